@@ -1,0 +1,1 @@
+"""MuJoCo entities: arena, phantom, catheter, introducer sheath, robot."""

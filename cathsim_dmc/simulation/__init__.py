@@ -1,0 +1,1 @@
+"""Many simulations of one task, stepped together."""

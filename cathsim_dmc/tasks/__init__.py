@@ -1,0 +1,1 @@
+"""Navigation tasks and their meaning as pure functions of arrays."""
