@@ -1,0 +1,400 @@
+"""Follower of a CathBot-like catheter robot: looks and joints, no forces.
+
+A main rail carries four platforms on prismatic joints. From the patient
+backwards: front clamps, catheter rotary unit, rear clamps, guidewire rotary
+unit. The two pairs of clamps hold the device in turn while it advances; the
+rotary units turn it and let it slide between their rollers.
+
+**Frame.** ``+z`` runs along the device towards the patient, the origin is the
+proximal mouth of the introducer sheath and the device lies on the ``z`` axis.
+``+y`` is down: in the LPS frame of a supine patient that is posterior, so a
+robot attached without rotation lies on the table below the device. ``+x`` is
+then the patient's left.
+
+**Motion** is perfect, as in the published system: the device's own joints are
+driven and the robot is posed after them. :func:`follower_posture` gives every
+robot joint as a function of how far the device was pushed and turned;
+:meth:`Robot.pose` writes that into the simulation. The joints are ordinary
+slides and hinges which nothing pushes (gravity compensated, no actuator, no
+contact, no limit in the solver): between two poses they stand still.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal, NamedTuple
+
+import mujoco
+import numpy as np
+from dm_control import composer, mjcf
+from numpy.typing import ArrayLike, NDArray
+
+# --- The clamp-advance-release cycle, measured in metres of device insertion. ---
+# The stroke is a choice: short enough for a rail of 0.35 m, long enough that a
+# hand-over happens about once a second at the fastest push (40 mm/s).
+STROKE = 0.040  # m, insertion over which a pair of clamps stays closed
+OVERLAP = 0.002  # m, both pairs are closed at each hand-over
+JAW_TRAVEL = 0.004  # m, insertion during which the jaws open, or close
+CYCLE = 2 * (STROKE - OVERLAP)  # m, the two pairs work half a cycle apart
+RETURN = CYCLE - STROKE - 2 * JAW_TRAVEL  # m, insertion while a platform returns
+JAW_OPENING = 0.005  # m, each jaw, fully open
+
+# --- Dimensions (own design; metres, robot frame). ---
+DEVICE_RADIUS = 0.835e-3  # m, 5 French
+FRONT_HOME, CATHETER_HOME = -0.080, -0.154  # m, z of the platforms at mid-stroke
+REAR_HOME, GUIDEWIRE_HOME = -0.228, -0.286
+CLAMP_HALF_LENGTH, ROTARY_HALF_LENGTH = 0.022, 0.026  # m, platforms along z
+RAIL_END = -0.360  # m, z of the proximal end of the rail
+ROLLER_RADIUS = 0.005  # m
+RING_TEETH, PINION_TEETH = 16, 8
+GEAR_MODULE = 0.002  # m of pitch diameter per tooth
+PINION_ANGLE = np.deg2rad(25.0)  # about z from +x: beside the ring, a little below
+PLATFORM_RANGE = 0.026  # m, either side of home; the cycle itself needs 0.0249
+
+# Nothing is ever accelerated by a force here, so real masses would only enter the
+# mean inertia of the model, which scales the solver's stopping rule for the
+# catheter. Masses are therefore a trifle; damping calms a viewer's mouse.
+GEOM_MASS = 2e-5  # kg
+SLIDE_DAMPING = 1.0  # N s/m
+HINGE_DAMPING = 1e-4  # N m s/rad
+VISUAL_GROUP = 2  # geom group of everything drawn for looks
+
+
+@dataclass(frozen=True)
+class RobotJoint:
+    """One joint of the follower: name, kind, and its range in m or rad.
+
+    ``range`` is ``None`` for wheels, which turn without end.
+    """
+
+    name: str
+    kind: Literal["slide", "hinge"]
+    range: tuple[float, float] | None
+
+
+def _platform_joint(name: str) -> RobotJoint:
+    return RobotJoint(f"{name}_platform", "slide", (-PLATFORM_RANGE, PLATFORM_RANGE))
+
+
+def _jaw_joints(name: str) -> tuple[RobotJoint, ...]:
+    return tuple(
+        RobotJoint(f"{name}_jaw_{side}", "slide", (0.0, JAW_OPENING))
+        for side in ("left", "right")
+    )
+
+
+def _wheel_joints(name: str) -> tuple[RobotJoint, ...]:
+    wheels = ("ring", "pinion", "roller_left", "roller_right")
+    return tuple(RobotJoint(f"{name}_{wheel}", "hinge", None) for wheel in wheels)
+
+
+#: Order of the joints in a posture, and in ``Robot.joints``.
+JOINTS: tuple[RobotJoint, ...] = (
+    *map(_platform_joint, ("front", "catheter", "rear", "guidewire")),
+    *_jaw_joints("front"),
+    *_jaw_joints("rear"),
+    *_wheel_joints("catheter"),
+    *_wheel_joints("guidewire"),
+)
+
+
+class ClampState(NamedTuple):
+    """One pair of clamps and its platform; every field has the insertion's shape."""
+
+    travel: NDArray[np.float64]  # m, platform along +z from its home
+    opening: NDArray[np.float64]  # m, each jaw from the device, 0 when it holds
+    closed: NDArray[np.bool_]  # the pair holds the device
+
+
+def clamp_states(insertion: ArrayLike) -> tuple[ClampState, ClampState]:
+    """Front and rear pair of clamps after ``insertion`` (...,) metres of device.
+
+    A platform moves with the device while its jaws are closed, opening or
+    closing, and swings back in between: the insertion minus a smooth staircase,
+    ``travel = phase - STROKE / 2 - CYCLE * smoothstep(return progress)``. Both
+    position and speed are continuous. It depends on the insertion alone, so a
+    withdrawn device retraces it backwards.
+    """
+    insertion = np.asarray(insertion, np.float64)
+    if not np.isfinite(insertion).all():
+        raise ValueError(
+            f"insertion must be finite metres, got {insertion}: "
+            "check the device's base joint for a diverged simulation"
+        )
+    # Insertion 0 lies in the middle of an overlap: both pairs hold at the start.
+    front = OVERLAP / 2
+    return _clamp_state(insertion + front), _clamp_state(insertion + front + CYCLE / 2)
+
+
+def follower_posture(
+    insertion: ArrayLike,
+    rotation: ArrayLike = 0.0,
+    *,
+    guidewire_insertion: ArrayLike | None = None,
+    guidewire_rotation: ArrayLike | None = None,
+) -> NDArray[np.float64]:
+    """Every joint of the follower for a device pushed and turned so far.
+
+    Args:
+      insertion: (...,) metres from the start, positive into the patient.
+      rotation: (...,) radians about +z from the start.
+      guidewire_insertion: (...,) metres; the catheter's if omitted, as the
+        rotary unit at the back then works on the same device.
+      guidewire_rotation: (...,) radians; the catheter's if omitted.
+
+    Returns:
+      (..., len(JOINTS)) float64 in the order of ``JOINTS``; metres for slides,
+      radians for hinges, continuous in every argument (angles do not wrap).
+
+    Raises:
+      ValueError: an argument is not finite, or the shapes do not broadcast.
+    """
+    values = [insertion, rotation, guidewire_insertion, guidewire_rotation]
+    values[2] = insertion if guidewire_insertion is None else guidewire_insertion
+    values[3] = rotation if guidewire_rotation is None else guidewire_rotation
+    pushed, turned, wire_pushed, wire_turned = np.broadcast_arrays(
+        *(np.asarray(value, np.float64) for value in values)
+    )
+    if not all(np.isfinite(value).all() for value in (turned, wire_pushed, wire_turned)):
+        raise ValueError(
+            f"rotations and the guidewire insertion must be finite, got rotation "
+            f"{turned}, guidewire insertion {wire_pushed} and rotation {wire_turned}"
+        )
+    front, rear = clamp_states(pushed)
+    # The catheter unit stays half-way between the clamps, so the free lengths of
+    # shaft either side of it stay equal; the guidewire unit rides with the rear.
+    catheter_travel = (front.travel + rear.travel) / 2
+    columns = (
+        front.travel,
+        catheter_travel,
+        rear.travel,
+        rear.travel,
+        front.opening,
+        front.opening,
+        rear.opening,
+        rear.opening,
+        *_wheel_angles(pushed - catheter_travel, turned),
+        *_wheel_angles(wire_pushed - rear.travel, wire_turned),
+    )
+    return np.stack(columns, axis=-1)
+
+
+def _smoothstep(u: NDArray[np.float64]) -> NDArray[np.float64]:
+    u = np.clip(u, 0.0, 1.0)
+    return u * u * (3.0 - 2.0 * u)
+
+
+def _clamp_state(shifted: NDArray[np.float64]) -> ClampState:
+    phase = np.mod(shifted, CYCLE)  # the jaws are closed over [0, STROKE]
+    progress = (phase - STROKE - JAW_TRAVEL) / RETURN
+    travel = phase - STROKE / 2 - CYCLE * _smoothstep(progress)
+    opened = _smoothstep((phase - STROKE) / JAW_TRAVEL)
+    shut = _smoothstep((phase - CYCLE + JAW_TRAVEL) / JAW_TRAVEL)
+    return ClampState(travel, JAW_OPENING * (opened - shut), phase <= STROKE)
+
+
+def _wheel_angles(slip: NDArray, turned: NDArray) -> tuple[NDArray, ...]:
+    """Ring, pinion, left and right roller; ``slip`` is device past platform (m)."""
+    rolled = slip / ROLLER_RADIUS
+    return turned, -turned * (RING_TEETH / PINION_TEETH), rolled, -rolled
+
+
+class Robot(composer.Entity):
+    """The follower; attach it to the arena at the mouth of the introducer sheath."""
+
+    def _build(self, device_radius: float = DEVICE_RADIUS, name: str = "robot"):
+        """Builds the model.
+
+        Args:
+          device_radius: metres; jaws and rollers touch a device this thick.
+          name: name of the model, the prefix of its elements once attached.
+        """
+        if not 1e-4 <= device_radius <= 4e-3:
+            raise ValueError(
+                f"device_radius is {device_radius} m, allowed are 1e-4 to 4e-3 m "
+                "(devices up to 24 French); did you mean millimetres?"
+            )
+        self._device_radius = device_radius
+        self._kinds = {joint.name: joint for joint in JOINTS}
+        self._mjcf_root = mjcf.RootElement(model=name)
+        self._build_defaults()
+        self._build_rail()
+        self._build_clamps("front", FRONT_HOME)
+        self._build_rotary("catheter", CATHETER_HOME)
+        self._build_clamps("rear", REAR_HOME)
+        self._build_rotary("guidewire", GUIDEWIRE_HOME)
+        self._joints = tuple(
+            self._mjcf_root.find("joint", joint.name) for joint in JOINTS
+        )
+
+    @property
+    def mjcf_model(self) -> mjcf.RootElement:
+        """The PyMJCF model."""
+        return self._mjcf_root
+
+    @property
+    def joints(self) -> tuple[mjcf.Element, ...]:
+        """The MJCF joints in the order of ``JOINTS``."""
+        return self._joints
+
+    def pose(
+        self, physics: mjcf.Physics, insertion: float, rotation: float = 0.0
+    ) -> None:
+        """Puts the robot where a device pushed and turned so far needs it.
+
+        Call it once per control step, before or after the physics steps. Body
+        and geom positions are brought up to date with it.
+
+        Args:
+          physics: the simulation the robot is part of.
+          insertion: metres since the start, positive into the patient.
+          rotation: radians about +z since the start.
+        """
+        joints = physics.bind(self._joints).element_id
+        model, data = physics.model, physics.data
+        # Written to the arrays themselves: a write through the binding marks the
+        # physics dirty, and the next read would run a whole forward pass, which
+        # costs a step and replaces the contact forces and the solver's warm start.
+        data.qpos[model.jnt_qposadr[joints]] = follower_posture(insertion, rotation)
+        data.qvel[model.jnt_dofadr[joints]] = 0.0
+        mujoco.mj_kinematics(model.ptr, data.ptr)
+
+    # ------------------------------------------------------------- construction
+
+    def _build_defaults(self) -> None:
+        root = self._mjcf_root
+        geom = root.default.geom
+        geom.contype = geom.conaffinity = 0
+        geom.group, geom.mass = VISUAL_GROUP, GEOM_MASS
+        root.default.joint.limited = "false"
+        for name, rgba, specular, shininess in MATERIALS:
+            root.asset.add(
+                "material", name=name, rgba=rgba, specular=specular, shininess=shininess
+            )
+
+    def _build_rail(self) -> None:
+        rail = self._mjcf_root.worldbody.add("body", name="rail")
+        middle, half = RAIL_END / 2, -RAIL_END / 2
+        _box(rail, (0, 0.057, middle), (0.034, 0.006, half), "aluminium")
+        for side in (-1, 1):
+            x = side * 0.022
+            _box(rail, (side * 0.0342, 0.057, middle), (0.0004, 0.002, half), "graphite")
+            _box(rail, (x, 0.049, middle), (0.003, 0.003, half), "aluminium")
+            _rod(rail, (x, 0.043, -0.004), (x, 0.043, RAIL_END), 0.005, "steel")
+        _rod(rail, (0, 0.045, -0.004), (0, 0.045, RAIL_END), 0.003, "brass")
+        for z, guide in ((-0.010, 0.010), (RAIL_END + 0.006, 0.014)):
+            _box(rail, (0, 0.041, z), (0.038, 0.022, 0.006), "aluminium")
+            _box(rail, (0, 0.010, z), (0.008, 0.010, 0.006), "aluminium")
+            _rod(rail, (0, 0, z - guide), (0, 0, z + guide), 0.006, "steel")
+        # Valve manifold at the far end, with one air line per platform.
+        _box(rail, (0, 0.043, RAIL_END - 0.020), (0.036, 0.018, 0.020), "graphite")
+        for x, material in zip((-0.024, -0.008, 0.008, 0.024), ACCENTS, strict=True):
+            start, end = RAIL_END - 0.036, RAIL_END - 0.056
+            _rod(rail, (x, 0.043, start), (x, 0.043, end), 0.004, material)
+            tip = (x, 0.055, end - 0.040)
+            _rod(rail, (x, 0.043, end), tip, 0.0022, "rubber", "capsule")
+
+    def _build_platform(
+        self, name: str, home: float, half_length: float, accent: str
+    ) -> mjcf.Element:
+        body = self._add_body(
+            self._mjcf_root.worldbody, f"{name}_platform", (0, 0, home), (0, 0, 1)
+        )
+        _box(body, (0, 0.030, 0), (0.042, 0.004, half_length), "graphite")
+        for side in (-1, 1):
+            _box(body, (side * 0.022, 0.040, 0), (0.010, 0.006, 0.017), "steel")
+            stripe = (0.0006, 0.0022, half_length - 0.003)
+            _box(body, (side * 0.0421, 0.030, 0), stripe, accent)
+        return body
+
+    def _build_clamps(self, name: str, home: float) -> None:
+        accent = "clamp"
+        platform = self._build_platform(name, home, CLAMP_HALF_LENGTH, accent)
+        _box(platform, (0, 0.022, 0), (0.027, 0.004, 0.009), "aluminium")
+        r, y = self._device_radius, 0.0135
+        for side, word in ((1, "left"), (-1, "right")):
+            _rod(platform, (side * 0.028, y, 0), (side * 0.041, y, 0), 0.006, "steel")
+            _box(platform, (side * 0.0345, 0.022, 0), (0.005, 0.004, 0.006), "graphite")
+            jaw = self._add_body(
+                platform, f"{name}_jaw_{word}", (side * r, 0, 0), (side, 0, 0)
+            )
+            _box(jaw, (side * 0.001, 0, 0), (0.001, 0.004, 0.012), "rubber")
+            _box(jaw, (side * 0.0055, 0.002, 0), (0.0035, 0.008, 0.010), accent)
+            _box(jaw, (side * 0.0105, y, 0), (0.0085, 0.0045, 0.010), accent)
+            _rod(jaw, (side * 0.018, y, 0), (side * 0.030, y, 0), 0.0022, "brass")
+
+    def _build_rotary(self, name: str, home: float) -> None:
+        accent = name
+        platform = self._build_platform(name, home, ROTARY_HALF_LENGTH, accent)
+        _rod(platform, (0, 0, -0.018), (0, 0, -0.006), 0.019, "graphite")
+        _box(platform, (0, 0.014, -0.012), (0.019, 0.012, 0.006), "graphite")
+        _rod(platform, (0, 0, -0.023), (0, 0, -0.0055), 0.011, "steel")
+        distance = GEAR_MODULE * (RING_TEETH + PINION_TEETH) / 2
+        x, y = distance * np.cos(PINION_ANGLE), distance * np.sin(PINION_ANGLE)
+        _rod(platform, (x, y, -0.026), (x, y, -0.003), 0.0085, "aluminium")
+        _box(platform, (x, 0.023, -0.014), (0.006, 0.003, 0.008), "graphite")
+
+        ring = self._add_body(platform, f"{name}_ring", (0, 0, 0.002), (0, 0, 1))
+        _gear(ring, RING_TEETH, PINION_ANGLE, accent)
+        _rod(ring, (0, 0, 0.004), (0, 0, 0.007), 0.0085, "steel")
+        for side in (-1, 1):
+            _box(ring, (0, side * 0.0063, 0.011), (0.010, 0.0012, 0.006), "steel")
+        for side, word in ((1, "left"), (-1, "right")):
+            at = (side * (ROLLER_RADIUS + self._device_radius), 0, 0.015)
+            roller = self._add_body(ring, f"{name}_roller_{word}", at, (0, 1, 0))
+            _rod(roller, (0, -0.005, 0), (0, 0.005, 0), ROLLER_RADIUS, "rubber")
+            # A stripe, without which a turning cylinder looks still.
+            _box(roller, (0, 0, 0), (0.0052, 0.0044, 0.001), accent)
+
+        pinion = self._add_body(platform, f"{name}_pinion", (x, y, 0.002), (0, 0, 1))
+        # A gap of the pinion faces a tooth of the ring.
+        gap = PINION_ANGLE + np.pi + np.pi / PINION_TEETH
+        _gear(pinion, PINION_TEETH, gap, "brass")
+
+    def _add_body(self, parent, name: str, pos, axis) -> mjcf.Element:
+        """A body with gravity compensated, and its one joint of the same name."""
+        body = parent.add("body", name=name, pos=pos, gravcomp=1)
+        joint = self._kinds[name]
+        slides = joint.kind == "slide"
+        element = body.add("joint", name=name, type=joint.kind, axis=axis)
+        element.damping = SLIDE_DAMPING if slides else HINGE_DAMPING
+        if joint.range is not None:
+            element.range = joint.range
+        return body
+
+
+#: name, RGBA, specular, shininess
+MATERIALS = (
+    ("aluminium", (0.72, 0.74, 0.77, 1.0), 0.6, 0.5),
+    ("steel", (0.86, 0.87, 0.89, 1.0), 0.9, 0.8),
+    ("graphite", (0.13, 0.14, 0.16, 1.0), 0.3, 0.3),
+    ("brass", (0.80, 0.65, 0.32, 1.0), 0.7, 0.6),
+    ("rubber", (0.06, 0.06, 0.07, 1.0), 0.1, 0.1),
+    ("clamp", (0.86, 0.24, 0.16, 1.0), 0.4, 0.4),
+    ("catheter", (0.10, 0.45, 0.78, 1.0), 0.4, 0.4),
+    ("guidewire", (0.95, 0.62, 0.10, 1.0), 0.4, 0.4),
+)
+ACCENTS = ("clamp", "catheter", "clamp", "guidewire")  # by platform, front to back
+
+
+def _box(body, centre, half_sizes, material: str, quat=(1, 0, 0, 0)) -> None:
+    body.add(
+        "geom", type="box", pos=centre, size=half_sizes, quat=quat, material=material
+    )
+
+
+def _rod(body, start, end, radius, material: str, shape: str = "cylinder") -> None:
+    body.add(
+        "geom", type=shape, fromto=(*start, *end), size=(radius,), material=material
+    )
+
+
+def _gear(body, teeth: int, angle: float, material: str) -> None:
+    """A spur gear about z with one tooth at ``angle`` (rad from +x)."""
+    pitch = GEAR_MODULE * teeth / 2
+    _rod(body, (0, 0, -0.004), (0, 0, 0.004), pitch - 0.8 * GEAR_MODULE, material)
+    half_sizes = (pitch + 0.75 * GEAR_MODULE, 0.9 * GEAR_MODULE, 0.0038)
+    for i in range(teeth // 2):  # a box across the gear makes two opposite teeth
+        half_turn = (angle + 2 * np.pi * i / teeth) / 2
+        quat = (np.cos(half_turn), 0, 0, np.sin(half_turn))
+        _box(body, (0, 0, 0), half_sizes, material, quat)
