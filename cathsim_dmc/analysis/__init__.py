@@ -1,0 +1,1 @@
+"""What recorded episodes say: force statistics, success rates, heatmaps."""

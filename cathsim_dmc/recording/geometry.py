@@ -1,0 +1,117 @@
+"""Small geometry for drawing: orientations, shading normals, force colours."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+# Top of the colour scale, newtons. Published in-contact forces lie mostly within
+# 0-0.2 N with outliers above 0.4 N, so ordinary contacts use half the scale.
+FORCE_COLOUR_MAX = 0.4
+
+# Pale yellow over orange to dark red; monotone in lightness, so it survives
+# greyscale printing and the common colour deficiencies.
+_FORCE_COLOURS = np.array(
+    [[255, 240, 150], [253, 170, 70], [225, 65, 40], [120, 0, 45]], dtype=np.float64
+)
+
+
+def surface_arrays(surface: Any) -> tuple[np.ndarray, np.ndarray]:
+    """Return vertices (V, 3) float64 and faces (F, 3) int64 of a triangle surface.
+
+    Args:
+        surface: A pair ``(vertices, faces)`` or an object with those attributes.
+
+    Raises:
+        ValueError: on a wrong shape or a face that names a missing vertex.
+    """
+    if hasattr(surface, "vertices"):
+        surface = surface.vertices, surface.faces
+    vertices = np.asarray(surface[0], dtype=np.float64)
+    faces = np.asarray(surface[1], dtype=np.int64)
+    for name, array in (("vertices", vertices), ("faces", faces)):
+        if array.ndim != 2 or array.shape[1] != 3:
+            raise ValueError(f"{name} must have shape (n, 3), got {array.shape}")
+    if faces.size and (faces.min() < 0 or faces.max() >= len(vertices)):
+        raise ValueError(
+            f"faces must index {len(vertices)} vertices, got indices "
+            f"{faces.min()} to {faces.max()}"
+        )
+    return vertices, faces
+
+
+def vertex_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """Return unit vertex normals (V, 3), faces weighted by their area.
+
+    A vertex without a face of positive area gets +z.
+    """
+    corners = vertices[faces]
+    face_normals = np.cross(
+        corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+    )
+    normals = np.zeros_like(vertices)
+    for corner in range(3):
+        for axis in range(3):
+            normals[:, axis] += np.bincount(
+                faces[:, corner], face_normals[:, axis], minlength=len(vertices)
+            )
+    length = np.linalg.norm(normals, axis=1, keepdims=True)
+    upright = np.broadcast_to([0.0, 0.0, 1.0], normals.shape)
+    return np.where(length > 0, normals / np.where(length > 0, length, 1), upright)
+
+
+def z_to(direction: np.ndarray) -> np.ndarray:
+    """Return the shortest rotations taking +z to ``direction``, as quaternions wxyz.
+
+    Half-angle construction: q = (1 + z.d, z x d), normalised; for d = -z, where that
+    vanishes, half a turn about x.
+
+    Args:
+        direction: (..., 3) vectors of any length; a zero vector gives the identity.
+
+    Returns:
+        (..., 4) unit quaternions.
+    """
+    direction = np.asarray(direction, dtype=np.float64)
+    length = np.linalg.norm(direction, axis=-1, keepdims=True)
+    up = np.broadcast_to([0.0, 0.0, 1.0], direction.shape)
+    unit = np.where(length > 0, direction / np.where(length > 0, length, 1), up)
+    quaternion = np.stack(
+        [
+            1 + unit[..., 2],
+            -unit[..., 1],
+            unit[..., 0],
+            np.zeros(unit.shape[:-1]),
+        ],
+        axis=-1,
+    )
+    norm = np.linalg.norm(quaternion, axis=-1, keepdims=True)
+    flipped = np.broadcast_to([0.0, 1.0, 0.0, 0.0], quaternion.shape)
+    return np.where(norm > 1e-9, quaternion / np.where(norm > 1e-9, norm, 1), flipped)
+
+
+def xyzw(quaternion_wxyz: np.ndarray) -> np.ndarray:
+    """Reorder quaternions (..., 4) from MuJoCo's wxyz to Rerun's xyzw."""
+    return np.roll(quaternion_wxyz, -1, axis=-1)
+
+
+def rotate(quaternion_wxyz: np.ndarray, vector: np.ndarray) -> np.ndarray:
+    """Rotate vectors (..., 3) by unit quaternions (..., 4) wxyz."""
+    scalar, axis = quaternion_wxyz[..., :1], quaternion_wxyz[..., 1:]
+    twice = 2 * np.cross(axis, vector)
+    return vector + scalar * twice + np.cross(axis, twice)
+
+
+def force_colours(magnitude: np.ndarray) -> np.ndarray:
+    """Return RGB colours (..., 3) uint8 of force magnitudes (...,) in newtons.
+
+    The scale is linear from 0 to ``FORCE_COLOUR_MAX`` and saturates above.
+    """
+    magnitude = np.asarray(magnitude, dtype=np.float64)
+    last = len(_FORCE_COLOURS) - 1
+    place = np.clip(magnitude / FORCE_COLOUR_MAX, 0, 1) * last
+    lower = np.minimum(place.astype(np.int64), last - 1)
+    share = (place - lower)[..., None]
+    mixed = _FORCE_COLOURS[lower] * (1 - share) + _FORCE_COLOURS[lower + 1] * share
+    return np.round(mixed).astype(np.uint8)

@@ -1,0 +1,98 @@
+"""Primitive geoms of a compiled model, for drawing bodies that the record moves."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+# MuJoCo geom types that a recording can draw, and how many sizes each one uses:
+# sphere (radius), capsule and cylinder (radius, half length), box (half extents).
+SIZES = {"sphere": 1, "capsule": 2, "cylinder": 2, "box": 3}
+
+
+@dataclass(frozen=True, eq=False)
+class BodyGeom:
+    """One primitive fixed to a body.
+
+    Attributes:
+        body: Row of the body in ``Episode.body_pos`` (the MuJoCo body id).
+        body_name: Full name of the body, such as ``robot/carriage``.
+        kind: "sphere", "capsule", "cylinder" or "box".
+        size: MuJoCo half sizes in metres: (radius,), (radius, half length) or
+            (half x, half y, half z).
+        position: (3,) centre in the frame of the body, metres.
+        quaternion: (4,) wxyz, orientation in the frame of the body.
+        rgba: (4,) colour in [0, 1].
+
+    Raises:
+        ValueError: on an unknown kind or a wrong number of sizes.
+    """
+
+    body: int
+    body_name: str
+    kind: str
+    size: np.ndarray
+    position: np.ndarray
+    quaternion: np.ndarray
+    rgba: np.ndarray
+
+    def __post_init__(self) -> None:
+        if self.kind not in SIZES:
+            raise ValueError(f"kind must be one of {', '.join(SIZES)}; got {self.kind}")
+        shapes = {
+            "size": (SIZES[self.kind],),
+            "position": (3,),
+            "quaternion": (4,),
+            "rgba": (4,),
+        }
+        for name, shape in shapes.items():
+            array = np.array(getattr(self, name), dtype=np.float64)
+            if array.shape != shape:
+                raise ValueError(
+                    f"{name} of a {self.kind} must have shape {shape}, "
+                    f"got {array.shape}"
+                )
+            array.setflags(write=False)
+            object.__setattr__(self, name, array)
+
+
+def body_geoms(
+    physics: Any, entities: Iterable[str] = ("robot", "sheath")
+) -> tuple[BodyGeom, ...]:
+    """Return the visible primitives of some entities, in the order of the model.
+
+    Args:
+        physics: A dm_control ``Physics``.
+        entities: MJCF prefixes; an entity that the model lacks adds nothing, and
+            meshes are left out because their vertices belong to the model file.
+    """
+    wanted = tuple(entities)
+    return tuple(_walk(physics.model, wanted))
+
+
+def _walk(model: Any, wanted: tuple[str, ...]) -> Iterator[BodyGeom]:
+    import mujoco
+
+    kinds = {int(getattr(mujoco.mjtGeom, f"mjGEOM_{k.upper()}")): k for k in SIZES}
+    for geom in range(model.ngeom):
+        kind = kinds.get(int(model.geom_type[geom]))
+        body = int(model.geom_bodyid[geom])
+        name = model.id2name(body, "body")
+        if kind is None or name.split("/", 1)[0] not in wanted:
+            continue
+        material = int(model.geom_matid[geom])
+        rgba = model.mat_rgba[material] if material >= 0 else model.geom_rgba[geom]
+        if rgba[3] == 0:
+            continue
+        yield BodyGeom(
+            body=body,
+            body_name=name,
+            kind=kind,
+            size=model.geom_size[geom][: SIZES[kind]],
+            position=model.geom_pos[geom],
+            quaternion=model.geom_quat[geom],
+            rgba=rgba,
+        )
