@@ -59,6 +59,19 @@ SLIDE_DAMPING = 1.0  # N s/m
 HINGE_DAMPING = 1e-4  # N m s/rad
 VISUAL_GROUP = 2  # geom group of everything drawn for looks
 
+#: name, RGBA, specular, shininess
+MATERIALS = (
+    ("aluminium", (0.72, 0.74, 0.77, 1.0), 0.6, 0.5),
+    ("steel", (0.86, 0.87, 0.89, 1.0), 0.9, 0.8),
+    ("graphite", (0.22, 0.24, 0.27, 1.0), 0.4, 0.4),
+    ("brass", (0.80, 0.65, 0.32, 1.0), 0.7, 0.6),
+    ("rubber", (0.10, 0.10, 0.11, 1.0), 0.1, 0.1),
+    ("clamp", (0.86, 0.24, 0.16, 1.0), 0.4, 0.4),
+    ("catheter", (0.10, 0.45, 0.78, 1.0), 0.4, 0.4),
+    ("guidewire", (0.95, 0.62, 0.10, 1.0), 0.4, 0.4),
+)
+ACCENTS = ("clamp", "catheter", "clamp", "guidewire")  # by platform, front to back
+
 
 @dataclass(frozen=True)
 class RobotJoint:
@@ -155,7 +168,9 @@ def follower_posture(
     pushed, turned, wire_pushed, wire_turned = np.broadcast_arrays(
         *(np.asarray(value, np.float64) for value in values)
     )
-    if not all(np.isfinite(value).all() for value in (turned, wire_pushed, wire_turned)):
+    if not all(
+        np.isfinite(value).all() for value in (turned, wire_pushed, wire_turned)
+    ):
         raise ValueError(
             f"rotations and the guidewire insertion must be finite, got rotation "
             f"{turned}, guidewire insertion {wire_pushed} and rotation {wire_turned}"
@@ -278,8 +293,6 @@ class Robot(composer.Entity):
         _box(rail, (0, 0.057, middle), (0.034, 0.006, half), "aluminium")
         for side in (-1, 1):
             x = side * 0.022
-            _box(rail, (side * 0.0342, 0.057, middle), (0.0004, 0.002, half), "graphite")
-            _box(rail, (x, 0.049, middle), (0.003, 0.003, half), "aluminium")
             _rod(rail, (x, 0.043, -0.004), (x, 0.043, RAIL_END), 0.005, "steel")
         _rod(rail, (0, 0.045, -0.004), (0, 0.045, RAIL_END), 0.003, "brass")
         for z, guide in ((-0.010, 0.010), (RAIL_END + 0.006, 0.014)):
@@ -289,10 +302,8 @@ class Robot(composer.Entity):
         # Valve manifold at the far end, with one air line per platform.
         _box(rail, (0, 0.043, RAIL_END - 0.020), (0.036, 0.018, 0.020), "graphite")
         for x, material in zip((-0.024, -0.008, 0.008, 0.024), ACCENTS, strict=True):
-            start, end = RAIL_END - 0.036, RAIL_END - 0.056
-            _rod(rail, (x, 0.043, start), (x, 0.043, end), 0.004, material)
-            tip = (x, 0.055, end - 0.040)
-            _rod(rail, (x, 0.043, end), tip, 0.0022, "rubber", "capsule")
+            start, end = (x, 0.043, RAIL_END - 0.038), (x, 0.055, RAIL_END - 0.090)
+            _rod(rail, start, end, 0.003, material, "capsule")
 
     def _build_platform(
         self, name: str, home: float, half_length: float, accent: str
@@ -301,20 +312,18 @@ class Robot(composer.Entity):
             self._mjcf_root.worldbody, f"{name}_platform", (0, 0, home), (0, 0, 1)
         )
         _box(body, (0, 0.030, 0), (0.042, 0.004, half_length), "graphite")
-        for side in (-1, 1):
-            _box(body, (side * 0.022, 0.040, 0), (0.010, 0.006, 0.017), "steel")
-            stripe = (0.0006, 0.0022, half_length - 0.003)
-            _box(body, (side * 0.0421, 0.030, 0), stripe, accent)
+        # One block rides on both rods, one stripe shows on both flanks.
+        _box(body, (0, 0.040, 0), (0.032, 0.006, 0.017), "steel")
+        _box(body, (0, 0.030, 0), (0.0427, 0.0022, half_length - 0.003), accent)
         return body
 
     def _build_clamps(self, name: str, home: float) -> None:
         accent = "clamp"
         platform = self._build_platform(name, home, CLAMP_HALF_LENGTH, accent)
-        _box(platform, (0, 0.022, 0), (0.027, 0.004, 0.009), "aluminium")
+        _box(platform, (0, 0.022, 0), (0.040, 0.004, 0.008), "aluminium")
         r, y = self._device_radius, 0.0135
         for side, word in ((1, "left"), (-1, "right")):
             _rod(platform, (side * 0.028, y, 0), (side * 0.041, y, 0), 0.006, "steel")
-            _box(platform, (side * 0.0345, 0.022, 0), (0.005, 0.004, 0.006), "graphite")
             jaw = self._add_body(
                 platform, f"{name}_jaw_{word}", (side * r, 0, 0), (side, 0, 0)
             )
@@ -332,13 +341,11 @@ class Robot(composer.Entity):
         distance = GEAR_MODULE * (RING_TEETH + PINION_TEETH) / 2
         x, y = distance * np.cos(PINION_ANGLE), distance * np.sin(PINION_ANGLE)
         _rod(platform, (x, y, -0.026), (x, y, -0.003), 0.0085, "aluminium")
-        _box(platform, (x, 0.023, -0.014), (0.006, 0.003, 0.008), "graphite")
 
         ring = self._add_body(platform, f"{name}_ring", (0, 0, 0.002), (0, 0, 1))
         _gear(ring, RING_TEETH, PINION_ANGLE, accent)
-        _rod(ring, (0, 0, 0.004), (0, 0, 0.007), 0.0085, "steel")
         for side in (-1, 1):
-            _box(ring, (0, side * 0.0063, 0.011), (0.010, 0.0012, 0.006), "steel")
+            _box(ring, (0, side * 0.0063, 0.010), (0.010, 0.0012, 0.007), "steel")
         for side, word in ((1, "left"), (-1, "right")):
             at = (side * (ROLLER_RADIUS + self._device_radius), 0, 0.015)
             roller = self._add_body(ring, f"{name}_roller_{word}", at, (0, 1, 0))
@@ -361,20 +368,6 @@ class Robot(composer.Entity):
         if joint.range is not None:
             element.range = joint.range
         return body
-
-
-#: name, RGBA, specular, shininess
-MATERIALS = (
-    ("aluminium", (0.72, 0.74, 0.77, 1.0), 0.6, 0.5),
-    ("steel", (0.86, 0.87, 0.89, 1.0), 0.9, 0.8),
-    ("graphite", (0.13, 0.14, 0.16, 1.0), 0.3, 0.3),
-    ("brass", (0.80, 0.65, 0.32, 1.0), 0.7, 0.6),
-    ("rubber", (0.06, 0.06, 0.07, 1.0), 0.1, 0.1),
-    ("clamp", (0.86, 0.24, 0.16, 1.0), 0.4, 0.4),
-    ("catheter", (0.10, 0.45, 0.78, 1.0), 0.4, 0.4),
-    ("guidewire", (0.95, 0.62, 0.10, 1.0), 0.4, 0.4),
-)
-ACCENTS = ("clamp", "catheter", "clamp", "guidewire")  # by platform, front to back
 
 
 def _box(body, centre, half_sizes, material: str, quat=(1, 0, 0, 0)) -> None:

@@ -15,7 +15,7 @@ from cathsim_dmc.entities.robot import CYCLE, DEVICE_RADIUS, Robot
 
 IMAGE = pathlib.Path(__file__).parents[1] / "images" / "robot.png"
 BACKGROUND = (0.93, 0.945, 0.96)
-CLOSE, WIDE = "close", "wide"
+HERO, ABOVE = "hero", "above"
 
 
 def scene() -> tuple[mjcf.Physics, Robot]:
@@ -39,22 +39,26 @@ def scene() -> tuple[mjcf.Physics, Robot]:
         width=32,
         height=192,
     )
-    table = root.asset.add("material", name="table", rgba=(*BACKGROUND, 1), specular=0.05)
+    table = root.asset.add(
+        "material", name="table", rgba=(*BACKGROUND, 1), specular=0.05
+    )
     world = root.worldbody
     world.add("geom", type="plane", pos=(0, 0, -0.063), size=(3, 3, 1), material=table)
-    world.add("light", pos=(-0.5, -0.6, 1.2), dir=(0.35, 0.4, -1), diffuse=[0.55] * 3)
+    world.add("light", pos=(-0.3, -0.3, 1.5), dir=(0.2, 0.2, -1), diffuse=[0.55] * 3)
+    # The robot is shifted so that the middle of its rail is near the origin.
     for name, pos, target, fovy in (
-        (WIDE, (0.40, -0.36, 0.34), (-0.005, 0, -0.03), 30),
-        (CLOSE, (0.14, -0.10, 0.13), (0.0, 0, -0.012), 34),
+        (HERO, (0.34, -0.52, 0.36), (-0.015, 0, -0.030), 19),
+        (ABOVE, (0.0, -0.001, 1.2), (0, 0, -0.012), 5.2),
     ):
-        # The robot is shifted so that the middle of its rail is at the origin.
         body = world.add("body", name=f"{name}_target", pos=target)
         world.add(
             "camera", name=name, pos=pos, fovy=fovy, mode="targetbody", target=body
         )
     robot = Robot()
     # Robot +z to world +x, robot +y (down) to world -z.
-    site = world.add("site", pos=(0.19, 0, 0), xyaxes=(0, -1, 0, 0, 0, -1), size=(1e-4,))
+    site = world.add(
+        "site", pos=(0.19, 0, 0), xyaxes=(0, -1, 0, 0, 0, -1), size=(1e-4,)
+    )
     arena.attach(robot, site)
     world.add(
         "geom",
@@ -80,13 +84,14 @@ def main() -> None:
     parser.add_argument("--output", type=pathlib.Path, default=IMAGE)
     output = parser.parse_args().output
     physics, robot = scene()
-    top = render(physics, robot, 0.012, WIDE, 560, 1200)
-    row = [
-        render(physics, robot, phase * CYCLE, CLOSE, 300, 400)
-        for phase in (0.0, 0.25, 0.65)
+    rows = [render(physics, robot, 0.25 * CYCLE, HERO, 500, 1100)]
+    # Seen from above over one cycle: both hold, front holds, both hold, rear holds.
+    rows += [
+        render(physics, robot, phase * CYCLE, ABOVE, 190, 1100)
+        for phase in (0.0, 0.25, 0.5, 0.75)
     ]
     output.parent.mkdir(parents=True, exist_ok=True)
-    image.imsave(output, np.vstack([top, np.hstack(row)]))
+    image.imsave(output, np.vstack(rows))
     print(f"{output}: {output.stat().st_size / 1000:.0f} kB")
 
 

@@ -1,0 +1,347 @@
+import mujoco
+import numpy as np
+import pytest
+from dm_control import composer, mjcf
+from hypothesis import given
+from hypothesis import strategies as st
+
+from cathsim_dmc.entities import robot as robot_module
+from cathsim_dmc.entities.robot import (
+    CYCLE,
+    JAW_OPENING,
+    JOINTS,
+    ROLLER_RADIUS,
+    Robot,
+    clamp_states,
+    follower_posture,
+)
+
+NAMES = [joint.name for joint in JOINTS]
+COLUMN = {name: i for i, name in enumerate(NAMES)}
+insertions = st.floats(-0.5, 1.5, allow_nan=False)
+rotations = st.floats(-50.0, 50.0, allow_nan=False)
+
+
+def arena_with_robot(gravity=(0.0, 0.0, -9.81), falling_ball=False):
+    arena = composer.Arena()
+    root = arena.mjcf_model
+    root.option.gravity = gravity
+    root.option.integrator = "discrete"
+    if falling_ball:  # another moving thing, right through the robot
+        body = root.worldbody.add("body", name="ball", pos=(0, 0, 0.1))
+        body.add("freejoint", name="ball")
+        body.add("geom", name="ball", size=(0.01,), mass=0.01)
+    robot = Robot()
+    arena.attach(robot)
+    return mjcf.Physics.from_mjcf_model(root), robot
+
+
+# ------------------------------------------------------------------ posture
+
+
+@given(insertions, st.floats(1e-7, 1e-4), rotations)
+def test_posture_is_continuous(insertion, step, rotation):
+    change = np.abs(
+        follower_posture(insertion + step, rotation + step)
+        - follower_posture(insertion, rotation)
+    )
+    # Fastest slide: the return swing, 1 - 1.5 CYCLE / RETURN; jaws are slower.
+    fastest = 1.5 * CYCLE / robot_module.RETURN
+    slides = [i for i, joint in enumerate(JOINTS) if joint.kind == "slide"]
+    wheels = [i for i, joint in enumerate(JOINTS) if joint.kind == "hinge"]
+    assert change[slides].max() <= fastest * step + 1e-12
+    assert change[wheels].max() <= (1 + fastest) * step / ROLLER_RADIUS + 1e-9
+
+
+@given(insertions)
+def test_speed_of_the_platforms_is_continuous(insertion):
+    x = insertion + np.linspace(0, CYCLE, 40001)
+    travel = np.stack([state.travel for state in clamp_states(x)])
+    speed = np.diff(travel) / np.diff(x)
+    assert np.abs(np.diff(speed)).max() < 0.01
+
+
+@given(insertions)
+def test_device_is_always_held(insertion):
+    front, rear = clamp_states(insertion)
+    assert front.closed or rear.closed
+    for state in (front, rear):
+        assert (state.opening == 0.0) == bool(state.closed)
+
+
+def test_both_pairs_hold_during_every_hand_over_and_at_the_start():
+    x = np.linspace(0, 5 * CYCLE, 200001)
+    front, rear = clamp_states(x)
+    assert front.closed[0] and rear.closed[0]
+    both = front.closed & rear.closed
+    assert np.isclose(both.mean(), 2 * robot_module.OVERLAP / CYCLE, atol=1e-3)
+    # A pair only opens while the other one holds.
+    assert np.all(rear.closed[front.opening > 0])
+    assert np.all(front.closed[rear.opening > 0])
+    assert np.isclose(front.opening.max(), JAW_OPENING)
+
+
+@given(insertions, st.floats(-2e-3, 2e-3))
+def test_no_slip_while_clamped(insertion, step):
+    before = clamp_states(insertion)
+    after = clamp_states(insertion + step)
+    for a, b in zip(before, after, strict=True):
+        if a.opening < JAW_OPENING and b.opening < JAW_OPENING:
+            # Also while the jaws are part open the platform goes with the device.
+            assert b.travel - a.travel == pytest.approx(step, abs=1e-12)
+
+
+@given(insertions, rotations)
+def test_posture_stays_in_range(insertion, rotation):
+    posture = follower_posture(insertion, rotation)
+    for joint, value in zip(JOINTS, posture, strict=True):
+        if joint.range is not None:
+            low, high = joint.range
+            assert low <= value <= high, joint.name
+
+
+def test_ranges_are_not_idle():
+    posture = follower_posture(np.linspace(0, CYCLE, 5001))
+    for i, joint in enumerate(JOINTS):
+        if joint.range is not None and joint.name != "catheter_platform":
+            width = joint.range[1] - joint.range[0]
+            assert np.ptp(posture[:, i]) > 0.9 * width, joint.name
+
+
+@given(insertions, rotations)
+def test_posture_repeats_each_cycle_but_for_the_rollers(insertion, rotation):
+    a = follower_posture(insertion, rotation)
+    b = follower_posture(insertion + CYCLE, rotation)
+    rollers = np.array(["roller" in name for name in NAMES])
+    np.testing.assert_allclose(a[~rollers], b[~rollers], atol=1e-12)
+    np.testing.assert_allclose(np.abs(b - a)[rollers], CYCLE / ROLLER_RADIUS, atol=1e-9)
+
+
+def test_posture_broadcasts_over_batch_axes():
+    insertion = np.linspace(0, 0.3, 12).reshape(3, 4)
+    rotation = np.linspace(-1, 1, 4)
+    batch = follower_posture(insertion, rotation)
+    assert batch.shape == (3, 4, len(JOINTS)) and batch.dtype == np.float64
+    for i in np.ndindex(3, 4):
+        np.testing.assert_array_equal(
+            batch[i], follower_posture(insertion[i], rotation[i[1]])
+        )
+
+
+def test_guidewire_unit_follows_its_own_device_when_told():
+    same = follower_posture(0.1, 1.0)
+    own = follower_posture(0.1, 1.0, guidewire_insertion=0.15, guidewire_rotation=-2.0)
+    changed = {NAMES[i] for i in np.flatnonzero(same != own)}
+    assert changed == {name for name in NAMES if name.startswith("guidewire_")} - {
+        "guidewire_platform"
+    }
+    assert own[COLUMN["guidewire_ring"]] == -2.0
+
+
+def test_platforms_never_meet():
+    posture = follower_posture(np.linspace(0, CYCLE, 4001))
+    homes = np.array(
+        [
+            robot_module.FRONT_HOME,
+            robot_module.CATHETER_HOME,
+            robot_module.REAR_HOME,
+            robot_module.GUIDEWIRE_HOME,
+        ]
+    )
+    clamp, rotary = robot_module.CLAMP_HALF_LENGTH, robot_module.ROTARY_HALF_LENGTH
+    half = np.array([clamp, rotary, clamp, rotary])
+    centre = homes + posture[:, :4]
+    gaps = (centre - half)[:, :-1] - (centre + half)[:, 1:]
+    assert gaps.min() > 0.004
+    assert (centre + half).max() < -0.016  # the front end plate
+    assert (centre - half).min() > robot_module.RAIL_END + 0.012
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf])
+def test_posture_refuses_what_is_not_finite(bad):
+    with pytest.raises(ValueError, match="finite"):
+        follower_posture(bad)
+    with pytest.raises(ValueError, match="finite"):
+        follower_posture(0.0, bad)
+
+
+# ------------------------------------------------------------------- entity
+
+
+def test_joints_and_names():
+    physics, robot = arena_with_robot()
+    assert [joint.name for joint in robot.joints] == NAMES
+    assert [j.full_identifier for j in robot.joints] == [f"robot/{n}" for n in NAMES]
+    assert physics.model.nv == physics.model.nq == len(JOINTS) == 16
+    assert physics.model.nu == 0 and physics.model.neq == 0
+    assert robot.mjcf_model.model == "robot"
+    assert Robot(name="follower").mjcf_model.model == "follower"
+
+
+def test_ranges_are_written_but_not_enforced():
+    physics, robot = arena_with_robot()
+    bound = physics.bind(robot.joints)
+    assert not np.any(bound.limited)
+    for joint, given_range in zip(JOINTS, bound.range, strict=True):
+        np.testing.assert_allclose(given_range, joint.range or (0, 0))
+
+
+@pytest.mark.parametrize("radius", [0.0, 0.835, -1e-3])
+def test_device_radius_is_checked(radius):
+    with pytest.raises(ValueError, match="millimetres"):
+        Robot(device_radius=radius)
+
+
+def test_all_geoms_are_for_looks_only():
+    physics, robot = arena_with_robot()
+    geoms = physics.bind(robot.mjcf_model.find_all("geom"))
+    assert not np.any(geoms.contype) and not np.any(geoms.conaffinity)
+    kinds = {int(mujoco.mjtGeom.mjGEOM_BOX), int(mujoco.mjtGeom.mjGEOM_CYLINDER)}
+    assert set(np.asarray(geoms.type)) <= kinds | {int(mujoco.mjtGeom.mjGEOM_CAPSULE)}
+    assert set(np.asarray(geoms.group)) == {robot_module.VISUAL_GROUP}
+    assert np.all(geoms.matid >= 0)
+    # The model's mean inertia, which scales the solver's stopping rule, is left
+    # alone: a carriage has 0.2 kg.
+    mass_matrix_trace = physics.model.stat.meaninertia * physics.model.nv
+    assert mass_matrix_trace < 0.02 * 0.2
+
+
+def test_it_stands_still_and_touches_nothing():
+    physics, robot = arena_with_robot(gravity=(3.0, -5.0, -9.81), falling_ball=True)
+    robot.pose(physics, 0.0567, 2.0)
+    joints = physics.bind(robot.joints)
+    start = joints.qpos.copy()
+    for _ in range(2000):
+        physics.step()
+        assert physics.data.ncon == 0 and physics.data.nefc == 0
+    assert physics.named.data.qpos["ball"][2] < -10.0  # gravity did act
+    np.testing.assert_allclose(joints.qpos, start, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(joints.qvel, 0.0, atol=1e-9)
+    assert not any(warning.number for warning in physics.data.warning)
+
+
+def test_pose_writes_the_posture_and_updates_positions():
+    physics, robot = arena_with_robot()
+    joints = physics.bind(robot.joints)
+    platform = robot.mjcf_model.find("body", "front_platform")
+    joints.qvel = 1.0
+    physics.forward()
+    for insertion in (0.0, 0.02, 0.11):
+        robot.pose(physics, insertion, 0.3)
+        assert not physics.is_dirty  # no hidden forward pass
+        np.testing.assert_array_equal(joints.qpos, follower_posture(insertion, 0.3))
+        np.testing.assert_array_equal(joints.qvel, 0.0)
+        z = physics.bind(platform).xpos[2]
+        assert z == pytest.approx(
+            robot_module.FRONT_HOME + clamp_states(insertion)[0].travel, abs=1e-12
+        )
+
+
+def test_pose_leaves_everything_else_bit_for_bit():
+    paths = []
+    for posed in (False, True):
+        physics, robot = arena_with_robot(falling_ball=True)
+        path = []
+        for i in range(50):
+            physics.step(10)
+            if posed:
+                robot.pose(physics, 1e-3 * i, 0.01 * i)
+            path.append(physics.named.data.qpos["ball"].copy())
+        paths.append(np.array(path))
+    np.testing.assert_array_equal(*paths)
+
+
+def test_closed_jaws_and_rollers_touch_a_device_of_the_given_radius():
+    radius = 1.2e-3
+    robot = Robot(device_radius=radius)
+    physics = mjcf.Physics.from_mjcf_model(robot.mjcf_model)
+    robot.pose(physics, 0.0, 0.0)
+    for pair in ("front", "rear"):
+        for side, word in ((1, "left"), (-1, "right")):
+            jaw = robot.mjcf_model.find("body", f"{pair}_jaw_{word}")
+            geoms = physics.bind(jaw.find_all("geom"))
+            edges = side * geoms.xpos[:, 0]
+            boxes = np.asarray(geoms.type) == mujoco.mjtGeom.mjGEOM_BOX
+            inner = (edges - geoms.size[:, 0])[boxes].min()
+            assert inner == pytest.approx(radius, abs=1e-9)
+            roller = robot.mjcf_model.find("body", "catheter_roller_" + word)
+            x = physics.bind(roller).xpos[0]
+            assert x == pytest.approx(side * (radius + ROLLER_RADIUS), abs=1e-9)
+
+
+@pytest.mark.parametrize("unit", ["catheter", "guidewire"])
+@pytest.mark.parametrize("word", ["left", "right"])
+@given(insertion=insertions, rotation=rotations)
+def test_rollers_roll_on_the_device_without_slip(unit, word, insertion, rotation):
+    """The roller's surface moves with the device where the two touch."""
+    robot, physics, jacobian = _solo()
+    model, data = physics.model.ptr, physics.data.ptr
+    step = 1e-6
+    velocity = (
+        follower_posture(insertion + step, rotation)
+        - follower_posture(insertion - step, rotation)
+    ) / (2 * step)
+    robot.pose(physics, insertion, rotation)
+    mujoco.mj_comPos(model, data)
+    body = model.body(f"{unit}_roller_{word}").id
+    centre = data.xpos[body]
+    z = np.array([0.0, 0.0, centre[2]])
+    contact = centre + (z - centre) * ROLLER_RADIUS / np.linalg.norm(z - centre)
+    mujoco.mj_jac(model, data, jacobian, None, contact, body)
+    order = [model.joint(name).dofadr[0] for name in NAMES]
+    surface = jacobian[:, order] @ velocity
+    np.testing.assert_allclose(surface, [0.0, 0.0, 1.0], atol=1e-4)
+
+
+def test_meshing_gears_turn_without_slip_and_teeth_meet_gaps():
+    assert follower_posture(0.0, 0.7)[COLUMN["catheter_ring"]] == 0.7
+    robot, physics, jacobian = _solo()
+    model, data = physics.model.ptr, physics.data.ptr
+    robot.pose(physics, 0.0, 0.0)
+    mujoco.mj_comPos(model, data)
+    velocity = follower_posture(0.0, 1.0) - follower_posture(0.0, 0.0)
+    order = [model.joint(name).dofadr[0] for name in NAMES]
+    for unit in ("catheter", "guidewire"):
+        ring = data.xpos[model.body(f"{unit}_ring").id].copy()
+        pinion = data.xpos[model.body(f"{unit}_pinion").id].copy()
+        teeth = robot_module.RING_TEETH, robot_module.PINION_TEETH
+        pitch_point = ring + (pinion - ring) * teeth[0] / sum(teeth)
+        speeds = []
+        for name in ("ring", "pinion"):
+            body = model.body(f"{unit}_{name}").id
+            mujoco.mj_jac(model, data, jacobian, None, pitch_point, body)
+            speeds.append(jacobian[:, order] @ velocity)
+        np.testing.assert_allclose(speeds[0], speeds[1], atol=1e-12)
+        assert np.linalg.norm(speeds[0]) == pytest.approx(0.016, rel=1e-9)
+        # On the line of centres: a ring tooth against a pinion gap.
+        line = np.arctan2(*(pinion - ring)[[1, 0]])
+        offset_ring = _nearest_tooth(physics, f"{unit}_ring", line)
+        offset_pinion = _nearest_tooth(physics, f"{unit}_pinion", line + np.pi)
+        assert offset_ring == pytest.approx(0.0, abs=1e-9)
+        assert offset_pinion == pytest.approx(np.pi / teeth[1], abs=1e-9)
+
+
+_SOLO = []
+
+
+def _solo():
+    """One robot without an arena, built once: hypothesis asks for it often."""
+    if not _SOLO:
+        robot = Robot()
+        physics = mjcf.Physics.from_mjcf_model(robot.mjcf_model)
+        _SOLO.extend([robot, physics, np.zeros((3, physics.model.nv))])
+    return _SOLO
+
+
+def _nearest_tooth(physics, body, angle):
+    """Angle (rad, unsigned) from ``angle`` to the nearest tooth of a gear."""
+    model = physics.model.ptr
+    geoms = np.flatnonzero(
+        (model.geom_bodyid == model.body(body).id)
+        & (model.geom_type == mujoco.mjtGeom.mjGEOM_BOX)
+        & (np.abs(model.geom_pos).max(axis=1) == 0)
+    )
+    across = physics.data.geom_xmat[geoms].reshape(-1, 3, 3)[:, :, 0]
+    teeth = np.arctan2(across[:, 1], across[:, 0])
+    difference = np.mod(teeth - angle + np.pi / 2, np.pi) - np.pi / 2
+    return np.abs(difference).min()
