@@ -1,0 +1,19 @@
+"""Fluoroscopy on the CPU: pure functions of arrays, no OpenGL."""
+
+from cathsim_dmc.imaging.carm import VIEWS, CArm
+from cathsim_dmc.imaging.device import device_attenuation, device_thickness
+from cathsim_dmc.imaging.fluoroscopy import Biplane, Fluoroscope, Masks, rgb
+from cathsim_dmc.imaging.thickness import closed, surface_thickness
+
+__all__ = [
+    "VIEWS",
+    "Biplane",
+    "CArm",
+    "Fluoroscope",
+    "Masks",
+    "closed",
+    "device_attenuation",
+    "device_thickness",
+    "rgb",
+    "surface_thickness",
+]

@@ -1,0 +1,233 @@
+"""The C-arm: where the X-ray source and the detector stand about the patient.
+
+Frames. The world is the patient frame LPS in metres (+x left, +y posterior, +z
+superior). Pixel coordinates are (column, row): column grows to the right, row
+downwards, whole numbers are pixel *centres*, so (0, 0) is the centre of the top left
+pixel and the image spans [-0.5, columns - 0.5] x [-0.5, rows - 0.5]. The observer
+looks from the detector towards the source: the patient's left is on the right of an
+AP image and the head is up.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from functools import cached_property
+from types import MappingProxyType
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+# Primary and secondary angle of the views used for the arch, degrees. Signs are those
+# of the DICOM positioner angles: LAO and cranial positive.
+VIEWS: Mapping[str, tuple[float, float]] = MappingProxyType(
+    {
+        "AP": (0.0, 0.0),
+        "LAO45": (45.0, 0.0),
+        "LATERAL": (90.0, 0.0),
+        "RAO30": (-30.0, 0.0),
+    }
+)
+
+# Usual geometry of an angiography C-arm, m: source to isocentre is fixed by the
+# gantry (0.72-0.81), source to detector is adjustable (0.90-1.20).
+SOURCE_ISOCENTRE = 0.75
+SOURCE_DETECTOR = 1.10
+# Width of a 30 cm square flat detector, m; 0.205 m of patient at the isocentre.
+DETECTOR_SIZE = 0.30
+RESOLUTION = (128, 128)  # the published image observation
+
+# Closer to the source than this (m) nothing is imaged: the tube housing is there.
+NEAREST = 0.05
+
+
+@dataclass(frozen=True)
+class CArm:
+    """A cone-beam X-ray camera.
+
+    Attributes:
+        primary: rotation of the detector about the long axis of the patient, rad,
+            0 = detector in front of the chest, positive towards the left (LAO).
+        secondary: tilt of the detector, rad, positive towards the head (cranial).
+        magnification: electronic zoom; 2 shows half the field on the same pixels.
+        source_detector: distance of source and detector, m.
+        source_isocentre: distance of source and isocentre, m.
+        detector_size: width of the detector (its columns), m; pixels are square.
+        resolution: (rows, columns).
+        isocentre: the point (3,) about which the arm turns, world frame, m.
+    """
+
+    primary: float = 0.0
+    secondary: float = 0.0
+    magnification: float = 1.0
+    source_detector: float = SOURCE_DETECTOR
+    source_isocentre: float = SOURCE_ISOCENTRE
+    detector_size: float = DETECTOR_SIZE
+    resolution: tuple[int, int] = RESOLUTION
+    isocentre: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+    def __post_init__(self) -> None:
+        for name in ("primary", "secondary"):
+            object.__setattr__(self, name, float(getattr(self, name)))
+            if not np.isfinite(getattr(self, name)):
+                raise ValueError(f"{name} is not finite; give an angle in radians.")
+        if not abs(self.secondary) < np.pi / 2:
+            raise ValueError(
+                f"secondary is {self.secondary:g} rad; it must lie between -pi/2 and "
+                "pi/2 (give radians, or use CArm.view for degrees)."
+            )
+        for name in ("magnification", "detector_size", "source_isocentre"):
+            value = float(getattr(self, name))
+            object.__setattr__(self, name, value)
+            if not (np.isfinite(value) and value > 0.0):
+                raise ValueError(f"{name} is {value:g}; it must be > 0.")
+        object.__setattr__(self, "source_detector", float(self.source_detector))
+        if not self.source_detector > self.source_isocentre > NEAREST:
+            raise ValueError(
+                f"source_detector is {self.source_detector:g} m and source_isocentre "
+                f"{self.source_isocentre:g} m; the isocentre lies between source and "
+                f"detector and more than {NEAREST:g} m from the source."
+            )
+        resolution = tuple(int(n) for n in self.resolution)
+        if len(resolution) != 2 or min(resolution) < 1:
+            raise ValueError(
+                f"resolution is {self.resolution!r}; give (rows, columns), both >= 1."
+            )
+        object.__setattr__(self, "resolution", resolution)
+        isocentre = tuple(float(x) for x in np.asarray(self.isocentre).ravel())
+        if len(isocentre) != 3 or not np.isfinite(isocentre).all():
+            raise ValueError(
+                f"isocentre is {self.isocentre!r}; give three finite numbers in metres."
+            )
+        object.__setattr__(self, "isocentre", isocentre)
+
+    @classmethod
+    def view(cls, name: str = "AP", **fields) -> CArm:
+        """C-arm of a named view; further fields as in the constructor.
+
+        Raises:
+            ValueError: if the name is not one of `VIEWS`.
+        """
+        if name not in VIEWS:
+            raise ValueError(
+                f"view is {name!r}; choose one of {', '.join(VIEWS)} or give the "
+                "angles primary and secondary."
+            )
+        primary, secondary = np.deg2rad(VIEWS[name])
+        return cls(primary=primary, secondary=secondary, **fields)
+
+    def centred_on(self, points: ArrayLike) -> CArm:
+        """The same arm with its isocentre in the middle of the box round `points`.
+
+        Args:
+            points: (..., 3) world frame, m, for example the vertices of the lumen.
+        """
+        points = np.asarray(points, dtype=np.float64).reshape(-1, 3)
+        middle = 0.5 * (points.min(axis=0) + points.max(axis=0))
+        return replace(self, isocentre=tuple(middle))
+
+    @cached_property
+    def axes(self) -> np.ndarray:
+        """(3, 3) float64, rows: image right, image down, source to detector (world)."""
+        ca, sa = np.cos(self.primary), np.sin(self.primary)
+        cb, sb = np.cos(self.secondary), np.sin(self.secondary)
+        right = (ca, sa, 0.0)
+        down = (sb * sa, -sb * ca, -cb)
+        beam = (cb * sa, -cb * ca, sb)
+        axes = np.array([right, down, beam])
+        axes.flags.writeable = False
+        return axes
+
+    @cached_property
+    def source(self) -> np.ndarray:
+        """(3,) float64, position of the X-ray focus, world frame, m."""
+        source = np.asarray(self.isocentre) - self.source_isocentre * self.axes[2]
+        source.flags.writeable = False
+        return source
+
+    @property
+    def pitch(self) -> float:
+        """Side of a pixel on the detector, m."""
+        return self.detector_size / (self.resolution[1] * self.magnification)
+
+    @property
+    def field_of_view(self) -> tuple[float, float]:
+        """Height and width (m) of what is seen in the plane of the isocentre."""
+        rows, columns = self.resolution
+        scale = self.pitch * self.source_isocentre / self.source_detector
+        return rows * scale, columns * scale
+
+    @property
+    def focal_length(self) -> float:
+        """Source to detector distance in pixels."""
+        return self.source_detector / self.pitch
+
+    def camera(self, points: ArrayLike) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Coordinates of world points along the axes, seen from the source.
+
+        Args:
+            points: (..., 3) world frame, m.
+
+        Returns:
+            right, down, depth: (...) float64 each, m.
+        """
+        points = np.asarray(points, dtype=np.float64)
+        # Sums written out: a matrix product would round differently for batches.
+        x, y, z = (points[..., i] - self.source[i] for i in range(3))
+        right, down, depth = (a[0] * x + a[1] * y + a[2] * z for a in self.axes)
+        return right, down, depth
+
+    def project(self, points: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
+        """Pixel coordinates of world points.
+
+        Args:
+            points: (..., 3) world frame, m.
+
+        Returns:
+            pixels: (..., 2) float64, (column, row); NaN for points nearer to the
+                source than `NEAREST` or behind it. Points outside the image have
+                coordinates outside it.
+            depth: (...) float64, distance from the source along the beam axis, m.
+        """
+        right, down, depth = self.camera(points)
+        scale = self.focal_length / np.where(depth > NEAREST, depth, np.nan)
+        rows, columns = self.resolution
+        column = right * scale + 0.5 * (columns - 1)
+        row = down * scale + 0.5 * (rows - 1)
+        return np.stack([column, row], axis=-1), depth
+
+    def unproject(self, pixels: ArrayLike, depth: ArrayLike) -> np.ndarray:
+        """World points (..., 3) at `pixels` (..., 2) and `depth` (...) (m).
+
+        The inverse of `project`.
+        """
+        pixels = np.asarray(pixels, dtype=np.float64)
+        depth = np.asarray(depth, dtype=np.float64)[..., None]
+        rows, columns = self.resolution
+        centre = 0.5 * np.array([columns - 1, rows - 1])
+        plane = (pixels - centre) / self.focal_length
+        right, down, beam = self.axes
+        direction = plane[..., :1] * right + plane[..., 1:] * down + beam
+        return self.source + depth * direction
+
+    def slant(self, supersample: int = 1) -> np.ndarray:
+        """Path along each ray per unit of depth, 1 / cos of its angle to the axis.
+
+        Args:
+            supersample: rays along each side of a pixel.
+
+        Returns:
+            (rows * supersample, columns * supersample) float64, >= 1.
+        """
+        rows, columns = (_subpixels(n, supersample) for n in self.resolution)
+        return np.sqrt(
+            1.0
+            + ((columns / self.focal_length) ** 2)[None, :]
+            + ((rows / self.focal_length) ** 2)[:, None]
+        )
+
+
+def _subpixels(count: int, supersample: int) -> np.ndarray:
+    """Positions (px, from the image centre) of the ray grid along one side."""
+    step = np.arange(count * supersample) + 0.5
+    return step / supersample - 0.5 * count

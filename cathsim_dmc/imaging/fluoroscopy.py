@@ -1,0 +1,290 @@
+"""Fluoroscopy: the picture an operator sees, computed without OpenGL.
+
+What does not move, the path through vessel and patient, is computed once per anatomy
+and view (`Fluoroscope.from_surface`); what moves, the device, is drawn in every frame
+(`Fluoroscope.render`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from cathsim_dmc.imaging import detector, materials
+from cathsim_dmc.imaging.carm import CArm
+from cathsim_dmc.imaging.device import device_attenuation, device_thickness
+from cathsim_dmc.imaging.thickness import closed, surface_thickness
+
+# Water equivalent of a chest from front to back, m: the usual 20 cm phantom.
+PATIENT_THICKNESS = 0.20
+
+# A pixel shows the device if the path through it is at least this share of its
+# diameter: half the pixel covered to half the depth.
+MASK_SHARE = 0.25
+
+# Strength of the vessel's white overlay on a roadmap.
+ROADMAP_OPACITY = 0.5
+
+# Frames rendered at once.
+_CHUNK = 16
+
+RandomStates = np.random.RandomState | Sequence[np.random.RandomState]
+
+
+class Masks(NamedTuple):
+    """Segmentation: `device` (..., rows, columns) and `vessel` (rows, columns) bool."""
+
+    device: np.ndarray
+    vessel: np.ndarray
+
+
+def background_signal(background: ArrayLike) -> np.ndarray:
+    """Signal behind the patient alone, relative to its mean over the image.
+
+    Automatic exposure keeps the mean signal at the detector constant, so only
+    differences of patient thickness are seen.
+
+    Args:
+        background: water equivalent of the patient, m: a number, or (rows, columns).
+
+    Returns:
+        float32 of the same shape, with mean 1.
+    """
+    passed = np.exp(-materials.WATER * np.asarray(background, dtype=np.float64))
+    return (passed / passed.mean()).astype(np.float32)
+
+
+@dataclass(frozen=True, eq=False)
+class Fluoroscope:
+    """One C-arm view of one anatomy.
+
+    I = I0 exp(-(mu_bg L_bg + mu_iodine c L_vessel + mu_device L_device)), scaled so
+    that plain tissue has the signal 1; then quantum noise, detector blur, and grey
+    level = round(255 gain signal). Vessel and device count with their excess over
+    the tissue whose place they take.
+
+    Attributes:
+        carm: the view.
+        vessel: (rows, columns) path length through the lumen, m.
+        vessel_mask: (rows, columns) bool, pixels whose central ray meets the lumen.
+        contrast: iodine in the lumen, kg/m³ (mg/ml); 0 is contrast off.
+        background: water equivalent of the patient, m, a number or (rows, columns).
+        device_mu: excess attenuation of the device, homogenised, 1/m.
+        marker_mu: the same for the marker at its tip, 1/m; None for no marker.
+        marker_length: length of the marker, m.
+        kerma: air kerma at the detector per frame behind plain tissue, Gy; more is
+            less noise.
+        blur: standard deviation of the detector's point spread, m.
+        gain: share of full white given to plain tissue.
+        roadmap: opacity of the vessel laid over the live image in white; 0 for none.
+            A roadmap is usually shown with contrast 0.
+    """
+
+    carm: CArm
+    vessel: np.ndarray
+    vessel_mask: np.ndarray
+    contrast: float = materials.CONTRAST
+    background: float | np.ndarray = PATIENT_THICKNESS
+    device_mu: float = materials.CATHETER
+    marker_mu: float | None = materials.MARKER
+    marker_length: float = materials.MARKER_LENGTH
+    kerma: float = detector.FRAME_KERMA
+    blur: float = detector.DETECTOR_BLUR
+    gain: float = detector.GAIN
+    roadmap: float = 0.0
+
+    def __post_init__(self) -> None:
+        shape = self.carm.resolution
+        for name, dtype in (("vessel", np.float32), ("vessel_mask", bool)):
+            value = np.array(getattr(self, name), dtype=dtype)
+            if value.shape != shape:
+                raise ValueError(
+                    f"{name} has shape {value.shape}, the C-arm {shape}; compute it "
+                    "with the same C-arm (Fluoroscope.from_surface)."
+                )
+            value.flags.writeable = False
+            object.__setattr__(self, name, value)
+        if np.ndim(self.background) and np.shape(self.background) != shape:
+            raise ValueError(
+                f"background has shape {np.shape(self.background)}; give one number "
+                f"or {shape}, in metres of water."
+            )
+        for name in ("contrast", "device_mu", "marker_length", "blur"):
+            if not getattr(self, name) >= 0.0:
+                raise ValueError(f"{name} is {getattr(self, name)}; it must be >= 0.")
+        for name in ("kerma", "gain"):
+            if not getattr(self, name) > 0.0:
+                raise ValueError(f"{name} is {getattr(self, name)}; it must be > 0.")
+        if not 0.0 <= self.roadmap <= 1.0:
+            raise ValueError(f"roadmap is {self.roadmap}; it must lie in [0, 1].")
+
+    @classmethod
+    def from_surface(
+        cls,
+        vertices: ArrayLike,
+        faces: ArrayLike,
+        carm: CArm | None = None,
+        supersample: int = 3,
+        **fields,
+    ) -> Fluoroscope:
+        """Fluoroscope of a lumen surface: the static part, once per anatomy and view.
+
+        Args:
+            vertices: (V, 3) of the lumen surface, world frame, m.
+            faces: (F, 3), counter-clockwise seen from outside. Open ends are closed.
+            carm: the view; by default AP with the isocentre in the middle of the
+                surface.
+            supersample: rays along each side of a pixel.
+            **fields: `contrast` and the further attributes.
+
+        Raises:
+            ValueError: if the surface is not oriented outwards, or reaches the source.
+        """
+        if carm is None:
+            carm = CArm.view("AP").centred_on(vertices)
+        vertices, faces = closed(vertices, faces)
+        thickness = surface_thickness(carm, vertices, faces, supersample)
+        central = surface_thickness(carm, vertices, faces, 1)
+        return cls(carm=carm, vessel=thickness, vessel_mask=central > 0.0, **fields)
+
+    @cached_property
+    def signal(self) -> np.ndarray:
+        """(rows, columns) float32, signal behind patient and vessel, no device."""
+        vessel = materials.IODINE * self.contrast * self.vessel
+        signal = background_signal(self.background) * detector.transmission(vessel)
+        signal.flags.writeable = False
+        return signal
+
+    @property
+    def quanta(self) -> float:
+        """Mean number of quanta on a pixel behind plain tissue in one frame."""
+        return detector.quanta_per_pixel(self.carm.pitch, self.kerma)
+
+    def render(
+        self,
+        points: ArrayLike,
+        radius: ArrayLike,
+        random_state: RandomStates | None = None,
+    ) -> np.ndarray:
+        """Images of a device in the vessel.
+
+        Args:
+            points: (..., n, 3) joints of the device from base to tip, world frame, m.
+            radius: m, one number, one per device (...,), or per link (..., n - 1).
+            random_state: source of quantum noise: one state, or one per frame in the
+                order of the flattened batch; None for an image without noise.
+
+        Returns:
+            (..., rows, columns, 1) uint8, dark = opaque. A batch equals its frames
+            rendered one by one, bit for bit.
+
+        Raises:
+            ValueError: if shapes do not match (see `device_attenuation`).
+        """
+        points = np.asarray(points, dtype=np.float64)
+        depth = device_attenuation(
+            self.carm,
+            points,
+            radius,
+            self.device_mu,
+            self.marker_mu,
+            self.marker_length,
+        )
+        batch, shape = depth.shape[:-2], self.carm.resolution
+        depth = depth.reshape(-1, *shape)
+        single = isinstance(random_state, np.random.RandomState)
+        if random_state is not None and not single:
+            random_state = list(random_state)
+            if len(random_state) != len(depth):
+                raise ValueError(
+                    f"{len(random_state)} random states for {len(depth)} frames; give "
+                    "one, or one per frame."
+                )
+        image = np.empty(depth.shape, dtype=np.uint8)
+        for start in range(0, len(depth), _CHUNK):
+            part = slice(start, start + _CHUNK)
+            states = (
+                random_state if random_state is None or single else (random_state[part])
+            )
+            image[part] = self._developed(depth[part], states)
+        return image.reshape(*batch, *shape, 1)
+
+    def _developed(self, depth: np.ndarray, states) -> np.ndarray:
+        """Grey images of optical depths (B, rows, columns); `depth` is used up."""
+        np.negative(depth, out=depth)
+        signal = np.exp(depth, out=depth)
+        signal *= self.signal
+        if states is not None:
+            signal = detector.quantum_noise(signal, self.quanta, states)
+        signal = detector.blurred(signal, self.blur / self.carm.pitch)
+        image = detector.grey(signal, self.gain)
+        if self.roadmap > 0.0:
+            image = detector.roadmapped(image, self.vessel_mask, self.roadmap)
+        return image
+
+    def masks(self, points: ArrayLike, radius: ArrayLike) -> Masks:
+        """Which pixels show the device, and which the vessel.
+
+        Args:
+            points, radius: as in `render`.
+        """
+        thickness = device_thickness(self.carm, points, radius)
+        radius = np.asarray(radius, dtype=np.float64)
+        if radius.ndim == np.ndim(points) - 1:
+            # A chain of unlike links is seen where its thinnest link would be.
+            radius = radius.min(axis=-1)
+        least = MASK_SHARE * 2.0 * radius[..., None, None]
+        return Masks(device=thickness >= least, vessel=self.vessel_mask)
+
+
+@dataclass(frozen=True, eq=False)
+class Biplane:
+    """Two C-arms that look at the same instant, as a two-channel image.
+
+    Attributes:
+        frontal, lateral: fluoroscopes of the same resolution.
+    """
+
+    frontal: Fluoroscope
+    lateral: Fluoroscope
+
+    def __post_init__(self) -> None:
+        shapes = self.frontal.carm.resolution, self.lateral.carm.resolution
+        if shapes[0] != shapes[1]:
+            raise ValueError(
+                f"the planes have {shapes[0]} and {shapes[1]} pixels; give both the "
+                "same resolution."
+            )
+
+    def render(
+        self,
+        points: ArrayLike,
+        radius: ArrayLike,
+        random_state: RandomStates | None = None,
+    ) -> np.ndarray:
+        """(..., rows, columns, 2) uint8: frontal, lateral; see `Fluoroscope.render`.
+
+        With noise and one random state, give one frame at a time or one state per
+        frame if a batch must equal its frames: the frontal plane draws first.
+        """
+        planes = [
+            plane.render(points, radius, random_state)
+            for plane in (self.frontal, self.lateral)
+        ]
+        return np.concatenate(planes, axis=-1)
+
+
+def rgb(image: ArrayLike) -> np.ndarray:
+    """Grey images (..., rows, columns, 1) as (..., rows, columns, 3), for viewers."""
+    image = np.asarray(image)
+    if image.ndim < 3 or image.shape[-1] != 1:
+        raise ValueError(
+            f"image has shape {image.shape}; give (..., rows, columns, 1), of a "
+            "biplane image one channel at a time (image[..., :1])."
+        )
+    return np.repeat(image, 3, axis=-1)
