@@ -1,0 +1,83 @@
+"""The angiography suite: world settings of the physics, light and cameras."""
+
+from dm_control import composer
+
+BLOOD_DENSITY = 1060.0  # kg/m^3
+GRAVITY = 9.81  # m/s^2
+
+
+class AngiographyArena(composer.Arena):
+    """World in the patient frame LPS (+x left, +y posterior, +z superior), metres.
+
+    The patient lies on the back: gravity points to +y.
+    """
+
+    def _build(self, device_density: float = 1100.0, name: str = "arena"):
+        """Sets the physics.
+
+        Args:
+          device_density: mean density of the device, kg/m³. It floats in blood, so
+            only the rest of its weight pulls.
+          name: of the arena.
+        """
+        super()._build(name=name)
+        root = self._mjcf_root
+        # composer.Arena's own file raises small masses and inertias and asks for
+        # no-slip iterations; a catheter's links are lighter than its bounds.
+        root.compiler.boundmass = 0
+        root.compiler.boundinertia = 0
+        root.option.noslip_iterations = 0
+        # Springs and damping enter the implicit metric, so a stiff light chain is
+        # stable at steps of milliseconds.
+        root.option.integrator = "discrete"
+        # Pyramidal cones diverge under full-amplitude steps of the tip.
+        root.option.cone = "elliptic"
+        root.option.density = 0
+        root.option.viscosity = 0
+        buoyancy = max(0.0, 1 - BLOOD_DENSITY / device_density)
+        root.option.gravity = (0, GRAVITY * buoyancy, 0)
+        root.size.memory = "16M"
+        root.visual.map.znear = 0.01
+        root.visual.map.zfar = 50
+        root.visual.headlight.ambient = (0.35, 0.35, 0.35)
+        root.visual.headlight.diffuse = (0.5, 0.5, 0.5)
+        root.visual.scale.forcewidth = 0.02
+        root.asset.add(
+            "texture",
+            name="backdrop",
+            type="skybox",
+            builtin="gradient",
+            rgb1=(0.96, 0.97, 0.98),
+            rgb2=(0.75, 0.8, 0.86),
+            width=64,
+            height=64,
+        )
+        root.worldbody.add(
+            "light",
+            name="ceiling",
+            pos=(0, -1.5, 0.3),
+            dir=(0, 1, 0),
+            diffuse=(0.45, 0.45, 0.45),
+            castshadow=False,
+        )
+
+    def add_camera(self, name: str, target, distance: float, xyaxes, fovy=30.0):
+        """Adds a camera that looks at a point.
+
+        Args:
+          name: of the camera.
+          target: point (3,) that the optical axis meets, m.
+          distance: from the point, m.
+          xyaxes: right and up directions (6,) of the image.
+          fovy: vertical field of view, degrees.
+        """
+        right, up = xyaxes[:3], xyaxes[3:]
+        backward = (
+            right[1] * up[2] - right[2] * up[1],
+            right[2] * up[0] - right[0] * up[2],
+            right[0] * up[1] - right[1] * up[0],
+        )
+        position = [t + distance * b for t, b in zip(target, backward, strict=True)]
+        return self._mjcf_root.worldbody.add(
+            "camera", name=name, pos=position, xyaxes=xyaxes, fovy=fovy
+        )

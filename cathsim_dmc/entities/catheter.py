@@ -1,0 +1,340 @@
+"""The catheter: a chain of rigid links with the bending stiffness of a real device."""
+
+from dm_control import composer, mjcf
+from dm_control.composer.observation import observable
+import numpy as np
+
+from cathsim_dmc.entities import devices
+
+# Relaxation time of bending: joint damping = time * stiffness, s. It lumps the loss
+# inside the polymer with the drag of blood: a 0.2 m cantilever of 50 N·mm² with a drag
+# of 0.15 N·s/m² relaxes in c L⁴ / (12.4 EI) = 0.4 s, a 0.07 m tip in 0.02 s.
+BENDING_RELAXATION_TIME = 0.2
+# Rotor inertia of the hinges, kg·m². Next to the damping it acts within 2 ms, far
+# below the relaxation time, and it gives the contact solver the scale of mass at
+# which the wall is as hard as silicone (docs/physics.md).
+HINGE_ARMATURE = 1e-6
+# Lag of the drives of the tip, s.
+STEERING_LAG = 0.05
+
+CARRIAGE_MASS = 0.2  # kg, platform of the follower that pushes the device
+MAX_PUSH_FORCE = 5.0  # N, slip of the clamps
+MAX_PUSH_SPEED = 0.04  # m/s
+CARRIAGE_GAIN = 100.0  # N·s/m, stiff: 1 N of load costs 1 cm/s
+
+ROTOR_INERTIA = 1e-6  # kg·m², rotary unit as seen by the device
+MAX_TORQUE = 0.02  # N·m
+MAX_ROTATION_SPEED = 3.14  # rad/s
+ROTATION_GAIN = 0.01  # N·m·s/rad
+
+_COLOUR = (0.85, 0.32, 0.08, 1.0)
+_TIP_COLOUR = (0.95, 0.75, 0.1, 1.0)
+
+
+class Catheter(composer.Entity):
+    """A serial chain of links; +z of every link points to the distal end.
+
+    The origin of the entity is the place of the distal end at zero insertion.
+    """
+
+    def _build(
+        self,
+        device: str | devices.Device = "published",
+        discretisation: devices.Discretisation | None = None,
+        *,
+        stroke: float = 0.25,
+        rotation: bool = False,
+        name: str = "catheter",
+    ):
+        """Builds the chain.
+
+        Args:
+          device: what it is made of, or its name in `devices.DEVICES`.
+          discretisation: how it is divided into links.
+          stroke: longest insertion, m.
+          rotation: whether the base can be rotated.
+          name: of the entity.
+        """
+        self._device = devices.get(device)
+        self._discretisation = discretisation or devices.Discretisation()
+        self._stroke = stroke
+        if not stroke > 0:
+            raise ValueError(f"stroke is {stroke} m; it must be positive")
+        self._lengths = self._discretisation.link_lengths(self._device)
+        self._mjcf_root = mjcf.RootElement(model=name)
+        self._mjcf_root.compiler.angle = "radian"
+        self._links = []
+        self._bends = []
+        self._twists = []
+        self._build_base(rotation)
+        for index in range(1, len(self._lengths)):
+            self._build_link(index)
+        self._head = self._links[-1].add(
+            "site",
+            name="head",
+            pos=(0, 0, self._lengths[-1]),
+            size=[self._device.outer_radius],
+            rgba=_TIP_COLOUR,
+            group=4,
+        )
+        self._build_motors()
+        self._build_sensors()
+
+    def _build_base(self, rotation: bool):
+        base = self._mjcf_root.worldbody.add(
+            "body", name="link_0", pos=(0, 0, -self._lengths.sum())
+        )
+        self._insertion = base.add(
+            "joint",
+            name="insertion",
+            type="slide",
+            axis=(0, 0, 1),
+            armature=CARRIAGE_MASS,
+            limited=True,
+            range=(0.0, self._stroke),
+        )
+        self._rotation = None
+        if rotation:
+            self._rotation = base.add(
+                "joint",
+                name="rotation",
+                type="hinge",
+                axis=(0, 0, 1),
+                armature=ROTOR_INERTIA,
+            )
+        self._links.append(base)
+        self._add_capsule(base, 0)
+
+    def _build_link(self, index: int):
+        link = self._links[-1].add(
+            "body", name=f"link_{index}", pos=(0, 0, self._lengths[index - 1])
+        )
+        self._links.append(link)
+        compliance, twist_compliance = self._joint_compliance(index)
+        stiffness = 1 / compliance
+        start = self._lengths[index - 1 :].sum() - self._lengths[index - 1] / 2
+        stop = self._lengths[index:].sum() - self._lengths[index] / 2
+        rest = self._device.rest_angle(start, stop)
+        if index in self._torsion_links():
+            twist = 1 / (twist_compliance * self._torsion_span())
+            self._twists.append(
+                link.add(
+                    "joint",
+                    name=f"twist_{index}",
+                    axis=(0, 0, 1),
+                    stiffness=twist,
+                    damping=BENDING_RELAXATION_TIME * twist,
+                    armature=HINGE_ARMATURE,
+                )
+            )
+        for axis, direction in (("x", (1, 0, 0)), ("y", (0, 1, 0))):
+            self._bends.append(
+                link.add(
+                    "joint",
+                    name=f"bend_{axis}_{index}",
+                    axis=direction,
+                    stiffness=stiffness,
+                    damping=BENDING_RELAXATION_TIME * stiffness,
+                    springref=rest if axis == "y" else 0.0,
+                    armature=HINGE_ARMATURE,
+                )
+            )
+        self._add_capsule(link, index)
+
+    def _add_capsule(self, body, index: int):
+        length = self._lengths[index]
+        body.add(
+            "geom",
+            name=f"link_{index}",
+            type="capsule",
+            fromto=(0, 0, 0, 0, 0, length),
+            size=[self._device.outer_radius],
+            mass=self._device.linear_density * length,
+            rgba=_TIP_COLOUR if self._in_tip(index) else _COLOUR,
+            contype=0,
+            conaffinity=1,
+        )
+
+    def _in_tip(self, index: int) -> bool:
+        return index >= len(self._lengths) - self._device.tip_links
+
+    def _section(self, index: int) -> devices.Section:
+        return self._device.tip if self._in_tip(index) else self._device.shaft
+
+    def _joint_compliance(self, index: int) -> tuple[float, float]:
+        """Compliance in rad/(N·m) of bending and twist of the rod next to a joint.
+
+        A joint stands for the half links on both of its sides, l/2EI each.
+        """
+        bending = twist = 0.0
+        for neighbour in (index - 1, index):
+            section = self._section(neighbour)
+            half = self._lengths[neighbour] / 2
+            bending += half / section.bending_stiffness
+            twist += half / section.torsional_stiffness
+        return bending, twist
+
+    def _torsion_links(self) -> np.ndarray:
+        """Links that turn about the device's axis against their predecessors."""
+        count = self._discretisation.torsion_joints
+        last = len(self._lengths) - 1
+        if count > last:
+            raise ValueError(
+                f"torsion_joints is {count}, but the chain has {last} joints"
+            )
+        edges = np.linspace(0, last, count + 1)
+        return np.round((edges[:-1] + edges[1:]) / 2 + 0.5).astype(int)
+
+    def _torsion_span(self) -> float:
+        """Joints of the chain that one torsion hinge stands for."""
+        return (len(self._lengths) - 1) / self._discretisation.torsion_joints
+
+    def _build_motors(self):
+        self._tip_motors = []
+        if self._device.steerable:
+            first = len(self._lengths) - self._device.tip_links
+            for index in range(first, len(self._lengths)):
+                for axis in ("x", "y"):
+                    joint = self._mjcf_root.find("joint", f"bend_{axis}_{index}")
+                    # The torque that bends the free joint by the steering angle: a
+                    # motor shifts the rest shape and adds no stiffness.
+                    torque = joint.stiffness * self._device.steering_angle
+                    self._tip_motors.append(
+                        self._mjcf_root.actuator.add(
+                            "general",
+                            name=f"tip_{axis}_{index - first}",
+                            joint=joint,
+                            ctrllimited=True,
+                            ctrlrange=(-1, 1),
+                            dyntype="filterexact",
+                            dynprm=[STEERING_LAG],
+                            gainprm=[torque],
+                        )
+                    )
+        self._insertion_motor = self._add_velocity_motor(
+            "insertion",
+            self._insertion,
+            CARRIAGE_GAIN,
+            MAX_PUSH_SPEED,
+            MAX_PUSH_FORCE,
+        )
+        self._rotation_motor = None
+        if self._rotation is not None:
+            self._rotation_motor = self._add_velocity_motor(
+                "rotation",
+                self._rotation,
+                ROTATION_GAIN,
+                MAX_ROTATION_SPEED,
+                MAX_TORQUE,
+            )
+
+    def _add_velocity_motor(self, name, joint, gain, max_speed, max_effort):
+        return self._mjcf_root.actuator.add(
+            "general",
+            name=name,
+            joint=joint,
+            ctrllimited=True,
+            ctrlrange=(-1, 1),
+            forcelimited=True,
+            forcerange=(-max_effort, max_effort),
+            gainprm=[gain * max_speed],
+            biastype="affine",
+            biasprm=[0, 0, -gain],
+        )
+
+    def _build_sensors(self):
+        grip = self._links[0].add("site", name="grip", size=[1e-3], group=4)
+        self._push_force = self._mjcf_root.sensor.add(
+            "force", name="push_force", site=grip
+        )
+        self._push_torque = self._mjcf_root.sensor.add(
+            "torque", name="push_torque", site=grip
+        )
+
+    def _build_observables(self):
+        return CatheterObservables(self)
+
+    @property
+    def mjcf_model(self) -> mjcf.RootElement:
+        """The MJCF model of the chain."""
+        return self._mjcf_root
+
+    @property
+    def device(self) -> devices.Device:
+        """What the catheter is made of."""
+        return self._device
+
+    @property
+    def link_lengths(self) -> np.ndarray:
+        """Lengths (n,) of the links from proximal to distal, m."""
+        return self._lengths
+
+    @property
+    def stroke(self) -> float:
+        """Longest insertion, m."""
+        return self._stroke
+
+    @property
+    def links(self) -> tuple:
+        """Bodies from proximal to distal."""
+        return tuple(self._links)
+
+    @property
+    def head(self):
+        """Site at the distal end."""
+        return self._head
+
+    @property
+    def insertion(self):
+        """Slide joint of the base."""
+        return self._insertion
+
+    @property
+    def rotation(self):
+        """Hinge joint of the base, or None."""
+        return self._rotation
+
+    @property
+    def bends(self) -> tuple:
+        """Bending hinges from proximal to distal, x before y."""
+        return tuple(self._bends)
+
+    @property
+    def joints(self) -> tuple:
+        """All joints in the order of the chain."""
+        return tuple(self._mjcf_root.find_all("joint"))
+
+    @property
+    def tip_motors(self) -> tuple:
+        """Motors of the tip from proximal to distal, x before y."""
+        return tuple(self._tip_motors)
+
+    @property
+    def actuators(self) -> tuple:
+        """All actuators in the order of the action: tip, insertion, rotation."""
+        rotation = () if self._rotation_motor is None else (self._rotation_motor,)
+        return (*self._tip_motors, self._insertion_motor, *rotation)
+
+    @property
+    def push_sensors(self) -> tuple:
+        """Force and torque sensors at the grip, in the frame of link 0."""
+        return self._push_force, self._push_torque
+
+
+class CatheterObservables(composer.Observables):
+    """Joint-level readings, off by default."""
+
+    @composer.observable
+    def joint_positions(self):
+        """Joint positions in the order of the chain, m and rad."""
+        return observable.MJCFFeature("qpos", self._entity.joints)
+
+    @composer.observable
+    def joint_velocities(self):
+        """Joint velocities in the order of the chain, m/s and rad/s."""
+        return observable.MJCFFeature("qvel", self._entity.joints)
+
+    @composer.observable
+    def head_position(self):
+        """Position (3,) of the distal end in the world frame, m."""
+        return observable.MJCFFeature("xpos", self._entity.head)

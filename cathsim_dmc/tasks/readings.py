@@ -1,0 +1,155 @@
+"""What a task reads from the simulator, for one simulation or for many at once.
+
+A `Layout` finds the quantities of a compiled model by name once; `Layout.read` then
+takes them from any object with MuJoCo's array names: an `mujoco.MjData`, with arrays
+such as qpos (nq,), or a `mujoco.batch.Batch`, with arrays such as qpos (N, nq). Every
+array of the result has the leading axes of the source, written `...` below.
+"""
+
+import dataclasses
+
+import mujoco
+import numpy as np
+
+from cathsim_dmc.tasks import forces
+
+
+@dataclasses.dataclass(frozen=True)
+class Readings:
+    """State of the device after a control step.
+
+    Positions of joints and their velocities are those at the end of the step. All
+    other quantities are MuJoCo's of the last substep, which starts one physics step
+    (some 4 ms) earlier. World frame, SI units, float64. J joints, L links.
+
+    Attributes:
+      insertion: (...), slide of the base, m, 0 at the start of the stroke.
+      joint_positions: (..., J), in the order of the chain, m and rad.
+      joint_velocities: (..., J), m/s and rad/s.
+      com_inertia: (..., L, 10), inertia of each link about the subtree's centre of
+        mass (MuJoCo `cinert`), kg·m², kg·m and kg.
+      com_velocity: (..., L, 6), rotational and translational velocity of each link
+        about the subtree's centre of mass (`cvel`), rad/s and m/s.
+      actuator_force: (..., J), generalised force of the motors, N and N·m.
+      external_force: (..., L, 6), contact torque and force on each link about the
+        subtree's centre of mass (`cfrc_ext`), N·m and N.
+      centreline: (..., L + 1, 3), proximal ends of the links and the head, m.
+      head: (..., 3), distal end, m.
+      push_force: (...), N, positive when the base pushes the device forward.
+      push_torque: (...), N·m, torque of the base on the device about its axis.
+      load_cell: (..., 3), N, force of the phantom on its support.
+    """
+
+    insertion: np.ndarray
+    joint_positions: np.ndarray
+    joint_velocities: np.ndarray
+    com_inertia: np.ndarray
+    com_velocity: np.ndarray
+    actuator_force: np.ndarray
+    external_force: np.ndarray
+    centreline: np.ndarray
+    head: np.ndarray
+    push_force: np.ndarray
+    push_torque: np.ndarray
+    load_cell: np.ndarray
+
+
+class Layout:
+    """Places of a task's quantities in the arrays of a compiled model."""
+
+    # Fields of `mujoco.MjData` that `read` uses, for a batch to bind beforehand.
+    FIELDS = (
+        "qpos",
+        "qvel",
+        "cinert",
+        "cvel",
+        "qfrc_actuator",
+        "cfrc_ext",
+        "xpos",
+        "site_xpos",
+        "sensordata",
+    )
+
+    def __init__(self, model: mujoco.MjModel, catheter: str, phantom: str):
+        """Finds the quantities by name.
+
+        Args:
+          model: the compiled model.
+          catheter: MJCF scope of the catheter, such as "catheter".
+          phantom: MJCF scope of the phantom.
+
+        Raises:
+          ValueError: if the model lacks one of the names.
+        """
+        base = _id(model, mujoco.mjtObj.mjOBJ_BODY, f"{catheter}/link_0")
+        links = [
+            body for body in range(base, model.nbody) if model.body_rootid[body] == base
+        ]
+        joints = [
+            joint for joint in range(model.njnt) if model.jnt_bodyid[joint] in links
+        ]
+        self.links = _as_slice(links)
+        self.qpos = _as_slice(model.jnt_qposadr[joints])
+        self.dofs = _as_slice(model.jnt_dofadr[joints])
+        insertion = _id(model, mujoco.mjtObj.mjOBJ_JOINT, f"{catheter}/insertion")
+        self.insertion_qpos = int(model.jnt_qposadr[insertion])
+        self.insertion_dof = int(model.jnt_dofadr[insertion])
+        rotation = mujoco.mj_name2id(
+            model, mujoco.mjtObj.mjOBJ_JOINT, f"{catheter}/rotation"
+        )
+        self.rotation_qpos = None if rotation < 0 else int(model.jnt_qposadr[rotation])
+        self.head_site = _id(model, mujoco.mjtObj.mjOBJ_SITE, f"{catheter}/head")
+        self.push_force = _sensor(model, f"{catheter}/push_force")
+        self.push_torque = _sensor(model, f"{catheter}/push_torque")
+        self.load_cell = _sensor(model, f"{phantom}/load_cell")
+        self.wall_contacts = _sensor(model, "wall_contacts")
+
+    def read(self, data) -> Readings:
+        """Takes the readings, as copies.
+
+        Args:
+          data: an `mujoco.MjData` or a `mujoco.batch.Batch` with `FIELDS` bound.
+        """
+        xpos = data.xpos[..., self.links, :]
+        head = data.site_xpos[..., self.head_site, :]
+        sensors = data.sensordata
+        qpos = data.qpos
+        return Readings(
+            insertion=qpos[..., self.insertion_qpos].copy(),
+            joint_positions=qpos[..., self.qpos].copy(),
+            joint_velocities=data.qvel[..., self.dofs].copy(),
+            com_inertia=data.cinert[..., self.links, :].copy(),
+            com_velocity=data.cvel[..., self.links, :].copy(),
+            actuator_force=data.qfrc_actuator[..., self.dofs].copy(),
+            external_force=data.cfrc_ext[..., self.links, :].copy(),
+            centreline=np.concatenate([xpos, head[..., None, :]], axis=-2),
+            head=head.copy(),
+            # MuJoCo reports the force of the site's body on its parent.
+            push_force=sensors[..., self.push_force][..., 2].copy(),
+            push_torque=sensors[..., self.push_torque][..., 2].copy(),
+            load_cell=sensors[..., self.load_cell].copy(),
+        )
+
+    def contacts(self, sensordata: np.ndarray) -> forces.Contacts:
+        """Contacts with the wall from sensor rows (..., nsensordata)."""
+        return forces.Contacts.from_sensor(sensordata[..., self.wall_contacts])
+
+
+def _id(model: mujoco.MjModel, kind: mujoco.mjtObj, name: str) -> int:
+    index = mujoco.mj_name2id(model, kind, name)
+    if index < 0:
+        raise ValueError(f"the model has no {kind.name[6:].lower()} named {name!r}")
+    return index
+
+
+def _sensor(model: mujoco.MjModel, name: str) -> slice:
+    sensor = _id(model, mujoco.mjtObj.mjOBJ_SENSOR, name)
+    start = int(model.sensor_adr[sensor])
+    return slice(start, start + int(model.sensor_dim[sensor]))
+
+
+def _as_slice(indices) -> slice:
+    indices = np.asarray(indices)
+    if (np.diff(indices) != 1).any():
+        raise ValueError(f"the catheter's elements are not contiguous: {indices}")
+    return slice(int(indices[0]), int(indices[-1]) + 1)
