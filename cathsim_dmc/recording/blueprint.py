@@ -36,10 +36,10 @@ def episode_blueprint(
     )
     plots = [
         _plot("Reward", "series/reward"),
-        _plot("Force, N", "series/force"),
+        _plot("Force, N", "series/force", legend=True),
         _plot("Insertion, mm", "series/insertion_mm"),
-        _plot("Action", "series/action"),
-        _plot("All actions", "series/action_all", legend=False),
+        _plot("Action", "series/action", legend=True),
+        _plot("All actions", "series/action_all"),
     ]
     if distance:
         plots.insert(1, _plot("Distance to goal, mm", "series/distance_mm"))
@@ -84,7 +84,7 @@ def _scene(centre: np.ndarray, extent: float) -> rrb.Spatial3DView:
     )
 
 
-def _plot(name: str, origin: str, legend: bool = True) -> rrb.TimeSeriesView:
+def _plot(name: str, origin: str, legend: bool = False) -> rrb.TimeSeriesView:
     return rrb.TimeSeriesView(
         origin=origin, name=name, plot_legend=rrb.PlotLegend(visible=legend)
     )

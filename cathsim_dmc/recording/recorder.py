@@ -102,15 +102,16 @@ class EpisodeRecorder:
     def _bind(self) -> None:
         # A reset may compile a new model, so names are looked up once per episode.
         model = self._env.physics.model
-        self._links = []
-        while True:
-            name = f"{LINK_PREFIX}{len(self._links)}"
-            link = _find(model, name, "body", required=not self._links)
-            if link is None:
-                break
-            self._links.append(link)
-        self._head = _find(model, HEAD_SITE, "site")
-        joint = _find(model, INSERTION_JOINT, "joint")
+        bodies = _names(model, "body", model.nbody)
+        count = 0
+        while f"{LINK_PREFIX}{count}" in bodies:
+            count += 1
+        # Asking for link 0 makes the error of a model without a catheter.
+        self._links = [
+            _find(bodies, f"{LINK_PREFIX}{i}", "body") for i in range(max(count, 1))
+        ]
+        self._head = _find(_names(model, "site", model.nsite), HEAD_SITE, "site")
+        joint = _find(_names(model, "joint", model.njnt), INSERTION_JOINT, "joint")
         self._insertion = int(model.jnt_qposadr[joint])
 
     def record_episode(
@@ -249,16 +250,16 @@ class EpisodeRecorder:
         )
 
 
-def _find(model: Any, name: str, kind: str, required: bool = True) -> int | None:
-    count = {"body": model.nbody, "site": model.nsite, "joint": model.njnt}[kind]
-    names = {model.id2name(i, kind): i for i in range(count)}
-    if name in names:
-        return names[name]
-    if required:
+def _names(model: Any, kind: str, count: int) -> dict[str, int]:
+    return {model.id2name(i, kind): i for i in range(count)}
+
+
+def _find(names: dict[str, int], name: str, kind: str) -> int:
+    if name not in names:
         raise ValueError(
             f"the model has no {kind} {name!r}; it has {', '.join(sorted(names))}"
         )
-    return None
+    return names[name]
 
 
 def _link_radii(model: Any, links: list[int]) -> list[float]:

@@ -1,0 +1,139 @@
+"""Opening recordings in the viewer of the installed Rerun package."""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+import socket
+import subprocess
+import sys
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from urllib.parse import quote
+
+# First bytes of every recording of the current format.
+_MAGIC = b"RRF2"
+_SUFFIX = ".rrd"
+LOOPBACK = "127.0.0.1"
+WEB_PORT = 9090
+# The interpreter's own package, never another `rerun` that PATH may hold: file
+# format and viewer have to be of one version.
+_RERUN = (sys.executable, "-m", "rerun_cli")
+
+
+class ViewerError(RuntimeError):
+    """The viewer cannot be opened here; the message says what would help."""
+
+
+def check_recording(path: str | os.PathLike[str]) -> Path:
+    """Return the absolute path of a recording after looking at its first bytes.
+
+    Raises:
+        FileNotFoundError: if there is no such file.
+        ValueError: if it is not a Rerun recording.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise FileNotFoundError(f"no recording at {path}")
+    with open(path, "rb") as stream:
+        start = stream.read(len(_MAGIC))
+    if path.suffix != _SUFFIX or start != _MAGIC:
+        raise ValueError(
+            f"{path} is not a Rerun recording (*{_SUFFIX}); write one with write_rrd, "
+            "or bring an older one up to date with `rerun rrd migrate`"
+        )
+    return path.resolve()
+
+
+def viewer_command(path: Path) -> list[str]:
+    """Return the command that opens a recording in a window of its own."""
+    return [*_RERUN, str(path), "--new", "--bind", LOOPBACK]
+
+
+def serve_command(path: Path, host: str, port: int, data_port: int) -> list[str]:
+    """Return the command that serves a recording to browsers.
+
+    Args:
+        path: The recording.
+        host: Address to listen on, for the web page and for the data.
+        port: Port of the web page.
+        data_port: Port of the data that the page loads.
+    """
+    ports = ["--port", str(data_port), "--web-viewer-port", str(port)]
+    return [*_RERUN, str(path), "--serve-web", "--bind", host, *ports]
+
+
+def web_address(host: str, port: int, data_port: int) -> str:
+    """Return the address to type into a browser while a recording is served."""
+    data = quote(f"rerun+http://{host}:{data_port}/proxy", safe="")
+    return f"http://{host}:{port}?url={data}"
+
+
+def has_display(environment: Mapping[str, str] | None = None) -> bool:
+    """Whether a window can be opened, as far as the environment tells."""
+    if not sys.platform.startswith("linux"):
+        return True
+    environment = os.environ if environment is None else environment
+    return any(environment.get(name) for name in ("DISPLAY", "WAYLAND_DISPLAY"))
+
+
+def open_viewer(
+    path: str | os.PathLike[str],
+    *,
+    web: bool = False,
+    host: str = LOOPBACK,
+    port: int = WEB_PORT,
+    announce: Callable[[str], None] | None = None,
+) -> int:
+    """Open a recording in the Rerun viewer and wait until it is closed.
+
+    Args:
+        path: A ``.rrd`` file.
+        web: Serve a web viewer until interrupted, for machines without a display.
+        host: Address to serve on; the default is reachable from this machine only.
+        port: Port of the web page.
+        announce: Called with the address to open in a browser before serving.
+
+    Returns:
+        The exit status of the viewer.
+
+    Raises:
+        FileNotFoundError: if there is no such file.
+        ValueError: if it is not a Rerun recording.
+        ViewerError: if Rerun is not installed, a window is asked for where there is
+            no display, or the port is taken.
+    """
+    recording = check_recording(path)
+    if importlib.util.find_spec("rerun_cli") is None:
+        raise ViewerError("the Rerun viewer is missing; pip install rerun-sdk")
+    if not web and not has_display():
+        raise ViewerError(
+            f"no display to open {recording.name} on; serve it with web=True (in the "
+            "shell: --web) and open the address in a browser, or copy the file to a "
+            "machine with a screen"
+        )
+    command = viewer_command(recording)
+    if web:
+        data_port = _checked_ports(host, port)
+        command = serve_command(recording, host, port, data_port)
+        if announce is not None:
+            announce(web_address(host, port, data_port))
+    try:
+        return subprocess.run(command, check=False).returncode
+    except KeyboardInterrupt:
+        # Ctrl-C is how serving ends.
+        return 0
+
+
+def _checked_ports(host: str, port: int) -> int:
+    """Return a free port for the data after making sure that ``port`` is free."""
+    with socket.socket() as page, socket.socket() as data:
+        page.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            page.bind((host, port))
+        except OSError as error:
+            raise ViewerError(
+                f"cannot serve on {host}:{port} ({error.strerror}); choose another port"
+            ) from error
+        data.bind((host, 0))
+        return data.getsockname()[1]

@@ -1,0 +1,38 @@
+"""Made-up episodes for the tests of recording and analysis."""
+
+import numpy as np
+
+from cathsim_dmc.recording.episode import Episode
+
+
+def make_episode(steps=6, links=4, actions=21, seed=0, counts=None, **changes):
+    rng = np.random.default_rng(seed)
+    if counts is None:
+        counts = rng.integers(0, 4, steps)
+    contact_step = np.repeat(np.arange(steps), counts)
+    force = rng.normal(size=(len(contact_step), 3))
+    magnitude = np.linalg.norm(force, axis=1)
+    largest = np.zeros(steps)
+    np.maximum.at(largest, contact_step, magnitude)
+    quaternion = rng.normal(size=(steps + 1, 3, 4))
+    quaternion /= np.linalg.norm(quaternion, axis=-1, keepdims=True)
+    values = {
+        "task": "type1_bca",
+        "seed": seed,
+        "meta": {"success": True, "termination": "success"},
+        "time": 0.04 * np.arange(steps + 1),
+        "qpos": rng.normal(size=(steps + 1, 9)),
+        "catheter": rng.normal(size=(steps + 1, links + 1, 3)),
+        "body_pos": rng.normal(size=(steps + 1, 3, 3)),
+        "body_quat": quaternion,
+        "action": rng.uniform(-1, 1, (steps, actions)),
+        "reward": rng.normal(size=steps),
+        "insertion": np.linspace(0, 0.1, steps + 1),
+        "wall_force_sum": np.bincount(contact_step, magnitude, minlength=steps),
+        "wall_force_max": largest,
+        "push_force": rng.normal(size=steps),
+        "contact_step": contact_step,
+        "contact_position": rng.normal(size=force.shape),
+        "contact_force": force,
+    }
+    return Episode(**{**values, **changes})
