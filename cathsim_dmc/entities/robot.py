@@ -135,8 +135,16 @@ def clamp_states(insertion: ArrayLike) -> tuple[ClampState, ClampState]:
             "check the device's base joint for a diverged simulation"
         )
     # Insertion 0 lies in the middle of an overlap: both pairs hold at the start.
-    front = OVERLAP / 2
-    return _clamp_state(insertion + front), _clamp_state(insertion + front + CYCLE / 2)
+    start = OVERLAP / 2
+    shifted = np.stack([insertion + start, insertion + (start + CYCLE / 2)])
+    phase = np.mod(shifted, CYCLE)  # the jaws are closed over [0, STROKE]
+    swung = _smoothstep((phase - (STROKE + JAW_TRAVEL)) / RETURN)
+    travel = phase - STROKE / 2 - CYCLE * swung
+    opened = _smoothstep((phase - STROKE) / JAW_TRAVEL)
+    shut = _smoothstep((phase - (CYCLE - JAW_TRAVEL)) / JAW_TRAVEL)
+    opening = JAW_OPENING * (opened - shut)
+    front, rear = map(ClampState, travel, opening, phase <= STROKE)
+    return front, rear
 
 
 def follower_posture(
@@ -162,19 +170,14 @@ def follower_posture(
     Raises:
       ValueError: an argument is not finite, or the shapes do not broadcast.
     """
-    values = [insertion, rotation, guidewire_insertion, guidewire_rotation]
-    values[2] = insertion if guidewire_insertion is None else guidewire_insertion
-    values[3] = rotation if guidewire_rotation is None else guidewire_rotation
+    if guidewire_insertion is None:
+        guidewire_insertion = insertion
+    if guidewire_rotation is None:
+        guidewire_rotation = rotation
+    devices = (insertion, rotation, guidewire_insertion, guidewire_rotation)
     pushed, turned, wire_pushed, wire_turned = np.broadcast_arrays(
-        *(np.asarray(value, np.float64) for value in values)
+        *(np.asarray(value, np.float64) for value in devices)
     )
-    if not all(
-        np.isfinite(value).all() for value in (turned, wire_pushed, wire_turned)
-    ):
-        raise ValueError(
-            f"rotations and the guidewire insertion must be finite, got rotation "
-            f"{turned}, guidewire insertion {wire_pushed} and rotation {wire_turned}"
-        )
     front, rear = clamp_states(pushed)
     # The catheter unit stays half-way between the clamps, so the free lengths of
     # shaft either side of it stay equal; the guidewire unit rides with the rear.
@@ -191,21 +194,18 @@ def follower_posture(
         *_wheel_angles(pushed - catheter_travel, turned),
         *_wheel_angles(wire_pushed - rear.travel, wire_turned),
     )
-    return np.stack(columns, axis=-1)
+    posture = np.stack(columns, axis=-1)
+    if not np.isfinite(posture).all():
+        raise ValueError(
+            f"rotations and guidewire insertion must be finite, got rotation {turned}, "
+            f"guidewire insertion {wire_pushed} and guidewire rotation {wire_turned}"
+        )
+    return posture
 
 
 def _smoothstep(u: NDArray[np.float64]) -> NDArray[np.float64]:
-    u = np.clip(u, 0.0, 1.0)
+    u = np.minimum(np.maximum(u, 0.0), 1.0)
     return u * u * (3.0 - 2.0 * u)
-
-
-def _clamp_state(shifted: NDArray[np.float64]) -> ClampState:
-    phase = np.mod(shifted, CYCLE)  # the jaws are closed over [0, STROKE]
-    progress = (phase - STROKE - JAW_TRAVEL) / RETURN
-    travel = phase - STROKE / 2 - CYCLE * _smoothstep(progress)
-    opened = _smoothstep((phase - STROKE) / JAW_TRAVEL)
-    shut = _smoothstep((phase - CYCLE + JAW_TRAVEL) / JAW_TRAVEL)
-    return ClampState(travel, JAW_OPENING * (opened - shut), phase <= STROKE)
 
 
 def _wheel_angles(slip: NDArray, turned: NDArray) -> tuple[NDArray, ...]:
