@@ -48,7 +48,7 @@ def _unit(value: ArrayLike, name: str) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class Goal:
-    """A place to reach: `position` (3,) at `arc_length` (m) of a vessel's centreline."""
+    """A place to reach: `position` (3,), `arc_length` (m) on a vessel's centreline."""
 
     name: str
     vessel: str

@@ -1,0 +1,439 @@
+"""Convex wall pieces around a vessel tree: nothing in the lumen, no gap.
+
+Each vessel becomes a polyhedral tube: ring planes across its centreline (closer
+together where it bends or tapers) and sectors around it. A wall piece is the
+convex hull of one face of the tube and the same face moved outwards. Where a
+piece stands in the lumen of another vessel it is replaced by its parts outside
+that vessel's tube; these are cut along the planes through the other vessel's
+axis, so they are convex and share their boundaries.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from cathsim_dmc.anatomy.centreline import Array, Centreline, VesselTree
+from cathsim_dmc.anatomy.phantom import End
+from cathsim_dmc.anatomy.polytope import clip, clip_all, volume_and_width
+
+# Depth of the wall, m: twice a 6F device's diameter, so nothing tunnels.
+THICKNESS = 4e-3
+# Height of a chord over the lumen surface, m; half of it stands in the lumen.
+TOLERANCE = 0.3e-3
+# Radius of the hole in the inlet cap, m: closes on a sheath of 2 mm radius.
+INLET_HOLE_RADIUS = 1.5e-3
+_LONGEST_SLAB = 25e-3
+_FEWEST_SECTORS = 7
+# A run of slabs may form one piece while the vessel bends less than this, rad.
+_STRAIGHT = math.radians(1.0)
+# Pieces thinner than this (m) or smaller (m^3) are left out: no device passes the
+# slit they would fill, and MuJoCo rejects meshes without volume.
+_THINNEST = 0.02e-3
+_SMALLEST = 1e-12
+
+
+@dataclass(frozen=True, eq=False)
+class Tube:
+    """Polyhedral tube: `inner` and `outer` corners (rings, sectors, 3), metres."""
+
+    arc_length: Array
+    centres: Array
+    tangents: Array
+    inner: Array
+    outer: Array
+
+    @cached_property
+    def faces(self) -> tuple[Array, Array]:
+        """Outward unit normals (slabs, sectors, 3) and offsets of the faces."""
+        corners = self.face_corners(self.inner)
+        a, b, c, d = (corners[..., i, :] for i in range(4))
+        normal = np.cross(d - a, c - b)
+        normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
+        middle = 0.5 * (self.centres[:-1] + self.centres[1:])
+        outward = corners.mean(axis=-2) - middle[:, None]
+        normal *= np.sign(np.einsum("skj,skj->sk", normal, outward))[..., None]
+        # A slightly warped face: the highest corner keeps the wall outside.
+        return normal, np.einsum("skj,skcj->skc", normal, corners).max(axis=-1)
+
+    @staticmethod
+    def face_corners(rings: Array) -> Array:
+        """Corners (slabs, sectors, 4, 3) between neighbouring rings and sectors."""
+        ahead = np.roll(rings, -1, axis=1)
+        return np.stack([rings[:-1], ahead[:-1], rings[1:], ahead[1:]], axis=2)
+
+    @cached_property
+    def reach(self) -> float:
+        """Largest distance (m) of a lumen corner from its ring's centre."""
+        return float(np.linalg.norm(self.inner - self.centres[:, None], axis=-1).max())
+
+    @cached_property
+    def line(self) -> Centreline:
+        """Centres of the rings as a polyline; radii are the mean corner distances."""
+        radii = np.linalg.norm(self.inner - self.centres[:, None], axis=-1)
+        return Centreline(self.centres, radii.mean(axis=1))
+
+
+def _frames(tangents: Array) -> tuple[Array, Array]:
+    """Rotation-minimising normals u, v (n, 3) along unit tangents (n, 3)."""
+    axis = np.zeros(3)
+    axis[np.abs(tangents[0]).argmin()] = 1.0
+    u = np.empty_like(tangents)
+    u[0] = np.cross(tangents[0], axis)
+    u[0] /= np.linalg.norm(u[0])
+    for i in range(1, len(tangents)):
+        u[i] = u[i - 1] - (u[i - 1] @ tangents[i]) * tangents[i]
+        u[i] /= np.linalg.norm(u[i])
+    return u, np.cross(tangents, u)
+
+
+@dataclass(frozen=True, eq=False)
+class _Shape:
+    """Differential geometry of a centreline at its points."""
+
+    line: Centreline
+    tangents: Array
+    bend: Array  # (n, 3) curvature vector c'', 1/m
+    flare: Array  # (n,) r'', 1/m
+
+    @classmethod
+    def of(cls, line: Centreline) -> _Shape:
+        s = line.arc_length
+        segments = np.diff(line.points, axis=0)
+        segments /= np.linalg.norm(segments, axis=1)[:, None]
+        tangents = np.concatenate(
+            [segments[:1], segments[:-1] + segments[1:], segments[-1:]]
+        )
+        tangents /= np.linalg.norm(tangents, axis=1)[:, None]
+        edge_order = 2 if len(s) > 2 else 1
+        bend = np.gradient(tangents, s, axis=0, edge_order=1)
+        slope = np.gradient(line.radii, s, edge_order=edge_order)
+        return cls(line, tangents, bend, np.gradient(slope, s, edge_order=1))
+
+    def at(self, s: Array, values: Array) -> Array:
+        arc = self.line.arc_length
+        if values.ndim == 1:
+            return np.interp(s, arc, values)
+        return np.stack([np.interp(s, arc, values[:, i]) for i in range(3)], axis=1)
+
+    def ring_positions(self, start: float, tolerance: float) -> Array:
+        """Arc lengths from `start` to the end, chords within `tolerance`."""
+        r = self.line.radii
+        curvature = np.linalg.norm(self.bend, axis=1)
+        # On the outer side of a bend the surface is longer by 1 + r/R.
+        surface = curvature * (1.0 + r * curvature) + np.abs(self.flare)
+        density = np.maximum(np.sqrt(surface / (8.0 * tolerance)), 1.0 / _LONGEST_SLAB)
+        s = self.line.arc_length
+        steps = 0.5 * (density[1:] + density[:-1]) * np.diff(s)
+        count = np.concatenate([[0.0], np.cumsum(steps)])
+        first = float(np.interp(start, s, count))
+        slabs = max(1, math.ceil(count[-1] - first - 1e-9))
+        positions = np.interp(np.linspace(first, count[-1], slabs + 1), count, s)
+        positions[0], positions[-1] = start, s[-1]
+        return positions
+
+
+def polyhedral_tube(
+    line: Centreline,
+    *,
+    start: float = 0.0,
+    radius: float | None = None,
+    tolerance: float = TOLERANCE,
+    thickness: float = THICKNESS,
+) -> Tube:
+    """Tube around `line` from arc length `start` (m) to its end.
+
+    Args:
+        line: centreline with lumen radii.
+        start: first ring.
+        radius: lumen radius (m) that decides the number of sectors; the largest
+            of the line if None.
+        tolerance: height (m) of a chord over the surface, along and around.
+        thickness: distance (m) from the lumen to the outside of the wall; less on
+            the inner side of a bend, where ring planes would cross.
+    """
+    shape = _Shape.of(line)
+    s = shape.ring_positions(start, tolerance)
+    if radius is None:
+        radius = float(line.radii.max())
+    sectors = math.ceil(2.0 * math.pi * radius / math.sqrt(8.0 * radius * tolerance))
+    sectors = max(sectors, _FEWEST_SECTORS)
+    centres, radii, _ = line.at(s)
+    tangents = shape.at(s, shape.tangents)
+    tangents /= np.linalg.norm(tangents, axis=1)[:, None]
+    u, v = _frames(tangents)
+    angle = 2.0 * math.pi * np.arange(sectors) / sectors
+    spokes = (
+        np.cos(angle)[:, None] * u[:, None] + np.sin(angle)[:, None] * v[:, None]
+    )
+    # Half of each chord's height in, half out: around ...
+    ring = 2.0 * radii / (1.0 + math.cos(math.pi / sectors))
+    # ... and along: positive where the lumen bulges, so the corners move out.
+    towards = np.einsum("rkj,rj->rk", spokes, shape.at(s, shape.bend))
+    bulge = -towards * (1.0 - radii[:, None] * towards)
+    bulge -= shape.at(s, shape.flare)[:, None]
+    spacing = np.gradient(s) if len(s) > 2 else np.full(len(s), s[-1] - s[0])
+    lift = np.clip(bulge * spacing[:, None] ** 2 / 16.0, -tolerance / 2, tolerance / 2)
+    inner = ring[:, None] + lift
+    # Ring planes cross at distance 1/|c''| on the inner side: stay short of it.
+    limit = np.where(towards > 0.0, 0.9 / np.maximum(towards, 1e-9), np.inf)
+    outer = inner + np.clip(limit - inner, 0.25e-3, thickness)
+    return Tube(
+        s,
+        centres,
+        tangents,
+        centres[:, None] + inner[..., None] * spokes,
+        centres[:, None] + outer[..., None] * spokes,
+    )
+
+
+def _convex_run(tube: Tube) -> int:
+    """Number of first slabs whose wall is convex along a straight axis."""
+    line = tube.line
+    slope = np.diff(line.radii) / np.diff(line.arc_length)
+    run = 1
+    while run < len(slope):
+        turn = np.clip(tube.tangents[0] @ tube.tangents[run + 1], -1.0, 1.0)
+        if math.acos(turn) > _STRAIGHT or slope[run] < slope[run - 1] - 1e-3:
+            break
+        run += 1
+    return run
+
+
+def _hulls(tube: Tube, first: int) -> list[list[Array]]:
+    """Wall pieces of a tube by sector; the `first` slabs form one piece each."""
+    sectors = tube.inner.shape[1]
+    inner, outer = (Tube.face_corners(rings) for rings in (tube.inner, tube.outer))
+    pieces: list[list[Array]] = []
+    for k in range(sectors):
+        column = []
+        if first > 1:
+            rings = tube.inner[: first + 1, [k, (k + 1) % sectors]].reshape(-1, 3)
+            # The outside of the last ring, carried back along the straight axis.
+            last = tube.outer[first, [k, (k + 1) % sectors]]
+            shift = tube.centres[0] - tube.centres[first]
+            column.append(np.concatenate([rings, last, last + shift]))
+        for j in range(first if first > 1 else 0, len(tube.centres) - 1):
+            column.append(np.concatenate([inner[j, k], outer[j, k]]))
+        pieces.append(column)
+    return pieces
+
+
+def subtract(piece: Array, tube: Tube, *, rooted: bool) -> list[Array]:
+    """Parts of a convex piece (n, 3) outside the lumen of `tube`, all convex.
+
+    Args:
+        piece: vertices.
+        tube: the lumen to keep free.
+        rooted: the tube starts inside another lumen (a branch), so there is no
+            wall to keep before its first plane.
+    """
+    middle = piece.mean(axis=0)
+    size = np.sqrt(((piece - middle) ** 2).sum(axis=1).max())
+    nearest = tube.line.project(middle)
+    if nearest.distance > size + tube.reach:
+        return [piece]
+    # Heights (rings, n) of the vertices over the ring planes.
+    height = np.einsum("rj,rnj->rn", tube.tangents, piece[None] - tube.centres[:, None])
+    touched = (height[:-1].max(axis=1) > 0.0) & (height[1:].min(axis=1) < 0.0)
+    # A plane is meaningless far from its ring: keep the slabs near the piece.
+    gap = np.abs(tube.line.arc_length - nearest.arc_length)
+    touched &= np.minimum(gap[:-1], gap[1:]) < size + np.diff(tube.line.arc_length)
+    slabs = np.flatnonzero(touched)
+    if not len(slabs):
+        return [piece]
+    home = int(np.searchsorted(tube.line.arc_length, nearest.arc_length)) - 1
+    home = min(max(home, slabs[0]), slabs[-1])
+    axis = tube.centres[home + 1] - tube.centres[home]
+    axis /= np.linalg.norm(axis)
+    # Planes through the axis and the corners; sector k lies between k and k + 1.
+    cuts = np.cross(axis, tube.inner[home] - tube.centres[home])
+    cuts /= np.linalg.norm(cuts, axis=1)[:, None]
+    levels = cuts @ tube.centres[home]
+    normals, offsets = (values[slabs] for values in tube.faces)
+    sectors = len(cuts)
+    side = cuts @ piece.T - levels[:, None]
+    parts: dict[int, Array] = {}
+    blocked: set[int] = set()
+    for k in range(sectors):
+        ahead = (k + 1) % sectors
+        if side[k].max() <= 1e-9 or side[ahead].min() >= -1e-9:
+            continue
+        part = clip(piece, cuts[k], levels[k])
+        part = None if part is None else clip(part, -cuts[ahead], -levels[ahead])
+        if part is None:
+            continue
+        parts[k] = part
+        if (part @ normals[:, k].T - offsets[:, k]).min() < -1e-9:
+            blocked.add(k)
+    if not blocked:
+        return [piece]
+    out: list[Array | None] = []
+    if not rooted and slabs[0] == 0 and height[0].min() < -1e-9:
+        out.append(clip(piece, -tube.tangents[0], -tube.tangents[0] @ tube.centres[0]))
+    if slabs[-1] == len(tube.centres) - 2 and height[-1].max() > 1e-9:
+        end = tube.tangents[-1]
+        out.append(clip(piece, end, end @ tube.centres[-1]))
+    out += [clip_all(parts[k], normals[:, k], offsets[:, k]) for k in blocked]
+    # Free sectors side by side form one part while they span less than a half turn.
+    free = [k for k in parts if k not in blocked]
+    starts = [k for k in free if (k - 1) % sectors not in free]
+    for first in starts or free[:1]:
+        k = first
+        while k in free:
+            last = k
+            while (last + 1) % sectors in free and (last + 1 - k) % sectors < (
+                sectors // 2 - 1
+            ):
+                last = (last + 1) % sectors
+            group = clip(piece, cuts[k], levels[k])
+            ahead = (last + 1) % sectors
+            if group is not None:
+                out.append(clip(group, -cuts[ahead], -levels[ahead]))
+            span = (last - k) % sectors + 1
+            for done in range(span):
+                free.remove((k + done) % sectors)
+            k = ahead
+    return [part for part in out if part is not None]
+
+
+def _support_planes(tube: Tube, run: int, parent: Tube) -> tuple[Array, Array]:
+    """One plane per sector of a branch on which its parent's lumen rests.
+
+    The plane is parallel to the parent's wall where the sector leaves it. Normals
+    (sectors, 3) point out of the parent; offsets (sectors,).
+    """
+    rings = tube.inner[: run + 1]
+    middles = 0.5 * (rings + np.roll(rings, -1, axis=1))
+    fine = np.linspace(0.0, 1.0, 33)[:, None, None]
+    ray = middles[0] + fine * (middles[-1] - middles[0])
+    nearest = parent.line.project(ray)
+    leaves = (nearest.radius - nearest.distance < 0.0).argmax(axis=0)
+    columns = np.arange(ray.shape[1])
+    points = ray[leaves, columns]
+    foot = parent.line.at(nearest.arc_length[leaves, columns]).position
+    normals = points - foot
+    normals /= np.linalg.norm(normals, axis=1)[:, None]
+    corners = parent.inner.reshape(-1, 3)
+    heights = normals @ corners.T
+    near = np.linalg.norm(points[:, None] - corners[None], axis=2) < 2.0 * parent.reach
+    return normals, np.where(near, heights, -np.inf).max(axis=1)
+
+
+def _ring_inside(line: Centreline, ostium: float, parent: Centreline) -> float:
+    """Largest arc length up to `ostium` whose whole ring lies in the parent."""
+    s = np.linspace(0.0, ostium, 65)
+    place = line.at(s)
+    u, v = _frames(place.tangent)
+    angle = np.linspace(0.0, 2.0 * math.pi, 17)[:-1]
+    spokes = np.cos(angle)[:, None] * u[:, None] + np.sin(angle)[:, None] * v[:, None]
+    rings = place.position[:, None] + 1.05 * place.radius[:, None, None] * spokes
+    nearest = parent.project(rings)
+    inside = (nearest.distance < nearest.radius).all(axis=1)
+    # The last ring of the first unbroken stretch inside.
+    return float(s[max(0, (~inside).argmax() - 1)]) if not inside.all() else ostium
+
+
+def _cap(end: End, thickness: float) -> list[Array]:
+    """Disc that closes a flat end, or a ring of sectors around the inlet's hole."""
+    u, v = (frame[0] for frame in _frames(end.direction[None]))
+    sectors = 12
+    angle = 2.0 * math.pi * np.arange(sectors) / sectors
+    spokes = np.cos(angle)[:, None] * u + np.sin(angle)[:, None] * v
+    # Circumscribed polygons: the rim covers the wall's thickness all around.
+    stretch = 1.0 / math.cos(math.pi / sectors)
+    rim = end.position + (end.radius + 0.5 * thickness) * stretch * spokes
+    depth = thickness * end.direction
+    if not end.open:
+        return [np.concatenate([rim, rim + depth])]
+    hole = end.position + INLET_HOLE_RADIUS * stretch * spokes
+    pieces = []
+    for k in range(sectors):
+        pair = [k, (k + 1) % sectors]
+        face = np.concatenate([hole[pair], rim[pair]])
+        pieces.append(np.concatenate([face, face + depth]))
+    return pieces
+
+
+def tree_tubes(
+    tree: VesselTree, *, tolerance: float = TOLERANCE, thickness: float = THICKNESS
+) -> dict[str, Tube]:
+    """Polyhedral tube of each vessel; branches start inside their parent."""
+    tubes = {}
+    for name, vessel in tree.vessels.items():
+        line = vessel.centreline
+        start, radius = 0.0, None
+        if vessel.parent is not None:
+            parent = tree.vessel(vessel.parent).centreline
+            start = _ring_inside(line, vessel.ostium, parent)
+            # The flare is short: the calibre beyond it sets the sectors.
+            radius = float(np.median(line.radii[line.arc_length > vessel.ostium]))
+        tubes[name] = polyhedral_tube(
+            line,
+            start=start,
+            radius=radius,
+            tolerance=tolerance,
+            thickness=thickness,
+        )
+    return tubes
+
+
+def build_wall(
+    tree: VesselTree,
+    ends: tuple[End, ...] = (),
+    *,
+    tolerance: float = TOLERANCE,
+    thickness: float = THICKNESS,
+) -> tuple[Array, ...]:
+    """Convex wall pieces (n_i, 3) around the lumen of `tree`, metres.
+
+    Args:
+        tree: vessels with smooth centrelines; a branch is straight where it
+            crosses its parent's wall.
+        ends: flat ends to close; an open one keeps a hole for the sheath.
+        tolerance: height (m) of a chord over the lumen surface, along and around;
+            half of it stands in the lumen.
+        thickness: depth (m) of the wall.
+    """
+    tubes = tree_tubes(tree, tolerance=tolerance, thickness=thickness)
+    wall: list[Array] = []
+    for name, vessel in tree.vessels.items():
+        tube = tubes[name]
+        run = _convex_run(tube) if vessel.parent is not None else 1
+        columns = _hulls(tube, run)
+        planes = None
+        if vessel.parent is not None:
+            planes = _support_planes(tube, run, tubes[vessel.parent])
+        for k, column in enumerate(columns):
+            pieces: list[Array] = column
+            if planes is not None:
+                kept = (clip(piece, planes[0][k], planes[1][k]) for piece in pieces)
+                pieces = [piece for piece in kept if piece is not None]
+            wall += _free_lumens(pieces, name, tree, tubes)
+    for end in ends:
+        wall += _free_lumens(_cap(end, thickness), end.vessel, tree, tubes)
+    return tuple(wall)
+
+
+def _free_lumens(
+    pieces: list[Array], name: str, tree: VesselTree, tubes: dict[str, Tube]
+) -> list[Array]:
+    """Cut the lumens of all vessels but `name` and its parent out of `pieces`."""
+    out = []
+    for piece in pieces:
+        parts = [piece]
+        for other, tube in tubes.items():
+            if other not in (name, tree.vessel(name).parent):
+                rooted = tree.vessel(other).parent is not None
+                parts = [q for p in parts for q in subtract(p, tube, rooted=rooted)]
+        # Hulls as built are solid; only what was cut can be a sliver.
+        out += [part for part in parts if part is piece or _solid(part)]
+    return out
+
+
+def _solid(piece: Array) -> bool:
+    volume, width = volume_and_width(piece)
+    return volume > _SMALLEST and width > _THINNEST
