@@ -44,6 +44,9 @@ class Catheter(composer.Entity):
         *,
         stroke: float = 0.25,
         rotation: bool = False,
+        friction: float = 0.0,
+        solref: tuple[float, ...] = (0.02, 1.0),
+        solimp: tuple[float, ...] = (0.9, 0.95, 0.001, 0.5, 2),
         name: str = "catheter",
     ):
         """Builds the chain.
@@ -53,6 +56,9 @@ class Catheter(composer.Entity):
           discretisation: how it is divided into links.
           stroke: longest insertion, m.
           rotation: whether the base can be rotated.
+          friction: Coulomb coefficient; MuJoCo takes the larger of the two bodies'.
+          solref: of the contacts.
+          solimp: of the contacts.
           name: of the entity.
         """
         self._device = devices.get(device)
@@ -63,6 +69,12 @@ class Catheter(composer.Entity):
         self._lengths = self._discretisation.link_lengths(self._device)
         self._mjcf_root = mjcf.RootElement(model=name)
         self._mjcf_root.compiler.angle = "radian"
+        self._contact = {
+            "friction": (friction, 0, 0),
+            "solref": solref,
+            "solimp": solimp,
+            "condim": 3,
+        }
         self._links = []
         self._bends = []
         self._twists = []
@@ -153,6 +165,7 @@ class Catheter(composer.Entity):
             rgba=_TIP_COLOUR if self._in_tip(index) else _COLOUR,
             contype=0,
             conaffinity=1,
+            **self._contact,
         )
 
     def _in_tip(self, index: int) -> bool:

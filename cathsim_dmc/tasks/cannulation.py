@@ -1,0 +1,130 @@
+"""What it means to cannulate a branch: distance, success and reward."""
+
+import dataclasses
+
+import numpy as np
+
+from cathsim_dmc.anatomy import centreline as centrelines
+
+# The published task.
+GOAL_RADIUS = 8e-3  # m, δ
+SUCCESS_REWARD = 10.0
+MAX_STEPS = 2000
+CONTROL_TIMESTEP = 0.04  # s, one frame of fluoroscopy
+START_JITTER = 1e-3  # m, radius of the ball of the random displacement of the tip
+
+REWARDS = ("distance", "path")
+
+
+@dataclasses.dataclass(frozen=True)
+class Outcome:
+    """How a control step went; arrays have the leading axes of the head.
+
+    Attributes:
+      distance: (...), straight from head to goal, m.
+      in_branch: (...) bool, whether the head is in the lumen of the target branch.
+      success: (...) bool, in the branch and within the goal's radius.
+      terms: named reward terms (...), before weighting.
+      reward: (...), the weighted terms that count.
+    """
+
+    distance: np.ndarray
+    in_branch: np.ndarray
+    success: np.ndarray
+    terms: dict[str, np.ndarray]
+    reward: np.ndarray
+
+
+@dataclasses.dataclass(frozen=True)
+class Cannulation:
+    """The goal of a task and its reward.
+
+    Attributes:
+      goal: (3,), m, world frame.
+      branch: centreline of the whole target branch.
+      ostium: arc length at which the branch leaves its parent's lumen, m.
+      route: centreline from the inlet to the goal.
+      goal_radius: δ, m.
+      reward: "distance" (published: minus the straight distance in metres) or "path"
+        (minus the way along the route that is left, and the distance from it).
+      success_reward: bonus, weight of the term "success".
+      max_steps: control steps until the episode is truncated.
+    """
+
+    goal: np.ndarray
+    branch: centrelines.Centreline
+    ostium: float
+    route: centrelines.Centreline
+    goal_radius: float = GOAL_RADIUS
+    reward: str = "distance"
+    success_reward: float = SUCCESS_REWARD
+    max_steps: int = MAX_STEPS
+
+    def __post_init__(self):
+        if self.reward not in REWARDS:
+            raise ValueError(
+                f"reward is {self.reward!r}; allowed are {', '.join(REWARDS)}"
+            )
+        if not self.goal_radius > 0:
+            raise ValueError(f"goal_radius is {self.goal_radius} m; it must be > 0")
+        if self.max_steps < 1:
+            raise ValueError(f"max_steps is {self.max_steps}; at least 1")
+
+    @property
+    def weights(self) -> dict[str, float]:
+        """Weights of the reward terms."""
+        return {self.reward: -1.0, "success": self.success_reward}
+
+    def outcome(self, head: np.ndarray) -> Outcome:
+        """Judges the position (..., 3) of the head, m, world frame."""
+        distance = np.sqrt(((head - self.goal) ** 2).sum(-1))
+        in_branch = self.in_branch(head)
+        success = in_branch & (distance < self.goal_radius)
+        terms = {"distance": distance, "success": success.astype(float)}
+        if self.reward == "path":
+            terms["path"] = self.path_distance(head)
+        weights = self.weights
+        # Published: +10 inside δ, minus the distance otherwise.
+        reward = np.where(
+            success, weights["success"], weights[self.reward] * terms[self.reward]
+        )
+        return Outcome(distance, in_branch, success, terms, reward)
+
+    def in_branch(self, head: np.ndarray) -> np.ndarray:
+        """Whether the head (..., 3) is in the lumen of the branch, past its ostium."""
+        place = self.branch.project(head)
+        return (place.distance <= place.radius) & (place.arc_length >= self.ostium)
+
+    def path_distance(self, head: np.ndarray) -> np.ndarray:
+        """Way (...) along the route to the goal plus distance from the route, m."""
+        place = self.route.project(head)
+        return self.route.length - place.arc_length + place.distance
+
+
+def start_displacement(random_state: np.random.RandomState) -> np.ndarray:
+    """Random displacement (3,) of the tip at the start: uniform in a ball, m."""
+    direction = random_state.normal(size=3)
+    radius = START_JITTER * random_state.uniform() ** (1 / 3)
+    return radius * direction / np.linalg.norm(direction)
+
+
+def check_action(action: np.ndarray, size: int) -> np.ndarray:
+    """Returns the action (..., size) as float64.
+
+    Raises:
+      ValueError: if its shape is wrong or it is not finite.
+    """
+    action = np.asarray(action, dtype=np.float64)
+    if action.shape[-1:] != (size,):
+        raise ValueError(
+            f"the action has shape {action.shape}, but the last axis must have {size} "
+            "entries in [-1, 1]: tip motors from proximal to distal (x before y), "
+            "translation, and rotation if the task has it"
+        )
+    finite = np.isfinite(action)
+    if not finite.all():
+        raise ValueError(
+            f"the action holds {np.count_nonzero(~finite)} NaN or infinite entries; "
+            "all must be numbers in [-1, 1]"
+        )
+    return action
