@@ -36,3 +36,19 @@ def make_episode(steps=6, links=4, actions=21, seed=0, counts=None, **changes):
         "contact_force": force,
     }
     return Episode(**{**values, **changes})
+
+
+def make_tube(radius=0.02, length=0.08, sides=12, rings=5):
+    """An open tube along z about the origin: vertices (V, 3), faces (F, 3)."""
+    angle = np.linspace(0, 2 * np.pi, sides, endpoint=False)
+    ring = radius * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    height = np.linspace(-length / 2, length / 2, rings)
+    vertices = np.concatenate(
+        [np.column_stack([ring, np.full(sides, z)]) for z in height]
+    )
+    a = (np.arange(rings - 1)[:, None] * sides + np.arange(sides)).ravel()
+    b = a - a % sides + (a + 1) % sides
+    faces = np.concatenate(
+        [np.stack([a, b, b + sides], 1), np.stack([a, b + sides, a + sides], 1)]
+    )
+    return vertices, faces

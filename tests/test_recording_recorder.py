@@ -200,7 +200,9 @@ def test_the_record_follows_the_simulation(wall_env):
     assert episode.meta["versions"]["mujoco"] == mujoco.__version__
     physics = wall_env.physics
     np.testing.assert_array_equal(episode.qpos[-1], physics.data.qpos)
-    np.testing.assert_array_equal(episode.head[-1], physics.named.data.site_xpos["catheter/head"])
+    np.testing.assert_array_equal(
+        episode.head[-1], physics.named.data.site_xpos["catheter/head"]
+    )
 
 
 def test_contacts_press_on_the_wall_and_agree_with_the_task(wall_env):

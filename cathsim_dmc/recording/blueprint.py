@@ -12,7 +12,7 @@ TIMELINE_STEP = "step"
 
 # Distance of the eye in extents of the scene: the viewer's vertical field of view
 # is near 45 degrees, which shows 0.83 of the distance.
-EYE_DISTANCE = 1.5
+EYE_DISTANCE = 1.35
 
 
 def episode_blueprint(

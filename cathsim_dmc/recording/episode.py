@@ -303,4 +303,3 @@ def _checked_meta(meta: Any) -> dict[str, Any]:
             f"{plain['termination']!r}"
         )
     return plain
-

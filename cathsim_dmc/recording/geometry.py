@@ -33,6 +33,8 @@ def surface_arrays(surface: Any) -> tuple[np.ndarray, np.ndarray]:
     for name, array in (("vertices", vertices), ("faces", faces)):
         if array.ndim != 2 or array.shape[1] != 3:
             raise ValueError(f"{name} must have shape (n, 3), got {array.shape}")
+    if not len(vertices) or not np.isfinite(vertices).all():
+        raise ValueError("a surface needs vertices with finite coordinates")
     if faces.size and (faces.min() < 0 or faces.max() >= len(vertices)):
         raise ValueError(
             f"faces must index {len(vertices)} vertices, got indices "

@@ -22,12 +22,12 @@ from cathsim_dmc.recording.blueprint import (
     TIMELINE_TIME,
     episode_blueprint,
 )
+from cathsim_dmc.recording.drawing import Drawing, action_layout, goal_distance
 from cathsim_dmc.recording.episode import Episode
 from cathsim_dmc.recording.files import atomic_path
 from cathsim_dmc.recording.geometry import (
     force_colours,
     rotate,
-    surface_arrays,
     vertex_normals,
     xyzw,
     z_to,
@@ -38,8 +38,6 @@ from cathsim_dmc.recording.summary import episode_markdown
 APPLICATION_ID = "cathsim"
 SUFFIX = ".rrd"
 
-# 5F diagnostic catheter, 1.67 mm outer diameter; used when the record has no radii.
-CATHETER_RADIUS = 0.835e-3
 # Drawing only: 1 N is an arrow of 100 mm, so the usual 0-0.2 N span 0-20 mm.
 ARROW_METRES_PER_NEWTON = 0.1
 ARROW_RADIUS = 0.6e-3
@@ -47,9 +45,6 @@ TRAIL_RADIUS = 0.25e-3
 HEAD_SCALE = 2.0
 # At this quality noisy frames take about half of what the exact PNG takes.
 JPEG_QUALITY = 90
-TIP_PREFIX = "tip_"
-# Order of the actions without names: 20 tip motors, translation, rotation.
-DEFAULT_TIP_MOTORS = 20
 
 VESSEL_COLOUR = (225, 140, 130, 60)
 SHAFT_COLOUR = (215, 228, 255)
@@ -91,16 +86,21 @@ def write_rrd(
         ValueError: on frames, radii or geoms that do not fit the episode.
         RuntimeError: if Rerun is switched off by the ``RERUN`` environment variable.
     """
-    vertices, faces = surface_arrays(surface)
-    geoms = _checked_geoms(episode, robot_geoms)
-    radii = _checked_radii(episode, catheter_radius)
-    goal = _checked_goal(episode, goal_position, goal_radius)
-    frames = _checked_frames(episode, fluoroscopy)
+    drawing = Drawing.of(
+        episode,
+        surface,
+        robot_geoms=robot_geoms,
+        goal_position=goal_position,
+        goal_radius=goal_radius,
+        catheter_radius=catheter_radius,
+        fluoroscopy=fluoroscopy,
+    )
+    low, high = drawing.vertices.min(0), drawing.vertices.max(0)
     layout = episode_blueprint(
-        centre=(vertices.min(0) + vertices.max(0)) / 2,
-        extent=float(np.ptp(vertices, axis=0).max()),
-        fluoroscopy=frames is not None,
-        distance=_distance(episode) is not None,
+        centre=(low + high) / 2,
+        extent=float((high - low).max()),
+        fluoroscopy=drawing.frames is not None,
+        distance=goal_distance(episode) is not None,
     )
     with atomic_path(path, SUFFIX) as temporary:
         stream = rr.RecordingStream(APPLICATION_ID)
@@ -115,13 +115,13 @@ def write_rrd(
             stream.save(temporary, default_blueprint=layout)
             stream.send_recording_name(_title(episode))
             log = _Log(stream, episode)
-            _log_static(log, vertices, faces, goal)
-            _log_catheter(log, radii)
-            _log_bodies(log, geoms)
+            _log_static(log, drawing)
+            _log_catheter(log, drawing.radii)
+            _log_bodies(log, drawing.geoms)
             _log_contacts(log)
             _log_series(log)
-            if frames is not None:
-                _log_frames(log, frames, lossless)
+            if drawing.frames is not None:
+                _log_frames(log, drawing.frames, lossless)
             stream.flush()
             stream.disconnect()
     return Path(path)
@@ -164,12 +164,8 @@ class _Log:
         self.columns(entity, columns, rows)
 
 
-def _log_static(
-    log: _Log,
-    vertices: np.ndarray,
-    faces: np.ndarray,
-    goal: tuple[np.ndarray, float] | None,
-) -> None:
+def _log_static(log: _Log, drawing: Drawing) -> None:
+    vertices, faces = drawing.vertices, drawing.faces
     # Patient frame LPS: x to the patient's left, y to the back, z up.
     log.static("world", rr.ViewCoordinates.LBU)
     log.static(
@@ -181,8 +177,8 @@ def _log_static(
             albedo_factor=VESSEL_COLOUR,
         ),
     )
-    if goal is not None:
-        position, radius = goal
+    if drawing.goal is not None:
+        position, radius = drawing.goal
         log.static(
             "world/goal",
             rr.Ellipsoids3D(
@@ -302,7 +298,7 @@ def _log_series(log: _Log) -> None:
     log.series(
         "series/reward", episode.reward, measured, "reward", colors=[90, 160, 90]
     )
-    distance = _distance(episode)
+    distance = goal_distance(episode)
     if distance is not None:
         log.series(
             "series/distance_mm",
@@ -354,101 +350,6 @@ def _log_frames(log: _Log, frames: np.ndarray, lossless: bool) -> None:
     log.columns("fluoroscopy", rr.EncodedImage.columns(blob=blobs))
 
 
-def action_layout(episode: Episode) -> tuple[list[str], np.ndarray]:
-    """Return short names of the A actions and a mask (A,) of those bending the tip."""
-    count = episode.action.shape[1]
-    given = episode.meta.get("action_names")
-    if given is not None and len(given) == count:
-        names = [str(name).rsplit("/", 1)[-1] for name in given]
-    else:
-        tips = min(count, DEFAULT_TIP_MOTORS)
-        names = [f"{TIP_PREFIX}{'xy'[i % 2]}_{i // 2}" for i in range(tips)]
-        extra = ["translation", "rotation"]
-        names += [
-            extra[i] if i < len(extra) else f"action_{tips + i}"
-            for i in range(count - tips)
-        ]
-    return names, np.array([name.startswith(TIP_PREFIX) for name in names], dtype=bool)
-
-
-def _distance(episode: Episode) -> np.ndarray | None:
-    distance = episode.meta.get("distance")
-    if distance is None:
-        return None
-    distance = np.asarray(distance, dtype=np.float64)
-    if distance.shape != episode.time.shape:
-        raise ValueError(
-            f"meta['distance'] must have one entry per state, {episode.time.size}; "
-            f"got shape {distance.shape}"
-        )
-    return distance
-
-
 def _title(episode: Episode) -> str:
     seed = "unseeded" if episode.seed is None else f"seed {episode.seed}"
     return f"{episode.task}, {seed}, {episode.termination}"
-
-
-def _checked_geoms(
-    episode: Episode, geoms: Iterable[BodyGeom]
-) -> tuple[BodyGeom, ...]:
-    geoms = tuple(geoms)
-    bodies = episode.body_pos.shape[1]
-    for geom in geoms:
-        if not 0 <= geom.body < bodies:
-            raise ValueError(
-                f"geom of {geom.body_name!r} names body {geom.body}, the episode has "
-                f"{bodies}; take the geoms from the model that was recorded"
-            )
-    return geoms
-
-
-def _checked_radii(
-    episode: Episode, given: float | Sequence[float] | None
-) -> np.ndarray:
-    if given is None:
-        given = episode.meta.get("catheter_radius", CATHETER_RADIUS)
-    links = episode.catheter.shape[1] - 1
-    radii = np.asarray(given, dtype=np.float64)
-    if radii.shape not in ((), (links,)) or not (radii > 0).all():
-        raise ValueError(
-            f"catheter_radius must be one positive radius or {links} of them, in "
-            f"metres; got {given}"
-        )
-    return np.broadcast_to(radii, (links,))
-
-
-def _checked_goal(
-    episode: Episode, position: Sequence[float] | None, radius: float | None
-) -> tuple[np.ndarray, float] | None:
-    if position is None:
-        position = episode.meta.get("goal_position")
-    if radius is None:
-        radius = episode.meta.get("goal_radius")
-    if position is None and radius is None:
-        return None
-    if position is None or radius is None:
-        raise ValueError(
-            f"a goal needs both position and radius, got {position} and {radius}"
-        )
-    position = np.asarray(position, dtype=np.float64)
-    if position.shape != (3,) or not radius > 0:
-        raise ValueError(
-            "a goal is a position (3,) and a positive radius in metres, got shape "
-            f"{position.shape} and {radius}"
-        )
-    return position, float(radius)
-
-
-def _checked_frames(episode: Episode, frames: np.ndarray | None) -> np.ndarray | None:
-    if frames is None:
-        return None
-    frames = np.asarray(frames)
-    states = episode.steps + 1
-    if frames.ndim != 4 or frames.shape[0] != states or frames.shape[-1] != 1:
-        raise ValueError(
-            f"fluoroscopy must have shape ({states}, H, W, 1), got {frames.shape}"
-        )
-    if frames.dtype != np.uint8:
-        raise ValueError(f"fluoroscopy must be uint8, got {frames.dtype}")
-    return frames

@@ -1,0 +1,204 @@
+"""Where the device presses on the wall, seen from the front."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from cathsim_dmc.analysis.forces import magnitude
+from cathsim_dmc.recording.episode import Episode
+from cathsim_dmc.recording.files import atomic_path
+from cathsim_dmc.recording.geometry import surface_arrays
+
+SUFFIX = ".png"
+# Cells of 2 mm: about the diameter of the device, below which neighbouring contacts
+# of one place would be told apart.
+CELL = 2e-3
+# Margin around the vessel in the picture.
+MARGIN = 5e-3
+# Columns of the antero-posterior projection: x (lateral, patient left on the right
+# of the picture, as the reader faces the patient) and z (up).
+AP_AXES = (0, 2)
+_PICTURE_HEIGHT_IN = 7.0
+_PICTURE_WIDTH_RANGE_IN = (5.5, 14.0)
+_COLOUR_BAR_IN = 1.6
+_DPI = 150
+
+
+@dataclass(frozen=True, eq=False)
+class ForceMap:
+    """Mean contact force per cell of the AP projection.
+
+    Attributes:
+        x_edges: (nx+1,) edges of the columns, metres.
+        z_edges: (nz+1,) edges of the rows, metres.
+        mean: (nz, nx) mean magnitude of the contacts in a cell, newtons; NaN where
+            there was no contact.
+        count: (nz, nx) int64 number of contacts.
+        outside: Number of contacts beyond the map, which it leaves out.
+    """
+
+    x_edges: np.ndarray
+    z_edges: np.ndarray
+    mean: np.ndarray
+    count: np.ndarray
+    outside: int
+
+
+def force_map(
+    position: np.ndarray,
+    force: np.ndarray,
+    low: np.ndarray,
+    high: np.ndarray,
+    cell: float = CELL,
+) -> ForceMap:
+    """Average contact forces over the cells of the AP projection.
+
+    The mean is over contacts, not over time: a place that is touched once counts as
+    one that is touched always, as in the published heatmaps.
+
+    Args:
+        position: (K, 3) places of contact, world frame, metres.
+        force: (K,) magnitudes, newtons.
+        low: (2,) lower corner (x, z) of the map, metres.
+        high: (2,) upper corner; the map grows to whole cells.
+        cell: Side of a cell, metres.
+
+    Raises:
+        ValueError: if the cell or the extent is not positive, or shapes differ.
+    """
+    position = np.asarray(position, dtype=np.float64).reshape(-1, 3)
+    force = np.asarray(force, dtype=np.float64)
+    low, high = np.asarray(low, np.float64), np.asarray(high, np.float64)
+    if force.shape != position.shape[:1]:
+        raise ValueError(
+            f"{len(position)} positions need as many force magnitudes, got shape "
+            f"{force.shape}"
+        )
+    if not cell > 0 or not (high > low).all():
+        raise ValueError(
+            f"cell and extent must be positive, got cell {cell}, {low} to {high}"
+        )
+    shape = np.maximum(np.ceil((high - low) / cell - 1e-9).astype(int), 1)
+    index = np.floor((position[:, AP_AXES] - low) / cell).astype(int)
+    inside = ((index >= 0) & (index < shape)).all(axis=1)
+    index, force = index[inside], force[inside]
+    flat = index[:, 1] * shape[0] + index[:, 0]
+    size = int(shape.prod())
+    count = np.bincount(flat, minlength=size)
+    total = np.bincount(flat, force, minlength=size)
+    mean = np.full(size, np.nan)
+    np.divide(total, count, out=mean, where=count > 0)
+    return ForceMap(
+        x_edges=low[0] + cell * np.arange(shape[0] + 1),
+        z_edges=low[1] + cell * np.arange(shape[1] + 1),
+        mean=mean.reshape(shape[::-1]),
+        count=count.reshape(shape[::-1]),
+        outside=int(np.count_nonzero(~inside)),
+    )
+
+
+def heatmap(
+    episodes: Iterable[Episode],
+    surface: Any,
+    path: str | os.PathLike[str],
+    *,
+    cell: float = CELL,
+    force_limit: float | None = None,
+    title: str | None = None,
+) -> ForceMap:
+    """Draw the mean contact force of some episodes over the vessel, as a PNG.
+
+    Args:
+        episodes: All evaluation episodes; one without contact adds nothing.
+        surface: The vessel, ``(vertices, faces)`` or an object with these, metres.
+        path: Target, ``*.png``; appears whole or not at all.
+        cell: Side of a cell of the map, metres.
+        force_limit: Top of the colour scale in newtons, to compare pictures; by
+            default the largest mean of the map.
+        title: Text above the picture.
+
+    Returns:
+        The map that was drawn.
+
+    Raises:
+        ValueError: if there are no episodes, or ``force_limit`` is not positive.
+    """
+    episodes = list(episodes)
+    if not episodes:
+        raise ValueError("a heatmap needs at least one episode")
+    if force_limit is not None and not force_limit > 0:
+        raise ValueError(f"force_limit must be positive, got {force_limit}")
+    vertices, faces = surface_arrays(surface)
+    outline = vertices[:, AP_AXES]
+    position = np.concatenate([e.contact_position for e in episodes])
+    force = np.concatenate([magnitude(e.contact_force) for e in episodes])
+    field = force_map(
+        position, force, outline.min(0) - MARGIN, outline.max(0) + MARGIN, cell
+    )
+    if title is None:
+        title = (
+            f"{', '.join(sorted({e.task for e in episodes}))}: {len(episodes)} "
+            f"episodes, {len(force)} contacts"
+        )
+    figure = _figure(field, outline, faces, force_limit, title)
+    with atomic_path(path, SUFFIX) as temporary:
+        figure.savefig(temporary, format="png", dpi=_DPI)
+    return field
+
+
+def _figure(
+    field: ForceMap,
+    outline: np.ndarray,
+    faces: np.ndarray,
+    force_limit: float | None,
+    title: str,
+) -> Any:
+    """Build the picture with matplotlib's objects, which leave pyplot alone."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.collections import PolyCollection
+    from matplotlib.figure import Figure
+
+    x_mm, z_mm = 1e3 * field.x_edges, 1e3 * field.z_edges
+    width = _PICTURE_HEIGHT_IN * np.ptp(x_mm) / np.ptp(z_mm) + _COLOUR_BAR_IN
+    figure = Figure(
+        figsize=(np.clip(width, *_PICTURE_WIDTH_RANGE_IN), _PICTURE_HEIGHT_IN),
+        layout="constrained",
+    )
+    FigureCanvasAgg(figure)
+    axes = figure.add_subplot()
+    triangles = 1e3 * outline[faces]
+    # All triangles twice: dark and wide, then light on top, which leaves a dark rim
+    # around the silhouette without computing it.
+    for colour, rim in (("0.45", 2.2), ("0.9", 0.6)):
+        axes.add_collection(
+            PolyCollection(triangles, facecolors=colour, edgecolors=colour, lw=rim)
+        )
+    if force_limit is None:
+        force_limit = np.nanmax(field.mean) if field.count.any() else 0.0
+    image = axes.pcolormesh(
+        x_mm,
+        z_mm,
+        np.ma.masked_invalid(field.mean),
+        cmap="inferno_r",
+        vmin=0.0,
+        # A map without force still needs a scale.
+        vmax=force_limit if force_limit > 0 else 1.0,
+        zorder=3,
+    )
+    over = bool(field.count.any() and np.nanmax(field.mean) > force_limit)
+    bar = figure.colorbar(
+        image, ax=axes, extend="max" if over else "neither", shrink=0.8
+    )
+    bar.set_label("mean contact force, N")
+    axes.set_xlim(x_mm[0], x_mm[-1])
+    axes.set_ylim(z_mm[0], z_mm[-1])
+    axes.set_aspect("equal")
+    axes.set_xlabel("x, mm (patient left →)")
+    axes.set_ylabel("z, mm (head ↑)")
+    axes.set_title(title, fontsize=11)
+    return figure

@@ -1,0 +1,165 @@
+"""What goes into a recording beside the episode, checked against it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from cathsim_dmc.recording.episode import Episode
+from cathsim_dmc.recording.geometry import surface_arrays
+from cathsim_dmc.recording.scene import BodyGeom
+
+# 5F diagnostic catheter, 1.67 mm outer diameter; used when the record has no radii.
+CATHETER_RADIUS = 0.835e-3
+TIP_PREFIX = "tip_"
+# Order of the actions without names: 20 tip motors, translation, rotation.
+DEFAULT_TIP_MOTORS = 20
+
+
+@dataclass(frozen=True, eq=False)
+class Drawing:
+    """Checked inputs of a recording; lengths in metres, world frame.
+
+    Attributes:
+        vertices: (V, 3) float64 of the vessel surface.
+        faces: (F, 3) int64.
+        geoms: Primitives that the body poses of the episode move.
+        radii: (L,) radii of the links of the catheter.
+        goal: Position (3,) and radius, or None.
+        frames: (T+1, H, W, 1) uint8 fluoroscopy, or None.
+    """
+
+    vertices: np.ndarray
+    faces: np.ndarray
+    geoms: tuple[BodyGeom, ...]
+    radii: np.ndarray
+    goal: tuple[np.ndarray, float] | None
+    frames: np.ndarray | None
+
+    @classmethod
+    def of(
+        cls,
+        episode: Episode,
+        surface: Any,
+        *,
+        robot_geoms: Iterable[BodyGeom] = (),
+        goal_position: Sequence[float] | None = None,
+        goal_radius: float | None = None,
+        catheter_radius: float | Sequence[float] | None = None,
+        fluoroscopy: np.ndarray | None = None,
+    ) -> Drawing:
+        """Check the arguments of ``write_rrd``; what is None comes from ``meta``.
+
+        Raises:
+            ValueError: on anything that does not fit the episode.
+        """
+        vertices, faces = surface_arrays(surface)
+        return cls(
+            vertices,
+            faces,
+            _checked_geoms(episode, robot_geoms),
+            _checked_radii(episode, catheter_radius),
+            _checked_goal(episode, goal_position, goal_radius),
+            _checked_frames(episode, fluoroscopy),
+        )
+
+
+def action_layout(episode: Episode) -> tuple[list[str], np.ndarray]:
+    """Return short names of the A actions and a mask (A,) of those bending the tip."""
+    count = episode.action.shape[1]
+    given = episode.meta.get("action_names")
+    if given is not None and len(given) == count:
+        names = [str(name).rsplit("/", 1)[-1] for name in given]
+    else:
+        tips = min(count, DEFAULT_TIP_MOTORS)
+        names = [f"{TIP_PREFIX}{'xy'[i % 2]}_{i // 2}" for i in range(tips)]
+        extra = ["translation", "rotation"]
+        names += [
+            extra[i] if i < len(extra) else f"action_{tips + i}"
+            for i in range(count - tips)
+        ]
+    return names, np.array([name.startswith(TIP_PREFIX) for name in names], dtype=bool)
+
+
+def goal_distance(episode: Episode) -> np.ndarray | None:
+    """Return the distance to the goal (T+1,) in metres, or None if not recorded.
+
+    Raises:
+        ValueError: if ``meta['distance']`` does not have one entry per state.
+    """
+    distance = episode.meta.get("distance")
+    if distance is None:
+        return None
+    distance = np.asarray(distance, dtype=np.float64)
+    if distance.shape != episode.time.shape:
+        raise ValueError(
+            f"meta['distance'] must have one entry per state, {episode.time.size}; "
+            f"got shape {distance.shape}"
+        )
+    return distance
+
+
+def _checked_geoms(episode: Episode, geoms: Iterable[BodyGeom]) -> tuple[BodyGeom, ...]:
+    geoms = tuple(geoms)
+    bodies = episode.body_pos.shape[1]
+    for geom in geoms:
+        if not 0 <= geom.body < bodies:
+            raise ValueError(
+                f"geom of {geom.body_name!r} names body {geom.body}, the episode has "
+                f"{bodies}; take the geoms from the model that was recorded"
+            )
+    return geoms
+
+
+def _checked_radii(
+    episode: Episode, given: float | Sequence[float] | None
+) -> np.ndarray:
+    if given is None:
+        given = episode.meta.get("catheter_radius", CATHETER_RADIUS)
+    links = episode.catheter.shape[1] - 1
+    radii = np.asarray(given, dtype=np.float64)
+    if radii.shape not in ((), (links,)) or not (radii > 0).all():
+        raise ValueError(
+            f"catheter_radius must be one positive radius or {links} of them, in "
+            f"metres; got {given}"
+        )
+    return np.broadcast_to(radii, (links,))
+
+
+def _checked_goal(
+    episode: Episode, position: Sequence[float] | None, radius: float | None
+) -> tuple[np.ndarray, float] | None:
+    if position is None:
+        position = episode.meta.get("goal_position")
+    if radius is None:
+        radius = episode.meta.get("goal_radius")
+    if position is None and radius is None:
+        return None
+    if position is None or radius is None:
+        raise ValueError(
+            f"a goal needs both position and radius, got {position} and {radius}"
+        )
+    position = np.asarray(position, dtype=np.float64)
+    if position.shape != (3,) or not radius > 0:
+        raise ValueError(
+            "a goal is a position (3,) and a positive radius in metres, got shape "
+            f"{position.shape} and {radius}"
+        )
+    return position, float(radius)
+
+
+def _checked_frames(episode: Episode, frames: np.ndarray | None) -> np.ndarray | None:
+    if frames is None:
+        return None
+    frames = np.asarray(frames)
+    states = episode.steps + 1
+    if frames.ndim != 4 or frames.shape[0] != states or frames.shape[-1] != 1:
+        raise ValueError(
+            f"fluoroscopy must have shape ({states}, H, W, 1), got {frames.shape}"
+        )
+    if frames.dtype != np.uint8:
+        raise ValueError(f"fluoroscopy must be uint8, got {frames.dtype}")
+    return frames

@@ -1,0 +1,95 @@
+import sys
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from recording_samples import make_episode, make_tube
+
+from cathsim_dmc.analysis.heatmap import force_map, heatmap
+
+
+@given(seed=st.integers(0, 2**31), count=st.integers(0, 60))
+def test_the_map_keeps_the_sum_of_force_and_the_number_of_contacts(seed, count):
+    rng = np.random.default_rng(seed)
+    position = rng.uniform(-1.2, 1.2, (count, 3))
+    force = rng.uniform(0, 2, count)
+    field = force_map(position, force, np.array([-1, -1]), np.array([1, 1]), 0.3)
+    inside = (position[:, [0, 2]] >= -1).all(1) & (position[:, [0, 2]] < 1.1).all(1)
+    assert field.count.sum() == inside.sum()
+    assert field.outside == count - inside.sum()
+    total = np.nansum(field.mean * field.count)
+    np.testing.assert_allclose(total, force[inside].sum())
+    assert (np.isnan(field.mean) == (field.count == 0)).all()
+
+
+def test_a_contact_lies_in_the_cell_that_its_edges_say():
+    position = np.array([[0.25, 9.0, -0.75], [0.25, -9.0, -0.75], [-0.9, 0, 0.9]])
+    field = force_map(
+        position, np.array([1.0, 3.0, 5.0]), np.array([-1, -1]), np.array([1, 1]), 0.5
+    )
+    assert field.mean.shape == (4, 4)
+    column = np.searchsorted(field.x_edges, 0.25) - 1
+    row = np.searchsorted(field.z_edges, -0.75, side="right") - 1
+    # searchsorted is exclusive on edges: 0.25 lies in [0, 0.5).
+    assert field.x_edges[column] <= 0.25 < field.x_edges[column + 1]
+    assert field.mean[row, column] == 2.0 and field.count[row, column] == 2
+    assert field.mean[3, 0] == 5.0
+
+
+def test_wrong_maps_are_refused():
+    low, high = np.zeros(2), np.ones(2)
+    with pytest.raises(ValueError, match="as many"):
+        force_map(np.zeros((2, 3)), np.zeros(3), low, high)
+    with pytest.raises(ValueError, match="positive"):
+        force_map(np.zeros((2, 3)), np.zeros(2), high, low)
+    with pytest.raises(ValueError, match="positive"):
+        force_map(np.zeros((2, 3)), np.zeros(2), low, high, 0.0)
+
+
+def picture_of(tmp_path, episodes, **options):
+    from matplotlib.image import imread
+
+    path = tmp_path / "map.png"
+    field = heatmap(episodes, make_tube(), path, **options)
+    return field, imread(path)[..., :3]
+
+
+def test_the_picture_shows_contacts_where_they_are(tmp_path):
+    places = np.array([[0.01, 0.0, 0.02]] * 6)
+    force = np.tile([0.0, 0.0, 0.4], (6, 1))
+    touched = make_episode(
+        counts=np.ones(6, int), contact_position=places, contact_force=force
+    )
+    free = make_episode(counts=np.zeros(6, int))
+    # The limit keeps both colour bars the same, so only the map can differ.
+    field, with_contact = picture_of(
+        tmp_path, [touched, free], force_limit=0.5, title="t", cell=4e-3
+    )
+    empty, without = picture_of(tmp_path, [free], force_limit=0.5, title="t", cell=4e-3)
+    assert np.nanmax(field.mean) == pytest.approx(0.4) and empty.count.sum() == 0
+    changed = np.argwhere(np.abs(with_contact - without).max(axis=-1) > 0.1)
+    assert len(changed) > 20
+    # All of the change is one square cell, to the right of the middle of the tube.
+    height, width = np.ptp(changed, axis=0)
+    assert abs(int(height) - int(width)) <= 2
+    silhouette = np.argwhere(np.abs(without - 0.9).max(axis=-1) < 0.01)
+    assert changed[:, 1].mean() > silhouette[:, 1].mean()
+    assert changed[:, 0].mean() < silhouette[:, 0].mean()
+
+
+def test_a_heatmap_touches_no_global_state_and_leaves_one_file(tmp_path):
+    heatmap([make_episode()], make_tube(), tmp_path / "map.png")
+    assert [p.name for p in tmp_path.iterdir()] == ["map.png"]
+    pyplot = sys.modules.get("matplotlib.pyplot")
+    assert pyplot is None or not pyplot.get_fignums()
+
+
+def test_wrong_heatmaps_are_refused(tmp_path):
+    tube = make_tube()
+    with pytest.raises(ValueError, match="at least one episode"):
+        heatmap([], tube, tmp_path / "map.png")
+    with pytest.raises(ValueError, match=r"\.png"):
+        heatmap([make_episode()], tube, tmp_path / "map.pdf")
+    with pytest.raises(ValueError, match="force_limit"):
+        heatmap([make_episode()], tube, tmp_path / "map.png", force_limit=0.0)
