@@ -18,7 +18,7 @@ from cathsim_dmc.imaging.carm import NEAREST, CArm
 # a rod thinner than a pixel stays below 0.5 % at every angle.
 _SPACING = 1.0 / 3.0
 # Discs may lie further apart on wide shadows: this fraction of their radius.
-_RELATIVE_SPACING = 0.2
+_RELATIVE_SPACING = 0.1
 # Frames drawn at once: their sums fit the processor's cache.
 _CHUNK = 16
 
@@ -109,7 +109,8 @@ def _chain(points: ArrayLike, radius: ArrayLike):
 
 def _drawn(carm, points, radius, mu, marker_mu, marker_length) -> np.ndarray:
     """Optical depth (B, rows, columns) float64 of B chains."""
-    camera = np.stack(carm.camera(points), axis=-1)
+    with np.errstate(invalid="ignore"):  # joints that are not finite
+        camera = np.stack(carm.camera(points), axis=-1)
     tail, head = camera[:, :-1], camera[:, 1:]
     along = head - tail
     # Written out: np.linalg.norm and matmul need not round alike for all shapes.

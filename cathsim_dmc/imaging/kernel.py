@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 # Steps of the radius per pixel. It sets only the spread of a shadow, not its weight.
-RADIUS_STEPS = 32
+RADIUS_STEPS = 64
 # Steps of the sub-pixel position per pixel for discs up to one pixel in radius; wider
 # shadows are smoother and need fewer.
 OFFSET_STEPS = 64

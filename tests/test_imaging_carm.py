@@ -1,0 +1,118 @@
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from cathsim_dmc.imaging import VIEWS, CArm
+
+angles = st.floats(-3.0, 3.0)
+tilts = st.floats(-1.4, 1.4)
+coordinates = st.tuples(*[st.floats(-0.15, 0.15)] * 3)
+
+
+def test_ap_image_has_the_patients_left_on_the_right_and_the_head_up():
+    carm = CArm.view("AP")
+    middle, _ = carm.project([0.0, 0.0, 0.0])
+    np.testing.assert_allclose(middle, [63.5, 63.5])
+    left, _ = carm.project([0.05, 0.0, 0.0])
+    head, _ = carm.project([0.0, 0.0, 0.05])
+    assert left[0] > middle[0] and left[1] == pytest.approx(middle[1])
+    assert head[1] < middle[1] and head[0] == pytest.approx(middle[0])
+    # The detector is in front of the chest: the front (-y) is further from the source.
+    _, depth = carm.project([[0.0, -0.05, 0.0], [0.0, 0.05, 0.0]])
+    np.testing.assert_allclose(depth, [0.80, 0.70])
+
+
+def test_signs_of_the_angles_follow_dicom():
+    # LAO: detector on the patient's left; cranial: detector towards the head.
+    assert CArm.view("LAO45").axes[2] @ [1.0, 0.0, 0.0] > 0.7
+    assert CArm.view("RAO30").axes[2] @ [1.0, 0.0, 0.0] == pytest.approx(-0.5)
+    assert CArm(secondary=0.3).axes[2] @ [0.0, 0.0, 1.0] > 0.0
+    np.testing.assert_allclose(
+        CArm.view("LATERAL").axes, [[0, 1, 0], [0, 0, -1], [1, 0, 0]], atol=1e-15
+    )
+
+
+def test_field_of_view_and_magnification():
+    carm = CArm.view("AP")
+    edge = 0.5 * carm.field_of_view[1]
+    pixel, _ = carm.project([edge, 0.0, 0.0])
+    assert pixel[0] == pytest.approx(127.5)
+    zoomed = CArm.view("AP", magnification=2.0)
+    assert zoomed.field_of_view[0] == pytest.approx(0.5 * carm.field_of_view[0])
+    assert CArm(resolution=(64, 128)).field_of_view == pytest.approx((edge, 2 * edge))
+
+
+@given(angles, tilts, coordinates)
+def test_axes_are_a_rotation_and_unproject_inverts_project(primary, secondary, point):
+    carm = CArm(primary, secondary, isocentre=(0.01, -0.02, 0.03))
+    np.testing.assert_allclose(carm.axes @ carm.axes.T, np.eye(3), atol=1e-12)
+    right, down, beam = carm.axes
+    # Not mirrored: the observer looks against the beam, as x right, y down demand.
+    np.testing.assert_allclose(np.cross(right, down), -beam, atol=1e-12)
+    pixel, depth = carm.project(point)
+    np.testing.assert_allclose(carm.unproject(pixel, depth), point, atol=1e-12)
+
+
+@given(angles, tilts)
+def test_points_of_one_ray_share_a_pixel(primary, secondary):
+    carm = CArm(primary, secondary)
+    point = np.array([0.03, -0.04, 0.06])
+    ray = carm.source + np.linspace(0.5, 1.4, 5)[:, None] * (point - carm.source)
+    pixels, _ = carm.project(ray)
+    np.testing.assert_allclose(pixels, np.broadcast_to(pixels[0], (5, 2)), atol=1e-9)
+
+
+def test_projection_equals_the_textbook_intersection_with_the_detector():
+    carm = CArm(0.4, -0.2, magnification=1.3, isocentre=(0.02, 0.01, -0.03))
+    point = np.array([0.05, 0.02, 0.04])
+    right, down, beam = carm.axes
+    centre = carm.source + carm.source_detector * beam
+    ray = point - carm.source
+    hit = carm.source + ray * ((centre - carm.source) @ beam) / (ray @ beam)
+    expected = [(hit - centre) @ right, (hit - centre) @ down]
+    pixel, _ = carm.project(point)
+    np.testing.assert_allclose((pixel - 63.5) * carm.pitch, expected, atol=1e-12)
+
+
+def test_points_behind_the_source_have_no_pixel():
+    carm = CArm.view("AP")
+    pixels, depth = carm.project([[0.0, 1.0, 0.0], [0.0, 0.0, 0.0]])
+    assert np.isnan(pixels[0]).all() and depth[0] < 0.0
+    assert np.isfinite(pixels[1]).all()
+
+
+def test_projection_does_not_depend_on_the_batch():
+    points = np.random.RandomState(0).uniform(-0.1, 0.1, (7, 5, 3))
+    carm = CArm.view("LAO45")
+    pixels, _ = carm.project(points)
+    for i in np.ndindex(7, 5):
+        assert (carm.project(points[i])[0] == pixels[i]).all()
+
+
+def test_centred_on_puts_the_box_in_the_middle():
+    carm = CArm.view("RAO30").centred_on([[0.0, 0.0, 0.0], [0.1, 0.2, 0.4]])
+    assert carm.isocentre == pytest.approx((0.05, 0.1, 0.2))
+    assert carm.primary == CArm.view("RAO30").primary
+
+
+@pytest.mark.parametrize(
+    ("fields", "message"),
+    [
+        ({"primary": np.nan}, "primary"),
+        ({"secondary": 2.0}, "secondary"),
+        ({"magnification": 0.0}, "magnification"),
+        ({"detector_size": -1.0}, "detector_size"),
+        ({"source_detector": 0.5}, "source_detector"),
+        ({"resolution": (0, 4)}, "resolution"),
+        ({"isocentre": (1.0, 2.0)}, "isocentre"),
+    ],
+)
+def test_wrong_fields_are_named(fields, message):
+    with pytest.raises(ValueError, match=message):
+        CArm(**fields)
+
+
+def test_unknown_view_lists_the_known_ones():
+    with pytest.raises(ValueError, match=", ".join(VIEWS)):
+        CArm.view("PA")

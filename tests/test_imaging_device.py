@@ -1,0 +1,289 @@
+import time
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from test_imaging_thickness import (
+    cylinder_interval,
+    pixel_mean,
+    rays,
+    sphere_interval,
+)
+
+from cathsim_dmc.imaging import VIEWS, CArm, device_attenuation, device_thickness
+from cathsim_dmc.imaging.kernel import disc_quadrant, table
+
+RADIUS = 0.84e-3
+
+
+def curve(links=36, phase=0.0):
+    """A catheter round an arch, (links + 1, 3)."""
+    s = np.linspace(0, 1, links + 1)[:, None]
+    angle = np.pi * s + phase
+    return np.concatenate(
+        [
+            0.035 * np.cos(angle),
+            0.02 * (s - 0.5) + 0.005 * np.sin(3 * angle),
+            0.05 * np.sin(angle) - 0.02,
+        ],
+        axis=1,
+    )
+
+
+def volume(points, radius):
+    length = np.linalg.norm(np.diff(points, axis=0), axis=1)
+    return (np.pi * radius**2 * length).sum() + 4 / 3 * np.pi * np.mean(radius) ** 3
+
+
+def seen_volume(carm, image, depth):
+    """Volume that an image of thickness shows of an object at one depth."""
+    area = (depth / carm.focal_length) ** 2 / carm.slant()
+    return (image * area).sum(axis=(-2, -1))
+
+
+def true_capsule(carm, start, stop, radius, supersample):
+    direction = rays(carm, supersample)
+    spans = [
+        cylinder_interval(carm.source, direction, start, stop, radius),
+        sphere_interval(carm.source, direction, start, radius),
+        sphere_interval(carm.source, direction, stop, radius),
+    ]
+    enter = np.min([np.where(b > a, a, np.inf) for a, b in spans], axis=0)
+    leave = np.max([np.where(b > a, b, -np.inf) for a, b in spans], axis=0)
+    chord = np.where(leave > enter, leave - enter, 0.0)
+    return pixel_mean(chord, supersample)
+
+
+# ---------------------------------------------------------------- the disc kernel
+
+
+@given(st.floats(-1.5, 1.5), st.floats(-1.5, 1.5))
+def test_area_of_a_quadrant_of_the_disc(x, y):
+    strips = np.linspace(-1, 1, 20001)
+    middle = 0.5 * (strips[1:] + strips[:-1])
+    half = np.sqrt(1 - middle**2)
+    height = np.clip(np.minimum(half, y) + half, 0.0, None)
+    expected = (height * (middle < x)).sum() * (strips[1] - strips[0])
+    assert disc_quadrant(x, y) == pytest.approx(expected, abs=3e-4)
+
+
+@given(st.floats(0.05, 6.0), st.floats(-0.5, 0.5), st.floats(-0.5, 0.5))
+def test_shares_sum_to_one_and_keep_the_centre(radius, row, column):
+    side = max(int(np.ceil(radius)), 1)
+    entry = table(side)
+    index = entry.rows(*(np.array([v]) for v in (radius, row, column)))
+    shares = entry.shares[index[0]].astype(float).reshape(2 * side + 1, -1)
+    assert shares.min() > -1e-6
+    assert shares.sum() == pytest.approx(1.0, abs=1e-5)
+    if side > 1:  # wide discs: the centre of mass is the centre of the disc
+        k = np.arange(2 * side + 1) - side
+        tolerance = 0.5 / entry.steps + 0.08 / radius
+        assert shares.sum(axis=1) @ k == pytest.approx(row, abs=tolerance)
+        assert shares.sum(axis=0) @ k == pytest.approx(column, abs=tolerance)
+
+
+# ----------------------------------------------------------------- accuracy
+
+
+@pytest.mark.parametrize(
+    ("view", "resolution", "supersample"),
+    [(view, 128, 16) for view in VIEWS] + [("LAO45", 256, 8)],
+)
+def test_tilted_capsule_of_catheter_size(view, resolution, supersample):
+    carm = CArm.view(view, resolution=(resolution, resolution))
+    start, stop = np.array([-0.05, 0.02, -0.06]), np.array([0.045, -0.03, 0.055])
+    image = device_thickness(carm, np.stack([start, stop]), RADIUS)
+    truth = true_capsule(carm, start, stop, RADIUS, supersample)
+    assert image.sum() == pytest.approx(truth.sum(), rel=1e-3)
+    assert np.abs(image - truth).sum() < 0.01 * truth.sum()
+
+
+def test_profile_of_a_wide_cylinder_is_its_chord():
+    carm = CArm.view("AP", resolution=(256, 256))
+    start, stop = np.array([-0.2, 0.0, -0.06]), np.array([0.2, 0.03, 0.06])
+    image = device_thickness(carm, np.stack([start, stop]), 0.008)
+    truth = true_capsule(carm, start, stop, 0.008, 4)
+    assert np.abs(image - truth).sum() < 0.01 * truth.sum()
+    assert image.max() == pytest.approx(truth.max(), rel=0.02)
+
+
+def test_end_on_the_whole_length_is_seen_in_one_spot():
+    carm = CArm.view("AP", resolution=(129, 129))
+    points = np.array([[0.0, 0.03, 0.0], [0.0, 0.0, 0.0], [0.0, -0.03, 0.0]])
+    image = device_thickness(carm, points, 2.5e-3)
+    assert image.argmax() == 64 * 129 + 64
+    assert image.max() == pytest.approx(0.06 + 4 / 3 * 2.5e-3, rel=0.02)
+
+
+@pytest.mark.parametrize("view", VIEWS)
+@pytest.mark.parametrize("magnification", [1.0, 2.0])
+def test_drawn_centreline_is_the_projected_one(view, magnification):
+    carm = CArm.view(view, magnification=magnification)
+    points = curve()
+    t = np.linspace(0, 1, 4001)
+    knots = np.linspace(0, 1, len(points))
+    dense = np.stack([np.interp(t, knots, points[:, i]) for i in range(3)], -1)
+    truth, _ = carm.project(dense)
+    image = device_thickness(carm, points, RADIUS)
+
+    # Weight in a window round a point of the curve has its centre of mass on the
+    # curve, where the curve is seen once and nearly straight.
+    rows, columns = np.indices(image.shape)
+    distances = []
+    for centre in truth[200:-200:100]:
+        near = np.hypot(truth[:, 0] - centre[0], truth[:, 1] - centre[1]) < 6
+        parts = np.flatnonzero(np.diff(np.flatnonzero(near)) > 1)
+        inside = (centre > 4).all() and (centre < 123).all()
+        if len(parts) or not inside:
+            continue
+        window = np.exp(-((columns - centre[0]) ** 2 + (rows - centre[1]) ** 2) / 2.0)
+        weight = image * window
+        found = np.array([(weight * columns).sum(), (weight * rows).sum()])
+        found /= weight.sum()
+        distances.append(np.hypot(*(truth - found).T).min())
+    assert len(distances) >= 8
+    assert max(distances) < 0.5
+    assert np.mean(distances) < 0.15
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    st.floats(0, 2 * np.pi),
+    st.floats(-1.4, 1.4),
+    st.floats(-1.0, 1.0),
+    st.floats(-1.0, 1.0),
+    st.floats(0.1e-3, 3e-3),
+)
+def test_weight_is_kept_under_rotation_and_subpixel_motion(turn, tilt, dx, dz, radius):
+    carm = CArm.view("AP")
+    pixel = carm.pitch * carm.source_isocentre / carm.source_detector
+    half = 0.03 * np.array(
+        [
+            np.cos(turn) * np.cos(tilt),
+            np.sin(tilt),
+            np.sin(turn) * np.cos(tilt),
+        ]
+    )
+    centre = np.array([dx * pixel, 0.0, dz * pixel])
+    points = np.stack([centre - half, centre, centre + half])
+    image = device_thickness(carm, points, radius)
+    depth = carm.project(points)[1]
+    expected = volume(points, radius)
+    # Mean of (focal / depth)² along the rod, in closed form.
+    shrink = 1.0 / (depth[0] * depth[2]) * depth[1] ** 2
+    seen = seen_volume(carm, image, depth[1]) / shrink
+    assert seen == pytest.approx(expected, rel=0.01)
+
+
+@pytest.mark.parametrize("radius", [0.2e-3, RADIUS, 3e-3])
+def test_subpixel_position_decides_the_shares_of_neighbouring_pixels(radius):
+    # An upright rod: columns get the exact area of its half-elliptic profile.
+    carm = CArm.view("AP")
+    pixel = carm.pitch * carm.source_isocentre / carm.source_detector
+    points = np.array([[0.0, 0.0, -0.03], [0.0, 0.0, 0.03]])
+    shift = np.arange(0, 41) / 16 + 0.01
+    moved = points + shift[:, None, None] * pixel * [1.0, 0.0, 0.0]
+    image = device_thickness(carm, moved, radius)
+    edges = np.arange(129) - 0.5
+    t = np.clip((edges - 63.5 - shift[:, None]) * pixel / radius, -1, 1)
+    share = np.diff((t * np.sqrt(1 - t * t) + np.arcsin(t)) / np.pi, axis=-1)
+    columns = image.sum(axis=1) / image.sum(axis=(1, 2))[:, None]
+    np.testing.assert_allclose(columns, share, atol=0.02 * min(pixel / radius, 2.5))
+    assert np.abs(columns - share).mean() * 128 < 0.02
+    np.testing.assert_allclose(image.sum(axis=(1, 2)), image[0].sum(), rtol=2e-3)
+
+
+# ------------------------------------------------------------------- marker
+
+
+def test_marker_adds_its_weight_at_the_tip():
+    carm = CArm.view("AP")
+    points = np.linspace([-0.05, 0, 0], [0.05, 0, 0], 15)
+    plain = device_attenuation(carm, points, RADIUS, mu=100.0)
+    marked = device_attenuation(carm, points, RADIUS, 100.0, 1100.0, 4e-3)
+    extra = (marked - plain).astype(float)
+    depth = carm.source_isocentre
+    # The marker covers the last 4 mm of the chain, its round end included.
+    expected = 1000.0 * np.pi * RADIUS**2 * 4e-3
+    assert seen_volume(carm, extra, depth) == pytest.approx(expected, rel=0.02)
+    where = (extra.sum(axis=0) * np.arange(128)).sum() / extra.sum()
+    tip = np.array([0.05 + 2 / 3 * RADIUS - 2e-3, 0, 0])
+    assert where == pytest.approx(carm.project(tip)[0][0], abs=0.15)
+    assert extra.min() > -1e-6
+
+
+def test_marker_longer_than_a_link_runs_over_several():
+    carm = CArm.view("AP")
+    points = np.linspace([-0.05, 0, 0], [0.05, 0, 0], 51)
+    extra = device_attenuation(carm, points, RADIUS, 0.0, 1.0, 0.02)
+    expected = np.pi * RADIUS**2 * 0.02
+    assert seen_volume(carm, extra, 0.75) == pytest.approx(expected, rel=0.01)
+
+
+# -------------------------------------------------------------------- batches
+
+
+def test_a_batch_equals_its_frames_bit_for_bit():
+    rng = np.random.RandomState(1)
+    points = curve() + rng.uniform(-0.02, 0.02, (5, 7, 1, 3))
+    radius = rng.uniform(0.3e-3, 4e-3, (5, 7))
+    carm = CArm(0.3, 0.1)
+    batch = device_attenuation(carm, points, radius, 100.0, 900.0, 3e-3)
+    assert batch.shape == (5, 7, 128, 128) and batch.dtype == np.float32
+    for i in np.ndindex(5, 7):
+        single = device_attenuation(carm, points[i], radius[i], 100.0, 900.0, 3e-3)
+        assert (single == batch[i]).all()
+
+
+def test_radius_per_device_and_per_link():
+    carm = CArm.view("AP")
+    points = np.stack([curve(), curve(phase=0.2)])
+    one = device_thickness(carm, points, RADIUS)
+    assert (device_thickness(carm, points, [RADIUS, RADIUS]) == one).all()
+    assert (device_thickness(carm, points, np.full((2, 36), RADIUS)) == one).all()
+    tapered = np.linspace(1.2e-3, 0.5e-3, 36)
+    image = device_thickness(carm, points[0], tapered)
+    assert image.sum() > device_thickness(carm, points[0], 0.5e-3).sum()
+
+
+def test_devices_outside_the_view_or_broken_leave_the_rest():
+    carm = CArm.view("AP")
+    points = np.stack([curve(), curve() + [1.0, 0, 0], curve() + [0, 3.0, 0], curve()])
+    points[3, 5] = np.nan
+    image = device_thickness(carm, points, RADIUS)
+    assert (image[1:3] == 0.0).all()
+    assert np.isfinite(image).all()
+    assert 0.8 * image[0].sum() < image[3].sum() < image[0].sum()
+    assert (device_thickness(carm, np.full((2, 3), np.inf), RADIUS) == 0.0).all()
+    # A device that leaves the image is cut at its edge.
+    line = np.linspace([-0.5, 0, 0], [0.5, 0, 0], 101)
+    image = device_thickness(carm, line, RADIUS)
+    assert image.sum(axis=0) == pytest.approx(image.sum(axis=0).mean(), rel=0.02)
+    far = device_thickness(carm, [[0, 0, 0], [1e9, 0, 0]], RADIUS)
+    assert np.isfinite(far).all()
+
+
+@pytest.mark.parametrize(
+    ("points", "radius", "message"),
+    [
+        (np.zeros((1, 3)), RADIUS, "n >= 2"),
+        (np.zeros((4, 2)), RADIUS, r"\(\.\.\., n, 3\)"),
+        (curve(), 0.0, "> 0"),
+        (curve(), np.full(12, RADIUS), "radius has shape"),
+        (curve(), 0.5, "px in radius"),
+    ],
+)
+def test_wrong_devices_are_refused(points, radius, message):
+    with pytest.raises(ValueError, match=message):
+        device_thickness(CArm(), points, radius)
+
+
+def test_fifteen_hundred_frames_a_second():
+    carm = CArm.view("AP")
+    points = curve() + np.random.RandomState(0).uniform(-0.01, 0.01, (150, 1, 3))
+    device_thickness(carm, points, RADIUS)
+    start = time.process_time()
+    device_thickness(carm, points, RADIUS)
+    # A third of the target, so that a busy machine does not fail the test.
+    assert time.process_time() - start < 150 / 500

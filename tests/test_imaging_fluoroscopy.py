@@ -1,0 +1,318 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from test_imaging_device import RADIUS, curve
+from test_imaging_thickness import ball, tube
+
+from cathsim_dmc.imaging import (
+    VIEWS,
+    Biplane,
+    CArm,
+    Fluoroscope,
+    detector,
+    materials,
+    rgb,
+)
+
+
+@pytest.fixture(scope="module")
+def vessel():
+    """A tube round the catheter of `curve`."""
+    return tube(curve(links=60), 0.01, sides=32)
+
+
+@pytest.fixture(scope="module")
+def fluoroscope(vessel):
+    return Fluoroscope.from_surface(*vessel)
+
+
+@pytest.fixture(scope="module")
+def frames():
+    return curve() + np.random.RandomState(3).uniform(-5e-3, 5e-3, (20, 1, 3))
+
+
+# ------------------------------------------------------------------- detector
+
+
+def test_transmission_is_beer_lambert():
+    mu, length = 20.6, np.array([[0.0, 0.05], [0.1, 0.2]])
+    np.testing.assert_allclose(
+        detector.transmission(mu * length), np.exp(-20.6 * length), rtol=1e-6
+    )
+
+
+@pytest.mark.parametrize("quanta", [5.0, 20.0, 400.0, 4000.0])
+def test_noise_has_the_moments_of_poisson(quanta):
+    signal = np.ones((8, 256, 256), dtype=np.float32)
+    counts = (
+        detector.quantum_noise(signal, quanta, np.random.RandomState(0)) * quanta
+    ).astype(float)
+    assert counts.mean() == pytest.approx(quanta, rel=0.005)
+    assert counts.var() == pytest.approx(quanta, rel=0.01)
+    centred = counts - counts.mean()
+    skew = (centred**3).mean() / counts.std() ** 3
+    assert skew == pytest.approx(quanta**-0.5, abs=0.02)
+    np.testing.assert_allclose(counts, np.rint(counts), atol=1e-2)
+
+
+def test_noise_is_zero_without_quanta_and_never_negative():
+    rs = np.random.RandomState(0)
+    dark = detector.quantum_noise(np.zeros((64, 64)), 1000.0, rs)
+    assert dark.max() <= 3.0 / 1000.0
+    dim = detector.quantum_noise(np.full((64, 64), 1e-3), 1000.0, rs)
+    assert dim.min() >= 0.0 and dim.mean() == pytest.approx(1e-3, rel=0.2)
+
+
+@settings(max_examples=30)
+@given(st.floats(0.2, 4.0))
+def test_blur_keeps_weight_and_has_its_width(sigma):
+    point = np.zeros((61, 61), dtype=np.float32)
+    point[30, 30] = 1.0
+    spread = detector.blurred(point, sigma).astype(float)
+    assert spread.sum() == pytest.approx(1.0, rel=1e-5)
+    x = np.arange(61) - 30
+    variance = (spread.sum(axis=0) * x**2).sum()
+    # Cut off at three sigma, and sampled: exact for wide blurs.
+    if sigma > 0.6:
+        assert variance == pytest.approx(sigma**2, rel=0.06)
+    np.testing.assert_allclose(spread, spread.T, atol=1e-7)
+    flat = np.full((2, 9, 5), 0.3, dtype=np.float32)
+    np.testing.assert_allclose(detector.blurred(flat, sigma), 0.3, rtol=1e-5)
+
+
+def test_grey_levels():
+    signal = np.array([[-1.0, 0.0, 0.5], [1.0, 1.2, 9.0]])
+    image = detector.grey(signal, gain=0.8)
+    assert image.dtype == np.uint8
+    assert image.tolist() == [[0, 0, 102], [204, 245, 255]]
+
+
+def test_materials_are_ordered_as_on_a_screen():
+    assert 0 < materials.CATHETER < materials.NITINOL_WIRE < materials.STEEL_WIRE
+    assert materials.CATHETER < materials.MARKER < materials.PLATINUM
+    assert materials.homogenised([100.0], [0.0]) == 0.0
+    assert materials.homogenised(120.6, 0.5) == pytest.approx(50.0)
+    with pytest.raises(ValueError, match="fractions"):
+        materials.homogenised([1.0, 2.0], [0.6, 0.6])
+
+
+# ----------------------------------------------------------------- the image
+
+
+def test_image_is_beer_lambert_of_its_parts(fluoroscope, frames):
+    from cathsim_dmc.imaging import device_attenuation
+
+    image = fluoroscope.render(frames, RADIUS)
+    assert image.shape == (20, 128, 128, 1) and image.dtype == np.uint8
+    depth = device_attenuation(
+        fluoroscope.carm,
+        frames,
+        RADIUS,
+        materials.CATHETER,
+        materials.MARKER,
+        materials.MARKER_LENGTH,
+    )
+    total = materials.IODINE * materials.CONTRAST * fluoroscope.vessel + depth
+    expected = 255.0 * detector.GAIN * np.exp(-total.astype(float))
+    assert np.abs(image[..., 0] - expected).max() < 0.51
+
+
+@pytest.mark.parametrize("view", VIEWS)
+def test_device_and_vessel_are_darker_than_tissue(vessel, frames, view):
+    carm = CArm.view(view).centred_on(vessel[0])
+    scope = Fluoroscope.from_surface(*vessel, carm=carm)
+    image = scope.render(frames[0], RADIUS)[..., 0].astype(float)
+    masks = scope.masks(frames[0], RADIUS)
+    tissue = image[(scope.vessel == 0.0) & ~masks.device].mean()
+    lumen = image[masks.vessel & ~masks.device].mean()
+    device = image[masks.device].mean()
+    assert tissue == pytest.approx(255 * detector.GAIN, abs=1.0)
+    assert tissue - 15 > lumen > device + 15
+
+
+def test_contrast_off_shows_the_device_only(fluoroscope, frames):
+    plain = replace(fluoroscope, contrast=0.0)
+    image = plain.render(frames[0], RADIUS)[..., 0]
+    device = plain.masks(frames[0], RADIUS).device
+    level = round(255 * detector.GAIN)
+    assert (image[device] < level - 10).all()
+    untouched = image[np.abs(image.astype(int) - level) <= 1]
+    assert untouched.size > 0.95 * image.size
+    darker = replace(fluoroscope, contrast=30.0).render(frames[0], RADIUS)[..., 0]
+    normal = fluoroscope.render(frames[0], RADIUS)[..., 0]
+    assert (darker[fluoroscope.vessel_mask] < normal[fluoroscope.vessel_mask]).all()
+
+
+def test_tip_marker_is_the_darkest_part(fluoroscope, frames):
+    plain = replace(fluoroscope, contrast=0.0)
+    image = plain.render(frames, RADIUS)[..., 0]
+    for frame, points in zip(image, frames, strict=True):
+        row, column = np.unravel_index(frame.argmin(), frame.shape)
+        tip, _ = plain.carm.project(points[-1])
+        assert np.hypot(column - tip[0], row - tip[1]) < 1.6
+
+
+def test_roadmap_lightens_the_vessel(fluoroscope, frames):
+    live = replace(fluoroscope, contrast=0.0)
+    road = replace(live, roadmap=0.5)
+    a = live.render(frames[0], RADIUS)[..., 0].astype(int)
+    b = road.render(frames[0], RADIUS)[..., 0].astype(int)
+    mask = fluoroscope.vessel_mask
+    assert (a[~mask] == b[~mask]).all()
+    assert (b[mask] > a[mask]).all()
+    device = road.masks(frames[0], RADIUS).device
+    assert b[device & mask].mean() < b[~device & mask].mean() - 10
+
+
+def test_device_mask_covers_the_catheter(fluoroscope, frames):
+    masks = fluoroscope.masks(frames, RADIUS)
+    assert masks.device.shape == (20, 128, 128) and masks.device.dtype == bool
+    for mask, points in zip(masks.device, frames, strict=True):
+        pixels, _ = fluoroscope.carm.project(points)
+        t = np.linspace(0, 36, 800)
+        line = np.stack([np.interp(t, np.arange(37), p) for p in pixels.T], -1)
+        c, r = np.rint(line).astype(int).T
+        assert mask[r, c].mean() > 0.97
+        r, c = np.nonzero(mask)
+        far = np.hypot(c[:, None] - line[:, 0], r[:, None] - line[:, 1]).min(axis=1)
+        assert far.max() < 1.2
+
+
+def test_vessel_mask_is_the_silhouette():
+    scope = Fluoroscope.from_surface(*ball([0, 0, 0], 0.03))
+    carm = scope.carm
+    distance = carm.source_isocentre
+    edge = 0.03 / np.sqrt(distance**2 - 0.03**2) * carm.focal_length
+    rows, columns = np.indices((128, 128)) - 63.5
+    away = np.hypot(rows, columns)
+    assert scope.vessel_mask[away < edge - 0.1].all()
+    assert not scope.vessel_mask[away > edge + 0.1].any()
+
+
+def test_uneven_patient_shades_the_image(vessel):
+    depth = np.full((128, 128), 0.20)
+    depth[:, 64:] = 0.22
+    scope = Fluoroscope.from_surface(*vessel, background=depth, contrast=0.0)
+    np.testing.assert_allclose(scope.signal.mean(), 1.0, rtol=1e-5)
+    ratio = scope.signal[0, 100] / scope.signal[0, 10]
+    assert ratio == pytest.approx(np.exp(-20.6 * 0.02), rel=1e-5)
+
+
+# --------------------------------------------------------- batches and seeds
+
+
+def test_a_batch_equals_its_frames_bit_for_bit(fluoroscope, frames):
+    blurry = replace(fluoroscope, blur=2e-3, roadmap=0.3)
+    for scope in (fluoroscope, blurry):
+        batch = scope.render(frames.reshape(4, 5, 37, 3), RADIUS)
+        for i in range(20):
+            single = scope.render(frames[i], RADIUS)
+            assert (single == batch.reshape(20, 128, 128, 1)[i]).all()
+
+
+@pytest.mark.parametrize("resolution", [(128, 128), (33, 47)])
+def test_noisy_batches_equal_noisy_frames(vessel, frames, resolution):
+    carm = CArm(resolution=resolution).centred_on(vessel[0])
+    scope = Fluoroscope.from_surface(*vessel, carm=carm)
+    batch = scope.render(frames, RADIUS, np.random.RandomState(7))
+    one = np.random.RandomState(7)
+    singles = np.stack([scope.render(p, RADIUS, one) for p in frames])
+    assert (batch == singles).all()
+
+    states = [np.random.RandomState(k) for k in range(20)]
+    batch = scope.render(frames, RADIUS, states)
+    singles = np.stack(
+        [
+            scope.render(p, RADIUS, np.random.RandomState(k))
+            for k, p in enumerate(frames)
+        ]
+    )
+    assert (batch == singles).all()
+
+
+def test_seeds_decide_the_noise(fluoroscope, frames):
+    def image(seed):
+        return fluoroscope.render(frames[0], RADIUS, np.random.RandomState(seed))
+
+    assert (image(0) == image(0)).all()
+    assert (image(0) != image(1)).mean() > 0.5
+    clean = fluoroscope.render(frames[0], RADIUS)
+    assert (clean == fluoroscope.render(frames[0], RADIUS)).all()
+    residual = image(0).astype(float) - clean
+    tissue = fluoroscope.vessel[..., None] == 0.0
+    expected = 255 * detector.GAIN / np.sqrt(fluoroscope.quanta)
+    # Without noise, tissue is rounded from 191.25 to 191.
+    assert residual[tissue].mean() == pytest.approx(0.25, abs=0.1)
+    assert residual[tissue].std() == pytest.approx(expected, rel=0.15)
+
+
+def test_more_dose_is_less_noise(fluoroscope, frames):
+    clean = fluoroscope.render(frames[0], RADIUS).astype(float)
+    spread = []
+    for kerma in (5e-9, 100e-9):
+        scope = replace(fluoroscope, kerma=kerma)
+        noisy = scope.render(frames[0], RADIUS, np.random.RandomState(0))
+        spread.append((noisy - clean).std())
+    assert spread[0] > 3 * spread[1]
+
+
+def test_rendering_changes_nothing(fluoroscope, frames):
+    points, signal = frames.copy(), fluoroscope.signal.copy()
+    fluoroscope.render(points, RADIUS, np.random.RandomState(0))
+    assert (points == frames).all() and (signal == fluoroscope.signal).all()
+    with pytest.raises(ValueError):
+        fluoroscope.vessel[0, 0] = 1.0
+
+
+# ------------------------------------------------------------- biplane, rgb
+
+
+def test_biplane_stacks_two_views(vessel, frames):
+    planes = [
+        Fluoroscope.from_surface(*vessel, carm=CArm.view(v).centred_on(vessel[0]))
+        for v in ("AP", "LATERAL")
+    ]
+    image = Biplane(*planes).render(frames, RADIUS)
+    assert image.shape == (20, 128, 128, 2)
+    for channel, plane in enumerate(planes):
+        assert (image[..., channel] == plane.render(frames, RADIUS)[..., 0]).all()
+    states = [np.random.RandomState(k) for k in range(20)]
+    noisy = Biplane(*planes).render(frames, RADIUS, states)
+    single = Biplane(*planes).render(frames[4], RADIUS, np.random.RandomState(4))
+    assert (noisy[4] == single).all()
+    small = replace(planes[0].carm, resolution=(64, 64))
+    with pytest.raises(ValueError, match="resolution"):
+        Biplane(planes[0], Fluoroscope.from_surface(*vessel, carm=small))
+
+
+def test_rgb_repeats_the_grey_channel(fluoroscope, frames):
+    image = fluoroscope.render(frames[0], RADIUS)
+    colour = rgb(image)
+    assert colour.shape == (128, 128, 3) and colour.dtype == np.uint8
+    assert (colour == image).all()
+    with pytest.raises(ValueError, match="biplane"):
+        rgb(np.zeros((128, 128, 2), dtype=np.uint8))
+
+
+@pytest.mark.parametrize(
+    ("fields", "message"),
+    [
+        ({"contrast": -1.0}, "contrast"),
+        ({"gain": 0.0}, "gain"),
+        ({"kerma": 0.0}, "kerma"),
+        ({"roadmap": 1.5}, "roadmap"),
+        ({"background": np.zeros(3)}, "background"),
+        ({"vessel": np.zeros((4, 4))}, "vessel"),
+    ],
+)
+def test_wrong_fields_are_named(fluoroscope, fields, message):
+    with pytest.raises(ValueError, match=message):
+        replace(fluoroscope, **fields)
+
+
+def test_wrong_number_of_random_states_is_refused(fluoroscope, frames):
+    with pytest.raises(ValueError, match="random states"):
+        fluoroscope.render(frames, RADIUS, [np.random.RandomState(0)])

@@ -1,0 +1,287 @@
+import time
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from cathsim_dmc.imaging import VIEWS, CArm, closed, surface_thickness
+
+
+def rays(carm, supersample):
+    """Unit directions (rows * s, columns * s, 3) from the source."""
+    rows, columns = carm.resolution
+    x = (np.arange(columns * supersample) + 0.5) / supersample - 0.5
+    y = (np.arange(rows * supersample) + 0.5) / supersample - 0.5
+    pixels = np.stack(np.meshgrid(x, y), axis=-1)
+    direction = carm.unproject(pixels, np.ones(pixels.shape[:2])) - carm.source
+    return direction / np.linalg.norm(direction, axis=-1, keepdims=True)
+
+
+def pixel_mean(image, supersample):
+    rows, columns = (n // supersample for n in image.shape)
+    return image.reshape(rows, supersample, columns, supersample).mean(axis=(1, 3))
+
+
+def sphere_interval(origin, direction, centre, radius):
+    offset = centre - origin
+    along = direction @ offset
+    half = np.sqrt(np.maximum(radius**2 - (offset @ offset - along**2), 0.0))
+    return along - half, along + half
+
+
+def cylinder_interval(origin, direction, start, stop, radius):
+    """Where rays are inside a cylinder with flat ends; empty if enter > leave."""
+    axis = (stop - start) / np.linalg.norm(stop - start)
+    across = direction - (direction @ axis)[..., None] * axis
+    offset = origin - start
+    offset_across = offset - offset @ axis * axis
+    a = (across**2).sum(axis=-1)
+    b = across @ offset_across
+    c = offset_across @ offset_across - radius**2
+    root = b * b - a * c
+    with np.errstate(divide="ignore", invalid="ignore"):
+        half = np.sqrt(np.maximum(root, 0.0)) / a
+        middle = -b / a
+        ends = np.stack(
+            [
+                ((start - origin) @ axis) / (direction @ axis),
+                ((stop - origin) @ axis) / (direction @ axis),
+            ]
+        )
+    enter = np.maximum(middle - half, ends.min(axis=0))
+    leave = np.minimum(middle + half, ends.max(axis=0))
+    return np.where(root > 0.0, enter, 0.0), np.where(root > 0.0, leave, -1.0)
+
+
+def tube(line, radius, sides=48, cap=True):
+    """Triangle tube round a polyline, closed by fans unless cap is False."""
+    line = np.asarray(line, dtype=float)
+    radius = np.broadcast_to(radius, len(line))
+    tangent = np.gradient(line, axis=0)
+    tangent /= np.linalg.norm(tangent, axis=1, keepdims=True)
+    helper = np.eye(3)[np.argmin(np.abs(tangent).max(axis=0))]
+    u = np.cross(tangent, helper)
+    u /= np.linalg.norm(u, axis=1, keepdims=True)
+    v = np.cross(tangent, u)
+    angle = np.arange(sides) * 2 * np.pi / sides
+    # Outer polygon of the area of the circle: chords then agree in the mean.
+    size = radius * np.sqrt(2 * np.pi / sides / np.sin(2 * np.pi / sides))
+    ring = line[:, None] + size[:, None, None] * (
+        np.cos(angle)[:, None] * u[:, None] + np.sin(angle)[:, None] * v[:, None]
+    )
+    vertices = ring.reshape(-1, 3)
+    i, j = np.meshgrid(np.arange(len(line) - 1), np.arange(sides), indexing="ij")
+    a, b = i * sides + j, i * sides + (j + 1) % sides
+    c, d = a + sides, b + sides
+    faces = np.concatenate(
+        [np.stack([a, b, d], -1).reshape(-1, 3), np.stack([a, d, c], -1).reshape(-1, 3)]
+    )
+    if cap:
+        last = (len(line) - 1) * sides
+        k = np.arange(sides)
+        n = len(vertices)
+        vertices = np.concatenate([vertices, line[[0, -1]]])
+        faces = np.concatenate(
+            [
+                faces,
+                np.stack([np.full(sides, n), (k + 1) % sides, k], -1),
+                np.stack([np.full(sides, n + 1), last + k, last + (k + 1) % sides], -1),
+            ]
+        )
+    return vertices, faces
+
+
+def ball(centre, radius, count=90):
+    """A sphere as a tube with pole caps."""
+    t = np.linspace(0, np.pi, count + 2)[1:-1]
+    line = np.asarray(centre) - radius * np.cos(t)[:, None] * [0.0, 0.0, 1.0]
+    vertices, faces = tube(line, radius * np.sin(t), sides=2 * count)
+    vertices[-2:] = np.asarray(centre) + radius * np.array([[0, 0, -1.0], [0, 0, 1.0]])
+    return vertices, faces
+
+
+def capsule(start, stop, radius, count=40):
+    axis = (stop - start) / np.linalg.norm(stop - start)
+    t = np.linspace(0, np.pi / 2, count + 1)[1:]
+    first = start - radius * np.cos(t)[:, None] * axis
+    second = stop + radius * np.cos(t[::-1])[:, None] * axis
+    line = np.concatenate([first, second])
+    size = radius * np.concatenate([np.sin(t), np.sin(t[::-1])])
+    vertices, faces = tube(line, size, sides=160)
+    vertices[-2:] = start - radius * axis, stop + radius * axis
+    return vertices, faces
+
+
+def relative_error(image, truth):
+    return np.abs(image - truth).sum() / truth.sum()
+
+
+@pytest.mark.parametrize("view", VIEWS)
+def test_sphere(view):
+    carm = CArm.view(view, isocentre=(0.0, 0.01, 0.0))
+    centre, radius = np.array([0.02, -0.01, 0.03]), 0.03
+    vertices, faces = ball(centre, radius)
+    enter, leave = sphere_interval(carm.source, rays(carm, 3), centre, radius)
+    truth = pixel_mean(leave - enter, 3)
+    image = surface_thickness(carm, vertices, faces, 3)
+    assert relative_error(image, truth) < 0.01
+    assert image.max() == pytest.approx(2 * radius, rel=2e-3)
+
+
+@pytest.mark.parametrize("view", VIEWS)
+def test_cylinder(view):
+    carm = CArm.view(view)
+    start, stop = np.array([0.01, 0.0, -0.06]), np.array([0.01, 0.0, 0.05])
+    vertices, faces = tube(np.linspace(start, stop, 12), 0.012, sides=128)
+    enter, leave = cylinder_interval(carm.source, rays(carm, 3), start, stop, 0.012)
+    truth = pixel_mean(np.maximum(leave - enter, 0.0), 3)
+    image = surface_thickness(carm, vertices, faces, 3)
+    assert relative_error(image, truth) < 0.01
+
+
+@pytest.mark.parametrize("view", VIEWS)
+def test_tilted_capsule(view):
+    carm = CArm.view(view, magnification=1.5)
+    start, stop, radius = (
+        np.array([-0.03, 0.02, -0.03]),
+        np.array([0.02, -0.02, 0.03]),
+        0.01,
+    )
+    vertices, faces = capsule(start, stop, radius)
+    direction = rays(carm, 3)
+    spans = [
+        cylinder_interval(carm.source, direction, start, stop, radius),
+        sphere_interval(carm.source, direction, start, radius),
+        sphere_interval(carm.source, direction, stop, radius),
+    ]
+    # A capsule is convex: its chord is the hull of the chords of its parts.
+    enter = np.min([np.where(b > a, a, np.inf) for a, b in spans], axis=0)
+    leave = np.max([np.where(b > a, b, -np.inf) for a, b in spans], axis=0)
+    truth = pixel_mean(np.where(leave > enter, leave - enter, 0.0), 3)
+    image = surface_thickness(carm, vertices, faces, 3)
+    assert relative_error(image, truth) < 0.01
+
+
+@settings(max_examples=40, deadline=None)
+@given(
+    st.floats(-3.0, 3.0),
+    st.floats(-1.3, 1.3),
+    st.floats(-0.03, 0.03),
+    st.floats(-0.03, 0.03),
+    st.integers(1, 3),
+)
+def test_volume_is_seen_from_everywhere(primary, secondary, x, z, supersample):
+    carm = CArm(primary, secondary)
+    centre, radius = np.array([x, 0.01, z]), 0.025
+    vertices, faces = ball(centre, radius, count=30)
+    image = surface_thickness(carm, vertices, faces, supersample)
+    # A ray through a pixel stands for the solid angle of the pixel.
+    depth = (centre - carm.source) @ carm.axes[2]
+    area = (depth / carm.focal_length) ** 2 / carm.slant()
+    volume = np.linalg.det(vertices[faces]).sum() / 6
+    # Depth varies inside the ball: (1 + r²/5d²) of the volume at most.
+    assert (image * area).sum() == pytest.approx(volume, rel=0.01)
+    assert image.min() >= 0.0
+
+
+def test_no_ray_slips_between_triangles():
+    # A lattice that falls exactly on ray positions: every vertex and edge is hit.
+    carm = CArm(resolution=(32, 32))
+    n = 17
+    grid = np.linspace(4, 20, n)
+    x, y = np.meshgrid(grid, grid)
+    pixels = np.stack([x, y], axis=-1).reshape(-1, 2)
+    front = carm.unproject(pixels, np.full(len(pixels), 0.80))
+    back = carm.unproject(pixels, np.full(len(pixels), 0.70))
+    vertices = np.concatenate([front, back])
+    i, j = np.meshgrid(np.arange(n - 1), np.arange(n - 1), indexing="ij")
+    a = (i * n + j).ravel()
+    b, c, d = a + 1, a + n, a + n + 1
+    # Rows run down: seen from the detector (front), a, c, b is counter-clockwise.
+    sheet = np.concatenate([np.stack([a, c, b], -1), np.stack([b, c, d], -1)])
+    faces = np.concatenate([sheet, sheet[:, ::-1] + n * n])
+    vertices, faces = closed_sides(vertices, faces)
+    image = surface_thickness(carm, vertices, faces, 1)
+    inside = image[4:20, 4:20] / carm.slant()[4:20, 4:20]
+    np.testing.assert_allclose(inside, 0.10, rtol=1e-9)
+    image[4:21, 4:21] = 0.0
+    assert (image == 0.0).all()
+
+
+def closed_sides(vertices, faces):
+    """Join the rims of two sheets by a band of triangles."""
+    edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
+    known = {tuple(e) for e in edges.tolist()}
+    half = len(vertices) // 2
+    rim = [(a, b) for a, b in known if (b, a) not in known and a < half]
+    band = []
+    for a, b in rim:
+        band += [(b, a, a + half), (b, a + half, b + half)]
+    return vertices, np.concatenate([faces, np.array(band)])
+
+
+def test_two_bodies_add_and_a_hollow_one_subtracts():
+    carm = CArm.view("AP")
+    outer, inner = ball([0, 0, 0], 0.03), ball([0, 0, 0], 0.02)
+    a = surface_thickness(carm, *outer)
+    b = surface_thickness(carm, *inner)
+    vertices = np.concatenate([outer[0], inner[0]])
+    shell = np.concatenate([outer[1], inner[1][:, ::-1] + len(outer[0])])
+    np.testing.assert_allclose(
+        surface_thickness(carm, vertices, shell), a - b, atol=1e-12
+    )
+
+
+def test_open_ends_are_closed_flat():
+    line = np.linspace([0, 0, -0.05], [0.02, 0.01, 0.05], 9)
+    open_tube = tube(line, 0.01, cap=False)
+    capped = tube(line, 0.01, cap=True)
+    carm = CArm.view("LAO45")
+    vertices, faces = closed(*open_tube)
+    assert len(faces) == len(capped[1])
+    np.testing.assert_allclose(
+        surface_thickness(carm, vertices, faces),
+        surface_thickness(carm, *capped),
+        atol=1e-9,
+    )
+    # Vertices stored once per face, as in an STL file, are merged.
+    soup = open_tube[0][open_tube[1]].reshape(-1, 3)
+    merged, _ = closed(soup, np.arange(len(soup)).reshape(-1, 3))
+    assert len(merged) == len(vertices)
+
+
+def test_parts_outside_the_image_are_cut_off():
+    line = np.linspace([0, 0, -0.4], [0, 0, 0.4], 60)
+    image = surface_thickness(CArm.view("AP"), *tube(line, 0.01))
+    middle = surface_thickness(CArm.view("AP"), *tube(line[10:50], 0.01))
+    np.testing.assert_allclose(image, middle, atol=1e-6)
+
+
+def test_twenty_thousand_triangles_take_less_than_half_a_second():
+    vertices, faces = ball([0, 0, 0], 0.05, count=71)
+    assert len(faces) > 20_000
+    carm = CArm.view("AP")
+    start = time.process_time()
+    surface_thickness(carm, vertices, faces, 3)
+    assert time.process_time() - start < 0.5
+
+
+def test_bad_surfaces_are_refused():
+    vertices, faces = ball([0, 0, 0], 0.03, count=10)
+    with pytest.raises(ValueError, match="outwards"):
+        closed(vertices, faces[:, ::-1])
+    turned = faces.copy()
+    turned[5] = turned[5, ::-1]
+    with pytest.raises(ValueError, match="wound"):
+        closed(vertices, turned)
+    with pytest.raises(ValueError, match="indices"):
+        closed(vertices, faces + 5)
+    with pytest.raises(ValueError, match="no faces"):
+        closed(vertices, faces[:0])
+    with pytest.raises(ValueError, match="supersample"):
+        surface_thickness(CArm(), vertices, faces, 0)
+    with pytest.raises(ValueError, match="source"):
+        surface_thickness(CArm(), vertices + [0.0, 0.75, 0.0], faces)
+    with pytest.raises(ValueError, match=r"\(V, 3\)"):
+        surface_thickness(CArm(), vertices[:, :2], faces)
