@@ -25,6 +25,10 @@ _LEAK_DEPTH = 1.5e-3
 # Rays that leave through the inlet are no leaks; the hole's corners reach this far
 # (m) from the axis.
 _INLET_RADIUS = 1.7e-3
+# Pieces are grown by this much (m) when lines are cut with them.
+_SEAM = 1e-7
+# Rays start within this share of the lumen radius from a centreline.
+_OFF_AXIS = 0.7
 
 
 @dataclass(frozen=True)
@@ -123,7 +127,7 @@ def tube_samples(tree: VesselTree, spacing: float) -> SurfaceSamples:
     if not spacing > 0.0:
         raise ValueError(f"spacing is {spacing:g} m; it must be > 0.")
     points, outward, radii = [], [], []
-    for name, vessel in tree.vessels.items():
+    for vessel in tree.vessels.values():
         line = vessel.centreline
         count = max(2, round(line.length / spacing))
         place = line.at((np.arange(count) + 0.5) * line.length / count)
@@ -139,8 +143,6 @@ def tube_samples(tree: VesselTree, spacing: float) -> SurfaceSamples:
             points.append(place.position[i] + place.radius[i] * spokes)
             outward.append(spokes)
             radii.append(np.full(around, place.radius[i]))
-        owner = [name] * 0
-        del owner
     joined = SurfaceSamples(
         np.concatenate(points), np.concatenate(outward), np.concatenate(radii)
     )
@@ -163,12 +165,12 @@ def half_spaces(piece: Array) -> tuple[Array, Array]:
 def wall_intervals(
     wall: Sequence[Array], samples: SurfaceSamples, search: float
 ) -> tuple[Array, Array]:
-    """Intrusion and recession (n,) of a wall at samples of the lumen surface.
+    """Where a wall stands on the normals of the lumen surface, both (n,), metres.
 
     A line through each sample along its normal runs from one lumen radius inside
-    to `search` (m) outside. Intrusion is the depth of the innermost piece that is
-    met on the inner part, recession the distance to the first piece on the outer
-    part when the sample itself is in no piece.
+    to `search` (m) outside. The first result is the depth of the innermost piece
+    that is met on the inner part; the second is the distance to the first piece on
+    the outer part, 0 when the sample itself lies in a piece.
     """
     points, outward, radii = samples
     inside = np.zeros(len(points))
@@ -181,7 +183,8 @@ def wall_intervals(
             continue
         normals, offsets = half_spaces(piece)
         slope = outward[near] @ normals.T
-        room = offsets - points[near] @ normals.T
+        # Grown by a hair: a line along the seam of two pieces meets both.
+        room = offsets + _SEAM - points[near] @ normals.T
         with np.errstate(divide="ignore", invalid="ignore"):
             t = room / slope
         parallel = np.abs(slope) < 1e-12
@@ -209,10 +212,15 @@ def intrusion(
     Samples lie on the lumen surface about `spacing` (m) apart. At each one the
     intrusion is how far, along the inward normal and up to the centreline, the
     wall still stands in the lumen: the largest depth at which a piece is met, 0 if
-    none is. Statistics are over all samples.
+    none is. Recession is how far outside the lumen the wall is first met along the
+    outward normal. Statistics are over all samples.
     """
     samples = tube_samples(anatomy.tree, spacing)
-    inside, recession = wall_intervals(anatomy.wall, samples, search)
+    inside, outside = wall_intervals(anatomy.wall, samples, search)
+    # At the edge of an ostium a normal may graze the other vessel's surface, so the
+    # recession is the depth of the place met, not the way to it.
+    met = samples.points + outside[:, None] * samples.outward
+    recession = np.clip(-anatomy.depth(met), 0.0, outside)
     worst = samples.points[inside.argmax()]
     return Intrusion(
         inside=Distribution.of(inside),
@@ -255,7 +263,7 @@ def wall_model(wall: Sequence[Array], probe: float = 1e-3) -> mujoco.MjModel:
 
 
 def coverage(anatomy: Anatomy, n_rays: int = 100_000, *, seed: int = 0) -> Coverage:
-    """Shoot rays from the centrelines in all directions at the wall's triangles.
+    """Shoot rays from around the centrelines in all directions at the wall's triangles.
 
     A ray leaks when it hits nothing, or hits first at more than 1.5 mm outside the
     lumen, which means that it went through a slit. Rays that cross the inlet's
@@ -276,14 +284,18 @@ def coverage(anatomy: Anatomy, n_rays: int = 100_000, *, seed: int = 0) -> Cover
     origins = []
     for line, part in zip(lines, share, strict=True):
         count = max(1, round(part * n_rays / per_origin))
-        # Not on the end planes themselves, where rays graze the caps.
-        origins.append(line.at(rng.uniform(1e-4, line.length - 1e-4, count)).position)
+        # Not on the end planes themselves, where rays graze the caps; off the axis,
+        # because slits hide from one point of view.
+        place = line.at(rng.uniform(1e-4, line.length - 1e-4, count))
+        offset = np.cross(place.tangent, rng.normal(size=(count, 3)))
+        offset /= np.linalg.norm(offset, axis=1)[:, None]
+        reach = _OFF_AXIS * place.radius * rng.uniform(size=count)
+        origins.append(place.position + reach[:, None] * offset)
     inlet = anatomy.inlet
     leaks, rays = [], 0
     geom = np.empty(per_origin, np.int32)
     distance = np.empty(per_origin)
     for origin in np.concatenate(origins):
-        # Off the axis as well: slits hide behind pieces from one point of view.
         direction = rng.normal(size=(per_origin, 3))
         direction /= np.linalg.norm(direction, axis=1)[:, None]
         mujoco.mj_multiRay(
@@ -299,7 +311,6 @@ def coverage(anatomy: Anatomy, n_rays: int = 100_000, *, seed: int = 0) -> Cover
         missed = geom < 0
         end = origin + np.where(missed, 0.1, distance)[:, None] * direction
         leak = ~hole & (missed | (anatomy.depth(end) < -_LEAK_DEPTH))
-        # At the flat inlet the field falls off behind the plane, in front of the cap.
         rays += int((~hole).sum())
         leaks.append(_exits(anatomy.tree, origin, direction[leak]))
     positions = np.concatenate(leaks)

@@ -7,8 +7,8 @@ import numpy as np
 from cathsim_dmc.anatomy.centreline import Array, VesselTree
 from cathsim_dmc.anatomy.phantom import Surface
 
-# Grid step, m: about 20,000 triangles on an aortic arch with its branches.
-SPACING = 1.7e-3
+# Grid step, m: at most 20,000 triangles on an aortic arch with its branches.
+SPACING = 2e-3
 
 
 def depth_grid(tree: VesselTree, spacing: float) -> tuple[Array, Array]:
@@ -43,16 +43,14 @@ def depth_grid(tree: VesselTree, spacing: float) -> tuple[Array, Array]:
             mesh = np.meshgrid(*(axes[i][box[i]] for i in range(3)), indexing="ij")
             near = part.project(np.stack(mesh, axis=-1))
             depth = near.radius - near.distance
-            # Flat ends of the vessel; inner ends of the pieces stay round, which
-            # only repeats what the neighbouring piece says.
-            end = line.at(line.length)
-            if s1 >= line.length - 1e-9:
+            # Pieces have round ends, which only repeat what the neighbouring piece
+            # says; those that reach over a flat end of the vessel are cut there.
+            if line.length - s1 < reach:
+                end = line.at(line.length)
                 depth = np.minimum(depth, _behind(mesh, end.position, end.tangent))
-            if s0 == 0.0 and vessel.parent is None:
-                first_point = line.at(0.0)
-                depth = np.minimum(
-                    depth, _behind(mesh, first_point.position, -first_point.tangent)
-                )
+            if s0 < reach and vessel.parent is None:
+                end = line.at(0.0)
+                depth = np.minimum(depth, _behind(mesh, end.position, -end.tangent))
             view = grid[tuple(box)]
             np.maximum(view, depth, out=view)
     return grid, origin

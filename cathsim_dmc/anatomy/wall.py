@@ -23,7 +23,7 @@ from cathsim_dmc.anatomy.polytope import clip, clip_all, volume_and_width
 # Depth of the wall, m: twice a 6F device's diameter, so nothing tunnels.
 THICKNESS = 4e-3
 # Height of a chord over the lumen surface, m; half of it stands in the lumen.
-TOLERANCE = 0.3e-3
+TOLERANCE = 0.35e-3
 # Radius of the hole in the inlet cap, m: closes on a sheath of 2 mm radius.
 INLET_HOLE_RADIUS = 1.5e-3
 _LONGEST_SLAB = 25e-3
