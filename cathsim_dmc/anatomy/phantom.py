@@ -24,7 +24,9 @@ from cathsim_dmc.anatomy.centreline import (
     Vessel,
     VesselTree,
     _readonly,
+    as_points,
 )
+from cathsim_dmc.anatomy.depth import DepthField
 
 FORMAT = "cathsim-anatomy"
 FORMAT_VERSION = 1
@@ -144,6 +146,7 @@ class Anatomy:
         inlet: where the device enters.
         goals: places to reach, by name.
         ends: flat ends of the lumen, open or capped.
+        field: measured depth of a lumen that is no union of tubes (a scan), or None.
     """
 
     name: str
@@ -153,6 +156,7 @@ class Anatomy:
     inlet: Inlet
     goals: Mapping[str, Goal]
     ends: tuple[End, ...] = ()
+    field: DepthField | None = None
 
     def __post_init__(self) -> None:
         wall = tuple(_readonly(piece) for piece in self.wall)
@@ -172,6 +176,8 @@ class Anatomy:
 
     def depth(self, points: ArrayLike) -> Array:
         """Signed depth (...) of `points` (..., 3) in the lumen, metres, > 0 inside."""
+        if self.field is not None:
+            return self.field(as_points(points))
         return self.tree.depth(points)
 
     def goal(self, name: str) -> Goal:
@@ -282,6 +288,9 @@ def _pack(anatomy: Anatomy) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
         "wall_vertices": np.concatenate([np.empty((0, 3)), *anatomy.wall]),
         "wall_counts": np.array([len(piece) for piece in anatomy.wall], np.int64),
     }
+    if anatomy.field is not None:
+        for key, values in anatomy.field.arrays().items():
+            arrays[f"field_{key}"] = values
     vessels = []
     for index, vessel in enumerate(anatomy.tree.vessels.values()):
         arrays[f"vessel_{index}_points"] = vessel.centreline.points
@@ -335,6 +344,7 @@ def _unpack(description: dict[str, Any], arrays: dict[str, np.ndarray]) -> Anato
             entry["name"], line, entry["parent"], entry["ostium"]
         )
     stops = np.cumsum(arrays["wall_counts"])[:-1]
+    field = {k.removeprefix("field_"): v for k, v in arrays.items() if "field_" in k}
     return Anatomy(
         name=description["name"],
         tree=VesselTree(vessels),
@@ -345,4 +355,5 @@ def _unpack(description: dict[str, Any], arrays: dict[str, np.ndarray]) -> Anato
         inlet=Inlet(**description["inlet"]),
         goals={entry["name"]: Goal(**entry) for entry in description["goals"]},
         ends=tuple(End(**entry) for entry in description["ends"]),
+        field=DepthField.from_arrays(field) if field else None,
     )
