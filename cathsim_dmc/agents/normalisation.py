@@ -1,0 +1,66 @@
+"""Running statistics of a vector observation, frozen wherever nothing learns."""
+
+import torch
+from torch import nn
+
+# Below this share of its mean a float32 entry's spread is rounding noise
+# (resolution 6e-8), so the entry counts as constant.
+RELATIVE_FLOOR = 1e-6
+# Spread below which an entry counts as constant whatever its mean. Inertias of the
+# links are about 1e-9 kg m^2 and must stay above it.
+ABSOLUTE_FLOOR = 1e-13
+
+
+class ObservationNormaliser(nn.Module):
+    """Shift and scale each entry to zero mean and unit spread, then clip.
+
+    Entries mix metres with inertias of 1e-9 kg m^2, so no common epsilon fits: an
+    entry whose spread cannot be told from rounding gives exactly zero instead of
+    amplified noise. Statistics change only in `update`, never in `forward`, and are
+    buffers, so they travel with the weights.
+
+    Args:
+        size: number of entries of the observation.
+        clip: largest magnitude of a normalised entry.
+    """
+
+    def __init__(self, size: int, clip: float):
+        super().__init__()
+        self.clip = clip
+        self.register_buffer("count", torch.zeros((), dtype=torch.float64))
+        self.register_buffer("mean", torch.zeros(size, dtype=torch.float64))
+        self.register_buffer("squares", torch.zeros(size, dtype=torch.float64))
+        self.register_buffer("shift", torch.zeros(size))
+        self.register_buffer("scale", torch.ones(size))
+
+    def forward(self, observation: torch.Tensor) -> torch.Tensor:
+        """Normalise (..., size) float32; identity but for the clip before data."""
+        centred = (observation - self.shift) * self.scale
+        return centred.clamp(-self.clip, self.clip)
+
+    @torch.no_grad()
+    def update(self, observation: torch.Tensor) -> None:
+        """Merge a batch (..., size) into the statistics (Chan et al. 1983).
+
+        Raises:
+            ValueError: an entry is not finite.
+        """
+        rows = observation.reshape(-1, self.mean.numel()).double()
+        if not bool(torch.isfinite(rows).all()):
+            bad = (~torch.isfinite(rows)).any(0).nonzero().flatten().tolist()
+            raise ValueError(
+                f"observation entries {bad[:10]} are not finite; the simulation has "
+                f"diverged or an observable is broken. Statistics were not changed."
+            )
+        count = float(rows.shape[0])
+        mean = rows.mean(0)
+        squares = (rows - mean).square().sum(0)
+        total = self.count + count
+        delta = mean - self.mean
+        self.squares += squares + delta.square() * (self.count * count / total)
+        self.mean += delta * (count / total)
+        self.count.copy_(total)
+        spread = (self.squares / self.count).sqrt()
+        floor = (RELATIVE_FLOOR * self.mean.abs()).clamp_min(ABSOLUTE_FLOOR)
+        self.shift.copy_(self.mean)
+        self.scale.copy_(torch.where(spread > floor, 1.0 / spread, 0.0))

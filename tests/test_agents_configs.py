@@ -1,0 +1,83 @@
+import json
+
+import pytest
+
+from cathsim_dmc.agents.configs import (
+    ConfigError,
+    PPOConfig,
+    SACConfig,
+    config_from_dict,
+    make_config,
+)
+
+
+def test_ppo_defaults_are_the_published_settings():
+    config = PPOConfig()
+    published = {
+        "minibatch_size": 32,
+        "steps_per_update": 512,
+        "gamma": 0.99,
+        "gae_lambda": 0.95,
+        "clip": 0.1,
+        "epochs": 20,
+        "entropy_coefficient": 5.85e-4,
+        "value_coefficient": 0.872,
+        "max_grad_norm": 1.0,
+        "learning_rate": 3e-4,
+        "hidden": (64, 64),
+        "activation": "tanh",
+        "total_frames": 600_000,
+    }
+    assert {name: getattr(config, name) for name in published} == published
+
+
+@pytest.mark.parametrize("algorithm", ["ppo", "sac"])
+@pytest.mark.parametrize("preset", ["published", "demo"])
+def test_configs_survive_json(algorithm, preset):
+    config = make_config(algorithm, preset, seed=7, task_kwargs={"links": [1, 2]})
+    again = config_from_dict(json.loads(json.dumps(config.to_dict())))
+    assert again == config
+    assert again.seed == 7
+
+
+@pytest.mark.parametrize(
+    ("kind", "settings", "message"),
+    [
+        (PPOConfig, {"num_envs": 7}, "steps_per_update=512.*num_envs=7"),
+        (PPOConfig, {"minibatch_size": 100}, "minibatch_size=100"),
+        (PPOConfig, {"clip": 0.0}, r"clip=0.0.*\(0, 1\)"),
+        (PPOConfig, {"gamma": 1.5}, "gamma=1.5"),
+        (PPOConfig, {"epochs": 0}, "epochs=0.*positive integer"),
+        (PPOConfig, {"path": "gpu"}, "path='gpu'.*batched"),
+        (PPOConfig, {"hidden": ()}, "hidden"),
+        (PPOConfig, {"task_kwargs": {"a": object()}}, "task_kwargs"),
+        (PPOConfig, {"learning_rate": -1.0}, "learning_rate=-1.0"),
+        (SACConfig, {"tau": 0.0}, "tau=0.0"),
+        (SACConfig, {"random_frames": 10}, "random_frames=10.*256"),
+        (SACConfig, {"replay_frames": 32}, "replay_frames=32"),
+    ],
+)
+def test_bad_values_are_named(kind, settings, message):
+    with pytest.raises(ConfigError, match=message):
+        kind(**settings)
+
+
+def test_unknown_names_list_the_valid_ones():
+    with pytest.raises(ConfigError, match="ppo.*sac"):
+        make_config("dqn")
+    with pytest.raises(ConfigError, match="published.*demo"):
+        make_config("ppo", "fastest")
+    with pytest.raises(ConfigError, match="learning_rate"):
+        make_config("ppo", learn_rate=1.0)
+
+
+def test_only_settings_that_learning_does_not_depend_on_may_change():
+    config = PPOConfig()
+    longer = config.replace(total_frames=1_000_000, num_threads=1, torch_threads=2)
+    assert config.changed_for_resume(longer) == {}
+    other = config.replace(clip=0.2, seed=3)
+    assert config.changed_for_resume(other) == {"clip": (0.1, 0.2), "seed": (0, 3)}
+    annealed = config.replace(anneal=True)
+    assert "total_frames" in annealed.changed_for_resume(
+        annealed.replace(total_frames=1_000)
+    )

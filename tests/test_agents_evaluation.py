@@ -1,0 +1,127 @@
+import json
+
+import numpy as np
+import pytest
+import synthetic_env
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from cathsim_dmc.agents import compare, evaluate
+from cathsim_dmc.agents.evaluation import paired_bootstrap, wilson_interval
+
+SORTED = sorted(synthetic_env.SIZES)
+# Where "position" begins in the concatenated observation.
+START = sum(synthetic_env.SIZES[n] for n in SORTED[: SORTED.index("position")])
+
+
+def expert(observation):
+    """Steer straight to the origin."""
+    point = observation["observation_vector"][:, START : START + 3]
+    action = torch.zeros(len(point), synthetic_env.ACTIONS)
+    action[:, :3] = (-10 * point).clamp(-1, 1)
+    return action
+
+
+def play(**kwargs):
+    return evaluate(make_env=synthetic_env.make_env, task="reach", **kwargs)
+
+
+def test_each_seed_is_played_once_and_as_if_alone():
+    together = play(policy=expert, episodes=6, seed=50)
+    for index, episode in enumerate(together.episodes):
+        assert episode.env == index
+        (alone,) = play(policy=expert, episodes=1, seed=50 + index).episodes
+        assert alone.reward == pytest.approx(episode.reward)
+        assert alone.length == episode.length
+        env = synthetic_env.ReachEnv(1, seed=50 + index)
+        env.reset()
+        away = np.linalg.norm(env.point[0])
+        assert episode.length >= (away - synthetic_env.GOAL_RADIUS) / 0.1 / 3**0.5
+    # Lengths differ, so the quick environments had begun further episodes.
+    assert len({episode.length for episode in together.episodes}) > 1
+    assert together.successes == 6
+
+
+def test_force_figures_are_those_of_the_steps():
+    def push(observation):
+        return torch.ones(*observation.batch_size, synthetic_env.ACTIONS)
+
+    (episode,) = play(policy=push, episodes=1, seed=3).episodes
+    env = synthetic_env.ReachEnv(1, seed=3)
+    current = env.reset()
+    forces, reward = [], 0.0
+    while True:
+        current["action"] = push(current)
+        stepped, current = env.step_and_maybe_reset(current)
+        forces.append(float(stepped["next", "info", "wall_force_sum"]))
+        reward += float(stepped["next", "reward"])
+        if stepped["next", "done"]:
+            break
+    assert episode.length == len(forces) == 40
+    assert episode.mean_force == pytest.approx(np.mean(forces))
+    assert episode.max_force == pytest.approx(0.5 * max(forces))
+    assert episode.reward == pytest.approx(reward, rel=1e-5)
+    assert (episode.success, episode.terminated) == (False, False)
+    assert max(forces) > 0
+
+
+def test_evaluation_repeats_and_is_json(tmp_path):
+    first = play(policy="random", episodes=5, out_dir=tmp_path)
+    second = play(policy="random", episodes=5)
+    assert first == second
+    assert play(policy="random", episodes=5, seed=1) != first
+    written = json.loads((tmp_path / "evaluation.json").read_text())
+    assert written == json.loads(json.dumps(first.to_dict()))
+    assert len(written["episodes"]) == written["summary"]["episodes"] == 5
+    assert written["episodes"][1]["seed"] == first.seed + 1
+    low, high = written["summary"]["success_ci95"]
+    assert low <= written["summary"]["success"] <= high
+
+
+def test_expert_is_better_than_chance():
+    expertly = play(policy=expert, episodes=10)
+    randomly = play(policy="random", episodes=10)
+    result = compare(expertly, randomly)
+    assert result.better
+    assert result.reward_ci95[0] < result.reward_difference < result.reward_ci95[1]
+    assert result.success_difference > 0.5
+    reverse = compare(randomly, expertly)
+    assert not reverse.better
+    assert reverse.reward_difference == pytest.approx(-result.reward_difference)
+    json.dumps(result.to_dict())
+    with pytest.raises(ValueError, match="same"):
+        compare(expertly, play(policy="random", episodes=9))
+
+
+def test_bad_requests_are_refused(tmp_path):
+    with pytest.raises(ValueError, match="episodes=0"):
+        play(policy="random", episodes=0)
+    with pytest.raises(ValueError, match="task"):
+        evaluate(expert, make_env=synthetic_env.make_env)
+    with pytest.raises(RuntimeError, match="no checkpoint"):
+        evaluate(tmp_path, make_env=synthetic_env.make_env)
+
+
+@given(st.integers(1, 500).flatmap(lambda n: st.tuples(st.integers(0, n), st.just(n))))
+def test_wilson_interval_properties(counts):
+    successes, trials = counts
+    low, high = wilson_interval(successes, trials)
+    assert 0 <= low <= successes / trials + 1e-12
+    assert successes / trials - 1e-12 <= high <= 1
+    mirrored = wilson_interval(trials - successes, trials)
+    assert mirrored == pytest.approx((1 - high, 1 - low))
+
+
+def test_wilson_interval_against_a_published_value():
+    # Newcombe 1998, table I: 81 of 263 gives 0.2553 to 0.3662.
+    assert wilson_interval(81, 263) == pytest.approx((0.2553, 0.3662), abs=1e-4)
+
+
+def test_bootstrap_covers_the_normal_interval():
+    random = np.random.default_rng(0)
+    difference = random.normal(0.3, 1.0, 400)
+    mean, (low, high) = paired_bootstrap(difference, np.zeros(400))
+    half = 1.96 * difference.std() / 20
+    assert mean == pytest.approx(difference.mean())
+    assert (low, high) == pytest.approx((mean - half, mean + half), abs=0.02)

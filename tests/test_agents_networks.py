@@ -1,0 +1,156 @@
+import pytest
+import synthetic_env
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from tensordict import TensorDict
+from torchrl.envs import check_env_specs
+from torchrl.envs.utils import ExplorationType, set_exploration_type
+
+from cathsim_dmc.agents.configs import PPOConfig, SACConfig
+from cathsim_dmc.agents.networks import Signature, make_policy
+from cathsim_dmc.agents.normalisation import ObservationNormaliser
+from cathsim_dmc.agents.ppo import PPO
+
+
+def test_normaliser_equals_the_statistics_of_all_data_whatever_the_batches():
+    torch.manual_seed(0)
+    # Metres beside inertias, as the internal observation mixes them.
+    data = torch.randn(1_000, 3) * torch.tensor([0.1, 1e-9, 20.0])
+    data = data + torch.tensor([0.5, 3e-8, -7.0])
+    normaliser = ObservationNormaliser(3, clip=10.0)
+    for part in data.split([1, 9, 490, 500]):
+        normaliser.update(part)
+    expected = (data - data.mean(0)) / data.std(0, unbiased=False)
+    torch.testing.assert_close(normaliser(data), expected, rtol=1e-3, atol=1e-3)
+
+
+@settings(max_examples=30, deadline=None)
+@given(
+    st.floats(-1e3, 1e3, width=32),
+    st.sampled_from([0.0, 1e-7, 1e-9]),
+    st.integers(0, 5),
+)
+def test_nearly_constant_entries_never_blow_up(value, noise, seed):
+    torch.manual_seed(seed)
+    data = value * (1.0 + noise * torch.randn(200, 1))
+    normaliser = ObservationNormaliser(1, clip=10.0)
+    normaliser.update(data)
+    out = normaliser(data)
+    assert torch.isfinite(out).all()
+    # What rounding alone can produce must not be amplified.
+    assert out.abs().max() == 0
+
+
+def test_an_entry_that_first_moves_later_is_clipped_then_learnt():
+    normaliser = ObservationNormaliser(1, clip=5.0)
+    normaliser.update(torch.zeros(1_000, 1))
+    assert normaliser(torch.tensor([[0.3]])) == 0
+    normaliser.update(torch.tensor([[0.3]]))
+    assert 0 < normaliser(torch.tensor([[0.3]])) <= 5.0
+
+
+def test_normaliser_refuses_what_is_not_finite():
+    normaliser = ObservationNormaliser(2, clip=5.0)
+    with pytest.raises(ValueError, match=r"\[1\] are not finite"):
+        normaliser.update(torch.tensor([[0.0, float("nan")]]))
+    assert normaliser.count == 0
+
+
+def observation_of(signature, batch):
+    entries = {}
+    if signature.vector:
+        entries["observation_vector"] = torch.randn(*batch, signature.vector)
+    if signature.pixels:
+        entries["pixels"] = torch.randint(
+            0, 256, (*batch, *signature.pixels), dtype=torch.uint8
+        )
+    return TensorDict(entries, batch)
+
+
+@pytest.mark.parametrize("config", [PPOConfig(), SACConfig()], ids=["ppo", "sac"])
+@pytest.mark.parametrize(
+    "signature",
+    [
+        Signature(30, None, 21),
+        Signature(0, (1, 128, 128), 21),
+        Signature(0, (3, 128, 128), 22),
+        Signature(5, (1, 128, 128), 21),
+    ],
+    ids=["internal", "image", "sequential", "image and forces"],
+)
+def test_actions_are_bounded_and_deterministic_ones_repeat(config, signature):
+    torch.manual_seed(0)
+    policy = make_policy(signature, config)
+    observation = observation_of(signature, (4, 2))
+    with set_exploration_type(ExplorationType.RANDOM):
+        sampled = [policy(observation.clone())["action"] for _ in range(2)]
+    assert sampled[0].shape == (4, 2, signature.actions)
+    assert not torch.equal(*sampled)
+    assert all(action.abs().max() <= 1 for action in sampled)
+    with set_exploration_type(ExplorationType.DETERMINISTIC):
+        chosen = [policy(observation.clone())["action"] for _ in range(2)]
+    assert torch.equal(*chosen)
+
+
+@pytest.mark.parametrize("observation", ["internal", "image"])
+def test_standard_observations_satisfy_torchrl(observation):
+    env = synthetic_env.make_env("reach", observation=observation, num_envs=3)
+    check_env_specs(env)
+    signature = Signature.of(env)
+    if observation == "image":
+        assert signature == Signature(0, (1, 128, 128), synthetic_env.ACTIONS)
+    else:
+        size = sum(synthetic_env.SIZES.values())
+        assert signature == Signature(size, None, synthetic_env.ACTIONS)
+        seeded = [synthetic_env.make_env("reach", num_envs=3, seed=5) for _ in "ab"]
+        parts = seeded[0].base_env.reset()
+        names = sorted(synthetic_env.SIZES)
+        joined = torch.cat([parts[name] for name in names], -1).float()
+        assert torch.equal(seeded[1].reset()["observation_vector"], joined)
+
+
+def test_truncation_bootstraps_and_termination_does_not():
+    config = PPOConfig(num_envs=1, steps_per_update=32, hidden=(8,))
+    torch.manual_seed(0)
+    learner = PPO(config, Signature(3, None, 2))
+    steps = 4
+    observation = torch.randn(2, steps, 3)
+    following = torch.randn(2, steps, 3)
+    ends = torch.zeros(2, steps, 1, dtype=torch.bool)
+    ends[:, 1] = True
+    terminated = ends.clone()
+    terminated[1] = False  # the second environment only ran out of time
+    batch = TensorDict(
+        {
+            "observation_vector": observation,
+            "next": {
+                "observation_vector": following,
+                "reward": torch.randn(2, steps, 1),
+                "done": ends,
+                "terminated": terminated,
+            },
+        },
+        [2, steps],
+    )
+    learner.normaliser(batch)
+    learner._add_advantages(batch)
+    with torch.no_grad():
+        clip = config.observation_clip
+        value = learner.critic.module(observation.clamp(-clip, clip))[..., 0]
+        after = learner.critic.module(following.clamp(-clip, clip))[..., 0]
+    reward = batch["next", "reward"][..., 0]
+    for env in range(2):
+        advantage = 0.0
+        for step in reversed(range(steps)):
+            goes_on = 0.0 if terminated[env, step] else 1.0
+            delta = (
+                reward[env, step]
+                + config.gamma * goes_on * after[env, step]
+                - value[env, step]
+            )
+            carried = 0.0 if ends[env, step] else advantage
+            advantage = delta + config.gamma * config.gae_lambda * carried
+            torch.testing.assert_close(
+                batch["advantage"][env, step, 0], advantage, rtol=1e-4, atol=1e-5
+            )

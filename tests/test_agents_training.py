@@ -1,0 +1,259 @@
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+import synthetic_env
+import torch
+
+from cathsim_dmc.agents import ConfigError, evaluate, make_config, train
+from cathsim_dmc.agents.checkpoint import Checkpoint, checkpoints_in
+from cathsim_dmc.agents.metrics import MetricsFile, read_metrics
+
+CLOCKS = ("seconds", "frames_per_second")
+
+
+def small_ppo(**changes):
+    return make_config(
+        "ppo",
+        **{
+            "task": "reach",
+            "num_envs": 16,
+            "steps_per_update": 512,
+            "minibatch_size": 128,
+            "epochs": 6,
+            "learning_rate": 1e-3,
+            "total_frames": 1_024,
+            "metrics_frames": 512,
+            "checkpoint_frames": 512,
+            "normalisation_frames": 256,
+            **changes,
+        },
+    )
+
+
+def small_sac(**changes):
+    return make_config(
+        "sac",
+        **{
+            "task": "reach",
+            "num_envs": 16,
+            "batch_size": 64,
+            "learning_rate": 1e-3,
+            "random_frames": 512,
+            "replay_frames": 4_096,
+            "updates_per_frame": 0.25,
+            "initial_alpha": 0.1,
+            "total_frames": 1_024,
+            "metrics_frames": 256,
+            "checkpoint_frames": 512,
+            "normalisation_frames": 256,
+            **changes,
+        },
+    )
+
+
+def run(config, out, **kwargs):
+    kwargs.setdefault("make_env", synthetic_env.make_env)
+    return train(config, out, progress=False, **kwargs)
+
+
+def without_clocks(rows):
+    return [{k: v for k, v in row.items() if k not in CLOCKS} for row in rows]
+
+
+def test_ppo_learns_to_reach(tmp_path):
+    run(small_ppo(total_frames=10_240), tmp_path)
+    rewards = [row["episode_reward"] for row in read_metrics(tmp_path / "metrics.csv")]
+    assert rewards[-1] > rewards[1] + 15
+
+
+def test_sac_learns_to_reach(tmp_path):
+    run(small_sac(total_frames=3_072, num_envs=8), tmp_path)
+    trained = evaluate(tmp_path, episodes=20, make_env=synthetic_env.make_env)
+    chance = evaluate("random", "reach", episodes=20, make_env=synthetic_env.make_env)
+    assert trained.summary()["reward"] > chance.summary()["reward"] + 10
+
+
+def test_images_train(tmp_path):
+    config = small_ppo(
+        observation="image", total_frames=64, steps_per_update=64, epochs=1,
+        minibatch_size=32, cnn_features=16, normalisation_frames=0,
+    )  # fmt: skip
+    result = run(config, tmp_path)
+    assert result.metrics["gradient_steps"] == 2
+    assert evaluate(tmp_path, episodes=2, make_env=synthetic_env.make_env).episodes
+
+
+@pytest.mark.parametrize("make", [small_ppo, small_sac])
+def test_same_seed_same_run(tmp_path, make):
+    config = make(total_frames=1_024)
+    for name in "ab":
+        run(config, tmp_path / name)
+    first, second = (read_metrics(tmp_path / name / "metrics.csv") for name in "ab")
+    assert without_clocks(first) == without_clocks(second)
+    run(config.replace(seed=1), tmp_path / "c")
+    other = read_metrics(tmp_path / "c" / "metrics.csv")
+    assert without_clocks(first) != without_clocks(other)
+
+
+@pytest.mark.parametrize("make", [small_ppo, small_sac])
+def test_resuming_continues_counters_rows_and_weights(tmp_path, make):
+    first = run(make(total_frames=1_024), tmp_path)
+    before = Checkpoint.open(tmp_path).learning_state()
+    assert run(make(total_frames=1_024), tmp_path, resume=True).frames == 1_024
+    assert Checkpoint.open(tmp_path).frames == 1_024
+
+    second = run(make(total_frames=2_048), tmp_path, resume=True)
+    assert (first.frames, second.frames) == (1_024, 2_048)
+    assert second.seconds > first.seconds
+    rows = read_metrics(tmp_path / "metrics.csv")
+    frames = [row["frames"] for row in rows]
+    assert frames == sorted(set(frames))
+    for name in ("gradient_steps", "episodes", "seconds"):
+        values = [row[name] for row in rows]
+        assert values == sorted(values)
+    after = Checkpoint.open(tmp_path).learning_state()
+    steps = [state["learner"]["gradient_steps"] for state in (before, after)]
+    assert 0 < steps[0] < steps[1]
+
+
+def test_a_killed_run_continues_where_it_was_saved(tmp_path):
+    script = (
+        "import sys, synthetic_env, test_agents_training as t\n"
+        "from cathsim_dmc.agents import train\n"
+        "config = t.small_sac(total_frames=1_000_000)\n"
+        "train(config, sys.argv[1], make_env=synthetic_env.make_env)\n"
+    )
+    paths = [str(Path(__file__).parent), os.environ.get("PYTHONPATH", "")]
+    process = subprocess.Popen(
+        [sys.executable, "-c", script, str(tmp_path)],
+        env={**os.environ, "PYTHONPATH": os.pathsep.join(paths)},
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    try:
+        deadline = time.monotonic() + 60
+        while len(checkpoints_in(tmp_path)) < 2:
+            assert process.poll() is None, process.stderr.read()
+            assert time.monotonic() < deadline
+            time.sleep(0.05)
+    finally:
+        process.send_signal(signal.SIGKILL)
+        _, log = process.communicate()
+    assert "sac reach: 0/1,000,000 frames" in log
+    saved = Checkpoint.open(tmp_path)
+    # What a kill can leave behind: later rows, half a row, half a checkpoint.
+    with open(tmp_path / "metrics.csv", "a") as file:
+        columns = len(file_header(tmp_path)) - 1
+        file.write(f"{saved.frames + 64}" + ",0" * columns + "\n")
+        file.write(f"{saved.frames - 1},0.")
+    (tmp_path / "checkpoints" / ".unfinished-9").mkdir()
+
+    goal = saved.frames + 512
+    result = run(small_sac(total_frames=goal), tmp_path, resume=True)
+    assert result.frames == goal
+    frames = [row["frames"] for row in read_metrics(tmp_path / "metrics.csv")]
+    assert frames == sorted(set(frames))
+    assert saved.frames + 64 not in frames
+    assert frames[-1] == goal
+    assert result.metrics["replay_frames"] == min(goal, 4_096)
+    assert not list((tmp_path / "checkpoints").glob(".*"))
+
+
+def file_header(path):
+    return (path / "metrics.csv").read_text().splitlines()[0].split(",")
+
+
+def test_an_interrupt_saves_and_can_be_resumed(tmp_path):
+    def interrupting(task, **kwargs):
+        env = synthetic_env.make_env(task, **kwargs)
+        steps = env.base_env._step
+        count = 0
+
+        def step(tensordict):
+            nonlocal count
+            count += 1
+            if count == 70:
+                os.kill(os.getpid(), signal.SIGINT)
+            return steps(tensordict)
+
+        env.base_env._step = step
+        return env
+
+    config = small_ppo(total_frames=10_240, checkpoint_frames=10_240)
+    result = run(config, tmp_path, make_env=interrupting)
+    assert result.interrupted
+    assert 0 < result.frames < 10_240
+    assert Checkpoint.open(tmp_path).frames == result.frames
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    more = config.replace(total_frames=result.frames + 512)
+    assert run(more, tmp_path, resume=True).frames == result.frames + 512
+
+
+def test_a_run_is_neither_overwritten_nor_resumed_with_other_settings(tmp_path):
+    run(small_ppo(total_frames=512), tmp_path)
+    with pytest.raises(ConfigError, match="already holds a run"):
+        run(small_ppo(total_frames=512), tmp_path)
+    with pytest.raises(ConfigError, match="clip: the run has 0.1, given is 0.3"):
+        run(small_ppo(clip=0.3), tmp_path, resume=True)
+    with pytest.raises(ConfigError, match="algorithm"):
+        run(small_sac(), tmp_path, resume=True)
+
+
+def test_checkpoints_hold_weights_only_and_act_alike(tmp_path):
+    run(small_ppo(total_frames=2_048, keep_checkpoints=2), tmp_path)
+    found = checkpoints_in(tmp_path)
+    assert [path.name for path in found] == ["0000001536", "0000002048"]
+    for path in found:
+        assert sorted(child.name for child in path.iterdir()) == [
+            "checkpoint.json",
+            "learning.pt",
+            "policy.pt",
+        ]
+        for name in ("learning.pt", "policy.pt"):
+            torch.load(path / name, weights_only=True)
+    before = evaluate(tmp_path, episodes=3, make_env=synthetic_env.make_env)
+    observation = synthetic_env.make_env("reach", num_envs=5).reset()
+    location = Checkpoint.open(tmp_path).policy()(observation.clone())["loc"]
+    # A checkpoint is complete in itself: it may be moved and its run deleted.
+    alone = tmp_path / "elsewhere"
+    found[-1].rename(alone)
+    shutil.rmtree(tmp_path / "checkpoints")
+    after = evaluate(alone, episodes=3, make_env=synthetic_env.make_env)
+    assert after.episodes == before.episodes
+    assert torch.equal(
+        Checkpoint.open(alone).policy()(observation.clone())["loc"], location
+    )
+    assert location.abs().max() > 0
+
+
+def test_metrics_file_appends_whole_rows_and_names_strangers(tmp_path):
+    path = tmp_path / "metrics.csv"
+    table = MetricsFile(path, ["frames", "reward"])
+    table.append({"frames": 1, "reward": None})
+    table.append({"frames": 2, "reward": 0.1})
+    assert read_metrics(path) == [
+        {"frames": 1.0, "reward": None},
+        {"frames": 2.0, "reward": 0.1},
+    ]
+    with pytest.raises(ValueError, match="loss"):
+        table.append({"frames": 3, "loss": 1.0})
+    with pytest.raises(ValueError, match="columns"):
+        MetricsFile(path, ["frames", "length"], resume_at=1)
+    MetricsFile(path, ["frames", "reward"], resume_at=1)
+    assert [row["frames"] for row in read_metrics(path)] == [1.0]
+
+
+def test_importing_agents_loads_torchrl_before_dm_control():
+    script = (
+        "import os, sys; before = dict(os.environ)\n"
+        "import cathsim_dmc.agents\n"
+        "assert 'torchrl' in sys.modules and 'dm_control' not in sys.modules\n"
+        "assert dict(os.environ) == before, set(os.environ) ^ set(before)\n"
+    )
+    subprocess.run([sys.executable, "-c", script], check=True, timeout=120)
