@@ -1,0 +1,92 @@
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from recording_samples import make_tube
+from scipy.spatial.transform import Rotation
+
+from cathsim_dmc.recording.geometry import (
+    FORCE_COLOUR_MAX,
+    force_colours,
+    rotate,
+    surface_arrays,
+    vertex_normals,
+    xyzw,
+    z_to,
+)
+
+directions = st.tuples(*[st.floats(-1, 1)] * 3).filter(
+    lambda d: np.linalg.norm(d) > 1e-3
+)
+
+
+@given(directions)
+def test_z_to_turns_z_into_the_direction(direction):
+    direction = np.array(direction)
+    quaternion = z_to(direction)
+    assert np.linalg.norm(quaternion) == pytest.approx(1)
+    unit = direction / np.linalg.norm(direction)
+    turned = Rotation.from_quat(xyzw(quaternion)).apply([0, 0, 1])
+    np.testing.assert_allclose(turned, unit, atol=1e-6)
+    np.testing.assert_allclose(
+        rotate(quaternion, np.array([0, 0, 1.0])), unit, atol=1e-6
+    )
+
+
+def test_z_to_at_its_poles():
+    quaternions = z_to(np.array([[0, 0, 2.0], [0, 0, -3.0], [0, 0, 0]]))
+    np.testing.assert_allclose(quaternions[0], [1, 0, 0, 0])
+    np.testing.assert_allclose(quaternions[2], [1, 0, 0, 0])
+    down = rotate(quaternions[1], np.array([0, 0, 1.0]))
+    np.testing.assert_allclose(down, [0, 0, -1], atol=1e-12)
+
+
+@given(st.integers(0, 2**31))
+def test_rotate_agrees_with_scipy(seed):
+    rng = np.random.default_rng(seed)
+    quaternion = rng.normal(size=(4, 4))
+    quaternion /= np.linalg.norm(quaternion, axis=1, keepdims=True)
+    vector = rng.normal(size=(4, 3))
+    expected = Rotation.from_quat(xyzw(quaternion)).apply(vector)
+    np.testing.assert_allclose(rotate(quaternion, vector), expected, atol=1e-12)
+
+
+def test_normals_of_a_tube_point_outwards():
+    vertices, faces = make_tube(sides=24)
+    normals = vertex_normals(vertices, faces)
+    np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1)
+    radial = vertices[:, :2] / np.linalg.norm(vertices[:, :2], axis=1, keepdims=True)
+    assert ((normals[:, :2] * radial).sum(axis=1) > 0.99).all()
+
+
+def test_a_lonely_vertex_gets_a_unit_normal():
+    vertices = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [5, 5, 5]], float)
+    normals = vertex_normals(vertices, np.array([[0, 1, 2]]))
+    np.testing.assert_allclose(normals, [[0, 0, 1]] * 4)
+
+
+def test_surfaces_are_pairs_or_objects():
+    pair = make_tube()
+
+    class Surface:
+        vertices, faces = pair
+
+    for given_surface in (pair, Surface()):
+        vertices, faces = surface_arrays(given_surface)
+        np.testing.assert_array_equal(vertices, pair[0])
+        np.testing.assert_array_equal(faces, pair[1])
+    with pytest.raises(ValueError, match="faces must index"):
+        surface_arrays((pair[0][:5], pair[1]))
+    with pytest.raises(ValueError, match="vertices must have shape"):
+        surface_arrays((pair[0][:, :2], pair[1]))
+    with pytest.raises(ValueError, match="finite"):
+        surface_arrays((pair[0] * np.nan, pair[1]))
+
+
+def test_colours_darken_with_force_and_saturate():
+    force = np.linspace(0, FORCE_COLOUR_MAX, 30)
+    colours = force_colours(force).astype(int)
+    assert colours.shape == (30, 3)
+    lightness = colours @ [0.2126, 0.7152, 0.0722]
+    assert (np.diff(lightness) < 0).all()
+    np.testing.assert_array_equal(force_colours(10.0), colours[-1])

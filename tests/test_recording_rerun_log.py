@@ -1,0 +1,368 @@
+import dataclasses
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from recording_samples import make_episode, make_tube
+from scipy.spatial.transform import Rotation
+
+from cathsim_dmc.recording.geometry import rotate
+from cathsim_dmc.recording.rerun_log import ARROW_METRES_PER_NEWTON, write_rrd
+from cathsim_dmc.recording.scene import BodyGeom
+
+STEPS = 6
+GOAL = (0.01, 0.0, 0.03)
+
+
+def make_geoms():
+    common = {"quaternion": [1, 0, 0, 0], "rgba": [1, 0.5, 0, 1]}
+    return [
+        BodyGeom(1, "robot/base", "box", [0.01, 0.02, 0.03], [0, 0, 0], **common),
+        BodyGeom(1, "robot/base", "sphere", [0.01], [0, 0, 0.1], **common),
+        BodyGeom(2, "robot/wheel", "cylinder", [0.01, 0.02], [0, 0, 0], **common),
+        BodyGeom(
+            2,
+            "robot/wheel",
+            "capsule",
+            [0.01, 0.02],
+            [0.1, 0, 0],
+            quaternion=[0.5**0.5, 0.5**0.5, 0, 0],
+            rgba=[0, 0, 1, 0.5],
+        ),
+    ]
+
+
+def make_recorded(**changes):
+    episode = make_episode(STEPS, counts=np.array([2, 0, 1, 3, 0, 0]))
+    meta = {
+        **episode.meta,
+        "goal_position": GOAL,
+        "goal_radius": 0.008,
+        "distance": np.linalg.norm(episode.head - GOAL, axis=1),
+        "versions": {"a|b": "1.0"},
+    }
+    position, quaternion = episode.body_pos.copy(), episode.body_quat.copy()
+    position[:, 1], quaternion[:, 1] = position[0, 1], quaternion[0, 1]
+    values = {"meta": meta, "body_pos": position, "body_quat": quaternion}
+    return dataclasses.replace(episode, **{**values, **changes})
+
+
+class Recording:
+    """All rows of a recording: static and temporal values per entity."""
+
+    def __init__(self, path):
+        from rerun.chunk import RrdReader
+
+        reader = RrdReader(path)
+        self.recordings, self.blueprints = reader.recordings(), reader.blueprints()
+        self.static, self.temporal = {}, {}
+        for chunk in reader.stream():
+            batch = chunk.to_record_batch()
+            names = [
+                n for n in batch.schema.names if n not in ("rerun.controls.RowId",)
+            ]
+            target = self.static if chunk.is_static else self.temporal
+            rows = target.setdefault(chunk.entity_path, {})
+            for name in names:
+                rows.setdefault(name, []).extend(batch.column(name))
+        self.views = {}
+        for store in self.blueprints:
+            for chunk in reader.stream(store=store):
+                batch = chunk.to_record_batch()
+                if "ViewBlueprint:space_origin" in batch.schema.names:
+                    kind = batch.column("ViewBlueprint:class_identifier")[0].as_py()[0]
+                    origin = batch.column("ViewBlueprint:space_origin")[0].as_py()[0]
+                    self.views["/" + origin.lstrip("/")] = kind
+
+    def values(self, entity, name):
+        return [row.as_py() for row in self.temporal[entity][name]]
+
+    def nanoseconds(self, entity):
+        return [row.value for row in self.temporal[entity]["sim_time"]]
+
+    def fixed(self, entity, name):
+        return self.static[entity][name][-1].as_py()
+
+
+@pytest.fixture(scope="module")
+def written(tmp_path_factory):
+    path = tmp_path_factory.mktemp("rrd") / "episode.rrd"
+    episode = make_recorded()
+    frames = np.arange((STEPS + 1) * 20 * 16, dtype=np.uint32) % 251
+    frames = frames.astype(np.uint8).reshape(STEPS + 1, 20, 16, 1)
+    returned = write_rrd(
+        episode,
+        make_tube(),
+        path,
+        robot_geoms=make_geoms(),
+        fluoroscopy=frames,
+        lossless=True,
+    )
+    assert returned == path
+    return episode, frames, path, Recording(path)
+
+
+def test_the_file_holds_one_recording_and_its_layout(written):
+    _, _, path, recording = written
+    assert len(recording.recordings) == len(recording.blueprints) == 1
+    assert recording.recordings[0].application_id == "cathsim"
+    assert recording.views["/world"] == "3D"
+    assert recording.views["/fluoroscopy"] == "2D"
+    assert recording.views["/info"] == "TextDocument"
+    plots = {o for o, kind in recording.views.items() if kind == "TimeSeries"}
+    assert plots == {
+        "/series/reward",
+        "/series/distance_mm",
+        "/series/force",
+        "/series/insertion_mm",
+        "/series/action",
+        "/series/action_all",
+    }
+    assert [p.name for p in path.parent.iterdir()] == ["episode.rrd"]
+
+
+def test_rerun_itself_accepts_the_file(written):
+    done = subprocess.run(
+        [sys.executable, "-m", "rerun_cli", "rrd", "verify", str(written[2])],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    assert "verified without error" in done.stdout + done.stderr
+
+
+def test_every_entity_lives_on_both_timelines_at_the_right_rows(written):
+    episode, _, _, recording = written
+    states, steps = list(range(STEPS + 1)), list(range(1, STEPS + 1))
+    expected = {
+        "/world/catheter": states,
+        "/world/catheter/head": states,
+        "/world/catheter/trail": steps,
+        "/world/robot/wheel": states,
+        "/world/contacts": steps,
+        "/fluoroscopy": states,
+        "/series/reward": steps,
+        "/series/distance_mm": states,
+        "/series/force/wall_sum": steps,
+        "/series/force/wall_max": steps,
+        "/series/force/push": steps,
+        "/series/insertion_mm": states,
+        "/series/action/translation": states[:-1],
+        "/series/action/tip_bend": states[:-1],
+        "/series/action_all": states[:-1],
+    }
+    assert set(recording.temporal) == set(expected)
+    for entity, rows in expected.items():
+        assert recording.values(entity, "step") == rows, entity
+        wanted = [round(episode.time[row] * 1e9) for row in rows]
+        assert recording.nanoseconds(entity) == wanted, entity
+
+
+def test_capsules_span_the_joints_of_the_catheter(written):
+    episode, _, _, recording = written
+    entity = "/world/catheter"
+    lower = np.array(recording.values(entity, "Capsules3D:translations"))
+    lengths = np.array(recording.values(entity, "Capsules3D:lengths"))
+    turns = np.array(recording.values(entity, "Capsules3D:quaternions"))
+    tips = Rotation.from_quat(turns.reshape(-1, 4)).apply([0, 0, 1])
+    upper = lower + lengths[..., None] * tips.reshape(lower.shape)
+    np.testing.assert_allclose(lower, episode.catheter[:, :-1], atol=1e-6)
+    np.testing.assert_allclose(upper, episode.catheter[:, 1:], atol=1e-5)
+    head = np.array(recording.values("/world/catheter/head", "Points3D:positions"))
+    np.testing.assert_allclose(head[:, 0], episode.head, atol=1e-6)
+
+
+def test_arrows_show_the_contacts_of_their_step_only(written):
+    episode, _, _, recording = written
+    vectors = recording.values("/world/contacts", "Arrows3D:vectors")
+    origins = recording.values("/world/contacts", "Arrows3D:origins")
+    assert [len(v or []) for v in vectors] == [2, 0, 1, 3, 0, 0]
+    # An empty row clears the arrows of the step before; a null would keep them.
+    assert all(v is not None for v in vectors)
+    np.testing.assert_allclose(
+        np.concatenate([v for v in vectors if v]),
+        ARROW_METRES_PER_NEWTON * episode.contact_force,
+        atol=1e-6,
+    )
+    np.testing.assert_allclose(
+        np.concatenate([o for o in origins if o]), episode.contact_position, atol=1e-6
+    )
+
+
+def test_series_hold_the_values_of_the_episode(written):
+    episode, _, _, recording = written
+
+    def scalars(entity):
+        return np.array(recording.values(f"/series/{entity}", "Scalars:scalars"))
+
+    np.testing.assert_array_equal(scalars("reward")[:, 0], episode.reward)
+    np.testing.assert_array_equal(scalars("action_all"), episode.action)
+    np.testing.assert_array_equal(
+        scalars("action/translation")[:, 0], episode.action[:, 20]
+    )
+    np.testing.assert_allclose(
+        scalars("action/tip_bend")[:, 0],
+        np.sqrt((episode.action[:, :20] ** 2).mean(axis=1)),
+    )
+    np.testing.assert_array_equal(scalars("force/push")[:, 0], episode.push_force)
+    np.testing.assert_allclose(
+        scalars("distance_mm")[:, 0], 1e3 * np.array(episode.meta["distance"])
+    )
+    names = recording.fixed("/series/action_all", "SeriesLines:names")
+    assert names[:3] == ["tip_x_0", "tip_y_0", "tip_x_1"] and names[-1] == "translation"
+
+
+def test_bodies_carry_their_geoms(written):
+    episode, _, _, recording = written
+    moved = "/world/robot/wheel"
+    turns = np.array(recording.values(moved, "Transform3D:quaternion"))[:, 0]
+    np.testing.assert_allclose(
+        turns, np.roll(episode.body_quat[:, 2], -1, axis=-1), atol=1e-6
+    )
+    places = np.array(recording.values(moved, "Transform3D:translation"))[:, 0]
+    np.testing.assert_allclose(places, episode.body_pos[:, 2], atol=1e-6)
+    # A body that never moves is written once.
+    still = recording.fixed("/world/robot/base", "Transform3D:translation")
+    np.testing.assert_allclose(still[0], episode.body_pos[0, 1], atol=1e-6)
+    capsule = f"{moved}/capsule"
+    lower = recording.fixed(capsule, "Capsules3D:translations")[0]
+    geom = make_geoms()[3]
+    centre = np.array(lower) + rotate(geom.quaternion, np.array([0, 0, 0.02]))
+    np.testing.assert_allclose(centre, geom.position, atol=1e-6)
+    np.testing.assert_allclose(recording.fixed(capsule, "Capsules3D:lengths"), [0.04])
+    half = recording.fixed("/world/robot/base/box", "Boxes3D:half_sizes")
+    np.testing.assert_allclose(half, [[0.01, 0.02, 0.03]])
+
+
+def test_frames_come_back_exactly_when_lossless(written):
+    import io
+
+    from PIL import Image
+
+    _, frames, _, recording = written
+    blobs = recording.values("/fluoroscopy", "EncodedImage:blob")
+    for frame, blob in zip(frames, blobs, strict=True):
+        image = np.asarray(Image.open(io.BytesIO(bytes(blob[0]))))
+        np.testing.assert_array_equal(image, frame[..., 0])
+
+
+def test_the_scene_is_in_the_patient_frame_with_a_translucent_vessel(written):
+    _, _, _, recording = written
+    vertices, faces = make_tube()
+    assert len(recording.fixed("/world/vessel", "Mesh3D:vertex_positions")) == len(
+        vertices
+    )
+    assert len(recording.fixed("/world/vessel", "Mesh3D:triangle_indices")) == len(
+        faces
+    )
+    rgba = recording.fixed("/world/vessel", "Mesh3D:albedo_factor")[0]
+    assert 0 < rgba & 0xFF < 128
+    # Left, back, up in Rerun's numbering of directions.
+    assert list(recording.fixed("/world", "ViewCoordinates:xyz")[0]) == [4, 6, 1]
+    goal = recording.fixed("/world/goal", "Ellipsoids3D:centers")[0]
+    np.testing.assert_allclose(goal, GOAL, atol=1e-6)
+
+
+def test_the_text_is_a_table_with_escaped_cells(written):
+    text = written[3].fixed("/info", "TextDocument:text")[0]
+    assert "| Outcome | success |" in text
+    assert '{"a\\|b": "1.0"}' in text
+    assert "distance" not in text.split("| versions")[1]
+
+
+def test_an_episode_without_extras_opens_without_them(tmp_path):
+    episode = make_episode(STEPS, counts=np.zeros(STEPS, int))
+    recording = Recording(write_rrd(episode, make_tube(), tmp_path / "e.rrd"))
+    assert "/world/goal" not in recording.static
+    assert "/series/distance_mm" not in recording.temporal
+    assert "/fluoroscopy" not in recording.views
+    assert "/series/distance_mm" not in recording.views
+    arrows = recording.values("/world/contacts", "Arrows3D:vectors")
+    assert arrows == [[]] * STEPS
+
+
+def test_an_episode_of_no_steps_is_still_a_recording(tmp_path):
+    recording = Recording(write_rrd(make_episode(0), make_tube(), tmp_path / "e.rrd"))
+    assert recording.values("/world/catheter", "step") == [0]
+    assert "/series/reward" not in recording.temporal
+
+
+def test_two_episodes_are_two_recordings(tmp_path):
+    found = {
+        Recording(write_rrd(make_episode(2), make_tube(), tmp_path / f"{i}.rrd"))
+        .recordings[0]
+        .recording_id
+        for i in range(2)
+    }
+    assert len(found) == 2
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"fluoroscopy": np.zeros((STEPS, 4, 4, 1), np.uint8)}, "must have shape"),
+        ({"fluoroscopy": np.zeros((STEPS + 1, 4, 4, 1))}, "uint8"),
+        ({"catheter_radius": [0.001, 0.002]}, "4 of them"),
+        ({"catheter_radius": 0.0}, "positive"),
+        ({"goal_position": GOAL}, "both position and radius"),
+        ({"goal_position": GOAL[:2], "goal_radius": 0.1}, "position"),
+        (
+            {
+                "robot_geoms": [
+                    BodyGeom(9, "r", "sphere", [1], [0] * 3, [1, 0, 0, 0], [1] * 4)
+                ]
+            },
+            "names body 9",
+        ),
+    ],
+)
+def test_wrong_inputs_leave_no_file(tmp_path, options, message):
+    with pytest.raises(ValueError, match=message):
+        write_rrd(make_episode(STEPS), make_tube(), tmp_path / "e.rrd", **options)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_failure_half_way_keeps_the_old_file(tmp_path, monkeypatch):
+    import rerun as rr
+
+    path = tmp_path / "e.rrd"
+    write_rrd(make_episode(2), make_tube(), path)
+    before = path.read_bytes()
+
+    def broken(**kwargs):
+        raise OSError("no more")
+
+    monkeypatch.setattr(rr.Scalars, "columns", broken)
+    with pytest.raises(OSError, match="no more"):
+        write_rrd(make_episode(3), make_tube(), path)
+    assert path.read_bytes() == before
+    assert [p.name for p in tmp_path.iterdir()] == ["e.rrd"]
+
+
+def test_rerun_switched_off_is_an_error(tmp_path, monkeypatch):
+    monkeypatch.setenv("RERUN", "off")
+    with pytest.raises(RuntimeError, match="switched off"):
+        write_rrd(make_episode(2), make_tube(), tmp_path / "e.rrd")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_long_episode_stays_small(tmp_path):
+    episode = make_episode(500, links=100, counts=np.full(500, 6))
+    path = write_rrd(episode, make_tube(sides=64, rings=100), tmp_path / "e.rrd")
+    # Random joints do not compress; a real catheter takes less.
+    assert path.stat().st_size < 5e6
+
+
+def test_reading_episodes_needs_no_rerun():
+    code = (
+        "import sys; import cathsim_dmc.recording, cathsim_dmc.analysis.forces, "
+        "cathsim_dmc.analysis.heatmap; "
+        "print([m for m in ('rerun', 'matplotlib', 'dm_control', 'torch') "
+        "if m in sys.modules])"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True
+    )
+    assert done.stdout.strip() == "[]"
