@@ -207,11 +207,12 @@ class Catheter(composer.Entity):
         if self._device.steerable:
             first = len(self._lengths) - self._device.tip_links
             for index in range(first, len(self._lengths)):
+                # The torque that bends the free joint by the steering angle: a motor
+                # shifts the rest shape and adds no stiffness.
+                compliance, _ = self._joint_compliance(index)
+                torque = self._device.steering_angle / compliance
                 for axis in ("x", "y"):
                     joint = self._mjcf_root.find("joint", f"bend_{axis}_{index}")
-                    # The torque that bends the free joint by the steering angle: a
-                    # motor shifts the rest shape and adds no stiffness.
-                    torque = joint.stiffness * self._device.steering_angle
                     self._tip_motors.append(
                         self._mjcf_root.actuator.add(
                             "general",

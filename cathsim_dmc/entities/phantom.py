@@ -144,5 +144,5 @@ class Phantom(composer.Entity):
 
     @property
     def load_cell(self):
-        """Force sensor under the phantom, world frame, force on the support."""
+        """Force sensor under the phantom, world frame, force of the support on it."""
         return self._load_cell

@@ -81,10 +81,13 @@ class Layout:
         Raises:
           ValueError: if the model lacks one of the names.
         """
-        base = _id(model, mujoco.mjtObj.mjOBJ_BODY, f"{catheter}/link_0")
         links = [
-            body for body in range(base, model.nbody) if model.body_rootid[body] == base
+            body
+            for body in range(model.nbody)
+            if model.body(body).name.startswith(f"{catheter}/link_")
         ]
+        if not links:
+            raise ValueError(f"the model has no body named {catheter}/link_0")
         joints = [
             joint for joint in range(model.njnt) if model.jnt_bodyid[joint] in links
         ]
@@ -124,10 +127,10 @@ class Layout:
             external_force=data.cfrc_ext[..., self.links, :].copy(),
             centreline=np.concatenate([xpos, head[..., None, :]], axis=-2),
             head=head.copy(),
-            # MuJoCo reports the force of the site's body on its parent.
+            # MuJoCo reports the force of the parent on the site's body.
             push_force=sensors[..., self.push_force][..., 2].copy(),
             push_torque=sensors[..., self.push_torque][..., 2].copy(),
-            load_cell=sensors[..., self.load_cell].copy(),
+            load_cell=-sensors[..., self.load_cell],
         )
 
     def contacts(self, sensordata: np.ndarray) -> forces.Contacts:

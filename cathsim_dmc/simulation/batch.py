@@ -1,0 +1,248 @@
+"""Many simulations of one navigation task on a thread pool.
+
+Bit-identical to as many composer environments with the same seeds and actions: the
+same compiled model, the same `mj_step`, the same pure functions of arrays.
+"""
+
+import dataclasses
+import logging
+from collections.abc import Sequence
+
+import mujoco
+import numpy as np
+from dm_control import mjcf
+from mujoco import batch as mujoco_batch
+
+from cathsim_dmc.tasks import cannulation, forces, navigation, observations, readings
+
+_LOG = logging.getLogger(__name__)
+
+
+@dataclasses.dataclass(frozen=True)
+class Step:
+    """Result of one control step of N simulations.
+
+    Attributes:
+      observation: arrays (N, ...).
+      outcome: reward, success and distance, arrays (N,).
+      terminated: (N,) bool, success or a physics error.
+      truncated: (N,) bool, out of time.
+      physics_error: (N,) bool, the simulation diverged; such an episode says nothing
+        about the policy.
+      readings: state of the devices.
+      wall_force: on the wall over the control step.
+    """
+
+    observation: observations.Observation
+    outcome: cannulation.Outcome
+    terminated: np.ndarray
+    truncated: np.ndarray
+    physics_error: np.ndarray
+    readings: readings.Readings
+    wall_force: forces.WallForce
+
+
+class BatchSimulation:
+    """N simulations of one task.
+
+    A simulation that has ended must be reset before the next step; stepping it on is
+    allowed and goes on with the state as it is.
+    """
+
+    def __init__(
+        self,
+        task: navigation.Navigation,
+        num_simulations: int,
+        *,
+        num_threads: int = 0,
+        seeds: Sequence[int] | int = 0,
+    ):
+        """Compiles the task's model and starts the threads.
+
+        Args:
+          task: a task that no environment owns; the batch takes it over.
+          num_simulations: N.
+          num_threads: worker threads, 0 for one per core.
+          seeds: of each simulation, or of the first, the others counting up.
+        """
+        if num_simulations < 1:
+            raise ValueError(f"num_simulations is {num_simulations}; at least 1")
+        self._task = task
+        physics = mjcf.Physics.from_mjcf_model(task.root_entity.mjcf_model)
+        task.after_compile(physics, None)
+        self._model = physics.model.ptr
+        self._layout = task.layout
+        self._substeps = task.physics_steps_per_control_step
+        self._batch = mujoco_batch.Batch(self._model, num_simulations, num_threads)
+        for field in self._layout.FIELDS:
+            self._batch.bind(field)
+        self._rows = np.zeros(
+            (num_simulations, self._substeps, self._model.nsensordata)
+        )
+        self._steps = np.zeros(num_simulations, dtype=int)
+        self._action = np.zeros((num_simulations, len(task.catheter.actuators)))
+        self._images: list[np.ndarray] = []
+        self.seed(seeds)
+
+    def seed(self, seeds: Sequence[int] | int) -> None:
+        """Gives each simulation its own source of randomness."""
+        if np.ndim(seeds) == 0:
+            seeds = [int(seeds) + index for index in range(self.num_simulations)]
+        if len(seeds) != self.num_simulations:
+            raise ValueError(
+                f"{len(seeds)} seeds for {self.num_simulations} simulations; give one "
+                "each, or the first"
+            )
+        self._random_states = [np.random.RandomState(seed) for seed in seeds]
+
+    def reset(self, indices: np.ndarray | None = None) -> observations.Observation:
+        """Starts new episodes.
+
+        Args:
+          indices: of the simulations to reset, all if None.
+
+        Returns:
+          Observations (N, ...) of all simulations.
+        """
+        indices = np.arange(self.num_simulations) if indices is None else indices
+        if len(indices):
+            displacement = np.stack(
+                [
+                    cannulation.start_displacement(self._random_states[index])
+                    for index in indices
+                ]
+            )
+            # Without a pass at the default pose, whose solution would warm-start ours.
+            self._batch.reset(indices, stage=mujoco.mjtStage.mjSTAGE_NONE.value)
+            qpos = self._batch.qpos
+            qpos[indices] = self._task.start_qpos(qpos[indices], displacement)
+            self._batch.forward(indices)
+            self._rows[indices] = self._batch.sensordata[indices, None]
+            self._steps[indices] = 0
+            self._action[indices] = 0
+        self._measure()
+        self._look(indices)
+        return self._observe()
+
+    def step(self, action: np.ndarray) -> Step:
+        """Advances every simulation by one control step.
+
+        Args:
+          action: (N, A) in [-1, 1].
+
+        Raises:
+          ValueError: if the action has the wrong shape or is not finite.
+        """
+        action = cannulation.check_action(action, self._action.shape[-1])
+        if action.shape != self._action.shape:
+            raise ValueError(
+                f"the action has shape {action.shape}; {self.num_simulations} "
+                f"simulations need {self._action.shape}"
+            )
+        self._action = action.copy()
+        self._batch.ctrl[:] = action
+        self._task.posed_robot(self._batch.qpos)
+        warnings = self._batch.warning.copy()
+        self._batch.rollout(
+            self._substeps,
+            record=("sensordata",),
+            out={"sensordata": self._rows},
+        )
+        changed = self._batch.warning != warnings
+        error = changed.reshape(self.num_simulations, -1).any(-1)
+        if error.any():
+            _LOG.warning("simulations %s diverged", np.flatnonzero(error).tolist())
+        self._steps += 1
+        self._measure()
+        self._look()
+        outcome = self._task.meaning.outcome(self._readings.head)
+        if error.any():
+            outcome = dataclasses.replace(
+                outcome,
+                success=outcome.success & ~error,
+                reward=np.where(error, 0.0, outcome.reward),
+            )
+        terminated = outcome.success | error
+        return Step(
+            observation=self._observe(),
+            outcome=outcome,
+            terminated=terminated,
+            truncated=~terminated & (self._steps >= self._task.meaning.max_steps),
+            physics_error=error,
+            readings=self._readings,
+            wall_force=self._wall_force,
+        )
+
+    def _measure(self):
+        self._readings = self._layout.read(self._batch)
+        self._wall_force = forces.wall_force(
+            forces.magnitudes(self._rows[..., self._layout.wall_contacts])
+        )
+
+    def _look(self, fresh: np.ndarray | None = None):
+        """Takes images; those of fresh episodes fill their whole history."""
+        fluoroscope = self._task.fluoroscope
+        if fluoroscope is None:
+            return
+        image = observations.look(
+            fluoroscope, self._readings, self._task.catheter.device.outer_radius
+        )
+        if not self._images:
+            self._images = [image.copy() for _ in range(observations.SEQUENCE_LENGTH)]
+        elif fresh is None:
+            self._images = [image, *self._images[: observations.SEQUENCE_LENGTH - 1]]
+        else:
+            for past in self._images:
+                past[fresh] = image[fresh]
+
+    def _observe(self) -> observations.Observation:
+        frame = observations.Frame(
+            readings=self._readings,
+            wall_force=self._wall_force,
+            action=self._action,
+            image=self._images[0] if self._images else None,
+            past_images=tuple(self._images[1:]),
+        )
+        return observations.observe(
+            self._task.observation_names, frame, self._task.goal_position
+        )
+
+    @property
+    def num_simulations(self) -> int:
+        """N."""
+        return self._batch.nsim
+
+    @property
+    def num_actions(self) -> int:
+        """A, entries of an action."""
+        return self._action.shape[-1]
+
+    @property
+    def task(self) -> navigation.Navigation:
+        """The task that all simulations run."""
+        return self._task
+
+    @property
+    def batch(self) -> mujoco_batch.Batch:
+        """The simulations; `expand` gives model fields of their own to each."""
+        return self._batch
+
+    @property
+    def readings(self) -> readings.Readings:
+        """State of the devices after the last step or reset."""
+        return self._readings
+
+    @property
+    def wall_force(self) -> forces.WallForce:
+        """Force on the wall over the last step."""
+        return self._wall_force
+
+    @property
+    def sensor_rows(self) -> np.ndarray:
+        """Sensor rows (N, S, nsensordata) of the S substeps of the last step."""
+        return self._rows
+
+    @property
+    def steps(self) -> np.ndarray:
+        """Control steps (N,) since the last reset of each."""
+        return self._steps
