@@ -91,12 +91,18 @@ def test_episode_statistics_of_known_forces():
     assert found.f_max == 3.0
     assert found.step_mean == pytest.approx((4 + 0 + 2) / 3)
     assert found.step_max == 4.0
+    assert found.peak_max is None
     assert found.contact_share == pytest.approx(2 / 3)
     assert found.push_max == 4.0
     assert found.reward == 7.0
     assert found.path == pytest.approx(0.4)
     assert found.path_ratio == pytest.approx(2.0)
     assert (found.steps, found.contacts) == (3, 3)
+
+
+def test_peaks_within_steps_come_from_the_metadata():
+    meta = {**make_episode().meta, "wall_force_peak_max": [0.1, 0.7, 0.2]}
+    assert episode_statistics(make_episode(meta=meta)).peak_max == 0.7
 
 
 def test_an_episode_without_contact_or_steps_has_zero_force():
@@ -119,6 +125,7 @@ def make_statistics(success, f_mean, ratio):
         f_max=2 * f_mean,
         step_mean=f_mean,
         step_max=f_mean,
+        peak_max=None,
         contact_share=0.5,
         push_max=1.0,
         path=0.1,

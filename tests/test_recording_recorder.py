@@ -1,4 +1,5 @@
 import copy
+from types import SimpleNamespace
 
 import mujoco
 import numpy as np
@@ -115,11 +116,13 @@ class PushTask(composer.Task):
         head = physics.named.data.site_xpos["catheter/head"]
         if np.linalg.norm(head - self.goal_position) < self.goal_radius:
             self.termination = "success"
-        _, force = self.contacts(physics)
-        magnitude = np.linalg.norm(force, axis=-1)
-        self.wall_force_sum = float(magnitude.sum())
-        self.wall_force_max = float(magnitude.max(initial=0.0))
-        self.push_force = PUSH * float(physics.data.actuator_force[0])
+        force = np.linalg.norm(self.contacts(physics).force, axis=-1)
+        total, largest = force.sum(), force.max(initial=0.0)
+        self.wall_force = SimpleNamespace(
+            sum=total, max=largest, peak_sum=2 * total, peak_max=2 * largest
+        )
+        push = PUSH * float(physics.data.actuator_force[0])
+        self.readings = SimpleNamespace(push_force=push)
 
     def contacts(self, physics):
         """Forces on the wall at the present state, from MuJoCo's contact forces.
@@ -140,7 +143,14 @@ class PushTask(composer.Task):
             sign = 1.0 if contact.geom[1] == wall else -1.0
             position.append(np.array(contact.pos))
             force.append(sign * local[:3] @ contact.frame.reshape(3, 3))
-        return np.array(position).reshape(-1, 3), np.array(force).reshape(-1, 3)
+        # As in the real task, empty places of the sensor are marked.
+        position.append(np.zeros(3))
+        force.append(np.zeros(3))
+        return SimpleNamespace(
+            position=np.array(position),
+            force=np.array(force),
+            present=np.arange(len(force)) < len(force) - 1,
+        )
 
     def should_terminate_episode(self, physics):
         return self.termination is not None
@@ -218,6 +228,8 @@ def test_contacts_press_on_the_wall_and_agree_with_the_task(wall_env):
     total = np.bincount(episode.contact_step, magnitude, minlength=episode.steps)
     np.testing.assert_allclose(episode.wall_force_sum, total)
     assert (episode.wall_force_max <= episode.wall_force_sum + 1e-12).all()
+    peaks = episode.meta["wall_force_peak_max"]
+    np.testing.assert_allclose(peaks, 2 * episode.wall_force_max)
 
 
 def test_a_seed_repeats_an_episode_bit_for_bit(wall_env):
@@ -239,8 +251,13 @@ def test_success_ends_the_episode():
     assert min(episode.meta["distance"][:-1]) >= episode.meta["goal_radius"]
 
 
-def test_a_diverged_step_is_left_out():
-    env = make_env(goal=1.0, diverge_at=0.099)
+@pytest.mark.parametrize("raises", [True, False])
+def test_a_diverged_step_is_left_out(raises):
+    env = composer.Environment(
+        PushTask(goal=1.0, diverge_at=0.099),
+        raise_exception_on_physics_error=raises,
+        strip_singleton_obs_buffer_dim=True,
+    )
     episode = EpisodeRecorder(env).record_episode(push, seed=0)
     assert episode.termination == "physics_error"
     assert episode.steps == 5

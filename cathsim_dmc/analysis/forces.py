@@ -144,6 +144,8 @@ class EpisodeStatistics:
         step_mean: Mean over all steps of the wall force sum; steps without contact
             count as 0.
         step_max: Largest wall force sum of a step.
+        peak_max: Largest single contact of any physics step, which a sample per
+            control step can miss, or None if it was not recorded.
         contact_share: Fraction of the steps that have contact.
         push_max: Largest magnitude of the push force.
         path: Travelled path of the head.
@@ -158,6 +160,7 @@ class EpisodeStatistics:
     f_max: float
     step_mean: float
     step_max: float
+    peak_max: float | None
     contact_share: float
     push_max: float
     path: float
@@ -176,6 +179,7 @@ def episode_statistics(
     """
     size = magnitude(episode.contact_force)
     steps = step_forces(episode.contact_step, episode.contact_force, episode.steps)
+    peaks = episode.meta.get("wall_force_peak_max")
     ratio = None
     if route_length is not None:
         ratio = float(path_ratio(episode.head, route_length))
@@ -188,6 +192,7 @@ def episode_statistics(
         f_max=float(size.max(initial=0.0)),
         step_mean=_mean(steps.total),
         step_max=float(steps.total.max(initial=0.0)),
+        peak_max=None if peaks is None else max(peaks, default=0.0),
         contact_share=_mean(steps.contacts > 0),
         push_max=float(np.abs(episode.push_force).max(initial=0.0)),
         path=float(path_length(episode.head)),

@@ -27,26 +27,43 @@ _VERSIONED = ("cathsim-dmc", "mujoco", "dm-control", "numpy")
 class StepReadout:
     """What the task says about the control step that has just ended.
 
-    Forces in newtons, world frame, on the wall by the device.
+    Forces in newtons, world frame, on the wall by the device. Contacts, sum and
+    largest force are those of the last physics step; the peaks are over all physics
+    steps of the control step.
     """
 
     contact_position: np.ndarray
     contact_force: np.ndarray
     wall_force_sum: float
     wall_force_max: float
+    wall_force_peak_sum: float
+    wall_force_peak_max: float
     push_force: float
 
 
 def read_step(task: Any, physics: Any) -> StepReadout:
     """Ask a task for its forces; the one place that knows the task's attributes."""
-    position, force = task.contacts(physics)
+    contacts, wall = task.contacts(physics), task.wall_force
     return StepReadout(
-        contact_position=np.array(position, dtype=np.float64).reshape(-1, 3),
-        contact_force=np.array(force, dtype=np.float64).reshape(-1, 3),
-        wall_force_sum=float(task.wall_force_sum),
-        wall_force_max=float(task.wall_force_max),
-        push_force=float(task.push_force),
+        contact_position=np.array(contacts.position[contacts.present]),
+        contact_force=np.array(contacts.force[contacts.present]),
+        wall_force_sum=float(wall.sum),
+        wall_force_max=float(wall.max),
+        wall_force_peak_sum=float(wall.peak_sum),
+        wall_force_peak_max=float(wall.peak_max),
+        push_force=float(task.readings.push_force),
     )
+
+
+def read_termination(task: Any, timestep: Any) -> str | None:
+    """Return why the episode ended, or None while it runs.
+
+    A task never sees the end by diverged physics or by composer's time limit: the
+    environment then ends the episode itself, with discount 0 and 1.
+    """
+    if task.termination is not None or not timestep.last():
+        return task.termination
+    return "truncated" if timestep.discount else "physics_error"
 
 
 def read_goal(task: Any) -> tuple[np.ndarray, float] | None:
@@ -76,6 +93,9 @@ class EpisodeRecorder:
     """Runs a policy in an environment and keeps everything that happened.
 
     The environment stays usable afterwards; nothing is switched on or changed in it.
+    Poses are those the simulator holds after a step: with ``legacy_step=False`` they
+    belong to the start of the last physics step, as do the contacts, while ``qpos``
+    and ``time`` belong to its end.
 
     Args:
         env: A ``composer.Environment`` whose model holds the catheter and whose task
@@ -140,17 +160,18 @@ class EpisodeRecorder:
         self._bind()
         rows = _Rows()
         rows.add(**self._state())
-        steps, error, discount = 0, None, 1.0
+        steps, error, termination, discount = 0, None, None, 1.0
         while not timestep.last() and (max_steps is None or steps < max_steps):
             action = self._action(policy, timestep)
             try:
                 timestep = self._env.step(action)
             except control.PhysicsError as caught:
-                error = str(caught)
+                error, termination = str(caught), "physics_error"
                 break
             discount = float(timestep.discount)
-            if self._env.task.termination == "physics_error":
-                error = "the task reported diverged physics"
+            termination = read_termination(self._env.task, timestep)
+            if termination == "physics_error":
+                error = "the environment ended the episode"
                 break
             state = self._state()
             readout = read_step(self._env.task, self._env.physics)
@@ -161,6 +182,8 @@ class EpisodeRecorder:
                 reward=float(timestep.reward),
                 wall_force_sum=readout.wall_force_sum,
                 wall_force_max=readout.wall_force_max,
+                wall_force_peak_sum=readout.wall_force_peak_sum,
+                wall_force_peak_max=readout.wall_force_peak_max,
                 push_force=readout.push_force,
                 contact_step=np.full(count, steps),
                 contact_position=readout.contact_position,
@@ -171,7 +194,9 @@ class EpisodeRecorder:
             logging.getLogger(__name__).warning(
                 "physics diverged after %d steps: %s", steps, error
             )
-        meta = self._meta(rows, error, discount)
+        meta = self._meta(rows, termination or "truncated", discount)
+        if error is not None:
+            meta["error"] = error
         return self._episode(rows, seed, meta)
 
     def _state(self) -> dict[str, Any]:
@@ -198,9 +223,8 @@ class EpisodeRecorder:
             raise ValueError(f"the policy returned an action with {action}")
         return action
 
-    def _meta(self, rows: _Rows, error: str | None, discount: float) -> dict[str, Any]:
-        task, model = self._env.task, self._env.physics.model
-        termination = "physics_error" if error else task.termination or "truncated"
+    def _meta(self, rows: _Rows, termination: str, discount: float) -> dict[str, Any]:
+        model = self._env.physics.model
         if termination not in TERMINATIONS:
             raise ValueError(
                 f"the task ended with termination {termination!r}; it must be one of "
@@ -216,10 +240,10 @@ class EpisodeRecorder:
             "action_names": self._env.action_spec().name.split("\t"),
             "body_names": [model.id2name(i, "body") for i in range(model.nbody)],
             "catheter_radius": _link_radii(model, self._links),
+            "wall_force_peak_sum": rows.get("wall_force_peak_sum").tolist(),
+            "wall_force_peak_max": rows.get("wall_force_peak_max").tolist(),
         }
-        if error is not None:
-            meta["error"] = error
-        goal = read_goal(task)
+        goal = read_goal(self._env.task)
         if goal is not None:
             position, radius = goal
             head = rows.get("catheter")[:, -1]
