@@ -116,13 +116,21 @@ class BatchSimulation:
             self._batch.reset(indices, stage=mujoco.mjtStage.mjSTAGE_NONE.value)
             qpos = self._batch.qpos
             qpos[indices] = self._task.start_qpos(qpos[indices], displacement)
-            self._batch.forward(indices)
+            self._forward_unactuated(indices)
             self._rows[indices] = self._batch.sensordata[indices, None]
             self._steps[indices] = 0
             self._action[indices] = 0
         self._measure()
         self._look(indices)
         return self._observe()
+
+    def _forward_unactuated(self, indices: np.ndarray):
+        """What dm_control does at a reset, when there is no control yet."""
+        actuation = mujoco.mjtDisableBit.mjDSBL_ACTUATION.value
+        flags = self._batch.expand("opt.disableflags")
+        flags[indices] |= actuation
+        self._batch.forward(indices)
+        flags[indices] &= ~actuation
 
     def step(self, action: np.ndarray) -> Step:
         """Advances every simulation by one control step.
