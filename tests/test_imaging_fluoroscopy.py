@@ -163,8 +163,10 @@ def test_roadmap_lightens_the_vessel(fluoroscope, frames):
     mask = fluoroscope.vessel_mask
     assert (a[~mask] == b[~mask]).all()
     assert (b[mask] > a[mask]).all()
-    device = road.masks(frames[0], RADIUS).device
-    assert b[device & mask].mean() < b[~device & mask].mean() - 10
+    # Tissue goes half the way from 0.75 to white; the device keeps its contrast.
+    tissue = b[mask & (a == 191)]
+    assert (np.abs(tissue - 255 * 0.875) <= 1.5).all()
+    np.testing.assert_allclose(b[mask] / a[mask], 0.875 / 0.75, atol=0.02)
 
 
 def test_device_mask_covers_the_catheter(fluoroscope, frames):

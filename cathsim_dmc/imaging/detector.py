@@ -152,17 +152,17 @@ def grey(signal: ArrayLike, gain: float = GAIN) -> np.ndarray:
     return np.clip(level, 0.0, 255.0, out=level).astype(np.uint8)
 
 
-def roadmapped(image: ArrayLike, mask: ArrayLike, opacity: float) -> np.ndarray:
-    """Live image with the vessel laid over it in white.
+def roadmap_gain(mask: ArrayLike, opacity: float, gain: float = GAIN) -> np.ndarray:
+    """Factor on the signal that lays the vessel over the live image in white.
+
+    A factor, not a blend, so that a device in the vessel keeps its contrast.
 
     Args:
-        image: (..., rows, columns) uint8.
-        mask: (rows, columns) bool, where the vessel is.
-        opacity: 0 (nothing) to 1 (white vessel, the device hidden).
+        mask: (..., rows, columns) bool, where the vessel is.
+        opacity: 0 leaves the image as it is, 1 lifts plain tissue to full white.
+        gain: share of full white given to plain tissue (see `grey`).
 
     Returns:
-        (..., rows, columns) uint8.
+        (..., rows, columns) float32, >= 1 for gains up to 1.
     """
-    image = np.asarray(image)
-    lighter = image + np.float32(opacity) * (np.float32(255.0) - image)
-    return np.where(mask, np.rint(lighter).astype(np.uint8), image)
+    return np.where(mask, 1.0 + opacity * (1.0 / gain - 1.0), 1.0).astype(np.float32)

@@ -27,9 +27,6 @@ PATIENT_THICKNESS = 0.20
 # diameter: half the pixel covered to half the depth.
 MASK_SHARE = 0.25
 
-# Strength of the vessel's white overlay on a roadmap.
-ROADMAP_OPACITY = 0.5
-
 # Frames rendered at once.
 _CHUNK = 16
 
@@ -81,8 +78,8 @@ class Fluoroscope:
             less noise.
         blur: standard deviation of the detector's point spread, m.
         gain: share of full white given to plain tissue.
-        roadmap: opacity of the vessel laid over the live image in white; 0 for none.
-            A roadmap is usually shown with contrast 0.
+        roadmap: opacity of the vessel laid over the live image in white, 0 for none,
+            1 for tissue in full white; usually shown with contrast 0.
     """
 
     carm: CArm
@@ -222,10 +219,11 @@ class Fluoroscope:
         if states is not None:
             signal = detector.quantum_noise(signal, self.quanta, states)
         signal = detector.blurred(signal, self.blur / self.carm.pitch)
-        image = detector.grey(signal, self.gain)
         if self.roadmap > 0.0:
-            image = detector.roadmapped(image, self.vessel_mask, self.roadmap)
-        return image
+            signal = signal * detector.roadmap_gain(
+                self.vessel_mask, self.roadmap, self.gain
+            )
+        return detector.grey(signal, self.gain)
 
     def masks(self, points: ArrayLike, radius: ArrayLike) -> Masks:
         """Which pixels show the device, and which the vessel.

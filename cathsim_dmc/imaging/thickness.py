@@ -22,10 +22,11 @@ _CHUNK = 1_000_000
 
 
 def closed(vertices: ArrayLike, faces: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
-    """Merge coincident vertices and close open ends of a surface.
+    """Close the open ends of a surface.
 
     Every hole gets a fan from its rim to the mean of the rim, which is flat for the
-    cut end of a vessel.
+    cut end of a vessel. Coincident vertices are merged if the surface is open
+    without that, as triangles from an STL file are.
 
     Args:
         vertices: (V, 3) m.
@@ -35,43 +36,24 @@ def closed(vertices: ArrayLike, faces: ArrayLike) -> tuple[np.ndarray, np.ndarra
         vertices (V', 3) float64 and faces (F', 3) int64 of a closed surface.
 
     Raises:
-        ValueError: if shapes are wrong, an edge has more than two faces or faces
-            disagree about the outside, or the surface is wound inside out.
+        ValueError: if shapes are wrong, faces disagree about the outside, or the
+            surface is wound inside out.
     """
     vertices, faces = _mesh(vertices, faces)
-    vertices, index = np.unique(vertices, axis=0, return_inverse=True)
-    faces = index.reshape(-1)[faces]
-    a, b, c = faces.T
-    faces = faces[(a != b) & (b != c) & (c != a)]
-
-    edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
-    count = len(vertices)
-    forth = edges[:, 0] * count + edges[:, 1]
-    back = edges[:, 1] * count + edges[:, 0]
-    if len(np.unique(forth)) != len(forth):
-        raise ValueError(
-            "the surface has edges with more than two faces, or neighbours wound "
-            "against each other; give an oriented manifold (for example after "
-            "trimesh.repair.fix_winding)."
-        )
-    rim = edges[~np.isin(forth, back)]
+    rim = _rim(faces, len(vertices))[0]
     if len(rim):
-        from scipy.sparse import coo_array
-        from scipy.sparse.csgraph import connected_components
-
-        graph = coo_array((np.ones(len(rim)), tuple(rim.T)), shape=(count, count))
-        label = connected_components(graph, directed=False)[1][rim[:, 0]]
-        holes, label = np.unique(label, return_inverse=True)
-        middle = np.stack(
-            [
-                np.bincount(label, weights=vertices[rim[:, 0], i]) / np.bincount(label)
-                for i in range(3)
-            ],
-            axis=-1,
-        )
-        fan = np.stack([rim[:, 1], rim[:, 0], count + label], axis=-1)
-        vertices = np.concatenate([vertices, middle])
-        faces = np.concatenate([faces, fan])
+        vertices, index = np.unique(vertices, axis=0, return_inverse=True)
+        faces = index.reshape(-1)[faces]
+        a, b, c = faces.T
+        faces = faces[(a != b) & (b != c) & (c != a)]
+        rim, excess = _rim(faces, len(vertices))
+        if len(rim) and excess.max() > 1:
+            raise ValueError(
+                "faces of the surface are wound against their neighbours; orient "
+                "them alike (for example with trimesh.repair.fix_winding)."
+            )
+    if len(rim):
+        vertices, faces = _filled(vertices, faces, rim)
 
     volume = np.linalg.det(vertices[faces]).sum() / 6.0
     if volume <= 0.0:
@@ -80,6 +62,38 @@ def closed(vertices: ArrayLike, faces: ArrayLike) -> tuple[np.ndarray, np.ndarra
             "the order of the vertices of every face)."
         )
     return vertices, faces
+
+
+def _rim(faces: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Edges run more often one way than the other: (E, 2), and by how much (E,).
+
+    Without such edges the signed sum of ray depths is right, even where more than
+    two faces share an edge.
+    """
+    edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
+    low, high = edges.min(axis=1), edges.max(axis=1)
+    edge, index = np.unique(low * count + high, return_inverse=True)
+    net = np.bincount(index, weights=np.where(edges[:, 0] == low, 1, -1))
+    ends = np.stack(np.divmod(edge, count), axis=-1)
+    ends[net < 0] = ends[net < 0][:, ::-1]
+    return ends[net != 0], np.abs(net[net != 0])
+
+
+def _filled(vertices, faces, rim) -> tuple[np.ndarray, np.ndarray]:
+    """Surface with a fan over every hole of the rim."""
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    count = len(vertices)
+    graph = coo_array((np.ones(len(rim)), tuple(rim.T)), shape=(count, count))
+    label = connected_components(graph, directed=False)[1][rim[:, 0]]
+    label = np.unique(label, return_inverse=True)[1]
+    middle = np.stack(
+        [np.bincount(label, weights=vertices[rim[:, 0], i]) for i in range(3)], axis=-1
+    )
+    middle /= np.bincount(label)[:, None]
+    fan = np.stack([rim[:, 1], rim[:, 0], count + label], axis=-1)
+    return np.concatenate([vertices, middle]), np.concatenate([faces, fan])
 
 
 def surface_thickness(
