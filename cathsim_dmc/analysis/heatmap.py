@@ -24,7 +24,7 @@ MARGIN = 5e-3
 # of the picture, as the reader faces the patient) and z (up).
 AP_AXES = (0, 2)
 _PICTURE_HEIGHT_IN = 7.0
-_PICTURE_WIDTH_RANGE_IN = (5.5, 14.0)
+_PICTURE_WIDTH_RANGE_IN = (4.0, 14.0)
 _COLOUR_BAR_IN = 1.6
 _DPI = 150
 
@@ -141,10 +141,8 @@ def heatmap(
         position, force, outline.min(0) - MARGIN, outline.max(0) + MARGIN, cell
     )
     if title is None:
-        title = (
-            f"{', '.join(sorted({e.task for e in episodes}))}: {len(episodes)} "
-            f"episodes, {len(force)} contacts"
-        )
+        tasks = ", ".join(sorted({e.task for e in episodes}))
+        title = f"{tasks}\nepisodes {len(episodes)}, contacts {len(force)}"
     figure = _figure(field, outline, faces, force_limit, title)
     with atomic_path(path, SUFFIX) as temporary:
         figure.savefig(temporary, format="png", dpi=_DPI)

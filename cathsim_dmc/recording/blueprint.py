@@ -86,5 +86,7 @@ def _scene(centre: np.ndarray, extent: float) -> rrb.Spatial3DView:
 
 def _plot(name: str, origin: str, legend: bool = False) -> rrb.TimeSeriesView:
     return rrb.TimeSeriesView(
-        origin=origin, name=name, plot_legend=rrb.PlotLegend(visible=legend)
+        origin=origin,
+        name=name,
+        plot_legend=rrb.PlotLegend(corner="RightTop", visible=legend),
     )

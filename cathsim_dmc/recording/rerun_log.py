@@ -51,6 +51,8 @@ SHAFT_COLOUR = (215, 228, 255)
 HEAD_COLOUR = (255, 200, 0)
 GOAL_COLOUR = (60, 190, 90, 110)
 TRAIL_COLOUR = (255, 200, 0, 160)
+# Entities that would hide the device inside them, and how opaque they are drawn.
+SEE_THROUGH = {"sheath": 0.3}
 
 
 def write_rrd(
@@ -257,9 +259,11 @@ def _shape(parts: list[BodyGeom]) -> Any:
     size = np.stack([g.size for g in parts])
     centre = np.stack([g.position for g in parts])
     turn = np.stack([g.quaternion for g in parts])
+    rgba = np.stack([g.rgba for g in parts])
+    rgba[:, 3] *= SEE_THROUGH.get(parts[0].body_name.split("/", 1)[0], 1.0)
     common = {
         "quaternions": xyzw(turn),
-        "colors": np.stack([np.round(255 * g.rgba) for g in parts]).astype(np.uint8),
+        "colors": np.round(255 * rgba).astype(np.uint8),
         "fill_mode": "solid",
     }
     kind = parts[0].kind
