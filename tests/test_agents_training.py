@@ -9,10 +9,12 @@ from pathlib import Path
 import pytest
 import synthetic_env
 import torch
+from tensordict import TensorDict
 
 from cathsim_dmc.agents import ConfigError, evaluate, make_config, train
 from cathsim_dmc.agents.checkpoint import Checkpoint, checkpoints_in
 from cathsim_dmc.agents.metrics import MetricsFile, read_metrics
+from cathsim_dmc.agents.training import _excuse_divergence
 
 CLOCKS = ("seconds", "frames_per_second")
 
@@ -46,7 +48,7 @@ def small_sac(**changes):
             "learning_rate": 1e-3,
             "random_frames": 512,
             "replay_frames": 4_096,
-            "updates_per_frame": 0.25,
+            "updates_per_frame": 0.0625,
             "initial_alpha": 0.1,
             "total_frames": 1_024,
             "metrics_frames": 256,
@@ -73,7 +75,11 @@ def test_ppo_learns_to_reach(tmp_path):
 
 
 def test_sac_learns_to_reach(tmp_path):
-    run(small_sac(total_frames=3_072, num_envs=8), tmp_path)
+    config = small_sac(
+        total_frames=4_096, num_envs=8, gamma=0.9, learning_rate=3e-3,
+        initial_alpha=0.02, tau=0.02, updates_per_frame=0.25,
+    )  # fmt: skip
+    run(config, tmp_path)
     trained = evaluate(tmp_path, episodes=20, make_env=synthetic_env.make_env)
     chance = evaluate("random", "reach", episodes=20, make_env=synthetic_env.make_env)
     assert trained.summary()["reward"] > chance.summary()["reward"] + 10
@@ -230,6 +236,23 @@ def test_checkpoints_hold_weights_only_and_act_alike(tmp_path):
         Checkpoint.open(alone).policy()(observation.clone())["loc"], location
     )
     assert location.abs().max() > 0
+
+
+def test_a_diverged_simulation_is_cut_off_not_ended():
+    flags = torch.tensor([[[True], [True], [False]]])
+    batch = TensorDict(
+        {
+            "next": {
+                "terminated": flags.clone(),
+                "done": flags.clone(),
+                "info": {"physics_error": torch.tensor([[[True], [False], [False]]])},
+            }
+        },
+        [1, 3],
+    )
+    _excuse_divergence(batch)
+    assert batch["next", "terminated"].flatten().tolist() == [False, True, False]
+    assert torch.equal(batch["next", "done"], flags)
 
 
 def test_metrics_file_appends_whole_rows_and_names_strangers(tmp_path):

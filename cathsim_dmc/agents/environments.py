@@ -1,9 +1,10 @@
 """TorchRL environments of the tasks, with observations as the networks take them."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import partial
 from typing import Any
 
+import torch
 from torchrl.data import Composite
 from torchrl.envs import (
     CatTensors,
@@ -11,7 +12,6 @@ from torchrl.envs import (
     DMControlEnv,
     DoubleToFloat,
     EnvBase,
-    ExcludeTransform,
     FlattenObservation,
     PermuteTransform,
     SerialEnv,
@@ -25,13 +25,11 @@ VECTOR = "observation_vector"
 # Images, channels first, uint8.
 PIXELS = "pixels"
 
-IMAGE = "image"
-
 
 def make_env(
     task: str,
     *,
-    observation: str = "internal",
+    observation: str | Sequence[str] = "internal",
     num_envs: int = 1,
     num_threads: int | None = None,
     seed: int = 0,
@@ -42,7 +40,7 @@ def make_env(
 
     Args:
         task: name of a registered task.
-        observation: the task's observation option.
+        observation: name or names of the task's observations.
         num_envs: number of simulations; environment i draws from seed + i.
         num_threads: threads of the batched simulation, None for every core.
         seed: of the first environment.
@@ -89,10 +87,10 @@ def _composer_env(task: str, task_kwargs: dict[str, Any], seed: int) -> EnvBase:
 def standard_observations(env: EnvBase) -> TransformedEnv:
     """Append the transforms from an environment's entries to VECTOR and PIXELS.
 
-    Numeric entries at the top level of the observation are cast to float32,
-    flattened and concatenated in the order of their names. An entry "image"
-    (..., h, w, c) becomes channels first. Nested entries (forces and other
-    information) are no part of the observation and stay as they are.
+    Floating-point entries at the top level of the observation are cast to float32,
+    flattened and concatenated in the order of their names; so are bytes of shape
+    (..., h, w, c), channels first. Nested entries (forces and other information) are
+    no part of the observation and stay as they are.
     """
     spec = env.observation_spec
     batch = len(env.batch_size)
@@ -102,10 +100,15 @@ def standard_observations(env: EnvBase) -> TransformedEnv:
         if not isinstance(spec[name], Composite)
     }
     vectors = [name for name, leaf in leaves.items() if leaf.dtype.is_floating_point]
-    if not vectors and IMAGE not in leaves:
+    images = [
+        name
+        for name, leaf in leaves.items()
+        if leaf.dtype == torch.uint8 and leaf.ndim - batch == 3
+    ]
+    if not vectors and not images:
         raise ValueError(
-            f"the environment offers neither numeric observations nor an entry "
-            f"{IMAGE!r}; its entries are {sorted(map(str, spec.keys(True, True)))}."
+            f"the environment offers neither numbers nor images to observe; its "
+            f"entries are {sorted(map(str, spec.keys(True, True)))}."
         )
     transforms = Compose(DoubleToFloat())
     for name in vectors:
@@ -114,10 +117,8 @@ def standard_observations(env: EnvBase) -> TransformedEnv:
             transforms.append(FlattenObservation(first, -1, in_keys=[name]))
     if vectors:
         transforms.append(CatTensors(vectors, out_key=VECTOR, del_keys=True))
-    if IMAGE in leaves:
-        transforms.append(
-            PermuteTransform((-1, -3, -2), in_keys=[IMAGE], out_keys=[PIXELS])
-        )
-        transforms.append(ExcludeTransform(IMAGE))
+    if images:
+        transforms.append(PermuteTransform((-1, -3, -2), in_keys=images))
+        transforms.append(CatTensors(images, dim=-3, out_key=PIXELS, del_keys=True))
     transforms.append(StepCounter())
     return TransformedEnv(env, transforms)

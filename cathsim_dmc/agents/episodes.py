@@ -20,7 +20,10 @@ class EpisodeOutcome:
         terminated: ended by the task, not by the clock.
         success: whether the goal was reached.
         mean_force: mean over steps of the force summed over the wall (N).
-        max_force: largest single contact force on the wall (N).
+        max_force: largest single contact force on the wall at the end of a control
+            step (N), as published.
+        peak_force: the same within the control steps (N).
+        physics_error: whether the simulation diverged, which ended it.
         path_ratio: length of the head's path over the shortest one, dimensionless.
     """
 
@@ -31,6 +34,8 @@ class EpisodeOutcome:
     success: bool | None
     mean_force: float | None
     max_force: float | None
+    peak_force: float | None = None
+    physics_error: bool = False
     path_ratio: float | None = None
 
 
@@ -50,6 +55,7 @@ class EpisodeTracker:
         self.length = np.zeros(num_envs, dtype=np.int64)
         self.force_sum = np.zeros(num_envs)
         self.force_max = np.zeros(num_envs)
+        self.force_peak = np.zeros(num_envs)
         self.success = np.zeros(num_envs, dtype=bool)
 
     def add(self, batch: TensorDictBase) -> list[EpisodeOutcome]:
@@ -60,6 +66,8 @@ class EpisodeTracker:
         force_sum = information(batch, "wall_force_sum")
         force_max = information(batch, "wall_force_max")
         success = information(batch, "success")
+        force_peak = information(batch, "wall_force_peak")
+        error = information(batch, "physics_error")
         path_ratio = information(batch, "path_ratio")
         finished = []
         for step in range(batch.shape[1]):
@@ -69,6 +77,8 @@ class EpisodeTracker:
                 self.force_sum += force_sum[:, step]
             if force_max is not None:
                 np.maximum(self.force_max, force_max[:, step], out=self.force_max)
+            if force_peak is not None:
+                np.maximum(self.force_peak, force_peak[:, step], out=self.force_peak)
             if success is not None:
                 self.success |= success[:, step] > 0
             for env in np.flatnonzero(done[:, step]):
@@ -86,6 +96,10 @@ class EpisodeTracker:
                         max_force=None
                         if force_max is None
                         else float(self.force_max[env]),
+                        peak_force=None
+                        if force_peak is None
+                        else float(self.force_peak[env]),
+                        physics_error=error is not None and error[env, step] > 0,
                         path_ratio=None
                         if path_ratio is None
                         else float(path_ratio[env, step]),
@@ -96,5 +110,6 @@ class EpisodeTracker:
 
     def _clear(self, env: int) -> None:
         self.reward[env] = self.force_sum[env] = self.force_max[env] = 0.0
+        self.force_peak[env] = 0.0
         self.length[env] = 0
         self.success[env] = False

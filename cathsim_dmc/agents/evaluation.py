@@ -2,7 +2,7 @@
 
 import json
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -22,6 +22,15 @@ Policy = Callable[[TensorDictBase], TensorDictBase | torch.Tensor]
 # Two-sided 95 % quantile of the normal distribution.
 Z95 = 1.959963984540054
 BOOTSTRAP_SAMPLES = 10_000
+
+_REPORTED = (
+    "reward",
+    "length",
+    "mean_force",
+    "max_force",
+    "peak_force",
+    "path_ratio",
+)
 
 
 @dataclass(frozen=True)
@@ -64,8 +73,9 @@ class EvaluationResult:
     def summary(self) -> dict[str, Any]:
         """Means with deviations and the success rate with its interval."""
         result: dict[str, Any] = {"episodes": len(self.episodes)}
-        for name in ("reward", "length", "mean_force", "max_force", "path_ratio"):
+        for name in _REPORTED:
             result[name], result[f"{name}_sd"] = self.mean_sd(name)
+        result["physics_errors"] = sum(e.physics_error for e in self.episodes)
         successes = self.successes
         rate = interval = None
         if successes is not None:
@@ -199,7 +209,7 @@ def evaluate(
     seed: int = 1_000_000,
     *,
     name: str | None = None,
-    observation: str | None = None,
+    observation: str | Sequence[str] | None = None,
     task_kwargs: Mapping[str, Any] | None = None,
     path: str = "batched",
     num_threads: int | None = None,

@@ -23,7 +23,7 @@ from torchrl.envs.utils import ExplorationType
 from cathsim_dmc.agents import environments
 from cathsim_dmc.agents.checkpoint import Checkpoint, checkpoints_in, save_checkpoint
 from cathsim_dmc.agents.configs import ConfigError, TrainingConfig
-from cathsim_dmc.agents.episodes import EpisodeOutcome, EpisodeTracker
+from cathsim_dmc.agents.episodes import INFO, EpisodeOutcome, EpisodeTracker
 from cathsim_dmc.agents.interruption import Interruption
 from cathsim_dmc.agents.metrics import MetricsFile
 from cathsim_dmc.agents.networks import Signature
@@ -188,6 +188,7 @@ def train(
             batch = next(batches)
             before, frames = frames, frames + batch.numel()
             finished = tracker.add(batch)
+            _excuse_divergence(batch)
             window.extend(finished)
             episodes += len(finished)
             losses = learner.update(batch, min(before / config.total_frames, 1.0))
@@ -275,6 +276,17 @@ def _random_frames(
     left = max(learner.random_frames - frames, 0)
     whole = math.ceil(left / config.frames_per_batch) * config.frames_per_batch
     return whole or None
+
+
+def _excuse_divergence(batch: TensorDictBase) -> None:
+    """Count a diverged simulation as cut off, not as ended by the task.
+
+    Rewards are negative distances, so an end worth nothing afterwards would be the
+    best of all: the agent would learn to break the simulation.
+    """
+    error = batch.get(("next", INFO, "physics_error"), None)
+    if error is not None:
+        batch["next", "terminated"] &= ~error
 
 
 def _on_cpu(

@@ -26,7 +26,8 @@ class TrainingConfig:
 
     Attributes:
         task: name of a registered task, such as "type1_bca".
-        observation: the task's observation option ("internal", "image", ...).
+        observation: name or names of the task's observations ("internal", "image",
+            "sequential", "tracking", "force").
         task_kwargs: further keyword arguments of the task; must be JSON-able.
         path: "batched" steps all environments in one thread pool, "composer" runs
             one dm_control environment after the other (slow; the reference).
@@ -70,7 +71,7 @@ class TrainingConfig:
     )
 
     task: str = "type1_bca"
-    observation: str = "internal"
+    observation: str | tuple[str, ...] = "internal"
     task_kwargs: Mapping[str, Any] = field(default_factory=dict)
     path: str = "batched"
     num_envs: int = 16
@@ -94,6 +95,8 @@ class TrainingConfig:
     def __post_init__(self):
         """Validate; every message says what was given and what is allowed."""
         object.__setattr__(self, "hidden", tuple(self.hidden))
+        if not isinstance(self.observation, str):
+            object.__setattr__(self, "observation", tuple(self.observation))
         object.__setattr__(self, "task_kwargs", dict(self.task_kwargs))
         require(bool(self.task), "task", self.task, "the name of a task")
         require(bool(self.observation), "observation", self.observation, "a name")
@@ -167,6 +170,8 @@ class TrainingConfig:
         """The config as JSON-able values, with the algorithm's name."""
         values = dataclasses.asdict(self)
         values["hidden"] = list(self.hidden)
+        if not isinstance(self.observation, str):
+            values["observation"] = list(self.observation)
         return {"algorithm": self.algorithm, **values}
 
     def changed_for_resume(self, other: "TrainingConfig") -> dict[str, tuple]:
