@@ -58,6 +58,7 @@ def true_capsule(carm, start, stop, radius, supersample):
 # ---------------------------------------------------------------- the disc kernel
 
 
+@settings(deadline=None)
 @given(st.floats(-1.5, 1.5), st.floats(-1.5, 1.5))
 def test_area_of_a_quadrant_of_the_disc(x, y):
     strips = np.linspace(-1, 1, 20001)
@@ -68,6 +69,7 @@ def test_area_of_a_quadrant_of_the_disc(x, y):
     assert disc_quadrant(x, y) == pytest.approx(expected, abs=3e-4)
 
 
+@settings(deadline=None)
 @given(st.floats(0.05, 6.0), st.floats(-0.5, 0.5), st.floats(-0.5, 0.5))
 def test_shares_sum_to_one_and_keep_the_centre(radius, row, column):
     side = max(int(np.ceil(radius)), 1)
