@@ -61,7 +61,7 @@ def read_termination(task: Any, timestep: Any) -> str | None:
     A task never sees the end by diverged physics or by composer's time limit: the
     environment then ends the episode itself, with discount 0 and 1.
     """
-    if task.termination is not None or not timestep.last():
+    if not timestep.last() or task.termination not in (None, "truncated"):
         return task.termination
     return "truncated" if timestep.discount else "physics_error"
 

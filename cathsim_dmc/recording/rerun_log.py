@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 import rerun as rr
+from rerun.blueprint import Blueprint
 from rerun.error_utils import catch_and_log_exceptions
 
 from cathsim_dmc.recording.blueprint import (
@@ -97,13 +98,6 @@ def write_rrd(
         catheter_radius=catheter_radius,
         fluoroscopy=fluoroscopy,
     )
-    low, high = drawing.vertices.min(0), drawing.vertices.max(0)
-    layout = episode_blueprint(
-        centre=(low + high) / 2,
-        extent=float((high - low).max()),
-        fluoroscopy=drawing.frames is not None,
-        distance=goal_distance(episode) is not None,
-    )
     with atomic_path(path, SUFFIX) as temporary:
         stream = rr.RecordingStream(APPLICATION_ID)
         if not stream.is_enabled():
@@ -114,7 +108,7 @@ def write_rrd(
         with catch_and_log_exceptions(strict=True):
             stream.set_log_tick_enabled(False)
             stream.set_log_time_enabled(False)
-            stream.save(temporary, default_blueprint=layout)
+            stream.save(temporary, default_blueprint=_layout(episode, drawing))
             stream.send_recording_name(_title(episode))
             log = _Log(stream, episode)
             _log_static(log, drawing)
@@ -127,6 +121,16 @@ def write_rrd(
             stream.flush()
             stream.disconnect()
     return Path(path)
+
+
+def _layout(episode: Episode, drawing: Drawing) -> Blueprint:
+    low, high = drawing.vertices.min(0), drawing.vertices.max(0)
+    return episode_blueprint(
+        centre=(low + high) / 2,
+        extent=float((high - low).max()),
+        fluoroscopy=drawing.frames is not None,
+        distance=goal_distance(episode) is not None,
+    )
 
 
 class _Log:

@@ -1,0 +1,77 @@
+"""The recorder on the navigation task itself."""
+
+import numpy as np
+import pytest
+
+from cathsim_dmc import suite
+from cathsim_dmc.analysis.forces import episode_statistics, step_forces
+from cathsim_dmc.anatomy.arch import ARCHES, build_arch
+from cathsim_dmc.recording import Episode, EpisodeRecorder, body_geoms, write_rrd
+
+STEPS = 40
+
+
+@pytest.fixture(scope="module")
+def env():
+    options = {"phantom": build_arch(ARCHES["type1"]), "goal": "bca", "random": 0}
+    return suite.load("cathsim", "navigate", options)
+
+
+def bend_and_push(timestep):
+    action = np.zeros(21)
+    action[0:20:2], action[20] = 1.0, 1.0
+    return action
+
+
+@pytest.fixture(scope="module")
+def episode(env):
+    recorder = EpisodeRecorder(env, "navigate", {"goal": "bca"})
+    return recorder.record_episode(bend_and_push, seed=2, max_steps=STEPS)
+
+
+def test_contacts_make_up_the_forces_of_the_task(env, episode):
+    assert len(episode.contact_step) > 0
+    steps = step_forces(episode.contact_step, episode.contact_force, STEPS)
+    np.testing.assert_allclose(steps.total, episode.wall_force_sum, atol=1e-9)
+    np.testing.assert_allclose(steps.largest, episode.wall_force_max, atol=1e-9)
+    peaks = np.array(episode.meta["wall_force_peak_max"])
+    assert (peaks >= episode.wall_force_max - 1e-12).all()
+    assert episode.push_force[-1] == env.task.readings.push_force
+
+
+def test_contacts_lie_on_the_wall_and_press_outwards(env, episode):
+    depth = env.task.anatomy.depth(episode.contact_position)
+    assert np.abs(depth).max() < 2e-3
+    firm = np.linalg.norm(episode.contact_force, axis=1) > 1e-3
+    unit = episode.contact_force[firm]
+    unit /= np.linalg.norm(unit, axis=1, keepdims=True)
+    outside = episode.contact_position[firm] + 3e-3 * unit
+    assert (env.task.anatomy.depth(outside) < depth[firm]).mean() > 0.95
+
+
+def test_poses_are_those_of_the_task(env, episode):
+    np.testing.assert_array_equal(episode.catheter[-1], env.task.readings.centreline)
+    assert episode.insertion[-1] == env.task.readings.insertion
+    np.testing.assert_allclose(episode.meta["distance"][-1], env.task.outcome.distance)
+    np.testing.assert_allclose(np.diff(episode.time), 0.04)
+    # Published reward: minus the distance in metres.
+    np.testing.assert_allclose(episode.reward, -np.array(episode.meta["distance"])[1:])
+
+
+def test_a_seed_repeats_the_episode(env, episode):
+    again = EpisodeRecorder(env, "navigate", {"goal": "bca"}).record_episode(
+        bend_and_push, seed=2, max_steps=STEPS
+    )
+    assert again.equals(episode)
+
+
+def test_the_episode_is_drawn_with_its_robot(env, episode, tmp_path):
+    geoms = body_geoms(env.physics)
+    assert {g.body_name.split("/")[0] for g in geoms} == {"robot", "sheath"}
+    loaded = Episode.load(episode.save(tmp_path / "e.npz"))
+    path = write_rrd(
+        loaded, env.task.anatomy.surface, tmp_path / "e.rrd", robot_geoms=geoms
+    )
+    assert path.stat().st_size < 5e6
+    statistics = episode_statistics(loaded, env.task.meaning.route.length)
+    assert 0 < statistics.f_mean <= statistics.f_max <= statistics.peak_max
