@@ -31,6 +31,7 @@ GOAL_PAST_OSTIUM = 30e-3  # m along a branch, its first goal
 GOAL_DISTAL = 0.8  # of the passable part of a branch, its second goal
 INLET_WIDTH = 0.8  # of the lumen near the inlet; the rest of the blind end is cut off
 INLET_SEARCH = 40e-3  # m of the root in which that width is looked for
+NEAR_INLET = 15e-3  # m, distance from the lumen of an inlet that is pointed at
 RADII = (0.3e-3, 30e-3)  # m, allowed median radius of a vessel: arteriole, aneurysm
 
 
@@ -89,6 +90,12 @@ def import_scan(
     vertices, faces = read_mesh(mesh_path, units, mesh_frame)
     say(f"mesh: {len(faces)} triangles, {len(curves)} centrelines")
     measure = MeshDepth(vertices, faces)
+    if inlet is not None and measure(inlet[None])[0] < -NEAR_INLET:
+        raise ValueError(
+            f"inlet is {-measure(inlet[None])[0] * 1e3:.1f} mm away from the lumen; "
+            f"give a point in the lumen, or at most {NEAR_INLET * 1e3:g} mm from the "
+            "end by which the device enters."
+        )
     lines = {curve.name: _inside_part(curve, measure, units) for curve in curves}
     say("depth: measuring the lumen, the longest step")
     field = DepthField.from_mesh(vertices, faces, spacing)
@@ -321,11 +328,13 @@ def _place_inlet(tree: VesselTree, at_end: bool) -> tuple[VesselTree, Inlet]:
     if at_end:
         near = line.arc_length <= min(INLET_SEARCH, 0.3 * line.length)
         wide = INLET_WIDTH * np.median(line.radii[near])
-        start = float(line.arc_length[int((line.radii >= wide).argmax())])
+        first = int((line.radii >= wide).argmax())
+        # One radius more, because a vessel's end may be cut off at a slant.
+        start = float(line.arc_length[first] + line.radii[first])
     if start > 0.0:
         line = line.slice(start, line.length)
     place = line.at(0.0)
-    ahead = line.at(min(2.0 * float(place.radius), 0.5 * line.length)).position
+    ahead = line.at(min(3.0 * float(place.radius), 0.5 * line.length)).position
     opening = Inlet(root.name, place.position, ahead - place.position, place.radius)
     vessels = dict(tree.vessels)
     vessels[root.name] = Vessel(root.name, line)

@@ -112,8 +112,9 @@ def read_mesh(
     size = float(np.linalg.norm(np.ptp(vertices, axis=0)))
     if not SIZE[0] <= size <= SIZE[1]:
         raise ValueError(
-            f"{path} is {size:.3g} m across when its unit is {units!r}, which no vessel "
-            f"tree is (allowed {SIZE[0]:g} to {SIZE[1]:g} m). {_better_unit(size, units)}"
+            f"{path} is {size:.3g} m across when its unit is {units!r}, which no "
+            f"vessel tree is (allowed {SIZE[0]:g} to {SIZE[1]:g} m). "
+            f"{_better_unit(size, units)}"
         )
     return vertices, np.ascontiguousarray(faces)
 
@@ -131,8 +132,8 @@ def read_curve(path: str | Path, units: str = "mm", frame: str = "LPS") -> Curve
     path = Path(path)
     if not path.is_file():
         raise FileNotFoundError(
-            f"no centreline file {path}; give a 3D Slicer markup (.mrk.json) or a table "
-            "x,y,z[,radius] (.csv)."
+            f"no centreline file {path}; give a 3D Slicer markup (.mrk.json) or a "
+            "table x,y,z[,radius] (.csv)."
         )
     if path.suffix.lower() == ".json":
         points, radii = _read_markup(path)
@@ -149,8 +150,8 @@ def read_curve(path: str | Path, units: str = "mm", frame: str = "LPS") -> Curve
     keep = np.concatenate([[True], apart])
     if keep.sum() < 2 or not np.isfinite(points).all():
         raise ValueError(
-            f"{path} holds {keep.sum()} distinct points; a centreline needs at least 2, "
-            "all finite."
+            f"{path} holds {keep.sum()} distinct points; a centreline needs at least "
+            "2, all finite."
         )
     name = vessel_name(path)
     return Curve(name, path, points[keep], None if radii is None else radii[keep])

@@ -26,6 +26,10 @@ SHALLOW = 0.2e-3  # m, lattice points nearer to the wall are no way
 NEAR_END = 2.0  # radii; a curve that starts nearer to a free end starts there
 WIDE = 0.4  # of the widest free end: narrower ends are no inlet by default
 ROOT_WIDTH = 0.5  # of the inlet: narrower free ends do not continue the root
+SMOOTH = 0.6  # radii, standard deviation of the smoothing along a centreline
+NARROW = 1.5e-3  # m, radius below which smoothing would cut bends
+END_TRIM = 8e-3  # m, most that is cut off where a curve runs into its end
+END_SEARCH = 15e-3  # m from a blind end in which its width is looked for
 MIN_RADIUS = 0.1e-3  # m, floor of a centreline's radius where it scrapes the wall
 
 
@@ -129,40 +133,32 @@ class Ways:
         return np.asarray(way[::-1])
 
     def free_ends(self) -> list[FreeEnd]:
-        """Blind ends of the lumen, farthest from its widest part first."""
+        """Blind ends of the lumen."""
         nodes = self._nodes
         centre = int(nodes[self.depth[nodes].argmax()])
-        reach = self.lengths_from(centre)
         before = self.deepest_from(centre)
-        # Blind ends are where no lattice point within two radii lies farther out.
-        order = nodes[np.argsort(-reach[nodes])]
-        tree = self._lookup
-        taken = np.zeros(len(self.points), dtype=bool)
+        # Seen from one blind end, every other one is farther than all around it.
+        from_centre = self.lengths_from(centre)
+        first = int(nodes[from_centre[nodes].argmax()])
+        reach = self.lengths_from(first)
         ends = []
-        for node in order:
+        taken = np.zeros(len(self.points), dtype=bool)
+        for node in [first, *nodes[np.argsort(-reach[nodes])]]:
             if taken[node]:
                 continue
-            way = self.trace(before, node)
-            along = np.concatenate(
-                [
-                    [0.0],
-                    np.cumsum(
-                        np.linalg.norm(np.diff(self.points[way[::-1]], axis=0), axis=1)
-                    ),
-                ]
-            )
-            local = self.depth[way[::-1]][along < 15e-3].max()
-            near = nodes[tree.query_ball_point(self.points[node], 2.5 * local)]
-            if reach[near].max() > reach[node] + 1e-9:
-                taken[near] = True
-                continue
+            way = self.trace(before, node)[::-1]
+            steps = np.linalg.norm(np.diff(self.points[way], axis=0), axis=1)
+            along = np.concatenate([[0.0], np.cumsum(steps)])
+            local = self.depth[way][along < END_SEARCH].max()
+            place = self.points[node]
+            near = nodes[self._lookup.query_ball_point(place, 2.5 * local)]
             taken[near] = True
-            # The sphere stops one radius before the end, so its last part is left
-            # out of the bottleneck.
+            if node != first and reach[near].max() > reach[node] + 1e-9:
+                continue
+            # The depth falls to nothing at the very end, which is no bottleneck.
             inner = along > 2.0 * local
-            narrow = self.depth[way[::-1]][inner].min() if inner.any() else local
-            if reach[node] > 2.0 * local:
-                ends.append(FreeEnd(self.points[node], float(narrow), reach[node]))
+            narrow = self.depth[way][inner].min() if inner.any() else local
+            ends.append(FreeEnd(place, float(narrow), float(from_centre[node])))
         return ends
 
 
@@ -197,12 +193,6 @@ def plan_inlet(
     goal_end = to_last < margin
     if inlet is not None:
         node = ways.node(inlet)
-        away = float(np.linalg.norm(ways.points[node] - inlet))
-        if away > 3.0 * ways.depth[node]:
-            raise ValueError(
-                f"inlet is {away * 1e3:.1f} mm away from the lumen; give a point in the "
-                "lumen or near the end by which the device enters."
-            )
         gap = np.linalg.norm(position - inlet, axis=-1)
         chosen = int(gap.argmin())
         if gap[chosen] > max(3.0 * width[chosen], 2.5 * ways.depth[node]):
@@ -367,6 +357,11 @@ def _finish(
     field: DepthField, curve: np.ndarray, anchor: np.ndarray | None
 ) -> Centreline:
     """Centre a curve in the lumen and measure its radii."""
+    # Towards a blind end the depth tells the distance to the end, not the middle.
+    last = min(len(curve) // 2, int(END_TRIM / STEP))
+    deep = field(curve[-last:])
+    wide = np.nonzero(deep >= 0.6 * deep.max())[0][-1]
+    curve = curve[: len(curve) - last + wide + 1]
     points = centred(field, curve, fixed_start=anchor is not None)
     depth = field(points)
     # Points beyond the lumen's end are of no use to a device.
@@ -403,7 +398,35 @@ def centred(
         points = mixed
         if turn % 20 == 19:
             points = _resample(points)
-    return points
+    return _resample(_smoothed(points, field(points)))
+
+
+def _smoothed(points: np.ndarray, depth: np.ndarray) -> np.ndarray:
+    """Smooth a curve over about half the lumen's radius, its ends kept.
+
+    The middle of a wide vessel is flat, and a curve would wander about on it.
+    """
+    width = np.clip(SMOOTH * (depth - NARROW) / STEP, 0.0, 12.0)
+    pad = min(len(points) - 1, 40)
+    padded = np.concatenate(
+        [
+            2.0 * points[0] - points[pad:0:-1],
+            points,
+            2.0 * points[-1] - points[-2 : -pad - 2 : -1],
+        ]
+    )
+    levels = np.array([0.0, 1.0, 2.0, 4.0, 8.0, 12.0])
+    bank = np.stack(
+        [
+            gaussian_filter1d(padded, sigma, axis=0)[pad:-pad] if sigma else points
+            for sigma in levels
+        ]
+    )
+    at = np.interp(width, levels, np.arange(len(levels)))
+    low = np.minimum(at.astype(int), len(levels) - 2)
+    rest = (at - low)[:, None]
+    row = np.arange(len(points))
+    return (1.0 - rest) * bank[low, row] + rest * bank[low + 1, row]
 
 
 def _ostium(line: Centreline, trunk: Centreline) -> float:

@@ -23,7 +23,7 @@ from cathsim_dmc.anatomy.depth import DepthField
 THICKNESS = 4e-3  # m, of the wall where no other lumen is near
 THINNEST = 0.3e-3  # m, of the wall between two lumens
 TOLERANCE = 0.8e-3  # m, largest chord inside the lumen before moving outwards
-CHORD = 0.5e-3  # m, largest chord after it; pieces above are split again
+CHORD = 0.45e-3  # m, largest chord after it; pieces above are split again
 MOVE = 0.3e-3  # m, largest outward movement of a vertex
 FLAT = 0.02e-3  # m, triangles this close to one plane merge without asking
 EXTENT = 40e-3  # m, largest piece; longer ones slow the broad phase

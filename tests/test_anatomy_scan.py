@@ -1,0 +1,428 @@
+"""Import of a scan: a synthetic Y-shaped lumen, every error, and a real patient."""
+
+from __future__ import annotations
+
+import json
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial import ConvexHull, cKDTree
+
+from cathsim_dmc.anatomy.centreline import Centreline, Vessel, VesselTree
+from cathsim_dmc.anatomy.depth import DepthField, MeshDepth
+from cathsim_dmc.anatomy.phantom import Anatomy
+from cathsim_dmc.anatomy.scan import cut_open, describe, import_scan
+from cathsim_dmc.anatomy.scan_files import read_curve, read_mesh, vessel_name
+
+# Bounds of the wall (m): mean, 95th percentile and largest intrusion.
+INTRUSION = (0.10e-3, 0.30e-3, 0.60e-3)
+DEVICE_RADIUS = 0.84e-3
+SCAN = os.environ.get("CATHSIM_SCAN_DIR")
+
+
+def y_tree() -> VesselTree:
+    """A trunk of 6 mm radius that parts into branches of 3.5 and 3 mm radius."""
+
+    def tube(points, radii, step=1e-3):
+        line = Centreline(np.array(points) * 1e-3, np.array(radii) * 1e-3)
+        return line.resampled(step)
+
+    left = [(0, 0, 50), (4, 0, 58), (16, 0, 78), (24, 0, 100)]
+    right = [(0, 0, 50), (-4, 4, 58), (-12, 15, 75), (-15, 26, 88)]
+    return VesselTree(
+        {
+            "trunk": Vessel("trunk", tube([(0, 0, 0), (0, 0, 50)], [6, 6])),
+            "left": Vessel("left", tube(left, [5, 4, 3.5, 3.5]), "trunk", 9e-3),
+            "right": Vessel("right", tube(right, [5, 4, 3, 3]), "trunk", 9e-3),
+        }
+    )
+
+
+def marched(tree: VesselTree, spacing: float = 1.1e-3):
+    """Closed surface of a tree's lumen: vertices (mm), faces with outward normals."""
+    from skimage.measure import marching_cubes
+
+    points = np.concatenate([v.centreline.points for v in tree.vessels.values()])
+    low, high = points.min(0) - 9e-3, points.max(0) + 9e-3
+    axes = [np.arange(a, b, spacing) for a, b in zip(low, high, strict=True)]
+    grid = np.stack(np.meshgrid(*axes, indexing="ij"), -1)
+    depth = tree.depth(grid, closed=True)
+    vertices, faces, _, _ = marching_cubes(depth, 0.0, spacing=(spacing,) * 3)
+    return (vertices + low) * 1e3, faces[:, ::-1]
+
+
+def write_obj(path: Path, vertices, faces) -> Path:
+    lines = [f"v {x:.5f} {y:.5f} {z:.5f}" for x, y, z in vertices]
+    lines += [f"f {a + 1} {b + 1} {c + 1}" for a, b, c in faces]
+    path.write_text("\n".join(lines) + "\n")
+    return path
+
+
+def write_markup(path: Path, points_mm, *, system="LPS", radii=None) -> Path:
+    markup = {
+        "type": "Curve",
+        "coordinateSystem": system,
+        "coordinateUnits": "mm",
+        "controlPoints": [{"position": list(map(float, p))} for p in points_mm],
+    }
+    if radii is not None:
+        markup["measurements"] = [
+            {"name": "Radius", "controlPointValues": list(map(float, radii))}
+        ]
+    path.write_text(json.dumps({"markups": [markup]}))
+    return path
+
+
+@pytest.fixture(scope="module")
+def y_scan(tmp_path_factory):
+    """Mesh file, centreline files, and the tree they were made from."""
+    folder = tmp_path_factory.mktemp("scan")
+    tree = y_tree()
+    vertices, faces = marched(tree)
+    mesh = write_obj(folder / "lumen.obj", vertices, faces)
+    curves = []
+    for name in ("left", "right"):
+        own = tree.vessel(name).centreline
+        trunk = tree.root.centreline.slice(0.0, 0.049)
+        points = np.concatenate([trunk.points[4:], own.points]) * 1e3
+        curves.append(
+            write_markup(folder / f"centreline-{name.upper()}.mrk.json", points)
+        )
+    return mesh, curves, tree
+
+
+@pytest.fixture(scope="module")
+def y_anatomy(y_scan):
+    mesh, curves, _ = y_scan
+    return import_scan(mesh, curves)
+
+
+def figures(anatomy: Anatomy, count: int = 4000):
+    """Intrusion (count,) m along the inward normal, and uncovered share."""
+    rng = np.random.default_rng(0)
+    corners = anatomy.surface.vertices[anatomy.surface.faces]
+    cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    area = np.linalg.norm(cross, axis=1)
+    face = rng.choice(len(area), count, p=area / area.sum())
+    u, v = np.sort(rng.uniform(size=(2, count)), axis=0)
+    weights = np.stack([u, v - u, 1.0 - v], -1)
+    points = np.einsum("nk,nkd->nd", weights, corners[face])
+    normals = cross[face] / area[face, None]
+    # The cap over the inlet carries no wall.
+    plane = (points - anatomy.inlet.position) @ anatomy.inlet.direction
+    keep = plane > 0.2e-3
+    points, normals = points[keep], normals[keep]
+    steps = np.arange(-1.0e-3, 1.5e-3, 0.05e-3)  # inwards
+    probes = points[:, None] - steps[:, None] * normals[:, None]
+    solid = np.zeros(probes.shape[:2], dtype=bool)
+    tree = cKDTree(points)
+    for piece in anatomy.wall:
+        middle = 0.5 * (piece.min(0) + piece.max(0))
+        reach = np.linalg.norm(piece - middle, axis=1).max() + 2e-3
+        rows = tree.query_ball_point(middle, reach)
+        if rows:
+            planes = ConvexHull(piece).equations
+            values = probes[rows] @ planes[:, :3].T + planes[:, 3]
+            solid[rows] |= (values < 1e-9).all(-1)
+    depth = np.where(solid, np.maximum(anatomy.depth(probes), 0.0), 0.0)
+    return depth.max(axis=1), float((~solid.any(axis=1)).mean())
+
+
+def gap_to_wall(anatomy: Anatomy, points) -> float:
+    """Lower bound (m) of the distance from points (n, 3) to the nearest piece."""
+    nearest = np.inf
+    for piece in anatomy.wall:
+        planes = ConvexHull(piece).equations
+        values = points @ planes[:, :3].T + planes[:, 3]
+        nearest = min(nearest, float(values.max(axis=1).min()))
+    return nearest
+
+
+def test_depth_field_agrees_with_the_exact_distance(y_scan):
+    vertices, faces = read_mesh(y_scan[0])
+    field = DepthField.from_mesh(vertices, faces)
+    rng = np.random.default_rng(1)
+    points = vertices[rng.integers(len(vertices), size=2000)]
+    points = points + rng.normal(scale=1e-3, size=points.shape)
+    exact = MeshDepth(vertices, faces)(points)
+    near = (exact > -2e-3) & (exact < 4e-3)
+    assert near.sum() > 1000
+    assert np.abs(field(points) - exact)[near].max() < 0.25e-3
+    assert field(np.array([0.0, 0.0, 0.02])) == pytest.approx(6e-3, abs=0.7e-3)
+    assert field(np.array([1.0, 0.0, 0.0])) < -0.9
+    again = DepthField.from_arrays(field.arrays())
+    np.testing.assert_array_equal(again(points), field(points))
+
+
+def test_mesh_depth_of_a_box_is_exact():
+    import trimesh
+
+    box = trimesh.creation.box(extents=(2e-2, 4e-2, 6e-2))
+    rng = np.random.default_rng(2)
+    points = rng.uniform(-0.04, 0.04, size=(3000, 3))
+    excess = np.abs(points) - np.array([1e-2, 2e-2, 3e-2])
+    outside = np.linalg.norm(np.maximum(excess, 0.0), axis=1)
+    expected = -outside - np.minimum(excess.max(axis=1), 0.0)
+    got = MeshDepth(np.asarray(box.vertices), np.asarray(box.faces))(points)
+    np.testing.assert_allclose(got, expected, atol=1e-9)
+
+
+def test_import_finds_the_tree(y_anatomy, y_scan):
+    tree = y_anatomy.tree
+    assert list(tree.vessels) == ["aorta", "left", "right"]
+    parents = {tree.vessel(name).parent for name in ("left", "right")}
+    assert "aorta" in parents
+    truth = y_scan[2]
+    for name in ("left", "right"):
+        line = tree.vessel(name).centreline
+        own = line.points[line.arc_length > tree.vessel(name).ostium]
+        distance = truth.vessel(name).centreline.project(own).distance
+        assert distance.max() < 1.0e-3
+    root = tree.root.centreline
+    assert np.abs(root.radii[5:25] - 6e-3).max() < 0.8e-3
+
+
+def test_import_places_inlet_and_goals(y_anatomy):
+    inlet = y_anatomy.inlet
+    # The trunk's free end is at z = 0, and its lumen leads to +z.
+    assert 0.0 < inlet.position[2] < 15e-3
+    assert inlet.direction[2] > 0.97
+    assert sum(end.open for end in y_anatomy.ends) == 1
+    for goal in y_anatomy.goals.values():
+        assert y_anatomy.depth(goal.position) > DEVICE_RADIUS
+        assert y_anatomy.route(goal.name).radii.min() > DEVICE_RADIUS
+    assert {"left", "right"} <= set(y_anatomy.goals)
+    assert json.dumps(describe(y_anatomy))
+
+
+def test_wall_meets_the_figures(y_anatomy):
+    intrusion, uncovered = figures(y_anatomy)
+    mean, p95, largest = INTRUSION
+    assert intrusion.mean() <= mean
+    assert np.percentile(intrusion, 95) <= p95
+    assert intrusion.max() <= largest
+    assert uncovered == 0.0
+    assert len(y_anatomy.wall) < 0.25 * len(y_anatomy.surface.faces)
+
+
+def test_a_missing_piece_is_noticed(y_anatomy):
+    """The check of coverage itself can fail."""
+    from dataclasses import replace
+
+    holed = replace(y_anatomy, wall=y_anatomy.wall[::2])
+    assert figures(holed, 1000)[1] > 0.1
+
+
+def test_device_passes_every_centreline(y_anatomy):
+    for vessel in y_anatomy.tree.vessels.values():
+        line = vessel.centreline
+        fits = line.points[line.radii > DEVICE_RADIUS + 0.1e-3]
+        assert gap_to_wall(y_anatomy, fits) > DEVICE_RADIUS
+
+
+def test_surface_is_closed_and_encloses_the_lumen(y_anatomy):
+    faces = y_anatomy.surface.faces
+    edges = np.sort(faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
+    _, times = np.unique(edges, axis=0, return_counts=True)
+    assert (times == 2).all()
+    assert y_anatomy.surface.volume > 0.0
+
+
+def test_saved_anatomy_keeps_its_depth(y_anatomy, tmp_path):
+    y_anatomy.save(tmp_path / "a")
+    again = Anatomy.load(tmp_path / "a")
+    rng = np.random.default_rng(3)
+    points = rng.uniform(-0.03, 0.09, size=(500, 3))
+    np.testing.assert_array_equal(again.depth(points), y_anatomy.depth(points))
+    assert len(again.wall) == len(y_anatomy.wall)
+
+
+def test_inlet_in_the_middle_cuts_the_lumen(y_scan):
+    mesh, curves, _ = y_scan
+    short = []
+    for path in curves:  # they start at the trunk's end, so the cut shortens them
+        curve = read_curve(path)
+        keep = curve.points[curve.points[:, 2] > 30e-3] * 1e3
+        short.append(write_markup(path.with_name(f"short-{path.name}"), keep))
+    anatomy = import_scan(mesh, short, inlet=(0.0, 0.0, 28.0), spacing=0.8e-3)
+    assert anatomy.inlet.position[2] == pytest.approx(28e-3, abs=2e-3)
+    assert anatomy.surface.vertices[:, 2].min() > 25e-3
+
+
+def test_cut_keeps_the_far_side():
+    import trimesh
+
+    tube = trimesh.creation.cylinder(radius=5e-3, height=60e-3, sections=24)
+    tube = tube.subdivide().subdivide()
+    from cathsim_dmc.anatomy.phantom import Inlet
+
+    inlet = Inlet("aorta", np.array([0, 0, -0.0101]), np.array([0, 0, 1.0]), 5e-3)
+    points, shell, cap = cut_open(
+        np.asarray(tube.vertices), np.asarray(tube.faces), inlet
+    )
+    closed = trimesh.Trimesh(points, np.concatenate([shell, cap]), process=False)
+    assert closed.is_watertight
+    part = (0.03 + 0.0101) / 0.06
+    assert closed.volume == pytest.approx(tube.volume * part, rel=1e-6)
+
+
+def test_ras_markup_and_table_are_the_same_curve(y_scan, tmp_path):
+    curve = read_curve(y_scan[1][0])
+    ras = curve.points * 1e3 * (-1.0, -1.0, 1.0)
+    path = write_markup(tmp_path / "c-A.mrk.json", ras, system="RAS")
+    np.testing.assert_allclose(read_curve(path).points, curve.points, atol=1e-12)
+    table = tmp_path / "centreline_A.csv"
+    rows = np.c_[curve.points * 1e3, np.full(len(curve.points), 2.0)]
+    body = "\n".join(",".join(f"{x:.9f}" for x in row) for row in rows)
+    table.write_text("x,y,z,radius\n" + body + "\n")
+    read = read_curve(table)
+    np.testing.assert_allclose(read.points, curve.points, atol=1e-9)
+    np.testing.assert_allclose(read.radii, 2e-3)
+    table.write_text(body)  # without headings
+    np.testing.assert_allclose(read_curve(table).points, curve.points, atol=1e-9)
+
+
+@pytest.mark.parametrize("ending", ["stl", "ply"])
+def test_other_formats_give_the_same_mesh(y_scan, tmp_path, ending):
+    import trimesh
+
+    vertices, faces = read_mesh(y_scan[0])
+    path = tmp_path / f"lumen.{ending}"
+    # Inwards on purpose: the reader turns the surface outwards.
+    trimesh.Trimesh(vertices * 1e3, faces[:, ::-1], process=False).export(path)
+    again, triangles = read_mesh(path)
+    assert len(triangles) == len(faces)
+    corners = [again[triangles[:, k]] for k in range(3)]
+    volume = np.einsum("nd,nd->", corners[0], np.cross(corners[1], corners[2])) / 6.0
+    assert volume > 0.0
+
+
+@pytest.mark.parametrize(
+    ("file", "name"),
+    [
+        ("centreline-LCCA.mrk.json", "lcca"),
+        ("Centerline curve (8) RVA.json", "8_rva"),
+        ("left_mca.csv", "left_mca"),
+    ],
+)
+def test_vessels_are_called_after_their_files(file, name):
+    assert vessel_name(file) == name
+
+
+def test_missing_files(y_scan, tmp_path):
+    mesh, curves, _ = y_scan
+    with pytest.raises(FileNotFoundError, match="no mesh file"):
+        import_scan(tmp_path / "none.obj", curves)
+    with pytest.raises(FileNotFoundError, match="no centreline file"):
+        import_scan(mesh, [tmp_path / "none.mrk.json"])
+    with pytest.raises(ValueError, match="at least one file"):
+        import_scan(mesh, [])
+
+
+def test_unreadable_meshes(y_scan, tmp_path):
+    curves = y_scan[1]
+    odd = tmp_path / "lumen.xyz3"
+    odd.write_text("nothing")
+    with pytest.raises(ValueError, match="formats .*obj"):
+        import_scan(odd, curves)
+    broken = tmp_path / "lumen.ply"
+    broken.write_text("nothing")
+    with pytest.raises(ValueError, match="cannot be read as PLY"):
+        import_scan(broken, curves)
+
+
+def test_open_mesh(y_scan, tmp_path):
+    vertices, faces = read_mesh(y_scan[0])
+    path = write_obj(tmp_path / "open.obj", vertices * 1e3, faces[1:])
+    with pytest.raises(ValueError, match="3 boundary edges .*Fill holes"):
+        import_scan(path, y_scan[1])
+
+
+def test_several_components(y_scan, tmp_path):
+    vertices, faces = read_mesh(y_scan[0])
+    both = np.concatenate([vertices, vertices + 0.2]) * 1e3
+    path = write_obj(
+        tmp_path / "two.obj", both, np.concatenate([faces, faces + len(vertices)])
+    )
+    with pytest.raises(ValueError, match="2 separate parts"):
+        import_scan(path, y_scan[1])
+
+
+def test_wrong_units(y_scan):
+    with pytest.raises(ValueError, match="Pass units='mm'"):
+        import_scan(y_scan[0], y_scan[1], units="m")
+    with pytest.raises(ValueError, match="one of mm, cm, m"):
+        import_scan(y_scan[0], y_scan[1], units="inch")
+    # A factor of ten leaves a possible size, but not a possible radius.
+    with pytest.raises(ValueError, match="right units"):
+        import_scan(y_scan[0], y_scan[1], units="cm")
+
+
+def test_centreline_elsewhere(y_scan, tmp_path):
+    mesh, curves, _ = y_scan
+    points = read_curve(curves[0]).points * 1e3
+    away = write_markup(tmp_path / "centreline-A.mrk.json", points + (30.0, 0, 0))
+    with pytest.raises(ValueError, match=r"only \d+% of the centreline"):
+        import_scan(mesh, [away])
+    ras = points * (-1.0, -1.0, 1.0)
+    mirrored = write_markup(tmp_path / "centreline-B.mrk.json", ras)
+    try:
+        import_scan(mesh, [mirrored])
+    except ValueError as error:
+        assert "mesh_frame='RAS'" in str(error)
+    else:
+        pytest.fail("a mirrored centreline was accepted")
+
+
+def test_malformed_markups(y_scan, tmp_path):
+    mesh = y_scan[0]
+    path = tmp_path / "centreline-A.mrk.json"
+    path.write_text("{")
+    with pytest.raises(ValueError, match="is not JSON"):
+        import_scan(mesh, [path])
+    path.write_text(json.dumps({"markups": [{"type": "Curve"}]}))
+    with pytest.raises(ValueError, match="no 3D Slicer curve"):
+        import_scan(mesh, [path])
+    write_markup(path, [(0, 0, 10)])
+    with pytest.raises(ValueError, match="at least 2"):
+        import_scan(mesh, [path])
+    write_markup(path, [(0, 0, 10), (0, 0, 20)], system="scanner")
+    with pytest.raises(ValueError, match="'LPS' or 'RAS'"):
+        import_scan(mesh, [path])
+
+
+def test_names_must_differ(y_scan, tmp_path):
+    mesh, curves, _ = y_scan
+    text = curves[0].read_text()
+    for name in ("left", "aorta"):
+        (tmp_path / f"{name}.mrk.json").write_text(text)
+    with pytest.raises(ValueError, match="'left', which is taken"):
+        import_scan(mesh, [curves[0], tmp_path / "left.mrk.json"])
+    with pytest.raises(ValueError, match="'aorta', which is taken"):
+        import_scan(mesh, [tmp_path / "aorta.mrk.json"])
+
+
+def test_inlet_off_the_lumen(y_scan):
+    with pytest.raises(ValueError, match="away from the lumen"):
+        import_scan(*y_scan[:2], inlet=(90.0, 0.0, 0.0))
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(SCAN is None, reason="CATHSIM_SCAN_DIR names no scan")
+def test_real_patient():
+    folder = Path(SCAN)
+    mesh = next(iter(sorted(folder.glob("*.obj"))))
+    curves = sorted(folder.glob("*.mrk.json"))
+    anatomy = import_scan(mesh, curves)
+    intrusion, uncovered = figures(anatomy, 8000)
+    mean, p95, largest = INTRUSION
+    assert intrusion.mean() <= mean
+    assert np.percentile(intrusion, 95) <= p95
+    assert intrusion.max() <= largest
+    assert uncovered < 1e-3
+    assert len(anatomy.wall) <= 1500
+    assert {vessel_name(path) for path in curves} < set(anatomy.tree.vessels)
+    for goal in anatomy.goals:
+        assert anatomy.route(goal).radii.min() > DEVICE_RADIUS
