@@ -9,7 +9,6 @@ from torchrl.data import Composite
 from torchrl.envs import (
     CatTensors,
     Compose,
-    DMControlEnv,
     DoubleToFloat,
     EnvBase,
     FlattenObservation,
@@ -18,6 +17,8 @@ from torchrl.envs import (
     StepCounter,
     TransformedEnv,
 )
+
+from cathsim_dmc.agents.composer import composer_env
 
 # All numeric entries of an observation, concatenated in the order of their names.
 # Not called "state": TorchRL gives that name a meaning of its own.
@@ -69,19 +70,11 @@ def make_env(
         # Each factory seeds its own: SerialEnv.set_seed would hash the seeds apart.
         env = SerialEnv(
             num_envs,
-            [partial(_composer_env, task, kwargs, seed + i) for i in range(num_envs)],
+            [partial(composer_env, task, kwargs, seed + i) for i in range(num_envs)],
         )
     else:
         raise ValueError(f"path={path!r} is unknown; choose 'batched' or 'composer'.")
     return standard_observations(env)
-
-
-def _composer_env(task: str, task_kwargs: dict[str, Any], seed: int) -> EnvBase:
-    from cathsim_dmc import suite  # noqa: F401  (registers the domain)
-
-    env = DMControlEnv("cathsim", task, **task_kwargs)
-    env.set_seed(seed)
-    return env
 
 
 def standard_observations(env: EnvBase) -> TransformedEnv:

@@ -99,7 +99,7 @@ class EpisodeTracker:
                         peak_force=None
                         if force_peak is None
                         else float(self.force_peak[env]),
-                        physics_error=error is not None and error[env, step] > 0,
+                        physics_error=error is not None and bool(error[env, step]),
                         path_ratio=None
                         if path_ratio is None
                         else float(path_ratio[env, step]),

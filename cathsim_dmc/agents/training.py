@@ -125,7 +125,7 @@ def train(
         if checkpoint:
             state = checkpoint.learning_state()
             learner.load(checkpoint.policy_state(), state["learner"])
-        elif config.normalisation_frames:
+        elif not learner.random_frames:
             _observe_random_actions(env, learner, config)
         collector = Collector(
             env,
@@ -265,6 +265,8 @@ def _observe_random_actions(
     env: EnvBase, learner: PPO | SAC, config: TrainingConfig
 ) -> None:
     """Start the observation statistics, so that the first update sees sane inputs."""
+    if not config.normalisation_frames:
+        return
     steps = math.ceil(config.normalisation_frames / config.num_envs)
     learner.observe(env.rollout(steps, break_when_any_done=False))
 

@@ -43,7 +43,8 @@ class TrainingConfig:
         gamma: discount per control step.
         observation_clip: normalised vector entries are clipped to +- this.
         normalisation_frames: random steps before the first update from which the
-            first observation statistics come; they are not counted as frames.
+            first observation statistics come; they are not counted as frames. An
+            algorithm that begins with random actions anyway (SAC) needs none.
         checkpoint_frames: frames between two checkpoints.
         keep_checkpoints: how many of the newest checkpoints stay on disk.
         metrics_frames: frames between two rows of metrics.csv.
