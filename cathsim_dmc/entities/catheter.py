@@ -22,7 +22,10 @@ MAX_PUSH_FORCE = 5.0  # N, slip of the clamps
 MAX_PUSH_SPEED = 0.04  # m/s
 CARRIAGE_GAIN = 100.0  # N·s/m, stiff: 1 N of load costs 1 cm/s
 
-ROTOR_INERTIA = 1e-6  # kg·m², rotary unit as seen by the device
+# Rotary unit as seen by the device, kg·m²: a 0.3 kg clamp of 2 cm. The bounded torque
+# then changes the speed by less in a time step than the range in which the servo is
+# linear (4 rad/s); a rotor 100 times lighter went bang-bang between 0 and 80 rad/s.
+ROTOR_INERTIA = 1e-4
 MAX_TORQUE = 0.02  # N·m
 MAX_ROTATION_SPEED = 3.14  # rad/s
 ROTATION_GAIN = 0.01  # N·m·s/rad
@@ -78,6 +81,7 @@ class Catheter(composer.Entity):
         self._links = []
         self._bends = []
         self._twists = []
+        self._twist_compliances = self._torsion_hinges()
         self._build_base(rotation)
         for index in range(1, len(self._lengths)):
             self._build_link(index)
@@ -122,13 +126,13 @@ class Catheter(composer.Entity):
             "body", name=f"link_{index}", pos=(0, 0, self._lengths[index - 1])
         )
         self._links.append(link)
-        compliance, twist_compliance = self._joint_compliance(index)
-        stiffness = 1 / compliance
+        stiffness = 1 / self._joint_compliance(index)
         start = self._lengths[index - 1 :].sum() - self._lengths[index - 1] / 2
         stop = self._lengths[index:].sum() - self._lengths[index] / 2
         rest = self._device.rest_angle(start, stop)
-        if index in self._torsion_links():
-            twist = 1 / (twist_compliance * self._torsion_span())
+        twist_compliance = self._twist_compliances.get(index)
+        if twist_compliance is not None:
+            twist = 1 / twist_compliance
             self._twists.append(
                 link.add(
                     "joint",
@@ -174,33 +178,45 @@ class Catheter(composer.Entity):
     def _section(self, index: int) -> devices.Section:
         return self._device.tip if self._in_tip(index) else self._device.shaft
 
-    def _joint_compliance(self, index: int) -> tuple[float, float]:
-        """Compliance in rad/(N·m) of bending and twist of the rod next to a joint.
+    def _joint_compliance(self, index: int) -> float:
+        """Compliance in rad/(N·m) of the bending of the rod next to a joint.
 
         A joint stands for the half links on both of its sides, l/2EI each.
         """
-        bending = twist = 0.0
-        for neighbour in (index - 1, index):
-            section = self._section(neighbour)
-            half = self._lengths[neighbour] / 2
-            bending += half / section.bending_stiffness
-            twist += half / section.torsional_stiffness
-        return bending, twist
+        return sum(
+            self._lengths[neighbour] / 2 / self._section(neighbour).bending_stiffness
+            for neighbour in (index - 1, index)
+        )
 
-    def _torsion_links(self) -> np.ndarray:
-        """Links that turn about the device's axis against their predecessors."""
+    def _torsion_hinges(self) -> dict[int, float]:
+        """Compliance in rad/(N·m) of the torsion hinges, by the link they turn.
+
+        The hinges share the joints of the chain evenly. Each one lies in the middle
+        of its share and stands for the twist of the whole of it, l/GJ, whatever
+        sections it spans; the last one also for the distal half link.
+        """
         count = self._discretisation.torsion_joints
         last = len(self._lengths) - 1
         if count > last:
             raise ValueError(
                 f"torsion_joints is {count}, but the chain has {last} joints"
             )
+        if count == 0:
+            return {}
+        half = np.array(
+            [
+                length / 2 / self._section(index).torsional_stiffness
+                for index, length in enumerate(self._lengths)
+            ]
+        )
+        joints = half[:-1] + half[1:]
+        joints[-1] += half[-1]
         edges = np.linspace(0, last, count + 1)
-        return np.round((edges[:-1] + edges[1:]) / 2 + 0.5).astype(int)
-
-    def _torsion_span(self) -> float:
-        """Joints of the chain that one torsion hinge stands for."""
-        return (len(self._lengths) - 1) / self._discretisation.torsion_joints
+        total = np.interp(
+            edges, np.arange(last + 1), np.concatenate([[0.0], np.cumsum(joints)])
+        )
+        links = np.round((edges[:-1] + edges[1:]) / 2 + 0.5).astype(int)
+        return dict(zip(links.tolist(), np.diff(total).tolist(), strict=True))
 
     def _build_motors(self):
         self._tip_motors = []
@@ -209,7 +225,7 @@ class Catheter(composer.Entity):
             for index in range(first, len(self._lengths)):
                 # The torque that bends the free joint by the steering angle: a motor
                 # shifts the rest shape and adds no stiffness.
-                compliance, _ = self._joint_compliance(index)
+                compliance = self._joint_compliance(index)
                 torque = self._device.steering_angle / compliance
                 for axis in ("x", "y"):
                     joint = self._mjcf_root.find("joint", f"bend_{axis}_{index}")
