@@ -35,6 +35,12 @@ def _check(name: str, value: float, low: float, high: float, unit: str) -> None:
         )
 
 
+# Tube in front of the ascending aorta by which a phantom is mounted, m: the device
+# starts with its steerable tip (70 mm) free of the introducer sheath and its head in
+# the ascending aorta.
+INLET_TUBE = 70e-3
+
+
 @dataclass(frozen=True)
 class BranchParameters:
     """Figures of one branch of the arch (metres, radians).
@@ -76,7 +82,8 @@ class ArchParameters:
     Attributes:
         ascending_radius, bca_level_radius, lcca_level_radius, lsa_level_radius,
             descending_radius: lumen radius of the aorta at five levels.
-        ascending_length: straight part from the inlet to the start of the arch.
+        ascending_length: straight part from the inlet to the start of the arch; it
+            includes the phantom's `INLET_TUBE`.
         descending_length: straight part from the end of the arch to the cap.
         arch_radius: half the distance between the axes of the two limbs.
         arch_height: from the end of the straight limbs to the top of the arch's
@@ -102,7 +109,7 @@ class ArchParameters:
     lcca_level_radius: float = 13.55e-3
     lsa_level_radius: float = 12.65e-3
     descending_radius: float = 11.95e-3
-    ascending_length: float = 62.6e-3
+    ascending_length: float = INLET_TUBE + 62.6e-3
     descending_length: float = 100e-3
     arch_radius: float = 34e-3
     arch_height: float = 34e-3
@@ -119,7 +126,7 @@ class ArchParameters:
             name = f"{level}_radius"
             _check(name, getattr(self, name), 7e-3, 25e-3, "m")
         _check("descending_radius", self.descending_radius, 6e-3, 22e-3, "m")
-        _check("ascending_length", self.ascending_length, 20e-3, 150e-3, "m")
+        _check("ascending_length", self.ascending_length, 20e-3, 300e-3, "m")
         _check("descending_length", self.descending_length, 40e-3, 400e-3, "m")
         _check("arch_radius", self.arch_radius, 20e-3, 70e-3, "m")
         _check("arch_height", self.arch_height, 15e-3, 90e-3, "m")
@@ -275,7 +282,7 @@ TYPE_I = ArchParameters(
     lcca_level_radius=13.0e-3,
     lsa_level_radius=11.5e-3,
     descending_radius=9.1e-3,
-    ascending_length=57e-3,
+    ascending_length=INLET_TUBE + 57e-3,
     descending_length=96.5e-3,
     bca_drop=0.5,
     bca_lcca_spacing=15e-3,
@@ -335,15 +342,29 @@ _CUT = 2.0
 _ATTEMPTS = 1000
 
 
+def load(name: str, *, access: str = "ascending") -> Anatomy:
+    """Anatomy of the arch called `name` in `ARCHES`.
+
+    Raises:
+        ValueError: if there is none; the message lists the names.
+    """
+    if name not in ARCHES:
+        raise ValueError(f"no arch {name!r}; there are {', '.join(ARCHES)}.")
+    return build_arch(ARCHES[name], name, access=access)
+
+
 def sample(
     random_state: np.random.RandomState | np.random.Generator,
     arch_type: str | None = None,
+    *,
+    bovine: bool = False,
 ) -> ArchParameters:
     """Random arch from the anatomical distributions.
 
     Args:
         random_state: source of randomness; the same state gives the same arch.
         arch_type: "I", "II" or "III", or None to draw it by prevalence.
+        bovine: let the LCCA leave the BCA.
 
     Raises:
         ValueError: if `arch_type` is unknown.
@@ -358,7 +379,7 @@ def sample(
     for _ in range(_ATTEMPTS):
         # Independent draws now and then give branches that cross: draw again.
         try:
-            params = _draw(random_state, arch_type)
+            params = _draw(random_state, arch_type, bovine)
             arch_tree(params)
         except ValueError:
             continue
@@ -367,7 +388,9 @@ def sample(
 
 
 def _draw(
-    random_state: np.random.RandomState | np.random.Generator, arch_type: str
+    random_state: np.random.RandomState | np.random.Generator,
+    arch_type: str,
+    bovine: bool,
 ) -> ArchParameters:
     def normal(mean: float, deviation: float) -> float:
         z = float(np.clip(random_state.normal(), -_CUT, _CUT))
@@ -402,14 +425,25 @@ def _draw(
     drop = uniform(*DROP_RANGES[arch_type])
     radii = {name: branch.radius for name, branch in branches.items()}
     wall = 2e-3
+    spacings = {
+        "bca_lcca_spacing": max(21.8e-3, radii["bca"] + radii["lcca"] + wall),
+        "lcca_lsa_spacing": max(14.3e-3, radii["lcca"] + radii["lsa"] + wall),
+    }
+    if bovine:
+        # The LSA stays where it would be; a common trunk is 8 to 15 mm long.
+        trunk = uniform(8e-3, 15e-3)
+        spacings["lcca_lsa_spacing"] = max(
+            sum(spacings.values()) - 0.5 * trunk, radii["bca"] + radii["lsa"] + wall
+        )
+        spacings["bca_lcca_spacing"] = trunk
     return ArchParameters(
         **branches,
         **aorta,
-        ascending_length=normal(62.6e-3, 11.4e-3),
+        ascending_length=INLET_TUBE + normal(62.6e-3, 11.4e-3),
         arch_radius=arch_radius,
         arch_height=arch_radius * uniform(0.95, 1.15),
         plane_rotation=normal(_degrees(50.3), _degrees(13.8)),
         bca_drop=drop,
-        bca_lcca_spacing=max(21.8e-3, radii["bca"] + radii["lcca"] + wall),
-        lcca_lsa_spacing=max(14.3e-3, radii["lcca"] + radii["lsa"] + wall),
+        bovine=bovine,
+        **spacings,
     )

@@ -19,6 +19,11 @@ _CURVED_STEP = 2e-3
 _FLARE_STEP = 0.5e-3
 # Two lumens side by side need this much wall between them, m.
 MINIMUM_SEPTUM = 1e-3
+# A branch must leave its parent within this angle of the wall's normal, rad, and
+# within this multiple of the parent's radius along its axis: an ostium more
+# oblique than that is a slit.
+_MOST_OBLIQUE = math.radians(60.0)
+_LONGEST_EXIT = 2.2
 
 
 def _smooth_interpolation(s: Array, stations: Array, values: Array) -> Array:
@@ -157,16 +162,18 @@ def _branch(
     tilt = math.acos(
         np.clip(direction @ outward / np.linalg.norm(outward), -1.0, 1.0)
     )
-    if tilt > math.radians(65.0):
+    parent_radius = float(place.radius)
+    if tilt > _MOST_OBLIQUE or exit_length > _LONGEST_EXIT * parent_radius:
         raise ValueError(
             f"branch {name!r} leaves at {math.degrees(tilt):.0f} degrees from the "
-            "normal of its parent's wall; at most 65 degrees are allowed. Change its "
+            f"normal of its parent's wall, {exit_length * 1e3:.0f} mm from its "
+            f"centreline; at most {math.degrees(_MOST_OBLIQUE):.0f} degrees and "
+            f"{_LONGEST_EXIT * parent_radius * 1e3:.0f} mm are allowed. Change its "
             "take_off."
         )
     # The flare reaches inwards until the whole ring is inside the parent, so that
     # the wall is convex along the branch wherever it exists.
     wide = p.radius + fillet
-    parent_radius = float(place.radius)
     if wide > 0.95 * parent_radius:
         raise ValueError(
             f"branch {name!r} with its fillet has radius {wide:g} m at the ostium; its "

@@ -25,6 +25,8 @@ _LEAK_DEPTH = 1.5e-3
 # Rays that leave through the inlet are no leaks; the hole's corners reach this far
 # (m) from the axis.
 _INLET_RADIUS = 1.7e-3
+# Largest lumen radius (m) looked for in a scan.
+_WIDEST = 30e-3
 # Pieces are grown by this much (m) when lines are cut with them.
 _SEAM = 1e-7
 # Rays start within this share of the lumen radius from a centreline.
@@ -151,6 +153,39 @@ def tube_samples(tree: VesselTree, spacing: float) -> SurfaceSamples:
     return SurfaceSamples(*(values[free] for values in joined))
 
 
+def mesh_samples(anatomy: Anatomy, spacing: float, *, seed: int = 0) -> SurfaceSamples:
+    """Random points on the surface of an anatomy that is no union of tubes.
+
+    There is one point per square of `spacing` (m), none on the open ends. The radius
+    is how far the depth grows along the inward normal.
+    """
+    rng = np.random.default_rng(seed)
+    corners = anatomy.surface.vertices[anatomy.surface.faces]
+    cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    area = 0.5 * np.linalg.norm(cross, axis=1)
+    count = max(1, round(area.sum() / spacing**2))
+    face = rng.choice(len(area), count, p=area / area.sum())
+    cut = np.sort(rng.uniform(size=(count, 2)), axis=1)
+    weights = np.stack([cut[:, 0], cut[:, 1] - cut[:, 0], 1.0 - cut[:, 1]], axis=1)
+    points = np.einsum("nk,nkj->nj", weights, corners[face])
+    outward = 0.5 * cross[face] / area[face, None]
+    for end in anatomy.ends:
+        if end.open:
+            flat = np.abs((points - end.position) @ end.direction) < 1e-5
+            near = np.linalg.norm(points - end.position, axis=1) < 4.0 * end.radius
+            points, outward = points[~(flat & near)], outward[~(flat & near)]
+    radii = np.zeros(len(points))
+    growing = np.ones(len(points), dtype=bool)
+    step = 0.25e-3
+    while growing.any() and radii.max() < _WIDEST:
+        ahead = points[growing] - (radii[growing] + step)[:, None] * outward[growing]
+        # Half a step of slack for the field's interpolation.
+        deeper = anatomy.depth(ahead) > radii[growing] + 0.5 * step
+        growing[growing] = deeper
+        radii[growing] += step
+    return SurfaceSamples(points, outward, np.maximum(radii, step))
+
+
 def half_spaces(piece: Array) -> tuple[Array, Array]:
     """Outward unit normals (f, 3) and offsets (f,) of a convex piece (n, 3), m."""
     from scipy.spatial import ConvexHull
@@ -207,7 +242,7 @@ def wall_intervals(
 def intrusion(
     anatomy: Anatomy, spacing: float = 1e-3, *, search: float = 4e-3
 ) -> Intrusion:
-    """Distance between the wall and the lumen surface of an anatomy's tree.
+    """Distance between the wall and the lumen surface of an anatomy.
 
     Samples lie on the lumen surface about `spacing` (m) apart. At each one the
     intrusion is how far, along the inward normal and up to the centreline, the
@@ -215,7 +250,10 @@ def intrusion(
     none is. Recession is how far outside the lumen the wall is first met along the
     outward normal. Statistics are over all samples.
     """
-    samples = tube_samples(anatomy.tree, spacing)
+    if anatomy.field is None:
+        samples = tube_samples(anatomy.tree, spacing)
+    else:
+        samples = mesh_samples(anatomy, spacing)
     inside, outside = wall_intervals(anatomy.wall, samples, search)
     # At the edge of an ostium a normal may graze the other vessel's surface, so the
     # recession is the depth of the place met, not the way to it.

@@ -28,8 +28,14 @@ TOLERANCE = 0.35e-3
 INLET_HOLE_RADIUS = 1.5e-3
 _LONGEST_SLAB = 25e-3
 _FEWEST_SECTORS = 7
+# A branch has sectors enough for this share of its radius at the flared start.
+_START_SHARE = 0.85
 # A run of slabs may form one piece while the vessel bends less than this, rad.
 _STRAIGHT = math.radians(1.0)
+# Clearance (m) between a parent's lumen and the cut through a branch's piece, and
+# how near, in radii, a ring must be to its parent for the cut to be looked for.
+_MARGIN = 0.05e-3
+_NEAR_PARENT = 2.0
 # Pieces thinner than this (m) or smaller (m^3) are left out: no device passes the
 # slit they would fill, and MuJoCo rejects meshes without volume.
 _THINNEST = 0.02e-3
@@ -222,15 +228,8 @@ def _hulls(tube: Tube, first: int) -> list[list[Array]]:
     return pieces
 
 
-def subtract(piece: Array, tube: Tube, *, rooted: bool) -> list[Array]:
-    """Parts of a convex piece (n, 3) outside the lumen of `tube`, all convex.
-
-    Args:
-        piece: vertices.
-        tube: the lumen to keep free.
-        rooted: the tube starts inside another lumen (a branch), so there is no
-            wall to keep before its first plane.
-    """
+def subtract(piece: Array, tube: Tube) -> list[Array]:
+    """Parts of a convex piece (n, 3) outside the lumen of `tube`, all convex."""
     middle = piece.mean(axis=0)
     size = np.sqrt(((piece - middle) ** 2).sum(axis=1).max())
     nearest = tube.line.project(middle)
@@ -272,7 +271,7 @@ def subtract(piece: Array, tube: Tube, *, rooted: bool) -> list[Array]:
     if not blocked:
         return [piece]
     out: list[Array | None] = []
-    if not rooted and slabs[0] == 0 and height[0].min() < -1e-9:
+    if slabs[0] == 0 and height[0].min() < -1e-9:
         out.append(clip(piece, -tube.tangents[0], -tube.tangents[0] @ tube.centres[0]))
     if slabs[-1] == len(tube.centres) - 2 and height[-1].max() > 1e-9:
         end = tube.tangents[-1]
@@ -300,27 +299,51 @@ def subtract(piece: Array, tube: Tube, *, rooted: bool) -> list[Array]:
     return [part for part in out if part is not None]
 
 
-def _support_planes(tube: Tube, run: int, parent: Tube) -> tuple[Array, Array]:
-    """One plane per sector of a branch on which its parent's lumen rests.
+def _parent_cuts(tube: Tube, parent: Centreline) -> tuple[Array, Array]:
+    """Planes that keep a branch's wall out of its parent's lumen.
 
-    The plane is parallel to the parent's wall where the sector leaves it. Normals
-    (sectors, 3) point out of the parent; offsets (sectors,).
+    Each is parallel to the parent's wall where the sector leaves it, and just
+    above what the piece has inside the parent. What is cut off beside the lumen is
+    a sliver at the parent's wall, whose own pieces fill it.
+
+    Returns:
+        Unit normals (sectors, 3) out of the parent, and offsets (slabs, sectors),
+        -inf where a piece stays clear of the parent.
     """
-    rings = tube.inner[: run + 1]
-    middles = 0.5 * (rings + np.roll(rings, -1, axis=1))
-    fine = np.linspace(0.0, 1.0, 33)[:, None, None]
-    ray = middles[0] + fine * (middles[-1] - middles[0])
-    nearest = parent.line.project(ray)
+    middles = 0.5 * (tube.inner + np.roll(tube.inner, -1, axis=1))
+    fine = np.linspace(0.0, 1.0, 33)[:-1, None, None, None]
+    # (steps, slabs, sectors, 3), put in order along the tube
+    path = middles[:-1] + fine * (middles[1:] - middles[:-1])
+    ray = np.swapaxes(path, 0, 1).reshape(-1, *middles.shape[1:])
+    nearest = parent.project(ray)
     leaves = (nearest.radius - nearest.distance < 0.0).argmax(axis=0)
     columns = np.arange(ray.shape[1])
     points = ray[leaves, columns]
-    foot = parent.line.at(nearest.arc_length[leaves, columns]).position
+    foot = parent.at(nearest.arc_length[leaves, columns]).position
     normals = points - foot
     normals /= np.linalg.norm(normals, axis=1)[:, None]
-    corners = parent.inner.reshape(-1, 3)
-    heights = normals @ corners.T
-    near = np.linalg.norm(points[:, None] - corners[None], axis=2) < 2.0 * parent.reach
-    return normals, np.where(near, heights, -np.inf).max(axis=1)
+    # A grid through each piece: along, around and outwards, (..., 25, 5, 7, 3).
+    u, v, w = (np.linspace(0.0, 1.0, count) for count in (25, 5, 7))
+    sides = []
+    for rings in (tube.inner, tube.outer):
+        corners = Tube.face_corners(rings)[..., None, None, :]
+        first = corners[:, :, 0] + v[:, None] * (corners[:, :, 1] - corners[:, :, 0])
+        last = corners[:, :, 2] + v[:, None] * (corners[:, :, 3] - corners[:, :, 2])
+        first, last = first[:, :, 0, None], last[:, :, 0, None]
+        sides.append(first + u[:, None, None] * (last - first))
+    inner, outer = (side[..., None, :] for side in sides)
+    grid = inner + w[:, None] * (outer - inner)
+    offsets = np.full(grid.shape[:2], -np.inf)
+    near = parent.project(middles.mean(axis=1)).distance < _NEAR_PARENT * (
+        parent.radii.max() + tube.reach
+    )
+    for j in np.flatnonzero(near[:-1]):
+        place = parent.project(grid[j])
+        inside = place.distance < place.radius + _MARGIN
+        height = np.einsum("k...j,kj->k...", grid[j], normals)
+        height = np.where(inside, height, -np.inf).reshape(len(normals), -1)
+        offsets[j] = height.max(axis=1) + _MARGIN
+    return normals, offsets
 
 
 def _ring_inside(line: Centreline, ostium: float, parent: Centreline) -> float:
@@ -369,8 +392,10 @@ def tree_tubes(
         if vessel.parent is not None:
             parent = tree.vessel(vessel.parent).centreline
             start = _ring_inside(line, vessel.ostium, parent)
-            # The flare is short: the calibre beyond it sets the sectors.
-            radius = float(np.median(line.radii[line.arc_length > vessel.ostium]))
+            # The flare is short: let the calibre beyond it set the sectors, unless
+            # chords around the wide start would become too high.
+            calibre = np.median(line.radii[line.arc_length > vessel.ostium])
+            radius = float(max(calibre, _START_SHARE * line.at(start).radius))
         tubes[name] = polyhedral_tube(
             line,
             start=start,
@@ -402,16 +427,20 @@ def build_wall(
     wall: list[Array] = []
     for name, vessel in tree.vessels.items():
         tube = tubes[name]
-        run = _convex_run(tube) if vessel.parent is not None else 1
-        columns = _hulls(tube, run)
-        planes = None
-        if vessel.parent is not None:
-            planes = _support_planes(tube, run, tubes[vessel.parent])
-        for k, column in enumerate(columns):
-            pieces: list[Array] = column
-            if planes is not None:
-                kept = (clip(piece, planes[0][k], planes[1][k]) for piece in pieces)
-                pieces = [piece for piece in kept if piece is not None]
+        if vessel.parent is None:
+            for column in _hulls(tube, 1):
+                wall += _free_lumens(column, name, tree, tubes)
+            continue
+        run = _convex_run(tube)
+        normals, offsets = _parent_cuts(tube, tree.vessel(vessel.parent).centreline)
+        # The first piece of a column spans `run` slabs.
+        offsets = np.concatenate([offsets[:run].max(axis=0)[None], offsets[run:]])
+        for k, column in enumerate(_hulls(tube, run)):
+            cut = [
+                clip(piece, normals[k], level)
+                for piece, level in zip(column, offsets[:, k], strict=True)
+            ]
+            pieces = [piece for piece in cut if piece is not None and _solid(piece)]
             wall += _free_lumens(pieces, name, tree, tubes)
     for end in ends:
         wall += _free_lumens(_cap(end, thickness), end.vessel, tree, tubes)
@@ -427,8 +456,7 @@ def _free_lumens(
         parts = [piece]
         for other, tube in tubes.items():
             if other not in (name, tree.vessel(name).parent):
-                rooted = tree.vessel(other).parent is not None
-                parts = [q for p in parts for q in subtract(p, tube, rooted=rooted)]
+                parts = [q for p in parts for q in subtract(p, tube)]
         # Hulls as built are solid; only what was cut can be a sliver.
         out += [part for part in parts if part is piece or _solid(part)]
     return out

@@ -1,0 +1,172 @@
+"""Parametric arches: published figures, validation, sampling."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from cathsim_dmc.anatomy import arch
+from cathsim_dmc.anatomy.arch_tree import arch_tree
+
+
+def bca_drop(params):
+    """Height of the arch's top over the BCA ostium in LCCA diameters, measured."""
+    tree = arch_tree(params)
+    aorta = tree.vessel("aorta").centreline
+    top = (aorta.points[:, 2] + aorta.radii).max()
+    bca = tree.vessel("bca")
+    ostium = bca.centreline.at(bca.ostium).position
+    return (top - ostium[2]) / (2.0 * params.lcca.radius)
+
+
+def test_type_one_has_the_published_figures():
+    anatomy = arch.load("type1")
+    plane = arch.TYPE_I.plane_rotation
+    along = np.array([math.sin(plane), math.cos(plane), 0.0])
+    vertices = anatomy.surface.vertices
+    assert np.ptp(vertices @ along) == pytest.approx(91e-3, abs=1.5e-3)
+    descending = anatomy.tree.vessel("aorta").centreline.points[-1, 2]
+    assert vertices[:, 2].max() - descending == pytest.approx(186e-3, abs=1.5e-3)
+    bca, lcca = (anatomy.goal(name).position for name in ("bca", "lcca"))
+    assert np.linalg.norm(bca - lcca) == pytest.approx(15e-3, abs=1e-3)
+    tip = anatomy.inlet.position + arch.INLET_TUBE * anatomy.inlet.direction
+    away = np.linalg.norm([bca - tip, lcca - tip], axis=1)
+    assert away.mean() == pytest.approx(130e-3, abs=3e-3)
+    aorta = anatomy.tree.vessel("aorta").centreline
+    assert aorta.radii[-1] == pytest.approx(9.1e-3)
+    assert aorta.radii.max() == pytest.approx(13.8e-3)
+
+
+@pytest.mark.parametrize(
+    ("name", "low", "high"),
+    [("type1", 0, 1), ("type2", 1, 2), ("type3", 2, 3)],
+)
+def test_types_are_set_by_the_drop_of_the_bca(name, low, high):
+    drop = bca_drop(arch.ARCHES[name])
+    assert low < drop < high
+    assert drop == pytest.approx(arch.ARCHES[name].bca_drop, abs=0.15)
+
+
+@pytest.mark.parametrize("name", arch.ARCHES)
+def test_branches_start_on_their_parent_and_leave_it(name):
+    tree = arch_tree(arch.ARCHES[name])
+    for vessel in tree.vessels.values():
+        if vessel.parent is None:
+            continue
+        parent = tree.vessel(vessel.parent).centreline
+        line = vessel.centreline
+        start = parent.project(line.points[0])
+        assert start.distance < 1e-6
+        ostium = parent.project(line.at(vessel.ostium).position)
+        assert ostium.distance == pytest.approx(ostium.radius, abs=0.3e-3)
+        # The ostium is flared and the branch free of its parent further up.
+        assert line.at(vessel.ostium).radius > line.radii[-1]
+        assert line.length - vessel.ostium >= 40e-3
+        goal = line.at(vessel.ostium + 27e-3).position
+        depths = tree.depths(goal)
+        assert depths[vessel.name] > 0.0
+        assert depths[vessel.parent] < 0.0
+
+
+def test_bovine_lcca_leaves_the_bca():
+    tree = arch_tree(arch.BOVINE)
+    assert tree.vessel("lcca").parent == "bca"
+
+
+def test_take_off_angle_is_from_the_vertical():
+    tree = arch_tree(arch.TYPE_II)
+    for name in ("bca", "lcca", "lsa"):
+        tangent = tree.vessel(name).centreline.at(0.0).tangent
+        angle = math.acos(tangent[2])
+        assert angle == pytest.approx(
+            abs(getattr(arch.TYPE_II, name).take_off), abs=math.radians(1.0)
+        )
+
+
+def test_plane_is_turned_from_the_sagittal_plane():
+    aorta = arch_tree(arch.TYPE_I).vessel("aorta").centreline
+    chord = aorta.points[-1] - aorta.points[0]
+    # The descending aorta lies behind (+y) and to the left (+x) of the ascending.
+    turn = math.atan2(chord[0], chord[1])
+    assert turn == pytest.approx(arch.TYPE_I.plane_rotation)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"descending_radius": 0.05}, "descending_radius is 0.05 m; allowed is"),
+        ({"bca_drop": 9.0}, "LCCA diameters"),
+        ({"bca_lcca_spacing": 5e-3}, "bca_lcca_spacing"),
+        ({"arch_height": 0.015}, "Enlarge arch_radius"),
+        ({"ascending_length": math.nan}, "ascending_length is nan"),
+        ({"bovine": True, "bca_lcca_spacing": 60e-3}, "bca_lcca_spacing"),
+    ],
+)
+def test_bad_parameters_are_refused(change, message):
+    with pytest.raises(ValueError, match=message):
+        replace(arch.TYPE_II, **change)
+
+
+def test_branches_that_cross_are_refused():
+    leaning = replace(arch.TYPE_II.lcca, take_off=1.0)
+    upright = replace(arch.TYPE_II.bca, take_off=-0.3)
+    with pytest.raises(ValueError, match="come within|leaves at"):
+        arch_tree(replace(arch.TYPE_II, lcca=leaning, bca=upright))
+
+
+def test_sampling_repeats_with_its_seed():
+    first = arch.sample(np.random.RandomState(3))
+    assert first == arch.sample(np.random.RandomState(3))
+    assert first != arch.sample(np.random.RandomState(4))
+    assert arch.sample(np.random.default_rng(3)) == arch.sample(
+        np.random.default_rng(3)
+    )
+
+
+@settings(max_examples=15, deadline=None)
+@given(
+    st.integers(0, 2**31 - 1),
+    st.sampled_from(list(arch.DROP_RANGES)),
+    st.booleans(),
+)
+def test_samples_are_valid_arches_of_their_type(seed, arch_type, bovine):
+    params = arch.sample(np.random.RandomState(seed), arch_type, bovine=bovine)
+    low, high = arch.DROP_RANGES[arch_type]
+    assert low - 0.2 <= bca_drop(params) <= high + 0.2
+    tree = arch_tree(params)
+    assert tree.vessel("lcca").parent == ("bca" if bovine else "aorta")
+
+
+def test_types_are_drawn_by_prevalence():
+    random_state = np.random.RandomState(0)
+    drops = np.array([arch.sample(random_state).bca_drop for _ in range(150)])
+    share = [(drops < 1).mean(), ((drops >= 1) & (drops < 2)).mean()]
+    # 150 draws: three standard errors are 0.12.
+    np.testing.assert_allclose(share, [0.336, 0.434], atol=0.13)
+
+
+def test_unknown_names_list_the_known():
+    with pytest.raises(ValueError, match="type1, type2, type3, bovine"):
+        arch.load("type9")
+    with pytest.raises(ValueError, match="I, II, III"):
+        arch.sample(np.random.RandomState(0), "IV")
+    with pytest.raises(ValueError, match="ascending, descending"):
+        arch.load("type1", access="radial")
+
+
+def test_equal_parameters_give_one_anatomy():
+    assert arch.load("type1") is arch.load("type1")
+
+
+def test_femoral_access_enters_the_descending_aorta():
+    anatomy = arch.load("type2", access="descending")
+    aorta = anatomy.tree.vessel("aorta").centreline
+    np.testing.assert_allclose(anatomy.inlet.position, aorta.points[-1])
+    np.testing.assert_allclose(anatomy.inlet.direction, [0, 0, 1], atol=1e-9)
+    opened = [end for end in anatomy.ends if end.open]
+    assert len(opened) == 1
+    route = anatomy.route("bca")
+    np.testing.assert_allclose(route.points[0], anatomy.inlet.position, atol=1e-9)

@@ -1,0 +1,185 @@
+"""Centrelines, projections, vessel trees and routes."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from cathsim_dmc.anatomy.centreline import Centreline, Vessel, VesselTree
+
+
+def straight(length=0.1, radius=0.01, count=11):
+    points = np.zeros((count, 3))
+    points[:, 2] = np.linspace(0.0, length, count)
+    return Centreline(points, np.full(count, radius))
+
+
+def helix(count=200):
+    t = np.linspace(0.0, 4.0, count)
+    points = np.stack([0.03 * np.cos(t), 0.03 * np.sin(t), 0.02 * t], axis=1)
+    return Centreline(points, np.linspace(0.01, 0.004, count))
+
+
+def tree():
+    trunk = straight()
+    branch = Centreline([[0, 0, 0.05], [0.03, 0, 0.05], [0.06, 0, 0.05]], [0.004] * 3)
+    twig = Centreline([[0.04, 0, 0.05], [0.04, 0, 0.08]], [0.002, 0.002])
+    return VesselTree(
+        {
+            "aorta": Vessel("aorta", trunk),
+            "bca": Vessel("bca", branch, "aorta", 0.01),
+            "twig": Vessel("twig", twig, "bca", 0.004),
+        }
+    )
+
+
+def brute_force_distance(line, points):
+    """Distance to the polyline by plain point-to-segment geometry, one at a time."""
+    out = []
+    for p in points:
+        best = np.inf
+        for a, b in zip(line.points[:-1], line.points[1:], strict=True):
+            t = np.clip((p - a) @ (b - a) / ((b - a) @ (b - a)), 0.0, 1.0)
+            best = min(best, np.linalg.norm(p - a - t * (b - a)))
+        out.append(best)
+    return np.array(out)
+
+
+def test_interpolation_on_a_straight_line():
+    place = straight().at(np.array([[0.0, 0.025], [0.1, 7.0]]))
+    assert place.position.shape == (2, 2, 3)
+    np.testing.assert_allclose(place.position[..., 2], [[0, 0.025], [0.1, 0.1]])
+    np.testing.assert_allclose(place.tangent[1, 1], [0, 0, 1])
+    np.testing.assert_allclose(place.radius, 0.01)
+
+
+@settings(max_examples=20, deadline=None)
+@given(st.integers(0, 2**32 - 1))
+def test_projection_agrees_with_brute_force(seed):
+    line = helix(40)
+    points = np.random.default_rng(seed).uniform(-0.05, 0.1, (20, 3))
+    found = line.project(points)
+    np.testing.assert_allclose(
+        found.distance, brute_force_distance(line, points), atol=1e-12
+    )
+    place = line.at(found.arc_length)
+    np.testing.assert_allclose(
+        np.linalg.norm(points - place.position, axis=1), found.distance, atol=1e-12
+    )
+    np.testing.assert_allclose(place.radius, found.radius, atol=1e-12)
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.floats(0.0, 1.0))
+def test_points_on_the_line_project_onto_themselves(share):
+    line = helix()
+    s = share * line.length
+    found = line.project(line.at(s).position)
+    assert found.distance < 1e-8
+    assert found.arc_length == pytest.approx(s, abs=1e-8)
+
+
+def test_projection_keeps_leading_axes_and_chunks_agree(monkeypatch):
+    line = helix()
+    points = np.random.default_rng(0).normal(size=(4, 5, 3))
+    whole = line.project(points)
+    monkeypatch.setattr("cathsim_dmc.anatomy.centreline._CHUNK_ELEMENTS", 400)
+    parts = line.project(points)
+    assert whole.distance.shape == (4, 5)
+    for a, b in zip(whole, parts, strict=True):
+        np.testing.assert_allclose(a, b, rtol=0, atol=1e-12)
+
+
+def test_slice_and_resample_keep_the_curve():
+    line = helix()
+    part = line.slice(0.02, 0.07)
+    assert part.length == pytest.approx(0.05, abs=1e-9)
+    np.testing.assert_allclose(part.points[0], line.at(0.02).position, atol=1e-12)
+    back = line.slice(0.07, 0.02)
+    np.testing.assert_allclose(back.points, part.points[::-1], atol=1e-12)
+    even = line.resampled(1e-3)
+    np.testing.assert_allclose(even.points[[0, -1]], line.points[[0, -1]], atol=1e-12)
+    steps = np.diff(even.arc_length)
+    assert steps.max() <= 1.05e-3
+    assert steps.min() >= 0.95e-3
+
+
+@pytest.mark.parametrize(
+    ("points", "radii", "message"),
+    [
+        ([[0, 0, 0]], [1], "shape"),
+        ([[0, 0, 0], [0, 0, 1]], [1], "one radius"),
+        ([[0, 0, 0], [0, 0, 1]], [1, 0], "must be > 0"),
+        ([[0, 0, 0], [0, 0, 0]], [1, 1], "coincide"),
+        ([[0, 0, 0], [0, 0, np.nan]], [1, 1], "NaN"),
+    ],
+)
+def test_bad_centrelines_are_refused(points, radii, message):
+    with pytest.raises(ValueError, match=message):
+        Centreline(points, radii)
+
+
+def test_arrays_cannot_be_changed():
+    with pytest.raises(ValueError, match="read-only"):
+        straight().points[0, 0] = 1.0
+
+
+def test_depth_of_a_cylinder_and_its_open_ends():
+    vessels = VesselTree({"aorta": Vessel("aorta", straight())})
+    points = np.array(
+        [[0, 0, 0.05], [0.004, 0, 0.05], [0.013, 0, 0.05], [0, 0, -0.003], [0, 0, 0.1]]
+    )
+    np.testing.assert_allclose(
+        vessels.depth(points), [0.01, 0.006, -0.003, -0.003, 0.01], atol=1e-12
+    )
+    closed = vessels.depth(points, closed=True)
+    np.testing.assert_allclose(closed, [0.01, 0.006, -0.003, -0.003, 0.0], atol=1e-12)
+
+
+def test_depth_of_a_union_is_the_deepest_vessel():
+    vessels = tree()
+    points = np.random.default_rng(1).uniform(-0.02, 0.1, (300, 3))
+    single = vessels.depths(points)
+    np.testing.assert_array_equal(
+        vessels.depth(points), np.max(list(single.values()), axis=0)
+    )
+    assert vessels.depth(np.array([0.05, 0.0, 0.05])) == pytest.approx(0.004)
+
+
+def test_route_into_a_branch_and_between_branches():
+    vessels = tree()
+    route = vessels.route("aorta", "twig", 0.02)
+    assert route.length == pytest.approx(0.05 + 0.04 + 0.02)
+    np.testing.assert_allclose(route.points[0], [0, 0, 0])
+    np.testing.assert_allclose(route.points[-1], [0.04, 0, 0.07])
+    # A branch is entered by its distal end: back along it, then down the trunk.
+    back = vessels.route("bca", "aorta")
+    assert back.length == pytest.approx(0.06 + 0.05)
+    np.testing.assert_allclose(back.points[-1], [0, 0, 0.1])
+    femoral = vessels.route("aorta", "bca", 0.05, start_arc_length=0.1)
+    assert femoral.length == pytest.approx(0.05 + 0.05)
+
+
+def test_unknown_vessels_are_named():
+    with pytest.raises(ValueError, match="aorta, bca, twig"):
+        tree().vessel("lima")
+
+
+def test_trees_need_parents_first_and_one_root():
+    line = straight()
+    with pytest.raises(ValueError, match="no parent"):
+        VesselTree({"a": Vessel("a", line), "b": Vessel("b", line)})
+    with pytest.raises(ValueError, match="parents before"):
+        VesselTree({"a": Vessel("a", line), "b": Vessel("b", line, "c")})
+    with pytest.raises(ValueError, match="filed under"):
+        VesselTree({"x": Vessel("a", line)})
+    with pytest.raises(ValueError, match="at least one"):
+        VesselTree({})
+
+
+def test_trees_can_be_sent_to_workers():
+    import pickle
+
+    vessels = pickle.loads(pickle.dumps(tree()))
+    point = np.array([0.01, 0.0, 0.05])
+    assert vessels.depth(point) == tree().depth(point)
