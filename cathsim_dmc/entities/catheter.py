@@ -14,6 +14,9 @@ BENDING_RELAXATION_TIME = 0.2
 # below the relaxation time, and it gives the contact solver the scale of mass at
 # which the wall is as hard as silicone (docs/physics.md).
 HINGE_ARMATURE = 1e-6
+# The same of the torsion hinges. They are softer: more would delay the twist by more
+# than a few milliseconds.
+TORSION_ARMATURE = 1e-7
 # Lag of the drives of the tip, s.
 STEERING_LAG = 0.05
 
@@ -140,7 +143,7 @@ class Catheter(composer.Entity):
                     axis=(0, 0, 1),
                     stiffness=twist,
                     damping=BENDING_RELAXATION_TIME * twist,
-                    armature=HINGE_ARMATURE,
+                    armature=TORSION_ARMATURE,
                 )
             )
         for axis, direction in (("x", (1, 0, 0)), ("y", (0, 1, 0))):
