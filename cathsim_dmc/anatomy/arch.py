@@ -1,4 +1,4 @@
-"""Parametric aortic arches: the figures, the tree they give, presets, a sampler.
+"""Parametric aortic arches: presets, a sampler, and the anatomy they give.
 
 Built in the patient frame LPS with the inlet of the ascending aorta at the
 origin. The ascending aorta runs straight up (+z), the arch is half an ellipse
@@ -11,13 +11,18 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, fields, replace
+from dataclasses import replace
 from functools import lru_cache
 from types import MappingProxyType
 
 import numpy as np
 
-from cathsim_dmc.anatomy.arch_tree import MINIMUM_SEPTUM, arch_tree
+from cathsim_dmc.anatomy.arch_parameters import (
+    INLET_TUBE,
+    ArchParameters,
+    BranchParameters,
+)
+from cathsim_dmc.anatomy.arch_tree import arch_tree
 from cathsim_dmc.anatomy.centreline import VesselTree
 from cathsim_dmc.anatomy.phantom import Anatomy, End, Goal, Inlet
 
@@ -26,151 +31,6 @@ from cathsim_dmc.anatomy.phantom import Anatomy, End, Goal, Inlet
 DROP_RANGES: Mapping[str, tuple[float, float]] = MappingProxyType(
     {"I": (0.0, 1.0), "II": (1.0, 2.0), "III": (2.0, 3.0)}
 )
-
-
-def _check(name: str, value: float, low: float, high: float, unit: str) -> None:
-    if not (math.isfinite(value) and low <= value <= high):
-        raise ValueError(
-            f"{name} is {value:g} {unit}; allowed is {low:g} to {high:g} {unit}."
-        )
-
-
-# Tube in front of the ascending aorta by which a phantom is mounted, m: the device
-# starts with its steerable tip (70 mm) free of the introducer sheath and its head in
-# the ascending aorta.
-INLET_TUBE = 70e-3
-
-
-@dataclass(frozen=True)
-class BranchParameters:
-    """Figures of one branch of the arch (metres, radians).
-
-    Attributes:
-        radius: lumen radius at the origin, before the flare of the ostium.
-        end_radius: lumen radius at the distal end; the taper is linear.
-        take_off: angle of the first part from the vertical in the plane of the
-            arch, positive upstream (towards the ascending aorta).
-        length: from the ostium to the distal end.
-        bend_radius: radius of curvature after the straight first part.
-        bend_azimuth: direction of the bend: 0 downstream in the plane of the arch,
-            pi upstream, pi/2 out of the plane to the patient's right and back.
-        goal_depth: distance of the goal beyond the ostium, along the branch.
-    """
-
-    radius: float
-    end_radius: float
-    take_off: float
-    length: float = 45e-3
-    bend_radius: float = 100e-3
-    bend_azimuth: float = 0.0
-    goal_depth: float = 27e-3
-
-    def __post_init__(self) -> None:
-        _check("branch radius", self.radius, 1.5e-3, 12e-3, "m")
-        _check("branch end_radius", self.end_radius, 1.0e-3, 12e-3, "m")
-        _check("branch take_off", self.take_off, -1.3, 1.3, "rad")
-        _check("branch length", self.length, 40e-3, 150e-3, "m")
-        _check("branch bend_radius", self.bend_radius, 40e-3, 10.0, "m")
-        _check("branch bend_azimuth", self.bend_azimuth, -2 * math.pi, 2 * math.pi, "")
-        _check("branch goal_depth", self.goal_depth, 5e-3, self.length - 5e-3, "m")
-
-
-@dataclass(frozen=True)
-class ArchParameters:
-    """Every figure of an aortic arch (metres, radians).
-
-    Attributes:
-        ascending_radius, bca_level_radius, lcca_level_radius, lsa_level_radius,
-            descending_radius: lumen radius of the aorta at five levels.
-        ascending_length: straight part from the inlet to the start of the arch; it
-            includes the phantom's `INLET_TUBE`.
-        descending_length: straight part from the end of the arch to the cap.
-        arch_radius: half the distance between the axes of the two limbs.
-        arch_height: from the end of the straight limbs to the top of the arch's
-            centreline; equal to arch_radius for a circular arch.
-        plane_rotation: angle of the plane of the arch from the sagittal plane,
-            positive when the descending aorta lies to the left of the ascending.
-        bca_drop: height of the top of the arch above the BCA ostium, in LCCA
-            diameters (type I below 1, II from 1 to 2, III above 2).
-        bca_lcca_spacing, lcca_lsa_spacing: between ostium centres along the outer
-            curve of the arch.
-        bca, lcca, lsa: the branches.
-        fillet: by how much the radius of a branch grows at its ostium, at most.
-        descending_goal_depth: distance of the goal "descending" from the cap.
-        bovine: the LCCA leaves the BCA `bca_lcca_spacing` above the BCA's ostium
-            (measured along the BCA) instead of leaving the arch.
-    """
-
-    bca: BranchParameters
-    lcca: BranchParameters
-    lsa: BranchParameters
-    ascending_radius: float = 14.75e-3
-    bca_level_radius: float = 14.3e-3
-    lcca_level_radius: float = 13.55e-3
-    lsa_level_radius: float = 12.65e-3
-    descending_radius: float = 11.95e-3
-    ascending_length: float = INLET_TUBE + 62.6e-3
-    descending_length: float = 100e-3
-    arch_radius: float = 34e-3
-    arch_height: float = 34e-3
-    plane_rotation: float = math.radians(50.3)
-    bca_drop: float = 0.5
-    bca_lcca_spacing: float = 21.8e-3
-    lcca_lsa_spacing: float = 14.3e-3
-    fillet: float = 2.5e-3
-    descending_goal_depth: float = 30e-3
-    bovine: bool = False
-
-    def __post_init__(self) -> None:
-        for level in ("ascending", "bca_level", "lcca_level", "lsa_level"):
-            name = f"{level}_radius"
-            _check(name, getattr(self, name), 7e-3, 25e-3, "m")
-        _check("descending_radius", self.descending_radius, 6e-3, 22e-3, "m")
-        _check("ascending_length", self.ascending_length, 20e-3, 300e-3, "m")
-        _check("descending_length", self.descending_length, 40e-3, 400e-3, "m")
-        _check("arch_radius", self.arch_radius, 20e-3, 70e-3, "m")
-        _check("arch_height", self.arch_height, 15e-3, 90e-3, "m")
-        _check("plane_rotation", self.plane_rotation, -math.pi, math.pi, "rad")
-        _check("bca_drop", self.bca_drop, 0.0, 4.0, "LCCA diameters")
-        _check("fillet", self.fillet, 0.0, 5e-3, "m")
-        _check(
-            "descending_goal_depth",
-            self.descending_goal_depth,
-            5e-3,
-            self.descending_length,
-            "m",
-        )
-        widest = max(
-            getattr(self, field.name)
-            for field in fields(self)
-            if field.name.endswith("_radius") and field.name != "arch_radius"
-        )
-        tightest = min(
-            self.arch_radius**2 / self.arch_height,
-            self.arch_height**2 / self.arch_radius,
-        )
-        if tightest < 1.25 * widest:
-            raise ValueError(
-                f"the arch (arch_radius {self.arch_radius:g} m, arch_height "
-                f"{self.arch_height:g} m) bends with a radius of {tightest:g} m; it "
-                f"must be at least 1.25 times the widest lumen radius ({widest:g} m). "
-                "Enlarge arch_radius and arch_height or bring them closer together."
-            )
-        pairs = [("lcca_lsa_spacing", self.lcca, self.lsa)]
-        if not self.bovine:
-            pairs.append(("bca_lcca_spacing", self.bca, self.lcca))
-        for name, first, second in pairs:
-            need = first.radius + second.radius + MINIMUM_SEPTUM
-            _check(name, getattr(self, name), need, 80e-3, "m")
-        if self.bovine:
-            # Leave the ostium before branching, and keep the branch on the trunk.
-            low = self.lcca.radius + 2e-3
-            _check("bca_lcca_spacing", self.bca_lcca_spacing, low, 25e-3, "m")
-            if self.lcca.radius > 0.8 * self.bca.radius:
-                raise ValueError(
-                    f"a bovine LCCA of radius {self.lcca.radius:g} m needs a BCA of "
-                    f"radius {self.lcca.radius / 0.8:g} m or more."
-                )
 
 
 ACCESSES = ("ascending", "descending")

@@ -4,21 +4,20 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
+from cathsim_dmc.anatomy.arch_parameters import (
+    MINIMUM_SEPTUM,
+    ArchParameters,
+    BranchParameters,
+)
 from cathsim_dmc.anatomy.centreline import Array, Centreline, Vessel, VesselTree
-
-if TYPE_CHECKING:
-    from cathsim_dmc.anatomy.arch import ArchParameters, BranchParameters
 
 # Polyline steps, m: the chord of 2 mm on a 34 mm arch departs 0.015 mm from it.
 _STRAIGHT_STEP = 5e-3
 _CURVED_STEP = 2e-3
 _FLARE_STEP = 0.5e-3
-# Two lumens side by side need this much wall between them, m.
-MINIMUM_SEPTUM = 1e-3
 # A branch must leave its parent within this angle of the wall's normal, rad, and
 # within this multiple of the parent's radius along its axis: an ostium more
 # oblique than that is a slit.
@@ -159,9 +158,7 @@ def _branch(
     exit_length = float(np.linalg.norm(direction))
     direction = direction / exit_length
     outward = ostium - line.at(line.project(ostium).arc_length).position
-    tilt = math.acos(
-        np.clip(direction @ outward / np.linalg.norm(outward), -1.0, 1.0)
-    )
+    tilt = math.acos(np.clip(direction @ outward / np.linalg.norm(outward), -1.0, 1.0))
     parent_radius = float(place.radius)
     if tilt > _MOST_OBLIQUE or exit_length > _LONGEST_EXIT * parent_radius:
         raise ValueError(

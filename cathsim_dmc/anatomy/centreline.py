@@ -13,9 +13,9 @@ from types import MappingProxyType
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-Array = NDArray[np.float64]
+from cathsim_dmc.anatomy.segments import Array, Segments, as_points
 
 # Points x segments handled at once while projecting: stays within the L2 cache.
 _CHUNK_ELEMENTS = 64_000
@@ -47,60 +47,6 @@ def _readonly(values: ArrayLike) -> Array:
     array = np.array(values, dtype=np.float64)
     array.setflags(write=False)
     return array
-
-
-def as_points(points: ArrayLike, name: str = "points") -> Array:
-    """Return `points` as float64 (..., 3).
-
-    Raises:
-        ValueError: if the last axis is not 3.
-    """
-    array = np.asarray(points, dtype=np.float64)
-    if array.ndim == 0 or array.shape[-1] != 3:
-        raise ValueError(
-            f"{name} has shape {array.shape}; give coordinates (x, y, z) in metres "
-            "on the last axis, shape (..., 3)."
-        )
-    return array
-
-
-class _Segments:
-    """Straight segments prepared for the projection of many points at once.
-
-    Attributes are per segment: start (s, 3), direction (s, 3) not normalised,
-    length (s,). Distances come from the expanded square, so the work per
-    point and segment is two matrix products and a few elementwise passes.
-    """
-
-    def __init__(self, start: Array, end: Array) -> None:
-        self.start = start
-        self.direction = end - start
-        self.squared = np.einsum("sj,sj->s", self.direction, self.direction)
-        self.length = np.sqrt(self.squared)
-        # One matrix product gives p.d/|d|^2 and -2 p.a for every segment.
-        self._matrix = np.concatenate(
-            [(self.direction / self.squared[:, None]).T, -2.0 * start.T], axis=1
-        )
-        self._offset = np.concatenate(
-            [
-                -np.einsum("sj,sj->s", start, self.direction) / self.squared,
-                np.einsum("sj,sj->s", start, start),
-            ]
-        )
-
-    def squared_distance(self, points: Array) -> tuple[Array, Array]:
-        """Squared distance less |p|^2, and unclamped parameter, both (n, s)."""
-        product = points @ self._matrix
-        product += self._offset
-        count = len(self.length)
-        raw, base = product[:, :count], product[:, count:]
-        # |p-a|^2 - 2 t raw |d|^2 + t^2 |d|^2 with t = clip(raw, 0, 1)
-        clamped = np.clip(raw, 0.0, 1.0)
-        step = clamped - 2.0 * raw
-        step *= clamped
-        step *= self.squared
-        step += base
-        return step, raw
 
 
 @dataclass(frozen=True, eq=False)
@@ -156,8 +102,8 @@ class Centreline:
         return float(self.arc_length[-1])
 
     @cached_property
-    def _segments(self) -> _Segments:
-        return _Segments(self.points[:-1], self.points[1:])
+    def _segments(self) -> Segments:
+        return Segments(self.points[:-1], self.points[1:])
 
     def at(self, s: ArrayLike) -> CentrelinePoint:
         """Interpolate linearly at arc length `s` (...), clamped to the polyline."""
@@ -316,11 +262,11 @@ class VesselTree:
             ) from None
 
     @cached_property
-    def _segments(self) -> tuple[_Segments, list[slice]]:
+    def _segments(self) -> tuple[Segments, list[slice]]:
         lines = [vessel.centreline for vessel in self.vessels.values()]
         stops = np.cumsum([0] + [len(line.points) - 1 for line in lines])
         return (
-            _Segments(
+            Segments(
                 np.concatenate([line.points[:-1] for line in lines]),
                 np.concatenate([line.points[1:] for line in lines]),
             ),

@@ -15,6 +15,7 @@ import numpy as np
 
 from cathsim_dmc.anatomy.centreline import Array, VesselTree
 from cathsim_dmc.anatomy.phantom import Anatomy
+from cathsim_dmc.anatomy.wall import INLET_HOLE_RADIUS
 
 if TYPE_CHECKING:
     import mujoco
@@ -22,9 +23,9 @@ if TYPE_CHECKING:
 # A ray that ends this far (m) outside the lumen has passed through a slit: the
 # recession of a good wall is below 1 mm, its thickness 4 mm.
 _LEAK_DEPTH = 1.5e-3
-# Rays that leave through the inlet are no leaks; the hole's corners reach this far
-# (m) from the axis.
-_INLET_RADIUS = 1.7e-3
+# Rays that leave through the inlet are no leaks; the hole is a polygon whose corners
+# lie up to a tenth beyond its radius.
+_INLET_RADIUS = 1.1 * INLET_HOLE_RADIUS
 # Largest lumen radius (m) looked for in a scan.
 _WIDEST = 30e-3
 # Pieces are grown by this much (m) when lines are cut with them.
@@ -183,7 +184,16 @@ def mesh_samples(anatomy: Anatomy, spacing: float, *, seed: int = 0) -> SurfaceS
         deeper = anatomy.depth(ahead) > radii[growing] + 0.5 * step
         growing[growing] = deeper
         radii[growing] += step
-    return SurfaceSamples(points, outward, np.maximum(radii, step))
+    # A normal near an open end may run through it; what lies behind is no wall.
+    for end in anatomy.ends:
+        if end.open:
+            near = np.linalg.norm(points - end.position, axis=1) < 4.0 * end.radius
+            with np.errstate(divide="ignore", invalid="ignore"):
+                way = (points - end.position) @ end.direction
+                way /= outward @ end.direction
+            near &= way > 0.0
+            radii[near] = np.minimum(radii[near], way[near])
+    return SurfaceSamples(points, outward, np.maximum(radii, 0.0))
 
 
 def half_spaces(piece: Array) -> tuple[Array, Array]:
@@ -341,8 +351,10 @@ def coverage(anatomy: Anatomy, n_rays: int = 100_000, *, seed: int = 0) -> Cover
             None, per_origin, mujoco.mjMAXVAL,
         )  # fmt: skip
         with np.errstate(divide="ignore", invalid="ignore"):
-            t = (inlet.position - origin) @ inlet.direction / (
-                direction @ inlet.direction
+            t = (
+                (inlet.position - origin)
+                @ inlet.direction
+                / (direction @ inlet.direction)
             )
             crossing = origin + t[:, None] * direction - inlet.position
             hole = (t > 0.0) & (np.linalg.norm(crossing, axis=1) < _INLET_RADIUS)

@@ -8,7 +8,7 @@ from cathsim_dmc.anatomy.centreline import Array, VesselTree
 from cathsim_dmc.anatomy.phantom import Surface
 
 # Grid step, m: at most 20,000 triangles on an aortic arch with its branches.
-SPACING = 2e-3
+SPACING = 2.2e-3
 
 
 def depth_grid(tree: VesselTree, spacing: float) -> tuple[Array, Array]:

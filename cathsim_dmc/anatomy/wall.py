@@ -11,23 +11,24 @@ axis, so they are convex and share their boundaries.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 
 from cathsim_dmc.anatomy.centreline import Array, Centreline, VesselTree
 from cathsim_dmc.anatomy.phantom import End
 from cathsim_dmc.anatomy.polytope import clip, clip_all, volume_and_width
+from cathsim_dmc.anatomy.tube import (
+    THICKNESS,
+    TOLERANCE,
+    Tube,
+    frames,
+    polyhedral_tube,
+    widened,
+)
 
-# Depth of the wall, m: twice a 6F device's diameter, so nothing tunnels.
-THICKNESS = 4e-3
-# Height of a chord over the lumen surface, m; half of it stands in the lumen.
-TOLERANCE = 0.35e-3
-# Radius of the hole in the inlet cap, m: closes on a sheath of 2 mm radius.
-INLET_HOLE_RADIUS = 1.5e-3
-_LONGEST_SLAB = 25e-3
-_FEWEST_SECTORS = 7
+# Radius of the hole in the inlet cap, m. The front of the introducer sheath covers
+# it; its rim stays clear of the device, which the bore of the sheath guides.
+INLET_HOLE_RADIUS = 2.5e-3
 # A branch has sectors enough for this share of its radius at the flared start.
 _START_SHARE = 0.85
 # A run of slabs may form one piece while the vessel bends less than this, rad.
@@ -40,160 +41,6 @@ _NEAR_PARENT = 2.0
 # slit they would fill, and MuJoCo rejects meshes without volume.
 _THINNEST = 0.02e-3
 _SMALLEST = 1e-12
-
-
-@dataclass(frozen=True, eq=False)
-class Tube:
-    """Polyhedral tube: `inner` and `outer` corners (rings, sectors, 3), metres."""
-
-    arc_length: Array
-    centres: Array
-    tangents: Array
-    inner: Array
-    outer: Array
-
-    @cached_property
-    def faces(self) -> tuple[Array, Array]:
-        """Outward unit normals (slabs, sectors, 3) and offsets of the faces."""
-        corners = self.face_corners(self.inner)
-        a, b, c, d = (corners[..., i, :] for i in range(4))
-        normal = np.cross(d - a, c - b)
-        normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
-        middle = 0.5 * (self.centres[:-1] + self.centres[1:])
-        outward = corners.mean(axis=-2) - middle[:, None]
-        normal *= np.sign(np.einsum("skj,skj->sk", normal, outward))[..., None]
-        # A slightly warped face: the highest corner keeps the wall outside.
-        return normal, np.einsum("skj,skcj->skc", normal, corners).max(axis=-1)
-
-    @staticmethod
-    def face_corners(rings: Array) -> Array:
-        """Corners (slabs, sectors, 4, 3) between neighbouring rings and sectors."""
-        ahead = np.roll(rings, -1, axis=1)
-        return np.stack([rings[:-1], ahead[:-1], rings[1:], ahead[1:]], axis=2)
-
-    @cached_property
-    def reach(self) -> float:
-        """Largest distance (m) of a lumen corner from its ring's centre."""
-        return float(np.linalg.norm(self.inner - self.centres[:, None], axis=-1).max())
-
-    @cached_property
-    def line(self) -> Centreline:
-        """Centres of the rings as a polyline; radii are the mean corner distances."""
-        radii = np.linalg.norm(self.inner - self.centres[:, None], axis=-1)
-        return Centreline(self.centres, radii.mean(axis=1))
-
-
-def _frames(tangents: Array) -> tuple[Array, Array]:
-    """Rotation-minimising normals u, v (n, 3) along unit tangents (n, 3)."""
-    axis = np.zeros(3)
-    axis[np.abs(tangents[0]).argmin()] = 1.0
-    u = np.empty_like(tangents)
-    u[0] = np.cross(tangents[0], axis)
-    u[0] /= np.linalg.norm(u[0])
-    for i in range(1, len(tangents)):
-        u[i] = u[i - 1] - (u[i - 1] @ tangents[i]) * tangents[i]
-        u[i] /= np.linalg.norm(u[i])
-    return u, np.cross(tangents, u)
-
-
-@dataclass(frozen=True, eq=False)
-class _Shape:
-    """Differential geometry of a centreline at its points."""
-
-    line: Centreline
-    tangents: Array
-    bend: Array  # (n, 3) curvature vector c'', 1/m
-    flare: Array  # (n,) r'', 1/m
-
-    @classmethod
-    def of(cls, line: Centreline) -> _Shape:
-        s = line.arc_length
-        segments = np.diff(line.points, axis=0)
-        segments /= np.linalg.norm(segments, axis=1)[:, None]
-        tangents = np.concatenate(
-            [segments[:1], segments[:-1] + segments[1:], segments[-1:]]
-        )
-        tangents /= np.linalg.norm(tangents, axis=1)[:, None]
-        edge_order = 2 if len(s) > 2 else 1
-        bend = np.gradient(tangents, s, axis=0, edge_order=1)
-        slope = np.gradient(line.radii, s, edge_order=edge_order)
-        return cls(line, tangents, bend, np.gradient(slope, s, edge_order=1))
-
-    def at(self, s: Array, values: Array) -> Array:
-        arc = self.line.arc_length
-        if values.ndim == 1:
-            return np.interp(s, arc, values)
-        return np.stack([np.interp(s, arc, values[:, i]) for i in range(3)], axis=1)
-
-    def ring_positions(self, start: float, tolerance: float) -> Array:
-        """Arc lengths from `start` to the end, chords within `tolerance`."""
-        r = self.line.radii
-        curvature = np.linalg.norm(self.bend, axis=1)
-        # On the outer side of a bend the surface is longer by 1 + r/R.
-        surface = curvature * (1.0 + r * curvature) + np.abs(self.flare)
-        density = np.maximum(np.sqrt(surface / (8.0 * tolerance)), 1.0 / _LONGEST_SLAB)
-        s = self.line.arc_length
-        steps = 0.5 * (density[1:] + density[:-1]) * np.diff(s)
-        count = np.concatenate([[0.0], np.cumsum(steps)])
-        first = float(np.interp(start, s, count))
-        slabs = max(1, math.ceil(count[-1] - first - 1e-9))
-        positions = np.interp(np.linspace(first, count[-1], slabs + 1), count, s)
-        positions[0], positions[-1] = start, s[-1]
-        return positions
-
-
-def polyhedral_tube(
-    line: Centreline,
-    *,
-    start: float = 0.0,
-    radius: float | None = None,
-    tolerance: float = TOLERANCE,
-    thickness: float = THICKNESS,
-) -> Tube:
-    """Tube around `line` from arc length `start` (m) to its end.
-
-    Args:
-        line: centreline with lumen radii.
-        start: first ring.
-        radius: lumen radius (m) that decides the number of sectors; the largest
-            of the line if None.
-        tolerance: height (m) of a chord over the surface, along and around.
-        thickness: distance (m) from the lumen to the outside of the wall; less on
-            the inner side of a bend, where ring planes would cross.
-    """
-    shape = _Shape.of(line)
-    s = shape.ring_positions(start, tolerance)
-    if radius is None:
-        radius = float(line.radii.max())
-    sectors = math.ceil(2.0 * math.pi * radius / math.sqrt(8.0 * radius * tolerance))
-    sectors = max(sectors, _FEWEST_SECTORS)
-    centres, radii, _ = line.at(s)
-    tangents = shape.at(s, shape.tangents)
-    tangents /= np.linalg.norm(tangents, axis=1)[:, None]
-    u, v = _frames(tangents)
-    angle = 2.0 * math.pi * np.arange(sectors) / sectors
-    spokes = (
-        np.cos(angle)[:, None] * u[:, None] + np.sin(angle)[:, None] * v[:, None]
-    )
-    # Half of each chord's height in, half out: around ...
-    ring = 2.0 * radii / (1.0 + math.cos(math.pi / sectors))
-    # ... and along: positive where the lumen bulges, so the corners move out.
-    towards = np.einsum("rkj,rj->rk", spokes, shape.at(s, shape.bend))
-    bulge = -towards * (1.0 - radii[:, None] * towards)
-    bulge -= shape.at(s, shape.flare)[:, None]
-    spacing = np.gradient(s) if len(s) > 2 else np.full(len(s), s[-1] - s[0])
-    lift = np.clip(bulge * spacing[:, None] ** 2 / 16.0, -tolerance / 2, tolerance / 2)
-    inner = ring[:, None] + lift
-    # Ring planes cross at distance 1/|c''| on the inner side: stay short of it.
-    limit = np.where(towards > 0.0, 0.9 / np.maximum(towards, 1e-9), np.inf)
-    outer = inner + np.clip(limit - inner, 0.25e-3, thickness)
-    return Tube(
-        s,
-        centres,
-        tangents,
-        centres[:, None] + inner[..., None] * spokes,
-        centres[:, None] + outer[..., None] * spokes,
-    )
 
 
 def _convex_run(tube: Tube) -> int:
@@ -217,9 +64,11 @@ def _hulls(tube: Tube, first: int) -> list[list[Array]]:
     for k in range(sectors):
         column = []
         if first > 1:
-            rings = tube.inner[: first + 1, [k, (k + 1) % sectors]].reshape(-1, 3)
+            pair = [k, (k + 1) % sectors]
+            near, far = widened(*np.moveaxis(tube.inner[: first + 1, pair], 1, 0))
+            rings = np.concatenate([near, far])
             # The outside of the last ring, carried back along the straight axis.
-            last = tube.outer[first, [k, (k + 1) % sectors]]
+            last = np.stack(widened(*tube.outer[first, pair]))
             shift = tube.centres[0] - tube.centres[first]
             column.append(np.concatenate([rings, last, last + shift]))
         for j in range(first if first > 1 else 0, len(tube.centres) - 1):
@@ -350,7 +199,7 @@ def _ring_inside(line: Centreline, ostium: float, parent: Centreline) -> float:
     """Largest arc length up to `ostium` whose whole ring lies in the parent."""
     s = np.linspace(0.0, ostium, 65)
     place = line.at(s)
-    u, v = _frames(place.tangent)
+    u, v = frames(place.tangent)
     angle = np.linspace(0.0, 2.0 * math.pi, 17)[:-1]
     spokes = np.cos(angle)[:, None] * u[:, None] + np.sin(angle)[:, None] * v[:, None]
     rings = place.position[:, None] + 1.05 * place.radius[:, None, None] * spokes
@@ -362,7 +211,7 @@ def _ring_inside(line: Centreline, ostium: float, parent: Centreline) -> float:
 
 def _cap(end: End, thickness: float) -> list[Array]:
     """Disc that closes a flat end, or a ring of sectors around the inlet's hole."""
-    u, v = (frame[0] for frame in _frames(end.direction[None]))
+    u, v = (frame[0] for frame in frames(end.direction[None]))
     sectors = 12
     angle = 2.0 * math.pi * np.arange(sectors) / sectors
     spokes = np.cos(angle)[:, None] * u + np.sin(angle)[:, None] * v
