@@ -7,13 +7,17 @@ from cathsim_dmc.anatomy import phantom as anatomy_phantom
 
 # Lubricated silicone, Coulomb.
 FRICTION = 0.037
-# Contacts of the device with wall and sheath. MuJoCo raises the time constant to two
-# steps. The impedance starts low on purpose: the device then rests some 0.1 mm deep
-# under its usual load, more than a facet moves in a step, and never loses and hits the
-# wall anew; with a hard start (0.95) lost contacts gave jumps of 1.8 mm and peaks of
-# 1.3 N where now 0.1 N is the largest.
-CONTACT_SOLREF = (0.008, 1.0)
-CONTACT_SOLIMP = (0.6, 0.97, 0.0003, 0.5, 2)
+# Contacts of the device with wall and sheath. A critically damped return within
+# 3 ms, given directly as stiffness 1/t² and damping 2/t: the standard form would be
+# slowed down to two steps, which the implicit "discrete" integrator does not need.
+_CONTACT_TIME = 0.003  # s
+CONTACT_SOLREF = (-1 / _CONTACT_TIME**2, -2 / _CONTACT_TIME)
+# The impedance starts low and then rises like a barrier. Low, so that a device rests
+# some 0.1 mm deep under its usual load, more than it moves on the facets in a step: a
+# hard start (0.95) loses contact and hits the wall anew, with jumps of 1.8 mm and
+# peaks above 1 N. A barrier, so that a full push does not sink in: an impedance that
+# stops rising at 0.97 let 0.2 N push the tip 3 mm deep.
+CONTACT_SOLIMP = (0.7, 0.999, 0.0003, 0.5, 1)
 
 # Contacts that the wall sensor can report; the most seen in the soak is below 50.
 MAX_CONTACTS = 64

@@ -3,7 +3,9 @@
 from dm_control import composer, mjcf
 
 CLEARANCE = 0.35e-3  # m between the device and each side of the bore
-_WALL = 8e-3  # m; thick, so that a loaded shaft cannot tunnel through it
+# Thickness of the sides, m: their front covers the hole in the cap of the inlet, and
+# a loaded shaft cannot tunnel through them.
+_WALL = 8e-3
 _VISIBLE_WALL = 0.4e-3  # m, as drawn
 _COLOUR = (0.35, 0.45, 0.6, 0.35)
 
