@@ -14,6 +14,8 @@ from tensordict import TensorDict
 from cathsim_dmc.agents import ConfigError, evaluate, make_config, train
 from cathsim_dmc.agents.checkpoint import Checkpoint, checkpoints_in
 from cathsim_dmc.agents.metrics import MetricsFile, read_metrics
+from cathsim_dmc.agents.networks import Signature
+from cathsim_dmc.agents.sac import SAC
 from cathsim_dmc.agents.training import _excuse_divergence
 
 CLOCKS = ("seconds", "frames_per_second")
@@ -52,7 +54,7 @@ def small_sac(**changes):
             "initial_alpha": 0.1,
             "total_frames": 1_024,
             "metrics_frames": 256,
-            "checkpoint_frames": 512,
+            "checkpoint_frames": 256,
             "normalisation_frames": 256,
             **changes,
         },
@@ -74,6 +76,37 @@ def test_ppo_learns_to_reach(tmp_path):
     assert rewards[-1] > rewards[1] + 15
 
 
+def test_sac_learns_the_best_action_of_each_state(tmp_path):
+    torch.manual_seed(0)
+    config = small_sac(
+        learning_rate=1e-2, gamma=0.5, tau=0.05, updates_per_frame=0.1,
+        initial_alpha=0.01, target_entropy=-4.0,
+    )  # fmt: skip
+    learner = SAC(config, Signature(1, None, 1), tmp_path)
+    state = torch.rand(1, 2_500, 1) * 2 - 1
+    action = torch.rand(1, 2_500, 1) * 2 - 1
+    ended = torch.ones(1, 2_500, 1, dtype=torch.bool)
+    experience = TensorDict(
+        {
+            "observation_vector": state,
+            "action": action,
+            "next": {
+                "observation_vector": state.clone(),
+                "reward": -(action - 0.5 * state.sign()).square(),
+                "done": ended,
+                "terminated": ended.clone(),
+            },
+        },
+        [1, 2_500],
+    )
+    losses = learner.update(experience, 0.0)
+    assert losses["gradient_steps"] == 250
+    asked = TensorDict({"observation_vector": torch.tensor([[-0.6], [0.6]])}, [2])
+    chosen = learner.policy(asked)["action"].flatten()
+    torch.testing.assert_close(chosen, torch.tensor([-0.5, 0.5]), atol=0.15, rtol=0)
+
+
+@pytest.mark.slow
 def test_sac_learns_to_reach(tmp_path):
     config = small_sac(
         total_frames=4_096, num_envs=8, gamma=0.9, learning_rate=3e-3,

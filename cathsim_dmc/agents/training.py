@@ -194,6 +194,8 @@ def train(
             losses = learner.update(batch, min(before / config.total_frames, 1.0))
             _require_finite(losses, frames, saved)
 
+            step_reward = float(batch["next", "reward"].mean())
+
             last = frames >= config.total_frames or interruption.requested
             if last or _crossed(before, frames, config.metrics_frames):
                 elapsed = time.monotonic() - began
@@ -203,12 +205,12 @@ def train(
                     "frames_per_second": (frames - first_frames) / elapsed,
                     "episodes": episodes,
                     **_episode_means(window),
-                    "step_reward": float(batch["next", "reward"].mean()),
+                    "step_reward": step_reward,
                     **losses,
                 }
                 table.append(row)
                 board.add(row)
-            bar.update(frames, _episode_means(window))
+            bar.update(frames, {"step_reward": step_reward, **_episode_means(window)})
             if last or _crossed(before, frames, config.checkpoint_frames):
                 saved = save()
         if saved is None:
