@@ -211,10 +211,10 @@ def train(
                 table.append(row)
                 board.add(row)
             bar.update(frames, {"step_reward": step_reward, **_episode_means(window)})
-            if last or _crossed(before, frames, config.checkpoint_frames):
+            if _crossed(before, frames, config.checkpoint_frames):
                 saved = save()
-        if saved is None:
-            saved = save()
+        # However the loop ended; writes nothing if the last batch has just been saved.
+        saved = save()
         return TrainingResult(
             run=run,
             checkpoint=saved,
