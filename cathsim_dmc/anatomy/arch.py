@@ -168,7 +168,7 @@ TYPE_II = ArchParameters(
 )
 TYPE_III = replace(TYPE_II, bca_drop=2.5)
 BOVINE = replace(
-    TYPE_II, bca_drop=1.0, bca_lcca_spacing=10e-3, lcca_lsa_spacing=22e-3, bovine=True
+    TYPE_II, bca_drop=1.0, bca_lcca_spacing=10e-3, lcca_lsa_spacing=30e-3, bovine=True
 )
 ARCHES: Mapping[str, ArchParameters] = MappingProxyType(
     {"type1": TYPE_I, "type2": TYPE_II, "type3": TYPE_III, "bovine": BOVINE}
@@ -290,12 +290,12 @@ def _draw(
         "lcca_lsa_spacing": max(14.3e-3, radii["lcca"] + radii["lsa"] + wall),
     }
     if bovine:
-        # The LSA stays where it would be; a common trunk is 8 to 15 mm long.
-        trunk = uniform(8e-3, 15e-3)
-        spacings["lcca_lsa_spacing"] = max(
-            sum(spacings.values()) - 0.5 * trunk, radii["bca"] + radii["lsa"] + wall
-        )
-        spacings["bca_lcca_spacing"] = trunk
+        # The LSA stays where it would be; a common trunk is 8 to 15 mm long (an
+        # assumption).
+        spacings = {
+            "bca_lcca_spacing": uniform(8e-3, 15e-3),
+            "lcca_lsa_spacing": sum(spacings.values()),
+        }
     return ArchParameters(
         **branches,
         **aorta,

@@ -76,8 +76,9 @@ class ArchParameters:
         bca, lcca, lsa: the branches.
         fillet: by how much the radius of a branch grows at its ostium, at most.
         descending_goal_depth: distance of the goal "descending" from the cap.
-        bovine: the LCCA leaves the BCA `bca_lcca_spacing` above the BCA's ostium
-            (measured along the BCA) instead of leaving the arch.
+        bovine: the LCCA leaves the BCA, `bca_lcca_spacing` above the BCA's ostium
+            along the BCA, instead of leaving the arch; `lcca_lsa_spacing` is then
+            from the BCA to the LSA.
     """
 
     bca: BranchParameters
@@ -135,7 +136,8 @@ class ArchParameters:
                 f"must be at least 1.25 times the widest lumen radius ({widest:g} m). "
                 "Enlarge arch_radius and arch_height or bring them closer together."
             )
-        pairs = [("lcca_lsa_spacing", self.lcca, self.lsa)]
+        before_lsa = self.bca if self.bovine else self.lcca
+        pairs = [("lcca_lsa_spacing", before_lsa, self.lsa)]
         if not self.bovine:
             pairs.append(("bca_lcca_spacing", self.bca, self.lcca))
         for name, first, second in pairs:

@@ -128,8 +128,13 @@ def _outer_curve(p: ArchParameters) -> tuple[Array, Array, Array, dict[str, floa
         summit = outer[:, 1].argmax()
         height = outer[summit, 1] - p.bca_drop * 2.0 * p.lcca.radius
         bca = np.interp(height, outer[: summit + 1, 1], arc[: summit + 1])
-        lcca = bca + (0.5 * p.bca_lcca_spacing if p.bovine else p.bca_lcca_spacing)
-        lsa = lcca + p.lcca_lsa_spacing
+        if p.bovine:
+            # No LCCA ostium: its level of the aorta is half-way to the LSA.
+            lsa = bca + p.lcca_lsa_spacing
+            lcca = 0.5 * (bca + lsa)
+        else:
+            lcca = bca + p.bca_lcca_spacing
+            lsa = lcca + p.lcca_lsa_spacing
         levels = {
             name: float(np.interp(place, arc, s))
             for name, place in (("bca", bca), ("lcca", lcca), ("lsa", lsa))
@@ -178,7 +183,9 @@ def _branch(
         )
     sag = parent_radius - math.sqrt(parent_radius**2 - wide**2)
     reach = wide * math.tan(tilt)
-    flare_start = max(exit_length - sag - reach, 0.1 * exit_length)
+    # A bent parent needs more than this estimate for a straight one.
+    inwards = 1.25 * (sag + reach) + 1e-3
+    flare_start = max(exit_length - inwards, 0.1 * exit_length)
     flare_end = exit_length + 2.0 * fillet + p.radius * math.tan(tilt)
     bend_start = flare_end + 6e-3
     length = exit_length + p.length
@@ -232,7 +239,9 @@ def arch_tree(params: ArchParameters) -> VesselTree:
         "bca": math.inf
         if params.bovine
         else params.bca_lcca_spacing - params.bca.radius - params.lcca.radius,
-        "lsa": params.lcca_lsa_spacing - params.lcca.radius - params.lsa.radius,
+        "lsa": params.lcca_lsa_spacing
+        - (params.bca if params.bovine else params.lcca).radius
+        - params.lsa.radius,
     }
     septa["lcca"] = min(septa.values())
     s = aorta.centreline.arc_length
