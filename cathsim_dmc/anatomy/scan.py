@@ -22,7 +22,12 @@ from cathsim_dmc.anatomy.scan_files import (
     read_mesh,
 )
 from cathsim_dmc.anatomy.scan_tree import Ways, grow_tree, plan_inlet
-from cathsim_dmc.anatomy.scan_wall import DEVICE_RADIUS, TOLERANCE, build_wall
+from cathsim_dmc.anatomy.scan_wall import (
+    DEVICE_RADIUS,
+    TOLERANCE,
+    build_wall,
+    inlet_cap,
+)
 
 log = logging.getLogger(__name__)
 
@@ -112,6 +117,7 @@ def import_scan(
     wall, _ = build_wall(
         cut_vertices, shell, field, centres, tolerance=tolerance, progress=say
     )
+    wall += tuple(inlet_cap(cut_vertices[cap[:, :2]], opening))
     anatomy = Anatomy(
         name=name or Path(mesh_path).stem,
         tree=tree,

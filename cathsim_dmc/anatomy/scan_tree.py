@@ -28,6 +28,8 @@ WIDE = 0.4  # of the widest free end: narrower ends are no inlet by default
 ROOT_WIDTH = 0.5  # of the inlet: narrower free ends do not continue the root
 SMOOTH = 0.6  # radii, standard deviation of the smoothing along a centreline
 NARROW = 1.5e-3  # m, radius below which smoothing would cut bends
+TAIL = 15e-3  # m, end of a centreline that is cut off where it is too narrow
+TAIL_RADIUS = 1.1e-3  # m, of a 6 Fr device (1.0 mm) and a tenth to spare
 END_TRIM = 8e-3  # m, most that is cut off where a curve runs into its end
 END_SEARCH = 15e-3  # m from a blind end in which its width is looked for
 MIN_RADIUS = 0.1e-3  # m, floor of a centreline's radius where it scrapes the wall
@@ -364,9 +366,11 @@ def _finish(
     curve = curve[: len(curve) - last + wide + 1]
     points = centred(field, curve, fixed_start=anchor is not None)
     depth = field(points)
-    # Points beyond the lumen's end are of no use to a device.
-    inside = np.nonzero(depth > MIN_RADIUS)[0]
-    points, depth = points[: inside[-1] + 1], depth[: inside[-1] + 1]
+    # A tail that no device can follow is cut off; a stenosis farther up is kept.
+    tail = max(2, len(points) - int(TAIL / STEP))
+    narrow = np.nonzero(depth[tail:] < TAIL_RADIUS)[0]
+    if narrow.size:
+        points, depth = points[: tail + narrow[0]], depth[: tail + narrow[0]]
     return Centreline(points, np.maximum(depth, MIN_RADIUS))
 
 

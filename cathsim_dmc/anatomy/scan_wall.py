@@ -19,16 +19,19 @@ import numpy as np
 from scipy.spatial import ConvexHull, QhullError, cKDTree
 
 from cathsim_dmc.anatomy.depth import DepthField
+from cathsim_dmc.anatomy.phantom import Inlet
+from cathsim_dmc.anatomy.wall import INLET_HOLE_RADIUS
 
 THICKNESS = 4e-3  # m, of the wall where no other lumen is near
 THINNEST = 0.3e-3  # m, of the wall between two lumens
-TOLERANCE = 0.8e-3  # m, largest chord inside the lumen before moving outwards
-CHORD = 0.45e-3  # m, largest chord after it; pieces above are split again
+TOLERANCE = 0.65e-3  # m, largest chord inside the lumen before moving outwards
+CHORD = 0.4e-3  # m, largest chord after it; pieces above are split again
 MOVE = 0.3e-3  # m, largest outward movement of a vertex
 FLAT = 0.02e-3  # m, triangles this close to one plane merge without asking
 EXTENT = 40e-3  # m, largest piece; longer ones slow the broad phase
 DEVICE_RADIUS = 0.84e-3  # m, 5 Fr catheter (1 Fr = 1/3 mm diameter)
 CLEARANCE = 0.1e-3  # m, kept between that device on the centreline and a merged hull
+CAP_OVERLAP = 2e-3  # m, of the inlet's cap under the wall around it
 CAPS = (1.0, 0.5, 0.25, 0.1)  # shares of the thickness tried for a lone triangle
 _ORDER = 6  # subdivision of a hull's triangles where its depth is sampled
 
@@ -237,6 +240,32 @@ class _Builder:
             points = self.corners(every, piece.cap)
             hulls.append(points[ConvexHull(points).vertices])
         return tuple(hulls)
+
+
+def inlet_cap(
+    border: np.ndarray, inlet: Inlet, thickness: float = THICKNESS
+) -> list[np.ndarray]:
+    """Convex sectors that close the cut at the inlet but for the sheath's hole.
+
+    Args:
+        border: (n, 2, 3) m, edges of the cut through the lumen.
+        inlet: the plane of the cut and the middle of the hole.
+        thickness: m, of the cap, which lies behind the plane.
+    """
+    # A chord between two spokes cuts into the hole less than this at 12 sectors.
+    hole = INLET_HOLE_RADIUS / np.cos(np.pi / 12)
+    spokes = border - inlet.position
+    reach = np.linalg.norm(spokes, axis=-1, keepdims=True)
+    spokes = spokes / np.maximum(reach, 1e-9)
+    sectors = []
+    for spoke, far in zip(spokes, reach, strict=True):
+        if far.max() <= hole:
+            continue
+        face = inlet.position + np.concatenate(
+            [hole * spoke, np.maximum(far, hole) * spoke + CAP_OVERLAP * spoke]
+        )
+        sectors.append(np.concatenate([face, face - thickness * inlet.direction]))
+    return sectors
 
 
 def outward_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
