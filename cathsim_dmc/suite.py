@@ -72,7 +72,7 @@ def navigate(
       **options: fields of `tasks.navigation.NavigationConfig`.
     """
     return _environment(
-        _anatomy(phantom), goal, random, environment_kwargs or {}, options
+        load_anatomy(phantom), goal, random, environment_kwargs or {}, options
     )
 
 
@@ -114,7 +114,7 @@ def load(
     )
 
 
-def _anatomy(phantom) -> anatomies.Anatomy:
+def load_anatomy(phantom) -> anatomies.Anatomy:
     if isinstance(phantom, anatomies.Anatomy):
         return phantom
     from cathsim_dmc.anatomy import arch
@@ -130,7 +130,7 @@ def _anatomy(phantom) -> anatomies.Anatomy:
 
 
 def _arch_environment(name, goal, random, environment_kwargs, options):
-    return _environment(_anatomy(name), goal, random, environment_kwargs or {}, options)
+    return _environment(load_anatomy(name), goal, random, environment_kwargs or {}, options)
 
 
 def _environment(anatomy, goal, random, environment_kwargs, options):

@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 import torch
 from tensordict import TensorDictBase
-from torchrl.envs.utils import ExplorationType, set_exploration_type
+from torchrl.envs import EnvBase
+from torchrl.envs.utils import ExplorationType, set_exploration_type, step_mdp
 
 from cathsim_dmc.agents import environments
 from cathsim_dmc.agents.checkpoint import Checkpoint
@@ -18,6 +19,8 @@ from cathsim_dmc.agents.episodes import EpisodeOutcome, EpisodeTracker
 from cathsim_dmc.agents.training import EnvFactory
 
 Policy = Callable[[TensorDictBase], TensorDictBase | torch.Tensor]
+# Called after every step with the environment and which episodes (n,) bool still run.
+Observer = Callable[[EnvBase, np.ndarray], None]
 
 # Two-sided 95 % quantile of the normal distribution.
 Z95 = 1.959963984540054
@@ -214,6 +217,7 @@ def evaluate(
     path: str = "batched",
     num_threads: int | None = None,
     out_dir: str | Path | None = None,
+    observer: Observer | None = None,
     make_env: EnvFactory = environments.make_env,
 ) -> EvaluationResult:
     """Play episodes with a policy, each with a seed of its own, all side by side.
@@ -236,6 +240,7 @@ def evaluate(
         path: "batched" or "composer".
         num_threads: of the batched simulation.
         out_dir: write evaluation.json there.
+        observer: called after every step, before any environment is reset.
         make_env: see `environments.make_env`.
 
     Raises:
@@ -281,7 +286,7 @@ def evaluate(
         act = policy
         name = name or getattr(policy, "__name__", type(policy).__name__)
     try:
-        outcomes = _first_episodes(env, act)
+        outcomes = _first_episodes(env, act, observer)
     finally:
         env.close()
     result = EvaluationResult(task, name, seed, outcomes, settings)
@@ -291,7 +296,9 @@ def evaluate(
 
 
 @torch.no_grad()
-def _first_episodes(env: Any, act: Policy) -> tuple[EpisodeOutcome, ...]:
+def _first_episodes(
+    env: EnvBase, act: Policy, observer: Observer | None
+) -> tuple[EpisodeOutcome, ...]:
     (count,) = env.batch_size
     tracker = EpisodeTracker(count)
     outcomes: dict[int, EpisodeOutcome] = {}
@@ -301,9 +308,13 @@ def _first_episodes(env: Any, act: Policy) -> tuple[EpisodeOutcome, ...]:
             answer = act(current)
             action = answer if isinstance(answer, torch.Tensor) else answer["action"]
             current["action"] = action.to(torch.float32)
-            stepped, current = env.step_and_maybe_reset(current)
+            stepped = env.step(current)
+            if observer is not None:
+                running = np.array([index not in outcomes for index in range(count)])
+                observer(env, running)
             for outcome in tracker.add(stepped.unsqueeze(1)):
                 outcomes.setdefault(outcome.env, outcome)
+            current = env.maybe_reset(step_mdp(stepped))
     return tuple(outcomes[env_index] for env_index in range(count))
 
 

@@ -131,18 +131,34 @@ def heatmap(
     episodes = list(episodes)
     if not episodes:
         raise ValueError("a heatmap needs at least one episode")
+    position = np.concatenate([e.contact_position for e in episodes])
+    force = np.concatenate([magnitude(e.contact_force) for e in episodes])
+    if title is None:
+        tasks = ", ".join(sorted({e.task for e in episodes}))
+        title = f"{tasks}\nepisodes {len(episodes)}, contacts {len(force)}"
+    return contact_heatmap(
+        position, force, surface, path, cell=cell, force_limit=force_limit, title=title
+    )
+
+
+def contact_heatmap(
+    position: np.ndarray,
+    force: np.ndarray,
+    surface: Any,
+    path: str | os.PathLike[str],
+    *,
+    cell: float = CELL,
+    force_limit: float | None = None,
+    title: str = "",
+) -> ForceMap:
+    """Draw the mean of contact forces (K,) in N at positions (K, 3), see `heatmap`."""
     if force_limit is not None and not force_limit > 0:
         raise ValueError(f"force_limit must be positive, got {force_limit}")
     vertices, faces = surface_arrays(surface)
     outline = vertices[:, AP_AXES]
-    position = np.concatenate([e.contact_position for e in episodes])
-    force = np.concatenate([magnitude(e.contact_force) for e in episodes])
     field = force_map(
         position, force, outline.min(0) - MARGIN, outline.max(0) + MARGIN, cell
     )
-    if title is None:
-        tasks = ", ".join(sorted({e.task for e in episodes}))
-        title = f"{tasks}\nepisodes {len(episodes)}, contacts {len(force)}"
     figure = _figure(field, outline, faces, force_limit, title)
     with atomic_path(path, SUFFIX) as temporary:
         figure.savefig(temporary, format="png", dpi=_DPI)
