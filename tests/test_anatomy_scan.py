@@ -131,12 +131,16 @@ def figures(anatomy: Anatomy, count: int = 4000):
 
 
 def gap_to_wall(anatomy: Anatomy, points) -> float:
-    """Lower bound (m) of the distance from points (n, 3) to the nearest piece."""
+    """Distance (m) from points (n, 3) to the nearest piece, negative in one."""
+    import trimesh
+
     nearest = np.inf
     for piece in anatomy.wall:
-        planes = ConvexHull(piece).equations
-        values = points @ planes[:, :3].T + planes[:, 3]
-        nearest = min(nearest, float(values.max(axis=1).min()))
+        near = np.linalg.norm(points - piece.mean(0), axis=1) < 30e-3
+        if near.any():
+            hull = trimesh.convex.convex_hull(piece)
+            depth = MeshDepth(np.asarray(hull.vertices), np.asarray(hull.faces))
+            nearest = min(nearest, float(-depth(points[near]).max()))
     return nearest
 
 

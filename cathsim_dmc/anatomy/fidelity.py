@@ -192,7 +192,7 @@ def mesh_samples(anatomy: Anatomy, spacing: float, *, seed: int = 0) -> SurfaceS
                 way = (points - end.position) @ end.direction
                 way /= outward @ end.direction
             near &= way > 0.0
-            radii[near] = np.minimum(radii[near], way[near])
+            radii[near] = np.minimum(radii[near], way[near] - 1e-5)
     return SurfaceSamples(points, outward, np.maximum(radii, 0.0))
 
 
