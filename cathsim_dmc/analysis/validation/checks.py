@@ -1,0 +1,159 @@
+"""Checks: a measured figure, the bound it must keep, and reports of many of them."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+
+@dataclasses.dataclass(frozen=True)
+class Check:
+    """One figure against its bound.
+
+    Attributes:
+        name: what was measured, unique in its report.
+        value: the figure, in `unit`.
+        unit: such as "%" or "mm"; "" for a pure number.
+        bound: the bound as text, such as "<= 2".
+        passed: whether the value keeps the bound.
+        note: the quantities behind the figure, for the reader of the table.
+    """
+
+    name: str
+    value: float
+    unit: str
+    bound: str
+    passed: bool
+    note: str = ""
+
+    @classmethod
+    def at_most(
+        cls, name: str, value: float, bound: float, unit: str, note: str = ""
+    ) -> Check:
+        """A check of value <= bound; a value that is no number fails."""
+        value = float(value)
+        return cls(name, value, unit, f"<= {bound:g}", bool(value <= bound), note)
+
+    @classmethod
+    def at_least(
+        cls, name: str, value: float, bound: float, unit: str, note: str = ""
+    ) -> Check:
+        """A check of value >= bound; a value that is no number fails."""
+        value = float(value)
+        return cls(name, value, unit, f">= {bound:g}", bool(value >= bound), note)
+
+    @classmethod
+    def deviation(
+        cls,
+        name: str,
+        measured: float,
+        expected: float,
+        percent: float,
+        note: str = "",
+    ) -> Check:
+        """A check that |measured / expected - 1| is at most `percent` %.
+
+        Raises:
+            ValueError: if the expected quantity is zero or no number.
+        """
+        if not (math.isfinite(expected) and expected != 0):
+            raise ValueError(
+                f"check {name!r} expects {expected!r}; a relative deviation needs a "
+                "finite quantity other than 0"
+            )
+        return cls.at_most(
+            name, 100 * abs(measured / expected - 1), percent, "%", note
+        )
+
+
+@dataclasses.dataclass(frozen=True)
+class Report:
+    """What one validation measured.
+
+    Attributes:
+        title: of the validation.
+        checks: figures with a bound.
+        findings: figures without one, plain values that JSON can hold.
+    """
+
+    title: str
+    checks: Sequence[Check]
+    findings: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+
+    def __post_init__(self):
+        names = [check.name for check in self.checks]
+        twice = sorted({name for name in names if names.count(name) > 1})
+        if twice:
+            raise ValueError(f"report {self.title!r} has two checks named {twice}")
+
+    @property
+    def passed(self) -> bool:
+        """Whether every check passed."""
+        return all(check.passed for check in self.checks)
+
+    @property
+    def failures(self) -> tuple[Check, ...]:
+        """Checks that did not pass."""
+        return tuple(check for check in self.checks if not check.passed)
+
+    def as_dict(self) -> dict[str, Any]:
+        """The object that `--json` prints; numbers that JSON lacks become null."""
+        return _plain(
+            {
+                "checks": [dataclasses.asdict(check) for check in self.checks],
+                "title": self.title,
+                "passed": self.passed,
+                "findings": dict(self.findings),
+            }
+        )
+
+    def table(self):
+        """A `rich.table.Table` of the checks."""
+        from rich.table import Table
+
+        table = Table(title=self.title)
+        table.add_column("check")
+        table.add_column("measured", justify="right")
+        table.add_column("bound", justify="right")
+        table.add_column("")
+        table.add_column("behind it", style="dim")
+        for check in self.checks:
+            table.add_row(
+                check.name,
+                _number(check),
+                f"{check.bound} {check.unit}".rstrip(),
+                "[green]pass[/]" if check.passed else "[bold red]FAIL[/]",
+                check.note,
+            )
+        return table
+
+    def markdown(self) -> str:
+        """The same table in Markdown."""
+        lines = [
+            "| check | measured | bound | | behind it |",
+            "|---|---|---|---|---|",
+        ]
+        lines += [
+            f"| {check.name} | {_number(check)} | {check.bound} {check.unit} | "
+            f"{'pass' if check.passed else '**FAIL**'} | {check.note} |"
+            for check in self.checks
+        ]
+        return "\n".join(lines) + "\n"
+
+
+def _number(check: Check) -> str:
+    return f"{check.value:.3g} {check.unit}".rstrip()
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, Mapping):
+        return {str(key): _plain(each) for key, each in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_plain(each) for each in value]
+    if hasattr(value, "tolist"):
+        return _plain(value.tolist())
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value

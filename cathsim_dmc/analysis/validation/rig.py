@@ -1,0 +1,159 @@
+"""Test rigs: the catheter of the tasks, with their settings, under known loads."""
+
+from __future__ import annotations
+
+import mujoco
+import numpy as np
+from dm_control import mjcf
+
+from cathsim_dmc.entities import devices
+from cathsim_dmc.entities.arena import AngiographyArena
+from cathsim_dmc.entities.catheter import BENDING_RELAXATION_TIME, Catheter
+from cathsim_dmc.entities.phantom import CONTACT_SOLIMP, CONTACT_SOLREF, FRICTION
+from cathsim_dmc.tasks.navigation import PHYSICS_TIMESTEP
+
+# A rig has come to rest when no joint has moved by more than this, rad and m, over
+# one relaxation time of the rod. The constraint solver's tolerance leaves less.
+REST_CHANGE = 1e-6
+
+
+class Rig:
+    """A device alone in the arena of the tasks, along +z, its base at insertion 0.
+
+    Integrator, time step, solver and contact parameters are those of the tasks.
+    Gravity is off; what the default device weighs in blood is nothing anyway.
+
+    Attributes:
+        arena: to which a test adds its own fixtures before `compile`.
+        catheter: with `origin` at the middle of link 0.
+    """
+
+    def __init__(
+        self,
+        device: str | devices.Device = "published",
+        discretisation: devices.Discretisation | None = None,
+        *,
+        stroke: float = 0.1,
+        rotation: bool = False,
+        friction: float = FRICTION,
+        timestep: float = PHYSICS_TIMESTEP,
+    ):
+        self.device = devices.get(device)
+        area = np.pi * self.device.outer_radius**2
+        self.arena = AngiographyArena(self.device.linear_density / area)
+        self.arena.mjcf_model.option.timestep = timestep
+        self.arena.mjcf_model.option.gravity = (0, 0, 0)
+        self.catheter = Catheter(
+            self.device,
+            discretisation,
+            stroke=stroke,
+            rotation=rotation,
+            solref=CONTACT_SOLREF,
+            solimp=CONTACT_SOLIMP,
+            friction=friction,
+        )
+        self.lengths = self.catheter.link_lengths
+        self.arena.attach(self.catheter)
+
+    @property
+    def sections(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Lengths (2,), EI (2,) and GJ (2,) of the free rod, shaft and tip.
+
+        The carriage holds link 0 by its middle: the first joint stands for the rod
+        from there to the middle of link 1.
+        """
+        tip = self.device.tip_length
+        shaft = self.lengths.sum() - tip - self.lengths[0] / 2
+        both = (self.device.shaft, self.device.tip)
+        return (
+            np.array([shaft, tip]),
+            np.array([section.bending_stiffness for section in both]),
+            np.array([section.torsional_stiffness for section in both]),
+        )
+
+    def compile(self) -> None:
+        """Compiles the model; fixtures can no longer be added."""
+        physics = mjcf.Physics.from_mjcf_model(self.arena.mjcf_model)
+        self._physics = physics  # owns model and data
+        self.model = physics.model.ptr
+        self.data = physics.data.ptr
+        self.name = self.catheter.mjcf_model.model
+        self.head = self.model.site(f"{self.name}/head").id
+        self.tip_body = self.model.body(f"{self.name}/link_{len(self.lengths) - 1}").id
+        mujoco.mj_forward(self.model, self.data)
+
+    def qpos(self, joint: str) -> float:
+        """Position of a joint of the catheter, by its name in the entity."""
+        return float(self.data.joint(f"{self.name}/{joint}").qpos[0])
+
+    def sensor(self, name: str) -> np.ndarray:
+        """Reading of a sensor, by its full name."""
+        return self.data.sensor(name).data.copy()
+
+    @property
+    def joints(self) -> np.ndarray:
+        """Places (n, 3) of the proximal ends of the links, m."""
+        return self.data.xpos[self.tip_body + 1 - len(self.lengths) :][
+            : len(self.lengths)
+        ].copy()
+
+    @property
+    def head_position(self) -> np.ndarray:
+        """Place (3,) of the distal end, m."""
+        return self.data.site_xpos[self.head].copy()
+
+    def load_head(self, force=(0.0, 0.0, 0.0), torque=(0.0, 0.0, 0.0)) -> None:
+        """Sets the dead load on the distal end, world frame, N and N·m."""
+        # A force on the body, unlike one on the joints, reaches the force sensors.
+        lever = self.head_position - self.data.xipos[self.tip_body]
+        load = self.data.xfrc_applied[self.tip_body]
+        load[:3] = force
+        load[3:] = np.asarray(torque) + np.cross(lever, force)
+
+    def step(self, force=None, torque=(0.0, 0.0, 0.0)) -> None:
+        """One time step, under a dead load on the distal end if one is given."""
+        if force is not None:
+            self.load_head(force, torque)
+        mujoco.mj_step(self.model, self.data)
+
+    def settle(
+        self,
+        force=None,
+        torque=(0.0, 0.0, 0.0),
+        *,
+        rest_change: float = REST_CHANGE,
+        longest: float = 20.0,
+    ) -> float:
+        """Steps until the device is at rest and returns the time that took, s.
+
+        Args:
+            force: (3,) dead load on the distal end, N; None leaves what is applied.
+            torque: (3,) N·m.
+            rest_change: of every joint over one relaxation time, rad and m.
+            longest: s.
+
+        Raises:
+            RuntimeError: if it is not at rest by then, or the simulation diverges.
+        """
+        count = round(BENDING_RELAXATION_TIME / self.model.opt.timestep)
+        start, change = self.data.time, np.inf
+        while change > rest_change:
+            before = self.data.qpos.copy()
+            for _ in range(count):
+                self.step(force, torque)
+            change = np.abs(self.data.qpos - before).max()
+            if self.data.time - start > longest:
+                raise RuntimeError(
+                    f"after {longest} s a joint still moves by {change:.2g} in "
+                    f"{BENDING_RELAXATION_TIME} s, more than {rest_change:g}; the load "
+                    "is too large or the time too short"
+                )
+        warnings = [
+            mujoco.mjtWarning(kind).name
+            for kind, warning in enumerate(self.data.warning)
+            if warning.number
+        ]
+        if warnings:
+            raise RuntimeError(f"MuJoCo warned of {', '.join(warnings)}")
+        mujoco.mj_forward(self.model, self.data)
+        return float(self.data.time - start)
