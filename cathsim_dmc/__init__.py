@@ -1,8 +1,13 @@
 """Endovascular navigation tasks on dm_control composer and MuJoCo."""
 
 import importlib
+import warnings
 
 __version__ = "0.1.0"
+
+# MuJoCo's window library warns at import on a machine without a screen. Nothing here
+# needs one before a viewer is asked for, which then says so itself.
+warnings.filterwarnings("ignore", message=".*DISPLAY environment variable is missing.*")
 
 _SUBMODULES = (
     "agents",

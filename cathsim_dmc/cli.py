@@ -27,7 +27,9 @@ app.command(benchmarks, name="benchmark", help="Measure speed; results table.")
 def main() -> None:
     """Runs the command line."""
     try:
-        code = app.cli(prog="cathsim", description=__doc__, config=(conf.OmitArgPrefixes,))
+        code = app.cli(
+            prog="cathsim", description=__doc__, config=(conf.OmitArgPrefixes,)
+        )
     except (ValueError, OSError, RuntimeError, ImportError) as error:
         # Errors with a message for the user; anything else is ours, with traceback.
         print(f"cathsim: {type(error).__name__}: {error}", file=sys.stderr)

@@ -114,7 +114,12 @@ def load(
     )
 
 
-def load_anatomy(phantom) -> anatomies.Anatomy:
+def load_anatomy(phantom: "str | Path | anatomies.Anatomy") -> anatomies.Anatomy:
+    """Returns an anatomy: itself, an arch by name, or one saved in a directory.
+
+    Raises:
+      ValueError: if there is none; lists the names.
+    """
     if isinstance(phantom, anatomies.Anatomy):
         return phantom
     from cathsim_dmc.anatomy import arch
@@ -130,7 +135,8 @@ def load_anatomy(phantom) -> anatomies.Anatomy:
 
 
 def _arch_environment(name, goal, random, environment_kwargs, options):
-    return _environment(load_anatomy(name), goal, random, environment_kwargs or {}, options)
+    anatomy = load_anatomy(name)
+    return _environment(anatomy, goal, random, environment_kwargs or {}, options)
 
 
 def _environment(anatomy, goal, random, environment_kwargs, options):

@@ -1,8 +1,10 @@
 """Agents: TorchRL environments, PPO and SAC, training, evaluation, checkpoints."""
 
-# torchrl before anything that loads dm_control: with MUJOCO_GL=egl or osmesa the
-# other order crashes inside triton. (The variable itself is the user's to set.)
-import torchrl  # noqa: F401, I001
+# isort: off
+from cathsim_dmc.agents import import_order  # noqa: F401
+import torchrl  # noqa: F401
+
+# isort: on
 
 from cathsim_dmc.agents.checkpoint import Checkpoint, CheckpointError
 from cathsim_dmc.agents.configs import (

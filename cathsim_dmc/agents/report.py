@@ -51,9 +51,8 @@ class Report:
         from rich.table import Table
 
         table = Table(title=f"{self.policy.task}, seeds from {self.policy.seed}")
-        columns = ("policy", "reward", "length", "mean force N", "max force N", "success")
-        for column in columns:
-            table.add_column(column, no_wrap=True)
+        for column in ("policy", "reward", "steps", "force, N", "peak, N", "success"):
+            table.add_column(column)
         for result in (self.policy, self.baseline):
             if result is not None:
                 table.add_row(result.policy, *_cells(result.summary()))
@@ -63,7 +62,8 @@ class Report:
             low, high = self.comparison.reward_ci95
             console.print(
                 f"reward over {self.comparison.baseline}: "
-                f"{self.comparison.reward_difference:+.1f} (95 % {low:+.1f} to {high:+.1f})"
+                f"{self.comparison.reward_difference:+.1f} "
+                f"(95 % interval {low:+.1f} to {high:+.1f})"
             )
 
 
@@ -81,7 +81,7 @@ def _cells(summary: Mapping[str, Any]) -> list[str]:
         spread("reward", 1),
         spread("length", 0),
         spread("mean_force", 3),
-        spread("max_force", 3),
+        spread("peak_force", 3),
         success,
     ]
 
@@ -272,7 +272,7 @@ def demo(out: str | Path, frames: int, seed: int) -> int:
     _say(f"1/3 training PPO on {config.task}, {frames} frames -> {out}")
     result = training.train(config, out, resume=(out / "config.json").exists())
     if result.interrupted:
-        _say(f"interrupted; `cathsim demo --out {out}` goes on from {result.checkpoint}")
+        _say(f"interrupted at {result.frames} frames; run it again to go on")
         return 1
     _say("2/3 evaluating 30 episodes, and the random policy on the same seeds")
     report = evaluate(out, out_dir=out)

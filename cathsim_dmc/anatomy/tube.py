@@ -98,6 +98,7 @@ class Shape:
 
     @classmethod
     def of(cls, line: Centreline) -> Shape:
+        """Shape of a polyline, by finite differences."""
         s = line.arc_length
         segments = np.diff(line.points, axis=0)
         segments /= np.linalg.norm(segments, axis=1)[:, None]
@@ -111,6 +112,7 @@ class Shape:
         return cls(line, tangents, bend, np.gradient(slope, s, edge_order=1))
 
     def at(self, s: Array, values: Array) -> Array:
+        """Values (n,) or (n, 3) at the points, interpolated at arc lengths `s`."""
         arc = self.line.arc_length
         if values.ndim == 1:
             return np.interp(s, arc, values)

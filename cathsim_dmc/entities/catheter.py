@@ -1,8 +1,8 @@
 """The catheter: a chain of rigid links with the bending stiffness of a real device."""
 
+import numpy as np
 from dm_control import composer, mjcf
 from dm_control.composer.observation import observable
-import numpy as np
 
 from cathsim_dmc.entities import devices
 

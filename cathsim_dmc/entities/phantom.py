@@ -1,7 +1,7 @@
 """The phantom: the wall of an anatomy as convex pieces, its goals and its sensors."""
 
-from dm_control import composer, mjcf
 import numpy as np
+from dm_control import composer, mjcf
 
 from cathsim_dmc.anatomy import phantom as anatomy_phantom
 

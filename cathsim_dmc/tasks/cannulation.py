@@ -40,7 +40,7 @@ class Cannulation:
     """The goal of a task and its reward.
 
     Attributes:
-      goal: (3,), m, world frame.
+      goal: (3,) or, if it differs between simulations, (..., 3), m, world frame.
       branch: centreline of the whole target branch.
       ostium: arc length at which the branch leaves its parent's lumen, m.
       route: centreline from the inlet to the goal.
@@ -49,6 +49,7 @@ class Cannulation:
         (minus the way along the route that is left, and the distance from it).
       success_reward: bonus, weight of the term "success".
       max_steps: control steps until the episode is truncated.
+      goal_arc_length: () or (...), of the goal on the route, m; None for its end.
     """
 
     goal: np.ndarray
@@ -59,6 +60,7 @@ class Cannulation:
     reward: str = "distance"
     success_reward: float = SUCCESS_REWARD
     max_steps: int = MAX_STEPS
+    goal_arc_length: np.ndarray | None = None
 
     def __post_init__(self):
         if self.reward not in REWARDS:
@@ -98,13 +100,32 @@ class Cannulation:
     def path_distance(self, head: np.ndarray) -> np.ndarray:
         """Way (...) along the route to the goal plus distance from the route, m."""
         place = self.route.project(head)
-        return self.route.length - place.arc_length + place.distance
+        if self.goal_arc_length is None:
+            return self.route.length - place.arc_length + place.distance
+        return np.abs(self.goal_arc_length - place.arc_length) + place.distance
+
+    def shifted(self, shift: np.ndarray) -> "Cannulation":
+        """The same task with the goal moved along its branch.
+
+        Args:
+          shift: () or (...), m, positive away from the ostium; the goal stays
+            between the ostium and the end of the branch.
+        """
+        branch = self.branch
+        start = branch.project(self.goal).arc_length
+        stop = np.clip(start + shift, self.ostium, branch.length)
+        moved = branch.at(stop).position - branch.at(start).position
+        goal = self.goal + moved
+        arc_length = self.route.project(goal).arc_length
+        return dataclasses.replace(self, goal=goal, goal_arc_length=arc_length)
 
 
-def start_displacement(random_state: np.random.RandomState) -> np.ndarray:
-    """Random displacement (3,) of the tip at the start: uniform in a ball, m."""
+def start_displacement(
+    random_state: np.random.RandomState, ball: float = START_JITTER
+) -> np.ndarray:
+    """Random displacement (3,) of the tip: uniform in a ball of that radius, m."""
     direction = random_state.normal(size=3)
-    radius = START_JITTER * random_state.uniform() ** (1 / 3)
+    radius = ball * random_state.uniform() ** (1 / 3)
     return radius * direction / np.linalg.norm(direction)
 
 

@@ -182,7 +182,7 @@ class Navigation(composer.Task):
         if self._observables is None:
             keys = self._observation_keys()
             self._observables = {
-                key: observable.Generic(lambda physics, key=key: self._see(physics)[key])
+                key: observable.Generic(lambda physics, k=key: self._see(physics)[k])
                 for key in keys
             }
             for each in self._observables.values():
