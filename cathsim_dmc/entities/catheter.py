@@ -33,6 +33,7 @@ MAX_TORQUE = 0.02  # N·m
 MAX_ROTATION_SPEED = 3.14  # rad/s
 ROTATION_GAIN = 0.01  # N·m·s/rad
 
+_VISIBLE_SHAFT = 0.45  # m of device behind the simulated part, at full insertion
 _COLOUR = (0.85, 0.32, 0.08, 1.0)
 _TIP_COLOUR = (0.95, 0.75, 0.1, 1.0)
 
@@ -123,6 +124,19 @@ class Catheter(composer.Entity):
             )
         self._links.append(base)
         self._add_capsule(base, 0)
+        # The rest of the device, which the follower holds; for looks only.
+        base.add(
+            "geom",
+            name="shaft",
+            type="capsule",
+            fromto=(0, 0, -_VISIBLE_SHAFT - self._stroke, 0, 0, 0),
+            size=[self._device.outer_radius],
+            mass=0,
+            contype=0,
+            conaffinity=0,
+            group=2,
+            rgba=_COLOUR,
+        )
 
     def _build_link(self, index: int):
         link = self._links[-1].add(

@@ -1,0 +1,49 @@
+"""Draws docs/images/scene.png: the whole scene, and the arch with the catheter in it.
+
+Needs an OpenGL library: MUJOCO_GL=egl or osmesa python docs/scripts/scene_picture.py
+"""
+
+from pathlib import Path
+
+import numpy as np
+from dm_control.mujoco import engine
+from PIL import Image
+
+from cathsim_dmc import suite
+
+OUT = Path(__file__).parents[1] / "images" / "scene.png"
+HEIGHT = 640
+
+
+def draw(physics, target, distance, azimuth, elevation, width, fovy=30.0):
+    physics.model.vis.global_.fovy = fovy
+    camera = engine.MovableCamera(physics, HEIGHT, width)
+    camera.set_pose(target, distance, azimuth, elevation)
+    camera.option.geomgroup[3] = 0
+    camera.option.geomgroup[4] = 0
+    camera.option.sitegroup[:] = 0
+    camera.option.sitegroup[4] = 1
+    image = camera.render().copy()
+    camera._scene.free()
+    return image
+
+
+def main():
+    env = suite.load("cathsim", "type1_lcca", task_kwargs={"random": 3})
+    env.reset()
+    action = np.zeros(env.action_spec().shape)
+    action[-1] = 1.0
+    for step in range(95):
+        # A little bend to the patient's left and back, as the branch asks for.
+        action[:20:2], action[1:20:2] = -0.15, 0.1
+        env.step(action)
+    physics = env.physics
+    physics.model.vis.global_.offwidth = 1600
+    physics.model.vis.global_.offheight = HEIGHT
+    whole = draw(physics, (0.03, 0.02, -0.15), 1.2, 118, -22, 420, 38.0)
+    arch = draw(physics, (0.02, 0.01, 0.12), 0.5, 140, -8, 400)
+    Image.fromarray(np.concatenate([whole, arch], axis=1)).save(OUT)
+
+
+if __name__ == "__main__":
+    main()
