@@ -356,9 +356,11 @@ def check(phantom: Annotated[str, conf.Positional], /, json: bool = False) -> in
 
 def _show(report: Any, as_json: bool) -> int:
     if as_json:
-        _print_json(report.to_dict())
+        _print_json(report.as_dict())
     else:
-        report.print()
+        from rich.console import Console
+
+        Console().print(report.table())
     return 0 if report.passed else CHECK_FAILED
 
 
@@ -384,6 +386,18 @@ for _name, _help in {
     "forces": "Force balance, known loads, and the published protocol.",
 }.items():
     validations.command(_validation(_name, _help), name=_name)
+
+
+@benchmarks.command
+def speed(json: bool = False) -> int:
+    """Measure how fast the simulator is. Run it with nothing else running.
+
+    Args:
+        json: Print one JSON object and nothing else.
+    """
+    from cathsim_dmc.analysis import benchmark
+
+    return _show(benchmark.speed(lambda text: print(text, file=sys.stderr)), json)
 
 
 if __name__ == "__main__":

@@ -1,0 +1,107 @@
+"""Errors of physics: found, named and kept for replay, never clipped away."""
+
+import json
+import logging
+import os
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from cathsim_dmc.anatomy import phantom as anatomies
+
+DIVERGED = "diverged"
+ESCAPED = "escaped through the wall"
+EXPLODED = "exploding force"
+
+# Control steps between two looks for an escape; a device that has left the lumen does
+# not find back within a second.
+ESCAPE_INTERVAL = 25
+# Deeper outside the lumen than this, m, the axis of the device is behind the wall:
+# the wall is 4 mm thick, and penetration stays below 1 mm.
+_ESCAPE_DEPTH = 2e-3
+# Within this way of the plane of the inlet, m, the sheath holds the device.
+_MOUTH = 2e-3
+# No contact of a device that is pushed with 5 N at most is harder than this, N.
+MAX_FORCE = 50.0
+
+_FORMAT = 1
+_LOG = logging.getLogger(__name__)
+
+
+def escaped(anatomy: anatomies.Anatomy, centreline: np.ndarray) -> np.ndarray:
+    """Whether devices have left the lumen.
+
+    Args:
+      anatomy: whose lumen, and whose inlet.
+      centreline: (..., n, 3), nodes of the devices, m, world frame.
+
+    Returns:
+      (...) bool: some node past the inlet lies more than 2 mm outside the lumen.
+    """
+    inlet = anatomy.inlet
+    beyond = (centreline - inlet.position) @ inlet.direction > _MOUTH
+    # Farther from the inlet than the sheath reaches, a node may also lie behind the
+    # plane of the inlet, in a vessel that turns back.
+    aside = np.linalg.norm(centreline - inlet.position, axis=-1) > _MOUTH
+    axis = np.cross(centreline - inlet.position, inlet.direction)
+    in_sheath = ~beyond & (np.linalg.norm(axis, axis=-1) < inlet.radius)
+    outside = anatomy.depth(centreline) < -_ESCAPE_DEPTH
+    return (outside & aside & ~in_sheath).any(-1)
+
+
+def dump(
+    reason: str,
+    *,
+    task: dict[str, Any],
+    state: np.ndarray,
+    actions: np.ndarray,
+    directory: str | Path | None = None,
+) -> Path:
+    """Writes what replays an episode that ended in an error, and logs where.
+
+    Args:
+      reason: what went wrong.
+      task: JSON-able description of the task.
+      state: (nstate,), MuJoCo's mjSTATE_INTEGRATION at the start of the episode.
+      actions: (T, A) up to and with the one that failed.
+      directory: where to; `CATHSIM_DUMP_DIR` or the system's temporary directory by
+        default.
+
+    Returns:
+      The .npz file.
+    """
+    directory = Path(
+        directory or os.environ.get("CATHSIM_DUMP_DIR") or tempfile.gettempdir()
+    )
+    directory.mkdir(parents=True, exist_ok=True)
+    meta = json.dumps({"format": _FORMAT, "reason": reason, "task": task})
+    handle, name = tempfile.mkstemp(".npz", "cathsim-error-", directory)
+    with os.fdopen(handle, "wb") as stream:
+        np.savez(stream, meta=np.array(meta), state=state, actions=actions)
+    _LOG.error(
+        "%s after %d steps of %s; replay it with cathsim_dmc.tasks.integrity.load(%r)",
+        reason,
+        len(actions),
+        task.get("goal", "an episode"),
+        name,
+    )
+    return Path(name)
+
+
+def load(path: str | Path) -> tuple[dict[str, Any], np.ndarray, np.ndarray]:
+    """Reads a dump: description, start state (nstate,) and actions (T, A).
+
+    Raises:
+      ValueError: if the file is no dump of this format.
+    """
+    with np.load(path, allow_pickle=False) as data:
+        if not {"meta", "state", "actions"} <= set(data.files):
+            raise ValueError(f"{path} is no dump of an episode; it has {data.files}")
+        meta = json.loads(str(data["meta"]))
+        if meta.get("format") != _FORMAT:
+            raise ValueError(
+                f"{path} has format {meta.get('format')}; this version reads {_FORMAT}"
+            )
+        return meta, data["state"], data["actions"]
