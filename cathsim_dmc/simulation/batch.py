@@ -81,7 +81,13 @@ class BatchSimulation:
         )
         self._steps = np.zeros(num_simulations, dtype=int)
         self._action = np.zeros((num_simulations, len(task.catheter.actuators)))
-        self._images: list[np.ndarray] = []
+        self._screen = task.screen(self._model, num_simulations)
+        self._delay = task.action_delay(num_simulations)
+        self._variation = task.model_variation(self._model)
+        fields = self._variation.fields
+        self._fields = {name: self._batch.expand(name) for name in fields}
+        self._goal_shift = np.zeros(num_simulations)
+        self._meaning = task.usual_meaning
         self.seed(seeds)
 
     def seed(self, seeds: Sequence[int] | int) -> None:
@@ -104,25 +110,33 @@ class BatchSimulation:
         Returns:
           Observations (N, ...) of all simulations.
         """
-        indices = np.arange(self.num_simulations) if indices is None else indices
+        task = self._task
+        everyone = np.arange(self.num_simulations)
+        indices = everyone if indices is None else np.unique(indices)
         if len(indices):
-            displacement = np.stack(
-                [
-                    cannulation.start_displacement(self._random_states[index])
-                    for index in indices
-                ]
-            )
+            displacement = np.stack([self._draw(index) for index in indices])
+            if task.config.randomisation.goal_shift is not None:
+                self._meaning = task.usual_meaning.shifted(self._goal_shift)
             # Without a pass at the default pose, whose solution would warm-start ours.
             self._batch.reset(indices, stage=mujoco.mjtStage.mjSTAGE_NONE.value)
             qpos = self._batch.qpos
-            qpos[indices] = self._task.start_qpos(qpos[indices], displacement)
+            qpos[indices] = task.start_qpos(qpos[indices], displacement)
             self._forward_unactuated(indices)
             self._rows[indices] = self._batch.sensordata[indices, None]
             self._steps[indices] = 0
             self._action[indices] = 0
         self._measure()
-        self._look(indices)
-        return self._observe()
+        return self._observe(indices)
+
+    def _draw(self, index: int) -> np.ndarray:
+        """Draws the episode of one simulation; returns its displacement (3,)."""
+        episode = self._task.config.randomisation.draw(self._random_states[index])
+        fields = {name: values[index] for name, values in self._fields.items()}
+        self._variation.write(fields, episode)
+        self._delay.restart(index, episode.delay)
+        self._screen.restart(index, episode.deviation)
+        self._goal_shift[index] = episode.goal_shift or 0.0
+        return episode.displacement
 
     def _forward_unactuated(self, indices: np.ndarray):
         """What dm_control does at a reset, when there is no control yet."""
@@ -148,7 +162,7 @@ class BatchSimulation:
                 f"simulations need {self._action.shape}"
             )
         self._action = action.copy()
-        self._batch.ctrl[:] = action
+        self._batch.ctrl[:] = self._delay.pass_on(action)
         self._task.posed_robot(self._batch.qpos)
         warnings = self._batch.warning.copy()
         self._batch.rollout(
@@ -162,8 +176,7 @@ class BatchSimulation:
             _LOG.warning("simulations %s diverged", np.flatnonzero(error).tolist())
         self._steps += 1
         self._measure()
-        self._look()
-        outcome = self._task.meaning.outcome(self._readings.head)
+        outcome = self._meaning.outcome(self._readings.head)
         if error.any():
             outcome = dataclasses.replace(
                 outcome,
@@ -175,7 +188,7 @@ class BatchSimulation:
             observation=self._observe(),
             outcome=outcome,
             terminated=terminated,
-            truncated=~terminated & (self._steps >= self._task.meaning.max_steps),
+            truncated=~terminated & (self._steps >= self._meaning.max_steps),
             physics_error=error,
             readings=self._readings,
             wall_force=self._wall_force,
@@ -187,33 +200,20 @@ class BatchSimulation:
             forces.magnitudes(self._rows[..., self._layout.wall_contacts])
         )
 
-    def _look(self, fresh: np.ndarray | None = None):
-        """Takes images; those of fresh episodes fill their whole history."""
-        fluoroscope = self._task.fluoroscope
-        if fluoroscope is None:
-            return
-        image = observations.look(
-            fluoroscope, self._readings, self._task.catheter.device.outer_radius
+    def _observe(self, fresh: np.ndarray | None = None) -> observations.Observation:
+        """Observations of all; `fresh` are in the first step of an episode."""
+        goal = self._meaning.goal
+        picture = self._screen.take(
+            self._readings.centreline,
+            goal,
+            self._batch.qpos,
+            self._random_states,
+            fresh,
         )
-        if not self._images:
-            self._images = [image.copy() for _ in range(observations.SEQUENCE_LENGTH)]
-        elif fresh is None:
-            self._images = [image, *self._images[: observations.SEQUENCE_LENGTH - 1]]
-        else:
-            for past in self._images:
-                past[fresh] = image[fresh]
-
-    def _observe(self) -> observations.Observation:
         frame = observations.Frame(
-            readings=self._readings,
-            wall_force=self._wall_force,
-            action=self._action,
-            image=self._images[0] if self._images else None,
-            past_images=tuple(self._images[1:]),
+            self._readings, self._wall_force, self._action, goal, picture
         )
-        return observations.observe(
-            self._task.observation_names, frame, self._task.goal_position
-        )
+        return observations.observe(self._task.observation_names, frame)
 
     @property
     def num_simulations(self) -> int:
@@ -229,6 +229,11 @@ class BatchSimulation:
     def task(self) -> navigation.Navigation:
         """The task that all simulations run."""
         return self._task
+
+    @property
+    def meaning(self) -> cannulation.Cannulation:
+        """Goals, which may differ between simulations, reward and success rule."""
+        return self._meaning
 
     @property
     def batch(self) -> mujoco_batch.Batch:

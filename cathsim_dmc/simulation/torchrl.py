@@ -94,7 +94,7 @@ class BatchedEnv(EnvBase):
             chosen = np.flatnonzero(mask)
         observation = self._simulation.reset(chosen)
         simulation = self._simulation
-        outcome = simulation.task.meaning.outcome(simulation.readings.head)
+        outcome = simulation.meaning.outcome(simulation.readings.head)
         no = np.zeros(self.batch_size, dtype=bool)
         info = self._info(simulation.readings, simulation.wall_force, outcome, no)
         return self._tensors(observation, info)

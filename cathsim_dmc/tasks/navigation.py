@@ -1,64 +1,30 @@
 """Navigation of a catheter through an anatomy, as a composer task."""
 
-import dataclasses
-import logging
-from collections.abc import Sequence
-
 import dm_env.specs
 import numpy as np
 from dm_control import composer
-from dm_control.composer.observation import observable
 
 from cathsim_dmc.anatomy import phantom as anatomies
 from cathsim_dmc.entities import devices
 from cathsim_dmc.entities.arena import AngiographyArena
 from cathsim_dmc.entities.catheter import Catheter
-from cathsim_dmc.entities.phantom import (
-    CONTACT_SOLIMP,
-    CONTACT_SOLREF,
-    FRICTION,
-    Phantom,
-)
+from cathsim_dmc.entities.phantom import CONTACT_SOLIMP, CONTACT_SOLREF, Phantom
 from cathsim_dmc.entities.robot import Robot, follower_posture
 from cathsim_dmc.entities.sheath import Sheath
-from cathsim_dmc.imaging import fluoroscopy
-from cathsim_dmc.tasks import cannulation, forces, observations, placement, readings
+from cathsim_dmc.imaging import angiograph
+from cathsim_dmc.tasks import (
+    cameras,
+    cannulation,
+    forces,
+    observations,
+    placement,
+    readings,
+    screen,
+    variations,
+)
+from cathsim_dmc.tasks.config import PHYSICS_TIMESTEP, NavigationConfig
 
-PHYSICS_TIMESTEP = 0.004  # s
-
-_LOG = logging.getLogger(__name__)
-
-
-@dataclasses.dataclass(frozen=True)
-class NavigationConfig:
-    """Options of a navigation task; the anatomy and the goal come beside them.
-
-    Attributes:
-      observation: name or names in `observations.OBSERVATIONS`.
-      device: name in `devices.DEVICES`, or a device.
-      rotation: whether the action has a rotation of the base.
-      reward: "distance" or "path", see `cannulation.Cannulation`.
-      goal_radius: δ, m.
-      max_steps: control steps until truncation.
-      friction: Coulomb coefficient of device on wall.
-      shaft_link: longest link of the shaft, m.
-      torsion_joints: torsion hinges along the shaft; None for 4 with rotation and a
-        torsionally rigid shaft without.
-      working_length: simulated length of the device, m; None for what the goal needs.
-      physics_timestep: s.
-    """
-
-    observation: str | Sequence[str] = "internal"
-    device: str | devices.Device = "published"
-    rotation: bool = False
-    reward: str = "distance"
-    goal_radius: float = cannulation.GOAL_RADIUS
-    max_steps: int = cannulation.MAX_STEPS
-    friction: float = FRICTION
-    shaft_link: float = 0.0175
-    torsion_joints: int | None = None
-    working_length: float | None = None
-    physics_timestep: float = PHYSICS_TIMESTEP
+__all__ = ["PHYSICS_TIMESTEP", "Navigation", "NavigationConfig"]
 
 
 class Navigation(composer.Task):
@@ -93,26 +59,26 @@ class Navigation(composer.Task):
         self._anatomy = anatomy
         self._goal = placement.resolve_goal(anatomy, goal)
         self._observation_names = observations.resolve(config.observation)
-        self._meaning = placement.cannulation_task(
+        self._usual_meaning = self._meaning = placement.cannulation_task(
             anatomy,
             self._goal,
             reward=config.reward,
             goal_radius=config.goal_radius,
             max_steps=config.max_steps,
+            spare=max((0.0, *(config.randomisation.goal_shift or ()))),
         )
         self._device = devices.get(config.device)
         self._placement = placement.place_device(
             anatomy, self._meaning.route.length, self._device, config.working_length
         )
-        self._fluoroscope = None
-        if observations.needs_images(self._observation_names):
-            self._fluoroscope = fluoroscopy.Fluoroscope.from_surface(
-                anatomy.surface.vertices, anatomy.surface.faces
+        self._angiograph = None
+        if observations.needs_fluoroscopy(self._observation_names):
+            self._angiograph = angiograph.Angiograph(
+                anatomy.surface.vertices, anatomy.surface.faces, config.fluoroscopy
             )
         self._build_scene()
         self.set_timesteps(cannulation.CONTROL_TIMESTEP, config.physics_timestep)
         self._layout = None
-        self._restart()
         self._observables = None
 
     def _build_scene(self):
@@ -153,6 +119,8 @@ class Navigation(composer.Task):
         self._attach(self._robot, pos=mouth.robot, **frame)
         self._phantom.add_wall_sensor(self._catheter.links[0])
         placement.add_cameras(self._arena, self._anatomy)
+        if set(cameras.KINDS) & set(self._observation_names):
+            cameras.add_tip_camera(self._arena, self._catheter)
 
     def _attach(self, entity, **frame):
         site = self._arena.mjcf_model.worldbody.add("site", group=5, **frame)
@@ -164,7 +132,6 @@ class Navigation(composer.Task):
         self._contacts = None
         self._wall_force = None
         self._observation = None
-        self._images = []
         self._step = 0
         self._termination = None
         self._action = np.zeros(len(self._catheter.actuators))
@@ -180,48 +147,16 @@ class Navigation(composer.Task):
     def task_observables(self):
         """One observable per key of the chosen observations."""
         if self._observables is None:
-            keys = self._observation_keys()
-            self._observables = {
-                key: observable.Generic(lambda physics, k=key: self._see(physics)[k])
-                for key in keys
-            }
-            for each in self._observables.values():
-                each.enabled = True
-        return self._observables
-
-    def _observation_keys(self) -> list[str]:
-        return list(
-            observations.observe(
-                self._observation_names, self._empty_frame(), self._goal.position
+            entries = observations.entries(
+                self._observation_names, self._config.fluoroscopy, self._config.cameras
             )
-        )
-
-    def _empty_frame(self) -> observations.Frame:
-        """A frame of zeros, which has the keys of every other."""
-        joints, links = len(self._catheter.joints), len(self._catheter.links)
-        zero = np.zeros(())
-        state = readings.Readings(
-            insertion=zero,
-            joint_positions=np.zeros(joints),
-            joint_velocities=np.zeros(joints),
-            com_inertia=np.zeros((links, 10)),
-            com_velocity=np.zeros((links, 6)),
-            actuator_force=np.zeros(joints),
-            external_force=np.zeros((links, 6)),
-            centreline=np.zeros((links + 1, 3)),
-            head=np.zeros(3),
-            push_force=zero,
-            push_torque=zero,
-            load_cell=np.zeros(3),
-        )
-        image = np.zeros((1, 1, 1), dtype=np.uint8)
-        return observations.Frame(
-            readings=state,
-            wall_force=forces.WallForce(zero, zero, zero, zero),
-            action=self._action,
-            image=image,
-            past_images=(image, image),
-        )
+            self._observables = {
+                key: observations.Seen(
+                    lambda physics, key=key: self._see(physics)[key], spec
+                )
+                for key, spec in entries.items()
+            }
+        return self._observables
 
     def action_spec(self, physics) -> dm_env.specs.BoundedArray:
         """Bounds [-1, 1] for each actuator."""
@@ -243,17 +178,32 @@ class Navigation(composer.Task):
             model, self._catheter.mjcf_model.model, self._phantom.mjcf_model.model
         )
         self._robot_qpos = physics.bind(self._robot.joints).qposadr
+        self._variation = self.model_variation(model)
+        self._screen = self.screen(model, 1)
+        self._delay = self.action_delay(1)
         self._restart()
+        # Composer looks once before the first reset, which must not draw noise.
+        self._noise = None
         self._sensor_rows = np.zeros(
             (self.physics_steps_per_control_step, model.nsensordata)
         )
 
     def initialize_episode(self, physics, random_state):
-        """Puts the device to its start, displaced by up to 1 mm."""
+        """Draws what differs between episodes and puts the device to its start."""
         self._restart()
-        displacement = cannulation.start_displacement(random_state)
-        data = physics.data.ptr
-        data.qpos[:] = self.start_qpos(data.qpos, displacement)
+        self._noise = [random_state]
+        episode = self._config.randomisation.draw(random_state)
+        model, data = physics.model.ptr, physics.data.ptr
+        fields = {name: getattr(model, name) for name in self._variation.fields}
+        self._variation.write(fields, episode)
+        self._delay.restart(0, episode.delay)
+        self._screen.restart(0, episode.deviation)
+        if episode.goal_shift is not None:
+            self._meaning = self._usual_meaning.shifted(episode.goal_shift)
+            goal = self._phantom.goals.get(self._goal.name)
+            if goal is not None:  # only looks
+                physics.bind(goal).pos = self._meaning.goal
+        data.qpos[:] = self.start_qpos(data.qpos, episode.displacement)
 
     def start_qpos(self, qpos: np.ndarray, displacement: np.ndarray) -> np.ndarray:
         """Start configuration (..., nq) with the tip displaced by (..., 3) m.
@@ -287,7 +237,7 @@ class Navigation(composer.Task):
         del random_state
         self._action = cannulation.check_action(action, len(self._catheter.actuators))
         data = physics.data.ptr
-        data.ctrl[:] = self._action
+        data.ctrl[:] = self._delay.pass_on(self._action[None])[0]
         self.posed_robot(data.qpos)
         self._substep = 0
 
@@ -338,29 +288,57 @@ class Navigation(composer.Task):
         if self._observation is None:
             if not self._step:
                 self._measure(physics)
-            self._remember_image()
+            picture = self._screen.take(
+                self._readings.centreline[None],
+                self.goal_position,
+                physics.data.ptr.qpos[None],
+                self._noise,
+                None if self._step else np.zeros(1, dtype=int),
+            )
             self._observation = observations.observe(
-                self._observation_names, self._frame(), self._goal.position
+                self._observation_names,
+                observations.Frame(
+                    self._readings,
+                    self._wall_force,
+                    self._action,
+                    self.goal_position,
+                    picture.of(0),
+                ),
             )
         return self._observation
 
-    def _remember_image(self):
-        if self._fluoroscope is None:
-            return
-        image = observations.look(
-            self._fluoroscope, self._readings, self._device.outer_radius
-        )
-        if not self._images:
-            self._images = [image] * observations.SEQUENCE_LENGTH
-        self._images = [image, *self._images[: observations.SEQUENCE_LENGTH - 1]]
+    # What the batched path builds anew for its own simulations.
 
-    def _frame(self) -> observations.Frame:
-        return observations.Frame(
-            readings=self._readings,
-            wall_force=self._wall_force,
-            action=self._action,
-            image=self._images[0] if self._images else None,
-            past_images=tuple(self._images[1:]),
+    def model_variation(self, model) -> variations.ModelVariation:
+        """Writes randomised fields of the compiled model."""
+        return variations.ModelVariation(
+            model,
+            self._config.randomisation,
+            self._catheter.mjcf_model.model,
+            self._phantom.mjcf_model.model,
+        )
+
+    def screen(self, model, simulations: int) -> screen.Screen:
+        """Takes the pictures of a number of simulations."""
+        return screen.Screen(
+            self._observation_names,
+            self._angiograph,
+            self._device.outer_radius,
+            simulations,
+            screen.open_cameras(
+                self._observation_names,
+                model,
+                self._config.cameras,
+                self._catheter.mjcf_model.model,
+            ),
+        )
+
+    def action_delay(self, simulations: int) -> variations.ActionDelay:
+        """Holds back the actions of a number of simulations."""
+        return variations.ActionDelay(
+            simulations,
+            len(self._catheter.actuators),
+            self._config.randomisation.longest_delay,
         )
 
     # What others may read.
@@ -372,8 +350,13 @@ class Navigation(composer.Task):
 
     @property
     def meaning(self) -> cannulation.Cannulation:
-        """Goal, reward and success rule."""
+        """Goal, reward and success rule of the episode."""
         return self._meaning
+
+    @property
+    def usual_meaning(self) -> cannulation.Cannulation:
+        """The same without randomisation."""
+        return self._usual_meaning
 
     @property
     def anatomy(self) -> anatomies.Anatomy:
@@ -387,8 +370,8 @@ class Navigation(composer.Task):
 
     @property
     def goal_position(self) -> np.ndarray:
-        """Position (3,) of the goal, m, world frame."""
-        return self._goal.position
+        """Position (3,) of the goal in this episode, m, world frame."""
+        return self._meaning.goal
 
     @property
     def goal_radius(self) -> float:
@@ -401,9 +384,9 @@ class Navigation(composer.Task):
         return self._placement
 
     @property
-    def fluoroscope(self) -> fluoroscopy.Fluoroscope | None:
-        """The C-arm of the image observations, or None without them."""
-        return self._fluoroscope
+    def fluoroscope(self) -> angiograph.Fluoroscope | None:
+        """The frontal C-arm of this episode, or None without such observations."""
+        return self._screen.fluoroscope
 
     @property
     def observation_names(self) -> tuple[str, ...]:

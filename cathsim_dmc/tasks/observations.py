@@ -4,14 +4,46 @@ import dataclasses
 from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
+from dm_control.composer.observation import observable
+from dm_env import specs
 
-from cathsim_dmc.imaging import fluoroscopy
+from cathsim_dmc.imaging.options import FluoroscopyOptions
 from cathsim_dmc.tasks import forces, readings
+from cathsim_dmc.tasks.cameras import CameraOptions
 
 TRACKED_POINTS = 8
 SEQUENCE_LENGTH = 3
 
 Observation = dict[str, np.ndarray]
+
+
+@dataclasses.dataclass(frozen=True)
+class Picture:
+    """What is on the operator's screen; None where no observation needs it.
+
+    Attributes:
+      image: (..., H, W, P) uint8, fluoroscopy of P planes.
+      past_images: the same, one and two control steps before, newest first.
+      masks: (..., H, W, 2 P) uint8, see `imaging.angiograph.masks`.
+      pixels: (..., P, K + 1, 2), tracked points and goal, (column, row).
+      views: pictures of MuJoCo's cameras by key.
+    """
+
+    image: np.ndarray | None = None
+    past_images: tuple[np.ndarray, ...] = ()
+    masks: np.ndarray | None = None
+    pixels: np.ndarray | None = None
+    views: Mapping[str, np.ndarray] = dataclasses.field(default_factory=dict)
+
+    def of(self, index: int) -> "Picture":
+        """The picture of one of many simulations."""
+        return Picture(
+            image=None if self.image is None else self.image[index],
+            past_images=tuple(image[index] for image in self.past_images),
+            masks=None if self.masks is None else self.masks[index],
+            pixels=None if self.pixels is None else self.pixels[index],
+            views={key: view[index] for key, view in self.views.items()},
+        )
 
 
 @dataclasses.dataclass(frozen=True)
@@ -21,16 +53,16 @@ class Frame:
     Attributes:
       readings: state of the device.
       wall_force: on the wall over the control step.
-      action: (..., A), the action that led here, zeros after a reset.
-      image: (..., H, W, 1) uint8, fluoroscopy, or None if no observation needs it.
-      past_images: the same, one and two control steps before, newest first.
+      action: (..., A), the action that was asked for, zeros after a reset.
+      goal: (3,) or (..., 3), m.
+      picture: on the operator's screen.
     """
 
     readings: readings.Readings
     wall_force: forces.WallForce
     action: np.ndarray
-    image: np.ndarray | None = None
-    past_images: tuple[np.ndarray, ...] = ()
+    goal: np.ndarray
+    picture: Picture = Picture()
 
 
 def _flat(array: np.ndarray, axes: int) -> np.ndarray:
@@ -38,9 +70,8 @@ def _flat(array: np.ndarray, axes: int) -> np.ndarray:
     return array.reshape(*array.shape[: array.ndim - axes], -1)
 
 
-def internal(frame: Frame, goal: np.ndarray) -> Observation:
+def internal(frame: Frame) -> Observation:
     """State of joints and links, as published."""
-    del goal
     state = frame.readings
     return {
         "position": state.joint_positions,
@@ -52,44 +83,70 @@ def internal(frame: Frame, goal: np.ndarray) -> Observation:
     }
 
 
-def image(frame: Frame, goal: np.ndarray) -> Observation:
-    """One fluoroscopic image (H, W, 1) uint8."""
-    del goal
-    return {"image": frame.image}
+def image(frame: Frame) -> Observation:
+    """One fluoroscopic image, a channel for each plane."""
+    return {"image": frame.picture.image}
 
 
-def sequential(frame: Frame, goal: np.ndarray) -> Observation:
-    """Three consecutive images (H, W, 3) uint8, oldest first."""
-    del goal
-    images = (*reversed(frame.past_images), frame.image)
+def sequential(frame: Frame) -> Observation:
+    """Three consecutive images, oldest first."""
+    images = (*reversed(frame.picture.past_images), frame.picture.image)
     return {"sequential": np.concatenate(images, axis=-1)}
 
 
-def tracking(frame: Frame, goal: np.ndarray) -> Observation:
-    """What an operator follows on the screen.
+def segmentation(frame: Frame) -> Observation:
+    """Which pixels show the device, and which the vessel."""
+    return {"segmentation": frame.picture.masks}
 
-    Equidistant points along the steerable part and the shaft next to it, from proximal
-    to the head, the goal, the insertion and the last action.
+
+def tracked(line: np.ndarray) -> np.ndarray:
+    """Tracked points (..., K, 3) of a centreline (..., n, 3).
+
+    Equidistant joints along the steerable part and the shaft next to it, from
+    proximal to the head.
     """
-    line = frame.readings.centreline
     chosen = np.linspace(line.shape[-2] // 2, line.shape[-2] - 1, TRACKED_POINTS)
-    points = line[..., np.round(chosen).astype(int), :]
+    return line[..., np.round(chosen).astype(int), :]
+
+
+def tracking(frame: Frame) -> Observation:
+    """Points along the device in space, the goal, the insertion, the last action."""
+    line = frame.readings.centreline
     return {
-        "tracking_points": _flat(points, 2),
-        "tracking_goal": np.broadcast_to(goal, (*line.shape[:-2], 3)),
+        "tracking_points": _flat(tracked(line), 2),
+        "tracking_goal": np.broadcast_to(frame.goal, (*line.shape[:-2], 3)),
+        **_operator(frame),
+    }
+
+
+def tracking_2d(frame: Frame) -> Observation:
+    """The same points and the goal in pixels, as seen on the screen."""
+    pixels = frame.picture.pixels
+    return {
+        "tracking_pixels": _flat(pixels[..., :-1, :], 3),
+        "tracking_goal_pixels": _flat(pixels[..., -1, :], 2),
+        **_operator(frame),
+    }
+
+
+def _operator(frame: Frame) -> Observation:
+    return {
         "tracking_insertion": frame.readings.insertion[..., None],
         "tracking_action": frame.action,
     }
 
 
-def force(frame: Frame, goal: np.ndarray) -> Observation:
-    """Force sensing, N and N·m.
+def goal(frame: Frame) -> Observation:
+    """Where the goal is, in the world and from the head."""
+    head = frame.readings.head
+    return {
+        "goal_position": np.broadcast_to(frame.goal, head.shape),
+        "goal_from_head": frame.goal - head,
+    }
 
-    `wall_force`: sum and largest contact at the end of the step, and their peaks
-    within it; `push_force`: push and torque at the base; `load_cell`: force of the
-    phantom on its support, world frame.
-    """
-    del goal
+
+def force(frame: Frame) -> Observation:
+    """Force sensing beside any other observation."""
     wall, state = frame.wall_force, frame.readings
     return {
         "wall_force": np.stack(
@@ -100,14 +157,60 @@ def force(frame: Frame, goal: np.ndarray) -> Observation:
     }
 
 
-OBSERVATIONS: Mapping[str, Callable[[Frame, np.ndarray], Observation]] = {
+def rgb(frame: Frame) -> Observation:
+    """Colour images of MuJoCo's cameras."""
+    return _views(frame, "rgb")
+
+
+def depth(frame: Frame) -> Observation:
+    """Distance images of MuJoCo's cameras."""
+    return _views(frame, "depth")
+
+
+def _views(frame: Frame, kind: str) -> Observation:
+    views = frame.picture.views
+    return {key: view for key, view in views.items() if key.startswith(kind)}
+
+
+OBSERVATIONS: Mapping[str, Callable[[Frame], Observation]] = {
     "internal": internal,
     "image": image,
     "sequential": sequential,
+    "segmentation": segmentation,
     "tracking": tracking,
+    "tracking_2d": tracking_2d,
+    "goal": goal,
     "force": force,
+    "rgb": rgb,
+    "depth": depth,
 }
-_WITH_IMAGES = ("image", "sequential")
+_FLUOROSCOPIC = ("image", "sequential", "segmentation", "tracking_2d")
+
+# Keys of the observations of numbers; those of pictures depend on their options.
+_NUMBERS: Mapping[str, tuple[str, ...]] = {
+    "internal": (
+        "position",
+        "velocity",
+        "com_inertia",
+        "com_velocity",
+        "actuator_force",
+        "external_force",
+    ),
+    "tracking": (
+        "tracking_points",
+        "tracking_goal",
+        "tracking_insertion",
+        "tracking_action",
+    ),
+    "tracking_2d": (
+        "tracking_pixels",
+        "tracking_goal_pixels",
+        "tracking_insertion",
+        "tracking_action",
+    ),
+    "goal": ("goal_position", "goal_from_head"),
+    "force": ("wall_force", "push_force", "load_cell"),
+}
 
 
 def resolve(names: str | Sequence[str]) -> tuple[str, ...]:
@@ -126,21 +229,58 @@ def resolve(names: str | Sequence[str]) -> tuple[str, ...]:
     return chosen
 
 
-def needs_images(names: Sequence[str]) -> bool:
-    """Whether any of the observations shows a fluoroscopic image."""
-    return any(name in _WITH_IMAGES for name in names)
+def needs_fluoroscopy(names: Sequence[str]) -> bool:
+    """Whether any of the observations needs the angiography machine."""
+    return any(name in _FLUOROSCOPIC for name in names)
 
 
-def observe(names: Sequence[str], frame: Frame, goal: np.ndarray) -> Observation:
+def observe(names: Sequence[str], frame: Frame) -> Observation:
     """Computes the named observations; arrays are the caller's own."""
     observation: Observation = {}
     for name in names:
-        observation.update(OBSERVATIONS[name](frame, goal))
+        observation.update(OBSERVATIONS[name](frame))
     return {key: np.array(value) for key, value in observation.items()}
 
 
-def look(
-    fluoroscope: fluoroscopy.Fluoroscope, state: readings.Readings, radius: float
-) -> np.ndarray:
-    """Fluoroscopic image (..., H, W, 1) uint8 of a device of a radius in m."""
-    return fluoroscope.render(state.centreline, radius)
+def entries(
+    names: Sequence[str], fluoroscopy: FluoroscopyOptions, cameras: CameraOptions
+) -> dict[str, specs.Array | None]:
+    """Keys of the named observations, with the specs of those of pictures."""
+    planes, size = fluoroscopy.planes, fluoroscopy.resolution
+    grey = {
+        "image": planes,
+        "sequential": planes * SEQUENCE_LENGTH,
+        "segmentation": planes * 2,
+    }
+    result: dict[str, specs.Array | None] = {}
+    for name in names:
+        if name in grey:
+            result[name] = _picture((*size, grey[name]))
+        elif name == "rgb":
+            for camera in cameras.names:
+                result[f"rgb_{camera}"] = _picture((*cameras.resolution, 3))
+        elif name == "depth":
+            for camera in cameras.names:
+                shape = (*cameras.resolution, 1)
+                result[f"depth_{camera}"] = specs.Array(shape, np.float32)
+        else:
+            result.update(dict.fromkeys(_NUMBERS[name]))
+    return result
+
+
+def _picture(shape: tuple[int, ...]) -> specs.BoundedArray:
+    return specs.BoundedArray(shape, np.uint8, 0, 255)
+
+
+class Seen(observable.Generic):
+    """One entry of the observation, with the range of a picture in its spec."""
+
+    def __init__(self, see: Callable, spec: specs.Array | None):
+        super().__init__(see)
+        self._spec = spec
+        self.enabled = True
+
+    @property
+    def array_spec(self) -> specs.Array | None:
+        """Spec of a picture; None for numbers, whose spec composer infers."""
+        return self._spec

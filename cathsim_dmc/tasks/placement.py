@@ -68,15 +68,24 @@ def resolve_goal(
 
 
 def cannulation_task(
-    anatomy: anatomies.Anatomy, goal: anatomies.Goal, **options
+    anatomy: anatomies.Anatomy, goal: anatomies.Goal, spare: float = 0.0, **options
 ) -> cannulation.Cannulation:
-    """Builds the meaning of the task of reaching a goal; options are its fields."""
+    """Builds the meaning of the task of reaching a goal.
+
+    Args:
+      anatomy: where.
+      goal: of the anatomy.
+      spare: way past the goal that the route goes on, m.
+      **options: fields of `cannulation.Cannulation`.
+    """
     vessel = anatomy.tree.vessel(goal.vessel)
     inlet = anatomy.tree.vessel(anatomy.inlet.vessel).centreline
     route = anatomy.tree.route(
         anatomy.inlet.vessel,
         goal.vessel,
-        goal.arc_length,
+        min(goal.arc_length + spare, vessel.centreline.length)
+        if spare
+        else goal.arc_length,
         start_arc_length=float(inlet.project(anatomy.inlet.position).arc_length),
     )
     return cannulation.Cannulation(
@@ -84,6 +93,7 @@ def cannulation_task(
         branch=vessel.centreline,
         ostium=vessel.ostium,
         route=route,
+        goal_arc_length=route.project(goal.position).arc_length if spare else None,
         **options,
     )
 
@@ -184,7 +194,7 @@ def start_joints(
     lever = beyond[index]
     # The base cannot go back behind its start, so the stroke begins 1 mm later.
     return {
-        "insertion": cannulation.START_JITTER + displacement[..., 2],
+        "insertion": np.maximum(cannulation.START_JITTER + displacement[..., 2], 0.0),
         f"bend_x_{index}": -displacement[..., 1] / lever,
         f"bend_y_{index}": displacement[..., 0] / lever,
     }

@@ -1,0 +1,117 @@
+"""Options of the fluoroscopy that a task shows, in a form that JSON can hold."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from cathsim_dmc.imaging import carm as carms
+from cathsim_dmc.imaging import detector, materials
+
+# Name in `carm.VIEWS`, or primary and secondary angle in degrees.
+View = str | Sequence[float]
+
+
+@dataclass(frozen=True)
+class FluoroscopyOptions:
+    """How the angiography suite is set up.
+
+    Attributes:
+        view: name of a view, or (primary, secondary) angle in degrees.
+        biplane: the same for a second C-arm, or None for a single plane.
+        size: pixels along a side of the image, or (rows, columns).
+        magnification: electronic zoom.
+        centre: isocentre (3,), world frame, m; None for the middle of the lumen.
+        contrast: iodine in the lumen, kg/m³ (mg/ml); True for the usual concentration,
+            False for none.
+        noise: whether quanta are counted. The noise comes from the environment's
+            source of randomness.
+        kerma: air kerma at the detector per frame, Gy; more is less noise.
+        gain: share of full white given to plain tissue.
+        blur: standard deviation of the detector's point spread, m.
+        roadmap: opacity of the vessel laid over the live image, 0 for none; usually
+            with `contrast=False`.
+        source_detector: distance of source and detector, m.
+        source_isocentre: distance of source and isocentre, m.
+        detector_size: width of the detector, m.
+    """
+
+    view: View = "AP"
+    biplane: View | None = None
+    size: int | Sequence[int] = carms.RESOLUTION
+    magnification: float = 1.0
+    centre: Sequence[float] | None = None
+    contrast: float | bool = True
+    noise: bool = False
+    kerma: float = detector.FRAME_KERMA
+    gain: float = detector.GAIN
+    blur: float = detector.DETECTOR_BLUR
+    roadmap: float = 0.0
+    source_detector: float = carms.SOURCE_DETECTOR
+    source_isocentre: float = carms.SOURCE_ISOCENTRE
+    detector_size: float = carms.DETECTOR_SIZE
+
+    def __post_init__(self) -> None:
+        # Built here, so that a wrong option is refused before any simulation.
+        self.carms(np.zeros((1, 3)))
+
+    @property
+    def iodine(self) -> float:
+        """Iodine in the lumen, kg/m³."""
+        if isinstance(self.contrast, bool):
+            return materials.CONTRAST if self.contrast else 0.0
+        return float(self.contrast)
+
+    @property
+    def resolution(self) -> tuple[int, int]:
+        """(rows, columns)."""
+        size = self.size
+        return (size, size) if isinstance(size, int) else tuple(size)
+
+    @property
+    def planes(self) -> int:
+        """Number of C-arms, 1 or 2."""
+        return 1 if self.biplane is None else 2
+
+    def carms(
+        self,
+        points: np.ndarray,
+        deviation: tuple[float, float] = (0.0, 0.0),
+    ) -> tuple[carms.CArm, ...]:
+        """The C-arms, frontal first.
+
+        Args:
+            points: (..., 3) whose middle is the isocentre unless `centre` is given, m.
+            deviation: added to primary and secondary angle of every plane, degrees.
+
+        Raises:
+            ValueError: if a view or a distance is not possible.
+        """
+        arms = []
+        for view in (self.view, self.biplane)[: self.planes]:
+            primary, secondary = np.add(_angles(view), deviation)
+            arm = carms.CArm(
+                primary=np.deg2rad(primary),
+                secondary=np.deg2rad(secondary),
+                magnification=self.magnification,
+                source_detector=self.source_detector,
+                source_isocentre=self.source_isocentre,
+                detector_size=self.detector_size,
+                resolution=self.resolution,
+                isocentre=(0.0, 0.0, 0.0) if self.centre is None else self.centre,
+            )
+            arms.append(arm if self.centre is not None else arm.centred_on(points))
+        return tuple(arms)
+
+
+def _angles(view: View) -> tuple[float, float]:
+    if isinstance(view, str) and view in carms.VIEWS:
+        return carms.VIEWS[view]
+    if isinstance(view, str) or np.shape(view) != (2,):
+        raise ValueError(
+            f"view is {view!r}; give one of {', '.join(carms.VIEWS)}, or the primary "
+            "and secondary angle in degrees"
+        )
+    return float(view[0]), float(view[1])

@@ -1,0 +1,254 @@
+"""Domain randomisation: what differs from episode to episode, drawn from one source.
+
+Composer and the batched path draw the same `Episode` in the same order and write it
+to fields of the compiled model, so nothing is compiled again.
+"""
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import mujoco
+import numpy as np
+from dm_control.composer import variation
+from dm_control.composer.variation import distributions
+
+from cathsim_dmc.imaging.angiograph import Deviation
+from cathsim_dmc.tasks import cannulation
+
+# Lowest and highest value of a uniform distribution, or any composer Variation.
+Range = Sequence[float] | variation.Variation
+
+_RANGES = ("friction", "stiffness", "view", "gain", "kerma", "goal_shift", "roll")
+
+
+@dataclasses.dataclass(frozen=True)
+class Randomisation:
+    """What is drawn at the start of an episode; None leaves it as it is.
+
+    A range is `(low, high)` of a uniform distribution, or a composer Variation.
+
+    Attributes:
+      friction: Coulomb coefficient of device on wall.
+      stiffness: factor of EI and GJ; damping and steering torques follow, so that
+        relaxation time and steering angles stay.
+      start_radius: of the ball in which the tip starts, m.
+      view: deviation of the C-arm's angles, degrees, rounded to whole ones.
+      gain: factor of the image's gain.
+      kerma: factor of the kerma, which sets the quantum noise if there is any.
+      goal_shift: of the goal along its branch, m, positive away from the ostium.
+      roll: of the device about its own axis, rad.
+      delay: least and longest delay of the action, whole control steps.
+    """
+
+    friction: Range | None = None
+    stiffness: Range | None = None
+    start_radius: float = cannulation.START_JITTER
+    view: Range | None = None
+    gain: Range | None = None
+    kerma: Range | None = None
+    goal_shift: Sequence[float] | None = None
+    roll: Range | None = None
+    delay: Sequence[int] | None = None
+
+    def __post_init__(self):
+        for name in (*_RANGES, "delay"):
+            value = getattr(self, name)
+            if value is None or isinstance(value, variation.Variation):
+                if value is not None and name in ("delay", "goal_shift"):
+                    raise ValueError(
+                        f"{name} is a Variation; its bounds must be known before, so "
+                        "give (low, high)"
+                    )
+                continue
+            if np.shape(value) != (2,) or not value[0] <= value[1]:
+                raise ValueError(
+                    f"{name} is {value!r}; give (low, high) with low <= high, or None"
+                )
+            if name in ("friction", "delay") and value[0] < 0:
+                raise ValueError(f"{name} is {value!r}; it cannot be negative")
+            if name in ("stiffness", "gain", "kerma") and value[0] <= 0:
+                raise ValueError(f"{name} is {value!r}; factors must be > 0")
+        delay = self.delay or ()
+        if not all(float(steps).is_integer() for steps in delay):
+            raise ValueError(f"delay is {self.delay!r}; give whole control steps")
+        if not self.start_radius >= 0:
+            raise ValueError(f"start_radius is {self.start_radius} m; it must be >= 0")
+
+    @classmethod
+    def make(cls, value: "Randomisation | Mapping[str, Any] | bool") -> "Randomisation":
+        """From the option of a task: False, True for `USUAL`, fields, or an object."""
+        if isinstance(value, cls):
+            return value
+        if isinstance(value, bool):
+            return USUAL if value else cls()
+        known = [field.name for field in dataclasses.fields(cls)]
+        unknown = sorted(set(value) - set(known))
+        if unknown:
+            raise ValueError(
+                f"nothing named {', '.join(unknown)} can be randomised; there are "
+                f"{', '.join(known)}"
+            )
+        return cls(**value)
+
+    @property
+    def longest_delay(self) -> int:
+        """Of the action, control steps."""
+        return 0 if self.delay is None else int(self.delay[1])
+
+    def draw(self, random_state: np.random.RandomState) -> "Episode":
+        """Draws an episode; what is None takes nothing from the source."""
+
+        def value(name: str) -> float | None:
+            chosen = getattr(self, name)
+            if chosen is None:
+                return None
+            if not isinstance(chosen, variation.Variation):
+                chosen = distributions.Uniform(*map(float, chosen))
+            return float(variation.evaluate(chosen, random_state=random_state))
+
+        displacement = cannulation.start_displacement(random_state, self.start_radius)
+        friction, stiffness = value("friction"), value("stiffness")
+        primary, secondary = value("view"), value("view")
+        gain, kerma = value("gain"), value("kerma")
+        shift, roll = value("goal_shift"), value("roll")
+        delay = 0
+        if self.delay is not None:
+            low, high = map(int, self.delay)
+            delay = int(random_state.randint(low, high + 1))
+        return Episode(
+            displacement=displacement,
+            friction=friction,
+            stiffness=stiffness,
+            deviation=Deviation(
+                primary=round(primary or 0.0),
+                secondary=round(secondary or 0.0),
+                gain=1.0 if gain is None else gain,
+                kerma=1.0 if kerma is None else kerma,
+            ),
+            goal_shift=shift,
+            roll=roll,
+            delay=delay,
+        )
+
+
+# Friction and EI over what real devices and lubrication show (the friction that is
+# usually randomised is 0.02-0.15), the rest over what differs between two sessions.
+USUAL = Randomisation(
+    friction=(0.02, 0.15),
+    stiffness=(0.8, 1.25),
+    start_radius=2e-3,
+    view=(-5.0, 5.0),
+    gain=(0.85, 1.15),
+    kerma=(0.5, 2.0),
+    goal_shift=(-0.005, 0.005),
+    roll=(-np.pi, np.pi),
+    delay=(0, 2),
+)
+
+
+@dataclasses.dataclass(frozen=True)
+class Episode:
+    """What was drawn for an episode; None where the model's own value stands.
+
+    Attributes:
+      displacement: (3,) of the tip at the start, frame of the inlet, m.
+      friction: Coulomb coefficient.
+      stiffness: factor.
+      deviation: of the angiography machine.
+      goal_shift: m along the branch.
+      roll: rad.
+      delay: control steps.
+    """
+
+    displacement: np.ndarray
+    friction: float | None = None
+    stiffness: float | None = None
+    deviation: Deviation = Deviation()
+    goal_shift: float | None = None
+    roll: float | None = None
+    delay: int = 0
+
+
+class ModelVariation:
+    """Writes an episode to the fields of a compiled model that it changes."""
+
+    def __init__(
+        self,
+        model: mujoco.MjModel,
+        randomisation: Randomisation,
+        catheter: str,
+        phantom: str,
+    ):
+        """Finds the elements.
+
+        Args:
+          model: the compiled model, as it is without randomisation.
+          randomisation: which fields will change.
+          catheter: MJCF scope of the catheter.
+          phantom: MJCF scope of the phantom.
+        """
+
+        def named(kind: str, count: int, *prefixes: str) -> np.ndarray:
+            accessor = getattr(model, kind)
+            return np.array(
+                [i for i in range(count) if accessor(i).name.startswith(prefixes)],
+                dtype=int,
+            )
+
+        self._geoms = named("geom", model.ngeom, f"{catheter}/", f"{phantom}/")
+        self._hinges = named(
+            "joint", model.njnt, f"{catheter}/bend_", f"{catheter}/twist_"
+        )
+        self._dofs = model.jnt_dofadr[self._hinges]
+        self._motors = named("actuator", model.nu, f"{catheter}/tip_")
+        self._base = model.body(f"{catheter}/link_0").id
+        fields = []
+        if randomisation.friction is not None:
+            fields += ["geom_friction"]
+        if randomisation.stiffness is not None:
+            fields += ["jnt_stiffness", "dof_damping", "actuator_gainprm"]
+        if randomisation.roll is not None:
+            fields += ["body_quat"]
+        self.fields = tuple(fields)
+        self._usual = {field: getattr(model, field).copy() for field in fields}
+
+    def write(self, arrays: Mapping[str, np.ndarray], episode: Episode) -> None:
+        """Writes to `arrays`, live fields `self.fields` of one simulation's model."""
+        if episode.friction is not None:
+            arrays["geom_friction"][self._geoms, 0] = episode.friction
+        if episode.stiffness is not None:
+            for field, where in (
+                ("jnt_stiffness", self._hinges),
+                ("dof_damping", self._dofs),
+                ("actuator_gainprm", (self._motors, 0)),
+            ):
+                arrays[field][where] = self._usual[field][where] * episode.stiffness
+        if episode.roll is not None:
+            half = episode.roll / 2
+            turn = np.array([np.cos(half), 0.0, 0.0, np.sin(half)])
+            quaternion = np.empty(4)
+            mujoco.mju_mulQuat(quaternion, self._usual["body_quat"][self._base], turn)
+            arrays["body_quat"][self._base] = quaternion
+
+
+class ActionDelay:
+    """Commands of N simulations on their way to the drives."""
+
+    def __init__(self, simulations: int, actions: int, longest: int):
+        """Starts without delay; `longest` bounds the delays, control steps."""
+        self._past = np.zeros((longest + 1, simulations, actions))
+        self._delay = np.zeros(simulations, dtype=int)
+
+    def restart(self, index: int, delay: int) -> None:
+        """Begins an episode of one simulation, with drives at rest."""
+        self._past[:, index] = 0.0
+        self._delay[index] = delay
+
+    def pass_on(self, action: np.ndarray) -> np.ndarray:
+        """Takes the action (N, A) of this step, returns the one that takes effect."""
+        if len(self._past) == 1:
+            return action
+        self._past = np.roll(self._past, 1, axis=0)
+        self._past[0] = action
+        return self._past[self._delay, np.arange(len(self._delay))]

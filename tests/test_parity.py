@@ -1,0 +1,165 @@
+"""The batched path against as many composer environments, bit for bit."""
+
+import numpy as np
+import pytest
+
+from cathsim_dmc import suite
+from cathsim_dmc.anatomy import arch
+from cathsim_dmc.anatomy.phantom import Goal
+from cathsim_dmc.simulation.batch import BatchSimulation
+
+SIMULATIONS = 3
+STEPS = 60
+SEED = 10
+NUMBERS = ("internal", "tracking", "goal", "force")
+PICTURES = ("image", "sequential", "segmentation", "tracking_2d")
+NOISY_BIPLANE = {"biplane": "LATERAL", "noise": True, "size": (48, 64), "roadmap": 0.4}
+
+
+@pytest.fixture(scope="module")
+def anatomy():
+    return arch.load("type1")
+
+
+def make(anatomy, seed, **options):
+    options = {"phantom": anatomy, "goal": "bca", "random": seed, **options}
+    return suite.load("cathsim", "navigate", options)
+
+
+class Pair:
+    """A batch and the composer environments with the same seeds."""
+
+    def __init__(self, anatomy, **options):
+        self.environments = [
+            make(anatomy, SEED + i, **options) for i in range(SIMULATIONS)
+        ]
+        self.batch = BatchSimulation(
+            make(anatomy, 0, **options).task, SIMULATIONS, seeds=SEED, num_threads=2
+        )
+
+    def reset(self):
+        self.timesteps = [each.reset() for each in self.environments]
+        self.compare_observations(self.batch.reset())
+
+    def reset_some(self, indices):
+        observation = self.batch.reset(np.array(indices))
+        for i in indices:
+            self.timesteps[i] = self.environments[i].reset()
+        self.compare_observations(observation)
+
+    def step(self, action):
+        step = self.batch.step(action)
+        self.timesteps = [
+            each.step(row) for each, row in zip(self.environments, action, strict=True)
+        ]
+        self.compare_observations(step.observation)
+        for i, timestep in enumerate(self.timesteps):
+            task = self.environments[i].task
+            assert step.outcome.reward[i] == timestep.reward
+            assert (step.terminated[i] or step.truncated[i]) == timestep.last()
+            assert step.terminated[i] == (timestep.discount == 0)
+            for name in ("sum", "max", "peak_sum", "peak_max"):
+                batched = getattr(step.wall_force, name)[i]
+                assert batched == getattr(task.wall_force, name)
+            assert step.readings.push_force[i] == task.readings.push_force
+        return step
+
+    def compare_observations(self, observation):
+        for i, timestep in enumerate(self.timesteps):
+            assert list(observation) == list(timestep.observation)
+            for key, value in observation.items():
+                other = timestep.observation[key]
+                assert value[i].dtype == other.dtype
+                np.testing.assert_array_equal(value[i], other, err_msg=f"{key} of {i}")
+
+
+def actions(steps, seed=0):
+    """Random steering while pushing on, which meets the wall."""
+    random = np.random.default_rng(seed)
+    rows = random.uniform(-1, 1, (steps, SIMULATIONS, 21))
+    rows[..., -1] = 1.0
+    return rows
+
+
+def test_episodes_are_equal_bit_for_bit(anatomy):
+    pair = Pair(anatomy, observation=[*NUMBERS, *PICTURES], max_steps=STEPS)
+    touched = False
+    for episode in range(2):
+        pair.reset()
+        for action in actions(STEPS, episode):
+            step = pair.step(action)
+            touched |= bool((step.wall_force.sum > 0).any())
+        assert step.truncated.all()
+    assert touched
+
+
+def test_partial_resets_are_equal(anatomy):
+    pair = Pair(
+        anatomy, observation=["internal", "sequential"], fluoroscopy=NOISY_BIPLANE
+    )
+    pair.reset()
+    for index, action in enumerate(actions(24)):
+        pair.step(action)
+        if index % 6 == 5:
+            pair.reset_some([index // 6 % SIMULATIONS])
+
+
+def test_randomised_episodes_are_equal(anatomy):
+    pair = Pair(
+        anatomy,
+        observation=[*NUMBERS, *PICTURES],
+        fluoroscopy=NOISY_BIPLANE,
+        randomisation=True,
+        reward="path",
+    )
+    seen = []
+    for episode in range(2):
+        pair.reset()
+        seen.append(pair.batch.meaning.goal.copy())
+        for index, action in enumerate(actions(30, episode)):
+            pair.step(action)
+            if index == 15:
+                pair.reset_some([2, 0])
+    # It is randomised indeed: no two goals of an episode and none of two are alike.
+    assert len(np.unique(np.concatenate(seen), axis=0)) == 2 * SIMULATIONS
+
+
+def test_success_ends_both(anatomy):
+    # A goal in the aorta ahead of the tip, which a straight push reaches.
+    aorta = anatomy.tree.vessel("aorta").centreline
+    start = make(anatomy, 0, observation="tracking").task.placement
+    ahead = aorta.project(start.start + 0.02 * start.direction).arc_length
+    goal = Goal("ahead", "aorta", aorta.at(ahead).position, float(ahead))
+    pair = Pair(anatomy, goal=goal, observation="tracking")
+    pair.reset()
+    push = np.zeros((SIMULATIONS, 21))
+    push[:, -1] = 1.0
+    for _ in range(20):
+        step = pair.step(push)
+        if step.terminated.any():
+            break
+    ended = step.terminated
+    assert ended.any()
+    np.testing.assert_array_equal(step.outcome.reward[ended], 10.0)
+    pair.reset_some(np.flatnonzero(ended))
+
+
+@pytest.mark.parametrize("noise", [False, True])
+def test_one_policy_on_images_runs_alike(anatomy, noise):
+    """A policy that looks at the image steers both paths along the same way."""
+
+    def steer(image):
+        rows = image.astype(np.float64).mean(axis=(-1, -2)) - image.mean()
+        action = np.ones((*image.shape[:-3], 21))
+        action[..., :20] = np.clip(rows[..., 20:40] / 8, -1, 1)
+        return action
+
+    pair = Pair(anatomy, observation="image", fluoroscopy={"noise": noise, "size": 64})
+    pair.reset()
+    observation = {
+        "image": np.stack([t.observation["image"] for t in pair.timesteps])
+    }
+    for _ in range(20):
+        observation = pair.step(steer(observation["image"])).observation
+    heads = [each.task.readings.head for each in pair.environments]
+    np.testing.assert_array_equal(pair.batch.readings.head, heads)
