@@ -1,0 +1,421 @@
+"""Soak: long episodes under harsh policies, with a record of everything that breaks.
+
+    python benchmarks/soak.py --out runs/soak          # 100 episodes of 2,000 steps
+    python benchmarks/soak.py --out runs/soak --quick  # 16 episodes of 200 steps
+
+Every finished episode is one line of OUT/episodes.jsonl, written as soon as its batch
+ends; the same command goes on with the episodes that are missing. The report is
+printed and left in OUT/soak.json and OUT/soak.md. Exit code 1: a bound was broken.
+
+What is measured
+- penetration: depth of the device in the wall pieces, of every contact in every
+  physics substep (MuJoCo's `dist`). Percentiles are those of the deepest contact of
+  a substep, over the substeps that have a contact.
+- wall force: magnitude of every single contact in every substep, and their sum.
+- excess: every control step, by how much the device stands out of the true lumen (or
+  of the sheath), at points 1 mm apart along its axis: `analysis.containment`. It adds
+  what the wall pieces stay behind the lumen to the penetration.
+- escape: the excess exceeds the device's diameter, so that a part of the device is
+  wholly outside; and, to be sure, the end of the episode without a wall contact there.
+- warnings: MuJoCo's own counters.
+
+A goal does not end an episode here: its radius is tiny.
+"""
+
+import argparse
+import dataclasses
+import itertools
+import json
+import os
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+from scipy.stats import qmc
+
+from cathsim_dmc import suite
+from cathsim_dmc.analysis.containment import Containment
+from cathsim_dmc.simulation.batch import BatchSimulation
+from cathsim_dmc.tasks import forces
+
+TASKS = ("type1_bca", "type1_lcca", "type2_bca", "type2_lcca")
+EPISODES, STEPS = 100, 2000
+QUICK_EPISODES, QUICK_STEPS = 16, 200
+TINY_GOAL = 1e-9  # m
+
+# Bounds.
+PENETRATION_P99 = 0.3e-3  # m
+PENETRATION_MAX = 1e-3  # m
+FORCE_MAX = 10.0  # N
+
+# Penetrations are counted in bins, so that percentiles of all episodes together come
+# from their lines alone.
+BIN = 1e-6  # m
+
+# Control steps between two changes of the action, where a policy changes it.
+LONGEST_HOLD = 100
+
+
+# Policies: (control steps, seed) -> actions (T, 21) in [-1, 1].
+
+
+def halton_noise(steps: int, size: int, seed: int) -> np.ndarray:
+    """Low-discrepancy noise, new at every control step."""
+    return 2 * qmc.Halton(size, seed=seed).random(steps) - 1
+
+
+def full_push(steps: int, size: int, seed: int) -> np.ndarray:
+    """Forward at full speed to the end, the tip held: straight, or curled anyhow."""
+    random = np.random.RandomState(seed)
+    tip = random.choice([-1.0, 1.0], size=size) * random.choice([0.0, 0.5, 1.0])
+    tip[-1] = 1.0
+    return np.tile(tip, (steps, 1))
+
+
+def bang_bang(steps: int, size: int, seed: int) -> np.ndarray:
+    """All motors of the tip from one stop to the other, forward all the time.
+
+    The period differs between seeds; the shortest is one control step.
+    """
+    random = np.random.RandomState(seed)
+    hold = (1, 2, 5, 25)[seed % 4]
+    sign = np.where(np.arange(steps) // hold % 2, -1.0, 1.0)
+    action = sign[:, None] * random.choice([-1.0, 1.0], size=size)
+    action[:, -1] = 1.0
+    return action
+
+
+def reversals(steps: int, size: int, seed: int) -> np.ndarray:
+    """Push and pull at full speed in turn, with a new stop of the tip each time."""
+    random = np.random.RandomState(seed)
+    action = np.empty((steps, size))
+    start, direction = 0, 1.0
+    while start < steps:
+        stop = start + random.randint(1, LONGEST_HOLD)
+        action[start:stop] = random.choice([-1.0, 1.0], size=size)
+        action[start:stop, -1] = direction
+        start, direction = stop, -direction
+    return action
+
+
+POLICIES: dict[str, Callable[[int, int, int], np.ndarray]] = {
+    "halton": halton_noise,
+    "push": full_push,
+    "bang_bang": bang_bang,
+    "reversals": reversals,
+}
+
+
+@dataclasses.dataclass(frozen=True)
+class Episode:
+    """One episode to run; `seed` is that of its start and of its policy."""
+
+    number: int
+    task: str
+    policy: str
+    seed: int
+
+
+def plan(episodes: int) -> list[Episode]:
+    """Spreads episodes evenly over tasks and policies."""
+    pairs = itertools.cycle(itertools.product(POLICIES, TASKS))
+    counts: dict[tuple[str, str], int] = {}
+    result = []
+    for number, (policy, task) in zip(range(episodes), pairs, strict=False):
+        repeat = counts.get((policy, task), 0)
+        counts[policy, task] = repeat + 1
+        result.append(Episode(number, task, policy, repeat))
+    return result
+
+
+@dataclasses.dataclass
+class Peak:
+    """A largest value of each simulation, and the control step it fell into."""
+
+    value: np.ndarray
+    step: np.ndarray
+
+    @classmethod
+    def none(cls, size: int) -> "Peak":
+        return cls(np.zeros(size), np.full(size, -1))
+
+    def update(self, value: np.ndarray, step: int) -> None:
+        larger = value > self.value
+        self.value[larger] = value[larger]
+        self.step[larger] = step
+
+
+def run(simulation: BatchSimulation, episodes: list[Episode], steps: int) -> list[dict]:
+    """Runs the episodes, all of one task, side by side.
+
+    Args:
+      simulation: of the task, with as many simulations as there are episodes.
+      episodes: what to run.
+      steps: control steps.
+
+    Returns:
+      One row for each episode.
+    """
+    size = len(episodes)
+    simulation.seed([episode.seed for episode in episodes])
+    actions = np.stack(
+        [
+            POLICIES[episode.policy](steps, simulation.num_actions, episode.seed)
+            for episode in episodes
+        ],
+        axis=1,
+    )
+    containment = Containment.of(simulation.task)
+    simulation.reset()
+    warnings = np.zeros(size, dtype=int)
+    before = simulation.batch.warning.reshape(size, -1).copy()
+    excess, force, total = (Peak.none(size) for _ in range(3))
+    penetration, overflow = Peak.none(size), Peak.none(size)
+    histograms: list[dict[int, int]] = [{} for _ in episodes]
+    force_sum = np.zeros(size)
+    errors = np.full(size, -1)
+    insertion = np.zeros(size)
+    for step in range(steps):
+        result = simulation.step(actions[step])
+        after = simulation.batch.warning.reshape(size, -1).copy()
+        warnings += (after != before).any(-1)
+        before = after
+        errors[result.physics_error & (errors < 0)] = step
+        rows = simulation.sensor_rows[..., simulation.task.layout.wall_contacts]
+        contacts = forces.Contacts.from_sensor(rows)
+        deepest = contacts.penetration.max(-1)
+        touching = contacts.present.any(-1)
+        for index, histogram in enumerate(histograms):
+            for depth in deepest[index, touching[index]]:
+                bin_ = max(0, int(depth / BIN))
+                histogram[bin_] = histogram.get(bin_, 0) + 1
+        penetration.update(deepest.max(-1), step)
+        force.update(contacts.magnitude.max((-1, -2)), step)
+        total.update(contacts.magnitude.sum(-1).max(-1), step)
+        overflow.update(contacts.found.max(-1), step)
+        excess.update(containment.largest_excess(result.readings.centreline), step)
+        force_sum += contacts.magnitude.sum(-1).mean(-1)
+        insertion = np.maximum(insertion, result.readings.insertion)
+    radius = containment.device_radius
+    return [
+        {
+            **dataclasses.asdict(episode),
+            "steps": steps,
+            "warnings": int(warnings[index]),
+            "physics_error_step": int(errors[index]),
+            "escaped": bool(excess.value[index] > 2 * radius),
+            "excess_max": float(excess.value[index]),
+            "excess_step": int(excess.step[index]),
+            "penetration_max": float(penetration.value[index]),
+            "penetration_step": int(penetration.step[index]),
+            "force_max": float(force.value[index]),
+            "force_step": int(force.step[index]),
+            "force_sum_max": float(total.value[index]),
+            "force_sum_mean": float(force_sum[index] / steps),
+            "contacts_max": int(overflow.value[index]),
+            "insertion_max": float(insertion[index]),
+            "penetration_histogram": histograms[index],
+        }
+        for index, episode in enumerate(episodes)
+    ]
+
+
+# Results.
+
+
+def read_rows(path: Path, steps: int) -> list[dict]:
+    """Rows of a file that this program wrote; a torn last line is dropped.
+
+    Raises:
+      ValueError: if they are of another number of steps.
+    """
+    if not path.is_file():
+        return []
+    rows = []
+    for line in path.read_text().splitlines():
+        try:
+            rows.append(json.loads(line))
+        except json.JSONDecodeError:
+            continue
+    if any(row["steps"] != steps for row in rows):
+        raise ValueError(
+            f"{path} holds episodes of {rows[0]['steps']} steps, not {steps}; give "
+            "another --out, or delete it"
+        )
+    return rows
+
+
+def append_rows(path: Path, rows: list[dict]) -> None:
+    """Adds rows in one step: a reader finds all of them or none."""
+    old = path.read_text() if path.is_file() else ""
+    temporary = path.with_suffix(".writing")
+    temporary.write_text(old + "".join(json.dumps(row) + "\n" for row in rows))
+    os.replace(temporary, path)
+
+
+def percentile(rows: list[dict], percent: float) -> float:
+    """Percentile of the penetration of all rows together, m (0 without contact)."""
+    counts: dict[int, int] = {}
+    for row in rows:
+        for key, count in row["penetration_histogram"].items():
+            counts[int(key)] = counts.get(int(key), 0) + count
+    total = sum(counts.values())
+    seen = 0
+    for bin_ in sorted(counts):
+        seen += counts[bin_]
+        if seen >= total * percent / 100:
+            return (bin_ + 1) * BIN
+    return 0.0
+
+
+def summarise(rows: list[dict]) -> dict:
+    """Figures of a set of episodes; lengths in mm, forces in N."""
+    return {
+        "episodes": len(rows),
+        "warnings": sum(row["warnings"] for row in rows),
+        "escapes": sum(row["escaped"] for row in rows),
+        "excess_max_mm": 1e3 * max(row["excess_max"] for row in rows),
+        "penetration_p99_mm": 1e3 * percentile(rows, 99),
+        "penetration_max_mm": 1e3 * max(row["penetration_max"] for row in rows),
+        "force_max": max(row["force_max"] for row in rows),
+        "force_sum_max": max(row["force_sum_max"] for row in rows),
+        "force_sum_mean": float(np.mean([row["force_sum_mean"] for row in rows])),
+        "contacts_max": max(row["contacts_max"] for row in rows),
+    }
+
+
+def report(rows: list[dict]) -> dict:
+    """Checks and figures, as every measuring command reports them."""
+    total = summarise(rows)
+
+    def check(name, value, unit, bound):
+        return {
+            "name": name,
+            "value": value,
+            "unit": unit,
+            "bound": f"<= {bound:g}",
+            "passed": bool(value <= bound),
+        }
+
+    def worst(key):
+        row = max(rows, key=lambda row: row[f"{key}_max"])
+        names = ("task", "policy", "seed", f"{key}_max", f"{key}_step")
+        return {name: row[name] for name in names}
+
+    groups = [
+        {
+            "task": task,
+            "policy": policy,
+            **summarise(
+                [r for r in rows if (r["task"], r["policy"]) == (task, policy)]
+            ),
+        }
+        for policy, task in sorted({(row["policy"], row["task"]) for row in rows})
+    ]
+    return {
+        "checks": [
+            check("MuJoCo warnings", total["warnings"], "", 0),
+            check("escapes", total["escapes"], "", 0),
+            check(
+                "penetration p99",
+                total["penetration_p99_mm"],
+                "mm",
+                PENETRATION_P99 * 1e3,
+            ),
+            check(
+                "penetration max",
+                total["penetration_max_mm"],
+                "mm",
+                PENETRATION_MAX * 1e3,
+            ),
+            check("largest wall force", total["force_max"], "N", FORCE_MAX),
+            check(
+                "contacts in the sensor", total["contacts_max"], "", sensor_capacity()
+            ),
+        ],
+        "total": total,
+        "worst": {key: worst(key) for key in ("penetration", "force", "excess")},
+        "groups": groups,
+    }
+
+
+def sensor_capacity() -> int:
+    """Contacts that the wall sensor can report."""
+    from cathsim_dmc.entities import phantom
+
+    return phantom.MAX_CONTACTS
+
+
+def markdown(result: dict) -> str:
+    """The report as tables."""
+    lines = [
+        "| check | measured | bound | |",
+        "|---|---|---|---|",
+        *(
+            f"| {c['name']} | {c['value']:.3g} {c['unit']} | {c['bound']} {c['unit']} "
+            f"| {'pass' if c['passed'] else '**FAIL**'} |"
+            for c in result["checks"]
+        ),
+        "",
+        "| task | policy | episodes | penetration p99 / max, mm | excess max, mm "
+        "| largest force, N | mean sum, N | contacts |",
+        "|---|---|---|---|---|---|---|---|",
+    ]
+    for group in [*result["groups"], {"task": "all", "policy": "", **result["total"]}]:
+        lines.append(
+            f"| {group['task']} | {group['policy']} | {group['episodes']} "
+            f"| {group['penetration_p99_mm']:.3f} / {group['penetration_max_mm']:.3f} "
+            f"| {group['excess_max_mm']:.2f} | {group['force_max']:.2f} "
+            f"| {group['force_sum_mean']:.3f} | {group['contacts_max']} |"
+        )
+    return "\n".join(lines) + "\n"
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--out", type=Path, default=Path("runs/soak"))
+    parser.add_argument("--quick", action="store_true")
+    parser.add_argument("--episodes", type=int)
+    parser.add_argument("--steps", type=int)
+    parser.add_argument("--threads", type=int, default=0, help="0: one per core")
+    parser.add_argument("--together", type=int, default=8, help="episodes side by side")
+    parser.add_argument("--json", action="store_true")
+    options = parser.parse_args()
+    episodes = options.episodes or (QUICK_EPISODES if options.quick else EPISODES)
+    steps = options.steps or (QUICK_STEPS if options.quick else STEPS)
+    options.out.mkdir(parents=True, exist_ok=True)
+    path = options.out / "episodes.jsonl"
+    wanted = plan(episodes)
+    done = {row["number"] for row in read_rows(path, steps)}
+    for task in TASKS:
+        missing = [e for e in wanted if e.task == task and e.number not in done]
+        for first in range(0, len(missing), options.together):
+            part = missing[first : first + options.together]
+            start = time.perf_counter()
+            environment = suite.load(
+                suite.DOMAIN, task, task_kwargs={"goal_radius": TINY_GOAL}
+            )
+            simulation = BatchSimulation(
+                environment.task, len(part), num_threads=options.threads
+            )
+            append_rows(path, run(simulation, part, steps))
+            print(
+                f"{task}: {len(part)} episodes in {time.perf_counter() - start:.0f} s",
+                file=sys.stderr,
+            )
+    rows = [row for row in read_rows(path, steps) if row["number"] < episodes]
+    result = report(rows)
+    (options.out / "soak.json").write_text(json.dumps(result, indent=2) + "\n")
+    (options.out / "soak.md").write_text(markdown(result))
+    if options.json:
+        print(json.dumps(result, indent=2))
+    else:
+        print(markdown(result))
+        print(json.dumps(result["worst"], indent=2))
+    return 0 if all(check["passed"] for check in result["checks"]) else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,99 @@
+"""Whether a device is where it must be: in the lumen or in the introducer sheath."""
+
+import dataclasses
+
+import mujoco
+import numpy as np
+
+from cathsim_dmc.anatomy import phantom as anatomies
+
+# Spacing of the points along the device at which it is measured, m: about a device
+# radius, so that nothing the size of the device is missed between two of them.
+SPACING = 1e-3
+
+
+def points_along(centreline: np.ndarray, spacing: float = SPACING) -> np.ndarray:
+    """Points along the links of a device.
+
+    Args:
+      centreline: (..., L + 1, 3), proximal ends of the links and the head, m.
+      spacing: largest distance between neighbouring points, m.
+
+    Returns:
+      (..., P, 3): both ends of every link and points evenly between them.
+
+    Raises:
+      ValueError: if there is no link, or the spacing is not positive.
+    """
+    centreline = np.asarray(centreline, dtype=np.float64)
+    if centreline.ndim < 2 or centreline.shape[-2] < 2 or centreline.shape[-1] != 3:
+        raise ValueError(
+            f"centreline has shape {centreline.shape}; give (..., L + 1, 3), L >= 1"
+        )
+    if not spacing > 0:
+        raise ValueError(f"spacing is {spacing} m; it must be > 0")
+    lengths = np.linalg.norm(np.diff(centreline, axis=-2), axis=-1)
+    # Links are rigid, so the first of a batch tells how all are divided.
+    counts = np.ceil(lengths.reshape(-1, lengths.shape[-1])[0] / spacing)
+    counts = np.maximum(counts.astype(int), 1)
+    link = np.repeat(np.arange(len(counts)), counts)
+    along = np.concatenate([np.arange(count) / count for count in counts])[:, None]
+    points = (1 - along) * centreline[..., link, :] + along * (
+        centreline[..., link + 1, :]
+    )
+    return np.concatenate([points, centreline[..., -1:, :]], axis=-2)
+
+
+@dataclasses.dataclass(frozen=True)
+class Containment:
+    """Lumen and sheath that hold a device.
+
+    Attributes:
+      anatomy: lumen and inlet.
+      device_radius: m.
+      bore_half_width: half the inner width of the sheath's square bore, m.
+      bore_sides: (2, 3), unit normals of the two pairs of sides, world frame.
+    """
+
+    anatomy: anatomies.Anatomy
+    device_radius: float
+    bore_half_width: float
+    bore_sides: np.ndarray
+
+    @classmethod
+    def of(cls, task) -> "Containment":
+        """Containment of the device of a `tasks.navigation.Navigation`."""
+        matrix = np.empty(9)
+        mujoco.mju_quat2Mat(matrix, task.placement.quaternion)
+        return cls(
+            task.anatomy,
+            task.catheter.device.outer_radius,
+            task.sheath.bore_half_width,
+            matrix.reshape(3, 3).T[:2],
+        )
+
+    def excess(self, points: np.ndarray) -> np.ndarray:
+        """How far the device stands out of the lumen and of the sheath, m.
+
+        In the lumen it is the device's radius less the depth of the point in the true
+        lumen (not in the wall pieces, which approximate it). Before the inlet it is
+        the distance by which the device's side lies beyond that of the bore. The
+        smaller of the two counts: a device that is in neither has nowhere to hide.
+
+        Args:
+          points: (..., 3) on the axis of the device, m, world frame.
+
+        Returns:
+          (...), m; at most 0 where the device is inside.
+        """
+        points = np.asarray(points, dtype=np.float64)
+        in_lumen = self.device_radius - self.anatomy.depth(points)
+        offset = points - self.anatomy.inlet.position
+        lateral = np.abs(offset @ self.bore_sides.T).max(-1)
+        in_sheath = lateral + self.device_radius - self.bore_half_width
+        before = offset @ self.anatomy.inlet.direction <= 0
+        return np.where(before, np.minimum(in_lumen, in_sheath), in_lumen)
+
+    def largest_excess(self, centreline: np.ndarray) -> np.ndarray:
+        """Largest excess (...) along a device's centreline (..., L + 1, 3), m."""
+        return self.excess(points_along(centreline)).max(-1)
