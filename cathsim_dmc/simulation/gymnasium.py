@@ -1,0 +1,310 @@
+"""The tasks as Gymnasium environments: one simulation, or many on the batched path."""
+
+from typing import Any
+
+import gymnasium
+import numpy as np
+from dm_env import specs
+
+from cathsim_dmc import suite
+from cathsim_dmc.imaging import angiograph
+from cathsim_dmc.simulation import batch
+from cathsim_dmc.tasks import cannulation
+
+RENDER_MODES = ("rgb_array",)
+_MOST_SEED = 2**32  # first seed that numpy's RandomState does not take
+
+# Quantities of `info`, beside "success" and "physics_error"; m and N.
+INFO = (
+    "distance",
+    "insertion",
+    "push_force",
+    "wall_force_sum",
+    "wall_force_max",
+    "wall_force_peak",
+)
+
+
+def space(spec: specs.Array, dtype: np.dtype) -> gymnasium.spaces.Box:
+    """Box of an array; numbers as `dtype`, pictures as they are."""
+    if spec.dtype == np.uint8:
+        return gymnasium.spaces.Box(0, 255, spec.shape, np.uint8)
+    if isinstance(spec, specs.BoundedArray):
+        low, high = (
+            np.broadcast_to(bound, spec.shape).astype(dtype)
+            for bound in (spec.minimum, spec.maximum)
+        )
+        return gymnasium.spaces.Box(low, high, spec.shape, dtype)
+    return gymnasium.spaces.Box(-np.inf, np.inf, spec.shape, dtype)
+
+
+def _spaces(environment, dtype: np.dtype):
+    observation = gymnasium.spaces.Dict(
+        {
+            key: space(spec, dtype)
+            for key, spec in environment.observation_spec().items()
+        }
+    )
+    return observation, space(environment.action_spec(), dtype)
+
+
+def _float_type(dtype: str) -> np.dtype:
+    if np.dtype(dtype) not in (np.float32, np.float64):
+        raise ValueError(f"dtype is {dtype!r}; give float32 or float64")
+    return np.dtype(dtype)
+
+
+def _converted(observation, dtype: np.dtype) -> dict[str, np.ndarray]:
+    return {
+        key: value.copy() if value.dtype == np.uint8 else value.astype(dtype)
+        for key, value in observation.items()
+    }
+
+
+def _words(seed: int) -> int | list[int]:
+    """A seed of any size as `RandomState.seed` takes it; small ones as they are."""
+    if seed < _MOST_SEED:
+        return seed
+    words = []
+    while seed:
+        seed, word = divmod(seed, _MOST_SEED)
+        words.append(word)
+    return words
+
+
+def _numbers(state, wall, outcome) -> dict[str, Any]:
+    values = (
+        outcome.distance,
+        state.insertion,
+        state.push_force,
+        wall.sum,
+        wall.max,
+        wall.peak_max,
+    )
+    return dict(zip(INFO, values, strict=True))
+
+
+class CathSimEnv(gymnasium.Env):
+    """One simulation of a task.
+
+    `reset(seed=s)` starts the same episode as the suite's `random=s`. The observation
+    is a dictionary, whatever it holds. `terminated` is success or, with
+    `info["physics_error"]`, divergence; `truncated` is the end of the time.
+    """
+
+    metadata = {
+        "render_modes": list(RENDER_MODES),
+        "render_fps": round(1 / cannulation.CONTROL_TIMESTEP),
+    }
+
+    def __init__(
+        self,
+        task: str = "type1_bca",
+        render_mode: str | None = None,
+        dtype: str = "float32",
+        **task_kwargs: Any,
+    ):
+        """Loads the task.
+
+        Args:
+          task: of `suite.SUITE`.
+          render_mode: "rgb_array" renders fluoroscopy, which needs no OpenGL.
+          dtype: of the numbers observed and of the action, float32 or float64.
+          **task_kwargs: options of the task, such as `observation`.
+        """
+        if render_mode not in (None, *RENDER_MODES):
+            raise ValueError(
+                f"render_mode is {render_mode!r}; give None or "
+                f"{', '.join(map(repr, RENDER_MODES))}"
+            )
+        self.render_mode = render_mode
+        self._dtype = _float_type(dtype)
+        self._environment = suite.load(suite.DOMAIN, task, task_kwargs)
+        self.observation_space, self.action_space = _spaces(
+            self._environment, self._dtype
+        )
+        self._renderer = None
+        self._ended = True
+        self._closed = False
+
+    def reset(self, *, seed: int | None = None, options: dict | None = None):
+        """Starts an episode; see `gymnasium.Env.reset`. `options` has no meaning."""
+        super().reset(seed=seed)
+        if seed is not None:
+            self._environment.random_state.seed(_words(seed))
+        timestep = self._environment.reset()
+        self._ended = False
+        return _converted(timestep.observation, self._dtype), self._info(False)
+
+    def step(self, action: np.ndarray):
+        """Advances by one control step; see `gymnasium.Env.step`."""
+        if self._ended:
+            raise gymnasium.error.ResetNeeded(
+                "the episode has ended, or none has begun; call reset()"
+            )
+        timestep = self._environment.step(np.asarray(action, dtype=np.float64))
+        self._ended = timestep.last()
+        terminated = self._ended and timestep.discount == 0
+        return (
+            _converted(timestep.observation, self._dtype),
+            float(timestep.reward),
+            terminated,
+            self._ended and not terminated,
+            self._info(terminated),
+        )
+
+    def _info(self, terminated: bool) -> dict[str, Any]:
+        task = self._environment.task
+        outcome = task.meaning.outcome(task.readings.head)
+        numbers = _numbers(task.readings, task.wall_force, outcome)
+        success = task.termination == "success"
+        return {
+            **{key: float(value) for key, value in numbers.items()},
+            "success": success,
+            # The task ends an episode by success or time; composer by divergence.
+            "physics_error": terminated and not success,
+        }
+
+    def render(self) -> np.ndarray | None:
+        """Fluoroscopy (rows, columns, 3) uint8, two planes side by side."""
+        if self.render_mode is None:
+            gymnasium.logger.warn(
+                'render() without a render_mode; make the environment with "rgb_array"'
+            )
+            return None
+        if self._ended and self._environment.task.readings is None:
+            raise gymnasium.error.ResetNeeded("there is nothing to see before reset()")
+        return fluoroscopy_frame(self._environment.task, self._machine())
+
+    def _machine(self) -> angiograph.Angiograph:
+        if self._renderer is None:
+            task = self._environment.task
+            surface = task.anatomy.surface
+            self._renderer = angiograph.Angiograph(
+                surface.vertices, surface.faces, task.config.fluoroscopy
+            )
+        return self._renderer
+
+    @property
+    def environment(self):
+        """The composer environment."""
+        return self._environment
+
+    def close(self) -> None:
+        """Frees the simulator; closing twice does nothing."""
+        if not self._closed:
+            self._environment.close()
+        self._closed = True
+
+
+def fluoroscopy_frame(task, machine: angiograph.Angiograph) -> np.ndarray:
+    """The device of a task before a machine, (rows, columns, 3) uint8, no noise."""
+    image = angiograph.render(
+        [machine.planes()],
+        task.readings.centreline[None],
+        task.catheter.device.outer_radius,
+    )[0]
+    row = np.concatenate(list(np.moveaxis(image, -1, 0)), axis=1)
+    return np.repeat(row[..., None], 3, axis=-1)
+
+
+class CathSimVectorEnv(gymnasium.vector.VectorEnv):
+    """N simulations of a task on the batched path.
+
+    An episode that ends is followed by the next one in the same step; its last
+    observation and information are in `infos["final_obs"]` and `infos["final_info"]`.
+    """
+
+    metadata = {
+        **CathSimEnv.metadata,
+        "autoreset_mode": gymnasium.vector.AutoresetMode.SAME_STEP,
+    }
+
+    def __init__(
+        self,
+        num_envs: int = 1,
+        task: str = "type1_bca",
+        num_threads: int = 0,
+        dtype: str = "float32",
+        render_mode: str | None = None,
+        **task_kwargs: Any,
+    ):
+        """Starts the simulations.
+
+        Args:
+          num_envs: N.
+          task: of `suite.SUITE`.
+          num_threads: worker threads, 0 for one per core.
+          dtype: of the numbers observed and of the action.
+          render_mode: None; one simulation renders (`CathSimEnv`).
+          **task_kwargs: options of the task.
+        """
+        if render_mode is not None:
+            raise ValueError(
+                f"render_mode is {render_mode!r}; many simulations do not render, "
+                'make one with gymnasium.make(..., render_mode="rgb_array")'
+            )
+        self.render_mode = None
+        self._dtype = _float_type(dtype)
+        environment = suite.load(suite.DOMAIN, task, task_kwargs)
+        self.num_envs = num_envs
+        self.single_observation_space, self.single_action_space = _spaces(
+            environment, self._dtype
+        )
+        many = gymnasium.vector.utils.batch_space
+        self.observation_space = many(self.single_observation_space, num_envs)
+        self.action_space = many(self.single_action_space, num_envs)
+        self._simulation = batch.BatchSimulation(
+            environment.task,
+            num_envs,
+            num_threads=num_threads,
+            seeds=np.random.SeedSequence().generate_state(num_envs).tolist(),
+        )
+
+    def reset(self, *, seed: int | list[int] | None = None, options=None):
+        """Starts all episodes; a seed is that of the first, the others count up."""
+        super().reset(seed=seed if np.ndim(seed) == 0 else seed[0])
+        if seed is not None:
+            if np.ndim(seed) == 0:
+                seed = [seed + i for i in range(self.num_envs)]
+            self._simulation.seed([_words(each) for each in seed])
+        observation = self._simulation.reset()
+        return _converted(observation, self._dtype), self._info(None)
+
+    def step(self, actions: np.ndarray):
+        """Advances all; see `gymnasium.vector.VectorEnv.step`."""
+        step = self._simulation.step(np.asarray(actions, dtype=np.float64))
+        observation, info = step.observation, self._info(step)
+        ended = step.terminated | step.truncated
+        if ended.any():
+            final = _converted(observation, self._dtype)
+            observation = self._simulation.reset(np.flatnonzero(ended))
+            info = {
+                **self._info(None),
+                "final_obs": final,
+                "_final_obs": ended,
+                "final_info": info,
+                "_final_info": ended,
+            }
+        return (
+            _converted(observation, self._dtype),
+            step.outcome.reward.copy(),
+            step.terminated.copy(),
+            step.truncated.copy(),
+            info,
+        )
+
+    def _info(self, step: batch.Step | None) -> dict[str, np.ndarray]:
+        simulation = self._simulation
+        if step is None:
+            outcome = simulation.meaning.outcome(simulation.readings.head)
+            error = np.zeros(self.num_envs, dtype=bool)
+        else:
+            outcome, error = step.outcome, step.physics_error
+        info = _numbers(simulation.readings, simulation.wall_force, outcome)
+        return {**info, "success": outcome.success, "physics_error": error}
+
+    @property
+    def simulation(self) -> batch.BatchSimulation:
+        """The simulations underneath."""
+        return self._simulation

@@ -1,0 +1,161 @@
+"""The tasks as Gymnasium environments."""
+
+import subprocess
+import sys
+import warnings
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+gymnasium = pytest.importorskip("gymnasium")
+from gymnasium.utils.env_checker import check_env  # noqa: E402
+
+import cathsim_dmc.gym  # noqa: E402
+from cathsim_dmc import suite  # noqa: E402
+from cathsim_dmc.simulation.gymnasium import CathSimEnv  # noqa: E402
+
+TASK = "cathsim/type1_bca-v0"
+
+
+def run(env, steps, seed):
+    env.action_space.seed(seed)
+    rows = [env.reset(seed=seed)[0]]
+    rewards = []
+    for _ in range(steps):
+        observation, reward, *_ = env.step(env.action_space.sample())
+        rows.append(observation)
+        rewards.append(reward)
+    return rows, rewards
+
+
+def test_every_task_has_an_id():
+    assert {cathsim_dmc.gym.task_of(name) for name in cathsim_dmc.gym.IDS} == set(
+        suite.SUITE
+    )
+    assert set(cathsim_dmc.gym.IDS) <= set(gymnasium.registry)
+    with pytest.raises(ValueError, match="cathsim/type1_bca-v0"):
+        cathsim_dmc.gym.task_of("cathsim/none-v0")
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {},
+        {"observation": ["image", "tracking_2d", "force"], "randomisation": True},
+        {"dtype": "float64", "observation": "segmentation"},
+    ],
+)
+def test_check_env_has_nothing_to_say(options):
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        # Numbers have no bounds of their own; Gymnasium would like some.
+        warnings.filterwarnings("ignore", message=".*infinity.*")
+        env = gymnasium.make(TASK, render_mode="rgb_array", **options)
+        check_env(env.unwrapped)
+    env.close()
+
+
+def test_a_seed_is_the_suites_seed():
+    env = gymnasium.make(TASK, observation="internal", dtype="float64")
+    rows, _ = run(env, 5, seed=7)
+    again, _ = run(env, 5, seed=7)
+    other, _ = run(env, 5, seed=8)
+    plain = suite.load("cathsim", "type1_bca", {"random": 7})
+    timestep = plain.reset()
+    for key in rows[0]:
+        np.testing.assert_array_equal(rows[0][key], timestep.observation[key])
+        np.testing.assert_array_equal(rows[-1][key], again[-1][key])
+    assert not np.array_equal(rows[0]["position"], other[0]["position"])
+    rows, _ = run(env, 1, seed=2**70 + 1)
+    assert not np.array_equal(rows[0]["position"], again[0]["position"])
+
+
+def test_time_truncates_and_does_not_terminate():
+    env = gymnasium.make(TASK, max_steps=3)
+    env.reset(seed=0)
+    ends = [env.step(env.action_space.sample())[2:4] for _ in range(3)]
+    assert ends == [(False, False), (False, False), (False, True)]
+    with pytest.raises(gymnasium.error.ResetNeeded):
+        env.step(env.action_space.sample())
+
+
+def test_success_terminates():
+    env = gymnasium.make("cathsim/navigate-v0", **{"goal": "bca", "goal_radius": 1.0})
+    env.reset(seed=0)
+    task = env.unwrapped.environment.task
+    # Any place in the branch counts with such a goal, so the branch is moved here.
+    task._meaning = _everywhere(task.meaning)
+    _, reward, terminated, truncated, info = env.step(np.zeros(21, np.float32))
+    assert (reward, terminated, truncated) == (10.0, True, False)
+    assert info["success"] and not info["physics_error"]
+
+
+def _everywhere(meaning):
+    import dataclasses
+
+    wide = dataclasses.replace(meaning.route, radii=meaning.route.radii + 1.0)
+    return dataclasses.replace(meaning, branch=wide, ostium=-1.0)
+
+
+def test_render_shows_the_device_as_it_goes():
+    env = gymnasium.make(TASK, render_mode="rgb_array", fluoroscopy={"size": 96})
+    env.reset(seed=0)
+    first = env.render()
+    assert first.shape == (96, 96, 3) and first.dtype == np.uint8
+    push = np.zeros(21, np.float32)
+    push[-1] = 1
+    for _ in range(15):
+        env.step(push)
+    darker = (first.astype(int) - env.render())[..., 0]
+    unwrapped = env.unwrapped
+    carm = unwrapped._machine().planes()[0].carm
+    (column, row), _ = carm.project(unwrapped.environment.task.readings.head)
+    # The tip has come here: the picture is darker, and nowhere far from the device.
+    top, left = round(row) - 1, round(column) - 1
+    near = darker[top : top + 3, left : left + 3]
+    assert near.max() > 10
+    assert (np.abs(darker) > 5).sum() < 60
+    with pytest.raises(ValueError, match="rgb_array"):
+        CathSimEnv(render_mode="human")
+    biplane = gymnasium.make(
+        TASK, render_mode="rgb_array", fluoroscopy={"size": 32, "biplane": "LATERAL"}
+    )
+    biplane.reset(seed=0)
+    assert biplane.render().shape == (32, 64, 3)
+
+
+def test_vector_environment_is_the_single_ones_and_resets_by_itself():
+    steps, count = 4, 3
+    many = gymnasium.make_vec(
+        TASK, num_envs=count, vectorization_mode="vector_entry_point", max_steps=steps
+    )
+    single = gymnasium.make(TASK, max_steps=steps)
+    observation, _ = many.reset(seed=5)
+    first, _ = single.reset(seed=6)
+    np.testing.assert_array_equal(observation["position"][1], first["position"])
+    many.action_space.seed(0)
+    for index in range(steps):
+        action = many.action_space.sample()
+        observation, reward, terminated, truncated, info = many.step(action)
+        row = single.step(action[1])
+        assert reward[1] == row[1]
+        assert truncated.all() == (index == steps - 1) and not terminated.any()
+    np.testing.assert_array_equal(info["final_obs"]["position"][1], row[0]["position"])
+    np.testing.assert_allclose(info["final_info"]["distance"][1], row[4]["distance"])
+    # The next episode has begun, in each from its own source.
+    following, _ = single.reset()
+    np.testing.assert_array_equal(observation["position"][1], following["position"])
+    assert many.observation_space.contains(observation)
+    many.step(many.action_space.sample())
+
+
+@pytest.mark.slow
+def test_the_stable_baselines_example_runs(tmp_path):
+    pytest.importorskip("stable_baselines3")
+    script = Path(__file__).parents[1] / "examples" / "sb3_ppo.py"
+    sizes = "--steps 512 --envs 4 --rollout 64 --max-steps 40 --episodes 1".split()
+    command = [sys.executable, script, *sizes, "--out", tmp_path]
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    assert "episode 0: {'distance'" in done.stdout
+    assert (tmp_path / "model.zip").stat().st_size > 1000
