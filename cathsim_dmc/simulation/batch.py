@@ -5,7 +5,6 @@ same compiled model, the same `mj_step`, the same pure functions of arrays.
 """
 
 import dataclasses
-import logging
 from collections.abc import Sequence
 
 import mujoco
@@ -14,8 +13,6 @@ from dm_control import mjcf
 from mujoco import batch as mujoco_batch
 
 from cathsim_dmc.tasks import cannulation, forces, navigation, observations, readings
-
-_LOG = logging.getLogger(__name__)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -27,8 +24,8 @@ class Step:
       outcome: reward, success and distance, arrays (N,).
       terminated: (N,) bool, success or a physics error.
       truncated: (N,) bool, out of time.
-      physics_error: (N,) bool, the simulation diverged; such an episode says nothing
-        about the policy.
+      physics_error: (N,) bool, the physics failed (logged with a dump that replays
+        it); such an episode says nothing about the policy.
       readings: state of the devices.
       wall_force: on the wall over the control step.
     """
@@ -83,6 +80,7 @@ class BatchSimulation:
         self._action = np.zeros((num_simulations, len(task.catheter.actuators)))
         self._screen = task.screen(self._model, num_simulations)
         self._delay = task.action_delay(num_simulations)
+        self._monitor = task.monitor(num_simulations)
         self._variation = task.model_variation(self._model)
         fields = self._variation.fields
         self._fields = {name: self._batch.expand(name) for name in fields}
@@ -134,6 +132,7 @@ class BatchSimulation:
         fields = {name: values[index] for name, values in self._fields.items()}
         self._variation.write(fields, episode)
         self._delay.restart(index, episode.delay)
+        self._monitor.restart(index)
         self._screen.restart(index, episode.deviation)
         self._goal_shift[index] = episode.goal_shift or 0.0
         return episode.displacement
@@ -164,6 +163,7 @@ class BatchSimulation:
         self._action = action.copy()
         self._batch.ctrl[:] = self._delay.pass_on(action)
         self._task.posed_robot(self._batch.qpos)
+        self._monitor.before_step(self._batch.state, action)
         warnings = self._batch.warning.copy()
         self._batch.rollout(
             self._substeps,
@@ -171,11 +171,14 @@ class BatchSimulation:
             out={"sensordata": self._rows},
         )
         changed = self._batch.warning != warnings
-        error = changed.reshape(self.num_simulations, -1).any(-1)
-        if error.any():
-            _LOG.warning("simulations %s diverged", np.flatnonzero(error).tolist())
         self._steps += 1
         self._measure()
+        reasons = self._monitor.errors(
+            changed.reshape(self.num_simulations, -1).any(-1),
+            self._readings.centreline,
+            self._wall_force.peak_max,
+        )
+        error = np.array([reason is not None for reason in reasons])
         outcome = self._meaning.outcome(self._readings.head)
         if error.any():
             outcome = dataclasses.replace(

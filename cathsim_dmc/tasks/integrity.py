@@ -51,6 +51,71 @@ def escaped(anatomy: anatomies.Anatomy, centreline: np.ndarray) -> np.ndarray:
     return (outside & aside & ~in_sheath).any(-1)
 
 
+class Monitor:
+    """Watches N simulations for errors of physics, and keeps what replays them."""
+
+    def __init__(self, anatomy: anatomies.Anatomy, simulations: int, task: dict):
+        """Starts with no episode running.
+
+        Args:
+          anatomy: whose lumen the devices must not leave.
+          simulations: N.
+          task: JSON-able description of the task for the dumps.
+        """
+        self._anatomy = anatomy
+        self._task = task
+        self._states: list[np.ndarray | None] = [None] * simulations
+        self._actions: list[list[np.ndarray]] = [[] for _ in range(simulations)]
+
+    def restart(self, index: int) -> None:
+        """Forgets the episode of a simulation."""
+        self._states[index] = None
+        self._actions[index] = []
+
+    def before_step(self, states: np.ndarray, actions: np.ndarray) -> None:
+        """Keeps the start of each episode, and the actions.
+
+        Args:
+          states: (N, nstate), mjSTATE_INTEGRATION.
+          actions: (N, A).
+        """
+        for index, (state, action) in enumerate(zip(states, actions, strict=True)):
+            if self._states[index] is None:
+                self._states[index] = state.copy()
+            self._actions[index].append(action.copy())
+
+    def errors(
+        self, diverged: np.ndarray, centreline: np.ndarray, peak_force: np.ndarray
+    ) -> list[str | None]:
+        """What went wrong in the control step that has just ended; logs and dumps it.
+
+        Args:
+          diverged: (N,) bool, MuJoCo warned.
+          centreline: (N, n, 3), nodes of the devices, m.
+          peak_force: (N,), largest single contact force within the step, N.
+
+        Returns:
+          A reason for each simulation, None where nothing did.
+        """
+        counts = np.array([len(actions) for actions in self._actions])
+        looked = np.flatnonzero(counts % ESCAPE_INTERVAL == 0)
+        out = np.zeros(len(counts), dtype=bool)
+        if looked.size:
+            out[looked] = escaped(self._anatomy, centreline[looked])
+        exploded = ~(peak_force <= MAX_FORCE)
+        reasons: list[str | None] = [None] * len(counts)
+        for index in np.flatnonzero(diverged | out | exploded):
+            reason = EXPLODED if exploded[index] else ESCAPED
+            reasons[index] = reason = DIVERGED if diverged[index] else reason
+            dump(
+                reason,
+                task=self._task,
+                state=self._states[index],
+                actions=np.array(self._actions[index]),
+            )
+        return reasons
+
+
 def dump(
     reason: str,
     *,

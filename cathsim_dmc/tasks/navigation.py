@@ -1,6 +1,7 @@
 """Navigation of a catheter through an anatomy, as a composer task."""
 
 import dm_env.specs
+import mujoco
 import numpy as np
 from dm_control import composer
 
@@ -16,6 +17,7 @@ from cathsim_dmc.tasks import (
     cameras,
     cannulation,
     forces,
+    integrity,
     observations,
     placement,
     readings,
@@ -23,6 +25,8 @@ from cathsim_dmc.tasks import (
     variations,
 )
 from cathsim_dmc.tasks.config import PHYSICS_TIMESTEP, NavigationConfig
+
+_STATE = mujoco.mjtState.mjSTATE_INTEGRATION.value
 
 __all__ = ["PHYSICS_TIMESTEP", "Navigation", "NavigationConfig"]
 
@@ -134,6 +138,7 @@ class Navigation(composer.Task):
         self._observation = None
         self._step = 0
         self._termination = None
+        self._error = None
         self._action = np.zeros(len(self._catheter.actuators))
 
     # Composer's own interface.
@@ -181,6 +186,8 @@ class Navigation(composer.Task):
         self._variation = self.model_variation(model)
         self._screen = self.screen(model, 1)
         self._delay = self.action_delay(1)
+        self._monitor = self.monitor(1)
+        self._state = np.zeros(mujoco.mj_stateSize(model, _STATE))
         self._restart()
         # Composer looks once before the first reset, which must not draw noise.
         self._noise = None
@@ -191,6 +198,7 @@ class Navigation(composer.Task):
     def initialize_episode(self, physics, random_state):
         """Draws what differs between episodes and puts the device to its start."""
         self._restart()
+        self._monitor.restart(0)
         self._noise = [random_state]
         episode = self._config.randomisation.draw(random_state)
         model, data = physics.model.ptr, physics.data.ptr
@@ -239,6 +247,8 @@ class Navigation(composer.Task):
         data = physics.data.ptr
         data.ctrl[:] = self._delay.pass_on(self._action[None])[0]
         self.posed_robot(data.qpos)
+        mujoco.mj_getState(physics.model.ptr, data, self._state, _STATE)
+        self._monitor.before_step(self._state[None], self._action[None])
         self._substep = 0
 
     def after_substep(self, physics, random_state):
@@ -254,20 +264,31 @@ class Navigation(composer.Task):
         self._observation = None
         self._measure(physics)
         self._outcome = self._meaning.outcome(self._readings.head)
-        if self._outcome.success:
+        # A substep that diverged raised before its sensors were kept.
+        diverged = self._substep < self.physics_steps_per_control_step
+        (self._error,) = self._monitor.errors(
+            np.array([diverged]),
+            self._readings.centreline[None],
+            self._wall_force.peak_max[None],
+        )
+        if self._error is not None:
+            self._termination = "physics_error"
+        elif self._outcome.success:
             self._termination = "success"
         elif self._step >= self._meaning.max_steps:
             self._termination = "truncated"
 
     def get_reward(self, physics):
-        """Reward of the last control step."""
+        """Reward of the last control step, 0 if the physics failed in it."""
         del physics
+        if self._error is not None:
+            return 0.0
         return float(self._outcome.reward)
 
     def get_discount(self, physics):
-        """0 at success, 1 otherwise; the time limit keeps 1."""
+        """0 at success or an error of physics, 1 otherwise; the time limit keeps 1."""
         del physics
-        return 0.0 if self._termination == "success" else 1.0
+        return 0.0 if self._termination in ("success", "physics_error") else 1.0
 
     def should_terminate_episode(self, physics):
         """Whether the episode has ended."""
@@ -339,6 +360,18 @@ class Navigation(composer.Task):
             simulations,
             len(self._catheter.actuators),
             self._config.randomisation.longest_delay,
+        )
+
+    def monitor(self, simulations: int) -> integrity.Monitor:
+        """Watches a number of simulations for errors of physics."""
+        return integrity.Monitor(
+            self._anatomy,
+            simulations,
+            {
+                "anatomy": self._anatomy.name,
+                "goal": self._goal.name,
+                "config": repr(self._config),
+            },
         )
 
     # What others may read.
@@ -435,8 +468,13 @@ class Navigation(composer.Task):
 
     @property
     def termination(self) -> str | None:
-        """Why the episode ended: "success", "truncated", or None while it runs."""
+        """Why the episode ended: "success", "truncated", "physics_error", or None."""
         return self._termination
+
+    @property
+    def error(self) -> str | None:
+        """What went wrong with the physics, if the episode ended by that."""
+        return self._error
 
     def contacts(self, physics) -> forces.Contacts:
         """Contacts with the wall in the last substep."""
