@@ -1,0 +1,472 @@
+"""Every task of the suite keeps the contracts of dm_env, dm_control and this domain."""
+
+import dataclasses
+
+import dm_env
+import mujoco
+import numpy as np
+import pytest
+from absl.testing import absltest
+from conftest import SHORT_EPISODE, TASKS
+from dm_control import suite as dm_suite
+from dm_env import specs, test_utils
+from scipy.stats import qmc
+
+from cathsim_dmc import suite
+from cathsim_dmc.analysis.containment import Containment
+from cathsim_dmc.anatomy import arch
+from cathsim_dmc.anatomy.phantom import Goal
+from cathsim_dmc.tasks import cannulation, forces, observations
+
+# Those that need OpenGL are tested with the cameras.
+WITHOUT_GL = tuple(
+    name for name in observations.OBSERVATIONS if name not in ("rgb", "depth")
+)
+# The goal does not move within an anatomy, unless it is randomised.
+CONSTANT = {"tracking_goal", "tracking_goal_pixels", "goal_position"}
+
+
+def all_observations(shared_environment):
+    return shared_environment("type1_lcca", observation=WITHOUT_GL)
+
+
+def random_actions(environment, steps, seed=0):
+    spec = environment.action_spec()
+    random = np.random.RandomState(seed)
+    return random.uniform(spec.minimum, spec.maximum, (steps, *spec.shape))
+
+
+def first_observations(task_name, steps):
+    """Observations of the first steps of a new environment with seed 7."""
+    environment = suite.load("cathsim", task_name, task_kwargs={"random": 7})
+    timesteps = [environment.reset()]
+    timesteps += [environment.step(a) for a in random_actions(environment, steps)]
+    environment.close()
+    return [timestep.observation for timestep in timesteps]
+
+
+def assert_bitwise_equal(first, second):
+    assert len(first) == len(second)
+    for one, other in zip(first, second, strict=True):
+        assert list(one) == list(other)
+        for key in one:
+            assert one[key].dtype == other[key].dtype
+            assert one[key].tobytes() == other[key].tobytes(), key
+
+
+# The contract of dm_env, with episodes that end within the action sequence.
+
+
+class Contract(test_utils.EnvironmentTestMixin):
+    task_name: str
+
+    @classmethod
+    def setUpClass(cls):
+        super().setUpClass()
+        cls.loaded = suite.load(
+            "cathsim", cls.task_name, task_kwargs={"max_steps": SHORT_EPISODE}
+        )
+
+    @classmethod
+    def tearDownClass(cls):
+        cls.loaded.close()
+        super().tearDownClass()
+
+    def make_object_under_test(self):
+        # As after construction, which takes a second: the next step is a reset.
+        self.loaded._reset_next_step = True
+        return self.loaded
+
+    def tearDown(self):
+        absltest.TestCase.tearDown(self)
+
+    def make_action_sequence(self):
+        yield from random_actions(self.loaded, 2 * SHORT_EPISODE)
+
+    def test_episode_ends_within_the_sequence(self):
+        self.loaded.reset()
+        steps = [self.loaded.step(action) for action in self.make_action_sequence()]
+        self.assertIn(True, [step.last() for step in steps])
+
+
+class TestContractType1Bca(Contract, absltest.TestCase):
+    task_name = "type1_bca"
+
+
+class TestContractType1Lcca(Contract, absltest.TestCase):
+    task_name = "type1_lcca"
+
+
+class TestContractType2Bca(Contract, absltest.TestCase):
+    task_name = "type2_bca"
+
+
+class TestContractType2Lcca(Contract, absltest.TestCase):
+    task_name = "type2_lcca"
+
+
+# The sweep over tasks.
+
+
+def test_the_published_tasks_are_there():
+    assert set(TASKS) <= set(suite.SUITE)
+    for name in TASKS:
+        assert suite.SUITE[name].__doc__.count("\n") == 0, "one line for `cathsim list`"
+
+
+@pytest.mark.parametrize("task_name", TASKS)
+def test_components_have_names(shared_environment, task_name):
+    model = shared_environment(task_name).physics.model.ptr
+    kinds = {
+        "body": model.nbody,
+        "joint": model.njnt,
+        "actuator": model.nu,
+        "sensor": model.nsensor,
+        "camera": model.ncam,
+        "mesh": model.nmesh,
+    }
+    kinds_of = {kind: getattr(mujoco.mjtObj, f"mjOBJ_{kind.upper()}") for kind in kinds}
+    for kind, count in kinds.items():
+        names = [
+            mujoco.mj_id2name(model, kinds_of[kind], index) for index in range(count)
+        ]
+        assert all(names), f"a {kind} has no name"
+    for name in ("catheter/link_0", "phantom/wall", "sheath/bore", "robot/rail"):
+        assert model.body(name).id > 0
+
+
+@pytest.mark.parametrize("task_name", TASKS)
+def test_action_spec(shared_environment, task_name):
+    spec = shared_environment(task_name).action_spec()
+    assert isinstance(spec, specs.BoundedArray)
+    assert spec.shape == (21,) and spec.dtype == np.float64
+    assert (spec.minimum == -1).all() and (spec.maximum == 1).all()
+    names = [name.removeprefix("catheter/") for name in spec.name.split("\t")]
+    tip = [f"tip_{axis}_{joint}" for joint in range(10) for axis in "xy"]
+    assert names == [*tip, "insertion"]
+
+
+@pytest.mark.parametrize("task_name", TASKS)
+def test_observations_conform_to_their_specs(shared_environment, task_name):
+    environment = shared_environment(task_name)
+    expected = environment.observation_spec()
+    timestep = environment.reset()
+    for action in random_actions(environment, 5):
+        assert list(timestep.observation) == list(expected)
+        for key, spec in expected.items():
+            spec.validate(timestep.observation[key])
+            assert np.isfinite(timestep.observation[key]).all(), key
+        timestep = environment.step(action)
+    environment.reward_spec().validate(timestep.reward)
+    environment.discount_spec().validate(timestep.discount)
+
+
+def test_every_observation_conforms_to_its_spec(shared_environment):
+    environment = all_observations(shared_environment)
+    expected = environment.observation_spec()
+    timestep = environment.reset()
+    for action in random_actions(environment, 3):
+        for key, spec in expected.items():
+            spec.validate(timestep.observation[key])
+        timestep = environment.step(action)
+
+
+@pytest.mark.parametrize("task_name", TASKS)
+def test_start_is_randomised_within_a_millimetre(shared_environment, task_name):
+    environment = shared_environment(task_name)
+    start = environment.task.placement.start
+    axis = environment.task.placement.direction
+    heads = []
+    for _ in range(8):
+        environment.reset()
+        heads.append(environment.task.readings.head)
+    heads = np.array(heads)
+    assert len(np.unique(heads.round(9), axis=0)) == len(heads)
+    # The stroke begins a millimetre in, so that the base can go back to displace it.
+    displacement = heads - (start + cannulation.START_JITTER * axis)
+    assert np.linalg.norm(displacement, axis=-1).max() < 1.02e-3
+    assert np.linalg.norm(displacement, axis=-1).max() > 0.3e-3
+
+
+@pytest.mark.parametrize("task_name", TASKS)
+def test_same_seed_gives_the_same_episode(shared_environment, reseed, task_name):
+    environment = shared_environment(task_name)
+    actions = random_actions(environment, 20)
+    runs = []
+    for seed in (7, 7, 8):
+        timesteps = [reseed(environment, seed)]
+        timesteps += [environment.step(action) for action in actions]
+        runs.append([timestep.observation for timestep in timesteps])
+    assert_bitwise_equal(runs[0], runs[1])
+    assert (runs[0][0]["position"] != runs[2][0]["position"]).any()
+
+
+def test_two_environments_with_one_seed_are_equal():
+    assert_bitwise_equal(*(first_observations("type1_lcca", 20) for _ in range(2)))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("task_name", TASKS)
+def test_first_200_observations_are_equal_bit_for_bit(task_name):
+    assert_bitwise_equal(*(first_observations(task_name, 199) for _ in range(2)))
+
+
+@pytest.mark.parametrize("task_name", TASKS)
+def test_no_memory_is_shared(shared_environment, task_name):
+    assert_no_shared_memory(shared_environment(task_name))
+
+
+def test_no_memory_is_shared_between_any_observations(shared_environment):
+    assert_no_shared_memory(all_observations(shared_environment))
+
+
+def assert_no_shared_memory(environment):
+    first = environment.reset().observation
+    kept = {key: value.copy() for key, value in first.items()}
+    second, third = (
+        environment.step(action).observation
+        for action in random_actions(environment, 2)
+    )
+    arrays = [
+        (f"{name} of step {step}", value)
+        for step, observation in enumerate((first, second, third))
+        for name, value in observation.items()
+    ]
+    for index, (name, value) in enumerate(arrays):
+        for other_name, other in arrays[:index]:
+            assert not np.shares_memory(value, other), f"{name} and {other_name}"
+    for key, value in kept.items():
+        np.testing.assert_array_equal(first[key], value)
+
+
+@pytest.mark.parametrize("task_name", TASKS)
+def test_no_observation_is_constant(shared_environment, task_name):
+    assert_nothing_is_constant(shared_environment(task_name))
+
+
+def test_none_of_all_observations_is_constant(shared_environment):
+    assert_nothing_is_constant(all_observations(shared_environment))
+
+
+def assert_nothing_is_constant(environment):
+    seen = [environment.reset().observation]
+    actions = random_actions(environment, 25)
+    # Forward and to one side, so that the device touches the wall.
+    actions[5:] = 1.0
+    seen += [environment.step(action).observation for action in actions]
+    for key in seen[0]:
+        if key not in CONSTANT:
+            assert any((one[key] != seen[0][key]).any() for one in seen), key
+
+
+@pytest.mark.parametrize("task_name", TASKS)
+def test_dm_control_loads_the_task(shared_environment, reseed, task_name):
+    environment = dm_suite.load(
+        "cathsim", task_name, task_kwargs={"random": 7}, visualize_reward=True
+    )
+    # A used environment with that seed: neither who loads it nor its past matters.
+    expected = reseed(shared_environment(task_name), 7)
+    assert_bitwise_equal([environment.reset().observation], [expected.observation])
+    environment.close()
+
+
+def test_other_domains_load_too():
+    environment = suite.load("cartpole", "balance", task_kwargs={"random": 1})
+    assert environment.reset().first()
+
+
+def test_environment_kwargs_reach_composer():
+    environment = suite.load(
+        "cathsim", "type1_bca", environment_kwargs={"time_limit": 0.1}
+    )
+    environment.reset()
+    last = [environment.step(np.zeros(21)).last() for _ in range(3)]
+    assert last == [False, False, True]
+    environment.close()
+
+
+# Reward, discount and end of the episode.
+
+
+@pytest.mark.parametrize("task_name", TASKS)
+def test_time_out_comes_at_max_steps_with_discount_one(shared_environment, task_name):
+    environment = shared_environment(task_name, max_steps=SHORT_EPISODE)
+    environment.reset()
+    steps = [environment.step(np.zeros(21)) for _ in range(SHORT_EPISODE)]
+    assert [step.last() for step in steps] == [False] * (SHORT_EPISODE - 1) + [True]
+    assert [step.discount for step in steps] == [1.0] * SHORT_EPISODE
+    assert environment.task.termination == "truncated"
+    assert environment.step(np.zeros(21)).first()
+    assert environment.step(np.zeros(21)).mid()
+
+
+@pytest.mark.parametrize("task_name", TASKS)
+def test_default_limit_is_the_published_one(shared_environment, task_name):
+    assert shared_environment(task_name).task.meaning.max_steps == 2000
+    assert shared_environment(task_name).control_timestep() == pytest.approx(0.04)
+    assert shared_environment(task_name).task.goal_radius == pytest.approx(8e-3)
+
+
+@pytest.mark.parametrize("task_name", TASKS)
+def test_reward_is_minus_the_distance_in_metres(shared_environment, task_name):
+    environment = shared_environment(task_name)
+    environment.reset()
+    for action in random_actions(environment, 5):
+        timestep = environment.step(action)
+        distance = np.linalg.norm(
+            environment.task.readings.head - environment.task.goal_position
+        )
+        assert timestep.reward == pytest.approx(-distance, rel=1e-12)
+        assert timestep.discount == 1.0
+        assert 0.05 < distance < 0.3
+
+
+@pytest.fixture(scope="module")
+def near_goal():
+    """An environment whose goal lies 3 cm ahead of the tip."""
+    anatomy = arch.load("type1")
+    line = anatomy.tree.vessel("aorta").centreline
+    place = line.at(0.105)
+    goal = Goal("near", "aorta", place.position, 0.105)
+    environment = suite.load(
+        "cathsim",
+        "navigate",
+        task_kwargs={"phantom": anatomy, "goal": goal, "random": 3},
+    )
+    yield environment
+    environment.close()
+
+
+def push(size=21):
+    action = np.zeros(size)
+    action[20] = 1.0
+    return action
+
+
+def test_success_pays_ten_and_ends_with_discount_zero(near_goal):
+    timestep = near_goal.reset()
+    steps = 0
+    while not timestep.last():
+        timestep = near_goal.step(push())
+        steps += 1
+        assert steps < 60, "the goal was never reached"
+    distance = np.linalg.norm(
+        near_goal.task.readings.head - near_goal.task.goal_position
+    )
+    assert distance < near_goal.task.goal_radius
+    assert timestep.reward == 10.0
+    assert timestep.discount == 0.0
+    assert near_goal.task.termination == "success"
+    assert near_goal.task.outcome.success
+    # 2.2 cm at 40 mm/s, less at first.
+    assert 12 <= steps
+    assert near_goal.step(push()).first()
+    assert near_goal.task.termination is None
+
+
+def test_success_at_the_last_step_is_success(near_goal, reseed, monkeypatch):
+    reseed(near_goal, 3)
+    steps = 1
+    while not near_goal.step(push()).last():
+        steps += 1
+    limited = dataclasses.replace(near_goal.task.meaning, max_steps=steps)
+    monkeypatch.setattr(near_goal.task, "_meaning", limited)
+    reseed(near_goal, 3)
+    timesteps = [near_goal.step(push()) for _ in range(steps)]
+    assert [step.last() for step in timesteps] == [False] * (steps - 1) + [True]
+    assert timesteps[-1].discount == 0.0 and timesteps[-1].reward == 10.0
+    assert near_goal.task.termination == "success"
+
+
+def test_time_out_one_step_before_success(near_goal, reseed, monkeypatch):
+    reseed(near_goal, 3)
+    steps = 1
+    while not near_goal.step(push()).last():
+        steps += 1
+    limited = dataclasses.replace(near_goal.task.meaning, max_steps=steps - 1)
+    monkeypatch.setattr(near_goal.task, "_meaning", limited)
+    reseed(near_goal, 3)
+    timesteps = [near_goal.step(push()) for _ in range(steps - 1)]
+    assert timesteps[-1].last() and timesteps[-1].discount == 1.0
+    assert timesteps[-1].reward < 0
+
+
+def test_time_is_exactly_the_control_steps(shared_environment):
+    environment = shared_environment("type1_bca")
+    environment.reset()
+    for step in range(1, 4):
+        environment.step(np.zeros(21))
+        assert environment.physics.time() == pytest.approx(0.04 * step, abs=1e-12)
+
+
+def test_step_types_are_dm_env_s(shared_environment):
+    environment = shared_environment("type1_bca")
+    assert environment.reset().step_type is dm_env.StepType.FIRST
+    assert environment.step(np.zeros(21)).step_type is dm_env.StepType.MID
+
+
+# Noise.
+
+
+def halton_episode(environment, steps):
+    size = environment.action_spec().shape[0]
+    actions = 2 * qmc.Halton(size, seed=0).random(steps) - 1
+    environment.reset()
+    for action in actions:
+        yield environment.step(action)
+
+
+# m, what the device may sink into the wall: the bound of the soak (benchmarks/soak.py).
+PENETRATION = 1e-3
+# m, what the wall pieces may stay behind the true lumen; see anatomy/fidelity.py.
+RECESSION = 0.6e-3
+WALL_FORCE = 10.0  # N
+
+
+@pytest.mark.parametrize("task_name", TASKS)
+@pytest.mark.parametrize(
+    "steps",
+    [
+        pytest.param(100, id="100"),
+        pytest.param(2000, id="2000", marks=pytest.mark.slow),
+    ],
+)
+def test_halton_noise_breaks_nothing(
+    task_name, steps, shared_environment, reseed, record_property
+):
+    """Low-discrepancy noise on every motor: the device stays where it must be.
+
+    How it is measured. After every control step, at points 1 mm apart along the axis
+    of every link, head included: the depth of the point in the *true* lumen (union of
+    tapered tubes, not the wall pieces that stand for it), less the device's radius; or,
+    before the inlet, the gap to the sides of the sheath's bore. What the device stands
+    out by must not exceed the penetration that the soak allows plus the recession that
+    the wall pieces are allowed. The penetration itself is MuJoCo's depth of every
+    contact in every physics step of 4 ms, and must keep its bound alone.
+    """
+    environment = shared_environment(task_name)
+    task = environment.task
+    reseed(environment, 0)
+    containment = Containment.of(task)
+    excess, force, depth = [], [], []
+    episode = halton_episode(environment, steps)
+    for count, timestep in enumerate(episode, start=1):
+        assert timestep.last() == (count == 2000)  # noise finds no branch
+        excess.append(containment.largest_excess(task.readings.centreline))
+        force.append(task.wall_force.peak_max)
+        rows = task._sensor_rows[:, task.layout.wall_contacts]
+        depth.append(forces.Contacts.from_sensor(rows).penetration.max())
+    assert count == steps
+    warnings = [warning.number for warning in environment.physics.data.ptr.warning]
+    assert not any(warnings), warnings
+    figures = {
+        "largest_wall_force_N": float(max(force)),
+        "largest_excess_mm": 1e3 * float(max(excess)),
+        "largest_penetration_mm": 1e3 * float(max(depth)),
+    }
+    for name, value in figures.items():
+        record_property(name, value)
+    print(task_name, steps, {name: round(v, 3) for name, v in figures.items()})
+    assert max(force) <= WALL_FORCE
+    assert max(depth) <= PENETRATION
+    assert max(excess) <= PENETRATION + RECESSION
