@@ -1,0 +1,72 @@
+"""The domain is known to dm_control and to TorchRL, and registering it is safe."""
+
+import subprocess
+import sys
+
+import pytest
+from conftest import TASKS
+from dm_control import suite as dm_suite
+
+from cathsim_dmc import suite
+
+
+def test_all_constants_of_dm_control_know_the_tasks():
+    assert dm_suite._DOMAINS["cathsim"] is suite
+    pairs = {("cathsim", name) for name in suite.SUITE}
+    assert pairs <= set(dm_suite.ALL_TASKS)
+    assert {("cathsim", name) for name in TASKS} <= set(dm_suite.BENCHMARKING)
+    assert ("cathsim", "navigate") in dm_suite.EXTRA
+    assert set(dm_suite.BENCHMARKING).isdisjoint(dm_suite.EXTRA)
+    assert set(dm_suite.TASKS_BY_DOMAIN["cathsim"]) == set(suite.SUITE)
+    assert pairs <= set(dm_suite.REWARD_VIZ) | set(dm_suite.NO_REWARD_VIZ)
+    assert {("cathsim", "type1_bca"), ("cathsim", "type2_bca")} <= set(dm_suite.EASY)
+    assert {("cathsim", "type1_lcca"), ("cathsim", "type2_lcca")} <= set(dm_suite.HARD)
+
+
+def test_the_other_domains_stay():
+    assert ("cartpole", "balance") in dm_suite.BENCHMARKING
+    assert set(dm_suite.TASKS_BY_DOMAIN["cartpole"]) >= {"balance", "swingup"}
+
+
+def test_registering_twice_changes_nothing():
+    names = (
+        "ALL_TASKS",
+        "BENCHMARKING",
+        "EASY",
+        "HARD",
+        "EXTRA",
+        "REWARD_VIZ",
+        "NO_REWARD_VIZ",
+        "TASKS_BY_DOMAIN",
+    )
+    before = {name: getattr(dm_suite, name) for name in names}
+    suite._register()
+    assert {name: getattr(dm_suite, name) for name in names} == before
+    assert len(dm_suite.ALL_TASKS) == len(set(dm_suite.ALL_TASKS))
+
+
+@pytest.mark.parametrize("name", ["_DOMAINS", "_get_tasks", "_get_tasks_by_domain"])
+def test_a_private_name_that_vanished_is_loud(monkeypatch, name):
+    monkeypatch.delattr(dm_suite, name)
+    with pytest.raises(ImportError, match=rf"{name}.*dm-control"):
+        suite._register()
+
+
+def test_importing_the_suite_is_all_dm_control_needs():
+    code = (
+        "from dm_control import suite; import cathsim_dmc.suite;"
+        "e = suite.load('cathsim', 'type1_bca', task_kwargs={'random': 1});"
+        "print(e.reset().observation['position'].shape)"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, timeout=120
+    )
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.startswith("(")
+
+
+def test_torchrl_lists_the_domain():
+    from torchrl.envs import DMControlEnv
+
+    available = dict(DMControlEnv.available_envs)
+    assert set(available["cathsim"]) == set(suite.SUITE)

@@ -1,0 +1,180 @@
+"""TorchRL sees the tasks through dm_control and through the batched simulation."""
+
+import numpy as np
+import pytest
+import torch
+from conftest import SHORT_EPISODE, TASKS
+from torchrl.envs import DMControlEnv
+from torchrl.envs.utils import check_env_specs
+
+from cathsim_dmc import suite
+from cathsim_dmc.simulation.torchrl import INFO, BatchedEnv
+
+ENVS = 3
+
+
+@pytest.fixture(scope="module")
+def batched():
+    return BatchedEnv("type1_lcca", ENVS, num_threads=1, seed=5, observation="internal")
+
+
+@pytest.fixture(scope="module")
+def short_batched():
+    return BatchedEnv(
+        "type1_bca",
+        ENVS,
+        num_threads=1,
+        task_kwargs={"max_steps": SHORT_EPISODE},
+        observation=["tracking", "force"],
+    )
+
+
+@pytest.mark.parametrize("task_name", TASKS)
+def test_dm_control_env(task_name):
+    env = DMControlEnv("cathsim", task_name, max_steps=SHORT_EPISODE)
+    check_env_specs(env)
+    assert env.action_spec.shape == (21,)
+
+    # The same seed, the same episode; another seed, another one.
+    def rollout(seed):
+        env.set_seed(seed)
+        torch.manual_seed(0)
+        return env.rollout(2 * SHORT_EPISODE)
+
+    first, again, other = rollout(3), rollout(3), rollout(4)
+    for key in ("position", "velocity", "external_force"):
+        assert torch.equal(first["next", key], again["next", key]), key
+    assert not torch.equal(first["position"][0], other["position"][0])
+    # The time limit truncates; it terminates nothing.
+    assert first.shape == (SHORT_EPISODE,)
+    assert first["next", "truncated"].flatten().tolist() == (
+        [False] * (SHORT_EPISODE - 1) + [True]
+    )
+    assert not first["next", "terminated"].any()
+    env.close()
+
+
+def test_seed_of_dm_control_env_is_that_of_the_suite():
+    env = DMControlEnv("cathsim", "type2_bca", max_steps=SHORT_EPISODE)
+    env.set_seed(11)
+    expected = suite.load("cathsim", "type2_bca", task_kwargs={"random": 11})
+    expected.reset()  # as set_seed does
+    position = expected.reset().observation["position"]
+    np.testing.assert_array_equal(env.reset()["position"].numpy(), position)
+    env.close()
+    expected.close()
+
+
+def test_success_is_terminated_in_torchrl():
+    from cathsim_dmc.anatomy import arch
+    from cathsim_dmc.anatomy.phantom import Goal
+
+    anatomy = arch.load("type1")
+    place = anatomy.tree.vessel("aorta").centreline.at(0.09)
+    env = DMControlEnv(
+        "cathsim",
+        "navigate",
+        phantom=anatomy,
+        goal=Goal("near", "aorta", place.position, 0.09),
+    )
+    forward = torch.zeros(21, dtype=torch.float64)
+    forward[-1] = 1.0
+    rollout = env.rollout(60, policy=lambda td: td.set("action", forward.clone()))
+    last = rollout[-1]["next"]
+    assert last["terminated"].item() and not last["truncated"].item()
+    assert last["reward"].item() == 10.0
+    assert len(rollout) < 60
+    env.close()
+
+
+def test_batched_env(batched):
+    check_env_specs(batched)
+    assert batched.batch_size == (ENVS,)
+    assert batched.action_spec.shape == (ENVS, 21)
+    assert {*INFO, "success", "physics_error"} == set(batched.reset()["info"].keys())
+
+
+def test_batched_env_with_numbers_and_forces(short_batched):
+    check_env_specs(short_batched)
+
+
+@pytest.mark.parametrize("observation", ["image", "sequential"])
+def test_batched_env_with_images(observation):
+    env = BatchedEnv("type2_lcca", 2, num_threads=1, observation=observation)
+    check_env_specs(env)
+    image = env.reset()[observation]
+    assert image.dtype == torch.uint8
+    assert image.shape == (2, 128, 128, 1 if observation == "image" else 3)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("task_name", TASKS)
+def test_batched_env_of_each_task(task_name):
+    check_env_specs(BatchedEnv(task_name, 2, num_threads=1))
+
+
+def test_batched_seeds(batched):
+    def start(seed):
+        batched.set_seed(seed)
+        return batched.reset()["position"]
+
+    first, again, other = start(1), start(1), start(9)
+    assert torch.equal(first, again)
+    assert not torch.equal(first, other)
+    # Each simulation has a seed of its own, counting up.
+    assert len({tuple(row.tolist()) for row in first}) == ENVS
+    assert torch.equal(start(2)[:-1], first[1:])
+
+
+def test_only_what_is_done_is_reset(batched):
+    batched.set_seed(0)
+    tensordict = batched.reset()
+    for _ in range(3):
+        tensordict["action"] = batched.action_spec.rand()
+        tensordict = batched.step(tensordict)["next"]
+    before = tensordict["position"].clone()
+    tensordict["_reset"] = torch.tensor([[True], [False], [True]])
+    after = batched.reset(tensordict)["position"]
+    assert torch.equal(after[1], before[1])
+    assert not torch.equal(after[0], before[0])
+    assert not torch.equal(after[2], before[2])
+    assert batched.simulation.steps.tolist() == [0, 3, 0]
+
+
+def test_time_limit_truncates_the_batch(short_batched):
+    rollout = short_batched.rollout(2 * SHORT_EPISODE, break_when_any_done=True)
+    assert rollout.shape == (ENVS, SHORT_EPISODE)
+    last = rollout[:, -1]["next"]
+    assert last["truncated"].all() and last["done"].all()
+    assert not last["terminated"].any()
+    assert not last["info", "physics_error"].any()
+    assert not rollout[:, :-1]["next", "done"].any()
+
+
+def test_tensors_of_steps_share_no_memory(short_batched):
+    tensordict = short_batched.reset()
+    kept = {key: tensordict[key].clone() for key in ("tracking_points", "wall_force")}
+    first = dict(tensordict.items())
+    for _ in range(2):
+        tensordict["action"] = short_batched.action_spec.rand()
+        tensordict = short_batched.step(tensordict)["next"].clone(False)
+    for key, value in kept.items():
+        assert torch.equal(first[key], value)
+
+
+def test_bad_actions_are_refused(batched):
+    tensordict = batched.reset()
+    tensordict["action"] = torch.full((ENVS, 21), float("nan"))
+    with pytest.raises(ValueError, match="NaN"):
+        batched.step(tensordict)
+
+
+def test_episodes_start_over_by_themselves(short_batched):
+    steps = 2 * SHORT_EPISODE + 3
+    rollout = short_batched.rollout(steps, break_when_any_done=False)
+    assert rollout.shape == (ENVS, steps)
+    done = rollout["next", "done"][..., 0]
+    assert done.nonzero()[:, 1].unique().tolist() == [
+        SHORT_EPISODE - 1,
+        2 * SHORT_EPISODE - 1,
+    ]
