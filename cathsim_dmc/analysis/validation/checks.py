@@ -63,9 +63,7 @@ class Check:
                 f"check {name!r} expects {expected!r}; a relative deviation needs a "
                 "finite quantity other than 0"
             )
-        return cls.at_most(
-            name, 100 * abs(measured / expected - 1), percent, "%", note
-        )
+        return cls.at_most(name, 100 * abs(measured / expected - 1), percent, "%", note)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
@@ -57,9 +58,7 @@ class Study:
         return float(100 * (self.force_mean[self.at(value)] / self.force_mean[0] - 1))
 
 
-def study(
-    script: insertion.Script, parameter: str, values: Sequence[float]
-) -> Study:
+def study(script: insertion.Script, parameter: str, values: Sequence[float]) -> Study:
     """Runs a script at several resolutions, other settings at their defaults."""
     values = np.sort(np.asarray(values, dtype=float))
     runs = [insertion.run(script, **{parameter: value}) for value in values.tolist()]
@@ -129,3 +128,18 @@ def checks(results: Sequence[Study]) -> list[Check]:
                 )
             )
     return found
+
+
+def summary(one: Study) -> dict[str, Any]:
+    """Plain values of a study; lengths in mm, forces in N."""
+    return {
+        "script": one.script.name,
+        "parameter": one.parameter,
+        "value": one.values.tolist(),
+        "links": one.links.tolist(),
+        "path_mean_mm": (1e3 * one.path_mean).tolist(),
+        "path_max_mm": (1e3 * one.path_max).tolist(),
+        "force_mean": one.force_mean.tolist(),
+        "force_p95": one.force_p95.tolist(),
+        "penetration_max_mm": (1e3 * one.penetration_max).tolist(),
+    }

@@ -41,7 +41,7 @@ CURL_TIME = 2.0  # s
 # Over the arch along its wall, into the first branch, into the last one.
 SCRIPTS = (
     Script("over the arch", 0.5, (0.3, 0.0), 8.0),
-    Script("into the BCA", 0.5, (0.0, 0.0), 4.8),
+    Script("into the BCA", 0.5, (0.0, 0.0), 6.4),
     Script("into the LSA", 0.5, (-0.3, 0.0), 7.2),
 )
 

@@ -1,15 +1,16 @@
-"""`cathsim validate wall`: wall against lumen, and Coulomb friction that acts."""
+"""`cathsim validate wall`: wall against lumen, friction that acts, convergence."""
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import mujoco
 import numpy as np
 
-from cathsim_dmc.analysis.validation import theory
+from cathsim_dmc.analysis.validation import convergence, theory
 from cathsim_dmc.analysis.validation.checks import Check, Report
 from cathsim_dmc.analysis.validation.rig import Rig
 from cathsim_dmc.anatomy import fidelity
@@ -169,10 +170,19 @@ def lumen_checks(anatomy: Anatomy, rays: int = RAYS) -> list[Check]:
     ]
 
 
+def validate_anatomy(anatomies: Mapping[str, Anatomy], rays: int = RAYS) -> Report:
+    """Checks of intrusion, coverage and patency of some anatomies, by name."""
+    checks: list[Check] = []
+    for name, anatomy in anatomies.items():
+        checks += lumen_checks(dataclasses.replace(anatomy, name=name), rays)
+    return Report("wall of " + ", ".join(anatomies), checks)
+
+
 def validate_wall(
     figure_path: str | Path | None = None,
     phantoms: Sequence[str | Path | Anatomy] = (),
     rays: int = RAYS,
+    with_convergence: bool = True,
 ) -> Report:
     """Runs every check of the wall.
 
@@ -181,6 +191,8 @@ def validate_wall(
         phantoms: further anatomies beside the arches, such as an imported scan: the
             directory of one, or the anatomy.
         rays: of the coverage of each anatomy.
+        with_convergence: whether to run the convergence studies, which take longer
+            than all the rest.
 
     Raises:
         ValueError: if a directory holds no anatomy.
@@ -212,14 +224,18 @@ def validate_wall(
                 f"θ = {np.degrees(one.angle):.1f}°",
             )
         )
-    findings = {
+    findings: dict[str, Any] = {
         # The ratio of a slippery rod is near 1 whatever happens; the exponent is not.
         "friction from the exponent": {
             f"{one.friction:g}": float(np.log(one.mean) / one.angle) for one in pulled
         }
     }
+    studies = convergence.studies() if with_convergence else []
+    if studies:
+        checks += convergence.checks(studies)
+        findings["convergence"] = [convergence.summary(one) for one in studies]
     if figure_path is not None:
         from cathsim_dmc.analysis.validation import figures
 
-        figures.wall(anatomies, pulled, figure_path)
+        figures.wall(anatomies, pulled, studies, figure_path)
     return Report("wall", checks, findings)

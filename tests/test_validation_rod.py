@@ -1,0 +1,88 @@
+"""The device of the tasks against elastica, Euler and GJ."""
+
+import numpy as np
+import pytest
+
+from cathsim_dmc.analysis.validation import rod
+from cathsim_dmc.analysis.validation.rig import Rig
+from cathsim_dmc.entities import devices
+from cathsim_dmc.entities.catheter import MAX_ROTATION_SPEED
+
+
+def test_rig_has_the_settings_of_the_tasks():
+    from cathsim_dmc import suite
+
+    rig = Rig()
+    rig.compile()
+    task = suite.load("cathsim", "type1_bca", task_kwargs={"random": 0})
+    model = task.physics.model.ptr
+    for name in ("integrator", "timestep", "cone", "solver", "iterations", "tolerance"):
+        assert getattr(rig.model.opt, name) == getattr(model.opt, name), name
+    link = model.geom("catheter/link_3").id
+    ours = rig.model.geom("catheter/link_3").id
+    for name in ("geom_solref", "geom_solimp", "geom_friction", "geom_condim"):
+        np.testing.assert_array_equal(
+            getattr(rig.model, name)[ours], getattr(model, name)[link]
+        )
+
+
+def test_cantilever_is_the_elastica_up_to_60_degrees():
+    results = rod.cantilevers(end_angles=(2.0, 30.0, 60.0))
+    assert max(one.deviation for one in results) < rod.CANTILEVER_BOUND / 100
+    # The loads are not trivial: the end moves by more than half of the length.
+    assert results[-1].expected.position[-1, 1] > 0.2
+
+
+@pytest.mark.parametrize("plane", [0.0, np.pi / 2])
+def test_bending_does_not_depend_on_the_plane(plane):
+    (one,) = rod.cantilevers(end_angles=(45.0,), plane=plane)
+    assert one.deviation < rod.CANTILEVER_BOUND / 100
+
+
+def test_coarse_chain_fails_the_cantilever():
+    coarse = devices.Discretisation(shaft_link=0.07)
+    (one,) = rod.cantilevers(end_angles=(60.0,), discretisation=coarse)
+    assert one.deviation > rod.CANTILEVER_BOUND / 100
+
+
+@pytest.mark.parametrize("end", ["sliding", "fixed"])
+def test_column_buckles_at_eulers_load(end):
+    one = rod.buckling(end)
+    assert abs(one.critical / one.expected - 1) < rod.BUCKLING_BOUND / 100
+
+
+def test_short_column_is_weaker_as_the_chain_of_hinges_says():
+    one = rod.buckling("sliding", joints=4)
+    links = np.pi**2 / 12 / 4**2
+    assert one.critical / one.expected - 1 == pytest.approx(-links, abs=0.01)
+
+
+@pytest.mark.parametrize("device", ["published", "wire_035_amplatz"])
+@pytest.mark.parametrize("torsion_joints", [1, 4, 25])
+def test_twist_is_that_of_gj(device, torsion_joints):
+    one = rod.twist_under_torque(device, torsion_joints)
+    assert abs(one.simulated / one.expected - 1) < rod.TWIST_BOUND / 100
+
+
+def test_tip_lags_behind_the_base_as_theory_says():
+    one = rod.twist_lag()
+    assert abs(one.lag / one.expected_lag - 1) < rod.TWIST_BOUND / 100
+    assert abs(one.rise_time / one.expected_rise_time - 1) < rod.TWIST_BOUND / 100
+    # The speed servo of the base neither overshoots nor hunts.
+    speed = np.diff(one.base) / np.diff(one.time)
+    assert speed.max() < 1.001 * MAX_ROTATION_SPEED
+    assert speed[50:].min() > 0.98 * MAX_ROTATION_SPEED
+
+
+def test_settle_says_when_it_does_not():
+    rig = Rig()
+    rig.compile()
+    with pytest.raises(RuntimeError, match="still moves"):
+        rig.settle((1e-3, 0, 0), longest=0.1)
+
+
+@pytest.mark.slow
+def test_rod_report_passes(tmp_path):
+    report = rod.validate_rod(tmp_path / "rod.png")
+    assert report.passed, report.failures
+    assert (tmp_path / "rod.png").stat().st_size > 10_000

@@ -1,0 +1,97 @@
+"""Closed forms against other closed forms, and the report of checks."""
+
+import json
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from cathsim_dmc.analysis.validation import theory
+from cathsim_dmc.analysis.validation.checks import Check, Report
+
+
+@settings(deadline=None, max_examples=15)
+@given(
+    angle=st.floats(0.02, 1.4),
+    length=st.floats(0.05, 0.5),
+    stiffness=st.floats(1e-6, 5e-3),
+    split=st.floats(0.1, 0.9),
+)
+def test_elastica_of_a_uniform_rod_meets_the_elliptic_integrals(
+    angle, length, stiffness, split
+):
+    shape = theory.elastica(
+        [split * length, (1 - split) * length], [stiffness] * 2, angle
+    )
+    force, end = theory.elastica_by_elliptic_integrals(length, stiffness, angle)
+    np.testing.assert_allclose(shape.force, force, rtol=1e-6)
+    np.testing.assert_allclose(shape.position[-1], end, rtol=1e-6)
+    assert shape.angle[-1] == pytest.approx(angle)
+
+
+def test_small_deflection_of_a_stepped_rod_is_linear_theory():
+    lengths, stiffnesses = np.array([0.2, 0.1]), np.array([5e-5, 2e-5])
+    shape = theory.elastica(lengths, stiffnesses, 1e-3)
+    # Virtual work: Σ of the integral of x²/EI, x from the end.
+    expected = 0.1**3 / 3 / 2e-5 + (0.3**3 - 0.1**3) / 3 / 5e-5
+    assert shape.position[-1, 1] / shape.force == pytest.approx(expected, rel=1e-5)
+
+
+@pytest.mark.parametrize("angle", [0.0, -0.1, np.pi / 2, np.nan])
+def test_elastica_refuses_other_angles(angle):
+    with pytest.raises(ValueError, match="end_angle"):
+        theory.elastica([0.1], [1e-5], angle)
+
+
+@pytest.mark.parametrize(("end", "factor"), [("sliding", 1), ("fixed", 4)])
+@pytest.mark.parametrize("parts", [1, 3])
+def test_uniform_column_is_eulers(end, factor, parts):
+    load = theory.buckling_load([0.3 / parts] * parts, [5e-5] * parts, end=end)
+    assert load == pytest.approx(factor * np.pi**2 * 5e-5 / 0.3**2, rel=1e-9)
+
+
+def test_stepped_column_lies_between_the_uniform_ones():
+    bounds = [theory.buckling_load([0.3], [ei]) for ei in (2e-5, 5e-5)]
+    assert bounds[0] < theory.buckling_load([0.2, 0.1], [5e-5, 2e-5]) < bounds[1]
+
+
+def test_column_refuses_an_unknown_end():
+    with pytest.raises(ValueError, match="sliding, fixed"):
+        theory.buckling_load([0.3], [5e-5], end="free")
+
+
+def test_checks_keep_their_bounds_and_nan_fails():
+    assert Check.at_most("a", 2.0, 2.0, "%").passed
+    assert not Check.at_most("a", 2.01, 2.0, "%").passed
+    assert not Check.at_most("a", np.nan, 2.0, "%").passed
+    assert not Check.at_least("a", np.nan, 2.0, "%").passed
+    low, high = Check.deviation("a", 0.9, 1.0, 5), Check.deviation("a", 1.04, 1.0, 5)
+    assert low.value == pytest.approx(10) and not low.passed
+    assert high.value == pytest.approx(4) and high.passed
+    with pytest.raises(ValueError, match="other than 0"):
+        Check.deviation("a", 1.0, 0.0, 5)
+
+
+def test_report_is_one_json_object_without_nan():
+    checks = [Check.at_most("a", 1.0, 2.0, "mm"), Check.at_most("b", np.inf, 2.0, "%")]
+    report = Report("r", checks, {"array": np.arange(2.0), "nan": float("nan")})
+    plain = json.loads(json.dumps(report.as_dict(), allow_nan=False))
+    assert plain["checks"][0] == {
+        "name": "a",
+        "value": 1.0,
+        "unit": "mm",
+        "bound": "<= 2",
+        "passed": True,
+        "note": "",
+    }
+    assert plain["checks"][1]["value"] is None
+    assert plain["findings"] == {"array": [0.0, 1.0], "nan": None}
+    assert not report.passed and report.failures == (checks[1],)
+    assert report.table().row_count == 2
+    assert "**FAIL**" in report.markdown()
+
+
+def test_report_refuses_two_checks_of_one_name():
+    with pytest.raises(ValueError, match="two checks"):
+        Report("r", [Check.at_most("a", 1, 2, "")] * 2)

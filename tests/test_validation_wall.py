@@ -1,0 +1,56 @@
+"""Friction of the device against the capstan, and checks of the lumen."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from cathsim_dmc.analysis.validation import convergence, forces, insertion, wall
+
+
+@pytest.mark.parametrize("friction", wall.FRICTIONS)
+def test_capstan(friction):
+    one = wall.capstan(friction)
+    assert abs(one.mean / one.expected - 1) < wall.CAPSTAN_BOUND / 100
+    # A slippery rod's ratio is near 1 anyway: the exponent has to be right as well.
+    assert np.log(one.mean) / one.angle == pytest.approx(friction, rel=0.1)
+
+
+def test_tube_passes_the_checks_of_the_lumen():
+    tube = forces.straight_tube(0.06, 4e-3)
+    checks = wall.lumen_checks(tube, rays=5_000)
+    assert all(check.passed for check in checks), checks
+
+
+def test_a_hole_and_a_plug_fail_the_checks_of_the_lumen():
+    tube = forces.straight_tube(0.06, 4e-3)
+    half = dataclasses.replace(tube, wall=tube.wall[::2])
+    checks = {check.name: check for check in wall.lumen_checks(half, rays=5_000)}
+    assert not checks["tube: coverage"].passed
+    corners = np.stack(np.meshgrid(*[(-1e-3, 1e-3)] * 3), axis=-1).reshape(-1, 3)
+    plug = corners + (0, 0, 0.03)
+    plugged = dataclasses.replace(tube, wall=(*tube.wall, plug))
+    checks = {check.name: check for check in wall.lumen_checks(plugged, rays=1_000)}
+    assert not checks["tube: contacts of a sphere on the centrelines"].passed
+
+
+def test_validate_wall_names_a_missing_directory(tmp_path):
+    with pytest.raises(ValueError, match="no phantom at"):
+        wall.validate_wall(phantoms=[tmp_path / "nowhere"])
+
+
+def test_insertion_is_reproducible_and_the_default_step_converged():
+    script = dataclasses.replace(insertion.SCRIPTS[0], duration=1.0)
+    once, again = insertion.run(script), insertion.run(script)
+    np.testing.assert_array_equal(once.head, again.head)
+    assert once.head.shape == (25, 3)
+    study = convergence.study(script, "physics_timestep", (0.004, 0.002))
+    assert study.values.tolist() == [0.002, 0.004]
+    assert 0 < study.path_mean[1] < 1e-3
+
+
+@pytest.mark.slow
+def test_wall_report_passes(tmp_path):
+    report = wall.validate_wall(tmp_path / "wall.png")
+    assert report.passed, report.failures
+    assert (tmp_path / "wall.png").stat().st_size > 10_000
