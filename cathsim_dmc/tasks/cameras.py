@@ -10,14 +10,17 @@ import numpy as np
 CAMERAS = ("top", "side", "tip")
 KINDS = ("rgb", "depth")
 
-# A chip-on-tip endoscope: wide angle, in front of the rounded end of the device.
+# A chip-on-tip endoscope: wide angle, in the middle of the rounded end of the device,
+# so that a wall which the tip touches is still in front of it.
 _TIP_FIELD_OF_VIEW = 90.0  # degrees, vertical
-_TIP_CLEARANCE = 0.2e-3  # m
-# The tip sees walls a millimetre away; MuJoCo's default clips them at centimetres.
-NEAREST = 0.5e-3  # m
+# That wall is a device radius away; MuJoCo's default clips it at centimetres.
+NEAREST = 0.3e-3  # m
 FARTHEST = 10.0  # m, the top view stands 0.7 m away
 
-_LUMEN_GROUP, _SITE_GROUPS = 2, (4, 5)
+# A geom without opacity would still be in the depth image.
+_OUT_OF_SIGHT = 1e3  # m
+
+_SITE_GROUPS = (4, 5)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -56,11 +59,10 @@ def add_tip_camera(arena, catheter) -> None:
     arena.mjcf_model.visual.map.zfar = FARTHEST
     # Near and far planes are in units of the extent.
     arena.mjcf_model.statistic.extent = 1.0
-    ahead = catheter.link_lengths[-1] + catheter.device.outer_radius + _TIP_CLEARANCE
     catheter.links[-1].add(
         "camera",
         name="tip",
-        pos=(0, 0, ahead),
+        pos=(0, 0, catheter.link_lengths[-1]),
         xyaxes=(1, 0, 0, 0, -1, 0),  # a camera looks along its -z
         fovy=_TIP_FIELD_OF_VIEW,
     )
@@ -92,20 +94,22 @@ class Cameras:
             name: model.camera(f"{catheter}/tip" if name == "tip" else name).id
             for name in options.names
         }
-        try:
-            self._renderer = mujoco.Renderer(model, rows, columns)
-        except Exception as error:  # every backend fails in its own way
-            chosen = os.environ.get("MUJOCO_GL", "not set")
-            raise ValueError(
-                f"the observations rgb and depth need OpenGL, which does not start "
-                f"here (MUJOCO_GL is {chosen}: {type(error).__name__}: {error}). Set "
-                "MUJOCO_GL to egl (with a GPU), osmesa (software) or glfw (with a "
-                "display) before Python starts, or observe image or segmentation, "
-                "which need no OpenGL."
-            ) from error
+        self._device = [
+            i for i in range(model.ngeom) if model.geom(i).name.startswith(catheter)
+        ]
+        self._renderer = _renderer(model, rows, columns)
         self._options = mujoco.MjvOption()
         for group in _SITE_GROUPS:
             self._options.sitegroup[group] = 0
+
+    def __del__(self):
+        # MuJoCo frees the textures and buffers of whatever context is current, which
+        # may be that of other cameras.
+        renderer = getattr(self, "_renderer", None)
+        context = renderer and renderer._gl_context  # noqa: SLF001
+        if context is not None:
+            context.make_current()
+            renderer.close()
 
     def see(self, kinds: Sequence[str], qpos: np.ndarray) -> dict[str, np.ndarray]:
         """Pictures of N configurations.
@@ -131,14 +135,16 @@ class Cameras:
 
     def _picture(self, kind: str, camera: int, name: str) -> np.ndarray:
         renderer = self._renderer
-        # From inside, the wall must be opaque and its back faces drawn.
-        inside = name == "tip"
-        self._options.flags[mujoco.mjtVisFlag.mjVIS_TRANSPARENT] = False
         renderer.update_scene(self._data, camera, self._options)
+        # From inside, the wall is opaque, its back faces are drawn and the device,
+        # in which the camera is, does not hide it.
+        inside = name == "tip"
         renderer.scene.flags[mujoco.mjtRndFlag.mjRND_CULL_FACE] = not inside
         if inside:
             for geom in renderer.scene.geoms[: renderer.scene.ngeom]:
                 geom.rgba[3] = 1.0
+                if geom.objid in self._device:
+                    geom.pos[:] = _OUT_OF_SIGHT
         if kind == "rgb":
             return renderer.render()
         renderer.enable_depth_rendering()
@@ -146,3 +152,16 @@ class Cameras:
             return renderer.render()[..., None]
         finally:
             renderer.disable_depth_rendering()
+
+
+def _renderer(model: mujoco.MjModel, rows: int, columns: int) -> mujoco.Renderer:
+    try:
+        return mujoco.Renderer(model, rows, columns)
+    except Exception as error:  # every backend fails in its own way
+        chosen = os.environ.get("MUJOCO_GL", "not set")
+        raise ValueError(
+            f"the observations rgb and depth need OpenGL, which does not start here "
+            f"(MUJOCO_GL is {chosen}: {type(error).__name__}: {error}). Set MUJOCO_GL "
+            "to egl (with a GPU), osmesa (software) or glfw (with a display) before "
+            "Python starts, or observe image or segmentation, which need no OpenGL."
+        ) from error
