@@ -256,6 +256,16 @@ class Discretisation:
     shaft_link: float = 0.0175
     torsion_joints: int = 0
 
+    def __post_init__(self):
+        for name in ("working_length", "shaft_link"):
+            value = getattr(self, name)
+            if not (math.isfinite(value) and value > 0):
+                raise ValueError(
+                    f"{name} is {value!r}; it must be a positive number of metres"
+                )
+        if self.torsion_joints < 0:
+            raise ValueError(f"torsion_joints is {self.torsion_joints}; at least 0")
+
     def link_lengths(self, device: Device) -> np.ndarray:
         """Lengths (n,) of the links from proximal to distal, m."""
         shaft_length = self.working_length - device.tip_length

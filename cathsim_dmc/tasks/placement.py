@@ -15,6 +15,7 @@ _LEAST_START_DEPTH = 0.005  # m
 # Way beyond the goal that the stroke leaves for bends, detours and wrong branches.
 _SPARE_STROKE = 0.08  # m
 _BASE_LENGTH = 0.02  # m of device that never leaves the sheath
+_LONGEST_DEVICE = 3.0  # m, the longest wires sold
 
 
 @dataclasses.dataclass(frozen=True)
@@ -113,7 +114,8 @@ def place_device(
       working_length: simulated length, m; None for what the route needs.
 
     Raises:
-      ValueError: if `working_length` is shorter than the tip and its start need.
+      ValueError: if `working_length` is shorter than the tip and its start need, or
+        longer than any device is.
     """
     inlet = anatomy.inlet
     start_depth = _straight_run(anatomy, device)
@@ -121,11 +123,12 @@ def place_device(
         stroke = max(route_length - start_depth, 0.0) + _SPARE_STROKE
         working_length = start_depth + stroke + _BASE_LENGTH
     stroke = working_length - start_depth - _BASE_LENGTH
-    if stroke <= 0 or working_length <= device.tip_length:
-        least = max(start_depth + _BASE_LENGTH, device.tip_length)
+    least = max(start_depth + _BASE_LENGTH, device.tip_length)
+    # Also false for NaN.
+    if not least < working_length <= _LONGEST_DEVICE:
         raise ValueError(
             f"working_length is {working_length} m; {device.name!r} needs more than "
-            f"{least:.3f} m here to be moved at all"
+            f"{least:.3f} m here to be moved at all, and {_LONGEST_DEVICE:g} m at most"
         )
     return Placement(
         inlet=np.array(inlet.position),

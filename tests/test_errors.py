@@ -1,0 +1,244 @@
+"""Bad input: each error says what was given and lists what is allowed."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from conftest import TASKS
+
+from cathsim_dmc import suite
+from cathsim_dmc.anatomy import arch
+from cathsim_dmc.anatomy.phantom import Goal
+from cathsim_dmc.anatomy.scan import import_scan
+from cathsim_dmc.entities import devices
+from cathsim_dmc.simulation.batch import BatchSimulation
+from cathsim_dmc.tasks import cannulation, observations
+from cathsim_dmc.tasks.navigation import NavigationConfig
+
+
+def fails(words, error=ValueError, **options):
+    """Loads a task with options; the message must hold all the words."""
+    task_name = options.pop("task_name", "type1_bca")
+    with pytest.raises(error) as caught:
+        suite.load("cathsim", task_name, task_kwargs=options)
+    missing = [word for word in words if str(word) not in str(caught.value)]
+    assert not missing, f"{missing} not in: {caught.value}"
+
+
+def test_wrong_task_name():
+    fails(["type3_bcb", "cathsim", *TASKS, "navigate"], task_name="type3_bcb")
+
+
+def test_wrong_domain_name():
+    with pytest.raises(ValueError) as caught:
+        suite.load("cathsin", "type1_bca")
+    for word in ("cathsin", "cathsim", "cartpole", "walker"):
+        assert word in str(caught.value)
+
+
+def test_wrong_observation_name():
+    fails(["pixels", *observations.OBSERVATIONS], observation="pixels")
+
+
+@pytest.mark.parametrize("names", [["internal", "pixels"], ["force", "force"], []])
+def test_wrong_list_of_observations(names):
+    fails([names, *observations.OBSERVATIONS, "list"], observation=names)
+
+
+def test_wrong_option_name():
+    fails(
+        ["observations", "random", "observation", "max_steps", "goal_radius"],
+        observations="internal",
+    )
+
+
+def test_every_option_is_listed():
+    names = [field.name for field in dataclasses.fields(NavigationConfig)]
+    fails(["frictoin", *names], frictoin=0.1)
+
+
+def test_wrong_goal_name():
+    fails(
+        ["carotid", *arch.load("type1").goals],
+        task_name="navigate",
+        phantom="type1",
+        goal="carotid",
+    )
+
+
+def test_goal_outside_the_lumen():
+    goal = Goal("beside", "bca", [0.1, 0.0, 0.0], 0.01)
+    fails(
+        ["beside", "outside the lumen", "mm", "point inside", "bca", "lcca"],
+        task_name="navigate",
+        phantom="type1",
+        goal=goal,
+    )
+
+
+def test_goal_in_a_vessel_that_is_not_there():
+    place = arch.load("type1").tree.vessel("bca").centreline.at(0.02)
+    fails(
+        ["rcca", *arch.load("type1").tree.vessels],
+        task_name="navigate",
+        goal=Goal("far", "rcca", place.position, 0.02),
+    )
+
+
+@pytest.mark.parametrize("phantom", ["type9", "runs/no/such/phantom"])
+def test_missing_phantom(phantom):
+    fails(
+        [phantom, "directory", "cathsim phantom", *arch.ARCHES],
+        task_name="navigate",
+        phantom=phantom,
+    )
+
+
+def test_directory_without_an_anatomy(tmp_path):
+    fails(
+        [tmp_path, "anatomy.json"],
+        FileNotFoundError,
+        task_name="navigate",
+        phantom=str(tmp_path),
+    )
+
+
+def test_wrong_device():
+    fails(["guidewire", *devices.DEVICES], device="guidewire")
+
+
+def test_wrong_reward():
+    fails(["sparse", *cannulation.REWARDS], reward="sparse")
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"goal_radius": 0.0}, ["goal_radius", "0.0", "> 0"]),
+        ({"goal_radius": -1e-3}, ["goal_radius", "-0.001", "> 0"]),
+        ({"max_steps": 0}, ["max_steps", "0", "at least 1"]),
+        ({"friction": -0.1}, ["friction", "-0.1", "between 0 and 2"]),
+        ({"friction": 5.0}, ["friction", "5.0", "between 0 and 2"]),
+        ({"working_length": 0.05}, ["working_length", "0.05", "published", "more"]),
+        ({"torsion_joints": 500}, ["torsion_joints", "500", "joints"]),
+        ({"torsion_joints": -1}, ["torsion_joints", "-1", "at least 0"]),
+        ({"working_length": 300.0}, ["working_length", "300", "at most"]),
+        ({"fluoroscopy": {"zoom": 2}}, ["fluoroscopy", "zoom", "magnification"]),
+        ({"cameras": {"names": ("front",)}}, ["front", "top", "side"]),
+        ({"randomisation": {"gravity": 1}}, ["gravity", "friction"]),
+    ],
+)
+def test_wrong_values(options, words):
+    fails(words, **options)
+
+
+@pytest.mark.parametrize("value", [float("nan"), float("inf"), -1.0, 0.0])
+def test_lengths_and_times_must_be_positive(value):
+    fails(["working_length", str(value)], working_length=value)
+    fails(["shaft_link", str(value), "positive"], shaft_link=value)
+
+
+# Actions.
+
+LAYOUT = ["21", "[-1, 1]", "tip motors", "translation"]
+
+
+@pytest.fixture
+def environment(shared_environment):
+    environment = shared_environment("type1_bca")
+    environment.reset()
+    return environment
+
+
+@pytest.mark.parametrize("shape", [(20,), (22,), (), (21, 1)])
+def test_action_of_wrong_shape(environment, shape):
+    with pytest.raises(ValueError) as caught:
+        environment.step(np.zeros(shape))
+    for word in (str(shape), *LAYOUT):
+        assert word in str(caught.value)
+
+
+def test_action_with_a_leading_axis(environment):
+    with pytest.raises(ValueError, match=r"\(1, 21\)"):
+        environment.step(np.zeros((1, 21)))
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+def test_action_that_is_not_finite(environment, value):
+    action = np.zeros(21)
+    action[[3, 20]] = value
+    before = environment.physics.data.qpos.copy()
+    with pytest.raises(ValueError, match=r"2 NaN or infinite.*\[-1, 1\]"):
+        environment.step(action)
+    np.testing.assert_array_equal(environment.physics.data.qpos, before)
+
+
+def test_actions_of_a_batch(environment):
+    simulation = BatchSimulation(environment.task, 2, num_threads=1)
+    simulation.reset()
+    with pytest.raises(ValueError, match=r"\(2, 20\).*21"):
+        simulation.step(np.zeros((2, 20)))
+    with pytest.raises(ValueError, match=r"\(3, 21\).*\(2, 21\)"):
+        simulation.step(np.zeros((3, 21)))
+    with pytest.raises(ValueError, match="1 NaN"):
+        action = np.zeros((2, 21))
+        action[1, 0] = np.nan
+        simulation.step(action)
+
+
+def test_batches_of_nothing_and_of_too_few_seeds(environment):
+    with pytest.raises(ValueError, match="num_simulations is 0"):
+        BatchSimulation(environment.task, 0)
+    with pytest.raises(ValueError, match="3 seeds for 2 simulations"):
+        BatchSimulation(environment.task, 2, num_threads=1, seeds=[1, 2, 3])
+
+
+# Scans.
+
+# An octahedron of 50 mm, and its faces.
+CORNERS = "v 50 0 0\nv -50 0 0\nv 0 50 0\nv 0 -50 0\nv 0 0 50\nv 0 0 -50\n"
+FACES = [
+    *("f 1 3 5", "f 3 2 5", "f 2 4 5", "f 4 1 5"),
+    *("f 3 1 6", "f 2 3 6", "f 4 2 6", "f 1 4 6"),
+]
+
+
+@pytest.fixture
+def curve(tmp_path):
+    path = tmp_path / "centreline-LCCA.csv"
+    path.write_text("5,5,5\n8,8,8\n10,10,10\n")
+    return path
+
+
+def test_missing_scan_file(tmp_path, curve):
+    with pytest.raises(FileNotFoundError) as caught:
+        import_scan(tmp_path / "lumen.obj", [curve])
+    for word in ("lumen.obj", "OBJ", "STL", "PLY"):
+        assert word in str(caught.value)
+
+
+def test_missing_centreline(tmp_path):
+    mesh = tmp_path / "lumen.obj"
+    mesh.write_text(CORNERS + "\n".join(FACES) + "\n")
+    with pytest.raises(FileNotFoundError) as caught:
+        import_scan(mesh, [tmp_path / "centreline-LCCA.mrk.json"])
+    for word in ("centreline-LCCA.mrk.json", ".csv"):
+        assert word in str(caught.value)
+
+
+def test_scan_that_is_not_closed(tmp_path, curve):
+    mesh = tmp_path / "lumen.obj"
+    mesh.write_text(CORNERS + "\n".join(FACES[:7]) + "\n")
+    with pytest.raises(ValueError) as caught:
+        import_scan(mesh, [curve])
+    for word in ("lumen.obj", "not closed", "Close the vessel ends", "fill holes"):
+        assert word in str(caught.value)
+
+
+def test_scan_in_a_format_nobody_reads(tmp_path, curve):
+    mesh = tmp_path / "lumen.docx"
+    mesh.write_text("")
+    with pytest.raises(ValueError) as caught:
+        import_scan(mesh, [curve])
+    for word in ("docx", "obj", "stl", "ply"):
+        assert word in str(caught.value)
