@@ -74,7 +74,7 @@ def test_a_dump_replays_the_episode(dumps, monkeypatch):
     for action in actions:
         again.task.posed_robot(data.qpos)
         data.ctrl[:] = action
-        for _ in range(again.task.physics_steps_per_control_step):
+        for _ in range(again.task.substeps):
             mujoco.mj_step(model, data)
     np.testing.assert_array_equal(data.qpos, final)
 

@@ -138,7 +138,7 @@ def suite_overhead(steps: int = 150) -> float:
         bare = mujoco.MjData(model)
         mujoco.mj_copyData(bare, model, data)
         ours = theirs = 0.0
-        substeps = task.physics_steps_per_control_step
+        substeps = task.substeps
         for step in range(steps):
             action = (RANDOM if seed % 2 else PUSH).action(step, generator, 21)
             start = time.process_time()
@@ -171,7 +171,7 @@ def thread_scaling(steps: int = 30) -> tuple[float, dict[str, float]]:
             simulation.reset()
             generator = np.random.default_rng(run)
             shape = (NUM_SIMULATIONS, simulation.num_actions)
-            substeps = simulation.task.physics_steps_per_control_step
+            substeps = simulation.task.substeps
             start = time.perf_counter()
             for _ in range(steps):
                 simulation.batch.ctrl[:] = generator.uniform(-1, 1, shape)
@@ -197,7 +197,7 @@ def torchrl_overhead(steps: int = 30, threads: int = 1) -> tuple[float, float]:
         task_kwargs={"goal_radius": _NEVER},
     )
     bare = _batch(threads)
-    substeps = bare.task.physics_steps_per_control_step
+    substeps = bare.task.substeps
     ratios, rates = [], []
     for run in range(_RUNS + 1):
         current = env.reset()

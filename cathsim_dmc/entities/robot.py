@@ -111,6 +111,13 @@ JOINTS: tuple[RobotJoint, ...] = (
 )
 
 
+# Insertion 0 lies in the middle of an overlap: both pairs hold at the start.
+_PHASES = OVERLAP / 2 + np.array([0.0, CYCLE / 2])
+# Phases at which a platform returns, its jaws open and its jaws close, and for how long.
+_STARTS = np.array([STROKE + JAW_TRAVEL, STROKE, CYCLE - JAW_TRAVEL])
+_SPANS = np.array([RETURN, JAW_TRAVEL, JAW_TRAVEL])
+
+
 class ClampState(NamedTuple):
     """One pair of clamps and its platform; every field has the insertion's shape."""
 
@@ -134,17 +141,23 @@ def clamp_states(insertion: ArrayLike) -> tuple[ClampState, ClampState]:
             f"insertion must be finite metres, got {insertion}: "
             "check the device's base joint for a diverged simulation"
         )
-    # Insertion 0 lies in the middle of an overlap: both pairs hold at the start.
-    start = OVERLAP / 2
-    shifted = np.stack([insertion + start, insertion + (start + CYCLE / 2)])
-    phase = np.mod(shifted, CYCLE)  # the jaws are closed over [0, STROKE]
-    swung = _smoothstep((phase - (STROKE + JAW_TRAVEL)) / RETURN)
-    travel = phase - STROKE / 2 - CYCLE * swung
-    opened = _smoothstep((phase - STROKE) / JAW_TRAVEL)
-    shut = _smoothstep((phase - (CYCLE - JAW_TRAVEL)) / JAW_TRAVEL)
-    opening = JAW_OPENING * (opened - shut)
-    front, rear = map(ClampState, travel, opening, phase <= STROKE)
+    travel, opening, phase = _clamps(insertion)
+    closed = phase <= STROKE
+    front, rear = (
+        ClampState(travel[..., i], opening[..., i], closed[..., i]) for i in (0, 1)
+    )
     return front, rear
+
+
+def _clamps(insertion: NDArray[np.float64]) -> tuple[NDArray, NDArray, NDArray]:
+    """Travel, jaw opening and phase (..., 2) of the front and the rear clamps."""
+    # The jaws are closed over phases [0, STROKE].
+    phase = np.mod(insertion[..., None] + _PHASES, CYCLE)
+    # Progress of the platform's return, of the opening and of the closing.
+    u = np.minimum(np.maximum((phase[..., None] - _STARTS) / _SPANS, 0.0), 1.0)
+    swung = u * u * (3.0 - 2.0 * u)
+    travel = phase - STROKE / 2 - CYCLE * swung[..., 0]
+    return travel, JAW_OPENING * (swung[..., 1] - swung[..., 2]), phase
 
 
 def follower_posture(
@@ -170,48 +183,38 @@ def follower_posture(
     Raises:
       ValueError: an argument is not finite, or the shapes do not broadcast.
     """
-    if guidewire_insertion is None:
-        guidewire_insertion = insertion
-    if guidewire_rotation is None:
-        guidewire_rotation = rotation
-    devices = (insertion, rotation, guidewire_insertion, guidewire_rotation)
-    pushed, turned, wire_pushed, wire_turned = np.broadcast_arrays(
-        *(np.asarray(value, np.float64) for value in devices)
-    )
-    front, rear = clamp_states(pushed)
+    pushed = np.asarray(insertion, np.float64)
+    turned = np.asarray(rotation, np.float64)
+    wire_pushed = pushed if guidewire_insertion is None else guidewire_insertion
+    wire_turned = turned if guidewire_rotation is None else guidewire_rotation
+    shape = np.broadcast(pushed, turned, wire_pushed, wire_turned).shape
+    travel, opening, _ = _clamps(pushed)
+    front, rear = travel[..., 0], travel[..., 1]
     # The catheter unit stays half-way between the clamps, so the free lengths of
     # shaft either side of it stay equal; the guidewire unit rides with the rear.
-    catheter_travel = (front.travel + rear.travel) / 2
-    columns = (
-        front.travel,
-        catheter_travel,
-        rear.travel,
-        rear.travel,
-        front.opening,
-        front.opening,
-        rear.opening,
-        rear.opening,
-        *_wheel_angles(pushed - catheter_travel, turned),
-        *_wheel_angles(wire_pushed - rear.travel, wire_turned),
-    )
-    posture = np.stack(columns, axis=-1)
+    middle = (front + rear) / 2
+    posture = np.empty((*shape, len(JOINTS)))
+    posture[..., 0], posture[..., 1] = front, middle
+    posture[..., 2] = posture[..., 3] = rear
+    posture[..., 4] = posture[..., 5] = opening[..., 0]
+    posture[..., 6] = posture[..., 7] = opening[..., 1]
+    _turn_wheels(posture[..., 8:12], pushed - middle, turned)
+    _turn_wheels(posture[..., 12:16], wire_pushed - rear, wire_turned)
     if not np.isfinite(posture).all():
         raise ValueError(
-            f"rotations and guidewire insertion must be finite, got rotation {turned}, "
-            f"guidewire insertion {wire_pushed} and guidewire rotation {wire_turned}"
+            f"insertions and rotations must be finite, got insertion {pushed}, "
+            f"rotation {turned}, guidewire insertion {wire_pushed} and guidewire "
+            f"rotation {wire_turned}: check for a diverged simulation"
         )
     return posture
 
 
-def _smoothstep(u: NDArray[np.float64]) -> NDArray[np.float64]:
-    u = np.minimum(np.maximum(u, 0.0), 1.0)
-    return u * u * (3.0 - 2.0 * u)
-
-
-def _wheel_angles(slip: NDArray, turned: NDArray) -> tuple[NDArray, ...]:
-    """Ring, pinion, left and right roller; ``slip`` is device past platform (m)."""
-    rolled = slip / ROLLER_RADIUS
-    return turned, -turned * (RING_TEETH / PINION_TEETH), rolled, -rolled
+def _turn_wheels(wheels: NDArray, slip: NDArray, turned: NDArray) -> None:
+    """Sets ring, pinion and rollers (..., 4); ``slip`` is device past platform (m)."""
+    wheels[..., 0] = turned
+    wheels[..., 1] = -turned * (RING_TEETH / PINION_TEETH)
+    wheels[..., 2] = slip / ROLLER_RADIUS
+    wheels[..., 3] = -wheels[..., 2]
 
 
 class Robot(composer.Entity):

@@ -69,7 +69,7 @@ class BatchSimulation:
         task.after_compile(physics, None)
         self._model = physics.model.ptr
         self._layout = task.layout
-        self._substeps = task.physics_steps_per_control_step
+        self._substeps = task.substeps
         self._batch = mujoco_batch.Batch(self._model, num_simulations, num_threads)
         for field in self._layout.FIELDS:
             self._batch.bind(field)

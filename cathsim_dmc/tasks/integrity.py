@@ -97,15 +97,20 @@ class Monitor:
         Returns:
           A reason for each simulation, None where nothing did.
         """
-        counts = np.array([len(actions) for actions in self._actions])
-        looked = np.flatnonzero(counts % ESCAPE_INTERVAL == 0)
-        out = np.zeros(len(counts), dtype=bool)
-        if looked.size:
+        looked = [
+            index
+            for index, actions in enumerate(self._actions)
+            if len(actions) % ESCAPE_INTERVAL == 0
+        ]
+        wrong = diverged | ~(peak_force <= MAX_FORCE)
+        reasons: list[str | None] = [None] * len(self._actions)
+        if not looked and not wrong.any():
+            return reasons
+        out = np.zeros(len(reasons), dtype=bool)
+        if looked:
             out[looked] = escaped(self._anatomy, centreline[looked])
-        exploded = ~(peak_force <= MAX_FORCE)
-        reasons: list[str | None] = [None] * len(counts)
-        for index in np.flatnonzero(diverged | out | exploded):
-            reason = EXPLODED if exploded[index] else ESCAPED
+        for index in np.flatnonzero(wrong | out):
+            reason = ESCAPED if out[index] and not wrong[index] else EXPLODED
             reasons[index] = reason = DIVERGED if diverged[index] else reason
             dump(
                 reason,
