@@ -1,0 +1,328 @@
+"""The compiled chain is the device it stands for: masses, stiffness, shape, motors."""
+
+import math
+
+import mujoco
+import numpy as np
+import pytest
+from dm_control import mjcf
+
+from cathsim_dmc.entities import devices
+from cathsim_dmc.entities.arena import AngiographyArena
+from cathsim_dmc.entities.catheter import (
+    BENDING_RELAXATION_TIME,
+    CARRIAGE_MASS,
+    HINGE_ARMATURE,
+    MAX_PUSH_FORCE,
+    MAX_PUSH_SPEED,
+    ROTOR_INERTIA,
+    TORSION_ARMATURE,
+    Catheter,
+)
+
+STEERABLE = ("published", "steerable_4f")
+LENGTH = 0.3
+
+
+def compiled(device="published", **options):
+    """Catheter and physics of a device alone in the arena, as in a task."""
+    device = devices.get(device)
+    discretisation = devices.Discretisation(
+        working_length=options.pop("working_length", LENGTH),
+        torsion_joints=options.pop("torsion_joints", 0),
+        shaft_link=options.pop("shaft_link", 0.0175),
+    )
+    area = math.pi * device.outer_radius**2
+    arena = AngiographyArena(device_density=device.linear_density / area)
+    catheter = Catheter(device, discretisation, **options)
+    arena.attach(catheter)
+    return catheter, mjcf.Physics.from_mjcf_model(arena.mjcf_model)
+
+
+@pytest.fixture(scope="module")
+def published():
+    return compiled()
+
+
+def link_bodies(physics):
+    model = physics.model.ptr
+    return [
+        body
+        for body in range(model.nbody)
+        if model.body(body).name.startswith("catheter/link_")
+    ]
+
+
+def capsule_inertia(mass, radius, length):
+    """Principal moments of a solid capsule whose axis has a length between centres."""
+    cylinder = math.pi * radius**2 * length
+    ball = 4 / 3 * math.pi * radius**3
+    m_cyl = mass * cylinder / (cylinder + ball)
+    m_ball = mass - m_cyl
+    axial = m_cyl * radius**2 / 2 + m_ball * 2 * radius**2 / 5
+    transverse = m_cyl * (length**2 / 12 + radius**2 / 4) + m_ball * (
+        2 * radius**2 / 5 + length**2 / 4 + 3 * length * radius / 8
+    )
+    return transverse, transverse, axial
+
+
+@pytest.mark.parametrize("name", devices.DEVICES)
+def test_masses_and_inertias_are_the_physical_ones(name):
+    """composer's own arena raises masses below 1e-5 kg and inertias below 1e-11."""
+    catheter, physics = compiled(name)
+    device, model = catheter.device, physics.model.ptr
+    bodies = link_bodies(physics)
+    masses = device.linear_density * catheter.link_lengths
+    np.testing.assert_allclose(model.body_mass[bodies], masses, rtol=1e-9)
+    assert model.body_mass[bodies].sum() == pytest.approx(
+        device.linear_density * LENGTH, rel=1e-9
+    )
+    expected = [
+        capsule_inertia(mass, device.outer_radius, length)
+        for mass, length in zip(masses, catheter.link_lengths, strict=True)
+    ]
+    compiled_moments = np.sort(model.body_inertia[bodies], axis=-1)[:, ::-1]
+    np.testing.assert_allclose(compiled_moments, expected, rtol=1e-6)
+
+
+def test_floors_would_have_acted():
+    """The links are lighter than the floors, or the test above would prove nothing."""
+    catheter, physics = compiled("steerable_4f")
+    model = physics.model.ptr
+    bodies = link_bodies(physics)
+    assert model.body_mass[bodies].min() < 1e-5
+    assert model.body_inertia[bodies].min() < 1e-11
+
+
+@pytest.mark.parametrize("name", devices.DEVICES)
+def test_joint_stiffness_is_that_of_the_rod(name):
+    catheter, physics = compiled(name)
+    device, lengths = catheter.device, catheter.link_lengths
+    bends = physics.bind(catheter.bends)
+    stiffness = np.asarray(bends.stiffness).reshape(-1, 2)
+    assert stiffness.shape == (len(lengths) - 1, 2)
+    np.testing.assert_array_equal(stiffness[:, 0], stiffness[:, 1])
+    first_tip = len(lengths) - device.tip_links
+    within_shaft, within_tip = stiffness[: first_tip - 1], stiffness[first_tip:]
+    np.testing.assert_allclose(
+        within_shaft, device.shaft.bending_stiffness / lengths[0], rtol=1e-9
+    )
+    np.testing.assert_allclose(
+        within_tip, device.tip.bending_stiffness / lengths[-1], rtol=1e-9
+    )
+    # Where the sections meet, half a link of each bends.
+    border = (
+        lengths[0] / 2 / device.shaft.bending_stiffness
+        + lengths[-1] / 2 / device.tip.bending_stiffness
+    )
+    np.testing.assert_allclose(stiffness[first_tip - 1], 1 / border, rtol=1e-9)
+    np.testing.assert_allclose(
+        np.asarray(bends.damping).reshape(-1, 2),
+        BENDING_RELAXATION_TIME * stiffness,
+        rtol=1e-9,
+    )
+    np.testing.assert_allclose(bends.armature, HINGE_ARMATURE)
+
+
+@pytest.mark.parametrize("shaft_link", [0.007, 0.0175, 0.03])
+def test_compliance_does_not_depend_on_the_links(shaft_link):
+    """The sum of l/EI over the joints is that of the rod less its outer half links."""
+    catheter, physics = compiled(shaft_link=shaft_link)
+    device, lengths = catheter.device, catheter.link_lengths
+    stiffness = np.asarray(physics.bind(catheter.bends).stiffness)[::2]
+    shaft = LENGTH - device.tip_length - lengths[0] / 2
+    tip = device.tip_length - lengths[-1] / 2
+    expected = (
+        shaft / device.shaft.bending_stiffness + tip / device.tip.bending_stiffness
+    )
+    assert (1 / stiffness).sum() == pytest.approx(expected, rel=1e-9)
+    assert lengths.max() <= max(shaft_link, 0.007) + 1e-12
+    assert lengths.sum() == pytest.approx(LENGTH, rel=1e-12)
+
+
+def test_published_discretisation_of_the_tip():
+    catheter, _ = compiled()
+    np.testing.assert_allclose(catheter.link_lengths[-10:], 0.007)
+    assert len(catheter.tip_motors) == 20
+
+
+def test_capsules_have_the_device_s_radius_and_the_links_length(published):
+    catheter, physics = published
+    model = physics.model.ptr
+    for index, length in enumerate(catheter.link_lengths):
+        geom = model.geom(f"catheter/link_{index}")
+        assert geom.type[0] == mujoco.mjtGeom.mjGEOM_CAPSULE
+        assert geom.size[0] == pytest.approx(catheter.device.outer_radius)
+        assert geom.size[1] == pytest.approx(length / 2)
+        np.testing.assert_allclose(geom.pos, [0, 0, length / 2], atol=1e-12)
+        assert geom.condim[0] == 3
+        assert geom.margin[0] == 0 and geom.gap[0] == 0
+
+
+def test_the_device_does_not_collide_with_itself(published):
+    _, physics = published
+    model = physics.model.ptr
+    geoms = [
+        geom
+        for geom in range(model.ngeom)
+        if model.geom(geom).name.startswith("catheter/")
+    ]
+    types, affinities = model.geom_contype[geoms], model.geom_conaffinity[geoms]
+    assert not (types[:, None] & affinities[None, :]).any()
+
+
+def test_a_curled_device_has_no_contact(published):
+    catheter, physics = published
+    with physics.reset_context():
+        # Rolled up to a ring that overlaps itself.
+        joints = physics.bind(catheter.bends[1::2])
+        joints.qpos = np.full(len(catheter.bends) // 2, 0.8)
+    assert physics.data.ncon == 0
+    physics.reset()
+
+
+def test_straight_device_ends_at_its_origin(published):
+    catheter, physics = published
+    physics.reset()
+    np.testing.assert_allclose(physics.bind(catheter.head).xpos, 0, atol=1e-12)
+    bodies = link_bodies(physics)
+    starts = physics.data.ptr.xpos[bodies]
+    np.testing.assert_allclose(starts[:, :2], 0, atol=1e-12)
+    np.testing.assert_allclose(
+        -starts[:, 2], np.cumsum(catheter.link_lengths[::-1])[::-1], rtol=1e-12
+    )
+
+
+# Motors.
+
+
+def names_of_actions(catheter):
+    return [actuator.name for actuator in catheter.actuators]
+
+
+def test_actuators_are_in_the_order_of_the_action(published):
+    catheter, physics = published
+    tip = [f"tip_{axis}_{joint}" for joint in range(10) for axis in "xy"]
+    assert names_of_actions(catheter) == [*tip, "insertion"]
+    model = physics.model.ptr
+    assert model.nu == 21
+    compiled_names = [model.actuator(index).name for index in range(model.nu)]
+    assert compiled_names == [f"catheter/{name}" for name in [*tip, "insertion"]]
+    # Motor i of the tip turns the proximal joint of link i of the tip.
+    first = len(catheter.link_lengths) - 10
+    for index, motor in enumerate(catheter.tip_motors):
+        joint = f"catheter/bend_{'xy'[index % 2]}_{first + index // 2}"
+        actuator = model.actuator(f"catheter/{motor.name}")
+        assert model.joint(int(actuator.trnid[0])).name == joint
+    np.testing.assert_array_equal(model.actuator_ctrlrange, [[-1, 1]] * 21)
+    assert model.actuator_ctrllimited.all()
+
+
+def test_rotation_adds_one_action():
+    catheter, physics = compiled(rotation=True, torsion_joints=4)
+    assert names_of_actions(catheter)[20:] == ["insertion", "rotation"]
+    model = physics.model.ptr
+    assert model.nu == 22
+    joint = model.joint("catheter/rotation")
+    assert model.dof_armature[joint.dofadr[0]] == ROTOR_INERTIA
+    np.testing.assert_allclose(joint.axis, [0, 0, 1])
+
+
+def test_passive_devices_have_no_tip_motors():
+    catheter, physics = compiled("wire_035_amplatz", rotation=True)
+    assert names_of_actions(catheter) == ["insertion", "rotation"]
+    assert physics.model.nu == 2
+
+
+@pytest.mark.parametrize("name", STEERABLE)
+def test_a_motor_bends_its_free_joint_by_the_steering_angle(name):
+    catheter, physics = compiled(name)
+    physics.model.opt.gravity[:] = 0
+    physics.bind(catheter.tip_motors[-1]).ctrl = 1.0
+    for _ in range(1500):
+        physics.step()
+    angles = np.asarray(physics.bind(catheter.bends).qpos)
+    assert angles[-1] == pytest.approx(catheter.device.steering_angle, rel=1e-3)
+    assert np.abs(angles[:-1]).max() < 1e-4
+
+
+def test_carriage_moves_at_the_speed_asked_for(published):
+    catheter, physics = published
+    physics.reset()
+    model = physics.model.ptr
+    joint = model.joint("catheter/insertion")
+    assert model.dof_armature[joint.dofadr[0]] == CARRIAGE_MASS
+    assert joint.type[0] == mujoco.mjtJoint.mjJNT_SLIDE
+    np.testing.assert_allclose(joint.range, [0, catheter.stroke])
+    limits = model.actuator("catheter/insertion").forcerange
+    np.testing.assert_allclose(limits, [-MAX_PUSH_FORCE, MAX_PUSH_FORCE])
+    physics.bind(catheter.actuators[20]).ctrl = 1.0
+    for _ in range(250):
+        physics.step()
+    speed = physics.bind(catheter.insertion).qvel
+    assert float(np.squeeze(speed)) == pytest.approx(MAX_PUSH_SPEED, rel=0.01)
+    physics.reset()
+
+
+# Torsion and rest shape.
+
+
+@pytest.mark.parametrize("count", [1, 4, 9])
+def test_torsion_hinges_add_up_to_the_rod(count):
+    catheter, physics = compiled(rotation=True, torsion_joints=count)
+    model, device = physics.model.ptr, catheter.device
+    twists = [
+        model.joint(index)
+        for index in range(model.njnt)
+        if "/twist_" in model.joint(index).name
+    ]
+    assert len(twists) == count
+    compliance = sum(1 / twist.stiffness[0] for twist in twists)
+    first_half = catheter.link_lengths[0] / 2
+    expected = (
+        LENGTH - device.tip_length - first_half
+    ) / device.shaft.torsional_stiffness + (
+        device.tip_length / device.tip.torsional_stiffness
+    )
+    assert compliance == pytest.approx(expected, rel=1e-9)
+    for twist in twists:
+        np.testing.assert_allclose(twist.axis, [0, 0, 1])
+        assert model.dof_armature[twist.dofadr[0]] == TORSION_ARMATURE
+
+
+def test_without_torsion_hinges_there_are_only_bends(published):
+    catheter, physics = published
+    assert physics.model.nv == 1 + 2 * (len(catheter.link_lengths) - 1)
+
+
+@pytest.mark.parametrize("name", ["diagnostic_5f_j", "diagnostic_5f_simmons"])
+def test_rest_shape_turns_by_the_arcs(name):
+    catheter, physics = compiled(name)
+    addresses = physics.bind(catheter.bends).qposadr
+    rest = physics.model.ptr.qpos_spring[addresses]
+    np.testing.assert_array_equal(rest[::2], 0)
+    turning = sum(arc.angle for arc in catheter.device.tip_shape)
+    outer = catheter.link_lengths[-1] / 2  # the last half link has no joint
+    lost = catheter.device.rest_angle(outer, 0.0)
+    assert rest[1::2].sum() == pytest.approx(turning - lost, rel=1e-9)
+
+
+@pytest.mark.parametrize("stroke", [0.0, -0.1])
+def test_stroke_must_be_positive(stroke):
+    with pytest.raises(ValueError, match=f"stroke is {stroke}"):
+        compiled(stroke=stroke)
+
+
+def test_device_and_section_errors_say_what_is_allowed():
+    with pytest.raises(ValueError, match=r"bending_stiffness.*N·m²"):
+        devices.Section(-1.0, 1.0)
+    with pytest.raises(ValueError, match=r"outer_radius.*positive number in SI"):
+        devices.Device("x", 0.0, 1e-3, devices.PUBLISHED.shaft, devices.PUBLISHED.shaft)
+    with pytest.raises(ValueError, match=r"no device.*published.*lunderquist"):
+        devices.get("amplatz")
+
+
+def test_isotropic_section_has_the_shear_modulus_of_its_material():
+    section = devices.Section.isotropic(3.0, 0.5)
+    # GJ = E / 2(1+ν) · 2I
+    assert section.torsional_stiffness == pytest.approx(2.0)

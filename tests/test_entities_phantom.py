@@ -1,0 +1,319 @@
+"""Wall, sensors, sheath and arena of a compiled task."""
+
+import math
+
+import mujoco
+import numpy as np
+import pytest
+from dm_control import mjcf
+
+from cathsim_dmc.anatomy import arch
+from cathsim_dmc.entities import phantom as phantoms
+from cathsim_dmc.entities.arena import BLOOD_DENSITY, GRAVITY, AngiographyArena
+from cathsim_dmc.entities.phantom import Phantom
+from cathsim_dmc.entities.sheath import CLEARANCE, Sheath
+
+
+@pytest.fixture(scope="module")
+def environment(shared_environment):
+    return shared_environment("type1_bca")
+
+
+@pytest.fixture(scope="module")
+def model(environment):
+    return environment.physics.model.ptr
+
+
+@pytest.fixture(scope="module")
+def pressed(environment, reseed):
+    """Data of every substep that has wall contacts while the device is pushed in.
+
+    Yields a list of (sensordata, contacts of the wall as mj_contactForce gives them).
+    Built by stepping MuJoCo alone, so that nothing of the task stands in between.
+    """
+    reseed(environment, 0)
+    model, task = environment.physics.model.ptr, environment.task
+    data = mujoco.MjData(model)
+    data.qpos[:] = environment.physics.data.qpos
+    mujoco.mj_forward(model, data)
+    random = np.random.RandomState(1)
+    steps = []
+    for control in range(90):
+        if control % 10 == 0:
+            data.ctrl[:20] = random.choice([-1.0, 1.0], 20)
+        data.ctrl[20] = 1.0
+        for _ in range(task.physics_steps_per_control_step):
+            mujoco.mj_step(model, data)
+            contacts = wall_contacts(model, data)
+            if contacts:
+                steps.append((data.sensordata.copy(), contacts))
+    return steps
+
+
+def wall_contacts(model, data):
+    """(force on the wall in the world frame, position, depth) of each wall contact."""
+    result = []
+    for index in range(data.ncon):
+        contact = data.contact[index]
+        names = [model.geom(geom).name for geom in contact.geom]
+        if not any(name.startswith("phantom/") for name in names):
+            continue
+        local = np.zeros(6)
+        mujoco.mj_contactForce(model, data, index, local)
+        # The frame's normal points from geom 0 to geom 1: force on geom 1.
+        force = contact.frame.reshape(3, 3).T @ local[:3]
+        if names[0].startswith("phantom/"):
+            force = -force
+        result.append((force, contact.pos.copy(), -contact.dist))
+    return result
+
+
+def sorted_by_position(positions, *others):
+    order = np.lexsort(np.asarray(positions).round(9).T)
+    return [np.asarray(values)[order] for values in (positions, *others)]
+
+
+# Sensors.
+
+
+def test_the_fixture_has_something_to_measure(pressed):
+    forces = [np.linalg.norm(force) for _, each in pressed for force, _, _ in each]
+    assert len(pressed) > 80
+    assert max(forces) > 0.05
+    assert max(len(each) for _, each in pressed) > 5
+
+
+def test_wall_sensor_equals_the_contact_forces_of_the_same_substep(
+    environment, pressed
+):
+    """Fresh: the readings are those of this substep's solution, not of the last."""
+    layout = environment.task.layout
+    for sensordata, expected in pressed:
+        contacts = layout.contacts(sensordata)
+        here = contacts.present
+        # A contact without a constraint row, just in touch, may miss in either list.
+        assert here.sum() == len(expected)
+        positions, forces, depths = sorted_by_position(
+            contacts.position[here], contacts.force[here], contacts.penetration[here]
+        )
+        true_positions, true_forces, true_depths = sorted_by_position(
+            [each[1] for each in expected],
+            [each[0] for each in expected],
+            [each[2] for each in expected],
+        )
+        np.testing.assert_allclose(positions, true_positions, atol=1e-9)
+        np.testing.assert_allclose(depths, true_depths, atol=1e-9)
+        np.testing.assert_allclose(forces, true_forces, atol=1e-9, rtol=1e-6)
+
+
+def test_magnitude_is_that_of_normal_and_friction_together(environment, pressed):
+    layout = environment.task.layout
+    for sensordata, expected in pressed[::20]:
+        contacts = layout.contacts(sensordata)
+        total = sum(np.linalg.norm(force) for force, _, _ in expected)
+        assert contacts.magnitude.sum() == pytest.approx(total, rel=1e-6, abs=1e-9)
+        assert contacts.found == len(expected)
+
+
+def test_load_cell_equals_the_sum_of_the_contact_forces(environment, pressed):
+    """Newton's third law: the wall passes on what the device does to it."""
+    layout = environment.task.layout
+    for sensordata, expected in pressed:
+        total = sum(force for force, _, _ in expected)
+        cell = -sensordata[layout.load_cell]
+        error = np.linalg.norm(cell - total)
+        assert error <= 1e-6 + 0.01 * np.linalg.norm(total)
+
+
+def test_load_cell_is_empty_without_contact(environment, reseed):
+    reseed(environment, 0)
+    readings = environment.task.readings
+    assert not environment.task.contacts(environment.physics).present.any()
+    np.testing.assert_allclose(readings.load_cell, 0, atol=1e-9)
+
+
+def test_readings_of_the_task_are_those_sensors(environment, reseed):
+    reseed(environment, 0)
+    action = np.ones(21)
+    for _ in range(40):
+        environment.step(action)
+        task = environment.task
+        contacts = task.contacts(environment.physics)
+        assert task.wall_force.sum == pytest.approx(contacts.magnitude.sum())
+        assert task.wall_force.max == pytest.approx(contacts.magnitude.max())
+        assert task.wall_force.peak_sum >= task.wall_force.sum
+        assert task.wall_force.peak_max >= task.wall_force.max
+    assert task.wall_force.sum > 0
+
+
+def test_friction_stays_in_its_cone(pressed, environment):
+    layout = environment.task.layout
+    friction = environment.task.config.friction
+    for sensordata, _ in pressed[::10]:
+        contacts = layout.contacts(sensordata)
+        rows = sensordata[layout.wall_contacts].reshape(-1, 14)[contacts.present]
+        normal, tangents = rows[:, 1], rows[:, 2:4]
+        assert (normal >= -1e-12).all()
+        assert (
+            np.linalg.norm(tangents, axis=-1) <= friction * normal * 1.01 + 1e-9
+        ).all()
+
+
+# Wall.
+
+
+def test_every_piece_collides_with_the_device_only(model, environment):
+    wall = [
+        model.geom(f"phantom/wall_{index}")
+        for index in range(len(environment.task.anatomy.wall))
+    ]
+    for geom in wall:
+        assert geom.contype[0] == 1 and geom.conaffinity[0] == 0
+        assert geom.condim[0] == 3
+        # The contact surface is the wall itself.
+        assert geom.margin[0] == 0 and geom.gap[0] == 0
+    lumen = model.geom("phantom/lumen")
+    assert lumen.contype[0] == 0 and lumen.conaffinity[0] == 0
+
+
+def test_device_and_wall_have_the_same_contact(model):
+    wall, link = model.geom("phantom/wall_0"), model.geom("catheter/link_3")
+    np.testing.assert_array_equal(wall.solref, link.solref)
+    np.testing.assert_array_equal(wall.solimp, link.solimp)
+    np.testing.assert_array_equal(wall.solref, phantoms.CONTACT_SOLREF)
+    np.testing.assert_array_equal(wall.solimp, phantoms.CONTACT_SOLIMP)
+    assert wall.friction[0] == link.friction[0] == phantoms.FRICTION
+
+
+def test_pieces_lie_where_the_anatomy_puts_them(model, environment):
+    anatomy = environment.task.anatomy
+    data = mujoco.MjData(model)
+    mujoco.mj_kinematics(model, data)
+    for index in range(0, len(anatomy.wall), 50):
+        geom = model.geom(f"phantom/wall_{index}")
+        mesh = model.mesh(int(geom.dataid[0]))
+        start, count = int(mesh.vertadr[0]), int(mesh.vertnum[0])
+        vertices = model.mesh_vert[start : start + count]
+        rotation = data.geom_xmat[geom.id].reshape(3, 3)
+        world = vertices @ rotation.T + data.geom_xpos[geom.id]
+        piece = anatomy.wall[index]
+        gap = np.linalg.norm(world[:, None] - piece[None], axis=-1).min(1)
+        assert gap.max() < 1e-6
+
+
+def test_goals_are_where_the_anatomy_puts_them(environment):
+    task, physics = environment.task, environment.physics
+    assert set(task.phantom.goals) == set(task.anatomy.goals)
+    for name, site in task.phantom.goals.items():
+        np.testing.assert_allclose(
+            physics.bind(site).xpos, task.anatomy.goals[name].position, atol=1e-9
+        )
+
+
+def test_phantom_has_no_mass(model):
+    assert model.body("phantom/wall").mass[0] == 0
+
+
+@pytest.mark.parametrize("friction", [-0.1, 2.5, math.nan])
+def test_friction_outside_its_range(friction):
+    with pytest.raises(ValueError, match="friction is .* between 0 and 2"):
+        Phantom(arch.load("type1"), friction)
+
+
+# Sheath.
+
+
+@pytest.fixture(scope="module")
+def sheath_model():
+    sheath = Sheath(
+        length=0.2,
+        device_radius=0.8e-3,
+        solref=phantoms.CONTACT_SOLREF,
+        solimp=phantoms.CONTACT_SOLIMP,
+    )
+    arena = AngiographyArena()
+    arena.attach(sheath)
+    return sheath, mjcf.Physics.from_mjcf_model(arena.mjcf_model).model.ptr
+
+
+def test_bore_leaves_the_clearance_on_each_side(sheath_model):
+    sheath, model = sheath_model
+    assert sheath.bore_half_width == pytest.approx(0.8e-3 + CLEARANCE)
+    inner = {
+        side: np.abs(model.geom(f"sheath/{side}").pos[axis])
+        - model.geom(f"sheath/{side}").size[axis]
+        for side, axis in {"left": 0, "right": 0, "top": 1, "bottom": 1}.items()
+    }
+    np.testing.assert_allclose(list(inner.values()), sheath.bore_half_width)
+
+
+def test_bore_spans_its_length_and_ends_at_the_origin(sheath_model):
+    sheath, model = sheath_model
+    for side in ("left", "right", "top", "bottom"):
+        geom = model.geom(f"sheath/{side}")
+        assert geom.pos[2] + geom.size[2] == pytest.approx(0, abs=1e-12)
+        assert geom.pos[2] - geom.size[2] == pytest.approx(-sheath.length)
+
+
+def test_bore_is_frictionless_and_only_guides_the_device(sheath_model):
+    _, model = sheath_model
+    for side in ("left", "right", "top", "bottom"):
+        geom = model.geom(f"sheath/{side}")
+        assert geom.condim[0] == 1 and geom.priority[0] == 1
+        assert geom.contype[0] == 1 and geom.conaffinity[0] == 0
+    tube = model.geom("sheath/tube")
+    assert tube.contype[0] == 0 and tube.conaffinity[0] == 0
+
+
+def test_sheath_holds_the_device_at_the_start(environment, model):
+    """It reaches from the inlet back over the whole chain, along the device's axis."""
+    task = environment.task
+    body = model.body("sheath/bore").id
+    data = mujoco.MjData(model)
+    mujoco.mj_kinematics(model, data)
+    np.testing.assert_allclose(data.xpos[body], task.anatomy.inlet.position, atol=1e-9)
+    axis = data.xmat[body].reshape(3, 3)[:, 2]
+    np.testing.assert_allclose(axis, task.anatomy.inlet.direction, atol=1e-9)
+    base = data.xpos[model.body("catheter/link_0").id]
+    behind = (task.anatomy.inlet.position - base) @ axis
+    assert behind == pytest.approx(task.sheath.length, abs=1e-9)
+
+
+# Arena.
+
+
+def test_settings_of_the_physics(model):
+    option = model.opt
+    assert option.integrator == mujoco.mjtIntegrator.mjINT_DISCRETE
+    assert option.cone == mujoco.mjtCone.mjCONE_ELLIPTIC
+    assert option.noslip_iterations == 0
+    assert option.density == 0 and option.viscosity == 0
+    assert option.timestep == pytest.approx(0.004)
+
+
+def test_gravity_pulls_to_the_back_less_the_buoyancy(environment, model):
+    device = environment.task.catheter.device
+    density = device.linear_density / (math.pi * device.outer_radius**2)
+    # A hollow catheter is lighter than blood, in which it is taken to float.
+    expected = GRAVITY * max(0.0, 1 - BLOOD_DENSITY / density)
+    np.testing.assert_allclose(model.opt.gravity, [0, expected, 0])
+
+
+@pytest.mark.parametrize("density", [BLOOD_DENSITY, 1500.0, 6450.0])
+def test_a_denser_device_sinks_more(density):
+    arena = AngiographyArena(device_density=density)
+    gravity = arena.mjcf_model.option.gravity
+    np.testing.assert_allclose(gravity[1], GRAVITY * (1 - BLOOD_DENSITY / density))
+
+
+def test_camera_looks_at_its_target():
+    arena = AngiographyArena()
+    target = np.array([0.1, 0.2, 0.3])
+    arena.add_camera("view", target, 0.5, (1, 0, 0, 0, 0, 1))
+    model = mjcf.Physics.from_mjcf_model(arena.mjcf_model).model.ptr
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    camera = model.camera("view").id
+    # A camera looks along its -z axis.
+    axis = -data.cam_xmat[camera].reshape(3, 3)[:, 2]
+    np.testing.assert_allclose(data.cam_xpos[camera] + 0.5 * axis, target, atol=1e-9)
