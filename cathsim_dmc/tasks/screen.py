@@ -31,6 +31,7 @@ class Screen:
           eyes: cameras, needed by `rgb` and `depth`.
         """
         self._names = names
+        self._on = angiograph is not None or eyes is not None
         self._angiograph = angiograph
         self._radius = radius
         self._eyes = eyes
@@ -62,6 +63,8 @@ class Screen:
           fresh: indices of simulations that have just begun an episode: only theirs
             are taken and fill their whole history. None for all, one step on.
         """
+        if not self._on:
+            return observations.Picture()
         count = len(qpos)
         chosen = np.arange(count) if fresh is None else fresh
         line = lines[chosen]

@@ -1,0 +1,229 @@
+"""What the observations show, and when."""
+
+import json
+
+import numpy as np
+import pytest
+
+from cathsim_dmc import suite
+from cathsim_dmc.anatomy import arch
+from cathsim_dmc.imaging import Fluoroscope, FluoroscopyOptions
+from cathsim_dmc.tasks import observations
+from cathsim_dmc.tasks.config import NavigationConfig
+
+SIZE = 64
+
+
+@pytest.fixture(scope="module")
+def anatomy():
+    return arch.load("type1")
+
+
+def make(anatomy, observation, seed=0, **options):
+    options = {
+        "phantom": anatomy,
+        "goal": "bca",
+        "random": seed,
+        "fluoroscopy": {"size": SIZE, **options.pop("fluoroscopy", {})},
+        **options,
+    }
+    return suite.load("cathsim", "navigate", {"observation": observation, **options})
+
+
+def push(environment, steps, bend=0.0):
+    action = np.zeros(21)
+    action[0:20:2], action[-1] = bend, 1.0
+    return [environment.step(action) for _ in range(steps)]
+
+
+@pytest.mark.parametrize("noise", [False, True])
+def test_sequential_is_the_last_three_images_oldest_first(anatomy, noise):
+    env = make(anatomy, ["image", "sequential"], fluoroscopy={"noise": noise})
+    for _ in range(2):  # the second time after an episode
+        timesteps = [env.reset(), *push(env, 5)]
+        images = [t.observation["image"][..., 0] for t in timesteps]
+        stacks = [t.observation["sequential"] for t in timesteps]
+        # Nothing of an earlier episode is seen; the first image fills the history.
+        for channel in range(3):
+            np.testing.assert_array_equal(stacks[0][..., channel], images[0])
+        np.testing.assert_array_equal(stacks[1][..., 1], images[0])
+        for t in range(2, 6):
+            for channel in range(3):
+                np.testing.assert_array_equal(
+                    stacks[t][..., channel], images[t - 2 + channel]
+                )
+        assert not np.array_equal(images[0], images[5])
+
+
+def test_the_image_is_the_fluoroscopes(anatomy):
+    env = make(anatomy, "image", fluoroscopy={"view": "LAO45", "contrast": 25.0})
+    env.reset()
+    image = push(env, 10)[-1].observation["image"]
+    options = FluoroscopyOptions(view="LAO45", size=SIZE)
+    surface = anatomy.surface
+    scope = Fluoroscope.from_surface(
+        surface.vertices,
+        surface.faces,
+        options.carms(surface.vertices)[0],
+        contrast=25.0,
+    )
+    task = env.task
+    radius = task.catheter.device.outer_radius
+    np.testing.assert_array_equal(
+        image, scope.render(task.readings.centreline, radius)
+    )
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"view": "LAO45"},
+        {"view": "LATERAL"},
+        {"view": "RAO30"},
+        {"view": (10.0, -20.0)},
+        {"contrast": False},
+        {"magnification": 2.0},
+        {"roadmap": 0.7},
+        {"gain": 0.5},
+        {"noise": True},
+        {"blur": 5e-3},
+        {"centre": (0.0, 0.0, 0.05)},
+        {"source_detector": 0.95},
+    ],
+)
+def test_every_option_changes_the_image(anatomy, options):
+    plain = make(anatomy, "image").reset().observation["image"]
+    other = make(anatomy, "image", fluoroscopy=options).reset().observation["image"]
+    assert plain.shape == other.shape
+    assert (plain != other).mean() > 0.01
+
+
+def test_noise_is_new_in_every_image_and_the_same_for_a_seed(anatomy):
+    def images(seed):
+        env = make(anatomy, "image", seed, fluoroscopy={"noise": True})
+        first = env.reset().observation["image"]
+        return [first, *(t.observation["image"] for t in push(env, 2))]
+
+    one, again, other = images(1), images(1), images(2)
+    for a, b, c in zip(one, again, other, strict=True):
+        np.testing.assert_array_equal(a, b)
+        assert (a != c).mean() > 0.2
+    far = np.abs(one[0][:4].astype(int) - one[1][:4])  # away from the device
+    assert 0 < far.mean() < 10
+
+
+def test_noise_does_not_change_where_the_device_starts(anatomy):
+    loud = make(anatomy, ["image", "internal"], 3, fluoroscopy={"noise": True})
+    quiet = make(anatomy, ["image", "internal"], 3)
+    np.testing.assert_array_equal(
+        loud.reset().observation["position"], quiet.reset().observation["position"]
+    )
+
+
+def test_biplane_sees_both_views(anatomy):
+    env = make(
+        anatomy,
+        ["image", "sequential", "segmentation", "tracking_2d"],
+        fluoroscopy={"view": "AP", "biplane": "LATERAL", "size": (32, 48)},
+    )
+    seen = env.reset().observation
+    assert seen["image"].shape == (32, 48, 2)
+    assert seen["sequential"].shape == (32, 48, 6)
+    assert seen["segmentation"].shape == (32, 48, 4)
+    assert seen["tracking_pixels"].shape == (2 * observations.TRACKED_POINTS * 2,)
+    for channel, view in enumerate(("AP", "LATERAL")):
+        single = make(anatomy, "image", fluoroscopy={"view": view, "size": (32, 48)})
+        np.testing.assert_array_equal(
+            seen["image"][..., channel], single.reset().observation["image"][..., 0]
+        )
+
+
+def test_segmentation_is_device_and_vessel(anatomy):
+    env = make(anatomy, ["segmentation", "image", "tracking_2d"])
+    before = env.reset().observation
+    after = push(env, 20)[-1].observation
+    assert set(np.unique(after["segmentation"])) == {0, 255}
+    device, vessel = np.moveaxis(after["segmentation"] == 255, -1, 0)
+    # The vessel stays, the device grows into it and is mostly inside.
+    np.testing.assert_array_equal(vessel, before["segmentation"][..., 1] == 255)
+    assert device.sum() > (before["segmentation"][..., 0] == 255).sum()
+    assert vessel.mean() > 0.05
+    # The head, whose pixel coordinates are given, is on the device.
+    column, row = after["tracking_pixels"].reshape(-1, 2)[-1]
+    r, c = round(row), round(column)
+    assert device[r - 1 : r + 2, c - 1 : c + 2].any()
+    # Where the device is, the image is darker than that of the vessel alone.
+    away = env.task.readings.centreline + [1.0, 0.0, 0.0]
+    radius = env.task.catheter.device.outer_radius
+    empty = env.task.fluoroscope.render(away, radius)
+    assert (after["image"][device] < empty[device]).all()
+    far = after["image"] == empty
+    assert far.mean() > 0.9 and not (device & far[..., 0]).any()
+
+
+def test_tracking_follows_device_and_goal_in_space_and_on_the_screen(anatomy):
+    env = make(anatomy, ["tracking", "tracking_2d", "goal"])
+    env.reset()
+    seen = push(env, 8, bend=0.3)[-1].observation
+    task = env.task
+    points = seen["tracking_points"].reshape(-1, 3)
+    np.testing.assert_array_equal(points[-1], task.readings.head)
+    line = task.readings.centreline
+    assert all((point == line).all(-1).any() for point in points)
+    carm = task.fluoroscope.carm
+    pixels = seen["tracking_pixels"].reshape(-1, 2)
+    np.testing.assert_allclose(pixels, carm.project(points)[0])
+    np.testing.assert_allclose(
+        seen["tracking_goal_pixels"], carm.project(task.goal_position)[0]
+    )
+    np.testing.assert_array_equal(seen["goal_position"], task.goal_position)
+    np.testing.assert_allclose(
+        seen["goal_from_head"], task.goal_position - task.readings.head
+    )
+    assert np.linalg.norm(seen["goal_from_head"]) == pytest.approx(
+        float(task.outcome.distance)
+    )
+    assert seen["tracking_insertion"] == task.readings.insertion
+    assert seen["tracking_action"][0] == 0.3 and seen["tracking_action"][-1] == 1.0
+
+
+def test_specs_tell_shapes_and_ranges(anatomy):
+    names = [n for n in observations.OBSERVATIONS if n not in ("rgb", "depth")]
+    env = make(anatomy, names)
+    specs, seen = env.observation_spec(), env.reset().observation
+    assert list(specs) == list(seen)
+    for key, spec in specs.items():
+        spec.validate(seen[key])
+    for key in ("image", "sequential", "segmentation"):
+        assert (specs[key].minimum, specs[key].maximum) == (0, 255)
+
+
+def test_observations_are_copies(anatomy):
+    env = make(anatomy, ["image", "segmentation", "tracking"])
+    first = env.reset().observation
+    kept = {key: value.copy() for key, value in first.items()}
+    for value in first.values():
+        value[...] = 0
+    second = env.step(np.zeros(21)).observation
+    assert second["image"].any() and second["segmentation"].any()
+    push(env, 3)
+    assert not np.array_equal(kept["image"], first["image"])
+
+
+def test_options_are_json_and_wrong_ones_are_refused():
+    text = '{"fluoroscopy": {"view": [5, 0], "biplane": "LAO45", "size": 32}}'
+    config = NavigationConfig(**json.loads(text))
+    assert config.fluoroscopy.planes == 2
+    for options, message in (
+        ({"fluoroscopy": {"view": "PA"}}, "LAO45"),
+        ({"fluoroscopy": {"zoom": 2}}, "magnification"),
+        ({"fluoroscopy": {"size": 0}}, "resolution"),
+        ({"fluoroscopy": {"view": (0, 90)}}, "secondary"),
+        ({"cameras": {"names": "front"}}, "top, side, tip"),
+        ({"cameras": {"size": (0, 1)}}, "size"),
+        ({"cameras": 3}, "mapping"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            NavigationConfig(**options)
+    with pytest.raises(ValueError, match="segmentation"):
+        observations.resolve("pictures")

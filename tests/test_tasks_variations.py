@@ -1,0 +1,229 @@
+"""Domain randomisation: what is drawn, and what it does to the model."""
+
+import numpy as np
+import pytest
+from dm_control.composer.variation import distributions
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from cathsim_dmc import suite
+from cathsim_dmc.anatomy import arch
+from cathsim_dmc.tasks import cannulation
+from cathsim_dmc.tasks.variations import USUAL, ActionDelay, Episode, Randomisation
+
+
+@pytest.fixture(scope="module")
+def anatomy():
+    return arch.load("type1")
+
+
+def make(anatomy, randomisation, **options):
+    options = {"phantom": anatomy, "goal": "bca", "random": 0, **options}
+    options["randomisation"] = randomisation
+    return suite.load("cathsim", "navigate", options)
+
+
+def elements(environment):
+    """Indices of hinges, tip motors, device and wall geoms, and the base."""
+    model = environment.physics.model.ptr
+
+    def named(kind, count, prefix):
+        names = [getattr(model, kind)(i).name for i in range(count)]
+        return [i for i, name in enumerate(names) if name.startswith(prefix)]
+
+    return {
+        "hinges": named("joint", model.njnt, "catheter/bend"),
+        "motors": named("actuator", model.nu, "catheter/tip"),
+        "device": named("geom", model.ngeom, "catheter/link"),
+        "wall": named("geom", model.ngeom, "phantom/wall"),
+        "base": model.body("catheter/link_0").id,
+    }
+
+
+def snapshot(environment):
+    model = environment.physics.model.ptr
+    hinges = ("jnt_stiffness", "dof_damping", "actuator_gainprm")
+    fields = ("geom_friction", "body_quat", *hinges)
+    return {field: getattr(model, field).copy() for field in fields}
+
+
+def test_nothing_is_drawn_but_the_displacement_by_default():
+    drawn, plain = np.random.RandomState(3), np.random.RandomState(3)
+    episode = Randomisation().draw(drawn)
+    displacement = cannulation.start_displacement(plain)
+    np.testing.assert_array_equal(episode.displacement, displacement)
+    assert episode == Episode(episode.displacement)
+    assert drawn.randint(2**31) == plain.randint(2**31)
+
+
+@given(seed=st.integers(0, 2**32 - 1))
+@settings(deadline=None)
+def test_draws_lie_in_their_ranges(seed):
+    episode = USUAL.draw(np.random.RandomState(seed))
+    assert np.linalg.norm(episode.displacement) <= USUAL.start_radius
+    for name in ("friction", "stiffness", "goal_shift", "roll", "delay"):
+        low, high = getattr(USUAL, name)
+        assert low <= getattr(episode, name) <= high
+    deviation = episode.deviation
+    for name in ("primary", "secondary"):
+        angle = getattr(deviation, name)
+        assert USUAL.view[0] <= angle <= USUAL.view[1] and angle == int(angle)
+    for name in ("gain", "kerma"):
+        assert getattr(USUAL, name)[0] <= getattr(deviation, name)
+        assert getattr(deviation, name) <= getattr(USUAL, name)[1]
+
+
+def test_a_composer_variation_is_a_range_too():
+    friction = distributions.Normal(loc=0.05, scale=1e-9)
+    draws = [
+        Randomisation(friction=friction).draw(np.random.RandomState(i)).friction
+        for i in range(5)
+    ]
+    np.testing.assert_allclose(draws, 0.05, atol=1e-7)
+    assert len(set(draws)) == 5
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"friction": (0.2, 0.1)}, "low <= high"),
+        ({"friction": (-0.1, 0.1)}, "negative"),
+        ({"stiffness": (0.0, 1.0)}, "must be > 0"),
+        ({"delay": (0, 1.5)}, "whole control steps"),
+        ({"delay": distributions.Uniform()}, "bounds must be known"),
+        ({"start_radius": -1.0}, "start_radius"),
+        ({"colour": (0, 1)}, "friction, stiffness"),
+    ],
+)
+def test_impossible_ranges_are_refused(options, message):
+    with pytest.raises(ValueError, match=message):
+        Randomisation.make(options)
+
+
+def test_the_model_takes_what_was_drawn_and_gives_it_back(anatomy):
+    env = make(
+        anatomy, {"friction": (0.1, 0.12), "stiffness": (2.0, 3.0), "roll": (0.5, 1.0)}
+    )
+    usual, at = snapshot(env), elements(env)  # before anything is drawn
+    env.reset()
+    model = env.physics.model.ptr
+    ratios = []
+    for _ in range(3):
+        env.reset()
+        assert env.physics.model.ptr is model  # not compiled again
+        friction = model.geom_friction[[*at["device"], *at["wall"]], 0]
+        assert len(set(friction)) == 1 and 0.1 <= friction[0] <= 0.12
+        ratio = model.jnt_stiffness[at["hinges"]] / usual["jnt_stiffness"][at["hinges"]]
+        ratios.append(ratio[0])
+        np.testing.assert_allclose(ratio, ratio[0])
+        dofs = model.jnt_dofadr[at["hinges"]]
+        damping = model.dof_damping[dofs] / usual["dof_damping"][dofs]
+        torque = (
+            model.actuator_gainprm[at["motors"], 0]
+            / usual["actuator_gainprm"][at["motors"], 0]
+        )
+        np.testing.assert_allclose(damping, ratio[0])
+        np.testing.assert_allclose(torque, ratio[0])
+        angle = 2 * np.arctan2(
+            model.body_quat[at["base"], 3], model.body_quat[at["base"], 0]
+        )
+        assert 0.5 <= angle <= 1.0
+    # Factors act on the model's own values, not on those of the episode before.
+    assert len(set(ratios)) == 3 and max(ratios) <= 3.0
+    # What is not named stays as it is: the push, the insertion joint, other bodies.
+    others = np.setdiff1d(np.arange(model.nu), at["motors"])
+    np.testing.assert_array_equal(
+        model.actuator_gainprm[others], usual["actuator_gainprm"][others]
+    )
+    bodies = np.setdiff1d(np.arange(model.nbody), [at["base"]])
+    np.testing.assert_array_equal(model.body_quat[bodies], usual["body_quat"][bodies])
+
+
+def test_roll_turns_the_plane_in_which_the_tip_bends(anatomy):
+    def bent(roll):
+        env = make(anatomy, {"roll": (roll, roll), "start_radius": 0.0})
+        env.reset()
+        straight = env.task.placement.direction
+        action = np.zeros(21)
+        action[0:20:2] = 0.4
+        for _ in range(10):
+            env.step(action)
+        sideways = env.task.readings.head - env.task.placement.inlet
+        sideways = sideways - (sideways @ straight) * straight
+        return sideways / np.linalg.norm(sideways)
+
+    # Gravity sags the tip by far less than the motors bend it.
+    assert bent(0.0) @ bent(np.pi / 2) == pytest.approx(0.0, abs=0.1)
+    assert bent(0.0) @ bent(np.pi) == pytest.approx(-1.0, abs=0.02)
+
+
+def test_a_shifted_goal_moves_along_its_branch(anatomy):
+    plain = make(anatomy, False).task.usual_meaning
+    for reward in cannulation.REWARDS:
+        env = make(anatomy, {"goal_shift": (-0.01, 0.01)}, reward=reward)
+        goals = []
+        for _ in range(6):
+            env.reset()
+            meaning = env.task.meaning
+            place = meaning.branch.project(meaning.goal)
+            assert meaning.ostium <= place.arc_length
+            assert place.distance < 1e-9
+            assert meaning.outcome(meaning.goal).success
+            assert float(meaning.path_distance(meaning.goal)) < 1e-9
+            goals.append(float(place.arc_length))
+            np.testing.assert_array_equal(env.task.goal_position, meaning.goal)
+        usual = float(plain.branch.project(plain.goal).arc_length)
+        assert len(set(goals)) == 6 and max(np.abs(np.array(goals) - usual)) <= 0.0101
+    # Without a shift the meaning is that of the task without randomisation.
+    wide = make(anatomy, {"goal_shift": (-0.01, 0.01)}).task.usual_meaning
+    heads = plain.goal + np.random.default_rng(0).normal(size=(20, 3)) * 0.02
+    one, other = plain.outcome(heads), wide.shifted(0.0).outcome(heads)
+    np.testing.assert_allclose(one.reward, other.reward, atol=1e-12)
+    assert wide.route.length > plain.route.length
+
+
+@given(
+    delays=st.lists(st.integers(0, 4), min_size=1, max_size=4),
+    actions=st.lists(st.floats(-1, 1), min_size=1, max_size=12),
+)
+def test_actions_arrive_as_late_as_drawn(delays, actions):
+    count = len(delays)
+    way = ActionDelay(count, 1, longest=4)
+    for index, delay in enumerate(delays):
+        way.restart(index, delay)
+    sent = [np.full((count, 1), a) for a in actions]
+    arrived = [way.pass_on(a).copy() for a in sent]
+    for index, delay in enumerate(delays):
+        expected = ([0.0] * delay + actions)[: len(actions)]
+        assert [float(a[index, 0]) for a in arrived] == expected
+    way.restart(0, 1)
+    assert way.pass_on(np.ones((count, 1)))[0, 0] == 0.0
+
+
+def test_delayed_device_does_later_what_it_does_at_once(anatomy):
+    def insertions(delay):
+        env = make(anatomy, {"delay": (delay, delay), "start_radius": 0.0})
+        env.reset()
+        push = np.zeros(21)
+        push[-1] = 1.0
+        return [float(env.step(push) and env.task.readings.insertion) for _ in range(8)]
+
+    at_once, late = insertions(0), insertions(3)
+    assert max(np.abs(np.diff(late[:3]))) < 1e-5 < at_once[1] - at_once[0]
+    assert late[-1] - late[2] == pytest.approx(at_once[4] - 1e-3, abs=2e-4)
+
+
+def test_view_and_gain_change_the_image_and_are_seeded(anatomy):
+    def images(seed, **ranges):
+        env = make(
+            anatomy, ranges, observation="image", fluoroscopy={"size": 64}, random=seed
+        )
+        return [env.reset().observation["image"].astype(float) for _ in range(3)]
+
+    bright = images(0, gain=(0.9, 1.1))
+    corners = [image[0, 0, 0] for image in bright]
+    assert len(set(corners)) > 1
+    turned = images(0, view=(-20, 20))
+    assert np.abs(turned[0] - turned[1]).max() > 20
+    for one, other in zip(turned, images(0, view=(-20, 20)), strict=True):
+        np.testing.assert_array_equal(one, other)
