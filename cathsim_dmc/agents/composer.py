@@ -16,6 +16,7 @@ NUMBERS = (
     "wall_force_sum",
     "wall_force_max",
     "wall_force_peak",
+    "path_ratio",
 )
 FLAGS = ("success", "physics_error")
 
@@ -53,6 +54,7 @@ class TaskInformation(Transform):
             "wall_force_sum": wall.sum,
             "wall_force_max": wall.max,
             "wall_force_peak": wall.peak_max,
+            "path_ratio": task.path_ratio,
         }
         entries = {
             name: torch.tensor([float(values[name])], dtype=torch.float32)

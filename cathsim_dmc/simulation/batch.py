@@ -81,6 +81,7 @@ class BatchSimulation:
         self._screen = task.screen(self._model, num_simulations)
         self._delay = task.action_delay(num_simulations)
         self._monitor = task.monitor(num_simulations)
+        self._travel = cannulation.Travel(num_simulations)
         self._variation = task.model_variation(self._model)
         fields = self._variation.fields
         self._fields = {name: self._batch.expand(name) for name in fields}
@@ -124,6 +125,7 @@ class BatchSimulation:
             self._steps[indices] = 0
             self._action[indices] = 0
         self._measure()
+        self._travel.restart(indices, self._readings.head, self._meaning)
         return self._observe(indices)
 
     def _draw(self, index: int) -> np.ndarray:
@@ -179,6 +181,7 @@ class BatchSimulation:
             self._wall_force.peak_max,
         )
         error = np.array([reason is not None for reason in reasons])
+        self._travel.add(self._readings.head)
         outcome = self._meaning.outcome(self._readings.head)
         if error.any():
             outcome = dataclasses.replace(
@@ -252,6 +255,11 @@ class BatchSimulation:
     def wall_force(self) -> forces.WallForce:
         """Force on the wall over the last step."""
         return self._wall_force
+
+    @property
+    def path_ratio(self) -> np.ndarray:
+        """Way of each head (N,) so far over the shortest way to the goal."""
+        return self._travel.path_ratio
 
     @property
     def sensor_rows(self) -> np.ndarray:

@@ -20,6 +20,7 @@ INFO = (
     "wall_force_sum",
     "wall_force_max",
     "wall_force_peak",
+    "path_ratio",
 )
 
 
@@ -119,6 +120,7 @@ class BatchedEnv(EnvBase):
             "wall_force_sum": wall.sum,
             "wall_force_max": wall.max,
             "wall_force_peak": wall.peak_max,
+            "path_ratio": self._simulation.path_ratio,
         }
         info = {key: _column(numbers[key], torch.float32) for key in INFO}
         info["success"] = _column(outcome.success, torch.bool)

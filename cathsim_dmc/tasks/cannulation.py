@@ -119,6 +119,34 @@ class Cannulation:
         return dataclasses.replace(self, goal=goal, goal_arc_length=arc_length)
 
 
+class Travel:
+    """Ways that the heads of N simulations have gone in their episodes."""
+
+    def __init__(self, simulations: int):
+        """Starts with all heads at rest."""
+        self._last = np.zeros((simulations, 3))
+        self._gone = np.zeros(simulations)
+        self._shortest = np.ones(simulations)
+
+    def restart(
+        self, indices: np.ndarray, head: np.ndarray, meaning: Cannulation
+    ) -> None:
+        """Begins episodes of some simulations with the heads (N, 3) of all, m."""
+        self._last[indices] = head[indices]
+        self._gone[indices] = 0.0
+        self._shortest[indices] = meaning.path_distance(head)[indices]
+
+    def add(self, head: np.ndarray) -> None:
+        """Adds the way to the heads (N, 3), m."""
+        self._gone += np.sqrt(((head - self._last) ** 2).sum(-1))
+        self._last = head
+
+    @property
+    def path_ratio(self) -> np.ndarray:
+        """(N,), way gone so far over the shortest way from start to goal."""
+        return self._gone / self._shortest
+
+
 def start_displacement(
     random_state: np.random.RandomState, ball: float = START_JITTER
 ) -> np.ndarray:

@@ -187,6 +187,7 @@ class Navigation(composer.Task):
         self._screen = self.screen(model, 1)
         self._delay = self.action_delay(1)
         self._monitor = self.monitor(1)
+        self._travel = cannulation.Travel(1)
         self._state = np.zeros(mujoco.mj_stateSize(model, _STATE))
         self._restart()
         # Composer looks once before the first reset, which must not draw noise.
@@ -289,6 +290,7 @@ class Navigation(composer.Task):
         self._step += 1
         self._observation = None
         self._measure(physics)
+        self._travel.add(self._readings.head[None])
         self._outcome = self._meaning.outcome(self._readings.head)
         diverged = (physics.data.ptr.warning.number != self._warnings).any()
         (self._error,) = self._monitor.errors(
@@ -334,6 +336,8 @@ class Navigation(composer.Task):
         if self._observation is None:
             if not self._step:
                 self._measure(physics)
+                head = self._readings.head[None]
+                self._travel.restart(np.zeros(1, dtype=int), head, self._meaning)
             picture = self._screen.take(
                 self._readings.centreline[None],
                 self.goal_position,
@@ -485,6 +489,11 @@ class Navigation(composer.Task):
     def outcome(self) -> cannulation.Outcome:
         """Reward terms, distance and success of the last control step."""
         return self._outcome
+
+    @property
+    def path_ratio(self) -> float:
+        """Way of the head so far over the shortest way to the goal."""
+        return float(self._travel.path_ratio[0])
 
     @property
     def wall_force(self) -> forces.WallForce:
