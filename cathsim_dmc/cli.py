@@ -329,7 +329,10 @@ def generate(
     if seed is None:
         anatomy = arch.load(kind)
     else:
-        parameters = arch.sample(np.random.RandomState(seed), kind)
+        drawn = {"type1": "I", "type2": "II", "type3": "III"}.get(kind)
+        parameters = arch.sample(
+            np.random.RandomState(seed), drawn, bovine=kind == "bovine"
+        )
         anatomy = arch.build_arch(parameters, name=f"{kind}-{seed}")
     anatomy.save(out)
     print(f"{len(anatomy.wall)} wall pieces, goals {', '.join(anatomy.goals)}: {out}")

@@ -254,7 +254,7 @@ def construction() -> tuple[float, float, float]:
     random_state = np.random.RandomState(0)
 
     def new_anatomy():
-        arch.build_arch(arch.sample(random_state, "type2"))
+        arch.build_arch(arch.sample(random_state, "II"))
 
     construct = _timed(lambda: _environment("type1_bca").close())
     return construct, _timed(environment.reset, 20), _timed(new_anatomy)
