@@ -465,6 +465,7 @@ def expert_episodes(
     settings: Settings | None = None,
     num_threads: int | None = None,
     out_dir: str | Path | None = None,
+    observer: evaluation.Observer | None = None,
 ) -> evaluation.EvaluationResult:
     """Evaluates the expert as `evaluation.evaluate` does a trained policy.
 
@@ -476,6 +477,7 @@ def expert_episodes(
       settings: how to drive.
       num_threads: of the simulation, None for every core.
       out_dir: write evaluation.json there.
+      observer: as in `evaluation.evaluate`.
     """
     crew = {}
 
@@ -504,6 +506,7 @@ def expert_episodes(
         task_kwargs=task_kwargs,
         num_threads=num_threads,
         out_dir=out_dir,
+        observer=observer,
         make_env=make_env,
     )
 

@@ -142,7 +142,7 @@ def evaluate(
         from cathsim_dmc.agents import expert
 
         _require_task(task, policy)
-        result = expert.evaluate(
+        result = expert.expert_episodes(
             task, episodes, seed, task_kwargs=task_kwargs, **options
         )
     else:
