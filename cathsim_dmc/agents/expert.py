@@ -40,13 +40,16 @@ _WITHDRAWN = 2e-3  # m, insertion below which there is nothing left to withdraw
 
 @dataclasses.dataclass(frozen=True)
 class Settings:
-    """How the expert drives. Found on arches and seeds other than the published ones.
+    """How the expert drives.
+
+    None of the values is critical: with half or (nearly) twice the gain, the speed,
+    the look-ahead or the share the published tasks are solved without a retry too.
 
     Attributes:
       lookahead: longest way along the route to the point pursued, m.
       least_lookahead: shortest, m; about one link of the tip.
       lookahead_radii: in between it is so many radii of the lumen.
-      lookahead_factors: of successive attempts; the first is that of the first.
+      lookahead_factors: multiply it in successive attempts, over and over.
       gain: share of the error of direction corrected in a control step. The drives
         and the damping of the tip answer within some 0.25 s, six steps; a gain well
         above 1/6 overshoots.

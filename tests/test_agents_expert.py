@@ -1,0 +1,312 @@
+"""The scripted expert: its geometry against MuJoCo, its retries, and its success."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from cathsim_dmc import agents, suite
+from cathsim_dmc.agents import expert
+from cathsim_dmc.simulation import batch
+from cathsim_dmc.tasks import forces
+
+TASKS = ("type1_bca", "type1_lcca", "type2_bca", "type2_lcca")
+GENTLE = 0.2  # N, below which most published forces lie
+
+
+def make_task(name="type1_lcca", **options):
+    """A task that no environment steps."""
+    options.setdefault("observation", "tracking")
+    return suite.load(suite.DOMAIN, name, task_kwargs=options).task
+
+
+@pytest.fixture(scope="module")
+def task():
+    """The harder published task, which the tests' simulations run one at a time."""
+    return make_task()
+
+
+@pytest.fixture(scope="module")
+def plan(task):
+    """Plan of the same."""
+    return expert.Plan.for_task(task)
+
+
+def no_force(*shape):
+    """Wall forces of zero."""
+    return forces.wall_force(np.zeros((*shape, 1, 1)))
+
+
+def jiggled(task, count, steps, seed=0):
+    """Simulations after random actions that push forwards."""
+    simulation = batch.BatchSimulation(task, count, num_threads=1, seeds=seed)
+    simulation.reset()
+    random = np.random.default_rng(seed)
+    for step in range(steps):
+        if step % 10 == 0:
+            action = random.uniform(-1, 1, (count, simulation.num_actions))
+            action[:, 20] = np.abs(action[:, 20])
+        simulation.step(action)
+    return simulation
+
+
+@pytest.mark.parametrize("rotation", [False, True])
+def test_tip_frames_are_mujocos(rotation):
+    env = suite.load(
+        suite.DOMAIN, "type2_lcca", task_kwargs={"rotation": rotation, "random": 0}
+    )
+    task, random = env.task, np.random.default_rng(0)
+    env.reset()
+    for _ in range(10):
+        env.step(random.uniform(-1, 1, env.action_spec().shape))
+    physics = env.physics
+    physics.forward()
+    joints = [motor.joint for motor in task.catheter.tip_motors]
+    expected = physics.bind(joints).xaxis.reshape(-1, 2, 3)
+    head = physics.bind(task.catheter.head).xmat.reshape(3, 3)[:, 2]
+    state = task.layout.read(physics.data.ptr)
+    axes, direction = expert.tip_frames(
+        expert.Plan.for_task(task), state.joint_positions
+    )
+    # The y hinge sits on the frame that the x hinge has turned.
+    np.testing.assert_allclose(axes, expected, atol=1e-9)
+    np.testing.assert_allclose(direction, head, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    "hinge, towards", [(0, (0, -1)), (1, (1, 0))], ids=["bend_x", "bend_y"]
+)
+def test_a_positive_bend_turns_the_head_as_documented(task, hinge, towards):
+    simulation = batch.BatchSimulation(task, 1, num_threads=1)
+    simulation.reset()
+    before = simulation.readings.head[0]
+    action = np.zeros((1, simulation.num_actions))
+    action[0, hinge:20:2] = 0.3
+    for _ in range(15):
+        simulation.step(action)
+    moved = (simulation.readings.head[0] - before)[:2]
+    assert moved @ towards > 0.9 * np.linalg.norm(moved) > 5e-3
+
+
+@given(s=st.floats(0.0, 1.0), fraction=st.floats(0.0, 0.95), angle=st.floats(0, 6.28))
+@settings(max_examples=50, deadline=None)
+def test_a_head_in_the_tube_is_not_outside(plan, s, fraction, angle):
+    index = int(s * (len(plan.points) - 1))
+    across = np.linalg.svd(np.gradient(plan.points, axis=0)[index][None])[2][1:]
+    offset = np.cos(angle) * across[0] + np.sin(angle) * across[1]
+    head = plan.points[index] + fraction * plan.radii[index] * offset
+    place = expert.locate(plan, head)
+    assert place.excess <= 0
+    distance = np.linalg.norm(plan.at(place.arc_length) - head)
+    assert distance <= fraction * plan.radii[index] + 1e-9
+
+
+def test_beside_the_ostium_the_head_is_still_in_the_parent(task, plan):
+    origin = task.anatomy.tree.origin("lcca")
+    # Off the aorta's axis, nearer to the axis of the branch, but out of its tube.
+    aorta = task.anatomy.tree.vessel("aorta").centreline.at(origin)
+    branch = task.meaning.branch.at(task.meaning.ostium * 0.75)
+    across = np.cross(branch.tangent, aorta.tangent)
+    away = branch.radius * 1.3 * across / np.linalg.norm(across)
+    head = branch.position + away
+    assert task.anatomy.depth(head) > 0
+    assert task.meaning.route.project(head).arc_length > origin + 5e-3
+    place = expert.locate(plan, head)
+    assert place.excess <= 0
+    assert place.arc_length <= origin + 1e-3
+
+
+def test_a_sibling_branch_is_outside(plan):
+    lost = make_task("type1_bca").goal_position
+    assert expert.locate(plan, lost).excess > expert.Settings().tolerance
+
+
+def test_many_act_as_each_alone(task, plan):
+    simulation = jiggled(task, 3, 20)
+    readings, wall_force = simulation.readings, simulation.wall_force
+    together = expert.Expert(plan)
+    alone = [expert.Expert(plan) for _ in range(3)]
+    for _ in range(3):
+        action = together.act(readings, wall_force)
+        assert action.shape == (3, plan.num_actions)
+        assert np.abs(action).max() <= 1.0
+        for index, single in enumerate(alone):
+            part = dataclasses.replace(
+                readings,
+                **{
+                    field.name: getattr(readings, field.name)[index]
+                    for field in dataclasses.fields(readings)
+                },
+            )
+            force = forces.WallForce(
+                *(value[index] for value in dataclasses.astuple(wall_force))
+            )
+            np.testing.assert_allclose(
+                action[index], single.act(part, force), rtol=0, atol=1e-12
+            )
+
+
+def test_bends_follow_the_leader(plan):
+    bend = np.random.default_rng(0).uniform(-0.3, 0.3, (1, len(plan.tip), 2))
+    state = expert.State.fresh((1,), len(plan.tip))
+    state = dataclasses.replace(state, bend=bend, insertion=np.array([0.05]))
+    link = plan.link_length
+    pushed = expert._follow_the_leader(plan, state, state.insertion + link)
+    np.testing.assert_allclose(pushed[:, :-1], bend[:, 1:])
+    pulled = expert._follow_the_leader(plan, state, state.insertion - link)
+    np.testing.assert_allclose(pulled[:, 1:], bend[:, :-1])
+    half = expert._follow_the_leader(plan, state, state.insertion + link / 2)
+    np.testing.assert_allclose(half[:, :-1], (bend[:, :-1] + bend[:, 1:]) / 2)
+
+
+def test_a_head_that_stands_still_is_withdrawn_and_tried_again():
+    options = expert.Settings(patience=5)
+    state = expert.State.fresh((2,), 10)
+    insertion, retracted = np.full(2, 0.08), []
+    for step in range(24):
+        # The first gains a millimetre a step, the second nothing.
+        arc = np.array([0.1 + 1e-3 * step, 0.1])
+        place = expert.Place(arc, np.full(2, 0.01), np.full(2, -0.5))
+        state = expert._attempt(options, state, place, insertion)
+        retracted.append(state.retracting.copy())
+        insertion = insertion - 1e-3 * state.retracting
+    retracted = np.array(retracted)
+    assert not retracted[:, 0].any()
+    assert state.attempts.tolist() == [0, 1]
+    begun, ended = np.flatnonzero(np.diff(retracted[:, 1].astype(int)))
+    assert begun == options.patience
+    assert (ended - begun) * 1e-3 == pytest.approx(options.backoff, abs=1.1e-3)
+
+
+def test_a_lost_head_is_withdrawn_until_it_is_back():
+    options = expert.Settings(lost_patience=3, backoff=5e-3)
+    state = expert.State.fresh((), 10)
+    insertion = np.array(0.08)
+    for step in range(60):
+        excess = np.array(2.0 if insertion > 0.06 else -0.5)
+        place = expert.Place(np.array(0.1 + 1e-3 * step), np.array(0.004), excess)
+        state = expert._attempt(options, state, place, insertion)
+        if state.attempts and not state.retracting:
+            break
+        insertion = insertion - 1e-3 * state.retracting
+    assert state.attempts == 1
+    assert insertion == pytest.approx(0.06, abs=1.1e-3)
+
+
+def test_pressing_on_the_wall_slows_the_device_down(task, plan):
+    simulation = jiggled(task, 2, 1)
+    options = expert.Settings()
+    pressing = forces.wall_force(np.array([0.0, 1.0]).reshape(2, 1, 1))
+    action = expert.Expert(plan, options).act(simulation.readings, pressing)
+    assert action[0, 20] > 0.5 * options.speed
+    assert action[1, 20] == pytest.approx(options.speed * options.creep)
+
+
+def test_reset_forgets_only_those_named(task, plan):
+    simulation = jiggled(task, 3, 20)
+    pilot = expert.Expert(plan)
+    pilot.act(simulation.readings, simulation.wall_force)
+    kept = pilot.state.bend.copy()
+    assert (np.abs(kept).max((1, 2)) > 0).all()
+    pilot.reset(np.array([False, True, False]))
+    assert not pilot.state.bend[1].any() and np.isnan(pilot.state.insertion[1])
+    np.testing.assert_array_equal(pilot.state.bend[[0, 2]], kept[[0, 2]])
+
+
+def test_the_number_of_simulations_must_not_change(task, plan):
+    simulation = jiggled(task, 2, 1)
+    pilot = expert.Expert(plan)
+    pilot.act(simulation.readings, simulation.wall_force)
+    single = dataclasses.replace(simulation.readings, head=np.zeros(3))
+    with pytest.raises(ValueError, match=r"call reset\(\)"):
+        pilot.act(single, no_force())
+
+
+def test_a_device_without_motors_is_refused():
+    with pytest.raises(ValueError, match="has no motors.*published"):
+        expert.Expert.for_task(make_task(device="diagnostic_5f_j"))
+
+
+def test_policy_reaches_the_goal_in_a_composer_environment():
+    env = suite.load(
+        suite.DOMAIN, "type1_lcca", task_kwargs={"observation": "tracking", "random": 5}
+    )
+    act = expert.policy(env)
+    lengths = []
+    for _ in range(2):
+        timestep, steps, largest = env.reset(), 0, 0.0
+        while not timestep.last():
+            timestep = env.step(act(timestep))
+            largest = max(largest, float(env.task.wall_force.peak_max))
+            steps += 1
+        assert env.task.termination == "success"
+        assert largest < GENTLE
+        lengths.append(steps)
+    # The second episode begins without memory of the first.
+    assert max(lengths) < 300
+
+
+def test_policy_needs_no_observation_before_the_first_step():
+    env = suite.load(suite.DOMAIN, "type1_bca", task_kwargs={"random": 5})
+    for observable in env.task.task_observables.values():
+        observable.enabled = False
+    timestep = env.reset()
+    assert env.task.readings is None
+    action = expert.policy(env)(timestep)
+    assert action.shape == env.action_spec().shape
+    assert action[20] > 0
+
+
+def test_it_recovers_from_a_wrong_branch(task, plan):
+    # A straight push ends in the BCA of this arch.
+    simulation = batch.BatchSimulation(task, 1, num_threads=1, seeds=3)
+    simulation.reset()
+    push = np.zeros((1, simulation.num_actions))
+    push[0, 20] = 1.0
+    for _ in range(75):
+        simulation.step(push)
+    bca = make_task("type1_bca").meaning
+    assert bca.in_branch(simulation.readings.head)[0]
+    pilot = expert.Expert(plan)
+    for _ in range(600):
+        step = simulation.step(pilot.act(simulation.readings, simulation.wall_force))
+        if step.terminated[0]:
+            break
+    assert step.outcome.success[0]
+    assert pilot.state.attempts[0] >= 1
+
+
+def test_episodes_are_evaluated_like_those_of_any_policy():
+    result = expert.expert_episodes("type2_lcca", episodes=3, seed=70, num_threads=1)
+    assert isinstance(result, agents.EvaluationResult)
+    assert (result.policy, result.seed, result.successes) == ("expert", 70, 3)
+    assert result.values("max_force").max() < GENTLE
+    again = expert.expert_episodes("type2_lcca", episodes=3, seed=70, num_threads=1)
+    assert again.to_dict() == result.to_dict()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", TASKS)
+def test_it_solves_the_published_tasks_gently(name):
+    result = expert.expert_episodes(name, episodes=30)
+    assert result.successes == 30
+    assert result.values("peak_force").max() < GENTLE
+    assert result.values("length").max() < 300
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("access", ["ascending", "descending"])
+@pytest.mark.parametrize("seed", [200, 203])
+def test_it_solves_random_arches(seed, access):
+    from cathsim_dmc.anatomy import arch
+
+    params = arch.sample(np.random.RandomState(seed), bovine=seed % 2 == 1)
+    anatomy = arch.build_arch(params, access=access)
+    for goal in ("bca", "lcca", "lsa"):
+        result = expert.expert_episodes(
+            "navigate", 2, 5, task_kwargs={"phantom": anatomy, "goal": goal}
+        )
+        assert result.successes == 2
+        assert result.values("peak_force").max() < GENTLE
