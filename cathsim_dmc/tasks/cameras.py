@@ -1,5 +1,7 @@
 """Pictures of MuJoCo's cameras, which need OpenGL, unlike fluoroscopy."""
 
+from __future__ import annotations
+
 import dataclasses
 import os
 from collections.abc import Sequence

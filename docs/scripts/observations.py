@@ -1,0 +1,168 @@
+"""Writes docs/observations.md from the specs of the task `type1_bca`.
+
+`python docs/scripts/observations.py` writes; the tests compare.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+
+from cathsim_dmc import suite
+from cathsim_dmc.imaging import VIEWS, FluoroscopyOptions
+from cathsim_dmc.tasks import observations
+from cathsim_dmc.tasks.cameras import CAMERAS, KINDS, CameraOptions
+from cathsim_dmc.tasks.descriptions import DESCRIPTIONS, Description
+from cathsim_dmc.tasks.variations import USUAL, Randomisation
+
+OUTPUT = Path(__file__).parents[1] / "observations.md"
+TASK = "type1_bca"
+
+INTRODUCTION = f"""# Observations
+
+This page is generated from the specs of `{TASK}` by `docs/scripts/observations.py`.
+
+An observation is chosen by name, or by a list of names:
+
+```python
+env = suite.load("cathsim", "{TASK}", task_kwargs={{
+    "observation": ["image", "tracking", "force"],
+    "fluoroscopy": {{"view": "LAO45", "noise": True}},
+}})
+```
+
+The world frame is that of the patient (LPS): +x to the patient's left, +y posterior,
++z superior. Joints and links run from proximal to distal; their number, and so some of
+the shapes, depend on the device and on the length that a task needs. Positions and
+velocities of joints are those at the end of the control step, all other numbers those
+of its last physics step.
+"""
+
+FLUOROSCOPY = f"""
+## Fluoroscopy
+
+`image`, `sequential`, `segmentation` and `tracking_2d` look through a C-arm. It needs
+no OpenGL. `task_kwargs={{"fluoroscopy": {{...}}}}` sets it up:
+
+{{table}}
+
+Views are {", ".join(f"`{name}`" for name in VIEWS)}, or the primary (LAO positive) and
+secondary (cranial positive) angle in degrees. With `biplane` the channels of the second
+C-arm follow those of the first.
+"""
+
+CAMERA_TEXT = f"""
+## Cameras
+
+`rgb` and `depth` need OpenGL: set `MUJOCO_GL` to `egl`, `osmesa` or `glfw` before
+Python starts. Cameras are {", ".join(f"`{name}`" for name in CAMERAS)}, an endoscope at
+the distal end; `task_kwargs={{"cameras": {{"names": [...], "size": 128}}}}` chooses.
+"""
+
+RANDOMISATION = """
+## Domain randomisation
+
+Off by default. `task_kwargs={"randomisation": True}` draws from the usual ranges at
+every reset, a mapping from its own. A range is `[low, high]` of a uniform distribution,
+or a `dm_control.composer.variation.Variation`. All draws, quantum noise included, come
+from the one source that the environment's seed sets, and the batched path draws what
+composer draws.
+
+{table}
+"""
+
+
+def _shape(shape: tuple[int, ...]) -> str:
+    return "(" + ", ".join(map(str, shape)) + ("," if len(shape) == 1 else "") + ")"
+
+
+def _range(description: Description) -> str:
+    def bound(value: float) -> str:
+        return f"{value:g}" if np.isfinite(value) else "∞"
+
+    if np.isinf(description.low) and np.isinf(description.high):
+        return "unbounded"
+    return f"{bound(description.low)} to {bound(description.high)}"
+
+
+def _row(*cells: str) -> str:
+    return "| " + " | ".join(cells) + " |"
+
+
+def entries_table() -> str:
+    """Every entry of every observation, from the specs."""
+    drawn = [name for name in observations.OBSERVATIONS if name not in KINDS]
+    environment = suite.load("cathsim", TASK, {"observation": drawn})
+    specs = dict(environment.observation_spec())
+    # Pictures of cameras have a spec without OpenGL, too.
+    specs |= observations.entries(KINDS, FluoroscopyOptions(), CameraOptions())
+    rows = [
+        _row("observation", "entry", "shape", "type", "range", "unit", "meaning"),
+        _row(*["---"] * 7),
+    ]
+    for name, entries in DESCRIPTIONS.items():
+        for key, text in entries.items():
+            spec = specs[key.replace("<camera>", CameraOptions().names[0])]
+            rows.append(
+                _row(
+                    f"`{name}`",
+                    f"`{key}`",
+                    _shape(spec.shape),
+                    str(spec.dtype),
+                    _range(text),
+                    text.unit,
+                    text.meaning,
+                )
+            )
+    return "\n".join(rows)
+
+
+def _attributes(kind: type) -> dict[str, str]:
+    """Meanings of the attributes of a class from its docstring."""
+    meanings: dict[str, str] = {}
+    name = None
+    for line in kind.__doc__.split("Attributes:")[1].splitlines():
+        word, colon, rest = line.strip().partition(":")
+        if colon and word in kind.__dataclass_fields__:
+            name = word
+            meanings[name] = rest.strip()
+        elif name and line.strip():
+            meanings[name] += " " + line.strip()
+    return meanings
+
+
+def options_table(kind: type, values: object, title: str) -> str:
+    """Fields of a dataclass of options with their values and meanings."""
+    rows = [_row("option", title, "meaning"), _row("---", "---", "---")]
+    for name, meaning in _attributes(kind).items():
+        value = getattr(values, name)
+        if isinstance(value, tuple):
+            value = ", ".join(f"{each:.4g}" for each in value)
+        elif isinstance(value, float):
+            value = f"{value:.4g}"
+        rows.append(_row(f"`{name}`", str(value), meaning))
+    return "\n".join(rows)
+
+
+def page() -> str:
+    """The whole page."""
+    parts = [INTRODUCTION, entries_table() + "\n"]
+    table = options_table(FluoroscopyOptions, FluoroscopyOptions(), "default")
+    parts.append(FLUOROSCOPY.replace("{table}", table))
+    parts.append(CAMERA_TEXT)
+    table = options_table(Randomisation, USUAL, "usual range")
+    parts.append(RANDOMISATION.replace("{table}", table))
+    assert len(_attributes(Randomisation)) == len(dataclasses.fields(Randomisation))
+    return "\n".join(part.strip("\n") + "\n" for part in parts)
+
+
+def main() -> None:
+    """Writes the page."""
+    OUTPUT.write_text(page(), encoding="utf-8")
+    print(OUTPUT)
+
+
+if __name__ == "__main__":
+    main()
