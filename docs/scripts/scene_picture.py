@@ -6,16 +6,18 @@ Needs an OpenGL library: MUJOCO_GL=egl or osmesa python docs/scripts/scene_pictu
 from pathlib import Path
 
 import numpy as np
-from dm_control.mujoco import engine
 from PIL import Image
 
-from cathsim_dmc import suite
+from cathsim_dmc.agents import expert  # torchrl before dm_control
+from cathsim_dmc import suite  # isort: skip
 
 OUT = Path(__file__).parents[1] / "images" / "scene.png"
 HEIGHT = 640
 
 
 def draw(physics, target, distance, azimuth, elevation, width, fovy=30.0):
+    from dm_control.mujoco import engine
+
     physics.model.vis.global_.fovy = fovy
     camera = engine.MovableCamera(physics, HEIGHT, width)
     camera.set_pose(target, distance, azimuth, elevation)
@@ -30,13 +32,10 @@ def draw(physics, target, distance, azimuth, elevation, width, fovy=30.0):
 
 def main():
     env = suite.load("cathsim", "type1_lcca", task_kwargs={"random": 3})
-    env.reset()
-    action = np.zeros(env.action_spec().shape)
-    action[-1] = 1.0
-    for step in range(95):
-        # A little bend to the patient's left and back, as the branch asks for.
-        action[:20:2], action[1:20:2] = -0.15, 0.1
-        env.step(action)
+    act = expert.policy(env)
+    timestep = env.reset()
+    while not timestep.last():
+        timestep = env.step(act(timestep))
     physics = env.physics
     physics.model.vis.global_.offwidth = 1600
     physics.model.vis.global_.offheight = HEIGHT
