@@ -47,9 +47,9 @@ def flat(key, value):
 
 def convergence(report) -> str:
     rows = [
-        "| script | parameter | value | links | path, mean (max), mm | wall force, "
-        "mean (p95), mN | deepest penetration, mm |",
-        "|---|---|---|---|---|---|---|",
+        "| script | parameter | value | links | path, mean (max), mm | off the track, "
+        "max, mm | wall force, mean (p95), mN | deepest penetration, mm |",
+        "|---|---|---|---|---|---|---|---|",
     ]
     units = {"physics_timestep": "time step, ms", "shaft_link": "longest link, mm"}
     for one in report.findings.get("convergence", ()):
@@ -58,6 +58,7 @@ def convergence(report) -> str:
                 f"| {one['script']} | {units[one['parameter']]} | {1e3 * value:g} | "
                 f"{one['links'][index]} | {one['path_mean_mm'][index]:.3f} "
                 f"({one['path_max_mm'][index]:.2f}) | "
+                f"{one['track_max_mm'][index]:.2f} | "
                 f"{1e3 * one['force_mean'][index]:.2f} "
                 f"({1e3 * one['force_p95'][index]:.1f}) | "
                 f"{one['penetration_max_mm'][index]:.2f} |"

@@ -168,7 +168,7 @@ def _convergence(axes, studies):
         x = 1e3 * one.values
         style = {"color": colour, "linewidth": 1, "markersize": 4}
         path.plot(x[1:], 1e3 * one.path_mean[1:], "o-", label=one.script.name, **style)
-        path.plot(x[1:], 1e3 * one.path_max[1:], "^:", **style)
+        path.plot(x[1:], 1e3 * one.track_max[1:], "^:", **style)
         if one.force_mean[0] > 1e-3:
             force.plot(x, 1e3 * one.force_mean, "o-", **style)
         for ax in (path, force):
@@ -177,7 +177,7 @@ def _convergence(axes, studies):
     for path, force in axes:
         path.set(
             title="Tip path against the finest run",
-            ylabel="distance: mean (o), max (▵), mm",
+            ylabel="same time, mean (o); off track, max (▵), mm",
             yscale="log",
         )
         force.set(title="Mean wall force", ylabel="mN")
@@ -280,7 +280,7 @@ def forces(
         xlabel="force on the phantom, N",
         ylabel="1/N",
         yscale="log",
-        ylim=(1e-2, None),
+        ylim=(1e-2, 1e4),
     )
     ax = axes[2]
     ordered = np.sort(samples)
@@ -298,5 +298,5 @@ def forces(
         label=f"normal, {comparison.reference_mean:g} ± {comparison.reference_sd:g} N",
     )
     ax.set(title="Cumulative", xlabel="force on the phantom, N", ylabel="share")
-    ax.legend(frameon=False, fontsize=8, loc="center right")
+    ax.legend(frameon=False, fontsize=8, loc="center", bbox_to_anchor=(0.42, 0.5))
     _save(figure, path)
