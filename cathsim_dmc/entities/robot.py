@@ -113,7 +113,7 @@ JOINTS: tuple[RobotJoint, ...] = (
 
 # Insertion 0 lies in the middle of an overlap: both pairs hold at the start.
 _PHASES = OVERLAP / 2 + np.array([0.0, CYCLE / 2])
-# Phases at which a platform returns, its jaws open, its jaws close; how long each takes.
+# Phases at which a platform returns, its jaws open and close; how long each takes.
 _STARTS = np.array([STROKE + JAW_TRAVEL, STROKE, CYCLE - JAW_TRAVEL])
 _SPANS = np.array([RETURN, JAW_TRAVEL, JAW_TRAVEL])
 

@@ -8,9 +8,6 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from cathsim_dmc.agents import expert  # torchrl before dm_control
-from cathsim_dmc import suite  # isort: skip
-
 OUT = Path(__file__).parents[1] / "images" / "scene.png"
 HEIGHT = 640
 
@@ -31,6 +28,10 @@ def draw(physics, target, distance, azimuth, elevation, width, fovy=30.0):
 
 
 def main():
+    from cathsim_dmc.agents import expert  # torchrl goes before dm_control
+
+    from cathsim_dmc import suite  # isort: skip
+
     env = suite.load("cathsim", "type1_lcca", task_kwargs={"random": 3})
     act = expert.policy(env)
     timestep = env.reset()
