@@ -156,12 +156,7 @@ class BatchSimulation:
         Raises:
           ValueError: if the action has the wrong shape or is not finite.
         """
-        action = cannulation.check_action(action, self._action.shape[-1])
-        if action.shape != self._action.shape:
-            raise ValueError(
-                f"the action has shape {action.shape}; {self.num_simulations} "
-                f"simulations need {self._action.shape}"
-            )
+        action = cannulation.check_action(action, self._action.shape)
         self._action = action.copy()
         self._batch.ctrl[:] = self._delay.pass_on(action)
         self._task.posed_robot(self._batch.qpos)

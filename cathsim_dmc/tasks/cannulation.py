@@ -156,18 +156,23 @@ def start_displacement(
     return radius * direction / np.linalg.norm(direction)
 
 
-def check_action(action: np.ndarray, size: int) -> np.ndarray:
-    """Returns the action (..., size) as float64.
+def check_action(action: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+    """Returns the action as float64.
+
+    Args:
+      action: of one simulation (A,), or of many (N, A).
+      shape: that it must have.
 
     Raises:
-      ValueError: if its shape is wrong or it is not finite.
+      ValueError: if its shape is another or it is not finite.
     """
     action = np.asarray(action, dtype=np.float64)
-    if action.shape[-1:] != (size,):
+    if action.shape != shape:
+        many = f"for {shape[0]} simulations, " if len(shape) > 1 else ""
         raise ValueError(
-            f"the action has shape {action.shape}, but the last axis must have {size} "
-            "entries in [-1, 1]: tip motors from proximal to distal (x before y), "
-            "translation, and rotation if the task has it"
+            f"the action has shape {action.shape}, but it must have {shape}: {many}"
+            f"{shape[-1]} entries in [-1, 1]: tip motors from proximal to distal (x "
+            "before y), translation, and rotation if the task has it"
         )
     finite = np.isfinite(action)
     if not finite.all():

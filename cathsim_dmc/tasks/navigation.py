@@ -242,7 +242,8 @@ class Navigation(composer.Task):
     def before_step(self, physics, action, random_state):
         """Applies the action and moves the robot along."""
         del random_state
-        self._action = cannulation.check_action(action, len(self._catheter.actuators))
+        shape = (len(self._catheter.actuators),)
+        self._action = cannulation.check_action(action, shape)
         data = physics.data.ptr
         data.ctrl[:] = self._delay.pass_on(self._action[None])[0]
         self.posed_robot(data.qpos)
