@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from cathsim_dmc import agents, suite
-from cathsim_dmc.agents import expert
+from cathsim_dmc.agents import expert, pursuit
 from cathsim_dmc.simulation import batch
 from cathsim_dmc.tasks import forces
 
@@ -31,7 +31,7 @@ def task():
 @pytest.fixture(scope="module")
 def plan(task):
     """Plan of the same."""
-    return expert.Plan.for_task(task)
+    return pursuit.Plan.for_task(task)
 
 
 def no_force(*shape):
@@ -67,8 +67,8 @@ def test_tip_frames_are_mujocos(rotation):
     expected = physics.bind(joints).xaxis.reshape(-1, 2, 3)
     head = physics.bind(task.catheter.head).xmat.reshape(3, 3)[:, 2]
     state = task.layout.read(physics.data.ptr)
-    axes, direction = expert.tip_frames(
-        expert.Plan.for_task(task), state.joint_positions
+    axes, direction = pursuit.tip_frames(
+        pursuit.Plan.for_task(task), state.joint_positions
     )
     # The y hinge sits on the frame that the x hinge has turned.
     np.testing.assert_allclose(axes, expected, atol=1e-9)
@@ -97,7 +97,7 @@ def test_a_head_in_the_tube_is_not_outside(plan, s, fraction, angle):
     across = np.linalg.svd(np.gradient(plan.points, axis=0)[index][None])[2][1:]
     offset = np.cos(angle) * across[0] + np.sin(angle) * across[1]
     head = plan.points[index] + fraction * plan.radii[index] * offset
-    place = expert.locate(plan, head)
+    place = pursuit.locate(plan, head)
     assert place.excess <= 0
     distance = np.linalg.norm(plan.at(place.arc_length) - head)
     assert distance <= fraction * plan.radii[index] + 1e-9
@@ -113,14 +113,14 @@ def test_beside_the_ostium_the_head_is_still_in_the_parent(task, plan):
     head = branch.position + away
     assert task.anatomy.depth(head) > 0
     assert task.meaning.route.project(head).arc_length > origin + 5e-3
-    place = expert.locate(plan, head)
+    place = pursuit.locate(plan, head)
     assert place.excess <= 0
     assert place.arc_length <= origin + 1e-3
 
 
 def test_a_sibling_branch_is_outside(plan):
     lost = make_task("type1_bca").goal_position
-    assert expert.locate(plan, lost).excess > expert.Settings().tolerance
+    assert pursuit.locate(plan, lost).excess > pursuit.Settings().tolerance
 
 
 def test_many_act_as_each_alone(task, plan):
@@ -150,26 +150,26 @@ def test_many_act_as_each_alone(task, plan):
 
 def test_bends_follow_the_leader(plan):
     bend = np.random.default_rng(0).uniform(-0.3, 0.3, (1, len(plan.tip), 2))
-    state = expert.State.fresh((1,), len(plan.tip))
+    state = pursuit.State.fresh((1,), len(plan.tip))
     state = dataclasses.replace(state, bend=bend, insertion=np.array([0.05]))
     link = plan.link_length
-    pushed = expert._follow_the_leader(plan, state, state.insertion + link)
+    pushed = pursuit._follow_the_leader(plan, state, state.insertion + link)
     np.testing.assert_allclose(pushed[:, :-1], bend[:, 1:])
-    pulled = expert._follow_the_leader(plan, state, state.insertion - link)
+    pulled = pursuit._follow_the_leader(plan, state, state.insertion - link)
     np.testing.assert_allclose(pulled[:, 1:], bend[:, :-1])
-    half = expert._follow_the_leader(plan, state, state.insertion + link / 2)
+    half = pursuit._follow_the_leader(plan, state, state.insertion + link / 2)
     np.testing.assert_allclose(half[:, :-1], (bend[:, :-1] + bend[:, 1:]) / 2)
 
 
 def test_a_head_that_stands_still_is_withdrawn_and_tried_again():
-    options = expert.Settings(patience=5)
-    state = expert.State.fresh((2,), 10)
+    options = pursuit.Settings(patience=5)
+    state = pursuit.State.fresh((2,), 10)
     insertion, retracted = np.full(2, 0.08), []
     for step in range(24):
         # The first gains a millimetre a step, the second nothing.
         arc = np.array([0.1 + 1e-3 * step, 0.1])
-        place = expert.Place(arc, np.full(2, 0.01), np.full(2, -0.5))
-        state = expert._attempt(options, state, place, insertion)
+        place = pursuit.Place(arc, np.full(2, 0.01), np.full(2, -0.5))
+        state = pursuit._attempt(options, state, place, insertion)
         retracted.append(state.retracting.copy())
         insertion = insertion - 1e-3 * state.retracting
     retracted = np.array(retracted)
@@ -181,13 +181,13 @@ def test_a_head_that_stands_still_is_withdrawn_and_tried_again():
 
 
 def test_a_lost_head_is_withdrawn_until_it_is_back():
-    options = expert.Settings(lost_patience=3, backoff=5e-3)
-    state = expert.State.fresh((), 10)
+    options = pursuit.Settings(lost_patience=3, backoff=5e-3)
+    state = pursuit.State.fresh((), 10)
     insertion = np.array(0.08)
     for step in range(60):
         excess = np.array(2.0 if insertion > 0.06 else -0.5)
-        place = expert.Place(np.array(0.1 + 1e-3 * step), np.array(0.004), excess)
-        state = expert._attempt(options, state, place, insertion)
+        place = pursuit.Place(np.array(0.1 + 1e-3 * step), np.array(0.004), excess)
+        state = pursuit._attempt(options, state, place, insertion)
         if state.attempts and not state.retracting:
             break
         insertion = insertion - 1e-3 * state.retracting
@@ -197,7 +197,7 @@ def test_a_lost_head_is_withdrawn_until_it_is_back():
 
 def test_pressing_on_the_wall_slows_the_device_down(task, plan):
     simulation = jiggled(task, 2, 1)
-    options = expert.Settings()
+    options = pursuit.Settings()
     pressing = forces.wall_force(np.array([0.0, 1.0]).reshape(2, 1, 1))
     action = expert.Expert(plan, options).act(simulation.readings, pressing)
     assert action[0, 20] > 0.5 * options.speed

@@ -1,0 +1,393 @@
+"""Pursuit of a route by a steerable tip: the expert's decisions as pure functions.
+
+Everything is a function of arrays with leading batch axes, written `...`: one
+simulation, or many side by side.
+
+**Steering.** The head pursues a point of the route some way ahead of it. The rotation
+that would turn the head towards that point, a vector in the world, has components
+along the two hinges of every joint of the tip: what each hinge would have to bend. A
+positive `bend_x` turns the distal part from +z towards -y of its link, a positive
+`bend_y` from +z towards +x (right-hand rule). Every step adds a fraction of these to
+the motors, most to the distal joints. As the device advances, what a joint was told
+moves on to its proximal neighbour, and back again as it is withdrawn (follow the
+leader), so the tip keeps the shape of the way it came.
+
+**Retries.** When the head makes no progress, or has left the tube of the route as in
+a wrong branch, the device is withdrawn until the head is back in the route and then
+tries again, from farther back and with another look-ahead each time.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+
+from cathsim_dmc.entities import devices
+from cathsim_dmc.tasks import forces, navigation
+from cathsim_dmc.tasks.readings import Readings
+
+ROUTE_SPACING = 1e-3  # m, resolution of the route
+_WITHDRAWN = 2e-3  # m, insertion below which there is nothing left to withdraw
+
+
+@dataclasses.dataclass(frozen=True)
+class Settings:
+    """How the expert drives.
+
+    None of the values is critical. The published tasks were solved without a retry
+    with 0.5 to 1.6 times the gain or the speed, with 0.75 to 1.4 times the look-ahead,
+    and with shares from 0.4 to 0.85.
+
+    Attributes:
+      lookahead: longest way along the route to the point pursued, m.
+      least_lookahead: shortest, m; about one link of the tip.
+      lookahead_radii: in between it is so many radii of the lumen.
+      lookahead_factors: multiply it in successive attempts, over and over.
+      gain: share of the error of direction corrected in a control step. The drives
+        and the damping of the tip answer within some 0.25 s, six steps; a gain well
+        above 1/6 overshoots.
+      share: of a joint's part in steering to that of its distal neighbour.
+      max_bend_rate: largest correction of one hinge in a control step, rad.
+      speed: fastest translation, as a part of what the carriage can do.
+      creep: slowest, as a part of `speed`, when misaligned or pressing.
+      aligned, misaligned: cosines of the error of direction between which the speed
+        falls from full to creeping.
+      soft_force, hard_force: largest contact, N, between which it falls likewise; the
+        published forces lie below 0.2 N, with outliers above 0.4 N.
+      progress: m; what the head must gain to count as moving.
+      patience: control steps without progress until a retry.
+      lost_patience: control steps outside the route's tube until a retry.
+      tolerance: by how much of its radius the lumen may exceed the route's tube.
+      backoff: way back of the first retry, m.
+      backoff_growth: of the way back from each retry to the next, up to the fourth.
+    """
+
+    lookahead: float = 16e-3
+    least_lookahead: float = 8e-3
+    lookahead_radii: float = 1.5
+    lookahead_factors: tuple[float, ...] = (1.0, 0.75, 1.3)
+    gain: float = 0.12
+    share: float = 0.65
+    max_bend_rate: float = 0.08
+    speed: float = 0.6
+    creep: float = 0.05
+    aligned: float = 0.9
+    misaligned: float = 0.5
+    soft_force: float = 0.1
+    hard_force: float = 0.35
+    progress: float = 0.3e-3
+    patience: int = 40
+    lost_patience: int = 10
+    tolerance: float = 0.25
+    backoff: float = 15e-3
+    backoff_growth: float = 0.5
+
+
+@dataclasses.dataclass(frozen=True)
+class Plan:
+    """What the expert knows of a task; world frame, SI units.
+
+    Attributes:
+      points: (P, 3), route from the inlet to the goal.
+      radii: (P,), of the lumen.
+      arc_length: (P,), along the route.
+      base: (3, 3), orientation of the device where it enters.
+      hinges: column in `Readings.joint_positions` and axis (0, 1, 2 for x, y, z) of
+        every hinge of the chain, from proximal to distal.
+      tip: (M, 2) int, numbers among `hinges` of the x and y hinges of the tip motors.
+      steering_angle: by which a motor bends its free joint at most, rad.
+      link_length: of the tip, m.
+      num_actions: A.
+    """
+
+    points: np.ndarray
+    radii: np.ndarray
+    arc_length: np.ndarray
+    base: np.ndarray
+    hinges: tuple[tuple[int, int], ...]
+    tip: np.ndarray
+    steering_angle: float
+    link_length: float
+    num_actions: int
+
+    @classmethod
+    def for_task(cls, task: navigation.Navigation) -> Plan:
+        """Reads off a task.
+
+        Raises:
+          ValueError: if the task's device has no motors in its tip.
+        """
+        catheter = task.catheter
+        if not catheter.device.steerable:
+            steerable = [d.name for d in devices.DEVICES.values() if d.steerable]
+            raise ValueError(
+                f"device {catheter.device.name!r} has no motors in its tip, so the "
+                f"expert cannot steer it; choose one of {', '.join(steerable)}"
+            )
+        route = task.meaning.route.resampled(ROUTE_SPACING)
+        hinges, numbers = [], {}
+        for column, joint in enumerate(catheter.joints):
+            if joint.name == catheter.insertion.name:
+                continue
+            numbers[joint.name] = len(hinges)
+            hinges.append((column, int(np.argmax(joint.axis))))
+        motors = [numbers[motor.joint.name] for motor in catheter.tip_motors]
+        return cls(
+            points=route.points,
+            radii=route.radii,
+            arc_length=route.arc_length,
+            base=_matrix(task.placement.quaternion),
+            hinges=tuple(hinges),
+            tip=np.array(motors).reshape(-1, 2),
+            steering_angle=catheter.device.steering_angle,
+            link_length=float(catheter.link_lengths[-1]),
+            num_actions=len(catheter.actuators),
+        )
+
+    @property
+    def length(self) -> float:
+        """Length of the route, m."""
+        return float(self.arc_length[-1])
+
+    def at(self, arc_length: np.ndarray) -> np.ndarray:
+        """Point (..., 3) of the route; beyond the goal, straight on."""
+        axes = range(3)
+        point = np.stack(
+            [np.interp(arc_length, self.arc_length, self.points[:, i]) for i in axes],
+            axis=-1,
+        )
+        last = self.points[-1] - self.points[-2]
+        last = last / np.linalg.norm(last)
+        return point + np.maximum(arc_length - self.length, 0.0)[..., None] * last
+
+
+@dataclasses.dataclass(frozen=True)
+class Place:
+    """Where a head is on a route.
+
+    Attributes:
+      arc_length: (...), m.
+      radius: (...), of the lumen there, m.
+      excess: (...), by how much the head is out of the route's tube, in radii there;
+        negative inside.
+    """
+
+    arc_length: np.ndarray
+    radius: np.ndarray
+    excess: np.ndarray
+
+
+def locate(plan: Plan, head: np.ndarray) -> Place:
+    """Finds the place of a head (..., 3) on the route.
+
+    It is the nearest point of the route whose cross-section reaches the head: beside
+    an ostium, still in the parent, the axis of the branch may be nearer than the
+    parent's, yet the head is not in the branch. If none does, it is the point whose
+    cross-section comes nearest.
+    """
+    offset = head[..., None, :] - plan.points
+    distance = np.sqrt(np.einsum("...i,...i->...", offset, offset))
+    outside = distance - plan.radii
+    inside = outside <= 0
+    # Any inside point beats every outside one.
+    rank = np.where(inside, distance - 1.0, np.maximum(outside, 0.0))
+    index = rank.argmin(-1)
+    excess = np.take_along_axis(outside, index[..., None], -1)[..., 0]
+    radius = plan.radii[index]
+    return Place(plan.arc_length[index], radius, excess / radius)
+
+
+@dataclasses.dataclass(frozen=True)
+class State:
+    """What the expert remembers of each simulation, arrays (...).
+
+    Attributes:
+      bend: (..., M, 2), told to the hinges of the tip, rad.
+      insertion: at the last step, m; NaN before the first.
+      retracting: bool.
+      turn: insertion to be withdrawn to while retracting, m.
+      best: farthest place on the route in this attempt, m.
+      stale: control steps since then.
+      lost: control steps out of the route's tube.
+      attempts: retries so far.
+    """
+
+    bend: np.ndarray
+    insertion: np.ndarray
+    retracting: np.ndarray
+    turn: np.ndarray
+    best: np.ndarray
+    stale: np.ndarray
+    lost: np.ndarray
+    attempts: np.ndarray
+
+    @classmethod
+    def fresh(cls, shape: tuple[int, ...], joints: int) -> State:
+        """State at the start of an episode."""
+        return cls(
+            bend=np.zeros((*shape, joints, 2)),
+            insertion=np.full(shape, np.nan),
+            retracting=np.zeros(shape, dtype=bool),
+            turn=np.zeros(shape),
+            best=np.zeros(shape),
+            stale=np.zeros(shape, dtype=int),
+            lost=np.zeros(shape, dtype=int),
+            attempts=np.zeros(shape, dtype=int),
+        )
+
+
+def tip_frames(plan: Plan, joints: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Hinge axes of the tip and direction of the head, world frame.
+
+    Args:
+      plan: of the task.
+      joints: (..., J), `Readings.joint_positions`.
+
+    Returns:
+      Axes (..., M, 2, 3) of the x and y hinges of the tip and direction (..., 3).
+    """
+    frame = np.broadcast_to(plan.base, (*joints.shape[:-1], 3, 3))
+    axes = []
+    for column, axis in plan.hinges:
+        axes.append(frame[..., axis])
+        frame = _turned(frame, axis, joints[..., column])
+    stacked = np.stack(axes, axis=-2)
+    return stacked[..., plan.tip, :], frame[..., 2]
+
+
+def decide(
+    plan: Plan,
+    settings: Settings,
+    state: State,
+    readings: Readings,
+    wall_force: forces.WallForce,
+) -> tuple[np.ndarray, State]:
+    """One control step of the expert: a pure function.
+
+    Args:
+      plan: of the task.
+      settings: how to drive.
+      state: after the last step, arrays (...).
+      readings: of the devices, arrays (...).
+      wall_force: arrays (...); its `max` slows the device down.
+
+    Returns:
+      Action (..., A) in [-1, 1] and the new state.
+    """
+    place = locate(plan, readings.head)
+    axes, direction = tip_frames(plan, readings.joint_positions)
+    target = plan.at(place.arc_length + _lookahead(plan, settings, state, place))
+    turn, cosine = _rotation_to(direction, target - readings.head)
+    bend = _follow_the_leader(plan, state, readings.insertion)
+    bend = bend + _correction(settings, axes, turn)
+    bend = np.clip(bend, -plan.steering_angle, plan.steering_angle)
+    state = _attempt(settings, state, place, readings.insertion)
+    free = _ramp(wall_force.max, settings.hard_force, settings.soft_force)
+    clear = _ramp(cosine, settings.misaligned, settings.aligned)
+    advance = settings.speed * np.maximum(free * clear, settings.creep)
+    translation = np.where(state.retracting, -settings.speed, advance)
+    action = np.zeros((*translation.shape, plan.num_actions))
+    motors = plan.tip.size
+    action[..., :motors] = (bend / plan.steering_angle).reshape(*translation.shape, -1)
+    action[..., motors] = translation
+    return action, dataclasses.replace(state, bend=bend)
+
+
+def _lookahead(
+    plan: Plan, settings: Settings, state: State, place: Place
+) -> np.ndarray:
+    """Way (...) from the place to the point pursued, m."""
+    # The lumen that counts is the one to come, or a branch is entered too obliquely.
+    coming = place.arc_length + settings.least_lookahead
+    radius = np.interp(coming, plan.arc_length, plan.radii)
+    ahead = np.clip(
+        settings.lookahead_radii * radius, settings.least_lookahead, settings.lookahead
+    )
+    factors = np.asarray(settings.lookahead_factors)
+    return ahead * factors[state.attempts % len(factors)]
+
+
+def _rotation_to(direction: np.ndarray, way: np.ndarray) -> tuple[np.ndarray, ...]:
+    """Rotation vector (..., 3), rad, from a direction to a way; cosine (...)."""
+    way = way / np.maximum(np.linalg.norm(way, axis=-1, keepdims=True), 1e-9)
+    cosine = np.einsum("...i,...i->...", direction, way)
+    axis = np.cross(direction, way)
+    sine = np.linalg.norm(axis, axis=-1)
+    angle = np.arctan2(sine, cosine)
+    return axis * (angle / np.maximum(sine, 1e-9))[..., None], cosine
+
+
+def _follow_the_leader(plan: Plan, state: State, insertion: np.ndarray) -> np.ndarray:
+    """Bends (..., M, 2) moved along the tip by as much as the device moved."""
+    moved = np.where(np.isnan(state.insertion), 0.0, insertion - state.insertion)
+    part = np.clip(moved / plan.link_length, -1.0, 1.0)[..., None, None]
+    bend = state.bend
+    distal = np.concatenate([bend[..., 1:, :], bend[..., -1:, :]], axis=-2)
+    proximal = np.concatenate([bend[..., :1, :], bend[..., :-1, :]], axis=-2)
+    forward, backward = np.maximum(part, 0.0), np.maximum(-part, 0.0)
+    return bend + forward * (distal - bend) + backward * (proximal - bend)
+
+
+def _correction(settings: Settings, axes: np.ndarray, turn: np.ndarray) -> np.ndarray:
+    """Change (..., M, 2) of the bends that turns the head, rad."""
+    weight = settings.share ** np.arange(axes.shape[-3])[::-1]
+    weight = settings.gain * weight / weight.sum()
+    needed = np.einsum("...jai,...i->...ja", axes, turn)
+    limit = settings.max_bend_rate
+    return np.clip(weight[:, None] * needed, -limit, limit)
+
+
+def _attempt(
+    settings: Settings, state: State, place: Place, insertion: np.ndarray
+) -> State:
+    """Counts progress; begins and ends retries."""
+    outside = place.excess > settings.tolerance
+    gained = place.arc_length > state.best + settings.progress
+    idle = gained | state.retracting
+    stale = np.where(idle, 0, state.stale + 1)
+    lost = np.where(outside & ~state.retracting, state.lost + 1, 0)
+    give_up = (stale > settings.patience) | (lost > settings.lost_patience)
+    growth = 1 + settings.backoff_growth * (state.attempts % 4)
+    turn = np.where(give_up, insertion - settings.backoff * growth, state.turn)
+    back = (insertion <= turn) & ~outside | (insertion <= _WITHDRAWN)
+    retracting = (state.retracting | give_up) & ~back
+    again = state.retracting & ~retracting
+    best = np.where(gained, place.arc_length, state.best)
+    return dataclasses.replace(
+        state,
+        insertion=np.array(insertion),
+        retracting=retracting,
+        turn=turn,
+        best=np.where(again, place.arc_length, best),
+        stale=np.where(give_up, 0, stale),
+        lost=lost,
+        attempts=state.attempts + give_up,
+    )
+
+
+def _matrix(quaternion: np.ndarray) -> np.ndarray:
+    """Rotation matrix (3, 3) of a unit quaternion wxyz."""
+    w, x, y, z = quaternion
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+
+
+def _turned(frame: np.ndarray, axis: int, angle: np.ndarray) -> np.ndarray:
+    """Frame (..., 3, 3) turned by an angle (...) about its own axis 0, 1 or 2."""
+    first, second = (axis + 1) % 3, (axis + 2) % 3
+    cosine, sine = np.cos(angle)[..., None], np.sin(angle)[..., None]
+    turned = np.array(frame)
+    turned[..., first] = cosine * frame[..., first] + sine * frame[..., second]
+    turned[..., second] = cosine * frame[..., second] - sine * frame[..., first]
+    return turned
+
+
+def _ramp(value: np.ndarray, none: float, full: float) -> np.ndarray:
+    """0 at `none` and on its side, 1 at `full` and on its side, linear between."""
+    return np.clip((value - none) / (full - none), 0.0, 1.0)
