@@ -11,7 +11,7 @@ env = gymnasium.make("cathsim/type1_bca-v0", observation="image")
 
 from cathsim_dmc import suite
 
-VERSION = 0
+VERSION = 0  # the same as in simulation.gymnasium, which is imported late
 IDS = tuple(f"{suite.DOMAIN}/{task}-v{VERSION}" for task in suite.SUITE)
 
 _MODULE = "cathsim_dmc.simulation.gymnasium"

@@ -142,7 +142,8 @@ class EpisodeRecorder:
         A step in which the physics diverges ends the episode and is left out of it.
 
         Args:
-            policy: Called with every ``dm_env.TimeStep``, returns the action.
+            policy: Called with every ``dm_env.TimeStep``, returns the action. It may
+                raise ``StopIteration`` to end the episode as truncated.
             seed: Seeds the environment's random state before the reset; with None it
                 goes on from where it is and the episode cannot be repeated.
             max_steps: Ends the episode as truncated; by default only the environment
@@ -162,7 +163,10 @@ class EpisodeRecorder:
         rows.add(**self._state())
         steps, error, termination, discount = 0, None, None, 1.0
         while not timestep.last() and (max_steps is None or steps < max_steps):
-            action = self._action(policy, timestep)
+            try:
+                action = self._action(policy, timestep)
+            except StopIteration:
+                break
             try:
                 timestep = self._env.step(action)
             except control.PhysicsError as caught:

@@ -12,6 +12,7 @@ from cathsim_dmc.simulation import batch
 from cathsim_dmc.tasks import cannulation
 
 RENDER_MODES = ("rgb_array",)
+VERSION = 0  # of the ids
 _MOST_SEED = 2**32  # first seed that numpy's RandomState does not take
 
 # Quantities of `info`, beside "success" and "physics_error"; m and N.
@@ -206,6 +207,22 @@ def fluoroscopy_frame(task, machine: angiograph.Angiograph) -> np.ndarray:
     )[0]
     row = np.concatenate(list(np.moveaxis(image, -1, 0)), axis=1)
     return np.repeat(row[..., None], 3, axis=-1)
+
+
+def make(task: str, **options: Any) -> gymnasium.Env:
+    """An environment with a spec that says how to make it again, without wrappers.
+
+    Args:
+      task: of `suite.SUITE`.
+      **options: of `CathSimEnv`; JSON can hold them if the spec shall be written.
+    """
+    spec = gymnasium.envs.registration.EnvSpec(
+        id=f"{suite.DOMAIN}/{task}-v{VERSION}",
+        entry_point=f"{__name__}:{CathSimEnv.__name__}",
+        kwargs={"task": task, **options},
+        disable_env_checker=True,
+    )
+    return gymnasium.make(spec)
 
 
 class CathSimVectorEnv(gymnasium.vector.VectorEnv):

@@ -1,0 +1,166 @@
+"""A session of cannulation by hand, episode after episode, recorded."""
+
+import time
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from cathsim_dmc import suite
+from cathsim_dmc.play.controls import Controls
+from cathsim_dmc.recording.episode import SUFFIX, Episode
+from cathsim_dmc.recording.recorder import EpisodeRecorder
+from cathsim_dmc.tasks.cannulation import CONTROL_TIMESTEP
+
+MODES = ("fluoroscopy", "viewer")
+_PAUSE = 1.0  # s, for which the end of an episode is shown
+
+
+class Session:
+    """Runs episodes at the pace of the clock, with a face and a pair of hands."""
+
+    def __init__(
+        self,
+        task: str,
+        mode: str = "fluoroscopy",
+        *,
+        seed: int = 0,
+        speed: float = 1.0,
+        task_kwargs: Mapping[str, Any] | None = None,
+    ):
+        """Loads the task and opens the window.
+
+        Args:
+          task: of `suite.SUITE`.
+          mode: "fluoroscopy" is a plain window, "viewer" MuJoCo's.
+          seed: of the first episode; the others count up.
+          speed: of the simulation against the clock.
+          task_kwargs: options of the task.
+
+        Raises:
+          ValueError: if an argument is wrong or no window can be opened.
+        """
+        if mode not in MODES:
+            raise ValueError(f"mode is {mode!r}; give one of {', '.join(MODES)}")
+        if not speed > 0:
+            raise ValueError(f"speed is {speed}; it must be > 0")
+        self._options = dict(task_kwargs or {})
+        # The screen is the operator's observation; the task's own would only cost.
+        self._environment = suite.load(
+            suite.DOMAIN, task, {"observation": "tracking", **self._options}
+        )
+        self._task_name, self._seed, self._speed = task, seed, speed
+        navigation = self._environment.task
+        self._controls = Controls(
+            len(navigation.catheter.tip_motors) // 2,
+            navigation.catheter.rotation is not None,
+        )
+        self._face = _face(mode, navigation, self._controls)
+        self._next = time.monotonic()
+
+    def run(self, out: Path | None = None, episodes: int | None = None) -> list[Path]:
+        """Plays until the operator quits, or for a number of episodes.
+
+        Args:
+          out: directory for the records, made if it is not there; None for none.
+          episodes: None for no limit.
+
+        Returns:
+          The files written, one for each episode of at least one step.
+        """
+        if out is not None:
+            Path(out).mkdir(parents=True, exist_ok=True)
+        recorder = EpisodeRecorder(self._environment, self._task_name, self._options)
+        written: list[Path] = []
+        played = 0
+        try:
+            while episodes is None or played < episodes:
+                self._controls.restart()
+                self._next = time.monotonic()
+                episode = recorder.record_episode(self._hand, self._seed + played)
+                played += 1
+                if out is not None and episode.steps:
+                    written.append(_save(episode, Path(out)))
+                if self._quits():
+                    break
+                self._farewell(episode)
+        finally:
+            self._face.close()
+        return written
+
+    def _hand(self, timestep: Any) -> np.ndarray:
+        """The operator as a policy; stops the episode when asked to."""
+        del timestep
+        if hasattr(self._face, "open"):
+            self._face.open(self._environment.physics)
+        self._face.show(self._environment.task)
+        self._next += CONTROL_TIMESTEP / self._speed
+        while (left := self._next - time.monotonic()) > 0:
+            self._face.poll()
+            time.sleep(min(left, 0.005))
+        # A machine that cannot keep pace runs slower and does not catch up later.
+        self._next = max(self._next, time.monotonic() - CONTROL_TIMESTEP)
+        self._face.poll()
+        if self._quits() or self._controls.requested == "restart":
+            raise StopIteration
+        return self._controls.action(CONTROL_TIMESTEP)
+
+    def _quits(self) -> bool:
+        return self._face.closed or self._controls.requested == "quit"
+
+    def _farewell(self, episode: Episode):
+        if self._controls.requested == "restart":
+            return
+        text = f"{episode.termination} after {episode.time[-1]:.1f} s"
+        until = time.monotonic() + _PAUSE / self._speed
+        while time.monotonic() < until and not self._quits():
+            self._face.show(self._environment.task, text)
+            self._face.poll()
+            time.sleep(0.02)
+
+
+def _face(mode: str, task: Any, controls: Controls):
+    if mode == "viewer":
+        from cathsim_dmc.play.viewer import MujocoViewer
+
+        return MujocoViewer(task, controls)
+    from cathsim_dmc.play.window import FluoroscopyWindow
+
+    return FluoroscopyWindow(task, controls)
+
+
+def _save(episode: Episode, directory: Path) -> Path:
+    """Saves under the first number that is free."""
+    number = 0
+    while (path := directory / f"{episode.task}_{number:03d}{SUFFIX}").exists():
+        number += 1
+    return episode.save(path)
+
+
+def play(
+    task: str,
+    mode: str = "fluoroscopy",
+    out: str | Path | None = None,
+    *,
+    seed: int = 0,
+    episodes: int | None = None,
+    speed: float = 1.0,
+    task_kwargs: Mapping[str, Any] | None = None,
+) -> list[Path]:
+    """Plays a task by keyboard and records demonstrations.
+
+    Args:
+      task: of `suite.SUITE`.
+      mode: "fluoroscopy", a plain window without OpenGL, or "viewer", MuJoCo's.
+      out: directory for the episodes (npz), None for none.
+      seed: of the first episode; the others count up.
+      episodes: to play, None until the operator quits.
+      speed: of the simulation against the clock.
+      task_kwargs: options of the task.
+
+    Returns:
+      The files written.
+    """
+    session = Session(task, mode, seed=seed, speed=speed, task_kwargs=task_kwargs)
+    return session.run(None if out is None else Path(out), episodes)

@@ -1,0 +1,198 @@
+"""Fluoroscopy in a plain window, without OpenGL."""
+
+import time
+from typing import Any
+
+import numpy as np
+
+from cathsim_dmc.imaging import angiograph
+from cathsim_dmc.imaging.options import FluoroscopyOptions
+from cathsim_dmc.play import readout
+from cathsim_dmc.play.controls import HELP, Controls
+
+TITLE = "cathsim"
+SIZE = 512  # px
+
+# Keys of Tk by command.
+KEYS = {
+    "w": "push",
+    "s": "pull",
+    "Right": "right",
+    "Left": "left",
+    "Up": "up",
+    "Down": "down",
+    "a": "turn_left",
+    "d": "turn_right",
+    "space": "straight",
+    "r": "restart",
+    "Escape": "quit",
+}
+# X repeats a held key as release and press; a release counts if none follows in, s:
+_REPEAT = 0.06
+_BAR_FORCE = readout.FORCE_LEVELS[-1][0]  # N at the end of the bar
+_PANEL = 230  # px
+
+
+class FluoroscopyWindow:
+    """Shows the task as an operator sees it and turns keys into commands."""
+
+    def __init__(self, task: Any, controls: Controls):
+        """Opens the window.
+
+        Args:
+          task: a navigation task; its fluoroscopy options are used, with as many
+            pixels as the window has and with quantum noise.
+          controls: that the keys act on.
+
+        Raises:
+          ValueError: if there is no Tk or no display.
+        """
+        try:
+            import tkinter
+        except ImportError as error:
+            raise ValueError(
+                "the fluoroscopy window needs tkinter; install your system's "
+                "python3-tk, or play with mode='viewer'"
+            ) from error
+        self._controls = controls
+        try:
+            self._root = tkinter.Tk(className=TITLE)
+        except tkinter.TclError as error:
+            raise ValueError(
+                f"no window can be opened ({error}); set DISPLAY, or run under "
+                "xvfb-run"
+            ) from error
+        self._tk = tkinter
+        self._machine = _machine(task)
+        self._random = np.random.RandomState(0)
+        self._released: dict[str, float] = {}
+        self.closed = False
+        self._build(self._machine[0].carm.resolution, len(self._machine))
+
+    def _build(self, resolution: tuple[int, int], planes: int):
+        tk, root = self._tk, self._root
+        root.title(TITLE)
+        root.configure(background="black")
+        root.resizable(False, False)
+        root.protocol("WM_DELETE_WINDOW", self._close)
+        rows, columns = resolution
+        self._screen = tk.Canvas(
+            root, width=columns * planes, height=rows, highlightthickness=0
+        )
+        self._screen.grid(row=0, column=0)
+        panel = tk.Canvas(
+            root, width=_PANEL, height=rows, background="black", highlightthickness=0
+        )
+        panel.grid(row=0, column=1)
+        self._panel = panel
+        tk.Label(
+            root,
+            text=HELP,
+            foreground="grey70",
+            background="black",
+            wraplength=columns * planes + _PANEL,
+        ).grid(row=1, column=0, columnspan=2)
+        root.bind("<KeyPress>", self._pressed)
+        root.bind("<KeyRelease>", self._let_go)
+        root.update()
+        root.focus_force()
+
+    def _pressed(self, event):
+        command = KEYS.get(_name(event.keysym))
+        if command is not None:
+            self._released.pop(command, None)
+            self._controls.press(command)
+
+    def _let_go(self, event):
+        command = KEYS.get(_name(event.keysym))
+        if command is not None:
+            self._released[command] = time.monotonic()
+
+    def _close(self):
+        self.closed = True
+
+    def poll(self) -> None:
+        """Takes the keys pressed since the last call."""
+        self._root.update()
+        for command, when in list(self._released.items()):
+            if time.monotonic() - when > _REPEAT:
+                self._controls.release(command)
+                del self._released[command]
+
+    def show(self, task: Any, message: str = "") -> None:
+        """Draws the state of a task."""
+        planes = angiograph.render(
+            [self._machine],
+            task.readings.centreline[None],
+            task.catheter.device.outer_radius,
+            [self._random],
+        )[0]
+        image = np.concatenate(list(np.moveaxis(planes, -1, 0)), axis=1)
+        rows, columns = image.shape
+        data = b"P5 %d %d 255 " % (columns, rows) + image.tobytes()
+        self._image = self._tk.PhotoImage(data=data, format="PPM", master=self._root)
+        self._screen.delete("all")
+        self._screen.create_image(0, 0, image=self._image, anchor="nw")
+        self._draw_goal(task, columns // len(self._machine))
+        self._draw_panel(task, message)
+        self._root.update()
+
+    def _draw_goal(self, task, width: int):
+        """A ring where the goal is, in every plane."""
+        places = angiograph.pixels([self._machine], task.goal_position[None, None])
+        for plane, fluoroscope in enumerate(self._machine):
+            carm = fluoroscope.carm
+            _, depth = carm.project(task.goal_position)
+            radius = task.goal_radius * carm.focal_length / float(depth)
+            x, y = places[0, plane, 0] + 0.5 + [plane * width, 0]
+            self._screen.create_oval(
+                x - radius, y - radius, x + radius, y + radius, outline="green2"
+            )
+
+    def _draw_panel(self, task, message):
+        panel, left, y = self._panel, 14, 24
+        panel.delete("all")
+        for name, value in readout.lines(task):
+            panel.create_text(left, y, text=name, fill="grey70", anchor="w")
+            panel.create_text(_PANEL - 14, y, text=value, fill="white", anchor="e")
+            y += 24
+        force = float(task.wall_force.max)
+        width = (_PANEL - 2 * left) * min(force / _BAR_FORCE, 1.0)
+        panel.create_rectangle(left, y, _PANEL - left, y + 16, outline="grey40")
+        panel.create_rectangle(
+            left, y, left + width, y + 16, fill=readout.colour(force), width=0
+        )
+        y += 60
+        # The bend of the tip as a joystick.
+        size, (about_x, about_y) = 40, self._controls.bend
+        middle = _PANEL / 2
+        panel.create_rectangle(
+            middle - size, y, middle + size, y + 2 * size, outline="grey40"
+        )
+        x0, y0 = middle + size * about_y, y + size - size * about_x
+        panel.create_oval(x0 - 5, y0 - 5, x0 + 5, y0 + 5, fill="white")
+        y += 2 * size + 30
+        panel.create_text(
+            left, y, text=message, fill="white", anchor="nw", width=_PANEL - 2 * left
+        )
+
+    def close(self) -> None:
+        """Closes the window."""
+        self._root.destroy()
+
+
+def _machine(task) -> angiograph.Planes:
+    options = task.config.fluoroscopy
+    rows, columns = options.resolution
+    factor = max(1, round(SIZE / max(rows, columns)))
+    fields = {name: getattr(options, name) for name in options.__dataclass_fields__}
+    fields["size"] = (rows * factor, columns * factor)
+    surface = task.anatomy.surface
+    machine = angiograph.Angiograph(
+        surface.vertices, surface.faces, FluoroscopyOptions(**fields)
+    )
+    return machine.planes()
+
+
+def _name(keysym: str) -> str:
+    return keysym.lower() if len(keysym) == 1 else keysym

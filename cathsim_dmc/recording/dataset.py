@@ -1,0 +1,154 @@
+"""Episodes as a Minari dataset, which Gymnasium and TorchRL load."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from cathsim_dmc.recording.episode import Episode
+
+# Options that say what is observed. An episode does not hold observations: they come
+# from repeating it, and may be others than those it was recorded with.
+_OBSERVED = ("observation", "fluoroscopy", "cameras")
+# Rewards of a repeated episode may differ by rounding on another machine.
+TOLERANCE = 1e-9
+
+
+def export(
+    episodes: Iterable[Episode],
+    dataset_id: str,
+    *,
+    observation: str | Sequence[str] | None = None,
+    task_kwargs: Mapping[str, Any] | None = None,
+    author: str = "",
+    description: str = "",
+):
+    """Repeats episodes and writes them as a dataset to Minari's own directory.
+
+    The directory is `~/.minari/datasets`, or where MINARI_DATASETS_PATH says. Every
+    step is taken anew from the episode's seed and compared with the record, so the
+    dataset holds what happened and nothing else.
+
+    Args:
+      episodes: of one task, with the same options, seeded and not empty.
+      dataset_id: such as "cathsim/type1_bca/human-v0".
+      observation: names of observations; None for those of the record, or
+        "internal".
+      task_kwargs: further options of what is observed, such as `fluoroscopy`.
+      author: for the dataset's metadata.
+      description: the same.
+
+    Returns:
+      The `minari.MinariDataset`. `recover_environment()` gives its environment, and
+      the infos of each step are those of the Gymnasium environment.
+
+    Raises:
+      ValueError: if the episodes do not belong together or do not repeat.
+      ModuleNotFoundError: if minari is not installed.
+    """
+    try:
+        import minari
+
+        from cathsim_dmc.simulation.gymnasium import make
+    except ModuleNotFoundError as error:
+        raise ModuleNotFoundError(
+            "minari is not installed; `pip install cathsim-dmc[gym]` adds it"
+        ) from error
+    episodes = list(episodes)
+    task, options = _common(episodes)
+    options.update(task_kwargs or {})
+    if observation is not None:
+        options["observation"] = observation
+    single = all((e.action == e.action.astype(np.float32)).all() for e in episodes)
+    environment = make(task, dtype="float32" if single else "float64", **options)
+    try:
+        return minari.create_dataset_from_buffers(
+            dataset_id,
+            # Buffers filled here: Minari's own collector asks for JAX.
+            [_repeat(environment, episode) for episode in episodes],
+            env=environment,
+            algorithm_name="recorded episodes",
+            author=author or None,
+            description=description
+            or f"{len(episodes)} recorded episodes of the task {task} of cathsim_dmc",
+            data_format="hdf5",
+            jpeg_encoding=False,
+        )
+    finally:
+        environment.close()
+
+
+def _common(episodes: Sequence[Episode]) -> tuple[str, dict[str, Any]]:
+    """Task and options that all episodes share."""
+    if not episodes:
+        raise ValueError("there are no episodes to export")
+    tasks = {episode.task for episode in episodes}
+    kinds = [
+        {
+            key: value
+            for key, value in episode.meta.get("task_kwargs", {}).items()
+            if key not in ("random", *_OBSERVED)
+        }
+        for episode in episodes
+    ]
+    if len(tasks) > 1 or any(kind != kinds[0] for kind in kinds):
+        raise ValueError(
+            f"the episodes are of the tasks {', '.join(sorted(tasks))}, or with "
+            "different options; export each kind as a dataset of its own"
+        )
+    for index, episode in enumerate(episodes):
+        if episode.seed is None or not episode.steps:
+            raise ValueError(
+                f"episode {index} has {episode.steps} steps and the seed "
+                f"{episode.seed}; only seeded episodes with steps can be repeated"
+            )
+    first = episodes[0].meta.get("task_kwargs", {})
+    observed = {key: first[key] for key in _OBSERVED if key in first}
+    return episodes[0].task, {**kinds[0], **observed}
+
+
+def _repeat(environment, episode: Episode):
+    """Takes every step of an episode again; returns it as Minari's buffer.
+
+    Raises:
+      ValueError: if it goes another way.
+    """
+    from minari.data_collector import EpisodeBuffer
+
+    dtype = environment.action_space.dtype
+    first = environment.reset(seed=episode.seed)
+    seen, infos, ends = [first[0]], [first[1]], []
+    for step, action in enumerate(episode.action.astype(dtype)):
+        observation, reward, *end, info = environment.step(action)
+        seen.append(observation)
+        infos.append(info)
+        ends.append(end)
+        if abs(reward - episode.reward[step]) > TOLERANCE:
+            raise ValueError(
+                f"episode with seed {episode.seed} does not repeat: reward {reward} "
+                f"instead of {episode.reward[step]} at step {step}; it was recorded "
+                f"with {episode.meta.get('versions')}"
+            )
+        if any(end) and step + 1 < episode.steps:
+            raise ValueError(
+                f"episode with seed {episode.seed} ends at step {step} instead of "
+                f"{episode.steps - 1}; export it with the options it was recorded with"
+            )
+    # Who recorded may have stopped it, which no step says.
+    terminated, truncated = np.array(ends).T
+    truncated[-1] |= not terminated[-1]
+    return EpisodeBuffer(
+        seed=episode.seed,
+        observations=_columns(seen),
+        actions=episode.action.astype(dtype),
+        rewards=episode.reward.tolist(),
+        terminations=terminated.tolist(),
+        truncations=truncated.tolist(),
+        infos=_columns(infos),
+    )
+
+
+def _columns(rows: Sequence[Mapping[str, Any]]) -> dict[str, np.ndarray]:
+    return {key: np.array([row[key] for row in rows]) for key in rows[0]}
