@@ -8,8 +8,10 @@ from cathsim_dmc.entities import devices
 
 # Relaxation time of bending: joint damping = time * stiffness, s. It lumps the loss
 # inside the polymer with the drag of blood: a 0.2 m cantilever of 50 N·mm² with a drag
-# of 0.15 N·s/m² relaxes in c L⁴ / (12.4 EI) = 0.4 s, a 0.07 m tip in 0.02 s.
-BENDING_RELAXATION_TIME = 0.2
+# of 0.15 N·s/m² relaxes in c L⁴ / (12.4 EI) = 0.4 s, a 0.07 m tip in 0.02 s. With 0.2 s
+# the tip, thrown over by all its motors, hits the wall faster than steps of 4 ms
+# resolve (1.4 mm deep, against 0.9 mm).
+BENDING_RELAXATION_TIME = 0.3
 # Rotor inertia of the hinges, kg·m². Next to the damping it acts within 2 ms, far
 # below the relaxation time, and it gives the contact solver the scale of mass at
 # which the wall is as hard as silicone (docs/physics.md).
@@ -24,6 +26,12 @@ CARRIAGE_MASS = 0.2  # kg, platform of the follower that pushes the device
 MAX_PUSH_FORCE = 5.0  # N, slip of the clamps
 MAX_PUSH_SPEED = 0.04  # m/s
 CARRIAGE_GAIN = 100.0  # N·s/m, stiff: 1 N of load costs 1 cm/s
+
+# The links are rigid; the axial compliance of the whole device, L / EA, sits in a
+# spring at its base. Without it a jam stops the carriage within a step, and the push
+# force chatters. Damping ratio of the carriage on that spring.
+COMPRESSION_DAMPING = 0.5
+COMPRESSION_ARMATURE = 1e-3  # kg, about the mass of the device
 
 # Rotary unit as seen by the device, kg·m²: a 0.3 kg clamp of 2 cm. The bounded torque
 # then changes the speed by less in a time step than the range in which the servo is
@@ -112,6 +120,16 @@ class Catheter(composer.Entity):
             armature=CARRIAGE_MASS,
             limited=True,
             range=(0.0, self._stroke),
+        )
+        stiffness = self._device.axial_stiffness / self._lengths.sum()
+        base.add(
+            "joint",
+            name="compression",
+            type="slide",
+            axis=(0, 0, 1),
+            stiffness=stiffness,
+            damping=2 * COMPRESSION_DAMPING * (stiffness * CARRIAGE_MASS) ** 0.5,
+            armature=COMPRESSION_ARMATURE,
         )
         self._rotation = None
         if rotation:

@@ -110,6 +110,11 @@ class Device:
         """Whether the joints of the tip carry motors."""
         return self.steering_angle > 0
 
+    @property
+    def axial_stiffness(self) -> float:
+        """EA of the shaft in N, as of a solid round rod: EA = 4 EI / r²."""
+        return 4 * self.shaft.bending_stiffness / self.outer_radius**2
+
     def rest_angle(self, start: float, stop: float) -> float:
         """Turning angle of the unloaded shape between two places.
 

@@ -19,8 +19,9 @@ CONTACT_SOLREF = (-1 / _CONTACT_TIME**2, -2 / _CONTACT_TIME)
 # stops rising at 0.97 let 0.2 N push the tip 3 mm deep.
 CONTACT_SOLIMP = (0.7, 0.999, 0.0003, 0.5, 1)
 
-# Contacts that the wall sensor can report; the most seen in the soak is below 50.
-MAX_CONTACTS = 64
+# Contacts that the wall sensor can report. A device jammed in a narrow tube has about
+# a hundred; `Contacts.found` tells when there are more.
+MAX_CONTACTS = 192
 CONTACT_FIELDS = ("found", "force", "dist", "pos", "normal", "tangent")
 
 _LUMEN_COLOUR = (0.8, 0.25, 0.25, 0.25)
