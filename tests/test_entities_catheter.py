@@ -290,9 +290,12 @@ def test_torsion_hinges_add_up_to_the_rod(count):
         assert model.dof_armature[twist.dofadr[0]] == TORSION_ARMATURE
 
 
-def test_without_torsion_hinges_there_are_only_bends(published):
+def test_without_torsion_hinges_nothing_twists(published):
     catheter, physics = published
-    assert physics.model.nv == 1 + 2 * (len(catheter.link_lengths) - 1)
+    model = physics.model.ptr
+    names = [model.joint(index).name for index in range(model.njnt)]
+    assert not [name for name in names if "twist" in name]
+    assert len(catheter.bends) == 2 * (len(catheter.link_lengths) - 1)
 
 
 @pytest.mark.parametrize("name", ["diagnostic_5f_j", "diagnostic_5f_simmons"])

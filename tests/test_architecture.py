@@ -1,0 +1,240 @@
+"""Who may import whom, what is heavy, and what an import may not do."""
+
+import ast
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import cathsim_dmc
+
+PACKAGE = Path(cathsim_dmc.__file__).parent
+NAME = "cathsim_dmc"
+
+_TASK = {"anatomy", "imaging", "entities", "tasks"}
+_FACE = _TASK | {"suite", "simulation"}
+# Part of the package -> parts that it may import. Arrows point one way: what stands
+# further up knows what stands further down, never the other way round.
+ALLOWED = {
+    "__init__": set(),
+    "anatomy": set(),
+    "imaging": {"anatomy"},
+    "entities": {"anatomy", "imaging"},
+    "tasks": {"anatomy", "imaging", "entities"},
+    "suite": _TASK,
+    "simulation": _TASK | {"suite"},
+    "recording": _FACE,
+    "analysis": _FACE | {"recording"},
+    "agents": _FACE | {"recording", "analysis"},
+    # The faces to the outside: everything but each other.
+    "gym": _FACE,
+    "cli": _FACE | {"recording", "analysis", "agents"},
+}
+# Package -> files that may import it, wherever in the file the import stands.
+CONFINED = {
+    # The benchmark compares the TorchRL environment with the simulation underneath.
+    "torch": {"simulation/torchrl.py", "agents/", "analysis/benchmark.py"},
+    "torchrl": {"simulation/torchrl.py", "agents/"},
+    "tensordict": {"simulation/torchrl.py", "agents/"},
+    "rerun": {"recording/"},
+    "coacd": {"anatomy/"},
+    "gymnasium": {"simulation/gymnasium.py", "gym.py"},
+    "tyro": {"cli.py"},
+}
+# Slow to import: only within functions, unless a module is itself loaded late.
+LATE = ("trimesh", "coacd", "skimage", "matplotlib", "rerun", "torch", "torchrl")
+
+
+def modules():
+    return sorted(PACKAGE.rglob("*.py"))
+
+
+def imported(path):
+    """(name of the module imported, at the top level?) of each import in a file."""
+    tree = ast.parse(path.read_text())
+    inner = {
+        node
+        for function in ast.walk(tree)
+        if isinstance(function, ast.FunctionDef | ast.AsyncFunctionDef | ast.Lambda)
+        for node in ast.walk(function)
+    }
+    typing = {
+        node
+        for block in ast.walk(tree)
+        if isinstance(block, ast.If) and "TYPE_CHECKING" in ast.unparse(block.test)
+        for node in ast.walk(block)
+    }
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            for alias in node.names:
+                yield alias.name, node not in inner and node not in typing
+        elif isinstance(node, ast.ImportFrom):
+            assert not node.level, f"{path}: relative import; write it in full"
+            for alias in node.names:
+                full = f"{node.module}.{alias.name}"
+                yield full, node not in inner and node not in typing
+
+
+def part_of(module):
+    """Part of the package that a dotted name lies in, or None for other packages."""
+    names = module.split(".")
+    if names[0] != NAME:
+        return None
+    return names[1] if len(names) > 1 else "__init__"
+
+
+def home(path):
+    relative = path.relative_to(PACKAGE)
+    return relative.parts[0].removesuffix(".py")
+
+
+def test_every_part_is_in_the_contract():
+    assert {home(path) for path in modules()} <= set(ALLOWED)
+
+
+def test_the_contract_has_no_circles():
+    order = []
+    left = {part: set(allowed) for part, allowed in ALLOWED.items()}
+    while left:
+        free = [part for part, allowed in left.items() if not allowed - set(order)]
+        assert free, f"circle among {sorted(left)}"
+        order += free
+        left = {part: allowed for part, allowed in left.items() if part not in free}
+
+
+@pytest.mark.parametrize("part", ALLOWED)
+def test_imports_point_one_way(part):
+    wrong = []
+    for path in modules():
+        if home(path) != part:
+            continue
+        for module, _ in imported(path):
+            target = part_of(module)
+            if target in (None, part) or target not in ALLOWED:
+                continue  # another package, itself, or a name such as __version__
+            if target not in ALLOWED[part]:
+                wrong.append(f"{path.relative_to(PACKAGE)} imports {module}")
+    assert not wrong, f"{part} may import {sorted(ALLOWED[part])} only: {wrong}"
+
+
+@pytest.mark.parametrize("package", CONFINED)
+def test_heavy_packages_stay_where_they_belong(package):
+    homes = CONFINED[package]
+    wrong, right = [], []
+    for path in modules():
+        relative = path.relative_to(PACKAGE).as_posix()
+        if any(module.split(".")[0] == package for module, _ in imported(path)):
+            fits = any(
+                relative == home_
+                or (home_.endswith("/") and relative.startswith(home_))
+                for home_ in homes
+            )
+            (right if fits else wrong).append(relative)
+    assert not wrong, f"{package} belongs into {sorted(homes)}"
+    assert right, f"nothing imports {package} any more: drop the rule"
+
+
+def test_no_file_sets_environment_variables_at_import():
+    wrong = []
+    for path in modules():
+        for node in ast.parse(path.read_text()).body:
+            # Within functions it would be a user's call.
+            if isinstance(node, ast.FunctionDef | ast.ClassDef):
+                continue
+            text = ast.unparse(node)
+            if "os.environ[" in text.split("=")[0] or any(
+                call in text
+                for call in ("environ.setdefault", "environ.update", "putenv")
+            ):
+                wrong.append(f"{path.relative_to(PACKAGE)}: {text}")
+    assert not wrong
+
+
+def run(code, **environment):
+    """Runs Python code in a fresh interpreter."""
+    return subprocess.run(
+        [sys.executable, "-c", code],
+        capture_output=True,
+        text=True,
+        timeout=300,
+        env={**os.environ, **environment},
+    )
+
+
+def loaded_by(statement):
+    done = run(f"import sys\n{statement}\nprint(*sys.modules)")
+    assert done.returncode == 0, done.stderr
+    return {name.split(".")[0] for name in done.stdout.split()}
+
+
+def test_the_package_itself_is_light():
+    loaded = loaded_by("import cathsim_dmc; cathsim_dmc.__version__")
+    assert not loaded & {"dm_control", "mujoco", "scipy", *LATE}
+
+
+def test_the_suite_is_loaded_without_torch_and_without_the_heavy_ones():
+    loaded = loaded_by("from cathsim_dmc import suite")
+    assert "dm_control" in loaded
+    assert not loaded & set(LATE)
+
+
+def test_loading_a_task_stays_below_300_mb():
+    done = run(
+        "import resource, sys\n"
+        "from cathsim_dmc import suite\n"
+        "suite.load('cathsim', 'type2_bca').reset()\n"
+        "print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss, *sys.modules)"
+    )
+    assert done.returncode == 0, done.stderr
+    kilobytes, *loaded = done.stdout.split()
+    assert int(kilobytes) < 300_000
+    # scikit-image draws the surface of an arch; the others have no business here.
+    assert not {name.split(".")[0] for name in loaded} & set(LATE) - {"skimage"}
+
+
+def test_imports_leave_the_environment_as_it_is():
+    """Of our own: what dm_control and torchrl do is theirs."""
+    done = run(
+        "import os, torchrl, torchrl.envs, tensordict, rerun, tyro\n"
+        "from dm_control import composer, suite\n"
+        "before = dict(os.environ)\n"
+        "import cathsim_dmc.suite, cathsim_dmc.agents, cathsim_dmc.cli\n"
+        "import cathsim_dmc.recording.viewer, cathsim_dmc.simulation.torchrl\n"
+        "assert dict(os.environ) == before, set(os.environ) ^ set(before)\n",
+        MUJOCO_GL="disable",
+    )
+    assert done.returncode == 0, done.stderr
+
+
+@pytest.mark.parametrize(
+    "backend", ["egl", pytest.param("osmesa", marks=pytest.mark.slow)]
+)
+def test_agents_import_before_dm_control_with_opengl(backend):
+    """The other order ends in a segmentation fault inside triton."""
+    probe = run("import mujoco; mujoco.GLContext(8, 8).free()", MUJOCO_GL=backend)
+    if probe.returncode != 0:
+        pytest.skip(f"no {backend} on this machine")
+    done = run(
+        "from cathsim_dmc import agents, suite; print(len(suite.SUITE))",
+        MUJOCO_GL=backend,
+    )
+    assert done.returncode == 0, done.stderr
+    assert int(done.stdout) >= 5
+
+
+@pytest.mark.parametrize("backend", ["egl", "osmesa"])
+def test_the_order_that_crashes_is_refused(backend):
+    """An error that says what to do, in place of the crash; it needs no OpenGL."""
+    done = run(
+        "import os, sys, types\n"
+        # As if dm_control had been loaded with that back end.
+        "sys.modules['dm_control.mujoco'] = types.ModuleType('dm_control.mujoco')\n"
+        "import cathsim_dmc.agents",
+        MUJOCO_GL=backend,
+    )
+    assert done.returncode == 1, "crashed or went on"
+    assert "ImportError" in done.stderr
+    for word in (backend, "torchrl", "first", "MUJOCO_GL=disable"):
+        assert word in done.stderr

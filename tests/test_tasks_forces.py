@@ -1,0 +1,81 @@
+"""Readings of the contact sensor, turned into forces on the wall."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as arrays
+
+from cathsim_dmc.tasks import forces
+
+
+def sensor_row(contacts, places):
+    """Row of the sensor: found, force, dist, pos, normal, tangent for each place."""
+    rows = np.zeros((places, 14))
+    for index, (force, depth, position, normal, tangent) in enumerate(contacts):
+        rows[index] = [len(contacts), *force, -depth, *position, *normal, *tangent]
+    return rows.ravel()
+
+
+X, Y, Z = np.eye(3)
+
+
+def test_one_contact():
+    """The sensor's force acts on the device along the normal out of the wall."""
+    row = sensor_row([((3.0, 0.5, -0.2), 1e-4, (0.1, 0.2, 0.3), Z, X)], 4)
+    contacts = forces.Contacts.from_sensor(row)
+    assert contacts.present.tolist() == [True, False, False, False]
+    # z × x = y is the second tangent; the wall feels the opposite of the device.
+    np.testing.assert_allclose(contacts.force[0], -(3.0 * Z + 0.5 * X - 0.2 * Y))
+    assert contacts.magnitude[0] == pytest.approx(np.sqrt(9 + 0.25 + 0.04))
+    np.testing.assert_allclose(contacts.position[0], (0.1, 0.2, 0.3))
+    assert contacts.penetration[0] == pytest.approx(1e-4)
+    assert contacts.found == 1
+
+
+def test_empty_places_hold_zeros():
+    contacts = forces.Contacts.from_sensor(np.zeros(5 * 14))
+    assert not contacts.present.any() and contacts.found == 0
+    for values in (contacts.force, contacts.magnitude, contacts.penetration):
+        assert not values.any()
+
+
+def test_overflow_is_told():
+    row = sensor_row([((1.0, 0, 0), 0, (0, 0, 0), Z, X)] * 2, 2)
+    row.reshape(2, 14)[:, 0] = 7
+    assert forces.Contacts.from_sensor(row).found == 7
+
+
+NUMBERS = st.floats(-5, 5, allow_subnormal=False)
+
+
+@given(arrays.arrays(float, (2, 3, 4 * 14), elements=NUMBERS))
+def test_leading_axes_are_kept(rows):
+    together = forces.Contacts.from_sensor(rows)
+    assert together.force.shape == (2, 3, 4, 3)
+    for index in np.ndindex(2, 3):
+        alone = forces.Contacts.from_sensor(rows[index])
+        np.testing.assert_array_equal(alone.force, together.force[index])
+        np.testing.assert_array_equal(alone.present, together.present[index])
+    np.testing.assert_allclose(forces.magnitudes(rows), together.magnitude, atol=1e-12)
+
+
+@given(arrays.arrays(float, (6, 3), elements=NUMBERS))
+def test_magnitude_is_the_norm_of_the_force(local):
+    row = sensor_row([(force, 0.0, (0, 0, 0), Y, Z) for force in local], 6)
+    contacts = forces.Contacts.from_sensor(row)
+    np.testing.assert_allclose(
+        np.linalg.norm(contacts.force, axis=-1), contacts.magnitude, atol=1e-12
+    )
+
+
+@given(arrays.arrays(float, (3, 5, 4), elements=st.floats(0, 5, allow_subnormal=False)))
+def test_sum_and_peaks(magnitude):
+    wall = forces.wall_force(magnitude)
+    assert wall.sum.shape == (3,)
+    np.testing.assert_allclose(wall.sum, magnitude[:, -1].sum(-1))
+    np.testing.assert_array_equal(wall.max, magnitude[:, -1].max(-1))
+    np.testing.assert_allclose(wall.peak_sum, magnitude.sum(-1).max(-1))
+    np.testing.assert_array_equal(wall.peak_max, magnitude.max((-1, -2)))
+    assert (wall.peak_sum >= wall.sum).all()
+    assert (wall.peak_max >= wall.max).all() and (wall.sum >= wall.max - 1e-12).all()
