@@ -1,6 +1,7 @@
 """The command `cathsim`. Thin: every command imports what it needs when it runs."""
 
 import json
+import os
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -30,12 +31,15 @@ def main() -> None:
         code = app.cli(
             prog="cathsim", description=__doc__, config=(conf.OmitArgPrefixes,)
         )
+        sys.stdout.flush()
+    except BrokenPipeError:
+        # The reader, such as `head`, has seen enough; nor may the exit flush again.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        code = 0
     except (ValueError, OSError, RuntimeError, ImportError) as error:
         # Errors with a message for the user; anything else is ours, with traceback.
         print(f"cathsim: {type(error).__name__}: {error}", file=sys.stderr)
         code = BAD_INPUT
-    except BrokenPipeError:
-        code = 0
     sys.exit(code)
 
 
@@ -119,7 +123,7 @@ def train(
     """
     from cathsim_dmc import agents
 
-    overrides = json.loads(settings)
+    overrides = _settings(settings)
     if num_envs is not None:
         overrides["num_envs"] = num_envs
     config = agents.make_config(
@@ -141,6 +145,19 @@ def train(
     result = agents.train(config, out, resume=resume, progress=not quiet)
     print(f"{result.frames} frames in {result.seconds:.0f} s: {result.checkpoint}")
     return 0
+
+
+def _settings(text: str) -> dict[str, Any]:
+    """Reads hyper-parameters given as a JSON object."""
+    try:
+        settings = json.loads(text)
+    except json.JSONDecodeError as error:
+        settings = error
+    if not isinstance(settings, dict):
+        raise ValueError(
+            f"settings are {text!r}; give a JSON object such as '{{\"gamma\": 0.95}}'"
+        )
+    return settings
 
 
 def _check_task(task: str, task_kwargs: dict[str, Any], observation: str) -> None:
@@ -281,6 +298,10 @@ def import_phantom(
     out: Path,
     name: str | None = None,
     units: Literal["mm", "cm", "m"] = "mm",
+    frame: Literal["LPS", "RAS"] = "LPS",
+    inlet: tuple[float, float, float] | None = None,
+    wall: Literal["prisms", "coacd"] = "prisms",
+    threshold_mm: float | None = None,
 ) -> int:
     """Turn the surface of a lumen and its centrelines into an anatomy.
 
@@ -289,7 +310,11 @@ def import_phantom(
         centreline: 3D Slicer curves (.mrk.json) or CSV files, one per branch.
         out: Directory of the anatomy.
         name: Of the anatomy.
-        units: Of mesh and centrelines.
+        units: Of mesh, CSV centrelines and inlet.
+        frame: Of mesh, CSV centrelines and inlet.
+        inlet: Where the device enters: a free end, or a place to cut the lumen at.
+        wall: Pieces near the surface, or CoACD's coarse ones (needs the extra coacd).
+        threshold_mm: Of CoACD, the concavity of a piece; 4 by default.
     """
     from cathsim_dmc.anatomy import scan
 
@@ -297,7 +322,11 @@ def import_phantom(
         mesh,
         centreline,
         units=units,
+        mesh_frame=frame,
         name=name or out.name,
+        inlet=inlet,
+        wall=wall,
+        threshold=None if threshold_mm is None else threshold_mm * 1e-3,
         progress=lambda text: print(text, file=sys.stderr),
     )
     anatomy.save(out)

@@ -4,17 +4,24 @@ from __future__ import annotations
 
 import json
 import os
+import subprocess
+import sys
+from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from scipy.spatial import ConvexHull, cKDTree
 
+from cathsim_dmc.anatomy import scan_coacd
 from cathsim_dmc.anatomy.centreline import Centreline, Vessel, VesselTree
 from cathsim_dmc.anatomy.depth import DepthField, MeshDepth
-from cathsim_dmc.anatomy.phantom import Anatomy
-from cathsim_dmc.anatomy.scan import cut_open, describe, import_scan
+from cathsim_dmc.anatomy.phantom import Anatomy, Inlet, Surface
+from cathsim_dmc.anatomy.scan import describe, import_scan
 from cathsim_dmc.anatomy.scan_files import read_curve, read_mesh, vessel_name
+from cathsim_dmc.anatomy.scan_inlet import cut_open, shut_behind
+from cathsim_dmc.anatomy.scan_tree import name_trunk
 
 # Bounds of the wall (m): mean, 95th percentile and largest intrusion.
 INTRUSION = (0.10e-3, 0.30e-3, 0.60e-3)
@@ -40,7 +47,7 @@ def y_tree() -> VesselTree:
     )
 
 
-def marched(tree: VesselTree, spacing: float = 1.1e-3):
+def marched(tree: VesselTree, spacing: float = 2.0e-3):
     """Closed surface of a tree's lumen: vertices (mm), faces with outward normals."""
     from skimage.measure import marching_cubes
 
@@ -96,7 +103,7 @@ def y_scan(tmp_path_factory):
 @pytest.fixture(scope="module")
 def y_anatomy(y_scan):
     mesh, curves, _ = y_scan
-    return import_scan(mesh, curves, spacing=0.7e-3)
+    return import_scan(mesh, curves, spacing=1e-3, tolerance=0.5e-3)
 
 
 def figures(anatomy: Anatomy, count: int = 4000):
@@ -146,7 +153,7 @@ def gap_to_wall(anatomy: Anatomy, points) -> float:
 
 def test_depth_field_agrees_with_the_exact_distance(y_scan):
     vertices, faces = read_mesh(y_scan[0])
-    field = DepthField.from_mesh(vertices, faces)
+    field = DepthField.from_mesh(vertices, faces, 1e-3)
     rng = np.random.default_rng(1)
     points = vertices[rng.integers(len(vertices), size=2000)]
     points = points + rng.normal(scale=1e-3, size=points.shape)
@@ -214,8 +221,6 @@ def test_wall_meets_the_figures(y_anatomy):
 
 def test_a_missing_piece_is_noticed(y_anatomy):
     """The check of coverage itself can fail."""
-    from dataclasses import replace
-
     holed = replace(y_anatomy, wall=y_anatomy.wall[::2])
     assert figures(holed, 1000)[1] > 0.1
 
@@ -244,6 +249,7 @@ def test_saved_anatomy_keeps_its_depth(y_anatomy, tmp_path):
     assert len(again.wall) == len(y_anatomy.wall)
 
 
+@pytest.mark.slow
 def test_inlet_in_the_middle_cuts_the_lumen(y_scan):
     mesh, curves, _ = y_scan
     short = []
@@ -256,21 +262,175 @@ def test_inlet_in_the_middle_cuts_the_lumen(y_scan):
     assert anatomy.surface.vertices[:, 2].min() > 25e-3
 
 
-def test_cut_keeps_the_far_side():
+CUT = Inlet("aorta", np.array([0, 0, -0.0101]), np.array([0, 0, 1.0]), 5e-3)
+
+
+@pytest.fixture(scope="module")
+def tube():
+    """Closed cylinder of 5 mm radius and 60 mm length along z (m)."""
     import trimesh
 
-    tube = trimesh.creation.cylinder(radius=5e-3, height=60e-3, sections=24)
-    tube = tube.subdivide().subdivide()
-    from cathsim_dmc.anatomy.phantom import Inlet
+    mesh = trimesh.creation.cylinder(radius=5e-3, height=60e-3, sections=24)
+    return mesh.subdivide().subdivide()
 
-    inlet = Inlet("aorta", np.array([0, 0, -0.0101]), np.array([0, 0, 1.0]), 5e-3)
-    points, shell, cap = cut_open(
-        np.asarray(tube.vertices), np.asarray(tube.faces), inlet
-    )
+
+@pytest.fixture(scope="module")
+def cut_tube(tube):
+    """The tube cut at z = -10.1 mm: points, open shell, cap."""
+    return cut_open(np.asarray(tube.vertices), np.asarray(tube.faces), CUT)
+
+
+def test_cut_keeps_the_far_side(tube, cut_tube):
+    import trimesh
+
+    points, shell, cap = cut_tube
     closed = trimesh.Trimesh(points, np.concatenate([shell, cap]), process=False)
     assert closed.is_watertight
     part = (0.03 + 0.0101) / 0.06
     assert closed.volume == pytest.approx(tube.volume * part, rel=1e-6)
+
+
+def test_lumen_ends_at_the_inlet(tube, cut_tube):
+    points, shell, cap = cut_tube
+    whole = DepthField.from_mesh(tube.vertices, np.asarray(tube.faces), 0.8e-3)
+    shut = shut_behind(whole, points, np.concatenate([shell, cap]), CUT)
+    s = np.linspace(-19e-3, 39e-3, 117)
+    offset = np.array([[0.0, 0.0, 0.0], [2e-3, 0.0, 0.0], [0.0, -4e-3, 0.0]])
+    line = CUT.position + s[:, None] * CUT.direction + offset[:, None]
+    depth, before = shut(line), whole(line)
+    # The plane lies between lattice points, where the field interpolates.
+    front, behind = s > whole.spacing, s < -whole.spacing
+    np.testing.assert_array_equal(depth[:, front], before[:, front])
+    assert (before[:, behind] > 0.5e-3).all()
+    np.testing.assert_allclose(
+        depth[:, behind], np.broadcast_to(s[behind], (3, behind.sum())), atol=0.15e-3
+    )
+    assert len(shut.bricks) < len(whole.bricks)
+
+
+def fork(*names, trunk=(0.0, 60.0)) -> VesselTree:
+    """A root of 8 mm radius, a branch, and further branches off that branch, mm."""
+
+    def line(start, end, radius):
+        ends = Centreline(np.array([start, end]) * 1e-3, np.full(2, radius * 1e-3))
+        return ends.resampled(1e-3)
+
+    low, high = trunk
+    vessels = {
+        "aorta": Vessel("aorta", line((0, 0, -40), (0, 0, 40), 8.0)),
+        names[0]: Vessel(names[0], line((low, 0, 0), (high, 0, 0), 3.0), "aorta", 8e-3),
+    }
+    for number, name in enumerate(names[1:]):
+        start = (30 + 10 * number, 0, 0)
+        end = (30 + 10 * number, 40, 0)
+        vessels[name] = Vessel(name, line(start, end, 2.0), names[0], 3e-3)
+    return VesselTree(vessels)
+
+
+def test_right_branches_share_the_brachiocephalic():
+    before = fork("rva", "rcca", "reca")
+    tree = name_trunk(before)
+    assert list(tree.vessels) == ["aorta", "bca", "rva", "rcca", "reca"]
+    parents = {key: vessel.parent for key, vessel in tree.vessels.items()}
+    assert parents == {
+        "aorta": None,
+        "bca": "aorta",
+        "rva": "bca",
+        "rcca": "bca",
+        "reca": "rva",
+    }
+    bca = tree.vessel("bca")
+    assert bca.centreline.length == pytest.approx(30e-3)
+    assert bca.ostium == before.vessel("rva").ostium
+    # Own lumen starts where the trunk's radius is left, and no way is longer.
+    assert tree.vessel("rva").ostium == pytest.approx(4e-3, abs=1e-3)
+    for name in ("rva", "rcca", "reca"):
+        ways = [t.route("aorta", name).length for t in (before, tree)]
+        assert ways[0] == pytest.approx(ways[1], abs=1e-9)
+    rng = np.random.default_rng(4)
+    points = rng.uniform((-10e-3, -5e-3, -8e-3), (59e-3, 39e-3, 8e-3), size=(500, 3))
+    np.testing.assert_allclose(tree.depth(points), before.depth(points), atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    "names", [("lva", "lcca"), ("rva", "lcca"), ("rva",), ("rva", "bca"), ("a", "b")]
+)
+def test_other_trunks_keep_their_names(names):
+    tree = fork(*names)
+    assert name_trunk(tree) is tree
+
+
+@pytest.fixture(scope="module")
+def coacd_tube(cut_tube):
+    """Anatomy of the cut tube with CoACD's wall, and how to build another."""
+    pytest.importorskip("coacd")
+    points, shell, cap = cut_tube
+    faces = np.concatenate([shell, cap])
+    field = DepthField.from_mesh(points, faces, 1e-3)
+    ends = np.array([[0, 0, -10.1e-3], [0, 0, 28e-3]])
+    line = Centreline(ends, np.full(2, 5e-3)).resampled(1e-3)
+    tree = VesselTree({"aorta": Vessel("aorta", line)})
+
+    def build(threshold):
+        wall, report = scan_coacd.decompose_wall(
+            points, shell, field, tree, threshold=threshold
+        )
+        surface = Surface(points, faces)
+        return Anatomy("tube", tree, surface, wall, CUT, {}, (), field), report
+
+    return build
+
+
+def test_coacd_surrounds_the_lumen(coacd_tube):
+    anatomy, report = coacd_tube(scan_coacd.THRESHOLD)
+    assert report.pieces == len(anatomy.wall) < 0.1 * len(anatomy.surface.faces)
+    assert report.prisms == 0
+    intrusion, uncovered = figures(anatomy, 2000)
+    assert uncovered < 5e-3
+    assert intrusion.max() < scan_coacd.THRESHOLD / 2.0
+    line = anatomy.tree.root.centreline
+    inside = line.points[line.arc_length < 33e-3]
+    assert gap_to_wall(anatomy, inside) > DEVICE_RADIUS
+
+
+@pytest.mark.slow
+def test_smaller_threshold_follows_the_lumen(coacd_tube):
+    coarse, fine = (coacd_tube(threshold)[0] for threshold in (4e-3, 1.5e-3))
+    assert len(fine.wall) > len(coarse.wall)
+    means = [figures(each, 2000)[0].mean() for each in (coarse, fine)]
+    assert means[1] < 0.6 * means[0]
+
+
+def test_wall_options(y_scan, monkeypatch):
+    mesh, curves, _ = y_scan
+    with pytest.raises(ValueError, match="one of prisms, coacd"):
+        import_scan(mesh, curves, wall="boxes")
+    with pytest.raises(ValueError, match="for wall='coacd' only"):
+        import_scan(mesh, curves, threshold=1e-3)
+    monkeypatch.setitem(sys.modules, "coacd", None)
+    with pytest.raises(ImportError, match=r"pip install 'cathsim-dmc\[coacd\]'"):
+        import_scan(mesh, curves, wall="coacd")
+    monkeypatch.setitem(sys.modules, "coacd", SimpleNamespace(set_log_level=print))
+    with pytest.raises(ValueError, match="20 mm; give 0.1 to 10 mm"):
+        import_scan(mesh, curves, wall="coacd", threshold=20e-3)
+
+
+@pytest.mark.slow
+def test_command_imports_with_coacd(y_scan, tmp_path):
+    pytest.importorskip("coacd")
+    mesh, curves, _ = y_scan
+    command = [sys.executable, "-m", "cathsim_dmc.cli", "phantom", "import", str(mesh)]
+    command += ["--centreline", *map(str, curves), "--out", str(tmp_path / "y")]
+    command += ["--wall", "coacd", "--inlet", "0", "0", "0"]
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    result = json.loads(done.stdout)
+    assert result["wall"]["leaks"] == 0
+    assert result["wall"]["closed_to_5fr"] == []
+    # What the option costs, and says so.
+    assert 0.1 < result["wall"]["intrusion_mm"]["mean"] < 1.5
+    anatomy = Anatomy.load(tmp_path / "y")
+    assert len(anatomy.wall) == result["wall_pieces"]
+    assert anatomy.name == "y"
 
 
 def test_ras_markup_and_table_are_the_same_curve(y_scan, tmp_path):
@@ -424,6 +584,19 @@ def test_the_general_check_agrees(y_anatomy):
     assert found.max <= INTRUSION[2]
     assert fidelity.coverage(y_anatomy, 10_000).leaks == 0
     assert fidelity.patency(y_anatomy, DEVICE_RADIUS, spacing=1e-3).passed
+
+
+@pytest.mark.slow
+def test_fine_mesh_at_the_default_tolerance(y_scan, tmp_path):
+    from cathsim_dmc.anatomy import fidelity
+
+    mesh = write_obj(tmp_path / "lumen.obj", *marched(y_scan[2], 1.1e-3))
+    anatomy = import_scan(mesh, y_scan[1], spacing=0.7e-3)
+    found = fidelity.intrusion(anatomy, 1e-3).inside
+    assert found.mean <= INTRUSION[0]
+    assert found.p95 <= INTRUSION[1] and found.max <= INTRUSION[2]
+    assert fidelity.coverage(anatomy, 10_000).leaks == 0
+    assert len(anatomy.wall) < 0.03 * len(anatomy.surface.faces)
 
 
 @pytest.mark.slow

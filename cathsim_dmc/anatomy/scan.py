@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from cathsim_dmc.anatomy import fidelity, scan_coacd
 from cathsim_dmc.anatomy.centreline import Vessel, VesselTree
 from cathsim_dmc.anatomy.depth import SPACING, DepthField, MeshDepth
 from cathsim_dmc.anatomy.phantom import Anatomy, End, Goal, Inlet, Surface
@@ -21,7 +22,8 @@ from cathsim_dmc.anatomy.scan_files import (
     read_curve,
     read_mesh,
 )
-from cathsim_dmc.anatomy.scan_tree import Ways, grow_tree, plan_inlet
+from cathsim_dmc.anatomy.scan_inlet import cut_open, shut_behind
+from cathsim_dmc.anatomy.scan_tree import Ways, grow_tree, name_trunk, plan_inlet
 from cathsim_dmc.anatomy.scan_wall import (
     DEVICE_RADIUS,
     TOLERANCE,
@@ -32,11 +34,14 @@ from cathsim_dmc.anatomy.scan_wall import (
 log = logging.getLogger(__name__)
 
 ROOT = "aorta"
+WALLS = ("prisms", "coacd")
 GOAL_PAST_OSTIUM = 30e-3  # m along a branch, its first goal
 GOAL_DISTAL = 0.8  # of the passable part of a branch, its second goal
 INLET_WIDTH = 0.8  # of the lumen near the inlet; the rest of the blind end is cut off
 INLET_SEARCH = 40e-3  # m of the root in which that width is looked for
 NEAR_INLET = 15e-3  # m, distance from the lumen of an inlet that is pointed at
+SAMPLING = 1e-3  # m, between the places at which the wall is measured
+RAYS = 20_000  # shot at the wall to find leaks
 RADII = (0.3e-3, 30e-3)  # m, allowed median radius of a vessel: arteriole, aneurysm
 
 
@@ -50,7 +55,9 @@ def import_scan(
     inlet: Sequence[float] | None = None,
     root: str = ROOT,
     spacing: float = SPACING,
+    wall: str = "prisms",
     tolerance: float = TOLERANCE,
+    threshold: float | None = None,
     progress: Callable[[str], None] | None = None,
 ) -> Anatomy:
     """Turn a lumen surface and centrelines drawn in it into an anatomy.
@@ -67,7 +74,10 @@ def import_scan(
             else the wide end farthest from their starts.
         root: name of the vessel that starts at the inlet.
         spacing: m, of the fine lattice of depths.
-        tolerance: m, of the wall pieces; see ``scan_wall.build_wall``.
+        wall: "prisms" (merged triangle prisms, near the surface) or "coacd" (convex
+            decomposition, coarse; needs the package coacd).
+        tolerance: m, of the prisms; see ``scan_wall.build_wall``.
+        threshold: m, of CoACD; see ``scan_coacd.decompose_wall``.
         progress: called with a line of text for every step.
 
     Returns:
@@ -77,7 +87,9 @@ def import_scan(
     Raises:
         FileNotFoundError: if a file is missing.
         ValueError: if a file or an option is not as stated; says how to mend it.
+        ImportError: if ``wall`` is "coacd" and the package is missing.
     """
+    threshold = _check_wall(wall, threshold)
     started = time.monotonic()
 
     def say(text: str) -> None:
@@ -108,32 +120,47 @@ def import_scan(
     ways = Ways(field)
     lines = {key: _proximal_first(line, field) for key, line in lines.items()}
     entry, far = plan_inlet(ways, list(lines.values()), inlet)
-    tree = grow_tree(field, ways, lines, entry, far, root)
+    tree = name_trunk(grow_tree(field, ways, lines, entry, far, root))
     at_end = inlet is None or not np.allclose(entry, inlet)
     tree, opening = _place_inlet(tree, at_end)
     say(f"tree: {', '.join(_summary(tree))}")
     cut_vertices, shell, cap = cut_open(vertices, faces, opening)
-    centres = np.concatenate([v.centreline.points for v in tree.vessels.values()])
-    wall, _ = build_wall(
-        cut_vertices, shell, field, centres, tolerance=tolerance, progress=say
-    )
-    wall += tuple(inlet_cap(cut_vertices[cap[:, :2]], opening))
+    if wall == "coacd":
+        pieces, _ = scan_coacd.decompose_wall(
+            cut_vertices, shell, field, tree, threshold=threshold, progress=say
+        )
+    else:
+        lines = [vessel.centreline.points for vessel in tree.vessels.values()]
+        pieces, _ = build_wall(
+            cut_vertices,
+            shell,
+            field,
+            np.concatenate(lines),
+            tolerance=tolerance,
+            progress=say,
+        )
+    pieces += tuple(inlet_cap(cut_vertices[cap[:, :2]], opening))
+    closed = np.concatenate([shell, cap])
     anatomy = Anatomy(
         name=name or Path(mesh_path).stem,
         tree=tree,
-        surface=_compact(cut_vertices, np.concatenate([shell, cap])),
-        wall=wall,
+        surface=_compact(cut_vertices, closed),
+        wall=pieces,
         inlet=opening,
         goals=_goals(tree, root),
         ends=_ends(tree, opening),
-        field=field,
+        field=shut_behind(field, cut_vertices, closed, opening),
     )
-    say(f"done: {len(wall)} wall pieces, goals {', '.join(anatomy.goals)}")
+    say(f"done: {len(pieces)} wall pieces, goals {', '.join(anatomy.goals)}")
     return anatomy
 
 
 def describe(anatomy: Anatomy) -> dict[str, Any]:
-    """What an import gave, as JSON values in millimetres."""
+    """What an import gave, as JSON values in millimetres.
+
+    The wall is measured, not quoted: how far it stands in the lumen, rays that slip
+    through it, and vessels it closes to a 5 Fr catheter.
+    """
     vessels = {}
     for key, vessel in anatomy.tree.vessels.items():
         line = vessel.centreline
@@ -156,15 +183,36 @@ def describe(anatomy: Anatomy) -> dict[str, Any]:
     return {
         "name": anatomy.name,
         "wall_pieces": len(anatomy.wall),
+        "wall": measure_wall(anatomy),
         "surface_triangles": len(anatomy.surface.faces),
         "volume_ml": round(anatomy.surface.volume * 1e6, 1),
         "inlet": {
             "vessel": anatomy.inlet.vessel,
             "position_mm": np.round(anatomy.inlet.position * 1e3, 1).tolist(),
-            "radius_mm": round(anatomy.inlet.radius * 1e3, 2),
+            "radius_mm": round(float(anatomy.inlet.radius) * 1e3, 2),
         },
         "vessels": vessels,
         "goals": goals,
+    }
+
+
+def measure_wall(anatomy: Anatomy) -> dict[str, Any]:
+    """Figures of the wall, JSON values in millimetres; see ``fidelity``."""
+
+    def summary(values: fidelity.Distribution) -> dict[str, float]:
+        return {
+            key: round(getattr(values, key) * 1e3, 3) for key in ("mean", "p95", "max")
+        }
+
+    found = fidelity.intrusion(anatomy, SAMPLING)
+    rays = fidelity.coverage(anatomy, RAYS)
+    passage = fidelity.patency(anatomy, DEVICE_RADIUS, spacing=SAMPLING)
+    return {
+        "intrusion_mm": summary(found.inside),
+        "recession_mm": summary(found.recession),
+        "rays": rays.rays,
+        "leaks": rays.leaks,
+        "closed_to_5fr": list(passage.blocked),
     }
 
 
@@ -175,109 +223,22 @@ def passable_length(vessel: Vessel, radius: float = DEVICE_RADIUS) -> float:
     return float(line.arc_length[narrow.argmax()] if narrow.any() else line.length)
 
 
-def cut_open(
-    vertices: np.ndarray, faces: np.ndarray, inlet: Inlet
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Cut a closed surface across the inlet and drop what lies behind it.
-
-    Only the ring of triangles around the inlet is cut: a bent vessel may meet the
-    inlet's plane again elsewhere.
-
-    Args:
-        vertices: (V, 3) m.
-        faces: (F, 3) of a closed surface, normals outward.
-        inlet: where to cut; its direction points to the part that stays.
-
-    Returns:
-        (vertices (W, 3) m, faces that stay (n, 3), faces of the flat cap (m, 3)).
-
-    Raises:
-        ValueError: if the plane does not part the lumen in two.
-    """
-    from cathsim_dmc.anatomy.scan_wall import _adjacent_faces
-
-    side = (vertices - inlet.position) @ inlet.direction
-    side = np.where(np.abs(side) < 1e-9, 1e-9, side)
-    front = side[faces] > 0.0
-    crossing = front.any(1) & ~front.all(1)
-    pairs = _adjacent_faces(faces)
-    ring_pairs = pairs[crossing[pairs].all(1)]
-    ring = _component(len(faces), ring_pairs, crossing, vertices, faces, inlet.position)
-    others = pairs[~ring[pairs].any(1)]
-    behind = ring.copy()
-    touching = pairs[ring[pairs].sum(1) == 1]
-    outer = np.where(ring[touching[:, 0]], touching[:, 1], touching[:, 0])
-    label = _labels(len(faces), others)
-    # A triangle beyond the ring lies wholly on one side of the plane there.
-    gone = np.unique(label[outer[~front[outer].any(1)]])
-    stay = np.unique(label[outer[front[outer].all(1)]])
-    if np.intersect1d(gone, stay).size or not stay.size:
-        raise ValueError(
-            f"the lumen cannot be cut at {np.round(inlet.position * 1e3, 1)} mm: both "
-            "sides stay connected. Choose an inlet on a single vessel."
-        )
-    behind = np.isin(label, gone) & ~ring
-    added: dict[tuple[int, int], int] = {}
-    fresh: list[np.ndarray] = []
-
-    def on_edge(a: int, b: int) -> int:
-        key = (min(a, b), max(a, b))
-        if key not in added:
-            t = side[key[0]] / (side[key[0]] - side[key[1]])
-            point = vertices[key[0]] + t * (vertices[key[1]] - vertices[key[0]])
-            added[key] = len(vertices) + len(fresh)
-            fresh.append(point)
-        return added[key]
-
-    pieces, border = [], []
-    for face in faces[ring]:
-        polygon, cut = [], []
-        for a, b in zip(face, np.roll(face, -1), strict=True):
-            if side[a] > 0.0:
-                polygon.append(int(a))
-            if (side[a] > 0.0) != (side[b] > 0.0):
-                polygon.append(on_edge(int(a), int(b)))
-                cut.append((polygon[-1], side[a] > 0.0))
-        for k in range(1, len(polygon) - 1):
-            pieces.append((polygon[0], polygon[k], polygon[k + 1]))
-        leaves = next(v for v, leaving in cut if leaving)
-        enters = next(v for v, leaving in cut if not leaving)
-        border.append((leaves, enters))
-    centre = len(vertices) + len(fresh)
-    points = np.concatenate([vertices, fresh, [np.mean(fresh, axis=0)]])
-    shell = np.concatenate([faces[~ring & ~behind], np.array(pieces)])
-    cap = np.array([(enters, leaves, centre) for leaves, enters in border])
-    return points, shell, cap
-
-
-def _labels(count, pairs):
-    from scipy.sparse import coo_matrix
-    from scipy.sparse.csgraph import connected_components
-
-    link = coo_matrix((np.ones(len(pairs)), pairs.T), shape=(count, count))
-    return connected_components(link, directed=False)[1]
-
-
-def _component(count, pairs, among, vertices, faces, position):
-    """The connected group of faces in ``among`` whose middle is next to a point."""
-    label = _labels(count, pairs)
-    keys = np.unique(label[among])
-    if not len(keys):
-        raise ValueError(
-            f"no lumen at {np.round(position * 1e3, 1)} mm; choose another inlet."
-        )
-    middle = vertices[faces].mean(1)
-    # Mean distance, not the smallest: a neighbour may pass close by.
-    distance = [
-        np.linalg.norm(middle[(label == key) & among] - position, axis=1).mean()
-        for key in keys
-    ]
-    return (label == keys[int(np.argmin(distance))]) & among
-
-
 def _compact(vertices, faces) -> Surface:
     used, numbers = np.unique(faces, return_inverse=True)
     return Surface(vertices[used], numbers.reshape(-1, 3).astype(np.int32))
+
+
+def _check_wall(wall: str, threshold: float | None) -> float:
+    """CoACD's threshold (m), before an import takes its time to no avail."""
+    if wall not in WALLS:
+        raise ValueError(f"wall is {wall!r}; give one of {', '.join(WALLS)}.")
+    if wall == "coacd":
+        scan_coacd.load_coacd()
+    elif threshold is not None:
+        raise ValueError("a threshold is for wall='coacd' only; leave it out.")
+    return scan_coacd.check_threshold(
+        scan_coacd.THRESHOLD if threshold is None else threshold
+    )
 
 
 def _read_curves(paths, units, frame, root) -> list[Curve]:
@@ -367,7 +328,11 @@ def _ends(tree: VesselTree, opening: Inlet) -> tuple[End, ...]:
         End(opening.vessel, opening.position, -opening.direction, opening.radius, True)
     ]
     for key, vessel in tree.vessels.items():
-        place = vessel.centreline.at(vessel.centreline.length)
+        length = vessel.centreline.length
+        branches = [k for k, v in tree.vessels.items() if v.parent == key]
+        if any(tree.origin(k) > length - 1e-6 for k in branches):
+            continue  # goes on in its branches
+        place = vessel.centreline.at(length)
         ends.append(End(key, place.position, place.tangent, float(place.radius), False))
     return tuple(ends)
 

@@ -8,29 +8,32 @@ of the lumen, whose depth then serves as its radius.
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.ndimage import gaussian_filter1d
 from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import connected_components, dijkstra
 from scipy.spatial import cKDTree
 
 from cathsim_dmc.anatomy.centreline import Centreline, Vessel, VesselTree
 from cathsim_dmc.anatomy.depth import DepthField
+from cathsim_dmc.anatomy.scan_centring import STEP, centred, resample
 
 LATTICE = 1e-3  # m, spacing of the lattice on which ways are searched
 CORRIDOR = 2e-3  # m, distance from a drawn curve at which a way costs twice
-STEP = 1e-3  # m, spacing of the centrelines that result
 SHALLOW = 0.2e-3  # m, lattice points nearer to the wall are no way
 NEAR_END = 2.0  # radii; a curve that starts nearer to a free end starts there
 WIDE = 0.4  # of the widest free end: narrower ends are no inlet by default
 ROOT_WIDTH = 0.5  # of the inlet: narrower free ends do not continue the root
-SMOOTH = 0.6  # radii, standard deviation of the smoothing along a centreline
-NARROW = 1.5e-3  # m, radius below which smoothing would cut bends
 TAIL = 15e-3  # m, end of a centreline that is cut off where it is too narrow
 TAIL_RADIUS = 1.1e-3  # m, of a 6 Fr device (1.0 mm) and a tenth to spare
 END_TRIM = 8e-3  # m, most that is cut off where a curve runs into its end
+TRUNK = "bca"  # name of the common trunk of the right branches
+# Branches of which the brachiocephalic artery is the trunk.
+_RIGHT = re.compile(
+    r"(r|right_?)(cca|ica|eca|va|sa|sca|aa|(common_)?carotid\w*|vertebral\w*|subclavian\w*)"
+)
 END_SEARCH = 15e-3  # m from a blind end in which its width is looked for
 MIN_RADIUS = 0.1e-3  # m, floor of a centreline's radius where it scrapes the wall
 
@@ -113,7 +116,7 @@ class Ways:
         Depth decides, but leaving the curve by ``CORRIDOR`` doubles the price, so
         that a drawn curve chooses the vessel and the lumen the way through it.
         """
-        tree = cKDTree(_resample(curve))
+        tree = cKDTree(resample(curve))
         off = tree.query(self.points, distance_upper_bound=5.0 * CORRIDOR)[0]
         off = np.minimum(off, 5.0 * CORRIDOR)
         price = (LATTICE / self.depth) ** 2 * (1.0 + (off / CORRIDOR) ** 2)
@@ -264,9 +267,9 @@ def grow_tree(
     raw = {}
     for name, curve in curves.items():
         lead = ways.points[ways.trace(before, ways.node(curve[0]))]
-        raw[name] = _resample(np.concatenate([lead, ways.along(curve)]))
+        raw[name] = resample(np.concatenate([lead, ways.along(curve)]))
     if far is not None:
-        root = _resample(ways.points[ways.trace(before, ways.node(far))])
+        root = resample(ways.points[ways.trace(before, ways.node(far))])
     else:
         root = _shared_beginning(list(raw.values()), field)
     root = _deep_start(root, field)
@@ -276,7 +279,7 @@ def grow_tree(
         parent, at = _parent(curve, lines, vessels, field)
         trunk = vessels[parent].centreline
         anchor = trunk.at(trunk.project(curve[at]).arc_length).position
-        own = _resample(np.concatenate([anchor[None], curve[at + 1 :]]))
+        own = resample(np.concatenate([anchor[None], curve[at + 1 :]]))
         line = _finish(field, own, anchor)
         lines[name] = curve
         vessels[name] = Vessel(name, line, parent, _ostium(line, trunk))
@@ -289,19 +292,47 @@ def grow_tree(
     return VesselTree(ordered)
 
 
+def name_trunk(tree: VesselTree) -> VesselTree:
+    """Give the common trunk of right branches its name, the brachiocephalic artery.
+
+    Where curves share a trunk, the trunk is part of one of them: the right carotid
+    then leaves the right vertebral. If both are right branches by name, the part up
+    to the first of them becomes a vessel of its own and the parent of both. Nothing
+    changes if the trunk's name is taken or no two right branches share one.
+    """
+    root = tree.root.name
+    if TRUNK in tree.vessels:
+        return tree
+    for name, vessel in tree.vessels.items():
+        branches = [v for v in tree.vessels.values() if v.parent == name]
+        names = [name, *(branch.name for branch in branches)]
+        if vessel.parent != root or len(names) < 2:
+            continue
+        if not all(_RIGHT.fullmatch(key) for key in names):
+            continue
+        line = vessel.centreline
+        split = min(tree.origin(branch.name) for branch in branches)
+        if not vessel.ostium + 2.0 * STEP < split < line.length - 2.0 * STEP:
+            continue  # they part in the root's lumen, or at the curve's end
+        trunk = line.slice(0.0, split)
+        rest = line.slice(split, line.length)
+        vessels = {}
+        for key, other in tree.vessels.items():
+            if key == name:
+                vessels[TRUNK] = Vessel(TRUNK, trunk, root, vessel.ostium)
+                vessels[key] = Vessel(key, rest, TRUNK, _ostium(rest, trunk))
+            elif other.parent == name and tree.origin(key) < split + STEP:
+                own = other.centreline
+                vessels[key] = Vessel(key, own, TRUNK, _ostium(own, trunk))
+            else:
+                vessels[key] = other
+        return VesselTree(vessels)
+    return tree
+
+
 def _bulk(field: DepthField, curve: np.ndarray) -> float:
     """Length times mean depth: the larger of two branches becomes the parent."""
     return float(np.maximum(field(curve), 0.0).sum())
-
-
-def _resample(points: np.ndarray, step: float = STEP) -> np.ndarray:
-    lengths = np.linalg.norm(np.diff(points, axis=0), axis=1)
-    points = points[np.concatenate([[True], lengths > 1e-9])]
-    lengths = lengths[lengths > 1e-9]
-    s = np.concatenate([[0.0], np.cumsum(lengths)])
-    count = max(2, int(round(s[-1] / step)) + 1)
-    t = np.linspace(0.0, s[-1], count)
-    return np.stack([np.interp(t, s, points[:, k]) for k in range(3)], -1)
 
 
 def _separation(curve: np.ndarray, other: np.ndarray, field: DepthField) -> int:
@@ -372,65 +403,6 @@ def _finish(
     if narrow.size:
         points, depth = points[: tail + narrow[0]], depth[: tail + narrow[0]]
     return Centreline(points, np.maximum(depth, MIN_RADIUS))
-
-
-def centred(
-    field: DepthField,
-    curve: np.ndarray,
-    *,
-    fixed_start: bool = False,
-    rounds: int = 240,
-) -> np.ndarray:
-    """Move a curve (n, 3) sideways towards the middle of the lumen.
-
-    Every round steps up the depth across the curve and then smooths a little; the
-    step shrinks, so that the curve settles on the ridge of the depth.
-    """
-    points = curve.copy()
-    for turn in range(rounds):
-        share = 1.0 - turn / rounds
-        tangent = np.gradient(points, axis=0)
-        tangent /= np.maximum(np.linalg.norm(tangent, axis=1, keepdims=True), 1e-12)
-        uphill = field.gradient(points)
-        uphill -= np.einsum("nd,nd->n", uphill, tangent)[:, None] * tangent
-        move = 0.3e-3 * share * uphill
-        smooth = gaussian_filter1d(points, 1.0, axis=0, mode="nearest")
-        # Smoothing fades with the step: a constant one would cut tight bends.
-        mixed = points + move + 0.6 * share * (smooth - points)
-        mixed[-1] = points[-1] + move[-1]
-        mixed[0] = points[0] if fixed_start else points[0] + move[0]
-        points = mixed
-        if turn % 20 == 19:
-            points = _resample(points)
-    return _resample(_smoothed(points, field(points)))
-
-
-def _smoothed(points: np.ndarray, depth: np.ndarray) -> np.ndarray:
-    """Smooth a curve over about half the lumen's radius, its ends kept.
-
-    The middle of a wide vessel is flat, and a curve would wander about on it.
-    """
-    width = np.clip(SMOOTH * (depth - NARROW) / STEP, 0.0, 12.0)
-    pad = min(len(points) - 1, 40)
-    padded = np.concatenate(
-        [
-            2.0 * points[0] - points[pad:0:-1],
-            points,
-            2.0 * points[-1] - points[-2 : -pad - 2 : -1],
-        ]
-    )
-    levels = np.array([0.0, 1.0, 2.0, 4.0, 8.0, 12.0])
-    bank = np.stack(
-        [
-            gaussian_filter1d(padded, sigma, axis=0)[pad:-pad] if sigma else points
-            for sigma in levels
-        ]
-    )
-    at = np.interp(width, levels, np.arange(len(levels)))
-    low = np.minimum(at.astype(int), len(levels) - 2)
-    rest = (at - low)[:, None]
-    row = np.arange(len(points))
-    return (1.0 - rest) * bank[low, row] + rest * bank[low + 1, row]
 
 
 def _ostium(line: Centreline, trunk: Centreline) -> float:

@@ -114,7 +114,7 @@ class _Builder:
         self.faces = np.asarray(faces)
         self.field = field
         self.normals = outward_normals(self.vertices, self.faces)
-        self.reach = _free_thickness(field, self.vertices, self.normals, thickness)
+        self.reach = free_thickness(field, self.vertices, self.normals, thickness)
         self.shift = np.zeros(len(self.vertices))
         self._centres = centres
         depth = field(centres) if len(centres) else np.zeros(0)
@@ -184,7 +184,7 @@ class _Builder:
         for key, piece in pieces.items():
             owner[piece.faces] = key
         neighbours = {key: set() for key in pieces}
-        for a, b in _adjacent_faces(self.faces):
+        for a, b in adjacent_faces(self.faces):
             if owner[a] != owner[b] and min(owner[a], owner[b]) >= 0:
                 neighbours[owner[a]].add(owner[b])
                 neighbours[owner[b]].add(owner[a])
@@ -299,7 +299,7 @@ def outward_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     return normals
 
 
-def _free_thickness(field, vertices, normals, thickness):
+def free_thickness(field, vertices, normals, thickness):
     """How far (V,) m each vertex can move out before another lumen comes near."""
     reach = np.full(len(vertices), THINNEST)
     going = np.ones(len(vertices), dtype=bool)
@@ -319,7 +319,7 @@ def _barycentric(order: int) -> np.ndarray:
     return weights
 
 
-def _adjacent_faces(faces: np.ndarray) -> np.ndarray:
+def adjacent_faces(faces: np.ndarray) -> np.ndarray:
     """Pairs (n, 2) of triangles that share an edge."""
     edges = np.sort(faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
     owner = np.repeat(np.arange(len(faces)), 3)
@@ -336,7 +336,7 @@ def _flat_patches(vertices, faces, extent) -> list[list[int]]:
     area = np.linalg.norm(cross, axis=1)
     normal = cross / np.maximum(area, 1e-30)[:, None]
     neighbours: list[list[int]] = [[] for _ in range(len(faces))]
-    for a, b in _adjacent_faces(faces):
+    for a, b in adjacent_faces(faces):
         neighbours[a].append(int(b))
         neighbours[b].append(int(a))
     patch = np.full(len(faces), -1)
