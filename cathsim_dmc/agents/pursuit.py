@@ -128,7 +128,7 @@ class Plan:
         route = task.meaning.route.resampled(ROUTE_SPACING)
         hinges, numbers = [], {}
         for column, joint in enumerate(catheter.joints):
-            if joint.name == catheter.insertion.name:
+            if joint.type == "slide":
                 continue
             numbers[joint.name] = len(hinges)
             hinges.append((column, int(np.argmax(joint.axis))))
