@@ -1,0 +1,121 @@
+"""The soak's policies, its book-keeping, and that it goes on where it stopped."""
+
+import importlib.util
+import json
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from conftest import TASKS
+
+PATH = Path(__file__).parents[1] / "benchmarks" / "soak.py"
+
+
+@pytest.fixture(scope="module")
+def soak():
+    spec = importlib.util.spec_from_file_location("soak", PATH)
+    module = importlib.util.module_from_spec(spec)
+    sys.modules["soak"] = module
+    spec.loader.exec_module(module)
+    yield module
+    del sys.modules["soak"]
+
+
+def test_plan_covers_every_task_and_policy_evenly(soak):
+    episodes = soak.plan(100)
+    assert [episode.number for episode in episodes] == list(range(100))
+    keys = [(episode.task, episode.policy) for episode in episodes]
+    counts = {key: keys.count(key) for key in keys}
+    assert set(counts) == {(task, policy) for task in TASKS for policy in soak.POLICIES}
+    assert set(counts.values()) <= {6, 7}
+    # No episode is another one over again.
+    assert len({(e.task, e.policy, e.seed) for e in episodes}) == 100
+
+
+@pytest.mark.parametrize("name", ["halton", "push", "bang_bang", "reversals"])
+def test_policies_are_repeatable_and_use_the_whole_range(soak, name):
+    policy = soak.POLICIES[name]
+    actions = policy(400, 21, 1)
+    assert actions.shape == (400, 21)
+    assert np.abs(actions).max() <= 1
+    np.testing.assert_array_equal(actions, policy(400, 21, 1))
+    assert (actions != policy(400, 21, 2)).any()
+    forward = actions[:, -1]
+    if name == "halton":
+        assert forward.min() < -0.98 and forward.max() > 0.98
+    elif name == "reversals":
+        assert set(forward) == {-1.0, 1.0}
+    else:
+        assert set(forward) == {1.0}
+
+
+def test_percentile_is_that_of_all_rows_together(soak):
+    rows = [
+        {"penetration_histogram": {"0": 98, "100": 1}},
+        {"penetration_histogram": {"300": 1}},
+    ]
+    assert soak.percentile(rows, 98) == pytest.approx(1e-6)
+    assert soak.percentile(rows, 99) == pytest.approx(101e-6)
+    assert soak.percentile(rows, 100) == pytest.approx(301e-6)
+    assert soak.percentile([{"penetration_histogram": {}}], 99) == 0
+
+
+def run(soak, monkeypatch, capsys, out, episodes):
+    arguments = ["--out", out, "--episodes", episodes, "--steps", 3, "--threads", 1]
+    monkeypatch.setattr(sys, "argv", ["soak", *map(str, arguments), "--json"])
+    code = soak.main()
+    printed = capsys.readouterr()
+    return code, json.loads(printed.out), printed.err
+
+
+def test_it_goes_on_where_it_stopped(soak, monkeypatch, capsys, tmp_path):
+    code, first, _ = run(soak, monkeypatch, capsys, tmp_path, 1)
+    assert code == 0
+    assert first["total"]["episodes"] == 1
+    path = tmp_path / "episodes.jsonl"
+    before = path.read_text()
+    code, second, err = run(soak, monkeypatch, capsys, tmp_path, 2)
+    assert code == 0
+    assert path.read_text().startswith(before)
+    assert second["total"]["episodes"] == 2
+    assert err.count("episodes in") == 1, "an episode was run twice"
+    assert all(check["passed"] for check in second["checks"])
+    assert (tmp_path / "soak.md").read_text().count("|") > 20
+    # A line that was cut off is run again.
+    path.write_text(path.read_text()[:-20])
+    _, third, err = run(soak, monkeypatch, capsys, tmp_path, 2)
+    assert err.count("episodes in") == 1
+    assert third["total"] == second["total"]
+
+
+def test_rows_of_another_length_are_refused(soak, tmp_path):
+    path = tmp_path / "episodes.jsonl"
+    path.write_text(json.dumps({"number": 0, "steps": 3}) + "\n")
+    with pytest.raises(ValueError, match=r"episodes of 3 steps, not 2000.*--out"):
+        soak.read_rows(path, 2000)
+
+
+def test_a_broken_bound_fails_the_report(soak):
+    row = {
+        "number": 0,
+        "task": "type1_bca",
+        "policy": "push",
+        "seed": 0,
+        "steps": 10,
+        "warnings": 1,
+        "escaped": True,
+        "excess_max": 2e-3,
+        "excess_step": 3,
+        "penetration_max": 1.5e-3,
+        "penetration_step": 4,
+        "force_max": 12.0,
+        "force_step": 5,
+        "force_sum_max": 13.0,
+        "force_sum_mean": 1.0,
+        "contacts_max": 10_000,
+        "penetration_histogram": {"1500": 10},
+    }
+    report = soak.report([row])
+    assert not any(check["passed"] for check in report["checks"])
+    assert report["worst"]["force"]["force_step"] == 5
