@@ -3,7 +3,6 @@
 import json
 import os
 import sys
-from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -396,28 +395,64 @@ def _show(report: Any, as_json: bool) -> int:
     return 0 if report.passed else CHECK_FAILED
 
 
-def _validation(name: str, help_text: str) -> Callable[..., int]:
-    def command(figure: Path | None = None, json: bool = False) -> int:
-        from cathsim_dmc.analysis import validation
-
-        return _show(getattr(validation, f"validate_{name}")(figure), json)
-
-    command.__name__ = name
-    command.__doc__ = f"""{help_text}
+@validations.command
+def rod(figure: Path | None = None, json: bool = False) -> int:
+    """Bending, buckling and twist of the device against theory.
 
     Args:
         figure: Where to draw the comparison, a PNG.
         json: Print one JSON object and nothing else.
     """
-    return command
+    from cathsim_dmc.analysis import validation
+
+    return _show(validation.validate_rod(figure), json)
 
 
-for _name, _help in {
-    "rod": "Bending, buckling and twist of the device against theory.",
-    "wall": "Fidelity of the wall, capstan friction, convergence.",
-    "forces": "Force balance, known loads, and the published protocol.",
-}.items():
-    validations.command(_validation(_name, _help), name=_name)
+@validations.command
+def wall(
+    figure: Path | None = None,
+    phantom: list[str] = [],  # noqa: B006  # tyro reads it, nobody writes it
+    convergence: bool = True,
+    json: bool = False,
+) -> int:
+    """Fidelity of the wall, friction against the capstan equation, convergence.
+
+    Args:
+        figure: Where to draw the comparison, a PNG.
+        phantom: Directories of further anatomies, such as an imported scan.
+        convergence: Include the studies of time step and link length.
+        json: Print one JSON object and nothing else.
+    """
+    from cathsim_dmc.analysis import validation
+
+    report = validation.validate_wall(figure, phantom, with_convergence=convergence)
+    return _show(report, json)
+
+
+@validations.command
+def forces(
+    figure: Path | None = None,
+    episode: Path | None = None,
+    mean: float = 0.4,
+    sd: float = 0.02,
+    margin: float = 0.1,
+    json: bool = False,
+) -> int:
+    """Force balance, known loads, and the published protocol.
+
+    Args:
+        figure: Where to draw density and cumulative plots, a PNG.
+        episode: Recorded cannulation (.npz of `cathsim record`) for the protocol;
+            scripted insertions by default.
+        mean: Of the normal reference, N; the published one is unverified.
+        sd: Standard deviation of the reference, N.
+        margin: Of the equivalence test, N.
+        json: Print one JSON object and nothing else.
+    """
+    from cathsim_dmc.analysis import validation
+
+    report = validation.validate_forces(figure, episode, mean, sd, margin)
+    return _show(report, json)
 
 
 @benchmarks.command
