@@ -10,6 +10,10 @@ import numpy as np
 from cathsim_dmc.imaging import carm as carms
 from cathsim_dmc.imaging import detector, materials
 
+# Long side of a 30 x 38 cm flat detector, m. It shows 0.26 m of patient: an arch from
+# the inlet to the ends of the branches.
+DETECTOR_SIZE = 0.38
+
 # Name in `carm.VIEWS`, or primary and secondary angle in degrees.
 View = str | Sequence[float]
 
@@ -51,7 +55,7 @@ class FluoroscopyOptions:
     roadmap: float = 0.0
     source_detector: float = carms.SOURCE_DETECTOR
     source_isocentre: float = carms.SOURCE_ISOCENTRE
-    detector_size: float = carms.DETECTOR_SIZE
+    detector_size: float = DETECTOR_SIZE
 
     def __post_init__(self) -> None:
         # Built here, so that a wrong option is refused before any simulation.

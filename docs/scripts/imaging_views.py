@@ -19,6 +19,7 @@ from scipy.ndimage import gaussian_filter1d
 from cathsim_dmc.anatomy.arch import ARCHES, arch_tree
 from cathsim_dmc.anatomy.surface import lumen_surface
 from cathsim_dmc.imaging import VIEWS, CArm, Fluoroscope, rgb
+from cathsim_dmc.imaging.options import DETECTOR_SIZE
 
 OUTPUT = Path(__file__).parents[1] / "images" / "fluoroscopy_views.png"
 CATHETER_RADIUS = 0.84e-3  # 5F
@@ -44,11 +45,11 @@ def views(tree, surface) -> dict[str, np.ndarray]:
     points = catheter(tree)
     images = {}
     for name in VIEWS:
-        carm = CArm.view(name).centred_on(surface.vertices)
+        carm = CArm.view(name, detector_size=DETECTOR_SIZE).centred_on(surface.vertices)
         scope = Fluoroscope.from_surface(surface.vertices, surface.faces, carm)
         images[name] = scope.render(points, CATHETER_RADIUS, np.random.RandomState(0))
 
-    carm = CArm.view("LAO45").centred_on(surface.vertices)
+    carm = CArm.view("LAO45", detector_size=DETECTOR_SIZE).centred_on(surface.vertices)
     scope = Fluoroscope.from_surface(surface.vertices, surface.faces, carm)
     live = replace(scope, contrast=0.0)
     road = replace(live, roadmap=0.7)

@@ -51,6 +51,12 @@ no OpenGL. `task_kwargs={{"fluoroscopy": {{...}}}}` sets it up:
 Views are {", ".join(f"`{name}`" for name in VIEWS)}, or the primary (LAO positive) and
 secondary (cranial positive) angle in degrees. With `biplane` the channels of the second
 C-arm follow those of the first.
+
+![Views and modes](images/observation_views.png)
+
+A cannulation of the left common carotid artery by the scripted expert:
+
+![Cannulation](images/cannulation_strip.png)
 """
 
 CAMERA_TEXT = f"""
@@ -59,6 +65,8 @@ CAMERA_TEXT = f"""
 `rgb` and `depth` need OpenGL: set `MUJOCO_GL` to `egl`, `osmesa` or `glfw` before
 Python starts. Cameras are {", ".join(f"`{name}`" for name in CAMERAS)}, an endoscope at
 the distal end; `task_kwargs={{"cameras": {{"names": [...], "size": 128}}}}` chooses.
+
+![Cameras](images/camera_views.png)
 """
 
 RANDOMISATION = """

@@ -1,0 +1,92 @@
+"""A cannulation of the left common carotid artery, as an operator sees it.
+
+Writes docs/images/cannulation_strip.png: the scripted expert in the task `type1_lcca`
+at six moments, above in AP with the vessel as a roadmap, below in LAO 45 while contrast
+runs; the ring is the goal. Needs no OpenGL.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import matplotlib
+
+matplotlib.use("Agg")
+import matplotlib.pyplot as plt
+import numpy as np
+
+from cathsim_dmc.agents import expert  # torchrl goes before dm_control
+
+from cathsim_dmc import suite  # isort: skip
+from cathsim_dmc.imaging import Angiograph, FluoroscopyOptions
+from cathsim_dmc.imaging import angiograph as machines
+
+OUTPUT = Path(__file__).parents[1] / "images" / "cannulation_strip.png"
+TASK, SEED, MOMENTS = "type1_lcca", 3, 6
+ROWS = {
+    "AP, roadmap": FluoroscopyOptions(
+        view="AP", size=256, contrast=False, roadmap=0.6, kerma=1e-7
+    ),
+    "LAO 45, contrast": FluoroscopyOptions(view="LAO45", size=256, kerma=1e-7),
+}
+
+
+def run() -> tuple[object, list[dict]]:
+    """The task, and the state of the device at every control step."""
+    env = suite.load("cathsim", TASK, task_kwargs={"random": SEED})
+    act = expert.policy(env)
+    timestep, states = env.reset(), []
+    while True:
+        task = env.task
+        states.append(
+            {
+                "time": env.physics.time(),
+                "line": task.readings.centreline,
+                "insertion": float(task.readings.insertion),
+                "force": float(task.wall_force.peak_max),
+            }
+        )
+        if timestep.last():
+            return env.task, states
+        timestep = env.step(act(timestep))
+
+
+def main() -> None:
+    """Draws the figure."""
+    task, states = run()
+    surface, random = task.anatomy.surface, np.random.RandomState(0)
+    chosen = np.linspace(0, len(states) - 1, MOMENTS).round().astype(int)
+    figure, axes = plt.subplots(
+        len(ROWS), MOMENTS, figsize=(12, 4.5), layout="constrained"
+    )
+    for number, (title, options) in enumerate(ROWS.items()):
+        row = axes[number]
+        planes = Angiograph(surface.vertices, surface.faces, options).planes()
+        carm = planes[0].carm
+        goal, depth = carm.project(task.goal_position)
+        radius = task.goal_radius * carm.focal_length / depth
+        for axis, index in zip(row, chosen, strict=True):
+            state = states[index]
+            image = machines.render(
+                [planes],
+                state["line"][None],
+                task.catheter.device.outer_radius,
+                [random],
+            )[0]
+            axis.imshow(image[..., 0], cmap="gray", vmin=0, vmax=255)
+            axis.add_patch(plt.Circle(goal, radius, fill=False, color="limegreen"))
+            axis.set_axis_off()
+            if number == 0:
+                axis.set_title(
+                    f"{state['time']:.1f} s, {state['insertion'] * 1e3:.0f} mm in, "
+                    f"{state['force']:.2f} N",
+                    fontsize=8,
+                )
+        row[0].text(250, 246, title, ha="right", fontsize=8)
+    figure.savefig(OUTPUT, dpi=100, pil_kwargs={"optimize": True})
+    size = OUTPUT.stat().st_size / 1000
+    print(f"{OUTPUT} ({size:.0f} kB): {task.termination} after {len(states) - 1} steps")
+
+
+if __name__ == "__main__":
+    main()

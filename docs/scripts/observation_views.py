@@ -1,0 +1,110 @@
+"""What the image observations of a task show, option by option.
+
+Writes docs/images/observation_views.png (needs no OpenGL) and, where there is OpenGL
+(MUJOCO_GL=osmesa or egl), docs/images/camera_views.png.
+"""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import matplotlib
+
+matplotlib.use("Agg")
+import matplotlib.pyplot as plt
+import numpy as np
+
+from cathsim_dmc import suite
+from cathsim_dmc.tasks.cameras import CAMERAS
+
+IMAGES = Path(__file__).parents[1] / "images"
+TASK, SEED, STEPS = "type1_bca", 1, 60
+# Title -> options of the fluoroscopy, and the observation that is shown.
+PANELS = {
+    "AP": ({}, "image"),
+    "LAO45": ({"view": "LAO45"}, "image"),
+    "LATERAL": ({"view": "LATERAL"}, "image"),
+    "RAO30": ({"view": "RAO30"}, "image"),
+    "contrast off": ({"contrast": False}, "image"),
+    "noise": ({"noise": True}, "image"),
+    "noise, a quarter of the dose": ({"noise": True, "kerma": 6e-9}, "image"),
+    "roadmap": ({"contrast": False, "roadmap": 0.7}, "image"),
+    "biplane, first": ({"biplane": "LATERAL"}, "image"),
+    "biplane, second": ({"biplane": "LATERAL"}, "image"),
+    "(20, -25) degrees": ({"view": (20, -25)}, "image"),
+    "magnified on the arch": (
+        {"magnification": 2.5, "centre": (0.02, 0, 0.15)},
+        "image",
+    ),
+    "segmentation: device": ({}, "segmentation"),
+    "segmentation: vessel": ({}, "segmentation"),
+    "sequential, as colours": ({}, "sequential"),
+    "tracking_2d on the image": ({}, "tracking_2d"),
+}
+
+
+def load(**options):
+    return suite.load("cathsim", TASK, {"random": SEED, "goal_radius": 1e-3, **options})
+
+
+def drive(env):
+    """The last observation after a push with a bend, into the arch."""
+    timestep = env.reset()
+    action = np.zeros(env.action_spec().shape)
+    for step in range(STEPS):
+        action[-1] = 1.0
+        action[1:20:2] = -0.1 if step > STEPS // 2 else 0.05
+        timestep = env.step(action)
+    return timestep.observation
+
+
+def fluoroscopy() -> Path:
+    figure, axes = plt.subplots(4, 4, figsize=(9.6, 10.2), layout="constrained")
+    for axis, (title, (options, name)) in zip(axes.flat, PANELS.items(), strict=True):
+        names = [name, "image"] if name == "tracking_2d" else name
+        seen = drive(load(observation=names, fluoroscopy=options))
+        picture = seen["image"] if name == "tracking_2d" else seen[name]
+        channel = int("second" in title or "vessel" in title)
+        if name != "sequential":
+            picture = picture[..., channel]
+        axis.imshow(picture, cmap="gray", vmin=0, vmax=255)
+        if name == "tracking_2d":
+            axis.plot(*seen["tracking_pixels"].reshape(-1, 2).T, ".", color="orange")
+            axis.plot(*seen["tracking_goal_pixels"], "x", color="limegreen")
+            axis.set_xlim(-0.5, 127.5), axis.set_ylim(127.5, -0.5)
+        axis.set_title(title, fontsize=9)
+        axis.set_axis_off()
+    path = IMAGES / "observation_views.png"
+    figure.savefig(path, dpi=100, pil_kwargs={"optimize": True})
+    return path
+
+
+def cameras() -> Path:
+    options = {"names": CAMERAS, "size": 256}
+    seen = drive(load(observation=["rgb", "depth"], cameras=options))
+    figure, axes = plt.subplots(2, 3, figsize=(9, 6), layout="constrained")
+    for column, name in enumerate(CAMERAS):
+        depth = seen[f"depth_{name}"][..., 0]
+        near = depth[depth < 1]
+        axes[0, column].imshow(seen[f"rgb_{name}"])
+        axes[1, column].imshow(depth, vmin=near.min(), vmax=near.max())
+        axes[0, column].set_title(f"rgb_{name}", fontsize=9)
+        low, high = near.min() * 1e3, near.max() * 1e3
+        axes[1, column].set_title(f"depth_{name}: {low:.0f}-{high:.0f} mm", fontsize=9)
+    for axis in axes.flat:
+        axis.set_axis_off()
+    path = IMAGES / "camera_views.png"
+    figure.savefig(path, dpi=100, pil_kwargs={"optimize": True})
+    return path
+
+
+def main() -> None:
+    """Draws the figures."""
+    print(fluoroscopy())
+    if os.environ.get("MUJOCO_GL", "disable") != "disable":
+        print(cameras())
+
+
+if __name__ == "__main__":
+    main()
