@@ -8,7 +8,8 @@ from torchrl.envs import DMControlEnv
 from torchrl.envs.utils import check_env_specs
 
 from cathsim_dmc import suite
-from cathsim_dmc.simulation.torchrl import INFO, BatchedEnv
+from cathsim_dmc.simulation.torchrl import BatchedEnv
+from cathsim_dmc.tasks.measures import FLAGS, MEASURES
 
 ENVS = 3
 
@@ -91,7 +92,7 @@ def test_batched_env(batched):
     check_env_specs(batched)
     assert batched.batch_size == (ENVS,)
     assert batched.action_spec.shape == (ENVS, 21)
-    assert {*INFO, "success", "physics_error"} == set(batched.reset()["info"].keys())
+    assert {*MEASURES, *FLAGS} == set(batched.reset()["info"].keys())
 
 
 def test_batched_env_with_numbers_and_forces(short_batched):

@@ -8,17 +8,7 @@ from tensordict import TensorDict, TensorDictBase
 from torchrl.data import Binary, Composite, Unbounded
 from torchrl.envs import DMControlEnv, EnvBase, Transform, TransformedEnv
 
-# As in simulation.torchrl, which the agents read under the same names.
-NUMBERS = (
-    "distance",
-    "insertion",
-    "push_force",
-    "wall_force_sum",
-    "wall_force_max",
-    "wall_force_peak",
-    "path_ratio",
-)
-FLAGS = ("success", "physics_error")
+from cathsim_dmc.tasks import measures
 
 
 class TaskInformation(Transform):
@@ -35,40 +25,38 @@ class TaskInformation(Transform):
     def _step(
         self, tensordict: TensorDictBase, next_tensordict: TensorDictBase
     ) -> TensorDictBase:
-        next_tensordict["info"] = self._read(bool(next_tensordict["done"]))
+        next_tensordict["info"] = self._read()
         return next_tensordict
 
     def _reset(
         self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
     ) -> TensorDictBase:
-        tensordict_reset["info"] = self._read(done=False)
+        tensordict_reset["info"] = self._read()
         return tensordict_reset
 
-    def _read(self, done: bool) -> TensorDict:
+    def _read(self) -> TensorDict:
         task = self.environment.task
-        state, wall = task.readings, task.wall_force
-        values = {
-            "distance": task.meaning.outcome(state.head).distance,
-            "insertion": state.insertion,
-            "push_force": state.push_force,
-            "wall_force_sum": wall.sum,
-            "wall_force_max": wall.max,
-            "wall_force_peak": wall.peak_max,
-            "path_ratio": task.path_ratio,
-        }
+        state = task.readings
+        numbers = measures.measures(
+            state,
+            task.wall_force,
+            task.meaning.outcome(state.head).distance,
+            task.path_ratio,
+        )
         entries = {
-            name: torch.tensor([float(values[name])], dtype=torch.float32)
-            for name in NUMBERS
+            name: torch.tensor([float(value)], dtype=torch.float32)
+            for name, value in numbers.items()
         }
         entries["success"] = torch.tensor([task.termination == "success"])
-        # The task ends an episode by success or time; composer by divergence.
-        entries["physics_error"] = torch.tensor([done and task.termination is None])
+        entries["physics_error"] = torch.tensor([task.termination == "physics_error"])
         return TensorDict(entries)
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
         """Declare "info"."""
-        info = {name: Unbounded((1,), dtype=torch.float32) for name in NUMBERS}
-        info |= {name: Binary(1, (1,), dtype=torch.bool) for name in FLAGS}
+        info = {
+            name: Unbounded((1,), dtype=torch.float32) for name in measures.MEASURES
+        }
+        info |= {name: Binary(1, (1,), dtype=torch.bool) for name in measures.FLAGS}
         observation_spec["info"] = Composite(info)
         return observation_spec
 

@@ -17,13 +17,12 @@ from cathsim_dmc.agents import environments
 from cathsim_dmc.agents.checkpoint import Checkpoint
 from cathsim_dmc.agents.episodes import EpisodeOutcome, EpisodeTracker
 from cathsim_dmc.agents.training import EnvFactory
+from cathsim_dmc.analysis.forces import wilson_interval
 
 Policy = Callable[[TensorDictBase], TensorDictBase | torch.Tensor]
 # Called after every step with the environment and which episodes (n,) bool still run.
 Observer = Callable[[EnvBase, np.ndarray], None]
 
-# Two-sided 95 % quantile of the normal distribution.
-Z95 = 1.959963984540054
 BOOTSTRAP_SAMPLES = 10_000
 
 _REPORTED = (
@@ -128,26 +127,6 @@ class Comparison:
     def to_dict(self) -> dict[str, Any]:
         """JSON-able values."""
         return asdict(self)
-
-
-def wilson_interval(successes: int, trials: int) -> tuple[float, float]:
-    """95 % score interval of a proportion (Wilson 1927).
-
-    Raises:
-        ValueError: not 0 <= successes <= trials with at least one trial.
-    """
-    if not 0 <= successes <= trials or trials < 1:
-        raise ValueError(
-            f"{successes} successes in {trials} trials: need 0 <= successes <= trials "
-            f"and at least one trial."
-        )
-    rate = successes / trials
-    spread = Z95**2 / trials
-    centre = (rate + spread / 2) / (1 + spread)
-    half = (
-        Z95 * np.sqrt(rate * (1 - rate) / trials + spread / (4 * trials)) / (1 + spread)
-    )
-    return max(0.0, float(centre - half)), min(1.0, float(centre + half))
 
 
 def paired_bootstrap(

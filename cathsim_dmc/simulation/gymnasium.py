@@ -9,21 +9,11 @@ from dm_env import specs
 from cathsim_dmc import suite
 from cathsim_dmc.imaging import angiograph
 from cathsim_dmc.simulation import batch
-from cathsim_dmc.tasks import cannulation
+from cathsim_dmc.tasks import cannulation, measures
 
 RENDER_MODES = ("rgb_array",)
 VERSION = 0  # of the ids
 _MOST_SEED = 2**32  # first seed that numpy's RandomState does not take
-
-# Quantities of `info`, beside "success" and "physics_error"; m and N.
-INFO = (
-    "distance",
-    "insertion",
-    "push_force",
-    "wall_force_sum",
-    "wall_force_max",
-    "wall_force_peak",
-)
 
 
 def space(spec: specs.Array, dtype: np.dtype) -> gymnasium.spaces.Box:
@@ -71,18 +61,6 @@ def _words(seed: int) -> int | list[int]:
         seed, word = divmod(seed, _MOST_SEED)
         words.append(word)
     return words
-
-
-def _numbers(state, wall, outcome) -> dict[str, Any]:
-    values = (
-        outcome.distance,
-        state.insertion,
-        state.push_force,
-        wall.sum,
-        wall.max,
-        wall.peak_max,
-    )
-    return dict(zip(INFO, values, strict=True))
 
 
 class CathSimEnv(gymnasium.Env):
@@ -157,7 +135,9 @@ class CathSimEnv(gymnasium.Env):
     def _info(self, terminated: bool) -> dict[str, Any]:
         task = self._environment.task
         outcome = task.meaning.outcome(task.readings.head)
-        numbers = _numbers(task.readings, task.wall_force, outcome)
+        numbers = measures.measures(
+            task.readings, task.wall_force, outcome.distance, task.path_ratio
+        )
         success = task.termination == "success"
         return {
             **{key: float(value) for key, value in numbers.items()},
@@ -318,7 +298,12 @@ class CathSimVectorEnv(gymnasium.vector.VectorEnv):
             error = np.zeros(self.num_envs, dtype=bool)
         else:
             outcome, error = step.outcome, step.physics_error
-        info = _numbers(simulation.readings, simulation.wall_force, outcome)
+        info = measures.measures(
+            simulation.readings,
+            simulation.wall_force,
+            outcome.distance,
+            simulation.path_ratio,
+        )
         return {**info, "success": outcome.success, "physics_error": error}
 
     @property

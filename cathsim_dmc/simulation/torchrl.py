@@ -11,17 +11,7 @@ from torchrl.envs import EnvBase
 
 from cathsim_dmc import suite
 from cathsim_dmc.simulation import batch
-
-# Quantities beside the observation that logs and evaluations use: (N, 1) float32.
-INFO = (
-    "distance",
-    "insertion",
-    "push_force",
-    "wall_force_sum",
-    "wall_force_max",
-    "wall_force_peak",
-    "path_ratio",
-)
+from cathsim_dmc.tasks import measures
 
 
 class BatchedEnv(EnvBase):
@@ -29,7 +19,7 @@ class BatchedEnv(EnvBase):
 
     Keys: the task's observations (float32, images uint8), "action" (N, A), "reward",
     "terminated" (success or physics error), "truncated", and under "info" the
-    quantities `INFO` (float32), "success" and "physics_error" (bool), all (N, 1).
+    `tasks.measures.MEASURES` (float32) and `FLAGS` (bool), all (N, 1).
     """
 
     def __init__(
@@ -74,8 +64,11 @@ class BatchedEnv(EnvBase):
             else Unbounded(value.shape, dtype=torch.float32)
             for key, value in observation.items()
         }
-        info = {key: Unbounded((*shape, 1), dtype=torch.float32) for key in INFO}
-        for key in ("success", "physics_error"):
+        info = {
+            key: Unbounded((*shape, 1), dtype=torch.float32)
+            for key in measures.MEASURES
+        }
+        for key in measures.FLAGS:
             info[key] = Binary(1, (*shape, 1), dtype=torch.bool)
         entries["info"] = Composite(info, shape=shape)
         self.observation_spec = Composite(entries, shape=shape)
@@ -113,16 +106,10 @@ class BatchedEnv(EnvBase):
         return result
 
     def _info(self, state, wall, outcome, physics_error) -> dict[str, torch.Tensor]:
-        numbers = {
-            "distance": outcome.distance,
-            "insertion": state.insertion,
-            "push_force": state.push_force,
-            "wall_force_sum": wall.sum,
-            "wall_force_max": wall.max,
-            "wall_force_peak": wall.peak_max,
-            "path_ratio": self._simulation.path_ratio,
-        }
-        info = {key: _column(numbers[key], torch.float32) for key in INFO}
+        numbers = measures.measures(
+            state, wall, outcome.distance, self._simulation.path_ratio
+        )
+        info = {key: _column(value, torch.float32) for key, value in numbers.items()}
         info["success"] = _column(outcome.success, torch.bool)
         info["physics_error"] = _column(physics_error, torch.bool)
         return info
