@@ -171,11 +171,11 @@ class CArm:
         Returns:
             right, down, depth: (...) float64 each, m.
         """
-        points = np.asarray(points, dtype=np.float64)
+        relative = np.asarray(points, dtype=np.float64) - self.source
         # Sums written out: a matrix product would round differently for batches.
-        x, y, z = (points[..., i] - self.source[i] for i in range(3))
-        right, down, depth = (a[0] * x + a[1] * y + a[2] * z for a in self.axes)
-        return right, down, depth
+        terms = relative[..., None, :] * self.axes
+        total = terms[..., 0] + terms[..., 1] + terms[..., 2]
+        return total[..., 0], total[..., 1], total[..., 2]
 
     def project(self, points: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
         """Pixel coordinates of world points.

@@ -30,6 +30,9 @@ DETECTOR_BLUR = 0.16e-3
 # Share of full white given to the signal 1. Leaves room above for noise and roadmap.
 GAIN = 0.75
 
+# Below this width, px, a neighbour would get less than 1e-5 of it.
+LEAST_BLUR = 0.2
+
 # Quantiles in the table of normal deviates: two random bytes choose one.
 _QUANTILES = 1 << 16
 
@@ -108,6 +111,11 @@ def quantum_noise(
     return result.reshape(signal.shape)
 
 
+def blurs(sigma: float) -> bool:
+    """Whether a point spread of `sigma` px reaches beyond its own pixel."""
+    return sigma >= LEAST_BLUR
+
+
 def blurred(signal: ArrayLike, sigma: float) -> np.ndarray:
     """Signal spread by a Gaussian of `sigma` pixels; edges continue outwards.
 
@@ -120,7 +128,7 @@ def blurred(signal: ArrayLike, sigma: float) -> np.ndarray:
         (..., rows, columns) float32.
     """
     signal = np.asarray(signal, dtype=np.float32)
-    if sigma < 0.2:
+    if not blurs(sigma):
         return signal
     reach = math.ceil(3.0 * sigma)
     weight = np.exp(-0.5 * (np.arange(-reach, reach + 1) / sigma) ** 2)

@@ -155,7 +155,7 @@ def _drawn(carm, points, radius, mu, marker_mu, marker_length) -> np.ndarray:
     count = np.ceil(np.sqrt(shift[:, 0] ** 2 + shift[:, 1] ** 2) / spacing)
     # A link that runs far out of the image must not fill the memory.
     most = 4.0 * (rows + columns) / _SPACING
-    count = np.clip(count, 1.0, most).astype(np.int64)
+    count = np.minimum(np.maximum(count, 1.0), most).astype(np.int64)
 
     # One row per disc.
     of = np.repeat(np.arange(len(link)), count)
@@ -166,7 +166,8 @@ def _drawn(carm, points, radius, mu, marker_mu, marker_length) -> np.ndarray:
     weight = np.full(len(of), float(mu))
     if marker_length > 0.0:
         distal = to_tip.reshape(-1)[link][of] + (1.0 - fraction) * length[of]
-        inside = np.clip((marker_length - distal) / piece + 0.5, 0.0, 1.0)
+        inside = (marker_length - distal) / piece + 0.5
+        inside = np.minimum(np.maximum(inside, 0.0), 1.0)
         weight += (marker_mu - mu) * inside
     # A pixel sees, at this depth, an area (depth / focal)² across the beam axis and
     # 1 / slant of that across its ray; volume over area is the mean path length.
@@ -188,8 +189,10 @@ def _with_caps(tail, head, along, length, radius):
     """Lengthen both ends by 2/3 radius: the volume of a hemispherical cap."""
     tail, head, along, length = tail.copy(), head.copy(), along.copy(), length.copy()
     for i, end, side in ((0, tail, -1.0), (-1, head, 1.0)):
-        with np.errstate(invalid="ignore", divide="ignore"):
-            unit = np.nan_to_num(along[:, i] / length[:, i, None])
+        # A link without length has no direction and gets no cap. (Plain comparisons
+        # and not np.nan_to_num or np.clip, which take longer than the rest.)
+        reached = np.where(length[:, i] > 0.0, length[:, i], np.inf)
+        unit = along[:, i] / reached[:, None]
         cap = 2.0 / 3.0 * radius[:, i]
         end[:, i] += side * cap[:, None] * unit
     for i in (0, -1):
@@ -205,7 +208,7 @@ def _add_discs(image, frame, row, column, radius, weight) -> None:
     frames, rows, columns = image.shape
     near_row, near_column = np.floor(row + 0.5), np.floor(column + 0.5)
     reach = kernel.reach(radius)
-    for side in np.unique(reach):
+    for side in range(int(reach.min()), int(reach.max()) + 1):
         # Discs whose centre is further out than this cannot touch the image.
         use = np.flatnonzero(
             (reach == side)
@@ -216,7 +219,6 @@ def _add_discs(image, frame, row, column, radius, weight) -> None:
         )
         if not len(use):
             continue
-        side = int(side)
         table = kernel.table(side)
         r, c = near_row[use], near_column[use]
         shares = table.shares[table.rows(radius[use], row[use] - r, column[use] - c)]

@@ -87,7 +87,7 @@ class _Table:
     def rows(self, radius: np.ndarray, row: np.ndarray, column: np.ndarray):
         """Index into `shares` of discs with `radius` px at sub-pixel offsets (n,)."""
         level = np.rint((radius - (self.reach - 1)) * RADIUS_STEPS).astype(np.int64)
-        level = np.clip(level - 1, 0, RADIUS_STEPS - 1)
+        level = np.minimum(np.maximum(level - 1, 0), RADIUS_STEPS - 1)
         for missing in np.flatnonzero(
             (np.bincount(level, minlength=RADIUS_STEPS) > 0) & ~self._filled
         ):
