@@ -313,7 +313,7 @@ def import_phantom(
         frame: Of mesh, CSV centrelines and inlet.
         inlet: Where the device enters: a free end, or a place to cut the lumen at.
         wall: Pieces near the surface, or CoACD's coarse ones (needs the extra coacd).
-        threshold_mm: Of CoACD, the concavity of a piece; 4 by default.
+        threshold_mm: Of CoACD, the concavity of a piece; 3.5 by default.
     """
     from cathsim_dmc.anatomy import scan
 

@@ -21,7 +21,7 @@ from cathsim_dmc.anatomy.phantom import Anatomy, Inlet, Surface
 from cathsim_dmc.anatomy.scan import describe, import_scan
 from cathsim_dmc.anatomy.scan_files import read_curve, read_mesh, vessel_name
 from cathsim_dmc.anatomy.scan_inlet import cut_open, shut_behind
-from cathsim_dmc.anatomy.scan_tree import name_trunk
+from cathsim_dmc.anatomy.scan_trunk import name_trunk
 
 # Bounds of the wall (m): mean, 95th percentile and largest intrusion.
 INTRUSION = (0.10e-3, 0.30e-3, 0.60e-3)

@@ -23,7 +23,8 @@ from cathsim_dmc.anatomy.scan_files import (
     read_mesh,
 )
 from cathsim_dmc.anatomy.scan_inlet import cut_open, shut_behind
-from cathsim_dmc.anatomy.scan_tree import Ways, grow_tree, name_trunk, plan_inlet
+from cathsim_dmc.anatomy.scan_tree import Ways, grow_tree, plan_inlet
+from cathsim_dmc.anatomy.scan_trunk import name_trunk
 from cathsim_dmc.anatomy.scan_wall import (
     DEVICE_RADIUS,
     TOLERANCE,

@@ -8,7 +8,6 @@ of the lumen, whose depth then serves as its radius.
 
 from __future__ import annotations
 
-import re
 from dataclasses import dataclass
 
 import numpy as np
@@ -29,11 +28,6 @@ ROOT_WIDTH = 0.5  # of the inlet: narrower free ends do not continue the root
 TAIL = 15e-3  # m, end of a centreline that is cut off where it is too narrow
 TAIL_RADIUS = 1.1e-3  # m, of a 6 Fr device (1.0 mm) and a tenth to spare
 END_TRIM = 8e-3  # m, most that is cut off where a curve runs into its end
-TRUNK = "bca"  # name of the common trunk of the right branches
-# Branches of which the brachiocephalic artery is the trunk.
-_RIGHT = re.compile(
-    r"(r|right_?)(cca|ica|eca|va|sa|sca|aa|(common_)?carotid\w*|vertebral\w*|subclavian\w*)"
-)
 END_SEARCH = 15e-3  # m from a blind end in which its width is looked for
 MIN_RADIUS = 0.1e-3  # m, floor of a centreline's radius where it scrapes the wall
 
@@ -282,7 +276,7 @@ def grow_tree(
         own = resample(np.concatenate([anchor[None], curve[at + 1 :]]))
         line = _finish(field, own, anchor)
         lines[name] = curve
-        vessels[name] = Vessel(name, line, parent, _ostium(line, trunk))
+        vessels[name] = Vessel(name, line, parent, ostium_of(line, trunk))
     # Report in the order in which the files were given, parents first.
     ordered = {root_name: vessels[root_name]}
     while len(ordered) < len(vessels):
@@ -290,44 +284,6 @@ def grow_tree(
             if name not in ordered and vessels[name].parent in ordered:
                 ordered[name] = vessels[name]
     return VesselTree(ordered)
-
-
-def name_trunk(tree: VesselTree) -> VesselTree:
-    """Give the common trunk of right branches its name, the brachiocephalic artery.
-
-    Where curves share a trunk, the trunk is part of one of them: the right carotid
-    then leaves the right vertebral. If both are right branches by name, the part up
-    to the first of them becomes a vessel of its own and the parent of both. Nothing
-    changes if the trunk's name is taken or no two right branches share one.
-    """
-    root = tree.root.name
-    if TRUNK in tree.vessels:
-        return tree
-    for name, vessel in tree.vessels.items():
-        branches = [v for v in tree.vessels.values() if v.parent == name]
-        names = [name, *(branch.name for branch in branches)]
-        if vessel.parent != root or len(names) < 2:
-            continue
-        if not all(_RIGHT.fullmatch(key) for key in names):
-            continue
-        line = vessel.centreline
-        split = min(tree.origin(branch.name) for branch in branches)
-        if not vessel.ostium + 2.0 * STEP < split < line.length - 2.0 * STEP:
-            continue  # they part in the root's lumen, or at the curve's end
-        trunk = line.slice(0.0, split)
-        rest = line.slice(split, line.length)
-        vessels = {}
-        for key, other in tree.vessels.items():
-            if key == name:
-                vessels[TRUNK] = Vessel(TRUNK, trunk, root, vessel.ostium)
-                vessels[key] = Vessel(key, rest, TRUNK, _ostium(rest, trunk))
-            elif other.parent == name and tree.origin(key) < split + STEP:
-                own = other.centreline
-                vessels[key] = Vessel(key, own, TRUNK, _ostium(own, trunk))
-            else:
-                vessels[key] = other
-        return VesselTree(vessels)
-    return tree
 
 
 def _bulk(field: DepthField, curve: np.ndarray) -> float:
@@ -405,7 +361,7 @@ def _finish(
     return Centreline(points, np.maximum(depth, MIN_RADIUS))
 
 
-def _ostium(line: Centreline, trunk: Centreline) -> float:
+def ostium_of(line: Centreline, trunk: Centreline) -> float:
     """Arc length at which a branch leaves its parent's tube."""
     place = trunk.project(line.points)
     outside = place.distance > place.radius
