@@ -150,6 +150,22 @@ def test_vector_environment_is_the_single_ones_and_resets_by_itself():
     many.step(many.action_space.sample())
 
 
+def test_unknown_options_are_refused_with_the_known_ones():
+    with pytest.raises(TypeError, match="unexpected keyword argument 'frameskip'.*obs"):
+        gymnasium.make(TASK, frameskip=2)
+
+
+def test_torchrl_takes_the_id():
+    torchrl_envs = pytest.importorskip("torchrl.envs")
+    from torchrl.envs.utils import check_env_specs
+
+    env = torchrl_envs.GymEnv(TASK, observation=["image", "force"], max_steps=5)
+    check_env_specs(env)
+    rollout = env.rollout(20)
+    assert rollout["next", "truncated"].flatten().tolist() == [False] * 4 + [True]
+    assert rollout["image"].shape == (5, 128, 128, 1)
+
+
 @pytest.mark.slow
 def test_the_stable_baselines_example_runs(tmp_path):
     pytest.importorskip("stable_baselines3")

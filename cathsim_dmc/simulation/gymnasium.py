@@ -1,5 +1,7 @@
 """The tasks as Gymnasium environments: one simulation, or many on the batched path."""
 
+import dataclasses
+from collections.abc import Mapping
 from typing import Any
 
 import gymnasium
@@ -10,9 +12,12 @@ from cathsim_dmc import suite
 from cathsim_dmc.imaging import angiograph
 from cathsim_dmc.simulation import batch
 from cathsim_dmc.tasks import cannulation, measures
+from cathsim_dmc.tasks.config import NavigationConfig
 
 RENDER_MODES = ("rgb_array",)
 VERSION = 0  # of the ids
+# Options of the suite's factories beside those of the task.
+_FACTORY_OPTIONS = ("phantom", "goal", "random", "environment_kwargs")
 _MOST_SEED = 2**32  # first seed that numpy's RandomState does not take
 
 
@@ -43,6 +48,17 @@ def _float_type(dtype: str) -> np.dtype:
     if np.dtype(dtype) not in (np.float32, np.float64):
         raise ValueError(f"dtype is {dtype!r}; give float32 or float64")
     return np.dtype(dtype)
+
+
+def _refuse_unknown(options: Mapping[str, Any]) -> None:
+    """Raises TypeError as for any call: TorchRL tries arguments and looks for it."""
+    fields = [field.name for field in dataclasses.fields(NavigationConfig)]
+    for name in options:
+        if name not in (*_FACTORY_OPTIONS, *fields):
+            raise TypeError(
+                f"{CathSimEnv.__name__}.__init__() got an unexpected keyword argument "
+                f"'{name}'; options are {', '.join(fields)}"
+            )
 
 
 def _converted(observation, dtype: np.dtype) -> dict[str, np.ndarray]:
@@ -96,6 +112,7 @@ class CathSimEnv(gymnasium.Env):
                 f"render_mode is {render_mode!r}; give None or "
                 f"{', '.join(map(repr, RENDER_MODES))}"
             )
+        _refuse_unknown(task_kwargs)
         self.render_mode = render_mode
         self._dtype = _float_type(dtype)
         self._environment = suite.load(suite.DOMAIN, task, task_kwargs)
