@@ -273,6 +273,41 @@ def replay(
 
 
 @app.command
+def play(
+    task: Task,
+    /,
+    mode: Literal["fluoroscopy", "viewer"] = "fluoroscopy",
+    out: Path | None = None,
+    seed: int = 0,
+    episodes: int | None = None,
+    speed: float = 1.0,
+    phantom: str | None = None,
+    goal: str | None = None,
+) -> int:
+    """Cannulate by keyboard, with the forces on the screen.
+
+    Args:
+        task: A task of `cathsim list`.
+        mode: A plain window with the X-ray image, or MuJoCo's viewer (needs OpenGL).
+        out: Directory for the episodes as demonstrations (.npz).
+        seed: Of the first episode.
+        episodes: Stop after so many.
+        speed: Times real time.
+        phantom: For `navigate`: directory of an anatomy.
+        goal: For `navigate`: name of the goal.
+    """
+    from cathsim_dmc.play import play as run
+
+    kwargs = _task_kwargs(phantom, goal)
+    written = run(
+        task, mode, out, seed=seed, episodes=episodes, speed=speed, task_kwargs=kwargs
+    )
+    for path in written:
+        print(path)
+    return 0
+
+
+@app.command
 def demo(out: Path = Path("runs/demo"), frames: int = 150_000, seed: int = 0) -> int:
     """Train PPO briefly on type1_bca, evaluate it, draw and record it.
 

@@ -8,10 +8,9 @@ from cathsim_dmc.entities import devices
 
 # Relaxation time of bending: joint damping = time * stiffness, s. It lumps the loss
 # inside the polymer with the drag of blood: a 0.2 m cantilever of 50 N·mm² with a drag
-# of 0.15 N·s/m² relaxes in c L⁴ / (12.4 EI) = 0.4 s, a 0.07 m tip in 0.02 s. With 0.2 s
-# the tip, thrown over by all its motors, hits the wall faster than steps of 4 ms
-# resolve (1.4 mm deep, against 0.9 mm).
-BENDING_RELAXATION_TIME = 0.3
+# of 0.15 N·s/m² relaxes in c L⁴ / (12.4 EI) = 0.4 s. With half of it, a buckled shaft
+# that snaps through outruns steps of 4 ms (docs/soak.md).
+BENDING_RELAXATION_TIME = 0.4
 # Rotor inertia of the hinges, kg·m². Next to the damping it acts within 2 ms, far
 # below the relaxation time, and it gives the contact solver the scale of mass at
 # which the wall is as hard as silicone (docs/physics.md).
