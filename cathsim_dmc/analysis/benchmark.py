@@ -220,6 +220,9 @@ def torchrl_overhead(steps: int = 30, threads: int = 1) -> tuple[float, float]:
     return statistics.median(ratios[1:]), statistics.median(rates[1:])
 
 
+_OBSERVED = ("internal", "image")
+
+
 def image_ratio(steps: int = 60) -> float:
     """Rate of the image environment over that of the internal one, same actions."""
     environments = [_environment("type1_bca", observation=o) for o in _OBSERVED]
@@ -233,7 +236,23 @@ def image_ratio(steps: int = 60) -> float:
     return statistics.median(ratios[1:])
 
 
-_OBSERVED = ("internal", "image")
+def batched_image_ratio(steps: int = 20) -> float:
+    """The same ratio of two batched simulations on one thread."""
+    simulations = [_batch(1, observation=o) for o in _OBSERVED]
+    ratios = []
+    for run in range(_RUNS + 1):
+        seconds = []
+        for simulation in simulations:
+            simulation.seed(run)
+            simulation.reset()
+            generator = np.random.default_rng(run)
+            shape = (NUM_SIMULATIONS, simulation.num_actions)
+            start = time.process_time()
+            for _ in range(steps):
+                simulation.step(generator.uniform(-1, 1, shape))
+            seconds.append(time.process_time() - start)
+        ratios.append(seconds[0] / seconds[1])
+    return statistics.median(ratios[1:])
 
 
 def _timed(function: Callable[[], object], runs: int = _RUNS) -> float:
@@ -280,11 +299,14 @@ def _import_seconds(statement: str) -> float:
 
 def peak_memory() -> float:
     """Peak memory of a process that loads a task and steps it, MB."""
+    # The kernel's high-water mark of the address space: ru_maxrss would hold what the
+    # parent had when it forked.
     return _in_fresh_process(
-        "import resource; from cathsim_dmc import suite; "
+        "from cathsim_dmc import suite; "
         "env = suite.load('cathsim', 'type1_bca'); env.reset(); "
         "env.step([0.0] * 21); "
-        "print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024)",
+        "print([int(line.split()[1]) / 1024 for line in open('/proc/self/status') "
+        "if line.startswith('VmHWM')][0])",
         runs=3,
     )
 
@@ -317,7 +339,10 @@ def speed(say: Callable[[str], None] = lambda text: None) -> Report:
     checks.append(Check.at_most("TorchRL batched step / Batch.step", ratio, 1.2, "x"))
     scaling, rates = thread_scaling()
     checks.append(Check.at_least("two threads / one", scaling, 1.85, "x"))
-    checks.append(Check.at_least("image / internal", image_ratio(), 0.8, "x"))
+    checks += [
+        Check.at_least(f"image / internal, {name}", ratio(), 0.8, "x")
+        for name, ratio in (("batched", batched_image_ratio), ("suite", image_ratio))
+    ]
     say("construction, memory, imports")
     construct, reset, anatomy = construction()
     checks += [

@@ -187,7 +187,7 @@ def follower_posture(
     turned = np.asarray(rotation, np.float64)
     wire_pushed = pushed if guidewire_insertion is None else guidewire_insertion
     wire_turned = turned if guidewire_rotation is None else guidewire_rotation
-    shape = np.broadcast(pushed, turned, wire_pushed, wire_turned).shape
+    shape = (pushed + turned + wire_pushed + wire_turned).shape
     travel, opening, _ = _clamps(pushed)
     front, rear = travel[..., 0], travel[..., 1]
     # The catheter unit stays half-way between the clamps, so the free lengths of

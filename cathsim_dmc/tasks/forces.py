@@ -55,9 +55,15 @@ class Contacts:
 
 
 def magnitudes(row: np.ndarray) -> np.ndarray:
-    """Contact force magnitudes (..., K) in N from the sensor's row (..., K * 14)."""
+    """Contact force magnitudes in N from the sensor's row (..., K * 14).
+
+    Returns:
+      (..., M) with M <= K, the most contacts of any row: the sensor fills its places
+      from the first, and most are empty.
+    """
     slots = row.reshape(*row.shape[:-1], -1, _CONTACT_SIZE)
-    force = slots[..., 1:4]
+    occupied = min(int(slots[..., 0, 0].max()), slots.shape[-2])
+    force = slots[..., :occupied, 1:4]
     return np.sqrt(np.einsum("...i,...i->...", force, force))
 
 
@@ -79,8 +85,12 @@ class WallForce:
 
 
 def wall_force(magnitude: np.ndarray) -> WallForce:
-    """Summarises the contact magnitudes (..., S, K) of S substeps, in N."""
-    total = magnitude.sum(-1)
+    """Summarises the contact magnitudes (..., S, M) of S substeps, in N."""
+    if not magnitude.shape[-1]:
+        return WallForce(*np.zeros((4, *magnitude.shape[:-2])))
+    # One contact after the other: numpy's pairwise sum along the last axis would depend
+    # on the number of empty places, and so on what other simulations touch.
+    total = np.ascontiguousarray(np.moveaxis(magnitude, -1, 0)).sum(0)
     largest = magnitude.max(-1)
     return WallForce(
         sum=total[..., -1],

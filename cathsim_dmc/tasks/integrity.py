@@ -16,8 +16,8 @@ ESCAPED = "escaped through the wall"
 EXPLODED = "exploding force"
 
 # Control steps between two looks for an escape; a device that has left the lumen does
-# not find back within a second.
-ESCAPE_INTERVAL = 25
+# not find back within two seconds.
+ESCAPE_INTERVAL = 50
 # Deeper outside the lumen than this, m, the axis of the device is behind the wall:
 # the wall is 4 mm thick, and penetration stays below 1 mm.
 _ESCAPE_DEPTH = 2e-3
@@ -102,10 +102,10 @@ class Monitor:
             for index, actions in enumerate(self._actions)
             if len(actions) % ESCAPE_INTERVAL == 0
         ]
-        wrong = diverged | ~(peak_force <= MAX_FORCE)
         reasons: list[str | None] = [None] * len(self._actions)
-        if not looked and not wrong.any():
+        if not (looked or diverged.any() or not peak_force.max() <= MAX_FORCE):
             return reasons
+        wrong = diverged | ~(peak_force <= MAX_FORCE)
         out = np.zeros(len(reasons), dtype=bool)
         if looked:
             out[looked] = escaped(self._anatomy, centreline[looked])

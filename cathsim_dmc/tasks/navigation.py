@@ -271,8 +271,10 @@ class Navigation(composer.Task):
         The sensors of each are kept, as peaks within the step count.
         """
         del action, random_state
+        if self._substep:
+            return
         model, data = physics.model.ptr, physics.data.ptr
-        while self._substep < self.substeps - 2:
+        for _ in range(len(self._sensor_rows) - 2):
             mujoco.mj_step(model, data)
             self._keep_sensors(data)
 
@@ -293,9 +295,8 @@ class Navigation(composer.Task):
         self._measure(physics)
         self._travel.add(self._readings.head[None])
         self._outcome = self._meaning.outcome(self._readings.head)
-        diverged = (physics.data.ptr.warning.number != self._warnings).any()
         (self._error,) = self._monitor.errors(
-            np.array([diverged]),
+            (physics.data.ptr.warning.number != self._warnings).any(keepdims=True),
             self._readings.centreline[None],
             self._wall_force.peak_max[None],
         )
