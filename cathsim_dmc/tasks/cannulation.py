@@ -77,7 +77,7 @@ class Cannulation:
 
     def outcome(self, head: np.ndarray) -> Outcome:
         """Judges the position (..., 3) of the head, m, world frame."""
-        distance = np.sqrt(((head - self.goal) ** 2).sum(-1))
+        distance = _norm(head - self.goal)
         success = distance < self.goal_radius
         if success.any():  # finding the place in the branch takes 50 µs
             success = success & self.in_branch(head)
@@ -119,6 +119,11 @@ class Cannulation:
         return dataclasses.replace(self, goal=goal, goal_arc_length=arc_length)
 
 
+def _norm(vectors: np.ndarray) -> np.ndarray:
+    """Length of vectors (..., 3)."""
+    return np.sqrt(np.einsum("...i,...i->...", vectors, vectors))
+
+
 class Travel:
     """Ways that the heads of N simulations have gone in their episodes."""
 
@@ -138,7 +143,7 @@ class Travel:
 
     def add(self, head: np.ndarray) -> None:
         """Adds the way to the heads (N, 3), m."""
-        self._gone += np.sqrt(((head - self._last) ** 2).sum(-1))
+        self._gone += _norm(head - self._last)
         self._last = head
 
     @property

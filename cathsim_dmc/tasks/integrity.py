@@ -100,10 +100,10 @@ class Monitor:
         looked = [
             index
             for index, actions in enumerate(self._actions)
-            if len(actions) % ESCAPE_INTERVAL == 0
+            if not len(actions) % ESCAPE_INTERVAL
         ]
         reasons: list[str | None] = [None] * len(self._actions)
-        if not (looked or diverged.any() or not peak_force.max() <= MAX_FORCE):
+        if not looked and not diverged.any() and (peak_force <= MAX_FORCE).all():
             return reasons
         wrong = diverged | ~(peak_force <= MAX_FORCE)
         out = np.zeros(len(reasons), dtype=bool)
