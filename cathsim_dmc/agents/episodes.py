@@ -24,8 +24,8 @@ class EpisodeOutcome:
             step (N), as published.
         peak_force: the same within the control steps (N).
         physics_error: whether the simulation diverged, which ended it.
-        path_ratio: length of the head's path over the route that was left, dimensionless;
-            below 1 where the head cuts the corner of the route at an ostium.
+        path_ratio: length of the head's path over the route that was left; below 1
+            where the head cuts the corner of the route at an ostium.
     """
 
     env: int
