@@ -193,15 +193,19 @@ class Anatomy:
                 f"no goal {name!r}; there are {', '.join(self.goals) or 'none'}."
             ) from None
 
-    def route(self, goal: str) -> Centreline:
-        """Polyline with radii from the inlet to the goal called `goal`."""
-        target = self.goal(goal)
+    def route(self, goal: str | Goal, spare: float = 0.0) -> Centreline:
+        """Polyline with radii from the inlet to a goal, or `spare` (m) past it."""
+        target = goal if isinstance(goal, Goal) else self.goal(goal)
+        there = target.arc_length
+        if spare:
+            end = self.tree.vessel(target.vessel).centreline.length
+            there = min(there + spare, end)
         line = self.tree.vessel(self.inlet.vessel).centreline
         start = float(line.project(self.inlet.position).arc_length)
         return self.tree.route(
             self.inlet.vessel,
             target.vessel,
-            target.arc_length,
+            there,
             start_arc_length=start,
         )
 

@@ -1,5 +1,7 @@
 """The phantom: the wall of an anatomy as convex pieces, its goals and its sensors."""
 
+from typing import Any
+
 import numpy as np
 from dm_control import composer, mjcf
 
@@ -26,6 +28,18 @@ CONTACT_FIELDS = ("found", "force", "dist", "pos", "normal", "tangent")
 
 _LUMEN_COLOUR = (0.8, 0.25, 0.25, 0.25)
 _GOAL_COLOUR = (0.1, 0.7, 0.3, 0.5)
+
+
+def wall_contact(friction: float) -> dict[str, Any]:
+    """Attributes of a geom that the device touches as wall; friction is Coulomb's."""
+    return {
+        "contype": 1,
+        "conaffinity": 0,
+        "condim": 3,
+        "friction": (friction, 0, 0),
+        "solref": CONTACT_SOLREF,
+        "solimp": CONTACT_SOLIMP,
+    }
 
 
 class Phantom(composer.Entity):
@@ -80,12 +94,7 @@ class Phantom(composer.Entity):
                 name=name,
                 type="mesh",
                 mesh=name,
-                contype=1,
-                conaffinity=0,
-                condim=3,
-                friction=(friction, 0, 0),
-                solref=CONTACT_SOLREF,
-                solimp=CONTACT_SOLIMP,
+                **wall_contact(friction),
                 mass=0,
                 group=3,
             )

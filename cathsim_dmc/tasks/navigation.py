@@ -133,7 +133,6 @@ class Navigation(composer.Task):
     def _restart(self):
         self._outcome = None
         self._readings = None
-        self._contacts = None
         self._wall_force = None
         self._observation = None
         self._step = 0

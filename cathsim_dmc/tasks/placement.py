@@ -80,15 +80,7 @@ def cannulation_task(
       **options: fields of `cannulation.Cannulation`.
     """
     vessel = anatomy.tree.vessel(goal.vessel)
-    inlet = anatomy.tree.vessel(anatomy.inlet.vessel).centreline
-    route = anatomy.tree.route(
-        anatomy.inlet.vessel,
-        goal.vessel,
-        min(goal.arc_length + spare, vessel.centreline.length)
-        if spare
-        else goal.arc_length,
-        start_arc_length=float(inlet.project(anatomy.inlet.position).arc_length),
-    )
+    route = anatomy.route(goal, spare)
     return cannulation.Cannulation(
         goal=goal.position,
         branch=vessel.centreline,

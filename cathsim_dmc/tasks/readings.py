@@ -96,7 +96,6 @@ class Layout:
         self.dofs = _as_slice(model.jnt_dofadr[joints])
         insertion = _id(model, mujoco.mjtObj.mjOBJ_JOINT, f"{catheter}/insertion")
         self.insertion_qpos = int(model.jnt_qposadr[insertion])
-        self.insertion_dof = int(model.jnt_dofadr[insertion])
         rotation = mujoco.mj_name2id(
             model, mujoco.mjtObj.mjOBJ_JOINT, f"{catheter}/rotation"
         )

@@ -16,7 +16,7 @@ from cathsim_dmc.analysis.validation.rig import Rig
 from cathsim_dmc.anatomy import fidelity
 from cathsim_dmc.anatomy.phantom import Anatomy
 from cathsim_dmc.entities import devices
-from cathsim_dmc.entities.phantom import CONTACT_SOLIMP, CONTACT_SOLREF, FRICTION
+from cathsim_dmc.entities.phantom import FRICTION, wall_contact
 
 # Bounds on how far the wall stands in the lumen, mm.
 INTRUSION_MEAN, INTRUSION_P95, INTRUSION_MAX = 0.10, 0.30, 0.60
@@ -76,12 +76,7 @@ def capstan(friction: float, device: str | devices.Device = "published") -> Caps
         type="cylinder",
         size=(DRUM_RADIUS, 0.05),
         zaxis=(0, 1, 0),
-        contype=1,
-        conaffinity=0,
-        condim=3,
-        friction=(friction, 0, 0),
-        solref=CONTACT_SOLREF,
-        solimp=CONTACT_SOLIMP,
+        **wall_contact(friction),
     )
     rig.compile()
     middles = np.cumsum(rig.lengths) - rig.lengths / 2
