@@ -133,16 +133,8 @@ def test_many_act_as_each_alone(task, plan):
         assert action.shape == (3, plan.num_actions)
         assert np.abs(action).max() <= 1.0
         for index, single in enumerate(alone):
-            part = dataclasses.replace(
-                readings,
-                **{
-                    field.name: getattr(readings, field.name)[index]
-                    for field in dataclasses.fields(readings)
-                },
-            )
-            force = forces.WallForce(
-                *(value[index] for value in dataclasses.astuple(wall_force))
-            )
+            part = type(readings)(*(value[index] for value in readings))
+            force = forces.WallForce(*(value[index] for value in wall_force))
             np.testing.assert_allclose(
                 action[index], single.act(part, force), rtol=0, atol=1e-12
             )
@@ -219,7 +211,7 @@ def test_the_number_of_simulations_must_not_change(task, plan):
     simulation = jiggled(task, 2, 1)
     pilot = expert.Expert(plan)
     pilot.act(simulation.readings, simulation.wall_force)
-    single = dataclasses.replace(simulation.readings, head=np.zeros(3))
+    single = simulation.readings._replace(head=np.zeros(3))
     with pytest.raises(ValueError, match=r"call reset\(\)"):
         pilot.act(single, no_force())
 

@@ -42,11 +42,21 @@ CONFINED = {
     "tensordict": {"simulation/torchrl.py", "agents/"},
     "rerun": {"recording/"},
     "coacd": {"anatomy/"},
+    "numba": {"imaging/kernel.py"},
     "gymnasium": {"simulation/gymnasium.py", "gym.py"},
     "tyro": {"cli.py"},
 }
 # Slow to import: only within functions, unless a module is itself loaded late.
-LATE = ("trimesh", "coacd", "skimage", "matplotlib", "rerun", "torch", "torchrl")
+LATE = (
+    "trimesh",
+    "coacd",
+    "skimage",
+    "matplotlib",
+    "rerun",
+    "torch",
+    "torchrl",
+    "numba",
+)
 
 
 def modules():

@@ -49,6 +49,7 @@ def test_spawned_workers_collect(observation):
         assert batch["next", "reward"].isfinite().all()
     # Episodes end by time, and go on with the next one.
     flat = torch.cat([batch.flatten() for batch in batches])
-    assert flat["next", "truncated"].sum() == 64 // 16 and not flat[
-        "next", "terminated"
-    ].any()
+    assert (
+        flat["next", "truncated"].sum() == 64 // 16
+        and not flat["next", "terminated"].any()
+    )

@@ -156,9 +156,7 @@ def test_one_policy_on_images_runs_alike(anatomy, noise):
 
     pair = Pair(anatomy, observation="image", fluoroscopy={"noise": noise, "size": 64})
     pair.reset()
-    observation = {
-        "image": np.stack([t.observation["image"] for t in pair.timesteps])
-    }
+    observation = {"image": np.stack([t.observation["image"] for t in pair.timesteps])}
     for _ in range(20):
         observation = pair.step(steer(observation["image"])).observation
     heads = [each.task.readings.head for each in pair.environments]

@@ -454,8 +454,8 @@ def test_halton_noise_breaks_nothing(
         assert timestep.last() == (count == 2000)  # noise finds no branch
         excess.append(containment.largest_excess(task.readings.centreline))
         force.append(task.wall_force.peak_max)
-        rows = task._sensor_rows[:, task.layout.wall_contacts]
-        depth.append(forces.Contacts.from_sensor(rows).penetration.max())
+        contacts = forces.Contacts.from_sensor(task.contact_history.rows)
+        depth.append(contacts.penetration.max(initial=0.0))
     assert count == steps
     warnings = [warning.number for warning in environment.physics.data.ptr.warning]
     assert not any(warnings), warnings

@@ -69,9 +69,7 @@ def test_the_image_is_the_fluoroscopes(anatomy):
     )
     task = env.task
     radius = task.catheter.device.outer_radius
-    np.testing.assert_array_equal(
-        image, scope.render(task.readings.centreline, radius)
-    )
+    np.testing.assert_array_equal(image, scope.render(task.readings.centreline, radius))
 
 
 @pytest.mark.parametrize(

@@ -115,7 +115,7 @@ def test_readings_are_copies(shared_environment):
     environment = shared_environment("type1_bca")
     environment.reset()
     state = environment.task.readings
-    kept = dataclasses.asdict(state)
+    kept = state._asdict()
     kept = {name: np.array(value) for name, value in kept.items()}
     for _ in range(3):
         environment.step(np.ones(21))

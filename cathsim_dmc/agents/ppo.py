@@ -63,6 +63,9 @@ class PPO:
             # Per minibatch, as in the published agents.
             normalize_advantage=True,
             log_explained_variance=False,
+            # There is no second set of weights to swap in, which takes a tenth of a
+            # gradient step.
+            functional=False,
         )
         self.advantage = GAE(
             gamma=config.gamma, lmbda=config.gae_lambda, value_network=None

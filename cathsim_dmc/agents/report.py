@@ -250,13 +250,14 @@ def _timestep_policy(name, checkpoint, environment, seed) -> policies.TimestepPo
 
 def _images(environment, episode: Episode) -> np.ndarray:
     """X-ray images (T + 1, H, W, 1) of an episode."""
-    from cathsim_dmc.imaging import Fluoroscope
+    from cathsim_dmc.imaging import Angiograph
 
     task = environment.task
     surface = task.anatomy.surface
-    fluoroscope = task.fluoroscope or Fluoroscope.from_surface(
-        surface.vertices, surface.faces
-    )
+    fluoroscope = task.fluoroscope
+    if fluoroscope is None:
+        machine = Angiograph(surface.vertices, surface.faces, task.config.fluoroscopy)
+        fluoroscope = machine.planes()[0]
     return fluoroscope.render(episode.catheter, task.catheter.device.outer_radius)
 
 

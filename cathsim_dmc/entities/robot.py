@@ -112,10 +112,10 @@ JOINTS: tuple[RobotJoint, ...] = (
 
 
 # Insertion 0 lies in the middle of an overlap: both pairs hold at the start.
-_PHASES = OVERLAP / 2 + np.array([0.0, CYCLE / 2])
-# Phases at which a platform returns, its jaws open and close; how long each takes.
-_STARTS = np.array([STROKE + JAW_TRAVEL, STROKE, CYCLE - JAW_TRAVEL])
-_SPANS = np.array([RETURN, JAW_TRAVEL, JAW_TRAVEL])
+_FRONT_PHASE, _REAR_PHASE = OVERLAP / 2, OVERLAP / 2 + CYCLE / 2
+
+# One number, or an array of them.
+Scalars = float | NDArray[np.float64]
 
 
 class ClampState(NamedTuple):
@@ -141,23 +141,28 @@ def clamp_states(insertion: ArrayLike) -> tuple[ClampState, ClampState]:
             f"insertion must be finite metres, got {insertion}: "
             "check the device's base joint for a diverged simulation"
         )
-    travel, opening, phase = _clamps(insertion)
-    closed = phase <= STROKE
-    front, rear = (
-        ClampState(travel[..., i], opening[..., i], closed[..., i]) for i in (0, 1)
-    )
+    front, rear = (_clamp(insertion, phase) for phase in (_FRONT_PHASE, _REAR_PHASE))
     return front, rear
 
 
-def _clamps(insertion: NDArray[np.float64]) -> tuple[NDArray, NDArray, NDArray]:
-    """Travel, jaw opening and phase (..., 2) of the front and the rear clamps."""
+def _clamp(insertion: Scalars, offset: float) -> ClampState:
     # The jaws are closed over phases [0, STROKE].
-    phase = np.mod(insertion[..., None] + _PHASES, CYCLE)
-    # Progress of the platform's return, of the opening and of the closing.
-    u = np.minimum(np.maximum((phase[..., None] - _STARTS) / _SPANS, 0.0), 1.0)
-    swung = u * u * (3.0 - 2.0 * u)
-    travel = phase - STROKE / 2 - CYCLE * swung[..., 0]
-    return travel, JAW_OPENING * (swung[..., 1] - swung[..., 2]), phase
+    phase = (insertion + offset) % CYCLE
+    swung = _smoothstep((phase - (STROKE + JAW_TRAVEL)) / RETURN)
+    opened = _smoothstep((phase - STROKE) / JAW_TRAVEL)
+    closed = _smoothstep((phase - (CYCLE - JAW_TRAVEL)) / JAW_TRAVEL)
+    return ClampState(
+        travel=phase - STROKE / 2 - CYCLE * swung,
+        opening=JAW_OPENING * (opened - closed),
+        closed=phase <= STROKE,
+    )
+
+
+def _smoothstep(u: Scalars) -> Scalars:
+    # Plain floats are worth it: this runs in every control step, on caches that the
+    # physics has just filled, where each call of numpy takes microseconds.
+    u = min(max(u, 0.0), 1.0) if isinstance(u, float) else np.clip(u, 0.0, 1.0)
+    return u * u * (3.0 - 2.0 * u)
 
 
 def follower_posture(
@@ -183,38 +188,45 @@ def follower_posture(
     Raises:
       ValueError: an argument is not finite, or the shapes do not broadcast.
     """
-    pushed = np.asarray(insertion, np.float64)
-    turned = np.asarray(rotation, np.float64)
-    wire_pushed = pushed if guidewire_insertion is None else guidewire_insertion
-    wire_turned = turned if guidewire_rotation is None else guidewire_rotation
-    shape = (pushed + turned + wire_pushed + wire_turned).shape
-    travel, opening, _ = _clamps(pushed)
-    front, rear = travel[..., 0], travel[..., 1]
-    # The catheter unit stays half-way between the clamps, so the free lengths of
-    # shaft either side of it stay equal; the guidewire unit rides with the rear.
-    middle = (front + rear) / 2
-    posture = np.empty((*shape, len(JOINTS)))
-    posture[..., 0], posture[..., 1] = front, middle
-    posture[..., 2] = posture[..., 3] = rear
-    posture[..., 4] = posture[..., 5] = opening[..., 0]
-    posture[..., 6] = posture[..., 7] = opening[..., 1]
-    _turn_wheels(posture[..., 8:12], pushed - middle, turned)
-    _turn_wheels(posture[..., 12:16], wire_pushed - rear, wire_turned)
+    given = (
+        insertion,
+        rotation,
+        insertion if guidewire_insertion is None else guidewire_insertion,
+        rotation if guidewire_rotation is None else guidewire_rotation,
+    )
+    if all(isinstance(each, float) for each in given):
+        posture = np.array(_posture(*given))
+    else:
+        given = np.broadcast_arrays(*(np.asarray(each, np.float64) for each in given))
+        posture = np.stack(_posture(*given), axis=-1)
     if not np.isfinite(posture).all():
         raise ValueError(
-            f"insertions and rotations must be finite, got insertion {pushed}, "
-            f"rotation {turned}, guidewire insertion {wire_pushed} and guidewire "
-            f"rotation {wire_turned}: check for a diverged simulation"
+            "insertion, rotation, guidewire insertion and guidewire rotation must be "
+            f"finite, got {given}: check for a diverged simulation"
         )
     return posture
 
 
-def _turn_wheels(wheels: NDArray, slip: NDArray, turned: NDArray) -> None:
-    """Sets ring, pinion and rollers (..., 4); ``slip`` is device past platform (m)."""
-    wheels[..., 0] = turned
-    wheels[..., 1] = -turned * (RING_TEETH / PINION_TEETH)
-    wheels[..., 2] = slip / ROLLER_RADIUS
-    wheels[..., 3] = -wheels[..., 2]
+def _posture(
+    pushed: Scalars, turned: Scalars, wire_pushed: Scalars, wire_turned: Scalars
+) -> tuple[Scalars, ...]:
+    """The joints in the order of ``JOINTS``."""
+    front, rear = _clamp(pushed, _FRONT_PHASE), _clamp(pushed, _REAR_PHASE)
+    # The catheter unit stays half-way between the clamps, so the free lengths of
+    # shaft either side of it stay equal; the guidewire unit rides with the rear.
+    middle = (front.travel + rear.travel) / 2
+    return (
+        *(front.travel, middle, rear.travel, rear.travel),
+        *(front.opening, front.opening, rear.opening, rear.opening),
+        *_wheels(pushed - middle, turned),
+        *_wheels(wire_pushed - rear.travel, wire_turned),
+    )
+
+
+def _wheels(slip: Scalars, turned: Scalars) -> tuple[Scalars, ...]:
+    """Ring, pinion and rollers; ``slip`` is how far the device is past the platform."""
+    rolled = slip / ROLLER_RADIUS
+    return turned, -turned * (RING_TEETH / PINION_TEETH), rolled, -rolled
 
 
 class Robot(composer.Entity):

@@ -49,9 +49,7 @@ class Controls:
     def press(self, command: str, hold: float = np.inf) -> None:
         """Begins to hold a command, for `hold` seconds or until `release`."""
         if command not in COMMANDS:
-            raise ValueError(
-                f"no command {command!r}; there are {', '.join(COMMANDS)}"
-            )
+            raise ValueError(f"no command {command!r}; there are {', '.join(COMMANDS)}")
         if command == "straight":
             self._bend[:] = 0.0
         elif command in _HELD:

@@ -59,8 +59,7 @@ class FluoroscopyWindow:
             self._root = tkinter.Tk(className=TITLE)
         except tkinter.TclError as error:
             raise ValueError(
-                f"no window can be opened ({error}); set DISPLAY, or run under "
-                "xvfb-run"
+                f"no window can be opened ({error}); set DISPLAY, or run under xvfb-run"
             ) from error
         self._tk = tkinter
         self._machine = _machine(task)

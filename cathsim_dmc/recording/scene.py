@@ -8,6 +8,8 @@ from typing import Any
 
 import numpy as np
 
+# Geoms that bodies collide with are not drawn, as in MuJoCo's own viewers.
+_VISIBLE_GROUPS = 3
 # MuJoCo geom types that a recording can draw, and how many sizes each one uses:
 # sphere (radius), capsule and cylinder (radius, half length), box (half extents).
 SIZES = {"sphere": 1, "capsule": 2, "cylinder": 2, "box": 3}
@@ -85,7 +87,7 @@ def _walk(model: Any, wanted: tuple[str, ...]) -> Iterator[BodyGeom]:
             continue
         material = int(model.geom_matid[geom])
         rgba = model.mat_rgba[material] if material >= 0 else model.geom_rgba[geom]
-        if rgba[3] == 0:
+        if rgba[3] == 0 or model.geom_group[geom] >= _VISIBLE_GROUPS:
             continue
         yield BodyGeom(
             body=body,

@@ -179,8 +179,7 @@ class BatchSimulation:
         self._travel.add(self._readings.head)
         outcome = self._meaning.outcome(self._readings.head)
         if error.any():
-            outcome = dataclasses.replace(
-                outcome,
+            outcome = outcome._replace(
                 success=outcome.success & ~error,
                 reward=np.where(error, 0.0, outcome.reward),
             )

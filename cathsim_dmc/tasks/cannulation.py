@@ -1,6 +1,8 @@
 """What it means to cannulate a branch: distance, success and reward."""
 
 import dataclasses
+import functools
+from typing import NamedTuple
 
 import numpy as np
 
@@ -16,8 +18,7 @@ START_JITTER = 1e-3  # m, radius of the ball of the random displacement of the t
 REWARDS = ("distance", "path")
 
 
-@dataclasses.dataclass(frozen=True)
-class Outcome:
+class Outcome(NamedTuple):
     """How a control step went; arrays have the leading axes of the head.
 
     Attributes:
@@ -70,7 +71,7 @@ class Cannulation:
         if self.max_steps < 1:
             raise ValueError(f"max_steps is {self.max_steps}; at least 1")
 
-    @property
+    @functools.cached_property
     def weights(self) -> dict[str, float]:
         """Weights of the reward terms."""
         return {self.reward: -1.0, "success": self.success_reward}
@@ -79,16 +80,15 @@ class Cannulation:
         """Judges the position (..., 3) of the head, m, world frame."""
         distance = _norm(head - self.goal)
         success = distance < self.goal_radius
-        if success.any():  # finding the place in the branch takes 50 µs
-            success = success & self.in_branch(head)
-        terms = {"distance": distance, "success": success.astype(float)}
+        terms = {"distance": distance}
         if self.reward == "path":
             terms["path"] = self.path_distance(head)
-        weights = self.weights
-        # Published: +10 inside δ, minus the distance otherwise.
-        reward = np.where(
-            success, weights["success"], weights[self.reward] * terms[self.reward]
-        )
+        reward = self.weights[self.reward] * terms[self.reward]
+        if success.any():  # finding the place in the branch takes 50 µs
+            success = success & self.in_branch(head)
+            # Published: +10 inside δ, minus the distance otherwise.
+            reward = np.where(success, self.weights["success"], reward)
+        terms["success"] = success.astype(float)
         return Outcome(distance, success, terms, reward)
 
     def in_branch(self, head: np.ndarray) -> np.ndarray:
@@ -121,7 +121,7 @@ class Cannulation:
 
 def _norm(vectors: np.ndarray) -> np.ndarray:
     """Length of vectors (..., 3)."""
-    return np.sqrt(np.einsum("...i,...i->...", vectors, vectors))
+    return np.sqrt(np.vecdot(vectors, vectors))
 
 
 class Travel:
@@ -129,26 +129,35 @@ class Travel:
 
     def __init__(self, simulations: int):
         """Starts with all heads at rest."""
-        self._last = np.zeros((simulations, 3))
         self._gone = np.zeros(simulations)
         self._shortest = np.ones(simulations)
+        # Positions whose ways are not in the sum yet: it is seldom asked for.
+        self._heads = [np.zeros((simulations, 3))]
 
     def restart(
         self, indices: np.ndarray, head: np.ndarray, meaning: Cannulation
     ) -> None:
         """Begins episodes of some simulations with the heads (N, 3) of all, m."""
-        self._last[indices] = head[indices]
+        self._sum_up()
+        self._heads[0] = self._heads[0].copy()
+        self._heads[0][indices] = head[indices]
         self._gone[indices] = 0.0
         self._shortest[indices] = meaning.path_distance(head)[indices]
 
     def add(self, head: np.ndarray) -> None:
         """Adds the way to the heads (N, 3), m."""
-        self._gone += _norm(head - self._last)
-        self._last = head
+        self._heads.append(head)
+
+    def _sum_up(self):
+        ways = _norm(np.diff(self._heads, axis=0))
+        # One step after the other: a sum would depend on when it is taken.
+        self._gone = np.cumsum([self._gone, *ways], axis=0)[-1]
+        del self._heads[:-1]
 
     @property
     def path_ratio(self) -> np.ndarray:
         """(N,), way gone so far over the shortest way from start to goal."""
+        self._sum_up()
         return self._gone / self._shortest
 
 

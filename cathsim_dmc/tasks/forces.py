@@ -1,12 +1,19 @@
 """Forces between device and wall, as functions of the contact sensor's readings."""
 
 import dataclasses
+from typing import NamedTuple
 
 import numpy as np
 
 # Layout of one contact in the sensor's row: found, force, dist, pos, normal, tangent.
 # The order is MuJoCo's own, whatever the order in the model file.
 _CONTACT_SIZE = 1 + 3 + 1 + 3 + 3 + 3
+
+
+def _slots(row: np.ndarray) -> np.ndarray:
+    """The sensor's row (..., K * 14) contact by contact (..., K, 14)."""
+    places = row.shape[-1] // _CONTACT_SIZE
+    return row.reshape(*row.shape[:-1], places, _CONTACT_SIZE)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -34,7 +41,7 @@ class Contacts:
     @classmethod
     def from_sensor(cls, row: np.ndarray) -> "Contacts":
         """Reads the sensor's row (..., K * 14) as `entities.phantom` declares it."""
-        slots = row.reshape(*row.shape[:-1], -1, _CONTACT_SIZE)
+        slots = _slots(row)
         found = slots[..., 0]
         present = found > 0
         normal, tangent = slots[..., 8:11], slots[..., 11:14]
@@ -61,14 +68,53 @@ def magnitudes(row: np.ndarray) -> np.ndarray:
       (..., M) with M <= K, the most contacts of any row: the sensor fills its places
       from the first, and most are empty.
     """
-    slots = row.reshape(*row.shape[:-1], -1, _CONTACT_SIZE)
+    slots = _slots(row)
     occupied = min(int(slots[..., 0, 0].max()), slots.shape[-2])
     force = slots[..., :occupied, 1:4]
-    return np.sqrt(np.einsum("...i,...i->...", force, force))
+    return np.sqrt(np.vecdot(force, force))
 
 
-@dataclasses.dataclass(frozen=True)
-class WallForce:
+class ContactHistory:
+    """Contacts in each physics step of a control step, without the empty places.
+
+    A row of the sensor is long and mostly empty; copying it after every physics step
+    would take as long as a tenth of a free one.
+    """
+
+    def __init__(self, steps: int, places: int):
+        """Starts empty, for `steps` physics steps and a row of `places` numbers."""
+        self._rows = np.zeros((steps, places))
+        self._width = 0
+        self._length = 0
+
+    def clear(self) -> None:
+        """Begins a control step."""
+        if self._width:
+            self._rows[:, : self._width] = 0.0
+        self._width = self._length = 0
+
+    def keep(self, row: np.ndarray) -> None:
+        """Keeps the sensor's row (K * 14,) of the physics step just done."""
+        found = row[0]
+        if found:
+            width = min(int(found) * _CONTACT_SIZE, len(row))
+            self._rows[self._length, :width] = row[:width]
+            self._width = max(self._width, width)
+        self._length += 1
+
+    @property
+    def rows(self) -> np.ndarray:
+        """Rows (S, M * 14) of the S >= 1 steps kept, of the M places used."""
+        return self._rows[: max(self._length, 1), : self._width]
+
+    def magnitudes(self) -> np.ndarray:
+        """Contact force magnitudes (S, M), N."""
+        rows = self.rows
+        # Without a contact there is nothing to work out, which is the usual case.
+        return magnitudes(rows) if rows.size else rows
+
+
+class WallForce(NamedTuple):
     """Force on the wall over one control step, N.
 
     Attributes:
@@ -90,7 +136,7 @@ def wall_force(magnitude: np.ndarray) -> WallForce:
         return WallForce(*np.zeros((4, *magnitude.shape[:-2])))
     # One contact after the other: numpy's pairwise sum along the last axis would depend
     # on the number of empty places, and so on what other simulations touch.
-    total = np.ascontiguousarray(np.moveaxis(magnitude, -1, 0)).sum(0)
+    total = magnitude.cumsum(-1)[..., -1]
     largest = magnitude.max(-1)
     return WallForce(
         sum=total[..., -1],

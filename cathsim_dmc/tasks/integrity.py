@@ -4,6 +4,7 @@ import json
 import logging
 import os
 import tempfile
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -85,27 +86,35 @@ class Monitor:
             self._actions[index].append(action.copy())
 
     def errors(
-        self, diverged: np.ndarray, centreline: np.ndarray, peak_force: np.ndarray
+        self,
+        diverged: Sequence[bool],
+        centreline: np.ndarray,
+        peak_force: Sequence[float],
     ) -> list[str | None]:
         """What went wrong in the control step that has just ended; logs and dumps it.
 
         Args:
-          diverged: (N,) bool, MuJoCo warned.
+          diverged: (N,), MuJoCo warned.
           centreline: (N, n, 3), nodes of the devices, m.
           peak_force: (N,), largest single contact force within the step, N.
 
         Returns:
           A reason for each simulation, None where nothing did.
         """
+        # Plain Python: numpy takes longer over the one simulation of an environment,
+        # and no longer over many.
         looked = [
             index
             for index, actions in enumerate(self._actions)
             if not len(actions) % ESCAPE_INTERVAL
         ]
+        wrong = [
+            bool(warned or not force <= MAX_FORCE)
+            for warned, force in zip(diverged, peak_force, strict=True)
+        ]
         reasons: list[str | None] = [None] * len(self._actions)
-        if not looked and not diverged.any() and (peak_force <= MAX_FORCE).all():
+        if not looked and not any(wrong):
             return reasons
-        wrong = diverged | ~(peak_force <= MAX_FORCE)
         out = np.zeros(len(reasons), dtype=bool)
         if looked:
             out[looked] = escaped(self._anatomy, centreline[looked])

@@ -191,7 +191,10 @@ class Navigation(composer.Task):
         self._restart()
         # Composer looks once before the first reset, which must not draw noise.
         self._noise = None
-        self._sensor_rows = np.zeros((self.substeps, model.nsensordata))
+        places = self._layout.wall_contacts
+        self._contact_history = forces.ContactHistory(
+            self.substeps, places.stop - places.start
+        )
 
     def initialize_episode(self, physics, random_state):
         """Draws what differs between episodes and puts the device to its start."""
@@ -230,12 +233,12 @@ class Navigation(composer.Task):
 
     def posed_robot(self, qpos: np.ndarray) -> np.ndarray:
         """Poses the follower's joints after the device, in place: qpos (..., nq)."""
-        layout = self._layout
-        rotation = layout.rotation_qpos
-        qpos[..., self._robot_qpos] = follower_posture(
-            qpos[..., layout.insertion_qpos],
-            0.0 if rotation is None else qpos[..., rotation],
-        )
+        insertion, rotation = self._layout.insertion_qpos, self._layout.rotation_qpos
+        pushed = qpos[..., insertion]
+        turned = 0.0 if rotation is None else qpos[..., rotation]
+        if qpos.ndim == 1:
+            pushed, turned = float(pushed), float(turned)
+        qpos[..., self._robot_qpos] = follower_posture(pushed, turned)
         return qpos
 
     def before_step(self, physics, action, random_state):
@@ -248,9 +251,10 @@ class Navigation(composer.Task):
         self.posed_robot(data.qpos)
         if not self._step:
             mujoco.mj_getState(physics.model.ptr, data, self._state, _STATE)
-        self._monitor.before_step(self._state[None], self._action[None])
-        self._warnings = data.warning.number.copy()
-        self._substep = 0
+        self._monitor.before_step([self._state], [self._action])
+        self._warnings = data.warning.number.tobytes()
+        self._contact_history.clear()
+        self._first_substep = True
 
     @property
     def physics_steps_per_control_step(self) -> int:
@@ -267,24 +271,24 @@ class Navigation(composer.Task):
 
         Composer's bookkeeping between two of them takes as long as a fifth of a free
         step. (With a single one, its schedule of observations takes longer still.)
-        The sensors of each are kept, as peaks within the step count.
+        The contacts of each are kept, as peaks within the step count.
         """
         del action, random_state
-        if self._substep:
+        if not self._first_substep:
             return
+        self._first_substep = False
         model, data = physics.model.ptr, physics.data.ptr
-        for _ in range(len(self._sensor_rows) - 2):
+        contacts = data.sensordata[self._layout.wall_contacts]  # not a copy
+        for _ in range(self.substeps - self.physics_steps_per_control_step):
             mujoco.mj_step(model, data)
-            self._keep_sensors(data)
+            self._contact_history.keep(contacts)
 
     def after_substep(self, physics, random_state):
-        """Keeps the sensors of the physics step that composer did."""
+        """Keeps the contacts of the physics step that composer did."""
         del random_state
-        self._keep_sensors(physics.data.ptr)
-
-    def _keep_sensors(self, data):
-        self._sensor_rows[self._substep] = data.sensordata
-        self._substep += 1
+        self._contact_history.keep(
+            physics.data.ptr.sensordata[self._layout.wall_contacts]
+        )
 
     def after_step(self, physics, random_state):
         """Decides reward, success and end of the episode, once."""
@@ -294,10 +298,9 @@ class Navigation(composer.Task):
         self._measure(physics)
         self._travel.add(self._readings.head[None])
         self._outcome = self._meaning.outcome(self._readings.head)
+        warned = physics.data.ptr.warning.number.tobytes() != self._warnings
         (self._error,) = self._monitor.errors(
-            (physics.data.ptr.warning.number != self._warnings).any(keepdims=True),
-            self._readings.centreline[None],
-            self._wall_force.peak_max[None],
+            [warned], self._readings.centreline[None], [self._wall_force.peak_max]
         )
         if self._error is not None:
             self._termination = "physics_error"
@@ -328,10 +331,10 @@ class Navigation(composer.Task):
     def _measure(self, physics):
         data = physics.data.ptr
         self._readings = self._layout.read(data)
-        rows = self._sensor_rows if self._step else data.sensordata[None]
-        self._wall_force = forces.wall_force(
-            forces.magnitudes(rows[:, self._layout.wall_contacts])
-        )
+        if not self._step:
+            self._contact_history.clear()
+            self._contact_history.keep(data.sensordata[self._layout.wall_contacts])
+        self._wall_force = forces.wall_force(self._contact_history.magnitudes())
 
     def _see(self, physics) -> observations.Observation:
         if self._observation is None:
@@ -500,6 +503,11 @@ class Navigation(composer.Task):
     def wall_force(self) -> forces.WallForce:
         """Force on the wall over the last control step, N."""
         return self._wall_force
+
+    @property
+    def contact_history(self) -> forces.ContactHistory:
+        """Contacts with the wall in each physics step of the last control step."""
+        return self._contact_history
 
     @property
     def termination(self) -> str | None:

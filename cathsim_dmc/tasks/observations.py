@@ -1,7 +1,8 @@
 """Observations of a task as functions of a frame, for one simulation or for many."""
 
-import dataclasses
 from collections.abc import Callable, Mapping, Sequence
+from types import MappingProxyType
+from typing import NamedTuple
 
 import numpy as np
 from dm_control.composer.observation import observable
@@ -17,8 +18,7 @@ SEQUENCE_LENGTH = 3
 Observation = dict[str, np.ndarray]
 
 
-@dataclasses.dataclass(frozen=True)
-class Picture:
+class Picture(NamedTuple):
     """What is on the operator's screen; None where no observation needs it.
 
     Attributes:
@@ -33,10 +33,12 @@ class Picture:
     past_images: tuple[np.ndarray, ...] = ()
     masks: np.ndarray | None = None
     pixels: np.ndarray | None = None
-    views: Mapping[str, np.ndarray] = dataclasses.field(default_factory=dict)
+    views: Mapping[str, np.ndarray] = MappingProxyType({})
 
     def of(self, index: int) -> "Picture":
         """The picture of one of many simulations."""
+        if self is DARK:
+            return self
         return Picture(
             image=None if self.image is None else self.image[index],
             past_images=tuple(image[index] for image in self.past_images),
@@ -46,8 +48,11 @@ class Picture:
         )
 
 
-@dataclasses.dataclass(frozen=True)
-class Frame:
+# A screen that is off.
+DARK = Picture()
+
+
+class Frame(NamedTuple):
     """What there is to observe after a control step.
 
     Attributes:
@@ -62,7 +67,7 @@ class Frame:
     wall_force: forces.WallForce
     action: np.ndarray
     goal: np.ndarray
-    picture: Picture = Picture()
+    picture: Picture = DARK
 
 
 def _flat(array: np.ndarray, axes: int) -> np.ndarray:
@@ -114,7 +119,7 @@ def tracking(frame: Frame) -> Observation:
     line = frame.readings.centreline
     return {
         "tracking_points": _flat(tracked(line), 2),
-        "tracking_goal": np.broadcast_to(frame.goal, (*line.shape[:-2], 3)),
+        "tracking_goal": np.broadcast_to(frame.goal, (*line.shape[:-2], 3)).copy(),
         **_operator(frame),
     }
 
@@ -132,7 +137,7 @@ def tracking_2d(frame: Frame) -> Observation:
 def _operator(frame: Frame) -> Observation:
     return {
         "tracking_insertion": frame.readings.insertion[..., None],
-        "tracking_action": frame.action,
+        "tracking_action": frame.action.copy(),
     }
 
 
@@ -140,7 +145,7 @@ def goal(frame: Frame) -> Observation:
     """Where the goal is, in the world and from the head."""
     head = frame.readings.head
     return {
-        "goal_position": np.broadcast_to(frame.goal, head.shape),
+        "goal_position": np.broadcast_to(frame.goal, head.shape).copy(),
         "goal_from_head": frame.goal - head,
     }
 
@@ -239,7 +244,7 @@ def observe(names: Sequence[str], frame: Frame) -> Observation:
     observation: Observation = {}
     for name in names:
         observation.update(OBSERVATIONS[name](frame))
-    return {key: np.array(value) for key, value in observation.items()}
+    return observation
 
 
 def entries(

@@ -6,7 +6,7 @@ such as qpos (nq,), or a `mujoco.batch.Batch`, with arrays such as qpos (N, nq).
 array of the result has the leading axes of the source, written `...` below.
 """
 
-import dataclasses
+from typing import NamedTuple
 
 import mujoco
 import numpy as np
@@ -14,8 +14,7 @@ import numpy as np
 from cathsim_dmc.tasks import forces
 
 
-@dataclasses.dataclass(frozen=True)
-class Readings:
+class Readings(NamedTuple):
     """State of the device after a control step.
 
     Positions of joints and their velocities are those at the end of the step. All
@@ -127,8 +126,8 @@ class Layout:
             centreline=np.concatenate([xpos, head[..., None, :]], axis=-2),
             head=head.copy(),
             # MuJoCo reports the force of the parent on the site's body.
-            push_force=sensors[..., self.push_force][..., 2].copy(),
-            push_torque=sensors[..., self.push_torque][..., 2].copy(),
+            push_force=sensors[..., self.push_force.start + 2].copy(),
+            push_torque=sensors[..., self.push_torque.start + 2].copy(),
             load_cell=-sensors[..., self.load_cell],
         )
 

@@ -64,7 +64,7 @@ class Screen:
             are taken and fill their whole history. None for all, one step on.
         """
         if not self._on:
-            return observations.Picture()
+            return observations.DARK
         count = len(qpos)
         chosen = np.arange(count) if fresh is None else fresh
         line = lines[chosen]
