@@ -1,9 +1,14 @@
 """Environments that many tests share; loading one takes a second."""
 
+import hypothesis
 import numpy as np
 import pytest
 
 from cathsim_dmc import suite
+
+# A first call may import scipy or compile; how long it takes is not what is tested.
+hypothesis.settings.register_profile("default", deadline=None)
+hypothesis.settings.load_profile("default")
 
 TASKS = ("type1_bca", "type1_lcca", "type2_bca", "type2_lcca")
 SHORT_EPISODE = 12  # control steps

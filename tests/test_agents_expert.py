@@ -91,7 +91,7 @@ def test_a_positive_bend_turns_the_head_as_documented(task, hinge, towards):
 
 
 @given(s=st.floats(0.0, 1.0), fraction=st.floats(0.0, 0.95), angle=st.floats(0, 6.28))
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=50)
 def test_a_head_in_the_tube_is_not_outside(plan, s, fraction, angle):
     index = int(s * (len(plan.points) - 1))
     across = np.linalg.svd(np.gradient(plan.points, axis=0)[index][None])[2][1:]

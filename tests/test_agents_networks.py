@@ -25,7 +25,7 @@ def test_normaliser_equals_the_statistics_of_all_data_whatever_the_batches():
     torch.testing.assert_close(normaliser(data), expected, rtol=1e-3, atol=1e-3)
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(
     st.floats(-1e3, 1e3, width=32),
     st.sampled_from([0.0, 1e-7, 1e-9]),

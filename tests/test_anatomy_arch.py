@@ -126,7 +126,7 @@ def test_sampling_repeats_with_its_seed():
     )
 
 
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=15)
 @given(
     st.integers(0, 2**31 - 1),
     st.sampled_from(list(arch.DROP_RANGES)),

@@ -53,7 +53,7 @@ def test_interpolation_on_a_straight_line():
     np.testing.assert_allclose(place.radius, 0.01)
 
 
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=20)
 @given(st.integers(0, 2**32 - 1))
 def test_projection_agrees_with_brute_force(seed):
     line = helix(40)
@@ -69,7 +69,7 @@ def test_projection_agrees_with_brute_force(seed):
     np.testing.assert_allclose(place.radius, found.radius, atol=1e-12)
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(st.floats(0.0, 1.0))
 def test_points_on_the_line_project_onto_themselves(share):
     line = helix()

@@ -1,6 +1,6 @@
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from cathsim_dmc.imaging import VIEWS, CArm
@@ -43,7 +43,6 @@ def test_field_of_view_and_magnification():
     assert CArm(resolution=(64, 128)).field_of_view == pytest.approx((edge, 2 * edge))
 
 
-@settings(deadline=None)
 @given(angles, tilts, coordinates)
 def test_axes_are_a_rotation_and_unproject_inverts_project(primary, secondary, point):
     carm = CArm(primary, secondary, isocentre=(0.01, -0.02, 0.03))
@@ -55,7 +54,6 @@ def test_axes_are_a_rotation_and_unproject_inverts_project(primary, secondary, p
     np.testing.assert_allclose(carm.unproject(pixel, depth), point, atol=1e-12)
 
 
-@settings(deadline=None)
 @given(angles, tilts)
 def test_points_of_one_ray_share_a_pixel(primary, secondary):
     carm = CArm(primary, secondary)

@@ -58,7 +58,6 @@ def true_capsule(carm, start, stop, radius, supersample):
 # ---------------------------------------------------------------- the disc kernel
 
 
-@settings(deadline=None)
 @given(st.floats(-1.5, 1.5), st.floats(-1.5, 1.5))
 def test_area_of_a_quadrant_of_the_disc(x, y):
     strips = np.linspace(-1, 1, 20001)
@@ -77,7 +76,7 @@ def brute_shares(image_size, row, column, radius, fine=200):
     return counts / (np.pi * (radius * fine) ** 2)
 
 
-@settings(deadline=None, max_examples=40)
+@settings(max_examples=40)
 @given(st.floats(0.2, 4.0), st.floats(4.5, 6.5), st.floats(4.5, 6.5))
 def test_a_disc_is_shared_by_the_area_in_each_pixel(radius, row, column):
     image = np.zeros((11, 11))
@@ -87,7 +86,6 @@ def test_a_disc_is_shared_by_the_area_in_each_pixel(radius, row, column):
     assert image.min() >= 0.0
 
 
-@settings(deadline=None)
 @given(
     st.floats(1e-6, 6.0),
     st.floats(-0.5, 0.5),
@@ -100,7 +98,6 @@ def test_nothing_of_a_disc_is_lost(radius, row, column, centre):
     assert image.sum() == pytest.approx(2.0, rel=1e-9)
 
 
-@settings(deadline=None)
 @given(st.floats(0.1, 6.0), st.floats(-9.0, 14.0), st.floats(-9.0, 14.0))
 def test_a_disc_beside_the_image_is_cut_at_its_edge(radius, row, column):
     large, small = np.zeros((37, 37)), np.zeros((5, 5))
@@ -173,7 +170,7 @@ def test_drawn_centreline_is_the_projected_one(view, magnification):
     assert np.mean(distances) < 0.15
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(
     st.floats(0, 2 * np.pi),
     st.floats(-1.4, 1.4),

@@ -66,7 +66,7 @@ def test_noise_is_zero_without_quanta_and_never_negative():
     assert dim.min() >= 0.0 and dim.mean() == pytest.approx(1e-3, rel=0.2)
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(st.floats(0.2, 4.0))
 def test_blur_keeps_weight_and_has_its_width(sigma):
     point = np.zeros((61, 61), dtype=np.float32)

@@ -163,7 +163,7 @@ def test_tilted_capsule(view):
     assert relative_error(image, truth) < 0.01
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(
     st.floats(-3.0, 3.0),
     st.floats(-1.3, 1.3),

@@ -10,7 +10,7 @@ from recording_samples import make_episode
 from cathsim_dmc.recording.episode import Episode
 
 
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=20)
 @given(
     steps=st.integers(0, 12),
     links=st.integers(1, 5),

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from dm_control.composer.variation import distributions
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from cathsim_dmc import suite
@@ -57,7 +57,6 @@ def test_nothing_is_drawn_but_the_displacement_by_default():
 
 
 @given(seed=st.integers(0, 2**32 - 1))
-@settings(deadline=None)
 def test_draws_lie_in_their_ranges(seed):
     episode = USUAL.draw(np.random.RandomState(seed))
     assert np.linalg.norm(episode.displacement) <= USUAL.start_radius

@@ -73,7 +73,7 @@ def test_shifted_samples_are_not_equivalent():
     assert result.cohens_d < -10
 
 
-@settings(deadline=None, max_examples=25)
+@settings(max_examples=25)
 @given(
     st.lists(st.floats(0, 1), min_size=2, max_size=12),
     st.lists(st.floats(0, 1), min_size=2, max_size=12),

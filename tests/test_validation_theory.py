@@ -11,7 +11,7 @@ from cathsim_dmc.analysis.validation import theory
 from cathsim_dmc.analysis.validation.checks import Check, Report
 
 
-@settings(deadline=None, max_examples=15)
+@settings(max_examples=15)
 @given(
     angle=st.floats(0.02, 1.4),
     length=st.floats(0.05, 0.5),
