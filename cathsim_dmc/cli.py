@@ -497,9 +497,9 @@ def speed(json: bool = False) -> int:
     Args:
         json: Print one JSON object and nothing else.
     """
-    from cathsim_dmc.analysis import benchmark
+    from cathsim_dmc.analysis.speed import report
 
-    return _show(benchmark.speed(lambda text: print(text, file=sys.stderr)), json)
+    return _show(report.speed(lambda text: print(text, file=sys.stderr)), json)
 
 
 if __name__ == "__main__":

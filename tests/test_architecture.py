@@ -37,7 +37,7 @@ ALLOWED = {
 # Package -> files that may import it, wherever in the file the import stands.
 CONFINED = {
     # The benchmark compares the TorchRL environment with the simulation underneath.
-    "torch": {"simulation/torchrl.py", "agents/", "analysis/benchmark.py"},
+    "torch": {"simulation/torchrl.py", "agents/", "analysis/speed/ratios.py"},
     "torchrl": {"simulation/torchrl.py", "agents/"},
     "tensordict": {"simulation/torchrl.py", "agents/"},
     "rerun": {"recording/"},

@@ -151,11 +151,8 @@ def _clamp(insertion: Scalars, offset: float) -> ClampState:
     swung = _smoothstep((phase - (STROKE + JAW_TRAVEL)) / RETURN)
     opened = _smoothstep((phase - STROKE) / JAW_TRAVEL)
     closed = _smoothstep((phase - (CYCLE - JAW_TRAVEL)) / JAW_TRAVEL)
-    return ClampState(
-        travel=phase - STROKE / 2 - CYCLE * swung,
-        opening=JAW_OPENING * (opened - closed),
-        closed=phase <= STROKE,
-    )
+    travel = phase - STROKE / 2 - CYCLE * swung
+    return ClampState(travel, JAW_OPENING * (opened - closed), phase <= STROKE)
 
 
 def _smoothstep(u: Scalars) -> Scalars:
@@ -194,17 +191,16 @@ def follower_posture(
         insertion if guidewire_insertion is None else guidewire_insertion,
         rotation if guidewire_rotation is None else guidewire_rotation,
     )
-    if all(isinstance(each, float) for each in given):
-        posture = np.array(_posture(*given))
-    else:
+    single = all(isinstance(each, float) for each in given)
+    if not single:
         given = np.broadcast_arrays(*(np.asarray(each, np.float64) for each in given))
-        posture = np.stack(_posture(*given), axis=-1)
-    if not np.isfinite(posture).all():
+    # A number that is not finite spoils every sum it is in.
+    if not np.isfinite(sum(given)).all():
         raise ValueError(
             "insertion, rotation, guidewire insertion and guidewire rotation must be "
             f"finite, got {given}: check for a diverged simulation"
         )
-    return posture
+    return np.array(_posture(*given)) if single else np.stack(_posture(*given), -1)
 
 
 def _posture(

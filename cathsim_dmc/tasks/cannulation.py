@@ -24,14 +24,21 @@ class Outcome(NamedTuple):
     Attributes:
       distance: (...), straight from head to goal, m.
       success: (...) bool, in the branch and within the goal's radius.
-      terms: named reward terms (...), before weighting.
       reward: (...), the weighted terms that count.
+      path: (...), way along the route that is left and distance from it, m; None
+        unless it is rewarded.
     """
 
     distance: np.ndarray
     success: np.ndarray
-    terms: dict[str, np.ndarray]
     reward: np.ndarray
+    path: np.ndarray | None = None
+
+    @property
+    def terms(self) -> dict[str, np.ndarray]:
+        """Named reward terms (...), before weighting."""
+        terms = {"distance": self.distance, "success": self.success.astype(float)}
+        return terms if self.path is None else {**terms, "path": self.path}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -80,16 +87,13 @@ class Cannulation:
         """Judges the position (..., 3) of the head, m, world frame."""
         distance = _norm(head - self.goal)
         success = distance < self.goal_radius
-        terms = {"distance": distance}
-        if self.reward == "path":
-            terms["path"] = self.path_distance(head)
-        reward = self.weights[self.reward] * terms[self.reward]
+        path = self.path_distance(head) if self.reward == "path" else None
+        reward = self.weights[self.reward] * (distance if path is None else path)
         if success.any():  # finding the place in the branch takes 50 µs
             success = success & self.in_branch(head)
             # Published: +10 inside δ, minus the distance otherwise.
             reward = np.where(success, self.weights["success"], reward)
-        terms["success"] = success.astype(float)
-        return Outcome(distance, success, terms, reward)
+        return Outcome(distance, success, reward, path)
 
     def in_branch(self, head: np.ndarray) -> np.ndarray:
         """Whether the head (..., 3) is in the lumen of the branch, past its ostium."""

@@ -85,27 +85,25 @@ class ContactHistory:
         """Starts empty, for `steps` physics steps and a row of `places` numbers."""
         self._rows = np.zeros((steps, places))
         self._width = 0
-        self._length = 0
 
     def clear(self) -> None:
-        """Begins a control step."""
+        """Begins a control step, without contacts."""
         if self._width:
             self._rows[:, : self._width] = 0.0
-        self._width = self._length = 0
+            self._width = 0
 
-    def keep(self, row: np.ndarray) -> None:
+    def keep(self, step: int, row: np.ndarray) -> None:
         """Keeps the sensor's row (K * 14,) of the physics step just done."""
         found = row[0]
         if found:
             width = min(int(found) * _CONTACT_SIZE, len(row))
-            self._rows[self._length, :width] = row[:width]
+            self._rows[step, :width] = row[:width]
             self._width = max(self._width, width)
-        self._length += 1
 
     @property
     def rows(self) -> np.ndarray:
-        """Rows (S, M * 14) of the S >= 1 steps kept, of the M places used."""
-        return self._rows[: max(self._length, 1), : self._width]
+        """Rows (S, M * 14) of the S physics steps, of the M places used."""
+        return self._rows[:, : self._width]
 
     def magnitudes(self) -> np.ndarray:
         """Contact force magnitudes (S, M), N."""

@@ -250,11 +250,11 @@ class Navigation(composer.Task):
         data.ctrl[:] = self._delay.pass_on(self._action[None])[0]
         self.posed_robot(data.qpos)
         if not self._step:
+            self._warnings = data.warning.number.tobytes()
             mujoco.mj_getState(physics.model.ptr, data, self._state, _STATE)
         self._monitor.before_step([self._state], [self._action])
-        self._warnings = data.warning.number.tobytes()
         self._contact_history.clear()
-        self._first_substep = True
+        self._substep = 0
 
     @property
     def physics_steps_per_control_step(self) -> int:
@@ -274,21 +274,22 @@ class Navigation(composer.Task):
         The contacts of each are kept, as peaks within the step count.
         """
         del action, random_state
-        if not self._first_substep:
+        if self._substep:
             return
-        self._first_substep = False
+        self._substep = self.substeps - self.physics_steps_per_control_step
         model, data = physics.model.ptr, physics.data.ptr
         contacts = data.sensordata[self._layout.wall_contacts]  # not a copy
-        for _ in range(self.substeps - self.physics_steps_per_control_step):
+        for substep in range(self._substep):
             mujoco.mj_step(model, data)
-            self._contact_history.keep(contacts)
+            if contacts[0]:
+                self._contact_history.keep(substep, contacts)
 
     def after_substep(self, physics, random_state):
         """Keeps the contacts of the physics step that composer did."""
         del random_state
-        self._contact_history.keep(
-            physics.data.ptr.sensordata[self._layout.wall_contacts]
-        )
+        contacts = physics.data.ptr.sensordata[self._layout.wall_contacts]
+        self._contact_history.keep(self._substep, contacts)
+        self._substep += 1
 
     def after_step(self, physics, random_state):
         """Decides reward, success and end of the episode, once."""
@@ -298,7 +299,8 @@ class Navigation(composer.Task):
         self._measure(physics)
         self._travel.add(self._readings.head[None])
         self._outcome = self._meaning.outcome(self._readings.head)
-        warned = physics.data.ptr.warning.number.tobytes() != self._warnings
+        warnings = physics.data.ptr.warning.number.tobytes()
+        warned, self._warnings = warnings != self._warnings, warnings
         (self._error,) = self._monitor.errors(
             [warned], self._readings.centreline[None], [self._wall_force.peak_max]
         )
@@ -333,7 +335,8 @@ class Navigation(composer.Task):
         self._readings = self._layout.read(data)
         if not self._step:
             self._contact_history.clear()
-            self._contact_history.keep(data.sensordata[self._layout.wall_contacts])
+            contacts = data.sensordata[self._layout.wall_contacts]
+            self._contact_history.keep(-1, contacts)
         self._wall_force = forces.wall_force(self._contact_history.magnitudes())
 
     def _see(self, physics) -> observations.Observation:

@@ -50,6 +50,12 @@ def main():
     rates = report["findings"]["batched_steps_per_second"]
     lines += ["", "Batched control steps per second, 16 simulations, random:", ""]
     lines += [f"- {name}: {rate:.0f}" for name, rate in rates.items()]
+    lines += ["", "Where a control step of 40 ms goes, µs on one core:", ""]
+    stages = report["findings"]["microseconds_in_a_control_step"]
+    lines += [f"| | {' | '.join(stages)} |", "|---" * (len(stages) + 1) + "|"]
+    for stage in next(iter(stages.values())):
+        cells = [f"{table[stage]:.0f}" for table in stages.values()]
+        lines.append(f"| {stage} | {' | '.join(cells)} |")
     page = PAGE.read_text()
     block = BEGIN + "\n" + "\n".join(lines) + "\n" + END
     PAGE.write_text(re.sub(f"{BEGIN}.*{END}", lambda _: block, page, flags=re.S))

@@ -1,0 +1,1 @@
+"""How fast the simulator is, and where the time goes: `cathsim benchmark speed`."""

@@ -1,0 +1,216 @@
+"""Speed of the environment under a policy, by insertion depth and by stage."""
+
+import contextlib
+import dataclasses
+import time
+from collections.abc import Callable, Iterator
+
+import mujoco
+import numpy as np
+
+from cathsim_dmc import suite
+from cathsim_dmc.tasks.cannulation import CONTROL_TIMESTEP
+
+DEPTHS = (0.0, 0.1, 0.2, 0.3, np.inf)  # m of insertion, edges of the bins
+NEVER = 1e-6  # m, goal radius that no policy meets
+
+
+@dataclasses.dataclass(frozen=True)
+class Drive:
+    """A policy of the benchmark: the action (A,) at a control step."""
+
+    name: str
+    action: Callable[[int, np.random.Generator, int], np.ndarray]
+
+
+def _still(step: int, generator: np.random.Generator, size: int) -> np.ndarray:
+    return np.zeros(size)
+
+
+def _random(step: int, generator: np.random.Generator, size: int) -> np.ndarray:
+    return generator.uniform(-1, 1, size)
+
+
+def _push(step: int, generator: np.random.Generator, size: int) -> np.ndarray:
+    action = np.zeros(size)
+    action[-1] = 1.0
+    return action
+
+
+def _curl(step: int, generator: np.random.Generator, size: int) -> np.ndarray:
+    action = np.ones(size)
+    action[1:-1:2] = 0.0
+    return action
+
+
+IDLE, RANDOM = Drive("idle", _still), Drive("random", _random)
+PUSH, CURL = Drive("push", _push), Drive("curl", _curl)
+
+
+@dataclasses.dataclass(frozen=True)
+class Pace:
+    """Speed of one episode.
+
+    Attributes:
+      insertion: (T,), m, after each control step.
+      seconds: (T,), CPU seconds of each control step.
+      contacts: (T,), with the wall at its end.
+    """
+
+    insertion: np.ndarray
+    seconds: np.ndarray
+    contacts: np.ndarray
+
+    @property
+    def factor(self) -> float:
+        """Real-time factor of the whole episode."""
+        return len(self.seconds) * CONTROL_TIMESTEP / self.seconds.sum()
+
+    def by_depth(self) -> dict[str, dict[str, float]]:
+        """Real-time factor and mean number of contacts by insertion depth."""
+        table = {}
+        for low, high in zip(DEPTHS[:-1], DEPTHS[1:], strict=True):
+            chosen = (self.insertion >= low) & (self.insertion < high)
+            if chosen.any():
+                end = "+" if np.isinf(high) else f"–{1e3 * high:.0f}"
+                table[f"{1e3 * low:.0f}{end} mm"] = {
+                    "real_time_factor": chosen.sum()
+                    * CONTROL_TIMESTEP
+                    / self.seconds[chosen].sum(),
+                    "steps_per_second": chosen.sum() / self.seconds[chosen].sum(),
+                    "contacts": float(self.contacts[chosen].mean()),
+                }
+        return table
+
+
+def load(task: str = "type1_bca", **options):
+    """A suite environment whose episodes never end in success."""
+    options.setdefault("goal_radius", NEVER)
+    return suite.load(suite.DOMAIN, task, task_kwargs={"random": 0, **options})
+
+
+def pace(environment, drive: Drive, steps: int, seed: int = 0) -> Pace:
+    """Runs an episode of a suite environment and times every control step."""
+    generator = np.random.default_rng(seed)
+    size = environment.action_spec().shape[0]
+    environment.reset()
+    insertion, seconds, contacts = [], [], []
+    for step in range(steps):
+        action = drive.action(step, generator, size)
+        start = time.process_time()
+        environment.step(action)
+        seconds.append(time.process_time() - start)
+        insertion.append(float(environment.task.readings.insertion))
+        contacts.append(float(environment.task.contacts(environment.physics).found))
+    return Pace(np.array(insertion), np.array(seconds), np.array(contacts))
+
+
+# MuJoCo's timers of the stages of `mj_step`.
+_STAGES = {
+    "kinematics and inertia": ("POS_KINEMATICS", "POS_INERTIA"),
+    "broad phase": ("COL_BROAD",),
+    "narrow phase": ("COL_NARROW",),
+    "constraints": ("POS_MAKE", "POS_PROJECT", "CONSTRAINT"),
+}
+_HOOKS = {
+    "before_step": "action and follower",
+    "after_step": "forces, reward, errors of physics",
+}
+
+
+def account(drive: Drive, steps: int = 150, runs: int = 3) -> dict[str, float]:
+    """Where a control step goes.
+
+    The stages of `mj_step` come from MuJoCo's own timers, whose shares are applied to
+    the time it takes without them. What is left of a step beside `mj_step` and the
+    hooks of the task is composer's: its schedule, its buffers, and the observation.
+
+    Returns:
+      CPU time of each stage in a control step, µs; they add up to the whole.
+    """
+    environment = load()
+    task = environment.task
+    bare, whole, hooks = [], [], []
+    for run in range(runs + 1):
+        ours, theirs = against_bare_steps(environment, drive, steps, run)
+        bare.append(theirs)
+        whole.append(ours)
+        with _timed_hooks(task) as seconds:
+            pace(environment, drive, steps, run)
+        hooks.append([seconds[name] for name in _HOOKS])
+    with _mujoco_timers(environment.physics.data.ptr) as timers:
+        pace(environment, drive, steps)
+        stages = {
+            name: sum(timers(stage) for stage in parts)
+            for name, parts in _STAGES.items()
+        }
+        total = timers("STEP")
+    physics = np.median(bare[1:])
+    table = {name: physics * part / total for name, part in stages.items()}
+    table["other physics"] = physics - sum(table.values())
+    table.update(zip(_HOOKS.values(), np.median(hooks[1:], axis=0), strict=True))
+    table["composer and observation"] = np.median(whole[1:]) - sum(table.values())
+    return {name: 1e6 * float(value) / steps for name, value in table.items()}
+
+
+def against_bare_steps(
+    environment, drive: Drive, steps: int, seed: int
+) -> tuple[float, float]:
+    """CPU seconds of an episode, and of bare `mj_step` calls with the same controls."""
+    generator = np.random.default_rng(seed)
+    size = environment.action_spec().shape[0]
+    actions = [drive.action(step, generator, size) for step in range(steps)]
+    substeps = environment.task.substeps
+    environment.reset()
+    model, data = environment.physics.model.ptr, environment.physics.data.ptr
+    bare = mujoco.MjData(model)
+    mujoco.mj_copyData(bare, model, data)
+    start = time.process_time()
+    for action in actions:
+        environment.step(action)
+    middle = time.process_time()
+    for action in actions:
+        bare.ctrl[:] = action
+        for _ in range(substeps):
+            mujoco.mj_step(model, bare)
+    return middle - start, time.process_time() - middle
+
+
+@contextlib.contextmanager
+def _timed_hooks(task) -> Iterator[dict[str, float]]:
+    """CPU seconds in the hooks of a task, while the context is open."""
+    seconds = dict.fromkeys(_HOOKS, 0.0)
+
+    def timed(name: str) -> Callable:
+        hook = getattr(task, name)
+
+        def call(*arguments):
+            start = time.process_time()
+            hook(*arguments)
+            seconds[name] += time.process_time() - start
+
+        return call
+
+    for name in _HOOKS:
+        setattr(task, name, timed(name))
+    try:
+        yield seconds
+    finally:
+        for name in _HOOKS:
+            delattr(task, name)
+
+
+@contextlib.contextmanager
+def _mujoco_timers(data: mujoco.MjData) -> Iterator[Callable[[str], float]]:
+    """MuJoCo's timers, read by name, running while the context is open."""
+
+    def read(stage: str) -> float:
+        return data.timer[int(getattr(mujoco.mjtTimer, f"mjTIMER_{stage}"))].duration
+
+    for timer in data.timer:
+        timer.duration, timer.number = 0.0, 0
+    mujoco.set_mjcb_time(time.perf_counter)
+    try:
+        yield read
+    finally:
+        mujoco.set_mjcb_time(None)
