@@ -44,7 +44,7 @@ CONFINED = {
     "coacd": {"anatomy/"},
     "numba": {"imaging/kernel.py"},
     "gymnasium": {"simulation/gymnasium.py", "gym.py"},
-    "tyro": {"cli.py"},
+    "tyro": {"cli/"},
 }
 # Slow to import: only within functions, unless a module is itself loaded late.
 LATE = (

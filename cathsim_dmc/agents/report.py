@@ -1,7 +1,6 @@
-"""What `cathsim eval`, `record` and `demo` do: evaluations, heatmaps, recordings."""
+"""What `cathsim eval` and `record` do: evaluations, heatmaps, recordings."""
 
 import dataclasses
-import sys
 import time
 from collections.abc import Mapping
 from pathlib import Path
@@ -11,7 +10,7 @@ import numpy as np
 from torchrl.envs import EnvBase
 
 from cathsim_dmc import suite
-from cathsim_dmc.agents import configs, evaluation, policies, training
+from cathsim_dmc.agents import evaluation, policies
 from cathsim_dmc.agents.checkpoint import Checkpoint
 from cathsim_dmc.analysis import heatmap
 from cathsim_dmc.recording import recorder, rerun_log
@@ -259,35 +258,3 @@ def _images(environment, episode: Episode) -> np.ndarray:
         machine = Angiograph(surface.vertices, surface.faces, task.config.fluoroscopy)
         fluoroscope = machine.planes()[0]
     return fluoroscope.render(episode.catheter, task.catheter.device.outer_radius)
-
-
-def demo(out: str | Path, frames: int, seed: int) -> int:
-    """Trains PPO on type1_bca, evaluates, draws and records it.
-
-    A run that is there is continued or, if it is complete, only evaluated.
-    """
-    out = Path(out)
-    config = configs.make_config(
-        "ppo", "demo", task="type1_bca", total_frames=frames, seed=seed
-    )
-    _say(f"1/3 training PPO on {config.task}, {frames} frames -> {out}")
-    result = training.train(config, out, resume=(out / "config.json").exists())
-    if result.interrupted:
-        _say(f"interrupted at {result.frames} frames; run it again to go on")
-        return 1
-    _say("2/3 evaluating 30 episodes, and the random policy on the same seeds")
-    report = evaluate(out, out_dir=out)
-    report.print()
-    _say("3/3 recording an episode")
-    episode = record(out, out / "episode.rrd")
-    checkpoint = Checkpoint.open(out)
-    _say(
-        f"{episode.steps} steps, {episode.termination}. In {out}: "
-        f"{checkpoint.path.relative_to(out)} (policy), metrics.csv, evaluation.json, "
-        f"heatmap.png, episode.rrd (open it: cathsim replay {out / 'episode.rrd'})"
-    )
-    return 0
-
-
-def _say(text: str) -> None:
-    print(text, file=sys.stderr, flush=True)

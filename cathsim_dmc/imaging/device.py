@@ -102,4 +102,6 @@ def _chain(points: ArrayLike, radius: ArrayLike):
         ) from None
     if not (radius > 0.0).all():
         raise ValueError(f"the smallest radius is {radius.min():g} m; it must be > 0.")
-    return points.reshape(-1, links + 1, 3), radius.reshape(-1, links), batch
+    # Copied, for what is compiled is compiled again for another kind of array.
+    radius = radius.reshape(-1, links).copy()
+    return points.reshape(-1, links + 1, 3), radius, batch

@@ -7,9 +7,8 @@ from dm_control import composer
 
 from cathsim_dmc.anatomy import phantom as anatomies
 from cathsim_dmc.entities import devices
-from cathsim_dmc.entities.arena import AngiographyArena
 from cathsim_dmc.entities.catheter import Catheter
-from cathsim_dmc.entities.phantom import CONTACT_SOLIMP, CONTACT_SOLREF, Phantom
+from cathsim_dmc.entities.phantom import Phantom
 from cathsim_dmc.entities.robot import Robot, follower_posture
 from cathsim_dmc.entities.sheath import Sheath
 from cathsim_dmc.imaging import angiograph
@@ -25,6 +24,7 @@ from cathsim_dmc.tasks import (
     variations,
 )
 from cathsim_dmc.tasks.config import PHYSICS_TIMESTEP, NavigationConfig
+from cathsim_dmc.tasks.scene import Scene
 
 _STATE = mujoco.mjtState.mjSTATE_INTEGRATION.value
 
@@ -80,55 +80,13 @@ class Navigation(composer.Task):
             self._angiograph = angiograph.Angiograph(
                 anatomy.surface.vertices, anatomy.surface.faces, config.fluoroscopy
             )
-        self._build_scene()
+        self._scene = Scene.build(anatomy, self._device, self._placement, config)
+        if set(cameras.KINDS) & set(self._observation_names):
+            cameras.add_tip_camera(self._scene.arena, self._scene.catheter)
+        self._num_actions = len(self._scene.catheter.actuators)
         self.set_timesteps(cannulation.CONTROL_TIMESTEP, config.physics_timestep)
         self._layout = None
         self._observables = None
-
-    def _build_scene(self):
-        config, device = self._config, self._device
-        area = np.pi * device.outer_radius**2
-        self._arena = AngiographyArena(device_density=device.linear_density / area)
-        self._phantom = Phantom(
-            self._anatomy, config.friction, goal_radius=config.goal_radius
-        )
-        self._arena.attach(self._phantom)
-        torsion = config.torsion_joints
-        if torsion is None:
-            torsion = 4 if config.rotation else 0
-        self._catheter = Catheter(
-            device,
-            devices.Discretisation(
-                working_length=self._placement.working_length,
-                shaft_link=config.shaft_link,
-                torsion_joints=torsion,
-            ),
-            stroke=self._placement.stroke,
-            rotation=config.rotation,
-            solref=CONTACT_SOLREF,
-            solimp=CONTACT_SOLIMP,
-            friction=config.friction,
-        )
-        self._sheath = Sheath(
-            length=self._placement.working_length - self._placement.start_depth,
-            device_radius=device.outer_radius,
-            solref=CONTACT_SOLREF,
-            solimp=CONTACT_SOLIMP,
-        )
-        self._robot = Robot(device_radius=device.outer_radius)
-        mouth = self._placement
-        frame = {"quat": mouth.quaternion}
-        self._attach(self._sheath, pos=mouth.inlet, **frame)
-        self._attach(self._catheter, pos=mouth.start, **frame)
-        self._attach(self._robot, pos=mouth.robot, **frame)
-        self._phantom.add_wall_sensor(self._catheter.links[0])
-        placement.add_cameras(self._arena, self._anatomy)
-        if set(cameras.KINDS) & set(self._observation_names):
-            cameras.add_tip_camera(self._arena, self._catheter)
-
-    def _attach(self, entity, **frame):
-        site = self._arena.mjcf_model.worldbody.add("site", group=5, **frame)
-        self._arena.attach(entity, site)
 
     def _restart(self):
         self._outcome = None
@@ -138,14 +96,14 @@ class Navigation(composer.Task):
         self._step = 0
         self._termination = None
         self._error = None
-        self._action = np.zeros(len(self._catheter.actuators))
+        self._action = np.zeros(self._num_actions)
 
     # Composer's own interface.
 
     @property
     def root_entity(self):
         """The arena."""
-        return self._arena
+        return self._scene.arena
 
     @property
     def task_observables(self):
@@ -165,7 +123,7 @@ class Navigation(composer.Task):
     def action_spec(self, physics) -> dm_env.specs.BoundedArray:
         """Bounds [-1, 1] for each actuator."""
         del physics
-        names = [actuator.name for actuator in self._catheter.actuators]
+        names = [actuator.name for actuator in self._scene.catheter.actuators]
         return dm_env.specs.BoundedArray(
             shape=(len(names),),
             dtype=np.float64,
@@ -179,9 +137,11 @@ class Navigation(composer.Task):
         del random_state
         model = physics.model.ptr
         self._layout = readings.Layout(
-            model, self._catheter.mjcf_model.model, self._phantom.mjcf_model.model
+            model,
+            self._scene.catheter.mjcf_model.model,
+            self._scene.phantom.mjcf_model.model,
         )
-        self._robot_qpos = physics.bind(self._robot.joints).qposadr
+        self._robot_qpos = physics.bind(self._scene.robot.joints).qposadr
         self._variation = self.model_variation(model)
         self._screen = self.screen(model, 1)
         self._delay = self.action_delay(1)
@@ -209,7 +169,7 @@ class Navigation(composer.Task):
         self._screen.restart(0, episode.deviation)
         if episode.goal_shift is not None:
             self._meaning = self._usual_meaning.shifted(episode.goal_shift)
-            goal = self._phantom.goals.get(self._goal.name)
+            goal = self._scene.phantom.goals.get(self._goal.name)
             if goal is not None:  # only looks
                 physics.bind(goal).pos = self._meaning.goal
         data.qpos[:] = self.start_qpos(data.qpos, episode.displacement)
@@ -223,10 +183,10 @@ class Navigation(composer.Task):
         """
         qpos = np.array(qpos)
         joints = placement.start_joints(
-            self._catheter.link_lengths, self._placement.start_depth, displacement
+            self._scene.catheter.link_lengths, self._placement.start_depth, displacement
         )
         columns = np.arange(self._layout.qpos.start, self._layout.qpos.stop)
-        names = [joint.name for joint in self._catheter.joints]
+        names = [joint.name for joint in self._scene.catheter.joints]
         for name, value in joints.items():
             qpos[..., columns[names.index(name)]] = value
         return self.posed_robot(qpos)
@@ -244,8 +204,7 @@ class Navigation(composer.Task):
     def before_step(self, physics, action, random_state):
         """Applies the action and moves the robot along."""
         del random_state
-        shape = (len(self._catheter.actuators),)
-        self._action = cannulation.check_action(action, shape)
+        self._action = cannulation.check_action(action, (self._num_actions,))
         data = physics.data.ptr
         data.ctrl[:] = self._delay.pass_on(self._action[None])[0]
         self.posed_robot(data.qpos)
@@ -371,8 +330,8 @@ class Navigation(composer.Task):
         return variations.ModelVariation(
             model,
             self._config.randomisation,
-            self._catheter.mjcf_model.model,
-            self._phantom.mjcf_model.model,
+            self._scene.catheter.mjcf_model.model,
+            self._scene.phantom.mjcf_model.model,
         )
 
     def screen(self, model, simulations: int) -> screen.Screen:
@@ -386,7 +345,7 @@ class Navigation(composer.Task):
                 self._observation_names,
                 model,
                 self._config.cameras,
-                self._catheter.mjcf_model.model,
+                self._scene.catheter.mjcf_model.model,
             ),
         )
 
@@ -394,7 +353,7 @@ class Navigation(composer.Task):
         """Holds back the actions of a number of simulations."""
         return variations.ActionDelay(
             simulations,
-            len(self._catheter.actuators),
+            self._num_actions,
             self._config.randomisation.longest_delay,
         )
 
@@ -465,22 +424,22 @@ class Navigation(composer.Task):
     @property
     def catheter(self) -> Catheter:
         """The device."""
-        return self._catheter
+        return self._scene.catheter
 
     @property
     def phantom(self) -> Phantom:
         """Wall, goals and load cell."""
-        return self._phantom
+        return self._scene.phantom
 
     @property
     def robot(self) -> Robot:
         """The follower."""
-        return self._robot
+        return self._scene.robot
 
     @property
     def sheath(self) -> Sheath:
         """The introducer sheath."""
-        return self._sheath
+        return self._scene.sheath
 
     @property
     def layout(self) -> readings.Layout:

@@ -1,0 +1,83 @@
+"""`cathsim validate rod`, `wall` and `forces`; `cathsim benchmark speed`."""
+
+import sys
+from pathlib import Path
+
+from tyro.extras import SubcommandApp
+
+from cathsim_dmc.cli.options import show
+
+validations = SubcommandApp()
+benchmarks = SubcommandApp()
+
+
+@validations.command
+def rod(figure: Path | None = None, json: bool = False) -> int:
+    """Bending, buckling and twist of the device against theory.
+
+    Args:
+        figure: Where to draw the comparison, a PNG.
+        json: Print one JSON object and nothing else.
+    """
+    from cathsim_dmc.analysis import validation
+
+    return show(validation.validate_rod(figure), json)
+
+
+@validations.command
+def wall(
+    figure: Path | None = None,
+    phantom: list[str] = [],  # noqa: B006  # tyro reads it, nobody writes it
+    convergence: bool = True,
+    json: bool = False,
+) -> int:
+    """Fidelity of the wall, friction against the capstan equation, convergence.
+
+    Args:
+        figure: Where to draw the comparison, a PNG.
+        phantom: Directories of further anatomies, such as an imported scan.
+        convergence: Include the studies of time step and link length.
+        json: Print one JSON object and nothing else.
+    """
+    from cathsim_dmc.analysis import validation
+
+    report = validation.validate_wall(figure, phantom, with_convergence=convergence)
+    return show(report, json)
+
+
+@validations.command
+def forces(
+    figure: Path | None = None,
+    episode: Path | None = None,
+    mean: float = 0.4,
+    sd: float = 0.02,
+    margin: float = 0.1,
+    json: bool = False,
+) -> int:
+    """Force balance, known loads, and the published protocol.
+
+    Args:
+        figure: Where to draw density and cumulative plots, a PNG.
+        episode: Recorded cannulation (.npz of `cathsim record`) for the protocol;
+            scripted insertions by default.
+        mean: Of the normal reference, N; the published one is unverified.
+        sd: Standard deviation of the reference, N.
+        margin: Of the equivalence test, N.
+        json: Print one JSON object and nothing else.
+    """
+    from cathsim_dmc.analysis import validation
+
+    report = validation.validate_forces(figure, episode, mean, sd, margin)
+    return show(report, json)
+
+
+@benchmarks.command
+def speed(json: bool = False) -> int:
+    """Measure how fast the simulator is. Run it with nothing else running.
+
+    Args:
+        json: Print one JSON object and nothing else.
+    """
+    from cathsim_dmc.analysis.speed import report
+
+    return show(report.speed(lambda text: print(text, file=sys.stderr)), json)

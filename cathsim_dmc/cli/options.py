@@ -1,0 +1,51 @@
+"""What several commands share: options, exit codes, printing."""
+
+import dataclasses
+import json
+from typing import Annotated, Any
+
+from tyro import conf
+
+# Exit codes beside 0: a check has failed; the input cannot be used.
+CHECK_FAILED, BAD_INPUT = 1, 2
+EVALUATION_SEED = 1_000_000  # apart from the seeds of training
+
+Task = Annotated[str, conf.Positional]
+
+
+@dataclasses.dataclass(frozen=True)
+class OwnAnatomy:
+    """An anatomy of one's own, for `navigate`.
+
+    Attributes:
+        phantom: Directory of an anatomy.
+        goal: Name of the goal in it.
+    """
+
+    phantom: str | None = None
+    goal: str | None = None
+
+    @property
+    def task_kwargs(self) -> dict[str, Any]:
+        """What was given, as options of the task."""
+        given = dataclasses.asdict(self)
+        return {key: value for key, value in given.items() if value is not None}
+
+
+NO_ANATOMY = OwnAnatomy()
+
+
+def print_json(values: Any) -> None:
+    """Prints one JSON object."""
+    print(json.dumps(values, indent=2))
+
+
+def show(report: Any, as_json: bool) -> int:
+    """Prints a report of checks; returns the exit code."""
+    if as_json:
+        print_json(report.as_dict())
+    else:
+        from rich.console import Console
+
+        Console().print(report.table())
+    return 0 if report.passed else CHECK_FAILED

@@ -1,0 +1,105 @@
+"""`cathsim phantom import`, `generate` and `check`."""
+
+import sys
+from pathlib import Path
+from typing import Annotated, Literal
+
+from tyro import conf
+from tyro.extras import SubcommandApp
+
+from cathsim_dmc.cli.options import print_json, show
+
+phantoms = SubcommandApp()
+
+
+@phantoms.command(name="import")
+def import_phantom(
+    mesh: Annotated[Path, conf.Positional],
+    /,
+    centreline: list[Path],
+    out: Path,
+    name: str | None = None,
+    units: Literal["mm", "cm", "m"] = "mm",
+    frame: Literal["LPS", "RAS"] = "LPS",
+    inlet: tuple[float, float, float] | None = None,
+    wall: Literal["prisms", "coacd"] = "prisms",
+    threshold_mm: float | None = None,
+) -> int:
+    """Turn the surface of a lumen and its centrelines into an anatomy.
+
+    Args:
+        mesh: Closed surface of the lumen: OBJ, STL or PLY.
+        centreline: 3D Slicer curves (.mrk.json) or CSV files, one per branch.
+        out: Directory of the anatomy.
+        name: Of the anatomy.
+        units: Of mesh, CSV centrelines and inlet.
+        frame: Of mesh, CSV centrelines and inlet.
+        inlet: Where the device enters: a free end, or a place to cut the lumen at.
+        wall: Pieces near the surface, or CoACD's coarse ones (needs the extra coacd).
+        threshold_mm: Of CoACD, the concavity of a piece; 3.5 by default.
+    """
+    from cathsim_dmc.anatomy import scan
+
+    anatomy = scan.import_scan(
+        mesh,
+        centreline,
+        units=units,
+        mesh_frame=frame,
+        name=name or out.name,
+        inlet=inlet,
+        wall=wall,
+        threshold=None if threshold_mm is None else threshold_mm * 1e-3,
+        progress=lambda text: print(text, file=sys.stderr),
+    )
+    anatomy.save(out)
+    print_json({"directory": str(out), **scan.describe(anatomy)})
+    return 0
+
+
+@phantoms.command
+def generate(
+    kind: Annotated[str, conf.Positional],
+    /,
+    out: Path,
+    seed: int | None = None,
+) -> int:
+    """Generate an arch.
+
+    Args:
+        kind: A named arch such as type1, type2, type3, bovine; with a seed, one drawn
+            from the anatomical distributions of that type.
+        out: Directory of the anatomy.
+        seed: Draw the arch at random.
+    """
+    import numpy as np
+
+    from cathsim_dmc.anatomy import arch
+
+    if kind not in arch.ARCHES:
+        raise ValueError(f"no arch {kind!r}; there are {', '.join(arch.ARCHES)}")
+    if seed is None:
+        anatomy = arch.load(kind)
+    else:
+        drawn = {"type1": "I", "type2": "II", "type3": "III"}.get(kind)
+        parameters = arch.sample(
+            np.random.RandomState(seed), drawn, bovine=kind == "bovine"
+        )
+        anatomy = arch.build_arch(parameters, name=f"{kind}-{seed}")
+    anatomy.save(out)
+    print(f"{len(anatomy.wall)} wall pieces, goals {', '.join(anatomy.goals)}: {out}")
+    return 0
+
+
+@phantoms.command
+def check(phantom: Annotated[str, conf.Positional], /, json: bool = False) -> int:
+    """Check an anatomy: intrusion and coverage of its wall, patency of its vessels.
+
+    Args:
+        phantom: Directory of an anatomy, or the name of an arch.
+        json: Print one JSON object and nothing else.
+    """
+    from cathsim_dmc import suite
+    from cathsim_dmc.analysis import validation
+
+    anatomy = suite.load_anatomy(phantom)
+    return show(validation.validate_anatomy({anatomy.name: anatomy}), json)

@@ -1,0 +1,52 @@
+"""The speed benchmark: what it measures, not how fast this machine is."""
+
+import mujoco
+import numpy as np
+import pytest
+
+from cathsim_dmc.analysis.speed import pace
+
+
+@pytest.fixture(scope="module")
+def environment():
+    loaded = pace.load()
+    yield loaded
+    loaded.close()
+
+
+def test_a_pace_has_a_time_for_every_control_step(environment):
+    run = pace.pace(environment, pace.PUSH, 20)
+    assert run.seconds.shape == run.insertion.shape == run.contacts.shape == (20,)
+    assert (run.seconds > 0).all() and (np.diff(run.insertion)[1:] > 0).all()
+    assert run.factor == pytest.approx(20 * 0.04 / run.seconds.sum())
+
+
+def test_every_step_of_a_pace_falls_into_one_depth(environment):
+    run = pace.Pace(
+        insertion=np.array([0.0, 0.05, 0.1, 0.25, 0.4]),
+        seconds=np.array([0.01, 0.03, 0.02, 0.04, 0.04]),
+        contacts=np.array([0, 2, 5, 7, 9]),
+    )
+    table = run.by_depth()
+    assert list(table) == ["0–100 mm", "100–200 mm", "200–300 mm", "300+ mm"]
+    assert table["0–100 mm"]["real_time_factor"] == pytest.approx(2 * 0.04 / 0.04)
+    assert table["0–100 mm"]["contacts"] == 1
+    assert table["300+ mm"]["steps_per_second"] == pytest.approx(25)
+
+
+def test_the_account_adds_up_and_leaves_nothing_behind(environment):
+    table = pace.account(pace.RANDOM, steps=20, runs=1)
+    assert list(table)[-1] == "composer and observation"
+    assert all(part > 0 for part in table.values()), table
+    physics = sum(list(table.values())[:5])
+    # Half of a free step and more is physics, on any machine.
+    assert physics > 0.5 * sum(table.values())
+    assert mujoco.get_mjcb_time() is None
+
+
+def test_timed_hooks_are_put_back(environment):
+    task = environment.task
+    with pace._timed_hooks(task) as seconds:
+        pace.pace(environment, pace.RANDOM, 3)
+        assert "after_step" in vars(task)
+    assert "after_step" not in vars(task) and seconds["after_step"] > 0
