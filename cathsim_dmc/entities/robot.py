@@ -21,6 +21,7 @@ contact, no limit in the solver): between two poses they stand still.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Literal, NamedTuple
 
@@ -191,16 +192,19 @@ def follower_posture(
         insertion if guidewire_insertion is None else guidewire_insertion,
         rotation if guidewire_rotation is None else guidewire_rotation,
     )
-    single = all(isinstance(each, float) for each in given)
-    if not single:
+    if all(isinstance(each, float) for each in given):
+        posture = np.array(_posture(*given))
+        finite = math.isfinite(sum(given))
+    else:
         given = np.broadcast_arrays(*(np.asarray(each, np.float64) for each in given))
-    # A number that is not finite spoils every sum it is in.
-    if not np.isfinite(sum(given)).all():
+        posture = np.stack(_posture(*given), axis=-1)
+        finite = np.isfinite(posture).all()
+    if not finite:
         raise ValueError(
             "insertion, rotation, guidewire insertion and guidewire rotation must be "
             f"finite, got {given}: check for a diverged simulation"
         )
-    return np.array(_posture(*given)) if single else np.stack(_posture(*given), -1)
+    return posture
 
 
 def _posture(

@@ -113,16 +113,20 @@ def render(
     Returns:
         (N, rows, columns, planes) uint8.
     """
+    groups = _alike(machines)
     images = []
     for plane, shape in enumerate(_resolutions(machines)):
-        image = np.empty((len(points), *shape), dtype=np.uint8)
-        for chosen in _alike(machines):
+        if len(groups) == 1:
+            images.append(machines[0][plane].render(points, radius, random_states))
+            continue
+        image = np.empty((len(points), *shape, 1), dtype=np.uint8)
+        for chosen in groups:
             states = random_states and [random_states[i] for i in chosen]
             image[chosen] = machines[chosen[0]][plane].render(
                 points[chosen], radius, states
-            )[..., 0]
+            )
         images.append(image)
-    return np.stack(images, axis=-1)
+    return np.concatenate(images, axis=-1) if len(images) > 1 else images[0]
 
 
 def masks(machines: Sequence[Planes], points: np.ndarray, radius: float) -> np.ndarray:

@@ -162,20 +162,19 @@ class CArm:
         """Source to detector distance in pixels."""
         return self.source_detector / self.pitch
 
-    def camera(self, points: ArrayLike) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def camera(self, points: ArrayLike) -> np.ndarray:
         """Coordinates of world points along the axes, seen from the source.
 
         Args:
             points: (..., 3) world frame, m.
 
         Returns:
-            right, down, depth: (...) float64 each, m.
+            (..., 3) float64: right, down and depth, m.
         """
         relative = np.asarray(points, dtype=np.float64) - self.source
         # Sums written out: a matrix product would round differently for batches.
         terms = relative[..., None, :] * self.axes
-        total = terms[..., 0] + terms[..., 1] + terms[..., 2]
-        return total[..., 0], total[..., 1], total[..., 2]
+        return terms[..., 0] + terms[..., 1] + terms[..., 2]
 
     def project(self, points: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
         """Pixel coordinates of world points.
@@ -189,7 +188,7 @@ class CArm:
                 coordinates outside it.
             depth: (...) float64, distance from the source along the beam axis, m.
         """
-        right, down, depth = self.camera(points)
+        right, down, depth = np.moveaxis(self.camera(points), -1, 0)
         scale = self.focal_length / np.where(depth > NEAREST, depth, np.nan)
         rows, columns = self.resolution
         column = right * scale + 0.5 * (columns - 1)

@@ -111,11 +111,6 @@ def quantum_noise(
     return result.reshape(signal.shape)
 
 
-def blurs(sigma: float) -> bool:
-    """Whether a point spread of `sigma` px reaches beyond its own pixel."""
-    return sigma >= LEAST_BLUR
-
-
 def blurred(signal: ArrayLike, sigma: float) -> np.ndarray:
     """Signal spread by a Gaussian of `sigma` pixels; edges continue outwards.
 
@@ -128,7 +123,7 @@ def blurred(signal: ArrayLike, sigma: float) -> np.ndarray:
         (..., rows, columns) float32.
     """
     signal = np.asarray(signal, dtype=np.float32)
-    if not blurs(sigma):
+    if sigma < LEAST_BLUR:
         return signal
     reach = math.ceil(3.0 * sigma)
     weight = np.exp(-0.5 * (np.arange(-reach, reach + 1) / sigma) ** 2)

@@ -68,7 +68,7 @@ def device_attenuation(
 
     image = np.zeros((len(points), *carm.resolution), dtype=np.float32)
     with np.errstate(invalid="ignore"):  # joints that are not finite
-        camera = np.stack(carm.camera(points), axis=-1)
+        camera = carm.camera(points)
     kernel.add_devices(
         image,
         camera,
@@ -91,17 +91,16 @@ def _chain(points: ArrayLike, radius: ArrayLike):
     batch, links = points.shape[:-2], points.shape[-2] - 1
     radius = np.asarray(radius, dtype=np.float64)
     per_link = radius.ndim == points.ndim - 1
+    # Filled in, and not a broadcast view: what is compiled is compiled again for
+    # another kind of array.
+    radii = np.empty((*batch, links))
     try:
-        radius = np.broadcast_to(
-            radius if per_link else radius[..., None], (*batch, links)
-        )
+        radii[...] = radius if per_link else radius[..., None]
     except ValueError:
         raise ValueError(
             f"radius has shape {radius.shape}; for points {points.shape} give one "
             f"number, {batch} or {(*batch, links)}."
         ) from None
-    if not (radius > 0.0).all():
-        raise ValueError(f"the smallest radius is {radius.min():g} m; it must be > 0.")
-    # Copied, for what is compiled is compiled again for another kind of array.
-    radius = radius.reshape(-1, links).copy()
-    return points.reshape(-1, links + 1, 3), radius, batch
+    if not (radii > 0.0).all():
+        raise ValueError(f"the smallest radius is {radii.min():g} m; it must be > 0.")
+    return points.reshape(-1, links + 1, 3), radii.reshape(-1, links), batch

@@ -213,43 +213,19 @@ class Fluoroscope:
 
     def _developed(self, depth: np.ndarray, states) -> np.ndarray:
         """Grey images of optical depths (B, rows, columns); `depth` is used up."""
-        sigma = self.blur / self.carm.pitch
-        if states is None and not detector.blurs(sigma):
-            return self._retouched(depth)
         np.negative(depth, out=depth)
         signal = np.exp(depth, out=depth)
         signal *= self.signal
         if states is not None:
             signal = detector.quantum_noise(signal, self.quanta, states)
-        signal = detector.blurred(signal, sigma)
+        signal = detector.blurred(signal, self.blur / self.carm.pitch)
         if self.roadmap > 0.0:
             signal = signal * self._roadmap_gain
         return detector.grey(signal, self.gain)
-
-    def _retouched(self, depth: np.ndarray) -> np.ndarray:
-        """The same where pixels are independent: only those of the device change."""
-        touched = np.flatnonzero(depth)
-        pixel = touched % self.signal.size
-        signal = np.exp(-depth.reshape(-1)[touched])
-        signal *= self.signal.reshape(-1)[pixel]
-        if self.roadmap > 0.0:
-            signal *= self._roadmap_gain.reshape(-1)[pixel]
-        image = np.empty(depth.shape, dtype=np.uint8)
-        image[:] = self._empty_image
-        image.reshape(-1)[touched] = detector.grey(signal, self.gain)
-        return image
 
     @cached_property
     def _roadmap_gain(self) -> np.ndarray:
         return detector.roadmap_gain(self.vessel_mask, self.roadmap, self.gain)
-
-    @cached_property
-    def _empty_image(self) -> np.ndarray:
-        """(rows, columns) uint8, the image without device, noise or blur."""
-        signal = self.signal
-        if self.roadmap > 0.0:
-            signal = signal * self._roadmap_gain
-        return detector.grey(signal, self.gain)
 
     def masks(self, points: ArrayLike, radius: ArrayLike) -> Masks:
         """Which pixels show the device, and which the vessel.

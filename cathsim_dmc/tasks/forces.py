@@ -128,10 +128,14 @@ class WallForce(NamedTuple):
     peak_max: np.ndarray
 
 
+NO_FORCE = WallForce(*np.zeros(4))
+
+
 def wall_force(magnitude: np.ndarray) -> WallForce:
     """Summarises the contact magnitudes (..., S, M) of S substeps, in N."""
     if not magnitude.shape[-1]:
-        return WallForce(*np.zeros((4, *magnitude.shape[:-2])))
+        shape = magnitude.shape[:-2]
+        return WallForce(*np.zeros((4, *shape))) if shape else NO_FORCE
     # One contact after the other: numpy's pairwise sum along the last axis would depend
     # on the number of empty places, and so on what other simulations touch.
     total = magnitude.cumsum(-1)[..., -1]

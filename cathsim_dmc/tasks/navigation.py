@@ -141,6 +141,7 @@ class Navigation(composer.Task):
             self._scene.catheter.mjcf_model.model,
             self._scene.phantom.mjcf_model.model,
         )
+        self._substeps = self.substeps  # which asks the MJCF model, and takes its time
         self._robot_qpos = physics.bind(self._scene.robot.joints).qposadr
         self._variation = self.model_variation(model)
         self._screen = self.screen(model, 1)
@@ -235,7 +236,7 @@ class Navigation(composer.Task):
         del action, random_state
         if self._substep:
             return
-        self._substep = self.substeps - self.physics_steps_per_control_step
+        self._substep = self._substeps - self.physics_steps_per_control_step
         model, data = physics.model.ptr, physics.data.ptr
         contacts = data.sensordata[self._layout.wall_contacts]  # not a copy
         for substep in range(self._substep):

@@ -118,7 +118,7 @@ _HOOKS = {
 }
 
 
-def account(drive: Drive, steps: int = 150, runs: int = 3) -> dict[str, float]:
+def account(drive: Drive, steps: int = 150, runs: int = 7) -> dict[str, float]:
     """Where a control step goes.
 
     The stages of `mj_step` come from MuJoCo's own timers, whose shares are applied to
@@ -130,11 +130,11 @@ def account(drive: Drive, steps: int = 150, runs: int = 3) -> dict[str, float]:
     """
     environment = load()
     task = environment.task
-    bare, whole, hooks = [], [], []
+    bare, added, hooks = [], [], []
     for run in range(runs + 1):
         ours, theirs = against_bare_steps(environment, drive, steps, run)
         bare.append(theirs)
-        whole.append(ours)
+        added.append(ours - theirs)
         with _timed_hooks(task) as seconds:
             pace(environment, drive, steps, run)
         hooks.append([seconds[name] for name in _HOOKS])
@@ -149,7 +149,9 @@ def account(drive: Drive, steps: int = 150, runs: int = 3) -> dict[str, float]:
     table = {name: physics * part / total for name, part in stages.items()}
     table["other physics"] = physics - sum(table.values())
     table.update(zip(_HOOKS.values(), np.median(hooks[1:], axis=0), strict=True))
-    table["composer and observation"] = np.median(whole[1:]) - sum(table.values())
+    table["composer and observation"] = (
+        physics + np.median(added[1:]) - sum(table.values())
+    )
     return {name: 1e6 * float(value) / steps for name, value in table.items()}
 
 
