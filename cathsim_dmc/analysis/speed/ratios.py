@@ -66,7 +66,9 @@ def thread_scaling(steps: int = 30) -> tuple[list[float], float, dict[str, float
             cpu[-1][threads] = time.process_time() - start[1]
     total = steps * NUM_SIMULATIONS
     rates = {
-        f"{threads} threads": statistics.median(total / run[threads] for run in wall)
+        f"{threads} thread{'s' * (threads > 1)}": statistics.median(
+            total / run[threads] for run in wall
+        )
         for threads in batches
     }
     slower = statistics.median(run[2] / run[1] for run in cpu[1:])
