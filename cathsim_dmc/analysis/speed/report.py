@@ -45,7 +45,7 @@ def speed(say: Callable[[str], None] = lambda text: None) -> Report:
     say("overheads")
     overheads, rates = _overheads()
     say("construction, memory, imports")
-    checks += overheads + _construction() + _processes()
+    checks += overheads + _images() + _construction() + _processes()
     say("where a step goes")
     stages = {drive.name: account(drive, STEPS) for drive in (RANDOM, PUSH)}
     findings = {
@@ -86,16 +86,25 @@ def _overheads() -> tuple[list[Check], dict[str, float]]:
         for drive in (RANDOM, PUSH)
     ]
     torchrl, rate = ratios.torchrl_overhead()
-    threads, slower, rates = ratios.thread_scaling()
-    cores = f"; {slower:.2f} x the CPU time on two cores"
-    batched, single = ratios.batched_image_ratio(), ratios.image_ratio()
+    threads, undisturbed, rates = ratios.thread_scaling()
+    cores = f"; {undisturbed:.2f} x at equal speed of the cores"
     checks += [
         _ratio(Check.at_most, "TorchRL batched step / Batch.step", torchrl, 1.2),
         _ratio(Check.at_least, "two threads / one", threads, 1.85, cores),
-        _ratio(Check.at_least, "image / internal, batched", batched, 0.8),
-        _ratio(Check.at_least, "image / internal, suite", single, 0.8),
     ]
     return checks, {**rates, "TorchRL, 1 thread": rate}
+
+
+def _images() -> list[Check]:
+    batched, single = ratios.batched_image_ratio(), ratios.image_ratio()
+    return [
+        _ratio(Check.at_least, "image / internal, batched", batched, 0.8),
+        _ratio(Check.at_least, "image / internal, suite", single, 0.8),
+        *(
+            Check.at_least(f"fluoroscopy, {name}", rate, 1500, "frames/s")
+            for name, rate in ratios.frame_rates().items()
+        ),
+    ]
 
 
 def _ratio(check: Callable, name: str, runs: list[float], bar: float, note: str = ""):
