@@ -294,6 +294,7 @@ def test_devices_outside_the_view_or_broken_leave_the_rest():
         (np.zeros((4, 2)), RADIUS, r"\(\.\.\., n, 3\)"),
         (curve(), 0.0, "> 0"),
         (curve(), np.full(12, RADIUS), "radius has shape"),
+        (curve(), 0.5, "px in radius"),
     ],
 )
 def test_wrong_devices_are_refused(points, radius, message):

@@ -34,7 +34,8 @@ def device_thickness(
         joint that is not finite or not in front of the source are left out.
 
     Raises:
-        ValueError: if shapes do not match or a radius is not positive.
+        ValueError: if shapes do not match, a radius is not positive, or a shadow is
+            wider than 256 pixels.
     """
     return device_attenuation(carm, points, radius, mu=1.0)
 
@@ -69,7 +70,7 @@ def device_attenuation(
     image = np.zeros((len(points), *carm.resolution), dtype=np.float32)
     with np.errstate(invalid="ignore"):  # joints that are not finite
         camera = carm.camera(points)
-    kernel.add_devices(
+    widest = kernel.add_devices(
         image,
         camera,
         radius,
@@ -78,6 +79,12 @@ def device_attenuation(
         float(marker_mu),
         float(marker_length),
     )
+    if widest > kernel.WIDEST:
+        raise ValueError(
+            f"a shadow is {widest:.0f} px in radius; at most {kernel.WIDEST} can be "
+            "drawn. Lower the resolution or magnification, or check the radius "
+            "(metres)."
+        )
     return image.reshape(*batch, *carm.resolution)
 
 

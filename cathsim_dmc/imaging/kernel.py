@@ -24,6 +24,8 @@ from cathsim_dmc.imaging.carm import NEAREST
 SPACING = 1.0 / 3.0
 # Discs may lie further apart on wide shadows: this fraction of their radius.
 RELATIVE_SPACING = 0.1
+# Discs wider than this (px) are no device's, but one whose radius is in other units.
+WIDEST = 128
 
 
 def _compiled(function: Callable) -> Callable:
@@ -108,7 +110,7 @@ def add_devices(
     mu: float,
     marker_mu: float,
     marker_length: float,
-) -> None:
+) -> float:
     """Adds the optical depth of devices to images, each frame on its own.
 
     Args:
@@ -119,11 +121,15 @@ def add_devices(
         mu: attenuation of the device, 1/m.
         marker_mu: the same of the marker at its tip, 1/m.
         marker_length: of the marker, m.
+
+    Returns:
+        Radius of the widest shadow in view, px; those above `WIDEST` are not drawn.
     """
+    widest = 0.0
     for frame in range(len(image)):
         to_tip = 0.0  # arc length from the tip, m
         for link in range(radius.shape[1] - 1, -1, -1):
-            to_tip += _add_link(
+            length, wide = _add_link(
                 image[frame],
                 camera[frame],
                 link,
@@ -134,13 +140,20 @@ def add_devices(
                 marker_length,
                 to_tip,
             )
+            to_tip += length
+            widest = max(widest, wide)
+    return widest
 
 
 @_compiled
 def _add_link(
     image, camera, link, radii, focal, mu, marker_mu, marker_length, to_tip
-) -> float:
-    """Adds one link whose distal end is `to_tip` from the tip; returns its length."""
+) -> tuple[float, float]:
+    """Adds one link whose distal end is `to_tip` from the tip.
+
+    Returns:
+        its length, m, and the radius of its shadow, px, 0 if it is not in view.
+    """
     rows, columns = image.shape
     radius = radii[link]
     x0, y0, z0 = camera[link]
@@ -148,7 +161,7 @@ def _add_link(
     length = math.sqrt((x1 - x0) ** 2 + (y1 - y0) ** 2 + (z1 - z0) ** 2)
     # A link that is not finite cannot be drawn; one without length has no direction.
     if not 0.0 < length < math.inf:
-        return 0.0
+        return 0.0, 0.0
     # The two ends are lengthened by 2/3 radius: the volume of a hemispherical cap.
     cap = 2.0 / 3.0 * radius / length
     back = cap if link == 0 else 0.0
@@ -159,7 +172,7 @@ def _add_link(
     dx, dy, dz, length = dx * stretch, dy * stretch, dz * stretch, length * stretch
     nearest = min(z0, z0 + dz)
     if not nearest > NEAREST:
-        return length
+        return length, 0.0
 
     # Ends in pixels from the middle of the image.
     wide = radius * focal / nearest
@@ -172,7 +185,9 @@ def _add_link(
         or min(v0, v1) >= high
         or max(v0, v1) <= -high
     ):
-        return length
+        return length, 0.0
+    if wide > WIDEST:
+        return length, wide
 
     spacing = max(SPACING, RELATIVE_SPACING * wide)
     # A link that runs far out of the image must not take for ever.
@@ -199,4 +214,4 @@ def _add_link(
             radius * scale,
             weight,
         )
-    return length
+    return length, wide
