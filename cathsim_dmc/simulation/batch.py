@@ -213,7 +213,9 @@ class BatchSimulation:
         frame = observations.Frame(
             self._readings, self._wall_force, self._action, goal, picture
         )
-        return observations.observe(self._task.observation_names, frame)
+        observation = observations.observe(self._task.observation_names, frame)
+        # The caller's own, as composer's buffers make them for an environment.
+        return {key: np.array(value) for key, value in observation.items()}
 
     @property
     def num_simulations(self) -> int:

@@ -119,7 +119,7 @@ def tracking(frame: Frame) -> Observation:
     line = frame.readings.centreline
     return {
         "tracking_points": _flat(tracked(line), 2),
-        "tracking_goal": np.broadcast_to(frame.goal, (*line.shape[:-2], 3)).copy(),
+        "tracking_goal": np.broadcast_to(frame.goal, (*line.shape[:-2], 3)),
         **_operator(frame),
     }
 
@@ -137,7 +137,7 @@ def tracking_2d(frame: Frame) -> Observation:
 def _operator(frame: Frame) -> Observation:
     return {
         "tracking_insertion": frame.readings.insertion[..., None],
-        "tracking_action": frame.action.copy(),
+        "tracking_action": frame.action,
     }
 
 
@@ -145,7 +145,7 @@ def goal(frame: Frame) -> Observation:
     """Where the goal is, in the world and from the head."""
     head = frame.readings.head
     return {
-        "goal_position": np.broadcast_to(frame.goal, head.shape).copy(),
+        "goal_position": np.broadcast_to(frame.goal, head.shape),
         "goal_from_head": frame.goal - head,
     }
 
@@ -240,7 +240,7 @@ def needs_fluoroscopy(names: Sequence[str]) -> bool:
 
 
 def observe(names: Sequence[str], frame: Frame) -> Observation:
-    """Computes the named observations; arrays are the caller's own."""
+    """Computes the named observations; arrays may share memory with the frame."""
     observation: Observation = {}
     for name in names:
         observation.update(OBSERVATIONS[name](frame))
