@@ -19,6 +19,7 @@ _SUBMODULES = (
     "simulation",
     "suite",
     "tasks",
+    "validation",
 )
 
 

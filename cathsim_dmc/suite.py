@@ -20,7 +20,7 @@ from dm_control import composer
 from dm_control import suite as dm_suite
 from dm_control.utils import containers
 
-from cathsim_dmc.anatomy import phantom as anatomies
+from cathsim_dmc.anatomy import Anatomy, Goal
 from cathsim_dmc.tasks import navigation
 
 DOMAIN = "cathsim"
@@ -56,8 +56,8 @@ def type2_lcca(random=None, environment_kwargs=None, **options):
 
 @SUITE.add()
 def navigate(
-    phantom: "str | Path | anatomies.Anatomy" = "type1",
-    goal: "str | anatomies.Goal" = "bca",
+    phantom: "str | Path | Anatomy" = "type1",
+    goal: "str | Goal" = "bca",
     random=None,
     environment_kwargs=None,
     **options,
@@ -114,15 +114,15 @@ def load(
     )
 
 
-def load_anatomy(phantom: "str | Path | anatomies.Anatomy") -> anatomies.Anatomy:
+def load_anatomy(phantom: "str | Path | Anatomy") -> Anatomy:
     """Returns an anatomy: itself, an arch by name, or one saved in a directory.
 
     Raises:
       ValueError: if there is none; lists the names.
     """
-    if isinstance(phantom, anatomies.Anatomy):
+    if isinstance(phantom, Anatomy):
         return phantom
-    from cathsim_dmc.anatomy import arch
+    from cathsim_dmc.anatomy.arch import arch
 
     if str(phantom) in arch.ARCHES:
         return arch.load(str(phantom))
@@ -131,7 +131,7 @@ def load_anatomy(phantom: "str | Path | anatomies.Anatomy") -> anatomies.Anatomy
             f"no phantom at {str(phantom)!r}; give a directory written by `cathsim "
             f"phantom import` or `generate`, or one of {', '.join(arch.ARCHES)}"
         )
-    return anatomies.Anatomy.load(phantom)
+    return Anatomy.load(phantom)
 
 
 def _arch_environment(name, goal, random, environment_kwargs, options):

@@ -6,7 +6,7 @@ from tensordict import TensorDict
 from torchrl.data import Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase
 
-from cathsim_dmc.agents.environments import standard_observations
+from cathsim_dmc.simulation.environments import standard_observations
 
 ACTIONS = 21
 GOAL_RADIUS = 0.15

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from cathsim_dmc.agents import compare, evaluate
 from cathsim_dmc.agents.evaluation import paired_bootstrap
-from cathsim_dmc.analysis.forces import wilson_interval
+from cathsim_dmc.analysis.force_statistics import wilson_interval
 
 SORTED = sorted(synthetic_env.SIZES)
 # Where "position" begins in the concatenated observation.

@@ -292,7 +292,7 @@ def test_it_solves_the_published_tasks_gently(name):
 @pytest.mark.parametrize("access", ["ascending", "descending"])
 @pytest.mark.parametrize("seed", [200, 203])
 def test_it_solves_random_arches(seed, access):
-    from cathsim_dmc.anatomy import arch
+    from cathsim_dmc.anatomy.arch import arch
 
     params = arch.sample(np.random.RandomState(seed), bovine=seed % 2 == 1)
     anatomy = arch.build_arch(params, access=access)

@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from cathsim_dmc.analysis.containment import Containment, points_along
-from cathsim_dmc.anatomy import arch
+from cathsim_dmc.anatomy.arch import arch
 
 RADIUS, BORE = 0.8e-3, 1.15e-3
 

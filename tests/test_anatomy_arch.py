@@ -8,8 +8,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from cathsim_dmc.anatomy import arch
-from cathsim_dmc.anatomy.arch_tree import arch_tree
+from cathsim_dmc.anatomy.arch import arch
+from cathsim_dmc.anatomy.arch.tree import arch_tree
 
 
 def bca_drop(params):

@@ -14,14 +14,14 @@ import numpy as np
 import pytest
 from scipy.spatial import ConvexHull, cKDTree
 
-from cathsim_dmc.anatomy import scan_coacd
+from cathsim_dmc.anatomy.anatomy import Anatomy, Inlet, Surface
 from cathsim_dmc.anatomy.centreline import Centreline, Vessel, VesselTree
-from cathsim_dmc.anatomy.depth import DepthField, MeshDepth
-from cathsim_dmc.anatomy.phantom import Anatomy, Inlet, Surface
-from cathsim_dmc.anatomy.scan import describe, import_scan
-from cathsim_dmc.anatomy.scan_files import read_curve, read_mesh, vessel_name
-from cathsim_dmc.anatomy.scan_inlet import cut_open, shut_behind
-from cathsim_dmc.anatomy.scan_trunk import name_trunk
+from cathsim_dmc.anatomy.scan import coacd_wall as scan_coacd
+from cathsim_dmc.anatomy.scan.files import read_curve, read_mesh, vessel_name
+from cathsim_dmc.anatomy.scan.importer import describe, import_scan
+from cathsim_dmc.anatomy.scan.inlet import cut_open, shut_behind
+from cathsim_dmc.anatomy.scan.trunk import name_trunk
+from cathsim_dmc.anatomy.wall.depth import DepthField, MeshDepth
 
 # Bounds of the wall (m): mean, 95th percentile and largest intrusion.
 INTRUSION = (0.10e-3, 0.30e-3, 0.60e-3)
@@ -576,7 +576,7 @@ def test_inlet_off_the_lumen(y_scan):
 
 def test_the_general_check_agrees(y_anatomy):
     """The figures of every anatomy hold for a scan: wall, leaks, patency."""
-    from cathsim_dmc.anatomy import fidelity
+    from cathsim_dmc.anatomy.wall import fidelity
 
     found = fidelity.intrusion(y_anatomy, 1e-3).inside
     assert found.mean <= INTRUSION[0]
@@ -588,7 +588,7 @@ def test_the_general_check_agrees(y_anatomy):
 
 @pytest.mark.slow
 def test_fine_mesh_at_the_default_tolerance(y_scan, tmp_path):
-    from cathsim_dmc.anatomy import fidelity
+    from cathsim_dmc.anatomy.wall import fidelity
 
     mesh = write_obj(tmp_path / "lumen.obj", *marched(y_scan[2], 1.1e-3))
     anatomy = import_scan(mesh, y_scan[1], spacing=0.7e-3)

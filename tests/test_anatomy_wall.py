@@ -6,8 +6,11 @@ import numpy as np
 import pytest
 from scipy.spatial import ConvexHull
 
-from cathsim_dmc.anatomy import arch, fidelity, polytope, surface, tube, wall
+from cathsim_dmc.anatomy import surface, tube
+from cathsim_dmc.anatomy.arch import arch
 from cathsim_dmc.anatomy.centreline import Centreline, Vessel, VesselTree
+from cathsim_dmc.anatomy.wall import fidelity, polytope
+from cathsim_dmc.anatomy.wall import pieces as wall
 
 # Bounds on the intrusion of wall pieces into the lumen, m.
 MEAN, P95, MAX = 0.10e-3, 0.30e-3, 0.60e-3

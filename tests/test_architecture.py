@@ -27,19 +27,25 @@ ALLOWED = {
     "suite": _TASK,
     "simulation": _TASK | {"suite"},
     "recording": _FACE,
-    "analysis": _FACE | {"recording"},
+    "analysis": _FACE | {"recording", "validation"},
+    "validation": _FACE | {"recording"},
     "agents": _FACE | {"recording", "analysis"},
     # The faces to the outside: everything but each other.
     "gym": _FACE,
     "play": _FACE | {"recording"},
-    "cli": _FACE | {"recording", "analysis", "agents", "play"},
+    "cli": _FACE | {"recording", "analysis", "validation", "agents", "play"},
 }
+_TORCHRL_FACE = (
+    "simulation/torchrl.py",
+    "simulation/composer.py",
+    "simulation/environments.py",
+)
 # Package -> files that may import it, wherever in the file the import stands.
 CONFINED = {
     # The benchmark compares the TorchRL environment with the simulation underneath.
-    "torch": {"simulation/torchrl.py", "agents/", "analysis/speed/ratios.py"},
-    "torchrl": {"simulation/torchrl.py", "agents/"},
-    "tensordict": {"simulation/torchrl.py", "agents/"},
+    "torch": {*_TORCHRL_FACE, "agents/", "analysis/speed/ratios.py"},
+    "torchrl": {*_TORCHRL_FACE, "agents/"},
+    "tensordict": {*_TORCHRL_FACE, "agents/"},
     "rerun": {"recording/"},
     "coacd": {"anatomy/"},
     "numba": {"imaging/kernel.py"},

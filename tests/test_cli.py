@@ -9,8 +9,8 @@ import pytest
 from conftest import TASKS
 
 from cathsim_dmc import cli, suite
-from cathsim_dmc.anatomy import arch
-from cathsim_dmc.anatomy.phantom import Anatomy
+from cathsim_dmc.anatomy.anatomy import Anatomy
+from cathsim_dmc.anatomy.arch import arch
 
 
 @pytest.fixture

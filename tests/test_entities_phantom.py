@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from dm_control import mjcf
 
-from cathsim_dmc.anatomy import arch
+from cathsim_dmc.anatomy.arch import arch
 from cathsim_dmc.entities import phantom as phantoms
 from cathsim_dmc.entities.arena import BLOOD_DENSITY, GRAVITY, AngiographyArena
 from cathsim_dmc.entities.phantom import Phantom

@@ -7,12 +7,12 @@ import pytest
 from conftest import TASKS
 
 from cathsim_dmc import suite
-from cathsim_dmc.anatomy import arch
-from cathsim_dmc.anatomy.phantom import Goal
-from cathsim_dmc.anatomy.scan import import_scan
+from cathsim_dmc.anatomy.anatomy import Goal
+from cathsim_dmc.anatomy.arch import arch
+from cathsim_dmc.anatomy.scan.importer import import_scan
 from cathsim_dmc.entities import devices
 from cathsim_dmc.simulation.batch import BatchSimulation
-from cathsim_dmc.tasks import cannulation, observations
+from cathsim_dmc.tasks import objectives, observations
 from cathsim_dmc.tasks.navigation import NavigationConfig
 
 
@@ -108,7 +108,7 @@ def test_wrong_device():
 
 
 def test_wrong_reward():
-    fails(["sparse", *cannulation.REWARDS], reward="sparse")
+    fails(["sparse", *objectives.REWARDS], reward="sparse")
 
 
 @pytest.mark.parametrize(

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from cathsim_dmc import suite
-from cathsim_dmc.analysis.forces import episode_statistics, step_forces
-from cathsim_dmc.anatomy.arch import ARCHES, build_arch
+from cathsim_dmc.analysis.force_statistics import episode_statistics, step_forces
+from cathsim_dmc.anatomy.arch.arch import ARCHES, build_arch
 from cathsim_dmc.recording import Episode, EpisodeRecorder, body_geoms, write_rrd
 
 STEPS = 40

@@ -357,7 +357,8 @@ def test_a_long_episode_stays_small(tmp_path):
 
 def test_reading_episodes_needs_no_rerun():
     code = (
-        "import sys; import cathsim_dmc.recording, cathsim_dmc.analysis.forces, "
+        "import sys; import cathsim_dmc.recording, "
+        "cathsim_dmc.analysis.force_statistics, "
         "cathsim_dmc.analysis.heatmap; "
         "print([m for m in ('rerun', 'matplotlib', 'dm_control', 'torch') "
         "if m in sys.modules])"

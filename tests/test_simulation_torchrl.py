@@ -9,7 +9,7 @@ from torchrl.envs.utils import check_env_specs
 
 from cathsim_dmc import suite
 from cathsim_dmc.simulation.torchrl import BatchedEnv
-from cathsim_dmc.tasks.measures import FLAGS, MEASURES
+from cathsim_dmc.tasks.info import FLAGS, MEASURES
 
 ENVS = 3
 
@@ -67,8 +67,8 @@ def test_seed_of_dm_control_env_is_that_of_the_suite():
 
 
 def test_success_is_terminated_in_torchrl():
-    from cathsim_dmc.anatomy import arch
-    from cathsim_dmc.anatomy.phantom import Goal
+    from cathsim_dmc.anatomy.anatomy import Goal
+    from cathsim_dmc.anatomy.arch import arch
 
     anatomy = arch.load("type1")
     place = anatomy.tree.vessel("aorta").centreline.at(0.09)

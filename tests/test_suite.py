@@ -14,9 +14,9 @@ from scipy.stats import qmc
 
 from cathsim_dmc import suite
 from cathsim_dmc.analysis.containment import Containment
-from cathsim_dmc.anatomy import arch
-from cathsim_dmc.anatomy.phantom import Goal
-from cathsim_dmc.tasks import cannulation, forces, observations
+from cathsim_dmc.anatomy.anatomy import Goal
+from cathsim_dmc.anatomy.arch import arch
+from cathsim_dmc.tasks import forces, objectives, observations
 
 # Those that need OpenGL are tested with the cameras.
 WITHOUT_GL = tuple(
@@ -183,7 +183,7 @@ def test_start_is_randomised_within_a_millimetre(shared_environment, task_name):
     heads = np.array(heads)
     assert len(np.unique(heads.round(9), axis=0)) == len(heads)
     # The stroke begins a millimetre in, so that the base can go back to displace it.
-    displacement = heads - (start + cannulation.START_JITTER * axis)
+    displacement = heads - (start + objectives.START_JITTER * axis)
     assert np.linalg.norm(displacement, axis=-1).max() < 1.02e-3
     assert np.linalg.norm(displacement, axis=-1).max() > 0.3e-3
 

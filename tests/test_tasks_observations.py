@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from cathsim_dmc import suite
-from cathsim_dmc.anatomy import arch
+from cathsim_dmc.anatomy.arch import arch
 from cathsim_dmc.imaging import Fluoroscope, FluoroscopyOptions
 from cathsim_dmc.tasks import observations
 from cathsim_dmc.tasks.config import NavigationConfig

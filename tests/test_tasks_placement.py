@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from cathsim_dmc.anatomy import arch
-from cathsim_dmc.anatomy.phantom import Inlet
+from cathsim_dmc.anatomy.anatomy import Inlet
+from cathsim_dmc.anatomy.arch import arch
 from cathsim_dmc.entities import devices
 from cathsim_dmc.tasks import placement, readings
 

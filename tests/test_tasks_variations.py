@@ -7,8 +7,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from cathsim_dmc import suite
-from cathsim_dmc.anatomy import arch
-from cathsim_dmc.tasks import cannulation
+from cathsim_dmc.anatomy.arch import arch
+from cathsim_dmc.tasks import objectives as objectives
 from cathsim_dmc.tasks.variations import USUAL, ActionDelay, Episode, Randomisation
 
 
@@ -50,7 +50,7 @@ def snapshot(environment):
 def test_nothing_is_drawn_but_the_displacement_by_default():
     drawn, plain = np.random.RandomState(3), np.random.RandomState(3)
     episode = Randomisation().draw(drawn)
-    displacement = cannulation.start_displacement(plain)
+    displacement = objectives.start_displacement(plain)
     np.testing.assert_array_equal(episode.displacement, displacement)
     assert episode == Episode(episode.displacement)
     assert drawn.randint(2**31) == plain.randint(2**31)
@@ -158,7 +158,7 @@ def test_roll_turns_the_plane_in_which_the_tip_bends(anatomy):
 
 def test_a_shifted_goal_moves_along_its_branch(anatomy):
     plain = make(anatomy, False).task.usual_meaning
-    for reward in cannulation.REWARDS:
+    for reward in objectives.REWARDS:
         env = make(anatomy, {"goal_shift": (-0.01, 0.01)}, reward=reward)
         goals = []
         for _ in range(6):

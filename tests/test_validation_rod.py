@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from cathsim_dmc.analysis.validation import rod
-from cathsim_dmc.analysis.validation.rig import Rig
 from cathsim_dmc.entities import devices
 from cathsim_dmc.entities.catheter import MAX_ROTATION_SPEED
+from cathsim_dmc.validation import rod
+from cathsim_dmc.validation.rig import Rig
 
 
 def test_rig_has_the_settings_of_the_tasks():

@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from cathsim_dmc.analysis.validation import theory
-from cathsim_dmc.analysis.validation.checks import Check, Report
+from cathsim_dmc.validation import theory
+from cathsim_dmc.validation.checks import Check, Report
 
 
 @settings(max_examples=15)

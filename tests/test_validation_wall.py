@@ -5,7 +5,8 @@ import dataclasses
 import numpy as np
 import pytest
 
-from cathsim_dmc.analysis.validation import convergence, forces, insertion, wall
+from cathsim_dmc.validation import convergence, insertion, wall
+from cathsim_dmc.validation import force_sensors as forces
 
 
 @pytest.mark.parametrize("friction", wall.FRICTIONS)

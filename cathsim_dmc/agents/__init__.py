@@ -14,7 +14,6 @@ from cathsim_dmc.agents.configs import (
     TrainingConfig,
     make_config,
 )
-from cathsim_dmc.agents.environments import make_env
 from cathsim_dmc.agents.evaluation import (
     Comparison,
     EvaluationResult,
@@ -23,6 +22,7 @@ from cathsim_dmc.agents.evaluation import (
     random_policy,
 )
 from cathsim_dmc.agents.training import TrainingResult, train
+from cathsim_dmc.simulation.environments import make_env
 
 __all__ = [
     "Checkpoint",

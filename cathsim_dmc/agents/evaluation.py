@@ -13,11 +13,11 @@ from tensordict import TensorDictBase
 from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type, step_mdp
 
-from cathsim_dmc.agents import environments
 from cathsim_dmc.agents.checkpoint import Checkpoint
 from cathsim_dmc.agents.episodes import EpisodeOutcome, EpisodeTracker
 from cathsim_dmc.agents.training import EnvFactory
-from cathsim_dmc.analysis.forces import wilson_interval
+from cathsim_dmc.analysis.force_statistics import wilson_interval
+from cathsim_dmc.simulation import environments
 
 Policy = Callable[[TensorDictBase], TensorDictBase | torch.Tensor]
 # Called after every step with the environment and which episodes (n,) bool still run.

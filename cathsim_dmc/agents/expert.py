@@ -16,8 +16,9 @@ import numpy as np
 import torch
 from dm_control import composer
 
-from cathsim_dmc.agents import environments, evaluation
+from cathsim_dmc.agents import evaluation
 from cathsim_dmc.agents.pursuit import Plan, Settings, State, decide
+from cathsim_dmc.simulation import environments
 from cathsim_dmc.tasks import forces, navigation
 from cathsim_dmc.tasks.readings import Readings
 

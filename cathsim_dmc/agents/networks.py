@@ -11,8 +11,8 @@ from torchrl.envs import EnvBase
 from torchrl.modules import ProbabilisticActor, TanhNormal, ValueOperator
 
 from cathsim_dmc.agents.configs import TrainingConfig
-from cathsim_dmc.agents.environments import PIXELS, VECTOR
 from cathsim_dmc.agents.normalisation import ObservationNormaliser
+from cathsim_dmc.simulation.environments import PIXELS, VECTOR
 
 # The normalised vector: what the networks read in place of VECTOR.
 NORMAL = "observation_normal"

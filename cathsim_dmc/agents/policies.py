@@ -9,8 +9,8 @@ from dm_control import composer
 from tensordict import TensorDict
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from cathsim_dmc.agents import environments
 from cathsim_dmc.agents.checkpoint import Checkpoint
+from cathsim_dmc.simulation import environments
 
 TimestepPolicy = Callable[[dm_env.TimeStep], np.ndarray]
 

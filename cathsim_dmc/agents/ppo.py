@@ -10,13 +10,13 @@ from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.value import GAE
 
 from cathsim_dmc.agents.configs import PPOConfig
-from cathsim_dmc.agents.environments import VECTOR
 from cathsim_dmc.agents.networks import (
     Signature,
     make_actor,
     make_critic,
     make_normaliser,
 )
+from cathsim_dmc.simulation.environments import VECTOR
 
 _TERMS = ("loss_objective", "loss_critic", "loss_entropy")
 

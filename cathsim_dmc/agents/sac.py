@@ -10,7 +10,6 @@ from torch import nn
 from torchrl.objectives import SACLoss, SoftUpdate
 
 from cathsim_dmc.agents.configs import SACConfig
-from cathsim_dmc.agents.environments import VECTOR
 from cathsim_dmc.agents.networks import (
     Signature,
     make_actor,
@@ -18,6 +17,7 @@ from cathsim_dmc.agents.networks import (
     make_q_function,
 )
 from cathsim_dmc.agents.replay import ReplayMemory
+from cathsim_dmc.simulation.environments import VECTOR
 
 _TERMS = ("loss_actor", "loss_qvalue", "loss_alpha")
 

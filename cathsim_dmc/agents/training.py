@@ -20,7 +20,6 @@ from torchrl.collectors import Collector
 from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType
 
-from cathsim_dmc.agents import environments
 from cathsim_dmc.agents.checkpoint import Checkpoint, checkpoints_in, save_checkpoint
 from cathsim_dmc.agents.configs import ConfigError, TrainingConfig
 from cathsim_dmc.agents.episodes import INFO, EpisodeOutcome, EpisodeTracker
@@ -30,6 +29,7 @@ from cathsim_dmc.agents.networks import Signature
 from cathsim_dmc.agents.ppo import PPO
 from cathsim_dmc.agents.progress import Progress
 from cathsim_dmc.agents.sac import SAC
+from cathsim_dmc.simulation import environments
 
 EnvFactory = Callable[..., EnvBase]
 

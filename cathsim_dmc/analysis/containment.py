@@ -5,7 +5,7 @@ import dataclasses
 import mujoco
 import numpy as np
 
-from cathsim_dmc.anatomy import phantom as anatomies
+from cathsim_dmc.anatomy import Anatomy
 
 # Spacing of the points along the device at which it is measured, m: about a device
 # radius, so that nothing the size of the device is missed between two of them.
@@ -55,7 +55,7 @@ class Containment:
       bore_sides: (2, 3), unit normals of the two pairs of sides, world frame.
     """
 
-    anatomy: anatomies.Anatomy
+    anatomy: Anatomy
     device_radius: float
     bore_half_width: float
     bore_sides: np.ndarray

@@ -1,5 +1,6 @@
 """Geometry without physics: vessels, arches, lumen surfaces and wall pieces."""
 
+from cathsim_dmc.anatomy.anatomy import Anatomy, End, Goal, Inlet, Surface
 from cathsim_dmc.anatomy.centreline import (
     Centreline,
     CentrelinePoint,
@@ -7,7 +8,6 @@ from cathsim_dmc.anatomy.centreline import (
     Vessel,
     VesselTree,
 )
-from cathsim_dmc.anatomy.phantom import Anatomy, End, Goal, Inlet, Surface
 
 __all__ = [
     "Anatomy",

@@ -19,7 +19,7 @@ def rod(figure: Path | None = None, json: bool = False) -> int:
         figure: Where to draw the comparison, a PNG.
         json: Print one JSON object and nothing else.
     """
-    from cathsim_dmc.analysis import validation
+    from cathsim_dmc import validation
 
     return show(validation.validate_rod(figure), json)
 
@@ -39,7 +39,7 @@ def wall(
         convergence: Include the studies of time step and link length.
         json: Print one JSON object and nothing else.
     """
-    from cathsim_dmc.analysis import validation
+    from cathsim_dmc import validation
 
     report = validation.validate_wall(figure, phantom, with_convergence=convergence)
     return show(report, json)
@@ -65,7 +65,7 @@ def forces(
         margin: Of the equivalence test, N.
         json: Print one JSON object and nothing else.
     """
-    from cathsim_dmc.analysis import validation
+    from cathsim_dmc import validation
 
     report = validation.validate_forces(figure, episode, mean, sd, margin)
     return show(report, json)

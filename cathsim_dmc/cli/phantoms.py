@@ -38,7 +38,7 @@ def import_phantom(
         wall: Pieces near the surface, or CoACD's coarse ones (needs the extra coacd).
         threshold_mm: Of CoACD, the concavity of a piece; 3.5 by default.
     """
-    from cathsim_dmc.anatomy import scan
+    from cathsim_dmc.anatomy.scan import importer as scan
 
     anatomy = scan.import_scan(
         mesh,
@@ -73,7 +73,7 @@ def generate(
     """
     import numpy as np
 
-    from cathsim_dmc.anatomy import arch
+    from cathsim_dmc.anatomy.arch import arch
 
     if kind not in arch.ARCHES:
         raise ValueError(f"no arch {kind!r}; there are {', '.join(arch.ARCHES)}")
@@ -98,8 +98,7 @@ def check(phantom: Annotated[str, conf.Positional], /, json: bool = False) -> in
         phantom: Directory of an anatomy, or the name of an arch.
         json: Print one JSON object and nothing else.
     """
-    from cathsim_dmc import suite
-    from cathsim_dmc.analysis import validation
+    from cathsim_dmc import suite, validation
 
     anatomy = suite.load_anatomy(phantom)
     return show(validation.validate_anatomy({anatomy.name: anatomy}), json)

@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 from dm_control import composer, mjcf
 
-from cathsim_dmc.anatomy import phantom as anatomy_phantom
+from cathsim_dmc.anatomy import Anatomy
 
 # Lubricated silicone, Coulomb.
 FRICTION = 0.037
@@ -47,7 +47,7 @@ class Phantom(composer.Entity):
 
     def _build(
         self,
-        anatomy: anatomy_phantom.Anatomy,
+        anatomy: Anatomy,
         friction: float = FRICTION,
         goal_radius: float = 8e-3,
         name: str = "phantom",
@@ -142,7 +142,7 @@ class Phantom(composer.Entity):
         return self._mjcf_root
 
     @property
-    def anatomy(self) -> anatomy_phantom.Anatomy:
+    def anatomy(self) -> Anatomy:
         """Lumen, wall pieces and goals."""
         return self._anatomy
 

@@ -11,7 +11,7 @@ from cathsim_dmc import suite
 from cathsim_dmc.play.controls import Controls
 from cathsim_dmc.recording.episode import SUFFIX, Episode
 from cathsim_dmc.recording.recorder import EpisodeRecorder
-from cathsim_dmc.tasks.cannulation import CONTROL_TIMESTEP
+from cathsim_dmc.tasks.objectives import CONTROL_TIMESTEP
 
 MODES = ("fluoroscopy", "viewer")
 _PAUSE = 1.0  # s, for which the end of an episode is shown

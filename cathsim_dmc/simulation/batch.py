@@ -12,7 +12,7 @@ import numpy as np
 from dm_control import mjcf
 from mujoco import batch as mujoco_batch
 
-from cathsim_dmc.tasks import cannulation, forces, navigation, observations, readings
+from cathsim_dmc.tasks import forces, navigation, objectives, observations, readings
 
 
 @dataclasses.dataclass(frozen=True)
@@ -31,7 +31,7 @@ class Step:
     """
 
     observation: observations.Observation
-    outcome: cannulation.Outcome
+    outcome: objectives.Outcome
     terminated: np.ndarray
     truncated: np.ndarray
     physics_error: np.ndarray
@@ -81,7 +81,7 @@ class BatchSimulation:
         self._screen = task.screen(self._model, num_simulations)
         self._delay = task.action_delay(num_simulations)
         self._monitor = task.monitor(num_simulations)
-        self._travel = cannulation.Travel(num_simulations)
+        self._travel = objectives.Travel(num_simulations)
         self._variation = task.model_variation(self._model)
         fields = self._variation.fields
         self._fields = {name: self._batch.expand(name) for name in fields}
@@ -156,7 +156,7 @@ class BatchSimulation:
         Raises:
           ValueError: if the action has the wrong shape or is not finite.
         """
-        action = cannulation.check_action(action, self._action.shape)
+        action = objectives.check_action(action, self._action.shape)
         self._action = action.copy()
         self._batch.ctrl[:] = self._delay.pass_on(action)
         self._task.posed_robot(self._batch.qpos)
@@ -233,7 +233,7 @@ class BatchSimulation:
         return self._task
 
     @property
-    def meaning(self) -> cannulation.Cannulation:
+    def meaning(self) -> objectives.Cannulation:
         """Goals, which may differ between simulations, reward and success rule."""
         return self._meaning
 

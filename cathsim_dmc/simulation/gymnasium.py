@@ -11,7 +11,8 @@ from dm_env import specs
 from cathsim_dmc import suite
 from cathsim_dmc.imaging import angiograph
 from cathsim_dmc.simulation import batch
-from cathsim_dmc.tasks import cannulation, measures
+from cathsim_dmc.tasks import info as task_info
+from cathsim_dmc.tasks import objectives
 from cathsim_dmc.tasks.config import NavigationConfig
 
 RENDER_MODES = ("rgb_array",)
@@ -89,7 +90,7 @@ class CathSimEnv(gymnasium.Env):
 
     metadata = {
         "render_modes": list(RENDER_MODES),
-        "render_fps": round(1 / cannulation.CONTROL_TIMESTEP),
+        "render_fps": round(1 / objectives.CONTROL_TIMESTEP),
     }
 
     def __init__(
@@ -152,7 +153,7 @@ class CathSimEnv(gymnasium.Env):
     def _info(self, terminated: bool) -> dict[str, Any]:
         task = self._environment.task
         outcome = task.meaning.outcome(task.readings.head)
-        numbers = measures.measures(
+        numbers = task_info.measures(
             task.readings, task.wall_force, outcome.distance, task.path_ratio
         )
         success = task.termination == "success"
@@ -315,7 +316,7 @@ class CathSimVectorEnv(gymnasium.vector.VectorEnv):
             error = np.zeros(self.num_envs, dtype=bool)
         else:
             outcome, error = step.outcome, step.physics_error
-        info = measures.measures(
+        info = task_info.measures(
             simulation.readings,
             simulation.wall_force,
             outcome.distance,

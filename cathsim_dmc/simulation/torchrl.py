@@ -11,7 +11,8 @@ from torchrl.envs import EnvBase
 
 from cathsim_dmc import suite
 from cathsim_dmc.simulation import batch
-from cathsim_dmc.tasks import measures
+from cathsim_dmc.tasks import info as info
+from cathsim_dmc.tasks import info as task_info
 
 
 class BatchedEnv(EnvBase):
@@ -66,9 +67,9 @@ class BatchedEnv(EnvBase):
         }
         info = {
             key: Unbounded((*shape, 1), dtype=torch.float32)
-            for key in measures.MEASURES
+            for key in task_info.MEASURES
         }
-        for key in measures.FLAGS:
+        for key in task_info.FLAGS:
             info[key] = Binary(1, (*shape, 1), dtype=torch.bool)
         entries["info"] = Composite(info, shape=shape)
         self.observation_spec = Composite(entries, shape=shape)
@@ -106,7 +107,7 @@ class BatchedEnv(EnvBase):
         return result
 
     def _info(self, state, wall, outcome, physics_error) -> dict[str, torch.Tensor]:
-        numbers = measures.measures(
+        numbers = task_info.measures(
             state, wall, outcome.distance, self._simulation.path_ratio
         )
         info = {key: _column(value, torch.float32) for key, value in numbers.items()}

@@ -7,7 +7,7 @@ from typing import Any
 from cathsim_dmc.entities import devices
 from cathsim_dmc.entities.phantom import FRICTION
 from cathsim_dmc.imaging.options import FluoroscopyOptions
-from cathsim_dmc.tasks import cannulation
+from cathsim_dmc.tasks import objectives as objectives
 from cathsim_dmc.tasks.cameras import CameraOptions
 from cathsim_dmc.tasks.variations import Randomisation
 
@@ -22,7 +22,7 @@ class NavigationConfig:
       observation: name or names in `observations.OBSERVATIONS`.
       device: name in `devices.DEVICES`, or a device.
       rotation: whether the action has a rotation of the base.
-      reward: "distance" or "path", see `cannulation.Cannulation`.
+      reward: "distance" or "path", see `objectives.Cannulation`.
       goal_radius: δ, m.
       max_steps: control steps until truncation.
       friction: Coulomb coefficient of device on wall.
@@ -42,8 +42,8 @@ class NavigationConfig:
     device: str | devices.Device = "published"
     rotation: bool = False
     reward: str = "distance"
-    goal_radius: float = cannulation.GOAL_RADIUS
-    max_steps: int = cannulation.MAX_STEPS
+    goal_radius: float = objectives.GOAL_RADIUS
+    max_steps: int = objectives.MAX_STEPS
     friction: float = FRICTION
     shaft_link: float = 0.0175
     torsion_joints: int | None = None

@@ -5,7 +5,7 @@ import mujoco
 import numpy as np
 from dm_control import composer
 
-from cathsim_dmc.anatomy import phantom as anatomies
+from cathsim_dmc.anatomy import Anatomy, Goal
 from cathsim_dmc.entities import devices
 from cathsim_dmc.entities.catheter import Catheter
 from cathsim_dmc.entities.phantom import Phantom
@@ -14,13 +14,13 @@ from cathsim_dmc.entities.sheath import Sheath
 from cathsim_dmc.imaging import angiograph
 from cathsim_dmc.tasks import (
     cameras,
-    cannulation,
     forces,
-    integrity,
+    image_sensors,
+    objectives,
     observations,
+    physics_errors,
     placement,
     readings,
-    screen,
     variations,
 )
 from cathsim_dmc.tasks.config import PHYSICS_TIMESTEP, NavigationConfig
@@ -41,8 +41,8 @@ class Navigation(composer.Task):
 
     def __init__(
         self,
-        anatomy: anatomies.Anatomy,
-        goal: str | anatomies.Goal,
+        anatomy: Anatomy,
+        goal: str | Goal,
         config: NavigationConfig | None = None,
         random: np.random.RandomState | int | None = None,
     ):
@@ -84,7 +84,7 @@ class Navigation(composer.Task):
         if set(cameras.KINDS) & set(self._observation_names):
             cameras.add_tip_camera(self._scene.arena, self._scene.catheter)
         self._num_actions = len(self._scene.catheter.actuators)
-        self.set_timesteps(cannulation.CONTROL_TIMESTEP, config.physics_timestep)
+        self.set_timesteps(objectives.CONTROL_TIMESTEP, config.physics_timestep)
         self._layout = None
         self._observables = None
 
@@ -147,7 +147,7 @@ class Navigation(composer.Task):
         self._screen = self.screen(model, 1)
         self._delay = self.action_delay(1)
         self._monitor = self.monitor(1)
-        self._travel = cannulation.Travel(1)
+        self._travel = objectives.Travel(1)
         self._state = np.zeros(mujoco.mj_stateSize(model, _STATE))
         self._restart()
         # Composer looks once before the first reset, which must not draw noise.
@@ -205,7 +205,7 @@ class Navigation(composer.Task):
     def before_step(self, physics, action, random_state):
         """Applies the action and moves the robot along."""
         del random_state
-        self._action = cannulation.check_action(action, (self._num_actions,))
+        self._action = objectives.check_action(action, (self._num_actions,))
         data = physics.data.ptr
         data.ctrl[:] = self._delay.pass_on(self._action[None])[0]
         self.posed_robot(data.qpos)
@@ -335,14 +335,14 @@ class Navigation(composer.Task):
             self._scene.phantom.mjcf_model.model,
         )
 
-    def screen(self, model, simulations: int) -> screen.Screen:
+    def screen(self, model, simulations: int) -> image_sensors.Screen:
         """Takes the pictures of a number of simulations."""
-        return screen.Screen(
+        return image_sensors.Screen(
             self._observation_names,
             self._angiograph,
             self._device.outer_radius,
             simulations,
-            screen.open_cameras(
+            image_sensors.open_cameras(
                 self._observation_names,
                 model,
                 self._config.cameras,
@@ -358,9 +358,9 @@ class Navigation(composer.Task):
             self._config.randomisation.longest_delay,
         )
 
-    def monitor(self, simulations: int) -> integrity.Monitor:
+    def monitor(self, simulations: int) -> physics_errors.Monitor:
         """Watches a number of simulations for errors of physics."""
-        return integrity.Monitor(
+        return physics_errors.Monitor(
             self._anatomy,
             simulations,
             {
@@ -378,22 +378,22 @@ class Navigation(composer.Task):
         return self._config
 
     @property
-    def meaning(self) -> cannulation.Cannulation:
+    def meaning(self) -> objectives.Cannulation:
         """Goal, reward and success rule of the episode."""
         return self._meaning
 
     @property
-    def usual_meaning(self) -> cannulation.Cannulation:
+    def usual_meaning(self) -> objectives.Cannulation:
         """The same without randomisation."""
         return self._usual_meaning
 
     @property
-    def anatomy(self) -> anatomies.Anatomy:
+    def anatomy(self) -> Anatomy:
         """Lumen, wall and goals."""
         return self._anatomy
 
     @property
-    def goal(self) -> anatomies.Goal:
+    def goal(self) -> Goal:
         """Where to go."""
         return self._goal
 
@@ -453,7 +453,7 @@ class Navigation(composer.Task):
         return self._readings
 
     @property
-    def outcome(self) -> cannulation.Outcome:
+    def outcome(self) -> objectives.Outcome:
         """Reward terms, distance and success of the last control step."""
         return self._outcome
 

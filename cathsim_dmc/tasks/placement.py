@@ -4,9 +4,9 @@ import dataclasses
 
 import numpy as np
 
-from cathsim_dmc.anatomy import phantom as anatomies
+from cathsim_dmc.anatomy import Anatomy, Goal
 from cathsim_dmc.entities import arena, devices
-from cathsim_dmc.tasks import cannulation
+from cathsim_dmc.tasks import objectives as objectives
 
 # The steerable tip starts free of the sheath wherever the vessel is straight enough.
 _FREE_LENGTH = 0.005  # m of shaft out of the sheath behind the tip
@@ -48,9 +48,7 @@ class Placement:
         return self.start - self.working_length * self.direction
 
 
-def resolve_goal(
-    anatomy: anatomies.Anatomy, goal: "str | anatomies.Goal"
-) -> anatomies.Goal:
+def resolve_goal(anatomy: Anatomy, goal: "str | Goal") -> Goal:
     """Returns the goal, by name or as given.
 
     Raises:
@@ -69,19 +67,19 @@ def resolve_goal(
 
 
 def cannulation_task(
-    anatomy: anatomies.Anatomy, goal: anatomies.Goal, spare: float = 0.0, **options
-) -> cannulation.Cannulation:
+    anatomy: Anatomy, goal: Goal, spare: float = 0.0, **options
+) -> objectives.Cannulation:
     """Builds the meaning of the task of reaching a goal.
 
     Args:
       anatomy: where.
       goal: of the anatomy.
       spare: way past the goal that the route goes on, m.
-      **options: fields of `cannulation.Cannulation`.
+      **options: fields of `objectives.Cannulation`.
     """
     vessel = anatomy.tree.vessel(goal.vessel)
     route = anatomy.route(goal, spare)
-    return cannulation.Cannulation(
+    return objectives.Cannulation(
         goal=goal.position,
         branch=vessel.centreline,
         ostium=vessel.ostium,
@@ -92,7 +90,7 @@ def cannulation_task(
 
 
 def place_device(
-    anatomy: anatomies.Anatomy,
+    anatomy: Anatomy,
     route_length: float,
     device: devices.Device,
     working_length: float | None = None,
@@ -132,7 +130,7 @@ def place_device(
     )
 
 
-def _straight_run(anatomy: anatomies.Anatomy, device: devices.Device) -> float:
+def _straight_run(anatomy: Anatomy, device: devices.Device) -> float:
     """Depth up to which the straight device fits into the lumen, m."""
     inlet = anatomy.inlet
     depths = np.arange(1e-3, device.tip_length + _FREE_LENGTH + 1e-9, 1e-3)
@@ -189,13 +187,13 @@ def start_joints(
     lever = beyond[index]
     # The base cannot go back behind its start, so the stroke begins 1 mm later.
     return {
-        "insertion": np.maximum(cannulation.START_JITTER + displacement[..., 2], 0.0),
+        "insertion": np.maximum(objectives.START_JITTER + displacement[..., 2], 0.0),
         f"bend_x_{index}": -displacement[..., 1] / lever,
         f"bend_y_{index}": displacement[..., 0] / lever,
     }
 
 
-def add_cameras(scene: arena.AngiographyArena, anatomy: anatomies.Anatomy) -> None:
+def add_cameras(scene: arena.AngiographyArena, anatomy: Anatomy) -> None:
     """Adds the published top view and a view from the side."""
     vertices = anatomy.surface.vertices
     low, high = vertices.min(0), vertices.max(0)

@@ -4,7 +4,7 @@ import dataclasses
 
 import numpy as np
 
-from cathsim_dmc.anatomy import phantom as anatomies
+from cathsim_dmc.anatomy import Anatomy
 from cathsim_dmc.entities import devices
 from cathsim_dmc.entities.arena import AngiographyArena
 from cathsim_dmc.entities.catheter import Catheter
@@ -39,7 +39,7 @@ class Scene:
     @classmethod
     def build(
         cls,
-        anatomy: anatomies.Anatomy,
+        anatomy: Anatomy,
         device: devices.Device,
         place: placement.Placement,
         config: NavigationConfig,

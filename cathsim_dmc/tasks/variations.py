@@ -14,7 +14,7 @@ from dm_control.composer import variation
 from dm_control.composer.variation import distributions
 
 from cathsim_dmc.imaging.angiograph import Deviation
-from cathsim_dmc.tasks import cannulation
+from cathsim_dmc.tasks import objectives as objectives
 
 # Lowest and highest value of a uniform distribution, or any composer Variation.
 Range = Sequence[float] | variation.Variation
@@ -43,7 +43,7 @@ class Randomisation:
 
     friction: Range | None = None
     stiffness: Range | None = None
-    start_radius: float = cannulation.START_JITTER
+    start_radius: float = objectives.START_JITTER
     view: Range | None = None
     gain: Range | None = None
     kerma: Range | None = None
@@ -107,7 +107,7 @@ class Randomisation:
                 chosen = distributions.Uniform(*map(float, chosen))
             return float(variation.evaluate(chosen, random_state=random_state))
 
-        displacement = cannulation.start_displacement(random_state, self.start_radius)
+        displacement = objectives.start_displacement(random_state, self.start_radius)
         friction, stiffness = value("friction"), value("stiffness")
         primary, secondary = value("view"), value("view")
         gain, kerma = value("gain"), value("kerma")

@@ -16,7 +16,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 from scipy.ndimage import gaussian_filter1d
 
-from cathsim_dmc.anatomy.arch import ARCHES, arch_tree
+from cathsim_dmc.anatomy.arch.arch import ARCHES, arch_tree
 from cathsim_dmc.anatomy.surface import lumen_surface
 from cathsim_dmc.imaging import VIEWS, CArm, Fluoroscope, rgb
 from cathsim_dmc.imaging.options import DETECTOR_SIZE

@@ -12,7 +12,7 @@ import time
 
 from rich.console import Console
 
-from cathsim_dmc.analysis import validation
+from cathsim_dmc import validation
 
 DOCS = pathlib.Path(__file__).parents[1]
 PAGE = DOCS / "validation.md"

@@ -24,7 +24,7 @@ from cathsim_dmc.analysis.speed.pace import (
     load,
     pace,
 )
-from cathsim_dmc.analysis.validation.checks import Check, Report
+from cathsim_dmc.validation.checks import Check, Report
 
 RUNS = 5
 STEPS = 150  # control steps; a push is then in the branch
@@ -113,7 +113,7 @@ def _ratio(check: Callable, name: str, runs: list[float], bar: float, note: str 
 
 
 def _construction() -> list[Check]:
-    from cathsim_dmc.anatomy import arch
+    from cathsim_dmc.anatomy.arch import arch
 
     environment = load()
     environment.reset()

@@ -1,0 +1,363 @@
+"""The anatomy as the simulator sees it: lumen, wall pieces, inlet and goals.
+
+Lengths are metres, positions are in the patient frame LPS.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import json
+import os
+import tempfile
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from cathsim_dmc.anatomy.centreline import (
+    Array,
+    Centreline,
+    Vessel,
+    VesselTree,
+    _readonly,
+    as_points,
+)
+from cathsim_dmc.anatomy.wall.depth import DepthField
+
+FORMAT = "cathsim-anatomy"
+FORMAT_VERSION = 1
+_DESCRIPTION = "anatomy.json"
+
+
+def _vector(value: ArrayLike, name: str) -> Array:
+    vector = _readonly(value)
+    if vector.shape != (3,) or not np.isfinite(vector).all():
+        raise ValueError(f"{name} is {value!r}; give three finite numbers in metres.")
+    return vector
+
+
+def _unit(value: ArrayLike, name: str) -> Array:
+    vector = _vector(value, name)
+    norm = np.linalg.norm(vector)
+    if norm < 1e-9:
+        raise ValueError(f"{name} is zero; give a direction.")
+    return _readonly(vector / norm)
+
+
+@dataclass(frozen=True, eq=False)
+class Goal:
+    """A place to reach: `position` (3,), `arc_length` (m) on a vessel's centreline."""
+
+    name: str
+    vessel: str
+    position: Array
+    arc_length: float
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "position", _vector(self.position, "goal position"))
+
+
+@dataclass(frozen=True, eq=False)
+class Inlet:
+    """Where the device enters: `position` (3,), unit `direction` (3,) into the lumen.
+
+    `radius` (m) is the lumen radius there.
+    """
+
+    vessel: str
+    position: Array
+    direction: Array
+    radius: float
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "position", _vector(self.position, "inlet position"))
+        object.__setattr__(self, "direction", _unit(self.direction, "inlet direction"))
+        if not self.radius > 0.0:
+            raise ValueError(f"inlet radius is {self.radius:g} m; it must be > 0.")
+
+
+@dataclass(frozen=True, eq=False)
+class End:
+    """A flat end of the lumen: `position` (3,), unit `direction` (3,) out of it.
+
+    `open` is true for the inlet, false where a wall cap closes the vessel.
+    """
+
+    vessel: str
+    position: Array
+    direction: Array
+    radius: float
+    open: bool
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "position", _vector(self.position, "end position"))
+        object.__setattr__(self, "direction", _unit(self.direction, "end direction"))
+
+
+@dataclass(frozen=True, eq=False)
+class Surface:
+    """Triangles of the lumen surface, normals outwards, closed.
+
+    Attributes:
+        vertices: (V, 3) float64, metres, LPS.
+        faces: (F, 3) int32, counter-clockwise seen from outside the lumen.
+    """
+
+    vertices: Array
+    faces: np.ndarray
+
+    def __post_init__(self) -> None:
+        vertices = _readonly(self.vertices)
+        faces = np.array(self.faces, dtype=np.int32)
+        faces.setflags(write=False)
+        if vertices.ndim != 2 or vertices.shape[1] != 3:
+            raise ValueError(f"vertices have shape {vertices.shape}; give (V, 3).")
+        if faces.ndim != 2 or faces.shape[1] != 3:
+            raise ValueError(f"faces have shape {faces.shape}; give (F, 3).")
+        if faces.size and (faces.min() < 0 or faces.max() >= len(vertices)):
+            raise ValueError(
+                f"faces name vertices {faces.min()} to {faces.max()}; there are "
+                f"{len(vertices)}."
+            )
+        object.__setattr__(self, "vertices", vertices)
+        object.__setattr__(self, "faces", faces)
+
+    @property
+    def volume(self) -> float:
+        """Enclosed volume (m^3), positive when normals point outwards."""
+        a, b, c = (self.vertices[self.faces[:, i]] for i in range(3))
+        return float(np.einsum("fj,fj->", a, np.cross(b, c)) / 6.0)
+
+
+@dataclass(frozen=True, eq=False)
+class Anatomy:
+    """An anatomy ready for simulation.
+
+    Attributes:
+        name: what to call it.
+        tree: centrelines and radii; defines the true lumen.
+        surface: triangles of the lumen surface, for looks and for images.
+        wall: one array (n_i, 3) of vertices per convex wall piece, metres, world
+            frame; the pieces lie outside the lumen.
+        inlet: where the device enters.
+        goals: places to reach, by name.
+        ends: flat ends of the lumen, open or capped.
+        field: measured depth of a lumen that is no union of tubes (a scan), or None.
+    """
+
+    name: str
+    tree: VesselTree
+    surface: Surface
+    wall: tuple[Array, ...]
+    inlet: Inlet
+    goals: Mapping[str, Goal]
+    ends: tuple[End, ...] = ()
+    field: DepthField | None = None
+
+    def __post_init__(self) -> None:
+        wall = tuple(_readonly(piece) for piece in self.wall)
+        for index, piece in enumerate(wall):
+            if piece.ndim != 2 or piece.shape[1] != 3 or len(piece) < 4:
+                raise ValueError(
+                    f"wall piece {index} has shape {piece.shape}; give (n, 3), n >= 4."
+                )
+        for key, goal in self.goals.items():
+            if key != goal.name:
+                raise ValueError(f"goal {goal.name!r} is filed under {key!r}.")
+            self.tree.vessel(goal.vessel)
+        self.tree.vessel(self.inlet.vessel)
+        object.__setattr__(self, "wall", wall)
+        object.__setattr__(self, "goals", dict(self.goals))
+        object.__setattr__(self, "ends", tuple(self.ends))
+
+    def depth(self, points: ArrayLike) -> Array:
+        """Signed depth (...) of `points` (..., 3) in the lumen, metres, > 0 inside."""
+        if self.field is not None:
+            return self.field(as_points(points))
+        return self.tree.depth(points)
+
+    def goal(self, name: str) -> Goal:
+        """Goal called `name`.
+
+        Raises:
+            ValueError: if there is none; the message lists the names.
+        """
+        try:
+            return self.goals[name]
+        except KeyError:
+            raise ValueError(
+                f"no goal {name!r}; there are {', '.join(self.goals) or 'none'}."
+            ) from None
+
+    def route(self, goal: str | Goal, spare: float = 0.0) -> Centreline:
+        """Polyline with radii from the inlet to a goal, or `spare` (m) past it."""
+        target = goal if isinstance(goal, Goal) else self.goal(goal)
+        there = target.arc_length
+        if spare:
+            end = self.tree.vessel(target.vessel).centreline.length
+            there = min(there + spare, end)
+        line = self.tree.vessel(self.inlet.vessel).centreline
+        start = float(line.project(self.inlet.position).arc_length)
+        return self.tree.route(
+            self.inlet.vessel,
+            target.vessel,
+            there,
+            start_arc_length=start,
+        )
+
+    def save(self, directory: str | os.PathLike[str]) -> Path:
+        """Write the anatomy into `directory` and return that path.
+
+        The geometry goes into an npz named by its content, the description into
+        `anatomy.json`, which is replaced last: a reader finds the old anatomy or
+        the new one, never a mixture.
+        """
+        directory = Path(directory)
+        directory.mkdir(parents=True, exist_ok=True)
+        arrays, description = _pack(self)
+        buffer = io.BytesIO()
+        np.savez_compressed(buffer, **arrays)
+        data = buffer.getvalue()
+        digest = hashlib.sha256(data).hexdigest()
+        description["geometry"] = f"geometry-{digest[:16]}.npz"
+        description["sha256"] = digest
+        _write(directory / description["geometry"], data)
+        text = json.dumps(description, indent=2) + "\n"
+        _write(directory / _DESCRIPTION, text.encode())
+        for stale in directory.glob("geometry-*.npz"):
+            if stale.name != description["geometry"]:
+                stale.unlink(missing_ok=True)
+        return directory
+
+    @classmethod
+    def load(cls, directory: str | os.PathLike[str]) -> Anatomy:
+        """Read an anatomy that `save` wrote.
+
+        Raises:
+            FileNotFoundError: if `directory` holds no anatomy.
+            ValueError: if a file is damaged or of another format.
+        """
+        path = Path(directory) / _DESCRIPTION
+        if not path.is_file():
+            raise FileNotFoundError(
+                f"no {_DESCRIPTION} in {directory}; give a directory that "
+                "Anatomy.save wrote."
+            )
+        try:
+            description = json.loads(path.read_text())
+        except (json.JSONDecodeError, UnicodeDecodeError) as error:
+            raise ValueError(f"{path} is damaged: {error}") from error
+        if not isinstance(description, dict) or (
+            description.get("format") != FORMAT
+            or description.get("version") != FORMAT_VERSION
+        ):
+            raise ValueError(
+                f"{path} is not a {FORMAT} file of version {FORMAT_VERSION}; write it "
+                "again with Anatomy.save."
+            )
+        # Only the bare file name counts: a description may not point elsewhere.
+        geometry = path.parent / Path(str(description.get("geometry"))).name
+        if not geometry.is_file():
+            raise ValueError(f"{path} names {geometry.name}, which is missing.")
+        data = geometry.read_bytes()
+        if hashlib.sha256(data).hexdigest() != description.get("sha256"):
+            raise ValueError(f"{geometry} is damaged: its checksum differs.")
+        try:
+            with np.load(io.BytesIO(data), allow_pickle=False) as archive:
+                return _unpack(description, {k: archive[k] for k in archive.files})
+        except (KeyError, TypeError) as error:
+            raise ValueError(f"{path} lacks an entry: {error}") from error
+
+
+def _write(path: Path, data: bytes) -> None:
+    """Replace the file at `path` in one step."""
+    handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=".writing-")
+    try:
+        with os.fdopen(handle, "wb") as stream:
+            stream.write(data)
+        os.replace(temporary, path)
+    except BaseException:
+        Path(temporary).unlink(missing_ok=True)
+        raise
+
+
+def _pack(anatomy: Anatomy) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+    arrays: dict[str, np.ndarray] = {
+        "surface_vertices": anatomy.surface.vertices,
+        "surface_faces": anatomy.surface.faces,
+        "wall_vertices": np.concatenate([np.empty((0, 3)), *anatomy.wall]),
+        "wall_counts": np.array([len(piece) for piece in anatomy.wall], np.int64),
+    }
+    if anatomy.field is not None:
+        for key, values in anatomy.field.arrays().items():
+            arrays[f"field_{key}"] = values
+    vessels = []
+    for index, vessel in enumerate(anatomy.tree.vessels.values()):
+        arrays[f"vessel_{index}_points"] = vessel.centreline.points
+        arrays[f"vessel_{index}_radii"] = vessel.centreline.radii
+        vessels.append(
+            {"name": vessel.name, "parent": vessel.parent, "ostium": vessel.ostium}
+        )
+    description = {
+        "format": FORMAT,
+        "version": FORMAT_VERSION,
+        "units": "m",
+        "frame": "LPS",
+        "name": anatomy.name,
+        "vessels": vessels,
+        "inlet": {
+            "vessel": anatomy.inlet.vessel,
+            "position": anatomy.inlet.position.tolist(),
+            "direction": anatomy.inlet.direction.tolist(),
+            "radius": float(anatomy.inlet.radius),
+        },
+        "goals": [
+            {
+                "name": goal.name,
+                "vessel": goal.vessel,
+                "position": goal.position.tolist(),
+                "arc_length": float(goal.arc_length),
+            }
+            for goal in anatomy.goals.values()
+        ],
+        "ends": [
+            {
+                "vessel": end.vessel,
+                "position": end.position.tolist(),
+                "direction": end.direction.tolist(),
+                "radius": float(end.radius),
+                "open": bool(end.open),
+            }
+            for end in anatomy.ends
+        ],
+    }
+    return arrays, description
+
+
+def _unpack(description: dict[str, Any], arrays: dict[str, np.ndarray]) -> Anatomy:
+    vessels = {}
+    for index, entry in enumerate(description["vessels"]):
+        line = Centreline(
+            arrays[f"vessel_{index}_points"], arrays[f"vessel_{index}_radii"]
+        )
+        vessels[entry["name"]] = Vessel(
+            entry["name"], line, entry["parent"], entry["ostium"]
+        )
+    stops = np.cumsum(arrays["wall_counts"])[:-1]
+    field = {k.removeprefix("field_"): v for k, v in arrays.items() if "field_" in k}
+    return Anatomy(
+        name=description["name"],
+        tree=VesselTree(vessels),
+        surface=Surface(arrays["surface_vertices"], arrays["surface_faces"]),
+        wall=tuple(np.split(arrays["wall_vertices"], stops))
+        if len(arrays["wall_counts"])
+        else (),
+        inlet=Inlet(**description["inlet"]),
+        goals={entry["name"]: Goal(**entry) for entry in description["goals"]},
+        ends=tuple(End(**entry) for entry in description["ends"]),
+        field=DepthField.from_arrays(field) if field else None,
+    )

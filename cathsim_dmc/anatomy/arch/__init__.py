@@ -1,0 +1,1 @@
+"""Parametric aortic arches: parameters, vessel tree, sampling."""

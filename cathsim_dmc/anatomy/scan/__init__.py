@@ -1,0 +1,1 @@
+"""Import of a patient's lumen surface."""

@@ -1,0 +1,82 @@
+"""Curves moved to the middle of a lumen."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.ndimage import gaussian_filter1d
+
+from cathsim_dmc.anatomy.wall.depth import DepthField
+
+STEP = 1e-3  # m, spacing of the centrelines that result
+SMOOTH = 0.6  # radii, standard deviation of the smoothing along a centreline
+NARROW = 1.5e-3  # m, radius below which smoothing would cut bends
+
+
+def resample(points: np.ndarray, step: float = STEP) -> np.ndarray:
+    """Points of a polyline (n, 3) m at equal distances of about ``step``."""
+    lengths = np.linalg.norm(np.diff(points, axis=0), axis=1)
+    points = points[np.concatenate([[True], lengths > 1e-9])]
+    lengths = lengths[lengths > 1e-9]
+    s = np.concatenate([[0.0], np.cumsum(lengths)])
+    count = max(2, int(round(s[-1] / step)) + 1)
+    t = np.linspace(0.0, s[-1], count)
+    return np.stack([np.interp(t, s, points[:, k]) for k in range(3)], -1)
+
+
+def centred(
+    field: DepthField,
+    curve: np.ndarray,
+    *,
+    fixed_start: bool = False,
+    rounds: int = 240,
+) -> np.ndarray:
+    """Move a curve (n, 3) sideways towards the middle of the lumen.
+
+    Every round steps up the depth across the curve and then smooths a little; the
+    step shrinks, so that the curve settles on the ridge of the depth.
+    """
+    points = curve.copy()
+    for turn in range(rounds):
+        share = 1.0 - turn / rounds
+        tangent = np.gradient(points, axis=0)
+        tangent /= np.maximum(np.linalg.norm(tangent, axis=1, keepdims=True), 1e-12)
+        uphill = field.gradient(points)
+        uphill -= np.einsum("nd,nd->n", uphill, tangent)[:, None] * tangent
+        move = 0.3e-3 * share * uphill
+        smooth = gaussian_filter1d(points, 1.0, axis=0, mode="nearest")
+        # Smoothing fades with the step: a constant one would cut tight bends.
+        mixed = points + move + 0.6 * share * (smooth - points)
+        mixed[-1] = points[-1] + move[-1]
+        mixed[0] = points[0] if fixed_start else points[0] + move[0]
+        points = mixed
+        if turn % 20 == 19:
+            points = resample(points)
+    return resample(_smoothed(points, field(points)))
+
+
+def _smoothed(points: np.ndarray, depth: np.ndarray) -> np.ndarray:
+    """Smooth a curve over about half the lumen's radius, its ends kept.
+
+    The middle of a wide vessel is flat, and a curve would wander about on it.
+    """
+    width = np.clip(SMOOTH * (depth - NARROW) / STEP, 0.0, 12.0)
+    pad = min(len(points) - 1, 40)
+    padded = np.concatenate(
+        [
+            2.0 * points[0] - points[pad:0:-1],
+            points,
+            2.0 * points[-1] - points[-2 : -pad - 2 : -1],
+        ]
+    )
+    levels = np.array([0.0, 1.0, 2.0, 4.0, 8.0, 12.0])
+    bank = np.stack(
+        [
+            gaussian_filter1d(padded, sigma, axis=0)[pad:-pad] if sigma else points
+            for sigma in levels
+        ]
+    )
+    at = np.interp(width, levels, np.arange(len(levels)))
+    low = np.minimum(at.astype(int), len(levels) - 2)
+    rest = (at - low)[:, None]
+    row = np.arange(len(points))
+    return (1.0 - rest) * bank[low, row] + rest * bank[low + 1, row]

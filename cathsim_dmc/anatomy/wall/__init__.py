@@ -1,0 +1,1 @@
+"""The wall of a lumen: convex pieces, measured depth, fidelity."""

@@ -1,0 +1,187 @@
+"""Errors of physics: found, named and kept for replay, never clipped away."""
+
+import json
+import logging
+import os
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from cathsim_dmc.anatomy import Anatomy
+
+DIVERGED = "diverged"
+ESCAPED = "escaped through the wall"
+EXPLODED = "exploding force"
+
+# Control steps between two looks for an escape; a device that has left the lumen does
+# not find back within two seconds.
+ESCAPE_INTERVAL = 50
+# Deeper outside the lumen than this, m, the axis of the device is behind the wall:
+# the wall is 4 mm thick, and penetration stays below 1 mm.
+_ESCAPE_DEPTH = 2e-3
+# Within this way of the plane of the inlet, m, the sheath holds the device.
+_MOUTH = 2e-3
+# No contact of a device that is pushed with 5 N at most is harder than this, N.
+MAX_FORCE = 50.0
+
+_FORMAT = 1
+_LOG = logging.getLogger(__name__)
+
+
+def escaped(anatomy: Anatomy, centreline: np.ndarray) -> np.ndarray:
+    """Whether devices have left the lumen.
+
+    Args:
+      anatomy: whose lumen, and whose inlet.
+      centreline: (..., n, 3), nodes of the devices, m, world frame.
+
+    Returns:
+      (...) bool: some node past the inlet lies more than 2 mm outside the lumen.
+    """
+    inlet = anatomy.inlet
+    beyond = (centreline - inlet.position) @ inlet.direction > _MOUTH
+    # Farther from the inlet than the sheath reaches, a node may also lie behind the
+    # plane of the inlet, in a vessel that turns back.
+    aside = np.linalg.norm(centreline - inlet.position, axis=-1) > _MOUTH
+    axis = np.cross(centreline - inlet.position, inlet.direction)
+    in_sheath = ~beyond & (np.linalg.norm(axis, axis=-1) < inlet.radius)
+    outside = anatomy.depth(centreline) < -_ESCAPE_DEPTH
+    return (outside & aside & ~in_sheath).any(-1)
+
+
+class Monitor:
+    """Watches N simulations for errors of physics, and keeps what replays them."""
+
+    def __init__(self, anatomy: Anatomy, simulations: int, task: dict):
+        """Starts with no episode running.
+
+        Args:
+          anatomy: whose lumen the devices must not leave.
+          simulations: N.
+          task: JSON-able description of the task for the dumps.
+        """
+        self._anatomy = anatomy
+        self._task = task
+        self._states: list[np.ndarray | None] = [None] * simulations
+        self._actions: list[list[np.ndarray]] = [[] for _ in range(simulations)]
+
+    def restart(self, index: int) -> None:
+        """Forgets the episode of a simulation."""
+        self._states[index] = None
+        self._actions[index] = []
+
+    def before_step(self, states: np.ndarray, actions: np.ndarray) -> None:
+        """Keeps the start of each episode, and the actions.
+
+        Args:
+          states: (N, nstate), mjSTATE_INTEGRATION.
+          actions: (N, A).
+        """
+        for index, (state, action) in enumerate(zip(states, actions, strict=True)):
+            if self._states[index] is None:
+                self._states[index] = state.copy()
+            self._actions[index].append(action.copy())
+
+    def errors(
+        self,
+        diverged: Sequence[bool],
+        centreline: np.ndarray,
+        peak_force: Sequence[float],
+    ) -> list[str | None]:
+        """What went wrong in the control step that has just ended; logs and dumps it.
+
+        Args:
+          diverged: (N,), MuJoCo warned.
+          centreline: (N, n, 3), nodes of the devices, m.
+          peak_force: (N,), largest single contact force within the step, N.
+
+        Returns:
+          A reason for each simulation, None where nothing did.
+        """
+        # Plain Python: numpy takes longer over the one simulation of an environment,
+        # and no longer over many.
+        looked = [
+            index
+            for index, actions in enumerate(self._actions)
+            if not len(actions) % ESCAPE_INTERVAL
+        ]
+        wrong = [
+            bool(warned or not force <= MAX_FORCE)
+            for warned, force in zip(diverged, peak_force, strict=True)
+        ]
+        reasons: list[str | None] = [None] * len(self._actions)
+        if not looked and not any(wrong):
+            return reasons
+        out = np.zeros(len(reasons), dtype=bool)
+        if looked:
+            out[looked] = escaped(self._anatomy, centreline[looked])
+        for index in np.flatnonzero(wrong | out):
+            reason = ESCAPED if out[index] and not wrong[index] else EXPLODED
+            reasons[index] = reason = DIVERGED if diverged[index] else reason
+            dump(
+                reason,
+                task=self._task,
+                state=self._states[index],
+                actions=np.array(self._actions[index]),
+            )
+        return reasons
+
+
+def dump(
+    reason: str,
+    *,
+    task: dict[str, Any],
+    state: np.ndarray,
+    actions: np.ndarray,
+    directory: str | Path | None = None,
+) -> Path:
+    """Writes what replays an episode that ended in an error, and logs where.
+
+    Args:
+      reason: what went wrong.
+      task: JSON-able description of the task.
+      state: (nstate,), MuJoCo's mjSTATE_INTEGRATION at the start of the episode.
+      actions: (T, A) up to and with the one that failed.
+      directory: where to; `CATHSIM_DUMP_DIR` or the system's temporary directory by
+        default.
+
+    Returns:
+      The .npz file.
+    """
+    directory = Path(
+        directory or os.environ.get("CATHSIM_DUMP_DIR") or tempfile.gettempdir()
+    )
+    directory.mkdir(parents=True, exist_ok=True)
+    meta = json.dumps({"format": _FORMAT, "reason": reason, "task": task})
+    handle, name = tempfile.mkstemp(".npz", "cathsim-error-", directory)
+    with os.fdopen(handle, "wb") as stream:
+        np.savez(stream, meta=np.array(meta), state=state, actions=actions)
+    _LOG.error(
+        "%s after %d steps of %s; replay it with "
+        "cathsim_dmc.tasks.physics_errors.load(%r)",
+        reason,
+        len(actions),
+        task.get("goal", "an episode"),
+        name,
+    )
+    return Path(name)
+
+
+def load(path: str | Path) -> tuple[dict[str, Any], np.ndarray, np.ndarray]:
+    """Reads a dump: description, start state (nstate,) and actions (T, A).
+
+    Raises:
+      ValueError: if the file is no dump of this format.
+    """
+    with np.load(path, allow_pickle=False) as data:
+        if not {"meta", "state", "actions"} <= set(data.files):
+            raise ValueError(f"{path} is no dump of an episode; it has {data.files}")
+        meta = json.loads(str(data["meta"]))
+        if meta.get("format") != _FORMAT:
+            raise ValueError(
+                f"{path} has format {meta.get('format')}; this version reads {_FORMAT}"
+            )
+        return meta, data["state"], data["actions"]

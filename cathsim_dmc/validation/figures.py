@@ -1,0 +1,302 @@
+"""Figures of the validation, one PNG per command."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from scipy import stats
+
+from cathsim_dmc.anatomy.anatomy import Anatomy
+from cathsim_dmc.anatomy.wall import fidelity
+from cathsim_dmc.tasks.navigation import PHYSICS_TIMESTEP, NavigationConfig
+
+if TYPE_CHECKING:
+    from cathsim_dmc.validation import convergence, forces, protocol
+    from cathsim_dmc.validation import rod as rods
+    from cathsim_dmc.validation import wall as walls
+
+SIMULATED, THEORY, THIRD = "#c0501f", "#30506b", "#6a9a4b"
+_COLOURS = (SIMULATED, THEORY, THIRD, "#9467bd", "#b08d20")
+
+
+def _canvas(rows: int, columns: int) -> tuple[Figure, np.ndarray]:
+    figure = Figure(figsize=(4.6 * columns, 3.6 * rows), layout="constrained")
+    FigureCanvasAgg(figure)
+    axes = figure.subplots(rows, columns, squeeze=False)
+    for ax in axes.ravel():
+        ax.spines[["top", "right"]].set_visible(False)
+        ax.grid(True, color="0.9", linewidth=0.6)
+        ax.set_axisbelow(True)
+    return figure, axes
+
+
+def _save(figure: Figure, path: str | Path) -> None:
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    part = path.with_name(f".{path.name}.part")
+    figure.savefig(part, dpi=110, format="png")
+    os.replace(part, path)
+
+
+def rod(
+    bent: Sequence[rods.Cantilever],
+    columns: Sequence[rods.Buckling],
+    short: Sequence[rods.Buckling],
+    lag: rods.TwistLag,
+    path: str | Path,
+) -> None:
+    """Draws cantilevers, columns and twist."""
+    figure, axes = _canvas(2, 2)
+    _cantilevers(axes[0, 0], bent)
+    _lag(axes[0, 1], lag)
+    _southwell(axes[1, 0], columns)
+    _short_columns(axes[1, 1], [*short, *columns])
+    _save(figure, path)
+
+
+def _cantilevers(ax, bent):
+    for index, one in enumerate(bent):
+        first = index == 0
+        ax.plot(
+            *(1e3 * one.expected.position.T),
+            color=THEORY,
+            linewidth=1.4,
+            label="elastica" if first else None,
+        )
+        ax.plot(
+            *(1e3 * one.simulated.T),
+            ".",
+            color=SIMULATED,
+            markersize=4,
+            label="joints" if first else None,
+        )
+        end = 1e3 * one.expected.position[-1]
+        ax.annotate(
+            f"{np.degrees(one.end_angle):.0f}°, {1e3 * one.force:.2g} mN",
+            end,
+            xytext=(6, -2),
+            textcoords="offset points",
+            fontsize=7,
+        )
+    ax.set(
+        title="Cantilever under end load",
+        xlabel="along the axis, mm",
+        ylabel="deflection, mm",
+        xlim=(-20, 440),
+    )
+    ax.legend(frameon=False, fontsize=8, loc="upper left")
+
+
+def _southwell(ax, columns):
+    for colour, one in zip(_COLOURS, columns, strict=False):
+        w = 1e3 * one.deflection
+        # Scaled by Euler's load, so that its line has slope 1.
+        y = w / (one.load / one.expected)
+        ax.plot(w, y, "o", color=colour, markersize=5, label=f"guide {one.end}")
+        line = np.array([0.0, w.max()])
+        offset = (y - w * one.expected / one.critical).mean()
+        ax.plot(line, offset + line, color=colour, linewidth=1, alpha=0.7)
+    ax.set(
+        title="Southwell plot, 262 mm of shaft",
+        xlabel="deflection w under axial load, mm",
+        ylabel="w · Euler's load / load, mm",
+    )
+    ax.text(
+        0.97, 0.05, "lines: slope 1,\nEuler's load", ha="right", fontsize=8,
+        transform=ax.transAxes,
+    )  # fmt: skip
+    ax.legend(frameon=False, fontsize=8)
+
+
+def _short_columns(ax, columns):
+    for colour, end in zip(_COLOURS, ("sliding", "fixed"), strict=False):
+        those = sorted((c for c in columns if c.end == end), key=lambda c: c.length)
+        ax.plot(
+            [1e3 * c.length for c in those],
+            [100 * (c.critical / c.expected - 1) for c in those],
+            "o-",
+            color=colour,
+            linewidth=1,
+            markersize=4,
+            label=f"guide {end}",
+        )
+    ax.axhspan(-5, 5, color="0.93", zorder=0)
+    ax.set(
+        title="Buckling of shorter columns, default links",
+        xlabel="length, mm",
+        ylabel="deviation from Euler, %",
+        ylim=(-8, 8),
+    )
+    ax.legend(frameon=False, fontsize=8, loc="upper right")
+
+
+def _lag(ax, lag):
+    behind = lag.base - lag.tip
+    ax.plot(lag.time, lag.base - lag.expected, color=THEORY, label="theory")
+    ax.plot(
+        lag.time[::12], behind[::12], ".", color=SIMULATED, markersize=4,
+        label="simulated",
+    )  # fmt: skip
+    ax.set(
+        title="Lag of the braked tip behind the base",
+        xlabel="time, s",
+        ylabel="lag, rad",
+        xlim=(0, 2.5),
+    )
+    ax.legend(frameon=False, fontsize=8, loc="lower right")
+
+
+def _convergence(axes, studies):
+    (by_step, force_by_step), (by_link, force_by_link) = axes
+    defaults = {
+        "physics_timestep": 1e3 * PHYSICS_TIMESTEP,
+        "shaft_link": 1e3 * NavigationConfig().shaft_link,
+    }
+    labels = {"physics_timestep": "time step, ms", "shaft_link": "longest link, mm"}
+    scripts = list(dict.fromkeys(one.script.name for one in studies))
+    for one in studies:
+        colour = _COLOURS[scripts.index(one.script.name)]
+        of_step = one.parameter == "physics_timestep"
+        path = by_step if of_step else by_link
+        force = force_by_step if of_step else force_by_link
+        x = 1e3 * one.values
+        style = {"color": colour, "linewidth": 1, "markersize": 4}
+        path.plot(x[1:], 1e3 * one.path_mean[1:], "o-", label=one.script.name, **style)
+        path.plot(x[1:], 1e3 * one.track_max[1:], "^:", **style)
+        if one.force_mean[0] > 1e-3:
+            force.plot(x, 1e3 * one.force_mean, "o-", **style)
+        for ax in (path, force):
+            ax.set_xlabel(labels[one.parameter])
+            ax.axvline(defaults[one.parameter], color="0.6", linewidth=0.8, zorder=0)
+    for path, force in axes:
+        path.set(
+            title="Tip path against the finest run",
+            ylabel="same time, mean (o); off track, max (▵), mm",
+            yscale="log",
+        )
+        force.set(title="Mean wall force", ylabel="mN")
+        force.set_ylim(bottom=0)
+    by_step.legend(frameon=False, fontsize=8, loc="lower right")
+
+
+def wall(
+    anatomies: Sequence[Anatomy],
+    pulled: Sequence[walls.Capstan],
+    studies: Sequence[convergence.Study],
+    path: str | Path,
+) -> None:
+    """Draws the distribution of intrusion, the capstan and the convergence."""
+    figure, rows = _canvas(3 if studies else 1, 2)
+    axes = rows[0]
+    if studies:
+        _convergence(rows[1:], studies)
+    ax = axes[0]
+    for colour, anatomy in zip(_COLOURS * 3, anatomies, strict=False):
+        inside, _ = fidelity.wall_intervals(anatomy.wall, _lumen(anatomy), 4e-3)
+        values = np.sort(1e3 * inside)
+        share = 100 * (1 - np.arange(1, len(values) + 1) / len(values))
+        ax.plot(values[:-1], share[:-1], color=colour, label=anatomy.name)
+    for x, y, text in ((0.30, 5, "p95 ≤ 0.30"), (0.60, 5e-3, "max ≤ 0.60")):
+        ax.plot(x, y, "v", color="0.4", markersize=6)
+        ax.annotate(text, (x, y), xytext=(5, 3), textcoords="offset points", fontsize=8)
+    ax.set(
+        title="Wall inside the lumen",
+        xlabel="intrusion, mm",
+        ylabel="share of the lumen surface above, %",
+        yscale="log",
+        xlim=(0, 0.75),
+        ylim=(2e-3, 120),
+    )
+    ax.legend(frameon=False, fontsize=8)
+    ax = axes[1]
+    for colour, one in zip(_COLOURS, pulled, strict=False):
+        ax.plot(
+            1e3 * one.travel, one.ratio, color=colour, label=f"μ = {one.friction:g}"
+        )
+        ax.axhline(one.expected, color=colour, linestyle="--", linewidth=1)
+    ax.set(
+        title="Rod pulled over a drum of 50 mm radius",
+        ylim=(1, 2.5),
+        xlabel="travel of the base, mm",
+        ylabel="tension ratio (dashed: exp μθ)",
+    )
+    ax.legend(frameon=False, fontsize=8)
+    _save(figure, path)
+
+
+def _lumen(anatomy: Anatomy) -> fidelity.SurfaceSamples:
+    """The same places as `fidelity.intrusion` measures."""
+    if anatomy.field is None:
+        return fidelity.tube_samples(anatomy.tree, 1e-3)
+    return fidelity.mesh_samples(anatomy, 1e-3)
+
+
+def forces(
+    pushed: Mapping[str, Sequence[forces.DeadEnd]],
+    samples: np.ndarray,
+    comparison: protocol.Comparison,
+    path: str | Path,
+) -> None:
+    """Draws the dead end, and density and cumulative plots of the protocol."""
+    figure, (axes,) = _canvas(1, 3)
+    ax = axes[0]
+    for colour, (name, runs) in zip(_COLOURS, pushed.items(), strict=False):
+        push = [one.push for one in runs]
+        closed = [
+            one.load_cell + (one.sheath if name == "wide" else 0.0) for one in runs
+        ]
+        ax.errorbar(
+            push,
+            closed,
+            xerr=[one.ripple for one in runs],
+            fmt="o",
+            color=colour,
+            markersize=5,
+            elinewidth=0.8,
+            capsize=2,
+            label=f"{name} tube" + (", with rim of the sheath" * (name == "wide")),
+        )
+    limit = 1.3 * max(one.push for runs in pushed.values() for one in runs)
+    ax.plot([0, limit], [0, limit], color="0.5", linewidth=0.8, zorder=0)
+    ax.set(
+        title="Pushed against a dead end",
+        xlabel="push force (bar: ripple), N",
+        ylabel="load cell, N",
+    )
+    ax.legend(frameon=False, fontsize=8)
+    reference = stats.norm(comparison.reference_mean, comparison.reference_sd)
+    grid = np.linspace(0, max(samples.max(), reference.ppf(0.9999)) * 1.05, 800)
+    ax = axes[1]
+    ax.hist(samples, bins=40, density=True, color=SIMULATED, alpha=0.6)
+    ax.plot(grid, reference.pdf(grid), color=THEORY)
+    ax.set(
+        title="Density",
+        xlabel="force on the phantom, N",
+        ylabel="1/N",
+        yscale="log",
+        ylim=(1e-2, 1e4),
+    )
+    ax = axes[2]
+    ordered = np.sort(samples)
+    ax.step(
+        ordered,
+        np.arange(1, len(ordered) + 1) / len(ordered),
+        where="post",
+        color=SIMULATED,
+        label=f"simulated, n = {comparison.count}",
+    )
+    ax.plot(
+        grid,
+        reference.cdf(grid),
+        color=THEORY,
+        label=f"normal, {comparison.reference_mean:g} ± {comparison.reference_sd:g} N",
+    )
+    ax.set(title="Cumulative", xlabel="force on the phantom, N", ylabel="share")
+    ax.legend(frameon=False, fontsize=8, loc="center", bbox_to_anchor=(0.42, 0.5))
+    _save(figure, path)

@@ -1,0 +1,337 @@
+"""`cathsim validate forces`: sensors against known loads, the published protocol."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from pathlib import Path
+
+import mujoco
+import numpy as np
+
+from cathsim_dmc import suite
+from cathsim_dmc.anatomy.anatomy import Anatomy, Goal
+from cathsim_dmc.anatomy.arch.arch import anatomy_frame
+from cathsim_dmc.anatomy.centreline import Centreline, Vessel, VesselTree
+from cathsim_dmc.anatomy.surface import lumen_surface
+from cathsim_dmc.anatomy.wall.pieces import build_wall
+from cathsim_dmc.entities.phantom import Phantom
+from cathsim_dmc.recording.episode import Episode
+from cathsim_dmc.tasks import forces
+from cathsim_dmc.tasks.navigation import PHYSICS_TIMESTEP
+from cathsim_dmc.validation import insertion, protocol
+from cathsim_dmc.validation.checks import Check, Report
+from cathsim_dmc.validation.rig import Rig
+
+BALANCE_BOUND = 1.0  # %
+RESTING_LOADS = (0.01, 0.1, 1.0)  # N
+# Shares of the full speed; a stalled carriage pushes with 4 N times that.
+PUSHES = (0.1, 0.25, 0.5, 1.0)
+# A blind tube that guides the device, and one in which it buckles: length, radius, m.
+GUIDING_TUBE = (0.04, 1.5e-3)
+WIDE_TUBE = (0.1, 2e-3)
+AVERAGING = 1.0  # s
+INSERTION_SPEEDS = (0.25, 0.5, 1.0)  # of 40 mm/s
+INSERTION_SEEDS = 5
+# The tip straight, and bent towards the wall of the branch.
+INSERTION_CURLS = ((0.0, 0.0), (0.0, -0.3))
+USUAL_FORCE = 0.2  # N, most forces on phantoms lie below
+USUAL_SHARE = 90.0  # %, "most"
+
+
+@dataclasses.dataclass(frozen=True)
+class Resting:
+    """The last link resting on a plate under a load, N.
+
+    Attributes:
+        load: on the middle of the link.
+        contacts: sum of the contact sensor, force of the device on the plate.
+        load_cell: of the plate on its support.
+        base: share of the load that the base carries, by its sensor.
+        penetration: m.
+    """
+
+    load: float
+    contacts: float
+    load_cell: float
+    base: float
+    penetration: float
+
+
+def resting_link(load: float, settling: float = 5.0) -> Resting:
+    """Presses the last link of the straight device on a plate.
+
+    Args:
+        load: N.
+        settling: s, of which the first is for raising the load.
+    """
+    rig = Rig()
+    plate = Phantom(_plate(rig.device.outer_radius))
+    rig.arena.attach(plate)
+    plate.add_wall_sensor(rig.catheter.links[0])
+    rig.compile()
+    steps = round(settling / rig.model.opt.timestep)
+    last = round(AVERAGING / rig.model.opt.timestep)
+    rows = []
+    for step in range(steps):
+        share = min(1.0, step * rig.model.opt.timestep)
+        rig.data.xfrc_applied[rig.tip_body, 1] = share * load
+        rig.step()
+        if step < steps - last:
+            continue
+        contacts = forces.Contacts.from_sensor(rig.sensor("wall_contacts"))
+        rows.append(
+            (
+                contacts.force[..., 1].sum(),
+                # MuJoCo's sensor gives the force of the support on the phantom.
+                -rig.sensor(f"{plate.mjcf_model.model}/load_cell")[1],
+                -rig.sensor(f"{rig.name}/push_force")[1],
+                contacts.penetration.max(),
+            )
+        )
+    return Resting(load, *np.mean(rows, axis=0).tolist())
+
+
+def _plate(height: float) -> Anatomy:
+    """An anatomy whose wall is a plate at y = `height` (m), touching the device."""
+    tube = straight_tube(*GUIDING_TUBE)
+    corners = np.stack(
+        np.meshgrid((-0.05, 0.05), (height, height + 4e-3), (-0.5, 0.5)), axis=-1
+    )
+    return dataclasses.replace(tube, name="plate", wall=(corners.reshape(-1, 3),))
+
+
+def straight_tube(length: float, radius: float) -> Anatomy:
+    """A straight vessel along +z, closed at its far end; m."""
+    z = np.linspace(0.0, length, 13)
+    line = Centreline(np.stack([0 * z, 0 * z, z], axis=-1), np.full(len(z), radius))
+    tree = VesselTree({"tube": Vessel("tube", line, None, 0.0)})
+    inlet, ends = anatomy_frame(tree, "ascending")
+    place = length - 1e-3
+    return Anatomy(
+        name="tube",
+        tree=tree,
+        surface=lumen_surface(tree),
+        wall=build_wall(tree, ends),
+        inlet=inlet,
+        goals={"end": Goal("end", "tube", line.at(place).position, place)},
+        ends=ends,
+    )
+
+
+@dataclasses.dataclass(frozen=True)
+class DeadEnd:
+    """The device pushed against the blind end of a tube; averages over a second, N.
+
+    Attributes:
+        motor: what the stalled carriage pushes with.
+        push: push force at the base.
+        load_cell: of the phantom, along the axis.
+        contacts: sum of the contact sensor along the axis.
+        sheath: axial force on the rim of the sheath.
+        ripple: standard deviation of the push force.
+    """
+
+    motor: float
+    push: float
+    load_cell: float
+    contacts: float
+    sheath: float
+    ripple: float
+
+
+def dead_end(
+    command: float,
+    tube: tuple[float, float] = GUIDING_TUBE,
+    *,
+    settling: float = 3.0,
+    timestep: float = PHYSICS_TIMESTEP,
+) -> DeadEnd:
+    """Pushes the device of the tasks against the end of a straight tube.
+
+    Args:
+        command: of the translation, in (0, 1].
+        tube: length and radius, m.
+        settling: s after the tip could have arrived.
+        timestep: s.
+    """
+    environment = suite.load(
+        "cathsim",
+        "navigate",
+        task_kwargs={
+            "random": 0,
+            "phantom": straight_tube(*tube),
+            "goal": "end",
+            "goal_radius": 1e-6,
+            "physics_timestep": timestep,
+        },
+    )
+    task = environment.task
+    environment.reset()
+    model, data = environment.physics.model.ptr, environment.physics.data.ptr
+    motor = model.actuator(f"{task.catheter.mjcf_model.model}/insertion")
+    data.actuator(motor.id).ctrl[0] = command
+    bore = environment.physics.bind(task.sheath.body).element_id
+    way = tube[0] - task.placement.start_depth
+    full_speed = motor.gainprm[0] / -motor.biasprm[2]
+    steps = round((settling + way / (command * full_speed)) / timestep)
+    rows = []
+    for step in range(steps):
+        mujoco.mj_step(model, data)
+        if step < steps - round(AVERAGING / timestep):
+            continue
+        reading = task.layout.read(data)
+        contacts = task.layout.contacts(data.sensordata)
+        rows.append(
+            (
+                reading.push_force,
+                reading.load_cell[2],
+                contacts.force[:, 2].sum(),
+                _axial_force_on(model, data, bore),
+            )
+        )
+    rows = np.array(rows)
+    return DeadEnd(
+        command * float(motor.gainprm[0]),
+        *rows.mean(axis=0).tolist(),
+        ripple=float(rows[:, 0].std()),
+    )
+
+
+def _axial_force_on(model, data, body: int) -> float:
+    """Sum of the contact forces on a static body along z, N."""
+    total, wrench = 0.0, np.zeros(6)
+    for index in range(data.ncon):
+        contact = data.contact[index]
+        bodies = model.geom_bodyid[list(contact.geom)]
+        if body not in bodies:
+            continue
+        mujoco.mj_contactForce(model, data, index, wrench)
+        # The frame's first row is the normal from the first geom to the second, on
+        # which the force acts.
+        on_second = (contact.frame.reshape(3, 3).T @ wrench[:3])[2]
+        total += on_second if bodies[1] == body else -on_second
+    return float(total)
+
+
+def scripted_cannulations(
+    speeds: Sequence[float] = INSERTION_SPEEDS, seeds: int = INSERTION_SEEDS
+) -> dict[float, list[insertion.Insertion]]:
+    """Insertions into the BCA of the type-I arch, by speed (share of 40 mm/s)."""
+    return {
+        speed: [
+            insertion.run(
+                insertion.Script("into the BCA", speed, curl, 4.0 / speed),
+                seed=seed,
+                goal="bca",
+                goal_radius=8e-3,
+            )
+            for curl in INSERTION_CURLS
+            for seed in range(seeds)
+        ]
+        for speed in speeds
+    }
+
+
+def validate_forces(
+    figure_path: str | Path | None = None,
+    episode: str | Path | Episode | Sequence[float] | None = None,
+    reference_mean: float = protocol.REFERENCE_MEAN,
+    reference_sd: float = protocol.REFERENCE_SD,
+    margin: float = protocol.EQUIVALENCE_MARGIN,
+) -> Report:
+    """Runs every check of the forces, and the published protocol.
+
+    Args:
+        figure_path: PNG to write, or None.
+        episode: cannulation of the BCA for the protocol: a recorded episode, its
+            file, or force samples in N. None for scripted insertions.
+        reference_mean: of the normal reference, N.
+        reference_sd: N.
+        margin: of the equivalence test, N.
+
+    Raises:
+        ValueError: if the episode has too few contacts for statistics.
+    """
+    checks = []
+    rested = [resting_link(load) for load in RESTING_LOADS]
+    for one in rested:
+        checks.append(
+            Check.deviation(
+                f"last link resting under {one.load:g} N, contact sensor",
+                one.contacts,
+                one.load,
+                BALANCE_BOUND,
+                f"{one.contacts:.5f} N, load cell {one.load_cell:.5f} N, "
+                f"{1e3 * one.penetration:.2f} mm deep",
+            )
+        )
+    pushed = {"guiding": [dead_end(command) for command in PUSHES]}
+    pushed["wide"] = [dead_end(command, WIDE_TUBE) for command in PUSHES]
+    for one in pushed["guiding"]:
+        for name, value in (("load cell", one.load_cell), ("contacts", one.contacts)):
+            checks.append(
+                Check.deviation(
+                    f"dead end, motor {one.motor:g} N: push force = {name}",
+                    value,
+                    one.push,
+                    BALANCE_BOUND,
+                    f"{one.push:.4f} N, {value:.4f} N",
+                )
+            )
+    for one in pushed["wide"]:
+        checks.append(
+            Check.deviation(
+                f"wide dead end, motor {one.motor:g} N: push force = load cell + rim "
+                "of the sheath",
+                one.load_cell + one.sheath,
+                one.push,
+                BALANCE_BOUND,
+                f"{one.push:.4f} N, {one.load_cell:.4f} N, {one.sheath:.4f} N",
+            )
+        )
+    cannulations = scripted_cannulations()
+    for speed, runs in cannulations.items():
+        single = np.concatenate([run.contact_forces for run in runs])
+        peak = max(run.peak.max() for run in runs)
+        checks.append(
+            Check.at_least(
+                f"insertion into the BCA at {40 * speed:g} mm/s: contact forces up to "
+                f"{USUAL_FORCE:g} N",
+                100 * float((single <= USUAL_FORCE).mean()),
+                USUAL_SHARE,
+                "%",
+                f"{len(single)} samples of {len(runs)} insertions "
+                f"({sum(run.success for run in runs)} arrive), mean "
+                f"{1e3 * single.mean():.2f} mN, largest {peak:.3f} N",
+            )
+        )
+    samples = _samples(episode, cannulations)
+    comparison = protocol.compare(samples, reference_mean, reference_sd, margin)
+    findings = {
+        "protocol": comparison.as_dict(),
+        "ripple of the push force against a dead end, N": {
+            tube: {f"{one.motor:g} N": one.ripple for one in runs}
+            for tube, runs in pushed.items()
+        },
+    }
+    if figure_path is not None:
+        from cathsim_dmc.validation import figures
+
+        figures.forces(pushed, samples, comparison, figure_path)
+    return Report("forces", checks, findings)
+
+
+def _samples(episode, cannulations) -> np.ndarray:
+    if episode is None:
+        resultants = [
+            run.resultant[run.resultant > 0]
+            for runs in cannulations.values()
+            for run in runs
+        ]
+        return np.concatenate(resultants)
+    if isinstance(episode, (str, Path)):
+        episode = Episode.load(episode)
+    if isinstance(episode, Episode):
+        return protocol.load_cell_samples(episode)
+    return np.asarray(episode, dtype=np.float64)

@@ -1,0 +1,399 @@
+"""`cathsim validate rod`: bending, buckling and twist of the device against theory."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import mujoco
+import numpy as np
+
+from cathsim_dmc.entities import devices
+from cathsim_dmc.entities.catheter import BENDING_RELAXATION_TIME, MAX_ROTATION_SPEED
+from cathsim_dmc.validation import theory
+from cathsim_dmc.validation.checks import Check, Report
+from cathsim_dmc.validation.rig import Rig
+
+CANTILEVER_BOUND = 2.0  # % of the deflection
+BUCKLING_BOUND = 5.0  # % of the load
+TWIST_BOUND = 2.0  # % of the angle
+END_ANGLES = (2.0, 15.0, 30.0, 45.0, 60.0)  # degrees
+# Fractions of the load of Euler at which the Southwell plot is taken.
+SOUTHWELL_FRACTIONS = (0.5, 0.6, 0.7, 0.8, 0.9)
+# Columns of fewer links, whose load is off by π²/12n² (sliding), π²/3n² (fixed).
+SHORT_COLUMNS = (
+    *(("sliding", count) for count in (4, 6, 9)),
+    *(("fixed", count) for count in (8, 10, 12)),
+)
+TORSION_JOINTS = 4  # default of the tasks with rotation
+TWIST = 0.35  # rad, of the whole device under the end torque; lag of the braked tip
+
+
+@dataclasses.dataclass(frozen=True)
+class Cantilever:
+    """A cantilever under end load, simulated and as elastica.
+
+    Attributes:
+        end_angle: of the elastica, rad.
+        force: N.
+        simulated: (n + 1, 2), axial and transverse places of joints and head from the
+            clamp on, m.
+        expected: the elastica.
+        deviation: of the displacement of the end, per displacement of the end.
+    """
+
+    end_angle: float
+    force: float
+    simulated: np.ndarray
+    expected: theory.Elastica
+    deviation: float
+
+
+def straight(device: str | devices.Device) -> devices.Device:
+    """The device without its pre-shaped tip."""
+    return dataclasses.replace(devices.get(device), tip_shape=())
+
+
+def cantilevers(
+    device: str | devices.Device = "published",
+    end_angles=END_ANGLES,
+    *,
+    plane: float = np.pi / 4,
+    discretisation: devices.Discretisation | None = None,
+) -> list[Cantilever]:
+    """Loads the end of a straight device across and compares it with the elastica.
+
+    Args:
+        device: its shape at rest is taken as straight.
+        end_angles: of the elastica's end, degrees; they set the forces.
+        plane: direction of the force about the axis, rad. π/4 bends both hinges of
+            every joint.
+        discretisation: default of the tasks if None.
+    """
+    rig = Rig(straight(device), discretisation)
+    rig.compile()
+    lengths, bending, _ = rig.sections
+    across = np.array([np.cos(plane), np.sin(plane), 0.0])
+    clamp = np.array([0.0, 0.0, -lengths.sum()])
+    unloaded = rig.head_position
+    results = []
+    for degrees in end_angles:
+        shape = theory.elastica(lengths, bending, np.radians(degrees))
+        rig.settle(shape.force * across)
+        moved = rig.head_position - unloaded
+        expected = shape.position[-1] - (lengths.sum(), 0.0)
+        simulated = np.array([moved[2], moved @ across])
+        # What leaves the plane of the load is an error too.
+        error = np.append(simulated - expected, moved @ np.cross([0, 0, 1], across))
+        points = np.concatenate([rig.joints, rig.head_position[None]]) - clamp
+        results.append(
+            Cantilever(
+                np.radians(degrees),
+                shape.force,
+                np.stack([points[:, 2], points @ across], axis=-1),
+                shape,
+                float(np.linalg.norm(error) / np.linalg.norm(expected)),
+            )
+        )
+    return results
+
+
+@dataclasses.dataclass(frozen=True)
+class Buckling:
+    """Southwell plot of a column.
+
+    Attributes:
+        end: "sliding" or "fixed", see `theory.buckling_load`.
+        length: of the column, m.
+        load: (n,), axial loads, N.
+        deflection: (n,), additional deflection under the axial load, m.
+        critical: load from the plot, N.
+        expected: load of Euler, N.
+    """
+
+    end: str
+    length: float
+    load: np.ndarray
+    deflection: np.ndarray
+    critical: float
+    expected: float
+
+
+def buckling(
+    end: str,
+    joints: int | None = None,
+    device: str | devices.Device = "published",
+    discretisation: devices.Discretisation | None = None,
+) -> Buckling:
+    """Measures the critical load of a clamped-guided length by a Southwell plot.
+
+    The carriage clamps link 0; a guide that cannot turn holds another link by its
+    middle and pushes back along the axis. Between them lies a length `joints` links
+    long. A sideways force bends the column a little; under an axial load P the
+    deflection grows by w, and w/P over w is a line of slope 1/P_cr (Southwell 1932).
+
+    Args:
+        end: "sliding" lets the guide move sideways, "fixed" holds it on the axis.
+        joints: links from clamp to guide; None for the whole shaft.
+        device: its shape at rest is taken as straight.
+        discretisation: default of the tasks if None.
+    """
+    rig = Rig(straight(device), discretisation)
+    shaft = len(rig.lengths) - rig.device.tip_links
+    last = shaft - 1 if joints is None else joints
+    if not 2 <= last < shaft:
+        raise ValueError(f"joints is {joints}; allowed are 2 to {shaft - 1}")
+    middles = np.cumsum(rig.lengths) - rig.lengths / 2
+    length = middles[last] - middles[0]
+    stiffness = rig.device.shaft.bending_stiffness
+    expected = theory.buckling_load([length], [stiffness], end=end)
+    _add_guide(rig, last, end)
+    rig.compile()
+    link = rig.model.body(f"{rig.name}/link_{last}").id
+    middle = rig.model.body(f"{rig.name}/link_{(last + 1) // 2}").id
+    pushed = middle if end == "fixed" else link
+    # Small enough for linear theory at the largest load, where it grows tenfold.
+    stiffness_across = stiffness / length**3 * (192 if end == "fixed" else 12)
+    bend = 2e-4 * length * stiffness_across
+
+    def deflection(load):
+        rig.data.xfrc_applied[:] = 0
+        rig.data.xfrc_applied[pushed, 0] = bend
+        rig.data.xfrc_applied[link, 2] = -load
+        rig.settle(longest=60.0)
+        return rig.data.xipos[pushed, 0]
+
+    loads = expected * np.array(SOUTHWELL_FRACTIONS)
+    unloaded = deflection(0.0)
+    additional = np.array([deflection(load) for load in loads]) - unloaded
+    slope = np.polyfit(additional, additional / loads, 1)[0]
+    return Buckling(end, length, loads, additional, 1 / slope, expected)
+
+
+def _add_guide(rig: Rig, index: int, end: str) -> None:
+    """Welds a link to a massless slider that cannot turn."""
+    origin = float(np.sum(rig.lengths[:index]) - rig.lengths.sum())
+    guide = rig.arena.mjcf_model.worldbody.add("body", name="guide", pos=(0, 0, origin))
+    guide.add("inertial", pos=(0, 0, 0), mass=1e-3, diaginertia=(1e-9, 1e-9, 1e-9))
+    axes = {"z": (0, 0, 1)}
+    if end == "sliding":
+        axes |= {"x": (1, 0, 0), "y": (0, 1, 0)}
+    for name, axis in axes.items():
+        guide.add("joint", name=f"guide_{name}", type="slide", axis=axis)
+    rig.arena.mjcf_model.equality.add(
+        "weld",
+        body1=guide,
+        body2=rig.catheter.links[index],
+        solref=(0.008, 1.0),
+        solimp=(0.999, 0.9999, 1e-4, 0.5, 2),
+    )
+
+
+@dataclasses.dataclass(frozen=True)
+class TwistUnderTorque:
+    """Twist of the straight device under an end torque: N·m, rad, rad."""
+
+    torque: float
+    simulated: float
+    expected: float
+
+
+def twist_under_torque(
+    device: str | devices.Device = "published",
+    torsion_joints: int = TORSION_JOINTS,
+) -> TwistUnderTorque:
+    """Twists the straight device by a torque on its end against GJ."""
+    rig = _torsion_rig(device, torsion_joints)
+    lengths, _, torsional = rig.sections
+    torque = TWIST / theory.twist(1.0, lengths, torsional)
+    # The motor of the base is a speed servo: the base creeps, so wait for a time.
+    for _ in range(round(12 * BENDING_RELAXATION_TIME / rig.model.opt.timestep)):
+        rig.step((0, 0, 0), (0, 0, torque))
+    return TwistUnderTorque(torque, _twist(rig), TWIST)
+
+
+@dataclasses.dataclass(frozen=True)
+class TwistLag:
+    """Lag of the tip behind the turning base.
+
+    Attributes:
+        time: (n,), s.
+        base: (n,), angle of the base, rad.
+        tip: (n,), angle of the tip, rad.
+        expected: (n,), angle of the tip that theory gives for that of the base, rad.
+        lag: of the tip in steady rotation, rad.
+        expected_lag: rad.
+        rise_time: time in which the lag reaches 1 - 1/e of its final value, s.
+        expected_rise_time: s, for the measured motion of the base.
+    """
+
+    time: np.ndarray
+    base: np.ndarray
+    tip: np.ndarray
+    expected: np.ndarray
+    lag: float
+    expected_lag: float
+    rise_time: float
+    expected_rise_time: float
+
+
+def twist_lag(
+    device: str | devices.Device = "published",
+    torsion_joints: int = TORSION_JOINTS,
+    duration: float = 4.0,
+) -> TwistLag:
+    """Turns the base at full speed against a viscous brake b on the tip.
+
+    With K = 1/Σ(l/GJ), base speed ω and the rod's own relaxation time τ, the lag δ
+    obeys (b + Kτ) δ' + K δ = b ω: it rises to bω/K with the time constant b/K + τ.
+    """
+    rig = _torsion_rig(device, torsion_joints)
+    lengths, _, torsional = rig.sections
+    stiffness = 1 / theory.twist(1.0, lengths, torsional)
+    brake = TWIST * stiffness / MAX_ROTATION_SPEED
+    rig.data.actuator(f"{rig.name}/rotation").ctrl[0] = 1.0
+    timestep = rig.model.opt.timestep
+    # The device is straight, so the rates of its hinges add up to that of the tip.
+    axial = [
+        rig.model.joint(f"{rig.name}/{joint.name}").dofadr[0]
+        for joint in rig.catheter.joints
+        if joint.name == "rotation" or joint.name.startswith("twist_")
+    ]
+    base, tip = [0.0], [0.0]
+    for _ in range(round(duration / timestep)):
+        rig.step((0, 0, 0), (0, 0, -brake * rig.data.qvel[axial].sum()))
+        base.append(rig.qpos("rotation"))
+        tip.append(base[-1] - _twist(rig, wrapped=True))
+    base, tip = np.array(base), np.array(tip)
+    time = timestep * np.arange(len(base))
+    constant = brake / stiffness + BENDING_RELAXATION_TIME
+    # The motor takes some 20 ms to its speed; the lag is driven by what it does.
+    lag, speed = np.zeros(len(base)), np.diff(base) / timestep
+    for index, omega in enumerate(speed):
+        final = brake * omega / stiffness
+        lag[index + 1] = final + (lag[index] - final) * np.exp(-timestep / constant)
+    return TwistLag(
+        time=time,
+        base=base,
+        tip=tip,
+        expected=base - lag,
+        lag=float((base - tip)[-50:].mean()),
+        expected_lag=float(brake * speed[-50:].mean() / stiffness),
+        rise_time=_rise_time(time, base - tip),
+        expected_rise_time=_rise_time(time, lag),
+    )
+
+
+def _rise_time(time: np.ndarray, curve: np.ndarray) -> float:
+    """Time (s) at which a rising curve first meets 1 - 1/e of its end."""
+    level = (1 - np.exp(-1)) * curve[-50:].mean()
+    index = int(np.argmax(curve >= level))
+    return float(
+        np.interp(level, curve[index - 1 : index + 1], time[index - 1 : index + 1])
+    )
+
+
+def _torsion_rig(device, torsion_joints) -> Rig:
+    rig = Rig(
+        straight(device),
+        devices.Discretisation(torsion_joints=torsion_joints),
+        rotation=True,
+    )
+    rig.compile()
+    return rig
+
+
+def _twist(rig: Rig, wrapped: bool = False) -> float:
+    """Angle of the tip about the axis against the base, rad; base ahead if wrapped."""
+    # A step leaves the poses of its start.
+    mujoco.mj_kinematics(rig.model, rig.data)
+    base = rig.data.body(f"{rig.name}/link_0").xmat.reshape(3, 3)
+    relative = base.T @ rig.data.xmat[rig.tip_body].reshape(3, 3)
+    angle = float(np.arctan2(relative[1, 0], relative[0, 0]))
+    return -angle if wrapped else angle
+
+
+def validate_rod(figure_path: str | Path | None = None) -> Report:
+    """Runs every check of the rod.
+
+    Args:
+        figure_path: PNG to write, or None.
+    """
+    checks: list[Check] = []
+    bent = cantilevers()
+    for one in bent:
+        checks.append(
+            Check.at_most(
+                f"cantilever, end at {np.degrees(one.end_angle):.0f}°",
+                100 * one.deviation,
+                CANTILEVER_BOUND,
+                "%",
+                f"{1e3 * one.force:.3g} mN, deflection "
+                f"{1e3 * one.expected.position[-1, 1]:.1f} mm",
+            )
+        )
+    worst = max(
+        ((cantilevers(name, (45.0,))[0].deviation, name) for name in devices.DEVICES),
+    )
+    checks.append(
+        Check.at_most(
+            "cantilever, worst device of the library, end at 45°",
+            100 * worst[0],
+            CANTILEVER_BOUND,
+            "%",
+            worst[1],
+        )
+    )
+    columns = [buckling("sliding"), buckling("fixed")]
+    for column in columns:
+        checks.append(
+            Check.deviation(
+                f"buckling load, clamped - guided, guide {column.end}",
+                column.critical,
+                column.expected,
+                BUCKLING_BOUND,
+                f"{1e3 * column.critical:.2f} mN, Euler {1e3 * column.expected:.2f} mN "
+                f"over {1e3 * column.length:.0f} mm",
+            )
+        )
+    for name in ("published", "wire_035_amplatz"):
+        turned = twist_under_torque(name)
+        checks.append(
+            Check.deviation(
+                f"twist under end torque, {name}",
+                turned.simulated,
+                turned.expected,
+                TWIST_BOUND,
+                f"{turned.simulated:.4f} rad under {1e6 * turned.torque:.3g} µN·m",
+            )
+        )
+    lag = twist_lag()
+    checks += [
+        Check.deviation(
+            "lag of the tip behind the turning base",
+            lag.lag,
+            lag.expected_lag,
+            TWIST_BOUND,
+            f"{lag.lag:.4f} rad, bω/K = {lag.expected_lag:.4f} rad",
+        ),
+        Check.deviation(
+            "rise time of that lag",
+            lag.rise_time,
+            lag.expected_rise_time,
+            TWIST_BOUND,
+            f"{lag.rise_time:.4f} s, theory {lag.expected_rise_time:.4f} s",
+        ),
+    ]
+    short = [buckling(end, count) for end, count in SHORT_COLUMNS]
+    findings = {
+        "buckling load of shorter columns, deviation from Euler, %": {
+            f"{1e3 * one.length:.0f} mm, guide {one.end}": 100
+            * (one.critical / one.expected - 1)
+            for one in short
+        }
+    }
+    if figure_path is not None:
+        from cathsim_dmc.validation import figures
+
+        figures.rod(bent, columns, short, lag, figure_path)
+    return Report("rod", checks, findings)

@@ -1,0 +1,236 @@
+"""`cathsim validate wall`: wall against lumen, friction that acts, convergence."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from cathsim_dmc.anatomy.anatomy import Anatomy
+from cathsim_dmc.anatomy.wall import fidelity
+from cathsim_dmc.entities import devices
+from cathsim_dmc.entities.phantom import FRICTION, wall_contact
+from cathsim_dmc.validation import convergence, theory
+from cathsim_dmc.validation.checks import Check, Report
+from cathsim_dmc.validation.rig import Rig
+
+# Bounds on how far the wall stands in the lumen, mm.
+INTRUSION_MEAN, INTRUSION_P95, INTRUSION_MAX = 0.10, 0.30, 0.60
+CAPSTAN_BOUND = 10.0  # % of the tension ratio
+ARCHES = ("type1", "type2")
+RAYS = 100_000
+# Default friction, and about the ends of the range of lubricated silicone to bare
+# steel.
+FRICTIONS = (FRICTION, 0.1, 0.2)
+DRUM_RADIUS = 0.05  # m
+WRAP = np.pi  # rad, angle of the wrap at the start
+TENSION = 0.5  # N, dead load on the distal end: far above EI/R² = 0.02 N
+PULL_SPEED = 0.02  # m/s, no load
+_SETTLING = 0.5  # s, before the pull
+_LEAD = 0.02  # m of rod between the clamp and the drum; first part of the pull
+_PULL = 0.1  # m
+
+
+@dataclasses.dataclass(frozen=True)
+class Capstan:
+    """A rod pulled round a drum.
+
+    Attributes:
+        friction: Coulomb coefficient.
+        angle: by which the drum turns the force in the rod, rad.
+        travel: (n,), way of the base, m.
+        ratio: (n,), tension at the base over that at the end.
+        mean: of the ratio in steady sliding.
+        expected: exp(μθ).
+    """
+
+    friction: float
+    angle: float
+    travel: np.ndarray
+    ratio: np.ndarray
+    mean: float
+    expected: float
+
+
+def capstan(friction: float, device: str | devices.Device = "published") -> Capstan:
+    """Pulls the rod over a drum with the contact parameters of the phantom.
+
+    The distal end carries a dead load; the base retracts. Both forces are measured,
+    and so is the angle between them, because a rod with bending stiffness leaves the
+    drum earlier than a string.
+    """
+    device = dataclasses.replace(devices.get(device), tip_shape=())
+    rig = Rig(device, friction=friction, stroke=_PULL)
+    radius = DRUM_RADIUS + device.outer_radius
+    base = _PULL - rig.lengths.sum()
+    drum = rig.arena.mjcf_model.worldbody.add(
+        "body", name="drum", pos=(radius, 0, base + _LEAD)
+    )
+    drum.add(
+        "geom",
+        name="drum",
+        type="cylinder",
+        size=(DRUM_RADIUS, 0.05),
+        zaxis=(0, 1, 0),
+        **wall_contact(friction),
+    )
+    rig.compile()
+    middles = np.cumsum(rig.lengths) - rig.lengths / 2
+    heading = np.clip((middles - _LEAD) / radius, 0.0, WRAP)
+    rig.data.joint(f"{rig.name}/insertion").qpos = _PULL
+    for index in range(1, len(middles)):
+        angle = heading[index] - heading[index - 1]
+        rig.data.joint(f"{rig.name}/bend_y_{index}").qpos = angle
+    mujoco.mj_forward(rig.model, rig.data)
+    load = TENSION * np.array([np.sin(WRAP), 0.0, np.cos(WRAP)])
+    motor = rig.data.actuator(f"{rig.name}/insertion")
+    for _ in range(round(_SETTLING / rig.model.opt.timestep)):
+        rig.step(load)
+    motor.ctrl[0] = -PULL_SPEED / _full_speed(rig)
+    travel, force = [], []
+    while not travel or travel[-1] < _PULL - 0.02:
+        rig.step(load)
+        travel.append(_PULL - rig.qpos("insertion"))
+        force.append(rig.sensor(f"{rig.name}/push_force"))
+        if len(travel) > 10_000:
+            raise RuntimeError(
+                f"the rod stuck on the drum after {1e3 * travel[-1]:.1f} mm"
+            )
+    travel, force = np.array(travel), np.array(force)
+    tension = np.linalg.norm(force, axis=1)
+    # Link 0 never turns, so its frame is the world's. Both forces point away from
+    # the drum.
+    sliding = travel > _LEAD
+    cosine = (force[sliding] @ load) / (tension[sliding] * TENSION)
+    angle = float(np.pi - np.arccos(np.clip(cosine, -1, 1)).mean())
+    ratio = tension / TENSION
+    return Capstan(
+        friction=friction,
+        angle=angle,
+        travel=travel,
+        ratio=ratio,
+        mean=float(ratio[sliding].mean()),
+        expected=theory.capstan_ratio(friction, angle),
+    )
+
+
+def _full_speed(rig: Rig) -> float:
+    actuator = rig.model.actuator(f"{rig.name}/insertion")
+    return float(actuator.gainprm[0] / -actuator.biasprm[2])
+
+
+def lumen_checks(anatomy: Anatomy, rays: int = RAYS) -> list[Check]:
+    """Intrusion, coverage and patency of an anatomy.
+
+    Args:
+        anatomy: generated or imported.
+        rays: of the coverage.
+    """
+    name = anatomy.name
+    inside = fidelity.intrusion(anatomy).inside
+    cover = fidelity.coverage(anatomy, rays)
+    device = devices.get("published")
+    passage = fidelity.patency(anatomy, device.outer_radius)
+    bounds = {"mean": INTRUSION_MEAN, "p95": INTRUSION_P95, "max": INTRUSION_MAX}
+    return [
+        *(
+            Check.at_most(
+                f"{name}: intrusion, {which}",
+                1e3 * getattr(inside, which),
+                bound,
+                "mm",
+                f"{inside.count} places, {len(anatomy.wall)} pieces",
+            )
+            for which, bound in bounds.items()
+        ),
+        Check.at_least(
+            f"{name}: coverage",
+            100 * cover.fraction,
+            100.0,
+            "%",
+            f"{cover.leaks} of {cover.rays} rays escape",
+        ),
+        Check.at_most(
+            f"{name}: contacts of a sphere on the centrelines",
+            passage.contacts,
+            0,
+            "",
+            f"radius {1e3 * passage.radius:.2f} mm, {passage.positions} places"
+            + (f", blocked: {', '.join(passage.blocked)}" if passage.blocked else ""),
+        ),
+    ]
+
+
+def validate_anatomy(anatomies: Mapping[str, Anatomy], rays: int = RAYS) -> Report:
+    """Checks of intrusion, coverage and patency of some anatomies, by name."""
+    checks: list[Check] = []
+    for name, anatomy in anatomies.items():
+        checks += lumen_checks(dataclasses.replace(anatomy, name=name), rays)
+    return Report("wall of " + ", ".join(anatomies), checks)
+
+
+def validate_wall(
+    figure_path: str | Path | None = None,
+    phantoms: Sequence[str | Path | Anatomy] = (),
+    rays: int = RAYS,
+    with_convergence: bool = True,
+) -> Report:
+    """Runs every check of the wall.
+
+    Args:
+        figure_path: PNG to write, or None.
+        phantoms: further anatomies beside the arches, such as an imported scan: the
+            directory of one, or the anatomy.
+        rays: of the coverage of each anatomy.
+        with_convergence: whether to run the convergence studies, which take longer
+            than all the rest.
+
+    Raises:
+        ValueError: if a directory holds no anatomy.
+    """
+    from cathsim_dmc.anatomy.arch import arch
+
+    anatomies = [arch.load(name) for name in ARCHES]
+    for phantom in phantoms:
+        if not isinstance(phantom, Anatomy):
+            if not Path(phantom).is_dir():
+                raise ValueError(
+                    f"no phantom at {str(phantom)!r}; give a directory written by "
+                    "`cathsim phantom import` or `generate`"
+                )
+            phantom = Anatomy.load(phantom)
+        anatomies.append(phantom)
+    checks: list[Check] = []
+    for anatomy in anatomies:
+        checks += lumen_checks(anatomy, rays)
+    pulled = [capstan(friction) for friction in FRICTIONS]
+    for one in pulled:
+        checks.append(
+            Check.deviation(
+                f"capstan, friction {one.friction:g}",
+                one.mean,
+                one.expected,
+                CAPSTAN_BOUND,
+                f"ratio {one.mean:.4f}, exp(μθ) = {one.expected:.4f}, "
+                f"θ = {np.degrees(one.angle):.1f}°",
+            )
+        )
+    findings: dict[str, Any] = {
+        # The ratio of a slippery rod is near 1 whatever happens; the exponent is not.
+        "friction from the exponent": {
+            f"{one.friction:g}": float(np.log(one.mean) / one.angle) for one in pulled
+        }
+    }
+    studies = convergence.studies() if with_convergence else []
+    if studies:
+        checks += convergence.checks(studies)
+        findings["convergence"] = [convergence.summary(one) for one in studies]
+    if figure_path is not None:
+        from cathsim_dmc.validation import figures
+
+        figures.wall(anatomies, pulled, studies, figure_path)
+    return Report("wall", checks, findings)

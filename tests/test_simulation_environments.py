@@ -1,0 +1,76 @@
+import json
+
+import pytest
+import synthetic_env
+import torch
+from torchrl.envs import check_env_specs
+
+from cathsim_dmc.agents import evaluate, make_config, make_env, train
+from cathsim_dmc.agents.networks import Signature
+from cathsim_dmc.simulation.environments import standard_observations
+
+TASK = "type1_bca"
+
+
+def test_both_paths_give_the_same_episodes():
+    settings = {"task": TASK, "episodes": 2, "task_kwargs": {"max_steps": 6}}
+    batched, composer = (
+        evaluate("random", path=path, **settings) for path in ("batched", "composer")
+    )
+    assert batched.episodes == composer.episodes
+    assert [episode.length for episode in batched.episodes] == [6, 6]
+    first, second = batched.episodes
+    assert first.reward != second.reward
+    assert first.reward < 0
+    assert None not in (first.success, first.max_force, first.mean_force)
+    json.dumps(batched.to_dict())
+
+
+@pytest.mark.parametrize("path", ["batched", "composer"])
+def test_a_task_satisfies_torchrl_and_gives_what_was_asked(path):
+    env = make_env(
+        TASK,
+        observation=("sequential", "tracking"),
+        num_envs=2,
+        num_threads=1,
+        path=path,
+        task_kwargs={"max_steps": 5},
+    )
+    check_env_specs(env)
+    signature = Signature.of(env)
+    assert signature.pixels == (3, 128, 128)
+    assert signature.actions == 21
+    steps = env.rollout(7, break_when_any_done=False)
+    assert steps["pixels"].dtype == torch.uint8
+    assert steps["pixels"].float().std() > 1
+    assert steps["observation_vector"].dtype == torch.float32
+    assert steps["observation_vector"].isfinite().all()
+    ended = steps["next", "truncated"][:, :, 0]
+    assert ended.nonzero()[:, 1].tolist() == [4, 4]
+    assert not steps["next", "terminated"].any()
+    # The new episode begins with a history of its own: three equal images.
+    fresh = steps["pixels"][:, 5]
+    assert torch.equal(fresh[:, 0], fresh[:, 2])
+
+
+def test_a_task_trains_and_evaluates(tmp_path):
+    config = make_config(
+        "ppo", task=TASK, task_kwargs={"max_steps": 8}, num_envs=4, num_threads=1,
+        steps_per_update=64, epochs=1, total_frames=64, normalisation_frames=16,
+    )  # fmt: skip
+    result = train(config, tmp_path, progress=False)
+    assert result.metrics["episodes"] == 8
+    assert result.metrics["mean_force"] is not None
+    outcome = evaluate(tmp_path, episodes=2, num_threads=1, out_dir=tmp_path)
+    assert outcome.task == TASK
+    assert [episode.length for episode in outcome.episodes] == [8, 8]
+
+
+def test_unknown_paths_and_empty_observations_are_refused():
+    with pytest.raises(ValueError, match="path='gpu'.*batched.*composer"):
+        make_env(TASK, path="gpu")
+    bare = synthetic_env.ReachEnv(2)
+    for name in synthetic_env.SIZES:
+        del bare.observation_spec[name]
+    with pytest.raises(ValueError, match="neither numbers nor images"):
+        standard_observations(bare)

@@ -1,0 +1,186 @@
+"""The meaning of a task: success, reward, start and actions, as functions of arrays."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as arrays
+from scipy import stats
+
+from cathsim_dmc.anatomy.arch import arch
+from cathsim_dmc.tasks import objectives, placement
+
+
+@pytest.fixture(scope="module")
+def anatomy():
+    return arch.load("type1")
+
+
+@pytest.fixture(scope="module", params=["distance", "path"])
+def task(request, anatomy):
+    return placement.cannulation_task(
+        anatomy, anatomy.goal("bca"), reward=request.param
+    )
+
+
+def towards(task, way):
+    """A point on the centreline of the branch, `way` m before the goal."""
+    place = task.branch.project(task.goal).arc_length
+    return task.branch.at(place - way).position
+
+
+def test_the_goal_itself_is_success(task):
+    outcome = task.outcome(task.goal)
+    assert outcome.success and task.in_branch(task.goal)
+    assert outcome.distance == 0
+    assert outcome.reward == objectives.SUCCESS_REWARD == 10.0
+
+
+@pytest.mark.parametrize(("way", "success"), [(7.8e-3, True), (8.2e-3, False)])
+def test_the_radius_of_the_goal_is_eight_millimetres(task, way, success):
+    outcome = task.outcome(towards(task, way))
+    assert outcome.distance == pytest.approx(way, rel=0.02)
+    assert outcome.success == success
+
+
+def test_success_through_a_wall_does_not_count(task):
+    """Within 8 mm of the goal, and outside the lumen of the branch."""
+    place = task.branch.project(task.goal)
+    tangent = task.branch.at(place.arc_length).tangent
+    side = np.cross(tangent, [1.0, 0.0, 0.0])
+    side /= np.linalg.norm(side)
+    for gap, inside in ((-0.5e-3, True), (0.5e-3, False)):
+        head = task.goal + (place.radius + gap) * side
+        outcome = task.outcome(head)
+        assert outcome.distance < objectives.GOAL_RADIUS
+        assert task.in_branch(head) == outcome.success == inside
+        assert (outcome.reward == 10.0) == inside
+
+
+def test_the_stump_in_the_parent_is_not_the_branch(task):
+    """A branch's centreline starts on its parent's; the branch starts at the ostium."""
+    before, after = task.branch.at(np.array([task.ostium - 1e-3, task.ostium + 1e-3]))[
+        0
+    ]
+    assert not task.in_branch(before)
+    assert task.in_branch(after)
+
+
+def test_reward_is_minus_the_distance_in_metres(anatomy):
+    task = placement.cannulation_task(anatomy, anatomy.goal("lcca"))
+    head = anatomy.inlet.position + [0, 0, 0.07]
+    expected = -np.linalg.norm(head - task.goal)
+    assert task.outcome(head).reward == pytest.approx(expected, rel=1e-12)
+    assert task.outcome(head).terms.keys() == {"distance", "success"}
+
+
+def test_path_reward_counts_the_way_that_is_left(anatomy):
+    task = placement.cannulation_task(anatomy, anatomy.goal("lcca"), reward="path")
+    for way in (0.02, 0.06, 0.12):
+        head = task.route.at(task.route.length - way).position
+        assert task.outcome(head).reward == pytest.approx(-way, abs=1e-6)
+        aside = head + [1e-3, 0, 0]
+        assert task.path_distance(aside) > way - 1e-3
+    # Straight through the wall it is nearer than along the vessel.
+    start = task.route.at(0.0).position
+    assert task.path_distance(start) > np.linalg.norm(start - task.goal)
+
+
+def test_path_distance_falls_all_the_way(anatomy):
+    task = placement.cannulation_task(anatomy, anatomy.goal("lcca"), reward="path")
+    way = np.linspace(0, task.route.length, 50)
+    left = task.path_distance(task.route.at(way).position)
+    assert (np.diff(left) < 0).all()
+
+
+@given(
+    heads=arrays.arrays(
+        float, (4, 2, 3), elements=st.floats(-0.05, 0.25, allow_subnormal=False)
+    )
+)
+def test_a_batch_is_many_single_ones(task, heads):
+    """Up to rounding: sums may be added in another order in a batch."""
+    together = task.outcome(heads)
+    assert together.reward.shape == together.success.shape == (4, 2)
+    for index in np.ndindex(4, 2):
+        alone = task.outcome(heads[index])
+        assert alone.success == together.success[index]
+        for name in ("distance", "reward"):
+            one, many = getattr(alone, name), getattr(together, name)[index]
+            np.testing.assert_allclose(one, many, atol=1e-9, rtol=0)
+        for name, term in together.terms.items():
+            np.testing.assert_allclose(alone.terms[name], term[index], atol=1e-9)
+
+
+@given(
+    heads=arrays.arrays(
+        float, (16, 3), elements=st.floats(-0.3, 0.3, allow_subnormal=False)
+    )
+)
+def test_success_is_near_and_inside(task, anatomy, heads):
+    outcome = task.outcome(heads)
+    assert (outcome.distance[outcome.success] < task.goal_radius).all()
+    assert (anatomy.depth(heads[outcome.success]) >= 0).all()
+    assert (outcome.reward[~outcome.success] < 0).all()
+
+
+# Start.
+
+
+def test_start_is_uniform_in_a_ball_of_a_millimetre():
+    random = np.random.RandomState(0)
+    points = np.array([objectives.start_displacement(random) for _ in range(2000)])
+    radius = np.linalg.norm(points, axis=-1) / 1e-3
+    assert radius.max() <= 1
+    # Uniform in the ball: r³ and each z/r are uniform.
+    assert stats.kstest(radius**3, "uniform").pvalue > 1e-3
+    for axis in range(3):
+        cosine = points[:, axis] / (radius * 1e-3)
+        assert stats.kstest(cosine, stats.uniform(-1, 2).cdf).pvalue > 1e-3
+
+
+def test_start_needs_nothing_but_its_source():
+    first, again = (
+        objectives.start_displacement(np.random.RandomState(5)) for _ in range(2)
+    )
+    np.testing.assert_array_equal(first, again)
+
+
+# Actions and options.
+
+
+@given(action=arrays.arrays(np.float32, (3, 21), elements=st.floats(-1, 1, width=32)))
+def test_good_actions_pass_as_they_are(action):
+    checked = objectives.check_action(action, (3, 21))
+    assert checked.dtype == np.float64
+    np.testing.assert_array_equal(checked, action)
+
+
+@pytest.mark.parametrize("shape", [(20,), (1, 21), (21, 1), ()])
+def test_actions_of_a_wrong_shape(shape):
+    with pytest.raises(ValueError, match=r"must have \(21,\).*tip motors"):
+        objectives.check_action(np.zeros(shape), (21,))
+
+
+@given(index=st.integers(0, 20), value=st.sampled_from([np.nan, np.inf, -np.inf]))
+def test_one_bad_entry_is_enough(index, value):
+    action = np.zeros(21)
+    action[index] = value
+    with pytest.raises(ValueError, match="1 NaN or infinite"):
+        objectives.check_action(action, (21,))
+
+
+@pytest.mark.parametrize(
+    ("field", "value", "message"),
+    [
+        ("reward", "sparse", "distance, path"),
+        ("goal_radius", 0.0, "> 0"),
+        ("goal_radius", float("nan"), "> 0"),
+        ("max_steps", 0, "at least 1"),
+    ],
+)
+def test_bad_options(task, field, value, message):
+    with pytest.raises(ValueError, match=message):
+        dataclasses.replace(task, **{field: value})
