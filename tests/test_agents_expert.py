@@ -63,10 +63,10 @@ def test_tip_frames_are_mujocos(rotation):
         env.step(random.uniform(-1, 1, env.action_spec().shape))
     physics = env.physics
     physics.forward()
-    joints = [motor.joint for motor in task.catheter.tip_motors]
+    joints = [motor.joint for motor in task.scene.catheter.tip_motors]
     expected = physics.bind(joints).xaxis.reshape(-1, 2, 3)
-    head = physics.bind(task.catheter.head).xmat.reshape(3, 3)[:, 2]
-    state = task.layout.read(physics.data.ptr)
+    head = physics.bind(task.scene.catheter.head).xmat.reshape(3, 3)[:, 2]
+    state = task.rollout.index.read(physics.data.ptr)
     axes, direction = pursuit.tip_frames(
         pursuit.Plan.for_task(task), state.joint_positions
     )
@@ -104,15 +104,15 @@ def test_a_head_in_the_tube_is_not_outside(plan, s, fraction, angle):
 
 
 def test_beside_the_ostium_the_head_is_still_in_the_parent(task, plan):
-    origin = task.anatomy.tree.origin("lcca")
+    origin = task.scene.anatomy.tree.origin("lcca")
     # Off the aorta's axis, nearer to the axis of the branch, but out of its tube.
-    aorta = task.anatomy.tree.vessel("aorta").centreline.at(origin)
-    branch = task.meaning.branch.at(task.meaning.ostium * 0.75)
+    aorta = task.scene.anatomy.tree.vessel("aorta").centreline.at(origin)
+    branch = task.objective.branch.at(task.objective.ostium * 0.75)
     across = np.cross(branch.tangent, aorta.tangent)
     away = branch.radius * 1.3 * across / np.linalg.norm(across)
     head = branch.position + away
-    assert task.anatomy.depth(head) > 0
-    assert task.meaning.route.project(head).arc_length > origin + 5e-3
+    assert task.scene.anatomy.depth(head) > 0
+    assert task.objective.route.project(head).arc_length > origin + 5e-3
     place = pursuit.locate(plan, head)
     assert place.excess <= 0
     assert place.arc_length <= origin + 1e-3
@@ -259,7 +259,7 @@ def test_it_recovers_from_a_wrong_branch(task, plan):
     push[0, 20] = 1.0
     for _ in range(75):
         simulation.step(push)
-    bca = make_task("type1_bca").meaning
+    bca = make_task("type1_bca").objective
     assert bca.in_branch(simulation.readings.head)[0]
     pilot = expert.Expert(plan)
     for _ in range(600):
@@ -298,7 +298,7 @@ def test_it_solves_random_arches(seed, access):
     anatomy = arch.build_arch(params, access=access)
     for goal in ("bca", "lcca", "lsa"):
         result = expert.expert_episodes(
-            "navigate", 2, 5, task_kwargs={"phantom": anatomy, "goal": goal}
+            "navigate", 2, 5, task_kwargs={"anatomy": anatomy, "goal": goal}
         )
         assert result.successes == 2
         assert result.values("peak_force").max() < GENTLE

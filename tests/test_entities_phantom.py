@@ -87,7 +87,7 @@ def test_wall_sensor_equals_the_contact_forces_of_the_same_substep(
     environment, pressed
 ):
     """Fresh: the readings are those of this substep's solution, not of the last."""
-    layout = environment.task.layout
+    layout = environment.task.rollout.index
     for sensordata, expected in pressed:
         contacts = layout.contacts(sensordata)
         here = contacts.present
@@ -107,7 +107,7 @@ def test_wall_sensor_equals_the_contact_forces_of_the_same_substep(
 
 
 def test_magnitude_is_that_of_normal_and_friction_together(environment, pressed):
-    layout = environment.task.layout
+    layout = environment.task.rollout.index
     for sensordata, expected in pressed[::20]:
         contacts = layout.contacts(sensordata)
         total = sum(np.linalg.norm(force) for force, _, _ in expected)
@@ -117,7 +117,7 @@ def test_magnitude_is_that_of_normal_and_friction_together(environment, pressed)
 
 def test_load_cell_equals_the_sum_of_the_contact_forces(environment, pressed):
     """Newton's third law: the wall passes on what the device does to it."""
-    layout = environment.task.layout
+    layout = environment.task.rollout.index
     for sensordata, expected in pressed:
         total = sum(force for force, _, _ in expected)
         cell = -sensordata[layout.load_cell]
@@ -147,7 +147,7 @@ def test_readings_of_the_task_are_those_sensors(environment, reseed):
 
 
 def test_friction_stays_in_its_cone(pressed, environment):
-    layout = environment.task.layout
+    layout = environment.task.rollout.index
     friction = environment.task.config.friction
     for sensordata, _ in pressed[::10]:
         contacts = layout.contacts(sensordata)
@@ -165,7 +165,7 @@ def test_friction_stays_in_its_cone(pressed, environment):
 def test_every_piece_collides_with_the_device_only(model, environment):
     wall = [
         model.geom(f"phantom/wall_{index}")
-        for index in range(len(environment.task.anatomy.wall))
+        for index in range(len(environment.task.scene.anatomy.wall))
     ]
     for geom in wall:
         assert geom.contype[0] == 1 and geom.conaffinity[0] == 0
@@ -186,7 +186,7 @@ def test_device_and_wall_have_the_same_contact(model):
 
 
 def test_pieces_lie_where_the_anatomy_puts_them(model, environment):
-    anatomy = environment.task.anatomy
+    anatomy = environment.task.scene.anatomy
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
     for index in range(0, len(anatomy.wall), 50):
@@ -203,10 +203,10 @@ def test_pieces_lie_where_the_anatomy_puts_them(model, environment):
 
 def test_goals_are_where_the_anatomy_puts_them(environment):
     task, physics = environment.task, environment.physics
-    assert set(task.phantom.goals) == set(task.anatomy.goals)
-    for name, site in task.phantom.goals.items():
+    assert set(task.scene.phantom.goals) == set(task.scene.anatomy.goals)
+    for name, site in task.scene.phantom.goals.items():
         np.testing.assert_allclose(
-            physics.bind(site).xpos, task.anatomy.goals[name].position, atol=1e-9
+            physics.bind(site).xpos, task.scene.anatomy.goals[name].position, atol=1e-9
         )
 
 
@@ -271,12 +271,14 @@ def test_sheath_holds_the_device_at_the_start(environment, model):
     body = model.body("sheath/bore").id
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
-    np.testing.assert_allclose(data.xpos[body], task.anatomy.inlet.position, atol=1e-9)
+    np.testing.assert_allclose(
+        data.xpos[body], task.scene.anatomy.inlet.position, atol=1e-9
+    )
     axis = data.xmat[body].reshape(3, 3)[:, 2]
-    np.testing.assert_allclose(axis, task.anatomy.inlet.direction, atol=1e-9)
+    np.testing.assert_allclose(axis, task.scene.anatomy.inlet.direction, atol=1e-9)
     base = data.xpos[model.body("catheter/link_0").id]
-    behind = (task.anatomy.inlet.position - base) @ axis
-    assert behind == pytest.approx(task.sheath.length, abs=1e-9)
+    behind = (task.scene.anatomy.inlet.position - base) @ axis
+    assert behind == pytest.approx(task.scene.sheath.length, abs=1e-9)
 
 
 # Arena.
@@ -292,7 +294,7 @@ def test_settings_of_the_physics(model):
 
 
 def test_gravity_pulls_to_the_back_less_the_buoyancy(environment, model):
-    device = environment.task.catheter.device
+    device = environment.task.scene.catheter.device
     density = device.linear_density / (math.pi * device.outer_radius**2)
     # A hollow catheter is lighter than blood, in which it is taken to float.
     expected = GRAVITY * max(0.0, 1 - BLOOD_DENSITY / density)

@@ -13,7 +13,7 @@ STEPS = 40
 
 @pytest.fixture(scope="module")
 def env():
-    options = {"phantom": build_arch(ARCHES["type1"]), "goal": "bca", "random": 0}
+    options = {"anatomy": build_arch(ARCHES["type1"]), "goal": "bca", "random": 0}
     return suite.load("cathsim", "navigate", options)
 
 
@@ -40,13 +40,13 @@ def test_contacts_make_up_the_forces_of_the_task(env, episode):
 
 
 def test_contacts_lie_on_the_wall_and_press_outwards(env, episode):
-    depth = env.task.anatomy.depth(episode.contact_position)
+    depth = env.task.scene.anatomy.depth(episode.contact_position)
     assert np.abs(depth).max() < 2e-3
     firm = np.linalg.norm(episode.contact_force, axis=1) > 1e-3
     unit = episode.contact_force[firm]
     unit /= np.linalg.norm(unit, axis=1, keepdims=True)
     outside = episode.contact_position[firm] + 3e-3 * unit
-    assert (env.task.anatomy.depth(outside) < depth[firm]).mean() > 0.95
+    assert (env.task.scene.anatomy.depth(outside) < depth[firm]).mean() > 0.95
 
 
 def test_poses_are_those_of_the_task(env, episode):
@@ -72,8 +72,8 @@ def test_the_episode_is_drawn_with_its_robot(env, episode, tmp_path):
     assert [g.kind for g in geoms if g.body_name.startswith("sheath")] == ["cylinder"]
     loaded = Episode.load(episode.save(tmp_path / "e.npz"))
     path = write_rrd(
-        loaded, env.task.anatomy.surface, tmp_path / "e.rrd", robot_geoms=geoms
+        loaded, env.task.scene.anatomy.surface, tmp_path / "e.rrd", robot_geoms=geoms
     )
     assert path.stat().st_size < 5e6
-    statistics = episode_statistics(loaded, env.task.meaning.route.length)
+    statistics = episode_statistics(loaded, env.task.objective.route.length)
     assert 0 < statistics.f_mean <= statistics.f_max <= statistics.peak_max

@@ -85,7 +85,7 @@ def test_success_terminates():
     env.reset(seed=0)
     task = env.unwrapped.environment.task
     # Any place in the branch counts with such a goal, so the branch is moved here.
-    task._meaning = _everywhere(task.meaning)
+    task._meaning = _everywhere(task.objective)
     _, reward, terminated, truncated, info = env.step(np.zeros(21, np.float32))
     assert (reward, terminated, truncated) == (10.0, True, False)
     assert info["success"] and not info["physics_error"]

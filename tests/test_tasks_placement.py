@@ -76,7 +76,7 @@ def test_the_head_is_displaced_as_asked(shared_environment, task_name):
         mujoco.mj_kinematics(model, data)
         heads.append(data.site_xpos[site].copy())
     matrix = np.empty(9)
-    mujoco.mju_quat2Mat(matrix, task.placement.quaternion)
+    mujoco.mju_quat2Mat(matrix, task.scene.placement.quaternion)
     expected = asked @ matrix.reshape(3, 3).T
     # Bent by an angle below 0.02 rad, the tip falls back by a part in ten thousand.
     np.testing.assert_allclose(np.array(heads[1:]) - heads[0], expected, atol=1e-5)
@@ -100,15 +100,15 @@ def test_readings_have_the_shapes_they_say(shared_environment):
     environment = shared_environment("type1_lcca")
     environment.reset()
     state = environment.task.readings
-    links = len(environment.task.catheter.links)
-    joints = len(environment.task.catheter.joints)
+    links = len(environment.task.scene.catheter.links)
+    joints = len(environment.task.scene.catheter.joints)
     assert state.centreline.shape == (links + 1, 3)
     assert state.joint_positions.shape == state.joint_velocities.shape == (joints,)
     assert state.com_inertia.shape == (links, 10)
     assert state.external_force.shape == (links, 6)
     np.testing.assert_array_equal(state.centreline[-1], state.head)
     lengths = np.linalg.norm(np.diff(state.centreline, axis=0), axis=-1)
-    np.testing.assert_allclose(lengths, environment.task.catheter.link_lengths)
+    np.testing.assert_allclose(lengths, environment.task.scene.catheter.link_lengths)
 
 
 def test_readings_are_copies(shared_environment):
@@ -134,7 +134,7 @@ def test_insertion_is_what_the_base_has_moved(shared_environment):
     now = environment.task.readings
     moved = now.insertion - start.insertion
     assert 0.01 < moved <= 0.0164
-    axis = environment.task.placement.direction
+    axis = environment.task.scene.placement.direction
     assert (now.head - start.head) @ axis == pytest.approx(moved, abs=3e-4)
 
 
@@ -148,4 +148,4 @@ def test_insertion_is_what_the_base_has_moved(shared_environment):
 def test_a_model_without_the_names(shared_environment, scopes, message):
     model = shared_environment("type1_bca").physics.model.ptr
     with pytest.raises(ValueError, match=message):
-        readings.Layout(model, *scopes)
+        readings.ModelIndex(model, *scopes)

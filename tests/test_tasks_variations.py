@@ -9,7 +9,13 @@ from hypothesis import strategies as st
 from cathsim_dmc import suite
 from cathsim_dmc.anatomy.arch import arch
 from cathsim_dmc.tasks import objectives as objectives
-from cathsim_dmc.tasks.variations import USUAL, ActionDelay, Episode, Randomisation
+from cathsim_dmc.tasks.variations import (
+    DEFAULT_RANGES,
+    ActionDelay,
+    Episode,
+    Randomisation,
+    start_displacement,
+)
 
 
 @pytest.fixture(scope="module")
@@ -18,7 +24,7 @@ def anatomy():
 
 
 def make(anatomy, randomisation, **options):
-    options = {"phantom": anatomy, "goal": "bca", "random": 0, **options}
+    options = {"anatomy": anatomy, "goal": "bca", "random": 0, **options}
     options["randomisation"] = randomisation
     return suite.load("cathsim", "navigate", options)
 
@@ -50,7 +56,7 @@ def snapshot(environment):
 def test_nothing_is_drawn_but_the_displacement_by_default():
     drawn, plain = np.random.RandomState(3), np.random.RandomState(3)
     episode = Randomisation().draw(drawn)
-    displacement = objectives.start_displacement(plain)
+    displacement = start_displacement(plain)
     np.testing.assert_array_equal(episode.displacement, displacement)
     assert episode == Episode(episode.displacement)
     assert drawn.randint(2**31) == plain.randint(2**31)
@@ -58,18 +64,20 @@ def test_nothing_is_drawn_but_the_displacement_by_default():
 
 @given(seed=st.integers(0, 2**32 - 1))
 def test_draws_lie_in_their_ranges(seed):
-    episode = USUAL.draw(np.random.RandomState(seed))
-    assert np.linalg.norm(episode.displacement) <= USUAL.start_radius
+    episode = DEFAULT_RANGES.draw(np.random.RandomState(seed))
+    assert np.linalg.norm(episode.displacement) <= DEFAULT_RANGES.start_radius
     for name in ("friction", "stiffness", "goal_shift", "roll", "delay"):
-        low, high = getattr(USUAL, name)
+        low, high = getattr(DEFAULT_RANGES, name)
         assert low <= getattr(episode, name) <= high
     deviation = episode.deviation
     for name in ("primary", "secondary"):
         angle = getattr(deviation, name)
-        assert USUAL.view[0] <= angle <= USUAL.view[1] and angle == int(angle)
+        assert DEFAULT_RANGES.view[0] <= angle <= DEFAULT_RANGES.view[
+            1
+        ] and angle == int(angle)
     for name in ("gain", "kerma"):
-        assert getattr(USUAL, name)[0] <= getattr(deviation, name)
-        assert getattr(deviation, name) <= getattr(USUAL, name)[1]
+        assert getattr(DEFAULT_RANGES, name)[0] <= getattr(deviation, name)
+        assert getattr(deviation, name) <= getattr(DEFAULT_RANGES, name)[1]
 
 
 def test_a_composer_variation_is_a_range_too():
@@ -142,12 +150,12 @@ def test_roll_turns_the_plane_in_which_the_tip_bends(anatomy):
     def bent(roll):
         env = make(anatomy, {"roll": (roll, roll), "start_radius": 0.0})
         env.reset()
-        straight = env.task.placement.direction
+        straight = env.task.scene.placement.direction
         action = np.zeros(21)
         action[0:20:2] = 0.4
         for _ in range(10):
             env.step(action)
-        sideways = env.task.readings.head - env.task.placement.inlet
+        sideways = env.task.readings.head - env.task.scene.placement.inlet
         sideways = sideways - (sideways @ straight) * straight
         return sideways / np.linalg.norm(sideways)
 
@@ -157,13 +165,13 @@ def test_roll_turns_the_plane_in_which_the_tip_bends(anatomy):
 
 
 def test_a_shifted_goal_moves_along_its_branch(anatomy):
-    plain = make(anatomy, False).task.usual_meaning
+    plain = make(anatomy, False).task.nominal_objective
     for reward in objectives.REWARDS:
         env = make(anatomy, {"goal_shift": (-0.01, 0.01)}, reward=reward)
         goals = []
         for _ in range(6):
             env.reset()
-            meaning = env.task.meaning
+            meaning = env.task.objective
             place = meaning.branch.project(meaning.goal)
             assert meaning.ostium <= place.arc_length
             assert place.distance < 1e-9
@@ -174,7 +182,7 @@ def test_a_shifted_goal_moves_along_its_branch(anatomy):
         usual = float(plain.branch.project(plain.goal).arc_length)
         assert len(set(goals)) == 6 and max(np.abs(np.array(goals) - usual)) <= 0.0101
     # Without a shift the meaning is that of the task without randomisation.
-    wide = make(anatomy, {"goal_shift": (-0.01, 0.01)}).task.usual_meaning
+    wide = make(anatomy, {"goal_shift": (-0.01, 0.01)}).task.nominal_objective
     heads = plain.goal + np.random.default_rng(0).normal(size=(20, 3)) * 0.02
     one, other = plain.outcome(heads), wide.shifted(0.0).outcome(heads)
     np.testing.assert_allclose(one.reward, other.reward, atol=1e-12)

@@ -67,7 +67,7 @@ class EpisodeTracker:
         force_sum = information(batch, "wall_force_sum")
         force_max = information(batch, "wall_force_max")
         success = information(batch, "success")
-        force_peak = information(batch, "wall_force_peak")
+        force_peak = information(batch, "wall_force_peak_max")
         error = information(batch, "physics_error")
         path_ratio = information(batch, "path_ratio")
         finished = []

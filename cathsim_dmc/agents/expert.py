@@ -103,7 +103,7 @@ def policy(
         state, wall_force = task.readings, task.wall_force
         if state is None:
             # Without observations the task measures nothing before the first step.
-            state = task.layout.read(env.physics.data.ptr)
+            state = task.rollout.index.read(env.physics.data.ptr)
             wall_force = forces.wall_force(np.zeros((1, 1)))
         return expert.act(state, wall_force)
 

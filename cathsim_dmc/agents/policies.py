@@ -53,5 +53,5 @@ def random(environment: composer.Environment, seed: int) -> TimestepPolicy:
 def push(environment: composer.Environment) -> TimestepPolicy:
     """Full push, tip motors at rest."""
     action = np.zeros(environment.action_spec().shape)
-    action[len(environment.task.catheter.tip_motors)] = 1.0
+    action[len(environment.task.scene.catheter.tip_motors)] = 1.0
     return lambda timestep: action

@@ -96,7 +96,7 @@ class ContactLog:
         """Adds the contacts at the end of a control step; an evaluation observer."""
         simulation = env.base_env.simulation
         rows = simulation.sensor_rows[running, -1]
-        contacts = simulation.task.layout.contacts(rows)
+        contacts = simulation.task.rollout.index.contacts(rows)
         self._positions.append(contacts.position[contacts.present])
         self._magnitudes.append(contacts.magnitude[contacts.present])
 
@@ -168,7 +168,7 @@ def evaluate(
         heatmap.contact_heatmap(
             contacts.positions,
             contacts.magnitudes,
-            environment.task.anatomy.surface,
+            environment.task.scene.anatomy.surface,
             Path(out_dir) / "heatmap.png",
             title=f"{result.task}, {result.policy}: {episodes} episodes",
         )
@@ -227,7 +227,7 @@ def record(
     episode.save(out.with_suffix(".npz"))
     rerun_log.write_rrd(
         episode,
-        environment.task.anatomy.surface,
+        environment.task.scene.anatomy.surface,
         out,
         robot_geoms=body_geoms(environment.physics),
         fluoroscopy=_images(environment, episode) if fluoroscopy else None,
@@ -252,9 +252,9 @@ def _images(environment, episode: Episode) -> np.ndarray:
     from cathsim_dmc.imaging import Angiograph
 
     task = environment.task
-    surface = task.anatomy.surface
-    fluoroscope = task.fluoroscope
+    surface = task.scene.anatomy.surface
+    fluoroscope = task.rollout.fluoroscope
     if fluoroscope is None:
         machine = Angiograph(surface.vertices, surface.faces, task.config.fluoroscopy)
         fluoroscope = machine.planes()[0]
-    return fluoroscope.render(episode.catheter, task.catheter.device.outer_radius)
+    return fluoroscope.render(episode.catheter, task.scene.catheter.device.outer_radius)

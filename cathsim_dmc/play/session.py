@@ -11,7 +11,7 @@ from cathsim_dmc import suite
 from cathsim_dmc.play.controls import Controls
 from cathsim_dmc.recording.episode import SUFFIX, Episode
 from cathsim_dmc.recording.recorder import EpisodeRecorder
-from cathsim_dmc.tasks.objectives import CONTROL_TIMESTEP
+from cathsim_dmc.tasks.config import CONTROL_TIMESTEP
 
 MODES = ("fluoroscopy", "viewer")
 _PAUSE = 1.0  # s, for which the end of an episode is shown
@@ -53,8 +53,8 @@ class Session:
         self._task_name, self._seed, self._speed = task, seed, speed
         navigation = self._environment.task
         self._controls = Controls(
-            len(navigation.catheter.tip_motors) // 2,
-            navigation.catheter.rotation is not None,
+            len(navigation.scene.catheter.tip_motors) // 2,
+            navigation.scene.catheter.rotation is not None,
         )
         self._face = _face(mode, navigation, self._controls)
         self._next = time.monotonic()

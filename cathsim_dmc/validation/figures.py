@@ -14,7 +14,7 @@ from scipy import stats
 
 from cathsim_dmc.anatomy.anatomy import Anatomy
 from cathsim_dmc.anatomy.wall import fidelity
-from cathsim_dmc.tasks.navigation import PHYSICS_TIMESTEP, NavigationConfig
+from cathsim_dmc.tasks.config import PHYSICS_TIMESTEP, NavigationConfig
 
 if TYPE_CHECKING:
     from cathsim_dmc.validation import convergence, forces, protocol

@@ -54,7 +54,7 @@ def run() -> tuple[object, list[dict]]:
 def main() -> None:
     """Draws the figure."""
     task, states = run()
-    surface, random = task.anatomy.surface, np.random.RandomState(0)
+    surface, random = task.scene.anatomy.surface, np.random.RandomState(0)
     chosen = np.linspace(0, len(states) - 1, MOMENTS).round().astype(int)
     figure, axes = plt.subplots(
         len(ROWS), MOMENTS, figsize=(12, 4.5), layout="constrained"
@@ -64,13 +64,13 @@ def main() -> None:
         planes = Angiograph(surface.vertices, surface.faces, options).planes()
         carm = planes[0].carm
         goal, depth = carm.project(task.goal_position)
-        radius = task.goal_radius * carm.focal_length / depth
+        radius = task.objective.goal_radius * carm.focal_length / depth
         for axis, index in zip(row, chosen, strict=True):
             state = states[index]
             image = machines.render(
                 [planes],
                 state["line"][None],
-                task.catheter.device.outer_radius,
+                task.scene.catheter.device.outer_radius,
                 [random],
             )[0]
             axis.imshow(image[..., 0], cmap="gray", vmin=0, vmax=255)

@@ -9,7 +9,7 @@ import mujoco
 import numpy as np
 
 from cathsim_dmc import suite
-from cathsim_dmc.tasks.objectives import CONTROL_TIMESTEP
+from cathsim_dmc.tasks.config import CONTROL_TIMESTEP
 
 DEPTHS = (0.0, 0.1, 0.2, 0.3, np.inf)  # m of insertion, edges of the bins
 NEVER = 1e-6  # m, goal radius that no policy meets

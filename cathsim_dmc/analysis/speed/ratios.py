@@ -119,7 +119,7 @@ def frame_rates(frames: int = 100) -> dict[str, float]:
     environment = load(observation="image")
     environment.reset()
     task = environment.task
-    scope, radius = task.fluoroscope, task.catheter.device.outer_radius
+    scope, radius = task.rollout.fluoroscope, task.scene.catheter.device.outer_radius
     line = task.readings.centreline
     many = np.repeat(line[None], NUM_SIMULATIONS, axis=0)
     random_state = np.random.RandomState(0)
