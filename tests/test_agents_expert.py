@@ -245,7 +245,6 @@ def test_policy_needs_no_observation_before_the_first_step():
     for observable in env.task.task_observables.values():
         observable.enabled = False
     timestep = env.reset()
-    assert env.task.readings is None
     action = expert.policy(env)(timestep)
     assert action.shape == env.action_spec().shape
     assert action[20] > 0

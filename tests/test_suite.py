@@ -90,20 +90,12 @@ class Contract(test_utils.EnvironmentTestMixin):
         self.assertIn(True, [step.last() for step in steps])
 
 
-class TestContractType1Bca(Contract, absltest.TestCase):
-    task_name = "type1_bca"
-
-
-class TestContractType1Lcca(Contract, absltest.TestCase):
-    task_name = "type1_lcca"
-
-
-class TestContractType2Bca(Contract, absltest.TestCase):
-    task_name = "type2_bca"
-
-
-class TestContractType2Lcca(Contract, absltest.TestCase):
-    task_name = "type2_lcca"
+# One class for every registered task, those of the future included.
+for _name in suite.SUITE:
+    _class = f"TestContract{_name.title().replace('_', '')}"
+    globals()[_class] = type(
+        _class, (Contract, absltest.TestCase), {"task_name": _name}
+    )
 
 
 # The sweep over tasks.

@@ -179,7 +179,7 @@ def test_tracking_follows_device_and_goal_in_space_and_on_the_screen(anatomy):
         seen["goal_from_head"], task.goal_position - task.readings.head
     )
     assert np.linalg.norm(seen["goal_from_head"]) == pytest.approx(
-        float(task.outcome.distance)
+        task.info()["distance"]
     )
     assert seen["tracking_insertion"] == task.readings.insertion
     assert seen["tracking_action"][0] == 0.3 and seen["tracking_action"][-1] == 1.0

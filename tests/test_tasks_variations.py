@@ -165,27 +165,30 @@ def test_roll_turns_the_plane_in_which_the_tip_bends(anatomy):
 
 
 def test_a_shifted_goal_moves_along_its_branch(anatomy):
-    plain = make(anatomy, False).task.nominal_objective
-    for reward in objectives.REWARDS:
+    plain = make(anatomy, False).task.objective
+    for reward in (objectives.PUBLISHED_REWARD, {"path": -1.0, "success": 10.0}):
         env = make(anatomy, {"goal_shift": (-0.01, 0.01)}, reward=reward)
         goals = []
         for _ in range(6):
             env.reset()
-            meaning = env.task.objective
-            place = meaning.branch.project(meaning.goal)
-            assert meaning.ostium <= place.arc_length
-            assert place.distance < 1e-9
-            assert meaning.outcome(meaning.goal).success
-            assert float(meaning.path_distance(meaning.goal)) < 1e-9
-            goals.append(float(place.arc_length))
-            np.testing.assert_array_equal(env.task.goal_position, meaning.goal)
+            objective = env.task.objective
+            (place,) = objective.branch.project(objective.goal).arc_length
+            assert objective.ostium <= place
+            assert objective.branch.project(objective.goal).distance < 1e-9
+            assert objective.success(objective.goal)
+            assert objective.path_distance(objective.goal) < 1e-9
+            goals.append(float(place))
+            np.testing.assert_array_equal([env.task.goal_position], objective.goal)
         usual = float(plain.branch.project(plain.goal).arc_length)
         assert len(set(goals)) == 6 and max(np.abs(np.array(goals) - usual)) <= 0.0101
-    # Without a shift the meaning is that of the task without randomisation.
-    wide = make(anatomy, {"goal_shift": (-0.01, 0.01)}).task.nominal_objective
+    # Without a shift the objective is that of the task without randomisation.
+    wide = suite.make_task(
+        "navigate", anatomy=anatomy, randomisation={"goal_shift": (-0.01, 0.01)}
+    ).objective
     heads = plain.goal + np.random.default_rng(0).normal(size=(20, 3)) * 0.02
-    one, other = plain.outcome(heads), wide.shifted(0.0).outcome(heads)
-    np.testing.assert_allclose(one.reward, other.reward, atol=1e-12)
+    for figure in ("distance", "success"):
+        one, other = (getattr(o, figure)(heads) for o in (plain, wide.shifted(0.0)))
+        np.testing.assert_allclose(one, other, atol=1e-12)
     assert wide.route.length > plain.route.length
 
 
@@ -199,12 +202,12 @@ def test_actions_arrive_as_late_as_drawn(delays, actions):
     for index, delay in enumerate(delays):
         way.restart(index, delay)
     sent = [np.full((count, 1), a) for a in actions]
-    arrived = [way.pass_on(a).copy() for a in sent]
+    arrived = [way.delayed(a).copy() for a in sent]
     for index, delay in enumerate(delays):
         expected = ([0.0] * delay + actions)[: len(actions)]
         assert [float(a[index, 0]) for a in arrived] == expected
     way.restart(0, 1)
-    assert way.pass_on(np.ones((count, 1)))[0, 0] == 0.0
+    assert way.delayed(np.ones((count, 1)))[0, 0] == 0.0
 
 
 def test_delayed_device_does_later_what_it_does_at_once(anatomy):

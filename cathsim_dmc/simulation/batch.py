@@ -12,6 +12,7 @@ from dm_control import mjcf
 from mujoco import batch as mujoco_batch
 
 from cathsim_dmc.tasks import forces, readings
+from cathsim_dmc.tasks.actions import check_action
 from cathsim_dmc.tasks.navigation import Navigation
 from cathsim_dmc.tasks.rollout import Rollout
 from cathsim_dmc.tasks.step import Step
@@ -123,6 +124,7 @@ class BatchSimulation:
           ValueError: if the action has the wrong shape or is not finite.
         """
         batch = self._batch
+        action = check_action(action, batch.ctrl.shape)
         batch.ctrl[:] = self._rollout.command(action, lambda: batch.state)
         warnings = batch.warning.copy()
         batch.rollout(

@@ -118,7 +118,7 @@ class CathSimEnv(gymnasium.Env):
             self._environment, self._dtype
         )
         self._renderer = None
-        self._ended = True
+        self._begun, self._ended = False, True
         self._closed = False
 
     def reset(self, *, seed: int | None = None, options: dict | None = None):
@@ -127,7 +127,7 @@ class CathSimEnv(gymnasium.Env):
         if seed is not None:
             self._environment.random_state.seed(_words(seed))
         timestep = self._environment.reset()
-        self._ended = False
+        self._begun, self._ended = True, False
         info = self._environment.task.info()
         return _converted(timestep.observation, self._dtype), info
 
@@ -155,7 +155,7 @@ class CathSimEnv(gymnasium.Env):
                 'render() without a render_mode; make the environment with "rgb_array"'
             )
             return None
-        if self._ended and self._environment.task.readings is None:
+        if not self._begun:
             raise gymnasium.error.ResetNeeded("there is nothing to see before reset()")
         return fluoroscopy_frame(self._environment.task, self._machine())
 

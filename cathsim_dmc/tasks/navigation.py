@@ -9,6 +9,7 @@ from dm_control import composer
 
 from cathsim_dmc.imaging.angiograph import Angiograph
 from cathsim_dmc.tasks import cameras, forces, observations, readings
+from cathsim_dmc.tasks.actions import check_action
 from cathsim_dmc.tasks.config import CONTROL_TIMESTEP, NavigationConfig
 from cathsim_dmc.tasks.objectives import Objective
 from cathsim_dmc.tasks.rollout import Rollout, SimulationState, SingleState
@@ -62,6 +63,7 @@ class Navigation(composer.Task):
                 f"randomisation shifts the goal, but {type(objective).__name__} has "
                 "no method shifted(shift): add one, or leave goal_shift out"
             )
+        self._num_actions = len(scene.catheter.actuators)
         self._names = observations.resolve(config.observation)
         self._angiograph = None
         if observations.needs_fluoroscopy(self._names):
@@ -157,7 +159,7 @@ class Navigation(composer.Task):
     def before_step(self, physics, action, random_state):
         """Applies the action and moves the robot along."""
         del physics, random_state
-        action = np.asarray(action, dtype=np.float64)
+        action = check_action(action, (self._num_actions,))
         control = self._rollout.command(action[None], self._read_state)
         self._data.ctrl[:] = control[0]
         self._warnings = self._data.warning.number.tobytes()
@@ -260,14 +262,14 @@ class Navigation(composer.Task):
         return self._rollout
 
     @property
-    def readings(self) -> readings.Readings | None:
+    def readings(self) -> readings.Readings:
         """State of the device after the last control step, without a leading axis."""
-        return None if self._step is None else _only(self._step.readings)
+        return _only(self._current().readings)
 
     @property
-    def wall_force(self) -> forces.WallForce | None:
+    def wall_force(self) -> forces.WallForce:
         """Force on the wall over the last control step, N, without a leading axis."""
-        return None if self._step is None else _only(self._step.wall_force)
+        return _only(self._current().wall_force)
 
     @property
     def contact_history(self) -> forces.ContactHistory:

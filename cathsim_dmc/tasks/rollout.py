@@ -16,7 +16,6 @@ from cathsim_dmc.entities.robot import follower_posture
 from cathsim_dmc.imaging.angiograph import Angiograph
 from cathsim_dmc.imaging.fluoroscopy import Fluoroscope
 from cathsim_dmc.tasks import forces, observations, placement, readings
-from cathsim_dmc.tasks.actions import check_action
 from cathsim_dmc.tasks.config import NavigationConfig
 from cathsim_dmc.tasks.image_sensors import ImageSensors, open_cameras
 from cathsim_dmc.tasks.objectives import Measurement, Objective
@@ -134,7 +133,7 @@ class Rollout:
         if self._config.randomisation.goal_shift is not None:
             self._objective = self._nominal_objective.shifted(self._goal_shift)
         qpos = self._state.qpos
-        qpos[indices] = self._start_qpos(qpos[indices], displacement)
+        qpos[indices] = self.start_qpos(qpos[indices], displacement)
         self._steps[indices] = 0
         # New arrays: those handed out before stay what they were.
         self._action = self._action.copy()
@@ -152,7 +151,7 @@ class Rollout:
         self._goal_shift[index] = episode.goal_shift or 0.0
         return episode.displacement
 
-    def _start_qpos(self, qpos: np.ndarray, displacement: np.ndarray) -> np.ndarray:
+    def start_qpos(self, qpos: np.ndarray, displacement: np.ndarray) -> np.ndarray:
         """Start configurations (K, nq), the tips displaced by (K, 3) m.
 
         The displacement is in the frame of the inlet, whose z points into the lumen.
@@ -188,16 +187,12 @@ class Rollout:
         """Takes the actions of a control step and poses the robot.
 
         Args:
-          action: (N, A) in [-1, 1]; what lies outside is clipped.
+          action: (N, A) float64 as `actions.check_action` returns it.
           read_states: Reads the states (N, nstate), mjSTATE_INTEGRATION.
 
         Returns:
           Control (N, A) of the actuators for all physics steps.
-
-        Raises:
-          ValueError: if the action has the wrong shape or is not finite.
         """
-        action = check_action(action, self._action.shape)
         self._previous_action, self._action = self._action, action
         self.pose_robot(self._state.qpos)
         self._monitor.before_step(read_states, action)
