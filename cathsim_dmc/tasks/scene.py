@@ -8,7 +8,7 @@ from cathsim_dmc.anatomy import Anatomy
 from cathsim_dmc.entities import devices
 from cathsim_dmc.entities.arena import AngiographyArena
 from cathsim_dmc.entities.catheter import Catheter
-from cathsim_dmc.entities.phantom import CONTACT_SOLIMP, CONTACT_SOLREF, Phantom
+from cathsim_dmc.entities.phantom import Phantom
 from cathsim_dmc.entities.robot import Robot
 from cathsim_dmc.entities.sheath import Sheath
 from cathsim_dmc.tasks import placement
@@ -45,7 +45,6 @@ class Scene:
         config: NavigationConfig,
     ) -> "Scene":
         """Builds the entities and attaches them to the arena."""
-        contact = {"solref": CONTACT_SOLREF, "solimp": CONTACT_SOLIMP}
         area = np.pi * device.outer_radius**2
         torsion = config.torsion_joints
         if torsion is None:
@@ -63,12 +62,10 @@ class Scene:
                 stroke=place.stroke,
                 rotation=config.rotation,
                 friction=config.friction,
-                **contact,
             ),
             sheath=Sheath(
                 length=place.working_length - place.start_depth,
                 device_radius=device.outer_radius,
-                **contact,
             ),
             robot=Robot(device_radius=device.outer_radius),
         )
@@ -79,7 +76,11 @@ class Scene:
             (scene.robot, place.robot),
         ):
             site = scene.arena.mjcf_model.worldbody.add(
-                "site", group=5, pos=position, quat=place.quaternion
+                "site",
+                name=f"{entity.mjcf_model.model}_mount",
+                group=5,
+                pos=position,
+                quat=place.quaternion,
             )
             scene.arena.attach(entity, site)
         scene.phantom.add_wall_sensor(scene.catheter.links[0])
