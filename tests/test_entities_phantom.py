@@ -8,7 +8,7 @@ import pytest
 from dm_control import mjcf
 
 from cathsim_dmc.anatomy.arch import arch
-from cathsim_dmc.entities import phantom as phantoms
+from cathsim_dmc.entities import contact
 from cathsim_dmc.entities.arena import BLOOD_DENSITY, GRAVITY, AngiographyArena
 from cathsim_dmc.entities.phantom import Phantom
 from cathsim_dmc.entities.sheath import CLEARANCE, Sheath
@@ -164,7 +164,7 @@ def test_friction_stays_in_its_cone(pressed, environment):
 
 def test_every_piece_collides_with_the_device_only(model, environment):
     wall = [
-        model.geom(f"phantom/wall_{index}")
+        model.geom(f"phantom/wall_{index:03d}")
         for index in range(len(environment.task.scene.anatomy.wall))
     ]
     for geom in wall:
@@ -177,12 +177,12 @@ def test_every_piece_collides_with_the_device_only(model, environment):
 
 
 def test_device_and_wall_have_the_same_contact(model):
-    wall, link = model.geom("phantom/wall_0"), model.geom("catheter/link_3")
+    wall, link = model.geom("phantom/wall_000"), model.geom("catheter/link_3")
     np.testing.assert_array_equal(wall.solref, link.solref)
     np.testing.assert_array_equal(wall.solimp, link.solimp)
-    np.testing.assert_array_equal(wall.solref, phantoms.CONTACT_SOLREF)
-    np.testing.assert_array_equal(wall.solimp, phantoms.CONTACT_SOLIMP)
-    assert wall.friction[0] == link.friction[0] == phantoms.FRICTION
+    np.testing.assert_array_equal(wall.solref, contact.CONTACT_SOLREF)
+    np.testing.assert_array_equal(wall.solimp, contact.CONTACT_SOLIMP)
+    assert wall.friction[0] == link.friction[0] == contact.FRICTION
 
 
 def test_pieces_lie_where_the_anatomy_puts_them(model, environment):
@@ -190,7 +190,7 @@ def test_pieces_lie_where_the_anatomy_puts_them(model, environment):
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
     for index in range(0, len(anatomy.wall), 50):
-        geom = model.geom(f"phantom/wall_{index}")
+        geom = model.geom(f"phantom/wall_{index:03d}")
         mesh = model.mesh(int(geom.dataid[0]))
         start, count = int(mesh.vertadr[0]), int(mesh.vertnum[0])
         vertices = model.mesh_vert[start : start + count]
@@ -225,12 +225,7 @@ def test_friction_outside_its_range(friction):
 
 @pytest.fixture(scope="module")
 def sheath_model():
-    sheath = Sheath(
-        length=0.2,
-        device_radius=0.8e-3,
-        solref=phantoms.CONTACT_SOLREF,
-        solimp=phantoms.CONTACT_SOLIMP,
-    )
+    sheath = Sheath(length=0.2, device_radius=0.8e-3)
     arena = AngiographyArena()
     arena.attach(sheath)
     return sheath, mjcf.Physics.from_mjcf_model(arena.mjcf_model).model.ptr
@@ -279,6 +274,33 @@ def test_sheath_holds_the_device_at_the_start(environment, model):
     base = data.xpos[model.body("catheter/link_0").id]
     behind = (task.scene.anatomy.inlet.position - base) @ axis
     assert behind == pytest.approx(task.scene.sheath.length, abs=1e-9)
+
+
+# Names.
+
+
+@pytest.mark.parametrize("rotation", [False, True])
+def test_every_element_has_a_name(shared_environment, rotation):
+    environment = shared_environment("type1_bca", rotation=rotation)
+    model = environment.physics.model.ptr
+    for kind, count in (
+        ("BODY", model.nbody),
+        ("JOINT", model.njnt),
+        ("GEOM", model.ngeom),
+        ("SITE", model.nsite),
+        ("ACTUATOR", model.nu),
+        ("SENSOR", model.nsensor),
+        ("CAMERA", model.ncam),
+        ("LIGHT", model.nlight),
+        ("MESH", model.nmesh),
+        ("MATERIAL", model.nmat),
+    ):
+        assert count > 0
+        object_type = getattr(mujoco.mjtObj, f"mjOBJ_{kind}")
+        names = [mujoco.mj_id2name(model, object_type, i) for i in range(count)]
+        # PyMJCF calls what has no name "//unnamed_geom_3".
+        bare = [name for name in names if not name or "unnamed" in name]
+        assert not bare, f"{kind}: {bare}"
 
 
 # Arena.

@@ -5,7 +5,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from cathsim_dmc.entities import devices
-from cathsim_dmc.entities.phantom import FRICTION
+from cathsim_dmc.entities.contact import FRICTION
 from cathsim_dmc.imaging.options import FluoroscopyOptions
 from cathsim_dmc.tasks.cameras import CameraOptions
 from cathsim_dmc.tasks.variations import Randomisation

@@ -8,7 +8,7 @@ from cathsim_dmc.anatomy import Anatomy, Goal
 from cathsim_dmc.entities import devices
 from cathsim_dmc.entities.arena import AngiographyArena
 from cathsim_dmc.entities.catheter import Catheter
-from cathsim_dmc.entities.phantom import CONTACT_SOLIMP, CONTACT_SOLREF, Phantom
+from cathsim_dmc.entities.phantom import Phantom
 from cathsim_dmc.entities.robot import Robot
 from cathsim_dmc.entities.sheath import Sheath
 from cathsim_dmc.tasks import placement
@@ -17,7 +17,6 @@ from cathsim_dmc.tasks.objectives import GOAL_RADIUS
 
 # Joints of the shaft that twist, where the base turns.
 _TORSION_JOINTS = 4
-_CONTACT = {"solref": CONTACT_SOLREF, "solimp": CONTACT_SOLIMP}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -95,7 +94,6 @@ class Scene:
             or Sheath(
                 length=place.working_length - place.start_depth,
                 device_radius=radius,
-                **_CONTACT,
             ),
             robot=robot or Robot(device_radius=radius),
         )
@@ -111,7 +109,11 @@ class Scene:
             (self.robot, place.robot),
         ):
             site = self.arena.mjcf_model.worldbody.add(
-                "site", group=5, pos=position, quat=place.quaternion
+                "site",
+                name=f"{entity.mjcf_model.model}_mount",
+                group=5,
+                pos=position,
+                quat=place.quaternion,
             )
             self.arena.attach(entity, site)
         self.phantom.add_wall_sensor(self.catheter.links[0])
@@ -144,5 +146,4 @@ def _catheter(
         stroke=place.stroke,
         rotation=config.rotation,
         friction=config.friction,
-        **_CONTACT,
     )

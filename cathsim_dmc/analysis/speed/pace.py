@@ -2,6 +2,7 @@
 
 import contextlib
 import dataclasses
+import functools
 import time
 from collections.abc import Callable, Iterator
 
@@ -12,6 +13,7 @@ from cathsim_dmc import suite
 from cathsim_dmc.tasks.config import CONTROL_TIMESTEP
 
 DEPTHS = (0.0, 0.1, 0.2, 0.3, np.inf)  # m of insertion, edges of the bins
+_WARM_STEPS = 1000  # of the humanoid, 5 s: it has come to lie on the floor
 NEVER = 1e-6  # m, goal radius that no policy meets
 
 
@@ -81,6 +83,34 @@ class Pace:
                     "contacts": float(self.contacts[chosen].mean()),
                 }
         return table
+
+
+def humanoid_step(steps: int = 2000) -> float:
+    """CPU time of one `mj_step` of dm_control's humanoid, µs: the speed of the machine.
+
+    A real-time factor times this is a figure that another machine, or the same one at
+    another hour, can be held to. The humanoid of `stand` falls without controls from
+    its standing pose; the first steps warm it up and are not timed.
+
+    Args:
+      steps: number of timed physics steps.
+    """
+    model, start = _humanoid()
+    data = mujoco.MjData(model)
+    mujoco.mj_copyData(data, model, start)
+    mujoco.mj_step(model, data, nstep=_WARM_STEPS)
+    begin = time.process_time()
+    mujoco.mj_step(model, data, nstep=steps)
+    return 1e6 * (time.process_time() - begin) / steps
+
+
+@functools.cache
+def _humanoid() -> tuple[mujoco.MjModel, mujoco.MjData]:
+    from dm_control import suite as control_suite
+
+    environment = control_suite.load("humanoid", "stand", task_kwargs={"random": 0})
+    environment.reset()
+    return environment.physics.model.ptr, environment.physics.data.ptr
 
 
 def load(task: str = "type1_bca", **options):
