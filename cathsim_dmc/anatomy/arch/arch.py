@@ -17,13 +17,14 @@ from types import MappingProxyType
 
 import numpy as np
 
-from cathsim_dmc.anatomy.anatomy import Anatomy, End, Goal, Inlet
+from cathsim_dmc.anatomy.anatomy import Anatomy
 from cathsim_dmc.anatomy.arch.parameters import (
     INLET_TUBE,
     ArchParameters,
     BranchParameters,
 )
 from cathsim_dmc.anatomy.arch.tree import arch_tree
+from cathsim_dmc.anatomy.builder import Place, access_inlet
 from cathsim_dmc.anatomy.centreline import VesselTree
 
 # Range of the BCA drop in LCCA diameters for each type of arch (class by the
@@ -33,50 +34,13 @@ DROP_RANGES: Mapping[str, tuple[float, float]] = MappingProxyType(
 )
 
 
-ACCESSES = ("ascending", "descending")
-
-
-def anatomy_frame(tree: VesselTree, access: str) -> tuple[Inlet, tuple[End, ...]]:
-    """Inlet at one end of the root, and every flat end of the tree.
-
-    Args:
-        tree: vessels.
-        access: "ascending" enters at the root's first point, "descending" (as from
-            the femoral artery) at its last.
-    """
-    if access not in ACCESSES:
-        raise ValueError(f"access is {access!r}; choose one of {', '.join(ACCESSES)}.")
-    root = tree.root
-    first = root.centreline.at(0.0)
-    ends = [
-        End(
-            root.name,
-            first.position,
-            -first.tangent,
-            float(first.radius),
-            access == "ascending",
-        )
-    ]
-    for vessel in tree.vessels.values():
-        last = vessel.centreline.at(vessel.centreline.length)
-        entered = vessel is root and access == "descending"
-        ends.append(
-            End(vessel.name, last.position, last.tangent, float(last.radius), entered)
-        )
-    entry = next(end for end in ends if end.open)
-    inlet = Inlet(root.name, entry.position, -entry.direction, entry.radius)
-    return inlet, tuple(ends)
-
-
-def _goals(params: ArchParameters, tree: VesselTree) -> dict[str, Goal]:
-    goals = {}
-    for name in ("bca", "lcca", "lsa"):
-        vessel = tree.vessel(name)
-        arc = vessel.ostium + getattr(params, name).goal_depth
-        goals[name] = Goal(name, name, vessel.centreline.at(arc).position, arc)
-    aorta = tree.root.centreline
-    arc = aorta.length - params.descending_goal_depth
-    goals["descending"] = Goal("descending", "aorta", aorta.at(arc).position, arc)
+def _goals(params: ArchParameters, tree: VesselTree) -> dict[str, Place]:
+    goals = {
+        name: Place(name, past_ostium=getattr(params, name).goal_depth)
+        for name in ("bca", "lcca", "lsa")
+    }
+    arc = tree.root.centreline.length - params.descending_goal_depth
+    goals["descending"] = Place("aorta", arc_length=arc)
     return goals
 
 
@@ -98,19 +62,9 @@ def build_arch(
     Raises:
         ValueError: if the parameters give no valid arch.
     """
-    from cathsim_dmc.anatomy.surface import lumen_surface
-    from cathsim_dmc.anatomy.wall.pieces import build_wall
-
     tree = arch_tree(params)
-    inlet, ends = anatomy_frame(tree, access)
-    return Anatomy(
-        name=name,
-        tree=tree,
-        surface=lumen_surface(tree),
-        wall=build_wall(tree, ends),
-        inlet=inlet,
-        goals=_goals(params, tree),
-        ends=ends,
+    return Anatomy.from_tree(
+        tree, name, inlet=access_inlet(tree, access), goals=_goals(params, tree)
     )
 
 
@@ -171,7 +125,7 @@ BOVINE = replace(
     TYPE_II, bca_drop=1.0, bca_lcca_spacing=10e-3, lcca_lsa_spacing=30e-3, bovine=True
 )
 ARCHES: Mapping[str, ArchParameters] = MappingProxyType(
-    {"type1": TYPE_I, "type2": TYPE_II, "type3": TYPE_III, "bovine": BOVINE}
+    {"simple1": TYPE_I, "simple2": TYPE_II, "type3": TYPE_III, "bovine": BOVINE}
 )
 
 # Share of the types I, II and III (one of the published cohorts).
