@@ -122,14 +122,14 @@ def load_anatomy(phantom: "str | Path | Anatomy") -> Anatomy:
     """
     if isinstance(phantom, Anatomy):
         return phantom
-    from cathsim_dmc.anatomy.arch import arch
+    from cathsim_dmc.anatomy import phantoms
 
-    if str(phantom) in arch.ARCHES:
-        return arch.load(str(phantom))
+    if str(phantom) in phantoms.PHANTOMS:
+        return phantoms.load(str(phantom))
     if not Path(phantom).is_dir():
         raise ValueError(
             f"no phantom at {str(phantom)!r}; give a directory written by `cathsim "
-            f"phantom import` or `generate`, or one of {', '.join(arch.ARCHES)}"
+            f"phantom import` or `generate`, or one of {', '.join(phantoms.PHANTOMS)}"
         )
     return Anatomy.load(phantom)
 

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from cathsim_dmc.anatomy.anatomy import Anatomy, End, Goal, Inlet
-from cathsim_dmc.anatomy.centreline import Array, Vessel, VesselTree
+from cathsim_dmc.anatomy.centreline import Array, VesselTree
 from cathsim_dmc.anatomy.curves import FLARE, SMOOTHING, Curve, smooth_tree
 
 # Goals lie this far (m) past the ostium of their branch where it is long enough,

@@ -29,8 +29,8 @@ def junction_end(vessel: Vessel, parent: Vessel) -> float:
     if not (free & reach).any():
         raise ValueError(
             f"branch {vessel.name!r} does not part from {parent.name!r} within "
-            f"{_LONGEST_JUNCTION * place.radius[0] * 1e3:.0f} mm of its ostium; it runs "
-            "along its parent's wall. Start it further on, or merge the two."
+            f"{_LONGEST_JUNCTION * place.radius[0] * 1e3:.0f} mm of its ostium; it "
+            "runs along its parent's wall. Start it further on, or merge the two."
         )
     return float(s[int(free.argmax())])
 

@@ -1,4 +1,4 @@
-"""`cathsim phantom import`, `generate` and `check`."""
+"""`cathsim phantom import`, `build`, `generate` and `check`."""
 
 import sys
 from pathlib import Path
@@ -53,6 +53,29 @@ def import_phantom(
     )
     anatomy.save(out)
     print_json({"directory": str(out), **scan.describe(anatomy)})
+    return 0
+
+
+@phantoms.command
+def build(
+    tree: Annotated[Path, conf.Positional],
+    /,
+    out: Path,
+    access: str | None = None,
+) -> int:
+    """Build an anatomy around centrelines.
+
+    Args:
+        tree: Vessel tree in JSON: centrelines, radii, parents, inlets, goals
+            (docs/anatomies.md has the format).
+        out: Directory of the anatomy.
+        access: Inlet of the file that the device enters by; the first if left out.
+    """
+    from cathsim_dmc.anatomy.tree_file import read_tree
+
+    anatomy = read_tree(tree).build(access)
+    anatomy.save(out)
+    print(f"{len(anatomy.wall)} wall pieces, goals {', '.join(anatomy.goals)}: {out}")
     return 0
 
 
