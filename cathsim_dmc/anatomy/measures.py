@@ -119,8 +119,10 @@ def measure(
         if vessel.parent is not None
     }
     drop = None
-    if {"bca", "lcca"} <= branches.keys():
-        bca = tree.vessel("bca")
+    # With an aberrant right subclavian the right carotid stands in the BCA's place.
+    first_branch = "bca" if "bca" in branches else "rcca"
+    if {first_branch, "lcca"} <= branches.keys():
+        bca = tree.vessel(first_branch)
         ostium = bca.centreline.at(bca.ostium).position[2]
         drop = (top_of_arch(aorta) - ostium) / branches["lcca"].diameter
     levels = {
