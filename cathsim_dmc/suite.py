@@ -196,14 +196,14 @@ def load_anatomy(anatomy: str | Path | Anatomy) -> Anatomy:
     """
     if isinstance(anatomy, Anatomy):
         return anatomy
-    from cathsim_dmc.anatomy.arch import arch
+    from cathsim_dmc.anatomy import phantoms
 
-    if str(anatomy) in arch.ARCHES:
-        return arch.load(str(anatomy))
+    if str(anatomy) in phantoms.PHANTOMS:
+        return phantoms.load(str(anatomy))
     if not Path(anatomy).is_dir():
         raise ValueError(
             f"no anatomy at {str(anatomy)!r}; give a directory written by `cathsim "
-            f"phantom import` or `generate`, or one of {', '.join(arch.ARCHES)}"
+            f"phantom import` or `generate`, or one of {', '.join(phantoms.PHANTOMS)}"
         )
     return Anatomy.load(anatomy)
 

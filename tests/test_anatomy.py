@@ -11,7 +11,7 @@ from cathsim_dmc.anatomy.arch import arch
 
 @pytest.fixture(scope="module")
 def anatomy():
-    return arch.load("type1")
+    return arch.load("simple1")
 
 
 def test_round_trip(anatomy, tmp_path):
@@ -31,9 +31,9 @@ def test_round_trip(anatomy, tmp_path):
 
 def test_saving_again_leaves_one_geometry(anatomy, tmp_path):
     anatomy.save(tmp_path)
-    arch.load("type2").save(tmp_path)
+    arch.load("simple2").save(tmp_path)
     assert len(list(tmp_path.iterdir())) == 2
-    assert Anatomy.load(tmp_path).name == "type2"
+    assert Anatomy.load(tmp_path).name == "simple2"
 
 
 def test_damage_is_found(anatomy, tmp_path):
@@ -66,9 +66,9 @@ def test_failed_writing_leaves_the_old_anatomy(anatomy, tmp_path, monkeypatch):
 
     monkeypatch.setattr("cathsim_dmc.anatomy.anatomy.os.replace", broken)
     with pytest.raises(OSError, match="disk full"):
-        arch.load("type2").save(tmp_path)
+        arch.load("simple2").save(tmp_path)
     monkeypatch.undo()
-    assert Anatomy.load(tmp_path).name == "type1"
+    assert Anatomy.load(tmp_path).name == "simple1"
     assert not list(tmp_path.glob(".writing-*"))
 
 

@@ -23,7 +23,7 @@ def bca_drop(params):
 
 
 def test_type_one_has_the_published_figures():
-    anatomy = arch.load("type1")
+    anatomy = arch.load("simple1")
     plane = arch.TYPE_I.plane_rotation
     along = np.array([math.sin(plane), math.cos(plane), 0.0])
     vertices = anatomy.surface.vertices
@@ -42,7 +42,7 @@ def test_type_one_has_the_published_figures():
 
 @pytest.mark.parametrize(
     ("name", "low", "high"),
-    [("type1", 0, 1), ("type2", 1, 2), ("type3", 2, 3)],
+    [("simple1", 0, 1), ("simple2", 1, 2), ("type3", 2, 3)],
 )
 def test_types_are_set_by_the_drop_of_the_bca(name, low, high):
     drop = bca_drop(arch.ARCHES[name])
@@ -149,20 +149,20 @@ def test_types_are_drawn_by_prevalence():
 
 
 def test_unknown_names_list_the_known():
-    with pytest.raises(ValueError, match="type1, type2, type3, bovine"):
+    with pytest.raises(ValueError, match="simple1, simple2, type3, bovine"):
         arch.load("type9")
     with pytest.raises(ValueError, match="I, II, III"):
         arch.sample(np.random.RandomState(0), "IV")
     with pytest.raises(ValueError, match="ascending, descending"):
-        arch.load("type1", access="radial")
+        arch.load("simple1", access="radial")
 
 
 def test_equal_parameters_give_one_anatomy():
-    assert arch.load("type1") is arch.load("type1")
+    assert arch.load("simple1") is arch.load("simple1")
 
 
 def test_femoral_access_enters_the_descending_aorta():
-    anatomy = arch.load("type2", access="descending")
+    anatomy = arch.load("simple2", access="descending")
     aorta = anatomy.tree.vessel("aorta").centreline
     np.testing.assert_allclose(anatomy.inlet.position, aorta.points[-1])
     np.testing.assert_allclose(anatomy.inlet.direction, [0, 0, 1], atol=1e-9)

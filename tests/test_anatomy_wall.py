@@ -38,7 +38,7 @@ def test_presets_keep_the_lumen_free_and_closed(name):
 
 
 def test_femoral_access_is_closed_but_for_its_inlet():
-    check(arch.load("type1", access="descending"))
+    check(arch.load("simple1", access="descending"))
 
 
 @pytest.mark.parametrize("seed", range(2, 4))
@@ -55,7 +55,7 @@ def test_many_random_arches_keep_the_lumen_free_and_closed(seed):
 
 
 def test_pieces_are_convex_with_few_vertices():
-    for piece in arch.load("type2").wall:
+    for piece in arch.load("simple2").wall:
         hull = ConvexHull(piece * 1e3)
         assert hull.volume > 1e-3
         assert len(piece) <= 40
@@ -63,10 +63,10 @@ def test_pieces_are_convex_with_few_vertices():
 
 def test_mujoco_compiles_every_piece_quietly(capfd):
     start = time.process_time()
-    model = fidelity.wall_model(arch.load("type2").wall)
+    model = fidelity.wall_model(arch.load("simple2").wall)
     # A twentieth of this is usual; the bound only catches a wrong order.
     assert time.process_time() - start < 2.0
-    assert model.nmesh == len(arch.load("type2").wall)
+    assert model.nmesh == len(arch.load("simple2").wall)
     output = capfd.readouterr()
     assert "WARNING" not in output.out + output.err
     # MuJoCo's hulls have the volume of ours: no piece was dropped or degenerate.
@@ -99,7 +99,7 @@ def test_fidelity_sees_a_wall_that_stands_in_the_lumen():
 def test_fidelity_sees_a_missing_piece_and_a_blocked_branch():
     from dataclasses import replace
 
-    anatomy = arch.load("type1")
+    anatomy = arch.load("simple1")
     lsa = anatomy.goal("lsa").position
     away = [np.linalg.norm(piece.mean(axis=0) - lsa) for piece in anatomy.wall]
     holed = list(anatomy.wall)
@@ -115,7 +115,7 @@ def test_fidelity_sees_a_missing_piece_and_a_blocked_branch():
 
 def test_too_large_a_sphere_touches():
     # The LCCA of type I has a radius of 3 mm.
-    found = fidelity.patency(arch.load("type1"), 3.2e-3, spacing=4e-3)
+    found = fidelity.patency(arch.load("simple1"), 3.2e-3, spacing=4e-3)
     assert "lcca" in found.blocked
 
 
@@ -145,7 +145,7 @@ def test_two_halves_of_a_clipped_piece_fill_it():
         assert sum(volumes) == pytest.approx(whole, rel=1e-9)
 
 
-@pytest.mark.parametrize("name", ["type1", "bovine"])
+@pytest.mark.parametrize("name", ["simple1", "bovine"])
 def test_surface_is_closed_points_outwards_and_follows_the_lumen(name):
     anatomy = arch.load(name)
     found = anatomy.surface

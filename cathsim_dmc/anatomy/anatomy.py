@@ -13,7 +13,7 @@ import tempfile
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -27,6 +27,10 @@ from cathsim_dmc.anatomy.centreline import (
     as_points,
 )
 from cathsim_dmc.anatomy.wall.depth import DepthField
+
+if TYPE_CHECKING:
+    from cathsim_dmc.anatomy.builder import Place
+    from cathsim_dmc.anatomy.curves import Curve
 
 FORMAT = "cathsim-anatomy"
 FORMAT_VERSION = 1
@@ -173,6 +177,37 @@ class Anatomy:
         object.__setattr__(self, "wall", wall)
         object.__setattr__(self, "goals", dict(self.goals))
         object.__setattr__(self, "ends", tuple(self.ends))
+
+    @classmethod
+    def from_tree(
+        cls,
+        tree: VesselTree | Mapping[str, Curve],
+        name: str = "tree",
+        *,
+        inlet: Place | None = None,
+        goals: Mapping[str, Place] | None = None,
+        **smoothing: float,
+    ) -> Anatomy:
+        """Build lumen surface, wall pieces, inlet and goals around centrelines.
+
+        Args:
+            tree: measured centrelines (`anatomy.curves.Curve`) by name, parents
+                before their children; or a finished vessel tree, taken as it is.
+            name: what to call the anatomy.
+            inlet: where the device enters; what lies behind is cut off. The first
+                point of the root if None.
+            goals: places to reach; if None one in each branch, see
+                `anatomy.builder.default_goals`.
+            **smoothing: `smoothing` and `flare` of `anatomy.curves.smooth_tree`, m.
+
+        Raises:
+            ValueError: if the centrelines give no valid lumen, or a place is not on
+                its vessel; names the vessel.
+        """
+        # The builder needs this class.
+        from cathsim_dmc.anatomy.builder import build_anatomy
+
+        return build_anatomy(tree, name, inlet=inlet, goals=goals, **smoothing)
 
     def depth(self, points: ArrayLike) -> Array:
         """Signed depth (...) of `points` (..., 3) in the lumen, metres, > 0 inside."""

@@ -81,3 +81,10 @@ def lumen_surface(tree: VesselTree, spacing: float = SPACING) -> Surface:
     if surface.volume < 0.0:
         surface = Surface(surface.vertices, surface.faces[:, ::-1])
     return surface
+
+
+def loose_edges(surface: Surface) -> int:
+    """Number of edges of a surface that do not have exactly two triangles."""
+    edges = surface.faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
+    _, counts = np.unique(np.sort(edges, axis=1), axis=0, return_counts=True)
+    return int((counts != 2).sum())

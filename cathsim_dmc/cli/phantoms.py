@@ -1,4 +1,4 @@
-"""`cathsim phantom import`, `generate` and `check`."""
+"""`cathsim phantom import`, `build`, `generate` and `check`."""
 
 import sys
 from pathlib import Path
@@ -57,6 +57,29 @@ def import_phantom(
 
 
 @phantoms.command
+def build(
+    tree: Annotated[Path, conf.Positional],
+    /,
+    out: Path,
+    access: str | None = None,
+) -> int:
+    """Build an anatomy around centrelines.
+
+    Args:
+        tree: Vessel tree in JSON: centrelines, radii, parents, inlets, goals
+            (docs/anatomies.md has the format).
+        out: Directory of the anatomy.
+        access: Inlet of the file that the device enters by; the first if left out.
+    """
+    from cathsim_dmc.anatomy.tree_file import read_tree
+
+    anatomy = read_tree(tree).build(access)
+    anatomy.save(out)
+    print(f"{len(anatomy.wall)} wall pieces, goals {', '.join(anatomy.goals)}: {out}")
+    return 0
+
+
+@phantoms.command
 def generate(
     kind: Annotated[str, conf.Positional],
     /,
@@ -91,14 +114,74 @@ def generate(
 
 
 @phantoms.command
-def check(phantom: Annotated[str, conf.Positional], /, json: bool = False) -> int:
-    """Check an anatomy: intrusion and coverage of its wall, patency of its vessels.
+def check(
+    phantom: Annotated[str, conf.Positional],
+    /,
+    figure: Path | None = None,
+    access: str | None = None,
+    push: bool = True,
+    json: bool = False,
+) -> int:
+    """Check an anatomy and measure what it is like.
+
+    The wall's intrusion and coverage, patency, goals; type of the arch, diameters,
+    take-offs, curvature; whether a device that is only pushed reaches each goal.
 
     Args:
-        phantom: Directory of an anatomy, or the name of an arch.
+        phantom: Directory of an anatomy, or the name of a phantom.
+        figure: PNG of three views; check.png in a directory of an anatomy if left
+            out.
+        access: End of the aorta that the device enters, ascending or descending, of a
+            named phantom.
+        push: Try a straight push to each goal.
         json: Print one JSON object and nothing else.
     """
     from cathsim_dmc import suite, validation
+    from cathsim_dmc.anatomy import phantoms as shipped
 
-    anatomy = suite.load_anatomy(phantom)
-    return show(validation.validate_anatomy({anatomy.name: anatomy}), json)
+    if access is None:
+        anatomy = suite.load_anatomy(phantom)
+    elif phantom in shipped.PHANTOMS:
+        anatomy = shipped.load(phantom, access=access)
+    else:
+        raise ValueError(
+            f"{phantom!r} is no named phantom, so its access is as built; named are "
+            f"{', '.join(shipped.PHANTOMS)}"
+        )
+    if figure is None and Path(phantom).is_dir():
+        figure = Path(phantom) / "check.png"
+    report = validation.validate_anatomy(
+        {anatomy.name: anatomy}, figure_path=figure, push=push
+    )
+    code = show(report, json)
+    if not json:
+        print_measures(report.findings[anatomy.name])
+    if figure is not None:
+        print(f"three views: {figure}", file=sys.stderr)
+    return code
+
+
+def print_measures(findings: dict) -> None:
+    """Prints what an anatomy is like, a line for each of its parts."""
+    figures = dict(findings["measures"])
+    branches = figures.pop("branches")
+    diameters = figures.pop("diameters")
+    print(_line("arch", figures))
+    print(_line("diameters, mm", diameters))
+    for name, branch in branches.items():
+        print(_line(name, branch))
+    for goal, push in findings.get("straight push", {}).items():
+        reached = "reaches" if push["success"] else "does not reach"
+        print(
+            f"a straight push {reached} {goal}: {push['steps']} steps, force on the "
+            f"wall {1e3 * push['mean_force']:.0f} mN on average, largest contact "
+            f"{1e3 * push['peak_force']:.0f} mN"
+        )
+
+
+def _line(name: str, figures: dict) -> str:
+    cells = (
+        f"{key} {value:.3g}" if isinstance(value, float) else f"{key} {value}"
+        for key, value in figures.items()
+    )
+    return f"{name}: {', '.join(cells)}"

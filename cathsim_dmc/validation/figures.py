@@ -36,7 +36,8 @@ def _canvas(rows: int, columns: int) -> tuple[Figure, np.ndarray]:
     return figure, axes
 
 
-def _save(figure: Figure, path: str | Path) -> None:
+def save_figure(figure: Figure, path: str | Path) -> None:
+    """Writes a figure as PNG in one step."""
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     part = path.with_name(f".{path.name}.part")
@@ -57,7 +58,7 @@ def rod(
     _lag(axes[0, 1], lag)
     _southwell(axes[1, 0], columns)
     _short_columns(axes[1, 1], [*short, *columns])
-    _save(figure, path)
+    save_figure(figure, path)
 
 
 def _cantilevers(ax, bent):
@@ -227,7 +228,7 @@ def wall(
         ylabel="tension ratio (dashed: exp μθ)",
     )
     ax.legend(frameon=False, fontsize=8)
-    _save(figure, path)
+    save_figure(figure, path)
 
 
 def _lumen(anatomy: Anatomy) -> fidelity.SurfaceSamples:
@@ -299,4 +300,4 @@ def forces(
     )
     ax.set(title="Cumulative", xlabel="force on the phantom, N", ylabel="share")
     ax.legend(frameon=False, fontsize=8, loc="center", bbox_to_anchor=(0.42, 0.5))
-    _save(figure, path)
+    save_figure(figure, path)

@@ -11,7 +11,7 @@ import numpy as np
 
 from cathsim_dmc import suite
 from cathsim_dmc.anatomy.anatomy import Anatomy, Goal
-from cathsim_dmc.anatomy.arch.arch import anatomy_frame
+from cathsim_dmc.anatomy.builder import anatomy_frame
 from cathsim_dmc.anatomy.centreline import Centreline, Vessel, VesselTree
 from cathsim_dmc.anatomy.surface import lumen_surface
 from cathsim_dmc.anatomy.wall.pieces import build_wall

@@ -10,6 +10,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
+from cathsim_dmc.anatomy import measures, surface
 from cathsim_dmc.anatomy.anatomy import Anatomy
 from cathsim_dmc.anatomy.wall import fidelity
 from cathsim_dmc.entities import devices
@@ -124,7 +125,7 @@ def _full_speed(rig: Rig) -> float:
 
 
 def lumen_checks(anatomy: Anatomy, rays: int = RAYS) -> list[Check]:
-    """Intrusion, coverage and patency of an anatomy.
+    """Surface, intrusion, coverage, patency and goals of an anatomy.
 
     Args:
         anatomy: generated or imported.
@@ -136,7 +137,25 @@ def lumen_checks(anatomy: Anatomy, rays: int = RAYS) -> list[Check]:
     device = devices.get("published")
     passage = fidelity.patency(anatomy, device.outer_radius)
     bounds = {"mean": INTRUSION_MEAN, "p95": INTRUSION_P95, "max": INTRUSION_MAX}
+    loose = surface.loose_edges(anatomy.surface)
+    astray = [
+        goal.name
+        for goal in anatomy.goals.values()
+        if not min(
+            float(anatomy.depth(goal.position)),
+            float(anatomy.tree.depths(goal.position)[goal.vessel]),
+        )
+        > device.outer_radius
+    ]
     return [
+        Check.at_most(
+            f"{name}: edges of the surface without two triangles",
+            loose,
+            0,
+            "",
+            f"{len(anatomy.surface.faces)} triangles, "
+            f"{1e6 * anatomy.surface.volume:.0f} ml",
+        ),
         *(
             Check.at_most(
                 f"{name}: intrusion, {which}",
@@ -162,15 +181,85 @@ def lumen_checks(anatomy: Anatomy, rays: int = RAYS) -> list[Check]:
             f"radius {1e3 * passage.radius:.2f} mm, {passage.positions} places"
             + (f", blocked: {', '.join(passage.blocked)}" if passage.blocked else ""),
         ),
+        Check.at_most(
+            f"{name}: goals that the device cannot reach in their vessel",
+            len(astray),
+            0,
+            "",
+            f"of {', '.join(anatomy.goals) or 'none'}"
+            + (f", astray: {', '.join(astray)}" if astray else ""),
+        ),
     ]
 
 
-def validate_anatomy(anatomies: Mapping[str, Anatomy], rays: int = RAYS) -> Report:
-    """Checks of intrusion, coverage and patency of some anatomies, by name."""
+def validate_anatomy(
+    anatomies: Mapping[str, Anatomy],
+    rays: int = RAYS,
+    figure_path: str | Path | None = None,
+    push: bool = False,
+) -> Report:
+    """Checks some anatomies, by name, and measures what they are like.
+
+    Args:
+        anatomies: generated, measured or imported.
+        rays: of the coverage of each.
+        figure_path: PNG of three views of the first one, or None.
+        push: whether to try a straight push to each goal, which takes seconds.
+    """
     checks: list[Check] = []
+    findings: dict[str, Any] = {}
     for name, anatomy in anatomies.items():
         checks += lumen_checks(dataclasses.replace(anatomy, name=name), rays)
-    return Report("wall of " + ", ".join(anatomies), checks)
+        findings[name] = {"measures": shape(anatomy)}
+        if push:
+            from cathsim_dmc.validation.push import straight_push
+
+            findings[name]["straight push"] = {
+                goal: dataclasses.asdict(straight_push(anatomy, goal))
+                for goal in anatomy.goals
+            }
+    if figure_path is not None:
+        from cathsim_dmc.validation import views
+
+        views.draw(next(iter(anatomies.values())), figure_path)
+    return Report("anatomy of " + ", ".join(anatomies), checks, findings)
+
+
+def shape(anatomy: Anatomy) -> dict[str, Any]:
+    """What an anatomy is like, for people: millimetres and degrees in the names."""
+    found = dataclasses.asdict(
+        measures.measure(
+            anatomy.tree, anatomy.inlet.position, measures.inlet_axis(anatomy)
+        )
+    )
+    return {"pieces": len(anatomy.wall), **_for_people(found)}
+
+
+_ANGLES = {
+    "plane",
+    "ascending_tilt",
+    "ascending_turn",
+    "take_off",
+    "lean",
+    "axis_angle",
+}
+_PLAIN = {"drop", "tortuosity"}
+
+
+def _for_people(values: Mapping[str, Any], inside: str = "") -> dict[str, Any]:
+    out: dict[str, Any] = {}
+    for key, value in values.items():
+        if isinstance(value, Mapping):
+            out[key] = _for_people(value, key)
+        elif not isinstance(value, float) or key in _PLAIN:
+            out[key] = value
+        elif key in _ANGLES:
+            out[f"{key}_deg"] = round(float(np.degrees(value)), 1)
+        elif inside == "diameters":
+            out[key] = round(1e3 * value, 2)
+        else:
+            out[f"{key}_mm"] = round(1e3 * value, 2)
+    return out
 
 
 def validate_wall(
@@ -192,15 +281,15 @@ def validate_wall(
     Raises:
         ValueError: if a directory holds no anatomy.
     """
-    from cathsim_dmc.anatomy.arch import arch
+    from cathsim_dmc.anatomy import phantoms as shipped
 
-    anatomies = [arch.load(name) for name in ARCHES]
+    anatomies = [shipped.load(name) for name in ARCHES]
     for phantom in phantoms:
         if not isinstance(phantom, Anatomy):
             if not Path(phantom).is_dir():
                 raise ValueError(
                     f"no phantom at {str(phantom)!r}; give a directory written by "
-                    "`cathsim phantom import` or `generate`"
+                    "`cathsim phantom import`, `build` or `generate`"
                 )
             phantom = Anatomy.load(phantom)
         anatomies.append(phantom)

@@ -34,6 +34,13 @@ class BranchParameters:
         bend_azimuth: direction of the bend: 0 downstream in the plane of the arch,
             pi upstream, pi/2 out of the plane to the patient's right and back.
         goal_depth: distance of the goal beyond the ostium, along the branch.
+        lean: angle of the first part out of the plane of the arch, positive to the
+            patient's right and back.
+        roll: place of the ostium around the aorta, from its outer curve to the
+            patient's right and back.
+        second_bend_radius: radius of curvature of the distal half, after the first
+            bend; None to go on with the first bend.
+        second_bend_azimuth: direction of that bend, as `bend_azimuth`.
     """
 
     radius: float
@@ -43,14 +50,23 @@ class BranchParameters:
     bend_radius: float = 100e-3
     bend_azimuth: float = 0.0
     goal_depth: float = 27e-3
+    lean: float = 0.0
+    roll: float = 0.0
+    second_bend_radius: float | None = None
+    second_bend_azimuth: float = 0.0
 
     def __post_init__(self) -> None:
         _check("branch radius", self.radius, 1.5e-3, 12e-3, "m")
         _check("branch end_radius", self.end_radius, 1.0e-3, 12e-3, "m")
         _check("branch take_off", self.take_off, -1.3, 1.3, "rad")
         _check("branch length", self.length, 40e-3, 150e-3, "m")
-        _check("branch bend_radius", self.bend_radius, 40e-3, 10.0, "m")
-        _check("branch bend_azimuth", self.bend_azimuth, -2 * math.pi, 2 * math.pi, "")
+        _check("branch lean", self.lean, -1.3, 1.3, "rad")
+        _check("branch roll", self.roll, -1.3, 1.3, "rad")
+        second = self.second_bend_radius
+        for bend in (self.bend_radius, self.bend_radius if second is None else second):
+            _check("branch bend_radius", bend, 25e-3, 10.0, "m")
+        for azimuth in (self.bend_azimuth, self.second_bend_azimuth):
+            _check("branch bend_azimuth", azimuth, -2 * math.pi, 2 * math.pi, "")
         _check("branch goal_depth", self.goal_depth, 5e-3, self.length - 5e-3, "m")
 
 
@@ -79,6 +95,16 @@ class ArchParameters:
         bovine: the LCCA leaves the BCA, `bca_lcca_spacing` above the BCA's ostium
             along the BCA, instead of leaving the arch; `lcca_lsa_spacing` is then
             from the BCA to the LSA.
+        ascending_bend: angle by which the ascending limb turns, evenly, before the
+            arch: its root leans away from the descending limb by as much.
+        descending_bend: angle by which the descending limb turns on after the arch.
+        plane_tilt: angle of the plane of the arch from the vertical, positive with
+            its top to the patient's right and back.
+        bow, sway: amplitudes of half a wave and of a whole one by which the aorta's
+            centreline leaves the plane, positive to the right and back at first.
+        aberrant: right subclavian artery that leaves the aorta last ("rsa"); the
+            first branch is then the right carotid ("rcca") with the figures of `bca`.
+        lsa_aberrant_spacing: between their ostium centres, as the other spacings.
     """
 
     bca: BranchParameters
@@ -100,6 +126,13 @@ class ArchParameters:
     fillet: float = 2.5e-3
     descending_goal_depth: float = 30e-3
     bovine: bool = False
+    ascending_bend: float = 0.0
+    descending_bend: float = 0.0
+    plane_tilt: float = 0.0
+    bow: float = 0.0
+    sway: float = 0.0
+    aberrant: BranchParameters | None = None
+    lsa_aberrant_spacing: float = 16e-3
 
     def __post_init__(self) -> None:
         for level in ("ascending", "bca_level", "lcca_level", "lsa_level"):
@@ -113,6 +146,11 @@ class ArchParameters:
         _check("plane_rotation", self.plane_rotation, -math.pi, math.pi, "rad")
         _check("bca_drop", self.bca_drop, 0.0, 4.0, "LCCA diameters")
         _check("fillet", self.fillet, 0.0, 5e-3, "m")
+        _check("ascending_bend", self.ascending_bend, 0.0, 1.0, "rad")
+        _check("descending_bend", self.descending_bend, -0.5, 0.5, "rad")
+        _check("plane_tilt", self.plane_tilt, -0.6, 0.6, "rad")
+        for name in ("bow", "sway"):
+            _check(name, getattr(self, name), -15e-3, 15e-3, "m")
         _check(
             "descending_goal_depth",
             self.descending_goal_depth,
@@ -136,10 +174,23 @@ class ArchParameters:
                 f"must be at least 1.25 times the widest lumen radius ({widest:g} m). "
                 "Enlarge arch_radius and arch_height or bring them closer together."
             )
+        bends = (self.ascending_bend, abs(self.descending_bend))
+        for limb, bend in zip(("ascending", "descending"), bends, strict=True):
+            length = getattr(self, f"{limb}_length")
+            if length < 1.25 * widest * bend:
+                raise ValueError(
+                    f"the {limb} limb ({length:g} m long) turns by {bend:g} rad, with "
+                    f"a radius of {length / bend:g} m; it must be at least 1.25 times "
+                    f"the widest lumen radius ({widest:g} m). Reduce {limb}_bend."
+                )
         before_lsa = self.bca if self.bovine else self.lcca
         pairs = [("lcca_lsa_spacing", before_lsa, self.lsa)]
         if not self.bovine:
             pairs.append(("bca_lcca_spacing", self.bca, self.lcca))
+        if self.aberrant is not None:
+            if self.bovine:
+                raise ValueError("an arch is bovine or has an aberrant, not both.")
+            pairs.append(("lsa_aberrant_spacing", self.lsa, self.aberrant))
         for name, first, second in pairs:
             need = first.radius + second.radius + MINIMUM_SEPTUM
             _check(name, getattr(self, name), need, 80e-3, "m")

@@ -300,15 +300,29 @@ def _free_lumens(
     pieces: list[Array], name: str, tree: VesselTree, tubes: dict[str, Tube]
 ) -> list[Array]:
     """Cut the lumens of all vessels but `name` and its parent out of `pieces`."""
-    out = []
-    for piece in pieces:
-        parts = [piece]
-        for other, tube in tubes.items():
-            if other not in (name, tree.vessel(name).parent):
-                parts = [q for p in parts for q in subtract(p, tube)]
-        # Hulls as built are solid; only what was cut can be a sliver.
-        out += [part for part in parts if part is piece or _solid(part)]
-    return out
+    whole = {id(piece) for piece in pieces}
+    parts = list(pieces)
+    for other, tube in tubes.items():
+        if other in (name, tree.vessel(name).parent) or not parts:
+            continue
+        near = _near(parts, tube)
+        parts = [
+            part
+            for piece, is_near in zip(parts, near, strict=True)
+            for part in (subtract(piece, tube) if is_near else [piece])
+        ]
+    # Hulls as built are solid; only what was cut can be a sliver.
+    return [part for part in parts if id(part) in whole or _solid(part)]
+
+
+def _near(pieces: list[Array], tube: Tube) -> Array:
+    """Whether pieces may reach into a tube, (n,) bool; most do not."""
+    stops = np.cumsum([len(piece) for piece in pieces])
+    points = np.concatenate(pieces)
+    first = np.concatenate([[0], stops[:-1]])
+    low, high = (ufunc.reduceat(points, first) for ufunc in (np.minimum, np.maximum))
+    gap = tube.line.project(0.5 * (low + high)).distance
+    return gap <= 0.5 * np.linalg.norm(high - low, axis=1) + tube.reach + 1e-6
 
 
 def _solid(piece: Array) -> bool:

@@ -1,0 +1,343 @@
+"""Random aortic arches from anatomical distributions, and named sets of them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from types import MappingProxyType
+
+import numpy as np
+
+from cathsim_dmc.anatomy import measures
+from cathsim_dmc.anatomy.arch.parameters import ArchParameters, BranchParameters
+from cathsim_dmc.anatomy.arch.tree import arch_tree
+
+# Range of the BCA drop in LCCA diameters for each type of arch (class by the
+# vertical distance from the BCA origin to the top of the arch).
+DROP_RANGES: Mapping[str, tuple[float, float]] = MappingProxyType(
+    {"I": (0.0, 1.0), "II": (1.0, 2.0), "III": (2.0, 3.0)}
+)
+# How the branches leave the arch. Bovine: a common trunk of BCA and LCCA (78 %), or
+# the LCCA off the BCA further on (22 %). Aberrant: the right subclavian artery leaves
+# last and passes behind; the right carotid leaves first.
+VARIANTS = ("normal", "bovine_trunk", "bovine_branch", "aberrant")
+# Share of the types I, II and III (one of the published cohorts).
+_PREVALENCE = (0.336, 0.434, 0.230)
+# Mean and standard deviation of the lumen diameters of the aorta, m (61 aortas).
+AORTA_DIAMETERS = MappingProxyType(
+    {
+        "ascending_radius": (29.5e-3, 3.9e-3),
+        "bca_level_radius": (28.6e-3, 3.9e-3),
+        "lcca_level_radius": (27.1e-3, 3.2e-3),
+        "lsa_level_radius": (25.3e-3, 3.0e-3),
+        "descending_radius": (23.9e-3, 3.3e-3),
+    }
+)
+# The same for branch diameters at the origin, m (217 CT angiographies) ...
+BRANCH_DIAMETERS = MappingProxyType(
+    {
+        "bca": (12.5e-3, 1.95e-3),
+        "lcca": (8.28e-3, 1.51e-3),
+        "lsa": (10.4e-3, 2.2e-3),
+    }
+)
+# ... and take-off angles, degrees, upstream positive (118 CT studies).
+TAKE_OFFS = MappingProxyType(
+    {"bca": (44.9, 15.9), "lcca": (25.7, 15.5), "lsa": (-28.8, 14.5)}
+)
+# From the root to the BCA along the centreline, m; angle of the plane of the arch from
+# the sagittal plane, degrees (BCA-LSA line).
+ASCENDING_LENGTH = (62.6e-3, 11.4e-3)
+PLANE_ROTATION = (50.3, 13.8)
+# Spacing of the ostia BCA-LCCA and LCCA-LSA, m; the wall between two flared ones.
+SPACINGS = (21.8e-3, 14.3e-3)
+_WALL = 2e-3
+# What no table gives is spread around the two measured phantoms. Their aortas turn by
+# 47 to 107 degrees up to the BCA, which the limb shares with the arch, stand out of
+# their plane by 4 mm (standard deviation), and tilt little; their branches leave the
+# plane by 5 to 25 degrees and are longer than their chords by 2 to 20 %.
+ASCENDING_BEND = (22.0, 12.0)  # degrees
+_PLANE_TILT = (0.0, 6.0)  # degrees
+_SWAY = (4e-3, 3e-3)  # m
+_BOW = (0.0, 3e-3)  # m
+_LEAN = (5.0, 12.0)  # degrees
+_ROLL = (0.0, 8.0)  # degrees
+_BRANCH_BEND = (35e-3, 110e-3)  # m
+_DESCENDING_BEND = (0.0, 5.0)  # degrees
+_ARCH_RADIUS = (34e-3, 3.4e-3)  # m
+_ARCH_ASPECT = (0.9, 1.15)
+_DESCENDING_LENGTH = (105e-3, 125e-3)  # m, below the arch
+# Levels of one aorta are wide or narrow together; the share is an assumption.
+_AORTA_CORRELATION = 0.8
+# Draws stop at this many standard deviations.
+_CUT = 2.0
+_ATTEMPTS = 1000
+# Corrections of drop and ascending length towards what was drawn, at most, and how
+# near (m; LCCA diameters) they must come.
+_CORRECTIONS = 5
+_LENGTH_TOLERANCE = 2e-3
+_DROP_TOLERANCE = 0.05
+_SHORTEST_LIMB = 20e-3  # m
+
+Random = np.random.RandomState | np.random.Generator
+
+
+def sample(
+    random_state: Random, arch_type: str | None = None, *, variant: str = "normal"
+) -> ArchParameters:
+    """Random arch from the anatomical distributions; its measured type is the one drawn.
+
+    Args:
+        random_state: source of randomness; the same state gives the same arch.
+        arch_type: "I", "II" or "III", or None to draw it by prevalence.
+        variant: one of `VARIANTS`.
+
+    Raises:
+        ValueError: if `arch_type` or `variant` is unknown.
+    """
+    if arch_type is None:
+        place = np.searchsorted(np.cumsum(_PREVALENCE), random_state.uniform())
+        arch_type = list(DROP_RANGES)[min(int(place), 2)]
+    if arch_type not in DROP_RANGES:
+        raise ValueError(
+            f"arch_type is {arch_type!r}; choose one of {', '.join(DROP_RANGES)}."
+        )
+    if variant not in VARIANTS:
+        raise ValueError(
+            f"variant is {variant!r}; choose one of {', '.join(VARIANTS)}."
+        )
+    for _ in range(_ATTEMPTS):
+        # Independent draws now and then give branches that cross: draw again.
+        draw = _Draw(random_state)
+        drop = draw.uniform(*DROP_RANGES[arch_type])
+        try:
+            params = _corrected(
+                _draw(draw, drop, variant), drop, draw.normal(*ASCENDING_LENGTH)
+            )
+        except ValueError:
+            continue
+        if params is not None:
+            return params
+    raise RuntimeError(f"no valid arch of type {arch_type} in {_ATTEMPTS} attempts.")
+
+
+@dataclass(frozen=True)
+class _Draw:
+    """Truncated normal and uniform numbers from one source."""
+
+    source: Random
+
+    def normal(self, mean: float, deviation: float) -> float:
+        return mean + deviation * self.score()
+
+    def score(self) -> float:
+        # Again, not clipped, or the bounds would be likely values.
+        while True:
+            z = float(self.source.normal())
+            if abs(z) <= _CUT:
+                return z
+
+    def uniform(self, low: float, high: float) -> float:
+        return float(self.source.uniform(low, high))
+
+
+def _corrected(
+    params: ArchParameters, drop: float, ascending: float
+) -> ArchParameters | None:
+    """The arch whose measured drop and ascending length are those drawn.
+
+    None if its limb would be too short, or its type is another one after all.
+    """
+    for _ in range(_CORRECTIONS):
+        tree = arch_tree(params)
+        found = measures.measure(tree)
+        first = next(name for name, one in tree.vessels.items() if one.parent)
+        short = ascending - _level(tree, first)
+        low = drop - found.drop
+        if abs(short) < _LENGTH_TOLERANCE and abs(low) < _DROP_TOLERANCE:
+            break
+        params = replace(
+            params,
+            bca_drop=max(params.bca_drop + low, 0.0),
+            ascending_length=max(params.ascending_length + short, _SHORTEST_LIMB),
+        )
+    else:
+        return None
+    return params if measures.arch_type(drop) == found.arch_type else None
+
+
+def _level(tree, name: str) -> float:
+    vessel = tree.vessel(name)
+    ostium = vessel.centreline.at(vessel.ostium).position
+    return float(tree.root.centreline.project(ostium).arc_length)
+
+
+def _draw(draw: _Draw, drop: float, variant: str) -> ArchParameters:
+    aorta = _aorta(draw)
+    branches = {name: _branch(draw, name) for name in BRANCH_DIAMETERS}
+    aberrant = None
+    if variant == "aberrant":
+        # The first branch is the right carotid, as wide as the left one.
+        radius = 0.5 * draw.normal(*BRANCH_DIAMETERS["lcca"])
+        branches["bca"] = replace(
+            branches["bca"], radius=radius, end_radius=min(radius, 3.15e-3)
+        )
+        # It leaves the back of the arch, to the right and up.
+        aberrant = replace(
+            _branch(draw, "lsa"),
+            take_off=math.radians(draw.uniform(-10.0, 20.0)),
+            lean=math.radians(draw.uniform(35.0, 60.0)),
+            roll=math.radians(draw.uniform(35.0, 55.0)),
+        )
+    radii = {name: branch.radius for name, branch in branches.items()}
+    spacings = {
+        "bca_lcca_spacing": max(SPACINGS[0], radii["bca"] + radii["lcca"] + _WALL),
+        "lcca_lsa_spacing": max(SPACINGS[1], radii["lcca"] + radii["lsa"] + _WALL),
+    }
+    if variant.startswith("bovine"):
+        # The LSA stays where it would be. The LCCA leaves right above the ostium of a
+        # common trunk, or 10 to 18 mm up the BCA (both lengths are assumptions).
+        least = radii["lcca"] + 2.2e-3
+        along = least + draw.uniform(0.0, 2e-3)
+        if variant == "bovine_branch":
+            along = max(draw.uniform(10e-3, 18e-3), least)
+        spacings = {
+            "bca_lcca_spacing": along,
+            "lcca_lsa_spacing": sum(spacings.values()),
+        }
+        branches["lcca"] = replace(branches["lcca"], roll=0.0)
+    arch_radius = draw.normal(*_ARCH_RADIUS)
+    return ArchParameters(
+        **branches,
+        **aorta,
+        ascending_length=40e-3,  # corrected to the drawn length up to the BCA
+        descending_length=draw.uniform(*_DESCENDING_LENGTH),
+        arch_radius=arch_radius,
+        arch_height=arch_radius * draw.uniform(*_ARCH_ASPECT),
+        plane_rotation=math.radians(draw.normal(*PLANE_ROTATION)),
+        bca_drop=drop,
+        bovine=variant.startswith("bovine"),
+        ascending_bend=max(0.0, math.radians(draw.normal(*ASCENDING_BEND))),
+        descending_bend=math.radians(draw.normal(*_DESCENDING_BEND)),
+        plane_tilt=math.radians(draw.normal(*_PLANE_TILT)),
+        bow=draw.normal(*_BOW),
+        sway=draw.normal(*_SWAY),
+        aberrant=aberrant,
+        lsa_aberrant_spacing=radii["lsa"]
+        + (aberrant.radius if aberrant else 0.0)
+        + draw.uniform(2e-3, 6e-3),
+        **spacings,
+    )
+
+
+def _aorta(draw: _Draw) -> dict[str, float]:
+    common = draw.score()
+    own = math.sqrt(1.0 - _AORTA_CORRELATION)
+    return {
+        name: 0.5
+        * (
+            mean
+            + deviation * (math.sqrt(_AORTA_CORRELATION) * common + own * draw.score())
+        )
+        for name, (mean, deviation) in AORTA_DIAMETERS.items()
+    }
+
+
+def _branch(draw: _Draw, name: str) -> BranchParameters:
+    radius = 0.5 * draw.normal(*BRANCH_DIAMETERS[name])
+    # Taper: the LCCA narrows to a mid common carotid of 6.3 mm, others by a tenth.
+    end = min(radius, 3.15e-3) if name == "lcca" else 0.9 * radius
+    # Downstream at first for those that lean upstream, and back for the LSA.
+    towards = math.pi if name == "lsa" else 0.0
+    turn = draw.uniform(-math.pi / 2, math.pi / 2)
+    return BranchParameters(
+        radius=radius,
+        end_radius=end,
+        take_off=math.radians(draw.normal(*TAKE_OFFS[name])),
+        length=draw.uniform(45e-3, 55e-3),
+        bend_radius=draw.uniform(*_BRANCH_BEND),
+        bend_azimuth=towards + turn,
+        lean=math.radians(draw.normal(*_LEAN)),
+        roll=math.radians(draw.normal(*_ROLL)),
+        second_bend_radius=draw.uniform(*_BRANCH_BEND),
+        # Most turn back, as arteries that go up the neck do.
+        second_bend_azimuth=_wrapped(towards + turn + math.pi + draw.normal(0.0, 0.8)),
+    )
+
+
+def _wrapped(angle: float) -> float:
+    return math.remainder(angle, 2.0 * math.pi)
+
+
+@dataclass(frozen=True)
+class ArchSeed:
+    """One arch of a set: what is drawn, and its seed.
+
+    Attributes:
+        seed: of the `RandomState` that draws it.
+        arch_type: "I", "II" or "III".
+        variant: one of `VARIANTS`.
+    """
+
+    seed: int
+    arch_type: str
+    variant: str = "normal"
+
+    @property
+    def name(self) -> str:
+        """Such as "arch-II-2000049"."""
+        variant = "" if self.variant == "normal" else f"-{self.variant}"
+        return f"arch-{self.arch_type}{variant}-{self.seed}"
+
+    def parameters(self) -> ArchParameters:
+        """The arch; the same one at every call."""
+        random_state = np.random.RandomState(self.seed)
+        return sample(random_state, self.arch_type, variant=self.variant)
+
+
+# Names of the sets with the first of their seeds; no two share one.
+_FIRST_SEEDS = {"train": 1_000_000, "test": 2_000_000, "test_variants": 3_000_000}
+SETS = tuple(_FIRST_SEEDS)
+TRAIN_SIZE = 1000
+TEST_SIZE = 98
+_VARIANT_SIZE = 12  # of each kind in `test_variants`
+_BOVINE_SHARE, _BOVINE_TRUNK_SHARE = 0.20, 0.78
+
+
+@lru_cache
+def arch_set(name: str) -> tuple[ArchSeed, ...]:
+    """The arches of a set; sets are disjoint and never change.
+
+    "train" holds 1,000 arches of all types by prevalence, a fifth of them bovine.
+    "test" holds 98 normal arches, 49 of type I and 49 of type II. "test_variants"
+    holds 12 each of type III, of both bovine variants and with an aberrant right
+    subclavian (which have no BCA: their goals are rcca, lcca, lsa and rsa).
+
+    Raises:
+        ValueError: if there is no such set.
+    """
+    if name not in SETS:
+        raise ValueError(f"no set {name!r} of arches; there are {', '.join(SETS)}.")
+    first = _FIRST_SEEDS[name]
+    if name == "test":
+        kinds = [(kind, "normal") for kind in ("I", "II") * (TEST_SIZE // 2)]
+    elif name == "test_variants":
+        four = [("III", "normal"), *(("II", one) for one in VARIANTS[1:])]
+        kinds = four * _VARIANT_SIZE
+    else:
+        source = np.random.RandomState(first)
+        kinds = []
+        for _ in range(TRAIN_SIZE):
+            kind, bovine, trunk = source.uniform(size=3)
+            place = np.searchsorted(np.cumsum(_PREVALENCE), kind)
+            variant = "normal"
+            if bovine < _BOVINE_SHARE:
+                is_trunk = trunk < _BOVINE_TRUNK_SHARE
+                variant = "bovine_trunk" if is_trunk else "bovine_branch"
+            kinds.append((list(DROP_RANGES)[min(int(place), 2)], variant))
+    return tuple(
+        ArchSeed(first + index, kind, variant)
+        for index, (kind, variant) in enumerate(kinds)
+    )

@@ -1,0 +1,235 @@
+"""From a vessel tree to an anatomy: ends, inlet, goals, surface and wall."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from cathsim_dmc.anatomy.anatomy import Anatomy, End, Goal, Inlet
+from cathsim_dmc.anatomy.centreline import Array, VesselTree
+from cathsim_dmc.anatomy.curves import FLARE, SMOOTHING, Curve, smooth_tree
+
+# Goals lie this far (m) past the ostium of their branch where it is long enough,
+# at most so near (m) to its free end, and not beyond the ostium of a fork.
+GOAL_DEPTH = 27e-3
+_GOAL_END = 5e-3
+ACCESSES = ("ascending", "descending")
+
+
+@dataclass(frozen=True, eq=False)
+class Place:
+    """A place on a vessel: exactly one of the three ways to say where.
+
+    Attributes:
+        vessel: name.
+        arc_length: m along its centreline from its first point.
+        past_ostium: m along its centreline from its ostium.
+        position: (3,) m, a point of the lumen; the place is the nearest one of the
+            centreline.
+    """
+
+    vessel: str
+    arc_length: float | None = None
+    past_ostium: float | None = None
+    position: Array | None = None
+
+    def __post_init__(self) -> None:
+        given = (self.arc_length, self.past_ostium, self.position)
+        if sum(value is not None for value in given) != 1:
+            raise ValueError(
+                f"a place on vessel {self.vessel!r} needs one of arc_length, "
+                "past_ostium and position, and only one."
+            )
+
+    def arc(self, tree: VesselTree) -> float:
+        """Arc length (m) of the place.
+
+        Raises:
+            ValueError: if the tree has no such vessel, or the place is not on it.
+        """
+        vessel = tree.vessel(self.vessel)
+        line = vessel.centreline
+        if self.position is not None:
+            return float(line.project(np.asarray(self.position, float)).arc_length)
+        start = 0.0 if self.past_ostium is None else vessel.ostium
+        offset = self.arc_length if self.past_ostium is None else self.past_ostium
+        arc = start + float(offset)
+        if not -1e-9 <= arc <= line.length + 1e-9:
+            raise ValueError(
+                f"place {arc * 1e3:.1f} mm along vessel {self.vessel!r} is not on it: "
+                f"it is {line.length * 1e3:.1f} mm long, with its ostium at "
+                f"{vessel.ostium * 1e3:.1f} mm."
+            )
+        return min(max(arc, 0.0), line.length)
+
+
+def build_anatomy(
+    tree: VesselTree | Mapping[str, Curve],
+    name: str = "tree",
+    *,
+    inlet: Place | None = None,
+    goals: Mapping[str, Place] | None = None,
+    smoothing: float = SMOOTHING,
+    flare: float = FLARE,
+) -> Anatomy:
+    """Anatomy around a tree of centrelines; see `Anatomy.from_tree`."""
+    from cathsim_dmc.anatomy.surface import lumen_surface
+    from cathsim_dmc.anatomy.wall.pieces import build_wall
+
+    if not isinstance(tree, VesselTree):
+        tree = smooth_tree(tree, smoothing=smoothing, flare=flare)
+    placed = (
+        default_goals(tree)
+        if goals is None
+        else {key: _goal(key, place, tree) for key, place in goals.items()}
+    )
+    inlet = inlet or Place(tree.root.name, arc_length=0.0)
+    tree, entered = _cut_at(tree, inlet, placed)
+    if inlet.vessel == tree.root.name:
+        # Arc lengths count from the new first point.
+        placed = {key: _moved(goal, tree) for key, goal in placed.items()}
+    ends = flat_ends(tree, *entered)
+    return Anatomy(
+        name=name,
+        tree=tree,
+        surface=lumen_surface(tree),
+        wall=build_wall(tree, ends),
+        inlet=_inlet(ends),
+        goals=placed,
+        ends=ends,
+    )
+
+
+def access_inlet(tree: VesselTree, access: str) -> Place:
+    """Place of the inlet: "ascending", the root's first point, or "descending"."""
+    if access not in ACCESSES:
+        raise ValueError(f"access is {access!r}; choose one of {', '.join(ACCESSES)}.")
+    root = tree.root
+    arc = 0.0 if access == "ascending" else root.centreline.length
+    return Place(root.name, arc_length=arc)
+
+
+def anatomy_frame(tree: VesselTree, access: str) -> tuple[Inlet, tuple[End, ...]]:
+    """Inlet at one end of the root, and every flat end of the tree.
+
+    Args:
+        tree: vessels.
+        access: "ascending" enters at the root's first point, "descending" (as from
+            the femoral artery) at its last.
+    """
+    access_inlet(tree, access)
+    ends = flat_ends(tree, tree.root.name, access == "ascending")
+    return _inlet(ends), ends
+
+
+def flat_ends(tree: VesselTree, entered: str, at_first: bool) -> tuple[End, ...]:
+    """Every flat end of a tree, the one where the device enters open.
+
+    Args:
+        tree: vessels.
+        entered: vessel that the device enters.
+        at_first: whether it enters at the first point of the root's centreline.
+    """
+    root = tree.root
+    first = root.centreline.at(0.0)
+    ends = [
+        End(root.name, first.position, -first.tangent, float(first.radius), at_first)
+    ]
+    for name, vessel in tree.vessels.items():
+        last = vessel.centreline.at(vessel.centreline.length)
+        is_open = name == entered and not at_first
+        ends.append(End(name, last.position, last.tangent, float(last.radius), is_open))
+    return tuple(ends)
+
+
+def default_goals(tree: VesselTree) -> dict[str, Goal]:
+    """A goal in each branch: 27 mm past its ostium where there is room for it.
+
+    It lies at least 5 mm before the branch's free end, and not beyond the place
+    where a branch of its own parts from it. Branches shorter than 10 mm have none.
+    """
+    goals = {}
+    for name, vessel in tree.vessels.items():
+        length = vessel.centreline.length - vessel.ostium
+        if vessel.parent is None or length < 2.0 * _GOAL_END:
+            continue
+        deepest = min(vessel.ostium + GOAL_DEPTH, vessel.centreline.length - _GOAL_END)
+        for fork in tree.vessels.values():
+            if fork.parent == name:
+                ostium = fork.centreline.at(fork.ostium).position
+                level = float(vessel.centreline.project(ostium).arc_length)
+                deepest = min(deepest, level)
+        goals[name] = _goal(name, Place(name, arc_length=deepest), tree)
+    return goals
+
+
+def _goal(name: str, place: Place, tree: VesselTree) -> Goal:
+    arc = place.arc(tree)
+    centre = tree.vessel(place.vessel).centreline.at(arc)
+    position = centre.position if place.position is None else place.position
+    depth = float(tree.depths(position)[place.vessel])
+    if not depth > 0.0:
+        raise ValueError(
+            f"goal {name!r} at {np.round(np.multiply(position, 1e3), 1).tolist()} mm "
+            f"lies {-depth * 1e3:.1f} mm outside vessel {place.vessel!r}; give a point "
+            "inside it."
+        )
+    return Goal(name, place.vessel, position, arc)
+
+
+def _moved(goal: Goal, tree: VesselTree) -> Goal:
+    line = tree.vessel(goal.vessel).centreline
+    return replace(goal, arc_length=float(line.project(goal.position).arc_length))
+
+
+def _inlet(ends: tuple[End, ...]) -> Inlet:
+    entry = next(end for end in ends if end.open)
+    return Inlet(entry.vessel, entry.position, -entry.direction, entry.radius)
+
+
+def _cut_at(
+    tree: VesselTree, inlet: Place, goals: Mapping[str, Goal]
+) -> tuple[VesselTree, tuple[str, bool]]:
+    """The tree without what lies behind the inlet; vessel and end that is entered.
+
+    Raises:
+        ValueError: if a branch or a goal lies behind the inlet.
+    """
+    vessel = tree.vessel(inlet.vessel)
+    line = vessel.centreline
+    arc = inlet.arc(tree)
+    is_root = vessel.parent is None
+    at_first = is_root and arc <= 0.5 * line.length
+    if not is_root and arc < vessel.ostium + 5e-3:
+        raise ValueError(
+            f"the inlet lies {arc * 1e3:.1f} mm along branch {vessel.name!r}, whose "
+            f"ostium is at {vessel.ostium * 1e3:.1f} mm; it must be 5 mm past it."
+        )
+    low, high = (arc, line.length) if at_first else (0.0, arc)
+    if high - low < 10e-3:
+        raise ValueError(f"the inlet leaves nothing of vessel {vessel.name!r}.")
+    for name, child in tree.vessels.items():
+        if child.parent == vessel.name:
+            centre = child.centreline.at(child.ostium)
+            place = float(line.project(centre.position).arc_length)
+            reach = float(centre.radius)
+            if place - reach < low or place + reach > high:
+                raise ValueError(
+                    f"the inlet, {arc * 1e3:.1f} mm along {vessel.name!r}, is at or "
+                    f"beyond the ostium of branch {name!r} at {place * 1e3:.1f} mm; "
+                    "put it nearer to the free end, or leave the branch out."
+                )
+    for goal in goals.values():
+        if goal.vessel == vessel.name and not low < goal.arc_length < high:
+            raise ValueError(
+                f"goal {goal.name!r} lies behind the inlet, "
+                f"{goal.arc_length * 1e3:.1f} mm along {vessel.name!r}."
+            )
+    if math.isclose(low, 0.0) and math.isclose(high, line.length):
+        return tree, (vessel.name, at_first)
+    vessels = dict(tree.vessels)
+    vessels[vessel.name] = replace(vessel, centreline=line.slice(low, high))
+    return VesselTree(vessels), (vessel.name, at_first)

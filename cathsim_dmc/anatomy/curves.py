@@ -1,0 +1,284 @@
+"""Vessel trees from measured centrelines: splines, ostia, flares.
+
+Lengths are metres, points are in one frame (LPS unless said otherwise).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+from scipy import interpolate
+
+from cathsim_dmc.anatomy.centreline import Array, Centreline, Vessel, VesselTree
+from cathsim_dmc.anatomy.septa import check_septa
+
+# Standard deviations of measured positions and radii, m: how far the spline may
+# depart from them, root mean square: less than what a lattice of 0.5 mm leaves open.
+SMOOTHING = 0.35e-3
+_RADIUS_SMOOTHING = 0.15e-3
+# By how much a branch's radius grows at its ostium, m, if its parent has the room.
+FLARE = 1e-3
+_STEP = 1e-3  # m, between the points of a built centreline
+_FINE = 0.25e-3  # m, steps in which an ostium is looked for
+# The lumen may not fold on the inner side of a bend: least ratio of the radius of
+# the bend to that of the lumen.
+_LEAST_BEND = 1.05
+# A branch keeps this share of its parent's radius free at its ostium.
+_WIDEST_OSTIUM = 0.95
+# The flare reaches this far into the parent beyond the estimate for a straight one.
+_FLARE_MARGIN = 1.25
+
+
+@dataclass(frozen=True, eq=False)
+class Curve:
+    """A measured centreline.
+
+    Attributes:
+        points: (n, 3) float64, metres; n >= 2. A branch begins inside its parent or
+            within the parent's radius of its wall, and runs away from it.
+        radii: (n,) float64, metres: radius of the vessel's own lumen. Those of a
+            branch are not used where it still lies in its parent.
+        parent: name of the vessel it leaves, None for the root.
+    """
+
+    points: Array
+    radii: Array
+    parent: str | None = None
+    line: Centreline = field(init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        # Centreline refuses wrong shapes, NaN, repeated points, radii <= 0.
+        line = Centreline(self.points, self.radii)
+        object.__setattr__(self, "line", line)
+        object.__setattr__(self, "points", line.points)
+        object.__setattr__(self, "radii", line.radii)
+
+
+def smooth_tree(
+    curves: Mapping[str, Curve],
+    *,
+    smoothing: float = SMOOTHING,
+    flare: float = FLARE,
+) -> VesselTree:
+    """Vessel tree through measured centrelines.
+
+    Each vessel is a cubic smoothing spline. A branch starts on its parent's
+    centreline; its ostium is where its centreline leaves the parent's lumen, and its
+    radius grows towards the ostium.
+
+    Args:
+        curves: centrelines by name, parents before their children, the root first.
+        smoothing: root mean square (m) by which the spline may miss the points; 0
+            runs through all of them.
+        flare: growth (m) of a branch's radius at its ostium, at most.
+
+    Raises:
+        ValueError: if a branch does not begin in its parent or never leaves it, if a
+            vessel bends more sharply than its lumen allows, or if two vessels run
+            into each other; names the vessel and the place.
+    """
+    for name, value in (("smoothing", smoothing), ("flare", flare)):
+        if not (math.isfinite(value) and 0.0 <= value <= 5e-3):
+            raise ValueError(f"{name} is {value:g} m; allowed is 0 to 0.005 m.")
+    vessels: dict[str, Vessel] = {}
+    for name, curve in curves.items():
+        if curve.parent is None:
+            line = _spline(curve.points, curve.radii, smoothing)
+            vessels[name] = Vessel(name, line)
+        else:
+            if curve.parent not in vessels:
+                raise ValueError(
+                    f"parent {curve.parent!r} of vessel {name!r} is not among "
+                    f"{sorted(vessels)}; list parents before their children."
+                )
+            parent = vessels[curve.parent]
+            vessels[name] = _branch(name, curve, parent, smoothing, flare)
+        _check_bends(vessels[name])
+    tree = VesselTree(vessels)
+    check_septa(tree)
+    return tree
+
+
+def _fit(
+    points: Array, smoothing: float, weights: Array | None = None
+) -> tuple[interpolate.BSpline, float]:
+    """Cubic spline (3 coordinates) over chord length, and the whole chord length."""
+    chord = np.concatenate(
+        [[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))]
+    )
+    order = min(3, len(points) - 1)
+    weights = np.ones(len(points)) if weights is None else weights
+    # In millimetres, which fitpack's tolerances suit.
+    (knots, coefficients, degree), _ = interpolate.splprep(
+        1e3 * points.T,
+        u=chord,
+        w=weights,
+        k=order,
+        s=len(points) * (1e3 * smoothing) ** 2,
+    )
+    spline = interpolate.BSpline(knots, 1e-3 * np.array(coefficients).T, degree)
+    return spline, float(chord[-1])
+
+
+def _sampled(spline: interpolate.BSpline, end: float, step: float) -> Array:
+    """Points (n, 3) of a spline at equal arcs of about `step` (m), ends included."""
+    parameter = np.linspace(0.0, end, max(20, 10 * math.ceil(end / step)))
+    points = spline(parameter)
+    arc = np.concatenate(
+        [[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))]
+    )
+    count = max(2, math.ceil(arc[-1] / step) + 1)
+    # Chords between the points interpolated would show as wrinkles in its curvature.
+    return spline(np.interp(np.linspace(0.0, arc[-1], count), arc, parameter))
+
+
+def _radii(places: Array, values: Array, at: Array) -> Array:
+    """Smooth radii at arc lengths `at` from measured ones, constant outside them."""
+    if len(places) < 4:
+        return np.interp(at, places, values)
+    spline = interpolate.splrep(
+        places, 1e3 * values, s=len(values) * (1e3 * _RADIUS_SMOOTHING) ** 2
+    )
+    smooth = 1e-3 * interpolate.splev(np.clip(at, places[0], places[-1]), spline)
+    # A spline may overshoot where the calibre changes at once.
+    return np.clip(smooth, 0.9 * values.min(), 1.1 * values.max())
+
+
+def _spline(points: Array, radii: Array, smoothing: float) -> Centreline:
+    spline, end = _fit(points, smoothing)
+    dense = _sampled(spline, end, _STEP)
+    line = Centreline(dense, np.ones(len(dense)))
+    places = np.maximum.accumulate(line.project(points).arc_length)
+    fresh = np.concatenate([[True], np.diff(places) > 1e-6])
+    smooth = _radii(places[fresh], radii[fresh], line.arc_length)
+    return Centreline(dense, smooth)
+
+
+def _branch(
+    name: str, curve: Curve, parent: Vessel, smoothing: float, flare: float
+) -> Vessel:
+    start = _onto_parent(name, curve.points, parent)
+    # The start is no measurement: it lies on the parent.
+    weights = np.ones(len(start))
+    weights[0] = 100.0
+    spline, end = _fit(start, smoothing, weights)
+    dense = _sampled(spline, end, _FINE)
+    dense[0] = start[0]
+    fine = Centreline(dense, np.ones(len(dense)))
+    ostium = _ostium(name, fine, parent)
+    place = fine.at(ostium)
+    foot = parent.centreline.at(parent.centreline.project(place.position).arc_length)
+    outward = place.position - foot.position
+    outward /= np.linalg.norm(outward)
+    tilt = math.acos(float(np.clip(place.tangent @ outward, -1.0, 1.0)))
+    places = np.maximum.accumulate(fine.project(curve.points).arc_length)
+    own = places >= ostium
+    own &= np.concatenate([[True], np.diff(places) > 1e-6])
+    if not own.any():
+        raise ValueError(
+            f"branch {name!r} has no point beyond its ostium; give it more points."
+        )
+    s = np.linspace(0.0, fine.length, max(2, math.ceil(fine.length / _STEP) + 1))
+    calibre = float(curve.radii[own][0])
+    parent_radius = float(parent.centreline.at(_origin(fine, parent)).radius)
+    parent_radius = max(parent_radius, float(foot.radius))
+    room = _WIDEST_OSTIUM * parent_radius - calibre
+    if room < 0.0:
+        raise ValueError(
+            f"branch {name!r} has a lumen radius of {calibre * 1e3:.1f} mm at its "
+            f"ostium, {parent.name!r} one of {parent_radius * 1e3:.1f} mm there; a "
+            f"branch may have {_WIDEST_OSTIUM:g} of its parent's. Radii of a branch "
+            "are those of its own lumen, not of the sphere inside both."
+        )
+    wide = calibre + min(flare, room)
+    begin, over = _flare_span(wide, calibre, parent_radius, tilt, ostium)
+    fine_s = np.arange(begin, over, 0.5e-3)
+    s = np.unique(np.concatenate([s[(s < begin) | (s > over)], fine_s, [over]]))
+    s = s[np.concatenate([[True], np.diff(s) > 0.1e-3])]
+    u = np.clip((s - begin) / (over - begin), 0.0, 1.0)
+    radii = _radii(places[own], curve.radii[own], s)
+    radii = radii + (wide - calibre) * (1.0 - u) ** 2
+    return Vessel(name, Centreline(fine.at(s).position, radii), parent.name, ostium)
+
+
+def _flare_span(
+    wide: float, calibre: float, parent_radius: float, tilt: float, ostium: float
+) -> tuple[float, float]:
+    """Arc lengths at which a flare begins, inside the parent, and is over."""
+    sag = parent_radius - math.sqrt(parent_radius**2 - min(wide, parent_radius) ** 2)
+    slant = math.tan(min(tilt, math.radians(60.0)))
+    inwards = _FLARE_MARGIN * (sag + wide * slant) + 1e-3
+    begin = max(ostium - inwards, 0.1 * ostium)
+    return begin, ostium + 2.0 * max(wide - calibre, 0.5e-3) + calibre * slant
+
+
+def _onto_parent(name: str, points: Array, parent: Vessel) -> Array:
+    """The branch's points with the first on its parent's centreline."""
+    line = parent.centreline
+    first = line.project(points[0])
+    if first.distance > 2.0 * first.radius:
+        raise ValueError(
+            f"branch {name!r} begins {first.distance * 1e3:.1f} mm from the "
+            f"centreline of {parent.name!r}, whose lumen radius is "
+            f"{first.radius * 1e3:.1f} mm there; let it begin in its parent, or name "
+            "another parent."
+        )
+    foot = line.at(first.arc_length).position
+    # A point next to the foot would make a sharp turn of its own.
+    near = np.linalg.norm(points - foot, axis=1) < max(0.25 * first.radius, 1e-3)
+    kept = points[np.argmin(near) :] if not near.all() else points[-1:]
+    if first.distance <= first.radius:
+        return np.concatenate([foot[None], kept])
+    # It begins outside: carry its first direction back to the parent.
+    direction = kept[min(1, len(kept) - 1)] - kept[0]
+    back = kept[0] - np.linspace(0.0, 4.0, 200)[:, None] * first.radius * (
+        direction / max(float(np.linalg.norm(direction)), 1e-9)
+    )
+    way = line.project(back)
+    foot = line.at(way.arc_length[way.distance.argmin()]).position
+    return np.concatenate([foot[None], kept])
+
+
+def _ostium(name: str, line: Centreline, parent: Vessel) -> float:
+    """Arc length (m) at which a branch leaves its parent's lumen for good."""
+    near = parent.centreline.project(line.points)
+    outside = near.distance - near.radius
+    if outside[-1] <= 0.0:
+        raise ValueError(
+            f"branch {name!r} ends inside its parent {parent.name!r}; it must leave "
+            "its lumen. Name another parent or give more points."
+        )
+    last = int(np.flatnonzero(outside <= 0.0)[-1])
+    share = -outside[last] / (outside[last + 1] - outside[last])
+    s = line.arc_length
+    return float(s[last] + share * (s[last + 1] - s[last]))
+
+
+def _origin(line: Centreline, parent: Vessel) -> float:
+    return float(parent.centreline.project(line.points[0]).arc_length)
+
+
+def _check_bends(vessel: Vessel) -> None:
+    line = vessel.centreline
+    # Over a lumen radius, below which a kink is no bend.
+    s = np.arange(vessel.ostium, line.length, 1e-3)
+    if len(s) < 3:
+        return
+    place = line.at(s)
+    ahead, behind = (line.at(s + sign * place.radius) for sign in (0.5, -0.5))
+    turn = np.arccos(
+        np.clip(np.einsum("nj,nj->n", ahead.tangent, behind.tangent), -1.0, 1.0)
+    )
+    bend = place.radius / np.maximum(turn, 1e-9)
+    worst = int((bend / place.radius).argmin())
+    if bend[worst] < _LEAST_BEND * place.radius[worst]:
+        x, y, z = np.round(place.position[worst] * 1e3, 1)
+        raise ValueError(
+            f"vessel {vessel.name!r} bends with a radius of {bend[worst] * 1e3:.1f} mm "
+            f"at ({x}, {y}, {z}) mm, {s[worst] * 1e3:.0f} mm along it, where its lumen "
+            f"radius is {place.radius[worst] * 1e3:.1f} mm; the lumen would fold. "
+            "Smooth more, or mend the points there."
+        )

@@ -1,0 +1,46 @@
+"""Anatomies that come with the package, by name."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from pathlib import Path
+
+from cathsim_dmc.anatomy.anatomy import Anatomy
+from cathsim_dmc.anatomy.arch import arch
+from cathsim_dmc.anatomy.builder import ACCESSES
+from cathsim_dmc.anatomy.tree_file import TreeFile, read_tree
+
+_DATA = Path(__file__).parent / "data"
+# The published silicone phantoms, measured; see docs/anatomies.md.
+MEASURED = ("type1", "type2")
+PHANTOMS = (*MEASURED, *arch.ARCHES)
+
+
+def measured_tree(name: str) -> TreeFile:
+    """Centrelines, inlets and goals of a measured phantom."""
+    return read_tree(_DATA / f"{name}.json")
+
+
+def load(name: str, *, access: str = "ascending") -> Anatomy:
+    """Anatomy called `name` in `PHANTOMS`; equal calls give the same object.
+
+    Args:
+        name: of the phantom.
+        access: "ascending" enters at the aortic root, "descending" (as from the
+            femoral artery) at the end of the descending aorta.
+
+    Raises:
+        ValueError: if there is no such phantom or access; the message lists them.
+    """
+    if name not in PHANTOMS:
+        raise ValueError(f"no phantom {name!r}; there are {', '.join(PHANTOMS)}.")
+    if access not in ACCESSES:
+        raise ValueError(f"access is {access!r}; choose one of {', '.join(ACCESSES)}.")
+    if name in MEASURED:
+        return _measured(name, access)
+    return arch.load(name, access=access)
+
+
+@lru_cache(maxsize=8)
+def _measured(name: str, access: str) -> Anatomy:
+    return measured_tree(name).build(access)

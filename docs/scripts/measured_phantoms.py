@@ -1,0 +1,127 @@
+"""Writes the tree files of the measured phantoms from the measurements.
+
+python docs/scripts/measured_phantoms.py [--check]
+
+The measurements are points on the centrelines about 6 mm apart with the radius of the
+inscribed sphere (lattice of 0.5 mm: positions good to 0.5 mm, radii to 0.3 mm). The
+points are kept as they are; the splines of `anatomy.curves` smooth them. The radii
+become those of each vessel's own lumen, see `own_radii`.
+"""
+
+import json
+import sys
+from pathlib import Path
+
+import numpy as np
+
+from cathsim_dmc.anatomy.anatomy import _write
+from cathsim_dmc.anatomy.builder import default_goals
+from cathsim_dmc.anatomy.centreline import Centreline
+from cathsim_dmc.anatomy.phantoms import _DATA, MEASURED
+from cathsim_dmc.anatomy.tree_file import FORMAT, FORMAT_VERSION, parse_tree
+
+ROOT = Path(__file__).parents[2]
+MEASUREMENTS = ROOT / "tests/data/measured"
+# A sphere nearer to the parent's lumen than this (mm) sees the parent's, too: the
+# radius of a branch counts from there on.
+SEEN = 3.0
+CAPPED = 10.0  # mm from a free end, where the cap makes the inscribed sphere small
+# Narrower places (mm) are not told from an artefact of the lattice.
+NARROWEST = 1.5
+NOTE = (
+    "Published aortic arch phantom of Type {type}, measured by the authors of this "
+    "package on its released scan: points on the centrelines, radii of inscribed "
+    "spheres; written by docs/scripts/measured_phantoms.py."
+)
+
+
+def own_radii(points, radii, parent, is_fork):
+    """Radii (n,) mm of a vessel's own lumen from those of the inscribed sphere.
+
+    A branch keeps its first own radius down to its parent. The last own radius goes
+    on to a free end. Nothing is narrower than `NARROWEST`.
+    """
+    line = Centreline(points, radii)
+    s = line.arc_length
+    own = s <= s[-1] - CAPPED
+    own[:2] = True
+    radii = radii.copy()
+    radii[~own] = radii[own][-1]
+    if parent is not None:
+        fine = np.arange(0.0, s[-1], 0.1)
+        near = parent.project(line.at(fine).position)
+        ostium = fine[np.flatnonzero(near.distance < near.radius)[-1]]
+        # At a fork the sphere sees both daughters alike, and no more of the parent.
+        first = 1 if is_fork else int((s >= ostium + SEEN).argmax())
+        radii[:first] = radii[first]
+    return np.maximum(radii, NARROWEST)
+
+
+def tree_file(name):
+    """Content of the tree file of the phantom `name`."""
+    measured = json.loads((MEASUREMENTS / f"{name}.json").read_text())
+    vessels, lines = {}, {}
+    for key, vessel in measured["vessels"].items():
+        columns = np.array(vessel["points"])
+        points, radii = columns[:, :3], columns[:, 3]
+        lines[key] = Centreline(points, radii)
+        parent = vessel["parent"]
+        own = own_radii(points, radii, lines.get(parent), "parts_at_point" in vessel)
+        vessels[key] = {
+            "parent": parent,
+            "points_mm": points.tolist(),
+            "radii_mm": np.round(own, 2).tolist(),
+        }
+    content = {
+        "format": FORMAT,
+        "version": FORMAT_VERSION,
+        "name": name,
+        "units": "mm",
+        "frame": "LPS",
+        "note": NOTE.format(type=measured["type"]),
+        "vessels": vessels,
+        "inlets": {
+            "ascending": {"vessel": "aorta", "end": "first"},
+            "descending": {"vessel": "aorta", "end": "last"},
+        },
+    }
+    tree = parse_tree(content).tree()
+    goals = default_goals(tree)
+    content["goals"] = {
+        key: {
+            "vessel": key,
+            "past_ostium_mm": round(
+                1e3 * (goal.arc_length - tree.vessel(key).ostium), 1
+            ),
+        }
+        for key, goal in goals.items()
+        if key != "lsa_fork2"  # a stub of 12 mm
+    }
+    arc = 1e3 * tree.root.centreline.length - 30.0
+    content["goals"]["descending"] = {"vessel": "aorta", "arc_length_mm": round(arc, 1)}
+    return content
+
+
+def text(content):
+    """JSON with one point a line."""
+    lines = json.dumps(content, indent=1, ensure_ascii=False)
+    lines = lines.replace("[\n     ", "[").replace("\n    ]", "]")
+    return lines.replace(",\n     ", ", ") + "\n"
+
+
+def main():
+    stale = []
+    for name in MEASURED:
+        new = text(tree_file(name)).encode()
+        path = _DATA / f"{name}.json"
+        if "--check" in sys.argv:
+            if path.read_bytes() != new:
+                stale.append(str(path))
+        else:
+            _write(path, new)
+    if stale:
+        sys.exit(f"{', '.join(stale)}: run docs/scripts/measured_phantoms.py")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,187 @@
+"""Figures of an arch, against trees whose figures are known, and the check command."""
+
+import json
+import math
+import sys
+
+import numpy as np
+import pytest
+
+from cathsim_dmc import cli
+from cathsim_dmc.anatomy import measures, phantoms
+from cathsim_dmc.anatomy.arch import arch
+from cathsim_dmc.anatomy.arch.tree import arch_tree
+from cathsim_dmc.anatomy.centreline import Centreline, Vessel, VesselTree
+
+TYPES = ("type1", "type2")
+
+
+def half_ring(radius=40e-3, lumen=10e-3, tilt=0.0):
+    """An aorta that is half a ring over straight limbs of 50 mm, in the x-z plane."""
+    angle = np.linspace(0.0, math.pi, 400)
+    ring = np.stack(
+        [radius * (1 - np.cos(angle)), 0 * angle, radius * np.sin(angle)], axis=1
+    )
+    up = np.linspace(-50e-3, 0.0, 40)[:-1]
+    rise = np.stack([0 * up, 0 * up, up], axis=1)
+    fall = np.stack([0 * up + 2 * radius, 0 * up, up[::-1]], axis=1)
+    points = np.concatenate([rise, ring, fall])
+    turn = np.array(
+        [
+            [math.cos(tilt), 0, math.sin(tilt)],
+            [0, 1, 0],
+            [-math.sin(tilt), 0, math.cos(tilt)],
+        ]
+    )
+    return Centreline(points @ turn.T, np.full(len(points), lumen))
+
+
+def with_branches(aorta, drop_angle, lumen=3e-3):
+    """BCA and LCCA that stand upright on the ring; the BCA `drop_angle` before it."""
+    vessels = {"aorta": Vessel("aorta", aorta)}
+    for name, angle in (("bca", drop_angle), ("lcca", math.pi / 2)):
+        start = np.array([40e-3 * (1 - math.cos(angle)), 0.0, 40e-3 * math.sin(angle)])
+        line = Centreline(
+            start + np.linspace(0, 60e-3, 61)[:, None] * [0, 0, 1.0], [lumen] * 61
+        )
+        depth = aorta.project(line.points)
+        ostium = float(np.interp(0.0, depth.distance - depth.radius, line.arc_length))
+        vessels[name] = Vessel(name, line, "aorta", ostium)
+    return VesselTree(vessels)
+
+
+@pytest.mark.parametrize(
+    ("angle", "expected"), [(1.5, "I"), (0.77, "II"), (0.5, "III")]
+)
+def test_type_is_the_drop_of_the_ostium_in_diameters(angle, expected):
+    found = measures.measure(with_branches(half_ring(), angle))
+    # The branch stands over x = R (1 - cos); the tube's upper side is at radius 50.
+    x = 40e-3 * (1 - math.cos(angle)) - 40e-3
+    ostium = math.sqrt(50e-3**2 - x**2)
+    drop = (50e-3 - ostium) / 6e-3
+    assert found.drop == pytest.approx(drop, abs=0.05)
+    assert found.arch_type == expected
+
+
+def test_bends_and_angles_of_a_half_ring():
+    found = measures.measure(with_branches(half_ring(), 1.0))
+    assert found.tightest_bend == pytest.approx(40e-3, rel=0.01)
+    assert found.span == pytest.approx(80e-3, rel=0.01)
+    assert found.height == pytest.approx(90e-3, rel=0.01)
+    assert found.ascending_tilt == pytest.approx(0.0, abs=0.01)
+    # The centreline's nearest place to the ostium, which stands upright over 1.0 rad.
+    x = 40e-3 * (1 - math.cos(1.0)) - 40e-3
+    level = math.acos(-x / 50e-3)
+    assert found.ascending_turn == pytest.approx(level, abs=0.02)
+    assert found.diameters["ascending"] == pytest.approx(20e-3)
+    bca = found.branches["bca"]
+    assert bca.take_off == pytest.approx(0.0, abs=1e-6)
+    assert bca.lean == pytest.approx(0.0, abs=1e-6)
+    assert bca.axis_offset == pytest.approx(40e-3 * (1 - math.cos(1.0)), abs=1e-4)
+    assert bca.diameter == pytest.approx(6e-3)
+    assert bca.tortuosity == pytest.approx(1.0)
+    # Along the arch is +x, the patient's left: 90 degrees from the sagittal plane.
+    assert found.plane == pytest.approx(math.pi / 2, abs=0.01)
+
+
+def test_tilt_of_the_root_is_seen():
+    found = measures.measure(
+        VesselTree({"aorta": Vessel("aorta", half_ring(tilt=-0.3))})
+    )
+    assert found.ascending_tilt == pytest.approx(0.3, abs=0.01)
+    assert found.arch_type is None
+    assert found.branches == {}
+
+
+def test_take_offs_are_those_of_the_parameters():
+    found = measures.measure(arch_tree(arch.TYPE_II))
+    for name in ("bca", "lcca", "lsa"):
+        expected = getattr(arch.TYPE_II, name).take_off
+        assert found.branches[name].take_off == pytest.approx(expected, abs=0.06)
+    assert found.plane == pytest.approx(arch.TYPE_II.plane_rotation, abs=0.01)
+
+
+@pytest.mark.parametrize(
+    ("name", "expected"),
+    [
+        ("type1", "I"),
+        ("type2", "II"),
+        ("simple1", "I"),
+        ("simple2", "II"),
+        ("type3", "III"),
+    ],
+)
+def test_phantoms_are_of_the_type_they_are_named_after(name, expected):
+    found = measures.measure(phantoms.load(name).tree)
+    assert found.arch_type == expected
+
+
+def test_measured_phantoms_are_as_was_measured():
+    """Beside the figures taken from the scans themselves."""
+    one, two = (
+        measures.measure(phantoms.load(name).tree) for name in ("type1", "type2")
+    )
+    assert one.drop == pytest.approx(0.3, abs=0.2)
+    assert two.drop == pytest.approx(1.9, abs=0.35)
+    degrees = [math.degrees(found.ascending_turn) for found in (one, two)]
+    np.testing.assert_allclose(degrees, [107, 47], atol=6)
+    tilts = [math.degrees(found.ascending_tilt) for found in (one, two)]
+    np.testing.assert_allclose(tilts, [25, 13], atol=5)
+    spans = [1e3 * found.span for found in (one, two)]
+    np.testing.assert_allclose(spans, [69, 69], atol=5)
+    heights = [1e3 * found.height for found in (one, two)]
+    np.testing.assert_allclose(heights, [66, 62], atol=4)
+    radii = [500 * one.branches[name].diameter for name in ("bca", "lcca", "lsa")]
+    np.testing.assert_allclose(radii, [4.2, 2.9, 4.7], atol=0.5)
+
+
+@pytest.fixture
+def cathsim(monkeypatch, capsys):
+    def run(*arguments):
+        monkeypatch.setattr(sys, "argv", ["cathsim", "phantom", *map(str, arguments)])
+        with pytest.raises(SystemExit) as end:
+            cli.main()
+        captured = capsys.readouterr()
+        return end.value.code or 0, captured.out, captured.err
+
+    return run
+
+
+def test_check_measures_and_draws(cathsim, tmp_path):
+    picture = tmp_path / "views.png"
+    code, out, _ = cathsim(
+        "check", "simple1", "--no-push", "--figure", picture, "--json"
+    )
+    assert code == 0
+    report = json.loads(out)
+    assert report["passed"]
+    found = report["findings"]["simple1"]["measures"]
+    assert found["arch_type"] == "I"
+    assert found["branches"]["lcca"]["diameter_mm"] == pytest.approx(6.1, abs=0.2)
+    assert picture.stat().st_size > 20_000
+
+
+def test_check_of_a_directory_draws_into_it(cathsim, tmp_path):
+    anatomy = phantoms.load("type2", access="descending")
+    anatomy.save(tmp_path / "two")
+    code, out, err = cathsim("check", tmp_path / "two", "--no-push")
+    assert code == 0
+    assert "arch_type II" in out
+    assert (tmp_path / "two/check.png").is_file()
+    assert "check.png" in err
+    code, _, err = cathsim("check", tmp_path / "two", "--access", "ascending")
+    assert code == 2
+    assert "no named phantom" in err
+
+
+def test_check_fails_where_a_goal_is_in_another_vessel(cathsim, tmp_path):
+    from dataclasses import replace
+
+    anatomy = phantoms.load("type2")
+    astray = replace(anatomy.goal("lcca"), position=anatomy.goal("lsa").position)
+    replace(anatomy, goals={"lcca": astray}).save(tmp_path / "wrong")
+    code, out, _ = cathsim("check", tmp_path / "wrong", "--no-push", "--json")
+    assert code == 1
+    failed = [one for one in json.loads(out)["checks"] if not one["passed"]]
+    assert len(failed) == 1
+    assert "lcca" in failed[0]["note"]

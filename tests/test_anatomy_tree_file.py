@@ -1,0 +1,299 @@
+"""Anatomies from centrelines: splines, ostia, inlets, goals, and the JSON file."""
+
+import copy
+import json
+import sys
+
+import numpy as np
+import pytest
+
+from cathsim_dmc import cli
+from cathsim_dmc.anatomy import Anatomy
+from cathsim_dmc.anatomy.builder import Place
+from cathsim_dmc.anatomy.curves import Curve, smooth_tree
+from cathsim_dmc.anatomy.tree_file import parse_tree, read_tree
+from cathsim_dmc.anatomy.wall import fidelity
+
+BEND = 40.0  # mm
+
+
+def helix(count=25):
+    """A vessel that climbs as it turns, and its points at equal angles, mm."""
+    angle = np.linspace(0.0, 2.2, count)
+    return np.stack(
+        [BEND * np.cos(angle), BEND * np.sin(angle), 20.0 * angle], axis=1
+    ), angle
+
+
+def content():
+    points, _ = helix()
+    side = points[12] + np.outer(np.linspace(0.0, 60.0, 11), [0.3, 0.5, 0.81])
+    return {
+        "format": "cathsim-vessel-tree",
+        "version": 1,
+        "name": "helix",
+        "units": "mm",
+        "frame": "LPS",
+        "vessels": {
+            "trunk": {
+                "parent": None,
+                "points_mm": points.tolist(),
+                "radii_mm": [9.0] * len(points),
+            },
+            "side": {
+                "parent": "trunk",
+                "points_mm": side.tolist(),
+                "radii_mm": [3.5] * len(side),
+            },
+        },
+        "inlets": {
+            "low": {"vessel": "trunk", "end": "first"},
+            "high": {"vessel": "trunk", "end": "last"},
+            "cut": {"vessel": "trunk", "arc_length_mm": 15.0},
+            "side": {"vessel": "side", "end": "last"},
+        },
+        "goals": {
+            "side": {"vessel": "side", "past_ostium_mm": 27.0},
+            "far": {"vessel": "trunk", "arc_length_mm": 80.0},
+            "free": {"vessel": "side", "position_mm": (side[8] + [1, 0, 0]).tolist()},
+        },
+    }
+
+
+def check(anatomy):
+    found = fidelity.intrusion(anatomy, 1.5e-3).inside
+    assert found.mean <= 0.10e-3
+    assert found.p95 <= 0.30e-3
+    assert found.max <= 0.60e-3
+    assert fidelity.coverage(anatomy, 10_000).fraction == 1.0
+    assert fidelity.patency(anatomy, 1e-3, spacing=2e-3).passed
+
+
+@pytest.mark.parametrize("access", ["low", "high", "cut", "side"])
+def test_tree_along_a_space_curve_is_free_and_closed(access):
+    anatomy = parse_tree(content()).build(access)
+    check(anatomy)
+    assert [end.open for end in anatomy.ends].count(True) == 1
+    entered = next(end for end in anatomy.ends if end.open)
+    np.testing.assert_allclose(entered.position, anatomy.inlet.position)
+    route = anatomy.route("far" if access == "side" else "side")
+    np.testing.assert_allclose(route.points[0], anatomy.inlet.position, atol=1e-9)
+    # The device goes in along the centreline.
+    first = route.points[1] - route.points[0]
+    assert first @ anatomy.inlet.direction > 0.99 * np.linalg.norm(first)
+
+
+def test_spline_is_the_curve_and_the_ostium_is_on_the_wall():
+    points, _ = helix()
+    tree = parse_tree(content()).tree()
+    dense, _ = helix(2000)
+    away = tree.vessel("trunk").centreline.project(dense * 1e-3).distance
+    assert away.max() < 0.5e-3
+    side = tree.vessel("side")
+    place = side.centreline.at(side.ostium)
+    near = tree.vessel("trunk").centreline.project(place.position)
+    assert near.distance == pytest.approx(near.radius, abs=0.05e-3)
+    # A flare of 1 mm that begins within the parent and is over soon after.
+    radii = side.centreline.at(side.ostium + np.array([-1e-3, 10e-3])).radius
+    assert 3.7e-3 < radii[0] <= 4.5e-3
+    assert radii[1] == pytest.approx(3.5e-3, abs=0.05e-3)
+    origin = tree.vessel("trunk").centreline.project(side.centreline.points[0])
+    assert origin.distance < 1e-6
+
+
+def test_smoothing_takes_away_scatter_of_the_measurement():
+    points, angle = helix(41)
+    noise = np.random.default_rng(0).normal(0.0, 0.2, points.shape)
+    curve = Curve((points + noise) * 1e-3, np.full(len(points), 9e-3))
+    dense, _ = helix(2000)
+    errors = [
+        smooth_tree({"a": curve}, smoothing=smoothing)
+        .root.centreline.project(dense * 1e-3)
+        .distance.mean()
+        for smoothing in (0.0, 0.35e-3)
+    ]
+    assert errors[1] < 0.7 * errors[0]
+
+
+def test_cut_inlet_drops_what_lies_behind_it():
+    whole, cut = (parse_tree(content()).build(access) for access in ("low", "cut"))
+    lengths = [a.tree.root.centreline.length for a in (whole, cut)]
+    assert lengths[0] - lengths[1] == pytest.approx(15e-3)
+    for name in whole.goals:
+        np.testing.assert_allclose(
+            whole.goal(name).position, cut.goal(name).position, atol=1e-9
+        )
+    moved = whole.goal("far").arc_length - cut.goal("far").arc_length
+    assert moved == pytest.approx(15e-3)
+    wholly = np.concatenate(whole.wall)
+    entry = cut.inlet
+    behind = (wholly - entry.position) @ entry.direction < -6e-3
+    assert behind.any()
+    left = (np.concatenate(cut.wall) - entry.position) @ entry.direction < -6e-3
+    assert not left[np.linalg.norm(
+        np.concatenate(cut.wall) - entry.position, axis=1) < 20e-3].any()  # fmt: skip
+
+
+def test_from_tree_sets_a_goal_in_each_branch():
+    anatomy = Anatomy.from_tree(parse_tree(content()).curves, "helix")
+    assert list(anatomy.goals) == ["side"]
+    side = anatomy.tree.vessel("side")
+    assert anatomy.goal("side").arc_length == pytest.approx(side.ostium + 27e-3)
+    again = Anatomy.from_tree(
+        anatomy.tree, "b", goals={"x": Place("trunk", arc_length=0.03)}
+    )
+    assert again.tree is anatomy.tree
+    assert list(again.goals) == ["x"]
+
+
+def test_right_and_left_are_turned_from_ras():
+    lps, ras = content(), content()
+    ras["frame"] = "RAS"
+    for vessel in ras["vessels"].values():
+        vessel["points_mm"] = [[-x, -y, z] for x, y, z in vessel["points_mm"]]
+    x, y, z = ras["goals"]["free"]["position_mm"]
+    ras["goals"]["free"]["position_mm"] = [-x, -y, z]
+    first, second = (parse_tree(one) for one in (lps, ras))
+    for name in first.curves:
+        np.testing.assert_allclose(
+            first.curves[name].points, second.curves[name].points
+        )
+    np.testing.assert_allclose(
+        first.goals["free"].position, second.goals["free"].position
+    )
+
+
+def change(path, value):
+    def apply(tree):
+        target = tree
+        for key in path[:-1]:
+            target = target[key]
+        if value is KeyError:
+            del target[path[-1]]
+        else:
+            target[path[-1]] = value
+
+    return apply
+
+
+@pytest.mark.parametrize(
+    ("apply", "message"),
+    [
+        (change(["units"], "m"), "units is 'm'"),
+        (change(["version"], 2), "version 2"),
+        (change(["frame"], "LAS"), "LPS, RAS"),
+        (change(["colour"], "red"), "unknown entries colour"),
+        (change(["vessels"], {}), "vessels is empty"),
+        (change(["vessels", "trunk", "radii_mm"], KeyError), "lacks radii_mm"),
+        (change(["vessels", "trunk", "radii_mm", 3], -1.0), "radii from -1"),
+        (change(["vessels", "trunk", "radii_mm", 3], float("nan")), r"\[3\] is nan"),
+        (change(["vessels", "trunk", "radii_mm", 3], True), r"\[3\] is True"),
+        (change(["vessels", "trunk", "points_mm", 3], [1, 2]), "rows of 3 numbers"),
+        (change(["vessels", "trunk", "points_mm", 3], [1e5, 2, 3]), "millimetres"),
+        (change(["vessels", "side", "radii_mm"], [3.5]), "one radius for each"),
+        (change(["vessels", "side", "parent"], "aorta"), "not among"),
+        (change(["vessels", "side", "parent"], None), "only the first, has null"),
+        (change(["vessels", "trunk", "radii_mm"], [0.009] * 25), "millimetres"),
+        (change(["inlets", "low", "end"], "middle"), "first, last"),
+        (change(["inlets", "side", "end"], "first"), "'side' has last"),
+        (change(["inlets", "low", "arc_length_mm"], 3.0), "one of end and"),
+        (change(["goals", "side", "vessel"], "lcca"), "there are trunk, side"),
+        (change(["goals", "side"], {"vessel": "side"}), "give one of"),
+        (change(["goals", "side", "past_ostium_mm"], "deep"), "give 0 to"),
+    ],
+)
+def test_wrong_entries_are_named(apply, message):
+    tree = content()
+    apply(tree)
+    with pytest.raises(ValueError, match=message):
+        parse_tree(tree)
+
+
+def moved_side(offset, count=11):
+    points, _ = helix()
+    return (points[12] + np.outer(np.linspace(0.0, 60.0, count), offset)).tolist()
+
+
+@pytest.mark.parametrize(
+    ("apply", "message"),
+    [
+        (
+            change(
+                ["vessels", "side", "points_mm"],
+                (np.array(moved_side([0.3, 0.5, 0.81])) + [0, 0, 60.0]).tolist(),
+            ),
+            "'side' begins .* from the centreline of 'trunk'",
+        ),
+        (change(["vessels", "side", "radii_mm"], [8.9] * 11), "of its parent's"),
+        (
+            change(
+                ["vessels", "side", "points_mm"],
+                np.array(helix(41)[0][20:31]).tolist(),
+            ),
+            "'side' ends inside its parent",
+        ),
+        (
+            change(
+                ["vessels", "side", "points_mm"],
+                (np.array(helix(41)[0][20:31]) * [1.27, 1.27, 1.0]).tolist(),
+            ),
+            "does not part from 'trunk'|begins",
+        ),
+        (change(["vessels", "trunk", "radii_mm"], [49.0] * 25), "would fold"),
+        (change(["goals", "side", "past_ostium_mm"], 200.0), "is not on it"),
+        (
+            change(["goals", "free", "position_mm"], [0, 0, 0]),
+            "outside vessel 'side'",
+        ),
+        (
+            change(["inlets", "low"], {"vessel": "trunk", "arc_length_mm": 54}),
+            "ostium of branch 'side'",
+        ),
+    ],
+)
+def test_impossible_trees_are_refused(apply, message):
+    tree = content()
+    apply(tree)
+    with pytest.raises(ValueError, match=message):
+        parse_tree(tree).build("low")
+
+
+def test_branches_that_meet_are_refused():
+    tree = content()
+    other = copy.deepcopy(tree["vessels"]["side"])
+    start = np.array(helix()[0][15])
+    target = np.array(tree["vessels"]["side"]["points_mm"][8])
+    way = np.linspace(0.0, 1.3, 11)[:, None] * (target - start)
+    other["points_mm"] = (start + way).tolist()
+    tree["vessels"]["other"] = other
+    with pytest.raises(ValueError, match="'side' and 'other'|'other' and 'side'"):
+        parse_tree(tree).build("low")
+
+
+def run(monkeypatch, capsys, *arguments):
+    monkeypatch.setattr(sys, "argv", ["cathsim", "phantom", *map(str, arguments)])
+    with pytest.raises(SystemExit) as end:
+        cli.main()
+    captured = capsys.readouterr()
+    return end.value.code or 0, captured.out, captured.err
+
+
+def test_command_builds_and_refuses(tmp_path, monkeypatch, capsys):
+    path = tmp_path / "tree.json"
+    path.write_text(json.dumps(content()))
+    out, other = tmp_path / "helix", tmp_path / "other"
+    code, text, _ = run(monkeypatch, capsys, "build", path, "--out", out)
+    assert code == 0
+    assert "wall pieces" in text
+    assert Anatomy.load(out).goals.keys() == {"side", "far", "free"}
+    wrong = ("build", path, "--out", other, "--access", "x")
+    code, _, error = run(monkeypatch, capsys, *wrong)
+    assert code == 2
+    assert "low, high, cut, side" in error
+    path.write_text("{")
+    code, _, error = run(monkeypatch, capsys, "build", path, "--out", other)
+    assert code == 2
+    assert "tree.json" in error
+    assert not other.exists()
+    with pytest.raises(FileNotFoundError):
+        read_tree(tmp_path / "none.json")
