@@ -7,13 +7,7 @@ import torchrl  # noqa: F401
 # isort: on
 
 from cathsim_dmc.agents.checkpoint import Checkpoint, CheckpointError
-from cathsim_dmc.agents.configs import (
-    ConfigError,
-    PPOConfig,
-    SACConfig,
-    TrainingConfig,
-    make_config,
-)
+from cathsim_dmc.agents.config import ConfigError, TrainingConfig
 from cathsim_dmc.agents.evaluation import (
     Comparison,
     EvaluationResult,
@@ -21,10 +15,14 @@ from cathsim_dmc.agents.evaluation import (
     evaluate,
     random_policy,
 )
+from cathsim_dmc.agents.learners import LEARNERS, make_config
+from cathsim_dmc.agents.ppo import PPOConfig
+from cathsim_dmc.agents.sac import SACConfig
 from cathsim_dmc.agents.training import TrainingResult, train
 from cathsim_dmc.simulation.environments import make_env
 
 __all__ = [
+    "LEARNERS",
     "Checkpoint",
     "CheckpointError",
     "Comparison",

@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from pathlib import Path
 
-from cathsim_dmc.agents import configs, report, training
+from cathsim_dmc.agents import learners, report, training
 from cathsim_dmc.agents.checkpoint import Checkpoint
 
 
@@ -27,7 +27,7 @@ def demo(
       Whether it came to the end; an interrupted training can be continued.
     """
     out = Path(out)
-    config = configs.make_config(
+    config = learners.make_config(
         "ppo", "demo", task="type1_bca", total_frames=frames, seed=seed
     )
     say(f"1/3 training PPO on {config.task}, {frames} frames -> {out}")

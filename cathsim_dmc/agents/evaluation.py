@@ -1,7 +1,6 @@
 """Evaluation: fixed seeds, each episode counted once, intervals beside every mean."""
 
 import json
-import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -13,6 +12,7 @@ from tensordict import TensorDictBase
 from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type, step_mdp
 
+from cathsim_dmc import files
 from cathsim_dmc.agents.checkpoint import Checkpoint
 from cathsim_dmc.agents.episodes import EpisodeOutcome, EpisodeTracker
 from cathsim_dmc.agents.training import EnvFactory
@@ -193,7 +193,7 @@ def evaluate(
     name: str | None = None,
     observation: str | Sequence[str] | None = None,
     task_kwargs: Mapping[str, Any] | None = None,
-    path: str = "batched",
+    backend: str = "batched",
     num_threads: int | None = None,
     out_dir: str | Path | None = None,
     observer: Observer | None = None,
@@ -216,7 +216,7 @@ def evaluate(
         name: of the policy, for the reports.
         observation: as for task.
         task_kwargs: as for task.
-        path: "batched" or "composer".
+        backend: "batched" or "composer".
         num_threads: of the batched simulation.
         out_dir: write evaluation.json there.
         observer: called after every step, before any environment is reset.
@@ -243,7 +243,7 @@ def evaluate(
     settings = {
         "observation": observation or "internal",
         "task_kwargs": dict(task_kwargs or {}),
-        "path": path,
+        "backend": backend,
         "frames": checkpoint.frames if checkpoint else None,
     }
     env = make_env(
@@ -252,7 +252,7 @@ def evaluate(
         num_envs=episodes,
         num_threads=num_threads,
         seed=seed,
-        path=path,
+        backend=backend,
         task_kwargs=settings["task_kwargs"],
     )
     if checkpoint is not None:
@@ -301,8 +301,5 @@ def write_evaluation(out_dir: str | Path, values: Mapping[str, Any]) -> Path:
     """Write evaluation.json atomically; return its path."""
     directory = Path(out_dir)
     directory.mkdir(parents=True, exist_ok=True)
-    target = directory / "evaluation.json"
-    temporary = directory / "evaluation.json.tmp"
-    temporary.write_text(json.dumps(values, indent=2) + "\n")
-    os.replace(temporary, target)
-    return target
+    text = json.dumps(values, indent=2) + "\n"
+    return files.write_text(directory / "evaluation.json", text)
