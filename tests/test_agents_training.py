@@ -332,7 +332,8 @@ def test_importing_agents_loads_torchrl_before_dm_control():
     script = (
         "import os, sys; before = dict(os.environ)\n"
         "import cathsim_dmc.agents\n"
-        "assert 'torchrl' in sys.modules and 'dm_control' not in sys.modules\n"
+        "loaded = list(sys.modules)\n"
+        "assert loaded.index('torchrl') < loaded.index('dm_control')\n"
         "assert dict(os.environ) == before, set(os.environ) ^ set(before)\n"
     )
     subprocess.run([sys.executable, "-c", script], check=True, timeout=120)

@@ -28,14 +28,16 @@ ALLOWED = {
     "tasks": {"anatomy", "imaging", "entities"},
     "suite": _TASK,
     "simulation": _TASK | {"suite"},
+    "policies": _FACE,
     "recording": _FACE,
-    "analysis": _FACE | {"recording", "validation"},
+    "analysis": _FACE | {"recording", "validation", "policies"},
     "validation": _FACE | {"recording"},
-    "agents": _FACE | {"recording", "analysis"},
+    "agents": _FACE | {"recording", "analysis", "policies"},
     # The faces to the outside: everything but each other.
     "gym": _FACE,
-    "play": _FACE | {"recording"},
-    "cli": _FACE | {"recording", "analysis", "validation", "agents", "play"},
+    "play": _FACE | {"recording", "policies"},
+    "cli": _FACE
+    | {"recording", "analysis", "validation", "policies", "agents", "play"},
 }
 _TORCHRL_FACE = (
     "simulation/torchrl.py",

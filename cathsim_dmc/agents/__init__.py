@@ -13,9 +13,9 @@ from cathsim_dmc.agents.evaluation import (
     EvaluationResult,
     compare,
     evaluate,
-    random_policy,
 )
 from cathsim_dmc.agents.learners import LEARNERS, make_config
+from cathsim_dmc.agents.policies import load_policy
 from cathsim_dmc.agents.ppo import PPOConfig
 from cathsim_dmc.agents.sac import SACConfig
 from cathsim_dmc.agents.training import TrainingResult, train
@@ -34,8 +34,8 @@ __all__ = [
     "TrainingResult",
     "compare",
     "evaluate",
+    "load_policy",
     "make_config",
     "make_env",
-    "random_policy",
     "train",
 ]

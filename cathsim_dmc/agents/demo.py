@@ -13,18 +13,18 @@ def demo(
     seed: int,
     say: Callable[[str], None] = lambda text: None,
 ) -> bool:
-    """Trains PPO on type1_bca, evaluates, draws and records it.
+    """Train PPO on type1_bca, evaluates, draws and records it.
 
     A run that is there is continued or, if it is complete, only evaluated.
 
     Args:
-      out: directory of the run.
-      frames: control steps of training.
-      seed: of everything.
-      say: told what happens.
+        out: Directory of the run.
+        frames: Number of control steps of training.
+        seed: Seed of networks, exploration and environments.
+        say: Function that is told what happens.
 
     Returns:
-      Whether it came to the end; an interrupted training can be continued.
+        Whether it came to the end; an interrupted training can be continued.
     """
     out = Path(out)
     config = learners.make_config(

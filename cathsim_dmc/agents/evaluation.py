@@ -8,21 +8,21 @@ from typing import Any
 
 import numpy as np
 import torch
-from tensordict import TensorDictBase
 from torchrl.envs import EnvBase
-from torchrl.envs.utils import ExplorationType, set_exploration_type, step_mdp
+from torchrl.envs.utils import step_mdp
 
 from cathsim_dmc import files
-from cathsim_dmc.agents.checkpoint import Checkpoint
 from cathsim_dmc.agents.episodes import EpisodeOutcome, EpisodeTracker
-from cathsim_dmc.agents.training import EnvFactory
+from cathsim_dmc.agents.policies import PolicyLike, load_policy, view_of
 from cathsim_dmc.analysis.force_statistics import wilson_interval
+from cathsim_dmc.policies import Policy
 from cathsim_dmc.simulation import environments
 
-Policy = Callable[[TensorDictBase], TensorDictBase | torch.Tensor]
+EnvFactory = Callable[..., EnvBase]
 # Called after every step with the environment and which episodes (n,) bool still run.
 Observer = Callable[[EnvBase, np.ndarray], None]
 
+EVALUATION_SEED = 1_000_000  # apart from the seeds of training
 BOOTSTRAP_SAMPLES = 10_000
 
 _REPORTED = (
@@ -173,22 +173,11 @@ def compare(policy: EvaluationResult, baseline: EvaluationResult) -> Comparison:
     )
 
 
-def random_policy(num_actions: int, seed: int = 0) -> Policy:
-    """Uniform actions in [-1, 1] from a generator of its own."""
-    generator = torch.Generator().manual_seed(seed)
-
-    def random(observation: TensorDictBase) -> torch.Tensor:
-        shape = (*observation.batch_size, num_actions)
-        return 2.0 * torch.rand(shape, generator=generator) - 1.0
-
-    return random
-
-
 def evaluate(
-    policy: str | Path | Checkpoint | Policy,
+    policy: PolicyLike,
     task: str | None = None,
     episodes: int = 30,
-    seed: int = 1_000_000,
+    seed: int = EVALUATION_SEED,
     *,
     name: str | None = None,
     observation: str | Sequence[str] | None = None,
@@ -206,42 +195,40 @@ def evaluate(
     while others finish is not counted.
 
     Args:
-        policy: a run's or checkpoint's directory, a Checkpoint, "random", or a
-            callable that gets the observations (episodes,) and returns the actions
-            or the tensordict with "action" in it. "step_count" tells such a callable
-            where each episode stands.
-        task: the task; for a checkpoint, None takes the one it was trained on.
-        episodes: how many.
-        seed: of the first episode. The default lies apart from training seeds.
-        name: of the policy, for the reports.
-        observation: as for task.
-        task_kwargs: as for task.
-        backend: "batched" or "composer".
-        num_threads: of the batched simulation.
-        out_dir: write evaluation.json there.
-        observer: called after every step, before any environment is reset.
-        make_env: see `environments.make_env`.
+        policy: Directory of a run or of a checkpoint, Checkpoint, name in
+            `cathsim_dmc.policies.POLICIES`, policy, or function of the observations
+            (episodes, ...) that returns the actions (episodes, A) or the TensorDict
+            with "action" in it.
+        task: Name of the task; None takes the one that the policy was trained on.
+        episodes: Number of episodes.
+        seed: Seed of the first episode; the others count up. The default lies apart
+            from training seeds.
+        name: Name of the policy for the reports.
+        observation: Name or names of the observations; None takes those that the
+            policy reads.
+        task_kwargs: Further options of the task; None takes those that the policy was
+            trained with.
+        backend: Way of simulating, "batched" or "composer".
+        num_threads: Number of threads of the batched simulation; None takes one per
+            core.
+        out_dir: Directory for evaluation.json; None writes none.
+        observer: Function that is called after every step, before any environment is
+            reset.
+        make_env: Function that makes the environment, as `environments.make_env`.
 
     Raises:
         ValueError: no task is known, or episodes < 1.
-        CheckpointError: there is no such checkpoint.
+        CheckpointError: there is no such checkpoint, or it is damaged.
     """
     if episodes < 1:
         raise ValueError(f"episodes={episodes}: at least one is needed.")
-    checkpoint = None
-    if isinstance(policy, Checkpoint):
-        checkpoint = policy
-    elif isinstance(policy, str | Path) and str(policy) != "random":
-        checkpoint = Checkpoint.open(policy)
-    if checkpoint is not None:
-        config = checkpoint.config
-        task = config.task if task is None else task
-        observation = config.observation if observation is None else observation
-        task_kwargs = config.task_kwargs if task_kwargs is None else task_kwargs
-    if task is None:
-        raise ValueError("task=None: a policy that is no checkpoint needs a task.")
+    player = load_policy(policy, seed)
+    task = require_task(player, task)
+    checkpoint = getattr(player, "checkpoint", None)
+    if task_kwargs is None:
+        task_kwargs = player.task_kwargs
     settings = {
-        "observation": observation or "internal",
+        "observation": observation or player.observation or "internal",
         "task_kwargs": dict(task_kwargs or {}),
         "backend": backend,
         "frames": checkpoint.frames if checkpoint else None,
@@ -255,45 +242,56 @@ def evaluate(
         backend=backend,
         task_kwargs=settings["task_kwargs"],
     )
-    if checkpoint is not None:
-        act: Policy = checkpoint.policy()
-        name = name or f"{checkpoint.config.algorithm} {checkpoint.path.name}"
-    elif isinstance(policy, str | Path):
-        act = random_policy(env.action_spec.shape[-1], seed)
-        name = name or "random"
-    else:
-        act = policy
-        name = name or getattr(policy, "__name__", type(policy).__name__)
     try:
-        outcomes = _first_episodes(env, act, observer)
+        outcomes = _first_episodes(env, player, observer)
     finally:
         env.close()
-    result = EvaluationResult(task, name, seed, outcomes, settings)
+    result = EvaluationResult(task, name or player.name, seed, outcomes, settings)
     if out_dir is not None:
         write_evaluation(out_dir, result.to_dict())
     return result
 
 
+def require_task(policy: Policy, task: str | None) -> str:
+    """The task asked for, or the one that the policy was made for.
+
+    Raises:
+        ValueError: there is neither.
+    """
+    chosen = task or policy.task
+    if chosen is None:
+        from cathsim_dmc import suite
+
+        raise ValueError(
+            f"the policy {policy.name!r} was not trained on a task, so it needs a "
+            f"task to play: one of {', '.join(suite.SUITE)}"
+        )
+    return chosen
+
+
 @torch.no_grad()
 def _first_episodes(
-    env: EnvBase, act: Policy, observer: Observer | None
+    env: EnvBase, policy: Policy, observer: Observer | None
 ) -> tuple[EpisodeOutcome, ...]:
     (count,) = env.batch_size
     tracker = EpisodeTracker(count)
     outcomes: dict[int, EpisodeOutcome] = {}
-    with set_exploration_type(ExplorationType.DETERMINISTIC):
-        current = env.reset()
-        while len(outcomes) < count:
-            answer = act(current)
-            action = answer if isinstance(answer, torch.Tensor) else answer["action"]
-            current["action"] = action.to(torch.float32)
-            stepped = env.step(current)
-            if observer is not None:
-                running = np.array([index not in outcomes for index in range(count)])
-                observer(env, running)
-            for outcome in tracker.add(stepped.unsqueeze(1)):
-                outcomes.setdefault(outcome.env, outcome)
-            current = env.maybe_reset(step_mdp(stepped))
+    current = env.reset()
+    view = view_of(env)
+    begins = np.ones(count, dtype=bool)
+    while len(outcomes) < count:
+        if begins.any():
+            policy.reset(view, begins)
+        action = torch.as_tensor(policy.act(current))
+        current["action"] = action.to(torch.float32)
+        stepped = env.step(current)
+        if observer is not None:
+            running = np.array([index not in outcomes for index in range(count)])
+            observer(env, running)
+        for outcome in tracker.add(stepped.unsqueeze(1)):
+            outcomes.setdefault(outcome.env, outcome)
+        begins = stepped["next", "done"].reshape(count).numpy()
+        current = env.maybe_reset(step_mdp(stepped))
     return tuple(outcomes[env_index] for env_index in range(count))
 
 

@@ -26,6 +26,7 @@ from cathsim_dmc.agents.checkpoint import (
 )
 from cathsim_dmc.agents.config import ConfigError, TrainingConfig
 from cathsim_dmc.agents.episodes import INFO, EpisodeTracker
+from cathsim_dmc.agents.evaluation import EnvFactory
 from cathsim_dmc.agents.interruption import Interruption
 from cathsim_dmc.agents.learners import Learner, make_learner
 from cathsim_dmc.agents.networks import NetworkShapes
@@ -33,7 +34,6 @@ from cathsim_dmc.agents.replay import ReplayError
 from cathsim_dmc.agents.training_log import TrainingLog, crossed
 from cathsim_dmc.simulation import environments
 
-EnvFactory = Callable[..., EnvBase]
 CONFIG_FILE = "config.json"
 
 

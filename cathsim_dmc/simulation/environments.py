@@ -84,6 +84,11 @@ def make_env(
     return standard_observations(env)
 
 
+def composer_of(env: EnvBase) -> Any:
+    """The composer environment under one environment of the backend "composer"."""
+    return env.base_env._env
+
+
 def standard_observations(env: EnvBase) -> TransformedEnv:
     """Append the transforms from an environment's entries to VECTOR and PIXELS.
 

@@ -18,7 +18,6 @@ from cathsim_dmc.analysis.speed.pace import (
     IDLE,
     PUSH,
     RANDOM,
-    Drive,
     Pace,
     account,
     load,
@@ -39,7 +38,7 @@ def speed(say: Callable[[str], None] = lambda text: None) -> Report:
     say("by insertion depth")
     long = load(working_length=_LONG)
     depths = {
-        drive.name: _median_pace(long, drive, _LONG_STEPS)[1].by_depth()
+        drive: _median_pace(long, drive, _LONG_STEPS)[1].by_depth()
         for drive in (IDLE, RANDOM, PUSH, CURL)
     }
     say("overheads")
@@ -47,7 +46,7 @@ def speed(say: Callable[[str], None] = lambda text: None) -> Report:
     say("construction, memory, imports")
     checks += overheads + _images() + _construction() + _processes()
     say("where a step goes")
-    stages = {drive.name: account(drive, STEPS) for drive in (RANDOM, PUSH)}
+    stages = {drive: account(drive, STEPS) for drive in (RANDOM, PUSH)}
     findings = {
         "by_insertion_depth": depths,
         "batched_steps_per_second": rates,
@@ -56,7 +55,7 @@ def speed(say: Callable[[str], None] = lambda text: None) -> Report:
     return Report("speed, one core", checks, findings)
 
 
-def _median_pace(environment, drive: Drive, steps: int) -> tuple[float, Pace]:
+def _median_pace(environment, drive: str, steps: int) -> tuple[float, Pace]:
     paces = [pace(environment, drive, steps) for _ in range(RUNS)]
     factors = [each.factor for each in paces]
     middle = statistics.median(factors)
@@ -69,7 +68,7 @@ def _factors() -> list[Check]:
     for drive, bar in ((PUSH, 12), (RANDOM, 20), (CURL, 5)):
         factor, one = _median_pace(environment, drive, STEPS)
         note = f"{one.contacts.mean():.1f} contacts, {one.insertion[-1] * 1e3:.0f} mm"
-        name = f"real-time factor, {drive.name}"
+        name = f"real-time factor, {drive}"
         checks.append(Check.at_least(name, factor, bar, "x", note))
     return checks
 
@@ -79,7 +78,7 @@ def _overheads() -> tuple[list[Check], dict[str, float]]:
     checks = [
         _ratio(
             Check.at_most,
-            f"suite step / mj_step, {drive.name}",
+            f"suite step / mj_step, {drive}",
             ratios.suite_overhead(drive, STEPS),
             1.25,
         )
