@@ -1,5 +1,6 @@
 """Evaluation: fixed seeds, each episode counted once, intervals beside every mean."""
 
+import dataclasses
 import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
@@ -14,7 +15,7 @@ from torchrl.envs.utils import step_mdp
 from cathsim_dmc import files
 from cathsim_dmc.agents.episodes import EpisodeOutcome, EpisodeTracker
 from cathsim_dmc.agents.policies import PolicyLike, load_policy, view_of
-from cathsim_dmc.analysis.force_statistics import wilson_interval
+from cathsim_dmc.analysis.force_statistics import QUANTITIES, Statistics
 from cathsim_dmc.policies import Policy
 from cathsim_dmc.simulation import environments
 
@@ -25,14 +26,7 @@ Observer = Callable[[EnvBase, np.ndarray], None]
 EVALUATION_SEED = 1_000_000  # apart from the seeds of training
 BOOTSTRAP_SAMPLES = 10_000
 
-_REPORTED = (
-    "reward",
-    "length",
-    "mean_force",
-    "max_force",
-    "peak_force",
-    "path_ratio",
-)
+_REPORTED = ("reward", "length", "path_ratio")
 
 
 @dataclass(frozen=True)
@@ -40,11 +34,11 @@ class EvaluationResult:
     """Episodes of one policy on one task.
 
     Attributes:
-        task: name of the task.
-        policy: what was evaluated.
-        seed: of the first episode; episode i was played with seed + i.
-        episodes: in the order of their seeds.
-        settings: observation, task_kwargs and, for a checkpoint, its frames.
+        task: Name of the task.
+        policy: Name of the policy.
+        seed: Seed of the first episode; episode i was played with seed + i.
+        episodes: Episodes in the order of their seeds.
+        settings: Observation, task_kwargs, backend and, for a checkpoint, its frames.
     """
 
     task: str
@@ -54,8 +48,19 @@ class EvaluationResult:
     settings: Mapping[str, Any]
 
     def values(self, name: str) -> np.ndarray:
-        """An outcome of every episode, float64 (episodes,); NaN where unknown."""
-        return np.array([getattr(e, name) for e in self.episodes], dtype=np.float64)
+        """A figure of every episode, float64 (episodes,); NaN where unknown.
+
+        Args:
+            name: Name of an attribute of `EpisodeOutcome`, with dots for what lies
+                deeper, such as "reward" or "forces.peak_sum.maximum".
+        """
+
+        def value(outcome: Any) -> Any:
+            for part in name.split("."):
+                outcome = None if outcome is None else getattr(outcome, part)
+            return outcome
+
+        return np.array([value(e) for e in self.episodes], dtype=np.float64)
 
     def mean_sd(self, name: str) -> tuple[float | None, float | None]:
         """Mean and sample standard deviation over the episodes; None if unknown."""
@@ -73,16 +78,32 @@ class EvaluationResult:
         return sum(known) if len(known) == len(self.episodes) else None
 
     def summary(self) -> dict[str, Any]:
-        """Means with deviations and the success rate with its interval."""
+        """Means with deviations over the episodes, success rate with its interval.
+
+        Forces in N, by quantity and statistic as docs/forces.md defines them.
+        """
         result: dict[str, Any] = {"episodes": len(self.episodes)}
         for name in _REPORTED:
             result[name], result[f"{name}_sd"] = self.mean_sd(name)
+        result["forces"] = {
+            quantity: {
+                statistic.name: dict(
+                    zip(
+                        ("mean", "sd"),
+                        self.mean_sd(f"forces.{quantity}.{statistic.name}"),
+                        strict=True,
+                    )
+                )
+                for statistic in dataclasses.fields(Statistics)
+            }
+            for quantity in QUANTITIES
+        }
         result["physics_errors"] = sum(e.physics_error for e in self.episodes)
         successes = self.successes
         rate = interval = None
         if successes is not None:
             rate = successes / len(self.episodes)
-            interval = list(wilson_interval(successes, len(self.episodes)))
+            interval = list(success_interval(successes, len(self.episodes)))
         result["success"] = rate
         result["success_ci95"] = interval
         return result
@@ -107,19 +128,20 @@ class Comparison:
     """How much better one policy is than another on the same seeds.
 
     Attributes:
-        policy: the one in question.
-        baseline: the other.
-        reward_difference: mean over seeds of the difference of episode rewards.
-        reward_ci95: its bootstrap interval, resampling seeds.
-        success_difference: difference of the success rates; None if unknown.
-        success_ci95: its bootstrap interval; None if unknown.
-        better: whether the reward interval lies above zero.
+        policy: Name of the policy in question.
+        baseline: Name of the other one.
+        reward_difference: Mean over seeds of the difference of episode rewards.
+        reward_ci95: Bootstrap interval of that mean, resampling seeds; None for a
+            single seed.
+        success_difference: Difference of the success rates; None if unknown.
+        success_ci95: Bootstrap interval of that difference; None if unknown.
+        better: Whether the reward interval lies above zero.
     """
 
     policy: str
     baseline: str
     reward_difference: float
-    reward_ci95: tuple[float, float]
+    reward_ci95: tuple[float, float] | None
     success_difference: float | None
     success_ci95: tuple[float, float] | None
     better: bool
@@ -129,16 +151,35 @@ class Comparison:
         return asdict(self)
 
 
+def success_interval(successes: int, trials: int) -> tuple[float, float]:
+    """Wilson's 95 % interval of a success rate, as fractions."""
+    # Imported late: it takes most of a second.
+    from scipy import stats
+
+    interval = stats.binomtest(successes, trials).proportion_ci(method="wilson")
+    return float(interval.low), float(interval.high)
+
+
 def paired_bootstrap(
     first: np.ndarray, second: np.ndarray, seed: int = 0
-) -> tuple[float, tuple[float, float]]:
-    """Mean of first - second over pairs (n,), with its 95 % percentile interval."""
+) -> tuple[float, tuple[float, float] | None]:
+    """Mean of first - second over pairs (n,), with its 95 % percentile interval.
+
+    The interval is None for a single pair, which tells nothing about the spread.
+    """
+    from scipy import stats
+
     difference = np.asarray(first, np.float64) - np.asarray(second, np.float64)
-    draws = np.random.default_rng(seed).integers(
-        len(difference), size=(BOOTSTRAP_SAMPLES, len(difference))
-    )
-    low, high = np.quantile(difference[draws].mean(1), (0.025, 0.975))
-    return float(difference.mean()), (float(low), float(high))
+    if len(difference) < 2:
+        return float(difference.mean()), None
+    interval = stats.bootstrap(
+        (difference,),
+        np.mean,
+        n_resamples=BOOTSTRAP_SAMPLES,
+        method="percentile",
+        random_state=np.random.default_rng(seed),
+    ).confidence_interval
+    return float(difference.mean()), (float(interval.low), float(interval.high))
 
 
 def compare(policy: EvaluationResult, baseline: EvaluationResult) -> Comparison:
@@ -169,7 +210,7 @@ def compare(policy: EvaluationResult, baseline: EvaluationResult) -> Comparison:
         reward_ci95=reward_ci,
         success_difference=success,
         success_ci95=success_ci,
-        better=reward_ci[0] > 0,
+        better=reward_ci is not None and reward_ci[0] > 0,
     )
 
 

@@ -12,6 +12,7 @@ from torchrl.envs import EnvBase
 from cathsim_dmc import suite
 from cathsim_dmc.agents import evaluation, policies
 from cathsim_dmc.analysis import heatmap
+from cathsim_dmc.analysis.force_statistics import millinewtons
 from cathsim_dmc.policies import in_environment
 from cathsim_dmc.recording import recorder, rerun_log
 from cathsim_dmc.recording.episode import Episode
@@ -47,38 +48,56 @@ class Report:
         from rich.console import Console
         from rich.table import Table
 
-        table = Table(title=f"{self.policy.task}, seeds from {self.policy.seed}")
-        for column in ("policy", "reward", "steps", "force, N", "peak, N", "success"):
+        table = Table(
+            title=f"{self.policy.task}, seeds from {self.policy.seed}",
+            caption=_CAPTION,
+            caption_justify="left",
+        )
+        for column in _COLUMNS:
             table.add_column(column)
         for result in (self.policy, self.baseline):
             if result is not None:
-                table.add_row(result.policy, *_cells(result.summary()))
+                table.add_row(result.policy, *_cells(result))
         console = Console()
         console.print(table)
         if self.comparison is not None:
-            low, high = self.comparison.reward_ci95
+            interval = "one episode tells no interval"
+            if self.comparison.reward_ci95 is not None:
+                low, high = self.comparison.reward_ci95
+                interval = f"95 % interval {low:+.1f} to {high:+.1f}"
             console.print(
                 f"reward over {self.comparison.baseline}: "
-                f"{self.comparison.reward_difference:+.1f} "
-                f"(95 % interval {low:+.1f} to {high:+.1f})"
+                f"{self.comparison.reward_difference:+.1f} ({interval})"
             )
 
 
-def _cells(summary: Mapping[str, Any]) -> list[str]:
+_COLUMNS = (
+    "policy", "reward", "steps", "mean force, mN", "max force, mN", "peak, mN",
+    "success",
+)  # fmt: skip
+_CAPTION = (
+    "Mean ± standard deviation over episodes. Mean force: sum over all contacts at the "
+    "end of a control step, mean over all steps. Max force: largest single contact at "
+    "the end of any control step. Peak: the same in any physics step."
+)
+
+
+def _cells(result: evaluation.EvaluationResult) -> list[str]:
     def spread(name: str, digits: int) -> str:
-        mean, deviation = summary[name], summary[f"{name}_sd"]
+        mean, deviation = result.mean_sd(name)
         return "–" if mean is None else f"{mean:.{digits}f} ± {deviation:.{digits}f}"
 
+    summary = result.summary()
     rate, interval = summary["success"], summary["success_ci95"]
     success = "–"
     if rate is not None:
         low, high = (round(100 * bound) for bound in interval)
         success = f"{100 * rate:.0f} % ({low}–{high})"
+    forces = ("mean_force", "max_force", "peak_force")
     return [
         spread("reward", 1),
         spread("length", 0),
-        spread("mean_force", 3),
-        spread("peak_force", 3),
+        *(millinewtons(*result.mean_sd(name)) for name in forces),
         success,
     ]
 
