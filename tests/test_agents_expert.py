@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from cathsim_dmc import agents, suite
-from cathsim_dmc.agents import expert, pursuit
+from cathsim_dmc import agents, policies, suite
+from cathsim_dmc.policies import expert, pursuit
 from cathsim_dmc.simulation import batch
 from cathsim_dmc.tasks import forces
 
@@ -225,7 +225,7 @@ def test_policy_reaches_the_goal_in_a_composer_environment():
     env = suite.load(
         suite.DOMAIN, "type1_lcca", task_kwargs={"observation": "tracking", "random": 5}
     )
-    act = expert.policy(env)
+    act = policies.in_environment(policies.make_policy("expert"), env)
     lengths = []
     for _ in range(2):
         timestep, steps, largest = env.reset(), 0, 0.0
@@ -245,7 +245,8 @@ def test_policy_needs_no_observation_before_the_first_step():
     for observable in env.task.task_observables.values():
         observable.enabled = False
     timestep = env.reset()
-    action = expert.policy(env)(timestep)
+    act = policies.in_environment(policies.make_policy("expert"), env)
+    action = act(timestep)
     assert action.shape == env.action_spec().shape
     assert action[20] > 0
 
@@ -270,18 +271,18 @@ def test_it_recovers_from_a_wrong_branch(task, plan):
 
 
 def test_episodes_are_evaluated_like_those_of_any_policy():
-    result = expert.expert_episodes("type2_lcca", episodes=3, seed=70, num_threads=1)
+    result = agents.evaluate("expert", "type2_lcca", episodes=3, seed=70, num_threads=1)
     assert isinstance(result, agents.EvaluationResult)
     assert (result.policy, result.seed, result.successes) == ("expert", 70, 3)
     assert result.values("max_force").max() < GENTLE
-    again = expert.expert_episodes("type2_lcca", episodes=3, seed=70, num_threads=1)
+    again = agents.evaluate("expert", "type2_lcca", episodes=3, seed=70, num_threads=1)
     assert again.to_dict() == result.to_dict()
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", TASKS)
 def test_it_solves_the_published_tasks_gently(name):
-    result = expert.expert_episodes(name, episodes=30)
+    result = agents.evaluate("expert", name, episodes=30)
     assert result.successes == 30
     assert result.values("peak_force").max() < GENTLE
     assert result.values("length").max() < 300
@@ -296,8 +297,8 @@ def test_it_solves_random_arches(seed, access):
     params = arch.sample(np.random.RandomState(seed), bovine=seed % 2 == 1)
     anatomy = arch.build_arch(params, access=access)
     for goal in ("bca", "lcca", "lsa"):
-        result = expert.expert_episodes(
-            "navigate", 2, 5, task_kwargs={"anatomy": anatomy, "goal": goal}
+        result = agents.evaluate(
+            "expert", "navigate", 2, 5, task_kwargs={"anatomy": anatomy, "goal": goal}
         )
         assert result.successes == 2
         assert result.values("peak_force").max() < GENTLE

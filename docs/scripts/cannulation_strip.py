@@ -15,9 +15,7 @@ matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 import numpy as np
 
-from cathsim_dmc.agents import expert  # torchrl goes before dm_control
-
-from cathsim_dmc import suite  # isort: skip
+from cathsim_dmc import policies, suite
 from cathsim_dmc.imaging import Angiograph, FluoroscopyOptions
 from cathsim_dmc.imaging import angiograph as machines
 
@@ -34,7 +32,7 @@ ROWS = {
 def run() -> tuple[object, list[dict]]:
     """The task, and the state of the device at every control step."""
     env = suite.load("cathsim", TASK, task_kwargs={"random": SEED})
-    act = expert.policy(env)
+    act = policies.in_environment(policies.make_policy("expert"), env)
     timestep, states = env.reset(), []
     while True:
         task = env.task

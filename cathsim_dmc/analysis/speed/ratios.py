@@ -13,7 +13,6 @@ import numpy as np
 from cathsim_dmc.analysis.speed.pace import (
     NEVER,
     RANDOM,
-    Drive,
     against_bare_steps,
     load,
     pace,
@@ -23,12 +22,12 @@ NUM_SIMULATIONS = 16
 _RUNS = 12
 
 
-def suite_overhead(drive: Drive, steps: int = 150) -> list[float]:
+def suite_overhead(policy: str, steps: int = 150) -> list[float]:
     """CPU time of suite environment steps over that of their bare mj_step calls."""
     environment = load()
     ratios = []
     for run in range(2 * _RUNS + 1):
-        ours, bare = against_bare_steps(environment, drive, steps, run)
+        ours, bare = against_bare_steps(environment, policy, steps, run)
         ratios.append(ours / bare)
     return ratios[1:]
 

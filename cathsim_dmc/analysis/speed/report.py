@@ -21,7 +21,6 @@ from cathsim_dmc.analysis.speed.pace import (
     IDLE,
     PUSH,
     RANDOM,
-    Drive,
     Pace,
     account,
     humanoid_step,
@@ -45,7 +44,7 @@ def speed(say: Callable[[str], None] = lambda text: None) -> Report:
     say("by insertion depth")
     long = load(working_length=_LONG)
     depths = {
-        drive.name: _median_pace(long, drive, _LONG_STEPS).by_depth()
+        drive: _median_pace(long, drive, _LONG_STEPS).by_depth()
         for drive in (IDLE, RANDOM, PUSH, CURL)
     }
     say("overheads")
@@ -53,7 +52,7 @@ def speed(say: Callable[[str], None] = lambda text: None) -> Report:
     say("construction, memory, imports")
     checks += overheads + _images() + _construction() + _processes()
     say("where a step goes")
-    stages = {drive.name: account(drive, STEPS) for drive in (RANDOM, PUSH)}
+    stages = {drive: account(drive, STEPS) for drive in (RANDOM, PUSH)}
     findings = {
         "calibration": calibration,
         "by_insertion_depth": depths,
@@ -63,7 +62,7 @@ def speed(say: Callable[[str], None] = lambda text: None) -> Report:
     return Report("speed, one core", checks, findings)
 
 
-def _median_pace(environment, drive: Drive, steps: int) -> Pace:
+def _median_pace(environment, drive: str, steps: int) -> Pace:
     paces = [pace(environment, drive, steps) for _ in range(RUNS)]
     return sorted(paces, key=lambda one: one.factor)[RUNS // 2]
 
@@ -81,7 +80,7 @@ def _factors() -> tuple[list[Check], dict[str, dict[str, float]]]:
             factors.append(one.factor)
             products.append(one.factor * (humanoid[-2] + humanoid[-1]) / 2)
         factor, step = statistics.median(factors), statistics.median(humanoid)
-        table[drive.name] = {
+        table[drive] = {
             "real_time_factor": factor,
             "humanoid_step_microseconds": step,
         }
@@ -89,7 +88,7 @@ def _factors() -> tuple[list[Check], dict[str, dict[str, float]]]:
             f"{factor:.1f} x real time, humanoid {step:.1f} µs; "
             f"{one.contacts.mean():.1f} contacts, {one.insertion[-1] * 1e3:.0f} mm"
         )
-        name = f"calibrated speed, {drive.name}"
+        name = f"calibrated speed, {drive}"
         product = statistics.median(products)
         checks.append(Check.at_least(name, product, bar, "µs", note))
     return checks, table
@@ -100,7 +99,7 @@ def _overheads() -> tuple[list[Check], dict[str, float]]:
     checks = [
         _ratio(
             Check.at_most,
-            f"suite step / mj_step, {drive.name}",
+            f"suite step / mj_step, {drive}",
             ratios.suite_overhead(drive, STEPS),
             1.25,
         )
