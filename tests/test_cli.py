@@ -83,7 +83,7 @@ def test_generated_phantom_of_a_seed(cathsim, tmp_path):
     )
     assert code == 0, err
     anatomy = Anatomy.load(tmp_path / "random")
-    usual = arch.load("type1")
+    usual = arch.load("simple1")
     assert set(anatomy.goals) >= {"bca", "lcca"}
     drawn = anatomy.tree.vessel("bca").centreline.length
     assert drawn != usual.tree.vessel("bca").centreline.length
@@ -100,7 +100,7 @@ def test_check_prints_one_object_and_passes(cathsim):
 
 def test_a_failed_check_exits_with_one(cathsim, tmp_path):
     """An arch that has lost three pieces of its wall leaks."""
-    whole = arch.load("type1")
+    whole = arch.load("simple1")
     leaking = dataclasses.replace(whole, name="leaking", wall=whole.wall[3:])
     leaking.save(tmp_path)
     code, out, _ = cathsim("phantom", "check", tmp_path, "--json")

@@ -217,7 +217,7 @@ def test_phantom_has_no_mass(model):
 @pytest.mark.parametrize("friction", [-0.1, 2.5, math.nan])
 def test_friction_outside_its_range(friction):
     with pytest.raises(ValueError, match="friction is .* between 0 and 2"):
-        Phantom(arch.load("type1"), friction)
+        Phantom(arch.load("simple1"), friction)
 
 
 # Sheath.

@@ -20,7 +20,7 @@ from cathsim_dmc.tasks.variations import (
 
 @pytest.fixture(scope="module")
 def anatomy():
-    return arch.load("type1")
+    return arch.load("simple1")
 
 
 def make(anatomy, randomisation, **options):
