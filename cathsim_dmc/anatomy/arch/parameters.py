@@ -139,7 +139,7 @@ class ArchParameters:
             name = f"{level}_radius"
             _check(name, getattr(self, name), 7e-3, 25e-3, "m")
         _check("descending_radius", self.descending_radius, 6e-3, 22e-3, "m")
-        _check("ascending_length", self.ascending_length, 20e-3, 300e-3, "m")
+        _check("ascending_length", self.ascending_length, 5e-3, 300e-3, "m")
         _check("descending_length", self.descending_length, 40e-3, 400e-3, "m")
         _check("arch_radius", self.arch_radius, 20e-3, 70e-3, "m")
         _check("arch_height", self.arch_height, 15e-3, 90e-3, "m")
