@@ -26,7 +26,6 @@ import argparse
 import dataclasses
 import itertools
 import json
-import os
 import sys
 import time
 from collections.abc import Callable
@@ -35,7 +34,7 @@ from pathlib import Path
 import numpy as np
 from scipy.stats import qmc
 
-from cathsim_dmc import suite
+from cathsim_dmc import files, suite
 from cathsim_dmc.analysis.containment import Containment
 from cathsim_dmc.simulation.batch import BatchSimulation
 from cathsim_dmc.tasks import forces
@@ -183,7 +182,7 @@ def run(simulation: BatchSimulation, episodes: list[Episode], steps: int) -> lis
         warnings += (after != before).any(-1)
         before = after
         errors[result.physics_error & (errors < 0)] = step
-        rows = simulation.sensor_rows[..., simulation.task.layout.wall_contacts]
+        rows = simulation.sensor_rows[..., simulation.task.rollout.index.wall_contacts]
         contacts = forces.Contacts.from_sensor(rows)
         deepest = contacts.penetration.max(-1)
         touching = contacts.present.any(-1)
@@ -250,9 +249,7 @@ def read_rows(path: Path, steps: int) -> list[dict]:
 
 def write_rows(path: Path, rows: list[dict]) -> None:
     """Replaces the file in one step: a reader finds all rows or the old ones."""
-    temporary = path.with_suffix(".writing")
-    temporary.write_text("".join(json.dumps(row) + "\n" for row in rows))
-    os.replace(temporary, path)
+    files.write_text(path, "".join(json.dumps(row) + "\n" for row in rows))
 
 
 def percentile(rows: list[dict], percent: float) -> float:
@@ -407,8 +404,8 @@ def main() -> int:
             )
     rows = [row for row in read_rows(path, steps) if row["number"] < episodes]
     result = report(rows)
-    (options.out / "soak.json").write_text(json.dumps(result, indent=2) + "\n")
-    (options.out / "soak.md").write_text(markdown(result))
+    files.write_text(options.out / "soak.json", json.dumps(result, indent=2) + "\n")
+    files.write_text(options.out / "soak.md", markdown(result))
     if options.json:
         print(json.dumps(result, indent=2))
     else:

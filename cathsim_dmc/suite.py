@@ -10,8 +10,9 @@ TorchRL's `DMControlEnv` know it too.
 """
 
 import dataclasses
+import inspect
 import sys
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -20,60 +21,134 @@ from dm_control import composer
 from dm_control import suite as dm_suite
 from dm_control.utils import containers
 
-from cathsim_dmc.anatomy import Anatomy, Goal
-from cathsim_dmc.tasks import navigation
+from cathsim_dmc.anatomy import Anatomy
+from cathsim_dmc.tasks import placement
+from cathsim_dmc.tasks.config import NavigationConfig
+from cathsim_dmc.tasks.navigation import Navigation
+from cathsim_dmc.tasks.objectives import Cannulation, Objective
+from cathsim_dmc.tasks.scene import Scene
 
 DOMAIN = "cathsim"
 SUITE = containers.TaggedTasks()
 
 # Constants of dm_control.suite that are computed from its domains at import.
 _TAGGED = {"BENCHMARKING": "benchmarking", "EASY": "easy", "HARD": "hard"}
+# Rewards are distances, not in [0, 1], and nothing is coloured by them.
+_TAG = "no_reward_visualization"
+_CONFIG_FIELDS = tuple(field.name for field in dataclasses.fields(NavigationConfig))
 
 
-@SUITE.add("benchmarking", "easy")
-def type1_bca(random=None, environment_kwargs=None, **options):
-    """Type-I arch: cannulate the brachiocephalic artery from the ascending aorta."""
-    return _arch_environment("type1", "bca", random, environment_kwargs, options)
+@dataclasses.dataclass(frozen=True)
+class TaskDefinition:
+    """What a registered task is made of.
+
+    Attributes:
+      description: one line for people.
+      anatomy: anatomy or its name; None where the user chooses.
+      goal: name of a goal; None where the user chooses.
+      objective: function of an anatomy, a goal and options by name; they become
+        options of the task. With an option `farthest_shift` it is told how far past
+        its place randomisation may shift the goal, m.
+      options: fields of `NavigationConfig` that differ from their defaults.
+    """
+
+    description: str
+    anatomy: str | Anatomy | None
+    goal: str | None
+    objective: Callable[..., Objective] = Cannulation.to
+    options: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+
+    @property
+    def objective_options(self) -> tuple[str, ...]:
+        """Names of the options that the objective takes."""
+        parameters = inspect.signature(self.objective).parameters.values()
+        return tuple(p.name for p in parameters if p.kind is p.KEYWORD_ONLY)
 
 
-@SUITE.add("benchmarking", "hard")
-def type1_lcca(random=None, environment_kwargs=None, **options):
-    """Type-I arch: cannulate the left common carotid from the ascending aorta."""
-    return _arch_environment("type1", "lcca", random, environment_kwargs, options)
+TASKS: dict[str, TaskDefinition] = {}
 
 
-@SUITE.add("benchmarking", "easy")
-def type2_bca(random=None, environment_kwargs=None, **options):
-    """Type-II arch: cannulate the brachiocephalic artery from the ascending aorta."""
-    return _arch_environment("type2", "bca", random, environment_kwargs, options)
-
-
-@SUITE.add("benchmarking", "hard")
-def type2_lcca(random=None, environment_kwargs=None, **options):
-    """Type-II arch: cannulate the left common carotid from the ascending aorta."""
-    return _arch_environment("type2", "lcca", random, environment_kwargs, options)
-
-
-@SUITE.add()
-def navigate(
-    phantom: "str | Path | Anatomy" = "type1",
-    goal: "str | Goal" = "bca",
-    random=None,
-    environment_kwargs=None,
-    **options,
-):
-    """Any anatomy, such as an imported scan: reach a goal of it.
+def register(name: str, definition: TaskDefinition, *tags: str) -> None:
+    """Adds a task to the suite, under which name everything else knows it.
 
     Args:
-      phantom: directory written by `cathsim phantom`, name of an arch, or anatomy.
-      goal: name of a goal of the anatomy, or a goal.
-      random: seed.
-      environment_kwargs: of `composer.Environment`.
-      **options: fields of `tasks.navigation.NavigationConfig`.
+      name: Name of the task.
+      definition: What the task is made of.
+      *tags: Tags of dm_control's suite, such as "easy".
+
+    Raises:
+      ValueError: if the name is taken.
     """
-    return _environment(
-        load_anatomy(phantom), goal, random, environment_kwargs or {}, options
+    if name in TASKS:
+        raise ValueError(f"there is a task {name!r} already; choose another name")
+    TASKS[name] = definition
+
+    def factory(random=None, environment_kwargs=None, **options):
+        task = make_task(name, random=random, **options)
+        return _environment(task, environment_kwargs or {})
+
+    factory.__name__, factory.__doc__ = name, definition.description
+    SUITE.add(*tags, _TAG)(factory)
+    _register_domain()
+
+
+def make_task(
+    name: str, random: np.random.RandomState | int | None = None, **options: Any
+) -> Navigation:
+    """A task of the suite, without compiling an environment.
+
+    Args:
+      name: Name of a task in `SUITE`.
+      random: Seed or source of randomness.
+      **options: Fields of `NavigationConfig`, options of the task's objective (such
+        as `reward` and `goal_radius`) and, for `navigate`, `anatomy` and `goal`.
+
+    Raises:
+      ValueError: if the task or an option does not exist; lists those that do.
+    """
+    if name not in TASKS:
+        raise ValueError(
+            f"no task {name!r} in domain {DOMAIN!r}; there are {', '.join(TASKS)}"
+        )
+    definition = TASKS[name]
+    options = {**definition.options, **options}
+    anatomy, goal = definition.anatomy, definition.goal
+    if anatomy is None:
+        # `phantom` is what this option was called at first.
+        anatomy = options.pop("phantom", "type1")
+        anatomy = options.pop("anatomy", anatomy)
+        goal = options.pop("goal", "bca")
+    _refuse_unknown(definition, options)
+    anatomy = load_anatomy(anatomy)
+    goal = placement.resolve_goal(anatomy, goal)
+    config = NavigationConfig(
+        **{key: value for key, value in options.items() if key in _CONFIG_FIELDS}
     )
+    chosen = {k: v for k, v in options.items() if k not in _CONFIG_FIELDS}
+    if "farthest_shift" in definition.objective_options:
+        chosen["farthest_shift"] = config.randomisation.farthest_shift
+    objective = definition.objective(anatomy, goal, **chosen)
+    scene = Scene.build(anatomy, goal, config, goal_radius=objective.goal_radius)
+    return Navigation(scene, objective, config, random)
+
+
+def task_options(name: str) -> tuple[str, ...]:
+    """Names of the options of a task beside `random` and `environment_kwargs`."""
+    definition = TASKS[name]
+    own = () if definition.anatomy is not None else ("anatomy", "goal")
+    of_objective = (o for o in definition.objective_options if o != "farthest_shift")
+    return (*own, *of_objective, *_CONFIG_FIELDS)
+
+
+def _refuse_unknown(definition: TaskDefinition, options: Mapping[str, Any]) -> None:
+    known = (*_CONFIG_FIELDS, *definition.objective_options)
+    known = [name for name in known if name != "farthest_shift"]
+    unknown = sorted(set(options) - set(known))
+    if unknown:
+        raise ValueError(
+            f"no task option {', '.join(map(repr, unknown))}; there are random, "
+            f"{', '.join(known)}"
+        )
 
 
 def load(
@@ -87,11 +162,10 @@ def load(
 
     Args:
       domain_name: "cathsim", or any other domain of dm_control.suite.
-      task_name: a task of the domain, see `SUITE`.
-      task_kwargs: `random` (a seed), and fields of
-        `tasks.navigation.NavigationConfig` such as `observation`.
-      environment_kwargs: of `composer.Environment`.
-      visualize_reward: accepted as dm_control does; there is nothing to colour.
+      task_name: Name of a task of the domain, see `SUITE`.
+      task_kwargs: Options of the task: `random` (a seed), and see `make_task`.
+      environment_kwargs: Arguments of `composer.Environment`.
+      visualize_reward: Accepted as dm_control does; there is nothing to colour.
 
     Raises:
       ValueError: if domain, task or an option does not exist; lists those that do.
@@ -114,47 +188,27 @@ def load(
     )
 
 
-def load_anatomy(phantom: "str | Path | Anatomy") -> Anatomy:
+def load_anatomy(anatomy: str | Path | Anatomy) -> Anatomy:
     """Returns an anatomy: itself, an arch by name, or one saved in a directory.
 
     Raises:
       ValueError: if there is none; lists the names.
     """
-    if isinstance(phantom, Anatomy):
-        return phantom
+    if isinstance(anatomy, Anatomy):
+        return anatomy
     from cathsim_dmc.anatomy import phantoms
 
-    if str(phantom) in phantoms.PHANTOMS:
-        return phantoms.load(str(phantom))
-    if not Path(phantom).is_dir():
+    if str(anatomy) in phantoms.PHANTOMS:
+        return phantoms.load(str(anatomy))
+    if not Path(anatomy).is_dir():
         raise ValueError(
-            f"no phantom at {str(phantom)!r}; give a directory written by `cathsim "
+            f"no anatomy at {str(anatomy)!r}; give a directory written by `cathsim "
             f"phantom import` or `generate`, or one of {', '.join(phantoms.PHANTOMS)}"
         )
-    return Anatomy.load(phantom)
+    return Anatomy.load(anatomy)
 
 
-def _arch_environment(name, goal, random, environment_kwargs, options):
-    anatomy = load_anatomy(name)
-    return _environment(anatomy, goal, random, environment_kwargs or {}, options)
-
-
-def _environment(anatomy, goal, random, environment_kwargs, options):
-    known = [field.name for field in dataclasses.fields(navigation.NavigationConfig)]
-    unknown = sorted(set(options) - set(known))
-    if unknown:
-        raise ValueError(
-            f"no task option {', '.join(map(repr, unknown))}; there are random, "
-            f"{', '.join(known)}"
-        )
-    random_state = (
-        random
-        if isinstance(random, np.random.RandomState)
-        else np.random.RandomState(random)
-    )
-    task = navigation.Navigation(
-        anatomy, goal, navigation.NavigationConfig(**options), random_state
-    )
+def _environment(task: Navigation, environment_kwargs: Mapping[str, Any]):
     settings = {
         "strip_singleton_obs_buffer_dim": True,
         "recompile_mjcf_every_episode": False,
@@ -164,11 +218,11 @@ def _environment(anatomy, goal, random, environment_kwargs, options):
         "raise_exception_on_physics_error": False,
         **environment_kwargs,
     }
-    return composer.Environment(task, random_state=random_state, **settings)
+    return composer.Environment(task, random_state=task.random, **settings)
 
 
-def _register() -> None:
-    """Adds the domain to dm_control.suite; does nothing if it is there."""
+def _register_domain() -> None:
+    """Tells dm_control.suite of the domain and its tasks; as often as one likes."""
     needed = ("_DOMAINS", "_get_tasks", "_get_tasks_by_domain", "ALL_TASKS", *_TAGGED)
     missing = [name for name in needed if not hasattr(dm_suite, name)]
     if missing:
@@ -190,4 +244,22 @@ def _register() -> None:
     )
 
 
-_register()
+_GOALS = {
+    "bca": "the brachiocephalic artery",
+    "lcca": "the left common carotid",
+}
+for _anatomy, _kind in (("type1", "Type-I"), ("type2", "Type-II")):
+    for _goal, _artery in _GOALS.items():
+        register(
+            f"{_anatomy}_{_goal}",
+            TaskDefinition(
+                f"{_kind} arch: cannulate {_artery} from the ascending aorta.",
+                _anatomy,
+                _goal,
+            ),
+            "easy" if _goal == "bca" else "hard",
+        )
+register(
+    "navigate",
+    TaskDefinition("Any anatomy, such as an imported scan: reach a goal.", None, None),
+)

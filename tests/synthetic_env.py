@@ -144,7 +144,7 @@ def make_env(
     num_envs=1,
     num_threads=None,
     seed=0,
-    path="batched",
+    backend="batched",
     task_kwargs=None,
 ):
     env = ReachEnv(num_envs, seed, image=observation == "image", **(task_kwargs or {}))

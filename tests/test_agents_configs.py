@@ -2,13 +2,8 @@ import json
 
 import pytest
 
-from cathsim_dmc.agents.configs import (
-    ConfigError,
-    PPOConfig,
-    SACConfig,
-    config_from_dict,
-    make_config,
-)
+from cathsim_dmc.agents import ConfigError, PPOConfig, SACConfig, make_config
+from cathsim_dmc.agents.learners import LEARNERS, config_from_dict
 
 
 def test_ppo_defaults_are_the_published_settings():
@@ -31,8 +26,10 @@ def test_ppo_defaults_are_the_published_settings():
     assert {name: getattr(config, name) for name in published} == published
 
 
-@pytest.mark.parametrize("algorithm", ["ppo", "sac"])
-@pytest.mark.parametrize("preset", ["published", "demo"])
+@pytest.mark.parametrize(
+    ("algorithm", "preset"),
+    [(name, preset) for name, a in LEARNERS.items() for preset in a.config.presets],
+)
 def test_configs_survive_json(algorithm, preset):
     config = make_config(algorithm, preset, seed=7, task_kwargs={"links": [1, 2]})
     again = config_from_dict(json.loads(json.dumps(config.to_dict())))
@@ -48,10 +45,27 @@ def test_configs_survive_json(algorithm, preset):
         (PPOConfig, {"clip": 0.0}, r"clip=0.0.*\(0, 1\)"),
         (PPOConfig, {"gamma": 1.5}, "gamma=1.5"),
         (PPOConfig, {"epochs": 0}, "epochs=0.*positive integer"),
-        (PPOConfig, {"path": "gpu"}, "path='gpu'.*batched"),
+        (PPOConfig, {"backend": "gpu"}, "backend='gpu'.*batched"),
         (PPOConfig, {"hidden": ()}, "hidden"),
         (PPOConfig, {"task_kwargs": {"a": object()}}, "task_kwargs"),
         (PPOConfig, {"learning_rate": -1.0}, "learning_rate=-1.0"),
+        (PPOConfig, {"num_envs": "many"}, "num_envs='many'.*an integer"),
+        (PPOConfig, {"num_envs": 16.0}, "num_envs=16.0.*an integer"),
+        (PPOConfig, {"seed": True}, "seed=True.*an integer"),
+        (PPOConfig, {"seed": 10**400}, "seed=1000.*an integer"),
+        (PPOConfig, {"anneal": "False"}, "anneal='False'.*true or false"),
+        (PPOConfig, {"gamma": None}, "gamma=None.*finite number"),
+        (PPOConfig, {"gamma": float("nan")}, "gamma=nan.*finite number"),
+        (PPOConfig, {"learning_rate": 10**400}, "learning_rate=.*finite number"),
+        (PPOConfig, {"target_kl": [1]}, "target_kl.*finite number or None"),
+        (PPOConfig, {"hidden": 64}, "hidden=64.*a list"),
+        (PPOConfig, {"hidden": [64, "x"]}, "hidden.*each entry an integer"),
+        (PPOConfig, {"hidden": [10**9]}, "hidden.*16384"),
+        (PPOConfig, {"task_kwargs": "x"}, "task_kwargs='x'.*object"),
+        (PPOConfig, {"task_kwargs": {"a": float("inf")}}, "task_kwargs.*finite"),
+        (PPOConfig, {"activation": "sine"}, "activation='sine'.*tanh.*relu"),
+        (PPOConfig, {"checkpoint_seconds": 0}, "checkpoint_seconds=0"),
+        (SACConfig, {"replay_bytes": None}, "replay_bytes=None.*an integer"),
         (SACConfig, {"tau": 0.0}, "tau=0.0"),
         (SACConfig, {"random_frames": 10}, "random_frames=10.*256"),
         (SACConfig, {"replay_frames": 32}, "replay_frames=32"),

@@ -8,8 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from cathsim_dmc.agents import compare, evaluate
-from cathsim_dmc.agents.evaluation import paired_bootstrap
-from cathsim_dmc.analysis.force_statistics import wilson_interval
+from cathsim_dmc.agents.evaluation import paired_bootstrap, success_interval
+from cathsim_dmc.agents.report import Report
 
 SORTED = sorted(synthetic_env.SIZES)
 # Where "position" begins in the concatenated observation.
@@ -62,6 +62,11 @@ def test_force_figures_are_those_of_the_steps():
     assert episode.length == len(forces) == 40
     assert episode.mean_force == pytest.approx(np.mean(forces))
     assert episode.max_force == pytest.approx(0.5 * max(forces))
+    assert episode.peak_force is None
+    touching = [force for force in forces if force > 0]
+    assert 0 < len(touching) < 40
+    assert episode.forces.sum.mean_in_contact == pytest.approx(np.mean(touching))
+    assert episode.forces.sum.maximum == pytest.approx(max(forces))
     assert episode.reward == pytest.approx(reward, rel=1e-5)
     assert (episode.success, episode.terminated) == (False, False)
     assert max(forces) > 0
@@ -76,6 +81,11 @@ def test_evaluation_repeats_and_is_json(tmp_path):
     assert written == json.loads(json.dumps(first.to_dict()))
     assert len(written["episodes"]) == written["summary"]["episodes"] == 5
     assert written["episodes"][1]["seed"] == first.seed + 1
+    forces = written["summary"]["forces"]
+    sums = [episode["forces"]["sum"]["mean"] for episode in written["episodes"]]
+    assert forces["sum"]["mean"]["mean"] == pytest.approx(np.mean(sums))
+    assert forces["sum"]["mean"]["sd"] == pytest.approx(np.std(sums, ddof=1))
+    assert forces["peak_sum"]["maximum"] == {"mean": None, "sd": None}
     low, high = written["summary"]["success_ci95"]
     assert low <= written["summary"]["success"] <= high
 
@@ -105,18 +115,18 @@ def test_bad_requests_are_refused(tmp_path):
 
 
 @given(st.integers(1, 500).flatmap(lambda n: st.tuples(st.integers(0, n), st.just(n))))
-def test_wilson_interval_properties(counts):
+def test_success_interval_properties(counts):
     successes, trials = counts
-    low, high = wilson_interval(successes, trials)
+    low, high = success_interval(successes, trials)
     assert 0 <= low <= successes / trials + 1e-12
     assert successes / trials - 1e-12 <= high <= 1
-    mirrored = wilson_interval(trials - successes, trials)
+    mirrored = success_interval(trials - successes, trials)
     assert mirrored == pytest.approx((1 - high, 1 - low))
 
 
-def test_wilson_interval_against_a_published_value():
+def test_success_interval_against_a_published_value():
     # Newcombe 1998, table I: 81 of 263 gives 0.2553 to 0.3662.
-    assert wilson_interval(81, 263) == pytest.approx((0.2553, 0.3662), abs=1e-4)
+    assert success_interval(81, 263) == pytest.approx((0.2553, 0.3662), abs=1e-4)
 
 
 def test_bootstrap_covers_the_normal_interval():
@@ -126,3 +136,25 @@ def test_bootstrap_covers_the_normal_interval():
     half = 1.96 * difference.std() / 20
     assert mean == pytest.approx(difference.mean())
     assert (low, high) == pytest.approx((mean - half, mean + half), abs=0.02)
+
+
+def test_one_pair_has_no_interval():
+    assert paired_bootstrap(np.array([2.0]), np.array([0.5])) == (1.5, None)
+    one = compare(play(policy=expert, episodes=1), play(policy="random", episodes=1))
+    assert one.reward_ci95 is None and not one.better
+
+
+def test_the_table_says_which_force_is_which(capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "200")
+
+    def push(observation):
+        return torch.ones(*observation.batch_size, synthetic_env.ACTIONS)
+
+    result = play(policy=push, episodes=3)
+    Report(result, None, None, 1.0).print()
+    text = " ".join(capsys.readouterr().out.split())
+    for word in ("mean force, mN", "max force, mN", "peak, mN", "sum over all"):
+        assert word in text
+    mean, deviation = result.mean_sd("forces.sum.mean")
+    assert mean > 0.1
+    assert f"│ {1e3 * mean:.0f} ± {1e3 * deviation:.0f}" in text

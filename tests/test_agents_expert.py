@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from cathsim_dmc import agents, suite
-from cathsim_dmc.agents import expert, pursuit
+from cathsim_dmc import agents, policies, suite
+from cathsim_dmc.policies import expert, pursuit
 from cathsim_dmc.simulation import batch
 from cathsim_dmc.tasks import forces
 
@@ -63,10 +63,10 @@ def test_tip_frames_are_mujocos(rotation):
         env.step(random.uniform(-1, 1, env.action_spec().shape))
     physics = env.physics
     physics.forward()
-    joints = [motor.joint for motor in task.catheter.tip_motors]
+    joints = [motor.joint for motor in task.scene.catheter.tip_motors]
     expected = physics.bind(joints).xaxis.reshape(-1, 2, 3)
-    head = physics.bind(task.catheter.head).xmat.reshape(3, 3)[:, 2]
-    state = task.layout.read(physics.data.ptr)
+    head = physics.bind(task.scene.catheter.head).xmat.reshape(3, 3)[:, 2]
+    state = task.rollout.index.read(physics.data.ptr)
     axes, direction = pursuit.tip_frames(
         pursuit.Plan.for_task(task), state.joint_positions
     )
@@ -104,15 +104,15 @@ def test_a_head_in_the_tube_is_not_outside(plan, s, fraction, angle):
 
 
 def test_beside_the_ostium_the_head_is_still_in_the_parent(task, plan):
-    origin = task.anatomy.tree.origin("lcca")
+    origin = task.scene.anatomy.tree.origin("lcca")
     # Off the aorta's axis, nearer to the axis of the branch, but out of its tube.
-    aorta = task.anatomy.tree.vessel("aorta").centreline.at(origin)
-    branch = task.meaning.branch.at(task.meaning.ostium * 0.75)
+    aorta = task.scene.anatomy.tree.vessel("aorta").centreline.at(origin)
+    branch = task.objective.branch.at(task.objective.ostium * 0.75)
     across = np.cross(branch.tangent, aorta.tangent)
     away = branch.radius * 1.3 * across / np.linalg.norm(across)
     head = branch.position + away
-    assert task.anatomy.depth(head) > 0
-    assert task.meaning.route.project(head).arc_length > origin + 5e-3
+    assert task.scene.anatomy.depth(head) > 0
+    assert task.objective.route.project(head).arc_length > origin + 5e-3
     place = pursuit.locate(plan, head)
     assert place.excess <= 0
     assert place.arc_length <= origin + 1e-3
@@ -225,7 +225,7 @@ def test_policy_reaches_the_goal_in_a_composer_environment():
     env = suite.load(
         suite.DOMAIN, "type1_lcca", task_kwargs={"observation": "tracking", "random": 5}
     )
-    act = expert.policy(env)
+    act = policies.in_environment(policies.make_policy("expert"), env)
     lengths = []
     for _ in range(2):
         timestep, steps, largest = env.reset(), 0, 0.0
@@ -245,8 +245,8 @@ def test_policy_needs_no_observation_before_the_first_step():
     for observable in env.task.task_observables.values():
         observable.enabled = False
     timestep = env.reset()
-    assert env.task.readings is None
-    action = expert.policy(env)(timestep)
+    act = policies.in_environment(policies.make_policy("expert"), env)
+    action = act(timestep)
     assert action.shape == env.action_spec().shape
     assert action[20] > 0
 
@@ -259,7 +259,7 @@ def test_it_recovers_from_a_wrong_branch(task, plan):
     push[0, 20] = 1.0
     for _ in range(75):
         simulation.step(push)
-    bca = make_task("type1_bca").meaning
+    bca = make_task("type1_bca").objective
     assert bca.in_branch(simulation.readings.head)[0]
     pilot = expert.Expert(plan)
     for _ in range(600):
@@ -271,18 +271,18 @@ def test_it_recovers_from_a_wrong_branch(task, plan):
 
 
 def test_episodes_are_evaluated_like_those_of_any_policy():
-    result = expert.expert_episodes("type2_lcca", episodes=3, seed=70, num_threads=1)
+    result = agents.evaluate("expert", "type2_lcca", episodes=3, seed=70, num_threads=1)
     assert isinstance(result, agents.EvaluationResult)
     assert (result.policy, result.seed, result.successes) == ("expert", 70, 3)
     assert result.values("max_force").max() < GENTLE
-    again = expert.expert_episodes("type2_lcca", episodes=3, seed=70, num_threads=1)
+    again = agents.evaluate("expert", "type2_lcca", episodes=3, seed=70, num_threads=1)
     assert again.to_dict() == result.to_dict()
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", TASKS)
 def test_it_solves_the_published_tasks_gently(name):
-    result = expert.expert_episodes(name, episodes=30)
+    result = agents.evaluate("expert", name, episodes=30)
     assert result.successes == 30
     assert result.values("peak_force").max() < GENTLE
     assert result.values("length").max() < 300
@@ -297,8 +297,8 @@ def test_it_solves_random_arches(seed, access):
     params = arch.sample(np.random.RandomState(seed), bovine=seed % 2 == 1)
     anatomy = arch.build_arch(params, access=access)
     for goal in ("bca", "lcca", "lsa"):
-        result = expert.expert_episodes(
-            "navigate", 2, 5, task_kwargs={"phantom": anatomy, "goal": goal}
+        result = agents.evaluate(
+            "expert", "navigate", 2, 5, task_kwargs={"anatomy": anatomy, "goal": goal}
         )
         assert result.successes == 2
         assert result.values("peak_force").max() < GENTLE

@@ -7,8 +7,9 @@ from tensordict import TensorDict
 from torchrl.envs import check_env_specs
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from cathsim_dmc.agents.configs import PPOConfig, SACConfig
-from cathsim_dmc.agents.networks import Signature, make_policy
+from cathsim_dmc.agents import PPOConfig, SACConfig
+from cathsim_dmc.agents.learners import make_policy
+from cathsim_dmc.agents.networks import NetworkShapes
 from cathsim_dmc.agents.normalisation import ObservationNormaliser
 from cathsim_dmc.agents.ppo import PPO
 
@@ -57,35 +58,35 @@ def test_normaliser_refuses_what_is_not_finite():
     assert normaliser.count == 0
 
 
-def observation_of(signature, batch):
+def observation_of(shapes, batch):
     entries = {}
-    if signature.vector:
-        entries["observation_vector"] = torch.randn(*batch, signature.vector)
-    if signature.pixels:
+    if shapes.vector:
+        entries["observation_vector"] = torch.randn(*batch, shapes.vector)
+    if shapes.pixels:
         entries["pixels"] = torch.randint(
-            0, 256, (*batch, *signature.pixels), dtype=torch.uint8
+            0, 256, (*batch, *shapes.pixels), dtype=torch.uint8
         )
     return TensorDict(entries, batch)
 
 
 @pytest.mark.parametrize("config", [PPOConfig(), SACConfig()], ids=["ppo", "sac"])
 @pytest.mark.parametrize(
-    "signature",
+    "shapes",
     [
-        Signature(30, None, 21),
-        Signature(0, (1, 128, 128), 21),
-        Signature(0, (3, 128, 128), 22),
-        Signature(5, (1, 128, 128), 21),
+        NetworkShapes(30, None, 21),
+        NetworkShapes(0, (1, 128, 128), 21),
+        NetworkShapes(0, (3, 128, 128), 22),
+        NetworkShapes(5, (1, 128, 128), 21),
     ],
     ids=["internal", "image", "sequential", "image and forces"],
 )
-def test_actions_are_bounded_and_deterministic_ones_repeat(config, signature):
+def test_actions_are_bounded_and_deterministic_ones_repeat(config, shapes):
     torch.manual_seed(0)
-    policy = make_policy(signature, config)
-    observation = observation_of(signature, (4, 2))
+    policy = make_policy(shapes, config)
+    observation = observation_of(shapes, (4, 2))
     with set_exploration_type(ExplorationType.RANDOM):
         sampled = [policy(observation.clone())["action"] for _ in range(2)]
-    assert sampled[0].shape == (4, 2, signature.actions)
+    assert sampled[0].shape == (4, 2, shapes.actions)
     assert not torch.equal(*sampled)
     assert all(action.abs().max() <= 1 for action in sampled)
     with set_exploration_type(ExplorationType.DETERMINISTIC):
@@ -97,12 +98,12 @@ def test_actions_are_bounded_and_deterministic_ones_repeat(config, signature):
 def test_standard_observations_satisfy_torchrl(observation):
     env = synthetic_env.make_env("reach", observation=observation, num_envs=3)
     check_env_specs(env)
-    signature = Signature.of(env)
+    shapes = NetworkShapes.of(env)
     if observation == "image":
-        assert signature == Signature(0, (1, 128, 128), synthetic_env.ACTIONS)
+        assert shapes == NetworkShapes(0, (1, 128, 128), synthetic_env.ACTIONS)
     else:
         size = sum(synthetic_env.SIZES.values())
-        assert signature == Signature(size, None, synthetic_env.ACTIONS)
+        assert shapes == NetworkShapes(size, None, synthetic_env.ACTIONS)
         seeded = [synthetic_env.make_env("reach", num_envs=3, seed=5) for _ in "ab"]
         parts = seeded[0].base_env.reset()
         names = sorted(synthetic_env.SIZES)
@@ -110,10 +111,10 @@ def test_standard_observations_satisfy_torchrl(observation):
         assert torch.equal(seeded[1].reset()["observation_vector"], joined)
 
 
-def test_truncation_bootstraps_and_termination_does_not():
+def test_truncation_bootstraps_and_termination_does_not(tmp_path):
     config = PPOConfig(num_envs=1, steps_per_update=32, hidden=(8,))
     torch.manual_seed(0)
-    learner = PPO(config, Signature(3, None, 2))
+    learner = PPO(config, NetworkShapes(3, None, 2), tmp_path)
     steps = 4
     observation = torch.randn(2, steps, 3)
     following = torch.randn(2, steps, 3)

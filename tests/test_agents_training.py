@@ -14,9 +14,9 @@ from tensordict import TensorDict
 from cathsim_dmc.agents import ConfigError, evaluate, make_config, train
 from cathsim_dmc.agents.checkpoint import Checkpoint, checkpoints_in
 from cathsim_dmc.agents.metrics import MetricsFile, read_metrics
-from cathsim_dmc.agents.networks import Signature
+from cathsim_dmc.agents.networks import NetworkShapes
 from cathsim_dmc.agents.sac import SAC
-from cathsim_dmc.agents.training import _excuse_divergence
+from cathsim_dmc.agents.training import _truncate_diverged
 
 CLOCKS = ("seconds", "frames_per_second")
 
@@ -82,7 +82,7 @@ def test_sac_learns_the_best_action_of_each_state(tmp_path):
         learning_rate=1e-2, gamma=0.5, tau=0.05, updates_per_frame=0.1,
         initial_alpha=0.01, target_entropy=-4.0,
     )  # fmt: skip
-    learner = SAC(config, Signature(1, None, 1), tmp_path)
+    learner = SAC(config, NetworkShapes(1, None, 1), tmp_path)
     state = torch.rand(1, 2_500, 1) * 2 - 1
     action = torch.rand(1, 2_500, 1) * 2 - 1
     ended = torch.ones(1, 2_500, 1, dtype=torch.bool)
@@ -204,6 +204,29 @@ def test_a_killed_run_continues_where_it_was_saved(tmp_path):
     assert not list((tmp_path / "checkpoints").glob(".*"))
 
 
+def test_a_run_saves_by_the_clock_too(tmp_path):
+    config = small_ppo(
+        total_frames=4_096, checkpoint_frames=10**6, keep_checkpoints=100
+    )
+    run(config, tmp_path / "frames")
+    assert [path.name for path in checkpoints_in(tmp_path / "frames")] == ["0000004096"]
+    run(config.replace(checkpoint_seconds=1e-3), tmp_path / "clock")
+    found = [int(path.name) for path in checkpoints_in(tmp_path / "clock")]
+    assert found == list(range(512, 4_097, 512))
+    # Saving disturbs nothing.
+    rows = [read_metrics(tmp_path / n / "metrics.csv") for n in ("frames", "clock")]
+    assert without_clocks(rows[0]) == without_clocks(rows[1])
+
+
+def test_there_must_be_a_run_to_resume(tmp_path):
+    with pytest.raises(ConfigError, match="there is no run in .* to resume"):
+        run(small_ppo(), tmp_path / "none", resume=True)
+    assert not (tmp_path / "none").exists()
+    # One that was killed before its first checkpoint begins anew.
+    (tmp_path / "config.json").write_text("{}")
+    assert run(small_ppo(total_frames=512), tmp_path, resume=True).frames == 512
+
+
 def file_header(path):
     return (path / "metrics.csv").read_text().splitlines()[0].split(",")
 
@@ -271,7 +294,7 @@ def test_checkpoints_hold_weights_only_and_act_alike(tmp_path):
     assert location.abs().max() > 0
 
 
-def test_a_diverged_simulation_is_cut_off_not_ended():
+def test_a_diverged_simulation_is_truncated_not_terminated():
     flags = torch.tensor([[[True], [True], [False]]])
     batch = TensorDict(
         {
@@ -283,7 +306,7 @@ def test_a_diverged_simulation_is_cut_off_not_ended():
         },
         [1, 3],
     )
-    _excuse_divergence(batch)
+    _truncate_diverged(batch)
     assert batch["next", "terminated"].flatten().tolist() == [False, True, False]
     assert torch.equal(batch["next", "done"], flags)
 
@@ -309,7 +332,8 @@ def test_importing_agents_loads_torchrl_before_dm_control():
     script = (
         "import os, sys; before = dict(os.environ)\n"
         "import cathsim_dmc.agents\n"
-        "assert 'torchrl' in sys.modules and 'dm_control' not in sys.modules\n"
+        "loaded = list(sys.modules)\n"
+        "assert loaded.index('torchrl') < loaded.index('dm_control')\n"
         "assert dict(os.environ) == before, set(os.environ) ^ set(before)\n"
     )
     subprocess.run([sys.executable, "-c", script], check=True, timeout=120)

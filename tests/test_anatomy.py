@@ -64,12 +64,12 @@ def test_failed_writing_leaves_the_old_anatomy(anatomy, tmp_path, monkeypatch):
     def broken(*args):
         raise OSError("disk full")
 
-    monkeypatch.setattr("cathsim_dmc.anatomy.anatomy.os.replace", broken)
+    monkeypatch.setattr("cathsim_dmc.files.os.replace", broken)
     with pytest.raises(OSError, match="disk full"):
         arch.load("simple2").save(tmp_path)
     monkeypatch.undo()
     assert Anatomy.load(tmp_path).name == "simple1"
-    assert not list(tmp_path.glob(".writing-*"))
+    assert not list(tmp_path.glob(".*"))
 
 
 def test_route_starts_at_the_inlet_and_ends_at_the_goal(anatomy):

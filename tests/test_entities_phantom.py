@@ -8,7 +8,7 @@ import pytest
 from dm_control import mjcf
 
 from cathsim_dmc.anatomy.arch import arch
-from cathsim_dmc.entities import phantom as phantoms
+from cathsim_dmc.entities import contact
 from cathsim_dmc.entities.arena import BLOOD_DENSITY, GRAVITY, AngiographyArena
 from cathsim_dmc.entities.phantom import Phantom
 from cathsim_dmc.entities.sheath import CLEARANCE, Sheath
@@ -87,7 +87,7 @@ def test_wall_sensor_equals_the_contact_forces_of_the_same_substep(
     environment, pressed
 ):
     """Fresh: the readings are those of this substep's solution, not of the last."""
-    layout = environment.task.layout
+    layout = environment.task.rollout.index
     for sensordata, expected in pressed:
         contacts = layout.contacts(sensordata)
         here = contacts.present
@@ -107,7 +107,7 @@ def test_wall_sensor_equals_the_contact_forces_of_the_same_substep(
 
 
 def test_magnitude_is_that_of_normal_and_friction_together(environment, pressed):
-    layout = environment.task.layout
+    layout = environment.task.rollout.index
     for sensordata, expected in pressed[::20]:
         contacts = layout.contacts(sensordata)
         total = sum(np.linalg.norm(force) for force, _, _ in expected)
@@ -117,7 +117,7 @@ def test_magnitude_is_that_of_normal_and_friction_together(environment, pressed)
 
 def test_load_cell_equals_the_sum_of_the_contact_forces(environment, pressed):
     """Newton's third law: the wall passes on what the device does to it."""
-    layout = environment.task.layout
+    layout = environment.task.rollout.index
     for sensordata, expected in pressed:
         total = sum(force for force, _, _ in expected)
         cell = -sensordata[layout.load_cell]
@@ -147,7 +147,7 @@ def test_readings_of_the_task_are_those_sensors(environment, reseed):
 
 
 def test_friction_stays_in_its_cone(pressed, environment):
-    layout = environment.task.layout
+    layout = environment.task.rollout.index
     friction = environment.task.config.friction
     for sensordata, _ in pressed[::10]:
         contacts = layout.contacts(sensordata)
@@ -164,8 +164,8 @@ def test_friction_stays_in_its_cone(pressed, environment):
 
 def test_every_piece_collides_with_the_device_only(model, environment):
     wall = [
-        model.geom(f"phantom/wall_{index}")
-        for index in range(len(environment.task.anatomy.wall))
+        model.geom(f"phantom/wall_{index:03d}")
+        for index in range(len(environment.task.scene.anatomy.wall))
     ]
     for geom in wall:
         assert geom.contype[0] == 1 and geom.conaffinity[0] == 0
@@ -177,20 +177,20 @@ def test_every_piece_collides_with_the_device_only(model, environment):
 
 
 def test_device_and_wall_have_the_same_contact(model):
-    wall, link = model.geom("phantom/wall_0"), model.geom("catheter/link_3")
+    wall, link = model.geom("phantom/wall_000"), model.geom("catheter/link_3")
     np.testing.assert_array_equal(wall.solref, link.solref)
     np.testing.assert_array_equal(wall.solimp, link.solimp)
-    np.testing.assert_array_equal(wall.solref, phantoms.CONTACT_SOLREF)
-    np.testing.assert_array_equal(wall.solimp, phantoms.CONTACT_SOLIMP)
-    assert wall.friction[0] == link.friction[0] == phantoms.FRICTION
+    np.testing.assert_array_equal(wall.solref, contact.CONTACT_SOLREF)
+    np.testing.assert_array_equal(wall.solimp, contact.CONTACT_SOLIMP)
+    assert wall.friction[0] == link.friction[0] == contact.FRICTION
 
 
 def test_pieces_lie_where_the_anatomy_puts_them(model, environment):
-    anatomy = environment.task.anatomy
+    anatomy = environment.task.scene.anatomy
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
     for index in range(0, len(anatomy.wall), 50):
-        geom = model.geom(f"phantom/wall_{index}")
+        geom = model.geom(f"phantom/wall_{index:03d}")
         mesh = model.mesh(int(geom.dataid[0]))
         start, count = int(mesh.vertadr[0]), int(mesh.vertnum[0])
         vertices = model.mesh_vert[start : start + count]
@@ -203,10 +203,10 @@ def test_pieces_lie_where_the_anatomy_puts_them(model, environment):
 
 def test_goals_are_where_the_anatomy_puts_them(environment):
     task, physics = environment.task, environment.physics
-    assert set(task.phantom.goals) == set(task.anatomy.goals)
-    for name, site in task.phantom.goals.items():
+    assert set(task.scene.phantom.goals) == set(task.scene.anatomy.goals)
+    for name, site in task.scene.phantom.goals.items():
         np.testing.assert_allclose(
-            physics.bind(site).xpos, task.anatomy.goals[name].position, atol=1e-9
+            physics.bind(site).xpos, task.scene.anatomy.goals[name].position, atol=1e-9
         )
 
 
@@ -225,12 +225,7 @@ def test_friction_outside_its_range(friction):
 
 @pytest.fixture(scope="module")
 def sheath_model():
-    sheath = Sheath(
-        length=0.2,
-        device_radius=0.8e-3,
-        solref=phantoms.CONTACT_SOLREF,
-        solimp=phantoms.CONTACT_SOLIMP,
-    )
+    sheath = Sheath(length=0.2, device_radius=0.8e-3)
     arena = AngiographyArena()
     arena.attach(sheath)
     return sheath, mjcf.Physics.from_mjcf_model(arena.mjcf_model).model.ptr
@@ -271,12 +266,41 @@ def test_sheath_holds_the_device_at_the_start(environment, model):
     body = model.body("sheath/bore").id
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
-    np.testing.assert_allclose(data.xpos[body], task.anatomy.inlet.position, atol=1e-9)
+    np.testing.assert_allclose(
+        data.xpos[body], task.scene.anatomy.inlet.position, atol=1e-9
+    )
     axis = data.xmat[body].reshape(3, 3)[:, 2]
-    np.testing.assert_allclose(axis, task.anatomy.inlet.direction, atol=1e-9)
+    np.testing.assert_allclose(axis, task.scene.anatomy.inlet.direction, atol=1e-9)
     base = data.xpos[model.body("catheter/link_0").id]
-    behind = (task.anatomy.inlet.position - base) @ axis
-    assert behind == pytest.approx(task.sheath.length, abs=1e-9)
+    behind = (task.scene.anatomy.inlet.position - base) @ axis
+    assert behind == pytest.approx(task.scene.sheath.length, abs=1e-9)
+
+
+# Names.
+
+
+@pytest.mark.parametrize("rotation", [False, True])
+def test_every_element_has_a_name(shared_environment, rotation):
+    environment = shared_environment("type1_bca", rotation=rotation)
+    model = environment.physics.model.ptr
+    for kind, count in (
+        ("BODY", model.nbody),
+        ("JOINT", model.njnt),
+        ("GEOM", model.ngeom),
+        ("SITE", model.nsite),
+        ("ACTUATOR", model.nu),
+        ("SENSOR", model.nsensor),
+        ("CAMERA", model.ncam),
+        ("LIGHT", model.nlight),
+        ("MESH", model.nmesh),
+        ("MATERIAL", model.nmat),
+    ):
+        assert count > 0
+        object_type = getattr(mujoco.mjtObj, f"mjOBJ_{kind}")
+        names = [mujoco.mj_id2name(model, object_type, i) for i in range(count)]
+        # PyMJCF calls what has no name "//unnamed_geom_3".
+        bare = [name for name in names if not name or "unnamed" in name]
+        assert not bare, f"{kind}: {bare}"
 
 
 # Arena.
@@ -292,7 +316,7 @@ def test_settings_of_the_physics(model):
 
 
 def test_gravity_pulls_to_the_back_less_the_buoyancy(environment, model):
-    device = environment.task.catheter.device
+    device = environment.task.scene.catheter.device
     density = device.linear_density / (math.pi * device.outer_radius**2)
     # A hollow catheter is lighter than blood, in which it is taken to float.
     expected = GRAVITY * max(0.0, 1 - BLOOD_DENSITY / density)

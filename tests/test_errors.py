@@ -12,8 +12,9 @@ from cathsim_dmc.anatomy.arch import arch
 from cathsim_dmc.anatomy.scan.importer import import_scan
 from cathsim_dmc.entities import devices
 from cathsim_dmc.simulation.batch import BatchSimulation
-from cathsim_dmc.tasks import objectives, observations
-from cathsim_dmc.tasks.navigation import NavigationConfig
+from cathsim_dmc.tasks import observations
+from cathsim_dmc.tasks.config import NavigationConfig
+from cathsim_dmc.tasks.objectives import Cannulation
 
 
 def fails(words, error=ValueError, **options):
@@ -108,7 +109,8 @@ def test_wrong_device():
 
 
 def test_wrong_reward():
-    fails(["sparse", *objectives.REWARDS], reward="sparse")
+    for reward in ("sparse", {"sparse": 1.0}):
+        fails(["sparse", *Cannulation.TERMS, "success"], reward=reward)
 
 
 @pytest.mark.parametrize(

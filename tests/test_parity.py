@@ -22,7 +22,7 @@ def anatomy():
 
 
 def make(anatomy, seed, **options):
-    options = {"phantom": anatomy, "goal": "bca", "random": seed, **options}
+    options = {"anatomy": anatomy, "goal": "bca", "random": seed, **options}
     return suite.load("cathsim", "navigate", options)
 
 
@@ -39,10 +39,10 @@ class Pair:
 
     def reset(self):
         self.timesteps = [each.reset() for each in self.environments]
-        self.compare_observations(self.batch.reset())
+        self.compare_observations(self.batch.reset().observation)
 
     def reset_some(self, indices):
-        observation = self.batch.reset(np.array(indices))
+        observation = self.batch.reset(np.array(indices)).observation
         for i in indices:
             self.timesteps[i] = self.environments[i].reset()
         self.compare_observations(observation)
@@ -62,6 +62,9 @@ class Pair:
                 batched = getattr(step.wall_force, name)[i]
                 assert batched == getattr(task.wall_force, name)
             assert step.readings.push_force[i] == task.readings.push_force
+            mine, theirs = task.info(), step.info()
+            assert list(mine) == list(theirs)
+            assert mine == {name: value[i].item() for name, value in theirs.items()}
         return step
 
     def compare_observations(self, observation):
@@ -110,12 +113,12 @@ def test_randomised_episodes_are_equal(anatomy):
         observation=[*NUMBERS, *PICTURES],
         fluoroscopy=NOISY_BIPLANE,
         randomisation=True,
-        reward="path",
+        reward={"path": -1.0, "success": 10.0, "force": -0.1, "smoothness": -0.01},
     )
     seen = []
     for episode in range(2):
         pair.reset()
-        seen.append(pair.batch.meaning.goal.copy())
+        seen.append(pair.batch.rollout.objective.goal.copy())
         for index, action in enumerate(actions(30, episode)):
             pair.step(action)
             if index == 15:
@@ -127,7 +130,7 @@ def test_randomised_episodes_are_equal(anatomy):
 def test_success_ends_both(anatomy):
     # A goal in the aorta ahead of the tip, which a straight push reaches.
     aorta = anatomy.tree.vessel("aorta").centreline
-    start = make(anatomy, 0, observation="tracking").task.placement
+    start = make(anatomy, 0, observation="tracking").task.scene.placement
     ahead = aorta.project(start.start + 0.02 * start.direction).arc_length
     goal = Goal("ahead", "aorta", aorta.at(ahead).position, float(ahead))
     pair = Pair(anatomy, goal=goal, observation="tracking")

@@ -110,6 +110,8 @@ def test_what_cannot_be_repeated_is_refused(episodes, directory):
     with pytest.raises(ValueError, match="seed None"):
         export(record([None]), DATASET)
     with pytest.raises(ValueError, match="does not repeat"):
-        export(episodes, DATASET, task_kwargs={"friction": 0.5, "reward": "path"})
+        export(
+            episodes, DATASET, task_kwargs={"friction": 0.5, "reward": {"path": -1.0}}
+        )
     with pytest.raises(ValueError, match="instead of"):
         export(episodes, DATASET, task_kwargs={"max_steps": 5})

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from cathsim_dmc import suite
-from cathsim_dmc.analysis.force_statistics import episode_statistics, step_forces
+from cathsim_dmc.analysis.force_statistics import magnitude, recorded_forces
 from cathsim_dmc.anatomy.arch.arch import ARCHES, build_arch
 from cathsim_dmc.recording import Episode, EpisodeRecorder, body_geoms, write_rrd
 
@@ -13,7 +13,7 @@ STEPS = 40
 
 @pytest.fixture(scope="module")
 def env():
-    options = {"phantom": build_arch(ARCHES["type1"]), "goal": "bca", "random": 0}
+    options = {"anatomy": build_arch(ARCHES["type1"]), "goal": "bca", "random": 0}
     return suite.load("cathsim", "navigate", options)
 
 
@@ -31,22 +31,24 @@ def episode(env):
 
 def test_contacts_make_up_the_forces_of_the_task(env, episode):
     assert len(episode.contact_step) > 0
-    steps = step_forces(episode.contact_step, episode.contact_force, STEPS)
-    np.testing.assert_allclose(steps.total, episode.wall_force_sum, atol=1e-9)
-    np.testing.assert_allclose(steps.largest, episode.wall_force_max, atol=1e-9)
+    size, total, largest = magnitude(episode.contact_force), *np.zeros((2, STEPS))
+    np.add.at(total, episode.contact_step, size)
+    np.maximum.at(largest, episode.contact_step, size)
+    np.testing.assert_allclose(total, episode.wall_force_sum, atol=1e-9)
+    np.testing.assert_allclose(largest, episode.wall_force_max, atol=1e-9)
     peaks = np.array(episode.meta["wall_force_peak_max"])
     assert (peaks >= episode.wall_force_max - 1e-12).all()
     assert episode.push_force[-1] == env.task.readings.push_force
 
 
 def test_contacts_lie_on_the_wall_and_press_outwards(env, episode):
-    depth = env.task.anatomy.depth(episode.contact_position)
+    depth = env.task.scene.anatomy.depth(episode.contact_position)
     assert np.abs(depth).max() < 2e-3
     firm = np.linalg.norm(episode.contact_force, axis=1) > 1e-3
     unit = episode.contact_force[firm]
     unit /= np.linalg.norm(unit, axis=1, keepdims=True)
     outside = episode.contact_position[firm] + 3e-3 * unit
-    assert (env.task.anatomy.depth(outside) < depth[firm]).mean() > 0.95
+    assert (env.task.scene.anatomy.depth(outside) < depth[firm]).mean() > 0.95
 
 
 def test_poses_are_those_of_the_task(env, episode):
@@ -72,8 +74,9 @@ def test_the_episode_is_drawn_with_its_robot(env, episode, tmp_path):
     assert [g.kind for g in geoms if g.body_name.startswith("sheath")] == ["cylinder"]
     loaded = Episode.load(episode.save(tmp_path / "e.npz"))
     path = write_rrd(
-        loaded, env.task.anatomy.surface, tmp_path / "e.rrd", robot_geoms=geoms
+        loaded, env.task.scene.anatomy.surface, tmp_path / "e.rrd", robot_geoms=geoms
     )
     assert path.stat().st_size < 5e6
-    statistics = episode_statistics(loaded, env.task.meaning.route.length)
-    assert 0 < statistics.f_mean <= statistics.f_max <= statistics.peak_max
+    forces = recorded_forces(loaded)
+    assert 0 < forces.max.mean <= forces.max.maximum <= forces.peak_max.maximum
+    assert forces.sum.mean < forces.sum.mean_in_contact

@@ -6,7 +6,7 @@ import torch
 from torchrl.envs import check_env_specs
 
 from cathsim_dmc.agents import evaluate, make_config, make_env, train
-from cathsim_dmc.agents.networks import Signature
+from cathsim_dmc.agents.networks import NetworkShapes
 from cathsim_dmc.simulation.environments import standard_observations
 
 TASK = "type1_bca"
@@ -15,7 +15,8 @@ TASK = "type1_bca"
 def test_both_paths_give_the_same_episodes():
     settings = {"task": TASK, "episodes": 2, "task_kwargs": {"max_steps": 6}}
     batched, composer = (
-        evaluate("random", path=path, **settings) for path in ("batched", "composer")
+        evaluate("random", backend=backend, **settings)
+        for backend in ("batched", "composer")
     )
     assert batched.episodes == composer.episodes
     assert [episode.length for episode in batched.episodes] == [6, 6]
@@ -26,20 +27,20 @@ def test_both_paths_give_the_same_episodes():
     json.dumps(batched.to_dict())
 
 
-@pytest.mark.parametrize("path", ["batched", "composer"])
-def test_a_task_satisfies_torchrl_and_gives_what_was_asked(path):
+@pytest.mark.parametrize("backend", ["batched", "composer"])
+def test_a_task_satisfies_torchrl_and_gives_what_was_asked(backend):
     env = make_env(
         TASK,
         observation=("sequential", "tracking"),
         num_envs=2,
         num_threads=1,
-        path=path,
+        backend=backend,
         task_kwargs={"max_steps": 5},
     )
     check_env_specs(env)
-    signature = Signature.of(env)
-    assert signature.pixels == (3, 128, 128)
-    assert signature.actions == 21
+    shapes = NetworkShapes.of(env)
+    assert shapes.pixels == (3, 128, 128)
+    assert shapes.actions == 21
     steps = env.rollout(7, break_when_any_done=False)
     assert steps["pixels"].dtype == torch.uint8
     assert steps["pixels"].float().std() > 1
@@ -67,8 +68,8 @@ def test_a_task_trains_and_evaluates(tmp_path):
 
 
 def test_unknown_paths_and_empty_observations_are_refused():
-    with pytest.raises(ValueError, match="path='gpu'.*batched.*composer"):
-        make_env(TASK, path="gpu")
+    with pytest.raises(ValueError, match="backend=.gpu..*batched.*composer"):
+        make_env(TASK, backend="gpu")
     bare = synthetic_env.ReachEnv(2)
     for name in synthetic_env.SIZES:
         del bare.observation_spec[name]

@@ -85,17 +85,17 @@ def test_success_terminates():
     env.reset(seed=0)
     task = env.unwrapped.environment.task
     # Any place in the branch counts with such a goal, so the branch is moved here.
-    task._meaning = _everywhere(task.meaning)
+    task.rollout._objective = _everywhere(task.objective)
     _, reward, terminated, truncated, info = env.step(np.zeros(21, np.float32))
     assert (reward, terminated, truncated) == (10.0, True, False)
     assert info["success"] and not info["physics_error"]
 
 
-def _everywhere(meaning):
+def _everywhere(objective):
     import dataclasses
 
-    wide = dataclasses.replace(meaning.route, radii=meaning.route.radii + 1.0)
-    return dataclasses.replace(meaning, branch=wide, ostium=-1.0)
+    wide = dataclasses.replace(objective.route, radii=objective.route.radii + 1.0)
+    return dataclasses.replace(objective, branch=wide, ostium=-1.0)
 
 
 def test_render_shows_the_device_as_it_goes():

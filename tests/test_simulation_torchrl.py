@@ -9,7 +9,6 @@ from torchrl.envs.utils import check_env_specs
 
 from cathsim_dmc import suite
 from cathsim_dmc.simulation.torchrl import BatchedEnv
-from cathsim_dmc.tasks.info import FLAGS, MEASURES
 
 ENVS = 3
 
@@ -92,7 +91,12 @@ def test_batched_env(batched):
     check_env_specs(batched)
     assert batched.batch_size == (ENVS,)
     assert batched.action_spec.shape == (ENVS, 21)
-    assert {*MEASURES, *FLAGS} == set(batched.reset()["info"].keys())
+    info = batched.reset()["info"]
+    assert list(info.keys()) == list(batched.simulation.reset().info())
+    for name in ("reward_distance", "reward_success", "wall_force_peak_max"):
+        assert info[name].shape == (ENVS, 1) and info[name].dtype == torch.float32
+    for name in ("success", "physics_error"):
+        assert info[name].dtype == torch.bool
 
 
 def test_batched_env_with_numbers_and_forces(short_batched):
@@ -139,7 +143,7 @@ def test_only_what_is_done_is_reset(batched):
     assert torch.equal(after[1], before[1])
     assert not torch.equal(after[0], before[0])
     assert not torch.equal(after[2], before[2])
-    assert batched.simulation.steps.tolist() == [0, 3, 0]
+    assert batched.simulation.rollout.steps.tolist() == [0, 3, 0]
 
 
 def test_time_limit_truncates_the_batch(short_batched):

@@ -4,7 +4,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from cathsim_dmc.analysis.speed import pace
+from cathsim_dmc.analysis.speed import pace, report
 
 
 @pytest.fixture(scope="module")
@@ -50,3 +50,22 @@ def test_timed_hooks_are_put_back(environment):
         pace.pace(environment, pace.RANDOM, 3)
         assert "after_step" in vars(task)
     assert "after_step" not in vars(task) and seconds["after_step"] > 0
+
+
+def test_the_humanoid_is_the_same_work_every_time():
+    model, start = pace._humanoid()
+    before = start.qpos.copy()
+    assert 1 < pace.humanoid_step(20) < 1e4
+    np.testing.assert_array_equal(start.qpos, before)
+    assert model.nv == 27 and start.time == 0
+
+
+def test_calibrated_speed_is_the_product_of_factor_and_humanoid(monkeypatch):
+    monkeypatch.setattr(report, "_BARS", ((pace.RANDOM, 1.0),))
+    monkeypatch.setattr(report, "RUNS", 1)
+    monkeypatch.setattr(report, "STEPS", 3)
+    steps = iter((30.0, 10.0))
+    monkeypatch.setattr(report, "humanoid_step", lambda: next(steps))
+    (check,), table = report._factors()
+    assert check.value == pytest.approx(20 * table["random"]["real_time_factor"])
+    assert check.unit == "µs" and check.passed

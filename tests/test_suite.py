@@ -16,7 +16,8 @@ from cathsim_dmc import suite
 from cathsim_dmc.analysis.containment import Containment
 from cathsim_dmc.anatomy.anatomy import Goal
 from cathsim_dmc.anatomy.arch import arch
-from cathsim_dmc.tasks import forces, objectives, observations
+from cathsim_dmc.tasks import forces, observations
+from cathsim_dmc.tasks.variations import START_JITTER
 
 # Those that need OpenGL are tested with the cameras.
 WITHOUT_GL = tuple(
@@ -89,20 +90,12 @@ class Contract(test_utils.EnvironmentTestMixin):
         self.assertIn(True, [step.last() for step in steps])
 
 
-class TestContractType1Bca(Contract, absltest.TestCase):
-    task_name = "type1_bca"
-
-
-class TestContractType1Lcca(Contract, absltest.TestCase):
-    task_name = "type1_lcca"
-
-
-class TestContractType2Bca(Contract, absltest.TestCase):
-    task_name = "type2_bca"
-
-
-class TestContractType2Lcca(Contract, absltest.TestCase):
-    task_name = "type2_lcca"
+# One class for every registered task, those of the future included.
+for _name in suite.SUITE:
+    _class = f"TestContract{_name.title().replace('_', '')}"
+    globals()[_class] = type(
+        _class, (Contract, absltest.TestCase), {"task_name": _name}
+    )
 
 
 # The sweep over tasks.
@@ -174,8 +167,8 @@ def test_every_observation_conforms_to_its_spec(shared_environment):
 @pytest.mark.parametrize("task_name", TASKS)
 def test_start_is_randomised_within_a_millimetre(shared_environment, task_name):
     environment = shared_environment(task_name)
-    start = environment.task.placement.start
-    axis = environment.task.placement.direction
+    start = environment.task.scene.placement.start
+    axis = environment.task.scene.placement.direction
     heads = []
     for _ in range(8):
         environment.reset()
@@ -183,7 +176,7 @@ def test_start_is_randomised_within_a_millimetre(shared_environment, task_name):
     heads = np.array(heads)
     assert len(np.unique(heads.round(9), axis=0)) == len(heads)
     # The stroke begins a millimetre in, so that the base can go back to displace it.
-    displacement = heads - (start + objectives.START_JITTER * axis)
+    displacement = heads - (start + START_JITTER * axis)
     assert np.linalg.norm(displacement, axis=-1).max() < 1.02e-3
     assert np.linalg.norm(displacement, axis=-1).max() > 0.3e-3
 
@@ -302,9 +295,11 @@ def test_time_out_comes_at_max_steps_with_discount_one(shared_environment, task_
 
 @pytest.mark.parametrize("task_name", TASKS)
 def test_default_limit_is_the_published_one(shared_environment, task_name):
-    assert shared_environment(task_name).task.meaning.max_steps == 2000
+    assert shared_environment(task_name).task.config.max_steps == 2000
     assert shared_environment(task_name).control_timestep() == pytest.approx(0.04)
-    assert shared_environment(task_name).task.goal_radius == pytest.approx(8e-3)
+    assert shared_environment(task_name).task.objective.goal_radius == pytest.approx(
+        8e-3
+    )
 
 
 @pytest.mark.parametrize("task_name", TASKS)
@@ -331,7 +326,7 @@ def near_goal():
     environment = suite.load(
         "cathsim",
         "navigate",
-        task_kwargs={"phantom": anatomy, "goal": goal, "random": 3},
+        task_kwargs={"anatomy": anatomy, "goal": goal, "random": 3},
     )
     yield environment
     environment.close()
@@ -353,15 +348,20 @@ def test_success_pays_ten_and_ends_with_discount_zero(near_goal):
     distance = np.linalg.norm(
         near_goal.task.readings.head - near_goal.task.goal_position
     )
-    assert distance < near_goal.task.goal_radius
+    assert distance < near_goal.task.objective.goal_radius
     assert timestep.reward == 10.0
     assert timestep.discount == 0.0
     assert near_goal.task.termination == "success"
-    assert near_goal.task.outcome.success
+    assert near_goal.task.info()["success"]
     # 2.2 cm at 40 mm/s, less at first.
     assert 12 <= steps
     assert near_goal.step(push()).first()
     assert near_goal.task.termination is None
+
+
+def limit_steps(environment, monkeypatch, steps):
+    limited = dataclasses.replace(environment.task.config, max_steps=steps)
+    monkeypatch.setattr(environment.task.rollout, "_config", limited)
 
 
 def test_success_at_the_last_step_is_success(near_goal, reseed, monkeypatch):
@@ -369,8 +369,7 @@ def test_success_at_the_last_step_is_success(near_goal, reseed, monkeypatch):
     steps = 1
     while not near_goal.step(push()).last():
         steps += 1
-    limited = dataclasses.replace(near_goal.task.meaning, max_steps=steps)
-    monkeypatch.setattr(near_goal.task, "_meaning", limited)
+    limit_steps(near_goal, monkeypatch, steps)
     reseed(near_goal, 3)
     timesteps = [near_goal.step(push()) for _ in range(steps)]
     assert [step.last() for step in timesteps] == [False] * (steps - 1) + [True]
@@ -383,8 +382,7 @@ def test_time_out_one_step_before_success(near_goal, reseed, monkeypatch):
     steps = 1
     while not near_goal.step(push()).last():
         steps += 1
-    limited = dataclasses.replace(near_goal.task.meaning, max_steps=steps - 1)
-    monkeypatch.setattr(near_goal.task, "_meaning", limited)
+    limit_steps(near_goal, monkeypatch, steps - 1)
     reseed(near_goal, 3)
     timesteps = [near_goal.step(push()) for _ in range(steps - 1)]
     assert timesteps[-1].last() and timesteps[-1].discount == 1.0

@@ -48,7 +48,7 @@ for name in ("top", "side", "tip"):
 
 # The top camera's distance to what it sees of the arch.
 task = env.task
-surface = task.anatomy.surface.vertices
+surface = task.scene.anatomy.surface.vertices
 model = env.physics.model.ptr
 camera = env.physics.data.cam_xpos[model.camera("top").id]
 depth = seen["depth_top"]

@@ -10,7 +10,12 @@ from hypothesis.extra import numpy as arrays
 from scipy import stats
 
 from cathsim_dmc.anatomy.arch import arch
-from cathsim_dmc.tasks import objectives, placement
+from cathsim_dmc.tasks import forces, objectives, readings
+from cathsim_dmc.tasks.actions import check_action
+from cathsim_dmc.tasks.objectives import PUBLISHED_REWARD, Cannulation
+from cathsim_dmc.tasks.variations import start_displacement
+
+PATH_REWARD = {"path": -1.0, "success": 10.0}
 
 
 @pytest.fixture(scope="module")
@@ -18,11 +23,36 @@ def anatomy():
     return arch.load("type1")
 
 
-@pytest.fixture(scope="module", params=["distance", "path"])
+def cannulation(anatomy, goal="bca", **options):
+    return Cannulation.to(anatomy, anatomy.goal(goal), **options)
+
+
+@pytest.fixture(scope="module", params=[PUBLISHED_REWARD, PATH_REWARD])
 def task(request, anatomy):
-    return placement.cannulation_task(
-        anatomy, anatomy.goal("bca"), reward=request.param
+    return cannulation(anatomy, reward=request.param)
+
+
+def measurement(head, **changes):
+    """What there is to judge with the heads (..., 3): no force, no motion."""
+    head = np.asarray(head)
+    shape = head.shape[:-1]
+    nothing = np.zeros(shape)
+    fields = dict.fromkeys(readings.Readings._fields)
+    fields |= {"head": head, "insertion": nothing}
+    force = forces.WallForce(
+        *(changes.pop(n, nothing) for n in forces.WallForce._fields)
     )
+    still = np.zeros((*shape, 21))
+    return objectives.Measurement(
+        readings.Readings(**fields),
+        force,
+        changes.pop("action", still),
+        changes.pop("previous_action", still),
+    )
+
+
+def judge(task, head, **changes):
+    return task.outcome(measurement(head, **changes))
 
 
 def towards(task, way):
@@ -32,16 +62,16 @@ def towards(task, way):
 
 
 def test_the_goal_itself_is_success(task):
-    outcome = task.outcome(task.goal)
+    outcome = judge(task, task.goal)
     assert outcome.success and task.in_branch(task.goal)
-    assert outcome.distance == 0
-    assert outcome.reward == objectives.SUCCESS_REWARD == 10.0
+    assert task.distance(task.goal) == 0
+    assert outcome.reward == 10.0
 
 
 @pytest.mark.parametrize(("way", "success"), [(7.8e-3, True), (8.2e-3, False)])
 def test_the_radius_of_the_goal_is_eight_millimetres(task, way, success):
-    outcome = task.outcome(towards(task, way))
-    assert outcome.distance == pytest.approx(way, rel=0.02)
+    outcome = judge(task, towards(task, way))
+    assert task.distance(towards(task, way)) == pytest.approx(way, rel=0.02)
     assert outcome.success == success
 
 
@@ -53,8 +83,8 @@ def test_success_through_a_wall_does_not_count(task):
     side /= np.linalg.norm(side)
     for gap, inside in ((-0.5e-3, True), (0.5e-3, False)):
         head = task.goal + (place.radius + gap) * side
-        outcome = task.outcome(head)
-        assert outcome.distance < objectives.GOAL_RADIUS
+        outcome = judge(task, head)
+        assert task.distance(head) < objectives.GOAL_RADIUS
         assert task.in_branch(head) == outcome.success == inside
         assert (outcome.reward == 10.0) == inside
 
@@ -69,18 +99,18 @@ def test_the_stump_in_the_parent_is_not_the_branch(task):
 
 
 def test_reward_is_minus_the_distance_in_metres(anatomy):
-    task = placement.cannulation_task(anatomy, anatomy.goal("lcca"))
+    task = cannulation(anatomy, "lcca")
     head = anatomy.inlet.position + [0, 0, 0.07]
     expected = -np.linalg.norm(head - task.goal)
-    assert task.outcome(head).reward == pytest.approx(expected, rel=1e-12)
-    assert task.outcome(head).terms.keys() == {"distance", "success"}
+    assert judge(task, head).reward == pytest.approx(expected, rel=1e-12)
+    assert judge(task, head).terms.keys() == {"distance", "success"}
 
 
 def test_path_reward_counts_the_way_that_is_left(anatomy):
-    task = placement.cannulation_task(anatomy, anatomy.goal("lcca"), reward="path")
+    task = cannulation(anatomy, "lcca", reward=PATH_REWARD)
     for way in (0.02, 0.06, 0.12):
         head = task.route.at(task.route.length - way).position
-        assert task.outcome(head).reward == pytest.approx(-way, abs=1e-6)
+        assert judge(task, head).reward == pytest.approx(-way, abs=1e-6)
         aside = head + [1e-3, 0, 0]
         assert task.path_distance(aside) > way - 1e-3
     # Straight through the wall it is nearer than along the vessel.
@@ -89,7 +119,7 @@ def test_path_reward_counts_the_way_that_is_left(anatomy):
 
 
 def test_path_distance_falls_all_the_way(anatomy):
-    task = placement.cannulation_task(anatomy, anatomy.goal("lcca"), reward="path")
+    task = cannulation(anatomy, "lcca", reward=PATH_REWARD)
     way = np.linspace(0, task.route.length, 50)
     left = task.path_distance(task.route.at(way).position)
     assert (np.diff(left) < 0).all()
@@ -102,14 +132,12 @@ def test_path_distance_falls_all_the_way(anatomy):
 )
 def test_a_batch_is_many_single_ones(task, heads):
     """Up to rounding: sums may be added in another order in a batch."""
-    together = task.outcome(heads)
+    together = judge(task, heads)
     assert together.reward.shape == together.success.shape == (4, 2)
     for index in np.ndindex(4, 2):
-        alone = task.outcome(heads[index])
+        alone = judge(task, heads[index])
         assert alone.success == together.success[index]
-        for name in ("distance", "reward"):
-            one, many = getattr(alone, name), getattr(together, name)[index]
-            np.testing.assert_allclose(one, many, atol=1e-9, rtol=0)
+        np.testing.assert_allclose(alone.reward, together.reward[index], atol=1e-9)
         for name, term in together.terms.items():
             np.testing.assert_allclose(alone.terms[name], term[index], atol=1e-9)
 
@@ -120,10 +148,50 @@ def test_a_batch_is_many_single_ones(task, heads):
     )
 )
 def test_success_is_near_and_inside(task, anatomy, heads):
-    outcome = task.outcome(heads)
-    assert (outcome.distance[outcome.success] < task.goal_radius).all()
+    outcome = judge(task, heads)
+    assert (task.distance(heads)[outcome.success] < task.goal_radius).all()
     assert (anatomy.depth(heads[outcome.success]) >= 0).all()
     assert (outcome.reward[~outcome.success] < 0).all()
+
+
+# Terms.
+
+
+def test_the_reward_is_the_sum_of_its_terms(anatomy):
+    random = np.random.default_rng(0)
+    names = (*Cannulation.TERMS, "success")
+    weights = dict(zip(names, random.uniform(-2, 2, len(names)), strict=True))
+    task = cannulation(anatomy, reward=weights)
+    heads = task.goal + random.normal(scale=8e-3, size=(50, 3))
+    outcome = judge(
+        task,
+        heads,
+        sum=random.uniform(size=50),
+        peak_max=random.uniform(size=50),
+        action=random.uniform(-1, 1, (50, 21)),
+    )
+    assert 0 < outcome.success.sum() < 50
+    assert set(outcome.terms) == set(names)
+    np.testing.assert_allclose(sum(outcome.terms.values()), outcome.reward, rtol=1e-12)
+    for name in ("distance", "path"):
+        assert (outcome.terms[name][outcome.success] == 0).all()
+        assert (outcome.terms[name][~outcome.success] != 0).all()
+
+
+def test_terms_are_what_their_names_say(anatomy):
+    weights = {"force": -2.0, "peak_force": -3.0, "time": -0.5, "smoothness": -1.0}
+    task = cannulation(anatomy, reward=weights)
+    outcome = judge(
+        task,
+        np.zeros((1, 3)),
+        sum=np.array([0.3]),
+        peak_max=np.array([0.7]),
+        action=np.full((1, 21), 0.5),
+        previous_action=np.full((1, 21), -0.5),
+    )
+    terms = {name: float(value[0]) for name, value in outcome.terms.items()}
+    expected = {"force": -0.6, "peak_force": -2.1, "time": -0.5, "smoothness": -1.0}
+    assert terms == pytest.approx(expected)
 
 
 # Start.
@@ -131,7 +199,7 @@ def test_success_is_near_and_inside(task, anatomy, heads):
 
 def test_start_is_uniform_in_a_ball_of_a_millimetre():
     random = np.random.RandomState(0)
-    points = np.array([objectives.start_displacement(random) for _ in range(2000)])
+    points = np.array([start_displacement(random) for _ in range(2000)])
     radius = np.linalg.norm(points, axis=-1) / 1e-3
     assert radius.max() <= 1
     # Uniform in the ball: r³ and each z/r are uniform.
@@ -142,9 +210,7 @@ def test_start_is_uniform_in_a_ball_of_a_millimetre():
 
 
 def test_start_needs_nothing_but_its_source():
-    first, again = (
-        objectives.start_displacement(np.random.RandomState(5)) for _ in range(2)
-    )
+    first, again = (start_displacement(np.random.RandomState(5)) for _ in range(2))
     np.testing.assert_array_equal(first, again)
 
 
@@ -153,7 +219,7 @@ def test_start_needs_nothing_but_its_source():
 
 @given(action=arrays.arrays(np.float32, (3, 21), elements=st.floats(-1, 1, width=32)))
 def test_good_actions_pass_as_they_are(action):
-    checked = objectives.check_action(action, (3, 21))
+    checked = check_action(action, (3, 21))
     assert checked.dtype == np.float64
     np.testing.assert_array_equal(checked, action)
 
@@ -161,7 +227,14 @@ def test_good_actions_pass_as_they_are(action):
 @pytest.mark.parametrize("shape", [(20,), (1, 21), (21, 1), ()])
 def test_actions_of_a_wrong_shape(shape):
     with pytest.raises(ValueError, match=r"must have \(21,\).*tip motors"):
-        objectives.check_action(np.zeros(shape), (21,))
+        check_action(np.zeros(shape), (21,))
+
+
+@given(action=arrays.arrays(float, (2, 3), elements=st.floats(-1e300, 1e300)))
+def test_actions_outside_are_clipped(action):
+    checked = check_action(action, (2, 3))
+    np.testing.assert_array_equal(checked, np.clip(action, -1, 1))
+    assert not np.shares_memory(checked, action)
 
 
 @given(index=st.integers(0, 20), value=st.sampled_from([np.nan, np.inf, -np.inf]))
@@ -169,16 +242,19 @@ def test_one_bad_entry_is_enough(index, value):
     action = np.zeros(21)
     action[index] = value
     with pytest.raises(ValueError, match="1 NaN or infinite"):
-        objectives.check_action(action, (21,))
+        check_action(action, (21,))
 
 
 @pytest.mark.parametrize(
     ("field", "value", "message"),
     [
-        ("reward", "sparse", "distance, path"),
+        ("weights", "sparse", "mapping of reward terms.*distance, path"),
+        ("weights", {}, "mapping of reward terms"),
+        ("weights", {"sparse": 1.0}, "no term sparse.*distance, path"),
+        ("weights", {"distance": float("nan")}, "finite"),
+        ("weights", {"distance": "1"}, "finite"),
         ("goal_radius", 0.0, "> 0"),
         ("goal_radius", float("nan"), "> 0"),
-        ("max_steps", 0, "at least 1"),
     ],
 )
 def test_bad_options(task, field, value, message):

@@ -68,7 +68,7 @@ def test_the_image_is_the_fluoroscopes(anatomy):
         contrast=25.0,
     )
     task = env.task
-    radius = task.catheter.device.outer_radius
+    radius = task.scene.catheter.device.outer_radius
     np.testing.assert_array_equal(image, scope.render(task.readings.centreline, radius))
 
 
@@ -152,8 +152,8 @@ def test_segmentation_is_device_and_vessel(anatomy):
     assert device[r - 1 : r + 2, c - 1 : c + 2].any()
     # Where the device is, the image is darker than that of the vessel alone.
     away = env.task.readings.centreline + [1.0, 0.0, 0.0]
-    radius = env.task.catheter.device.outer_radius
-    empty = env.task.fluoroscope.render(away, radius)
+    radius = env.task.scene.catheter.device.outer_radius
+    empty = env.task.rollout.fluoroscope.render(away, radius)
     assert (after["image"][device] < empty[device]).all()
     far = after["image"] == empty
     assert far.mean() > 0.9 and not (device & far[..., 0]).any()
@@ -168,7 +168,7 @@ def test_tracking_follows_device_and_goal_in_space_and_on_the_screen(anatomy):
     np.testing.assert_array_equal(points[-1], task.readings.head)
     line = task.readings.centreline
     assert all((point == line).all(-1).any() for point in points)
-    carm = task.fluoroscope.carm
+    carm = task.rollout.fluoroscope.carm
     pixels = seen["tracking_pixels"].reshape(-1, 2)
     np.testing.assert_allclose(pixels, carm.project(points)[0])
     np.testing.assert_allclose(
@@ -179,7 +179,7 @@ def test_tracking_follows_device_and_goal_in_space_and_on_the_screen(anatomy):
         seen["goal_from_head"], task.goal_position - task.readings.head
     )
     assert np.linalg.norm(seen["goal_from_head"]) == pytest.approx(
-        float(task.outcome.distance)
+        task.info()["distance"]
     )
     assert seen["tracking_insertion"] == task.readings.insertion
     assert seen["tracking_action"][0] == 0.3 and seen["tracking_action"][-1] == 1.0

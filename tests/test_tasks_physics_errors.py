@@ -75,7 +75,7 @@ def test_a_dump_replays_the_episode(dumps, monkeypatch):
     model, data = again.physics.model.ptr, again.physics.data.ptr
     mujoco.mj_setState(model, data, state, mujoco.mjtState.mjSTATE_INTEGRATION)
     for action in actions:
-        again.task.posed_robot(data.qpos)
+        again.task.rollout.pose_robot(data.qpos[None])
         data.ctrl[:] = action
         for _ in range(again.task.substeps):
             mujoco.mj_step(model, data)

@@ -45,10 +45,10 @@ def test_frame_turns_z_into_any_direction(azimuth, height):
 def test_the_device_starts_inside_and_reaches_every_goal(name):
     anatomy = arch.load(name)
     for goal in anatomy.goals.values():
-        task = placement.cannulation_task(anatomy, goal)
-        placed = placement.place_device(anatomy, task.route.length, devices.PUBLISHED)
+        route = anatomy.route(goal)
+        placed = placement.place_device(anatomy, route.length, devices.PUBLISHED)
         assert anatomy.depth(placed.start) > devices.PUBLISHED.outer_radius
-        assert placed.start_depth + placed.stroke >= task.route.length
+        assert placed.start_depth + placed.stroke >= route.length
         assert placed.working_length > placed.start_depth + placed.stroke
         np.testing.assert_allclose(
             np.linalg.norm(placed.robot - placed.start), placed.working_length
@@ -72,11 +72,12 @@ def test_the_head_is_displaced_as_asked(shared_environment, task_name):
     random = np.random.RandomState(0)
     heads, asked = [], random.uniform(-0.5e-3, 0.5e-3, (6, 3))
     for displacement in [np.zeros(3), *asked]:
-        data.qpos[:] = task.start_qpos(model.qpos0, displacement)
+        start = task.rollout.start_qpos(model.qpos0[None].copy(), displacement[None])
+        data.qpos[:] = start[0]
         mujoco.mj_kinematics(model, data)
         heads.append(data.site_xpos[site].copy())
     matrix = np.empty(9)
-    mujoco.mju_quat2Mat(matrix, task.placement.quaternion)
+    mujoco.mju_quat2Mat(matrix, task.scene.placement.quaternion)
     expected = asked @ matrix.reshape(3, 3).T
     # Bent by an angle below 0.02 rad, the tip falls back by a part in ten thousand.
     np.testing.assert_allclose(np.array(heads[1:]) - heads[0], expected, atol=1e-5)
@@ -87,10 +88,11 @@ def test_start_takes_a_batch(shared_environment):
     environment.reset()
     task, model = environment.task, environment.physics.model.ptr
     displacement = np.random.RandomState(1).uniform(-1e-3, 1e-3, (3, 3))
-    together = task.start_qpos(np.tile(model.qpos0, (3, 1)), displacement)
+    rollout = task.rollout
+    together = rollout.start_qpos(np.tile(model.qpos0, (3, 1)), displacement)
     for index in range(3):
-        alone = task.start_qpos(model.qpos0, displacement[index])
-        np.testing.assert_array_equal(together[index], alone)
+        alone = rollout.start_qpos(model.qpos0[None].copy(), displacement[[index]])
+        np.testing.assert_array_equal(together[[index]], alone)
 
 
 # Readings.
@@ -100,15 +102,15 @@ def test_readings_have_the_shapes_they_say(shared_environment):
     environment = shared_environment("type1_lcca")
     environment.reset()
     state = environment.task.readings
-    links = len(environment.task.catheter.links)
-    joints = len(environment.task.catheter.joints)
+    links = len(environment.task.scene.catheter.links)
+    joints = len(environment.task.scene.catheter.joints)
     assert state.centreline.shape == (links + 1, 3)
     assert state.joint_positions.shape == state.joint_velocities.shape == (joints,)
     assert state.com_inertia.shape == (links, 10)
     assert state.external_force.shape == (links, 6)
     np.testing.assert_array_equal(state.centreline[-1], state.head)
     lengths = np.linalg.norm(np.diff(state.centreline, axis=0), axis=-1)
-    np.testing.assert_allclose(lengths, environment.task.catheter.link_lengths)
+    np.testing.assert_allclose(lengths, environment.task.scene.catheter.link_lengths)
 
 
 def test_readings_are_copies(shared_environment):
@@ -134,18 +136,19 @@ def test_insertion_is_what_the_base_has_moved(shared_environment):
     now = environment.task.readings
     moved = now.insertion - start.insertion
     assert 0.01 < moved <= 0.0164
-    axis = environment.task.placement.direction
+    axis = environment.task.scene.placement.direction
     assert (now.head - start.head) @ axis == pytest.approx(moved, abs=3e-4)
 
 
 @pytest.mark.parametrize(
     ("scopes", "message"),
     [
-        (("guidewire", "phantom"), "guidewire/link_0"),
-        (("catheter", "heart"), "sensor named 'heart/load_cell'"),
+        (("guidewire", "phantom", "robot"), "guidewire/link_0"),
+        (("catheter", "heart", "robot"), "sensor named 'heart/load_cell'"),
+        (("catheter", "phantom", "arm"), "joint named 'arm/"),
     ],
 )
 def test_a_model_without_the_names(shared_environment, scopes, message):
     model = shared_environment("type1_bca").physics.model.ptr
     with pytest.raises(ValueError, match=message):
-        readings.Layout(model, *scopes)
+        readings.ModelIndex(model, *scopes)

@@ -9,7 +9,13 @@ from hypothesis import strategies as st
 from cathsim_dmc import suite
 from cathsim_dmc.anatomy.arch import arch
 from cathsim_dmc.tasks import objectives as objectives
-from cathsim_dmc.tasks.variations import USUAL, ActionDelay, Episode, Randomisation
+from cathsim_dmc.tasks.variations import (
+    DEFAULT_RANGES,
+    ActionDelay,
+    Episode,
+    Randomisation,
+    start_displacement,
+)
 
 
 @pytest.fixture(scope="module")
@@ -18,7 +24,7 @@ def anatomy():
 
 
 def make(anatomy, randomisation, **options):
-    options = {"phantom": anatomy, "goal": "bca", "random": 0, **options}
+    options = {"anatomy": anatomy, "goal": "bca", "random": 0, **options}
     options["randomisation"] = randomisation
     return suite.load("cathsim", "navigate", options)
 
@@ -50,7 +56,7 @@ def snapshot(environment):
 def test_nothing_is_drawn_but_the_displacement_by_default():
     drawn, plain = np.random.RandomState(3), np.random.RandomState(3)
     episode = Randomisation().draw(drawn)
-    displacement = objectives.start_displacement(plain)
+    displacement = start_displacement(plain)
     np.testing.assert_array_equal(episode.displacement, displacement)
     assert episode == Episode(episode.displacement)
     assert drawn.randint(2**31) == plain.randint(2**31)
@@ -58,18 +64,20 @@ def test_nothing_is_drawn_but_the_displacement_by_default():
 
 @given(seed=st.integers(0, 2**32 - 1))
 def test_draws_lie_in_their_ranges(seed):
-    episode = USUAL.draw(np.random.RandomState(seed))
-    assert np.linalg.norm(episode.displacement) <= USUAL.start_radius
+    episode = DEFAULT_RANGES.draw(np.random.RandomState(seed))
+    assert np.linalg.norm(episode.displacement) <= DEFAULT_RANGES.start_radius
     for name in ("friction", "stiffness", "goal_shift", "roll", "delay"):
-        low, high = getattr(USUAL, name)
+        low, high = getattr(DEFAULT_RANGES, name)
         assert low <= getattr(episode, name) <= high
     deviation = episode.deviation
     for name in ("primary", "secondary"):
         angle = getattr(deviation, name)
-        assert USUAL.view[0] <= angle <= USUAL.view[1] and angle == int(angle)
+        assert DEFAULT_RANGES.view[0] <= angle <= DEFAULT_RANGES.view[
+            1
+        ] and angle == int(angle)
     for name in ("gain", "kerma"):
-        assert getattr(USUAL, name)[0] <= getattr(deviation, name)
-        assert getattr(deviation, name) <= getattr(USUAL, name)[1]
+        assert getattr(DEFAULT_RANGES, name)[0] <= getattr(deviation, name)
+        assert getattr(deviation, name) <= getattr(DEFAULT_RANGES, name)[1]
 
 
 def test_a_composer_variation_is_a_range_too():
@@ -142,12 +150,12 @@ def test_roll_turns_the_plane_in_which_the_tip_bends(anatomy):
     def bent(roll):
         env = make(anatomy, {"roll": (roll, roll), "start_radius": 0.0})
         env.reset()
-        straight = env.task.placement.direction
+        straight = env.task.scene.placement.direction
         action = np.zeros(21)
         action[0:20:2] = 0.4
         for _ in range(10):
             env.step(action)
-        sideways = env.task.readings.head - env.task.placement.inlet
+        sideways = env.task.readings.head - env.task.scene.placement.inlet
         sideways = sideways - (sideways @ straight) * straight
         return sideways / np.linalg.norm(sideways)
 
@@ -157,27 +165,30 @@ def test_roll_turns_the_plane_in_which_the_tip_bends(anatomy):
 
 
 def test_a_shifted_goal_moves_along_its_branch(anatomy):
-    plain = make(anatomy, False).task.usual_meaning
-    for reward in objectives.REWARDS:
+    plain = make(anatomy, False).task.objective
+    for reward in (objectives.PUBLISHED_REWARD, {"path": -1.0, "success": 10.0}):
         env = make(anatomy, {"goal_shift": (-0.01, 0.01)}, reward=reward)
         goals = []
         for _ in range(6):
             env.reset()
-            meaning = env.task.meaning
-            place = meaning.branch.project(meaning.goal)
-            assert meaning.ostium <= place.arc_length
-            assert place.distance < 1e-9
-            assert meaning.outcome(meaning.goal).success
-            assert float(meaning.path_distance(meaning.goal)) < 1e-9
-            goals.append(float(place.arc_length))
-            np.testing.assert_array_equal(env.task.goal_position, meaning.goal)
+            objective = env.task.objective
+            (place,) = objective.branch.project(objective.goal).arc_length
+            assert objective.ostium <= place
+            assert objective.branch.project(objective.goal).distance < 1e-9
+            assert objective.success(objective.goal)
+            assert objective.path_distance(objective.goal) < 1e-9
+            goals.append(float(place))
+            np.testing.assert_array_equal([env.task.goal_position], objective.goal)
         usual = float(plain.branch.project(plain.goal).arc_length)
         assert len(set(goals)) == 6 and max(np.abs(np.array(goals) - usual)) <= 0.0101
-    # Without a shift the meaning is that of the task without randomisation.
-    wide = make(anatomy, {"goal_shift": (-0.01, 0.01)}).task.usual_meaning
+    # Without a shift the objective is that of the task without randomisation.
+    wide = suite.make_task(
+        "navigate", anatomy=anatomy, randomisation={"goal_shift": (-0.01, 0.01)}
+    ).objective
     heads = plain.goal + np.random.default_rng(0).normal(size=(20, 3)) * 0.02
-    one, other = plain.outcome(heads), wide.shifted(0.0).outcome(heads)
-    np.testing.assert_allclose(one.reward, other.reward, atol=1e-12)
+    for figure in ("distance", "success"):
+        one, other = (getattr(o, figure)(heads) for o in (plain, wide.shifted(0.0)))
+        np.testing.assert_allclose(one, other, atol=1e-12)
     assert wide.route.length > plain.route.length
 
 
@@ -191,12 +202,12 @@ def test_actions_arrive_as_late_as_drawn(delays, actions):
     for index, delay in enumerate(delays):
         way.restart(index, delay)
     sent = [np.full((count, 1), a) for a in actions]
-    arrived = [way.pass_on(a).copy() for a in sent]
+    arrived = [way.delayed(a).copy() for a in sent]
     for index, delay in enumerate(delays):
         expected = ([0.0] * delay + actions)[: len(actions)]
         assert [float(a[index, 0]) for a in arrived] == expected
     way.restart(0, 1)
-    assert way.pass_on(np.ones((count, 1)))[0, 0] == 0.0
+    assert way.delayed(np.ones((count, 1)))[0, 0] == 0.0
 
 
 def test_delayed_device_does_later_what_it_does_at_once(anatomy):

@@ -7,24 +7,22 @@ import torchrl  # noqa: F401
 # isort: on
 
 from cathsim_dmc.agents.checkpoint import Checkpoint, CheckpointError
-from cathsim_dmc.agents.configs import (
-    ConfigError,
-    PPOConfig,
-    SACConfig,
-    TrainingConfig,
-    make_config,
-)
+from cathsim_dmc.agents.config import ConfigError, TrainingConfig
 from cathsim_dmc.agents.evaluation import (
     Comparison,
     EvaluationResult,
     compare,
     evaluate,
-    random_policy,
 )
+from cathsim_dmc.agents.learners import LEARNERS, make_config
+from cathsim_dmc.agents.policies import load_policy
+from cathsim_dmc.agents.ppo import PPOConfig
+from cathsim_dmc.agents.sac import SACConfig
 from cathsim_dmc.agents.training import TrainingResult, train
 from cathsim_dmc.simulation.environments import make_env
 
 __all__ = [
+    "LEARNERS",
     "Checkpoint",
     "CheckpointError",
     "Comparison",
@@ -36,8 +34,8 @@ __all__ = [
     "TrainingResult",
     "compare",
     "evaluate",
+    "load_policy",
     "make_config",
     "make_env",
-    "random_policy",
     "train",
 ]

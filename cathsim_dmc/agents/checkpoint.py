@@ -1,9 +1,12 @@
 """Checkpoints: weights and numbers only, complete or not there at all."""
 
+import hashlib
+import io
 import json
+import math
 import os
 import shutil
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
@@ -12,19 +15,22 @@ from typing import Any
 import torch
 from tensordict.nn import TensorDictSequential
 
-from cathsim_dmc.agents.configs import TrainingConfig, config_from_dict
-from cathsim_dmc.agents.networks import Signature, make_policy
+from cathsim_dmc import files
+from cathsim_dmc.agents.config import ConfigError, TrainingConfig
+from cathsim_dmc.agents.learners import config_from_dict, make_policy
+from cathsim_dmc.agents.networks import NetworkShapes
 
-FORMAT = 1
+FORMAT = 2
 _DIRECTORY = "checkpoints"
 _DESCRIPTION = "checkpoint.json"
 _POLICY = "policy.pt"
 _LEARNING = "learning.pt"
 _UNFINISHED = ".unfinished-"
+_MAX_DESCRIPTION = 2**20  # bytes
 
 
 class CheckpointError(RuntimeError):
-    """A checkpoint is missing, incomplete or of another kind."""
+    """A checkpoint is missing, incomplete, damaged or of another kind."""
 
 
 @dataclass(frozen=True)
@@ -32,28 +38,31 @@ class Checkpoint:
     """A complete checkpoint on disk.
 
     Attributes:
-        path: its directory.
-        config: of the run that wrote it.
-        signature: sizes of observation and action.
-        frames: frames the run had seen.
-        seconds: wall time the run had taken, over all its processes.
+        path: Directory of the checkpoint.
+        config: Settings of the run that wrote it.
+        shapes: Sizes of observation and action.
+        frames: Number of frames that the run had seen.
+        seconds: Wall time that the run had taken, over all its processes.
+        sha256: Checksums of the files with the weights, by file name.
     """
 
     path: Path
     config: TrainingConfig
-    signature: Signature
+    shapes: NetworkShapes
     frames: int
     seconds: float
+    sha256: Mapping[str, str]
 
     @classmethod
     def open(cls, path: str | Path) -> "Checkpoint":
         """Open a checkpoint, or the newest one of a run.
 
         Args:
-            path: a checkpoint's directory or a run's directory.
+            path: Directory of a checkpoint or of a run.
 
         Raises:
-            CheckpointError: there is none, or it cannot be read.
+            CheckpointError: there is none, or its description cannot be used; the
+                message names the field, what was given and what is allowed.
         """
         path = Path(path)
         if not (path / _DESCRIPTION).exists():
@@ -64,41 +73,128 @@ class Checkpoint:
                     f"{_DIRECTORY}/<frames>."
                 )
             path = found[-1]
-        try:
-            values = json.loads((path / _DESCRIPTION).read_text())
-        except ValueError as error:
-            raise CheckpointError(f"{path / _DESCRIPTION}: {error}") from error
-        if values.get("format") != FORMAT:
-            raise CheckpointError(
-                f"{path} has format {values.get('format')!r}, this version reads "
-                f"{FORMAT}."
-            )
-        return cls(
-            path=path,
-            config=config_from_dict(values["config"]),
-            signature=Signature.from_dict(values["signature"]),
-            frames=values["frames"],
-            seconds=values["seconds"],
+        description = path / _DESCRIPTION
+        values = _read_description(description)
+
+        def field(name: str, allowed: str, fits: Callable[[Any], bool]) -> Any:
+            if name not in values or not fits(values[name]):
+                given = repr(values[name]) if name in values else "missing"
+                raise CheckpointError(
+                    f"{description}: {name} is {given}; it must be {allowed}."
+                )
+            return values[name]
+
+        config = field("config", "an object of settings", _is_object)
+        shapes = field("shapes", "an object of sizes", _is_object)
+        checksums = field(
+            "sha256",
+            f"an object with the checksums of {_POLICY} and {_LEARNING}",
+            lambda value: (
+                _is_object(value)
+                and all(isinstance(value.get(n), str) for n in (_POLICY, _LEARNING))
+            ),
         )
+        try:
+            return cls(
+                path=path,
+                config=config_from_dict(config),
+                shapes=NetworkShapes.from_dict(shapes),
+                frames=field(
+                    "frames", "an integer >= 0", lambda v: type(v) is int and v >= 0
+                ),
+                seconds=float(field("seconds", "a number >= 0", _is_duration)),
+                sha256=checksums,
+            )
+        except (ConfigError, ValueError) as error:
+            raise CheckpointError(f"{description}: {error}") from error
 
     def policy_state(self) -> dict[str, Any]:
-        """Weights and statistics of the policy, on the CPU."""
-        return _load(self.path / _POLICY)
+        """Weights and statistics of the policy, on the CPU.
+
+        Raises:
+            CheckpointError: the file is missing or is not what was written.
+        """
+        return self._load(_POLICY)
 
     def learning_state(self) -> dict[str, Any]:
-        """Everything else that continuing the run needs."""
-        return _load(self.path / _LEARNING)
+        """Everything else that continuing the run needs.
+
+        Raises:
+            CheckpointError: the file is missing or is not what was written.
+        """
+        return self._load(_LEARNING)
 
     def policy(self) -> TensorDictSequential:
-        """The policy, ready to act: raw observation in, action out."""
-        policy = make_policy(self.signature, self.config)
-        policy.load_state_dict(self.policy_state())
+        """The policy, ready to act: raw observation in, action out.
+
+        Raises:
+            CheckpointError: the weights are damaged or of another network.
+        """
+        state = self.policy_state()
+        try:
+            policy = make_policy(self.shapes, self.config)
+            policy.load_state_dict(state)
+        except (RuntimeError, TypeError, AttributeError) as error:
+            raise CheckpointError(
+                f"{self.path / _POLICY} does not fit the network that "
+                f"{_DESCRIPTION} describes: {_line(error)}"
+            ) from error
         return policy.eval().requires_grad_(False)
 
+    def _load(self, name: str) -> dict[str, Any]:
+        path = self.path / name
+        try:
+            data = path.read_bytes()
+        except OSError as error:
+            raise CheckpointError(f"{path} cannot be read: {error}.") from error
+        given = hashlib.sha256(data).hexdigest()
+        if given != self.sha256[name]:
+            raise CheckpointError(
+                f"{path} is damaged: its SHA-256 is {given[:12]}…, {_DESCRIPTION} says "
+                f"{self.sha256[name][:12]}…. Use an older checkpoint of the run."
+            )
+        try:
+            # weights_only: a checkpoint from elsewhere must not be able to run code.
+            state = torch.load(io.BytesIO(data), map_location="cpu", weights_only=True)
+        except Exception as error:  # torch's reader of weights fails in many ways
+            raise CheckpointError(f"{path} holds no weights: {_line(error)}") from error
+        if not isinstance(state, dict):
+            raise CheckpointError(
+                f"{path} holds a {type(state).__name__}; it must be a dictionary of "
+                "weights and numbers."
+            )
+        return state
 
-def _load(path: Path) -> dict[str, Any]:
-    # weights_only: a checkpoint from elsewhere must not be able to run code.
-    return torch.load(path, map_location="cpu", weights_only=True)
+
+def _read_description(path: Path) -> dict[str, Any]:
+    """A checkpoint.json of this format."""
+    try:
+        if path.stat().st_size > _MAX_DESCRIPTION:
+            raise CheckpointError(f"{path} is too long for a checkpoint's description.")
+        values = json.loads(path.read_text())
+    except (OSError, ValueError, RecursionError) as error:
+        raise CheckpointError(f"{path} cannot be read: {error}.") from error
+    if not _is_object(values):
+        raise CheckpointError(f"{path} is no JSON object.")
+    if type(values.get("format")) is not int or values["format"] != FORMAT:
+        raise CheckpointError(
+            f"{path}: format is {values.get('format')!r}; this version reads {FORMAT}."
+        )
+    return values
+
+
+def _is_object(value: object) -> bool:
+    return isinstance(value, dict)
+
+
+def _is_duration(value: object) -> bool:
+    return type(value) in (int, float) and math.isfinite(value) and value >= 0
+
+
+def _line(error: Exception) -> str:
+    """The first line that says something."""
+    lines = [line.strip() for line in str(error).splitlines() if line.strip()]
+    return " ".join(lines[:2])[:200] or type(error).__name__
 
 
 def checkpoints_in(run: Path) -> list[Path]:
@@ -109,7 +205,7 @@ def checkpoints_in(run: Path) -> list[Path]:
     complete = (
         child
         for child in directory.iterdir()
-        if child.name.isdigit() and (child / _DESCRIPTION).exists()
+        if child.name.isdecimal() and (child / _DESCRIPTION).exists()
     )
     return sorted(complete, key=lambda child: int(child.name))
 
@@ -118,7 +214,7 @@ def save_checkpoint(
     run: Path,
     *,
     config: TrainingConfig,
-    signature: Signature,
+    shapes: NetworkShapes,
     frames: int,
     seconds: float,
     policy: Mapping[str, Any],
@@ -131,6 +227,9 @@ def save_checkpoint(
 
     Returns:
         Its directory.
+
+    Raises:
+        OSError: it cannot be written, as on a full disk; the others stay.
     """
     directory = Path(run) / _DIRECTORY
     directory.mkdir(parents=True, exist_ok=True)
@@ -143,29 +242,27 @@ def save_checkpoint(
         return target
     temporary = directory / f"{_UNFINISHED}{name}"
     temporary.mkdir()
+    checksums = {}
     for file, state in ((_POLICY, policy), (_LEARNING, learning)):
-        with open(temporary / file, "wb") as stream:
-            torch.save(dict(state), stream)
-            _flush(stream)
+        # By way of memory: torch's own writer hides the cause on a full disk.
+        stream = io.BytesIO()
+        torch.save(dict(state), stream)
+        data = stream.getvalue()
+        checksums[file] = hashlib.sha256(data).hexdigest()
+        files.write_bytes(temporary / file, data)
     description = {
         "format": FORMAT,
         "frames": frames,
         "seconds": seconds,
         "config": config.to_dict(),
-        "signature": signature.to_dict(),
+        "shapes": shapes.to_dict(),
+        "sha256": checksums,
         "versions": {
             name: version(name) for name in ("torch", "torchrl", "mujoco", "dm-control")
         },
     }
-    with open(temporary / _DESCRIPTION, "w") as stream:
-        json.dump(description, stream, indent=2)
-        _flush(stream)
+    files.write_text(temporary / _DESCRIPTION, json.dumps(description, indent=2) + "\n")
     os.rename(temporary, target)
     for old in checkpoints_in(run)[: -config.keep_checkpoints]:
         shutil.rmtree(old)
     return target
-
-
-def _flush(stream: Any) -> None:
-    stream.flush()
-    os.fsync(stream.fileno())

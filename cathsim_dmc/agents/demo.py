@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from pathlib import Path
 
-from cathsim_dmc.agents import configs, report, training
+from cathsim_dmc.agents import learners, report, training
 from cathsim_dmc.agents.checkpoint import Checkpoint
 
 
@@ -13,21 +13,21 @@ def demo(
     seed: int,
     say: Callable[[str], None] = lambda text: None,
 ) -> bool:
-    """Trains PPO on type1_bca, evaluates, draws and records it.
+    """Train PPO on type1_bca, evaluates, draws and records it.
 
     A run that is there is continued or, if it is complete, only evaluated.
 
     Args:
-      out: directory of the run.
-      frames: control steps of training.
-      seed: of everything.
-      say: told what happens.
+        out: Directory of the run.
+        frames: Number of control steps of training.
+        seed: Seed of networks, exploration and environments.
+        say: Function that is told what happens.
 
     Returns:
-      Whether it came to the end; an interrupted training can be continued.
+        Whether it came to the end; an interrupted training can be continued.
     """
     out = Path(out)
-    config = configs.make_config(
+    config = learners.make_config(
         "ppo", "demo", task="type1_bca", total_frames=frames, seed=seed
     )
     say(f"1/3 training PPO on {config.task}, {frames} frames -> {out}")

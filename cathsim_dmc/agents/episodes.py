@@ -5,8 +5,17 @@ from dataclasses import dataclass
 import numpy as np
 from tensordict import TensorDictBase
 
+from cathsim_dmc.analysis.force_statistics import EpisodeForces, ForceTracker
+
 # Information of the environment about a step, beside the observation.
 INFO = "info"
+# Force of a control step -> its name in the information.
+_FORCES = {
+    "sum": "wall_force_sum",
+    "max": "wall_force_max",
+    "peak_sum": "wall_force_peak_sum",
+    "peak_max": "wall_force_peak_max",
+}
 
 
 @dataclass(frozen=True)
@@ -14,17 +23,14 @@ class EpisodeOutcome:
     """One finished episode. None where the environment does not tell.
 
     Attributes:
-        env: index of the environment it ran in.
-        reward: sum over the episode.
-        length: control steps.
-        terminated: ended by the task, not by the clock.
-        success: whether the goal was reached.
-        mean_force: mean over steps of the force summed over the wall (N).
-        max_force: largest single contact force on the wall at the end of a control
-            step (N), as published.
-        peak_force: the same within the control steps (N).
-        physics_error: whether the simulation diverged, which ended it.
-        path_ratio: length of the head's path over the route that was left; below 1
+        env: Index of the environment it ran in.
+        reward: Sum of the rewards over the episode.
+        length: Number of control steps.
+        terminated: Whether it was ended by the task, not by the clock.
+        success: Whether the goal was reached.
+        forces: Forces on the wall, N.
+        physics_error: Whether the simulation diverged, which ended it.
+        path_ratio: Length of the head's path over the route that was left; below 1
             where the head cuts the corner of the route at an ostium.
     """
 
@@ -33,11 +39,24 @@ class EpisodeOutcome:
     length: int
     terminated: bool
     success: bool | None
-    mean_force: float | None
-    max_force: float | None
-    peak_force: float | None = None
+    forces: EpisodeForces
     physics_error: bool = False
     path_ratio: float | None = None
+
+    @property
+    def mean_force(self) -> float | None:
+        """Mean over all steps of the sum over contacts at their end, N."""
+        return self.forces.sum and self.forces.sum.mean
+
+    @property
+    def max_force(self) -> float | None:
+        """Largest single contact at the end of any control step, N."""
+        return self.forces.max and self.forces.max.maximum
+
+    @property
+    def peak_force(self) -> float | None:
+        """Largest single contact of any physics step, N."""
+        return self.forces.peak_max and self.forces.peak_max.maximum
 
 
 def information(batch: TensorDictBase, name: str) -> np.ndarray | None:
@@ -54,63 +73,45 @@ class EpisodeTracker:
     def __init__(self, num_envs: int):
         self.reward = np.zeros(num_envs)
         self.length = np.zeros(num_envs, dtype=np.int64)
-        self.force_sum = np.zeros(num_envs)
-        self.force_max = np.zeros(num_envs)
-        self.force_peak = np.zeros(num_envs)
         self.success = np.zeros(num_envs, dtype=bool)
+        self.forces = ForceTracker(num_envs)
 
     def add(self, batch: TensorDictBase) -> list[EpisodeOutcome]:
         """Add steps (num_envs, steps); return the episodes that ended, in order."""
         reward = batch["next", "reward"].reshape(batch.shape).double().numpy()
         done = batch["next", "done"].reshape(batch.shape).numpy()
         terminated = batch["next", "terminated"].reshape(batch.shape).numpy()
-        force_sum = information(batch, "wall_force_sum")
-        force_max = information(batch, "wall_force_max")
+        forces = {name: information(batch, key) for name, key in _FORCES.items()}
         success = information(batch, "success")
-        force_peak = information(batch, "wall_force_peak")
         error = information(batch, "physics_error")
         path_ratio = information(batch, "path_ratio")
         finished = []
         for step in range(batch.shape[1]):
             self.reward += reward[:, step]
             self.length += 1
-            if force_sum is not None:
-                self.force_sum += force_sum[:, step]
-            if force_max is not None:
-                np.maximum(self.force_max, force_max[:, step], out=self.force_max)
-            if force_peak is not None:
-                np.maximum(self.force_peak, force_peak[:, step], out=self.force_peak)
+            self.forces.add(
+                {
+                    name: None if values is None else values[:, step]
+                    for name, values in forces.items()
+                }
+            )
             if success is not None:
                 self.success |= success[:, step] > 0
-            for env in np.flatnonzero(done[:, step]):
-                length = int(self.length[env])
+            for env in map(int, np.flatnonzero(done[:, step])):
                 finished.append(
                     EpisodeOutcome(
-                        env=int(env),
+                        env=env,
                         reward=float(self.reward[env]),
-                        length=length,
+                        length=int(self.length[env]),
                         terminated=bool(terminated[env, step]),
                         success=None if success is None else bool(self.success[env]),
-                        mean_force=None
-                        if force_sum is None
-                        else float(self.force_sum[env] / length),
-                        max_force=None
-                        if force_max is None
-                        else float(self.force_max[env]),
-                        peak_force=None
-                        if force_peak is None
-                        else float(self.force_peak[env]),
+                        forces=self.forces.finish(env),
                         physics_error=error is not None and bool(error[env, step]),
                         path_ratio=None
                         if path_ratio is None
                         else float(path_ratio[env, step]),
                     )
                 )
-                self._clear(env)
+                self.reward[env] = self.length[env] = 0
+                self.success[env] = False
         return finished
-
-    def _clear(self, env: int) -> None:
-        self.reward[env] = self.force_sum[env] = self.force_max[env] = 0.0
-        self.force_peak[env] = 0.0
-        self.length[env] = 0
-        self.success[env] = False

@@ -1,7 +1,7 @@
 """Evaluation: fixed seeds, each episode counted once, intervals beside every mean."""
 
+import dataclasses
 import json
-import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -9,30 +9,24 @@ from typing import Any
 
 import numpy as np
 import torch
-from tensordict import TensorDictBase
 from torchrl.envs import EnvBase
-from torchrl.envs.utils import ExplorationType, set_exploration_type, step_mdp
+from torchrl.envs.utils import step_mdp
 
-from cathsim_dmc.agents.checkpoint import Checkpoint
+from cathsim_dmc import files
 from cathsim_dmc.agents.episodes import EpisodeOutcome, EpisodeTracker
-from cathsim_dmc.agents.training import EnvFactory
-from cathsim_dmc.analysis.force_statistics import wilson_interval
+from cathsim_dmc.agents.policies import PolicyLike, load_policy, view_of
+from cathsim_dmc.analysis.force_statistics import QUANTITIES, Statistics
+from cathsim_dmc.policies import Policy
 from cathsim_dmc.simulation import environments
 
-Policy = Callable[[TensorDictBase], TensorDictBase | torch.Tensor]
+EnvFactory = Callable[..., EnvBase]
 # Called after every step with the environment and which episodes (n,) bool still run.
 Observer = Callable[[EnvBase, np.ndarray], None]
 
+EVALUATION_SEED = 1_000_000  # apart from the seeds of training
 BOOTSTRAP_SAMPLES = 10_000
 
-_REPORTED = (
-    "reward",
-    "length",
-    "mean_force",
-    "max_force",
-    "peak_force",
-    "path_ratio",
-)
+_REPORTED = ("reward", "length", "path_ratio")
 
 
 @dataclass(frozen=True)
@@ -40,11 +34,11 @@ class EvaluationResult:
     """Episodes of one policy on one task.
 
     Attributes:
-        task: name of the task.
-        policy: what was evaluated.
-        seed: of the first episode; episode i was played with seed + i.
-        episodes: in the order of their seeds.
-        settings: observation, task_kwargs and, for a checkpoint, its frames.
+        task: Name of the task.
+        policy: Name of the policy.
+        seed: Seed of the first episode; episode i was played with seed + i.
+        episodes: Episodes in the order of their seeds.
+        settings: Observation, task_kwargs, backend and, for a checkpoint, its frames.
     """
 
     task: str
@@ -54,8 +48,19 @@ class EvaluationResult:
     settings: Mapping[str, Any]
 
     def values(self, name: str) -> np.ndarray:
-        """An outcome of every episode, float64 (episodes,); NaN where unknown."""
-        return np.array([getattr(e, name) for e in self.episodes], dtype=np.float64)
+        """A figure of every episode, float64 (episodes,); NaN where unknown.
+
+        Args:
+            name: Name of an attribute of `EpisodeOutcome`, with dots for what lies
+                deeper, such as "reward" or "forces.peak_sum.maximum".
+        """
+
+        def value(outcome: Any) -> Any:
+            for part in name.split("."):
+                outcome = None if outcome is None else getattr(outcome, part)
+            return outcome
+
+        return np.array([value(e) for e in self.episodes], dtype=np.float64)
 
     def mean_sd(self, name: str) -> tuple[float | None, float | None]:
         """Mean and sample standard deviation over the episodes; None if unknown."""
@@ -73,16 +78,32 @@ class EvaluationResult:
         return sum(known) if len(known) == len(self.episodes) else None
 
     def summary(self) -> dict[str, Any]:
-        """Means with deviations and the success rate with its interval."""
+        """Means with deviations over the episodes, success rate with its interval.
+
+        Forces in N, by quantity and statistic as docs/forces.md defines them.
+        """
         result: dict[str, Any] = {"episodes": len(self.episodes)}
         for name in _REPORTED:
             result[name], result[f"{name}_sd"] = self.mean_sd(name)
+        result["forces"] = {
+            quantity: {
+                statistic.name: dict(
+                    zip(
+                        ("mean", "sd"),
+                        self.mean_sd(f"forces.{quantity}.{statistic.name}"),
+                        strict=True,
+                    )
+                )
+                for statistic in dataclasses.fields(Statistics)
+            }
+            for quantity in QUANTITIES
+        }
         result["physics_errors"] = sum(e.physics_error for e in self.episodes)
         successes = self.successes
         rate = interval = None
         if successes is not None:
             rate = successes / len(self.episodes)
-            interval = list(wilson_interval(successes, len(self.episodes)))
+            interval = list(success_interval(successes, len(self.episodes)))
         result["success"] = rate
         result["success_ci95"] = interval
         return result
@@ -107,19 +128,20 @@ class Comparison:
     """How much better one policy is than another on the same seeds.
 
     Attributes:
-        policy: the one in question.
-        baseline: the other.
-        reward_difference: mean over seeds of the difference of episode rewards.
-        reward_ci95: its bootstrap interval, resampling seeds.
-        success_difference: difference of the success rates; None if unknown.
-        success_ci95: its bootstrap interval; None if unknown.
-        better: whether the reward interval lies above zero.
+        policy: Name of the policy in question.
+        baseline: Name of the other one.
+        reward_difference: Mean over seeds of the difference of episode rewards.
+        reward_ci95: Bootstrap interval of that mean, resampling seeds; None for a
+            single seed.
+        success_difference: Difference of the success rates; None if unknown.
+        success_ci95: Bootstrap interval of that difference; None if unknown.
+        better: Whether the reward interval lies above zero.
     """
 
     policy: str
     baseline: str
     reward_difference: float
-    reward_ci95: tuple[float, float]
+    reward_ci95: tuple[float, float] | None
     success_difference: float | None
     success_ci95: tuple[float, float] | None
     better: bool
@@ -129,16 +151,35 @@ class Comparison:
         return asdict(self)
 
 
+def success_interval(successes: int, trials: int) -> tuple[float, float]:
+    """Wilson's 95 % interval of a success rate, as fractions."""
+    # Imported late: it takes most of a second.
+    from scipy import stats
+
+    interval = stats.binomtest(successes, trials).proportion_ci(method="wilson")
+    return float(interval.low), float(interval.high)
+
+
 def paired_bootstrap(
     first: np.ndarray, second: np.ndarray, seed: int = 0
-) -> tuple[float, tuple[float, float]]:
-    """Mean of first - second over pairs (n,), with its 95 % percentile interval."""
+) -> tuple[float, tuple[float, float] | None]:
+    """Mean of first - second over pairs (n,), with its 95 % percentile interval.
+
+    The interval is None for a single pair, which tells nothing about the spread.
+    """
+    from scipy import stats
+
     difference = np.asarray(first, np.float64) - np.asarray(second, np.float64)
-    draws = np.random.default_rng(seed).integers(
-        len(difference), size=(BOOTSTRAP_SAMPLES, len(difference))
-    )
-    low, high = np.quantile(difference[draws].mean(1), (0.025, 0.975))
-    return float(difference.mean()), (float(low), float(high))
+    if len(difference) < 2:
+        return float(difference.mean()), None
+    interval = stats.bootstrap(
+        (difference,),
+        np.mean,
+        n_resamples=BOOTSTRAP_SAMPLES,
+        method="percentile",
+        random_state=np.random.default_rng(seed),
+    ).confidence_interval
+    return float(difference.mean()), (float(interval.low), float(interval.high))
 
 
 def compare(policy: EvaluationResult, baseline: EvaluationResult) -> Comparison:
@@ -169,31 +210,20 @@ def compare(policy: EvaluationResult, baseline: EvaluationResult) -> Comparison:
         reward_ci95=reward_ci,
         success_difference=success,
         success_ci95=success_ci,
-        better=reward_ci[0] > 0,
+        better=reward_ci is not None and reward_ci[0] > 0,
     )
 
 
-def random_policy(num_actions: int, seed: int = 0) -> Policy:
-    """Uniform actions in [-1, 1] from a generator of its own."""
-    generator = torch.Generator().manual_seed(seed)
-
-    def random(observation: TensorDictBase) -> torch.Tensor:
-        shape = (*observation.batch_size, num_actions)
-        return 2.0 * torch.rand(shape, generator=generator) - 1.0
-
-    return random
-
-
 def evaluate(
-    policy: str | Path | Checkpoint | Policy,
+    policy: PolicyLike,
     task: str | None = None,
     episodes: int = 30,
-    seed: int = 1_000_000,
+    seed: int = EVALUATION_SEED,
     *,
     name: str | None = None,
     observation: str | Sequence[str] | None = None,
     task_kwargs: Mapping[str, Any] | None = None,
-    path: str = "batched",
+    backend: str = "batched",
     num_threads: int | None = None,
     out_dir: str | Path | None = None,
     observer: Observer | None = None,
@@ -206,44 +236,42 @@ def evaluate(
     while others finish is not counted.
 
     Args:
-        policy: a run's or checkpoint's directory, a Checkpoint, "random", or a
-            callable that gets the observations (episodes,) and returns the actions
-            or the tensordict with "action" in it. "step_count" tells such a callable
-            where each episode stands.
-        task: the task; for a checkpoint, None takes the one it was trained on.
-        episodes: how many.
-        seed: of the first episode. The default lies apart from training seeds.
-        name: of the policy, for the reports.
-        observation: as for task.
-        task_kwargs: as for task.
-        path: "batched" or "composer".
-        num_threads: of the batched simulation.
-        out_dir: write evaluation.json there.
-        observer: called after every step, before any environment is reset.
-        make_env: see `environments.make_env`.
+        policy: Directory of a run or of a checkpoint, Checkpoint, name in
+            `cathsim_dmc.policies.POLICIES`, policy, or function of the observations
+            (episodes, ...) that returns the actions (episodes, A) or the TensorDict
+            with "action" in it.
+        task: Name of the task; None takes the one that the policy was trained on.
+        episodes: Number of episodes.
+        seed: Seed of the first episode; the others count up. The default lies apart
+            from training seeds.
+        name: Name of the policy for the reports.
+        observation: Name or names of the observations; None takes those that the
+            policy reads.
+        task_kwargs: Further options of the task; None takes those that the policy was
+            trained with.
+        backend: Way of simulating, "batched" or "composer".
+        num_threads: Number of threads of the batched simulation; None takes one per
+            core.
+        out_dir: Directory for evaluation.json; None writes none.
+        observer: Function that is called after every step, before any environment is
+            reset.
+        make_env: Function that makes the environment, as `environments.make_env`.
 
     Raises:
         ValueError: no task is known, or episodes < 1.
-        CheckpointError: there is no such checkpoint.
+        CheckpointError: there is no such checkpoint, or it is damaged.
     """
     if episodes < 1:
         raise ValueError(f"episodes={episodes}: at least one is needed.")
-    checkpoint = None
-    if isinstance(policy, Checkpoint):
-        checkpoint = policy
-    elif isinstance(policy, str | Path) and str(policy) != "random":
-        checkpoint = Checkpoint.open(policy)
-    if checkpoint is not None:
-        config = checkpoint.config
-        task = config.task if task is None else task
-        observation = config.observation if observation is None else observation
-        task_kwargs = config.task_kwargs if task_kwargs is None else task_kwargs
-    if task is None:
-        raise ValueError("task=None: a policy that is no checkpoint needs a task.")
+    player = load_policy(policy, seed)
+    task = require_task(player, task)
+    checkpoint = getattr(player, "checkpoint", None)
+    if task_kwargs is None:
+        task_kwargs = player.task_kwargs
     settings = {
-        "observation": observation or "internal",
+        "observation": observation or player.observation or "internal",
         "task_kwargs": dict(task_kwargs or {}),
-        "path": path,
+        "backend": backend,
         "frames": checkpoint.frames if checkpoint else None,
     }
     env = make_env(
@@ -252,48 +280,59 @@ def evaluate(
         num_envs=episodes,
         num_threads=num_threads,
         seed=seed,
-        path=path,
+        backend=backend,
         task_kwargs=settings["task_kwargs"],
     )
-    if checkpoint is not None:
-        act: Policy = checkpoint.policy()
-        name = name or f"{checkpoint.config.algorithm} {checkpoint.path.name}"
-    elif isinstance(policy, str | Path):
-        act = random_policy(env.action_spec.shape[-1], seed)
-        name = name or "random"
-    else:
-        act = policy
-        name = name or getattr(policy, "__name__", type(policy).__name__)
     try:
-        outcomes = _first_episodes(env, act, observer)
+        outcomes = _first_episodes(env, player, observer)
     finally:
         env.close()
-    result = EvaluationResult(task, name, seed, outcomes, settings)
+    result = EvaluationResult(task, name or player.name, seed, outcomes, settings)
     if out_dir is not None:
         write_evaluation(out_dir, result.to_dict())
     return result
 
 
+def require_task(policy: Policy, task: str | None) -> str:
+    """The task asked for, or the one that the policy was made for.
+
+    Raises:
+        ValueError: there is neither.
+    """
+    chosen = task or policy.task
+    if chosen is None:
+        from cathsim_dmc import suite
+
+        raise ValueError(
+            f"the policy {policy.name!r} was not trained on a task, so it needs a "
+            f"task to play: one of {', '.join(suite.SUITE)}"
+        )
+    return chosen
+
+
 @torch.no_grad()
 def _first_episodes(
-    env: EnvBase, act: Policy, observer: Observer | None
+    env: EnvBase, policy: Policy, observer: Observer | None
 ) -> tuple[EpisodeOutcome, ...]:
     (count,) = env.batch_size
     tracker = EpisodeTracker(count)
     outcomes: dict[int, EpisodeOutcome] = {}
-    with set_exploration_type(ExplorationType.DETERMINISTIC):
-        current = env.reset()
-        while len(outcomes) < count:
-            answer = act(current)
-            action = answer if isinstance(answer, torch.Tensor) else answer["action"]
-            current["action"] = action.to(torch.float32)
-            stepped = env.step(current)
-            if observer is not None:
-                running = np.array([index not in outcomes for index in range(count)])
-                observer(env, running)
-            for outcome in tracker.add(stepped.unsqueeze(1)):
-                outcomes.setdefault(outcome.env, outcome)
-            current = env.maybe_reset(step_mdp(stepped))
+    current = env.reset()
+    view = view_of(env)
+    begins = np.ones(count, dtype=bool)
+    while len(outcomes) < count:
+        if begins.any():
+            policy.reset(view, begins)
+        action = torch.as_tensor(policy.act(current))
+        current["action"] = action.to(torch.float32)
+        stepped = env.step(current)
+        if observer is not None:
+            running = np.array([index not in outcomes for index in range(count)])
+            observer(env, running)
+        for outcome in tracker.add(stepped.unsqueeze(1)):
+            outcomes.setdefault(outcome.env, outcome)
+        begins = stepped["next", "done"].reshape(count).numpy()
+        current = env.maybe_reset(step_mdp(stepped))
     return tuple(outcomes[env_index] for env_index in range(count))
 
 
@@ -301,8 +340,5 @@ def write_evaluation(out_dir: str | Path, values: Mapping[str, Any]) -> Path:
     """Write evaluation.json atomically; return its path."""
     directory = Path(out_dir)
     directory.mkdir(parents=True, exist_ok=True)
-    target = directory / "evaluation.json"
-    temporary = directory / "evaluation.json.tmp"
-    temporary.write_text(json.dumps(values, indent=2) + "\n")
-    os.replace(temporary, target)
-    return target
+    text = json.dumps(values, indent=2) + "\n"
+    return files.write_text(directory / "evaluation.json", text)

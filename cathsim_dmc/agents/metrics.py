@@ -6,6 +6,8 @@ import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
+from cathsim_dmc import files
+
 
 class MetricsError(ValueError):
     """A metrics file does not belong to this run."""
@@ -15,10 +17,10 @@ class MetricsFile:
     """Append rows of numbers keyed by the frame counter.
 
     Args:
-        path: of the CSV file.
-        columns: names; the first is the frame counter.
-        resume_at: keep existing rows up to this frame and drop later ones (a killed
-            run writes rows past its last checkpoint); None starts a new file.
+        path: Path of the CSV file.
+        columns: Names of the columns; the first is the frame counter.
+        resume_at: Frame up to which existing rows are kept; later ones are dropped (a
+            killed run writes rows past its last checkpoint). None starts a new file.
     """
 
     def __init__(
@@ -27,12 +29,9 @@ class MetricsFile:
         self.path = Path(path)
         self.columns = list(columns)
         kept = [] if resume_at is None else self._rows_until(resume_at)
-        temporary = self.path.with_suffix(".csv.tmp")
-        with open(temporary, "w", newline="") as file:
-            csv.writer(file, lineterminator="\n").writerows([self.columns, *kept])
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(temporary, self.path)
+        text = io.StringIO()
+        csv.writer(text, lineterminator="\n").writerows([self.columns, *kept])
+        files.write_text(self.path, text.getvalue())
 
     def append(self, values: Mapping[str, float | int | None]) -> None:
         """Write one row in a single system call; None leaves a field empty."""
@@ -59,7 +58,7 @@ class MetricsFile:
             )
         # A row cut short by a crash has fewer fields.
         whole = (row for row in rows if len(row) == len(header))
-        return [row for row in whole if int(row[0]) <= frames]
+        return [row for row in whole if row[0].isdecimal() and int(row[0]) <= frames]
 
 
 def _cell(value: float | int | None) -> str:

@@ -10,7 +10,7 @@ from torch import nn
 from torchrl.envs import EnvBase
 from torchrl.modules import ProbabilisticActor, TanhNormal, ValueOperator
 
-from cathsim_dmc.agents.configs import TrainingConfig
+from cathsim_dmc.agents.config import TrainingConfig
 from cathsim_dmc.agents.normalisation import ObservationNormaliser
 from cathsim_dmc.simulation.environments import PIXELS, VECTOR
 
@@ -24,11 +24,14 @@ CONVOLUTIONS = ((32, 8, 4), (64, 4, 2), (64, 3, 1))
 # actions sit at their bounds.
 LOG_STD_RANGE = (-5.0, 2.0)
 
+# Largest size that a description of networks may ask for: it must not take all memory.
+MAX_SIZE = 65_536
+
 _ACTIVATIONS = {"tanh": nn.Tanh, "relu": nn.ReLU, "elu": nn.ELU}
 
 
 @dataclass(frozen=True)
-class Signature:
+class NetworkShapes:
     """Sizes that fix the networks: all that is needed to rebuild a policy.
 
     Attributes:
@@ -42,7 +45,7 @@ class Signature:
     actions: int
 
     @classmethod
-    def of(cls, env: EnvBase) -> "Signature":
+    def of(cls, env: EnvBase) -> "NetworkShapes":
         """Read the sizes from an environment's specs."""
         spec = env.observation_spec
         keys = list(spec.keys())
@@ -51,13 +54,33 @@ class Signature:
         return cls(int(vector), pixels, int(env.action_spec.shape[-1]))
 
     @classmethod
-    def from_dict(cls, values: Mapping[str, Any]) -> "Signature":
-        """The inverse of to_dict."""
-        pixels = values["pixels"]
+    def from_dict(cls, values: Mapping[str, Any]) -> "NetworkShapes":
+        """The inverse of to_dict.
+
+        Raises:
+            ValueError: a size is missing, no integer or out of range.
+        """
+
+        def size(value: object, name: str, least: int) -> int:
+            if type(value) is not int or not least <= value <= MAX_SIZE:
+                raise ValueError(
+                    f"shapes.{name} is {value!r}; it must be an integer from {least} "
+                    f"to {MAX_SIZE:,}."
+                )
+            return value
+
+        pixels = values.get("pixels")
+        if pixels is not None:
+            if not isinstance(pixels, list | tuple) or len(pixels) != 3:
+                raise ValueError(
+                    f"shapes.pixels is {pixels!r}; it must be null or [channels, "
+                    "height, width]."
+                )
+            pixels = tuple(size(value, "pixels", 1) for value in pixels)
         return cls(
-            values["vector"],
-            None if pixels is None else tuple(pixels),
-            values["actions"],
+            vector=size(values.get("vector"), "vector", 0),
+            pixels=pixels,
+            actions=size(values.get("actions"), "actions", 1),
         )
 
     def to_dict(self) -> dict[str, Any]:
@@ -104,17 +127,17 @@ class Body(nn.Module):
     layers follow.
     """
 
-    def __init__(self, signature: Signature, config: TrainingConfig, actions: int = 0):
+    def __init__(self, shapes: NetworkShapes, config: TrainingConfig, actions: int = 0):
         super().__init__()
         self.convolutions = None
-        size = signature.vector + actions
-        if signature.pixels is not None:
-            self.convolutions = Convolutions(signature.pixels, config.cnn_features)
+        size = shapes.vector + actions
+        if shapes.pixels is not None:
+            self.convolutions = Convolutions(shapes.pixels, config.cnn_features)
             size += config.cnn_features
-        self.has_pixels = signature.pixels is not None
-        self.has_vector = signature.vector > 0
+        self.has_pixels = shapes.pixels is not None
+        self.has_vector = shapes.vector > 0
         layers: list[nn.Module] = []
-        if signature.vector or actions:
+        if shapes.vector or actions:
             for width in config.hidden:
                 layers += [nn.Linear(size, width), _ACTIVATIONS[config.activation]()]
                 size = width
@@ -122,7 +145,7 @@ class Body(nn.Module):
         self.features = size
 
     def forward(self, *inputs: torch.Tensor) -> torch.Tensor:
-        """Inputs in the order of Signature.keys, then the action if there is one."""
+        """Inputs in the order of `shapes.keys`, then the action if there is one."""
         parts = list(inputs)
         if self.has_pixels:
             index = int(self.has_vector)
@@ -134,23 +157,23 @@ class GaussianActor(nn.Module):
     """Mean and deviation of the actions before the tanh, each (..., actions).
 
     Args:
-        signature: sizes of observation and action.
+        shapes: sizes of observation and action.
         config: widths and activation.
         state_dependent_std: whether the deviation is an output of the network (SAC)
             or one parameter per action (PPO).
     """
 
     def __init__(
-        self, signature: Signature, config: TrainingConfig, state_dependent_std: bool
+        self, shapes: NetworkShapes, config: TrainingConfig, state_dependent_std: bool
     ):
         super().__init__()
-        self.body = Body(signature, config)
-        self.mean = nn.Linear(self.body.features, signature.actions)
+        self.body = Body(shapes, config)
+        self.mean = nn.Linear(self.body.features, shapes.actions)
         self.state_dependent_std = state_dependent_std
         if state_dependent_std:
-            self.log_std = nn.Linear(self.body.features, signature.actions)
+            self.log_std = nn.Linear(self.body.features, shapes.actions)
         else:
-            self.log_std = nn.Parameter(torch.zeros(signature.actions))
+            self.log_std = nn.Parameter(torch.zeros(shapes.actions))
 
     def forward(self, *inputs: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Return (mean, deviation)."""
@@ -163,13 +186,13 @@ class GaussianActor(nn.Module):
 class Value(nn.Module):
     """Value (..., 1) of an observation, or of observation and action."""
 
-    def __init__(self, signature: Signature, config: TrainingConfig, actions: int = 0):
+    def __init__(self, shapes: NetworkShapes, config: TrainingConfig, actions: int = 0):
         super().__init__()
-        self.body = Body(signature, config, actions)
+        self.body = Body(shapes, config, actions)
         self.value = nn.Linear(self.body.features, 1)
 
     def forward(self, *inputs: torch.Tensor) -> torch.Tensor:
-        """Inputs in the order of Signature.keys, then the action if there is one."""
+        """Inputs in the order of `shapes.keys`, then the action if there is one."""
         return self.value(self.body(*inputs))
 
 
@@ -181,16 +204,10 @@ def orthogonal_(module: nn.Module, head: nn.Linear, gain: float) -> None:
             nn.init.zeros_(layer.bias)
 
 
-def make_actor(signature: Signature, config: TrainingConfig) -> ProbabilisticActor:
-    """The stochastic actor of the config's algorithm; actions in [-1, 1]."""
-    network = GaussianActor(
-        signature, config, state_dependent_std=config.algorithm == "sac"
-    )
-    if config.algorithm == "ppo":
-        # A small head starts the policy near the middle of every action's range.
-        orthogonal_(network, network.mean, 0.01)
+def make_actor(shapes: NetworkShapes, network: GaussianActor) -> ProbabilisticActor:
+    """The stochastic actor on a network; actions in [-1, 1]."""
     return ProbabilisticActor(
-        TensorDictModule(network, in_keys=signature.keys, out_keys=["loc", "scale"]),
+        TensorDictModule(network, in_keys=shapes.keys, out_keys=["loc", "scale"]),
         in_keys=["loc", "scale"],
         out_keys=["action"],
         distribution_class=TanhNormal,
@@ -198,28 +215,30 @@ def make_actor(signature: Signature, config: TrainingConfig) -> ProbabilisticAct
     )
 
 
-def make_critic(signature: Signature, config: TrainingConfig) -> ValueOperator:
+def make_critic(shapes: NetworkShapes, config: TrainingConfig) -> ValueOperator:
     """State value, key "state_value"."""
-    network = Value(signature, config)
+    network = Value(shapes, config)
     orthogonal_(network, network.value, 1.0)
-    return ValueOperator(network, in_keys=signature.keys)
+    return ValueOperator(network, in_keys=shapes.keys)
 
 
-def make_q_function(signature: Signature, config: TrainingConfig) -> ValueOperator:
+def make_q_function(shapes: NetworkShapes, config: TrainingConfig) -> ValueOperator:
     """Action value, key "state_action_value"."""
-    network = Value(signature, config, signature.actions)
-    return ValueOperator(network, in_keys=[*signature.keys, "action"])
+    network = Value(shapes, config, shapes.actions)
+    return ValueOperator(network, in_keys=[*shapes.keys, "action"])
 
 
-def make_normaliser(signature: Signature, config: TrainingConfig) -> TensorDictModule:
+def make_normaliser(shapes: NetworkShapes, config: TrainingConfig) -> TensorDictModule:
     """The module that turns the raw vector into the networks' input."""
-    module = ObservationNormaliser(signature.vector, config.observation_clip)
+    module = ObservationNormaliser(shapes.vector, config.observation_clip)
     return TensorDictModule(module, in_keys=[VECTOR], out_keys=[NORMAL])
 
 
-def make_policy(signature: Signature, config: TrainingConfig) -> TensorDictSequential:
+def make_policy(
+    shapes: NetworkShapes, config: TrainingConfig, actor: ProbabilisticActor
+) -> TensorDictSequential:
     """Normaliser and actor in one: raw observation in, action out."""
     modules: list[nn.Module] = []
-    if signature.vector:
-        modules.append(make_normaliser(signature, config))
-    return TensorDictSequential(*modules, make_actor(signature, config))
+    if shapes.vector:
+        modules.append(make_normaliser(shapes, config))
+    return TensorDictSequential(*modules, actor)

@@ -1,33 +1,130 @@
-"""Policies for dm_control environments: timestep in, action out."""
+"""Policies of every kind behind one face: by name, from a checkpoint, a function."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
 
-import dm_env
 import numpy as np
 import torch
-from dm_control import composer
-from tensordict import TensorDict
+from tensordict import TensorDict, TensorDictBase
+from torchrl.envs import EnvBase, SerialEnv
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from cathsim_dmc.agents.checkpoint import Checkpoint
+from cathsim_dmc.policies import (
+    POLICIES,
+    BatchedView,
+    ComposerView,
+    Policy,
+    View,
+    make_policy,
+)
 from cathsim_dmc.simulation import environments
 
-TimestepPolicy = Callable[[dm_env.TimeStep], np.ndarray]
+# Gets the standard observations (N, ...), returns the actions (N, A) or the TensorDict
+# with "action" in it.
+PolicyFunction = Callable[[TensorDictBase], TensorDictBase | torch.Tensor]
+PolicyLike = str | Path | Checkpoint | Policy | PolicyFunction
 
 
-def trained(checkpoint: Checkpoint) -> TimestepPolicy:
-    """The trained policy, acting deterministically with frozen statistics."""
-    network = checkpoint.policy()
+class FunctionPolicy(Policy):
+    """A function of the standard observations.
+
+    A function with randomness of its own, such as a network, acts deterministically:
+    with the middle of its distribution.
+    """
+
+    def __init__(self, function: PolicyFunction, name: str | None = None):
+        """Wraps a function.
+
+        Args:
+            function: Function from the observations (N, ...) to the actions (N, A) or
+                to the TensorDict with "action" in it.
+            name: Name for reports; by default the function's.
+        """
+        self._function = function
+        default = getattr(function, "__name__", type(function).__name__)
+        self.name = name or default
 
     @torch.no_grad()
-    def act(timestep: dm_env.TimeStep) -> np.ndarray:
+    def act(self, observation: Any) -> np.ndarray:
+        """Actions (N, A) float32."""
+        if not isinstance(observation, TensorDictBase):
+            observation = _tensors(observation)
         with set_exploration_type(ExplorationType.DETERMINISTIC):
-            return network(_tensors(timestep.observation))["action"][0].double().numpy()
+            answer = self._function(observation)
+        action = answer if isinstance(answer, torch.Tensor) else answer["action"]
+        return action.to(torch.float32).numpy()
 
-    return act
+
+class TrainedPolicy(FunctionPolicy):
+    """The policy of a checkpoint, with frozen observation statistics."""
+
+    def __init__(self, checkpoint: Checkpoint):
+        """Loads the weights.
+
+        Args:
+            checkpoint: Checkpoint of a run.
+
+        Raises:
+            CheckpointError: its weights cannot be used.
+        """
+        config = checkpoint.config
+        name = f"{config.algorithm} {checkpoint.path.name}"
+        super().__init__(checkpoint.policy(), name)
+        self.checkpoint = checkpoint
+        self.task = config.task
+        self.observation = config.observation
+        self.task_kwargs = config.task_kwargs
 
 
-def _tensors(observation: dict[str, np.ndarray]) -> TensorDict:
+def load_policy(policy: PolicyLike, seed: int = 0) -> Policy:
+    """A policy from whatever names one.
+
+    Args:
+        policy: Name in `POLICIES`, directory of a run or of a checkpoint, Checkpoint,
+            policy, or function as for `FunctionPolicy`.
+        seed: Seed of a named policy's own randomness.
+
+    Raises:
+        CheckpointError: it is neither a name nor a directory with a checkpoint.
+    """
+    if isinstance(policy, Policy):
+        return policy
+    if isinstance(policy, Checkpoint):
+        return TrainedPolicy(policy)
+    if isinstance(policy, str | Path):
+        if str(policy) in POLICIES:
+            return make_policy(str(policy), seed)
+        return TrainedPolicy(Checkpoint.open(policy))
+    return FunctionPolicy(policy)
+
+
+class _ForeignView:
+    """Simulations of an environment that is not ours: only their numbers are known."""
+
+    def __init__(self, env: EnvBase):
+        (self.num_simulations,) = env.batch_size
+        self.num_actions = int(env.action_spec.shape[-1])
+
+    def __getattr__(self, name: str) -> Any:
+        raise AttributeError(
+            f"the policy asks for {name!r}, which only environments of "
+            "cathsim_dmc.simulation know"
+        )
+
+
+def view_of(env: EnvBase) -> View:
+    """What a policy may know of the simulations of a TorchRL environment."""
+    base = getattr(env, "base_env", env)
+    if hasattr(base, "simulation"):
+        return BatchedView(base.simulation)
+    if isinstance(base, SerialEnv):
+        return ComposerView([environments.composer_of(one) for one in base._envs])
+    return _ForeignView(env)
+
+
+def _tensors(observation: Mapping[str, np.ndarray]) -> TensorDict:
     """One observation as `environments.standard_observations` arranges it."""
     vectors, images = [], []
     for _, value in sorted(observation.items()):
@@ -41,17 +138,3 @@ def _tensors(observation: dict[str, np.ndarray]) -> TensorDict:
     if images:
         entries[environments.PIXELS] = torch.cat(images)[None]
     return TensorDict(entries, batch_size=[1])
-
-
-def random(environment: composer.Environment, seed: int) -> TimestepPolicy:
-    """Uniform actions from a generator of its own."""
-    generator = np.random.default_rng(seed)
-    shape = environment.action_spec().shape
-    return lambda timestep: generator.uniform(-1, 1, shape)
-
-
-def push(environment: composer.Environment) -> TimestepPolicy:
-    """Full push, tip motors at rest."""
-    action = np.zeros(environment.action_spec().shape)
-    action[len(environment.task.catheter.tip_motors)] = 1.0
-    return lambda timestep: action

@@ -1,6 +1,9 @@
 """Proximal policy optimisation on TorchRL's ClipPPOLoss and GAE."""
 
-from typing import Any
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, ClassVar
 
 import torch
 from tensordict import TensorDictBase
@@ -9,24 +12,119 @@ from torch import nn
 from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.value import GAE
 
-from cathsim_dmc.agents.configs import PPOConfig
+from cathsim_dmc.agents.config import ConfigError, TrainingConfig, require
 from cathsim_dmc.agents.networks import (
-    Signature,
+    GaussianActor,
+    NetworkShapes,
     make_actor,
     make_critic,
-    make_normaliser,
+    make_policy,
+    orthogonal_,
 )
 from cathsim_dmc.simulation.environments import VECTOR
 
 _TERMS = ("loss_objective", "loss_critic", "loss_entropy")
 
 
+@dataclass(frozen=True, kw_only=True)
+class PPOConfig(TrainingConfig):
+    """PPO with the settings of the published agents.
+
+    `steps_per_update` counts frames over all environments together. That keeps the
+    published ratio of learning to experience (320 minibatch steps per 512 frames)
+    for any number of environments; with the default 16 of them an update sees 32
+    consecutive steps of each, beyond the horizon of the advantage estimate
+    (1 / (1 - gamma * gae_lambda) = 17 steps).
+
+    Attributes:
+        steps_per_update: Number of frames per update, over all environments.
+        minibatch_size: Number of frames per gradient step.
+        epochs: Number of passes over the batch per update.
+        gae_lambda: Decay factor of the generalised advantage estimate.
+        clip: Largest change of the probability ratio that is rewarded.
+        entropy_coefficient: Weight of the entropy bonus in the loss.
+        value_coefficient: Weight of the squared value error in the loss.
+        max_grad_norm: Largest joint gradient norm of both networks.
+        target_kl: Approximate KL divergence from the collecting policy beyond which
+            an update's epochs stop; None never stops.
+        anneal: Whether to decrease the learning rate linearly to zero over
+            total_frames.
+    """
+
+    algorithm: ClassVar[str] = "ppo"
+    # "demo" buys wall time with larger minibatches and fewer passes: about a tenth of
+    # the published cost of learning per frame.
+    presets: ClassVar[Mapping[str, Mapping[str, Any]]] = {
+        "published": {},
+        "demo": {
+            "num_envs": 32,
+            "steps_per_update": 2_048,
+            "minibatch_size": 256,
+            "epochs": 10,
+            "clip": 0.2,
+            "target_kl": 0.05,
+            "anneal": True,
+        },
+    }
+
+    steps_per_update: int = 512
+    minibatch_size: int = 32
+    epochs: int = 20
+    gae_lambda: float = 0.95
+    clip: float = 0.1
+    entropy_coefficient: float = 5.85e-4
+    value_coefficient: float = 0.872
+    max_grad_norm: float = 1.0
+    target_kl: float | None = None
+    anneal: bool = False
+
+    def __post_init__(self):
+        """Validate the algorithm's own fields after the shared ones."""
+        super().__post_init__()
+        self._require_positive(
+            "steps_per_update", "minibatch_size", "epochs", "max_grad_norm"
+        )
+        if self.steps_per_update % self.num_envs:
+            raise ConfigError(
+                f"steps_per_update={self.steps_per_update} is not a multiple of "
+                f"num_envs={self.num_envs}: choose num_envs that divides it, or set "
+                f"steps_per_update to a multiple."
+            )
+        if self.steps_per_update % self.minibatch_size:
+            raise ConfigError(
+                f"steps_per_update={self.steps_per_update} is not a multiple of "
+                f"minibatch_size={self.minibatch_size}: a smaller last minibatch "
+                f"would weigh its frames more than the others."
+            )
+        require(self.minibatch_size > 1, "minibatch_size", self.minibatch_size, "> 1")
+        require(0 <= self.gae_lambda <= 1, "gae_lambda", self.gae_lambda, "in [0, 1]")
+        require(0 < self.clip < 1, "clip", self.clip, "in (0, 1)")
+        for name in ("entropy_coefficient", "value_coefficient"):
+            value = getattr(self, name)
+            require(value >= 0, name, value, ">= 0")
+        kl = self.target_kl
+        require(kl is None or kl > 0, "target_kl", kl, "positive, or None")
+
+    @property
+    def frames_per_batch(self) -> int:
+        """Frames per update, over all environments."""
+        return self.steps_per_update
+
+    def changed_for_resume(self, other: TrainingConfig) -> dict[str, tuple]:
+        """As in the base class; an annealed run may not change its length."""
+        changed = super().changed_for_resume(other)
+        if self.anneal and self.total_frames != other.total_frames:
+            changed["total_frames"] = (self.total_frames, other.total_frames)
+        return changed
+
+
 class PPO:
     """The learner: a policy to collect with, and an update from what it collected.
 
     Attributes:
-        policy: raw observation in, sampled action and its log-probability out.
-        random_frames: frames to collect with uniformly random actions first (none).
+        policy: Raw observation in, sampled action and its log-probability out.
+        random_frames: Number of frames to collect with uniformly random actions
+            first (none).
     """
 
     metrics = (
@@ -42,17 +140,14 @@ class PPO:
     )
     random_frames = 0
 
-    def __init__(self, config: PPOConfig, signature: Signature):
+    def __init__(self, config: PPOConfig, shapes: NetworkShapes, directory: Path):
+        del directory  # It keeps nothing on disk.
         self.config = config
-        self.device = torch.device(config.device)
-        self.actor = make_actor(signature, config).to(self.device)
-        self.critic = make_critic(signature, config).to(self.device)
-        self.normaliser = None
-        modules: list[nn.Module] = []
-        if signature.vector:
-            self.normaliser = make_normaliser(signature, config).to(self.device)
-            modules.append(self.normaliser)
-        self.policy = TensorDictSequential(*modules, self.actor)
+        self.device = torch.device(config.torch_device)
+        self.policy = self.make_policy(shapes, config).to(self.device)
+        self.actor = self.policy[-1]
+        self.normaliser = self.policy[0] if shapes.vector else None
+        self.critic = make_critic(shapes, config).to(self.device)
         self.loss = ClipPPOLoss(
             self.actor,
             self.critic,
@@ -76,13 +171,21 @@ class PPO:
             self.parameters, lr=config.learning_rate, eps=1e-5, fused=True
         )
         self.loss_keys = [
-            *signature.keys,
+            *shapes.keys,
             "action",
             "action_log_prob",
             "advantage",
             "value_target",
         ]
         self.gradient_steps = 0
+
+    @staticmethod
+    def make_policy(shapes: NetworkShapes, config: PPOConfig) -> TensorDictSequential:
+        """A policy with fresh weights: raw observation in, action out."""
+        network = GaussianActor(shapes, config, state_dependent_std=False)
+        # A small head starts the policy near the middle of every action's range.
+        orthogonal_(network, network.mean, 0.01)
+        return make_policy(shapes, config, make_actor(shapes, network))
 
     def observe(self, batch: TensorDictBase) -> None:
         """Take observation statistics from a batch without learning from it."""
@@ -93,8 +196,8 @@ class PPO:
         """Learn from a batch (num_envs, steps) collected with the current policy.
 
         Args:
-            batch: as the collector gives it.
-            progress: share of the run that is done, in [0, 1].
+            batch: Steps as the collector gives them.
+            progress: Share of the run that is done, in [0, 1].
 
         Returns:
             Means over the update's gradient steps of the quantities in `metrics`.

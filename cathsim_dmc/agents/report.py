@@ -11,13 +11,12 @@ from torchrl.envs import EnvBase
 
 from cathsim_dmc import suite
 from cathsim_dmc.agents import evaluation, policies
-from cathsim_dmc.agents.checkpoint import Checkpoint
 from cathsim_dmc.analysis import heatmap
+from cathsim_dmc.analysis.force_statistics import millinewtons
+from cathsim_dmc.policies import in_environment
 from cathsim_dmc.recording import recorder, rerun_log
 from cathsim_dmc.recording.episode import Episode
 from cathsim_dmc.recording.scene import body_geoms
-
-NAMED_POLICIES = ("random", "expert", "push")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -25,10 +24,10 @@ class Report:
     """An evaluation, with a baseline on the same seeds.
 
     Attributes:
-      policy: what was asked for.
-      baseline: the random policy, or None.
-      comparison: of the two, or None.
-      seconds: wall time.
+        policy: Evaluation of the policy that was asked for.
+        baseline: Evaluation of the random policy, or None.
+        comparison: Comparison of the two, or None.
+        seconds: Wall time of both.
     """
 
     policy: evaluation.EvaluationResult
@@ -49,38 +48,56 @@ class Report:
         from rich.console import Console
         from rich.table import Table
 
-        table = Table(title=f"{self.policy.task}, seeds from {self.policy.seed}")
-        for column in ("policy", "reward", "steps", "force, N", "peak, N", "success"):
+        table = Table(
+            title=f"{self.policy.task}, seeds from {self.policy.seed}",
+            caption=_CAPTION,
+            caption_justify="left",
+        )
+        for column in _COLUMNS:
             table.add_column(column)
         for result in (self.policy, self.baseline):
             if result is not None:
-                table.add_row(result.policy, *_cells(result.summary()))
+                table.add_row(result.policy, *_cells(result))
         console = Console()
         console.print(table)
         if self.comparison is not None:
-            low, high = self.comparison.reward_ci95
+            interval = "one episode tells no interval"
+            if self.comparison.reward_ci95 is not None:
+                low, high = self.comparison.reward_ci95
+                interval = f"95 % interval {low:+.1f} to {high:+.1f}"
             console.print(
                 f"reward over {self.comparison.baseline}: "
-                f"{self.comparison.reward_difference:+.1f} "
-                f"(95 % interval {low:+.1f} to {high:+.1f})"
+                f"{self.comparison.reward_difference:+.1f} ({interval})"
             )
 
 
-def _cells(summary: Mapping[str, Any]) -> list[str]:
+_COLUMNS = (
+    "policy", "reward", "steps", "mean force, mN", "max force, mN", "peak, mN",
+    "success",
+)  # fmt: skip
+_CAPTION = (
+    "Mean ± standard deviation over episodes. Mean force: sum over all contacts at the "
+    "end of a control step, mean over all steps. Max force: largest single contact at "
+    "the end of any control step. Peak: the same in any physics step."
+)
+
+
+def _cells(result: evaluation.EvaluationResult) -> list[str]:
     def spread(name: str, digits: int) -> str:
-        mean, deviation = summary[name], summary[f"{name}_sd"]
+        mean, deviation = result.mean_sd(name)
         return "–" if mean is None else f"{mean:.{digits}f} ± {deviation:.{digits}f}"
 
+    summary = result.summary()
     rate, interval = summary["success"], summary["success_ci95"]
     success = "–"
     if rate is not None:
         low, high = (round(100 * bound) for bound in interval)
         success = f"{100 * rate:.0f} % ({low}–{high})"
+    forces = ("mean_force", "max_force", "peak_force")
     return [
         spread("reward", 1),
         spread("length", 0),
-        spread("mean_force", 3),
-        spread("peak_force", 3),
+        *(millinewtons(*result.mean_sd(name)) for name in forces),
         success,
     ]
 
@@ -96,7 +113,7 @@ class ContactLog:
         """Adds the contacts at the end of a control step; an evaluation observer."""
         simulation = env.base_env.simulation
         rows = simulation.sensor_rows[running, -1]
-        contacts = simulation.task.layout.contacts(rows)
+        contacts = simulation.task.rollout.index.contacts(rows)
         self._positions.append(contacts.position[contacts.present])
         self._magnitudes.append(contacts.magnitude[contacts.present])
 
@@ -112,11 +129,11 @@ class ContactLog:
 
 
 def evaluate(
-    policy: str | Path,
+    policy: policies.PolicyLike,
     *,
     task: str | None = None,
     episodes: int = 30,
-    seed: int = 1_000_000,
+    seed: int = evaluation.EVALUATION_SEED,
     task_kwargs: Mapping[str, Any] | None = None,
     num_threads: int | None = None,
     baseline: bool = True,
@@ -125,29 +142,27 @@ def evaluate(
     """Evaluates a policy; writes evaluation.json and heatmap.png into a directory.
 
     Args:
-      policy: directory of a run or checkpoint, "random", or "expert".
-      task: by default the checkpoint's.
-      episodes: how many.
-      seed: of the first.
-      task_kwargs: by default the checkpoint's.
-      num_threads: of the simulation.
-      baseline: play the same seeds with the random policy too.
-      out_dir: for the files, if any.
+        policy: Policy, or what names one, see `policies.load_policy`.
+        task: Name of the task; None takes the one that the policy was trained on.
+        episodes: Number of episodes.
+        seed: Seed of the first episode; the others count up.
+        task_kwargs: Further options of the task; None takes those that the policy was
+            trained with.
+        num_threads: Number of threads of the simulation; None takes one per core.
+        baseline: Whether to play the same seeds with the random policy too.
+        out_dir: Directory for the files; None writes none.
     """
     start = time.monotonic()
     contacts = ContactLog()
-    options = {"num_threads": num_threads, "observer": contacts}
-    if str(policy) == "expert":
-        from cathsim_dmc.agents import expert
-
-        _require_task(task, policy)
-        result = expert.expert_episodes(
-            task, episodes, seed, task_kwargs=task_kwargs, **options
-        )
-    else:
-        result = evaluation.evaluate(
-            policy, task, episodes, seed, task_kwargs=task_kwargs, **options
-        )
+    result = evaluation.evaluate(
+        policy,
+        task,
+        episodes,
+        seed,
+        task_kwargs=task_kwargs,
+        num_threads=num_threads,
+        observer=contacts,
+    )
     other = comparison = None
     if baseline and str(policy) != "random":
         other = evaluation.evaluate(
@@ -168,27 +183,19 @@ def evaluate(
         heatmap.contact_heatmap(
             contacts.positions,
             contacts.magnitudes,
-            environment.task.anatomy.surface,
+            environment.task.scene.anatomy.surface,
             Path(out_dir) / "heatmap.png",
             title=f"{result.task}, {result.policy}: {episodes} episodes",
         )
     return report
 
 
-def _require_task(task: str | None, policy: str | Path) -> None:
-    if task is None:
-        raise ValueError(
-            f"policy {str(policy)!r} is no checkpoint, so the task must be given: "
-            f"--task with one of {', '.join(suite.SUITE)}"
-        )
-
-
 def record(
-    policy: str | Path,
+    policy: policies.PolicyLike,
     out: str | Path,
     *,
     task: str | None = None,
-    seed: int = 1_000_000,
+    seed: int = evaluation.EVALUATION_SEED,
     max_steps: int | None = None,
     task_kwargs: Mapping[str, Any] | None = None,
     fluoroscopy: bool = True,
@@ -196,38 +203,40 @@ def record(
     """Records one episode as .rrd, and as .npz beside it.
 
     Args:
-      policy: directory of a run or checkpoint, or one of `NAMED_POLICIES`.
-      out: the .rrd file.
-      task: by default the checkpoint's.
-      seed: of the episode.
-      max_steps: stop after so many control steps.
-      task_kwargs: by default the checkpoint's.
-      fluoroscopy: include X-ray images.
+        policy: Policy, or what names one, see `policies.load_policy`.
+        out: Path of the .rrd file.
+        task: Name of the task; None takes the one that the policy was trained on.
+        seed: Seed of the episode.
+        max_steps: Number of control steps after which the episode is cut off; None
+            leaves it to the task.
+        task_kwargs: Further options of the task; None takes those that the policy was
+            trained with.
+        fluoroscopy: Whether to include X-ray images.
+
+    Returns:
+        The episode.
+
+    Raises:
+        ValueError: `out` is no .rrd file, or no task is known.
+        CheckpointError: there is no such checkpoint, or it is damaged.
     """
     out = Path(out)
     if out.suffix != ".rrd":
         raise ValueError(f"the recording is to be written to {out}; give an .rrd file")
-    checkpoint = None
-    if str(policy) in NAMED_POLICIES:
-        _require_task(task, policy)
-    else:
-        checkpoint = Checkpoint.open(policy)
-        task = task or checkpoint.config.task
-        if task_kwargs is None:
-            task_kwargs = checkpoint.config.task_kwargs
-    kwargs = dict(task_kwargs or {})
-    if checkpoint is not None:
-        kwargs["observation"] = checkpoint.config.observation
+    player = policies.load_policy(policy, seed)
+    task = evaluation.require_task(player, task)
+    kwargs = dict(player.task_kwargs or {} if task_kwargs is None else task_kwargs)
+    if player.observation is not None:
+        kwargs["observation"] = player.observation
     environment = suite.load(suite.DOMAIN, task, task_kwargs={**kwargs, "random": seed})
-    act = _timestep_policy(str(policy), checkpoint, environment, seed)
     episode = recorder.EpisodeRecorder(environment, task, kwargs).record_episode(
-        act, seed=seed, max_steps=max_steps
+        in_environment(player, environment), seed=seed, max_steps=max_steps
     )
     out.parent.mkdir(parents=True, exist_ok=True)
     episode.save(out.with_suffix(".npz"))
     rerun_log.write_rrd(
         episode,
-        environment.task.anatomy.surface,
+        environment.task.scene.anatomy.surface,
         out,
         robot_geoms=body_geoms(environment.physics),
         fluoroscopy=_images(environment, episode) if fluoroscopy else None,
@@ -235,26 +244,14 @@ def record(
     return episode
 
 
-def _timestep_policy(name, checkpoint, environment, seed) -> policies.TimestepPolicy:
-    if checkpoint is not None:
-        return policies.trained(checkpoint)
-    if name == "expert":
-        from cathsim_dmc.agents import expert
-
-        return expert.policy(environment)
-    if name == "push":
-        return policies.push(environment)
-    return policies.random(environment, seed)
-
-
 def _images(environment, episode: Episode) -> np.ndarray:
     """X-ray images (T + 1, H, W, 1) of an episode."""
     from cathsim_dmc.imaging import Angiograph
 
     task = environment.task
-    surface = task.anatomy.surface
-    fluoroscope = task.fluoroscope
+    surface = task.scene.anatomy.surface
+    fluoroscope = task.rollout.fluoroscope
     if fluoroscope is None:
         machine = Angiograph(surface.vertices, surface.faces, task.config.fluoroscopy)
         fluoroscope = machine.planes()[0]
-    return fluoroscope.render(episode.catheter, task.catheter.device.outer_radius)
+    return fluoroscope.render(episode.catheter, task.scene.catheter.device.outer_radius)

@@ -1,25 +1,98 @@
 """Soft actor-critic on TorchRL's SACLoss and SoftUpdate."""
 
+from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictSequential
-from torch import nn
 from torchrl.objectives import SACLoss, SoftUpdate
 
-from cathsim_dmc.agents.configs import SACConfig
+from cathsim_dmc.agents.config import TrainingConfig, require
 from cathsim_dmc.agents.networks import (
-    Signature,
+    GaussianActor,
+    NetworkShapes,
     make_actor,
-    make_normaliser,
+    make_policy,
     make_q_function,
 )
 from cathsim_dmc.agents.replay import ReplayMemory
 from cathsim_dmc.simulation.environments import VECTOR
 
+# 2 GiB hold about 270,000 transitions of the internal observation.
+REPLAY_BYTES = 2 * 1024**3
+
 _TERMS = ("loss_actor", "loss_qvalue", "loss_alpha")
+
+
+@dataclass(frozen=True, kw_only=True)
+class SACConfig(TrainingConfig):
+    """SAC with twin critics and a learned entropy weight.
+
+    Attributes:
+        batch_size: Number of transitions per gradient step.
+        tau: Share of the critics that the target critics take over in a step.
+        replay_frames: Largest number of transitions kept.
+        replay_bytes: Largest size of the replay files in bytes; the smaller of the
+            two limits rules.
+        random_frames: Number of frames at the start with uniformly random actions
+            and no learning.
+        steps_per_env: Number of control steps of each environment between two
+            updates.
+        updates_per_frame: Number of gradient steps per frame collected.
+        initial_alpha: Weight of the entropy at the start.
+        target_entropy: Entropy that the weight is steered towards, in nats; None
+            means minus the number of actions.
+    """
+
+    algorithm: ClassVar[str] = "sac"
+    presets: ClassVar[Mapping[str, Mapping[str, Any]]] = {
+        "published": {},
+        "demo": {"num_envs": 32, "updates_per_frame": 0.25},
+    }
+
+    batch_size: int = 256
+    tau: float = 0.005
+    replay_frames: int = 600_000
+    replay_bytes: int = REPLAY_BYTES
+    random_frames: int = 5_000
+    steps_per_env: int = 4
+    updates_per_frame: float = 1.0
+    initial_alpha: float = 1.0
+    target_entropy: float | None = None
+
+    def __post_init__(self):
+        """Validate the algorithm's own fields after the shared ones."""
+        super().__post_init__()
+        self._require_positive(
+            "batch_size",
+            "replay_frames",
+            "replay_bytes",
+            "steps_per_env",
+            "updates_per_frame",
+            "initial_alpha",
+        )
+        require(0 < self.tau <= 1, "tau", self.tau, "in (0, 1]")
+        require(
+            self.random_frames >= self.batch_size,
+            "random_frames",
+            self.random_frames,
+            f"at least batch_size={self.batch_size}",
+        )
+        require(
+            self.replay_frames >= max(self.batch_size, self.frames_per_batch),
+            "replay_frames",
+            self.replay_frames,
+            f"at least batch_size={self.batch_size} and "
+            f"num_envs * steps_per_env={self.frames_per_batch}",
+        )
+
+    @property
+    def frames_per_batch(self) -> int:
+        """Frames between two updates, over all environments."""
+        return self.num_envs * self.steps_per_env
 
 
 class SAC:
@@ -29,8 +102,9 @@ class SAC:
     when sampled, so old and new transitions agree.
 
     Attributes:
-        policy: raw observation in, sampled action out.
-        random_frames: frames to collect with uniformly random actions first.
+        policy: Raw observation in, sampled action out.
+        random_frames: Number of frames to collect with uniformly random actions
+            first.
     """
 
     metrics = (
@@ -43,18 +117,14 @@ class SAC:
         "gradient_steps",
     )
 
-    def __init__(self, config: SACConfig, signature: Signature, directory: Path):
+    def __init__(self, config: SACConfig, shapes: NetworkShapes, directory: Path):
         self.config = config
-        self.device = torch.device(config.device)
+        self.device = torch.device(config.torch_device)
         self.random_frames = config.random_frames
-        self.actor = make_actor(signature, config).to(self.device)
-        q_function = make_q_function(signature, config).to(self.device)
-        self.normaliser = None
-        modules: list[nn.Module] = []
-        if signature.vector:
-            self.normaliser = make_normaliser(signature, config).to(self.device)
-            modules.append(self.normaliser)
-        self.policy = TensorDictSequential(*modules, self.actor)
+        self.policy = self.make_policy(shapes, config).to(self.device)
+        self.actor = self.policy[-1]
+        self.normaliser = self.policy[0] if shapes.vector else None
+        q_function = make_q_function(shapes, config).to(self.device)
         target = config.target_entropy
         self.loss = SACLoss(
             self.actor,
@@ -62,7 +132,7 @@ class SAC:
             num_qvalue_nets=2,
             loss_function="l2",
             alpha_init=config.initial_alpha,
-            target_entropy=-float(signature.actions) if target is None else target,
+            target_entropy=-float(shapes.actions) if target is None else target,
         )
         self.loss.make_value_estimator(gamma=config.gamma)
         self.targets = SoftUpdate(self.loss, tau=config.tau)
@@ -74,14 +144,20 @@ class SAC:
         self.replay = ReplayMemory(
             directory / "replay", config.replay_frames, config.replay_bytes
         )
-        keys = [*signature.raw_keys, "reward", "done", "terminated"]
+        keys = [*shapes.raw_keys, "reward", "done", "terminated"]
         self.replay_keys = [
-            *signature.raw_keys,
+            *shapes.raw_keys,
             "action",
             *[("next", key) for key in keys],
         ]
         self.gradient_steps = 0
         self.owed_steps = 0.0
+
+    @staticmethod
+    def make_policy(shapes: NetworkShapes, config: SACConfig) -> TensorDictSequential:
+        """A policy with fresh weights: raw observation in, action out."""
+        network = GaussianActor(shapes, config, state_dependent_std=True)
+        return make_policy(shapes, config, make_actor(shapes, network))
 
     def observe(self, batch: TensorDictBase) -> None:
         """Take observation statistics from a batch without learning from it."""
@@ -92,8 +168,8 @@ class SAC:
         """Store a batch (num_envs, steps) and take the gradient steps it pays for.
 
         Args:
-            batch: as the collector gives it.
-            progress: share of the run that is done; not used.
+            batch: Steps as the collector gives them.
+            progress: Share of the run that is done; not used.
 
         Returns:
             Means over the gradient steps of the quantities in `metrics`.

@@ -3,10 +3,7 @@
 import contextlib
 import json
 import math
-import os
-import shutil
 import time
-from collections import deque
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,35 +17,24 @@ from torchrl.collectors import Collector
 from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType
 
-from cathsim_dmc.agents.checkpoint import Checkpoint, checkpoints_in, save_checkpoint
-from cathsim_dmc.agents.configs import ConfigError, TrainingConfig
-from cathsim_dmc.agents.episodes import INFO, EpisodeOutcome, EpisodeTracker
+from cathsim_dmc import files
+from cathsim_dmc.agents.checkpoint import (
+    Checkpoint,
+    CheckpointError,
+    checkpoints_in,
+    save_checkpoint,
+)
+from cathsim_dmc.agents.config import ConfigError, TrainingConfig
+from cathsim_dmc.agents.episodes import INFO, EpisodeTracker
+from cathsim_dmc.agents.evaluation import EnvFactory
 from cathsim_dmc.agents.interruption import Interruption
-from cathsim_dmc.agents.metrics import MetricsFile
-from cathsim_dmc.agents.networks import Signature
-from cathsim_dmc.agents.ppo import PPO
-from cathsim_dmc.agents.progress import Progress
-from cathsim_dmc.agents.sac import SAC
+from cathsim_dmc.agents.learners import Learner, make_learner
+from cathsim_dmc.agents.networks import NetworkShapes
+from cathsim_dmc.agents.replay import ReplayError
+from cathsim_dmc.agents.training_log import TrainingLog, crossed
 from cathsim_dmc.simulation import environments
 
-EnvFactory = Callable[..., EnvBase]
-
-# Finished episodes over which the running figures are taken.
-EPISODE_WINDOW = 100
-
-# The rest of metrics.csv's columns are the learner's own.
-COLUMNS = (
-    "frames",
-    "seconds",
-    "frames_per_second",
-    "episodes",
-    "episode_reward",
-    "episode_length",
-    "success",
-    "mean_force",
-    "max_force",
-    "step_reward",
-)
+CONFIG_FILE = "config.json"
 
 
 @dataclass(frozen=True)
@@ -56,12 +42,12 @@ class TrainingResult:
     """What a call of `train` leaves behind.
 
     Attributes:
-        run: directory of the run.
-        checkpoint: directory of the newest checkpoint.
-        frames: seen in all, over all processes of the run.
-        seconds: wall time in all.
-        interrupted: whether a signal ended it before total_frames.
-        metrics: the last row of metrics.csv.
+        run: Directory of the run.
+        checkpoint: Directory of the newest checkpoint.
+        frames: Number of frames seen in all, over all processes of the run.
+        seconds: Wall time in all.
+        interrupted: Whether a signal ended it before total_frames.
+        metrics: Last row of metrics.csv.
     """
 
     run: Path
@@ -88,140 +74,64 @@ def train(
     dropped, episodes that were running start anew.
 
     Args:
-        config: what to train, and how.
-        out_dir: directory of the run.
-        resume: continue the run there; with none there, start one.
-        progress: show progress on standard error.
-        make_env: see `environments.make_env`; another one may be put in its place.
+        config: Settings: what to train, and how.
+        out_dir: Directory of the run.
+        resume: Whether to continue the run there. One that was killed before its
+            first checkpoint starts anew.
+        progress: Whether to show progress on standard error.
+        make_env: Function that makes the environment, as `environments.make_env`.
 
     Raises:
         ConfigError: the directory holds a run that was not to be resumed, or one with
-            other settings.
+            other settings, or none that could be resumed.
+        CheckpointError: the checkpoint to continue from is damaged.
+        ReplayError: so are the files of its replay.
         FloatingPointError: a loss is not finite; the last checkpoint stays.
+        OSError: the disk is full, or the directory cannot be written to.
     """
     run = Path(out_dir)
     checkpoint = _prepare(run, config, resume)
-    frames = checkpoint.frames if checkpoint else 0
-    seconds_before = checkpoint.seconds if checkpoint else 0.0
-
     with contextlib.ExitStack() as stack:
         stack.enter_context(_torch_threads(config.torch_threads))
-        # A resumed run gets fresh episodes: another stretch of the same seeds.
-        env_seed = int(
-            np.random.SeedSequence([config.seed, frames]).generate_state(1)[0]
-        )
-        env = make_env(
-            config.task,
-            observation=config.observation,
-            num_envs=config.num_envs,
-            num_threads=config.num_threads,
-            seed=env_seed % 2**31,
-            path=config.path,
-            task_kwargs=config.task_kwargs,
-        )
+        env = _make_environment(config, checkpoint, make_env)
         torch.manual_seed(config.seed)
-        signature = Signature.of(env)
-        learner = _make_learner(config, signature, run)
+        shapes = NetworkShapes.of(env)
+        learner = make_learner(config, shapes, run)
+        state: dict[str, Any] = {}
         if checkpoint:
-            state = checkpoint.learning_state()
-            learner.load(checkpoint.policy_state(), state["learner"])
+            state = _restore(learner, checkpoint)
         elif not learner.random_frames:
             _observe_random_actions(env, learner, config)
-        collector = Collector(
-            env,
-            _on_cpu(learner.policy, learner.device),
-            frames_per_batch=config.frames_per_batch,
-            total_frames=-1,
-            init_random_frames=_random_frames(learner, config, frames),
-            exploration_type=ExplorationType.RANDOM,
-            trust_policy=True,
-            track_traj_ids=False,
-            auto_register_policy_transforms=False,
-        )
+        frames = checkpoint.frames if checkpoint else 0
+        collector = _make_collector(env, learner, config, frames)
         stack.callback(collector.shutdown)
         # After everything that draws numbers while being made.
         if checkpoint:
             torch.set_rng_state(state["rng"])
         else:
             torch.manual_seed(config.seed + 1)
-
-        columns = [*COLUMNS, *learner.metrics]
-        table = MetricsFile(
-            run / "metrics.csv", columns, frames if checkpoint else None
+        log = TrainingLog(
+            run,
+            config,
+            learner.metrics,
+            frames=frames,
+            seconds=checkpoint.seconds if checkpoint else 0.0,
+            episodes=state.get("episodes", 0),
+            resumed=checkpoint is not None,
+            progress=progress,
         )
-        board = _tensorboard(run, config)
-        stack.callback(board.close)
-        bar = stack.enter_context(
-            Progress(
-                f"{config.algorithm} {config.task}",
-                config.total_frames,
-                start=frames,
-                enabled=progress,
-            )
-        )
+        stack.enter_context(log)
+        saver = _Saver(run, config, shapes, learner, log, checkpoint)
         interruption = stack.enter_context(Interruption())
-        tracker = EpisodeTracker(config.num_envs)
-        window: deque[EpisodeOutcome] = deque(maxlen=EPISODE_WINDOW)
-        episodes = int(state["episodes"]) if checkpoint else 0
-        row: dict[str, float | None] = {}
-        began = time.monotonic()
-        saved = checkpoint.path if checkpoint else None
-        first_frames = frames
-
-        def save() -> Path:
-            return save_checkpoint(
-                run,
-                config=config,
-                signature=signature,
-                frames=frames,
-                seconds=seconds_before + time.monotonic() - began,
-                policy=learner.policy_state(),
-                learning={
-                    "learner": learner.learning_state(),
-                    "rng": torch.get_rng_state(),
-                    "episodes": episodes,
-                },
-            )
-
-        batches = iter(collector)
-        while frames < config.total_frames and not interruption.requested:
-            batch = next(batches)
-            before, frames = frames, frames + batch.numel()
-            finished = tracker.add(batch)
-            _excuse_divergence(batch)
-            window.extend(finished)
-            episodes += len(finished)
-            losses = learner.update(batch, min(before / config.total_frames, 1.0))
-            _require_finite(losses, frames, saved)
-
-            step_reward = float(batch["next", "reward"].mean())
-
-            last = frames >= config.total_frames or interruption.requested
-            if last or _crossed(before, frames, config.metrics_frames):
-                elapsed = time.monotonic() - began
-                row = {
-                    "frames": frames,
-                    "seconds": seconds_before + elapsed,
-                    "frames_per_second": (frames - first_frames) / elapsed,
-                    "episodes": episodes,
-                    **_episode_means(window),
-                    "step_reward": step_reward,
-                    **losses,
-                }
-                table.append(row)
-                board.add(row)
-            bar.update(frames, {"step_reward": step_reward, **_episode_means(window)})
-            if _crossed(before, frames, config.checkpoint_frames):
-                saved = save()
+        _loop(config, collector, learner, log, saver, interruption)
         # However the loop ended; writes nothing if the last batch has just been saved.
-        saved = save()
         return TrainingResult(
             run=run,
-            checkpoint=saved,
-            frames=frames,
-            seconds=seconds_before + time.monotonic() - began,
-            interrupted=frames < config.total_frames,
-            metrics=row,
+            checkpoint=saver.save(),
+            frames=log.frames,
+            seconds=log.seconds,
+            interrupted=log.frames < config.total_frames,
+            metrics=log.row,
         )
 
 
@@ -231,6 +141,11 @@ def _prepare(run: Path, config: TrainingConfig, resume: bool) -> Checkpoint | No
     if existing and not resume:
         raise ConfigError(
             f"{run} already holds a run: resume it, or choose another directory."
+        )
+    if resume and not existing and not (run / CONFIG_FILE).exists():
+        raise ConfigError(
+            f"there is no run in {run} to resume: give the directory of one, or start "
+            "a new one without resume."
         )
     checkpoint = Checkpoint.open(existing[-1]) if existing else None
     if checkpoint is not None:
@@ -246,25 +161,47 @@ def _prepare(run: Path, config: TrainingConfig, resume: bool) -> Checkpoint | No
                 f"change: {sorted(config.resumable)}."
             )
     run.mkdir(parents=True, exist_ok=True)
-    temporary = run / "config.json.tmp"
-    temporary.write_text(json.dumps(config.to_dict(), indent=2) + "\n")
-    os.replace(temporary, run / "config.json")
-    if checkpoint is None:
-        # Left by a run that was killed before its first checkpoint.
-        shutil.rmtree(run / "replay", ignore_errors=True)
+    files.write_text(run / CONFIG_FILE, json.dumps(config.to_dict(), indent=2) + "\n")
     return checkpoint
 
 
-def _make_learner(config: TrainingConfig, signature: Signature, run: Path) -> PPO | SAC:
-    if config.algorithm == "ppo":
-        return PPO(config, signature)
-    if config.algorithm == "sac":
-        return SAC(config, signature, run)
-    raise ConfigError(f"no learner for algorithm {config.algorithm!r}.")
+def _make_environment(
+    config: TrainingConfig, checkpoint: Checkpoint | None, make_env: EnvFactory
+) -> EnvBase:
+    # A resumed run gets fresh episodes: another stretch of the same seeds.
+    frames = checkpoint.frames if checkpoint else 0
+    seed = int(np.random.SeedSequence([config.seed, frames]).generate_state(1)[0])
+    return make_env(
+        config.task,
+        observation=config.observation,
+        num_envs=config.num_envs,
+        num_threads=config.num_threads,
+        seed=seed % 2**31,
+        backend=config.backend,
+        task_kwargs=config.task_kwargs,
+    )
+
+
+def _restore(learner: Learner, checkpoint: Checkpoint) -> dict[str, Any]:
+    """Give a learner what a checkpoint holds; return the state of the training."""
+    policy, state = checkpoint.policy_state(), checkpoint.learning_state()
+    try:
+        learner.load(policy, state["learner"])
+        training = {"rng": state["rng"], "episodes": int(state["episodes"])}
+    except ReplayError:
+        raise
+    except (KeyError, TypeError, ValueError, AttributeError, RuntimeError) as error:
+        line = " ".join(str(error).split())[:200]
+        raise CheckpointError(
+            f"{checkpoint.path} cannot be continued from: it does not fit what "
+            f"{checkpoint.config.algorithm} learns with ({type(error).__name__}: "
+            f"{line}). Its policy may still be evaluated."
+        ) from error
+    return training
 
 
 def _observe_random_actions(
-    env: EnvBase, learner: PPO | SAC, config: TrainingConfig
+    env: EnvBase, learner: Learner, config: TrainingConfig
 ) -> None:
     """Start the observation statistics, so that the first update sees sane inputs."""
     if not config.normalisation_frames:
@@ -273,16 +210,98 @@ def _observe_random_actions(
     learner.observe(env.rollout(steps, break_when_any_done=False))
 
 
-def _random_frames(
-    learner: PPO | SAC, config: TrainingConfig, frames: int
-) -> int | None:
-    """Frames still to be collected at random, in whole batches."""
+def _make_collector(
+    env: EnvBase, learner: Learner, config: TrainingConfig, frames: int
+) -> Collector:
+    # Frames still to be collected at random, in whole batches.
     left = max(learner.random_frames - frames, 0)
     whole = math.ceil(left / config.frames_per_batch) * config.frames_per_batch
-    return whole or None
+    return Collector(
+        env,
+        _on_cpu(learner.policy, learner.device),
+        frames_per_batch=config.frames_per_batch,
+        total_frames=-1,
+        init_random_frames=whole or None,
+        exploration_type=ExplorationType.RANDOM,
+        trust_policy=True,
+        track_traj_ids=False,
+        auto_register_policy_transforms=False,
+    )
 
 
-def _excuse_divergence(batch: TensorDictBase) -> None:
+class _Saver:
+    """Writes checkpoints, and knows when one is due."""
+
+    def __init__(
+        self,
+        run: Path,
+        config: TrainingConfig,
+        shapes: NetworkShapes,
+        learner: Learner,
+        log: TrainingLog,
+        checkpoint: Checkpoint | None,
+    ):
+        self.newest = checkpoint.path if checkpoint else None
+        self._run, self._config, self._shapes = run, config, shapes
+        self._learner, self._log = learner, log
+        self._frames, self._time = log.frames, time.monotonic()
+
+    def due(self) -> bool:
+        """Whether so many frames or seconds have passed since the last one."""
+        return (
+            crossed(self._frames, self._log.frames, self._config.checkpoint_frames)
+            or time.monotonic() - self._time >= self._config.checkpoint_seconds
+        )
+
+    def save(self) -> Path:
+        """Write a checkpoint; return its directory."""
+        self.newest = save_checkpoint(
+            self._run,
+            config=self._config,
+            shapes=self._shapes,
+            frames=self._log.frames,
+            seconds=self._log.seconds,
+            policy=self._learner.policy_state(),
+            learning={
+                "learner": self._learner.learning_state(),
+                "rng": torch.get_rng_state(),
+                "episodes": self._log.episodes,
+            },
+        )
+        self._frames, self._time = self._log.frames, time.monotonic()
+        return self.newest
+
+
+def _loop(
+    config: TrainingConfig,
+    collector: Collector,
+    learner: Learner,
+    log: TrainingLog,
+    saver: _Saver,
+    interruption: Interruption,
+) -> None:
+    """Collect, learn, take note and save until the frames are there or a signal."""
+    tracker = EpisodeTracker(config.num_envs)
+    batches = iter(collector)
+    while log.frames < config.total_frames and not interruption.requested:
+        batch = next(batches)
+        finished = tracker.add(batch)
+        _truncate_diverged(batch)
+        losses = learner.update(batch, min(log.frames / config.total_frames, 1.0))
+        frames = log.frames + batch.numel()
+        _require_finite(losses, frames, saver.newest)
+        log.add(
+            batch.numel(),
+            finished,
+            step_reward=float(batch["next", "reward"].mean()),
+            losses=losses,
+            last=frames >= config.total_frames or interruption.requested,
+        )
+        if saver.due():
+            saver.save()
+
+
+def _truncate_diverged(batch: TensorDictBase) -> None:
     """Count a diverged simulation as cut off, not as ended by the task.
 
     Rewards are negative distances, so an end worth nothing afterwards would be the
@@ -317,10 +336,6 @@ def _torch_threads(count: int) -> Iterator[None]:
         torch.set_num_threads(before)
 
 
-def _crossed(before: int, after: int, interval: int) -> bool:
-    return before // interval != after // interval
-
-
 def _require_finite(losses: dict[str, float], frames: int, saved: Path | None) -> None:
     broken = {name: value for name, value in losses.items() if not math.isfinite(value)}
     if broken:
@@ -328,52 +343,3 @@ def _require_finite(losses: dict[str, float], frames: int, saved: Path | None) -
             f"after {frames} frames these are not finite: {broken}. Nothing was saved "
             f"since {saved}; lower the learning rate, or look at the observations."
         )
-
-
-def _episode_means(window: deque[EpisodeOutcome]) -> dict[str, float | None]:
-    """Means over the last finished episodes; None where nothing is known."""
-
-    def mean(name: str) -> float | None:
-        known = [value for o in window if (value := getattr(o, name)) is not None]
-        return float(np.mean(known)) if known else None
-
-    return {
-        "episode_reward": mean("reward"),
-        "episode_length": mean("length"),
-        "success": mean("success"),
-        "mean_force": mean("mean_force"),
-        "max_force": mean("max_force"),
-    }
-
-
-class _NoBoard:
-    def add(self, row: dict[str, Any]) -> None:
-        """Nothing to write to."""
-
-    def close(self) -> None:
-        """Nothing to close."""
-
-
-class _Board:
-    def __init__(self, writer: Any):
-        self.writer = writer
-
-    def add(self, row: dict[str, Any]) -> None:
-        for name, value in row.items():
-            if name != "frames" and value is not None:
-                self.writer.add_scalar(name, value, row["frames"])
-
-    def close(self) -> None:
-        self.writer.close()
-
-
-def _tensorboard(run: Path, config: TrainingConfig) -> _Board | _NoBoard:
-    if not config.tensorboard:
-        return _NoBoard()
-    try:
-        from torch.utils.tensorboard import SummaryWriter
-    except ImportError as error:
-        raise ConfigError(
-            "tensorboard=True needs the extra: pip install 'cathsim-dmc[tensorboard]'."
-        ) from error
-    return _Board(SummaryWriter(run / "tensorboard"))

@@ -64,11 +64,11 @@ class Containment:
     def of(cls, task) -> "Containment":
         """Containment of the device of a `tasks.navigation.Navigation`."""
         matrix = np.empty(9)
-        mujoco.mju_quat2Mat(matrix, task.placement.quaternion)
+        mujoco.mju_quat2Mat(matrix, task.scene.placement.quaternion)
         return cls(
-            task.anatomy,
-            task.catheter.device.outer_radius,
-            task.sheath.bore_half_width,
+            task.scene.anatomy,
+            task.scene.catheter.device.outer_radius,
+            task.scene.sheath.bore_half_width,
             matrix.reshape(3, 3).T[:2],
         )
 

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 
 from cathsim_dmc.analysis.force_statistics import magnitude
+from cathsim_dmc.files import atomic_path
 from cathsim_dmc.recording.episode import Episode
-from cathsim_dmc.recording.files import atomic_path
 from cathsim_dmc.recording.geometry import surface_arrays
 
 SUFFIX = ".png"

@@ -9,7 +9,6 @@ import hashlib
 import io
 import json
 import os
-import tempfile
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,6 +17,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from cathsim_dmc import files
 from cathsim_dmc.anatomy.centreline import (
     Array,
     Centreline,
@@ -260,9 +260,9 @@ class Anatomy:
         digest = hashlib.sha256(data).hexdigest()
         description["geometry"] = f"geometry-{digest[:16]}.npz"
         description["sha256"] = digest
-        _write(directory / description["geometry"], data)
+        files.write_bytes(directory / description["geometry"], data)
         text = json.dumps(description, indent=2) + "\n"
-        _write(directory / _DESCRIPTION, text.encode())
+        files.write_text(directory / _DESCRIPTION, text)
         for stale in directory.glob("geometry-*.npz"):
             if stale.name != description["geometry"]:
                 stale.unlink(missing_ok=True)
@@ -306,18 +306,6 @@ class Anatomy:
                 return _unpack(description, {k: archive[k] for k in archive.files})
         except (KeyError, TypeError) as error:
             raise ValueError(f"{path} lacks an entry: {error}") from error
-
-
-def _write(path: Path, data: bytes) -> None:
-    """Replace the file at `path` in one step."""
-    handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=".writing-")
-    try:
-        with os.fdopen(handle, "wb") as stream:
-            stream.write(data)
-        os.replace(temporary, path)
-    except BaseException:
-        Path(temporary).unlink(missing_ok=True)
-        raise
 
 
 def _pack(anatomy: Anatomy) -> tuple[dict[str, np.ndarray], dict[str, Any]]:

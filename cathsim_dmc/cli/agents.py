@@ -77,7 +77,7 @@ def train(
             "task_kwargs": anatomy.task_kwargs,
             "seed": seed,
             "num_threads": threads,
-            "path": path,
+            "backend": path,
             "tensorboard": tensorboard,
             **overrides,
         },

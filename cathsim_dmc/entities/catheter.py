@@ -2,9 +2,9 @@
 
 import numpy as np
 from dm_control import composer, mjcf
-from dm_control.composer.observation import observable
 
 from cathsim_dmc.entities import devices
+from cathsim_dmc.entities.contact import device_contact
 
 # Relaxation time of bending: joint damping = time * stiffness, s. It lumps the loss
 # inside the polymer with the drag of blood: a 0.2 m cantilever of 50 N·mm² with a drag
@@ -59,8 +59,6 @@ class Catheter(composer.Entity):
         stroke: float = 0.25,
         rotation: bool = False,
         friction: float = 0.0,
-        solref: tuple[float, ...] = (0.02, 1.0),
-        solimp: tuple[float, ...] = (0.9, 0.95, 0.001, 0.5, 2),
         name: str = "catheter",
     ):
         """Builds the chain.
@@ -71,8 +69,6 @@ class Catheter(composer.Entity):
           stroke: longest insertion, m.
           rotation: whether the base can be rotated.
           friction: Coulomb coefficient; MuJoCo takes the larger of the two bodies'.
-          solref: of the contacts.
-          solimp: of the contacts.
           name: of the entity.
         """
         self._device = devices.get(device)
@@ -83,12 +79,7 @@ class Catheter(composer.Entity):
         self._lengths = self._discretisation.link_lengths(self._device)
         self._mjcf_root = mjcf.RootElement(model=name)
         self._mjcf_root.compiler.angle = "radian"
-        self._contact = {
-            "friction": (friction, 0, 0),
-            "solref": solref,
-            "solimp": solimp,
-            "condim": 3,
-        }
+        self._contact = device_contact(friction)
         self._links = []
         self._bends = []
         self._twists = []
@@ -201,8 +192,6 @@ class Catheter(composer.Entity):
             size=[self._device.outer_radius],
             mass=self._device.linear_density * length,
             rgba=_TIP_COLOUR if self._in_tip(index) else _COLOUR,
-            contype=0,
-            conaffinity=1,
             **self._contact,
         )
 
@@ -308,15 +297,8 @@ class Catheter(composer.Entity):
 
     def _build_sensors(self):
         grip = self._links[0].add("site", name="grip", size=[1e-3], group=4)
-        self._push_force = self._mjcf_root.sensor.add(
-            "force", name="push_force", site=grip
-        )
-        self._push_torque = self._mjcf_root.sensor.add(
-            "torque", name="push_torque", site=grip
-        )
-
-    def _build_observables(self):
-        return CatheterObservables(self)
+        self._mjcf_root.sensor.add("force", name="push_force", site=grip)
+        self._mjcf_root.sensor.add("torque", name="push_torque", site=grip)
 
     @property
     def mjcf_model(self) -> mjcf.RootElement:
@@ -378,27 +360,3 @@ class Catheter(composer.Entity):
         """All actuators in the order of the action: tip, insertion, rotation."""
         rotation = () if self._rotation_motor is None else (self._rotation_motor,)
         return (*self._tip_motors, self._insertion_motor, *rotation)
-
-    @property
-    def push_sensors(self) -> tuple:
-        """Force and torque sensors at the grip, in the frame of link 0."""
-        return self._push_force, self._push_torque
-
-
-class CatheterObservables(composer.Observables):
-    """Joint-level readings, off by default."""
-
-    @composer.observable
-    def joint_positions(self):
-        """Joint positions in the order of the chain, m and rad."""
-        return observable.MJCFFeature("qpos", self._entity.joints)
-
-    @composer.observable
-    def joint_velocities(self):
-        """Joint velocities in the order of the chain, m/s and rad/s."""
-        return observable.MJCFFeature("qvel", self._entity.joints)
-
-    @composer.observable
-    def head_position(self):
-        """Position (3,) of the distal end in the world frame, m."""
-        return observable.MJCFFeature("xpos", self._entity.head)

@@ -1,25 +1,10 @@
 """The phantom: the wall of an anatomy as convex pieces, its goals and its sensors."""
 
-from typing import Any
-
 import numpy as np
 from dm_control import composer, mjcf
 
 from cathsim_dmc.anatomy import Anatomy
-
-# Lubricated silicone, Coulomb.
-FRICTION = 0.037
-# Contacts of the device with wall and sheath. A critically damped return within
-# 3 ms, given directly as stiffness 1/t² and damping 2/t: the standard form would be
-# slowed down to two steps, which the implicit "discrete" integrator does not need.
-_CONTACT_TIME = 0.003  # s
-CONTACT_SOLREF = (-1 / _CONTACT_TIME**2, -2 / _CONTACT_TIME)
-# The impedance starts low and then rises like a barrier. Low, so that a device rests
-# some 0.1 mm deep under its usual load, more than it moves on the facets in a step: a
-# hard start (0.95) loses contact and hits the wall anew, with jumps of 1.8 mm and
-# peaks above 1 N. A barrier, so that a full push does not sink in: an impedance that
-# stops rising at 0.97 let 0.2 N push the tip 3 mm deep.
-CONTACT_SOLIMP = (0.7, 0.999, 0.0003, 0.5, 1)
+from cathsim_dmc.entities.contact import FRICTION, wall_contact
 
 # Contacts that the wall sensor can report. A device jammed in a narrow tube has about
 # a hundred; `Contacts.found` tells when there are more.
@@ -28,18 +13,6 @@ CONTACT_FIELDS = ("found", "force", "dist", "pos", "normal", "tangent")
 
 _LUMEN_COLOUR = (0.8, 0.25, 0.25, 0.25)
 _GOAL_COLOUR = (0.1, 0.7, 0.3, 0.5)
-
-
-def wall_contact(friction: float) -> dict[str, Any]:
-    """Attributes of a geom that the device touches as wall; friction is Coulomb's."""
-    return {
-        "contype": 1,
-        "conaffinity": 0,
-        "condim": 3,
-        "friction": (friction, 0, 0),
-        "solref": CONTACT_SOLREF,
-        "solimp": CONTACT_SOLIMP,
-    }
 
 
 class Phantom(composer.Entity):
@@ -85,7 +58,7 @@ class Phantom(composer.Entity):
 
     def _add_wall(self, friction: float):
         for index, piece in enumerate(self._anatomy.wall):
-            name = f"wall_{index}"
+            name = f"wall_{index:03d}"
             self._mjcf_root.asset.add(
                 "mesh", name=name, vertex=np.ravel(piece), inertia="shell"
             )

@@ -13,8 +13,8 @@ then the patient's left.
 
 **Motion** is perfect, as in the published system: the device's own joints are
 driven and the robot is posed after them. :func:`follower_posture` gives every
-robot joint as a function of how far the device was pushed and turned;
-:meth:`Robot.pose` writes that into the simulation. The joints are ordinary
+robot joint as a function of how far the device was pushed and turned; the task
+writes that into the simulation. The joints are ordinary
 slides and hinges which nothing pushes (gravity compensated, no actuator, no
 contact, no limit in the solver): between two poses they stand still.
 """
@@ -23,9 +23,8 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Literal, NamedTuple
+from typing import Literal
 
-import mujoco
 import numpy as np
 from dm_control import composer, mjcf
 from numpy.typing import ArrayLike, NDArray
@@ -72,6 +71,7 @@ MATERIALS = (
     ("guidewire", (0.95, 0.62, 0.10, 1.0), 0.4, 0.4),
 )
 ACCENTS = ("clamp", "catheter", "clamp", "guidewire")  # by platform, front to back
+SIDES = ((1, "left"), (-1, "right"))  # sign of x, word: +x is the patient's left
 
 
 @dataclass(frozen=True)
@@ -119,41 +119,21 @@ _FRONT_PHASE, _REAR_PHASE = OVERLAP / 2, OVERLAP / 2 + CYCLE / 2
 Scalars = float | NDArray[np.float64]
 
 
-class ClampState(NamedTuple):
-    """One pair of clamps and its platform; every field has the insertion's shape."""
+def _clamp(insertion: Scalars, offset: float) -> tuple[Scalars, Scalars]:
+    """One pair of clamps: travel of its platform from home, opening of each jaw, m.
 
-    travel: NDArray[np.float64]  # m, platform along +z from its home
-    opening: NDArray[np.float64]  # m, each jaw from the device, 0 when it holds
-    closed: NDArray[np.bool_]  # the pair holds the device
-
-
-def clamp_states(insertion: ArrayLike) -> tuple[ClampState, ClampState]:
-    """Front and rear pair of clamps after ``insertion`` (...,) metres of device.
-
-    A platform moves with the device while its jaws are closed, opening or
-    closing, and swings back in between: the insertion minus a smooth staircase,
+    A platform moves with the device while its jaws are closed, opening or closing,
+    and swings back in between: the insertion minus a smooth staircase,
     ``travel = phase - STROKE / 2 - CYCLE * smoothstep(return progress)``. Both
     position and speed are continuous. It depends on the insertion alone, so a
     withdrawn device retraces it backwards.
     """
-    insertion = np.asarray(insertion, np.float64)
-    if not np.isfinite(insertion).all():
-        raise ValueError(
-            f"insertion must be finite metres, got {insertion}: "
-            "check the device's base joint for a diverged simulation"
-        )
-    front, rear = (_clamp(insertion, phase) for phase in (_FRONT_PHASE, _REAR_PHASE))
-    return front, rear
-
-
-def _clamp(insertion: Scalars, offset: float) -> ClampState:
     # The jaws are closed over phases [0, STROKE].
     phase = (insertion + offset) % CYCLE
     swung = _smoothstep((phase - (STROKE + JAW_TRAVEL)) / RETURN)
     opened = _smoothstep((phase - STROKE) / JAW_TRAVEL)
     closed = _smoothstep((phase - (CYCLE - JAW_TRAVEL)) / JAW_TRAVEL)
-    travel = phase - STROKE / 2 - CYCLE * swung
-    return ClampState(travel, JAW_OPENING * (opened - closed), phase <= STROKE)
+    return phase - STROKE / 2 - CYCLE * swung, JAW_OPENING * (opened - closed)
 
 
 def _smoothstep(u: Scalars) -> Scalars:
@@ -211,15 +191,16 @@ def _posture(
     pushed: Scalars, turned: Scalars, wire_pushed: Scalars, wire_turned: Scalars
 ) -> tuple[Scalars, ...]:
     """The joints in the order of ``JOINTS``."""
-    front, rear = _clamp(pushed, _FRONT_PHASE), _clamp(pushed, _REAR_PHASE)
+    front, front_opening = _clamp(pushed, _FRONT_PHASE)
+    rear, rear_opening = _clamp(pushed, _REAR_PHASE)
     # The catheter unit stays half-way between the clamps, so the free lengths of
     # shaft either side of it stay equal; the guidewire unit rides with the rear.
-    middle = (front.travel + rear.travel) / 2
+    middle = (front + rear) / 2
     return (
-        *(front.travel, middle, rear.travel, rear.travel),
-        *(front.opening, front.opening, rear.opening, rear.opening),
+        *(front, middle, rear, rear),
+        *(front_opening, front_opening, rear_opening, rear_opening),
         *_wheels(pushed - middle, turned),
-        *_wheels(wire_pushed - rear.travel, wire_turned),
+        *_wheels(wire_pushed - rear, wire_turned),
     )
 
 
@@ -267,28 +248,6 @@ class Robot(composer.Entity):
         """The MJCF joints in the order of ``JOINTS``."""
         return self._joints
 
-    def pose(
-        self, physics: mjcf.Physics, insertion: float, rotation: float = 0.0
-    ) -> None:
-        """Puts the robot where a device pushed and turned so far needs it.
-
-        Call it once per control step, before or after the physics steps. Body
-        and geom positions are brought up to date with it.
-
-        Args:
-          physics: the simulation the robot is part of.
-          insertion: metres since the start, positive into the patient.
-          rotation: radians about +z since the start.
-        """
-        joints = physics.bind(self._joints).element_id
-        model, data = physics.model, physics.data
-        # Written to the arrays themselves: a write through the binding marks the
-        # physics dirty, and the next read would run a whole forward pass, which
-        # costs a step and replaces the contact forces and the solver's warm start.
-        data.qpos[model.jnt_qposadr[joints]] = follower_posture(insertion, rotation)
-        data.qvel[model.jnt_dofadr[joints]] = 0.0
-        mujoco.mj_kinematics(model.ptr, data.ptr)
-
     # ------------------------------------------------------------- construction
 
     def _build_defaults(self) -> None:
@@ -305,20 +264,27 @@ class Robot(composer.Entity):
     def _build_rail(self) -> None:
         rail = self._mjcf_root.worldbody.add("body", name="rail")
         middle, half = RAIL_END / 2, -RAIL_END / 2
-        _box(rail, (0, 0.057, middle), (0.034, 0.006, half), "aluminium")
-        for side in (-1, 1):
-            x = side * 0.022
-            _rod(rail, (x, 0.043, -0.004), (x, 0.043, RAIL_END), 0.005, "steel")
-        _rod(rail, (0, 0.045, -0.004), (0, 0.045, RAIL_END), 0.003, "brass")
-        for z, guide in ((-0.010, 0.010), (RAIL_END + 0.006, 0.014)):
-            _box(rail, (0, 0.041, z), (0.038, 0.022, 0.006), "aluminium")
-            _box(rail, (0, 0.010, z), (0.008, 0.010, 0.006), "aluminium")
-            _rod(rail, (0, 0, z - guide), (0, 0, z + guide), 0.006, "steel")
+        _box(rail, "bed", (0, 0.057, middle), (0.034, 0.006, half), "aluminium")
+        for side, word in reversed(SIDES):
+            start, end = (side * 0.022, 0.043, -0.004), (side * 0.022, 0.043, RAIL_END)
+            _rod(rail, f"rod_{word}", start, end, 0.005, "steel")
+        _rod(rail, "screw", (0, 0.045, -0.004), (0, 0.045, RAIL_END), 0.003, "brass")
+        for end, z, guide in (
+            ("front", -0.010, 0.010),
+            ("rear", RAIL_END + 0.006, 0.014),
+        ):
+            plate, post = (0.038, 0.022, 0.006), (0.008, 0.010, 0.006)
+            _box(rail, f"{end}_plate", (0, 0.041, z), plate, "aluminium")
+            _box(rail, f"{end}_post", (0, 0.010, z), post, "aluminium")
+            start, stop = (0, 0, z - guide), (0, 0, z + guide)
+            _rod(rail, f"{end}_guide", start, stop, 0.006, "steel")
         # Valve manifold at the far end, with one air line per platform.
-        _box(rail, (0, 0.043, RAIL_END - 0.020), (0.036, 0.018, 0.020), "graphite")
-        for x, material in zip((-0.024, -0.008, 0.008, 0.024), ACCENTS, strict=True):
+        at, half_sizes = (0, 0.043, RAIL_END - 0.020), (0.036, 0.018, 0.020)
+        _box(rail, "manifold", at, half_sizes, "graphite")
+        for index, material in enumerate(ACCENTS):
+            x = -0.024 + 0.016 * index
             start, end = (x, 0.043, RAIL_END - 0.038), (x, 0.055, RAIL_END - 0.090)
-            _rod(rail, start, end, 0.003, material, "capsule")
+            _rod(rail, f"air_line_{index}", start, end, 0.003, material, "capsule")
 
     def _build_platform(
         self, name: str, home: float, half_length: float, accent: str
@@ -326,47 +292,54 @@ class Robot(composer.Entity):
         body = self._add_body(
             self._mjcf_root.worldbody, f"{name}_platform", (0, 0, home), (0, 0, 1)
         )
-        _box(body, (0, 0.030, 0), (0.042, 0.004, half_length), "graphite")
+        _box(body, "plate", (0, 0.030, 0), (0.042, 0.004, half_length), "graphite")
         # One block rides on both rods, one stripe shows on both flanks.
-        _box(body, (0, 0.040, 0), (0.032, 0.006, 0.017), "steel")
-        _box(body, (0, 0.030, 0), (0.0427, 0.0022, half_length - 0.003), accent)
+        _box(body, "block", (0, 0.040, 0), (0.032, 0.006, 0.017), "steel")
+        half_sizes = (0.0427, 0.0022, half_length - 0.003)
+        _box(body, "stripe", (0, 0.030, 0), half_sizes, accent)
         return body
 
     def _build_clamps(self, name: str, home: float) -> None:
         accent = "clamp"
         platform = self._build_platform(name, home, CLAMP_HALF_LENGTH, accent)
-        _box(platform, (0, 0.022, 0), (0.040, 0.004, 0.008), "aluminium")
+        _box(platform, "bridge", (0, 0.022, 0), (0.040, 0.004, 0.008), "aluminium")
         r, y = self._device_radius, 0.0135
-        for side, word in ((1, "left"), (-1, "right")):
-            _rod(platform, (side * 0.028, y, 0), (side * 0.041, y, 0), 0.006, "steel")
+        for side, word in SIDES:
+            start, end = (side * 0.028, y, 0), (side * 0.041, y, 0)
+            _rod(platform, f"cylinder_{word}", start, end, 0.006, "steel")
             jaw = self._add_body(
                 platform, f"{name}_jaw_{word}", (side * r, 0, 0), (side, 0, 0)
             )
-            _box(jaw, (side * 0.001, 0, 0), (0.001, 0.004, 0.012), "rubber")
-            _box(jaw, (side * 0.0055, 0.002, 0), (0.0035, 0.008, 0.010), accent)
-            _box(jaw, (side * 0.0105, y, 0), (0.0085, 0.0045, 0.010), accent)
-            _rod(jaw, (side * 0.018, y, 0), (side * 0.030, y, 0), 0.0022, "brass")
+            _box(jaw, "pad", (side * 0.001, 0, 0), (0.001, 0.004, 0.012), "rubber")
+            at, half_sizes = (side * 0.0055, 0.002, 0), (0.0035, 0.008, 0.010)
+            _box(jaw, "holder", at, half_sizes, accent)
+            at, half_sizes = (side * 0.0105, y, 0), (0.0085, 0.0045, 0.010)
+            _box(jaw, "arm", at, half_sizes, accent)
+            start, end = (side * 0.018, y, 0), (side * 0.030, y, 0)
+            _rod(jaw, "piston", start, end, 0.0022, "brass")
 
     def _build_rotary(self, name: str, home: float) -> None:
         accent = name
         platform = self._build_platform(name, home, ROTARY_HALF_LENGTH, accent)
-        _rod(platform, (0, 0, -0.018), (0, 0, -0.006), 0.019, "graphite")
-        _box(platform, (0, 0.014, -0.012), (0.019, 0.012, 0.006), "graphite")
-        _rod(platform, (0, 0, -0.023), (0, 0, -0.0055), 0.011, "steel")
+        _rod(platform, "motor", (0, 0, -0.018), (0, 0, -0.006), 0.019, "graphite")
+        _box(platform, "foot", (0, 0.014, -0.012), (0.019, 0.012, 0.006), "graphite")
+        _rod(platform, "hub", (0, 0, -0.023), (0, 0, -0.0055), 0.011, "steel")
         distance = GEAR_MODULE * (RING_TEETH + PINION_TEETH) / 2
         x, y = distance * np.cos(PINION_ANGLE), distance * np.sin(PINION_ANGLE)
-        _rod(platform, (x, y, -0.026), (x, y, -0.003), 0.0085, "aluminium")
+        _rod(platform, "drive", (x, y, -0.026), (x, y, -0.003), 0.0085, "aluminium")
 
         ring = self._add_body(platform, f"{name}_ring", (0, 0, 0.002), (0, 0, 1))
         _gear(ring, RING_TEETH, PINION_ANGLE, accent)
-        for side in (-1, 1):
-            _box(ring, (0, side * 0.0063, 0.010), (0.010, 0.0012, 0.007), "steel")
-        for side, word in ((1, "left"), (-1, "right")):
+        for side, word in ((-1, "top"), (1, "bottom")):
+            at, half_sizes = (0, side * 0.0063, 0.010), (0.010, 0.0012, 0.007)
+            _box(ring, f"fork_{word}", at, half_sizes, "steel")
+        for side, word in SIDES:
             at = (side * (ROLLER_RADIUS + self._device_radius), 0, 0.015)
             roller = self._add_body(ring, f"{name}_roller_{word}", at, (0, 1, 0))
-            _rod(roller, (0, -0.005, 0), (0, 0.005, 0), ROLLER_RADIUS, "rubber")
+            start, end = (0, -0.005, 0), (0, 0.005, 0)
+            _rod(roller, "tyre", start, end, ROLLER_RADIUS, "rubber")
             # A stripe, without which a turning cylinder looks still.
-            _box(roller, (0, 0, 0), (0.0052, 0.0044, 0.001), accent)
+            _box(roller, "stripe", (0, 0, 0), (0.0052, 0.0044, 0.001), accent)
 
         pinion = self._add_body(platform, f"{name}_pinion", (x, y, 0.002), (0, 0, 1))
         # A gap of the pinion faces a tooth of the ring.
@@ -385,24 +358,38 @@ class Robot(composer.Entity):
         return body
 
 
-def _box(body, centre, half_sizes, material: str, quat=(1, 0, 0, 0)) -> None:
+def _box(body, part: str, centre, half_sizes, material: str, quat=(1, 0, 0, 0)) -> None:
     body.add(
-        "geom", type="box", pos=centre, size=half_sizes, quat=quat, material=material
+        "geom",
+        name=f"{body.name}_{part}",
+        type="box",
+        pos=centre,
+        size=half_sizes,
+        quat=quat,
+        material=material,
     )
 
 
-def _rod(body, start, end, radius, material: str, shape: str = "cylinder") -> None:
+def _rod(
+    body, part: str, start, end, radius, material: str, shape: str = "cylinder"
+) -> None:
     body.add(
-        "geom", type=shape, fromto=(*start, *end), size=(radius,), material=material
+        "geom",
+        name=f"{body.name}_{part}",
+        type=shape,
+        fromto=(*start, *end),
+        size=(radius,),
+        material=material,
     )
 
 
 def _gear(body, teeth: int, angle: float, material: str) -> None:
     """A spur gear about z with one tooth at ``angle`` (rad from +x)."""
     pitch = GEAR_MODULE * teeth / 2
-    _rod(body, (0, 0, -0.004), (0, 0, 0.004), pitch - 0.8 * GEAR_MODULE, material)
+    root_radius = pitch - 0.8 * GEAR_MODULE
+    _rod(body, "blank", (0, 0, -0.004), (0, 0, 0.004), root_radius, material)
     half_sizes = (pitch + 0.75 * GEAR_MODULE, 0.9 * GEAR_MODULE, 0.0038)
     for i in range(teeth // 2):  # a box across the gear makes two opposite teeth
         half_turn = (angle + 2 * np.pi * i / teeth) / 2
         quat = (np.cos(half_turn), 0, 0, np.sin(half_turn))
-        _box(body, (0, 0, 0), half_sizes, material, quat)
+        _box(body, f"teeth_{i}", (0, 0, 0), half_sizes, material, quat)

@@ -2,6 +2,8 @@
 
 from dm_control import composer, mjcf
 
+from cathsim_dmc.entities.contact import sheath_contact
+
 CLEARANCE = 0.35e-3  # m between the device and each side of the bore
 # Thickness of the sides, m: their front covers the hole in the cap of the inlet, and
 # a loaded shaft cannot tunnel through them.
@@ -23,8 +25,6 @@ class Sheath(composer.Entity):
         self,
         length: float,
         device_radius: float,
-        solref: tuple[float, float],
-        solimp: tuple[float, ...],
         name: str = "sheath",
     ):
         """Builds the four sides of the bore.
@@ -32,8 +32,6 @@ class Sheath(composer.Entity):
         Args:
           length: of the bore, m.
           device_radius: outer radius of the device it guides, m.
-          solref: of the contacts.
-          solimp: of the contacts.
           name: of the entity.
         """
         self._bore_half_width = device_radius + CLEARANCE
@@ -57,14 +55,7 @@ class Sheath(composer.Entity):
                     _WALL / 2 if y else self._bore_half_width + _WALL,
                     length / 2,
                 ),
-                contype=1,
-                conaffinity=0,
-                # Frictionless whatever the device's own friction is: one row a
-                # contact in place of three.
-                priority=1,
-                condim=1,
-                solref=solref,
-                solimp=solimp,
+                **sheath_contact(),
                 mass=0,
                 group=3,
             )

@@ -9,9 +9,10 @@ import numpy as np
 
 from cathsim_dmc import suite
 from cathsim_dmc.play.controls import Controls
+from cathsim_dmc.policies import Policy, in_environment
 from cathsim_dmc.recording.episode import SUFFIX, Episode
 from cathsim_dmc.recording.recorder import EpisodeRecorder
-from cathsim_dmc.tasks.objectives import CONTROL_TIMESTEP
+from cathsim_dmc.tasks.config import CONTROL_TIMESTEP
 
 MODES = ("fluoroscopy", "viewer")
 _PAUSE = 1.0  # s, for which the end of an episode is shown
@@ -28,6 +29,7 @@ class Session:
         seed: int = 0,
         speed: float = 1.0,
         task_kwargs: Mapping[str, Any] | None = None,
+        policy: Policy | None = None,
     ):
         """Loads the task and opens the window.
 
@@ -37,6 +39,7 @@ class Session:
           seed: of the first episode; the others count up.
           speed: of the simulation against the clock.
           task_kwargs: options of the task.
+          policy: that plays while the operator watches; None for the operator.
 
         Raises:
           ValueError: if an argument is wrong or no window can be opened.
@@ -47,14 +50,16 @@ class Session:
             raise ValueError(f"speed is {speed}; it must be > 0")
         self._options = dict(task_kwargs or {})
         # The screen is the operator's observation; the task's own would only cost.
+        observation = (policy and policy.observation) or "tracking"
         self._environment = suite.load(
-            suite.DOMAIN, task, {"observation": "tracking", **self._options}
+            suite.DOMAIN, task, {"observation": observation, **self._options}
         )
+        self._policy = policy and in_environment(policy, self._environment)
         self._task_name, self._seed, self._speed = task, seed, speed
         navigation = self._environment.task
         self._controls = Controls(
-            len(navigation.catheter.tip_motors) // 2,
-            navigation.catheter.rotation is not None,
+            len(navigation.scene.catheter.tip_motors) // 2,
+            navigation.scene.catheter.rotation is not None,
         )
         self._face = _face(mode, navigation, self._controls)
         self._next = time.monotonic()
@@ -90,8 +95,7 @@ class Session:
         return written
 
     def _hand(self, timestep: Any) -> np.ndarray:
-        """The operator as a policy; stops the episode when asked to."""
-        del timestep
+        """The operator, or the policy watched; stops the episode when asked to."""
         if hasattr(self._face, "open"):
             self._face.open(self._environment.physics)
         self._face.show(self._environment.task)
@@ -104,6 +108,8 @@ class Session:
         self._face.poll()
         if self._quits() or self._controls.requested == "restart":
             raise StopIteration
+        if self._policy is not None:
+            return self._policy(timestep)
         return self._controls.action(CONTROL_TIMESTEP)
 
     def _quits(self) -> bool:
@@ -147,6 +153,7 @@ def play(
     episodes: int | None = None,
     speed: float = 1.0,
     task_kwargs: Mapping[str, Any] | None = None,
+    policy: Policy | None = None,
 ) -> list[Path]:
     """Plays a task by keyboard and records demonstrations.
 
@@ -158,9 +165,12 @@ def play(
       episodes: to play, None until the operator quits.
       speed: of the simulation against the clock.
       task_kwargs: options of the task.
+      policy: that plays while the operator watches; None for the operator.
 
     Returns:
       The files written.
     """
-    session = Session(task, mode, seed=seed, speed=speed, task_kwargs=task_kwargs)
+    session = Session(
+        task, mode, seed=seed, speed=speed, task_kwargs=task_kwargs, policy=policy
+    )
     return session.run(None if out is None else Path(out), episodes)

@@ -38,8 +38,10 @@ class MujocoViewer:
     def __init__(self, task: Any, controls: Controls):
         """Prepares; the window opens with the first `show`."""
         self._controls = controls
-        self._focus = np.array(task.placement.inlet + task.goal_position) / 2
-        self._size = float(np.linalg.norm(task.goal_position - task.placement.inlet))
+        self._focus = np.array(task.scene.placement.inlet + task.goal_position) / 2
+        self._size = float(
+            np.linalg.norm(task.goal_position - task.scene.placement.inlet)
+        )
         self._viewer = self._model = None
         self._threads: set[threading.Thread] = set()
         # Keys arrive on the viewer's own thread.

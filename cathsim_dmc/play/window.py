@@ -123,7 +123,7 @@ class FluoroscopyWindow:
         planes = angiograph.render(
             [self._machine],
             task.readings.centreline[None],
-            task.catheter.device.outer_radius,
+            task.scene.catheter.device.outer_radius,
             [self._random],
         )[0]
         image = np.concatenate(list(np.moveaxis(planes, -1, 0)), axis=1)
@@ -142,7 +142,7 @@ class FluoroscopyWindow:
         for plane, fluoroscope in enumerate(self._machine):
             carm = fluoroscope.carm
             _, depth = carm.project(task.goal_position)
-            radius = task.goal_radius * carm.focal_length / float(depth)
+            radius = task.objective.goal_radius * carm.focal_length / float(depth)
             x, y = places[0, plane, 0] + 0.5 + [plane * width, 0]
             self._screen.create_oval(
                 x - radius, y - radius, x + radius, y + radius, outline="green2"
@@ -186,7 +186,7 @@ def _machine(task) -> angiograph.Planes:
     factor = max(1, round(SIZE / max(rows, columns)))
     fields = {name: getattr(options, name) for name in options.__dataclass_fields__}
     fields["size"] = (rows * factor, columns * factor)
-    surface = task.anatomy.surface
+    surface = task.scene.anatomy.surface
     machine = angiograph.Angiograph(
         surface.vertices, surface.faces, FluoroscopyOptions(**fields)
     )

@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from cathsim_dmc.recording.files import atomic_path
+from cathsim_dmc.files import atomic_path
 
 FORMAT = "cathsim-episode"
 FORMAT_VERSION = 1

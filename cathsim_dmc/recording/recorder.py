@@ -71,7 +71,8 @@ def read_goal(task: Any) -> tuple[np.ndarray, float] | None:
     position = getattr(task, "goal_position", None)
     if position is None:
         return None
-    return np.array(position, dtype=np.float64).reshape(3), float(task.goal_radius)
+    radius = float(task.objective.goal_radius)
+    return np.array(position, dtype=np.float64).reshape(3), radius
 
 
 class _Rows:

@@ -18,6 +18,7 @@ import rerun as rr
 from rerun.blueprint import Blueprint
 from rerun.error_utils import catch_and_log_exceptions
 
+from cathsim_dmc.files import atomic_path
 from cathsim_dmc.recording.blueprint import (
     TIMELINE_STEP,
     TIMELINE_TIME,
@@ -25,7 +26,6 @@ from cathsim_dmc.recording.blueprint import (
 )
 from cathsim_dmc.recording.drawing import Drawing, action_layout, goal_distance
 from cathsim_dmc.recording.episode import Episode
-from cathsim_dmc.recording.files import atomic_path
 from cathsim_dmc.recording.geometry import (
     force_colours,
     rotate,

@@ -5,21 +5,18 @@ from typing import Any
 
 import torch
 from tensordict import TensorDict, TensorDictBase
-from torchrl.data import Binary, Composite, Unbounded
+from torchrl.data import Composite
 from torchrl.envs import DMControlEnv, EnvBase, Transform, TransformedEnv
 
-from cathsim_dmc.tasks import info as info
-from cathsim_dmc.tasks import info as task_info
+from cathsim_dmc import suite
+from cathsim_dmc.simulation.torchrl import info_spec
 
 
 class TaskInformation(Transform):
-    """Adds "info" to a composer environment: what its task measured in a step.
-
-    Args:
-        environment: the composer environment underneath.
-    """
+    """Adds "info" to a composer environment: the figures of its task after a step."""
 
     def __init__(self, environment: Any):
+        """Keeps the composer environment underneath."""
         super().__init__()
         self.__dict__["environment"] = environment
 
@@ -36,36 +33,25 @@ class TaskInformation(Transform):
         return tensordict_reset
 
     def _read(self) -> TensorDict:
-        task = self.environment.task
-        state = task.readings
-        numbers = task_info.measures(
-            state,
-            task.wall_force,
-            task.meaning.outcome(state.head).distance,
-            task.path_ratio,
-        )
         entries = {
-            name: torch.tensor([float(value)], dtype=torch.float32)
-            for name, value in numbers.items()
+            name: torch.tensor([value], dtype=_dtype(value))
+            for name, value in self.environment.task.info().items()
         }
-        entries["success"] = torch.tensor([task.termination == "success"])
-        entries["physics_error"] = torch.tensor([task.termination == "physics_error"])
         return TensorDict(entries)
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
-        """Declare "info"."""
-        info = {
-            name: Unbounded((1,), dtype=torch.float32) for name in task_info.MEASURES
-        }
-        info |= {name: Binary(1, (1,), dtype=torch.bool) for name in task_info.FLAGS}
-        observation_spec["info"] = Composite(info)
+        """Declares "info"."""
+        info = self.environment.task.info()
+        observation_spec["info"] = info_spec(info, torch.Size([]))
         return observation_spec
+
+
+def _dtype(value: bool | float) -> torch.dtype:
+    return torch.bool if isinstance(value, bool) else torch.float32
 
 
 def composer_env(task: str, task_kwargs: Mapping[str, Any], seed: int) -> EnvBase:
     """One seeded composer environment of a task, batch size []."""
-    from cathsim_dmc import suite
-
     env = DMControlEnv(suite.DOMAIN, task, **task_kwargs)
     env.set_seed(seed)
     return TransformedEnv(env, TaskInformation(env._env))

@@ -34,26 +34,31 @@ def make_env(
     num_envs: int = 1,
     num_threads: int | None = None,
     seed: int = 0,
-    path: str = "batched",
+    backend: str = "batched",
     task_kwargs: Mapping[str, Any] | None = None,
 ) -> EnvBase:
     """A seeded environment of batch size [num_envs] whose observations are standard.
 
     Args:
-        task: name of a registered task.
-        observation: name or names of the task's observations.
-        num_envs: number of simulations; environment i draws from seed + i.
-        num_threads: threads of the batched simulation, None for every core.
-        seed: of the first environment.
-        path: "batched" (mujoco.batch) or "composer" (dm_control, one by one).
-        task_kwargs: further arguments of the task.
+        task: Name of a registered task.
+        observation: Name or names of the task's observations.
+        num_envs: Number of simulations; simulation i draws from seed + i.
+        num_threads: Number of threads of the batched simulation, None for one per
+            core.
+        seed: Seed of the first simulation.
+        backend: Way of simulating: "batched" (mujoco.batch, all side by side) or
+            "composer" (dm_control environments, one after the other).
+        task_kwargs: Further options of the task.
 
     Returns:
         An environment with "observation_vector" (num_envs, n) float32 and/or
         "pixels" (num_envs, c, h, w) uint8.
+
+    Raises:
+        ValueError: the backend, the task or one of its options is unknown.
     """
     kwargs = dict(task_kwargs or {})
-    if path == "batched":
+    if backend == "batched":
         # Imported late: importing this module must not load MuJoCo.
         from cathsim_dmc.simulation.torchrl import BatchedEnv
 
@@ -65,7 +70,7 @@ def make_env(
             observation=observation,
             task_kwargs=kwargs,
         )
-    elif path == "composer":
+    elif backend == "composer":
         kwargs["observation"] = observation
         # Each factory seeds its own: SerialEnv.set_seed would hash the seeds apart.
         env = SerialEnv(
@@ -73,8 +78,15 @@ def make_env(
             [partial(composer_env, task, kwargs, seed + i) for i in range(num_envs)],
         )
     else:
-        raise ValueError(f"path={path!r} is unknown; choose 'batched' or 'composer'.")
+        raise ValueError(
+            f"backend={backend!r} is unknown; choose 'batched' or 'composer'."
+        )
     return standard_observations(env)
+
+
+def composer_of(env: EnvBase) -> Any:
+    """The composer environment under one environment of the backend "composer"."""
+    return env.base_env._env
 
 
 def standard_observations(env: EnvBase) -> TransformedEnv:

@@ -1,6 +1,5 @@
 """The tasks as Gymnasium environments: one simulation, or many on the batched path."""
 
-import dataclasses
 from collections.abc import Mapping
 from typing import Any
 
@@ -11,14 +10,12 @@ from dm_env import specs
 from cathsim_dmc import suite
 from cathsim_dmc.imaging import angiograph
 from cathsim_dmc.simulation import batch
-from cathsim_dmc.tasks import info as task_info
-from cathsim_dmc.tasks import objectives
-from cathsim_dmc.tasks.config import NavigationConfig
+from cathsim_dmc.tasks.config import CONTROL_TIMESTEP
 
 RENDER_MODES = ("rgb_array",)
 VERSION = 0  # of the ids
-# Options of the suite's factories beside those of the task.
-_FACTORY_OPTIONS = ("phantom", "goal", "random", "environment_kwargs")
+# Arguments of the suite's factories beside the options of the task.
+_FACTORY_OPTIONS = ("phantom", "random", "environment_kwargs")
 _MOST_SEED = 2**32  # first seed that numpy's RandomState does not take
 
 
@@ -51,14 +48,14 @@ def _float_type(dtype: str) -> np.dtype:
     return np.dtype(dtype)
 
 
-def _refuse_unknown(options: Mapping[str, Any]) -> None:
+def _refuse_unknown(task: str, options: Mapping[str, Any]) -> None:
     """Raises TypeError as for any call: TorchRL tries arguments and looks for it."""
-    fields = [field.name for field in dataclasses.fields(NavigationConfig)]
-    for name in options:
-        if name not in (*_FACTORY_OPTIONS, *fields):
+    known = suite.task_options(task) if task in suite.TASKS else ()
+    for name in options if known else ():
+        if name not in (*_FACTORY_OPTIONS, *known):
             raise TypeError(
                 f"{CathSimEnv.__name__}.__init__() got an unexpected keyword argument "
-                f"'{name}'; options are {', '.join(fields)}"
+                f"'{name}'; options are {', '.join(known)}"
             )
 
 
@@ -90,7 +87,7 @@ class CathSimEnv(gymnasium.Env):
 
     metadata = {
         "render_modes": list(RENDER_MODES),
-        "render_fps": round(1 / objectives.CONTROL_TIMESTEP),
+        "render_fps": round(1 / CONTROL_TIMESTEP),
     }
 
     def __init__(
@@ -113,7 +110,7 @@ class CathSimEnv(gymnasium.Env):
                 f"render_mode is {render_mode!r}; give None or "
                 f"{', '.join(map(repr, RENDER_MODES))}"
             )
-        _refuse_unknown(task_kwargs)
+        _refuse_unknown(task, task_kwargs)
         self.render_mode = render_mode
         self._dtype = _float_type(dtype)
         self._environment = suite.load(suite.DOMAIN, task, task_kwargs)
@@ -121,7 +118,7 @@ class CathSimEnv(gymnasium.Env):
             self._environment, self._dtype
         )
         self._renderer = None
-        self._ended = True
+        self._begun, self._ended = False, True
         self._closed = False
 
     def reset(self, *, seed: int | None = None, options: dict | None = None):
@@ -130,8 +127,9 @@ class CathSimEnv(gymnasium.Env):
         if seed is not None:
             self._environment.random_state.seed(_words(seed))
         timestep = self._environment.reset()
-        self._ended = False
-        return _converted(timestep.observation, self._dtype), self._info(False)
+        self._begun, self._ended = True, False
+        info = self._environment.task.info()
+        return _converted(timestep.observation, self._dtype), info
 
     def step(self, action: np.ndarray):
         """Advances by one control step; see `gymnasium.Env.step`."""
@@ -147,22 +145,8 @@ class CathSimEnv(gymnasium.Env):
             float(timestep.reward),
             terminated,
             self._ended and not terminated,
-            self._info(terminated),
+            self._environment.task.info(),
         )
-
-    def _info(self, terminated: bool) -> dict[str, Any]:
-        task = self._environment.task
-        outcome = task.meaning.outcome(task.readings.head)
-        numbers = task_info.measures(
-            task.readings, task.wall_force, outcome.distance, task.path_ratio
-        )
-        success = task.termination == "success"
-        return {
-            **{key: float(value) for key, value in numbers.items()},
-            "success": success,
-            # The task ends an episode by success or time; composer by divergence.
-            "physics_error": terminated and not success,
-        }
 
     def render(self) -> np.ndarray | None:
         """Fluoroscopy (rows, columns, 3) uint8, two planes side by side."""
@@ -171,14 +155,14 @@ class CathSimEnv(gymnasium.Env):
                 'render() without a render_mode; make the environment with "rgb_array"'
             )
             return None
-        if self._ended and self._environment.task.readings is None:
+        if not self._begun:
             raise gymnasium.error.ResetNeeded("there is nothing to see before reset()")
         return fluoroscopy_frame(self._environment.task, self._machine())
 
     def _machine(self) -> angiograph.Angiograph:
         if self._renderer is None:
             task = self._environment.task
-            surface = task.anatomy.surface
+            surface = task.scene.anatomy.surface
             self._renderer = angiograph.Angiograph(
                 surface.vertices, surface.faces, task.config.fluoroscopy
             )
@@ -201,7 +185,7 @@ def fluoroscopy_frame(task, machine: angiograph.Angiograph) -> np.ndarray:
     image = angiograph.render(
         [machine.planes()],
         task.readings.centreline[None],
-        task.catheter.device.outer_radius,
+        task.scene.device.outer_radius,
     )[0]
     row = np.concatenate(list(np.moveaxis(image, -1, 0)), axis=1)
     return np.repeat(row[..., None], 3, axis=-1)
@@ -266,11 +250,12 @@ class CathSimVectorEnv(gymnasium.vector.VectorEnv):
         self.single_observation_space, self.single_action_space = _spaces(
             environment, self._dtype
         )
+        environment.close()
         many = gymnasium.vector.utils.batch_space
         self.observation_space = many(self.single_observation_space, num_envs)
         self.action_space = many(self.single_action_space, num_envs)
         self._simulation = batch.BatchSimulation(
-            environment.task,
+            suite.make_task(task, **task_kwargs),
             num_envs,
             num_threads=num_threads,
             seeds=np.random.SeedSequence().generate_state(num_envs).tolist(),
@@ -283,24 +268,24 @@ class CathSimVectorEnv(gymnasium.vector.VectorEnv):
             if np.ndim(seed) == 0:
                 seed = [seed + i for i in range(self.num_envs)]
             self._simulation.seed([_words(each) for each in seed])
-        observation = self._simulation.reset()
-        return _converted(observation, self._dtype), self._info(None)
+        step = self._simulation.reset()
+        return _converted(step.observation, self._dtype), step.info()
 
     def step(self, actions: np.ndarray):
         """Advances all; see `gymnasium.vector.VectorEnv.step`."""
         step = self._simulation.step(np.asarray(actions, dtype=np.float64))
-        observation, info = step.observation, self._info(step)
+        observation, info = step.observation, step.info()
         ended = step.terminated | step.truncated
         if ended.any():
-            final = _converted(observation, self._dtype)
-            observation = self._simulation.reset(np.flatnonzero(ended))
+            begun = self._simulation.reset(np.flatnonzero(ended))
             info = {
-                **self._info(None),
-                "final_obs": final,
+                **begun.info(),
+                "final_obs": _converted(observation, self._dtype),
                 "_final_obs": ended,
                 "final_info": info,
                 "_final_info": ended,
             }
+            observation = begun.observation
         return (
             _converted(observation, self._dtype),
             step.outcome.reward.copy(),
@@ -308,21 +293,6 @@ class CathSimVectorEnv(gymnasium.vector.VectorEnv):
             step.truncated.copy(),
             info,
         )
-
-    def _info(self, step: batch.Step | None) -> dict[str, np.ndarray]:
-        simulation = self._simulation
-        if step is None:
-            outcome = simulation.meaning.outcome(simulation.readings.head)
-            error = np.zeros(self.num_envs, dtype=bool)
-        else:
-            outcome, error = step.outcome, step.physics_error
-        info = task_info.measures(
-            simulation.readings,
-            simulation.wall_force,
-            outcome.distance,
-            simulation.path_ratio,
-        )
-        return {**info, "success": outcome.success, "physics_error": error}
 
     @property
     def simulation(self) -> batch.BatchSimulation:

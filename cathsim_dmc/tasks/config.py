@@ -5,25 +5,24 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from cathsim_dmc.entities import devices
-from cathsim_dmc.entities.phantom import FRICTION
+from cathsim_dmc.entities.contact import FRICTION
 from cathsim_dmc.imaging.options import FluoroscopyOptions
-from cathsim_dmc.tasks import objectives as objectives
 from cathsim_dmc.tasks.cameras import CameraOptions
 from cathsim_dmc.tasks.variations import Randomisation
 
 PHYSICS_TIMESTEP = 0.004  # s
+CONTROL_TIMESTEP = 0.04  # s, one frame of fluoroscopy
+MAX_STEPS = 2000  # published
 
 
 @dataclasses.dataclass(frozen=True)
 class NavigationConfig:
-    """Options of a navigation task; the anatomy and the goal come beside them.
+    """Options of a navigation task; scene and objective come beside them.
 
     Attributes:
       observation: name or names in `observations.OBSERVATIONS`.
       device: name in `devices.DEVICES`, or a device.
       rotation: whether the action has a rotation of the base.
-      reward: "distance" or "path", see `objectives.Cannulation`.
-      goal_radius: δ, m.
       max_steps: control steps until truncation.
       friction: Coulomb coefficient of device on wall.
       shaft_link: longest link of the shaft, m.
@@ -34,16 +33,14 @@ class NavigationConfig:
       fluoroscopy: `imaging.FluoroscopyOptions` of the image observations, or a
         mapping of its fields.
       cameras: `cameras.CameraOptions` of `rgb` and `depth`, or a mapping.
-      randomisation: `variations.Randomisation`, a mapping of its fields, True for the
-        usual ranges, False for none.
+      randomisation: `variations.Randomisation`, a mapping of its fields, True for
+        `variations.DEFAULT_RANGES`, False for none.
     """
 
     observation: str | Sequence[str] = "internal"
     device: str | devices.Device = "published"
     rotation: bool = False
-    reward: str = "distance"
-    goal_radius: float = objectives.GOAL_RADIUS
-    max_steps: int = objectives.MAX_STEPS
+    max_steps: int = MAX_STEPS
     friction: float = FRICTION
     shaft_link: float = 0.0175
     torsion_joints: int | None = None
@@ -54,6 +51,8 @@ class NavigationConfig:
     randomisation: Randomisation | Mapping[str, Any] | bool = False
 
     def __post_init__(self):
+        if self.max_steps < 1:
+            raise ValueError(f"max_steps is {self.max_steps}; at least 1")
         kinds = {"fluoroscopy": FluoroscopyOptions, "cameras": CameraOptions}
         for name, kind in kinds.items():
             value = getattr(self, name)

@@ -1,4 +1,4 @@
-"""What the operator sees: the live images of N simulations and their recent past."""
+"""The live images of N simulations and their recent past."""
 
 from collections.abc import Sequence
 
@@ -10,32 +10,32 @@ from cathsim_dmc.imaging.fluoroscopy import Fluoroscope
 from cathsim_dmc.tasks import cameras, observations
 
 
-class Screen:
-    """Takes the pictures that the observations ask for, of N simulations."""
+class ImageSensors:
+    """Captures the images that the observations ask for, of N simulations."""
 
     def __init__(
         self,
         names: Sequence[str],
         angiograph: machines.Angiograph | None,
-        radius: float,
-        simulations: int,
-        eyes: cameras.Cameras | None = None,
+        device_radius: float,
+        num_simulations: int,
+        gl_cameras: cameras.Cameras | None = None,
     ):
-        """Switches the screen on.
+        """Switches the sensors on.
 
         Args:
-          names: of the observations.
-          angiograph: needed by fluoroscopic observations.
-          radius: of the device, m.
-          simulations: N.
-          eyes: cameras, needed by `rgb` and `depth`.
+          names: Names of the observations.
+          angiograph: Angiography machine, needed by fluoroscopic observations.
+          device_radius: Outer radius of the device, m.
+          num_simulations: N.
+          gl_cameras: MuJoCo's cameras, needed by `rgb` and `depth`.
         """
         self._names = names
-        self._on = angiograph is not None or eyes is not None
+        self._on = angiograph is not None or gl_cameras is not None
         self._angiograph = angiograph
-        self._radius = radius
-        self._eyes = eyes
-        self._planes = [angiograph and angiograph.planes()] * simulations
+        self._radius = device_radius
+        self._cameras = gl_cameras
+        self._planes = [angiograph and angiograph.planes()] * num_simulations
         self._images: list[np.ndarray] = []
         self._masks = self._pixels = None
         self._views: dict[str, np.ndarray] = {}
@@ -45,15 +45,15 @@ class Screen:
         if self._angiograph is not None:
             self._planes[index] = self._angiograph.planes(deviation)
 
-    def take(
+    def capture(
         self,
         lines: np.ndarray,
         goal: np.ndarray,
         qpos: np.ndarray,
         random_states: Sequence[np.random.RandomState] | None,
         fresh: np.ndarray | None = None,
-    ) -> observations.Picture:
-        """Takes the next pictures.
+    ) -> observations.Images:
+        """Captures the next images.
 
         Args:
           lines: (N, n, 3), centrelines of the devices, m.
@@ -61,10 +61,10 @@ class Screen:
           qpos: (N, nq).
           random_states: N sources of quantum noise, None for images without.
           fresh: indices of simulations that have just begun an episode: only theirs
-            are taken and fill their whole history. None for all, one step on.
+            are captured and fill their whole history. None for all, one step on.
         """
         if not self._on:
-            return observations.DARK
+            return observations.NO_IMAGES
         count = len(qpos)
         chosen = np.arange(count) if fresh is None else fresh
         line = lines[chosen]
@@ -85,9 +85,9 @@ class Screen:
             self._pixels = _merged(self._pixels, pixels, count, fresh)
         kinds = [kind for kind in cameras.KINDS if kind in self._names]
         if kinds:
-            for key, view in self._eyes.see(kinds, qpos[chosen]).items():
+            for key, view in self._cameras.see(kinds, qpos[chosen]).items():
                 self._views[key] = _merged(self._views.get(key), view, count, fresh)
-        return observations.Picture(
+        return observations.Images(
             image=self._images[0] if self._images else None,
             past_images=tuple(self._images[1:]),
             masks=self._masks,

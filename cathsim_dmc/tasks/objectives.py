@@ -1,99 +1,223 @@
-"""What it means to cannulate a branch: distance, success and reward."""
+"""What a task asks for: when it succeeds, and what it rewards."""
 
 import dataclasses
-import functools
-from typing import NamedTuple
+from collections.abc import Callable, Mapping
+from types import MappingProxyType
+from typing import ClassVar, NamedTuple, Protocol
 
 import numpy as np
 
-from cathsim_dmc.anatomy import centreline as centrelines
+from cathsim_dmc.anatomy import Anatomy, Centreline, Goal
+from cathsim_dmc.tasks import forces, readings
 
-# The published task.
-GOAL_RADIUS = 8e-3  # m, δ
-SUCCESS_REWARD = 10.0
-MAX_STEPS = 2000
-CONTROL_TIMESTEP = 0.04  # s, one frame of fluoroscopy
-START_JITTER = 1e-3  # m, radius of the ball of the random displacement of the tip
+GOAL_RADIUS = 8e-3  # m, δ of the published task
+# Weights of the published reward: minus the distance in metres, or 10 at success.
+PUBLISHED_REWARD: Mapping[str, float] = MappingProxyType(
+    {"distance": -1.0, "success": 10.0}
+)
 
-REWARDS = ("distance", "path")
+
+class Measurement(NamedTuple):
+    """What there is to judge after a control step; SI units, world frame.
+
+    Attributes:
+      readings: state of the devices, arrays with the leading axes `...`.
+      wall_force: force on the wall over the control step, arrays (...).
+      action: (..., A), action of this control step in [-1, 1].
+      previous_action: (..., A), action of the control step before, zeros after a
+        reset.
+    """
+
+    readings: readings.Readings
+    wall_force: forces.WallForce
+    action: np.ndarray
+    previous_action: np.ndarray
 
 
 class Outcome(NamedTuple):
-    """How a control step went; arrays have the leading axes of the head.
+    """Judgement of a control step; arrays have the leading axes of the measurement.
 
     Attributes:
-      distance: (...), straight from head to goal, m.
-      success: (...) bool, in the branch and within the goal's radius.
-      reward: (...), the weighted terms that count.
-      path: (...), way along the route that is left and distance from it, m; None
-        unless it is rewarded.
+      reward: (...) float64, the sum of the terms.
+      success: (...) bool, which ends the episode.
+      terms: name to weighted reward term (...).
     """
 
-    distance: np.ndarray
-    success: np.ndarray
     reward: np.ndarray
-    path: np.ndarray | None = None
+    success: np.ndarray
+    terms: Mapping[str, np.ndarray]
+
+
+class Objective(Protocol):
+    """What a navigation task asks for; pure functions of arrays.
+
+    The composer environment calls it with one leading axis of length 1, the batched
+    simulation with one of length N: work on the last axes only.
+
+    Attributes:
+      goal: (3,), or (N, 3) where it differs between simulations, m, world frame.
+      goal_radius: distance from the goal that counts as reached, m.
+    """
 
     @property
-    def terms(self) -> dict[str, np.ndarray]:
-        """Named reward terms (...), before weighting."""
-        terms = {"distance": self.distance, "success": self.success.astype(float)}
-        return terms if self.path is None else {**terms, "path": self.path}
+    def goal(self) -> np.ndarray: ...  # noqa: D102
+
+    @property
+    def goal_radius(self) -> float: ...  # noqa: D102
+
+    def outcome(self, measurement: Measurement) -> Outcome:
+        """Judges a control step."""
+        ...
+
+    def path_distance(self, head: np.ndarray) -> np.ndarray:
+        """Way (...) from heads (..., 3) to the goal through the lumen, m."""
+        ...
+
+
+class ShiftableObjective(Objective, Protocol):
+    """An objective whose goal can be moved along its branch from episode to episode."""
+
+    def shifted(self, shift: np.ndarray) -> "ShiftableObjective":
+        """The same objective with the goal moved by `shift` () or (N,), m."""
+        ...
 
 
 @dataclasses.dataclass(frozen=True)
 class Cannulation:
-    """The goal of a task and its reward.
+    """Bring the head of the device into a branch.
+
+    Success: the head is within `goal_radius` of the goal and inside the lumen of the
+    branch, past its ostium. The reward is the sum of the weighted `TERMS` and of
+    "success". At success the terms of `UNTIL_SUCCESS` count nothing: with the
+    published weights the last reward is 10, and minus the distance before.
 
     Attributes:
-      goal: (3,) or, if it differs between simulations, (..., 3), m, world frame.
+      goal: (3,) or, if it differs between simulations, (N, 3), m, world frame.
       branch: centreline of the whole target branch.
       ostium: arc length at which the branch leaves its parent's lumen, m.
       route: centreline from the inlet to the goal.
       goal_radius: δ, m.
-      reward: "distance" (published: minus the straight distance in metres) or "path"
-        (minus the way along the route that is left, and the distance from it).
-      success_reward: bonus, weight of the term "success".
-      max_steps: control steps until the episode is truncated.
-      goal_arc_length: () or (...), of the goal on the route, m; None for its end.
+      weights: reward term to its weight; terms without one are not worked out.
+      goal_arc_length: () or (N,), of the goal on the route, m; None for its end.
     """
 
     goal: np.ndarray
-    branch: centrelines.Centreline
+    branch: Centreline
     ostium: float
-    route: centrelines.Centreline
+    route: Centreline
     goal_radius: float = GOAL_RADIUS
-    reward: str = "distance"
-    success_reward: float = SUCCESS_REWARD
-    max_steps: int = MAX_STEPS
+    weights: Mapping[str, float] = dataclasses.field(
+        default_factory=lambda: PUBLISHED_REWARD
+    )
     goal_arc_length: np.ndarray | None = None
 
+    # Reward terms before weighting: arrays (...) of an objective and a measurement. A
+    # subclass adds terms of its own.
+    TERMS: ClassVar[
+        Mapping[str, Callable[["Cannulation", Measurement], np.ndarray]]
+    ] = MappingProxyType(
+        {
+            # Straight from head to goal, m.
+            "distance": lambda self, m: self.distance(m.readings.head),
+            # Way along the route that is left, and distance from the route, m.
+            "path": lambda self, m: self.path_distance(m.readings.head),
+            # Sum of all contacts on the wall at the end of the control step, N.
+            "force": lambda self, m: m.wall_force.sum,
+            # Largest single contact in any physics step of the control step, N.
+            "peak_force": lambda self, m: m.wall_force.peak_max,
+            # 1 for each control step.
+            "time": lambda self, m: np.ones_like(m.readings.insertion),
+            # Mean square of the change of the action.
+            "smoothness": lambda self, m: np.square(m.action - m.previous_action).mean(
+                -1
+            ),
+        }
+    )
+    UNTIL_SUCCESS: ClassVar[frozenset[str]] = frozenset({"distance", "path"})
+
     def __post_init__(self):
-        if self.reward not in REWARDS:
-            raise ValueError(
-                f"reward is {self.reward!r}; allowed are {', '.join(REWARDS)}"
-            )
         if not self.goal_radius > 0:
             raise ValueError(f"goal_radius is {self.goal_radius} m; it must be > 0")
-        if self.max_steps < 1:
-            raise ValueError(f"max_steps is {self.max_steps}; at least 1")
+        object.__setattr__(self, "weights", self._checked(self.weights))
 
-    @functools.cached_property
-    def weights(self) -> dict[str, float]:
-        """Weights of the reward terms."""
-        return {self.reward: -1.0, "success": self.success_reward}
+    def _checked(self, weights: Mapping[str, float]) -> Mapping[str, float]:
+        known = (*self.TERMS, "success")
+        problem = None
+        if not isinstance(weights, Mapping) or not weights:
+            problem = "give a mapping of reward terms to weights"
+        elif set(weights) - set(known):
+            problem = (
+                f"no term {', '.join(sorted(map(str, set(weights) - set(known))))}"
+            )
+        elif not all(
+            isinstance(weight, int | float) and np.isfinite(weight)
+            for weight in weights.values()
+        ):
+            problem = "weights must be finite numbers"
+        if problem:
+            raise ValueError(
+                f"reward is {weights!r}: {problem}; terms are {', '.join(known)}, and "
+                f"the published reward is {dict(PUBLISHED_REWARD)}"
+            )
+        return MappingProxyType({name: float(w) for name, w in weights.items()})
 
-    def outcome(self, head: np.ndarray) -> Outcome:
-        """Judges the position (..., 3) of the head, m, world frame."""
-        distance = _norm(head - self.goal)
-        success = distance < self.goal_radius
-        path = self.path_distance(head) if self.reward == "path" else None
-        reward = self.weights[self.reward] * (distance if path is None else path)
+    @classmethod
+    def to(
+        cls,
+        anatomy: Anatomy,
+        goal: Goal,
+        *,
+        reward: Mapping[str, float] = PUBLISHED_REWARD,
+        goal_radius: float = GOAL_RADIUS,
+        farthest_shift: float = 0.0,
+    ) -> "Cannulation":
+        """The objective of reaching a goal of an anatomy.
+
+        Args:
+          anatomy: Anatomy to navigate.
+          goal: Goal in the lumen of one of its vessels.
+          reward: Weights of the reward terms.
+          goal_radius: Distance from the goal that counts as reached, m.
+          farthest_shift: How far past the goal its place may be shifted, m.
+        """
+        vessel = anatomy.tree.vessel(goal.vessel)
+        route = anatomy.route(goal, farthest_shift)
+        arc_length = route.project(goal.position).arc_length if farthest_shift else None
+        return cls(
+            goal=goal.position,
+            branch=vessel.centreline,
+            ostium=vessel.ostium,
+            route=route,
+            goal_radius=goal_radius,
+            weights=reward,
+            goal_arc_length=arc_length,
+        )
+
+    def outcome(self, measurement: Measurement) -> Outcome:
+        """Judges a control step."""
+        success = self.success(measurement.readings.head)
+        terms = {}
+        for name, weight in self.weights.items():
+            if name == "success":
+                terms[name] = weight * success
+                continue
+            term = weight * self.TERMS[name](self, measurement)
+            if name in self.UNTIL_SUCCESS:
+                term = np.where(success, 0.0, term)
+            terms[name] = term
+        return Outcome(sum(terms.values()), success, MappingProxyType(terms))
+
+    def success(self, head: np.ndarray) -> np.ndarray:
+        """Whether heads (..., 3) are in the branch and within the goal's radius."""
+        success = self.distance(head) < self.goal_radius
         if success.any():  # finding the place in the branch takes 50 µs
             success = success & self.in_branch(head)
-            # Published: +10 inside δ, minus the distance otherwise.
-            reward = np.where(success, self.weights["success"], reward)
-        return Outcome(distance, success, reward, path)
+        return success
+
+    def distance(self, head: np.ndarray) -> np.ndarray:
+        """Straight distance (...) from heads (..., 3) to the goal, m."""
+        offset = head - self.goal
+        return np.sqrt(np.vecdot(offset, offset))
 
     def in_branch(self, head: np.ndarray) -> np.ndarray:
         """Whether the head (..., 3) is in the lumen of the branch, past its ostium."""
@@ -108,10 +232,10 @@ class Cannulation:
         return np.abs(self.goal_arc_length - place.arc_length) + place.distance
 
     def shifted(self, shift: np.ndarray) -> "Cannulation":
-        """The same task with the goal moved along its branch.
+        """The same objective with the goal moved along its branch.
 
         Args:
-          shift: () or (...), m, positive away from the ostium; the goal stays
+          shift: () or (N,), m, positive away from the ostium; the goal stays
             between the ostium and the end of the branch.
         """
         branch = self.branch
@@ -121,81 +245,3 @@ class Cannulation:
         goal = self.goal + moved
         arc_length = self.route.project(goal).arc_length
         return dataclasses.replace(self, goal=goal, goal_arc_length=arc_length)
-
-
-def _norm(vectors: np.ndarray) -> np.ndarray:
-    """Length of vectors (..., 3)."""
-    return np.sqrt(np.vecdot(vectors, vectors))
-
-
-class Travel:
-    """Ways that the heads of N simulations have gone in their episodes."""
-
-    def __init__(self, simulations: int):
-        """Starts with all heads at rest."""
-        self._gone = np.zeros(simulations)
-        self._shortest = np.ones(simulations)
-        # Positions whose ways are not in the sum yet: it is seldom asked for.
-        self._heads = [np.zeros((simulations, 3))]
-
-    def restart(
-        self, indices: np.ndarray, head: np.ndarray, meaning: Cannulation
-    ) -> None:
-        """Begins episodes of some simulations with the heads (N, 3) of all, m."""
-        self._sum_up()
-        self._heads[0] = self._heads[0].copy()
-        self._heads[0][indices] = head[indices]
-        self._gone[indices] = 0.0
-        self._shortest[indices] = meaning.path_distance(head)[indices]
-
-    def add(self, head: np.ndarray) -> None:
-        """Adds the way to the heads (N, 3), m."""
-        self._heads.append(head)
-
-    def _sum_up(self):
-        ways = _norm(np.diff(self._heads, axis=0))
-        # One step after the other: a sum would depend on when it is taken.
-        self._gone = np.cumsum([self._gone, *ways], axis=0)[-1]
-        del self._heads[:-1]
-
-    @property
-    def path_ratio(self) -> np.ndarray:
-        """(N,), way gone so far over the shortest way from start to goal."""
-        self._sum_up()
-        return self._gone / self._shortest
-
-
-def start_displacement(
-    random_state: np.random.RandomState, ball: float = START_JITTER
-) -> np.ndarray:
-    """Random displacement (3,) of the tip: uniform in a ball of that radius, m."""
-    direction = random_state.normal(size=3)
-    radius = ball * random_state.uniform() ** (1 / 3)
-    return radius * direction / np.linalg.norm(direction)
-
-
-def check_action(action: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
-    """Returns the action as float64.
-
-    Args:
-      action: of one simulation (A,), or of many (N, A).
-      shape: that it must have.
-
-    Raises:
-      ValueError: if its shape is another or it is not finite.
-    """
-    action = np.asarray(action, dtype=np.float64)
-    if action.shape != shape:
-        many = f"for {shape[0]} simulations, " if len(shape) > 1 else ""
-        raise ValueError(
-            f"the action has shape {action.shape}, but it must have {shape}: {many}"
-            f"{shape[-1]} entries in [-1, 1]: tip motors from proximal to distal (x "
-            "before y), translation, and rotation if the task has it"
-        )
-    finite = np.isfinite(action)
-    if not finite.all():
-        raise ValueError(
-            f"the action holds {np.count_nonzero(~finite)} NaN or infinite entries; "
-            "all must be numbers in [-1, 1]"
-        )
-    return action

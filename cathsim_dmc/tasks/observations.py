@@ -1,5 +1,11 @@
-"""Observations of a task as functions of a frame, for one simulation or for many."""
+"""The table of observations: what each holds, beside the function that computes it.
 
+An observation is a function of a `Frame`, for one simulation or for many. To add one,
+write it here and register it with its entries.
+"""
+
+import dataclasses
+import math
 from collections.abc import Callable, Mapping, Sequence
 from types import MappingProxyType
 from typing import NamedTuple
@@ -18,15 +24,15 @@ SEQUENCE_LENGTH = 3
 Observation = dict[str, np.ndarray]
 
 
-class Picture(NamedTuple):
-    """What is on the operator's screen; None where no observation needs it.
+class Images(NamedTuple):
+    """What the image sensors show; None where no observation needs it.
 
     Attributes:
       image: (..., H, W, P) uint8, fluoroscopy of P planes.
       past_images: the same, one and two control steps before, newest first.
       masks: (..., H, W, 2 P) uint8, see `imaging.angiograph.masks`.
       pixels: (..., P, K + 1, 2), tracked points and goal, (column, row).
-      views: pictures of MuJoCo's cameras by key.
+      views: images of MuJoCo's cameras by key.
     """
 
     image: np.ndarray | None = None
@@ -35,21 +41,8 @@ class Picture(NamedTuple):
     pixels: np.ndarray | None = None
     views: Mapping[str, np.ndarray] = MappingProxyType({})
 
-    def of(self, index: int) -> "Picture":
-        """The picture of one of many simulations."""
-        if self is DARK:
-            return self
-        return Picture(
-            image=None if self.image is None else self.image[index],
-            past_images=tuple(image[index] for image in self.past_images),
-            masks=None if self.masks is None else self.masks[index],
-            pixels=None if self.pixels is None else self.pixels[index],
-            views={key: view[index] for key, view in self.views.items()},
-        )
 
-
-# A screen that is off.
-DARK = Picture()
+NO_IMAGES = Images()
 
 
 class Frame(NamedTuple):
@@ -57,17 +50,122 @@ class Frame(NamedTuple):
 
     Attributes:
       readings: state of the device.
-      wall_force: on the wall over the control step.
+      wall_force: force on the wall over the control step.
       action: (..., A), the action that was asked for, zeros after a reset.
       goal: (3,) or (..., 3), m.
-      picture: on the operator's screen.
+      images: what the image sensors show.
     """
 
     readings: readings.Readings
     wall_force: forces.WallForce
     action: np.ndarray
     goal: np.ndarray
-    picture: Picture = DARK
+    images: Images = NO_IMAGES
+
+
+@dataclasses.dataclass(frozen=True)
+class ImageOptions:
+    """Options on which the shapes of images depend.
+
+    Attributes:
+      fluoroscopy: set-up of the angiography machine.
+      cameras: MuJoCo's cameras and their size.
+    """
+
+    fluoroscopy: FluoroscopyOptions = FluoroscopyOptions()
+    cameras: CameraOptions = CameraOptions()
+
+    def fluoroscopic(self, channels: int) -> tuple[int, ...]:
+        """Shape (rows, columns, channels of all planes) of a fluoroscopic image."""
+        fluoroscopy = self.fluoroscopy
+        return (*fluoroscopy.resolution, fluoroscopy.planes * channels)
+
+
+@dataclasses.dataclass(frozen=True)
+class Entry:
+    """One array of an observation, as people and specs need to know it.
+
+    Attributes:
+      key: name in the observation; `<camera>` stands for the name of each camera.
+      unit: of its numbers, by part where parts differ.
+      meaning: layout and frame.
+      low: least value, -inf if there is no bound.
+      high: greatest value.
+      dtype: of an image; None for numbers, whose spec composer infers.
+      shape: shape of an image by the options; None for numbers.
+    """
+
+    key: str
+    unit: str
+    meaning: str
+    low: float = -math.inf
+    high: float = math.inf
+    dtype: type | None = None
+    shape: Callable[[ImageOptions], tuple[int, ...]] | None = None
+
+    def keys(self, options: ImageOptions) -> tuple[str, ...]:
+        """Names in the observation."""
+        if "<camera>" not in self.key:
+            return (self.key,)
+        return tuple(self.key.replace("<camera>", n) for n in options.cameras.names)
+
+    def spec(self, options: ImageOptions) -> specs.Array | None:
+        """Spec of an image; None for numbers."""
+        if self.shape is None:
+            return None
+        shape = self.shape(options)
+        if self.dtype is np.uint8:
+            return specs.BoundedArray(shape, np.uint8, int(self.low), int(self.high))
+        return specs.Array(shape, self.dtype)
+
+
+@dataclasses.dataclass(frozen=True)
+class ObservationKind:
+    """One row of the table.
+
+    Attributes:
+      observe: function from a frame to the arrays of the observation.
+      entries: its arrays.
+      fluoroscopic: whether it needs the angiography machine.
+    """
+
+    observe: Callable[[Frame], Observation]
+    entries: tuple[Entry, ...]
+    fluoroscopic: bool = False
+
+
+OBSERVATIONS: dict[str, ObservationKind] = {}
+
+
+def _register(*entries: Entry, fluoroscopic: bool = False):
+    """Puts the decorated function into the table under its own name."""
+
+    def add(function: Callable[[Frame], Observation]):
+        OBSERVATIONS[function.__name__] = ObservationKind(
+            function, entries, fluoroscopic
+        )
+        return function
+
+    return add
+
+
+_POINTS = f"{TRACKED_POINTS} points along the device, proximal to head"
+_OPERATOR = (
+    Entry(
+        "tracking_insertion",
+        "m",
+        "slide of the base, 0 at the start of the stroke; its stops are soft",
+        -0.001,
+    ),
+    Entry("tracking_action", "1", "the last action, zeros after a reset", -1, 1),
+)
+
+
+def _operator(frame: Frame) -> Observation:
+    return {
+        "tracking_insertion": frame.readings.insertion[..., None],
+        "tracking_action": frame.action,
+    }
 
 
 def _flat(array: np.ndarray, axes: int) -> np.ndarray:
@@ -75,6 +173,30 @@ def _flat(array: np.ndarray, axes: int) -> np.ndarray:
     return array.reshape(*array.shape[: array.ndim - axes], -1)
 
 
+@_register(
+    Entry(
+        "position",
+        "m, rad",
+        "joints in the order of the chain: slide of the base, then hinges",
+    ),
+    Entry("velocity", "m/s, rad/s", "of the same joints"),
+    Entry(
+        "com_inertia",
+        "kg·m², kg·m, kg",
+        "10 numbers a link: inertia about the subtree's centre of mass (`cinert`)",
+    ),
+    Entry(
+        "com_velocity",
+        "rad/s, m/s",
+        "6 numbers a link: rotation, translation (`cvel`)",
+    ),
+    Entry("actuator_force", "N, N·m", "of the motors, by joint"),
+    Entry(
+        "external_force",
+        "N·m, N",
+        "6 numbers a link: contact torque, contact force (`cfrc_ext`)",
+    ),
+)
 def internal(frame: Frame) -> Observation:
     """State of joints and links, as published."""
     state = frame.readings
@@ -88,20 +210,56 @@ def internal(frame: Frame) -> Observation:
     }
 
 
+@_register(
+    Entry(
+        "image",
+        "grey level",
+        "fluoroscopy, dark = opaque, one channel a plane",
+        0,
+        255,
+        np.uint8,
+        lambda options: options.fluoroscopic(1),
+    ),
+    fluoroscopic=True,
+)
 def image(frame: Frame) -> Observation:
     """One fluoroscopic image, a channel for each plane."""
-    return {"image": frame.picture.image}
+    return {"image": frame.images.image}
 
 
+@_register(
+    Entry(
+        "sequential",
+        "grey level",
+        "three consecutive images, oldest first; equal after a reset",
+        0,
+        255,
+        np.uint8,
+        lambda options: options.fluoroscopic(SEQUENCE_LENGTH),
+    ),
+    fluoroscopic=True,
+)
 def sequential(frame: Frame) -> Observation:
     """Three consecutive images, oldest first."""
-    images = (*reversed(frame.picture.past_images), frame.picture.image)
+    images = (*reversed(frame.images.past_images), frame.images.image)
     return {"sequential": np.concatenate(images, axis=-1)}
 
 
+@_register(
+    Entry(
+        "segmentation",
+        "0 or 255",
+        "channels: device, vessel (of each plane)",
+        0,
+        255,
+        np.uint8,
+        lambda options: options.fluoroscopic(2),
+    ),
+    fluoroscopic=True,
+)
 def segmentation(frame: Frame) -> Observation:
     """Which pixels show the device, and which the vessel."""
-    return {"segmentation": frame.picture.masks}
+    return {"segmentation": frame.images.masks}
 
 
 def tracked(line: np.ndarray) -> np.ndarray:
@@ -114,6 +272,11 @@ def tracked(line: np.ndarray) -> np.ndarray:
     return line[..., np.round(chosen).astype(int), :]
 
 
+@_register(
+    Entry("tracking_points", "m", f"{_POINTS}, world frame"),
+    Entry("tracking_goal", "m", "centre of the goal, world frame"),
+    *_OPERATOR,
+)
 def tracking(frame: Frame) -> Observation:
     """Points along the device in space, the goal, the insertion, the last action."""
     line = frame.readings.centreline
@@ -124,9 +287,19 @@ def tracking(frame: Frame) -> Observation:
     }
 
 
+@_register(
+    Entry(
+        "tracking_pixels",
+        "pixel",
+        f"{_POINTS}: column, row (plane by plane); pixel centres are whole numbers",
+    ),
+    Entry("tracking_goal_pixels", "pixel", "goal: column, row"),
+    *_OPERATOR,
+    fluoroscopic=True,
+)
 def tracking_2d(frame: Frame) -> Observation:
-    """The same points and the goal in pixels, as seen on the screen."""
-    pixels = frame.picture.pixels
+    """The same points and the goal in pixels, as fluoroscopy shows them."""
+    pixels = frame.images.pixels
     return {
         "tracking_pixels": _flat(pixels[..., :-1, :], 3),
         "tracking_goal_pixels": _flat(pixels[..., -1, :], 2),
@@ -134,13 +307,10 @@ def tracking_2d(frame: Frame) -> Observation:
     }
 
 
-def _operator(frame: Frame) -> Observation:
-    return {
-        "tracking_insertion": frame.readings.insertion[..., None],
-        "tracking_action": frame.action,
-    }
-
-
+@_register(
+    Entry("goal_position", "m", "centre of the goal, world frame"),
+    Entry("goal_from_head", "m", "from the head to the goal, world frame"),
+)
 def goal(frame: Frame) -> Observation:
     """Where the goal is, in the world and from the head."""
     head = frame.readings.head
@@ -150,6 +320,21 @@ def goal(frame: Frame) -> Observation:
     }
 
 
+@_register(
+    Entry(
+        "wall_force",
+        "N",
+        "on the wall: sum and largest contact at the end of the step, and their "
+        "peaks within it",
+        0,
+    ),
+    Entry(
+        "push_force",
+        "N, N·m",
+        "force and torque of the base on the device, positive forward",
+    ),
+    Entry("load_cell", "N", "force of the phantom on its support, world frame"),
+)
 def force(frame: Frame) -> Observation:
     """Force sensing beside any other observation."""
     wall, state = frame.wall_force, frame.readings
@@ -162,60 +347,44 @@ def force(frame: Frame) -> Observation:
     }
 
 
+@_register(
+    Entry(
+        "rgb_<camera>",
+        "colour level",
+        "red, green, blue",
+        0,
+        255,
+        np.uint8,
+        lambda options: (*options.cameras.resolution, 3),
+    )
+)
 def rgb(frame: Frame) -> Observation:
     """Colour images of MuJoCo's cameras."""
     return _views(frame, "rgb")
 
 
+@_register(
+    Entry(
+        "depth_<camera>",
+        "m",
+        "distance along the optical axis",
+        0,
+        math.inf,
+        np.float32,
+        lambda options: (*options.cameras.resolution, 1),
+    )
+)
 def depth(frame: Frame) -> Observation:
     """Distance images of MuJoCo's cameras."""
     return _views(frame, "depth")
 
 
 def _views(frame: Frame, kind: str) -> Observation:
-    views = frame.picture.views
+    views = frame.images.views
     return {key: view for key, view in views.items() if key.startswith(kind)}
 
 
-OBSERVATIONS: Mapping[str, Callable[[Frame], Observation]] = {
-    "internal": internal,
-    "image": image,
-    "sequential": sequential,
-    "segmentation": segmentation,
-    "tracking": tracking,
-    "tracking_2d": tracking_2d,
-    "goal": goal,
-    "force": force,
-    "rgb": rgb,
-    "depth": depth,
-}
-_FLUOROSCOPIC = ("image", "sequential", "segmentation", "tracking_2d")
-
-# Keys of the observations of numbers; those of pictures depend on their options.
-_NUMBERS: Mapping[str, tuple[str, ...]] = {
-    "internal": (
-        "position",
-        "velocity",
-        "com_inertia",
-        "com_velocity",
-        "actuator_force",
-        "external_force",
-    ),
-    "tracking": (
-        "tracking_points",
-        "tracking_goal",
-        "tracking_insertion",
-        "tracking_action",
-    ),
-    "tracking_2d": (
-        "tracking_pixels",
-        "tracking_goal_pixels",
-        "tracking_insertion",
-        "tracking_action",
-    ),
-    "goal": ("goal_position", "goal_from_head"),
-    "force": ("wall_force", "push_force", "load_cell"),
-}
+# The use of the table.
 
 
 def resolve(names: str | Sequence[str]) -> tuple[str, ...]:
@@ -236,56 +405,38 @@ def resolve(names: str | Sequence[str]) -> tuple[str, ...]:
 
 def needs_fluoroscopy(names: Sequence[str]) -> bool:
     """Whether any of the observations needs the angiography machine."""
-    return any(name in _FLUOROSCOPIC for name in names)
+    return any(OBSERVATIONS[name].fluoroscopic for name in names)
 
 
 def observe(names: Sequence[str], frame: Frame) -> Observation:
     """Computes the named observations; arrays may share memory with the frame."""
     observation: Observation = {}
     for name in names:
-        observation.update(OBSERVATIONS[name](frame))
+        observation.update(OBSERVATIONS[name].observe(frame))
     return observation
 
 
-def entries(
-    names: Sequence[str], fluoroscopy: FluoroscopyOptions, cameras: CameraOptions
+def entry_specs(
+    names: Sequence[str], options: ImageOptions
 ) -> dict[str, specs.Array | None]:
-    """Keys of the named observations, with the specs of those of pictures."""
-    planes, size = fluoroscopy.planes, fluoroscopy.resolution
-    grey = {
-        "image": planes,
-        "sequential": planes * SEQUENCE_LENGTH,
-        "segmentation": planes * 2,
+    """Keys of the named observations, with the specs of those that are images."""
+    return {
+        key: entry.spec(options)
+        for name in names
+        for entry in OBSERVATIONS[name].entries
+        for key in entry.keys(options)
     }
-    result: dict[str, specs.Array | None] = {}
-    for name in names:
-        if name in grey:
-            result[name] = _picture((*size, grey[name]))
-        elif name == "rgb":
-            for camera in cameras.names:
-                result[f"rgb_{camera}"] = _picture((*cameras.resolution, 3))
-        elif name == "depth":
-            for camera in cameras.names:
-                shape = (*cameras.resolution, 1)
-                result[f"depth_{camera}"] = specs.Array(shape, np.float32)
-        else:
-            result.update(dict.fromkeys(_NUMBERS[name]))
-    return result
 
 
-def _picture(shape: tuple[int, ...]) -> specs.BoundedArray:
-    return specs.BoundedArray(shape, np.uint8, 0, 255)
+class FrameObservable(observable.Generic):
+    """One entry of the observation, with the range of an image in its spec."""
 
-
-class Seen(observable.Generic):
-    """One entry of the observation, with the range of a picture in its spec."""
-
-    def __init__(self, see: Callable, spec: specs.Array | None):
-        super().__init__(see)
+    def __init__(self, read: Callable, spec: specs.Array | None):
+        super().__init__(read)
         self._spec = spec
         self.enabled = True
 
     @property
     def array_spec(self) -> specs.Array | None:
-        """Spec of a picture; None for numbers, whose spec composer infers."""
+        """Spec of an image; None for numbers, whose spec composer infers."""
         return self._spec

@@ -4,7 +4,7 @@ import json
 import logging
 import os
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -52,38 +52,44 @@ def escaped(anatomy: Anatomy, centreline: np.ndarray) -> np.ndarray:
     return (outside & aside & ~in_sheath).any(-1)
 
 
-class Monitor:
+class PhysicsMonitor:
     """Watches N simulations for errors of physics, and keeps what replays them."""
 
-    def __init__(self, anatomy: Anatomy, simulations: int, task: dict):
+    def __init__(self, anatomy: Anatomy, num_simulations: int, task: dict):
         """Starts with no episode running.
 
         Args:
-          anatomy: whose lumen the devices must not leave.
-          simulations: N.
+          anatomy: Anatomy whose lumen the devices must not leave.
+          num_simulations: N.
           task: JSON-able description of the task for the dumps.
         """
         self._anatomy = anatomy
         self._task = task
-        self._states: list[np.ndarray | None] = [None] * simulations
-        self._actions: list[list[np.ndarray]] = [[] for _ in range(simulations)]
+        self._states: list[np.ndarray | None] = [None] * num_simulations
+        self._actions: list[list[np.ndarray]] = [[] for _ in range(num_simulations)]
 
     def restart(self, index: int) -> None:
         """Forgets the episode of a simulation."""
         self._states[index] = None
         self._actions[index] = []
 
-    def before_step(self, states: np.ndarray, actions: np.ndarray) -> None:
+    def before_step(
+        self, read_states: Callable[[], np.ndarray], actions: np.ndarray
+    ) -> None:
         """Keeps the start of each episode, and the actions.
 
         Args:
-          states: (N, nstate), mjSTATE_INTEGRATION.
+          read_states: Reads the states (N, nstate), mjSTATE_INTEGRATION; called only
+            when an episode begins.
           actions: (N, A).
         """
-        for index, (state, action) in enumerate(zip(states, actions, strict=True)):
-            if self._states[index] is None:
-                self._states[index] = state.copy()
-            self._actions[index].append(action.copy())
+        if any(state is None for state in self._states):
+            states = read_states()
+            for index, state in enumerate(self._states):
+                if state is None:
+                    self._states[index] = states[index].copy()
+        for index, action in enumerate(actions):
+            self._actions[index].append(action)
 
     def errors(
         self,

@@ -7,6 +7,7 @@ import numpy as np
 from cathsim_dmc.anatomy import Anatomy, Goal
 from cathsim_dmc.entities import arena, devices
 from cathsim_dmc.tasks import objectives as objectives
+from cathsim_dmc.tasks.variations import START_JITTER
 
 # The steerable tip starts free of the sheath wherever the vessel is straight enough.
 _FREE_LENGTH = 0.005  # m of shaft out of the sheath behind the tip
@@ -64,29 +65,6 @@ def resolve_goal(anatomy: Anatomy, goal: "str | Goal") -> Goal:
             f"point inside, or one of the goals {', '.join(anatomy.goals)}"
         )
     return goal
-
-
-def cannulation_task(
-    anatomy: Anatomy, goal: Goal, spare: float = 0.0, **options
-) -> objectives.Cannulation:
-    """Builds the meaning of the task of reaching a goal.
-
-    Args:
-      anatomy: where.
-      goal: of the anatomy.
-      spare: way past the goal that the route goes on, m.
-      **options: fields of `objectives.Cannulation`.
-    """
-    vessel = anatomy.tree.vessel(goal.vessel)
-    route = anatomy.route(goal, spare)
-    return objectives.Cannulation(
-        goal=goal.position,
-        branch=vessel.centreline,
-        ostium=vessel.ostium,
-        route=route,
-        goal_arc_length=route.project(goal.position).arc_length if spare else None,
-        **options,
-    )
 
 
 def place_device(
@@ -187,7 +165,7 @@ def start_joints(
     lever = beyond[index]
     # The base cannot go back behind its start, so the stroke begins 1 mm later.
     return {
-        "insertion": np.maximum(objectives.START_JITTER + displacement[..., 2], 0.0),
+        "insertion": np.maximum(START_JITTER + displacement[..., 2], 0.0),
         f"bend_x_{index}": -displacement[..., 1] / lever,
         f"bend_y_{index}": displacement[..., 0] / lever,
     }

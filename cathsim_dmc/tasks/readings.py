@@ -1,9 +1,9 @@
 """What a task reads from the simulator, for one simulation or for many at once.
 
-A `Layout` finds the quantities of a compiled model by name once; `Layout.read` then
-takes them from any object with MuJoCo's array names: an `mujoco.MjData`, with arrays
-such as qpos (nq,), or a `mujoco.batch.Batch`, with arrays such as qpos (N, nq). Every
-array of the result has the leading axes of the source, written `...` below.
+A `ModelIndex` finds the quantities of a compiled model by name once; `ModelIndex.read`
+then takes them from any object with MuJoCo's array names: an `mujoco.MjData`, with
+arrays such as qpos (nq,), or a `mujoco.batch.Batch`, with arrays such as qpos (N, nq).
+Every array of the result has the leading axes of the source, written `...` below.
 """
 
 from typing import NamedTuple
@@ -11,6 +11,7 @@ from typing import NamedTuple
 import mujoco
 import numpy as np
 
+from cathsim_dmc.entities.robot import JOINTS
 from cathsim_dmc.tasks import forces
 
 
@@ -53,7 +54,7 @@ class Readings(NamedTuple):
     load_cell: np.ndarray
 
 
-class Layout:
+class ModelIndex:
     """Places of a task's quantities in the arrays of a compiled model."""
 
     # Fields of `mujoco.MjData` that `read` uses, for a batch to bind beforehand.
@@ -69,13 +70,14 @@ class Layout:
         "sensordata",
     )
 
-    def __init__(self, model: mujoco.MjModel, catheter: str, phantom: str):
+    def __init__(self, model: mujoco.MjModel, catheter: str, phantom: str, robot: str):
         """Finds the quantities by name.
 
         Args:
           model: the compiled model.
           catheter: MJCF scope of the catheter, such as "catheter".
           phantom: MJCF scope of the phantom.
+          robot: MJCF scope of the follower robot.
 
         Raises:
           ValueError: if the model lacks one of the names.
@@ -99,6 +101,11 @@ class Layout:
             model, mujoco.mjtObj.mjOBJ_JOINT, f"{catheter}/rotation"
         )
         self.rotation_qpos = None if rotation < 0 else int(model.jnt_qposadr[rotation])
+        follower = [
+            _id(model, mujoco.mjtObj.mjOBJ_JOINT, f"{robot}/{joint.name}")
+            for joint in JOINTS
+        ]
+        self.robot_qpos = model.jnt_qposadr[follower].copy()
         self.head_site = _id(model, mujoco.mjtObj.mjOBJ_SITE, f"{catheter}/head")
         self.push_force = _sensor(model, f"{catheter}/push_force")
         self.push_torque = _sensor(model, f"{catheter}/push_torque")

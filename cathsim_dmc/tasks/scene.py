@@ -4,15 +4,16 @@ import dataclasses
 
 import numpy as np
 
-from cathsim_dmc.anatomy import Anatomy
+from cathsim_dmc.anatomy import Anatomy, Goal
 from cathsim_dmc.entities import devices
 from cathsim_dmc.entities.arena import AngiographyArena
 from cathsim_dmc.entities.catheter import Catheter
-from cathsim_dmc.entities.phantom import CONTACT_SOLIMP, CONTACT_SOLREF, Phantom
+from cathsim_dmc.entities.phantom import Phantom
 from cathsim_dmc.entities.robot import Robot
 from cathsim_dmc.entities.sheath import Sheath
 from cathsim_dmc.tasks import placement
 from cathsim_dmc.tasks.config import NavigationConfig
+from cathsim_dmc.tasks.objectives import GOAL_RADIUS
 
 # Joints of the shaft that twist, where the base turns.
 _TORSION_JOINTS = 4
@@ -20,9 +21,11 @@ _TORSION_JOINTS = 4
 
 @dataclasses.dataclass(frozen=True)
 class Scene:
-    """Entities of a task.
+    """Entities of a task, attached to the arena.
 
     Attributes:
+      goal: where the device is to go.
+      placement: where device, sheath and robot stand.
       arena: the root, with light and the density of blood.
       phantom: wall, goals and load cell.
       catheter: the device.
@@ -30,6 +33,8 @@ class Scene:
       robot: the follower, which moves along with the device.
     """
 
+    goal: Goal
+    placement: placement.Placement
     arena: AngiographyArena
     phantom: Phantom
     catheter: Catheter
@@ -40,48 +45,105 @@ class Scene:
     def build(
         cls,
         anatomy: Anatomy,
-        device: devices.Device,
-        place: placement.Placement,
+        goal: str | Goal,
         config: NavigationConfig,
+        *,
+        goal_radius: float = GOAL_RADIUS,
+        arena: AngiographyArena | None = None,
+        phantom: Phantom | None = None,
+        catheter: Catheter | None = None,
+        sheath: Sheath | None = None,
+        robot: Robot | None = None,
     ) -> "Scene":
-        """Builds the entities and attaches them to the arena."""
-        contact = {"solref": CONTACT_SOLREF, "solimp": CONTACT_SOLIMP}
-        area = np.pi * device.outer_radius**2
-        torsion = config.torsion_joints
-        if torsion is None:
-            torsion = _TORSION_JOINTS if config.rotation else 0
-        scene = cls(
-            arena=AngiographyArena(device_density=device.linear_density / area),
-            phantom=Phantom(anatomy, config.friction, goal_radius=config.goal_radius),
-            catheter=Catheter(
-                device,
-                devices.Discretisation(
-                    working_length=place.working_length,
-                    shaft_link=config.shaft_link,
-                    torsion_joints=torsion,
-                ),
-                stroke=place.stroke,
-                rotation=config.rotation,
-                friction=config.friction,
-                **contact,
-            ),
-            sheath=Sheath(
-                length=place.working_length - place.start_depth,
-                device_radius=device.outer_radius,
-                **contact,
-            ),
-            robot=Robot(device_radius=device.outer_radius),
+        """Builds the entities that are not given, and attaches all to the arena.
+
+        Args:
+          anatomy: Anatomy to navigate.
+          goal: Name in `anatomy.goals`, or a goal inside the lumen.
+          config: Options of the task.
+          goal_radius: Radius of the goal markers, m; for looks only.
+          arena: Arena of one's own.
+          phantom: Phantom of one's own, of the same anatomy.
+          catheter: Device of one's own; it must reach the goal.
+          sheath: Introducer sheath of one's own.
+          robot: Follower of one's own.
+        """
+        goal = placement.resolve_goal(anatomy, goal)
+        route = anatomy.route(goal, config.randomisation.farthest_shift)
+        device = devices.get(config.device) if catheter is None else catheter.device
+        place = placement.place_device(
+            anatomy,
+            route.length,
+            device,
+            config.working_length
+            if catheter is None
+            else float(np.sum(catheter.link_lengths)),
         )
-        scene.arena.attach(scene.phantom)
-        for entity, position in (
-            (scene.sheath, place.inlet),
-            (scene.catheter, place.start),
-            (scene.robot, place.robot),
-        ):
-            site = scene.arena.mjcf_model.worldbody.add(
-                "site", group=5, pos=position, quat=place.quaternion
-            )
-            scene.arena.attach(entity, site)
-        scene.phantom.add_wall_sensor(scene.catheter.links[0])
-        placement.add_cameras(scene.arena, anatomy)
+        radius = device.outer_radius
+        scene = cls(
+            goal=goal,
+            placement=place,
+            arena=arena
+            or AngiographyArena(
+                device_density=device.linear_density / (np.pi * radius**2)
+            ),
+            phantom=phantom
+            or Phantom(anatomy, config.friction, goal_radius=goal_radius),
+            catheter=catheter or _catheter(device, place, config),
+            sheath=sheath
+            or Sheath(
+                length=place.working_length - place.start_depth,
+                device_radius=radius,
+            ),
+            robot=robot or Robot(device_radius=radius),
+        )
+        scene._attach()
         return scene
+
+    def _attach(self):
+        self.arena.attach(self.phantom)
+        place = self.placement
+        for entity, position in (
+            (self.sheath, place.inlet),
+            (self.catheter, place.start),
+            (self.robot, place.robot),
+        ):
+            site = self.arena.mjcf_model.worldbody.add(
+                "site",
+                name=f"{entity.mjcf_model.model}_mount",
+                group=5,
+                pos=position,
+                quat=place.quaternion,
+            )
+            self.arena.attach(entity, site)
+        self.phantom.add_wall_sensor(self.catheter.links[0])
+        placement.add_cameras(self.arena, self.anatomy)
+
+    @property
+    def anatomy(self) -> Anatomy:
+        """Lumen, wall and goals."""
+        return self.phantom.anatomy
+
+    @property
+    def device(self) -> devices.Device:
+        """What the catheter is made of."""
+        return self.catheter.device
+
+
+def _catheter(
+    device: devices.Device, place: placement.Placement, config: NavigationConfig
+) -> Catheter:
+    torsion = config.torsion_joints
+    if torsion is None:
+        torsion = _TORSION_JOINTS if config.rotation else 0
+    return Catheter(
+        device,
+        devices.Discretisation(
+            working_length=place.working_length,
+            shaft_link=config.shaft_link,
+            torsion_joints=torsion,
+        ),
+        stroke=place.stroke,
+        rotation=config.rotation,
+        friction=config.friction,
+    )

@@ -16,10 +16,22 @@ from dm_control.composer.variation import distributions
 from cathsim_dmc.imaging.angiograph import Deviation
 from cathsim_dmc.tasks import objectives as objectives
 
+# Published: radius of the ball of the random displacement of the tip.
+START_JITTER = 1e-3  # m
+
 # Lowest and highest value of a uniform distribution, or any composer Variation.
 Range = Sequence[float] | variation.Variation
 
 _RANGES = ("friction", "stiffness", "view", "gain", "kerma", "goal_shift", "roll")
+
+
+def start_displacement(
+    random_state: np.random.RandomState, ball: float = START_JITTER
+) -> np.ndarray:
+    """Random displacement (3,) of the tip: uniform in a ball of that radius, m."""
+    direction = random_state.normal(size=3)
+    radius = ball * random_state.uniform() ** (1 / 3)
+    return radius * direction / np.linalg.norm(direction)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -43,7 +55,7 @@ class Randomisation:
 
     friction: Range | None = None
     stiffness: Range | None = None
-    start_radius: float = objectives.START_JITTER
+    start_radius: float = START_JITTER
     view: Range | None = None
     gain: Range | None = None
     kerma: Range | None = None
@@ -77,11 +89,11 @@ class Randomisation:
 
     @classmethod
     def make(cls, value: "Randomisation | Mapping[str, Any] | bool") -> "Randomisation":
-        """From the option of a task: False, True for `USUAL`, fields, or an object."""
+        """From a task's option: False, True for `DEFAULT_RANGES`, or fields."""
         if isinstance(value, cls):
             return value
         if isinstance(value, bool):
-            return USUAL if value else cls()
+            return DEFAULT_RANGES if value else cls()
         known = [field.name for field in dataclasses.fields(cls)]
         unknown = sorted(set(value) - set(known))
         if unknown:
@@ -96,6 +108,11 @@ class Randomisation:
         """Of the action, control steps."""
         return 0 if self.delay is None else int(self.delay[1])
 
+    @property
+    def farthest_shift(self) -> float:
+        """How far past its place a goal may be shifted, m."""
+        return max(0.0, *(self.goal_shift or (0.0,)))
+
     def draw(self, random_state: np.random.RandomState) -> "Episode":
         """Draws an episode; what is None takes nothing from the source."""
 
@@ -107,7 +124,7 @@ class Randomisation:
                 chosen = distributions.Uniform(*map(float, chosen))
             return float(variation.evaluate(chosen, random_state=random_state))
 
-        displacement = objectives.start_displacement(random_state, self.start_radius)
+        displacement = start_displacement(random_state, self.start_radius)
         friction, stiffness = value("friction"), value("stiffness")
         primary, secondary = value("view"), value("view")
         gain, kerma = value("gain"), value("kerma")
@@ -134,7 +151,7 @@ class Randomisation:
 
 # Friction and EI over what real devices and lubrication show (the friction that is
 # usually randomised is 0.02-0.15), the rest over what differs between two sessions.
-USUAL = Randomisation(
+DEFAULT_RANGES = Randomisation(
     friction=(0.02, 0.15),
     stiffness=(0.8, 1.25),
     start_radius=2e-3,
@@ -211,7 +228,7 @@ class ModelVariation:
         if randomisation.roll is not None:
             fields += ["body_quat"]
         self.fields = tuple(fields)
-        self._usual = {field: getattr(model, field).copy() for field in fields}
+        self._nominal = {field: getattr(model, field).copy() for field in fields}
 
     def write(self, arrays: Mapping[str, np.ndarray], episode: Episode) -> None:
         """Writes to `arrays`, live fields `self.fields` of one simulation's model."""
@@ -223,29 +240,29 @@ class ModelVariation:
                 ("dof_damping", self._dofs),
                 ("actuator_gainprm", (self._motors, 0)),
             ):
-                arrays[field][where] = self._usual[field][where] * episode.stiffness
+                arrays[field][where] = self._nominal[field][where] * episode.stiffness
         if episode.roll is not None:
             half = episode.roll / 2
             turn = np.array([np.cos(half), 0.0, 0.0, np.sin(half)])
             quaternion = np.empty(4)
-            mujoco.mju_mulQuat(quaternion, self._usual["body_quat"][self._base], turn)
+            mujoco.mju_mulQuat(quaternion, self._nominal["body_quat"][self._base], turn)
             arrays["body_quat"][self._base] = quaternion
 
 
 class ActionDelay:
     """Commands of N simulations on their way to the drives."""
 
-    def __init__(self, simulations: int, actions: int, longest: int):
+    def __init__(self, num_simulations: int, num_actions: int, longest: int):
         """Starts without delay; `longest` bounds the delays, control steps."""
-        self._past = np.zeros((longest + 1, simulations, actions))
-        self._delay = np.zeros(simulations, dtype=int)
+        self._past = np.zeros((longest + 1, num_simulations, num_actions))
+        self._delay = np.zeros(num_simulations, dtype=int)
 
     def restart(self, index: int, delay: int) -> None:
         """Begins an episode of one simulation, with drives at rest."""
         self._past[:, index] = 0.0
         self._delay[index] = delay
 
-    def pass_on(self, action: np.ndarray) -> np.ndarray:
+    def delayed(self, action: np.ndarray) -> np.ndarray:
         """Takes the action (N, A) of this step, returns the one that takes effect."""
         if len(self._past) == 1:
             return action

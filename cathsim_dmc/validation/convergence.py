@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from cathsim_dmc.tasks.navigation import PHYSICS_TIMESTEP, NavigationConfig
+from cathsim_dmc.tasks.config import PHYSICS_TIMESTEP, NavigationConfig
 from cathsim_dmc.validation import insertion
 from cathsim_dmc.validation.checks import Check
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -14,7 +13,8 @@ from scipy import stats
 
 from cathsim_dmc.anatomy.anatomy import Anatomy
 from cathsim_dmc.anatomy.wall import fidelity
-from cathsim_dmc.tasks.navigation import PHYSICS_TIMESTEP, NavigationConfig
+from cathsim_dmc.files import atomic_path
+from cathsim_dmc.tasks.config import PHYSICS_TIMESTEP, NavigationConfig
 
 if TYPE_CHECKING:
     from cathsim_dmc.validation import convergence, forces, protocol
@@ -40,9 +40,8 @@ def save_figure(figure: Figure, path: str | Path) -> None:
     """Writes a figure as PNG in one step."""
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
-    part = path.with_name(f".{path.name}.part")
-    figure.savefig(part, dpi=110, format="png")
-    os.replace(part, path)
+    with atomic_path(path) as temporary:
+        figure.savefig(temporary, dpi=110, format="png")
 
 
 def rod(

@@ -18,7 +18,7 @@ from cathsim_dmc.anatomy.wall.pieces import build_wall
 from cathsim_dmc.entities.phantom import Phantom
 from cathsim_dmc.recording.episode import Episode
 from cathsim_dmc.tasks import forces
-from cathsim_dmc.tasks.navigation import PHYSICS_TIMESTEP
+from cathsim_dmc.tasks.config import PHYSICS_TIMESTEP
 from cathsim_dmc.validation import insertion, protocol
 from cathsim_dmc.validation.checks import Check, Report
 from cathsim_dmc.validation.rig import Rig
@@ -169,10 +169,10 @@ def dead_end(
     task = environment.task
     environment.reset()
     model, data = environment.physics.model.ptr, environment.physics.data.ptr
-    motor = model.actuator(f"{task.catheter.mjcf_model.model}/insertion")
+    motor = model.actuator(f"{task.scene.catheter.mjcf_model.model}/insertion")
     data.actuator(motor.id).ctrl[0] = command
-    bore = environment.physics.bind(task.sheath.body).element_id
-    way = tube[0] - task.placement.start_depth
+    bore = environment.physics.bind(task.scene.sheath.body).element_id
+    way = tube[0] - task.scene.placement.start_depth
     full_speed = motor.gainprm[0] / -motor.biasprm[2]
     steps = round((settling + way / (command * full_speed)) / timestep)
     rows = []
@@ -180,8 +180,8 @@ def dead_end(
         mujoco.mj_step(model, data)
         if step < steps - round(AVERAGING / timestep):
             continue
-        reading = task.layout.read(data)
-        contacts = task.layout.contacts(data.sensordata)
+        reading = task.rollout.index.read(data)
+        contacts = task.rollout.index.contacts(data.sensordata)
         rows.append(
             (
                 reading.push_force,

@@ -9,6 +9,7 @@ import numpy as np
 
 from cathsim_dmc import suite
 from cathsim_dmc.tasks import objectives as objectives
+from cathsim_dmc.tasks.config import CONTROL_TIMESTEP
 
 
 @dataclasses.dataclass(frozen=True)
@@ -31,7 +32,7 @@ class Script:
     def action(self, step: int, size: int) -> np.ndarray:
         """Action (size,) of a control step."""
         action = np.zeros(size)
-        ramp = min(1.0, (step + 1) * objectives.CONTROL_TIMESTEP / CURL_TIME)
+        ramp = min(1.0, (step + 1) * CONTROL_TIMESTEP / CURL_TIME)
         action[0:20:2], action[1:20:2] = ramp * np.array(self.curl)[:, None]
         action[20] = self.speed
         return action
@@ -108,8 +109,8 @@ def run(
     environment.reset()
     rows: list[tuple] = []
     single: list[np.ndarray] = []
-    size = len(task.catheter.actuators)
-    for step in range(round(script.duration / objectives.CONTROL_TIMESTEP)):
+    size = len(task.scene.catheter.actuators)
+    for step in range(round(script.duration / CONTROL_TIMESTEP)):
         timestep = environment.step(script.action(step, size))
         if environment.physics.data.ptr.warning.number.any():
             raise RuntimeError(
@@ -138,6 +139,6 @@ def run(
         resultant=resultant,
         contact_forces=np.concatenate(single),
         penetration=penetration,
-        links=len(task.catheter.links),
+        links=len(task.scene.catheter.links),
         success=task.termination == "success",
     )

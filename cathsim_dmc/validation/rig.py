@@ -9,8 +9,8 @@ from dm_control import mjcf
 from cathsim_dmc.entities import devices
 from cathsim_dmc.entities.arena import AngiographyArena
 from cathsim_dmc.entities.catheter import BENDING_RELAXATION_TIME, Catheter
-from cathsim_dmc.entities.phantom import CONTACT_SOLIMP, CONTACT_SOLREF, FRICTION
-from cathsim_dmc.tasks.navigation import PHYSICS_TIMESTEP
+from cathsim_dmc.entities.contact import FRICTION
+from cathsim_dmc.tasks.config import PHYSICS_TIMESTEP
 
 # A rig has come to rest when no joint has moved by more than this, rad and m, over
 # one relaxation time of the rod. The constraint solver's tolerance leaves less.
@@ -48,8 +48,6 @@ class Rig:
             discretisation,
             stroke=stroke,
             rotation=rotation,
-            solref=CONTACT_SOLREF,
-            solimp=CONTACT_SOLIMP,
             friction=friction,
         )
         self.lengths = self.catheter.link_lengths

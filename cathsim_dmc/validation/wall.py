@@ -14,7 +14,7 @@ from cathsim_dmc.anatomy import measures, surface
 from cathsim_dmc.anatomy.anatomy import Anatomy
 from cathsim_dmc.anatomy.wall import fidelity
 from cathsim_dmc.entities import devices
-from cathsim_dmc.entities.phantom import FRICTION, wall_contact
+from cathsim_dmc.entities.contact import FRICTION, wall_contact
 from cathsim_dmc.validation import convergence, theory
 from cathsim_dmc.validation.checks import Check, Report
 from cathsim_dmc.validation.rig import Rig

@@ -15,9 +15,7 @@ matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 import numpy as np
 
-from cathsim_dmc.agents import expert  # torchrl goes before dm_control
-
-from cathsim_dmc import suite  # isort: skip
+from cathsim_dmc import policies, suite
 from cathsim_dmc.imaging import Angiograph, FluoroscopyOptions
 from cathsim_dmc.imaging import angiograph as machines
 
@@ -34,7 +32,7 @@ ROWS = {
 def run() -> tuple[object, list[dict]]:
     """The task, and the state of the device at every control step."""
     env = suite.load("cathsim", TASK, task_kwargs={"random": SEED})
-    act = expert.policy(env)
+    act = policies.in_environment(policies.make_policy("expert"), env)
     timestep, states = env.reset(), []
     while True:
         task = env.task
@@ -54,7 +52,7 @@ def run() -> tuple[object, list[dict]]:
 def main() -> None:
     """Draws the figure."""
     task, states = run()
-    surface, random = task.anatomy.surface, np.random.RandomState(0)
+    surface, random = task.scene.anatomy.surface, np.random.RandomState(0)
     chosen = np.linspace(0, len(states) - 1, MOMENTS).round().astype(int)
     figure, axes = plt.subplots(
         len(ROWS), MOMENTS, figsize=(12, 4.5), layout="constrained"
@@ -64,13 +62,13 @@ def main() -> None:
         planes = Angiograph(surface.vertices, surface.faces, options).planes()
         carm = planes[0].carm
         goal, depth = carm.project(task.goal_position)
-        radius = task.goal_radius * carm.focal_length / depth
+        radius = task.objective.goal_radius * carm.focal_length / depth
         for axis, index in zip(row, chosen, strict=True):
             state = states[index]
             image = machines.render(
                 [planes],
                 state["line"][None],
-                task.catheter.device.outer_radius,
+                task.scene.catheter.device.outer_radius,
                 [random],
             )[0]
             axis.imshow(image[..., 0], cmap="gray", vmin=0, vmax=255)

@@ -14,8 +14,7 @@ from cathsim_dmc import suite
 from cathsim_dmc.imaging import VIEWS, FluoroscopyOptions
 from cathsim_dmc.tasks import observations
 from cathsim_dmc.tasks.cameras import CAMERAS, KINDS, CameraOptions
-from cathsim_dmc.tasks.descriptions import DESCRIPTIONS, Description
-from cathsim_dmc.tasks.variations import USUAL, Randomisation
+from cathsim_dmc.tasks.variations import DEFAULT_RANGES, Randomisation
 
 OUTPUT = Path(__file__).parents[1] / "observations.md"
 TASK = "type1_bca"
@@ -72,7 +71,7 @@ the distal end; `task_kwargs={{"cameras": {{"names": [...], "size": 128}}}}` cho
 RANDOMISATION = """
 ## Domain randomisation
 
-Off by default. `task_kwargs={"randomisation": True}` draws from the usual ranges at
+Off by default. `task_kwargs={"randomisation": True}` draws from the default ranges at
 every reset, a mapping from its own. A range is `[low, high]` of a uniform distribution,
 or a `dm_control.composer.variation.Variation`. All draws, quantum noise included, come
 from the one source that the environment's seed sets, and the batched path draws what
@@ -86,13 +85,13 @@ def _shape(shape: tuple[int, ...]) -> str:
     return "(" + ", ".join(map(str, shape)) + ("," if len(shape) == 1 else "") + ")"
 
 
-def _range(description: Description) -> str:
+def _range(entry: observations.Entry) -> str:
     def bound(value: float) -> str:
         return f"{value:g}" if np.isfinite(value) else "∞"
 
-    if np.isinf(description.low) and np.isinf(description.high):
+    if np.isinf(entry.low) and np.isinf(entry.high):
         return "unbounded"
-    return f"{bound(description.low)} to {bound(description.high)}"
+    return f"{bound(entry.low)} to {bound(entry.high)}"
 
 
 def _row(*cells: str) -> str:
@@ -105,23 +104,23 @@ def entries_table() -> str:
     environment = suite.load("cathsim", TASK, {"observation": drawn})
     specs = dict(environment.observation_spec())
     # Pictures of cameras have a spec without OpenGL, too.
-    specs |= observations.entries(KINDS, FluoroscopyOptions(), CameraOptions())
+    specs |= observations.entry_specs(KINDS, observations.ImageOptions())
     rows = [
         _row("observation", "entry", "shape", "type", "range", "unit", "meaning"),
         _row(*["---"] * 7),
     ]
-    for name, entries in DESCRIPTIONS.items():
-        for key, text in entries.items():
-            spec = specs[key.replace("<camera>", CameraOptions().names[0])]
+    for name, kind in observations.OBSERVATIONS.items():
+        for entry in kind.entries:
+            spec = specs[entry.key.replace("<camera>", CameraOptions().names[0])]
             rows.append(
                 _row(
                     f"`{name}`",
-                    f"`{key}`",
+                    f"`{entry.key}`",
                     _shape(spec.shape),
                     str(spec.dtype),
-                    _range(text),
-                    text.unit,
-                    text.meaning,
+                    _range(entry),
+                    entry.unit,
+                    entry.meaning,
                 )
             )
     return "\n".join(rows)
@@ -160,7 +159,7 @@ def page() -> str:
     table = options_table(FluoroscopyOptions, FluoroscopyOptions(), "default")
     parts.append(FLUOROSCOPY.replace("{table}", table))
     parts.append(CAMERA_TEXT)
-    table = options_table(Randomisation, USUAL, "usual range")
+    table = options_table(Randomisation, DEFAULT_RANGES, "default range")
     parts.append(RANDOMISATION.replace("{table}", table))
     assert len(_attributes(Randomisation)) == len(dataclasses.fields(Randomisation))
     return "\n".join(part.strip("\n") + "\n" for part in parts)

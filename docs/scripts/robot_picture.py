@@ -11,7 +11,7 @@ import numpy as np
 from dm_control import composer, mjcf
 from matplotlib import image
 
-from cathsim_dmc.entities.robot import CYCLE, DEVICE_RADIUS, Robot
+from cathsim_dmc.entities.robot import CYCLE, DEVICE_RADIUS, Robot, follower_posture
 
 IMAGE = pathlib.Path(__file__).parents[1] / "images" / "robot.png"
 BACKGROUND = (0.93, 0.945, 0.96)
@@ -75,7 +75,7 @@ def scene() -> tuple[mjcf.Physics, Robot]:
 
 def render(physics, robot, insertion, camera, height, width) -> np.ndarray:
     """Pixels (height, width, 3) uint8 of the posed robot."""
-    robot.pose(physics, insertion, rotation=8.0 * insertion)
+    physics.bind(robot.joints).qpos = follower_posture(insertion, 8.0 * insertion)
     return physics.render(height, width, camera_id=camera)
 
 

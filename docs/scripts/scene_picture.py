@@ -28,12 +28,10 @@ def draw(physics, target, distance, azimuth, elevation, width, fovy=30.0):
 
 
 def main():
-    from cathsim_dmc.agents import expert  # torchrl goes before dm_control
-
-    from cathsim_dmc import suite  # isort: skip
+    from cathsim_dmc import policies, suite
 
     env = suite.load("cathsim", "type1_lcca", task_kwargs={"random": 3})
-    act = expert.policy(env)
+    act = policies.in_environment(policies.make_policy("expert"), env)
     timestep = env.reset()
     while not timestep.last():
         timestep = env.step(act(timestep))

@@ -2,6 +2,7 @@
 
 import contextlib
 import dataclasses
+import functools
 import time
 from collections.abc import Callable, Iterator
 
@@ -9,42 +10,16 @@ import mujoco
 import numpy as np
 
 from cathsim_dmc import suite
-from cathsim_dmc.tasks.objectives import CONTROL_TIMESTEP
+from cathsim_dmc.policies import in_environment, make_policy
+from cathsim_dmc.tasks.config import CONTROL_TIMESTEP
 
 DEPTHS = (0.0, 0.1, 0.2, 0.3, np.inf)  # m of insertion, edges of the bins
+_WARM_STEPS = 1000  # of the humanoid, 5 s: it has come to lie on the floor
 NEVER = 1e-6  # m, goal radius that no policy meets
 
 
-@dataclasses.dataclass(frozen=True)
-class Drive:
-    """A policy of the benchmark: the action (A,) at a control step."""
-
-    name: str
-    action: Callable[[int, np.random.Generator, int], np.ndarray]
-
-
-def _still(step: int, generator: np.random.Generator, size: int) -> np.ndarray:
-    return np.zeros(size)
-
-
-def _random(step: int, generator: np.random.Generator, size: int) -> np.ndarray:
-    return generator.uniform(-1, 1, size)
-
-
-def _push(step: int, generator: np.random.Generator, size: int) -> np.ndarray:
-    action = np.zeros(size)
-    action[-1] = 1.0
-    return action
-
-
-def _curl(step: int, generator: np.random.Generator, size: int) -> np.ndarray:
-    action = np.ones(size)
-    action[1:-1:2] = 0.0
-    return action
-
-
-IDLE, RANDOM = Drive("idle", _still), Drive("random", _random)
-PUSH, CURL = Drive("push", _push), Drive("curl", _curl)
+# Policies of `cathsim_dmc.policies` under which the speed is measured.
+IDLE, RANDOM, PUSH, CURL = "idle", "random", "push", "curl"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -83,22 +58,49 @@ class Pace:
         return table
 
 
+def humanoid_step(steps: int = 2000) -> float:
+    """CPU time of one `mj_step` of dm_control's humanoid, µs: the speed of the machine.
+
+    A real-time factor times this is a figure that another machine, or the same one at
+    another hour, can be held to. The humanoid of `stand` falls without controls from
+    its standing pose; the first steps warm it up and are not timed.
+
+    Args:
+      steps: number of timed physics steps.
+    """
+    model, start = _humanoid()
+    data = mujoco.MjData(model)
+    mujoco.mj_copyData(data, model, start)
+    mujoco.mj_step(model, data, nstep=_WARM_STEPS)
+    begin = time.process_time()
+    mujoco.mj_step(model, data, nstep=steps)
+    return 1e6 * (time.process_time() - begin) / steps
+
+
+@functools.cache
+def _humanoid() -> tuple[mujoco.MjModel, mujoco.MjData]:
+    from dm_control import suite as control_suite
+
+    environment = control_suite.load("humanoid", "stand", task_kwargs={"random": 0})
+    environment.reset()
+    return environment.physics.model.ptr, environment.physics.data.ptr
+
+
 def load(task: str = "type1_bca", **options):
     """A suite environment whose episodes never end in success."""
     options.setdefault("goal_radius", NEVER)
     return suite.load(suite.DOMAIN, task, task_kwargs={"random": 0, **options})
 
 
-def pace(environment, drive: Drive, steps: int, seed: int = 0) -> Pace:
+def pace(environment, policy: str, steps: int, seed: int = 0) -> Pace:
     """Runs an episode of a suite environment and times every control step."""
-    generator = np.random.default_rng(seed)
-    size = environment.action_spec().shape[0]
-    environment.reset()
+    act = in_environment(make_policy(policy, seed), environment)
+    timestep = environment.reset()
     insertion, seconds, contacts = [], [], []
-    for step in range(steps):
-        action = drive.action(step, generator, size)
+    for _ in range(steps):
+        action = act(timestep)
         start = time.process_time()
-        environment.step(action)
+        timestep = environment.step(action)
         seconds.append(time.process_time() - start)
         insertion.append(float(environment.task.readings.insertion))
         contacts.append(float(environment.task.contacts(environment.physics).found))
@@ -118,7 +120,7 @@ _HOOKS = {
 }
 
 
-def account(drive: Drive, steps: int = 150, runs: int = 7) -> dict[str, float]:
+def account(policy: str, steps: int = 150, runs: int = 7) -> dict[str, float]:
     """Where a control step goes.
 
     The stages of `mj_step` come from MuJoCo's own timers, whose shares are applied to
@@ -132,14 +134,14 @@ def account(drive: Drive, steps: int = 150, runs: int = 7) -> dict[str, float]:
     task = environment.task
     bare, added, hooks = [], [], []
     for run in range(runs + 1):
-        ours, theirs = against_bare_steps(environment, drive, steps, run)
+        ours, theirs = against_bare_steps(environment, policy, steps, run)
         bare.append(theirs)
         added.append(ours - theirs)
         with _timed_hooks(task) as seconds:
-            pace(environment, drive, steps, run)
+            pace(environment, policy, steps, run)
         hooks.append([seconds[name] for name in _HOOKS])
     with _mujoco_timers(environment.physics.data.ptr) as timers:
-        pace(environment, drive, steps)
+        pace(environment, policy, steps)
         stages = {
             name: sum(timers(stage) for stage in parts)
             for name, parts in _STAGES.items()
@@ -156,14 +158,14 @@ def account(drive: Drive, steps: int = 150, runs: int = 7) -> dict[str, float]:
 
 
 def against_bare_steps(
-    environment, drive: Drive, steps: int, seed: int
+    environment, policy: str, steps: int, seed: int
 ) -> tuple[float, float]:
     """CPU seconds of an episode, and of bare `mj_step` calls with the same controls."""
-    generator = np.random.default_rng(seed)
-    size = environment.action_spec().shape[0]
-    actions = [drive.action(step, generator, size) for step in range(steps)]
     substeps = environment.task.substeps
-    environment.reset()
+    timestep = environment.reset()
+    # None of these policies looks at the observation.
+    act = in_environment(make_policy(policy, seed), environment)
+    actions = [act(timestep) for _ in range(steps)]
     model, data = environment.physics.model.ptr, environment.physics.data.ptr
     bare = mujoco.MjData(model)
     mujoco.mj_copyData(bare, model, data)

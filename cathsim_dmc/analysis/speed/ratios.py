@@ -13,7 +13,6 @@ import numpy as np
 from cathsim_dmc.analysis.speed.pace import (
     NEVER,
     RANDOM,
-    Drive,
     against_bare_steps,
     load,
     pace,
@@ -23,12 +22,12 @@ NUM_SIMULATIONS = 16
 _RUNS = 12
 
 
-def suite_overhead(drive: Drive, steps: int = 150) -> list[float]:
+def suite_overhead(policy: str, steps: int = 150) -> list[float]:
     """CPU time of suite environment steps over that of their bare mj_step calls."""
     environment = load()
     ratios = []
     for run in range(2 * _RUNS + 1):
-        ours, bare = against_bare_steps(environment, drive, steps, run)
+        ours, bare = against_bare_steps(environment, policy, steps, run)
         ratios.append(ours / bare)
     return ratios[1:]
 
@@ -119,7 +118,7 @@ def frame_rates(frames: int = 100) -> dict[str, float]:
     environment = load(observation="image")
     environment.reset()
     task = environment.task
-    scope, radius = task.fluoroscope, task.catheter.device.outer_radius
+    scope, radius = task.rollout.fluoroscope, task.scene.catheter.device.outer_radius
     line = task.readings.centreline
     many = np.repeat(line[None], NUM_SIMULATIONS, axis=0)
     random_state = np.random.RandomState(0)

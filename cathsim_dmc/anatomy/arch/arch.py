@@ -16,18 +16,16 @@ from dataclasses import replace
 from functools import lru_cache
 from types import MappingProxyType
 
-import numpy as np
-
 from cathsim_dmc.anatomy.anatomy import Anatomy
 from cathsim_dmc.anatomy.arch.parameters import (
     INLET_TUBE,
     ArchParameters,
     BranchParameters,
 )
-from cathsim_dmc.anatomy.arch.sampler import DROP_RANGES, SETS, VARIANTS, sample
 from cathsim_dmc.anatomy.arch.tree import arch_tree
 from cathsim_dmc.anatomy.builder import Place, access_inlet
 from cathsim_dmc.anatomy.centreline import VesselTree
+
 
 def _goals(params: ArchParameters, tree: VesselTree) -> dict[str, Place]:
     goals = {
@@ -128,6 +126,7 @@ BOVINE = replace(
 ARCHES: Mapping[str, ArchParameters] = MappingProxyType(
     {"simple1": TYPE_I, "simple2": TYPE_II, "type3": TYPE_III, "bovine": BOVINE}
 )
+
 
 def load(name: str, *, access: str = "ascending") -> Anatomy:
     """Anatomy of the arch called `name` in `ARCHES`.

@@ -91,7 +91,7 @@ Random = np.random.RandomState | np.random.Generator
 def sample(
     random_state: Random, arch_type: str | None = None, *, variant: str = "normal"
 ) -> ArchParameters:
-    """Random arch from the anatomical distributions; its measured type is the one drawn.
+    """Random arch from the anatomical distributions, measured to be of the type drawn.
 
     Args:
         random_state: source of randomness; the same state gives the same arch.

@@ -118,14 +118,14 @@ class Plan:
         Raises:
           ValueError: if the task's device has no motors in its tip.
         """
-        catheter = task.catheter
+        catheter = task.scene.catheter
         if not catheter.device.steerable:
             steerable = [d.name for d in devices.DEVICES.values() if d.steerable]
             raise ValueError(
                 f"device {catheter.device.name!r} has no motors in its tip, so the "
                 f"expert cannot steer it; choose one of {', '.join(steerable)}"
             )
-        route = task.meaning.route.resampled(ROUTE_SPACING)
+        route = task.objective.route.resampled(ROUTE_SPACING)
         hinges, numbers = [], {}
         for column, joint in enumerate(catheter.joints):
             if joint.type == "slide":
@@ -137,7 +137,7 @@ class Plan:
             points=route.points,
             radii=route.radii,
             arc_length=route.arc_length,
-            base=_matrix(task.placement.quaternion),
+            base=_matrix(task.scene.placement.quaternion),
             hinges=tuple(hinges),
             tip=np.array(motors).reshape(-1, 2),
             steering_angle=catheter.device.steering_angle,

@@ -1,0 +1,258 @@
+"""What every training run must say, whichever algorithm learns."""
+
+import dataclasses
+import json
+import math
+import types
+import typing
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any, ClassVar, Literal
+
+# Widest layer and most layers of a network: settings must not take all memory.
+MAX_WIDTH, MAX_LAYERS = 16_384, 16
+MAX_INTEGER = 2**62
+
+
+class ConfigError(ValueError):
+    """A hyper-parameter is outside what is allowed, or contradicts another."""
+
+
+def require(condition: bool, name: str, given: object, allowed: str) -> None:
+    """Raise ConfigError naming the field, what was given and what is allowed."""
+    if not condition:
+        raise ConfigError(f"{name}={given!r} is not allowed: {name} must be {allowed}.")
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrainingConfig:
+    """Settings shared by all algorithms; subclasses add the algorithm's own.
+
+    Attributes:
+        task: Name of a registered task, such as "type1_bca".
+        observation: Name or names of the task's observations, such as "internal",
+            "image", "sequential" or "tracking".
+        task_kwargs: Further options of the task; must be JSON-able.
+        backend: Way of simulating: "batched" steps all simulations in one thread
+            pool, "composer" runs one dm_control environment after the other (slow;
+            the reference).
+        num_envs: Number of simulations stepped side by side.
+        num_threads: Number of threads of the batched simulation; None takes one per
+            core.
+        seed: Seed of networks, exploration and environments.
+        total_frames: Number of control steps to train for, over all simulations. The
+            last batch is finished, so a run may end slightly above.
+        hidden: Widths of the hidden layers of the vector networks.
+        activation: Activation function of the hidden layers.
+        cnn_features: Width of the layer behind the convolutions (images only).
+        learning_rate: Learning rate of Adam, for every network.
+        gamma: Discount factor per control step.
+        observation_clip: Largest magnitude of a normalised vector entry; larger ones
+            are clipped.
+        normalisation_frames: Number of random control steps before the first update,
+            from which the first observation statistics come; they are not counted as
+            frames. An algorithm that begins with random actions anyway (SAC) needs
+            none.
+        checkpoint_frames: Number of frames between two checkpoints.
+        checkpoint_seconds: Longest time between two checkpoints in seconds of wall
+            time, so that a killed run loses no more.
+        keep_checkpoints: Number of the newest checkpoints that stay on disk.
+        metrics_frames: Number of frames between two rows of metrics.csv.
+        tensorboard: Whether to write TensorBoard event files too (needs the
+            `tensorboard` extra).
+        torch_device: Torch device of the networks, such as "cpu" or "cuda"; the
+            simulation is always on the CPU.
+        torch_threads: Number of threads of one torch operation. One is fastest for
+            the small published MLP; images profit from all cores.
+    """
+
+    algorithm: ClassVar[str] = ""
+    # Settings by the name of a preset; what a preset leaves out has its default.
+    presets: ClassVar[Mapping[str, Mapping[str, Any]]] = {"published": {}}
+    # What may differ between a run and its continuation: nothing that learning
+    # depends on, apart from how long it lasts.
+    resumable: ClassVar[frozenset[str]] = frozenset(
+        {
+            "total_frames",
+            "checkpoint_frames",
+            "checkpoint_seconds",
+            "keep_checkpoints",
+            "metrics_frames",
+            "tensorboard",
+            "num_threads",
+            "torch_threads",
+            "torch_device",
+        }
+    )
+
+    task: str = "type1_bca"
+    observation: str | tuple[str, ...] = "internal"
+    task_kwargs: Mapping[str, Any] = field(default_factory=dict)
+    backend: Literal["batched", "composer"] = "batched"
+    num_envs: int = 16
+    num_threads: int | None = None
+    seed: int = 0
+    total_frames: int = 600_000
+    hidden: tuple[int, ...] = (64, 64)
+    activation: Literal["tanh", "relu", "elu"] = "tanh"
+    cnn_features: int = 512
+    learning_rate: float = 3e-4
+    gamma: float = 0.99
+    observation_clip: float = 10.0
+    normalisation_frames: int = 4_096
+    checkpoint_frames: int = 51_200
+    checkpoint_seconds: float = 120.0
+    keep_checkpoints: int = 3
+    metrics_frames: int = 2_048
+    tensorboard: bool = False
+    torch_device: str = "cpu"
+    torch_threads: int = 1
+
+    def __post_init__(self):
+        """Validate; every message says what was given and what is allowed."""
+        for name in ("hidden", "observation"):
+            if isinstance(getattr(self, name), list):
+                object.__setattr__(self, name, tuple(getattr(self, name)))
+        for name, kind in typing.get_type_hints(type(self)).items():
+            if typing.get_origin(kind) is not ClassVar:
+                _require_type(name, getattr(self, name), kind)
+        object.__setattr__(self, "task_kwargs", dict(self.task_kwargs))
+        require(bool(self.task), "task", self.task, "the name of a task")
+        require(bool(self.observation), "observation", self.observation, "a name")
+        require(
+            0 < len(self.hidden) <= MAX_LAYERS
+            and all(0 < width <= MAX_WIDTH for width in self.hidden),
+            "hidden",
+            self.hidden,
+            f"1 to {MAX_LAYERS} widths from 1 to {MAX_WIDTH}",
+        )
+        require(
+            0 < self.cnn_features <= MAX_WIDTH,
+            "cnn_features",
+            self.cnn_features,
+            f"a positive integer up to {MAX_WIDTH}",
+        )
+        self._require_positive(
+            "num_envs",
+            "total_frames",
+            "checkpoint_frames",
+            "keep_checkpoints",
+            "metrics_frames",
+            "torch_threads",
+            "learning_rate",
+            "observation_clip",
+            "checkpoint_seconds",
+        )
+        for name in ("seed", "normalisation_frames"):
+            value = getattr(self, name)
+            require(value >= 0, name, value, "an integer >= 0")
+        threads = self.num_threads
+        require(
+            threads is None or threads > 0,
+            "num_threads",
+            threads,
+            "a positive integer, or None for every core",
+        )
+        require(0 < self.gamma <= 1, "gamma", self.gamma, "in (0, 1]")
+        try:
+            json.dumps(self.task_kwargs, allow_nan=False)
+        except (TypeError, ValueError) as error:
+            raise ConfigError(
+                f"task_kwargs={self.task_kwargs!r} cannot be written to config.json "
+                f"({error}); use finite numbers, strings, lists and dicts only."
+            ) from error
+
+    def _require_positive(self, *names: str) -> None:
+        for name in names:
+            value = getattr(self, name)
+            kind = "a positive integer" if isinstance(value, int) else "positive"
+            require(value > 0, name, value, kind)
+
+    @property
+    def frames_per_batch(self) -> int:
+        """Number of frames between two calls of the learner's update."""
+        raise NotImplementedError
+
+    def replace(self, **changes: Any) -> "TrainingConfig":
+        """A copy with some fields changed, validated again."""
+        _require_fields(type(self), changes)
+        return dataclasses.replace(self, **changes)
+
+    def to_dict(self) -> dict[str, Any]:
+        """The config as JSON-able values, with the algorithm's name."""
+        values = dataclasses.asdict(self)
+        values["hidden"] = list(self.hidden)
+        if not isinstance(self.observation, str):
+            values["observation"] = list(self.observation)
+        return {"algorithm": self.algorithm, **values}
+
+    @classmethod
+    def from_dict(cls, values: Mapping[str, Any]) -> "TrainingConfig":
+        """A config of this class from its fields by name.
+
+        Raises:
+            ConfigError: an unknown field, or a value that is not allowed.
+        """
+        _require_fields(cls, values)
+        return cls(**values)
+
+    def changed_for_resume(self, other: "TrainingConfig") -> dict[str, tuple]:
+        """Fields (name: (here, other)) that differ and may not on resuming."""
+        here, there = self.to_dict(), other.to_dict()
+        return {
+            name: (here.get(name), there.get(name))
+            for name in sorted(set(here) | set(there))
+            if name not in self.resumable and here.get(name) != there.get(name)
+        }
+
+
+def _require_fields(kind: type[TrainingConfig], names: Mapping[str, Any]) -> None:
+    valid = [item.name for item in dataclasses.fields(kind)]
+    unknown = sorted(set(names) - set(valid))
+    if unknown:
+        raise ConfigError(
+            f"{kind.__name__} has no field {unknown}; valid fields are {valid}."
+        )
+
+
+_KINDS = {
+    int: "an integer below 2**62",
+    float: "a finite number",
+    str: "a string",
+    bool: "true or false",
+    type(None): "None",
+}
+
+
+def _require_type(name: str, value: object, kind: Any) -> None:
+    require(_fits(value, kind), name, value, _description(kind))
+
+
+def _fits(value: object, kind: Any) -> bool:
+    """Whether a value is of an annotated type; of numbers only finite ones."""
+    origin, arguments = typing.get_origin(kind), typing.get_args(kind)
+    if origin is Literal:
+        return any(value == choice and isinstance(value, str) for choice in arguments)
+    if origin in (typing.Union, types.UnionType):
+        return any(_fits(value, argument) for argument in arguments)
+    if origin is tuple:
+        return isinstance(value, tuple) and all(_fits(v, arguments[0]) for v in value)
+    if origin is Mapping or origin is None and kind is Mapping:
+        return isinstance(value, Mapping)
+    if type(value) is int and abs(value) > MAX_INTEGER:
+        return False
+    if kind is float:
+        return type(value) in (int, float) and math.isfinite(value)
+    # A bool is an int to Python, but no number of anything.
+    return type(value) is kind
+
+
+def _description(kind: Any) -> str:
+    origin, arguments = typing.get_origin(kind), typing.get_args(kind)
+    if origin is Literal:
+        return "one of " + ", ".join(map(repr, arguments))
+    if origin in (typing.Union, types.UnionType):
+        return " or ".join(_description(argument) for argument in arguments)
+    if origin is tuple:
+        return f"a list, each entry {_description(arguments[0])}"
+    return _KINDS.get(kind, "an object of settings")

@@ -1,0 +1,172 @@
+"""What a training run says about itself: metrics.csv, TensorBoard, progress."""
+
+import contextlib
+import time
+from collections import deque
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from cathsim_dmc.agents.config import ConfigError, TrainingConfig
+from cathsim_dmc.agents.episodes import EpisodeOutcome
+from cathsim_dmc.agents.metrics import MetricsFile
+from cathsim_dmc.agents.progress import Progress
+
+# Number of finished episodes over which the running figures are taken.
+EPISODE_WINDOW = 100
+
+# The rest of metrics.csv's columns are the learner's own.
+COLUMNS = (
+    "frames",
+    "seconds",
+    "frames_per_second",
+    "episodes",
+    "episode_reward",
+    "episode_length",
+    "success",
+    "mean_force",
+    "max_force",
+    "step_reward",
+)
+
+
+class TrainingLog(contextlib.AbstractContextManager):
+    """Counts frames, episodes and seconds of a run and writes them down.
+
+    Attributes:
+        frames: Number of frames so far, over all processes of the run.
+        episodes: Number of finished episodes likewise.
+        row: Last row of metrics.csv that was written; empty before the first.
+    """
+
+    def __init__(
+        self,
+        run: Path,
+        config: TrainingConfig,
+        metrics: Sequence[str],
+        *,
+        frames: int,
+        seconds: float,
+        episodes: int,
+        resumed: bool,
+        progress: bool,
+    ):
+        """Open the files.
+
+        Args:
+            run: Directory of the run.
+            config: Settings of the run.
+            metrics: Names of the learner's own figures.
+            frames: Number of frames that earlier processes of the run have seen.
+            seconds: Wall time that they have taken.
+            episodes: Number of episodes that they have finished.
+            resumed: Whether there were any.
+            progress: Whether to show progress on standard error.
+        """
+        self.frames, self.episodes = frames, episodes
+        self.row: dict[str, float | None] = {}
+        self._config = config
+        self._frames_before, self._seconds_before = frames, seconds
+        self._window: deque[EpisodeOutcome] = deque(maxlen=EPISODE_WINDOW)
+        self._stack = contextlib.ExitStack()
+        columns = [*COLUMNS, *metrics]
+        self._table = MetricsFile(
+            run / "metrics.csv", columns, frames if resumed else None
+        )
+        self._board = _tensorboard(run) if config.tensorboard else None
+        label = f"{config.algorithm} {config.task}"
+        self._bar = Progress(label, config.total_frames, start=frames, enabled=progress)
+        self._began = time.monotonic()
+
+    def __enter__(self) -> "TrainingLog":
+        """Show the progress and start the clock."""
+        if self._board is not None:
+            self._stack.callback(self._board.close)
+        self._stack.enter_context(self._bar)
+        self._began = time.monotonic()
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        """Close what is open."""
+        self._stack.close()
+
+    @property
+    def seconds(self) -> float:
+        """Wall time of the run so far, over all its processes."""
+        return self._seconds_before + time.monotonic() - self._began
+
+    def add(
+        self,
+        frames: int,
+        finished: Sequence[EpisodeOutcome],
+        step_reward: float,
+        losses: Mapping[str, float],
+        last: bool,
+    ) -> None:
+        """Take note of a batch.
+
+        Args:
+            frames: Number of frames of the batch.
+            finished: Episodes that ended in it.
+            step_reward: Mean reward of its steps.
+            losses: Figures of the learner's update.
+            last: Whether no other batch follows, so that a row is due anyway.
+        """
+        before, self.frames = self.frames, self.frames + frames
+        self.episodes += len(finished)
+        self._window.extend(finished)
+        means = _episode_means(self._window)
+        if last or crossed(before, self.frames, self._config.metrics_frames):
+            elapsed = self.seconds - self._seconds_before
+            self.row = {
+                "frames": self.frames,
+                "seconds": self._seconds_before + elapsed,
+                "frames_per_second": (self.frames - self._frames_before) / elapsed,
+                "episodes": self.episodes,
+                **means,
+                "step_reward": step_reward,
+                **losses,
+            }
+            self._table.append(self.row)
+            self._show_on_board()
+        self._bar.update(self.frames, {"step_reward": step_reward, **means})
+
+    def _show_on_board(self) -> None:
+        if self._board is None:
+            return
+        for name, value in self.row.items():
+            if name != "frames" and value is not None:
+                self._board.add_scalar(name, value, self.frames)
+
+
+def crossed(before: int, after: int, interval: int) -> bool:
+    """Whether a multiple of `interval` lies in (before, after]."""
+    return before // interval != after // interval
+
+
+def _episode_means(window: deque[EpisodeOutcome]) -> dict[str, float | None]:
+    """Means over the last finished episodes; None where nothing is known."""
+
+    def mean(name: str) -> float | None:
+        known = [value for o in window if (value := getattr(o, name)) is not None]
+        return float(np.mean(known)) if known else None
+
+    return {
+        "episode_reward": mean("reward"),
+        "episode_length": mean("length"),
+        "success": mean("success"),
+        "mean_force": mean("mean_force"),
+        "max_force": mean("max_force"),
+    }
+
+
+def _tensorboard(run: Path) -> Any:
+    try:
+        from torch.utils.tensorboard import SummaryWriter
+    except ImportError as error:
+        raise ConfigError(
+            "tensorboard=True needs the extra: pip install 'cathsim-dmc[tensorboard]'."
+        ) from error
+    return SummaryWriter(run / "tensorboard")

@@ -1,0 +1,102 @@
+"""Files that appear whole or not at all."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import uuid
+from collections.abc import Iterator
+from pathlib import Path
+from typing import BinaryIO
+
+try:
+    import fcntl
+except ImportError:  # Windows has no advisory locks: leftovers stay there.
+    fcntl = None
+
+_PARTIAL = ".partial"
+
+
+@contextlib.contextmanager
+def atomic_path(
+    path: str | os.PathLike[str], suffix: str | None = None
+) -> Iterator[Path]:
+    """Yield a temporary path whose content becomes `path` when the block ends well.
+
+    The temporary file lies in the same directory, is flushed to disk and renamed. When
+    the block raises, it is removed and an older `path` stays as it was. Of several
+    writers of one path all succeed, and the last one's content stays. What a killed
+    writer has left is removed by the next writer of the same path.
+
+    Args:
+        path: Path of the file that is to appear.
+        suffix: Ending that `path` must have, such as ".npz"; None allows any.
+
+    Raises:
+        ValueError: if `path` does not end in `suffix`.
+        FileNotFoundError: if the directory does not exist.
+        RuntimeError: if the block ends without having written anything.
+    """
+    path = Path(path)
+    if suffix is not None and path.suffix != suffix:
+        raise ValueError(f"the file name must end in {suffix}, got {path.name!r}")
+    if not path.parent.is_dir():
+        raise FileNotFoundError(f"no directory {path.parent}; create it first")
+    _remove_leftovers(path)
+    temporary, stream = _create(path)
+    try:
+        with stream:
+            yield temporary
+            if not temporary.is_file() or not temporary.stat().st_size:
+                raise RuntimeError(f"nothing was written for {path}")
+            # Opened anew: the block may have put another file in its place.
+            with open(temporary, "rb+") as written:
+                os.fsync(written.fileno())
+            os.replace(temporary, path)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def write_bytes(path: str | os.PathLike[str], data: bytes) -> Path:
+    """Write a file atomically, see `atomic_path`; return its path."""
+    with atomic_path(path) as temporary:
+        temporary.write_bytes(data)
+    return Path(path)
+
+
+def write_text(path: str | os.PathLike[str], text: str) -> Path:
+    """Write UTF-8 text atomically, see `atomic_path`; return its path."""
+    return write_bytes(path, text.encode())
+
+
+def _create(path: Path) -> tuple[Path, BinaryIO]:
+    """An empty temporary file beside `path`, locked for as long as it is open."""
+    while True:
+        name = f".{path.name}.{uuid.uuid4().hex[:12]}{_PARTIAL}"
+        temporary = path.with_name(name)
+        # Not tempfile, whose files only their owner may read, whatever the umask.
+        stream = open(temporary, "xb")
+        if fcntl is None:
+            return temporary, stream
+        fcntl.flock(stream, fcntl.LOCK_EX)
+        # Before the lock was ours, another writer may have taken it for a leftover.
+        if temporary.exists():
+            return temporary, stream
+        stream.close()
+
+
+def _remove_leftovers(path: Path) -> None:
+    """Remove temporary files of `path` that no living process holds open."""
+    if fcntl is None:
+        return
+    prefix = f".{path.name}."
+    for leftover in path.parent.iterdir():
+        name = leftover.name
+        if not (name.startswith(prefix) and name.endswith(_PARTIAL)):
+            continue
+        if len(name) != len(prefix) + 12 + len(_PARTIAL) or leftover.is_symlink():
+            continue
+        # Another writer may remove it, or have just renamed it.
+        with contextlib.suppress(OSError), open(leftover, "rb") as stream:
+            fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            leftover.unlink()

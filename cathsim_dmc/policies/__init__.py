@@ -1,0 +1,42 @@
+"""Policies that are not learnt, and what every policy is: numpy, no torch."""
+
+from cathsim_dmc.policies.expert import ExpertPolicy
+from cathsim_dmc.policies.policy import Policy, in_environment
+from cathsim_dmc.policies.scripted import Curl, Idle, Push, Random
+from cathsim_dmc.policies.view import BatchedView, ComposerView, View
+
+# Policies by name: a new one is a class and a line here.
+POLICIES: dict[str, type[Policy]] = {
+    "random": Random,
+    "push": Push,
+    "expert": ExpertPolicy,
+    "idle": Idle,
+    "curl": Curl,
+}
+
+
+def make_policy(name: str, seed: int = 0) -> Policy:
+    """The policy of a name.
+
+    Args:
+        name: Name in `POLICIES`.
+        seed: Seed of the policy's own randomness, for the first simulation; those of
+            the others count up.
+
+    Raises:
+        ValueError: there is none of that name; lists those that exist.
+    """
+    if name not in POLICIES:
+        raise ValueError(f"no policy {name!r}; there are {', '.join(POLICIES)}")
+    return POLICIES[name](seed)
+
+
+__all__ = [
+    "POLICIES",
+    "BatchedView",
+    "ComposerView",
+    "Policy",
+    "View",
+    "in_environment",
+    "make_policy",
+]

@@ -1,0 +1,83 @@
+"""Policies that look at nothing: yardsticks of agents, loads of the simulator."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from cathsim_dmc.policies.policy import Policy
+from cathsim_dmc.policies.view import View
+
+
+class Random(Policy):
+    """Uniform actions in [-1, 1], from a generator for each simulation."""
+
+    name = "random"
+
+    def __init__(self, seed: int = 0):
+        """Draws simulation i's actions from seed + i.
+
+        Args:
+            seed: Seed of the first simulation's actions.
+        """
+        self._seed = seed
+        self._generators: list[np.random.Generator] = []
+        self._size = 0
+
+    def reset(self, view: View, which: np.ndarray) -> None:
+        """Begin; a further episode goes on with the generator of its simulation."""
+        self._size = view.num_actions
+        if len(self._generators) != view.num_simulations:
+            seeds = range(self._seed, self._seed + view.num_simulations)
+            self._generators = [np.random.default_rng(seed) for seed in seeds]
+
+    def act(self, observation: Any) -> np.ndarray:
+        """Actions (N, A), whatever is observed."""
+        return np.stack([g.uniform(-1, 1, self._size) for g in self._generators])
+
+
+class _Constant(Policy):
+    """The same action in every step."""
+
+    def __init__(self, seed: int = 0):
+        """Takes a seed as all policies do, and draws nothing from it."""
+        self._action = np.zeros((0, 0))
+
+    def reset(self, view: View, which: np.ndarray) -> None:
+        """Look up what the entries of an action are."""
+        self._action = np.zeros((view.num_simulations, view.num_actions))
+        self._fill(self._action, view)
+
+    def _fill(self, action: np.ndarray, view: View) -> None:
+        """Write the action (N, A), which is zero."""
+
+    def act(self, observation: Any) -> np.ndarray:
+        """Actions (N, A), whatever is observed."""
+        return self._action
+
+
+class Idle(_Constant):
+    """No push, tip motors at rest."""
+
+    name = "idle"
+
+
+class Push(_Constant):
+    """Full push, tip motors at rest."""
+
+    name = "push"
+
+    def _fill(self, action: np.ndarray, view: View) -> None:
+        action[:, len(view.task.scene.catheter.tip_motors)] = 1.0
+
+
+class Curl(_Constant):
+    """Full push, the tip bent as far as it goes: the device jams."""
+
+    name = "curl"
+
+    def _fill(self, action: np.ndarray, view: View) -> None:
+        motors = len(view.task.scene.catheter.tip_motors)
+        action[:, 0:motors:2] = 1.0
+        action[:, motors] = 1.0

@@ -1,0 +1,100 @@
+"""What a policy may know beyond the observation: the simulations themselves.
+
+One face for many simulations side by side and for composer environments, so that a
+policy that looks at positions and forces needs no second version of itself.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple, Protocol, TypeVar
+
+import numpy as np
+from dm_control import composer
+
+from cathsim_dmc.simulation.batch import BatchSimulation
+from cathsim_dmc.tasks import forces
+from cathsim_dmc.tasks.navigation import Navigation
+from cathsim_dmc.tasks.readings import Readings
+
+Stacked = TypeVar("Stacked", bound=NamedTuple)
+
+
+class View(Protocol):
+    """N simulations of one task.
+
+    Attributes:
+        num_simulations: N.
+        num_actions: Number A of entries of an action.
+        task: The task that all of them run.
+        readings: State of the devices; every array has the leading axis N.
+        wall_force: Force on the wall over the last control step, likewise.
+    """
+
+    num_simulations: int
+    num_actions: int
+
+    @property
+    def task(self) -> Navigation:
+        """The task that all simulations run."""
+
+    @property
+    def readings(self) -> Readings:
+        """State of the devices; every array has the leading axis N."""
+
+    @property
+    def wall_force(self) -> forces.WallForce:
+        """Force on the wall over the last control step; arrays (N,), N."""
+
+
+class BatchedView:
+    """The simulations of a batch."""
+
+    def __init__(self, simulation: BatchSimulation):
+        self._simulation = simulation
+        self.num_simulations = simulation.num_simulations
+        self.num_actions = simulation.num_actions
+
+    @property
+    def task(self) -> Navigation:
+        """The task that all simulations run."""
+        return self._simulation.task
+
+    @property
+    def readings(self) -> Readings:
+        """State of the devices; every array has the leading axis N."""
+        return self._simulation.readings
+
+    @property
+    def wall_force(self) -> forces.WallForce:
+        """Force on the wall over the last control step; arrays (N,), N."""
+        return self._simulation.wall_force
+
+
+class ComposerView:
+    """Composer environments, one simulation each."""
+
+    def __init__(self, environments: Sequence[composer.Environment]):
+        self._environments = list(environments)
+        self.num_simulations = len(self._environments)
+        self.num_actions = int(self._environments[0].action_spec().shape[0])
+
+    @property
+    def task(self) -> Navigation:
+        """The task of the first; the others' differ in their randomness only."""
+        return self._environments[0].task
+
+    @property
+    def readings(self) -> Readings:
+        """State of the devices; every array has the leading axis N."""
+        return _stacked([env.task.readings for env in self._environments])
+
+    @property
+    def wall_force(self) -> forces.WallForce:
+        """Force on the wall over the last control step; arrays (N,), N."""
+        return _stacked([env.task.wall_force for env in self._environments])
+
+
+def _stacked(parts: list[Stacked]) -> Stacked:
+    """Tuples of arrays (...,) as one of arrays (N, ...)."""
+    return type(parts[0])(*map(np.stack, zip(*parts, strict=True)))

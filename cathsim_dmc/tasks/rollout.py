@@ -1,0 +1,322 @@
+"""The course of an episode, for any number of simulations and whoever steps them.
+
+    begin → (forward pass) → start → command → (physics steps) → finish → command → …
+
+The composer environment steps a `Rollout` of one simulation, the batched simulation
+one of N; so both draw, command, judge and observe alike, bit for bit.
+"""
+
+from collections.abc import Callable, Sequence
+from typing import Protocol
+
+import mujoco
+import numpy as np
+
+from cathsim_dmc.entities.robot import follower_posture
+from cathsim_dmc.imaging.angiograph import Angiograph
+from cathsim_dmc.imaging.fluoroscopy import Fluoroscope
+from cathsim_dmc.tasks import forces, observations, placement, readings
+from cathsim_dmc.tasks.config import NavigationConfig
+from cathsim_dmc.tasks.image_sensors import ImageSensors, open_cameras
+from cathsim_dmc.tasks.objectives import Measurement, Objective
+from cathsim_dmc.tasks.path_tracker import PathTracker
+from cathsim_dmc.tasks.physics_errors import PhysicsMonitor
+from cathsim_dmc.tasks.scene import Scene
+from cathsim_dmc.tasks.step import Step
+from cathsim_dmc.tasks.variations import ActionDelay, ModelVariation
+
+
+class SimulationState(Protocol):
+    """State of N simulations: arrays with MuJoCo's names and a leading axis N.
+
+    A `mujoco.batch.Batch` is one; `SingleState` makes one of an `mujoco.MjData`.
+    `readings.ModelIndex.FIELDS` says which arrays are read; `qpos` is written.
+    """
+
+    qpos: np.ndarray
+
+
+class SingleState:
+    """Arrays of one `mujoco.MjData`, not copied, with a leading axis of length 1."""
+
+    def __init__(self, data: mujoco.MjData):
+        """Takes the views; they stay valid as long as `data` lives."""
+        for field in readings.ModelIndex.FIELDS:
+            setattr(self, field, getattr(data, field)[None])
+
+
+class Rollout:
+    """Episodes of N simulations of one task."""
+
+    def __init__(
+        self,
+        scene: Scene,
+        objective: Objective,
+        config: NavigationConfig,
+        model: mujoco.MjModel,
+        state: SimulationState,
+        model_field: Callable[[str], np.ndarray],
+        num_simulations: int = 1,
+        angiograph: Angiograph | None = None,
+    ):
+        """Prepares what an episode needs; no episode has begun yet.
+
+        Args:
+          scene: Entities and where they stand.
+          objective: Success and reward.
+          config: Options of the task.
+          model: The compiled scene.
+          state: Arrays of the simulations.
+          model_field: Gives a field of the model that each simulation has for itself,
+            (N, ...), to be written.
+          num_simulations: N.
+          angiograph: Angiography machine, needed by fluoroscopic observations.
+        """
+        self._scene = scene
+        self._config = config
+        self._state = state
+        self._nominal_objective = self._objective = objective
+        self._names = observations.resolve(config.observation)
+        catheter = scene.catheter.mjcf_model.model
+        phantom = scene.phantom.mjcf_model.model
+        self._index = readings.ModelIndex(
+            model, catheter, phantom, scene.robot.mjcf_model.model
+        )
+        num_actions = len(scene.catheter.actuators)
+        randomisation = config.randomisation
+        self._variation = ModelVariation(model, randomisation, catheter, phantom)
+        self._fields = {name: model_field(name) for name in self._variation.fields}
+        self._delay = ActionDelay(
+            num_simulations, num_actions, randomisation.longest_delay
+        )
+        self._sensors = ImageSensors(
+            self._names,
+            angiograph,
+            scene.device.outer_radius,
+            num_simulations,
+            open_cameras(self._names, model, config.cameras, catheter),
+        )
+        self._monitor = PhysicsMonitor(
+            scene.anatomy,
+            num_simulations,
+            {
+                "anatomy": scene.anatomy.name,
+                "goal": scene.goal.name,
+                "config": repr(config),
+            },
+        )
+        self._path = PathTracker(num_simulations)
+        self._random_states: list[np.random.RandomState] | None = None
+        self._goal_shift = np.zeros(num_simulations)
+        self._steps = np.zeros(num_simulations, dtype=int)
+        self._action = np.zeros((num_simulations, num_actions))
+        self._previous_action = self._action
+        self._readings: readings.Readings | None = None
+        self._wall_force: forces.WallForce | None = None
+
+    # The course of an episode.
+
+    def begin(
+        self, indices: np.ndarray, random_states: Sequence[np.random.RandomState]
+    ) -> None:
+        """Draws new episodes and puts the devices to their start.
+
+        A forward pass must follow, then `start`.
+
+        Args:
+          indices: (K,) numbers of the simulations, whose state has been reset.
+          random_states: N sources of randomness; those of other simulations are left
+            alone.
+        """
+        self._random_states = list(random_states)
+        displacement = np.stack([self._draw(index) for index in indices])
+        if self._config.randomisation.goal_shift is not None:
+            self._objective = self._nominal_objective.shifted(self._goal_shift)
+        qpos = self._state.qpos
+        qpos[indices] = self.start_qpos(qpos[indices], displacement)
+        self._steps[indices] = 0
+        # New arrays: those handed out before stay what they were.
+        self._action = self._action.copy()
+        self._action[indices] = 0.0
+        self._previous_action = self._action
+
+    def _draw(self, index: int) -> np.ndarray:
+        """Draws the episode of one simulation; returns its displacement (3,)."""
+        episode = self._config.randomisation.draw(self._random_states[index])
+        fields = {name: values[index] for name, values in self._fields.items()}
+        self._variation.write(fields, episode)
+        self._delay.restart(index, episode.delay)
+        self._monitor.restart(index)
+        self._sensors.restart(index, episode.deviation)
+        self._goal_shift[index] = episode.goal_shift or 0.0
+        return episode.displacement
+
+    def start_qpos(self, qpos: np.ndarray, displacement: np.ndarray) -> np.ndarray:
+        """Start configurations (K, nq), the tips displaced by (K, 3) m.
+
+        The displacement is in the frame of the inlet, whose z points into the lumen.
+        """
+        joints = placement.start_joints(
+            self._scene.catheter.link_lengths,
+            self._scene.placement.start_depth,
+            displacement,
+        )
+        names = [joint.name for joint in self._scene.catheter.joints]
+        for name, value in joints.items():
+            qpos[..., self._index.qpos.start + names.index(name)] = value
+        return self.pose_robot(qpos)
+
+    def pose_robot(self, qpos: np.ndarray) -> np.ndarray:
+        """Poses the follower's joints after the device, in place: qpos (N, nq)."""
+        index = self._index
+        if len(qpos) == 1:  # plain floats take a third of the time
+            (row,) = qpos
+            turned = 0.0 if index.rotation_qpos is None else row[index.rotation_qpos]
+            row[index.robot_qpos] = follower_posture(
+                float(row[index.insertion_qpos]), float(turned)
+            )
+            return qpos
+        pushed = qpos[..., index.insertion_qpos]
+        turned = 0.0 if index.rotation_qpos is None else qpos[..., index.rotation_qpos]
+        qpos[..., index.robot_qpos] = follower_posture(pushed, turned)
+        return qpos
+
+    def command(
+        self, action: np.ndarray, read_states: Callable[[], np.ndarray]
+    ) -> np.ndarray:
+        """Takes the actions of a control step and poses the robot.
+
+        Args:
+          action: (N, A) float64 as `actions.check_action` returns it.
+          read_states: Reads the states (N, nstate), mjSTATE_INTEGRATION.
+
+        Returns:
+          Control (N, A) of the actuators for all physics steps.
+        """
+        self._previous_action, self._action = self._action, action
+        self.pose_robot(self._state.qpos)
+        self._monitor.before_step(read_states, action)
+        return self._delay.delayed(action)
+
+    def start(self, indices: np.ndarray, magnitudes: np.ndarray) -> Step:
+        """First measurement of new episodes, after the forward pass.
+
+        Args:
+          indices: (K,) numbers of the simulations that have begun an episode.
+          magnitudes: (N, S, M), N, contact forces on the wall.
+
+        Returns:
+          All simulations as they stand; no episode ends at its start.
+        """
+        self._measure(magnitudes)
+        head = self._readings.head
+        self._path.restart(indices, head, self._objective.path_distance(head))
+        going_on = np.zeros(len(head), dtype=bool)
+        return self._step([None] * len(head), indices, going_on)
+
+    def finish(self, magnitudes: np.ndarray, warned: Sequence[bool]) -> Step:
+        """Measures, judges and observes after the physics steps of a control step.
+
+        Args:
+          magnitudes: (N, S, M), N, contact forces on the wall in S physics steps.
+          warned: (N,), whether MuJoCo warned in one of them.
+        """
+        self._steps += 1
+        self._measure(magnitudes)
+        self._path.add(self._readings.head)
+        errors = self._monitor.errors(
+            warned, self._readings.centreline, self._wall_force.peak_max
+        )
+        return self._step(errors)
+
+    def _measure(self, magnitudes: np.ndarray):
+        self._readings = self._index.read(self._state)
+        self._wall_force = forces.wall_force(magnitudes)
+
+    def _step(
+        self,
+        errors: Sequence[str | None],
+        fresh: np.ndarray | None = None,
+        ended: np.ndarray | None = None,
+    ) -> Step:
+        """Judges and observes what was measured.
+
+        Args:
+          errors: N errors of physics, None where there is none.
+          fresh: (K,) numbers of simulations that have just begun an episode: only
+            their images are captured. None for all, one control step on.
+          ended: (N,) bool, None for what the objective and the physics say.
+        """
+        outcome = self._objective.outcome(
+            Measurement(
+                self._readings, self._wall_force, self._action, self._previous_action
+            )
+        )
+        failed = np.array([error is not None for error in errors])
+        if failed.any():
+            outcome = outcome._replace(
+                success=outcome.success & ~failed,
+                reward=np.where(failed, 0.0, outcome.reward),
+                terms={n: np.where(failed, 0.0, t) for n, t in outcome.terms.items()},
+            )
+        terminated = outcome.success | failed if ended is None else ended
+        goal = self._objective.goal
+        offset = self._readings.head - goal
+        return Step(
+            observation=self._observe(goal, fresh),
+            outcome=outcome,
+            terminated=terminated,
+            truncated=~terminated & (self._steps >= self._config.max_steps),
+            errors=tuple(errors),
+            readings=self._readings,
+            wall_force=self._wall_force,
+            distance=np.sqrt(np.vecdot(offset, offset)),
+            path_ratio=self._path.ratio,
+        )
+
+    def _observe(
+        self, goal: np.ndarray, fresh: np.ndarray | None
+    ) -> observations.Observation:
+        images = self._sensors.capture(
+            self._readings.centreline,
+            goal,
+            self._state.qpos,
+            self._random_states,
+            fresh,
+        )
+        frame = observations.Frame(
+            self._readings, self._wall_force, self._action, goal, images
+        )
+        return observations.observe(self._names, frame)
+
+    # What others may read.
+
+    @property
+    def objective(self) -> Objective:
+        """Goals, which may differ between simulations, reward and success rule."""
+        return self._objective
+
+    @property
+    def index(self) -> readings.ModelIndex:
+        """Places of the task's quantities in the compiled model."""
+        return self._index
+
+    @property
+    def readings(self) -> readings.Readings | None:
+        """State of the devices after the last step or reset."""
+        return self._readings
+
+    @property
+    def wall_force(self) -> forces.WallForce | None:
+        """Force on the wall over the last step."""
+        return self._wall_force
+
+    @property
+    def steps(self) -> np.ndarray:
+        """Control steps (N,) since each episode began."""
+        return self._steps
+
+    @property
+    def fluoroscope(self) -> Fluoroscope | None:
+        """Frontal C-arm of the first simulation, or None without fluoroscopy."""
+        return self._sensors.fluoroscope

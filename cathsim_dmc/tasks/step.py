@@ -1,0 +1,63 @@
+"""What N simulations have to say after a control step."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from cathsim_dmc.tasks import forces, objectives, observations, readings
+
+
+class Step(NamedTuple):
+    """State of N simulations after a control step, or at the start of an episode.
+
+    Attributes:
+      observation: arrays (N, ...), which may share memory with the readings.
+      outcome: reward, success and reward terms, arrays (N,); the reward is 0 and
+        there is no success where the physics failed.
+      terminated: (N,) bool, success or a physics error.
+      truncated: (N,) bool, out of time.
+      errors: N reasons, None where the physics went well; the others are logged with
+        a dump that replays the episode, which says nothing about the policy.
+      readings: state of the devices.
+      wall_force: force on the wall over the control step.
+      distance: (N,), straight from head to goal, m.
+      path_ratio: (N,), way of the head so far over the shortest way to the goal.
+    """
+
+    observation: observations.Observation
+    outcome: objectives.Outcome
+    terminated: np.ndarray
+    truncated: np.ndarray
+    errors: tuple[str | None, ...]
+    readings: readings.Readings
+    wall_force: forces.WallForce
+    distance: np.ndarray
+    path_ratio: np.ndarray
+
+    @property
+    def physics_error(self) -> np.ndarray:
+        """(N,) bool, whether the physics failed."""
+        return np.array([error is not None for error in self.errors])
+
+    def info(self) -> dict[str, np.ndarray]:
+        """Figures beside the observation, arrays (N,): for logs and wrappers.
+
+        "distance" and "insertion" in m; "push_force" in N; "wall_force_sum",
+        "wall_force_max" and their peaks within the control step in N (see
+        `forces.WallForce`); "path_ratio"; "success" and "physics_error" (bool); and
+        "reward_<term>" for each weighted term of the reward.
+        """
+        wall = self.wall_force
+        return {
+            "distance": self.distance,
+            "insertion": self.readings.insertion,
+            "push_force": self.readings.push_force,
+            "wall_force_sum": wall.sum,
+            "wall_force_max": wall.max,
+            "wall_force_peak_sum": wall.peak_sum,
+            "wall_force_peak_max": wall.peak_max,
+            "path_ratio": self.path_ratio,
+            "success": self.outcome.success,
+            "physics_error": self.physics_error,
+            **{f"reward_{name}": term for name, term in self.outcome.terms.items()},
+        }

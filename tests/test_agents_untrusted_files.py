@@ -1,0 +1,367 @@
+"""Files from elsewhere: nothing in them is executed, and what is wrong is named."""
+
+import hashlib
+import json
+import os
+import pickle
+import shutil
+
+import numpy as np
+import pytest
+import synthetic_env
+import torch
+from tensordict import TensorDict
+from test_agents_training import run, small_ppo, small_sac
+
+from cathsim_dmc.agents import Checkpoint, CheckpointError, evaluate, train
+from cathsim_dmc.agents.metrics import MetricsError, MetricsFile, read_metrics
+from cathsim_dmc.agents.replay import ReplayError, ReplayMemory
+
+
+class Bomb:
+    """Unpickling it makes a folder."""
+
+    def __init__(self, marker):
+        self.marker = marker
+
+    def __reduce__(self):
+        return os.mkdir, (str(self.marker),)
+
+
+@pytest.fixture
+def marker(tmp_path):
+    """A path that exists once something was unpickled."""
+    path = tmp_path / "executed"
+    pickle.loads(pickle.dumps(Bomb(path)))
+    assert path.is_dir(), "the bomb is a dud"
+    path.rmdir()
+    return path
+
+
+def bombs(marker):
+    """Ways of packing a pickle, by name."""
+    plain = pickle.dumps(Bomb(marker))
+    folder = marker.parent / "packing"
+    folder.mkdir(exist_ok=True)
+    torch.save(Bomb(marker), folder / "zip.pt")
+    torch.save(Bomb(marker), folder / "old.pt", _use_new_zipfile_serialization=False)
+    np.save(folder / "object.npy", np.array([Bomb(marker)]), allow_pickle=True)
+    torch.save({"actor": Bomb(marker)}, folder / "dict.pt")
+    packed = {path.name: path.read_bytes() for path in sorted(folder.iterdir())}
+    assert not marker.exists()
+    return {"plain": plain, **packed}
+
+
+def transitions(count, size=3):
+    return TensorDict(
+        {
+            "observation_vector": torch.arange(count * size).reshape(count, size) / 7,
+            "pixels": torch.arange(count, dtype=torch.uint8)[:, None, None],
+            "next": {"done": torch.arange(count)[:, None] % 2 == 0},
+        },
+        [count],
+    )
+
+
+def written_replay(folder, capacity=8, count=10):
+    memory = ReplayMemory(folder, capacity, 2**20)
+    memory.extend(transitions(count)[:6])
+    memory.extend(transitions(count)[6:])
+    return memory
+
+
+def test_a_replay_comes_back_as_it_was(tmp_path):
+    memory = written_replay(tmp_path / "replay")
+    assert memory.state()["cursor"] == 2 and len(memory) == 8
+    again = ReplayMemory(tmp_path / "replay", 8, 2**20)
+    again.load(json.loads(json.dumps(memory.state())))
+    torch.manual_seed(0)
+    expected = memory.sample(50)
+    torch.manual_seed(0)
+    found = again.sample(50)
+    assert (found == expected).all()
+    assert found["next", "done"].dtype == torch.bool
+    whole = again._storage["pixels"].flatten().tolist()
+    assert whole == [8, 9, 2, 3, 4, 5, 6, 7]
+    # Both processes map the same files.
+    again.extend(transitions(1))
+    assert memory._storage["pixels"].flatten().tolist()[2] == 0
+
+
+def test_a_replay_takes_its_room_on_the_disk_at_once(tmp_path):
+    memory = ReplayMemory(tmp_path / "replay", 1_000, 2**20)
+    memory.extend(transitions(1, size=64))
+    size = (tmp_path / "replay" / "observation_vector.raw").stat()
+    assert size.st_size == 1_000 * 64 * 4
+    assert size.st_blocks * 512 >= size.st_size
+    huge = ReplayMemory(tmp_path / "other", 2**45, 2**60)
+    with pytest.raises(OSError, match="lower replay_bytes"):
+        huge.extend(transitions(1))
+
+
+def test_nothing_in_front_of_the_replay_is_executed(tmp_path, marker):
+    """Among others the files that TensorDict.load_memmap would unpickle."""
+    folder = tmp_path / "replay"
+    memory = written_replay(folder)
+    for bomb in bombs(marker).values():
+        for name in ("other.pickle", "meta.json", "observation_vector.memmap"):
+            (folder / name).write_bytes(bomb)
+        (folder / "meta.json").write_text(
+            json.dumps(
+                {
+                    "shape": [8],
+                    "device": "cpu",
+                    "_type": "<class 'tensordict._td.TensorDict'>",
+                    "observation_vector": {"type": "NonTensorData"},
+                }
+            )
+        )
+        ReplayMemory(folder, 8, 2**20).load(memory.state())
+        for name in ("observation_vector.raw", "replay.json"):
+            kept = (folder / name).read_bytes()
+            (folder / name).write_bytes(bomb)
+            with pytest.raises(ReplayError):
+                ReplayMemory(folder, 8, 2**20).load(memory.state())
+            (folder / name).write_bytes(kept)
+    assert not marker.exists()
+
+
+def edited(folder, change):
+    path = folder / "replay.json"
+    values = json.loads(path.read_text())
+    change(values)
+    path.write_text(json.dumps(values))
+
+
+def rename(values, old, new):
+    values["entries"][new] = values["entries"].pop(old)
+
+
+EDITS = {
+    "outside": lambda v: rename(v, "pixels", "../secret"),
+    "absolute": lambda v: rename(v, "pixels", "/etc/passwd"),
+    "parent": lambda v: rename(v, "pixels", ".."),
+    "nested twice": lambda v: v["entries"].update(next=v["entries"]["pixels"]),
+    "pickle dtype": lambda v: v["entries"]["pixels"].update(dtype="object"),
+    "list dtype": lambda v: v["entries"]["pixels"].update(dtype=["uint8"]),
+    "huge": lambda v: v["entries"]["pixels"].update(shape=[2**50, 2**50]),
+    "negative": lambda v: v["entries"]["pixels"].update(shape=[-1]),
+    "fraction": lambda v: v["entries"]["pixels"].update(shape=[1.5]),
+    "text shape": lambda v: v["entries"]["pixels"].update(shape="11"),
+    "deep": lambda v: v["entries"]["pixels"].update(shape=[1] * 100),
+    "other dtype": lambda v: v["entries"]["pixels"].update(dtype="bool"),
+    "no entries": lambda v: v.update(entries=[]),
+    "null entry": lambda v: v["entries"].update(pixels=None),
+    "capacity": lambda v: v.update(capacity=9),
+    "text capacity": lambda v: v.update(capacity="8"),
+    "version": lambda v: v.update(version=2),
+    "less": lambda v: v["entries"].pop("pixels"),
+}
+
+
+@pytest.mark.parametrize("case", EDITS)
+def test_an_edited_description_is_refused(tmp_path, case):
+    folder = tmp_path / "replay"
+    state = written_replay(folder).state()
+    edited(folder, EDITS[case])
+    with pytest.raises(ReplayError) as caught:
+        ReplayMemory(folder, 8, 2**20).load(state)
+    assert "\n" not in str(caught.value)
+
+
+def test_links_short_files_and_wrong_counters_are_refused(tmp_path):
+    folder = tmp_path / "replay"
+    state = written_replay(folder).state()
+    for name, value in (("size", 9), ("cursor", 8), ("size", -1), ("capacity", None)):
+        with pytest.raises(ReplayError, match="replay"):
+            ReplayMemory(folder, 8, 2**20).load({**state, name: value})
+    raw = folder / "pixels.raw"
+    data = raw.read_bytes()
+    for wrong in (data[:-1], data + b"\0", b""):
+        raw.write_bytes(wrong)
+        with pytest.raises(ReplayError, match="pixels.raw has .* bytes"):
+            ReplayMemory(folder, 8, 2**20).load(state)
+    raw.unlink()
+    with pytest.raises(ReplayError, match="pixels.raw cannot be opened"):
+        ReplayMemory(folder, 8, 2**20).load(state)
+    secret = tmp_path / "secret"
+    secret.write_bytes(data)
+    raw.symlink_to(secret)
+    with pytest.raises(ReplayError, match="pixels.raw cannot be opened"):
+        ReplayMemory(folder, 8, 2**20).load(state)
+    assert secret.read_bytes() == data
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory):
+    """Finished runs of both algorithms, to be copied."""
+    runs = tmp_path_factory.mktemp("trained")
+    run(small_ppo(total_frames=512), runs / "ppo")
+    run(small_sac(total_frames=768), runs / "sac")
+    return runs
+
+
+def checkpoint_of(folder):
+    return Checkpoint.open(folder).path
+
+
+@pytest.mark.parametrize("algorithm", ["ppo", "sac"])
+@pytest.mark.parametrize("name", ["policy.pt", "learning.pt"])
+def test_nothing_in_a_checkpoint_is_executed(
+    tmp_path, marker, trained, algorithm, name
+):
+    """Even where the checksum has been made to fit."""
+    make = {"ppo": small_ppo, "sac": small_sac}[algorithm]
+    for number, (kind, bomb) in enumerate(bombs(marker).items()):
+        folder = tmp_path / str(number)
+        shutil.copytree(trained / algorithm, folder)
+        path = checkpoint_of(folder)
+        (path / name).write_bytes(bomb)
+        for mended in (False, True):
+            if mended:
+                values = json.loads((path / "checkpoint.json").read_text())
+                values["sha256"][name] = hashlib.sha256(bomb).hexdigest()
+                (path / "checkpoint.json").write_text(json.dumps(values))
+            match = f"{name} (holds no weights|is damaged)"
+            with pytest.raises(CheckpointError, match=match) as caught:
+                run(make(total_frames=4_096), folder, resume=True)
+            assert "\n" not in str(caught.value), kind
+            if name == "policy.pt":
+                with pytest.raises(CheckpointError, match=match):
+                    evaluate(folder, episodes=1, make_env=synthetic_env.make_env)
+    assert not marker.exists()
+
+
+def test_no_other_file_of_a_run_is_executed(tmp_path, marker, trained):
+    folder = tmp_path / "run"
+    for kind, bomb in bombs(marker).items():
+        shutil.copytree(trained / "sac", folder)
+        (folder / "replay" / "meta.json").write_bytes(bomb)
+        (folder / "replay" / "other.pickle").write_bytes(bomb)
+        (folder / "config.json").write_bytes(bomb)
+        (folder / "evaluation.json").write_bytes(bomb)
+        run(small_sac(total_frames=832), folder, resume=True)
+        (checkpoint_of(folder) / "checkpoint.json").write_bytes(bomb)
+        with pytest.raises(CheckpointError, match="checkpoint.json"):
+            Checkpoint.open(folder)
+        (folder / "metrics.csv").write_bytes(bomb)
+        with pytest.raises(ValueError):
+            MetricsFile(folder / "metrics.csv", ["frames"], resume_at=1)
+        with pytest.raises(ValueError):
+            assert not read_metrics(folder / "metrics.csv"), kind
+            raise MetricsError
+        shutil.rmtree(folder)
+    assert not marker.exists()
+
+
+@pytest.mark.parametrize("name", ["policy.pt", "learning.pt"])
+def test_flipped_bits_are_found(tmp_path, trained, name):
+    random = np.random.default_rng(0)
+    for index in range(10):
+        folder = tmp_path / str(index)
+        shutil.copytree(trained / "ppo", folder)
+        path = checkpoint_of(folder) / name
+        data = bytearray(path.read_bytes())
+        place = random.integers(len(data))
+        data[place] ^= 1 << int(random.integers(8))
+        path.write_bytes(bytes(data))
+        checkpoint = Checkpoint.open(folder)
+        with pytest.raises(CheckpointError, match=f"{name} is damaged: its SHA-256"):
+            checkpoint.policy()
+            checkpoint.learning_state()
+
+
+@pytest.mark.parametrize("content", [b"", b"weights", b"PK\x03\x04", b"\x80\x02."])
+def test_a_file_without_weights_says_so(tmp_path, trained, content):
+    shutil.copytree(trained / "ppo", tmp_path / "run")
+    path = checkpoint_of(tmp_path / "run")
+    (path / "policy.pt").write_bytes(content)
+    with pytest.raises(CheckpointError, match="policy.pt is damaged"):
+        Checkpoint.open(path).policy()
+    values = json.loads((path / "checkpoint.json").read_text())
+    values["sha256"]["policy.pt"] = hashlib.sha256(content).hexdigest()
+    (path / "checkpoint.json").write_text(json.dumps(values))
+    with pytest.raises(CheckpointError, match="policy.pt holds no weights") as caught:
+        Checkpoint.open(path).policy()
+    assert "\n" not in str(caught.value)
+
+
+MISSING = object()
+FIELDS = {
+    "format": ([MISSING, None, "2", 1, True], "format is"),
+    "frames": ([MISSING, None, "x", -5, 1.5, True], "frames is .* integer >= 0"),
+    "seconds": ([MISSING, None, "x", -1, float("nan")], "seconds is .* number >= 0"),
+    "config": ([MISSING, None, [], "x"], "config is .* object"),
+    "shapes": ([MISSING, None, [], 3], "shapes is .* object"),
+    "sha256": ([MISSING, None, {}, {"policy.pt": 3}], "sha256 is .* checksums"),
+}
+NESTED = {
+    "algorithm": ("config", ["dqn", None, [], 3], "algorithm .* is unknown.*ppo"),
+    "gamma": ("config", ["x", None, 2.0], "gamma=.* not allowed"),
+    "hidden": ("config", [[10**9], "x", [None]], "hidden=.* not allowed"),
+    "task_kwargs": ("config", [None, 3], "task_kwargs=.* not allowed"),
+    "strange": ("config", [1], "no field .*strange"),
+    "vector": ("shapes", [-1, None, "x", 10**12, True], "shapes.vector is"),
+    "actions": ("shapes", [0, None, 1.5], "shapes.actions is"),
+    "pixels": ("shapes", [[1], "x", [1, 2, 0], [1, 2, None]], "shapes.pixels is"),
+}
+
+
+@pytest.mark.parametrize("name", [*FIELDS, *NESTED])
+def test_a_wrong_description_names_the_field(tmp_path, trained, name):
+    shutil.copytree(trained / "ppo", tmp_path / "run")
+    path = checkpoint_of(tmp_path / "run")
+    original = json.loads((path / "checkpoint.json").read_text())
+    group, wrong, match = NESTED.get(name) or (None, *FIELDS[name])
+    for value in wrong:
+        values = json.loads(json.dumps(original))
+        holder = values if group is None else values[group]
+        holder[name] = value
+        if value is MISSING:
+            del holder[name]
+        (path / "checkpoint.json").write_text(json.dumps(values))
+        with pytest.raises(CheckpointError, match=match) as caught:
+            Checkpoint.open(path)
+        assert "\n" not in str(caught.value)
+        assert str(path) in str(caught.value)
+
+
+def test_weights_of_another_network_are_refused(tmp_path, trained):
+    shutil.copytree(trained / "ppo", tmp_path / "run")
+    path = checkpoint_of(tmp_path / "run")
+    values = json.loads((path / "checkpoint.json").read_text())
+    values["shapes"]["vector"] += 1
+    (path / "checkpoint.json").write_text(json.dumps(values))
+    with pytest.raises(CheckpointError, match="does not fit the network") as caught:
+        Checkpoint.open(path).policy()
+    assert "\n" not in str(caught.value)
+
+
+def test_a_run_without_its_replay_says_that_it_cannot_go_on(tmp_path, trained):
+    shutil.copytree(trained / "sac", tmp_path / "run")
+    shutil.rmtree(tmp_path / "run" / "replay")
+    with pytest.raises(ReplayError, match="missing.*can still be evaluated"):
+        run(small_sac(total_frames=4_096), tmp_path / "run", resume=True)
+    assert evaluate(tmp_path / "run", episodes=1, make_env=synthetic_env.make_env)
+
+
+def test_a_full_disk_is_named_and_leaves_the_checkpoints(
+    tmp_path, trained, monkeypatch
+):
+    shutil.copytree(trained / "ppo", tmp_path / "run")
+    before = Checkpoint.open(tmp_path / "run")
+
+    def full(path, data):
+        raise OSError(28, "No space left on device", str(path))
+
+    monkeypatch.setattr("cathsim_dmc.agents.checkpoint.files.write_bytes", full)
+    with pytest.raises(OSError, match="No space left"):
+        train(
+            small_ppo(total_frames=1_024),
+            tmp_path / "run",
+            resume=True,
+            progress=False,
+            make_env=synthetic_env.make_env,
+        )
+    assert Checkpoint.open(tmp_path / "run") == before
+    before.policy()

@@ -1,0 +1,135 @@
+"""Files that appear whole or not at all, whoever writes or dies meanwhile."""
+
+import os
+import signal
+import stat
+import subprocess
+import sys
+import threading
+
+import pytest
+
+from cathsim_dmc import files
+
+
+def names(folder):
+    return sorted(path.name for path in folder.iterdir())
+
+
+@pytest.mark.parametrize("umask", [0o022, 0o027, 0o077])
+def test_the_umask_decides_who_may_read(tmp_path, umask):
+    before = os.umask(umask)
+    try:
+        files.write_text(tmp_path / "a.json", "{}")
+        with files.atomic_path(tmp_path / "b.bin") as path:
+            path.write_bytes(b"1")
+    finally:
+        os.umask(before)
+    for name in ("a.json", "b.bin"):
+        mode = stat.S_IMODE((tmp_path / name).stat().st_mode)
+        assert mode == 0o666 & ~umask
+
+
+def test_a_failure_leaves_the_older_file_and_nothing_else(tmp_path):
+    target = files.write_text(tmp_path / "a.txt", "old")
+    with pytest.raises(ZeroDivisionError), files.atomic_path(target) as path:
+        path.write_text("half")
+        1 / 0  # noqa: B018
+    with pytest.raises(RuntimeError, match="nothing was written"):
+        with files.atomic_path(target):
+            pass
+    assert target.read_text() == "old"
+    assert names(tmp_path) == ["a.txt"]
+
+
+def test_wrong_paths_are_refused_before_the_work(tmp_path):
+    with pytest.raises(ValueError, match="end in .npz, got 'a.txt'"):
+        with files.atomic_path(tmp_path / "a.txt", ".npz"):
+            raise AssertionError
+    with pytest.raises(FileNotFoundError, match="no directory"):
+        with files.atomic_path(tmp_path / "missing" / "a.txt"):
+            raise AssertionError
+
+
+def test_the_block_may_put_a_file_of_its_own_there(tmp_path):
+    with files.atomic_path(tmp_path / "a.txt") as path:
+        path.unlink()
+        path.write_text("other")
+    assert (tmp_path / "a.txt").read_text() == "other"
+    assert names(tmp_path) == ["a.txt"]
+
+
+KILLED = """
+import os, signal, sys
+from cathsim_dmc import files
+with files.atomic_path(sys.argv[1]) as path:
+    path.write_text("half")
+    print("writing", flush=True)
+    sys.stdin.read()
+"""
+
+
+def writer(target):
+    process = subprocess.Popen(
+        [sys.executable, "-c", KILLED, str(target)],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
+    )
+    assert process.stdout.readline() == "writing\n"
+    return process
+
+
+def test_what_the_dead_left_goes_and_what_the_living_write_stays(tmp_path):
+    target = files.write_text(tmp_path / "a.txt", "old")
+    dead, alive = writer(target), writer(target)
+    dead.send_signal(signal.SIGKILL)
+    dead.communicate()
+    assert len(names(tmp_path)) == 3
+    # A file of another target, and one that only looks alike, are none of its business.
+    (tmp_path / ".b.txt.0123456789ab.partial").write_text("another")
+    (tmp_path / ".a.txt.mine.partial").write_text("mine")
+    files.write_text(target, "new")
+    left = [name for name in names(tmp_path) if name.endswith(".partial")]
+    assert len(left) == 3
+    assert target.read_text() == "new"
+    # The living one still succeeds.
+    alive.communicate("")
+    assert alive.returncode == 0
+    assert target.read_text() == "half"
+    assert names(tmp_path) == [
+        ".a.txt.mine.partial",
+        ".b.txt.0123456789ab.partial",
+        "a.txt",
+    ]
+
+
+def test_many_writers_of_one_file_all_succeed(tmp_path):
+    target = tmp_path / "a.bin"
+    contents = [bytes([index]) * 100_000 for index in range(8)]
+    seen, failed, stop = set(), [], threading.Event()
+
+    def write(data):
+        try:
+            for _ in range(30):
+                files.write_bytes(target, data)
+        except Exception as error:
+            failed.append(error)
+
+    def read():
+        while not stop.is_set():
+            if target.exists():
+                seen.add(target.read_bytes())
+
+    threads = [threading.Thread(target=write, args=(data,)) for data in contents]
+    reader = threading.Thread(target=read)
+    reader.start()
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    stop.set()
+    reader.join()
+    assert not failed
+    assert seen <= set(contents) and len(seen) > 1
+    assert names(tmp_path) == ["a.bin"]

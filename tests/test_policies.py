@@ -1,0 +1,149 @@
+"""One face for every policy: by name, trained or a function, batched or composer."""
+
+import numpy as np
+import pytest
+import synthetic_env
+import torch
+from tensordict import TensorDict
+
+from cathsim_dmc import policies, suite
+from cathsim_dmc.agents import evaluate, load_policy, report
+from cathsim_dmc.agents.training import train
+from cathsim_dmc.policies import POLICIES, ComposerView, Policy
+from cathsim_dmc.recording import Episode
+
+TASK = "type1_bca"
+SHORT = {"max_steps": 12}
+
+
+@pytest.mark.parametrize("name", POLICIES)
+def test_a_named_policy_plays_the_same_on_both_backends(name):
+    batched, composer = (
+        evaluate(name, TASK, 2, 7, task_kwargs=SHORT, backend=backend, num_threads=1)
+        for backend in ("batched", "composer")
+    )
+    assert batched.policy == name
+    assert batched.episodes == composer.episodes
+    assert batched.episodes[0].reward != batched.episodes[1].reward
+
+
+def test_a_random_recording_has_the_actions_of_its_seed(tmp_path):
+    out = tmp_path / "episode.rrd"
+    report.record("random", out, task=TASK, seed=71, task_kwargs=SHORT)
+    episode = Episode.load(out.with_suffix(".npz"))
+    expected = np.random.default_rng(71).uniform(-1, 1, (12, 21))
+    np.testing.assert_array_equal(episode.action, expected)
+
+
+class Backwards(Policy):
+    """Pulls, and counts how often it was told of a new episode."""
+
+    name = "backwards"
+    observation = "tracking"
+
+    def __init__(self, seed=0):
+        self.begun = []
+
+    def reset(self, view, which):
+        self.begun.append(which.copy())
+        self.shape = view.num_simulations, view.num_actions
+        self.motors = len(view.task.scene.catheter.tip_motors)
+        assert view.readings.head.shape == (self.shape[0], 3)
+        assert view.wall_force.sum.shape == self.shape[:1]
+
+    def act(self, observation):
+        action = np.zeros(self.shape)
+        action[:, self.motors] = -1.0
+        return action
+
+
+@pytest.mark.parametrize("backend", ["batched", "composer"])
+def test_a_policy_of_ones_own_needs_one_class_and_one_line(monkeypatch, backend):
+    monkeypatch.setitem(POLICIES, "backwards", Backwards)
+    named = evaluate("backwards", TASK, 2, 5, task_kwargs=SHORT, backend=backend)
+    mine = Backwards()
+    given = evaluate(mine, TASK, 2, 5, task_kwargs=SHORT, backend=backend)
+    assert named.to_dict() == given.to_dict()
+    assert named.settings["observation"] == "tracking"
+    assert [which.tolist() for which in mine.begun] == [[True, True]]
+
+
+def test_a_policy_is_told_which_simulations_begin_anew():
+    """The shorter episodes go on with further ones until the longest has ended."""
+    begun = []
+
+    class Steer(Policy):
+        name = "steer"
+
+        def reset(self, view, which):
+            begun.append(which.copy())
+
+        def act(self, observation):
+            point = observation["observation_vector"][:, -6:-3]
+            action = torch.zeros(len(point), synthetic_env.ACTIONS)
+            action[:, :3] = (-10 * point).clamp(-1, 1)
+            return action.numpy()
+
+    result = evaluate(Steer(), "reach", 5, 50, make_env=synthetic_env.make_env)
+    lengths = np.array([episode.length for episode in result.episodes])
+    assert begun[0].all() and len(begun) > 1
+    assert begun[1].tolist() == (lengths == lengths.min()).tolist()
+
+
+def test_random_actions_of_a_simulation_do_not_depend_on_the_others():
+    view = ComposerView([suite.load("cathsim", TASK, {"random": 0})])
+    alone = policies.make_policy("random", seed=8)
+    together = policies.make_policy("random", seed=6)
+
+    class Three:
+        num_simulations, num_actions = 3, view.num_actions
+
+    alone.reset(view, np.ones(1, bool))
+    together.reset(Three(), np.ones(3, bool))
+    first = together.act(None)
+    np.testing.assert_array_equal(first[2], alone.act(None)[0])
+    # A further episode goes on, it does not repeat.
+    alone.reset(view, np.ones(1, bool))
+    assert not np.array_equal(alone.act(None)[0], first[2])
+
+
+def test_functions_and_trained_policies_act_on_a_composer_timestep(tmp_path):
+    from cathsim_dmc.agents import make_config
+
+    config = make_config(
+        "ppo", task=TASK, task_kwargs=SHORT, num_envs=4, num_threads=1,
+        steps_per_update=64, epochs=1, total_frames=64, normalisation_frames=16,
+    )  # fmt: skip
+    train(config, tmp_path, progress=False)
+    trained = load_policy(tmp_path)
+    assert trained.task == TASK and trained.task_kwargs == SHORT
+    result = evaluate(trained, episodes=2, seed=3, num_threads=1)
+    assert result.settings["frames"] == 64
+    out = tmp_path / "episode.rrd"
+    episode = report.record(tmp_path, out, seed=4, fluoroscopy=False)
+    environment = suite.load("cathsim", TASK, {"random": 4, **SHORT})
+    first = environment.reset().observation
+    vector = np.concatenate([np.ravel(first[name]) for name in sorted(first)])
+    observation = TensorDict(
+        {"observation_vector": torch.as_tensor(vector).float()[None]}, [1]
+    )
+    np.testing.assert_array_equal(episode.action[:1], trained.act(observation))
+
+    def still(observation):
+        assert observation["observation_vector"].ndim == 2
+        return torch.zeros(*observation.batch_size, 21)
+
+    assert load_policy(still).name == "still"
+    episode = report.record(still, out, task=TASK, task_kwargs=SHORT, fluoroscopy=False)
+    assert not episode.action.any()
+
+
+def test_what_is_no_policy_is_refused(tmp_path):
+    with pytest.raises(ValueError, match="random, push, expert"):
+        policies.make_policy("expret")
+    with pytest.raises(RuntimeError, match="no checkpoint in"):
+        load_policy(tmp_path / "expret")
+    with pytest.raises(ValueError, match="'push' was not trained.*type1_bca"):
+        evaluate("push")
+    with pytest.raises(AttributeError, match="'task'.*only environments of"):
+        evaluate("push", "reach", 1, make_env=synthetic_env.make_env)
