@@ -79,11 +79,11 @@ def test_generated_phantom_can_be_navigated(cathsim, tmp_path):
 
 def test_generated_phantom_of_a_seed(cathsim, tmp_path):
     code, _, err = cathsim(
-        "phantom", "generate", "type1", "--seed", 4, "--out", tmp_path / "random"
+        "phantom", "generate", "I", "--seed", 4, "--out", tmp_path / "random"
     )
     assert code == 0, err
     anatomy = Anatomy.load(tmp_path / "random")
-    usual = arch.load("type1")
+    usual = arch.load("simple1")
     assert set(anatomy.goals) >= {"bca", "lcca"}
     drawn = anatomy.tree.vessel("bca").centreline.length
     assert drawn != usual.tree.vessel("bca").centreline.length

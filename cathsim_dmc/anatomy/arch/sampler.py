@@ -62,9 +62,9 @@ ASCENDING_BEND = (30.0, 12.0)  # degrees
 _PLANE_TILT = (0.0, 6.0)  # degrees
 _SWAY = (4e-3, 3e-3)  # m
 _BOW = (0.0, 3e-3)  # m
-_LEAN = (5.0, 15.0)  # degrees
-_ROLL = (0.0, 8.0)  # degrees
-_BRANCH_BEND = (28e-3, 80e-3)  # m
+_LEAN = (5.0, 12.0)  # degrees
+_TIGHTEST_BRANCH_BEND = 4.0  # lumen radii
+_WIDEST_BRANCH_BEND = 65e-3  # m
 _DESCENDING_BEND = (0.0, 5.0)  # degrees
 _ARCH_RADIUS = (34e-3, 3.4e-3)  # m
 _ARCH_ASPECT = (0.9, 1.15)
@@ -197,7 +197,6 @@ def _draw(draw: _Draw, drop: float, variant: str) -> ArchParameters:
             _branch(draw, "lsa"),
             take_off=math.radians(draw.uniform(-10.0, 20.0)),
             lean=math.radians(draw.uniform(35.0, 60.0)),
-            roll=math.radians(draw.uniform(35.0, 55.0)),
         )
     radii = {name: branch.radius for name, branch in branches.items()}
     spacings = {
@@ -215,7 +214,6 @@ def _draw(draw: _Draw, drop: float, variant: str) -> ArchParameters:
             "bca_lcca_spacing": along,
             "lcca_lsa_spacing": sum(spacings.values()),
         }
-        branches["lcca"] = replace(branches["lcca"], roll=0.0)
     arch_radius = draw.normal(*_ARCH_RADIUS)
     return ArchParameters(
         **branches,
@@ -260,16 +258,16 @@ def _branch(draw: _Draw, name: str) -> BranchParameters:
     # Downstream at first for those that lean upstream, and back for the LSA.
     towards = math.pi if name == "lsa" else 0.0
     turn = draw.uniform(-math.pi / 2, math.pi / 2)
+    bends = (_TIGHTEST_BRANCH_BEND * radius, _WIDEST_BRANCH_BEND)
     return BranchParameters(
         radius=radius,
         end_radius=end,
         take_off=math.radians(draw.normal(*TAKE_OFFS[name])),
         length=draw.uniform(45e-3, 55e-3),
-        bend_radius=draw.uniform(*_BRANCH_BEND),
+        bend_radius=draw.uniform(*bends),
         bend_azimuth=towards + turn,
         lean=math.radians(draw.normal(*_LEAN)),
-        roll=math.radians(draw.normal(*_ROLL)),
-        second_bend_radius=draw.uniform(*_BRANCH_BEND),
+        second_bend_radius=draw.uniform(*bends),
         # Most turn back, as arteries that go up the neck do.
         second_bend_azimuth=_wrapped(towards + turn + math.pi + draw.normal(0.0, 0.8)),
     )
