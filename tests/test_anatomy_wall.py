@@ -41,19 +41,6 @@ def test_femoral_access_is_closed_but_for_its_inlet():
     check(arch.load("simple1", access="descending"))
 
 
-@pytest.mark.parametrize("seed", range(2, 4))
-def test_random_arches_keep_the_lumen_free_and_closed(seed):
-    params = arch.sample(np.random.RandomState(seed), bovine=seed == 3)
-    check(arch.build_arch(params), 10_000)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("seed", range(10, 50))
-def test_many_random_arches_keep_the_lumen_free_and_closed(seed):
-    params = arch.sample(np.random.RandomState(seed), bovine=seed % 5 == 0)
-    check(arch.build_arch(params), 50_000)
-
-
 def test_pieces_are_convex_with_few_vertices():
     for piece in arch.load("simple2").wall:
         hull = ConvexHull(piece * 1e3)

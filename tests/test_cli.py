@@ -86,7 +86,7 @@ def test_generated_phantom_can_be_navigated(cathsim, tmp_path):
 
 def test_generated_phantom_of_a_seed(cathsim, tmp_path):
     code, _, err = cathsim(
-        "phantom", "generate", "type1", "--seed", 4, "--out", tmp_path / "random"
+        "phantom", "generate", "I", "--seed", 4, "--out", tmp_path / "random"
     )
     assert code == 0, err
     anatomy = Anatomy.load(tmp_path / "random")

@@ -85,32 +85,63 @@ def generate(
     /,
     out: Path,
     seed: int | None = None,
+    variant: str = "normal",
+    index: int | None = None,
+    access: str = "ascending",
 ) -> int:
-    """Generate an arch.
+    """Generate an anatomy: a named phantom, or a random arch.
 
     Args:
-        kind: A named arch such as type1, type2, type3, bovine; with a seed, one drawn
-            from the anatomical distributions of that type.
+        kind: A named phantom such as type1, simple1, bovine; I, II or III for a random
+            arch of that type; train, test or test_variants for an arch of that set.
         out: Directory of the anatomy.
-        seed: Draw the arch at random.
+        seed: Seed of a random arch of a type.
+        variant: How the branches of a random arch of a type leave it: normal,
+            bovine_trunk, bovine_branch or aberrant.
+        index: Place of an arch in its set.
+        access: End of the aorta that the device enters, ascending or descending.
     """
-    import numpy as np
-
+    from cathsim_dmc.anatomy import phantoms as shipped
     from cathsim_dmc.anatomy.arch import arch
 
-    if kind not in arch.ARCHES:
-        raise ValueError(f"no arch {kind!r}; there are {', '.join(arch.ARCHES)}")
-    if seed is None:
-        anatomy = arch.load(kind)
-    else:
-        drawn = {"type1": "I", "type2": "II", "type3": "III"}.get(kind)
-        parameters = arch.sample(
-            np.random.RandomState(seed), drawn, bovine=kind == "bovine"
+    given = {"seed": seed is not None, "index": index is not None}
+    if kind in arch.DROP_RANGES:
+        _check_given(kind, given, "seed")
+        anatomy = arch.build_seed(
+            arch.ArchSeed(int(seed or 0), kind, variant), access=access
         )
-        anatomy = arch.build_arch(parameters, name=f"{kind}-{seed}")
+    elif kind in arch.SETS:
+        _check_given(kind, given, "index")
+        arches = arch.arch_set(kind)
+        if not 0 <= index < len(arches):
+            raise ValueError(
+                f"index is {index}; {kind!r} has arches 0 to {len(arches) - 1}"
+            )
+        anatomy = arch.build_seed(arches[index], access=access)
+    elif kind in shipped.PHANTOMS:
+        _check_given(kind, given, None)
+        anatomy = shipped.load(kind, access=access)
+    else:
+        raise ValueError(
+            f"no phantom, type or set {kind!r}; there are "
+            f"{', '.join((*shipped.PHANTOMS, *arch.DROP_RANGES, *arch.SETS))}"
+        )
     anatomy.save(out)
-    print(f"{len(anatomy.wall)} wall pieces, goals {', '.join(anatomy.goals)}: {out}")
+    print(
+        f"{anatomy.name}: {len(anatomy.wall)} wall pieces, goals "
+        f"{', '.join(anatomy.goals)}: {out}"
+    )
     return 0
+
+
+def _check_given(kind: str, given: dict[str, bool], needed: str | None) -> None:
+    """Check that of seed and index the one that `kind` needs is given, and no other."""
+    for option, is_given in given.items():
+        if is_given and option != needed:
+            use = f"give --{needed} with it" if needed else "it is no random arch"
+            raise ValueError(f"--{option} does not go with {kind!r}; {use}")
+    if needed and not given[needed]:
+        raise ValueError(f"{kind!r} needs --{needed}")
 
 
 @phantoms.command

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from cathsim_dmc.anatomy.anatomy import _write
+from cathsim_dmc import files
 from cathsim_dmc.anatomy.builder import default_goals
 from cathsim_dmc.anatomy.centreline import Centreline
 from cathsim_dmc.anatomy.phantoms import _DATA, MEASURED
@@ -118,7 +118,7 @@ def main():
             if path.read_bytes() != new:
                 stale.append(str(path))
         else:
-            _write(path, new)
+            files.write_bytes(path, new)
     if stale:
         sys.exit(f"{', '.join(stale)}: run docs/scripts/measured_phantoms.py")
 

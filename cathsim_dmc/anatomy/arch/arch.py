@@ -22,9 +22,30 @@ from cathsim_dmc.anatomy.arch.parameters import (
     ArchParameters,
     BranchParameters,
 )
+from cathsim_dmc.anatomy.arch.sampler import (
+    DROP_RANGES,
+    SETS,
+    VARIANTS,
+    ArchSeed,
+    arch_set,
+    sample,
+)
 from cathsim_dmc.anatomy.arch.tree import arch_tree
 from cathsim_dmc.anatomy.builder import Place, access_inlet
 from cathsim_dmc.anatomy.centreline import VesselTree
+
+__all__ = [
+    "ARCHES",
+    "DROP_RANGES",
+    "SETS",
+    "VARIANTS",
+    "ArchSeed",
+    "arch_set",
+    "build_arch",
+    "build_seed",
+    "load",
+    "sample",
+]
 
 
 def _goals(params: ArchParameters, tree: VesselTree) -> dict[str, Place]:
@@ -49,7 +70,7 @@ def build_arch(
 ) -> Anatomy:
     """Anatomy of an arch: tree, wall, surface, inlet and goals.
 
-    Takes a fifth of a second. The last results are kept in memory, so equal
+    Takes less than half a second. The last results are kept in memory, so equal
     parameters give the same object.
 
     Args:
@@ -65,6 +86,16 @@ def build_arch(
     return Anatomy.from_tree(
         tree, name, inlet=access_inlet(tree, access), goals=_goals(params, tree)
     )
+
+
+def build_seed(seed: ArchSeed, *, access: str = "ascending") -> Anatomy:
+    """Anatomy of one arch of a set, see `sampler.arch_set`; the same at every call.
+
+    Args:
+        seed: of the set.
+        access: as of `build_arch`.
+    """
+    return build_arch(seed.parameters(), seed.name, access=access)
 
 
 def _degrees(value: float) -> float:

@@ -35,9 +35,7 @@ class BranchParameters:
             pi upstream, pi/2 out of the plane to the patient's right and back.
         goal_depth: distance of the goal beyond the ostium, along the branch.
         lean: angle of the first part out of the plane of the arch, positive to the
-            patient's right and back.
-        roll: place of the ostium around the aorta, from its outer curve to the
-            patient's right and back.
+            patient's right and back; the ostium lies as far round the aorta.
         second_bend_radius: radius of curvature of the distal half, after the first
             bend; None to go on with the first bend.
         second_bend_azimuth: direction of that bend, as `bend_azimuth`.
@@ -51,7 +49,6 @@ class BranchParameters:
     bend_azimuth: float = 0.0
     goal_depth: float = 27e-3
     lean: float = 0.0
-    roll: float = 0.0
     second_bend_radius: float | None = None
     second_bend_azimuth: float = 0.0
 
@@ -61,10 +58,9 @@ class BranchParameters:
         _check("branch take_off", self.take_off, -1.3, 1.3, "rad")
         _check("branch length", self.length, 40e-3, 150e-3, "m")
         _check("branch lean", self.lean, -1.3, 1.3, "rad")
-        _check("branch roll", self.roll, -1.3, 1.3, "rad")
         second = self.second_bend_radius
         for bend in (self.bend_radius, self.bend_radius if second is None else second):
-            _check("branch bend_radius", bend, 25e-3, 10.0, "m")
+            _check("branch bend_radius", bend, 3.0 * self.radius, 10.0, "m")
         for azimuth in (self.bend_azimuth, self.second_bend_azimuth):
             _check("branch bend_azimuth", azimuth, -2 * math.pi, 2 * math.pi, "")
         _check("branch goal_depth", self.goal_depth, 5e-3, self.length - 5e-3, "m")
@@ -139,7 +135,7 @@ class ArchParameters:
             name = f"{level}_radius"
             _check(name, getattr(self, name), 7e-3, 25e-3, "m")
         _check("descending_radius", self.descending_radius, 6e-3, 22e-3, "m")
-        _check("ascending_length", self.ascending_length, 20e-3, 300e-3, "m")
+        _check("ascending_length", self.ascending_length, 5e-3, 300e-3, "m")
         _check("descending_length", self.descending_length, 40e-3, 400e-3, "m")
         _check("arch_radius", self.arch_radius, 20e-3, 70e-3, "m")
         _check("arch_height", self.arch_height, 15e-3, 90e-3, "m")

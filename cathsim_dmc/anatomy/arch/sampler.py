@@ -58,28 +58,32 @@ _WALL = 2e-3
 # 47 to 107 degrees up to the BCA, which the limb shares with the arch, stand out of
 # their plane by 4 mm (standard deviation), and tilt little; their branches leave the
 # plane by 5 to 25 degrees and are longer than their chords by 2 to 20 %.
-ASCENDING_BEND = (22.0, 12.0)  # degrees
+ASCENDING_BEND = (30.0, 12.0)  # degrees
 _PLANE_TILT = (0.0, 6.0)  # degrees
 _SWAY = (4e-3, 3e-3)  # m
 _BOW = (0.0, 3e-3)  # m
 _LEAN = (5.0, 12.0)  # degrees
-_ROLL = (0.0, 8.0)  # degrees
-_BRANCH_BEND = (35e-3, 110e-3)  # m
+_TIGHTEST_BRANCH_BEND = 4.0  # lumen radii
+_WIDEST_BRANCH_BEND = 65e-3  # m
 _DESCENDING_BEND = (0.0, 5.0)  # degrees
 _ARCH_RADIUS = (34e-3, 3.4e-3)  # m
 _ARCH_ASPECT = (0.9, 1.15)
 _DESCENDING_LENGTH = (105e-3, 125e-3)  # m, below the arch
 # Levels of one aorta are wide or narrow together; the share is an assumption.
 _AORTA_CORRELATION = 0.8
-# Draws stop at this many standard deviations.
-_CUT = 2.0
+# Draws stop at this many standard deviations of the untruncated distribution, which
+# is widened so that what is left has the deviation of the table.
+_CUT = 2.2
+_CUT_DEVIATION = 0.9162
 _ATTEMPTS = 1000
 # Corrections of drop and ascending length towards what was drawn, at most, and how
 # near (m; LCCA diameters) they must come.
 _CORRECTIONS = 5
 _LENGTH_TOLERANCE = 2e-3
 _DROP_TOLERANCE = 0.05
-_SHORTEST_LIMB = 20e-3  # m
+_SHORTEST_LIMB = 6e-3  # m
+# The limb bends no more than with this multiple of the widest lumen radius.
+_LIMB_BEND = 1.4
 
 Random = np.random.RandomState | np.random.Generator
 
@@ -137,7 +141,7 @@ class _Draw:
         while True:
             z = float(self.source.normal())
             if abs(z) <= _CUT:
-                return z
+                return z / _CUT_DEVIATION
 
     def uniform(self, low: float, high: float) -> float:
         return float(self.source.uniform(low, high))
@@ -150,6 +154,7 @@ def _corrected(
 
     None if its limb would be too short, or its type is another one after all.
     """
+    bend = params.ascending_bend
     for _ in range(_CORRECTIONS):
         tree = arch_tree(params)
         found = measures.measure(tree)
@@ -158,10 +163,13 @@ def _corrected(
         low = drop - found.drop
         if abs(short) < _LENGTH_TOLERANCE and abs(low) < _DROP_TOLERANCE:
             break
+        limb = max(params.ascending_length + short, _SHORTEST_LIMB)
+        widest = float(tree.root.centreline.radii.max())
         params = replace(
             params,
             bca_drop=max(params.bca_drop + low, 0.0),
-            ascending_length=max(params.ascending_length + short, _SHORTEST_LIMB),
+            ascending_length=limb,
+            ascending_bend=min(bend, limb / (_LIMB_BEND * widest)),
         )
     else:
         return None
@@ -189,7 +197,6 @@ def _draw(draw: _Draw, drop: float, variant: str) -> ArchParameters:
             _branch(draw, "lsa"),
             take_off=math.radians(draw.uniform(-10.0, 20.0)),
             lean=math.radians(draw.uniform(35.0, 60.0)),
-            roll=math.radians(draw.uniform(35.0, 55.0)),
         )
     radii = {name: branch.radius for name, branch in branches.items()}
     spacings = {
@@ -207,7 +214,6 @@ def _draw(draw: _Draw, drop: float, variant: str) -> ArchParameters:
             "bca_lcca_spacing": along,
             "lcca_lsa_spacing": sum(spacings.values()),
         }
-        branches["lcca"] = replace(branches["lcca"], roll=0.0)
     arch_radius = draw.normal(*_ARCH_RADIUS)
     return ArchParameters(
         **branches,
@@ -252,16 +258,16 @@ def _branch(draw: _Draw, name: str) -> BranchParameters:
     # Downstream at first for those that lean upstream, and back for the LSA.
     towards = math.pi if name == "lsa" else 0.0
     turn = draw.uniform(-math.pi / 2, math.pi / 2)
+    bends = (_TIGHTEST_BRANCH_BEND * radius, _WIDEST_BRANCH_BEND)
     return BranchParameters(
         radius=radius,
         end_radius=end,
         take_off=math.radians(draw.normal(*TAKE_OFFS[name])),
         length=draw.uniform(45e-3, 55e-3),
-        bend_radius=draw.uniform(*_BRANCH_BEND),
+        bend_radius=draw.uniform(*bends),
         bend_azimuth=towards + turn,
         lean=math.radians(draw.normal(*_LEAN)),
-        roll=math.radians(draw.normal(*_ROLL)),
-        second_bend_radius=draw.uniform(*_BRANCH_BEND),
+        second_bend_radius=draw.uniform(*bends),
         # Most turn back, as arteries that go up the neck do.
         second_bend_azimuth=_wrapped(towards + turn + math.pi + draw.normal(0.0, 0.8)),
     )

@@ -181,7 +181,7 @@ def arch_tree(params: ArchParameters) -> VesselTree:
             ostium = trunk.position + trunk.radius * across
             fillet = min(fillet, 0.9 * trunk.radius - branch.radius, 1e-3)
         else:
-            ostium = _ostium(points, outer, levels[level], aorta, plane, branch.roll)
+            ostium = _ostium(points, outer, levels[level], aorta, plane, branch.lean)
         vessels[name] = branch_vessel(
             name, branch, parent, ostium, direction, plane, max(fillet, 0.0)
         )
@@ -196,9 +196,9 @@ def _ostium(
     level: float,
     aorta: Vessel,
     plane: Plane,
-    roll: float,
+    lean: float,
 ) -> Array:
-    """Point (3,) on the aorta's surface, `roll` away from its outer curve."""
+    """Point (3,) on the aorta's surface, `lean` round it from its outer curve."""
     flat = np.concatenate(
         [[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))]
     )
@@ -214,7 +214,7 @@ def _ostium(
     outward /= np.linalg.norm(outward)
     aside = np.cross(outward, place.tangent)
     aside *= np.sign(aside @ plane.normal) or 1.0
-    around = math.cos(roll) * outward + math.sin(roll) * aside
+    around = math.cos(lean) * outward + math.sin(lean) * aside
     return place.position + float(place.radius) * around
 
 

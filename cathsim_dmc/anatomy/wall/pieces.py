@@ -159,6 +159,7 @@ def _parent_cuts(tube: Tube, parent: Centreline) -> tuple[Array, Array]:
         Unit normals (sectors, 3) out of the parent, and offsets (slabs, sectors),
         -inf where a piece stays clear of the parent.
     """
+    parent = _nearby(parent, tube)
     middles = 0.5 * (tube.inner + np.roll(tube.inner, -1, axis=1))
     fine = np.linspace(0.0, 1.0, 33)[:-1, None, None, None]
     # (steps, slabs, sectors, 3), put in order along the tube
@@ -193,6 +194,15 @@ def _parent_cuts(tube: Tube, parent: Centreline) -> tuple[Array, Array]:
         height = np.where(inside, height, -np.inf).reshape(len(normals), -1)
         offsets[j] = height.max(axis=1) + _MARGIN
     return normals, offsets
+
+
+def _nearby(parent: Centreline, tube: Tube) -> Centreline:
+    """The part of a parent's centreline that a branch's wall can come near to."""
+    start = parent.project(tube.centres)
+    margin = _NEAR_PARENT * (parent.radii.max() + tube.reach + THICKNESS)
+    near = start.distance < margin
+    arcs = start.arc_length[near]
+    return parent.slice(arcs.min() - margin, arcs.max() + margin)
 
 
 def _ring_inside(line: Centreline, ostium: float, parent: Centreline) -> float:
