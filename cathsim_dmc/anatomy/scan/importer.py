@@ -22,6 +22,7 @@ from cathsim_dmc.anatomy.scan.files import (
     read_mesh,
 )
 from cathsim_dmc.anatomy.scan.inlet import cut_open, shut_behind
+from cathsim_dmc.anatomy.scan.mesh_depth import MeshDepth, depth_field
 from cathsim_dmc.anatomy.scan.tree import Ways, grow_tree, plan_inlet
 from cathsim_dmc.anatomy.scan.trunk import name_trunk
 from cathsim_dmc.anatomy.scan.wall import (
@@ -31,7 +32,7 @@ from cathsim_dmc.anatomy.scan.wall import (
     inlet_cap,
 )
 from cathsim_dmc.anatomy.wall import fidelity
-from cathsim_dmc.anatomy.wall.depth import SPACING, DepthField, MeshDepth
+from cathsim_dmc.anatomy.wall.depth import SPACING, DepthField
 
 log = logging.getLogger(__name__)
 
@@ -117,7 +118,7 @@ def import_scan(
         )
     lines = {curve.name: _inside_part(curve, measure, units) for curve in curves}
     say("depth: measuring the lumen, the longest step")
-    field = DepthField.from_mesh(vertices, faces, spacing)
+    field = depth_field(vertices, faces, spacing)
     say(f"depth: {len(field.bricks)} bricks of {spacing * 1e3:g} mm")
     ways = Ways(field)
     lines = {key: _proximal_first(line, field) for key, line in lines.items()}
