@@ -189,3 +189,177 @@ def signed_depths(blocks, points, triangles, normals, boxes, leaf, first):
                     sign = -1.0 if _dot(gap, normals[row, place]) > 0.0 else 1.0
             depth[b, i], owner[b, i] = sign * math.sqrt(best), own
     return depth, owner
+
+
+@_compiled
+def _cross(a, b):
+    return (
+        a[1] * b[2] - a[2] * b[1],
+        a[2] * b[0] - a[0] * b[2],
+        a[0] * b[1] - a[1] * b[0],
+    )
+
+
+@_compiled
+def _hit(p, ray, triangle):
+    """Where the line p + t ray meets a triangle: t, or infinity if it does not.
+
+    Moeller & Trumbore, Fast Minimum Storage Ray/Triangle Intersection, 1997; edges
+    and corners do not count.
+    """
+    a, b, c = triangle[0], triangle[1], triangle[2]
+    ab, ac, ap = _difference(b, a), _difference(c, a), _difference(p, a)
+    n = _cross(ab, ac)
+    slope = _dot(n, ray)
+    size = math.sqrt(_dot(n, n) * _dot(ray, ray))
+    if abs(slope) <= 1e-9 * size or size == 0.0:
+        return math.inf
+    q = _cross(ray, ap)
+    u = _dot(ac, q) / slope
+    v = -_dot(ab, q) / slope
+    if u <= 1e-6 or v <= 1e-6 or u + v >= 1.0 - 1e-6:
+        return math.inf
+    return -_dot(n, ap) / slope
+
+
+@_compiled
+def _misses(p, inverse, reach, box):
+    """Whether the ray from ``p`` passes a box (2, 3) within ``reach`` by."""
+    near, far = 0.0, reach
+    for k in range(3):
+        if math.isinf(inverse[k]):
+            if p[k] < box[0, k] or p[k] > box[1, k]:
+                return True
+            continue
+        t1, t2 = (box[0, k] - p[k]) * inverse[k], (box[1, k] - p[k]) * inverse[k]
+        near, far = max(near, min(t1, t2)), min(far, max(t1, t2))
+    return not near <= far
+
+
+@_compiled
+def blocked_share(points, rays, normals, triangles, boxes, leaf, first):
+    """Share (n,) of the rays into the half space of a normal that meet a triangle.
+
+    Args:
+        points: (n, 3) m, off the surface.
+        rays: (m, 3), unit.
+        normals: (n, 3); zeros take all rays.
+        triangles: (F, 3, 3) m, in the order of the tree.
+        boxes: (2^k - 1, 2, 3) m, of the tree's nodes.
+        leaf: triangles per leaf.
+        first: number of the first leaf among the nodes.
+    """
+    share = np.zeros(len(points))
+    stack = np.empty(_STACK, np.int64)
+    for i in range(len(points)):
+        shot, met = 0, 0
+        for ray in rays:
+            if _dot(ray, normals[i]) < 0.0:
+                continue
+            shot += 1
+            inverse = (1.0 / ray[0], 1.0 / ray[1], 1.0 / ray[2])
+            stack[0], size = 0, 1
+            while size:
+                size -= 1
+                node = stack[size]
+                if _misses(points[i], inverse, math.inf, boxes[node]):
+                    continue
+                if node < first:
+                    stack[size], stack[size + 1] = 2 * node + 1, 2 * node + 2
+                    size += 2
+                    continue
+                start = (node - first) * leaf
+                for row in range(start, min(start + leaf, len(triangles))):
+                    t = _hit(points[i], ray, triangles[row])
+                    if 0.0 < t < math.inf:
+                        met, size = met + 1, 0
+                        break
+        share[i] = met / max(shot, 1)
+    return share
+
+
+@_compiled
+def crossing_faces(edges, points, faces, triangles, boxes, leaf, first):
+    """Rows of edges and faces (n, 2) that cross without a common vertex.
+
+    Args:
+        edges: (E, 2) vertices.
+        points: (V, 3) m.
+        faces: (F, 3) vertices, in the order of the tree.
+        triangles: (F, 3, 3) m, in the order of the tree.
+        boxes: (2^k - 1, 2, 3) m, of the tree's nodes.
+        leaf: triangles per leaf.
+        first: number of the first leaf among the nodes.
+    """
+    found = [(0, 0) for _ in range(0)]
+    stack = np.empty(_STACK, np.int64)
+    for number in range(len(edges)):
+        a, b = edges[number]
+        ray = _difference(points[b], points[a])
+        inverse = (1.0 / ray[0], 1.0 / ray[1], 1.0 / ray[2])
+        stack[0], size = 0, 1
+        while size:
+            size -= 1
+            node = stack[size]
+            if _misses(points[a], inverse, 1.0, boxes[node]):
+                continue
+            if node < first:
+                stack[size], stack[size + 1] = 2 * node + 1, 2 * node + 2
+                size += 2
+                continue
+            start = (node - first) * leaf
+            for row in range(start, min(start + leaf, len(triangles))):
+                shared = False
+                for k in range(3):
+                    shared = shared or faces[row, k] == a or faces[row, k] == b
+                if shared:
+                    continue
+                t = _hit(points[a], ray, triangles[row])
+                if 1e-6 < t < 1.0 - 1e-6:
+                    found.append((number, row))
+    return found
+
+
+@_compiled
+def _mixed(values, i, j, k, x, y, z):
+    """Trilinear interpolation in a cell (i, j, k) of a lattice."""
+    total = 0.0
+    for a in range(2):
+        wx = x if a else 1.0 - x
+        for b in range(2):
+            wxy = wx * (y if b else 1.0 - y)
+            total += wxy * (
+                (1.0 - z) * values[i + a, j + b, k] + z * values[i + a, j + b, k + 1]
+            )
+    return total
+
+
+@_compiled
+def lattice_depths(points, origin, spacing, cells, quantum, coarse, index, bricks):
+    """Depths (n,) m at points (n, 3) m; see ``DepthField.__call__``."""
+    out = np.empty(len(points))
+    wide = spacing * cells
+    corner, rest = np.empty(3, np.int64), np.empty(3)
+    for n in range(len(points)):
+        beyond = 0.0
+        for k in range(3):
+            cell = (points[n, k] - origin[k]) / wide
+            inside = min(max(cell, 0.0), index.shape[k] - 1e-9)
+            beyond += (cell - inside) ** 2
+            corner[k] = int(inside)
+            rest[k] = inside - corner[k]
+        row = index[corner[0], corner[1], corner[2]]
+        if row < 0:
+            depth = _mixed(
+                coarse, corner[0], corner[1], corner[2], rest[0], rest[1], rest[2]
+            )
+        else:
+            for k in range(3):
+                scaled = rest[k] * cells
+                corner[k] = min(int(scaled), cells - 1)
+                rest[k] = scaled - corner[k]
+            depth = quantum * _mixed(
+                bricks[row], corner[0], corner[1], corner[2], rest[0], rest[1], rest[2]
+            )
+        out[n] = depth - math.sqrt(beyond) * wide
+    return out

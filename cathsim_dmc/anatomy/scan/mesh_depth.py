@@ -26,7 +26,8 @@ class MeshDepth:
 
     def __init__(self, vertices: np.ndarray, faces: np.ndarray):
         """Prepare for ``vertices`` (V, 3) m and ``faces`` (F, 3), normals outward."""
-        faces = np.asarray(faces)
+        self._points = np.ascontiguousarray(vertices, dtype=np.float64)
+        self._faces = faces = np.asarray(faces, dtype=np.int64)
         triangles = np.asarray(vertices, dtype=np.float64)[faces]
         normals = _feature_normals(triangles, faces, len(vertices))
         self._order = _along_a_curve(triangles.mean(axis=1))
@@ -63,6 +64,47 @@ class MeshDepth:
             self._first,
         )
         return depth, self._order[owner]
+
+    def blocked_share(
+        self, points: np.ndarray, rays: np.ndarray, normals: np.ndarray
+    ) -> np.ndarray:
+        """Share (n,) of rays (m, 3) on the side of ``normals`` (n, 3) that hit.
+
+        The rays start at ``points`` (n, 3) m; a normal of zero takes all of them.
+        """
+        from cathsim_dmc.anatomy.scan.closest import blocked_share
+
+        arrays = [np.ascontiguousarray(each, np.float64) for each in (points, rays)]
+        return blocked_share(
+            *arrays,
+            np.ascontiguousarray(normals, np.float64),
+            self._triangles,
+            self._boxes,
+            LEAF,
+            self._first,
+        )
+
+    def crossings(self) -> tuple[np.ndarray, np.ndarray]:
+        """Faces that an edge of another face pierces, and those edges' vertices.
+
+        Returns:
+            (faces (n,), edges (n, 2)), one pair for every crossing.
+        """
+        from cathsim_dmc.anatomy.scan.closest import crossing_faces
+
+        edges = np.sort(self._faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
+        edges = np.unique(edges, axis=0)
+        found = crossing_faces(
+            edges,
+            self._points,
+            np.ascontiguousarray(self._faces[self._order]),
+            self._triangles,
+            self._boxes,
+            LEAF,
+            self._first,
+        )
+        pairs = np.array(found, dtype=np.int64).reshape(-1, 2)
+        return self._order[pairs[:, 1]], edges[pairs[:, 0]]
 
 
 def depth_field(
