@@ -5,12 +5,13 @@ Lengths are metres, positions are in the patient frame LPS.
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import io
 import json
 import os
 import tempfile
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -18,6 +19,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from cathsim_dmc.anatomy import loading
 from cathsim_dmc.anatomy.centreline import (
     Array,
     Centreline,
@@ -31,6 +33,7 @@ from cathsim_dmc.anatomy.wall.depth import DepthField
 FORMAT = "cathsim-anatomy"
 FORMAT_VERSION = 1
 _DESCRIPTION = "anatomy.json"
+_READS = 50  # of a description that is replaced while it is read
 
 
 def _vector(value: ArrayLike, name: str) -> Array:
@@ -214,7 +217,8 @@ class Anatomy:
 
         The geometry goes into an npz named by its content, the description into
         `anatomy.json`, which is replaced last: a reader finds the old anatomy or
-        the new one, never a mixture.
+        the new one, never a mixture. Of processes that save into one directory at
+        once, one waits for the other, and the last one's anatomy stays.
         """
         directory = Path(directory)
         directory.mkdir(parents=True, exist_ok=True)
@@ -225,12 +229,16 @@ class Anatomy:
         digest = hashlib.sha256(data).hexdigest()
         description["geometry"] = f"geometry-{digest[:16]}.npz"
         description["sha256"] = digest
-        _write(directory / description["geometry"], data)
         text = json.dumps(description, indent=2) + "\n"
-        _write(directory / _DESCRIPTION, text.encode())
-        for stale in directory.glob("geometry-*.npz"):
-            if stale.name != description["geometry"]:
-                stale.unlink(missing_ok=True)
+        with _alone(directory) as alone:
+            _write(directory / description["geometry"], data)
+            _write(directory / _DESCRIPTION, text.encode())
+            # Others may be about to name what they have just written.
+            if alone:
+                stale = {*directory.glob("geometry-*.npz")}
+                stale -= {directory / description["geometry"]}
+                for path in [*stale, *directory.glob(".writing-*")]:
+                    path.unlink(missing_ok=True)
         return directory
 
     @classmethod
@@ -239,38 +247,81 @@ class Anatomy:
 
         Raises:
             FileNotFoundError: if `directory` holds no anatomy.
-            ValueError: if a file is damaged or of another format.
+            ValueError: if a file is damaged, of another format, or holds what no
+                anatomy does; names the file and the entry.
         """
         path = Path(directory) / _DESCRIPTION
-        if not path.is_file():
-            raise FileNotFoundError(
-                f"no {_DESCRIPTION} in {directory}; give a directory that "
-                "Anatomy.save wrote."
-            )
-        try:
-            description = json.loads(path.read_text())
-        except (json.JSONDecodeError, UnicodeDecodeError) as error:
-            raise ValueError(f"{path} is damaged: {error}") from error
-        if not isinstance(description, dict) or (
-            description.get("format") != FORMAT
-            or description.get("version") != FORMAT_VERSION
-        ):
-            raise ValueError(
-                f"{path} is not a {FORMAT} file of version {FORMAT_VERSION}; write it "
-                "again with Anatomy.save."
-            )
-        # Only the bare file name counts: a description may not point elsewhere.
-        geometry = path.parent / Path(str(description.get("geometry"))).name
-        if not geometry.is_file():
-            raise ValueError(f"{path} names {geometry.name}, which is missing.")
-        data = geometry.read_bytes()
+        for _ in range(_READS):
+            description, text = _read_description(path)
+            # Only the bare file name counts: a description may not point elsewhere.
+            geometry = path.parent / Path(str(description.get("geometry"))).name
+            try:
+                data = loading.read_regular(geometry, loading.LARGEST_ARRAYS)
+                break
+            except FileNotFoundError:
+                # Replaced between the two reads, unless the description still stands.
+                if _read_description(path)[1] == text:
+                    raise ValueError(
+                        f"{path} names {geometry.name}, which is missing."
+                    ) from None
+        else:
+            raise ValueError(f"{path} was replaced {_READS} times while it was read.")
         if hashlib.sha256(data).hexdigest() != description.get("sha256"):
             raise ValueError(f"{geometry} is damaged: its checksum differs.")
+        loading.check_description(description, path)
+        arrays = loading.read_arrays(data, geometry)
+        loading.check_arrays(arrays, len(description["vessels"]), geometry)
         try:
-            with np.load(io.BytesIO(data), allow_pickle=False) as archive:
-                return _unpack(description, {k: archive[k] for k in archive.files})
-        except (KeyError, TypeError) as error:
-            raise ValueError(f"{path} lacks an entry: {error}") from error
+            anatomy = _unpack(description, arrays)
+        except ValueError as error:
+            raise ValueError(f"{path}: {error}") from error
+        loading.check_places(anatomy, path)
+        return anatomy
+
+
+def _read_description(path: Path) -> tuple[dict[str, Any], bytes]:
+    """The description of an anatomy, and its text."""
+    try:
+        text = loading.read_regular(path, loading.LARGEST_TEXT)
+    except FileNotFoundError:
+        raise FileNotFoundError(
+            f"no {_DESCRIPTION} in {path.parent}; give a directory that "
+            "Anatomy.save wrote."
+        ) from None
+    try:
+        description = json.loads(text)
+    except (json.JSONDecodeError, UnicodeDecodeError, RecursionError) as error:
+        raise ValueError(f"{path} is damaged: {error}") from error
+    if not isinstance(description, dict) or (
+        description.get("format") != FORMAT
+        or description.get("version") != FORMAT_VERSION
+    ):
+        raise ValueError(
+            f"{path} is not a {FORMAT} file of version {FORMAT_VERSION}; write it "
+            "again with Anatomy.save."
+        )
+    return description, text
+
+
+@contextlib.contextmanager
+def _alone(directory: Path) -> Iterator[bool]:
+    """Holds other processes' `save` off a directory; false where that is not known."""
+    try:
+        import fcntl
+
+        handle = os.open(directory, os.O_RDONLY)
+    except (ImportError, OSError):
+        yield False
+        return
+    try:
+        try:
+            fcntl.flock(handle, fcntl.LOCK_EX)
+            locked = True
+        except OSError:
+            locked = False
+        yield locked
+    finally:
+        os.close(handle)
 
 
 def _write(path: Path, data: bytes) -> None:

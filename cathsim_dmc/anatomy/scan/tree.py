@@ -155,7 +155,7 @@ def _finish(
     # Towards a blind end the depth tells the distance to the end, not the middle.
     last = min(len(curve) // 2, int(END_TRIM / STEP))
     deep = field(curve[-last:])
-    wide = np.nonzero(deep >= 0.6 * deep.max())[0][-1]
+    wide = np.nonzero(deep >= 0.75 * deep.max())[0][-1]
     curve = curve[: len(curve) - last + wide + 1]
     points = centred(field, curve, fixed_start=anchor is not None)
     depth = field(points)
