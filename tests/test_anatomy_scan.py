@@ -12,12 +12,12 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from cathsim_dmc.anatomy.scan.files import read_curve, read_mesh, vessel_name
 from scipy.spatial import ConvexHull, cKDTree
 
 from cathsim_dmc.anatomy.anatomy import Anatomy, Inlet, Surface
 from cathsim_dmc.anatomy.centreline import Centreline, Vessel, VesselTree
 from cathsim_dmc.anatomy.scan import coacd_wall as scan_coacd
-from cathsim_dmc.anatomy.scan.files import read_curve, read_mesh, vessel_name
 from cathsim_dmc.anatomy.scan.importer import describe, import_scan
 from cathsim_dmc.anatomy.scan.inlet import cut_open, shut_behind
 from cathsim_dmc.anatomy.scan.mesh_depth import MeshDepth, depth_field

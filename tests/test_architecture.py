@@ -48,6 +48,7 @@ CONFINED = {
     "tensordict": {*_TORCHRL_FACE, "agents/"},
     "rerun": {"recording/"},
     "coacd": {"anatomy/"},
+    "fast_simplification": {"anatomy/scan/repair.py"},
     "numba": {"imaging/kernel.py", "anatomy/scan/closest.py"},
     "gymnasium": {"simulation/gymnasium.py", "gym.py"},
     "tyro": {"cli/"},

@@ -46,8 +46,8 @@ NEAR_INLET = 15e-3  # m, distance from the lumen of an inlet that is pointed at
 RADII = (0.3e-3, 30e-3)  # m, allowed median radius of a vessel: arteriole, aneurysm
 
 
-# What a step takes of the time of a whole import, for a progress bar.
-SHARES = {"mesh": 0.05, "depth": 0.45, "tree": 0.6, "wall": 0.98, "done": 1.0}
+# Share of an import that is done when a step begins, for a progress bar.
+SHARES = {"mesh": 0.0, "depth": 0.06, "tree": 0.35, "wall": 0.65, "done": 1.0}
 
 
 def import_scan(
