@@ -10,7 +10,7 @@ from cathsim_dmc.entities.arena import AngiographyArena
 from cathsim_dmc.entities.catheter import Catheter
 from cathsim_dmc.entities.phantom import Phantom
 from cathsim_dmc.entities.robot import Robot
-from cathsim_dmc.entities.sheath import Sheath
+from cathsim_dmc.entities.sheath import Sheath, straight
 from cathsim_dmc.tasks import placement
 from cathsim_dmc.tasks.config import NavigationConfig
 
@@ -64,7 +64,7 @@ class Scene:
                 friction=config.friction,
             ),
             sheath=Sheath(
-                length=place.working_length - place.start_depth,
+                straight(place.working_length - place.start_depth),
                 device_radius=device.outer_radius,
             ),
             robot=Robot(device_radius=device.outer_radius),
@@ -83,6 +83,7 @@ class Scene:
                 quat=place.quaternion,
             )
             scene.arena.attach(entity, site)
+        scene.sheath.guide(scene.catheter, place.start_depth)
         scene.phantom.add_wall_sensor(scene.catheter.links[0])
         placement.add_cameras(scene.arena, anatomy)
         return scene
