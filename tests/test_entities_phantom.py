@@ -163,7 +163,7 @@ def test_friction_stays_in_its_cone(pressed, environment):
 
 def test_every_piece_collides_with_the_device_only(model, environment):
     wall = [
-        model.geom(f"phantom/wall_{index:03d}")
+        model.geom(f"wall_{index:03d}")
         for index in range(len(environment.task.anatomy.wall))
     ]
     for geom in wall:
@@ -176,7 +176,7 @@ def test_every_piece_collides_with_the_device_only(model, environment):
 
 
 def test_device_and_wall_have_the_same_contact(model):
-    wall, link = model.geom("phantom/wall_000"), model.geom("catheter/link_3")
+    wall, link = model.geom("wall_000"), model.geom("catheter/link_3")
     np.testing.assert_array_equal(wall.solref, link.solref)
     np.testing.assert_array_equal(wall.solimp, link.solimp)
     np.testing.assert_array_equal(wall.solref, contact.CONTACT_SOLREF)
@@ -189,7 +189,7 @@ def test_pieces_lie_where_the_anatomy_puts_them(model, environment):
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
     for index in range(0, len(anatomy.wall), 50):
-        geom = model.geom(f"phantom/wall_{index:03d}")
+        geom = model.geom(f"wall_{index:03d}")
         mesh = model.mesh(int(geom.dataid[0]))
         start, count = int(mesh.vertadr[0]), int(mesh.vertnum[0])
         vertices = model.mesh_vert[start : start + count]

@@ -84,6 +84,6 @@ class Scene:
             )
             scene.arena.attach(entity, site)
         scene.sheath.guide(scene.catheter, place.start_depth)
-        scene.phantom.add_wall_sensor(scene.catheter.links[0])
+        scene.phantom.stand(scene.catheter.links[0])
         placement.add_cameras(scene.arena, anatomy)
         return scene
