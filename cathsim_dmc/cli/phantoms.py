@@ -1,6 +1,7 @@
 """`cathsim phantom import`, `build`, `generate` and `check`."""
 
 import contextlib
+import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Annotated, Literal
