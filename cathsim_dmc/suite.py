@@ -46,6 +46,7 @@ class TaskDefinition:
       description: one line for people.
       anatomy: anatomy or its name; None where the user chooses.
       goal: name of a goal; None where the user chooses.
+      access: where the device enters, see `anatomy.phantoms.load`.
       objective: function of an anatomy, a goal and options by name; they become
         options of the task. With an option `farthest_shift` it is told how far past
         its place randomisation may shift the goal, m.
@@ -55,6 +56,7 @@ class TaskDefinition:
     description: str
     anatomy: str | Anatomy | None
     goal: str | None
+    access: str = "ascending"
     objective: Callable[..., Objective] = Cannulation.to
     options: Mapping[str, Any] = dataclasses.field(default_factory=dict)
 
@@ -85,7 +87,7 @@ def register(name: str, definition: TaskDefinition, *tags: str) -> None:
 
     def factory(random=None, environment_kwargs=None, **options):
         task = make_task(name, random=random, **options)
-        return _environment(task, environment_kwargs or {})
+        return environment(task, **(environment_kwargs or {}))
 
     factory.__name__, factory.__doc__ = name, definition.description
     SUITE.add(*tags, _TAG)(factory)
@@ -101,7 +103,8 @@ def make_task(
       name: Name of a task in `SUITE`.
       random: Seed or source of randomness.
       **options: Fields of `NavigationConfig`, options of the task's objective (such
-        as `reward` and `goal_radius`) and, for `navigate`, `anatomy` and `goal`.
+        as `reward` and `goal_radius`) and, for `navigate`, `anatomy`, `goal` and
+        `access`.
 
     Raises:
       ValueError: if the task or an option does not exist; lists those that do.
@@ -112,14 +115,15 @@ def make_task(
         )
     definition = TASKS[name]
     options = {**definition.options, **options}
-    anatomy, goal = definition.anatomy, definition.goal
+    anatomy, goal, access = definition.anatomy, definition.goal, definition.access
     if anatomy is None:
         # `phantom` is what this option was called at first.
         anatomy = options.pop("phantom", "type1")
         anatomy = options.pop("anatomy", anatomy)
         goal = options.pop("goal", "bca")
+        access = options.pop("access", access)
     _refuse_unknown(definition, options)
-    anatomy = load_anatomy(anatomy)
+    anatomy = load_anatomy(anatomy, access)
     goal = placement.resolve_goal(anatomy, goal)
     config = NavigationConfig(
         **{key: value for key, value in options.items() if key in _CONFIG_FIELDS}
@@ -135,7 +139,7 @@ def make_task(
 def task_options(name: str) -> tuple[str, ...]:
     """Names of the options of a task beside `random` and `environment_kwargs`."""
     definition = TASKS[name]
-    own = () if definition.anatomy is not None else ("anatomy", "goal")
+    own = () if definition.anatomy is not None else ("anatomy", "goal", "access")
     of_objective = (o for o in definition.objective_options if o != "farthest_shift")
     return (*own, *of_objective, *_CONFIG_FIELDS)
 
@@ -188,8 +192,13 @@ def load(
     )
 
 
-def load_anatomy(anatomy: str | Path | Anatomy) -> Anatomy:
-    """Returns an anatomy: itself, an arch by name, or one saved in a directory.
+def load_anatomy(anatomy: str | Path | Anatomy, access: str = "ascending") -> Anatomy:
+    """Returns an anatomy: itself, a phantom by name, or one saved in a directory.
+
+    Args:
+      anatomy: Anatomy, name in `anatomy.phantoms.PHANTOMS`, or directory.
+      access: Where the device enters a phantom, "ascending" or "descending"; an
+        anatomy or a directory has its own inlet.
 
     Raises:
       ValueError: if there is none; lists the names.
@@ -199,7 +208,7 @@ def load_anatomy(anatomy: str | Path | Anatomy) -> Anatomy:
     from cathsim_dmc.anatomy import phantoms
 
     if str(anatomy) in phantoms.PHANTOMS:
-        return phantoms.load(str(anatomy))
+        return phantoms.load(str(anatomy), access=access)
     if not Path(anatomy).is_dir():
         raise ValueError(
             f"no anatomy at {str(anatomy)!r}; give a directory written by `cathsim "
@@ -208,7 +217,13 @@ def load_anatomy(anatomy: str | Path | Anatomy) -> Anatomy:
     return Anatomy.load(anatomy)
 
 
-def _environment(task: Navigation, environment_kwargs: Mapping[str, Any]):
+def environment(task: Navigation, **environment_kwargs: Any) -> composer.Environment:
+    """The composer environment of a task, with the settings that the suite uses.
+
+    Args:
+      task: Task that no other environment owns.
+      **environment_kwargs: Arguments of `composer.Environment` that differ.
+    """
     settings = {
         "strip_singleton_obs_buffer_dim": True,
         "recompile_mjcf_every_episode": False,
@@ -244,21 +259,49 @@ def _register_domain() -> None:
     )
 
 
-_GOALS = {
+_ARTERIES = {
     "bca": "the brachiocephalic artery",
     "lcca": "the left common carotid",
+    "lsa": "the left subclavian artery",
 }
-for _anatomy, _kind in (("type1", "Type-I"), ("type2", "Type-II")):
-    for _goal, _artery in _GOALS.items():
-        register(
-            f"{_anatomy}_{_goal}",
-            TaskDefinition(
-                f"{_kind} arch: cannulate {_artery} from the ascending aorta.",
-                _anatomy,
-                _goal,
-            ),
-            "easy" if _goal == "bca" else "hard",
-        )
+_PHANTOMS = {
+    "type1": "Type-I phantom",
+    "type2": "Type-II phantom",
+    "simple1": "Idealised Type-I arch",
+    "simple2": "Idealised Type-II arch",
+    "type3": "Type-III arch",
+    "bovine": "Bovine arch",
+}
+
+
+def _register_published() -> None:
+    """From the ascending aorta, as published, and the same in idealised arches."""
+    for anatomy in ("type1", "type2", "simple1", "simple2"):
+        for goal in ("bca", "lcca"):
+            text = f"cannulate {_ARTERIES[goal]} from the ascending aorta."
+            register(
+                f"{anatomy}_{goal}",
+                TaskDefinition(f"{_PHANTOMS[anatomy]}: {text}", anatomy, goal),
+                "easy" if goal == "bca" else "hard",
+            )
+
+
+def _register_femoral() -> None:
+    """The clinical route: from the groin, through the descending aorta."""
+    for anatomy in ("type1", "type2", "type3", "bovine"):
+        for goal, artery in _ARTERIES.items():
+            text = f"cannulate {artery} from the descending aorta."
+            register(
+                f"femoral_{anatomy}_{goal}",
+                TaskDefinition(
+                    f"{_PHANTOMS[anatomy]}: {text}", anatomy, goal, "descending"
+                ),
+                "hard",
+            )
+
+
+_register_published()
+_register_femoral()
 register(
     "navigate",
     TaskDefinition("Any anatomy, such as an imported scan: reach a goal.", None, None),

@@ -227,6 +227,13 @@ def test_there_must_be_a_run_to_resume(tmp_path):
     assert run(small_ppo(total_frames=512), tmp_path, resume=True).frames == 512
 
 
+@pytest.mark.parametrize("device", ["banana", "meta:x", "xla"])
+def test_a_device_that_is_not_there_is_refused_at_once(tmp_path, device):
+    with pytest.raises(ConfigError, match=f"torch_device='{device}' cannot be used"):
+        run(small_ppo(torch_device=device), tmp_path / "run")
+    assert not (tmp_path / "run").exists()
+
+
 def file_header(path):
     return (path / "metrics.csv").read_text().splitlines()[0].split(",")
 

@@ -13,7 +13,7 @@ RADIUS, BORE = 0.8e-3, 1.15e-3
 
 @pytest.fixture(scope="module")
 def containment():
-    anatomy = arch.load("type1")
+    anatomy = arch.load("simple1")
     assert np.allclose(anatomy.inlet.direction, [0, 0, 1])
     return Containment(anatomy, RADIUS, BORE, np.eye(3)[:2])
 

@@ -12,16 +12,17 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from cathsim_dmc.anatomy.scan.files import read_curve, read_mesh, vessel_name
 from scipy.spatial import ConvexHull, cKDTree
 
 from cathsim_dmc.anatomy.anatomy import Anatomy, Inlet, Surface
 from cathsim_dmc.anatomy.centreline import Centreline, Vessel, VesselTree
 from cathsim_dmc.anatomy.scan import coacd_wall as scan_coacd
-from cathsim_dmc.anatomy.scan.files import read_curve, read_mesh, vessel_name
 from cathsim_dmc.anatomy.scan.importer import describe, import_scan
 from cathsim_dmc.anatomy.scan.inlet import cut_open, shut_behind
+from cathsim_dmc.anatomy.scan.mesh_depth import MeshDepth, depth_field
 from cathsim_dmc.anatomy.scan.trunk import name_trunk
-from cathsim_dmc.anatomy.wall.depth import DepthField, MeshDepth
+from cathsim_dmc.anatomy.wall.depth import DepthField
 
 # Bounds of the wall (m): mean, 95th percentile and largest intrusion.
 INTRUSION = (0.10e-3, 0.30e-3, 0.60e-3)
@@ -153,7 +154,7 @@ def gap_to_wall(anatomy: Anatomy, points) -> float:
 
 def test_depth_field_agrees_with_the_exact_distance(y_scan):
     vertices, faces = read_mesh(y_scan[0])
-    field = DepthField.from_mesh(vertices, faces, 0.8e-3)
+    field = depth_field(vertices, faces, 0.8e-3)
     rng = np.random.default_rng(1)
     points = vertices[rng.integers(len(vertices), size=2000)]
     points = points + rng.normal(scale=1e-3, size=points.shape)
@@ -292,7 +293,7 @@ def test_cut_keeps_the_far_side(tube, cut_tube):
 
 def test_lumen_ends_at_the_inlet(tube, cut_tube):
     points, shell, cap = cut_tube
-    whole = DepthField.from_mesh(tube.vertices, np.asarray(tube.faces), 1e-3)
+    whole = depth_field(tube.vertices, np.asarray(tube.faces), 1e-3)
     shut = shut_behind(whole, points, np.concatenate([shell, cap]), CUT)
     s = np.linspace(-19e-3, 39e-3, 117)
     offset = np.array([[0.0, 0.0, 0.0], [2e-3, 0.0, 0.0], [0.0, -4e-3, 0.0]])
@@ -366,7 +367,7 @@ def coacd_tube(cut_tube):
     pytest.importorskip("coacd")
     points, shell, cap = cut_tube
     faces = np.concatenate([shell, cap])
-    field = DepthField.from_mesh(points, faces, 1.5e-3)
+    field = depth_field(points, faces, 1.5e-3)
     ends = np.array([[0, 0, -10.1e-3], [0, 0, 28e-3]])
     line = Centreline(ends, np.full(2, 5e-3)).resampled(1e-3)
     tree = VesselTree({"aorta": Vessel("aorta", line)})

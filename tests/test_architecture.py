@@ -52,7 +52,8 @@ CONFINED = {
     "tensordict": {*_TORCHRL_FACE, "agents/"},
     "rerun": {"recording/"},
     "coacd": {"anatomy/"},
-    "numba": {"imaging/kernel.py"},
+    "fast_simplification": {"anatomy/scan/repair.py"},
+    "numba": {"imaging/kernel.py", "anatomy/scan/closest.py"},
     "gymnasium": {"simulation/gymnasium.py", "gym.py"},
     "tyro": {"cli/"},
 }

@@ -2,15 +2,22 @@
 
 import dataclasses
 import json
+import shlex
+import signal
 import subprocess
 import sys
+import time
 
 import pytest
 from conftest import TASKS
 
+import cathsim_dmc
 from cathsim_dmc import cli, suite
+from cathsim_dmc.agents import LEARNERS, Checkpoint
+from cathsim_dmc.agents.checkpoint import checkpoints_in
 from cathsim_dmc.anatomy.anatomy import Anatomy
 from cathsim_dmc.anatomy.arch import arch
+from cathsim_dmc.cli import training
 
 
 @pytest.fixture
@@ -100,7 +107,7 @@ def test_check_prints_one_object_and_passes(cathsim):
 
 def test_a_failed_check_exits_with_one(cathsim, tmp_path):
     """An arch that has lost three pieces of its wall leaks."""
-    whole = arch.load("type1")
+    whole = arch.load("simple1")
     leaking = dataclasses.replace(whole, name="leaking", wall=whole.wall[3:])
     leaking.save(tmp_path)
     code, out, _ = cathsim("phantom", "check", tmp_path, "--json")
@@ -143,11 +150,112 @@ def test_a_reader_that_stops_early_is_no_error():
         assert process.stderr.read() == ""
 
 
+def test_version(cathsim):
+    assert cathsim("--version") == (0, f"cathsim-dmc {cathsim_dmc.__version__}\n", "")
+
+
+TINY = (
+    *("--num-envs", 4, "--threads", 1, "--steps-per-update", 64, "--epochs", 1),
+    *("--normalisation-frames", 0, "--max-steps", 8, "--quiet"),
+)
+
+
+def test_every_setting_is_a_typed_option(cathsim, tmp_path):
+    code, out, err = cathsim(
+        "train", "navigate", "--out", tmp_path, *TINY, "--frames", 64,
+        "--phantom", "type2", "--goal", "lcca", "--hidden", 8, 8, "--no-tensorboard",
+        "--target-kl", 0.5, "--friction", 0.1, "--observation", "tracking", "force",
+    )  # fmt: skip
+    assert code == 0, err
+    assert "64 frames in" in out
+    config = Checkpoint.open(tmp_path).config
+    assert (config.hidden, config.target_kl, config.epochs) == ((8, 8), 0.5, 1)
+    assert config.observation == ("tracking", "force")
+    assert config.task_kwargs == {
+        "max_steps": 8, "friction": 0.1, "phantom": "type2", "goal": "lcca",
+    }  # fmt: skip
+    # A run that is resumed keeps its own settings and may go on for longer.
+    code, out, err = cathsim("train", "--out", tmp_path, "--resume", "--frames", 128)
+    assert code == 0, err
+    assert Checkpoint.open(tmp_path).config == config.replace(total_frames=128)
+    code, _, err = cathsim("train", "--out", tmp_path, "--resume", "--clip", 0.3)
+    assert code == 2 and "clip: the run has 0.1, given is 0.3" in err
+
+
+@pytest.mark.parametrize("algorithm", LEARNERS)
+def test_the_help_explains_every_setting(cathsim, monkeypatch, algorithm):
+    monkeypatch.setenv("COLUMNS", "200")
+    code, out, _ = cathsim("train", "--algo", algorithm, "--help")
+    assert code == 0
+    for item in dataclasses.fields(LEARNERS[algorithm].config):
+        if item.name in ("task", "task_kwargs"):
+            continue
+        option = "--" + item.name.replace("_", "-")
+        assert option in out
+        text = training._field_helps(LEARNERS[algorithm].config)[item.name]
+        assert text[0].isupper() and text.endswith("."), f"{option}: {text}"
+        assert not text.startswith("Of "), f"{option}: {text}"
+
+
+def started(*arguments):
+    code = (
+        "import sys; sys.argv = ['cathsim', *sys.argv[1:]]\n"
+        "from cathsim_dmc import cli; cli.main()"
+    )
+    return subprocess.Popen(
+        [sys.executable, "-c", code, *map(str, arguments)],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+
+
+def test_an_interrupted_training_says_how_to_go_on(cathsim, tmp_path):
+    out = tmp_path / "my run"
+    process = started(
+        "train", "type1_bca", "--out", out, *TINY, "--frames", 10**6,
+        "--checkpoint-frames", 64, "--keep-checkpoints", 1,
+    )  # fmt: skip
+    deadline = time.monotonic() + 120
+    while not checkpoints_in(out) and time.monotonic() < deadline:
+        assert process.poll() is None, process.communicate()
+        time.sleep(0.1)
+    process.send_signal(signal.SIGINT)
+    _, err = process.communicate(timeout=60)
+    assert process.returncode == 130
+    saved = Checkpoint.open(out).frames
+    (line,) = [line for line in err.splitlines() if "interrupted" in line]
+    assert f"after {saved} of 1000000 frames" in line
+    again = shlex.split(line.split("go on with: ")[1])
+    assert again[0] == "cathsim"
+    code, printed, err = cathsim(*again[1:], "--frames", saved + 64)
+    assert code == 0, err
+    assert f"{saved + 64} frames in" in printed
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ("eval", "random", "--task", "type1_bca", "--episodes", 30),
+        ("benchmark", "speed"),
+    ],
+)
+def test_an_interrupt_leaves_one_line(arguments):
+    process = started(*arguments)
+    time.sleep(6.0)
+    process.send_signal(signal.SIGINT)
+    out, err = process.communicate(timeout=60)
+    assert (process.returncode, out) == (130, "")
+    assert err.splitlines()[-1] == "cathsim: interrupted"
+    assert "Traceback" not in err
+
+
 # Bad input: exit code 2, a message on stderr, nothing on stdout, nothing done.
 
+TRAIN = ("train", "type1_bca", "--out", "OUT")
 BAD = {
     "no such command": (["trian"], ["train", "eval"]),
-    "no arguments": (["train"], ["task", "out"]),
+    "no arguments": (["train"], ["TASK", "--out"]),
     "no such task": (["train", "type9", "--out", "OUT"], ["type9", *TASKS]),
     "no such algorithm": (
         ["train", "type1_bca", "--out", "OUT", "--algo", "dqn"],
@@ -157,22 +265,24 @@ BAD = {
         ["train", "type1_bca", "--out", "OUT", "--observation", "pixels"],
         ["pixels", "internal", "image", "sequential", "tracking"],
     ),
-    "no such hyper-parameter": (
-        ["train", "type1_bca", "--out", "OUT", "--settings", '{"gama": 0.9}'],
-        ["gama", "gamma"],
-    ),
-    "settings that are no JSON": (
-        ["train", "type1_bca", "--out", "OUT", "--settings", "gamma=1"],
-        ["gamma=1", "JSON object"],
-    ),
-    "settings that are no object": (
-        ["train", "type1_bca", "--out", "OUT", "--settings", "[1]"],
-        ["[1]", "JSON object"],
-    ),
+    "no such hyper-parameter": ([*TRAIN, "--gama", 0.9], ["--gama", "gamma"]),
+    "text for an integer": ([*TRAIN, "--num-envs", "many"], ["--num-envs", "many"]),
+    "text for a number": ([*TRAIN, "--gamma", "x"], ["--gamma", "'x'"]),
+    "text in a list": ([*TRAIN, "--hidden", 64, "x"], ["--hidden", "x"]),
+    "a value out of range": ([*TRAIN, "--gamma", 2], ["gamma=2.0", "(0, 1]"]),
+    "not a number": ([*TRAIN, "--learning-rate", "nan"], ["learning_rate=nan"]),
+    "a negative seed": ([*TRAIN, "--seed", -1], ["seed=-1", ">= 0"]),
+    "an option of another algorithm": ([*TRAIN, "--tau", 0.1], ["--tau"]),
+    "no such preset": ([*TRAIN, "--preset", "best"], ["best", "published", "demo"]),
+    "no such backend": ([*TRAIN, "--backend", "gpu"], ["gpu", "batched", "composer"]),
+    "no such device": ([*TRAIN, "--torch-device", "banana"], ["banana", "cpu"]),
+    "an option of the task": ([*TRAIN, "--max-steps", 0], ["max_steps", "0"]),
+    "nothing to resume": ([*TRAIN, "--resume"], ["no run in OUT to resume"]),
+    "settings as JSON": ([*TRAIN, "--settings", "{}"], ["--settings"]),
     "no such goal": (
         [
             *("train", "navigate", "--out", "OUT"),
-            *("--phantom", "type1", "--goal", "x"),
+            *("--anatomy", "type1", "--goal", "x"),
         ],
         ["bca", "lcca", "lsa"],
     ),

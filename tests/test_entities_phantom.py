@@ -1,4 +1,4 @@
-"""Wall, sensors, sheath and arena of a compiled task."""
+"""Wall, sensors and arena of a compiled task."""
 
 import math
 
@@ -11,7 +11,6 @@ from cathsim_dmc.anatomy.arch import arch
 from cathsim_dmc.entities import contact
 from cathsim_dmc.entities.arena import BLOOD_DENSITY, GRAVITY, AngiographyArena
 from cathsim_dmc.entities.phantom import Phantom
-from cathsim_dmc.entities.sheath import CLEARANCE, Sheath
 
 
 @pytest.fixture(scope="module")
@@ -164,7 +163,7 @@ def test_friction_stays_in_its_cone(pressed, environment):
 
 def test_every_piece_collides_with_the_device_only(model, environment):
     wall = [
-        model.geom(f"phantom/wall_{index:03d}")
+        model.geom(f"wall_{index:03d}")
         for index in range(len(environment.task.scene.anatomy.wall))
     ]
     for geom in wall:
@@ -177,7 +176,7 @@ def test_every_piece_collides_with_the_device_only(model, environment):
 
 
 def test_device_and_wall_have_the_same_contact(model):
-    wall, link = model.geom("phantom/wall_000"), model.geom("catheter/link_3")
+    wall, link = model.geom("wall_000"), model.geom("catheter/link_3")
     np.testing.assert_array_equal(wall.solref, link.solref)
     np.testing.assert_array_equal(wall.solimp, link.solimp)
     np.testing.assert_array_equal(wall.solref, contact.CONTACT_SOLREF)
@@ -190,7 +189,7 @@ def test_pieces_lie_where_the_anatomy_puts_them(model, environment):
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
     for index in range(0, len(anatomy.wall), 50):
-        geom = model.geom(f"phantom/wall_{index:03d}")
+        geom = model.geom(f"wall_{index:03d}")
         mesh = model.mesh(int(geom.dataid[0]))
         start, count = int(mesh.vertadr[0]), int(mesh.vertnum[0])
         vertices = model.mesh_vert[start : start + count]
@@ -217,63 +216,7 @@ def test_phantom_has_no_mass(model):
 @pytest.mark.parametrize("friction", [-0.1, 2.5, math.nan])
 def test_friction_outside_its_range(friction):
     with pytest.raises(ValueError, match="friction is .* between 0 and 2"):
-        Phantom(arch.load("type1"), friction)
-
-
-# Sheath.
-
-
-@pytest.fixture(scope="module")
-def sheath_model():
-    sheath = Sheath(length=0.2, device_radius=0.8e-3)
-    arena = AngiographyArena()
-    arena.attach(sheath)
-    return sheath, mjcf.Physics.from_mjcf_model(arena.mjcf_model).model.ptr
-
-
-def test_bore_leaves_the_clearance_on_each_side(sheath_model):
-    sheath, model = sheath_model
-    assert sheath.bore_half_width == pytest.approx(0.8e-3 + CLEARANCE)
-    inner = {
-        side: np.abs(model.geom(f"sheath/{side}").pos[axis])
-        - model.geom(f"sheath/{side}").size[axis]
-        for side, axis in {"left": 0, "right": 0, "top": 1, "bottom": 1}.items()
-    }
-    np.testing.assert_allclose(list(inner.values()), sheath.bore_half_width)
-
-
-def test_bore_spans_its_length_and_ends_at_the_origin(sheath_model):
-    sheath, model = sheath_model
-    for side in ("left", "right", "top", "bottom"):
-        geom = model.geom(f"sheath/{side}")
-        assert geom.pos[2] + geom.size[2] == pytest.approx(0, abs=1e-12)
-        assert geom.pos[2] - geom.size[2] == pytest.approx(-sheath.length)
-
-
-def test_bore_is_frictionless_and_only_guides_the_device(sheath_model):
-    _, model = sheath_model
-    for side in ("left", "right", "top", "bottom"):
-        geom = model.geom(f"sheath/{side}")
-        assert geom.condim[0] == 1 and geom.priority[0] == 1
-        assert geom.contype[0] == 1 and geom.conaffinity[0] == 0
-    tube = model.geom("sheath/tube")
-    assert tube.contype[0] == 0 and tube.conaffinity[0] == 0
-
-
-def test_sheath_holds_the_device_at_the_start(environment, model):
-    """It reaches from the inlet back over the whole chain, along the device's axis."""
-    task = environment.task
-    body = model.body("sheath/bore").id
-    data = mujoco.MjData(model)
-    mujoco.mj_kinematics(model, data)
-    np.testing.assert_allclose(
-        data.xpos[body], task.scene.anatomy.inlet.position, atol=1e-9
-    )
-    axis = data.xmat[body].reshape(3, 3)[:, 2]
-    np.testing.assert_allclose(axis, task.scene.anatomy.inlet.direction, atol=1e-9)
-    base = data.xpos[model.body("catheter/link_0").id]
-    behind = (task.scene.anatomy.inlet.position - base) @ axis
-    assert behind == pytest.approx(task.scene.sheath.length, abs=1e-9)
+        Phantom(arch.load("simple1"), friction)
 
 
 # Names.

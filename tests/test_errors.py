@@ -60,7 +60,7 @@ def test_every_option_is_listed():
 
 def test_wrong_goal_name():
     fails(
-        ["carotid", *arch.load("type1").goals],
+        ["carotid", *arch.load("simple1").goals],
         task_name="navigate",
         phantom="type1",
         goal="carotid",
@@ -78,9 +78,9 @@ def test_goal_outside_the_lumen():
 
 
 def test_goal_in_a_vessel_that_is_not_there():
-    place = arch.load("type1").tree.vessel("bca").centreline.at(0.02)
+    place = arch.load("simple1").tree.vessel("bca").centreline.at(0.02)
     fails(
-        ["rcca", *arch.load("type1").tree.vessels],
+        ["rcca", *arch.load("simple1").tree.vessels],
         task_name="navigate",
         goal=Goal("far", "rcca", place.position, 0.02),
     )

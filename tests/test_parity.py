@@ -18,7 +18,7 @@ NOISY_BIPLANE = {"biplane": "LATERAL", "noise": True, "size": (48, 64), "roadmap
 
 @pytest.fixture(scope="module")
 def anatomy():
-    return arch.load("type1")
+    return arch.load("simple1")
 
 
 def make(anatomy, seed, **options):

@@ -13,7 +13,7 @@ STEPS = 40
 
 @pytest.fixture(scope="module")
 def env():
-    options = {"anatomy": build_arch(ARCHES["type1"]), "goal": "bca", "random": 0}
+    options = {"anatomy": build_arch(ARCHES["simple1"]), "goal": "bca", "random": 0}
     return suite.load("cathsim", "navigate", options)
 
 

@@ -69,7 +69,7 @@ def test_success_is_terminated_in_torchrl():
     from cathsim_dmc.anatomy.anatomy import Goal
     from cathsim_dmc.anatomy.arch import arch
 
-    anatomy = arch.load("type1")
+    anatomy = arch.load("simple1")
     place = anatomy.tree.vessel("aorta").centreline.at(0.09)
     env = DMControlEnv(
         "cathsim",

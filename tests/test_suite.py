@@ -319,7 +319,7 @@ def test_reward_is_minus_the_distance_in_metres(shared_environment, task_name):
 @pytest.fixture(scope="module")
 def near_goal():
     """An environment whose goal lies 3 cm ahead of the tip."""
-    anatomy = arch.load("type1")
+    anatomy = arch.load("simple1")
     line = anatomy.tree.vessel("aorta").centreline
     place = line.at(0.105)
     goal = Goal("near", "aorta", place.position, 0.105)

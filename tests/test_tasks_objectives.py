@@ -20,7 +20,7 @@ PATH_REWARD = {"path": -1.0, "success": 10.0}
 
 @pytest.fixture(scope="module")
 def anatomy():
-    return arch.load("type1")
+    return arch.load("simple1")
 
 
 def cannulation(anatomy, goal="bca", **options):

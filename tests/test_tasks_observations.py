@@ -16,7 +16,7 @@ SIZE = 64
 
 @pytest.fixture(scope="module")
 def anatomy():
-    return arch.load("type1")
+    return arch.load("simple1")
 
 
 def make(anatomy, observation, seed=0, **options):

@@ -27,7 +27,7 @@ def _push(environment):
 
 
 def test_a_device_in_lumen_and_sheath_has_not_escaped():
-    anatomy = arch.load("type1")
+    anatomy = arch.load("simple1")
     inlet = anatomy.inlet
     way = np.linspace(-0.3, 0.1, 81)[:, None]
     straight = inlet.position + way * inlet.direction

@@ -25,7 +25,7 @@ def direction(azimuth, height):
 @given(azimuth=ANGLES, height=st.floats(-1, 1))
 def test_frame_turns_z_into_any_direction(azimuth, height):
     axis = direction(azimuth, height)
-    anatomy = arch.load("type1")
+    anatomy = arch.load("simple1")
     inlet = Inlet("aorta", [0, 0, 0], axis, 0.0138)
     placed = placement.place_device(
         dataclasses.replace(anatomy, inlet=inlet), 0.2, devices.PUBLISHED, 0.3
@@ -58,7 +58,7 @@ def test_the_device_starts_inside_and_reaches_every_goal(name):
 @pytest.mark.parametrize("length", [0.0, 0.05, 0.09, -1.0, math.nan, math.inf, 5.0])
 def test_working_length_is_checked(length):
     with pytest.raises(ValueError, match=r"working_length is .*more than.*at most"):
-        placement.place_device(arch.load("type1"), 0.2, devices.PUBLISHED, length)
+        placement.place_device(arch.load("simple1"), 0.2, devices.PUBLISHED, length)
 
 
 @pytest.mark.parametrize("task_name", ["type1_bca", "type2_lcca"])

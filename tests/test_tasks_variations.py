@@ -20,7 +20,7 @@ from cathsim_dmc.tasks.variations import (
 
 @pytest.fixture(scope="module")
 def anatomy():
-    return arch.load("type1")
+    return arch.load("simple1")
 
 
 def make(anatomy, randomisation, **options):
@@ -41,7 +41,7 @@ def elements(environment):
         "hinges": named("joint", model.njnt, "catheter/bend"),
         "motors": named("actuator", model.nu, "catheter/tip"),
         "device": named("geom", model.ngeom, "catheter/link"),
-        "wall": named("geom", model.ngeom, "phantom/wall"),
+        "wall": named("geom", model.ngeom, "wall_"),
         "base": model.body("catheter/link_0").id,
     }
 

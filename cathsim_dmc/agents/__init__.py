@@ -2,7 +2,9 @@
 
 # isort: off
 from cathsim_dmc.agents import import_order  # noqa: F401
-import torchrl  # noqa: F401
+
+# With its collectors: after dm_control they would print deprecation warnings.
+import torchrl.collectors  # noqa: F401
 
 # isort: on
 

@@ -135,11 +135,12 @@ def evaluate(
     episodes: int = 30,
     seed: int = evaluation.EVALUATION_SEED,
     task_kwargs: Mapping[str, Any] | None = None,
+    backend: str = "batched",
     num_threads: int | None = None,
     baseline: bool = True,
     out_dir: str | Path | None = None,
 ) -> Report:
-    """Evaluates a policy; writes evaluation.json and heatmap.png into a directory.
+    """Evaluates a policy; writes its files into a directory.
 
     Args:
         policy: Policy, or what names one, see `policies.load_policy`.
@@ -148,9 +149,11 @@ def evaluate(
         seed: Seed of the first episode; the others count up.
         task_kwargs: Further options of the task; None takes those that the policy was
             trained with.
+        backend: Way of simulating, "batched" or "composer".
         num_threads: Number of threads of the simulation; None takes one per core.
         baseline: Whether to play the same seeds with the random policy too.
-        out_dir: Directory for the files; None writes none.
+        out_dir: Directory for evaluation.json and, from the batched backend,
+            heatmap.png; None writes none.
     """
     start = time.monotonic()
     contacts = ContactLog()
@@ -160,8 +163,9 @@ def evaluate(
         episodes,
         seed,
         task_kwargs=task_kwargs,
+        backend=backend,
         num_threads=num_threads,
-        observer=contacts,
+        observer=contacts if backend == "batched" else None,
     )
     other = comparison = None
     if baseline and str(policy) != "random":
@@ -171,12 +175,14 @@ def evaluate(
             episodes,
             seed,
             task_kwargs=result.settings["task_kwargs"],
+            backend=backend,
             num_threads=num_threads,
         )
         comparison = evaluation.compare(result, other)
     report = Report(result, other, comparison, time.monotonic() - start)
     if out_dir is not None:
         evaluation.write_evaluation(out_dir, report.to_dict())
+    if out_dir is not None and backend == "batched":
         environment = suite.load(
             suite.DOMAIN, result.task, task_kwargs=dict(result.settings["task_kwargs"])
         )

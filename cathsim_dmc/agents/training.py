@@ -83,13 +83,15 @@ def train(
 
     Raises:
         ConfigError: the directory holds a run that was not to be resumed, or one with
-            other settings, or none that could be resumed.
+            other settings, or none that could be resumed; or the torch device cannot
+            be used.
         CheckpointError: the checkpoint to continue from is damaged.
         ReplayError: so are the files of its replay.
         FloatingPointError: a loss is not finite; the last checkpoint stays.
         OSError: the disk is full, or the directory cannot be written to.
     """
     run = Path(out_dir)
+    _require_device(config.torch_device)
     checkpoint = _prepare(run, config, resume)
     with contextlib.ExitStack() as stack:
         stack.enter_context(_torch_threads(config.torch_threads))
@@ -133,6 +135,16 @@ def train(
             interrupted=log.frames < config.total_frames,
             metrics=log.row,
         )
+
+
+def _require_device(name: str) -> None:
+    try:
+        torch.zeros(1, device=name)
+    except (RuntimeError, AssertionError, NotImplementedError) as error:
+        line = " ".join(str(error).split())[:200]
+        raise ConfigError(
+            f"torch_device={name!r} cannot be used here ({line}); 'cpu' always can."
+        ) from error
 
 
 def _prepare(run: Path, config: TrainingConfig, resume: bool) -> Checkpoint | None:

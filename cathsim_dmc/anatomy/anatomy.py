@@ -5,11 +5,12 @@ Lengths are metres, positions are in the patient frame LPS.
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import io
 import json
 import os
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -18,6 +19,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from cathsim_dmc import files
+from cathsim_dmc.anatomy import loading
 from cathsim_dmc.anatomy.centreline import (
     Array,
     Centreline,
@@ -35,6 +37,7 @@ if TYPE_CHECKING:
 FORMAT = "cathsim-anatomy"
 FORMAT_VERSION = 1
 _DESCRIPTION = "anatomy.json"
+_READS = 50  # of a description that is replaced while it is read
 
 
 def _vector(value: ArrayLike, name: str) -> Array:
@@ -249,7 +252,8 @@ class Anatomy:
 
         The geometry goes into an npz named by its content, the description into
         `anatomy.json`, which is replaced last: a reader finds the old anatomy or
-        the new one, never a mixture.
+        the new one, never a mixture. Of processes that save into one directory at
+        once, one waits for the other, and the last one's anatomy stays.
         """
         directory = Path(directory)
         directory.mkdir(parents=True, exist_ok=True)
@@ -260,12 +264,15 @@ class Anatomy:
         digest = hashlib.sha256(data).hexdigest()
         description["geometry"] = f"geometry-{digest[:16]}.npz"
         description["sha256"] = digest
-        files.write_bytes(directory / description["geometry"], data)
         text = json.dumps(description, indent=2) + "\n"
-        files.write_text(directory / _DESCRIPTION, text)
-        for stale in directory.glob("geometry-*.npz"):
-            if stale.name != description["geometry"]:
-                stale.unlink(missing_ok=True)
+        with _alone(directory) as alone:
+            files.write_bytes(directory / description["geometry"], data)
+            files.write_text(directory / _DESCRIPTION, text)
+            # Others may be about to name what they have just written.
+            if alone:
+                stale = {*directory.glob("geometry-*.npz")}
+                for path in stale - {directory / description["geometry"]}:
+                    path.unlink(missing_ok=True)
         return directory
 
     @classmethod
@@ -274,38 +281,81 @@ class Anatomy:
 
         Raises:
             FileNotFoundError: if `directory` holds no anatomy.
-            ValueError: if a file is damaged or of another format.
+            ValueError: if a file is damaged, of another format, or holds what no
+                anatomy does; names the file and the entry.
         """
         path = Path(directory) / _DESCRIPTION
-        if not path.is_file():
-            raise FileNotFoundError(
-                f"no {_DESCRIPTION} in {directory}; give a directory that "
-                "Anatomy.save wrote."
-            )
-        try:
-            description = json.loads(path.read_text())
-        except (json.JSONDecodeError, UnicodeDecodeError) as error:
-            raise ValueError(f"{path} is damaged: {error}") from error
-        if not isinstance(description, dict) or (
-            description.get("format") != FORMAT
-            or description.get("version") != FORMAT_VERSION
-        ):
-            raise ValueError(
-                f"{path} is not a {FORMAT} file of version {FORMAT_VERSION}; write it "
-                "again with Anatomy.save."
-            )
-        # Only the bare file name counts: a description may not point elsewhere.
-        geometry = path.parent / Path(str(description.get("geometry"))).name
-        if not geometry.is_file():
-            raise ValueError(f"{path} names {geometry.name}, which is missing.")
-        data = geometry.read_bytes()
+        for _ in range(_READS):
+            description, text = _read_description(path)
+            # Only the bare file name counts: a description may not point elsewhere.
+            geometry = path.parent / Path(str(description.get("geometry"))).name
+            try:
+                data = loading.read_regular(geometry, loading.LARGEST_ARRAYS)
+                break
+            except FileNotFoundError:
+                # Replaced between the two reads, unless the description still stands.
+                if _read_description(path)[1] == text:
+                    raise ValueError(
+                        f"{path} names {geometry.name}, which is missing."
+                    ) from None
+        else:
+            raise ValueError(f"{path} was replaced {_READS} times while it was read.")
         if hashlib.sha256(data).hexdigest() != description.get("sha256"):
             raise ValueError(f"{geometry} is damaged: its checksum differs.")
+        loading.check_description(description, path)
+        arrays = loading.read_arrays(data, geometry)
+        loading.check_arrays(arrays, len(description["vessels"]), geometry)
         try:
-            with np.load(io.BytesIO(data), allow_pickle=False) as archive:
-                return _unpack(description, {k: archive[k] for k in archive.files})
-        except (KeyError, TypeError) as error:
-            raise ValueError(f"{path} lacks an entry: {error}") from error
+            anatomy = _unpack(description, arrays)
+        except ValueError as error:
+            raise ValueError(f"{path}: {error}") from error
+        loading.check_places(anatomy, path)
+        return anatomy
+
+
+def _read_description(path: Path) -> tuple[dict[str, Any], bytes]:
+    """The description of an anatomy, and its text."""
+    try:
+        text = loading.read_regular(path, loading.LARGEST_TEXT)
+    except FileNotFoundError:
+        raise FileNotFoundError(
+            f"no {_DESCRIPTION} in {path.parent}; give a directory that "
+            "Anatomy.save wrote."
+        ) from None
+    try:
+        description = json.loads(text)
+    except (json.JSONDecodeError, UnicodeDecodeError, RecursionError) as error:
+        raise ValueError(f"{path} is damaged: {error}") from error
+    if not isinstance(description, dict) or (
+        description.get("format") != FORMAT
+        or description.get("version") != FORMAT_VERSION
+    ):
+        raise ValueError(
+            f"{path} is not a {FORMAT} file of version {FORMAT_VERSION}; write it "
+            "again with Anatomy.save."
+        )
+    return description, text
+
+
+@contextlib.contextmanager
+def _alone(directory: Path) -> Iterator[bool]:
+    """Holds other processes' `save` off a directory; false where that is not known."""
+    try:
+        import fcntl
+
+        handle = os.open(directory, os.O_RDONLY)
+    except (ImportError, OSError):
+        yield False
+        return
+    try:
+        try:
+            fcntl.flock(handle, fcntl.LOCK_EX)
+            locked = True
+        except OSError:
+            locked = False
+        yield locked
+    finally:
+        os.close(handle)
 
 
 def _pack(anatomy: Anatomy) -> tuple[dict[str, np.ndarray], dict[str, Any]]:

@@ -6,14 +6,20 @@ import sys
 from tyro import conf
 from tyro.extras import SubcommandApp
 
-from cathsim_dmc.cli import agents
+from cathsim_dmc import __version__
+from cathsim_dmc.cli import agents, training
 from cathsim_dmc.cli.measurements import benchmarks, validations
-from cathsim_dmc.cli.options import BAD_INPUT, print_json
+from cathsim_dmc.cli.options import BAD_INPUT, INTERRUPTED, print_json
 from cathsim_dmc.cli.phantoms import phantoms
 
-_DESCRIPTION = "Autonomous endovascular navigation: train, evaluate, record, validate."
+_DESCRIPTION = (
+    "Autonomous endovascular navigation: train, evaluate, record, validate. "
+    "`cathsim COMMAND --help` explains a command, `cathsim --version` names it."
+)
 
 app = SubcommandApp()
+# First of the list of commands; what it does is put there when its arguments are known.
+app.command(training.command([]), name="train")
 
 
 @app.command(name="list")
@@ -21,7 +27,7 @@ def list_tasks(json: bool = False) -> int:
     """List the tasks, with one line each.
 
     Args:
-        json: Print JSON instead of a table.
+        json: Whether to print JSON instead of a table.
     """
     from rich.console import Console
     from rich.table import Table
@@ -46,18 +52,39 @@ app.command(benchmarks, name="benchmark", help="Measure the speed.")
 
 
 def main() -> None:
-    """Runs the command line."""
+    """Run the command line."""
     try:
-        code = app.cli(
-            prog="cathsim", description=_DESCRIPTION, config=(conf.OmitArgPrefixes,)
-        )
+        code = _run(sys.argv[1:])
         sys.stdout.flush()
     except BrokenPipeError:
         # The reader, such as `head`, has seen enough; nor may the exit flush again.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         code = 0
-    except (ValueError, OSError, RuntimeError, ImportError) as error:
+    except KeyboardInterrupt:
+        print("cathsim: interrupted", file=sys.stderr)
+        code = INTERRUPTED
+    except (
+        ValueError,
+        OSError,
+        RuntimeError,
+        ImportError,
+        ArithmeticError,
+        MemoryError,
+    ) as error:
         # Errors with a message for the user; anything else is ours, with traceback.
-        print(f"cathsim: {type(error).__name__}: {error}", file=sys.stderr)
+        text = " ".join(str(error).split()) or "no message"
+        print(f"cathsim: {type(error).__name__}: {text}", file=sys.stderr)
         code = BAD_INPUT
     sys.exit(code)
+
+
+def _run(arguments: list[str]) -> int:
+    if arguments == ["--version"]:
+        print(f"cathsim-dmc {__version__}")
+        return 0
+    app.command(training.command(arguments), name="train")
+    return app.cli(
+        prog="cathsim",
+        description=_DESCRIPTION,
+        config=(conf.OmitArgPrefixes,),
+    )

@@ -2,7 +2,9 @@
 
 import sys
 from pathlib import Path
+from typing import Annotated
 
+from tyro import conf
 from tyro.extras import SubcommandApp
 
 from cathsim_dmc.cli.options import show
@@ -16,8 +18,8 @@ def rod(figure: Path | None = None, json: bool = False) -> int:
     """Bending, buckling and twist of the device against theory.
 
     Args:
-        figure: Where to draw the comparison, a PNG.
-        json: Print one JSON object and nothing else.
+        figure: Path of a PNG to draw the comparison into.
+        json: Whether to print one JSON object and nothing else.
     """
     from cathsim_dmc import validation
 
@@ -27,21 +29,21 @@ def rod(figure: Path | None = None, json: bool = False) -> int:
 @validations.command
 def wall(
     figure: Path | None = None,
-    phantom: list[str] = [],  # noqa: B006  # tyro reads it, nobody writes it
+    anatomy: Annotated[list[str], conf.arg(aliases=("--phantom",))] = [],  # noqa: B006
     convergence: bool = True,
     json: bool = False,
 ) -> int:
     """Fidelity of the wall, friction against the capstan equation, convergence.
 
     Args:
-        figure: Where to draw the comparison, a PNG.
-        phantom: Directories of further anatomies, such as an imported scan.
-        convergence: Include the studies of time step and link length.
-        json: Print one JSON object and nothing else.
+        figure: Path of a PNG to draw the comparison into.
+        anatomy: Directories of further anatomies, such as an imported scan.
+        convergence: Whether to include the studies of time step and link length.
+        json: Whether to print one JSON object and nothing else.
     """
     from cathsim_dmc import validation
 
-    report = validation.validate_wall(figure, phantom, with_convergence=convergence)
+    report = validation.validate_wall(figure, anatomy, with_convergence=convergence)
     return show(report, json)
 
 
@@ -57,13 +59,13 @@ def forces(
     """Force balance, known loads, and the published protocol.
 
     Args:
-        figure: Where to draw density and cumulative plots, a PNG.
+        figure: Path of a PNG to draw density and cumulative plots into.
         episode: Recorded cannulation (.npz of `cathsim record`) for the protocol;
             scripted insertions by default.
-        mean: Of the normal reference, N; the published one is unverified.
+        mean: Mean of the normal reference, N; the published one is unverified.
         sd: Standard deviation of the reference, N.
-        margin: Of the equivalence test, N.
-        json: Print one JSON object and nothing else.
+        margin: Margin of the equivalence test, N.
+        json: Whether to print one JSON object and nothing else.
     """
     from cathsim_dmc import validation
 
@@ -76,7 +78,7 @@ def speed(json: bool = False) -> int:
     """Measure how fast the simulator is. Run it with nothing else running.
 
     Args:
-        json: Print one JSON object and nothing else.
+        json: Whether to print one JSON object and nothing else.
     """
     from cathsim_dmc.analysis.speed import report
 

@@ -6,8 +6,8 @@ from typing import Annotated, Any
 
 from tyro import conf
 
-# Exit codes beside 0: a check has failed; the input cannot be used.
-CHECK_FAILED, BAD_INPUT = 1, 2
+# Exit codes beside 0: a check has failed; the input cannot be used; Ctrl-C.
+CHECK_FAILED, BAD_INPUT, INTERRUPTED = 1, 2, 130
 EVALUATION_SEED = 1_000_000  # apart from the seeds of training
 
 Task = Annotated[str, conf.Positional]
@@ -15,20 +15,20 @@ Task = Annotated[str, conf.Positional]
 
 @dataclasses.dataclass(frozen=True)
 class OwnAnatomy:
-    """An anatomy of one's own, for `navigate`.
+    """An anatomy of one's own, for the task `navigate`.
 
     Attributes:
-        phantom: Directory of an anatomy.
+        anatomy: Directory of an anatomy, or name of an arch.
         goal: Name of the goal in it.
     """
 
-    phantom: str | None = None
+    anatomy: Annotated[str | None, conf.arg(aliases=("--phantom",))] = None
     goal: str | None = None
 
     @property
     def task_kwargs(self) -> dict[str, Any]:
         """What was given, as options of the task."""
-        given = dataclasses.asdict(self)
+        given = {"phantom": self.anatomy, "goal": self.goal}
         return {key: value for key, value in given.items() if value is not None}
 
 
@@ -36,12 +36,12 @@ NO_ANATOMY = OwnAnatomy()
 
 
 def print_json(values: Any) -> None:
-    """Prints one JSON object."""
+    """Print one JSON object."""
     print(json.dumps(values, indent=2))
 
 
 def show(report: Any, as_json: bool) -> int:
-    """Prints a report of checks; returns the exit code."""
+    """Print a report of checks; return the exit code."""
     if as_json:
         print_json(report.as_dict())
     else:

@@ -1,6 +1,8 @@
 """`cathsim phantom import`, `build`, `generate` and `check`."""
 
+import contextlib
 import sys
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -16,44 +18,92 @@ phantoms = SubcommandApp()
 def import_phantom(
     mesh: Annotated[Path, conf.Positional],
     /,
-    centreline: list[Path],
     out: Path,
+    centreline: tuple[Path, ...] = (),
     name: str | None = None,
-    units: Literal["mm", "cm", "m"] = "mm",
+    units: Literal["mm", "cm", "m"] | None = None,
     frame: Literal["LPS", "RAS"] = "LPS",
+    axes: str | None = None,
     inlet: tuple[float, float, float] | None = None,
+    rename: tuple[str, ...] = (),
     wall: Literal["prisms", "coacd"] = "prisms",
     threshold_mm: float | None = None,
+    cache: bool = True,
 ) -> int:
-    """Turn the surface of a lumen and its centrelines into an anatomy.
+    """Turn the surface of a lumen into an anatomy.
 
     Args:
-        mesh: Closed surface of the lumen: OBJ, STL or PLY.
-        centreline: 3D Slicer curves (.mrk.json) or CSV files, one per branch.
+        mesh: Surface of the lumen: OBJ, STL, PLY or VTP; ends open or capped.
         out: Directory of the anatomy.
-        name: Of the anatomy.
-        units: Of mesh, CSV centrelines and inlet.
-        frame: Of mesh, CSV centrelines and inlet.
+        centreline: 3D Slicer curves (.mrk.json) or CSV files, one per branch; without
+            any they are computed from the surface.
+        name: Name of the anatomy.
+        units: Unit of mesh, CSV centrelines and inlet; guessed if not given.
+        frame: Frame of mesh, CSV centrelines and inlet.
+        axes: Where +x, +y and +z of that frame point in the patient, for a scan that
+            does not stand upright: three of L, R, A, P, S, I, such as ILP.
         inlet: Where the device enters: a free end, or a place to cut the lumen at.
+        rename: Names of computed branches, each as computed=wanted.
         wall: Pieces near the surface, or CoACD's coarse ones (needs the extra coacd).
-        threshold_mm: Of CoACD, the concavity of a piece; 3.5 by default.
+        threshold_mm: CoACD's concavity of a piece; 3.5 by default.
+        cache: Whether to use what was imported from the same files before.
     """
-    from cathsim_dmc.anatomy.scan import importer as scan
+    from cathsim_dmc.anatomy.scan import report
+    from cathsim_dmc.anatomy.scan.cache import cached_import
+    from cathsim_dmc.anatomy.scan.importer import import_scan
 
-    anatomy = scan.import_scan(
-        mesh,
-        centreline,
-        units=units,
-        mesh_frame=frame,
-        name=name or out.name,
-        inlet=inlet,
-        wall=wall,
-        threshold=None if threshold_mm is None else threshold_mm * 1e-3,
-        progress=lambda text: print(text, file=sys.stderr),
-    )
+    changes = dict(_change(text) for text in rename)
+    notes: list[str] = []
+    with _progress() as progress:
+        anatomy = (cached_import if cache else import_scan)(
+            mesh,
+            centreline,
+            units=units,
+            mesh_frame=frame,
+            axes=axes,
+            name=name or out.name,
+            inlet=inlet,
+            rename=changes,
+            wall=wall,
+            threshold=None if threshold_mm is None else threshold_mm * 1e-3,
+            progress=progress,
+            notes=notes,
+        )
+        progress("wall: measuring it")
+        figures = report.describe(anatomy)
     anatomy.save(out)
-    print_json({"directory": str(out), **scan.describe(anatomy)})
+    print_json({"directory": str(out), "notes": notes, **figures})
     return 0
+
+
+def _change(text: str) -> tuple[str, str]:
+    old, equals, new = text.partition("=")
+    if not equals or not old or not new:
+        raise ValueError(f"rename is {text!r}; give computed=wanted, e.g. branch_1=lra")
+    return old, new
+
+
+@contextlib.contextmanager
+def _progress() -> Iterator[Callable[[str], None]]:
+    """Lines of an import as a bar on standard error; notes stay above it."""
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+
+    from cathsim_dmc.anatomy.scan.importer import SHARES
+
+    console = Console(stderr=True, soft_wrap=True)
+    columns = (BarColumn(30), TimeElapsedColumn(), TextColumn("{task.description}"))
+    with Progress(*columns, console=console) as bar:
+        task = bar.add_task("mesh: reading", total=1.0)
+
+        def show(text: str) -> None:
+            step, _, rest = text.partition(": ")
+            if step == "note" or not console.is_terminal:
+                console.print(text, markup=False, highlight=False)
+            if step in SHARES:
+                bar.update(task, completed=SHARES[step], description=text[:60])
+
+        yield show
 
 
 @phantoms.command

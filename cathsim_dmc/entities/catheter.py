@@ -81,6 +81,7 @@ class Catheter(composer.Entity):
         self._mjcf_root.compiler.angle = "radian"
         self._contact = device_contact(friction)
         self._links = []
+        self._link_geoms = []
         self._bends = []
         self._twists = []
         self._twist_compliances = self._torsion_hinges()
@@ -184,15 +185,17 @@ class Catheter(composer.Entity):
 
     def _add_capsule(self, body, index: int):
         length = self._lengths[index]
-        body.add(
-            "geom",
-            name=f"link_{index}",
-            type="capsule",
-            fromto=(0, 0, 0, 0, 0, length),
-            size=[self._device.outer_radius],
-            mass=self._device.linear_density * length,
-            rgba=_TIP_COLOUR if self._in_tip(index) else _COLOUR,
-            **self._contact,
+        self._link_geoms.append(
+            body.add(
+                "geom",
+                name=f"link_{index}",
+                type="capsule",
+                fromto=(0, 0, 0, 0, 0, length),
+                size=[self._device.outer_radius],
+                mass=self._device.linear_density * length,
+                rgba=_TIP_COLOUR if self._in_tip(index) else _COLOUR,
+                **self._contact,
+            )
         )
 
     def _in_tip(self, index: int) -> bool:
@@ -324,6 +327,11 @@ class Catheter(composer.Entity):
     def links(self) -> tuple:
         """Bodies from proximal to distal."""
         return tuple(self._links)
+
+    @property
+    def link_geoms(self) -> tuple:
+        """Capsules of the links from proximal to distal."""
+        return tuple(self._link_geoms)
 
     @property
     def head(self):

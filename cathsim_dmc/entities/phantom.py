@@ -38,7 +38,7 @@ class Phantom(composer.Entity):
         self._anatomy = anatomy
         self._mjcf_root = mjcf.RootElement(model=name)
         self._body = self._mjcf_root.worldbody.add("body", name="wall")
-        self._add_wall(friction)
+        self._friction = friction
         self._add_looks()
         self._goals = {
             goal.name: self._body.add(
@@ -51,26 +51,6 @@ class Phantom(composer.Entity):
             )
             for goal in anatomy.goals.values()
         }
-        cell = self._body.add("site", name="load_cell", size=[1e-3], group=4)
-        self._load_cell = self._mjcf_root.sensor.add(
-            "force", name="load_cell", site=cell
-        )
-
-    def _add_wall(self, friction: float):
-        for index, piece in enumerate(self._anatomy.wall):
-            name = f"wall_{index:03d}"
-            self._mjcf_root.asset.add(
-                "mesh", name=name, vertex=np.ravel(piece), inertia="shell"
-            )
-            self._body.add(
-                "geom",
-                name=name,
-                type="mesh",
-                mesh=name,
-                **wall_contact(friction),
-                mass=0,
-                group=3,
-            )
 
     def _add_looks(self):
         surface = self._anatomy.surface
@@ -93,20 +73,48 @@ class Phantom(composer.Entity):
             rgba=_LUMEN_COLOUR,
         )
 
-    def add_wall_sensor(self, device_body) -> None:
-        """Adds the sensor of the contacts of a device with the wall.
+    def stand(self, device_body) -> None:
+        """Puts the wall into the world, with sensors of what a device does to it.
+
+        The pieces belong to the world itself, not to a body of the phantom: MuJoCo's
+        broad phase goes through every piece of every other body in every step, which
+        took a sixth of a free one.
 
         Args:
           device_body: root body of the device, an element of the same model tree.
         """
-        self._body.root.root_model.sensor.add(
+        root = self._mjcf_root.root_model
+        for index, piece in enumerate(self._anatomy.wall):
+            name = f"wall_{index:03d}"
+            mesh = self._mjcf_root.asset.add(
+                "mesh", name=name, vertex=np.ravel(piece), inertia="shell"
+            )
+            root.worldbody.add(
+                "geom",
+                name=name,
+                type="mesh",
+                mesh=mesh,
+                **wall_contact(self._friction),
+                mass=0,
+                group=3,
+            )
+        root.sensor.add(
             "contact",
             name="wall_contacts",
-            body1=self._body,
+            body1="world",
             subtree2=device_body,
             num=MAX_CONTACTS,
             data=" ".join(CONTACT_FIELDS),
             reduce="none",
+        )
+        # A load cell under the phantom carries what the contacts add up to.
+        root.sensor.add(
+            "contact",
+            name="load_cell",
+            body1="world",
+            subtree2=device_body,
+            data="force",
+            reduce="netforce",
         )
 
     @property
@@ -121,15 +129,10 @@ class Phantom(composer.Entity):
 
     @property
     def body(self):
-        """The one static body that carries the wall."""
+        """The static body that carries looks and goals."""
         return self._body
 
     @property
     def goals(self) -> dict:
         """Goal sites by name."""
         return self._goals
-
-    @property
-    def load_cell(self):
-        """Force sensor under the phantom, world frame, force of the support on it."""
-        return self._load_cell

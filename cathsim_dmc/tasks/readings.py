@@ -109,7 +109,7 @@ class ModelIndex:
         self.head_site = _id(model, mujoco.mjtObj.mjOBJ_SITE, f"{catheter}/head")
         self.push_force = _sensor(model, f"{catheter}/push_force")
         self.push_torque = _sensor(model, f"{catheter}/push_torque")
-        self.load_cell = _sensor(model, f"{phantom}/load_cell")
+        self.load_cell = _sensor(model, "load_cell")
         self.wall_contacts = _sensor(model, "wall_contacts")
 
     def read(self, data) -> Readings:

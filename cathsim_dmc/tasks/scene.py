@@ -10,7 +10,7 @@ from cathsim_dmc.entities.arena import AngiographyArena
 from cathsim_dmc.entities.catheter import Catheter
 from cathsim_dmc.entities.phantom import Phantom
 from cathsim_dmc.entities.robot import Robot
-from cathsim_dmc.entities.sheath import Sheath
+from cathsim_dmc.entities.sheath import Sheath, straight
 from cathsim_dmc.tasks import placement
 from cathsim_dmc.tasks.config import NavigationConfig
 from cathsim_dmc.tasks.objectives import GOAL_RADIUS
@@ -92,7 +92,7 @@ class Scene:
             catheter=catheter or _catheter(device, place, config),
             sheath=sheath
             or Sheath(
-                length=place.working_length - place.start_depth,
+                straight(place.working_length - place.start_depth),
                 device_radius=radius,
             ),
             robot=robot or Robot(device_radius=radius),
@@ -116,7 +116,8 @@ class Scene:
                 quat=place.quaternion,
             )
             self.arena.attach(entity, site)
-        self.phantom.add_wall_sensor(self.catheter.links[0])
+        self.sheath.guide(self.catheter, place.start_depth)
+        self.phantom.stand(self.catheter.links[0])
         placement.add_cameras(self.arena, self.anatomy)
 
     @property

@@ -213,7 +213,7 @@ class ModelVariation:
                 dtype=int,
             )
 
-        self._geoms = named("geom", model.ngeom, f"{catheter}/", f"{phantom}/")
+        self._geoms = named("geom", model.ngeom, f"{catheter}/", "wall_")
         self._hinges = named(
             "joint", model.njnt, f"{catheter}/bend_", f"{catheter}/twist_"
         )

@@ -68,7 +68,7 @@ def resting_link(load: float, settling: float = 5.0) -> Resting:
     rig = Rig()
     plate = Phantom(_plate(rig.device.outer_radius))
     rig.arena.attach(plate)
-    plate.add_wall_sensor(rig.catheter.links[0])
+    plate.stand(rig.catheter.links[0])
     rig.compile()
     steps = round(settling / rig.model.opt.timestep)
     last = round(AVERAGING / rig.model.opt.timestep)
@@ -84,7 +84,7 @@ def resting_link(load: float, settling: float = 5.0) -> Resting:
             (
                 contacts.force[..., 1].sum(),
                 # MuJoCo's sensor gives the force of the support on the phantom.
-                -rig.sensor(f"{plate.mjcf_model.model}/load_cell")[1],
+                -rig.sensor("load_cell")[1],
                 -rig.sensor(f"{rig.name}/push_force")[1],
                 contacts.penetration.max(),
             )

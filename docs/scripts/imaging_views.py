@@ -78,7 +78,7 @@ def views(tree, surface) -> dict[str, np.ndarray]:
 
 def main() -> None:
     """Draw the figure."""
-    tree = arch_tree(ARCHES["type1"])
+    tree = arch_tree(ARCHES["simple1"])
     images = views(tree, lumen_surface(tree))
     figure, axes = plt.subplots(2, 4, figsize=(9.6, 5.1), layout="constrained")
     for axis, (title, image) in zip(axes.flat, images.items(), strict=True):

@@ -4,34 +4,35 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from cathsim_dmc.anatomy.anatomy import Anatomy, End, Goal, Inlet, Surface
 from cathsim_dmc.anatomy.centreline import Vessel, VesselTree
 from cathsim_dmc.anatomy.scan import coacd_wall
-from cathsim_dmc.anatomy.scan.files import (
-    Curve,
-    check_inside,
-    frame_sign,
-    metres_per,
-    read_curve,
-    read_mesh,
-)
+from cathsim_dmc.anatomy.scan.check import check_tree
+from cathsim_dmc.anatomy.scan.compiled_field import compiled, plain
+from cathsim_dmc.anatomy.scan.curves import Curve, check_inside, read_curve
+from cathsim_dmc.anatomy.scan.ends import Entry, FreeEnd, free_ends, listed, plan_inlet
+from cathsim_dmc.anatomy.scan.extract import centrelines, continued
 from cathsim_dmc.anatomy.scan.inlet import cut_open, shut_behind
-from cathsim_dmc.anatomy.scan.tree import Ways, grow_tree, plan_inlet
+from cathsim_dmc.anatomy.scan.lumen import Lumen, read_lumen
+from cathsim_dmc.anatomy.scan.mesh_depth import MeshDepth, depth_field
+from cathsim_dmc.anatomy.scan.naming import name_branches, renamed
+from cathsim_dmc.anatomy.scan.tree import grow_tree
 from cathsim_dmc.anatomy.scan.trunk import name_trunk
+from cathsim_dmc.anatomy.scan.units import frame_sign, metres_per, upright
 from cathsim_dmc.anatomy.scan.wall import (
     DEVICE_RADIUS,
     TOLERANCE,
     build_wall,
     inlet_cap,
 )
-from cathsim_dmc.anatomy.wall import fidelity
-from cathsim_dmc.anatomy.wall.depth import SPACING, DepthField, MeshDepth
+from cathsim_dmc.anatomy.scan.ways import Ways
+from cathsim_dmc.anatomy.wall.depth import SPACING, DepthField
 
 log = logging.getLogger(__name__)
 
@@ -42,45 +43,57 @@ GOAL_DISTAL = 0.8  # of the passable part of a branch, its second goal
 INLET_WIDTH = 0.8  # of the lumen near the inlet; the rest of the blind end is cut off
 INLET_SEARCH = 40e-3  # m of the root in which that width is looked for
 NEAR_INLET = 15e-3  # m, distance from the lumen of an inlet that is pointed at
-SAMPLING = 1e-3  # m, between the places at which the wall is measured
-RAYS = 20_000  # shot at the wall to find leaks
 RADII = (0.3e-3, 30e-3)  # m, allowed median radius of a vessel: arteriole, aneurysm
+
+
+# Share of an import that is done when a step begins, for a progress bar.
+SHARES = {"mesh": 0.0, "depth": 0.06, "tree": 0.35, "wall": 0.65, "done": 1.0}
 
 
 def import_scan(
     mesh_path: str | Path,
-    centreline_paths: Sequence[str | Path],
+    centreline_paths: Sequence[str | Path] = (),
     *,
-    units: str = "mm",
+    units: str | None = None,
     mesh_frame: str = "LPS",
+    axes: str | None = None,
     name: str | None = None,
     inlet: Sequence[float] | None = None,
     root: str = ROOT,
+    rename: Mapping[str, str] | None = None,
     spacing: float = SPACING,
     wall: str = "prisms",
     tolerance: float = TOLERANCE,
     threshold: float | None = None,
     progress: Callable[[str], None] | None = None,
+    notes: list[str] | None = None,
 ) -> Anatomy:
-    """Turn a lumen surface and centrelines drawn in it into an anatomy.
+    """Turn the surface of a lumen into an anatomy.
 
     Args:
-        mesh_path: closed lumen surface (OBJ, STL, PLY, ...).
+        mesh_path: lumen surface (OBJ, STL, PLY or VTP); vessel ends open or capped.
         centreline_paths: 3D Slicer markups or tables x,y,z[,radius], one per branch;
             the branch is called after the file (centreline-LCCA.mrk.json: "lcca").
-        units: of the mesh, of tables and of ``inlet``: "mm", "cm" or "m".
+            Without any they are computed, and named where the arch tells how.
+        units: of the mesh, of tables and of ``inlet``: "mm", "cm" or "m"; None
+            guesses by the width of the lumen, and says so.
         mesh_frame: "LPS" or "RAS", of the mesh, of tables and of ``inlet``.
+        axes: where +x, +y and +z of that frame point in the patient, if the scan does
+            not stand upright, such as "ILP"; see ``units.upright``.
         name: of the anatomy, by default the mesh file's.
         inlet: (x, y, z) where the device enters: a free end if one is near, else the
             lumen is cut there. By default the end at which the centrelines start,
-            else the wide end farthest from their starts.
+            else the wide end farthest from their starts or from the widest end.
         root: name of the vessel that starts at the inlet.
+        rename: new names of computed vessels by their computed names.
         spacing: m, of the fine lattice of depths.
         wall: "prisms" (merged triangle prisms, near the surface) or "coacd" (convex
             decomposition, coarse; needs the package coacd).
         tolerance: m, of the prisms; see ``scan.wall.build_wall``.
         threshold: m, of CoACD; see ``coacd_wall.decompose_wall``.
-        progress: called with a line of text for every step.
+        progress: called with a line of text for every step, which begins with the
+            step's name, a key of ``SHARES``, or with "note".
+        notes: list to which what was guessed, mended and left out is added.
 
     Returns:
         The anatomy, in metres, LPS. Radii are those of the largest sphere in the
@@ -88,7 +101,8 @@ def import_scan(
 
     Raises:
         FileNotFoundError: if a file is missing.
-        ValueError: if a file or an option is not as stated; says how to mend it.
+        ValueError: if a file or an option is not as stated, or the tree that results
+            does not agree with the surface; says how to mend it.
         ImportError: if ``wall`` is "coacd" and the package is missing.
     """
     threshold = _check_wall(wall, threshold)
@@ -97,125 +111,156 @@ def import_scan(
     def say(text: str) -> None:
         log.info(text)
         if progress is not None:
-            progress(f"{time.monotonic() - started:6.1f} s  {text}")
+            progress(text)
 
-    scale, sign = metres_per(units), frame_sign(mesh_frame)
-    curves = _read_curves(centreline_paths, units, mesh_frame, root)
-    if inlet is not None:
-        inlet = np.asarray(inlet, dtype=np.float64)
-        if inlet.shape != (3,) or not np.isfinite(inlet).all():
-            raise ValueError(f"inlet is {inlet!r}; give (x, y, z) in {units}.")
-        inlet = inlet * sign * scale
-    vertices, faces = read_mesh(mesh_path, units, mesh_frame)
-    say(f"mesh: {len(faces)} triangles, {len(curves)} centrelines")
+    def note(text: str) -> None:
+        if notes is not None:
+            notes.append(text)
+        say(f"note: {text}")
+
+    frame_sign(mesh_frame), upright(axes)
+    if units is not None:
+        metres_per(units)
+    place = _as_point(inlet)
+    _check_paths(centreline_paths)
+    for path in centreline_paths:
+        read_curve(path, units or "mm", mesh_frame)  # before the long steps
+    lumen = read_lumen(mesh_path, units, mesh_frame, axes, say)
+    for text in lumen.notes:
+        note(text)
+    if place is not None:
+        turn = upright(axes)
+        place = turn @ (place * frame_sign(mesh_frame) * metres_per(lumen.units))
+    vertices, faces = lumen.vertices, lumen.faces
     measure = MeshDepth(vertices, faces)
-    if inlet is not None and measure(inlet[None])[0] < -NEAR_INLET:
-        raise ValueError(
-            f"inlet is {-measure(inlet[None])[0] * 1e3:.1f} mm away from the lumen; "
-            f"give a point in the lumen, or at most {NEAR_INLET * 1e3:g} mm from the "
-            "end by which the device enters."
-        )
-    lines = {curve.name: _inside_part(curve, measure, units) for curve in curves}
-    say("depth: measuring the lumen, the longest step")
-    field = DepthField.from_mesh(vertices, faces, spacing)
-    say(f"depth: {len(field.bricks)} bricks of {spacing * 1e3:g} mm")
+    _check_near(place, measure)
+    curves = _read_curves(centreline_paths, lumen, mesh_frame, axes, root)
+    lines = {curve.name: _inside_part(curve, measure, lumen.units) for curve in curves}
+    say(f"depth: measuring the lumen of {len(faces):,} triangles")
+    field = compiled(depth_field(vertices, faces, spacing))
+    say(f"tree: {len(field.bricks):,} bricks of depth, looking for vessels")
     ways = Ways(field)
-    lines = {key: _proximal_first(line, field) for key, line in lines.items()}
-    entry, far = plan_inlet(ways, list(lines.values()), inlet)
-    tree = name_trunk(grow_tree(field, ways, lines, entry, far, root))
-    at_end = inlet is None or not np.allclose(entry, inlet)
-    tree, opening = _place_inlet(tree, at_end)
+    for pinch in ways.pinches:
+        note(f"the lumen is pinched to a slit at {_mm(pinch)}; vessels go on beyond")
+    tree, opening = _tree(field, ways, lines, place, root, rename or {}, note)
     say(f"tree: {', '.join(_summary(tree))}")
-    cut_vertices, shell, cap = cut_open(vertices, faces, opening)
+    anatomy = Anatomy(
+        name=name or Path(mesh_path).stem,
+        tree=tree,
+        surface=Surface(vertices, faces),
+        wall=(),
+        inlet=opening,
+        goals=_goals(tree, root),
+        ends=_ends(tree, opening),
+        field=field,
+    )
+    anatomy = _walled(anatomy, wall, tolerance, threshold, say, note)
+    say(
+        f"done: {len(anatomy.wall)} wall pieces in {time.monotonic() - started:.0f} s, "
+        f"goals {', '.join(anatomy.goals) or 'none'}"
+    )
+    return anatomy
+
+
+def _tree(field, ways, lines, place, root, rename, note) -> tuple[VesselTree, Inlet]:
+    """The tree of given lines, or of computed ones, and its inlet."""
+    ends = free_ends(ways)
+    lines = {key: _proximal_first(line, field) for key, line in lines.items()}
+    entry = plan_inlet(ways, ends, list(lines.values()), place)
+    drawn = bool(lines)
+    if drawn:
+        if rename:
+            raise ValueError("rename is for computed centrelines; rename the files.")
+        lines, added = continued(ways, ends, lines, entry)
+        for key, length in added.items():
+            note(
+                f"centreline {key!r} stops {length * 1e3:.0f} mm before its vessel "
+                "ends; continued to the end"
+            )
+    else:
+        lines = _computed(ways, ends, entry, root, rename, note)
+    tree = grow_tree(field, ways, lines, entry.position, entry.far, root, drawn)
+    return _place_inlet(name_trunk(tree), entry.at_end)
+
+
+def _computed(
+    ways: Ways,
+    ends: Sequence[FreeEnd],
+    entry: Entry,
+    root: str,
+    rename: Mapping[str, str],
+    note: Callable[[str], None],
+) -> dict[str, np.ndarray]:
+    found, thin = centrelines(ways, ends, entry)
+    if not found:
+        raise ValueError(
+            "no branch of the lumen lets a 5 Fr catheter "
+            f"({DEVICE_RADIUS * 2e3:.2f} mm) in for 15 mm, so there is no goal; its "
+            f"ends are {listed(ends)}."
+        )
+    start = ways.node(entry.position)
+    if entry.far is None:
+        line = found[0].points
+    else:
+        line = ways.points[ways.trace(ways.deepest_from(start), ways.node(entry.far))]
+    names = name_branches(line, [f.points for f in found], entry.far is not None)
+    names = renamed(names, rename, root)
+    open_names = [key for key in names if key.startswith("branch_")]
+    if open_names:
+        places = ", ".join(
+            f"{key} ends at {_mm(f.tip)}"
+            for key, f in zip(names, found, strict=True)
+            if key in open_names
+        )
+        note(f"geometry names no {places}; name them with rename (--rename)")
+    if thin:
+        note(f"{thin} branches too thin or short for a 5 Fr catheter left out")
+    note(f"inlet chosen at {_mm(entry.position)}")
+    return {key: f.points for key, f in zip(names, found, strict=True)}
+
+
+def _walled(anatomy, wall, tolerance, threshold, say, note) -> Anatomy:
+    """The anatomy cut open at its inlet and surrounded by its wall, and proved."""
+    vertices, faces = anatomy.surface.vertices, np.asarray(anatomy.surface.faces)
+    field, tree, opening = anatomy.field, anatomy.tree, anatomy.inlet
+    cut_vertices, shell, cap = cut_open(vertices, faces.astype(np.int64), opening)
+    closed = np.concatenate([shell, cap])
+    anatomy = Anatomy(
+        name=anatomy.name,
+        tree=tree,
+        surface=_compact(cut_vertices, closed),
+        wall=(),
+        inlet=opening,
+        goals=anatomy.goals,
+        ends=anatomy.ends,
+        field=compiled(shut_behind(field, cut_vertices, closed, opening)),
+    )
+    for check in check_tree(anatomy):
+        if check.passed:
+            continue
+        if check.name == "start of the device" or not anatomy.goals:
+            note(f"{check.name}: {check.detail}")
+            continue
+        raise ValueError(
+            f"the tree does not agree with the surface ({check.name}): {check.detail}. "
+            "Mend the surface or the centrelines there, leave that branch out, or let "
+            "the centrelines be computed."
+        )
     if wall == "coacd":
         pieces, _ = coacd_wall.decompose_wall(
             cut_vertices, shell, field, tree, threshold=threshold, progress=say
         )
     else:
-        lines = [vessel.centreline.points for vessel in tree.vessels.values()]
         pieces, _ = build_wall(
             cut_vertices,
             shell,
             field,
-            np.concatenate(lines),
+            np.concatenate([v.centreline.points for v in tree.vessels.values()]),
             tolerance=tolerance,
             progress=say,
         )
     pieces += tuple(inlet_cap(cut_vertices[cap[:, :2]], opening))
-    closed = np.concatenate([shell, cap])
-    anatomy = Anatomy(
-        name=name or Path(mesh_path).stem,
-        tree=tree,
-        surface=_compact(cut_vertices, closed),
-        wall=pieces,
-        inlet=opening,
-        goals=_goals(tree, root),
-        ends=_ends(tree, opening),
-        field=shut_behind(field, cut_vertices, closed, opening),
-    )
-    say(f"done: {len(pieces)} wall pieces, goals {', '.join(anatomy.goals)}")
-    return anatomy
-
-
-def describe(anatomy: Anatomy) -> dict[str, Any]:
-    """What an import gave, as JSON values in millimetres.
-
-    The wall is measured, not quoted: how far it stands in the lumen, rays that slip
-    through it, and vessels it closes to a 5 Fr catheter.
-    """
-    vessels = {}
-    for key, vessel in anatomy.tree.vessels.items():
-        line = vessel.centreline
-        own = line.arc_length >= vessel.ostium
-        vessels[key] = {
-            "parent": vessel.parent,
-            "length_mm": round(line.length * 1e3, 1),
-            "ostium_mm": round(vessel.ostium * 1e3, 1),
-            "median_radius_mm": round(float(np.median(line.radii[own])) * 1e3, 2),
-            "passable_mm": round(passable_length(vessel) * 1e3, 1),
-        }
-    goals = {}
-    for key in anatomy.goals:
-        route = anatomy.route(key)
-        goals[key] = {
-            "vessel": anatomy.goals[key].vessel,
-            "route_mm": round(route.length * 1e3, 1),
-            "narrowest_radius_mm": round(float(route.radii.min()) * 1e3, 2),
-        }
-    return {
-        "name": anatomy.name,
-        "wall_pieces": len(anatomy.wall),
-        "wall": measure_wall(anatomy),
-        "surface_triangles": len(anatomy.surface.faces),
-        "volume_ml": round(anatomy.surface.volume * 1e6, 1),
-        "inlet": {
-            "vessel": anatomy.inlet.vessel,
-            "position_mm": np.round(anatomy.inlet.position * 1e3, 1).tolist(),
-            "radius_mm": round(float(anatomy.inlet.radius) * 1e3, 2),
-        },
-        "vessels": vessels,
-        "goals": goals,
-    }
-
-
-def measure_wall(anatomy: Anatomy) -> dict[str, Any]:
-    """Figures of the wall, JSON values in millimetres; see ``fidelity``."""
-
-    def summary(values: fidelity.Distribution) -> dict[str, float]:
-        return {
-            key: round(getattr(values, key) * 1e3, 3) for key in ("mean", "p95", "max")
-        }
-
-    found = fidelity.intrusion(anatomy, SAMPLING)
-    rays = fidelity.coverage(anatomy, RAYS)
-    passage = fidelity.patency(anatomy, DEVICE_RADIUS, spacing=SAMPLING)
-    return {
-        "intrusion_mm": summary(found.inside),
-        "recession_mm": summary(found.recession),
-        "rays": rays.rays,
-        "leaks": rays.leaks,
-        "closed_to_5fr": list(passage.blocked),
-    }
+    return replace(anatomy, wall=pieces, field=plain(anatomy.field))
 
 
 def passable_length(vessel: Vessel, radius: float = DEVICE_RADIUS) -> float:
@@ -243,13 +288,39 @@ def _check_wall(wall: str, threshold: float | None) -> float:
     )
 
 
-def _read_curves(paths, units, frame, root) -> list[Curve]:
-    if isinstance(paths, str | Path) or len(paths) == 0:
+def _as_point(inlet: Sequence[float] | None) -> np.ndarray | None:
+    if inlet is None:
+        return None
+    try:
+        point = np.asarray(inlet, dtype=np.float64)
+    except (TypeError, ValueError):
+        point = np.empty(0)
+    if point.shape != (3,) or not np.isfinite(point).all():
+        raise ValueError(f"inlet is {inlet!r}; give (x, y, z) in the mesh's unit.")
+    return point
+
+
+def _check_near(place: np.ndarray | None, measure: MeshDepth) -> None:
+    if place is not None and measure(place[None])[0] < -NEAR_INLET:
         raise ValueError(
-            f"centreline_paths is {paths!r}; give a list of at least one file, one per "
-            "branch (3D Slicer .mrk.json or .csv)."
+            f"inlet is {-measure(place[None])[0] * 1e3:.1f} mm away from the lumen; "
+            f"give a point in the lumen, or at most {NEAR_INLET * 1e3:g} mm from the "
+            "end by which the device enters."
         )
-    curves = [read_curve(path, units, frame) for path in paths]
+
+
+def _check_paths(paths: Sequence[str | Path]) -> None:
+    if isinstance(paths, str | Path):
+        raise ValueError(
+            f"centreline_paths is {paths!r}; give a list of files, one per branch (3D "
+            "Slicer .mrk.json or .csv), or none to have them computed."
+        )
+
+
+def _read_curves(paths, lumen: Lumen, frame, axes, root) -> list[Curve]:
+    curves = [read_curve(path, lumen.units, frame) for path in paths]
+    turn = upright(axes)
+    curves = [replace(curve, points=curve.points @ turn.T) for curve in curves]
     names = [curve.name for curve in curves]
     for curve in curves:
         if names.count(curve.name) > 1 or curve.name == root:
@@ -345,3 +416,7 @@ def _summary(tree: VesselTree) -> list[str]:
         + (f" from {vessel.parent}" if vessel.parent else "")
         for key, vessel in tree.vessels.items()
     ]
+
+
+def _mm(point: np.ndarray) -> str:
+    return "(" + ", ".join(f"{x * 1e3:.0f}" for x in point) + ") mm"

@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from cathsim_dmc.anatomy.anatomy import Inlet
+from cathsim_dmc.anatomy.scan.mesh_depth import MeshDepth
 from cathsim_dmc.anatomy.scan.wall import adjacent_faces
-from cathsim_dmc.anatomy.wall.depth import BRICK, OUTER, QUANTUM, DepthField, MeshDepth
+from cathsim_dmc.anatomy.wall.depth import BRICK, OUTER, QUANTUM, DepthField
 
 
 def cut_open(

@@ -11,7 +11,7 @@ from cathsim_dmc.anatomy.scan.tree import ostium_of
 TRUNK = "bca"  # name of the common trunk of the right branches
 # Branches of which the brachiocephalic artery is the trunk.
 _RIGHT = re.compile(
-    r"(r|right_?)(cca|ica|eca|va|sa|sca|aa|(common_)?carotid\w*|vertebral\w*|subclavian\w*)"
+    r"(r|right_?)(cca|ica|eca|va|sa|sca|aa|(common_)?carotid\w*|vertebral\w*|subclavian\w*)(_\d+)?"
 )
 
 

@@ -1,0 +1,262 @@
+"""What a saved anatomy may hold: types, shapes, finite values, plausible places."""
+
+from __future__ import annotations
+
+import io
+import math
+import os
+import stat
+import zipfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+EXTENT = 2.5  # m, diagonal of the box around an anatomy
+FAR = 10.0  # m from the origin; scanners' frames begin within a few metres
+AROUND = 50e-3  # m, of the wall and of places outside the lumen's box
+OFF = 5e-3  # m, of inlet and goals off their centrelines, beside the radius
+FLAT = 1e-7  # m, least thickness of a wall piece
+LARGEST_TEXT = 20_000_000  # bytes of anatomy.json
+LARGEST_ARRAYS = 2_000_000_000  # bytes of all arrays, unpacked
+
+_NUMBER, _VECTOR, _TEXT = "a finite number", "three finite numbers", "a text"
+_FIELDS = {
+    "vessels": {"name": _TEXT, "parent": "a text or null", "ostium": _NUMBER},
+    "inlet": {
+        "vessel": _TEXT,
+        "position": _VECTOR,
+        "direction": _VECTOR,
+        "radius": _NUMBER,
+    },
+    "goals": {
+        "name": _TEXT,
+        "vessel": _TEXT,
+        "position": _VECTOR,
+        "arc_length": _NUMBER,
+    },
+    "ends": {
+        "vessel": _TEXT,
+        "position": _VECTOR,
+        "direction": _VECTOR,
+        "radius": _NUMBER,
+        "open": "true or false",
+    },
+}
+
+
+def read_regular(path: Path, most: int) -> bytes:
+    """Bytes of a regular file, not of one that a symbolic link leads to.
+
+    Raises:
+        FileNotFoundError: if there is none.
+        ValueError: if it is a link or no file, or larger than ``most`` bytes.
+    """
+    try:
+        handle = os.open(path, os.O_RDONLY | getattr(os, "O_NOFOLLOW", 0))
+    except FileNotFoundError:
+        raise
+    except OSError as error:
+        if path.is_symlink():
+            raise ValueError(
+                f"{path} is a symbolic link, which is not followed; put the file "
+                "itself there."
+            ) from error
+        raise
+    with os.fdopen(handle, "rb") as stream:
+        state = os.fstat(stream.fileno())
+        if not stat.S_ISREG(state.st_mode):
+            raise ValueError(f"{path} is no regular file.")
+        if state.st_size > most:
+            raise ValueError(
+                f"{path} has {state.st_size:,} bytes, more than the {most:,} that an "
+                "anatomy may have."
+            )
+        return stream.read()
+
+
+def read_arrays(data: bytes, path: Path) -> dict[str, np.ndarray]:
+    """Arrays of an npz file, nothing unpickled.
+
+    Raises:
+        ValueError: if it is damaged or its arrays would fill the memory.
+    """
+    try:
+        with zipfile.ZipFile(io.BytesIO(data)) as archive:
+            size = sum(entry.file_size for entry in archive.infolist())
+        if size > LARGEST_ARRAYS:
+            raise ValueError(f"its arrays unpack to {size:,} bytes")
+        with np.load(io.BytesIO(data), allow_pickle=False) as archive:
+            return {key: archive[key] for key in archive.files}
+    except (zipfile.BadZipFile, ValueError, OSError, EOFError, KeyError) as error:
+        raise ValueError(f"{path} is damaged: {error}.") from error
+
+
+def check_description(description: dict[str, Any], path: Path) -> None:
+    """Checks the entries of ``anatomy.json``; ValueError names a wrong one."""
+    for key, allowed in (("units", "m"), ("frame", "LPS")):
+        if description.get(key) != allowed:
+            raise ValueError(
+                f"{path}: {key} is {description.get(key)!r}; an anatomy is saved in "
+                f"{allowed!r} only. Write it again with Anatomy.save."
+            )
+    _check(path, "name", description.get("name"), _TEXT)
+    for key, fields in _FIELDS.items():
+        entries = description.get(key)
+        if key == "inlet":
+            entries = [entries]
+        if not isinstance(entries, list):
+            raise ValueError(f"{path}: {key} is {_short(entries)}; give a list.")
+        for number, entry in enumerate(entries):
+            where = key if key == "inlet" else f"{key}[{number}]"
+            if not isinstance(entry, dict) or set(entry) != set(fields):
+                raise ValueError(
+                    f"{path}: {where} is {_short(entry)}; give an object with "
+                    f"{', '.join(fields)}."
+                )
+            for name, kind in fields.items():
+                _check(path, f"{where}.{name}", entry[name], kind)
+    for key in ("vessels", "goals"):
+        names = [entry["name"] for entry in description[key]]
+        twice = next((name for name in names if names.count(name) > 1), None)
+        if twice is not None:
+            raise ValueError(f"{path}: {key} has {twice!r} twice.")
+
+
+def check_arrays(arrays: dict[str, np.ndarray], vessels: int, path: Path) -> None:
+    """Checks shapes, types and values of the arrays of an anatomy with ``vessels``."""
+    _array(arrays, "surface_vertices", "f", (-1, 3), path)
+    faces = _array(arrays, "surface_faces", "iu", (-1, 3), path)
+    corners = _array(arrays, "wall_vertices", "f", (-1, 3), path)
+    counts = _array(arrays, "wall_counts", "iu", (-1,), path)
+    if len(counts) and (counts.min() < 4 or counts.sum() != len(corners)):
+        raise ValueError(
+            f"{path}: wall_counts {_short(counts.tolist())} do not fit the "
+            f"{len(corners)} wall_vertices (at least 4 for each piece)."
+        )
+    vertices = arrays["surface_vertices"]
+    if not len(faces) or not len(vertices):
+        raise ValueError(f"{path}: the surface has no triangles.")
+    for index in range(vessels):
+        points = _array(arrays, f"vessel_{index}_points", "f", (-1, 3), path)
+        _array(arrays, f"vessel_{index}_radii", "f", (len(points),), path)
+    if "field_origin" in arrays:
+        _check_field(arrays, path)
+
+
+def check_places(anatomy: Any, path: Path) -> None:
+    """Checks that wall, inlet, goals and vessels lie where the lumen is."""
+    vertices = anatomy.surface.vertices
+    low, high = vertices.min(axis=0), vertices.max(axis=0)
+    size = float(np.linalg.norm(high - low))
+    if not 1e-3 <= size <= EXTENT or np.abs(vertices).max() > FAR:
+        raise ValueError(
+            f"{path}: the surface is {size:.3g} m across and reaches "
+            f"{np.abs(vertices).max():.3g} m from the origin (allowed 0.001 to "
+            f"{EXTENT:g} m, {FAR:g} m); its unit is not the metre."
+        )
+
+    def near(points: np.ndarray, what: str) -> None:
+        off = np.maximum(low - points, points - high).max()
+        if off > AROUND:
+            raise ValueError(
+                f"{path}: {what} lies {off:.3g} m outside the box of the surface "
+                f"(at most {AROUND:g} m)."
+            )
+
+    for index, piece in enumerate(anatomy.wall):
+        near(piece, f"wall piece {index}")
+        if np.linalg.svd(piece - piece.mean(axis=0), compute_uv=False)[-1] < FLAT:
+            raise ValueError(
+                f"{path}: wall piece {index} has no volume; write the anatomy again."
+            )
+    for vessel in anatomy.tree.vessels.values():
+        near(vessel.centreline.points, f"vessel {vessel.name!r}")
+    places = {"inlet": anatomy.inlet}
+    places |= {f"goal {name!r}": goal for name, goal in anatomy.goals.items()}
+    for what, place in places.items():
+        line = anatomy.tree.vessel(place.vessel).centreline
+        found = line.project(place.position)
+        gap = float(found.distance - found.radius)
+        if gap > OFF:
+            raise ValueError(
+                f"{path}: {what} lies {gap:.3g} m outside the vessel "
+                f"{place.vessel!r} that it is in (at most {OFF:g} m)."
+            )
+    for goal in anatomy.goals.values():
+        length = anatomy.tree.vessel(goal.vessel).centreline.length
+        if not 0.0 <= goal.arc_length <= length + OFF:
+            raise ValueError(
+                f"{path}: goal {goal.name!r} has the arc length {goal.arc_length:.3g} "
+                f"m; its vessel has 0 to {length:.3g} m."
+            )
+    for end in anatomy.ends:
+        near(end.position[None], f"an end of {end.vessel!r}")
+
+
+def _check_field(arrays: dict[str, np.ndarray], path: Path) -> None:
+    origin = _array(arrays, "field_origin", "f", (3,), path)
+    spacing = _array(arrays, "field_spacing", "f", (), path)
+    index = _array(arrays, "field_index", "i", (-1, -1, -1), path)
+    shape = tuple(n + 1 for n in index.shape)
+    _array(arrays, "field_coarse", "f", shape, path)
+    bricks = _array(arrays, "field_bricks", "i", (-1, 9, 9, 9), path)
+    if not 1e-5 <= float(spacing) <= 0.1 or np.abs(origin).max() > FAR:
+        raise ValueError(
+            f"{path}: the depth field has a spacing of {float(spacing):.3g} m and the "
+            f"origin {origin.tolist()}; its unit is not the metre."
+        )
+    if index.size and not -1 <= index.min() <= index.max() < len(bricks):
+        raise ValueError(
+            f"{path}: field_index names bricks {index.min()} to {index.max()}; there "
+            f"are {len(bricks)}."
+        )
+
+
+def _array(
+    arrays: dict[str, np.ndarray],
+    name: str,
+    kinds: str,
+    shape: tuple[int, ...],
+    path: Path,
+) -> np.ndarray:
+    """The array of a name, of one of the numpy ``kinds``; -1 stands for any size."""
+    if name not in arrays:
+        raise ValueError(f"{path} lacks the array {name!r}.")
+    array = arrays[name]
+    fits = array.ndim == len(shape) and all(
+        want in (-1, size) for want, size in zip(shape, array.shape, strict=True)
+    )
+    if array.dtype.kind not in kinds or not fits:
+        wanted = ", ".join("n" if n < 0 else str(n) for n in shape)
+        raise ValueError(
+            f"{path}: {name} is {array.dtype} of shape {array.shape}; it must be "
+            f"{'whole numbers' if 'f' not in kinds else 'floats'} of shape ({wanted})."
+        )
+    if not np.isfinite(array).all():
+        raise ValueError(f"{path}: {name} holds NaN or infinite values.")
+    return array
+
+
+def _check(path: Path, name: str, value: Any, kind: str) -> None:
+    def number(x: Any) -> bool:
+        return (
+            isinstance(x, int | float) and not isinstance(x, bool) and math.isfinite(x)
+        )
+
+    fine = {
+        _NUMBER: lambda: number(value),
+        _VECTOR: lambda: (
+            isinstance(value, list) and len(value) == 3 and all(map(number, value))
+        ),
+        _TEXT: lambda: isinstance(value, str) and 0 < len(value) < 200,
+        "a text or null": lambda: value is None or isinstance(value, str),
+        "true or false": lambda: isinstance(value, bool),
+    }[kind]()
+    if not fine:
+        raise ValueError(f"{path}: {name} is {_short(value)}; give {kind}.")
+
+
+def _short(value: Any) -> str:
+    text = repr(value)
+    return text if len(text) <= 80 else text[:77] + "..."

@@ -1,0 +1,314 @@
+"""Proof of a vessel tree against the surface it claims to run in."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
+
+from cathsim_dmc.anatomy.anatomy import Anatomy
+from cathsim_dmc.anatomy.centreline import Vessel
+from cathsim_dmc.anatomy.scan.mesh_depth import MeshDepth
+from cathsim_dmc.anatomy.wall.depth import DepthField
+from cathsim_dmc.anatomy.wall.pieces import INLET_HOLE_RADIUS
+
+SLACK = 0.3e-3  # m, by which a triangulated surface may cut into a tube
+STEP = 0.5e-3  # m, between the places of a centreline that are tested
+FREE = 12e-3  # m, of lumen beyond the end of a vessel, or this many radii:
+FREE_RADII = 4.0
+JOINS = 15e-3  # m of lumen between the end of a vessel and another that it joins
+PASSABLE = 0.6e-3  # m, depth of a lumen that counts as going on
+BESIDE = 15e-3  # m that two vessels may run in one lumen beyond their parting
+VOLUME = (0.5e-6, 2e-3)  # m^3 of a lumen
+RADIUS = (0.3e-3, 30e-3)  # m, median of a vessel
+WIDEST = 45e-3  # m
+START = 75e-3  # m past the inlet, deepest start of a device
+START_CLEARANCE = 1e-3  # m between the device and the wall there
+START_ROOM = 10e-3  # m between the head at the start and a goal's ostium
+
+
+@dataclass(frozen=True)
+class TreeCheck:
+    """One finding about a tree.
+
+    Attributes:
+        name: what was looked at.
+        passed: whether it is as it should be.
+        detail: the figures, and where it is wrong.
+    """
+
+    name: str
+    passed: bool
+    detail: str
+
+
+def check_tree(anatomy: Anatomy) -> list[TreeCheck]:
+    """Proves the tree of an anatomy against its surface.
+
+    Args:
+        anatomy: of any origin; its surface must be closed.
+
+    Returns:
+        One finding for each of: centrelines inside the lumen, every vessel in a lumen
+        of its own, branches on their parents, free ends, goals, sizes, the inlet, and
+        the start of the device.
+    """
+    surface = anatomy.surface
+    measure = MeshDepth(surface.vertices, np.asarray(surface.faces, dtype=np.int64))
+    return [
+        _inside(anatomy, measure),
+        _own_lumen(anatomy),
+        _parents(anatomy),
+        _free_ends(anatomy, measure),
+        _goals(anatomy),
+        _sizes(anatomy),
+        _inlet(anatomy, measure),
+        _start(anatomy, measure),
+    ]
+
+
+def _finding(name: str, wrong: list[str], fine: str) -> TreeCheck:
+    return TreeCheck(name, not wrong, "; ".join(wrong) if wrong else fine)
+
+
+def _mm(point: np.ndarray) -> str:
+    return "(" + ", ".join(f"{x * 1e3:.0f}" for x in point) + ") mm"
+
+
+def _inside(anatomy: Anatomy, measure: MeshDepth) -> TreeCheck:
+    wrong, least = [], np.inf
+    for key, vessel in anatomy.tree.vessels.items():
+        line = vessel.centreline
+        # At the very ends a flat cap is as near as one likes.
+        margin = min(0.5 * float(line.radii[-1]), 0.2 * line.length)
+        first = margin if vessel.parent is None else 0.0
+        # Densely, so that no stretch between two points leaves the lumen either.
+        s = np.arange(first, line.length - margin, STEP)
+        place = line.at(s)
+        depth = measure(place.position)
+        floor = np.minimum(0.25 * place.radius, SLACK)
+        worst = int((depth - floor).argmin())
+        least = min(least, float(depth.min()))
+        if depth[worst] < min(floor[worst], 0.1e-3) - SLACK * 0.5:
+            wrong.append(
+                f"{key} leaves the lumen {s[worst] * 1e3:.0f} mm from its start, at "
+                f"{_mm(place.position[worst])}, by {-depth[worst] * 1e3:.1f} mm"
+            )
+    return _finding(
+        "centrelines in the lumen", wrong, f"at least {least * 1e3:.2f} mm deep"
+    )
+
+
+def _own_lumen(anatomy: Anatomy) -> TreeCheck:
+    wrong = []
+    vessels = list(anatomy.tree.vessels.values())
+    for vessel in vessels:
+        s, own = _own_part(vessel)
+        for other in vessels:
+            if other is vessel or other.parent == vessel.name:
+                continue
+            place = other.centreline.project(own.position)
+            reach = 0.5 * np.minimum(place.radius, own.radius)
+            beside = place.distance < reach
+            if other.parent is not None:
+                beside &= place.arc_length > other.ostium
+            length = STEP * int(beside.sum())
+            if length > BESIDE:
+                wrong.append(
+                    f"{vessel.name} runs {length * 1e3:.0f} mm in the lumen of "
+                    f"{other.name}, around {_mm(own.position[beside.argmax()])}"
+                )
+    return _finding("every vessel in a lumen of its own", wrong, f"{len(vessels)}")
+
+
+def _own_part(vessel: Vessel):
+    line = vessel.centreline
+    s = np.arange(vessel.ostium, line.length, STEP)
+    return s, line.at(s)
+
+
+def _parents(anatomy: Anatomy) -> TreeCheck:
+    wrong = []
+    tree = anatomy.tree
+    for key, vessel in tree.vessels.items():
+        if vessel.parent is None:
+            continue
+        parent = tree.vessel(vessel.parent)
+        place = parent.centreline.project(vessel.centreline.points[0])
+        if place.distance > place.radius:
+            wrong.append(
+                f"{key} starts {place.distance * 1e3:.1f} mm from the centreline of "
+                f"{parent.name}, outside of it"
+            )
+        if parent.parent is not None and place.arc_length < parent.ostium - 2e-3:
+            wrong.append(
+                f"{key} leaves {parent.name} {place.arc_length * 1e3:.0f} mm from its "
+                f"start, before that has an ostium ({parent.ostium * 1e3:.0f} mm)"
+            )
+    return _finding("branches on their parents", wrong, "in order")
+
+
+def _free_ends(anatomy: Anatomy, measure: MeshDepth) -> TreeCheck:
+    wrong, farthest = [], 0.0
+    # The field is the same lumen, sampled, and asking it is faster.
+    depth = anatomy.field or measure
+    tree = anatomy.tree
+    for key, vessel in tree.vessels.items():
+        line = vessel.centreline
+        goes_on = any(
+            v.parent == key and tree.origin(v.name) > line.length - 2e-3
+            for v in tree.vessels.values()
+        )
+        if goes_on:
+            continue
+        end = line.at(line.length)
+        tail = line.radii[line.arc_length > line.length - 30e-3]
+        wide = float(max(tail.max(), end.radius))
+        ahead = _lumen_beyond(depth, end.position, end.tangent, wide)
+        beyond = float(np.linalg.norm(ahead - end.position, axis=1).max(initial=0.0))
+        if beyond <= max(FREE, FREE_RADII * wide):
+            farthest = max(farthest, beyond)
+            continue
+        # Or it ends in another vessel, where a ring of vessels closes.
+        near = ahead[np.linalg.norm(ahead - end.position, axis=1) < JOINS + wide]
+        others = [v.centreline for v in tree.vessels.values() if v is not vessel]
+        places = [other.project(near) for other in others]
+        if any((place.distance < 0.7 * place.radius).any() for place in places):
+            continue
+        wrong.append(
+            f"{key} ends at {_mm(end.position)}, but its lumen goes on for "
+            f"{beyond * 1e3:.0f} mm or more"
+        )
+    return _finding(
+        "vessels end at ends of the surface",
+        wrong,
+        f"at most {farthest * 1e3:.1f} mm before",
+    )
+
+
+def _lumen_beyond(
+    depth: DepthField | MeshDepth,
+    position: np.ndarray,
+    tangent: np.ndarray,
+    radius: float,
+) -> np.ndarray:
+    """Lattice points (n, 3) of the passable lumen ahead of a place, within 60 mm.
+
+    Args:
+        depth: of the lumen.
+        position: (3,) m, in the lumen.
+        tangent: (3,), unit, ahead.
+        radius: m, of the lumen up to here: what lies behind is cut off there.
+    """
+    spacing = float(np.clip(radius / 3.0, 0.5e-3, 2.0e-3))
+    reach = max(24 * spacing, (FREE_RADII + 1.5) * radius)
+    steps = np.arange(-reach, reach + 1e-9, spacing)
+    local = np.stack(np.meshgrid(steps, steps, steps, indexing="ij"), -1)
+    local = local.reshape(-1, 3)
+    along = local @ tangent
+    aside = np.linalg.norm(local - along[:, None] * tangent, axis=1)
+    behind = (along < 0.0) & (along > -2.0 * spacing) & (aside < 1.6 * radius + 2e-3)
+    points = local[~behind] + position
+    points = points[depth(points) > PASSABLE]
+    if not len(points):
+        return points
+    pairs = cKDTree(points).query_pairs(1.8 * spacing, output_type="ndarray")
+    n = len(points)
+    link = coo_matrix((np.ones(len(pairs)), pairs.T), shape=(n, n))
+    label = connected_components(link, directed=False)[1]
+    gap = np.linalg.norm(points - position, axis=1)
+    gap[(points - position) @ tangent < -1e-9] = np.inf
+    nearest = int(gap.argmin())
+    if gap[nearest] > radius + 2.0 * spacing:
+        return points[:0]
+    return points[label == label[nearest]]
+
+
+def _goals(anatomy: Anatomy) -> TreeCheck:
+    wrong = []
+    for name, goal in anatomy.goals.items():
+        line = anatomy.tree.vessel(goal.vessel).centreline
+        off = float(np.linalg.norm(line.at(goal.arc_length).position - goal.position))
+        if off > 1e-3:
+            wrong.append(
+                f"{name} lies {off * 1e3:.1f} mm from its place in {goal.vessel}"
+            )
+        depths = anatomy.tree.depths(goal.position)
+        best = max(depths, key=lambda key: float(depths[key]))
+        if float(depths[goal.vessel]) < float(depths[best]) - 0.5e-3:
+            wrong.append(f"{name} lies in {best}, not in {goal.vessel}")
+        if not float(anatomy.depth(goal.position)) > 0.0:
+            wrong.append(f"{name} lies outside the lumen")
+    return _finding("goals in their vessels", wrong, f"{len(anatomy.goals)} goals")
+
+
+def _sizes(anatomy: Anatomy) -> TreeCheck:
+    wrong = []
+    volume = anatomy.surface.volume
+    if not VOLUME[0] <= volume <= VOLUME[1]:
+        wrong.append(
+            f"the lumen holds {volume * 1e6:.2g} ml (allowed {VOLUME[0] * 1e6:g} to "
+            f"{VOLUME[1] * 1e6:g}): the unit is wrong"
+        )
+    for key, vessel in anatomy.tree.vessels.items():
+        own = vessel.centreline.radii[vessel.centreline.arc_length >= vessel.ostium]
+        middle, widest = float(np.median(own)), float(own.max())
+        if not RADIUS[0] <= middle <= RADIUS[1] or widest > WIDEST:
+            wrong.append(
+                f"{key} has a radius of {middle * 1e3:.3g} mm (median; allowed "
+                f"{RADIUS[0] * 1e3:g} to {RADIUS[1] * 1e3:g})"
+            )
+    return _finding("sizes of vessels", wrong, f"{volume * 1e6:.0f} ml")
+
+
+def _inlet(anatomy: Anatomy, measure: MeshDepth) -> TreeCheck:
+    inlet, wrong = anatomy.inlet, []
+    line = anatomy.tree.vessel(inlet.vessel).centreline
+    place = line.project(inlet.position)
+    if place.distance > place.radius:
+        wrong.append(
+            f"it lies {place.distance * 1e3:.0f} mm from the centreline of "
+            f"{inlet.vessel}"
+        )
+    s = np.linspace(1e-3, max(2e-3, 0.5 * inlet.radius), 5)
+    ahead = measure(inlet.position + s[:, None] * inlet.direction)
+    if ahead.min() <= 0.0:
+        wrong.append("its direction does not lead into the lumen")
+    if inlet.radius < INLET_HOLE_RADIUS:
+        wrong.append(
+            f"its radius of {inlet.radius * 1e3:.2g} mm is less than that of the "
+            f"sheath's hole ({INLET_HOLE_RADIUS * 1e3:.2g} mm)"
+        )
+    return _finding("inlet", wrong, f"{inlet.radius * 2e3:.1f} mm wide")
+
+
+def _start(anatomy: Anatomy, measure: MeshDepth) -> TreeCheck:
+    """Whether a device that starts straight begins before every goal's ostium."""
+    inlet, wrong = anatomy.inlet, []
+    s = np.arange(START_CLEARANCE, START, STEP)
+    depth = measure(inlet.position + s[:, None] * inlet.direction)
+    # At the inlet's cap the surface is near, but open.
+    tight = (depth < START_CLEARANCE) & (s > 2.0 * inlet.radius)
+    run = float(s[tight.argmax()] if tight.any() else START)
+    head = inlet.position + run * inlet.direction
+    for name, goal in anatomy.goals.items():
+        if goal.vessel == inlet.vessel:
+            continue
+        lineage, tree = goal.vessel, anatomy.tree
+        while tree.vessel(lineage).parent not in (inlet.vessel, None):
+            lineage = tree.vessel(lineage).parent
+        branch = tree.vessel(lineage)
+        ostium = branch.centreline.at(branch.ostium).position
+        route = anatomy.route(name)
+        here = float(route.project(head).arc_length)
+        there = float(route.project(ostium).arc_length)
+        if here > there - START_ROOM:
+            wrong.append(
+                f"the ostium of {lineage} is {there * 1e3:.0f} mm from the inlet and a "
+                f"device starts {here * 1e3:.0f} mm deep, so that the way to {name} "
+                "is no way; choose an inlet farther back"
+            )
+    return _finding("start of the device", wrong, f"{run * 1e3:.0f} mm deep at most")

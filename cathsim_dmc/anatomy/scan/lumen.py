@@ -1,0 +1,82 @@
+"""A lumen as an import uses it: read, scaled, turned and mended."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from cathsim_dmc.anatomy.scan.mesh import guess_units, read_triangles
+from cathsim_dmc.anatomy.scan.repair import Opening, mend
+from cathsim_dmc.anatomy.scan.units import UNITS, frame_sign, metres_per, upright
+
+# Diagonal of the box around a vessel tree, m: an intracranial segment, a whole aorta
+# with arms and legs.
+SIZE = (15e-3, 2.5)
+
+
+@dataclass(frozen=True)
+class Lumen:
+    """The closed surface of a lumen.
+
+    Attributes:
+        vertices: (V, 3) m, LPS.
+        faces: (F, 3) int64, normals outwards.
+        units: of the file.
+        openings: vessel ends that were open and are capped now.
+        notes: what was guessed and what was mended, a line for each.
+    """
+
+    vertices: np.ndarray
+    faces: np.ndarray
+    units: str
+    openings: tuple[Opening, ...]
+    notes: tuple[str, ...]
+
+
+def read_lumen(
+    path: str | Path,
+    units: str | None = None,
+    frame: str = "LPS",
+    axes: str | None = None,
+    say: Callable[[str], None] = lambda text: None,
+) -> Lumen:
+    """Read the surface of a lumen and mend it.
+
+    Args:
+        path: OBJ, STL, PLY or VTP; ends open or capped, any orientation, thin or
+            with the wall's thickness.
+        units: of its coordinates, a key of ``units.UNITS``, or None to guess by the
+            lumen's width.
+        frame: "LPS" or "RAS".
+        axes: where +x, +y and +z of the scan point if it does not stand upright; see
+            ``units.upright``.
+        say: called with a line of text for every step.
+
+    Raises:
+        FileNotFoundError: if there is no such file.
+        ValueError: if it is no such surface; says how to mend it.
+    """
+    if units is not None:
+        metres_per(units)
+    sign, turn = frame_sign(frame), upright(axes)
+    vertices, faces = read_triangles(path)
+    say(f"mesh: {len(faces):,} triangles read")
+    try:
+        units, why = guess_units(vertices, faces, units)
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from error
+    vertices = (vertices * sign * UNITS[units]) @ turn.T
+    size = float(np.linalg.norm(np.ptp(vertices, axis=0)))
+    if not SIZE[0] <= size <= SIZE[1]:
+        raise ValueError(
+            f"{path} is {size:.3g} m across when its unit is {units!r}, which no "
+            f"vessel tree is (allowed {SIZE[0]:g} to {SIZE[1]:g} m). Check the unit in "
+            "which the mesh was exported."
+        )
+    mended = mend(str(path), vertices, faces)
+    return Lumen(
+        mended.vertices, mended.faces, units, mended.openings, (why, *mended.notes)
+    )

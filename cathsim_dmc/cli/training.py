@@ -1,0 +1,219 @@
+"""`cathsim train`: every setting of the algorithm and the task is a typed option."""
+
+import argparse
+import dataclasses
+import functools
+import json
+import operator
+import shlex
+import sys
+import typing
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import docstring_parser
+from tyro import conf
+
+from cathsim_dmc.cli.options import INTERRUPTED, NO_ANATOMY, OwnAnatomy
+
+_ALGORITHM, _PRESET = "ppo", "published"
+_SUMMARY = "Train an agent."
+_DETAILS = (
+    "The defaults of the settings are those of the algorithm and preset chosen; a run "
+    "that is resumed keeps its own."
+)
+# Shorter names of settings.
+_ALIASES = {"total_frames": "--frames", "num_threads": "--threads"}
+
+
+def command(arguments: Sequence[str]) -> Callable[..., int]:
+    """The command for a command line, whose options depend on the algorithm in it.
+
+    Args:
+        arguments: Arguments of `cathsim`. If they are for another command, it has no
+            options, only a line in the list of commands.
+
+    Raises:
+        ValueError: the run to be resumed has no readable settings.
+    """
+    if list(arguments[:1]) != ["train"]:
+
+        def unused() -> int:
+            raise AssertionError("the command line was read twice, differently")
+
+        unused.__doc__ = _SUMMARY
+        return unused
+    base, resumed = _base(arguments[1:])
+    kind = _options(base, resumed)
+
+    def train(options: Annotated[kind, conf.arg(name="")]) -> int:
+        return _run(options, base)
+
+    train.__doc__ = f"{_SUMMARY}\n\n{_DETAILS}"
+    return train
+
+
+def _base(arguments: Sequence[str]) -> tuple[Any, bool]:
+    """Settings that the options start from, and whether they are those of a run."""
+    # torchrl goes before dm_control.
+    from cathsim_dmc.agents.learners import LEARNERS, config_from_dict, make_config
+
+    parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
+    # Values may be missing here: that is an error that the real parser words.
+    for name in ("--algo", "--preset", "--out"):
+        parser.add_argument(name, nargs="?")
+    parser.add_argument("--resume", action="store_true")
+    given, _ = parser.parse_known_args(arguments)
+    path = Path(given.out or ".") / "config.json"
+    if given.resume and given.out and not given.preset and path.is_file():
+        try:
+            config = config_from_dict(dict(json.loads(path.read_text())))
+        except (ValueError, TypeError) as error:
+            raise ValueError(f"{path} holds no settings of a run: {error}") from error
+        if given.algo in (None, config.algorithm):
+            return config, True
+    algorithm = given.algo if given.algo in LEARNERS else _ALGORITHM
+    presets = LEARNERS[algorithm].config.presets
+    preset = given.preset if given.preset in presets else _PRESET
+    return make_config(algorithm, preset), False
+
+
+def _options(base: Any, resumed: bool) -> type:
+    """A dataclass of all options, from the fields of the settings."""
+    from cathsim_dmc.agents.learners import LEARNERS
+
+    field = dataclasses.field
+    task = {"default": base.task} if resumed else {}
+    fields: list[tuple[str, Any, Any]] = [
+        (
+            "task",
+            conf.Positional[_explained(str, "Task of `cathsim list`.", metavar="TASK")],
+            field(**task),
+        ),
+        (
+            "out",
+            _explained(
+                Path, "Directory of the run: checkpoints, metrics.csv, config.json."
+            ),
+            field(),
+        ),
+        (
+            "algo",
+            _explained(
+                Literal[tuple(LEARNERS)],
+                "Algorithm that learns; each has settings of its own.",
+            ),
+            field(default=base.algorithm),
+        ),
+        (
+            "preset",
+            _explained(
+                Literal[tuple(base.presets)],
+                "Named settings that the options below start from.",
+            ),
+            field(default=_PRESET),
+        ),
+        (
+            "resume",
+            _explained(
+                bool, "Whether to continue the run in OUT from its newest checkpoint."
+            ),
+            field(default=False),
+        ),
+        (
+            "quiet",
+            _explained(bool, "Whether to show no progress."),
+            field(default=False),
+        ),
+        ("anatomy", OwnAnatomy, field(default=NO_ANATOMY)),
+        (
+            "options",
+            Annotated[_task_options(base), conf.arg(name="task")],
+            field(default_factory=_task_options(base)),
+        ),
+    ]
+    helps = _field_helps(type(base))
+    for item in dataclasses.fields(base):
+        if item.name in ("task", "task_kwargs"):
+            continue
+        aliases = [_ALIASES[item.name]] if item.name in _ALIASES else None
+        kind = _explained(item.type, helps[item.name], aliases=aliases)
+        fields.append((item.name, kind, field(default=getattr(base, item.name))))
+    return dataclasses.make_dataclass("Train", fields, kw_only=True, frozen=True)
+
+
+@functools.cache
+def _task_kind(names: frozenset[str]) -> type:
+    """A dataclass of the task's options that are single values, None by default."""
+    from cathsim_dmc.tasks.config import NavigationConfig
+
+    helps = _field_helps(NavigationConfig)
+    fields = []
+    for name, kind in typing.get_type_hints(NavigationConfig).items():
+        kinds = [one for one in _alternatives(kind) if one in (str, int, float, bool)]
+        if kinds and name not in names:
+            either = functools.reduce(operator.or_, kinds) | None
+            help = f"{helps.get(name, '')} By default the task's own.".strip()
+            option = (name, _explained(either, help), dataclasses.field(default=None))
+            fields.append(option)
+    kind = dataclasses.make_dataclass("TaskOptions", fields, kw_only=True, frozen=True)
+    kind.__doc__ = "Options of the task."
+    return kind
+
+
+def _task_options(base: Any) -> type:
+    return _task_kind(frozenset(item.name for item in dataclasses.fields(base)))
+
+
+def _alternatives(kind: Any) -> tuple[Any, ...]:
+    """Types that a value may have, for a union more than one."""
+    return typing.get_args(kind) if not isinstance(kind, type) else (kind,)
+
+
+def _explained(kind: Any, text: str, **more: Any) -> Any:
+    return Annotated[kind, conf.arg(help=text, **more)]
+
+
+def _field_helps(kind: type) -> dict[str, str]:
+    """What the docstrings of a dataclass and its bases say of each field."""
+    helps: dict[str, str] = {}
+    for one in reversed(kind.__mro__):
+        if dataclasses.is_dataclass(one):
+            for entry in docstring_parser.parse(one.__doc__ or "").params:
+                helps[entry.arg_name] = " ".join((entry.description or "").split())
+    return helps
+
+
+def _run(options: Any, base: Any) -> int:
+    from cathsim_dmc import agents
+
+    names = {item.name for item in dataclasses.fields(base)}
+    given = {name: value for name, value in vars(options).items() if name in names}
+    wanted = {k: v for k, v in vars(options.options).items() if v is not None}
+    config = base.replace(
+        **given,
+        task_kwargs={**base.task_kwargs, **wanted, **options.anatomy.task_kwargs},
+    )
+    _check_task(config)
+    result = agents.train(
+        config, options.out, resume=options.resume, progress=not options.quiet
+    )
+    if result.interrupted:
+        again = ["cathsim", "train", config.task, "--out", str(options.out), "--resume"]
+        print(
+            f"interrupted after {result.frames} of {config.total_frames} frames, which "
+            f"are saved; go on with: {shlex.join(again)}",
+            file=sys.stderr,
+        )
+        return INTERRUPTED
+    print(f"{result.frames} frames in {result.seconds:.0f} s: {result.checkpoint}")
+    return 0
+
+
+def _check_task(config: Any) -> None:
+    """Load the task once, so that bad input fails before a run is set up."""
+    from cathsim_dmc import suite
+
+    kwargs = {**config.task_kwargs, "observation": config.observation}
+    suite.load(suite.DOMAIN, config.task, task_kwargs=kwargs).close()

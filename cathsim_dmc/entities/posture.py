@@ -1,0 +1,95 @@
+"""Joint angles that lay a chain of links along a line."""
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+# The first link has no hinge: the line must begin along it. rad
+_LARGEST_START_ANGLE = 1e-3
+
+
+def joints_along(
+    link_lengths: ArrayLike, line: ArrayLike, advance: float = 0.0
+) -> NDArray[np.float64]:
+    """Angles of the bending hinges that put every node of a chain on a line.
+
+    The chain is that of `entities.catheter`: link 0 slides along +z, every further
+    link bends about x, then about y of the link before it. Twist is zero, so rows in
+    order are the positions of `Catheter.bends`.
+
+    Args:
+      link_lengths: (n,) lengths of the links from proximal to distal, m.
+      line: points (k, 3) of the line, m, from the proximal end of link 0 at zero
+        insertion, in its frame: the line begins along +z, at least as far as
+        `advance` and link 0 reach.
+      advance: insertion of the chain, m: its way along the line from the first point.
+
+    Returns:
+      (n - 1, 2) float64, rad: about x and about y of joints 1 to n - 1.
+
+    Raises:
+      ValueError: if the line is too short, or does not begin along +z.
+    """
+    lengths = np.asarray(link_lengths, np.float64)
+    points = np.asarray(line, np.float64)
+    nodes = _nodes(lengths, points, advance)
+    directions = np.diff(nodes, axis=0) / lengths[:, None]
+    start = float(np.arccos(np.clip(directions[0, 2], -1.0, 1.0)))
+    if start > _LARGEST_START_ANGLE:
+        raise ValueError(
+            f"the line turns link 0 by {np.degrees(start):.2f}° away from +z, but it "
+            "has no hinge; begin the line with a straight piece along +z of "
+            f"{1e3 * (advance + lengths[0]):.1f} mm at least"
+        )
+    frame = np.eye(3)
+    angles = np.empty((len(lengths) - 1, 2))
+    for index, direction in enumerate(directions[1:]):
+        x, y, z = frame.T @ direction
+        about_x, about_y = np.arctan2(-y, z), np.arcsin(np.clip(x, -1.0, 1.0))
+        angles[index] = about_x, about_y
+        frame = frame @ _turn_x(about_x) @ _turn_y(about_y)
+    return angles
+
+
+def _nodes(lengths: np.ndarray, points: np.ndarray, advance: float) -> np.ndarray:
+    """Nodes (n + 1, 3) on the line, each one link from the one before it."""
+    steps = np.linalg.norm(np.diff(points, axis=0), axis=-1)
+    arc = np.concatenate([[0.0], np.cumsum(steps)])
+    if not 0 <= advance < arc[-1]:
+        raise ValueError(
+            f"advance is {advance} m; it must be from 0 to the line's {arc[-1]:.4f} m"
+        )
+    piece = int(np.searchsorted(arc, advance, "right")) - 1
+    share = (advance - arc[piece]) / steps[piece]
+    nodes = [points[piece] + share * (points[piece + 1] - points[piece])]
+    for number, length in enumerate(lengths):
+        centre = nodes[-1]
+        # First point of the line, from the last node on, that is one link away.
+        beyond = np.linalg.norm(points[piece + 1 :] - centre, axis=-1) >= length
+        if not beyond.any():
+            raise ValueError(
+                f"the line is {1e3 * arc[-1]:.1f} mm long and ends before link "
+                f"{number} of {len(lengths)}; the chain takes "
+                f"{1e3 * (advance + lengths.sum()):.1f} mm"
+            )
+        following = piece + int(np.argmax(beyond))
+        begin = centre if following == piece else points[following]
+        nodes.append(_crossing(begin, points[following + 1], centre, length))
+        piece = following
+    return np.array(nodes)
+
+
+def _crossing(begin, end, centre, radius: float) -> np.ndarray:
+    """Point between two points, the first in a sphere, the second not, on it."""
+    way, offset = end - begin, begin - centre
+    a, b, c = way @ way, way @ offset, offset @ offset - radius**2
+    return begin + (-b + np.sqrt(b * b - a * c)) / a * way
+
+
+def _turn_x(angle: float) -> np.ndarray:
+    c, s = np.cos(angle), np.sin(angle)
+    return np.array([[1, 0, 0], [0, c, -s], [0, s, c]])
+
+
+def _turn_y(angle: float) -> np.ndarray:
+    c, s = np.cos(angle), np.sin(angle)
+    return np.array([[c, 0, s], [0, 1, 0], [-s, 0, c]])

@@ -1,0 +1,305 @@
+"""The introducer sheath, straight and bent, and joints that follow a line."""
+
+import mujoco
+import numpy as np
+import pytest
+from dm_control import mjcf
+
+from cathsim_dmc.entities import contact, devices
+from cathsim_dmc.entities.arena import AngiographyArena
+from cathsim_dmc.entities.catheter import Catheter
+from cathsim_dmc.entities.posture import joints_along
+from cathsim_dmc.entities.sheath import CLEARANCE, Sheath, straight
+
+BEND = 0.04  # m
+LENGTH, STROKE = 0.3, 0.15  # m
+
+
+def bend(straight_length, radius=BEND, angle=np.pi / 2, points=60):
+    """Straight along +z from the origin, then an arc towards +x; (n, 3), m."""
+    turn = np.linspace(0, angle, points)
+    arc = np.stack([radius * (1 - np.cos(turn)), 0 * turn, radius * np.sin(turn)], -1)
+    return np.concatenate([[[0, 0, 0]], arc + [0, 0, straight_length]])
+
+
+class Rig:
+    """A device whose base slides along +z from the origin, in a sheath."""
+
+    def __init__(self, line):
+        arena = AngiographyArena()
+        arena.mjcf_model.option.timestep = 4e-3
+        self.catheter = Catheter(
+            "published", devices.Discretisation(working_length=LENGTH), stroke=STROKE
+        )
+        self.lengths = self.catheter.link_lengths
+        self.sheath = Sheath(
+            line, self.catheter.device.outer_radius, self.lengths.max()
+        )
+        arena.attach(self.sheath)
+        site = arena.mjcf_model.worldbody.add("site", name="start", pos=(0, 0, LENGTH))
+        arena.attach(self.catheter, site)
+        self.sheath.guide(self.catheter, LENGTH - self.sheath.length)
+        self.physics = mjcf.Physics.from_mjcf_model(arena.mjcf_model)
+        self.model, self.data = self.physics.model.ptr, self.physics.data.ptr
+
+    def pose(self, angles):
+        hinges = [self.model.joint(j.full_identifier) for j in self.catheter.bends]
+        for hinge, angle in zip(hinges, angles.ravel(), strict=True):
+            self.data.qpos[hinge.qposadr[0]] = angle
+        mujoco.mj_forward(self.model, self.data)
+
+    @property
+    def nodes(self):
+        links = [self.model.body(b.full_identifier).id for b in self.catheter.links]
+        head = self.model.site(self.catheter.head.full_identifier).id
+        return np.vstack([self.data.xpos[links], self.data.site_xpos[head]])
+
+    @property
+    def push_force(self):
+        return self.data.sensor("catheter/push_force").data[2]
+
+    @property
+    def penetration(self):
+        return max((-one.dist for one in self.data.contact), default=0.0)
+
+    def drive(self, command, seconds):
+        """Push force (T,) and penetration (T,) of every step."""
+        self.data.actuator("catheter/insertion").ctrl[0] = command
+        rows = []
+        for _ in range(round(seconds / self.model.opt.timestep)):
+            mujoco.mj_step(self.model, self.data)
+            rows.append((self.push_force, self.penetration))
+        return np.array(rows).T
+
+
+@pytest.fixture(scope="module")
+def straight_rig():
+    return Rig(straight(0.23) + [0, 0, 0.23])
+
+
+def sides(rig, kind):
+    model = rig.model
+    return [
+        model.geom(index)
+        for index in range(model.ngeom)
+        if model.geom(index).name.startswith("sheath/")
+        and model.geom(index).type[0] == getattr(mujoco.mjtGeom, f"mjGEOM_{kind}")
+    ]
+
+
+# Straight.
+
+
+def test_a_straight_sheath_has_a_boxed_mouth_behind_which_rods_reach_back(straight_rig):
+    half_width = straight_rig.catheter.device.outer_radius + CLEARANCE
+    assert straight_rig.sheath.bore_half_width == pytest.approx(half_width)
+    boxes, rods = sides(straight_rig, "BOX"), sides(straight_rig, "CAPSULE")
+    assert len(boxes) == len(rods) == 4
+    for box in boxes:
+        assert np.linalg.norm(box.pos[:2]) - box.size[0] == pytest.approx(half_width)
+        assert box.pos[2] + box.size[2] == pytest.approx(0.23)
+    behind = min(box.pos[2] - box.size[2] for box in boxes)
+    for rod in rods:
+        assert np.linalg.norm(rod.pos[:2]) - rod.size[0] == pytest.approx(half_width)
+        assert rod.pos[2] + rod.size[1] == pytest.approx(behind)
+        assert rod.pos[2] - rod.size[1] == pytest.approx(0)
+
+
+def test_the_bore_is_closed_all_round(straight_rig):
+    """Whichever way the device moves, a rod stops it within the corner's distance."""
+    radius = straight_rig.catheter.device.outer_radius
+    for angle in np.linspace(0, 2 * np.pi, 73):
+        way = np.linspace(0, 4e-3, 401)[:, None] * [np.cos(angle), np.sin(angle)]
+        blocked = np.zeros(len(way), bool)
+        for rod in sides(straight_rig, "CAPSULE"):
+            distance = np.linalg.norm(way - rod.pos[:2], axis=-1)
+            blocked |= distance < rod.size[0] + radius
+        first = int(np.argmax(blocked))
+        assert 0.3e-3 < np.linalg.norm(way[first]) < 0.6e-3
+        assert blocked[first:].all()
+
+
+def test_the_sheath_is_frictionless_and_only_guides_the_device(straight_rig):
+    model = straight_rig.model
+    assert model.npair > 0
+    for rod in sides(straight_rig, "CAPSULE") + sides(straight_rig, "CYLINDER"):
+        assert rod.contype[0] == rod.conaffinity[0] == 0
+    for box in sides(straight_rig, "BOX"):
+        assert box.condim[0] == 1 and box.priority[0] == 1
+        assert box.contype[0] == 1 and box.conaffinity[0] == 0
+    assert set(model.pair_dim) == {1}
+    for solref in model.pair_solref:
+        np.testing.assert_array_equal(solref, contact.CONTACT_SOLREF)
+
+
+def test_every_link_that_can_meet_the_sheath_is_paired(straight_rig):
+    model = straight_rig.model
+    paired = {model.geom(int(index)).name for index in model.pair_geom1} | {
+        model.geom(int(index)).name for index in model.pair_geom2
+    }
+    starts = np.cumsum(straight_rig.lengths) - straight_rig.lengths
+    for index, start in enumerate(starts):
+        if start < 0.21:
+            assert f"catheter/link_{index}" in paired
+    assert f"catheter/link_{len(starts) - 1}" not in paired
+
+
+def test_the_sheath_holds_a_device_that_is_pushed_aside(straight_rig):
+    rig = straight_rig
+    mujoco.mj_resetData(rig.model, rig.data)
+    body = rig.model.body("catheter/link_6").id
+    # Into a corner, where the bore gives way most.
+    for share in np.linspace(0, 1, 11):
+        rig.data.xfrc_applied[body, :2] = 0.7 * share
+        rig.drive(0.0, 0.08)
+    _, penetration = rig.drive(0.0, 1.0)
+    inside = rig.nodes[:13]
+    assert np.abs(inside[:, :2]).max() < CLEARANCE + 0.35e-3
+    assert penetration.max() < 0.35e-3
+
+
+def test_sheath_ends_at_the_inlet_and_reaches_over_the_chain(shared_environment):
+    environment = shared_environment("type1_bca")
+    task = environment.task
+    model = environment.physics.model.ptr
+    data = mujoco.MjData(model)
+    mujoco.mj_kinematics(model, data)
+    body = model.body("sheath/bore").id
+    np.testing.assert_allclose(data.xpos[body], task.anatomy.inlet.position, atol=1e-9)
+    axis = data.xmat[body].reshape(3, 3)[:, 2]
+    np.testing.assert_allclose(axis, task.anatomy.inlet.direction, atol=1e-9)
+    base = data.xpos[model.body("catheter/link_0").id]
+    behind = (task.anatomy.inlet.position - base) @ axis
+    assert behind == pytest.approx(task.sheath.length, abs=1e-9)
+
+
+# Bent.
+
+
+@pytest.fixture(scope="module")
+def bent_rig():
+    return Rig(bend(0.2))
+
+
+def beyond(line, length=0.15):
+    """The line, gone on straight from its end."""
+    direction = (line[-1] - line[-2]) / np.linalg.norm(line[-1] - line[-2])
+    return np.concatenate([line, line[-1:] + length * direction])
+
+
+def test_a_device_laid_along_a_bent_sheath_touches_nothing(bent_rig):
+    mujoco.mj_resetData(bent_rig.model, bent_rig.data)
+    bent_rig.pose(joints_along(bent_rig.lengths, beyond(bend(0.2))))
+    assert bent_rig.data.ncon == 0
+    bent_rig.pose(np.zeros((len(bent_rig.lengths) - 1, 2)))
+    assert bent_rig.data.ncon > 0
+
+
+def test_a_device_goes_round_a_bend_without_jam(bent_rig):
+    rig = bent_rig
+    mujoco.mj_resetData(rig.model, rig.data)
+    rig.pose(joints_along(rig.lengths, beyond(bend(0.2))))
+    rig.drive(0.0, 1.0)
+    push, depth = rig.drive(1.0, 3.5)
+    insertion = rig.data.joint("catheter/insertion").qpos[0]
+    assert insertion > 0.9 * 0.04 * 3.5
+    # Bending and unbending a damped rod takes some force; friction would add much.
+    assert push.max() < 0.05 and depth.max() < 0.3e-3
+    in_bend = rig.nodes[(rig.nodes[:, 2] > 0.2) & (rig.nodes[:, 0] < 0.035)]
+    assert len(in_bend) >= 2
+    # On the inner side of the bend the bore is a link's sagitta, 0.9 mm, wider.
+    assert distance_to(bend(0.2), in_bend).max() < 1.6e-3
+    pull, depth = rig.drive(-1.0, 3.0)
+    # The reversal is sudden, and swings the free end back.
+    assert np.abs(pull).max() < 0.2 and depth.max() < 0.4e-3
+    assert rig.data.joint("catheter/insertion").qpos[0] < 0.03
+    assert not any(warning.number for warning in rig.data.warning)
+
+
+def test_the_same_push_gives_the_same_bits(bent_rig):
+    paths = []
+    for _ in range(2):
+        mujoco.mj_resetData(bent_rig.model, bent_rig.data)
+        bent_rig.pose(joints_along(bent_rig.lengths, beyond(bend(0.2))))
+        bent_rig.drive(1.0, 0.4)
+        paths.append(bent_rig.data.qpos.copy())
+    np.testing.assert_array_equal(*paths)
+
+
+@pytest.mark.parametrize(
+    ("line", "message"),
+    [
+        (np.zeros((1, 3)), r"shape \(1, 3\)"),
+        (np.zeros((4, 2)), r"shape \(4, 2\)"),
+        ([[0, 0, 0], [0, 0, 0]], "repeats a point"),
+        ([[0, 0, 0], [0, 0, np.nan]], "not finite"),
+        (bend(0.1, radius=0.004), "turns by .*smooth the line"),
+    ],
+)
+def test_lines_that_no_sheath_follows(line, message):
+    with pytest.raises(ValueError, match=message):
+        Sheath(np.asarray(line, float), 0.8e-3)
+
+
+@pytest.mark.parametrize("radius", [0.0, -1e-3, np.nan])
+def test_sizes_are_checked(radius):
+    with pytest.raises(ValueError, match="must be positive"):
+        Sheath(straight(0.1), radius)
+    with pytest.raises(ValueError, match="must be positive"):
+        Sheath(straight(0.1), 1e-3, wall=radius)
+
+
+# Joints along a line.
+
+
+def distance_to(line, points):
+    """Distance of points (m, 3) from a polyline, m."""
+    start, way = line[:-1], np.diff(line, axis=0)
+    offset = points[:, None] - start
+    share = np.clip(np.vecdot(offset, way) / np.vecdot(way, way), 0, 1)
+    return np.linalg.norm(offset - share[..., None] * way, axis=-1).min(1)
+
+
+@pytest.mark.parametrize("turn", [0.0, 1.0, 2.5, 4.0])
+def test_nodes_of_the_chain_lie_on_an_arc(bent_rig, turn):
+    """Whatever side the arc bends to, nodes lie on it within 0.3 mm."""
+    spin = np.array(
+        [[np.cos(turn), -np.sin(turn), 0], [np.sin(turn), np.cos(turn), 0], [0, 0, 1]]
+    )
+    line = bend(0.06, angle=4.5, points=200) @ spin.T
+    line = beyond(line)
+    mujoco.mj_resetData(bent_rig.model, bent_rig.data)
+    bent_rig.pose(joints_along(bent_rig.lengths, line))
+    nodes = bent_rig.nodes
+    assert distance_to(line, nodes).max() < 0.3e-3
+    on_arc = nodes[1:][np.cumsum(bent_rig.lengths) > 0.08][:8]
+    centre = spin @ [BEND, 0, 0.06]
+    radius = np.linalg.norm(on_arc - centre, axis=-1)
+    np.testing.assert_allclose(radius, BEND, atol=0.3e-3)
+
+
+def test_the_chain_advances_along_the_line(bent_rig):
+    line = beyond(bend(0.2))
+    mujoco.mj_resetData(bent_rig.model, bent_rig.data)
+    start = bent_rig.model.joint("catheter/insertion").qposadr[0]
+    bent_rig.data.qpos[start] = 0.03
+    bent_rig.pose(joints_along(bent_rig.lengths, line, advance=0.03))
+    bent = bent_rig.nodes[-1]
+    np.testing.assert_allclose(bent[2], 0.24, atol=1e-3)
+    expected = LENGTH + 0.03 - 0.2 - BEND * np.pi / 2 + BEND
+    assert bent[0] == pytest.approx(expected, abs=2e-3)
+
+
+def test_a_straight_line_leaves_the_joints_straight():
+    angles = joints_along([0.02, 0.01, 0.01], straight(0.1) + [0, 0, 0.1])
+    np.testing.assert_array_equal(angles, np.zeros((2, 2)))
+
+
+def test_lines_that_no_chain_follows():
+    line = straight(0.1) + [0, 0, 0.1]
+    with pytest.raises(ValueError, match="ends before link 2 of 3"):
+        joints_along([0.05, 0.04, 0.02], line)
+    with pytest.raises(ValueError, match="link 0 by 90.00° away from .z"):
+        joints_along([0.01, 0.01], line @ [[1, 0, 0], [0, 0, 1], [0, 1, 0]])
+    with pytest.raises(ValueError, match="advance is 0.2 m"):
+        joints_along([0.01], line, advance=0.2)

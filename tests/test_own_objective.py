@@ -1,0 +1,137 @@
+"""An objective of one's own means the same in composer and in the batch."""
+
+import importlib.util
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from cathsim_dmc import suite
+from cathsim_dmc.simulation.batch import BatchSimulation
+from cathsim_dmc.tasks.config import NavigationConfig
+from cathsim_dmc.tasks.navigation import Navigation
+from cathsim_dmc.tasks.objectives import Cannulation, Outcome
+from cathsim_dmc.tasks.scene import Scene
+
+EXAMPLE = Path(__file__).parents[1] / "examples" / "own_objective.py"
+SEEDS = (4, 5)
+STEPS = 40
+
+
+@pytest.fixture(scope="module")
+def example():
+    spec = importlib.util.spec_from_file_location("own_objective", EXAMPLE)
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+class Advance:
+    """No relative of `Cannulation`: pays for insertion, done at 20 mm of it."""
+
+    goal_radius = 1e-3
+
+    def __init__(self, goal):
+        self.goal = goal
+
+    def outcome(self, measurement):
+        insertion = measurement.readings.insertion
+        terms = {"advance": insertion, "load": -measurement.wall_force.peak_sum}
+        return Outcome(sum(terms.values()), insertion > 0.02, terms)
+
+    def path_distance(self, head):
+        return np.linalg.norm(head - self.goal, axis=-1)
+
+
+def advancing(random=None, **options):
+    anatomy = suite.load_anatomy("simple1")
+    config = NavigationConfig(**options)
+    scene = Scene.build(anatomy, "lcca", config)
+    return Navigation(scene, Advance(scene.goal.position), config, random)
+
+
+def gentle(example, random=None, **options):
+    return suite.make_task(example.TASK, random=random, **options)
+
+
+def pushing(seed):
+    """Steering and pushing on, which meets the wall."""
+    random = np.random.default_rng(seed)
+    rows = random.uniform(-1, 1, (STEPS, len(SEEDS), 21))
+    rows[..., 20] = 1.0
+    return rows
+
+
+def assert_equal_rewards(make):
+    """Steps composer environments and a batch alike; returns all rewards."""
+    batch = BatchSimulation(make(), len(SEEDS), seeds=SEEDS, num_threads=1)
+    batch.reset()
+    environments = [suite.environment(make(random=seed)) for seed in SEEDS]
+    for environment in environments:
+        environment.reset()
+    rewards = []
+    running = [True] * len(SEEDS)
+    for action in pushing(0):
+        step = batch.step(action)
+        for i, environment in enumerate(environments):
+            if not running[i]:
+                continue
+            timestep = environment.step(action[i])
+            assert timestep.reward == step.outcome.reward[i]
+            assert timestep.last() == (step.terminated[i] or step.truncated[i])
+            info = {name: value[i].item() for name, value in step.info().items()}
+            assert environment.task.info() == info
+            running[i] = not timestep.last()
+            rewards.append(timestep.reward)
+    return rewards, step
+
+
+def test_the_subclass_of_the_example(example):
+    rewards, step = assert_equal_rewards(lambda **o: gentle(example, **o))
+    assert {"distance", "success", "excess_force"} == set(step.outcome.terms)
+    plain = suite.make_task("type1_lcca").objective
+    assert isinstance(plain, Cannulation)
+    assert "excess_force" not in plain.weights
+
+
+def test_the_option_of_the_example_reaches_the_reward(example):
+    heavy = gentle(example, tolerance_weight=5.0).objective
+    assert heavy.weights["excess_force"] == -5.0
+    with pytest.raises(ValueError, match="tolerance_weight"):
+        gentle(example, weight=5.0)
+
+
+def test_an_objective_without_relatives():
+    rewards, step = assert_equal_rewards(advancing)
+    assert max(rewards) > 0.02
+    assert step.outcome.success.all()
+
+
+def test_what_the_batch_cannot_honour_is_refused():
+    class Shaped(Navigation):
+        def get_reward(self, physics):
+            return 2.0 * super().get_reward(physics)
+
+    task = suite.make_task("simple1_bca")
+    shaped = Shaped(task.scene, task.objective, task.config)
+    with pytest.raises(ValueError, match=r"Shaped overrides get_reward.*Objective"):
+        BatchSimulation(shaped, 2, num_threads=1)
+
+
+def test_a_goal_that_cannot_be_shifted_is_refused():
+    with pytest.raises(ValueError, match=r"goal.*Advance.*shifted"):
+        advancing(randomisation=True)
+
+
+def test_a_name_that_is_taken_is_refused(example):
+    with pytest.raises(ValueError, match=r"'type1_bca' already"):
+        suite.register("type1_bca", suite.TASKS[example.TASK])
+
+
+def test_entities_of_ones_own_are_used():
+    from cathsim_dmc.entities.robot import Robot
+
+    anatomy, config = suite.load_anatomy("simple1"), NavigationConfig()
+    robot = Robot(device_radius=2e-3)
+    scene = Scene.build(anatomy, "bca", config, robot=robot)
+    assert scene.robot is robot
