@@ -14,7 +14,7 @@ from cathsim_dmc.anatomy import Anatomy
 from cathsim_dmc.validation.figures import save_figure
 
 # Name, axis to the right, axis upwards or downwards, axis towards the reader or away.
-_VIEWS = (
+VIEWS = (
     ("from the front", 0, (2, 1), (1, -1)),
     ("from the left", 1, (2, 1), (0, 1)),
     ("from below", 0, (1, -1), (2, -1)),
@@ -35,7 +35,7 @@ def draw(anatomy: Anatomy, path: str | Path, title: str | None = None) -> None:
     figure = Figure(figsize=(13.5, 5.6), layout="constrained")
     FigureCanvasAgg(figure)
     axes = figure.subplots(1, 3)
-    for ax, view in zip(axes, _VIEWS, strict=True):
+    for ax, view in zip(axes, VIEWS, strict=True):
         draw_view(ax, anatomy, view)
     names, labels = axes[0].get_legend_handles_labels()
     figure.legend(names, labels, fontsize=8, loc="outside lower center", ncols=7)
@@ -43,7 +43,7 @@ def draw(anatomy: Anatomy, path: str | Path, title: str | None = None) -> None:
     save_figure(figure, path)
 
 
-def draw_view(ax: Axes, anatomy: Anatomy, view: tuple = _VIEWS[0]) -> None:
+def draw_view(ax: Axes, anatomy: Anatomy, view: tuple = VIEWS[0]) -> None:
     """Draws one of the views, millimetres."""
     name, right, (up, sign), (out, towards) = view
 

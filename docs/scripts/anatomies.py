@@ -1,0 +1,239 @@
+"""Writes the tables and pictures of docs/anatomies.md.
+
+python docs/scripts/anatomies.py [--no-push]  (about five minutes)
+"""
+
+import json
+import sys
+from pathlib import Path
+
+import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+from cathsim_dmc.anatomy import measures, phantoms
+from cathsim_dmc.anatomy.arch import arch, sampler
+from cathsim_dmc.anatomy.surface import lumen_surface
+from cathsim_dmc.anatomy.wall.depth import MeshDepth
+from cathsim_dmc.validation import views, wall
+from cathsim_dmc.validation.figures import save_figure
+from cathsim_dmc.validation.push import straight_push
+
+ROOT = Path(__file__).parents[1]
+PAGE, IMAGES = ROOT / "anatomies.md", ROOT / "images"
+MEASUREMENTS = ROOT.parent / "tests/data/measured"
+MAIN = ("bca", "lcca", "lsa")
+
+
+def table(header, rows):
+    lines = [header, ["---"] * len(header), *rows]
+    return ["| " + " | ".join(map(str, line)) + " |" for line in lines]
+
+
+def per_branch(found, key, scale=1.0, digits=0):
+    """Figures of BCA, LCCA and LSA side by side."""
+    values = [scale * getattr(found.branches[name], key) for name in MAIN]
+    return " / ".join(f"{value:.{digits}f}" for value in values)
+
+
+def shapes(anatomies):
+    """What the shipped anatomies are like, a column for each."""
+    found = {
+        name: measures.measure(one.tree, one.inlet.position, measures.inlet_axis(one))
+        for name, one in anatomies.items()
+    }
+    degrees = 180.0 / np.pi
+    lines = {
+        "type, drop of the BCA in LCCA diameters": lambda m: (
+            f"{m.arch_type}, {m.drop:.2f}"
+        ),
+        "Ø aorta ascending / at BCA / at LSA / descending, mm": lambda m: " / ".join(
+            f"{1e3 * m.diameters[level]:.0f}"
+            for level in ("ascending", "bca", "lsa", "descending")
+        ),
+        "Ø BCA / LCCA / LSA, mm": lambda m: per_branch(m, "diameter", 1e3, 1),
+        "narrowest Ø of the same, mm": lambda m: per_branch(m, "narrowest", 1e3, 1),
+        "take-off upstream, °": lambda m: per_branch(m, "take_off", degrees),
+        "lean out of the plane, °": lambda m: per_branch(m, "lean", degrees),
+        "out of the plane 40 mm on, mm": lambda m: per_branch(m, "out_of_plane", 1e3),
+        "length over chord": lambda m: per_branch(m, "tortuosity", 1.0, 2),
+        "span / height, mm": lambda m: f"{1e3 * m.span:.0f} / {1e3 * m.height:.0f}",
+        "first 30 mm against the vertical, °": lambda m: (
+            f"{degrees * m.ascending_tilt:.0f}"
+        ),
+        "turn up to the BCA, °; mean radius, mm": lambda m: (
+            f"{degrees * m.ascending_turn:.0f}; {1e3 * m.bend_radius:.0f}"
+        ),
+        "tightest bend of the aorta, mm": lambda m: f"{1e3 * m.tightest_bend:.0f}",
+        "ostia off the start axis, mm": lambda m: per_branch(m, "axis_offset", 1e3),
+    }
+    rows = [
+        [line, *(show(one) for one in found.values())] for line, show in lines.items()
+    ]
+    return table(["", *anatomies], rows)
+
+
+def walls(anatomies):
+    """Fidelity of the walls."""
+    rows = []
+    for name, anatomy in anatomies.items():
+        checks = wall.lumen_checks(anatomy)
+        by_name = {check.name.split(": ", 1)[1]: check for check in checks}
+        intrusion = [
+            f"{by_name[f'intrusion, {which}'].value:.2f}"
+            for which in ("mean", "p95", "max")
+        ]
+        rows.append(
+            [
+                name,
+                len(anatomy.wall),
+                " / ".join(intrusion),
+                f"{by_name['coverage'].value:g} %",
+                "yes" if all(check.passed for check in checks) else "**no**",
+            ]
+        )
+    header = ["", "pieces", "intrusion mean / p95 / max, mm", "rays stopped"]
+    return table([*header, "all checks pass"], rows)
+
+
+def against_measured():
+    """Built centrelines and radii against the measured ones."""
+    rows = []
+    for name in phantoms.MEASURED:
+        tree = phantoms.load(name).tree
+        surface = lumen_surface(tree, 1e-3)
+        depth = MeshDepth(surface.vertices, surface.faces)
+        measured = json.loads((MEASUREMENTS / f"{name}.json").read_text())["vessels"]
+        away, errors = [], []
+        for key, vessel in measured.items():
+            points = np.array(vessel["points"]) * 1e-3
+            line = tree.vessel(key).centreline
+            near = line.project(points[:, :3])
+            away.append(near.distance)
+            branch = tree.vessel(key)
+            start = 10e-3 if branch.parent is None else branch.ostium + 3e-3
+            own = near.arc_length > start
+            own &= near.arc_length < line.length - 10e-3
+            built = depth(line.at(near.arc_length[own]).position)
+            errors.append(np.abs(built - points[own, 3]))
+        away, errors = 1e3 * np.concatenate(away), 1e3 * np.concatenate(errors)
+        rows.append(
+            [
+                name,
+                *(f"{np.mean(x):.2f} / {np.percentile(x, 95):.2f} / {x.max():.2f}"
+                  for x in (away, errors)),
+            ]
+        )  # fmt: skip
+    header = ["", "centreline, mean / p95 / max, mm", "inscribed radius, the same"]
+    return table(header, rows)
+
+
+def pushes(names):
+    rows = []
+    for name in names:
+        for access in phantoms.ACCESSES:
+            anatomy = phantoms.load(name, access=access)
+            for goal in MAIN:
+                push = straight_push(anatomy, goal)
+                rows.append(
+                    [
+                        name,
+                        access,
+                        goal,
+                        f"reached, {push.steps} steps" if push.success else "missed",
+                        f"{1e3 * push.mean_force:.0f} / {1e3 * push.peak_force:.0f}",
+                    ]
+                )
+    header = ["", "access", "goal", "straight push"]
+    return table([*header, "force mean of sums / largest contact, mN"], rows)
+
+
+def distributions():
+    """Sampled sizes of the test arches beside the tables."""
+    seeds = arch.arch_set("test")
+    drawn = [seed.parameters() for seed in seeds]
+    found = [measures.measure(arch.arch_tree(one)) for one in drawn]
+    rows = []
+
+    def row(name, values, table_figures, digits=1):
+        mean, deviation = table_figures
+        rows.append(
+            [
+                name,
+                f"{mean:.{digits}f} ± {deviation:.{digits}f}" if deviation else "–",
+                f"{np.mean(values):.{digits}f} ± {np.std(values):.{digits}f}",
+                f"{np.min(values):.{digits}f} to {np.max(values):.{digits}f}",
+            ]
+        )
+
+    for name, (mean, deviation) in sampler.AORTA_DIAMETERS.items():
+        level = name.removesuffix("_radius").replace("_", " ")
+        values = [2e3 * getattr(one, name) for one in drawn]
+        row(f"Ø aorta, {level}, mm", values, (1e3 * mean, 1e3 * deviation))
+    for name, (mean, deviation) in sampler.BRANCH_DIAMETERS.items():
+        values = [2e3 * getattr(one, name).radius for one in drawn]
+        row(f"Ø {name} at its origin, mm", values, (1e3 * mean, 1e3 * deviation))
+    for name, figures in sampler.TAKE_OFFS.items():
+        values = [np.degrees(getattr(one, name).take_off) for one in drawn]
+        row(f"take-off {name}, °", values, figures)
+    row(
+        "root to BCA, mm",
+        [1e3 * one.bend_radius * one.ascending_turn for one in found],
+        [1e3 * figure for figure in sampler.ASCENDING_LENGTH],
+    )
+    nothing = (0.0, 0.0)
+    row("turn up to the BCA, °", [np.degrees(m.ascending_turn) for m in found], nothing)
+    row("radius of that bend, mm", [1e3 * m.bend_radius for m in found], nothing)
+    aside = [1e3 * abs(b.out_of_plane) for m in found for b in m.branches.values()]
+    row("branches out of the plane 40 mm on, mm", aside, nothing)
+    bent = [b.tortuosity for m in found for b in m.branches.values()]
+    row("branches, length over chord", bent, nothing, 2)
+    return table(["", "table", "98 test arches", "range"], rows)
+
+
+def gallery():
+    """Front and left views of random arches."""
+    figure = Figure(figsize=(15, 10.5), layout="constrained")
+    FigureCanvasAgg(figure)
+    axes = figure.subplots(4, 6)
+    seeds = [*arch.arch_set("test")[:8], *arch.arch_set("test_variants")[:4]]
+    for place, seed in enumerate(seeds):
+        anatomy = arch.build_seed(seed)
+        for side in (0, 1):
+            ax = axes[place // 3, 2 * (place % 3) + side]
+            views.draw_view(ax, anatomy, views.VIEWS[side])
+            ax.set_xlabel("")
+            ax.set_ylabel("")
+            ax.tick_params(labelsize=6)
+            ax.set_title(seed.name if side == 0 else "from the left", fontsize=7)
+    save_figure(figure, IMAGES / "random_arches.png")
+
+
+def write(blocks):
+    page = PAGE.read_text()
+    for name, lines in blocks.items():
+        begin, end = f"<!-- {name} -->", f"<!-- end of {name} -->"
+        head, rest = page.split(begin)
+        _, tail = rest.split(end)
+        page = head + begin + "\n" + "\n".join(lines) + "\n" + end + tail
+    PAGE.write_text(page)
+
+
+def main():
+    anatomies = {name: phantoms.load(name) for name in phantoms.PHANTOMS}
+    for name in phantoms.MEASURED:
+        views.draw(anatomies[name], IMAGES / f"anatomy_{name}.png")
+    gallery()
+    blocks = {
+        "shapes": shapes(anatomies),
+        "walls": walls(anatomies),
+        "against measured": against_measured(),
+        "distributions": distributions(),
+    }
+    if "--no-push" not in sys.argv:
+        blocks["pushes"] = pushes(phantoms.PHANTOMS)
+    write(blocks)
+
+
+if __name__ == "__main__":
+    main()
