@@ -75,6 +75,8 @@ def free_ends(ways: Ways) -> list[FreeEnd]:
     # Seen from one blind end, every other one is farther than all around it.
     first = int(nodes[ways.lengths_from(centre)[nodes].argmax()])
     reach = ways.lengths_from(first)
+    # Own vessels are told on the ways to that end: the widest place may be one, too.
+    back = ways.deepest_from(first)
     lookup = cKDTree(ways.points[nodes])
     taken = np.zeros(len(ways.points), dtype=bool)
     cover, ends = Cover(ways), []
@@ -89,12 +91,14 @@ def free_ends(ways: Ways) -> list[FreeEnd]:
         taken[near] = True
         if node != first and reach[near].max() > reach[node] + 1e-9:
             continue
-        own = cover.own_part(way)
-        own_length = length_of(ways, own) if len(own) > 1 else 0.0
-        width = float(np.median(ways.depth[own])) if len(own) else 0.0
-        if ends and own_length < max(STUB, width):
-            continue  # a bulge of a vessel that is known
-        cover.add(way)
+        if node != first:
+            path = ways.trace(back, node)[::-1]
+            own = cover.own_part(path)
+            own_length = length_of(ways, own) if len(own) > 1 else 0.0
+            width = float(np.median(ways.depth[own])) if len(own) else 0.0
+            if own_length < max(STUB, width):
+                continue  # a bulge of a vessel that is known
+            cover.add(path)
         # The depth falls to nothing at the very end, which is no bottleneck.
         inner = along > 2.0 * local
         narrow = float(ways.depth[way][inner].min()) if inner.any() else local
