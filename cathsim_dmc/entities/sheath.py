@@ -153,8 +153,8 @@ class Sheath(composer.Entity):
         starts = self.length + start_depth - np.cumsum(lengths[::-1])[::-1]
         # Bends and the axial compliance shift a link by less than its own length.
         spare = lengths.max()
-        # Every other link would hold all the nodes, but half the contacts give way twice
-        # as far: 0.6 mm in place of 0.25 mm under 1 N on a link.
+        # Every other link would hold all nodes too, but half the contacts give way
+        # twice as far: 0.6 mm in place of 0.25 mm under 1 N on a link.
         for link, (start, length) in enumerate(zip(starts, lengths, strict=True)):
             for index, sides in enumerate(self._pieces[:-1]):
                 low, high = self._axis.arcs[index : index + 2]
