@@ -79,13 +79,10 @@ class Rollout:
         self._nominal_objective = self._objective = objective
         self._names = observations.resolve(config.observation)
         catheter = scene.catheter.mjcf_model.model
-        phantom = scene.phantom.mjcf_model.model
-        self._index = readings.ModelIndex(
-            model, catheter, phantom, scene.robot.mjcf_model.model
-        )
+        self._index = readings.ModelIndex(model, catheter, scene.robot.mjcf_model.model)
         num_actions = len(scene.catheter.actuators)
         randomisation = config.randomisation
-        self._variation = ModelVariation(model, randomisation, catheter, phantom)
+        self._variation = ModelVariation(model, randomisation, catheter)
         self._fields = {name: model_field(name) for name in self._variation.fields}
         self._delay = ActionDelay(
             num_simulations, num_actions, randomisation.longest_delay
