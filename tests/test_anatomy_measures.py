@@ -180,8 +180,6 @@ def test_check_fails_where_a_goal_is_in_another_vessel(cathsim, tmp_path):
     anatomy = phantoms.load("type2")
     astray = replace(anatomy.goal("lcca"), position=anatomy.goal("lsa").position)
     replace(anatomy, goals={"lcca": astray}).save(tmp_path / "wrong")
-    code, out, _ = cathsim("check", tmp_path / "wrong", "--no-push", "--json")
-    assert code == 1
-    failed = [one for one in json.loads(out)["checks"] if not one["passed"]]
-    assert len(failed) == 1
-    assert "lcca" in failed[0]["note"]
+    code, out, err = cathsim("check", tmp_path / "wrong", "--no-push", "--json")
+    assert code == 2 and not out
+    assert "goal 'lcca'" in err

@@ -82,6 +82,7 @@ def test_goal_in_a_vessel_that_is_not_there():
     fails(
         ["rcca", *arch.load("simple1").tree.vessels],
         task_name="navigate",
+        anatomy="simple1",
         goal=Goal("far", "rcca", place.position, 0.02),
     )
 
@@ -233,7 +234,7 @@ def test_scan_that_is_not_closed(tmp_path, curve):
     mesh.write_text(CORNERS + "\n".join(FACES[:7]) + "\n")
     with pytest.raises(ValueError) as caught:
         import_scan(mesh, [curve])
-    for word in ("lumen.obj", "not closed", "Close the vessel ends", "fill holes"):
+    for word in ("lumen.obj", "not closed", "hole", "mm wide", "Fill holes"):
         assert word in str(caught.value)
 
 
