@@ -337,6 +337,25 @@ def test_weights_of_another_network_are_refused(tmp_path, trained):
     assert "\n" not in str(caught.value)
 
 
+@pytest.mark.parametrize("name", ["rng", "learner", "episodes"])
+def test_a_checkpoint_that_learning_cannot_use_says_so(tmp_path, trained, name):
+    """With a checksum that fits: weights of another version, or an edited file."""
+    for value in (None, {}, "x"):
+        folder = tmp_path / str(value)
+        shutil.copytree(trained / "ppo", folder)
+        path = checkpoint_of(folder)
+        state = torch.load(path / "learning.pt", weights_only=True)
+        state[name] = value
+        torch.save(state, path / "learning.pt")
+        values = json.loads((path / "checkpoint.json").read_text())
+        digest = hashlib.sha256((path / "learning.pt").read_bytes()).hexdigest()
+        values["sha256"]["learning.pt"] = digest
+        (path / "checkpoint.json").write_text(json.dumps(values))
+        with pytest.raises(CheckpointError, match="cannot be continued") as caught:
+            run(small_ppo(total_frames=1_024), folder, resume=True)
+        assert "\n" not in str(caught.value)
+
+
 def test_a_run_without_its_replay_says_that_it_cannot_go_on(tmp_path, trained):
     shutil.copytree(trained / "sac", tmp_path / "run")
     shutil.rmtree(tmp_path / "run" / "replay")

@@ -12,15 +12,17 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from cathsim_dmc.anatomy.scan.files import read_curve, read_mesh, vessel_name
 from scipy.spatial import ConvexHull, cKDTree
+from synthetic_scans import marched, read_mesh, write_markup, write_obj, y_tree
 
 from cathsim_dmc.anatomy.anatomy import Anatomy, Inlet, Surface
 from cathsim_dmc.anatomy.centreline import Centreline, Vessel, VesselTree
 from cathsim_dmc.anatomy.scan import coacd_wall as scan_coacd
-from cathsim_dmc.anatomy.scan.importer import describe, import_scan
+from cathsim_dmc.anatomy.scan.curves import read_curve, vessel_name
+from cathsim_dmc.anatomy.scan.importer import import_scan
 from cathsim_dmc.anatomy.scan.inlet import cut_open, shut_behind
 from cathsim_dmc.anatomy.scan.mesh_depth import MeshDepth, depth_field
+from cathsim_dmc.anatomy.scan.report import describe
 from cathsim_dmc.anatomy.scan.trunk import name_trunk
 from cathsim_dmc.anatomy.wall.depth import DepthField
 
@@ -28,59 +30,6 @@ from cathsim_dmc.anatomy.wall.depth import DepthField
 INTRUSION = (0.10e-3, 0.30e-3, 0.60e-3)
 DEVICE_RADIUS = 0.84e-3
 SCAN = os.environ.get("CATHSIM_SCAN_DIR")
-
-
-def y_tree() -> VesselTree:
-    """A trunk of 6 mm radius that parts into branches of 3.5 and 3 mm radius."""
-
-    def tube(points, radii, step=1e-3):
-        line = Centreline(np.array(points) * 1e-3, np.array(radii) * 1e-3)
-        return line.resampled(step)
-
-    left = [(0, 0, 50), (4, 0, 58), (16, 0, 78), (24, 0, 100)]
-    right = [(0, 0, 50), (-4, 4, 58), (-12, 15, 75), (-15, 26, 88)]
-    return VesselTree(
-        {
-            "trunk": Vessel("trunk", tube([(0, 0, 0), (0, 0, 50)], [6, 6])),
-            "left": Vessel("left", tube(left, [5, 4, 3.5, 3.5]), "trunk", 9e-3),
-            "right": Vessel("right", tube(right, [5, 4, 3, 3]), "trunk", 9e-3),
-        }
-    )
-
-
-def marched(tree: VesselTree, spacing: float = 2.0e-3):
-    """Closed surface of a tree's lumen: vertices (mm), faces with outward normals."""
-    from skimage.measure import marching_cubes
-
-    points = np.concatenate([v.centreline.points for v in tree.vessels.values()])
-    low, high = points.min(0) - 9e-3, points.max(0) + 9e-3
-    axes = [np.arange(a, b, spacing) for a, b in zip(low, high, strict=True)]
-    grid = np.stack(np.meshgrid(*axes, indexing="ij"), -1)
-    depth = tree.depth(grid, closed=True)
-    vertices, faces, _, _ = marching_cubes(depth, 0.0, spacing=(spacing,) * 3)
-    return (vertices + low) * 1e3, faces[:, ::-1]
-
-
-def write_obj(path: Path, vertices, faces) -> Path:
-    lines = [f"v {x:.5f} {y:.5f} {z:.5f}" for x, y, z in vertices]
-    lines += [f"f {a + 1} {b + 1} {c + 1}" for a, b, c in faces]
-    path.write_text("\n".join(lines) + "\n")
-    return path
-
-
-def write_markup(path: Path, points_mm, *, system="LPS", radii=None) -> Path:
-    markup = {
-        "type": "Curve",
-        "coordinateSystem": system,
-        "coordinateUnits": "mm",
-        "controlPoints": [{"position": list(map(float, p))} for p in points_mm],
-    }
-    if radii is not None:
-        markup["measurements"] = [
-            {"name": "Radius", "controlPointValues": list(map(float, radii))}
-        ]
-    path.write_text(json.dumps({"markups": [markup]}))
-    return path
 
 
 @pytest.fixture(scope="module")
@@ -483,47 +432,8 @@ def test_missing_files(y_scan, tmp_path):
         import_scan(tmp_path / "none.obj", curves)
     with pytest.raises(FileNotFoundError, match="no centreline file"):
         import_scan(mesh, [tmp_path / "none.mrk.json"])
-    with pytest.raises(ValueError, match="at least one file"):
-        import_scan(mesh, [])
-
-
-def test_unreadable_meshes(y_scan, tmp_path):
-    curves = y_scan[1]
-    odd = tmp_path / "lumen.xyz3"
-    odd.write_text("nothing")
-    with pytest.raises(ValueError, match="formats .*obj"):
-        import_scan(odd, curves)
-    broken = tmp_path / "lumen.ply"
-    broken.write_text("nothing")
-    with pytest.raises(ValueError, match="cannot be read as PLY"):
-        import_scan(broken, curves)
-
-
-def test_open_mesh(y_scan, tmp_path):
-    vertices, faces = read_mesh(y_scan[0])
-    path = write_obj(tmp_path / "open.obj", vertices * 1e3, faces[1:])
-    with pytest.raises(ValueError, match="3 boundary edges .*Fill holes"):
-        import_scan(path, y_scan[1])
-
-
-def test_several_components(y_scan, tmp_path):
-    vertices, faces = read_mesh(y_scan[0])
-    both = np.concatenate([vertices, vertices + 0.2]) * 1e3
-    path = write_obj(
-        tmp_path / "two.obj", both, np.concatenate([faces, faces + len(vertices)])
-    )
-    with pytest.raises(ValueError, match="2 separate parts"):
-        import_scan(path, y_scan[1])
-
-
-def test_wrong_units(y_scan):
-    with pytest.raises(ValueError, match="Pass units='mm'"):
-        import_scan(y_scan[0], y_scan[1], units="m")
-    with pytest.raises(ValueError, match="one of mm, cm, m"):
-        import_scan(y_scan[0], y_scan[1], units="inch")
-    # A factor of ten leaves a possible size, but not a possible radius.
-    with pytest.raises(ValueError, match="right units"):
-        import_scan(y_scan[0], y_scan[1], units="cm")
+    with pytest.raises(ValueError, match="give a list of files"):
+        import_scan(mesh, curves[0])
 
 
 def test_centreline_elsewhere(y_scan, tmp_path):

@@ -55,13 +55,13 @@ def wall_contacts(model, data):
     for index in range(data.ncon):
         contact = data.contact[index]
         names = [model.geom(geom).name for geom in contact.geom]
-        if not any(name.startswith("phantom/") for name in names):
+        if not any(name.startswith("wall_") for name in names):
             continue
         local = np.zeros(6)
         mujoco.mj_contactForce(model, data, index, local)
         # The frame's normal points from geom 0 to geom 1: force on geom 1.
         force = contact.frame.reshape(3, 3).T @ local[:3]
-        if names[0].startswith("phantom/"):
+        if names[0].startswith("wall_"):
             force = -force
         result.append((force, contact.pos.copy(), -contact.dist))
     return result

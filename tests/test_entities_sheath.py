@@ -132,15 +132,13 @@ def test_the_sheath_is_frictionless_and_only_guides_the_device(straight_rig):
         np.testing.assert_array_equal(solref, contact.CONTACT_SOLREF)
 
 
-def test_every_link_that_can_meet_the_sheath_is_paired(straight_rig):
+def test_every_link_that_can_meet_the_rods_is_paired(straight_rig):
     model = straight_rig.model
-    paired = {model.geom(int(index)).name for index in model.pair_geom1} | {
-        model.geom(int(index)).name for index in model.pair_geom2
-    }
+    geoms = np.concatenate([model.pair_geom1, model.pair_geom2]).tolist()
+    paired = {model.geom(index).name for index in geoms}
     starts = np.cumsum(straight_rig.lengths) - straight_rig.lengths
-    for index, start in enumerate(starts):
-        if start < 0.21:
-            assert f"catheter/link_{index}" in paired
+    for index in np.flatnonzero(starts < 0.21):
+        assert f"catheter/link_{index}" in paired
     assert f"catheter/link_{len(starts) - 1}" not in paired
 
 
@@ -165,12 +163,14 @@ def test_sheath_ends_at_the_inlet_and_reaches_over_the_chain(shared_environment)
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
     body = model.body("sheath/bore").id
-    np.testing.assert_allclose(data.xpos[body], task.anatomy.inlet.position, atol=1e-9)
+    np.testing.assert_allclose(
+        data.xpos[body], task.scene.anatomy.inlet.position, atol=1e-9
+    )
     axis = data.xmat[body].reshape(3, 3)[:, 2]
-    np.testing.assert_allclose(axis, task.anatomy.inlet.direction, atol=1e-9)
+    np.testing.assert_allclose(axis, task.scene.anatomy.inlet.direction, atol=1e-9)
     base = data.xpos[model.body("catheter/link_0").id]
-    behind = (task.anatomy.inlet.position - base) @ axis
-    assert behind == pytest.approx(task.sheath.length, abs=1e-9)
+    behind = (task.scene.anatomy.inlet.position - base) @ axis
+    assert behind == pytest.approx(task.scene.sheath.length, abs=1e-9)
 
 
 # Bent.

@@ -265,15 +265,7 @@ def evaluate(
         raise ValueError(f"episodes={episodes}: at least one is needed.")
     player = load_policy(policy, seed)
     task = require_task(player, task)
-    checkpoint = getattr(player, "checkpoint", None)
-    if task_kwargs is None:
-        task_kwargs = player.task_kwargs
-    settings = {
-        "observation": observation or player.observation or "internal",
-        "task_kwargs": dict(task_kwargs or {}),
-        "backend": backend,
-        "frames": checkpoint.frames if checkpoint else None,
-    }
+    settings = _settings(player, observation, task_kwargs, backend)
     env = make_env(
         task,
         observation=settings["observation"],
@@ -291,6 +283,23 @@ def evaluate(
     if out_dir is not None:
         write_evaluation(out_dir, result.to_dict())
     return result
+
+
+def _settings(
+    policy: Policy,
+    observation: str | Sequence[str] | None,
+    task_kwargs: Mapping[str, Any] | None,
+    backend: str,
+) -> dict[str, Any]:
+    """What was asked for, and where nothing was, what the policy was made for."""
+    checkpoint = getattr(policy, "checkpoint", None)
+    options = policy.task_kwargs if task_kwargs is None else task_kwargs
+    return {
+        "observation": observation or policy.observation or "internal",
+        "task_kwargs": dict(options or {}),
+        "backend": backend,
+        "frames": checkpoint.frames if checkpoint else None,
+    }
 
 
 def require_task(policy: Policy, task: str | None) -> str:

@@ -156,6 +156,9 @@ def evaluate(
             heatmap.png; None writes none.
     """
     start = time.monotonic()
+    if out_dir is not None:
+        # Now: an evaluation that cannot be written would be lost.
+        Path(out_dir).mkdir(parents=True, exist_ok=True)
     contacts = ContactLog()
     result = evaluation.evaluate(
         policy,
@@ -231,6 +234,8 @@ def record(
         raise ValueError(f"the recording is to be written to {out}; give an .rrd file")
     player = policies.load_policy(policy, seed)
     task = evaluation.require_task(player, task)
+    # Now: an episode that cannot be written would be lost.
+    out.parent.mkdir(parents=True, exist_ok=True)
     kwargs = dict(player.task_kwargs or {} if task_kwargs is None else task_kwargs)
     if player.observation is not None:
         kwargs["observation"] = player.observation
@@ -238,15 +243,19 @@ def record(
     episode = recorder.EpisodeRecorder(environment, task, kwargs).record_episode(
         in_environment(player, environment), seed=seed, max_steps=max_steps
     )
-    out.parent.mkdir(parents=True, exist_ok=True)
-    episode.save(out.with_suffix(".npz"))
-    rerun_log.write_rrd(
-        episode,
-        environment.task.scene.anatomy.surface,
-        out,
-        robot_geoms=body_geoms(environment.physics),
-        fluoroscopy=_images(environment, episode) if fluoroscopy else None,
-    )
+    arrays = episode.save(out.with_suffix(".npz"))
+    try:
+        rerun_log.write_rrd(
+            episode,
+            environment.task.scene.anatomy.surface,
+            out,
+            robot_geoms=body_geoms(environment.physics),
+            fluoroscopy=_images(environment, episode) if fluoroscopy else None,
+        )
+    except BaseException:
+        # Both or none.
+        arrays.unlink(missing_ok=True)
+        raise
     return episode
 
 

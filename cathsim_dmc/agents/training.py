@@ -99,26 +99,19 @@ def train(
         torch.manual_seed(config.seed)
         shapes = NetworkShapes.of(env)
         learner = make_learner(config, shapes, run)
-        state: dict[str, Any] = {}
-        if checkpoint:
-            state = _restore(learner, checkpoint)
-        elif not learner.random_frames:
-            _observe_random_actions(env, learner, config)
-        frames = checkpoint.frames if checkpoint else 0
-        collector = _make_collector(env, learner, config, frames)
+        state = _start(learner, env, config, checkpoint)
+        collector = _make_collector(env, learner, config, state["frames"])
         stack.callback(collector.shutdown)
         # After everything that draws numbers while being made.
         if checkpoint:
-            torch.set_rng_state(state["rng"])
+            torch.set_rng_state(state.pop("rng"))
         else:
             torch.manual_seed(config.seed + 1)
         log = TrainingLog(
             run,
             config,
             learner.metrics,
-            frames=frames,
-            seconds=checkpoint.seconds if checkpoint else 0.0,
-            episodes=state.get("episodes", 0),
+            **state,
             resumed=checkpoint is not None,
             progress=progress,
         )
@@ -127,14 +120,9 @@ def train(
         interruption = stack.enter_context(Interruption())
         _loop(config, collector, learner, log, saver, interruption)
         # However the loop ended; writes nothing if the last batch has just been saved.
-        return TrainingResult(
-            run=run,
-            checkpoint=saver.save(),
-            frames=log.frames,
-            seconds=log.seconds,
-            interrupted=log.frames < config.total_frames,
-            metrics=log.row,
-        )
+        newest = saver.save()
+        short = log.frames < config.total_frames
+        return TrainingResult(run, newest, log.frames, log.seconds, short, log.row)
 
 
 def _require_device(name: str) -> None:
@@ -194,12 +182,28 @@ def _make_environment(
     )
 
 
-def _restore(learner: Learner, checkpoint: Checkpoint) -> dict[str, Any]:
-    """Give a learner what a checkpoint holds; return the state of the training."""
+def _start(
+    learner: Learner,
+    env: EnvBase,
+    config: TrainingConfig,
+    checkpoint: Checkpoint | None,
+) -> dict[str, Any]:
+    """Give a learner what a checkpoint holds, or its first look at observations.
+
+    Returns:
+        What earlier processes of the run have counted: frames, seconds, episodes; and
+        from a checkpoint the state "rng" of torch's generator.
+    """
+    if checkpoint is None:
+        if not learner.random_frames:
+            _observe_random_actions(env, learner, config)
+        return {"frames": 0, "seconds": 0.0, "episodes": 0}
     policy, state = checkpoint.policy_state(), checkpoint.learning_state()
     try:
         learner.load(policy, state["learner"])
-        training = {"rng": state["rng"], "episodes": int(state["episodes"])}
+        # Tried here: a later error would name no file.
+        rng = torch.Generator().set_state(state["rng"]).get_state()
+        counted = {"rng": rng, "episodes": int(state["episodes"])}
     except ReplayError:
         raise
     except (KeyError, TypeError, ValueError, AttributeError, RuntimeError) as error:
@@ -209,7 +213,7 @@ def _restore(learner: Learner, checkpoint: Checkpoint) -> dict[str, Any]:
             f"{checkpoint.config.algorithm} learns with ({type(error).__name__}: "
             f"{line}). Its policy may still be evaluated."
         ) from error
-    return training
+    return {"frames": checkpoint.frames, "seconds": checkpoint.seconds, **counted}
 
 
 def _observe_random_actions(

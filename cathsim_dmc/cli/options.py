@@ -28,7 +28,7 @@ class OwnAnatomy:
     @property
     def task_kwargs(self) -> dict[str, Any]:
         """What was given, as options of the task."""
-        given = {"phantom": self.anatomy, "goal": self.goal}
+        given = {"anatomy": self.anatomy, "goal": self.goal}
         return {key: value for key, value in given.items() if value is not None}
 
 

@@ -41,7 +41,7 @@ def import_phantom(
         units: Unit of mesh, CSV centrelines and inlet; guessed if not given.
         frame: Frame of mesh, CSV centrelines and inlet.
         axes: Where +x, +y and +z of that frame point in the patient, for a scan that
-            does not stand upright: three of L, R, A, P, S, I, such as ILP.
+            does not stand upright: three of L, R, A, P, S, I, such as ILA.
         inlet: Where the device enters: a free end, or a place to cut the lumen at.
         rename: Names of computed branches, each as computed=wanted.
         wall: Pieces near the surface, or CoACD's coarse ones (needs the extra coacd).

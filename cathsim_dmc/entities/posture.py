@@ -32,16 +32,31 @@ def joints_along(
     lengths = np.asarray(link_lengths, np.float64)
     points = np.asarray(line, np.float64)
     nodes = _nodes(lengths, points, advance)
-    directions = np.diff(nodes, axis=0) / lengths[:, None]
+    return bends_of(np.diff(nodes, axis=0) / lengths[:, None])
+
+
+def bends_of(directions: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Angles of the bending hinges of a chain whose links point in given directions.
+
+    Args:
+      directions: unit vectors (n, 3) of the links in the frame of link 0; the first
+        is +z.
+
+    Returns:
+      (n - 1, 2) float64, rad: about x and about y of joints 1 to n - 1.
+
+    Raises:
+      ValueError: if the first link does not point along +z.
+    """
     start = float(np.arccos(np.clip(directions[0, 2], -1.0, 1.0)))
     if start > _LARGEST_START_ANGLE:
         raise ValueError(
-            f"the line turns link 0 by {np.degrees(start):.2f}° away from +z, but it "
-            "has no hinge; begin the line with a straight piece along +z of "
-            f"{1e3 * (advance + lengths[0]):.1f} mm at least"
+            f"link 0 points {np.degrees(start):.2f}° away from +z, but it has no "
+            "hinge; begin the line with a straight piece along +z, as long as the link "
+            "and the way that it is advanced"
         )
     frame = np.eye(3)
-    angles = np.empty((len(lengths) - 1, 2))
+    angles = np.empty((len(directions) - 1, 2))
     for index, direction in enumerate(directions[1:]):
         x, y, z = frame.T @ direction
         about_x, about_y = np.arctan2(-y, z), np.arcsin(np.clip(x, -1.0, 1.0))

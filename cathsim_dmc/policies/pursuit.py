@@ -40,27 +40,27 @@ class Settings:
     and with shares from 0.4 to 0.85.
 
     Attributes:
-      lookahead: longest way along the route to the point pursued, m.
-      least_lookahead: shortest, m; about one link of the tip.
-      lookahead_radii: in between it is so many radii of the lumen.
-      lookahead_factors: multiply it in successive attempts, over and over.
-      gain: share of the error of direction corrected in a control step. The drives
-        and the damping of the tip answer within some 0.25 s, six steps; a gain well
-        above 1/6 overshoots.
-      share: of a joint's part in steering to that of its distal neighbour.
-      max_bend_rate: largest correction of one hinge in a control step, rad.
-      speed: fastest translation, as a part of what the carriage can do.
-      creep: slowest, as a part of `speed`, when misaligned or pressing.
-      aligned, misaligned: cosines of the error of direction between which the speed
-        falls from full to creeping.
-      soft_force, hard_force: largest contact, N, between which it falls likewise; the
-        published forces lie below 0.2 N, with outliers above 0.4 N.
-      progress: m; what the head must gain to count as moving.
-      patience: control steps without progress until a retry.
-      lost_patience: control steps outside the route's tube until a retry.
-      tolerance: by how much of its radius the lumen may exceed the route's tube.
-      backoff: way back of the first retry, m.
-      backoff_growth: of the way back from each retry to the next, up to the fourth.
+        lookahead: longest way along the route to the point pursued, m.
+        least_lookahead: shortest, m; about one link of the tip.
+        lookahead_radii: in between it is so many radii of the lumen.
+        lookahead_factors: multiply it in successive attempts, over and over.
+        gain: share of the error of direction corrected in a control step. The drives
+            and the damping of the tip answer within some 0.25 s, six steps; a gain well
+            above 1/6 overshoots.
+        share: of a joint's part in steering to that of its distal neighbour.
+        max_bend_rate: largest correction of one hinge in a control step, rad.
+        speed: fastest translation, as a part of what the carriage can do.
+        creep: slowest, as a part of `speed`, when misaligned or pressing.
+        aligned, misaligned: cosines of the error of direction between which the speed
+            falls from full to creeping.
+        soft_force, hard_force: largest contact, N, between which it falls likewise; the
+            published forces lie below 0.2 N, with outliers above 0.4 N.
+        progress: m; what the head must gain to count as moving.
+        patience: control steps without progress until a retry.
+        lost_patience: control steps outside the route's tube until a retry.
+        tolerance: by how much of its radius the lumen may exceed the route's tube.
+        backoff: way back of the first retry, m.
+        backoff_growth: of the way back from each retry to the next, up to the fourth.
     """
 
     lookahead: float = 16e-3
@@ -89,16 +89,16 @@ class Plan:
     """What the expert knows of a task; world frame, SI units.
 
     Attributes:
-      points: (P, 3), route from the inlet to the goal.
-      radii: (P,), of the lumen.
-      arc_length: (P,), along the route.
-      base: (3, 3), orientation of the device where it enters.
-      hinges: column in `Readings.joint_positions` and axis (0, 1, 2 for x, y, z) of
-        every hinge of the chain, from proximal to distal.
-      tip: (M, 2) int, numbers among `hinges` of the x and y hinges of the tip motors.
-      steering_angle: by which a motor bends its free joint at most, rad.
-      link_length: of the tip, m.
-      num_actions: A.
+        points: (P, 3), route from the inlet to the goal.
+        radii: (P,), of the lumen.
+        arc_length: (P,), along the route.
+        base: (3, 3), orientation of the device where it enters.
+        hinges: column in `Readings.joint_positions` and axis (0, 1, 2 for x, y, z) of
+            every hinge of the chain, from proximal to distal.
+        tip: (M, 2) int, numbers among `hinges` of the x and y hinges of the tip motors.
+        steering_angle: by which a motor bends its free joint at most, rad.
+        link_length: of the tip, m.
+        num_actions: A.
     """
 
     points: np.ndarray
@@ -116,7 +116,7 @@ class Plan:
         """Reads off a task.
 
         Raises:
-          ValueError: if the task's device has no motors in its tip.
+            ValueError: if the task's device has no motors in its tip.
         """
         catheter = task.scene.catheter
         if not catheter.device.steerable:
@@ -167,10 +167,10 @@ class Place:
     """Where a head is on a route.
 
     Attributes:
-      arc_length: (...), m.
-      radius: (...), of the lumen there, m.
-      excess: (...), by how much the head is out of the route's tube, in radii there;
-        negative inside.
+        arc_length: (...), m.
+        radius: (...), of the lumen there, m.
+        excess: (...), by how much the head is out of the route's tube, in radii there;
+            negative inside.
     """
 
     arc_length: np.ndarray
@@ -203,14 +203,14 @@ class State:
     """What the expert remembers of each simulation, arrays (...).
 
     Attributes:
-      bend: (..., M, 2), told to the hinges of the tip, rad.
-      insertion: at the last step, m; NaN before the first.
-      retracting: bool.
-      turn: insertion to be withdrawn to while retracting, m.
-      best: farthest place on the route in this attempt, m.
-      stale: control steps since then.
-      lost: control steps out of the route's tube.
-      attempts: retries so far.
+        bend: (..., M, 2), told to the hinges of the tip, rad.
+        insertion: at the last step, m; NaN before the first.
+        retracting: bool.
+        turn: insertion to be withdrawn to while retracting, m.
+        best: farthest place on the route in this attempt, m.
+        stale: control steps since then.
+        lost: control steps out of the route's tube.
+        attempts: retries so far.
     """
 
     bend: np.ndarray
@@ -241,11 +241,11 @@ def tip_frames(plan: Plan, joints: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Hinge axes of the tip and direction of the head, world frame.
 
     Args:
-      plan: of the task.
-      joints: (..., J), `Readings.joint_positions`.
+        plan: of the task.
+        joints: (..., J), `Readings.joint_positions`.
 
     Returns:
-      Axes (..., M, 2, 3) of the x and y hinges of the tip and direction (..., 3).
+        Axes (..., M, 2, 3) of the x and y hinges of the tip and direction (..., 3).
     """
     frame = np.broadcast_to(plan.base, (*joints.shape[:-1], 3, 3))
     axes = []
@@ -266,14 +266,14 @@ def decide(
     """One control step of the expert: a pure function.
 
     Args:
-      plan: of the task.
-      settings: how to drive.
-      state: after the last step, arrays (...).
-      readings: of the devices, arrays (...).
-      wall_force: arrays (...); its `max` slows the device down.
+        plan: of the task.
+        settings: how to drive.
+        state: after the last step, arrays (...).
+        readings: of the devices, arrays (...).
+        wall_force: arrays (...); its `max` slows the device down.
 
     Returns:
-      Action (..., A) in [-1, 1] and the new state.
+        Action (..., A) in [-1, 1] and the new state.
     """
     place = locate(plan, readings.head)
     axes, direction = tip_frames(plan, readings.joint_positions)

@@ -2,21 +2,28 @@
 
 import dataclasses
 
+import mujoco
 import numpy as np
 
 from cathsim_dmc.anatomy import Anatomy, Goal
 from cathsim_dmc.entities import arena, devices
 from cathsim_dmc.tasks import objectives as objectives
-from cathsim_dmc.tasks.variations import START_JITTER
 
-# The steerable tip starts free of the sheath wherever the vessel is straight enough.
+# The steerable tip starts free of the sheath wherever the way to the first branching
+# is long enough.
 _FREE_LENGTH = 0.005  # m of shaft out of the sheath behind the tip
-_START_CLEARANCE = 1e-3  # m between the straight device and the wall at the start
 _LEAST_START_DEPTH = 0.005  # m
+# At the start the head has come no further than this part of the way to the first
+# branching, so that every goal of an anatomy lies ahead.
+_SHARE_OF_TRUNK = 0.5
 # Way beyond the goal that the stroke leaves for bends, detours and wrong branches.
 _SPARE_STROKE = 0.08  # m
 _BASE_LENGTH = 0.02  # m of device that never leaves the sheath
+# One chain for every registered task, so that observations have one shape and a policy
+# of one task can be tried on any other; longer where a goal lies farther away.
+_COMMON_LENGTH = 0.34  # m
 _LONGEST_DEVICE = 3.0  # m, the longest wires sold
+_LINE_SPACING = 1e-3  # m
 
 
 @dataclasses.dataclass(frozen=True)
@@ -25,10 +32,13 @@ class Placement:
 
     Attributes:
       inlet: (3,), mouth of the sheath in the plane of the inlet.
+      direction: (3,), unit vector of insertion at the inlet.
       quaternion: (4,) wxyz, turns +z into the direction of insertion.
       start_depth: way of the tip past the inlet at zero insertion, m.
       stroke: longest insertion, m.
       working_length: simulated length of the device, m.
+      line: (k, 3), m, frame of the base at zero insertion: way of the device from its
+        base through the sheath, and on along the vessel's centreline.
     """
 
     inlet: np.ndarray
@@ -37,15 +47,16 @@ class Placement:
     start_depth: float
     stroke: float
     working_length: float
+    line: np.ndarray
 
     @property
     def start(self) -> np.ndarray:
-        """Position (3,) of the head at zero insertion."""
+        """Position (3,) that the head of the straight device has at zero insertion."""
         return self.inlet + self.start_depth * self.direction
 
     @property
     def robot(self) -> np.ndarray:
-        """Position (3,) of the proximal mouth of the sheath."""
+        """Position (3,) of the proximal mouth of the sheath, and of the base."""
         return self.start - self.working_length * self.direction
 
 
@@ -69,27 +80,34 @@ def resolve_goal(anatomy: Anatomy, goal: "str | Goal") -> Goal:
 
 def place_device(
     anatomy: Anatomy,
-    route_length: float,
+    goal: Goal,
     device: devices.Device,
     working_length: float | None = None,
+    farthest_shift: float = 0.0,
 ) -> Placement:
     """Puts a device to the inlet of an anatomy.
 
     Args:
-      anatomy: where to.
-      route_length: from the inlet to the goal, m.
-      device: its tip length decides how far it starts inside.
-      working_length: simulated length, m; None for what the route needs.
+      anatomy: Anatomy to navigate.
+      goal: Goal that the device must be able to reach.
+      device: Device; the length of its tip decides how far it starts inside.
+      working_length: Simulated length, m; None for the common one, or what the goal
+        needs if that is more.
+      farthest_shift: How far past its place the goal may be shifted, m.
 
     Raises:
       ValueError: if `working_length` is shorter than the tip and its start need, or
         longer than any device is.
     """
     inlet = anatomy.inlet
-    start_depth = _straight_run(anatomy, device)
+    start_depth = min(
+        device.tip_length + _FREE_LENGTH,
+        max(_SHARE_OF_TRUNK * _way_to_branching(anatomy), _LEAST_START_DEPTH),
+    )
+    route = anatomy.route(goal, farthest_shift)
     if working_length is None:
-        stroke = max(route_length - start_depth, 0.0) + _SPARE_STROKE
-        working_length = start_depth + stroke + _BASE_LENGTH
+        stroke = max(route.length - start_depth, 0.0) + _SPARE_STROKE
+        working_length = max(start_depth + stroke + _BASE_LENGTH, _COMMON_LENGTH)
     stroke = working_length - start_depth - _BASE_LENGTH
     least = max(start_depth + _BASE_LENGTH, device.tip_length)
     # Also false for NaN.
@@ -98,25 +116,37 @@ def place_device(
             f"working_length is {working_length} m; {device.name!r} needs more than "
             f"{least:.3f} m here to be moved at all, and {_LONGEST_DEVICE:g} m at most"
         )
+    quaternion = _frame(inlet.direction)
+    matrix = np.empty(9)
+    mujoco.mju_quat2Mat(matrix, quaternion)
+    outside = working_length - start_depth
+    # The last links may reach a little past the head's place: they are chords.
+    ahead = np.arange(0.0, min(start_depth + 0.03, route.length), _LINE_SPACING)
+    inside = (route.at(ahead).position - inlet.position) @ matrix.reshape(3, 3)
+    # The first point of the route is the inlet; the sheath ends there, straight.
+    line = np.vstack([[0.0, 0.0, 0.0], inside - inside[0] + [0.0, 0.0, outside]])
     return Placement(
         inlet=np.array(inlet.position),
-        quaternion=_frame(inlet.direction),
+        quaternion=quaternion,
         direction=np.array(inlet.direction),
         start_depth=start_depth,
         stroke=stroke,
         working_length=working_length,
+        line=line,
     )
 
 
-def _straight_run(anatomy: Anatomy, device: devices.Device) -> float:
-    """Depth up to which the straight device fits into the lumen, m."""
-    inlet = anatomy.inlet
-    depths = np.arange(1e-3, device.tip_length + _FREE_LENGTH + 1e-9, 1e-3)
-    points = inlet.position + depths[:, None] * inlet.direction
-    free = anatomy.depth(points) > device.outer_radius + _START_CLEARANCE
-    # The first millimetres lie in the plane of the open end, where depth is small.
-    blocked = np.flatnonzero(~free & (depths > _LEAST_START_DEPTH))
-    return float(depths[-1] if blocked.size == 0 else depths[blocked[0] - 1])
+def _way_to_branching(anatomy: Anatomy) -> float:
+    """Way from the inlet to the nearest branching of its vessel, m; inf for none."""
+    tree, inlet = anatomy.tree, anatomy.inlet
+    vessel = tree.vessel(inlet.vessel)
+    start = float(vessel.centreline.project(inlet.position).arc_length)
+    places = [] if vessel.parent is None else [vessel.ostium]
+    for child in tree.vessels.values():
+        if child.parent == vessel.name:
+            ostium = child.centreline.at(child.ostium).position
+            places.append(float(vessel.centreline.project(ostium).arc_length))
+    return min((abs(place - start) for place in places), default=np.inf)
 
 
 def _frame(direction: np.ndarray) -> np.ndarray:
@@ -141,34 +171,6 @@ def _frame(direction: np.ndarray) -> np.ndarray:
     # Half turn: the axis is the eigenvector of eigenvalue 1.
     values, vectors = np.linalg.eigh((matrix + matrix.T) / 2)
     return np.concatenate([[0.0], vectors[:, np.argmax(values)]])
-
-
-def start_joints(
-    link_lengths: np.ndarray, start_depth: float, displacement: np.ndarray
-) -> dict[str, np.ndarray]:
-    """Joint positions that displace the tip of the straight device.
-
-    The axial part moves the base, the lateral part bends the first joint out of the
-    sheath.
-
-    Args:
-      link_lengths: (n,) of the chain, m.
-      start_depth: of the tip past the mouth of the sheath, m.
-      displacement: (..., 3), m, z along the direction of insertion.
-
-    Returns:
-      Joint positions (...) by name, m and rad; all others stay straight.
-    """
-    beyond = np.cumsum(link_lengths[::-1])[::-1]  # from joint i to the head
-    free = np.flatnonzero(beyond[1:] <= start_depth)
-    index = int(free[0]) + 1 if free.size else len(link_lengths) - 1
-    lever = beyond[index]
-    # The base cannot go back behind its start, so the stroke begins 1 mm later.
-    return {
-        "insertion": np.maximum(START_JITTER + displacement[..., 2], 0.0),
-        f"bend_x_{index}": -displacement[..., 1] / lever,
-        f"bend_y_{index}": displacement[..., 0] / lever,
-    }
 
 
 def add_cameras(scene: arena.AngiographyArena, anatomy: Anatomy) -> None:

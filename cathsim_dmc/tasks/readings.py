@@ -70,13 +70,12 @@ class ModelIndex:
         "sensordata",
     )
 
-    def __init__(self, model: mujoco.MjModel, catheter: str, phantom: str, robot: str):
+    def __init__(self, model: mujoco.MjModel, catheter: str, robot: str):
         """Finds the quantities by name.
 
         Args:
           model: the compiled model.
           catheter: MJCF scope of the catheter, such as "catheter".
-          phantom: MJCF scope of the phantom.
           robot: MJCF scope of the follower robot.
 
         Raises:

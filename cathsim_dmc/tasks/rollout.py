@@ -15,13 +15,14 @@ import numpy as np
 from cathsim_dmc.entities.robot import follower_posture
 from cathsim_dmc.imaging.angiograph import Angiograph
 from cathsim_dmc.imaging.fluoroscopy import Fluoroscope
-from cathsim_dmc.tasks import forces, observations, placement, readings
+from cathsim_dmc.tasks import forces, observations, readings
 from cathsim_dmc.tasks.config import NavigationConfig
 from cathsim_dmc.tasks.image_sensors import ImageSensors, open_cameras
 from cathsim_dmc.tasks.objectives import Measurement, Objective
 from cathsim_dmc.tasks.path_tracker import PathTracker
 from cathsim_dmc.tasks.physics_errors import PhysicsMonitor
 from cathsim_dmc.tasks.scene import Scene
+from cathsim_dmc.tasks.start import StartPosture
 from cathsim_dmc.tasks.step import Step
 from cathsim_dmc.tasks.variations import ActionDelay, ModelVariation
 
@@ -78,13 +79,10 @@ class Rollout:
         self._nominal_objective = self._objective = objective
         self._names = observations.resolve(config.observation)
         catheter = scene.catheter.mjcf_model.model
-        phantom = scene.phantom.mjcf_model.model
-        self._index = readings.ModelIndex(
-            model, catheter, phantom, scene.robot.mjcf_model.model
-        )
+        self._index = readings.ModelIndex(model, catheter, scene.robot.mjcf_model.model)
         num_actions = len(scene.catheter.actuators)
         randomisation = config.randomisation
-        self._variation = ModelVariation(model, randomisation, catheter, phantom)
+        self._variation = ModelVariation(model, randomisation, catheter)
         self._fields = {name: model_field(name) for name in self._variation.fields}
         self._delay = ActionDelay(
             num_simulations, num_actions, randomisation.longest_delay
@@ -106,6 +104,7 @@ class Rollout:
             },
         )
         self._path = PathTracker(num_simulations)
+        self._start = StartPosture(scene, model, self._index)
         self._random_states: list[np.random.RandomState] | None = None
         self._goal_shift = np.zeros(num_simulations)
         self._steps = np.zeros(num_simulations, dtype=int)
@@ -129,19 +128,19 @@ class Rollout:
             alone.
         """
         self._random_states = list(random_states)
-        displacement = np.stack([self._draw(index) for index in indices])
+        for index in indices:
+            self._draw(index)
+        self.pose_robot(self._state.qpos)
         if self._config.randomisation.goal_shift is not None:
             self._objective = self._nominal_objective.shifted(self._goal_shift)
-        qpos = self._state.qpos
-        qpos[indices] = self.start_qpos(qpos[indices], displacement)
         self._steps[indices] = 0
         # New arrays: those handed out before stay what they were.
         self._action = self._action.copy()
         self._action[indices] = 0.0
         self._previous_action = self._action
 
-    def _draw(self, index: int) -> np.ndarray:
-        """Draws the episode of one simulation; returns its displacement (3,)."""
+    def _draw(self, index: int) -> None:
+        """Draws the episode of one simulation and puts its device to the start."""
         episode = self._config.randomisation.draw(self._random_states[index])
         fields = {name: values[index] for name, values in self._fields.items()}
         self._variation.write(fields, episode)
@@ -149,22 +148,7 @@ class Rollout:
         self._monitor.restart(index)
         self._sensors.restart(index, episode.deviation)
         self._goal_shift[index] = episode.goal_shift or 0.0
-        return episode.displacement
-
-    def start_qpos(self, qpos: np.ndarray, displacement: np.ndarray) -> np.ndarray:
-        """Start configurations (K, nq), the tips displaced by (K, 3) m.
-
-        The displacement is in the frame of the inlet, whose z points into the lumen.
-        """
-        joints = placement.start_joints(
-            self._scene.catheter.link_lengths,
-            self._scene.placement.start_depth,
-            displacement,
-        )
-        names = [joint.name for joint in self._scene.catheter.joints]
-        for name, value in joints.items():
-            qpos[..., self._index.qpos.start + names.index(name)] = value
-        return self.pose_robot(qpos)
+        self._start.write(self._state.qpos[index], episode.displacement, episode.roll)
 
     def pose_robot(self, qpos: np.ndarray) -> np.ndarray:
         """Poses the follower's joints after the device, in place: qpos (N, nq)."""

@@ -69,15 +69,15 @@ class Scene:
           robot: Follower of one's own.
         """
         goal = placement.resolve_goal(anatomy, goal)
-        route = anatomy.route(goal, config.randomisation.farthest_shift)
         device = devices.get(config.device) if catheter is None else catheter.device
         place = placement.place_device(
             anatomy,
-            route.length,
+            goal,
             device,
             config.working_length
             if catheter is None
             else float(np.sum(catheter.link_lengths)),
+            config.randomisation.farthest_shift,
         )
         radius = device.outer_radius
         scene = cls(

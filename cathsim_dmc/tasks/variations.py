@@ -195,7 +195,6 @@ class ModelVariation:
         model: mujoco.MjModel,
         randomisation: Randomisation,
         catheter: str,
-        phantom: str,
     ):
         """Finds the elements.
 
@@ -203,7 +202,6 @@ class ModelVariation:
           model: the compiled model, as it is without randomisation.
           randomisation: which fields will change.
           catheter: MJCF scope of the catheter.
-          phantom: MJCF scope of the phantom.
         """
 
         def named(kind: str, count: int, *prefixes: str) -> np.ndarray:

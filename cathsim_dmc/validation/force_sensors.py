@@ -160,7 +160,7 @@ def dead_end(
         "navigate",
         task_kwargs={
             "random": 0,
-            "phantom": straight_tube(*tube),
+            "anatomy": straight_tube(*tube),
             "goal": "end",
             "goal_radius": 1e-6,
             "physics_timestep": timestep,
@@ -171,7 +171,7 @@ def dead_end(
     model, data = environment.physics.model.ptr, environment.physics.data.ptr
     motor = model.actuator(f"{task.scene.catheter.mjcf_model.model}/insertion")
     data.actuator(motor.id).ctrl[0] = command
-    bore = environment.physics.bind(task.scene.sheath.body).element_id
+    sheath = environment.physics.bind(task.scene.sheath.bodies).element_id
     way = tube[0] - task.scene.placement.start_depth
     full_speed = motor.gainprm[0] / -motor.biasprm[2]
     steps = round((settling + way / (command * full_speed)) / timestep)
@@ -187,7 +187,7 @@ def dead_end(
                 reading.push_force,
                 reading.load_cell[2],
                 contacts.force[:, 2].sum(),
-                _axial_force_on(model, data, bore),
+                _axial_force_on(model, data, sheath),
             )
         )
     rows = np.array(rows)
@@ -198,19 +198,19 @@ def dead_end(
     )
 
 
-def _axial_force_on(model, data, body: int) -> float:
-    """Sum of the contact forces on a static body along z, N."""
+def _axial_force_on(model, data, sheath: np.ndarray) -> float:
+    """Sum of the contact forces on static bodies along z, N."""
     total, wrench = 0.0, np.zeros(6)
     for index in range(data.ncon):
         contact = data.contact[index]
         bodies = model.geom_bodyid[list(contact.geom)]
-        if body not in bodies:
+        if not np.isin(bodies, sheath).any():
             continue
         mujoco.mj_contactForce(model, data, index, wrench)
         # The frame's first row is the normal from the first geom to the second, on
         # which the force acts.
         on_second = (contact.frame.reshape(3, 3).T @ wrench[:3])[2]
-        total += on_second if bodies[1] == body else -on_second
+        total += on_second if bodies[1] in sheath else -on_second
     return float(total)
 
 

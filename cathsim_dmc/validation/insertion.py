@@ -99,7 +99,7 @@ def run(
         "navigate",
         task_kwargs={
             "random": seed,
-            "phantom": phantom,
+            "anatomy": phantom,
             "goal": goal,
             "goal_radius": goal_radius,
             **options,

@@ -44,7 +44,7 @@ def straight_push(anatomy: Anatomy, goal: str | Goal, seed: int = 0, **options) 
     environment = suite.load(
         suite.DOMAIN,
         "navigate",
-        task_kwargs={"phantom": anatomy, "goal": goal, "random": seed, **options},
+        task_kwargs={"anatomy": anatomy, "goal": goal, "random": seed, **options},
     )
     try:
         return _push(environment, anatomy.route(goal).length)

@@ -79,7 +79,7 @@ def import_scan(
             guesses by the width of the lumen, and says so.
         mesh_frame: "LPS" or "RAS", of the mesh, of tables and of ``inlet``.
         axes: where +x, +y and +z of that frame point in the patient, if the scan does
-            not stand upright, such as "ILP"; see ``units.upright``.
+            not stand upright, such as "ILA"; see ``units.upright``.
         name: of the anatomy, by default the mesh file's.
         inlet: (x, y, z) where the device enters: a free end if one is near, else the
             lumen is cut there. By default the end at which the centrelines start,

@@ -43,8 +43,8 @@ def upright(axes: str | None) -> np.ndarray:
 
     Args:
         axes: where the scan's +x, +y and +z point in the patient, three of the letters
-            L, R (left, right), A, P (front, back), S, I (head, feet): "ILP" says that
-            +x points to the feet, +y to the left and +z to the back. None and "LPS"
+            L, R (left, right), A, P (front, back), S, I (head, feet): "ILA" says that
+            +x points to the feet, +y to the left and +z to the front. None and "LPS"
             leave points as they are.
 
     Raises:
@@ -56,7 +56,7 @@ def upright(axes: str | None) -> np.ndarray:
     if len(letters) != 3 or not set(letters) <= set(_AXES):
         raise ValueError(
             f"axes are {axes!r}; give three letters of L, R, A, P, S and I, where +x, "
-            "+y and +z of the scan point, such as 'ILP'."
+            "+y and +z of the scan point, such as 'ILA'."
         )
     turn = np.array([_AXES[letter] for letter in letters], dtype=float).T
     if abs(np.linalg.det(turn)) < 0.5:

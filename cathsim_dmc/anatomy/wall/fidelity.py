@@ -343,6 +343,7 @@ def coverage(anatomy: Anatomy, n_rays: int = 100_000, *, seed: int = 0) -> Cover
     leaks, rays = [], 0
     geom = np.empty(per_origin, np.int32)
     distance = np.empty(per_origin)
+    one = np.empty(1, np.int32)
     for origin in np.concatenate(origins):
         direction = rng.normal(size=(per_origin, 3))
         direction /= np.linalg.norm(direction, axis=1)[:, None]
@@ -358,6 +359,12 @@ def coverage(anatomy: Anatomy, n_rays: int = 100_000, *, seed: int = 0) -> Cover
             )
             crossing = origin + t[:, None] * direction - inlet.position
             hole = (t > 0.0) & (np.linalg.norm(crossing, axis=1) < _INLET_RADIUS)
+        # Near a geom that lies all around the origin mj_multiRay passes rays by that
+        # mj_ray stops (MuJoCo 3.17).
+        for k in np.flatnonzero(geom < 0):
+            found = mujoco.mj_ray(model, data, origin, direction[k], None, 1, -1, one)
+            if found >= 0.0:
+                geom[k], distance[k] = one[0], found
         missed = geom < 0
         end = origin + np.where(missed, 0.1, distance)[:, None] * direction
         leak = ~hole & (missed | (anatomy.depth(end) < -_LEAK_DEPTH))

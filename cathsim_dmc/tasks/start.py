@@ -1,0 +1,113 @@
+"""The posture in which a device waits for its episode to begin."""
+
+import mujoco
+import numpy as np
+
+from cathsim_dmc.entities.posture import bends_of, joints_along
+from cathsim_dmc.tasks.readings import ModelIndex
+from cathsim_dmc.tasks.scene import Scene
+from cathsim_dmc.tasks.variations import START_JITTER
+
+# How long the device settles; its hinges relax in 0.4 s.
+_SETTLING_TIME = 2.0  # s
+
+
+class StartPosture:
+    """Where the joints of the device are at the start of an episode.
+
+    The device is laid along the centreline of the vessel and let go, with motors and
+    base at rest: a bent elastic device comes to lie against the wall. This is done
+    once, on the compiled model without randomisation, so it is the same for every
+    simulation and every seed. An episode starts there at rest, the head displaced by
+    what was drawn.
+    """
+
+    def __init__(self, scene: Scene, model: mujoco.MjModel, index: ModelIndex):
+        """Lets the device settle.
+
+        Args:
+          scene: Entities and where they stand.
+          model: The compiled scene.
+          index: Places of the task's quantities in the model.
+        """
+        catheter = scene.catheter
+        columns = {
+            joint.name: index.qpos.start + number
+            for number, joint in enumerate(catheter.joints)
+        }
+        links = range(1, len(catheter.links))
+        # (n - 1, 2): places in qpos of the hinges about x and y.
+        self._bends = np.array(
+            [[columns[f"bend_{axis}_{link}"] for axis in "xy"] for link in links]
+        )
+        self._insertion = index.insertion_qpos
+        data = mujoco.MjData(model)
+        # The base cannot go back behind its start, so the stroke begins 1 mm later.
+        data.qpos[self._insertion] = START_JITTER
+        data.qpos[self._bends] = joints_along(
+            catheter.link_lengths, scene.placement.line, START_JITTER
+        )
+        for _ in range(round(_SETTLING_TIME / model.opt.timestep)):
+            mujoco.mj_step(model, data)
+        data.qvel[:] = 0.0
+        mujoco.mj_kinematics(model, data)
+        mujoco.mj_comPos(model, data)
+        self._angles = data.qpos[self._bends].copy()
+        self._advance = float(data.qpos[self._insertion])
+        self._directions = self._link_directions(index, data)
+        self._find_levers(model, data, index, catheter.link_lengths, scene)
+
+    def _link_directions(self, index: ModelIndex, data: mujoco.MjData) -> np.ndarray:
+        """Unit vectors (n, 3) of the links in the frame of link 0."""
+        frames = data.xmat[index.links].reshape(-1, 3, 3)
+        return frames[..., 2] @ frames[0]
+
+    def _find_levers(self, model, data, index, link_lengths, scene):
+        """How base and the first free joint move the head, for the displacement."""
+        beyond = np.cumsum(link_lengths[::-1])[::-1]  # from joint i to the head
+        free = np.flatnonzero(beyond[1:] <= scene.placement.start_depth)
+        self._free = int(free[0]) if free.size else len(link_lengths) - 2
+        jacobian = np.zeros((3, model.nv))
+        mujoco.mj_jacSite(model, data, jacobian, None, index.head_site)
+        frame = data.xmat[index.links.start].reshape(3, 3)
+        places = [self._insertion, *self._bends[self._free]]
+        dofs = [_dof_of(model, place) for place in places]
+        # Joint steps for a displacement in the frame of the inlet.
+        self._steps = np.linalg.inv(frame.T @ jacobian[:, dofs])
+
+    def write(
+        self, qpos: np.ndarray, displacement: np.ndarray, roll: float | None = None
+    ) -> None:
+        """Writes the start configuration of one simulation.
+
+        Args:
+          qpos: (nq,), written in place; joints of other entities are left alone.
+          displacement: (3,) of the head in the frame of the inlet, whose z points
+            into the lumen, m.
+          roll: Angle by which the device is turned about its own axis, rad: its
+            hinges stand otherwise, its shape is the same.
+        """
+        angles, step = self._angles, self._steps @ displacement
+        if roll:
+            angles = bends_of(_turned(self._directions, -roll))
+            step = np.concatenate([step[:1], _turn(-roll) @ step[1:]])
+        qpos[self._bends] = angles
+        qpos[self._bends[self._free]] += step[1:]
+        qpos[self._insertion] = max(self._advance + step[0], 0.0)
+
+
+def _dof_of(model: mujoco.MjModel, place: int) -> int:
+    """Degree of freedom of the joint at a place in qpos."""
+    return int(model.jnt_dofadr[np.flatnonzero(model.jnt_qposadr == place)[0]])
+
+
+def _turn(angle: float) -> np.ndarray:
+    c, s = np.cos(angle), np.sin(angle)
+    return np.array([[c, -s], [s, c]])
+
+
+def _turned(vectors: np.ndarray, angle: float) -> np.ndarray:
+    """Vectors (n, 3) turned about z."""
+    turned = vectors.copy()
+    turned[:, :2] = vectors[:, :2] @ _turn(angle).T
+    return turned

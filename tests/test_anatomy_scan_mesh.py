@@ -1,0 +1,279 @@
+"""Reading and mending the surface of a lumen: formats, units, repairs, bad scans."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from synthetic_scans import marched, write_obj, y_tree
+
+from cathsim_dmc.anatomy.scan.lumen import read_lumen
+from cathsim_dmc.anatomy.scan.mesh import read_triangles
+from cathsim_dmc.anatomy.scan.repair import edge_counts, volume
+from cathsim_dmc.anatomy.scan.units import upright
+
+DATA = Path(__file__).parent / "data"
+
+
+@pytest.fixture(scope="module")
+def y_mesh():
+    """Closed surface of the Y: vertices (mm), faces with outward normals."""
+    return marched(y_tree(), 2.0e-3)
+
+
+def assert_closed(lumen):
+    edges, times = edge_counts(lumen.faces)
+    assert (times == 2).all()
+    assert volume(lumen.vertices, lumen.faces) > 0.0
+    directed = lumen.faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
+    assert len(np.unique(directed, axis=0)) == len(directed)
+
+
+def said(lumen, text):
+    return any(text in note for note in lumen.notes)
+
+
+@pytest.mark.parametrize(
+    "file", sorted(DATA.glob("cylinder-*.vtp")), ids=lambda p: p.stem
+)
+def test_vtk_wrote_these_cylinders(file):
+    vertices, faces = read_triangles(file)
+    # A prism of nine sides in a circle of 5 mm, 40 mm high.
+    assert volume(vertices, faces) == pytest.approx(2892.544, rel=1e-5)
+
+
+def test_damaged_vtp_files(tmp_path):
+    good = (DATA / "cylinder-raw-zlib.vtp").read_bytes()
+    bad = {
+        "cut": good[: len(good) // 2],
+        "entities": b'<!DOCTYPE a [<!ENTITY b "c">]>' + good,
+        "other": b'<VTKFile type="ImageData"></VTKFile>',
+        "lz4": good.replace(b"vtkZLibDataCompressor", b"vtkLZ4DataCompressor"),
+    }
+    for name, data in bad.items():
+        path = tmp_path / f"{name}.vtp"
+        path.write_bytes(data)
+        with pytest.raises(ValueError, match="cannot be read as VTP") as error:
+            read_triangles(path)
+        assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("kind", ["stl", "ply", "obj"])
+def test_formats_and_inverted_normals(y_mesh, tmp_path, kind):
+    vertices, faces = y_mesh
+    path = tmp_path / f"lumen.{kind}"
+    trimesh.Trimesh(vertices, faces[:, ::-1], process=False).export(path)
+    lumen = read_lumen(path)
+    assert_closed(lumen)
+    assert len(lumen.faces) == len(faces)
+    assert said(lumen, "inside out")
+
+
+@pytest.mark.parametrize(("units", "scale"), [("mm", 1.0), ("cm", 0.1), ("m", 1e-3)])
+def test_units_are_guessed_and_said(y_mesh, tmp_path, units, scale):
+    vertices, faces = y_mesh
+    path = write_obj(tmp_path / "lumen.obj", vertices * scale, faces)
+    lumen = read_lumen(path)
+    assert lumen.units == units and said(lumen, f"unit guessed: {units}")
+    assert np.ptp(lumen.vertices, axis=0) == pytest.approx(
+        np.ptp(vertices, axis=0) * 1e-3, rel=1e-2
+    )
+
+
+def test_a_wrong_unit_is_refused_and_the_right_one_named(y_mesh, tmp_path):
+    vertices, faces = y_mesh
+    path = write_obj(tmp_path / "lumen.obj", vertices * 0.1, faces)
+    with pytest.raises(ValueError, match="1.1[0-9]* mm wide .*pass units='cm'"):
+        read_lumen(path, units="mm")
+    with pytest.raises(ValueError, match="pass units='cm'"):
+        read_lumen(path, units="m")
+    with pytest.raises(ValueError, match="one of mm, cm, m"):
+        read_lumen(path, units="inch")
+
+
+def test_files_that_are_no_meshes(tmp_path):
+    empty = tmp_path / "empty.stl"
+    empty.write_bytes(b"")
+    with pytest.raises(ValueError, match=r"is empty \(0 bytes\)"):
+        read_lumen(empty)
+    for kind in ("stl", "ply", "obj", "vtp"):
+        text = tmp_path / f"text.{kind}"
+        text.write_text("Dear all,\nthe scan follows tomorrow.\n" * 10)
+        with pytest.raises(ValueError, match="cannot be read|0 triangles") as error:
+            read_lumen(text)
+        assert "\n" not in str(error.value)
+    odd = tmp_path / "lumen.glb"
+    odd.write_bytes(b"x")
+    with pytest.raises(ValueError, match="formats obj, stl, ply, vtp"):
+        read_lumen(odd)
+
+
+def test_far_too_many_triangles_are_refused_unread(tmp_path, monkeypatch):
+    path = tmp_path / "huge.stl"
+    with path.open("wb") as stream:
+        stream.write(b"\0" * 80 + np.array([10_000_000], "<u4").tobytes())
+        stream.truncate(84 + 50 * 10_000_000)  # sparse
+    monkeypatch.setattr(Path, "read_bytes", lambda self: pytest.fail("was read"))
+    with pytest.raises(ValueError, match="some 10.0 million triangles"):
+        read_lumen(path)
+
+
+def test_not_a_number(y_mesh, tmp_path):
+    vertices, faces = y_mesh
+    broken = vertices.copy()
+    broken[7, 1] = np.nan
+    path = write_obj(tmp_path / "nan.obj", broken, faces)
+    with pytest.raises(ValueError, match="1 vertices whose coordinates are NaN"):
+        read_lumen(path)
+
+
+def test_holes_flips_slivers_and_crumbs_are_mended(y_mesh, tmp_path):
+    vertices, faces = y_mesh
+    rng = np.random.default_rng(0)
+    flipped = rng.choice(len(faces), 40, replace=False)
+    faces = faces.copy()
+    faces[flipped] = faces[flipped][:, ::-1]
+    # A triangle without area between two neighbours, as exporters leave them.
+    a, b, c = faces[100]
+    middle = 0.5 * (vertices[a] + vertices[b])
+    vertices = np.concatenate([vertices, middle[None]])
+    m = len(vertices) - 1
+    faces[100] = (m, b, c)
+    faces = np.concatenate([faces, [(a, m, c), (a, b, m)]])
+    crumb = trimesh.creation.icosphere(1, 0.5)
+    count = len(vertices)
+    vertices = np.concatenate([vertices, crumb.vertices + (40, 0, 0)])
+    faces = np.concatenate([np.delete(faces, [300, 500], axis=0), crumb.faces + count])
+    lumen = read_lumen(write_obj(tmp_path / "rough.obj", vertices, faces))
+    assert_closed(lumen)
+    for text in ("flipped", "holes filled", "crumbs", "without area"):
+        assert said(lumen, text), text
+
+
+def test_open_ends_are_capped(y_mesh, tmp_path):
+    vertices, faces = y_mesh
+    axes = {"left": (8, 0, 22), "right": (-3, 11, 13)}
+    stay = vertices[:, 2] > 4.0
+    for name, axis in axes.items():
+        tip = y_tree().vessel(name).centreline.points[-1] * 1e3
+        off = vertices - tip
+        stay &= (off @ axis < -4.0 * np.linalg.norm(axis)) | (
+            np.linalg.norm(off, axis=1) > 12.0
+        )
+    lumen = read_lumen(
+        write_obj(tmp_path / "open.obj", vertices, faces[stay[faces].all(axis=1)])
+    )
+    assert_closed(lumen)
+    assert len(lumen.openings) == 3
+    radii = sorted(opening.radius * 1e3 for opening in lumen.openings)
+    assert radii[2] == pytest.approx(6.0, abs=0.3) and said(lumen, "3 open vessel ends")
+
+
+def test_a_gash_in_the_side_is_refused(y_mesh, tmp_path):
+    vertices, faces = y_mesh
+    middle = vertices[faces].mean(axis=1)
+    gone = np.linalg.norm(middle - (6, 0, 25), axis=1) < 6.0
+    path = write_obj(tmp_path / "gash.obj", vertices, faces[~gone])
+    with pytest.raises(ValueError, match="hole 1[0-9.]* mm wide in the side"):
+        read_lumen(path)
+
+
+def test_edges_shared_by_three_triangles_are_mended(y_mesh, tmp_path):
+    vertices, faces = y_mesh
+    a, b, _ = faces[200]
+    fin = vertices[a] + (0.5, 0.5, 3.0)
+    path = write_obj(
+        tmp_path / "fin.obj",
+        np.concatenate([vertices, fin[None]]),
+        np.concatenate([faces, [(a, b, len(vertices))]]),
+    )
+    lumen = read_lumen(path)
+    assert_closed(lumen)
+    assert said(lumen, "1 edges shared by more than two triangles")
+
+
+def test_two_separate_lumens_are_refused(y_mesh, tmp_path):
+    vertices, faces = y_mesh
+    both = np.concatenate([vertices, vertices + 200.0])
+    path = write_obj(
+        tmp_path / "two.obj", both, np.concatenate([faces, faces + len(vertices)])
+    )
+    with pytest.raises(ValueError, match="2 separate parts"):
+        read_lumen(path)
+
+
+def test_a_spike_through_the_wall_is_refused(y_mesh, tmp_path):
+    vertices, faces = y_mesh
+    spiked = vertices.copy()
+    at = np.linalg.norm(spiked - (6, 0, 25), axis=1).argmin()
+    spiked[at] = (-25, 0, 25)  # inwards, through the lumen and out of it again
+    path = write_obj(tmp_path / "spike.obj", spiked, faces)
+    with pytest.raises(ValueError, match="intersects itself: [0-9]+ triangles, one at"):
+        read_lumen(path)
+
+
+def thick(outer_radius, capped):
+    """A bent tube of 5 mm inner radius with a wall, open at both ends (mm)."""
+    t = np.linspace(0.0, np.pi, 60)
+    line = np.stack([40 * np.cos(t), np.zeros(60), 40 * np.sin(t)], axis=1)
+    ring = np.linspace(0.0, 2.0 * np.pi, 24, endpoint=False)
+    sheets = []
+    for radius in (5.0, outer_radius):
+        radial = np.stack([np.cos(t), np.zeros(60), np.sin(t)], axis=1)
+        points = (
+            line[:, None]
+            + radius * np.cos(ring)[:, None] * radial[:, None]
+            + radius * np.sin(ring)[:, None] * np.array([0.0, 1.0, 0.0])
+        )
+        sheets.append(points.reshape(-1, 3))
+    i, j = np.meshgrid(np.arange(59), np.arange(24), indexing="ij")
+    a, b = i * 24 + j, i * 24 + (j + 1) % 24
+    c, d = a + 24, b + 24
+    quads = np.stack([a, b, c, b, d, c], -1).reshape(-1, 3)
+    n = len(sheets[0])
+    faces = [quads, quads[:, ::-1] + n]
+    if capped:
+        k = np.arange(24)
+        for row, turn in ((0, 1), (59, -1)):
+            p, q = row * 24 + k, row * 24 + (k + 1) % 24
+            rim = np.stack([p, p + n, q, q, p + n, q + n], -1).reshape(-1, 3)
+            faces.append(rim[:, ::turn])
+    return np.concatenate(sheets), np.concatenate(faces)
+
+
+@pytest.mark.parametrize("rims", [True, False], ids=["one surface", "two surfaces"])
+def test_of_a_thick_wall_the_lumen_is_taken(tmp_path, rims):
+    vertices, faces = thick(6.5, rims)
+    lumen = read_lumen(write_obj(tmp_path / "wall.obj", vertices, faces))
+    assert_closed(lumen)
+    assert said(lumen, "thick wall") and len(lumen.openings) == 2
+    exact = np.pi * 40 * np.pi * 5**2 * 1e-9
+    assert volume(lumen.vertices, lumen.faces) == pytest.approx(exact, rel=0.03)
+
+
+def test_many_triangles_are_decimated(tmp_path):
+    vertices, faces = marched(y_tree(), 0.45e-3)
+    assert len(faces) > 50_000
+    path = tmp_path / "fine.stl"
+    trimesh.Trimesh(vertices, faces, process=False).export(path)
+    lumen = read_lumen(path)
+    assert_closed(lumen)
+    assert len(lumen.faces) < 13_000 and said(lumen, "decimated from")
+    before = volume(vertices * 1e-3, faces)
+    assert volume(lumen.vertices, lumen.faces) == pytest.approx(before, rel=5e-3)
+
+
+def test_axes_turn_a_lying_scan(y_mesh, tmp_path):
+    vertices, faces = y_mesh
+    np.testing.assert_array_equal(upright("LPS"), np.eye(3))
+    # +x points to the feet, +y to the left, +z to the front.
+    np.testing.assert_array_equal(upright("ILA") @ [1, 0, 0], [0, 0, -1])
+    lying = vertices[:, [2, 0, 1]] * (-1, 1, -1)
+    lumen = read_lumen(write_obj(tmp_path / "a.obj", lying, faces), axes="ILA")
+    both = [x.mean(axis=0) for x in (lumen.vertices, vertices * 1e-3)]
+    np.testing.assert_allclose(*both, atol=1e-7)
+    for axes, match in (("LPX", "three letters"), ("LLS", "twice"), ("RPS", "mirror")):
+        with pytest.raises(ValueError, match=match):
+            upright(axes)

@@ -1,0 +1,278 @@
+"""Imports that used to go wrong in silence: each scan is made of tubes."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from synthetic_scans import marched, write_markup, write_obj, y_tree
+
+from cathsim_dmc.anatomy.anatomy import Anatomy, Goal
+from cathsim_dmc.anatomy.centreline import Centreline, Vessel, VesselTree
+from cathsim_dmc.anatomy.scan import importer
+from cathsim_dmc.anatomy.scan.check import check_tree
+from cathsim_dmc.anatomy.scan.importer import import_scan
+
+BOX = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)]) * 1e-3
+
+
+@pytest.fixture(autouse=True)
+def no_wall(monkeypatch):
+    """The tree is what is tested; the wall takes most of an import's time."""
+    report = SimpleNamespace(pieces=1)
+    monkeypatch.setattr(importer, "build_wall", lambda *a, **k: ((BOX,), report))
+
+
+def tube(points, radii):
+    line = Centreline(np.array(points) * 1e-3, np.array(radii) * 1e-3)
+    return line.resampled(1e-3)
+
+
+def arch_tree(pinch: float | None = None) -> VesselTree:
+    """An aorta that turns back, with three branches and their own (mm).
+
+    ``pinch``: radius of a narrow place of the left common carotid.
+    """
+    t = np.linspace(0.0, np.pi, 40)
+    bow = [(35 * np.cos(a), 0.0, 120 + 35 * np.sin(a)) for a in t]
+    down = [(35, 0, z) for z in range(0, 120, 4)]
+    up = [(-35, 0, z) for z in range(116, 70, -4)]
+    line = [*down, *bow, *up]
+    aorta = tube(line, [10] * len(down) + [11] * (len(bow) + len(up)))
+    vessels = {"aorta": Vessel("aorta", aorta)}
+
+    def branch(name, start, points, radii, parent="aorta", ostium=12e-3):
+        vessels[name] = Vessel(name, tube([start, *points], radii), parent, ostium)
+
+    branch("bca", (-25, 0, 145), [(-32, 0, 165), (-38, 0, 190)], [5.5] * 3)
+    end = (-38, 0, 190)
+    branch("rcca", end, [(-40, -3, 205), (-42, -5, 260)], [4, 3.2, 3], "bca", 5e-3)
+    branch("rsa", end, [(-52, 2, 200), (-100, 4, 205)], [4, 3.5, 3], "bca", 5e-3)
+    radii = [4.0, 3.5, 3.2, 3.2, 3.2, 3.0]
+    if pinch:
+        radii[3] = pinch
+    carotid = [(0, 0, 175), (2, 0, 205), (3, 0, 220), (4, 0, 235), (6, 0, 265)]
+    branch("lcca", (0, 0, 155), carotid, radii)
+    branch("lsa", (22, 0, 147), [(30, 0, 175), (50, 2, 195), (90, 4, 200)], [4.5] * 4)
+    return VesselTree(vessels)
+
+
+@pytest.fixture(scope="module")
+def arch_scan(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("arch")
+    tree = arch_tree()
+    return write_obj(folder / "lumen.obj", *marched(tree, 1.6e-3)), tree
+
+
+def failed(anatomy):
+    return {
+        check.name: check.detail for check in check_tree(anatomy) if not check.passed
+    }
+
+
+def drawn(folder, name, *parts):
+    """A markup called after a vessel, through polylines (mm)."""
+    return write_markup(
+        folder / f"centreline-{name.upper()}.mrk.json", np.concatenate(parts)
+    )
+
+
+def along(tree, name, start=0.0, end=None):
+    """Points (n, 3) mm of the way from the inlet of a tree to the end of a vessel."""
+    route = tree.route("aorta", name)
+    return (
+        route.slice(start * 1e-3, route.length if end is None else end * 1e-3).points
+        * 1e3
+    )
+
+
+def test_computed_branches_get_their_anatomical_names(arch_scan):
+    mesh, tree = arch_scan
+    notes = []
+    anatomy = import_scan(mesh, spacing=1e-3, notes=notes)
+    assert set(anatomy.tree.vessels) == {"aorta", "bca", "rcca", "rsa", "lcca", "lsa"}
+    parents = {k: v.parent for k, v in anatomy.tree.vessels.items()}
+    assert parents["lcca"] == parents["lsa"] == parents["bca"] == "aorta"
+    assert parents["rcca"] == parents["rsa"] == "bca"
+    # The device enters by the descending aorta, whose end is at z = 0.
+    assert anatomy.inlet.position[0] > 0.03 and anatomy.inlet.position[2] < 0.03
+    for name in ("rcca", "rsa", "lcca", "lsa", "aorta"):
+        vessel = anatomy.tree.vessel(name)
+        own = vessel.centreline.points[vessel.centreline.arc_length > vessel.ostium]
+        off = tree.vessel(name).centreline.project(own).distance
+        assert np.percentile(off, 95) < 1e-3, name
+    assert failed(anatomy) == {}
+    assert any("inlet chosen" in note for note in notes)
+
+
+def test_a_turned_scan_gets_the_same_names(arch_scan, tmp_path):
+    """Names come from the arch, not from the scan's axes."""
+    vertices, faces = marched(arch_scan[1], 1.6e-3)
+    lying = vertices[:, [2, 0, 1]] * (-1, 1, -1)
+    mesh = write_obj(tmp_path / "lying.obj", lying, faces)
+    free = import_scan(mesh, spacing=1e-3)
+    turned = import_scan(mesh, spacing=1e-3, axes="ILA")
+    names = {"aorta", "bca", "rcca", "rsa", "lcca", "lsa"}
+    assert set(free.tree.vessels) == set(turned.tree.vessels) == names
+    assert turned.goals["lcca"].position[2] > 0.15
+    assert free.goals["lcca"].position[0] < -0.15
+
+
+def test_names_can_be_changed(arch_scan):
+    with pytest.raises(ValueError, match="no vessel 'rva' to rename; there are"):
+        import_scan(arch_scan[0], spacing=1e-3, rename={"rva": "x"})
+
+
+def test_curves_that_part_early_at_a_wide_flat_end(arch_scan, tmp_path):
+    """They start 8 mm apart, meet, run together and part at the arch."""
+    mesh, tree = arch_scan
+    paths = []
+    for name, side in (("lcca", 6.0), ("rcca", -6.0)):
+        way = along(tree, name)
+        # Off the middle of the aorta's first 40 mm, to either side.
+        fade = np.clip(1.0 - np.arange(len(way)) / 40.0, 0.0, 1.0)
+        paths.append(drawn(tmp_path, name, way + fade[:, None] * (side, 0, 0)))
+    anatomy = import_scan(mesh, paths, spacing=1e-3)
+    assert failed(anatomy) == {}
+    for name in ("lcca", "rcca"):
+        # 207 mm beside the aorta is what was found once.
+        assert anatomy.tree.vessel(name).ostium < 30e-3
+        assert anatomy.tree.vessel(name).parent == "aorta"
+
+
+def test_a_pinch_does_not_move_a_goal_into_the_next_vessel(tmp_path):
+    tree = arch_tree(pinch=0.3)
+    mesh = write_obj(tmp_path / "lumen.obj", *marched(tree, 0.7e-3))
+    paths = [drawn(tmp_path, name, along(tree, name)) for name in ("lcca", "lsa")]
+    notes = []
+    anatomy = import_scan(mesh, paths, spacing=0.6e-3, notes=notes)
+    assert failed(anatomy) == {}
+    lcca = anatomy.tree.vessel("lcca").centreline
+    assert np.linalg.norm(lcca.points[-1] - (6e-3, 0, 265e-3)) < 10e-3
+    assert lcca.radii.min() < 0.6e-3
+    for name, goal in anatomy.goals.items():
+        assert anatomy.route(name).radii.min() > 0.84e-3, name
+        if name.startswith("lcca"):
+            assert abs(goal.position[0]) < 10e-3 and goal.position[2] < 220e-3
+
+
+def test_curves_that_start_12_mm_from_an_end_start_there(arch_scan, tmp_path):
+    mesh, tree = arch_scan
+    # From the heart's end of the aorta, 12 mm into it.
+    back = tree.root.centreline.points[::-1] * 1e3
+    origin = tree.origin("lcca")
+    way = back[np.linspace(0, 1, len(back)) < 1]
+    length = tree.root.centreline.length - origin
+    way = way[12 : int(length * 1e3)]
+    lcca = tree.vessel("lcca").centreline.points * 1e3
+    anatomy = import_scan(mesh, [drawn(tmp_path, "lcca", way, lcca)], spacing=1e-3)
+    assert anatomy.inlet.position[0] < -0.03
+    assert anatomy.inlet.position[2] < 0.1
+
+
+def test_an_inlet_at_a_bulge_is_not_its_end(tmp_path):
+    """A sinus beside the aorta: the lumen is cut there, across the aorta."""
+    tree = arch_tree()
+    bulge = Vessel("bulge", tube([(35, 0, 50), (46, 0, 50)], [8, 7]), "aorta", 5e-3)
+    bulged = VesselTree({**tree.vessels, "bulge": bulge})
+    mesh = write_obj(tmp_path / "lumen.obj", *marched(bulged, 1.6e-3))
+    anatomy = import_scan(mesh, spacing=1e-3)
+    assert "branch_1" not in anatomy.tree.vessels
+    cut = import_scan(mesh, spacing=1e-3, inlet=(35.0, 0.0, 50.0))
+    assert abs(cut.inlet.direction[2]) > 0.9
+    assert abs(cut.inlet.position[2] - 50e-3) < 3e-3
+    assert failed(cut).keys() <= {"start of the device"}
+
+
+def test_a_start_at_the_ostium_is_said(tmp_path):
+    """A straight trunk of 50 mm: a device starts past the fork."""
+    tree = y_tree()
+    mesh = write_obj(tmp_path / "lumen.obj", *marched(tree, 2e-3))
+    notes = []
+    anatomy = import_scan(mesh, spacing=1e-3, notes=notes)
+    assert set(anatomy.tree.vessels) == {"aorta", "branch_1", "branch_2"}
+    assert "start of the device" in failed(anatomy)
+    assert any("starts" in note and "inlet farther back" in note for note in notes)
+    assert any("geometry names no branch_1" in note for note in notes)
+
+
+def test_a_truncated_centreline_is_continued_and_said(arch_scan, tmp_path):
+    mesh, tree = arch_scan
+    length = tree.route("aorta", "lcca").length * 1e3
+    path = drawn(tmp_path, "lcca", along(tree, "lcca", 5.0, length - 60.0))
+    notes = []
+    anatomy = import_scan(mesh, [path], spacing=1e-3, notes=notes)
+    assert any("'lcca' stops" in note and "continued" in note for note in notes)
+    tip = anatomy.tree.vessel("lcca").centreline.points[-1]
+    assert np.linalg.norm(tip - (6e-3, 0, 265e-3)) < 10e-3
+
+
+def test_a_lumen_thinner_than_the_device_is_refused(tmp_path):
+    line = tube([(0, 0, 0), (0, 0, 20), (0, 0, 60)], [3, 0.6, 0.6])
+    tree = VesselTree({"aorta": Vessel("aorta", line)})
+    mesh = write_obj(tmp_path / "thin.obj", *marched(tree, 0.4e-3))
+    with pytest.raises(ValueError, match="5 Fr catheter") as error:
+        import_scan(mesh, spacing=0.4e-3)
+    assert "\n" not in str(error.value)
+
+
+@pytest.fixture(scope="module")
+def good(arch_scan):
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(importer, "build_wall", lambda *a, **k: ((BOX,), None))
+        return import_scan(arch_scan[0], spacing=1e-3)
+
+
+def changed(anatomy: Anatomy, tree=None, goals=None) -> Anatomy:
+    return Anatomy(
+        name=anatomy.name,
+        tree=tree or anatomy.tree,
+        surface=anatomy.surface,
+        wall=anatomy.wall,
+        inlet=anatomy.inlet,
+        goals=anatomy.goals if goals is None else goals,
+        ends=anatomy.ends,
+        field=anatomy.field,
+    )
+
+
+def test_the_proof_finds_each_fault(good):
+    """What `check_tree` is to find, planted in a tree that passes."""
+    assert failed(good) == {}
+    vessels = dict(good.tree.vessels)
+    lcca, lsa = vessels["lcca"], vessels["lsa"]
+    # A jump from one vessel into the next, through both walls.
+    middle = len(lcca.centreline.points) // 2
+    points = np.concatenate(
+        [lcca.centreline.points[:middle], lsa.centreline.points[-20:]]
+    )
+    radii = np.full(len(points), 3e-3)
+    jump = Vessel("lcca", Centreline(points, radii), "aorta", lcca.ostium)
+    found = failed(changed(good, VesselTree({**vessels, "lcca": jump}), {}))
+    assert "lcca leaves the lumen" in found["centrelines in the lumen"]
+    # A branch that runs in the aorta.
+    beside = good.tree.root.centreline.slice(0.05, 0.2)
+    twin = Vessel("lcca", beside, "aorta", 5e-3)
+    found = failed(changed(good, VesselTree({**vessels, "lcca": twin}), {}))
+    assert "lcca runs" in found["every vessel in a lumen of its own"]
+    # A vessel that stops half way.
+    short = Vessel("lcca", lcca.centreline.slice(0.0, 0.06), "aorta", lcca.ostium)
+    found = failed(changed(good, VesselTree({**vessels, "lcca": short}), {}))
+    assert "its lumen goes on" in found["vessels end at ends of the surface"]
+    # A goal that lies in another vessel.
+    goal = good.goals["lsa"]
+    wrong = Goal("lcca", "lcca", goal.position, good.goals["lcca"].arc_length)
+    found = failed(changed(good, goals={"lcca": wrong}))
+    assert "lies in lsa, not in lcca" in found["goals in their vessels"]
+    # A branch that does not start on its parent.
+    adrift = Vessel("lcca", lcca.centreline.slice(0.04, 0.09), "lsa", 1e-3)
+    found = failed(changed(good, VesselTree({**vessels, "lcca": adrift}), {}))
+    assert "outside of it" in found["branches on their parents"]
+
+
+def test_generated_arches_are_proved_too():
+    from cathsim_dmc.anatomy.arch import arch
+
+    found = failed(arch.load("type1"))
+    assert found.keys() <= {"start of the device"}
