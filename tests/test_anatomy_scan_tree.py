@@ -62,7 +62,7 @@ def arch_tree(pinch: float | None = None) -> VesselTree:
 def arch_scan(tmp_path_factory):
     folder = tmp_path_factory.mktemp("arch")
     tree = arch_tree()
-    return write_obj(folder / "lumen.obj", *marched(tree, 1.6e-3)), tree
+    return write_obj(folder / "lumen.obj", *marched(tree, 2.2e-3)), tree
 
 
 def failed(anatomy):
@@ -108,7 +108,7 @@ def test_computed_branches_get_their_anatomical_names(arch_scan):
 
 def test_a_turned_scan_gets_the_same_names(arch_scan, tmp_path):
     """Names come from the arch, not from the scan's axes."""
-    vertices, faces = marched(arch_scan[1], 1.6e-3)
+    vertices, faces = marched(arch_scan[1], 2.2e-3)
     lying = vertices[:, [2, 0, 1]] * (-1, 1, -1)
     mesh = write_obj(tmp_path / "lying.obj", lying, faces)
     free = import_scan(mesh, spacing=1e-3)
@@ -176,7 +176,7 @@ def test_an_inlet_at_a_bulge_is_not_its_end(tmp_path):
     tree = arch_tree()
     bulge = Vessel("bulge", tube([(35, 0, 50), (46, 0, 50)], [8, 7]), "aorta", 5e-3)
     bulged = VesselTree({**tree.vessels, "bulge": bulge})
-    mesh = write_obj(tmp_path / "lumen.obj", *marched(bulged, 1.6e-3))
+    mesh = write_obj(tmp_path / "lumen.obj", *marched(bulged, 2.2e-3))
     anatomy = import_scan(mesh, spacing=1e-3)
     assert "branch_1" not in anatomy.tree.vessels
     cut = import_scan(mesh, spacing=1e-3, inlet=(35.0, 0.0, 50.0))
