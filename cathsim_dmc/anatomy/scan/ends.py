@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.spatial import cKDTree
+from scipy.spatial.distance import cdist
 
 from cathsim_dmc.anatomy.scan.ways import Ways
 
@@ -39,26 +40,32 @@ class Cover:
     def __init__(self, ways: Ways):
         """Nothing is covered yet."""
         self._ways = ways
-        self.mask = np.zeros(len(ways.points), dtype=bool)
-        self._tree = cKDTree(ways.points)
+        self._centres = np.empty((0, 3))
+        self._reach = np.empty(0)
 
     def add(self, way: np.ndarray) -> None:
         """Cover the surroundings of a way (n,) of nodes."""
+        # Every other point does: their spheres overlap.
+        way = way[::2]
+        self._centres = np.concatenate([self._centres, self._ways.points[way]])
         reach = COVER * self._ways.depth[way] + 1e-3
-        # The spheres overlap: as many points as their radii apart do.
-        done = -np.inf
-        steps = np.linalg.norm(np.diff(self._ways.points[way], axis=0), axis=1)
-        along = np.concatenate([[0.0], np.cumsum(steps)])
-        for node, radius, here in zip(way, reach, along, strict=True):
-            if here < done:
-                continue
-            done = here + 0.25 * radius
-            near = self._tree.query_ball_point(self._ways.points[node], radius)
-            self.mask[near] = True
+        self._reach = np.concatenate([self._reach, reach])
+
+    def covers(self, nodes: np.ndarray) -> np.ndarray:
+        """Whether each of some nodes (n,) is covered."""
+        if not len(self._centres):
+            return np.zeros(len(nodes), dtype=bool)
+        points = self._ways.points[nodes]
+        out = np.empty(len(nodes), dtype=bool)
+        for first in range(0, len(nodes), 256):
+            part = slice(first, first + 256)
+            gap = cdist(points[part], self._centres)
+            out[part] = (gap < self._reach).any(axis=1)
+        return out
 
     def own_part(self, way: np.ndarray) -> np.ndarray:
         """Nodes of a way, given from its tip on, before it meets what is covered."""
-        met = self.mask[way]
+        met = self.covers(way)
         return way[: int(met.argmax())] if met.any() else way
 
 
@@ -80,8 +87,9 @@ def free_ends(ways: Ways) -> list[FreeEnd]:
     lookup = cKDTree(ways.points[nodes])
     taken = np.zeros(len(ways.points), dtype=bool)
     cover, ends = Cover(ways), []
-    for node in [first, *nodes[np.argsort(-reach[nodes])]]:
-        if taken[node] or (cover.mask[node] and node != first):
+    tips = _local_maxima(ways, reach)
+    for node in [first, *tips[np.argsort(-reach[tips])]]:
+        if taken[node] or (node != first and cover.covers(np.array([node]))[0]):
             continue
         way = ways.trace(before, node)[::-1]
         steps = np.linalg.norm(np.diff(ways.points[way], axis=0), axis=1)
@@ -111,6 +119,15 @@ def free_ends(ways: Ways) -> list[FreeEnd]:
             "least one end for the device to enter by."
         )
     return ends
+
+
+def _local_maxima(ways: Ways, reach: np.ndarray) -> np.ndarray:
+    """Nodes of the largest piece from which no neighbour is farther."""
+    rows, cols = ways.links
+    top = ways.main.copy()
+    top[rows[reach[cols] > reach[rows]]] = False
+    top[cols[reach[rows] > reach[cols]]] = False
+    return np.flatnonzero(top)
 
 
 @dataclass(frozen=True)
