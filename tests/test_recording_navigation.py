@@ -71,7 +71,7 @@ def test_the_episode_is_drawn_with_its_robot(env, episode, tmp_path):
     geoms = body_geoms(env.physics)
     assert {g.body_name.split("/")[0] for g in geoms} == {"robot", "sheath"}
     # The tube that is seen, not the thick sides of the bore that the device touches.
-    assert [g.kind for g in geoms if g.body_name.startswith("sheath")] == ["cylinder"]
+    assert {g.kind for g in geoms if g.body_name.startswith("sheath")} == {"cylinder"}
     loaded = Episode.load(episode.save(tmp_path / "e.npz"))
     path = write_rrd(
         loaded, env.task.scene.anatomy.surface, tmp_path / "e.rrd", robot_geoms=geoms
