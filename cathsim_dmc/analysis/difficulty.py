@@ -207,6 +207,7 @@ def difficulty(
     seeds: int = 30,
     first_seed: int = 0,
     *,
+    players: Sequence[str] | None = None,
     num_threads: int = 0,
     say: Callable[[str], None] = lambda text: None,
     keep: Callable[[Report], None] = lambda report: None,
@@ -217,20 +218,25 @@ def difficulty(
         names: Names of registered tasks; None for all with an anatomy of their own.
         seeds: Number of episodes of each policy on each task.
         first_seed: Seed of the first episode; the others count up.
+        players: Names of policies in `LIMITS`; None for all.
         num_threads: Number of threads of the simulation, 0 for one per core.
         say: Function that is told of the progress.
         keep: Function that is given the report so far after every task.
 
     Raises:
-        ValueError: there is no such task, it is named twice, or seeds < 1.
+        ValueError: there is no such task or policy, it is named twice, or seeds < 1.
     """
     names = tasks() if names is None else tuple(names)
-    _refuse(names, seeds)
+    players = tuple(LIMITS) if players is None else tuple(players)
+    _refuse("tasks", names, tasks())
+    _refuse("policies", players, tuple(LIMITS))
+    if seeds < 1:
+        raise ValueError(f"seeds is {seeds}; at least 1")
     checks: list[Check] = []
     found: dict[str, dict[str, Any]] = {}
     report = None
     for name in names:
-        trials = _trials(name, seeds, first_seed, num_threads, say)
+        trials = _trials(name, players, seeds, first_seed, num_threads, say)
         found[name] = {policy: trial.summary() for policy, trial in trials.items()}
         checks += _checks(name, trials)
         report = Report(
@@ -247,21 +253,17 @@ def difficulty(
     return report
 
 
-def _refuse(names: Sequence[str], seeds: int) -> None:
-    """Refuses input that would fail after hours of work."""
-    known = tasks()
-    unknown = [name for name in names if name not in known]
-    twice = sorted({name for name in names if names.count(name) > 1})
-    if unknown or twice or not names:
+def _refuse(what: str, given: Sequence[str], known: Sequence[str]) -> None:
+    """Refuses names that would fail after hours of work."""
+    if not given or set(given) - set(known) or len(set(given)) < len(given):
         raise ValueError(
-            f"tasks are {list(names)}; give each once, out of {', '.join(known)}"
+            f"{what} are {list(given)}; give each once, out of {', '.join(known)}"
         )
-    if seeds < 1:
-        raise ValueError(f"seeds is {seeds}; at least 1")
 
 
 def _trials(
     name: str,
+    players: Sequence[str],
     seeds: int,
     first_seed: int,
     num_threads: int,
@@ -272,11 +274,11 @@ def _trials(
     task = suite.make_task(name, observation="tracking")
     simulation = BatchSimulation(task, seeds, num_threads=num_threads)
     trials = {}
-    for policy, limit in LIMITS.items():
+    for policy in players:
         if policy == "expert" and not task.scene.device.steerable:
             continue
         player = policies.make_policy(policy, first_seed)
-        trials[policy] = trial = play(simulation, player, first_seed, limit)
+        trials[policy] = trial = play(simulation, player, first_seed, LIMITS[policy])
         say(f"{name}, {policy}: {trial.successes} of {seeds}")
     return trials
 
@@ -286,7 +288,7 @@ def _checks(name: str, trials: Mapping[str, Trial]) -> list[Check]:
         return 100.0 * trial.successes / len(trial.ends)
 
     checks = []
-    if asks_for_steering(name):
+    if "push" in trials and asks_for_steering(name):
         push = trials["push"]
         checks.append(
             Check.at_most(

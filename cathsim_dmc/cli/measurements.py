@@ -93,6 +93,7 @@ def speed(json: bool = False) -> int:
 @benchmarks.command
 def difficulty(
     task: conf.UseAppendAction[list[str]] = [],  # noqa: B006
+    policy: conf.UseAppendAction[list[str]] = [],  # noqa: B006
     seeds: int = 30,
     seed: int = EVALUATION_SEED,
     threads: int = 0,
@@ -107,6 +108,8 @@ def difficulty(
     Args:
         task: Task of `cathsim list`, repeated for several; all but `navigate` by
             default.
+        policy: Policy of the four, repeated for several; all by default: "push",
+            "random", "random_curl", "expert".
         seeds: Number of episodes of each policy on each task.
         seed: Seed of the first episode; the others count up.
         threads: Number of threads of the simulation, 0 for one per core.
@@ -126,6 +129,7 @@ def difficulty(
         task or None,
         seeds,
         seed,
+        players=policy or None,
         num_threads=threads,
         say=lambda text: print(text, file=sys.stderr, flush=True),
         keep=keep,
