@@ -245,21 +245,32 @@ class CathSimVectorEnv(gymnasium.vector.VectorEnv):
             )
         self.render_mode = None
         self._dtype = _float_type(dtype)
-        environment = suite.load(suite.DOMAIN, task, task_kwargs)
         self.num_envs = num_envs
-        self.single_observation_space, self.single_action_space = _spaces(
-            environment, self._dtype
-        )
-        environment.close()
-        many = gymnasium.vector.utils.batch_space
-        self.observation_space = many(self.single_observation_space, num_envs)
-        self.action_space = many(self.single_action_space, num_envs)
         self._simulation = batch.BatchSimulation(
             suite.make_task(task, **task_kwargs),
             num_envs,
             num_threads=num_threads,
             seeds=np.random.SeedSequence().generate_state(num_envs).tolist(),
         )
+        self._make_spaces(self._simulation.reset().observation)
+
+    def _make_spaces(self, observation: Mapping[str, np.ndarray]) -> None:
+        def box(array: np.ndarray) -> gymnasium.spaces.Box:
+            pixels = array.dtype == np.uint8
+            dtype = np.uint8 if pixels else self._dtype
+            spec = specs.Array(array.shape[1:], dtype)
+            return space(spec, dtype)
+
+        action = specs.BoundedArray(
+            (self._simulation.num_actions,), self._dtype, -1.0, 1.0
+        )
+        self.single_observation_space = gymnasium.spaces.Dict(
+            {key: box(value) for key, value in observation.items()}
+        )
+        self.single_action_space = space(action, self._dtype)
+        many = gymnasium.vector.utils.batch_space
+        self.observation_space = many(self.single_observation_space, self.num_envs)
+        self.action_space = many(self.single_action_space, self.num_envs)
 
     def reset(self, *, seed: int | list[int] | None = None, options=None):
         """Starts all episodes; a seed is that of the first, the others count up."""
