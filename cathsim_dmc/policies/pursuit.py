@@ -29,6 +29,7 @@ from cathsim_dmc.tasks.readings import Readings
 
 ROUTE_SPACING = 1e-3  # m, resolution of the route
 _WITHDRAWN = 2e-3  # m, insertion below which there is nothing left to withdraw
+_NEARBY = 10e-3  # m of the route that a head can pass between two control steps
 
 
 @dataclasses.dataclass(frozen=True)
@@ -178,13 +179,23 @@ class Place:
     excess: np.ndarray
 
 
-def locate(plan: Plan, head: np.ndarray) -> Place:
+def locate(plan: Plan, head: np.ndarray, last: np.ndarray | None = None) -> Place:
     """Finds the place of a head (..., 3) on the route.
 
     It is the nearest point of the route whose cross-section reaches the head: beside
     an ostium, still in the parent, the axis of the branch may be nearer than the
     parent's, yet the head is not in the branch. If none does, it is the point whose
     cross-section comes nearest.
+
+    Where the route turns back into a branch, the cross-sections of both reach a head
+    between them, and the nearer axis changes with every movement. A head that was on
+    one of them stays on it as long as it can: points near the last place come first.
+
+    Args:
+        plan: of the task.
+        head: (..., 3), m.
+        last: (...), arc length of its place a control step ago, m; NaN or None where
+            that is not known.
     """
     offset = head[..., None, :] - plan.points
     distance = np.sqrt(np.einsum("...i,...i->...", offset, offset))
@@ -192,6 +203,9 @@ def locate(plan: Plan, head: np.ndarray) -> Place:
     inside = outside <= 0
     # Any inside point beats every outside one.
     rank = np.where(inside, distance - 1.0, np.maximum(outside, 0.0))
+    if last is not None:  # and one near the last place every other
+        nearby = np.abs(plan.arc_length - last[..., None]) <= _NEARBY
+        rank = rank - 1.0 * (inside & nearby)
     index = rank.argmin(-1)
     excess = np.take_along_axis(outside, index[..., None], -1)[..., 0]
     radius = plan.radii[index]
@@ -205,6 +219,8 @@ class State:
     Attributes:
         bend: (..., M, 2), told to the hinges of the tip, rad.
         insertion: at the last step, m; NaN before the first.
+        arc_length: of the place on the route at the last step, m; NaN before the
+            first.
         retracting: bool.
         turn: insertion to be withdrawn to while retracting, m.
         best: farthest place on the route in this attempt, m.
@@ -215,6 +231,7 @@ class State:
 
     bend: np.ndarray
     insertion: np.ndarray
+    arc_length: np.ndarray
     retracting: np.ndarray
     turn: np.ndarray
     best: np.ndarray
@@ -228,6 +245,7 @@ class State:
         return cls(
             bend=np.zeros((*shape, joints, 2)),
             insertion=np.full(shape, np.nan),
+            arc_length=np.full(shape, np.nan),
             retracting=np.zeros(shape, dtype=bool),
             turn=np.zeros(shape),
             best=np.zeros(shape),
@@ -275,7 +293,7 @@ def decide(
     Returns:
         Action (..., A) in [-1, 1] and the new state.
     """
-    place = locate(plan, readings.head)
+    place = locate(plan, readings.head, state.arc_length)
     axes, direction = tip_frames(plan, readings.joint_positions)
     target = plan.at(place.arc_length + _lookahead(plan, settings, state, place))
     turn, cosine = _rotation_to(direction, target - readings.head)
@@ -357,6 +375,7 @@ def _attempt(
     return dataclasses.replace(
         state,
         insertion=np.array(insertion),
+        arc_length=np.array(place.arc_length),
         retracting=retracting,
         turn=turn,
         best=np.where(again, place.arc_length, best),
