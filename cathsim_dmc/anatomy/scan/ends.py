@@ -16,6 +16,7 @@ COVER = 1.5  # radii; what lies nearer to a way is no vessel of its own
 STUB = 3e-3  # m, shortest own vessel beyond that
 WIDE = 0.4  # of the widest free end: narrower ends are no inlet by default
 ROOT_WIDTH = 0.5  # of the inlet: narrower free ends do not continue the root
+LEG = 60e-3  # m at both ends of an aorta, in which it shows that it turns back
 STARTS = 30e-3  # m along the lumen; curves that start nearer to an end start there
 
 
@@ -159,8 +160,8 @@ def plan_inlet(
         curves: (n_i, 3) m, given centrelines, first point proximal; may be empty.
         inlet: (3,) m near the end to use or in the middle of a vessel that is to be
             cut there, or None to choose: the end at which the curves start, else the
-            wide end farthest along the lumen from their starts, and without curves
-            from the widest end.
+            wide end farthest along the lumen from their starts. Without curves it is
+            the end of an aorta that is not at the heart, else the widest.
 
     Raises:
         ValueError: if no end can be chosen; lists them.
@@ -183,14 +184,23 @@ def plan_inlet(
     else:
         wide = np.flatnonzero(width >= WIDE * width.max())
         root = int(width.argmax())
-        others = wide[wide != root]
-        if len(others):
-            reach = ways.lengths_from(nodes[root])[np.array(nodes)]
-            chosen = int(others[reach[others].argmax()])
-        else:
-            chosen = root
+        others = [k for k in wide if k != root and _arched(ways, nodes[root], nodes[k])]
+        # From the heart an aorta turns back; other trees are entered by their trunk.
+        reach = ways.lengths_from(nodes[root])[nodes]
+        chosen = int(max(others, key=lambda k: reach[k])) if others else root
     far = _far_end(ways, ends, at_goal, nodes[chosen], curves, chosen)
     return Entry(position[chosen], True, far)
+
+
+def _arched(ways: Ways, heart: int, node: int) -> bool:
+    """Whether the way from one end to another turns back, as an aortic arch does."""
+    way = ways.points[ways.trace(ways.deepest_from(heart), node)]
+    steps = np.linalg.norm(np.diff(way, axis=0), axis=1)
+    along = np.concatenate([[0.0], np.cumsum(steps)])
+    leg = min(LEG, 0.25 * along[-1])
+    first = way[np.searchsorted(along, leg)] - way[0]
+    last = way[np.searchsorted(along, along[-1] - leg)] - way[-1]
+    return float(first @ last) > 0.0
 
 
 def _ends_of_curves(ways, ends, lasts) -> np.ndarray:
