@@ -48,16 +48,16 @@ class ObjectivePool:
     def outcome(self, measurement: Measurement) -> Outcome:
         """Judges a control step of N simulations."""
         parts = [
-            (objective.outcome(_part(measurement, rows)), rows)
+            (objective.outcome(part(measurement, rows)), rows)
             for objective, rows in self._groups
         ]
         terms = {
-            name: self._merged([(part.terms[name], rows) for part, rows in parts])
+            name: self._merged([(one.terms[name], rows) for one, rows in parts])
             for name in parts[0][0].terms
         }
         return Outcome(
-            reward=self._merged([(part.reward, rows) for part, rows in parts]),
-            success=self._merged([(part.success, rows) for part, rows in parts]),
+            reward=self._merged([(one.reward, rows) for one, rows in parts]),
+            success=self._merged([(one.success, rows) for one, rows in parts]),
             terms=MappingProxyType(terms),
         )
 
@@ -83,8 +83,8 @@ class ObjectivePool:
         return merged
 
 
-def _part(measured: Any, rows: np.ndarray) -> Any:
+def part(measured: Any, rows: np.ndarray) -> Any:
     """Rows of all arrays of a named tuple, and of the tuples in it."""
     if isinstance(measured, np.ndarray):
         return measured[rows]
-    return type(measured)._make(_part(value, rows) for value in measured)
+    return type(measured)._make(part(value, rows) for value in measured)
