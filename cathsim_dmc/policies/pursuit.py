@@ -25,6 +25,7 @@ import numpy as np
 
 from cathsim_dmc.entities import devices
 from cathsim_dmc.tasks import forces, navigation
+from cathsim_dmc.tasks.cases import Case
 from cathsim_dmc.tasks.readings import Readings
 
 ROUTE_SPACING = 1e-3  # m, resolution of the route
@@ -113,8 +114,8 @@ class Plan:
     num_actions: int
 
     @classmethod
-    def for_task(cls, task: navigation.Navigation) -> Plan:
-        """Reads off a task.
+    def for_task(cls, task: navigation.Navigation | Case) -> Plan:
+        """Reads off a task, or one of the anatomies that its episodes draw from.
 
         Raises:
             ValueError: if the task's device has no motors in its tip.

@@ -14,6 +14,7 @@ from dm_control import composer
 
 from cathsim_dmc.simulation.batch import BatchSimulation
 from cathsim_dmc.tasks import forces
+from cathsim_dmc.tasks.cases import Case
 from cathsim_dmc.tasks.navigation import Navigation
 from cathsim_dmc.tasks.readings import Readings
 
@@ -38,6 +39,9 @@ class View(Protocol):
     def task(self) -> Navigation:
         """The task that all simulations run."""
 
+    def case(self, index: int) -> Case:
+        """Scene and objective of the episode of one simulation."""
+
     @property
     def readings(self) -> Readings:
         """State of the devices; every array has the leading axis N."""
@@ -59,6 +63,10 @@ class BatchedView:
     def task(self) -> Navigation:
         """The task that all simulations run."""
         return self._simulation.task
+
+    def case(self, index: int) -> Case:
+        """Scene and objective of the episode of one simulation."""
+        return self._simulation.rollout.case(index)
 
     @property
     def readings(self) -> Readings:
@@ -83,6 +91,10 @@ class ComposerView:
     def task(self) -> Navigation:
         """The task of the first; the others' differ in their randomness only."""
         return self._environments[0].task
+
+    def case(self, index: int) -> Case:
+        """Scene and objective of the episode of one simulation."""
+        return self._environments[index].task.rollout.case()
 
     @property
     def readings(self) -> Readings:

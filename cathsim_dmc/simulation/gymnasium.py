@@ -8,6 +8,7 @@ import numpy as np
 from dm_env import specs
 
 from cathsim_dmc import suite
+from cathsim_dmc.anatomy.anatomy import Surface
 from cathsim_dmc.imaging import angiograph
 from cathsim_dmc.simulation import batch
 from cathsim_dmc.tasks.config import CONTROL_TIMESTEP
@@ -117,7 +118,7 @@ class CathSimEnv(gymnasium.Env):
         self.observation_space, self.action_space = _spaces(
             self._environment, self._dtype
         )
-        self._renderer = None
+        self._machines: dict[Surface, angiograph.Angiograph] = {}
         self._begun, self._ended = False, True
         self._closed = False
 
@@ -160,13 +161,13 @@ class CathSimEnv(gymnasium.Env):
         return fluoroscopy_frame(self._environment.task, self._machine())
 
     def _machine(self) -> angiograph.Angiograph:
-        if self._renderer is None:
-            task = self._environment.task
-            surface = task.scene.anatomy.surface
-            self._renderer = angiograph.Angiograph(
+        task = self._environment.task
+        surface = task.scene.anatomy.surface
+        if surface not in self._machines:
+            self._machines[surface] = angiograph.Angiograph(
                 surface.vertices, surface.faces, task.config.fluoroscopy
             )
-        return self._renderer
+        return self._machines[surface]
 
     @property
     def environment(self):

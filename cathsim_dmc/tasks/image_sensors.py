@@ -25,25 +25,31 @@ class ImageSensors:
 
         Args:
           names: Names of the observations.
-          angiograph: Angiography machine, needed by fluoroscopic observations.
+          angiograph: Angiography machine, needed by fluoroscopic observations; an
+            episode may have another one of the same set-up.
           device_radius: Outer radius of the device, m.
           num_simulations: N.
           gl_cameras: MuJoCo's cameras, needed by `rgb` and `depth`.
         """
         self._names = names
         self._on = angiograph is not None or gl_cameras is not None
-        self._angiograph = angiograph
         self._radius = device_radius
         self._cameras = gl_cameras
+        self._noise = angiograph is not None and angiograph.options.noise
         self._planes = [angiograph and angiograph.planes()] * num_simulations
         self._images: list[np.ndarray] = []
         self._masks = self._pixels = None
         self._views: dict[str, np.ndarray] = {}
 
-    def restart(self, index: int, deviation: machines.Deviation) -> None:
+    def restart(
+        self,
+        index: int,
+        angiograph: machines.Angiograph | None,
+        deviation: machines.Deviation,
+    ) -> None:
         """Begins an episode of one simulation, before a machine that deviates."""
-        if self._angiograph is not None:
-            self._planes[index] = self._angiograph.planes(deviation)
+        if angiograph is not None:
+            self._planes[index] = angiograph.planes(deviation)
 
     def capture(
         self,
@@ -71,7 +77,7 @@ class ImageSensors:
         planes = [self._planes[index] for index in chosen]
         if self._wants("image", "sequential"):
             states = None
-            if random_states is not None and self._angiograph.options.noise:
+            if random_states is not None and self._noise:
                 states = [random_states[index] for index in chosen]
             image = machines.render(planes, line, self._radius, states)
             self._remember(image, count, fresh)

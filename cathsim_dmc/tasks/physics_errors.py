@@ -59,17 +59,19 @@ class PhysicsMonitor:
         """Starts with no episode running.
 
         Args:
-          anatomy: Anatomy whose lumen the devices must not leave.
+          anatomy: Anatomy whose lumen the devices must not leave, until an episode
+            begins in another one.
           num_simulations: N.
           task: JSON-able description of the task for the dumps.
         """
-        self._anatomy = anatomy
+        self._anatomies = [anatomy] * num_simulations
         self._task = task
         self._states: list[np.ndarray | None] = [None] * num_simulations
         self._actions: list[list[np.ndarray]] = [[] for _ in range(num_simulations)]
 
-    def restart(self, index: int) -> None:
-        """Forgets the episode of a simulation."""
+    def restart(self, index: int, anatomy: Anatomy) -> None:
+        """Forgets the episode of a simulation; the next one is in an anatomy."""
+        self._anatomies[index] = anatomy
         self._states[index] = None
         self._actions[index] = []
 
@@ -123,17 +125,27 @@ class PhysicsMonitor:
             return reasons
         out = np.zeros(len(reasons), dtype=bool)
         if looked:
-            out[looked] = escaped(self._anatomy, centreline[looked])
+            out[looked] = self._escaped(looked, centreline)
         for index in np.flatnonzero(wrong | out):
             reason = ESCAPED if out[index] and not wrong[index] else EXPLODED
             reasons[index] = reason = DIVERGED if diverged[index] else reason
             dump(
                 reason,
-                task=self._task,
+                task={"anatomy": self._anatomies[index].name, **self._task},
                 state=self._states[index],
                 actions=np.array(self._actions[index]),
             )
         return reasons
+
+    def _escaped(self, looked: list[int], centreline: np.ndarray) -> np.ndarray:
+        """Whether some simulations have left the lumen, each its own: (len,) bool."""
+        out = np.zeros(len(looked), dtype=bool)
+        own = [self._anatomies[index] for index in looked]
+        for anatomy in dict.fromkeys(own):
+            rows = [row for row, other in enumerate(own) if other is anatomy]
+            chosen = [looked[row] for row in rows]
+            out[rows] = escaped(anatomy, centreline[chosen])
+        return out
 
 
 def dump(

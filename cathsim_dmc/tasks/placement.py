@@ -21,7 +21,7 @@ _SPARE_STROKE = 0.08  # m
 _BASE_LENGTH = 0.02  # m of device that never leaves the sheath
 # One chain for every registered task, so that observations have one shape and a policy
 # of one task can be tried on any other; longer where a goal lies farther away.
-_COMMON_LENGTH = 0.34  # m
+COMMON_LENGTH = 0.34  # m
 _LONGEST_DEVICE = 3.0  # m, the longest wires sold
 _LINE_SPACING = 1e-3  # m
 
@@ -108,7 +108,7 @@ def place_device(
     )
     if working_length is None:
         stroke = max(route.length - start_depth, 0.0) + _SPARE_STROKE
-        working_length = max(start_depth + stroke + _BASE_LENGTH, _COMMON_LENGTH)
+        working_length = max(start_depth + stroke + _BASE_LENGTH, COMMON_LENGTH)
     stroke = working_length - start_depth - _BASE_LENGTH
     least = max(start_depth + _BASE_LENGTH, device.tip_length)
     # Also false for NaN.
