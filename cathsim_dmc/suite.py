@@ -120,8 +120,9 @@ def make_task(
         # `phantom` is what this option was called at first.
         anatomy = options.pop("phantom", "type1")
         anatomy = options.pop("anatomy", anatomy)
-        goal = options.pop("goal", "bca")
         access = options.pop("access", access)
+    if goal is None:
+        goal = options.pop("goal", "bca")
     _refuse_unknown(definition, options)
     anatomy = load_anatomy(anatomy, access)
     goal = placement.resolve_goal(anatomy, goal)
@@ -130,7 +131,7 @@ def make_task(
     )
     chosen = {k: v for k, v in options.items() if k not in _CONFIG_FIELDS}
     if "farthest_shift" in definition.objective_options:
-        chosen["farthest_shift"] = config.randomisation.farthest_shift
+        chosen["farthest_shift"] = config.ranges.farthest_shift
     objective = definition.objective(anatomy, goal, **chosen)
     scene = Scene.build(anatomy, goal, config, goal_radius=objective.goal_radius)
     return Navigation(scene, objective, config, random)
@@ -139,7 +140,8 @@ def make_task(
 def task_options(name: str) -> tuple[str, ...]:
     """Names of the options of a task beside `random` and `environment_kwargs`."""
     definition = TASKS[name]
-    own = () if definition.anatomy is not None else ("anatomy", "goal", "access")
+    own = () if definition.anatomy is not None else ("anatomy", "access")
+    own = own if definition.goal is not None else (*own, "goal")
     of_objective = (o for o in definition.objective_options if o != "farthest_shift")
     return (*own, *of_objective, *_CONFIG_FIELDS)
 

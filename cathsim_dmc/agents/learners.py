@@ -45,6 +45,7 @@ class Learner(Protocol):
         shapes: NetworkShapes, config: TrainingConfig
     ) -> TensorDictSequential:
         """A policy with fresh weights: raw observation in, action out."""
+        ...
 
     def observe(self, batch: TensorDictBase) -> None:
         """Take observation statistics from a batch without learning from it."""
@@ -59,12 +60,15 @@ class Learner(Protocol):
         Returns:
             Figures by the names in `metrics`; what is not known yet is left out.
         """
+        ...
 
     def policy_state(self) -> dict[str, Any]:
         """Weights and statistics that acting needs."""
+        ...
 
     def learning_state(self) -> dict[str, Any]:
         """What learning needs beyond the policy: tensors, numbers, strings."""
+        ...
 
     def load(self, policy: dict[str, Any], learning: dict[str, Any]) -> None:
         """Restore what policy_state and learning_state gave."""

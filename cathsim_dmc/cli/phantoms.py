@@ -162,6 +162,7 @@ def generate(
         )
     elif kind in arch.SETS:
         _check_given(kind, given, "index")
+        index = int(index or 0)
         arches = arch.arch_set(kind)
         if not 0 <= index < len(arches):
             raise ValueError(

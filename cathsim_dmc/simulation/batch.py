@@ -76,9 +76,9 @@ class BatchSimulation:
         )
         self.seed(seeds)
 
-    def seed(self, seeds: Sequence[int] | int) -> None:
+    def seed(self, seeds: Sequence[int | Sequence[int]] | int) -> None:
         """Gives each simulation its own source of randomness."""
-        if np.ndim(seeds) == 0:
+        if isinstance(seeds, int | np.integer):
             seeds = [int(seeds) + index for index in range(self.num_simulations)]
         if len(seeds) != self.num_simulations:
             raise ValueError(
@@ -158,12 +158,12 @@ class BatchSimulation:
         return self._rollout
 
     @property
-    def readings(self) -> readings.Readings | None:
+    def readings(self) -> readings.Readings:
         """State of the devices after the last step or reset, arrays (N, ...)."""
         return self._rollout.readings
 
     @property
-    def wall_force(self) -> forces.WallForce | None:
+    def wall_force(self) -> forces.WallForce:
         """Force on the wall over the last step, arrays (N,)."""
         return self._rollout.wall_force
 

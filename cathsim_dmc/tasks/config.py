@@ -2,7 +2,7 @@
 
 import dataclasses
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, cast
 
 from cathsim_dmc.entities import devices
 from cathsim_dmc.entities.contact import FRICTION
@@ -61,6 +61,23 @@ class NavigationConfig:
         object.__setattr__(
             self, "randomisation", Randomisation.make(self.randomisation)
         )
+
+    # Three fields with the types that they have once the config is made.
+
+    @property
+    def ranges(self) -> Randomisation:
+        """`randomisation`, whatever it was given as."""
+        return cast(Randomisation, self.randomisation)
+
+    @property
+    def fluoroscopy_options(self) -> FluoroscopyOptions:
+        """`fluoroscopy`, whatever it was given as."""
+        return cast(FluoroscopyOptions, self.fluoroscopy)
+
+    @property
+    def camera_options(self) -> CameraOptions:
+        """`cameras`, whatever they were given as."""
+        return cast(CameraOptions, self.cameras)
 
 
 def _options(name: str, kind: type, value: Mapping[str, Any]):

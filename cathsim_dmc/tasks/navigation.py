@@ -58,7 +58,7 @@ class Navigation(composer.Task):
             if isinstance(random, np.random.RandomState)
             else np.random.RandomState(random)
         )
-        if config.randomisation.goal_shift and not hasattr(objective, "shifted"):
+        if config.ranges.goal_shift and not hasattr(objective, "shifted"):
             raise ValueError(
                 f"randomisation shifts the goal, but {type(objective).__name__} has "
                 "no method shifted(shift): add one, or leave goal_shift out"
@@ -69,12 +69,12 @@ class Navigation(composer.Task):
         if observations.needs_fluoroscopy(self._names):
             surface = scene.anatomy.surface
             self._angiograph = Angiograph(
-                surface.vertices, surface.faces, config.fluoroscopy
+                surface.vertices, surface.faces, config.fluoroscopy_options
             )
         if set(cameras.KINDS) & set(self._names):
             cameras.add_tip_camera(scene.arena, scene.catheter)
         self.set_timesteps(CONTROL_TIMESTEP, config.physics_timestep)
-        self._rollout: Rollout | None = None
+        self._rollout: Rollout  # there once the model is compiled
         self._observables = None
         self._step: Step | None = None
 
@@ -109,7 +109,7 @@ class Navigation(composer.Task):
         """One observable per entry of the chosen observations."""
         if self._observables is None:
             options = observations.ImageOptions(
-                self._config.fluoroscopy, self._config.cameras
+                self._config.fluoroscopy_options, self._config.camera_options
             )
             self._observables = {
                 key: observations.FrameObservable(
@@ -153,7 +153,7 @@ class Navigation(composer.Task):
         self._step = None
         self._rollout.begin(_ONLY, [random_state])
         goal = self._scene.phantom.goals.get(self._scene.goal.name)
-        if goal is not None and self._config.randomisation.goal_shift:  # only looks
+        if goal is not None and self._config.ranges.goal_shift:  # only looks
             physics.bind(goal).pos = self.goal_position
 
     def before_step(self, physics, action, random_state):
@@ -222,12 +222,12 @@ class Navigation(composer.Task):
     def get_reward(self, physics) -> float:
         """Reward of the last control step, 0 if the physics failed in it."""
         del physics
-        return float(self._step.outcome.reward[0])
+        return float(self._current().outcome.reward[0])
 
     def get_discount(self, physics) -> float:
         """0 at success or an error of physics, 1 otherwise; the time limit keeps 1."""
         del physics
-        return 0.0 if self._step.terminated[0] else 1.0
+        return 0.0 if self._current().terminated[0] else 1.0
 
     def should_terminate_episode(self, physics) -> bool:
         """Whether the episode has ended."""
@@ -249,7 +249,7 @@ class Navigation(composer.Task):
     @property
     def objective(self) -> Objective:
         """Success and reward, with the goal of this episode."""
-        return self._objective if self._rollout is None else self._rollout.objective
+        return self._objective if self.rollout is None else self.rollout.objective
 
     @property
     def goal_position(self) -> np.ndarray:
@@ -259,7 +259,7 @@ class Navigation(composer.Task):
     @property
     def rollout(self) -> Rollout | None:
         """The course of the episode, or None before the model is compiled."""
-        return self._rollout
+        return getattr(self, "_rollout", None)
 
     @property
     def readings(self) -> readings.Readings:

@@ -6,7 +6,7 @@ import os
 import tempfile
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
@@ -95,7 +95,7 @@ class PhysicsMonitor:
         self,
         diverged: Sequence[bool],
         centreline: np.ndarray,
-        peak_force: Sequence[float],
+        peak_force: Sequence[float] | np.ndarray,
     ) -> list[str | None]:
         """What went wrong in the control step that has just ended; logs and dumps it.
 
@@ -124,13 +124,14 @@ class PhysicsMonitor:
         out = np.zeros(len(reasons), dtype=bool)
         if looked:
             out[looked] = escaped(self._anatomy, centreline[looked])
-        for index in np.flatnonzero(wrong | out):
+        for index in np.flatnonzero(wrong | out).tolist():
             reason = ESCAPED if out[index] and not wrong[index] else EXPLODED
             reasons[index] = reason = DIVERGED if diverged[index] else reason
             dump(
                 reason,
                 task=self._task,
-                state=self._states[index],
+                # Kept before the step that went wrong.
+                state=cast(np.ndarray, self._states[index]),
                 actions=np.array(self._actions[index]),
             )
         return reasons

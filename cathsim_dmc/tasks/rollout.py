@@ -7,7 +7,7 @@ one of N; so both draw, command, judge and observe alike, bit for bit.
 """
 
 from collections.abc import Callable, Sequence
-from typing import Protocol
+from typing import Protocol, cast
 
 import mujoco
 import numpy as np
@@ -18,7 +18,7 @@ from cathsim_dmc.imaging.fluoroscopy import Fluoroscope
 from cathsim_dmc.tasks import forces, observations, readings
 from cathsim_dmc.tasks.config import NavigationConfig
 from cathsim_dmc.tasks.image_sensors import ImageSensors, open_cameras
-from cathsim_dmc.tasks.objectives import Measurement, Objective
+from cathsim_dmc.tasks.objectives import Measurement, Objective, ShiftableObjective
 from cathsim_dmc.tasks.path_tracker import PathTracker
 from cathsim_dmc.tasks.physics_errors import PhysicsMonitor
 from cathsim_dmc.tasks.scene import Scene
@@ -39,6 +39,8 @@ class SimulationState(Protocol):
 
 class SingleState:
     """Arrays of one `mujoco.MjData`, not copied, with a leading axis of length 1."""
+
+    qpos: np.ndarray
 
     def __init__(self, data: mujoco.MjData):
         """Takes the views; they stay valid as long as `data` lives."""
@@ -81,7 +83,7 @@ class Rollout:
         catheter = scene.catheter.mjcf_model.model
         self._index = readings.ModelIndex(model, catheter, scene.robot.mjcf_model.model)
         num_actions = len(scene.catheter.actuators)
-        randomisation = config.randomisation
+        randomisation = config.ranges
         self._variation = ModelVariation(model, randomisation, catheter)
         self._fields = {name: model_field(name) for name in self._variation.fields}
         self._delay = ActionDelay(
@@ -92,7 +94,7 @@ class Rollout:
             angiograph,
             scene.device.outer_radius,
             num_simulations,
-            open_cameras(self._names, model, config.cameras, catheter),
+            open_cameras(self._names, model, config.camera_options, catheter),
         )
         self._monitor = PhysicsMonitor(
             scene.anatomy,
@@ -105,13 +107,14 @@ class Rollout:
         )
         self._path = PathTracker(num_simulations)
         self._start = StartPosture(scene, model, self._index)
-        self._random_states: list[np.random.RandomState] | None = None
+        self._random_states: list[np.random.RandomState] = []
         self._goal_shift = np.zeros(num_simulations)
         self._steps = np.zeros(num_simulations, dtype=int)
         self._action = np.zeros((num_simulations, num_actions))
         self._previous_action = self._action
-        self._readings: readings.Readings | None = None
-        self._wall_force: forces.WallForce | None = None
+        # There from the first measurement on.
+        self._readings: readings.Readings
+        self._wall_force: forces.WallForce
 
     # The course of an episode.
 
@@ -131,8 +134,10 @@ class Rollout:
         for index in indices:
             self._draw(index)
         self.pose_robot(self._state.qpos)
-        if self._config.randomisation.goal_shift is not None:
-            self._objective = self._nominal_objective.shifted(self._goal_shift)
+        if self._config.ranges.goal_shift is not None:
+            # Navigation has made sure that it can be shifted.
+            nominal = cast(ShiftableObjective, self._nominal_objective)
+            self._objective = nominal.shifted(self._goal_shift)
         self._steps[indices] = 0
         # New arrays: those handed out before stay what they were.
         self._action = self._action.copy()
@@ -141,7 +146,7 @@ class Rollout:
 
     def _draw(self, index: int) -> None:
         """Draws the episode of one simulation and puts its device to the start."""
-        episode = self._config.randomisation.draw(self._random_states[index])
+        episode = self._config.ranges.draw(self._random_states[index])
         fields = {name: values[index] for name, values in self._fields.items()}
         self._variation.write(fields, episode)
         self._delay.restart(index, episode.delay)
@@ -286,12 +291,12 @@ class Rollout:
         return self._index
 
     @property
-    def readings(self) -> readings.Readings | None:
+    def readings(self) -> readings.Readings:
         """State of the devices after the last step or reset."""
         return self._readings
 
     @property
-    def wall_force(self) -> forces.WallForce | None:
+    def wall_force(self) -> forces.WallForce:
         """Force on the wall over the last step."""
         return self._wall_force
 

@@ -118,7 +118,8 @@ def import_scan(
             notes.append(text)
         say(f"note: {text}")
 
-    frame_sign(mesh_frame), upright(axes)
+    frame_sign(mesh_frame)
+    upright(axes)
     if units is not None:
         metres_per(units)
     place = _as_point(inlet)
@@ -225,6 +226,7 @@ def _walled(anatomy, wall, tolerance, threshold, say, note) -> Anatomy:
     field, tree, opening = anatomy.field, anatomy.tree, anatomy.inlet
     cut_vertices, shell, cap = cut_open(vertices, faces.astype(np.int64), opening)
     closed = np.concatenate([shell, cap])
+    shut = compiled(shut_behind(field, cut_vertices, closed, opening))
     anatomy = Anatomy(
         name=anatomy.name,
         tree=tree,
@@ -233,7 +235,7 @@ def _walled(anatomy, wall, tolerance, threshold, say, note) -> Anatomy:
         inlet=opening,
         goals=anatomy.goals,
         ends=anatomy.ends,
-        field=compiled(shut_behind(field, cut_vertices, closed, opening)),
+        field=shut,
     )
     for check in check_tree(anatomy):
         if check.passed:
@@ -260,7 +262,7 @@ def _walled(anatomy, wall, tolerance, threshold, say, note) -> Anatomy:
             progress=say,
         )
     pieces += tuple(inlet_cap(cut_vertices[cap[:, :2]], opening))
-    return replace(anatomy, wall=pieces, field=plain(anatomy.field))
+    return replace(anatomy, wall=pieces, field=plain(shut))
 
 
 def passable_length(vessel: Vessel, radius: float = DEVICE_RADIUS) -> float:
@@ -375,7 +377,9 @@ def _place_inlet(tree: VesselTree, at_end: bool) -> tuple[VesselTree, Inlet]:
         line = line.slice(start, line.length)
     place = line.at(0.0)
     ahead = line.at(min(3.0 * float(place.radius), 0.5 * line.length)).position
-    opening = Inlet(root.name, place.position, ahead - place.position, place.radius)
+    opening = Inlet(
+        root.name, place.position, ahead - place.position, float(place.radius)
+    )
     vessels = dict(tree.vessels)
     vessels[root.name] = Vessel(root.name, line)
     return VesselTree(vessels), opening
