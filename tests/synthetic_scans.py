@@ -9,6 +9,7 @@ import numpy as np
 
 from cathsim_dmc.anatomy.centreline import Centreline, Vessel, VesselTree
 from cathsim_dmc.anatomy.scan.lumen import read_lumen
+from cathsim_dmc.anatomy.surface import lumen_surface
 
 
 def read_mesh(path, units="mm"):
@@ -37,15 +38,8 @@ def y_tree() -> VesselTree:
 
 def marched(tree: VesselTree, spacing: float = 2.0e-3):
     """Closed surface of a tree's lumen: vertices (mm), faces with outward normals."""
-    from skimage.measure import marching_cubes
-
-    points = np.concatenate([v.centreline.points for v in tree.vessels.values()])
-    low, high = points.min(0) - 9e-3, points.max(0) + 9e-3
-    axes = [np.arange(a, b, spacing) for a, b in zip(low, high, strict=True)]
-    grid = np.stack(np.meshgrid(*axes, indexing="ij"), -1)
-    depth = tree.depth(grid, closed=True)
-    vertices, faces, _, _ = marching_cubes(depth, 0.0, spacing=(spacing,) * 3)
-    return (vertices + low) * 1e3, faces[:, ::-1]
+    surface = lumen_surface(tree, spacing)
+    return surface.vertices * 1e3, np.asarray(surface.faces)
 
 
 def write_obj(path: Path, vertices, faces) -> Path:

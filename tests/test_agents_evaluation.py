@@ -8,8 +8,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from cathsim_dmc.agents import compare, evaluate
-from cathsim_dmc.agents.evaluation import paired_bootstrap, success_interval
+from cathsim_dmc.agents.evaluation import paired_bootstrap
 from cathsim_dmc.agents.report import Report
+from cathsim_dmc.analysis.intervals import success_interval
 
 SORTED = sorted(synthetic_env.SIZES)
 # Where "position" begins in the concatenated observation.

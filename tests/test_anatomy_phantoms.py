@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 
 from cathsim_dmc.anatomy import phantoms
+from cathsim_dmc.anatomy import surface as surfaces
+from cathsim_dmc.anatomy.scan.mesh_depth import MeshDepth
 from cathsim_dmc.anatomy.surface import lumen_surface
 from cathsim_dmc.anatomy.wall import fidelity
-from cathsim_dmc.anatomy.wall.depth import MeshDepth
 
 MEASURED = Path(__file__).parent / "data/measured"
 SCRIPT = Path(__file__).parents[1] / "docs/scripts/measured_phantoms.py"
@@ -70,6 +71,20 @@ def test_walls_keep_the_lumen_free_and_closed(name, access):
     assert fidelity.coverage(anatomy, 20_000).fraction == 1.0
     assert fidelity.patency(anatomy, 1e-3, spacing=2e-3).passed
     assert len(anatomy.wall) <= 850
+
+
+@pytest.mark.parametrize("name", phantoms.MEASURED)
+def test_surfaces_are_whole_where_the_lumen_is_narrow(name):
+    """A grid coarser than the lumen tears the carotids into beads."""
+    anatomy = phantoms.load(name)
+    assert surfaces.bodies(anatomy.surface) == 1
+    assert surfaces.loose_edges(anatomy.surface) == 0
+    torn = lumen_surface(phantoms.load("type2").tree, 2.2e-3)
+    assert surfaces.bodies(torn) > 1
+    vertices = anatomy.surface.vertices
+    gap = np.abs(anatomy.tree.depth(vertices, closed=True))
+    assert np.percentile(gap, 99) < 0.3e-3
+    assert len(anatomy.surface.faces) < 40_000
 
 
 def test_accesses_enter_at_the_two_ends_of_the_aorta():

@@ -172,7 +172,7 @@ def test_every_setting_is_a_typed_option(cathsim, tmp_path):
     assert (config.hidden, config.target_kl, config.epochs) == ((8, 8), 0.5, 1)
     assert config.observation == ("tracking", "force")
     assert config.task_kwargs == {
-        "max_steps": 8, "friction": 0.1, "phantom": "type2", "goal": "lcca",
+        "max_steps": 8, "friction": 0.1, "anatomy": "type2", "goal": "lcca",
     }  # fmt: skip
     # A run that is resumed keeps its own settings and may go on for longer.
     code, out, err = cathsim("train", "--out", tmp_path, "--resume", "--frames", 128)
@@ -296,7 +296,7 @@ BAD = {
     ),
     "no such scan": (
         ["phantom", "import", "OUT.obj", "--centreline", "OUT.csv", "--out", "OUT"],
-        ["OUT.csv", ".mrk.json"],
+        ["OUT.obj", "no mesh file", "STL"],
     ),
     "no such checkpoint": (["eval", "OUT"], ["no checkpoint", "OUT"]),
     "no task to evaluate on": (["eval", "random"], ["needs a task"]),

@@ -299,7 +299,7 @@ def test_lines_that_no_chain_follows():
     line = straight(0.1) + [0, 0, 0.1]
     with pytest.raises(ValueError, match="ends before link 2 of 3"):
         joints_along([0.05, 0.04, 0.02], line)
-    with pytest.raises(ValueError, match="link 0 by 90.00° away from .z"):
+    with pytest.raises(ValueError, match="link 0 points 90.00° away from .z"):
         joints_along([0.01, 0.01], line @ [[1, 0, 0], [0, 0, 1], [0, 1, 0]])
     with pytest.raises(ValueError, match="advance is 0.2 m"):
         joints_along([0.01], line, advance=0.2)

@@ -82,6 +82,7 @@ def test_goal_in_a_vessel_that_is_not_there():
     fails(
         ["rcca", *arch.load("simple1").tree.vessels],
         task_name="navigate",
+        anatomy="simple1",
         goal=Goal("far", "rcca", place.position, 0.02),
     )
 
@@ -119,6 +120,17 @@ def test_wrong_reward():
         ({"goal_radius": 0.0}, ["goal_radius", "0.0", "> 0"]),
         ({"goal_radius": -1e-3}, ["goal_radius", "-0.001", "> 0"]),
         ({"max_steps": 0}, ["max_steps", "0", "at least 1"]),
+        ({"max_steps": 1.5}, ["max_steps", "1.5", "integer"]),
+        ({"max_steps": float("inf")}, ["max_steps", "inf", "integer"]),
+        ({"max_steps": True}, ["max_steps", "True", "integer"]),
+        ({"rotation": "False"}, ["rotation", "'False'", "True or False"]),
+        ({"shaft_link": 1e9}, ["shaft_link", "1e", "0.002 to 0.1 m"]),
+        ({"shaft_link": 1e-6}, ["shaft_link", "1e-06", "0.002 to 0.1 m"]),
+        ({"friction": "0.1"}, ["friction", "'0.1'", "number"]),
+        ({"physics_timestep": 1e9}, ["physics_timestep", "control step of 0.04"]),
+        ({"physics_timestep": 0.003}, ["physics_timestep", "whole part"]),
+        ({"physics_timestep": float("inf")}, ["physics_timestep", "finite"]),
+        ({"torsion_joints": 1.5}, ["torsion_joints", "1.5", "integer"]),
         ({"friction": -0.1}, ["friction", "-0.1", "between 0 and 2"]),
         ({"friction": 5.0}, ["friction", "5.0", "between 0 and 2"]),
         ({"working_length": 0.05}, ["working_length", "0.05", "published", "more"]),
@@ -233,7 +245,7 @@ def test_scan_that_is_not_closed(tmp_path, curve):
     mesh.write_text(CORNERS + "\n".join(FACES[:7]) + "\n")
     with pytest.raises(ValueError) as caught:
         import_scan(mesh, [curve])
-    for word in ("lumen.obj", "not closed", "Close the vessel ends", "fill holes"):
+    for word in ("lumen.obj", "not closed", "hole", "mm wide", "Fill holes"):
         assert word in str(caught.value)
 
 

@@ -107,6 +107,32 @@ def test_random_actions_of_a_simulation_do_not_depend_on_the_others():
     assert not np.array_equal(alone.act(None)[0], first[2])
 
 
+def test_a_random_curl_is_one_direction_for_each_episode():
+    task = suite.make_task(TASK, random=0)
+    motors = len(task.scene.catheter.tip_motors)
+
+    class Many:
+        num_simulations, num_actions = 200, motors + 1
+
+    Many.task = task
+    policy = policies.make_policy("random_curl", seed=3)
+    policy.reset(Many(), np.ones(200, bool))
+    first = policy.act(None)
+    tip = first[:, :motors].reshape(200, -1, 2)
+    assert (tip == tip[:, :1]).all() and (first[:, motors] == 1.0).all()
+    size = np.linalg.norm(tip[:, 0], axis=-1)
+    assert size.max() <= 1.0 and size.min() < 0.1 and size.max() > 0.9
+    # To all sides.
+    assert (np.abs(tip[:, 0].mean(0)) < 0.15).all()
+    again = policies.make_policy("random_curl", seed=3 + 7)
+    again.reset(Many(), np.ones(200, bool))
+    np.testing.assert_array_equal(first[7:], again.act(None)[:-7])
+    # A new episode draws anew, and only for the simulations that begin one.
+    begins = np.arange(200) < 5
+    policy.reset(Many(), begins)
+    assert ((policy.act(None) != first).any(-1) == begins).all()
+
+
 def test_functions_and_trained_policies_act_on_a_composer_timestep(tmp_path):
     from cathsim_dmc.agents import make_config
 

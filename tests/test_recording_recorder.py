@@ -91,7 +91,7 @@ class PushTask(composer.Task):
         self._observables["time"].enabled = True
         self.set_timesteps(CONTROL_TIMESTEP, 0.002)
         self.goal_position = np.array([0.0, 0.0, goal])
-        self.goal_radius = 0.004
+        self.objective = SimpleNamespace(goal_radius=0.004)
         self._diverge_at = diverge_at
         self.termination = None
 
@@ -114,7 +114,7 @@ class PushTask(composer.Task):
 
     def after_step(self, physics, random_state):
         head = physics.named.data.site_xpos["catheter/head"]
-        if np.linalg.norm(head - self.goal_position) < self.goal_radius:
+        if np.linalg.norm(head - self.goal_position) < self.objective.goal_radius:
             self.termination = "success"
         force = np.linalg.norm(self.contacts(physics).force, axis=-1)
         total, largest = force.sum(), force.max(initial=0.0)
@@ -123,6 +123,9 @@ class PushTask(composer.Task):
         )
         push = PUSH * float(physics.data.actuator_force[0])
         self.readings = SimpleNamespace(push_force=push)
+
+    def info(self):
+        return {"reward_distance": -1.0, "reward_success": 0.0, "distance": 1.0}
 
     def contacts(self, physics):
         """Forces on the wall at the present state, from MuJoCo's contact forces.
@@ -228,6 +231,11 @@ def test_contacts_press_on_the_wall_and_agree_with_the_task(wall_env):
     total = np.bincount(episode.contact_step, magnitude, minlength=episode.steps)
     np.testing.assert_allclose(episode.wall_force_sum, total)
     assert (episode.wall_force_max <= episode.wall_force_sum + 1e-12).all()
+    terms = episode.meta["reward_terms"]
+    assert terms == {
+        "distance": [-1.0] * episode.steps,
+        "success": [0.0] * episode.steps,
+    }
     peaks = episode.meta["wall_force_peak_max"]
     np.testing.assert_allclose(peaks, 2 * episode.wall_force_max)
 

@@ -16,6 +16,7 @@ from cathsim_dmc import files
 from cathsim_dmc.agents.episodes import EpisodeOutcome, EpisodeTracker
 from cathsim_dmc.agents.policies import PolicyLike, load_policy, view_of
 from cathsim_dmc.analysis.force_statistics import QUANTITIES, Statistics
+from cathsim_dmc.analysis.intervals import success_interval
 from cathsim_dmc.policies import Policy
 from cathsim_dmc.simulation import environments
 
@@ -149,15 +150,6 @@ class Comparison:
     def to_dict(self) -> dict[str, Any]:
         """JSON-able values."""
         return asdict(self)
-
-
-def success_interval(successes: int, trials: int) -> tuple[float, float]:
-    """Wilson's 95 % interval of a success rate, as fractions."""
-    # Imported late: it takes most of a second.
-    from scipy import stats
-
-    interval = stats.binomtest(successes, trials).proportion_ci(method="wilson")
-    return float(interval.low), float(interval.high)
 
 
 def paired_bootstrap(

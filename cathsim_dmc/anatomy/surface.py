@@ -11,6 +11,10 @@ from cathsim_dmc.anatomy.centreline import Array, VesselTree
 
 # Grid step, m: at most 20,000 triangles on an aortic arch with its branches.
 SPACING = 2.2e-3
+# A lumen narrower than this share of the step (radius) would show gaps: the step is
+# made smaller, to the same share, though not below the least one.
+_NARROW = 0.9
+_LEAST_SPACING = 1e-3
 
 
 def depth_grid(tree: VesselTree, spacing: float) -> tuple[Array, Array]:
@@ -65,13 +69,23 @@ def _behind(mesh: Sequence[Array], position: Array, direction: Array) -> Array:
     return level - (x * direction[0] + y * direction[1] + z * direction[2])
 
 
-def lumen_surface(tree: VesselTree, spacing: float = SPACING) -> Surface:
+def fitting_spacing(tree: VesselTree) -> float:
+    """Grid step (m) that shows the narrowest lumen of a tree without gaps."""
+    narrowest = min(
+        float(vessel.centreline.radii.min()) for vessel in tree.vessels.values()
+    )
+    return min(SPACING, max(_NARROW * narrowest, _LEAST_SPACING))
+
+
+def lumen_surface(tree: VesselTree, spacing: float | None = None) -> Surface:
     """Closed triangulated surface of the lumen, normals outwards.
 
     Args:
         tree: vessels; the flat ends of the tubes are closed by triangles.
-        spacing: grid step (m) of the marching cubes.
+        spacing: grid step (m) of the marching cubes; `fitting_spacing` if None.
     """
+    if spacing is None:
+        spacing = fitting_spacing(tree)
     if not spacing > 0.0:
         raise ValueError(f"spacing is {spacing:g} m; it must be > 0.")
     from skimage.measure import marching_cubes
@@ -91,3 +105,16 @@ def loose_edges(surface: Surface) -> int:
     edges = surface.faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
     _, counts = np.unique(np.sort(edges, axis=1), axis=0, return_counts=True)
     return int((counts != 2).sum())
+
+
+def bodies(surface: Surface) -> int:
+    """Number of parts of a surface that no edge connects."""
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    first, second = surface.faces[:, :2].T, surface.faces[:, 1:].T
+    ends = np.concatenate([first, second], axis=1)
+    count = len(surface.vertices)
+    edges = coo_array((np.ones(ends.shape[1]), ends), shape=(count, count))
+    _, labels = connected_components(edges, directed=False)
+    return len(np.unique(labels[surface.faces[:, 0]]))

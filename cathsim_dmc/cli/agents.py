@@ -41,7 +41,7 @@ def evaluate(
 
     Args:
         policy: Directory of a run or of a checkpoint, or name of a policy: "random",
-            "push", "expert", "idle", "curl".
+            "push", "expert", "idle", "curl", "random_curl".
         task: Task of `cathsim list`; by default the one that the policy was trained on.
         episodes: Number of episodes, each with a seed of its own.
         seed: Seed of the first episode; the others count up.
@@ -88,7 +88,7 @@ def record(
 
     Args:
         policy: Directory of a run or of a checkpoint, or name of a policy: "random",
-            "push", "expert", "idle", "curl".
+            "push", "expert", "idle", "curl", "random_curl".
         out: Path of the .rrd file.
         task: Task of `cathsim list`; by default the one that the policy was trained on.
         seed: Seed of the episode.

@@ -4,7 +4,7 @@ from collections.abc import Callable
 
 from cathsim_dmc.policies.expert import ExpertPolicy
 from cathsim_dmc.policies.policy import Policy, in_environment
-from cathsim_dmc.policies.scripted import Curl, Idle, Push, Random
+from cathsim_dmc.policies.scripted import Curl, Idle, Push, Random, RandomCurl
 from cathsim_dmc.policies.view import BatchedView, ComposerView, View
 
 # Policies by name: a new one is a class and a line here.
@@ -14,6 +14,7 @@ POLICIES: dict[str, Callable[[int], Policy]] = {
     "expert": ExpertPolicy,
     "idle": Idle,
     "curl": Curl,
+    "random_curl": RandomCurl,
 }
 
 

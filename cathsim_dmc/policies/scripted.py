@@ -37,6 +37,46 @@ class Random(Policy):
         return np.stack([g.uniform(-1, 1, self._size) for g in self._generators])
 
 
+class RandomCurl(Policy):
+    """Full push, the tip bent all the way in one direction drawn for each episode.
+
+    Every x hinge of the tip gets the same command and every y hinge the same: a point
+    drawn uniformly by angle and by distance in the unit circle.
+    """
+
+    name = "random_curl"
+
+    def __init__(self, seed: int = 0):
+        """Draws simulation i's curls from seed + i.
+
+        Args:
+            seed: Seed of the first simulation's curls.
+        """
+        self._seed = seed
+        self._generators: list[np.random.Generator] = []
+        self._action = np.zeros((0, 0))
+
+    def reset(self, view: View, which: np.ndarray) -> None:
+        """Draw the curls of the simulations that begin a new episode."""
+        count = view.num_simulations
+        if len(self._generators) != count:
+            seeds = range(self._seed, self._seed + count)
+            self._generators = [np.random.default_rng(seed) for seed in seeds]
+            self._action = np.zeros((count, view.num_actions))
+        motors = len(view.task.scene.catheter.tip_motors)
+        self._action = self._action.copy()
+        for index in np.flatnonzero(which):
+            draw = self._generators[index]
+            angle, size = draw.uniform(0.0, 2.0 * np.pi), draw.uniform()
+            self._action[index, 0:motors:2] = size * np.cos(angle)
+            self._action[index, 1:motors:2] = size * np.sin(angle)
+            self._action[index, motors] = 1.0
+
+    def act(self, observation: Any) -> np.ndarray:
+        """Actions (N, A), whatever is observed."""
+        return self._action
+
+
 class _Constant(Policy):
     """The same action in every step."""
 

@@ -39,6 +39,7 @@ class StepReadout:
     wall_force_peak_sum: float
     wall_force_peak_max: float
     push_force: float
+    reward_terms: dict[str, float]
 
 
 def read_step(task: Any, physics: Any) -> StepReadout:
@@ -52,7 +53,18 @@ def read_step(task: Any, physics: Any) -> StepReadout:
         wall_force_peak_sum=float(wall.peak_sum),
         wall_force_peak_max=float(wall.peak_max),
         push_force=float(task.readings.push_force),
+        reward_terms=_reward_terms(task),
     )
+
+
+def _reward_terms(task: Any) -> dict[str, float]:
+    """Weighted terms of the last reward by name."""
+    prefix = "reward_"
+    return {
+        name.removeprefix(prefix): value
+        for name, value in task.info().items()
+        if name.startswith(prefix)
+    }
 
 
 def read_termination(task: Any, timestep: Any) -> str | None:
@@ -190,6 +202,7 @@ class EpisodeRecorder:
                 wall_force_peak_sum=readout.wall_force_peak_sum,
                 wall_force_peak_max=readout.wall_force_peak_max,
                 push_force=readout.push_force,
+                reward_terms=readout.reward_terms,
                 contact_step=np.full(count, steps),
                 contact_position=readout.contact_position,
                 contact_force=readout.contact_force,
@@ -247,6 +260,7 @@ class EpisodeRecorder:
             "catheter_radius": _link_radii(model, self._links),
             "wall_force_peak_sum": rows.get("wall_force_peak_sum").tolist(),
             "wall_force_peak_max": rows.get("wall_force_peak_max").tolist(),
+            "reward_terms": _columns(rows.columns.get("reward_terms", [])),
         }
         goal = read_goal(self._env.task)
         if goal is not None:
@@ -277,6 +291,11 @@ class EpisodeRecorder:
                 for name, shape in ragged.items()
             },
         )
+
+
+def _columns(rows: list[dict[str, float]]) -> dict[str, list[float]]:
+    """Rows of named numbers as a list for each name."""
+    return {name: [row[name] for row in rows] for name in (rows[0] if rows else ())}
 
 
 def _names(model: Any, kind: str, count: int) -> dict[str, int]:

@@ -306,6 +306,8 @@ def _log_series(log: _Log) -> None:
     log.series(
         "series/reward", episode.reward, measured, "reward", colors=[90, 160, 90]
     )
+    for name, values in episode.meta.get("reward_terms", {}).items():
+        log.series(f"series/reward/{name}", np.array(values), measured, name)
     distance = goal_distance(episode)
     if distance is not None:
         log.series(

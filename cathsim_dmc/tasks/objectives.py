@@ -197,13 +197,14 @@ class Cannulation:
     def outcome(self, measurement: Measurement) -> Outcome:
         """Judges a control step."""
         success = self.success(measurement.readings.head)
+        any_success = success.any()
         terms = {}
         for name, weight in self.weights.items():
             if name == "success":
                 terms[name] = weight * success
                 continue
             term = weight * self.TERMS[name](self, measurement)
-            if name in self.UNTIL_SUCCESS:
+            if any_success and name in self.UNTIL_SUCCESS:
                 term = np.where(success, 0.0, term)
             terms[name] = term
         return Outcome(sum(terms.values(), _NOTHING), success, MappingProxyType(terms))

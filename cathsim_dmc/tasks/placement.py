@@ -14,8 +14,8 @@ from cathsim_dmc.tasks import objectives as objectives
 _FREE_LENGTH = 0.005  # m of shaft out of the sheath behind the tip
 _LEAST_START_DEPTH = 0.005  # m
 # At the start the head has come no further than this part of the way to the first
-# branching, so that every goal of an anatomy lies ahead.
-_SHARE_OF_TRUNK = 0.5
+# branching, to the end of the vessel and to the goal, so that all of them lie ahead.
+_LARGEST_SHARE = 0.5
 # Way beyond the goal that the stroke leaves for bends, detours and wrong branches.
 _SPARE_STROKE = 0.08  # m
 _BASE_LENGTH = 0.02  # m of device that never leaves the sheath
@@ -100,11 +100,12 @@ def place_device(
         longer than any device is.
     """
     inlet = anatomy.inlet
+    route = anatomy.route(goal, farthest_shift)
+    way = min(_way_to_branching(anatomy), anatomy.route(goal).length)
     start_depth = min(
         device.tip_length + _FREE_LENGTH,
-        max(_SHARE_OF_TRUNK * _way_to_branching(anatomy), _LEAST_START_DEPTH),
+        max(_LARGEST_SHARE * way, _LEAST_START_DEPTH),
     )
-    route = anatomy.route(goal, farthest_shift)
     if working_length is None:
         stroke = max(route.length - start_depth, 0.0) + _SPARE_STROKE
         working_length = max(start_depth + stroke + _BASE_LENGTH, _COMMON_LENGTH)
@@ -119,12 +120,12 @@ def place_device(
     quaternion = _frame(inlet.direction)
     matrix = np.empty(9)
     mujoco.mju_quat2Mat(matrix, quaternion)
-    outside = working_length - start_depth
-    # The last links may reach a little past the head's place: they are chords.
-    ahead = np.arange(0.0, min(start_depth + 0.03, route.length), _LINE_SPACING)
+    outside = np.array([0.0, 0.0, working_length - start_depth])
+    # A little longer than the device, whose links are chords of the line.
+    ahead = np.arange(0.0, min(2 * start_depth, route.length), _LINE_SPACING)
     inside = (route.at(ahead).position - inlet.position) @ matrix.reshape(3, 3)
     # The first point of the route is the inlet; the sheath ends there, straight.
-    line = np.vstack([[0.0, 0.0, 0.0], inside - inside[0] + [0.0, 0.0, outside]])
+    line = np.vstack([np.zeros(3), inside - inside[0] + outside])
     return Placement(
         inlet=np.array(inlet.position),
         quaternion=quaternion,
@@ -137,16 +138,17 @@ def place_device(
 
 
 def _way_to_branching(anatomy: Anatomy) -> float:
-    """Way from the inlet to the nearest branching of its vessel, m; inf for none."""
+    """Way from the inlet to the nearest branching or far end of its vessel, m."""
     tree, inlet = anatomy.tree, anatomy.inlet
     vessel = tree.vessel(inlet.vessel)
     start = float(vessel.centreline.project(inlet.position).arc_length)
-    places = [] if vessel.parent is None else [vessel.ostium]
+    length = vessel.centreline.length
+    places = [length if start < length / 2 else vessel.ostium]
     for child in tree.vessels.values():
         if child.parent == vessel.name:
             ostium = child.centreline.at(child.ostium).position
             places.append(float(vessel.centreline.project(ostium).arc_length))
-    return min((abs(place - start) for place in places), default=np.inf)
+    return min(abs(place - start) for place in places)
 
 
 def _frame(direction: np.ndarray) -> np.ndarray:

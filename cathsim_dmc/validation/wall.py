@@ -12,6 +12,7 @@ import numpy as np
 
 from cathsim_dmc.anatomy import measures, surface
 from cathsim_dmc.anatomy.anatomy import Anatomy
+from cathsim_dmc.anatomy.scan.check import check_tree
 from cathsim_dmc.anatomy.wall import fidelity
 from cathsim_dmc.entities import devices
 from cathsim_dmc.entities.contact import FRICTION, wall_contact
@@ -156,6 +157,12 @@ def lumen_checks(anatomy: Anatomy, rays: int = RAYS) -> list[Check]:
             f"{len(anatomy.surface.faces)} triangles, "
             f"{1e6 * anatomy.surface.volume:.0f} ml",
         ),
+        Check.at_most(
+            f"{name}: separate parts of the surface",
+            surface.bodies(anatomy.surface),
+            1,
+            "",
+        ),
         *(
             Check.at_most(
                 f"{name}: intrusion, {which}",
@@ -210,6 +217,8 @@ def validate_anatomy(
     findings: dict[str, Any] = {}
     for name, anatomy in anatomies.items():
         checks += lumen_checks(dataclasses.replace(anatomy, name=name), rays)
+        if anatomy.field is not None:
+            checks += tree_checks(dataclasses.replace(anatomy, name=name))
         findings[name] = {"measures": shape(anatomy)}
         if push:
             from cathsim_dmc.validation.push import straight_push
@@ -223,6 +232,20 @@ def validate_anatomy(
 
         views.draw(next(iter(anatomies.values())), figure_path)
     return Report("anatomy of " + ", ".join(anatomies), checks, findings)
+
+
+def tree_checks(anatomy: Anatomy) -> list[Check]:
+    """Tree of a scan against its surface; see `anatomy.scan.check.check_tree`."""
+    return [
+        Check.at_most(
+            f"{anatomy.name}: {found.name}, violations",
+            0 if found.passed else 1,
+            0,
+            "",
+            found.detail,
+        )
+        for found in check_tree(anatomy)
+    ]
 
 
 def shape(anatomy: Anatomy) -> dict[str, Any]:

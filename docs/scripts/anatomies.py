@@ -13,8 +13,8 @@ from matplotlib.figure import Figure
 
 from cathsim_dmc.anatomy import measures, phantoms
 from cathsim_dmc.anatomy.arch import arch, sampler
+from cathsim_dmc.anatomy.scan.mesh_depth import MeshDepth
 from cathsim_dmc.anatomy.surface import lumen_surface
-from cathsim_dmc.anatomy.wall.depth import MeshDepth
 from cathsim_dmc.validation import views, wall
 from cathsim_dmc.validation.figures import save_figure
 from cathsim_dmc.validation.push import straight_push

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.spatial import cKDTree
+from scipy.spatial.distance import cdist
 
 from cathsim_dmc.anatomy.scan.ways import Ways
 
@@ -15,6 +16,7 @@ COVER = 1.5  # radii; what lies nearer to a way is no vessel of its own
 STUB = 3e-3  # m, shortest own vessel beyond that
 WIDE = 0.4  # of the widest free end: narrower ends are no inlet by default
 ROOT_WIDTH = 0.5  # of the inlet: narrower free ends do not continue the root
+LEG = 60e-3  # m at both ends of an aorta, in which it shows that it turns back
 STARTS = 30e-3  # m along the lumen; curves that start nearer to an end start there
 
 
@@ -39,26 +41,32 @@ class Cover:
     def __init__(self, ways: Ways):
         """Nothing is covered yet."""
         self._ways = ways
-        self.mask = np.zeros(len(ways.points), dtype=bool)
-        self._tree = cKDTree(ways.points)
+        self._centres = np.empty((0, 3))
+        self._reach = np.empty(0)
 
     def add(self, way: np.ndarray) -> None:
         """Cover the surroundings of a way (n,) of nodes."""
+        # Every other point does: their spheres overlap.
+        way = way[::2]
+        self._centres = np.concatenate([self._centres, self._ways.points[way]])
         reach = COVER * self._ways.depth[way] + 1e-3
-        # The spheres overlap: as many points as their radii apart do.
-        done = -np.inf
-        steps = np.linalg.norm(np.diff(self._ways.points[way], axis=0), axis=1)
-        along = np.concatenate([[0.0], np.cumsum(steps)])
-        for node, radius, here in zip(way, reach, along, strict=True):
-            if here < done:
-                continue
-            done = here + 0.25 * radius
-            near = self._tree.query_ball_point(self._ways.points[node], radius)
-            self.mask[near] = True
+        self._reach = np.concatenate([self._reach, reach])
+
+    def covers(self, nodes: np.ndarray) -> np.ndarray:
+        """Whether each of some nodes (n,) is covered."""
+        if not len(self._centres):
+            return np.zeros(len(nodes), dtype=bool)
+        points = self._ways.points[nodes]
+        out = np.empty(len(nodes), dtype=bool)
+        for first in range(0, len(nodes), 256):
+            part = slice(first, first + 256)
+            gap = cdist(points[part], self._centres)
+            out[part] = (gap < self._reach).any(axis=1)
+        return out
 
     def own_part(self, way: np.ndarray) -> np.ndarray:
         """Nodes of a way, given from its tip on, before it meets what is covered."""
-        met = self.mask[way]
+        met = self.covers(way)
         return way[: int(met.argmax())] if met.any() else way
 
 
@@ -80,8 +88,9 @@ def free_ends(ways: Ways) -> list[FreeEnd]:
     lookup = cKDTree(ways.points[nodes])
     taken = np.zeros(len(ways.points), dtype=bool)
     cover, ends = Cover(ways), []
-    for node in [first, *nodes[np.argsort(-reach[nodes])]]:
-        if taken[node] or (cover.mask[node] and node != first):
+    tips = _local_maxima(ways, reach)
+    for node in [first, *tips[np.argsort(-reach[tips])]]:
+        if taken[node] or (node != first and cover.covers(np.array([node]))[0]):
             continue
         way = ways.trace(before, node)[::-1]
         steps = np.linalg.norm(np.diff(ways.points[way], axis=0), axis=1)
@@ -113,6 +122,15 @@ def free_ends(ways: Ways) -> list[FreeEnd]:
     return ends
 
 
+def _local_maxima(ways: Ways, reach: np.ndarray) -> np.ndarray:
+    """Nodes of the largest piece from which no neighbour is farther."""
+    rows, cols = ways.links
+    top = ways.main.copy()
+    top[rows[reach[cols] > reach[rows]]] = False
+    top[cols[reach[rows] > reach[cols]]] = False
+    return np.flatnonzero(top)
+
+
 @dataclass(frozen=True)
 class Entry:
     """Where the device enters and where the root vessel leads.
@@ -142,8 +160,8 @@ def plan_inlet(
         curves: (n_i, 3) m, given centrelines, first point proximal; may be empty.
         inlet: (3,) m near the end to use or in the middle of a vessel that is to be
             cut there, or None to choose: the end at which the curves start, else the
-            wide end farthest along the lumen from their starts, and without curves
-            from the widest end.
+            wide end farthest along the lumen from their starts. Without curves it is
+            the end of an aorta that is not at the heart, else the widest.
 
     Raises:
         ValueError: if no end can be chosen; lists them.
@@ -166,14 +184,23 @@ def plan_inlet(
     else:
         wide = np.flatnonzero(width >= WIDE * width.max())
         root = int(width.argmax())
-        others = wide[wide != root]
-        if len(others):
-            reach = ways.lengths_from(nodes[root])[np.array(nodes)]
-            chosen = int(others[reach[others].argmax()])
-        else:
-            chosen = root
+        others = [k for k in wide if k != root and _arched(ways, nodes[root], nodes[k])]
+        # From the heart an aorta turns back; other trees are entered by their trunk.
+        reach = ways.lengths_from(nodes[root])[nodes]
+        chosen = int(max(others, key=lambda k: reach[k])) if others else root
     far = _far_end(ways, ends, at_goal, nodes[chosen], curves, chosen)
     return Entry(position[chosen], True, far)
+
+
+def _arched(ways: Ways, heart: int, node: int) -> bool:
+    """Whether the way from one end to another turns back, as an aortic arch does."""
+    way = ways.points[ways.trace(ways.deepest_from(heart), node)]
+    steps = np.linalg.norm(np.diff(way, axis=0), axis=1)
+    along = np.concatenate([[0.0], np.cumsum(steps)])
+    leg = min(LEG, 0.25 * along[-1])
+    first = way[np.searchsorted(along, leg)] - way[0]
+    last = way[np.searchsorted(along, along[-1] - leg)] - way[-1]
+    return float(first @ last) > 0.0
 
 
 def _ends_of_curves(ways, ends, lasts) -> np.ndarray:

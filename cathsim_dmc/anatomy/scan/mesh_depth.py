@@ -35,6 +35,12 @@ class MeshDepth:
         self._normals = np.ascontiguousarray(normals[self._order])
         self._boxes, self._first = _box_tree(self._triangles)
 
+    @property
+    def mean_area(self) -> float:
+        """Mean area of the triangles, m^2."""
+        a, b, c = (self._triangles[:, k] for k in range(3))
+        return float(0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1).mean())
+
     def __call__(self, points: np.ndarray) -> np.ndarray:
         """Depth (n,) m at ``points`` (n, 3) m, > 0 inside."""
         return self.nearest(points)[0]
@@ -139,9 +145,13 @@ def depth_field(
     steps = spacing * np.arange(BRICK + 1)
     local = np.stack(np.meshgrid(steps, steps, steps, indexing="ij"), -1)
     bricks = np.empty((len(rows),) + (BRICK + 1,) * 3, dtype=np.int16)
-    # The smaller a block, the fewer triangles it asks about: an eighth of a brick,
-    # the lower ones without the planes that the upper ones share with them.
-    parts = (slice(0, BRICK // 2), slice(BRICK // 2, BRICK + 1))
+    # The smaller a block, the fewer triangles it asks about: bricks are cut into as
+    # many as suit the triangles' size, the last one in each direction with the planes
+    # that bricks share.
+    edge = np.sqrt(measure.mean_area)
+    cells = BRICK // 2 if spacing * BRICK < 4.0 * edge else BRICK // 4
+    stops = [*range(0, BRICK, cells), BRICK + 1]
+    parts = [slice(*pair) for pair in zip(stops[:-1], stops[1:], strict=True)]
     for start in range(0, len(rows), 4096):
         base = origin + wide * rows[start : start + 4096]
         for i in parts:

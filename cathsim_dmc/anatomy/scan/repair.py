@@ -13,6 +13,7 @@ from cathsim_dmc.anatomy.scan.thick import inner_shell, lumen_of_wall
 
 MERGE = 1e-6  # of the mesh's size: vertices nearer than this are one
 CRUMB = 0.03  # of the surface's area: smaller separate parts are dropped
+CRUMB_WIDTH = 12e-3  # m, and if they are not wider
 CROWDED = 0.01  # of the triangles: more around crowded edges are not mended
 HOLE = 8e-3  # m, widest hole in the side of a vessel that is filled
 SPIKE = 4e-3  # m, widest patch around a self-intersection that is cut out
@@ -114,7 +115,9 @@ class _Work:
         label = parts(self.faces, len(self.vertices))
         area = areas(self.vertices, self.faces)
         share = np.bincount(label, area) / area.sum()
-        large = np.flatnonzero(share > CRUMB)
+        large = np.flatnonzero(
+            (share > CRUMB) | (widths(self.vertices, self.faces, label) > CRUMB_WIDTH)
+        )
         if len(large) == 2 and not quiet:
             inner = inner_shell(self.vertices, *(self.faces[label == k] for k in large))
             if inner is not None:
@@ -315,13 +318,7 @@ class _Work:
 
     def _widest_patch(self, chosen: np.ndarray) -> float:
         label = parts(self.faces[chosen], len(self.vertices))
-        widths = [
-            np.linalg.norm(
-                np.ptp(self.vertices[self.faces[chosen][label == k]].reshape(-1, 3), 0)
-            )
-            for k in np.unique(label)
-        ]
-        return float(max(widths))
+        return float(widths(self.vertices, self.faces[chosen], label).max())
 
     def _keep(self, chosen: np.ndarray) -> None:
         used, numbers = np.unique(self.faces[chosen], return_inverse=True)
@@ -348,6 +345,15 @@ def areas(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     """Area (F,) of each triangle, m^2."""
     a, b, c = (vertices[faces[:, k]] for k in range(3))
     return 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1)
+
+
+def widths(vertices: np.ndarray, faces: np.ndarray, label: np.ndarray) -> np.ndarray:
+    """Diagonal (n,) of the box around each of n parts, m."""
+    low = np.full((label.max() + 1, 3), np.inf)
+    high = -low
+    np.minimum.at(low, label, vertices[faces].min(axis=1))
+    np.maximum.at(high, label, vertices[faces].max(axis=1))
+    return np.linalg.norm(high - low, axis=1)
 
 
 def volume(vertices: np.ndarray, faces: np.ndarray) -> float:

@@ -1,0 +1,315 @@
+"""How hard the registered tasks are: what policies without learning make of them.
+
+Four policies play the same seeds of every task: a straight push, random actions, a
+push with a random fixed curl of the tip, and the scripted expert. A task that a
+straight push solves measures nothing but force; one that the expert cannot solve may
+be unsolvable.
+"""
+
+from __future__ import annotations
+
+import collections
+import dataclasses
+import itertools
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from cathsim_dmc import policies, suite
+from cathsim_dmc.analysis.force_statistics import EpisodeForces, ForceTracker
+from cathsim_dmc.analysis.intervals import success_interval
+from cathsim_dmc.simulation.batch import BatchSimulation
+from cathsim_dmc.tasks.step import Step
+from cathsim_dmc.validation.checks import Check, Report
+
+# How an episode can end.
+SUCCESS, TIME, CUT = "success", "out of time", "cut"
+STUCK, ERROR = "stuck", "physics error"
+ENDS = (SUCCESS, TIME, CUT, STUCK, ERROR)
+
+# Success that the expert must reach, and a straight push must not exceed where the
+# task asks for steering, %.
+LEAST_EXPERT = 95.0
+MOST_PUSH = 10.0
+
+
+@dataclasses.dataclass(frozen=True)
+class Limit:
+    """When an episode that leads nowhere is cut off; None for never.
+
+    Attributes:
+        steps: Control steps after which the episode ends.
+        stuck_steps: Control steps in which the insertion did not grow by `growth`.
+        growth: m; what a device that still slides gains in that time.
+    """
+
+    steps: int | None = None
+    stuck_steps: int | None = None
+    growth: float = 0.5e-3
+
+
+# A constant command that has not moved the device for 2 s has brought it to rest.
+# Random actions leave the device within a few centimetres of its start.
+_BLIND = Limit(steps=500, stuck_steps=50)
+LIMITS: Mapping[str, Limit] = {
+    "push": _BLIND,
+    "random": Limit(steps=500),
+    "random_curl": _BLIND,
+    "expert": Limit(),
+}
+
+
+@dataclasses.dataclass(frozen=True)
+class Trial:
+    """Episodes of one policy on one task, in the order of their seeds.
+
+    Attributes:
+        ends: How each episode ended, one of `ENDS`.
+        steps: Control steps of each.
+        forces: Forces on the wall in each.
+    """
+
+    ends: tuple[str, ...]
+    steps: tuple[int, ...]
+    forces: tuple[EpisodeForces, ...]
+
+    @property
+    def successes(self) -> int:
+        """Number of episodes that reached the goal."""
+        return self.ends.count(SUCCESS)
+
+    def summary(self) -> dict[str, Any]:
+        """JSON-able figures over the episodes.
+
+        Forces in N: "mean_force" is the sum over all contacts, mean over the control
+        steps; "max_force" the largest single contact at the end of a control step,
+        "peak_force" in any physics step; each is averaged over the episodes, and
+        "largest_force" is the largest "peak_force" of all.
+        """
+        count = len(self.ends)
+        peaks = [one.peak_max.maximum for one in self.forces]
+        low, high = success_interval(self.successes, count)
+        return {
+            "episodes": count,
+            "successes": self.successes,
+            "success": self.successes / count,
+            "success_ci95": [low, high],
+            "ends": dict(collections.Counter(self.ends)),
+            "steps": float(np.mean(self.steps)),
+            "mean_force": float(np.mean([one.sum.mean for one in self.forces])),
+            "max_force": float(np.mean([one.max.maximum for one in self.forces])),
+            "peak_force": float(np.mean(peaks)),
+            "largest_force": float(np.max(peaks)),
+        }
+
+
+class _Slides:
+    """How long the devices of N simulations have not advanced."""
+
+    def __init__(self, insertion: np.ndarray, growth: float):
+        self._best = insertion.copy()
+        self._growth = growth
+        self.steps = np.zeros(len(insertion), dtype=int)
+
+    def add(self, insertion: np.ndarray) -> None:
+        grown = insertion > self._best + self._growth
+        self._best = np.where(grown, insertion, self._best)
+        self.steps = np.where(grown, 0, self.steps + 1)
+
+
+def play(
+    simulation: BatchSimulation,
+    policy: policies.Policy,
+    seed: int,
+    limit: Limit | None = None,
+) -> Trial:
+    """Plays one episode in each simulation of a batch.
+
+    Args:
+        simulation: Simulations, which are seeded and reset; those whose episode has
+            ended rest at the start until the last has.
+        policy: Policy without memory of other simulations.
+        seed: Seed of the first simulation; the others count up.
+        limit: When episodes are cut off; None for when the task ends them.
+    """
+    limit = limit or Limit()
+    count = simulation.num_simulations
+    simulation.seed(seed)
+    step = simulation.reset()
+    view = policies.BatchedView(simulation)
+    policy.reset(view, np.ones(count, dtype=bool))
+    tracker = ForceTracker(count)
+    slides = _Slides(step.readings.insertion, limit.growth)
+    ends: dict[int, str] = {}
+    lengths, forces = np.zeros(count, dtype=int), {}
+    for number in itertools.count(1):
+        action = np.array(policy.act(step.observation))
+        action[list(ends)] = 0.0
+        step = simulation.step(action)
+        tracker.add(step.wall_force._asdict())
+        slides.add(step.readings.insertion)
+        ended = _ends(step, number, slides.steps, limit)
+        ended = {i: end for i, end in ended.items() if i not in ends}
+        for index, end in ended.items():
+            ends[index], lengths[index] = end, number
+            forces[index] = tracker.finish(index)
+        if len(ends) == count:
+            break
+        if ended:
+            step = simulation.reset(np.array(list(ended)))
+    everyone = range(count)
+    return Trial(
+        tuple(ends[i] for i in everyone),
+        tuple(int(length) for length in lengths),
+        tuple(forces[i] for i in everyone),
+    )
+
+
+def _ends(step: Step, number: int, resting: np.ndarray, limit: Limit) -> dict[int, str]:
+    """How the episodes end that end with this control step, by simulation."""
+    found = {}
+    for index in range(len(step.terminated)):
+        if step.outcome.success[index]:
+            found[index] = SUCCESS
+        elif step.errors[index] is not None:
+            found[index] = ERROR
+        elif step.truncated[index]:
+            found[index] = TIME
+        elif limit.stuck_steps is not None and resting[index] >= limit.stuck_steps:
+            found[index] = STUCK
+        elif limit.steps is not None and number >= limit.steps:
+            found[index] = CUT
+    return found
+
+
+def tasks() -> tuple[str, ...]:
+    """Names of the registered tasks whose anatomy is theirs, not the user's."""
+    return tuple(
+        name
+        for name, definition in suite.TASKS.items()
+        if definition.anatomy is not None
+    )
+
+
+def asks_for_steering(task: str) -> bool:
+    """Whether a straight push must not solve a registered task.
+
+    It may where the BCA is reached from the ascending aorta, whose continuation it is:
+    in the published phantoms a straight device slides in.
+    """
+    definition = suite.TASKS[task]
+    return definition.access == "descending" or definition.goal == "lcca"
+
+
+def difficulty(
+    names: Sequence[str] | None = None,
+    seeds: int = 30,
+    first_seed: int = 0,
+    *,
+    players: Sequence[str] | None = None,
+    num_threads: int = 0,
+    say: Callable[[str], None] = lambda text: None,
+    keep: Callable[[Report], None] = lambda report: None,
+) -> Report:
+    """Plays the policies of `LIMITS` on tasks and judges the tasks.
+
+    Args:
+        names: Names of registered tasks; None for all with an anatomy of their own.
+        seeds: Number of episodes of each policy on each task.
+        first_seed: Seed of the first episode; the others count up.
+        players: Names of policies in `LIMITS`; None for all.
+        num_threads: Number of threads of the simulation, 0 for one per core.
+        say: Function that is told of the progress.
+        keep: Function that is given the report so far after every task.
+
+    Raises:
+        ValueError: there is no such task or policy, it is named twice, or seeds < 1.
+    """
+    names = tasks() if names is None else tuple(names)
+    players = tuple(LIMITS) if players is None else tuple(players)
+    _refuse("tasks", names, tasks())
+    _refuse("policies", players, tuple(LIMITS))
+    if seeds < 1:
+        raise ValueError(f"seeds is {seeds}; at least 1")
+    checks: list[Check] = []
+    found: dict[str, dict[str, Any]] = {}
+    report = None
+    for name in names:
+        trials = _trials(name, players, seeds, first_seed, num_threads, say)
+        found[name] = {policy: trial.summary() for policy, trial in trials.items()}
+        checks += _checks(name, trials)
+        report = Report(
+            "difficulty of the tasks",
+            tuple(checks),
+            {
+                "seeds": seeds,
+                "first_seed": first_seed,
+                "limits": {key: dataclasses.asdict(x) for key, x in LIMITS.items()},
+                "tasks": dict(found),
+            },
+        )
+        keep(report)
+    return report
+
+
+def _refuse(what: str, given: Sequence[str], known: Sequence[str]) -> None:
+    """Refuses names that would fail after hours of work."""
+    if not given or set(given) - set(known) or len(set(given)) < len(given):
+        raise ValueError(
+            f"{what} are {list(given)}; give each once, out of {', '.join(known)}"
+        )
+
+
+def _trials(
+    name: str,
+    players: Sequence[str],
+    seeds: int,
+    first_seed: int,
+    num_threads: int,
+    say: Callable[[str], None],
+) -> dict[str, Trial]:
+    """The policies on one task, by name; no expert for a device without motors."""
+    # Cheapest to observe; none of the policies looks at it.
+    task = suite.make_task(name, observation="tracking")
+    simulation = BatchSimulation(task, seeds, num_threads=num_threads)
+    trials = {}
+    for policy in players:
+        if policy == "expert" and not task.scene.device.steerable:
+            continue
+        player = policies.make_policy(policy, first_seed)
+        trials[policy] = trial = play(simulation, player, first_seed, LIMITS[policy])
+        say(f"{name}, {policy}: {trial.successes} of {seeds}")
+    return trials
+
+
+def _checks(name: str, trials: Mapping[str, Trial]) -> list[Check]:
+    def percent(trial: Trial) -> float:
+        return 100.0 * trial.successes / len(trial.ends)
+
+    checks = []
+    if "push" in trials and asks_for_steering(name):
+        push = trials["push"]
+        checks.append(
+            Check.at_most(
+                f"{name}, straight push", percent(push), MOST_PUSH, "%", _note(push)
+            )
+        )
+    if "expert" in trials:
+        expert = trials["expert"]
+        checks.append(
+            Check.at_least(
+                f"{name}, expert", percent(expert), LEAST_EXPERT, "%", _note(expert)
+            )
+        )
+    return checks
+
+
+def _note(trial: Trial) -> str:
+    found = trial.summary()
+    low, high = (100 * bound for bound in found["success_ci95"])
+    return (
+        f"{found['successes']} of {found['episodes']} ({low:.0f}–{high:.0f} %), "
+        f"{found['steps']:.0f} steps; {1e3 * found['mean_force']:.1f} mN mean, "
+        f"{1e3 * found['largest_force']:.0f} mN largest"
+    )

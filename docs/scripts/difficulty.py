@@ -1,0 +1,111 @@
+"""Writes docs/difficulty.md's tables from reports of `cathsim benchmark difficulty`.
+
+    cathsim benchmark difficulty --out docs/data/difficulty.json
+    python docs/scripts/difficulty.py
+
+Further reports, such as of single tasks or policies, are merged into that file when
+they are given: python docs/scripts/difficulty.py REPORT.json ...; where two tell of one
+policy on one task, that with more episodes stays, or else the later.
+"""
+
+import json
+import re
+import sys
+from pathlib import Path
+
+PAGE = Path(__file__).parents[1] / "difficulty.md"
+DATA = PAGE.parent / "data" / "difficulty.json"
+BEGIN, END = "<!-- measured -->", "<!-- end -->"
+POLICIES = {
+    "push": "straight push",
+    "random": "random actions",
+    "random_curl": "push, random curl",
+    "expert": "expert",
+}
+
+
+def main(paths):
+    reports = [json.loads(path.read_text()) for path in (DATA, *paths) if path.exists()]
+    missing = [str(path) for path in paths if not path.exists()]
+    if missing or not reports:
+        sys.exit(f"no report at {', '.join(missing) or DATA}; see the usage above")
+    report = merged(reports)
+    DATA.write_text(json.dumps(report, indent=1) + "\n")
+    block = "\n".join([BEGIN, *tables(report), END])
+    page = PAGE.read_text()
+    PAGE.write_text(re.sub(f"{BEGIN}.*{END}", lambda _: block, page, flags=re.S))
+
+
+def merged(reports):
+    """One report of several: the same limits, the union of tasks and policies."""
+    limits, found, checks = {}, {}, {}
+    for report in reports:
+        for key, limit in report["findings"]["limits"].items():
+            if limits.setdefault(key, limit) != limit:
+                sys.exit(f"the reports cut off {key!r} by different rules")
+        bounds = {check["name"]: check for check in report["checks"]}
+        for task, trials in report["findings"]["tasks"].items():
+            kept = found.setdefault(task, {})
+            for policy, trial in trials.items():
+                if kept.get(policy, {"episodes": 0})["episodes"] <= trial["episodes"]:
+                    kept[policy] = trial
+                    name = f"{task}, {POLICIES[policy]}"
+                    checks.update({name: bounds[name]} if name in bounds else {})
+    return {
+        "checks": list(checks.values()),
+        "passed": all(check["passed"] for check in checks.values()),
+        "findings": {"limits": limits, "tasks": found},
+    }
+
+
+def tables(report):
+    """Lines of Markdown."""
+    names = list(POLICIES)
+    lines = [
+        "Success, % (95 % interval), and number of episodes:",
+        "",
+        f"| task | {' | '.join(POLICIES.values())} |",
+        "|---" * (len(names) + 1) + "|",
+    ]
+    everything = report["findings"]["tasks"]
+    for task, trials in everything.items():
+        cells = [_success(trials.get(policy)) for policy in names]
+        lines.append(f"| `{task}` | {' | '.join(cells)} |")
+    lines += [
+        "",
+        "Mean force on the wall (sum over all contacts, mean over the steps) / largest "
+        "contact of an episode (mean over the episodes), mN; control steps:",
+        "",
+        f"| task | {' | '.join(POLICIES.values())} |",
+        "|---" * (len(names) + 1) + "|",
+    ]
+    for task, trials in everything.items():
+        cells = [_force(trials.get(policy)) for policy in names]
+        lines.append(f"| `{task}` | {' | '.join(cells)} |")
+    missed = [check for check in report["checks"] if not check["passed"]]
+    lines += ["", f"{len(report['checks'])} bounds, {len(missed)} missed:", ""]
+    lines += [
+        f"- {c['name']}: {c['value']:.0f} % where the bound is {c['bound']} % "
+        f"({c['note']})"
+        for c in missed
+    ]
+    return lines
+
+
+def _success(trial):
+    if trial is None:
+        return "–"
+    low, high = (100 * bound for bound in trial["success_ci95"])
+    rate = 100 * trial["success"]
+    return f"{rate:.0f} ({low:.0f}–{high:.0f}), {trial['episodes']}"
+
+
+def _force(trial):
+    if trial is None:
+        return "–"
+    mean, largest = 1e3 * trial["mean_force"], 1e3 * trial["max_force"]
+    return f"{mean:.1f} / {largest:.0f}; {trial['steps']:.0f}"
+
+
+if __name__ == "__main__":
+    main([Path(argument) for argument in sys.argv[1:]])

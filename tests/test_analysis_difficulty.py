@@ -1,0 +1,135 @@
+"""How hard tasks are: ends of episodes, independence, bounds, bad input."""
+
+import dataclasses
+import re
+
+import numpy as np
+import pytest
+
+from cathsim_dmc import policies, suite
+from cathsim_dmc.analysis import difficulty
+from cathsim_dmc.analysis.difficulty import Limit, Trial
+from cathsim_dmc.analysis.force_statistics import EpisodeForces, Statistics
+from cathsim_dmc.cli import main
+from cathsim_dmc.simulation.batch import BatchSimulation
+
+
+class PushSome(policies.Policy):
+    """Pushes in the simulations of a mask, is idle in the others."""
+
+    def __init__(self, mask):
+        self._mask = np.array(mask)
+
+    def reset(self, view, which):
+        self._action = np.zeros((view.num_simulations, view.num_actions))
+        self._action[self._mask, len(view.task.scene.catheter.tip_motors)] = 1.0
+
+    def act(self, observation):
+        return self._action
+
+
+def simulations(count, **options):
+    task = suite.make_task("simple1_bca", observation="tracking", **options)
+    return BatchSimulation(task, count, num_threads=1)
+
+
+@pytest.fixture(scope="module")
+def three():
+    return simulations(3)
+
+
+def test_who_does_not_advance_is_stuck_and_the_others_go_on(three):
+    limit = Limit(steps=14, stuck_steps=6)
+    trial = difficulty.play(three, PushSome([True, False, True]), 5, limit)
+    assert trial.ends == ("cut", "stuck", "cut")
+    assert trial.steps == (14, 6, 14)
+
+
+def test_an_episode_does_not_depend_on_what_runs_beside_it(three):
+    push = policies.make_policy("push")
+    limit = Limit(steps=110, stuck_steps=50)
+    together = difficulty.play(three, push, 20, limit)
+    assert difficulty.play(three, push, 20, limit) == together
+    # The second is stopped early, reset and rests; the others must not notice.
+    mixed = difficulty.play(three, PushSome([True, False, True]), 20, limit)
+    for index in (0, 2):
+        assert mixed.steps[index] == together.steps[index]
+        assert mixed.forces[index] == together.forces[index]
+    assert together.forces[0] != together.forces[2]
+    assert max(f.max.maximum for f in together.forces) > 0
+
+
+def test_the_task_ends_episodes_that_nobody_cuts():
+    short = simulations(1, max_steps=8)
+    assert difficulty.play(short, PushSome([True]), 0) == dataclasses.replace(
+        difficulty.play(short, PushSome([True]), 0, Limit(steps=50)),
+        ends=("out of time",),
+        steps=(8,),
+    )
+
+
+def test_the_expert_succeeds_where_random_actions_do_not():
+    report = difficulty.difficulty(
+        ["simple1_bca"], 2, 3, players=["random", "expert"], num_threads=1
+    )
+    found = report.findings["tasks"]["simple1_bca"]
+    assert found["expert"]["successes"] == 2
+    assert found["random"]["ends"] == {"cut": 2}
+    assert found["random"]["steps"] == difficulty.LIMITS["random"].steps
+    assert report.passed and len(report.checks) == 1
+
+
+def trial(successes, count):
+    """Episodes of which some succeed."""
+    ends = ["success"] * successes + ["stuck"] * (count - successes)
+    force = Statistics(mean=0.002, mean_in_contact=0.004, maximum=0.05)
+    forces = (EpisodeForces(force, force, force, force),) * count
+    return Trial(tuple(ends), (100,) * count, forces)
+
+
+@pytest.mark.parametrize(
+    "task, pushed, steered, failures",
+    [
+        ("femoral_type1_bca", 3, 29, set()),
+        ("femoral_type1_bca", 4, 29, {"femoral_type1_bca, straight push"}),
+        ("type1_lcca", 4, 28, {"type1_lcca, straight push", "type1_lcca, expert"}),
+        # The published BCA is ahead of a straight device.
+        ("type1_bca", 30, 30, set()),
+    ],
+)
+def test_bounds(monkeypatch, task, pushed, steered, failures):
+    trials = {"push": trial(pushed, 30), "expert": trial(steered, 30)}
+    monkeypatch.setattr(difficulty, "_trials", lambda *_: trials)
+    kept = []
+    report = difficulty.difficulty([task], keep=kept.append)
+    assert {check.name for check in report.failures} == failures
+    assert kept == [report]
+    low, high = report.findings["tasks"][task]["push"]["success_ci95"]
+    assert low < pushed / 30 < high or pushed == 30
+
+
+def test_every_task_but_navigate_is_judged():
+    names = difficulty.tasks()
+    assert set(suite.SUITE) - set(names) == {"navigate"}
+    steered = {name for name in names if difficulty.asks_for_steering(name)}
+    assert steered == {n for n in names if n.startswith("femoral_") or "lcca" in n}
+
+
+@pytest.mark.parametrize(
+    "arguments, message",
+    [
+        (["--task", "type1_bca", "--task", "typo"], "tasks are.*typo.*type1_lcca"),
+        (["--task", "type1_bca", "--task", "type1_bca"], "give each once"),
+        (["--policy", "idle"], "policies are.*random_curl"),
+        (["--seeds", "0"], "seeds is 0; at least 1"),
+        (["--out", "nowhere/report.json"], "make the directory nowhere first"),
+    ],
+)
+def test_bad_input_is_refused_before_any_work(monkeypatch, capsys, arguments, message):
+    monkeypatch.setattr(difficulty, "_trials", lambda *_: pytest.fail("worked"))
+    monkeypatch.setattr("sys.argv", ["cathsim", "benchmark", "difficulty", *arguments])
+    with pytest.raises(SystemExit) as exit:
+        main()
+    assert exit.value.code == 2
+    error = capsys.readouterr().err
+    assert re.search(message, error), error
