@@ -88,7 +88,7 @@ def import_scan(
         rename: new names of computed vessels by their computed names.
         spacing: m, of the fine lattice of depths.
         wall: "prisms" (merged triangle prisms, near the surface) or "coacd" (convex
-            decomposition, coarse; needs the package coacd).
+            decomposition, coarse).
         tolerance: m, of the prisms; see ``scan.wall.build_wall``.
         threshold: m, of CoACD; see ``coacd_wall.decompose_wall``.
         progress: called with a line of text for every step, which begins with the
@@ -103,7 +103,6 @@ def import_scan(
         FileNotFoundError: if a file is missing.
         ValueError: if a file or an option is not as stated, or the tree that results
             does not agree with the surface; says how to mend it.
-        ImportError: if ``wall`` is "coacd" and the package is missing.
     """
     threshold = _check_wall(wall, threshold)
     started = time.monotonic()
@@ -281,9 +280,7 @@ def _check_wall(wall: str, threshold: float | None) -> float:
     """CoACD's threshold (m), before an import takes its time to no avail."""
     if wall not in WALLS:
         raise ValueError(f"wall is {wall!r}; give one of {', '.join(WALLS)}.")
-    if wall == "coacd":
-        coacd_wall.load_coacd()
-    elif threshold is not None:
+    if wall != "coacd" and threshold is not None:
         raise ValueError("a threshold is for wall='coacd' only; leave it out.")
     return coacd_wall.check_threshold(
         coacd_wall.THRESHOLD if threshold is None else threshold
