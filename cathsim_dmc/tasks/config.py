@@ -105,9 +105,9 @@ class NavigationConfig:
         )
         for name in ("friction", "shaft_link", "working_length", "physics_timestep"):
             value = getattr(self, name)
-            number = isinstance(value, int | float) and not isinstance(value, bool)
-            optional = value is None and name == "working_length"
-            good = optional or (number and np.isfinite(value))
+            good = value is None and name == "working_length"
+            if isinstance(value, int | float) and not isinstance(value, bool):
+                good = bool(np.isfinite(value))
             require(name, good, "a positive, finite number")
         require("friction", 0 <= self.friction <= 2, "between 0 and 2")
         require(
