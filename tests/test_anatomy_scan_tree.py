@@ -278,5 +278,5 @@ def test_the_proof_finds_each_fault(good):
 def test_generated_arches_are_proved_too():
     from cathsim_dmc.anatomy.arch import arch
 
-    found = failed(arch.load("type1"))
+    found = failed(arch.load("simple1"))
     assert found.keys() <= {"start of the device"}

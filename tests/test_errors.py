@@ -124,7 +124,7 @@ def test_wrong_reward():
         ({"max_steps": float("inf")}, ["max_steps", "inf", "integer"]),
         ({"max_steps": True}, ["max_steps", "True", "integer"]),
         ({"rotation": "False"}, ["rotation", "'False'", "True or False"]),
-        ({"shaft_link": 1e9}, ["shaft_link", "1e", "0.002 to 0.1 m"]),
+        ({"shaft_link": 1e9}, ["shaft_link", "1000000000.0", "0.002 to 0.1 m"]),
         ({"shaft_link": 1e-6}, ["shaft_link", "1e-06", "0.002 to 0.1 m"]),
         ({"friction": "0.1"}, ["friction", "'0.1'", "number"]),
         ({"physics_timestep": 1e9}, ["physics_timestep", "control step of 0.04"]),
