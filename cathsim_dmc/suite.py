@@ -70,7 +70,8 @@ class TaskDefinition:
         """Names of the options that choose the anatomy and the goal."""
         if self.random_arch:
             return ("arches", "pool", "first")
-        return () if self.anatomy is not None else ("anatomy", "goal", "access")
+        own = () if self.anatomy is not None else ("anatomy", "access")
+        return own if self.goal is not None else (*own, "goal")
 
     @property
     def objective_options(self) -> tuple[str, ...]:
@@ -144,7 +145,7 @@ def make_task(
     )
     chosen = {k: v for k, v in options.items() if k not in _CONFIG_FIELDS}
     if "farthest_shift" in definition.objective_options:
-        chosen["farthest_shift"] = config.randomisation.farthest_shift
+        chosen["farthest_shift"] = config.ranges.farthest_shift
     goals = [placement.resolve_goal(anatomy, goal) for anatomy in anatomies]
     config = _one_length(config, anatomies, goals)
     rooms = []
@@ -161,7 +162,7 @@ def _one_length(
     """The configuration with a device as long as the farthest goal needs."""
     if len(anatomies) == 1 or config.working_length is not None:
         return config
-    device, shift = devices.get(config.device), config.randomisation.farthest_shift
+    device, shift = devices.get(config.device), config.ranges.farthest_shift
     longest = max(
         placement.place_device(anatomy, goal, device, None, shift).working_length
         for anatomy, goal in zip(anatomies, goals, strict=True)

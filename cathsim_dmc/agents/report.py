@@ -40,6 +40,7 @@ class Report:
         values = {"policy": self.policy.to_dict(), "seconds": round(self.seconds, 1)}
         if self.baseline is not None:
             values["baseline"] = self.baseline.to_dict()
+        if self.comparison is not None:
             values["comparison"] = self.comparison.to_dict()
         return values
 

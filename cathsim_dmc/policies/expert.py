@@ -153,4 +153,6 @@ class ExpertPolicy(Policy):
 
     def act(self, observation: Any) -> np.ndarray:
         """Actions (N, A) for the state of the devices."""
+        if self._expert is None or self._view is None:
+            raise RuntimeError("the expert must be reset before it acts")
         return self._expert.act(self._view.readings, self._view.wall_force)

@@ -127,7 +127,13 @@ class Plan:
                 f"device {catheter.device.name!r} has no motors in its tip, so the "
                 f"expert cannot steer it; choose one of {', '.join(steerable)}"
             )
-        route = task.objective.route.resampled(ROUTE_SPACING)
+        line = getattr(task.objective, "route", None)
+        if line is None:
+            raise ValueError(
+                f"the objective {type(task.objective).__name__} has no route, a "
+                "centreline from the inlet to the goal, for the expert to follow"
+            )
+        route = line.resampled(ROUTE_SPACING)
         hinges, numbers = [], {}
         for column, joint in enumerate(catheter.joints):
             if joint.type == "slide":

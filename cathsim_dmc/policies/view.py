@@ -7,7 +7,7 @@ policy that looks at positions and forces needs no second version of itself.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple, Protocol, TypeVar
+from typing import Protocol, TypeVar
 
 import numpy as np
 from dm_control import composer
@@ -18,7 +18,7 @@ from cathsim_dmc.tasks.cases import Case
 from cathsim_dmc.tasks.navigation import Navigation
 from cathsim_dmc.tasks.readings import Readings
 
-Stacked = TypeVar("Stacked", bound=NamedTuple)
+Stacked = TypeVar("Stacked", Readings, forces.WallForce)
 
 
 class View(Protocol):
@@ -38,6 +38,7 @@ class View(Protocol):
     @property
     def task(self) -> Navigation:
         """The task that all simulations run."""
+        ...
 
     def case(self, index: int) -> Case:
         """Scene and objective of the episode of one simulation."""
@@ -45,10 +46,12 @@ class View(Protocol):
     @property
     def readings(self) -> Readings:
         """State of the devices; every array has the leading axis N."""
+        ...
 
     @property
     def wall_force(self) -> forces.WallForce:
         """Force on the wall over the last control step; arrays (N,), N."""
+        ...
 
 
 class BatchedView:

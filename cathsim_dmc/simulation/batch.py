@@ -77,16 +77,16 @@ class BatchSimulation:
         )
         self._models = _Fields(self._batch)
         if task.num_anatomies > 1:
-            writes = bool(ModelVariation.fields_of(task.config.randomisation))
+            writes = bool(ModelVariation.fields_of(task.config.ranges))
             self._models = _OwnModels(self._batch) if writes else _Models(self._batch)
         self._rollout = task.make_rollout(
             self._model, self._batch, self._models, num_simulations
         )
         self.seed(seeds)
 
-    def seed(self, seeds: Sequence[int] | int) -> None:
+    def seed(self, seeds: Sequence[int | Sequence[int]] | int) -> None:
         """Gives each simulation its own source of randomness."""
-        if np.ndim(seeds) == 0:
+        if isinstance(seeds, int | np.integer):
             seeds = [int(seeds) + index for index in range(self.num_simulations)]
         if len(seeds) != self.num_simulations:
             raise ValueError(
@@ -163,12 +163,12 @@ class BatchSimulation:
         return self._rollout
 
     @property
-    def readings(self) -> readings.Readings | None:
+    def readings(self) -> readings.Readings:
         """State of the devices after the last step or reset, arrays (N, ...)."""
         return self._rollout.readings
 
     @property
-    def wall_force(self) -> forces.WallForce | None:
+    def wall_force(self) -> forces.WallForce:
         """Force on the wall over the last step, arrays (N,)."""
         return self._rollout.wall_force
 

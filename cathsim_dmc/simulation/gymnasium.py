@@ -6,6 +6,7 @@ from typing import Any
 import gymnasium
 import numpy as np
 from dm_env import specs
+from gymnasium.envs.registration import EnvSpec
 
 from cathsim_dmc import suite
 from cathsim_dmc.anatomy.anatomy import Surface
@@ -199,7 +200,7 @@ def make(task: str, **options: Any) -> gymnasium.Env:
       task: of `suite.SUITE`.
       **options: of `CathSimEnv`; JSON can hold them if the spec shall be written.
     """
-    spec = gymnasium.envs.registration.EnvSpec(
+    spec = EnvSpec(
         id=f"{suite.DOMAIN}/{task}-v{VERSION}",
         entry_point=f"{__name__}:{CathSimEnv.__name__}",
         kwargs={"task": task, **options},
@@ -275,11 +276,12 @@ class CathSimVectorEnv(gymnasium.vector.VectorEnv):
 
     def reset(self, *, seed: int | list[int] | None = None, options=None):
         """Starts all episodes; a seed is that of the first, the others count up."""
-        super().reset(seed=seed if np.ndim(seed) == 0 else seed[0])
-        if seed is not None:
-            if np.ndim(seed) == 0:
-                seed = [seed + i for i in range(self.num_envs)]
-            self._simulation.seed([_words(each) for each in seed])
+        seeds = seed
+        if isinstance(seeds, int | np.integer):
+            seeds = [int(seeds) + i for i in range(self.num_envs)]
+        super().reset(seed=None if seeds is None else seeds[0])
+        if seeds is not None:
+            self._simulation.seed([_words(each) for each in seeds])
         step = self._simulation.reset()
         return _converted(step.observation, self._dtype), step.info()
 

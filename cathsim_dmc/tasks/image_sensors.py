@@ -74,11 +74,11 @@ class ImageSensors:
         count = len(qpos)
         chosen = np.arange(count) if fresh is None else fresh
         line = lines[chosen]
-        planes = [self._planes[index] for index in chosen]
+        planes = [self._planes[index] for index in chosen] if self._planes else []
         if self._wants("image", "sequential"):
             states = None
             if random_states is not None and self._noise:
-                states = [random_states[index] for index in chosen]
+                states = [random_states[index] for index in chosen.tolist()]
             image = machines.render(planes, line, self._radius, states)
             self._remember(image, count, fresh)
         if self._wants("segmentation"):
@@ -90,7 +90,7 @@ class ImageSensors:
             pixels = machines.pixels(planes, points)
             self._pixels = _merged(self._pixels, pixels, count, fresh)
         kinds = [kind for kind in cameras.KINDS if kind in self._names]
-        if kinds:
+        if kinds and self._cameras is not None:
             for key, view in self._cameras.see(kinds, qpos[chosen]).items():
                 self._views[key] = _merged(self._views.get(key), view, count, fresh)
         return observations.Images(
@@ -115,7 +115,7 @@ class ImageSensors:
     @property
     def fluoroscope(self) -> Fluoroscope | None:
         """Frontal plane before the first simulation, or None without fluoroscopy."""
-        return self._planes[0] and self._planes[0][0]
+        return self._planes[0][0] if self._planes else None
 
 
 def _merged(old, new, count, fresh):

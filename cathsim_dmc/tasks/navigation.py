@@ -68,7 +68,7 @@ class Navigation(composer.Task):
             if isinstance(random, np.random.RandomState)
             else np.random.RandomState(random)
         )
-        if config.randomisation.goal_shift and not hasattr(objective, "shifted"):
+        if config.ranges.goal_shift and not hasattr(objective, "shifted"):
             raise ValueError(
                 f"randomisation shifts the goal, but {type(objective).__name__} has "
                 "no method shifted(shift): add one, or leave goal_shift out"
@@ -77,7 +77,7 @@ class Navigation(composer.Task):
         self._names = observations.resolve(config.observation)
         self._fluoroscopy = None
         if observations.needs_fluoroscopy(self._names):
-            self._fluoroscopy = config.fluoroscopy
+            self._fluoroscopy = config.fluoroscopy_options
         if set(cameras.KINDS) & set(self._names):
             if others:
                 raise ValueError(
@@ -123,7 +123,7 @@ class Navigation(composer.Task):
         """One observable per entry of the chosen observations."""
         if self._observables is None:
             options = observations.ImageOptions(
-                self._config.fluoroscopy, self._config.cameras
+                self._config.fluoroscopy_options, self._config.camera_options
             )
             self._observables = {
                 key: observations.FrameObservable(
@@ -167,7 +167,7 @@ class Navigation(composer.Task):
         self._step = None
         self._rollout.begin(_ONLY, [random_state])
         goal = self._scene.phantom.goals.get(self._scene.goal.name)
-        if goal is not None and self._config.randomisation.goal_shift:  # only looks
+        if goal is not None and self._config.ranges.goal_shift:  # only looks
             physics.bind(goal).pos = self.goal_position
 
     def before_step(self, physics, action, random_state):
@@ -236,12 +236,12 @@ class Navigation(composer.Task):
     def get_reward(self, physics) -> float:
         """Reward of the last control step, 0 if the physics failed in it."""
         del physics
-        return float(self._step.outcome.reward[0])
+        return float(self._current().outcome.reward[0])
 
     def get_discount(self, physics) -> float:
         """0 at success or an error of physics, 1 otherwise; the time limit keeps 1."""
         del physics
-        return 0.0 if self._step.terminated[0] else 1.0
+        return 0.0 if self._current().terminated[0] else 1.0
 
     def should_terminate_episode(self, physics) -> bool:
         """Whether the episode has ended."""
@@ -272,7 +272,7 @@ class Navigation(composer.Task):
     @property
     def objective(self) -> Objective:
         """Success and reward, with the goal of this episode."""
-        return self._objective if self._rollout is None else self._rollout.objective
+        return self._objective if self.rollout is None else self.rollout.objective
 
     @property
     def goal_position(self) -> np.ndarray:
@@ -282,7 +282,7 @@ class Navigation(composer.Task):
     @property
     def rollout(self) -> Rollout | None:
         """The course of the episode, or None before the model is compiled."""
-        return self._rollout
+        return getattr(self, "_rollout", None)
 
     @property
     def readings(self) -> readings.Readings:

@@ -6,7 +6,7 @@ import os
 import tempfile
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
@@ -97,7 +97,7 @@ class PhysicsMonitor:
         self,
         diverged: Sequence[bool],
         centreline: np.ndarray,
-        peak_force: Sequence[float],
+        peak_force: Sequence[float] | np.ndarray,
     ) -> list[str | None]:
         """What went wrong in the control step that has just ended; logs and dumps it.
 
@@ -126,13 +126,14 @@ class PhysicsMonitor:
         out = np.zeros(len(reasons), dtype=bool)
         if looked:
             out[looked] = self._escaped(looked, centreline)
-        for index in np.flatnonzero(wrong | out):
+        for index in np.flatnonzero(wrong | out).tolist():
             reason = ESCAPED if out[index] and not wrong[index] else EXPLODED
             reasons[index] = reason = DIVERGED if diverged[index] else reason
             dump(
                 reason,
                 task={"anatomy": self._anatomies[index].name, **self._task},
-                state=self._states[index],
+                # Kept before the step that went wrong.
+                state=cast(np.ndarray, self._states[index]),
                 actions=np.array(self._actions[index]),
             )
         return reasons

@@ -7,7 +7,7 @@ one of N; so both draw, command, judge and observe alike, bit for bit.
 """
 
 from collections.abc import Callable, Sequence
-from typing import Protocol
+from typing import Protocol, cast
 
 import mujoco
 import numpy as np
@@ -19,7 +19,7 @@ from cathsim_dmc.tasks.cases import Case, model_index
 from cathsim_dmc.tasks.config import NavigationConfig
 from cathsim_dmc.tasks.image_sensors import ImageSensors, open_cameras
 from cathsim_dmc.tasks.objective_pool import together
-from cathsim_dmc.tasks.objectives import Measurement, Objective
+from cathsim_dmc.tasks.objectives import Measurement, Objective, ShiftableObjective
 from cathsim_dmc.tasks.path_tracker import PathTracker
 from cathsim_dmc.tasks.physics_errors import PhysicsMonitor
 from cathsim_dmc.tasks.step import Step
@@ -38,6 +38,8 @@ class SimulationState(Protocol):
 
 class SingleState:
     """Arrays of one `mujoco.MjData`, not copied, with a leading axis of length 1."""
+
+    qpos: np.ndarray
 
     def __init__(self, data: mujoco.MjData):
         """Takes the views; they stay valid as long as `data` lives."""
@@ -94,7 +96,7 @@ class Rollout:
         catheter = scene.catheter.mjcf_model.model
         self._index = model_index(scene, model)
         num_actions = len(scene.catheter.actuators)
-        randomisation = config.randomisation
+        randomisation = config.ranges
         self._variation = ModelVariation(model, randomisation, catheter)
         self._delay = ActionDelay(
             num_simulations, num_actions, randomisation.longest_delay
@@ -104,7 +106,7 @@ class Rollout:
             cases[0].angiograph,
             scene.device.outer_radius,
             num_simulations,
-            open_cameras(self._names, model, config.cameras, catheter),
+            open_cameras(self._names, model, config.camera_options, catheter),
         )
         self._monitor = PhysicsMonitor(
             scene.anatomy,
@@ -117,8 +119,9 @@ class Rollout:
         self._steps = np.zeros(num_simulations, dtype=int)
         self._action = np.zeros((num_simulations, num_actions))
         self._previous_action = self._action
-        self._readings: readings.Readings | None = None
-        self._wall_force: forces.WallForce | None = None
+        # There from the first measurement on.
+        self._readings: readings.Readings
+        self._wall_force: forces.WallForce
 
     # The course of an episode.
 
@@ -141,8 +144,10 @@ class Rollout:
         self._objective = together(
             [case.objective for case in self._cases], self._case_of
         )
-        if self._config.randomisation.goal_shift is not None:
-            self._objective = self._objective.shifted(self._goal_shift)
+        if self._config.ranges.goal_shift is not None:
+            # Navigation has made sure that it can be shifted.
+            shiftable = cast(ShiftableObjective, self._objective)
+            self._objective = shiftable.shifted(self._goal_shift)
         self._steps[indices] = 0
         # New arrays: those handed out before stay what they were.
         self._action = self._action.copy()
@@ -156,7 +161,7 @@ class Rollout:
             self._case_of[index] = random_state.randint(len(self._cases))
             self._access.load(index, self.case(index))
         case = self.case(index)
-        episode = self._config.randomisation.draw(random_state)
+        episode = self._config.ranges.draw(random_state)
         field = self._access.field
         fields = {name: field(index, name) for name in self._variation.fields}
         self._variation.write(fields, episode)
@@ -311,12 +316,12 @@ class Rollout:
         return self._index
 
     @property
-    def readings(self) -> readings.Readings | None:
+    def readings(self) -> readings.Readings:
         """State of the devices after the last step or reset."""
         return self._readings
 
     @property
-    def wall_force(self) -> forces.WallForce | None:
+    def wall_force(self) -> forces.WallForce:
         """Force on the wall over the last step."""
         return self._wall_force
 

@@ -90,7 +90,7 @@ class Randomisation:
     @classmethod
     def make(cls, value: "Randomisation | Mapping[str, Any] | bool") -> "Randomisation":
         """From a task's option: False, True for `DEFAULT_RANGES`, or fields."""
-        if isinstance(value, cls):
+        if isinstance(value, Randomisation):
             return value
         if isinstance(value, bool):
             return DEFAULT_RANGES if value else cls()

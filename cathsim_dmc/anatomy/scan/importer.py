@@ -88,7 +88,7 @@ def import_scan(
         rename: new names of computed vessels by their computed names.
         spacing: m, of the fine lattice of depths.
         wall: "prisms" (merged triangle prisms, near the surface) or "coacd" (convex
-            decomposition, coarse; needs the package coacd).
+            decomposition, coarse).
         tolerance: m, of the prisms; see ``scan.wall.build_wall``.
         threshold: m, of CoACD; see ``coacd_wall.decompose_wall``.
         progress: called with a line of text for every step, which begins with the
@@ -103,7 +103,6 @@ def import_scan(
         FileNotFoundError: if a file is missing.
         ValueError: if a file or an option is not as stated, or the tree that results
             does not agree with the surface; says how to mend it.
-        ImportError: if ``wall`` is "coacd" and the package is missing.
     """
     threshold = _check_wall(wall, threshold)
     started = time.monotonic()
@@ -118,7 +117,8 @@ def import_scan(
             notes.append(text)
         say(f"note: {text}")
 
-    frame_sign(mesh_frame), upright(axes)
+    frame_sign(mesh_frame)
+    upright(axes)
     if units is not None:
         metres_per(units)
     place = _as_point(inlet)
@@ -225,6 +225,7 @@ def _walled(anatomy, wall, tolerance, threshold, say, note) -> Anatomy:
     field, tree, opening = anatomy.field, anatomy.tree, anatomy.inlet
     cut_vertices, shell, cap = cut_open(vertices, faces.astype(np.int64), opening)
     closed = np.concatenate([shell, cap])
+    shut = compiled(shut_behind(field, cut_vertices, closed, opening))
     anatomy = Anatomy(
         name=anatomy.name,
         tree=tree,
@@ -233,7 +234,7 @@ def _walled(anatomy, wall, tolerance, threshold, say, note) -> Anatomy:
         inlet=opening,
         goals=anatomy.goals,
         ends=anatomy.ends,
-        field=compiled(shut_behind(field, cut_vertices, closed, opening)),
+        field=shut,
     )
     for check in check_tree(anatomy):
         if check.passed:
@@ -260,7 +261,7 @@ def _walled(anatomy, wall, tolerance, threshold, say, note) -> Anatomy:
             progress=say,
         )
     pieces += tuple(inlet_cap(cut_vertices[cap[:, :2]], opening))
-    return replace(anatomy, wall=pieces, field=plain(anatomy.field))
+    return replace(anatomy, wall=pieces, field=plain(shut))
 
 
 def passable_length(vessel: Vessel, radius: float = DEVICE_RADIUS) -> float:
@@ -279,9 +280,7 @@ def _check_wall(wall: str, threshold: float | None) -> float:
     """CoACD's threshold (m), before an import takes its time to no avail."""
     if wall not in WALLS:
         raise ValueError(f"wall is {wall!r}; give one of {', '.join(WALLS)}.")
-    if wall == "coacd":
-        coacd_wall.load_coacd()
-    elif threshold is not None:
+    if wall != "coacd" and threshold is not None:
         raise ValueError("a threshold is for wall='coacd' only; leave it out.")
     return coacd_wall.check_threshold(
         coacd_wall.THRESHOLD if threshold is None else threshold
@@ -375,7 +374,9 @@ def _place_inlet(tree: VesselTree, at_end: bool) -> tuple[VesselTree, Inlet]:
         line = line.slice(start, line.length)
     place = line.at(0.0)
     ahead = line.at(min(3.0 * float(place.radius), 0.5 * line.length)).position
-    opening = Inlet(root.name, place.position, ahead - place.position, place.radius)
+    opening = Inlet(
+        root.name, place.position, ahead - place.position, float(place.radius)
+    )
     vessels = dict(tree.vessels)
     vessels[root.name] = Vessel(root.name, line)
     return VesselTree(vessels), opening

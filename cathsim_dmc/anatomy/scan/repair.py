@@ -174,7 +174,7 @@ class _Work:
             crowded = edges[times > 2]
             if not len(crowded):
                 break
-            bad = np.isin(self.faces, crowded).any(axis=1)
+            bad = np.asarray(np.isin(self.faces, crowded).any(axis=1))
             first = first or (len(crowded), self.vertices[crowded[0, 0]])
             if bad.sum() > max(CROWDED * len(self.faces), 40):
                 raise ValueError(
@@ -299,11 +299,13 @@ class _Work:
                     f"{_mm(where)} mm, are pierced by others. Smooth or remesh that "
                     "place, or export the segmentation again."
                 )
-            self._keep(~np.isin(self.faces, self.faces[tangled]).any(axis=1))
+            touched = np.isin(self.faces, self.faces[tangled]).any(axis=1)
+            self._keep(np.asarray(~touched))
             self._drop_flakes()
             self.uncrowd()
             self.close()
         else:
+            assert first is not None  # every round has found some
             raise ValueError(
                 f"{self.name} intersects itself near {_mm(first[1])} mm, and cutting "
                 "the place out did not help. Smooth or remesh it."
