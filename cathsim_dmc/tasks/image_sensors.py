@@ -35,8 +35,11 @@ class ImageSensors:
         self._on = angiograph is not None or gl_cameras is not None
         self._radius = device_radius
         self._cameras = gl_cameras
-        self._noise = angiograph is not None and angiograph.options.noise
-        self._planes = [angiograph and angiograph.planes()] * num_simulations
+        self._planes: list[machines.Planes] = []
+        self._noise = False
+        if angiograph is not None:
+            self._planes = [angiograph.planes()] * num_simulations
+            self._noise = angiograph.options.noise
         self._images: list[np.ndarray] = []
         self._masks = self._pixels = None
         self._views: dict[str, np.ndarray] = {}

@@ -73,7 +73,10 @@ class ObjectivePool:
     def shifted(self, shift: np.ndarray) -> "ObjectivePool":
         """The same objectives with the goals moved along their branches by (N,) m."""
         return ObjectivePool(
-            [(objective.shifted(shift[rows]), rows) for objective, rows in self._groups]
+            [
+                (cast(ShiftableObjective, objective).shifted(shift[rows]), rows)
+                for objective, rows in self._groups
+            ]
         )
 
     def _merged(self, parts: Sequence[tuple[np.ndarray, np.ndarray]]) -> np.ndarray:

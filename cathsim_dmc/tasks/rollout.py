@@ -114,6 +114,7 @@ class Rollout:
             {"goal": scene.goal.name, "config": repr(config)},
         )
         self._path = PathTracker(num_simulations)
+        # None in the first look, which must not draw noise.
         self._random_states: list[np.random.RandomState] | None = None
         self._goal_shift = np.zeros(num_simulations)
         self._steps = np.zeros(num_simulations, dtype=int)
@@ -138,8 +139,10 @@ class Rollout:
             alone.
         """
         self._random_states = list(random_states)
-        for index in indices:
-            self._draw(index)
+        chosen = set(np.asarray(indices).tolist())
+        for index, random_state in enumerate(self._random_states):
+            if index in chosen:
+                self._draw(index, random_state)
         self.pose_robot(self._state.qpos)
         self._objective = together(
             [case.objective for case in self._cases], self._case_of
@@ -154,9 +157,8 @@ class Rollout:
         self._action[indices] = 0.0
         self._previous_action = self._action
 
-    def _draw(self, index: int) -> None:
+    def _draw(self, index: int, random_state: np.random.RandomState) -> None:
         """Draws the episode of one simulation and puts its device to the start."""
-        random_state = self._random_states[index]
         if len(self._cases) > 1:
             self._case_of[index] = random_state.randint(len(self._cases))
             self._access.load(index, self.case(index))
