@@ -114,7 +114,7 @@ class ContactLog:
         """Adds the contacts at the end of a control step; an evaluation observer."""
         simulation = env.base_env.simulation
         rows = simulation.sensor_rows[running, -1]
-        contacts = simulation.task.rollout.index.contacts(rows)
+        contacts = simulation.rollout.index.contacts(rows)
         self._positions.append(contacts.position[contacts.present])
         self._magnitudes.append(contacts.magnitude[contacts.present])
 

@@ -107,7 +107,8 @@ class Rollout:
         )
         self._path = PathTracker(num_simulations)
         self._start = StartPosture(scene, model, self._index)
-        self._random_states: list[np.random.RandomState] = []
+        # None before the first episode: specs are made of images without noise.
+        self._random_states: list[np.random.RandomState] | None = None
         self._goal_shift = np.zeros(num_simulations)
         self._steps = np.zeros(num_simulations, dtype=int)
         self._action = np.zeros((num_simulations, num_actions))
@@ -132,7 +133,7 @@ class Rollout:
         """
         self._random_states = list(random_states)
         for index in indices:
-            self._draw(index)
+            self._draw(index, random_states[index])
         self.pose_robot(self._state.qpos)
         if self._config.ranges.goal_shift is not None:
             # Navigation has made sure that it can be shifted.
@@ -144,9 +145,9 @@ class Rollout:
         self._action[indices] = 0.0
         self._previous_action = self._action
 
-    def _draw(self, index: int) -> None:
+    def _draw(self, index: int, random_state: np.random.RandomState) -> None:
         """Draws the episode of one simulation and puts its device to the start."""
-        episode = self._config.ranges.draw(self._random_states[index])
+        episode = self._config.ranges.draw(random_state)
         fields = {name: values[index] for name, values in self._fields.items()}
         self._variation.write(fields, episode)
         self._delay.restart(index, episode.delay)
