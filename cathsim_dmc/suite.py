@@ -153,7 +153,8 @@ def make_task(
         objective = definition.objective(anatomy, place, **chosen)
         scene = Scene.build(anatomy, place, config, goal_radius=objective.goal_radius)
         rooms.append((scene, objective))
-    return Navigation(*rooms[0], config, random, others=rooms[1:])
+    scene, objective = rooms[0]
+    return Navigation(scene, objective, config, random, others=rooms[1:])
 
 
 def _one_length(

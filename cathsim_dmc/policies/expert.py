@@ -92,7 +92,8 @@ class Experts:
         self._view = view
         self._settings = settings
         self._plans: dict[Case, Plan] = {}
-        self._experts: list[Expert | None] = [None] * view.num_simulations
+        # By simulation, from its first reset on.
+        self._experts: dict[int, Expert] = {}
 
     def reset(self, which: np.ndarray | None = None) -> None:
         """Looks at the anatomies of the simulations that begin a new episode.
@@ -100,8 +101,9 @@ class Experts:
         Args:
             which: Mask or indices of the simulations, None for all.
         """
-        numbers = np.arange(len(self._experts))
-        for index in numbers if which is None else numbers[which]:
+        numbers = np.arange(self._view.num_simulations)
+        chosen = numbers if which is None else numbers[which]
+        for index in chosen.tolist():
             case = self._view.case(index)
             if case not in self._plans:
                 self._plans[case] = Plan.for_task(case)
@@ -109,10 +111,10 @@ class Experts:
 
     def act(self, readings: Readings, wall_force: forces.WallForce) -> np.ndarray:
         """Action (N, A) in [-1, 1] for the state of the devices."""
-        rows = [np.array([index]) for index in range(len(self._experts))]
+        rows = [np.array([index]) for index in range(self._view.num_simulations)]
         actions = [
-            expert.act(part(readings, row), part(wall_force, row))
-            for expert, row in zip(self._experts, rows, strict=True)
+            self._experts[index].act(part(readings, row), part(wall_force, row))
+            for index, row in enumerate(rows)
         ]
         return np.concatenate(actions)
 

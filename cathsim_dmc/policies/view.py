@@ -42,6 +42,7 @@ class View(Protocol):
 
     def case(self, index: int) -> Case:
         """Scene and objective of the episode of one simulation."""
+        ...
 
     @property
     def readings(self) -> Readings:

@@ -94,7 +94,7 @@ class Navigation(composer.Task):
             for each in scenes:
                 each.arena.mjcf_model.option.timestep = config.physics_timestep
             self._cases = cases.alike(scenes, objectives, self._fluoroscopy)
-        self._rollout: Rollout | None = None
+        self._rollout: Rollout  # there once the model is compiled
         self._observables = None
         self._step: Step | None = None
 
@@ -257,7 +257,8 @@ class Navigation(composer.Task):
         Where episodes draw their anatomy, a batch has another scene in each
         simulation: see `Rollout.case`. This is the first one then.
         """
-        return self._scene if self._rollout is None else self._rollout.case().scene
+        rollout = self.rollout
+        return self._scene if rollout is None else rollout.case().scene
 
     @property
     def num_anatomies(self) -> int:

@@ -2,11 +2,16 @@
 
 from collections.abc import Sequence
 from types import MappingProxyType
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
-from cathsim_dmc.tasks.objectives import Measurement, Objective, Outcome
+from cathsim_dmc.tasks.objectives import (
+    Measurement,
+    Objective,
+    Outcome,
+    ShiftableObjective,
+)
 
 
 def together(objectives: Sequence[Objective], chosen: np.ndarray) -> Objective:

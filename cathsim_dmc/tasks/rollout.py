@@ -114,7 +114,7 @@ class Rollout:
             {"goal": scene.goal.name, "config": repr(config)},
         )
         self._path = PathTracker(num_simulations)
-        # None in the first look, which must not draw noise.
+        # None before the first episode: specs are made of images without noise.
         self._random_states: list[np.random.RandomState] | None = None
         self._goal_shift = np.zeros(num_simulations)
         self._steps = np.zeros(num_simulations, dtype=int)
@@ -139,10 +139,8 @@ class Rollout:
             alone.
         """
         self._random_states = list(random_states)
-        chosen = set(np.asarray(indices).tolist())
-        for index, random_state in enumerate(self._random_states):
-            if index in chosen:
-                self._draw(index, random_state)
+        for index in indices:
+            self._draw(index, random_states[index])
         self.pose_robot(self._state.qpos)
         self._objective = together(
             [case.objective for case in self._cases], self._case_of
