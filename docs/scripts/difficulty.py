@@ -67,7 +67,9 @@ def tables(report):
         f"| task | {' | '.join(POLICIES.values())} |",
         "|---" * (len(names) + 1) + "|",
     ]
-    everything = report["findings"]["tasks"]
+    found = report["findings"]["tasks"]
+    order = sorted(found, key=lambda name: (name.startswith("femoral"), name))
+    everything = {name: found[name] for name in order}
     for task, trials in everything.items():
         cells = [_success(trials.get(policy)) for policy in names]
         lines.append(f"| `{task}` | {' | '.join(cells)} |")
