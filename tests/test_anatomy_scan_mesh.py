@@ -11,7 +11,7 @@ from synthetic_scans import marched, write_obj, y_tree
 
 from cathsim_dmc.anatomy.scan.lumen import read_lumen
 from cathsim_dmc.anatomy.scan.mesh import read_triangles
-from cathsim_dmc.anatomy.scan.repair import edge_counts, volume
+from cathsim_dmc.anatomy.scan.topology import edge_counts, volume
 from cathsim_dmc.anatomy.scan.units import upright
 
 DATA = Path(__file__).parent / "data"
