@@ -259,7 +259,7 @@ class CathSimVectorEnv(gymnasium.vector.VectorEnv):
     def _make_spaces(self, observation: Mapping[str, np.ndarray]) -> None:
         def box(array: np.ndarray) -> gymnasium.spaces.Box:
             pixels = array.dtype == np.uint8
-            dtype = np.uint8 if pixels else self._dtype
+            dtype = np.dtype(np.uint8) if pixels else self._dtype
             spec = specs.Array(array.shape[1:], dtype)
             return space(spec, dtype)
 

@@ -10,8 +10,8 @@ from pathlib import Path
 
 import numpy as np
 
-from cathsim_dmc.anatomy.anatomy import Anatomy, End, Goal, Inlet, Surface
-from cathsim_dmc.anatomy.centreline import Vessel, VesselTree
+from cathsim_dmc.anatomy.anatomy import Anatomy, Inlet, Surface
+from cathsim_dmc.anatomy.centreline import VesselTree
 from cathsim_dmc.anatomy.scan import coacd_wall
 from cathsim_dmc.anatomy.scan.check import check_tree
 from cathsim_dmc.anatomy.scan.compiled_field import compiled, plain
@@ -22,6 +22,7 @@ from cathsim_dmc.anatomy.scan.inlet import cut_open, shut_behind
 from cathsim_dmc.anatomy.scan.lumen import Lumen, read_lumen
 from cathsim_dmc.anatomy.scan.mesh_depth import MeshDepth, depth_field
 from cathsim_dmc.anatomy.scan.naming import name_branches, renamed
+from cathsim_dmc.anatomy.scan.places import flat_ends, place_goals, place_inlet
 from cathsim_dmc.anatomy.scan.tree import grow_tree
 from cathsim_dmc.anatomy.scan.trunk import name_trunk
 from cathsim_dmc.anatomy.scan.units import frame_sign, metres_per, upright
@@ -38,10 +39,6 @@ log = logging.getLogger(__name__)
 
 ROOT = "aorta"
 WALLS = ("prisms", "coacd")
-GOAL_PAST_OSTIUM = 30e-3  # m along a branch, its first goal
-GOAL_DISTAL = 0.8  # of the passable part of a branch, its second goal
-INLET_WIDTH = 0.8  # of the lumen near the inlet; the rest of the blind end is cut off
-INLET_SEARCH = 40e-3  # m of the root in which that width is looked for
 NEAR_INLET = 15e-3  # m, distance from the lumen of an inlet that is pointed at
 RADII = (0.3e-3, 30e-3)  # m, allowed median radius of a vessel: arteriole, aneurysm
 
@@ -150,8 +147,8 @@ def import_scan(
         surface=Surface(vertices, faces),
         wall=(),
         inlet=opening,
-        goals=_goals(tree, root),
-        ends=_ends(tree, opening),
+        goals=place_goals(tree, root),
+        ends=flat_ends(tree, opening),
         field=field,
     )
     anatomy = _walled(anatomy, wall, tolerance, threshold, say, note)
@@ -180,7 +177,7 @@ def _tree(field, ways, lines, place, root, rename, note) -> tuple[VesselTree, In
     else:
         lines = _computed(ways, ends, entry, root, rename, note)
     tree = grow_tree(field, ways, lines, entry.position, entry.far, root, drawn)
-    return _place_inlet(name_trunk(tree), entry.at_end)
+    return place_inlet(name_trunk(tree), entry.at_end)
 
 
 def _computed(
@@ -262,13 +259,6 @@ def _walled(anatomy, wall, tolerance, threshold, say, note) -> Anatomy:
         )
     pieces += tuple(inlet_cap(cut_vertices[cap[:, :2]], opening))
     return replace(anatomy, wall=pieces, field=plain(shut))
-
-
-def passable_length(vessel: Vessel, radius: float = DEVICE_RADIUS) -> float:
-    """Arc length (m) up to which a sphere of ``radius`` (m) fits a vessel."""
-    line = vessel.centreline
-    narrow = (line.radii < radius) & (line.arc_length > vessel.ostium)
-    return float(line.arc_length[narrow.argmax()] if narrow.any() else line.length)
 
 
 def _compact(vertices, faces) -> Surface:
@@ -357,58 +347,6 @@ def _proximal_first(line: np.ndarray, field: DepthField) -> np.ndarray:
     part = max(1, len(line) // 8)
     first, last = field(line[:part]).max(), field(line[-part:]).max()
     return line[::-1] if last > 1.1 * first else line
-
-
-def _place_inlet(tree: VesselTree, at_end: bool) -> tuple[VesselTree, Inlet]:
-    """Start the root where the lumen has its width, and look along it there."""
-    root = tree.root
-    line = root.centreline
-    start = 0.0
-    if at_end:
-        near = line.arc_length <= min(INLET_SEARCH, 0.3 * line.length)
-        wide = INLET_WIDTH * np.median(line.radii[near])
-        first = int((line.radii >= wide).argmax())
-        # One radius more, because a vessel's end may be cut off at a slant.
-        start = float(line.arc_length[first] + line.radii[first])
-    if start > 0.0:
-        line = line.slice(start, line.length)
-    place = line.at(0.0)
-    ahead = line.at(min(3.0 * float(place.radius), 0.5 * line.length)).position
-    opening = Inlet(
-        root.name, place.position, ahead - place.position, float(place.radius)
-    )
-    vessels = dict(tree.vessels)
-    vessels[root.name] = Vessel(root.name, line)
-    return VesselTree(vessels), opening
-
-
-def _goals(tree: VesselTree, root: str) -> dict[str, Goal]:
-    goals = {}
-    for key, vessel in tree.vessels.items():
-        if key == root:
-            continue
-        reach = passable_length(vessel) - vessel.ostium
-        first = vessel.ostium + min(GOAL_PAST_OSTIUM, 0.5 * reach)
-        places = {key: first}
-        if GOAL_DISTAL * reach > 1.3 * (first - vessel.ostium):
-            places[f"{key}_distal"] = vessel.ostium + GOAL_DISTAL * reach
-        for name, s in places.items():
-            goals[name] = Goal(name, key, vessel.centreline.at(s).position, float(s))
-    return goals
-
-
-def _ends(tree: VesselTree, opening: Inlet) -> tuple[End, ...]:
-    ends = [
-        End(opening.vessel, opening.position, -opening.direction, opening.radius, True)
-    ]
-    for key, vessel in tree.vessels.items():
-        length = vessel.centreline.length
-        branches = [k for k, v in tree.vessels.items() if v.parent == key]
-        if any(tree.origin(k) > length - 1e-6 for k in branches):
-            continue  # goes on in its branches
-        place = vessel.centreline.at(length)
-        ends.append(End(key, place.position, place.tangent, float(place.radius), False))
-    return tuple(ends)
 
 
 def _summary(tree: VesselTree) -> list[str]:
