@@ -35,7 +35,7 @@ class Ways:
         """Build the lattice graph of ``field`` (26 neighbours)."""
         ijk, points, depth = field.lattice(spacing, SHALLOW)
         shape = tuple((ijk.max(axis=0) + 3).tolist())
-        key = np.ravel_multi_index(tuple((ijk + 1).T), shape)
+        key = np.asarray(np.ravel_multi_index(tuple((ijk + 1).T), shape))
         order = np.argsort(key)
         self.points, self.depth, key = points[order], depth[order], key[order]
         rows, cols, lengths = [], [], []
