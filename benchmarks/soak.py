@@ -182,7 +182,7 @@ def run(simulation: BatchSimulation, episodes: list[Episode], steps: int) -> lis
         warnings += (after != before).any(-1)
         before = after
         errors[result.physics_error & (errors < 0)] = step
-        rows = simulation.sensor_rows[..., simulation.task.rollout.index.wall_contacts]
+        rows = simulation.sensor_rows[..., simulation.rollout.index.wall_contacts]
         contacts = forces.Contacts.from_sensor(rows)
         deepest = contacts.penetration.max(-1)
         touching = contacts.present.any(-1)

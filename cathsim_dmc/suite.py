@@ -12,7 +12,7 @@ TorchRL's `DMControlEnv` know it too.
 import dataclasses
 import inspect
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +21,8 @@ from dm_control import composer
 from dm_control import suite as dm_suite
 from dm_control.utils import containers
 
-from cathsim_dmc.anatomy import Anatomy
+from cathsim_dmc.anatomy import Anatomy, Goal
+from cathsim_dmc.entities import devices
 from cathsim_dmc.tasks import placement
 from cathsim_dmc.tasks.config import NavigationConfig
 from cathsim_dmc.tasks.navigation import Navigation
@@ -30,6 +31,7 @@ from cathsim_dmc.tasks.scene import Scene
 
 DOMAIN = "cathsim"
 SUITE = containers.TaggedTasks()
+POOL = 16  # arches that an episode draws from, unless one says otherwise
 
 # Constants of dm_control.suite that are computed from its domains at import.
 _TAGGED = {"BENCHMARKING": "benchmarking", "EASY": "easy", "HARD": "hard"}
@@ -51,6 +53,8 @@ class TaskDefinition:
         options of the task. With an option `farthest_shift` it is told how far past
         its place randomisation may shift the goal, m.
       options: fields of `NavigationConfig` that differ from their defaults.
+      random_arch: whether each episode draws a random arch, from those that the
+        task's options `arches`, `pool` and `first` name; there is no `anatomy` then.
     """
 
     description: str
@@ -59,6 +63,15 @@ class TaskDefinition:
     access: str = "ascending"
     objective: Callable[..., Objective] = Cannulation.to
     options: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+    random_arch: bool = False
+
+    @property
+    def own_options(self) -> tuple[str, ...]:
+        """Names of the options that choose the anatomy and the goal."""
+        if self.random_arch:
+            return ("arches", "pool", "first")
+        own = () if self.anatomy is not None else ("anatomy", "access")
+        return own if self.goal is not None else (*own, "goal")
 
     @property
     def objective_options(self) -> tuple[str, ...]:
@@ -103,8 +116,8 @@ def make_task(
       name: Name of a task in `SUITE`.
       random: Seed or source of randomness.
       **options: Fields of `NavigationConfig`, options of the task's objective (such
-        as `reward` and `goal_radius`) and, for `navigate`, `anatomy`, `goal` and
-        `access`.
+        as `reward` and `goal_radius`); for `navigate`, `anatomy`, `goal` and
+        `access`; for random arches, `arches`, `pool` and `first`, see `load_arches`.
 
     Raises:
       ValueError: if the task or an option does not exist; lists those that do.
@@ -115,37 +128,62 @@ def make_task(
         )
     definition = TASKS[name]
     options = {**definition.options, **options}
-    anatomy, goal, access = definition.anatomy, definition.goal, definition.access
-    if anatomy is None:
-        # `phantom` is what this option was called at first.
-        anatomy = options.pop("phantom", "type1")
-        anatomy = options.pop("anatomy", anatomy)
-        goal = options.pop("goal", "bca")
-        access = options.pop("access", access)
+    own = {key: options.pop(key) for key in definition.own_options if key in options}
+    if definition.own_options and not definition.random_arch and "phantom" in options:
+        # What this option was called at first.
+        own.setdefault("anatomy", options.pop("phantom"))
     _refuse_unknown(definition, options)
-    anatomy = load_anatomy(anatomy, access)
-    goal = placement.resolve_goal(anatomy, goal)
+    goal = own.get("goal", definition.goal or "bca")
+    access = own.get("access", definition.access)
+    if definition.random_arch:
+        anatomies = load_arches(access=access, **own)
+    else:
+        chosen = own.get("anatomy", definition.anatomy or "type1")
+        anatomies = [load_anatomy(chosen, access)]
     config = NavigationConfig(
         **{key: value for key, value in options.items() if key in _CONFIG_FIELDS}
     )
     chosen = {k: v for k, v in options.items() if k not in _CONFIG_FIELDS}
     if "farthest_shift" in definition.objective_options:
-        chosen["farthest_shift"] = config.randomisation.farthest_shift
-    objective = definition.objective(anatomy, goal, **chosen)
-    scene = Scene.build(anatomy, goal, config, goal_radius=objective.goal_radius)
-    return Navigation(scene, objective, config, random)
+        chosen["farthest_shift"] = config.ranges.farthest_shift
+    goals = [placement.resolve_goal(anatomy, goal) for anatomy in anatomies]
+    config = _one_length(config, anatomies, goals)
+    rooms = []
+    for anatomy, place in zip(anatomies, goals, strict=True):
+        objective = definition.objective(anatomy, place, **chosen)
+        scene = Scene.build(anatomy, place, config, goal_radius=objective.goal_radius)
+        rooms.append((scene, objective))
+    scene, objective = rooms[0]
+    return Navigation(scene, objective, config, random, others=rooms[1:])
+
+
+def _one_length(
+    config: NavigationConfig, anatomies: Sequence[Anatomy], goals: Sequence[Goal]
+) -> NavigationConfig:
+    """The configuration with a device as long as the farthest goal needs."""
+    if len(anatomies) == 1 or config.working_length is not None:
+        return config
+    device, shift = devices.get(config.device), config.ranges.farthest_shift
+    longest = max(
+        placement.place_device(anatomy, goal, device, None, shift).working_length
+        for anatomy, goal in zip(anatomies, goals, strict=True)
+    )
+    return dataclasses.replace(config, working_length=longest)
 
 
 def task_options(name: str) -> tuple[str, ...]:
     """Names of the options of a task beside `random` and `environment_kwargs`."""
     definition = TASKS[name]
-    own = () if definition.anatomy is not None else ("anatomy", "goal", "access")
     of_objective = (o for o in definition.objective_options if o != "farthest_shift")
-    return (*own, *of_objective, *_CONFIG_FIELDS)
+    return (*definition.own_options, *of_objective, *_CONFIG_FIELDS)
 
 
 def _refuse_unknown(definition: TaskDefinition, options: Mapping[str, Any]) -> None:
-    known = (*_CONFIG_FIELDS, *definition.objective_options)
+    known = (
+        *_CONFIG_FIELDS,
+        *definition.objective_options,
+        *(definition.own_options if definition.random_arch else ()),
+    )
     known = [name for name in known if name != "farthest_shift"]
     unknown = sorted(set(options) - set(known))
     if unknown:
@@ -215,6 +253,55 @@ def load_anatomy(anatomy: str | Path | Anatomy, access: str = "ascending") -> An
             f"phantom import` or `generate`, or one of {', '.join(phantoms.PHANTOMS)}"
         )
     return Anatomy.load(anatomy)
+
+
+def load_arches(
+    arches: str = "train",
+    pool: int = POOL,
+    first: int = 0,
+    *,
+    access: str = "ascending",
+) -> list[Anatomy]:
+    """Random arches of a named set, in the order of their seeds; see `arch_set`.
+
+    Arches whose aorta bends back across the straight sheath, so that no device can
+    enter, are passed over.
+
+    Args:
+      arches: Name of the set: "train", "test" or "test_variants".
+      pool: Number of arches; building one takes about a second and a half.
+      first: Number in the set of the first one.
+      access: Where the device enters, "ascending" or "descending".
+
+    Raises:
+      ValueError: if there is no such set, it has no such arches, or with `pool=1`
+        the one cannot be entered.
+    """
+    from cathsim_dmc.anatomy.arch import arch
+
+    seeds = arch.arch_set(arches)
+    whole = all(isinstance(number, int | np.integer) for number in (pool, first))
+    if not whole or pool < 1 or not 0 <= first <= len(seeds) - pool:
+        raise ValueError(
+            f"pool is {pool!r} and first is {first!r}; {arches!r} has {len(seeds)} "
+            "arches, numbered from 0: give whole numbers, pool of at least 1 and first "
+            f"+ pool of at most {len(seeds)}"
+        )
+    found, number = [], first
+    while len(found) < pool and number < len(seeds):
+        anatomy = arch.build_seed(seeds[number], access=access)
+        if placement.is_clear(anatomy):
+            found.append(anatomy)
+        elif pool == 1:
+            break
+        number += 1
+    if len(found) < pool:
+        raise ValueError(
+            f"of the arches from number {first} of {arches!r}, {len(found)} can be "
+            f"entered and pool is {pool}: in the others the aorta bends back across "
+            "the straight sheath; give another first, or a smaller pool"
+        )
+    return found
 
 
 def environment(task: Navigation, **environment_kwargs: Any) -> composer.Environment:
@@ -300,8 +387,29 @@ def _register_femoral() -> None:
             )
 
 
+def _register_random() -> None:
+    """Another arch in each episode, both ways."""
+    for access, prefix in (("ascending", ""), ("descending", "femoral_")):
+        for goal in ("bca", "lcca"):
+            text = f"cannulate {_ARTERIES[goal]} from the {access} aorta."
+            register(
+                f"{prefix}arch_{goal}",
+                TaskDefinition(
+                    f"A random arch in each episode: {text}",
+                    None,
+                    goal,
+                    access,
+                    # One chain for all arches, whichever are drawn from.
+                    options={"working_length": placement.COMMON_LENGTH},
+                    random_arch=True,
+                ),
+                "hard",
+            )
+
+
 _register_published()
 _register_femoral()
+_register_random()
 register(
     "navigate",
     TaskDefinition("Any anatomy, such as an imported scan: reach a goal.", None, None),

@@ -8,7 +8,6 @@ import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -313,7 +312,6 @@ def test_other_trunks_keep_their_names(names):
 @pytest.fixture(scope="module")
 def coacd_tube(cut_tube):
     """Anatomy of the cut tube with CoACD's wall, and how to build another."""
-    pytest.importorskip("coacd")
     points, shell, cap = cut_tube
     faces = np.concatenate([shell, cap])
     field = depth_field(points, faces, 1.5e-3)
@@ -351,23 +349,18 @@ def test_smaller_threshold_follows_the_lumen(coacd_tube):
     assert means[1] < 0.6 * means[0]
 
 
-def test_wall_options(y_scan, monkeypatch):
+def test_wall_options(y_scan):
     mesh, curves, _ = y_scan
     with pytest.raises(ValueError, match="one of prisms, coacd"):
         import_scan(mesh, curves, wall="boxes")
     with pytest.raises(ValueError, match="for wall='coacd' only"):
         import_scan(mesh, curves, threshold=1e-3)
-    monkeypatch.setitem(sys.modules, "coacd", None)
-    with pytest.raises(ImportError, match=r"pip install 'cathsim-dmc\[coacd\]'"):
-        import_scan(mesh, curves, wall="coacd")
-    monkeypatch.setitem(sys.modules, "coacd", SimpleNamespace(set_log_level=print))
     with pytest.raises(ValueError, match="20 mm; give 0.1 to 10 mm"):
         import_scan(mesh, curves, wall="coacd", threshold=20e-3)
 
 
 @pytest.mark.slow
 def test_command_imports_with_coacd(y_scan, tmp_path):
-    pytest.importorskip("coacd")
     mesh, curves, _ = y_scan
     command = [sys.executable, "-m", "cathsim_dmc.cli", "phantom", "import", str(mesh)]
     command += ["--centreline", *map(str, curves), "--out", str(tmp_path / "y")]

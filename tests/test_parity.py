@@ -137,7 +137,7 @@ def test_success_ends_both(anatomy):
     pair.reset()
     push = np.zeros((SIMULATIONS, 21))
     push[:, -1] = 1.0
-    for _ in range(20):
+    for _ in range(40):
         step = pair.step(push)
         if step.terminated.any():
             break

@@ -183,3 +183,18 @@ def test_episodes_start_over_by_themselves(short_batched):
         SHORT_EPISODE - 1,
         2 * SHORT_EPISODE - 1,
     ]
+
+
+@pytest.mark.parametrize("backend", ["batched", "composer"])
+def test_the_first_episode_is_that_of_the_seed(backend):
+    """So that an episode of an evaluation can be recorded by its seed."""
+    from cathsim_dmc.simulation.environments import make_env
+
+    env = make_env("simple1_lcca", num_envs=2, seed=31, backend=backend, num_threads=1)
+    distances = env.reset()["info", "distance"].flatten().tolist()
+    for index, distance in enumerate(distances):
+        single = suite.load("cathsim", "simple1_lcca", {"random": 31 + index})
+        single.reset()
+        assert distance == np.float32(single.task.info()["distance"])
+        single.close()
+    env.close()

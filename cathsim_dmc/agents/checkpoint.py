@@ -188,7 +188,9 @@ def _is_object(value: object) -> bool:
 
 
 def _is_duration(value: object) -> bool:
-    return type(value) in (int, float) and math.isfinite(value) and value >= 0
+    if not isinstance(value, int | float) or isinstance(value, bool):
+        return False
+    return math.isfinite(value) and value >= 0
 
 
 def _line(error: Exception) -> str:

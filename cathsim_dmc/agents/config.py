@@ -242,7 +242,9 @@ def _fits(value: object, kind: Any) -> bool:
     if type(value) is int and abs(value) > MAX_INTEGER:
         return False
     if kind is float:
-        return type(value) in (int, float) and math.isfinite(value)
+        if not isinstance(value, int | float) or isinstance(value, bool):
+            return False
+        return math.isfinite(value)
     # A bool is an int to Python, but no number of anything.
     return type(value) is kind
 

@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar, Protocol
+from typing import Any, ClassVar, Generic, Protocol, TypeVar
 
 import torch
 from tensordict import TensorDictBase
@@ -14,8 +14,11 @@ from cathsim_dmc.agents.networks import NetworkShapes
 from cathsim_dmc.agents.ppo import PPO, PPOConfig
 from cathsim_dmc.agents.sac import SAC, SACConfig
 
+Settings = TypeVar("Settings", bound=TrainingConfig, contravariant=True)
+Config = TypeVar("Config", bound=TrainingConfig)
 
-class Learner(Protocol):
+
+class Learner(Protocol[Settings]):
     """What training asks of an algorithm.
 
     Attributes:
@@ -31,7 +34,7 @@ class Learner(Protocol):
     device: torch.device
     policy: TensorDictSequential
 
-    def __init__(self, config: TrainingConfig, shapes: NetworkShapes, directory: Path):
+    def __init__(self, config: Settings, shapes: NetworkShapes, directory: Path):
         """Make networks with fresh weights, drawn from torch's generator.
 
         Args:
@@ -41,10 +44,9 @@ class Learner(Protocol):
         """
 
     @staticmethod
-    def make_policy(
-        shapes: NetworkShapes, config: TrainingConfig
-    ) -> TensorDictSequential:
+    def make_policy(shapes: NetworkShapes, config: Settings) -> TensorDictSequential:
         """A policy with fresh weights: raw observation in, action out."""
+        ...
 
     def observe(self, batch: TensorDictBase) -> None:
         """Take observation statistics from a batch without learning from it."""
@@ -59,19 +61,22 @@ class Learner(Protocol):
         Returns:
             Figures by the names in `metrics`; what is not known yet is left out.
         """
+        ...
 
     def policy_state(self) -> dict[str, Any]:
         """Weights and statistics that acting needs."""
+        ...
 
     def learning_state(self) -> dict[str, Any]:
         """What learning needs beyond the policy: tensors, numbers, strings."""
+        ...
 
     def load(self, policy: dict[str, Any], learning: dict[str, Any]) -> None:
         """Restore what policy_state and learning_state gave."""
 
 
 @dataclass(frozen=True)
-class Algorithm:
+class Algorithm(Generic[Config]):
     """Settings and learner of one algorithm.
 
     Attributes:
@@ -79,11 +84,11 @@ class Algorithm:
         learner: Class of its learner.
     """
 
-    config: type[TrainingConfig]
-    learner: type[Learner]
+    config: type[Config]
+    learner: type[Learner[Config]]
 
 
-LEARNERS: dict[str, Algorithm] = {
+LEARNERS: dict[str, Algorithm[Any]] = {
     "ppo": Algorithm(PPOConfig, PPO),
     "sac": Algorithm(SACConfig, SAC),
 }

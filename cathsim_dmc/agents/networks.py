@@ -76,7 +76,8 @@ class NetworkShapes:
                     f"shapes.pixels is {pixels!r}; it must be null or [channels, "
                     "height, width]."
                 )
-            pixels = tuple(size(value, "pixels", 1) for value in pixels)
+            channels, height, width = (size(one, "pixels", 1) for one in pixels)
+            pixels = (channels, height, width)
         return cls(
             vector=size(values.get("vector"), "vector", 0),
             pixels=pixels,
@@ -129,12 +130,11 @@ class Body(nn.Module):
 
     def __init__(self, shapes: NetworkShapes, config: TrainingConfig, actions: int = 0):
         super().__init__()
-        self.convolutions = None
+        self.convolutions: Convolutions | None = None
         size = shapes.vector + actions
         if shapes.pixels is not None:
             self.convolutions = Convolutions(shapes.pixels, config.cnn_features)
             size += config.cnn_features
-        self.has_pixels = shapes.pixels is not None
         self.has_vector = shapes.vector > 0
         layers: list[nn.Module] = []
         if shapes.vector or actions:
@@ -147,7 +147,7 @@ class Body(nn.Module):
     def forward(self, *inputs: torch.Tensor) -> torch.Tensor:
         """Inputs in the order of `shapes.keys`, then the action if there is one."""
         parts = list(inputs)
-        if self.has_pixels:
+        if self.convolutions is not None:
             index = int(self.has_vector)
             parts[index] = self.convolutions(parts[index])
         return self.hidden(parts[0] if len(parts) == 1 else torch.cat(parts, -1))
@@ -169,17 +169,19 @@ class GaussianActor(nn.Module):
         super().__init__()
         self.body = Body(shapes, config)
         self.mean = nn.Linear(self.body.features, shapes.actions)
-        self.state_dependent_std = state_dependent_std
-        if state_dependent_std:
-            self.log_std = nn.Linear(self.body.features, shapes.actions)
-        else:
-            self.log_std = nn.Parameter(torch.zeros(shapes.actions))
+        # A layer, or a parameter.
+        self.log_std: nn.Linear | nn.Parameter = (
+            nn.Linear(self.body.features, shapes.actions)
+            if state_dependent_std
+            else nn.Parameter(torch.zeros(shapes.actions))
+        )
 
     def forward(self, *inputs: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Return (mean, deviation)."""
         features = self.body(*inputs)
         mean = self.mean(features)
-        raw = self.log_std(features) if self.state_dependent_std else self.log_std
+        layer = self.log_std
+        raw = layer(features) if isinstance(layer, nn.Linear) else layer
         return mean, raw.clamp(*LOG_STD_RANGE).exp().expand_as(mean)
 
 
@@ -201,7 +203,8 @@ def orthogonal_(module: nn.Module, head: nn.Linear, gain: float) -> None:
     for layer in module.modules():
         if isinstance(layer, nn.Linear | nn.Conv2d):
             nn.init.orthogonal_(layer.weight, gain if layer is head else 2**0.5)
-            nn.init.zeros_(layer.bias)
+            if layer.bias is not None:
+                nn.init.zeros_(layer.bias)
 
 
 def make_actor(shapes: NetworkShapes, network: GaussianActor) -> ProbabilisticActor:

@@ -24,6 +24,12 @@ class ObservationNormaliser(nn.Module):
         clip: largest magnitude of a normalised entry.
     """
 
+    count: torch.Tensor
+    mean: torch.Tensor
+    squares: torch.Tensor
+    shift: torch.Tensor
+    scale: torch.Tensor
+
     def __init__(self, size: int, clip: float):
         super().__init__()
         self.clip = clip

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import torch
@@ -121,7 +121,8 @@ def view_of(env: EnvBase) -> View:
         return BatchedView(base.simulation)
     if isinstance(base, SerialEnv):
         return ComposerView([environments.composer_of(one) for one in base._envs])
-    return _ForeignView(env)
+    # Whatever a policy asks of it beyond its numbers is an error that says so.
+    return cast(View, _ForeignView(env))
 
 
 def _tensors(observation: Mapping[str, np.ndarray]) -> TensorDict:

@@ -1,5 +1,7 @@
 """Proximal policy optimisation on TorchRL's ClipPPOLoss and GAE."""
 
+import functools
+import operator
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -127,7 +129,7 @@ class PPO:
             first (none).
     """
 
-    metrics = (
+    metrics: ClassVar[tuple[str, ...]] = (
         "loss_objective",
         "loss_critic",
         "entropy",
@@ -253,7 +255,7 @@ class PPO:
 
     def _step(self, minibatch: TensorDictBase) -> dict[str, torch.Tensor]:
         losses = self.loss(minibatch)
-        loss = sum(losses[name] for name in _TERMS)
+        loss = functools.reduce(operator.add, (losses[name] for name in _TERMS))
         self.optimiser.zero_grad()
         loss.backward()
         norm = nn.utils.clip_grad_norm_(self.parameters, self.config.max_grad_norm)

@@ -67,7 +67,7 @@ class ReplayMemory:
         self.max_bytes = max_bytes
         self.cursor = 0
         self.size = 0
-        self._storage: TensorDictBase | None = None
+        self._storage: TensorDictBase = TensorDict({}, [0])
         self._entries: Entries = {}
 
     def __len__(self) -> int:
@@ -76,7 +76,7 @@ class ReplayMemory:
 
     def extend(self, transitions: TensorDictBase) -> None:
         """Append transitions (n,), over the oldest ones when the ring is full."""
-        if self._storage is None:
+        if not self._entries:
             self._allocate(transitions)
         count = len(transitions)
         if count > self.capacity:

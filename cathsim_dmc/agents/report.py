@@ -40,6 +40,7 @@ class Report:
         values = {"policy": self.policy.to_dict(), "seconds": round(self.seconds, 1)}
         if self.baseline is not None:
             values["baseline"] = self.baseline.to_dict()
+        if self.comparison is not None:
             values["comparison"] = self.comparison.to_dict()
         return values
 
@@ -111,11 +112,10 @@ class ContactLog:
 
     def __call__(self, env: EnvBase, running: np.ndarray) -> None:
         """Adds the contacts at the end of a control step; an evaluation observer."""
-        simulation = env.base_env.simulation
-        rows = simulation.sensor_rows[running, -1]
-        contacts = simulation.task.rollout.index.contacts(rows)
-        self._positions.append(contacts.position[contacts.present])
-        self._magnitudes.append(contacts.magnitude[contacts.present])
+        contacts = env.base_env.simulation.contacts()
+        present = contacts.present & running[:, None]
+        self._positions.append(contacts.position[present])
+        self._magnitudes.append(contacts.magnitude[present])
 
     @property
     def positions(self) -> np.ndarray:

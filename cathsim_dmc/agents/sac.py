@@ -1,5 +1,7 @@
 """Soft actor-critic on TorchRL's SACLoss and SoftUpdate."""
 
+import functools
+import operator
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -107,7 +109,7 @@ class SAC:
             first.
     """
 
-    metrics = (
+    metrics: ClassVar[tuple[str, ...]] = (
         "loss_actor",
         "loss_qvalue",
         "loss_alpha",
@@ -200,7 +202,7 @@ class SAC:
             self.normaliser(sample["next"])
         losses = self.loss(sample)
         # Each term has gradients for its own parameters only, so one sum serves.
-        loss = sum(losses[name] for name in _TERMS)
+        loss = functools.reduce(operator.add, (losses[name] for name in _TERMS))
         self.optimiser.zero_grad()
         loss.backward()
         self.optimiser.step()

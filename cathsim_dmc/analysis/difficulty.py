@@ -88,7 +88,9 @@ class Trial:
         "largest_force" is the largest "peak_force" of all.
         """
         count = len(self.ends)
-        peaks = [one.peak_max.maximum for one in self.forces]
+        peaks = [one.peak_max.maximum for one in self.forces if one.peak_max]
+        sums = [one.sum.mean for one in self.forces if one.sum]
+        largest = [one.max.maximum for one in self.forces if one.max]
         low, high = success_interval(self.successes, count)
         return {
             "episodes": count,
@@ -97,8 +99,8 @@ class Trial:
             "success_ci95": [low, high],
             "ends": dict(collections.Counter(self.ends)),
             "steps": float(np.mean(self.steps)),
-            "mean_force": float(np.mean([one.sum.mean for one in self.forces])),
-            "max_force": float(np.mean([one.max.maximum for one in self.forces])),
+            "mean_force": float(np.mean(sums)),
+            "max_force": float(np.mean(largest)),
             "peak_force": float(np.mean(peaks)),
             "largest_force": float(np.max(peaks)),
         }
@@ -234,12 +236,9 @@ def difficulty(
         raise ValueError(f"seeds is {seeds}; at least 1")
     checks: list[Check] = []
     found: dict[str, dict[str, Any]] = {}
-    report = None
-    for name in names:
-        trials = _trials(name, players, seeds, first_seed, num_threads, say)
-        found[name] = {policy: trial.summary() for policy, trial in trials.items()}
-        checks += _checks(name, trials)
-        report = Report(
+
+    def report() -> Report:
+        return Report(
             "difficulty of the tasks",
             tuple(checks),
             {
@@ -249,8 +248,13 @@ def difficulty(
                 "tasks": dict(found),
             },
         )
-        keep(report)
-    return report
+
+    for name in names:
+        trials = _trials(name, players, seeds, first_seed, num_threads, say)
+        found[name] = {policy: trial.summary() for policy, trial in trials.items()}
+        checks += _checks(name, trials)
+        keep(report())
+    return report()
 
 
 def _refuse(what: str, given: Sequence[str], known: Sequence[str]) -> None:

@@ -190,10 +190,12 @@ def _figure(
     # around the silhouette without computing it.
     for colour, rim in (("0.45", 2.2), ("0.9", 0.6)):
         axes.add_collection(
-            PolyCollection(triangles, facecolors=colour, edgecolors=colour, lw=rim)
+            PolyCollection(
+                list(triangles), facecolors=colour, edgecolors=colour, lw=rim
+            )
         )
     if force_limit is None:
-        force_limit = np.nanmax(field.mean) if field.count.any() else 0.0
+        force_limit = float(np.nanmax(field.mean)) if field.count.any() else 0.0
     image = axes.pcolormesh(
         x_mm,
         z_mm,

@@ -259,7 +259,7 @@ class Anatomy:
         directory.mkdir(parents=True, exist_ok=True)
         arrays, description = _pack(self)
         buffer = io.BytesIO()
-        np.savez_compressed(buffer, **arrays)
+        np.savez_compressed(buffer, allow_pickle=False, **arrays)
         data = buffer.getvalue()
         digest = hashlib.sha256(data).hexdigest()
         description["geometry"] = f"geometry-{digest[:16]}.npz"

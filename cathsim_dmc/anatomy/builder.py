@@ -54,9 +54,10 @@ class Place:
         line = vessel.centreline
         if self.position is not None:
             return float(line.project(np.asarray(self.position, float)).arc_length)
-        start = 0.0 if self.past_ostium is None else vessel.ostium
-        offset = self.arc_length if self.past_ostium is None else self.past_ostium
-        arc = start + float(offset)
+        if self.past_ostium is not None:
+            arc = vessel.ostium + float(self.past_ostium)
+        else:
+            arc = float(self.arc_length or 0.0)
         if not -1e-9 <= arc <= line.length + 1e-9:
             raise ValueError(
                 f"place {arc * 1e3:.1f} mm along vessel {self.vessel!r} is not on it: "

@@ -109,12 +109,12 @@ def measure(
             if None.
     """
     aorta = tree.root.centreline
-    start = aorta.points[0] if start is None else np.asarray(start, float)
+    origin = aorta.points[0] if start is None else np.asarray(start, float)
     if axis is None:
         axis = _chord(aorta, 0.0, _END_CHORD)
     along, normal = _arch_plane(aorta)
     branches = {
-        name: _branch(vessel, start, axis, along, normal)
+        name: _branch(vessel, origin, axis, along, normal)
         for name, vessel in tree.vessels.items()
         if vessel.parent is not None
     }
@@ -149,7 +149,9 @@ def measure(
         span=_span(aorta),
         height=float(aorta.points[:, 2].max() - aorta.points[0, 2]),
         plane=math.atan2(along[0], along[1]),
-        ascending_tilt=_angle(_chord(aorta, 0.0, _END_CHORD), [0, 0, 1]),
+        ascending_tilt=_angle(
+            _chord(aorta, 0.0, _END_CHORD), np.array([0.0, 0.0, 1.0])
+        ),
         ascending_turn=turn,
         bend_radius=first / max(turn, 1e-9),
         tightest_bend=_tightest_bend(aorta),

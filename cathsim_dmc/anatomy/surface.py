@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from cathsim_dmc.anatomy.anatomy import Surface
@@ -60,10 +62,11 @@ def depth_grid(tree: VesselTree, spacing: float) -> tuple[Array, Array]:
     return grid, origin
 
 
-def _behind(mesh: list[Array], position: Array, direction: Array) -> Array:
+def _behind(mesh: Sequence[Array], position: Array, direction: Array) -> Array:
     """Distance (m) of grid points behind the plane through `position`."""
     level = float(direction @ position)
-    return level - sum(m * d for m, d in zip(mesh, direction, strict=True))
+    x, y, z = mesh
+    return level - (x * direction[0] + y * direction[1] + z * direction[2])
 
 
 def fitting_spacing(tree: VesselTree) -> float:

@@ -311,6 +311,7 @@ def _goal(
     if way == "position_mm":
         (position,) = _numbers([entry[way]], f"{where}: {way}", 3)
         return Place(vessel, position=position * flip * _MM)
-    return Place(
-        vessel, **{way.removesuffix("_mm"): _length(entry[way], f"{where}: {way}")}
-    )
+    length = _length(entry[way], f"{where}: {way}")
+    if way == "past_ostium_mm":
+        return Place(vessel, past_ostium=length)
+    return Place(vessel, arc_length=length)

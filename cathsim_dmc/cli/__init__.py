@@ -19,7 +19,7 @@ _DESCRIPTION = (
 
 app = SubcommandApp()
 # First of the list of commands; what it does is put there when its arguments are known.
-app.command(training.command([]), name="train")
+app.command(name="train")(training.command([]))
 
 
 @app.command(name="list")
@@ -82,7 +82,7 @@ def _run(arguments: list[str]) -> int:
     if arguments == ["--version"]:
         print(f"cathsim-dmc {__version__}")
         return 0
-    app.command(training.command(arguments), name="train")
+    app.command(name="train")(training.command(arguments))
     return app.cli(
         prog="cathsim",
         description=_DESCRIPTION,

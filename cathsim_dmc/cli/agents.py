@@ -19,7 +19,7 @@ from cathsim_dmc.cli.options import (
 
 def add_to(app: SubcommandApp) -> None:
     """Adds the commands."""
-    app.command(evaluate, name="eval")
+    app.command(name="eval")(evaluate)
     for command in (record, replay, play, demo):
         app.command(command)
 
@@ -110,7 +110,7 @@ def record(
     )
     print(f"{episode.steps} steps, {episode.termination}: {out}")
     forces = recorded_forces(episode)
-    if episode.steps:
+    if forces.sum is not None and forces.max is not None:
         print(
             f"mean force {millinewtons(forces.sum.mean)} mN (sum over contacts), max "
             f"force {millinewtons(forces.max.maximum)} mN (largest single contact)"

@@ -44,7 +44,7 @@ def import_phantom(
             does not stand upright: three of L, R, A, P, S, I, such as ILA.
         inlet: Where the device enters: a free end, or a place to cut the lumen at.
         rename: Names of computed branches, each as computed=wanted.
-        wall: Pieces near the surface, or CoACD's coarse ones (needs the extra coacd).
+        wall: Pieces near the surface, or CoACD's coarse ones.
         threshold_mm: CoACD's concavity of a piece; 3.5 by default.
         cache: Whether to use what was imported from the same files before.
     """
@@ -162,6 +162,7 @@ def generate(
         )
     elif kind in arch.SETS:
         _check_given(kind, given, "index")
+        index = int(index or 0)
         arches = arch.arch_set(kind)
         if not 0 <= index < len(arches):
             raise ValueError(

@@ -47,8 +47,11 @@ def command(arguments: Sequence[str]) -> Callable[..., int]:
     base, resumed = _base(arguments[1:])
     kind = _options(base, resumed)
 
-    def train(options: Annotated[kind, conf.arg(name="")]) -> int:
+    def train(options: Any) -> int:
         return _run(options, base)
+
+    # The class of the options is made here, so no annotation can name it.
+    train.__annotations__["options"] = Annotated[kind, conf.arg(name="")]
 
     train.__doc__ = f"{_SUMMARY}\n\n{_DETAILS}"
     return train

@@ -172,12 +172,13 @@ def follower_posture(
         insertion if guidewire_insertion is None else guidewire_insertion,
         rotation if guidewire_rotation is None else guidewire_rotation,
     )
-    if all(isinstance(each, float) for each in given):
-        posture = np.array(_posture(*given))
-        finite = math.isfinite(sum(given))
+    plain = [each for each in given if isinstance(each, float)]
+    if len(plain) == len(given):
+        posture = np.array(_posture(*plain))
+        finite = math.isfinite(sum(plain))
     else:
-        given = np.broadcast_arrays(*(np.asarray(each, np.float64) for each in given))
-        posture = np.stack(_posture(*given), axis=-1)
+        arrays = np.broadcast_arrays(*(np.asarray(each, np.float64) for each in given))
+        posture = np.stack(_posture(*arrays), axis=-1)
         finite = np.isfinite(posture).all()
     if not finite:
         raise ValueError(

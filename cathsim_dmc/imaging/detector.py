@@ -122,22 +122,22 @@ def blurred(signal: ArrayLike, sigma: float) -> np.ndarray:
     Returns:
         (..., rows, columns) float32.
     """
-    signal = np.asarray(signal, dtype=np.float32)
+    out = np.asarray(signal, dtype=np.float32)
     if sigma < LEAST_BLUR:
-        return signal
+        return out
     reach = math.ceil(3.0 * sigma)
     weight = np.exp(-0.5 * (np.arange(-reach, reach + 1) / sigma) ** 2)
     weight = (weight / weight.sum()).astype(np.float32)
     for axis in (-2, -1):
-        count = signal.shape[axis]
-        edges = [(0, 0)] * signal.ndim
+        count = out.shape[axis]
+        edges = [(0, 0)] * out.ndim
         edges[axis] = (reach, reach)
-        padded = np.moveaxis(np.pad(signal, edges, mode="edge"), axis, -1)
+        padded = np.moveaxis(np.pad(out, edges, mode="edge"), axis, -1)
         total = weight[0] * padded[..., :count]
         for k in range(1, 2 * reach + 1):
             total += weight[k] * padded[..., k : k + count]
-        signal = np.moveaxis(total, -1, axis)
-    return signal
+        out = np.moveaxis(total, -1, axis)
+    return out
 
 
 def grey(signal: ArrayLike, gain: float = GAIN) -> np.ndarray:

@@ -194,21 +194,19 @@ class Fluoroscope:
         )
         batch, shape = depth.shape[:-2], self.carm.resolution
         depth = depth.reshape(-1, *shape)
-        single = isinstance(random_state, np.random.RandomState)
-        if random_state is not None and not single:
-            random_state = list(random_state)
-            if len(random_state) != len(depth):
+        states = random_state
+        if states is not None and not isinstance(states, np.random.RandomState):
+            states = list(states)
+            if len(states) != len(depth):
                 raise ValueError(
-                    f"{len(random_state)} random states for {len(depth)} frames; give "
+                    f"{len(states)} random states for {len(depth)} frames; give "
                     "one, or one per frame."
                 )
         image = np.empty(depth.shape, dtype=np.uint8)
         for start in range(0, len(depth), _CHUNK):
             part = slice(start, start + _CHUNK)
-            states = (
-                random_state if random_state is None or single else (random_state[part])
-            )
-            image[part] = self._developed(depth[part], states)
+            of_part = states[part] if isinstance(states, list) else states
+            image[part] = self._developed(depth[part], of_part)
         return image.reshape(*batch, *shape, 1)
 
     def _developed(self, depth: np.ndarray, states) -> np.ndarray:
@@ -234,11 +232,11 @@ class Fluoroscope:
             points, radius: as in `render`.
         """
         thickness = device_thickness(self.carm, points, radius)
-        radius = np.asarray(radius, dtype=np.float64)
-        if radius.ndim == np.ndim(points) - 1:
+        radii = np.asarray(radius, dtype=np.float64)
+        if radii.ndim == np.ndim(points) - 1:
             # A chain of unlike links is seen where its thinnest link would be.
-            radius = radius.min(axis=-1)
-        least = MASK_SHARE * 2.0 * radius[..., None, None]
+            radii = np.asarray(radii.min(axis=-1))
+        least = MASK_SHARE * 2.0 * radii[..., None, None]
         return Masks(device=thickness >= least, vessel=self.vessel_mask)
 
 

@@ -72,7 +72,10 @@ class FluoroscopyOptions:
     def resolution(self) -> tuple[int, int]:
         """(rows, columns)."""
         size = self.size
-        return (size, size) if isinstance(size, int) else tuple(size)
+        if isinstance(size, int):
+            return size, size
+        rows, columns = size
+        return rows, columns
 
     @property
     def planes(self) -> int:
@@ -93,8 +96,13 @@ class FluoroscopyOptions:
         Raises:
             ValueError: if a view or a distance is not possible.
         """
+        centre = (0.0, 0.0, 0.0)
+        if self.centre is not None:
+            x, y, z = self.centre
+            centre = (x, y, z)
         arms = []
-        for view in (self.view, self.biplane)[: self.planes]:
+        views = [view for view in (self.view, self.biplane) if view is not None]
+        for view in views:
             primary, secondary = np.add(_angles(view), deviation)
             arm = carms.CArm(
                 primary=np.deg2rad(primary),
@@ -104,7 +112,7 @@ class FluoroscopyOptions:
                 source_isocentre=self.source_isocentre,
                 detector_size=self.detector_size,
                 resolution=self.resolution,
-                isocentre=(0.0, 0.0, 0.0) if self.centre is None else self.centre,
+                isocentre=centre,
             )
             arms.append(arm if self.centre is not None else arm.centred_on(points))
         return tuple(arms)

@@ -1,10 +1,15 @@
 """Cannulation by hand: keys, a window, a record of what was done."""
 
 import importlib
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from cathsim_dmc.play.controls import Controls
+    from cathsim_dmc.play.session import Session, play
 
 _LAZY = {"play": "session", "Session": "session", "Controls": "controls"}
 
-__all__ = list(_LAZY)
+__all__ = ["Controls", "Session", "play"]
 
 
 def __getattr__(name: str):

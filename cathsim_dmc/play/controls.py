@@ -74,7 +74,9 @@ class Controls:
           (A,) float64 that float32 holds exactly, so that a demonstration can be
           repeated through interfaces of single precision.
         """
-        axes = dict.fromkeys(("translation", "bend_x", "bend_y", "rotation"), 0.0)
+        axes: dict[str, float] = dict.fromkeys(
+            ("translation", "bend_x", "bend_y", "rotation"), 0.0
+        )
         for command in self._held:
             axis, sign = _HELD[command]
             axes[axis] += sign

@@ -96,8 +96,7 @@ class Session:
 
     def _hand(self, timestep: Any) -> np.ndarray:
         """The operator, or the policy watched; stops the episode when asked to."""
-        if hasattr(self._face, "open"):
-            self._face.open(self._environment.physics)
+        self._face.open(self._environment.physics)
         self._face.show(self._environment.task)
         self._next += CONTROL_TIMESTEP / self._speed
         while (left := self._next - time.monotonic()) > 0:

@@ -118,6 +118,9 @@ class FluoroscopyWindow:
                 self._controls.release(command)
                 del self._released[command]
 
+    def open(self, physics: Any) -> None:
+        """Needs nothing of the simulation: the window is open since it was made."""
+
     def show(self, task: Any, message: str = "") -> None:
         """Draws the state of a task."""
         planes = angiograph.render(

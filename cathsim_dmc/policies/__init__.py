@@ -1,12 +1,14 @@
 """Policies that are not learnt, and what every policy is: numpy, no torch."""
 
+from collections.abc import Callable
+
 from cathsim_dmc.policies.expert import ExpertPolicy
 from cathsim_dmc.policies.policy import Policy, in_environment
 from cathsim_dmc.policies.scripted import Curl, Idle, Push, Random, RandomCurl
 from cathsim_dmc.policies.view import BatchedView, ComposerView, View
 
 # Policies by name: a new one is a class and a line here.
-POLICIES: dict[str, type[Policy]] = {
+POLICIES: dict[str, Callable[[int], Policy]] = {
     "random": Random,
     "push": Push,
     "expert": ExpertPolicy,

@@ -15,6 +15,8 @@ from cathsim_dmc.policies.policy import Policy
 from cathsim_dmc.policies.pursuit import Plan, Settings, State, decide
 from cathsim_dmc.policies.view import View
 from cathsim_dmc.tasks import forces, navigation
+from cathsim_dmc.tasks.cases import Case
+from cathsim_dmc.tasks.objective_pool import part
 from cathsim_dmc.tasks.readings import Readings
 
 
@@ -82,6 +84,41 @@ class Expert:
         return action
 
 
+class Experts:
+    """An expert for each simulation, where their anatomies differ."""
+
+    def __init__(self, view: View, settings: Settings | None = None):
+        """Starts without knowing any simulation: `reset` comes first."""
+        self._view = view
+        self._settings = settings
+        self._plans: dict[Case, Plan] = {}
+        # By simulation, from its first reset on.
+        self._experts: dict[int, Expert] = {}
+
+    def reset(self, which: np.ndarray | None = None) -> None:
+        """Looks at the anatomies of the simulations that begin a new episode.
+
+        Args:
+            which: Mask or indices of the simulations, None for all.
+        """
+        numbers = np.arange(self._view.num_simulations)
+        chosen = numbers if which is None else numbers[which]
+        for index in chosen.tolist():
+            case = self._view.case(index)
+            if case not in self._plans:
+                self._plans[case] = Plan.for_task(case)
+            self._experts[index] = Expert(self._plans[case], self._settings)
+
+    def act(self, readings: Readings, wall_force: forces.WallForce) -> np.ndarray:
+        """Action (N, A) in [-1, 1] for the state of the devices."""
+        rows = [np.array([index]) for index in range(self._view.num_simulations)]
+        actions = [
+            self._experts[index].act(part(readings, row), part(wall_force, row))
+            for index, row in enumerate(rows)
+        ]
+        return np.concatenate(actions)
+
+
 class ExpertPolicy(Policy):
     """The expert as a policy; it looks at the simulations, not at the observation."""
 
@@ -97,7 +134,7 @@ class ExpertPolicy(Policy):
             settings: Settings of its driving.
         """
         self._settings = settings
-        self._expert: Expert | None = None
+        self._expert: Expert | Experts | None = None
         self._view: View | None = None
 
     def reset(self, view: View, which: np.ndarray) -> None:
@@ -108,9 +145,16 @@ class ExpertPolicy(Policy):
         """
         if self._expert is None or self._view is not view:
             self._view = view
-            self._expert = Expert.for_task(view.task, self._settings)
+            several = view.task.num_anatomies > 1
+            self._expert = (
+                Experts(view, self._settings)
+                if several
+                else Expert.for_task(view.task, self._settings)
+            )
         self._expert.reset(which)
 
     def act(self, observation: Any) -> np.ndarray:
         """Actions (N, A) for the state of the devices."""
+        if self._expert is None or self._view is None:
+            raise RuntimeError("the expert must be reset before it acts")
         return self._expert.act(self._view.readings, self._view.wall_force)

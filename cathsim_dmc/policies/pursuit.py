@@ -26,6 +26,7 @@ import numpy as np
 
 from cathsim_dmc.entities import devices
 from cathsim_dmc.tasks import forces, navigation
+from cathsim_dmc.tasks.cases import Case
 from cathsim_dmc.tasks.readings import Readings
 
 ROUTE_SPACING = 1e-3  # m, resolution of the route
@@ -114,8 +115,8 @@ class Plan:
     num_actions: int
 
     @classmethod
-    def for_task(cls, task: navigation.Navigation) -> Plan:
-        """Reads off a task.
+    def for_task(cls, task: navigation.Navigation | Case) -> Plan:
+        """Reads off a task, or one of the anatomies that its episodes draw from.
 
         Raises:
             ValueError: if the task's device has no motors in its tip.
@@ -127,7 +128,13 @@ class Plan:
                 f"device {catheter.device.name!r} has no motors in its tip, so the "
                 f"expert cannot steer it; choose one of {', '.join(steerable)}"
             )
-        route = task.objective.route.resampled(ROUTE_SPACING)
+        line = getattr(task.objective, "route", None)
+        if line is None:
+            raise ValueError(
+                f"the objective {type(task.objective).__name__} has no route, a "
+                "centreline from the inlet to the goal, for the expert to follow"
+            )
+        route = line.resampled(ROUTE_SPACING)
         hinges, numbers = [], {}
         for column, joint in enumerate(catheter.joints):
             if joint.type == "slide":

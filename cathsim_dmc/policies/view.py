@@ -7,17 +7,18 @@ policy that looks at positions and forces needs no second version of itself.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple, Protocol, TypeVar
+from typing import Protocol, TypeVar
 
 import numpy as np
 from dm_control import composer
 
 from cathsim_dmc.simulation.batch import BatchSimulation
 from cathsim_dmc.tasks import forces
+from cathsim_dmc.tasks.cases import Case
 from cathsim_dmc.tasks.navigation import Navigation
 from cathsim_dmc.tasks.readings import Readings
 
-Stacked = TypeVar("Stacked", bound=NamedTuple)
+Stacked = TypeVar("Stacked", Readings, forces.WallForce)
 
 
 class View(Protocol):
@@ -37,14 +38,21 @@ class View(Protocol):
     @property
     def task(self) -> Navigation:
         """The task that all simulations run."""
+        ...
+
+    def case(self, index: int) -> Case:
+        """Scene and objective of the episode of one simulation."""
+        ...
 
     @property
     def readings(self) -> Readings:
         """State of the devices; every array has the leading axis N."""
+        ...
 
     @property
     def wall_force(self) -> forces.WallForce:
         """Force on the wall over the last control step; arrays (N,), N."""
+        ...
 
 
 class BatchedView:
@@ -59,6 +67,10 @@ class BatchedView:
     def task(self) -> Navigation:
         """The task that all simulations run."""
         return self._simulation.task
+
+    def case(self, index: int) -> Case:
+        """Scene and objective of the episode of one simulation."""
+        return self._simulation.rollout.case(index)
 
     @property
     def readings(self) -> Readings:
@@ -83,6 +95,10 @@ class ComposerView:
     def task(self) -> Navigation:
         """The task of the first; the others' differ in their randomness only."""
         return self._environments[0].task
+
+    def case(self, index: int) -> Case:
+        """Scene and objective of the episode of one simulation."""
+        return self._environments[index].task.rollout.case()
 
     @property
     def readings(self) -> Readings:

@@ -5,8 +5,15 @@ episodes needs numpy alone.
 """
 
 import importlib
+from typing import TYPE_CHECKING
 
 from cathsim_dmc.recording.episode import Episode
+
+if TYPE_CHECKING:
+    from cathsim_dmc.recording.recorder import EpisodeRecorder
+    from cathsim_dmc.recording.rerun_log import write_rrd
+    from cathsim_dmc.recording.scene import BodyGeom, body_geoms
+    from cathsim_dmc.recording.viewer import ViewerError, open_viewer
 
 _LAZY = {
     "EpisodeRecorder": "recorder",
@@ -17,7 +24,15 @@ _LAZY = {
     "ViewerError": "viewer",
 }
 
-__all__ = ["Episode", *_LAZY]
+__all__ = [
+    "BodyGeom",
+    "Episode",
+    "EpisodeRecorder",
+    "ViewerError",
+    "body_geoms",
+    "open_viewer",
+    "write_rrd",
+]
 
 
 def __getattr__(name: str):

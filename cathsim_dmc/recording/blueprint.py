@@ -26,7 +26,7 @@ def episode_blueprint(
         fluoroscopy: Whether the recording has the ``fluoroscopy`` entity.
         distance: Whether the recording has ``series/distance_mm``.
     """
-    below = [rrb.TextDocumentView(origin="info", name="Episode")]
+    below: list[rrb.View] = [rrb.TextDocumentView(origin="info", name="Episode")]
     if fluoroscopy:
         below.insert(0, rrb.Spatial2DView(origin="fluoroscopy", name="Fluoroscopy"))
     left = rrb.Vertical(

@@ -142,13 +142,13 @@ def _checked_goal(
         raise ValueError(
             f"a goal needs both position and radius, got {position} and {radius}"
         )
-    position = np.asarray(position, dtype=np.float64)
-    if position.shape != (3,) or not radius > 0:
+    place = np.asarray(position, dtype=np.float64)
+    if place.shape != (3,) or not radius > 0:
         raise ValueError(
             "a goal is a position (3,) and a positive radius in metres, got shape "
-            f"{position.shape} and {radius}"
+            f"{place.shape} and {radius}"
         )
-    return position, float(radius)
+    return place, float(radius)
 
 
 def _checked_frames(episode: Episode, frames: np.ndarray | None) -> np.ndarray | None:

@@ -126,7 +126,10 @@ class Episode:
         sizes: dict[str, int] = {}
         for name, (axis, tail) in _AXES.items():
             shape = getattr(self, name).shape
-            wanted = (rows[axis], *(sizes.get(n, n) for n in tail))
+            wanted = (
+                rows[axis],
+                *(sizes.get(n, n) if isinstance(n, str) else n for n in tail),
+            )
             fits = len(shape) == len(wanted) and all(
                 isinstance(want, str) or have == want
                 for have, want in zip(shape, wanted, strict=True)

@@ -4,7 +4,9 @@ Bit-identical to as many composer environments with the same seeds and actions: 
 same compiled model, the same `mj_step`, the same `Rollout`.
 """
 
-from collections.abc import Sequence
+import copy
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 
 import mujoco
 import numpy as np
@@ -13,9 +15,11 @@ from mujoco import batch as mujoco_batch
 
 from cathsim_dmc.tasks import forces, readings
 from cathsim_dmc.tasks.actions import check_action
+from cathsim_dmc.tasks.cases import Case
 from cathsim_dmc.tasks.navigation import Navigation
 from cathsim_dmc.tasks.rollout import Rollout
 from cathsim_dmc.tasks.step import Step
+from cathsim_dmc.tasks.variations import ModelVariation
 
 # What composer calls on a task; the batch steps the rollout instead, so a task that
 # overrides one of these would mean something else here.
@@ -71,14 +75,18 @@ class BatchSimulation:
         self._rows = np.zeros(
             (num_simulations, self._substeps, self._model.nsensordata)
         )
+        self._models = _Fields(self._batch)
+        if task.num_anatomies > 1:
+            writes = bool(ModelVariation.fields_of(task.config.ranges))
+            self._models = _OwnModels(self._batch) if writes else _Models(self._batch)
         self._rollout = task.make_rollout(
-            self._model, self._batch, self._batch.expand, num_simulations
+            self._model, self._batch, self._models, num_simulations
         )
         self.seed(seeds)
 
-    def seed(self, seeds: Sequence[int] | int) -> None:
+    def seed(self, seeds: Sequence[int | Sequence[int]] | int) -> None:
         """Gives each simulation its own source of randomness."""
-        if np.ndim(seeds) == 0:
+        if isinstance(seeds, int | np.integer):
             seeds = [int(seeds) + index for index in range(self.num_simulations)]
         if len(seeds) != self.num_simulations:
             raise ValueError(
@@ -108,11 +116,8 @@ class BatchSimulation:
 
     def _forward_unactuated(self, indices: np.ndarray):
         """What dm_control does at a reset, when there is no control yet."""
-        actuation = mujoco.mjtDisableBit.mjDSBL_ACTUATION.value
-        flags = self._batch.expand("opt.disableflags")
-        flags[indices] |= actuation
-        self._batch.forward(indices)
-        flags[indices] &= ~actuation
+        with self._models.unactuated(indices):
+            self._batch.forward(indices)
 
     def step(self, action: np.ndarray) -> Step:
         """Advances every simulation by one control step.
@@ -158,12 +163,12 @@ class BatchSimulation:
         return self._rollout
 
     @property
-    def readings(self) -> readings.Readings | None:
+    def readings(self) -> readings.Readings:
         """State of the devices after the last step or reset, arrays (N, ...)."""
         return self._rollout.readings
 
     @property
-    def wall_force(self) -> forces.WallForce | None:
+    def wall_force(self) -> forces.WallForce:
         """Force on the wall over the last step, arrays (N,)."""
         return self._rollout.wall_force
 
@@ -180,6 +185,86 @@ class BatchSimulation:
     def contacts(self) -> forces.Contacts:
         """Contacts with the wall in the last physics step, arrays (N, K, ...)."""
         return self._rollout.index.contacts(self._rows[:, -1])
+
+
+_ACTUATION = mujoco.mjtDisableBit.mjDSBL_ACTUATION.value
+
+
+class _Fields:
+    """One model for all simulations, with fields of their own."""
+
+    def __init__(self, batch: mujoco_batch.Batch):
+        self._batch = batch
+
+    def field(self, index: int, name: str) -> np.ndarray:
+        """A field of the model of one simulation, to be written."""
+        return self._batch.expand(name)[index]
+
+    def load(self, index: int, case: Case) -> None:
+        """There is one anatomy."""
+
+    @contextmanager
+    def unactuated(self, indices: np.ndarray) -> Iterator[None]:
+        """Switches the actuators of some simulations off for a while."""
+        flags = self._batch.expand("opt.disableflags")
+        flags[indices] |= _ACTUATION
+        try:
+            yield
+        finally:
+            flags[indices] &= ~_ACTUATION
+
+
+class _Models:
+    """A model for each anatomy, shared by the simulations that have drawn it.
+
+    Simulations whose episodes write to their models need `_OwnModels`.
+    """
+
+    def __init__(self, batch: mujoco_batch.Batch):
+        self._batch = batch
+        self._models = [batch.model] * batch.nsim
+        self._by_case: dict[Case, mujoco.MjModel] = {}
+
+    def field(self, index: int, name: str) -> np.ndarray:
+        """A field of the model of one simulation, to be written."""
+        return getattr(self._models[index], name)
+
+    def load(self, index: int, case: Case) -> None:
+        """Lets one simulation run in an anatomy, from `unactuated` on."""
+        if case not in self._by_case:
+            model = copy.copy(self._batch.model)
+            case.write(model)
+            self._by_case[case] = model
+        self._models[index] = self._by_case[case]
+
+    @contextmanager
+    def unactuated(self, indices: np.ndarray) -> Iterator[None]:
+        """Switches the actuators of some simulations off for a while."""
+        chosen = {id(m): m for m in (self._models[index] for index in indices)}
+        for model in chosen.values():
+            model.opt.disableflags |= _ACTUATION
+        self._batch.set_models(self._models)
+        try:
+            yield
+        finally:
+            for model in chosen.values():
+                model.opt.disableflags &= ~_ACTUATION
+            self._batch.set_models(self._models)
+
+
+class _OwnModels(_Models):
+    """A model for each simulation, into which its anatomy is written."""
+
+    def __init__(self, batch: mujoco_batch.Batch):
+        super().__init__(batch)
+        self._models = [copy.copy(batch.model) for _ in range(batch.nsim)]
+        self._cases: list[Case | None] = [None] * batch.nsim
+
+    def load(self, index: int, case: Case) -> None:
+        """Lets one simulation run in an anatomy, from `unactuated` on."""
+        if case is not self._cases[index]:
+            case.write(self._models[index])
+            self._cases[index] = case
 
 
 def _own(step: Step) -> Step:

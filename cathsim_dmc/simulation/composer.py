@@ -53,5 +53,7 @@ def _dtype(value: bool | float) -> torch.dtype:
 def composer_env(task: str, task_kwargs: Mapping[str, Any], seed: int) -> EnvBase:
     """One seeded composer environment of a task, batch size []."""
     env = DMControlEnv(suite.DOMAIN, task, **task_kwargs)
-    env.set_seed(seed)
-    return TransformedEnv(env, TaskInformation(env._env))
+    transformed = TransformedEnv(env, TaskInformation(env._env))
+    # Not `set_seed`, which resets: the first episode is that of the seed.
+    env._env.random_state.seed(seed)
+    return transformed

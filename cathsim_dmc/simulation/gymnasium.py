@@ -6,8 +6,10 @@ from typing import Any
 import gymnasium
 import numpy as np
 from dm_env import specs
+from gymnasium.envs.registration import EnvSpec
 
 from cathsim_dmc import suite
+from cathsim_dmc.anatomy.anatomy import Surface
 from cathsim_dmc.imaging import angiograph
 from cathsim_dmc.simulation import batch
 from cathsim_dmc.tasks.config import CONTROL_TIMESTEP
@@ -117,7 +119,7 @@ class CathSimEnv(gymnasium.Env):
         self.observation_space, self.action_space = _spaces(
             self._environment, self._dtype
         )
-        self._renderer = None
+        self._machines: dict[Surface, angiograph.Angiograph] = {}
         self._begun, self._ended = False, True
         self._closed = False
 
@@ -160,13 +162,13 @@ class CathSimEnv(gymnasium.Env):
         return fluoroscopy_frame(self._environment.task, self._machine())
 
     def _machine(self) -> angiograph.Angiograph:
-        if self._renderer is None:
-            task = self._environment.task
-            surface = task.scene.anatomy.surface
-            self._renderer = angiograph.Angiograph(
+        task = self._environment.task
+        surface = task.scene.anatomy.surface
+        if surface not in self._machines:
+            self._machines[surface] = angiograph.Angiograph(
                 surface.vertices, surface.faces, task.config.fluoroscopy
             )
-        return self._renderer
+        return self._machines[surface]
 
     @property
     def environment(self):
@@ -198,7 +200,7 @@ def make(task: str, **options: Any) -> gymnasium.Env:
       task: of `suite.SUITE`.
       **options: of `CathSimEnv`; JSON can hold them if the spec shall be written.
     """
-    spec = gymnasium.envs.registration.EnvSpec(
+    spec = EnvSpec(
         id=f"{suite.DOMAIN}/{task}-v{VERSION}",
         entry_point=f"{__name__}:{CathSimEnv.__name__}",
         kwargs={"task": task, **options},
@@ -245,29 +247,41 @@ class CathSimVectorEnv(gymnasium.vector.VectorEnv):
             )
         self.render_mode = None
         self._dtype = _float_type(dtype)
-        environment = suite.load(suite.DOMAIN, task, task_kwargs)
         self.num_envs = num_envs
-        self.single_observation_space, self.single_action_space = _spaces(
-            environment, self._dtype
-        )
-        environment.close()
-        many = gymnasium.vector.utils.batch_space
-        self.observation_space = many(self.single_observation_space, num_envs)
-        self.action_space = many(self.single_action_space, num_envs)
         self._simulation = batch.BatchSimulation(
             suite.make_task(task, **task_kwargs),
             num_envs,
             num_threads=num_threads,
             seeds=np.random.SeedSequence().generate_state(num_envs).tolist(),
         )
+        self._make_spaces(self._simulation.reset().observation)
+
+    def _make_spaces(self, observation: Mapping[str, np.ndarray]) -> None:
+        def box(array: np.ndarray) -> gymnasium.spaces.Box:
+            pixels = array.dtype == np.uint8
+            dtype = np.dtype(np.uint8) if pixels else self._dtype
+            spec = specs.Array(array.shape[1:], dtype)
+            return space(spec, dtype)
+
+        action = specs.BoundedArray(
+            (self._simulation.num_actions,), self._dtype, -1.0, 1.0
+        )
+        self.single_observation_space = gymnasium.spaces.Dict(
+            {key: box(value) for key, value in observation.items()}
+        )
+        self.single_action_space = space(action, self._dtype)
+        many = gymnasium.vector.utils.batch_space
+        self.observation_space = many(self.single_observation_space, self.num_envs)
+        self.action_space = many(self.single_action_space, self.num_envs)
 
     def reset(self, *, seed: int | list[int] | None = None, options=None):
         """Starts all episodes; a seed is that of the first, the others count up."""
-        super().reset(seed=seed if np.ndim(seed) == 0 else seed[0])
-        if seed is not None:
-            if np.ndim(seed) == 0:
-                seed = [seed + i for i in range(self.num_envs)]
-            self._simulation.seed([_words(each) for each in seed])
+        seeds = seed
+        if isinstance(seeds, int | np.integer):
+            seeds = [int(seeds) + i for i in range(self.num_envs)]
+        super().reset(seed=None if seeds is None else seeds[0])
+        if seeds is not None:
+            self._simulation.seed([_words(each) for each in seeds])
         step = self._simulation.reset()
         return _converted(step.observation, self._dtype), step.info()
 

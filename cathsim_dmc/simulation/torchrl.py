@@ -51,6 +51,8 @@ class BatchedEnv(EnvBase):
         )
         super().__init__(device="cpu", batch_size=[num_envs])
         self._make_specs(self._simulation.reset())
+        # The look at the shapes has drawn: the first episode is that of the seed.
+        self._simulation.seed(seed)
 
     def _make_specs(self, step: Step) -> None:
         shape = self.batch_size

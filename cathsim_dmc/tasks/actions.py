@@ -15,7 +15,7 @@ def check_action(action: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
     """
     action = np.asarray(action, dtype=np.float64)
     if action.shape != shape:
-        many = f"for {shape[0]} simulations, " if len(shape) > 1 else ""
+        many = f"for {shape[0]} simulations, " if shape[1:] else ""
         raise ValueError(
             f"the action has shape {action.shape}, but it must have {shape}: {many}"
             f"{shape[-1]} entries in [-1, 1]: tip motors from proximal to distal (x "

@@ -46,13 +46,16 @@ class CameraOptions:
                 f"camera names are {self.names!r}; give different ones of "
                 f"{', '.join(CAMERAS)}"
             )
-        if len(self.resolution) != 2 or min(self.resolution) < 1:
+        if np.shape(self.size) not in ((), (2,)) or min(self.resolution) < 1:
             raise ValueError(f"camera size is {self.size!r}; give (rows, columns) >= 1")
 
     @property
     def resolution(self) -> tuple[int, int]:
         """(rows, columns)."""
-        return (self.size,) * 2 if isinstance(self.size, int) else tuple(self.size)
+        if isinstance(self.size, int):
+            return self.size, self.size
+        rows, columns = self.size
+        return rows, columns
 
 
 def add_tip_camera(arena, catheter) -> None:
@@ -108,7 +111,9 @@ class Cameras:
         # MuJoCo frees the textures and buffers of whatever context is current, which
         # may be that of other cameras.
         renderer = getattr(self, "_renderer", None)
-        context = renderer and renderer._gl_context  # noqa: SLF001
+        if renderer is None:
+            return
+        context = renderer._gl_context  # noqa: SLF001
         if context is not None:
             context.make_current()
             renderer.close()

@@ -3,7 +3,7 @@
 import dataclasses
 import numbers
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
@@ -71,6 +71,23 @@ class NavigationConfig:
             self, "randomisation", Randomisation.make(self.randomisation)
         )
 
+    # Three fields with the types that they have once the config is made.
+
+    @property
+    def ranges(self) -> Randomisation:
+        """`randomisation`, whatever it was given as."""
+        return cast(Randomisation, self.randomisation)
+
+    @property
+    def fluoroscopy_options(self) -> FluoroscopyOptions:
+        """`fluoroscopy`, whatever it was given as."""
+        return cast(FluoroscopyOptions, self.fluoroscopy)
+
+    @property
+    def camera_options(self) -> CameraOptions:
+        """`cameras`, whatever they were given as."""
+        return cast(CameraOptions, self.cameras)
+
     def _check_numbers(self):
         def require(name: str, good: bool, allowed: str):
             if not good:
@@ -88,9 +105,9 @@ class NavigationConfig:
         )
         for name in ("friction", "shaft_link", "working_length", "physics_timestep"):
             value = getattr(self, name)
-            number = isinstance(value, int | float) and not isinstance(value, bool)
-            optional = value is None and name == "working_length"
-            good = optional or (number and np.isfinite(value))
+            good = value is None and name == "working_length"
+            if isinstance(value, int | float) and not isinstance(value, bool):
+                good = bool(np.isfinite(value))
             require(name, good, "a positive, finite number")
         require("friction", 0 <= self.friction <= 2, "between 0 and 2")
         require(

@@ -128,14 +128,14 @@ class WallForce(NamedTuple):
     peak_max: np.ndarray
 
 
-NO_FORCE = WallForce(*np.zeros(4))
+NO_FORCE = WallForce(*(np.zeros(()) for _ in WallForce._fields))
 
 
 def wall_force(magnitude: np.ndarray) -> WallForce:
     """Summarises the contact magnitudes (..., S, M) of S substeps, in N."""
     if not magnitude.shape[-1]:
         shape = magnitude.shape[:-2]
-        return WallForce(*np.zeros((4, *shape))) if shape else NO_FORCE
+        return WallForce(*(np.zeros(shape) for _ in WallForce._fields))
     # One contact after the other: numpy's pairwise sum along the last axis would depend
     # on the number of empty places, and so on what other simulations touch.
     total = magnitude.cumsum(-1)[..., -1]

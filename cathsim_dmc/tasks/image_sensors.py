@@ -25,25 +25,34 @@ class ImageSensors:
 
         Args:
           names: Names of the observations.
-          angiograph: Angiography machine, needed by fluoroscopic observations.
+          angiograph: Angiography machine, needed by fluoroscopic observations; an
+            episode may have another one of the same set-up.
           device_radius: Outer radius of the device, m.
           num_simulations: N.
           gl_cameras: MuJoCo's cameras, needed by `rgb` and `depth`.
         """
         self._names = names
         self._on = angiograph is not None or gl_cameras is not None
-        self._angiograph = angiograph
         self._radius = device_radius
         self._cameras = gl_cameras
-        self._planes = [angiograph and angiograph.planes()] * num_simulations
+        self._planes: list[machines.Planes] = []
+        self._noise = False
+        if angiograph is not None:
+            self._planes = [angiograph.planes()] * num_simulations
+            self._noise = angiograph.options.noise
         self._images: list[np.ndarray] = []
         self._masks = self._pixels = None
         self._views: dict[str, np.ndarray] = {}
 
-    def restart(self, index: int, deviation: machines.Deviation) -> None:
+    def restart(
+        self,
+        index: int,
+        angiograph: machines.Angiograph | None,
+        deviation: machines.Deviation,
+    ) -> None:
         """Begins an episode of one simulation, before a machine that deviates."""
-        if self._angiograph is not None:
-            self._planes[index] = self._angiograph.planes(deviation)
+        if angiograph is not None:
+            self._planes[index] = angiograph.planes(deviation)
 
     def capture(
         self,
@@ -68,11 +77,11 @@ class ImageSensors:
         count = len(qpos)
         chosen = np.arange(count) if fresh is None else fresh
         line = lines[chosen]
-        planes = [self._planes[index] for index in chosen]
+        planes = [self._planes[index] for index in chosen] if self._planes else []
         if self._wants("image", "sequential"):
             states = None
-            if random_states is not None and self._angiograph.options.noise:
-                states = [random_states[index] for index in chosen]
+            if random_states is not None and self._noise:
+                states = [random_states[index] for index in chosen.tolist()]
             image = machines.render(planes, line, self._radius, states)
             self._remember(image, count, fresh)
         if self._wants("segmentation"):
@@ -84,7 +93,7 @@ class ImageSensors:
             pixels = machines.pixels(planes, points)
             self._pixels = _merged(self._pixels, pixels, count, fresh)
         kinds = [kind for kind in cameras.KINDS if kind in self._names]
-        if kinds:
+        if kinds and self._cameras is not None:
             for key, view in self._cameras.see(kinds, qpos[chosen]).items():
                 self._views[key] = _merged(self._views.get(key), view, count, fresh)
         return observations.Images(
@@ -109,7 +118,7 @@ class ImageSensors:
     @property
     def fluoroscope(self) -> Fluoroscope | None:
         """Frontal plane before the first simulation, or None without fluoroscopy."""
-        return self._planes[0] and self._planes[0][0]
+        return self._planes[0][0] if self._planes else None
 
 
 def _merged(old, new, count, fresh):

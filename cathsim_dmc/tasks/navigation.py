@@ -1,5 +1,6 @@
 """Navigation of a catheter through an anatomy, as a composer task."""
 
+from collections.abc import Sequence
 from typing import Any
 
 import dm_env.specs
@@ -7,12 +8,16 @@ import mujoco
 import numpy as np
 from dm_control import composer
 
-from cathsim_dmc.imaging.angiograph import Angiograph
-from cathsim_dmc.tasks import cameras, forces, observations, readings
+from cathsim_dmc.tasks import cameras, cases, forces, observations, readings
 from cathsim_dmc.tasks.actions import check_action
 from cathsim_dmc.tasks.config import CONTROL_TIMESTEP, NavigationConfig
 from cathsim_dmc.tasks.objectives import Objective
-from cathsim_dmc.tasks.rollout import Rollout, SimulationState, SingleState
+from cathsim_dmc.tasks.rollout import (
+    ModelAccess,
+    Rollout,
+    SimulationState,
+    SingleState,
+)
 from cathsim_dmc.tasks.scene import Scene
 from cathsim_dmc.tasks.step import Step
 
@@ -38,6 +43,7 @@ class Navigation(composer.Task):
         objective: Objective,
         config: NavigationConfig | None = None,
         random: np.random.RandomState | int | None = None,
+        others: Sequence[tuple[Scene, Objective]] = (),
     ):
         """Takes over the scene.
 
@@ -46,9 +52,13 @@ class Navigation(composer.Task):
           objective: Success and reward.
           config: Options; those that shape the scene must be the scene's.
           random: Seed or source of randomness of the environment.
+          others: Scenes and objectives beside the first, if each episode is to draw
+            one of them: another anatomy, with the same device and goals of the same
+            names. All are compiled here, which takes a second each.
 
         Raises:
-          ValueError: if the objective cannot do what the randomisation asks for.
+          ValueError: if the objective cannot do what the randomisation asks for, or
+            the scenes differ in more than their anatomies.
         """
         self._scene = scene
         self._objective = objective
@@ -58,23 +68,33 @@ class Navigation(composer.Task):
             if isinstance(random, np.random.RandomState)
             else np.random.RandomState(random)
         )
-        if config.randomisation.goal_shift and not hasattr(objective, "shifted"):
+        if config.ranges.goal_shift and not hasattr(objective, "shifted"):
             raise ValueError(
                 f"randomisation shifts the goal, but {type(objective).__name__} has "
                 "no method shifted(shift): add one, or leave goal_shift out"
             )
         self._num_actions = len(scene.catheter.actuators)
         self._names = observations.resolve(config.observation)
-        self._angiograph = None
+        self._fluoroscopy = None
         if observations.needs_fluoroscopy(self._names):
-            surface = scene.anatomy.surface
-            self._angiograph = Angiograph(
-                surface.vertices, surface.faces, config.fluoroscopy
-            )
+            self._fluoroscopy = config.fluoroscopy_options
         if set(cameras.KINDS) & set(self._names):
+            if others:
+                raise ValueError(
+                    f"the observation {config.observation!r} needs MuJoCo's cameras, "
+                    "which show one anatomy only, and this task draws from "
+                    f"{1 + len(others)}; observe image, sequential or segmentation, or "
+                    "make the task with pool=1"
+                )
             cameras.add_tip_camera(scene.arena, scene.catheter)
         self.set_timesteps(CONTROL_TIMESTEP, config.physics_timestep)
-        self._rollout: Rollout | None = None
+        self._cases: tuple[cases.Case, ...] = ()
+        if others:
+            scenes, objectives = zip((scene, objective), *others, strict=True)
+            for each in scenes:
+                each.arena.mjcf_model.option.timestep = config.physics_timestep
+            self._cases = cases.alike(scenes, objectives, self._fluoroscopy)
+        self._rollout: Rollout  # there once the model is compiled
         self._observables = None
         self._step: Step | None = None
 
@@ -82,20 +102,14 @@ class Navigation(composer.Task):
         self,
         model: mujoco.MjModel,
         state: SimulationState,
-        model_field,
+        access: ModelAccess,
         num_simulations: int = 1,
     ) -> Rollout:
         """The course of the task's episodes; see `Rollout`."""
-        return Rollout(
-            self._scene,
-            self._objective,
-            self._config,
-            model,
-            state,
-            model_field,
-            num_simulations,
-            self._angiograph,
-        )
+        chosen = self._cases or [
+            cases.Case(self._scene, self._objective, model, self._fluoroscopy)
+        ]
+        return Rollout(chosen, self._config, model, state, access, num_simulations)
 
     # Composer's hooks.
 
@@ -109,7 +123,7 @@ class Navigation(composer.Task):
         """One observable per entry of the chosen observations."""
         if self._observables is None:
             options = observations.ImageOptions(
-                self._config.fluoroscopy, self._config.cameras
+                self._config.fluoroscopy_options, self._config.camera_options
             )
             self._observables = {
                 key: observations.FrameObservable(
@@ -138,7 +152,7 @@ class Navigation(composer.Task):
         self._model, self._data = physics.model.ptr, physics.data.ptr
         model = self._model
         self._rollout = self.make_rollout(
-            model, SingleState(self._data), lambda name: getattr(model, name)[None]
+            model, SingleState(self._data), _SingleAccess(model, self._data)
         )
         self._substeps = self.substeps  # which asks the MJCF model, and takes its time
         self._state = np.zeros(mujoco.mj_stateSize(model, _STATE))
@@ -153,7 +167,7 @@ class Navigation(composer.Task):
         self._step = None
         self._rollout.begin(_ONLY, [random_state])
         goal = self._scene.phantom.goals.get(self._scene.goal.name)
-        if goal is not None and self._config.randomisation.goal_shift:  # only looks
+        if goal is not None and self._config.ranges.goal_shift:  # only looks
             physics.bind(goal).pos = self.goal_position
 
     def before_step(self, physics, action, random_state):
@@ -222,12 +236,12 @@ class Navigation(composer.Task):
     def get_reward(self, physics) -> float:
         """Reward of the last control step, 0 if the physics failed in it."""
         del physics
-        return float(self._step.outcome.reward[0])
+        return float(self._current().outcome.reward[0])
 
     def get_discount(self, physics) -> float:
         """0 at success or an error of physics, 1 otherwise; the time limit keeps 1."""
         del physics
-        return 0.0 if self._step.terminated[0] else 1.0
+        return 0.0 if self._current().terminated[0] else 1.0
 
     def should_terminate_episode(self, physics) -> bool:
         """Whether the episode has ended."""
@@ -238,8 +252,18 @@ class Navigation(composer.Task):
 
     @property
     def scene(self) -> Scene:
-        """Entities and where they stand."""
-        return self._scene
+        """Entities and where they stand, in the anatomy of this episode.
+
+        Where episodes draw their anatomy, a batch has another scene in each
+        simulation: see `Rollout.case`. This is the first one then.
+        """
+        rollout = self.rollout
+        return self._scene if rollout is None else rollout.case().scene
+
+    @property
+    def num_anatomies(self) -> int:
+        """How many anatomies an episode draws from."""
+        return len(self._cases) or 1
 
     @property
     def config(self) -> NavigationConfig:
@@ -249,7 +273,7 @@ class Navigation(composer.Task):
     @property
     def objective(self) -> Objective:
         """Success and reward, with the goal of this episode."""
-        return self._objective if self._rollout is None else self._rollout.objective
+        return self._objective if self.rollout is None else self.rollout.objective
 
     @property
     def goal_position(self) -> np.ndarray:
@@ -259,7 +283,7 @@ class Navigation(composer.Task):
     @property
     def rollout(self) -> Rollout | None:
         """The course of the episode, or None before the model is compiled."""
-        return self._rollout
+        return getattr(self, "_rollout", None)
 
     @property
     def readings(self) -> readings.Readings:
@@ -316,6 +340,28 @@ class Navigation(composer.Task):
     @_random.setter
     def _random(self, random_state: np.random.RandomState):
         self._random_state.set_state(random_state.get_state())
+
+
+class _SingleAccess:
+    """Access to the model of a composer environment."""
+
+    def __init__(self, model: mujoco.MjModel, data: mujoco.MjData):
+        self._model, self._data = model, data
+        self._case: cases.Case | None = None
+
+    def field(self, index: int, name: str) -> np.ndarray:
+        """A field of the model, to be written."""
+        del index
+        return getattr(self._model, name)
+
+    def load(self, index: int, case: cases.Case) -> None:
+        """Puts an anatomy into the model; the data begin anew."""
+        del index
+        if case is not self._case:
+            case.write(self._model)
+            self._case = case
+        # Without what a pass in the last anatomy has left.
+        mujoco.mj_resetData(self._model, self._data)
 
 
 def _only(measured):

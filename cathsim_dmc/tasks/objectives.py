@@ -10,6 +10,7 @@ import numpy as np
 from cathsim_dmc.anatomy import Anatomy, Centreline, Goal
 from cathsim_dmc.tasks import forces, readings
 
+_NOTHING = np.zeros(())
 GOAL_RADIUS = 8e-3  # m, δ of the published task
 # Weights of the published reward: minus the distance in metres, or 10 at success.
 PUBLISHED_REWARD: Mapping[str, float] = MappingProxyType(
@@ -206,7 +207,7 @@ class Cannulation:
             if any_success and name in self.UNTIL_SUCCESS:
                 term = np.where(success, 0.0, term)
             terms[name] = term
-        return Outcome(sum(terms.values()), success, MappingProxyType(terms))
+        return Outcome(sum(terms.values(), _NOTHING), success, MappingProxyType(terms))
 
     def success(self, head: np.ndarray) -> np.ndarray:
         """Whether heads (..., 3) are in the branch and within the goal's radius."""

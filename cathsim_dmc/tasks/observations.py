@@ -45,6 +45,12 @@ class Images(NamedTuple):
 NO_IMAGES = Images()
 
 
+def _captured(array: np.ndarray | None) -> np.ndarray:
+    """What the image sensors took, as they do where an observation asks for it."""
+    assert array is not None
+    return array
+
+
 class Frame(NamedTuple):
     """What there is to observe after a control step.
 
@@ -224,7 +230,7 @@ def internal(frame: Frame) -> Observation:
 )
 def image(frame: Frame) -> Observation:
     """One fluoroscopic image, a channel for each plane."""
-    return {"image": frame.images.image}
+    return {"image": _captured(frame.images.image)}
 
 
 @_register(
@@ -241,7 +247,7 @@ def image(frame: Frame) -> Observation:
 )
 def sequential(frame: Frame) -> Observation:
     """Three consecutive images, oldest first."""
-    images = (*reversed(frame.images.past_images), frame.images.image)
+    images = (*reversed(frame.images.past_images), _captured(frame.images.image))
     return {"sequential": np.concatenate(images, axis=-1)}
 
 
@@ -259,7 +265,7 @@ def sequential(frame: Frame) -> Observation:
 )
 def segmentation(frame: Frame) -> Observation:
     """Which pixels show the device, and which the vessel."""
-    return {"segmentation": frame.images.masks}
+    return {"segmentation": _captured(frame.images.masks)}
 
 
 def tracked(line: np.ndarray) -> np.ndarray:
@@ -299,7 +305,7 @@ def tracking(frame: Frame) -> Observation:
 )
 def tracking_2d(frame: Frame) -> Observation:
     """The same points and the goal in pixels, as fluoroscopy shows them."""
-    pixels = frame.images.pixels
+    pixels = _captured(frame.images.pixels)
     return {
         "tracking_pixels": _flat(pixels[..., :-1, :], 3),
         "tracking_goal_pixels": _flat(pixels[..., -1, :], 2),

@@ -6,7 +6,7 @@ import os
 import tempfile
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
@@ -59,17 +59,19 @@ class PhysicsMonitor:
         """Starts with no episode running.
 
         Args:
-          anatomy: Anatomy whose lumen the devices must not leave.
+          anatomy: Anatomy whose lumen the devices must not leave, until an episode
+            begins in another one.
           num_simulations: N.
           task: JSON-able description of the task for the dumps.
         """
-        self._anatomy = anatomy
+        self._anatomies = [anatomy] * num_simulations
         self._task = task
         self._states: list[np.ndarray | None] = [None] * num_simulations
         self._actions: list[list[np.ndarray]] = [[] for _ in range(num_simulations)]
 
-    def restart(self, index: int) -> None:
-        """Forgets the episode of a simulation."""
+    def restart(self, index: int, anatomy: Anatomy) -> None:
+        """Forgets the episode of a simulation; the next one is in an anatomy."""
+        self._anatomies[index] = anatomy
         self._states[index] = None
         self._actions[index] = []
 
@@ -95,7 +97,7 @@ class PhysicsMonitor:
         self,
         diverged: Sequence[bool],
         centreline: np.ndarray,
-        peak_force: Sequence[float],
+        peak_force: Sequence[float] | np.ndarray,
     ) -> list[str | None]:
         """What went wrong in the control step that has just ended; logs and dumps it.
 
@@ -123,17 +125,28 @@ class PhysicsMonitor:
             return reasons
         out = np.zeros(len(reasons), dtype=bool)
         if looked:
-            out[looked] = escaped(self._anatomy, centreline[looked])
-        for index in np.flatnonzero(wrong | out):
+            out[looked] = self._escaped(looked, centreline)
+        for index in np.flatnonzero(wrong | out).tolist():
             reason = ESCAPED if out[index] and not wrong[index] else EXPLODED
             reasons[index] = reason = DIVERGED if diverged[index] else reason
             dump(
                 reason,
-                task=self._task,
-                state=self._states[index],
+                task={"anatomy": self._anatomies[index].name, **self._task},
+                # Kept before the step that went wrong.
+                state=cast(np.ndarray, self._states[index]),
                 actions=np.array(self._actions[index]),
             )
         return reasons
+
+    def _escaped(self, looked: list[int], centreline: np.ndarray) -> np.ndarray:
+        """Whether some simulations have left the lumen, each its own: (len,) bool."""
+        out = np.zeros(len(looked), dtype=bool)
+        own = [self._anatomies[index] for index in looked]
+        for anatomy in dict.fromkeys(own):
+            rows = [row for row, other in enumerate(own) if other is anatomy]
+            chosen = [looked[row] for row in rows]
+            out[rows] = escaped(anatomy, centreline[chosen])
+        return out
 
 
 def dump(

@@ -21,9 +21,12 @@ _SPARE_STROKE = 0.08  # m
 _BASE_LENGTH = 0.02  # m of device that never leaves the sheath
 # One chain for every registered task, so that observations have one shape and a policy
 # of one task can be tried on any other; longer where a goal lies farther away.
-_COMMON_LENGTH = 0.34  # m
+COMMON_LENGTH = 0.34  # m
 _LONGEST_DEVICE = 3.0  # m, the longest wires sold
 _LINE_SPACING = 1e-3  # m
+# The wall is 4 mm thick; nearer to the inlet the sheath touches the inlet's own.
+_CLEAR_OF_LUMEN = 5.5e-3  # m
+_NEAR_INLET = 0.015  # m
 
 
 @dataclasses.dataclass(frozen=True)
@@ -108,7 +111,7 @@ def place_device(
     )
     if working_length is None:
         stroke = max(route.length - start_depth, 0.0) + _SPARE_STROKE
-        working_length = max(start_depth + stroke + _BASE_LENGTH, _COMMON_LENGTH)
+        working_length = max(start_depth + stroke + _BASE_LENGTH, COMMON_LENGTH)
     stroke = working_length - start_depth - _BASE_LENGTH
     least = max(start_depth + _BASE_LENGTH, device.tip_length)
     # Also false for NaN.
@@ -135,6 +138,18 @@ def place_device(
         working_length=working_length,
         line=line,
     )
+
+
+def is_clear(anatomy: Anatomy) -> bool:
+    """Whether the straight sheath before the inlet runs outside all vessels.
+
+    Where an aorta bends back on itself, the line may cross another part of it, and
+    the device would stand in the wall before it begins.
+    """
+    inlet = anatomy.inlet
+    behind = np.arange(_NEAR_INLET, COMMON_LENGTH, _LINE_SPACING)
+    line = inlet.position - behind[:, None] * np.asarray(inlet.direction)
+    return bool((anatomy.depth(line) < -_CLEAR_OF_LUMEN).all())
 
 
 def _way_to_branching(anatomy: Anatomy) -> float:

@@ -7,22 +7,21 @@ one of N; so both draw, command, judge and observe alike, bit for bit.
 """
 
 from collections.abc import Callable, Sequence
-from typing import Protocol
+from typing import Protocol, cast
 
 import mujoco
 import numpy as np
 
 from cathsim_dmc.entities.robot import follower_posture
-from cathsim_dmc.imaging.angiograph import Angiograph
 from cathsim_dmc.imaging.fluoroscopy import Fluoroscope
 from cathsim_dmc.tasks import forces, observations, readings
+from cathsim_dmc.tasks.cases import Case, model_index
 from cathsim_dmc.tasks.config import NavigationConfig
 from cathsim_dmc.tasks.image_sensors import ImageSensors, open_cameras
-from cathsim_dmc.tasks.objectives import Measurement, Objective
+from cathsim_dmc.tasks.objective_pool import together
+from cathsim_dmc.tasks.objectives import Measurement, Objective, ShiftableObjective
 from cathsim_dmc.tasks.path_tracker import PathTracker
 from cathsim_dmc.tasks.physics_errors import PhysicsMonitor
-from cathsim_dmc.tasks.scene import Scene
-from cathsim_dmc.tasks.start import StartPosture
 from cathsim_dmc.tasks.step import Step
 from cathsim_dmc.tasks.variations import ActionDelay, ModelVariation
 
@@ -40,10 +39,27 @@ class SimulationState(Protocol):
 class SingleState:
     """Arrays of one `mujoco.MjData`, not copied, with a leading axis of length 1."""
 
+    qpos: np.ndarray
+
     def __init__(self, data: mujoco.MjData):
         """Takes the views; they stay valid as long as `data` lives."""
         for field in readings.ModelIndex.FIELDS:
             setattr(self, field, getattr(data, field)[None])
+
+
+class ModelAccess(Protocol):
+    """The models that N simulations run on."""
+
+    def field(self, index: int, name: str) -> np.ndarray:
+        """A field of the model that one simulation has for itself, to be written."""
+        ...
+
+    def load(self, index: int, case: Case) -> None:
+        """Puts the anatomy of a case into the model of one simulation.
+
+        Called only where a task has several cases.
+        """
+        ...
 
 
 class Rollout:
@@ -51,67 +67,62 @@ class Rollout:
 
     def __init__(
         self,
-        scene: Scene,
-        objective: Objective,
+        cases: Sequence[Case],
         config: NavigationConfig,
         model: mujoco.MjModel,
         state: SimulationState,
-        model_field: Callable[[str], np.ndarray],
+        access: ModelAccess,
         num_simulations: int = 1,
-        angiograph: Angiograph | None = None,
     ):
         """Prepares what an episode needs; no episode has begun yet.
 
         Args:
-          scene: Entities and where they stand.
-          objective: Success and reward.
+          cases: Anatomies with their objectives; an episode draws one of them, if
+            there are several.
           config: Options of the task.
-          model: The compiled scene.
+          model: The compiled scene of the first case.
           state: Arrays of the simulations.
-          model_field: Gives a field of the model that each simulation has for itself,
-            (N, ...), to be written.
+          access: Access to the models of the simulations.
           num_simulations: N.
-          angiograph: Angiography machine, needed by fluoroscopic observations.
         """
-        self._scene = scene
+        self._cases = tuple(cases)
+        self._case_of = np.zeros(num_simulations, dtype=int)
+        self._objective = cases[0].objective
+        scene = cases[0].scene
         self._config = config
         self._state = state
-        self._nominal_objective = self._objective = objective
+        self._access = access
         self._names = observations.resolve(config.observation)
         catheter = scene.catheter.mjcf_model.model
-        self._index = readings.ModelIndex(model, catheter, scene.robot.mjcf_model.model)
+        self._index = model_index(scene, model)
         num_actions = len(scene.catheter.actuators)
-        randomisation = config.randomisation
+        randomisation = config.ranges
         self._variation = ModelVariation(model, randomisation, catheter)
-        self._fields = {name: model_field(name) for name in self._variation.fields}
         self._delay = ActionDelay(
             num_simulations, num_actions, randomisation.longest_delay
         )
         self._sensors = ImageSensors(
             self._names,
-            angiograph,
+            cases[0].angiograph,
             scene.device.outer_radius,
             num_simulations,
-            open_cameras(self._names, model, config.cameras, catheter),
+            open_cameras(self._names, model, config.camera_options, catheter),
         )
         self._monitor = PhysicsMonitor(
             scene.anatomy,
             num_simulations,
-            {
-                "anatomy": scene.anatomy.name,
-                "goal": scene.goal.name,
-                "config": repr(config),
-            },
+            {"goal": scene.goal.name, "config": repr(config)},
         )
         self._path = PathTracker(num_simulations)
-        self._start = StartPosture(scene, model, self._index)
+        # None before the first episode: specs are made of images without noise.
         self._random_states: list[np.random.RandomState] | None = None
         self._goal_shift = np.zeros(num_simulations)
         self._steps = np.zeros(num_simulations, dtype=int)
         self._action = np.zeros((num_simulations, num_actions))
         self._previous_action = self._action
-        self._readings: readings.Readings | None = None
-        self._wall_force: forces.WallForce | None = None
+        # There from the first measurement on.
+        self._readings: readings.Readings
+        self._wall_force: forces.WallForce
 
     # The course of an episode.
 
@@ -129,26 +140,36 @@ class Rollout:
         """
         self._random_states = list(random_states)
         for index in indices:
-            self._draw(index)
+            self._draw(index, random_states[index])
         self.pose_robot(self._state.qpos)
-        if self._config.randomisation.goal_shift is not None:
-            self._objective = self._nominal_objective.shifted(self._goal_shift)
+        self._objective = together(
+            [case.objective for case in self._cases], self._case_of
+        )
+        if self._config.ranges.goal_shift is not None:
+            # Navigation has made sure that it can be shifted.
+            shiftable = cast(ShiftableObjective, self._objective)
+            self._objective = shiftable.shifted(self._goal_shift)
         self._steps[indices] = 0
         # New arrays: those handed out before stay what they were.
         self._action = self._action.copy()
         self._action[indices] = 0.0
         self._previous_action = self._action
 
-    def _draw(self, index: int) -> None:
+    def _draw(self, index: int, random_state: np.random.RandomState) -> None:
         """Draws the episode of one simulation and puts its device to the start."""
-        episode = self._config.randomisation.draw(self._random_states[index])
-        fields = {name: values[index] for name, values in self._fields.items()}
+        if len(self._cases) > 1:
+            self._case_of[index] = random_state.randint(len(self._cases))
+            self._access.load(index, self.case(index))
+        case = self.case(index)
+        episode = self._config.ranges.draw(random_state)
+        field = self._access.field
+        fields = {name: field(index, name) for name in self._variation.fields}
         self._variation.write(fields, episode)
         self._delay.restart(index, episode.delay)
-        self._monitor.restart(index)
-        self._sensors.restart(index, episode.deviation)
+        self._monitor.restart(index, case.scene.anatomy)
+        self._sensors.restart(index, case.angiograph, episode.deviation)
         self._goal_shift[index] = episode.goal_shift or 0.0
-        self._start.write(self._state.qpos[index], episode.displacement, episode.roll)
+        case.start.write(self._state.qpos[index], episode.displacement, episode.roll)
 
     def pose_robot(self, qpos: np.ndarray) -> np.ndarray:
         """Poses the follower's joints after the device, in place: qpos (N, nq)."""
@@ -280,18 +301,27 @@ class Rollout:
         """Goals, which may differ between simulations, reward and success rule."""
         return self._objective
 
+    def case(self, index: int = 0) -> Case:
+        """Anatomy and objective of the episode of one simulation."""
+        return self._cases[self._case_of[index]]
+
+    @property
+    def case_of(self) -> np.ndarray:
+        """(N,) int, number of the case that each simulation has drawn."""
+        return self._case_of.copy()
+
     @property
     def index(self) -> readings.ModelIndex:
         """Places of the task's quantities in the compiled model."""
         return self._index
 
     @property
-    def readings(self) -> readings.Readings | None:
+    def readings(self) -> readings.Readings:
         """State of the devices after the last step or reset."""
         return self._readings
 
     @property
-    def wall_force(self) -> forces.WallForce | None:
+    def wall_force(self) -> forces.WallForce:
         """Force on the wall over the last step."""
         return self._wall_force
 

@@ -77,7 +77,7 @@ class Scene:
             config.working_length
             if catheter is None
             else float(np.sum(catheter.link_lengths)),
-            config.randomisation.farthest_shift,
+            config.ranges.farthest_shift,
         )
         radius = device.outer_radius
         scene = cls(

@@ -90,7 +90,7 @@ class Randomisation:
     @classmethod
     def make(cls, value: "Randomisation | Mapping[str, Any] | bool") -> "Randomisation":
         """From a task's option: False, True for `DEFAULT_RANGES`, or fields."""
-        if isinstance(value, cls):
+        if isinstance(value, Randomisation):
             return value
         if isinstance(value, bool):
             return DEFAULT_RANGES if value else cls()
@@ -218,6 +218,12 @@ class ModelVariation:
         self._dofs = model.jnt_dofadr[self._hinges]
         self._motors = named("actuator", model.nu, f"{catheter}/tip_")
         self._base = model.body(f"{catheter}/link_0").id
+        self.fields = self.fields_of(randomisation)
+        self._nominal = {field: getattr(model, field).copy() for field in self.fields}
+
+    @staticmethod
+    def fields_of(randomisation: Randomisation) -> tuple[str, ...]:
+        """Names of the fields of the model that a randomisation changes."""
         fields = []
         if randomisation.friction is not None:
             fields += ["geom_friction"]
@@ -225,8 +231,7 @@ class ModelVariation:
             fields += ["jnt_stiffness", "dof_damping", "actuator_gainprm"]
         if randomisation.roll is not None:
             fields += ["body_quat"]
-        self.fields = tuple(fields)
-        self._nominal = {field: getattr(model, field).copy() for field in fields}
+        return tuple(fields)
 
     def write(self, arrays: Mapping[str, np.ndarray], episode: Episode) -> None:
         """Writes to `arrays`, live fields `self.fields` of one simulation's model."""

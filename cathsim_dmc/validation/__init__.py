@@ -42,7 +42,7 @@ def validate_wall(*args: Any, **kwargs: Any) -> Report:
 
 
 def validate_forces(*args: Any, **kwargs: Any) -> Report:
-    """Sensors and published protocol: see `validation.forces.validate_forces`."""
-    from cathsim_dmc.validation import forces
+    """Sensors and published protocol: see `force_sensors.validate_forces`."""
+    from cathsim_dmc.validation import force_sensors
 
-    return forces.validate_forces(*args, **kwargs)
+    return force_sensors.validate_forces(*args, **kwargs)

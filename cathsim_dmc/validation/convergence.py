@@ -63,13 +63,13 @@ class Study:
 
 def study(script: insertion.Script, parameter: str, values: Sequence[float]) -> Study:
     """Runs a script at several resolutions, other settings at their defaults."""
-    values = np.sort(np.asarray(values, dtype=float))
-    runs = [insertion.run(script, **{parameter: value}) for value in values.tolist()]
+    ascending = np.sort(np.asarray(values, dtype=float))
+    runs = [insertion.run(script, **{parameter: value}) for value in ascending.tolist()]
     distance = [np.linalg.norm(run.head - runs[0].head, axis=1) for run in runs]
     return Study(
         script=script,
         parameter=parameter,
-        values=values,
+        values=ascending,
         links=np.array([run.links for run in runs]),
         path_mean=np.array([each.mean() for each in distance]),
         path_max=np.array([each.max() for each in distance]),

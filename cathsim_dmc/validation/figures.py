@@ -17,7 +17,7 @@ from cathsim_dmc.files import atomic_path
 from cathsim_dmc.tasks.config import PHYSICS_TIMESTEP, NavigationConfig
 
 if TYPE_CHECKING:
-    from cathsim_dmc.validation import convergence, forces, protocol
+    from cathsim_dmc.validation import convergence, force_sensors, protocol
     from cathsim_dmc.validation import rod as rods
     from cathsim_dmc.validation import wall as walls
 
@@ -238,7 +238,7 @@ def _lumen(anatomy: Anatomy) -> fidelity.SurfaceSamples:
 
 
 def forces(
-    pushed: Mapping[str, Sequence[forces.DeadEnd]],
+    pushed: Mapping[str, Sequence[force_sensors.DeadEnd]],
     samples: np.ndarray,
     comparison: protocol.Comparison,
     path: str | Path,

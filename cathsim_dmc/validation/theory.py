@@ -30,7 +30,9 @@ class Elastica(NamedTuple):
 
 
 def elastica(
-    lengths: Sequence[float], stiffnesses: Sequence[float], end_angle: float
+    lengths: Sequence[float] | np.ndarray,
+    stiffnesses: Sequence[float] | np.ndarray,
+    end_angle: float,
 ) -> Elastica:
     """The elastica of a stepped cantilever that ends at `end_angle` (rad).
 
@@ -106,8 +108,8 @@ def elastica_by_elliptic_integrals(
 
 
 def buckling_load(
-    lengths: Sequence[float],
-    stiffnesses: Sequence[float],
+    lengths: Sequence[float] | np.ndarray,
+    stiffnesses: Sequence[float] | np.ndarray,
     *,
     end: str = "sliding",
 ) -> float:

@@ -60,9 +60,13 @@ def draw_view(ax: Axes, anatomy: Anatomy, view: tuple = VIEWS[0]) -> None:
     light = 0.55 + 0.4 * np.abs(normal[order, out])
     colours = light[:, None] * np.array([[1.0, 0.86, 0.83]])
     ax.add_collection(
-        PolyCollection(flat(corners[order]), facecolors=colours, edgecolors="face",
-                       linewidths=0.3)
-    )  # fmt: skip
+        PolyCollection(
+            list(flat(corners[order])),
+            facecolors=colours,
+            edgecolors="face",
+            linewidths=0.3,
+        )
+    )
     for index, (vessel, branch) in enumerate(anatomy.tree.vessels.items()):
         line = flat(branch.centreline.points)
         ax.plot(*line.T, color=_COLOURS[index % len(_COLOURS)], lw=1.4, label=vessel)
@@ -75,7 +79,10 @@ def draw_view(ax: Axes, anatomy: Anatomy, view: tuple = VIEWS[0]) -> None:
     inlet = flat(anatomy.inlet.position)
     way = flat(anatomy.inlet.position + 0.015 * anatomy.inlet.direction) - inlet
     ax.annotate(
-        "", inlet + way, inlet - way, arrowprops={"arrowstyle": "->", "color": "k"}
+        "",
+        tuple(inlet + way),
+        tuple(inlet - way),
+        arrowprops={"arrowstyle": "->", "color": "k"},
     )
     ax.set_aspect("equal")
     ax.autoscale_view()

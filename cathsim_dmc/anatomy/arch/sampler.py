@@ -160,6 +160,8 @@ def _corrected(
         found = measures.measure(tree)
         first = next(name for name, one in tree.vessels.items() if one.parent)
         short = ascending - _level(tree, first)
+        if found.drop is None:  # without the branches that it is measured by
+            return None
         low = drop - found.drop
         if abs(short) < _LENGTH_TOLERANCE and abs(low) < _DROP_TOLERANCE:
             break
@@ -216,7 +218,9 @@ def _draw(draw: _Draw, drop: float, variant: str) -> ArchParameters:
         }
     arch_radius = draw.normal(*_ARCH_RADIUS)
     return ArchParameters(
-        **branches,
+        bca=branches["bca"],
+        lcca=branches["lcca"],
+        lsa=branches["lsa"],
         **aorta,
         ascending_length=40e-3,  # corrected to the drawn length up to the BCA
         descending_length=draw.uniform(*_DESCENDING_LENGTH),

@@ -183,7 +183,7 @@ def arch_tree(params: ArchParameters) -> VesselTree:
         else:
             ostium = _ostium(points, outer, levels[level], aorta, plane, branch.lean)
         vessels[name] = branch_vessel(
-            name, branch, parent, ostium, direction, plane, max(fillet, 0.0)
+            name, branch, parent, ostium, direction, plane, max(float(fillet), 0.0)
         )
     tree = VesselTree(vessels)
     check_septa(tree)

@@ -298,8 +298,8 @@ def _start(anatomy: Anatomy, measure: MeshDepth) -> TreeCheck:
         if goal.vessel == inlet.vessel:
             continue
         lineage, tree = goal.vessel, anatomy.tree
-        while tree.vessel(lineage).parent not in (inlet.vessel, None):
-            lineage = tree.vessel(lineage).parent
+        while (parent := tree.vessel(lineage).parent) not in (inlet.vessel, None):
+            lineage = parent
         branch = tree.vessel(lineage)
         ostium = branch.centreline.at(branch.ostium).position
         route = anatomy.route(name)

@@ -42,10 +42,6 @@ HALVINGS = 3  # of the threshold of a block that stops the device
 SLIVER = 1e-12  # m^2, smaller triangles are left out
 # Coarser than CoACD's own search (20, 150, 3): blocks are simple, and there are many.
 SEARCH = {"mcts_nodes": 10, "mcts_iterations": 30, "mcts_max_depth": 2}
-_MISSING = (
-    "wall='coacd' needs the package coacd, which is not installed; run "
-    "pip install 'cathsim-dmc[coacd]', or use wall='prisms'."
-)
 
 
 @dataclass(frozen=True)
@@ -66,15 +62,9 @@ class CoacdReport:
 
 
 def load_coacd():
-    """The package coacd, quiet.
+    """The package coacd, quiet."""
+    import coacd
 
-    Raises:
-        ImportError: if it is not installed; says how to install it.
-    """
-    try:
-        import coacd
-    except ImportError as error:
-        raise ImportError(_MISSING) from error
     coacd.set_log_level("error")
     return coacd
 
@@ -116,7 +106,6 @@ def decompose_wall(
         (vertices of each convex piece (n_i, 3) m, report).
 
     Raises:
-        ImportError: if coacd is not installed.
         ValueError: if the threshold is out of range.
     """
     coacd, threshold = load_coacd(), check_threshold(threshold)

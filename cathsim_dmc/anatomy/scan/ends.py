@@ -16,7 +16,7 @@ COVER = 1.5  # radii; what lies nearer to a way is no vessel of its own
 STUB = 3e-3  # m, shortest own vessel beyond that
 WIDE = 0.4  # of the widest free end: narrower ends are no inlet by default
 ROOT_WIDTH = 0.5  # of the inlet: narrower free ends do not continue the root
-LEG = 60e-3  # m at both ends of an aorta, in which it shows that it turns back
+LEG = 30e-3  # m, least distance of the top of an arch from both ends of an aorta
 STARTS = 30e-3  # m along the lumen; curves that start nearer to an end start there
 
 
@@ -195,12 +195,11 @@ def plan_inlet(
 def _arched(ways: Ways, heart: int, node: int) -> bool:
     """Whether the way from one end to another turns back, as an aortic arch does."""
     way = ways.points[ways.trace(ways.deepest_from(heart), node)]
-    steps = np.linalg.norm(np.diff(way, axis=0), axis=1)
-    along = np.concatenate([[0.0], np.cumsum(steps)])
-    leg = min(LEG, 0.25 * along[-1])
-    first = way[np.searchsorted(along, leg)] - way[0]
-    last = way[np.searchsorted(along, along[-1] - leg)] - way[-1]
-    return float(first @ last) > 0.0
+    # From its top both ends lie on one side.
+    to_heart, to_end = way[0] - way, way[-1] - way
+    one, other = (np.linalg.norm(each, axis=1) for each in (to_heart, to_end))
+    cosine = np.einsum("nd,nd->n", to_heart, to_end) / np.maximum(one * other, 1e-12)
+    return bool((cosine[(one > LEG) & (other > LEG)] > 0.5).any())
 
 
 def _ends_of_curves(ways, ends, lasts) -> np.ndarray:

@@ -10,8 +10,8 @@ from pathlib import Path
 
 import numpy as np
 
-from cathsim_dmc.anatomy.anatomy import Anatomy, End, Goal, Inlet, Surface
-from cathsim_dmc.anatomy.centreline import Vessel, VesselTree
+from cathsim_dmc.anatomy.anatomy import Anatomy, Inlet, Surface
+from cathsim_dmc.anatomy.centreline import VesselTree
 from cathsim_dmc.anatomy.scan import coacd_wall
 from cathsim_dmc.anatomy.scan.check import check_tree
 from cathsim_dmc.anatomy.scan.compiled_field import compiled, plain
@@ -22,6 +22,7 @@ from cathsim_dmc.anatomy.scan.inlet import cut_open, shut_behind
 from cathsim_dmc.anatomy.scan.lumen import Lumen, read_lumen
 from cathsim_dmc.anatomy.scan.mesh_depth import MeshDepth, depth_field
 from cathsim_dmc.anatomy.scan.naming import name_branches, renamed
+from cathsim_dmc.anatomy.scan.places import flat_ends, place_goals, place_inlet
 from cathsim_dmc.anatomy.scan.tree import grow_tree
 from cathsim_dmc.anatomy.scan.trunk import name_trunk
 from cathsim_dmc.anatomy.scan.units import frame_sign, metres_per, upright
@@ -38,10 +39,6 @@ log = logging.getLogger(__name__)
 
 ROOT = "aorta"
 WALLS = ("prisms", "coacd")
-GOAL_PAST_OSTIUM = 30e-3  # m along a branch, its first goal
-GOAL_DISTAL = 0.8  # of the passable part of a branch, its second goal
-INLET_WIDTH = 0.8  # of the lumen near the inlet; the rest of the blind end is cut off
-INLET_SEARCH = 40e-3  # m of the root in which that width is looked for
 NEAR_INLET = 15e-3  # m, distance from the lumen of an inlet that is pointed at
 RADII = (0.3e-3, 30e-3)  # m, allowed median radius of a vessel: arteriole, aneurysm
 
@@ -88,7 +85,7 @@ def import_scan(
         rename: new names of computed vessels by their computed names.
         spacing: m, of the fine lattice of depths.
         wall: "prisms" (merged triangle prisms, near the surface) or "coacd" (convex
-            decomposition, coarse; needs the package coacd).
+            decomposition, coarse).
         tolerance: m, of the prisms; see ``scan.wall.build_wall``.
         threshold: m, of CoACD; see ``coacd_wall.decompose_wall``.
         progress: called with a line of text for every step, which begins with the
@@ -103,7 +100,6 @@ def import_scan(
         FileNotFoundError: if a file is missing.
         ValueError: if a file or an option is not as stated, or the tree that results
             does not agree with the surface; says how to mend it.
-        ImportError: if ``wall`` is "coacd" and the package is missing.
     """
     threshold = _check_wall(wall, threshold)
     started = time.monotonic()
@@ -118,7 +114,8 @@ def import_scan(
             notes.append(text)
         say(f"note: {text}")
 
-    frame_sign(mesh_frame), upright(axes)
+    frame_sign(mesh_frame)
+    upright(axes)
     if units is not None:
         metres_per(units)
     place = _as_point(inlet)
@@ -150,8 +147,8 @@ def import_scan(
         surface=Surface(vertices, faces),
         wall=(),
         inlet=opening,
-        goals=_goals(tree, root),
-        ends=_ends(tree, opening),
+        goals=place_goals(tree, root),
+        ends=flat_ends(tree, opening),
         field=field,
     )
     anatomy = _walled(anatomy, wall, tolerance, threshold, say, note)
@@ -180,7 +177,7 @@ def _tree(field, ways, lines, place, root, rename, note) -> tuple[VesselTree, In
     else:
         lines = _computed(ways, ends, entry, root, rename, note)
     tree = grow_tree(field, ways, lines, entry.position, entry.far, root, drawn)
-    return _place_inlet(name_trunk(tree), entry.at_end)
+    return place_inlet(name_trunk(tree), entry.at_end)
 
 
 def _computed(
@@ -225,6 +222,7 @@ def _walled(anatomy, wall, tolerance, threshold, say, note) -> Anatomy:
     field, tree, opening = anatomy.field, anatomy.tree, anatomy.inlet
     cut_vertices, shell, cap = cut_open(vertices, faces.astype(np.int64), opening)
     closed = np.concatenate([shell, cap])
+    shut = compiled(shut_behind(field, cut_vertices, closed, opening))
     anatomy = Anatomy(
         name=anatomy.name,
         tree=tree,
@@ -233,7 +231,7 @@ def _walled(anatomy, wall, tolerance, threshold, say, note) -> Anatomy:
         inlet=opening,
         goals=anatomy.goals,
         ends=anatomy.ends,
-        field=compiled(shut_behind(field, cut_vertices, closed, opening)),
+        field=shut,
     )
     for check in check_tree(anatomy):
         if check.passed:
@@ -260,14 +258,7 @@ def _walled(anatomy, wall, tolerance, threshold, say, note) -> Anatomy:
             progress=say,
         )
     pieces += tuple(inlet_cap(cut_vertices[cap[:, :2]], opening))
-    return replace(anatomy, wall=pieces, field=plain(anatomy.field))
-
-
-def passable_length(vessel: Vessel, radius: float = DEVICE_RADIUS) -> float:
-    """Arc length (m) up to which a sphere of ``radius`` (m) fits a vessel."""
-    line = vessel.centreline
-    narrow = (line.radii < radius) & (line.arc_length > vessel.ostium)
-    return float(line.arc_length[narrow.argmax()] if narrow.any() else line.length)
+    return replace(anatomy, wall=pieces, field=plain(shut))
 
 
 def _compact(vertices, faces) -> Surface:
@@ -279,9 +270,7 @@ def _check_wall(wall: str, threshold: float | None) -> float:
     """CoACD's threshold (m), before an import takes its time to no avail."""
     if wall not in WALLS:
         raise ValueError(f"wall is {wall!r}; give one of {', '.join(WALLS)}.")
-    if wall == "coacd":
-        coacd_wall.load_coacd()
-    elif threshold is not None:
+    if wall != "coacd" and threshold is not None:
         raise ValueError("a threshold is for wall='coacd' only; leave it out.")
     return coacd_wall.check_threshold(
         coacd_wall.THRESHOLD if threshold is None else threshold
@@ -358,56 +347,6 @@ def _proximal_first(line: np.ndarray, field: DepthField) -> np.ndarray:
     part = max(1, len(line) // 8)
     first, last = field(line[:part]).max(), field(line[-part:]).max()
     return line[::-1] if last > 1.1 * first else line
-
-
-def _place_inlet(tree: VesselTree, at_end: bool) -> tuple[VesselTree, Inlet]:
-    """Start the root where the lumen has its width, and look along it there."""
-    root = tree.root
-    line = root.centreline
-    start = 0.0
-    if at_end:
-        near = line.arc_length <= min(INLET_SEARCH, 0.3 * line.length)
-        wide = INLET_WIDTH * np.median(line.radii[near])
-        first = int((line.radii >= wide).argmax())
-        # One radius more, because a vessel's end may be cut off at a slant.
-        start = float(line.arc_length[first] + line.radii[first])
-    if start > 0.0:
-        line = line.slice(start, line.length)
-    place = line.at(0.0)
-    ahead = line.at(min(3.0 * float(place.radius), 0.5 * line.length)).position
-    opening = Inlet(root.name, place.position, ahead - place.position, place.radius)
-    vessels = dict(tree.vessels)
-    vessels[root.name] = Vessel(root.name, line)
-    return VesselTree(vessels), opening
-
-
-def _goals(tree: VesselTree, root: str) -> dict[str, Goal]:
-    goals = {}
-    for key, vessel in tree.vessels.items():
-        if key == root:
-            continue
-        reach = passable_length(vessel) - vessel.ostium
-        first = vessel.ostium + min(GOAL_PAST_OSTIUM, 0.5 * reach)
-        places = {key: first}
-        if GOAL_DISTAL * reach > 1.3 * (first - vessel.ostium):
-            places[f"{key}_distal"] = vessel.ostium + GOAL_DISTAL * reach
-        for name, s in places.items():
-            goals[name] = Goal(name, key, vessel.centreline.at(s).position, float(s))
-    return goals
-
-
-def _ends(tree: VesselTree, opening: Inlet) -> tuple[End, ...]:
-    ends = [
-        End(opening.vessel, opening.position, -opening.direction, opening.radius, True)
-    ]
-    for key, vessel in tree.vessels.items():
-        length = vessel.centreline.length
-        branches = [k for k, v in tree.vessels.items() if v.parent == key]
-        if any(tree.origin(k) > length - 1e-6 for k in branches):
-            continue  # goes on in its branches
-        place = vessel.centreline.at(length)
-        ends.append(End(key, place.position, place.tangent, float(place.radius), False))
-    return tuple(ends)
 
 
 def _summary(tree: VesselTree) -> list[str]:

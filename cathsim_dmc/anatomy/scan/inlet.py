@@ -31,8 +31,8 @@ def cut_open(
     """
     side = (vertices - inlet.position) @ inlet.direction
     side = np.where(np.abs(side) < 1e-9, 1e-9, side)
-    front = side[faces] > 0.0
-    crossing = front.any(1) & ~front.all(1)
+    front = np.asarray(side[faces] > 0.0)
+    crossing: np.ndarray = np.asarray(front.any(axis=1) & ~front.all(axis=1))
     pairs = adjacent_faces(faces)
     ring_pairs = pairs[crossing[pairs].all(1)]
     ring = _component(len(faces), ring_pairs, crossing, vertices, faces, inlet.position)

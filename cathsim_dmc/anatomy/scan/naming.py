@@ -125,7 +125,7 @@ def _group_names(rows, side, up, behind, left) -> list[str]:
     height = np.array([r @ up for r in rel])
     aside = np.array([np.linalg.norm(r - (r @ up) * up) for r in rel])
     if len(rows) == 1:
-        return [{"bovine": "bca"}.get(side, side)]
+        return ["bca" if side == "bovine" else side]
     tall = np.flatnonzero((height > aside) & (height > TALL * height.max()))
     wide = np.flatnonzero((height <= aside) & (aside > 20e-3))
     right = side in ("bca", "bovine")
@@ -152,7 +152,7 @@ def _group_names(rows, side, up, behind, left) -> list[str]:
     for i in range(len(rows)):
         if i not in names:
             shared = {j: _common(rows[i], rows[j]) for j in known}
-            base = known[max(shared, key=shared.get)] if shared else side
+            base = known[max(shared, key=shared.__getitem__)] if shared else side
             number = 2
             while f"{base}_{number}" in names.values():
                 number += 1

@@ -9,7 +9,7 @@ import numpy as np
 
 from cathsim_dmc.anatomy.anatomy import Anatomy
 from cathsim_dmc.anatomy.scan.compiled_field import compiled
-from cathsim_dmc.anatomy.scan.importer import passable_length
+from cathsim_dmc.anatomy.scan.places import passable_length
 from cathsim_dmc.anatomy.scan.wall import DEVICE_RADIUS
 from cathsim_dmc.anatomy.wall import fidelity
 

@@ -137,7 +137,7 @@ def _array_reader(
             raise ValueError("a compressed block is damaged")
         return values
 
-    def unwrap(fetch: Callable[[int, int], bytes]) -> bytes:
+    def unwrap(fetch: Callable[..., bytes]) -> bytes:
         """Bytes of an array; ``fetch`` gives decoded bytes from a place on."""
         wide = header.itemsize
         if unpack is None:

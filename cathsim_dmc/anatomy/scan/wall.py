@@ -167,6 +167,7 @@ class _Builder:
                 best = _Piece(list(faces), ids, cap, cost)
             if cost <= 0.05e-3:
                 break
+        assert best is not None  # there are CAPS
         return best
 
     def merge(self, patches, tolerance, say):

@@ -34,8 +34,8 @@ class Ways:
     def __init__(self, field: DepthField, spacing: float = LATTICE):
         """Build the lattice graph of ``field`` (26 neighbours)."""
         ijk, points, depth = field.lattice(spacing, SHALLOW)
-        shape = ijk.max(0) + 3
-        key = np.ravel_multi_index(tuple((ijk + 1).T), tuple(shape))
+        shape = tuple((ijk.max(axis=0) + 3).tolist())
+        key = np.asarray(np.ravel_multi_index(tuple((ijk + 1).T), shape))
         order = np.argsort(key)
         self.points, self.depth, key = points[order], depth[order], key[order]
         rows, cols, lengths = [], [], []

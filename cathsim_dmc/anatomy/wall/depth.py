@@ -121,7 +121,7 @@ class DepthField:
         """The field as plain arrays, for an npz file."""
         return {
             "origin": self.origin,
-            "spacing": np.float64(self.spacing),
+            "spacing": np.array(self.spacing),
             "coarse": self.coarse,
             "index": self.index,
             "bricks": self.bricks,

@@ -1,0 +1,185 @@
+"""Triangles and how they hang together: merging, parts, borders, orientation."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
+
+MERGE = 1e-6  # of the mesh's size: vertices nearer than this are one
+ROUNDS = 6  # in which triangles without area are taken out, neighbours of others later
+
+
+def merged(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """One vertex per place, and no triangle with a vertex twice or given twice."""
+    size = np.linalg.norm(np.ptp(vertices, axis=0))
+    cell = np.rint(vertices / max(size * MERGE, 1e-30)).astype(np.int64)
+    _, first, inverse = np.unique(cell, axis=0, return_index=True, return_inverse=True)
+    faces = inverse.reshape(-1)[faces]
+    a, b, c = faces.T
+    faces = faces[(a != b) & (b != c) & (c != a)]
+    if not len(faces):
+        return vertices[:0], faces
+    _, once = np.unique(np.sort(faces, axis=1), axis=0, return_index=True)
+    faces = faces[np.sort(once)]
+    used, renumbered = np.unique(faces, return_inverse=True)
+    return vertices[first][used], renumbered.reshape(-1, 3)
+
+
+def areas(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """Area (F,) of each triangle, m^2."""
+    a, b, c = (vertices[faces[:, k]] for k in range(3))
+    return 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1)
+
+
+def widths(vertices: np.ndarray, faces: np.ndarray, label: np.ndarray) -> np.ndarray:
+    """Diagonal (n,) of the box around each of n parts, m."""
+    low = np.full((label.max() + 1, 3), np.inf)
+    high = -low
+    np.minimum.at(low, label, vertices[faces].min(axis=1))
+    np.maximum.at(high, label, vertices[faces].max(axis=1))
+    return np.linalg.norm(high - low, axis=1)
+
+
+def volume(vertices: np.ndarray, faces: np.ndarray) -> float:
+    """Enclosed volume (m^3) of a closed surface, > 0 if its normals point outwards."""
+    a, b, c = (vertices[faces[:, k]] - vertices[0] for k in range(3))
+    return float(np.einsum("nd,nd->", a, np.cross(b, c)) / 6.0)
+
+
+def edge_counts(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Edges (E, 2), lower vertex first, and the triangles at each (E,)."""
+    edges = np.sort(faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
+    return np.unique(edges, axis=0, return_counts=True)
+
+
+def parts(faces: np.ndarray, count: int) -> np.ndarray:
+    """Number (F,) of the connected part that each triangle belongs to, from 0."""
+    rows = faces[:, [0, 1, 2]].reshape(-1)
+    cols = faces[:, [1, 2, 0]].reshape(-1)
+    link = coo_matrix((np.ones(len(rows)), (rows, cols)), shape=(count, count))
+    label = connected_components(link, directed=False)[1][faces[:, 0]]
+    return np.unique(label, return_inverse=True)[1]
+
+
+def _neighbours(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Pairs (n, 2) of triangles at an edge, and whether they are oriented alike."""
+    directed = faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
+    edges = np.sort(directed, axis=1)
+    owner = np.repeat(np.arange(len(faces)), 3)
+    order = np.lexsort((edges[:, 1], edges[:, 0]))
+    edges, owner, directed = edges[order], owner[order], directed[order]
+    same = (edges[1:] == edges[:-1]).all(axis=1)
+    alike = directed[:-1, 0][same] != directed[1:, 0][same]
+    return np.stack([owner[:-1][same], owner[1:][same]], axis=1), alike
+
+
+def turned_faces(faces: np.ndarray) -> np.ndarray | None:
+    """Triangles (F,) to turn so that all neighbours agree, or None if none would do.
+
+    Every triangle stands in a graph twice, as it is and turned; neighbours that agree
+    are joined side to side, others crosswise.
+    """
+    pairs, alike = _neighbours(faces)
+    n = len(faces)
+    if alike.all():
+        return np.zeros(n, dtype=bool)
+    a, b = pairs.T
+    cross = np.where(alike, 0, n)
+    rows = np.concatenate([a, a + n])
+    cols = np.concatenate([b + cross, (b + n - cross)])
+    link = coo_matrix((np.ones(len(rows)), (rows, cols)), shape=(2 * n, 2 * n))
+    label = connected_components(link, directed=False)[1]
+    if (label[:n] == label[n:]).any():
+        return None
+    # Of the two sheets of each part, the one of which more triangles stay as given.
+    own, sizes = label[:n], np.bincount(label[:n], minlength=label.max() + 1)
+    return sizes[own] < sizes[label[n:]]
+
+
+def border_loops(faces: np.ndarray) -> list[np.ndarray]:
+    """Closed rows of vertices along the borders, in the direction of their faces.
+
+    Where two holes meet in a vertex, they become one loop each as far as that can
+    be told.
+    """
+    pairs = faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
+    there = {(int(a), int(b)) for a, b in pairs}
+    following: dict[int, list[int]] = {}
+    for a, b in sorted(there):
+        if (b, a) not in there:
+            following.setdefault(a, []).append(b)
+    loops = []
+    while following:
+        start = next(iter(following))
+        way, seen = [start], {start: 0}
+        while True:
+            after = following[way[-1]]
+            step = after.pop()
+            if not after:
+                del following[way[-1]]
+            if step in seen:
+                loops.append(np.array(way[seen[step] :]))
+                rest = way[: seen[step] + 1]
+                if len(rest) == 1 and step not in following:
+                    break
+                way, seen = rest, {v: k for k, v in enumerate(rest)}
+                if way[-1] not in following:
+                    break
+                continue
+            if step not in following:
+                break
+            seen[step] = len(way)
+            way.append(step)
+    return [loop for loop in loops if len(loop) >= 3]
+
+
+def loop_axis(points: np.ndarray) -> tuple[np.ndarray, float]:
+    """Unit normal (3,) of a closed loop, and its area (m^2)."""
+    spokes = points - points.mean(axis=0)
+    total = 0.5 * np.cross(spokes, np.roll(spokes, -1, axis=0)).sum(axis=0)
+    area = float(np.linalg.norm(total))
+    return total / max(area, 1e-30), area
+
+
+def without_slivers(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, int]:
+    """Triangles of which three corners lie in line are taken out.
+
+    The corner between the other two is put into the neighbour at the long edge, so
+    that no hole is left.
+    """
+    removed = 0
+    for _ in range(ROUNDS):
+        corners = vertices[faces]
+        sides = np.linalg.norm(corners - np.roll(corners, -1, axis=1), axis=2)
+        height = 2.0 * areas(vertices, faces) / np.maximum(sides.max(axis=1), 1e-30)
+        flat = np.flatnonzero(height < 1e-4 * np.maximum(sides.max(axis=1), 1e-30))
+        if not len(flat):
+            break
+        owner: dict[tuple[int, int], list[int]] = {}
+        for row, face in enumerate(faces):
+            for k in range(3):
+                a, b = int(face[k]), int(face[(k + 1) % 3])
+                owner.setdefault((min(a, b), max(a, b)), []).append(row)
+        gone, fresh, touched = [], [], set()
+        for row in flat:
+            k = int(sides[row].argmax())
+            a, b, m = (int(faces[row, (k + j) % 3]) for j in range(3))
+            others = [r for r in owner[(min(a, b), max(a, b))] if r != row]
+            if len(others) != 1 or touched & {row, others[0]} or others[0] in flat:
+                continue
+            other = others[0]
+            face = list(map(int, faces[other]))
+            for j in range(3):
+                if {face[j], face[(j + 1) % 3]} == {a, b}:
+                    p, q, top = face[j], face[(j + 1) % 3], face[(j + 2) % 3]
+                    fresh += [(p, m, top), (m, q, top)]
+            gone += [row, other]
+            touched |= {row, other}
+        if not gone:
+            break
+        removed += len(gone) // 2
+        keep = np.ones(len(faces), dtype=bool)
+        keep[gone] = False
+        faces = np.concatenate([faces[keep], np.array(fresh, dtype=faces.dtype)])
+    return faces, removed
