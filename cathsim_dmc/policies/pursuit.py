@@ -14,7 +14,8 @@ leader), so the tip keeps the shape of the way it came.
 
 **Retries.** When the head makes no progress, or has left the tube of the route as in
 a wrong branch, the device is withdrawn until the head is back in the route and then
-tries again, from farther back and with another look-ahead each time.
+tries again, from farther back, with another look-ahead each time, and every other time
+without jumps of its place on the route.
 """
 
 from __future__ import annotations
@@ -300,7 +301,9 @@ def decide(
     Returns:
         Action (..., A) in [-1, 1] and the new state.
     """
-    place = locate(plan, readings.head, state.arc_length)
+    # Every other attempt stays near the last place: both ways fail in some branchings.
+    steady = np.where(state.attempts % 2 == 1, state.arc_length, np.nan)
+    place = locate(plan, readings.head, steady)
     axes, direction = tip_frames(plan, readings.joint_positions)
     target = plan.at(place.arc_length + _lookahead(plan, settings, state, place))
     turn, cosine = _rotation_to(direction, target - readings.head)
