@@ -17,7 +17,7 @@ from cathsim_dmc.anatomy.arch import arch
 
 @pytest.fixture(scope="module")
 def saved(tmp_path_factory):
-    return arch.load("type1").save(tmp_path_factory.mktemp("saved") / "a")
+    return arch.load("simple1").save(tmp_path_factory.mktemp("saved") / "a")
 
 
 @pytest.fixture
@@ -124,7 +124,7 @@ def test_a_wrong_entry_is_named_in_one_line(forged, tmp_path, fault):
 
 def test_what_was_not_changed_is_read(forged, tmp_path):
     forged(lambda description, arrays: None)
-    assert Anatomy.load(tmp_path).name == "type1"
+    assert Anatomy.load(tmp_path).name == "simple1"
 
 
 def test_links_are_not_followed(forged, tmp_path):
@@ -162,7 +162,7 @@ for _ in range(int(sys.argv[3])):
 
 
 def test_two_writers_and_a_reader_never_break_a_directory(tmp_path):
-    arch.load("type1").save(tmp_path)
+    arch.load("simple1").save(tmp_path)
     writers = [
         subprocess.Popen(
             [sys.executable, "-c", WRITER, str(tmp_path), name, "15"],
@@ -170,7 +170,7 @@ def test_two_writers_and_a_reader_never_break_a_directory(tmp_path):
             stdout=subprocess.PIPE,
             text=True,
         )
-        for name in ("type1", "type2")
+        for name in ("simple1", "simple2")
     ]
     for writer in writers:
         assert writer.stdout.readline() == "ready\n"
@@ -182,5 +182,5 @@ def test_two_writers_and_a_reader_never_break_a_directory(tmp_path):
         seen.add(Anatomy.load(tmp_path).name)
     assert all(writer.wait() == 0 for writer in writers)
     seen.add(Anatomy.load(tmp_path).name)
-    assert seen <= {"type1", "type2"}
+    assert seen <= {"simple1", "simple2"}
     assert len(list(tmp_path.iterdir())) == 2

@@ -17,7 +17,7 @@ def imports(monkeypatch):
     def fake(mesh, curves=(), *, progress=None, notes=None, **options):
         done.append(options)
         notes.append("unit guessed: mm")
-        return arch.load("type1")
+        return arch.load("simple1")
 
     monkeypatch.setattr(cache, "import_scan", fake)
     return done

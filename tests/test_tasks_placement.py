@@ -76,7 +76,7 @@ def posture(environment):
 
     def nodes(displacement, roll=None):
         data.qpos[:] = model.qpos0
-        rollout._start.write(data.qpos, np.asarray(displacement), roll)
+        rollout.case().start.write(data.qpos, np.asarray(displacement), roll)
         mujoco.mj_kinematics(model, data)
         return rollout.index.read(data).centreline
 
