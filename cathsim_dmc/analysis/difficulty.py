@@ -186,11 +186,11 @@ def _ends(step: Step, number: int, resting: np.ndarray, limit: Limit) -> dict[in
 
 
 def tasks() -> tuple[str, ...]:
-    """Names of the registered tasks whose anatomy is theirs, not the user's."""
+    """Names of the registered tasks whose anatomy and goal are theirs."""
     return tuple(
         name
         for name, definition in suite.TASKS.items()
-        if definition.anatomy is not None
+        if definition.anatomy is not None or definition.random_arch
     )
 
 
