@@ -13,7 +13,8 @@ from cathsim_dmc.anatomy.scan.places import passable_length
 from cathsim_dmc.anatomy.scan.wall import DEVICE_RADIUS
 from cathsim_dmc.anatomy.wall import fidelity
 
-SAMPLING = 1e-3  # m, between the places at which the wall is measured
+SAMPLING = 1e-3  # m, between the places at which the passage is tried
+SURFACE_SAMPLING = 1.5e-3  # m, between the places at which intrusion is measured
 RAYS = 20_000  # shot at the wall to find leaks
 
 
@@ -68,7 +69,7 @@ def measure_wall(anatomy: Anatomy) -> dict[str, Any]:
 
     if anatomy.field is not None:
         anatomy = replace(anatomy, field=compiled(anatomy.field))
-    found = fidelity.intrusion(anatomy, SAMPLING)
+    found = fidelity.intrusion(anatomy, SURFACE_SAMPLING)
     rays = fidelity.coverage(anatomy, RAYS)
     passage = fidelity.patency(anatomy, DEVICE_RADIUS, spacing=SAMPLING)
     return {

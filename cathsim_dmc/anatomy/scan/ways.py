@@ -50,6 +50,7 @@ class Ways:
             lengths.append(np.full(found.sum(), spacing * np.linalg.norm(offset)))
         self._rows, self._cols = np.concatenate(rows), np.concatenate(cols)
         self._lengths = np.concatenate(lengths)
+        self._pattern: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None
         self.pinches = np.empty((0, 3))
         self._join(field)
         label = self._pieces()
@@ -130,8 +131,16 @@ class Ways:
         return True
 
     def _graph(self, weights: np.ndarray) -> csr_matrix:
+        """The lattice's links with ``weights`` (e,), in one direction."""
         n = len(self.points)
-        return csr_matrix((weights, (self._rows, self._cols)), shape=(n, n))
+        if self._pattern is None or len(self._pattern[0]) != len(weights):
+            # Sorting the links takes longer than the searches: once is enough.
+            numbers = np.arange(len(weights), dtype=np.float64)
+            sorted_ = csr_matrix((numbers, (self._rows, self._cols)), shape=(n, n))
+            order = sorted_.data.astype(np.int64)
+            self._pattern = (order, sorted_.indices, sorted_.indptr)
+        order, indices, indptr = self._pattern
+        return csr_matrix((weights[order], indices, indptr), shape=(n, n))
 
     @property
     def nodes(self) -> np.ndarray:
@@ -198,11 +207,22 @@ class Ways:
         weights = self._lengths * 0.5 * (price[self._rows] + price[self._cols])
         start = self.checked_node(curve[0], f"the start of centreline {name!r}")
         end = self.checked_node(curve[-1], f"the end of centreline {name!r}")
-        _, before = dijkstra(
-            self._graph(weights),
+        graph = self._graph(weights)
+        # Few ways leave the corridor; where one must, the whole lumen is searched.
+        near = off < 5.0 * CORRIDOR
+        near[[start, end]] = True
+        kept = np.flatnonzero(near)
+        ends = np.searchsorted(kept, [start, end])
+        cost, before = dijkstra(
+            graph[kept][:, kept],
             directed=False,
-            indices=start,
+            indices=ends[0],
             return_predecessors=True,
+        )
+        if np.isfinite(cost[ends[1]]):
+            return self.points[kept[self.trace(before, int(ends[1]))]]
+        _, before = dijkstra(
+            graph, directed=False, indices=start, return_predecessors=True
         )
         return self.points[self.trace(before, end)]
 
