@@ -169,7 +169,8 @@ class Rollout:
         self._monitor.restart(index, case.scene.anatomy)
         self._sensors.restart(index, case.angiograph, episode.deviation)
         self._goal_shift[index] = episode.goal_shift or 0.0
-        case.start.write(self._state.qpos[index], episode.displacement, episode.roll)
+        displacement = case.start.clear_of_wall(episode.displacement)
+        case.start.write(self._state.qpos[index], displacement, episode.roll)
 
     def pose_robot(self, qpos: np.ndarray) -> np.ndarray:
         """Poses the follower's joints after the device, in place: qpos (N, nq)."""

@@ -56,6 +56,11 @@ class StartPosture:
         self._advance = float(data.qpos[self._insertion])
         self._directions = self._link_directions(index, data)
         self._find_levers(model, data, index, catheter.link_lengths, scene)
+        self._anatomy = scene.anatomy
+        self._radius = scene.device.outer_radius
+        self._frame = data.xmat[index.links.start].reshape(3, 3).copy()
+        self._head = data.site_xpos[index.head_site].copy()
+        self._head_depth = float(scene.anatomy.depth(self._head))
 
     def _link_directions(self, index: ModelIndex, data: mujoco.MjData) -> np.ndarray:
         """Unit vectors (n, 3) of the links in the frame of link 0."""
@@ -74,6 +79,22 @@ class StartPosture:
         dofs = [_dof_of(model, place) for place in places]
         # Joint steps for a displacement in the frame of the inlet.
         self._steps = np.linalg.inv(frame.T @ jacobian[:, dofs])
+
+    def clear_of_wall(self, displacement: np.ndarray) -> np.ndarray:
+        """The displacement, or its opposite where it would press on the wall.
+
+        Args:
+          displacement: (3,) of the head in the frame of the inlet, m.
+
+        Returns:
+          (3,) m, of the same length.
+        """
+        depth = float(self._anatomy.depth(self._head + self._frame @ displacement))
+        return (
+            displacement
+            if depth >= min(self._radius, self._head_depth)
+            else -displacement
+        )
 
     def write(
         self, qpos: np.ndarray, displacement: np.ndarray, roll: float | None = None
