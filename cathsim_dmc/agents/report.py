@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from torchrl.envs import EnvBase
 
-from cathsim_dmc import suite
+from cathsim_dmc import files, suite
 from cathsim_dmc.agents import evaluation, policies
 from cathsim_dmc.analysis import heatmap
 from cathsim_dmc.analysis.force_statistics import millinewtons
@@ -243,8 +243,9 @@ def record(
     episode = recorder.EpisodeRecorder(environment, task, kwargs).record_episode(
         in_environment(player, environment), seed=seed, max_steps=max_steps
     )
-    arrays = episode.save(out.with_suffix(".npz"))
-    try:
+    # Last, and once both are written: no .npz without its .rrd.
+    with files.atomic_path(out.with_suffix(".npz")) as arrays:
+        episode.write(arrays)
         rerun_log.write_rrd(
             episode,
             environment.task.scene.anatomy.surface,
@@ -252,10 +253,6 @@ def record(
             robot_geoms=body_geoms(environment.physics),
             fluoroscopy=_images(environment, episode) if fluoroscopy else None,
         )
-    except BaseException:
-        # Both or none.
-        arrays.unlink(missing_ok=True)
-        raise
     return episode
 
 

@@ -108,7 +108,11 @@ def write_rrd(
         with catch_and_log_exceptions(strict=True):
             stream.set_log_tick_enabled(False)
             stream.set_log_time_enabled(False)
-            stream.save(temporary, default_blueprint=_layout(episode, drawing))
+            # Not `save`, which never comes back from a full disk.
+            encoded = stream.binary_stream()
+            stream.send_blueprint(
+                _layout(episode, drawing), make_active=False, make_default=True
+            )
             stream.send_recording_name(_title(episode))
             log = _Log(stream, episode)
             _log_static(log, drawing)
@@ -118,8 +122,9 @@ def write_rrd(
             _log_series(log)
             if drawing.frames is not None:
                 _log_frames(log, drawing.frames, lossless)
-            stream.flush()
+            data = encoded.read()
             stream.disconnect()
+        temporary.write_bytes(data or b"")
     return Path(path)
 
 
