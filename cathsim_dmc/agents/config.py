@@ -33,6 +33,12 @@ class TrainingConfig:
         observation: Name or names of the task's observations, such as "internal",
             "image", "sequential" or "tracking".
         task_kwargs: Further options of the task; must be JSON-able.
+        training_reward: Weights of the reward terms to learn from, such as
+            {"path": -1, "success": 10}; None takes the task's. Evaluation and
+            recordings always take the task's.
+        training_max_steps: Largest number of control steps of an episode of the
+            training, at whose end the value is carried on; None takes the task's.
+            Evaluation and recordings always take the task's.
         backend: Way of simulating: "batched" steps all simulations in one thread
             pool, "composer" runs one dm_control environment after the other (slow;
             the reference).
@@ -88,6 +94,8 @@ class TrainingConfig:
     task: str = "type1_bca"
     observation: str | tuple[str, ...] = "internal"
     task_kwargs: Mapping[str, Any] = field(default_factory=dict)
+    training_reward: Mapping[str, float] | None = None
+    training_max_steps: int | None = None
     backend: Literal["batched", "composer"] = "batched"
     num_envs: int = 16
     num_threads: int | None = None
@@ -117,6 +125,8 @@ class TrainingConfig:
             if typing.get_origin(kind) is not ClassVar:
                 _require_type(name, getattr(self, name), kind)
         object.__setattr__(self, "task_kwargs", dict(self.task_kwargs))
+        if self.training_reward is not None:
+            object.__setattr__(self, "training_reward", dict(self.training_reward))
         require(bool(self.task), "task", self.task, "the name of a task")
         require(bool(self.observation), "observation", self.observation, "a name")
         require(
@@ -143,6 +153,13 @@ class TrainingConfig:
             "observation_clip",
             "checkpoint_seconds",
         )
+        steps = self.training_max_steps
+        require(
+            steps is None or steps > 0,
+            "training_max_steps",
+            steps,
+            "a positive integer, or None for the task's own",
+        )
         for name in ("seed", "normalisation_frames"):
             value = getattr(self, name)
             require(value >= 0, name, value, "an integer >= 0")
@@ -167,6 +184,13 @@ class TrainingConfig:
             value = getattr(self, name)
             kind = "a positive integer" if isinstance(value, int) else "positive"
             require(value > 0, name, value, kind)
+
+    @property
+    def training_kwargs(self) -> dict[str, Any]:
+        """Options of the task while it is learnt."""
+        own = {"reward": self.training_reward, "max_steps": self.training_max_steps}
+        given = {name: value for name, value in own.items() if value is not None}
+        return {**self.task_kwargs, **given}
 
     @property
     def frames_per_batch(self) -> int:
@@ -237,8 +261,11 @@ def _fits(value: object, kind: Any) -> bool:
         return any(_fits(value, argument) for argument in arguments)
     if origin is tuple:
         return isinstance(value, tuple) and all(_fits(v, arguments[0]) for v in value)
-    if origin is Mapping or origin is None and kind is Mapping:
-        return isinstance(value, Mapping)
+    if origin is Mapping:
+        return isinstance(value, Mapping) and all(
+            isinstance(name, str) and (arguments[1] is Any or _fits(one, arguments[1]))
+            for name, one in value.items()
+        )
     if type(value) is int and abs(value) > MAX_INTEGER:
         return False
     if kind is float:
@@ -257,4 +284,6 @@ def _description(kind: Any) -> str:
         return " or ".join(_description(argument) for argument in arguments)
     if origin is tuple:
         return f"a list, each entry {_description(arguments[0])}"
+    if origin is Mapping and arguments[1] is not Any:
+        return f"names, each with {_description(arguments[1])}"
     return _KINDS.get(kind, "an object of settings")
