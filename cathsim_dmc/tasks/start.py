@@ -10,6 +10,11 @@ from cathsim_dmc.tasks.variations import START_JITTER
 
 # How long the device settles; its hinges relax in 0.4 s.
 _SETTLING_TIME = 2.0  # s
+# By how much the axis of a settled device may stand out of the lumen, m: the pieces of
+# the wall stay behind it by less, the device's radius not counted.
+_OUTSIDE = 0.5e-3
+# Deepest contact that a device at rest makes with a wall that it does not stand in, m.
+_DEEPEST = 1.0e-3
 
 
 class StartPosture:
@@ -29,6 +34,9 @@ class StartPosture:
           scene: Entities and where they stand.
           model: The compiled scene.
           index: Places of the task's quantities in the model.
+
+        Raises:
+          ValueError: if the device comes to rest outside the lumen or in its wall.
         """
         catheter = scene.catheter
         columns = {
@@ -49,6 +57,7 @@ class StartPosture:
         )
         for _ in range(round(_SETTLING_TIME / model.opt.timestep)):
             mujoco.mj_step(model, data)
+        _refuse_outside(scene, model, index, data)
         data.qvel[:] = 0.0
         mujoco.mj_kinematics(model, data)
         mujoco.mj_comPos(model, data)
@@ -115,6 +124,29 @@ class StartPosture:
         qpos[self._bends] = angles
         qpos[self._bends[self._free]] += step[1:]
         qpos[self._insertion] = max(self._advance + step[0], 0.0)
+
+
+def _refuse_outside(
+    scene: Scene, model: mujoco.MjModel, index: ModelIndex, data: mujoco.MjData
+) -> None:
+    """Raises ValueError if a settled device stands outside the lumen or in the wall."""
+    nodes = np.vstack([data.xpos[index.links], data.site_xpos[index.head_site]])
+    place, anatomy = scene.placement, scene.anatomy
+    # Those behind the mouth lie in the sheath, and touch the wall where that does.
+    entered = (nodes - place.inlet) @ place.direction > 0.0
+    out = -float(anatomy.depth(nodes[entered]).min(initial=0.0))
+    wall = [i for i in range(model.ngeom) if model.geom(i).name.startswith("wall_")]
+    touching = np.isin(data.contact.geom, wall).any(axis=-1)
+    deepest = -float(data.contact.dist[touching].min(initial=0.0))
+    if out > _OUTSIDE or deepest > _DEEPEST:
+        raise ValueError(
+            f"{scene.device.name!r} comes to rest {1e3 * max(out, 0.0):.1f} mm outside "
+            f"the lumen of {anatomy.name!r} and {1e3 * deepest:.1f} mm deep in its wall "
+            f"before an episode begins (allowed are {1e3 * _OUTSIDE:g} and "
+            f"{1e3 * _DEEPEST:g} mm): the sheath before its inlet or the first "
+            f"{1e3 * place.start_depth:.0f} mm do not fit; enter it elsewhere, or take "
+            "a device with a shorter or softer tip"
+        )
 
 
 def _dof_of(model: mujoco.MjModel, place: int) -> int:
