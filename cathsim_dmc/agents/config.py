@@ -39,6 +39,9 @@ class TrainingConfig:
         training_max_steps: Largest number of control steps of an episode of the
             training, at whose end the value is carried on; None takes the task's.
             Evaluation and recordings always take the task's.
+        training_start: Least and largest share of the way to the goal that the device
+            has made when an episode of the training starts; None takes the task's.
+            Evaluation and recordings always take the task's.
         backend: Way of simulating: "batched" steps all simulations in one thread
             pool, "composer" runs one dm_control environment after the other (slow;
             the reference).
@@ -96,6 +99,7 @@ class TrainingConfig:
     task_kwargs: Mapping[str, Any] = field(default_factory=dict)
     training_reward: Mapping[str, float] | None = None
     training_max_steps: int | None = None
+    training_start: tuple[float, float] | None = None
     backend: Literal["batched", "composer"] = "batched"
     num_envs: int = 16
     num_threads: int | None = None
@@ -118,7 +122,7 @@ class TrainingConfig:
 
     def __post_init__(self):
         """Validate; every message says what was given and what is allowed."""
-        for name in ("hidden", "observation"):
+        for name in ("hidden", "observation", "training_start"):
             if isinstance(getattr(self, name), list):
                 object.__setattr__(self, name, tuple(getattr(self, name)))
         for name, kind in typing.get_type_hints(type(self)).items():
@@ -188,7 +192,11 @@ class TrainingConfig:
     @property
     def training_kwargs(self) -> dict[str, Any]:
         """Options of the task while it is learnt."""
-        own = {"reward": self.training_reward, "max_steps": self.training_max_steps}
+        own = {
+            "reward": self.training_reward,
+            "max_steps": self.training_max_steps,
+            "start_along_route": self.training_start,
+        }
         given = {name: value for name, value in own.items() if value is not None}
         return {**self.task_kwargs, **given}
 
@@ -206,6 +214,8 @@ class TrainingConfig:
         """The config as JSON-able values, with the algorithm's name."""
         values = dataclasses.asdict(self)
         values["hidden"] = list(self.hidden)
+        if self.training_start is not None:
+            values["training_start"] = list(self.training_start)
         if not isinstance(self.observation, str):
             values["observation"] = list(self.observation)
         return {"algorithm": self.algorithm, **values}

@@ -93,7 +93,9 @@ class Navigation(composer.Task):
             scenes, objectives = zip((scene, objective), *others, strict=True)
             for each in scenes:
                 each.arena.mjcf_model.option.timestep = config.physics_timestep
-            self._cases = cases.alike(scenes, objectives, self._fluoroscopy)
+            self._cases = cases.alike(
+                scenes, objectives, self._fluoroscopy, config.start_along_route
+            )
         self._rollout: Rollout  # there once the model is compiled
         self._observables = None
         self._step: Step | None = None
@@ -107,7 +109,13 @@ class Navigation(composer.Task):
     ) -> Rollout:
         """The course of the task's episodes; see `Rollout`."""
         chosen = self._cases or [
-            cases.Case(self._scene, self._objective, model, self._fluoroscopy)
+            cases.Case(
+                self._scene,
+                self._objective,
+                model,
+                self._fluoroscopy,
+                start_along_route=self._config.start_along_route,
+            )
         ]
         return Rollout(chosen, self._config, model, state, access, num_simulations)
 

@@ -171,7 +171,9 @@ class Rollout:
         self._sensors.restart(index, case.angiograph, episode.deviation)
         self._goal_shift[index] = episode.goal_shift or 0.0
         displacement = case.start.clear_of_wall(episode.displacement)
-        case.start.write(self._state.qpos[index], displacement, episode.roll)
+        number = case.start.draw(random_state)
+        qpos = self._state.qpos[index]
+        case.start.write(qpos, displacement, episode.roll, number)
 
     def pose_robot(self, qpos: np.ndarray) -> np.ndarray:
         """Poses the follower's joints after the device, in place: qpos (N, nq)."""
