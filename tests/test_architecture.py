@@ -53,6 +53,7 @@ CONFINED = {
     "torch": {*_TORCHRL_FACE, "agents/", "analysis/speed/ratios.py"},
     "torchrl": {*_TORCHRL_FACE, "agents/"},
     "tensordict": {*_TORCHRL_FACE, "agents/"},
+    "safetensors": {"agents/pretrained.py"},
     "rerun": {"recording/"},
     "coacd": {"anatomy/"},
     "fast_simplification": {"anatomy/scan/repair.py"},

@@ -23,7 +23,7 @@ try:
 except ImportError:  # Windows: two runners there must not share a grid.
     fcntl = None
 
-_SESSIONS = "sessions.json"
+SESSIONS = "sessions.json"
 _FAILURE = "failure.txt"
 # Longer than `is_busy` of another process holds the lock, s.
 _PATIENCE = 1.0
@@ -222,7 +222,7 @@ def _put_aside(cell: Cell, run: Path) -> None:
 def _note_session(run: Path) -> list[dict[str, Any]]:
     """Add this process to those that worked on a run; return all of them."""
     run.mkdir(parents=True, exist_ok=True)
-    path = run / _SESSIONS
+    path = run / SESSIONS
     # Written atomically, so it is whole if it is there.
     sessions = json.loads(path.read_text()) if path.exists() else []
     sessions.append({"began": provenance.now(), **provenance.commit()})
