@@ -16,6 +16,8 @@ from cathsim_dmc.tasks.variations import Randomisation
 PHYSICS_TIMESTEP = 0.004  # s
 CONTROL_TIMESTEP = 0.04  # s, one frame of fluoroscopy
 MAX_STEPS = 2000  # published
+# The device is laid along the route, whose bends its links cut short.
+LARGEST_START = 0.95
 _MOST_JOINTS = 1000
 MOST_FRICTION = 2.0  # Coulomb coefficient
 # A link shorter than its own radius is no rod; one longer than a vessel is wide does
@@ -33,6 +35,9 @@ class NavigationConfig:
       observation: Name or names of observations, see `observations.OBSERVATIONS`.
       device: Name of a device in `devices.DEVICES`, or a device.
       rotation: Whether the action has a rotation of the base.
+      start_along_route: Least and largest share of the way to the goal that the head
+        of the device has made when an episode starts, drawn anew for each; None for
+        none of it. For curricula.
       max_steps: Number of control steps until the episode is truncated.
       friction: Coulomb coefficient of device on wall.
       shaft_link: Length of the longest link of the shaft, m.
@@ -52,6 +57,7 @@ class NavigationConfig:
     observation: str | Sequence[str] = "internal"
     device: str | devices.Device = "published"
     rotation: bool = False
+    start_along_route: Sequence[float] | None = None
     max_steps: int = MAX_STEPS
     friction: float = FRICTION
     shaft_link: float = 0.0175
@@ -94,6 +100,17 @@ class NavigationConfig:
     def _check_numbers(self):
         bounds.switch("rotation", self.rotation)
         bounds.whole("max_steps", self.max_steps, 1)
+        shares = self.start_along_route
+        if shares is not None and not (
+            isinstance(shares, Sequence)
+            and [type(one) in (int, float) for one in shares] == [True, True]
+            and 0 <= shares[0] <= shares[1] <= LARGEST_START
+        ):
+            bounds.refuse(
+                "start_along_route",
+                shares,
+                f"None, or (low, high) with 0 <= low <= high <= {LARGEST_START:g}",
+            )
         if self.torsion_joints is not None:
             bounds.whole("torsion_joints", self.torsion_joints, 0, _MOST_JOINTS)
         bounds.number("friction", self.friction, 0.0, MOST_FRICTION)
