@@ -140,6 +140,24 @@ def interval(
     return values[0], values[1]
 
 
+def array(name: str, value: Any, kinds: str = "fiu") -> np.ndarray:
+    """An array of finite numbers; `kinds` are those of numpy's dtypes."""
+    try:
+        given = np.asarray(value)
+    except ValueError:  # rows of different lengths
+        given = np.array(None)
+    if given.size and (given.dtype.kind not in kinds or not np.isfinite(given).all()):
+        refuse(name, value, "an array of finite numbers")
+    return given
+
+
+def instance(name: str, value: Any, kind: type) -> Any:
+    """An object of a class."""
+    if not isinstance(value, kind):
+        refuse(name, value, f"a {kind.__name__}")
+    return value
+
+
 def pixels(name: str, value: Any) -> tuple[int, int]:
     """Rows and columns of an image, given as both or as one number for both."""
     values = [value, value] if _is_whole(value) else _row(value)

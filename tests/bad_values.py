@@ -105,8 +105,8 @@ def places(document, path=()):
     if isinstance(document, dict):
         items = document
     elif isinstance(document, list):
-        items = {i: document[i] for i in {0, 1, len(document) - 1} if 0 <= i}
-        items = {i: v for i, v in items.items() if i < len(document)}
+        chosen = {0, 1, len(document) - 1}
+        items = {i: document[i] for i in chosen if 0 <= i < len(document)}
     for key, value in items.items():
         yield (*path, key)
         yield from places(value, (*path, key))

@@ -5,6 +5,7 @@ import dataclasses
 import mujoco
 import numpy as np
 
+from cathsim_dmc import bounds
 from cathsim_dmc.anatomy import Anatomy, Goal
 from cathsim_dmc.entities import arena, devices
 from cathsim_dmc.tasks import objectives as objectives
@@ -75,6 +76,7 @@ def resolve_goal(anatomy: Anatomy, goal: "str | Goal") -> Goal:
     """
     if isinstance(goal, str):
         goal = anatomy.goal(goal)
+    bounds.instance("goal", goal, Goal)
     depth = float(anatomy.depth(goal.position))
     if not depth > 0:
         raise ValueError(
