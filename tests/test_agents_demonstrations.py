@@ -103,7 +103,7 @@ def test_transitions_are_what_an_environment_gives(recorded, shapes):
 
 
 def test_what_does_not_fit_is_refused(recorded, shapes, tmp_path):
-    with pytest.raises(DatasetError, match=r"lacks .*com_inertia.*has .*tracking_points"):
+    with pytest.raises(DatasetError, match="lacks .*com_inertia.*tracking_points"):
         load_transitions(recorded.path, "internal", shapes)
     with pytest.raises(DatasetError, match="actions=21.*actions=22"):
         other = NetworkShapes(shapes.vector, None, 22)
