@@ -44,6 +44,7 @@ class BCConfig(TrainingConfig):
     hidden: tuple[int, ...] = (128, 128)
     learning_rate: float = 1e-3
     normalisation_frames: int = 0
+    training_max_steps: int | None = 300
     checkpoint_frames: int = 10_240
 
     def __post_init__(self):

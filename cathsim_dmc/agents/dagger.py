@@ -55,6 +55,7 @@ class DAggerConfig(TrainingConfig):
     hidden: tuple[int, ...] = (128, 128)
     learning_rate: float = 1e-3
     normalisation_frames: int = 0
+    training_max_steps: int | None = 300
     checkpoint_frames: int = 2_048
 
     def __post_init__(self):
