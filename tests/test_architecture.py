@@ -32,12 +32,14 @@ ALLOWED = {
     "recording": _FACE,
     "analysis": _FACE | {"recording", "validation", "policies"},
     "validation": _FACE | {"recording"},
-    "agents": _FACE | {"recording", "analysis", "policies"},
+    "pictures": _FACE | {"recording", "policies"},
+    "agents": _FACE | {"recording", "analysis", "policies", "pictures"},
     # The faces to the outside: everything but each other.
     "gym": _FACE,
     "play": _FACE | {"recording", "policies"},
     "cli": _FACE
-    | {"recording", "analysis", "validation", "policies", "agents", "play"},
+    | {"recording", "analysis", "validation", "policies", "agents", "play"}
+    | {"pictures"},
 }
 _TORCHRL_FACE = (
     "simulation/torchrl.py",
