@@ -13,6 +13,7 @@ from matplotlib.collections import LineCollection
 from matplotlib.colors import LinearSegmentedColormap, Normalize
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle
+from PIL import Image
 from scipy.interpolate import CubicSpline
 
 from cathsim_dmc.imaging import FluoroscopyOptions
@@ -37,8 +38,8 @@ ARROW_LEAST_N = 1e-4
 # Pieces of the drawn curve in each link.
 _PIECES = 6
 # The X-ray image of `scene_figure` unless another is asked for: arch and branches fill
-# it, and a frame has ten times the usual dose, for looks.
-FLUOROSCOPY = FluoroscopyOptions(size=400, magnification=1.3, kerma=4e-7, noise=True)
+# it, and a frame has a multiple of the usual dose, for looks.
+FLUOROSCOPY = FluoroscopyOptions(size=400, magnification=1.3, kerma=1e-6, noise=True)
 # Percentiles of an image that are shown as black and white.
 WINDOW = (0.02, 99.5)
 _HEIGHT_IN = 6.0
@@ -54,9 +55,12 @@ class Picture(Figure):
         self.agg = FigureCanvasAgg(self)
 
     def _repr_png_(self) -> bytes:
-        buffer = io.BytesIO()
-        self.savefig(buffer, format="png")
-        return buffer.getvalue()
+        """What a notebook shows and keeps: 256 colours take a third of the place."""
+        full, small = io.BytesIO(), io.BytesIO()
+        self.savefig(full, format="png")
+        picture = Image.open(full).convert("RGB")
+        picture.quantize(256, dither=Image.Dither.NONE).save(small, "PNG", optimize=True)
+        return small.getvalue()
 
 
 def force_map() -> LinearSegmentedColormap:
