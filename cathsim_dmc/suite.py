@@ -265,9 +265,6 @@ def load_arches(
 ) -> list[Anatomy]:
     """Random arches of a named set, in the order of their seeds; see `arch_set`.
 
-    Arches whose aorta bends back across the straight sheath, so that no device can
-    enter, are passed over.
-
     Args:
       arches: Name of the set: "train", "test" or "test_variants".
       pool: Number of arches; building one takes about a second and a half.
@@ -275,8 +272,8 @@ def load_arches(
       access: Where the device enters, "ascending" or "descending".
 
     Raises:
-      ValueError: if there is no such set, it has no such arches, or with `pool=1`
-        the one cannot be entered.
+      ValueError: if there is no such set, it has no such arches, or one of them
+        cannot be entered.
     """
     from cathsim_dmc.anatomy.arch import arch
 
@@ -288,19 +285,12 @@ def load_arches(
             "arches, numbered from 0: give whole numbers, pool of at least 1 and first "
             f"+ pool of at most {len(seeds)}"
         )
-    found, number = [], first
-    while len(found) < pool and number < len(seeds):
-        anatomy = arch.build_seed(seeds[number], access=access)
-        if placement.is_clear(anatomy):
-            found.append(anatomy)
-        elif pool == 1:
-            break
-        number += 1
-    if len(found) < pool:
+    found = [arch.build_seed(seed, access=access) for seed in seeds[first:][:pool]]
+    closed = [a.name for a in found if placement.sheath_direction(a) is None]
+    if closed:
         raise ValueError(
-            f"of the arches from number {first} of {arches!r}, {len(found)} can be "
-            f"entered and pool is {pool}: in the others the aorta bends back across "
-            "the straight sheath; give another first, or a smaller pool"
+            f"no sheath fits before the inlet of {', '.join(closed)}, whose aorta "
+            "bends back across it; give another first, or a smaller pool"
         )
     return found
 

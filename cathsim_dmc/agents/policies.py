@@ -82,12 +82,13 @@ def load_policy(policy: PolicyLike, seed: int = 0) -> Policy:
     """A policy from whatever names one.
 
     Args:
-        policy: Name in `POLICIES`, directory of a run or of a checkpoint, Checkpoint,
-            policy, or function as for `FunctionPolicy`.
+        policy: Name in `POLICIES`, "pretrained:NAME", file of a pretrained policy,
+            directory of a run or of a checkpoint, Checkpoint, policy, or function as
+            for `FunctionPolicy`.
         seed: Seed of a named policy's own randomness.
 
     Raises:
-        CheckpointError: it is neither a name nor a directory with a checkpoint.
+        CheckpointError: it is none of these, or damaged.
     """
     if isinstance(policy, Policy):
         return policy
@@ -96,6 +97,13 @@ def load_policy(policy: PolicyLike, seed: int = 0) -> Policy:
     if isinstance(policy, str | Path):
         if str(policy) in POLICIES:
             return make_policy(str(policy), seed)
+        # Imported late: it knows this module.
+        from cathsim_dmc.agents import pretrained
+
+        if str(policy).startswith(pretrained.PREFIX):
+            return pretrained.load_pretrained(str(policy))
+        if Path(policy).suffix == pretrained.SUFFIX:
+            return pretrained.PretrainedPolicy(policy)
         return TrainedPolicy(Checkpoint.open(policy))
     return FunctionPolicy(policy)
 

@@ -178,7 +178,7 @@ def _make_environment(
         num_threads=config.num_threads,
         seed=seed % 2**31,
         backend=config.backend,
-        task_kwargs=config.task_kwargs,
+        task_kwargs=config.training_kwargs,
     )
 
 

@@ -1,4 +1,4 @@
-"""`cathsim eval`, `record`, `replay`, `play` and `demo`."""
+"""`cathsim eval`, `record`, `replay`, `play`, `export` and `demo`."""
 
 import sys
 from pathlib import Path
@@ -20,7 +20,7 @@ from cathsim_dmc.cli.options import (
 def add_to(app: SubcommandApp) -> None:
     """Adds the commands."""
     app.command(name="eval")(evaluate)
-    for command in (record, replay, play, demo):
+    for command in (record, replay, play, export, demo):
         app.command(command)
 
 
@@ -41,7 +41,7 @@ def evaluate(
 
     Args:
         policy: Directory of a run or of a checkpoint, or name of a policy: "random",
-            "push", "expert", "idle", "curl", "random_curl".
+            "push", "expert", "idle", "curl", "random_curl", "pretrained:NAME".
         task: Task of `cathsim list`; by default the one that the policy was trained on.
         episodes: Number of episodes, each with a seed of its own.
         seed: Seed of the first episode; the others count up.
@@ -89,7 +89,7 @@ def record(
 
     Args:
         policy: Directory of a run or of a checkpoint, or name of a policy: "random",
-            "push", "expert", "idle", "curl", "random_curl".
+            "push", "expert", "idle", "curl", "random_curl", "pretrained:NAME".
         out: Path of the .rrd file.
         gif: Path of a film for slides, .gif or .webp; needs no OpenGL.
         task: Task of `cathsim list`; by default the one that the policy was trained on.
@@ -162,7 +162,7 @@ def play(
         episodes: Number of episodes; by default until you quit.
         speed: Speed of the simulation, in multiples of real time.
         policy: Policy to watch instead of playing yourself: directory of a run or of
-            a checkpoint, or name of a policy.
+            a checkpoint, or name of a policy, such as "pretrained:type1_bca".
         anatomy: Anatomy of one's own, for the task `navigate`.
     """
     watched = None
@@ -185,6 +185,41 @@ def play(
     )
     for path in written:
         print(path)
+    return 0
+
+
+def export(
+    run: Annotated[Path, conf.Positional],
+    name: Annotated[str, conf.Positional],
+    /,
+    out: Path | None = None,
+    results: Path = Path("results"),
+    episodes: int = 30,
+    threads: int | None = None,
+) -> int:
+    """Make a policy that ships from a run: evaluate it, write weights and a card.
+
+    Args:
+        run: Directory of a run or of a checkpoint.
+        name: Name of the policy, "type1_bca" for `pretrained:type1_bca`.
+        out: Directory to write to; by default that of the package.
+        results: Directory of `cathsim benchmark table`, for the other seeds.
+        episodes: Number of episodes of the evaluation by the published rule.
+        threads: Number of threads of the simulation; one per core by default.
+    """
+    from cathsim_dmc.agents.pretrained import DIRECTORY
+    from cathsim_dmc.benchmarks.export import export as write
+
+    print(
+        write(
+            run,
+            name,
+            directory=out or DIRECTORY,
+            results=results,
+            episodes=episodes,
+            num_threads=threads,
+        )
+    )
     return 0
 
 

@@ -218,5 +218,5 @@ def _check_task(config: Any) -> None:
     """Load the task once, so that bad input fails before a run is set up."""
     from cathsim_dmc import suite
 
-    kwargs = {**config.task_kwargs, "observation": config.observation}
+    kwargs = {**config.training_kwargs, "observation": config.observation}
     suite.load(suite.DOMAIN, config.task, task_kwargs=kwargs).close()

@@ -48,8 +48,9 @@ def escaped(anatomy: Anatomy, centreline: np.ndarray) -> np.ndarray:
     aside = np.linalg.norm(centreline - inlet.position, axis=-1) > _MOUTH
     axis = np.cross(centreline - inlet.position, inlet.direction)
     in_sheath = ~beyond & (np.linalg.norm(axis, axis=-1) < inlet.radius)
-    outside = anatomy.depth(centreline) < -_ESCAPE_DEPTH
-    return (outside & aside & ~in_sheath).any(-1)
+    outside = aside & ~in_sheath
+    outside[outside] = anatomy.depth(centreline[outside]) < -_ESCAPE_DEPTH
+    return outside.any(-1)
 
 
 class PhysicsMonitor:
