@@ -59,7 +59,9 @@ class Picture(Figure):
         full, small = io.BytesIO(), io.BytesIO()
         self.savefig(full, format="png")
         picture = Image.open(full).convert("RGB")
-        picture.quantize(256, dither=Image.Dither.NONE).save(small, "PNG", optimize=True)
+        picture.quantize(256, dither=Image.Dither.NONE).save(
+            small, "PNG", optimize=True
+        )
         return small.getvalue()
 
 

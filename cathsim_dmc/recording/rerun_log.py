@@ -78,7 +78,7 @@ def write_rrd(
     def fill(stream: rr.RecordingStream) -> None:
         log_episode(stream, episode, drawing, lossless)
 
-    _write(path, _layout(episode, drawing), _title(episode), fill)
+    write_recording(path, layout_of(episode, drawing), _title(episode), fill)
     return Path(path)
 
 
@@ -100,13 +100,23 @@ def log_episode(
         log_frames(log, drawing.frames, lossless)
 
 
-def _write(
+def write_recording(
     path: str | os.PathLike[str],
     layout: Blueprint,
     title: str,
     fill: Callable[[rr.RecordingStream], None],
 ) -> None:
-    """Writes a recording whole or not at all."""
+    """Write a recording, whole or not at all.
+
+    Args:
+        path: Target, ``*.rrd``.
+        layout: How the viewer opens it.
+        title: Name of the recording.
+        fill: Function that logs everything into the stream.
+
+    Raises:
+        RuntimeError: if Rerun is switched off by the ``RERUN`` environment variable.
+    """
     with atomic_path(path, SUFFIX) as temporary:
         stream = rr.RecordingStream(APPLICATION_ID)
         if not stream.is_enabled():
@@ -124,7 +134,8 @@ def _write(
             stream.disconnect()
 
 
-def _layout(episode: Episode, drawing: Drawing) -> Blueprint:
+def layout_of(episode: Episode, drawing: Drawing) -> Blueprint:
+    """How the viewer opens an episode."""
     low, high = drawing.vertices.min(0), drawing.vertices.max(0)
     planes = 0 if drawing.frames is None else drawing.frames.shape[-1]
     robots = [g.body for g in drawing.geoms if g.body_name.startswith("robot/")]
