@@ -288,8 +288,8 @@ def load_arches(
     closed = [a.name for a in found if placement.sheath_direction(a) is None]
     if closed:
         raise ValueError(
-            f"no sheath fits before the inlet of {', '.join(closed)}, whose aorta bends "
-            "back across it; give another first, or a smaller pool"
+            f"no sheath fits before the inlet of {', '.join(closed)}, whose aorta "
+            "bends back across it; give another first, or a smaller pool"
         )
     return found
 

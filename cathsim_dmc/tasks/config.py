@@ -48,7 +48,7 @@ class NavigationConfig:
     """
 
     observation: str | Sequence[str] = "internal"
-    device: str | devices.Device = "published"
+    device: str | devices.Device = "steerable_5f"
     rotation: bool = False
     max_steps: int = MAX_STEPS
     friction: float = FRICTION

@@ -141,8 +141,8 @@ def _refuse_outside(
     if out > _OUTSIDE or deepest > _DEEPEST:
         raise ValueError(
             f"{scene.device.name!r} comes to rest {1e3 * max(out, 0.0):.1f} mm outside "
-            f"the lumen of {anatomy.name!r} and {1e3 * deepest:.1f} mm deep in its wall "
-            f"before an episode begins (allowed are {1e3 * _OUTSIDE:g} and "
+            f"the lumen of {anatomy.name!r} and {1e3 * deepest:.1f} mm deep in its "
+            f"wall before an episode begins (allowed are {1e3 * _OUTSIDE:g} and "
             f"{1e3 * _DEEPEST:g} mm): the sheath before its inlet or the first "
             f"{1e3 * place.start_depth:.0f} mm do not fit; enter it elsewhere, or take "
             "a device with a shorter or softer tip"

@@ -58,7 +58,7 @@ class Capstan:
     expected: float
 
 
-def capstan(friction: float, device: str | devices.Device = "published") -> Capstan:
+def capstan(friction: float, device: str | devices.Device = "steerable_5f") -> Capstan:
     """Pulls the rod over a drum with the contact parameters of the phantom.
 
     The distal end carries a dead load; the base retracts. Both forces are measured,
@@ -135,7 +135,7 @@ def lumen_checks(anatomy: Anatomy, rays: int = RAYS) -> list[Check]:
     name = anatomy.name
     inside = fidelity.intrusion(anatomy).inside
     cover = fidelity.coverage(anatomy, rays)
-    device = devices.get("published")
+    device = devices.get("steerable_5f")
     passage = fidelity.patency(anatomy, device.outer_radius)
     bounds = {"mean": INTRUSION_MEAN, "p95": INTRUSION_P95, "max": INTRUSION_MAX}
     loose = surface.loose_edges(anatomy.surface)
