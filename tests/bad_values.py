@@ -164,9 +164,10 @@ class Tally:
         self.tried = Counter()
         self.wrong = []
 
-    def refused(self, entry, call, words=(), errors=(ValueError, OSError)):
+    def refused(self, entry, call, words=(), errors=(ValueError, OSError), note=""):
         """Calls with bad input; the error must say so in one line with the words."""
-        self.tried[entry] += 1
+        entry_, entry = entry, f"{entry} {note}".strip()
+        self.tried[entry_] += 1
         try:
             result = call()
         except errors as error:

@@ -33,14 +33,15 @@ ALLOWED = {
     "recording": _FACE,
     "analysis": _FACE | {"recording", "validation", "policies"},
     "validation": _FACE | {"recording"},
-    "agents": _FACE | {"recording", "analysis", "policies"},
+    "pictures": _FACE | {"recording", "policies"},
+    "agents": _FACE | {"recording", "analysis", "policies", "pictures"},
     "benchmarks": _FACE | {"recording", "analysis", "policies", "agents"},
     # The faces to the outside: everything but each other.
     "gym": _FACE,
     "play": _FACE | {"recording", "policies"},
     "cli": _FACE
     | {"recording", "analysis", "validation", "policies", "agents", "benchmarks"}
-    | {"play"},
+    | {"play", "pictures"},
 }
 _TORCHRL_FACE = (
     "simulation/torchrl.py",

@@ -83,9 +83,7 @@ def try_json(tally, entry, path, load, examples, harmless=lambda path, value: Fa
     def check(damaged):
         text, where = damaged
         path.write_text(text)
-        tally.refused(f"{entry}, entries", load, [path.name], ERRORS)
-        if tally.wrong and "accepted" in tally.wrong[-1]:
-            tally.wrong[-1] += f" at {where}: {text[:0]}"
+        tally.refused(f"{entry}, entries", load, [path.name], ERRORS, note=where)
 
     try:
         tally.draw(damaged_json(json.loads(good), harmless), examples, check)
@@ -177,7 +175,9 @@ def try_anatomy(tally, store, examples):
         description = json.loads(good[1])
         description["sha256"] = hashlib.sha256(buffer.getvalue()).hexdigest()
         (folder / "anatomy.json").write_text(json.dumps(description))
-        tally.refused("anatomy, arrays", lambda: Anatomy.load(folder), ["anatomy"])
+        tally.refused(
+            "anatomy, arrays", lambda: Anatomy.load(folder), ["anatomy"], note=damage
+        )
 
     # Wall pieces may be none: a phantom without walls is one's own business.
     names = sorted(arrays)
@@ -234,7 +234,7 @@ def try_checkpoint(tally, store, examples):
             changed[key] = changes[kind](state[key])
         torch.save(changed, path / "policy.pt")
         reseal(path)
-        tally.refused("checkpoint, weights", load, ["policy.pt"], ERRORS)
+        tally.refused("checkpoint, weights", load, ["policy.pt"], ERRORS, note=damage)
 
     kinds = st.sampled_from([*changes, "left out", "added"])
     keys = st.sampled_from([k for k, v in state.items() if isinstance(v, torch.Tensor)])

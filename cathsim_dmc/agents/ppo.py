@@ -11,6 +11,7 @@ import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictSequential
 from torch import nn
+from torchrl.envs import EnvBase
 from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.value import GAE
 
@@ -188,6 +189,9 @@ class PPO:
         # A small head starts the policy near the middle of every action's range.
         orthogonal_(network, network.mean, 0.01)
         return make_policy(shapes, config, make_actor(shapes, network))
+
+    def attach(self, env: EnvBase) -> None:
+        """Look at the environment to collect from; not needed."""
 
     def observe(self, batch: TensorDictBase) -> None:
         """Take observation statistics from a batch without learning from it."""

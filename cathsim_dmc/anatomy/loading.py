@@ -12,6 +12,8 @@ from typing import Any
 
 import numpy as np
 
+from cathsim_dmc import files
+
 EXTENT = 2.5  # m, diagonal of the box around an anatomy
 FAR = 10.0  # m from the origin; scanners' frames begin within a few metres
 AROUND = 50e-3  # m, of the wall and of places outside the lumen's box
@@ -88,7 +90,7 @@ def read_arrays(data: bytes, path: Path) -> dict[str, np.ndarray]:
             raise ValueError(f"its arrays unpack to {size:,} bytes")
         with np.load(io.BytesIO(data), allow_pickle=False) as archive:
             return {key: archive[key] for key in archive.files}
-    except (zipfile.BadZipFile, ValueError, OSError, EOFError, KeyError) as error:
+    except files.DAMAGED_ARCHIVE as error:
         raise ValueError(f"{path} is damaged: {error}.") from error
 
 
