@@ -17,6 +17,7 @@ import numpy as np
 MOST_SEED = 2**32 - 1
 # Simulations, episodes: more are a slip of the finger, and fill the memory.
 MOST_SIMULATIONS = 100_000
+MOST_THREADS = 4096
 # Pixels along a side of an image; detectors of angiography have 1,024 to 2,480.
 MOST_PIXELS = 4096
 # Way from the origin of what lies in an anatomy, m.

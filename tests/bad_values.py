@@ -178,7 +178,7 @@ class Tally:
         except BaseException as error:
             self.wrong.append(f"{entry}: crashed with {type(error).__name__}: {error}")
         else:
-            self.wrong.append(f"{entry}: accepted, gave {str(result)[:80]}")
+            self.wrong.append(f"{entry}: accepted, gave {str(result)[:300]}")
 
     def draw(self, strategy, count, check):
         """Calls `check` with so many examples of a strategy."""
