@@ -176,7 +176,7 @@ def _operator(frame: Frame) -> Observation:
 
 def _flat(array: np.ndarray, axes: int) -> np.ndarray:
     """Joins the last `axes` axes."""
-    return array.reshape(*array.shape[: array.ndim - axes], -1)
+    return array.reshape(array.shape[:-axes] + (-1,))
 
 
 @_register(

@@ -148,7 +148,8 @@ class ModelIndex:
             _id(model, mujoco.mjtObj.mjOBJ_JOINT, f"{robot}/{joint.name}")
             for joint in JOINTS
         ]
-        self.robot_qpos = model.jnt_qposadr[follower].copy()
+        # Whole numbers of the size that numpy indexes with: others are cast each time.
+        self.robot_qpos = model.jnt_qposadr[follower].astype(np.intp)
         self.head_site = _id(model, mujoco.mjtObj.mjOBJ_SITE, f"{catheter}/head")
         self.push_force = _sensor(model, f"{catheter}/push_force")
         self.push_torque = _sensor(model, f"{catheter}/push_torque")

@@ -19,7 +19,12 @@ from cathsim_dmc.tasks.cases import Case, model_index
 from cathsim_dmc.tasks.config import NavigationConfig
 from cathsim_dmc.tasks.image_sensors import ImageSensors, open_cameras
 from cathsim_dmc.tasks.objective_pool import together
-from cathsim_dmc.tasks.objectives import Measurement, Objective, ShiftableObjective
+from cathsim_dmc.tasks.objectives import (
+    Measurement,
+    Objective,
+    ShiftableObjective,
+    straight,
+)
 from cathsim_dmc.tasks.path_tracker import PathTracker
 from cathsim_dmc.tasks.physics_errors import PhysicsMonitor
 from cathsim_dmc.tasks.step import Step
@@ -256,9 +261,15 @@ class Rollout:
             their images are captured. None for all, one control step on.
           ended: (N,) bool, None for what the objective and the physics say.
         """
+        goal = self._objective.goal
+        distance = straight(self._readings.head, goal)
         outcome = self._objective.outcome(
             Measurement(
-                self._readings, self._wall_force, self._action, self._previous_action
+                self._readings,
+                self._wall_force,
+                self._action,
+                self._previous_action,
+                distance,
             )
         )
         success = outcome.success
@@ -271,7 +282,6 @@ class Rollout:
                 reward=np.where(failed, 0.0, outcome.reward),
                 terms={n: np.where(failed, 0.0, t) for n, t in outcome.terms.items()},
             )
-        goal = self._objective.goal
         return Step(
             observation=self._observe(goal, fresh),
             outcome=outcome,
@@ -280,7 +290,7 @@ class Rollout:
             errors=tuple(errors),
             readings=self._readings,
             wall_force=self._wall_force,
-            goal=goal,
+            distance=distance,
             path_ratio=self._path.ratio,
         )
 
