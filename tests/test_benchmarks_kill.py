@@ -25,7 +25,7 @@ observation = "internal"
 tasks = ["type1_bca"]
 seeds = [0, 1]
 total_frames = 4096
-evaluation = { episodes = 2 }
+evaluation = { episodes = 2, task_kwargs = { max_steps = 300 } }
 
 [row.settings]
 num_envs = 8
