@@ -78,19 +78,21 @@ def evaluate(
 def record(
     policy: Annotated[str, conf.Positional],
     /,
-    out: Path,
+    out: Path | None = None,
+    gif: Path | None = None,
     task: str | None = None,
     seed: int = EVALUATION_SEED,
     max_steps: int | None = None,
     anatomy: OwnAnatomy = NO_ANATOMY,
     fluoroscopy: bool = True,
 ) -> int:
-    """Record one episode as a Rerun file, and as .npz beside it.
+    """Record one episode: as a Rerun file, and as .npz beside it; or as a film.
 
     Args:
         policy: Directory of a run or of a checkpoint, or name of a policy: "random",
             "push", "expert", "idle", "curl", "random_curl", "pretrained:NAME".
         out: Path of the .rrd file.
+        gif: Path of a film for slides, .gif or .webp; needs no OpenGL.
         task: Task of `cathsim list`; by default the one that the policy was trained on.
         seed: Seed of the episode.
         max_steps: Number of control steps after which the episode is cut off.
@@ -108,8 +110,10 @@ def record(
         max_steps=max_steps,
         task_kwargs=anatomy.task_kwargs or None,
         fluoroscopy=fluoroscopy,
+        gif=gif,
     )
-    print(f"{episode.steps} steps, {episode.termination}: {out}")
+    written = " ".join(str(path) for path in (out, gif) if path is not None)
+    print(f"{episode.steps} steps, {episode.termination}: {written}")
     forces = recorded_forces(episode)
     if forces.sum is not None and forces.max is not None:
         print(

@@ -53,7 +53,7 @@ class Catheter(composer.Entity):
 
     def _build(
         self,
-        device: str | devices.Device = "published",
+        device: str | devices.Device = "steerable_5f",
         discretisation: devices.Discretisation | None = None,
         *,
         stroke: float = 0.25,
