@@ -36,9 +36,7 @@ def intersecting(y_mesh, folder):
 def two_components(y_mesh, folder):
     vertices, faces = y_mesh
     both = np.concatenate([vertices, vertices + 200.0])
-    write_obj(
-        folder / "scan.obj", both, np.concatenate([faces, faces + len(vertices)])
-    )
+    write_obj(folder / "scan.obj", both, np.concatenate([faces, faces + len(vertices)]))
     return ["scan.obj"], "2 separate parts"
 
 

@@ -29,7 +29,7 @@ _LINE_SPACING = 1e-3  # m
 _CLEAR_OF_LUMEN = 5.5e-3  # m
 _NEAR_INLET = 0.015  # m
 # Tilts of the sheath that are tried where the straight one crosses a vessel; 20 degrees
-# are enough for all arches of the set "test".
+# were enough for the first 40 arches of the set "test".
 _TILT_STEP, _LARGEST_TILT = np.radians(2.5), np.radians(30.0)
 _AZIMUTH_STEP = np.radians(15.0)
 
