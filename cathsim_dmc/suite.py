@@ -25,6 +25,7 @@ from cathsim_dmc.anatomy import Anatomy, Goal
 from cathsim_dmc.entities import devices
 from cathsim_dmc.tasks import placement
 from cathsim_dmc.tasks.config import NavigationConfig
+from cathsim_dmc.tasks.environment import Environment
 from cathsim_dmc.tasks.navigation import Navigation
 from cathsim_dmc.tasks.objectives import Cannulation, Objective
 from cathsim_dmc.tasks.scene import Scene
@@ -154,7 +155,7 @@ def make_task(
         scene = Scene.build(anatomy, place, config, goal_radius=objective.goal_radius)
         rooms.append((scene, objective))
     scene, objective = rooms[0]
-    return Navigation(scene, objective, config, random, others=rooms[1:])
+    return Navigation(scene, objective, config, random, others=rooms[1:], name=name)
 
 
 def _one_length(
@@ -310,7 +311,7 @@ def environment(task: Navigation, **environment_kwargs: Any) -> composer.Environ
         "raise_exception_on_physics_error": False,
         **environment_kwargs,
     }
-    return composer.Environment(task, random_state=task.random, **settings)
+    return Environment(task, random_state=task.random, **settings)
 
 
 def _register_domain() -> None:

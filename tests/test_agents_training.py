@@ -335,6 +335,30 @@ def test_metrics_file_appends_whole_rows_and_names_strangers(tmp_path):
     assert [row["frames"] for row in read_metrics(path)] == [1.0]
 
 
+def test_training_has_its_own_reward_and_episodes_and_evaluation_the_tasks(tmp_path):
+    """Without shaping: the published rule judges, whatever was learnt from."""
+    asked = []
+
+    def make_env(task, *, task_kwargs, **options):
+        asked.append(dict(task_kwargs))
+        own = {k: v for k, v in task_kwargs.items() if k == "max_steps"}
+        return synthetic_env.make_env(task, task_kwargs=own, **options)
+
+    config = small_ppo(
+        total_frames=512,
+        task_kwargs={"friction": 0.1},
+        training_reward={"path": -1.0, "success": 10.0},
+        training_max_steps=20,
+    )
+    train(config, tmp_path, progress=False, make_env=make_env)
+    (row,) = read_metrics(tmp_path / "metrics.csv")
+    assert row["episode_length"] <= 20
+    result = evaluate(tmp_path, episodes=4, make_env=make_env)
+    assert max(episode.length for episode in result.episodes) > 20
+    shaped = {"reward": {"path": -1.0, "success": 10.0}, "max_steps": 20}
+    assert asked == [{"friction": 0.1, **shaped}, {"friction": 0.1}]
+
+
 def test_importing_agents_loads_torchrl_before_dm_control():
     script = (
         "import os, sys; before = dict(os.environ)\n"

@@ -115,7 +115,7 @@ def test_plane_is_turned_from_the_sagittal_plane():
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"descending_radius": 0.05}, "descending_radius is 0.05 m; allowed is"),
+        ({"descending_radius": 0.05}, "descending_radius is 0.05; it must be"),
         ({"bca_drop": 9.0}, "LCCA diameters"),
         ({"bca_lcca_spacing": 5e-3}, "bca_lcca_spacing"),
         ({"arch_height": 0.015}, "Enlarge arch_radius"),

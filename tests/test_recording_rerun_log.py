@@ -8,7 +8,8 @@ from recording_samples import make_episode, make_tube
 from scipy.spatial.transform import Rotation
 
 from cathsim_dmc.recording.geometry import rotate
-from cathsim_dmc.recording.rerun_log import ARROW_METRES_PER_NEWTON, write_rrd
+from cathsim_dmc.recording.rerun_device import arrow_scale
+from cathsim_dmc.recording.rerun_log import write_rrd
 from cathsim_dmc.recording.scene import BodyGeom
 
 STEPS = 6
@@ -142,6 +143,7 @@ def test_every_entity_lives_on_both_timelines_at_the_right_rows(written):
         "/world/catheter/trail": steps,
         "/world/robot/wheel": states,
         "/world/contacts": steps,
+        "/world/heat": steps,
         "/fluoroscopy": states,
         "/series/reward": steps,
         "/series/distance_mm": states,
@@ -153,7 +155,7 @@ def test_every_entity_lives_on_both_timelines_at_the_right_rows(written):
         "/series/action/tip_bend": states[:-1],
         "/series/action_all": states[:-1],
     }
-    assert set(recording.temporal) == set(expected)
+    assert set(recording.temporal) == {*expected, "/events"}
     for entity, rows in expected.items():
         assert recording.values(entity, "step") == rows, entity
         wanted = [round(episode.time[row] * 1e9) for row in rows]
@@ -183,7 +185,7 @@ def test_arrows_show_the_contacts_of_their_step_only(written):
     assert all(v is not None for v in vectors)
     np.testing.assert_allclose(
         np.concatenate([v for v in vectors if v]),
-        ARROW_METRES_PER_NEWTON * episode.contact_force,
+        arrow_scale(episode) * episode.contact_force,
         atol=1e-6,
     )
     np.testing.assert_allclose(
@@ -206,12 +208,33 @@ def test_series_hold_the_values_of_the_episode(written):
         scalars("action/tip_bend")[:, 0],
         np.sqrt((episode.action[:, :20] ** 2).mean(axis=1)),
     )
-    np.testing.assert_array_equal(scalars("force/push")[:, 0], episode.push_force)
+    np.testing.assert_array_equal(scalars("force/push")[:, 0], 1e3 * episode.push_force)
     np.testing.assert_allclose(
         scalars("distance_mm")[:, 0], 1e3 * np.array(episode.meta["distance"])
     )
     names = recording.fixed("/series/action_all", "SeriesLines:names")
     assert names[:3] == ["tip_x_0", "tip_y_0", "tip_x_1"] and names[-1] == "translation"
+
+
+def test_events_stand_at_the_states_where_they_happen(written):
+    episode, _, _, recording = written
+    texts = [text[0] for text in recording.values("/events", "TextLog:text")]
+    rows = dict(zip(texts, recording.values("/events", "step"), strict=True))
+    assert rows["start of type1_bca"] == 0 and rows["end: success"] == STEPS
+    row = int(episode.wall_force_max.argmax())
+    assert rows[f"largest force, {1e3 * episode.wall_force_max[row]:.3g} mN"] == row + 1
+    nearest = int(np.argmin(episode.meta["distance"]))
+    named = [text for text in texts if text.startswith("nearest to the goal")]
+    assert [rows[text] for text in named] == [nearest]
+
+
+def test_links_take_the_colour_of_what_they_press(written):
+    episode, _, _, recording = written
+    colours = np.array(recording.values("/world/catheter", "Capsules3D:colors"))
+    plain = colours[0, 0]
+    assert (colours[0] == plain).all()  # nothing is known of the start
+    touched = (colours != plain).any(axis=1)[1:]
+    assert touched.tolist() == [bool(n) for n in episode.contact_counts]
 
 
 def test_bodies_carry_their_geoms(written):

@@ -215,7 +215,7 @@ def test_options_are_json_and_wrong_ones_are_refused():
     for options, message in (
         ({"fluoroscopy": {"view": "PA"}}, "LAO45"),
         ({"fluoroscopy": {"zoom": 2}}, "magnification"),
-        ({"fluoroscopy": {"size": 0}}, "resolution"),
+        ({"fluoroscopy": {"size": 0}}, "size is 0"),
         ({"fluoroscopy": {"view": (0, 90)}}, "secondary"),
         ({"cameras": {"names": "front"}}, "top, side, tip"),
         ({"cameras": {"size": (0, 1)}}, "size"),

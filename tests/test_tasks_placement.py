@@ -15,7 +15,9 @@ from cathsim_dmc.anatomy import phantoms
 from cathsim_dmc.anatomy.anatomy import Inlet
 from cathsim_dmc.anatomy.arch import arch
 from cathsim_dmc.entities import devices
+from cathsim_dmc.simulation.batch import BatchSimulation
 from cathsim_dmc.tasks import placement, readings
+from cathsim_dmc.tasks.config import NavigationConfig
 
 ANGLES = st.floats(0, 2 * math.pi)
 
@@ -40,7 +42,10 @@ def test_frame_turns_z_into_any_direction(azimuth, height):
     matrix = np.empty(9)
     mujoco.mju_quat2Mat(matrix, placed.quaternion)
     matrix = matrix.reshape(3, 3)
-    np.testing.assert_allclose(matrix[:, 2], inlet.direction, atol=1e-7)
+    # Of the sheath, which is tilted where the inlet's own would cross the aorta.
+    axis = placed.direction
+    np.testing.assert_allclose(matrix[:, 2], axis, atol=1e-7)
+    assert axis @ inlet.direction > 0.5
     assert np.linalg.det(matrix) == pytest.approx(1, abs=1e-7)
     # +y, below the device on the table, stays as posterior as it can.
     if abs(axis[1]) < 0.98:
@@ -215,3 +220,28 @@ def test_a_model_without_the_names(shared_environment, scopes, message):
     model = shared_environment("type1_bca").physics.model.ptr
     with pytest.raises(ValueError, match=message):
         readings.ModelIndex(model, *scopes)
+
+
+def test_an_episode_may_start_along_the_route():
+    """The head lies further and further in, at rest, alike for composer and batch."""
+    options = {"start_along_route": (0.0, 0.9), "random": 0}
+    task = suite.make_task("type1_lcca", **options)
+    environment = suite.environment(task)
+    starts = []
+    for _ in range(12):
+        environment.reset()
+        head = task.readings.head
+        starts.append(head)
+        assert task.scene.anatomy.depth(head) > 0
+    ways = task.objective.path_distance(np.array(starts))
+    whole = task.objective.route.length - task.scene.placement.start_depth
+    assert ways.min() < 0.25 * whole and ways.max() > 0.75 * whole
+    batch = BatchSimulation(suite.make_task("type1_lcca", **options), 1, seeds=0)
+    for start in starts[:3]:
+        np.testing.assert_array_equal(batch.reset().readings.head[0], start)
+
+
+@pytest.mark.parametrize("given", [0.5, (0.5,), (0.5, 0.2), (0, 2), ("0", 1), (-1, 0)])
+def test_bad_shares_of_the_route_are_refused(given):
+    with pytest.raises(ValueError, match=r"start_along_route.*0 <= low <= high"):
+        NavigationConfig(start_along_route=given)

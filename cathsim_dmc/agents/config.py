@@ -33,6 +33,15 @@ class TrainingConfig:
         observation: Name or names of the task's observations, such as "internal",
             "image", "sequential" or "tracking".
         task_kwargs: Further options of the task; must be JSON-able.
+        training_reward: Weights of the reward terms to learn from, such as
+            {"path": -1, "success": 10}; None takes the task's. Evaluation and
+            recordings always take the task's.
+        training_max_steps: Largest number of control steps of an episode of the
+            training, at whose end the value is carried on; None takes the task's.
+            Evaluation and recordings always take the task's.
+        training_start: Least and largest share of the way to the goal that the device
+            has made when an episode of the training starts; None takes the task's.
+            Evaluation and recordings always take the task's.
         backend: Way of simulating: "batched" steps all simulations in one thread
             pool, "composer" runs one dm_control environment after the other (slow;
             the reference).
@@ -52,7 +61,11 @@ class TrainingConfig:
         normalisation_frames: Number of random control steps before the first update,
             from which the first observation statistics come; they are not counted as
             frames. An algorithm that begins with random actions anyway (SAC) needs
-            none.
+            none, nor does one that starts from another policy.
+        initial_policy: Directory of the run or checkpoint whose policy the networks
+            start from, with its observation statistics; None starts afresh.
+        initial_std: Deviation before the tanh that every action of such a policy
+            starts with; None keeps the policy's own.
         checkpoint_frames: Number of frames between two checkpoints.
         checkpoint_seconds: Longest time between two checkpoints in seconds of wall
             time, so that a killed run loses no more.
@@ -88,6 +101,9 @@ class TrainingConfig:
     task: str = "type1_bca"
     observation: str | tuple[str, ...] = "internal"
     task_kwargs: Mapping[str, Any] = field(default_factory=dict)
+    training_reward: Mapping[str, float] | None = None
+    training_max_steps: int | None = None
+    training_start: tuple[float, float] | None = None
     backend: Literal["batched", "composer"] = "batched"
     num_envs: int = 16
     num_threads: int | None = None
@@ -100,6 +116,8 @@ class TrainingConfig:
     gamma: float = 0.99
     observation_clip: float = 10.0
     normalisation_frames: int = 4_096
+    initial_policy: str | None = None
+    initial_std: float | None = None
     checkpoint_frames: int = 51_200
     checkpoint_seconds: float = 120.0
     keep_checkpoints: int = 3
@@ -110,13 +128,15 @@ class TrainingConfig:
 
     def __post_init__(self):
         """Validate; every message says what was given and what is allowed."""
-        for name in ("hidden", "observation"):
+        for name in ("hidden", "observation", "training_start"):
             if isinstance(getattr(self, name), list):
                 object.__setattr__(self, name, tuple(getattr(self, name)))
         for name, kind in typing.get_type_hints(type(self)).items():
             if typing.get_origin(kind) is not ClassVar:
                 _require_type(name, getattr(self, name), kind)
         object.__setattr__(self, "task_kwargs", dict(self.task_kwargs))
+        if self.training_reward is not None:
+            object.__setattr__(self, "training_reward", dict(self.training_reward))
         require(bool(self.task), "task", self.task, "the name of a task")
         require(bool(self.observation), "observation", self.observation, "a name")
         require(
@@ -143,6 +163,13 @@ class TrainingConfig:
             "observation_clip",
             "checkpoint_seconds",
         )
+        steps = self.training_max_steps
+        require(
+            steps is None or steps > 0,
+            "training_max_steps",
+            steps,
+            "a positive integer, or None for the task's own",
+        )
         for name in ("seed", "normalisation_frames"):
             value = getattr(self, name)
             require(value >= 0, name, value, "an integer >= 0")
@@ -152,6 +179,13 @@ class TrainingConfig:
             "num_threads",
             threads,
             "a positive integer, or None for every core",
+        )
+        deviation = self.initial_std
+        require(
+            deviation is None or deviation > 0,
+            "initial_std",
+            deviation,
+            "positive, or None for the policy's own",
         )
         require(0 < self.gamma <= 1, "gamma", self.gamma, "in (0, 1]")
         try:
@@ -169,6 +203,17 @@ class TrainingConfig:
             require(value > 0, name, value, kind)
 
     @property
+    def training_kwargs(self) -> dict[str, Any]:
+        """Options of the task while it is learnt."""
+        own = {
+            "reward": self.training_reward,
+            "max_steps": self.training_max_steps,
+            "start_along_route": self.training_start,
+        }
+        given = {name: value for name, value in own.items() if value is not None}
+        return {**self.task_kwargs, **given}
+
+    @property
     def frames_per_batch(self) -> int:
         """Number of frames between two calls of the learner's update."""
         raise NotImplementedError
@@ -182,6 +227,8 @@ class TrainingConfig:
         """The config as JSON-able values, with the algorithm's name."""
         values = dataclasses.asdict(self)
         values["hidden"] = list(self.hidden)
+        if self.training_start is not None:
+            values["training_start"] = list(self.training_start)
         if not isinstance(self.observation, str):
             values["observation"] = list(self.observation)
         return {"algorithm": self.algorithm, **values}
@@ -237,8 +284,11 @@ def _fits(value: object, kind: Any) -> bool:
         return any(_fits(value, argument) for argument in arguments)
     if origin is tuple:
         return isinstance(value, tuple) and all(_fits(v, arguments[0]) for v in value)
-    if origin is Mapping or origin is None and kind is Mapping:
-        return isinstance(value, Mapping)
+    if origin is Mapping:
+        return isinstance(value, Mapping) and all(
+            isinstance(name, str) and (arguments[1] is Any or _fits(one, arguments[1]))
+            for name, one in value.items()
+        )
     if type(value) is int and abs(value) > MAX_INTEGER:
         return False
     if kind is float:
@@ -257,4 +307,6 @@ def _description(kind: Any) -> str:
         return " or ".join(_description(argument) for argument in arguments)
     if origin is tuple:
         return f"a list, each entry {_description(arguments[0])}"
+    if origin is Mapping and arguments[1] is not Any:
+        return f"names, each with {_description(arguments[1])}"
     return _KINDS.get(kind, "an object of settings")

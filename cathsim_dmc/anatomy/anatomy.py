@@ -105,7 +105,7 @@ class End:
         object.__setattr__(self, "direction", _unit(self.direction, "end direction"))
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Surface:
     """Triangles of the lumen surface, normals outwards, closed.
 
@@ -133,6 +133,10 @@ class Surface:
         object.__setattr__(self, "vertices", vertices)
         object.__setattr__(self, "faces", faces)
 
+    def __repr__(self) -> str:
+        """Numbers of vertices and triangles."""
+        return f"<Surface: {len(self.vertices)} vertices, {len(self.faces)} triangles>"
+
     @property
     def volume(self) -> float:
         """Enclosed volume (m^3), positive when normals point outwards."""
@@ -140,7 +144,7 @@ class Surface:
         return float(np.einsum("fj,fj->", a, np.cross(b, c)) / 6.0)
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Anatomy:
     """An anatomy ready for simulation.
 
@@ -180,6 +184,16 @@ class Anatomy:
         object.__setattr__(self, "wall", wall)
         object.__setattr__(self, "goals", dict(self.goals))
         object.__setattr__(self, "ends", tuple(self.ends))
+
+    def __repr__(self) -> str:
+        """Name, vessels, size, goals and wall in one line."""
+        box = 1e3 * np.ptp(self.surface.vertices, axis=0)
+        return (
+            f"<Anatomy {self.name!r}: vessels {', '.join(self.tree.vessels)}; "
+            f"{' x '.join(f'{side:.0f}' for side in box)} mm; goals "
+            f"{', '.join(self.goals) or 'none'}; inlet in {self.inlet.vessel}; "
+            f"{len(self.wall)} wall pieces>"
+        )
 
     @classmethod
     def from_tree(

@@ -139,7 +139,12 @@ def _clamp(insertion: Scalars, offset: float) -> tuple[Scalars, Scalars]:
 def _smoothstep(u: Scalars) -> Scalars:
     # Plain floats are worth it: this runs in every control step, on caches that the
     # physics has just filled, where each call of numpy takes microseconds.
-    u = min(max(u, 0.0), 1.0) if isinstance(u, float) else np.clip(u, 0.0, 1.0)
+    if not isinstance(u, float):
+        u = np.clip(u, 0.0, 1.0)
+    elif u <= 0.0:
+        return 0.0
+    elif u >= 1.0:
+        return 1.0
     return u * u * (3.0 - 2.0 * u)
 
 

@@ -44,6 +44,7 @@ class Navigation(composer.Task):
         config: NavigationConfig | None = None,
         random: np.random.RandomState | int | None = None,
         others: Sequence[tuple[Scene, Objective]] = (),
+        name: str | None = None,
     ):
         """Takes over the scene.
 
@@ -55,11 +56,13 @@ class Navigation(composer.Task):
           others: Scenes and objectives beside the first, if each episode is to draw
             one of them: another anatomy, with the same device and goals of the same
             names. All are compiled here, which takes a second each.
+          name: Name of the task for people; None takes the class's.
 
         Raises:
           ValueError: if the objective cannot do what the randomisation asks for, or
             the scenes differ in more than their anatomies.
         """
+        self.name = name or type(self).__name__
         self._scene = scene
         self._objective = objective
         self._config = config = config or NavigationConfig()
@@ -93,7 +96,9 @@ class Navigation(composer.Task):
             scenes, objectives = zip((scene, objective), *others, strict=True)
             for each in scenes:
                 each.arena.mjcf_model.option.timestep = config.physics_timestep
-            self._cases = cases.alike(scenes, objectives, self._fluoroscopy)
+            self._cases = cases.alike(
+                scenes, objectives, self._fluoroscopy, config.start_along_route
+            )
         self._rollout: Rollout  # there once the model is compiled
         self._observables = None
         self._step: Step | None = None
@@ -107,9 +112,29 @@ class Navigation(composer.Task):
     ) -> Rollout:
         """The course of the task's episodes; see `Rollout`."""
         chosen = self._cases or [
-            cases.Case(self._scene, self._objective, model, self._fluoroscopy)
+            cases.Case(
+                self._scene,
+                self._objective,
+                model,
+                self._fluoroscopy,
+                start_along_route=self._config.start_along_route,
+            )
         ]
         return Rollout(chosen, self._config, model, state, access, num_simulations)
+
+    def __repr__(self) -> str:
+        """Name, anatomy, goal, device and what is observed."""
+        scene = self.scene
+        anatomy = (
+            f"{self.num_anatomies} anatomies"
+            if self.num_anatomies > 1
+            else f"anatomy {scene.anatomy.name!r}"
+        )
+        return (
+            f"<{self.name}: {anatomy}, goal {scene.goal.name!r} within "
+            f"{1e3 * self.objective.goal_radius:g} mm, device {scene.device.name!r}, "
+            f"{self._num_actions} actions, observation {', '.join(self._names)}>"
+        )
 
     # Composer's hooks.
 
@@ -155,6 +180,7 @@ class Navigation(composer.Task):
             model, SingleState(self._data), _SingleAccess(model, self._data)
         )
         self._substeps = self.substeps  # which asks the MJCF model, and takes its time
+        self._warnings = self._data.warning.number  # not a copy
         self._state = np.zeros(mujoco.mj_stateSize(model, _STATE))
         self._contacts = self._data.sensordata[self._rollout.index.wall_contacts]
         self._contact_history = forces.ContactHistory(
@@ -176,7 +202,7 @@ class Navigation(composer.Task):
         action = check_action(action, (self._num_actions,))
         control = self._rollout.command(action[None], self._read_state)
         self._data.ctrl[:] = control[0]
-        self._warnings = self._data.warning.number.tobytes()
+        self._warned_before = self._warnings.tobytes()
         self._contact_history.clear()
         self._substep = 0
 
@@ -220,7 +246,7 @@ class Navigation(composer.Task):
     def after_step(self, physics, random_state):
         """Decides reward, success and end of the episode, once."""
         del physics, random_state
-        warned = self._data.warning.number.tobytes() != self._warnings
+        warned = self._warnings.tobytes() != self._warned_before
         magnitudes = self._contact_history.magnitudes()[None]
         self._step = self._rollout.finish(magnitudes, [warned])
 

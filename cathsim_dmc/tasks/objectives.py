@@ -8,6 +8,7 @@ from typing import ClassVar, NamedTuple, Protocol
 import numpy as np
 
 from cathsim_dmc.anatomy import Anatomy, Centreline, Goal
+from cathsim_dmc.anatomy.geodesic import LumenDistance
 from cathsim_dmc.tasks import forces, readings
 
 _NOTHING = np.zeros(())
@@ -71,7 +72,7 @@ class Objective(Protocol):
         ...
 
     def path_distance(self, head: np.ndarray) -> np.ndarray:
-        """Way (...) from heads (..., 3) to the goal through the lumen, m."""
+        """Way (...) from heads (..., 3) at the start to the goal along the route, m."""
         ...
 
 
@@ -100,6 +101,8 @@ class Cannulation:
       goal_radius: δ, m.
       weights: reward term to its weight; terms without one are not worked out.
       goal_arc_length: () or (N,), of the goal on the route, m; None for its end.
+      lumen: shortest ways through the lumen to the end of the route; None where no
+        term asks for them.
     """
 
     goal: np.ndarray
@@ -111,6 +114,7 @@ class Cannulation:
         default_factory=lambda: PUBLISHED_REWARD
     )
     goal_arc_length: np.ndarray | None = None
+    lumen: LumenDistance | None = None
 
     # Reward terms before weighting: arrays (...) of an objective and a measurement. A
     # subclass adds terms of its own.
@@ -120,8 +124,8 @@ class Cannulation:
         {
             # Straight from head to goal, m.
             "distance": lambda self, m: self.distance(m.readings.head),
-            # Way along the route that is left, and distance from the route, m.
-            "path": lambda self, m: self.path_distance(m.readings.head),
+            # Shortest way from head to goal inside the lumen, m.
+            "path": lambda self, m: self.lumen_distance(m.readings.head),
             # Sum of all contacts on the wall at the end of the control step, N.
             "force": lambda self, m: m.wall_force.sum,
             # Largest single contact in any physics step of the control step, N.
@@ -184,7 +188,7 @@ class Cannulation:
         vessel = anatomy.tree.vessel(goal.vessel)
         route = anatomy.route(goal, farthest_shift)
         arc_length = route.project(goal.position).arc_length if farthest_shift else None
-        return cls(
+        objective = cls(
             goal=goal.position,
             branch=vessel.centreline,
             ostium=vessel.ostium,
@@ -193,11 +197,14 @@ class Cannulation:
             weights=reward,
             goal_arc_length=arc_length,
         )
+        if "path" not in objective.weights:
+            return objective
+        return dataclasses.replace(objective, lumen=_ways_to(anatomy, route))
 
     def outcome(self, measurement: Measurement) -> Outcome:
         """Judges a control step."""
         success = self.success(measurement.readings.head)
-        any_success = success.any()
+        any_success = np.count_nonzero(success)
         terms = {}
         for name, weight in self.weights.items():
             if name == "success":
@@ -207,12 +214,12 @@ class Cannulation:
             if any_success and name in self.UNTIL_SUCCESS:
                 term = np.where(success, 0.0, term)
             terms[name] = term
-        return Outcome(sum(terms.values(), _NOTHING), success, MappingProxyType(terms))
+        return Outcome(sum(terms.values(), _NOTHING), success, terms)
 
     def success(self, head: np.ndarray) -> np.ndarray:
         """Whether heads (..., 3) are in the branch and within the goal's radius."""
         success = self.distance(head) < self.goal_radius
-        if success.any():  # finding the place in the branch takes 50 µs
+        if np.count_nonzero(success):  # finding the place in the branch takes 50 µs
             success = success & self.in_branch(head)
         return success
 
@@ -225,6 +232,20 @@ class Cannulation:
         """Whether the head (..., 3) is in the lumen of the branch, past its ostium."""
         place = self.branch.project(head)
         return (place.distance <= place.radius) & (place.arc_length >= self.ostium)
+
+    def lumen_distance(self, head: np.ndarray) -> np.ndarray:
+        """Shortest way (...) from heads (..., 3) to the goal inside the lumen, m.
+
+        From a head in another branch it leads back through the parent vessel.
+        """
+        if self.lumen is None:
+            raise ValueError(
+                "the objective has no ways through the lumen; make it with "
+                "Cannulation.to and a reward with the term 'path'"
+            )
+        # The goal lies on the way to the end of the route or at it.
+        left = self.lumen(head) - self.lumen(self.goal)
+        return np.maximum(left, self.distance(head))
 
     def path_distance(self, head: np.ndarray) -> np.ndarray:
         """Way (...) along the route to the goal plus distance from the route, m."""
@@ -247,3 +268,12 @@ class Cannulation:
         goal = self.goal + moved
         arc_length = self.route.project(goal).arc_length
         return dataclasses.replace(self, goal=goal, goal_arc_length=arc_length)
+
+
+def _ways_to(anatomy: Anatomy, route: Centreline) -> LumenDistance:
+    """Shortest ways through the lumen of an anatomy to the end of a route."""
+    vertices = anatomy.surface.vertices
+    bounds = np.stack([vertices.min(0), vertices.max(0)])
+    return LumenDistance(
+        anatomy.depth, bounds, route.points[-1], anatomy.inlet.position
+    )

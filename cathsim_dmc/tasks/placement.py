@@ -132,8 +132,8 @@ def place_device(
     matrix = np.empty(9)
     mujoco.mju_quat2Mat(matrix, quaternion)
     outside = np.array([0.0, 0.0, working_length - start_depth])
-    # A little longer than the device, whose links are chords of the line.
-    ahead = np.arange(0.0, min(2 * start_depth, route.length), _LINE_SPACING)
+    # Longer than the device lies in, whose links are chords of the line.
+    ahead = np.arange(0.0, route.length, _LINE_SPACING)
     inside = (route.at(ahead).position - inlet.position) @ matrix.reshape(3, 3)
     # The first point of the route is the inlet; the sheath ends there, straight.
     line = np.vstack([np.zeros(3), inside - inside[0] + outside])

@@ -1,9 +1,10 @@
 """What a task reads from the simulator, for one simulation or for many at once.
 
-A `ModelIndex` finds the quantities of a compiled model by name once; `ModelIndex.read`
-then takes them from any object with MuJoCo's array names: an `mujoco.MjData`, with
-arrays such as qpos (nq,), or a `mujoco.batch.Batch`, with arrays such as qpos (N, nq).
-Every array of the result has the leading axes of the source, written `...` below.
+A `ModelIndex` finds the quantities of a compiled model by name once. `ModelIndex.views`
+finds them in any object with MuJoCo's array names: an `mujoco.MjData`, with arrays such
+as qpos (nq,), or a `mujoco.batch.Batch`, with arrays such as qpos (N, nq). `Views.read`
+then takes them, step after step. Every array of the result has the leading axes of the
+source, written `...` below.
 """
 
 from typing import NamedTuple
@@ -54,10 +55,53 @@ class Readings(NamedTuple):
     load_cell: np.ndarray
 
 
+class Views(NamedTuple):
+    """Where the readings lie in a simulator's arrays, which change under them.
+
+    Attributes:
+      links: (..., L, 3), proximal ends of the links.
+      tip: (..., 1, 3), the head, in line with the links.
+      load_cell: (..., 3), force of the support on the phantom.
+
+    The others are those of `Readings`.
+    """
+
+    insertion: np.ndarray
+    joint_positions: np.ndarray
+    joint_velocities: np.ndarray
+    com_inertia: np.ndarray
+    com_velocity: np.ndarray
+    actuator_force: np.ndarray
+    external_force: np.ndarray
+    links: np.ndarray
+    tip: np.ndarray
+    head: np.ndarray
+    push_force: np.ndarray
+    push_torque: np.ndarray
+    load_cell: np.ndarray
+
+    def read(self) -> Readings:
+        """Takes the readings as they stand, as copies."""
+        return Readings(
+            insertion=self.insertion.copy(),
+            joint_positions=self.joint_positions.copy(),
+            joint_velocities=self.joint_velocities.copy(),
+            com_inertia=self.com_inertia.copy(),
+            com_velocity=self.com_velocity.copy(),
+            actuator_force=self.actuator_force.copy(),
+            external_force=self.external_force.copy(),
+            centreline=np.concatenate([self.links, self.tip], axis=-2),
+            head=self.head.copy(),
+            push_force=self.push_force.copy(),
+            push_torque=self.push_torque.copy(),
+            load_cell=-self.load_cell,
+        )
+
+
 class ModelIndex:
     """Places of a task's quantities in the arrays of a compiled model."""
 
-    # Fields of `mujoco.MjData` that `read` uses, for a batch to bind beforehand.
+    # Fields of `mujoco.MjData` that `views` uses, for a batch to bind beforehand.
     FIELDS = (
         "qpos",
         "qvel",
@@ -111,31 +155,37 @@ class ModelIndex:
         self.load_cell = _sensor(model, "load_cell")
         self.wall_contacts = _sensor(model, "wall_contacts")
 
-    def read(self, data) -> Readings:
-        """Takes the readings, as copies.
+    def views(self, data) -> Views:
+        """Finds the readings in a simulator's arrays.
 
         Args:
           data: an `mujoco.MjData` or a `mujoco.batch.Batch` with `FIELDS` bound.
+
+        Returns:
+          Views, not copied; they stay valid as long as `data` lives.
         """
-        xpos = data.xpos[..., self.links, :]
+        qpos, sensors = data.qpos, data.sensordata
         head = data.site_xpos[..., self.head_site, :]
-        sensors = data.sensordata
-        qpos = data.qpos
-        return Readings(
-            insertion=qpos[..., self.insertion_qpos].copy(),
-            joint_positions=qpos[..., self.qpos].copy(),
-            joint_velocities=data.qvel[..., self.dofs].copy(),
-            com_inertia=data.cinert[..., self.links, :].copy(),
-            com_velocity=data.cvel[..., self.links, :].copy(),
-            actuator_force=data.qfrc_actuator[..., self.dofs].copy(),
-            external_force=data.cfrc_ext[..., self.links, :].copy(),
-            centreline=np.concatenate([xpos, head[..., None, :]], axis=-2),
-            head=head.copy(),
+        return Views(
+            insertion=qpos[..., self.insertion_qpos],
+            joint_positions=qpos[..., self.qpos],
+            joint_velocities=data.qvel[..., self.dofs],
+            com_inertia=data.cinert[..., self.links, :],
+            com_velocity=data.cvel[..., self.links, :],
+            actuator_force=data.qfrc_actuator[..., self.dofs],
+            external_force=data.cfrc_ext[..., self.links, :],
+            links=data.xpos[..., self.links, :],
+            tip=head[..., None, :],
+            head=head,
             # MuJoCo reports the force of the parent on the site's body.
-            push_force=sensors[..., self.push_force.start + 2].copy(),
-            push_torque=sensors[..., self.push_torque.start + 2].copy(),
-            load_cell=-sensors[..., self.load_cell],
+            push_force=sensors[..., self.push_force.start + 2],
+            push_torque=sensors[..., self.push_torque.start + 2],
+            load_cell=sensors[..., self.load_cell],
         )
+
+    def read(self, data) -> Readings:
+        """Takes the readings once, as copies; see `views`."""
+        return self.views(data).read()
 
     def contacts(self, sensordata: np.ndarray) -> forces.Contacts:
         """Contacts with the wall from sensor rows (..., nsensordata)."""

@@ -95,6 +95,7 @@ class Rollout:
         self._names = observations.resolve(config.observation)
         catheter = scene.catheter.mjcf_model.model
         self._index = model_index(scene, model)
+        self._views = self._index.views(state)
         num_actions = len(scene.catheter.actuators)
         randomisation = config.ranges
         self._variation = ModelVariation(model, randomisation, catheter)
@@ -170,7 +171,9 @@ class Rollout:
         self._sensors.restart(index, case.angiograph, episode.deviation)
         self._goal_shift[index] = episode.goal_shift or 0.0
         displacement = case.start.clear_of_wall(episode.displacement)
-        case.start.write(self._state.qpos[index], displacement, episode.roll)
+        number = case.start.draw(random_state)
+        qpos = self._state.qpos[index]
+        case.start.write(qpos, displacement, episode.roll, number)
 
     def pose_robot(self, qpos: np.ndarray) -> np.ndarray:
         """Poses the follower's joints after the device, in place: qpos (N, nq)."""
@@ -236,7 +239,7 @@ class Rollout:
         return self._step(errors)
 
     def _measure(self, magnitudes: np.ndarray):
-        self._readings = self._index.read(self._state)
+        self._readings = self._views.read()
         self._wall_force = forces.wall_force(magnitudes)
 
     def _step(
@@ -258,16 +261,17 @@ class Rollout:
                 self._readings, self._wall_force, self._action, self._previous_action
             )
         )
-        failed = np.array([error is not None for error in errors])
-        if failed.any():
+        success = outcome.success
+        terminated = success.copy() if ended is None else ended
+        if errors.count(None) < len(errors):
+            failed = np.array([error is not None for error in errors])
+            terminated = terminated | failed
             outcome = outcome._replace(
-                success=outcome.success & ~failed,
+                success=success & ~failed,
                 reward=np.where(failed, 0.0, outcome.reward),
                 terms={n: np.where(failed, 0.0, t) for n, t in outcome.terms.items()},
             )
-        terminated = outcome.success | failed if ended is None else ended
         goal = self._objective.goal
-        offset = self._readings.head - goal
         return Step(
             observation=self._observe(goal, fresh),
             outcome=outcome,
@@ -276,7 +280,7 @@ class Rollout:
             errors=tuple(errors),
             readings=self._readings,
             wall_force=self._wall_force,
-            distance=np.sqrt(np.vecdot(offset, offset)),
+            goal=goal,
             path_ratio=self._path.ratio,
         )
 
