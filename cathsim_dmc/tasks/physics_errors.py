@@ -14,6 +14,7 @@ import numpy as np
 
 from cathsim_dmc import files
 from cathsim_dmc.anatomy import Anatomy
+from cathsim_dmc.tasks import placement
 
 DIVERGED = "diverged"
 ESCAPED = "escaped through the wall"
@@ -45,11 +46,14 @@ def escaped(anatomy: Anatomy, centreline: np.ndarray) -> np.ndarray:
       (...) bool: some node past the inlet lies more than 2 mm outside the lumen.
     """
     inlet = anatomy.inlet
-    beyond = (centreline - inlet.position) @ inlet.direction > _MOUTH
+    # Along the sheath, which need not stand as the vessel does; None where none fits.
+    along = placement.sheath_direction(anatomy)
+    along = inlet.direction if along is None else along
+    beyond = (centreline - inlet.position) @ along > _MOUTH
     # Farther from the inlet than the sheath reaches, a node may also lie behind the
     # plane of the inlet, in a vessel that turns back.
     aside = np.linalg.norm(centreline - inlet.position, axis=-1) > _MOUTH
-    axis = np.cross(centreline - inlet.position, inlet.direction)
+    axis = np.cross(centreline - inlet.position, along)
     in_sheath = ~beyond & (np.linalg.norm(axis, axis=-1) < inlet.radius)
     outside = aside & ~in_sheath
     outside[outside] = anatomy.depth(centreline[outside]) < -_ESCAPE_DEPTH
