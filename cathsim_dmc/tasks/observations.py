@@ -438,8 +438,9 @@ def resolve(names: str | Sequence[str]) -> tuple[str, ...]:
     Raises:
       ValueError: if a name is unknown or comes twice, or if there is none.
     """
-    chosen = (names,) if isinstance(names, str) else tuple(names)
-    unknown = [name for name in chosen if name not in OBSERVATIONS]
+    listed = isinstance(names, Sequence) and not isinstance(names, str | bytes)
+    chosen = tuple(names) if listed else (names,)
+    unknown = [n for n in chosen if not isinstance(n, str) or n not in OBSERVATIONS]
     if unknown or not chosen or len(set(chosen)) < len(chosen):
         raise ValueError(
             f"observation is {names!r}; give one of {', '.join(OBSERVATIONS)}, "

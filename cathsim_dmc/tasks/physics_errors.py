@@ -216,12 +216,18 @@ def load(path: str | Path) -> tuple[dict[str, Any], np.ndarray, np.ndarray]:
     Raises:
       ValueError: if the file is no dump of this format.
     """
-    with np.load(path, allow_pickle=False) as data:
-        if not {"meta", "state", "actions"} <= set(data.files):
-            raise ValueError(f"{path} is no dump of an episode; it has {data.files}")
-        meta = json.loads(str(data["meta"]))
-        if meta.get("format") != _FORMAT:
-            raise ValueError(
-                f"{path} has format {meta.get('format')}; this version reads {_FORMAT}"
-            )
-        return meta, data["state"], data["actions"]
+    try:
+        # A lone array is no archive, and has nothing to enter.
+        with np.load(path, allow_pickle=False) as data:
+            held = {name: data[name] for name in ("meta", "state", "actions")}
+        meta = json.loads(str(held["meta"]))
+    except FileNotFoundError:
+        raise
+    except (*files.DAMAGED_ARCHIVE, TypeError) as error:
+        raise ValueError(f"{path} is no dump of an episode: {error}") from error
+    if not isinstance(meta, dict) or meta.get("format") != _FORMAT:
+        raise ValueError(
+            f"{path} is no dump of an episode of format {_FORMAT}, which this version "
+            "reads"
+        )
+    return meta, held["state"], held["actions"]

@@ -6,6 +6,7 @@ import weakref
 import mujoco
 import numpy as np
 
+from cathsim_dmc import bounds
 from cathsim_dmc.anatomy import Anatomy, Goal
 from cathsim_dmc.entities import arena, devices
 from cathsim_dmc.tasks import objectives as objectives
@@ -76,6 +77,7 @@ def resolve_goal(anatomy: Anatomy, goal: "str | Goal") -> Goal:
     """
     if isinstance(goal, str):
         goal = anatomy.goal(goal)
+    bounds.instance("goal", goal, Goal)
     depth = float(anatomy.depth(goal.position))
     if not depth > 0:
         raise ValueError(
