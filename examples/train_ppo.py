@@ -47,7 +47,8 @@ class Settings:
     max_grad_norm: float = 1.0
     target_kl: float = 0.05  # ends the epochs of an update
     hidden: int = 64
-    evaluation_episodes: int = 30  # with a seed each, 2,000 steps at most
+    evaluation_episodes: int = 30  # each with a seed of its own
+    evaluation_steps: int = 2_000  # at most, of an episode
 
 
 def environment(settings: Settings, num_envs: int, seed: int, max_steps: int):
@@ -108,9 +109,7 @@ def update(batch, loss, advantage, optimiser, settings: Settings) -> float:
         kls = []
         for rows in torch.randperm(len(frames)).split(settings.minibatch_size):
             terms = loss(frames[rows])
-            total = (
-                terms["loss_objective"] + terms["loss_critic"] + terms["loss_entropy"]
-            )
+            total = sum(terms[f"loss_{n}"] for n in ("objective", "critic", "entropy"))
             optimiser.zero_grad()
             total.backward()
             nn.utils.clip_grad_norm_(loss.parameters(), settings.max_grad_norm)
@@ -126,7 +125,7 @@ def update(batch, loss, advantage, optimiser, settings: Settings) -> float:
 def evaluate(actor, norm: VecNormV2, settings: Settings) -> dict[str, float]:
     """Play every episode to its end with the most likely actions."""
     episodes = settings.evaluation_episodes
-    env, own = environment(settings, episodes, seed=1_000_000, max_steps=2_000)
+    env, own = environment(settings, episodes, 1_000_000, settings.evaluation_steps)
     own.load_state_dict(norm.state_dict())
     own.freeze()
     alive = torch.ones(episodes, dtype=torch.bool)
@@ -144,7 +143,7 @@ def evaluate(actor, norm: VecNormV2, settings: Settings) -> dict[str, float]:
     env.close()
     return {
         "success": float(success.mean()),
-        "steps": float(steps.mean()),
+        "control steps": float(steps.mean()),
         "largest force, N": float(force.mean()),
     }
 

@@ -102,5 +102,5 @@ def test_the_example_of_ppo_learns_what_it_prints(tmp_path):
     script = ROOT / "examples" / "train_ppo.py"
     assert len(script.read_text().splitlines()) <= 200
     options = "--total-frames 512 --num-envs 4 --max-steps 60 --evaluation-episodes 2"
-    out = run([str(script), *options.split()], tmp_path)
+    out = run([str(script), *options.split(), "--evaluation-steps", "50"], tmp_path)
     assert "512 frames" in out and "success: " in out
