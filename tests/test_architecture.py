@@ -169,12 +169,11 @@ def test_no_file_sets_environment_variables_at_import():
 
 @pytest.mark.parametrize("word", ["os.replace", "os.rename", "mkstemp", "fsync"])
 def test_files_are_replaced_in_one_place(word):
-    """Folders are renamed whole (checkpoints, imports); a dump has its own name."""
+    """Folders are renamed whole (checkpoints, imports)."""
     allowed = {
         "files.py",
         "agents/checkpoint.py",
         "anatomy/scan/cache.py",
-        "tasks/physics_errors.py",
     }
     found = {
         path.relative_to(PACKAGE).as_posix()

@@ -14,7 +14,8 @@ from torchrl.envs.utils import step_mdp
 
 from cathsim_dmc import files
 from cathsim_dmc.agents.episodes import EpisodeOutcome, EpisodeTracker
-from cathsim_dmc.agents.policies import PolicyLike, load_policy, view_of
+from cathsim_dmc.agents.policies import PolicyLike, load_policy
+from cathsim_dmc.agents.views import view_of
 from cathsim_dmc.analysis.force_statistics import QUANTITIES, Statistics
 from cathsim_dmc.analysis.intervals import success_interval
 from cathsim_dmc.policies import Policy

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from torchrl.envs import EnvBase
 
-from cathsim_dmc import suite
+from cathsim_dmc import files, suite
 from cathsim_dmc.agents import evaluation, policies
 from cathsim_dmc.analysis import heatmap
 from cathsim_dmc.analysis.force_statistics import millinewtons
@@ -276,10 +276,11 @@ def _targets(out: str | Path | None, gif: str | Path | None) -> dict[str, Path]:
 
 def _write_both(environment, episode: Episode, out: Path, fluoroscopy: bool) -> None:
     """Writes .npz and .rrd, or neither."""
-    arrays = episode.save(out.with_suffix(".npz"))
     task = environment.task
     surface = task.scene.anatomy.surface
-    try:
+    # Put in place last, once both are written.
+    with files.atomic_path(out.with_suffix(".npz")) as arrays:
+        episode.write(arrays)
         frames = None
         if fluoroscopy:
             frames = xray_film(episode, surface, film_options(task))
@@ -290,6 +291,3 @@ def _write_both(environment, episode: Episode, out: Path, fluoroscopy: bool) -> 
             robot_geoms=body_geoms(environment.physics),
             fluoroscopy=frames,
         )
-    except BaseException:
-        arrays.unlink(missing_ok=True)
-        raise

@@ -9,6 +9,7 @@ from tyro import conf
 # Exit codes beside 0: a check has failed; the input cannot be used; Ctrl-C.
 CHECK_FAILED, BAD_INPUT, INTERRUPTED = 1, 2, 130
 EVALUATION_SEED = 1_000_000  # apart from the seeds of training
+DEMONSTRATION_SEED = 2_000_000  # apart from both
 
 Task = Annotated[str, conf.Positional]
 

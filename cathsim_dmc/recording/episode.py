@@ -212,6 +212,12 @@ class Episode:
             ValueError: if the name does not end in ``.npz``.
             FileNotFoundError: if the directory does not exist.
         """
+        with atomic_path(path, SUFFIX) as temporary:
+            self.write(temporary)
+        return Path(path)
+
+    def write(self, path: str | os.PathLike[str]) -> None:
+        """Write what `save` does, whatever the name, over what is there."""
         header = {
             "format": FORMAT,
             "version": FORMAT_VERSION,
@@ -220,9 +226,8 @@ class Episode:
             "meta": self.meta,
         }
         arrays = {name: getattr(self, name) for name in _AXES}
-        with atomic_path(path, SUFFIX) as temporary, open(temporary, "wb") as stream:
+        with open(path, "wb") as stream:
             np.savez_compressed(stream, header=np.array(json.dumps(header)), **arrays)
-        return Path(path)
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> Episode:

@@ -127,11 +127,14 @@ def write_recording(
         with catch_and_log_exceptions(strict=True):
             stream.set_log_tick_enabled(False)
             stream.set_log_time_enabled(False)
-            stream.save(temporary, default_blueprint=layout)
+            # Not `save`, which never comes back from a full disk.
+            encoded = stream.binary_stream()
+            stream.send_blueprint(layout, make_active=False, make_default=True)
             stream.send_recording_name(title)
             fill(stream)
-            stream.flush()
+            data = encoded.read()
             stream.disconnect()
+        temporary.write_bytes(data or b"")
 
 
 def layout_of(episode: Episode, drawing: Drawing) -> Blueprint:

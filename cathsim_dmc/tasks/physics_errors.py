@@ -1,15 +1,18 @@
 """Errors of physics: found, named and kept for replay, never clipped away."""
 
+import io
 import json
 import logging
 import os
 import tempfile
+import uuid
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
 
+from cathsim_dmc import files
 from cathsim_dmc.anatomy import Anatomy
 
 DIVERGED = "diverged"
@@ -130,13 +133,17 @@ class PhysicsMonitor:
         for index in np.flatnonzero(wrong | out).tolist():
             reason = ESCAPED if out[index] and not wrong[index] else EXPLODED
             reasons[index] = reason = DIVERGED if diverged[index] else reason
-            dump(
-                reason,
-                task={"anatomy": self._anatomies[index].name, **self._task},
-                # Kept before the step that went wrong.
-                state=cast(np.ndarray, self._states[index]),
-                actions=np.array(self._actions[index]),
-            )
+            try:
+                dump(
+                    reason,
+                    task={"anatomy": self._anatomies[index].name, **self._task},
+                    # Kept before the step that went wrong.
+                    state=cast(np.ndarray, self._states[index]),
+                    actions=np.array(self._actions[index]),
+                )
+            except OSError as error:
+                # A full disk must not end the other simulations.
+                _LOG.error("%s; what would replay it is lost: %s", reason, error)
         return reasons
 
     def _escaped(self, looked: list[int], centreline: np.ndarray) -> np.ndarray:
@@ -176,18 +183,19 @@ def dump(
     )
     directory.mkdir(parents=True, exist_ok=True)
     meta = json.dumps({"format": _FORMAT, "reason": reason, "task": task})
-    handle, name = tempfile.mkstemp(".npz", "cathsim-error-", directory)
-    with os.fdopen(handle, "wb") as stream:
-        np.savez(stream, meta=np.array(meta), state=state, actions=actions)
+    path = directory / f"cathsim-error-{uuid.uuid4().hex[:12]}.npz"
+    buffer = io.BytesIO()
+    np.savez(buffer, meta=np.array(meta), state=state, actions=actions)
+    files.write_bytes(path, buffer.getvalue())
     _LOG.error(
         "%s after %d steps of %s; replay it with "
         "cathsim_dmc.tasks.physics_errors.load(%r)",
         reason,
         len(actions),
         task.get("goal", "an episode"),
-        name,
+        str(path),
     )
-    return Path(name)
+    return path
 
 
 def load(path: str | Path) -> tuple[dict[str, Any], np.ndarray, np.ndarray]:

@@ -91,7 +91,7 @@ class Capstan:
 def capstan(
     friction: float,
     wrap: float = WRAP,
-    device: str | devices.Device = "published",
+    device: str | devices.Device = "steerable_5f",
 ) -> Capstan:
     """Pulls the rod over a drum with and without friction.
 
@@ -195,7 +195,7 @@ def lumen_checks(anatomy: Anatomy, rays: int = RAYS) -> list[Check]:
     name = anatomy.name
     inside = fidelity.intrusion(anatomy).inside
     cover = fidelity.coverage(anatomy, rays)
-    device = devices.get("published")
+    device = devices.get("steerable_5f")
     passage = fidelity.patency(anatomy, device.outer_radius)
     bounds = {"mean": INTRUSION_MEAN, "p95": INTRUSION_P95, "max": INTRUSION_MAX}
     loose = surface.loose_edges(anatomy.surface)
