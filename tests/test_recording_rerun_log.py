@@ -1,12 +1,15 @@
 import dataclasses
+import io
 import subprocess
 import sys
 
 import numpy as np
 import pytest
+from PIL import Image
 from recording_samples import make_episode, make_tube
 from scipy.spatial.transform import Rotation
 
+from cathsim_dmc.recording.comparison import write_comparison
 from cathsim_dmc.recording.geometry import rotate
 from cathsim_dmc.recording.rerun_device import arrow_scale
 from cathsim_dmc.recording.rerun_log import write_rrd
@@ -260,10 +263,6 @@ def test_bodies_carry_their_geoms(written):
 
 
 def test_frames_come_back_exactly_when_lossless(written):
-    import io
-
-    from PIL import Image
-
     _, frames, _, recording = written
     blobs = recording.values("/fluoroscopy", "EncodedImage:blob")
     for frame, blob in zip(frames, blobs, strict=True):
@@ -310,6 +309,80 @@ def test_an_episode_of_no_steps_is_still_a_recording(tmp_path):
     recording = Recording(write_rrd(make_episode(0), make_tube(), tmp_path / "e.rrd"))
     assert recording.values("/world/catheter", "step") == [0]
     assert "/series/reward" not in recording.temporal
+
+
+def test_two_planes_are_two_images(tmp_path):
+    frames = np.random.default_rng(0).integers(0, 255, (STEPS + 1, 8, 8, 2), np.uint8)
+    path = write_rrd(
+        make_recorded(), make_tube(), tmp_path / "e.rrd", fluoroscopy=frames,
+        lossless=True,
+    )  # fmt: skip
+    recording = Recording(path)
+    for plane, entity in enumerate(("/fluoroscopy", "/fluoroscopy_lateral")):
+        assert recording.views[entity] == "2D"
+        blob = recording.values(entity, "EncodedImage:blob")[3][0]
+        image = np.asarray(Image.open(io.BytesIO(bytes(blob))))
+        np.testing.assert_array_equal(image, frames[3, ..., plane])
+
+
+def test_several_episodes_are_compared_in_one_recording(tmp_path):
+    longer = make_recorded()
+    shorter = make_episode(3, seed=1, meta=longer.meta | {"distance": [0.1] * 4})
+    shorter = dataclasses.replace(shorter, time=shorter.time + 5.0)
+    path = write_comparison(
+        {"first": longer, "second": shorter}, make_tube(), tmp_path / "c.rrd"
+    )
+    recording = Recording(path)
+    assert len(recording.recordings) == 1
+    for name, episode in (("first", longer), ("second", shorter)):
+        head = recording.values(f"/world/{name}/head", "Points3D:positions")
+        np.testing.assert_allclose(np.array(head)[:, 0], episode.head, atol=1e-6)
+        # Both begin at 0, wherever their clocks stood.
+        assert recording.nanoseconds(f"/world/{name}/head")[0] == 0
+        scalars = recording.values(f"/series/force/{name}", "Scalars:scalars")
+        np.testing.assert_allclose(
+            np.array(scalars)[:, 0], 1e3 * episode.wall_force_max
+        )
+    assert "| second |" in recording.fixed("/info", "TextDocument:text")[0]
+
+
+@pytest.mark.parametrize(
+    ("names", "message"),
+    [(["one"], "give 2 to 6"), (["a", "b c"], "'b c'"), (["a", "goal"], "taken")],
+)
+def test_what_cannot_be_compared_is_refused(tmp_path, names, message):
+    episodes = {name: make_recorded() for name in names}
+    with pytest.raises(ValueError, match=message):
+        write_comparison(episodes, make_tube(), tmp_path / "c.rrd")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_episodes_with_different_goals_are_not_compared(tmp_path):
+    other = make_recorded(meta=make_recorded().meta | {"goal_position": (0, 0, 0)})
+    with pytest.raises(ValueError, match="different goals"):
+        write_comparison(
+            {"a": make_recorded(), "b": other}, make_tube(), tmp_path / "c.rrd"
+        )
+
+
+def test_a_notebook_shows_an_episode_and_a_single_state():
+    pytest.importorskip("rerun_notebook")
+    from rerun.notebook import Viewer
+
+    from cathsim_dmc.recording.notebook import episode_viewer
+
+    assert isinstance(episode_viewer(make_recorded(), make_tube()), Viewer)
+    contacts = np.zeros((2, 3)), np.ones((2, 3))
+    state = episode_viewer(make_episode(0), make_tube(), contacts=contacts)
+    assert isinstance(state, Viewer)
+
+
+def test_without_the_extra_a_notebook_says_what_to_install(monkeypatch):
+    from cathsim_dmc.recording import notebook
+
+    monkeypatch.setattr(notebook.importlib.util, "find_spec", lambda name: None)
+    with pytest.raises(ImportError, match=r"cathsim-dmc\[notebook\]"):
+        notebook.episode_viewer(make_recorded(), make_tube())
 
 
 def test_two_episodes_are_two_recordings(tmp_path):

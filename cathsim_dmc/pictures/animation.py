@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import os
 from collections.abc import Iterator
 from pathlib import Path
@@ -24,6 +25,8 @@ _TICK_MS = 20  # browsers do not show frames that are shorter
 _DPI = 100
 _MARGIN = 8e-3  # around the vessel, m
 _FORCE_COLOUR = "#b3202c"
+# A film shows the noise of fluoroscopy, at a multiple of the usual dose.
+FLUOROSCOPY = dataclasses.replace(drawing.FLUOROSCOPY, noise=True, kerma=4e-7)
 
 
 def animate(
@@ -158,10 +161,12 @@ class _Film:
             drawing.draw_scene(self._scene, moment, self._projection, self._glass)
             self._label(moment, int(step))
             if image is None:
-                image = drawing.draw_fluoroscopy(self._xray, moment)
+                image = drawing.draw_fluoroscopy(
+                    self._xray, moment, FLUOROSCOPY, int(step)
+                )
                 self._xray.set_title("")
             else:
-                image.set_data(xray(moment, drawing.FLUOROSCOPY, int(step)))
+                image.set_data(xray(moment, FLUOROSCOPY, int(step)))
             now = float(self._episode.time[step] - self._episode.time[0])
             self._now.set_xdata([now, now])
             self._figure.agg.draw()

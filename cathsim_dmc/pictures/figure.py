@@ -37,9 +37,8 @@ ARROW_MM, ARROW_LEAST_MM = 22.0, 5.0
 ARROW_LEAST_N = 1e-4
 # Pieces of the drawn curve in each link.
 _PIECES = 6
-# The X-ray image of `scene_figure` unless another is asked for: arch and branches fill
-# it, and a frame has a multiple of the usual dose, for looks.
-FLUOROSCOPY = FluoroscopyOptions(size=400, magnification=1.3, kerma=1e-6, noise=True)
+# The X-ray image of `scene_figure` unless another is asked for; the arch fills it.
+FLUOROSCOPY = FluoroscopyOptions(size=400, magnification=1.3)
 # Percentiles of an image that are shown as black and white.
 WINDOW = (0.02, 99.5)
 _HEIGHT_IN = 6.0

@@ -45,7 +45,7 @@ def on_files(files, config):
     """Adds the pages that are written here."""
     for name in OF_THE_REPOSITORY:
         text = (ROOT / name).read_text()
-        files.append(File.generated(config, name, content=_linked(text)))
+        files.append(File.generated(config, name, content=text))
     files.append(File.generated(config, "examples.md", content=_examples()))
     for notebook in sorted((Path(config.docs_dir) / "tutorials").glob("*.ipynb")):
         source = f"tutorials/{notebook.name}"
@@ -66,24 +66,21 @@ def _as_pages(entries):
 
 
 def on_page_markdown(markdown, page, config, files):
-    """Leads links out of docs/ to the pages of the site."""
+    """Leads links out of docs/, and to notebooks, to the pages of the site."""
     del config, files
-    return _linked(markdown) if page.file.src_dir else markdown
+    up = "../" * page.file.src_uri.count("/")
 
-
-def _linked(text: str) -> str:
     def lead(match: re.Match) -> str:
         folder, target, anchor = match.group(1), match.group(2), match.group(3) or ""
         if folder == "examples/":
-            return f"](examples.md#{Path(target).stem.replace('_', '-')})"
+            return f"]({up}examples.md#{Path(target).stem.replace('_', '-')})"
         if folder == "docs/":
-            return f"]({target}{anchor})"
-        name = Path(target).name
-        if name in OF_THE_REPOSITORY:
-            return f"]({name}{anchor})"
-        return match.group(0)
+            return f"]({up}{target}{anchor})"
+        if Path(target).name in OF_THE_REPOSITORY:
+            return f"]({up}{Path(target).name}{anchor})"
+        return match.group(0).replace(".ipynb", ".md")
 
-    return _LINK.sub(lead, text)
+    return _LINK.sub(lead, markdown)
 
 
 def _examples() -> str:
