@@ -21,10 +21,12 @@ from dm_control import composer
 from dm_control import suite as dm_suite
 from dm_control.utils import containers
 
+from cathsim_dmc import bounds
 from cathsim_dmc.anatomy import Anatomy, Goal
 from cathsim_dmc.entities import devices
 from cathsim_dmc.tasks import placement
 from cathsim_dmc.tasks.config import NavigationConfig
+from cathsim_dmc.tasks.environment import Environment
 from cathsim_dmc.tasks.navigation import Navigation
 from cathsim_dmc.tasks.objectives import Cannulation, Objective
 from cathsim_dmc.tasks.scene import Scene
@@ -154,7 +156,7 @@ def make_task(
         scene = Scene.build(anatomy, place, config, goal_radius=objective.goal_radius)
         rooms.append((scene, objective))
     scene, objective = rooms[0]
-    return Navigation(scene, objective, config, random, others=rooms[1:])
+    return Navigation(scene, objective, config, random, others=rooms[1:], name=name)
 
 
 def _one_length(
@@ -245,6 +247,8 @@ def load_anatomy(anatomy: str | Path | Anatomy, access: str = "ascending") -> An
         return anatomy
     from cathsim_dmc.anatomy import phantoms
 
+    if not isinstance(anatomy, str | Path):
+        bounds.refuse("anatomy", anatomy, "an Anatomy, a name or a directory")
     if str(anatomy) in phantoms.PHANTOMS:
         return phantoms.load(str(anatomy), access=access)
     if not Path(anatomy).is_dir():
@@ -264,9 +268,6 @@ def load_arches(
 ) -> list[Anatomy]:
     """Random arches of a named set, in the order of their seeds; see `arch_set`.
 
-    Arches whose aorta bends back across the straight sheath, so that no device can
-    enter, are passed over.
-
     Args:
       arches: Name of the set: "train", "test" or "test_variants".
       pool: Number of arches; building one takes about a second and a half.
@@ -274,8 +275,8 @@ def load_arches(
       access: Where the device enters, "ascending" or "descending".
 
     Raises:
-      ValueError: if there is no such set, it has no such arches, or with `pool=1`
-        the one cannot be entered.
+      ValueError: if there is no such set, it has no such arches, or one of them
+        cannot be entered.
     """
     from cathsim_dmc.anatomy.arch import arch
 
@@ -287,19 +288,12 @@ def load_arches(
             "arches, numbered from 0: give whole numbers, pool of at least 1 and first "
             f"+ pool of at most {len(seeds)}"
         )
-    found, number = [], first
-    while len(found) < pool and number < len(seeds):
-        anatomy = arch.build_seed(seeds[number], access=access)
-        if placement.is_clear(anatomy):
-            found.append(anatomy)
-        elif pool == 1:
-            break
-        number += 1
-    if len(found) < pool:
+    found = [arch.build_seed(seed, access=access) for seed in seeds[first:][:pool]]
+    closed = [a.name for a in found if placement.sheath_direction(a) is None]
+    if closed:
         raise ValueError(
-            f"of the arches from number {first} of {arches!r}, {len(found)} can be "
-            f"entered and pool is {pool}: in the others the aorta bends back across "
-            "the straight sheath; give another first, or a smaller pool"
+            f"no sheath fits before the inlet of {', '.join(closed)}, whose aorta "
+            "bends back across it; give another first, or a smaller pool"
         )
     return found
 
@@ -320,7 +314,7 @@ def environment(task: Navigation, **environment_kwargs: Any) -> composer.Environ
         "raise_exception_on_physics_error": False,
         **environment_kwargs,
     }
-    return composer.Environment(task, random_state=task.random, **settings)
+    return Environment(task, random_state=task.random, **settings)
 
 
 def _register_domain() -> None:

@@ -64,6 +64,7 @@ def test_configs_survive_json(algorithm, preset):
         (PPOConfig, {"task_kwargs": "x"}, "task_kwargs='x'.*object"),
         (PPOConfig, {"task_kwargs": {"a": float("inf")}}, "task_kwargs.*finite"),
         (PPOConfig, {"activation": "sine"}, "activation='sine'.*tanh.*relu"),
+        (PPOConfig, {"training_start": [0.1, "x"]}, "training_start.*finite number"),
         (PPOConfig, {"training_max_steps": 0}, "training_max_steps=0.*positive"),
         (PPOConfig, {"training_reward": {"path": "x"}}, "training_reward.*finite"),
         (PPOConfig, {"training_reward": [1.0]}, "training_reward.*names, each with"),

@@ -5,6 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 from conftest import TASKS
+from dm_control.composer.variation import distributions
 
 from cathsim_dmc import suite
 from cathsim_dmc.anatomy.anatomy import Goal
@@ -15,6 +16,7 @@ from cathsim_dmc.simulation.batch import BatchSimulation
 from cathsim_dmc.tasks import observations
 from cathsim_dmc.tasks.config import NavigationConfig
 from cathsim_dmc.tasks.objectives import Cannulation
+from cathsim_dmc.tasks.variations import Randomisation
 
 
 def fails(words, error=ValueError, **options):
@@ -117,8 +119,8 @@ def test_wrong_reward():
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        ({"goal_radius": 0.0}, ["goal_radius", "0.0", "> 0"]),
-        ({"goal_radius": -1e-3}, ["goal_radius", "-0.001", "> 0"]),
+        ({"goal_radius": 0.0}, ["goal_radius", "0.0", "above 0"]),
+        ({"goal_radius": -1e-3}, ["goal_radius", "-0.001", "above 0"]),
         ({"max_steps": 0}, ["max_steps", "0", "at least 1"]),
         ({"max_steps": 1.5}, ["max_steps", "1.5", "integer"]),
         ({"max_steps": float("inf")}, ["max_steps", "inf", "integer"]),
@@ -129,17 +131,31 @@ def test_wrong_reward():
         ({"friction": "0.1"}, ["friction", "'0.1'", "number"]),
         ({"physics_timestep": 1e9}, ["physics_timestep", "control step of 0.04"]),
         ({"physics_timestep": 0.003}, ["physics_timestep", "whole part"]),
-        ({"physics_timestep": float("inf")}, ["physics_timestep", "finite"]),
+        ({"physics_timestep": float("inf")}, ["physics_timestep", "inf", "finite"]),
         ({"torsion_joints": 1.5}, ["torsion_joints", "1.5", "integer"]),
-        ({"friction": -0.1}, ["friction", "-0.1", "between 0 and 2"]),
-        ({"friction": 5.0}, ["friction", "5.0", "between 0 and 2"]),
-        ({"working_length": 0.05}, ["working_length", "0.05", "published", "more"]),
+        ({"friction": -0.1}, ["friction", "-0.1", "from 0 to 2"]),
+        ({"friction": 5.0}, ["friction", "5.0", "from 0 to 2"]),
+        ({"working_length": 0.05}, ["working_length", "0.05", "steerable_5f", "more"]),
         ({"torsion_joints": 500}, ["torsion_joints", "500", "joints"]),
-        ({"torsion_joints": -1}, ["torsion_joints", "-1", "at least 0"]),
+        ({"torsion_joints": -1}, ["torsion_joints", "-1", "from 0"]),
         ({"working_length": 300.0}, ["working_length", "300", "at most"]),
         ({"fluoroscopy": {"zoom": 2}}, ["fluoroscopy", "zoom", "magnification"]),
-        ({"cameras": {"names": ("front",)}}, ["front", "top", "side"]),
+        ({"cameras": {"names": ("front",)}}, ["front", "top", "side", "tip"]),
         ({"randomisation": {"gravity": 1}}, ["gravity", "friction"]),
+        ({"randomisation": {"delay": (0, 10**9)}}, ["randomisation", "delay", "250"]),
+        ({"randomisation": {"delay": (0, 1.5)}}, ["delay", "1.5", "integer"]),
+        ({"randomisation": 1}, ["randomisation", "1", "True", "friction"]),
+        ({"randomisation": {"friction": (0, np.inf)}}, ["friction", "inf", "0 to 2"]),
+        (
+            {"randomisation": {"view": (0, 80)}, "fluoroscopy": {"view": (0, 20)}},
+            ["randomisation", "view", "80", "fluoroscopy"],
+        ),
+        ({"fluoroscopy": {"size": 10**6}}, ["fluoroscopy", "size", "4096"]),
+        ({"fluoroscopy": {"size": (128, 0)}}, ["size", "(128, 0)", "columns"]),
+        ({"fluoroscopy": {"size": "128"}}, ["size", "'128'", "integer"]),
+        ({"fluoroscopy": {"magnification": "2"}}, ["magnification", "number"]),
+        ({"fluoroscopy": {"biplane": "TOP"}}, ["biplane", "TOP", "LATERAL"]),
+        ({"cameras": {"size": 10**6}}, ["cameras", "size", "4096"]),
     ],
 )
 def test_wrong_values(options, words):
@@ -149,7 +165,30 @@ def test_wrong_values(options, words):
 @pytest.mark.parametrize("value", [float("nan"), float("inf"), -1.0, 0.0])
 def test_lengths_and_times_must_be_positive(value):
     fails(["working_length", str(value)], working_length=value)
-    fails(["shaft_link", str(value), "positive"], shaft_link=value)
+    fails(["shaft_link", str(value), "0.002 to 0.1 m"], shaft_link=value)
+
+
+@pytest.mark.parametrize(
+    ("field", "value"),
+    [
+        ("bca_drop", "0.5"),
+        ("arch_radius", None),
+        ("bovine", "False"),
+        ("lcca", {"radius": 4e-3}),
+        ("lsa_aberrant_spacing", np.nan),
+        ("plane_tilt", np.inf),
+        ("ascending_length", True),
+    ],
+)
+def test_figures_of_an_arch_of_a_wrong_kind(field, value):
+    with pytest.raises(ValueError, match=f"{field} is .*; it must be"):
+        dataclasses.replace(arch.ARCHES["simple1"], **{field: value})
+
+
+def test_a_distribution_of_ones_own_is_held_to_the_bounds_when_it_is_drawn():
+    ranges = Randomisation(friction=distributions.Uniform(3.0, 4.0))
+    with pytest.raises(ValueError, match="friction, as drawn, is 3.*from 0 to 2"):
+        ranges.draw(np.random.RandomState(0))
 
 
 # Actions.
@@ -185,6 +224,15 @@ def test_action_that_is_not_finite(environment, value):
     with pytest.raises(ValueError, match=r"2 NaN or infinite.*\[-1, 1\]"):
         environment.step(action)
     np.testing.assert_array_equal(environment.physics.data.qpos, before)
+
+
+@pytest.mark.parametrize("value", ["x", None, 1j, "0.5", True, [0.0]])
+def test_actions_that_are_no_numbers(environment, value):
+    action = [value] * 21
+    if value == [0.0]:
+        action[3] = 0.0
+    with pytest.raises(ValueError, match=r"the action is .*21.*\[-1, 1\]"):
+        environment.step(action)
 
 
 def test_actions_of_a_batch(environment):

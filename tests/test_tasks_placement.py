@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+from unittest import mock
 
 import mujoco
 import numpy as np
@@ -14,7 +15,9 @@ from cathsim_dmc.anatomy import phantoms
 from cathsim_dmc.anatomy.anatomy import Inlet
 from cathsim_dmc.anatomy.arch import arch
 from cathsim_dmc.entities import devices
+from cathsim_dmc.simulation.batch import BatchSimulation
 from cathsim_dmc.tasks import placement, readings
+from cathsim_dmc.tasks.config import NavigationConfig
 
 ANGLES = st.floats(0, 2 * math.pi)
 
@@ -30,12 +33,19 @@ def test_frame_turns_z_into_any_direction(azimuth, height):
     anatomy = arch.load("simple1")
     inlet = Inlet("aorta", [0, 0, 0], axis, 0.0138)
     turned = dataclasses.replace(anatomy, inlet=inlet)
-    placed = placement.place_device(turned, anatomy.goal("bca"), devices.PUBLISHED)
+    # Whatever stands behind it.
+    with mock.patch.object(placement, "sheath_direction", lambda _: inlet.direction):
+        placed = placement.place_device(
+            turned, anatomy.goal("bca"), devices.STEERABLE_5F
+        )
     assert np.linalg.norm(placed.quaternion) == pytest.approx(1, abs=1e-9)
     matrix = np.empty(9)
     mujoco.mju_quat2Mat(matrix, placed.quaternion)
     matrix = matrix.reshape(3, 3)
-    np.testing.assert_allclose(matrix[:, 2], inlet.direction, atol=1e-7)
+    # Of the sheath, which is tilted where the inlet's own would cross the aorta.
+    axis = placed.direction
+    np.testing.assert_allclose(matrix[:, 2], axis, atol=1e-7)
+    assert axis @ inlet.direction > 0.5
     assert np.linalg.det(matrix) == pytest.approx(1, abs=1e-7)
     # +y, below the device on the table, stays as posterior as it can.
     if abs(axis[1]) < 0.98:
@@ -47,8 +57,8 @@ def test_the_device_starts_inside_and_reaches_every_goal(name):
     anatomy = arch.load(name)
     for goal in anatomy.goals.values():
         route = anatomy.route(goal)
-        placed = placement.place_device(anatomy, goal, devices.PUBLISHED)
-        assert anatomy.depth(placed.start) > devices.PUBLISHED.outer_radius
+        placed = placement.place_device(anatomy, goal, devices.STEERABLE_5F)
+        assert anatomy.depth(placed.start) > devices.STEERABLE_5F.outer_radius
         assert placed.start_depth + placed.stroke >= route.length
         assert placed.working_length > placed.start_depth + placed.stroke
         np.testing.assert_allclose(
@@ -60,7 +70,9 @@ def test_the_device_starts_inside_and_reaches_every_goal(name):
 def test_working_length_is_checked(length):
     with pytest.raises(ValueError, match=r"working_length is .*more than.*at most"):
         anatomy = arch.load("simple1")
-        placement.place_device(anatomy, anatomy.goal("bca"), devices.PUBLISHED, length)
+        placement.place_device(
+            anatomy, anatomy.goal("bca"), devices.STEERABLE_5F, length
+        )
 
 
 # Start.
@@ -139,7 +151,7 @@ def test_no_start_is_beyond_a_goal():
         for access in ("ascending", "descending"):
             anatomy = phantoms.load(name, access=access)
             for goal in anatomy.goals.values():
-                placed = placement.place_device(anatomy, goal, devices.PUBLISHED)
+                placed = placement.place_device(anatomy, goal, devices.STEERABLE_5F)
                 way = anatomy.route(goal).length
                 assert placed.start_depth <= max(0.5 * way, 5e-3)
 
@@ -208,3 +220,28 @@ def test_a_model_without_the_names(shared_environment, scopes, message):
     model = shared_environment("type1_bca").physics.model.ptr
     with pytest.raises(ValueError, match=message):
         readings.ModelIndex(model, *scopes)
+
+
+def test_an_episode_may_start_along_the_route():
+    """The head lies further and further in, at rest, alike for composer and batch."""
+    options = {"start_along_route": (0.0, 0.9), "random": 0}
+    task = suite.make_task("type1_lcca", **options)
+    environment = suite.environment(task)
+    starts = []
+    for _ in range(12):
+        environment.reset()
+        head = task.readings.head
+        starts.append(head)
+        assert task.scene.anatomy.depth(head) > 0
+    ways = task.objective.path_distance(np.array(starts))
+    whole = task.objective.route.length - task.scene.placement.start_depth
+    assert ways.min() < 0.25 * whole and ways.max() > 0.75 * whole
+    batch = BatchSimulation(suite.make_task("type1_lcca", **options), 1, seeds=0)
+    for start in starts[:3]:
+        np.testing.assert_array_equal(batch.reset().readings.head[0], start)
+
+
+@pytest.mark.parametrize("given", [0.5, (0.5,), (0.5, 0.2), (0, 2), ("0", 1), (-1, 0)])
+def test_bad_shares_of_the_route_are_refused(given):
+    with pytest.raises(ValueError, match=r"start_along_route.*0 <= low <= high"):
+        NavigationConfig(start_along_route=given)

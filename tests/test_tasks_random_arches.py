@@ -10,7 +10,7 @@ from cathsim_dmc import policies, suite
 from cathsim_dmc.anatomy.arch import arch
 from cathsim_dmc.policies.expert import Expert
 from cathsim_dmc.simulation.batch import BatchSimulation
-from cathsim_dmc.tasks import cases
+from cathsim_dmc.tasks import cases, placement
 from cathsim_dmc.tasks.objective_pool import part
 from cathsim_dmc.tasks.physics_errors import ESCAPE_INTERVAL
 
@@ -19,7 +19,7 @@ STEPS = 55  # past the first look for an escape
 SEED = 10
 SIMULATIONS = 3
 TASKS = ("arch_bca", "arch_lcca", "femoral_arch_bca", "femoral_arch_lcca")
-NUMBERS = ("internal", "tracking", "goal", "force")
+NUMBERS = ("internal", "tracking", "route", "goal", "force")
 
 
 def names(first=0, count=POOL, arches="train"):
@@ -271,9 +271,36 @@ def test_anatomies_with_other_goals_are_refused():
         cases.alike([t.scene for t in tasks], [t.objective for t in tasks])
 
 
-def test_arches_that_cannot_be_entered_are_passed_over():
-    # The device stood 45 mm outside the lumen of number 4, jammed with 180 N.
-    with pytest.raises(ValueError, match="can be entered"):
-        suite.load_arches(pool=1, first=4)
-    entered = [anatomy.name for anatomy in suite.load_arches(pool=2, first=4)]
-    assert names(4, 1)[0] not in entered and entered == names(5, 1) + names(8, 1)
+# Number 4 of "train" bends back across the straight sheath: the device stood 45 mm
+# outside the lumen, jammed with 180 N.
+CROSSING = 4
+
+
+def test_the_sheath_is_tilted_past_an_aorta_that_bends_back():
+    (anatomy,) = suite.load_arches(pool=1, first=CROSSING)
+    along = np.asarray(anatomy.inlet.direction)
+    direction = placement.sheath_direction(anatomy)
+    tilt = np.degrees(np.arccos(direction @ along))
+    assert 2.0 < tilt <= 30.0
+    behind = np.arange(0.015, placement.COMMON_LENGTH, 1e-3)[:, None]
+    # Sheath and wall, 4 mm, clear of one another; the straight one is not.
+    clear, crossing = (
+        anatomy.depth(anatomy.inlet.position - behind * way).max()
+        for way in (direction, along)
+    )
+    assert clear < -5e-3 < crossing
+
+
+def test_a_device_that_has_settled_in_a_wall_is_refused(monkeypatch):
+    monkeypatch.setattr(
+        placement, "sheath_direction", lambda anatomy: np.array(anatomy.inlet.direction)
+    )
+    task = suite.make_task("arch_bca", pool=1, first=CROSSING)
+    with pytest.raises(ValueError, match=r"comes to rest .* mm outside the lumen"):
+        suite.environment(task).reset()
+
+
+def test_an_arch_that_no_sheath_fits_before_is_named(monkeypatch):
+    monkeypatch.setattr(placement, "sheath_direction", lambda anatomy: None)
+    with pytest.raises(ValueError, match=f"{names(0, 1)[0]}.*give another first"):
+        suite.load_arches(pool=1)

@@ -9,12 +9,30 @@ from cathsim_dmc.validation import convergence, insertion, wall
 from cathsim_dmc.validation import force_sensors as forces
 
 
-@pytest.mark.parametrize("friction", wall.FRICTIONS)
-def test_capstan(friction):
-    one = wall.capstan(friction)
-    assert abs(one.mean / one.expected - 1) < wall.CAPSTAN_BOUND / 100
-    # A slippery rod's ratio is near 1 anyway: the exponent has to be right as well.
-    assert np.log(one.mean) / one.angle == pytest.approx(friction, rel=0.1)
+@pytest.mark.parametrize(("friction", "wrap"), wall.CAPSTANS)
+def test_capstan(friction, wrap):
+    one = wall.capstan(friction, wrap)
+    assert one.angle == pytest.approx(wrap, abs=np.radians(3))
+    assert one.check().passed, one.check()
+    # Without friction the tension is nearly the same at both ends.
+    assert one.free == pytest.approx(1, abs=0.015)
+
+
+@pytest.mark.parametrize(("friction", "wrap"), [(0.05, 0.5), (0.037, 1.0), (0.2, 1.5)])
+def test_the_capstan_check_sees_an_eighth_less_friction(friction, wrap):
+    """The ratio of the tensions hides it: at 0.05 and 90° it is 0.9 % of it."""
+    angle = wrap * np.pi
+    less = wall.Capstan(
+        friction=friction,
+        angle=angle,
+        travel=np.zeros(1),
+        ratio=np.zeros(1),
+        mean=float(np.exp(0.875 * friction * angle)),
+        free=1.0,
+        expected=float(np.exp(friction * angle)),
+    )
+    assert not less.check().passed
+    assert dataclasses.replace(less, mean=less.expected).check().passed
 
 
 def test_tube_passes_the_checks_of_the_lumen():

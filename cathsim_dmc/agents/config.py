@@ -39,6 +39,9 @@ class TrainingConfig:
         training_max_steps: Largest number of control steps of an episode of the
             training, at whose end the value is carried on; None takes the task's.
             Evaluation and recordings always take the task's.
+        training_start: Least and largest share of the way to the goal that the device
+            has made when an episode of the training starts; None takes the task's.
+            Evaluation and recordings always take the task's.
         backend: Way of simulating: "batched" steps all simulations in one thread
             pool, "composer" runs one dm_control environment after the other (slow;
             the reference).
@@ -58,7 +61,11 @@ class TrainingConfig:
         normalisation_frames: Number of random control steps before the first update,
             from which the first observation statistics come; they are not counted as
             frames. An algorithm that begins with random actions anyway (SAC) needs
-            none.
+            none, nor does one that starts from another policy.
+        initial_policy: Directory of the run or checkpoint whose policy the networks
+            start from, with its observation statistics; None starts afresh.
+        initial_std: Deviation before the tanh that every action of such a policy
+            starts with; None keeps the policy's own.
         checkpoint_frames: Number of frames between two checkpoints.
         checkpoint_seconds: Longest time between two checkpoints in seconds of wall
             time, so that a killed run loses no more.
@@ -96,6 +103,7 @@ class TrainingConfig:
     task_kwargs: Mapping[str, Any] = field(default_factory=dict)
     training_reward: Mapping[str, float] | None = None
     training_max_steps: int | None = None
+    training_start: tuple[float, float] | None = None
     backend: Literal["batched", "composer"] = "batched"
     num_envs: int = 16
     num_threads: int | None = None
@@ -108,6 +116,8 @@ class TrainingConfig:
     gamma: float = 0.99
     observation_clip: float = 10.0
     normalisation_frames: int = 4_096
+    initial_policy: str | None = None
+    initial_std: float | None = None
     checkpoint_frames: int = 51_200
     checkpoint_seconds: float = 120.0
     keep_checkpoints: int = 3
@@ -118,7 +128,7 @@ class TrainingConfig:
 
     def __post_init__(self):
         """Validate; every message says what was given and what is allowed."""
-        for name in ("hidden", "observation"):
+        for name in ("hidden", "observation", "training_start"):
             if isinstance(getattr(self, name), list):
                 object.__setattr__(self, name, tuple(getattr(self, name)))
         for name, kind in typing.get_type_hints(type(self)).items():
@@ -170,6 +180,13 @@ class TrainingConfig:
             threads,
             "a positive integer, or None for every core",
         )
+        deviation = self.initial_std
+        require(
+            deviation is None or deviation > 0,
+            "initial_std",
+            deviation,
+            "positive, or None for the policy's own",
+        )
         require(0 < self.gamma <= 1, "gamma", self.gamma, "in (0, 1]")
         try:
             json.dumps(self.task_kwargs, allow_nan=False)
@@ -188,7 +205,11 @@ class TrainingConfig:
     @property
     def training_kwargs(self) -> dict[str, Any]:
         """Options of the task while it is learnt."""
-        own = {"reward": self.training_reward, "max_steps": self.training_max_steps}
+        own = {
+            "reward": self.training_reward,
+            "max_steps": self.training_max_steps,
+            "start_along_route": self.training_start,
+        }
         given = {name: value for name, value in own.items() if value is not None}
         return {**self.task_kwargs, **given}
 
@@ -206,6 +227,8 @@ class TrainingConfig:
         """The config as JSON-able values, with the algorithm's name."""
         values = dataclasses.asdict(self)
         values["hidden"] = list(self.hidden)
+        if self.training_start is not None:
+            values["training_start"] = list(self.training_start)
         if not isinstance(self.observation, str):
             values["observation"] = list(self.observation)
         return {"algorithm": self.algorithm, **values}

@@ -2,23 +2,15 @@
 
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 import torch
 from tensordict import TensorDict, TensorDictBase
-from torchrl.envs import EnvBase, SerialEnv
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from cathsim_dmc.agents.checkpoint import Checkpoint
-from cathsim_dmc.policies import (
-    POLICIES,
-    BatchedView,
-    ComposerView,
-    Policy,
-    View,
-    make_policy,
-)
+from cathsim_dmc.policies import POLICIES, Policy, make_policy
 from cathsim_dmc.simulation import environments
 
 # Gets the standard observations (N, ...), returns the actions (N, A) or the TensorDict
@@ -82,12 +74,13 @@ def load_policy(policy: PolicyLike, seed: int = 0) -> Policy:
     """A policy from whatever names one.
 
     Args:
-        policy: Name in `POLICIES`, directory of a run or of a checkpoint, Checkpoint,
-            policy, or function as for `FunctionPolicy`.
+        policy: Name in `POLICIES`, "pretrained:NAME", file of a pretrained policy,
+            directory of a run or of a checkpoint, Checkpoint, policy, or function as
+            for `FunctionPolicy`.
         seed: Seed of a named policy's own randomness.
 
     Raises:
-        CheckpointError: it is neither a name nor a directory with a checkpoint.
+        CheckpointError: it is none of these, or damaged.
     """
     if isinstance(policy, Policy):
         return policy
@@ -96,33 +89,15 @@ def load_policy(policy: PolicyLike, seed: int = 0) -> Policy:
     if isinstance(policy, str | Path):
         if str(policy) in POLICIES:
             return make_policy(str(policy), seed)
+        # Imported late: it knows this module.
+        from cathsim_dmc.agents import pretrained
+
+        if str(policy).startswith(pretrained.PREFIX):
+            return pretrained.load_pretrained(str(policy))
+        if Path(policy).suffix == pretrained.SUFFIX:
+            return pretrained.PretrainedPolicy(policy)
         return TrainedPolicy(Checkpoint.open(policy))
     return FunctionPolicy(policy)
-
-
-class _ForeignView:
-    """Simulations of an environment that is not ours: only their numbers are known."""
-
-    def __init__(self, env: EnvBase):
-        (self.num_simulations,) = env.batch_size
-        self.num_actions = int(env.action_spec.shape[-1])
-
-    def __getattr__(self, name: str) -> Any:
-        raise AttributeError(
-            f"the policy asks for {name!r}, which only environments of "
-            "cathsim_dmc.simulation know"
-        )
-
-
-def view_of(env: EnvBase) -> View:
-    """What a policy may know of the simulations of a TorchRL environment."""
-    base = getattr(env, "base_env", env)
-    if hasattr(base, "simulation"):
-        return BatchedView(base.simulation)
-    if isinstance(base, SerialEnv):
-        return ComposerView([environments.composer_of(one) for one in base._envs])
-    # Whatever a policy asks of it beyond its numbers is an error that says so.
-    return cast(View, _ForeignView(env))
 
 
 def _tensors(observation: Mapping[str, np.ndarray]) -> TensorDict:

@@ -7,7 +7,7 @@ from tyro import conf
 from tyro.extras import SubcommandApp
 
 from cathsim_dmc import __version__
-from cathsim_dmc.cli import agents, training
+from cathsim_dmc.cli import agents, table, training
 from cathsim_dmc.cli.measurements import benchmarks, validations
 from cathsim_dmc.cli.options import BAD_INPUT, INTERRUPTED, print_json
 from cathsim_dmc.cli.phantoms import phantoms
@@ -48,7 +48,12 @@ def list_tasks(json: bool = False) -> int:
 agents.add_to(app)
 app.command(phantoms, name="phantom", help="Make, import and check anatomies.")
 app.command(validations, name="validate", help="Compare the physics with theory.")
-app.command(benchmarks, name="benchmark", help="Measure the speed.")
+benchmarks.command(table.table)
+app.command(
+    benchmarks,
+    name="benchmark",
+    help="Measure speed, difficulty, learning.",
+)
 
 
 def main() -> None:

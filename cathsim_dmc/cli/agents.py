@@ -1,4 +1,4 @@
-"""`cathsim eval`, `record`, `replay`, `play` and `demo`."""
+"""`cathsim eval`, `record`, `replay`, `play`, `export` and `demo`."""
 
 import sys
 from pathlib import Path
@@ -8,6 +8,7 @@ from tyro import conf
 from tyro.extras import SubcommandApp
 
 from cathsim_dmc.cli.options import (
+    DEMONSTRATION_SEED,
     EVALUATION_SEED,
     INTERRUPTED,
     NO_ANATOMY,
@@ -20,7 +21,7 @@ from cathsim_dmc.cli.options import (
 def add_to(app: SubcommandApp) -> None:
     """Adds the commands."""
     app.command(name="eval")(evaluate)
-    for command in (record, replay, play, demo):
+    for command in (record, demos, replay, play, export, demo):
         app.command(command)
 
 
@@ -41,13 +42,13 @@ def evaluate(
 
     Args:
         policy: Directory of a run or of a checkpoint, or name of a policy: "random",
-            "push", "expert", "idle", "curl", "random_curl".
+            "push", "expert", "idle", "curl", "random_curl", "pretrained:NAME".
         task: Task of `cathsim list`; by default the one that the policy was trained on.
         episodes: Number of episodes, each with a seed of its own.
         seed: Seed of the first episode; the others count up.
         out: Directory for evaluation.json and heatmap.png.
         baseline: Whether to compare with the random policy on the same seeds.
-        anatomy: Anatomy of one's own, for the task `navigate`.
+        anatomy: Where the task takes place.
         backend: Way of simulating: all episodes side by side, or dm_control's
             environments one after the other.
         threads: Number of threads of the simulation; one per core by default.
@@ -77,23 +78,25 @@ def evaluate(
 def record(
     policy: Annotated[str, conf.Positional],
     /,
-    out: Path,
+    out: Path | None = None,
+    gif: Path | None = None,
     task: str | None = None,
     seed: int = EVALUATION_SEED,
     max_steps: int | None = None,
     anatomy: OwnAnatomy = NO_ANATOMY,
     fluoroscopy: bool = True,
 ) -> int:
-    """Record one episode as a Rerun file, and as .npz beside it.
+    """Record one episode: as a Rerun file, and as .npz beside it; or as a film.
 
     Args:
         policy: Directory of a run or of a checkpoint, or name of a policy: "random",
-            "push", "expert", "idle", "curl", "random_curl".
+            "push", "expert", "idle", "curl", "random_curl", "pretrained:NAME".
         out: Path of the .rrd file.
+        gif: Path of a film for slides, .gif or .webp; needs no OpenGL.
         task: Task of `cathsim list`; by default the one that the policy was trained on.
         seed: Seed of the episode.
         max_steps: Number of control steps after which the episode is cut off.
-        anatomy: Anatomy of one's own, for the task `navigate`.
+        anatomy: Where the task takes place.
         fluoroscopy: Whether to include X-ray images.
     """
     from cathsim_dmc.agents import report
@@ -107,14 +110,72 @@ def record(
         max_steps=max_steps,
         task_kwargs=anatomy.task_kwargs or None,
         fluoroscopy=fluoroscopy,
+        gif=gif,
     )
-    print(f"{episode.steps} steps, {episode.termination}: {out}")
+    written = " ".join(str(path) for path in (out, gif) if path is not None)
+    print(f"{episode.steps} steps, {episode.termination}: {written}")
     forces = recorded_forces(episode)
     if forces.sum is not None and forces.max is not None:
         print(
             f"mean force {millinewtons(forces.sum.mean)} mN (sum over contacts), max "
             f"force {millinewtons(forces.max.maximum)} mN (largest single contact)"
         )
+    return 0
+
+
+def demos(
+    task: Task,
+    /,
+    out: Path,
+    episodes: int = 20,
+    observation: tuple[str, ...] = ("tracking",),
+    noise: float = 0.0,
+    seed: int = DEMONSTRATION_SEED,
+    max_steps: int | None = None,
+    anatomy: OwnAnatomy = NO_ANATOMY,
+    threads: int | None = None,
+    json: bool = False,
+) -> int:
+    """Write demonstrations of the expert as a Minari dataset.
+
+    Args:
+        task: Task of `cathsim list`.
+        out: Directory of the dataset, which must not exist. `minari.load_dataset`
+            knows it if its name ends in a version, such as lcca-v0.
+        episodes: Number of episodes, each with a seed of its own.
+        observation: Names of the observations that a learner is to see.
+        noise: Standard deviation of normal noise added to every entry of the expert's
+            action, so that it shows how it comes back to its way.
+        seed: Seed of the first episode; the others count up.
+        max_steps: Number of control steps after which an episode is cut off; by
+            default the task's own.
+        anatomy: Anatomy of one's own, for the task `navigate`.
+        threads: Number of threads of the simulation; one per core by default.
+        json: Whether to print one JSON object and nothing else.
+    """
+    from cathsim_dmc import agents
+    from cathsim_dmc.analysis.force_statistics import millinewtons
+
+    limit = {} if max_steps is None else {"max_steps": max_steps}
+    done = agents.record_demonstrations(
+        task,
+        out,
+        episodes,
+        observation=observation if len(observation) != 1 else observation[0],
+        seed=seed,
+        noise=noise,
+        task_kwargs={**limit, **anatomy.task_kwargs},
+        num_threads=threads,
+        say=lambda text: print(text, file=sys.stderr, flush=True),
+    )
+    if json:
+        print_json({**vars(done), "path": str(done.path)})
+        return 0
+    print(
+        f"{done.successes} of {done.episodes} episodes succeed, {done.steps} steps, "
+        f"mean force {millinewtons(done.mean_force)} mN, max force "
+        f"{millinewtons(done.max_force)} mN: {done.path}"
+    )
     return 0
 
 
@@ -158,8 +219,8 @@ def play(
         episodes: Number of episodes; by default until you quit.
         speed: Speed of the simulation, in multiples of real time.
         policy: Policy to watch instead of playing yourself: directory of a run or of
-            a checkpoint, or name of a policy.
-        anatomy: Anatomy of one's own, for the task `navigate`.
+            a checkpoint, or name of a policy, such as "pretrained:type1_bca".
+        anatomy: Where the task takes place.
     """
     watched = None
     if policy is not None:
@@ -181,6 +242,41 @@ def play(
     )
     for path in written:
         print(path)
+    return 0
+
+
+def export(
+    run: Annotated[Path, conf.Positional],
+    name: Annotated[str, conf.Positional],
+    /,
+    out: Path | None = None,
+    results: Path = Path("results"),
+    episodes: int = 30,
+    threads: int | None = None,
+) -> int:
+    """Make a policy that ships from a run: evaluate it, write weights and a card.
+
+    Args:
+        run: Directory of a run or of a checkpoint.
+        name: Name of the policy, "type1_bca" for `pretrained:type1_bca`.
+        out: Directory to write to; by default that of the package.
+        results: Directory of `cathsim benchmark table`, for the other seeds.
+        episodes: Number of episodes of the evaluation by the published rule.
+        threads: Number of threads of the simulation; one per core by default.
+    """
+    from cathsim_dmc.agents.pretrained import DIRECTORY
+    from cathsim_dmc.benchmarks.export import export as write
+
+    print(
+        write(
+            run,
+            name,
+            directory=out or DIRECTORY,
+            results=results,
+            episodes=episodes,
+            num_threads=threads,
+        )
+    )
     return 0
 
 

@@ -1,4 +1,4 @@
-"""`cathsim validate rod`, `wall`, `forces`; `cathsim benchmark speed`, `difficulty`."""
+"""`cathsim validate rod`, `wall`, `forces`; `benchmark speed`, `difficulty`."""
 
 import sys
 from json import dumps

@@ -7,12 +7,26 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from cathsim_dmc import bounds
 from cathsim_dmc.imaging import carm as carms
 from cathsim_dmc.imaging import detector, materials
 
 # Long side of a 30 x 38 cm flat detector, m. It shows 0.26 m of patient: an arch from
 # the inlet to the ends of the branches.
 DETECTOR_SIZE = 0.38
+
+# What a suite can be set to: far beyond what is built, within what can be computed.
+_BOUNDS = {
+    "magnification": (0.01, 1000.0, ""),
+    "kerma": (0.0, 1.0, "Gy"),
+    "gain": (0.0, 1000.0, ""),
+    "blur": (0.0, 0.1, "m"),
+    "roadmap": (0.0, 1.0, ""),
+    "source_detector": (0.0, bounds.FAR, "m"),
+    "source_isocentre": (0.0, bounds.FAR, "m"),
+    "detector_size": (1e-3, bounds.FAR, "m"),
+}
+_MOST_IODINE = 10_000.0  # kg/m³, twice the density of solid iodine
 
 # Name in `carm.VIEWS`, or primary and secondary angle in degrees.
 View = str | Sequence[float]
@@ -58,6 +72,16 @@ class FluoroscopyOptions:
     detector_size: float = DETECTOR_SIZE
 
     def __post_init__(self) -> None:
+        bounds.pixels("size", self.size)
+        for name, (low, high, unit) in _BOUNDS.items():
+            bounds.number(name, getattr(self, name), low, high, unit)
+        for name in ("kerma", "gain", "magnification"):
+            bounds.number(name, getattr(self, name), positive=True)
+        bounds.switch("noise", self.noise)
+        if not isinstance(self.contrast, bool):
+            bounds.number("contrast", self.contrast, 0.0, _MOST_IODINE, "kg/m³")
+        if self.centre is not None:
+            bounds.vector("centre", self.centre, 3, -bounds.FAR, bounds.FAR, "m")
         # Built here, so that a wrong option is refused before any simulation.
         self.carms(np.zeros((1, 3)))
 
@@ -71,11 +95,7 @@ class FluoroscopyOptions:
     @property
     def resolution(self) -> tuple[int, int]:
         """(rows, columns)."""
-        size = self.size
-        if isinstance(size, int):
-            return size, size
-        rows, columns = size
-        return rows, columns
+        return bounds.pixels("size", self.size)
 
     @property
     def planes(self) -> int:
@@ -101,9 +121,11 @@ class FluoroscopyOptions:
             x, y, z = self.centre
             centre = (x, y, z)
         arms = []
-        views = [view for view in (self.view, self.biplane) if view is not None]
-        for view in views:
-            primary, secondary = np.add(_angles(view), deviation)
+        views = {"view": self.view}
+        if self.biplane is not None:
+            views["biplane"] = self.biplane
+        for name, view in views.items():
+            primary, secondary = np.add(_angles(name, view), deviation)
             arm = carms.CArm(
                 primary=np.deg2rad(primary),
                 secondary=np.deg2rad(secondary),
@@ -118,12 +140,12 @@ class FluoroscopyOptions:
         return tuple(arms)
 
 
-def _angles(view: View) -> tuple[float, float]:
-    if isinstance(view, str) and view in carms.VIEWS:
-        return carms.VIEWS[view]
-    if isinstance(view, str) or np.shape(view) != (2,):
-        raise ValueError(
-            f"view is {view!r}; give one of {', '.join(carms.VIEWS)}, or the primary "
-            "and secondary angle in degrees"
-        )
-    return float(view[0]), float(view[1])
+def _angles(name: str, view: View) -> tuple[float, float]:
+    if isinstance(view, str):
+        return carms.VIEWS[bounds.choice(name, view, carms.VIEWS)]
+    try:
+        primary, secondary = bounds.vector(name, view, 2, -360.0, 360.0, "degrees")
+    except ValueError as error:
+        raise ValueError(f"{error}, or one of {', '.join(carms.VIEWS)}") from error
+    bounds.number(f"secondary angle of {name}", secondary, -89.0, 89.0, "degrees")
+    return primary, secondary

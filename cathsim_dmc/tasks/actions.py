@@ -2,18 +2,29 @@
 
 import numpy as np
 
+from cathsim_dmc import bounds
 
-def check_action(action: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+
+def check_action(given: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
     """Returns the action as float64, clipped to [-1, 1] as the drives would.
 
     Args:
-      action: of one simulation (A,), or of many (N, A).
+      given: action of one simulation (A,), or of many (N, A).
       shape: that it must have.
 
     Raises:
       ValueError: if its shape is another or it is not finite.
     """
-    action = np.asarray(action, dtype=np.float64)
+    try:
+        action = np.asarray(given)
+    except ValueError:  # rows of different lengths
+        action = np.array(None)
+    if action.dtype.kind not in "fiu":
+        raise ValueError(
+            f"the action is {bounds.shown(given)}; give an array {shape} of numbers in "
+            "[-1, 1]"
+        )
+    action = action.astype(np.float64)
     if action.shape != shape:
         many = f"for {shape[0]} simulations, " if shape[1:] else ""
         raise ValueError(

@@ -9,6 +9,8 @@ from collections.abc import Sequence
 import mujoco
 import numpy as np
 
+from cathsim_dmc import bounds
+
 CAMERAS = ("top", "side", "tip")
 KINDS = ("rgb", "depth")
 
@@ -38,7 +40,10 @@ class CameraOptions:
     size: int | Sequence[int] = 128
 
     def __post_init__(self):
-        names = (self.names,) if isinstance(self.names, str) else tuple(self.names)
+        names = (self.names,) if isinstance(self.names, str) else self.names
+        if not isinstance(names, Sequence):
+            bounds.refuse("camera names", names, f"some of {', '.join(CAMERAS)}")
+        names = tuple(names)
         object.__setattr__(self, "names", names)
         unknown = [name for name in names if name not in CAMERAS]
         if unknown or not names or len(set(names)) < len(names):
@@ -46,15 +51,12 @@ class CameraOptions:
                 f"camera names are {self.names!r}; give different ones of "
                 f"{', '.join(CAMERAS)}"
             )
-        if np.shape(self.size) not in ((), (2,)) or min(self.resolution) < 1:
-            raise ValueError(f"camera size is {self.size!r}; give (rows, columns) >= 1")
+        object.__setattr__(self, "size", bounds.pixels("camera size", self.size))
 
     @property
     def resolution(self) -> tuple[int, int]:
         """(rows, columns)."""
-        if isinstance(self.size, int):
-            return self.size, self.size
-        rows, columns = self.size
+        rows, columns = bounds.pixels("camera size", self.size)
         return rows, columns
 
 

@@ -53,6 +53,7 @@ class Case:
         model: mujoco.MjModel,
         fluoroscopy: FluoroscopyOptions | None = None,
         fields: Fields | None = None,
+        start_along_route: Sequence[float] | None = None,
     ):
         """Lets the device settle in the anatomy.
 
@@ -62,10 +63,13 @@ class Case:
           model: The compiled scene.
           fluoroscopy: Set-up of the angiography machine, None for no machine.
           fields: What `write` writes, by name in MuJoCo's model.
+          start_along_route: As in `NavigationConfig`.
         """
         self.scene = scene
         self.objective = objective
-        self.start = StartPosture(scene, model, model_index(scene, model))
+        self.start = StartPosture(
+            scene, model, model_index(scene, model), start_along_route
+        )
         self._fluoroscopy = fluoroscopy
         self._fields = fields or {}
 
@@ -102,6 +106,7 @@ def alike(
     scenes: Sequence[Scene],
     objectives: Sequence[Objective],
     fluoroscopy: FluoroscopyOptions | None = None,
+    start_along_route: Sequence[float] | None = None,
 ) -> tuple[Case, ...]:
     """Compiles scenes so that any of them can be written into a model of the first.
 
@@ -112,6 +117,7 @@ def alike(
       scenes: Scenes of one device, not compiled yet.
       objectives: Success and reward in each of them.
       fluoroscopy: Set-up of the angiography machines, None for none.
+      start_along_route: As in `NavigationConfig`.
 
     Raises:
       ValueError: if the scenes differ in more than wall and places.
@@ -122,7 +128,7 @@ def alike(
     host = _make_room(scenes[0], pieces, models)
     fields = _differences(host, models, [scene.anatomy.name for scene in scenes])
     return tuple(
-        Case(scene, objective, model, fluoroscopy, own)
+        Case(scene, objective, model, fluoroscopy, own, start_along_route)
         for scene, objective, model, own in zip(
             scenes, objectives, models, fields, strict=True
         )

@@ -1,12 +1,12 @@
 """Options of a navigation task."""
 
 import dataclasses
-import numbers
 from collections.abc import Mapping, Sequence
 from typing import Any, cast
 
 import numpy as np
 
+from cathsim_dmc import bounds
 from cathsim_dmc.entities import devices
 from cathsim_dmc.entities.contact import FRICTION
 from cathsim_dmc.imaging.options import FluoroscopyOptions
@@ -16,6 +16,10 @@ from cathsim_dmc.tasks.variations import Randomisation
 PHYSICS_TIMESTEP = 0.004  # s
 CONTROL_TIMESTEP = 0.04  # s, one frame of fluoroscopy
 MAX_STEPS = 2000  # published
+# The device is laid along the route, whose bends its links cut short.
+LARGEST_START = 0.95
+_MOST_JOINTS = 1000
+MOST_FRICTION = 2.0  # Coulomb coefficient
 # A link shorter than its own radius is no rod; one longer than a vessel is wide does
 # not follow its bends.
 _LEAST_LINK, _LONGEST_LINK = 2e-3, 0.1  # m
@@ -31,6 +35,9 @@ class NavigationConfig:
       observation: Name or names of observations, see `observations.OBSERVATIONS`.
       device: Name of a device in `devices.DEVICES`, or a device.
       rotation: Whether the action has a rotation of the base.
+      start_along_route: Least and largest share of the way to the goal that the head
+        of the device has made when an episode starts, drawn anew for each; None for
+        none of it. For curricula.
       max_steps: Number of control steps until the episode is truncated.
       friction: Coulomb coefficient of device on wall.
       shaft_link: Length of the longest link of the shaft, m.
@@ -48,8 +55,9 @@ class NavigationConfig:
     """
 
     observation: str | Sequence[str] = "internal"
-    device: str | devices.Device = "published"
+    device: str | devices.Device = "steerable_5f"
     rotation: bool = False
+    start_along_route: Sequence[float] | None = None
     max_steps: int = MAX_STEPS
     friction: float = FRICTION
     shaft_link: float = 0.0175
@@ -70,6 +78,7 @@ class NavigationConfig:
         object.__setattr__(
             self, "randomisation", Randomisation.make(self.randomisation)
         )
+        self._check_views()
 
     # Three fields with the types that they have once the config is made.
 
@@ -89,53 +98,59 @@ class NavigationConfig:
         return cast(CameraOptions, self.cameras)
 
     def _check_numbers(self):
-        def require(name: str, good: bool, allowed: str):
-            if not good:
-                given = getattr(self, name)
-                raise ValueError(f"{name} is {given!r}; it must be {allowed}")
+        bounds.switch("rotation", self.rotation)
+        bounds.whole("max_steps", self.max_steps, 1)
+        shares = self.start_along_route
+        if shares is not None and not (
+            isinstance(shares, Sequence)
+            and [type(one) in (int, float) for one in shares] == [True, True]
+            and 0 <= shares[0] <= shares[1] <= LARGEST_START
+        ):
+            bounds.refuse(
+                "start_along_route",
+                shares,
+                f"None, or (low, high) with 0 <= low <= high <= {LARGEST_START:g}",
+            )
+        if self.torsion_joints is not None:
+            bounds.whole("torsion_joints", self.torsion_joints, 0, _MOST_JOINTS)
+        bounds.number("friction", self.friction, 0.0, MOST_FRICTION)
+        bounds.number("shaft_link", self.shaft_link, _LEAST_LINK, _LONGEST_LINK, "m")
+        if self.working_length is not None:
+            bounds.number("working_length", self.working_length, positive=True)
+        timestep = bounds.number("physics_timestep", self.physics_timestep)
+        substeps = CONTROL_TIMESTEP / timestep if timestep else 0
+        if not (
+            timestep > 0
+            and _FEWEST_SUBSTEPS <= substeps + 1e-6
+            and substeps - 1e-6 <= _MOST_SUBSTEPS
+            and abs(substeps - round(substeps)) < 1e-6
+        ):
+            bounds.refuse(
+                "physics_timestep",
+                self.physics_timestep,
+                f"a whole part of the control step of {CONTROL_TIMESTEP:g} s, from "
+                f"{_FEWEST_SUBSTEPS} to {_MOST_SUBSTEPS} physics steps each",
+            )
 
-        require("rotation", isinstance(self.rotation, bool), "True or False")
-        steps = self.max_steps
-        require("max_steps", _whole(steps) and steps >= 1, "an integer, at least 1")
-        torsion = self.torsion_joints
-        require(
-            "torsion_joints",
-            torsion is None or (_whole(torsion) and torsion >= 0),
-            "an integer, at least 0, or None",
-        )
-        for name in ("friction", "shaft_link", "working_length", "physics_timestep"):
-            value = getattr(self, name)
-            good = value is None and name == "working_length"
-            if isinstance(value, int | float) and not isinstance(value, bool):
-                good = bool(np.isfinite(value))
-            require(name, good, "a positive, finite number")
-        require("friction", 0 <= self.friction <= 2, "between 0 and 2")
-        require(
-            "shaft_link",
-            _LEAST_LINK <= self.shaft_link <= _LONGEST_LINK,
-            f"positive, from {_LEAST_LINK:g} to {_LONGEST_LINK:g} m",
-        )
-        substeps = (
-            CONTROL_TIMESTEP / self.physics_timestep if self.physics_timestep else 0
-        )
-        require(
-            "physics_timestep",
-            self.physics_timestep > 0
-            and _FEWEST_SUBSTEPS <= round(substeps) <= _MOST_SUBSTEPS
-            and abs(substeps - round(substeps)) < 1e-6,
-            f"a whole part of the control step of {CONTROL_TIMESTEP:g} s, from "
-            f"{_FEWEST_SUBSTEPS} to {_MOST_SUBSTEPS} physics steps each",
-        )
-
-
-def _whole(value: Any) -> bool:
-    return isinstance(value, numbers.Integral) and not isinstance(value, bool)
+    def _check_views(self):
+        """Check that every C-arm stays possible, however far its angles deviate."""
+        view = self.ranges.view
+        ends = view if isinstance(view, Sequence) else (0.0,)
+        for deviation in {round(end) for end in ends}:
+            try:
+                self.fluoroscopy_options.carms(np.zeros((1, 3)), (deviation, deviation))
+            except ValueError as error:
+                raise ValueError(
+                    f"randomisation: view is {view!r}, by which the view of "
+                    f"fluoroscopy may deviate; at {deviation} degrees it is none: "
+                    f"{error}"
+                ) from error
 
 
 def _options(name: str, kind: type, value: Mapping[str, Any]):
     known = [field.name for field in dataclasses.fields(kind)]
-    if not isinstance(value, Mapping) or set(value) - set(known):
-        raise ValueError(
-            f"{name} is {value!r}; give a mapping with some of {', '.join(known)}"
-        )
-    return kind(**value)
+    bounds.mapping(name, value, known)
+    try:
+        return kind(**value)
+    except ValueError as error:
+        raise ValueError(f"{name}: {error}") from error

@@ -7,6 +7,7 @@ from typing import ClassVar, NamedTuple, Protocol
 
 import numpy as np
 
+from cathsim_dmc import bounds
 from cathsim_dmc.anatomy import Anatomy, Centreline, Goal
 from cathsim_dmc.anatomy.geodesic import LumenDistance
 from cathsim_dmc.tasks import forces, readings
@@ -149,8 +150,7 @@ class Cannulation:
     UNTIL_SUCCESS: ClassVar[frozenset[str]] = frozenset({"distance", "path"})
 
     def __post_init__(self):
-        if not self.goal_radius > 0:
-            raise ValueError(f"goal_radius is {self.goal_radius} m; it must be > 0")
+        bounds.number("goal_radius", self.goal_radius, positive=True)
         object.__setattr__(self, "weights", self._checked(self.weights))
 
     def _checked(self, weights: Mapping[str, float]) -> Mapping[str, float]:

@@ -27,6 +27,7 @@ from cathsim_dmc.tasks.objectives import (
 )
 from cathsim_dmc.tasks.path_tracker import PathTracker
 from cathsim_dmc.tasks.physics_errors import PhysicsMonitor
+from cathsim_dmc.tasks.route import Routes
 from cathsim_dmc.tasks.step import Step
 from cathsim_dmc.tasks.variations import ActionDelay, ModelVariation
 
@@ -107,6 +108,9 @@ class Rollout:
         self._delay = ActionDelay(
             num_simulations, num_actions, randomisation.longest_delay
         )
+        self._routes: Routes | None = None
+        if observations.needs_route(self._names):
+            self._routes = Routes([case.objective for case in cases])
         self._sensors = ImageSensors(
             self._names,
             cases[0].angiograph,
@@ -176,7 +180,9 @@ class Rollout:
         self._sensors.restart(index, case.angiograph, episode.deviation)
         self._goal_shift[index] = episode.goal_shift or 0.0
         displacement = case.start.clear_of_wall(episode.displacement)
-        case.start.write(self._state.qpos[index], displacement, episode.roll)
+        number = case.start.draw(random_state)
+        qpos = self._state.qpos[index]
+        case.start.write(qpos, displacement, episode.roll, number)
 
     def pose_robot(self, qpos: np.ndarray) -> np.ndarray:
         """Poses the follower's joints after the device, in place: qpos (N, nq)."""
@@ -302,8 +308,11 @@ class Rollout:
             self._random_states,
             fresh,
         )
+        state, ahead = self._readings, None
+        if self._routes is not None:
+            ahead = self._routes.ahead(self._case_of, state.head, state.head_frame)
         frame = observations.Frame(
-            self._readings, self._wall_force, self._action, goal, images
+            state, self._wall_force, self._action, goal, images, ahead
         )
         return observations.observe(self._names, frame)
 

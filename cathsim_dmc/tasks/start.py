@@ -1,5 +1,7 @@
 """The posture in which a device waits for its episode to begin."""
 
+from collections.abc import Sequence
+
 import mujoco
 import numpy as np
 
@@ -10,6 +12,12 @@ from cathsim_dmc.tasks.variations import START_JITTER
 
 # How long the device settles; its hinges relax in 0.4 s.
 _SETTLING_TIME = 2.0  # s
+_STARTS_ALONG_ROUTE = 16
+# By how much the axis of a settled device may stand out of the lumen, m: the pieces of
+# the wall stay behind it by less, the device's radius not counted.
+_OUTSIDE = 0.5e-3
+# Deepest contact that a device at rest makes with a wall that it does not stand in, m.
+_DEEPEST = 1.0e-3
 
 
 class StartPosture:
@@ -22,13 +30,25 @@ class StartPosture:
     what was drawn.
     """
 
-    def __init__(self, scene: Scene, model: mujoco.MjModel, index: ModelIndex):
+    def __init__(
+        self,
+        scene: Scene,
+        model: mujoco.MjModel,
+        index: ModelIndex,
+        along_route: Sequence[float] | None = None,
+    ):
         """Lets the device settle.
 
         Args:
           scene: Entities and where they stand.
           model: The compiled scene.
           index: Places of the task's quantities in the model.
+          along_route: Least and largest share of the way to the goal that the head
+            has made, for episodes that do not begin at the inlet; None for those
+            that do.
+
+        Raises:
+          ValueError: if the device comes to rest outside the lumen or in its wall.
         """
         catheter = scene.catheter
         columns = {
@@ -41,14 +61,9 @@ class StartPosture:
             [[columns[f"bend_{axis}_{link}"] for axis in "xy"] for link in links]
         )
         self._insertion = index.insertion_qpos
-        data = mujoco.MjData(model)
         # The base cannot go back behind its start, so the stroke begins 1 mm later.
-        data.qpos[self._insertion] = START_JITTER
-        data.qpos[self._bends] = joints_along(
-            catheter.link_lengths, scene.placement.line, START_JITTER
-        )
-        for _ in range(round(_SETTLING_TIME / model.opt.timestep)):
-            mujoco.mj_step(model, data)
+        data = self._settle(scene, model, START_JITTER)
+        _refuse_outside(scene, model, index, data)
         data.qvel[:] = 0.0
         mujoco.mj_kinematics(model, data)
         mujoco.mj_comPos(model, data)
@@ -61,6 +76,57 @@ class StartPosture:
         self._frame = data.xmat[index.links.start].reshape(3, 3).copy()
         self._head = data.site_xpos[index.head_site].copy()
         self._head_depth = float(scene.anatomy.depth(self._head))
+
+        self._ahead: list[np.ndarray] = []
+        if along_route is not None:
+            self._ahead = self._settled_along(scene, model, index, along_route)
+
+    def _settle(
+        self, scene: Scene, model: mujoco.MjModel, advance: float
+    ) -> mujoco.MjData:
+        """Lays the device along the line, so far advanced (m), and lets it go."""
+        data = mujoco.MjData(model)
+        data.qpos[self._insertion] = advance
+        data.qpos[self._bends] = joints_along(
+            scene.catheter.link_lengths, scene.placement.line, advance
+        )
+        for _ in range(round(_SETTLING_TIME / model.opt.timestep)):
+            mujoco.mj_step(model, data)
+        return data
+
+    def _settled_along(
+        self,
+        scene: Scene,
+        model: mujoco.MjModel,
+        index: ModelIndex,
+        shares: Sequence[float],
+    ) -> list[np.ndarray]:
+        """Configurations (nq,) with the device laid further and further in.
+
+        What springs out of a branch comes to rest elsewhere in the lumen; where a
+        device cannot lie at all, none is kept.
+        """
+        place = scene.placement
+        way = np.linalg.norm(np.diff(place.line, axis=0), axis=-1).sum()
+        way -= float(np.sum(scene.catheter.link_lengths)) + START_JITTER
+        settled = []
+        for share in np.linspace(shares[0], shares[1], _STARTS_ALONG_ROUTE):
+            data = self._settle(scene, model, START_JITTER + share * way)
+            try:
+                _refuse_outside(scene, model, index, data)
+            except ValueError:
+                continue
+            settled.append(data.qpos.copy())
+        if not settled:
+            raise ValueError(
+                f"start_along_route is {tuple(shares)}: {scene.device.name!r} can be "
+                f"laid nowhere there in {scene.anatomy.name!r}; give smaller shares"
+            )
+        return settled
+
+    def draw(self, random_state: np.random.RandomState) -> int | None:
+        """Draws where along the route an episode starts; None for the inlet."""
+        return random_state.randint(len(self._ahead)) if self._ahead else None
 
     def _link_directions(self, index: ModelIndex, data: mujoco.MjData) -> np.ndarray:
         """Unit vectors (n, 3) of the links in the frame of link 0."""
@@ -97,7 +163,11 @@ class StartPosture:
         )
 
     def write(
-        self, qpos: np.ndarray, displacement: np.ndarray, roll: float | None = None
+        self,
+        qpos: np.ndarray,
+        displacement: np.ndarray,
+        roll: float | None = None,
+        number: int | None = None,
     ) -> None:
         """Writes the start configuration of one simulation.
 
@@ -107,7 +177,13 @@ class StartPosture:
             into the lumen, m.
           roll: Angle by which the device is turned about its own axis, rad: its
             hinges stand otherwise, its shape is the same.
+          number: What `draw` returned: a device that lies along the route is neither
+            displaced nor turned.
         """
+        if number is not None:
+            qpos[self._bends] = self._ahead[number][self._bends]
+            qpos[self._insertion] = self._ahead[number][self._insertion]
+            return
         angles, step = self._angles, self._steps @ displacement
         if roll:
             angles = bends_of(_turned(self._directions, -roll))
@@ -115,6 +191,29 @@ class StartPosture:
         qpos[self._bends] = angles
         qpos[self._bends[self._free]] += step[1:]
         qpos[self._insertion] = max(self._advance + step[0], 0.0)
+
+
+def _refuse_outside(
+    scene: Scene, model: mujoco.MjModel, index: ModelIndex, data: mujoco.MjData
+) -> None:
+    """Raises ValueError if a settled device stands outside the lumen or in the wall."""
+    nodes = np.vstack([data.xpos[index.links], data.site_xpos[index.head_site]])
+    place, anatomy = scene.placement, scene.anatomy
+    # Those behind the mouth lie in the sheath, and touch the wall where that does.
+    entered = (nodes - place.inlet) @ place.direction > 0.0
+    out = -float(anatomy.depth(nodes[entered]).min(initial=0.0))
+    wall = [i for i in range(model.ngeom) if model.geom(i).name.startswith("wall_")]
+    touching = np.isin(data.contact.geom, wall).any(axis=-1)
+    deepest = -float(data.contact.dist[touching].min(initial=0.0))
+    if out > _OUTSIDE or deepest > _DEEPEST:
+        raise ValueError(
+            f"{scene.device.name!r} comes to rest {1e3 * max(out, 0.0):.1f} mm outside "
+            f"the lumen of {anatomy.name!r} and {1e3 * deepest:.1f} mm deep in its "
+            f"wall before an episode begins (allowed are {1e3 * _OUTSIDE:g} and "
+            f"{1e3 * _DEEPEST:g} mm): the sheath before its inlet or the first "
+            f"{1e3 * place.start_depth:.0f} mm do not fit; enter it elsewhere, or take "
+            "a device with a shorter or softer tip"
+        )
 
 
 def _dof_of(model: mujoco.MjModel, place: int) -> int:

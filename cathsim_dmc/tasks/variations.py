@@ -13,6 +13,7 @@ import numpy as np
 from dm_control.composer import variation
 from dm_control.composer.variation import distributions
 
+from cathsim_dmc import bounds
 from cathsim_dmc.imaging.angiograph import Deviation
 from cathsim_dmc.tasks import objectives as objectives
 
@@ -22,7 +23,19 @@ START_JITTER = 1e-3  # m
 # Lowest and highest value of a uniform distribution, or any composer Variation.
 Range = Sequence[float] | variation.Variation
 
-_RANGES = ("friction", "stiffness", "view", "gain", "kerma", "goal_shift", "roll")
+# Least and largest value of what is drawn, far beyond what differs between sessions,
+# within what can be simulated.
+_RANGES = {
+    "friction": (0.0, 2.0, ""),
+    "stiffness": (0.01, 100.0, ""),
+    "view": (-90.0, 90.0, "degrees"),
+    "gain": (0.01, 100.0, ""),
+    "kerma": (1e-3, 1e6, ""),
+    "goal_shift": (-1.0, 1.0, "m"),
+    "roll": (-2 * np.pi, 2 * np.pi, "rad"),
+    "delay": (0, 250, "control steps"),
+}
+_FARTHEST_START = 0.02  # m; the lumen is no wider
 
 
 def start_displacement(
@@ -64,28 +77,21 @@ class Randomisation:
     delay: Sequence[int] | None = None
 
     def __post_init__(self):
-        for name in (*_RANGES, "delay"):
+        for name, (low, high, unit) in _RANGES.items():
             value = getattr(self, name)
-            if value is None or isinstance(value, variation.Variation):
-                if value is not None and name in ("delay", "goal_shift"):
+            if value is None:
+                continue
+            if isinstance(value, variation.Variation):
+                if name in ("delay", "goal_shift"):
                     raise ValueError(
                         f"{name} is a Variation; its bounds must be known before, so "
                         "give (low, high)"
                     )
                 continue
-            if np.shape(value) != (2,) or not value[0] <= value[1]:
-                raise ValueError(
-                    f"{name} is {value!r}; give (low, high) with low <= high, or None"
-                )
-            if name in ("friction", "delay") and value[0] < 0:
-                raise ValueError(f"{name} is {value!r}; it cannot be negative")
-            if name in ("stiffness", "gain", "kerma") and value[0] <= 0:
-                raise ValueError(f"{name} is {value!r}; factors must be > 0")
-        delay = self.delay or ()
-        if not all(float(steps).is_integer() for steps in delay):
-            raise ValueError(f"delay is {self.delay!r}; give whole control steps")
-        if not self.start_radius >= 0:
-            raise ValueError(f"start_radius is {self.start_radius} m; it must be >= 0")
+            whole = name == "delay"
+            ends = bounds.interval(name, value, low, high, unit, integers=whole)
+            object.__setattr__(self, name, ends)
+        bounds.number("start_radius", self.start_radius, 0.0, _FARTHEST_START, "m")
 
     @classmethod
     def make(cls, value: "Randomisation | Mapping[str, Any] | bool") -> "Randomisation":
@@ -95,13 +101,15 @@ class Randomisation:
         if isinstance(value, bool):
             return DEFAULT_RANGES if value else cls()
         known = [field.name for field in dataclasses.fields(cls)]
-        unknown = sorted(set(value) - set(known))
-        if unknown:
-            raise ValueError(
-                f"nothing named {', '.join(unknown)} can be randomised; there are "
-                f"{', '.join(known)}"
+        if not isinstance(value, Mapping):
+            bounds.refuse(
+                "randomisation", value, f"True, False, or some of {', '.join(known)}"
             )
-        return cls(**value)
+        bounds.mapping("randomisation", value, known)
+        try:
+            return cls(**value)
+        except ValueError as error:
+            raise ValueError(f"randomisation: {error}") from error
 
     @property
     def longest_delay(self) -> int:
@@ -122,7 +130,10 @@ class Randomisation:
                 return None
             if not isinstance(chosen, variation.Variation):
                 chosen = distributions.Uniform(*map(float, chosen))
-            return float(variation.evaluate(chosen, random_state=random_state))
+                return float(variation.evaluate(chosen, random_state=random_state))
+            # Only now is it known what somebody's own distribution gives.
+            drawn = variation.evaluate(chosen, random_state=random_state)
+            return bounds.number(f"{name}, as drawn,", drawn, *_RANGES[name])
 
         displacement = start_displacement(random_state, self.start_radius)
         friction, stiffness = value("friction"), value("stiffness")

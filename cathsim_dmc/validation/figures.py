@@ -215,10 +215,9 @@ def wall(
     )
     ax.legend(frameon=False, fontsize=8)
     ax = axes[1]
-    for colour, one in zip(_COLOURS, pulled, strict=False):
-        ax.plot(
-            1e3 * one.travel, one.ratio, color=colour, label=f"μ = {one.friction:g}"
-        )
+    for colour, one in zip(_COLOURS * 2, pulled, strict=False):
+        label = f"μ = {one.friction:g}, {np.degrees(one.angle):.0f}°"
+        ax.plot(1e3 * one.travel, one.ratio, color=colour, label=label)
         ax.axhline(one.expected, color=colour, linestyle="--", linewidth=1)
     ax.set(
         title="Rod pulled over a drum of 50 mm radius",

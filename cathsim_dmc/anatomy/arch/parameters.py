@@ -5,6 +5,8 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, fields
 
+from cathsim_dmc import bounds
+
 # Two lumens side by side need this much wall between them, m.
 MINIMUM_SEPTUM = 1e-3
 # Tube in front of the ascending aorta by which a phantom is mounted, m: the device
@@ -14,10 +16,7 @@ INLET_TUBE = 70e-3
 
 
 def _check(name: str, value: float, low: float, high: float, unit: str) -> None:
-    if not (math.isfinite(value) and low <= value <= high):
-        raise ValueError(
-            f"{name} is {value:g} {unit}; allowed is {low:g} to {high:g} {unit}."
-        )
+    bounds.number(name, value, low, high, unit)
 
 
 @dataclass(frozen=True)
@@ -58,11 +57,13 @@ class BranchParameters:
         _check("branch take_off", self.take_off, -1.3, 1.3, "rad")
         _check("branch length", self.length, 40e-3, 150e-3, "m")
         _check("branch lean", self.lean, -1.3, 1.3, "rad")
-        second = self.second_bend_radius
-        for bend in (self.bend_radius, self.bend_radius if second is None else second):
-            _check("branch bend_radius", bend, 3.0 * self.radius, 10.0, "m")
-        for azimuth in (self.bend_azimuth, self.second_bend_azimuth):
-            _check("branch bend_azimuth", azimuth, -2 * math.pi, 2 * math.pi, "")
+        for name in ("bend_radius", "second_bend_radius"):
+            bend = getattr(self, name)
+            if bend is not None or name == "bend_radius":
+                _check(f"branch {name}", bend, 3.0 * self.radius, 10.0, "m")
+        for name in ("bend_azimuth", "second_bend_azimuth"):
+            azimuth = getattr(self, name)
+            _check(f"branch {name}", azimuth, -2 * math.pi, 2 * math.pi, "rad")
         _check("branch goal_depth", self.goal_depth, 5e-3, self.length - 5e-3, "m")
 
 
@@ -131,6 +132,13 @@ class ArchParameters:
     lsa_aberrant_spacing: float = 16e-3
 
     def __post_init__(self) -> None:
+        for name in ("bca", "lcca", "lsa", "aberrant"):
+            branch = getattr(self, name)
+            if not isinstance(branch, BranchParameters) and (
+                branch is not None or name != "aberrant"
+            ):
+                bounds.refuse(name, branch, "BranchParameters")
+        bounds.switch("bovine", self.bovine)
         for level in ("ascending", "bca_level", "lcca_level", "lsa_level"):
             name = f"{level}_radius"
             _check(name, getattr(self, name), 7e-3, 25e-3, "m")
@@ -142,6 +150,7 @@ class ArchParameters:
         _check("plane_rotation", self.plane_rotation, -math.pi, math.pi, "rad")
         _check("bca_drop", self.bca_drop, 0.0, 4.0, "LCCA diameters")
         _check("fillet", self.fillet, 0.0, 5e-3, "m")
+        _check("lsa_aberrant_spacing", self.lsa_aberrant_spacing, 0.0, 80e-3, "m")
         _check("ascending_bend", self.ascending_bend, 0.0, 1.0, "rad")
         _check("descending_bend", self.descending_bend, -0.5, 0.5, "rad")
         _check("plane_tilt", self.plane_tilt, -0.6, 0.6, "rad")

@@ -1,0 +1,178 @@
+"""Policies that ship with the package: weights as safetensors, a card beside them."""
+
+import hashlib
+import json
+import re
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from cathsim_dmc import files
+from cathsim_dmc.agents.checkpoint import CheckpointError
+from cathsim_dmc.agents.config import ConfigError
+from cathsim_dmc.agents.learners import config_from_dict, make_policy
+from cathsim_dmc.agents.networks import NetworkShapes
+from cathsim_dmc.agents.policies import FunctionPolicy
+
+FORMAT = 1
+PREFIX = "pretrained:"
+SUFFIX = ".safetensors"
+DIRECTORY = Path(__file__).parents[1] / "pretrained"
+_NAME = re.compile(r"[a-z0-9][a-z0-9_]*")
+_MAX_CARD = 2**20  # bytes
+_PARTS: Mapping[str, type] = {
+    "name": str,
+    "task": str,
+    "task_kwargs": dict,
+    "config": dict,
+    "shapes": dict,
+    "sha256": str,
+    "training": dict,
+    "evaluation": dict,
+}
+
+
+class PretrainedPolicy(FunctionPolicy):
+    """A trained policy from a file, acting deterministically.
+
+    Attributes:
+        card: What the policy was trained for and what it reached, see `read_card`.
+    """
+
+    def __init__(self, weights: str | Path):
+        """Load the weights and their card.
+
+        Args:
+            weights: Path of the `.safetensors` file; the card lies beside it.
+
+        Raises:
+            CheckpointError: there is none, or it is damaged.
+        """
+        from safetensors import SafetensorError
+        from safetensors.torch import load
+
+        weights = Path(weights)
+        self.card = read_card(weights.with_suffix(".json"))
+        try:
+            data = weights.read_bytes()
+        except OSError as error:
+            raise CheckpointError(f"{weights} cannot be read: {error}.") from error
+        if hashlib.sha256(data).hexdigest() != self.card["sha256"]:
+            raise CheckpointError(
+                f"{weights} is damaged, or its card is that of another policy: the "
+                "SHA-256 differs."
+            )
+        try:
+            config = config_from_dict(self.card["config"])
+            policy = make_policy(NetworkShapes.from_dict(self.card["shapes"]), config)
+            policy.load_state_dict(load(data))
+        except (ConfigError, SafetensorError, RuntimeError, ValueError) as error:
+            line = " ".join(str(error).split())[:200]
+            raise CheckpointError(
+                f"{weights} does not fit the network of its card: {line}"
+            ) from error
+        name = f"{PREFIX}{self.card['name']}"
+        super().__init__(policy.eval().requires_grad_(False), name)
+        self.task = self.card["task"]
+        self.observation = config.observation
+        self.task_kwargs = self.card["task_kwargs"]
+
+
+def pretrained_names(directory: str | Path = DIRECTORY) -> list[str]:
+    """Names of the policies that ship, as in "pretrained:NAME"."""
+    return sorted(path.stem for path in Path(directory).glob(f"*{SUFFIX}"))
+
+
+def load_pretrained(name: str) -> PretrainedPolicy:
+    """The policy that ships under a name.
+
+    Raises:
+        CheckpointError: there is none of that name (lists those that exist), or it
+            is damaged.
+    """
+    name = name.removeprefix(PREFIX)
+    names = pretrained_names()
+    if name not in names:
+        there = ", ".join(PREFIX + one for one in names) or "none yet"
+        raise CheckpointError(f"no policy {PREFIX}{name}; there are {there}.")
+    return PretrainedPolicy(DIRECTORY / f"{name}{SUFFIX}")
+
+
+def read_card(path: str | Path) -> dict[str, Any]:
+    """The card of a policy.
+
+    Returns:
+        "name", "task", "task_kwargs" (options of the task as it was evaluated),
+        "config" and "shapes" (what the network is made from), "sha256" of the
+        weights, "training" (command, frames, seconds, seed, commit), "seeds" (success
+        of every seed that was trained alike), "evaluation" (episodes, success with
+        interval, forces) and "versions".
+
+    Raises:
+        CheckpointError: it is missing or damaged.
+    """
+    path = Path(path)
+    try:
+        if path.stat().st_size > _MAX_CARD:
+            raise CheckpointError(f"{path} is too long for a card.")
+        card = json.loads(path.read_text())
+    except (OSError, ValueError, RecursionError) as error:
+        raise CheckpointError(f"{path} cannot be read: {error}.") from error
+    if not isinstance(card, dict) or card.get("format") != FORMAT:
+        raise CheckpointError(f"{path} is no card of format {FORMAT}.")
+    wrong = [name for name, kind in _PARTS.items() if type(card.get(name)) is not kind]
+    if wrong:
+        raise CheckpointError(f"{path}: {', '.join(wrong)} missing or of another type.")
+    return card
+
+
+def write_pretrained(
+    directory: str | Path,
+    name: str,
+    state: Mapping[str, torch.Tensor],
+    card: Mapping[str, Any],
+) -> Path:
+    """Write weights and card; the card last, which makes them a policy.
+
+    Args:
+        directory: Directory to write to.
+        name: Name of the policy: lower-case letters, digits and underscores.
+        state: Weights and statistics of the policy by name.
+        card: Card without "format", "name" and "sha256".
+
+    Returns:
+        Path of the weights.
+
+    Raises:
+        ValueError: the name is not allowed, or the state holds more than tensors.
+    """
+    from safetensors.torch import save
+
+    require_name(name)
+    others = sorted(k for k, v in state.items() if not isinstance(v, torch.Tensor))
+    if others:
+        raise ValueError(f"the policy's state holds {', '.join(others)}: no tensors")
+    directory = Path(directory)
+    directory.mkdir(parents=True, exist_ok=True)
+    data = save({key: value.cpu().contiguous() for key, value in state.items()})
+    weights = files.write_bytes(directory / f"{name}{SUFFIX}", data)
+    values = {
+        "format": FORMAT,
+        "name": name,
+        **card,
+        "sha256": hashlib.sha256(data).hexdigest(),
+    }
+    text = json.dumps(values, indent=1, allow_nan=False) + "\n"
+    files.write_text(weights.with_suffix(".json"), text)
+    return weights
+
+
+def require_name(name: str) -> None:
+    """Raise ValueError unless a policy may have this name."""
+    if not _NAME.fullmatch(name):
+        raise ValueError(
+            f"a policy cannot be called {name!r}; use lower-case letters, digits and "
+            "underscores"
+        )

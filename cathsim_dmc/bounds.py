@@ -1,0 +1,215 @@
+"""Values from outside: of the right kind, finite and within bounds.
+
+Every function returns the value as plain Python, or raises a ValueError that names the
+field, what was given and what is allowed.
+"""
+
+from __future__ import annotations
+
+import math
+import numbers
+from collections.abc import Mapping, Sequence
+from typing import Any, NoReturn
+
+import numpy as np
+
+# Seeds that numpy's RandomState takes.
+MOST_SEED = 2**32 - 1
+# Simulations, episodes: more are a slip of the finger, and fill the memory.
+MOST_SIMULATIONS = 100_000
+MOST_THREADS = 4096
+# Pixels along a side of an image; detectors of angiography have 1,024 to 2,480.
+MOST_PIXELS = 4096
+# Way from the origin of what lies in an anatomy, m.
+FAR = 10.0
+
+_SHOWN = 80  # characters of what was given
+
+
+def refuse(name: str, value: Any, allowed: str) -> NoReturn:
+    """Raise the error of a value that is not allowed."""
+    raise ValueError(f"{name} is {shown(value)}; it must be {allowed}")
+
+
+def shown(value: Any) -> str:
+    """What was given, on one line and short."""
+    try:
+        text = " ".join(repr(value).split())
+    except Exception:  # a class of somebody else's
+        text = f"a {type(value).__name__}"
+    return text if len(text) <= _SHOWN else text[: _SHOWN - 3] + "..."
+
+
+def number(
+    name: str,
+    value: Any,
+    low: float = -math.inf,
+    high: float = math.inf,
+    unit: str = "",
+    *,
+    positive: bool = False,
+) -> float:
+    """A finite number of a range, which includes its ends.
+
+    Args:
+        name: Name of the field.
+        value: What was given.
+        low: Least value.
+        high: Largest value.
+        unit: Unit of the bounds, for the message.
+        positive: Whether it must be greater than zero, beside the range.
+    """
+    good = _is_real(value) and low <= value <= high and (value > 0 or not positive)
+    if not good:
+        refuse(name, value, _allowed("a finite number", low, high, unit, positive))
+    return float(value)
+
+
+def whole(
+    name: str, value: Any, low: int | None = None, high: int | None = None
+) -> int:
+    """An integer of a range, which includes its ends; a bool is none."""
+    least, most = -math.inf if low is None else low, math.inf if high is None else high
+    if not _is_whole(value) or not least <= value <= most:
+        refuse(name, value, _allowed("an integer", least, most))
+    return int(value)
+
+
+def seed(name: str, value: Any) -> int:
+    """A seed of numpy's RandomState."""
+    return whole(name, value, 0, MOST_SEED)
+
+
+def switch(name: str, value: Any) -> bool:
+    """True or False, and nothing that Python takes for it."""
+    if not isinstance(value, bool | np.bool_):
+        refuse(name, value, "True or False")
+    return bool(value)
+
+
+def choice(name: str, value: Any, choices: Sequence[str] | Mapping[str, Any]) -> str:
+    """One of some words."""
+    if not isinstance(value, str) or value not in choices:
+        refuse(name, value, f"one of {', '.join(choices)}")
+    return value
+
+
+def vector(
+    name: str,
+    value: Any,
+    count: int,
+    low: float = -math.inf,
+    high: float = math.inf,
+    unit: str = "",
+) -> tuple[float, ...]:
+    """So many finite numbers of a range."""
+    values = _row(value)
+    if (
+        values is None
+        or len(values) != count
+        or not all(_is_real(one) and low <= one <= high for one in values)
+    ):
+        allowed = _allowed("a finite number", low, high, unit)
+        refuse(name, value, f"{count} numbers, each {allowed}")
+    return tuple(float(one) for one in values)
+
+
+def interval(
+    name: str,
+    value: Any,
+    low: float = -math.inf,
+    high: float = math.inf,
+    unit: str = "",
+    *,
+    integers: bool = False,
+) -> tuple[float, float]:
+    """The ends of a range within a range, the lower one first."""
+    values = _row(value)
+    fits = _is_whole if integers else _is_real
+    if (
+        values is None
+        or len(values) != 2
+        or not all(fits(one) and low <= one <= high for one in values)
+        or not values[0] <= values[1]
+    ):
+        kind = "an integer" if integers else "a finite number"
+        refuse(
+            name,
+            value,
+            f"(low, high) with low <= high, each {_allowed(kind, low, high, unit)}",
+        )
+    return values[0], values[1]
+
+
+def array(name: str, value: Any, kinds: str = "fiu") -> np.ndarray:
+    """An array of finite numbers; `kinds` are those of numpy's dtypes."""
+    try:
+        given = np.asarray(value)
+    except ValueError:  # rows of different lengths
+        given = np.array(None)
+    if given.size and (given.dtype.kind not in kinds or not np.isfinite(given).all()):
+        refuse(name, value, "an array of finite numbers")
+    return given
+
+
+def instance(name: str, value: Any, kind: type) -> Any:
+    """An object of a class."""
+    if not isinstance(value, kind):
+        refuse(name, value, f"a {kind.__name__}")
+    return value
+
+
+def pixels(name: str, value: Any) -> tuple[int, int]:
+    """Rows and columns of an image, given as both or as one number for both."""
+    values = [value, value] if _is_whole(value) else _row(value)
+    if (
+        values is None
+        or len(values) != 2
+        or not all(_is_whole(one) and 1 <= one <= MOST_PIXELS for one in values)
+    ):
+        allowed = f"an integer from 1 to {MOST_PIXELS}"
+        refuse(name, value, f"{allowed}, or (rows, columns), each {allowed}")
+    return int(values[0]), int(values[1])
+
+
+def mapping(name: str, value: Any, known: Sequence[str]) -> Mapping[str, Any]:
+    """A mapping with some of the known names."""
+    if not isinstance(value, Mapping) or set(value) - set(known):
+        refuse(name, value, f"a mapping with some of {', '.join(known)}")
+    return value
+
+
+def _row(value: Any) -> list[Any] | None:
+    """The entries of a sequence or of an array with one axis."""
+    if isinstance(value, np.ndarray):
+        return list(value) if value.ndim == 1 else None
+    if isinstance(value, Sequence) and not isinstance(value, str | bytes):
+        return list(value)
+    return None
+
+
+def _is_real(value: Any) -> bool:
+    if isinstance(value, bool) or not isinstance(value, numbers.Real):
+        return False
+    try:
+        return math.isfinite(value)
+    except OverflowError:  # an integer beyond all floats
+        return False
+
+
+def _is_whole(value: Any) -> bool:
+    return isinstance(value, numbers.Integral) and not isinstance(value, bool)
+
+
+def _allowed(
+    kind: str, low: float, high: float, unit: str = "", positive: bool = False
+) -> str:
+    unit = f" {unit}" if unit else ""
+    above = " above 0" if positive and low <= 0 else ""
+    if math.isinf(low) and math.isinf(high):
+        return kind + above
+    if math.isinf(high):
+        return f"{kind}{above}" if above else f"{kind}, at least {low:g}{unit}"
+    if math.isinf(low) or above:
+        return f"{kind}{above}, at most {high:g}{unit}"
+    return f"{kind} from {low:g} to {high:g}{unit}"

@@ -1,0 +1,401 @@
+"""Writes docs/results.md and its figures from the files of finished cells.
+
+    cathsim benchmark table            # trains what is missing, into results/
+    python docs/scripts/results.py
+
+Nothing else is read but the published figures (docs/data/published_results.json), the
+expert's (docs/data/difficulty.json) and the grid, which says what is missing.
+"""
+
+import argparse
+import json
+import os
+import sys
+from pathlib import Path
+
+# torchrl goes before dm_control.
+from cathsim_dmc import agents  # isort: skip  # noqa: F401
+
+import numpy as np
+import results_figures as figures
+
+from cathsim_dmc import files
+from cathsim_dmc.analysis.intervals import interquartile_mean, success_interval
+from cathsim_dmc.benchmarks.grid import DEFAULT_GRID, read_grid
+from cathsim_dmc.benchmarks.result import ResultError, read_result
+from cathsim_dmc.benchmarks.runner import clock
+
+DOCS = Path(__file__).parents[1]
+PUBLISHED = DOCS / "data/published_results.json"
+DIFFICULTY = DOCS / "data/difficulty.json"
+PUBLISHED_TASKS = ("type1_bca", "type1_lcca", "type2_bca", "type2_lcca")
+NAMES = {"internal": "Internal", "image": "Image", "sequential": "Sequential"}
+
+INTRODUCTION = """\
+# Results
+
+Written by `python docs/scripts/results.py` from the JSON files in `results/`, one for
+each training; `cathsim benchmark table` makes those that are missing.
+
+Every policy is evaluated over 30 episodes with seeds of their own, acting
+deterministically, by the published rule: 2,000 control steps at most, success within
+8 mm of the goal and inside the target branch, the published reward. That holds whatever
+reward and length of episodes it was trained with. Published figures are those of Jianu
+et al., whose simulator, phantoms' walls and force readings differ (see
+[physics.md](physics.md), [forces.md](forces.md)): rates can be compared, forces only in
+their order of magnitude.
+"""
+
+COLUMNS = """\
+Success counts the episodes of all seeds together, with Wilson's 95 % interval; *worst*
+is that of the worst seed. Mean force is the mean over steps in contact of the largest
+contact, which is nearest to the published f_mean; max force is the largest contact of
+an episode; both ± deviation over episodes, in mN. `–` is not there.
+"""
+
+HEADER = (
+    "| agent | seeds | success (95 %) | worst | reward | mean force | max force "
+    "| published: success | reward | mean force | max force |",
+    "|---|---|---|---|---|---|---|---|---|---|---|",
+)
+
+
+def main(arguments=None):
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--results", type=Path, default=DOCS.parent / "results")
+    parser.add_argument("--grid", type=Path, default=DEFAULT_GRID)
+    parser.add_argument("--out", type=Path, default=DOCS / "results.md")
+    options = parser.parse_args(arguments)
+    results, broken = read_all(options.results)
+    cells = read_grid(options.grid)
+    for line in broken:
+        print(line, file=sys.stderr)
+    text = page(results, broken, cells, options.out)
+    options.out.parent.mkdir(parents=True, exist_ok=True)
+    files.write_text(options.out, text)
+    return 1 if broken else 0
+
+
+def read_all(directory):
+    """All results of a directory by their names, and a line for each broken one."""
+    results, broken = {}, []
+    for path in sorted(directory.glob("*.json")):
+        try:
+            results[path.stem] = read_result(path)
+        except ResultError as error:
+            broken.append(str(error).replace(f"{path.parent}{os.sep}", ""))
+    return results, broken
+
+
+def page(results, broken, cells, out):
+    """The text of the page; draws its figures beside it."""
+    table = arranged(results, cells)
+    parts = [INTRODUCTION, standing(results, broken, cells)]
+    if results:
+        parts += [
+            beside_published(table),
+            other_tasks(table),
+            aggregates(table),
+            cost(results, cells),
+            *drawn(table, out),
+        ]
+    return "\n".join(part for part in parts if part)
+
+
+def arranged(results, cells):
+    """{task: {label: [results by seed]}}, tasks and agents in the order of the grid."""
+    order = {cell.name: index for index, cell in enumerate(cells)}
+    found = sorted(
+        results.values(), key=lambda r: (order.get(r.path.stem, len(order)), r.path)
+    )
+    tasks = [*PUBLISHED_TASKS, *(r.evaluation["task"] for r in found)]
+    table = {task: {} for task in tasks}
+    for result in found:
+        agents_ = table[result.evaluation["task"]]
+        agents_.setdefault(result.cell["label"], []).append(result)
+    return {task: agents_ for task, agents_ in table.items() if agents_}
+
+
+def standing(results, broken, cells):
+    """What is there and what is missing."""
+    missing = [cell for cell in cells if cell.name not in results]
+    lines = [
+        "## What is there",
+        "",
+        f"{len(cells) - len(missing)} of the {len(cells)} cells of the grid "
+        f"(`cathsim_dmc/benchmarks/grid.toml`) are finished.",
+    ]
+    others = sorted(set(results) - {cell.name for cell in cells})
+    if others:
+        lines += ["", f"Beside the grid there are: {', '.join(others)}."]
+    if missing:
+        lines += ["", "Missing:", ""]
+        rows = {}
+        for cell in missing:
+            rows.setdefault((cell.label, cell.task), []).append(str(cell.seed))
+        labels = dict.fromkeys(label for label, _ in rows)
+        for label in labels:
+            of = [
+                f"{task} (seed {', '.join(seeds)})"
+                for (one, task), seeds in rows.items()
+                if one == label
+            ]
+            lines.append(f"- {label}: {'; '.join(of)}")
+    if broken:
+        lines += ["", "Cannot be read, and are left out:", ""]
+        lines += [f"- {line}" for line in broken]
+    return "\n".join(lines) + "\n"
+
+
+def published_label(result):
+    """Name of the published agent that a cell repeats, or None."""
+    observation = result.cell["observation"]
+    name = NAMES.get(observation) if isinstance(observation, str) else None
+    return f"{result.cell['algorithm'].upper()}-{name}" if name else None
+
+
+def beside_published(table):
+    """One table for each published task."""
+    published = json.loads(PUBLISHED.read_text())["agents"]
+    lines = ["## Beside the published figures", "", COLUMNS]
+    for task in PUBLISHED_TASKS:
+        lines += [f"### {task}", "", *HEADER]
+        agents_ = table.get(task, {})
+        repeated = set()
+        for label, found in agents_.items():
+            name = published_label(found[0])
+            repeated.add(name)
+            theirs = published.get(name, {}).get(task)
+            lines.append(row(label, found, theirs))
+        for name, tasks in published.items():
+            if name not in repeated:
+                lines.append(row(f"{name} (missing)", [], tasks[task]))
+        lines.append("")
+    return "\n".join(lines)
+
+
+def other_tasks(table):
+    """One table for all tasks that were not published, with the expert's figures."""
+    experts = {}
+    if DIFFICULTY.exists():
+        tasks = json.loads(DIFFICULTY.read_text())["findings"]["tasks"]
+        experts = {task: trials.get("expert") for task, trials in tasks.items()}
+    lines = []
+    for task, agents_ in table.items():
+        if task in PUBLISHED_TASKS:
+            continue
+        for label, found in agents_.items():
+            cells = [task, label, *figures_of(found), by_group(found)]
+            expert = experts.get(task)
+            cells.append(f"{100 * expert['success']:.0f} %" if expert else "–")
+            lines.append(f"| {' | '.join(cells)} |")
+    if not lines:
+        return ""
+    return "\n".join(
+        [
+            "## Further tasks",
+            "",
+            "| task | agent | seeds | success (95 %) | worst | reward | mean force "
+            "| max force | success by kind of arch | expert |",
+            "|---|---|---|---|---|---|---|---|---|---|",
+            *lines,
+            "",
+        ]
+    )
+
+
+def row(label, found, theirs):
+    """A line of a table: ours, and the published figures of the same agent."""
+    ours = figures_of(found) if found else ["–"] * 6
+    return f"| {' | '.join([label, *ours, *published_figures(theirs)])} |"
+
+
+def figures_of(found):
+    """Seeds, success, worst seed, reward, mean and max force of one agent, as text."""
+    rates = [result.success for result in found]
+    counts = [result.evaluation["summary"]["episodes"] for result in found]
+    reached = sum(round(r * n) for r, n in zip(rates, counts, strict=True))
+    low, high = success_interval(reached, sum(counts))
+    return [
+        str(len(found)),
+        f"{percent(reached / sum(counts))} ({100 * low:.0f}–{100 * high:.0f})",
+        percent(min(rates)),
+        spread(found, "reward", 1, 0),
+        spread(found, "mean_force_in_contact", 1e3, 1),
+        spread(found, "max_force", 1e3, 0),
+    ]
+
+
+def by_group(found):
+    """Success in each kind of arch, where episodes have one each."""
+    reached = {}
+    for result in found:
+        groups = result.evaluation.get("groups") or ()
+        for group, success in zip(
+            groups, result.evaluation["episodes"]["success"], strict=False
+        ):
+            reached.setdefault(group, []).append(success)
+    return (
+        ", ".join(
+            f"{group}: {sum(one)} of {len(one)}"
+            for group, one in sorted(reached.items())
+        )
+        or "–"
+    )
+
+
+def published_figures(theirs):
+    if theirs is None:
+        return ["–"] * 4
+    return [
+        percent(theirs["success"]),
+        "{:.0f} ± {:.0f}".format(*theirs["reward"]),
+        "{:.0f} ± {:.0f}".format(*(1e3 * value for value in theirs["mean_force"])),
+        "{:.0f} ± {:.0f}".format(*(1e3 * value for value in theirs["max_force"])),
+    ]
+
+
+def spread(found, name, scale, digits):
+    """Mean ± deviation over the episodes of all seeds."""
+    values = [v for r in found for v in r.evaluation["episodes"][name] if v is not None]
+    if not values:
+        return "–"
+    deviation = np.std(values, ddof=1) if len(values) > 1 else 0.0
+    return f"{scale * np.mean(values):.{digits}f} ± {scale * deviation:.{digits}f}"
+
+
+def percent(rate):
+    return f"{100 * rate:.0f} %"
+
+
+def aggregates(table):
+    """Interquartile mean of the success over the four published tasks."""
+    published = json.loads(PUBLISHED.read_text())["agents"]
+    lines = [
+        "## Over the four published tasks",
+        "",
+        "Interquartile mean of the success rate over tasks and seeds (Agarwal et al. "
+        "2021), with the 95 % interval of a bootstrap that resamples seeds within "
+        "tasks; a single seed tells no interval. Published agents have one seed.",
+        "",
+        "| agent | tasks | seeds | interquartile mean | published |",
+        "|---|---|---|---|---|",
+    ]
+    labels = dict.fromkeys(label for t in PUBLISHED_TASKS for label in table.get(t, {}))
+    for label in labels:
+        found = [table[t][label] for t in PUBLISHED_TASKS if label in table.get(t, {})]
+        mean, interval = interquartile_mean([[r.success for r in one] for one in found])
+        text = percent(mean)
+        if interval is not None:
+            text += f" ({100 * interval[0]:.0f}–{100 * interval[1]:.0f})"
+        seeds = sorted({len(one) for one in found})
+        theirs = published.get(published_label(found[0][0]))
+        reference = "–"
+        if theirs is not None and len(found) == len(PUBLISHED_TASKS):
+            rates = [[theirs[task]["success"]] for task in PUBLISHED_TASKS]
+            reference = percent(interquartile_mean(rates)[0])
+        count = "–".join(map(str, (seeds[0], seeds[-1]) if len(seeds) > 1 else seeds))
+        lines.append(
+            f"| {label} | {len(found)} of 4 | {count} | {text} | {reference} |"
+        )
+    return "\n".join(lines) + "\n" if labels else ""
+
+
+def cost(results, cells):
+    """Frames and time of every training."""
+    lines = [
+        "## Frames and time",
+        "",
+        "*To 90 %*: when the last 100 training episodes, which explore and may be "
+        "shorter than 2,000 steps, first had 90 % success; at least 100 must have "
+        "ended. Times are wall times on the machine named, beside whatever else ran "
+        "there (*load* is the number of running processes over the last 15 minutes).",
+        "",
+        "| cell | frames | time | frames/s | frames to 90 % | time to 90 % | load "
+        "| machine | commit |",
+        "|---|---|---|---|---|---|---|---|---|",
+    ]
+    order = {cell.name: index for index, cell in enumerate(cells)}
+    for name in sorted(results, key=lambda n: (order.get(n, len(order)), n)):
+        values = results[name].values
+        training, machine = values["training"], values["machine"]
+        solved = training["solved"]
+        columns = [
+            name,
+            f"{training['frames']:,}",
+            clock(training["seconds"]),
+            f"{results[name].frames_per_second:.0f}",
+            f"{solved['frames']:,.0f}" if solved else "–",
+            clock(solved["seconds"]) if solved else "–",
+            f"{training['load']}" if training.get("load") is not None else "–",
+            f"{machine['cores']} × {machine['processor']}",
+            (values.get("commit") or "–")[:7] + ("+" if values.get("modified") else ""),
+        ]
+        lines.append(f"| {' | '.join(columns)} |")
+    return "\n".join(lines) + "\n"
+
+
+def drawn(table, out):
+    """Draws the figures; yields the parts of the page that show them."""
+    images = out.parent / "images"
+    looks = figures.Looks(
+        dict.fromkeys(label for one in table.values() for label in one)
+    )
+    main = {task: table[task] for task in PUBLISHED_TASKS if task in table}
+    further = {task: one for task, one in table.items() if task not in main}
+    published = json.loads(PUBLISHED.read_text())["agents"]
+    yield "## Figures\n"
+    for name, tasks in (("", main), ("_further", further)):
+        if not tasks:
+            continue
+        which = "further" if name else "published"
+        path = figures.learning_curves(
+            tasks, looks, images / f"results_curves{name}.png"
+        )
+        yield shown(
+            path,
+            f"Success in training on the {which} tasks, mean over seeds (number in the "
+            "legend) with a band from the least to the most successful seed. Training "
+            "episodes explore.",
+        )
+        theirs = {
+            task: {
+                label: published[published_label(found[0])][task]["max_force"]
+                for label, found in tasks[task].items()
+                if task in published.get(published_label(found[0]), {})
+            }
+            for task in tasks
+        }
+        path = images / f"results_forces{name}.png"
+        figures.force_boxes(tasks, looks, theirs, path)
+        yield shown(
+            path,
+            f"Largest contact force of every evaluation episode on the {which} tasks, "
+            "episodes of all seeds together; whiskers at 1.5 interquartile ranges. "
+            "Diamonds are the published mean ± deviation."
+            if not name
+            else "Largest contact force of every evaluation episode on the further "
+            "tasks, episodes of all seeds together.",
+        )
+    best = {
+        task: max(
+            agents_.values(), key=lambda found: np.mean([r.success for r in found])
+        )
+        for task, agents_ in table.items()
+    }
+    path = figures.force_maps(best, images / "results_force_maps.png")
+    if path is not None:
+        yield shown(
+            path,
+            "Mean contact force per place (2 mm) over all evaluation episodes of the "
+            "most successful agent of each task, seen from the front; the colour scale "
+            "ends at the 98th percentile.",
+        )
+
+
+def shown(path, caption):
+    return f"![{caption}](images/{path.name})\n\n{caption}\n"
+
+
+if __name__ == "__main__":
+    sys.exit(main())

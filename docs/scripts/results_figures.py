@@ -1,0 +1,234 @@
+"""Figures of docs/results.md: learning curves, box plots, maps of the force."""
+
+import math
+
+import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.collections import PolyCollection
+from matplotlib.figure import Figure
+from matplotlib.ticker import EngFormatter
+
+from cathsim_dmc import suite
+from cathsim_dmc.analysis.heatmap import AP_AXES, ForceMap
+from cathsim_dmc.benchmarks.result import map_from_values
+from cathsim_dmc.files import atomic_path
+
+DPI = 90
+PANEL = (4.2, 3.0)  # inches
+# Okabe and Ito's colours, which the colour-blind can tell apart.
+COLOURS = (
+    "#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000",
+    "#999999",
+)  # fmt: skip
+STYLES = ("-", "--", ":")
+POINTS = 200
+
+
+class Looks:
+    """One colour and line style for each agent, the same in every figure."""
+
+    def __init__(self, labels):
+        self._order = {label: index for index, label in enumerate(labels)}
+
+    def __getitem__(self, label):
+        index = self._order[label]
+        style = STYLES[index // len(COLOURS) % len(STYLES)]
+        return {"color": COLOURS[index % len(COLOURS)], "linestyle": style}
+
+
+def learning_curves(by_task, looks, path):
+    """Success in training over frames: mean over seeds, band from least to most.
+
+    Args:
+        by_task: Results of each task by the label of the agent: {task: {label: [...]}}.
+        looks: Looks of the agents.
+        path: Path of the PNG.
+    """
+    figure, panels = _panels(len(by_task))
+    for axes, (task, agents) in zip(panels, by_task.items(), strict=False):
+        for label, results in agents.items():
+            frames, success = _common(results)
+            if frames is None:
+                continue
+            line = {**looks[label], "label": f"{label} ({_seeds(len(results))})"}
+            axes.plot(frames, 100 * success.mean(0), lw=1.6, **line)
+            if len(success) > 1:
+                axes.fill_between(
+                    frames,
+                    100 * success.min(0),
+                    100 * success.max(0),
+                    color=line["color"],
+                    alpha=0.2,
+                    lw=0,
+                )
+        axes.set_title(task, fontsize=10)
+        axes.set_ylim(-3, 103)
+        axes.set_xlim(left=0)
+        axes.xaxis.set_major_formatter(EngFormatter(sep=""))
+        axes.set_xlabel("frames")
+        axes.set_ylabel("success in training, %")
+        axes.grid(alpha=0.3)
+        if axes.lines:
+            axes.legend(fontsize=7, loc="best", framealpha=0.7)
+    return _save(figure, path)
+
+
+def _common(results):
+    """Frames (P,) that all seeds have seen, and success (seeds, P) there."""
+    curves = []
+    for result in results:
+        curve = result.training["curve"]
+        pairs = zip(curve.get("frames", ()), curve.get("success", ()), strict=True)
+        known = [(f, s) for f, s in pairs if s is not None]
+        if len(known) >= 2:
+            curves.append(np.array(known, dtype=float))
+    if not curves:
+        return None, None
+    frames = np.linspace(
+        max(c[0, 0] for c in curves), min(c[-1, 0] for c in curves), POINTS
+    )
+    return frames, np.array([np.interp(frames, c[:, 0], c[:, 1]) for c in curves])
+
+
+def force_boxes(by_task, looks, published, path):
+    """Largest contact force of every evaluation episode, one box for each agent.
+
+    Args:
+        by_task: As for `learning_curves`.
+        looks: Looks of the agents.
+        published: Published (mean, deviation) in N by task and label, drawn as bars.
+        path: Path of the PNG.
+    """
+    widest = max(len(agents) for agents in by_task.values())
+    figure, panels = _panels(len(by_task), height=1.4 + 0.42 * widest)
+    for axes, (task, agents) in zip(panels, by_task.items(), strict=False):
+        labels = list(agents)[::-1]
+        for row, label in enumerate(labels):
+            forces = [
+                1e3 * value
+                for result in agents[label]
+                for value in result.evaluation["episodes"]["max_force"]
+                if value is not None
+            ]
+            colour = looks[label]["color"]
+            axes.boxplot(
+                forces,
+                positions=[row],
+                orientation="horizontal",
+                widths=0.6,
+                patch_artist=True,
+                boxprops={"facecolor": colour, "alpha": 0.5},
+                medianprops={"color": "black"},
+                flierprops={"markersize": 3, "markeredgecolor": colour},
+            )
+            reference = published.get(task, {}).get(label)
+            if reference is not None:
+                mean, deviation = (1e3 * value for value in reference)
+                axes.errorbar(
+                    mean, row - 0.4, xerr=deviation, fmt="d", ms=4, color="0.35", lw=1
+                )
+        names = [f"{label}\n{_seeds(len(agents[label]))}" for label in labels]
+        axes.set_yticks(range(len(labels)), names, fontsize=7)
+        axes.set_ylim(-0.8, len(labels) - 0.4)
+        axes.set_xlim(left=0)
+        axes.set_title(task, fontsize=10)
+        axes.set_xlabel("largest contact force of an episode, mN")
+        axes.grid(axis="x", alpha=0.3)
+    return _save(figure, path)
+
+
+def force_maps(chosen, path):
+    """Mean contact force over the vessel for one agent of each task.
+
+    Args:
+        chosen: Results of all seeds of one agent for each task, {task: [...]}.
+        path: Path of the PNG.
+
+    Returns:
+        The path, or None if no task has a map that can be drawn.
+    """
+    fields = {}
+    for task, results in chosen.items():
+        maps = [r.evaluation["force_map"] for r in results if r.evaluation["force_map"]]
+        definition = suite.TASKS.get(task)
+        if maps and definition is not None and definition.anatomy is not None:
+            fields[task] = (_merged([map_from_values(one) for one in maps]), results)
+    if not fields:
+        return None
+    figure, panels = _panels(len(fields), columns=4, width=2.9, height=3.9)
+    for axes, (task, (field, results)) in zip(panels, fields.items(), strict=False):
+        _draw_map(figure, axes, field, task)
+        episodes = sum(r.evaluation["summary"]["episodes"] for r in results)
+        label = results[0].cell["label"]
+        axes.set_title(
+            f"{task}\n{label}\n{_seeds(len(results))}, {episodes} episodes", fontsize=8
+        )
+    return _save(figure, path)
+
+
+def _draw_map(figure, axes, field, task):
+    definition = suite.TASKS[task]
+    surface = suite.load_anatomy(definition.anatomy, definition.access).surface
+    triangles = 1e3 * np.asarray(surface.vertices)[:, AP_AXES][surface.faces]
+    # Dark and wide below light: a rim around the silhouette.
+    for colour, rim in (("0.5", 1.8), ("0.92", 0.5)):
+        axes.add_collection(
+            PolyCollection(
+                list(triangles), facecolors=colour, edgecolors=colour, lw=rim,
+                rasterized=True,
+            )
+        )  # fmt: skip
+    touched = field.mean[field.count > 0]
+    # A single hard knock must not make everything else pale.
+    limit = 1e3 * float(np.percentile(touched, 98)) if len(touched) else 1.0
+    image = axes.pcolormesh(
+        1e3 * field.x_edges,
+        1e3 * field.z_edges,
+        1e3 * np.ma.masked_invalid(field.mean),
+        cmap="inferno_r",
+        vmin=0.0,
+        vmax=limit or 1.0,
+        zorder=3,
+    )
+    bar = figure.colorbar(image, ax=axes, extend="max", shrink=0.7, pad=0.02)
+    bar.set_label("mean contact force, mN", fontsize=7)
+    bar.ax.tick_params(labelsize=7)
+    axes.set_xlim(1e3 * field.x_edges[0], 1e3 * field.x_edges[-1])
+    axes.set_ylim(1e3 * field.z_edges[0], 1e3 * field.z_edges[-1])
+    axes.set_aspect("equal")
+    axes.tick_params(labelsize=7)
+    axes.set_xlabel("x, mm (patient left →)", fontsize=7)
+    axes.set_ylabel("z, mm (head ↑)", fontsize=7)
+
+
+def _merged(maps):
+    """One map of several of the same vessel, contacts counting alike."""
+    first = maps[0]
+    total = sum(np.nan_to_num(one.mean) * one.count for one in maps)
+    count = sum(one.count for one in maps)
+    mean = np.full(count.shape, np.nan)
+    np.divide(total, count, out=mean, where=count > 0)
+    outside = sum(one.outside for one in maps)
+    return ForceMap(first.x_edges, first.z_edges, mean, count, outside)
+
+
+def _panels(count, columns=2, width=PANEL[0], height=PANEL[1]):
+    columns = min(columns, count)
+    rows = math.ceil(count / columns)
+    figure = Figure(figsize=(columns * width, rows * height), layout="constrained")
+    FigureCanvasAgg(figure)
+    panels = figure.subplots(rows, columns, squeeze=False).ravel()
+    for unused in panels[count:]:
+        unused.remove()
+    return figure, panels
+
+
+def _seeds(count):
+    return f"{count} seed" + "s" * (count != 1)
+
+
+def _save(figure, path):
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with atomic_path(path, ".png") as temporary:
+        figure.savefig(temporary, format="png", dpi=DPI, pil_kwargs={"optimize": True})
+    return path
