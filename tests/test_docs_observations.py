@@ -21,13 +21,28 @@ def script():
     return module
 
 
-def test_the_table_names_what_the_functions_return():
-    """Of observations without OpenGL: a key that is missing or too many is found."""
-    names = [n for n in observations.OBSERVATIONS if n not in ("rgb", "depth")]
-    for name in names:
-        env = suite.load("cathsim", "type1_bca", {"observation": name, "random": 0})
-        env.reset()
-        returned = env.task.rollout.finish(np.zeros((1, 1, 0)), [False]).observation
+NAMES = [n for n in observations.OBSERVATIONS if n not in ("rgb", "depth")]
+
+
+@pytest.fixture(scope="module")
+def environment():
+    """With all observations that need no OpenGL."""
+    return suite.load("cathsim", "type1_bca", {"observation": NAMES, "random": 0})
+
+
+def test_the_table_names_what_the_functions_return(environment, monkeypatch):
+    """A key that is missing or too many is found."""
+    frames = []
+    observe = observations.observe
+    monkeypatch.setattr(
+        observations,
+        "observe",
+        lambda names, frame: frames.append(frame) or observe(names, frame),
+    )
+    environment.reset()
+    frame = frames[-1]
+    for name in NAMES:
+        returned = observations.OBSERVATIONS[name].observe(frame)
         listed = observations.entry_specs([name], observations.ImageOptions())
         assert list(returned) == list(listed)
 
@@ -46,13 +61,11 @@ def test_the_page_is_what_the_specs_say(script):
     )
 
 
-def test_values_lie_in_the_ranges_of_the_table():
-    names = [n for n in observations.OBSERVATIONS if n not in ("rgb", "depth")]
-    env = suite.load("cathsim", "type1_bca", {"observation": names, "random": 0})
+def test_values_lie_in_the_ranges_of_the_table(environment):
     random = np.random.default_rng(0)
-    timesteps = [env.reset()]
-    timesteps += [env.step(random.uniform(-1, 1, 21)) for _ in range(20)]
-    for name in names:
+    timesteps = [environment.reset()]
+    timesteps += [environment.step(random.uniform(-1, 1, 21)) for _ in range(20)]
+    for name in NAMES:
         for entry in observations.OBSERVATIONS[name].entries:
             values = np.stack([t.observation[entry.key] for t in timesteps])
             assert entry.low <= values.min(), entry.key

@@ -317,3 +317,17 @@ def test_one_bad_entry_is_enough(index, value):
 def test_bad_options(task, field, value, message):
     with pytest.raises(ValueError, match=message):
         dataclasses.replace(task, **{field: value})
+
+
+def test_a_success_rule_of_ones_own_sees_the_forces(anatomy):
+    @dataclasses.dataclass(frozen=True)
+    class Gentle(Cannulation):
+        def success(self, measurement):
+            gentle = measurement.wall_force.peak_max < 0.1
+            return super().success(measurement) & gentle
+
+    task = Gentle.to(anatomy, anatomy.goal("bca"))
+    heads = np.stack([task.goal, task.goal, towards(task, 0.03)])
+    outcome = judge(task, heads, peak_max=np.array([0.05, 0.2, 0.05]))
+    assert outcome.success.tolist() == [True, False, False]
+    assert outcome.reward[0] == 10.0 and (outcome.reward[1:] <= 0.0).all()
