@@ -135,7 +135,9 @@ DISCRETISATION = {
 TRAINING = {
     "task": word().filter(lambda value: not isinstance(value, str) or not value),
     "observation": st.sampled_from(["", 1, None, [], [1], {}, 1.5]),
-    "task_kwargs": st.sampled_from([None, 1, "x", [1], {"a": object()}, {"a": math.nan}]),
+    "task_kwargs": st.sampled_from(
+        [None, 1, "x", [1], {"a": object()}, {"a": math.nan}]
+    ),
     "backend": word(),
     "num_envs": whole(1),
     "num_threads": whole(1, optional=True),
@@ -225,7 +227,11 @@ def entries(folder):
         ("BranchParameters", _replaced(ARCH.bca), BRANCH),
         ("Device", _replaced(devices.PUBLISHED), DEVICE),
         ("Section", _replaced(section), SECTION),
-        ("Arc", _replaced(devices.Arc(0.01, 1.0)), {"radius": POSITIVE, "angle": number()}),
+        (
+            "Arc",
+            _replaced(devices.Arc(0.01, 1.0)),
+            {"radius": POSITIVE, "angle": number()},
+        ),
         ("Discretisation", devices.Discretisation, DISCRETISATION),
         ("PPO settings", lambda **o: learners.make_config("ppo", **o), TRAINING | PPO),
         ("SAC settings", lambda **o: learners.make_config("sac", **o), TRAINING | SAC),
