@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-import contextlib
 import os
 import re
-import shutil
-import uuid
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from cathsim_dmc.files import atomic_directory
 from cathsim_dmc.recording.episode import Episode
 
 # Options that say what is observed. An episode does not hold observations: they come
@@ -129,9 +127,7 @@ def write(
     from importlib.metadata import version
 
     name = path.name
-    temporary = path.with_name(f".{name}.{uuid.uuid4().hex[:12]}.partial")
-    temporary.mkdir()
-    try:
+    with atomic_directory(path) as temporary:
         storage = MinariStorage.new(
             temporary / "data",
             observation_space,
@@ -150,13 +146,6 @@ def write(
             }
         )
         storage.update_episodes(buffers)
-        for file in (temporary / "data").iterdir():
-            with open(file, "rb+") as stream:
-                os.fsync(stream.fileno())
-        os.rename(temporary, path)
-    finally:
-        with contextlib.suppress(FileNotFoundError):
-            shutil.rmtree(temporary)
     return path
 
 
