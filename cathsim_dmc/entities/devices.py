@@ -149,10 +149,10 @@ def _metal(bending_stiffness: float) -> Section:
 
 
 # The device of the registered tasks: the published discretisation of the tip (ten
-# links over 7 cm, 20 motors) on a 5F body. The published stiffness equals a rod stiffer than
-# any metal, so real ones take its place: a shaft between the body of a steerable 4F tube
-# (22.7 N·mm²) and an Amplatz wire (291 N·mm²), and that body's own figure for the
-# steerable part.
+# links over 7 cm, 20 motors) on a 5F body. The published stiffness equals a rod
+# stiffer than any metal, so real ones take its place: a shaft between the body of a
+# steerable 4F tube (22.7 N·mm²) and an Amplatz wire (291 N·mm²), and that body's own
+# figure for the steerable part.
 STEERABLE_5F = Device(
     name="steerable_5f",
     outer_radius=5 * FRENCH / 2,
