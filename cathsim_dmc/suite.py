@@ -21,6 +21,7 @@ from dm_control import composer
 from dm_control import suite as dm_suite
 from dm_control.utils import containers
 
+from cathsim_dmc import bounds
 from cathsim_dmc.anatomy import Anatomy, Goal
 from cathsim_dmc.entities import devices
 from cathsim_dmc.tasks import placement
@@ -246,6 +247,8 @@ def load_anatomy(anatomy: str | Path | Anatomy, access: str = "ascending") -> An
         return anatomy
     from cathsim_dmc.anatomy import phantoms
 
+    if not isinstance(anatomy, str | Path):
+        bounds.refuse("anatomy", anatomy, "an Anatomy, a name or a directory")
     if str(anatomy) in phantoms.PHANTOMS:
         return phantoms.load(str(anatomy), access=access)
     if not Path(anatomy).is_dir():

@@ -105,8 +105,8 @@ def places(document, path=()):
     if isinstance(document, dict):
         items = document
     elif isinstance(document, list):
-        items = {i: document[i] for i in {0, 1, len(document) - 1} if 0 <= i}
-        items = {i: v for i, v in items.items() if i < len(document)}
+        chosen = {0, 1, len(document) - 1}
+        items = {i: document[i] for i in chosen if 0 <= i < len(document)}
     for key, value in items.items():
         yield (*path, key)
         yield from places(value, (*path, key))
@@ -164,9 +164,10 @@ class Tally:
         self.tried = Counter()
         self.wrong = []
 
-    def refused(self, entry, call, words=(), errors=(ValueError, OSError)):
+    def refused(self, entry, call, words=(), errors=(ValueError, OSError), note=""):
         """Calls with bad input; the error must say so in one line with the words."""
-        self.tried[entry] += 1
+        entry_, entry = entry, f"{entry} {note}".strip()
+        self.tried[entry_] += 1
         try:
             result = call()
         except errors as error:
@@ -177,7 +178,7 @@ class Tally:
         except BaseException as error:
             self.wrong.append(f"{entry}: crashed with {type(error).__name__}: {error}")
         else:
-            self.wrong.append(f"{entry}: accepted, gave {str(result)[:80]}")
+            self.wrong.append(f"{entry}: accepted, gave {str(result)[:300]}")
 
     def draw(self, strategy, count, check):
         """Calls `check` with so many examples of a strategy."""

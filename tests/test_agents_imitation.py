@@ -76,8 +76,8 @@ def test_a_clone_does_what_the_expert_did(cloned, dataset, shapes):
     policy = Checkpoint.open(cloned).policy()
     mean, std = act(policy, states["observation_vector"])
     error = mean.tanh() - states[EXPERT_ACTION]
-    assert error.square().mean().sqrt() < 0.05
-    assert states[EXPERT_ACTION].std(0).mean() > 0.1
+    # A constant action would err by as much as the actions vary.
+    assert error.square().mean().sqrt() < states[EXPERT_ACTION].std(0).mean() / 2
     # It explores as far as it errs: PPO that starts from it keeps to the way.
     assert std.max() < 0.5
     assert evaluate(cloned, episodes=1, task_kwargs={"max_steps": 3}).episodes

@@ -214,7 +214,7 @@ def _scan(path):
 
 def entries(folder):
     """Name of an entry, what takes one field, and bad values by field."""
-    section = devices.PUBLISHED.shaft
+    section = devices.STEERABLE_5F.shaft
     return [
         ("task options", lambda **o: suite.make_task("type1_bca", **o), TASK),
         ("task navigate", lambda **o: suite.make_task("navigate", **o), NAVIGATE),
@@ -225,7 +225,7 @@ def entries(folder):
         ("Randomisation", Randomisation, RANDOMISATION),
         ("ArchParameters", _replaced(ARCH), ARCH_FIGURES),
         ("BranchParameters", _replaced(ARCH.bca), BRANCH),
-        ("Device", _replaced(devices.PUBLISHED), DEVICE),
+        ("Device", _replaced(devices.STEERABLE_5F), DEVICE),
         ("Section", _replaced(section), SECTION),
         (
             "Arc",

@@ -319,7 +319,7 @@ def test_stroke_must_be_positive(stroke):
 def test_device_and_section_errors_say_what_is_allowed():
     with pytest.raises(ValueError, match=r"bending_stiffness.*N·m²"):
         devices.Section(-1.0, 1.0)
-    with pytest.raises(ValueError, match=r"outer_radius.*positive number in SI"):
+    with pytest.raises(ValueError, match=r"outer_radius.*above 0"):
         devices.Device(
             "x", 0.0, 1e-3, devices.STEERABLE_5F.shaft, devices.STEERABLE_5F.shaft
         )

@@ -119,8 +119,8 @@ def test_wrong_reward():
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        ({"goal_radius": 0.0}, ["goal_radius", "0.0", "> 0"]),
-        ({"goal_radius": -1e-3}, ["goal_radius", "-0.001", "> 0"]),
+        ({"goal_radius": 0.0}, ["goal_radius", "0.0", "above 0"]),
+        ({"goal_radius": -1e-3}, ["goal_radius", "-0.001", "above 0"]),
         ({"max_steps": 0}, ["max_steps", "0", "at least 1"]),
         ({"max_steps": 1.5}, ["max_steps", "1.5", "integer"]),
         ({"max_steps": float("inf")}, ["max_steps", "inf", "integer"]),

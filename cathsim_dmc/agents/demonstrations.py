@@ -145,7 +145,7 @@ def _play(simulation: Any, seeds: np.ndarray, noise: float) -> list[Any]:
     step = simulation.reset()
     expert.reset(view, np.ones(count, dtype=bool))
     running = np.ones(count, dtype=bool)
-    for row in np.flatnonzero(running):
+    for row in np.flatnonzero(running).tolist():
         rows[row].see(step, row)
     while running.any():
         chosen = expert.act(None).astype(np.float32)
@@ -156,7 +156,7 @@ def _play(simulation: Any, seeds: np.ndarray, noise: float) -> list[Any]:
             action = np.clip(chosen + drawn, -1.0, 1.0).astype(np.float32)
             expert.follow(action)
         step = simulation.step(action.astype(np.float64))
-        for row in np.flatnonzero(running):
+        for row in np.flatnonzero(running).tolist():
             rows[row].do(chosen[row], action[row], step, row)
             rows[row].see(step, row)
         running &= ~(step.terminated | step.truncated)
@@ -236,20 +236,24 @@ def load_transitions(
     succeeded = [one for one in episodes if one is not None]
     if not succeeded:
         raise DatasetError(f"none of the {len(episodes)} episodes in {path} succeeds")
-    transitions = torch.cat(succeeded)
-    vector, pixels = (
-        tuple(transitions[key].shape[1:]) if key in transitions.keys() else None
-        for key in (VECTOR, PIXELS)
-    )
-    found = NetworkShapes(
-        vector[0] if vector else 0, pixels, transitions["action"].shape[-1]
-    )
+    transitions = TensorDict.cat(succeeded)
+    found = _shapes(transitions)
     if found != shapes:
         raise DatasetError(
             f"{path} holds {found}, and the task with the observation {observation!r} "
             f"has {shapes}: record it for the same task and options"
         )
     return transitions
+
+
+def _shapes(transitions: TensorDictBase) -> NetworkShapes:
+    vector, pixels = (transitions.get(key, None) for key in (VECTOR, PIXELS))
+    image = None
+    if pixels is not None:
+        channels, height, width = pixels.shape[1:]
+        image = (channels, height, width)
+    size = 0 if vector is None else vector.shape[-1]
+    return NetworkShapes(size, image, transitions["action"].shape[-1])
 
 
 def _tensors(

@@ -48,6 +48,8 @@ class Clone:
         self._keys, self._raw_keys = shapes.keys, shapes.raw_keys
         self._normaliser = self.policy[0] if shapes.vector else None
         self._network = network_of(self.policy)
+        assert isinstance(self._network.log_std, nn.Parameter)
+        self._log_std = self._network.log_std
         self._parameters = [
             *self._network.body.parameters(),
             *self._network.mean.parameters(),
@@ -108,7 +110,7 @@ class Clone:
         error = torch.where(free, target.clamp(-_SATURATED, _SATURATED).atanh(), mean)
         squares = (error - mean).square().sum(0) / free.sum(0).clamp_min(1)
         log_std = squares.clamp_min(1e-12).log() / 2
-        self._network.log_std.copy_(log_std.clamp(*LOG_STD_RANGE))
+        self._log_std.data.copy_(log_std.clamp(*LOG_STD_RANGE))
         return float((mean.tanh() - target).square().mean().sqrt())
 
     def learning_state(self) -> dict[str, Any]:

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from torchrl.envs import EnvBase
 
-from cathsim_dmc import files, suite
+from cathsim_dmc import bounds, files, suite
 from cathsim_dmc.agents import evaluation, policies
 from cathsim_dmc.analysis import heatmap
 from cathsim_dmc.analysis.force_statistics import millinewtons
@@ -158,6 +158,9 @@ def evaluate(
             heatmap.png; None writes none.
     """
     start = time.monotonic()
+    evaluation.check_numbers(episodes, seed, num_threads)
+    player = policies.load_policy(policy, seed)
+    _require_registered(evaluation.require_task(player, task))
     if out_dir is not None:
         # Now: an evaluation that cannot be written would be lost.
         Path(out_dir).mkdir(parents=True, exist_ok=True)
@@ -201,6 +204,11 @@ def evaluate(
     return report
 
 
+def _require_registered(task: str) -> None:
+    if task not in suite.SUITE:
+        raise ValueError(f"no task {task!r}; there are {', '.join(suite.SUITE)}")
+
+
 def record(
     policy: policies.PolicyLike,
     out: str | Path | None,
@@ -235,8 +243,12 @@ def record(
         CheckpointError: there is no such checkpoint, or it is damaged.
     """
     targets = _targets(out, gif)
+    bounds.seed("seed", seed)
+    if max_steps is not None:
+        bounds.whole("max_steps", max_steps, 1)
     player = policies.load_policy(policy, seed)
     task = evaluation.require_task(player, task)
+    _require_registered(task)
     # Now: an episode that cannot be written would be lost.
     for target in targets.values():
         target.parent.mkdir(parents=True, exist_ok=True)

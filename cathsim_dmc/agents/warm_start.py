@@ -64,8 +64,7 @@ def _set_deviation(
     middle = theirs.bias if isinstance(theirs, nn.Linear) else theirs
     if value is not None:
         middle = torch.full_like(middle, value).log()
-    target = ours
     if isinstance(ours, nn.Linear):
         ours.weight.zero_()
-        target = ours.bias
-    target.copy_(middle.clamp(*LOG_STD_RANGE))
+    target = ours.bias if isinstance(ours, nn.Linear) else ours
+    target.data.copy_(middle.clamp(*LOG_STD_RANGE))

@@ -249,15 +249,29 @@ def _trained(cell: Cell, run: Path) -> Checkpoint:
 def _judged(cell: Cell, checkpoint: Checkpoint) -> dict[str, Any]:
     config, began = checkpoint.config, time.monotonic()
     other = cell.evaluation.get("task_kwargs", {})
-    judgement = protocol.judge(
-        checkpoint,
-        cell.evaluation.get("task", cell.task),
-        observation=config.observation,
-        task_kwargs={**protocol.published_options(config.task_kwargs), **other},
-        episodes=cell.episodes,
-        name=cell.name,
-        num_threads=config.num_threads,
-    )
+    task = cell.evaluation.get("task", cell.task)
+    options = {**protocol.published_options(config.task_kwargs), **other}
+    arches = cell.evaluation.get("each_arch")
+    observation = config.observation
+    if arches is not None:
+        judgement = protocol.judge_each_arch(
+            checkpoint,
+            task,
+            arches,
+            observation=observation,
+            task_kwargs=options,
+            name=cell.name,
+        )
+    else:
+        judgement = protocol.judge(
+            checkpoint,
+            task,
+            observation=observation,
+            task_kwargs=options,
+            episodes=cell.episodes,
+            name=cell.name,
+            num_threads=config.num_threads,
+        )
     evaluation = judgement.result
     run = checkpoint.path.parents[1]
     write_evaluation(run, evaluation.to_dict())
@@ -268,6 +282,7 @@ def _judged(cell: Cell, checkpoint: Checkpoint) -> dict[str, Any]:
         "seconds": round(time.monotonic() - began, 1),
         "summary": evaluation.summary(),
         "episodes": result.episode_figures(evaluation),
+        "groups": judgement.groups,
         "force_map": result.map_values(judgement.contacts),
     }
 

@@ -2,6 +2,7 @@
 
 import dataclasses
 import shlex
+from collections.abc import Mapping
 from typing import Any
 
 from cathsim_dmc.agents.config import TrainingConfig
@@ -57,6 +58,8 @@ def _option(name: str, value: Any) -> list[str]:
     flag = f"--{name.replace('_', '-')}"
     if isinstance(value, bool):
         return [flag if value else f"--no-{flag[2:]}"]
+    if isinstance(value, Mapping):
+        return [flag, *(str(word) for pair in value.items() for word in pair)]
     if isinstance(value, list | tuple):
         return [flag, *map(str, value)]
     return [flag, str(value)]

@@ -29,7 +29,12 @@ _ROW: _Kinds = {
     "evaluation": (dict,),
 }
 _REQUIRED = ("label", "algorithm", "preset", "observation", "tasks", "total_frames")
-_EVALUATION: _Kinds = {"task": (str,), "episodes": (int,), "task_kwargs": (dict,)}
+_EVALUATION: _Kinds = {
+    "task": (str,),
+    "episodes": (int,),
+    "task_kwargs": (dict,),
+    "each_arch": (str,),
+}
 _WORDS = {str: "a string", int: "an integer", list: "a list", dict: "a table"}
 
 
@@ -53,7 +58,8 @@ class Cell:
             are added to those of the preset.
         variant: Further part of the name, for two rows that differ in settings only.
         evaluation: What differs from the published evaluation: `task`, `episodes`,
-            `task_kwargs`.
+            `task_kwargs`; or `each_arch`, a set of random arches to play one episode
+            each in.
     """
 
     label: str
@@ -186,6 +192,8 @@ def _cells(row: Any, where: str) -> list[Cell]:
     _check_fields(evaluation, _EVALUATION, f"{where}, evaluation")
     if evaluation.get("episodes", 1) < 1:
         raise GridError(f"{where}: evaluation.episodes must be at least 1")
+    if {"episodes", "each_arch"} <= set(evaluation):
+        raise GridError(f"{where}: evaluation has episodes and each_arch; give one")
     tasks, seeds = row["tasks"], row.get("seeds", [0])
     for name, given, kind in (("tasks", tasks, str), ("seeds", seeds, int)):
         if not given or any(type(one) is not kind for one in given):

@@ -1,15 +1,18 @@
 """The evaluation that every agent is judged by, whatever it was trained with."""
 
-from collections.abc import Mapping, Sequence
+import dataclasses
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 from cathsim_dmc import suite
 from cathsim_dmc.agents import evaluation
-from cathsim_dmc.agents.policies import PolicyLike
+from cathsim_dmc.agents.policies import PolicyLike, load_policy
 from cathsim_dmc.agents.report import ContactLog
 from cathsim_dmc.analysis.heatmap import AP_AXES, MARGIN, ForceMap, force_map
+from cathsim_dmc.anatomy.arch.arch import arch_set, build_seed
 from cathsim_dmc.tasks.config import MAX_STEPS
+from cathsim_dmc.tasks.placement import sheath_direction
 
 # Options that say what the device, its surroundings and the observations are. All
 # others (reward, goal radius, length of an episode, randomisation, starts) may differ
@@ -40,10 +43,12 @@ class Judgement:
         result: Episodes and their summary.
         contacts: Mean contact force per place; None where every episode has an
             anatomy of its own.
+        groups: Kind of arch of each episode; None where all have the same anatomy.
     """
 
     result: evaluation.EvaluationResult
     contacts: ForceMap | None
+    groups: tuple[str, ...] | None = None
 
 
 def published_options(task_kwargs: Mapping[str, Any]) -> dict[str, Any]:
@@ -99,3 +104,68 @@ def judge(
         low, high = outline.min(0) - MARGIN, outline.max(0) + MARGIN
         contacts = force_map(log.positions, log.magnitudes, low, high)
     return Judgement(result, contacts)
+
+
+def judge_each_arch(
+    policy: PolicyLike,
+    task: str,
+    arches: str,
+    *,
+    observation: str | Sequence[str],
+    task_kwargs: Mapping[str, Any],
+    name: str,
+    numbers: Iterable[int] | None = None,
+) -> Judgement:
+    """Evaluate a policy in every arch of a set, one episode each.
+
+    Arches before whose inlet no sheath fits are passed over.
+
+    Args:
+        policy: Policy, or what names one, see `agents.load_policy`.
+        task: Name of a task with random arches.
+        arches: Name of the set, such as "test".
+        observation: Name or names of the observations that it reads.
+        task_kwargs: Options of the task, see `published_options`.
+        name: Name of the policy for the reports.
+        numbers: Numbers of the arches in the set; None for all.
+
+    Raises:
+        ValueError: the task has no random arches, there is no such set, or none of
+            its arches can be entered.
+    """
+    definition = suite.TASKS[task]
+    if not definition.random_arch:
+        raise ValueError(f"{task} has one anatomy; give a task with random arches")
+    seeds = arch_set(arches)
+    played: list[evaluation.EvaluationResult] = []
+    groups: list[str] = []
+    player = load_policy(policy)
+    for number in range(len(seeds)) if numbers is None else numbers:
+        anatomy = build_seed(seeds[number], access=definition.access)
+        if sheath_direction(anatomy) is None:
+            continue
+        own = {"arches": arches, "pool": 1, "first": number}
+        one = evaluation.evaluate(
+            player,
+            task,
+            1,
+            evaluation.EVALUATION_SEED + number,
+            name=name,
+            observation=observation,
+            task_kwargs={**task_kwargs, **own},
+            # A single simulation has no use for more.
+            num_threads=1,
+        )
+        played.append(one)
+        groups.append(f"type {seeds[number].arch_type}")
+    if not played:
+        raise ValueError(f"no device can enter any of the arches {arches!r}")
+    whole = dataclasses.replace(
+        played[0],
+        episodes=tuple(one.episodes[0] for one in played),
+        settings={
+            **played[0].settings,
+            "task_kwargs": {**task_kwargs, "arches": arches, "pool": 1},
+        },
+    )
+    return Judgement(whole, None, tuple(groups))

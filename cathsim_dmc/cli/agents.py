@@ -48,7 +48,7 @@ def evaluate(
         seed: Seed of the first episode; the others count up.
         out: Directory for evaluation.json and heatmap.png.
         baseline: Whether to compare with the random policy on the same seeds.
-        anatomy: Anatomy of one's own, for the task `navigate`.
+        anatomy: Where the task takes place.
         backend: Way of simulating: all episodes side by side, or dm_control's
             environments one after the other.
         threads: Number of threads of the simulation; one per core by default.
@@ -96,7 +96,7 @@ def record(
         task: Task of `cathsim list`; by default the one that the policy was trained on.
         seed: Seed of the episode.
         max_steps: Number of control steps after which the episode is cut off.
-        anatomy: Anatomy of one's own, for the task `navigate`.
+        anatomy: Where the task takes place.
         fluoroscopy: Whether to include X-ray images.
     """
     from cathsim_dmc.agents import report
@@ -220,7 +220,7 @@ def play(
         speed: Speed of the simulation, in multiples of real time.
         policy: Policy to watch instead of playing yourself: directory of a run or of
             a checkpoint, or name of a policy, such as "pretrained:type1_bca".
-        anatomy: Anatomy of one's own, for the task `navigate`.
+        anatomy: Where the task takes place.
     """
     watched = None
     if policy is not None:

@@ -9,14 +9,13 @@ from __future__ import annotations
 
 import json
 import os
-import zipfile
 from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from cathsim_dmc.files import atomic_path
+from cathsim_dmc.files import DAMAGED_ARCHIVE, atomic_path
 
 FORMAT = "cathsim-episode"
 FORMAT_VERSION = 1
@@ -245,7 +244,7 @@ class Episode:
             with np.load(path, allow_pickle=False) as archive:
                 header = json.loads(str(archive["header"][()]))
                 arrays = {name: archive[name] for name in _AXES}
-        except (zipfile.BadZipFile, EOFError, KeyError, ValueError, OSError) as error:
+        except (*DAMAGED_ARCHIVE, TypeError) as error:
             raise ValueError(
                 f"{path} is not an episode written by Episode.save: {error}"
             ) from error

@@ -8,6 +8,7 @@ import mujoco
 import numpy as np
 from dm_control import composer
 
+from cathsim_dmc import bounds
 from cathsim_dmc.tasks import cameras, cases, forces, observations, readings
 from cathsim_dmc.tasks.actions import check_action
 from cathsim_dmc.tasks.config import CONTROL_TIMESTEP, NavigationConfig
@@ -66,11 +67,10 @@ class Navigation(composer.Task):
         self._scene = scene
         self._objective = objective
         self._config = config = config or NavigationConfig()
-        self._random_state = (
-            random
-            if isinstance(random, np.random.RandomState)
-            else np.random.RandomState(random)
-        )
+        if not isinstance(random, np.random.RandomState):
+            seed = None if random is None else bounds.seed("random", random)
+            random = np.random.RandomState(seed)
+        self._random_state = random
         if config.ranges.goal_shift and not hasattr(objective, "shifted"):
             raise ValueError(
                 f"randomisation shifts the goal, but {type(objective).__name__} has "

@@ -277,8 +277,7 @@ def validate_anatomy(
     findings: dict[str, Any] = {}
     for name, anatomy in anatomies.items():
         checks += lumen_checks(dataclasses.replace(anatomy, name=name), rays)
-        if anatomy.field is not None:
-            checks += tree_checks(dataclasses.replace(anatomy, name=name))
+        checks += tree_checks(dataclasses.replace(anatomy, name=name))
         findings[name] = {"measures": shape(anatomy)}
         if push:
             from cathsim_dmc.validation.push import straight_push
@@ -295,7 +294,7 @@ def validate_anatomy(
 
 
 def tree_checks(anatomy: Anatomy) -> list[Check]:
-    """Tree of a scan against its surface; see `anatomy.scan.check.check_tree`."""
+    """Tree against surface; see `anatomy.scan.check.check_tree`."""
     return [
         Check.at_most(
             f"{anatomy.name}: {found.name}, violations",

@@ -185,7 +185,7 @@ def other_tasks(table):
         if task in PUBLISHED_TASKS:
             continue
         for label, found in agents_.items():
-            cells = [task, label, *figures_of(found)]
+            cells = [task, label, *figures_of(found), by_group(found)]
             expert = experts.get(task)
             cells.append(f"{100 * expert['success']:.0f} %" if expert else "–")
             lines.append(f"| {' | '.join(cells)} |")
@@ -196,8 +196,8 @@ def other_tasks(table):
             "## Further tasks",
             "",
             "| task | agent | seeds | success (95 %) | worst | reward | mean force "
-            "| max force | expert |",
-            "|---|---|---|---|---|---|---|---|---|",
+            "| max force | success by kind of arch | expert |",
+            "|---|---|---|---|---|---|---|---|---|---|",
             *lines,
             "",
         ]
@@ -224,6 +224,24 @@ def figures_of(found):
         spread(found, "mean_force_in_contact", 1e3, 1),
         spread(found, "max_force", 1e3, 0),
     ]
+
+
+def by_group(found):
+    """Success in each kind of arch, where episodes have one each."""
+    reached = {}
+    for result in found:
+        groups = result.evaluation.get("groups") or ()
+        for group, success in zip(
+            groups, result.evaluation["episodes"]["success"], strict=False
+        ):
+            reached.setdefault(group, []).append(success)
+    return (
+        ", ".join(
+            f"{group}: {sum(one)} of {len(one)}"
+            for group, one in sorted(reached.items())
+        )
+        or "–"
+    )
 
 
 def published_figures(theirs):

@@ -150,11 +150,12 @@ def force_maps(chosen, path):
     fields = {}
     for task, results in chosen.items():
         maps = [r.evaluation["force_map"] for r in results if r.evaluation["force_map"]]
-        if maps and task in suite.TASKS:
+        definition = suite.TASKS.get(task)
+        if maps and definition is not None and definition.anatomy is not None:
             fields[task] = (_merged([map_from_values(one) for one in maps]), results)
     if not fields:
         return None
-    figure, panels = _panels(len(fields), columns=4, width=2.9, height=4.6)
+    figure, panels = _panels(len(fields), columns=4, width=2.9, height=3.9)
     for axes, (task, (field, results)) in zip(panels, fields.items(), strict=False):
         _draw_map(figure, axes, field, task)
         episodes = sum(r.evaluation["summary"]["episodes"] for r in results)
@@ -166,7 +167,8 @@ def force_maps(chosen, path):
 
 
 def _draw_map(figure, axes, field, task):
-    surface = suite.make_task(task).scene.anatomy.surface
+    definition = suite.TASKS[task]
+    surface = suite.load_anatomy(definition.anatomy, definition.access).surface
     triangles = 1e3 * np.asarray(surface.vertices)[:, AP_AXES][surface.faces]
     # Dark and wide below light: a rim around the silhouette.
     for colour, rim in (("0.5", 1.8), ("0.92", 0.5)):

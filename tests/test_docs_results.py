@@ -1,0 +1,111 @@
+"""The page of results, from made-up files of finished cells."""
+
+import importlib.util
+import re
+import sys
+from pathlib import Path
+
+import fabricated_results
+import numpy as np
+import pytest
+
+from cathsim_dmc.analysis.intervals import interquartile_mean
+
+SCRIPTS = Path(__file__).parents[1] / "docs/scripts"
+
+
+@pytest.fixture
+def page(tmp_path, monkeypatch):
+    """Writes the page of `tmp_path`/results; returns (exit code, text)."""
+    monkeypatch.syspath_prepend(str(SCRIPTS))
+    spec = importlib.util.spec_from_file_location("results", SCRIPTS / "results.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    monkeypatch.delitem(sys.modules, "results_figures", raising=False)
+
+    def write():
+        out = tmp_path / "docs/results.md"
+        code = module.main(["--results", str(tmp_path / "results"), "--out", str(out)])
+        return code, out.read_text()
+
+    return write
+
+
+def line_of(text, *words):
+    """The only line with all words."""
+    (line,) = [one for one in text.splitlines() if all(word in one for word in words)]
+    return [field.strip() for field in line.strip("| ").split("|")]
+
+
+def test_ours_stands_beside_the_published(page, tmp_path):
+    for seed, rate in enumerate((1.0, 0.9)):
+        fabricated_results.write(
+            tmp_path / "results", "type1_bca", "PPO-Internal", "ppo", "internal", seed,
+            rate,
+        )  # fmt: skip
+    code, text = page()
+    assert code == 0
+    ours = line_of(text, "| PPO-Internal | 2 | 95 % (86–98)")
+    assert ours[3] == "90 %"  # the worst seed
+    assert ours[7:9] == ["53 %", "-70 ± 28"]
+    assert ours[9:] == ["11 ± 21", "121 ± 95"]
+    assert "2 of the 38 cells" in text or re.search(r"\n2 of the \d+ cells", text)
+    missing = line_of(text, "- PPO-Internal: type1_lcca (seed 0, 1, 2)")[0]
+    assert "type1_bca (seed 2)" in missing
+    assert line_of(text, "PPO-Internal", "1 of 4")[2] == "2"
+    assert line_of(text, "PPO-Sequential (missing)", "97 %")
+    for name in re.findall(r"\]\((images/\S+)\)", text):
+        assert (tmp_path / "docs" / name).stat().st_size > 5_000
+    assert {path.name for path in (tmp_path / "docs/images").iterdir()} == {
+        "results_curves.png",
+        "results_forces.png",
+        "results_force_maps.png",
+    }
+
+
+def test_a_task_of_its_own_stands_beside_the_expert(page, tmp_path):
+    fabricated_results.write(
+        tmp_path / "results", "arch_bca", "PPO, any arch", "ppo", "tracking", 0, 0.8
+    )
+    code, text = page()
+    assert code == 0
+    assert line_of(text, "| arch_bca | PPO, any arch | 1 | 80 %")[-1] == "–"
+
+
+def test_without_results_everything_is_missing(page, tmp_path):
+    code, text = page()
+    assert code == 0
+    assert re.search(r"\n0 of the \d+ cells", text)
+    assert "## Figures" not in text
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [
+        lambda text: text[:200],
+        lambda text: text.replace('"success": ', '"succes": '),
+        lambda text: text.replace('"format": 1', '"format": 99'),
+        lambda text: "[]",
+    ],
+)
+def test_a_broken_file_is_named_and_left_out(page, tmp_path, capsys, damage):
+    path = fabricated_results.write(
+        tmp_path / "results", "type1_bca", "PPO-Internal", "ppo", "internal", 0, 1.0
+    )
+    path.write_text(damage(path.read_text()))
+    code, text = page()
+    assert code == 1
+    assert path.name in capsys.readouterr().err
+    assert path.name in text and str(tmp_path) not in text
+    assert "0 of the" in text
+
+
+def test_the_interquartile_mean_drops_a_quarter_on_either_side():
+    scores = [[0.0, 0.9], [0.8, 1.0], [0.9, 1.0], [0.1, 0.9]]
+    mean, interval = interquartile_mean(scores)
+    assert mean == pytest.approx(np.mean([0.8, 0.9, 0.9, 0.9]))
+    assert interval[0] < mean < interval[1] <= 1.0
+    assert interquartile_mean(scores) == (mean, interval)
+    assert interquartile_mean([[0.5], [1.0, 1.0]])[1] is None
+    with pytest.raises(ValueError, match="needs a run"):
+        interquartile_mean([[1.0], []])
