@@ -16,7 +16,7 @@ from cathsim_dmc.pictures.figure import scene_figure
 from cathsim_dmc.pictures.snapshot import Snapshot
 from cathsim_dmc.pictures.translucent import Projection, glass
 from cathsim_dmc.recording.episode import Episode
-from cathsim_dmc.recording.geometry import force_scale
+from cathsim_dmc.recording.geometry import force_scale, force_text
 
 TASK = "simple1_bca"
 
@@ -190,6 +190,11 @@ def test_the_scale_of_forces_holds_them_all():
     assert force_scale(np.array([0.05])) == 0.05
     assert force_scale(np.array([0.01, 0.06])) == 0.1
     assert force_scale(np.array([3.0])) == 0.4
+
+
+def test_forces_are_written_in_three_digits():
+    assert force_text(0.0) == "0 mN" and force_text(0.01234) == "12.3 mN"
+    assert force_text(0.9) == "900 mN" and force_text(1.1749) == "1.17 N"
 
 
 def test_tasks_and_anatomies_say_what_they_are(pushed):

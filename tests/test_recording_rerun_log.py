@@ -10,7 +10,7 @@ from recording_samples import make_episode, make_tube
 from scipy.spatial.transform import Rotation
 
 from cathsim_dmc.recording.comparison import write_comparison
-from cathsim_dmc.recording.geometry import rotate
+from cathsim_dmc.recording.geometry import force_text, rotate
 from cathsim_dmc.recording.rerun_device import arrow_scale
 from cathsim_dmc.recording.rerun_log import write_rrd
 from cathsim_dmc.recording.scene import BodyGeom
@@ -225,7 +225,8 @@ def test_events_stand_at_the_states_where_they_happen(written):
     rows = dict(zip(texts, recording.values("/events", "step"), strict=True))
     assert rows["start of type1_bca"] == 0 and rows["end: success"] == STEPS
     row = int(episode.wall_force_max.argmax())
-    assert rows[f"largest force, {1e3 * episode.wall_force_max[row]:.3g} mN"] == row + 1
+    largest = f"largest force, {force_text(episode.wall_force_max[row])}"
+    assert rows[largest] == row + 1
     nearest = int(np.argmin(episode.meta["distance"]))
     named = [text for text in texts if text.startswith("nearest to the goal")]
     assert [rows[text] for text in named] == [nearest]

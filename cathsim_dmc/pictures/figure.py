@@ -19,7 +19,7 @@ from scipy.interpolate import CubicSpline
 from cathsim_dmc.imaging import FluoroscopyOptions
 from cathsim_dmc.pictures.snapshot import Snapshot, fluoroscope_of, xray
 from cathsim_dmc.pictures.translucent import Glass, Projection, glass
-from cathsim_dmc.recording.geometry import force_colours
+from cathsim_dmc.recording.geometry import force_colours, force_text
 
 # Directions of view by name: azimuth of the viewer, degrees, and the picture's axes.
 VIEWS = {
@@ -213,7 +213,7 @@ def _draw_forces(axes: Any, snapshot: Snapshot, projection: Projection) -> None:
     )  # fmt: skip
     top = int(magnitude.argmax())
     axes.annotate(
-        f"{1e3 * largest:.3g} mN",
+        force_text(largest),
         place[top] + (along[top] if strong[top] else 0),
         xytext=(5, 4),
         textcoords="offset points",
@@ -258,6 +258,6 @@ def _caption(snapshot: Snapshot) -> str:
         return f"{snapshot.title}; no contact with the wall"
     contacts = "1 contact" if len(magnitude) == 1 else f"{len(magnitude)} contacts"
     return (
-        f"{snapshot.title}; {contacts}, {1e3 * magnitude.sum():.3g} mN in all, "
-        f"{1e3 * magnitude.max():.3g} mN the largest"
+        f"{snapshot.title}; {contacts}, {force_text(magnitude.sum())} in all, "
+        f"{force_text(magnitude.max())} the largest"
     )

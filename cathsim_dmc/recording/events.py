@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from cathsim_dmc.recording.episode import Episode
+from cathsim_dmc.recording.geometry import force_text
 
 # A contact is told of anew when nothing was touched for so many steps before.
 _QUIET = 10
@@ -22,7 +23,7 @@ def events(episode: Episode) -> list[tuple[int, str, str]]:
     force = episode.wall_force_max
     if force.max(initial=0.0) > 0:
         row = int(force.argmax())
-        found.append((row + 1, f"largest force, {_mn(force[row])}", WARN))
+        found.append((row + 1, f"largest force, {force_text(force[row])}", WARN))
     distance = episode.meta.get("distance")
     if distance:
         found += _approach(np.asarray(distance, dtype=np.float64))
@@ -38,7 +39,9 @@ def _contacts(episode: Episode) -> list[tuple[int, str, str]]:
     for row in touched[quiet]:
         force = episode.contact_force[episode.contact_step == row]
         largest = np.linalg.norm(force, axis=-1).max()
-        found.append((int(row) + 1, f"contact with the wall, {_mn(largest)}", INFO))
+        found.append(
+            (int(row) + 1, f"contact with the wall, {force_text(largest)}", INFO)
+        )
     return found
 
 
@@ -49,7 +52,3 @@ def _approach(distance: np.ndarray) -> list[tuple[int, str, str]]:
     if len(half):
         found.append((int(half[0]), "half of the distance to the goal", INFO))
     return found
-
-
-def _mn(newtons: float) -> str:
-    return f"{1e3 * newtons:.3g} mN"

@@ -131,3 +131,8 @@ def force_scale(magnitude: np.ndarray) -> float:
     """
     largest = float(np.max(magnitude, initial=0.0))
     return next((top for top in _FORCE_SCALES if largest <= top), FORCE_COLOUR_MAX)
+
+
+def force_text(newtons: float) -> str:
+    """Return a force in three digits: millinewtons below 1 N, newtons from there."""
+    return f"{newtons:.3g} N" if newtons >= 1 else f"{1e3 * newtons:.3g} mN"

@@ -11,7 +11,7 @@ import rerun as rr
 
 from cathsim_dmc.recording.drawing import Drawing
 from cathsim_dmc.recording.episode import Episode
-from cathsim_dmc.recording.geometry import force_colours, force_scale
+from cathsim_dmc.recording.geometry import force_colours, force_scale, force_text
 from cathsim_dmc.recording.rerun_device import ARROW_RADIUS, LONGEST_ARROW
 from cathsim_dmc.recording.rerun_log import APPLICATION_ID, layout_of, log_episode
 from cathsim_dmc.recording.scene import BodyGeom
@@ -79,6 +79,6 @@ def _log_moment(
         origins=position,
         colors=force_colours(magnitude, top),
         radii=ARROW_RADIUS,
-        labels=[f"{1e3 * each:.3g} mN" for each in magnitude],
+        labels=[force_text(each) for each in magnitude],
     )
     stream.log("world/contacts", arrows, static=True, strict=True)

@@ -6,7 +6,13 @@ import numpy as np
 import rerun as rr
 
 from cathsim_dmc.recording.episode import Episode
-from cathsim_dmc.recording.geometry import force_colours, force_scale, xyzw, z_to
+from cathsim_dmc.recording.geometry import (
+    force_colours,
+    force_scale,
+    force_text,
+    xyzw,
+    z_to,
+)
 from cathsim_dmc.recording.rerun_stream import Log
 
 # Drawing only: the longest arrow of an episode is about this long.
@@ -114,6 +120,6 @@ def _labels(episode: Episode, magnitude: np.ndarray) -> list[str]:
     np.maximum.at(largest, episode.contact_step, magnitude)
     named = (magnitude > 0) & (magnitude >= LABELLED * largest[episode.contact_step])
     return [
-        f"{1e3 * force:.3g} mN" if shown else ""
+        force_text(force) if shown else ""
         for force, shown in zip(magnitude, named, strict=True)
     ]
