@@ -7,7 +7,7 @@ PIP := PIP_DISABLE_PIP_VERSION_CHECK=1 $(BIN)/python -m pip install --quiet --co
 # MuJoCo looks for OpenGL at import; nothing here draws with it.
 export MUJOCO_GL ?= disable
 
-.PHONY: demo test test-slow lint figures clean
+.PHONY: demo test test-slow nightly lint audit compatibility dist docs clean
 
 demo: $(VENV)/.installed
 	$(BIN)/cathsim demo --out runs/demo
@@ -16,8 +16,33 @@ test: $(VENV)/.installed-test
 	$(BIN)/ruff check .
 	$(BIN)/python -m pytest -m "not slow" -n $(WORKERS) --dist worksteal -q
 
+# Says at its end how long it took, and which tests took longest.
 test-slow: $(VENV)/.installed-test
-	$(BIN)/python -m pytest -m slow -n $(WORKERS) --dist worksteal
+	$(BIN)/python -m pytest -m slow -n $(WORKERS) --dist worksteal --durations=15 -rA -q
+
+# Everything that can be checked, a night long.
+nightly: lint test test-slow docs dist audit compatibility
+	mkdir -p runs
+	$(BIN)/python benchmarks/soak.py --out runs/soak
+	$(BIN)/python benchmarks/long_load.py --steps 1000000 --out runs/long-load.json
+
+# Known holes of the pinned versions; asks a public database, so it needs a network.
+audit: $(VENV)/.installed
+	$(PYTHON) -m venv build/audit
+	PIP_DISABLE_PIP_VERSION_CHECK=1 build/audit/bin/python -m pip install --quiet pip-audit
+	$(PYTHON) tools/audit.py build/audit/bin/pip-audit constraints.txt
+
+# Pythons and versions of the main dependencies, each in a fresh environment.
+compatibility:
+	$(PYTHON) tools/compatibility.py
+
+# The wheel, proved in an empty environment away from the checkout.
+dist: $(VENV)/.installed
+	rm -rf dist build/wheel build/empty
+	$(PYTHON) -m venv build/empty
+	$(PIP) wheel --no-deps --wheel-dir dist . 2>/dev/null || $(BIN)/python -m pip wheel --quiet --no-deps --wheel-dir dist .
+	PIP_DISABLE_PIP_VERSION_CHECK=1 build/empty/bin/python -m pip install --quiet --constraint constraints.txt dist/*.whl
+	cd build && empty/bin/python ../tools/smoke.py --installed
 
 lint: $(VENV)/.installed-test
 	$(BIN)/ruff check .
@@ -36,6 +61,14 @@ $(VENV)/.installed: pyproject.toml constraints.txt $(VENV)/.created
 
 $(VENV)/.installed-test: $(VENV)/.installed
 	$(PIP) --editable '.[test]'
+	touch $@
+
+docs: $(VENV)/.installed-docs
+	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict
+	@echo "The site: build/site/index.html"
+
+$(VENV)/.installed-docs: $(VENV)/.installed
+	$(PIP) --editable '.[docs]'
 	touch $@
 
 clean:

@@ -15,20 +15,26 @@ _SUBMODULES = (
     "anatomy",
     "entities",
     "imaging",
+    "pictures",
+    "policies",
     "recording",
     "simulation",
     "suite",
     "tasks",
     "validation",
 )
+# What a notebook asks for first; see `cathsim_dmc.pictures`.
+_FUNCTIONS = ("fluoroscopy", "forces", "record", "show")
 
 
 def __getattr__(name: str):
     # Lazy, so that `import cathsim_dmc` loads neither dm_control nor torch.
+    if name in _FUNCTIONS:
+        return getattr(importlib.import_module(f"{__name__}.pictures"), name)
     if name in _SUBMODULES:
         return importlib.import_module(f"{__name__}.{name}")
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
 
 
 def __dir__() -> list[str]:
-    return sorted([*globals(), *_SUBMODULES])
+    return sorted([*globals(), *_SUBMODULES, *_FUNCTIONS])

@@ -17,6 +17,7 @@ import numpy as np
 MOST_SEED = 2**32 - 1
 # Simulations, episodes: more are a slip of the finger, and fill the memory.
 MOST_SIMULATIONS = 100_000
+MOST_THREADS = 4096
 # Pixels along a side of an image; detectors of angiography have 1,024 to 2,480.
 MOST_PIXELS = 4096
 # Way from the origin of what lies in an anatomy, m.
@@ -138,6 +139,24 @@ def interval(
             f"(low, high) with low <= high, each {_allowed(kind, low, high, unit)}",
         )
     return values[0], values[1]
+
+
+def array(name: str, value: Any, kinds: str = "fiu") -> np.ndarray:
+    """An array of finite numbers; `kinds` are those of numpy's dtypes."""
+    try:
+        given = np.asarray(value)
+    except ValueError:  # rows of different lengths
+        given = np.array(None)
+    if given.size and (given.dtype.kind not in kinds or not np.isfinite(given).all()):
+        refuse(name, value, "an array of finite numbers")
+    return given
+
+
+def instance(name: str, value: Any, kind: type) -> Any:
+    """An object of a class."""
+    if not isinstance(value, kind):
+        refuse(name, value, f"a {kind.__name__}")
+    return value
 
 
 def pixels(name: str, value: Any) -> tuple[int, int]:

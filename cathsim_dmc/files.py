@@ -5,6 +5,8 @@ from __future__ import annotations
 import contextlib
 import os
 import uuid
+import zipfile
+import zlib
 from collections.abc import Iterator
 from pathlib import Path
 from typing import BinaryIO
@@ -15,6 +17,17 @@ except ImportError:  # Windows has no advisory locks: leftovers stay there.
     fcntl = None
 
 _PARTIAL = ".partial"
+# What numpy's reader of archives raises where one is damaged.
+DAMAGED_ARCHIVE = (
+    zipfile.BadZipFile,
+    zlib.error,
+    EOFError,
+    KeyError,
+    ValueError,
+    OSError,
+    NotImplementedError,
+    RuntimeError,
+)
 
 
 @contextlib.contextmanager

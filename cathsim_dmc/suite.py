@@ -21,10 +21,12 @@ from dm_control import composer
 from dm_control import suite as dm_suite
 from dm_control.utils import containers
 
+from cathsim_dmc import bounds
 from cathsim_dmc.anatomy import Anatomy, Goal
 from cathsim_dmc.entities import devices
 from cathsim_dmc.tasks import placement
 from cathsim_dmc.tasks.config import NavigationConfig
+from cathsim_dmc.tasks.environment import Environment
 from cathsim_dmc.tasks.navigation import Navigation
 from cathsim_dmc.tasks.objectives import Cannulation, Objective
 from cathsim_dmc.tasks.scene import Scene
@@ -154,7 +156,7 @@ def make_task(
         scene = Scene.build(anatomy, place, config, goal_radius=objective.goal_radius)
         rooms.append((scene, objective))
     scene, objective = rooms[0]
-    return Navigation(scene, objective, config, random, others=rooms[1:])
+    return Navigation(scene, objective, config, random, others=rooms[1:], name=name)
 
 
 def _one_length(
@@ -245,6 +247,8 @@ def load_anatomy(anatomy: str | Path | Anatomy, access: str = "ascending") -> An
         return anatomy
     from cathsim_dmc.anatomy import phantoms
 
+    if not isinstance(anatomy, str | Path):
+        bounds.refuse("anatomy", anatomy, "an Anatomy, a name or a directory")
     if str(anatomy) in phantoms.PHANTOMS:
         return phantoms.load(str(anatomy), access=access)
     if not Path(anatomy).is_dir():
@@ -310,7 +314,7 @@ def environment(task: Navigation, **environment_kwargs: Any) -> composer.Environ
         "raise_exception_on_physics_error": False,
         **environment_kwargs,
     }
-    return composer.Environment(task, random_state=task.random, **settings)
+    return Environment(task, random_state=task.random, **settings)
 
 
 def _register_domain() -> None:

@@ -1,5 +1,7 @@
 """Environments that many tests share; loading one takes a second."""
 
+import contextlib
+
 import hypothesis
 import numpy as np
 import pytest
@@ -12,6 +14,35 @@ hypothesis.settings.load_profile("default")
 
 TASKS = ("type1_bca", "type1_lcca", "type2_bca", "type2_lcca")
 SHORT_EPISODE = 12  # control steps
+
+
+@pytest.fixture(autouse=True, scope="session")
+def dumps_of_physics_errors(tmp_path_factory):
+    """Dumps go where pytest tidies up; a test may say otherwise."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("CATHSIM_DUMP_DIR", str(tmp_path_factory.mktemp("dumps")))
+        yield
+
+
+@pytest.fixture
+def small_disk():
+    """Returns a context manager in which no file can grow beyond so many bytes.
+
+    What a process meets there is what it meets on a full disk or over its quota: an
+    OSError in the middle of a write. Unlike a small file system it needs no root.
+    """
+    resource = pytest.importorskip("resource")
+
+    @contextlib.contextmanager
+    def limited(size):
+        before = resource.getrlimit(resource.RLIMIT_FSIZE)
+        resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
+        try:
+            yield
+        finally:
+            resource.setrlimit(resource.RLIMIT_FSIZE, before)
+
+    return limited
 
 
 @pytest.fixture(scope="session")

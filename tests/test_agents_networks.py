@@ -7,11 +7,13 @@ from tensordict import TensorDict
 from torchrl.envs import check_env_specs
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from cathsim_dmc.agents import PPOConfig, SACConfig
+from cathsim_dmc.agents import PPOConfig, SACConfig, make_config
+from cathsim_dmc.agents.exploration import CorrelatedExploration, CorrelatedNoise
 from cathsim_dmc.agents.learners import make_policy
 from cathsim_dmc.agents.networks import NetworkShapes
 from cathsim_dmc.agents.normalisation import ObservationNormaliser
 from cathsim_dmc.agents.ppo import PPO
+from cathsim_dmc.simulation.environments import VECTOR
 
 
 def test_normaliser_equals_the_statistics_of_all_data_whatever_the_batches():
@@ -155,3 +157,31 @@ def test_truncation_bootstraps_and_termination_does_not(tmp_path):
             torch.testing.assert_close(
                 batch["advantage"][env, step, 0], advantage, rtol=1e-4, atol=1e-5
             )
+
+
+def test_correlated_noise_lasts_and_is_shared_and_stays_standard_normal():
+    torch.manual_seed(0)
+    noise = CorrelatedNoise(0.9, 0.8, [0, 1, 0, 1, 2])
+    drawn = torch.stack([noise.draw(torch.zeros(64, 5)).clone() for _ in range(2_000)])
+    assert drawn.mean().abs() < 0.02
+    assert (drawn.std((0, 1)) - 1.0).abs().max() < 0.02
+    flat = drawn.reshape(-1, 5).T
+    among = torch.corrcoef(flat)
+    assert among[0, 2] == pytest.approx(0.8, abs=0.02)
+    assert among[0, 1].abs() < 0.03 and among[0, 4].abs() < 0.03
+    now, following = drawn[:-1, :, 0].reshape(-1), drawn[1:, :, 0].reshape(-1)
+    after = torch.corrcoef(torch.stack([now, following]))[0, 1]
+    assert after == pytest.approx(0.9, abs=0.02)
+
+
+def test_correlated_exploration_says_how_likely_its_actions_are():
+    """As the policy itself would say it, which the loss compares it with."""
+    shapes = NetworkShapes(vector=4, pixels=None, actions=3)
+    config = make_config("ppo", noise_correlation=0.9)
+    policy = PPO.make_policy(shapes, config)
+    explorer = CorrelatedExploration(policy, CorrelatedNoise(0.9, 0.0, range(3)))
+    observed = TensorDict({VECTOR: torch.randn(6, 4)}, [6])
+    explored = explorer(observed.clone())
+    assert explored["action"].abs().max() < 1.0
+    own = policy[-1].get_dist(policy[0](observed)).log_prob(explored["action"])
+    torch.testing.assert_close(explored["action_log_prob"], own, atol=1e-4, rtol=1e-4)

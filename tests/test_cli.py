@@ -250,6 +250,17 @@ def test_an_interrupt_leaves_one_line(arguments):
     assert "Traceback" not in err
 
 
+def test_an_arch_of_a_set_is_chosen(cathsim):
+    where = ("--arches", "test", "--pool", 1, "--first", 2)
+    code, out, err = cathsim(
+        *("eval", "push", "--task", "femoral_arch_lcca", *where),
+        *("--episodes", 1, "--no-baseline", "--json"),
+    )
+    assert code == 0, err
+    task_kwargs = only_json(out)["task_kwargs"]
+    assert task_kwargs == {"arches": "test", "pool": 1, "first": 2}
+
+
 # Bad input: exit code 2, a message on stderr, nothing on stdout, nothing done.
 
 TRAIN = ("train", "type1_bca", "--out", "OUT")
@@ -303,6 +314,18 @@ BAD = {
     "no such task to evaluate on": (
         ["eval", "random", "--task", "type9"],
         ["type9", *TASKS],
+    ),
+    "arches where there are none": (
+        ["eval", "push", "--task", "type1_bca", "--pool", 2],
+        ["no task option 'pool'"],
+    ),
+    "no such set of arches": (
+        ["eval", "push", "--task", "arch_bca", "--arches", "trian"],
+        ["trian", "train", "test_variants"],
+    ),
+    "text for a number of arches": (
+        ["record", "push", "--task", "arch_bca", "--out", "OUT.rrd", "--first", "x"],
+        ["--first", "x"],
     ),
     "no such recording": (["replay", "OUT.rrd"], ["OUT.rrd"]),
     "no such task to record": (

@@ -20,11 +20,11 @@ from cathsim_dmc.entities.catheter import (
     Catheter,
 )
 
-STEERABLE = ("published", "steerable_4f")
+STEERABLE = ("steerable_5f", "steerable_4f")
 LENGTH = 0.3
 
 
-def compiled(device="published", **options):
+def compiled(device="steerable_5f", **options):
     """Catheter and physics of a device alone in the arena, as in a task."""
     device = devices.get(device)
     discretisation = devices.Discretisation(
@@ -319,10 +319,17 @@ def test_stroke_must_be_positive(stroke):
 def test_device_and_section_errors_say_what_is_allowed():
     with pytest.raises(ValueError, match=r"bending_stiffness.*N·m²"):
         devices.Section(-1.0, 1.0)
-    with pytest.raises(ValueError, match=r"outer_radius.*positive number in SI"):
-        devices.Device("x", 0.0, 1e-3, devices.PUBLISHED.shaft, devices.PUBLISHED.shaft)
-    with pytest.raises(ValueError, match=r"no device.*published.*lunderquist"):
+    with pytest.raises(ValueError, match=r"outer_radius.*above 0"):
+        devices.Device(
+            "x", 0.0, 1e-3, devices.STEERABLE_5F.shaft, devices.STEERABLE_5F.shaft
+        )
+    with pytest.raises(ValueError, match=r"no device.*steerable_5f.*lunderquist"):
         devices.get("amplatz")
+
+
+def test_the_former_name_of_a_device_is_understood_and_said():
+    with pytest.warns(FutureWarning, match="'steerable_5f' now"):
+        assert devices.get("published") is devices.DEVICES["steerable_5f"]
 
 
 def test_isotropic_section_has_the_shear_modulus_of_its_material():

@@ -29,7 +29,7 @@ class Rig:
         arena = AngiographyArena()
         arena.mjcf_model.option.timestep = 4e-3
         self.catheter = Catheter(
-            "published", devices.Discretisation(working_length=LENGTH), stroke=STROKE
+            "steerable_5f", devices.Discretisation(working_length=LENGTH), stroke=STROKE
         )
         self.lengths = self.catheter.link_lengths
         self.sheath = Sheath(

@@ -119,8 +119,8 @@ def test_wrong_reward():
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        ({"goal_radius": 0.0}, ["goal_radius", "0.0", "> 0"]),
-        ({"goal_radius": -1e-3}, ["goal_radius", "-0.001", "> 0"]),
+        ({"goal_radius": 0.0}, ["goal_radius", "0.0", "above 0"]),
+        ({"goal_radius": -1e-3}, ["goal_radius", "-0.001", "above 0"]),
         ({"max_steps": 0}, ["max_steps", "0", "at least 1"]),
         ({"max_steps": 1.5}, ["max_steps", "1.5", "integer"]),
         ({"max_steps": float("inf")}, ["max_steps", "inf", "integer"]),
@@ -135,7 +135,7 @@ def test_wrong_reward():
         ({"torsion_joints": 1.5}, ["torsion_joints", "1.5", "integer"]),
         ({"friction": -0.1}, ["friction", "-0.1", "from 0 to 2"]),
         ({"friction": 5.0}, ["friction", "5.0", "from 0 to 2"]),
-        ({"working_length": 0.05}, ["working_length", "0.05", "published", "more"]),
+        ({"working_length": 0.05}, ["working_length", "0.05", "steerable_5f", "more"]),
         ({"torsion_joints": 500}, ["torsion_joints", "500", "joints"]),
         ({"torsion_joints": -1}, ["torsion_joints", "-1", "from 0"]),
         ({"working_length": 300.0}, ["working_length", "300", "at most"]),

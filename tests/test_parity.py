@@ -11,7 +11,7 @@ from cathsim_dmc.simulation.batch import BatchSimulation
 SIMULATIONS = 3
 STEPS = 60
 SEED = 10
-NUMBERS = ("internal", "tracking", "goal", "force")
+NUMBERS = ("internal", "tracking", "route", "goal", "force")
 PICTURES = ("image", "sequential", "segmentation", "tracking_2d")
 NOISY_BIPLANE = {"biplane": "LATERAL", "noise": True, "size": (48, 64), "roadmap": 0.4}
 

@@ -1,14 +1,18 @@
 import dataclasses
+import io
 import subprocess
 import sys
 
 import numpy as np
 import pytest
+from PIL import Image
 from recording_samples import make_episode, make_tube
 from scipy.spatial.transform import Rotation
 
+from cathsim_dmc.recording.comparison import write_comparison
 from cathsim_dmc.recording.geometry import rotate
-from cathsim_dmc.recording.rerun_log import ARROW_METRES_PER_NEWTON, write_rrd
+from cathsim_dmc.recording.rerun_device import arrow_scale
+from cathsim_dmc.recording.rerun_log import write_rrd
 from cathsim_dmc.recording.scene import BodyGeom
 
 STEPS = 6
@@ -142,6 +146,7 @@ def test_every_entity_lives_on_both_timelines_at_the_right_rows(written):
         "/world/catheter/trail": steps,
         "/world/robot/wheel": states,
         "/world/contacts": steps,
+        "/world/heat": steps,
         "/fluoroscopy": states,
         "/series/reward": steps,
         "/series/distance_mm": states,
@@ -153,7 +158,7 @@ def test_every_entity_lives_on_both_timelines_at_the_right_rows(written):
         "/series/action/tip_bend": states[:-1],
         "/series/action_all": states[:-1],
     }
-    assert set(recording.temporal) == set(expected)
+    assert set(recording.temporal) == {*expected, "/events"}
     for entity, rows in expected.items():
         assert recording.values(entity, "step") == rows, entity
         wanted = [round(episode.time[row] * 1e9) for row in rows]
@@ -183,7 +188,7 @@ def test_arrows_show_the_contacts_of_their_step_only(written):
     assert all(v is not None for v in vectors)
     np.testing.assert_allclose(
         np.concatenate([v for v in vectors if v]),
-        ARROW_METRES_PER_NEWTON * episode.contact_force,
+        arrow_scale(episode) * episode.contact_force,
         atol=1e-6,
     )
     np.testing.assert_allclose(
@@ -206,12 +211,33 @@ def test_series_hold_the_values_of_the_episode(written):
         scalars("action/tip_bend")[:, 0],
         np.sqrt((episode.action[:, :20] ** 2).mean(axis=1)),
     )
-    np.testing.assert_array_equal(scalars("force/push")[:, 0], episode.push_force)
+    np.testing.assert_array_equal(scalars("force/push")[:, 0], 1e3 * episode.push_force)
     np.testing.assert_allclose(
         scalars("distance_mm")[:, 0], 1e3 * np.array(episode.meta["distance"])
     )
     names = recording.fixed("/series/action_all", "SeriesLines:names")
     assert names[:3] == ["tip_x_0", "tip_y_0", "tip_x_1"] and names[-1] == "translation"
+
+
+def test_events_stand_at_the_states_where_they_happen(written):
+    episode, _, _, recording = written
+    texts = [text[0] for text in recording.values("/events", "TextLog:text")]
+    rows = dict(zip(texts, recording.values("/events", "step"), strict=True))
+    assert rows["start of type1_bca"] == 0 and rows["end: success"] == STEPS
+    row = int(episode.wall_force_max.argmax())
+    assert rows[f"largest force, {1e3 * episode.wall_force_max[row]:.3g} mN"] == row + 1
+    nearest = int(np.argmin(episode.meta["distance"]))
+    named = [text for text in texts if text.startswith("nearest to the goal")]
+    assert [rows[text] for text in named] == [nearest]
+
+
+def test_links_take_the_colour_of_what_they_press(written):
+    episode, _, _, recording = written
+    colours = np.array(recording.values("/world/catheter", "Capsules3D:colors"))
+    plain = colours[0, 0]
+    assert (colours[0] == plain).all()  # nothing is known of the start
+    touched = (colours != plain).any(axis=1)[1:]
+    assert touched.tolist() == [bool(n) for n in episode.contact_counts]
 
 
 def test_bodies_carry_their_geoms(written):
@@ -237,10 +263,6 @@ def test_bodies_carry_their_geoms(written):
 
 
 def test_frames_come_back_exactly_when_lossless(written):
-    import io
-
-    from PIL import Image
-
     _, frames, _, recording = written
     blobs = recording.values("/fluoroscopy", "EncodedImage:blob")
     for frame, blob in zip(frames, blobs, strict=True):
@@ -287,6 +309,80 @@ def test_an_episode_of_no_steps_is_still_a_recording(tmp_path):
     recording = Recording(write_rrd(make_episode(0), make_tube(), tmp_path / "e.rrd"))
     assert recording.values("/world/catheter", "step") == [0]
     assert "/series/reward" not in recording.temporal
+
+
+def test_two_planes_are_two_images(tmp_path):
+    frames = np.random.default_rng(0).integers(0, 255, (STEPS + 1, 8, 8, 2), np.uint8)
+    path = write_rrd(
+        make_recorded(), make_tube(), tmp_path / "e.rrd", fluoroscopy=frames,
+        lossless=True,
+    )  # fmt: skip
+    recording = Recording(path)
+    for plane, entity in enumerate(("/fluoroscopy", "/fluoroscopy_lateral")):
+        assert recording.views[entity] == "2D"
+        blob = recording.values(entity, "EncodedImage:blob")[3][0]
+        image = np.asarray(Image.open(io.BytesIO(bytes(blob))))
+        np.testing.assert_array_equal(image, frames[3, ..., plane])
+
+
+def test_several_episodes_are_compared_in_one_recording(tmp_path):
+    longer = make_recorded()
+    shorter = make_episode(3, seed=1, meta=longer.meta | {"distance": [0.1] * 4})
+    shorter = dataclasses.replace(shorter, time=shorter.time + 5.0)
+    path = write_comparison(
+        {"first": longer, "second": shorter}, make_tube(), tmp_path / "c.rrd"
+    )
+    recording = Recording(path)
+    assert len(recording.recordings) == 1
+    for name, episode in (("first", longer), ("second", shorter)):
+        head = recording.values(f"/world/{name}/head", "Points3D:positions")
+        np.testing.assert_allclose(np.array(head)[:, 0], episode.head, atol=1e-6)
+        # Both begin at 0, wherever their clocks stood.
+        assert recording.nanoseconds(f"/world/{name}/head")[0] == 0
+        scalars = recording.values(f"/series/force/{name}", "Scalars:scalars")
+        np.testing.assert_allclose(
+            np.array(scalars)[:, 0], 1e3 * episode.wall_force_max
+        )
+    assert "| second |" in recording.fixed("/info", "TextDocument:text")[0]
+
+
+@pytest.mark.parametrize(
+    ("names", "message"),
+    [(["one"], "give 2 to 6"), (["a", "b c"], "'b c'"), (["a", "goal"], "taken")],
+)
+def test_what_cannot_be_compared_is_refused(tmp_path, names, message):
+    episodes = {name: make_recorded() for name in names}
+    with pytest.raises(ValueError, match=message):
+        write_comparison(episodes, make_tube(), tmp_path / "c.rrd")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_episodes_with_different_goals_are_not_compared(tmp_path):
+    other = make_recorded(meta=make_recorded().meta | {"goal_position": (0, 0, 0)})
+    with pytest.raises(ValueError, match="different goals"):
+        write_comparison(
+            {"a": make_recorded(), "b": other}, make_tube(), tmp_path / "c.rrd"
+        )
+
+
+def test_a_notebook_shows_an_episode_and_a_single_state():
+    pytest.importorskip("rerun_notebook")
+    from rerun.notebook import Viewer
+
+    from cathsim_dmc.recording.notebook import episode_viewer
+
+    assert isinstance(episode_viewer(make_recorded(), make_tube()), Viewer)
+    contacts = np.zeros((2, 3)), np.ones((2, 3))
+    state = episode_viewer(make_episode(0), make_tube(), contacts=contacts)
+    assert isinstance(state, Viewer)
+
+
+def test_without_the_extra_a_notebook_says_what_to_install(monkeypatch):
+    from cathsim_dmc.recording import notebook
+
+    monkeypatch.setattr(notebook.importlib.util, "find_spec", lambda name: None)
+    with pytest.raises(ImportError, match=r"cathsim-dmc\[notebook\]"):
+        notebook.episode_viewer(make_recorded(), make_tube())
 
 
 def test_two_episodes_are_two_recordings(tmp_path):

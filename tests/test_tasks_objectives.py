@@ -33,8 +33,8 @@ def task(request, anatomy):
     return cannulation(anatomy, reward=request.param)
 
 
-def measurement(head, **changes):
-    """What there is to judge with the heads (..., 3): no force, no motion."""
+def measurement(task, head, **changes):
+    """What a task judges with the heads (..., 3): no force, no motion."""
     head = np.asarray(head)
     shape = head.shape[:-1]
     nothing = np.zeros(shape)
@@ -49,11 +49,12 @@ def measurement(head, **changes):
         force,
         changes.pop("action", still),
         changes.pop("previous_action", still),
+        task.distance(head),
     )
 
 
 def judge(task, head, **changes):
-    return task.outcome(measurement(head, **changes))
+    return task.outcome(measurement(task, head, **changes))
 
 
 def towards(task, way):

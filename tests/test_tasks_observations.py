@@ -8,7 +8,7 @@ import pytest
 from cathsim_dmc import suite
 from cathsim_dmc.anatomy.arch import arch
 from cathsim_dmc.imaging import Fluoroscope, FluoroscopyOptions
-from cathsim_dmc.tasks import observations
+from cathsim_dmc.tasks import observations, route
 from cathsim_dmc.tasks.config import NavigationConfig
 
 SIZE = 64
@@ -183,6 +183,50 @@ def test_tracking_follows_device_and_goal_in_space_and_on_the_screen(anatomy):
     )
     assert seen["tracking_insertion"] == task.readings.insertion
     assert seen["tracking_action"][0] == 0.3 and seen["tracking_action"][-1] == 1.0
+
+
+def test_the_route_ahead_is_that_of_the_centreline_seen_from_the_tip(anatomy):
+    env = make(anatomy, "route")
+    env.reset()
+    observation = push(env, 25, bend=0.3)[-1].observation
+    state, line = env.task.readings, env.task.objective.route
+    frame = state.head_frame
+    np.testing.assert_allclose(frame.T @ frame, np.eye(3), atol=1e-12)
+    link = state.head - state.centreline[-2]
+    np.testing.assert_allclose(frame[:, 2], link / np.linalg.norm(link), atol=1e-12)
+    points = observation["route_points"].reshape(-1, 3) @ frame.T + state.head
+    place = line.project(points)
+    np.testing.assert_allclose(place.distance, 0, atol=1e-5)
+    np.testing.assert_allclose(np.diff(place.arc_length), 5e-3, atol=1e-4)
+    np.testing.assert_allclose(observation["route_radii"], place.radius, rtol=1e-2)
+    # The head lies in the cross-section of the first of them, or is nowhere nearer.
+    nearest = line.project(state.head)
+    assert abs(place.arc_length[0] - nearest.arc_length) < 1e-3
+    goal = frame @ observation["route_goal"] + state.head
+    np.testing.assert_allclose(goal, env.task.objective.goal, atol=1e-12)
+    device = observation["route_device"].reshape(-1, 3) @ frame.T + state.head
+    shown = observations.tracked(state.centreline)
+    np.testing.assert_allclose(device, shown[:-1], atol=1e-12)
+
+
+def test_the_route_goes_straight_on_behind_the_goal(anatomy):
+    objective = suite.make_task("simple1_bca").objective
+    line = objective.route
+    ahead = route.Routes([objective]).ahead(
+        np.zeros(1, int), line.points[-1:] - 1e-4, np.eye(3)[None]
+    )
+    points = ahead.points[0] + line.points[-1] - 1e-4
+    way = np.diff(points[2:], axis=0)
+    np.testing.assert_allclose(np.linalg.norm(way, axis=-1), 5e-3, atol=1e-9)
+    np.testing.assert_allclose(way, np.broadcast_to(way[0], way.shape), atol=1e-9)
+
+
+def test_an_objective_without_a_route_cannot_show_one():
+    class Anywhere:
+        goal, goal_radius = np.zeros(3), 1.0
+
+    with pytest.raises(ValueError, match="Anywhere has no route"):
+        route.Routes([Anywhere()])
 
 
 def test_specs_tell_shapes_and_ranges(anatomy):

@@ -1,4 +1,6 @@
 import logging
+import os
+import stat
 
 import mujoco
 import numpy as np
@@ -99,7 +101,7 @@ def test_the_batch_reports_the_same_error(dumps, monkeypatch):
 
 
 def test_a_diverging_simulation_is_a_physics_error(dumps):
-    simulation = batch.BatchSimulation(_load().task, 2, seeds=3)
+    simulation = batch.BatchSimulation(_load().task, 2, num_threads=1, seeds=3)
     simulation.reset()
     simulation.batch.qvel[1] = 1e12
     step = simulation.step(np.zeros((2, simulation.num_actions)))
@@ -117,6 +119,77 @@ def test_composer_reports_divergence(dumps):
     assert timestep.discount == 0.0
     assert environment.task.termination == "physics_error"
     assert environment.task.error == physics_errors.DIVERGED
+
+
+def test_a_dump_may_be_read_by_whom_the_umask_says(dumps):
+    before = os.umask(0o027)
+    try:
+        path = physics_errors.dump(
+            "tried", task={}, state=np.zeros(3), actions=np.zeros((2, 3))
+        )
+    finally:
+        os.umask(before)
+    assert stat.S_IMODE(path.stat().st_mode) == 0o640
+    assert physics_errors.load(path)[0]["reason"] == "tried"
+
+
+def test_a_full_disk_does_not_end_the_other_simulations(dumps, small_disk, caplog):
+    simulation = batch.BatchSimulation(_load().task, 2, num_threads=1, seeds=3)
+    simulation.reset()
+    simulation.batch.qvel[1] = 1e12
+    with small_disk(100):
+        step = simulation.step(np.zeros((2, simulation.num_actions)))
+    assert step.physics_error.tolist() == [False, True]
+    assert "lost" in caplog.text and "File too large" in caplog.text
+    assert not list(dumps.iterdir())
+
+
+# Factor of the springs of all joints: they push away from rest, so nothing is stable.
+_WILD = -1e3
+
+
+def _unstable(wild, steps=12):
+    """States (T, N, nq) and errors (N,) of three simulations, one of them wild."""
+    simulation = batch.BatchSimulation(_load().task, 3, num_threads=1, seeds=3)
+    simulation.reset()
+    simulation.batch.expand("jnt_stiffness")[wild] *= _WILD
+    action = np.tile(np.linspace(-1, 1, simulation.num_actions), (3, 1))
+    states, errors = [], [None] * 3
+    for _ in range(steps):
+        step = simulation.step(action)
+        states.append(simulation.batch.qpos.copy())
+        errors = [old or new for old, new in zip(errors, step.errors, strict=True)]
+    return np.array(states), errors
+
+
+def test_an_unstable_model_ends_with_a_reason_and_disturbs_nobody(dumps):
+    disturbed, errors = _unstable(wild=[1])
+    assert errors[1] in (physics_errors.DIVERGED, physics_errors.EXPLODED)
+    assert errors[0] is errors[2] is None
+    alone, none = _unstable(wild=[])
+    assert none == [None] * 3
+    np.testing.assert_array_equal(disturbed[:, [0, 2]], alone[:, [0, 2]])
+    assert (disturbed[0, 1] != alone[0, 1]).any()
+
+
+def test_the_dump_of_an_unstable_model_replays_it_bit_for_bit(dumps):
+    states, errors = _unstable(wild=[1])
+    reasons = {}
+    for path in dumps.glob("*.npz"):
+        meta, state, actions = physics_errors.load(path)
+        reasons[len(actions)] = meta["reason"]
+        again = _load()
+        again.reset()
+        model, data = again.physics.model.ptr, again.physics.data.ptr
+        model.jnt_stiffness[:] *= _WILD
+        mujoco.mj_setState(model, data, state, mujoco.mjtState.mjSTATE_INTEGRATION)
+        for action in actions:
+            again.task.rollout.pose_robot(data.qpos[None])
+            data.ctrl[:] = action
+            for _ in range(again.task.substeps):
+                mujoco.mj_step(model, data)
+        np.testing.assert_array_equal(data.qpos, states[len(actions) - 1, 1])
+    assert reasons[min(reasons)] == errors[1]
 
 
 def test_a_file_that_is_no_dump_is_refused(tmp_path):

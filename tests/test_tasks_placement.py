@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+from unittest import mock
 
 import mujoco
 import numpy as np
@@ -32,7 +33,11 @@ def test_frame_turns_z_into_any_direction(azimuth, height):
     anatomy = arch.load("simple1")
     inlet = Inlet("aorta", [0, 0, 0], axis, 0.0138)
     turned = dataclasses.replace(anatomy, inlet=inlet)
-    placed = placement.place_device(turned, anatomy.goal("bca"), devices.PUBLISHED)
+    # Whatever stands behind it.
+    with mock.patch.object(placement, "sheath_direction", lambda _: inlet.direction):
+        placed = placement.place_device(
+            turned, anatomy.goal("bca"), devices.STEERABLE_5F
+        )
     assert np.linalg.norm(placed.quaternion) == pytest.approx(1, abs=1e-9)
     matrix = np.empty(9)
     mujoco.mju_quat2Mat(matrix, placed.quaternion)
@@ -52,8 +57,8 @@ def test_the_device_starts_inside_and_reaches_every_goal(name):
     anatomy = arch.load(name)
     for goal in anatomy.goals.values():
         route = anatomy.route(goal)
-        placed = placement.place_device(anatomy, goal, devices.PUBLISHED)
-        assert anatomy.depth(placed.start) > devices.PUBLISHED.outer_radius
+        placed = placement.place_device(anatomy, goal, devices.STEERABLE_5F)
+        assert anatomy.depth(placed.start) > devices.STEERABLE_5F.outer_radius
         assert placed.start_depth + placed.stroke >= route.length
         assert placed.working_length > placed.start_depth + placed.stroke
         np.testing.assert_allclose(
@@ -65,7 +70,9 @@ def test_the_device_starts_inside_and_reaches_every_goal(name):
 def test_working_length_is_checked(length):
     with pytest.raises(ValueError, match=r"working_length is .*more than.*at most"):
         anatomy = arch.load("simple1")
-        placement.place_device(anatomy, anatomy.goal("bca"), devices.PUBLISHED, length)
+        placement.place_device(
+            anatomy, anatomy.goal("bca"), devices.STEERABLE_5F, length
+        )
 
 
 # Start.
@@ -144,7 +151,7 @@ def test_no_start_is_beyond_a_goal():
         for access in ("ascending", "descending"):
             anatomy = phantoms.load(name, access=access)
             for goal in anatomy.goals.values():
-                placed = placement.place_device(anatomy, goal, devices.PUBLISHED)
+                placed = placement.place_device(anatomy, goal, devices.STEERABLE_5F)
                 way = anatomy.route(goal).length
                 assert placed.start_depth <= max(0.5 * way, 5e-3)
 

@@ -19,7 +19,7 @@ STEPS = 55  # past the first look for an escape
 SEED = 10
 SIMULATIONS = 3
 TASKS = ("arch_bca", "arch_lcca", "femoral_arch_bca", "femoral_arch_lcca")
-NUMBERS = ("internal", "tracking", "goal", "force")
+NUMBERS = ("internal", "tracking", "route", "goal", "force")
 
 
 def names(first=0, count=POOL, arches="train"):

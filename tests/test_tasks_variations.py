@@ -175,7 +175,7 @@ def test_a_shifted_goal_moves_along_its_branch(anatomy):
             (place,) = objective.branch.project(objective.goal).arc_length
             assert objective.ostium <= place
             assert objective.branch.project(objective.goal).distance < 1e-9
-            assert objective.success(objective.goal)
+            assert objective.in_branch(objective.goal)
             assert objective.path_distance(objective.goal) < 1e-9
             goals.append(float(place))
             np.testing.assert_array_equal([env.task.goal_position], objective.goal)

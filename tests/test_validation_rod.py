@@ -57,7 +57,7 @@ def test_short_column_is_weaker_as_the_chain_of_hinges_says():
     assert one.critical / one.expected - 1 == pytest.approx(-links, abs=0.01)
 
 
-@pytest.mark.parametrize("device", ["published", "wire_035_amplatz"])
+@pytest.mark.parametrize("device", ["steerable_5f", "wire_035_amplatz"])
 @pytest.mark.parametrize("torsion_joints", [1, 4, 25])
 def test_twist_is_that_of_gj(device, torsion_joints):
     one = rod.twist_under_torque(device, torsion_joints)

@@ -1,4 +1,4 @@
-"""Agents: TorchRL environments, PPO and SAC, training, evaluation, checkpoints."""
+"""Agents: learners and demonstrations, training, evaluation, checkpoints."""
 
 # isort: off
 from cathsim_dmc.agents import import_order  # noqa: F401
@@ -10,6 +10,7 @@ import torchrl.collectors  # noqa: F401
 
 from cathsim_dmc.agents.checkpoint import Checkpoint, CheckpointError
 from cathsim_dmc.agents.config import ConfigError, TrainingConfig
+from cathsim_dmc.agents.demonstrations import record_demonstrations
 from cathsim_dmc.agents.evaluation import (
     Comparison,
     EvaluationResult,
@@ -39,5 +40,6 @@ __all__ = [
     "load_policy",
     "make_config",
     "make_env",
+    "record_demonstrations",
     "train",
 ]

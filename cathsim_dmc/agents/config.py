@@ -61,7 +61,11 @@ class TrainingConfig:
         normalisation_frames: Number of random control steps before the first update,
             from which the first observation statistics come; they are not counted as
             frames. An algorithm that begins with random actions anyway (SAC) needs
-            none.
+            none, nor does one that starts from another policy.
+        initial_policy: Directory of the run or checkpoint whose policy the networks
+            start from, with its observation statistics; None starts afresh.
+        initial_std: Deviation before the tanh that every action of such a policy
+            starts with; None keeps the policy's own.
         checkpoint_frames: Number of frames between two checkpoints.
         checkpoint_seconds: Longest time between two checkpoints in seconds of wall
             time, so that a killed run loses no more.
@@ -112,6 +116,8 @@ class TrainingConfig:
     gamma: float = 0.99
     observation_clip: float = 10.0
     normalisation_frames: int = 4_096
+    initial_policy: str | None = None
+    initial_std: float | None = None
     checkpoint_frames: int = 51_200
     checkpoint_seconds: float = 120.0
     keep_checkpoints: int = 3
@@ -173,6 +179,13 @@ class TrainingConfig:
             "num_threads",
             threads,
             "a positive integer, or None for every core",
+        )
+        deviation = self.initial_std
+        require(
+            deviation is None or deviation > 0,
+            "initial_std",
+            deviation,
+            "positive, or None for the policy's own",
         )
         require(0 < self.gamma <= 1, "gamma", self.gamma, "in (0, 1]")
         try:

@@ -12,9 +12,10 @@ import torch
 from torchrl.envs import EnvBase
 from torchrl.envs.utils import step_mdp
 
-from cathsim_dmc import files
+from cathsim_dmc import bounds, files
 from cathsim_dmc.agents.episodes import EpisodeOutcome, EpisodeTracker
-from cathsim_dmc.agents.policies import PolicyLike, load_policy, view_of
+from cathsim_dmc.agents.policies import PolicyLike, load_policy
+from cathsim_dmc.agents.views import view_of
 from cathsim_dmc.analysis.force_statistics import QUANTITIES, Statistics
 from cathsim_dmc.analysis.intervals import success_interval
 from cathsim_dmc.policies import Policy
@@ -253,8 +254,7 @@ def evaluate(
         ValueError: no task is known, or episodes < 1.
         CheckpointError: there is no such checkpoint, or it is damaged.
     """
-    if episodes < 1:
-        raise ValueError(f"episodes={episodes}: at least one is needed.")
+    check_numbers(episodes, seed, num_threads)
     player = load_policy(policy, seed)
     task = require_task(player, task)
     settings = _settings(player, observation, task_kwargs, backend)
@@ -275,6 +275,14 @@ def evaluate(
     if out_dir is not None:
         write_evaluation(out_dir, result.to_dict())
     return result
+
+
+def check_numbers(episodes: int, seed: int, num_threads: int | None) -> None:
+    """Refuse numbers that no evaluation has; ValueError names them."""
+    bounds.whole("episodes", episodes, 1, bounds.MOST_SIMULATIONS)
+    bounds.seed("seed", seed)
+    if num_threads is not None:
+        bounds.whole("num_threads (--threads)", num_threads, 1, bounds.MOST_THREADS)
 
 
 def _settings(

@@ -7,9 +7,12 @@ from typing import Any, ClassVar, Generic, Protocol, TypeVar
 
 import torch
 from tensordict import TensorDictBase
-from tensordict.nn import TensorDictSequential
+from tensordict.nn import TensorDictModuleBase, TensorDictSequential
+from torchrl.envs import EnvBase
 
+from cathsim_dmc.agents.bc import BC, BCConfig
 from cathsim_dmc.agents.config import ConfigError, TrainingConfig
+from cathsim_dmc.agents.dagger import DAgger, DAggerConfig
 from cathsim_dmc.agents.networks import NetworkShapes
 from cathsim_dmc.agents.ppo import PPO, PPOConfig
 from cathsim_dmc.agents.sac import SAC, SACConfig
@@ -32,7 +35,7 @@ class Learner(Protocol[Settings]):
     metrics: ClassVar[tuple[str, ...]]
     random_frames: int
     device: torch.device
-    policy: TensorDictSequential
+    policy: TensorDictModuleBase
 
     def __init__(self, config: Settings, shapes: NetworkShapes, directory: Path):
         """Make networks with fresh weights, drawn from torch's generator.
@@ -47,6 +50,9 @@ class Learner(Protocol[Settings]):
     def make_policy(shapes: NetworkShapes, config: Settings) -> TensorDictSequential:
         """A policy with fresh weights: raw observation in, action out."""
         ...
+
+    def attach(self, env: EnvBase) -> None:
+        """Look at the environment that `policy` is to collect from, once, first."""
 
     def observe(self, batch: TensorDictBase) -> None:
         """Take observation statistics from a batch without learning from it."""
@@ -91,6 +97,8 @@ class Algorithm(Generic[Config]):
 LEARNERS: dict[str, Algorithm[Any]] = {
     "ppo": Algorithm(PPOConfig, PPO),
     "sac": Algorithm(SACConfig, SAC),
+    "bc": Algorithm(BCConfig, BC),
+    "dagger": Algorithm(DAggerConfig, DAgger),
 }
 
 

@@ -2,23 +2,15 @@
 
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 import torch
 from tensordict import TensorDict, TensorDictBase
-from torchrl.envs import EnvBase, SerialEnv
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from cathsim_dmc.agents.checkpoint import Checkpoint
-from cathsim_dmc.policies import (
-    POLICIES,
-    BatchedView,
-    ComposerView,
-    Policy,
-    View,
-    make_policy,
-)
+from cathsim_dmc.policies import POLICIES, Policy, make_policy
 from cathsim_dmc.simulation import environments
 
 # Gets the standard observations (N, ...), returns the actions (N, A) or the TensorDict
@@ -106,31 +98,6 @@ def load_policy(policy: PolicyLike, seed: int = 0) -> Policy:
             return pretrained.PretrainedPolicy(policy)
         return TrainedPolicy(Checkpoint.open(policy))
     return FunctionPolicy(policy)
-
-
-class _ForeignView:
-    """Simulations of an environment that is not ours: only their numbers are known."""
-
-    def __init__(self, env: EnvBase):
-        (self.num_simulations,) = env.batch_size
-        self.num_actions = int(env.action_spec.shape[-1])
-
-    def __getattr__(self, name: str) -> Any:
-        raise AttributeError(
-            f"the policy asks for {name!r}, which only environments of "
-            "cathsim_dmc.simulation know"
-        )
-
-
-def view_of(env: EnvBase) -> View:
-    """What a policy may know of the simulations of a TorchRL environment."""
-    base = getattr(env, "base_env", env)
-    if hasattr(base, "simulation"):
-        return BatchedView(base.simulation)
-    if isinstance(base, SerialEnv):
-        return ComposerView([environments.composer_of(one) for one in base._envs])
-    # Whatever a policy asks of it beyond its numbers is an error that says so.
-    return cast(View, _ForeignView(env))
 
 
 def _tensors(observation: Mapping[str, np.ndarray]) -> TensorDict:

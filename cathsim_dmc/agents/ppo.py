@@ -1,20 +1,23 @@
 """Proximal policy optimisation on TorchRL's ClipPPOLoss and GAE."""
 
 import functools
+import math
 import operator
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, ClassVar, cast
 
 import torch
 from tensordict import TensorDictBase
-from tensordict.nn import TensorDictSequential
+from tensordict.nn import TensorDictModuleBase, TensorDictSequential
 from torch import nn
+from torchrl.envs import EnvBase
 from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.value import GAE
 
 from cathsim_dmc.agents.config import ConfigError, TrainingConfig, require
+from cathsim_dmc.agents.exploration import CorrelatedExploration, CorrelatedNoise
 from cathsim_dmc.agents.networks import (
     GaussianActor,
     NetworkShapes,
@@ -49,6 +52,12 @@ class PPOConfig(TrainingConfig):
         max_grad_norm: Largest joint gradient norm of both networks.
         target_kl: Approximate KL divergence from the collecting policy beyond which
             an update's epochs stop; None never stops.
+        initial_deviation: Standard deviation of the actions, before the tanh, that a
+            fresh policy explores with.
+        noise_correlation: Correlation of the exploration noise between two control
+            steps; 0 for white noise.
+        noise_shared: Share of the variance of the exploration noise that motors which
+            bend the tip about the same axis have in common; 0 for independent motors.
         anneal: Whether to decrease the learning rate linearly to zero over
             total_frames.
     """
@@ -67,6 +76,25 @@ class PPOConfig(TrainingConfig):
             "target_kl": 0.05,
             "anneal": True,
         },
+        # Found on type1_lcca, see docs/results.md: episodes that are short and start
+        # anywhere along the route, the way through the lumen as reward, and noise
+        # that bends the whole tip for a while.
+        "tuned": {
+            "num_envs": 32,
+            "steps_per_update": 2_048,
+            "minibatch_size": 256,
+            "epochs": 10,
+            "clip": 0.2,
+            "target_kl": 0.05,
+            "hidden": (128, 128),
+            "training_reward": {"path": -1.0, "success": 10.0},
+            "training_max_steps": 120,
+            "training_start": (0.0, 0.9),
+            "initial_deviation": 0.7,
+            "noise_correlation": 0.9,
+            "noise_shared": 0.8,
+            "total_frames": 300_000,
+        },
     }
 
     steps_per_update: int = 512
@@ -78,14 +106,24 @@ class PPOConfig(TrainingConfig):
     value_coefficient: float = 0.872
     max_grad_norm: float = 1.0
     target_kl: float | None = None
+    initial_deviation: float = 1.0
+    noise_correlation: float = 0.0
+    noise_shared: float = 0.0
     anneal: bool = False
 
     def __post_init__(self):
         """Validate the algorithm's own fields after the shared ones."""
         super().__post_init__()
         self._require_positive(
-            "steps_per_update", "minibatch_size", "epochs", "max_grad_norm"
+            "steps_per_update",
+            "minibatch_size",
+            "epochs",
+            "max_grad_norm",
+            "initial_deviation",
         )
+        for name in ("noise_correlation", "noise_shared"):
+            value = getattr(self, name)
+            require(0 <= value < 1, name, value, "in [0, 1)")
         if self.steps_per_update % self.num_envs:
             raise ConfigError(
                 f"steps_per_update={self.steps_per_update} is not a multiple of "
@@ -146,9 +184,10 @@ class PPO:
         del directory  # It keeps nothing on disk.
         self.config = config
         self.device = torch.device(config.torch_device)
-        self.policy = self.make_policy(shapes, config).to(self.device)
-        self.actor = self.policy[-1]
-        self.normaliser = self.policy[0] if shapes.vector else None
+        self.network = self.make_policy(shapes, config).to(self.device)
+        self.policy: TensorDictModuleBase = self.network
+        self.actor = self.network[-1]
+        self.normaliser = self.network[0] if shapes.vector else None
         self.critic = make_critic(shapes, config).to(self.device)
         self.loss = ClipPPOLoss(
             self.actor,
@@ -185,9 +224,28 @@ class PPO:
     def make_policy(shapes: NetworkShapes, config: PPOConfig) -> TensorDictSequential:
         """A policy with fresh weights: raw observation in, action out."""
         network = GaussianActor(shapes, config, state_dependent_std=False)
+        log_std = cast(nn.Parameter, network.log_std)
+        nn.init.constant_(log_std, math.log(config.initial_deviation))
         # A small head starts the policy near the middle of every action's range.
         orthogonal_(network, network.mean, 0.01)
         return make_policy(shapes, config, make_actor(shapes, network))
+
+    def attach(self, env: EnvBase) -> None:
+        """Look at the environment to collect from: which motors bend together."""
+        config = self.config
+        if not config.noise_correlation and not config.noise_shared:
+            return
+        groups = getattr(env.base_env, "action_groups", None)
+        if groups is None:
+            if config.noise_shared:
+                raise ConfigError(
+                    f"noise_shared={config.noise_shared!r} needs an environment that "
+                    "tells which motors bend together: choose backend='batched', or "
+                    "noise_shared=0."
+                )
+            groups = range(env.action_spec.shape[-1])
+        noise = CorrelatedNoise(config.noise_correlation, config.noise_shared, groups)
+        self.policy = CorrelatedExploration(self.network, noise)
 
     def observe(self, batch: TensorDictBase) -> None:
         """Take observation statistics from a batch without learning from it."""
@@ -266,7 +324,7 @@ class PPO:
 
     def policy_state(self) -> dict[str, Any]:
         """Weights and statistics that acting needs."""
-        return self.policy.state_dict()
+        return self.network.state_dict()
 
     def learning_state(self) -> dict[str, Any]:
         """What learning needs beyond the policy."""
@@ -278,7 +336,7 @@ class PPO:
 
     def load(self, policy: dict[str, Any], learning: dict[str, Any]) -> None:
         """Restore what policy_state and learning_state gave."""
-        self.policy.load_state_dict(policy)
+        self.network.load_state_dict(policy)
         self.critic.load_state_dict(learning["critic"])
         self.optimiser.load_state_dict(learning["optimiser"])
         self.gradient_steps = learning["gradient_steps"]

@@ -9,10 +9,12 @@ from typing import Any
 import numpy as np
 from torchrl.envs import EnvBase
 
-from cathsim_dmc import suite
+from cathsim_dmc import bounds, files, suite
 from cathsim_dmc.agents import evaluation, policies
 from cathsim_dmc.analysis import heatmap
 from cathsim_dmc.analysis.force_statistics import millinewtons
+from cathsim_dmc.pictures.animation import SUFFIXES, animate
+from cathsim_dmc.pictures.recorded import film_options, xray_film
 from cathsim_dmc.policies import in_environment
 from cathsim_dmc.recording import recorder, rerun_log
 from cathsim_dmc.recording.episode import Episode
@@ -156,6 +158,9 @@ def evaluate(
             heatmap.png; None writes none.
     """
     start = time.monotonic()
+    evaluation.check_numbers(episodes, seed, num_threads)
+    player = policies.load_policy(policy, seed)
+    _require_registered(evaluation.require_task(player, task))
     if out_dir is not None:
         # Now: an evaluation that cannot be written would be lost.
         Path(out_dir).mkdir(parents=True, exist_ok=True)
@@ -199,21 +204,27 @@ def evaluate(
     return report
 
 
+def _require_registered(task: str) -> None:
+    if task not in suite.SUITE:
+        raise ValueError(f"no task {task!r}; there are {', '.join(suite.SUITE)}")
+
+
 def record(
     policy: policies.PolicyLike,
-    out: str | Path,
+    out: str | Path | None,
     *,
     task: str | None = None,
     seed: int = evaluation.EVALUATION_SEED,
     max_steps: int | None = None,
     task_kwargs: Mapping[str, Any] | None = None,
     fluoroscopy: bool = True,
+    gif: str | Path | None = None,
 ) -> Episode:
-    """Records one episode as .rrd, and as .npz beside it.
+    """Records one episode: as .rrd, and as .npz beside it; or as a film.
 
     Args:
         policy: Policy, or what names one, see `policies.load_policy`.
-        out: Path of the .rrd file.
+        out: Path of the .rrd file; None writes none.
         task: Name of the task; None takes the one that the policy was trained on.
         seed: Seed of the episode.
         max_steps: Number of control steps after which the episode is cut off; None
@@ -221,21 +232,26 @@ def record(
         task_kwargs: Further options of the task; None takes those that the policy was
             trained with.
         fluoroscopy: Whether to include X-ray images.
+        gif: Path of the film, .gif or .webp; None makes none.
 
     Returns:
         The episode.
 
     Raises:
-        ValueError: `out` is no .rrd file, or no task is known.
+        ValueError: `out` is no .rrd file, `gif` no film, there is neither, or no task
+            is known.
         CheckpointError: there is no such checkpoint, or it is damaged.
     """
-    out = Path(out)
-    if out.suffix != ".rrd":
-        raise ValueError(f"the recording is to be written to {out}; give an .rrd file")
+    targets = _targets(out, gif)
+    bounds.seed("seed", seed)
+    if max_steps is not None:
+        bounds.whole("max_steps", max_steps, 1)
     player = policies.load_policy(policy, seed)
     task = evaluation.require_task(player, task)
+    _require_registered(task)
     # Now: an episode that cannot be written would be lost.
-    out.parent.mkdir(parents=True, exist_ok=True)
+    for target in targets.values():
+        target.parent.mkdir(parents=True, exist_ok=True)
     kwargs = dict(player.task_kwargs or {} if task_kwargs is None else task_kwargs)
     if player.observation is not None:
         kwargs["observation"] = player.observation
@@ -243,30 +259,47 @@ def record(
     episode = recorder.EpisodeRecorder(environment, task, kwargs).record_episode(
         in_environment(player, environment), seed=seed, max_steps=max_steps
     )
-    arrays = episode.save(out.with_suffix(".npz"))
-    try:
-        rerun_log.write_rrd(
-            episode,
-            environment.task.scene.anatomy.surface,
-            out,
-            robot_geoms=body_geoms(environment.physics),
-            fluoroscopy=_images(environment, episode) if fluoroscopy else None,
-        )
-    except BaseException:
-        # Both or none.
-        arrays.unlink(missing_ok=True)
-        raise
+    if "out" in targets:
+        _write_both(environment, episode, targets["out"], fluoroscopy)
+    if "gif" in targets:
+        animate(episode, environment.task.scene.anatomy.surface, targets["gif"])
     return episode
 
 
-def _images(environment, episode: Episode) -> np.ndarray:
-    """X-ray images (T + 1, H, W, 1) of an episode."""
-    from cathsim_dmc.imaging import Angiograph
+def _targets(out: str | Path | None, gif: str | Path | None) -> dict[str, Path]:
+    """The files to write by kind."""
+    targets = {}
+    for kind, path, suffixes in (("out", out, (".rrd",)), ("gif", gif, SUFFIXES)):
+        if path is None:
+            continue
+        targets[kind] = Path(path)
+        if targets[kind].suffix not in suffixes:
+            raise ValueError(
+                f"the recording is to be written to {path}; give an "
+                f"{' or '.join(suffixes)} file"
+            )
+    if not targets:
+        raise ValueError(
+            "nothing is to be written; give out (--out), an .rrd file, or gif (--gif), "
+            f"a {' or '.join(SUFFIXES)} file"
+        )
+    return targets
 
+
+def _write_both(environment, episode: Episode, out: Path, fluoroscopy: bool) -> None:
+    """Writes .npz and .rrd, or neither."""
     task = environment.task
     surface = task.scene.anatomy.surface
-    fluoroscope = task.rollout.fluoroscope
-    if fluoroscope is None:
-        machine = Angiograph(surface.vertices, surface.faces, task.config.fluoroscopy)
-        fluoroscope = machine.planes()[0]
-    return fluoroscope.render(episode.catheter, task.scene.catheter.device.outer_radius)
+    # Put in place last, once both are written.
+    with files.atomic_path(out.with_suffix(".npz")) as arrays:
+        episode.write(arrays)
+        frames = None
+        if fluoroscopy:
+            frames = xray_film(episode, surface, film_options(task))
+        rerun_log.write_rrd(
+            episode,
+            surface,
+            out,
+            robot_geoms=body_geoms(environment.physics),
+            fluoroscopy=frames,
+        )

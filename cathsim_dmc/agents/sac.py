@@ -10,9 +10,11 @@ from typing import Any, ClassVar
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictSequential
+from torchrl.envs import EnvBase
 from torchrl.objectives import SACLoss, SoftUpdate
 
 from cathsim_dmc.agents.config import TrainingConfig, require
+from cathsim_dmc.agents.demonstrations import load_transitions
 from cathsim_dmc.agents.networks import (
     GaussianActor,
     NetworkShapes,
@@ -45,6 +47,9 @@ class SACConfig(TrainingConfig):
             updates.
         updates_per_frame: Number of gradient steps per frame collected.
         initial_alpha: Weight of the entropy at the start.
+        demonstrations: Directory of a dataset that `cathsim demos` has written, from
+            which half of every minibatch is drawn (Ball et al. 2023, "Efficient online
+            reinforcement learning with offline data"); None for no dataset.
         target_entropy: Entropy that the weight is steered towards, in nats; None
             means minus the number of actions.
     """
@@ -64,6 +69,7 @@ class SACConfig(TrainingConfig):
     updates_per_frame: float = 1.0
     initial_alpha: float = 1.0
     target_entropy: float | None = None
+    demonstrations: str | None = None
 
     def __post_init__(self):
         """Validate the algorithm's own fields after the shared ones."""
@@ -152,6 +158,11 @@ class SAC:
             "action",
             *[("next", key) for key in keys],
         ]
+        self.demonstrations: TensorDictBase | None = None
+        if config.demonstrations is not None:
+            shown = load_transitions(config.demonstrations, config.observation, shapes)
+            self.demonstrations = shown.select(*self.replay_keys)
+            self.observe(shown)
         self.gradient_steps = 0
         self.owed_steps = 0.0
 
@@ -160,6 +171,9 @@ class SAC:
         """A policy with fresh weights: raw observation in, action out."""
         network = GaussianActor(shapes, config, state_dependent_std=True)
         return make_policy(shapes, config, make_actor(shapes, network))
+
+    def attach(self, env: EnvBase) -> None:
+        """Look at the environment to collect from; not needed."""
 
     def observe(self, batch: TensorDictBase) -> None:
         """Take observation statistics from a batch without learning from it."""
@@ -196,7 +210,7 @@ class SAC:
         }
 
     def _step(self) -> dict[str, torch.Tensor]:
-        sample = self.replay.sample(self.config.batch_size).to(self.device)
+        sample = self._sample(self.config.batch_size).to(self.device)
         if self.normaliser is not None:
             self.normaliser(sample)
             self.normaliser(sample["next"])
@@ -208,6 +222,15 @@ class SAC:
         self.optimiser.step()
         self.targets.step()
         return {name: losses[name].detach() for name in (*_TERMS, "alpha", "entropy")}
+
+    def _sample(self, count: int) -> TensorDictBase:
+        """Transitions (count,), half of them demonstrations if there are any."""
+        shown = self.demonstrations
+        if shown is None:
+            return self.replay.sample(count)
+        half = count // 2
+        chosen = shown[torch.randint(len(shown), (half,))]
+        return torch.cat([chosen, self.replay.sample(count - half)])
 
     def policy_state(self) -> dict[str, Any]:
         """Weights and statistics that acting needs."""

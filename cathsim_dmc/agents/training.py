@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import torch
 from tensordict import TensorDictBase
-from tensordict.nn import TensorDictSequential
+from tensordict.nn import TensorDictModuleBase
 from torchrl.collectors import Collector
 from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType
@@ -32,6 +32,7 @@ from cathsim_dmc.agents.learners import Learner, make_learner
 from cathsim_dmc.agents.networks import NetworkShapes
 from cathsim_dmc.agents.replay import ReplayError
 from cathsim_dmc.agents.training_log import TrainingLog, crossed
+from cathsim_dmc.agents.warm_start import take_over
 from cathsim_dmc.simulation import environments
 
 CONFIG_FILE = "config.json"
@@ -99,7 +100,8 @@ def train(
         torch.manual_seed(config.seed)
         shapes = NetworkShapes.of(env)
         learner = make_learner(config, shapes, run)
-        state = _start(learner, env, config, checkpoint)
+        learner.attach(env)
+        state = _start(learner, env, config, shapes, checkpoint)
         collector = _make_collector(env, learner, config, state["frames"])
         stack.callback(collector.shutdown)
         # After everything that draws numbers while being made.
@@ -186,16 +188,19 @@ def _start(
     learner: Learner,
     env: EnvBase,
     config: TrainingConfig,
+    shapes: NetworkShapes,
     checkpoint: Checkpoint | None,
 ) -> dict[str, Any]:
-    """Give a learner what a checkpoint holds, or its first look at observations.
+    """Give a learner what a checkpoint holds, another's policy, or its first look.
 
     Returns:
         What earlier processes of the run have counted: frames, seconds, episodes; and
         from a checkpoint the state "rng" of torch's generator.
     """
     if checkpoint is None:
-        if not learner.random_frames:
+        if config.initial_policy is not None:
+            take_over(learner.policy, config, shapes)
+        elif not learner.random_frames:
             _observe_random_actions(env, learner, config)
         return {"frames": 0, "seconds": 0.0, "episodes": 0}
     policy, state = checkpoint.policy_state(), checkpoint.learning_state()
@@ -329,7 +334,7 @@ def _truncate_diverged(batch: TensorDictBase) -> None:
 
 
 def _on_cpu(
-    policy: TensorDictSequential, device: torch.device
+    policy: TensorDictModuleBase, device: torch.device
 ) -> Callable[[TensorDictBase], TensorDictBase]:
     """A policy that takes and gives CPU tensors wherever its weights are."""
     if device.type == "cpu":

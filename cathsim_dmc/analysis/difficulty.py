@@ -194,13 +194,23 @@ def tasks() -> tuple[str, ...]:
     )
 
 
+# Tasks on the femoral route whose goal a straight device slides into: the LSA of the
+# measured phantoms leaves the outer curve of the arch, along which it comes. It does so
+# wherever the sheath stands in the descending aorta and up to 20 degrees askew
+# (docs/difficulty.md).
+FIRST_ON_THE_WAY = ("femoral_type1_lsa", "femoral_type2_lsa")
+
+
 def asks_for_steering(task: str) -> bool:
     """Whether a straight push must not solve a registered task.
 
-    It may where the BCA is reached from the ascending aorta, whose continuation it is:
-    in the published phantoms a straight device slides in.
+    It may where the goal is the first branch on the way of a straight device: the BCA
+    from the ascending aorta, whose continuation it is, and `FIRST_ON_THE_WAY`. There,
+    force tells a good cannulation from a bad one.
     """
     definition = suite.TASKS[task]
+    if task in FIRST_ON_THE_WAY:
+        return False
     return definition.access == "descending" or definition.goal == "lcca"
 
 

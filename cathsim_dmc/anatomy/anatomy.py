@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from cathsim_dmc import files
+from cathsim_dmc import bounds, files
 from cathsim_dmc.anatomy import loading
 from cathsim_dmc.anatomy.centreline import (
     Array,
@@ -41,7 +41,7 @@ _READS = 50  # of a description that is replaced while it is read
 
 
 def _vector(value: ArrayLike, name: str) -> Array:
-    vector = _readonly(value)
+    vector = _readonly(bounds.array(name, value))
     if vector.shape != (3,) or not np.isfinite(vector).all():
         raise ValueError(f"{name} is {value!r}; give three finite numbers in metres.")
     return vector
@@ -83,8 +83,7 @@ class Inlet:
     def __post_init__(self) -> None:
         object.__setattr__(self, "position", _vector(self.position, "inlet position"))
         object.__setattr__(self, "direction", _unit(self.direction, "inlet direction"))
-        if not self.radius > 0.0:
-            raise ValueError(f"inlet radius is {self.radius:g} m; it must be > 0.")
+        bounds.number("inlet radius", self.radius, positive=True)
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,7 +104,7 @@ class End:
         object.__setattr__(self, "direction", _unit(self.direction, "end direction"))
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Surface:
     """Triangles of the lumen surface, normals outwards, closed.
 
@@ -118,8 +117,8 @@ class Surface:
     faces: np.ndarray
 
     def __post_init__(self) -> None:
-        vertices = _readonly(self.vertices)
-        faces = np.array(self.faces, dtype=np.int32)
+        vertices = _readonly(bounds.array("vertices", self.vertices))
+        faces = np.array(bounds.array("faces", self.faces, "iu"), dtype=np.int32)
         faces.setflags(write=False)
         if vertices.ndim != 2 or vertices.shape[1] != 3:
             raise ValueError(f"vertices have shape {vertices.shape}; give (V, 3).")
@@ -133,6 +132,10 @@ class Surface:
         object.__setattr__(self, "vertices", vertices)
         object.__setattr__(self, "faces", faces)
 
+    def __repr__(self) -> str:
+        """Numbers of vertices and triangles."""
+        return f"<Surface: {len(self.vertices)} vertices, {len(self.faces)} triangles>"
+
     @property
     def volume(self) -> float:
         """Enclosed volume (m^3), positive when normals point outwards."""
@@ -140,7 +143,7 @@ class Surface:
         return float(np.einsum("fj,fj->", a, np.cross(b, c)) / 6.0)
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Anatomy:
     """An anatomy ready for simulation.
 
@@ -180,6 +183,16 @@ class Anatomy:
         object.__setattr__(self, "wall", wall)
         object.__setattr__(self, "goals", dict(self.goals))
         object.__setattr__(self, "ends", tuple(self.ends))
+
+    def __repr__(self) -> str:
+        """Name, vessels, size, goals and wall in one line."""
+        box = 1e3 * np.ptp(self.surface.vertices, axis=0)
+        return (
+            f"<Anatomy {self.name!r}: vessels {', '.join(self.tree.vessels)}; "
+            f"{' x '.join(f'{side:.0f}' for side in box)} mm; goals "
+            f"{', '.join(self.goals) or 'none'}; inlet in {self.inlet.vessel}; "
+            f"{len(self.wall)} wall pieces>"
+        )
 
     @classmethod
     def from_tree(

@@ -15,6 +15,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
+from cathsim_dmc import bounds
 from cathsim_dmc.anatomy.segments import Array, Segments, as_points
 
 # Points x segments handled at once while projecting: stays within the L2 cache.
@@ -65,7 +66,8 @@ class Centreline:
     radii: Array
 
     def __post_init__(self) -> None:
-        points, radii = _readonly(self.points), _readonly(self.radii)
+        points = _readonly(bounds.array("centreline points", self.points))
+        radii = _readonly(bounds.array("centreline radii", self.radii))
         if points.ndim != 2 or points.shape[1] != 3 or len(points) < 2:
             raise ValueError(
                 f"centreline points have shape {points.shape}; give (n, 3), n >= 2."
@@ -75,8 +77,6 @@ class Centreline:
                 f"centreline radii have shape {radii.shape}; give one radius for "
                 f"each of the {len(points)} points."
             )
-        if not (np.isfinite(points).all() and np.isfinite(radii).all()):
-            raise ValueError("centreline holds NaN or infinite values; remove them.")
         if radii.min() <= 0.0:
             raise ValueError(
                 f"smallest centreline radius is {radii.min():g} m; radii must be > 0."

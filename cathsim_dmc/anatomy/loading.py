@@ -12,10 +12,13 @@ from typing import Any
 
 import numpy as np
 
+from cathsim_dmc import files
+
 EXTENT = 2.5  # m, diagonal of the box around an anatomy
 FAR = 10.0  # m from the origin; scanners' frames begin within a few metres
 AROUND = 50e-3  # m, of the wall and of places outside the lumen's box
 OFF = 5e-3  # m, of inlet and goals off their centrelines, beside the radius
+WIDEST = 0.1  # m, radius of a vessel; the largest aneurysms have half of it
 FLAT = 1e-7  # m, least thickness of a wall piece
 LARGEST_TEXT = 20_000_000  # bytes of anatomy.json
 LARGEST_ARRAYS = 2_000_000_000  # bytes of all arrays, unpacked
@@ -88,7 +91,7 @@ def read_arrays(data: bytes, path: Path) -> dict[str, np.ndarray]:
             raise ValueError(f"its arrays unpack to {size:,} bytes")
         with np.load(io.BytesIO(data), allow_pickle=False) as archive:
             return {key: archive[key] for key in archive.files}
-    except (zipfile.BadZipFile, ValueError, OSError, EOFError, KeyError) as error:
+    except files.DAMAGED_ARCHIVE as error:
         raise ValueError(f"{path} is damaged: {error}.") from error
 
 
@@ -172,6 +175,12 @@ def check_places(anatomy: Any, path: Path) -> None:
             )
     for vessel in anatomy.tree.vessels.values():
         near(vessel.centreline.points, f"vessel {vessel.name!r}")
+        widest = float(vessel.centreline.radii.max())
+        if widest > WIDEST:
+            raise ValueError(
+                f"{path}: vessel {vessel.name!r} has a radius of {widest:.3g} m (at "
+                f"most {WIDEST:g} m); its unit is not the metre."
+            )
     places = {"inlet": anatomy.inlet}
     places |= {f"goal {name!r}": goal for name, goal in anatomy.goals.items()}
     for what, place in places.items():

@@ -8,6 +8,7 @@ from tyro import conf
 from tyro.extras import SubcommandApp
 
 from cathsim_dmc.cli.options import (
+    DEMONSTRATION_SEED,
     EVALUATION_SEED,
     INTERRUPTED,
     NO_ANATOMY,
@@ -20,7 +21,7 @@ from cathsim_dmc.cli.options import (
 def add_to(app: SubcommandApp) -> None:
     """Adds the commands."""
     app.command(name="eval")(evaluate)
-    for command in (record, replay, play, export, demo):
+    for command in (record, demos, replay, play, export, demo):
         app.command(command)
 
 
@@ -47,7 +48,7 @@ def evaluate(
         seed: Seed of the first episode; the others count up.
         out: Directory for evaluation.json and heatmap.png.
         baseline: Whether to compare with the random policy on the same seeds.
-        anatomy: Anatomy of one's own, for the task `navigate`.
+        anatomy: Where the task takes place.
         backend: Way of simulating: all episodes side by side, or dm_control's
             environments one after the other.
         threads: Number of threads of the simulation; one per core by default.
@@ -77,23 +78,25 @@ def evaluate(
 def record(
     policy: Annotated[str, conf.Positional],
     /,
-    out: Path,
+    out: Path | None = None,
+    gif: Path | None = None,
     task: str | None = None,
     seed: int = EVALUATION_SEED,
     max_steps: int | None = None,
     anatomy: OwnAnatomy = NO_ANATOMY,
     fluoroscopy: bool = True,
 ) -> int:
-    """Record one episode as a Rerun file, and as .npz beside it.
+    """Record one episode: as a Rerun file, and as .npz beside it; or as a film.
 
     Args:
         policy: Directory of a run or of a checkpoint, or name of a policy: "random",
             "push", "expert", "idle", "curl", "random_curl", "pretrained:NAME".
         out: Path of the .rrd file.
+        gif: Path of a film for slides, .gif or .webp; needs no OpenGL.
         task: Task of `cathsim list`; by default the one that the policy was trained on.
         seed: Seed of the episode.
         max_steps: Number of control steps after which the episode is cut off.
-        anatomy: Anatomy of one's own, for the task `navigate`.
+        anatomy: Where the task takes place.
         fluoroscopy: Whether to include X-ray images.
     """
     from cathsim_dmc.agents import report
@@ -107,14 +110,72 @@ def record(
         max_steps=max_steps,
         task_kwargs=anatomy.task_kwargs or None,
         fluoroscopy=fluoroscopy,
+        gif=gif,
     )
-    print(f"{episode.steps} steps, {episode.termination}: {out}")
+    written = " ".join(str(path) for path in (out, gif) if path is not None)
+    print(f"{episode.steps} steps, {episode.termination}: {written}")
     forces = recorded_forces(episode)
     if forces.sum is not None and forces.max is not None:
         print(
             f"mean force {millinewtons(forces.sum.mean)} mN (sum over contacts), max "
             f"force {millinewtons(forces.max.maximum)} mN (largest single contact)"
         )
+    return 0
+
+
+def demos(
+    task: Task,
+    /,
+    out: Path,
+    episodes: int = 20,
+    observation: tuple[str, ...] = ("tracking",),
+    noise: float = 0.0,
+    seed: int = DEMONSTRATION_SEED,
+    max_steps: int | None = None,
+    anatomy: OwnAnatomy = NO_ANATOMY,
+    threads: int | None = None,
+    json: bool = False,
+) -> int:
+    """Write demonstrations of the expert as a Minari dataset.
+
+    Args:
+        task: Task of `cathsim list`.
+        out: Directory of the dataset, which must not exist. `minari.load_dataset`
+            knows it if its name ends in a version, such as lcca-v0.
+        episodes: Number of episodes, each with a seed of its own.
+        observation: Names of the observations that a learner is to see.
+        noise: Standard deviation of normal noise added to every entry of the expert's
+            action, so that it shows how it comes back to its way.
+        seed: Seed of the first episode; the others count up.
+        max_steps: Number of control steps after which an episode is cut off; by
+            default the task's own.
+        anatomy: Anatomy of one's own, for the task `navigate`.
+        threads: Number of threads of the simulation; one per core by default.
+        json: Whether to print one JSON object and nothing else.
+    """
+    from cathsim_dmc import agents
+    from cathsim_dmc.analysis.force_statistics import millinewtons
+
+    limit = {} if max_steps is None else {"max_steps": max_steps}
+    done = agents.record_demonstrations(
+        task,
+        out,
+        episodes,
+        observation=observation if len(observation) != 1 else observation[0],
+        seed=seed,
+        noise=noise,
+        task_kwargs={**limit, **anatomy.task_kwargs},
+        num_threads=threads,
+        say=lambda text: print(text, file=sys.stderr, flush=True),
+    )
+    if json:
+        print_json({**vars(done), "path": str(done.path)})
+        return 0
+    print(
+        f"{done.successes} of {done.episodes} episodes succeed, {done.steps} steps, "
+        f"mean force {millinewtons(done.mean_force)} mN, max force "
+        f"{millinewtons(done.max_force)} mN: {done.path}"
+    )
     return 0
 
 
@@ -159,7 +220,7 @@ def play(
         speed: Speed of the simulation, in multiples of real time.
         policy: Policy to watch instead of playing yourself: directory of a run or of
             a checkpoint, or name of a policy, such as "pretrained:type1_bca".
-        anatomy: Anatomy of one's own, for the task `navigate`.
+        anatomy: Where the task takes place.
     """
     watched = None
     if policy is not None:

@@ -9,26 +9,34 @@ from tyro import conf
 # Exit codes beside 0: a check has failed; the input cannot be used; Ctrl-C.
 CHECK_FAILED, BAD_INPUT, INTERRUPTED = 1, 2, 130
 EVALUATION_SEED = 1_000_000  # apart from the seeds of training
+DEMONSTRATION_SEED = 2_000_000  # apart from both
 
 Task = Annotated[str, conf.Positional]
 
 
 @dataclasses.dataclass(frozen=True)
 class OwnAnatomy:
-    """An anatomy of one's own, for the task `navigate`.
+    """Where a task takes place, for `navigate` and the tasks on random arches.
 
     Attributes:
-        anatomy: Directory of an anatomy, or name of an arch.
-        goal: Name of the goal in it.
+        anatomy: Directory of an anatomy, or name of an arch (`navigate`).
+        goal: Name of the goal in it (`navigate`).
+        arches: Set of random arches that episodes draw from: train, test or
+            test_variants (`arch_…`, `femoral_arch_…`).
+        pool: Number of arches that episodes draw from (the same tasks).
+        first: Number in the set of the first of them (the same tasks).
     """
 
     anatomy: Annotated[str | None, conf.arg(aliases=("--phantom",))] = None
     goal: str | None = None
+    arches: str | None = None
+    pool: int | None = None
+    first: int | None = None
 
     @property
     def task_kwargs(self) -> dict[str, Any]:
         """What was given, as options of the task."""
-        given = {"anatomy": self.anatomy, "goal": self.goal}
+        given = dataclasses.asdict(self)
         return {key: value for key, value in given.items() if value is not None}
 
 

@@ -1,6 +1,7 @@
 """`cathsim train`: every setting of the algorithm and the task is a typed option."""
 
 import argparse
+import copy
 import dataclasses
 import functools
 import json
@@ -142,7 +143,10 @@ def _options(base: Any, resumed: bool) -> type:
             continue
         aliases = [_ALIASES[item.name]] if item.name in _ALIASES else None
         kind = _explained(item.type, helps[item.name], aliases=aliases)
-        fields.append((item.name, kind, field(default=getattr(base, item.name))))
+        value = getattr(base, item.name)
+        # A mapping may not be a default; every option gets one of its own.
+        default = functools.partial(copy.copy, value)
+        fields.append((item.name, kind, field(default_factory=default)))
     return dataclasses.make_dataclass("Train", fields, kw_only=True, frozen=True)
 
 

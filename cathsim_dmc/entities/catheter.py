@@ -53,7 +53,7 @@ class Catheter(composer.Entity):
 
     def _build(
         self,
-        device: str | devices.Device = "published",
+        device: str | devices.Device = "steerable_5f",
         discretisation: devices.Discretisation | None = None,
         *,
         stroke: float = 0.25,
@@ -368,3 +368,11 @@ class Catheter(composer.Entity):
         """All actuators in the order of the action: tip, insertion, rotation."""
         rotation = () if self._rotation_motor is None else (self._rotation_motor,)
         return (*self._tip_motors, self._insertion_motor, *rotation)
+
+    @property
+    def action_groups(self) -> tuple[int, ...]:
+        """Number of the group of each actuator: motors that bend about one axis."""
+        tip = len(self._tip_motors)
+        axes = [number % 2 for number in range(tip)]
+        first = min(tip, 2)
+        return (*axes, *range(first, first + len(self.actuators) - tip))

@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+import warnings
 
 import numpy as np
 
@@ -147,12 +148,13 @@ def _metal(bending_stiffness: float) -> Section:
     return Section.isotropic(bending_stiffness, METAL_POISSON_RATIO)
 
 
-# The published discretisation of the tip (ten links over 7 cm, 20 motors) on a
-# 5F body. The published stiffness equals a rod stiffer than any metal, so real ones
-# take its place: a shaft between the body of a steerable 4F tube (22.7 N·mm²) and an
-# Amplatz wire (291 N·mm²), and that body's own figure for the steerable part.
-PUBLISHED = Device(
-    name="published",
+# The device of the registered tasks: the published discretisation of the tip (ten
+# links over 7 cm, 20 motors) on a 5F body. The published stiffness equals a rod
+# stiffer than any metal, so real ones take its place: a shaft between the body of a
+# steerable 4F tube (22.7 N·mm²) and an Amplatz wire (291 N·mm²), and that body's own
+# figure for the steerable part.
+STEERABLE_5F = Device(
+    name="steerable_5f",
     outer_radius=5 * FRENCH / 2,
     linear_density=_tube_density(5 * FRENCH / 2, 0.5e-3, POLYMER_DENSITY),
     shaft=_polymer(50e-6),
@@ -217,7 +219,7 @@ WIRE_035_LUNDERQUIST = _guidewire("wire_035_lunderquist", 4860e-6)
 DEVICES: dict[str, Device] = {
     device.name: device
     for device in (
-        PUBLISHED,
+        STEERABLE_5F,
         STEERABLE_4F,
         DIAGNOSTIC_5F_J,
         DIAGNOSTIC_5F_SIMMONS,
@@ -230,6 +232,11 @@ DEVICES: dict[str, Device] = {
 }
 
 
+# Names that devices had before; runs and scripts that were made then say them.
+FORMER_NAMES = {"published": "steerable_5f"}
+PUBLISHED = STEERABLE_5F
+
+
 def get(device: "str | Device") -> Device:
     """Returns a device by name; a `Device` is returned as it is.
 
@@ -238,6 +245,15 @@ def get(device: "str | Device") -> Device:
     """
     if isinstance(device, Device):
         return device
+    if device in FORMER_NAMES:
+        name = FORMER_NAMES[device]
+        warnings.warn(
+            f"device {device!r} is called {name!r} now: only the layout of its tip is "
+            "that of the publication",
+            FutureWarning,
+            stacklevel=2,
+        )
+        device = name
     if device not in DEVICES:
         raise ValueError(
             f"no device is named {device!r}; known devices: {', '.join(DEVICES)}"

@@ -5,6 +5,7 @@ from collections.abc import Callable
 from cathsim_dmc.policies.expert import ExpertPolicy
 from cathsim_dmc.policies.policy import Policy, in_environment
 from cathsim_dmc.policies.scripted import Curl, Idle, Push, Random, RandomCurl
+from cathsim_dmc.policies.teacher import Teacher
 from cathsim_dmc.policies.view import BatchedView, ComposerView, View
 
 # Policies by name: a new one is a class and a line here.
@@ -39,6 +40,7 @@ __all__ = [
     "BatchedView",
     "ComposerView",
     "Policy",
+    "Teacher",
     "View",
     "in_environment",
     "make_policy",

@@ -83,6 +83,14 @@ class Expert:
         )
         return action
 
+    def follow(self, action: np.ndarray) -> None:
+        """Takes what was carried out, (..., A) in [-1, 1], for its own last action."""
+        if self._state is None:
+            return
+        told = action[..., : self._plan.tip.size] * self._plan.steering_angle
+        bend = told.reshape(self._state.bend.shape)
+        self._state = dataclasses.replace(self._state, bend=bend)
+
 
 class Experts:
     """An expert for each simulation, where their anatomies differ."""
@@ -117,6 +125,11 @@ class Experts:
             for index, row in enumerate(rows)
         ]
         return np.concatenate(actions)
+
+    def follow(self, action: np.ndarray) -> None:
+        """Takes what was carried out, (N, A) in [-1, 1], for their last actions."""
+        for index, expert in self._experts.items():
+            expert.follow(action[[index]])
 
 
 class ExpertPolicy(Policy):
@@ -158,3 +171,12 @@ class ExpertPolicy(Policy):
         if self._expert is None or self._view is None:
             raise RuntimeError("the expert must be reset before it acts")
         return self._expert.act(self._view.readings, self._view.wall_force)
+
+    def follow(self, action: np.ndarray) -> None:
+        """Takes what was carried out in place of its last actions for its own.
+
+        Args:
+            action: (N, A) in [-1, 1].
+        """
+        if self._expert is not None:
+            self._expert.follow(action)

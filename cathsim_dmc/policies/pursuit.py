@@ -28,10 +28,9 @@ from cathsim_dmc.entities import devices
 from cathsim_dmc.tasks import forces, navigation
 from cathsim_dmc.tasks.cases import Case
 from cathsim_dmc.tasks.readings import Readings
+from cathsim_dmc.tasks.route import Place, Route, along, locate
 
-ROUTE_SPACING = 1e-3  # m, resolution of the route
 _WITHDRAWN = 2e-3  # m, insertion below which there is nothing left to withdraw
-_NEARBY = 10e-3  # m of the route that a head can pass between two control steps
 
 
 @dataclasses.dataclass(frozen=True)
@@ -134,7 +133,7 @@ class Plan:
                 f"the objective {type(task.objective).__name__} has no route, a "
                 "centreline from the inlet to the goal, for the expert to follow"
             )
-        route = line.resampled(ROUTE_SPACING)
+        route = Route.of(line)
         hinges, numbers = [], {}
         for column, joint in enumerate(catheter.joints):
             if joint.type == "slide":
@@ -161,63 +160,7 @@ class Plan:
 
     def at(self, arc_length: np.ndarray) -> np.ndarray:
         """Point (..., 3) of the route; beyond the goal, straight on."""
-        axes = range(3)
-        point = np.stack(
-            [np.interp(arc_length, self.arc_length, self.points[:, i]) for i in axes],
-            axis=-1,
-        )
-        last = self.points[-1] - self.points[-2]
-        last = last / np.linalg.norm(last)
-        return point + np.maximum(arc_length - self.length, 0.0)[..., None] * last
-
-
-@dataclasses.dataclass(frozen=True)
-class Place:
-    """Where a head is on a route.
-
-    Attributes:
-        arc_length: (...), m.
-        radius: (...), of the lumen there, m.
-        excess: (...), by how much the head is out of the route's tube, in radii there;
-            negative inside.
-    """
-
-    arc_length: np.ndarray
-    radius: np.ndarray
-    excess: np.ndarray
-
-
-def locate(plan: Plan, head: np.ndarray, last: np.ndarray | None = None) -> Place:
-    """Finds the place of a head (..., 3) on the route.
-
-    It is the nearest point of the route whose cross-section reaches the head: beside
-    an ostium, still in the parent, the axis of the branch may be nearer than the
-    parent's, yet the head is not in the branch. If none does, it is the point whose
-    cross-section comes nearest.
-
-    Where the route turns back into a branch, the cross-sections of both reach a head
-    between them, and the nearer axis changes with every movement. A head that was on
-    one of them stays on it as long as it can: points near the last place come first.
-
-    Args:
-        plan: of the task.
-        head: (..., 3), m.
-        last: (...), arc length of its place a control step ago, m; NaN or None where
-            that is not known.
-    """
-    offset = head[..., None, :] - plan.points
-    distance = np.sqrt(np.einsum("...i,...i->...", offset, offset))
-    outside = distance - plan.radii
-    inside = outside <= 0
-    # Any inside point beats every outside one.
-    rank = np.where(inside, distance - 1.0, np.maximum(outside, 0.0))
-    if last is not None:  # and one near the last place every other
-        nearby = np.abs(plan.arc_length - last[..., None]) <= _NEARBY
-        rank = rank - 1.0 * (inside & nearby)
-    index = rank.argmin(-1)
-    excess = np.take_along_axis(outside, index[..., None], -1)[..., 0]
-    radius = plan.radii[index]
-    return Place(plan.arc_length[index], radius, excess / radius)
+        return along(self, arc_length)
 
 
 @dataclasses.dataclass(frozen=True)

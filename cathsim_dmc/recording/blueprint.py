@@ -2,49 +2,108 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 import rerun.blueprint as rrb
 
 TIMELINE_TIME = "sim_time"
 TIMELINE_STEP = "step"
+# Entities of the X-ray planes, frontal first.
+FLUOROSCOPY = ("fluoroscopy", "fluoroscopy_lateral")
+_PLANE_NAMES = ("Fluoroscopy, frontal", "Fluoroscopy, second plane")
 
 # Distance of the eye in extents of the scene: the viewer's vertical field of view
 # is near 45 degrees, which shows 0.83 of the distance.
 EYE_DISTANCE = 1.35
+# Of the eye from the tip that it follows, and from the robot, m.
+TIP_DISTANCE = 0.075
+ROBOT_OFFSET = np.array([-0.16, -0.42, 0.2])
+# Room above the curves of a plot for its legend, as a share of their height.
+_HEADROOM = 0.55
+_BACKGROUND = (30, 32, 38)
 
 
 def episode_blueprint(
-    centre: Sequence[float], extent: float, *, fluoroscopy: bool, distance: bool
+    centre: Sequence[float],
+    extent: float,
+    *,
+    planes: int,
+    distance: bool,
+    head: Sequence[float],
+    robot: Sequence[float] | None,
+    heights: Mapping[str, tuple[float, float]],
 ) -> rrb.Blueprint:
-    """Return the layout: scene on the left, series on the right.
+    """Return the layout: scene on the left, X-ray in the middle, series on the right.
 
     Args:
         centre: (3,) point the eye looks at, world frame (LPS), metres.
         extent: Largest side of the scene in metres.
-        fluoroscopy: Whether the recording has the ``fluoroscopy`` entity.
+        planes: Number of X-ray planes that the recording has.
         distance: Whether the recording has ``series/distance_mm``.
+        head: (3,) where the head is at first, metres.
+        robot: (3,) where the robot is, or None if the recording has none.
+        heights: Lowest and highest value of the plots "reward" and "force".
     """
-    below: list[rrb.View] = [rrb.TextDocumentView(origin="info", name="Episode")]
-    if fluoroscopy:
-        below.insert(0, rrb.Spatial2DView(origin="fluoroscopy", name="Fluoroscopy"))
-    left = rrb.Vertical(
-        _scene(np.asarray(centre, dtype=np.float64), extent),
-        rrb.Horizontal(*below),
-        row_shares=[2, 1],
+    middle = np.asarray(centre, dtype=np.float64)
+    insets: list[rrb.View] = [_tip(np.asarray(head, dtype=np.float64))]
+    if robot is not None:
+        insets.append(_robot(np.asarray(robot, dtype=np.float64)))
+    scene = rrb.Vertical(
+        _scene(middle, extent), rrb.Horizontal(*insets), row_shares=[3, 2]
     )
+    texts = rrb.Tabs(
+        rrb.TextLogView(origin="events", name="Events"),
+        rrb.TextDocumentView(origin="info", name="Episode"),
+    )
+    images = [
+        rrb.Spatial2DView(origin=origin, name=name)
+        for origin, name in zip(FLUOROSCOPY[:planes], _PLANE_NAMES, strict=False)
+    ]
     plots = [
-        _plot("Reward", "series/reward"),
-        _plot("Force, N", "series/force", legend=True),
+        _plot("Reward and its terms", "series/reward", heights["reward"]),
+        _plot("Force, mN", "series/force", heights["force"]),
         _plot("Insertion, mm", "series/insertion_mm"),
-        _plot("Action", "series/action", legend=True),
-        _plot("All actions", "series/action_all"),
+        rrb.Tabs(
+            _plot("Action", "series/action", (-1.0, 1.0)),
+            _plot("All actions", "series/action_all"),
+        ),
     ]
     if distance:
         plots.insert(1, _plot("Distance to goal, mm", "series/distance_mm"))
+    columns = [scene, rrb.Vertical(*images, texts), rrb.Vertical(*plots)]
+    return _page(rrb.Horizontal(*columns, column_shares=[5, 3.4, 3]))
+
+
+def comparison_blueprint(
+    centre: Sequence[float], extent: float, devices: Sequence[str], *, distance: bool
+) -> rrb.Blueprint:
+    """Return the layout of several episodes in one scene.
+
+    Args:
+        centre: (3,) point the eye looks at, world frame (LPS), metres.
+        extent: Largest side of the scene in metres.
+        devices: Entity paths of the devices, whose paths so far are drawn.
+        distance: Whether the recording has ``series/distance_mm``.
+    """
+    plots = [
+        _plot("Largest contact, mN", "series/force", None, legend=True),
+        _plot("Reward", "series/reward", None, legend=True),
+        _plot("Insertion, mm", "series/insertion_mm", None, legend=True),
+    ]
+    if distance:
+        plots.insert(
+            0, _plot("Distance to goal, mm", "series/distance_mm", None, legend=True)
+        )
+    scene = _scene(np.asarray(centre, dtype=np.float64), extent, devices)
+    text = rrb.TextDocumentView(origin="info", name="Episodes")
+    left = rrb.Vertical(scene, text, row_shares=[3, 1])
+    return _page(rrb.Horizontal(left, rrb.Vertical(*plots), column_shares=[3, 2]))
+
+
+def _page(content: rrb.Container) -> rrb.Blueprint:
     return rrb.Blueprint(
-        rrb.Horizontal(left, rrb.Vertical(*plots), column_shares=[3, 2]),
+        content,
         rrb.BlueprintPanel(state="collapsed"),
         rrb.SelectionPanel(state="collapsed"),
         rrb.TimePanel(
@@ -58,17 +117,24 @@ def episode_blueprint(
     )
 
 
-def _scene(centre: np.ndarray, extent: float) -> rrb.Spatial3DView:
-    # The trail is one short piece per step; showing all pieces up to the cursor
-    # draws where the head has been without giving away where it will go.
-    so_far = [
-        rrb.VisibleTimeRange(
-            timeline,
-            start=rrb.TimeRangeBoundary.infinite(),
-            end=rrb.TimeRangeBoundary.cursor_relative(),
-        )
-        for timeline in (TIMELINE_TIME, TIMELINE_STEP)
-    ]
+def _so_far() -> rrb.VisibleTimeRanges:
+    """Everything up to the cursor: where something has been, not where it will go."""
+    return rrb.VisibleTimeRanges(
+        [
+            rrb.VisibleTimeRange(
+                timeline,
+                start=rrb.TimeRangeBoundary.infinite(),
+                end=rrb.TimeRangeBoundary.cursor_relative(),
+            )
+            for timeline in (TIMELINE_TIME, TIMELINE_STEP)
+        ]
+    )
+
+
+def _scene(
+    centre: np.ndarray, extent: float, devices: Sequence[str] = ("world/catheter",)
+) -> rrb.Spatial3DView:
+    entities = [*(f"{device}/trail" for device in devices), "world/heat"]
     return rrb.Spatial3DView(
         origin="world",
         name="Scene",
@@ -79,14 +145,64 @@ def _scene(centre: np.ndarray, extent: float) -> rrb.Spatial3DView:
             look_target=centre,
             eye_up=[0.0, 0.0, 1.0],
         ),
+        background=_BACKGROUND,
         line_grid=False,
-        overrides={"world/catheter/trail": rrb.VisibleTimeRanges(so_far)},
+        overrides={entity: _so_far() for entity in entities},
     )
 
 
-def _plot(name: str, origin: str, legend: bool = False) -> rrb.TimeSeriesView:
+def _tip(head: np.ndarray) -> rrb.Spatial3DView:
+    """The neighbourhood of the tip, which the eye follows."""
+    return rrb.Spatial3DView(
+        origin="world",
+        name="Tip",
+        contents=["+ $origin/**", "- $origin/goal"],
+        eye_controls=rrb.EyeControls3D(
+            kind="orbital",
+            position=head + [0.0, -TIP_DISTANCE, 0.0],
+            look_target=head,
+            eye_up=[0.0, 0.0, 1.0],
+            tracking_entity="world/catheter/head",
+        ),
+        background=_BACKGROUND,
+        line_grid=False,
+        overrides={"world/heat": _so_far()},
+    )
+
+
+def _robot(place: np.ndarray) -> rrb.Spatial3DView:
+    """The follower robot, which stands far from the anatomy."""
+    return rrb.Spatial3DView(
+        origin="world",
+        name="Robot",
+        contents=["+ $origin/robot/**", "+ $origin/sheath/**", "+ $origin/catheter"],
+        eye_controls=rrb.EyeControls3D(
+            kind="orbital",
+            position=place + ROBOT_OFFSET,
+            look_target=place,
+            eye_up=[0.0, 0.0, 1.0],
+        ),
+        background=_BACKGROUND,
+        line_grid=False,
+    )
+
+
+def _plot(
+    name: str,
+    origin: str,
+    height: tuple[float, float] | None = None,
+    legend: bool = False,
+) -> rrb.TimeSeriesView:
+    """A plot; one with a known height has a legend in the room above its curves."""
+    axis = None
+    if height is not None:
+        low, high = height
+        rise = max(high - low, 1e-6)
+        axis = rrb.ScalarAxis(range=(low - 0.05 * rise, high + _HEADROOM * rise))
+    shown = legend or height is not None
     return rrb.TimeSeriesView(
         origin=origin,
         name=name,
-        plot_legend=rrb.PlotLegend(corner="RightTop", visible=legend),
+        axis_y=axis,
+        plot_legend=rrb.PlotLegend(corner="LeftTop", visible=shown),
     )

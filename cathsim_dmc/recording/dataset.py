@@ -2,7 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
+import os
+import re
+import shutil
+import uuid
 from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -14,6 +20,9 @@ from cathsim_dmc.recording.episode import Episode
 _OBSERVED = ("observation", "fluoroscopy", "cameras")
 # Rewards of a repeated episode may differ by rounding on another machine.
 TOLERANCE = 1e-9
+
+_NO_MINARI = "minari is not installed; `pip install cathsim-dmc[gym]` adds it"
+_VERSION = re.compile(r"-v\d+$")
 
 
 def export(
@@ -53,9 +62,7 @@ def export(
 
         from cathsim_dmc.simulation.gymnasium import make
     except ModuleNotFoundError as error:
-        raise ModuleNotFoundError(
-            "minari is not installed; `pip install cathsim-dmc[gym]` adds it"
-        ) from error
+        raise ModuleNotFoundError(_NO_MINARI) from error
     episodes = list(episodes)
     task, options = _common(episodes)
     options.update(task_kwargs or {})
@@ -78,6 +85,87 @@ def export(
         )
     finally:
         environment.close()
+
+
+def write(
+    path: str | os.PathLike[str],
+    buffers: Sequence[Any],
+    *,
+    env_spec: Any,
+    observation_space: Any,
+    action_space: Any,
+    algorithm: str,
+    description: str,
+) -> Path:
+    """Writes a dataset into a directory of its own, whole or not at all.
+
+    `minari.MinariDataset(path / "data")` loads it; so does `minari.load_dataset(name)`
+    if the name of the directory ends in a version, as in "lcca-v0", and
+    MINARI_DATASETS_PATH is the directory around it.
+
+    Args:
+      path: Directory of the dataset, which must not exist.
+      buffers: `minari.data_collector.EpisodeBuffer` of each episode.
+      env_spec: Spec of the Gymnasium environment, see `simulation.gymnasium.env_spec`.
+      observation_space: Its space of observations.
+      action_space: Its space of actions.
+      algorithm: What acted, for the metadata.
+      description: For the metadata.
+
+    Returns:
+      The directory.
+
+    Raises:
+      FileExistsError: the directory exists.
+      FileNotFoundError: the directory around it does not.
+      ModuleNotFoundError: minari is not installed.
+    """
+    path = Path(path)
+    check_free(path)
+    try:
+        from minari.dataset.minari_storage import MinariStorage
+    except ModuleNotFoundError as error:
+        raise ModuleNotFoundError(_NO_MINARI) from error
+    from importlib.metadata import version
+
+    name = path.name
+    temporary = path.with_name(f".{name}.{uuid.uuid4().hex[:12]}.partial")
+    temporary.mkdir()
+    try:
+        storage = MinariStorage.new(
+            temporary / "data",
+            observation_space,
+            action_space,
+            env_spec,
+            "hdf5",
+            jpeg_encoding=False,
+        )
+        storage.update_metadata(
+            {
+                # The last part of an id is a name with a version.
+                "dataset_id": name if _VERSION.search(name) else f"{name}-v0",
+                "algorithm_name": algorithm,
+                "description": description,
+                "minari_version": version("minari"),
+            }
+        )
+        storage.update_episodes(buffers)
+        for file in (temporary / "data").iterdir():
+            with open(file, "rb+") as stream:
+                os.fsync(stream.fileno())
+        os.rename(temporary, path)
+    finally:
+        with contextlib.suppress(FileNotFoundError):
+            shutil.rmtree(temporary)
+    return path
+
+
+def check_free(path: Path) -> None:
+    """Raises unless a dataset can be written there; see `write`."""
+    if path.exists():
+        raise FileExistsError(f"{path} exists: choose another directory, or remove it")
+    if not path.parent.is_dir():
+        raise FileNotFoundError(f"no directory {path.parent}; create it first")
 
 
 def _common(episodes: Sequence[Episode]) -> tuple[str, dict[str, Any]]:

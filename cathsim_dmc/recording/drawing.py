@@ -29,7 +29,7 @@ class Drawing:
         geoms: Primitives that the body poses of the episode move.
         radii: (L,) radii of the links of the catheter.
         goal: Position (3,) and radius, or None.
-        frames: (T+1, H, W, 1) uint8 fluoroscopy, or None.
+        frames: (T+1, H, W, P) uint8 fluoroscopy of P = 1 or 2 planes, or None.
     """
 
     vertices: np.ndarray
@@ -156,9 +156,11 @@ def _checked_frames(episode: Episode, frames: np.ndarray | None) -> np.ndarray |
         return None
     frames = np.asarray(frames)
     states = episode.steps + 1
-    if frames.ndim != 4 or frames.shape[0] != states or frames.shape[-1] != 1:
+    wrong = frames.ndim != 4 or frames.shape[0] != states
+    if wrong or frames.shape[-1] not in (1, 2):
         raise ValueError(
-            f"fluoroscopy must have shape ({states}, H, W, 1), got {frames.shape}"
+            f"fluoroscopy must have shape ({states}, H, W, 1), or 2 for two planes; "
+            f"got {frames.shape}"
         )
     if frames.dtype != np.uint8:
         raise ValueError(f"fluoroscopy must be uint8, got {frames.dtype}")

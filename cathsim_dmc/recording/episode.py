@@ -9,14 +9,13 @@ from __future__ import annotations
 
 import json
 import os
-import zipfile
 from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from cathsim_dmc.files import atomic_path
+from cathsim_dmc.files import DAMAGED_ARCHIVE, atomic_path
 
 FORMAT = "cathsim-episode"
 FORMAT_VERSION = 1
@@ -212,6 +211,12 @@ class Episode:
             ValueError: if the name does not end in ``.npz``.
             FileNotFoundError: if the directory does not exist.
         """
+        with atomic_path(path, SUFFIX) as temporary:
+            self.write(temporary)
+        return Path(path)
+
+    def write(self, path: str | os.PathLike[str]) -> None:
+        """Write what `save` does, whatever the name, over what is there."""
         header = {
             "format": FORMAT,
             "version": FORMAT_VERSION,
@@ -220,9 +225,8 @@ class Episode:
             "meta": self.meta,
         }
         arrays = {name: getattr(self, name) for name in _AXES}
-        with atomic_path(path, SUFFIX) as temporary, open(temporary, "wb") as stream:
+        with open(path, "wb") as stream:
             np.savez_compressed(stream, header=np.array(json.dumps(header)), **arrays)
-        return Path(path)
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> Episode:
@@ -240,7 +244,7 @@ class Episode:
             with np.load(path, allow_pickle=False) as archive:
                 header = json.loads(str(archive["header"][()]))
                 arrays = {name: archive[name] for name in _AXES}
-        except (zipfile.BadZipFile, EOFError, KeyError, ValueError, OSError) as error:
+        except (*DAMAGED_ARCHIVE, TypeError) as error:
             raise ValueError(
                 f"{path} is not an episode written by Episode.save: {error}"
             ) from error

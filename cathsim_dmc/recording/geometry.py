@@ -10,6 +10,9 @@ import numpy as np
 # 0-0.2 N with outliers above 0.4 N, so ordinary contacts use half the scale.
 FORCE_COLOUR_MAX = 0.4
 
+# Tops of the scale, newtons, for episodes with weaker forces.
+_FORCE_SCALES = (0.02, 0.05, 0.1, 0.2, FORCE_COLOUR_MAX)
+
 # Pale yellow over orange to dark red; monotone in lightness, so it survives
 # greyscale printing and the common colour deficiencies.
 _FORCE_COLOURS = np.array(
@@ -105,15 +108,26 @@ def rotate(quaternion_wxyz: np.ndarray, vector: np.ndarray) -> np.ndarray:
     return vector + scalar * twice + np.cross(axis, twice)
 
 
-def force_colours(magnitude: np.ndarray) -> np.ndarray:
+def force_colours(
+    magnitude: np.ndarray, largest: float = FORCE_COLOUR_MAX
+) -> np.ndarray:
     """Return RGB colours (..., 3) uint8 of force magnitudes (...,) in newtons.
 
-    The scale is linear from 0 to ``FORCE_COLOUR_MAX`` and saturates above.
+    The scale is linear from 0 to ``largest`` and saturates above.
     """
     magnitude = np.asarray(magnitude, dtype=np.float64)
     last = len(_FORCE_COLOURS) - 1
-    place = np.clip(magnitude / FORCE_COLOUR_MAX, 0, 1) * last
+    place = np.clip(magnitude / largest, 0, 1) * last
     lower = np.minimum(place.astype(np.int64), last - 1)
     share = (place - lower)[..., None]
     mixed = _FORCE_COLOURS[lower] * (1 - share) + _FORCE_COLOURS[lower + 1] * share
     return np.round(mixed).astype(np.uint8)
+
+
+def force_scale(magnitude: np.ndarray) -> float:
+    """Return the top of a colour scale in newtons that tells forces (...,) apart.
+
+    It is at most ``FORCE_COLOUR_MAX``, and no less than the largest force below that.
+    """
+    largest = float(np.max(magnitude, initial=0.0))
+    return next((top for top in _FORCE_SCALES if largest <= top), FORCE_COLOUR_MAX)

@@ -217,6 +217,13 @@ class EpisodeRecorder:
             meta["error"] = error
         return self._episode(rows, seed, meta)
 
+    def present(self) -> Episode:
+        """The present state as an episode of no steps."""
+        self._bind()
+        rows = _Rows()
+        rows.add(**self._state())
+        return self._episode(rows, None, self._meta(rows, "truncated", 1.0))
+
     def _state(self) -> dict[str, Any]:
         data = self._env.physics.data
         head = data.site_xpos[self._head]

@@ -13,6 +13,7 @@ import numpy as np
 from dm_control import mjcf
 from mujoco import batch as mujoco_batch
 
+from cathsim_dmc import bounds
 from cathsim_dmc.tasks import forces, readings
 from cathsim_dmc.tasks.actions import check_action
 from cathsim_dmc.tasks.cases import Case
@@ -62,8 +63,8 @@ class BatchSimulation:
         Raises:
           ValueError: if the task overrides what composer calls, or a number is wrong.
         """
-        if num_simulations < 1:
-            raise ValueError(f"num_simulations is {num_simulations}; at least 1")
+        bounds.whole("num_simulations", num_simulations, 1, bounds.MOST_SIMULATIONS)
+        bounds.whole("num_threads", num_threads, 0, bounds.MOST_THREADS)
         _refuse_overrides(type(task))
         self._task = task
         physics = mjcf.Physics.from_mjcf_model(task.root_entity.mjcf_model)
@@ -86,7 +87,9 @@ class BatchSimulation:
 
     def seed(self, seeds: Sequence[int | Sequence[int]] | int) -> None:
         """Gives each simulation its own source of randomness."""
-        if isinstance(seeds, int | np.integer):
+        if not isinstance(seeds, Sequence | np.ndarray):
+            bounds.seed("seed", seeds)
+            bounds.seed("seed of the last simulation", seeds + self.num_simulations - 1)
             seeds = [int(seeds) + index for index in range(self.num_simulations)]
         if len(seeds) != self.num_simulations:
             raise ValueError(

@@ -200,13 +200,17 @@ def make(task: str, **options: Any) -> gymnasium.Env:
       task: of `suite.SUITE`.
       **options: of `CathSimEnv`; JSON can hold them if the spec shall be written.
     """
-    spec = EnvSpec(
+    return gymnasium.make(env_spec(task, **options))
+
+
+def env_spec(task: str, **options: Any) -> EnvSpec:
+    """What says how to make an environment, see `make`; nothing is built."""
+    return EnvSpec(
         id=f"{suite.DOMAIN}/{task}-v{VERSION}",
         entry_point=f"{__name__}:{CathSimEnv.__name__}",
         kwargs={"task": task, **options},
         disable_env_checker=True,
     )
-    return gymnasium.make(spec)
 
 
 class CathSimVectorEnv(gymnasium.vector.VectorEnv):

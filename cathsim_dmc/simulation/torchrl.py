@@ -107,6 +107,11 @@ class BatchedEnv(EnvBase):
         self._simulation.seed(0 if seed is None else seed)
 
     @property
+    def action_groups(self) -> tuple[int, ...]:
+        """Number of the group of each action: motors that bend about one axis."""
+        return self._simulation.task.scene.catheter.action_groups
+
+    @property
     def simulation(self) -> BatchSimulation:
         """The simulations underneath."""
         return self._simulation

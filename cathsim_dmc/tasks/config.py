@@ -55,7 +55,7 @@ class NavigationConfig:
     """
 
     observation: str | Sequence[str] = "internal"
-    device: str | devices.Device = "published"
+    device: str | devices.Device = "steerable_5f"
     rotation: bool = False
     start_along_route: Sequence[float] | None = None
     max_steps: int = MAX_STEPS

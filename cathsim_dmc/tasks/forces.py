@@ -135,7 +135,9 @@ def wall_force(magnitude: np.ndarray) -> WallForce:
     """Summarises the contact magnitudes (..., S, M) of S substeps, in N."""
     if not magnitude.shape[-1]:
         shape = magnitude.shape[:-2]
-        return WallForce(*(np.zeros(shape) for _ in WallForce._fields))
+        return WallForce(
+            np.zeros(shape), np.zeros(shape), np.zeros(shape), np.zeros(shape)
+        )
     # One contact after the other: numpy's pairwise sum along the last axis would depend
     # on the number of empty places, and so on what other simulations touch.
     total = magnitude.cumsum(-1)[..., -1]

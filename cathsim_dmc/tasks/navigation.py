@@ -8,6 +8,7 @@ import mujoco
 import numpy as np
 from dm_control import composer
 
+from cathsim_dmc import bounds
 from cathsim_dmc.tasks import cameras, cases, forces, observations, readings
 from cathsim_dmc.tasks.actions import check_action
 from cathsim_dmc.tasks.config import CONTROL_TIMESTEP, NavigationConfig
@@ -44,6 +45,7 @@ class Navigation(composer.Task):
         config: NavigationConfig | None = None,
         random: np.random.RandomState | int | None = None,
         others: Sequence[tuple[Scene, Objective]] = (),
+        name: str | None = None,
     ):
         """Takes over the scene.
 
@@ -55,19 +57,20 @@ class Navigation(composer.Task):
           others: Scenes and objectives beside the first, if each episode is to draw
             one of them: another anatomy, with the same device and goals of the same
             names. All are compiled here, which takes a second each.
+          name: Name of the task for people; None takes the class's.
 
         Raises:
           ValueError: if the objective cannot do what the randomisation asks for, or
             the scenes differ in more than their anatomies.
         """
+        self.name = name or type(self).__name__
         self._scene = scene
         self._objective = objective
         self._config = config = config or NavigationConfig()
-        self._random_state = (
-            random
-            if isinstance(random, np.random.RandomState)
-            else np.random.RandomState(random)
-        )
+        if not isinstance(random, np.random.RandomState):
+            seed = None if random is None else bounds.seed("random", random)
+            random = np.random.RandomState(seed)
+        self._random_state = random
         if config.ranges.goal_shift and not hasattr(objective, "shifted"):
             raise ValueError(
                 f"randomisation shifts the goal, but {type(objective).__name__} has "
@@ -118,6 +121,20 @@ class Navigation(composer.Task):
             )
         ]
         return Rollout(chosen, self._config, model, state, access, num_simulations)
+
+    def __repr__(self) -> str:
+        """Name, anatomy, goal, device and what is observed."""
+        scene = self.scene
+        anatomy = (
+            f"{self.num_anatomies} anatomies"
+            if self.num_anatomies > 1
+            else f"anatomy {scene.anatomy.name!r}"
+        )
+        return (
+            f"<{self.name}: {anatomy}, goal {scene.goal.name!r} within "
+            f"{1e3 * self.objective.goal_radius:g} mm, device {scene.device.name!r}, "
+            f"{self._num_actions} actions, observation {', '.join(self._names)}>"
+        )
 
     # Composer's hooks.
 

@@ -1,5 +1,6 @@
 """Objectives that differ between simulations, as one."""
 
+import functools
 from collections.abc import Sequence
 from types import MappingProxyType
 from typing import Any, cast
@@ -37,7 +38,7 @@ class ObjectivePool:
         self._groups = tuple(groups)
         self._count = sum(len(rows) for _, rows in self._groups)
 
-    @property
+    @functools.cached_property
     def goal(self) -> np.ndarray:
         """(N, 3), m, world frame."""
         goal = np.empty((self._count, 3))

@@ -7,6 +7,7 @@ from typing import ClassVar, NamedTuple, Protocol
 
 import numpy as np
 
+from cathsim_dmc import bounds
 from cathsim_dmc.anatomy import Anatomy, Centreline, Goal
 from cathsim_dmc.anatomy.geodesic import LumenDistance
 from cathsim_dmc.tasks import forces, readings
@@ -28,12 +29,14 @@ class Measurement(NamedTuple):
       action: (..., A), action of this control step in [-1, 1].
       previous_action: (..., A), action of the control step before, zeros after a
         reset.
+      distance: (...), straight from the head to the goal of the objective, m.
     """
 
     readings: readings.Readings
     wall_force: forces.WallForce
     action: np.ndarray
     previous_action: np.ndarray
+    distance: np.ndarray
 
 
 class Outcome(NamedTuple):
@@ -48,6 +51,12 @@ class Outcome(NamedTuple):
     reward: np.ndarray
     success: np.ndarray
     terms: Mapping[str, np.ndarray]
+
+
+def straight(start: np.ndarray, end: np.ndarray) -> np.ndarray:
+    """Straight distances (...) between places (..., 3), m."""
+    way = end - start
+    return np.sqrt(np.vecdot(way, way))
 
 
 class Objective(Protocol):
@@ -123,7 +132,7 @@ class Cannulation:
     ] = MappingProxyType(
         {
             # Straight from head to goal, m.
-            "distance": lambda self, m: self.distance(m.readings.head),
+            "distance": lambda self, m: m.distance,
             # Shortest way from head to goal inside the lumen, m.
             "path": lambda self, m: self.lumen_distance(m.readings.head),
             # Sum of all contacts on the wall at the end of the control step, N.
@@ -141,8 +150,7 @@ class Cannulation:
     UNTIL_SUCCESS: ClassVar[frozenset[str]] = frozenset({"distance", "path"})
 
     def __post_init__(self):
-        if not self.goal_radius > 0:
-            raise ValueError(f"goal_radius is {self.goal_radius} m; it must be > 0")
+        bounds.number("goal_radius", self.goal_radius, positive=True)
         object.__setattr__(self, "weights", self._checked(self.weights))
 
     def _checked(self, weights: Mapping[str, float]) -> Mapping[str, float]:
@@ -203,30 +211,29 @@ class Cannulation:
 
     def outcome(self, measurement: Measurement) -> Outcome:
         """Judges a control step."""
-        success = self.success(measurement.readings.head)
+        success = self.success(measurement)
         any_success = np.count_nonzero(success)
         terms = {}
         for name, weight in self.weights.items():
             if name == "success":
-                terms[name] = weight * success
-                continue
-            term = weight * self.TERMS[name](self, measurement)
-            if any_success and name in self.UNTIL_SUCCESS:
-                term = np.where(success, 0.0, term)
+                term = weight * success if any_success else np.zeros(success.shape)
+            else:
+                term = weight * self.TERMS[name](self, measurement)
+                if any_success and name in self.UNTIL_SUCCESS:
+                    term = np.where(success, 0.0, term)
             terms[name] = term
         return Outcome(sum(terms.values(), _NOTHING), success, terms)
 
-    def success(self, head: np.ndarray) -> np.ndarray:
-        """Whether heads (..., 3) are in the branch and within the goal's radius."""
-        success = self.distance(head) < self.goal_radius
+    def success(self, measurement: Measurement) -> np.ndarray:
+        """Whether heads are in the branch and within the goal's radius: (...) bool."""
+        success = measurement.distance < self.goal_radius
         if np.count_nonzero(success):  # finding the place in the branch takes 50 µs
-            success = success & self.in_branch(head)
+            success = success & self.in_branch(measurement.readings.head)
         return success
 
     def distance(self, head: np.ndarray) -> np.ndarray:
         """Straight distance (...) from heads (..., 3) to the goal, m."""
-        offset = head - self.goal
-        return np.sqrt(np.vecdot(offset, offset))
+        return straight(head, self.goal)
 
     def in_branch(self, head: np.ndarray) -> np.ndarray:
         """Whether the head (..., 3) is in the lumen of the branch, past its ostium."""

@@ -17,6 +17,7 @@ from dm_env import specs
 from cathsim_dmc.imaging.options import FluoroscopyOptions
 from cathsim_dmc.tasks import forces, readings
 from cathsim_dmc.tasks.cameras import CameraOptions
+from cathsim_dmc.tasks.route import AHEAD, Ahead, into_frame
 
 TRACKED_POINTS = 8
 SEQUENCE_LENGTH = 3
@@ -60,6 +61,7 @@ class Frame(NamedTuple):
       action: (..., A), the action that was asked for, zeros after a reset.
       goal: (3,) or (..., 3), m.
       images: what the image sensors show.
+      ahead: what lies ahead of the tip on the route; None where nothing asks for it.
     """
 
     readings: readings.Readings
@@ -67,6 +69,7 @@ class Frame(NamedTuple):
     action: np.ndarray
     goal: np.ndarray
     images: Images = NO_IMAGES
+    ahead: Ahead | None = None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -133,22 +136,24 @@ class ObservationKind:
       observe: function from a frame to the arrays of the observation.
       entries: its arrays.
       fluoroscopic: whether it needs the angiography machine.
+      routed: whether it needs the route to the goal.
     """
 
     observe: Callable[[Frame], Observation]
     entries: tuple[Entry, ...]
     fluoroscopic: bool = False
+    routed: bool = False
 
 
 OBSERVATIONS: dict[str, ObservationKind] = {}
 
 
-def _register(*entries: Entry, fluoroscopic: bool = False):
+def _register(*entries: Entry, fluoroscopic: bool = False, routed: bool = False):
     """Puts the decorated function into the table under its own name."""
 
     def add(function: Callable[[Frame], Observation]):
         OBSERVATIONS[function.__name__] = ObservationKind(
-            function, entries, fluoroscopic
+            function, entries, fluoroscopic, routed
         )
         return function
 
@@ -176,7 +181,7 @@ def _operator(frame: Frame) -> Observation:
 
 def _flat(array: np.ndarray, axes: int) -> np.ndarray:
     """Joins the last `axes` axes."""
-    return array.reshape(*array.shape[: array.ndim - axes], -1)
+    return array.reshape(array.shape[:-axes] + (-1,))
 
 
 @_register(
@@ -314,6 +319,40 @@ def tracking_2d(frame: Frame) -> Observation:
 
 
 @_register(
+    Entry(
+        "route_points",
+        "m",
+        f"{len(AHEAD)} points of the centreline of the route, every "
+        f"{1e3 * AHEAD[1]:g} mm from the place of the head on, tip frame",
+    ),
+    Entry("route_radii", "m", "of the lumen at these points", 0),
+    Entry("route_goal", "m", "centre of the goal, tip frame"),
+    Entry(
+        "route_device",
+        "m",
+        f"{TRACKED_POINTS - 1} points along the device, proximal to the head and "
+        "without it, tip frame",
+    ),
+    Entry("route_action", "1", "the last action, zeros after a reset", -1, 1),
+    routed=True,
+)
+def route(frame: Frame) -> Observation:
+    """The way ahead as the tip sees it: nothing tells one anatomy from another."""
+    ahead, state = frame.ahead, frame.readings
+    assert ahead is not None
+    head, axes = state.head[..., None, :], state.head_frame
+    device = tracked(state.centreline)[..., :-1, :] - head
+    goal = np.broadcast_to(frame.goal, state.head.shape)[..., None, :] - head
+    return {
+        "route_points": _flat(ahead.points, 2),
+        "route_radii": ahead.radii,
+        "route_goal": into_frame(goal, axes)[..., 0, :],
+        "route_device": _flat(into_frame(device, axes), 2),
+        "route_action": frame.action,
+    }
+
+
+@_register(
     Entry("goal_position", "m", "centre of the goal, world frame"),
     Entry("goal_from_head", "m", "from the head to the goal, world frame"),
 )
@@ -399,8 +438,9 @@ def resolve(names: str | Sequence[str]) -> tuple[str, ...]:
     Raises:
       ValueError: if a name is unknown or comes twice, or if there is none.
     """
-    chosen = (names,) if isinstance(names, str) else tuple(names)
-    unknown = [name for name in chosen if name not in OBSERVATIONS]
+    listed = isinstance(names, Sequence) and not isinstance(names, str | bytes)
+    chosen = tuple(names) if listed else (names,)
+    unknown = [n for n in chosen if not isinstance(n, str) or n not in OBSERVATIONS]
     if unknown or not chosen or len(set(chosen)) < len(chosen):
         raise ValueError(
             f"observation is {names!r}; give one of {', '.join(OBSERVATIONS)}, "
@@ -412,6 +452,11 @@ def resolve(names: str | Sequence[str]) -> tuple[str, ...]:
 def needs_fluoroscopy(names: Sequence[str]) -> bool:
     """Whether any of the observations needs the angiography machine."""
     return any(OBSERVATIONS[name].fluoroscopic for name in names)
+
+
+def needs_route(names: Sequence[str]) -> bool:
+    """Whether any of the observations needs the route to the goal."""
+    return any(OBSERVATIONS[name].routed for name in names)
 
 
 def observe(names: Sequence[str], frame: Frame) -> Observation:

@@ -2,6 +2,8 @@
 
 import numpy as np
 
+from cathsim_dmc.tasks.objectives import straight
+
 
 class PathTracker:
     """Paths of the heads of N simulations in their episodes."""
@@ -32,8 +34,7 @@ class PathTracker:
 
     def add(self, head: np.ndarray) -> None:
         """Adds the ways to the heads (N, 3), m."""
-        way = head - self._head
-        self._length = self._length + np.sqrt(np.vecdot(way, way))
+        self._length = self._length + straight(self._head, head)
         self._head = head
 
     @property

@@ -1,16 +1,20 @@
 """Errors of physics: found, named and kept for replay, never clipped away."""
 
+import io
 import json
 import logging
 import os
 import tempfile
+import uuid
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
 
+from cathsim_dmc import files
 from cathsim_dmc.anatomy import Anatomy
+from cathsim_dmc.tasks import placement
 
 DIVERGED = "diverged"
 ESCAPED = "escaped through the wall"
@@ -42,11 +46,14 @@ def escaped(anatomy: Anatomy, centreline: np.ndarray) -> np.ndarray:
       (...) bool: some node past the inlet lies more than 2 mm outside the lumen.
     """
     inlet = anatomy.inlet
-    beyond = (centreline - inlet.position) @ inlet.direction > _MOUTH
+    # Along the sheath, which need not stand as the vessel does; None where none fits.
+    along = placement.sheath_direction(anatomy)
+    along = inlet.direction if along is None else along
+    beyond = (centreline - inlet.position) @ along > _MOUTH
     # Farther from the inlet than the sheath reaches, a node may also lie behind the
     # plane of the inlet, in a vessel that turns back.
     aside = np.linalg.norm(centreline - inlet.position, axis=-1) > _MOUTH
-    axis = np.cross(centreline - inlet.position, inlet.direction)
+    axis = np.cross(centreline - inlet.position, along)
     in_sheath = ~beyond & (np.linalg.norm(axis, axis=-1) < inlet.radius)
     outside = aside & ~in_sheath
     outside[outside] = anatomy.depth(centreline[outside]) < -_ESCAPE_DEPTH
@@ -68,13 +75,19 @@ class PhysicsMonitor:
         self._anatomies = [anatomy] * num_simulations
         self._task = task
         self._states: list[np.ndarray | None] = [None] * num_simulations
-        self._actions: list[list[np.ndarray]] = [[] for _ in range(num_simulations)]
+        self._fresh = set(range(num_simulations))  # whose state is not kept yet
+        # Actions (N, A) of all, and where in them the episode of each begins.
+        self._actions: list[np.ndarray] = []
+        self._first = [0] * num_simulations
 
     def restart(self, index: int, anatomy: Anatomy) -> None:
         """Forgets the episode of a simulation; the next one is in an anatomy."""
         self._anatomies[index] = anatomy
-        self._states[index] = None
-        self._actions[index] = []
+        self._fresh.add(index)
+        self._first[index] = len(self._actions)
+        if unused := min(self._first):
+            del self._actions[:unused]
+            self._first = [first - unused for first in self._first]
 
     def before_step(
         self, read_states: Callable[[], np.ndarray], actions: np.ndarray
@@ -84,21 +97,20 @@ class PhysicsMonitor:
         Args:
           read_states: Reads the states (N, nstate), mjSTATE_INTEGRATION; called only
             when an episode begins.
-          actions: (N, A).
+          actions: (N, A), which nobody changes afterwards.
         """
-        if any(state is None for state in self._states):
+        if self._fresh:
             states = read_states()
-            for index, state in enumerate(self._states):
-                if state is None:
-                    self._states[index] = states[index].copy()
-        for index, action in enumerate(actions):
-            self._actions[index].append(action)
+            for index in self._fresh:
+                self._states[index] = states[index].copy()
+            self._fresh.clear()
+        self._actions.append(actions)
 
     def errors(
         self,
         diverged: Sequence[bool],
         centreline: np.ndarray,
-        peak_force: Sequence[float] | np.ndarray,
+        peak_force: np.ndarray,
     ) -> list[str | None]:
         """What went wrong in the control step that has just ended; logs and dumps it.
 
@@ -112,16 +124,17 @@ class PhysicsMonitor:
         """
         # Plain Python: numpy takes longer over the one simulation of an environment,
         # and no longer over many.
+        taken = len(self._actions)
         looked = [
             index
-            for index, actions in enumerate(self._actions)
-            if not len(actions) % ESCAPE_INTERVAL
+            for index, first in enumerate(self._first)
+            if not (taken - first) % ESCAPE_INTERVAL
         ]
         wrong = [
-            bool(warned or not force <= MAX_FORCE)
-            for warned, force in zip(diverged, peak_force, strict=True)
+            warned or not force <= MAX_FORCE
+            for warned, force in zip(diverged, peak_force.tolist(), strict=True)
         ]
-        reasons: list[str | None] = [None] * len(self._actions)
+        reasons: list[str | None] = [None] * len(self._first)
         if not looked and not any(wrong):
             return reasons
         out = np.zeros(len(reasons), dtype=bool)
@@ -130,13 +143,19 @@ class PhysicsMonitor:
         for index in np.flatnonzero(wrong | out).tolist():
             reason = ESCAPED if out[index] and not wrong[index] else EXPLODED
             reasons[index] = reason = DIVERGED if diverged[index] else reason
-            dump(
-                reason,
-                task={"anatomy": self._anatomies[index].name, **self._task},
-                # Kept before the step that went wrong.
-                state=cast(np.ndarray, self._states[index]),
-                actions=np.array(self._actions[index]),
-            )
+            try:
+                dump(
+                    reason,
+                    task={"anatomy": self._anatomies[index].name, **self._task},
+                    # Kept before the step that went wrong.
+                    state=cast(np.ndarray, self._states[index]),
+                    actions=np.array(
+                        [one[index] for one in self._actions[self._first[index] :]]
+                    ),
+                )
+            except OSError as error:
+                # A full disk must not end the other simulations.
+                _LOG.error("%s; what would replay it is lost: %s", reason, error)
         return reasons
 
     def _escaped(self, looked: list[int], centreline: np.ndarray) -> np.ndarray:
@@ -176,18 +195,19 @@ def dump(
     )
     directory.mkdir(parents=True, exist_ok=True)
     meta = json.dumps({"format": _FORMAT, "reason": reason, "task": task})
-    handle, name = tempfile.mkstemp(".npz", "cathsim-error-", directory)
-    with os.fdopen(handle, "wb") as stream:
-        np.savez(stream, meta=np.array(meta), state=state, actions=actions)
+    path = directory / f"cathsim-error-{uuid.uuid4().hex[:12]}.npz"
+    buffer = io.BytesIO()
+    np.savez(buffer, meta=np.array(meta), state=state, actions=actions)
+    files.write_bytes(path, buffer.getvalue())
     _LOG.error(
         "%s after %d steps of %s; replay it with "
         "cathsim_dmc.tasks.physics_errors.load(%r)",
         reason,
         len(actions),
         task.get("goal", "an episode"),
-        name,
+        str(path),
     )
-    return Path(name)
+    return path
 
 
 def load(path: str | Path) -> tuple[dict[str, Any], np.ndarray, np.ndarray]:
@@ -196,12 +216,18 @@ def load(path: str | Path) -> tuple[dict[str, Any], np.ndarray, np.ndarray]:
     Raises:
       ValueError: if the file is no dump of this format.
     """
-    with np.load(path, allow_pickle=False) as data:
-        if not {"meta", "state", "actions"} <= set(data.files):
-            raise ValueError(f"{path} is no dump of an episode; it has {data.files}")
-        meta = json.loads(str(data["meta"]))
-        if meta.get("format") != _FORMAT:
-            raise ValueError(
-                f"{path} has format {meta.get('format')}; this version reads {_FORMAT}"
-            )
-        return meta, data["state"], data["actions"]
+    try:
+        # A lone array is no archive, and has nothing to enter.
+        with np.load(path, allow_pickle=False) as data:
+            held = {name: data[name] for name in ("meta", "state", "actions")}
+        meta = json.loads(str(held["meta"]))
+    except FileNotFoundError:
+        raise
+    except (*files.DAMAGED_ARCHIVE, TypeError) as error:
+        raise ValueError(f"{path} is no dump of an episode: {error}") from error
+    if not isinstance(meta, dict) or meta.get("format") != _FORMAT:
+        raise ValueError(
+            f"{path} is no dump of an episode of format {_FORMAT}, which this version "
+            "reads"
+        )
+    return meta, held["state"], held["actions"]

@@ -36,6 +36,7 @@ class Readings(NamedTuple):
         subtree's centre of mass (`cfrc_ext`), N·m and N.
       centreline: (..., L + 1, 3), proximal ends of the links and the head, m.
       head: (..., 3), distal end, m.
+      head_frame: (..., 3, 3), orientation of the last link, its axes in columns.
       push_force: (...), N, positive when the base pushes the device forward.
       push_torque: (...), N·m, torque of the base on the device about its axis.
       load_cell: (..., 3), N, force of the phantom on its support.
@@ -50,6 +51,7 @@ class Readings(NamedTuple):
     external_force: np.ndarray
     centreline: np.ndarray
     head: np.ndarray
+    head_frame: np.ndarray
     push_force: np.ndarray
     push_torque: np.ndarray
     load_cell: np.ndarray
@@ -61,6 +63,7 @@ class Views(NamedTuple):
     Attributes:
       links: (..., L, 3), proximal ends of the links.
       tip: (..., 1, 3), the head, in line with the links.
+      rotation: (..., 9), orientation of the last link, row by row.
       load_cell: (..., 3), force of the support on the phantom.
 
     The others are those of `Readings`.
@@ -76,6 +79,7 @@ class Views(NamedTuple):
     links: np.ndarray
     tip: np.ndarray
     head: np.ndarray
+    rotation: np.ndarray
     push_force: np.ndarray
     push_torque: np.ndarray
     load_cell: np.ndarray
@@ -92,6 +96,7 @@ class Views(NamedTuple):
             external_force=self.external_force.copy(),
             centreline=np.concatenate([self.links, self.tip], axis=-2),
             head=self.head.copy(),
+            head_frame=self.rotation.reshape(*self.rotation.shape[:-1], 3, 3).copy(),
             push_force=self.push_force.copy(),
             push_torque=self.push_torque.copy(),
             load_cell=-self.load_cell,
@@ -111,6 +116,7 @@ class ModelIndex:
         "cfrc_ext",
         "xpos",
         "site_xpos",
+        "site_xmat",
         "sensordata",
     )
 
@@ -148,7 +154,8 @@ class ModelIndex:
             _id(model, mujoco.mjtObj.mjOBJ_JOINT, f"{robot}/{joint.name}")
             for joint in JOINTS
         ]
-        self.robot_qpos = model.jnt_qposadr[follower].copy()
+        # Whole numbers of the size that numpy indexes with: others are cast each time.
+        self.robot_qpos = model.jnt_qposadr[follower].astype(np.intp)
         self.head_site = _id(model, mujoco.mjtObj.mjOBJ_SITE, f"{catheter}/head")
         self.push_force = _sensor(model, f"{catheter}/push_force")
         self.push_torque = _sensor(model, f"{catheter}/push_torque")
@@ -177,6 +184,7 @@ class ModelIndex:
             links=data.xpos[..., self.links, :],
             tip=head[..., None, :],
             head=head,
+            rotation=data.site_xmat[..., self.head_site, :],
             # MuJoCo reports the force of the parent on the site's body.
             push_force=sensors[..., self.push_force.start + 2],
             push_torque=sensors[..., self.push_torque.start + 2],

@@ -19,9 +19,15 @@ from cathsim_dmc.tasks.cases import Case, model_index
 from cathsim_dmc.tasks.config import NavigationConfig
 from cathsim_dmc.tasks.image_sensors import ImageSensors, open_cameras
 from cathsim_dmc.tasks.objective_pool import together
-from cathsim_dmc.tasks.objectives import Measurement, Objective, ShiftableObjective
+from cathsim_dmc.tasks.objectives import (
+    Measurement,
+    Objective,
+    ShiftableObjective,
+    straight,
+)
 from cathsim_dmc.tasks.path_tracker import PathTracker
 from cathsim_dmc.tasks.physics_errors import PhysicsMonitor
+from cathsim_dmc.tasks.route import Routes
 from cathsim_dmc.tasks.step import Step
 from cathsim_dmc.tasks.variations import ActionDelay, ModelVariation
 
@@ -102,6 +108,9 @@ class Rollout:
         self._delay = ActionDelay(
             num_simulations, num_actions, randomisation.longest_delay
         )
+        self._routes: Routes | None = None
+        if observations.needs_route(self._names):
+            self._routes = Routes([case.objective for case in cases])
         self._sensors = ImageSensors(
             self._names,
             cases[0].angiograph,
@@ -256,9 +265,15 @@ class Rollout:
             their images are captured. None for all, one control step on.
           ended: (N,) bool, None for what the objective and the physics say.
         """
+        goal = self._objective.goal
+        distance = straight(self._readings.head, goal)
         outcome = self._objective.outcome(
             Measurement(
-                self._readings, self._wall_force, self._action, self._previous_action
+                self._readings,
+                self._wall_force,
+                self._action,
+                self._previous_action,
+                distance,
             )
         )
         success = outcome.success
@@ -271,7 +286,6 @@ class Rollout:
                 reward=np.where(failed, 0.0, outcome.reward),
                 terms={n: np.where(failed, 0.0, t) for n, t in outcome.terms.items()},
             )
-        goal = self._objective.goal
         return Step(
             observation=self._observe(goal, fresh),
             outcome=outcome,
@@ -280,7 +294,7 @@ class Rollout:
             errors=tuple(errors),
             readings=self._readings,
             wall_force=self._wall_force,
-            goal=goal,
+            distance=distance,
             path_ratio=self._path.ratio,
         )
 
@@ -294,8 +308,11 @@ class Rollout:
             self._random_states,
             fresh,
         )
+        state, ahead = self._readings, None
+        if self._routes is not None:
+            ahead = self._routes.ahead(self._case_of, state.head, state.head_frame)
         frame = observations.Frame(
-            self._readings, self._wall_force, self._action, goal, images
+            state, self._wall_force, self._action, goal, images, ahead
         )
         return observations.observe(self._names, frame)
 

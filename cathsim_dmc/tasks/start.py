@@ -110,7 +110,7 @@ class StartPosture:
         way = np.linalg.norm(np.diff(place.line, axis=0), axis=-1).sum()
         way -= float(np.sum(scene.catheter.link_lengths)) + START_JITTER
         settled = []
-        for share in np.linspace(*shares, _STARTS_ALONG_ROUTE):
+        for share in np.linspace(shares[0], shares[1], _STARTS_ALONG_ROUTE):
             data = self._settle(scene, model, START_JITTER + share * way)
             try:
                 _refuse_outside(scene, model, index, data)

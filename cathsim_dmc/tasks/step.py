@@ -20,7 +20,7 @@ class Step(NamedTuple):
         a dump that replays the episode, which says nothing about the policy.
       readings: state of the devices.
       wall_force: force on the wall over the control step.
-      goal: (3,), or (N, 3) where it differs between simulations, m.
+      distance: (N,), straight from head to goal, m.
       path_ratio: (N,), way of the head so far over the shortest way to the goal.
     """
 
@@ -31,14 +31,8 @@ class Step(NamedTuple):
     errors: tuple[str | None, ...]
     readings: readings.Readings
     wall_force: forces.WallForce
-    goal: np.ndarray
+    distance: np.ndarray
     path_ratio: np.ndarray
-
-    @property
-    def distance(self) -> np.ndarray:
-        """(N,), straight from head to goal, m."""
-        offset = self.readings.head - self.goal
-        return np.sqrt(np.vecdot(offset, offset))
 
     @property
     def physics_error(self) -> np.ndarray:

@@ -30,7 +30,7 @@ class Rig:
 
     def __init__(
         self,
-        device: str | devices.Device = "published",
+        device: str | devices.Device = "steerable_5f",
         discretisation: devices.Discretisation | None = None,
         *,
         stroke: float = 0.1,

@@ -55,7 +55,7 @@ def straight(device: str | devices.Device) -> devices.Device:
 
 
 def cantilevers(
-    device: str | devices.Device = "published",
+    device: str | devices.Device = "steerable_5f",
     end_angles=END_ANGLES,
     *,
     plane: float = np.pi / 4,
@@ -122,7 +122,7 @@ class Buckling:
 def buckling(
     end: str,
     joints: int | None = None,
-    device: str | devices.Device = "published",
+    device: str | devices.Device = "steerable_5f",
     discretisation: devices.Discretisation | None = None,
 ) -> Buckling:
     """Measures the critical load of a clamped-guided length by a Southwell plot.
@@ -199,7 +199,7 @@ class TwistUnderTorque:
 
 
 def twist_under_torque(
-    device: str | devices.Device = "published",
+    device: str | devices.Device = "steerable_5f",
     torsion_joints: int = TORSION_JOINTS,
 ) -> TwistUnderTorque:
     """Twists the straight device by a torque on its end against GJ."""
@@ -238,7 +238,7 @@ class TwistLag:
 
 
 def twist_lag(
-    device: str | devices.Device = "published",
+    device: str | devices.Device = "steerable_5f",
     torsion_joints: int = TORSION_JOINTS,
     duration: float = 4.0,
 ) -> TwistLag:
@@ -356,7 +356,7 @@ def validate_rod(figure_path: str | Path | None = None) -> Report:
                 f"over {1e3 * column.length:.0f} mm",
             )
         )
-    for name in ("published", "wire_035_amplatz"):
+    for name in ("steerable_5f", "wire_035_amplatz"):
         turned = twist_under_torque(name)
         checks.append(
             Check.deviation(

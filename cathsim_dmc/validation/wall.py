@@ -91,7 +91,7 @@ class Capstan:
 def capstan(
     friction: float,
     wrap: float = WRAP,
-    device: str | devices.Device = "published",
+    device: str | devices.Device = "steerable_5f",
 ) -> Capstan:
     """Pulls the rod over a drum with and without friction.
 
@@ -195,7 +195,7 @@ def lumen_checks(anatomy: Anatomy, rays: int = RAYS) -> list[Check]:
     name = anatomy.name
     inside = fidelity.intrusion(anatomy).inside
     cover = fidelity.coverage(anatomy, rays)
-    device = devices.get("published")
+    device = devices.get("steerable_5f")
     passage = fidelity.patency(anatomy, device.outer_radius)
     bounds = {"mean": INTRUSION_MEAN, "p95": INTRUSION_P95, "max": INTRUSION_MAX}
     loose = surface.loose_edges(anatomy.surface)
@@ -277,8 +277,7 @@ def validate_anatomy(
     findings: dict[str, Any] = {}
     for name, anatomy in anatomies.items():
         checks += lumen_checks(dataclasses.replace(anatomy, name=name), rays)
-        if anatomy.field is not None:
-            checks += tree_checks(dataclasses.replace(anatomy, name=name))
+        checks += tree_checks(dataclasses.replace(anatomy, name=name))
         findings[name] = {"measures": shape(anatomy)}
         if push:
             from cathsim_dmc.validation.push import straight_push
@@ -295,7 +294,7 @@ def validate_anatomy(
 
 
 def tree_checks(anatomy: Anatomy) -> list[Check]:
-    """Tree of a scan against its surface; see `anatomy.scan.check.check_tree`."""
+    """Tree against surface; see `anatomy.scan.check.check_tree`."""
     return [
         Check.at_most(
             f"{anatomy.name}: {found.name}, violations",

@@ -4,8 +4,9 @@ Built in the patient frame LPS with the inlet of the ascending aorta at the
 origin. The arch is half an ellipse in a plane, between an ascending and a
 descending limb; limbs may bend and the plane may tilt and sway. Three branches
 leave the outer curve: brachiocephalic (bca), left common carotid (lcca) and
-left subclavian artery (lsa). The presets here are idealised: straight limbs in
-a vertical plane. `arch.sampler` draws curved ones.
+left subclavian artery (lsa). The presets of types I and II are idealised: straight
+limbs in a vertical plane. Type III and bovine curve in space, as what `arch.sampler`
+draws does.
 """
 
 from __future__ import annotations
@@ -150,9 +151,50 @@ TYPE_II = ArchParameters(
     ),
     bca_drop=1.5,
 )
-TYPE_III = replace(TYPE_II, bca_drop=2.5)
+
+
+def _bent(
+    branch: BranchParameters, lean: float, radius: float, azimuth: float
+) -> BranchParameters:
+    """A branch that leaves the plane of the arch, bends, and bends back half way."""
+    return replace(
+        branch,
+        lean=_degrees(lean),
+        length=50e-3,
+        bend_radius=radius,
+        bend_azimuth=azimuth,
+        second_bend_radius=radius,
+        second_bend_azimuth=azimuth - math.pi,
+    )
+
+
+# Arches that curve in space, as the sampler's do: sizes are the same anatomical means,
+# the limb turns by the sampler's mean, branches lean and bend as far as those of the
+# measured phantoms, and root and BCA are 62.6 and 66 mm apart (mean 62.6 ± 11.4). The
+# LCCA stands one standard deviation steeper than the mean: leaning upstream by 26
+# degrees it lies in the way of a device that slides over the top of the arch.
+TYPE_III = replace(
+    TYPE_II,
+    bca=_bent(TYPE_II.bca, 8.0, 45e-3, 0.6),
+    lcca=_bent(replace(TYPE_II.lcca, take_off=_degrees(10.0)), 14.0, 40e-3, 0.6),
+    lsa=_bent(TYPE_II.lsa, 10.0, 43e-3, math.pi + 0.6),
+    bca_drop=2.391,
+    ascending_length=45.6e-3,
+    descending_length=115e-3,
+    ascending_bend=_degrees(30.0),
+    sway=4e-3,
+)
+# The LCCA off the BCA, on an arch nearly as steep; the LSA leans back by half a
+# standard deviation more than the mean.
 BOVINE = replace(
-    TYPE_II, bca_drop=1.0, bca_lcca_spacing=10e-3, lcca_lsa_spacing=30e-3, bovine=True
+    TYPE_III,
+    lcca=_bent(TYPE_II.lcca, 14.0, 40e-3, 0.6),
+    lsa=replace(TYPE_III.lsa, take_off=_degrees(-36.0)),
+    bca_drop=2.166,
+    ascending_length=43.76e-3,
+    bca_lcca_spacing=10e-3,
+    lcca_lsa_spacing=36.1e-3,
+    bovine=True,
 )
 ARCHES: Mapping[str, ArchParameters] = MappingProxyType(
     {"simple1": TYPE_I, "simple2": TYPE_II, "type3": TYPE_III, "bovine": BOVINE}

@@ -21,6 +21,7 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import ConvexHull, QhullError, cKDTree
 
+from cathsim_dmc import bounds
 from cathsim_dmc.anatomy.centreline import VesselTree
 from cathsim_dmc.anatomy.scan.wall import (
     CLEARANCE,
@@ -72,12 +73,7 @@ def load_coacd():
 def check_threshold(threshold: float) -> float:
     """``threshold`` (m) if it is one; ValueError says what is allowed."""
     low, high = THRESHOLDS
-    if not low <= threshold <= high:
-        raise ValueError(
-            f"the threshold is {threshold * 1e3:g} mm; give {low * 1e3:g} to "
-            f"{high * 1e3:g} mm."
-        )
-    return float(threshold)
+    return bounds.number("threshold", threshold, low, high, "m")
 
 
 def decompose_wall(

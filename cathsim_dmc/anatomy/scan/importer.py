@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
+from cathsim_dmc import bounds
 from cathsim_dmc.anatomy.anatomy import Anatomy, Inlet, Surface
 from cathsim_dmc.anatomy.centreline import VesselTree
 from cathsim_dmc.anatomy.scan import coacd_wall
@@ -39,6 +40,10 @@ log = logging.getLogger(__name__)
 
 ROOT = "aorta"
 WALLS = ("prisms", "coacd")
+FRAMES = ("LPS", "RAS")
+# Of the lattice of depths and of the prisms, m: finer ones take all memory, coarser
+# ones no longer see the vessels.
+SPACINGS, TOLERANCES = (1e-4, 2e-3), (1e-5, 2e-3)
 NEAR_INLET = 15e-3  # m, distance from the lumen of an inlet that is pointed at
 RADII = (0.3e-3, 30e-3)  # m, allowed median radius of a vessel: arteriole, aneurysm
 
@@ -102,6 +107,10 @@ def import_scan(
             does not agree with the surface; says how to mend it.
     """
     threshold = _check_wall(wall, threshold)
+    bounds.choice("mesh_frame", mesh_frame, FRAMES)
+    bounds.number("spacing", spacing, *SPACINGS, "m")
+    bounds.number("tolerance", tolerance, *TOLERANCES, "m")
+    _check_rename(rename)
     started = time.monotonic()
 
     def say(text: str) -> None:
@@ -298,8 +307,18 @@ def _check_near(place: np.ndarray | None, measure: MeshDepth) -> None:
         )
 
 
+def _check_rename(rename: Mapping[str, str] | None) -> None:
+    if rename is None:
+        return
+    if not isinstance(rename, Mapping) or not all(
+        isinstance(word, str) for pair in rename.items() for word in pair
+    ):
+        bounds.refuse("rename", rename, "a mapping of computed names to wanted ones")
+
+
 def _check_paths(paths: Sequence[str | Path]) -> None:
-    if isinstance(paths, str | Path):
+    listed = isinstance(paths, Sequence) and not isinstance(paths, str | bytes)
+    if not listed or not all(isinstance(path, str | Path) for path in paths):
         raise ValueError(
             f"centreline_paths is {paths!r}; give a list of files, one per branch (3D "
             "Slicer .mrk.json or .csv), or none to have them computed."

@@ -1,0 +1,297 @@
+"""Expert demonstrations: recorded as Minari datasets, read back for learning."""
+
+import dataclasses
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from tensordict import TensorDict, TensorDictBase
+
+from cathsim_dmc.agents.networks import NetworkShapes
+from cathsim_dmc.policies import BatchedView
+from cathsim_dmc.policies.expert import ExpertPolicy
+from cathsim_dmc.recording import dataset
+from cathsim_dmc.recording.dataset_reader import (
+    DatasetEpisode,
+    DatasetError,
+    read_episodes,
+)
+from cathsim_dmc.simulation.environments import PIXELS, VECTOR
+from cathsim_dmc.tasks import observations
+from cathsim_dmc.tasks.step import Step
+
+DEMONSTRATION_SEED = 2_000_000  # apart from the seeds of evaluation
+# Among the infos: what the expert would do, where noise was added to what it did.
+EXPERT_ACTION = "expert_action"
+_SIMULATIONS = 16
+
+
+@dataclasses.dataclass(frozen=True)
+class Demonstrations:
+    """What was recorded.
+
+    Attributes:
+        path: Directory of the dataset.
+        episodes: Number of episodes.
+        successes: Number of those that reached the goal.
+        steps: Number of control steps in all.
+        mean_force: Mean over all steps of the sum over the contacts, N.
+        max_force: Largest single contact at the end of a step, N.
+    """
+
+    path: Path
+    episodes: int
+    successes: int
+    steps: int
+    mean_force: float
+    max_force: float
+
+
+def record_demonstrations(
+    task: str,
+    out: str | Path,
+    episodes: int = 20,
+    *,
+    observation: str | Sequence[str] = "tracking",
+    seed: int = DEMONSTRATION_SEED,
+    noise: float = 0.0,
+    task_kwargs: Mapping[str, Any] | None = None,
+    num_threads: int | None = None,
+    say: Callable[[str], None] | None = None,
+) -> Demonstrations:
+    """Let the expert play and write what it saw and did as a Minari dataset.
+
+    With noise the expert is pushed off its way and shows how it comes back; what it
+    would have done stands in the infos as "expert_action", at the end of the episode
+    too.
+
+    Args:
+        task: Name of the task.
+        out: Directory of the dataset, which must not exist.
+        episodes: Number of episodes.
+        observation: Name or names of the observations.
+        seed: Seed of the first episode; the others count up. The noise of an episode
+            is drawn from its seed too.
+        noise: Standard deviation of normal noise added to every entry of the
+            expert's action, which is clipped to [-1, 1] afterwards.
+        task_kwargs: Further options of the task; must be JSON-able.
+        num_threads: Number of threads of the simulation; None takes one per core.
+        say: Function that is told of progress.
+
+    Raises:
+        ValueError: a number is out of range, the task or an option is unknown, or the
+            task's device cannot be steered.
+        FileExistsError: `out` exists.
+        FileNotFoundError: the directory around `out` does not exist.
+        ModuleNotFoundError: minari is not installed.
+    """
+    out = Path(out)
+    if episodes < 1:
+        raise ValueError(f"episodes={episodes}: at least one is needed")
+    if not 0 <= noise <= 1:
+        raise ValueError(f"noise={noise} must be a deviation in [0, 1]")
+    dataset.check_free(out)
+    from cathsim_dmc.simulation.gymnasium import CathSimVectorEnv, env_spec
+
+    names = observation if isinstance(observation, str) else list(observation)
+    options = {**(task_kwargs or {}), "observation": names}
+    count = min(episodes, _SIMULATIONS)
+    environment = CathSimVectorEnv(count, task, num_threads or 0, **options)
+    buffers: list[Any] = []
+    while len(buffers) < episodes:
+        seeds = np.arange(count) + seed + len(buffers)
+        played = _play(environment.simulation, seeds, noise)
+        buffers += played[: episodes - len(buffers)]
+        if say is not None:
+            say(f"{len(buffers)} of {episodes} episodes")
+    dataset.write(
+        out,
+        buffers,
+        env_spec=env_spec(task, **options),
+        observation_space=environment.single_observation_space,
+        action_space=environment.single_action_space,
+        algorithm=f"scripted expert, noise {noise:g}",
+        description=f"{episodes} demonstrations of the task {task} of cathsim_dmc, "
+        f"seeds from {seed}",
+    )
+    return _summary(out, buffers)
+
+
+def _summary(out: Path, buffers: Sequence[Any]) -> Demonstrations:
+    def joined(name: str) -> np.ndarray:
+        return np.concatenate([buffer.infos[name][1:] for buffer in buffers])
+
+    return Demonstrations(
+        path=out,
+        episodes=len(buffers),
+        successes=sum(bool(buffer.infos["success"][-1]) for buffer in buffers),
+        steps=sum(len(buffer.rewards) for buffer in buffers),
+        mean_force=float(joined("wall_force_sum").mean()),
+        max_force=float(joined("wall_force_max").max()),
+    )
+
+
+def _play(simulation: Any, seeds: np.ndarray, noise: float) -> list[Any]:
+    """An episode of the expert for each seed, side by side, as Minari's buffers."""
+    from minari.data_collector import EpisodeBuffer
+
+    count = len(seeds)
+    simulation.seed(seeds.tolist())
+    generators = [np.random.default_rng(int(seed)) for seed in seeds]
+    expert, view = ExpertPolicy(), BatchedView(simulation)
+    rows = [_Rows() for _ in seeds]
+    step = simulation.reset()
+    expert.reset(view, np.ones(count, dtype=bool))
+    running = np.ones(count, dtype=bool)
+    for row in np.flatnonzero(running).tolist():
+        rows[row].see(step, row)
+    while running.any():
+        chosen = expert.act(None).astype(np.float32)
+        action = chosen
+        if noise:
+            size = chosen.shape[-1]
+            drawn = np.stack([draw.normal(0.0, noise, size) for draw in generators])
+            action = np.clip(chosen + drawn, -1.0, 1.0).astype(np.float32)
+            expert.follow(action)
+        step = simulation.step(action.astype(np.float64))
+        for row in np.flatnonzero(running).tolist():
+            rows[row].do(chosen[row], action[row], step, row)
+            rows[row].see(step, row)
+        running &= ~(step.terminated | step.truncated)
+    last = expert.act(None).astype(np.float32)
+    return [
+        EpisodeBuffer(seed=int(seed), **one.columns(last[row]))
+        for row, (seed, one) in enumerate(zip(seeds, rows, strict=True))
+    ]
+
+
+class _Rows:
+    """What happens to one simulation."""
+
+    def __init__(self) -> None:
+        self.seen: list[dict[str, np.ndarray]] = []
+        self.infos: list[dict[str, np.ndarray]] = []
+        self.steps: list[tuple[np.ndarray, np.ndarray, float, bool, bool]] = []
+
+    def see(self, step: Step, row: int) -> None:
+        """Take note of the observation before the next step."""
+        self.seen.append({key: _single(v[row]) for key, v in step.observation.items()})
+        self.infos.append({key: v[row] for key, v in step.info().items()})
+
+    def do(self, chosen: np.ndarray, action: np.ndarray, step: Step, row: int) -> None:
+        """Take note of what the expert chose, what was done and how it ended."""
+        ends = bool(step.terminated[row]), bool(step.truncated[row])
+        self.steps.append((chosen, action, float(step.outcome.reward[row]), *ends))
+
+    def columns(self, last: np.ndarray) -> dict[str, Any]:
+        """Fields of Minari's buffer, given what the expert would do at the end."""
+        chosen, actions, rewards, terminated, truncated = zip(*self.steps, strict=True)
+        infos = {key: np.array([i[key] for i in self.infos]) for key in self.infos[0]}
+        infos[EXPERT_ACTION] = np.stack([*chosen, last])
+        return {
+            "observations": {
+                key: np.stack([one[key] for one in self.seen]) for key in self.seen[0]
+            },
+            "actions": np.stack(actions),
+            "rewards": list(rewards),
+            "terminations": list(terminated),
+            "truncations": list(truncated),
+            "infos": infos,
+        }
+
+
+def _single(array: np.ndarray) -> np.ndarray:
+    return array if array.dtype == np.uint8 else array.astype(np.float32)
+
+
+def load_transitions(
+    path: str | Path,
+    observation: str | Sequence[str],
+    shapes: NetworkShapes,
+) -> TensorDictBase:
+    """Transitions of a dataset's successful episodes, as a collector gives them.
+
+    Args:
+        path: Directory of a Minari dataset.
+        observation: Name or names of the observations that the networks read; the
+            dataset may hold others beside them.
+        shapes: Sizes that the networks have.
+
+    Returns:
+        A TensorDict (n,) on the CPU with VECTOR and/or PIXELS, "action",
+        "expert_action" and under "next" the observation, "reward", "done" and
+        "terminated".
+
+    Raises:
+        DatasetError: there is none, it is damaged, or it holds no successful episode,
+            or observations or actions of other sizes.
+        ModuleNotFoundError: h5py is not installed.
+    """
+    keys = observations.entry_specs(
+        observations.resolve(observation), observations.ImageOptions()
+    )
+    episodes = [_tensors(path, e, sorted(keys)) for e in read_episodes(path)]
+    succeeded = [one for one in episodes if one is not None]
+    if not succeeded:
+        raise DatasetError(f"none of the {len(episodes)} episodes in {path} succeeds")
+    transitions = TensorDict.cat(succeeded)
+    found = _shapes(transitions)
+    if found != shapes:
+        raise DatasetError(
+            f"{path} holds {found}, and the task with the observation {observation!r} "
+            f"has {shapes}: record it for the same task and options"
+        )
+    return transitions
+
+
+def _shapes(transitions: TensorDictBase) -> NetworkShapes:
+    vector, pixels = (transitions.get(key, None) for key in (VECTOR, PIXELS))
+    image = None
+    if pixels is not None:
+        channels, height, width = pixels.shape[1:]
+        image = (channels, height, width)
+    size = 0 if vector is None else vector.shape[-1]
+    return NetworkShapes(size, image, transitions["action"].shape[-1])
+
+
+def _tensors(
+    path: str | Path, episode: DatasetEpisode, keys: Sequence[str]
+) -> TensorDict | None:
+    """Transitions of an episode; None if it did not succeed."""
+    missing = sorted(set(keys) - set(episode.observations))
+    if missing:
+        raise DatasetError(
+            f"{path} lacks {', '.join(missing)}; it has "
+            f"{', '.join(sorted(episode.observations))}: record the observation that "
+            "the learner is to see"
+        )
+    if not episode.success:
+        return None
+    # In the order in which `environments.standard_observations` joins them.
+    arrays = [torch.as_tensor(episode.observations[key]) for key in keys]
+    numbers = [a.flatten(1).float() for a in arrays if a.dtype != torch.uint8]
+    images = [a.movedim(-1, -3) for a in arrays if a.dtype == torch.uint8]
+    seen = {}
+    if numbers:
+        seen[VECTOR] = torch.cat(numbers, -1)
+    if images:
+        seen[PIXELS] = torch.cat(images, -3)
+    steps = len(episode.actions)
+    done = episode.terminations.astype(bool) | episode.truncations.astype(bool)
+    chosen = episode.infos.get(EXPERT_ACTION, episode.actions)[:steps]
+    return TensorDict(
+        {
+            **{key: value[:-1] for key, value in seen.items()},
+            "action": torch.as_tensor(episode.actions).float(),
+            EXPERT_ACTION: torch.as_tensor(chosen).float(),
+            "next": {
+                **{key: value[1:] for key, value in seen.items()},
+                "reward": torch.as_tensor(episode.rewards).float()[:, None],
+                "done": torch.as_tensor(done)[:, None],
+                "terminated": torch.as_tensor(episode.terminations).bool()[:, None],
+            },
+        },
+        batch_size=[steps],
+    )

@@ -1,0 +1,33 @@
+"""What a policy may know of the simulations under a TorchRL environment."""
+
+from typing import Any, cast
+
+from torchrl.envs import EnvBase, SerialEnv
+
+from cathsim_dmc.policies import BatchedView, ComposerView, View
+from cathsim_dmc.simulation import environments
+
+
+class _ForeignView:
+    """Simulations of an environment that is not ours: only their numbers are known."""
+
+    def __init__(self, env: EnvBase):
+        (self.num_simulations,) = env.batch_size
+        self.num_actions = int(env.action_spec.shape[-1])
+
+    def __getattr__(self, name: str) -> Any:
+        raise AttributeError(
+            f"the policy asks for {name!r}, which only environments of "
+            "cathsim_dmc.simulation know"
+        )
+
+
+def view_of(env: EnvBase) -> View:
+    """What a policy may know of the simulations of a TorchRL environment."""
+    base = getattr(env, "base_env", env)
+    if hasattr(base, "simulation"):
+        return BatchedView(base.simulation)
+    if isinstance(base, SerialEnv):
+        return ComposerView([environments.composer_of(one) for one in base._envs])
+    # Whatever a policy asks of it beyond its numbers is an error that says so.
+    return cast(View, _ForeignView(env))

@@ -1,0 +1,70 @@
+"""Starts a learner from the policy of another run."""
+
+import torch
+from torch import nn
+
+from cathsim_dmc.agents.checkpoint import Checkpoint
+from cathsim_dmc.agents.config import ConfigError, TrainingConfig
+from cathsim_dmc.agents.imitation import network_of, normaliser_of
+from cathsim_dmc.agents.networks import LOG_STD_RANGE, NetworkShapes
+
+# What must agree for the weights to mean the same.
+_ALIKE = ("observation", "hidden", "activation", "cnn_features", "observation_clip")
+
+
+def take_over(policy: nn.Module, config: TrainingConfig, shapes: NetworkShapes) -> None:
+    """Give a policy the weights and observation statistics of `initial_policy`.
+
+    A deviation that depends on the state (SAC) starts as one that does not (PPO,
+    cloning), and the other way round as its value in the middle of all states.
+
+    Args:
+        policy: Policy of the learner, changed in place.
+        config: Settings of the run that begins.
+        shapes: Sizes of its observation and action.
+
+    Raises:
+        ConfigError: the other policy has another network or observation.
+        CheckpointError: there is none, or it is damaged.
+    """
+    source = Checkpoint.open(str(config.initial_policy))
+    differing = [
+        f"{name}: it has {getattr(source.config, name)!r}, given is "
+        f"{getattr(config, name)!r}"
+        for name in _ALIKE
+        if getattr(source.config, name) != getattr(config, name)
+    ]
+    if source.shapes != shapes:
+        differing.append(f"sizes: it has {source.shapes}, the task has {shapes}")
+    if differing:
+        raise ConfigError(
+            f"initial_policy={config.initial_policy!r} does not fit "
+            f"({'; '.join(differing)}); give the same settings, or another policy."
+        )
+    given = source.policy()
+    theirs, ours = network_of(given), network_of(policy)
+    ours.body.load_state_dict(theirs.body.state_dict())
+    ours.mean.load_state_dict(theirs.mean.state_dict())
+    with torch.no_grad():
+        _set_deviation(ours.log_std, theirs.log_std, config.initial_std)
+    statistics, own = normaliser_of(given), normaliser_of(policy)
+    if statistics is not None and own is not None:
+        own.load_state_dict(statistics.state_dict())
+
+
+def _set_deviation(
+    ours: nn.Linear | nn.Parameter,
+    theirs: nn.Linear | nn.Parameter,
+    value: float | None,
+) -> None:
+    """Copy what a deviation depends on, or give it one value."""
+    if isinstance(ours, nn.Linear) and isinstance(theirs, nn.Linear) and value is None:
+        ours.load_state_dict(theirs.state_dict())
+        return
+    middle = theirs.bias if isinstance(theirs, nn.Linear) else theirs
+    if value is not None:
+        middle = torch.full_like(middle, value).log()
+    if isinstance(ours, nn.Linear):
+        ours.weight.zero_()
+    target = ours.bias if isinstance(ours, nn.Linear) else ours
+    target.data.copy_(middle.clamp(*LOG_STD_RANGE))

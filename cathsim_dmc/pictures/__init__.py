@@ -1,0 +1,96 @@
+"""Looking at a state or an episode in one call, without OpenGL.
+
+Everything here takes the environment that `cathsim_dmc.suite.load` returns.
+`cathsim_dmc` itself offers `show`, `record`, `forces` and `fluoroscopy`, so that
+`import cathsim_dmc` is enough in a notebook.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import numpy as np
+
+from cathsim_dmc.imaging import FluoroscopyOptions
+from cathsim_dmc.pictures.readout import ForceReadout, forces
+from cathsim_dmc.pictures.recorded import record, write
+from cathsim_dmc.pictures.snapshot import Snapshot, navigation_of
+from cathsim_dmc.recording.episode import Episode
+
+VIEWERS = ("figure", "rerun")
+
+__all__ = [
+    "Episode",
+    "ForceReadout",
+    "Snapshot",
+    "fluoroscopy",
+    "forces",
+    "record",
+    "show",
+    "write",
+]
+
+
+def show(
+    env: Any,
+    episode: Episode | None = None,
+    *,
+    step: int = -1,
+    viewer: str = "figure",
+    **options: Any,
+) -> Any:
+    """Draw anatomy, device, goal and contact forces.
+
+    Args:
+        env: What `cathsim_dmc.suite.load` returns.
+        episode: An episode recorded in it, whose state `step` is drawn; None draws the
+            present state of the environment.
+        step: Number of the episode's state; negative ones count from the end.
+        viewer: "figure" for a matplotlib figure, or "rerun" for Rerun's viewer in a
+            notebook, which shows all of an episode.
+        **options: Options of `pictures.figure.scene_figure`, such as `views` and
+            `fluoroscopy`; or `width` and `height` (pixels) of Rerun's viewer.
+
+    Returns:
+        The figure (a notebook draws it; `.savefig(path)` writes it), or the viewer.
+
+    Raises:
+        TypeError: it is no environment of this package.
+        ValueError: there is no such viewer.
+        ImportError: Rerun's notebook viewer is not installed.
+    """
+    if viewer not in VIEWERS:
+        raise ValueError(f"no viewer {viewer!r}; there are {', '.join(VIEWERS)}")
+    surface = navigation_of(env).scene.anatomy.surface
+    if viewer == "rerun":
+        from cathsim_dmc.pictures.interactive import rerun_viewer
+
+        return rerun_viewer(env, episode, **options)
+    from cathsim_dmc.pictures.figure import scene_figure
+
+    if episode is None:
+        return scene_figure(Snapshot.of(env), **options)
+    return scene_figure(Snapshot.of_episode(episode, surface, step), **options)
+
+
+def fluoroscopy(env: Any, seed: int = 0, **options: Any) -> np.ndarray:
+    """The X-ray image of an environment's present state.
+
+    Args:
+        env: What `cathsim_dmc.suite.load` returns, after a reset.
+        seed: Seed of the quantum noise, if `noise=True` is asked for.
+        **options: Fields of `imaging.FluoroscopyOptions` that differ from the task's,
+            such as `view="LAO45"`, `size=512`, `contrast=False`.
+
+    Returns:
+        (rows, columns) uint8, dark = opaque.
+
+    Raises:
+        TypeError: it is no environment of this package, or there is no such option.
+        ValueError: an option's value is not possible.
+    """
+    from cathsim_dmc.pictures.snapshot import xray
+
+    base: FluoroscopyOptions = navigation_of(env).config.fluoroscopy_options
+    return xray(Snapshot.of(env), dataclasses.replace(base, **options), seed)

@@ -1,0 +1,183 @@
+"""An episode as a moving picture for slides and pages, without OpenGL."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from PIL import Image
+
+from cathsim_dmc.files import atomic_path
+from cathsim_dmc.pictures import figure as drawing
+from cathsim_dmc.pictures.snapshot import Snapshot, xray
+from cathsim_dmc.pictures.translucent import Glass, Projection, glass
+from cathsim_dmc.recording.episode import Episode
+
+SUFFIXES = (".gif", ".webp")
+FRAMES = 90
+# The last frame stays for so long before it begins again, ms.
+_HOLD_MS = 1500
+_TICK_MS = 20  # browsers do not show frames that are shorter
+_DPI = 100
+_MARGIN = 8e-3  # around the vessel, m
+_FORCE_COLOUR = "#b3202c"
+# A film shows the noise of fluoroscopy, at a multiple of the usual dose.
+FLUOROSCOPY = dataclasses.replace(drawing.FLUOROSCOPY, noise=True, kerma=4e-7)
+
+
+def animate(
+    episode: Episode,
+    surface: Any,
+    path: str | os.PathLike[str],
+    *,
+    view: str = "front",
+    seconds: float | None = None,
+    frames: int = FRAMES,
+    width: int = 860,
+    quality: int = 80,
+) -> Path:
+    """Write an episode as an animated GIF or WebP, whole or not at all.
+
+    On the left the vessel as glass with device, goal and contact forces, on the right
+    the X-ray image over the force on the wall.
+
+    Args:
+        episode: What happens.
+        surface: Lumen surface with `vertices` and `faces`.
+        path: File to write, `.gif` or `.webp`.
+        view: Direction of view, of `figure.VIEWS`.
+        seconds: Length of the film without its last pause; None takes the episode's,
+            at least 2 and at most 12.
+        frames: Number of pictures at most; an episode has one state every 40 ms.
+        width: Width of the film, pixels.
+        quality: Quality of a WebP, 0 to 100.
+
+    Returns:
+        The path.
+
+    Raises:
+        ValueError: on another suffix, an unknown view, fewer than two frames, or an
+            episode without a goal.
+        FileNotFoundError: if the folder does not exist.
+    """
+    path = Path(path)
+    if path.suffix not in SUFFIXES:
+        raise ValueError(f"a film is a {' or '.join(SUFFIXES)} file, not {path.name}")
+    if view not in drawing.VIEWS:
+        raise ValueError(f"no view {view!r}; there are {', '.join(drawing.VIEWS)}")
+    if frames < 2:
+        raise ValueError(f"frames is {frames}; give at least 2")
+    length = float(episode.time[-1] - episode.time[0])
+    seconds = float(np.clip(length, 2.0, 12.0)) if seconds is None else seconds
+    count = min(frames, episode.steps + 1)
+    chosen = np.unique(np.linspace(0, episode.steps, count).round().astype(int))
+    pictures = [
+        Image.fromarray(picture)
+        for picture in _Film(episode, surface, view, width).pictures(chosen)
+    ]
+    tick = max(round(1000 * seconds / len(pictures)), _TICK_MS)
+    times = [tick] * (len(pictures) - 1) + [_HOLD_MS]
+    options: dict[str, Any] = {"quality": quality, "method": 4}
+    if path.suffix == ".gif":
+        pictures, options = _one_palette(pictures), {"optimize": False}
+    with atomic_path(path, path.suffix) as temporary:
+        pictures[0].save(
+            temporary,
+            format=path.suffix[1:].upper(),
+            save_all=True,
+            append_images=pictures[1:],
+            duration=times,
+            loop=0,
+            **options,
+        )
+    return path
+
+
+def _one_palette(pictures: list[Image.Image]) -> list[Image.Image]:
+    """The pictures in the 256 colours of the middle and the last one.
+
+    One palette for all keeps what does not move from flickering, and small.
+    """
+    both = pictures[len(pictures) // 2], pictures[-1]
+    sample = np.hstack([np.asarray(picture) for picture in both])
+    palette = Image.fromarray(sample).quantize(256, Image.Quantize.MEDIANCUT)
+    none = Image.Dither.NONE
+    return [picture.quantize(palette=palette, dither=none) for picture in pictures]
+
+
+class _Film:
+    """A figure of which each frame changes only what moves."""
+
+    def __init__(self, episode: Episode, surface: Any, view: str, width: int):
+        self._episode, self._surface = episode, surface
+        azimuth = drawing.VIEWS[view][0]
+        rough = Projection.of(surface.vertices, azimuth=azimuth, margin=_MARGIN)
+        rows, columns = rough.shape
+        left = columns / rows  # width of the scene as a share of the height
+        height = width / (left + 0.66)
+        # One pixel of the glass for each of the film.
+        self._projection = Projection.of(
+            surface.vertices, azimuth=azimuth, margin=_MARGIN, height=round(height)
+        )
+        self._glass: Glass = glass(surface.vertices, surface.faces, self._projection)
+        self._figure = drawing.Picture(
+            figsize=(width / _DPI, height / _DPI), dpi=_DPI, facecolor="white"
+        )
+        share = left / (left + 0.66)
+        self._scene = self._figure.add_axes((0, 0, share, 1))
+        self._scene.axis("off")
+        beside = (share + 0.01, 0.34, 0.98 - share, 0.64)
+        self._xray = self._figure.add_axes(beside)
+        self._force = self._figure.add_axes((share + 0.09, 0.1, 0.89 - share, 0.19))
+        self._draw_force()
+
+    def _draw_force(self) -> None:
+        episode, axes = self._episode, self._force
+        peak = episode.meta.get("wall_force_peak_max") or episode.wall_force_max
+        time = episode.time[1:] - episode.time[0]
+        force = 1e3 * np.asarray(peak, dtype=np.float64)
+        axes.fill_between(time, force, color=_FORCE_COLOUR, alpha=0.18, lw=0)
+        axes.plot(time, force, color=_FORCE_COLOUR, lw=1.1)
+        axes.set_xlim(0, max(float(time[-1]), 1e-3) if len(time) else 1.0)
+        axes.set_ylim(0, max(1.15 * force.max(initial=0.0), 1.0))
+        axes.set_xlabel("s", fontsize=8, labelpad=0)
+        axes.set_ylabel("wall force, mN", fontsize=8)
+        axes.tick_params(labelsize=7)
+        for side in ("top", "right"):
+            axes.spines[side].set_visible(False)
+        self._now = axes.axvline(0.0, color="0.2", lw=1.0)
+
+    def pictures(self, steps: np.ndarray) -> Iterator[np.ndarray]:
+        """RGB pictures (rows, columns, 3) uint8 of some states."""
+        image = None
+        for step in steps:
+            moment = Snapshot.of_episode(self._episode, self._surface, int(step))
+            self._scene.clear()
+            self._scene.axis("off")
+            drawing.draw_scene(self._scene, moment, self._projection, self._glass)
+            self._label(moment, int(step))
+            if image is None:
+                image = drawing.draw_fluoroscopy(
+                    self._xray, moment, FLUOROSCOPY, int(step)
+                )
+                self._xray.set_title("")
+            else:
+                image.set_data(xray(moment, FLUOROSCOPY, int(step)))
+            now = float(self._episode.time[step] - self._episode.time[0])
+            self._now.set_xdata([now, now])
+            self._figure.agg.draw()
+            yield np.asarray(self._figure.agg.buffer_rgba())[..., :3].copy()
+
+    def _label(self, moment: Snapshot, step: int) -> None:
+        time = self._episode.time[step] - self._episode.time[0]
+        text = f"{self._episode.task}   {time:4.1f} s"
+        if step == self._episode.steps:
+            text += f"   {self._episode.termination.replace('_', ' ')}"
+        self._scene.text(
+            0.02, 0.985, text, transform=self._scene.transAxes, va="top", fontsize=10,
+            fontweight="bold", color="0.2", zorder=10,
+        )  # fmt: skip

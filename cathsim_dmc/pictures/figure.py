@@ -1,0 +1,263 @@
+"""A scene as a matplotlib figure: anatomy, device, goal, contact forces."""
+
+from __future__ import annotations
+
+import functools
+import io
+from typing import Any
+
+import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.cm import ScalarMappable
+from matplotlib.collections import LineCollection
+from matplotlib.colors import LinearSegmentedColormap, Normalize
+from matplotlib.figure import Figure
+from matplotlib.patches import Circle
+from PIL import Image
+from scipy.interpolate import CubicSpline
+
+from cathsim_dmc.imaging import FluoroscopyOptions
+from cathsim_dmc.pictures.snapshot import Snapshot, fluoroscope_of, xray
+from cathsim_dmc.pictures.translucent import Glass, Projection, glass
+from cathsim_dmc.recording.geometry import force_colours
+
+# Directions of view by name: azimuth of the viewer, degrees, and the picture's axes.
+VIEWS = {
+    "front": (0.0, "x, mm (patient's left →)"),
+    "left": (90.0, "y, mm (towards the back →)"),
+}
+GOAL_COLOUR, GOAL_LIGHT = "#12805c", "#5fd7ac"
+DEVICE_COLOUR, DEVICE_LIGHT = "#173a63", "#7fb2e5"
+HEAD_COLOUR = "#ffb000"
+PATH_COLOUR = "#c77f00"
+# An arrow of the largest force is this long, mm; weaker ones are in proportion, down
+# to a length that can be seen.
+ARROW_MM, ARROW_LEAST_MM = 22.0, 5.0
+# Below this, N, a contact is drawn as a dot without an arrow.
+ARROW_LEAST_N = 1e-4
+# Pieces of the drawn curve in each link.
+_PIECES = 6
+# The X-ray image of `scene_figure` unless another is asked for; the arch fills it.
+FLUOROSCOPY = FluoroscopyOptions(size=400, magnification=1.3)
+# Percentiles of an image that are shown as black and white.
+WINDOW = (0.02, 99.5)
+_HEIGHT_IN = 6.0
+_POINTS_PER_INCH = 72.0
+
+
+class Picture(Figure):
+    """A figure that notebooks show whether or not pyplot was ever imported."""
+
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        """As `matplotlib.figure.Figure`, on the canvas that needs no screen."""
+        super().__init__(*args, **kwargs)
+        self.agg = FigureCanvasAgg(self)
+
+    def _repr_png_(self) -> bytes:
+        """What a notebook shows and keeps: 256 colours take a third of the place."""
+        full, small = io.BytesIO(), io.BytesIO()
+        self.savefig(full, format="png")
+        picture = Image.open(full).convert("RGB")
+        picture.quantize(256, dither=Image.Dither.NONE).save(
+            small, "PNG", optimize=True
+        )
+        return small.getvalue()
+
+
+def force_map() -> LinearSegmentedColormap:
+    """The colours of forces as a matplotlib colour map, for values in [0, 1]."""
+    colours = force_colours(np.linspace(0, 1, 64), 1.0) / 255
+    return LinearSegmentedColormap.from_list("cathsim_force", list(colours))
+
+
+@functools.lru_cache(maxsize=16)
+def _background(surface: Any, azimuth: float, height: int) -> tuple[Projection, Glass]:
+    projection = Projection.of(surface.vertices, azimuth=azimuth, height=height)
+    return projection, glass(surface.vertices, surface.faces, projection)
+
+
+def scene_figure(
+    snapshot: Snapshot,
+    *,
+    views: tuple[str, ...] = ("front", "left"),
+    fluoroscopy: bool = True,
+    pixels: int = 900,
+) -> Picture:
+    """Draw a moment of an episode, without OpenGL.
+
+    Args:
+        snapshot: What to draw.
+        views: Directions of view, of `VIEWS`.
+        fluoroscopy: Whether to put the X-ray image beside them.
+        pixels: Number of rows of the drawn vessel.
+
+    Raises:
+        ValueError: if a view does not exist, or there is nothing to draw.
+    """
+    unknown = [view for view in views if view not in VIEWS]
+    if unknown or not (views or fluoroscopy):
+        raise ValueError(f"views are {views!r}; give some of {', '.join(VIEWS)}")
+    drawn = [_background(snapshot.surface, VIEWS[v][0], pixels) for v in views]
+    ratios = [p.shape[1] / p.shape[0] for p, _ in drawn] + [1.0] * fluoroscopy
+    figure = Picture(
+        figsize=(_HEIGHT_IN * 0.84 * sum(ratios) + 1.6, _HEIGHT_IN),
+        dpi=120,
+        layout="constrained",
+    )
+    panels = figure.subplots(1, len(ratios), width_ratios=ratios, squeeze=False)[0]
+    for panel, view, (projection, picture) in zip(
+        panels[: len(views)], views, drawn, strict=True
+    ):
+        draw_scene(panel, snapshot, projection, picture)
+        panel.set_xlabel(VIEWS[view][1])
+        panel.set_title(f"from the {view}", fontsize=10)
+    if len(views):
+        panels[0].set_ylabel("z, mm (head ↑)")
+        bar = figure.colorbar(
+            ScalarMappable(Normalize(0, 1e3 * snapshot.force_scale), force_map()),
+            ax=panels[: len(views)].tolist(),
+            shrink=0.55,
+            pad=0.01,
+            extend="max",
+        )
+        bar.set_label("contact force on the wall, mN")
+    if fluoroscopy:
+        draw_fluoroscopy(panels[-1], snapshot)
+    figure.suptitle(_caption(snapshot), fontsize=11)
+    return figure
+
+
+def draw_scene(
+    axes: Any, snapshot: Snapshot, projection: Projection, picture: Glass
+) -> None:
+    """Draw a snapshot into axes whose units are millimetres."""
+    extent = projection.extent_mm
+    axes.imshow(picture.behind, extent=extent, zorder=1, interpolation="bilinear")
+    axes.set_xlim(extent[:2])
+    axes.set_ylim(extent[2:])
+    axes.set_aspect("equal")
+    axes.set_facecolor("white")
+    for side in ("top", "right"):
+        axes.spines[side].set_visible(False)
+    _draw_goal(axes, snapshot, projection)
+    if len(snapshot.path) > 1:
+        axes.plot(
+            *projection.flat_mm(snapshot.path).T, color=PATH_COLOUR, lw=0.9, zorder=3
+        )
+    _draw_device(axes, snapshot, projection)
+    axes.imshow(picture.glaze, extent=extent, zorder=6, interpolation="bilinear")
+    _draw_forces(axes, snapshot, projection)
+
+
+def _draw_goal(axes: Any, snapshot: Snapshot, projection: Projection) -> None:
+    x, z = projection.flat_mm(snapshot.goal)
+    radius = 1e3 * snapshot.goal_radius
+    axes.add_patch(
+        Circle((x, z), radius, fc=GOAL_COLOUR, ec=GOAL_COLOUR, alpha=0.22, zorder=2)
+    )
+    axes.add_patch(Circle((x, z), radius, fill=False, ec=GOAL_COLOUR, lw=1.6, zorder=7))
+
+
+def _points_per_mm(axes: Any) -> float:
+    """Length of a millimetre of the axes on paper, points."""
+    box = axes.get_position()
+    height = box.height * axes.figure.get_figheight() * _POINTS_PER_INCH
+    low, high = axes.get_ylim()
+    return height / (high - low)
+
+
+def _draw_device(axes: Any, snapshot: Snapshot, projection: Projection) -> None:
+    line, radius = _smooth(projection.flat_mm(snapshot.device), snapshot.radius)
+    # Thicker than in truth, by half: as printed it would be two points wide.
+    width = 1.5 * 2e3 * radius * _points_per_mm(axes)
+    pieces = np.stack([line[:-1], line[1:]], axis=1)
+    for colour, share in (("white", 1.5), (DEVICE_COLOUR, 1.0), (DEVICE_LIGHT, 0.35)):
+        axes.add_collection(
+            LineCollection(
+                list(pieces),
+                linewidths=share * width,
+                colors=colour,
+                capstyle="round",
+                zorder=4,
+            )
+        )
+    axes.plot(
+        *line[-1], "o", ms=1.6 * width[-1], mfc=HEAD_COLOUR, mec="white", mew=0.8,
+        zorder=5,
+    )  # fmt: skip
+
+
+def _smooth(line: np.ndarray, radius: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """A curve through the joints of the chain, and the radii of its pieces."""
+    joint = np.arange(len(line))
+    fine = np.linspace(0, joint[-1], joint[-1] * _PIECES + 1)
+    return CubicSpline(joint, line)(fine), np.repeat(radius, _PIECES)
+
+
+def _draw_forces(axes: Any, snapshot: Snapshot, projection: Projection) -> None:
+    magnitude = snapshot.magnitude
+    if not len(magnitude):
+        return
+    place = projection.flat_mm(snapshot.position)
+    colours = force_colours(magnitude, snapshot.force_scale) / 255
+    axes.scatter(*place.T, s=16, c=colours, edgecolors="0.15", linewidths=0.5, zorder=8)
+    largest = magnitude.max()
+    strong = magnitude > ARROW_LEAST_N
+    length = np.maximum(ARROW_MM * magnitude / largest, ARROW_LEAST_MM)
+    unit = snapshot.force / np.maximum(magnitude, 1e-12)[:, None]
+    along = projection.flat_mm(unit) / 1e3 * length[:, None]
+    axes.quiver(
+        *place[strong].T, *along[strong].T, color=colours[strong], angles="xy",
+        scale_units="xy", scale=1, width=0.012, edgecolor="0.15", linewidth=0.4,
+        zorder=8,
+    )  # fmt: skip
+    top = int(magnitude.argmax())
+    axes.annotate(
+        f"{1e3 * largest:.3g} mN",
+        place[top] + (along[top] if strong[top] else 0),
+        xytext=(5, 4),
+        textcoords="offset points",
+        fontsize=9,
+        fontweight="bold",
+        color="0.1",
+        bbox={"boxstyle": "round,pad=0.15", "fc": "white", "ec": "none", "alpha": 0.75},
+        zorder=9,
+    )
+
+
+def draw_fluoroscopy(
+    axes: Any,
+    snapshot: Snapshot,
+    options: FluoroscopyOptions | None = None,
+    seed: int = 0,
+) -> Any:
+    """Draw the X-ray image of a snapshot, with the goal as a ring.
+
+    Returns:
+        matplotlib's image, whose data another moment may replace.
+    """
+    options = options or FLUOROSCOPY
+    fluoroscope = fluoroscope_of(snapshot.surface, options)
+    frame = xray(snapshot, options, seed)
+    black, white = np.percentile(frame, WINDOW)
+    image = axes.imshow(
+        frame, cmap="gray", vmin=black, vmax=white, interpolation="bilinear"
+    )
+    (column, row), depth = fluoroscope.carm.project(snapshot.goal)
+    radius = snapshot.goal_radius * fluoroscope.carm.focal_length / float(depth)
+    axes.add_patch(Circle((column, row), radius, fill=False, ec=GOAL_LIGHT, lw=1.4))
+    axes.set_title("fluoroscopy", fontsize=10)
+    axes.set_xticks([])
+    axes.set_yticks([])
+    return image
+
+
+def _caption(snapshot: Snapshot) -> str:
+    magnitude = snapshot.magnitude
+    if not len(magnitude):
+        return f"{snapshot.title}; no contact with the wall"
+    contacts = "1 contact" if len(magnitude) == 1 else f"{len(magnitude)} contacts"
+    return (
+        f"{snapshot.title}; {contacts}, {1e3 * magnitude.sum():.3g} mN in all, "
+        f"{1e3 * magnitude.max():.3g} mN the largest"
+    )

@@ -1,0 +1,102 @@
+"""The forces of a state as one readable object."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from cathsim_dmc.pictures.snapshot import navigation_of
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class ForceReadout:
+    """Contacts and forces at the end of a control step; newtons, world frame (LPS).
+
+    Contacts, `wall_sum` and `wall_max` are those of the last physics step; the peaks
+    are the largest of any physics step of the control step.
+
+    Attributes:
+        position: (K, 3) places of contact with the wall, m.
+        force: (K, 3) force of the device on the wall.
+        magnitude: (K,) its norm, normal force and friction together.
+        penetration: (K,) depth of the device in the wall, m.
+        wall_sum: Sum of the magnitudes.
+        wall_max: Largest magnitude.
+        wall_peak_sum: Largest sum within the control step.
+        wall_peak_max: Largest magnitude within the control step.
+        push_force: Force at the base, positive when it pushes the device forward.
+        push_torque: Torque of the base on the device about its axis, N·m.
+        load_cell: (3,) force of the phantom on its support.
+    """
+
+    position: np.ndarray
+    force: np.ndarray
+    magnitude: np.ndarray
+    penetration: np.ndarray
+    wall_sum: float
+    wall_max: float
+    wall_peak_sum: float
+    wall_peak_max: float
+    push_force: float
+    push_torque: float
+    load_cell: np.ndarray
+
+    def __len__(self) -> int:
+        """Number of contacts K."""
+        return len(self.magnitude)
+
+    def __repr__(self) -> str:
+        """A table of the contacts and a line of the other forces."""
+        lines = [
+            f"{len(self)} contacts with the wall: sum {_mn(self.wall_sum)}, largest "
+            f"{_mn(self.wall_max)}, peak within the step {_mn(self.wall_peak_max)}",
+            f"push {_mn(self.push_force)}, load cell "
+            f"({', '.join(f'{1e3 * f:.1f}' for f in self.load_cell)}) mN",
+        ]
+        if len(self):
+            lines.append("     position, mm          force on the wall, mN")
+        for place, force in zip(1e3 * self.position, 1e3 * self.force, strict=True):
+            lines.append(
+                "  "
+                + " ".join(f"{x:6.1f}" for x in place)
+                + "  "
+                + " ".join(f"{f:8.2f}" for f in force)
+            )
+        return "\n".join(lines)
+
+
+def forces(env: Any) -> ForceReadout:
+    """Contacts and forces of an environment's present state.
+
+    Args:
+        env: What `cathsim_dmc.suite.load` returns, after a reset.
+
+    Raises:
+        TypeError: if it is no environment of this package.
+    """
+    task = navigation_of(env)
+    contacts, wall, readings = (
+        task.contacts(env.physics),
+        task.wall_force,
+        task.readings,
+    )
+    there = contacts.present
+    return ForceReadout(
+        position=contacts.position[there],
+        force=contacts.force[there],
+        magnitude=contacts.magnitude[there],
+        penetration=contacts.penetration[there],
+        wall_sum=float(wall.sum),
+        wall_max=float(wall.max),
+        wall_peak_sum=float(wall.peak_sum),
+        wall_peak_max=float(wall.peak_max),
+        push_force=float(readings.push_force),
+        push_torque=float(readings.push_torque),
+        load_cell=np.array(readings.load_cell),
+    )
+
+
+def _mn(newtons: float) -> str:
+    return f"{1e3 * newtons:.2f} mN"

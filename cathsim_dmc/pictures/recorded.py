@@ -1,0 +1,172 @@
+"""An episode of any policy, recorded in one call."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from cathsim_dmc import policies
+from cathsim_dmc.imaging import Angiograph, FluoroscopyOptions
+from cathsim_dmc.pictures.snapshot import navigation_of
+from cathsim_dmc.recording.episode import Episode
+from cathsim_dmc.recording.recorder import EpisodeRecorder
+from cathsim_dmc.recording.scene import body_geoms
+
+# A name of `policies.POLICIES`, a policy, or a function from the observation (a
+# dictionary of arrays) to the action (A,).
+AnyPolicy = str | policies.Policy | Callable[[Any], np.ndarray]
+FORMATS = (".rrd", ".npz", ".gif", ".webp")
+# X-ray images of a recording: pixels along a side, and how far the view is zoomed in.
+_FILM_SIZE, _FILM_MAGNIFICATION = 512, 1.3
+
+
+def record(
+    env: Any,
+    policy: AnyPolicy,
+    path: str | os.PathLike[str] | None = None,
+    *,
+    seed: int | None = None,
+    max_steps: int | None = None,
+    task_name: str | None = None,
+) -> Episode:
+    """Play one episode and keep it.
+
+    Args:
+        env: What `cathsim_dmc.suite.load` returns; it stays usable.
+        policy: Name in `policies.POLICIES`, a `Policy`, or a function from the
+            observation to the action.
+        path: File to write: `.rrd` (Rerun), `.npz` (arrays), `.gif` or `.webp`
+            (moving picture); None writes none.
+        seed: Seed of the episode; None goes on from the environment's random state.
+        max_steps: Number of control steps after which the episode is cut off.
+        task_name: Name of the task in the record; that of the environment otherwise.
+
+    Returns:
+        The episode.
+
+    Raises:
+        TypeError: the environment or the policy is none.
+        ValueError: the policy's name or the file's kind does not exist, or the policy
+            returns no action of the environment.
+        FileNotFoundError: the file's folder does not exist.
+    """
+    task = navigation_of(env)
+    target = None if path is None else _checked(path)
+    name = task_name or getattr(task, "name", None)
+    recorder = EpisodeRecorder(env, name)
+    episode = recorder.record_episode(as_function(policy, env, seed), seed, max_steps)
+    if target is not None:
+        write(episode, env, target)
+    return episode
+
+
+def _checked(path: str | os.PathLike[str]) -> Path:
+    """The path, if a file of its kind can be written there."""
+    target = Path(path)
+    if target.suffix not in FORMATS:
+        raise ValueError(
+            f"the recording is to be written to {target}; give a file that ends in "
+            f"{', '.join(FORMATS)}"
+        )
+    if not target.parent.is_dir():
+        raise FileNotFoundError(f"no folder {target.parent}; make it first")
+    return target
+
+
+def as_function(
+    policy: AnyPolicy, env: Any, seed: int | None = None
+) -> Callable[[Any], np.ndarray]:
+    """A policy as a function from the environment's timestep to the action.
+
+    Raises:
+        ValueError: there is no policy of that name.
+        TypeError: it is neither a name nor a policy nor a function.
+    """
+    if isinstance(policy, str):
+        policy = policies.make_policy(policy, seed or 0)
+    if isinstance(policy, policies.Policy):
+        return policies.in_environment(policy, env)
+    if not callable(policy):
+        raise TypeError(
+            f"the policy is {policy!r}; give one of {', '.join(policies.POLICIES)}, a "
+            "cathsim_dmc.policies.Policy, or a function from the observation to the "
+            "action"
+        )
+    function = policy
+    return lambda timestep: np.asarray(function(timestep.observation))
+
+
+def write(episode: Episode, env: Any, path: str | os.PathLike[str]) -> Path:
+    """Write an episode in the format that the file's name asks for.
+
+    Args:
+        episode: An episode of this environment.
+        env: The environment, for the anatomy and the shapes of the robot.
+        path: File to write, see `record`.
+    """
+    target = _checked(path)
+    scene = navigation_of(env).scene
+    if target.suffix == ".npz":
+        return episode.save(target)
+    if target.suffix == ".rrd":
+        from cathsim_dmc.recording.rerun_log import write_rrd
+
+        return write_rrd(
+            episode,
+            scene.anatomy.surface,
+            target,
+            robot_geoms=body_geoms(env.physics),
+            fluoroscopy=xray_film(
+                episode, scene.anatomy.surface, film_options(env.task)
+            ),
+        )
+    from cathsim_dmc.pictures.animation import animate
+
+    return animate(episode, scene.anatomy.surface, target)
+
+
+def film_options(task: Any) -> FluoroscopyOptions:
+    """The task's own X-ray view and a second plane, in the size of a screen."""
+    options = task.config.fluoroscopy_options
+    return dataclasses.replace(
+        options,
+        size=_FILM_SIZE,
+        noise=False,
+        magnification=max(options.magnification, _FILM_MAGNIFICATION),
+        biplane=options.biplane or "LATERAL",
+    )
+
+
+def xray_film(
+    episode: Episode, surface: Any, options: FluoroscopyOptions
+) -> np.ndarray:
+    """X-ray images of all states of an episode, with the contrast of a screen.
+
+    Args:
+        episode: What is seen.
+        surface: Lumen surface with `vertices` and `faces`.
+        options: Set-up of the angiography machine.
+
+    Returns:
+        (T + 1, rows, columns, planes) uint8, the frontal plane first. The darkest and
+        the brightest of each plane's grey levels are black and white.
+    """
+    machine = Angiograph(surface.vertices, surface.faces, options)
+    radius = np.asarray(episode.meta.get("catheter_radius", 0.835e-3))
+    if radius.ndim:
+        radius = np.broadcast_to(radius, (episode.steps + 1, len(radius)))
+    films = [plane.render(episode.catheter, radius) for plane in machine.planes()]
+    return np.concatenate([_windowed(film) for film in films], axis=-1)
+
+
+def _windowed(film: np.ndarray) -> np.ndarray:
+    """Grey levels (uint8) stretched over the whole scale, alike in all frames."""
+    darkest, brightest = int(film.min()), int(film.max())
+    levels = np.arange(256.0) - darkest
+    scale = np.clip(255 * levels / max(brightest - darkest, 1), 0, 255)
+    return scale.round().astype(np.uint8)[film]

@@ -1,0 +1,149 @@
+"""One moment of an episode, with all that a picture of it needs."""
+
+from __future__ import annotations
+
+import functools
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from cathsim_dmc.imaging import Angiograph, FluoroscopyOptions
+from cathsim_dmc.recording.episode import Episode
+from cathsim_dmc.recording.geometry import force_scale
+
+# Prepared views of anatomies that are kept: each holds some megabytes.
+_VIEWS = 8
+
+
+@dataclass(frozen=True, eq=False)
+class Snapshot:
+    """State of one simulation; lengths in metres, forces in newtons, world frame.
+
+    Attributes:
+        surface: Lumen surface with `vertices` (V, 3) and `faces` (F, 3).
+        device: (L + 1, 3) joints of the device from base to head.
+        radius: (L,) radii of its links.
+        goal: (3,) centre of the goal.
+        goal_radius: Radius of the goal.
+        position: (K, 3) contacts with the wall.
+        force: (K, 3) force of the device on the wall at each.
+        force_scale: Force of the last colour of the scale.
+        path: (P, 3) where the head has been, or (0, 3).
+        title: Text above the picture.
+    """
+
+    surface: Any
+    device: np.ndarray
+    radius: np.ndarray
+    goal: np.ndarray
+    goal_radius: float
+    position: np.ndarray
+    force: np.ndarray
+    force_scale: float
+    path: np.ndarray
+    title: str
+
+    @property
+    def magnitude(self) -> np.ndarray:
+        """(K,) magnitudes of the forces, N."""
+        return np.linalg.norm(self.force, axis=-1)
+
+    @classmethod
+    def of(cls, env: Any) -> Snapshot:
+        """The present state of a composer environment.
+
+        Raises:
+            TypeError: if it is no environment of this package.
+        """
+        task = navigation_of(env)
+        scene, readings = task.scene, task.readings
+        contacts = task.contacts(env.physics)
+        info = task.info()
+        links = len(readings.centreline) - 1
+        return cls(
+            surface=scene.anatomy.surface,
+            device=readings.centreline,
+            radius=np.full(links, scene.device.outer_radius),
+            goal=task.goal_position,
+            goal_radius=float(task.objective.goal_radius),
+            position=contacts.position[contacts.present],
+            force=contacts.force[contacts.present],
+            force_scale=force_scale(contacts.magnitude[contacts.present]),
+            path=np.zeros((0, 3)),
+            title=f"{task.name}: {1e3 * info['distance']:.0f} mm to {scene.goal.name}",
+        )
+
+    @classmethod
+    def of_episode(cls, episode: Episode, surface: Any, step: int = -1) -> Snapshot:
+        """A state of a recorded episode.
+
+        Args:
+            episode: The record.
+            surface: Lumen surface that it was recorded in.
+            step: Number of the state, 0 at the start; negative ones count from the
+                end.
+
+        Raises:
+            IndexError: if the episode has no such state.
+            ValueError: if the episode was recorded without a goal.
+        """
+        states = episode.steps + 1
+        if not -states <= step < states:
+            raise IndexError(f"step is {step}; the episode has {states} states")
+        step %= states
+        goal = episode.meta.get("goal_position")
+        if goal is None:
+            raise ValueError("the episode was recorded without a goal")
+        # Contacts of state t + 1 belong to step t.
+        there = episode.contact_step == step - 1
+        links = episode.catheter.shape[1] - 1
+        radius = np.asarray(episode.meta.get("catheter_radius", 0.835e-3))
+        return cls(
+            surface=surface,
+            device=episode.catheter[step],
+            radius=np.broadcast_to(radius, (links,)),
+            goal=np.asarray(goal, dtype=np.float64),
+            goal_radius=float(episode.meta["goal_radius"]),
+            position=episode.contact_position[there],
+            force=episode.contact_force[there],
+            # One scale for the whole episode.
+            force_scale=force_scale(np.linalg.norm(episode.contact_force, axis=-1)),
+            path=episode.head[: step + 1],
+            title=f"{episode.task}, {episode.time[step] - episode.time[0]:.1f} s",
+        )
+
+
+def navigation_of(env: Any) -> Any:
+    """The task of an environment of this package.
+
+    Raises:
+        TypeError: if it is none; says what is wanted.
+    """
+    task = getattr(env, "task", None)
+    if not hasattr(task, "scene") or not hasattr(env, "physics"):
+        raise TypeError(
+            f"{type(env).__name__} is no environment of cathsim; give what "
+            "cathsim_dmc.suite.load returns (a Gymnasium or TorchRL environment: the "
+            "composer environment inside it)"
+        )
+    return task
+
+
+@functools.lru_cache(maxsize=_VIEWS)
+def fluoroscope_of(surface: Any, options: FluoroscopyOptions) -> Any:
+    """The frontal plane of an angiography machine before a surface."""
+    return Angiograph(surface.vertices, surface.faces, options).planes()[0]
+
+
+def xray(snapshot: Snapshot, options: FluoroscopyOptions, seed: int = 0) -> np.ndarray:
+    """The X-ray image (rows, columns) uint8 of a snapshot.
+
+    Args:
+        snapshot: State of the device.
+        options: Set-up of the angiography machine.
+        seed: Seed of the quantum noise, if the options ask for noise.
+    """
+    state = np.random.RandomState(seed) if options.noise else None
+    fluoroscope = fluoroscope_of(snapshot.surface, options)
+    return fluoroscope.render(snapshot.device, snapshot.radius, state)[..., 0]

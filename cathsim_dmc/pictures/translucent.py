@@ -1,0 +1,215 @@
+"""A vessel as translucent glass, drawn by numpy: no OpenGL, no window.
+
+A device in a vessel is seen through the wall in front of it. Painting triangles one
+over the other with transparency shows every seam between them, so the hits of all
+pixels with all triangles are found first, sorted by depth and laid over each other
+pixel by pixel. Glass is denser where one looks along it, which draws the outline.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from cathsim_dmc.recording.geometry import vertex_normals
+
+# Colour of the wall, RGB in [0, 1], as lit from the left above the viewer's eye.
+WALL_COLOUR = (0.80, 0.36, 0.33)
+LIGHT = np.array([-0.35, 0.55, 0.76])
+# Opacity of one layer of the wall: seen straight on, and along the surface.
+FACING, GRAZING = 0.08, 0.70
+# Opacity of the nearest wall over a device inside, as a share of that.
+GLAZE = 0.45
+_SAMPLES = 2  # samples along each side of a pixel
+_LAYERS = 16  # walls behind each other; further ones are hidden by these
+
+
+@dataclass(frozen=True)
+class Projection:
+    """A parallel projection of the world onto a picture.
+
+    Attributes:
+        right, up: Unit vectors (3,) of the picture's axes, world frame.
+        low, high: Corners (2,) of the picture along `right` and `up`, metres.
+        pixels: Number of pixels along a metre.
+    """
+
+    right: np.ndarray
+    up: np.ndarray
+    low: np.ndarray
+    high: np.ndarray
+    pixels: float
+
+    @classmethod
+    def of(
+        cls,
+        vertices: np.ndarray,
+        *,
+        azimuth: float = 0.0,
+        margin: float = 6e-3,
+        height: int = 900,
+    ) -> Projection:
+        """A view upright in the patient frame (LPS) that shows all vertices.
+
+        Args:
+            vertices: (V, 3), world frame, metres.
+            azimuth: Angle of the viewer about the long axis of the patient, degrees:
+                0 in front of the chest (AP), 90 at the patient's left (lateral).
+            margin: Space around the vertices, metres.
+            height: Number of pixels from top to bottom.
+        """
+        angle = np.deg2rad(azimuth)
+        right = np.array([np.cos(angle), np.sin(angle), 0.0])
+        up = np.array([0.0, 0.0, 1.0])
+        flat = vertices @ np.stack([right, up], axis=1)
+        low, high = flat.min(0) - margin, flat.max(0) + margin
+        return cls(right, up, low, high, height / (high[1] - low[1]))
+
+    @property
+    def towards(self) -> np.ndarray:
+        """Unit vector (3,) from the scene towards the viewer."""
+        return np.cross(self.right, self.up)
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """(rows, columns) of the picture."""
+        width, height = np.round((self.high - self.low) * self.pixels).astype(int)
+        return max(int(height), 1), max(int(width), 1)
+
+    @property
+    def extent_mm(self) -> tuple[float, float, float, float]:
+        """Left, right, bottom and top of the picture, mm, for matplotlib."""
+        (left, bottom), (right, top) = 1e3 * self.low, 1e3 * self.high
+        return float(left), float(right), float(bottom), float(top)
+
+    def flat_mm(self, points: np.ndarray) -> np.ndarray:
+        """Points (..., 3) in metres as (..., 2) in the picture, mm."""
+        return 1e3 * np.stack([points @ self.right, points @ self.up], axis=-1)
+
+    def pixel(self, points: np.ndarray) -> np.ndarray:
+        """Points (..., 3) in metres as (..., 2): column and row, from the top left."""
+        flat = self.flat_mm(points) / 1e3
+        return np.stack(
+            [flat[..., 0] - self.low[0], self.high[1] - flat[..., 1]], axis=-1
+        ) * (self.pixels)
+
+
+@dataclass(frozen=True, eq=False)
+class Glass:
+    """Pictures (rows, columns, 4) of a vessel, float64 in [0, 1], not premultiplied.
+
+    Attributes:
+        behind: All walls, to be drawn first.
+        glaze: The nearest wall, to be drawn over the device.
+    """
+
+    behind: np.ndarray
+    glaze: np.ndarray
+
+
+def glass(
+    vertices: np.ndarray,
+    faces: np.ndarray,
+    projection: Projection,
+    colour: tuple[float, float, float] = WALL_COLOUR,
+) -> Glass:
+    """Draw a closed surface as translucent glass.
+
+    Args:
+        vertices: (V, 3), metres, world frame.
+        faces: (F, 3), counter-clockwise seen from outside.
+        projection: The view.
+        colour: RGB in [0, 1].
+    """
+    fine = replace(projection, pixels=projection.pixels * _SAMPLES)
+    rows, columns = (_SAMPLES * n for n in projection.shape)
+    pixel, depth, normal = _hits(vertices, faces, fine, (rows, columns))
+    order = np.lexsort((depth, pixel))  # within a pixel, the farthest first
+    pixel, normal = pixel[order], normal[order]
+    shade = _lit(normal, np.asarray(colour))
+    slant = 1.0 - np.abs(normal[:, 2])
+    opacity = FACING + (GRAZING - FACING) * slant**2.5
+    first = np.flatnonzero(np.diff(pixel, prepend=-1))
+    count = np.diff(np.append(first, len(pixel)))
+    where = pixel[first]
+    behind = np.zeros((rows * columns, 4))
+    for layer in range(min(int(count.max(initial=0)), _LAYERS)):
+        deep = count > layer
+        _over(
+            behind,
+            where[deep],
+            shade[first[deep] + layer],
+            opacity[first[deep] + layer],
+        )
+    glaze = np.zeros((rows * columns, 4))
+    last = first + count - 1
+    _over(glaze, where, shade[last], GLAZE * opacity[last])
+    return Glass(*(_smaller(each, (rows, columns)) for each in (behind, glaze)))
+
+
+def _hits(vertices, faces, projection, shape):
+    """Pixels (H,), depths (H,) towards the viewer and unit normals (H, 3) of hits."""
+    rows, columns = shape
+    frame = np.stack([projection.right, projection.up, projection.towards], axis=1)
+    normals = vertex_normals(vertices, faces) @ frame
+    flat = projection.pixel(vertices)[faces]  # (F, 3, 2)
+    depth = (vertices @ projection.towards)[faces]
+    low = np.maximum(np.ceil(flat.min(1) - 0.5).astype(int), 0)
+    high = np.floor(flat.max(1) - 0.5).astype(int)
+    high = np.minimum(high, [columns - 1, rows - 1])
+    size = np.maximum(high - low + 1, 0)
+    boxes = size.prod(1)
+    face = np.repeat(np.arange(len(faces)), boxes)
+    number = np.arange(len(face)) - np.repeat(np.cumsum(boxes) - boxes, boxes)
+    column = low[face, 0] + number % np.maximum(size[face, 0], 1)
+    row = low[face, 1] + number // np.maximum(size[face, 0], 1)
+    a, b, c = flat[:, 0], flat[:, 1], flat[:, 2]
+    area = _cross(b - a, c - a)
+    point = np.stack([column, row], axis=1) + 0.5
+    # Triangles seen edge on cover nothing.
+    area = np.where(np.abs(area) > 1e-12, area, np.inf)[face]
+    second = _cross(point - a[face], (c - a)[face]) / area
+    third = _cross((b - a)[face], point - a[face]) / area
+    inside = (second >= 0) & (third >= 0) & (second + third <= 1)
+    inside &= np.isfinite(area)
+    face, second, third = face[inside], second[inside], third[inside]
+    share = np.stack([1 - second - third, second, third], axis=1)
+    normal = np.einsum("hi,hij->hj", share, normals[faces[face]])
+    normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-9)
+    pixel = row[inside] * columns + column[inside]
+    return pixel, np.vecdot(share, depth[face]), normal
+
+
+def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    return a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
+
+
+def _lit(normal: np.ndarray, colour: np.ndarray) -> np.ndarray:
+    """Colours (H, 3) of glass lit from both sides."""
+    facing = np.where(normal[:, 2:] < 0, -normal, normal)
+    light = np.clip(facing @ (LIGHT / np.linalg.norm(LIGHT)), 0, 1)[:, None]
+    shine = 0.5 * light**24
+    return np.clip(colour * (0.55 + 0.55 * light) + shine, 0, 1)
+
+
+def _over(image: np.ndarray, where: np.ndarray, colour, opacity) -> None:
+    """Lays colours over some pixels of an RGBA image."""
+    below = image[where]
+    cover = opacity[:, None]
+    alpha = cover + below[:, 3:] * (1 - cover)
+    mixed = colour * cover + below[:, :3] * below[:, 3:] * (1 - cover)
+    image[where, :3] = mixed / np.maximum(alpha, 1e-9)
+    image[where, 3:] = alpha
+
+
+def _smaller(image: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
+    """Means over the samples of every pixel, colours weighted by opacity."""
+    rows, columns = shape
+    image = image.reshape(rows, columns, 4)
+    image = np.concatenate([image[..., :3] * image[..., 3:], image[..., 3:]], axis=-1)
+    parts = image.reshape(
+        rows // _SAMPLES, _SAMPLES, columns // _SAMPLES, _SAMPLES, 4
+    ).mean((1, 3))
+    parts[..., :3] /= np.maximum(parts[..., 3:], 1e-9)
+    return np.clip(parts, 0, 1)

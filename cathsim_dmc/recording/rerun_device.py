@@ -1,0 +1,119 @@
+"""The device, its path and its contacts as Rerun entities."""
+
+from __future__ import annotations
+
+import numpy as np
+import rerun as rr
+
+from cathsim_dmc.recording.episode import Episode
+from cathsim_dmc.recording.geometry import force_colours, force_scale, xyzw, z_to
+from cathsim_dmc.recording.rerun_stream import Log
+
+# Drawing only: the longest arrow of an episode is about this long.
+LONGEST_ARROW = 25e-3
+ARROW_RADIUS = 0.7e-3
+HEAT_RADIUS = 0.9e-3
+TRAIL_RADIUS = 0.25e-3
+HEAD_SCALE = 1.8
+# Forces below this share of the largest in their step have no label.
+LABELLED = 0.5
+
+SHAFT_COLOUR = (215, 228, 255)
+HEAD_COLOUR = (255, 200, 0)
+TRAIL_COLOUR = (255, 200, 0, 160)
+
+
+def log_catheter(
+    log: Log,
+    radii: np.ndarray,
+    colour: tuple[int, int, int] = SHAFT_COLOUR,
+    entity: str = "world/catheter",
+) -> None:
+    """Log the device as capsules coloured by what they press, its head and its path.
+
+    Args:
+        log: Where to.
+        radii: (L,) radii of the links, metres.
+        colour: Colour of links that press nothing.
+        entity: Path of the device.
+    """
+    joints = log.episode.catheter
+    states, links = joints.shape[0], joints.shape[1] - 1
+    along = np.diff(joints, axis=1)
+    log.static(entity, rr.Capsules3D.from_fields(radii=radii, fill_mode="solid"))
+    capsules = rr.Capsules3D.columns(
+        lengths=np.linalg.norm(along, axis=-1).ravel(),
+        translations=joints[:, :-1].reshape(-1, 3),
+        quaternions=xyzw(z_to(along)).reshape(-1, 4),
+        colors=link_colours(log.episode, colour).reshape(-1, 3),
+    )
+    log.columns(entity, capsules.partition(np.full(states, links)))
+    head = log.episode.head
+    log.static(
+        f"{entity}/head",
+        rr.Points3D.from_fields(colors=[HEAD_COLOUR], radii=[HEAD_SCALE * radii[-1]]),
+    )
+    log.columns(f"{entity}/head", rr.Points3D.columns(positions=head))
+    if log.episode.steps:
+        log.static(
+            f"{entity}/trail",
+            rr.LineStrips3D.from_fields(colors=[TRAIL_COLOUR], radii=[TRAIL_RADIUS]),
+        )
+        pieces = np.stack([head[:-1], head[1:]], axis=1)
+        log.columns(
+            f"{entity}/trail", rr.LineStrips3D.columns(strips=pieces), slice(1, None)
+        )
+
+
+def link_colours(episode: Episode, colour: tuple[int, int, int]) -> np.ndarray:
+    """Colours (T+1, L, 3) uint8 of the links: that of the largest force, or none."""
+    states, links = episode.catheter.shape[0], episode.catheter.shape[1] - 1
+    pressed = np.zeros((states, links))
+    magnitude = np.linalg.norm(episode.contact_force, axis=-1)
+    row = episode.contact_step + 1
+    middle = (episode.catheter[row, :-1] + episode.catheter[row, 1:]) / 2
+    away = np.linalg.norm(middle - episode.contact_position[:, None], axis=-1)
+    np.maximum.at(pressed, (row, away.argmin(axis=1)), magnitude)
+    plain = np.broadcast_to(np.array(colour, dtype=np.uint8), (states, links, 3))
+    hot = force_colours(pressed, force_scale(magnitude))
+    return np.where(pressed[..., None] > 0, hot, plain)
+
+
+def arrow_scale(episode: Episode) -> float:
+    """Length of an arrow for each newton, metres."""
+    return LONGEST_ARROW / force_scale(np.linalg.norm(episode.contact_force, axis=-1))
+
+
+def log_contacts(log: Log) -> None:
+    """Log the forces of each step as arrows, and the places pressed so far."""
+    episode = log.episode
+    magnitude = np.linalg.norm(episode.contact_force, axis=-1)
+    colours = force_colours(magnitude, force_scale(magnitude))
+    log.static(
+        "world/contacts",
+        rr.Arrows3D.from_fields(radii=[ARROW_RADIUS], show_labels=True),
+    )
+    arrows = rr.Arrows3D.columns(
+        vectors=arrow_scale(episode) * episode.contact_force,
+        origins=episode.contact_position,
+        colors=colours,
+        labels=_labels(episode, magnitude),
+    )
+    # A step without contact is an empty row, which takes the old arrows away.
+    rows = slice(1, None)
+    log.columns("world/contacts", arrows.partition(episode.contact_counts), rows)
+    if len(magnitude):
+        log.static("world/heat", rr.Points3D.from_fields(radii=[HEAT_RADIUS]))
+        heat = rr.Points3D.columns(positions=episode.contact_position, colors=colours)
+        log.columns("world/heat", heat.partition(episode.contact_counts), rows)
+
+
+def _labels(episode: Episode, magnitude: np.ndarray) -> list[str]:
+    """Text of every contact: its force if it is among the largest of its step."""
+    largest = np.zeros(episode.steps)
+    np.maximum.at(largest, episode.contact_step, magnitude)
+    named = (magnitude > 0) & (magnitude >= LABELLED * largest[episode.contact_step])
+    return [
+        f"{1e3 * force:.3g} mN" if shown else ""
+        for force, shown in zip(magnitude, named, strict=True)
+    ]

@@ -1,0 +1,101 @@
+"""What stands still, and the bodies that the record moves, as Rerun entities."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import rerun as rr
+
+from cathsim_dmc.recording.drawing import Drawing
+from cathsim_dmc.recording.geometry import rotate, vertex_normals, xyzw
+from cathsim_dmc.recording.rerun_stream import Log
+from cathsim_dmc.recording.scene import BodyGeom
+from cathsim_dmc.recording.summary import episode_markdown
+
+VESSEL_COLOUR = (225, 140, 130, 60)
+GOAL_COLOUR = (60, 190, 90, 110)
+# Entities that would hide the device inside them, and how opaque they are drawn.
+SEE_THROUGH = {"sheath": 0.3}
+
+
+def log_static(log: Log, drawing: Drawing) -> None:
+    """Log vessel, goal, directions and the page of text."""
+    vertices, faces = drawing.vertices, drawing.faces
+    # Patient frame LPS: x to the patient's left, y to the back, z up.
+    log.static("world", rr.ViewCoordinates.LBU)
+    log.static(
+        "world/vessel",
+        rr.Mesh3D(
+            vertex_positions=vertices.astype(np.float32),
+            vertex_normals=vertex_normals(vertices, faces).astype(np.float32),
+            triangle_indices=faces.astype(np.uint32),
+            albedo_factor=VESSEL_COLOUR,
+        ),
+    )
+    if drawing.goal is not None:
+        position, radius = drawing.goal
+        log.static(
+            "world/goal",
+            rr.Ellipsoids3D(
+                centers=[position],
+                half_sizes=[[radius] * 3],
+                colors=[GOAL_COLOUR],
+                fill_mode="solid",
+            ),
+        )
+    text = rr.TextDocument(episode_markdown(log.episode), media_type="text/markdown")
+    log.static("info", text)
+
+
+def log_bodies(log: Log, geoms: tuple[BodyGeom, ...]) -> None:
+    """Log the shapes of the bodies and how they move."""
+    episode = log.episode
+    bodies: dict[int, list[BodyGeom]] = {}
+    for geom in geoms:
+        bodies.setdefault(geom.body, []).append(geom)
+    for body, parts in bodies.items():
+        entity = f"world/{parts[0].body_name.strip('/')}"
+        for kind in sorted({g.kind for g in parts}):
+            log.static(f"{entity}/{kind}", _shape([g for g in parts if g.kind == kind]))
+        position = episode.body_pos[:, body]
+        quaternion = xyzw(episode.body_quat[:, body])
+        if np.ptp(position, axis=0).any() or np.ptp(quaternion, axis=0).any():
+            log.columns(
+                entity,
+                rr.Transform3D.columns(translation=position, quaternion=quaternion),
+            )
+        else:
+            log.static(
+                entity,
+                rr.Transform3D(
+                    translation=position[0],
+                    quaternion=rr.Quaternion(xyzw=quaternion[0]),
+                ),
+            )
+
+
+def _shape(parts: list[BodyGeom]) -> Any:
+    size = np.stack([g.size for g in parts])
+    centre = np.stack([g.position for g in parts])
+    turn = np.stack([g.quaternion for g in parts])
+    rgba = np.stack([g.rgba for g in parts])
+    rgba[:, 3] *= SEE_THROUGH.get(parts[0].body_name.split("/", 1)[0], 1.0)
+    common = {
+        "quaternions": xyzw(turn),
+        "colors": np.round(255 * rgba).astype(np.uint8),
+        "fill_mode": "solid",
+    }
+    kind = parts[0].kind
+    if kind == "box":
+        return rr.Boxes3D(half_sizes=size, centers=centre, **common)
+    if kind == "sphere":
+        return rr.Ellipsoids3D(
+            half_sizes=np.repeat(size, 3, axis=1), centers=centre, **common
+        )
+    radii, lengths = size[:, 0], 2 * size[:, 1]
+    if kind == "cylinder":
+        return rr.Cylinders3D(radii=radii, lengths=lengths, centers=centre, **common)
+    # MuJoCo centres a capsule, Rerun starts it at its lower end.
+    lower = centre + rotate(turn, size[:, 1:] * [0.0, 0.0, -1.0])
+    return rr.Capsules3D(radii=radii, lengths=lengths, translations=lower, **common)

@@ -1,0 +1,94 @@
+"""Series over time, X-ray images and events as Rerun entities."""
+
+from __future__ import annotations
+
+import io
+
+import numpy as np
+import rerun as rr
+
+from cathsim_dmc.recording.blueprint import FLUOROSCOPY
+from cathsim_dmc.recording.drawing import action_layout, goal_distance
+from cathsim_dmc.recording.events import events
+from cathsim_dmc.recording.rerun_stream import Log
+
+# At this quality noisy frames take about half of what the exact PNG takes.
+JPEG_QUALITY = 90
+
+
+def log_series(log: Log) -> None:
+    """Log reward with its terms, forces, distance, insertion and actions."""
+    episode = log.episode
+    every, measured, commanded = slice(None), slice(1, None), slice(0, episode.steps)
+    log.series(
+        "series/reward", episode.reward, measured, "reward", colors=[90, 160, 90]
+    )
+    for name, values in episode.meta.get("reward_terms", {}).items():
+        log.series(f"series/reward/{name}", np.array(values), measured, name)
+    distance = goal_distance(episode)
+    if distance is not None:
+        log.series(
+            "series/distance_mm",
+            1e3 * distance,
+            every,
+            "distance to goal, mm",
+            colors=[60, 190, 90],
+        )
+    forces = {
+        "wall_sum": (episode.wall_force_sum, "wall, sum", [230, 110, 40]),
+        "wall_max": (episode.wall_force_max, "wall, largest contact", [180, 20, 50]),
+        "push": (episode.push_force, "push", [80, 120, 210]),
+    }
+    for name, (values, label, colour) in forces.items():
+        log.series(f"series/force/{name}", 1e3 * values, measured, label, colors=colour)
+    log.series(
+        "series/insertion_mm",
+        1e3 * episode.insertion,
+        every,
+        "insertion, mm",
+        colors=[150, 90, 200],
+    )
+    names, tip = action_layout(episode)
+    for index in np.flatnonzero(~tip):
+        log.series(
+            f"series/action/{names[index]}",
+            episode.action[:, index],
+            commanded,
+            names[index],
+        )
+    if tip.any():
+        bend = np.sqrt(np.mean(episode.action[:, tip] ** 2, axis=1))
+        log.series("series/action/tip_bend", bend, commanded, "tip bend, rms")
+    log.series("series/action_all", episode.action, commanded, names)
+
+
+def log_frames(log: Log, frames: np.ndarray, lossless: bool) -> None:
+    """Log X-ray images (T+1, H, W, P), one entity for each of P planes."""
+    for plane, entity in enumerate(FLUOROSCOPY[: frames.shape[-1]]):
+        _log_plane(log, entity, frames[..., plane], lossless)
+
+
+def _log_plane(log: Log, entity: str, frames: np.ndarray, lossless: bool) -> None:
+    from PIL import Image
+
+    kind, options = ("PNG", {}) if lossless else ("JPEG", {"quality": JPEG_QUALITY})
+    blobs = []
+    for frame in frames:
+        buffer = io.BytesIO()
+        Image.fromarray(frame).save(buffer, kind, **options)
+        blobs.append(buffer.getvalue())
+    log.static(entity, rr.EncodedImage.from_fields(media_type=f"image/{kind.lower()}"))
+    log.columns(entity, rr.EncodedImage.columns(blob=blobs))
+
+
+def log_events(log: Log) -> None:
+    """Log what happens in the episode as lines of text."""
+    lines = events(log.episode)
+    rows = np.array([state for state, _, _ in lines], dtype=np.int64)
+    log.columns(
+        "events",
+        rr.TextLog.columns(
+            text=[text for _, text, _ in lines], level=[level for *_, level in lines]
+        ),
+        rows,
+    )

@@ -1,0 +1,60 @@
+"""A Rerun stream together with the times of one episode's states."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import rerun as rr
+
+from cathsim_dmc.recording.blueprint import TIMELINE_STEP, TIMELINE_TIME
+from cathsim_dmc.recording.episode import Episode
+
+
+class Log:
+    """Logs under a prefix of entity paths, static or as whole series."""
+
+    def __init__(
+        self, stream: rr.RecordingStream, episode: Episode, from_zero: bool = False
+    ) -> None:
+        """Takes the times of the episode.
+
+        Args:
+            stream: Where to.
+            episode: Whose states the rows are.
+            from_zero: Whether time begins at 0, so that episodes can be compared.
+        """
+        self.stream = stream
+        self.episode = episode
+        time = episode.time - episode.time[0] if from_zero else episode.time
+        # Rounded here, since Rerun truncates 0.12 s to 119,999,999 ns.
+        self._times = np.round(time * 1e9).astype("timedelta64[ns]")
+        self._steps = np.arange(episode.steps + 1)
+
+    def static(self, entity: str, *archetypes: Any) -> None:
+        """Logs what never changes."""
+        for archetype in archetypes:
+            self.stream.log(entity, archetype, static=True, strict=True)
+
+    def columns(
+        self, entity: str, columns: Any, rows: slice | np.ndarray = slice(None)
+    ) -> None:
+        """Sends one row per state in ``rows``; nothing at all for no rows."""
+        times = self._times[rows]
+        if not len(times):
+            return
+        indexes = [
+            rr.TimeColumn(TIMELINE_TIME, duration=times),
+            rr.TimeColumn(TIMELINE_STEP, sequence=self._steps[rows]),
+        ]
+        self.stream.send_columns(entity, indexes, columns, strict=True)
+
+    def series(
+        self, entity: str, values: np.ndarray, rows: slice, names: Any, **style: Any
+    ) -> None:
+        """Sends (n,) or (n, C) values as one plot entity of C lines."""
+        self.static(entity, rr.SeriesLines(names=names, **style))
+        columns = rr.Scalars.columns(scalars=values.ravel())
+        if values.ndim == 2:
+            columns = columns.partition(np.full(len(values), values.shape[1]))
+        self.columns(entity, columns, rows)

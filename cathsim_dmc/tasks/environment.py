@@ -1,0 +1,45 @@
+"""The composer environment of a task, which says what to do without OpenGL."""
+
+import os
+
+from dm_control import composer, mjcf
+
+
+class Environment(composer.Environment):
+    """`composer.Environment`, but for what `physics.render` says without OpenGL."""
+
+    def _recompile_physics(self):
+        super()._recompile_physics()
+        # Composer makes an mjcf.Physics and asks for no other class.
+        self._physics.__class__ = NavigationPhysics
+
+    def __repr__(self) -> str:
+        """The task and how long a control step is."""
+        return (
+            f"<Environment of {self.task!r}, control step "
+            f"{1e3 * self.control_timestep():g} ms>"
+        )
+
+
+class NavigationPhysics(mjcf.Physics):
+    """The simulator, whose pictures need OpenGL."""
+
+    def _make_rendering_contexts(self):
+        """Opens the off-screen context that pictures are drawn in.
+
+        Raises:
+          RuntimeError: there is no OpenGL; says what to do.
+        """
+        try:
+            super()._make_rendering_contexts()
+        except Exception as error:  # every backend fails in its own way
+            chosen = os.environ.get("MUJOCO_GL", "not set")
+            raise RuntimeError(
+                "MuJoCo's renderer (physics.render, from_pixels) needs OpenGL, which "
+                f"does not start here (MUJOCO_GL is {chosen}: {type(error).__name__}: "
+                f"{error}). Set MUJOCO_GL to egl (with a GPU), osmesa (software) or "
+                "glfw (with a display) before Python starts. Without OpenGL: "
+                "cathsim_dmc.show(env) draws the scene, cathsim_dmc.fluoroscopy(env) "
+                'the X-ray image, and task_kwargs={"observation": "image"} makes the '
+                "X-ray image the observation, in place of from_pixels."
+            ) from error

@@ -1,0 +1,180 @@
+"""The route to a goal: where a head is on it, and what lies ahead of its tip.
+
+Pure functions of arrays with leading batch axes, written `...`; metres.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from typing import NamedTuple, Protocol
+
+import numpy as np
+
+from cathsim_dmc.anatomy import Centreline
+from cathsim_dmc.tasks.objectives import Objective
+
+ROUTE_SPACING = 1e-3  # m, resolution of the route
+# Way along the route from the place of the head to each of the points ahead, m.
+AHEAD = np.arange(8) * 5e-3
+_NEARBY = 10e-3  # m of the route that a head can pass between two control steps
+
+
+class RouteLike(Protocol):
+    """Points (P, 3), their arc lengths (P,) and the lumen's radii (P,) there, m."""
+
+    @property
+    def points(self) -> np.ndarray: ...  # noqa: D102
+
+    @property
+    def radii(self) -> np.ndarray: ...  # noqa: D102
+
+    @property
+    def arc_length(self) -> np.ndarray: ...  # noqa: D102
+
+
+@dataclasses.dataclass(frozen=True)
+class Route:
+    """A route in steps of `ROUTE_SPACING`.
+
+    Attributes:
+        points: (P, 3), from the inlet to the goal, m, world frame.
+        radii: (P,), of the lumen, m.
+        arc_length: (P,), m.
+    """
+
+    points: np.ndarray
+    radii: np.ndarray
+    arc_length: np.ndarray
+
+    @classmethod
+    def of(cls, line: Centreline) -> Route:
+        """The route along a centreline."""
+        fine = line.resampled(ROUTE_SPACING)
+        return cls(fine.points, fine.radii, fine.arc_length)
+
+
+def along(route: RouteLike, arc_length: np.ndarray) -> np.ndarray:
+    """Point (..., 3) of a route; beyond its end, straight on."""
+    point = np.stack(
+        [np.interp(arc_length, route.arc_length, route.points[:, i]) for i in range(3)],
+        axis=-1,
+    )
+    last = route.points[-1] - route.points[-2]
+    last = last / np.linalg.norm(last)
+    beyond = np.maximum(arc_length - float(route.arc_length[-1]), 0.0)
+    return point + beyond[..., None] * last
+
+
+@dataclasses.dataclass(frozen=True)
+class Place:
+    """Where a head is on a route.
+
+    Attributes:
+        arc_length: (...), m.
+        radius: (...), of the lumen there, m.
+        excess: (...), by how much the head is out of the route's tube, in radii there;
+            negative inside.
+    """
+
+    arc_length: np.ndarray
+    radius: np.ndarray
+    excess: np.ndarray
+
+
+def locate(route: RouteLike, head: np.ndarray, last: np.ndarray | None = None) -> Place:
+    """Finds the place of a head (..., 3) on the route.
+
+    It is the nearest point of the route whose cross-section reaches the head: beside
+    an ostium, still in the parent, the axis of the branch may be nearer than the
+    parent's, yet the head is not in the branch. If none does, it is the point whose
+    cross-section comes nearest.
+
+    Where the route turns back into a branch, the cross-sections of both reach a head
+    between them, and the nearer axis changes with every movement. A head that was on
+    one of them stays on it as long as it can: points near the last place come first.
+
+    Args:
+        route: The route.
+        head: (..., 3), m.
+        last: (...), arc length of its place a control step ago, m; NaN or None where
+            that is not known.
+    """
+    offset = head[..., None, :] - route.points
+    distance = np.sqrt(np.einsum("...i,...i->...", offset, offset))
+    outside = distance - route.radii
+    inside = outside <= 0
+    # Any inside point beats every outside one.
+    rank = np.where(inside, distance - 1.0, np.maximum(outside, 0.0))
+    if last is not None:  # and one near the last place every other
+        nearby = np.abs(route.arc_length - last[..., None]) <= _NEARBY
+        rank = rank - 1.0 * (inside & nearby)
+    index = rank.argmin(-1)
+    excess = np.take_along_axis(outside, index[..., None], -1)[..., 0]
+    radius = route.radii[index]
+    return Place(route.arc_length[index], radius, excess / radius)
+
+
+class Ahead(NamedTuple):
+    """What lies ahead of the tips of N simulations, in the frame of each tip.
+
+    Its origin is the head, its z the direction of the head, its x and y the axes of
+    the hinges of the last link.
+
+    Attributes:
+        points: (N, K, 3), of the route, `AHEAD` of the place of the head, m.
+        radii: (N, K), of the lumen there, m.
+    """
+
+    points: np.ndarray
+    radii: np.ndarray
+
+
+class Routes:
+    """Routes of N simulations, whose goals may lie in different anatomies."""
+
+    def __init__(self, objectives: Sequence[Objective]):
+        """Takes the objective of every anatomy.
+
+        Raises:
+            ValueError: one of them has no route.
+        """
+        self._lines: list[Centreline] = []
+        for objective in objectives:
+            line = getattr(objective, "route", None)
+            if not isinstance(line, Centreline):
+                raise ValueError(
+                    f"the objective {type(objective).__name__} has no route, a "
+                    "centreline from the inlet to the goal, for the observation "
+                    "'route' to show; observe 'tracking' instead"
+                )
+            self._lines.append(line)
+        self._routes: dict[int, Route] = {}
+
+    def ahead(self, chosen: np.ndarray, head: np.ndarray, frame: np.ndarray) -> Ahead:
+        """What lies ahead.
+
+        Args:
+            chosen: (N,) int, number of the anatomy of each simulation.
+            head: (N, 3), m, world frame.
+            frame: (N, 3, 3), orientation of each tip, its axes in columns.
+        """
+        points = np.empty((len(head), len(AHEAD), 3))
+        radii = np.empty((len(head), len(AHEAD)))
+        for number in np.unique(chosen).tolist():
+            if number not in self._routes:
+                self._routes[number] = Route.of(self._lines[number])
+            route, rows = self._routes[number], np.flatnonzero(chosen == number)
+            place = locate(route, head[rows]).arc_length[:, None] + AHEAD
+            points[rows] = along(route, place)
+            radii[rows] = np.interp(place, route.arc_length, route.radii)
+        return Ahead(into_frame(points - head[:, None], frame), radii)
+
+
+def into_frame(vectors: np.ndarray, frame: np.ndarray) -> np.ndarray:
+    """Vectors (..., K, 3) of the world in frames (..., 3, 3), axes in columns.
+
+    Written out: a matrix product may round otherwise for one simulation than for many.
+    """
+    x, y, z = (frame[..., None, axis, :] for axis in range(3))
+    return vectors[..., :1] * x + vectors[..., 1:2] * y + vectors[..., 2:] * z

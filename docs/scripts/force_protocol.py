@@ -1,0 +1,154 @@
+"""Forces of a cannulation of type1_bca against the published description.
+
+    python docs/scripts/force_protocol.py --out docs/data/force_protocol.json
+
+Steered by the expert and merely pushed, with 1 to 100 times the bending stiffness and
+three frictions, one episode of the same start each; writes the table of docs/forces.md.
+A sample is one contact in the last physics step of a control step, as published.
+"""
+
+import argparse
+import itertools
+import json
+import re
+from pathlib import Path
+
+import numpy as np
+
+from cathsim_dmc import files, policies, suite
+from cathsim_dmc.simulation.batch import BatchSimulation
+from cathsim_dmc.tasks.variations import Episode, ModelVariation, Randomisation
+
+TASK = "type1_bca"
+STIFFNESS = (1.0, 3.0, 10.0, 30.0, 100.0)  # times the device's EI
+FRICTION = (0.02, 0.037, 0.15)  # wet silicone 0.037; the rest is the range randomised
+POLICIES = {"expert": "steered", "push": "pushed"}
+STEPS = 250
+RESTING = 40  # control steps without progress after which an episode is at its end
+NARROW, WIDE = 0.2, 0.4  # N: most lie below the first, outliers above the second
+PAGE = Path(__file__).parents[1] / "forces.md"
+BEGIN, END = "<!-- protocol -->", "<!-- end of protocol -->"
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--out", type=Path, required=True)
+    parser.add_argument("--threads", type=int, default=0)
+    options = parser.parse_args()
+    rows = []
+    for policy in POLICIES:
+        rows += play(policy, options.threads)
+    files.write_text(options.out, json.dumps(rows, indent=1) + "\n")
+    block = "\n".join([BEGIN, *table(rows), END])
+    page = PAGE.read_text()
+    PAGE.write_text(re.sub(f"{BEGIN}.*{END}", lambda _: block, page, flags=re.S))
+
+
+def play(name, threads):
+    """A row of figures for every stiffness and friction."""
+    settings = list(itertools.product(STIFFNESS, FRICTION))
+    count = len(settings)
+    task = suite.make_task(TASK, observation="tracking")
+    simulation = BatchSimulation(task, count, num_threads=threads)
+    # The same start for all.
+    simulation.seed([0] * count)
+    step = simulation.reset()
+    vary(simulation, task, settings)
+    policy = policies.make_policy(name, 0)
+    policy.reset(policies.BatchedView(simulation), np.ones(count, dtype=bool))
+    samples = [[] for _ in settings]
+    cell, ends = [[] for _ in settings], [None] * count
+    lengths, best = np.zeros(count, dtype=int), np.full(count, -1.0)
+    resting = np.zeros(count, dtype=int)
+    for number in range(1, STEPS + 1):
+        step = simulation.step(policy.act(step.observation))
+        contacts, insertion = simulation.contacts(), step.readings.insertion
+        grown = insertion > best + 0.5e-3
+        best = np.where(grown, insertion, best)
+        resting = np.where(grown, 0, resting + 1)
+        for i in range(count):
+            if ends[i] is not None:
+                continue
+            lengths[i] = number
+            present = contacts.present[i]
+            samples[i] += contacts.magnitude[i][present].tolist()
+            if present.any():
+                resultant = contacts.force[i][present].sum(0)
+                cell[i].append(float(np.linalg.norm(resultant)))
+            if step.errors[i] is not None:
+                ends[i] = step.errors[i]
+            elif step.outcome.success[i]:
+                ends[i] = "success"
+            elif resting[i] >= RESTING and name == "push":
+                ends[i] = "stuck"
+        if None not in ends:
+            break
+    return [
+        {
+            "policy": name,
+            "stiffness": stiffness,
+            "friction": friction,
+            "end": ends[i] or "out of time",
+            "steps": int(lengths[i]),
+            **figures(np.array(samples[i]), np.array(cell[i]), int(lengths[i])),
+        }
+        for i, (stiffness, friction) in enumerate(settings)
+    ]
+
+
+def vary(simulation, task, settings):
+    """Writes stiffness and friction into the model of each simulation."""
+    model = simulation.batch.model
+    ranges = Randomisation(friction=(0.0, 1.0), stiffness=(1.0, 100.0))
+    variation = ModelVariation(model, ranges, task.scene.catheter.mjcf_model.model)
+    arrays = {name: simulation.batch.expand(name) for name in variation.fields}
+    for index, (stiffness, friction) in enumerate(settings):
+        own = {name: array[index] for name, array in arrays.items()}
+        episode = Episode(np.zeros(3), friction=friction, stiffness=stiffness)
+        variation.write(own, episode)
+
+
+def figures(samples, cell, steps):
+    """Of the contact forces (n,) and the load cell's readings (m,), N."""
+    if not len(samples):
+        return {"samples": 0}
+    return {
+        "samples": len(samples),
+        "in_contact": len(cell) / steps,
+        "mean": float(samples.mean()),
+        "median": float(np.median(samples)),
+        "p95": float(np.percentile(samples, 95)),
+        "max": float(samples.max()),
+        "below": float((samples <= NARROW).mean()),
+        "above": float((samples > WIDE).mean()),
+        "load_cell": float(cell.mean()),
+    }
+
+
+def table(rows):
+    """Lines of Markdown."""
+    lines = [
+        "| | EI, times | friction | end, control steps | contacts, steps in contact "
+        "| mean / median / p95 / max, mN | up to 0.2 N / above 0.4 N "
+        "| load cell, mean, mN |",
+        "|---|---|---|---|---|---|---|---|",
+    ]
+    for row in rows:
+        start = (
+            f"| {POLICIES[row['policy']]} | {row['stiffness']:g} | {row['friction']:g} "
+            f"| {row['end']}, {row['steps']} "
+        )
+        if not row["samples"]:
+            lines.append(start + "| none | – | – | – |")
+            continue
+        four = (f"{1e3 * row[key]:.0f}" for key in ("mean", "median", "p95", "max"))
+        lines.append(
+            start + f"| {row['samples']}, {100 * row['in_contact']:.0f} % "
+            f"| {' / '.join(four)} | {100 * row['below']:.0f} % / "
+            f"{100 * row['above']:.0f} % | {1e3 * row['load_cell']:.0f} |"
+        )
+    return lines
+
+
+if __name__ == "__main__":
+    main()

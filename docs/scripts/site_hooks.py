@@ -1,0 +1,110 @@
+"""What the documentation site shows beside the pages under docs/.
+
+`CONTRIBUTING.md` and `CHANGELOG.md` of the repository become pages, the examples one
+page with their code, and notebooks pages with their outputs. Links that lead out of
+docs/ in the repository lead to those pages on the site.
+"""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import nbformat
+from mkdocs.structure.files import File
+from nbconvert import MarkdownExporter
+
+ROOT = Path(__file__).parents[2]
+OF_THE_REPOSITORY = ("CONTRIBUTING.md", "CHANGELOG.md")
+# Pages that not every state of the repository has.
+OPTIONAL = ("results.md", "reliability.md")
+# A link out of docs/ and where it leads on the site.
+_LINK = re.compile(r"\]\((?:\.\./)*(docs/|examples/)?([\w./-]*)(#[\w-]*)?\)")
+
+
+def on_config(config):
+    """Leaves pages out of the menu that are not there."""
+    config.nav = _present(config.nav, Path(config.docs_dir))
+    return config
+
+
+def _present(entries, folder):
+    found = []
+    for entry in entries:
+        if isinstance(entry, dict):
+            [(title, target)] = entry.items()
+            if isinstance(target, list):
+                entry = {title: _present(target, folder)}
+            elif target in OPTIONAL and not (folder / target).exists():
+                continue
+        found.append(entry)
+    return found
+
+
+def on_files(files, config):
+    """Adds the pages that are written here."""
+    for name in OF_THE_REPOSITORY:
+        text = (ROOT / name).read_text()
+        files.append(File.generated(config, name, content=text))
+    files.append(File.generated(config, "examples.md", content=_examples()))
+    for notebook in sorted((Path(config.docs_dir) / "tutorials").glob("*.ipynb")):
+        source = f"tutorials/{notebook.name}"
+        files.remove(files.get_file_from_path(source))
+        for name, content in _notebook(notebook).items():
+            files.append(File.generated(config, name, content=content))
+    config.nav = _as_pages(config.nav)
+    return files
+
+
+def _as_pages(entries):
+    """The menu, with the page of each notebook in its place."""
+    if isinstance(entries, list):
+        return [_as_pages(entry) for entry in entries]
+    if isinstance(entries, dict):
+        return {title: _as_pages(target) for title, target in entries.items()}
+    return entries.replace(".ipynb", ".md")
+
+
+def on_page_markdown(markdown, page, config, files):
+    """Leads links out of docs/, and to notebooks, to the pages of the site."""
+    del config, files
+    up = "../" * page.file.src_uri.count("/")
+
+    def lead(match: re.Match) -> str:
+        folder, target, anchor = match.group(1), match.group(2), match.group(3) or ""
+        if folder == "examples/":
+            return f"]({up}examples.md#{Path(target).stem.replace('_', '-')})"
+        if folder == "docs/":
+            return f"]({up}{target}{anchor})"
+        if Path(target).name in OF_THE_REPOSITORY:
+            return f"]({up}{Path(target).name}{anchor})"
+        return match.group(0).replace(".ipynb", ".md")
+
+    return _LINK.sub(lead, markdown)
+
+
+def _examples() -> str:
+    """The examples with their code."""
+    parts = ["# Examples", "", "Files under `examples/` of the repository.", ""]
+    for path in sorted((ROOT / "examples").glob("*.py")):
+        anchor = path.stem.replace("_", "-")
+        parts += [f"## `{path.name}` {{ #{anchor} }}", ""]
+        parts += ["```python", path.read_text().rstrip(), "```", ""]
+    return "\n".join(parts)
+
+
+def _notebook(path: Path) -> dict[str, str | bytes]:
+    """The page of a notebook and its pictures, by their place on the site."""
+    notebook = nbformat.read(path, as_version=4)
+    exporter = MarkdownExporter()
+    text, resources = exporter.from_notebook_node(notebook)
+    text = re.sub(r"<style.*?</style>", "", text, flags=re.DOTALL)
+    pages: dict[str, str | bytes] = {}
+    for name, content in resources.get("outputs", {}).items():
+        picture = f"{path.stem}_{name}"
+        text = text.replace(f"({name})", f"({picture})")
+        pages[f"tutorials/{picture}"] = content
+    source = f"*This page is the notebook `docs/tutorials/{path.name}`.*"
+    first, rest = text.lstrip().split("\n", 1)
+    pages[f"tutorials/{path.stem}.md"] = f"{first}\n\n{source}\n{rest}"
+    return pages

@@ -1,0 +1,210 @@
+"""Cloning, DAgger, demonstrations in SAC's replay, and runs that start from another."""
+
+import numpy as np
+import pytest
+import torch
+from tensordict import TensorDict
+
+from cathsim_dmc.agents import (
+    Checkpoint,
+    ConfigError,
+    evaluate,
+    make_config,
+    make_env,
+    record_demonstrations,
+    train,
+)
+from cathsim_dmc.agents.bc import BC
+from cathsim_dmc.agents.dagger import DAgger
+from cathsim_dmc.agents.demonstrations import EXPERT_ACTION, load_transitions
+from cathsim_dmc.agents.imitation import network_of
+from cathsim_dmc.agents.metrics import read_metrics
+from cathsim_dmc.agents.networks import NetworkShapes
+from cathsim_dmc.agents.sac import SAC
+
+SHARED = {
+    "task": "simple1_bca",
+    "observation": "tracking",
+    "num_envs": 2,
+    "num_threads": 1,
+    "hidden": (32,),
+    "task_kwargs": {"goal_radius": 0.045},
+}
+CLOCKS = ("seconds", "frames_per_second")
+
+
+@pytest.fixture(scope="module")
+def dataset(tmp_path_factory):
+    out = tmp_path_factory.mktemp("demos") / "near-v0"
+    kwargs = SHARED["task_kwargs"]
+    return str(record_demonstrations("simple1_bca", out, 2, task_kwargs=kwargs).path)
+
+
+@pytest.fixture(scope="module")
+def shapes():
+    return NetworkShapes.of(
+        make_env("simple1_bca", observation="tracking", num_threads=1)
+    )
+
+
+def small(algorithm, **changes):
+    return make_config(algorithm, **{**SHARED, **changes})
+
+
+@pytest.fixture(scope="module")
+def cloned(dataset, tmp_path_factory):
+    out = tmp_path_factory.mktemp("bc")
+    config = small(
+        "bc", demonstrations=dataset, gradient_steps=600, steps_per_env=8,
+        total_frames=64, metrics_frames=16,
+    )  # fmt: skip
+    train(config, out, progress=False)
+    return out
+
+
+def act(policy, vectors):
+    """What a policy would do on average, before the tanh."""
+    states = policy[0](TensorDict({"observation_vector": vectors}, [len(vectors)]))
+    return network_of(policy)(states["observation_normal"])
+
+
+def test_a_clone_does_what_the_expert_did(cloned, dataset, shapes):
+    rows = read_metrics(cloned / "metrics.csv")
+    assert rows[-1]["gradient_steps"] == 600
+    assert rows[-1]["loss"] < rows[0]["loss"] / 4
+    states = load_transitions(dataset, "tracking", shapes)
+    policy = Checkpoint.open(cloned).policy()
+    mean, std = act(policy, states["observation_vector"])
+    error = mean.tanh() - states[EXPERT_ACTION]
+    # A constant action would err by as much as the actions vary.
+    assert error.square().mean().sqrt() < states[EXPERT_ACTION].std(0).mean() / 2
+    # It explores as far as it errs: PPO that starts from it keeps to the way.
+    assert std.max() < 0.5
+    assert evaluate(cloned, episodes=1, task_kwargs={"max_steps": 3}).episodes
+
+
+def test_cloning_needs_a_dataset(tmp_path):
+    with pytest.raises(ConfigError, match="cathsim demos"):
+        train(small("bc"), tmp_path, progress=False)
+
+
+def test_a_clone_that_is_continued_learns_the_same(dataset, shapes, tmp_path):
+    config = small(
+        "bc", demonstrations=dataset, gradient_steps=40, steps_per_env=1, total_frames=4
+    )
+    torch.manual_seed(0)
+    straight = BC(config, shapes, tmp_path)
+    batch = TensorDict({}, [2, 1])
+    straight.update(batch, 0.0)
+    continued = BC(config, shapes, tmp_path)
+    continued.load(straight.policy_state(), straight.learning_state())
+    generator = torch.get_rng_state()
+    first = straight.update(batch, 0.5)
+    torch.set_rng_state(generator)
+    assert continued.update(batch, 0.5) == first
+    for one, other in zip(
+        straight.policy_state().values(), continued.policy_state().values(), strict=True
+    ):
+        torch.testing.assert_close(one, other, rtol=0, atol=0)
+
+
+def dagger(**changes):
+    settings = {
+        "steps_per_env": 8, "gradient_steps": 20, "total_frames": 48,
+        "metrics_frames": 16, "checkpoint_frames": 16,
+    }  # fmt: skip
+    return small("dagger", **{**settings, **changes})
+
+
+def test_dagger_learns_from_what_the_expert_would_do(tmp_path, monkeypatch):
+    batches = []
+    update = DAgger.update
+
+    def keep(self, batch, progress):
+        batches.append(batch.clone())
+        return update(self, batch, progress)
+
+    monkeypatch.setattr(DAgger, "update", keep)
+    train(dagger(expert_share=0.0), tmp_path / "a", progress=False)
+    first, *later = batches
+    torch.testing.assert_close(first["action"], first[EXPERT_ACTION], rtol=0, atol=0)
+    for batch in later:  # the learner alone
+        assert (batch["action"] != batch[EXPERT_ACTION]).any(-1).all()
+    rows = read_metrics(tmp_path / "a" / "metrics.csv")
+    assert [row["replay_frames"] for row in rows] == [16, 32, 48]
+    assert [row["expert_share"] for row in rows] == [1, 0, 0]
+    batches.clear()
+    train(dagger(expert_share=0.5), tmp_path / "b", progress=False)
+    apart = [(b["action"] != b[EXPERT_ACTION]).any(-1).float().mean() for b in batches]
+    assert apart[0] == 0 and 0.2 < apart[1] < 0.8 and apart[1] < apart[2]
+
+
+def test_dagger_repeats_and_goes_on(tmp_path):
+    for name in "ab":
+        train(dagger(), tmp_path / name, progress=False)
+    one, other = (read_metrics(tmp_path / name / "metrics.csv") for name in "ab")
+    for row in (*one, *other):
+        for clock in CLOCKS:
+            del row[clock]
+    assert one == other
+    more = dagger(total_frames=64)
+    result = train(more, tmp_path / "a", resume=True, progress=False)
+    assert result.metrics["replay_frames"] == 64
+    assert result.metrics["expert_share"] == pytest.approx(0.5**3)
+    # Without the expert, and without its simulations.
+    assert evaluate(tmp_path / "a", episodes=1, task_kwargs={"max_steps": 3}).episodes
+
+
+@pytest.mark.parametrize("algorithm", ["ppo", "sac"])
+def test_a_run_starts_from_the_policy_of_another(cloned, shapes, tmp_path, algorithm):
+    settings = {"total_frames": 2, "num_envs": 2, "learning_rate": 1e-12}
+    own = {
+        "ppo": {"steps_per_update": 2, "minibatch_size": 2, "epochs": 1},
+        "sac": {"steps_per_env": 1, "random_frames": 2, "batch_size": 2,
+                "replay_frames": 8, "updates_per_frame": 0.5},
+    }  # fmt: skip
+    config = small(algorithm, **settings, **own[algorithm], initial_policy=str(cloned))
+    train(config, tmp_path, progress=False)
+    vectors = torch.randn(5, shapes.vector) * 0.05
+    source, result = (Checkpoint.open(path).policy() for path in (cloned, tmp_path))
+    expected, deviation = act(source, vectors)
+    mean, std = act(result, vectors)
+    # Two frames have been added to the statistics since.
+    torch.testing.assert_close(mean.tanh(), expected.tanh(), rtol=0, atol=0.05)
+    torch.testing.assert_close(std, deviation, rtol=1e-3, atol=0)
+    fresh = small(algorithm, **settings, **own[algorithm])
+    train(fresh, tmp_path / "fresh", progress=False)
+    other, _ = act(Checkpoint.open(tmp_path / "fresh").policy(), vectors)
+    assert (other.tanh() - expected.tanh()).abs().max() > 0.1
+
+
+def test_the_deviation_to_start_with_can_be_given(cloned, shapes, tmp_path):
+    config = small(
+        "ppo", total_frames=2, steps_per_update=2, minibatch_size=2, epochs=1,
+        learning_rate=1e-12, initial_policy=str(cloned), initial_std=0.3,
+    )  # fmt: skip
+    train(config, tmp_path, progress=False)
+    _, std = act(Checkpoint.open(tmp_path).policy(), torch.zeros(1, shapes.vector))
+    np.testing.assert_allclose(std, 0.3, rtol=1e-3)
+
+
+def test_a_policy_that_does_not_fit_is_refused(cloned, tmp_path):
+    config = small("ppo", initial_policy=str(cloned), hidden=(16,))
+    with pytest.raises(ConfigError, match=r"hidden: it has \(32,\), given is \(16,\)"):
+        train(config, tmp_path, progress=False)
+    with pytest.raises(ConfigError, match="initial_std=0"):
+        small("ppo", initial_std=0.0)
+
+
+def test_half_of_sacs_minibatch_is_shown(dataset, shapes, tmp_path):
+    config = small("sac", demonstrations=dataset, random_frames=256)
+    learner = SAC(config, shapes, tmp_path)
+    shown = load_transitions(dataset, "tracking", shapes)
+    own = shown[:4].clone()
+    own["action"] = torch.full_like(own["action"], 0.123)
+    learner.replay.extend(own.select(*learner.replay_keys))
+    sample = learner._sample(10)
+    assert (sample["action"] == 0.123).all(-1).tolist() == [False] * 5 + [True] * 5
+    torch.manual_seed(0)
+    figures = learner._step()
+    assert all(torch.isfinite(value).all() for value in figures.values())

@@ -1,0 +1,426 @@
+"""Damaged files at every loader: refused, by path, and nothing is written."""
+
+import hashlib
+import io
+import json
+import shutil
+
+import numpy as np
+import pytest
+import synthetic_env
+import torch
+from bad_values import Tally, damaged_bytes, damaged_json
+from hypothesis import strategies as st
+from recording_samples import make_episode
+from synthetic_scans import marched, write_markup, write_obj, y_tree
+from test_agents_training import run, small_ppo, small_sac
+
+from cathsim_dmc.agents import Checkpoint
+from cathsim_dmc.agents.checkpoint import checkpoints_in
+from cathsim_dmc.agents.learners import config_from_dict
+from cathsim_dmc.agents.replay import ReplayMemory
+from cathsim_dmc.anatomy import Anatomy
+from cathsim_dmc.anatomy.scan.curves import read_curve
+from cathsim_dmc.anatomy.scan.mesh import read_triangles
+from cathsim_dmc.anatomy.tree_file import read_tree
+from cathsim_dmc.recording import viewer
+from cathsim_dmc.recording.episode import Episode
+from cathsim_dmc.tasks import physics_errors
+from cathsim_dmc.validation import force_sensors
+
+ERRORS = (ValueError, OSError, RuntimeError)
+
+
+@pytest.fixture(scope="module")
+def store(tmp_path_factory):
+    """One good file or folder of every kind."""
+    folder = tmp_path_factory.mktemp("store")
+    force_sensors.straight_tube(0.06, 4e-3).save(folder / "anatomy")
+    run(small_ppo(total_frames=512), folder / "ppo")
+    run(small_sac(total_frames=1_024, replay_frames=1_024), folder / "sac")
+    make_episode().save(folder / "episode.npz")
+    physics_errors.dump(
+        "tried", task={}, state=np.ones(9), actions=np.ones((3, 2)), directory=folder
+    ).rename(folder / "dump.npz")
+    vertices, faces = marched(y_tree(), 3e-3)
+    write_obj(folder / "lumen.obj", vertices, faces)
+    import trimesh
+
+    mesh = trimesh.Trimesh(vertices, faces, process=False)
+    for kind in ("stl", "ply"):
+        mesh.export(folder / f"lumen.{kind}")
+    points = [[0, 0, z] for z in range(0, 50, 5)]
+    write_markup(folder / "centreline-lcca.mrk.json", points, radii=[4.0] * 10)
+    tree = {
+        "format": "cathsim-vessel-tree",
+        "version": 1,
+        "name": "made up",
+        "units": "mm",
+        "frame": "LPS",
+        "vessels": {
+            "aorta": {
+                "parent": None,
+                "points_mm": [[0.0, 0, 0], [0, 0, 50], [0, 10, 100]],
+                "radii_mm": [12.0, 12.0, 11.0],
+            },
+            "bca": {
+                "parent": "aorta",
+                "points_mm": [[0.0, 0, 60], [20, 0, 80], [40, 0, 110]],
+                "radii_mm": [5.0, 5.0, 4.0],
+            },
+        },
+        "inlets": {"first": {"vessel": "aorta", "end": "first"}},
+        "goals": {"bca": {"vessel": "bca", "past_ostium_mm": 20.0}},
+    }
+    (folder / "tree.json").write_text(json.dumps(tree))
+    return folder
+
+
+def try_json(tally, entry, path, load, examples, harmless=lambda path, value: False):
+    """Damages one entry of a JSON file, and loads it."""
+    good = path.read_text()
+
+    def check(damaged):
+        text, where = damaged
+        path.write_text(text)
+        tally.refused(f"{entry}, entries", load, [path.name], ERRORS, note=where)
+
+    try:
+        tally.draw(damaged_json(json.loads(good), harmless), examples, check)
+    finally:
+        path.write_text(good)
+    load()
+
+
+def try_bytes(tally, entry, path, load, examples, same=None, named=None):
+    """Damages the bytes of a file, and loads it; `same` tells whether all is there."""
+    good = path.read_bytes()
+
+    def check(data):
+        if data == good:
+            return
+        path.write_bytes(data)
+
+        def read():
+            result = load()
+            if same is not None and same(result):
+                # A flipped bit that nobody reads, such as the time of a zip's entry.
+                raise ValueError(path.name)
+            return result
+
+        tally.refused(f"{entry}, bytes", read, [named or path.name], ERRORS)
+
+    try:
+        tally.draw(damaged_bytes(good), examples, check)
+    finally:
+        path.write_bytes(good)
+
+
+def reseal(folder):
+    """Makes the checksum of a checkpoint fit its edited files."""
+    path = folder / "checkpoint.json"
+    values = json.loads(path.read_text())
+    for name in values["sha256"]:
+        digest = hashlib.sha256((folder / name).read_bytes()).hexdigest()
+        values["sha256"][name] = digest
+    path.write_text(json.dumps(values))
+
+
+def try_anatomy(tally, store, examples):
+    folder = store / "anatomy"
+
+    def harmless(path, value):
+        # A vessel without a parent is a root; what names one is checked.
+        return path[-1] == "parent" and (value is None or isinstance(value, str))
+
+    try_json(
+        tally,
+        "anatomy",
+        folder / "anatomy.json",
+        lambda: Anatomy.load(folder),
+        examples,
+        harmless,
+    )
+    (geometry,) = folder.glob("geometry-*.npz")
+    try_bytes(tally, "anatomy", geometry, lambda: Anatomy.load(folder), examples)
+    with np.load(geometry) as archive:
+        arrays = dict(archive)
+    good = geometry.read_bytes(), (folder / "anatomy.json").read_text()
+    kinds = ["nan", "inf", "huge", "shape", "text", "missing", "empty", "shift"]
+
+    def check(damage):
+        name, kind = damage
+        values = arrays[name].copy()
+        if kind in ("nan", "inf") and values.dtype.kind != "f":
+            kind = "text"
+        if kind in ("huge", "shift") and values.dtype.kind != "f":
+            values = values + 10**6
+        elif kind == "huge":
+            values = values * 1e6
+        elif kind == "shift":
+            values = values + 20.0
+        changed = {
+            "nan": lambda: np.full_like(values, np.nan),
+            "inf": lambda: np.full_like(values, np.inf),
+            "shape": lambda: values[None],
+            "text": lambda: np.full(values.shape, "x"),
+            "empty": lambda: values[:0] if values.ndim else values[None],
+        }.get(kind, lambda: values)()
+        held = {k: v for k, v in arrays.items() if k != name}
+        if kind != "missing":
+            held[name] = changed
+        buffer = io.BytesIO()
+        np.savez_compressed(buffer, allow_pickle=False, **held)
+        geometry.write_bytes(buffer.getvalue())
+        description = json.loads(good[1])
+        description["sha256"] = hashlib.sha256(buffer.getvalue()).hexdigest()
+        (folder / "anatomy.json").write_text(json.dumps(description))
+        tally.refused(
+            "anatomy, arrays", lambda: Anatomy.load(folder), ["anatomy"], note=damage
+        )
+
+    # Wall pieces may be none: a phantom without walls is one's own business.
+    names = sorted(arrays)
+    cases = st.sampled_from([(n, k) for n in names for k in kinds])
+    cases = cases.filter(lambda c: not (c[0].startswith("wall_") and c[1] == "empty"))
+    try:
+        tally.draw(cases, examples, check)
+    finally:
+        geometry.write_bytes(good[0])
+        (folder / "anatomy.json").write_text(good[1])
+
+
+def try_checkpoint(tally, store, examples):
+    path = checkpoints_in(store / "ppo")[-1]
+
+    def harmless(where, value):
+        # For people, and where the settings have more than one kind.
+        free = ("versions", "num_threads", "target_kl", "task_kwargs")
+        as_number = isinstance(value, int | float) and not isinstance(value, bool)
+        fits = as_number and np.isfinite(value)
+        return (
+            not {"versions", "task_kwargs"}.isdisjoint(map(str, where))
+            or where[-1] in free
+            or (where[-1] == "observation" and isinstance(value, list) and value)
+            or (fits and where[-1] in ("value_coefficient", "observation_clip"))
+            or (fits and value > 0)
+            or (value == "left out" and "config" in where and len(where) > 1)
+        )
+
+    def load():
+        return Checkpoint.open(path).policy()
+
+    try_json(tally, "checkpoint", path / "checkpoint.json", load, examples, harmless)
+    for name in ("policy.pt", "learning.pt"):
+        read = load if name == "policy.pt" else Checkpoint.open(path).learning_state
+        try_bytes(tally, f"checkpoint {name}", path / name, read, examples)
+    good = (path / "policy.pt").read_bytes(), (path / "checkpoint.json").read_text()
+    state = torch.load(io.BytesIO(good[0]), weights_only=True)
+    changes = {
+        "shape": lambda v: v.new_zeros(3, *v.shape),
+        "text": lambda v: "x",
+        "none": lambda v: None,
+        "number": lambda v: 1.5,
+    }
+
+    def check(damage):
+        key, kind = damage
+        changed = dict(state)
+        if kind == "left out":
+            del changed[key]
+        elif kind == "added":
+            changed[f"{key}.x"] = torch.zeros(3)
+        else:
+            changed[key] = changes[kind](state[key])
+        torch.save(changed, path / "policy.pt")
+        reseal(path)
+        tally.refused("checkpoint, weights", load, ["policy.pt"], ERRORS, note=damage)
+
+    kinds = st.sampled_from([*changes, "left out", "added"])
+    keys = st.sampled_from([k for k, v in state.items() if isinstance(v, torch.Tensor)])
+    try:
+        tally.draw(st.tuples(keys, kinds), examples, check)
+    finally:
+        (path / "policy.pt").write_bytes(good[0])
+        (path / "checkpoint.json").write_text(good[1])
+
+
+def try_replay(tally, store, examples):
+    folder = store / "sac" / "replay"
+    state = Checkpoint.open(store / "sac").learning_state()["learner"]["replay"]
+
+    def load():
+        ReplayMemory(folder, 1_024, 10**9).load(state)
+
+    try_json(tally, "replay", folder / "replay.json", load, examples)
+
+
+def try_settings(tally, store, examples):
+    values = json.loads((store / "ppo" / "config.json").read_text())
+    kept = {
+        k: v
+        for k, v in values.items()
+        if k not in ("task_kwargs", "num_threads", "target_kl", "observation")
+    }
+
+    def harmless(path, value):
+        number = isinstance(value, int | float) and not isinstance(value, bool)
+        return value == "left out" or (number and np.isfinite(value) and value > 0)
+
+    def check(damaged):
+        text, where = damaged
+        if where:
+            word = "config" if where[0] == "algorithm" else where[0]
+            word = "algorithm" if where[0] == "algorithm" else word
+            tally.refused(
+                "config.json", lambda: config_from_dict(json.loads(text)), [word]
+            )
+
+    tally.draw(damaged_json(kept, harmless), examples, check)
+
+
+def try_recordings(tally, store, examples):
+    path, good = store / "episode.npz", Episode.load(store / "episode.npz")
+    read = lambda: Episode.load(path)  # noqa: E731
+    try_bytes(tally, "episode", path, read, examples, good.equals)
+    dump = store / "dump.npz"
+    first = physics_errors.load(dump)
+
+    def same(other):
+        return other[0] == first[0] and all(
+            np.array_equal(a, b) for a, b in zip(other[1:], first[1:], strict=True)
+        )
+
+    read = lambda: physics_errors.load(dump)  # noqa: E731
+    try_bytes(tally, "dump of an error", dump, read, examples, same)
+    rrd = store / "broken.rrd"
+
+    def check(data):
+        rrd.write_bytes(data)
+        tally.refused("rerun file", lambda: viewer.check_recording(rrd), [rrd.name])
+
+    no_rrd = st.binary(max_size=100).filter(lambda data: not data.startswith(b"RRF2"))
+    tally.draw(no_rrd, examples, check)
+    rrd.unlink()
+
+
+def try_scans(tally, store, examples):
+    for kind in ("stl", "ply", "obj", "vtp"):
+        path = store / f"broken.{kind}"
+        good = b""
+        if kind != "vtp":
+            good = (store / f"lumen.{kind}").read_bytes()
+        # Halves, and files of another kind; a flipped bit may give a lumen too.
+        halves = st.integers(1, max(1, len(good) // 2)).map(lambda n, g=good: g[:n])
+        texts = st.sampled_from(
+            [
+                b"",
+                b"\0" * 84,
+                b"\0" * 80 + b"\xff\xff\xff\x7f" + b"\0" * 50,
+                b"solid x\nfacet normal 0 0 1\nouter loop\nvertex 1 2\n",
+                b"ply\nformat ascii 1.0\nelement vertex 99999999999\nend_header\n",
+                b"v nan nan nan\nv 0 0 0\nv 1 1 1\nf 1 2 3\n",
+                b"v 0 0 0\nf 1 2 9\n",
+                b"v 0 0 0\nv 1 0 0\nv 0 1 0\n",
+                b"<?xml version='1.0'?><VTKFile type='PolyData'></VTKFile>",
+                b"<!DOCTYPE x [<!ENTITY a 'aaaa'>]><VTKFile>&a;</VTKFile>",
+            ]
+        )
+        few = st.binary(max_size=300)
+        strategy = st.one_of(texts, few, halves) if good else st.one_of(texts, few)
+        if kind == "obj":
+            # Half an OBJ is an OBJ with fewer triangles, and is found out later.
+            strategy = st.one_of(
+                texts.filter(lambda t: not t.startswith(b"v 0 0 0\nv 1"))
+            )
+
+        def check(data, path=path, kind=kind):
+            path.write_bytes(data)
+            tally.refused(
+                f"scan, {kind}", lambda: read_triangles(path), [path.name], ERRORS
+            )
+
+        tally.draw(strategy, examples, check)
+        path.unlink()
+
+
+def try_curves_and_trees(tally, store, examples):
+    curve = store / "centreline-lcca.mrk.json"
+
+    def harmless(path, value):
+        said = ("type", "coordinateUnits", "coordinateSystem", "measurements")
+        return not set(said).isdisjoint(map(str, path))
+
+    try_json(tally, "centreline", curve, lambda: read_curve(curve), examples, harmless)
+    table = store / "lcca.csv"
+
+    def check(text):
+        table.write_text(text)
+        tally.refused("centreline table", lambda: read_curve(table), [table.name])
+
+    rows = st.sampled_from(
+        ["1,2,3", "x,y,z", "1,2", "nan,1,2", "1;2", "", "a", "inf,0,0"]
+    )
+    bad = st.lists(rows, max_size=4).filter(lambda some: some.count("1,2,3") < 2)
+    tally.draw(bad.map("\n".join), examples, check)
+    table.unlink()
+    tree = store / "tree.json"
+
+    def optional(path, value):
+        left = path[-1] in ("inlets", "goals", "note") and value == "left out"
+        none = path == ("goals",) and value is None
+        return left or none or (value == {} and path[-1] in ("inlets", "goals"))
+
+    try_json(tally, "tree file", tree, lambda: read_tree(tree), examples, optional)
+    try_bytes(
+        tally,
+        "tree file",
+        tree,
+        lambda: read_tree(tree),
+        examples,
+        # A letter of a name or a figure may be another and be fine.
+        same=lambda other: True,
+    )
+
+
+EVERYTHING = (
+    try_anatomy,
+    try_checkpoint,
+    try_replay,
+    try_settings,
+    try_recordings,
+    try_scans,
+    try_curves_and_trees,
+)
+
+
+def settled(tally, store, before):
+    assert sorted(store.rglob("*")) == before, "something was written"
+    print(tally.report())
+    shown = "\n".join(sorted(set(tally.wrong))[:200])
+    assert not tally.wrong, f"{len(tally.wrong)} of {tally.tried.total()}:\n{shown}"
+
+
+def test_damaged_files_are_refused_by_name(store):
+    tally, before = Tally(), sorted(store.rglob("*"))
+    for one in EVERYTHING:
+        one(tally, store, 8)
+    settled(tally, store, before)
+    assert tally.tried.total() > 100
+
+
+@pytest.mark.slow
+def test_hundreds_of_damaged_files_are_refused_by_name(store):
+    tally, before = Tally(), sorted(store.rglob("*"))
+    for one in EVERYTHING:
+        one(tally, store, 60)
+    settled(tally, store, before)
+    assert tally.tried.total() > 700
+
+
+def test_a_run_with_damaged_settings_can_still_be_evaluated(store, tmp_path):
+    """The checkpoint holds its own settings: config.json is for people."""
+    shutil.copytree(store / "ppo", tmp_path / "run")
+    (tmp_path / "run" / "config.json").write_text("{")
+    Checkpoint.open(tmp_path / "run").policy()
+    assert synthetic_env.ACTIONS == Checkpoint.open(tmp_path / "run").shapes.actions

@@ -1,0 +1,148 @@
+"""The same seed gives the same bytes, in any process and on any number of threads."""
+
+import hashlib
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from cathsim_dmc import suite
+from cathsim_dmc.agents import make_config, train
+from cathsim_dmc.agents.checkpoint import Checkpoint
+from cathsim_dmc.anatomy.arch import arch
+from cathsim_dmc.simulation.batch import BatchSimulation
+
+STEPS = 15
+RANDOM = {"randomisation": True}
+
+
+def digest(*arrays):
+    """Of the bytes of arrays."""
+    sum_ = hashlib.sha256()
+    for array in arrays:
+        array = np.ascontiguousarray(array)
+        sum_.update(str((array.dtype, array.shape)).encode())
+        sum_.update(array.tobytes())
+    return sum_.hexdigest()
+
+
+def actions(seed, count):
+    return np.random.RandomState(seed).uniform(-1, 1, (STEPS, 1, count))
+
+
+def trajectory(threads, simulations=3, **options):
+    """Digest of what one batch does: states, rewards, forces and observations."""
+    task = suite.make_task("type1_lcca", **options)
+    batch = BatchSimulation(task, simulations, num_threads=threads, seeds=7)
+    step = batch.reset()
+    seen = [*map(np.array, step.observation.values())]
+    for action in actions(1, batch.num_actions):
+        step = batch.step(np.tile(action, (simulations, 1)))
+        seen += [batch.batch.qpos.copy(), step.outcome.reward, step.wall_force.peak_max]
+        seen += [np.array(value) for _, value in sorted(step.observation.items())]
+    return digest(*seen)
+
+
+def anatomy_digest():
+    anatomy = arch.build_seed(arch.arch_set("train")[3])
+    return digest(anatomy.surface.vertices, anatomy.surface.faces, *anatomy.wall)
+
+
+IN_PROCESS = """
+import test_determinism as t
+print(t.trajectory(1, **t.RANDOM), t.trajectory(1, observation="image"),
+      t.anatomy_digest())
+"""
+
+
+def elsewhere():
+    """The digests in a process of its own, with another hash seed."""
+    paths = [str(Path(__file__).parent), *sys.path]
+    done = subprocess.run(
+        [sys.executable, "-c", IN_PROCESS],
+        env={
+            **os.environ,
+            "PYTHONPATH": os.pathsep.join(filter(None, paths)),
+            "PYTHONHASHSEED": "123",
+        },
+        capture_output=True,
+        text=True,
+        timeout=300,
+    )
+    assert done.returncode == 0, done.stderr
+    return done.stdout.split()
+
+
+def test_processes_agree_on_trajectories_images_and_anatomies():
+    here = [
+        trajectory(1, **RANDOM),
+        trajectory(1, observation="image"),
+        anatomy_digest(),
+    ]
+    assert elsewhere() == here
+
+
+@pytest.mark.parametrize("options", [RANDOM, {"observation": "image"}])
+def test_the_number_of_threads_changes_nothing(options):
+    assert trajectory(1, **options) == trajectory(2, **options)
+
+
+def test_another_seed_is_another_trajectory():
+    """The digest sees what it must see."""
+    task = suite.make_task("type1_lcca", **RANDOM)
+    batch = BatchSimulation(task, 2, num_threads=1, seeds=[7, 8])
+    batch.reset()
+    action = np.zeros((2, batch.num_actions))
+    batch.step(action)
+    assert (batch.batch.qpos[0] != batch.batch.qpos[1]).any()
+    assert digest(batch.batch.qpos[0]) != digest(batch.batch.qpos[1])
+
+
+def test_composer_and_batch_give_the_same_bytes():
+    environment = suite.load("cathsim", "type1_lcca", task_kwargs={"random": 7})
+    environment.reset()
+    task = suite.make_task("type1_lcca")
+    batch = BatchSimulation(task, 1, num_threads=1, seeds=7)
+    batch.reset()
+    for action in actions(1, batch.num_actions):
+        timestep = environment.step(action[0])
+        step = batch.step(action)
+        assert digest(environment.physics.data.qpos) == digest(batch.batch.qpos[0])
+        assert timestep.reward == step.outcome.reward[0]
+        for key, value in timestep.observation.items():
+            np.testing.assert_array_equal(value, step.observation[key][0])
+
+
+def weights(state, prefix=""):
+    for key, value in sorted(state.items()):
+        if isinstance(value, dict):
+            yield from weights(value, f"{prefix}{key}.")
+        elif isinstance(value, torch.Tensor):
+            yield f"{prefix}{key}", value
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("algorithm", ["ppo", "sac"])
+def test_a_training_of_2000_frames_gives_the_same_weights_twice(tmp_path, algorithm):
+    settings = {"random_frames": 512} if algorithm == "sac" else {}
+    config = make_config(
+        algorithm,
+        task="type1_bca",
+        total_frames=2_000,
+        num_envs=8,
+        normalisation_frames=256,
+        seed=5,
+        **settings,
+    )
+    states = []
+    for index, threads in enumerate((1, 2)):
+        out = tmp_path / str(index)
+        train(config.replace(num_threads=threads), out, progress=False)
+        states.append(dict(weights(Checkpoint.open(out).policy_state())))
+    assert states[0].keys() == states[1].keys() and states[0]
+    for name, value in states[0].items():
+        assert torch.equal(value, states[1][name]), name

@@ -1,0 +1,106 @@
+"""What the documentation says runs, and its pages fit together."""
+
+import importlib.util
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+DOCS = ROOT / "docs"
+NOTEBOOKS = sorted((DOCS / "tutorials").glob("*.ipynb"))
+_BLOCK = re.compile(r"^```python\n(.*?)^```", re.DOTALL | re.MULTILINE)
+# Pages whose Python blocks run one after the other in one interpreter.
+SNIPPETS = ["README.md", "docs/index.md", "docs/concepts.md", "docs/how-to.md"]
+
+
+def run(arguments, folder):
+    done = subprocess.run(
+        [sys.executable, *arguments],
+        capture_output=True,
+        text=True,
+        cwd=folder,
+        env={
+            **os.environ,
+            "MUJOCO_GL": "disable",
+            "PYTHONPATH": os.pathsep.join(map(str, [ROOT, *sys.path])),
+        },
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr[-3000:]
+    return done.stdout
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("page", SNIPPETS)
+def test_snippets_run_as_printed(page, tmp_path):
+    blocks = _BLOCK.findall((ROOT / page).read_text())
+    assert blocks, f"{page} has no Python block any more: take it off the list"
+    # torchrl goes before dm_control, and a page may ask for it late.
+    run(["-c", "\n".join(blocks)], tmp_path)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("notebook", NOTEBOOKS, ids=lambda path: path.stem)
+def test_tutorials_run(notebook):
+    spec = importlib.util.spec_from_file_location(
+        "notebooks", DOCS / "scripts" / "notebooks.py"
+    )
+    script = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(script)
+    fresh = script.executed(notebook)
+    code = [cell for cell in fresh.cells if cell.cell_type == "code"]
+    assert all(cell.execution_count for cell in code)
+
+
+def test_there_are_six_tutorials():
+    assert [path.name[0] for path in NOTEBOOKS] == list("123456")
+
+
+def test_notebooks_hold_nothing_of_the_machine_they_ran_on():
+    for path in NOTEBOOKS:
+        text = path.read_text()
+        assert len(text) < 1_500_000, f"{path.name} is too large"
+        for word in (str(ROOT), str(Path.home()) + "/", "Traceback"):
+            assert word not in text, f"{path.name} holds {word!r}"
+
+
+def test_pages_link_to_files_that_exist():
+    pages = [*DOCS.rglob("*.md"), ROOT / "README.md", ROOT / "CONTRIBUTING.md"]
+    wrong = []
+    for page in pages:
+        for target in re.findall(r"\]\(([^)#\s]+)", page.read_text()):
+            if "://" not in target and not (page.parent / target).exists():
+                wrong.append(f"{page.relative_to(ROOT)}: {target}")
+    assert not wrong
+
+
+@pytest.mark.slow
+def test_the_site_builds_without_a_warning(tmp_path):
+    pytest.importorskip("mkdocs", reason="needs the extra docs")
+    pytest.importorskip("nbconvert", reason="needs the extra docs")
+    done = subprocess.run(
+        [sys.executable, "-m", "mkdocs", "build", "--strict", "-d", str(tmp_path)],
+        capture_output=True,
+        text=True,
+        cwd=ROOT,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr[-3000:]
+    for page in ("index", "concepts", "examples", "reference/suite", "CONTRIBUTING"):
+        assert (tmp_path / f"{page}.html").is_file()
+    assert list((tmp_path / "tutorials").glob("4_forces*.png"))
+    text = re.sub("<[^>]*>", "", (tmp_path / "reference/suite.html").read_text())
+    assert "load_anatomy" in text and "Raises" in text
+
+
+@pytest.mark.slow
+def test_the_example_of_ppo_learns_what_it_prints(tmp_path):
+    script = ROOT / "examples" / "train_ppo.py"
+    assert len(script.read_text().splitlines()) <= 200
+    options = "--total-frames 512 --num-envs 4 --max-steps 60 --evaluation-episodes 2"
+    out = run([str(script), *options.split(), "--evaluation-steps", "50"], tmp_path)
+    assert "512 frames" in out and "success: " in out

@@ -1,0 +1,283 @@
+"""Processes that are killed, disks that are full, folders that cannot be written."""
+
+import json
+import os
+import random
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+import synthetic_env
+from synthetic_scans import marched, write_obj, y_tree
+from test_agents_training import run, small_ppo
+
+from cathsim_dmc.agents import ConfigError, report
+from cathsim_dmc.agents.checkpoint import Checkpoint, checkpoints_in
+from cathsim_dmc.agents.metrics import read_metrics
+from cathsim_dmc.anatomy import Anatomy
+from cathsim_dmc.recording import Episode, viewer
+from cathsim_dmc.validation import force_sensors
+
+KILLS = 20
+
+
+def names(folder):
+    """What lies in a folder, but for what is known to be unfinished."""
+    left = (p.name for p in folder.iterdir())
+    return sorted(name for name in left if not name.endswith(".partial"))
+
+
+def spawn(script, *arguments):
+    """Python in a process of its own that finds the tests."""
+    paths = [str(Path(__file__).parent), *sys.path]
+    return subprocess.Popen(
+        [sys.executable, "-c", script, *map(str, arguments)],
+        env={**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, paths))},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+
+
+# Disks.
+
+
+def test_a_recording_on_a_full_disk_leaves_the_older_one(tmp_path, small_disk):
+    out = tmp_path / "a.rrd"
+
+    def record(seed):
+        return report.record(
+            "push", out, task="type1_bca", seed=seed, max_steps=3, fluoroscopy=False
+        )
+
+    first = record(1)
+    before = out.read_bytes()
+    for size in (2_000, len(before) // 2, len(before) - 1):
+        with small_disk(size), pytest.raises(OSError, match="File too large"):
+            record(2)
+        assert names(tmp_path) == ["a.npz", "a.rrd"]
+        assert out.read_bytes() == before
+        assert Episode.load(out.with_suffix(".npz")).equals(first)
+
+
+def test_a_failed_recording_leaves_no_arrays(tmp_path, monkeypatch):
+    def fail(*arguments, **options):
+        raise RuntimeError("no stream")
+
+    monkeypatch.setattr(report.rerun_log, "write_rrd", fail)
+    with pytest.raises(RuntimeError, match="no stream"):
+        report.record("push", tmp_path / "a.rrd", task="type1_bca", max_steps=1)
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_full_disk_ends_a_training_with_its_name(tmp_path, small_disk):
+    run(small_ppo(total_frames=512), tmp_path)
+    before = Checkpoint.open(tmp_path)
+    with small_disk(20_000), pytest.raises(OSError) as caught:
+        run(small_ppo(total_frames=4_096), tmp_path, resume=True)
+    assert "File too large" in str(caught.value)
+    assert "enforce fail" not in str(caught.value)
+    assert Checkpoint.open(tmp_path) == before
+    result = run(small_ppo(total_frames=1_024), tmp_path, resume=True)
+    assert result.frames == 1_024
+
+
+def test_a_full_disk_leaves_the_older_anatomy(tmp_path, small_disk):
+    tube = force_sensors.straight_tube(0.06, 4e-3)
+    tube.save(tmp_path / "tube")
+    before = names(tmp_path / "tube")
+    with small_disk(1_000), pytest.raises(OSError, match="File too large"):
+        force_sensors.straight_tube(0.05, 4e-3).save(tmp_path / "tube")
+    assert names(tmp_path / "tube") == before
+    held = Anatomy.load(tmp_path / "tube")
+    np.testing.assert_array_equal(held.surface.vertices, tube.surface.vertices)
+
+
+@pytest.mark.parametrize("kind", ["a file", "under a file", "read-only"])
+def test_folders_that_cannot_be_written_are_refused_before_the_work(
+    tmp_path, monkeypatch, kind
+):
+    out = tmp_path / "out"
+    if kind == "read-only":
+        if os.geteuid() == 0:
+            pytest.skip("root may write everywhere")
+        out.mkdir(mode=0o500)
+        out = out / "run"
+    else:
+        out.write_text("mine")
+        out = out if kind == "a file" else out / "run"
+
+    def work(*arguments, **options):
+        raise AssertionError("work was begun")
+
+    monkeypatch.setattr(synthetic_env, "make_env", work)
+    with pytest.raises((OSError, ConfigError), match="out"):
+        run(small_ppo(), out, make_env=work)
+    monkeypatch.setattr(report.evaluation, "evaluate", work)
+    with pytest.raises(OSError, match="out"):
+        report.evaluate("push", task="type1_bca", out_dir=out)
+    monkeypatch.setattr(report.suite, "load", work)
+    with pytest.raises(OSError, match="out"):
+        report.record("push", out / "a.rrd", task="type1_bca")
+    if kind != "read-only":
+        assert (tmp_path / "out").read_text() == "mine"
+
+
+# Two at once.
+
+COMPILE = """
+import numpy as np, sys
+from cathsim_dmc.imaging.device import device_attenuation
+from cathsim_dmc.imaging.carm import CArm
+points = np.linspace([0, 0, -0.05], [0.01, 0, 0.05], 30)
+print(float(device_attenuation(CArm(), points, 1e-3, 50.0, None, 1e-3).sum()))
+"""
+
+BUILD = """
+import sys
+from cathsim_dmc.validation import force_sensors
+for _ in range(5):
+    force_sensors.straight_tube(float(sys.argv[2]), 4e-3).save(sys.argv[1])
+"""
+
+
+def finished(processes):
+    """Standard output of processes, all of which must succeed."""
+    outputs = [process.communicate(timeout=300) for process in processes]
+    for process, (_, errors) in zip(processes, outputs, strict=True):
+        assert process.returncode == 0, errors
+    return [out for out, _ in outputs]
+
+
+def test_two_processes_compile_the_same_kernels_at_once(tmp_path, monkeypatch):
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "cache"))
+    outputs = finished([spawn(COMPILE) for _ in range(2)])
+    assert outputs[0] == outputs[1]
+    assert float(outputs[0]) > 0
+    # A third one, with what they left.
+    assert finished([spawn(COMPILE)]) == outputs[:1]
+
+
+def test_two_processes_write_the_same_anatomy_at_once(tmp_path):
+    lengths = ("0.06", "0.05")
+    finished([spawn(BUILD, tmp_path / "tube", length) for length in lengths])
+    held = Anatomy.load(tmp_path / "tube")
+    assert held.tree.vessel("tube").centreline.length in map(
+        pytest.approx, map(float, lengths)
+    )
+    assert len(names(tmp_path / "tube")) == 2
+
+
+# Kills.
+
+TRAIN = """
+import sys, synthetic_env, test_agents_training as t
+from cathsim_dmc.agents import train
+config = t.small_ppo(
+    total_frames=int(sys.argv[2]), checkpoint_frames=512, keep_checkpoints=2
+)
+print("begun", flush=True)
+train(config, sys.argv[1], resume=True, progress=False, make_env=synthetic_env.make_env)
+"""
+
+IMPORT = """
+import sys
+from cathsim_dmc.cli import main
+sys.argv = ["cathsim", "phantom", "import", sys.argv[1], "--out", sys.argv[2]]
+print("begun", flush=True)
+main()
+"""
+
+RECORD = """
+import sys
+from cathsim_dmc.agents import report
+print("begun", flush=True)
+for seed in range(1, 1000):
+    report.record("push", sys.argv[1], task="type1_bca", seed=seed, max_steps=4,
+                  fluoroscopy=False)
+"""
+
+
+def killed(script, *arguments, longest):
+    """Starts a process and kills it at a random moment after it has begun."""
+    process = spawn(script, *arguments)
+    assert process.stdout.readline() == "begun\n", process.stderr.read()
+    time.sleep(random.uniform(0.0, longest))
+    process.send_signal(signal.SIGKILL)
+    process.communicate()
+
+
+@pytest.mark.slow
+def test_a_training_that_is_killed_twenty_times_loses_nothing_finished(tmp_path):
+    (tmp_path / "config.json").write_text("{}")
+    reached = []
+    for _ in range(KILLS):
+        killed(TRAIN, tmp_path, 10**9, longest=6.0)
+        found = checkpoints_in(tmp_path)
+        for path in found:
+            Checkpoint.open(path).policy()
+            Checkpoint.open(path).learning_state()
+        reached.append(int(found[-1].name) if found else 0)
+    assert reached == sorted(reached)
+    assert reached[-1] > 0
+    goal = reached[-1] + 512
+    finished([spawn(TRAIN, tmp_path, goal)])
+    frames = [row["frames"] for row in read_metrics(tmp_path / "metrics.csv")]
+    assert frames == sorted(set(frames)) and frames[-1] == goal
+    print(f"killed {KILLS} times, frames {reached}")
+
+
+@pytest.mark.slow
+def test_an_import_that_is_killed_twenty_times_is_whole_or_not_there(
+    tmp_path, monkeypatch
+):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    mesh = write_obj(tmp_path / "lumen.obj", *marched(y_tree()))
+    out, whole = tmp_path / "anatomy", 0
+    for _ in range(KILLS):
+        killed(IMPORT, mesh, out, longest=12.0)
+        if (out / "anatomy.json").exists():
+            whole += 1
+            Anatomy.load(out)
+    finished([spawn(IMPORT, mesh, out)])
+    anatomy = Anatomy.load(out)
+    finished([spawn(IMPORT, mesh, tmp_path / "again")])
+    again = Anatomy.load(tmp_path / "again")
+    for a, b in zip(anatomy.wall, again.wall, strict=True):
+        np.testing.assert_array_equal(a, b)
+    assert len(names(out)) == 2
+    print(f"killed {KILLS} times, an anatomy was there after {whole} of them")
+
+
+@pytest.mark.slow
+def test_a_recording_that_is_killed_twenty_times_is_whole_or_not_there(tmp_path):
+    out, seen = tmp_path / "a.rrd", 0
+    for _ in range(KILLS):
+        killed(RECORD, out, longest=8.0)
+        arrays = out.with_suffix(".npz")
+        if arrays.exists():
+            seen += 1
+            assert Episode.load(arrays).steps == 4
+            viewer.check_recording(out)
+            # The end of a whole one.
+            assert out.read_bytes()[-12:-4] == b"RRF2FOOT"
+    assert names(tmp_path) in (["a.npz", "a.rrd"], ["a.rrd"], [])
+    report.record("push", out, task="type1_bca", max_steps=2, fluoroscopy=False)
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["a.npz", "a.rrd"]
+    assert seen
+    print(f"killed {KILLS} times, a recording was there after {seen} of them")
+
+
+def test_half_a_checkpoint_is_never_taken_for_one(tmp_path):
+    run(small_ppo(total_frames=512), tmp_path)
+    path = checkpoints_in(tmp_path)[-1]
+    later = path.with_name("0000000900")
+    later.mkdir()
+    (later / "policy.pt").write_bytes((path / "policy.pt").read_bytes())
+    assert checkpoints_in(tmp_path) == [path]
+    values = json.loads((path / "checkpoint.json").read_text())
+    assert Checkpoint.open(tmp_path).frames == values["frames"]

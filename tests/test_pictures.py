@@ -1,0 +1,228 @@
+"""Looking at a state or an episode in one call, on a machine without OpenGL."""
+
+import dataclasses
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from PIL import Image
+from recording_samples import make_tube
+
+import cathsim_dmc
+from cathsim_dmc import suite
+from cathsim_dmc.pictures.animation import animate
+from cathsim_dmc.pictures.figure import scene_figure
+from cathsim_dmc.pictures.snapshot import Snapshot
+from cathsim_dmc.pictures.translucent import Projection, glass
+from cathsim_dmc.recording.episode import Episode
+from cathsim_dmc.recording.geometry import force_scale
+
+TASK = "simple1_bca"
+
+
+@pytest.fixture(scope="module")
+def pushed():
+    """An environment whose device presses on the wall, and the record of it."""
+    env = suite.load("cathsim", TASK, task_kwargs={"random": 0})
+    episode = cathsim_dmc.record(env, "push", seed=0, max_steps=60)
+    assert len(episode.contact_force)
+    return env, episode
+
+
+def test_forces_are_those_of_the_task(pushed):
+    env, episode = pushed
+    readout = cathsim_dmc.forces(env)
+    last = episode.contact_step == episode.steps - 1
+    np.testing.assert_array_equal(readout.force, episode.contact_force[last])
+    np.testing.assert_allclose(
+        readout.magnitude, np.linalg.norm(readout.force, axis=1), rtol=1e-9
+    )
+    assert len(readout) == last.sum() > 0
+    assert readout.wall_sum == episode.wall_force_sum[-1]
+    assert readout.push_force == episode.push_force[-1]
+    text = repr(readout)
+    assert f"{1e3 * readout.wall_max:.2f} mN" in text
+    assert len(text.splitlines()) == 3 + len(readout)
+
+
+def test_the_fluoroscopy_of_a_state_shows_where_the_head_is(pushed):
+    env, _ = pushed
+    options = {"size": 96, "contrast": False}
+    image = cathsim_dmc.fluoroscopy(env, **options)
+    assert image.shape == (96, 96) and image.dtype == np.uint8
+    arm = dataclasses.replace(env.task.config.fluoroscopy_options, **options).carms(
+        env.task.scene.anatomy.surface.vertices
+    )[0]
+    column, row = arm.project(env.task.readings.head)[0].round().astype(int)
+    assert image[row, column] < image.max() - 20
+    with pytest.raises(TypeError, match="kontrast"):
+        cathsim_dmc.fluoroscopy(env, kontrast=1)
+
+
+def test_a_picture_shows_every_panel_and_is_the_same_again(pushed):
+    env, episode = pushed
+    figure = cathsim_dmc.show(env)
+    titles = [axes.get_title() for axes in figure.axes]
+    assert {"from the front", "from the left", "fluoroscopy"} <= set(titles)
+    assert TASK in figure.get_suptitle() and "mN" in figure.get_suptitle()
+    assert figure._repr_png_() == cathsim_dmc.show(env)._repr_png_()
+    one = cathsim_dmc.show(env, episode, step=0, views=("front",), fluoroscopy=False)
+    assert "no contact" in one.get_suptitle()
+    assert one._repr_png_() != figure._repr_png_()
+
+
+def test_the_moment_of_a_record_is_that_of_the_environment(pushed):
+    env, episode = pushed
+    live = Snapshot.of(env)
+    kept = Snapshot.of_episode(episode, live.surface)
+    for name in ("device", "radius", "goal", "position", "force"):
+        np.testing.assert_allclose(
+            getattr(kept, name), getattr(live, name), atol=1e-12, err_msg=name
+        )
+    start = Snapshot.of_episode(episode, live.surface, 0)
+    assert len(start.force) == 0 and len(start.path) == 1
+
+
+def test_glass_covers_what_the_surface_covers_and_darkens_at_the_rim():
+    vertices, faces = make_tube(radius=0.02, length=0.08, sides=48, rings=9)
+    projection = Projection.of(vertices, margin=0.01, height=200)
+    picture = glass(vertices, faces, projection)
+    alpha = picture.behind[..., 3]
+    rows, columns = projection.shape
+    assert alpha.shape == (rows, columns)
+    middle = alpha[rows // 2]
+    inside = np.flatnonzero(middle > 0)
+    width = len(inside) / projection.pixels
+    assert abs(width - 0.04) < 1.5 / projection.pixels
+    # Two walls behind each other cover more than one, the rim most of all.
+    assert picture.glaze[rows // 2, columns // 2, 3] < middle[columns // 2]
+    assert middle[inside[2]] > 2 * middle[columns // 2]
+    assert alpha[0].max() == 0 == alpha[:, 0].max()
+
+
+@pytest.mark.parametrize("azimuth", [0.0, 90.0, 37.0])
+def test_a_projection_maps_points_to_their_pixels(azimuth):
+    points = np.random.default_rng(0).normal(size=(20, 3))
+    projection = Projection.of(points, azimuth=azimuth)
+    np.testing.assert_allclose(projection.right @ projection.towards, 0, atol=1e-12)
+    # The viewer of the front stands before the chest: towards him is -y.
+    if azimuth == 0:
+        np.testing.assert_allclose(projection.towards, [0, -1, 0], atol=1e-12)
+    pixel = projection.pixel(points)
+    rows, columns = projection.shape
+    assert (pixel >= 0).all() and (pixel <= [columns, rows]).all()
+    highest = points[:, 2].argmax()
+    assert pixel[highest, 1] == pixel[:, 1].min()
+
+
+@pytest.mark.parametrize("suffix", [".rrd", ".npz", ".gif", ".webp"])
+def test_a_function_of_the_observation_is_recorded(pushed, tmp_path, suffix):
+    env, _ = pushed
+    seen = []
+
+    def policy(observation):
+        seen.append(sorted(observation))
+        return np.eye(21)[20]  # forward
+
+    path = tmp_path / f"episode{suffix}"
+    episode = cathsim_dmc.record(env, policy, path, seed=1, max_steps=4)
+    assert episode.task == TASK and episode.steps == 4 and len(seen) == 4
+    assert seen[0] == sorted(env.observation_spec())
+    assert episode.insertion[-1] > episode.insertion[0]
+    if suffix == ".npz":
+        assert Episode.load(path).equals(episode)
+    if suffix in (".gif", ".webp"):
+        film = Image.open(path)
+        assert film.n_frames == 5 and film.size[0] == 860
+    assert [p.name for p in tmp_path.iterdir()] == [path.name]
+
+
+def test_the_frames_of_a_film_differ_where_the_device_moves(pushed, tmp_path):
+    env, episode = pushed
+    surface = env.task.scene.anatomy.surface
+    path = animate(episode, surface, tmp_path / "a.webp", frames=3, width=400)
+    film, frames = Image.open(path), []
+    for number in range(3):
+        film.seek(number)
+        frames.append(np.asarray(film.convert("RGB"), dtype=int))
+    assert film.info["duration"] > 1000  # the last one stays
+    assert np.abs(frames[0] - frames[-1]).max() > 100
+
+
+@pytest.mark.parametrize(
+    ("call", "kind", "message"),
+    [
+        (lambda env: cathsim_dmc.record(env, "expret"), ValueError, "expert"),
+        (lambda env: cathsim_dmc.record(env, 3), TypeError, "function"),
+        (
+            lambda env: cathsim_dmc.record(env, "push", "e.mp4"),
+            ValueError,
+            ".rrd, .npz, .gif, .webp",
+        ),
+        (
+            lambda env: cathsim_dmc.record(env, "push", "none/e.gif"),
+            FileNotFoundError,
+            "no folder none",
+        ),
+        (lambda env: cathsim_dmc.show(env, viewer="tv"), ValueError, "figure"),
+        (lambda env: cathsim_dmc.show(env, views=("top",)), ValueError, "front"),
+        (lambda env: cathsim_dmc.show("env"), TypeError, "suite.load"),
+        (lambda env: cathsim_dmc.forces(env.task), TypeError, "suite.load"),
+    ],
+)
+def test_wrong_inputs_say_what_is_allowed(pushed, call, kind, message):
+    with pytest.raises(kind, match=message):
+        call(pushed[0])
+
+
+def test_steps_beyond_the_episode_are_refused(pushed):
+    env, episode = pushed
+    surface = env.task.scene.anatomy.surface
+    with pytest.raises(IndexError, match="61 states"):
+        Snapshot.of_episode(episode, surface, 61)
+    with pytest.raises(ValueError, match="film"):
+        animate(episode, surface, "episode.mp4")
+
+
+def test_the_scale_of_forces_holds_them_all():
+    assert force_scale(np.zeros(0)) == 0.02
+    assert force_scale(np.array([0.05])) == 0.05
+    assert force_scale(np.array([0.01, 0.06])) == 0.1
+    assert force_scale(np.array([3.0])) == 0.4
+
+
+def test_tasks_and_anatomies_say_what_they_are(pushed):
+    env, _ = pushed
+    for text in (TASK, "'simple1'", "'bca'", "8 mm", "21 actions", "internal"):
+        assert text in repr(env.task)
+        assert text in repr(env)
+    anatomy = env.task.scene.anatomy
+    assert len(repr(anatomy)) < 300
+    for text in ("simple1", "bca, lcca", f"{len(anatomy.wall)} wall pieces"):
+        assert text in repr(anatomy)
+
+
+def test_rendering_without_opengl_says_what_to_do():
+    done = subprocess.run(
+        [
+            sys.executable,
+            "-c",
+            "from cathsim_dmc import suite\n"
+            f"env = suite.load('cathsim', {TASK!r}); env.reset()\n"
+            "env.physics.render(8, 8)",
+        ],
+        capture_output=True,
+        text=True,
+        env={"MUJOCO_GL": "disable", "PYTHONPATH": ":".join(sys.path)},
+        check=False,
+    )
+    last = done.stderr.strip().splitlines()[-1]
+    assert last.startswith("RuntimeError")
+    for text in ("MUJOCO_GL is disable", "egl", "cathsim_dmc.show(env)", "fluoroscopy"):
+        assert text in last
+
+
+def test_scene_figure_needs_something_to_draw(pushed):
+    with pytest.raises(ValueError, match="front"):
+        scene_figure(Snapshot.of(pushed[0]), views=(), fluoroscopy=False)
