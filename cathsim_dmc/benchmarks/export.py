@@ -115,8 +115,7 @@ def write_list(directory: str | Path = pretrained.DIRECTORY) -> Path:
             for one in card.get("seeds", [])
         )
         commands += ["", f"`{name}`: `{card['training']['command']}`"]
-        if seeds:
-            commands.append(f"; all seeds of this training: {seeds}")
+        commands += [f"({seeds})"] * bool(seeds)
     text = "\n".join([*lines, *commands]) + "\n"
     return files.write_text(directory / "README.md", text)
 
