@@ -17,7 +17,7 @@ from nbconvert import MarkdownExporter
 ROOT = Path(__file__).parents[2]
 OF_THE_REPOSITORY = ("CONTRIBUTING.md", "CHANGELOG.md")
 # Pages that not every state of the repository has.
-OPTIONAL = ("results.md", "reliability.md")
+OPTIONAL = ("results.md", "reliability.md", "imitation.md")
 # A link out of docs/ and where it leads on the site.
 _LINK = re.compile(r"\]\((?:\.\./)*(docs/|examples/)?([\w./-]*)(#[\w-]*)?\)")
 
