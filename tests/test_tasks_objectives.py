@@ -310,8 +310,8 @@ def test_one_bad_entry_is_enough(index, value):
         ("weights", {"sparse": 1.0}, "no term sparse.*distance, path"),
         ("weights", {"distance": float("nan")}, "finite"),
         ("weights", {"distance": "1"}, "finite"),
-        ("goal_radius", 0.0, "> 0"),
-        ("goal_radius", float("nan"), "> 0"),
+        ("goal_radius", 0.0, "above 0"),
+        ("goal_radius", float("nan"), "above 0"),
     ],
 )
 def test_bad_options(task, field, value, message):
