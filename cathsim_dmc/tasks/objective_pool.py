@@ -1,6 +1,5 @@
 """Objectives that differ between simulations, as one."""
 
-import functools
 from collections.abc import Sequence
 from types import MappingProxyType
 from typing import Any, cast
@@ -37,14 +36,14 @@ class ObjectivePool:
         """Takes each objective with the numbers of its simulations, N in all."""
         self._groups = tuple(groups)
         self._count = sum(len(rows) for _, rows in self._groups)
+        self._goal = np.empty((self._count, 3))
+        for objective, rows in self._groups:
+            self._goal[rows] = objective.goal
 
-    @functools.cached_property
+    @property
     def goal(self) -> np.ndarray:
         """(N, 3), m, world frame."""
-        goal = np.empty((self._count, 3))
-        for objective, rows in self._groups:
-            goal[rows] = objective.goal
-        return goal
+        return self._goal
 
     @property
     def goal_radius(self) -> float:

@@ -8,7 +8,7 @@ import dataclasses
 import math
 from collections.abc import Callable, Mapping, Sequence
 from types import MappingProxyType
-from typing import NamedTuple
+from typing import NamedTuple, cast
 
 import numpy as np
 from dm_control.composer.observation import observable
@@ -446,7 +446,7 @@ def resolve(names: str | Sequence[str]) -> tuple[str, ...]:
             f"observation is {names!r}; give one of {', '.join(OBSERVATIONS)}, "
             "or a list of different ones"
         )
-    return chosen
+    return cast(tuple[str, ...], chosen)
 
 
 def needs_fluoroscopy(names: Sequence[str]) -> bool:

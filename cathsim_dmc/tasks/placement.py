@@ -203,7 +203,7 @@ def _clear(anatomy: Anatomy, directions: np.ndarray) -> np.ndarray:
     behind = np.arange(_NEAR_INLET, COMMON_LENGTH, _LINE_SPACING)
     lines = anatomy.inlet.position - behind[:, None] * directions[:, None]
     depth = anatomy.depth(lines.reshape(-1, 3)).reshape(len(directions), -1)
-    return (depth < -_CLEAR_OF_LUMEN).all(-1)
+    return np.asarray((depth < -_CLEAR_OF_LUMEN).all(-1))
 
 
 def _way_to_branching(anatomy: Anatomy) -> float:

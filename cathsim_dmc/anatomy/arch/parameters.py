@@ -15,7 +15,7 @@ MINIMUM_SEPTUM = 1e-3
 INLET_TUBE = 70e-3
 
 
-def _check(name: str, value: float, low: float, high: float, unit: str) -> None:
+def _check(name: str, value: object, low: float, high: float, unit: str) -> None:
     bounds.number(name, value, low, high, unit)
 
 
