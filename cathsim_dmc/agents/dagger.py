@@ -4,6 +4,7 @@ Ross, Gordon and Bagnell, "A Reduction of Imitation Learning and Structured Pred
 to No-Regret Online Learning", AISTATS 2011.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar
@@ -44,6 +45,11 @@ class DAggerConfig(TrainingConfig):
     """
 
     algorithm: ClassVar[str] = "dagger"
+    presets: ClassVar[Mapping[str, Mapping[str, Any]]] = {
+        "published": {},
+        # What learns in a minute: points along the device, few and short episodes.
+        "demo": {"observation": "tracking", "training_max_steps": 250},
+    }
 
     steps_per_env: int = 128
     expert_share: float = 0.5

@@ -280,8 +280,8 @@ def export(
     return 0
 
 
-def demo(out: Path = Path("runs/demo"), frames: int = 150_000, seed: int = 0) -> int:
-    """Train PPO briefly on type1_bca, evaluate it, draw and record it.
+def demo(out: Path = Path("runs/demo"), frames: int = 8_192, seed: int = 0) -> int:
+    """Learn type1_lcca from the expert, evaluate it, draw and record it.
 
     Args:
         out: Directory of the run.
