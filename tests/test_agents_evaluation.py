@@ -107,7 +107,7 @@ def test_expert_is_better_than_chance():
 
 
 def test_bad_requests_are_refused(tmp_path):
-    with pytest.raises(ValueError, match="episodes=0"):
+    with pytest.raises(ValueError, match="episodes is 0"):
         play(policy="random", episodes=0)
     with pytest.raises(ValueError, match="task"):
         evaluate(expert, make_env=synthetic_env.make_env)

@@ -230,7 +230,7 @@ def test_the_number_of_simulations_must_not_change(task, plan):
 
 
 def test_a_device_without_motors_is_refused():
-    with pytest.raises(ValueError, match="has no motors.*published"):
+    with pytest.raises(ValueError, match="has no motors.*steerable_5f"):
         expert.Expert.for_task(make_task(device="diagnostic_5f_j"))
 
 

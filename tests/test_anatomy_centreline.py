@@ -111,7 +111,7 @@ def test_slice_and_resample_keep_the_curve():
         ([[0, 0, 0], [0, 0, 1]], [1], "one radius"),
         ([[0, 0, 0], [0, 0, 1]], [1, 0], "must be > 0"),
         ([[0, 0, 0], [0, 0, 0]], [1, 1], "coincide"),
-        ([[0, 0, 0], [0, 0, np.nan]], [1, 1], "NaN"),
+        ([[0, 0, 0], [0, 0, np.nan]], [1, 1], "finite numbers"),
     ],
 )
 def test_bad_centrelines_are_refused(points, radii, message):

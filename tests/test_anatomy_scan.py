@@ -355,7 +355,7 @@ def test_wall_options(y_scan):
         import_scan(mesh, curves, wall="boxes")
     with pytest.raises(ValueError, match="for wall='coacd' only"):
         import_scan(mesh, curves, threshold=1e-3)
-    with pytest.raises(ValueError, match="20 mm; give 0.1 to 10 mm"):
+    with pytest.raises(ValueError, match="threshold is 0.02.*0.0001 to 0.01 m"):
         import_scan(mesh, curves, wall="coacd", threshold=20e-3)
 
 

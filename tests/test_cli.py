@@ -96,6 +96,7 @@ def test_generated_phantom_of_a_seed(cathsim, tmp_path):
     assert drawn != usual.tree.vessel("bca").centreline.length
 
 
+@pytest.mark.slow
 def test_check_prints_one_object_and_passes(cathsim):
     code, out, err = cathsim("phantom", "check", "type1", "--json")
     printed = only_json(out)
@@ -105,6 +106,7 @@ def test_check_prints_one_object_and_passes(cathsim):
         assert isinstance(check["passed"], bool)
 
 
+@pytest.mark.slow
 def test_a_failed_check_exits_with_one(cathsim, tmp_path):
     """An arch that has lost three pieces of its wall leaks."""
     whole = arch.load("simple1")
@@ -250,6 +252,7 @@ def test_an_interrupt_leaves_one_line(arguments):
     assert "Traceback" not in err
 
 
+@pytest.mark.slow
 def test_an_arch_of_a_set_is_chosen(cathsim):
     where = ("--arches", "test", "--pool", 1, "--first", 2)
     code, out, err = cathsim(
@@ -257,7 +260,7 @@ def test_an_arch_of_a_set_is_chosen(cathsim):
         *("--episodes", 1, "--no-baseline", "--json"),
     )
     assert code == 0, err
-    task_kwargs = only_json(out)["task_kwargs"]
+    task_kwargs = only_json(out)["policy"]["settings"]["task_kwargs"]
     assert task_kwargs == {"arches": "test", "pool": 1, "first": 2}
 
 

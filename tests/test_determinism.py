@@ -77,6 +77,7 @@ def elsewhere():
     return done.stdout.split()
 
 
+@pytest.mark.slow
 def test_processes_agree_on_trajectories_images_and_anatomies():
     here = [
         trajectory(1, **RANDOM),
@@ -86,6 +87,7 @@ def test_processes_agree_on_trajectories_images_and_anatomies():
     assert elsewhere() == here
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("options", [RANDOM, {"observation": "image"}])
 def test_the_number_of_threads_changes_nothing(options):
     assert trajectory(1, **options) == trajectory(2, **options)
@@ -102,6 +104,7 @@ def test_another_seed_is_another_trajectory():
     assert digest(batch.batch.qpos[0]) != digest(batch.batch.qpos[1])
 
 
+@pytest.mark.slow
 def test_composer_and_batch_give_the_same_bytes():
     environment = suite.load("cathsim", "type1_lcca", task_kwargs={"random": 7})
     environment.reset()

@@ -46,6 +46,7 @@ def spawn(script, *arguments):
 # Disks.
 
 
+@pytest.mark.slow
 def test_a_recording_on_a_full_disk_leaves_the_older_one(tmp_path, small_disk):
     out = tmp_path / "a.rrd"
 
@@ -64,6 +65,7 @@ def test_a_recording_on_a_full_disk_leaves_the_older_one(tmp_path, small_disk):
         assert Episode.load(out.with_suffix(".npz")).equals(first)
 
 
+@pytest.mark.slow
 def test_a_failed_recording_leaves_no_arrays(tmp_path, monkeypatch):
     def fail(*arguments, **options):
         raise RuntimeError("no stream")
@@ -153,6 +155,7 @@ def finished(processes):
     return [out for out, _ in outputs]
 
 
+@pytest.mark.slow
 def test_two_processes_compile_the_same_kernels_at_once(tmp_path, monkeypatch):
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "cache"))
     outputs = finished([spawn(COMPILE) for _ in range(2)])

@@ -22,6 +22,7 @@ def run(*arguments):
     )
 
 
+@pytest.mark.slow
 def test_a_short_load_is_measured(tmp_path):
     out = tmp_path / "load.json"
     done = run("--steps", 400, "--simulations", 4, "--rounds", 1, "--out", out)

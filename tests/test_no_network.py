@@ -66,6 +66,7 @@ def test_the_sockets_are_shut(call):
     assert "AssertionError: network" in done.stderr
 
 
+@pytest.mark.slow
 def test_loading_stepping_training_evaluating_and_recording_need_no_network(tmp_path):
     done = python(RUN, tmp_path)
     assert done.returncode == 0, done.stderr
@@ -73,21 +74,22 @@ def test_loading_stepping_training_evaluating_and_recording_need_no_network(tmp_
     assert (tmp_path / "a.rrd").stat().st_size > 10_000
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="needs /proc")
 def test_no_descriptor_is_a_socket_to_elsewhere(tmp_path):
     """Sockets of compiled code, which no patch of Python's sees."""
     code = RUN + (
-        "lines = [line for name in ('tcp', 'tcp6', 'udp', 'udp6')\\n"
-        "         for line in open(f'/proc/self/net/{name}').readlines()[1:]]\\n"
-        "import os\\n"
-        "mine = set()\\n"
-        "for one in os.listdir('/proc/self/fd'):\\n"
-        "    try:\\n"
-        "        mine.add(os.readlink(f'/proc/self/fd/{one}'))\\n"
-        "    except OSError:\\n"
-        "        pass\\n"
-        "inodes = {f'socket:[{line.split()[9]}]' for line in lines}\\n"
-        "assert not mine & inodes, mine & inodes\\n"
+        "lines = [line for name in ('tcp', 'tcp6', 'udp', 'udp6')\n"
+        "         for line in open(f'/proc/self/net/{name}').readlines()[1:]]\n"
+        "import os\n"
+        "mine = set()\n"
+        "for one in os.listdir('/proc/self/fd'):\n"
+        "    try:\n"
+        "        mine.add(os.readlink(f'/proc/self/fd/{one}'))\n"
+        "    except OSError:\n"
+        "        pass\n"
+        "inodes = {f'socket:[{line.split()[9]}]' for line in lines}\n"
+        "assert not mine & inodes, mine & inodes\n"
     )
     done = python(code, tmp_path)
     assert done.returncode == 0, done.stderr

@@ -172,6 +172,7 @@ def test_an_unstable_model_ends_with_a_reason_and_disturbs_nobody(dumps):
     assert (disturbed[0, 1] != alone[0, 1]).any()
 
 
+@pytest.mark.slow
 def test_the_dump_of_an_unstable_model_replays_it_bit_for_bit(dumps):
     states, errors = _unstable(wild=[1])
     reasons = {}

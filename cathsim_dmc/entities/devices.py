@@ -6,6 +6,9 @@ import warnings
 
 import numpy as np
 
+from cathsim_dmc import bounds
+
+_MOST_LINKS = 200
 FRENCH = 1e-3 / 3.0  # m of outer diameter per French
 INCH = 25.4e-3  # m
 
@@ -30,11 +33,10 @@ class Section:
     def __post_init__(self):
         for field in dataclasses.fields(self):
             value = getattr(self, field.name)
-            if not (math.isfinite(value) and value > 0):
-                raise ValueError(
-                    f"{field.name} is {value!r}, but it must be a positive number in "
-                    "N·m² (1 N·mm² = 1e-6 N·m²)"
-                )
+            try:
+                bounds.number(field.name, value, positive=True)
+            except ValueError as error:
+                raise ValueError(f"{error}, in N·m² (1 N·mm² = 1e-6 N·m²)") from error
 
     @classmethod
     def isotropic(cls, bending_stiffness: float, poisson_ratio: float) -> "Section":
@@ -53,6 +55,10 @@ class Arc:
 
     radius: float
     angle: float
+
+    def __post_init__(self):
+        bounds.number("radius", self.radius, positive=True)
+        bounds.number("angle", self.angle)
 
     @property
     def length(self) -> float:
@@ -89,22 +95,19 @@ class Device:
     tip_shape: tuple[Arc, ...] = ()
 
     def __post_init__(self):
+        bounds.instance("name", self.name, str)
+        of_device = f"of device {self.name!r}"
         for name in ("outer_radius", "linear_density", "tip_length"):
-            value = getattr(self, name)
-            if not (math.isfinite(value) and value > 0):
-                raise ValueError(
-                    f"{name} of device {self.name!r} is {value!r}, "
-                    "but it must be a positive number in SI units"
-                )
-        if self.tip_links < 1:
-            raise ValueError(
-                f"device {self.name!r} has {self.tip_links} tip links; at least 1"
-            )
-        if not 0 <= self.steering_angle < math.pi / 2:
-            raise ValueError(
-                f"steering_angle of device {self.name!r} is {self.steering_angle} rad "
-                "for each joint; it must be in [0, π/2)"
-            )
+            bounds.number(f"{name} {of_device}", getattr(self, name), positive=True)
+        bounds.whole(f"tip_links {of_device}", self.tip_links, 1, _MOST_LINKS)
+        for name in ("shaft", "tip"):
+            bounds.instance(f"{name} {of_device}", getattr(self, name), Section)
+        arcs = self.tip_shape
+        if not isinstance(arcs, tuple) or not all(isinstance(a, Arc) for a in arcs):
+            bounds.refuse(f"tip_shape {of_device}", arcs, "a tuple of Arc")
+        angle = f"steering_angle {of_device}"
+        if bounds.number(angle, self.steering_angle, 0.0) >= math.pi / 2:
+            bounds.refuse(angle, self.steering_angle, "in [0, π/2) rad for each joint")
 
     @property
     def steerable(self) -> bool:
@@ -148,11 +151,11 @@ def _metal(bending_stiffness: float) -> Section:
     return Section.isotropic(bending_stiffness, METAL_POISSON_RATIO)
 
 
-# The device of the registered tasks: the published discretisation of the tip (ten
-# links over 7 cm, 20 motors) on a 5F body. The published stiffness equals a rod
-# stiffer than any metal, so real ones take its place: a shaft between the body of a
-# steerable 4F tube (22.7 N·mm²) and an Amplatz wire (291 N·mm²), and that body's own
-# figure for the steerable part.
+# The device of the registered tasks: the published discretisation of the tip (ten links
+# over 7 cm, 20 motors) on a 5F body. The published stiffness equals a rod stiffer than
+# any metal, so real ones take its place: a shaft between the body of a steerable 4F
+# tube (22.7 N·mm²) and an Amplatz wire (291 N·mm²), and that body's own figure for the
+# steerable part.
 STEERABLE_5F = Device(
     name="steerable_5f",
     outer_radius=5 * FRENCH / 2,
@@ -245,7 +248,7 @@ def get(device: "str | Device") -> Device:
     """
     if isinstance(device, Device):
         return device
-    if device in FORMER_NAMES:
+    if isinstance(device, str) and device in FORMER_NAMES:
         name = FORMER_NAMES[device]
         warnings.warn(
             f"device {device!r} is called {name!r} now: only the layout of its tip is "
@@ -254,7 +257,7 @@ def get(device: "str | Device") -> Device:
             stacklevel=2,
         )
         device = name
-    if device not in DEVICES:
+    if not isinstance(device, str) or device not in DEVICES:
         raise ValueError(
             f"no device is named {device!r}; known devices: {', '.join(DEVICES)}"
         )
@@ -279,13 +282,8 @@ class Discretisation:
 
     def __post_init__(self):
         for name in ("working_length", "shaft_link"):
-            value = getattr(self, name)
-            if not (math.isfinite(value) and value > 0):
-                raise ValueError(
-                    f"{name} is {value!r}; it must be a positive number of metres"
-                )
-        if self.torsion_joints < 0:
-            raise ValueError(f"torsion_joints is {self.torsion_joints}; at least 0")
+            bounds.number(name, getattr(self, name), positive=True)
+        bounds.whole("torsion_joints", self.torsion_joints, 0)
 
     def link_lengths(self, device: Device) -> np.ndarray:
         """Lengths (n,) of the links from proximal to distal, m."""
