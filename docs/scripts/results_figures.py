@@ -66,11 +66,15 @@ def learning_curves(by_task, looks, path):
         axes.set_xlim(left=0)
         axes.xaxis.set_major_formatter(EngFormatter(sep=""))
         axes.set_xlabel("frames")
-        axes.set_ylabel("success in training, %")
+        axes.set_ylabel("success in training episodes, %")
         axes.grid(alpha=0.3)
         if axes.lines:
             axes.legend(fontsize=7, loc="best", framealpha=0.7)
     return _save(figure, path)
+
+
+# Episodes after which a mean over the last of them is shown.
+_FIRST_EPISODES = 100
 
 
 def _common(results):
@@ -78,8 +82,13 @@ def _common(results):
     curves = []
     for result in results:
         curve = result.training["curve"]
-        pairs = zip(curve.get("frames", ()), curve.get("success", ()), strict=True)
-        known = [(f, s) for f, s in pairs if s is not None]
+        columns = (curve.get(name, ()) for name in ("frames", "success", "episodes"))
+        # Successful episodes end first: a mean over the first few says nothing.
+        known = [
+            (frames, success)
+            for frames, success, episodes in zip(*columns, strict=True)
+            if success is not None and episodes >= _FIRST_EPISODES
+        ]
         if len(known) >= 2:
             curves.append(np.array(known, dtype=float))
     if not curves:
