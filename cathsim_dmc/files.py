@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import json
 import os
 import shutil
 import uuid
@@ -10,7 +11,7 @@ import zipfile
 import zlib
 from collections.abc import Iterator
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
 try:
     import fcntl
@@ -140,3 +141,22 @@ def _remove_leftovers(path: Path) -> None:
         with contextlib.suppress(OSError), open(leftover, "rb") as stream:
             fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
             leftover.unlink()
+
+
+def read_json(path: Path, largest: int, what: str) -> Any:
+    """The content of a JSON file from outside, which may be anything.
+
+    Args:
+        path: Path of the file.
+        largest: Size of the longest file that is read, bytes.
+        what: What the file should be, for the message of one that is longer.
+
+    Raises:
+        ValueError: it is missing, too long or no JSON; the message names it.
+    """
+    try:
+        if path.stat().st_size <= largest:
+            return json.loads(path.read_text())
+    except (OSError, ValueError, RecursionError) as error:
+        raise ValueError(f"{path} cannot be read: {error}") from error
+    raise ValueError(f"{path} is too long for {what}")

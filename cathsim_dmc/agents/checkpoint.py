@@ -169,11 +169,9 @@ class Checkpoint:
 def _read_description(path: Path) -> dict[str, Any]:
     """A checkpoint.json of this format."""
     try:
-        if path.stat().st_size > _MAX_DESCRIPTION:
-            raise CheckpointError(f"{path} is too long for a checkpoint's description.")
-        values = json.loads(path.read_text())
-    except (OSError, ValueError, RecursionError) as error:
-        raise CheckpointError(f"{path} cannot be read: {error}.") from error
+        values = files.read_json(path, _MAX_DESCRIPTION, "a checkpoint's description")
+    except ValueError as error:
+        raise CheckpointError(f"{error}.") from error
     if not _is_object(values):
         raise CheckpointError(f"{path} is no JSON object.")
     if type(values.get("format")) is not int or values["format"] != FORMAT:

@@ -28,6 +28,16 @@ from cathsim_dmc.agents.networks import (
 )
 from cathsim_dmc.simulation.environments import VECTOR
 
+# Larger minibatches and fewer passes: about a tenth of the published cost of learning
+# per frame.
+_LARGE_BATCHES: Mapping[str, Any] = {
+    "num_envs": 32,
+    "steps_per_update": 2_048,
+    "minibatch_size": 256,
+    "epochs": 10,
+    "clip": 0.2,
+    "target_kl": 0.05,
+}
 _TERMS = ("loss_objective", "loss_critic", "loss_entropy")
 
 
@@ -63,29 +73,14 @@ class PPOConfig(TrainingConfig):
     """
 
     algorithm: ClassVar[str] = "ppo"
-    # "demo" buys wall time with larger minibatches and fewer passes: about a tenth of
-    # the published cost of learning per frame.
     presets: ClassVar[Mapping[str, Mapping[str, Any]]] = {
         "published": {},
-        "demo": {
-            "num_envs": 32,
-            "steps_per_update": 2_048,
-            "minibatch_size": 256,
-            "epochs": 10,
-            "clip": 0.2,
-            "target_kl": 0.05,
-            "anneal": True,
-        },
+        "demo": {**_LARGE_BATCHES, "anneal": True},
         # Found on type1_lcca, see docs/results.md: episodes that are short and start
         # anywhere along the route, the way through the lumen as reward, and noise
         # that bends the whole tip for a while.
         "tuned": {
-            "num_envs": 32,
-            "steps_per_update": 2_048,
-            "minibatch_size": 256,
-            "epochs": 10,
-            "clip": 0.2,
-            "target_kl": 0.05,
+            **_LARGE_BATCHES,
             "hidden": (128, 128),
             "training_reward": {"path": -1.0, "success": 10.0},
             "training_max_steps": 120,

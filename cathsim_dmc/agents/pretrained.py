@@ -115,11 +115,9 @@ def read_card(path: str | Path) -> dict[str, Any]:
     """
     path = Path(path)
     try:
-        if path.stat().st_size > _MAX_CARD:
-            raise CheckpointError(f"{path} is too long for a card.")
-        card = json.loads(path.read_text())
-    except (OSError, ValueError, RecursionError) as error:
-        raise CheckpointError(f"{path} cannot be read: {error}.") from error
+        card = files.read_json(path, _MAX_CARD, "a card")
+    except ValueError as error:
+        raise CheckpointError(f"{error}.") from error
     if not isinstance(card, dict) or card.get("format") != FORMAT:
         raise CheckpointError(f"{path} is no card of format {FORMAT}.")
     wrong = [name for name, kind in _PARTS.items() if type(card.get(name)) is not kind]

@@ -190,18 +190,22 @@ def evaluate(
     report = Report(result, other, comparison, time.monotonic() - start)
     if out_dir is not None:
         evaluation.write_evaluation(out_dir, report.to_dict())
-    if out_dir is not None and backend == "batched":
-        environment = suite.load(
-            suite.DOMAIN, result.task, task_kwargs=dict(result.settings["task_kwargs"])
-        )
-        heatmap.contact_heatmap(
-            contacts.positions,
-            contacts.magnitudes,
-            environment.task.scene.anatomy.surface,
-            Path(out_dir) / "heatmap.png",
-            title=f"{result.task}, {result.policy}: {episodes} episodes",
-        )
+        if backend == "batched":
+            _draw_heatmap(contacts, result, Path(out_dir) / "heatmap.png")
     return report
+
+
+def _draw_heatmap(
+    contacts: ContactLog, result: evaluation.EvaluationResult, path: Path
+) -> None:
+    task = suite.make_task(result.task, **result.settings["task_kwargs"])
+    heatmap.contact_heatmap(
+        contacts.positions,
+        contacts.magnitudes,
+        task.scene.anatomy.surface,
+        path,
+        title=f"{result.task}, {result.policy}: {len(result.episodes)} episodes",
+    )
 
 
 def _require_registered(task: str) -> None:

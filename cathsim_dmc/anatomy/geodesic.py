@@ -29,7 +29,7 @@ class LumenDistance:
         origin: np.ndarray,
         spacing: float = SPACING,
     ):
-        """Works out the ways to a target: 0.2 to 0.5 s.
+        """Works out the ways to a target: 0.4 to 0.8 s.
 
         Args:
           depth: Signed depth (n,) of points (n, 3) in the lumen, m, > 0 inside.

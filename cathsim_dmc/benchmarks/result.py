@@ -95,13 +95,9 @@ def read_result(path: str | Path) -> Result:
     """
     path = Path(path)
     try:
-        if path.stat().st_size > _MAX_SIZE:
-            raise ResultError(f"{path} is too long for a result")
-        values = json.loads(path.read_text())
-    except (OSError, ValueError, RecursionError) as error:
-        if isinstance(error, ResultError):
-            raise
-        raise ResultError(f"{path} cannot be read: {error}") from error
+        values = files.read_json(path, _MAX_SIZE, "a result")
+    except ValueError as error:
+        raise ResultError(str(error)) from error
     if not isinstance(values, dict) or values.get("format") != FORMAT:
         raise ResultError(f"{path} is no result of format {FORMAT}")
     missing = [name for name in _PARTS if not isinstance(values.get(name), dict)]

@@ -8,12 +8,13 @@ main_data.hdf5 as plain arrays of numbers; links that lead out of the file are r
 from __future__ import annotations
 
 import dataclasses
-import json
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+
+from cathsim_dmc import files
 
 METADATA = "metadata.json"
 _ARRAYS = "main_data.hdf5"
@@ -64,11 +65,9 @@ def read_metadata(path: str | Path) -> dict[str, Any]:
     """
     file = _data(path) / METADATA
     try:
-        if file.stat().st_size > _MAX_METADATA:
-            raise DatasetError(f"{file} is too long for the metadata of a dataset")
-        values = json.loads(file.read_text())
-    except (OSError, RecursionError, ValueError) as error:
-        raise DatasetError(f"{file} cannot be read: {error}") from error
+        values = files.read_json(file, _MAX_METADATA, "the metadata of a dataset")
+    except ValueError as error:
+        raise DatasetError(str(error)) from error
     if not isinstance(values, dict) or values.get("data_format") != "hdf5":
         raise DatasetError(
             f"{file} does not describe a dataset in HDF5; `cathsim demos` writes one"

@@ -14,7 +14,7 @@ import numpy as np
 
 from cathsim_dmc import files
 from cathsim_dmc.anatomy import Anatomy
-from cathsim_dmc.tasks import placement
+from cathsim_dmc.tasks.scene import Scene
 
 DIVERGED = "diverged"
 ESCAPED = "escaped through the wall"
@@ -35,19 +35,21 @@ _FORMAT = 1
 _LOG = logging.getLogger(__name__)
 
 
-def escaped(anatomy: Anatomy, centreline: np.ndarray) -> np.ndarray:
+def escaped(
+    anatomy: Anatomy, centreline: np.ndarray, along: np.ndarray | None = None
+) -> np.ndarray:
     """Whether devices have left the lumen.
 
     Args:
       anatomy: whose lumen, and whose inlet.
       centreline: (..., n, 3), nodes of the devices, m, world frame.
+      along: (3,) unit vector of the sheath, which need not stand as the vessel does;
+        None for the inlet's direction.
 
     Returns:
       (...) bool: some node past the inlet lies more than 2 mm outside the lumen.
     """
     inlet = anatomy.inlet
-    # Along the sheath, which need not stand as the vessel does; None where none fits.
-    along = placement.sheath_direction(anatomy)
     along = inlet.direction if along is None else along
     beyond = (centreline - inlet.position) @ along > _MOUTH
     # Farther from the inlet than the sheath reaches, a node may also lie behind the
@@ -63,16 +65,16 @@ def escaped(anatomy: Anatomy, centreline: np.ndarray) -> np.ndarray:
 class PhysicsMonitor:
     """Watches N simulations for errors of physics, and keeps what replays them."""
 
-    def __init__(self, anatomy: Anatomy, num_simulations: int, task: dict):
+    def __init__(self, scene: Scene, num_simulations: int, task: dict):
         """Starts with no episode running.
 
         Args:
-          anatomy: Anatomy whose lumen the devices must not leave, until an episode
-            begins in another one.
+          scene: Scene whose lumen the devices must not leave, until an episode begins
+            in another one.
           num_simulations: N.
           task: JSON-able description of the task for the dumps.
         """
-        self._anatomies = [anatomy] * num_simulations
+        self._scenes = [scene] * num_simulations
         self._task = task
         self._states: list[np.ndarray | None] = [None] * num_simulations
         self._fresh = set(range(num_simulations))  # whose state is not kept yet
@@ -80,9 +82,9 @@ class PhysicsMonitor:
         self._actions: list[np.ndarray] = []
         self._first = [0] * num_simulations
 
-    def restart(self, index: int, anatomy: Anatomy) -> None:
-        """Forgets the episode of a simulation; the next one is in an anatomy."""
-        self._anatomies[index] = anatomy
+    def restart(self, index: int, scene: Scene) -> None:
+        """Forgets the episode of a simulation; the next one is in a scene."""
+        self._scenes[index] = scene
         self._fresh.add(index)
         self._first[index] = len(self._actions)
         if unused := min(self._first):
@@ -146,7 +148,7 @@ class PhysicsMonitor:
             try:
                 dump(
                     reason,
-                    task={"anatomy": self._anatomies[index].name, **self._task},
+                    task={"anatomy": self._scenes[index].anatomy.name, **self._task},
                     # Kept before the step that went wrong.
                     state=cast(np.ndarray, self._states[index]),
                     actions=np.array(
@@ -161,11 +163,11 @@ class PhysicsMonitor:
     def _escaped(self, looked: list[int], centreline: np.ndarray) -> np.ndarray:
         """Whether some simulations have left the lumen, each its own: (len,) bool."""
         out = np.zeros(len(looked), dtype=bool)
-        own = [self._anatomies[index] for index in looked]
-        for anatomy in dict.fromkeys(own):
-            rows = [row for row, other in enumerate(own) if other is anatomy]
-            chosen = [looked[row] for row in rows]
-            out[rows] = escaped(anatomy, centreline[chosen])
+        own = [self._scenes[index] for index in looked]
+        for scene in {id(scene): scene for scene in own}.values():
+            rows = [row for row, other in enumerate(own) if other is scene]
+            nodes = centreline[[looked[row] for row in rows]]
+            out[rows] = escaped(scene.anatomy, nodes, scene.placement.direction)
         return out
 
 

@@ -1,7 +1,6 @@
 """Where device, sheath and robot stand in an anatomy, and where the goal is."""
 
 import dataclasses
-import weakref
 
 import mujoco
 import numpy as np
@@ -165,18 +164,6 @@ def sheath_direction(anatomy: Anatomy) -> np.ndarray | None:
       Unit vector, or None if the sheath crosses a vessel at any tilt that a device can
       be expected to enter with.
     """
-    if anatomy not in _SHEATH_DIRECTIONS:
-        _SHEATH_DIRECTIONS[anatomy] = _find_sheath_direction(anatomy)
-    return _SHEATH_DIRECTIONS[anatomy]
-
-
-# Looked up as often as an episode is watched; an anatomy is never changed.
-_SHEATH_DIRECTIONS: "weakref.WeakKeyDictionary[Anatomy, np.ndarray | None]" = (
-    weakref.WeakKeyDictionary()
-)
-
-
-def _find_sheath_direction(anatomy: Anatomy) -> np.ndarray | None:
     inlet = anatomy.inlet
     along = np.asarray(inlet.direction, dtype=float)
     if _clear(anatomy, along[None])[0]:

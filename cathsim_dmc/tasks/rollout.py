@@ -119,7 +119,7 @@ class Rollout:
             open_cameras(self._names, model, config.camera_options, catheter),
         )
         self._monitor = PhysicsMonitor(
-            scene.anatomy,
+            scene,
             num_simulations,
             {"goal": scene.goal.name, "config": repr(config)},
         )
@@ -176,7 +176,7 @@ class Rollout:
         fields = {name: field(index, name) for name in self._variation.fields}
         self._variation.write(fields, episode)
         self._delay.restart(index, episode.delay)
-        self._monitor.restart(index, case.scene.anatomy)
+        self._monitor.restart(index, case.scene)
         self._sensors.restart(index, case.angiograph, episode.deviation)
         self._goal_shift[index] = episode.goal_shift or 0.0
         displacement = case.start.clear_of_wall(episode.displacement)

@@ -77,7 +77,7 @@ class StartPosture:
         self._head = data.site_xpos[index.head_site].copy()
         self._head_depth = float(scene.anatomy.depth(self._head))
 
-        self._ahead: list[np.ndarray] = []
+        self._ahead: list[tuple[np.ndarray, float]] = []
         if along_route is not None:
             self._ahead = self._settled_along(scene, model, index, along_route)
 
@@ -100,8 +100,8 @@ class StartPosture:
         model: mujoco.MjModel,
         index: ModelIndex,
         shares: Sequence[float],
-    ) -> list[np.ndarray]:
-        """Configurations (nq,) with the device laid further and further in.
+    ) -> list[tuple[np.ndarray, float]]:
+        """Angles of the hinges and insertions, further and further in.
 
         What springs out of a branch comes to rest elsewhere in the lumen; where a
         device cannot lie at all, none is kept.
@@ -116,7 +116,8 @@ class StartPosture:
                 _refuse_outside(scene, model, index, data)
             except ValueError:
                 continue
-            settled.append(data.qpos.copy())
+            advance = float(data.qpos[self._insertion])
+            settled.append((data.qpos[self._bends].copy(), advance))
         if not settled:
             raise ValueError(
                 f"start_along_route is {tuple(shares)}: {scene.device.name!r} can be "
@@ -181,8 +182,7 @@ class StartPosture:
             displaced nor turned.
         """
         if number is not None:
-            qpos[self._bends] = self._ahead[number][self._bends]
-            qpos[self._insertion] = self._ahead[number][self._insertion]
+            qpos[self._bends], qpos[self._insertion] = self._ahead[number]
             return
         angles, step = self._angles, self._steps @ displacement
         if roll:
