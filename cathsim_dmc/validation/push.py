@@ -8,7 +8,7 @@ import numpy as np
 
 from cathsim_dmc import suite
 from cathsim_dmc.anatomy import Anatomy, Goal
-from cathsim_dmc.entities.catheter import MAX_PUSH_SPEED
+from cathsim_dmc.entities.chain import MAX_PUSH_SPEED
 
 # A push that has gone on for so long a way of the base, m, beside that to the goal,
 # has missed.

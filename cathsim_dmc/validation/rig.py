@@ -8,7 +8,8 @@ from dm_control import mjcf
 
 from cathsim_dmc.entities import devices
 from cathsim_dmc.entities.arena import AngiographyArena
-from cathsim_dmc.entities.catheter import BENDING_RELAXATION_TIME, Catheter
+from cathsim_dmc.entities.catheter import Catheter
+from cathsim_dmc.entities.chain import BENDING_RELAXATION_TIME
 from cathsim_dmc.entities.contact import FRICTION
 from cathsim_dmc.tasks.config import PHYSICS_TIMESTEP
 

@@ -9,7 +9,7 @@ import mujoco
 import numpy as np
 
 from cathsim_dmc.entities import devices
-from cathsim_dmc.entities.catheter import BENDING_RELAXATION_TIME, MAX_ROTATION_SPEED
+from cathsim_dmc.entities.chain import BENDING_RELAXATION_TIME, MAX_ROTATION_SPEED
 from cathsim_dmc.validation import theory
 from cathsim_dmc.validation.checks import Check, Report
 from cathsim_dmc.validation.rig import Rig
