@@ -154,6 +154,17 @@ class Catheter(Chain):
         return self._device
 
     @property
+    def devices(self) -> tuple[devices.Device, ...]:
+        """What the catheter is made of, alone."""
+        return (self._device,)
+
+    @property
+    def density(self) -> float:
+        """Mean density of the device, kg/m³."""
+        radius = self._device.outer_radius
+        return self._device.linear_density / (np.pi * radius**2)
+
+    @property
     def tip_motors(self) -> tuple:
         """Motors of the tip from proximal to distal, x before y."""
         return tuple(self._tip_motors)

@@ -4,6 +4,7 @@ import numpy as np
 from dm_control import composer, mjcf
 
 from cathsim_dmc.entities.contact import device_contact
+from cathsim_dmc.entities.device import Device
 
 # Relaxation time of bending: joint damping = time * stiffness, s. It lumps the loss
 # inside the polymer with the drag of blood: a 0.2 m cantilever of 50 N·mm² with a drag
@@ -115,6 +116,21 @@ class Chain(composer.Entity):
 
     def _add_twist(self, link, index: int) -> None:
         """Adds the torsion hinge of a link, if it has one."""
+
+    @property
+    def device(self) -> Device:
+        """The device, or of several the outermost."""
+        raise NotImplementedError
+
+    @property
+    def devices(self) -> tuple[Device, ...]:
+        """The devices, from the innermost outwards."""
+        raise NotImplementedError
+
+    @property
+    def density(self) -> float:
+        """Density (kg/m³) of a body that blood carries as much of."""
+        raise NotImplementedError
 
     # How they are put together.
 

@@ -169,8 +169,12 @@ class DeviceStack(Chain):
         return self._lumen_friction
 
     @property
-    def density(self) -> float:
-        """Density that makes a link of all devices weigh what it does in blood."""
-        mass = sum(device.linear_density for device in self._devices)
+    def buoyant_share(self) -> float:
+        """Weight in blood of a link of all devices over that in air."""
         weight = sum(weight_density(device) for device in self._devices)
-        return BLOOD_DENSITY / (1 - weight / mass)
+        return weight / sum(device.linear_density for device in self._devices)
+
+    @property
+    def density(self) -> float:
+        """Density (kg/m³) of a body that blood carries as much of."""
+        return BLOOD_DENSITY / (1 - self.buoyant_share)

@@ -1,0 +1,499 @@
+"""Coaxial devices of N simulations: moved by the actions, written into the models.
+
+Once in a control step, before its physics steps, the devices are moved along and about
+their axis, and what the chain is made of then goes into the fields of the models. Where
+each device is and how it is turned lies in MuJoCo's `userdata`, so it is part of the
+state that is saved, dumped and replayed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import NamedTuple, Protocol
+
+import mujoco
+import numpy as np
+
+from cathsim_dmc.entities.chain import (
+    BENDING_RELAXATION_TIME,
+    MAX_PUSH_SPEED,
+    MAX_ROTATION_SPEED,
+)
+from cathsim_dmc.entities.coaxial import Links, Overlap
+from cathsim_dmc.entities.device_stack import DeviceStack
+from cathsim_dmc.entities.robot import follower_posture
+from cathsim_dmc.tasks.config import CONTROL_TIMESTEP
+from cathsim_dmc.tasks.readings import ModelIndex, Readings
+
+# Fields of the model that change as the devices slide. The constants that MuJoCo
+# derives from masses (`body_invweight0`, ...) stay those of the start: the armature of
+# the hinges outweighs the links in them a thousand times.
+FIELDS = (
+    "jnt_stiffness",
+    "dof_damping",
+    "qpos_spring",
+    "geom_size",
+    "geom_rbound",
+    "geom_aabb",
+    "geom_friction",
+    "body_mass",
+    "body_inertia",
+    "body_subtreemass",
+    "body_gravcomp",
+)
+# Rate of sliding above which the friction between devices acts in full, m/s.
+_SLIDING = 1e-3
+
+
+class CoaxialReadings(NamedTuple):
+    """State of K devices after a control step, arrays with the leading axis N.
+
+    Attributes:
+      insertion: (N, K), way of the end of each device from where the chain's end is at
+        zero insertion, m; negative for one that has been withdrawn farther.
+      rotation: (N, K), of the rotary units, rad.
+      tip_rotation: (N, K), of the ends of the devices, rad.
+      tips: (N, K, 3), ends of the devices, m, world frame.
+      leading_load: (N,), N, axial force in the device that reaches farthest where it
+        leaves the others, positive when it is pushed forward; for one device alone,
+        the push force.
+      lumen_friction: (N,), N, friction between the devices, that resists their sliding
+        in each other; 0 while they do not.
+    """
+
+    insertion: np.ndarray
+    rotation: np.ndarray
+    tip_rotation: np.ndarray
+    tips: np.ndarray
+    leading_load: np.ndarray
+    lumen_friction: np.ndarray
+
+
+class State(Protocol):
+    """The arrays of the simulations that coaxial devices read; see `FIELDS_READ`."""
+
+    qpos: np.ndarray
+    userdata: np.ndarray
+    cfrc_int: np.ndarray
+
+
+# Fields of `mujoco.MjData` beside `ModelIndex.FIELDS`, for a batch to bind beforehand.
+FIELDS_READ = ("userdata", "cfrc_int")
+
+
+def user_data(stack: DeviceStack) -> int:
+    """Numbers of `userdata` that the devices take: insertions, rotations of nodes."""
+    return len(stack.devices) * (1 + len(stack.stack.nodes))
+
+
+class ChainFields:
+    """Places in a model of what changes as the devices slide."""
+
+    def __init__(self, model: mujoco.MjModel, scope: str, index: ModelIndex):
+        """Finds the elements of the chain.
+
+        Args:
+          model: the compiled model.
+          scope: MJCF scope of the chain.
+          index: places of the task's quantities in the model.
+        """
+        self.bodies = index.links
+        count = self.bodies.stop - self.bodies.start
+        joints = [
+            joint
+            for joint in range(model.njnt)
+            if model.joint(joint).name.startswith(f"{scope}/bend_")
+        ]
+        self.joints = slice(joints[0], joints[-1] + 1)
+        self.dofs = _same(model.jnt_dofadr[joints])
+        self.qpos = _same(model.jnt_qposadr[joints])
+        geoms = [model.geom(f"{scope}/link_{link}").id for link in range(count)]
+        self.geoms = np.array(geoms, dtype=np.intp)
+        self.half_lengths = model.geom_size[geoms, 1].copy()
+        # MuJoCo orders the axes of inertia in its own way.
+        inertia = model.body_inertia[self.bodies]
+        along = inertia.argmin(axis=-1)
+        self.axes = np.where(np.arange(3) == along[:, None], 1, 0)
+
+    def write(self, arrays: Mapping[str, np.ndarray], made: Made, row: int) -> None:
+        """Writes what the chain of one simulation is made of.
+
+        Args:
+          arrays: live `FIELDS` of its model.
+          made: of some simulations.
+          row: which of them.
+        """
+        both = np.repeat(made.stiffness[row], 2)
+        arrays["jnt_stiffness"][self.joints] = both
+        arrays["dof_damping"][self.dofs] = BENDING_RELAXATION_TIME * both
+        arrays["qpos_spring"][self.qpos] = made.rest[row].ravel()
+        radius, geoms = made.links.radius[row], self.geoms
+        arrays["geom_size"][geoms, 0] = radius
+        arrays["geom_rbound"][geoms] = radius + self.half_lengths
+        box = arrays["geom_aabb"]
+        box[geoms, 3] = box[geoms, 4] = radius
+        box[geoms, 5] = radius + self.half_lengths
+        arrays["geom_friction"][geoms, 0] = made.links.friction[row]
+        mass, inertia = made.links.mass[row], made.inertia[row]
+        arrays["body_mass"][self.bodies] = mass
+        arrays["body_subtreemass"][self.bodies] = np.cumsum(mass[::-1])[::-1]
+        arrays["body_inertia"][self.bodies] = np.where(
+            self.axes, inertia[:, 1:], inertia[:, :1]
+        )
+        arrays["body_gravcomp"][self.bodies] = made.lightness[row]
+
+
+class Made(NamedTuple):
+    """What chains are made of, arrays with the leading axis N.
+
+    Attributes:
+      stiffness: (N, J), of the hinges, N·m/rad.
+      rest: (N, J, 2), angles of the free hinges about x and y, rad.
+      links: arrays (N, L).
+      inertia: (N, L, 2), across and along a link, kg·m².
+      lightness: (N, L), share of a link's mass that gravity does not pull at, beside
+        that which blood carries where all devices are.
+    """
+
+    stiffness: np.ndarray
+    rest: np.ndarray
+    links: Links
+    inertia: np.ndarray
+    lightness: np.ndarray
+
+
+def made_of(
+    entity: DeviceStack,
+    overlap: Overlap,
+    turns: np.ndarray,
+    friction: np.ndarray,
+    factor: np.ndarray,
+) -> Made:
+    """What chains are made of.
+
+    Args:
+      entity: of the devices.
+      overlap: of the devices.
+      turns: (N, K, J), rotation of each device at each joint, rad.
+      friction: (N,), Coulomb coefficient of an uncoated device on the wall.
+      factor: (N,), of all stiffnesses.
+    """
+    stack, share = entity.stack, entity.buoyant_share
+    free = stack.rest_angles(overlap, turns)
+    links = stack.links(overlap, friction)
+    lightness = np.zeros_like(links.mass)
+    if share > 0:
+        # Exactly nothing where all devices are: MuJoCo then passes the link over.
+        some = overlap.present.min(axis=1) < 1.0
+        lightness = np.where(some, 1.0 - links.weight / (links.mass * share), 0.0)
+    return Made(
+        stiffness=factor[:, None] / overlap.compliance,
+        rest=np.stack([-free.imag, free.real], axis=-1),
+        links=links,
+        inertia=stack.inertia(links.mass, links.radius),
+        lightness=lightness,
+    )
+
+
+def write_start(entity: DeviceStack, model: mujoco.MjModel, index: ModelIndex) -> None:
+    """Writes into a model what the chain is made of when an episode starts."""
+    overlap = entity.stack.overlap(entity.start_gaps[None])
+    turns = np.zeros((1, len(entity.devices), len(entity.stack.spans)))
+    made = made_of(entity, overlap, turns, np.array([entity.friction]), np.ones(1))
+    arrays = {name: getattr(model, name) for name in FIELDS}
+    ChainFields(model, entity.mjcf_model.model, index).write(arrays, made, 0)
+
+
+class CoaxialDevices:
+    """The devices of N simulations."""
+
+    def __init__(
+        self,
+        stack: DeviceStack,
+        model: mujoco.MjModel,
+        index: ModelIndex,
+        state: State,
+        field: Callable[[int, str], np.ndarray],
+        start_depth: float,
+        num_simulations: int,
+    ):
+        """Finds the places; no episode has begun yet.
+
+        Args:
+          stack: entity of the devices.
+          model: the compiled model.
+          index: places of the task's quantities in it.
+          state: arrays of the simulations.
+          field: gives a field of the model of one simulation, to be written.
+          start_depth: way of the chain's end past the mouth of the sheath at zero
+            insertion, m.
+          num_simulations: N.
+        """
+        self._entity, self._stack, self._rods = stack, stack.stack, stack.rods
+        self._index, self._qpos, self._field = index, state.qpos, field
+        self._internal_force = state.cfrc_int[:, index.links]
+        self._start_depth = start_depth
+        count, nodes = len(stack.devices), len(self._stack.nodes)
+        user = state.userdata
+        # Views: writing to them writes the state.
+        self._insertion = user[:, :count]
+        self._angles = user[:, count : count * (1 + nodes)].reshape(-1, count, nodes)
+        self._places = ChainFields(model, stack.mjcf_model.model, index)
+        self._arrays: list[dict[str, np.ndarray]] = [{} for _ in range(num_simulations)]
+        self._friction = np.full(num_simulations, stack.friction)
+        self._factor = np.ones(num_simulations)
+        # How fast the devices slide in each other, m/s, and press on each other, N.
+        self._sliding = np.zeros((num_simulations, count))
+        self._pressing = np.zeros(num_simulations)
+
+    # The course of an episode.
+
+    def restart(
+        self, index: int, friction: float | None, stiffness: float | None
+    ) -> None:
+        """Puts the devices of one simulation, whose chain lies at the start, there.
+
+        Args:
+          index: of the simulation.
+          friction: Coulomb coefficient of an uncoated device on the wall in this
+            episode; None for that of the entity.
+          stiffness: factor of all stiffnesses in this episode; None for 1.
+        """
+        gaps = self._entity.start_gaps
+        self._insertion[index] = self._qpos[index, self._index.insertion_qpos] - gaps
+        self._angles[index] = 0.0
+        self._sliding[index] = self._pressing[index] = 0.0
+        self._friction[index] = self._entity.friction if friction is None else friction
+        self._factor[index] = 1.0 if stiffness is None else stiffness
+        self._arrays[index] = {name: self._field(index, name) for name in FIELDS}
+        row = np.array([index])
+        self._write(row, *self._shape(row))
+
+    def command(self, action: np.ndarray, external_force: np.ndarray) -> np.ndarray:
+        """Moves the devices and writes what the chains are made of then.
+
+        The chain is driven to where the device will be that reaches farthest; the
+        others move as they are told. A device that leads is held up with the chain.
+
+        Args:
+          action: (N, 2 K) in [-1, 1], translation and rotation of each device.
+          external_force: (N, L, 6), contact force on the links, `Readings`.
+
+        Returns:
+          Control (N, 1) of the chain's motor.
+        """
+        reached = self._qpos[:, self._index.insertion_qpos]
+        before = self._held(reached)
+        step = MAX_PUSH_SPEED * CONTROL_TIMESTEP
+        target = before + step * action[:, 0::2]
+        np.clip(target, -self._withdrawn, self._entity.stroke, out=target)
+        # The chain's own end cannot be drawn back behind its start.
+        everyone, leader = np.arange(len(target)), target.argmax(axis=1)
+        lead = np.maximum(target[everyone, leader], 0.0)
+        target[everyone, leader] = lead
+        self._sliding[:] = (target - lead[:, None] - before + reached[:, None]) / (
+            CONTROL_TIMESTEP
+        )
+        self._insertion[:] = target
+        self._turn(action[:, 1::2], lead, external_force)
+        self._write(everyone, *self._shape(everyone))
+        return ((lead - reached) / step)[:, None]
+
+    @property
+    def _withdrawn(self) -> float:
+        """How far a device may be withdrawn: until its end has left the patient."""
+        return self._start_depth
+
+    def _held(self, reached: np.ndarray) -> np.ndarray:
+        """Insertions (N, K) with those that lead where the chain has come to."""
+        held = np.minimum(self._insertion, reached[:, None])
+        leader = self._insertion.argmax(axis=1)
+        held[np.arange(len(held)), leader] = reached
+        return held
+
+    def _shape(self, rows: np.ndarray) -> tuple[Overlap, np.ndarray]:
+        """Overlap of some simulations and rotations (n, K, J) at the joints."""
+        gaps = self._gaps(rows)
+        return self._stack.overlap(gaps), self._at_joints(rows, gaps)
+
+    def _gaps(self, rows: np.ndarray) -> np.ndarray:
+        insertion = self._insertion[rows]
+        return insertion.max(axis=1, keepdims=True) - insertion
+
+    def _at_joints(self, rows: np.ndarray, gaps: np.ndarray) -> np.ndarray:
+        """Rotations (n, K, J) of the devices where the chain has its joints."""
+        nodes, angles = self._stack.nodes, self._angles[rows]
+        if len(self._entity.devices) == 1:
+            return angles[..., 1:-1]
+        # From a joint's place on the chain to that on the device, nodes ascending.
+        place = np.maximum(nodes[1:-1] - gaps[..., None], 0.0)
+        ascending = nodes[::-1]
+        above = np.searchsorted(ascending, place, side="right")
+        above = np.minimum(above, len(nodes) - 1)
+        low, high = ascending[above - 1], ascending[above]
+        share = (place - low) / (high - low)
+        reverse = angles[..., ::-1]
+        first = np.take_along_axis(reverse, above - 1, axis=-1)
+        second = np.take_along_axis(reverse, above, axis=-1)
+        return first + share * (second - first)
+
+    def _turn(
+        self, rate: np.ndarray, lead: np.ndarray, external_force: np.ndarray
+    ) -> None:
+        """Turns the devices, against their shape in the vessel and friction."""
+        stack, everyone = self._stack, np.arange(len(rate))
+        overlap, turns = self._shape(everyone)
+        bends = self._qpos[:, self._places.qpos]
+        bends = bends[:, 1::2] - 1j * bends[:, 0::2]
+        torque, stiffening = stack.restoring(overlap, bends, turns)
+        torque = torque * self._factor[:, None, None]
+        stiffening = stiffening * self._factor[:, None, None]
+        friction = self._friction_torque(overlap, bends, turns, lead, external_force)
+        loads = self._to_nodes(np.stack([torque, stiffening, friction], axis=1))
+        turned = MAX_ROTATION_SPEED * CONTROL_TIMESTEP * rate
+        self._angles[:] = self._rods.turn(
+            self._angles,
+            turned,
+            CONTROL_TIMESTEP,
+            loads[:, 0],
+            loads[:, 1],
+            loads[:, 2],
+        )
+
+    def _friction_torque(
+        self,
+        overlap: Overlap,
+        bends: np.ndarray,
+        turns: np.ndarray,
+        lead: np.ndarray,
+        external_force: np.ndarray,
+    ) -> np.ndarray:
+        """Largest torques (N, K, J) of friction on the devices at the joints, N·m."""
+        stack, entity = self._stack, self._entity
+        force = np.sqrt((external_force[..., 3:] ** 2).sum(axis=-1))
+        # Nothing rubs in the sheath.
+        force = np.where(
+            lead[:, None] - stack.nodes[1:] > -self._start_depth, force, 0.0
+        )
+        outermost = overlap.outermost * force[:, None]
+        outermost = (outermost[..., :-1] + outermost[..., 1:]) / 2
+        outermost[..., -1] += overlap.outermost[..., -1] * force[:, None, -1] / 2
+        radii = np.array([device.outer_radius for device in entity.devices])
+        ratios = np.array([device.friction_ratio for device in entity.devices])
+        torque = self._friction[:, None, None] * (ratios * radii)[:, None] * outermost
+        if len(entity.devices) > 1:
+            pressure = stack.pressure(overlap, bends, turns)
+            pressure *= entity.lumen_friction * self._factor[:, None, None]
+            self._pressing = pressure.sum(axis=(1, 2))
+            # The lumen holds back the device in it; that one is too soft in torsion
+            # to turn the lumen in its turn.
+            torque[:, :-1] += pressure * radii[:-1, None]
+        return torque
+
+    def _to_nodes(self, loads: np.ndarray) -> np.ndarray:
+        """Loads (N, Q, K, J) at the joints, on the nodes (N, Q, K, M) of the rods."""
+        nodes = self._stack.nodes
+        result = np.zeros((*loads.shape[:-1], len(nodes) - 1))
+        if len(self._entity.devices) == 1:
+            result[..., :-1] = loads
+            return result
+        gaps = self._gaps(np.arange(len(loads)))
+        place = nodes[1:-1] - gaps[..., None]  # (N, K, J)
+        # Each node carries what its neighbours are farther from than it.
+        behind = np.append(nodes[:-2] - nodes[1:-1], nodes[-2])
+        ahead = np.append(nodes[1:-1] - nodes[2:], 1.0)
+        offset = place[..., None] - nodes[1:]  # (N, K, J, M)
+        weight = 1.0 - np.where(offset > 0, offset / behind, -offset / ahead)
+        np.clip(weight, 0.0, 1.0, out=weight)
+        weight *= (place >= 0.0)[..., None]
+        return (loads[..., None] * weight[:, None]).sum(axis=-2)
+
+    def _write(self, rows: np.ndarray, overlap: Overlap, turns: np.ndarray) -> None:
+        """Writes what the chains of some simulations are made of."""
+        friction, factor = self._friction[rows], self._factor[rows]
+        made = made_of(self._entity, overlap, turns, friction, factor)
+        for row, number in enumerate(rows.tolist()):
+            self._places.write(self._arrays[number], made, row)
+
+    # What others may read.
+
+    def pushed(self) -> np.ndarray:
+        """Insertion (N, K) of each device, m."""
+        return self._held(self._qpos[:, self._index.insertion_qpos])
+
+    def follower_posture(self) -> np.ndarray:
+        """Joints (N, len(JOINTS)) of the robot that holds the outer and inner device.
+
+        Of more than two devices it holds the outermost and the innermost; of one, both
+        units work on the same.
+        """
+        pushed, turned = self.pushed(), self.turned()
+        return follower_posture(
+            pushed[:, -1],
+            turned[:, -1],
+            guidewire_insertion=pushed[:, 0],
+            guidewire_rotation=turned[:, 0],
+        )
+
+    def turned(self) -> np.ndarray:
+        """Rotation (N, K) of the rotary unit of each device, rad."""
+        return self._angles[..., 0].copy()
+
+    def read(self, readings: Readings) -> CoaxialReadings:
+        """State of the devices.
+
+        Args:
+          readings: of the same control step.
+        """
+        insertion = self.pushed()
+        gaps = insertion.max(axis=1, keepdims=True) - insertion
+        friction = self._pressing * np.clip(
+            np.abs(np.diff(self._sliding, axis=1)).sum(axis=1) / _SLIDING, 0.0, 1.0
+        )
+        return CoaxialReadings(
+            insertion=insertion,
+            rotation=self.turned(),
+            tip_rotation=self._angles[..., -1].copy(),
+            tips=self.points(readings.centreline, gaps[..., None])[..., 0, :],
+            leading_load=self._leading_load(readings, gaps),
+            lumen_friction=friction,
+        )
+
+    def points(self, line: np.ndarray, places: np.ndarray) -> np.ndarray:
+        """Points (N, K, P, 3) of the chain at places (N, K, P), m, from its end.
+
+        Args:
+          line: (N, L + 1, 3), `Readings.centreline`.
+          places: those beyond the base are the base.
+        """
+        ascending = self._stack.nodes[::-1]
+        place = np.clip(places, 0.0, ascending[-1])
+        above = np.clip(
+            np.searchsorted(ascending, place, side="right"), 1, len(ascending) - 1
+        )
+        share = (place - ascending[above - 1]) / (
+            ascending[above] - ascending[above - 1]
+        )
+        last = len(ascending) - 1
+        rows = np.arange(len(line))[:, None, None]
+        near, far = line[rows, last - above + 1], line[rows, last - above]
+        return near + share[..., None] * (far - near)
+
+    def _leading_load(self, readings: Readings, gaps: np.ndarray) -> np.ndarray:
+        """Axial force (N,) in the leading device where it leaves the others, N."""
+        if gaps.shape[1] == 1:
+            return readings.push_force.copy()
+        second = np.sort(gaps, axis=1)[:, 1]
+        # The link that has the place in it: its joint bears what lies beyond.
+        link = (self._stack.nodes[1:] > second[:, None]).sum(axis=1)
+        link = np.minimum(link + 1, len(self._stack.link_lengths) - 1)
+        rows = np.arange(len(link))
+        line = readings.centreline
+        along = line[rows, link + 1] - line[rows, link]
+        force = self._internal_force[rows, link, 3:]
+        return (force * along).sum(axis=-1) / np.sqrt((along**2).sum(axis=-1))
+
+
+def _same(places: np.ndarray) -> slice:
+    """The places of the hinges, which follow each other, as a slice."""
+    return slice(int(places[0]), int(places[-1]) + 1)
