@@ -41,6 +41,8 @@ FIELDS = (
     "body_subtreemass",
     "body_gravcomp",
 )
+# Where points of a device are tracked, m from its end.
+DEVICE_PLACES = np.arange(7, -1, -1) * 15e-3
 # Rate of sliding above which the friction between devices acts in full, m/s.
 _SLIDING = 1e-3
 
@@ -53,7 +55,8 @@ class CoaxialReadings(NamedTuple):
         zero insertion, m; negative for one that has been withdrawn farther.
       rotation: (N, K), of the rotary units, rad.
       tip_rotation: (N, K), of the ends of the devices, rad.
-      tips: (N, K, 3), ends of the devices, m, world frame.
+      points: (N, K, P, 3), points of each device `DEVICE_PLACES` from its end, m, world
+        frame; the last one is its end.
       leading_load: (N,), N, axial force in the device that reaches farthest where it
         leaves the others, positive when it is pushed forward; for one device alone,
         the push force.
@@ -64,7 +67,7 @@ class CoaxialReadings(NamedTuple):
     insertion: np.ndarray
     rotation: np.ndarray
     tip_rotation: np.ndarray
-    tips: np.ndarray
+    points: np.ndarray
     leading_load: np.ndarray
     lumen_friction: np.ndarray
 
@@ -454,7 +457,7 @@ class CoaxialDevices:
             insertion=insertion,
             rotation=self.turned(),
             tip_rotation=self._angles[..., -1].copy(),
-            tips=self.points(readings.centreline, gaps[..., None])[..., 0, :],
+            points=self.points(readings.centreline, gaps[..., None] + DEVICE_PLACES),
             leading_load=self._leading_load(readings, gaps),
             lumen_friction=friction,
         )

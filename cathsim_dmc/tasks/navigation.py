@@ -155,7 +155,9 @@ class Navigation(composer.Task):
                     lambda physics, key=key: self._current().observation[key][0],
                     spec,
                 )
-                for key, spec in observations.entry_specs(self._names, options).items()
+                for key, spec in observations.entry_specs(
+                    self._names, options, self._scene.coaxial
+                ).items()
             }
         return self._observables
 

@@ -17,7 +17,7 @@ from cathsim_dmc.entities.robot import follower_posture
 from cathsim_dmc.imaging.fluoroscopy import Fluoroscope
 from cathsim_dmc.tasks import coaxial, forces, observations, readings
 from cathsim_dmc.tasks.cases import Case, model_index
-from cathsim_dmc.tasks.coaxial import CoaxialDevices
+from cathsim_dmc.tasks.coaxial import CoaxialDevices, CoaxialReadings
 from cathsim_dmc.tasks.config import NavigationConfig
 from cathsim_dmc.tasks.image_sensors import ImageSensors, open_cameras
 from cathsim_dmc.tasks.objective_pool import together
@@ -335,7 +335,7 @@ class Rollout:
         if self._routes is not None:
             ahead = self._routes.ahead(self._case_of, state.head, state.head_frame)
         frame = observations.Frame(
-            state, self._wall_force, self._action, goal, images, ahead
+            state, self._wall_force, self._action, goal, images, ahead, self.devices
         )
         return observations.observe(self._names, frame)
 
@@ -364,6 +364,11 @@ class Rollout:
     def readings(self) -> readings.Readings:
         """State of the devices after the last step or reset."""
         return self._readings
+
+    @property
+    def devices(self) -> CoaxialReadings | None:
+        """State of coaxial devices after the last step or reset; None for one alone."""
+        return None if self._coaxial is None else self._coaxial.read(self._readings)
 
     @property
     def wall_force(self) -> forces.WallForce:
