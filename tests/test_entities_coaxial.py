@@ -8,6 +8,7 @@ import pytest
 from scipy.integrate import quad
 
 from cathsim_dmc.entities import devices
+from cathsim_dmc.entities.catheter import Catheter
 from cathsim_dmc.entities.coaxial import Stack
 from cathsim_dmc.entities.torsion import STICKING, Rods
 
@@ -63,48 +64,60 @@ def test_integrals_are_those_of_the_devices(pair, gaps):
         return np.array(stiff), np.array(bent)
 
     for joint in range(0, len(pair.spans), 3):
-        far = pair.nodes[joint] - pair.link_lengths[joint] / 2
-        near = far - pair.spans[joint]
-        compliance = integral(lambda s: 1 / parts(s)[0].sum(), near, far, breaks)
+        far, place, near = pair.nodes[joint : joint + 3]
+        breaks = [*breaks, place]
+
+        def weight(s, far=far, place=place, near=near):
+            return (
+                (s - near) / (place - near) if s < place else (far - s) / (far - place)
+            )
+
+        compliance = integral(
+            lambda s: weight(s) / parts(s)[0].sum(), near, far, breaks
+        )
         assert overlap.compliance[0, joint] == pytest.approx(compliance, rel=1e-8)
         for k in range(2):
 
             def bend(s, k=k):
                 stiff, bent = parts(s)
-                return stiff[k] * bent[k] / stiff.sum()
+                return weight(s) * stiff[k] * bent[k] / stiff.sum()
 
             rest = integral(bend, near, far, breaks)
             assert overlap.rest[0, k, joint] == pytest.approx(rest, abs=1e-9)
 
         def both(s):
             stiff, bent = parts(s)
-            return np.prod(stiff) * np.prod(bent) / stiff.sum()
+            return weight(s) * np.prod(stiff) * np.prod(bent) / stiff.sum()
 
         coupling = integral(both, near, far, breaks)
         assert overlap.coupling[0, 0, joint] == pytest.approx(coupling, abs=1e-12)
 
 
 def test_one_device_is_the_catheter():
-    """A stack of one has the joints that `Catheter` gives the same device."""
-    from cathsim_dmc.entities.catheter import Catheter
-
+    """A stack of one is as stiff and as heavy as `Catheter`, and its end lies there."""
     for name in ("diagnostic_5f_simmons", "wire_035_glide", "steerable_4f"):
         catheter = Catheter(name)
-        alone = stack([name], catheter.link_lengths)
+        device, lengths = catheter.device, catheter.link_lengths
+        alone = stack([name], lengths)
         overlap = alone.overlap(np.zeros((1, 1)))
-        bends = catheter.bends
-        np.testing.assert_allclose(
-            1 / overlap.compliance[0], [b.stiffness[0] for b in bends[::2]], rtol=1e-9
-        )
+        theirs = np.array([bend.stiffness[0] for bend in catheter.bends[::2]])
+        border = len(lengths) - device.tip_links - 1
+        uniform = np.abs(np.arange(len(theirs)) - border) > 1
+        mine = 1 / overlap.compliance[0]
+        np.testing.assert_allclose(mine[uniform], theirs[uniform], rtol=1e-9)
+        assert overlap.compliance.sum() == pytest.approx((1 / theirs).sum(), rel=1e-9)
+        # Small bends move the end by their angle times their distance from it.
         rest = alone.rest_angles(overlap, np.zeros((1, 1, len(alone.spans))))[0]
-        np.testing.assert_allclose(
-            rest.real, [b.springref for b in bends[1::2]], atol=1e-12
-        )
+        moved, place = 0.0, 0.0
+        for arc in reversed(device.tip_shape):
+            moved += arc.angle * (place + arc.length / 2)
+            place += arc.length
+        assert (rest.real * alone.nodes[1:-1]).sum() == pytest.approx(moved)
         links = alone.links(overlap, np.array([0.037]))
         np.testing.assert_allclose(
-            links.mass[0], [g.mass for g in catheter.link_geoms], rtol=1e-12
+            links.mass[0], [geom.mass for geom in catheter.link_geoms], rtol=1e-12
         )
-        assert (links.radius == catheter.device.outer_radius).all()
+        assert (links.radius == device.outer_radius).all()
 
 
 def test_nothing_jumps_as_one_device_slides_through_the_other(pair):

@@ -7,9 +7,11 @@ the chain, at a place s from its end,
     EI(s) = Σ EI_k(s),    κ(s) EI(s) = Σ EI_k(s) κ_k(s),
 
 over the devices that reach so far, each with the curvature κ_k of its unloaded shape,
-turned by its own rotation there. A hinge stands for the stretch between the middles of
-its two links, and what it needs are integrals over that stretch; so the end of a device
-may lie anywhere in it, and everything is continuous as devices slide and turn.
+turned by its own rotation there. What a hinge needs are integrals of 1/EI and κ over
+its two links, with a weight that falls linearly from 1 at the hinge to 0 at their far
+ends: so the hinges bend by as much as the rod does, and about the same place on
+average, wherever the end of a device lies in a link, and everything changes
+continuously as devices slide and turn.
 
 Pure functions of arrays with a leading axis N of simulations; SI units. Directions
 across the chain are complex numbers x + iy in the frame of a link: a hinge bent by
@@ -35,12 +37,12 @@ class Overlap(NamedTuple):
     """What the overlap alone decides, whatever the rotations. J joints, L links.
 
     Attributes:
-      compliance: (N, J), ∫ds/EI of the stretch of a joint, rad/(N·m).
-      rest: (N, K, J), ∫κ_k EI_k/EI ds: by what each device bends the free joint, rad.
-      coupling: (N, P, J), ∫κ_k κ_l EI_k EI_l/EI ds for each pair of `Stack.pairs`:
+      compliance: (N, J), ∫h ds/EI of a joint with its weight h, rad/(N·m).
+      rest: (N, K, J), ∫h κ_k EI_k/EI ds: by what each device bends the free joint, rad.
+      coupling: (N, P, J), ∫h κ_k κ_l EI_k EI_l/EI ds for each pair of `Stack.pairs`:
         the energy of two devices that bend against each other, N·m.
-      stiffness: (N, K, J), mean of EI_k over the stretch, N·m².
-      moment: (N, K, J), mean of EI_k κ_k over the stretch, N·m.
+      stiffness: (N, K, J), weighted mean of EI_k, N·m².
+      moment: (N, K, J), weighted mean of EI_k κ_k, N·m.
       outermost: (N, K, L), share of each link on which a device is the outermost.
       present: (N, K, L), share of each link that a device reaches.
     """
@@ -78,7 +80,7 @@ class Stack:
       link_lengths: (L,), from proximal to distal, m.
       nodes: (L + 1,), distance of the ends of the links from the end of the chain, m,
         from proximal to distal.
-      spans: (J,), length of the stretch that each joint stands for, m.
+      spans: (J,), length of rod that each joint stands for, half of its two links, m.
       pairs: (P, 2), numbers of every two devices.
     """
 
@@ -97,10 +99,7 @@ class Stack:
         self.link_lengths = np.asarray(link_lengths, dtype=np.float64)
         beyond = np.cumsum(self.link_lengths[::-1])[::-1]
         self.nodes = np.append(beyond, 0.0)
-        middles = beyond - self.link_lengths / 2
-        # Stretch of joint j, between links j and j + 1: from its far to its near end.
-        self._far, self._near = middles[:-1], middles[1:]
-        self.spans = self._far - self._near
+        self.spans = (self.link_lengths[:-1] + self.link_lengths[1:]) / 2
         count = len(devices)
         self.pairs = np.array(
             [(k, j) for k in range(count) for j in range(k + 1, count)], dtype=int
@@ -117,7 +116,7 @@ class Stack:
         self._weight = np.array([weight_density(device) for device in devices])
 
     def overlap(self, gaps: np.ndarray) -> Overlap:
-        """Integrals over the stretches of the joints and over the links.
+        """Integrals around the joints and over the links.
 
         Args:
           gaps: (N, K), way from the end of each device to the end of the chain, m, at
@@ -128,26 +127,16 @@ class Stack:
         )
         edges.sort(axis=-1)
         # Between two of them nothing changes: cells (N, C).
-        stops = np.concatenate([edges[:, 1:], np.full((len(gaps), 1), _FAR)], axis=-1)
-        middles = (edges + stops) / 2
+        edges = np.concatenate([edges, np.full((len(gaps), 1), _FAR)], axis=-1)
+        middles = (edges[:, 1:] + edges[:, :-1]) / 2
         bending, moment = self._sections(middles, gaps)
         total = 1 / bending.sum(axis=1)
         share = moment * total[:, None]
         first, second = self.pairs[:, 0], self.pairs[:, 1]
-        values = np.concatenate(
-            [
-                total[:, None],
-                share,
-                share[:, first] * moment[:, second],
-                bending,
-                moment,
-            ],
-            axis=1,
-        )
-        lengths = np.minimum(stops[:, None], self._far[:, None])
-        lengths = lengths - np.maximum(edges[:, None], self._near[:, None])
-        np.maximum(lengths, 0.0, out=lengths)  # (N, J, C)
-        integrals = (values[:, :, None] * lengths[:, None]).sum(axis=-1)
+        both = share[:, first] * moment[:, second]
+        values = np.concatenate([total[:, None], share, both, bending, moment], axis=1)
+        weights = np.diff(self._weight_up_to(edges), axis=-1)  # (N, J, C)
+        integrals = (values[:, :, None] * weights[:, None]).sum(axis=-1)
         count = len(self.devices)
         cuts = np.cumsum([1, count, len(self.pairs), count])
         compliance, rest, coupling, stiffness, mean = np.split(integrals, cuts, axis=1)
@@ -161,6 +150,18 @@ class Stack:
             outermost,
             present,
         )
+
+    def _weight_up_to(self, places: np.ndarray) -> np.ndarray:
+        """Integral (N, J, C) of the weight of each joint from the end to places (N, C).
+
+        The weight rises along the link beyond the joint and falls along the one before.
+        """
+        joints = self.nodes[1:-1, None]
+        ahead, behind = self.link_lengths[1:, None], self.link_lengths[:-1, None]
+        offset = places[:, None] - joints
+        rise = np.clip(offset + ahead, 0.0, ahead)
+        fall = np.clip(offset, 0.0, behind)
+        return rise**2 / (2 * ahead) + fall - fall**2 / (2 * behind)
 
     def _sections(
         self, places: np.ndarray, gaps: np.ndarray
@@ -186,17 +187,20 @@ class Stack:
             covered = np.maximum(covered, present[:, k])
         return outermost, present
 
-    def rest_angles(self, overlap: Overlap, turns: np.ndarray) -> np.ndarray:
+    def rest_angles(
+        self, overlap: Overlap, turns: np.ndarray, factor: np.ndarray | complex = 1.0
+    ) -> np.ndarray:
         """Angles of the free joints.
 
         Args:
           overlap: of the devices.
           turns: (N, K, J), rotation of each device at each joint, rad.
+          factor: (N, K, J), of the part of each device.
 
         Returns:
           (N, J) complex, rad.
         """
-        return (overlap.rest * np.exp(1j * turns)).sum(axis=1)
+        return (overlap.rest * np.exp(1j * turns) * factor).sum(axis=1)
 
     def links(self, overlap: Overlap, friction: np.ndarray) -> Links:
         """What the links are made of.

@@ -17,9 +17,8 @@ LUMEN_FRICTION = 0.04
 # By how much each device starts ahead of the one around it, m.
 LEAD = 0.03
 # The end of the chain, in which the shapes of the devices lie when the inner one leads
-# by a few centimetres, has short links; m.
+# by a few centimetres, has links as short as the tips; it is longer than them by, m:
 _SHAPED_BEHIND = 0.07
-_SHAPED_LINK = 7e-3
 
 
 class DeviceStack(Chain):
@@ -89,7 +88,8 @@ class DeviceStack(Chain):
         if len(self._devices) == 1:
             return discretisation.link_lengths(self._devices[0])
         end = max(device.tip_length for device in self._devices) + _SHAPED_BEHIND
-        links = max(1, round(end / _SHAPED_LINK))
+        shortest = min(device.tip_length / device.tip_links for device in self._devices)
+        links = round(end / shortest)
         names = " in ".join(repr(device.name) for device in self._devices)
         return discretisation.divided(end, links, names)
 

@@ -199,7 +199,7 @@ WIRE_035_GLIDE = _hydrophilic_wire(
     0.035 * INCH,
     (0.50e-3, 0.28e-3),
     Arc(8e-3, math.radians(45)),
-    tip_links=5,
+    tip_links=4,
 )
 WIRE_014_MICRO = _hydrophilic_wire(
     "wire_014_micro",

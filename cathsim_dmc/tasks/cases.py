@@ -71,7 +71,7 @@ class Case:
         self.objective = objective
         index = model_index(scene, model)
         if isinstance(scene.catheter, DeviceStack):
-            coaxial.write_start(scene.catheter, model, index)
+            coaxial.write_still(scene.catheter, model)
         self.start = StartPosture(scene, model, index, start_along_route)
         self._fluoroscopy = fluoroscopy
         self._fields = fields or {}

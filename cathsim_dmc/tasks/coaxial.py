@@ -55,6 +55,7 @@ class CoaxialReadings(NamedTuple):
         zero insertion, m; negative for one that has been withdrawn farther.
       rotation: (N, K), of the rotary units, rad.
       tip_rotation: (N, K), of the ends of the devices, rad.
+      twist: (N, K), torque of the rotary units on the devices at rest, N·m.
       points: (N, K, P, 3), points of each device `DEVICE_PLACES` from its end, m, world
         frame; the last one is its end.
       leading_load: (N,), N, axial force in the device that reaches farthest where it
@@ -67,6 +68,7 @@ class CoaxialReadings(NamedTuple):
     insertion: np.ndarray
     rotation: np.ndarray
     tip_rotation: np.ndarray
+    twist: np.ndarray
     points: np.ndarray
     leading_load: np.ndarray
     lumen_friction: np.ndarray
@@ -92,16 +94,20 @@ def user_data(stack: DeviceStack) -> int:
 class ChainFields:
     """Places in a model of what changes as the devices slide."""
 
-    def __init__(self, model: mujoco.MjModel, scope: str, index: ModelIndex):
+    def __init__(self, model: mujoco.MjModel, scope: str):
         """Finds the elements of the chain.
 
         Args:
           model: the compiled model.
           scope: MJCF scope of the chain.
-          index: places of the task's quantities in the model.
         """
-        self.bodies = index.links
-        count = self.bodies.stop - self.bodies.start
+        bodies = [
+            body
+            for body in range(model.nbody)
+            if model.body(body).name.startswith(f"{scope}/link_")
+        ]
+        count = len(bodies)
+        self.bodies = slice(bodies[0], bodies[0] + count)
         joints = [
             joint
             for joint in range(model.njnt)
@@ -171,8 +177,13 @@ def made_of(
     turns: np.ndarray,
     friction: np.ndarray,
     factor: np.ndarray,
+    spin: np.ndarray | float = 0.0,
 ) -> Made:
     """What chains are made of.
+
+    The damping of a hinge resists how it moves against the turning shape, not against
+    the vessel: else a shaped device would be held back by its own damping when it is
+    turned. So the spring leads by what the damper takes.
 
     Args:
       entity: of the devices.
@@ -180,9 +191,10 @@ def made_of(
       turns: (N, K, J), rotation of each device at each joint, rad.
       friction: (N,), Coulomb coefficient of an uncoated device on the wall.
       factor: (N,), of all stiffnesses.
+      spin: (N, K, J), rate of that rotation, rad/s.
     """
     stack, share = entity.stack, entity.buoyant_share
-    free = stack.rest_angles(overlap, turns)
+    free = stack.rest_angles(overlap, turns, 1 + 1j * BENDING_RELAXATION_TIME * spin)
     links = stack.links(overlap, friction)
     lightness = np.zeros_like(links.mass)
     if share > 0:
@@ -198,13 +210,29 @@ def made_of(
     )
 
 
-def write_start(entity: DeviceStack, model: mujoco.MjModel, index: ModelIndex) -> None:
-    """Writes into a model what the chain is made of when an episode starts."""
-    overlap = entity.stack.overlap(entity.start_gaps[None])
+def write_still(
+    entity: DeviceStack,
+    model: mujoco.MjModel,
+    gaps: np.ndarray | None = None,
+    rotation: np.ndarray | None = None,
+) -> None:
+    """Writes into a model what the chain is made of while the devices stand still.
+
+    Args:
+      entity: of the devices.
+      model: the compiled model.
+      gaps: (K,), way from the end of each device to that of the chain, m; those at the
+        start of an episode if None.
+      rotation: (K,), of each device, not twisted, rad; 0 if None.
+    """
+    gaps = entity.start_gaps if gaps is None else np.asarray(gaps, np.float64)
     turns = np.zeros((1, len(entity.devices), len(entity.stack.spans)))
+    if rotation is not None:
+        turns += np.asarray(rotation)[:, None]
+    overlap = entity.stack.overlap(gaps[None])
     made = made_of(entity, overlap, turns, np.array([entity.friction]), np.ones(1))
     arrays = {name: getattr(model, name) for name in FIELDS}
-    ChainFields(model, entity.mjcf_model.model, index).write(arrays, made, 0)
+    ChainFields(model, entity.mjcf_model.model).write(arrays, made, 0)
 
 
 class CoaxialDevices:
@@ -241,13 +269,15 @@ class CoaxialDevices:
         # Views: writing to them writes the state.
         self._insertion = user[:, :count]
         self._angles = user[:, count : count * (1 + nodes)].reshape(-1, count, nodes)
-        self._places = ChainFields(model, stack.mjcf_model.model, index)
+        self._places = ChainFields(model, stack.mjcf_model.model)
         self._arrays: list[dict[str, np.ndarray]] = [{} for _ in range(num_simulations)]
         self._friction = np.full(num_simulations, stack.friction)
         self._factor = np.ones(num_simulations)
         # How fast the devices slide in each other, m/s, and press on each other, N.
         self._sliding = np.zeros((num_simulations, count))
         self._pressing = np.zeros(num_simulations)
+        # Rates at which they turn at the joints, rad/s.
+        self._spin = np.zeros((num_simulations, count, nodes - 2))
 
     # The course of an episode.
 
@@ -265,7 +295,7 @@ class CoaxialDevices:
         gaps = self._entity.start_gaps
         self._insertion[index] = self._qpos[index, self._index.insertion_qpos] - gaps
         self._angles[index] = 0.0
-        self._sliding[index] = self._pressing[index] = 0.0
+        self._sliding[index] = self._pressing[index] = self._spin[index] = 0.0
         self._friction[index] = self._entity.friction if friction is None else friction
         self._factor[index] = 1.0 if stiffness is None else stiffness
         self._arrays[index] = {name: self._field(index, name) for name in FIELDS}
@@ -298,8 +328,8 @@ class CoaxialDevices:
             CONTROL_TIMESTEP
         )
         self._insertion[:] = target
-        self._turn(action[:, 1::2], lead, external_force)
-        self._write(everyone, *self._shape(everyone))
+        overlap, turns = self._turn(action[:, 1::2], lead, external_force)
+        self._write(everyone, overlap, turns)
         return ((lead - reached) / step)[:, None]
 
     @property
@@ -342,8 +372,12 @@ class CoaxialDevices:
 
     def _turn(
         self, rate: np.ndarray, lead: np.ndarray, external_force: np.ndarray
-    ) -> None:
-        """Turns the devices, against their shape in the vessel and friction."""
+    ) -> tuple[Overlap, np.ndarray]:
+        """Turns the devices, against their shape in the vessel and friction.
+
+        Returns:
+          Overlap, and rotations (N, K, J) at the joints.
+        """
         stack, everyone = self._stack, np.arange(len(rate))
         overlap, turns = self._shape(everyone)
         bends = self._qpos[:, self._places.qpos]
@@ -353,15 +387,14 @@ class CoaxialDevices:
         stiffening = stiffening * self._factor[:, None, None]
         friction = self._friction_torque(overlap, bends, turns, lead, external_force)
         loads = self._to_nodes(np.stack([torque, stiffening, friction], axis=1))
+        torque, stiffening, friction = np.moveaxis(loads, 1, 0)
         turned = MAX_ROTATION_SPEED * CONTROL_TIMESTEP * rate
         self._angles[:] = self._rods.turn(
-            self._angles,
-            turned,
-            CONTROL_TIMESTEP,
-            loads[:, 0],
-            loads[:, 1],
-            loads[:, 2],
+            self._angles, turned, CONTROL_TIMESTEP, torque, stiffening, friction
         )
+        after = self._at_joints(everyone, self._gaps(everyone))
+        self._spin[:] = (after - turns) / CONTROL_TIMESTEP
+        return overlap, after
 
     def _friction_torque(
         self,
@@ -414,7 +447,8 @@ class CoaxialDevices:
     def _write(self, rows: np.ndarray, overlap: Overlap, turns: np.ndarray) -> None:
         """Writes what the chains of some simulations are made of."""
         friction, factor = self._friction[rows], self._factor[rows]
-        made = made_of(self._entity, overlap, turns, friction, factor)
+        spin = self._spin[rows]
+        made = made_of(self._entity, overlap, turns, friction, factor, spin)
         for row, number in enumerate(rows.tolist()):
             self._places.write(self._arrays[number], made, row)
 
@@ -457,6 +491,7 @@ class CoaxialDevices:
             insertion=insertion,
             rotation=self.turned(),
             tip_rotation=self._angles[..., -1].copy(),
+            twist=self._rods.base_torque(self._angles),
             points=self.points(readings.centreline, gaps[..., None] + DEVICE_PLACES),
             leading_load=self._leading_load(readings, gaps),
             lumen_friction=friction,
