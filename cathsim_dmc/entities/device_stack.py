@@ -16,9 +16,6 @@ from cathsim_dmc.entities.torsion import Rods
 LUMEN_FRICTION = 0.04
 # By how much each device starts ahead of the one around it, m.
 LEAD = 0.03
-# The end of the chain, in which the shapes of the devices lie when the inner one leads
-# by a few centimetres, has links as short as the tips; it is longer than them by, m:
-_SHAPED_BEHIND = 0.07
 
 
 class DeviceStack(Chain):
@@ -87,7 +84,9 @@ class DeviceStack(Chain):
     def _divide(self, discretisation: library.Discretisation) -> np.ndarray:
         if len(self._devices) == 1:
             return discretisation.link_lengths(self._devices[0])
-        end = max(device.tip_length for device in self._devices) + _SHAPED_BEHIND
+        # The end of the chain has links as short as those of the tips. A shape that
+        # lies behind it, under a wire that leads by more, is drawn by longer ones.
+        end = max(device.tip_length for device in self._devices)
         shortest = min(device.tip_length / device.tip_links for device in self._devices)
         links = round(end / shortest)
         names = " in ".join(repr(device.name) for device in self._devices)

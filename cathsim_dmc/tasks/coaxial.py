@@ -276,6 +276,10 @@ class CoaxialDevices:
         # How fast the devices slide in each other, m/s, and press on each other, N.
         self._sliding = np.zeros((num_simulations, count))
         self._pressing = np.zeros(num_simulations)
+        # One over the lengths of the segments of the rods on both sides of a node.
+        segments = -np.diff(self._stack.nodes)
+        self._per_behind = 1 / np.append(segments[0], segments)
+        self._per_ahead = -1 / np.append(segments, segments[-1])
         # Rates at which they turn at the joints, rad/s.
         self._spin = np.zeros((num_simulations, count, nodes - 2))
 
@@ -300,7 +304,8 @@ class CoaxialDevices:
         self._factor[index] = 1.0 if stiffness is None else stiffness
         self._arrays[index] = {name: self._field(index, name) for name in FIELDS}
         row = np.array([index])
-        self._write(row, *self._shape(row))
+        turns = np.zeros((1, *self._spin.shape[1:]))
+        self._write(row, self._stack.overlap(self._gaps(row)), turns)
 
     def command(self, action: np.ndarray, external_force: np.ndarray) -> np.ndarray:
         """Moves the devices and writes what the chains are made of then.
@@ -344,31 +349,25 @@ class CoaxialDevices:
         held[np.arange(len(held)), leader] = reached
         return held
 
-    def _shape(self, rows: np.ndarray) -> tuple[Overlap, np.ndarray]:
-        """Overlap of some simulations and rotations (n, K, J) at the joints."""
-        gaps = self._gaps(rows)
-        return self._stack.overlap(gaps), self._at_joints(rows, gaps)
-
     def _gaps(self, rows: np.ndarray) -> np.ndarray:
         insertion = self._insertion[rows]
         return insertion.max(axis=1, keepdims=True) - insertion
 
-    def _at_joints(self, rows: np.ndarray, gaps: np.ndarray) -> np.ndarray:
-        """Rotations (n, K, J) of the devices where the chain has its joints."""
-        nodes, angles = self._stack.nodes, self._angles[rows]
-        if len(self._entity.devices) == 1:
-            return angles[..., 1:-1]
-        # From a joint's place on the chain to that on the device, nodes ascending.
+    def _node_weights(self, gaps: np.ndarray) -> np.ndarray:
+        """Weights (N, K, J, M + 1) of a rod's nodes at the joints of the chain.
+
+        Between two nodes the rotation is linear; a joint beyond a device's end has that
+        of the end.
+        """
+        nodes = self._stack.nodes
         place = np.maximum(nodes[1:-1] - gaps[..., None], 0.0)
-        ascending = nodes[::-1]
-        above = np.searchsorted(ascending, place, side="right")
-        above = np.minimum(above, len(nodes) - 1)
-        low, high = ascending[above - 1], ascending[above]
-        share = (place - low) / (high - low)
-        reverse = angles[..., ::-1]
-        first = np.take_along_axis(reverse, above - 1, axis=-1)
-        second = np.take_along_axis(reverse, above, axis=-1)
-        return first + share * (second - first)
+        offset = place[..., None] - nodes
+        weight = 1.0 - np.maximum(offset * self._per_behind, offset * self._per_ahead)
+        return np.maximum(weight, 0.0, out=weight)
+
+    def _at_joints(self, weights: np.ndarray, rows: np.ndarray) -> np.ndarray:
+        """Rotations (n, K, J) of the devices where the chain has its joints."""
+        return (weights * self._angles[rows][:, :, None]).sum(axis=-1)
 
     def _turn(
         self, rate: np.ndarray, lead: np.ndarray, external_force: np.ndarray
@@ -379,20 +378,24 @@ class CoaxialDevices:
           Overlap, and rotations (N, K, J) at the joints.
         """
         stack, everyone = self._stack, np.arange(len(rate))
-        overlap, turns = self._shape(everyone)
+        gaps = self._gaps(everyone)
+        overlap, weights = stack.overlap(gaps), self._node_weights(gaps)
+        turns = self._at_joints(weights, everyone)
         bends = self._qpos[:, self._places.qpos]
         bends = bends[:, 1::2] - 1j * bends[:, 0::2]
         torque, stiffening = stack.restoring(overlap, bends, turns)
         torque = torque * self._factor[:, None, None]
         stiffening = stiffening * self._factor[:, None, None]
         friction = self._friction_torque(overlap, bends, turns, lead, external_force)
-        loads = self._to_nodes(np.stack([torque, stiffening, friction], axis=1))
+        loads = np.stack([torque, stiffening, friction], axis=1)
+        # A load is shared by the nodes on both sides of its joint.
+        loads = (loads[..., None] * weights[:, None, ..., 1:]).sum(axis=-2)
         torque, stiffening, friction = np.moveaxis(loads, 1, 0)
         turned = MAX_ROTATION_SPEED * CONTROL_TIMESTEP * rate
         self._angles[:] = self._rods.turn(
             self._angles, turned, CONTROL_TIMESTEP, torque, stiffening, friction
         )
-        after = self._at_joints(everyone, self._gaps(everyone))
+        after = self._at_joints(weights, everyone)
         self._spin[:] = (after - turns) / CONTROL_TIMESTEP
         return overlap, after
 
@@ -426,24 +429,6 @@ class CoaxialDevices:
             torque[:, :-1] += pressure * radii[:-1, None]
         return torque
 
-    def _to_nodes(self, loads: np.ndarray) -> np.ndarray:
-        """Loads (N, Q, K, J) at the joints, on the nodes (N, Q, K, M) of the rods."""
-        nodes = self._stack.nodes
-        result = np.zeros((*loads.shape[:-1], len(nodes) - 1))
-        if len(self._entity.devices) == 1:
-            result[..., :-1] = loads
-            return result
-        gaps = self._gaps(np.arange(len(loads)))
-        place = nodes[1:-1] - gaps[..., None]  # (N, K, J)
-        # Each node carries what its neighbours are farther from than it.
-        behind = np.append(nodes[:-2] - nodes[1:-1], nodes[-2])
-        ahead = np.append(nodes[1:-1] - nodes[2:], 1.0)
-        offset = place[..., None] - nodes[1:]  # (N, K, J, M)
-        weight = 1.0 - np.where(offset > 0, offset / behind, -offset / ahead)
-        np.clip(weight, 0.0, 1.0, out=weight)
-        weight *= (place >= 0.0)[..., None]
-        return (loads[..., None] * weight[:, None]).sum(axis=-2)
-
     def _write(self, rows: np.ndarray, overlap: Overlap, turns: np.ndarray) -> None:
         """Writes what the chains of some simulations are made of."""
         friction, factor = self._friction[rows], self._factor[rows]
@@ -464,7 +449,15 @@ class CoaxialDevices:
         Of more than two devices it holds the outermost and the innermost; of one, both
         units work on the same.
         """
-        pushed, turned = self.pushed(), self.turned()
+        pushed, turned = self.pushed(), self._angles[..., 0]
+        if len(pushed) == 1:  # plain floats take a third of the time
+            inner, outer = float(pushed[0, 0]), float(pushed[0, -1])
+            return follower_posture(
+                outer,
+                float(turned[0, -1]),
+                guidewire_insertion=inner,
+                guidewire_rotation=float(turned[0, 0]),
+            )
         return follower_posture(
             pushed[:, -1],
             turned[:, -1],

@@ -130,9 +130,10 @@ class Navigation(composer.Task):
             if self.num_anatomies > 1
             else f"anatomy {scene.anatomy.name!r}"
         )
+        inner = " in ".join(repr(device.name) for device in scene.catheter.devices)
         return (
             f"<{self.name}: {anatomy}, goal {scene.goal.name!r} within "
-            f"{1e3 * self.objective.goal_radius:g} mm, device {scene.device.name!r}, "
+            f"{1e3 * self.objective.goal_radius:g} mm, device {inner}, "
             f"{self._num_actions} actions, observation {', '.join(self._names)}>"
         )
 

@@ -191,7 +191,8 @@ def buckling(end: str) -> rod.Buckling:
     gaps = np.zeros(2)
     # Up to the last of the long links: beyond lie the tips.
     last = int(np.argmin(entity.link_lengths >= entity.link_lengths[0])) - 1
-    assert entity.stack.nodes[last + 1] > max(d.tip_length for d in entity.devices)
+    tips = max(device.tip_length for device in entity.devices)
+    assert entity.stack.nodes[last + 1] > tips - 1e-9
     stiffness = sum(device.shaft.bending_stiffness for device in entity.devices)
     return rod.column(
         Rig(catheter=entity),
@@ -253,5 +254,5 @@ def validate_pair(figure_path: str | Path | None = None) -> Report:
     if figure_path is not None:
         from cathsim_dmc.validation import figures
 
-        figures.pair(shapes, moving, figure_path)
+        figures.pair(shapes, moving.turned, figure_path)
     return Report("pair", checks, moving.findings)
