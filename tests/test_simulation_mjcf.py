@@ -5,6 +5,7 @@ import json
 import mujoco
 import numpy as np
 import pytest
+from lxml import etree
 
 from cathsim_dmc import suite
 from cathsim_dmc.simulation.mjcf import write_mjcf
@@ -58,6 +59,13 @@ def test_the_scene_moves_as_the_task_bit_for_bit(exported):
     cell = model.sensor(task["sensors"]["load_cell"]).adr[0]
     load = -data.sensordata[cell : cell + 3]
     np.testing.assert_array_equal(load, env.task.readings.load_cell)
+
+
+def test_older_versions_of_mujoco_can_read_the_scene(exported):
+    # The WebAssembly build is of 3.14, whose schema knows no class of a texture.
+    tree = etree.parse(str(exported / "scene.xml"))
+    textures = list(tree.iter("texture"))
+    assert textures and not any("class" in one.attrib for one in textures)
 
 
 def test_what_success_is_stands_beside_the_scene(exported):

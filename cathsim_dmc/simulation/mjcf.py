@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from dm_control import mjcf
+from lxml import etree
 
 from cathsim_dmc import bounds, suite
 from cathsim_dmc.files import atomic_directory
@@ -68,6 +69,7 @@ def write_mjcf(
     directory.parent.mkdir(parents=True, exist_ok=True)
     with atomic_directory(directory) as folder:
         mjcf.export_with_assets(env.task.root_entity.mjcf_model, folder, SCENE)
+        _for_older_versions(folder / SCENE)
         (folder / TASK).write_text(json.dumps(values, indent=1) + "\n")
     return directory
 
@@ -120,6 +122,17 @@ def describe(env: Any) -> dict[str, Any]:
             name: metadata.version(name) for name in ("cathsim-dmc", "mujoco")
         },
     }
+
+
+def _for_older_versions(scene: Path) -> None:
+    """Drops the defaults class of textures, which MuJoCo up to 3.14 refuses.
+
+    Nothing is lost: PyMJCF names a class in every element, and has none of textures.
+    """
+    tree = etree.parse(str(scene))
+    for texture in tree.iter("texture"):
+        texture.attrib.pop("class", None)
+    tree.write(str(scene))
 
 
 def _branch(objective: Any) -> dict[str, Any] | None:

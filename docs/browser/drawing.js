@@ -76,7 +76,7 @@ export class GlassView {
   arrow(pen, { position, force, magnitude }) {
     const start = this.pixel(position);
     const length = Math.max((ARROW * magnitude) / FORCE_TOP, ARROW_LEAST);
-    const scale = Math.min(length, 2 * ARROW) / Math.max(magnitude, 1e-9);
+    const scale = Math.min(length, ARROW) / Math.max(magnitude, 1e-9);
     const end = this.pixel(position.map((x, i) => x + scale * force[i]));
     pen.strokeStyle = forceColour(magnitude);
     pen.fillStyle = forceColour(magnitude);

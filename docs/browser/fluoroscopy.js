@@ -42,21 +42,24 @@ export class Fluoroscope {
    * @param {number} radius Of the device, m.
    * @param {Uint8ClampedArray} pixels RGBA, written.
    * @param {number} noise Standard deviation of the noise at signal 1; 0 for none.
+   * @param {number[]} window Signals that are shown as black and as white.
    */
-  render(line, radius, pixels, noise = 0) {
-    const { depth, signal, view } = this;
+  render(line, radius, pixels, noise = 0, window = [0, 1 / this.view.gain]) {
+    const { depth, signal } = this;
     depth.fill(0);
     const camera = line.map((point) => this.camera(point));
     let toTip = 0;
     for (let link = line.length - 2; link >= 0; link -= 1) {
       toTip += this.addLink(camera, link, radius, toTip);
     }
-    const white = 255 * view.gain;
+    const [black, white] = window;
+    const scale = 255 / (white - black);
     for (let i = 0; i < signal.length; i += 1) {
       let passed = signal[i];
       if (depth[i] > 0) passed *= Math.exp(-depth[i]);
       if (noise > 0) passed += noise * Math.sqrt(passed) * normal();
-      const grey = Math.floor(Math.min(Math.max(passed * white + 0.5, 0), 255));
+      const level = (passed - black) * scale + 0.5;
+      const grey = Math.floor(Math.min(Math.max(level, 0), 255));
       pixels[4 * i] = grey;
       pixels[4 * i + 1] = grey;
       pixels[4 * i + 2] = grey;

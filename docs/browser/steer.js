@@ -114,6 +114,7 @@ function drawFluoroscopy({ fluoroscope, screen, noise }, simulation) {
     simulation.task.device_radius,
     image.data,
     noise,
+    fluoroscope.view.window,
   );
   pen.putImageData(image, 0, 0);
   const { goal } = simulation.task;
