@@ -12,6 +12,7 @@ that ship. Nothing of it is in the repository.
 from __future__ import annotations
 
 import json
+import re
 import shutil
 import socket
 import subprocess
@@ -41,7 +42,11 @@ DEVICE_RADIUS = 0.835e-3  # m, of the published device
 # The blur of the detector, a quarter of a pixel here, is left out.
 FLUOROSCOPY = FluoroscopyOptions(size=480, magnification=1.2, kerma=2e-7, blur=0.0)
 # Files that Rerun's own server hands to a browser.
-VIEWER = ("index.html", "re_viewer.js", "re_viewer_bg.wasm", "favicon.svg")
+VIEWER = ("index.html", "re_viewer.js", "re_viewer_bg.wasm", "favicon.ico")
+POLICY = (
+    '<meta http-equiv="Content-Security-Policy" '
+    "content=\"connect-src 'self' blob: data:\" />"
+)
 RECORDINGS = (
     # name, title, policy, task, seed, steps at most
     ("type1_bca", "Type I, BCA", "pretrained:type1_bca", None, 1_000_000, None),
@@ -198,6 +203,14 @@ def write_viewer(out: Path, recordings: Path) -> None:
     finally:
         server.terminate()
         server.wait()
+    # Nothing is loaded from or sent to elsewhere: neither fonts (there are others to
+    # fall back on) nor the viewer's usage figures and its look for a later release.
+    page = (out / "index.html").read_text()
+    page = re.sub(r"<link\b[^>]*fonts\.(googleapis|gstatic)\.com[^>]*>", "", page)
+    page, count = re.subn(r"(<head>)", rf"\1\n    {POLICY}", page, count=1)
+    if not count:
+        raise SystemExit("Rerun's page has no <head> to put a policy into")
+    (out / "index.html").write_text(page)
 
 
 def _fetched(address: str, patience: float = 30.0) -> bytes:
