@@ -147,3 +147,11 @@ def _mesh_file(vertices: np.ndarray, faces: np.ndarray | None = None) -> mjcf.As
     counts = np.array([len(vertices), 0, 0, len(faces)], dtype="<i4")
     parts = (counts, vertices.astype("<f4"), faces.astype("<i4"))
     return mjcf.Asset(b"".join(part.tobytes() for part in parts), ".msh")
+
+
+def read_mesh_file(data: bytes) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices (n, 3) float32, m, and faces (m, 3) of a mesh that `Phantom` has made."""
+    vertices, _, _, faces = np.frombuffer(data, "<i4", 4)
+    points = np.frombuffer(data, "<f4", 3 * vertices, 16)
+    numbers = np.frombuffer(data, "<i4", 3 * faces, 16 + 12 * vertices)
+    return points.reshape(-1, 3), numbers.reshape(-1, 3)
