@@ -150,7 +150,7 @@ def _mesh_file(vertices: np.ndarray, faces: np.ndarray | None = None) -> mjcf.As
 
 
 def read_mesh_file(data: bytes) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices (n, 3) float32, m, and faces (m, 3) of a mesh that `Phantom` has made."""
+    """Vertices (n, 3) float32, m, and faces (m, 3) of a mesh of a `Phantom`."""
     vertices, _, _, faces = np.frombuffer(data, "<i4", 4)
     points = np.frombuffer(data, "<f4", 3 * vertices, 16)
     numbers = np.frombuffer(data, "<i4", 3 * faces, 16 + 12 * vertices)
