@@ -23,13 +23,12 @@ from dm_control.utils import containers
 
 from cathsim_dmc import bounds
 from cathsim_dmc.anatomy import Anatomy, Goal
-from cathsim_dmc.entities import devices
 from cathsim_dmc.tasks import placement
 from cathsim_dmc.tasks.config import NavigationConfig
 from cathsim_dmc.tasks.environment import Environment
 from cathsim_dmc.tasks.navigation import Navigation
 from cathsim_dmc.tasks.objectives import Cannulation, Objective
-from cathsim_dmc.tasks.scene import Scene
+from cathsim_dmc.tasks.scene import Scene, chosen_devices, longest_tip
 
 DOMAIN = "cathsim"
 SUITE = containers.TaggedTasks()
@@ -165,7 +164,7 @@ def _one_length(
     """The configuration with a device as long as the farthest goal needs."""
     if len(anatomies) == 1 or config.working_length is not None:
         return config
-    device, shift = devices.get(config.device), config.ranges.farthest_shift
+    device, shift = longest_tip(chosen_devices(config)), config.ranges.farthest_shift
     longest = max(
         placement.place_device(anatomy, goal, device, None, shift).working_length
         for anatomy, goal in zip(anatomies, goals, strict=True)
@@ -401,9 +400,34 @@ def _register_random() -> None:
             )
 
 
+def _register_coaxial() -> None:
+    """Beside each of them, with a guidewire alone and with one in a catheter."""
+    for name, definition in list(TASKS.items()):
+        for suffix, (chosen, words) in _COAXIAL.items():
+            register(
+                f"{name}_{suffix}",
+                dataclasses.replace(
+                    definition,
+                    description=f"{definition.description.rstrip('.')}, {words}.",
+                    options={**definition.options, "devices": chosen},
+                ),
+                "hard",
+            )
+
+
+# Devices of the tasks with that suffix, from the innermost outwards.
+_COAXIAL = {
+    "wire": (("wire_035_glide",), "with a guidewire that is pushed and turned"),
+    "pair": (
+        ("wire_035_glide", "berenstein_5f"),
+        "with a guidewire in a catheter, both pushed and turned",
+    ),
+}
+
 _register_published()
 _register_femoral()
 _register_random()
+_register_coaxial()
 register(
     "navigate",
     TaskDefinition("Any anatomy, such as an imported scan: reach a goal.", None, None),

@@ -90,12 +90,16 @@ class Contract(test_utils.EnvironmentTestMixin):
         self.assertIn(True, [step.last() for step in steps])
 
 
+# Coaxial devices stand beside every task; these few stand for them all in a hurry.
+COAXIAL = ("type1_lcca_wire", "femoral_type1_lcca_pair", "arch_bca_pair")
+
 # One class for every registered task, those of the future included.
 for _name in suite.SUITE:
     _class = f"TestContract{_name.title().replace('_', '')}"
-    globals()[_class] = type(
-        _class, (Contract, absltest.TestCase), {"task_name": _name}
-    )
+    _test = type(_class, (Contract, absltest.TestCase), {"task_name": _name})
+    if "devices" in suite.TASKS[_name].options and _name not in COAXIAL:
+        _test = pytest.mark.slow(_test)
+    globals()[_class] = _test
 
 
 # The sweep over tasks.
