@@ -12,6 +12,9 @@ export MUJOCO_GL ?= disable
 demo: $(VENV)/.installed
 	$(BIN)/cathsim demo --out runs/demo
 
+# One thread a worker: those of torch and numpy only wait for each other.
+test test-slow: export OMP_NUM_THREADS ?= 1
+
 test: $(VENV)/.installed-test
 	$(BIN)/ruff check .
 	$(BIN)/python -m pytest -m "not slow" -n $(WORKERS) --dist worksteal -q

@@ -243,9 +243,8 @@ def test_imports_leave_the_environment_as_it_is():
     assert done.returncode == 0, done.stderr
 
 
-@pytest.mark.parametrize(
-    "backend", ["egl", pytest.param("osmesa", marks=pytest.mark.slow)]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("backend", ["egl", "osmesa"])
 def test_agents_import_before_dm_control_with_opengl(backend):
     """The other order ends in a segmentation fault inside triton."""
     probe = run("import mujoco; mujoco.GLContext(8, 8).free()", MUJOCO_GL=backend)

@@ -116,7 +116,10 @@ def test_a_projection_maps_points_to_their_pixels(azimuth):
     assert pixel[highest, 1] == pixel[:, 1].min()
 
 
-@pytest.mark.parametrize("suffix", [".rrd", ".npz", ".gif", ".webp"])
+@pytest.mark.parametrize(
+    "suffix",
+    [".rrd", ".npz", ".webp", pytest.param(".gif", marks=pytest.mark.slow)],
+)
 def test_a_function_of_the_observation_is_recorded(pushed, tmp_path, suffix):
     env, _ = pushed
     seen = []

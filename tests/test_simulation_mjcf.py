@@ -86,3 +86,10 @@ def test_what_cannot_be_written_is_refused_before(tmp_path):
     with pytest.raises(ValueError, match="pool=1"):
         write_mjcf("arch_bca", tmp_path / "b", task_kwargs={"pool": 2})
     assert not list(tmp_path.iterdir())
+
+
+def test_equal_pieces_of_a_wall_are_no_trouble(tmp_path):
+    """Those of the straight arches repeat; the scene stays one file."""
+    folder = write_mjcf("simple1_bca", tmp_path / "scene")
+    assert sorted(path.name for path in folder.iterdir()) == ["scene.xml", "task.json"]
+    assert mujoco.MjModel.from_xml_path(str(folder / "scene.xml")).nmesh > 100

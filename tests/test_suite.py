@@ -7,7 +7,7 @@ import mujoco
 import numpy as np
 import pytest
 from absl.testing import absltest
-from conftest import SHORT_EPISODE, TASKS
+from conftest import EACH_TASK, SHORT_EPISODE, TASKS
 from dm_control import suite as dm_suite
 from dm_env import specs, test_utils
 from scipy.stats import qmc
@@ -107,7 +107,7 @@ def test_the_published_tasks_are_there():
         assert suite.SUITE[name].__doc__.count("\n") == 0, "one line for `cathsim list`"
 
 
-@pytest.mark.parametrize("task_name", TASKS)
+@pytest.mark.parametrize("task_name", EACH_TASK)
 def test_components_have_names(shared_environment, task_name):
     model = shared_environment(task_name).physics.model.ptr
     kinds = {
@@ -128,7 +128,7 @@ def test_components_have_names(shared_environment, task_name):
         assert model.body(name).id > 0
 
 
-@pytest.mark.parametrize("task_name", TASKS)
+@pytest.mark.parametrize("task_name", EACH_TASK)
 def test_action_spec(shared_environment, task_name):
     spec = shared_environment(task_name).action_spec()
     assert isinstance(spec, specs.BoundedArray)
@@ -139,7 +139,7 @@ def test_action_spec(shared_environment, task_name):
     assert names == [*tip, "insertion"]
 
 
-@pytest.mark.parametrize("task_name", TASKS)
+@pytest.mark.parametrize("task_name", EACH_TASK)
 def test_observations_conform_to_their_specs(shared_environment, task_name):
     environment = shared_environment(task_name)
     expected = environment.observation_spec()
@@ -164,7 +164,7 @@ def test_every_observation_conforms_to_its_spec(shared_environment):
         timestep = environment.step(action)
 
 
-@pytest.mark.parametrize("task_name", TASKS)
+@pytest.mark.parametrize("task_name", EACH_TASK)
 def test_start_is_randomised_within_a_millimetre(shared_environment, task_name):
     """Around where the device has settled, which no seed decides."""
     environment = shared_environment(task_name)
@@ -180,7 +180,7 @@ def test_start_is_randomised_within_a_millimetre(shared_environment, task_name):
     assert 0.3e-3 < displacement.max() < 1.02e-3
 
 
-@pytest.mark.parametrize("task_name", TASKS)
+@pytest.mark.parametrize("task_name", EACH_TASK)
 def test_same_seed_gives_the_same_episode(shared_environment, reseed, task_name):
     environment = shared_environment(task_name)
     actions = random_actions(environment, 20)
@@ -198,12 +198,12 @@ def test_two_environments_with_one_seed_are_equal():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("task_name", TASKS)
+@pytest.mark.parametrize("task_name", EACH_TASK)
 def test_first_200_observations_are_equal_bit_for_bit(task_name):
     assert_bitwise_equal(*(first_observations(task_name, 199) for _ in range(2)))
 
 
-@pytest.mark.parametrize("task_name", TASKS)
+@pytest.mark.parametrize("task_name", EACH_TASK)
 def test_no_memory_is_shared(shared_environment, task_name):
     assert_no_shared_memory(shared_environment(task_name))
 
@@ -231,7 +231,7 @@ def assert_no_shared_memory(environment):
         np.testing.assert_array_equal(first[key], value)
 
 
-@pytest.mark.parametrize("task_name", TASKS)
+@pytest.mark.parametrize("task_name", EACH_TASK)
 def test_no_observation_is_constant(shared_environment, task_name):
     assert_nothing_is_constant(shared_environment(task_name))
 
@@ -251,7 +251,7 @@ def assert_nothing_is_constant(environment):
             assert any((one[key] != seen[0][key]).any() for one in seen), key
 
 
-@pytest.mark.parametrize("task_name", TASKS)
+@pytest.mark.parametrize("task_name", EACH_TASK)
 def test_dm_control_loads_the_task(shared_environment, reseed, task_name):
     environment = dm_suite.load(
         "cathsim", task_name, task_kwargs={"random": 7}, visualize_reward=True
@@ -280,7 +280,7 @@ def test_environment_kwargs_reach_composer():
 # Reward, discount and end of the episode.
 
 
-@pytest.mark.parametrize("task_name", TASKS)
+@pytest.mark.parametrize("task_name", EACH_TASK)
 def test_time_out_comes_at_max_steps_with_discount_one(shared_environment, task_name):
     environment = shared_environment(task_name, max_steps=SHORT_EPISODE)
     environment.reset()
@@ -292,7 +292,7 @@ def test_time_out_comes_at_max_steps_with_discount_one(shared_environment, task_
     assert environment.step(np.zeros(21)).mid()
 
 
-@pytest.mark.parametrize("task_name", TASKS)
+@pytest.mark.parametrize("task_name", EACH_TASK)
 def test_default_limit_is_the_published_one(shared_environment, task_name):
     assert shared_environment(task_name).task.config.max_steps == 2000
     assert shared_environment(task_name).control_timestep() == pytest.approx(0.04)
@@ -301,7 +301,7 @@ def test_default_limit_is_the_published_one(shared_environment, task_name):
     )
 
 
-@pytest.mark.parametrize("task_name", TASKS)
+@pytest.mark.parametrize("task_name", EACH_TASK)
 def test_reward_is_minus_the_distance_in_metres(shared_environment, task_name):
     environment = shared_environment(task_name)
     environment.reset()
@@ -420,7 +420,7 @@ RECESSION = 0.6e-3
 WALL_FORCE = 10.0  # N
 
 
-@pytest.mark.parametrize("task_name", TASKS)
+@pytest.mark.parametrize("task_name", EACH_TASK)
 @pytest.mark.parametrize(
     "steps",
     [

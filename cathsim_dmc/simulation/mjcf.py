@@ -16,6 +16,7 @@ from dm_control import mjcf
 from lxml import etree
 
 from cathsim_dmc import bounds, suite
+from cathsim_dmc.entities.phantom import read_mesh_file
 from cathsim_dmc.files import atomic_directory
 from cathsim_dmc.tasks.forces import CONTACT_SIZE
 from cathsim_dmc.tasks.navigation import Navigation
@@ -69,7 +70,7 @@ def write_mjcf(
     directory.parent.mkdir(parents=True, exist_ok=True)
     with atomic_directory(directory) as folder:
         mjcf.export_with_assets(env.task.root_entity.mjcf_model, folder, SCENE)
-        _for_older_versions(folder / SCENE)
+        _in_one_file(folder / SCENE)
         (folder / TASK).write_text(json.dumps(values, indent=1) + "\n")
     return directory
 
@@ -124,14 +125,26 @@ def describe(env: Any) -> dict[str, Any]:
     }
 
 
-def _for_older_versions(scene: Path) -> None:
-    """Drops the defaults class of textures, which MuJoCo up to 3.14 refuses.
+def _in_one_file(scene: Path) -> None:
+    """Writes the meshes into the scene, and drops what older versions refuse.
 
-    Nothing is lost: PyMJCF names a class in every element, and has none of textures.
+    MuJoCo up to 3.14 refuses a defaults class of textures. Nothing is lost: PyMJCF
+    names a class in every element, and has none of textures.
     """
     tree = etree.parse(str(scene))
     for texture in tree.iter("texture"):
         texture.attrib.pop("class", None)
+    files = set()  # two equal pieces share one
+    for mesh in tree.iterfind("asset/mesh[@file]"):
+        file = scene.parent / mesh.attrib.pop("file")
+        files.add(file)
+        vertices, faces = read_mesh_file(file.read_bytes())
+        # Nine digits tell every float32.
+        mesh.set("vertex", " ".join(f"{x:.9g}" for x in vertices.ravel().tolist()))
+        if len(faces):
+            mesh.set("face", " ".join(map(str, faces.ravel().tolist())))
+    for file in files:
+        file.unlink()
     tree.write(str(scene))
 
 
