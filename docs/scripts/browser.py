@@ -23,6 +23,7 @@ import urllib.request
 from pathlib import Path
 
 import numpy as np
+import rerun_cli
 from PIL import Image
 
 from cathsim_dmc import agents, suite  # agents before anything of dm_control
@@ -191,7 +192,9 @@ def write_viewer(out: Path, recordings: Path) -> None:
             each.bind(("127.0.0.1", 0))
         ports = [each.getsockname()[1] for each in (page, data)]
     recording = next(iter(sorted(recordings.glob("*.rrd"))))
-    command = [sys.executable, "-m", "rerun_cli", str(recording), "--serve-web"]
+    # The program itself: `python -m rerun_cli` would leave it behind when it ends.
+    program = Path(rerun_cli.__file__).with_name("rerun")
+    command = [str(program), str(recording), "--serve-web"]
     command += ["--bind", "127.0.0.1", "--web-viewer-port", str(ports[0])]
     command += ["--port", str(ports[1])]
     server = subprocess.Popen(

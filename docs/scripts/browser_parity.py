@@ -30,6 +30,7 @@ from cathsim_dmc.agents import load_policy
 from cathsim_dmc.imaging.angiograph import Angiograph
 from cathsim_dmc.pictures.figure import Picture
 from cathsim_dmc.pictures.recorded import as_function
+from cathsim_dmc.style import COLOURS, tidy
 
 DOCS = browser.ROOT / "docs"
 TASK, SEED = "type1_lcca", browser.SEED
@@ -40,7 +41,6 @@ EPISODES = (
     ("learnt policy", "pretrained:type1_lcca", 300),
     ("straight push into a jam", "push", 150),
 )
-BLUE, ORANGE = "#0072b2", "#d55e00"  # Okabe and Ito's, for the colour-blind
 _BEGIN, _END = "<!-- measured -->", "<!-- end -->"
 
 
@@ -152,13 +152,13 @@ def draw(measured: list[dict], path: Path) -> None:
     for line, each in zip(axes, measured, strict=True):
         python, page = each["python"], each["browser"]
         time_s = 0.04 * np.arange(1, len(python["head"]) + 1)
-        for heads, style in ((python, "-"), (page, "--")):
-            colour = BLUE if style == "-" else ORANGE
-            label = "Python" if style == "-" else "WebAssembly"
+        for heads, dashes in ((python, "-"), (page, "--")):
+            colour = COLOURS[0] if dashes == "-" else COLOURS[1]
+            label = "Python" if dashes == "-" else "WebAssembly"
             x, _, z = 1e3 * heads["head"].T
-            line[0].plot(x, z, style, color=colour, lw=1.8, label=label)
+            line[0].plot(x, z, dashes, color=colour, lw=1.8, label=label)
             peak = 1e3 * heads["peak_max"]
-            line[2].plot(time_s, peak, style, color=colour, lw=1.4, label=label)
+            line[2].plot(time_s, peak, dashes, color=colour, lw=1.4, label=label)
         apart = 1e3 * np.linalg.norm(python["head"] - page["head"], axis=1)
         line[1].semilogy(time_s, np.maximum(apart, 1e-15), color="0.25", lw=1.4)
         line[1].set_ylim(1e-15, 10)
@@ -168,7 +168,7 @@ def draw(measured: list[dict], path: Path) -> None:
         line[1].set(xlabel="time, s", ylabel="heads apart, mm")
         line[2].set(xlabel="time, s", ylabel="largest contact, mN")
         for one in line:
-            one.spines[["top", "right"]].set_visible(False)
+            tidy(one)
     axes[0, 0].legend(frameon=False, fontsize=8)
     figure.savefig(path)
 
