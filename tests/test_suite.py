@@ -90,14 +90,21 @@ class Contract(test_utils.EnvironmentTestMixin):
         self.assertIn(True, [step.last() for step in steps])
 
 
-# Coaxial devices stand beside every task; these few stand for them all in a hurry.
-COAXIAL = ("type1_lcca_wire", "femoral_type1_lcca_pair", "arch_bca_pair")
+# What stands for all of them in a hurry: each access, each kind of anatomy and devices.
+QUICK = (
+    "simple1_bca",
+    "type1_lcca",
+    "femoral_type2_bca",
+    "arch_lcca",
+    "type1_lcca_wire",
+    "femoral_type1_lcca_pair",
+)
 
 # One class for every registered task, those of the future included.
 for _name in suite.SUITE:
     _class = f"TestContract{_name.title().replace('_', '')}"
     _test = type(_class, (Contract, absltest.TestCase), {"task_name": _name})
-    if "devices" in suite.TASKS[_name].options and _name not in COAXIAL:
+    if _name not in QUICK:
         _test = pytest.mark.slow(_test)
     globals()[_class] = _test
 
