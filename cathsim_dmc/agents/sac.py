@@ -58,7 +58,7 @@ class SACConfig(TrainingConfig):
     presets: ClassVar[Mapping[str, Mapping[str, Any]]] = {
         "published": {},
         "demo": {"num_envs": 32, "updates_per_frame": 0.25},
-        # Found on type1_lcca (docs/results.md): reward, episodes and starts of PPO's.
+        # Found on type1_lcca (docs/training.md): reward, episodes and starts of PPO's.
         # The weight of the entropy must start near the size of a step's reward (0.05):
         # at 0.1 and above the actions stay random for tens of thousands of frames.
         "tuned": {
