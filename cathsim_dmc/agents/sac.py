@@ -69,7 +69,7 @@ class SACConfig(TrainingConfig):
             "training_reward": {"path": -1.0, "success": 10.0},
             "training_max_steps": 120,
             "training_start": (0.0, 0.9),
-            "total_frames": 100_000,
+            "total_frames": 60_000,
         },
     }
 
