@@ -132,6 +132,8 @@ class _Film:
 
     def __init__(self, episode: Episode, surface: Any, view: str, width: int):
         self._episode, self._surface = episode, surface
+        # Points; in a small film the label must not run under the X-ray image.
+        self._font = float(np.clip(width / 65, 6.5, 10))
         azimuth = drawing.VIEWS[view][0]
         rough = Projection.of(surface.vertices, azimuth=azimuth, margin=_MARGIN)
         rows, columns = rough.shape
@@ -196,6 +198,6 @@ class _Film:
         if step == self._episode.steps:
             text += f"   {self._episode.termination.replace('_', ' ')}"
         self._scene.text(
-            0.02, 0.985, text, transform=self._scene.transAxes, va="top", fontsize=10,
-            fontweight="bold", color="0.2", zorder=10,
+            0.02, 0.985, text, transform=self._scene.transAxes, va="top",
+            fontsize=self._font, fontweight="bold", color="0.2", zorder=10,
         )  # fmt: skip

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import os
-from collections.abc import Iterable
+from collections.abc import Sequence
 from fractions import Fraction
 
 from PIL import Image
@@ -25,7 +25,7 @@ def require_encoder() -> None:
 
 def write_mp4(
     path: str | os.PathLike[str],
-    pictures: Iterable[Image.Image],
+    pictures: Sequence[Image.Image],
     tick: int,
     hold: int,
 ) -> None:
@@ -33,7 +33,7 @@ def write_mp4(
 
     Args:
         path: File to write.
-        pictures: RGB pictures.
+        pictures: RGB pictures, at least one.
         tick: Time that each is shown, ms.
         hold: Time that the last one is shown, ms.
 
@@ -43,16 +43,13 @@ def write_mp4(
     require_encoder()
     import av
 
+    # Colours are coded for two by two pixels.
+    width, height = (side - side % 2 for side in pictures[0].size)
     with av.open(str(path), "w", format="mp4") as file:
         stream = file.add_stream("libx264", rate=Fraction(1000, tick))
+        stream.width, stream.height = width, height
         stream.pix_fmt, stream.options = "yuv420p", {"crf": _QUALITY}
-        picture = None
-        for picture in pictures:
-            # Colours are coded for two by two pixels.
-            width, height = (side - side % 2 for side in picture.size)
-            stream.width, stream.height = width, height
-            picture = picture.crop((0, 0, width, height))
-            file.mux(stream.encode(av.VideoFrame.from_image(picture)))
-        for _ in range(hold // tick if picture else 0):
-            file.mux(stream.encode(av.VideoFrame.from_image(picture)))
+        for picture in [*pictures, *[pictures[-1]] * (hold // tick)]:
+            frame = av.VideoFrame.from_image(picture.crop((0, 0, width, height)))
+            file.mux(stream.encode(frame))
         file.mux(stream.encode())
