@@ -63,9 +63,9 @@ def test_a_film_for_slides_plays_the_episode(pushed, tmp_path):
     assert rows % 2 == columns % 2 == 0 and abs(columns - 321) < 4
     # Four pictures, and the last one for a while.
     assert 3.0 < seconds < 4.0 and len(frames) == 4 + 3
-    moved = np.abs(frames[0].astype(int) - frames[3]).max()
-    still = np.abs(frames[3].astype(int) - frames[-1]).max()
-    assert moved > 100 > 20 > still
+    moved = np.abs(frames[0].astype(int) - frames[3]).mean()
+    still = np.abs(frames[3].astype(int) - frames[-1]).mean()
+    assert moved > 1 > 3 * still
 
 
 def test_without_an_encoder_no_work_is_lost(pushed, tmp_path, monkeypatch):
@@ -193,9 +193,9 @@ def test_the_frames_of_a_film_differ_where_the_device_moves(pushed, tmp_path):
         (lambda env: cathsim_dmc.record(env, "expret"), ValueError, "expert"),
         (lambda env: cathsim_dmc.record(env, 3), TypeError, "function"),
         (
-            lambda env: cathsim_dmc.record(env, "push", "e.mp4"),
+            lambda env: cathsim_dmc.record(env, "push", "e.avi"),
             ValueError,
-            ".rrd, .npz, .gif, .webp",
+            ".rrd, .npz, .gif, .webp, .mp4",
         ),
         (
             lambda env: cathsim_dmc.record(env, "push", "none/e.gif"),
@@ -219,7 +219,7 @@ def test_steps_beyond_the_episode_are_refused(pushed):
     with pytest.raises(IndexError, match="61 states"):
         Snapshot.of_episode(episode, surface, 61)
     with pytest.raises(ValueError, match="film"):
-        animate(episode, surface, "episode.mp4")
+        animate(episode, surface, "episode.avi")
 
 
 def test_the_scale_of_forces_holds_them_all():
