@@ -180,6 +180,7 @@ def train(settings: Settings) -> None:
     batches = Collector(
         env, explorer, total_frames=settings.total_frames,
         frames_per_batch=settings.num_envs * settings.steps_per_update,
+        auto_register_policy_transforms=False,
     )  # fmt: skip
     start, frames = time.monotonic(), 0
     for batch in batches:
