@@ -4,6 +4,7 @@ import dataclasses
 import math
 
 from cathsim_dmc import bounds
+from cathsim_dmc.imaging import materials
 
 _MOST_LINKS = 200
 
@@ -75,6 +76,9 @@ class Device:
       inner_radius: of the lumen, m; 0 for a wire.
       friction_ratio: Coulomb friction on the wall, against that of an uncoated device
         in the same vessel.
+      attenuation: excess over water of X-rays, homogenised over its section, 1/m.
+      marker_attenuation: that of the radiopaque marker at its end, 1/m.
+      marker_length: of the marker, m.
       source: where its figures come from, for people.
     """
 
@@ -89,6 +93,9 @@ class Device:
     tip_shape: tuple[Arc, ...] = ()
     inner_radius: float = 0.0
     friction_ratio: float = 1.0
+    attenuation: float = materials.CATHETER
+    marker_attenuation: float = materials.MARKER
+    marker_length: float = materials.MARKER_LENGTH
     source: str = ""
 
     def __post_init__(self):
@@ -106,6 +113,8 @@ class Device:
         if bounds.number(lumen, self.inner_radius, 0.0) >= self.outer_radius:
             bounds.refuse(lumen, self.inner_radius, "less than its outer_radius")
         bounds.number(f"friction_ratio {of_device}", self.friction_ratio, 0.0)
+        for name in ("attenuation", "marker_attenuation", "marker_length"):
+            bounds.number(f"{name} {of_device}", getattr(self, name), 0.0)
         bounds.instance(f"source {of_device}", self.source, str)
         angle = f"steering_angle {of_device}"
         if bounds.number(angle, self.steering_angle, 0.0) >= math.pi / 2:

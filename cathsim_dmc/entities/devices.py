@@ -8,6 +8,7 @@ import numpy as np
 
 from cathsim_dmc import bounds
 from cathsim_dmc.entities.device import Arc, Device, Section
+from cathsim_dmc.imaging import materials
 
 FRENCH = 1e-3 / 3.0  # m of outer diameter per French
 INCH = 25.4e-3  # m
@@ -149,6 +150,8 @@ def _guidewire(name: str, shaft: float) -> Device:
         # Floppy ends are an order of magnitude softer than their shafts.
         tip=_metal(shaft / 10),
         tip_shape=(Arc(12.1e-3, math.radians(72)),),
+        attenuation=materials.STEEL_WIRE,
+        marker_attenuation=materials.STEEL_WIRE,
         source=f"{_HARRISON}; tip: a tenth, assumed",
     )
 
@@ -164,6 +167,10 @@ WIRE_035_LUNDERQUIST = _guidewire("wire_035_lunderquist", 4860e-6)
 def _core(diameter: float) -> float:
     """EI (N·m²) of a nitinol core."""
     return NITINOL_MODULUS * math.pi * diameter**4 / 64
+
+
+# Length of the platinum coil at the end of a hydrophilic wire, m; assumed.
+_COIL = 10e-3
 
 
 def _hydrophilic_wire(
@@ -187,6 +194,9 @@ def _hydrophilic_wire(
         tip_links=tip_links,
         tip_shape=(bend, _straight(4e-3)),
         friction_ratio=HYDROPHILIC,
+        attenuation=materials.NITINOL_WIRE * (shaft / outer) ** 2,
+        marker_attenuation=materials.MARKER,
+        marker_length=_COIL,
         source=f"EI: nitinol core (48 GPa) of {1e3 * shaft:.2g} mm, {1e3 * tip:.2g} mm "
         "in the distal 30 mm, diameters assumed, jacket left out; friction: a third of "
         "a PTFE-coated wire, Schröder 1993 (BF02602986)",

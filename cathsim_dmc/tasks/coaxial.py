@@ -22,6 +22,7 @@ from cathsim_dmc.entities.chain import (
 from cathsim_dmc.entities.coaxial import Links, Overlap
 from cathsim_dmc.entities.device_stack import DeviceStack
 from cathsim_dmc.entities.robot import follower_posture
+from cathsim_dmc.imaging.device import Shadow
 from cathsim_dmc.tasks.config import CONTROL_TIMESTEP
 from cathsim_dmc.tasks.readings import ModelIndex, Readings
 
@@ -509,6 +510,31 @@ class CoaxialDevices:
         rows = np.arange(len(line))[:, None, None]
         near, far = line[rows, last - above + 1], line[rows, last - above]
         return near + share[..., None] * (far - near)
+
+    def shadows(self, line: np.ndarray) -> list[Shadow]:
+        """The devices as X-rays meet them, from the innermost outwards.
+
+        Args:
+          line: (N, L + 1, 3), `Readings.centreline`.
+        """
+        nodes = self._stack.nodes
+        insertion = self.pushed()
+        gaps = insertion.max(axis=1, keepdims=True) - insertion
+        # A device has as many points as the chain: its own nodes, and its end.
+        beyond = (nodes < gaps[..., None]).sum(axis=-1, keepdims=True)
+        own = np.arange(len(nodes)) - np.maximum(beyond - 1, 0)
+        places = np.maximum(nodes[np.maximum(own, 0)], gaps[..., None])
+        points = self.points(line, places)
+        return [
+            Shadow(
+                points[:, k],
+                device.outer_radius,
+                device.attenuation,
+                device.marker_attenuation,
+                device.marker_length,
+            )
+            for k, device in enumerate(self._entity.devices)
+        ]
 
     def _leading_load(self, readings: Readings, gaps: np.ndarray) -> np.ndarray:
         """Axial force (N,) in the leading device where it leaves the others, N."""

@@ -305,7 +305,8 @@ def tracking(frame: Frame) -> Observation:
     Entry(
         "tracking_pixels",
         "pixel",
-        f"{_POINTS}: column, row (plane by plane); pixel centres are whole numbers",
+        f"{_POINTS}: column, row (plane by plane); pixel centres are whole numbers. "
+        "Those of each coaxial device follow",
     ),
     Entry("tracking_goal_pixels", "pixel", "goal: column, row"),
     *_OPERATOR,
@@ -432,24 +433,32 @@ def _views(frame: Frame, kind: str) -> Observation:
     return {key: view for key, view in views.items() if key.startswith(kind)}
 
 
-# What coaxial devices add to every observation of numbers.
+# What coaxial devices add to the observations of numbers.
 
 
-def _devices(frame: Frame) -> Observation:
-    """Where each coaxial device is, how it is turned, and what it bears."""
+def _driven(frame: Frame) -> Observation:
+    """How far the operator has pushed and turned each coaxial device."""
     state = frame.devices
     assert state is not None
     return {
         "device_insertion": state.insertion,
         "device_rotation": state.rotation,
+    }
+
+
+def _lying(frame: Frame) -> Observation:
+    """Where each coaxial device lies, and what it bears."""
+    state = frame.devices
+    assert state is not None
+    return {
         "device_tip_rotation": state.tip_rotation,
         "device_points": _flat(state.points, 3),
         "device_load": np.stack([state.leading_load, state.lumen_friction], axis=-1),
     }
 
 
-COAXIAL = ObservationKind(
-    _devices,
+DRIVEN = ObservationKind(
+    _driven,
     (
         Entry(
             "device_insertion",
@@ -458,6 +467,11 @@ COAXIAL = ObservationKind(
             "chain's end is at the start of the stroke",
         ),
         Entry("device_rotation", "rad", "of the rotary unit of each device"),
+    ),
+)
+LYING = ObservationKind(
+    _lying,
+    (
         Entry("device_tip_rotation", "rad", "of the end of each device"),
         Entry(
             "device_points",
@@ -473,14 +487,18 @@ COAXIAL = ObservationKind(
         ),
     ),
 )
-# Observations of numbers, which coaxial devices add theirs to; pictures show them.
-_OF_NUMBERS = ("internal", "tracking", "tracking_2d", "route")
+
+
+_IN_SPACE = {"internal", "tracking", "route"}
+_OF_NUMBERS = {*_IN_SPACE, "tracking_2d"}
 
 
 def _kinds(names: Sequence[str], coaxial: bool) -> list[ObservationKind]:
     kinds = [OBSERVATIONS[name] for name in names]
-    if coaxial and set(names) & set(_OF_NUMBERS):
-        kinds.append(COAXIAL)
+    if coaxial and _OF_NUMBERS.intersection(names):
+        kinds.append(DRIVEN)
+        if _IN_SPACE.intersection(names):
+            kinds.append(LYING)
     return kinds
 
 

@@ -14,6 +14,7 @@ import numpy as np
 
 from cathsim_dmc.entities.device_stack import DeviceStack
 from cathsim_dmc.entities.robot import follower_posture
+from cathsim_dmc.imaging.device import Shadow
 from cathsim_dmc.imaging.fluoroscopy import Fluoroscope
 from cathsim_dmc.tasks import coaxial, forces, observations, readings
 from cathsim_dmc.tasks.cases import Case, model_index
@@ -104,6 +105,7 @@ class Rollout:
         catheter = scene.catheter.mjcf_model.model
         self._index = model_index(scene, model)
         self._views = self._index.views(state)
+        self._device_radius = scene.device.outer_radius
         num_actions = len(scene.catheter.action_names)
         randomisation = config.ranges
         self._coaxial: CoaxialDevices | None = None
@@ -129,7 +131,6 @@ class Rollout:
         self._sensors = ImageSensors(
             self._names,
             cases[0].angiograph,
-            scene.device.outer_radius,
             num_simulations,
             open_cameras(self._names, model, config.camera_options, catheter),
         )
@@ -324,18 +325,22 @@ class Rollout:
     def _observe(
         self, goal: np.ndarray, fresh: np.ndarray | None
     ) -> observations.Observation:
-        images = self._sensors.capture(
-            self._readings.centreline,
-            goal,
-            self._state.qpos,
-            self._random_states,
-            fresh,
-        )
+        devices, images = self.devices, observations.NO_IMAGES
+        if self._sensors.on:
+            images = self._sensors.capture(
+                self._readings.centreline,
+                self.shadows,
+                goal,
+                self._state.qpos,
+                self._random_states,
+                fresh,
+                None if devices is None else devices.points,
+            )
         state, ahead = self._readings, None
         if self._routes is not None:
             ahead = self._routes.ahead(self._case_of, state.head, state.head_frame)
         frame = observations.Frame(
-            state, self._wall_force, self._action, goal, images, ahead, self.devices
+            state, self._wall_force, self._action, goal, images, ahead, devices
         )
         return observations.observe(self._names, frame)
 
@@ -364,6 +369,14 @@ class Rollout:
     def readings(self) -> readings.Readings:
         """State of the devices after the last step or reset."""
         return self._readings
+
+    @property
+    def shadows(self) -> Sequence[Shadow]:
+        """The devices as X-rays meet them, with points (N, n, 3)."""
+        line = self._readings.centreline
+        if self._coaxial is not None:
+            return self._coaxial.shadows(line)
+        return [Shadow(line, self._device_radius)]
 
     @property
     def devices(self) -> CoaxialReadings | None:
