@@ -7,10 +7,13 @@ PIP := PIP_DISABLE_PIP_VERSION_CHECK=1 $(BIN)/python -m pip install --quiet --co
 # MuJoCo looks for OpenGL at import; nothing here draws with it.
 export MUJOCO_GL ?= disable
 
-.PHONY: demo test test-slow nightly lint audit compatibility dist docs clean
+.PHONY: demo test test-slow nightly lint audit compatibility dist docs site clean
 
 demo: $(VENV)/.installed
 	$(BIN)/cathsim demo --out runs/demo
+
+# One thread a worker: those of torch and numpy only wait for each other.
+test test-slow: export OMP_NUM_THREADS ?= 1
 
 test: $(VENV)/.installed-test
 	$(BIN)/ruff check .
@@ -66,6 +69,10 @@ $(VENV)/.installed-test: $(VENV)/.installed
 docs: $(VENV)/.installed-docs
 	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict
 	@echo "The site: build/site/index.html"
+
+# The same with the pages in the browser; needs Node.js and npm.
+site: docs
+	$(BIN)/python docs/scripts/browser.py
 
 $(VENV)/.installed-docs: $(VENV)/.installed
 	$(PIP) --editable '.[docs]'

@@ -1,27 +1,28 @@
 """PPO in one file, on TorchRL's collector and losses: the one to copy and to change.
 
-    python examples/train_ppo.py --task type1_bca --total-frames 150000
+    python examples/train_ppo.py --task type1_lcca --total-frames 300000
 
-It reads from top to bottom: settings, environment, networks, loss, loop, evaluation.
-What a long run needs beside that (checkpoints that survive kill -9, resuming, metrics
-files, images) is in `cathsim train`.
+It reads from top to bottom: settings, environment, networks, noise, loop, evaluation.
+The settings are those of `cathsim train type1_lcca --preset tuned`. What a long run
+needs beside them (checkpoints that survive kill -9, metrics, images) is there.
 """
 
 import dataclasses
+import math
 import time
 
 import torch
 import tyro
 from tensordict.nn import AddStateIndependentNormalScale as LearntScale
-from tensordict.nn import TensorDictModule, TensorDictSequential
+from tensordict.nn import TensorDictModule, TensorDictModuleBase, TensorDictSequential
 from torch import nn
 from torchrl.collectors import Collector
-from torchrl.envs import ClipTransform, ExplorationType, set_exploration_type
-from torchrl.envs.transforms import VecNormV2
-from torchrl.modules import IndependentNormal, ProbabilisticActor, ValueOperator
+from torchrl.envs import ExplorationType, set_exploration_type
+from torchrl.modules import MLP, ProbabilisticActor, TanhNormal, ValueOperator
 from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.value import GAE
 
+from cathsim_dmc.agents.normalisation import ObservationNormaliser
 from cathsim_dmc.simulation.environments import VECTOR, make_env
 
 
@@ -29,82 +30,96 @@ from cathsim_dmc.simulation.environments import VECTOR, make_env
 class Settings:
     """Settings of a run; every one is an option of the command line."""
 
-    task: str = "type1_bca"  # a task of `cathsim list`
+    task: str = "type1_lcca"  # a task of `cathsim list`
     observation: str = "internal"  # of numbers, not images
-    max_steps: int = 2_000  # control steps of a training episode
     seed: int = 0  # of networks, exploration and environments
-    total_frames: int = 150_000
+    total_frames: int = 300_000
+    # Training episodes are short and start anywhere along the way, and what counts is
+    # the way left through the lumen. The evaluation is that of the task.
+    max_steps: int = 120
+    start: tuple[float, float] = (0.0, 0.9)  # least and largest share of the way
     num_envs: int = 32  # simulations side by side
     steps_per_update: int = 64  # of each simulation
     epochs: int = 10
     minibatch_size: int = 256
-    learning_rate: float = 3e-4  # falls to 0 over the run
+    learning_rate: float = 3e-4
     gamma: float = 0.99
-    gae_lambda: float = 0.95
     clip: float = 0.2
-    entropy_coefficient: float = 5.85e-4
-    value_coefficient: float = 0.872
-    max_grad_norm: float = 1.0
     target_kl: float = 0.05  # ends the epochs of an update
-    hidden: int = 64
+    hidden: int = 128
+    deviation: float = 0.7  # of the actions at first, before the tanh
+    correlation: float = 0.9  # of the noise between two control steps
+    shared: float = 0.8  # share of its variance that motors of one axis have in common
     evaluation_episodes: int = 30  # each with a seed of its own
     evaluation_steps: int = 2_000  # at most, of an episode
 
 
-def environment(settings: Settings, num_envs: int, seed: int, max_steps: int):
-    """Simulations side by side, with one vector of normalised numbers to observe."""
-    env = make_env(
-        settings.task,
-        observation=settings.observation,
-        num_envs=num_envs,
-        seed=seed,
-        task_kwargs={"max_steps": max_steps},
-    )
-    # Running mean and spread over all simulations; frozen, it is part of the policy.
-    norm = VecNormV2([VECTOR], decay=0.99999, eps=1e-2, reduce_batch_dims=True)
-    env.append_transform(norm)
-    env.append_transform(ClipTransform([VECTOR], low=-10.0, high=10.0))
-    return env, norm
+def environment(settings: Settings, num_envs: int, seed: int, max_steps: int, **more):
+    """Simulations side by side, with one vector of numbers to observe."""
+    options = {"max_steps": max_steps, **more}
+    kwargs = {"observation": settings.observation, "task_kwargs": options}
+    return make_env(settings.task, num_envs=num_envs, seed=seed, **kwargs)
 
 
-def network(inputs: int, outputs: int, hidden: int, gain: float) -> nn.Sequential:
+def network(inputs: int, outputs: int, hidden: int, gain: float) -> MLP:
     """Two hidden layers, orthogonal weights; `gain` is that of the last layer."""
-    layers = []
-    for size in (inputs, hidden):
-        layers += [nn.Linear(size, hidden), nn.Tanh()]
-        nn.init.orthogonal_(layers[-2].weight, 2**0.5)
-        nn.init.zeros_(layers[-2].bias)
-    layers.append(nn.Linear(hidden, outputs))
-    nn.init.orthogonal_(layers[-1].weight, gain)
-    nn.init.zeros_(layers[-1].bias)
-    return nn.Sequential(*layers)
+    mlp = MLP(inputs, outputs, num_cells=[hidden, hidden], activation_class=nn.Tanh)
+    layers = [layer for layer in mlp if isinstance(layer, nn.Linear)]
+    for layer in layers:
+        nn.init.orthogonal_(layer.weight, gain if layer is layers[-1] else 2**0.5)
+        nn.init.zeros_(layer.bias)
+    return mlp
 
 
-def make_actor(env, hidden: int) -> ProbabilisticActor:
-    """A Gaussian whose spread is learnt, and the same everywhere."""
-    inputs = env.observation_spec[VECTOR].shape[-1]
-    actions = env.action_spec.shape[-1]
-    mean = TensorDictModule(
-        network(inputs, actions, hidden, gain=0.01), [VECTOR], ["mean"]
-    )
-    scale = TensorDictModule(LearntScale(actions), ["mean"], ["loc", "scale"])
+def make_actor(inputs: int, actions: int, settings: Settings) -> ProbabilisticActor:
+    """A Gaussian before a tanh, whose spread is learnt, and the same everywhere."""
+    mean = network(inputs, actions, settings.hidden, gain=0.01)
+    scale = LearntScale(actions, init_value=math.log(settings.deviation))
     return ProbabilisticActor(
-        TensorDictSequential(mean, scale),
+        TensorDictModule(nn.Sequential(mean, scale), ["normal"], ["loc", "scale"]),
         in_keys=["loc", "scale"],
-        distribution_class=IndependentNormal,
+        distribution_class=TanhNormal,
         return_log_prob=True,
-        # The simulation clips actions to [-1, 1]; the log-probability is of the
-        # action as it was drawn.
-        default_interaction_type=ExplorationType.RANDOM,
     )
+
+
+class Exploration(TensorDictModuleBase):
+    """The policy with noise that lasts, and that motors of one axis share.
+
+    White noise on twenty motors averages out along the tip and over time. Each action
+    is still normal about the mean, and PPO takes its log-probability as if the noise
+    were white (Hollenstein et al., Colored Noise in PPO, AAAI 2024).
+    """
+
+    def __init__(self, policy: TensorDictSequential, groups, settings: Settings):
+        super().__init__()
+        self.policy, self.groups = policy, torch.as_tensor(groups)
+        self.in_keys, self.out_keys = policy.in_keys, policy.out_keys
+        self.shared, self.memory = settings.shared, settings.correlation
+        self.noise = None
+
+    def forward(self, frame):
+        """Adds the action and its log-probability."""
+        with set_exploration_type(ExplorationType.DETERMINISTIC):
+            frame = self.policy(frame)
+        mean, deviation = frame["loc"], frame["scale"]
+        common = torch.randn(*mean.shape[:-1], int(self.groups.max()) + 1)
+        noise = math.sqrt(1 - self.shared) * torch.randn_like(mean)
+        noise += math.sqrt(self.shared) * common[..., self.groups]
+        if self.noise is not None:
+            noise = self.memory * self.noise + math.sqrt(1 - self.memory**2) * noise
+        self.noise = noise
+        drawn = torch.tanh(mean + deviation * noise)
+        frame["action"] = drawn.clamp(-1 + 1e-6, 1 - 1e-6)
+        frame["action_log_prob"] = TanhNormal(mean, deviation).log_prob(frame["action"])
+        return frame
 
 
 def update(batch, loss, advantage, optimiser, settings: Settings) -> float:
     """Several epochs over a batch; returns the divergence from the old policy."""
     with torch.no_grad():
         advantage(batch)
-    frames = batch.reshape(-1)
-    divergence = 0.0
+    frames, divergence = batch.reshape(-1), 0.0
     for _ in range(settings.epochs):
         kls = []
         for rows in torch.randperm(len(frames)).split(settings.minibatch_size):
@@ -112,7 +127,7 @@ def update(batch, loss, advantage, optimiser, settings: Settings) -> float:
             total = sum(terms[f"loss_{n}"] for n in ("objective", "critic", "entropy"))
             optimiser.zero_grad()
             total.backward()
-            nn.utils.clip_grad_norm_(loss.parameters(), settings.max_grad_norm)
+            nn.utils.clip_grad_norm_(loss.parameters(), 1.0)
             optimiser.step()
             kls.append(terms["kl_approx"].detach())
         divergence = float(torch.stack(kls).mean())
@@ -122,78 +137,64 @@ def update(batch, loss, advantage, optimiser, settings: Settings) -> float:
 
 
 @torch.no_grad()
-def evaluate(actor, norm: VecNormV2, settings: Settings) -> dict[str, float]:
-    """Play every episode to its end with the most likely actions."""
+def evaluate(policy, settings: Settings) -> None:
+    """Play episodes of the task to their ends with the most likely actions."""
     episodes = settings.evaluation_episodes
-    env, own = environment(settings, episodes, 1_000_000, settings.evaluation_steps)
-    own.load_state_dict(norm.state_dict())
-    own.freeze()
+    env = environment(settings, episodes, 1_000_000, settings.evaluation_steps)
     alive = torch.ones(episodes, dtype=torch.bool)
-    success, steps, force = (torch.zeros(episodes) for _ in range(3))
+    success, steps = torch.zeros(episodes), torch.zeros(episodes)
     with set_exploration_type(ExplorationType.DETERMINISTIC):
         state = env.reset()
         while alive.any():
-            stepped, state = env.step_and_maybe_reset(actor(state))
-            info = stepped["next", "info"]
+            stepped, state = env.step_and_maybe_reset(policy(state))
             steps += alive
-            peak = info["wall_force_peak_max"][:, 0]
-            force = torch.where(alive, torch.maximum(force, peak), force)
-            success += alive & info["success"][:, 0]
+            success += alive & stepped["next", "info", "success"][:, 0]
             alive &= ~stepped["next", "done"][:, 0]
-    env.close()
-    return {
-        "success": float(success.mean()),
-        "control steps": float(steps.mean()),
-        "largest force, N": float(force.mean()),
-    }
+    print(f"success: {100 * success.mean():.0f} % of {episodes} episodes")
+    print(f"{steps.mean():.0f} control steps on average")
 
 
-def train(settings: Settings) -> dict[str, float]:
-    """Train and evaluate; returns the figures of the evaluation."""
+def train(settings: Settings) -> None:
+    """Train and evaluate."""
     torch.manual_seed(settings.seed)
     torch.set_num_threads(1)  # the networks are small
-    env, norm = environment(
-        settings, settings.num_envs, settings.seed, settings.max_steps
-    )
-    actor = make_actor(env, settings.hidden)
+    env = environment(
+        settings, settings.num_envs, settings.seed, settings.max_steps,
+        start_along_route=settings.start, reward={"path": -1.0, "success": 10.0},
+    )  # fmt: skip
     inputs = env.observation_spec[VECTOR].shape[-1]
-    critic = ValueOperator(
-        network(inputs, 1, settings.hidden, gain=1.0), in_keys=[VECTOR]
-    )
+    norm = ObservationNormaliser(inputs, clip=10.0)
+    norm.update(env.rollout(128, break_when_any_done=False)[VECTOR])  # random actions
+    normalise = TensorDictModule(norm, [VECTOR], ["normal"])
+    actor = make_actor(inputs, env.action_spec.shape[-1], settings)
+    critic = ValueOperator(network(inputs, 1, settings.hidden, 1.0), in_keys=["normal"])
     loss = ClipPPOLoss(
-        actor,
-        critic,
-        clip_epsilon=settings.clip,
-        entropy_coeff=settings.entropy_coefficient,
-        critic_coeff=settings.value_coefficient,
-        loss_critic_type="l2",
-        normalize_advantage=True,
-    )
-    advantage = GAE(
-        gamma=settings.gamma, lmbda=settings.gae_lambda, value_network=critic
-    )
+        actor, critic, clip_epsilon=settings.clip, normalize_advantage=True,
+        entropy_coeff=5.85e-4, critic_coeff=0.872, loss_critic_type="l2",
+        functional=False,
+    )  # fmt: skip
+    advantage = GAE(gamma=settings.gamma, lmbda=0.95, value_network=critic)
     optimiser = torch.optim.Adam(loss.parameters(), settings.learning_rate, eps=1e-5)
-    per_batch = settings.num_envs * settings.steps_per_update
-    collector = Collector(
-        env, actor, frames_per_batch=per_batch, total_frames=settings.total_frames
-    )
+    policy = TensorDictSequential(normalise, actor)
+    explorer = Exploration(policy, env.base_env.action_groups, settings)
+    batches = Collector(
+        env, explorer, total_frames=settings.total_frames,
+        frames_per_batch=settings.num_envs * settings.steps_per_update,
+        auto_register_policy_transforms=False,
+    )  # fmt: skip
     start, frames = time.monotonic(), 0
-    for batch in collector:
-        left = 1.0 - frames / settings.total_frames
-        optimiser.param_groups[0]["lr"] = settings.learning_rate * left
+    for batch in batches:
+        normalise(batch["next"])
         divergence = update(batch, loss, advantage, optimiser, settings)
+        norm.update(batch[VECTOR])  # the actions were chosen under the old statistics
         frames += batch.numel()
+        rate, ended = frames / (time.monotonic() - start), batch["next", "done"].sum()
         reached = int(batch["next", "info", "success"].sum())
-        print(
-            f"{frames:8} frames, {frames / (time.monotonic() - start):6.0f} a second, "
-            f"reward {float(batch['next', 'reward'].mean()):+.4f}, reached the goal "
-            f"{reached} times, kl {divergence:.3f}",
-            flush=True,
-        )
-    collector.shutdown()
-    return evaluate(actor, norm, settings)
+        print(f"{frames:8} frames, {rate:5.0f} a second, kl {divergence:.3f}, reached "
+              f"the goal in {reached} of {ended} episodes", flush=True)  # fmt: skip
+    batches.shutdown()
+    evaluate(policy, settings)
 
 
 if __name__ == "__main__":
-    for name, value in train(tyro.cli(Settings)).items():
-        print(f"{name}: {value:.3f}")
+    train(tyro.cli(Settings))

@@ -13,6 +13,11 @@ hypothesis.settings.register_profile("default", deadline=None)
 hypothesis.settings.load_profile("default")
 
 TASKS = ("type1_bca", "type1_lcca", "type2_bca", "type2_lcca")
+# To parametrise with; the fast tests take one goal of each arch.
+EACH_TASK = [
+    pytest.param(name, marks=() if quick else pytest.mark.slow)
+    for name, quick in zip(TASKS, (False, True, True, False), strict=True)
+]
 SHORT_EPISODE = 12  # control steps
 
 

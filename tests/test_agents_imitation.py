@@ -145,6 +145,7 @@ def test_dagger_learns_from_what_the_expert_would_do(tmp_path, monkeypatch):
     assert apart[0] == 0 and 0.2 < apart[1] < 0.8 and apart[1] < apart[2]
 
 
+@pytest.mark.slow
 def test_dagger_repeats_and_goes_on(tmp_path):
     for name in "ab":
         train(dagger(), tmp_path / name, progress=False)

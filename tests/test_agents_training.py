@@ -12,7 +12,11 @@ import torch
 from tensordict import TensorDict
 
 from cathsim_dmc.agents import ConfigError, evaluate, make_config, train
-from cathsim_dmc.agents.checkpoint import Checkpoint, checkpoints_in
+from cathsim_dmc.agents.checkpoint import (
+    Checkpoint,
+    CheckpointError,
+    checkpoints_in,
+)
 from cathsim_dmc.agents.metrics import MetricsFile, read_metrics
 from cathsim_dmc.agents.networks import NetworkShapes
 from cathsim_dmc.agents.sac import SAC
@@ -202,6 +206,32 @@ def test_a_killed_run_continues_where_it_was_saved(tmp_path):
     assert frames[-1] == goal
     assert result.metrics["replay_frames"] == min(goal, 4_096)
     assert not list((tmp_path / "checkpoints").glob(".*"))
+
+
+def test_running_figures_go_on_where_a_run_is_resumed(tmp_path):
+    """Of fresh episodes the short ones, which succeed, would end first."""
+    run(small_ppo(total_frames=2_048), tmp_path)
+    before = Checkpoint.open(tmp_path).learning_state()["window"]
+    row = read_metrics(tmp_path / "metrics.csv")[-1]
+    assert len(before) > 10
+    rewards = [episode[0] for episode in before]
+    assert sum(rewards) / len(rewards) == pytest.approx(row["episode_reward"], 1e-6)
+    run(small_ppo(total_frames=3_584), tmp_path, resume=True)
+    after = Checkpoint.open(tmp_path).learning_state()["window"]
+    new = int(read_metrics(tmp_path / "metrics.csv")[-1]["episodes"] - row["episodes"])
+    assert 0 < new < 100
+    assert after[:-new] == before[len(before) + new - len(after) :]
+
+
+@pytest.mark.parametrize("window", [[[1.0]], [["a"] * 5], 3])
+def test_a_checkpoint_with_other_figures_is_refused(tmp_path, monkeypatch, window):
+    run(small_ppo(total_frames=512), tmp_path)
+    state = Checkpoint.open(tmp_path).learning_state()
+    monkeypatch.setattr(
+        Checkpoint, "learning_state", lambda self: {**state, "window": window}
+    )
+    with pytest.raises(CheckpointError, match="cannot be continued"):
+        run(small_ppo(total_frames=1_024), tmp_path, resume=True)
 
 
 def test_a_run_saves_by_the_clock_too(tmp_path):

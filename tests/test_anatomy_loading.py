@@ -161,6 +161,7 @@ for _ in range(int(sys.argv[3])):
 """
 
 
+@pytest.mark.slow
 def test_two_writers_and_a_reader_never_break_a_directory(tmp_path):
     arch.load("simple1").save(tmp_path)
     writers = [

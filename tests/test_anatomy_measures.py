@@ -163,6 +163,7 @@ def test_check_measures_and_draws(cathsim, tmp_path):
     assert picture.stat().st_size > 20_000
 
 
+@pytest.mark.slow
 def test_check_of_a_directory_draws_into_it(cathsim, tmp_path):
     anatomy = phantoms.load("type2", access="descending")
     anatomy.save(tmp_path / "two")

@@ -329,6 +329,7 @@ def coacd_tube(cut_tube):
     return build
 
 
+@pytest.mark.slow
 def test_coacd_surrounds_the_lumen(coacd_tube):
     anatomy, report = coacd_tube(scan_coacd.THRESHOLD)
     assert report.pieces == len(anatomy.wall) < 0.1 * len(anatomy.surface.faces)

@@ -254,6 +254,7 @@ def test_of_a_thick_wall_the_lumen_is_taken(tmp_path, rims):
     assert volume(lumen.vertices, lumen.faces) == pytest.approx(exact, rel=0.03)
 
 
+@pytest.mark.slow
 def test_many_triangles_are_decimated(tmp_path):
     vertices, faces = marched(y_tree(), 0.45e-3)
     assert len(faces) > 50_000

@@ -101,6 +101,7 @@ def test_computed_branches_get_their_anatomical_names(arch_scan):
     assert any("inlet chosen" in note for note in notes)
 
 
+@pytest.mark.slow
 def test_a_turned_scan_gets_the_same_names(arch_scan, tmp_path):
     """Names come from the arch, not from the scan's axes."""
     vertices, faces = marched(arch_scan[1], 2.2e-3)
@@ -114,11 +115,13 @@ def test_a_turned_scan_gets_the_same_names(arch_scan, tmp_path):
     assert free.goals["lcca"].position[0] < -0.15
 
 
+@pytest.mark.slow
 def test_names_can_be_changed(arch_scan):
     with pytest.raises(ValueError, match="no vessel 'rva' to rename; there are"):
         import_scan(arch_scan[0], spacing=1e-3, rename={"rva": "x"})
 
 
+@pytest.mark.slow
 def test_curves_that_part_early_at_a_wide_flat_end(arch_scan, tmp_path):
     """They start 8 mm apart, meet, run together and part at the arch."""
     mesh, tree = arch_scan
@@ -136,6 +139,7 @@ def test_curves_that_part_early_at_a_wide_flat_end(arch_scan, tmp_path):
         assert anatomy.tree.vessel(name).parent == "aorta"
 
 
+@pytest.mark.slow
 def test_a_pinch_does_not_move_a_goal_into_the_next_vessel(tmp_path):
     tree = arch_tree()
     vertices, faces = marched(tree, 1.8e-3)
@@ -160,6 +164,7 @@ def test_a_pinch_does_not_move_a_goal_into_the_next_vessel(tmp_path):
             assert abs(goal.position[0]) < 10e-3 and goal.position[2] < 220e-3
 
 
+@pytest.mark.slow
 def test_curves_that_start_12_mm_from_an_end_start_there(arch_scan, tmp_path):
     mesh, tree = arch_scan
     # From the heart's end of the aorta, 12 mm into it.
@@ -174,6 +179,7 @@ def test_curves_that_start_12_mm_from_an_end_start_there(arch_scan, tmp_path):
     assert anatomy.inlet.position[2] < 0.1
 
 
+@pytest.mark.slow
 def test_an_inlet_at_a_bulge_is_not_its_end(tmp_path):
     """A sinus beside the aorta: the lumen is cut there, across the aorta."""
     tree = arch_tree()
@@ -200,6 +206,7 @@ def test_a_start_at_the_ostium_is_said(tmp_path):
     assert any("geometry names no branch_1" in note for note in notes)
 
 
+@pytest.mark.slow
 def test_a_truncated_centreline_is_continued_and_said(arch_scan, tmp_path):
     mesh, tree = arch_scan
     length = tree.route("aorta", "lcca").length * 1e3
@@ -275,6 +282,7 @@ def test_the_proof_finds_each_fault(good):
     assert "outside of it" in found["branches on their parents"]
 
 
+@pytest.mark.slow
 def test_generated_arches_are_proved_too():
     from cathsim_dmc.anatomy.arch import arch
 

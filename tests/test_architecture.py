@@ -20,9 +20,10 @@ _FACE = _TASK | {"suite", "simulation"}
 # further up knows what stands further down, never the other way round.
 ALLOWED = {
     "__init__": set(),
-    # Below everything: how files are written, and what values may be.
+    # Below everything: how files are written, what values may be, how figures look.
     "files": set(),
     "bounds": set(),
+    "style": set(),
     "anatomy": set(),
     "imaging": {"anatomy"},
     "entities": {"anatomy", "imaging"},
@@ -129,7 +130,7 @@ def test_imports_point_one_way(part):
             target = part_of(module)
             if target in (None, part) or target not in ALLOWED:
                 continue  # another package, itself, or a name such as __version__
-            if target not in ALLOWED[part] | {"files", "bounds"}:
+            if target not in ALLOWED[part] | {"files", "bounds", "style"}:
                 wrong.append(f"{path.relative_to(PACKAGE)} imports {module}")
     assert not wrong, f"{part} may import {sorted(ALLOWED[part])} only: {wrong}"
 
@@ -242,9 +243,8 @@ def test_imports_leave_the_environment_as_it_is():
     assert done.returncode == 0, done.stderr
 
 
-@pytest.mark.parametrize(
-    "backend", ["egl", pytest.param("osmesa", marks=pytest.mark.slow)]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("backend", ["egl", "osmesa"])
 def test_agents_import_before_dm_control_with_opengl(backend):
     """The other order ends in a segmentation fault inside triton."""
     probe = run("import mujoco; mujoco.GLContext(8, 8).free()", MUJOCO_GL=backend)

@@ -69,6 +69,7 @@ def run(soak, monkeypatch, capsys, out, episodes):
     return code, json.loads(printed.out), printed.err
 
 
+@pytest.mark.slow
 def test_it_goes_on_where_it_stopped(soak, monkeypatch, capsys, tmp_path):
     code, first, _ = run(soak, monkeypatch, capsys, tmp_path, 1)
     assert code == 0

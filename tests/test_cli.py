@@ -212,6 +212,7 @@ def started(*arguments):
     )
 
 
+@pytest.mark.slow
 def test_an_interrupted_training_says_how_to_go_on(cathsim, tmp_path):
     out = tmp_path / "my run"
     process = started(
@@ -242,6 +243,7 @@ def test_an_interrupted_training_says_how_to_go_on(cathsim, tmp_path):
         ("benchmark", "speed"),
     ],
 )
+@pytest.mark.slow
 def test_an_interrupt_leaves_one_line(arguments):
     process = started(*arguments)
     time.sleep(6.0)

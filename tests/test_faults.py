@@ -165,6 +165,7 @@ def test_two_processes_compile_the_same_kernels_at_once(tmp_path, monkeypatch):
     assert finished([spawn(COMPILE)]) == outputs[:1]
 
 
+@pytest.mark.slow
 def test_two_processes_write_the_same_anatomy_at_once(tmp_path):
     lengths = ("0.06", "0.05")
     finished([spawn(BUILD, tmp_path / "tube", length) for length in lengths])

@@ -14,9 +14,16 @@ from cathsim_dmc.recording import Episode
 
 TASK = "type1_bca"
 SHORT = {"max_steps": 12}
+QUICK = ("expert",)
 
 
-@pytest.mark.parametrize("name", POLICIES)
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(name, marks=() if name in QUICK else pytest.mark.slow)
+        for name in POLICIES
+    ],
+)
 def test_a_named_policy_plays_the_same_on_both_backends(name):
     batched, composer = (
         evaluate(name, TASK, 2, 7, task_kwargs=SHORT, backend=backend, num_threads=1)
@@ -57,7 +64,9 @@ class Backwards(Policy):
         return action
 
 
-@pytest.mark.parametrize("backend", ["batched", "composer"])
+@pytest.mark.parametrize(
+    "backend", ["batched", pytest.param("composer", marks=pytest.mark.slow)]
+)
 def test_a_policy_of_ones_own_needs_one_class_and_one_line(monkeypatch, backend):
     monkeypatch.setitem(POLICIES, "backwards", Backwards)
     named = evaluate("backwards", TASK, 2, 5, task_kwargs=SHORT, backend=backend)
@@ -133,6 +142,7 @@ def test_a_random_curl_is_one_direction_for_each_episode():
     assert ((policy.act(None) != first).any(-1) == begins).all()
 
 
+@pytest.mark.slow
 def test_functions_and_trained_policies_act_on_a_composer_timestep(tmp_path):
     from cathsim_dmc.agents import make_config
 

@@ -102,6 +102,7 @@ assert "cathsim_dmc" not in sys.modules
     assert done.returncode == 0, done.stderr
 
 
+@pytest.mark.slow
 def test_what_cannot_be_repeated_is_refused(episodes, directory):
     with pytest.raises(ValueError, match="no episodes"):
         export([], DATASET)

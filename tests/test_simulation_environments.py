@@ -12,6 +12,7 @@ from cathsim_dmc.simulation.environments import standard_observations
 TASK = "type1_bca"
 
 
+@pytest.mark.slow
 def test_both_paths_give_the_same_episodes():
     settings = {"task": TASK, "episodes": 2, "task_kwargs": {"max_steps": 6}}
     batched, composer = (

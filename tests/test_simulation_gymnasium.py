@@ -42,9 +42,12 @@ def test_every_task_has_an_id():
 @pytest.mark.parametrize(
     "options",
     [
-        {},
+        pytest.param({}, marks=pytest.mark.slow),
         {"observation": ["image", "tracking_2d", "force"], "randomisation": True},
-        {"dtype": "float64", "observation": "segmentation"},
+        pytest.param(
+            {"dtype": "float64", "observation": "segmentation"},
+            marks=pytest.mark.slow,
+        ),
     ],
 )
 def test_check_env_has_nothing_to_say(options):

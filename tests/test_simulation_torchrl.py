@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import torch
-from conftest import SHORT_EPISODE, TASKS
+from conftest import EACH_TASK, SHORT_EPISODE
 from torchrl.envs import DMControlEnv
 from torchrl.envs.utils import check_env_specs
 
@@ -29,7 +29,7 @@ def short_batched():
     )
 
 
-@pytest.mark.parametrize("task_name", TASKS)
+@pytest.mark.parametrize("task_name", EACH_TASK)
 def test_dm_control_env(task_name):
     env = DMControlEnv("cathsim", task_name, max_steps=SHORT_EPISODE)
     check_env_specs(env)
@@ -113,7 +113,7 @@ def test_batched_env_with_images(observation):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("task_name", TASKS)
+@pytest.mark.parametrize("task_name", EACH_TASK)
 def test_batched_env_of_each_task(task_name):
     check_env_specs(BatchedEnv(task_name, 2, num_threads=1))
 
@@ -185,7 +185,9 @@ def test_episodes_start_over_by_themselves(short_batched):
     ]
 
 
-@pytest.mark.parametrize("backend", ["batched", "composer"])
+@pytest.mark.parametrize(
+    "backend", ["batched", pytest.param("composer", marks=pytest.mark.slow)]
+)
 def test_the_first_episode_is_that_of_the_seed(backend):
     """So that an episode of an evaluation can be recorded by its seed."""
     from cathsim_dmc.simulation.environments import make_env

@@ -7,7 +7,7 @@ import mujoco
 import numpy as np
 import pytest
 from absl.testing import absltest
-from conftest import SHORT_EPISODE, TASKS
+from conftest import EACH_TASK, SHORT_EPISODE, TASKS
 from dm_control import suite as dm_suite
 from dm_env import specs, test_utils
 from scipy.stats import qmc
@@ -90,14 +90,21 @@ class Contract(test_utils.EnvironmentTestMixin):
         self.assertIn(True, [step.last() for step in steps])
 
 
-# Coaxial devices stand beside every task; these few stand for them all in a hurry.
-COAXIAL = ("type1_lcca_wire", "femoral_type1_lcca_pair", "arch_bca_pair")
+# What stands for all of them in a hurry: each access, each kind of anatomy and devices.
+QUICK = (
+    "simple1_bca",
+    "type1_lcca",
+    "femoral_type2_bca",
+    "arch_lcca",
+    "type1_lcca_wire",
+    "femoral_type1_lcca_pair",
+)
 
 # One class for every registered task, those of the future included.
 for _name in suite.SUITE:
     _class = f"TestContract{_name.title().replace('_', '')}"
     _test = type(_class, (Contract, absltest.TestCase), {"task_name": _name})
-    if "devices" in suite.TASKS[_name].options and _name not in COAXIAL:
+    if _name not in QUICK:
         _test = pytest.mark.slow(_test)
     globals()[_class] = _test
 
@@ -111,7 +118,7 @@ def test_the_published_tasks_are_there():
         assert suite.SUITE[name].__doc__.count("\n") == 0, "one line for `cathsim list`"
 
 
-@pytest.mark.parametrize("task_name", TASKS)
+@pytest.mark.parametrize("task_name", EACH_TASK)
 def test_components_have_names(shared_environment, task_name):
     model = shared_environment(task_name).physics.model.ptr
     kinds = {
@@ -132,7 +139,7 @@ def test_components_have_names(shared_environment, task_name):
         assert model.body(name).id > 0
 
 
-@pytest.mark.parametrize("task_name", TASKS)
+@pytest.mark.parametrize("task_name", EACH_TASK)
 def test_action_spec(shared_environment, task_name):
     spec = shared_environment(task_name).action_spec()
     assert isinstance(spec, specs.BoundedArray)
@@ -143,7 +150,7 @@ def test_action_spec(shared_environment, task_name):
     assert names == [*tip, "insertion"]
 
 
-@pytest.mark.parametrize("task_name", TASKS)
+@pytest.mark.parametrize("task_name", EACH_TASK)
 def test_observations_conform_to_their_specs(shared_environment, task_name):
     environment = shared_environment(task_name)
     expected = environment.observation_spec()
@@ -168,7 +175,7 @@ def test_every_observation_conforms_to_its_spec(shared_environment):
         timestep = environment.step(action)
 
 
-@pytest.mark.parametrize("task_name", TASKS)
+@pytest.mark.parametrize("task_name", EACH_TASK)
 def test_start_is_randomised_within_a_millimetre(shared_environment, task_name):
     """Around where the device has settled, which no seed decides."""
     environment = shared_environment(task_name)
@@ -184,7 +191,7 @@ def test_start_is_randomised_within_a_millimetre(shared_environment, task_name):
     assert 0.3e-3 < displacement.max() < 1.02e-3
 
 
-@pytest.mark.parametrize("task_name", TASKS)
+@pytest.mark.parametrize("task_name", EACH_TASK)
 def test_same_seed_gives_the_same_episode(shared_environment, reseed, task_name):
     environment = shared_environment(task_name)
     actions = random_actions(environment, 20)
@@ -202,12 +209,12 @@ def test_two_environments_with_one_seed_are_equal():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("task_name", TASKS)
+@pytest.mark.parametrize("task_name", EACH_TASK)
 def test_first_200_observations_are_equal_bit_for_bit(task_name):
     assert_bitwise_equal(*(first_observations(task_name, 199) for _ in range(2)))
 
 
-@pytest.mark.parametrize("task_name", TASKS)
+@pytest.mark.parametrize("task_name", EACH_TASK)
 def test_no_memory_is_shared(shared_environment, task_name):
     assert_no_shared_memory(shared_environment(task_name))
 
@@ -235,7 +242,7 @@ def assert_no_shared_memory(environment):
         np.testing.assert_array_equal(first[key], value)
 
 
-@pytest.mark.parametrize("task_name", TASKS)
+@pytest.mark.parametrize("task_name", EACH_TASK)
 def test_no_observation_is_constant(shared_environment, task_name):
     assert_nothing_is_constant(shared_environment(task_name))
 
@@ -255,7 +262,7 @@ def assert_nothing_is_constant(environment):
             assert any((one[key] != seen[0][key]).any() for one in seen), key
 
 
-@pytest.mark.parametrize("task_name", TASKS)
+@pytest.mark.parametrize("task_name", EACH_TASK)
 def test_dm_control_loads_the_task(shared_environment, reseed, task_name):
     environment = dm_suite.load(
         "cathsim", task_name, task_kwargs={"random": 7}, visualize_reward=True
@@ -284,7 +291,7 @@ def test_environment_kwargs_reach_composer():
 # Reward, discount and end of the episode.
 
 
-@pytest.mark.parametrize("task_name", TASKS)
+@pytest.mark.parametrize("task_name", EACH_TASK)
 def test_time_out_comes_at_max_steps_with_discount_one(shared_environment, task_name):
     environment = shared_environment(task_name, max_steps=SHORT_EPISODE)
     environment.reset()
@@ -296,7 +303,7 @@ def test_time_out_comes_at_max_steps_with_discount_one(shared_environment, task_
     assert environment.step(np.zeros(21)).mid()
 
 
-@pytest.mark.parametrize("task_name", TASKS)
+@pytest.mark.parametrize("task_name", EACH_TASK)
 def test_default_limit_is_the_published_one(shared_environment, task_name):
     assert shared_environment(task_name).task.config.max_steps == 2000
     assert shared_environment(task_name).control_timestep() == pytest.approx(0.04)
@@ -305,7 +312,7 @@ def test_default_limit_is_the_published_one(shared_environment, task_name):
     )
 
 
-@pytest.mark.parametrize("task_name", TASKS)
+@pytest.mark.parametrize("task_name", EACH_TASK)
 def test_reward_is_minus_the_distance_in_metres(shared_environment, task_name):
     environment = shared_environment(task_name)
     environment.reset()
@@ -424,7 +431,7 @@ RECESSION = 0.6e-3
 WALL_FORCE = 10.0  # N
 
 
-@pytest.mark.parametrize("task_name", TASKS)
+@pytest.mark.parametrize("task_name", EACH_TASK)
 @pytest.mark.parametrize(
     "steps",
     [

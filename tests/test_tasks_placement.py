@@ -222,6 +222,7 @@ def test_a_model_without_the_names(shared_environment, scopes, message):
         readings.ModelIndex(model, *scopes)
 
 
+@pytest.mark.slow
 def test_an_episode_may_start_along_the_route():
     """The head lies further and further in, at rest, alike for composer and batch."""
     options = {"start_along_route": (0.0, 0.9), "random": 0}

@@ -58,6 +58,7 @@ def test_validate_wall_names_a_missing_directory(tmp_path):
         wall.validate_wall(phantoms=[tmp_path / "nowhere"])
 
 
+@pytest.mark.slow
 def test_insertion_is_reproducible_and_the_default_step_converged():
     script = dataclasses.replace(insertion.SCRIPTS[0], duration=1.0)
     once, again = insertion.run(script), insertion.run(script)

@@ -13,7 +13,7 @@ from cathsim_dmc import bounds, files, suite
 from cathsim_dmc.agents import evaluation, policies
 from cathsim_dmc.analysis import heatmap
 from cathsim_dmc.analysis.force_statistics import millinewtons
-from cathsim_dmc.pictures.animation import SUFFIXES, animate
+from cathsim_dmc.pictures.animation import SUFFIXES, animate, check_film
 from cathsim_dmc.pictures.recorded import film_options, xray_film
 from cathsim_dmc.policies import in_environment
 from cathsim_dmc.recording import recorder, rerun_log
@@ -236,7 +236,7 @@ def record(
         task_kwargs: Further options of the task; None takes those that the policy was
             trained with.
         fluoroscopy: Whether to include X-ray images.
-        gif: Path of the film, .gif or .webp; None makes none.
+        gif: Path of the film, .gif, .webp or .mp4; None makes none.
 
     Returns:
         The episode.
@@ -244,6 +244,7 @@ def record(
     Raises:
         ValueError: `out` is no .rrd file, `gif` no film, there is neither, or no task
             is known.
+        ImportError: an MP4 is asked for without the extra `mp4`.
         CheckpointError: there is no such checkpoint, or it is damaged.
     """
     targets = _targets(out, gif)
@@ -282,6 +283,8 @@ def _targets(out: str | Path | None, gif: str | Path | None) -> dict[str, Path]:
                 f"the recording is to be written to {path}; give an "
                 f"{' or '.join(suffixes)} file"
             )
+    if "gif" in targets:
+        check_film(targets["gif"])
     if not targets:
         raise ValueError(
             "nothing is to be written; give out (--out), an .rrd file, or gif (--gif), "

@@ -31,7 +31,7 @@ from cathsim_dmc.agents.interruption import Interruption
 from cathsim_dmc.agents.learners import Learner, make_learner
 from cathsim_dmc.agents.networks import NetworkShapes
 from cathsim_dmc.agents.replay import ReplayError
-from cathsim_dmc.agents.training_log import TrainingLog, crossed
+from cathsim_dmc.agents.training_log import TrainingLog, crossed, read_window
 from cathsim_dmc.agents.warm_start import take_over
 from cathsim_dmc.simulation import environments
 
@@ -194,21 +194,27 @@ def _start(
     """Give a learner what a checkpoint holds, another's policy, or its first look.
 
     Returns:
-        What earlier processes of the run have counted: frames, seconds, episodes; and
-        from a checkpoint the state "rng" of torch's generator.
+        What earlier processes of the run have counted: frames, seconds, episodes, and
+        the figures of the last of these; and from a checkpoint the state "rng" of
+        torch's generator.
     """
     if checkpoint is None:
         if config.initial_policy is not None:
             take_over(learner.policy, config, shapes)
         elif not learner.random_frames:
             _observe_random_actions(env, learner, config)
-        return {"frames": 0, "seconds": 0.0, "episodes": 0}
+        return {"frames": 0, "seconds": 0.0, "episodes": 0, "window": []}
     policy, state = checkpoint.policy_state(), checkpoint.learning_state()
     try:
         learner.load(policy, state["learner"])
         # Tried here: a later error would name no file.
         rng = torch.Generator().set_state(state["rng"]).get_state()
-        counted = {"rng": rng, "episodes": int(state["episodes"])}
+        counted = {
+            "rng": rng,
+            "episodes": int(state["episodes"]),
+            # Older checkpoints do not have it.
+            "window": read_window(state.get("window", [])),
+        }
     except ReplayError:
         raise
     except (KeyError, TypeError, ValueError, AttributeError, RuntimeError) as error:
@@ -287,6 +293,7 @@ class _Saver:
                 "learner": self._learner.learning_state(),
                 "rng": torch.get_rng_state(),
                 "episodes": self._log.episodes,
+                "window": self._log.window,
             },
         )
         self._frames, self._time = self._log.frames, time.monotonic()

@@ -3,7 +3,7 @@
 import contextlib
 import time
 from collections import deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -17,17 +17,21 @@ from cathsim_dmc.agents.progress import Progress
 # Number of finished episodes over which the running figures are taken.
 EPISODE_WINDOW = 100
 
+# Columns of metrics.csv that are means over the last episodes, and what they are of.
+_FIGURES = {
+    "episode_reward": "reward",
+    "episode_length": "length",
+    "success": "success",
+    "mean_force": "mean_force",
+    "max_force": "max_force",
+}
 # The rest of metrics.csv's columns are the learner's own.
 COLUMNS = (
     "frames",
     "seconds",
     "frames_per_second",
     "episodes",
-    "episode_reward",
-    "episode_length",
-    "success",
-    "mean_force",
-    "max_force",
+    *_FIGURES,
     "step_reward",
 )
 
@@ -50,6 +54,7 @@ class TrainingLog(contextlib.AbstractContextManager):
         frames: int,
         seconds: float,
         episodes: int,
+        window: Sequence[Sequence[float | None]],
         resumed: bool,
         progress: bool,
     ):
@@ -62,6 +67,7 @@ class TrainingLog(contextlib.AbstractContextManager):
             frames: Number of frames that earlier processes of the run have seen.
             seconds: Wall time that they have taken.
             episodes: Number of episodes that they have finished.
+            window: Figures of the last of these, as `window` gave them.
             resumed: Whether there were any.
             progress: Whether to show progress on standard error.
         """
@@ -69,7 +75,7 @@ class TrainingLog(contextlib.AbstractContextManager):
         self.row: dict[str, float | None] = {}
         self._config = config
         self._frames_before, self._seconds_before = frames, seconds
-        self._window: deque[EpisodeOutcome] = deque(maxlen=EPISODE_WINDOW)
+        self._window = deque(map(list, window), maxlen=EPISODE_WINDOW)
         self._stack = contextlib.ExitStack()
         columns = [*COLUMNS, *metrics]
         self._table = MetricsFile(
@@ -97,6 +103,11 @@ class TrainingLog(contextlib.AbstractContextManager):
         """Wall time of the run so far, over all its processes."""
         return self._seconds_before + time.monotonic() - self._began
 
+    @property
+    def window(self) -> list[list[float | None]]:
+        """Figures of the last `EPISODE_WINDOW` episodes, for who goes on from here."""
+        return list(self._window)
+
     def add(
         self,
         frames: int,
@@ -116,7 +127,10 @@ class TrainingLog(contextlib.AbstractContextManager):
         """
         before, self.frames = self.frames, self.frames + frames
         self.episodes += len(finished)
-        self._window.extend(finished)
+        self._window.extend(
+            [_number(getattr(episode, name)) for name in _FIGURES.values()]
+            for episode in finished
+        )
         means = _episode_means(self._window)
         if last or crossed(before, self.frames, self._config.metrics_frames):
             elapsed = self.seconds - self._seconds_before
@@ -146,20 +160,31 @@ def crossed(before: int, after: int, interval: int) -> bool:
     return before // interval != after // interval
 
 
-def _episode_means(window: deque[EpisodeOutcome]) -> dict[str, float | None]:
+def _episode_means(window: Iterable[Sequence[float | None]]) -> dict[str, float | None]:
     """Means over the last finished episodes; None where nothing is known."""
+    means: dict[str, float | None] = dict.fromkeys(_FIGURES)
+    for name, values in zip(_FIGURES, zip(*window, strict=True), strict=False):
+        known = [value for value in values if value is not None]
+        means[name] = float(np.mean(known)) if known else None
+    return means
 
-    def mean(name: str) -> float | None:
-        known = [value for o in window if (value := getattr(o, name)) is not None]
-        return float(np.mean(known)) if known else None
 
-    return {
-        "episode_reward": mean("reward"),
-        "episode_length": mean("length"),
-        "success": mean("success"),
-        "mean_force": mean("mean_force"),
-        "max_force": mean("max_force"),
-    }
+def read_window(rows: Sequence[Sequence[float | None]]) -> list[list[float | None]]:
+    """Checks what `TrainingLog.window` gave and a checkpoint has kept.
+
+    Raises:
+        ValueError: A row has another number of figures than one for each column.
+        TypeError: A figure is no number.
+    """
+    window = [[_number(value) for value in row] for row in rows]
+    for row in window:
+        if len(row) != len(_FIGURES):
+            raise ValueError(f"{len(row)} figures of an episode, not {len(_FIGURES)}")
+    return window
+
+
+def _number(value: float | None) -> float | None:
+    return None if value is None else float(value)
 
 
 def _tensorboard(run: Path) -> Any:

@@ -199,18 +199,18 @@ def _figure(
     image = axes.pcolormesh(
         x_mm,
         z_mm,
-        np.ma.masked_invalid(field.mean),
+        1e3 * np.ma.masked_invalid(field.mean),
         cmap="inferno_r",
         vmin=0.0,
         # A map without force still needs a scale.
-        vmax=force_limit if force_limit > 0 else 1.0,
+        vmax=1e3 * force_limit if force_limit > 0 else 1.0,
         zorder=3,
     )
     over = bool(field.count.any() and np.nanmax(field.mean) > force_limit)
     bar = figure.colorbar(
         image, ax=axes, extend="max" if over else "neither", shrink=0.8
     )
-    bar.set_label("mean contact force, N")
+    bar.set_label("mean contact force, mN")
     axes.set_xlim(x_mm[0], x_mm[-1])
     axes.set_ylim(z_mm[0], z_mm[-1])
     axes.set_aspect("equal")

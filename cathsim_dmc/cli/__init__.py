@@ -2,6 +2,7 @@
 
 import os
 import sys
+from pathlib import Path
 
 from tyro import conf
 from tyro.extras import SubcommandApp
@@ -9,7 +10,14 @@ from tyro.extras import SubcommandApp
 from cathsim_dmc import __version__
 from cathsim_dmc.cli import agents, table, training
 from cathsim_dmc.cli.measurements import benchmarks, validations
-from cathsim_dmc.cli.options import BAD_INPUT, INTERRUPTED, print_json
+from cathsim_dmc.cli.options import (
+    BAD_INPUT,
+    INTERRUPTED,
+    NO_ANATOMY,
+    OwnAnatomy,
+    Task,
+    print_json,
+)
 from cathsim_dmc.cli.phantoms import phantoms
 
 _DESCRIPTION = (
@@ -47,6 +55,23 @@ def list_tasks(devices: bool = False, json: bool = False) -> int:
     for name, line in lines.items():
         table.add_row(name, line)
     Console().print(table)
+    return 0
+
+
+@app.command
+def mjcf(task: Task, /, out: Path, seed: int = 0, anatomy: OwnAnatomy = NO_ANATOMY):
+    """Write the scene of a task as MJCF, with the start of an episode as JSON.
+
+    Args:
+        task: Task of `cathsim list`.
+        out: Directory to write, which must not exist: scene.xml, which MuJoCo's
+            viewer opens, and task.json.
+        seed: Seed of the episode.
+        anatomy: Where the task takes place.
+    """
+    from cathsim_dmc.simulation.mjcf import write_mjcf
+
+    print(write_mjcf(task, out, seed=seed, task_kwargs=anatomy.task_kwargs))
     return 0
 
 

@@ -79,7 +79,7 @@ def record(
     policy: Annotated[str, conf.Positional],
     /,
     out: Path | None = None,
-    gif: Path | None = None,
+    gif: Annotated[Path | None, conf.arg(aliases=("--mp4",))] = None,
     task: str | None = None,
     seed: int = EVALUATION_SEED,
     max_steps: int | None = None,
@@ -92,7 +92,8 @@ def record(
         policy: Directory of a run or of a checkpoint, or name of a policy: "random",
             "push", "expert", "idle", "curl", "random_curl", "pretrained:NAME".
         out: Path of the .rrd file.
-        gif: Path of a film for slides, .gif or .webp; needs no OpenGL.
+        gif: Path of a film for slides, .gif, .webp or, with the extra `mp4`, .mp4;
+            needs no OpenGL.
         task: Task of `cathsim list`; by default the one that the policy was trained on.
         seed: Seed of the episode.
         max_steps: Number of control steps after which the episode is cut off.

@@ -57,8 +57,7 @@ class Phantom(composer.Entity):
         self._mjcf_root.asset.add(
             "mesh",
             name="lumen",
-            vertex=surface.vertices.ravel(),
-            face=surface.faces.ravel(),
+            file=_mesh_file(surface.vertices, surface.faces),
             inertia="shell",
         )
         self._body.add(
@@ -84,20 +83,19 @@ class Phantom(composer.Entity):
           device_body: root body of the device, an element of the same model tree.
         """
         root = self._mjcf_root.root_model
+        # What the pieces have in common is said once, and their vertices are binary:
+        # as text in each of some 600 geoms they took most of the time to compile.
+        shared = self._mjcf_root.default.add("default", dclass="wall")
+        shared.mesh.inertia = "shell"
+        shared.geom.set_attributes(
+            type="mesh", **wall_contact(self._friction), mass=0, group=3
+        )
         for index, piece in enumerate(self._anatomy.wall):
             name = f"wall_{index:03d}"
             mesh = self._mjcf_root.asset.add(
-                "mesh", name=name, vertex=np.ravel(piece), inertia="shell"
+                "mesh", name=name, dclass=shared, file=_mesh_file(piece)
             )
-            root.worldbody.add(
-                "geom",
-                name=name,
-                type="mesh",
-                mesh=mesh,
-                **wall_contact(self._friction),
-                mass=0,
-                group=3,
-            )
+            root.worldbody.add("geom", name=name, dclass=shared, mesh=mesh)
         root.sensor.add(
             "contact",
             name="wall_contacts",
@@ -136,3 +134,24 @@ class Phantom(composer.Entity):
     def goals(self) -> dict:
         """Goal sites by name."""
         return self._goals
+
+
+def _mesh_file(vertices: np.ndarray, faces: np.ndarray | None = None) -> mjcf.Asset:
+    """A mesh in MuJoCo's own binary format (MSH).
+
+    Args:
+      vertices: (n, 3), m.
+      faces: (m, 3) numbers of vertices; None for the convex hull.
+    """
+    faces = np.empty((0, 3)) if faces is None else faces
+    counts = np.array([len(vertices), 0, 0, len(faces)], dtype="<i4")
+    parts = (counts, vertices.astype("<f4"), faces.astype("<i4"))
+    return mjcf.Asset(b"".join(part.tobytes() for part in parts), ".msh")
+
+
+def read_mesh_file(data: bytes) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices (n, 3) float32, m, and faces (m, 3) of a mesh of a `Phantom`."""
+    vertices, _, _, faces = np.frombuffer(data, "<i4", 4)
+    points = np.frombuffer(data, "<f4", 3 * vertices, 16)
+    numbers = np.frombuffer(data, "<i4", 3 * faces, 16 + 12 * vertices)
+    return points.reshape(-1, 3), numbers.reshape(-1, 3)

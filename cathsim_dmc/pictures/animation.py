@@ -13,11 +13,12 @@ from PIL import Image
 
 from cathsim_dmc.files import atomic_path
 from cathsim_dmc.pictures import figure as drawing
+from cathsim_dmc.pictures import video
 from cathsim_dmc.pictures.snapshot import Snapshot, xray
 from cathsim_dmc.pictures.translucent import Glass, Projection, glass
 from cathsim_dmc.recording.episode import Episode
 
-SUFFIXES = (".gif", ".webp")
+SUFFIXES = (".gif", ".webp", video.SUFFIX)
 FRAMES = 90
 # The last frame stays for so long before it begins again, ms.
 _HOLD_MS = 1500
@@ -40,7 +41,7 @@ def animate(
     width: int = 860,
     quality: int = 80,
 ) -> Path:
-    """Write an episode as an animated GIF or WebP, whole or not at all.
+    """Write an episode as an animated GIF or WebP or an MP4, whole or not at all.
 
     On the left the vessel as glass with device, goal and contact forces, on the right
     the X-ray image over the force on the wall.
@@ -48,7 +49,7 @@ def animate(
     Args:
         episode: What happens.
         surface: Lumen surface with `vertices` and `faces`.
-        path: File to write, `.gif` or `.webp`.
+        path: File to write, `.gif`, `.webp` or, with the extra `mp4`, `.mp4`.
         view: Direction of view, of `figure.VIEWS`.
         seconds: Length of the film without its last pause; None takes the episode's,
             at least 2 and at most 12.
@@ -63,10 +64,10 @@ def animate(
         ValueError: on another suffix, an unknown view, fewer than two frames, or an
             episode without a goal.
         FileNotFoundError: if the folder does not exist.
+        ImportError: if an MP4 is asked for and cannot be encoded.
     """
     path = Path(path)
-    if path.suffix not in SUFFIXES:
-        raise ValueError(f"a film is a {' or '.join(SUFFIXES)} file, not {path.name}")
+    check_film(path)
     if view not in drawing.VIEWS:
         raise ValueError(f"no view {view!r}; there are {', '.join(drawing.VIEWS)}")
     if frames < 2:
@@ -80,6 +81,10 @@ def animate(
         for picture in _Film(episode, surface, view, width).pictures(chosen)
     ]
     tick = max(round(1000 * seconds / len(pictures)), _TICK_MS)
+    if path.suffix == video.SUFFIX:
+        with atomic_path(path, path.suffix) as temporary:
+            video.write_mp4(temporary, pictures, tick, _HOLD_MS)
+        return path
     times = [tick] * (len(pictures) - 1) + [_HOLD_MS]
     options: dict[str, Any] = {"quality": quality, "method": 4}
     if path.suffix == ".gif":
@@ -95,6 +100,19 @@ def animate(
             **options,
         )
     return path
+
+
+def check_film(path: Path) -> None:
+    """Raise unless a film of this name can be written.
+
+    Raises:
+        ValueError: on another suffix.
+        ImportError: if an MP4 is asked for and cannot be encoded.
+    """
+    if path.suffix not in SUFFIXES:
+        raise ValueError(f"a film is a {' or '.join(SUFFIXES)} file, not {path.name}")
+    if path.suffix == video.SUFFIX:
+        video.require_encoder()
 
 
 def _one_palette(pictures: list[Image.Image]) -> list[Image.Image]:
@@ -114,6 +132,8 @@ class _Film:
 
     def __init__(self, episode: Episode, surface: Any, view: str, width: int):
         self._episode, self._surface = episode, surface
+        # Points; in a small film the label must not run under the X-ray image.
+        self._font = float(np.clip(width / 65, 6.5, 10))
         azimuth = drawing.VIEWS[view][0]
         rough = Projection.of(surface.vertices, azimuth=azimuth, margin=_MARGIN)
         rows, columns = rough.shape
@@ -178,6 +198,6 @@ class _Film:
         if step == self._episode.steps:
             text += f"   {self._episode.termination.replace('_', ' ')}"
         self._scene.text(
-            0.02, 0.985, text, transform=self._scene.transAxes, va="top", fontsize=10,
-            fontweight="bold", color="0.2", zorder=10,
+            0.02, 0.985, text, transform=self._scene.transAxes, va="top",
+            fontsize=self._font, fontweight="bold", color="0.2", zorder=10,
         )  # fmt: skip

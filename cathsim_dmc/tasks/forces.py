@@ -7,13 +7,13 @@ import numpy as np
 
 # Layout of one contact in the sensor's row: found, force, dist, pos, normal, tangent.
 # The order is MuJoCo's own, whatever the order in the model file.
-_CONTACT_SIZE = 1 + 3 + 1 + 3 + 3 + 3
+CONTACT_SIZE = 1 + 3 + 1 + 3 + 3 + 3
 
 
 def _slots(row: np.ndarray) -> np.ndarray:
     """The sensor's row (..., K * 14) contact by contact (..., K, 14)."""
-    places = row.shape[-1] // _CONTACT_SIZE
-    return row.reshape(*row.shape[:-1], places, _CONTACT_SIZE)
+    places = row.shape[-1] // CONTACT_SIZE
+    return row.reshape(*row.shape[:-1], places, CONTACT_SIZE)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -96,7 +96,7 @@ class ContactHistory:
         """Keeps the sensor's row (K * 14,) of the physics step just done."""
         found = row[0]
         if found:
-            width = min(int(found) * _CONTACT_SIZE, len(row))
+            width = min(int(found) * CONTACT_SIZE, len(row))
             self._rows[step, :width] = row[:width]
             self._width = max(self._width, width)
 

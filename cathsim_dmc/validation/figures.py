@@ -11,6 +11,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from scipy import stats
 
+from cathsim_dmc import style
 from cathsim_dmc.anatomy.anatomy import Anatomy
 from cathsim_dmc.anatomy.wall import fidelity
 from cathsim_dmc.files import atomic_path
@@ -22,8 +23,8 @@ if TYPE_CHECKING:
     from cathsim_dmc.validation import rod as rods
     from cathsim_dmc.validation import wall as walls
 
-SIMULATED, THEORY, THIRD = "#c0501f", "#30506b", "#6a9a4b"
-_COLOURS = (SIMULATED, THEORY, THIRD, "#9467bd", "#b08d20")
+THEORY, SIMULATED, THIRD = style.COLOURS[:3]
+_COLOURS = (SIMULATED, THEORY, *style.COLOURS[2:5])
 
 
 def _canvas(rows: int, columns: int) -> tuple[Figure, np.ndarray]:
@@ -31,9 +32,7 @@ def _canvas(rows: int, columns: int) -> tuple[Figure, np.ndarray]:
     FigureCanvasAgg(figure)
     axes = figure.subplots(rows, columns, squeeze=False)
     for ax in axes.ravel():
-        ax.spines[["top", "right"]].set_visible(False)
-        ax.grid(True, color="0.9", linewidth=0.6)
-        ax.set_axisbelow(True)
+        style.tidy(ax)
     return figure, axes
 
 
@@ -203,11 +202,11 @@ def _convergence(axes, studies):
         path = by_step if of_step else by_link
         force = force_by_step if of_step else force_by_link
         x = 1e3 * one.values
-        style = {"color": colour, "linewidth": 1, "markersize": 4}
-        path.plot(x[1:], 1e3 * one.path_mean[1:], "o-", label=one.script.name, **style)
-        path.plot(x[1:], 1e3 * one.track_max[1:], "^:", **style)
+        look = {"color": colour, "linewidth": 1, "markersize": 4}
+        path.plot(x[1:], 1e3 * one.path_mean[1:], "o-", label=one.script.name, **look)
+        path.plot(x[1:], 1e3 * one.track_max[1:], "^:", **look)
         if one.force_mean[0] > 1e-3:
-            force.plot(x, 1e3 * one.force_mean, "o-", **style)
+            force.plot(x, 1e3 * one.force_mean, "o-", **look)
         for ax in (path, force):
             ax.set_xlabel(labels[one.parameter])
             ax.axvline(defaults[one.parameter], color="0.6", linewidth=0.8, zorder=0)

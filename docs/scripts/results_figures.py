@@ -12,14 +12,10 @@ from cathsim_dmc import suite
 from cathsim_dmc.analysis.heatmap import AP_AXES, ForceMap
 from cathsim_dmc.benchmarks.result import map_from_values
 from cathsim_dmc.files import atomic_path
+from cathsim_dmc.style import COLOURS
 
 DPI = 90
 PANEL = (4.2, 3.0)  # inches
-# Okabe and Ito's colours, which the colour-blind can tell apart.
-COLOURS = (
-    "#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000",
-    "#999999",
-)  # fmt: skip
 STYLES = ("-", "--", ":")
 POINTS = 200
 

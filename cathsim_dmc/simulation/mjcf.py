@@ -1,0 +1,160 @@
+"""A task as files: the scene as MJCF, and what another program needs to run it.
+
+MuJoCo's viewer, its WebAssembly build and other engines read the scene; the page in
+the browser is one of them.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+from dm_control import mjcf
+from lxml import etree
+
+from cathsim_dmc import bounds, suite
+from cathsim_dmc.entities.phantom import read_mesh_file
+from cathsim_dmc.files import atomic_directory
+from cathsim_dmc.tasks.forces import CONTACT_SIZE
+from cathsim_dmc.tasks.navigation import Navigation
+from cathsim_dmc.tasks.objectives import Cannulation
+
+FORMAT = 1
+SCENE, TASK = "scene.xml", "task.json"
+
+
+def write_mjcf(
+    task: str,
+    directory: str | os.PathLike[str],
+    *,
+    seed: int = 0,
+    task_kwargs: dict[str, Any] | None = None,
+) -> Path:
+    """Write the scene of a task and the start of one of its episodes.
+
+    `scene.xml` holds everything that the task simulates, meshes included, with as many
+    digits as were compiled: stepped with the same actions it moves as the task does,
+    bit for bit, on the same version of MuJoCo. `task.json` says how, see `describe`.
+
+    Args:
+        task: Name of a task of `suite.SUITE`.
+        directory: Directory to write, which must not exist.
+        seed: Seed of the episode that `task.json` starts.
+        task_kwargs: Options of the task.
+
+    Returns:
+        The directory.
+
+    Raises:
+        ValueError: the task or an option does not exist, or the task draws its
+            anatomy anew in each episode and has no single scene.
+        FileExistsError: the directory exists.
+    """
+    directory = Path(directory)
+    if directory.exists():
+        raise FileExistsError(f"{directory} exists; give a directory that does not")
+    if task not in suite.SUITE:
+        raise ValueError(f"no task {task!r}; there are {', '.join(suite.SUITE)}")
+    options = {**(task_kwargs or {}), "random": bounds.seed("seed", seed)}
+    env = suite.load(suite.DOMAIN, task, options)
+    if env.task.num_anatomies > 1:
+        raise ValueError(
+            f"{task} draws from {env.task.num_anatomies} anatomies; give pool=1 for "
+            "the scene of one"
+        )
+    env.reset()
+    values = {"name": task, "seed": seed, **describe(env)}
+    directory.parent.mkdir(parents=True, exist_ok=True)
+    with atomic_directory(directory) as folder:
+        mjcf.export_with_assets(env.task.root_entity.mjcf_model, folder, SCENE)
+        _in_one_file(folder / SCENE)
+        (folder / TASK).write_text(json.dumps(values, indent=1) + "\n")
+    return directory
+
+
+def describe(env: Any) -> dict[str, Any]:
+    """What a program needs to run a task as the suite does; JSON-able, SI units.
+
+    Args:
+        env: What `suite.load` returns, at the start of an episode.
+
+    Returns:
+        "qpos" (the start, at rest), "control_timestep" and "substeps" (`mj_step` with
+        the same control), "actuators" (order of the action, which is the control),
+        "links" (bodies from base to tip), "head" (site), "insertion" (joint),
+        "sensors" (name by quantity, and "contact_size", the numbers a contact takes in
+        the sensor of the wall: found, force, dist, pos, normal, tangent), "goal" and
+        "branch" (success: the head is within the goal's radius, nearer to the branch's
+        centreline than its radius there, and past its ostium), "max_steps",
+        "device_radius" and "versions".
+    """
+    task: Navigation = env.task
+    scene, data, objective = task.scene, env.physics.data, task.objective
+    catheter = scene.catheter
+    return {
+        "format": FORMAT,
+        "qpos": data.qpos.tolist(),
+        "control_timestep": task.control_timestep,
+        "substeps": task.substeps,
+        "max_steps": task.config.max_steps,
+        "actuators": [each.full_identifier for each in catheter.actuators],
+        "tip_joints": len(catheter.tip_motors) // 2,
+        "rotation": catheter.rotation is not None,
+        "links": [each.full_identifier for each in catheter.links],
+        "head": catheter.head.full_identifier,
+        "insertion": catheter.insertion.full_identifier,
+        "device_radius": scene.device.outer_radius,
+        "sensors": {
+            "wall_contacts": "wall_contacts",
+            "load_cell": "load_cell",
+            "push_force": f"{catheter.mjcf_model.model}/push_force",
+        },
+        "contact_size": CONTACT_SIZE,
+        "goal": {
+            "name": scene.goal.name,
+            "position": task.goal_position.tolist(),
+            "radius": float(objective.goal_radius),
+        },
+        "branch": _branch(objective),
+        "versions": {
+            name: metadata.version(name) for name in ("cathsim-dmc", "mujoco")
+        },
+    }
+
+
+def _in_one_file(scene: Path) -> None:
+    """Writes the meshes into the scene, and drops what older versions refuse.
+
+    MuJoCo up to 3.14 refuses a defaults class of textures. Nothing is lost: PyMJCF
+    names a class in every element, and has none of textures.
+    """
+    tree = etree.parse(str(scene))
+    for texture in tree.iter("texture"):
+        texture.attrib.pop("class", None)
+    files = set()  # two equal pieces share one
+    for mesh in tree.iterfind("asset/mesh[@file]"):
+        file = scene.parent / mesh.attrib.pop("file")
+        files.add(file)
+        vertices, faces = read_mesh_file(file.read_bytes())
+        # Nine digits tell every float32.
+        mesh.set("vertex", " ".join(f"{x:.9g}" for x in vertices.ravel().tolist()))
+        if len(faces):
+            mesh.set("face", " ".join(map(str, faces.ravel().tolist())))
+    for file in files:
+        file.unlink()
+    tree.write(str(scene))
+
+
+def _branch(objective: Any) -> dict[str, Any] | None:
+    """Centreline of the target branch; None for an objective that has no branch."""
+    if not isinstance(objective, Cannulation):
+        return None
+    line = objective.branch
+    return {
+        "points": line.points.tolist(),
+        "radii": line.radii.tolist(),
+        "ostium": float(objective.ostium),
+    }

@@ -1,0 +1,55 @@
+/**
+ * Visits the page on which one steers, in headless Chromium, holds keys and says what
+ * came of it.
+ *
+ *   node visit.mjs NODE_MODULES ADDRESS SCREENSHOT.png [KEY:SECONDS …]
+ *
+ * Prints a JSON object: simulated seconds, insertion (m), distance (m), the largest
+ * contact (N), milliseconds of a control step, and errors of the page.
+ */
+
+import { createRequire } from "node:module";
+
+const [modules, address, screenshot, ...keys] = process.argv.slice(2);
+const { chromium } = createRequire(`${modules}/`)("playwright-core");
+const browser = await chromium.launch({
+  executablePath: process.env.CHROMIUM ?? "/usr/bin/chromium",
+  args: [
+    "--no-sandbox",
+    "--disable-gpu",
+    "--disable-quic",
+    "--no-first-run",
+    "--disable-background-networking",
+    "--disable-component-update",
+    "--disable-sync",
+  ],
+});
+try {
+  const page = await browser.newPage({ viewport: { width: 1560, height: 760 } });
+  const errors = [];
+  page.on("pageerror", (error) => errors.push(error.message));
+  page.on("requestfailed", (request) => errors.push(`not loaded: ${request.url()}`));
+  await page.goto(address);
+  await page.waitForFunction(() => globalThis.cathsim, null, { timeout: 300_000 });
+  for (const key of keys) {
+    const [name, seconds] = key.split(":");
+    const held = name.split("+");
+    for (const each of held) await page.keyboard.down(each);
+    await page.waitForTimeout(1e3 * Number(seconds));
+    for (const each of held) await page.keyboard.up(each);
+  }
+  const state = await page.evaluate(() => {
+    const { simulation, milliseconds, trace } = globalThis.cathsim;
+    return {
+      seconds: simulation.time,
+      inserted: simulation.inserted,
+      distance: simulation.distance,
+      largest: Math.max(0, ...trace.values) / 1e3,
+      milliseconds,
+    };
+  });
+  await page.screenshot({ path: screenshot });
+  console.log(JSON.stringify({ ...state, errors }));
+} finally {
+  await browser.close();
+}

@@ -1,0 +1,236 @@
+"""What the pages under docs/browser/ need beside themselves; `make site` runs it.
+
+    python docs/scripts/browser.py [SITE]
+
+Writes into SITE/browser (build/site/browser): MuJoCo's WebAssembly build from the npm
+registry, at the version and checksum of docs/browser/package-lock.json; the web viewer
+of the installed rerun-sdk, which alone reads the recordings of its version; the scenes
+that `cathsim mjcf` writes, with pictures of their vessels; and recordings of policies
+that ship. Nothing of it is in the repository.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+import socket
+import subprocess
+import sys
+import time
+import urllib.error
+import urllib.request
+from pathlib import Path
+
+import numpy as np
+import rerun_cli
+from PIL import Image
+
+from cathsim_dmc import agents, suite  # agents before anything of dm_control
+from cathsim_dmc.agents import report
+from cathsim_dmc.imaging import FluoroscopyOptions
+from cathsim_dmc.imaging.angiograph import Angiograph
+from cathsim_dmc.pictures.figure import VIEWS
+from cathsim_dmc.pictures.translucent import Projection, glass
+from cathsim_dmc.simulation.mjcf import write_mjcf
+
+ROOT = Path(__file__).parents[2]
+PAGES = ROOT / "docs" / "browser"
+SCENES = ("type1_lcca", "type1_bca", "type2_lcca", "femoral_type1_lcca")
+SEED = 3
+GLASS_HEIGHT = 620  # px
+DEVICE_RADIUS = 0.835e-3  # m, of the published device
+# The blur of the detector, a quarter of a pixel here, is left out.
+FLUOROSCOPY = FluoroscopyOptions(size=480, magnification=1.2, kerma=2e-7, blur=0.0)
+# Files that Rerun's own server hands to a browser.
+VIEWER = ("index.html", "re_viewer.js", "re_viewer_bg.wasm", "favicon.ico")
+POLICY = (
+    '<meta http-equiv="Content-Security-Policy" '
+    "content=\"connect-src 'self' blob: data:\" />"
+)
+RECORDINGS = (
+    # name, title, policy, task, seed, steps at most
+    ("type1_bca", "Type I, BCA", "pretrained:type1_bca", None, 1_000_000, None),
+    ("type1_lcca", "Type I, LCCA", "pretrained:type1_lcca", None, 1_000_000, None),
+    ("type2_lcca", "Type II, LCCA", "pretrained:type2_lcca", None, 1_000_000, None),
+    ("femoral", "From the groin", "expert", "femoral_type1_lcca", 3, None),
+    ("jam", "A straight push jams", "push", "type1_lcca", 0, 150),
+)
+
+
+def main() -> None:
+    site = Path(sys.argv[1] if len(sys.argv) > 1 else ROOT / "build" / "site")
+    out = site / "browser"
+    if not (out / "steer.html").is_file():
+        raise SystemExit(f"{out} holds no pages; run `make docs` first")
+    write_mujoco(out / "vendor")
+    for name in SCENES:
+        write_scene(name, out / "scenes" / name)
+    (out / "scenes" / "scenes.json").write_text(json.dumps(SCENES))
+    write_recordings(out / "recordings")
+    write_viewer(out / "viewer", out / "recordings")
+    size = sum(path.stat().st_size for path in out.rglob("*") if path.is_file())
+    print(f"{out}: {size / 1e6:.0f} MB")
+    print(f"python -m http.server --directory {site}  # and open browser/index.html")
+
+
+def write_mujoco(out: Path) -> None:
+    """MuJoCo's WebAssembly build, as the lock file has it."""
+    modules = install(production=True) / "@mujoco" / "mujoco"
+    out.mkdir(parents=True, exist_ok=True)
+    for name in ("mujoco.js", "mujoco.wasm"):
+        shutil.copy(modules / name, out / name)
+    shutil.copy(modules / "package.json", out / "package.json")
+
+
+def install(production: bool = False) -> Path:
+    """Folder of the npm packages, installed with their checksums into build/npm."""
+    if shutil.which("npm") is None:
+        raise SystemExit("the pages in the browser need Node.js with npm 10 or newer")
+    folder = ROOT / "build" / ("npm" if production else "npm-test")
+    folder.mkdir(parents=True, exist_ok=True)
+    for name in ("package.json", "package-lock.json"):
+        shutil.copy(PAGES / name, folder / name)
+    command = ["npm", "ci", "--ignore-scripts", "--no-audit", "--no-fund"]
+    command += ["--omit=dev"] if production else []
+    subprocess.run(command, cwd=folder, check=True, stdout=subprocess.DEVNULL)
+    return folder / "node_modules"
+
+
+def write_scene(name: str, out: Path) -> None:
+    """The scene of a task, and what of its pictures does not move."""
+    shutil.rmtree(out, ignore_errors=True)
+    write_mjcf(name, out, seed=SEED)
+    surface = suite.make_task(name).scene.anatomy.surface
+    views = {"glass": [], "fluoroscopy": _fluoroscopy(surface, out)}
+    for view, (azimuth, _) in VIEWS.items():
+        projection = Projection.of(
+            surface.vertices, azimuth=azimuth, height=GLASS_HEIGHT
+        )
+        drawn = glass(surface.vertices, surface.faces, projection)
+        rows, columns = projection.shape
+        files = {}
+        for layer in ("behind", "glaze"):
+            files[layer] = f"{view}_{layer}.webp"
+            pixels = np.round(255 * getattr(drawn, layer)).astype(np.uint8)
+            Image.fromarray(pixels).save(out / files[layer], quality=85)
+        views["glass"].append(
+            {
+                "name": view,
+                **files,
+                "rows": rows,
+                "columns": columns,
+                "right": projection.right.tolist(),
+                "up": projection.up.tolist(),
+                "low": projection.low.tolist(),
+                "high": projection.high.tolist(),
+                "pixels": projection.pixels,
+            }
+        )
+    (out / "views.json").write_text(json.dumps(views))
+    print(f"{name}: {sum(p.stat().st_size for p in out.iterdir()) / 1e6:.1f} MB")
+
+
+def _fluoroscopy(surface, out: Path) -> dict:
+    """Geometry of the AP view, and the signal behind patient and vessel."""
+    options = FLUOROSCOPY
+    plane = Angiograph(surface.vertices, surface.faces, options).planes()[0]
+    arm = plane.carm
+    plane.signal.astype("<f4").tofile(out / "signal.bin")
+    rows, columns = arm.resolution
+    return {
+        "signal": "signal.bin",
+        "rows": rows,
+        "columns": columns,
+        "focal": arm.focal_length,
+        "axes": arm.axes.tolist(),
+        "source": arm.source.tolist(),
+        "gain": plane.gain,
+        "window": _window(plane),
+        "device_mu": plane.device_mu,
+        "marker_mu": plane.marker_mu,
+        "marker_length": plane.marker_length,
+        "noise": plane.quanta**-0.5,
+    }
+
+
+def _window(plane) -> list[float]:
+    """Signals shown as black and white: the contrast of a screen.
+
+    Black is a device across the densest part of the vessel.
+    """
+    device = np.exp(-plane.device_mu * 2 * DEVICE_RADIUS)
+    return [0.97 * float(plane.signal.min() * device), 1.02 * float(plane.signal.max())]
+
+
+def write_recordings(out: Path) -> None:
+    """Recordings of the policies that ship, of the expert and of a failure."""
+    out.mkdir(parents=True, exist_ok=True)
+    listed = []
+    for name, title, policy, task, seed, steps in RECORDINGS:
+        path = out / f"{name}.rrd"
+        episode = report.record(policy, path, task=task, seed=seed, max_steps=steps)
+        path.with_suffix(".npz").unlink()
+        largest = 1e3 * episode.wall_force_max.max()
+        command = f"cathsim record {policy} --seed {seed} --out {path.name}"
+        command += f" --task {task}" if task else ""
+        command += f" --max-steps {steps}" if steps else ""
+        text = (
+            f"{episode.task}, {policy}: {episode.termination} after {episode.steps} "
+            f"steps of 40 ms, largest contact {largest:.0f} mN. Made by: {command}"
+        )
+        listed.append({"name": name, "title": title, "file": path.name, "text": text})
+        print(f"{path.name}: {path.stat().st_size / 1e6:.1f} MB")
+    (out / "recordings.json").write_text(json.dumps(listed, indent=1))
+
+
+def write_viewer(out: Path, recordings: Path) -> None:
+    """The web viewer of the installed rerun-sdk, from its own server."""
+    out.mkdir(parents=True, exist_ok=True)
+    with socket.socket() as page, socket.socket() as data:
+        for each in (page, data):
+            each.bind(("127.0.0.1", 0))
+        ports = [each.getsockname()[1] for each in (page, data)]
+    recording = next(iter(sorted(recordings.glob("*.rrd"))))
+    # The program itself: `python -m rerun_cli` would leave it behind when it ends.
+    program = Path(rerun_cli.__file__).with_name("rerun")
+    command = [str(program), str(recording), "--serve-web"]
+    command += ["--bind", "127.0.0.1", "--web-viewer-port", str(ports[0])]
+    command += ["--port", str(ports[1])]
+    server = subprocess.Popen(
+        command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+    )
+    try:
+        for name in VIEWER:
+            (out / name).write_bytes(_fetched(f"http://127.0.0.1:{ports[0]}/{name}"))
+    finally:
+        server.terminate()
+        server.wait()
+    # Nothing is loaded from or sent to elsewhere: neither fonts (there are others to
+    # fall back on) nor the viewer's usage figures and its look for a later release.
+    page = (out / "index.html").read_text()
+    page = re.sub(r"<link\b[^>]*fonts\.(googleapis|gstatic)\.com[^>]*>", "", page)
+    page, count = re.subn(r"(<head>)", rf"\1\n    {POLICY}", page, count=1)
+    if not count:
+        raise SystemExit("Rerun's page has no <head> to put a policy into")
+    (out / "index.html").write_text(page)
+
+
+def _fetched(address: str, patience: float = 30.0) -> bytes:
+    """A file of a server that is about to start."""
+    until = time.monotonic() + patience
+    while True:
+        try:
+            with urllib.request.urlopen(address, timeout=patience) as answer:
+                return answer.read()
+        except urllib.error.HTTPError as error:
+            raise SystemExit(f"Rerun's viewer has no {address}: {error}") from error
+        except OSError as error:
+            if time.monotonic() > until:
+                raise SystemExit(f"Rerun's viewer did not start: {error}") from error
+            time.sleep(0.2)
+
+
+if __name__ == "__main__":
+    assert agents  # imported for its order
+    main()

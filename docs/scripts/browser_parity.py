@@ -1,0 +1,203 @@
+"""The page in the browser beside the Python task: the same actions, step by step.
+
+    python docs/scripts/browser_parity.py
+
+Replays episodes in MuJoCo's WebAssembly build (Node.js) and in the suite; writes
+docs/images/browser_parity.png and docs/data/browser_parity.json, and the table of
+docs/browser/index.md.
+"""
+
+from __future__ import annotations
+
+import datetime
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import numpy as np
+
+sys.path.insert(0, str(Path(__file__).parent))
+
+import browser  # also torchrl before dm_control
+import mujoco
+
+from cathsim_dmc import suite
+from cathsim_dmc.agents import load_policy
+from cathsim_dmc.imaging.angiograph import Angiograph
+from cathsim_dmc.pictures.figure import Picture
+from cathsim_dmc.pictures.recorded import as_function
+from cathsim_dmc.style import COLOURS, tidy
+
+DOCS = browser.ROOT / "docs"
+TASK, SEED = "type1_lcca", browser.SEED
+# Name, policy and control steps at most.
+EPISODES = (
+    ("random actions", "random", 150),
+    ("scripted expert", "expert", 300),
+    ("learnt policy", "pretrained:type1_lcca", 300),
+    ("straight push into a jam", "push", 150),
+)
+_BEGIN, _END = "<!-- measured -->", "<!-- end -->"
+
+
+def main() -> None:
+    module = browser.install(production=True) / "@mujoco" / "mujoco" / "mujoco.js"
+    with tempfile.TemporaryDirectory() as folder:
+        scene = Path(folder) / "scene"
+        browser.write_scene(TASK, scene)
+        measured = [
+            compared(name, policy, steps, module, scene)
+            for name, policy, steps in EPISODES
+        ]
+    draw(measured, DOCS / "images" / "browser_parity.png")
+    values = {
+        "date": datetime.date.today().isoformat(),
+        "task": TASK,
+        "seed": SEED,
+        "python": mujoco.__version__,
+        "webassembly": measured[0]["version"],
+        "episodes": [row(each) for each in measured],
+    }
+    text = json.dumps(values, indent=1) + "\n"
+    (DOCS / "data" / "browser_parity.json").write_text(text)
+    write_table(values, DOCS / "browser" / "index.md")
+
+
+def compared(name: str, policy: str, steps: int, module: Path, scene: Path) -> dict:
+    """An episode in Python, and the same actions in WebAssembly."""
+    played = play(policy, steps)
+    actions, out = scene.parent / "actions.json", scene.parent / "out.json"
+    image = scene.parent / "image.bin"
+    actions.write_text(json.dumps(played["action"]))
+    script = browser.PAGES / "replay.mjs"
+    command = ["node", script, module, scene, actions, out, image]
+    subprocess.run(command, check=True)
+    replayed = json.loads(out.read_text())
+    grey = np.frombuffer(image.read_bytes(), np.uint8).astype(int)
+    return {
+        "name": name,
+        "version": replayed["version"],
+        "python": {key: np.array(value) for key, value in played.items()},
+        "browser": {
+            key: np.array(value)
+            for key, value in replayed.items()
+            if isinstance(value, list)
+        },
+        "image": np.abs(grey - drawn(replayed["line"]).ravel()).max(),
+    }
+
+
+def play(policy: str, steps: int) -> dict[str, list]:
+    """Heads, forces and times of an episode of the suite."""
+    player = load_policy(policy, SEED)
+    kwargs = {"random": SEED, "observation": player.observation or "tracking"}
+    env = suite.load("cathsim", TASK, kwargs)
+    act = as_function(player, env, SEED)
+    timestep = env.reset()
+    names = ("action", "head", "max", "peak_max", "push", "milliseconds")
+    kept: dict[str, list] = {name: [] for name in (*names, "success")}
+    while not timestep.last() and len(kept["head"]) < steps:
+        action = np.array(act(timestep), dtype=np.float64)
+        start = time.process_time()
+        timestep = env.step(action)
+        kept["milliseconds"].append(1e3 * (time.process_time() - start))
+        kept["action"].append(action.tolist())
+        kept["head"].append(env.task.readings.head.tolist())
+        kept["max"].append(float(env.task.wall_force.max))
+        kept["peak_max"].append(float(env.task.wall_force.peak_max))
+        kept["push"].append(float(env.task.readings.push_force))
+        kept["success"].append(env.task.termination == "success")
+    return kept
+
+
+def drawn(line: list) -> np.ndarray:
+    """The fluoroscopy of a device by the package, as the page draws it."""
+    surface = suite.make_task(TASK).scene.anatomy.surface
+    plane = Angiograph(surface.vertices, surface.faces, browser.FLUOROSCOPY).planes()[0]
+    return plane.render(np.array(line), browser.DEVICE_RADIUS)[..., 0].astype(int)
+
+
+def row(each: dict) -> dict:
+    """The figures of an episode."""
+    python, page = each["python"], each["browser"]
+    apart = 1e3 * np.linalg.norm(python["head"] - page["head"], axis=1)
+    force = 1e3 * np.abs(python["peak_max"] - page["peak_max"])
+    spent = page["processor_milliseconds"]
+    return {
+        "name": each["name"],
+        "steps": len(apart),
+        "success": [bool(python["success"][-1]), bool(page["success"][-1])],
+        "head_mm": [float(np.median(apart)), float(apart.max()), float(apart[-1])],
+        "largest_mN": [
+            float(1e3 * python["peak_max"].max()),
+            float(1e3 * page["peak_max"].max()),
+        ],
+        "force_difference_mN": [float(np.median(force)), float(force.max())],
+        "grey_levels": int(each["image"]),
+        "milliseconds": [float(np.median(spent)), float(np.quantile(spent, 0.95))],
+        "python_milliseconds": float(np.median(python["milliseconds"])),
+    }
+
+
+def draw(measured: list[dict], path: Path) -> None:
+    """Tip path, distance of the tips and force of every episode."""
+    figure = Picture(figsize=(11, 2.5 * len(measured)), layout="constrained", dpi=100)
+    axes = figure.subplots(
+        len(measured), 3, squeeze=False, width_ratios=[0.8, 1.2, 1.2]
+    )
+    for line, each in zip(axes, measured, strict=True):
+        python, page = each["python"], each["browser"]
+        time_s = 0.04 * np.arange(1, len(python["head"]) + 1)
+        for heads, dashes in ((python, "-"), (page, "--")):
+            colour = COLOURS[0] if dashes == "-" else COLOURS[1]
+            label = "Python" if dashes == "-" else "WebAssembly"
+            x, _, z = 1e3 * heads["head"].T
+            line[0].plot(x, z, dashes, color=colour, lw=1.8, label=label)
+            peak = 1e3 * heads["peak_max"]
+            line[2].plot(time_s, peak, dashes, color=colour, lw=1.4, label=label)
+        apart = 1e3 * np.linalg.norm(python["head"] - page["head"], axis=1)
+        line[1].semilogy(time_s, np.maximum(apart, 1e-15), color="0.25", lw=1.4)
+        line[1].set_ylim(1e-15, 10)
+        line[0].set_aspect("equal", adjustable="datalim")
+        line[0].set_title(each["name"], fontsize=10, loc="left")
+        line[0].set(xlabel="x of the head, mm", ylabel="z, mm")
+        line[1].set(xlabel="time, s", ylabel="heads apart, mm")
+        line[2].set(xlabel="time, s", ylabel="largest contact, mN")
+        for one in line:
+            tidy(one)
+    axes[0, 0].legend(frameon=False, fontsize=8)
+    figure.savefig(path)
+
+
+def write_table(values: dict, page: Path) -> None:
+    """Put the figures into the page, between its two marks."""
+    lines = [
+        f"Measured on {values['date']}, {os.cpu_count()} shared cores, `{TASK}`, seed "
+        f"{SEED}; MuJoCo {values['python']} in Python, {values['webassembly']} in "
+        "WebAssembly (Node.js). A control step is 40 ms; times are of the processor.",
+        "",
+        "| episode | control steps | heads apart, mm: median / largest / at the end "
+        "| largest contact, mN: Python / WebAssembly | control step, ms: median / 95 % "
+        "| the same in Python, ms |",
+        "|---|---|---|---|---|---|",
+    ]
+    for each in values["episodes"]:
+        apart = " / ".join(f"{value:.2g}" for value in each["head_mm"])
+        force = " / ".join(f"{value:.2f}" for value in each["largest_mN"])
+        spent = " / ".join(f"{value:.1f}" for value in each["milliseconds"])
+        lines.append(
+            f"| {each['name']} | {each['steps']} | {apart} | {force} | {spent} | "
+            f"{each['python_milliseconds']:.1f} |"
+        )
+    text = page.read_text()
+    before, rest = text.split(_BEGIN)
+    after = rest.split(_END)[1]
+    page.write_text("\n".join([before + _BEGIN, *lines, _END + after]))
+
+
+if __name__ == "__main__":
+    main()

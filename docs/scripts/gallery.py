@@ -1,0 +1,105 @@
+"""The grid of clips in README and docs/gallery.md, each with the command behind it.
+
+    python docs/scripts/gallery.py [NAME …]
+
+Writes docs/images/gallery/NAME.webp, all of them or those that are named, and the page.
+Needs no OpenGL; the same seeds give the same clips.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import sys
+from pathlib import Path
+
+from cathsim_dmc.agents import load_policy  # before anything of dm_control
+
+import cathsim_dmc  # isort: skip
+from cathsim_dmc import suite  # isort: skip
+from cathsim_dmc.pictures.animation import animate  # isort: skip
+
+DOCS = Path(__file__).parents[1]
+FOLDER = DOCS / "images" / "gallery"
+LIMIT = 3_000_000  # bytes, all clips together
+WIDTH, FRAMES, QUALITY, COLUMNS = 400, 36, 50, 3
+EVALUATION = 1_000_000
+
+
+@dataclasses.dataclass(frozen=True)
+class Clip:
+    """A film of an episode, as `cathsim record` makes it."""
+
+    name: str
+    caption: str
+    policy: str
+    task: str
+    seed: int
+    steps: int | None = None
+    own_task: bool = False  # the policy's own, which the command need not name
+
+    @property
+    def command(self) -> str:
+        parts = ["cathsim record", self.policy]
+        parts += [] if self.own_task else [f"--task {self.task}"]
+        parts += [f"--seed {self.seed}"] if self.seed != EVALUATION else []
+        parts += [f"--max-steps {self.steps}"] if self.steps else []
+        return " ".join([*parts, f"--gif {self.name}.webp"])
+
+
+def _shipped(task: str, caption: str) -> Clip:
+    return Clip(task, caption, f"pretrained:{task}", task, EVALUATION, own_task=True)
+
+
+CLIPS = (
+    _shipped("type1_bca", "PPO, Type I, brachiocephalic artery"),
+    _shipped("type1_lcca", "PPO, Type I, left common carotid"),
+    _shipped("type2_lcca", "PPO, Type II, left common carotid"),
+    Clip(
+        "femoral", "Expert from the groin, Type III", "expert", "femoral_type3_lcca", 1
+    ),
+    Clip("bovine", "Expert, bovine arch", "expert", "femoral_bovine_lcca", 1),
+    Clip("jam", "A straight push passes and jams", "push", "type1_lcca", 0, 120),
+)
+
+
+def main() -> None:
+    FOLDER.mkdir(exist_ok=True)
+    for clip in CLIPS:
+        if len(sys.argv) > 1 and clip.name not in sys.argv[1:]:
+            continue
+        policy = load_policy(clip.policy, clip.seed)
+        kwargs = {"observation": policy.observation or "tracking"}
+        env = suite.load("cathsim", clip.task, kwargs)
+        episode = cathsim_dmc.record(
+            env, policy, seed=clip.seed, max_steps=clip.steps, task_name=clip.task
+        )
+        path = FOLDER / f"{clip.name}.webp"
+        surface = env.task.scene.anatomy.surface
+        options = {"frames": FRAMES, "width": WIDTH, "quality": QUALITY}
+        animate(episode, surface, path, **options)
+        size = path.stat().st_size / 1e3
+        print(f"{path.name}: {size:.0f} kB, {episode.termination}", flush=True)
+    total = sum(path.stat().st_size for path in FOLDER.glob("*.webp"))
+    if total > LIMIT:
+        raise SystemExit(f"the clips have {total} bytes, more than {LIMIT}")
+    print(f"{total / 1e6:.2f} MB in all")
+
+
+def grid(folder: str) -> list[str]:
+    """The clips as a table of Markdown, with pictures under a folder."""
+    lines = []
+    for first in range(0, len(CLIPS), COLUMNS):
+        row = CLIPS[first : first + COLUMNS]
+        cells = [f"![{clip.caption}]({folder}/{clip.name}.webp)" for clip in row]
+        words = [f"{clip.caption}<br>`{clip.command}`" for clip in row]
+        if not first:
+            lines += ["| " + " | ".join(cells) + " |", "|---" * COLUMNS + "|"]
+        else:
+            lines.append("| " + " | ".join(cells) + " |")
+        lines.append("| " + " | ".join(words) + " |")
+    return lines
+
+
+if __name__ == "__main__":
+    main()
+    print("\n".join(grid("images/gallery")))

@@ -1,0 +1,142 @@
+"""The pages in the browser: what they are made of, and what they compute."""
+
+import importlib.util
+import json
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+ROOT = Path(__file__).parents[1]
+PAGES = ROOT / "docs" / "browser"
+# Told where npm's packages are: `npm ci` in a copy of docs/browser.
+needs_node = pytest.mark.skipif(shutil.which("npm") is None, reason="needs Node.js")
+CHROMIUM = shutil.which("chromium")
+
+
+def test_everything_from_npm_has_a_version_and_a_checksum():
+    package = json.loads((PAGES / "package.json").read_text())
+    wanted = {**package["dependencies"], **package["devDependencies"]}
+    locked = json.loads((PAGES / "package-lock.json").read_text())["packages"]
+    del locked[""]
+    for name, version in wanted.items():
+        assert re.fullmatch(r"\d+\.\d+\.\d+", version), f"{name} is not pinned"
+        assert locked[f"node_modules/{name}"]["version"] == version
+    for name, entry in locked.items():
+        assert entry["integrity"].startswith("sha512-"), name
+        assert "resolved" not in entry, f"{name} names the place it came from"
+
+
+def test_pages_load_nothing_from_elsewhere():
+    for path in (*PAGES.glob("*.html"), *PAGES.glob("*.js"), *PAGES.glob("*.css")):
+        assert "//" not in re.sub(r"^\s*//.*|\s// .*", "", path.read_text(), flags=re.M)
+
+
+def test_keys_do_what_those_of_the_window_do():
+    from cathsim_dmc.play.controls import BEND_RATE, COMMANDS
+
+    text = (PAGES / "controls.js").read_text()
+    commands = set(re.findall(r'(?:Key\w|Arrow\w+|Space): "(\w+)"', text))
+    assert commands == set(COMMANDS) - {"turn_left", "turn_right", "quit"}
+    assert f"const BEND_RATE = {BEND_RATE:g};" in text
+
+
+@pytest.fixture(scope="module")
+def builder():
+    """The script that makes what the pages need."""
+    spec = importlib.util.spec_from_file_location(
+        "browser", ROOT / "docs" / "scripts" / "browser.py"
+    )
+    script = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(script)
+    return script
+
+
+@pytest.fixture(scope="module")
+def scene(builder, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("scenes") / "type1_lcca"
+    builder.write_scene("type1_lcca", folder)
+    return folder
+
+
+@pytest.mark.slow
+@needs_node
+def test_webassembly_moves_and_draws_as_python_does(builder, scene, tmp_path):
+    from cathsim_dmc import suite
+    from cathsim_dmc.imaging.angiograph import Angiograph
+
+    rng = np.random.RandomState(0)
+    actions = rng.uniform(-1, 1, (25, 21))
+    actions[:, 20] = 1.0  # on into the arch
+    (tmp_path / "actions.json").write_text(json.dumps(actions.tolist()))
+    module = builder.install(production=True) / "@mujoco" / "mujoco" / "mujoco.js"
+    out, image = tmp_path / "out.json", tmp_path / "image.bin"
+    command = ["node", PAGES / "replay.mjs", module, scene, tmp_path / "actions.json"]
+    subprocess.run([*command, out, image], check=True)
+    page = json.loads(out.read_text())
+    env = suite.load("cathsim", "type1_lcca", {"random": builder.SEED})
+    env.reset()
+    heads, forces = [], []
+    for action in actions:
+        env.step(action)
+        heads.append(env.task.readings.head)
+        forces.append(float(env.task.wall_force.peak_max))
+    # Until a contact is found otherwise they agree to the last digits of a float64;
+    # two versions of MuJoCo find some otherwise.
+    apart = np.linalg.norm(np.array(heads) - page["head"], axis=1)
+    assert np.median(apart) < 1e-9 and apart.max() < 0.5e-3
+    assert max(forces) > 0.0
+    np.testing.assert_allclose(page["peak_max"], forces, atol=0.02)
+    surface = env.task.scene.anatomy.surface
+    options = builder.FLUOROSCOPY
+    plane = Angiograph(surface.vertices, surface.faces, options).planes()[0]
+    drawn = plane.render(np.array(page["line"]), builder.DEVICE_RADIUS)[..., 0]
+    grey = np.frombuffer(image.read_bytes(), np.uint8).reshape(drawn.shape)
+    assert np.abs(grey.astype(int) - drawn).max() <= 1
+    assert grey.std() > 1
+
+
+@pytest.mark.slow
+@needs_node
+@pytest.mark.skipif(CHROMIUM is None, reason="needs Chromium")
+def test_a_visitor_steers(builder, scene, tmp_path):
+    site = tmp_path / "browser"
+    shutil.copytree(PAGES, site)
+    shutil.copytree(scene, site / "scenes" / "type1_lcca")
+    (site / "scenes" / "scenes.json").write_text('["type1_lcca"]')
+    builder.write_mujoco(site / "vendor")
+    modules = builder.install()
+    server = subprocess.Popen(
+        [sys.executable, "-u", "-m", "http.server", "0", "--bind", "127.0.0.1"],
+        cwd=site,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.DEVNULL,
+        text=True,
+    )
+    try:
+        port = re.search(r"port (\d+)", server.stdout.readline()).group(1)
+        picture = tmp_path / "page.png"
+        address = f"http://127.0.0.1:{port}/steer.html"
+        visit = ["node", PAGES / "visit.mjs", modules, address, picture]
+        done = subprocess.run(
+            [*visit, "KeyW:2", "KeyW+ArrowRight:1"],
+            capture_output=True,
+            text=True,
+            check=False,
+        )
+    finally:
+        server.terminate()
+        server.wait()
+    assert done.returncode == 0, done.stderr[-3000:]
+    seen = json.loads(done.stdout)
+    assert not seen["errors"]
+    assert seen["seconds"] > 0.5
+    # It was pushed at 40 mm/s for about as long as it was simulated.
+    assert (
+        0.3 * 0.04 * seen["seconds"] < seen["inserted"] < 0.04 * seen["seconds"] + 0.01
+    )
+    assert picture.stat().st_size > 50_000

@@ -1,0 +1,95 @@
+"""A task as files: another program that steps the scene gets what the task gets."""
+
+import json
+
+import mujoco
+import numpy as np
+import pytest
+from lxml import etree
+
+from cathsim_dmc import suite
+from cathsim_dmc.simulation.mjcf import write_mjcf
+from cathsim_dmc.tasks import forces
+
+TASK, SEED, STEPS = "type1_lcca", 3, 30
+
+
+@pytest.fixture(scope="module")
+def exported(tmp_path_factory):
+    return write_mjcf(TASK, tmp_path_factory.mktemp("mjcf") / "scene", seed=SEED)
+
+
+def actions():
+    rng = np.random.RandomState(0)
+    drawn = rng.uniform(-1, 1, (STEPS, 21))
+    drawn[:, :20] *= 0.5
+    drawn[:, 20] = 1.0  # onto the wall of the arch
+    return drawn
+
+
+def test_the_scene_moves_as_the_task_bit_for_bit(exported):
+    task = json.loads((exported / "task.json").read_text())
+    model = mujoco.MjModel.from_xml_path(str(exported / "scene.xml"))
+    data = mujoco.MjData(model)
+    data.qpos[:] = task["qpos"]
+    mujoco.mj_forward(model, data)
+    env = suite.load("cathsim", TASK, task_kwargs={"random": SEED})
+    env.reset()
+    order = [model.actuator(name).id for name in task["actuators"]]
+    contacts = model.sensor(task["sensors"]["wall_contacts"])
+    row = slice(contacts.adr[0], contacts.adr[0] + contacts.dim[0])
+    assert contacts.dim[0] % task["contact_size"] == 0
+    touched = 0
+    for action in actions():
+        data.ctrl[order] = np.clip(action, -1, 1)
+        for _ in range(task["substeps"]):
+            mujoco.mj_step(model, data)
+        env.step(action)
+        line = [data.body(name).xpos for name in task["links"]]
+        line.append(data.site(task["head"]).xpos)
+        np.testing.assert_array_equal(line, env.task.readings.centreline)
+        found = forces.Contacts.from_sensor(data.sensordata[row])
+        assert found.magnitude.max() == env.task.wall_force.max
+        touched += found.present.any()
+    assert touched > 5
+    insertion = data.joint(task["insertion"]).qpos[0]
+    assert insertion == env.task.readings.insertion > 0.03
+    push = model.sensor(task["sensors"]["push_force"]).adr[0] + 2
+    assert data.sensordata[push] == env.task.readings.push_force
+    cell = model.sensor(task["sensors"]["load_cell"]).adr[0]
+    load = -data.sensordata[cell : cell + 3]
+    np.testing.assert_array_equal(load, env.task.readings.load_cell)
+
+
+def test_older_versions_of_mujoco_can_read_the_scene(exported):
+    # The WebAssembly build is of 3.14, whose schema knows no class of a texture.
+    tree = etree.parse(str(exported / "scene.xml"))
+    textures = list(tree.iter("texture"))
+    assert textures and not any("class" in one.attrib for one in textures)
+
+
+def test_what_success_is_stands_beside_the_scene(exported):
+    task = json.loads((exported / "task.json").read_text())
+    objective = suite.make_task(TASK).objective
+    assert task["goal"]["radius"] == objective.goal_radius
+    np.testing.assert_array_equal(task["goal"]["position"], objective.goal)
+    np.testing.assert_array_equal(task["branch"]["points"], objective.branch.points)
+    assert task["branch"]["ostium"] == objective.ostium
+    assert task["substeps"] * 0.004 == pytest.approx(task["control_timestep"])
+
+
+def test_what_cannot_be_written_is_refused_before(tmp_path):
+    with pytest.raises(ValueError, match="no task 'type9'"):
+        write_mjcf("type9", tmp_path / "a")
+    with pytest.raises(FileExistsError, match="exists"):
+        write_mjcf(TASK, tmp_path)
+    with pytest.raises(ValueError, match="pool=1"):
+        write_mjcf("arch_bca", tmp_path / "b", task_kwargs={"pool": 2})
+    assert not list(tmp_path.iterdir())
+
+
+def test_equal_pieces_of_a_wall_are_no_trouble(tmp_path):
+    """Those of the straight arches repeat; the scene stays one file."""
+    folder = write_mjcf("simple1_bca", tmp_path / "scene")
+    assert sorted(path.name for path in folder.iterdir()) == ["scene.xml", "task.json"]
+    assert mujoco.MjModel.from_xml_path(str(folder / "scene.xml")).nmesh > 100
