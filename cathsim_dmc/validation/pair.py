@@ -34,7 +34,7 @@ SHAPES = (
 )
 # Largest step of the free end as one device slides in the other, in that of the curve:
 # a chain whose hinges jumped one after the other would make several at once.
-STEP_BOUND = 1.5
+STEP_BOUND = 1.1
 _FINE = 0.05e-3  # m, of the curve that is integrated
 
 
