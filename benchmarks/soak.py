@@ -28,7 +28,7 @@ import itertools
 import json
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -117,9 +117,13 @@ class Episode:
     seed: int
 
 
-def plan(episodes: int) -> list[Episode]:
+def plan(
+    episodes: int,
+    tasks: Sequence[str] = TASKS,
+    policies: Sequence[str] = tuple(POLICIES),
+) -> list[Episode]:
     """Spreads episodes evenly over tasks and policies."""
-    pairs = itertools.cycle(itertools.product(POLICIES, TASKS))
+    pairs = itertools.cycle(itertools.product(policies, tasks))
     counts: dict[tuple[str, str], int] = {}
     result = []
     for number, (policy, task) in zip(range(episodes), pairs, strict=False):
@@ -379,14 +383,19 @@ def main() -> int:
     parser.add_argument("--threads", type=int, default=0, help="0: one per core")
     parser.add_argument("--together", type=int, default=8, help="episodes side by side")
     parser.add_argument("--json", action="store_true")
+    parser.add_argument("--task", action="append", help="repeated for several")
+    parser.add_argument(
+        "--policy", action="append", choices=list(POLICIES), help="repeated likewise"
+    )
     options = parser.parse_args()
     episodes = options.episodes or (QUICK_EPISODES if options.quick else EPISODES)
     steps = options.steps or (QUICK_STEPS if options.quick else STEPS)
     options.out.mkdir(parents=True, exist_ok=True)
     path = options.out / "episodes.jsonl"
-    wanted = plan(episodes)
+    tasks = options.task or TASKS
+    wanted = plan(episodes, tasks, options.policy or tuple(POLICIES))
     done = {row["number"] for row in read_rows(path, steps)}
-    for task in TASKS:
+    for task in tasks:
         missing = [e for e in wanted if e.task == task and e.number not in done]
         for first in range(0, len(missing), options.together):
             part = missing[first : first + options.together]

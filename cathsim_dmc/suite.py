@@ -13,7 +13,6 @@ import dataclasses
 import inspect
 import sys
 from collections.abc import Callable, Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -21,19 +20,17 @@ from dm_control import composer
 from dm_control import suite as dm_suite
 from dm_control.utils import containers
 
-from cathsim_dmc import bounds
 from cathsim_dmc.anatomy import Anatomy, Goal
-from cathsim_dmc.entities import devices
 from cathsim_dmc.tasks import placement
+from cathsim_dmc.tasks.anatomies import load_anatomy, load_arches
 from cathsim_dmc.tasks.config import NavigationConfig
 from cathsim_dmc.tasks.environment import Environment
 from cathsim_dmc.tasks.navigation import Navigation
 from cathsim_dmc.tasks.objectives import Cannulation, Objective
-from cathsim_dmc.tasks.scene import Scene
+from cathsim_dmc.tasks.scene import Scene, chosen_devices, longest_tip
 
 DOMAIN = "cathsim"
 SUITE = containers.TaggedTasks()
-POOL = 16  # arches that an episode draws from, unless one says otherwise
 
 # Constants of dm_control.suite that are computed from its domains at import.
 _TAGGED = {"BENCHMARKING": "benchmarking", "EASY": "easy", "HARD": "hard"}
@@ -165,7 +162,7 @@ def _one_length(
     """The configuration with a device as long as the farthest goal needs."""
     if len(anatomies) == 1 or config.working_length is not None:
         return config
-    device, shift = devices.get(config.device), config.ranges.farthest_shift
+    device, shift = longest_tip(chosen_devices(config)), config.ranges.farthest_shift
     longest = max(
         placement.place_device(anatomy, goal, device, None, shift).working_length
         for anatomy, goal in zip(anatomies, goals, strict=True)
@@ -230,72 +227,6 @@ def load(
         dict(environment_kwargs) if environment_kwargs else None,
         visualize_reward,
     )
-
-
-def load_anatomy(anatomy: str | Path | Anatomy, access: str = "ascending") -> Anatomy:
-    """Returns an anatomy: itself, a phantom by name, or one saved in a directory.
-
-    Args:
-      anatomy: Anatomy, name in `anatomy.phantoms.PHANTOMS`, or directory.
-      access: Where the device enters a phantom, "ascending" or "descending"; an
-        anatomy or a directory has its own inlet.
-
-    Raises:
-      ValueError: if there is none; lists the names.
-    """
-    if isinstance(anatomy, Anatomy):
-        return anatomy
-    from cathsim_dmc.anatomy import phantoms
-
-    if not isinstance(anatomy, str | Path):
-        bounds.refuse("anatomy", anatomy, "an Anatomy, a name or a directory")
-    if str(anatomy) in phantoms.PHANTOMS:
-        return phantoms.load(str(anatomy), access=access)
-    if not Path(anatomy).is_dir():
-        raise ValueError(
-            f"no anatomy at {str(anatomy)!r}; give a directory written by `cathsim "
-            f"phantom import` or `generate`, or one of {', '.join(phantoms.PHANTOMS)}"
-        )
-    return Anatomy.load(anatomy)
-
-
-def load_arches(
-    arches: str = "train",
-    pool: int = POOL,
-    first: int = 0,
-    *,
-    access: str = "ascending",
-) -> list[Anatomy]:
-    """Random arches of a named set, in the order of their seeds; see `arch_set`.
-
-    Args:
-      arches: Name of the set: "train", "test" or "test_variants".
-      pool: Number of arches; building one takes about a second and a half.
-      first: Number in the set of the first one.
-      access: Where the device enters, "ascending" or "descending".
-
-    Raises:
-      ValueError: if there is no such set, it has no such arches, or one of them
-        cannot be entered.
-    """
-    from cathsim_dmc.anatomy.arch import arch
-
-    seeds = arch.arch_set(arches)
-    whole = all(isinstance(number, int | np.integer) for number in (pool, first))
-    if not whole or pool < 1 or not 0 <= first <= len(seeds) - pool:
-        raise ValueError(
-            f"pool is {pool!r} and first is {first!r}; {arches!r} has {len(seeds)} "
-            "arches, numbered from 0: give whole numbers, pool of at least 1 and first "
-            f"+ pool of at most {len(seeds)}"
-        )
-    found = [arch.build_seed(seed, access=access) for seed in seeds[first:][:pool]]
-    closed = [a.name for a in found if placement.sheath_direction(a) is None]
-    if closed:
-        raise ValueError(
-            f"no sheath fits before the inlet of {', '.join(closed)}, whose aorta "
-            "bends back across it; give another first, or a smaller pool"
-        )
-    return found
 
 
 def environment(task: Navigation, **environment_kwargs: Any) -> composer.Environment:
@@ -401,9 +332,34 @@ def _register_random() -> None:
             )
 
 
+def _register_coaxial() -> None:
+    """Beside each of them, with a guidewire alone and with one in a catheter."""
+    for name, definition in list(TASKS.items()):
+        for suffix, (chosen, words) in _COAXIAL.items():
+            register(
+                f"{name}_{suffix}",
+                dataclasses.replace(
+                    definition,
+                    description=f"{definition.description.rstrip('.')}, {words}.",
+                    options={**definition.options, "devices": chosen},
+                ),
+                "hard",
+            )
+
+
+# Devices of the tasks with that suffix, from the innermost outwards.
+_COAXIAL = {
+    "wire": (("wire_035_glide",), "with a guidewire that is pushed and turned"),
+    "pair": (
+        ("wire_035_glide", "berenstein_5f"),
+        "with a guidewire in a catheter, both pushed and turned",
+    ),
+}
+
 _register_published()
 _register_femoral()
 _register_random()
+_register_coaxial()
 register(
     "navigate",
     TaskDefinition("Any anatomy, such as an imported scan: reach a goal.", None, None),

@@ -9,7 +9,8 @@ from dm_control import mjcf
 
 from cathsim_dmc.entities import devices
 from cathsim_dmc.entities.arena import AngiographyArena
-from cathsim_dmc.entities.catheter import (
+from cathsim_dmc.entities.catheter import Catheter
+from cathsim_dmc.entities.chain import (
     BENDING_RELAXATION_TIME,
     CARRIAGE_MASS,
     HINGE_ARMATURE,
@@ -17,7 +18,6 @@ from cathsim_dmc.entities.catheter import (
     MAX_PUSH_SPEED,
     ROTOR_INERTIA,
     TORSION_ARMATURE,
-    Catheter,
 )
 
 STEERABLE = ("steerable_5f", "steerable_4f")

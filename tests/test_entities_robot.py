@@ -143,13 +143,18 @@ def test_posture_broadcasts_over_batch_axes():
         )
 
 
-def test_guidewire_unit_follows_its_own_device_when_told():
-    same = follower_posture(0.1, 1.0)
+def test_rear_clamps_and_guidewire_unit_follow_a_guidewire_of_its_own():
+    both = follower_posture(0.1, 1.0)
     own = follower_posture(0.1, 1.0, guidewire_insertion=0.15, guidewire_rotation=-2.0)
-    changed = {NAMES[i] for i in np.flatnonzero(same != own)}
-    assert changed == {name for name in NAMES if name.startswith("guidewire_")} - {
-        "guidewire_platform"
-    }
+    changed = {name for name, a, b in zip(NAMES, both, own, strict=True) if a != b}
+    kept = {name for name in NAMES if name.startswith("front_")}
+    # The catheter unit stays half-way between the clamps, and rolls on the catheter.
+    assert changed.isdisjoint(kept | {"catheter_ring", "catheter_pinion"})
+    assert {"rear_platform", "guidewire_ring", "catheter_platform"} <= changed
+    rear = [name for name in NAMES if name.startswith(("rear_", "guidewire_"))]
+    alone = follower_posture(0.15, -2.0)
+    for name in rear:
+        assert own[COLUMN[name]] == alone[COLUMN[name]]
     assert own[COLUMN["guidewire_ring"]] == -2.0
 
 

@@ -90,12 +90,23 @@ class Contract(test_utils.EnvironmentTestMixin):
         self.assertIn(True, [step.last() for step in steps])
 
 
+# What stands for all of them in a hurry: each access, each kind of anatomy and devices.
+QUICK = (
+    "simple1_bca",
+    "type1_lcca",
+    "femoral_type2_bca",
+    "arch_lcca",
+    "type1_lcca_wire",
+    "femoral_type1_lcca_pair",
+)
+
 # One class for every registered task, those of the future included.
 for _name in suite.SUITE:
     _class = f"TestContract{_name.title().replace('_', '')}"
-    globals()[_class] = type(
-        _class, (Contract, absltest.TestCase), {"task_name": _name}
-    )
+    _test = type(_class, (Contract, absltest.TestCase), {"task_name": _name})
+    if _name not in QUICK:
+        _test = pytest.mark.slow(_test)
+    globals()[_class] = _test
 
 
 # The sweep over tasks.

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from cathsim_dmc.entities import devices
-from cathsim_dmc.entities.catheter import MAX_ROTATION_SPEED
+from cathsim_dmc.entities.chain import MAX_ROTATION_SPEED
 from cathsim_dmc.validation import rod
 from cathsim_dmc.validation.rig import Rig
 

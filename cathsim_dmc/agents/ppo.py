@@ -76,7 +76,7 @@ class PPOConfig(TrainingConfig):
     presets: ClassVar[Mapping[str, Mapping[str, Any]]] = {
         "published": {},
         "demo": {**_LARGE_BATCHES, "anneal": True},
-        # Found on type1_lcca, see docs/results.md: episodes that are short and start
+        # Found on type1_lcca, see docs/training.md: episodes that are short and start
         # anywhere along the route, the way through the lumen as reward, and noise
         # that bends the whole tip for a while.
         "tuned": {

@@ -58,7 +58,7 @@ class SACConfig(TrainingConfig):
     presets: ClassVar[Mapping[str, Mapping[str, Any]]] = {
         "published": {},
         "demo": {"num_envs": 32, "updates_per_frame": 0.25},
-        # Found on type1_lcca (docs/results.md): reward, episodes and starts of PPO's.
+        # Found on type1_lcca (docs/training.md): reward, episodes and starts of PPO's.
         # The weight of the entropy must start near the size of a step's reward (0.05):
         # at 0.1 and above the actions stay random for tens of thousands of frames.
         "tuned": {
@@ -69,7 +69,7 @@ class SACConfig(TrainingConfig):
             "training_reward": {"path": -1.0, "success": 10.0},
             "training_max_steps": 120,
             "training_start": (0.0, 0.9),
-            "total_frames": 100_000,
+            "total_frames": 60_000,
         },
     }
 

@@ -186,11 +186,15 @@ def _ends(step: Step, number: int, resting: np.ndarray, limit: Limit) -> dict[in
 
 
 def tasks() -> tuple[str, ...]:
-    """Names of the registered tasks whose anatomy and goal are theirs."""
+    """Names of the registered tasks of a steerable device with an anatomy and a goal.
+
+    How hard a task is with coaxial devices is another question: nothing steers them.
+    """
     return tuple(
         name
         for name, definition in suite.TASKS.items()
-        if definition.anatomy is not None or definition.random_arch
+        if (definition.anatomy is not None or definition.random_arch)
+        and "devices" not in definition.options
     )
 
 

@@ -31,15 +31,20 @@ app.command(name="train")(training.command([]))
 
 
 @app.command(name="list")
-def list_tasks(json: bool = False) -> int:
-    """List the tasks, with one line each.
+def list_tasks(devices: bool = False, json: bool = False) -> int:
+    """List the tasks, with one line each, or the devices and what they are made of.
 
     Args:
+        devices: Whether to list the devices in place of the tasks.
         json: Whether to print JSON instead of a table.
     """
     from rich.console import Console
     from rich.table import Table
 
+    if devices:
+        from cathsim_dmc.cli import devices as library
+
+        return library.show(json)
     from cathsim_dmc import suite
 
     lines = {name: make.__doc__.splitlines()[0] for name, make in suite.SUITE.items()}

@@ -1,4 +1,4 @@
-"""`cathsim validate rod`, `wall`, `forces`; `benchmark speed`, `difficulty`."""
+"""`cathsim validate rod`, `pair`, `wall`, `forces`; `benchmark speed`, `difficulty`."""
 
 import sys
 from json import dumps
@@ -29,6 +29,19 @@ def rod(figure: Path | None = None, json: bool = False) -> int:
     from cathsim_dmc import validation
 
     return show(validation.validate_rod(figure), json)
+
+
+@validations.command
+def pair(figure: Path | None = None, json: bool = False) -> int:
+    """Devices in each other: bending, shape, buckling, sliding and torque.
+
+    Args:
+        figure: Path of a PNG to draw the comparison into.
+        json: Whether to print one JSON object and nothing else.
+    """
+    from cathsim_dmc import validation
+
+    return show(validation.validate_pair(figure), json)
 
 
 @validations.command

@@ -1,4 +1,4 @@
-"""Endovascular devices: what a catheter or guidewire is made of, in SI units."""
+"""The library of endovascular devices, and how a device is divided into links."""
 
 import dataclasses
 import math
@@ -7,136 +7,21 @@ import warnings
 import numpy as np
 
 from cathsim_dmc import bounds
+from cathsim_dmc.entities.device import Arc, Device, Section
+from cathsim_dmc.imaging import materials
 
-_MOST_LINKS = 200
 FRENCH = 1e-3 / 3.0  # m of outer diameter per French
 INCH = 25.4e-3  # m
 
 POLYMER_DENSITY = 1100.0  # kg/m^3, braided polyamide or Pebax shaft
 NITINOL_DENSITY = 6450.0  # kg/m^3
+NITINOL_MODULUS = 48e9  # Pa, austenite in bending
+POLYURETHANE_DENSITY = 1200.0  # kg/m^3, jacket of a hydrophilic wire, unfilled
 POLYMER_POISSON_RATIO = 0.4
 METAL_POISSON_RATIO = 0.33
-
-
-@dataclasses.dataclass(frozen=True)
-class Section:
-    """A stretch of uniform rod.
-
-    Attributes:
-      bending_stiffness: EI in N·m².
-      torsional_stiffness: GJ in N·m².
-    """
-
-    bending_stiffness: float
-    torsional_stiffness: float
-
-    def __post_init__(self):
-        for field in dataclasses.fields(self):
-            value = getattr(self, field.name)
-            try:
-                bounds.number(field.name, value, positive=True)
-            except ValueError as error:
-                raise ValueError(f"{error}, in N·m² (1 N·mm² = 1e-6 N·m²)") from error
-
-    @classmethod
-    def isotropic(cls, bending_stiffness: float, poisson_ratio: float) -> "Section":
-        """A round section of one isotropic material: GJ = EI / (1 + ν)."""
-        return cls(bending_stiffness, bending_stiffness / (1 + poisson_ratio))
-
-
-@dataclasses.dataclass(frozen=True)
-class Arc:
-    """A circular arc of a pre-shaped tip.
-
-    Attributes:
-      radius: radius of curvature of the centreline, m.
-      angle: turning angle, rad; the sign is the side to which it turns.
-    """
-
-    radius: float
-    angle: float
-
-    def __post_init__(self):
-        bounds.number("radius", self.radius, positive=True)
-        bounds.number("angle", self.angle)
-
-    @property
-    def length(self) -> float:
-        """Length along the centreline, m."""
-        return abs(self.radius * self.angle)
-
-
-@dataclasses.dataclass(frozen=True)
-class Device:
-    """A catheter or guidewire.
-
-    Attributes:
-      name: key in `DEVICES`.
-      outer_radius: m.
-      linear_density: mass per length, kg/m.
-      shaft: section proximal of the tip.
-      tip: section of the distal `tip_length`.
-      tip_length: m.
-      tip_links: rigid links that the tip is divided into.
-      steering_angle: largest angle that the motor of one tip joint bends it by
-        when nothing else loads it, rad. 0 makes a passive device without motors.
-      tip_shape: arcs of the unloaded shape, from proximal to distal; they end at
-        the distal end and bend in the local x-z plane.
-    """
-
-    name: str
-    outer_radius: float
-    linear_density: float
-    shaft: Section
-    tip: Section
-    tip_length: float = 0.07
-    tip_links: int = 10
-    steering_angle: float = 0.0
-    tip_shape: tuple[Arc, ...] = ()
-
-    def __post_init__(self):
-        bounds.instance("name", self.name, str)
-        of_device = f"of device {self.name!r}"
-        for name in ("outer_radius", "linear_density", "tip_length"):
-            bounds.number(f"{name} {of_device}", getattr(self, name), positive=True)
-        bounds.whole(f"tip_links {of_device}", self.tip_links, 1, _MOST_LINKS)
-        for name in ("shaft", "tip"):
-            bounds.instance(f"{name} {of_device}", getattr(self, name), Section)
-        arcs = self.tip_shape
-        if not isinstance(arcs, tuple) or not all(isinstance(a, Arc) for a in arcs):
-            bounds.refuse(f"tip_shape {of_device}", arcs, "a tuple of Arc")
-        angle = f"steering_angle {of_device}"
-        if bounds.number(angle, self.steering_angle, 0.0) >= math.pi / 2:
-            bounds.refuse(angle, self.steering_angle, "in [0, π/2) rad for each joint")
-
-    @property
-    def steerable(self) -> bool:
-        """Whether the joints of the tip carry motors."""
-        return self.steering_angle > 0
-
-    @property
-    def axial_stiffness(self) -> float:
-        """EA of the shaft in N, as of a solid round rod: EA = 4 EI / r²."""
-        return 4 * self.shaft.bending_stiffness / self.outer_radius**2
-
-    def rest_angle(self, start: float, stop: float) -> float:
-        """Turning angle of the unloaded shape between two places.
-
-        Args:
-          start: distance from the distal end, m.
-          stop: distance from the distal end, m, at most `start`.
-
-        Returns:
-          The angle in rad that the centreline turns by from `start` to `stop`.
-        """
-        total, distal = 0.0, 0.0
-        for arc in reversed(self.tip_shape):
-            proximal = distal + arc.length
-            overlap = min(start, proximal) - max(stop, distal)
-            if overlap > 0:
-                total += math.copysign(overlap / arc.radius, arc.angle)
-            distal = proximal
-        return total
+# Friction of a hydrophilic coat against that of PTFE, which has half, as the coat has a
+# sixth, of that of bare steel (Schröder 1993).
+HYDROPHILIC = 1 / 3
 
 
 def _tube_density(outer: float, inner: float, density: float) -> float:
@@ -151,6 +36,16 @@ def _metal(bending_stiffness: float) -> Section:
     return Section.isotropic(bending_stiffness, METAL_POISSON_RATIO)
 
 
+# Sources, named by the devices below.
+_HARRISON = "EI: flexural modulus in three-point bending, Harrison 2011 (11-3592.1)"
+_STEERABLE_TUBE = (
+    "EI: 22.7 and 2.8 N·mm² of body and tip of a 1.33/0.8 mm steerable tube"
+)
+_FIVE_FRENCH = (
+    "EI: shaft between that tube's body (22.7 N·mm²) and an Amplatz wire (291), tip "
+    "that body's own; lumen 1.0 mm, for wires up to 0.038 inch"
+)
+
 # The device of the registered tasks: the published discretisation of the tip (ten links
 # over 7 cm, 20 motors) on a 5F body. The published stiffness equals a rod stiffer than
 # any metal, so real ones take its place: a shaft between the body of a steerable 4F
@@ -163,6 +58,8 @@ STEERABLE_5F = Device(
     shaft=_polymer(50e-6),
     tip=_polymer(22.7e-6),
     steering_angle=0.3,
+    inner_radius=0.5e-3,
+    source=_FIVE_FRENCH,
 )
 
 # A 1.33 mm / 0.8 mm steerable tube: 22.7 N·mm² body, 2.8 N·mm² tip.
@@ -173,6 +70,8 @@ STEERABLE_4F = Device(
     shaft=_polymer(22.7e-6),
     tip=_polymer(2.8e-6),
     steering_angle=0.3,
+    inner_radius=0.8e-3 / 2,
+    source=_STEERABLE_TUBE,
 )
 
 # J tip: an arc of 12.1 mm over 72 degrees.
@@ -183,6 +82,8 @@ DIAGNOSTIC_5F_J = Device(
     shaft=_polymer(50e-6),
     tip=_polymer(22.7e-6),
     tip_shape=(Arc(12.1e-3, math.radians(72)),),
+    inner_radius=0.5e-3,
+    source=f"{_FIVE_FRENCH}; arc of 12.1 mm over 72°",
 )
 
 # Simmons: arcs of 20, 20, 6 and 10 mm at -70, 20, 185 and -2 degrees up to the tip.
@@ -196,6 +97,46 @@ DIAGNOSTIC_5F_SIMMONS = dataclasses.replace(
         Arc(6e-3, math.radians(185)),
         Arc(10e-3, math.radians(-2)),
     ),
+    source=f"{_FIVE_FRENCH}; arcs of 20, 20, 6 and 10 mm over -70°, 20°, 185° and -2°",
+)
+
+
+def _straight(length: float) -> Arc:
+    """A stretch without a bend, as an arc of the largest radius that is one."""
+    return Arc(1e3, length / 1e3)
+
+
+_OUTLINE = "one bend, as the type has it; its size assumed, to some 10° and 2 mm"
+
+# A single bend near the end, the short one steep, the long one gentle: the catheters
+# that carotids are tried with first.
+BERENSTEIN_5F = dataclasses.replace(
+    DIAGNOSTIC_5F_J,
+    name="berenstein_5f",
+    tip_shape=(Arc(8e-3, math.radians(60)), _straight(8e-3)),
+    source=f"{_FIVE_FRENCH}; {_OUTLINE}: 60° over 8 mm, then 8 mm straight",
+)
+VERTEBRAL_5F = dataclasses.replace(
+    DIAGNOSTIC_5F_J,
+    name="vertebral_5f",
+    tip_shape=(Arc(18e-3, math.radians(45)), _straight(10e-3)),
+    source=f"{_FIVE_FRENCH}; {_OUTLINE}: 45° over 14 mm, then 10 mm straight",
+)
+
+# Distal part of a 2.1F tube of 0.021 inch lumen: I = π (R⁴ - r⁴) / 4 = 7.9e-15 m⁴, in
+# polyether block amides of the moduli on the data sheets of Pebax 5533 and 4033.
+MICROCATHETER_021 = Device(
+    name="microcatheter_021",
+    outer_radius=2.1 * FRENCH / 2,
+    linear_density=_tube_density(2.1 * FRENCH / 2, 0.021 * INCH / 2, POLYMER_DENSITY),
+    shaft=_polymer(170e6 * 7.9e-15),
+    tip=_polymer(77e6 * 7.9e-15),
+    tip_length=0.05,
+    tip_links=8,
+    inner_radius=0.021 * INCH / 2,
+    friction_ratio=HYDROPHILIC,
+    source="EI: E I of a 0.70/0.53 mm tube, flexural moduli 170 and 77 MPa (data "
+    "sheets of Pebax 5533 and 4033); friction: as a hydrophilic wire",
 )
 
 
@@ -209,6 +150,9 @@ def _guidewire(name: str, shaft: float) -> Device:
         # Floppy ends are an order of magnitude softer than their shafts.
         tip=_metal(shaft / 10),
         tip_shape=(Arc(12.1e-3, math.radians(72)),),
+        attenuation=materials.STEEL_WIRE,
+        marker_attenuation=materials.STEEL_WIRE,
+        source=f"{_HARRISON}; tip: a tenth, assumed",
     )
 
 
@@ -218,6 +162,62 @@ WIRE_035_HEAVY_DUTY = _guidewire("wire_035_heavy_duty", 400e-6)
 WIRE_035_EXTRA_STIFF = _guidewire("wire_035_extra_stiff", 895e-6)
 WIRE_035_SUPER_STIFF = _guidewire("wire_035_super_stiff", 1850e-6)
 WIRE_035_LUNDERQUIST = _guidewire("wire_035_lunderquist", 4860e-6)
+
+
+def _core(diameter: float) -> float:
+    """EI (N·m²) of a nitinol core."""
+    return NITINOL_MODULUS * math.pi * diameter**4 / 64
+
+
+# Length of the platinum coil at the end of a hydrophilic wire, m; assumed.
+_COIL = 10e-3
+
+
+def _hydrophilic_wire(
+    name: str,
+    outer: float,
+    cores: tuple[float, float],
+    bend: Arc,
+    tip_links: int,
+) -> Device:
+    """A jacketed wire with a nitinol core; its diameters in shaft and tip, m."""
+    shaft, tip = cores
+    jacket = _tube_density(outer / 2, shaft / 2, POLYURETHANE_DENSITY)
+    core = _tube_density(shaft / 2, 0.0, NITINOL_DENSITY)
+    return Device(
+        name=name,
+        outer_radius=outer / 2,
+        linear_density=core + jacket,
+        shaft=_metal(_core(shaft)),
+        tip=_metal(_core(tip)),
+        tip_length=0.03,
+        tip_links=tip_links,
+        tip_shape=(bend, _straight(4e-3)),
+        friction_ratio=HYDROPHILIC,
+        attenuation=materials.NITINOL_WIRE * (shaft / outer) ** 2,
+        marker_attenuation=materials.MARKER,
+        marker_length=_COIL,
+        source=f"EI: nitinol core (48 GPa) of {1e3 * shaft:.2g} mm, {1e3 * tip:.2g} mm "
+        "in the distal 30 mm, diameters assumed, jacket left out; friction: a third of "
+        "a PTFE-coated wire, Schröder 1993 (BF02602986)",
+    )
+
+
+# An angled glide wire, and a micro-wire for the 0.021 inch micro-catheter.
+WIRE_035_GLIDE = _hydrophilic_wire(
+    "wire_035_glide",
+    0.035 * INCH,
+    (0.50e-3, 0.28e-3),
+    Arc(8e-3, math.radians(45)),
+    tip_links=4,
+)
+WIRE_014_MICRO = _hydrophilic_wire(
+    "wire_014_micro",
+    0.014 * INCH,
+    (0.20e-3, 0.12e-3),
+    Arc(4e-3, math.radians(45)),
+    tip_links=6,
+)
 
 DEVICES: dict[str, Device] = {
     device.name: device
@@ -231,6 +231,11 @@ DEVICES: dict[str, Device] = {
         WIRE_035_EXTRA_STIFF,
         WIRE_035_SUPER_STIFF,
         WIRE_035_LUNDERQUIST,
+        BERENSTEIN_5F,
+        VERTEBRAL_5F,
+        MICROCATHETER_021,
+        WIRE_035_GLIDE,
+        WIRE_014_MICRO,
     )
 }
 
@@ -287,16 +292,29 @@ class Discretisation:
 
     def link_lengths(self, device: Device) -> np.ndarray:
         """Lengths (n,) of the links from proximal to distal, m."""
-        shaft_length = self.working_length - device.tip_length
+        return self.divided(device.tip_length, device.tip_links, repr(device.name))
+
+    def divided(self, tip_length: float, tip_links: int, name: str) -> np.ndarray:
+        """Lengths (n,) of the links of a chain whose end has shorter ones, m.
+
+        Args:
+          tip_length: of that end, m.
+          tip_links: number of links that it is divided into.
+          name: of the device, for the error.
+
+        Raises:
+          ValueError: if the end alone is as long as the chain.
+        """
+        shaft_length = self.working_length - tip_length
         if shaft_length <= 0:
             raise ValueError(
                 f"working_length is {self.working_length} m, but the tip of "
-                f"{device.name!r} alone takes {device.tip_length} m"
+                f"{name} alone takes {tip_length} m"
             )
         shaft = math.ceil(round(shaft_length / self.shaft_link, 6))
         return np.concatenate(
             [
                 np.full(shaft, shaft_length / shaft),
-                np.full(device.tip_links, device.tip_length / device.tip_links),
+                np.full(tip_links, tip_length / tip_links),
             ]
         )

@@ -2,8 +2,8 @@
 
 A main rail carries four platforms on prismatic joints. From the patient
 backwards: front clamps, catheter rotary unit, rear clamps, guidewire rotary
-unit. The two pairs of clamps hold the device in turn while it advances; the
-rotary units turn it and let it slide between their rollers.
+unit. The two pairs of clamps hold one device in turn while it advances, or one of
+two devices each; the rotary units turn them and let them slide between their rollers.
 
 **Frame.** ``+z`` runs along the device towards the patient, the origin is the
 proximal mouth of the introducer sheath and the device lies on the ``z`` axis.
@@ -160,8 +160,9 @@ def follower_posture(
     Args:
       insertion: (...,) metres from the start, positive into the patient.
       rotation: (...,) radians about +z from the start.
-      guidewire_insertion: (...,) metres; the catheter's if omitted, as the
-        rotary unit at the back then works on the same device.
+      guidewire_insertion: (...,) metres; the catheter's if omitted: both pairs of
+        clamps and both rotary units then work on one device. With a guidewire of its
+        own, the front clamps hold the catheter and the rear ones the guidewire.
       guidewire_rotation: (...,) radians; the catheter's if omitted.
 
     Returns:
@@ -198,7 +199,7 @@ def _posture(
 ) -> tuple[Scalars, ...]:
     """The joints in the order of ``JOINTS``."""
     front, front_opening = _clamp(pushed, _FRONT_PHASE)
-    rear, rear_opening = _clamp(pushed, _REAR_PHASE)
+    rear, rear_opening = _clamp(wire_pushed, _REAR_PHASE)
     # The catheter unit stays half-way between the clamps, so the free lengths of
     # shaft either side of it stay equal; the guidewire unit rides with the rear.
     middle = (front + rear) / 2

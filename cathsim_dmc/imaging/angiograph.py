@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from cathsim_dmc.imaging.device import Shadow
 from cathsim_dmc.imaging.fluoroscopy import Fluoroscope
 from cathsim_dmc.imaging.options import FluoroscopyOptions
 
@@ -113,32 +114,51 @@ def render(
     Returns:
         (N, rows, columns, planes) uint8.
     """
+    return images(machines, [Shadow(points, radius)], random_states)
+
+
+def images(
+    machines: Sequence[Planes],
+    shadows: Sequence[Shadow],
+    random_states: Sequence[np.random.RandomState] | None = None,
+) -> np.ndarray:
+    """Images before N machines, each of one device or of several in each other.
+
+    Args:
+        machines: N times the planes of a machine, all with as many.
+        shadows: of the devices, with points (N, n, 3) and one radius.
+        random_states: as in `render`.
+
+    Returns:
+        (N, rows, columns, planes) uint8.
+    """
     groups = _alike(machines)
     images = []
     for plane, shape in enumerate(_resolutions(machines)):
         if len(groups) == 1:
-            images.append(machines[0][plane].render(points, radius, random_states))
+            images.append(machines[0][plane].image(shadows, random_states))
             continue
-        image = np.empty((len(points), *shape, 1), dtype=np.uint8)
+        image = np.empty((len(machines), *shape, 1), dtype=np.uint8)
         for chosen in groups:
             states = random_states and [random_states[i] for i in chosen]
-            image[chosen] = machines[chosen[0]][plane].render(
-                points[chosen], radius, states
-            )
+            own = [shadow.of(chosen) for shadow in shadows]
+            image[chosen] = machines[chosen[0]][plane].image(own, states)
         images.append(image)
     return np.concatenate(images, axis=-1) if len(images) > 1 else images[0]
 
 
-def masks(machines: Sequence[Planes], points: np.ndarray, radius: float) -> np.ndarray:
+def masks(machines: Sequence[Planes], shadows: Sequence[Shadow]) -> np.ndarray:
     """Segmentation (N, rows, columns, 2 planes) uint8, 0 or 255.
 
-    Channels: device and vessel of the frontal plane, then of the second one.
+    Channels: device and vessel of the frontal plane, then of the second one. Arguments
+    as in `images`.
     """
     channels = []
     for plane, shape in enumerate(_resolutions(machines)):
-        both = np.empty((len(points), *shape, 2), dtype=np.uint8)
+        both = np.empty((len(machines), *shape, 2), dtype=np.uint8)
         for chosen in _alike(machines):
-            mask = machines[chosen[0]][plane].masks(points[chosen], radius)
+            own = [shadow.of(chosen) for shadow in shadows]
+            mask = machines[chosen[0]][plane].masks_of(own)
             both[chosen, ..., 0] = mask.device * np.uint8(255)
             both[chosen, ..., 1] = mask.vessel * np.uint8(255)
         channels.append(both)

@@ -8,10 +8,36 @@ moves and however it turns.
 
 from __future__ import annotations
 
+from dataclasses import dataclass, replace
+
 import numpy as np
 from numpy.typing import ArrayLike
 
 from cathsim_dmc.imaging.carm import CArm
+
+
+@dataclass(frozen=True, eq=False)
+class Shadow:
+    """A device, or one of several in each other, as the beam meets it.
+
+    Attributes:
+        points: (..., n, 3) joints from base to tip, world frame, m.
+        radius: as in `device_thickness`.
+        mu: excess attenuation, homogenised over its cross-section, 1/m; None for that
+            of the fluoroscope's device, with its marker.
+        marker_mu: that of the marker at its tip, 1/m; None for no marker.
+        marker_length: of the marker, m, measured back from the tip.
+    """
+
+    points: np.ndarray
+    radius: ArrayLike
+    mu: float | None = None
+    marker_mu: float | None = None
+    marker_length: float = 0.0
+
+    def of(self, rows: np.ndarray) -> Shadow:
+        """The shadows of some frames of a batch; the radius is the same for all."""
+        return replace(self, points=self.points[rows])
 
 
 def device_thickness(

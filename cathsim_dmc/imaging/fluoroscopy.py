@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike
 
 from cathsim_dmc.imaging import detector, materials
 from cathsim_dmc.imaging.carm import CArm
-from cathsim_dmc.imaging.device import device_attenuation, device_thickness
+from cathsim_dmc.imaging.device import Shadow, device_attenuation, device_thickness
 from cathsim_dmc.imaging.thickness import closed, surface_thickness
 
 # Water equivalent of a chest from front to back, m: the usual 20 cm phantom.
@@ -183,15 +183,24 @@ class Fluoroscope:
         Raises:
             ValueError: if shapes do not match (see `device_attenuation`).
         """
-        points = np.asarray(points, dtype=np.float64)
-        depth = device_attenuation(
-            self.carm,
-            points,
-            radius,
-            self.device_mu,
-            self.marker_mu,
-            self.marker_length,
-        )
+        return self.image([Shadow(np.asarray(points), radius)], random_state)
+
+    def image(
+        self, shadows: Sequence[Shadow], random_state: RandomStates | None = None
+    ) -> np.ndarray:
+        """Images of devices in the vessel, whose optical depths add up.
+
+        Args:
+            shadows: of one device, or of several in each other, with the same leading
+                axes.
+            random_state: as in `render`.
+
+        Returns:
+            (..., rows, columns, 1) uint8, as `render`.
+        """
+        depth = self._depth(shadows[0])
+        for shadow in shadows[1:]:
+            depth += self._depth(shadow)
         batch, shape = depth.shape[:-2], self.carm.resolution
         depth = depth.reshape(-1, *shape)
         states = random_state
@@ -208,6 +217,14 @@ class Fluoroscope:
             of_part = states[part] if isinstance(states, list) else states
             image[part] = self._developed(depth[part], of_part)
         return image.reshape(*batch, *shape, 1)
+
+    def _depth(self, shadow: Shadow) -> np.ndarray:
+        """Optical depth (..., rows, columns) of a device."""
+        material = (shadow.mu, shadow.marker_mu, shadow.marker_length)
+        if shadow.mu is None:
+            material = (self.device_mu, self.marker_mu, self.marker_length)
+        points = np.asarray(shadow.points, dtype=np.float64)
+        return device_attenuation(self.carm, points, shadow.radius, *material)
 
     def _developed(self, depth: np.ndarray, states) -> np.ndarray:
         """Grey images of optical depths (B, rows, columns); `depth` is used up."""
@@ -231,13 +248,27 @@ class Fluoroscope:
         Args:
             points, radius: as in `render`.
         """
-        thickness = device_thickness(self.carm, points, radius)
-        radii = np.asarray(radius, dtype=np.float64)
-        if radii.ndim == np.ndim(points) - 1:
+        return self.masks_of([Shadow(np.asarray(points), radius)])
+
+    def masks_of(self, shadows: Sequence[Shadow]) -> Masks:
+        """Which pixels show one of several devices, and which the vessel.
+
+        Args:
+            shadows: as in `image`.
+        """
+        seen = self._shows(shadows[0])
+        for shadow in shadows[1:]:
+            seen |= self._shows(shadow)
+        return Masks(device=seen, vessel=self.vessel_mask)
+
+    def _shows(self, shadow: Shadow) -> np.ndarray:
+        """Pixels (..., rows, columns) bool that show a device."""
+        thickness = device_thickness(self.carm, shadow.points, shadow.radius)
+        radii = np.asarray(shadow.radius, dtype=np.float64)
+        if radii.ndim == np.ndim(shadow.points) - 1:
             # A chain of unlike links is seen where its thinnest link would be.
             radii = np.asarray(radii.min(axis=-1))
-        least = MASK_SHARE * 2.0 * radii[..., None, None]
-        return Masks(device=thickness >= least, vessel=self.vessel_mask)
+        return thickness >= MASK_SHARE * 2.0 * radii[..., None, None]
 
 
 @dataclass(frozen=True, eq=False)

@@ -8,11 +8,12 @@ from typing import Any
 import numpy as np
 
 from cathsim_dmc import suite
-from cathsim_dmc.play.controls import Controls
+from cathsim_dmc.play.controls import CoaxialControls, Controls
 from cathsim_dmc.policies import Policy, in_environment
 from cathsim_dmc.recording.episode import SUFFIX, Episode
 from cathsim_dmc.recording.recorder import EpisodeRecorder
 from cathsim_dmc.tasks.config import CONTROL_TIMESTEP
+from cathsim_dmc.tasks.scene import Scene
 
 MODES = ("fluoroscopy", "viewer")
 _PAUSE = 1.0  # s, for which the end of an episode is shown
@@ -57,10 +58,7 @@ class Session:
         self._policy = policy and in_environment(policy, self._environment)
         self._task_name, self._seed, self._speed = task, seed, speed
         navigation = self._environment.task
-        self._controls = Controls(
-            len(navigation.scene.catheter.tip_motors) // 2,
-            navigation.scene.catheter.rotation is not None,
-        )
+        self._controls = _hands(navigation.scene)
         self._face = _face(mode, navigation, self._controls)
         self._next = time.monotonic()
 
@@ -125,7 +123,14 @@ class Session:
             time.sleep(0.02)
 
 
-def _face(mode: str, task: Any, controls: Controls):
+def _hands(scene: Scene) -> Controls | CoaxialControls:
+    catheter = scene.catheter
+    if scene.coaxial:
+        return CoaxialControls(len(catheter.devices))
+    return Controls(len(catheter.tip_motors) // 2, catheter.rotation is not None)
+
+
+def _face(mode: str, task: Any, controls: Controls | CoaxialControls):
     if mode == "viewer":
         from cathsim_dmc.play.viewer import MujocoViewer
 

@@ -7,7 +7,7 @@ import mujoco
 import numpy as np
 
 from cathsim_dmc.play import readout
-from cathsim_dmc.play.controls import Controls
+from cathsim_dmc.play.controls import CoaxialControls, Controls
 
 # GLFW's codes by command. The viewer has letters and space for itself, so the keys
 # are those it leaves alone.
@@ -27,6 +27,11 @@ HELP = (
     "arrows: bend the tip   page up/down: push/pull\n"
     "home/end: rotate   delete: straighten   enter: again\nclose the window to quit"
 )
+COAXIAL_HELP = (
+    "up/down: push/pull the guidewire   left/right: rotate it\n"
+    "page up/down: push/pull the catheter   home/end: rotate it   enter: again\n"
+    "close the window to quit"
+)
 # The viewer reports presses and no releases, so a press counts for a moment, s.
 _HOLD = 0.2
 _PATIENCE = 5.0  # s, for the viewer's thread to end
@@ -35,9 +40,11 @@ _PATIENCE = 5.0  # s, for the viewer's thread to end
 class MujocoViewer:
     """Shows the task in three dimensions and turns keys into commands."""
 
-    def __init__(self, task: Any, controls: Controls):
+    def __init__(self, task: Any, controls: Controls | CoaxialControls):
         """Prepares; the window opens with the first `show`."""
         self._controls = controls
+        coaxial = isinstance(controls, CoaxialControls)
+        self._help = COAXIAL_HELP if coaxial else HELP
         self._focus = np.array(task.scene.placement.inlet + task.goal_position) / 2
         self._size = float(
             np.linalg.norm(task.goal_position - task.scene.placement.inlet)
@@ -109,7 +116,7 @@ class MujocoViewer:
         self._viewer.set_texts(
             [
                 (font, grid.mjGRID_TOPLEFT, "\n".join(names), "\n".join(values)),
-                (font, grid.mjGRID_BOTTOMLEFT, message or HELP, ""),
+                (font, grid.mjGRID_BOTTOMLEFT, message or self._help, ""),
             ]
         )
         self._viewer.sync()

@@ -8,7 +8,7 @@ import numpy as np
 from cathsim_dmc.imaging import angiograph
 from cathsim_dmc.imaging.options import FluoroscopyOptions
 from cathsim_dmc.play import readout
-from cathsim_dmc.play.controls import HELP, Controls
+from cathsim_dmc.play.controls import CoaxialControls, Controls
 
 TITLE = "cathsim"
 SIZE = 512  # px
@@ -36,7 +36,7 @@ _PANEL = 230  # px
 class FluoroscopyWindow:
     """Shows the task as an operator sees it and turns keys into commands."""
 
-    def __init__(self, task: Any, controls: Controls):
+    def __init__(self, task: Any, controls: Controls | CoaxialControls):
         """Opens the window.
 
         Args:
@@ -86,7 +86,7 @@ class FluoroscopyWindow:
         self._panel = panel
         tk.Label(
             root,
-            text=HELP,
+            text=self._controls.help,
             foreground="grey70",
             background="black",
             wraplength=columns * planes + _PANEL,
@@ -123,11 +123,8 @@ class FluoroscopyWindow:
 
     def show(self, task: Any, message: str = "") -> None:
         """Draws the state of a task."""
-        planes = angiograph.render(
-            [self._machine],
-            task.readings.centreline[None],
-            task.scene.catheter.device.outer_radius,
-            [self._random],
+        planes = angiograph.images(
+            [self._machine], task.rollout.shadows, [self._random]
         )[0]
         image = np.concatenate(list(np.moveaxis(planes, -1, 0)), axis=1)
         rows, columns = image.shape

@@ -63,14 +63,15 @@ class RandomCurl(Policy):
             seeds = range(self._seed, self._seed + count)
             self._generators = [np.random.default_rng(seed) for seed in seeds]
             self._action = np.zeros((count, view.num_actions))
-        motors = len(view.task.scene.catheter.tip_motors)
+        catheter = view.task.scene.catheter
+        motors = len(catheter.tip_motors)
         self._action = self._action.copy()
         for index in np.flatnonzero(which):
             draw = self._generators[index]
             angle, size = draw.uniform(0.0, 2.0 * np.pi), draw.uniform()
             self._action[index, 0:motors:2] = size * np.cos(angle)
             self._action[index, 1:motors:2] = size * np.sin(angle)
-            self._action[index, motors] = 1.0
+            self._action[index, catheter.translations] = 1.0
 
     def act(self, observation: Any) -> np.ndarray:
         """Actions (N, A), whatever is observed."""
@@ -109,7 +110,7 @@ class Push(_Constant):
     name = "push"
 
     def _fill(self, action: np.ndarray, view: View) -> None:
-        action[:, len(view.task.scene.catheter.tip_motors)] = 1.0
+        action[:, view.task.scene.catheter.translations] = 1.0
 
 
 class Curl(_Constant):
@@ -118,6 +119,6 @@ class Curl(_Constant):
     name = "curl"
 
     def _fill(self, action: np.ndarray, view: View) -> None:
-        motors = len(view.task.scene.catheter.tip_motors)
-        action[:, 0:motors:2] = 1.0
-        action[:, motors] = 1.0
+        catheter = view.task.scene.catheter
+        action[:, 0 : len(catheter.tip_motors) : 2] = 1.0
+        action[:, catheter.translations] = 1.0

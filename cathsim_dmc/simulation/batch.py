@@ -71,14 +71,15 @@ class BatchSimulation:
         self._model = physics.model.ptr
         self._substeps = task.substeps
         self._batch = mujoco_batch.Batch(self._model, num_simulations, num_threads)
-        for field in readings.ModelIndex.FIELDS:
+        for field in task.scene.fields:
             self._batch.bind(field)
         self._rows = np.zeros(
             (num_simulations, self._substeps, self._model.nsensordata)
         )
         self._models = _Fields(self._batch)
         if task.num_anatomies > 1:
-            writes = bool(ModelVariation.fields_of(task.config.ranges))
+            varies = bool(ModelVariation.fields_of(task.config.ranges))
+            writes = varies or task.scene.coaxial
             self._models = _OwnModels(self._batch) if writes else _Models(self._batch)
         self._rollout = task.make_rollout(
             self._model, self._batch, self._models, num_simulations
@@ -132,7 +133,7 @@ class BatchSimulation:
           ValueError: if the action has the wrong shape or is not finite.
         """
         batch = self._batch
-        action = check_action(action, batch.ctrl.shape)
+        action = check_action(action, (batch.nsim, self.num_actions))
         batch.ctrl[:] = self._rollout.command(action, lambda: batch.state)
         warnings = batch.warning.copy()
         batch.rollout(
@@ -153,7 +154,7 @@ class BatchSimulation:
     @property
     def num_actions(self) -> int:
         """A, entries of an action."""
-        return self._batch.ctrl.shape[-1]
+        return self._task.num_actions
 
     @property
     def task(self) -> Navigation:

@@ -184,11 +184,7 @@ class CathSimEnv(gymnasium.Env):
 
 def fluoroscopy_frame(task, machine: angiograph.Angiograph) -> np.ndarray:
     """The device of a task before a machine, (rows, columns, 3) uint8, no noise."""
-    image = angiograph.render(
-        [machine.planes()],
-        task.readings.centreline[None],
-        task.scene.device.outer_radius,
-    )[0]
+    image = angiograph.images([machine.planes()], task.rollout.shadows)[0]
     row = np.concatenate(list(np.moveaxis(image, -1, 0)), axis=1)
     return np.repeat(row[..., None], 3, axis=-1)
 

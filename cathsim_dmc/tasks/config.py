@@ -7,8 +7,9 @@ from typing import Any, cast
 import numpy as np
 
 from cathsim_dmc import bounds
-from cathsim_dmc.entities import devices
 from cathsim_dmc.entities.contact import FRICTION
+from cathsim_dmc.entities.device import Device
+from cathsim_dmc.entities.device_stack import LEAD, LUMEN_FRICTION
 from cathsim_dmc.imaging.options import FluoroscopyOptions
 from cathsim_dmc.tasks.cameras import CameraOptions
 from cathsim_dmc.tasks.variations import Randomisation
@@ -19,6 +20,7 @@ MAX_STEPS = 2000  # published
 # The device is laid along the route, whose bends its links cut short.
 LARGEST_START = 0.95
 _MOST_JOINTS = 1000
+_LONGEST_LEAD = 0.3  # m
 MOST_FRICTION = 2.0  # Coulomb coefficient
 # A link shorter than its own radius is no rod; one longer than a vessel is wide does
 # not follow its bends.
@@ -34,6 +36,11 @@ class NavigationConfig:
     Attributes:
       observation: Name or names of observations, see `observations.OBSERVATIONS`.
       device: Name of a device in `devices.DEVICES`, or a device.
+      devices: Coaxial devices from the innermost outwards, or their names, each pushed
+        and rotated by an action of its own, in place of `device`; None for `device`.
+      lead: By how much each coaxial device starts ahead of the one around it, m.
+      lumen_friction: Coulomb coefficient between a coaxial device and the lumen that it
+        lies in.
       rotation: Whether the action has a rotation of the base.
       start_along_route: Least and largest share of the way to the goal that the head
         of the device has made when an episode starts, drawn anew for each; None for
@@ -55,7 +62,10 @@ class NavigationConfig:
     """
 
     observation: str | Sequence[str] = "internal"
-    device: str | devices.Device = "steerable_5f"
+    device: str | Device = "steerable_5f"
+    devices: Sequence[str | Device] | None = None
+    lead: float = LEAD
+    lumen_friction: float = LUMEN_FRICTION
     rotation: bool = False
     start_along_route: Sequence[float] | None = None
     max_steps: int = MAX_STEPS
@@ -69,6 +79,7 @@ class NavigationConfig:
     randomisation: Randomisation | Mapping[str, Any] | bool = False
 
     def __post_init__(self):
+        self._check_devices()
         self._check_numbers()
         kinds = {"fluoroscopy": FluoroscopyOptions, "cameras": CameraOptions}
         for name, kind in kinds.items():
@@ -97,7 +108,33 @@ class NavigationConfig:
         """`cameras`, whatever they were given as."""
         return cast(CameraOptions, self.cameras)
 
+    def _check_devices(self):
+        if self.devices is None:
+            return
+        named = isinstance(self.devices, Sequence) and not isinstance(self.devices, str)
+        if not named or not self.devices:
+            bounds.refuse(
+                "devices",
+                self.devices,
+                "None, or names of devices from the innermost outwards, such as "
+                "['wire_035_glide', 'berenstein_5f']",
+            )
+        object.__setattr__(self, "devices", tuple(self.devices))
+        for name, option in (
+            ("device", self.device != type(self).device),
+            ("rotation", self.rotation),
+            ("torsion_joints", self.torsion_joints is not None),
+        ):
+            if option:
+                raise ValueError(
+                    f"{name} is {getattr(self, name)!r}, but devices is "
+                    f"{self.devices!r}: coaxial devices are all named by `devices`, "
+                    "and turned as they are; leave one of the two out"
+                )
+
     def _check_numbers(self):
+        bounds.number("lead", self.lead, 0.0, _LONGEST_LEAD, "m")
+        bounds.number("lumen_friction", self.lumen_friction, 0.0, MOST_FRICTION)
         bounds.switch("rotation", self.rotation)
         bounds.whole("max_steps", self.max_steps, 1)
         shares = self.start_along_route

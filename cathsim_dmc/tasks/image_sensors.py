@@ -6,6 +6,7 @@ import mujoco
 import numpy as np
 
 from cathsim_dmc.imaging import angiograph as machines
+from cathsim_dmc.imaging.device import Shadow
 from cathsim_dmc.imaging.fluoroscopy import Fluoroscope
 from cathsim_dmc.tasks import cameras, observations
 
@@ -17,7 +18,6 @@ class ImageSensors:
         self,
         names: Sequence[str],
         angiograph: machines.Angiograph | None,
-        device_radius: float,
         num_simulations: int,
         gl_cameras: cameras.Cameras | None = None,
     ):
@@ -27,13 +27,11 @@ class ImageSensors:
           names: Names of the observations.
           angiograph: Angiography machine, needed by fluoroscopic observations; an
             episode may have another one of the same set-up.
-          device_radius: Outer radius of the device, m.
           num_simulations: N.
           gl_cameras: MuJoCo's cameras, needed by `rgb` and `depth`.
         """
         self._names = names
         self._on = angiograph is not None or gl_cameras is not None
-        self._radius = device_radius
         self._cameras = gl_cameras
         self._planes: list[machines.Planes] = []
         self._noise = False
@@ -43,6 +41,11 @@ class ImageSensors:
         self._images: list[np.ndarray] = []
         self._masks = self._pixels = None
         self._views: dict[str, np.ndarray] = {}
+
+    @property
+    def on(self) -> bool:
+        """Whether an observation needs them."""
+        return self._on
 
     def restart(
         self,
@@ -57,20 +60,24 @@ class ImageSensors:
     def capture(
         self,
         lines: np.ndarray,
+        shadows: Sequence[Shadow],
         goal: np.ndarray,
         qpos: np.ndarray,
         random_states: Sequence[np.random.RandomState] | None,
         fresh: np.ndarray | None = None,
+        device_points: np.ndarray | None = None,
     ) -> observations.Images:
         """Captures the next images.
 
         Args:
-          lines: (N, n, 3), centrelines of the devices, m.
+          lines: (N, n, 3), centrelines of the chains, m.
+          shadows: What of them the beam meets: one device, or several in each other.
           goal: (3,) or (N, 3), m.
           qpos: (N, nq).
           random_states: N sources of quantum noise, None for images without.
           fresh: indices of simulations that have just begun an episode: only theirs
             are captured and fill their whole history. None for all, one step on.
+          device_points: (N, K, P, 3), tracked points of coaxial devices, m.
         """
         if not self._on:
             return observations.NO_IMAGES
@@ -82,14 +89,17 @@ class ImageSensors:
             states = None
             if random_states is not None and self._noise:
                 states = [random_states[index] for index in chosen.tolist()]
-            image = machines.render(planes, line, self._radius, states)
+            image = machines.images(planes, [s.of(chosen) for s in shadows], states)
             self._remember(image, count, fresh)
         if self._wants("segmentation"):
-            masks = machines.masks(planes, line, self._radius)
+            masks = machines.masks(planes, [s.of(chosen) for s in shadows])
             self._masks = _merged(self._masks, masks, count, fresh)
         if self._wants("tracking_2d"):
             ends = np.broadcast_to(goal, (count, 3))[chosen, None]
-            points = np.concatenate([observations.tracked(line), ends], axis=-2)
+            points = [observations.tracked(line)]
+            if device_points is not None:
+                points.append(device_points[chosen].reshape(len(line), -1, 3))
+            points = np.concatenate([*points, ends], axis=-2)
             pixels = machines.pixels(planes, points)
             self._pixels = _merged(self._pixels, pixels, count, fresh)
         kinds = [kind for kind in cameras.KINDS if kind in self._names]

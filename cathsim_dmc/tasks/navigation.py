@@ -76,7 +76,7 @@ class Navigation(composer.Task):
                 f"randomisation shifts the goal, but {type(objective).__name__} has "
                 "no method shifted(shift): add one, or leave goal_shift out"
             )
-        self._num_actions = len(scene.catheter.actuators)
+        self._num_actions = len(scene.catheter.action_names)
         self._names = observations.resolve(config.observation)
         self._fluoroscopy = None
         if observations.needs_fluoroscopy(self._names):
@@ -130,9 +130,10 @@ class Navigation(composer.Task):
             if self.num_anatomies > 1
             else f"anatomy {scene.anatomy.name!r}"
         )
+        inner = " in ".join(repr(device.name) for device in scene.catheter.devices)
         return (
             f"<{self.name}: {anatomy}, goal {scene.goal.name!r} within "
-            f"{1e3 * self.objective.goal_radius:g} mm, device {scene.device.name!r}, "
+            f"{1e3 * self.objective.goal_radius:g} mm, device {inner}, "
             f"{self._num_actions} actions, observation {', '.join(self._names)}>"
         )
 
@@ -155,14 +156,16 @@ class Navigation(composer.Task):
                     lambda physics, key=key: self._current().observation[key][0],
                     spec,
                 )
-                for key, spec in observations.entry_specs(self._names, options).items()
+                for key, spec in observations.entry_specs(
+                    self._names, options, self._scene.coaxial
+                ).items()
             }
         return self._observables
 
     def action_spec(self, physics) -> dm_env.specs.BoundedArray:
         """Bounds [-1, 1] for each actuator."""
         del physics
-        names = [actuator.name for actuator in self._scene.catheter.actuators]
+        names = self._scene.catheter.action_names
         return dm_env.specs.BoundedArray(
             shape=(len(names),),
             dtype=np.float64,
@@ -177,7 +180,9 @@ class Navigation(composer.Task):
         self._model, self._data = physics.model.ptr, physics.data.ptr
         model = self._model
         self._rollout = self.make_rollout(
-            model, SingleState(self._data), _SingleAccess(model, self._data)
+            model,
+            SingleState(self._data, self._scene.fields),
+            _SingleAccess(model, self._data),
         )
         self._substeps = self.substeps  # which asks the MJCF model, and takes its time
         self._warnings = self._data.warning.number  # not a copy
@@ -285,6 +290,11 @@ class Navigation(composer.Task):
         """
         rollout = self.rollout
         return self._scene if rollout is None else rollout.case().scene
+
+    @property
+    def num_actions(self) -> int:
+        """A, entries of an action."""
+        return self._num_actions
 
     @property
     def num_anatomies(self) -> int:

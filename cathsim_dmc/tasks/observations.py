@@ -17,6 +17,7 @@ from dm_env import specs
 from cathsim_dmc.imaging.options import FluoroscopyOptions
 from cathsim_dmc.tasks import forces, readings
 from cathsim_dmc.tasks.cameras import CameraOptions
+from cathsim_dmc.tasks.coaxial import DEVICE_PLACES, CoaxialReadings
 from cathsim_dmc.tasks.route import AHEAD, Ahead, into_frame
 
 TRACKED_POINTS = 8
@@ -62,6 +63,7 @@ class Frame(NamedTuple):
       goal: (3,) or (..., 3), m.
       images: what the image sensors show.
       ahead: what lies ahead of the tip on the route; None where nothing asks for it.
+      devices: state of coaxial devices; None for a device alone.
     """
 
     readings: readings.Readings
@@ -70,6 +72,7 @@ class Frame(NamedTuple):
     goal: np.ndarray
     images: Images = NO_IMAGES
     ahead: Ahead | None = None
+    devices: CoaxialReadings | None = None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -302,7 +305,8 @@ def tracking(frame: Frame) -> Observation:
     Entry(
         "tracking_pixels",
         "pixel",
-        f"{_POINTS}: column, row (plane by plane); pixel centres are whole numbers",
+        f"{_POINTS}: column, row (plane by plane); pixel centres are whole numbers. "
+        "Those of each coaxial device follow",
     ),
     Entry("tracking_goal_pixels", "pixel", "goal: column, row"),
     *_OPERATOR,
@@ -429,6 +433,75 @@ def _views(frame: Frame, kind: str) -> Observation:
     return {key: view for key, view in views.items() if key.startswith(kind)}
 
 
+# What coaxial devices add to the observations of numbers.
+
+
+def _driven(frame: Frame) -> Observation:
+    """How far the operator has pushed and turned each coaxial device."""
+    state = frame.devices
+    assert state is not None
+    return {
+        "device_insertion": state.insertion,
+        "device_rotation": state.rotation,
+    }
+
+
+def _lying(frame: Frame) -> Observation:
+    """Where each coaxial device lies, and what it bears."""
+    state = frame.devices
+    assert state is not None
+    return {
+        "device_tip_rotation": state.tip_rotation,
+        "device_points": _flat(state.points, 3),
+        "device_load": np.stack([state.leading_load, state.lumen_friction], axis=-1),
+    }
+
+
+DRIVEN = ObservationKind(
+    _driven,
+    (
+        Entry(
+            "device_insertion",
+            "m",
+            "of each device from the innermost outwards: way of its end, 0 where the "
+            "chain's end is at the start of the stroke",
+        ),
+        Entry("device_rotation", "rad", "of the rotary unit of each device"),
+    ),
+)
+LYING = ObservationKind(
+    _lying,
+    (
+        Entry("device_tip_rotation", "rad", "of the end of each device"),
+        Entry(
+            "device_points",
+            "m",
+            f"{len(DEVICE_PLACES)} points along each device, every "
+            f"{1e3 * DEVICE_PLACES[-2]:g} mm, proximal to its end, world frame",
+        ),
+        Entry(
+            "device_load",
+            "N",
+            "axial force in the device that reaches farthest where it leaves the "
+            "others, and friction between the devices that slide",
+        ),
+    ),
+)
+
+
+_IN_SPACE = {"internal", "tracking", "route"}
+_OF_NUMBERS = {*_IN_SPACE, "tracking_2d"}
+
+
+def _kinds(names: Sequence[str], coaxial: bool) -> list[ObservationKind]:
+    kinds = [OBSERVATIONS[name] for name in names]
+    if coaxial and _OF_NUMBERS.intersection(names):
+        kinds.append(DRIVEN)
+        if _IN_SPACE.intersection(names):
+            kinds.append(LYING)
+    return kinds
+
+
 # The use of the table.
 
 
@@ -462,19 +535,25 @@ def needs_route(names: Sequence[str]) -> bool:
 def observe(names: Sequence[str], frame: Frame) -> Observation:
     """Computes the named observations; arrays may share memory with the frame."""
     observation: Observation = {}
-    for name in names:
-        observation.update(OBSERVATIONS[name].observe(frame))
+    for kind in _kinds(names, frame.devices is not None):
+        observation.update(kind.observe(frame))
     return observation
 
 
 def entry_specs(
-    names: Sequence[str], options: ImageOptions
+    names: Sequence[str], options: ImageOptions, coaxial: bool = False
 ) -> dict[str, specs.Array | None]:
-    """Keys of the named observations, with the specs of those that are images."""
+    """Keys of the named observations, with the specs of those that are images.
+
+    Args:
+      names: of observations.
+      options: on which the shapes of images depend.
+      coaxial: whether the devices are coaxial ones.
+    """
     return {
         key: entry.spec(options)
-        for name in names
-        for entry in OBSERVATIONS[name].entries
+        for kind in _kinds(names, coaxial)
+        for entry in kind.entries
         for key in entry.keys(options)
     }
 

@@ -12,10 +12,13 @@ from typing import Protocol, cast
 import mujoco
 import numpy as np
 
+from cathsim_dmc.entities.device_stack import DeviceStack
 from cathsim_dmc.entities.robot import follower_posture
+from cathsim_dmc.imaging.device import Shadow
 from cathsim_dmc.imaging.fluoroscopy import Fluoroscope
-from cathsim_dmc.tasks import forces, observations, readings
+from cathsim_dmc.tasks import coaxial, forces, observations, readings
 from cathsim_dmc.tasks.cases import Case, model_index
+from cathsim_dmc.tasks.coaxial import CoaxialDevices, CoaxialReadings
 from cathsim_dmc.tasks.config import NavigationConfig
 from cathsim_dmc.tasks.image_sensors import ImageSensors, open_cameras
 from cathsim_dmc.tasks.objective_pool import together
@@ -47,9 +50,9 @@ class SingleState:
 
     qpos: np.ndarray
 
-    def __init__(self, data: mujoco.MjData):
-        """Takes the views; they stay valid as long as `data` lives."""
-        for field in readings.ModelIndex.FIELDS:
+    def __init__(self, data: mujoco.MjData, fields: Sequence[str]):
+        """Takes the views of some fields; they stay valid as long as `data` lives."""
+        for field in fields:
             setattr(self, field, getattr(data, field)[None])
 
 
@@ -102,9 +105,23 @@ class Rollout:
         catheter = scene.catheter.mjcf_model.model
         self._index = model_index(scene, model)
         self._views = self._index.views(state)
-        num_actions = len(scene.catheter.actuators)
+        self._device_radius = scene.device.outer_radius
+        num_actions = len(scene.catheter.action_names)
         randomisation = config.ranges
-        self._variation = ModelVariation(model, randomisation, catheter)
+        self._coaxial: CoaxialDevices | None = None
+        if isinstance(scene.catheter, DeviceStack):
+            self._coaxial = CoaxialDevices(
+                scene.catheter,
+                model,
+                self._index,
+                cast(coaxial.State, state),
+                access.field,
+                scene.placement.start_depth,
+                num_simulations,
+            )
+        self._variation = ModelVariation(
+            model, randomisation, catheter, walls=self._coaxial is None
+        )
         self._delay = ActionDelay(
             num_simulations, num_actions, randomisation.longest_delay
         )
@@ -114,7 +131,6 @@ class Rollout:
         self._sensors = ImageSensors(
             self._names,
             cases[0].angiograph,
-            scene.device.outer_radius,
             num_simulations,
             open_cameras(self._names, model, config.camera_options, catheter),
         )
@@ -183,10 +199,15 @@ class Rollout:
         number = case.start.draw(random_state)
         qpos = self._state.qpos[index]
         case.start.write(qpos, displacement, episode.roll, number)
+        if self._coaxial is not None:
+            self._coaxial.restart(index, episode.friction, episode.stiffness)
 
     def pose_robot(self, qpos: np.ndarray) -> np.ndarray:
         """Poses the follower's joints after the device, in place: qpos (N, nq)."""
         index = self._index
+        if self._coaxial is not None:
+            qpos[..., index.robot_qpos] = self._coaxial.follower_posture()
+            return qpos
         if len(qpos) == 1:  # plain floats take a third of the time
             (row,) = qpos
             turned = 0.0 if index.rotation_qpos is None else row[index.rotation_qpos]
@@ -209,12 +230,15 @@ class Rollout:
           read_states: Reads the states (N, nstate), mjSTATE_INTEGRATION.
 
         Returns:
-          Control (N, A) of the actuators for all physics steps.
+          Control (N, U) of the actuators for all physics steps.
         """
         self._previous_action, self._action = self._action, action
         self.pose_robot(self._state.qpos)
         self._monitor.before_step(read_states, action)
-        return self._delay.delayed(action)
+        action = self._delay.delayed(action)
+        if self._coaxial is None:
+            return action
+        return self._coaxial.command(action, self._readings.external_force)
 
     def start(self, indices: np.ndarray, magnitudes: np.ndarray) -> Step:
         """First measurement of new episodes, after the forward pass.
@@ -301,18 +325,22 @@ class Rollout:
     def _observe(
         self, goal: np.ndarray, fresh: np.ndarray | None
     ) -> observations.Observation:
-        images = self._sensors.capture(
-            self._readings.centreline,
-            goal,
-            self._state.qpos,
-            self._random_states,
-            fresh,
-        )
+        devices, images = self.devices, observations.NO_IMAGES
+        if self._sensors.on:
+            images = self._sensors.capture(
+                self._readings.centreline,
+                self.shadows,
+                goal,
+                self._state.qpos,
+                self._random_states,
+                fresh,
+                None if devices is None else devices.points,
+            )
         state, ahead = self._readings, None
         if self._routes is not None:
             ahead = self._routes.ahead(self._case_of, state.head, state.head_frame)
         frame = observations.Frame(
-            state, self._wall_force, self._action, goal, images, ahead
+            state, self._wall_force, self._action, goal, images, ahead, devices
         )
         return observations.observe(self._names, frame)
 
@@ -341,6 +369,19 @@ class Rollout:
     def readings(self) -> readings.Readings:
         """State of the devices after the last step or reset."""
         return self._readings
+
+    @property
+    def shadows(self) -> Sequence[Shadow]:
+        """The devices as X-rays meet them, with points (N, n, 3)."""
+        line = self._readings.centreline
+        if self._coaxial is not None:
+            return self._coaxial.shadows(line)
+        return [Shadow(line, self._device_radius)]
+
+    @property
+    def devices(self) -> CoaxialReadings | None:
+        """State of coaxial devices after the last step or reset; None for one alone."""
+        return None if self._coaxial is None else self._coaxial.read(self._readings)
 
     @property
     def wall_force(self) -> forces.WallForce:

@@ -1,6 +1,7 @@
 """The scene of a navigation task: entities, and where each is attached."""
 
 import dataclasses
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -8,12 +9,15 @@ from cathsim_dmc.anatomy import Anatomy, Goal
 from cathsim_dmc.entities import devices
 from cathsim_dmc.entities.arena import AngiographyArena
 from cathsim_dmc.entities.catheter import Catheter
+from cathsim_dmc.entities.chain import Chain
+from cathsim_dmc.entities.device_stack import DeviceStack
 from cathsim_dmc.entities.phantom import Phantom
 from cathsim_dmc.entities.robot import Robot
 from cathsim_dmc.entities.sheath import Sheath, straight
-from cathsim_dmc.tasks import placement
+from cathsim_dmc.tasks import coaxial, placement
 from cathsim_dmc.tasks.config import NavigationConfig
 from cathsim_dmc.tasks.objectives import GOAL_RADIUS
+from cathsim_dmc.tasks.readings import ModelIndex
 
 # Joints of the shaft that twist, where the base turns.
 _TORSION_JOINTS = 4
@@ -28,7 +32,7 @@ class Scene:
       placement: where device, sheath and robot stand.
       arena: the root, with light and the density of blood.
       phantom: wall, goals and load cell.
-      catheter: the device.
+      catheter: the device, or several in each other.
       sheath: holds the device before the inlet.
       robot: the follower, which moves along with the device.
     """
@@ -37,7 +41,7 @@ class Scene:
     placement: placement.Placement
     arena: AngiographyArena
     phantom: Phantom
-    catheter: Catheter
+    catheter: Chain
     sheath: Sheath
     robot: Robot
 
@@ -51,7 +55,7 @@ class Scene:
         goal_radius: float = GOAL_RADIUS,
         arena: AngiographyArena | None = None,
         phantom: Phantom | None = None,
-        catheter: Catheter | None = None,
+        catheter: Chain | None = None,
         sheath: Sheath | None = None,
         robot: Robot | None = None,
     ) -> "Scene":
@@ -69,27 +73,25 @@ class Scene:
           robot: Follower of one's own.
         """
         goal = placement.resolve_goal(anatomy, goal)
-        device = devices.get(config.device) if catheter is None else catheter.device
+        chosen = chosen_devices(config) if catheter is None else catheter.devices
+        length = config.working_length
+        if catheter is not None:
+            length = float(np.sum(catheter.link_lengths))
         place = placement.place_device(
-            anatomy,
-            goal,
-            device,
-            config.working_length
-            if catheter is None
-            else float(np.sum(catheter.link_lengths)),
-            config.ranges.farthest_shift,
+            anatomy, goal, longest_tip(chosen), length, config.ranges.farthest_shift
         )
-        radius = device.outer_radius
+        catheter = catheter or _chain(chosen, place, config)
+        radius = catheter.device.outer_radius
+        friction = config.friction
+        if isinstance(catheter, DeviceStack):
+            # The larger of two bodies' coefficients counts, and the devices differ.
+            friction = 0.0
         scene = cls(
             goal=goal,
             placement=place,
-            arena=arena
-            or AngiographyArena(
-                device_density=device.linear_density / (np.pi * radius**2)
-            ),
-            phantom=phantom
-            or Phantom(anatomy, config.friction, goal_radius=goal_radius),
-            catheter=catheter or _catheter(device, place, config),
+            arena=arena or AngiographyArena(device_density=catheter.density),
+            phantom=phantom or Phantom(anatomy, friction, goal_radius=goal_radius),
+            catheter=catheter,
             sheath=sheath
             or Sheath(
                 straight(place.working_length - place.start_depth),
@@ -101,6 +103,8 @@ class Scene:
         return scene
 
     def _attach(self):
+        if isinstance(self.catheter, DeviceStack):
+            self.arena.mjcf_model.size.nuserdata = coaxial.user_data(self.catheter)
         self.arena.attach(self.phantom)
         place = self.placement
         for entity, position in (
@@ -121,29 +125,64 @@ class Scene:
         placement.add_cameras(self.arena, self.anatomy)
 
     @property
+    def coaxial(self) -> bool:
+        """Whether the devices are coaxial ones, each moved by itself."""
+        return isinstance(self.catheter, DeviceStack)
+
+    @property
+    def fields(self) -> tuple[str, ...]:
+        """Fields of `mujoco.MjData` that episodes in the scene read and write."""
+        own = coaxial.FIELDS_READ if self.coaxial else ()
+        return (*ModelIndex.FIELDS, *own)
+
+    @property
     def anatomy(self) -> Anatomy:
         """Lumen, wall and goals."""
         return self.phantom.anatomy
 
     @property
     def device(self) -> devices.Device:
-        """What the catheter is made of."""
+        """What the catheter is made of; of several devices, the outermost."""
         return self.catheter.device
 
 
-def _catheter(
-    device: devices.Device, place: placement.Placement, config: NavigationConfig
-) -> Catheter:
+def chosen_devices(config: NavigationConfig) -> tuple[devices.Device, ...]:
+    """The devices of a task, from the innermost outwards."""
+    if config.devices is None:
+        return (devices.get(config.device),)
+    return tuple(devices.get(device) for device in config.devices)
+
+
+def longest_tip(chosen: Sequence[devices.Device]) -> devices.Device:
+    """The device whose tip decides how far the chain starts inside."""
+    return max(chosen, key=lambda device: device.tip_length)
+
+
+def _chain(
+    chosen: Sequence[devices.Device],
+    place: placement.Placement,
+    config: NavigationConfig,
+) -> Chain:
     torsion = config.torsion_joints
     if torsion is None:
         torsion = _TORSION_JOINTS if config.rotation else 0
+    discretisation = devices.Discretisation(
+        working_length=place.working_length,
+        shaft_link=config.shaft_link,
+        torsion_joints=torsion,
+    )
+    if config.devices is not None:
+        return DeviceStack(
+            chosen,
+            discretisation,
+            stroke=place.stroke,
+            lead=config.lead,
+            friction=config.friction,
+            lumen_friction=config.lumen_friction,
+        )
     return Catheter(
-        device,
-        devices.Discretisation(
-            working_length=place.working_length,
-            shaft_link=config.shaft_link,
-            torsion_joints=torsion,
-        ),
+        chosen[0],
+        discretisation,
         stroke=place.stroke,
         rotation=config.rotation,
         friction=config.friction,

@@ -206,6 +206,7 @@ class ModelVariation:
         model: mujoco.MjModel,
         randomisation: Randomisation,
         catheter: str,
+        walls: bool = True,
     ):
         """Finds the elements.
 
@@ -213,6 +214,7 @@ class ModelVariation:
           model: the compiled model, as it is without randomisation.
           randomisation: which fields will change.
           catheter: MJCF scope of the catheter.
+          walls: whether the friction drawn is that of the walls too.
         """
 
         def named(kind: str, count: int, *prefixes: str) -> np.ndarray:
@@ -222,7 +224,8 @@ class ModelVariation:
                 dtype=int,
             )
 
-        self._geoms = named("geom", model.ngeom, f"{catheter}/", "wall_")
+        rubbing = (f"{catheter}/", "wall_") if walls else (f"{catheter}/",)
+        self._geoms = named("geom", model.ngeom, *rubbing)
         self._hinges = named(
             "joint", model.njnt, f"{catheter}/bend_", f"{catheter}/twist_"
         )

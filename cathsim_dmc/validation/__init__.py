@@ -15,6 +15,7 @@ __all__ = [
     "Report",
     "validate_anatomy",
     "validate_forces",
+    "validate_pair",
     "validate_rod",
     "validate_wall",
 ]
@@ -25,6 +26,13 @@ def validate_rod(*args: Any, **kwargs: Any) -> Report:
     from cathsim_dmc.validation import rod
 
     return rod.validate_rod(*args, **kwargs)
+
+
+def validate_pair(*args: Any, **kwargs: Any) -> Report:
+    """Coaxial devices at rest and on the move: see `validation.pair.validate_pair`."""
+    from cathsim_dmc.validation import pair
+
+    return pair.validate_pair(*args, **kwargs)
 
 
 def validate_anatomy(*args: Any, **kwargs: Any) -> Report:

@@ -18,7 +18,8 @@ from cathsim_dmc.files import atomic_path
 from cathsim_dmc.tasks.config import PHYSICS_TIMESTEP, NavigationConfig
 
 if TYPE_CHECKING:
-    from cathsim_dmc.validation import convergence, force_sensors, protocol
+    from cathsim_dmc.validation import convergence, force_sensors, protocol, sliding
+    from cathsim_dmc.validation import pair as pairs
     from cathsim_dmc.validation import rod as rods
     from cathsim_dmc.validation import wall as walls
 
@@ -149,6 +150,42 @@ def _lag(ax, lag):
         xlim=(0, 2.5),
     )
     ax.legend(frameon=False, fontsize=8, loc="lower right")
+
+
+def pair(
+    shapes: Sequence[pairs.Shape], turned: Sequence[sliding.Torque], path: str | Path
+) -> None:
+    """Draws unloaded shapes of coaxial devices, and torque through tubes."""
+    figure, axes = _canvas(1, 2)
+    left, right = axes[0]
+    for index, shape in enumerate(shapes):
+        end = shape.expected[-1, :2]
+        across = end / np.linalg.norm(end)
+        colour = _COLOURS[index % len(_COLOURS)]
+        for points, style in ((shape.expected, "-"), (shape.simulated, ".")):
+            left.plot(
+                1e3 * points[:, 2], 1e3 * points[:, :2] @ across, style, color=colour
+            )
+    length = 1e3 * shapes[0].expected[-1, 2]
+    left.set_xlim(length - 100, length + 10)
+    left.set(
+        title="unloaded shapes: EI-weighted curvature, joints",
+        xlabel="along the sheath, mm",
+        ylabel="across, mm",
+        aspect="equal",
+    )
+    for index, one in enumerate(turned):
+        right.plot(
+            np.degrees(one.base),
+            np.degrees(one.tip),
+            color=_COLOURS[index],
+            label=one.name,
+        )
+    ends = [0, np.degrees(turned[0].base[-1])]
+    right.plot(ends, ends, color="0.6", linewidth=0.8)
+    right.set(title="torque", xlabel="base, °", ylabel="end of the device, °")
+    right.legend(frameon=False)
+    save_figure(figure, path)
 
 
 def _convergence(axes, studies):

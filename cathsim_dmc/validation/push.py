@@ -8,7 +8,7 @@ import numpy as np
 
 from cathsim_dmc import suite
 from cathsim_dmc.anatomy import Anatomy, Goal
-from cathsim_dmc.entities.catheter import MAX_PUSH_SPEED
+from cathsim_dmc.entities.chain import MAX_PUSH_SPEED
 
 # A push that has gone on for so long a way of the base, m, beside that to the goal,
 # has missed.
@@ -54,9 +54,8 @@ def straight_push(anatomy: Anatomy, goal: str | Goal, seed: int = 0, **options) 
 
 def _push(environment, way: float) -> Push:
     action = np.zeros(environment.action_spec().shape)
-    names = environment.action_spec().name.split("\t")
-    action[next(i for i, name in enumerate(names) if "insertion" in name)] = 1.0
     task = environment.task
+    action[list(task.scene.catheter.translations)] = 1.0
     longest = round((way + _SPARE) / (MAX_PUSH_SPEED * task.control_timestep))
     timestep = environment.reset()
     sums, peak, steps = [], 0.0, 0

@@ -8,7 +8,8 @@ from dm_control import mjcf
 
 from cathsim_dmc.entities import devices
 from cathsim_dmc.entities.arena import AngiographyArena
-from cathsim_dmc.entities.catheter import BENDING_RELAXATION_TIME, Catheter
+from cathsim_dmc.entities.catheter import Catheter
+from cathsim_dmc.entities.chain import BENDING_RELAXATION_TIME, Chain
 from cathsim_dmc.entities.contact import FRICTION
 from cathsim_dmc.tasks.config import PHYSICS_TIMESTEP
 
@@ -18,7 +19,9 @@ REST_CHANGE = 1e-6
 
 
 class Rig:
-    """A device alone in the arena of the tasks, along +z, its base at insertion 0.
+    """A device, or coaxial ones, alone in the arena of the tasks.
+
+    It lies along +z, its base at insertion 0.
 
     Integrator, time step, solver and contact parameters are those of the tasks.
     Gravity is off; what the default device weighs in blood is nothing anyway.
@@ -37,19 +40,19 @@ class Rig:
         rotation: bool = False,
         friction: float = FRICTION,
         timestep: float = PHYSICS_TIMESTEP,
+        catheter: Chain | None = None,
     ):
-        self.device = devices.get(device)
-        area = np.pi * self.device.outer_radius**2
-        self.arena = AngiographyArena(self.device.linear_density / area)
-        self.arena.mjcf_model.option.timestep = timestep
-        self.arena.mjcf_model.option.gravity = (0, 0, 0)
-        self.catheter = Catheter(
-            self.device,
+        self.catheter = catheter or Catheter(
+            devices.get(device),
             discretisation,
             stroke=stroke,
             rotation=rotation,
             friction=friction,
         )
+        self.device = self.catheter.device
+        self.arena = AngiographyArena(self.catheter.density)
+        self.arena.mjcf_model.option.timestep = timestep
+        self.arena.mjcf_model.option.gravity = (0, 0, 0)
         self.lengths = self.catheter.link_lengths
         self.arena.attach(self.catheter)
 

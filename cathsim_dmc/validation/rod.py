@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import mujoco
 import numpy as np
 
 from cathsim_dmc.entities import devices
-from cathsim_dmc.entities.catheter import BENDING_RELAXATION_TIME, MAX_ROTATION_SPEED
+from cathsim_dmc.entities.chain import BENDING_RELAXATION_TIME, MAX_ROTATION_SPEED
 from cathsim_dmc.validation import theory
 from cathsim_dmc.validation.checks import Check, Report
 from cathsim_dmc.validation.rig import Rig
@@ -73,15 +74,35 @@ def cantilevers(
     rig = Rig(straight(device), discretisation)
     rig.compile()
     lengths, bending, _ = rig.sections
+    return bent(rig, lengths, bending, end_angles, plane)
+
+
+def bent(
+    rig: Rig,
+    lengths: np.ndarray,
+    bending: np.ndarray,
+    end_angles: Sequence[float],
+    plane: float = np.pi / 4,
+) -> list[Cantilever]:
+    """Loads the end of a straight chain across and compares it with the elastica.
+
+    Args:
+        rig: compiled, at rest.
+        lengths: (S,) of the sections of the rod it stands for, from the clamp on, m.
+        bending: (S,) their EI, N·m².
+        end_angles: of the elastica's end, degrees; they set the forces.
+        plane: direction of the force about the axis, rad.
+    """
     across = np.array([np.cos(plane), np.sin(plane), 0.0])
-    clamp = np.array([0.0, 0.0, -lengths.sum()])
+    total = float(np.sum(lengths))
+    clamp = np.array([0.0, 0.0, -total])
     unloaded = rig.head_position
     results = []
     for degrees in end_angles:
         shape = theory.elastica(lengths, bending, np.radians(degrees))
         rig.settle(shape.force * across)
         moved = rig.head_position - unloaded
-        expected = shape.position[-1] - (lengths.sum(), 0.0)
+        expected = shape.position[-1] - (total, 0.0)
         simulated = np.array([moved[2], moved @ across])
         # What leaves the plane of the load is an error too.
         error = np.append(simulated - expected, moved @ np.cross([0, 0, 1], across))
@@ -143,12 +164,31 @@ def buckling(
     last = shaft - 1 if joints is None else joints
     if not 2 <= last < shaft:
         raise ValueError(f"joints is {joints}; allowed are 2 to {shaft - 1}")
+    return column(rig, end, last, rig.device.shaft.bending_stiffness)
+
+
+def column(
+    rig: Rig,
+    end: str,
+    last: int,
+    stiffness: float,
+    prepare: Callable[[Rig], None] = lambda rig: None,
+) -> Buckling:
+    """Measures the critical load of a chain between its clamp and a guide.
+
+    Args:
+        rig: not compiled yet.
+        end: as in `buckling`.
+        last: link that the guide holds.
+        stiffness: EI of the rod up to there, N·m².
+        prepare: called when the rig has been compiled.
+    """
     middles = np.cumsum(rig.lengths) - rig.lengths / 2
     length = middles[last] - middles[0]
-    stiffness = rig.device.shaft.bending_stiffness
     expected = theory.buckling_load([length], [stiffness], end=end)
     _add_guide(rig, last, end)
     rig.compile()
+    prepare(rig)
     link = rig.model.body(f"{rig.name}/link_{last}").id
     middle = rig.model.body(f"{rig.name}/link_{(last + 1) // 2}").id
     pushed = middle if end == "fixed" else link
@@ -320,8 +360,8 @@ def validate_rod(figure_path: str | Path | None = None) -> Report:
         figure_path: PNG to write, or None.
     """
     checks: list[Check] = []
-    bent = cantilevers()
-    for one in bent:
+    loaded = cantilevers()
+    for one in loaded:
         checks.append(
             Check.at_most(
                 f"cantilever, end at {np.degrees(one.end_angle):.0f}°",
@@ -395,5 +435,5 @@ def validate_rod(figure_path: str | Path | None = None) -> Report:
     if figure_path is not None:
         from cathsim_dmc.validation import figures
 
-        figures.rod(bent, columns, short, lag, figure_path)
+        figures.rod(loaded, columns, short, lag, figure_path)
     return Report("rod", checks, findings)

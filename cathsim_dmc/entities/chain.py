@@ -1,0 +1,340 @@
+"""A chain of rigid links that stands for slender devices; its base is driven."""
+
+import numpy as np
+from dm_control import composer, mjcf
+
+from cathsim_dmc.entities.contact import device_contact
+from cathsim_dmc.entities.device import Device
+
+# Relaxation time of bending: joint damping = time * stiffness, s. It lumps the loss
+# inside the polymer with the drag of blood: a 0.2 m cantilever of 50 N·mm² with a drag
+# of 0.15 N·s/m² relaxes in c L⁴ / (12.4 EI) = 0.4 s. With half of it, a buckled shaft
+# that snaps through outruns steps of 4 ms (docs/soak.md).
+BENDING_RELAXATION_TIME = 0.4
+# Rotor inertia of the hinges, kg·m². Next to the damping it acts within 2 ms, far
+# below the relaxation time, and it gives the contact solver the scale of mass at
+# which the wall is as hard as silicone (docs/physics.md).
+HINGE_ARMATURE = 1e-6
+# The same of the torsion hinges. They are softer: more would delay the twist by more
+# than a few milliseconds.
+TORSION_ARMATURE = 1e-7
+CARRIAGE_MASS = 0.2  # kg, platform of the follower that pushes the device
+MAX_PUSH_FORCE = 5.0  # N, slip of the clamps
+MAX_PUSH_SPEED = 0.04  # m/s
+CARRIAGE_GAIN = 100.0  # N·s/m, stiff: 1 N of load costs 1 cm/s
+
+# The links are rigid; the axial compliance of the whole device, L / EA, sits in a
+# spring at its base. Without it a jam stops the carriage within a step, and the push
+# force chatters. Damping ratio of the carriage on that spring.
+COMPRESSION_DAMPING = 0.5
+COMPRESSION_ARMATURE = 1e-3  # kg, about the mass of the device
+
+# Rotary unit as seen by the device, kg·m²: a 0.3 kg clamp of 2 cm. The bounded torque
+# then changes the speed by less in a time step than the range in which the servo is
+# linear (4 rad/s); a rotor 100 times lighter went bang-bang between 0 and 80 rad/s.
+ROTOR_INERTIA = 1e-4
+MAX_TORQUE = 0.02  # N·m
+MAX_ROTATION_SPEED = 3.14  # rad/s
+ROTATION_GAIN = 0.01  # N·m·s/rad
+
+_VISIBLE_SHAFT = 0.45  # m of device behind the simulated part, at full insertion
+COLOUR = (0.85, 0.32, 0.08, 1.0)
+TIP_COLOUR = (0.95, 0.75, 0.1, 1.0)
+
+
+class Chain(composer.Entity):
+    """Links with hinges about x and y; +z of every link points to the distal end.
+
+    The origin of the entity is the place of the distal end at zero insertion. What the
+    links are made of is what `Catheter` and `DeviceStack` say.
+    """
+
+    def _assemble(
+        self,
+        link_lengths: np.ndarray,
+        radius: float,
+        *,
+        stroke: float,
+        rotation: bool,
+        friction: float,
+        name: str,
+    ) -> None:
+        """Builds base, links, head, motors and sensors.
+
+        Args:
+          link_lengths: (n,), from proximal to distal, m.
+          radius: of all links, m.
+          stroke: longest insertion, m.
+          rotation: whether the base can be rotated.
+          friction: Coulomb coefficient; MuJoCo takes the larger of the two bodies'.
+          name: of the entity.
+        """
+        if not stroke > 0:
+            raise ValueError(f"stroke is {stroke} m; it must be positive")
+        self._lengths, self._radius, self._stroke = link_lengths, radius, stroke
+        self._mjcf_root = mjcf.RootElement(model=name)
+        self._mjcf_root.compiler.angle = "radian"
+        self._contact = device_contact(friction)
+        self._links = []
+        self._link_geoms = []
+        self._bends = []
+        self._build_base(rotation)
+        for index in range(1, len(self._lengths)):
+            self._build_link(index)
+        self._head = self._links[-1].add(
+            "site",
+            name="head",
+            pos=(0, 0, self._lengths[-1]),
+            size=[self._radius],
+            rgba=TIP_COLOUR,
+            group=4,
+        )
+        self._build_motors()
+        self._build_sensors()
+
+    # What the links are made of.
+
+    def _axial_stiffness(self) -> float:
+        """EA of the whole device, N."""
+        raise NotImplementedError
+
+    def _joint_compliance(self, index: int) -> float:
+        """Compliance in rad/(N·m) of the bending of the rod next to a joint."""
+        raise NotImplementedError
+
+    def _rest_angles(self, index: int) -> tuple[float, float]:
+        """Angles of the unloaded hinges of a joint about x and y, rad."""
+        raise NotImplementedError
+
+    def _link_mass(self, index: int) -> float:
+        """Mass of a link, kg."""
+        raise NotImplementedError
+
+    def _in_tip(self, index: int) -> bool:
+        """Whether a link belongs to the tip; for looks."""
+        raise NotImplementedError
+
+    def _add_twist(self, link, index: int) -> None:
+        """Adds the torsion hinge of a link, if it has one."""
+
+    @property
+    def device(self) -> Device:
+        """The device, or of several the outermost."""
+        raise NotImplementedError
+
+    @property
+    def devices(self) -> tuple[Device, ...]:
+        """The devices, from the innermost outwards."""
+        raise NotImplementedError
+
+    @property
+    def density(self) -> float:
+        """Density (kg/m³) of a body that blood carries as much of."""
+        raise NotImplementedError
+
+    # How they are put together.
+
+    def _build_base(self, rotation: bool):
+        base = self._mjcf_root.worldbody.add(
+            "body", name="link_0", pos=(0, 0, -self._lengths.sum())
+        )
+        self._insertion = base.add(
+            "joint",
+            name="insertion",
+            type="slide",
+            axis=(0, 0, 1),
+            armature=CARRIAGE_MASS,
+            limited=True,
+            range=(0.0, self._stroke),
+        )
+        stiffness = self._axial_stiffness() / self._lengths.sum()
+        base.add(
+            "joint",
+            name="compression",
+            type="slide",
+            axis=(0, 0, 1),
+            stiffness=stiffness,
+            damping=2 * COMPRESSION_DAMPING * (stiffness * CARRIAGE_MASS) ** 0.5,
+            armature=COMPRESSION_ARMATURE,
+        )
+        self._rotation = None
+        if rotation:
+            self._rotation = base.add(
+                "joint",
+                name="rotation",
+                type="hinge",
+                axis=(0, 0, 1),
+                armature=ROTOR_INERTIA,
+            )
+        self._links.append(base)
+        self._add_capsule(base, 0)
+        # The rest of the device, which the follower holds; for looks only.
+        base.add(
+            "geom",
+            name="shaft",
+            type="capsule",
+            fromto=(0, 0, -_VISIBLE_SHAFT - self._stroke, 0, 0, 0),
+            size=[self._radius],
+            mass=0,
+            contype=0,
+            conaffinity=0,
+            group=2,
+            rgba=COLOUR,
+        )
+
+    def _build_link(self, index: int):
+        link = self._links[-1].add(
+            "body", name=f"link_{index}", pos=(0, 0, self._lengths[index - 1])
+        )
+        self._links.append(link)
+        stiffness = 1 / self._joint_compliance(index)
+        rest = dict(zip("xy", self._rest_angles(index), strict=True))
+        self._add_twist(link, index)
+        for axis, direction in (("x", (1, 0, 0)), ("y", (0, 1, 0))):
+            self._bends.append(
+                link.add(
+                    "joint",
+                    name=f"bend_{axis}_{index}",
+                    axis=direction,
+                    stiffness=stiffness,
+                    damping=BENDING_RELAXATION_TIME * stiffness,
+                    springref=rest[axis],
+                    armature=HINGE_ARMATURE,
+                )
+            )
+        self._add_capsule(link, index)
+
+    def _add_capsule(self, body, index: int):
+        length = self._lengths[index]
+        self._link_geoms.append(
+            body.add(
+                "geom",
+                name=f"link_{index}",
+                type="capsule",
+                fromto=(0, 0, 0, 0, 0, length),
+                size=[self._radius],
+                mass=self._link_mass(index),
+                rgba=TIP_COLOUR if self._in_tip(index) else COLOUR,
+                **self._contact,
+            )
+        )
+
+    def _build_motors(self):
+        self._insertion_motor = self._add_velocity_motor(
+            "insertion",
+            self._insertion,
+            CARRIAGE_GAIN,
+            MAX_PUSH_SPEED,
+            MAX_PUSH_FORCE,
+        )
+        self._rotation_motor = None
+        if self._rotation is not None:
+            self._rotation_motor = self._add_velocity_motor(
+                "rotation",
+                self._rotation,
+                ROTATION_GAIN,
+                MAX_ROTATION_SPEED,
+                MAX_TORQUE,
+            )
+
+    def _add_velocity_motor(self, name, joint, gain, max_speed, max_effort):
+        return self._mjcf_root.actuator.add(
+            "general",
+            name=name,
+            joint=joint,
+            ctrllimited=True,
+            ctrlrange=(-1, 1),
+            forcelimited=True,
+            forcerange=(-max_effort, max_effort),
+            gainprm=[gain * max_speed],
+            biastype="affine",
+            biasprm=[0, 0, -gain],
+        )
+
+    def _build_sensors(self):
+        grip = self._links[0].add("site", name="grip", size=[1e-3], group=4)
+        self._mjcf_root.sensor.add("force", name="push_force", site=grip)
+        self._mjcf_root.sensor.add("torque", name="push_torque", site=grip)
+
+    @property
+    def mjcf_model(self) -> mjcf.RootElement:
+        """The MJCF model of the chain."""
+        return self._mjcf_root
+
+    @property
+    def link_lengths(self) -> np.ndarray:
+        """Lengths (n,) of the links from proximal to distal, m."""
+        return self._lengths
+
+    @property
+    def stroke(self) -> float:
+        """Longest insertion, m."""
+        return self._stroke
+
+    @property
+    def links(self) -> tuple:
+        """Bodies from proximal to distal."""
+        return tuple(self._links)
+
+    @property
+    def link_geoms(self) -> tuple:
+        """Capsules of the links from proximal to distal."""
+        return tuple(self._link_geoms)
+
+    @property
+    def head(self):
+        """Site at the distal end."""
+        return self._head
+
+    @property
+    def insertion(self):
+        """Slide joint of the base."""
+        return self._insertion
+
+    @property
+    def rotation(self):
+        """Hinge joint of the base, or None."""
+        return self._rotation
+
+    @property
+    def bends(self) -> tuple:
+        """Bending hinges from proximal to distal, x before y."""
+        return tuple(self._bends)
+
+    @property
+    def tip_motors(self) -> tuple:
+        """Motors of the tip from proximal to distal, x before y."""
+        return ()
+
+    @property
+    def actuators(self) -> tuple:
+        """All actuators: tip, insertion, rotation."""
+        rotation = () if self._rotation_motor is None else (self._rotation_motor,)
+        return (*self.tip_motors, self._insertion_motor, *rotation)
+
+    @property
+    def action_names(self) -> tuple[str, ...]:
+        """Names of the entries of an action: those of the actuators."""
+        return tuple(actuator.name for actuator in self.actuators)
+
+    @property
+    def translations(self) -> tuple[int, ...]:
+        """Places in the action of what pushes."""
+        return (len(self.tip_motors),)
+
+    @property
+    def action_groups(self) -> tuple[int, ...]:
+        """Number of the group of each entry of an action.
+
+        Motors of the tip that bend about one axis are one group, the others stand
+        alone.
+        """
+        tip = len(self.tip_motors)
+        axes = [number % 2 for number in range(tip)]
+        first = min(tip, 2)
+        return (*axes, *range(first, first + len(self.action_names) - tip))
+
+    @property
+    def joints(self) -> tuple:
+        """All joints in the order of the chain."""
+        return tuple(self._mjcf_root.find_all("joint"))

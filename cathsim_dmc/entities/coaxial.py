@@ -1,0 +1,341 @@
+"""Coaxial devices: what a chain is made of where devices lie in each other.
+
+Devices are numbered from the innermost outwards. One chain of links stands for all of
+them: its end is the farthest of their ends, and device k ends `gap_k` before it. Along
+the chain, at a place s from its end,
+
+    EI(s) = Σ EI_k(s),    κ(s) EI(s) = Σ EI_k(s) κ_k(s),
+
+over the devices that reach so far, each with the curvature κ_k of its unloaded shape,
+turned by its own rotation there. What a hinge needs are integrals of 1/EI and κ over
+its two links, with a weight that falls linearly from 1 at the hinge to 0 at their far
+ends: so the hinges bend by as much as the rod does, and about the same place on
+average, wherever the end of a device lies in a link, and everything changes
+continuously as devices slide and turn.
+
+Pure functions of arrays with a leading axis N of simulations; SI units. Directions
+across the chain are complex numbers x + iy in the frame of a link: a hinge bent by
+`bend_y` about y and `bend_x` about x leads towards bend_y - i bend_x, and a rotation by
+φ about the device multiplies by exp(iφ).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from cathsim_dmc.entities.arena import BLOOD_DENSITY
+from cathsim_dmc.entities.device import Device
+
+# Farther from the end than any device is long, m.
+_FAR = 1e3
+
+
+class Overlap(NamedTuple):
+    """What the overlap alone decides, whatever the rotations. J joints, L links.
+
+    Attributes:
+      compliance: (N, J), ∫h ds/EI of a joint with its weight h, rad/(N·m).
+      rest: (N, K, J), ∫h κ_k EI_k/EI ds: by what each device bends the free joint, rad.
+      coupling: (N, P, J), ∫h κ_k κ_l EI_k EI_l/EI ds for each pair of `Stack.pairs`:
+        the energy of two devices that bend against each other, N·m.
+      stiffness: (N, K, J), weighted mean of EI_k, N·m².
+      moment: (N, K, J), weighted mean of EI_k κ_k, N·m.
+      outermost: (N, K, L), share of each link on which a device is the outermost.
+      present: (N, K, L), share of each link that a device reaches.
+    """
+
+    compliance: np.ndarray
+    rest: np.ndarray
+    coupling: np.ndarray
+    stiffness: np.ndarray
+    moment: np.ndarray
+    outermost: np.ndarray
+    present: np.ndarray
+
+
+class Links(NamedTuple):
+    """What the links are, arrays (N, L).
+
+    Attributes:
+      radius: of the outermost device, m; in a link on which that changes, its mean.
+      friction: Coulomb coefficient on the wall, likewise.
+      mass: kg.
+      weight: what gravity pulls in blood, as mass, kg.
+    """
+
+    radius: np.ndarray
+    friction: np.ndarray
+    mass: np.ndarray
+    weight: np.ndarray
+
+
+class Stack:
+    """Coaxial devices on one chain of links.
+
+    Attributes:
+      devices: from the innermost outwards.
+      link_lengths: (L,), from proximal to distal, m.
+      nodes: (L + 1,), distance of the ends of the links from the end of the chain, m,
+        from proximal to distal.
+      spans: (J,), length of rod that each joint stands for, half of its two links, m.
+      pairs: (P, 2), numbers of every two devices.
+    """
+
+    def __init__(self, devices: Sequence[Device], link_lengths: np.ndarray):
+        """Prepares the sections of the devices.
+
+        Args:
+          devices: from the innermost outwards.
+          link_lengths: (L,), from proximal to distal, m.
+
+        Raises:
+          ValueError: if there is no device, or one does not fit into the next.
+        """
+        _check_fit(devices)
+        self.devices = tuple(devices)
+        self.link_lengths = np.asarray(link_lengths, dtype=np.float64)
+        beyond = np.cumsum(self.link_lengths[::-1])[::-1]
+        self.nodes = np.append(beyond, 0.0)
+        self.spans = (self.link_lengths[:-1] + self.link_lengths[1:]) / 2
+        count = len(devices)
+        self.pairs = np.array(
+            [(k, j) for k in range(count) for j in range(k + 1, count)], dtype=int
+        ).reshape(-1, 2)
+        # Ends of the pieces of each device, and EI and EI κ in them; the first entry
+        # stands for what is beyond the device's end.
+        pieces = [_pieces(device) for device in self.devices]
+        self._edges = [edges for edges, _, _ in pieces]
+        self._bending = [np.append(0.0, bending) for _, bending, _ in pieces]
+        self._moment = [np.append(0.0, moment) for _, _, moment in pieces]
+        self._radius = np.array([device.outer_radius for device in devices])
+        self._ratio = np.array([device.friction_ratio for device in devices])
+        self._density = np.array([device.linear_density for device in devices])
+        self._weight = np.array([weight_density(device) for device in devices])
+
+    def overlap(self, gaps: np.ndarray) -> Overlap:
+        """Integrals around the joints and over the links.
+
+        Args:
+          gaps: (N, K), way from the end of each device to the end of the chain, m, at
+            least 0, and 0 for the device that reaches farthest.
+        """
+        edges = np.concatenate(
+            [gaps[:, k, None] + edge for k, edge in enumerate(self._edges)], axis=-1
+        )
+        edges.sort(axis=-1)
+        # Between two of them nothing changes: cells (N, C).
+        edges = np.concatenate([edges, np.full((len(gaps), 1), _FAR)], axis=-1)
+        middles = (edges[:, 1:] + edges[:, :-1]) / 2
+        bending, moment = self._sections(middles, gaps)
+        total = 1 / bending.sum(axis=1)
+        share = moment * total[:, None]
+        first, second = self.pairs[:, 0], self.pairs[:, 1]
+        both = share[:, first] * moment[:, second]
+        values = np.concatenate([total[:, None], share, both, bending, moment], axis=1)
+        weights = np.diff(self._weight_up_to(edges), axis=-1)  # (N, J, C)
+        integrals = (values[:, :, None] * weights[:, None]).sum(axis=-1)
+        count = len(self.devices)
+        cuts = np.cumsum([1, count, len(self.pairs), count])
+        compliance, rest, coupling, stiffness, mean = np.split(integrals, cuts, axis=1)
+        outermost, present = self._shares(gaps)
+        return Overlap(
+            compliance[:, 0],
+            rest,
+            coupling,
+            stiffness / self.spans,
+            mean / self.spans,
+            outermost,
+            present,
+        )
+
+    def _weight_up_to(self, places: np.ndarray) -> np.ndarray:
+        """Integral (N, J, C) of the weight of each joint from the end to places (N, C).
+
+        The weight rises along the link beyond the joint and falls along the one before.
+        """
+        joints = self.nodes[1:-1, None]
+        ahead, behind = self.link_lengths[1:, None], self.link_lengths[:-1, None]
+        offset = places[:, None] - joints
+        rise = np.clip(offset + ahead, 0.0, ahead)
+        fall = np.clip(offset, 0.0, behind)
+        return rise**2 / (2 * ahead) + fall - fall**2 / (2 * behind)
+
+    def _sections(
+        self, places: np.ndarray, gaps: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """EI and EI κ (N, K, C) of each device at places (N, C) from the end."""
+        bending, moment = [], []
+        for k, edges in enumerate(self._edges):
+            own = places - gaps[:, k, None]
+            piece = (own[..., None] >= edges).sum(axis=-1)
+            bending.append(self._bending[k][piece])
+            moment.append(self._moment[k][piece])
+        return np.stack(bending, axis=1), np.stack(moment, axis=1)
+
+    def _shares(self, gaps: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Shares (N, K, L) of the links where a device is outermost, and present."""
+        present = (self.nodes[:-1] - gaps[..., None]) / self.link_lengths
+        np.clip(present, 0.0, 1.0, out=present)
+        # A place is covered by whatever lies farther out and reaches it.
+        covered = np.zeros_like(present[:, 0])
+        outermost = np.empty_like(present)
+        for k in reversed(range(len(self.devices))):
+            outermost[:, k] = np.maximum(present[:, k] - covered, 0.0)
+            covered = np.maximum(covered, present[:, k])
+        return outermost, present
+
+    def rest_angles(
+        self, overlap: Overlap, turns: np.ndarray, factor: np.ndarray | complex = 1.0
+    ) -> np.ndarray:
+        """Angles of the free joints.
+
+        Args:
+          overlap: of the devices.
+          turns: (N, K, J), rotation of each device at each joint, rad.
+          factor: (N, K, J), of the part of each device.
+
+        Returns:
+          (N, J) complex, rad.
+        """
+        return (overlap.rest * np.exp(1j * turns) * factor).sum(axis=1)
+
+    def links(self, overlap: Overlap, friction: np.ndarray) -> Links:
+        """What the links are made of.
+
+        Args:
+          overlap: of the devices.
+          friction: (N,), Coulomb coefficient of an uncoated device on the wall.
+        """
+        outermost, present = overlap.outermost, overlap.present
+        return Links(
+            radius=_sum(outermost, self._radius),
+            friction=_sum(outermost, self._ratio) * friction[:, None],
+            mass=_sum(present, self._density) * self.link_lengths,
+            weight=_sum(present, self._weight) * self.link_lengths,
+        )
+
+    def restoring(
+        self, overlap: Overlap, bends: np.ndarray, turns: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Torques that turn the shaped parts of the devices, and how they stiffen.
+
+        The energy of a joint that is bent by θ is |θ - Σ R_k e_k|²/2C, e_k = exp(iφ_k),
+        and that of two devices against each other -S cos(φ_k - φ_l). Its derivative by
+        a rotation is what makes a shaped device in a curved vessel lie in the curve,
+        and whip round when it is turned.
+
+        Args:
+          overlap: of the devices.
+          bends: (N, J) complex, how far the joints are bent, rad.
+          turns: (N, K, J), rotation of each device at each joint, rad.
+
+        Returns:
+          Torque (N, K, J) on each device in the direction of its rotation, N·m, and
+          minus its derivative by that rotation, N·m/rad.
+        """
+        pulls = overlap.rest * np.exp(1j * turns)  # (N, K, J)
+        others = pulls.sum(axis=1, keepdims=True) - pulls
+        torque = (np.conj(bends[:, None] - others) * pulls) / overlap.compliance[
+            :, None
+        ]
+        rate, torque = torque.real, -torque.imag
+        for number, (k, j) in enumerate(self.pairs):
+            angle = turns[:, k] - turns[:, j]
+            energy = overlap.coupling[:, number]
+            torque[:, k] -= energy * np.sin(angle)
+            torque[:, j] += energy * np.sin(angle)
+            rate[:, k] += energy * np.cos(angle)
+            rate[:, j] += energy * np.cos(angle)
+        return torque, rate
+
+    def pressure(
+        self, overlap: Overlap, bends: np.ndarray, turns: np.ndarray
+    ) -> np.ndarray:
+        """Forces by which each device presses on the lumen of the next one.
+
+        Each device carries its own share of the bending moment; where that share is
+        not straight along the device, it leans on the other.
+
+        Args:
+          overlap: of the devices.
+          bends: (N, J) complex, how far the joints are bent, rad.
+          turns: (N, K, J), rotation of each device at each joint, rad.
+
+        Returns:
+          (N, K - 1, J), N, at the joints, of device k on device k + 1.
+        """
+        curvature = (bends / self.spans)[:, None]
+        inner = slice(0, len(self.devices) - 1)
+        moment = overlap.stiffness[:, inner] * curvature - overlap.moment[
+            :, inner
+        ] * np.exp(1j * turns[:, inner])
+        shear = np.diff(moment, axis=-1) / self.link_lengths[1:-1]
+        ends = np.zeros((*shear.shape[:-1], 1))
+        force = np.abs(np.diff(np.concatenate([ends, shear, ends], axis=-1), axis=-1))
+        # Only where both are: a joint has the share of the links on its sides.
+        present = overlap.present[:, 1:]
+        return force * (present[..., :-1] + present[..., 1:]) / 2
+
+    def inertia(self, mass: np.ndarray, radius: np.ndarray) -> np.ndarray:
+        """Moments of inertia (N, L, 2) of solid capsules: across and along, kg·m²."""
+        length = self.link_lengths
+        share = 1 / (1 + 4 * radius / (3 * length))  # of the cylinder in the volume
+        cylinder, ball = mass * share, mass * (1 - share)
+        square = radius**2
+        across = cylinder * (length**2 / 12 + square / 4) + ball * (
+            2 * square / 5 + length**2 / 4 + 3 * length * radius / 8
+        )
+        along = cylinder * square / 2 + ball * 2 * square / 5
+        return np.stack([across, along], axis=-1)
+
+
+def weight_density(device: Device) -> float:
+    """Mass per length that gravity pulls at in blood, which fills the lumen, kg/m."""
+    section = np.pi * (device.outer_radius**2 - device.inner_radius**2)
+    return max(0.0, device.linear_density - BLOOD_DENSITY * section)
+
+
+def _pieces(device: Device) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Where the uniform pieces of a device begin, m from its end; their EI, and EI κ.
+
+    The positive curvature of an arc leads towards +x.
+    """
+    curved, end = [], 0.0
+    for arc in reversed(device.tip_shape):
+        curved.append((end, end + arc.length, np.copysign(1 / arc.radius, arc.angle)))
+        end += arc.length
+    starts = {0.0, device.tip_length, *(each for arc in curved for each in arc[:2])}
+    edges = np.array(sorted(starts))
+    in_tip = edges < device.tip_length
+    bending = np.where(
+        in_tip, device.tip.bending_stiffness, device.shaft.bending_stiffness
+    )
+    curvature = np.zeros(len(edges))
+    for start, stop, value in curved:
+        curvature[(edges >= start) & (edges < stop)] = value
+    return edges, bending, bending * curvature
+
+
+def _sum(shares: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """Sum over the devices (N, L) of shares (N, K, L) times values (K,)."""
+    return (shares * values[:, None]).sum(axis=1)
+
+
+def _check_fit(devices: Sequence[Device]) -> None:
+    if not devices:
+        raise ValueError("there is no device; give one or more, the innermost first")
+    for inner, outer in zip(devices[:-1], devices[1:], strict=True):
+        if not inner.outer_radius < outer.inner_radius:
+            lumen = (
+                f"has a lumen of {2e3 * outer.inner_radius:.3g} mm"
+                if outer.inner_radius
+                else "is solid"
+            )
+            raise ValueError(
+                f"device {inner.name!r} is {2e3 * inner.outer_radius:.3g} mm thick, "
+                f"but {outer.name!r}, in which it is to lie, {lumen}; give devices "
+                "from the innermost outwards, each thinner than the lumen of the next"
+            )

@@ -1,0 +1,155 @@
+"""What a catheter or guidewire is: a rod of two sections with a shape, in SI units."""
+
+import dataclasses
+import math
+
+from cathsim_dmc import bounds
+from cathsim_dmc.imaging import materials
+
+_MOST_LINKS = 200
+
+
+@dataclasses.dataclass(frozen=True)
+class Section:
+    """A stretch of uniform rod.
+
+    Attributes:
+      bending_stiffness: EI in N·m².
+      torsional_stiffness: GJ in N·m².
+    """
+
+    bending_stiffness: float
+    torsional_stiffness: float
+
+    def __post_init__(self):
+        for field in dataclasses.fields(self):
+            value = getattr(self, field.name)
+            try:
+                bounds.number(field.name, value, positive=True)
+            except ValueError as error:
+                raise ValueError(f"{error}, in N·m² (1 N·mm² = 1e-6 N·m²)") from error
+
+    @classmethod
+    def isotropic(cls, bending_stiffness: float, poisson_ratio: float) -> "Section":
+        """A round section of one isotropic material: GJ = EI / (1 + ν)."""
+        return cls(bending_stiffness, bending_stiffness / (1 + poisson_ratio))
+
+
+@dataclasses.dataclass(frozen=True)
+class Arc:
+    """A circular arc of a pre-shaped tip.
+
+    Attributes:
+      radius: radius of curvature of the centreline, m.
+      angle: turning angle, rad; the sign is the side to which it turns.
+    """
+
+    radius: float
+    angle: float
+
+    def __post_init__(self):
+        bounds.number("radius", self.radius, positive=True)
+        bounds.number("angle", self.angle)
+
+    @property
+    def length(self) -> float:
+        """Length along the centreline, m."""
+        return abs(self.radius * self.angle)
+
+
+@dataclasses.dataclass(frozen=True)
+class Device:
+    """A catheter or guidewire.
+
+    Attributes:
+      name: key in `DEVICES`.
+      outer_radius: m.
+      linear_density: mass per length, kg/m.
+      shaft: section proximal of the tip.
+      tip: section of the distal `tip_length`.
+      tip_length: m.
+      tip_links: rigid links that the tip is divided into.
+      steering_angle: largest angle that the motor of one tip joint bends it by
+        when nothing else loads it, rad. 0 makes a passive device without motors.
+      tip_shape: arcs of the unloaded shape, from proximal to distal; they end at
+        the distal end and bend in the local x-z plane.
+      inner_radius: of the lumen, m; 0 for a wire.
+      friction_ratio: Coulomb friction on the wall, against that of an uncoated device
+        in the same vessel.
+      attenuation: excess over water of X-rays, homogenised over its section, 1/m.
+      marker_attenuation: that of the radiopaque marker at its end, 1/m.
+      marker_length: of the marker, m.
+      source: where its figures come from, for people.
+    """
+
+    name: str
+    outer_radius: float
+    linear_density: float
+    shaft: Section
+    tip: Section
+    tip_length: float = 0.07
+    tip_links: int = 10
+    steering_angle: float = 0.0
+    tip_shape: tuple[Arc, ...] = ()
+    inner_radius: float = 0.0
+    friction_ratio: float = 1.0
+    attenuation: float = materials.CATHETER
+    marker_attenuation: float = materials.MARKER
+    marker_length: float = materials.MARKER_LENGTH
+    source: str = ""
+
+    def __post_init__(self):
+        bounds.instance("name", self.name, str)
+        of_device = f"of device {self.name!r}"
+        for name in ("outer_radius", "linear_density", "tip_length"):
+            bounds.number(f"{name} {of_device}", getattr(self, name), positive=True)
+        bounds.whole(f"tip_links {of_device}", self.tip_links, 1, _MOST_LINKS)
+        for name in ("shaft", "tip"):
+            bounds.instance(f"{name} {of_device}", getattr(self, name), Section)
+        arcs = self.tip_shape
+        if not isinstance(arcs, tuple) or not all(isinstance(a, Arc) for a in arcs):
+            bounds.refuse(f"tip_shape {of_device}", arcs, "a tuple of Arc")
+        lumen = f"inner_radius {of_device}"
+        if bounds.number(lumen, self.inner_radius, 0.0) >= self.outer_radius:
+            bounds.refuse(lumen, self.inner_radius, "less than its outer_radius")
+        bounds.number(f"friction_ratio {of_device}", self.friction_ratio, 0.0)
+        for name in ("attenuation", "marker_attenuation", "marker_length"):
+            bounds.number(f"{name} {of_device}", getattr(self, name), 0.0)
+        bounds.instance(f"source {of_device}", self.source, str)
+        angle = f"steering_angle {of_device}"
+        if bounds.number(angle, self.steering_angle, 0.0) >= math.pi / 2:
+            bounds.refuse(angle, self.steering_angle, "in [0, π/2) rad for each joint")
+
+    @property
+    def steerable(self) -> bool:
+        """Whether the joints of the tip carry motors."""
+        return self.steering_angle > 0
+
+    @property
+    def axial_stiffness(self) -> float:
+        """EA of the shaft in N, as of a solid round rod: EA = 4 EI / r²."""
+        return 4 * self.shaft.bending_stiffness / self.outer_radius**2
+
+    @property
+    def is_wire(self) -> bool:
+        """Whether it is solid, so that nothing fits into it."""
+        return self.inner_radius == 0.0
+
+    def rest_angle(self, start: float, stop: float) -> float:
+        """Turning angle of the unloaded shape between two places.
+
+        Args:
+          start: distance from the distal end, m.
+          stop: distance from the distal end, m, at most `start`.
+
+        Returns:
+          The angle in rad that the centreline turns by from `start` to `stop`.
+        """
+        total, distal = 0.0, 0.0
+        for arc in reversed(self.tip_shape):
+            proximal = distal + arc.length
+            overlap = min(start, proximal) - max(stop, distal)
+            if overlap > 0:
+                total += math.copysign(overlap / arc.radius, arc.angle)
+            distal = proximal
+        return total

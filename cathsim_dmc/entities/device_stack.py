@@ -1,0 +1,179 @@
+"""Coaxial devices in the simulation: guidewire, guidewire in catheter, and so on."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from cathsim_dmc.entities import devices as library
+from cathsim_dmc.entities.arena import BLOOD_DENSITY
+from cathsim_dmc.entities.chain import BENDING_RELAXATION_TIME, Chain
+from cathsim_dmc.entities.coaxial import Stack, weight_density
+from cathsim_dmc.entities.contact import FRICTION
+from cathsim_dmc.entities.device import Device
+from cathsim_dmc.entities.torsion import Rods
+
+# Coulomb coefficient between a device and the lined lumen around it (Lin 2020).
+LUMEN_FRICTION = 0.04
+# By how much each device starts ahead of the one around it, m.
+LEAD = 0.03
+
+
+class DeviceStack(Chain):
+    """Coaxial devices, each pushed and turned at its base, on one chain of links.
+
+    The end of the chain is that of the device that reaches farthest; what the links are
+    made of slides along it, see `coaxial`. The chain has one motor, which pushes it by
+    the device that leads; `tasks.coaxial` moves the devices and writes what changes
+    into the model, once in a control step. An action has two entries for each device,
+    from the innermost outwards: translation and rotation.
+    """
+
+    def _build(
+        self,
+        devices: Sequence[str | Device] = ("wire_035_glide", "berenstein_5f"),
+        discretisation: library.Discretisation | None = None,
+        *,
+        stroke: float = 0.25,
+        lead: float = LEAD,
+        friction: float = FRICTION,
+        lumen_friction: float = LUMEN_FRICTION,
+        name: str = "catheter",
+    ):
+        """Builds the chain.
+
+        Args:
+          devices: from the innermost outwards, or their names in `devices.DEVICES`.
+          discretisation: how the chain is divided into links.
+          stroke: longest insertion, m.
+          lead: by how much each device starts ahead of the one around it, m.
+          friction: Coulomb coefficient of an uncoated device on the wall.
+          lumen_friction: Coulomb coefficient between a device and the lumen it is in.
+          name: of the entity.
+
+        Raises:
+          ValueError: if a device does not fit into the next one, or is to be steered.
+        """
+        self._devices = tuple(library.get(device) for device in devices)
+        for device in self._devices:
+            if device.steerable:
+                raise ValueError(
+                    f"device {device.name!r} has motors in its tip, which coaxial "
+                    "devices cannot have yet; give a passive one, or the option "
+                    "`device` for a steerable device alone"
+                )
+        chosen = discretisation or library.Discretisation()
+        self._friction, self._lumen_friction = friction, lumen_friction
+        self._stack = Stack(self._devices, self._divide(chosen))
+        self._rods = Rods(self._devices, self._stack.nodes, BENDING_RELAXATION_TIME)
+        self._gaps = lead * np.arange(len(self._devices), dtype=np.float64)
+        overlap = self._stack.overlap(self._gaps[None])
+        turns = np.zeros((1, len(self._devices), len(self._stack.spans)))
+        self._compliance = overlap.compliance[0]
+        self._rest = self._stack.rest_angles(overlap, turns)[0]
+        self._mass = self._stack.links(overlap, np.zeros(1)).mass[0]
+        self._assemble(
+            self._stack.link_lengths,
+            # The thickest anywhere, so that the bounding volumes hold for all.
+            max(device.outer_radius for device in self._devices),
+            stroke=stroke,
+            rotation=False,
+            friction=friction,
+            name=name,
+        )
+
+    def _divide(self, discretisation: library.Discretisation) -> np.ndarray:
+        if len(self._devices) == 1:
+            return discretisation.link_lengths(self._devices[0])
+        # The end of the chain has links as short as those of the tips. A shape that
+        # lies behind it, under a wire that leads by more, is drawn by longer ones.
+        end = max(device.tip_length for device in self._devices)
+        shortest = min(device.tip_length / device.tip_links for device in self._devices)
+        links = round(end / shortest)
+        names = " in ".join(repr(device.name) for device in self._devices)
+        return discretisation.divided(end, links, names)
+
+    def _axial_stiffness(self) -> float:
+        return sum(device.axial_stiffness for device in self._devices)
+
+    def _joint_compliance(self, index: int) -> float:
+        return float(self._compliance[index - 1])
+
+    def _rest_angles(self, index: int) -> tuple[float, float]:
+        rest = self._rest[index - 1]
+        return -float(rest.imag), float(rest.real)
+
+    def _link_mass(self, index: int) -> float:
+        return float(self._mass[index])
+
+    def _in_tip(self, index: int) -> bool:
+        return bool(self._stack.nodes[index] <= self._devices[0].tip_length + 1e-9)
+
+    @property
+    def device(self) -> Device:
+        """The outermost device, which the sheath guides."""
+        return self._devices[-1]
+
+    @property
+    def devices(self) -> tuple[Device, ...]:
+        """The devices from the innermost outwards."""
+        return self._devices
+
+    @property
+    def device_names(self) -> tuple[str, ...]:
+        """What each device is to an operator, such as "guidewire" and "catheter"."""
+        names: list[str] = []
+        for device in self._devices:
+            kind = "guidewire" if device.is_wire else "catheter"
+            again = sum(name.startswith(kind) for name in names)
+            names.append(f"{kind}_{again + 1}" if again else kind)
+        return tuple(names)
+
+    @property
+    def action_names(self) -> tuple[str, ...]:
+        """Translation and rotation of each device, from the innermost outwards."""
+        return tuple(
+            f"{name}/{motion}"
+            for name in self.device_names
+            for motion in ("insertion", "rotation")
+        )
+
+    @property
+    def translations(self) -> tuple[int, ...]:
+        """Places in the action of what pushes."""
+        return tuple(range(0, 2 * len(self._devices), 2))
+
+    @property
+    def stack(self) -> Stack:
+        """What the chain is made of, as a function of how the devices lie."""
+        return self._stack
+
+    @property
+    def rods(self) -> Rods:
+        """The twist of the devices."""
+        return self._rods
+
+    @property
+    def start_gaps(self) -> np.ndarray:
+        """Way (K,) from the end of each device to that of the chain at the start, m."""
+        return self._gaps.copy()
+
+    @property
+    def friction(self) -> float:
+        """Coulomb coefficient of an uncoated device on the wall."""
+        return self._friction
+
+    @property
+    def lumen_friction(self) -> float:
+        """Coulomb coefficient between a device and the lumen that it is in."""
+        return self._lumen_friction
+
+    @property
+    def buoyant_share(self) -> float:
+        """Weight in blood of a link of all devices over that in air."""
+        weight = sum(weight_density(device) for device in self._devices)
+        return weight / sum(device.linear_density for device in self._devices)
+
+    @property
+    def density(self) -> float:
+        """Density (kg/m³) of a body that blood carries as much of."""
+        return BLOOD_DENSITY / (1 - self.buoyant_share)

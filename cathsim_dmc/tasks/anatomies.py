@@ -1,0 +1,78 @@
+"""Anatomies that a task can be given: a phantom, a directory, random arches."""
+
+from pathlib import Path
+
+import numpy as np
+
+from cathsim_dmc import bounds
+from cathsim_dmc.anatomy import Anatomy
+from cathsim_dmc.tasks import placement
+
+POOL = 16  # arches that an episode draws from, unless one says otherwise
+
+
+def load_anatomy(anatomy: str | Path | Anatomy, access: str = "ascending") -> Anatomy:
+    """Returns an anatomy: itself, a phantom by name, or one saved in a directory.
+
+    Args:
+      anatomy: Anatomy, name in `anatomy.phantoms.PHANTOMS`, or directory.
+      access: Where the device enters a phantom, "ascending" or "descending"; an
+        anatomy or a directory has its own inlet.
+
+    Raises:
+      ValueError: if there is none; lists the names.
+    """
+    if isinstance(anatomy, Anatomy):
+        return anatomy
+    # What builds anatomies takes a while to import.
+    from cathsim_dmc.anatomy import phantoms
+
+    if not isinstance(anatomy, str | Path):
+        bounds.refuse("anatomy", anatomy, "an Anatomy, a name or a directory")
+    if str(anatomy) in phantoms.PHANTOMS:
+        return phantoms.load(str(anatomy), access=access)
+    if not Path(anatomy).is_dir():
+        raise ValueError(
+            f"no anatomy at {str(anatomy)!r}; give a directory written by `cathsim "
+            f"phantom import` or `generate`, or one of {', '.join(phantoms.PHANTOMS)}"
+        )
+    return Anatomy.load(anatomy)
+
+
+def load_arches(
+    arches: str = "train",
+    pool: int = POOL,
+    first: int = 0,
+    *,
+    access: str = "ascending",
+) -> list[Anatomy]:
+    """Random arches of a named set, in the order of their seeds; see `arch_set`.
+
+    Args:
+      arches: Name of the set: "train", "test" or "test_variants".
+      pool: Number of arches; building one takes about a second and a half.
+      first: Number in the set of the first one.
+      access: Where the device enters, "ascending" or "descending".
+
+    Raises:
+      ValueError: if there is no such set, it has no such arches, or one of them
+        cannot be entered.
+    """
+    from cathsim_dmc.anatomy.arch import arch
+
+    seeds = arch.arch_set(arches)
+    whole = all(isinstance(number, int | np.integer) for number in (pool, first))
+    if not whole or pool < 1 or not 0 <= first <= len(seeds) - pool:
+        raise ValueError(
+            f"pool is {pool!r} and first is {first!r}; {arches!r} has {len(seeds)} "
+            "arches, numbered from 0: give whole numbers, pool of at least 1 and first "
+            f"+ pool of at most {len(seeds)}"
+        )
+    found = [arch.build_seed(seed, access=access) for seed in seeds[first:][:pool]]
+    closed = [a.name for a in found if placement.sheath_direction(a) is None]
+    if closed:
+        raise ValueError(
+            f"no sheath fits before the inlet of {', '.join(closed)}, whose aorta "
+            "bends back across it; give another first, or a smaller pool"
+        )
+    return found

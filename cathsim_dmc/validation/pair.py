@@ -1,0 +1,258 @@
+"""`cathsim validate pair`: coaxial devices against theory, at rest and on the move."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from pathlib import Path
+
+import mujoco
+import numpy as np
+
+from cathsim_dmc.entities import devices
+from cathsim_dmc.entities.device import Device
+from cathsim_dmc.entities.device_stack import DeviceStack
+from cathsim_dmc.tasks import coaxial
+from cathsim_dmc.validation import rod, sliding
+from cathsim_dmc.validation.checks import Check, Report
+from cathsim_dmc.validation.rig import Rig
+
+PAIR = ("wire_035_glide", "berenstein_5f")
+PROTRUSIONS = (0.0, 0.02, 0.05, 0.10)  # m, of the wire out of the catheter
+END_ANGLES = (15.0, 45.0)  # degrees
+CANTILEVER_BOUND = 2.0  # % of the deflection
+SHAPE_BOUND = 2.0  # % of the displacement of the end from the straight line
+BUCKLING_BOUND = 5.0  # % of the load
+# Overlaps whose unloaded shape is compared: devices, gaps (m) and rotations (rad). A
+# wire just out of the catheter, one withdrawn into its bend, one turned against it.
+SHAPES = (
+    (PAIR, (0.0, 0.02), (0.0, 0.0)),
+    (PAIR, (0.012, 0.0), (0.0, 0.0)),
+    (PAIR, (0.0, 0.005), (0.0, np.pi / 2)),
+    (("wire_035_amplatz", "diagnostic_5f_simmons"), (0.035, 0.0), (0.0, 0.0)),
+)
+_FINE = 0.05e-3  # m, of the curve that is integrated
+
+
+def straightened(names: Sequence[str]) -> tuple[Device, ...]:
+    """The devices without their pre-shaped tips."""
+    return tuple(dataclasses.replace(devices.get(name), tip_shape=()) for name in names)
+
+
+def sections(entity: DeviceStack, gaps: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Lengths and EI of the uniform sections of the free rod, from the clamp on.
+
+    The carriage holds link 0 by its middle, as in `Rig.sections`.
+    """
+    length = float(entity.link_lengths.sum() - entity.link_lengths[0] / 2)
+    edges = {0.0, length}
+    for device, gap in zip(entity.devices, gaps, strict=True):
+        edges |= {min(gap, length), min(gap + device.tip_length, length)}
+    places = np.array(sorted(edges))
+    middles = (places[1:] + places[:-1]) / 2
+    bending = sum(
+        np.where(
+            middles < gap,
+            0.0,
+            np.where(
+                middles < gap + device.tip_length,
+                device.tip.bending_stiffness,
+                device.shaft.bending_stiffness,
+            ),
+        )
+        for device, gap in zip(entity.devices, gaps, strict=True)
+    )
+    return np.diff(places)[::-1], np.asarray(bending)[::-1]
+
+
+def rig_of(
+    chosen: Sequence[str | Device],
+    gaps: Sequence[float],
+    rotation: Sequence[float] | None = None,
+) -> Rig:
+    """A compiled rig with coaxial devices that stand still."""
+    entity = DeviceStack(chosen)
+    rig = Rig(catheter=entity)
+    rig.compile()
+    coaxial.write_still(entity, rig.model, np.array(gaps), rotation)
+    return rig
+
+
+def cantilevers(protrusion: float) -> list[rod.Cantilever]:
+    """The pair, straightened, with the wire out by so much (m), loaded at its end."""
+    gaps = np.array([0.0, protrusion])
+    rig = rig_of(straightened(PAIR), gaps)
+    entity = rig.catheter
+    assert isinstance(entity, DeviceStack)
+    return rod.bent(rig, *sections(entity, gaps), END_ANGLES)
+
+
+@dataclasses.dataclass(frozen=True)
+class Shape:
+    """An unloaded shape.
+
+    Attributes:
+        devices: names, from the innermost outwards.
+        gaps: (K,) from the end of each device to that of the chain, m.
+        rotation: (K,) of each device, rad.
+        simulated: (L + 1, 3), joints and head, m, from the base of the chain.
+        expected: (n, 3), the curve of the EI-weighted curvature.
+        deviation: of head and joints from the curve at the same arc lengths, the
+            largest, over the displacement of the end from the straight line.
+    """
+
+    devices: tuple[str, ...]
+    gaps: np.ndarray
+    rotation: np.ndarray
+    simulated: np.ndarray
+    expected: np.ndarray
+    deviation: float
+
+
+def unloaded(
+    names: Sequence[str], gaps: Sequence[float], rotation: Sequence[float]
+) -> Shape:
+    """Lets coaxial devices settle and compares them with Σ EI κ / Σ EI."""
+    rig = rig_of(names, gaps, rotation)
+    entity = rig.catheter
+    assert isinstance(entity, DeviceStack)
+    rig.settle(longest=60.0)
+    mujoco.mj_kinematics(rig.model, rig.data)
+    points = np.vstack([rig.joints, rig.head_position]) - rig.joints[0]
+    length = float(entity.link_lengths.sum())
+    arc, curve = weighted_curve(entity.devices, gaps, rotation, length)
+    there = np.stack(
+        [np.interp(length - entity.stack.nodes, arc, axis) for axis in curve.T], axis=-1
+    )
+    moved = np.linalg.norm(curve[-1] - (0.0, 0.0, length))
+    error = np.linalg.norm(points - there, axis=-1).max()
+    return Shape(
+        tuple(names),
+        np.array(gaps),
+        np.array(rotation),
+        points,
+        curve,
+        float(error / moved),
+    )
+
+
+def weighted_curve(
+    chosen: Sequence[Device],
+    gaps: Sequence[float],
+    rotation: Sequence[float],
+    length: float,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Arc lengths (n,) and points (n, 3) of the curve of the EI-weighted curvature.
+
+    Integrated in steps of 0.05 mm from the base, with a frame that does not twist.
+    """
+    arc = np.arange(0.0, length, _FINE)
+    steps = np.diff(np.append(arc, length))
+    middle = length - (arc + steps / 2)  # from the end
+    stiffness, moment = np.zeros(len(arc)), np.zeros(len(arc), dtype=complex)
+    for device, gap, turn in zip(chosen, gaps, rotation, strict=True):
+        own = middle - gap
+        bending = np.where(
+            own < device.tip_length,
+            device.tip.bending_stiffness,
+            device.shaft.bending_stiffness,
+        ) * (own >= 0)
+        start = 0.0
+        for bow in reversed(device.tip_shape):
+            inside = (own >= start) & (own < start + bow.length)
+            sign = np.copysign(1 / bow.radius, bow.angle)
+            moment += np.where(inside, bending * sign * np.exp(1j * turn), 0.0)
+            start += bow.length
+        stiffness += bending
+    curvature = moment / stiffness
+    frame, points = np.eye(3), [np.zeros(3)]
+    for bend, step in zip(curvature, steps, strict=True):
+        # The curvature x + iy leads towards x and y: a turn about -y, x of the frame.
+        axis = frame @ np.array([-bend.imag, bend.real, 0.0]) * step
+        half = _rotation(axis / 2) @ frame
+        points.append(points[-1] + half[:, 2] * step)
+        frame = _rotation(axis) @ frame
+    return np.append(arc, length), np.array(points)
+
+
+def _rotation(vector: np.ndarray) -> np.ndarray:
+    """Rotation matrix of a rotation vector."""
+    angle = np.linalg.norm(vector)
+    if angle == 0.0:
+        return np.eye(3)
+    x, y, z = vector / angle
+    skew = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    return np.eye(3) + np.sin(angle) * skew + (1 - np.cos(angle)) * skew @ skew
+
+
+def buckling(end: str) -> rod.Buckling:
+    """Critical load of the shafts of the pair, one in the other."""
+    entity = DeviceStack(straightened(PAIR))
+    gaps = np.zeros(2)
+    # Up to the last of the long links: beyond lie the tips.
+    last = int(np.argmin(entity.link_lengths >= entity.link_lengths[0])) - 1
+    tips = max(device.tip_length for device in entity.devices)
+    assert entity.stack.nodes[last + 1] > tips - 1e-9
+    stiffness = sum(device.shaft.bending_stiffness for device in entity.devices)
+    return rod.column(
+        Rig(catheter=entity),
+        end,
+        last,
+        stiffness,
+        lambda rig: coaxial.write_still(entity, rig.model, gaps),
+    )
+
+
+def validate_pair(figure_path: str | Path | None = None) -> Report:
+    """Runs every check of coaxial devices.
+
+    Args:
+        figure_path: PNG to write, or None.
+    """
+    checks: list[Check] = []
+    for protrusion in PROTRUSIONS:
+        for one in cantilevers(protrusion):
+            what = f"wire out by {1e3 * protrusion:.0f} mm" if protrusion else "pair"
+            checks.append(
+                Check.at_most(
+                    f"cantilever, {what}, end at {np.degrees(one.end_angle):.0f}°",
+                    100 * one.deviation,
+                    CANTILEVER_BOUND,
+                    "%",
+                    f"{1e3 * one.force:.3g} mN, deflection "
+                    f"{1e3 * one.expected.position[-1, 1]:.1f} mm",
+                )
+            )
+    shapes = [unloaded(*each) for each in SHAPES]
+    for shape in shapes:
+        gaps = " and ".join(f"{1e3 * gap:.0f}" for gap in shape.gaps)
+        turned = np.degrees(shape.rotation[-1] - shape.rotation[0])
+        checks.append(
+            Check.at_most(
+                f"unloaded shape, {' in '.join(shape.devices)}, ends {gaps} mm back"
+                + (f", turned by {turned:.0f}°" if turned else ""),
+                100 * shape.deviation,
+                SHAPE_BOUND,
+                "%",
+                f"end {1e3 * np.hypot(*shape.expected[-1, :2]):.1f} mm off the axis",
+            )
+        )
+    for end in ("sliding", "fixed"):
+        load = buckling(end)
+        checks.append(
+            Check.deviation(
+                f"buckling load of the pair, clamped - guided, guide {end}",
+                load.critical,
+                load.expected,
+                BUCKLING_BOUND,
+                f"{1e3 * load.critical:.1f} mN, Euler {1e3 * load.expected:.1f} mN "
+                f"over {1e3 * load.length:.0f} mm",
+            )
+        )
+    moving = sliding.checks()
+    checks += moving.checks
+    if figure_path is not None:
+        from cathsim_dmc.validation import figures
+
+        figures.pair(shapes, moving.turned, figure_path)
+    return Report("pair", checks, moving.findings)

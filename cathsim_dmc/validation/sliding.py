@@ -1,0 +1,258 @@
+"""Coaxial devices on the move: sliding through each other, and turned in a tube."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from cathsim_dmc import suite
+from cathsim_dmc.anatomy import Anatomy, Centreline, Vessel, VesselTree
+from cathsim_dmc.anatomy.builder import Place
+from cathsim_dmc.entities.chain import MAX_PUSH_SPEED, MAX_ROTATION_SPEED
+from cathsim_dmc.entities.devices import get
+from cathsim_dmc.tasks.config import CONTROL_TIMESTEP
+from cathsim_dmc.validation.checks import Check
+
+SLIDING_PAIR = ("wire_035_amplatz", "diagnostic_5f_simmons")
+SLIDING_TASK = "femoral_type1_lcca"
+SPEED = 0.01  # m/s, of one device through the other
+LARGEST_STEP = 2.5  # mm, of the end of the chain in a control step
+# Steps of the script: name, speeds of wire and catheter in m/s, rotation of the
+# catheter in rad/s, duration in s.
+SCRIPT = (
+    ("both advance", 0.04, 0.04, 0.0, 3.0),
+    ("catheter over the wire", 0.0, SPEED, 0.0, 6.0),
+    ("wire withdrawn", -SPEED, 0.0, 0.0, 6.0),
+    ("wire advanced", SPEED, 0.0, 0.0, 6.0),
+    ("catheter turned", 0.0, 0.0, np.pi / 2, 4.0),
+)
+
+TURNED = "berenstein_5f"  # alone in a tube
+TUBE_RADIUS = 4e-3  # m
+BEND_RADIUS = 0.04  # m, of half a circle
+TURN_RATE = 0.5  # rad/s, of the base
+TURNS = 2.0
+STRAIGHT_LAG = 45.0  # °, of the end in a straight tube
+WHIP = 3.0  # least rate of turning of the end in a bend, in that of the base
+
+
+@dataclasses.dataclass(frozen=True)
+class Part:
+    """What happened in a part of the script.
+
+    Attributes:
+        name: of the part.
+        largest_step: of the end of the chain in a control step, m.
+        moved: distance of the end of the chain from where it was before the part, m.
+        peak_force: largest single contact, N.
+        warnings: of MuJoCo.
+    """
+
+    name: str
+    largest_step: float
+    moved: float
+    peak_force: float
+    warnings: int
+
+
+def slide(
+    names: Sequence[str] = SLIDING_PAIR, task: str = SLIDING_TASK, seed: int = 0
+) -> tuple[list[Part], list[np.ndarray]]:
+    """Slides two devices through each other in a vessel.
+
+    Returns:
+        The parts of the script, and the centrelines (L + 1, 3) at their ends, m.
+    """
+    environment = suite.load(
+        suite.DOMAIN,
+        task,
+        {"devices": tuple(names), "random": seed, "observation": "tracking"},
+    )
+    environment.reset()
+    play, parts, lines = environment.task, [], []
+    for name, wire, catheter, turn, duration in SCRIPT:
+        action = np.array([wire, 0.0, catheter, 0.0]) / MAX_PUSH_SPEED
+        action[3] = turn / MAX_ROTATION_SPEED
+        start = last = play.readings.head
+        largest = peak = 0.0
+        for _ in range(round(duration / CONTROL_TIMESTEP)):
+            if environment.step(action).last():
+                break
+            head = play.readings.head
+            largest = max(largest, float(np.linalg.norm(head - last)))
+            peak, last = max(peak, float(play.wall_force.peak_max)), head
+        warnings = int(environment.physics.data.ptr.warning.number.sum())
+        moved = float(np.linalg.norm(last - start))
+        parts.append(Part(name, largest, moved, peak, warnings))
+        lines.append(play.readings.centreline)
+    environment.close()
+    return parts, lines
+
+
+def tube(bent: bool) -> Anatomy:
+    """A tube of 4 mm radius, straight or with half a circle of 40 mm in it."""
+    s = np.linspace(0.0, 0.05, 11)
+    points = [np.stack([0 * s, 0 * s, s], axis=-1)]
+    if bent:
+        angle = np.linspace(0.0, np.pi, 61)[1:]
+        arc = np.stack([1 - np.cos(angle), 0 * angle, np.sin(angle)], axis=-1)
+        points.append((0.0, 0.0, 0.05) + BEND_RADIUS * arc)
+        s = np.linspace(0.0, 0.1, 21)[1:]
+        points.append(np.stack([0 * s, 0 * s, -s], axis=-1) + points[-1][-1])
+    else:
+        s = np.linspace(0.05, 0.05 + np.pi * BEND_RADIUS + 0.1, 31)[1:]
+        points.append(np.stack([0 * s, 0 * s, s], axis=-1))
+    line = np.concatenate(points)
+    tree = VesselTree(
+        {"tube": Vessel("tube", Centreline(line, np.full(len(line), TUBE_RADIUS)))}
+    )
+    length = tree.root.centreline.length
+    return Anatomy.from_tree(
+        tree,
+        "half circle" if bent else "straight tube",
+        goals={"end": Place("tube", arc_length=length - 2e-3)},
+    )
+
+
+@dataclasses.dataclass(frozen=True)
+class Torque:
+    """Rotation of a device's end against that of its base.
+
+    Attributes:
+        name: of the tube.
+        base: (T,), rad.
+        tip: (T,), rad.
+        torque: (T,), of the rotary unit on the device at rest, N·m.
+        stiffness: K of the whole device, N·m/rad.
+        shape: A, the torque by which the shape resists at most, EI κ α, N·m; 0 in a
+            straight tube.
+    """
+
+    name: str
+    base: np.ndarray
+    tip: np.ndarray
+    torque: np.ndarray
+    stiffness: float
+    shape: float
+
+    @property
+    def lag(self) -> np.ndarray:
+        """(T,), of the end behind the base, rad."""
+        return self.base - self.tip
+
+    @property
+    def whips(self) -> float:
+        """Largest rate of turning of the end over that of the base."""
+        return float(np.abs(np.diff(self.tip)).max() / np.diff(self.base).mean())
+
+    @property
+    def expected_lag(self) -> float:
+        """Largest lag without friction, rad, and without the tube's clearance.
+
+        With the shape gathered at the end, K (β - φ) = A sin φ; as the base turns on,
+        the end follows until 1 + A/K cos φ = 0, and then whips round.
+        """
+        ratio = self.shape / self.stiffness
+        if ratio <= 1.0:
+            return ratio
+        return float(ratio * np.sqrt(1 - 1 / ratio**2))
+
+
+def turn(bent: bool, **options: Any) -> Torque:
+    """Advances a pre-shaped catheter through a tube and turns its base slowly."""
+    environment = suite.load(
+        suite.DOMAIN,
+        "navigate",
+        {
+            "anatomy": tube(bent),
+            "goal": "end",
+            "devices": (TURNED,),
+            "goal_radius": 1e-4,
+            "observation": "tracking",
+            "random": 0,
+            **options,
+        },
+    )
+    environment.reset()
+    play, device = environment.task, get(TURNED)
+    # Until its bend lies at the far end of the half circle.
+    ahead = 0.05 + np.pi * BEND_RADIUS - play.scene.placement.start_depth
+    for _ in range(round(ahead / (0.5 * MAX_PUSH_SPEED * CONTROL_TIMESTEP))):
+        environment.step(np.array([0.5, 0.0]))
+    rods = play.scene.catheter.rods
+    rows = []
+    for _ in range(round(2 * np.pi * TURNS / (TURN_RATE * CONTROL_TIMESTEP))):
+        environment.step(np.array([0.0, TURN_RATE / MAX_ROTATION_SPEED]))
+        state = play.rollout.devices
+        rows.append((state.rotation[0, 0], state.tip_rotation[0, 0], state.twist[0, 0]))
+    environment.close()
+    base, tip, torque = np.array(rows).T
+    angle = abs(sum(arc.angle for arc in device.tip_shape))
+    shape = device.tip.bending_stiffness * angle / BEND_RADIUS if bent else 0.0
+    stiffness = float(1 / (1 / rods.stiffness[0]).sum())
+    name = "half circle" if bent else "straight tube"
+    return Torque(name, base, tip, torque, stiffness, shape)
+
+
+@dataclasses.dataclass(frozen=True)
+class Moving:
+    """Checks and findings of devices on the move, and what a figure shows."""
+
+    checks: list[Check]
+    findings: dict[str, Any]
+    turned: list[Torque]
+
+
+def checks() -> Moving:
+    """Runs the devices and judges them."""
+    parts, _ = slide()
+    found = [
+        Check.at_most(
+            f"sliding, {part.name}: largest step of the end in 40 ms",
+            1e3 * part.largest_step,
+            LARGEST_STEP,
+            "mm",
+            f"moves by {1e3 * part.moved:.1f} mm, largest contact "
+            f"{part.peak_force:.3f} N, {part.warnings} warnings",
+        )
+        for part in parts[1:]
+    ]
+    found.append(
+        Check.at_most("sliding, warnings", parts[-1].warnings, 0, "", "of MuJoCo")
+    )
+    turned = [turn(False), turn(True)]
+    straight, bent = turned
+    found += [
+        Check.at_most(
+            "torque in a straight tube, lag of the end",
+            float(np.degrees(np.abs(straight.lag).max())),
+            STRAIGHT_LAG,
+            "°",
+            "friction alone holds it back",
+        ),
+        Check.at_least(
+            "torque in a half circle, fastest turning of the end over the base's",
+            bent.whips,
+            WHIP,
+            "",
+            f"A/K = {bent.shape / bent.stiffness:.1f}: above 1 it whips",
+        ),
+    ]
+    findings = {
+        "sliding": [dataclasses.asdict(part) for part in parts],
+        "torque": {
+            one.name: {
+                "largest lag, °": float(np.degrees(one.lag.max())),
+                "largest lag without friction and clearance, °": float(
+                    np.degrees(one.expected_lag)
+                ),
+                "fastest turning of the end over the base's": one.whips,
+                "shape over torsional stiffness, rad": one.shape / one.stiffness,
+            }
+            for one in turned
+        },
+    }
+    return Moving(found, findings, turned)

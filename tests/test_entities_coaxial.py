@@ -1,0 +1,317 @@
+"""What a chain is made of where devices lie in each other, as a pure function."""
+
+import dataclasses
+import itertools
+
+import numpy as np
+import pytest
+from scipy.integrate import quad
+
+from cathsim_dmc.entities import devices
+from cathsim_dmc.entities.catheter import Catheter
+from cathsim_dmc.entities.coaxial import Stack
+from cathsim_dmc.entities.torsion import STICKING, Rods
+
+PAIR = ("wire_035_glide", "diagnostic_5f_simmons")
+LENGTHS = np.concatenate([np.full(12, 0.0166), np.full(20, 0.007)])
+
+
+def stack(names=PAIR, lengths=LENGTHS):
+    return Stack([devices.get(name) for name in names], lengths)
+
+
+@pytest.fixture(scope="module")
+def pair():
+    return stack()
+
+
+def bending(device, place):
+    """EI of a device at a distance from its end, 0 beyond it."""
+    if place < 0:
+        return 0.0
+    section = device.tip if place < device.tip_length else device.shaft
+    return section.bending_stiffness
+
+
+def curvature(device, place):
+    for arc in reversed(device.tip_shape):
+        if 0 <= place < arc.length:
+            return np.copysign(1 / arc.radius, arc.angle)
+        place -= arc.length
+    return 0.0
+
+
+def integral(function, low, high, breaks):
+    inside = sorted(b for b in breaks if low < b < high)
+    ends = [low, *inside, high]
+    return sum(quad(function, a, b)[0] for a, b in itertools.pairwise(ends))
+
+
+@pytest.mark.parametrize(
+    "gaps", [(0.0, 0.0), (0.0, 0.0234), (0.0, 0.11), (0.041, 0.0), (0.5, 0.0)]
+)
+def test_integrals_are_those_of_the_devices(pair, gaps):
+    """Against numerical integration of EI(s) and κ(s), joint by joint."""
+    overlap = pair.overlap(np.array([gaps]))
+    breaks = []
+    for device, gap in zip(pair.devices, gaps, strict=True):
+        arcs = np.cumsum([arc.length for arc in reversed(device.tip_shape)])
+        breaks += [gap, gap + device.tip_length, *(gap + arcs)]
+
+    def parts(s):
+        stiff = [bending(d, s - g) for d, g in zip(pair.devices, gaps, strict=True)]
+        bent = [curvature(d, s - g) for d, g in zip(pair.devices, gaps, strict=True)]
+        return np.array(stiff), np.array(bent)
+
+    for joint in range(0, len(pair.spans), 3):
+        far, place, near = pair.nodes[joint : joint + 3]
+        breaks = [*breaks, place]
+
+        def weight(s, far=far, place=place, near=near):
+            return (
+                (s - near) / (place - near) if s < place else (far - s) / (far - place)
+            )
+
+        compliance = integral(
+            lambda s: weight(s) / parts(s)[0].sum(), near, far, breaks
+        )
+        assert overlap.compliance[0, joint] == pytest.approx(compliance, rel=1e-8)
+        for k in range(2):
+
+            def bend(s, k=k):
+                stiff, bent = parts(s)
+                return weight(s) * stiff[k] * bent[k] / stiff.sum()
+
+            rest = integral(bend, near, far, breaks)
+            assert overlap.rest[0, k, joint] == pytest.approx(rest, abs=1e-9)
+
+        def both(s):
+            stiff, bent = parts(s)
+            return weight(s) * np.prod(stiff) * np.prod(bent) / stiff.sum()
+
+        coupling = integral(both, near, far, breaks)
+        assert overlap.coupling[0, 0, joint] == pytest.approx(coupling, abs=1e-12)
+
+
+def test_one_device_is_the_catheter():
+    """A stack of one is as stiff and as heavy as `Catheter`, and its end lies there."""
+    for name in ("diagnostic_5f_simmons", "wire_035_glide", "steerable_4f"):
+        catheter = Catheter(name)
+        device, lengths = catheter.device, catheter.link_lengths
+        alone = stack([name], lengths)
+        overlap = alone.overlap(np.zeros((1, 1)))
+        theirs = np.array([bend.stiffness[0] for bend in catheter.bends[::2]])
+        border = len(lengths) - device.tip_links - 1
+        uniform = np.abs(np.arange(len(theirs)) - border) > 1
+        mine = 1 / overlap.compliance[0]
+        np.testing.assert_allclose(mine[uniform], theirs[uniform], rtol=1e-9)
+        assert overlap.compliance.sum() == pytest.approx((1 / theirs).sum(), rel=1e-9)
+        # Small bends move the end by their angle times their distance from it.
+        rest = alone.rest_angles(overlap, np.zeros((1, 1, len(alone.spans))))[0]
+        moved, place = 0.0, 0.0
+        for arc in reversed(device.tip_shape):
+            moved += arc.angle * (place + arc.length / 2)
+            place += arc.length
+        assert (rest.real * alone.nodes[1:-1]).sum() == pytest.approx(moved)
+        links = alone.links(overlap, np.array([0.037]))
+        np.testing.assert_allclose(
+            links.mass[0], [geom.mass for geom in catheter.link_geoms], rtol=1e-12
+        )
+        assert (links.radius == device.outer_radius).all()
+
+
+def test_nothing_jumps_as_one_device_slides_through_the_other(pair):
+    """A tenth of the step has a tenth of the effect, wherever the ends lie."""
+    rng = np.random.default_rng(0)
+    lead = rng.uniform(0.0, 0.2, 200)
+    gaps = (
+        np.where(rng.random(200)[:, None] < 0.5, [0.0, 1.0], [1.0, 0.0])
+        * (lead[:, None])
+    )
+    moved = gaps + 1e-7 * (gaps > 0)
+    turns = np.broadcast_to(rng.uniform(-3, 3, (200, 2, 1)), (200, 2, len(pair.spans)))
+    results = []
+    for each in (gaps, moved):
+        overlap = pair.overlap(each)
+        links = pair.links(overlap, np.full(200, 0.04))
+        results.append((overlap.compliance, pair.rest_angles(overlap, turns), *links))
+    for before, after in zip(*results, strict=True):
+        scale = np.abs(before).max()
+        # 0.1 µm of 7 mm: at most some 1e-4 of the whole range of a joint.
+        assert np.abs(after - before).max() < 1e-3 * scale
+
+
+def test_a_rotation_turns_the_shape(pair):
+    overlap = pair.overlap(np.array([[0.03, 0.0]]))
+    still = np.zeros((1, 2, len(pair.spans)))
+    straight = pair.rest_angles(overlap, still)
+    turned = pair.rest_angles(overlap, still + 0.7)
+    np.testing.assert_allclose(turned, straight * np.exp(0.7j), rtol=1e-12)
+    assert np.abs(straight.imag).max() == 0.0 < straight.real.max()
+
+
+def test_restoring_torque_is_the_derivative_of_the_energy(pair):
+    rng = np.random.default_rng(1)
+    overlap = pair.overlap(np.array([[0.0, 0.013]]))
+    joints = len(pair.spans)
+    bends = rng.normal(size=(1, joints)) + 1j * rng.normal(size=(1, joints))
+    turns = rng.uniform(-3, 3, (1, 2, joints))
+
+    def energy(turns):
+        """½ ∫ Σ EI_k |κ - κ_k|² at the best κ for the bends, up to a constant."""
+        rest = pair.rest_angles(overlap, turns)
+        joint = np.abs(bends - rest) ** 2 / (2 * overlap.compliance)
+        return joint - overlap.coupling[:, 0] * np.cos(turns[:, 0] - turns[:, 1])
+
+    torque, rate = pair.restoring(overlap, bends, turns)
+    for k in range(2):
+        step = np.zeros_like(turns)
+        step[:, k] = 1e-5
+        slope = (energy(turns + step) - energy(turns - step)) / 2e-5
+        np.testing.assert_allclose(torque[:, k], -slope, atol=1e-9)
+        change = (
+            pair.restoring(overlap, bends, turns + step)[0][:, k]
+            - pair.restoring(overlap, bends, turns - step)[0][:, k]
+        ) / 2e-5
+        np.testing.assert_allclose(rate[:, k], -change, atol=1e-9)
+
+
+def test_links_have_the_outermost_devices_outside(pair):
+    wire, catheter = pair.devices
+    overlap = pair.overlap(np.array([[0.0, 0.0245], [0.0245, 0.0]]))
+    links = pair.links(overlap, np.array([0.06, 0.06]))
+    beyond = pair.nodes[:-1] <= 0.0245 + 1e-12
+    assert beyond.sum() == 3 and pair.nodes[-5] == pytest.approx(0.028)
+    assert (links.radius[0, beyond] == wire.outer_radius).all()
+    np.testing.assert_allclose(links.friction[0, beyond], 0.02)
+    np.testing.assert_allclose(links.friction[0, 0], 0.06)
+    # The fourth link from the end is half covered.
+    half = (wire.outer_radius + catheter.outer_radius) / 2
+    assert links.radius[0, -4] == pytest.approx(half)
+    # A catheter that leads is alone outside, and hides the wire.
+    np.testing.assert_allclose(links.radius[1], catheter.outer_radius)
+    total = wire.linear_density * (LENGTHS.sum() - 0.0245)
+    total += catheter.linear_density * LENGTHS.sum()
+    assert links.mass[1].sum() == pytest.approx(total)
+
+
+def test_devices_press_on_each_other_where_they_bend_against_each_other(pair):
+    still = np.zeros((1, 2, len(pair.spans)))
+    free = pair.overlap(np.array([[0.0, 0.0]]))
+    shape = pair.rest_angles(free, still)
+    assert pair.pressure(free, shape, still).max() > 0.1
+    # A straight tube on a straight wire does not press at all.
+    straight = [dataclasses.replace(d, tip_shape=()) for d in pair.devices]
+    alike = Stack(straight, LENGTHS)
+    nothing = alike.pressure(alike.overlap(np.zeros((1, 2))), 0 * shape, still)
+    assert nothing.max() == 0.0
+    # Nor do devices of which one has been withdrawn altogether.
+    apart = pair.overlap(np.array([[1.0, 0.0]]))
+    bent = pair.pressure(apart, pair.rest_angles(apart, still), still)
+    assert bent.max() == 0.0
+
+
+def test_devices_that_do_not_fit_are_refused():
+    with pytest.raises(ValueError, match=r"wire_035_glide.*0.889 mm.*0.533 mm"):
+        stack(["wire_035_glide", "microcatheter_021"])
+    with pytest.raises(ValueError, match="is solid"):
+        stack(["wire_014_micro", "wire_035_glide"])
+    with pytest.raises(ValueError, match="no device"):
+        stack([])
+    assert len(stack(["wire_014_micro", "microcatheter_021", "berenstein_5f"]).pairs)
+
+
+# Twist.
+
+
+def rods(names=("berenstein_5f",), relaxation=0.4):
+    nodes = stack(("berenstein_5f",)).nodes
+    return Rods([devices.get(name) for name in names], nodes, relaxation)
+
+
+def test_lag_behind_a_brake_is_b_omega_over_k():
+    """As `validate rod` demands of the hinges: δ = bω/K, with time constant b/K + τ."""
+    one = rods()
+    stiffness = 1 / (1 / one.stiffness[0]).sum()
+    device = devices.get("berenstein_5f")
+    expected = device.tip_length / device.tip.torsional_stiffness
+    expected += (LENGTHS.sum() - device.tip_length) / device.shaft.torsional_stiffness
+    assert stiffness == pytest.approx(1 / expected, rel=1e-12)
+    speed, step = 3.14, 0.004
+    brake = np.zeros((1, 1, len(LENGTHS)))
+    brake[..., -1] = 0.35 * stiffness / speed
+    angles = np.zeros((1, 1, len(LENGTHS) + 1))
+    lag = []
+    for _ in range(1500):
+        turned = np.full((1, 1), speed * step)
+        angles = one.turn(angles, turned, step, brake=brake)
+        lag.append(angles[0, 0, 0] - angles[0, 0, -1])
+    assert lag[-1] == pytest.approx(0.35, rel=1e-3)
+    constant = 0.35 / speed + 0.4
+    reached = step * (1 + np.argmax(np.array(lag) >= (1 - np.exp(-1)) * lag[-1]))
+    assert reached == pytest.approx(constant, abs=2 * step)
+
+
+def test_a_free_device_follows_its_base():
+    one = rods()
+    angles = np.zeros((1, 1, len(LENGTHS) + 1))
+    turned = one.turn(angles, np.full((1, 1), 0.1), 0.04)
+    np.testing.assert_allclose(turned, 0.1, rtol=1e-12)
+
+
+def test_friction_winds_the_device_up_until_it_gives():
+    """The end stays, but for a creep, until its twist bears the friction."""
+    one = rods()
+    stiffness = 1 / (1 / one.stiffness[0]).sum()
+    friction = np.zeros((1, 1, len(LENGTHS)))
+    friction[..., -1] = 0.5 * stiffness  # half a radian of twist
+    angles = np.zeros((1, 1, len(LENGTHS) + 1))
+    base, tip = [], []
+    for _ in range(200):
+        angles = one.turn(angles, np.full((1, 1), 0.02), 0.04, friction=friction)
+        base.append(angles[0, 0, 0])
+        tip.append(angles[0, 0, -1])
+    stuck = np.array(base) < 0.2
+    assert np.max(np.array(tip)[stuck]) <= STICKING * 0.04 * stuck.sum()
+    assert base[-1] - tip[-1] == pytest.approx(0.5, rel=0.02)
+    # Released, it keeps what friction holds.
+    for _ in range(200):
+        angles = one.turn(angles, np.zeros((1, 1)), 0.04, friction=friction)
+    assert 0.3 < base[-1] - angles[0, 0, -1] < 0.5
+
+
+def test_many_are_turned_as_each_alone():
+    """Bit for bit, whatever lies beside."""
+    two = rods(("wire_035_glide", "berenstein_5f"))
+    rng = np.random.default_rng(2)
+    shape = (5, 2, len(LENGTHS))
+    angles = rng.normal(size=(5, 2, len(LENGTHS) + 1))
+    turned = rng.normal(size=(5, 2))
+    torque, rate = 1e-4 * rng.normal(size=shape), 1e-4 * rng.normal(size=shape)
+    friction = 1e-5 * rng.random(shape)
+    many = two.turn(angles, turned, 0.04, torque, rate, friction)
+    for i in range(5):
+        row = slice(i, i + 1)
+        one = two.turn(
+            angles[row], turned[row], 0.04, torque[row], rate[row], friction[row]
+        )
+        assert one.tobytes() == many[row].tobytes()
+
+
+def test_overlaps_of_many_are_those_of_each(pair):
+    rng = np.random.default_rng(3)
+    gaps = np.where(rng.random(6)[:, None] < 0.5, [0.0, 1.0], [1.0, 0.0]) * (
+        rng.uniform(0, 0.2, (6, 1))
+    )
+    turns = rng.uniform(-3, 3, (6, 2, len(pair.spans)))
+    many = pair.overlap(gaps)
+    bends = pair.rest_angles(many, turns) + 0.1
+    for i in range(6):
+        row = slice(i, i + 1)
+        one = pair.overlap(gaps[row])
+        for mine, theirs in zip(one, many, strict=True):
+            assert mine.tobytes() == np.ascontiguousarray(theirs[row]).tobytes()
+        for function in (pair.restoring, lambda *a: [pair.pressure(*a)]):
+            alone = function(one, bends[row], turns[row])
+            for mine, theirs in zip(alone, function(many, bends, turns), strict=True):
+                assert mine.tobytes() == np.ascontiguousarray(theirs[row]).tobytes()

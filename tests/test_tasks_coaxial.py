@@ -1,0 +1,226 @@
+"""Coaxial devices in a task: how they move, what is written, both paths alike."""
+
+import mujoco
+import numpy as np
+import pytest
+
+from cathsim_dmc import suite
+from cathsim_dmc.simulation.batch import BatchSimulation
+from cathsim_dmc.tasks import coaxial
+from cathsim_dmc.tasks.config import CONTROL_TIMESTEP, NavigationConfig
+
+TASK = "simple1_lcca_pair"
+STEP = 0.04 * CONTROL_TIMESTEP  # m, of a device at full speed in a control step
+
+
+@pytest.fixture(scope="module")
+def environment():
+    env = suite.load("cathsim", TASK, {"random": 3, "observation": ["internal"]})
+    yield env
+    env.close()
+
+
+def run(environment, action, steps):
+    for _ in range(steps):
+        timestep = environment.step(np.array(action, dtype=float))
+    return timestep.observation
+
+
+def test_actions_are_translation_and_rotation_of_each(environment):
+    names = environment.action_spec().name.split("\t")
+    assert names == [
+        "guidewire/insertion",
+        "guidewire/rotation",
+        "catheter/insertion",
+        "catheter/rotation",
+    ]
+    assert environment.task.num_actions == 4
+    alone = suite.make_task("simple1_lcca_wire")
+    assert alone.scene.catheter.action_names == names[:2] or (
+        list(alone.scene.catheter.action_names) == names[:2]
+    )
+
+
+def test_the_wire_starts_ahead(environment):
+    seen = environment.reset().observation
+    insertion = seen["device_insertion"]
+    assert insertion[0] == environment.task.readings.insertion
+    assert insertion[0] - insertion[1] == pytest.approx(0.03)
+    assert (seen["device_rotation"] == 0).all()
+    points = seen["device_points"].reshape(2, 8, 3)
+    np.testing.assert_allclose(points[0, -1], environment.task.readings.head)
+    # The catheter's end lies 30 mm of nearly straight wire behind.
+    gap = np.linalg.norm(points[0, -1] - points[1, -1])
+    assert 0.025 < gap <= 0.0301
+
+
+def test_each_device_moves_by_its_own_action(environment):
+    before = environment.reset().observation["device_insertion"]
+    seen = run(environment, [0.0, 0.0, 0.5, 0.0], 10)
+    moved = seen["device_insertion"] - before
+    assert moved[1] == pytest.approx(5 * STEP)
+    # Held, but for the give of the drive under load.
+    assert abs(moved[0]) < 0.2e-3
+    seen = run(environment, [0.5, 0.0, 0.0, 0.0], 10)
+    moved = seen["device_insertion"] - before
+    assert moved == pytest.approx([5 * STEP, 5 * STEP], rel=0.1)
+
+
+def test_the_catheter_overtakes_the_wire_and_takes_the_lead(environment):
+    environment.reset()
+    seen = run(environment, [0.0, 0.0, 1.0, 0.0], 30)
+    wire, catheter = seen["device_insertion"]
+    assert catheter > wire + 0.01
+    assert environment.task.readings.insertion == catheter
+    # Now the wire is withdrawn until it has left the patient, and no farther.
+    seen = run(environment, [-1.0, 0.0, 0.0, 0.0], 80)
+    depth = environment.task.scene.placement.start_depth
+    assert seen["device_insertion"][0] == pytest.approx(-depth)
+    # The links are the catheter's alone wherever it has left the sheath.
+    model = environment.physics.model.ptr
+    links = [i for i in range(model.nbody) if "link_" in model.body(i).name]
+    catheter = environment.task.scene.catheter.device
+    expected = catheter.linear_density * environment.task.scene.catheter.link_lengths
+    np.testing.assert_allclose(model.body_mass[links][-8:], expected[-8:])
+
+
+def test_neither_can_leave_its_base(environment):
+    environment.reset()
+    seen = run(environment, [-1.0, 0.0, -1.0, 0.0], 100)
+    # One of them always keeps the end of the chain at its start.
+    assert seen["device_insertion"].max() == pytest.approx(0.0, abs=2e-4)
+    assert (seen["device_insertion"] >= -environment.task.scene.placement.start_depth)[
+        1
+    ]
+
+
+def test_rotation_turns_the_shape_of_the_end(environment):
+    """Where the wire lies free, its springs follow the rotation of its end."""
+    environment.reset()
+    model = environment.physics.model.ptr
+    count = len(environment.task.scene.catheter.links)
+    ends = [
+        model.joint(f"catheter/bend_{axis}_{count - 2}").qposadr[0] for axis in "xy"
+    ]
+
+    def direction():
+        x, y = model.qpos_spring[ends]
+        return y - 1j * x
+
+    first = direction()
+    assert first.real > 0.05 and first.imag == 0.0
+    seen = run(environment, [0.0, 0.5, 0.0, 0.0], 25)
+    assert seen["device_rotation"][0] == pytest.approx(0.5 * 3.14)
+    run(environment, [0.0, 0.0, 0.0, 0.0], 50)
+    seen = environment.task.rollout.devices
+    turned = np.angle(direction() / first)
+    assert turned == pytest.approx(seen.tip_rotation[0, 0], abs=0.05)
+    assert 1.0 < turned < 1.7
+    assert seen.rotation[0, 1] == 0.0
+
+
+def test_pushing_on_a_wall_loads_the_leading_device(environment):
+    environment.reset()
+    run(environment, [1.0, 0.0, 1.0, 0.0], 110)
+    seen = environment.task.rollout.devices
+    push = float(environment.task.readings.push_force)
+    assert push > 0.02
+    assert 0.0 < seen.leading_load[0] <= push * 1.5 + 0.05
+
+
+def test_the_state_holds_the_devices(environment):
+    """What is saved and put back goes on alike: insertions and twist are in it."""
+    environment.reset()
+    run(environment, [0.5, 0.7, 1.0, -0.3], 10)
+    model, data = environment.physics.model.ptr, environment.physics.data.ptr
+    kind = mujoco.mjtState.mjSTATE_INTEGRATION.value
+    state = np.zeros(mujoco.mj_stateSize(model, kind))
+    mujoco.mj_getState(model, data, state, kind)
+    seen = environment.task.rollout.devices
+    run(environment, [0.5, 0.7, 1.0, -0.3], 5)
+    mujoco.mj_setState(model, data, state, kind)
+    again = environment.task.rollout.devices
+    np.testing.assert_array_equal(again.insertion, seen.insertion)
+    np.testing.assert_array_equal(again.tip_rotation, seen.tip_rotation)
+
+
+def test_a_step_of_a_single_device_does_no_pair_work(shared_environment, monkeypatch):
+    environment = shared_environment("type1_bca")
+    assert environment.task.rollout.devices is None
+    assert environment.physics.model.ptr.nuserdata == 0
+    monkeypatch.setattr(
+        coaxial, "made_of", lambda *_: pytest.fail("coaxial work for one device")
+    )
+    environment.reset()
+    environment.step(np.zeros(21))
+
+
+@pytest.mark.parametrize("task", ["simple1_bca_pair", "simple1_bca_wire"])
+def test_both_paths_are_equal_bit_for_bit(task):
+    """Randomised, with a partial reset, while both devices move at random."""
+    options = {"randomisation": True, "observation": ["internal", "tracking", "force"]}
+    environments = [
+        suite.load("cathsim", task, {"random": 5 + i, **options}) for i in range(2)
+    ]
+    batch = BatchSimulation(
+        suite.make_task(task, random=0, **options), 2, seeds=5, num_threads=2
+    )
+    steps = [env.reset().observation for env in environments]
+    batched = batch.reset().observation
+    rng = np.random.default_rng(0)
+    for number in range(40):
+        for i, seen in enumerate(steps):
+            assert list(seen) == list(batched)
+            for key, value in batched.items():
+                np.testing.assert_array_equal(value[i], seen[key], err_msg=key)
+        if number == 20:
+            batched = batch.reset(np.array([1])).observation
+            steps[1] = environments[1].reset().observation
+            continue
+        action = rng.uniform(-1, 1, (2, batch.num_actions))
+        action[:, 0::2] = np.abs(action[:, 0::2])
+        batched = batch.step(action).observation
+        steps = [
+            env.step(row).observation
+            for env, row in zip(environments, action, strict=True)
+        ]
+
+
+@pytest.mark.slow
+def test_anatomies_take_turns_with_coaxial_devices():
+    """Random arches: each simulation has a model of its own, alike in both paths."""
+    options = {"pool": 2, "observation": "tracking"}
+    environment = suite.load("cathsim", "arch_bca_pair", {"random": 5, **options})
+    batch = BatchSimulation(
+        suite.make_task("arch_bca_pair", random=0, **options), 3, seeds=5
+    )
+    rng = np.random.default_rng(1)
+    for _ in range(3):
+        seen, batched = environment.reset().observation, batch.reset().observation
+        for _ in range(15):
+            for key, value in batched.items():
+                np.testing.assert_array_equal(value[0], seen[key], err_msg=key)
+            action = rng.uniform(-1, 1, (3, 4))
+            batched = batch.step(action).observation
+            seen = environment.step(action[0]).observation
+
+
+@pytest.mark.parametrize(
+    "options, message",
+    [
+        ({"devices": "berenstein_5f"}, "from the innermost outwards"),
+        ({"devices": []}, "from the innermost outwards"),
+        ({"devices": ["berenstein_5f"], "device": "steerable_4f"}, "leave one of"),
+        ({"devices": ["berenstein_5f"], "rotation": True}, "rotation is True"),
+        ({"lead": -0.01}, "lead"),
+        ({"lumen_friction": -1}, "lumen_friction"),
+    ],
+)
+def test_options_that_cannot_be_are_refused(options, message):
+    with pytest.raises(ValueError, match=message):
+        NavigationConfig(**options)
+
+
+def test_a_steerable_device_in_a_stack_is_refused():
+    with pytest.raises(ValueError, match="motors in its tip"):
+        suite.make_task("simple1_bca_wire", devices=["steerable_5f"])
