@@ -13,6 +13,7 @@ from cathsim_dmc.entities import devices
 from cathsim_dmc.entities.device import Device
 from cathsim_dmc.entities.device_stack import DeviceStack
 from cathsim_dmc.tasks import coaxial
+from cathsim_dmc.tasks.config import CONTROL_TIMESTEP
 from cathsim_dmc.validation import rod, sliding
 from cathsim_dmc.validation.checks import Check, Report
 from cathsim_dmc.validation.rig import Rig
@@ -31,7 +32,10 @@ SHAPES = (
     (PAIR, (0.0, 0.005), (0.0, np.pi / 2)),
     (("wire_035_amplatz", "diagnostic_5f_simmons"), (0.035, 0.0), (0.0, 0.0)),
 )
-_FINE = 0.05e-3  # m, of the curve that is integrated
+# Largest step of the free end as one device slides in the other, in that of the curve:
+# a chain whose hinges jumped one after the other would make several at once.
+STEP_BOUND = 1.5
+_FINE, _COARSE = 0.05e-3, 0.5e-3  # m, of the curve that is integrated
 
 
 def straightened(names: Sequence[str]) -> tuple[Device, ...]:
@@ -141,12 +145,14 @@ def weighted_curve(
     gaps: Sequence[float],
     rotation: Sequence[float],
     length: float,
+    spacing: float = _FINE,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Arc lengths (n,) and points (n, 3) of the curve of the EI-weighted curvature.
 
-    Integrated in steps of 0.05 mm from the base, with a frame that does not twist.
+    Integrated from the base in steps of a spacing in m, with a frame that does not
+    twist.
     """
-    arc = np.arange(0.0, length, _FINE)
+    arc = np.arange(0.0, length, spacing)
     steps = np.diff(np.append(arc, length))
     middle = length - (arc + steps / 2)  # from the end
     stiffness, moment = np.zeros(len(arc)), np.zeros(len(arc), dtype=complex)
@@ -173,6 +179,47 @@ def weighted_curve(
         points.append(points[-1] + half[:, 2] * step)
         frame = _rotation(axis) @ frame
     return np.append(arc, length), np.array(points)
+
+
+def free_ends(names: Sequence[str], leads: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Ends (n, 3) of the unloaded chain and of the curve, as the wire slides, m.
+
+    Args:
+        names: of wire and catheter.
+        leads: (n,), by how much the wire is ahead of the catheter, m; negative where it
+            is behind.
+    """
+    entity = DeviceStack(names)
+    stack, length = entity.stack, float(entity.link_lengths.sum())
+    gaps = np.stack([np.maximum(-leads, 0.0), np.maximum(leads, 0.0)], axis=-1)
+    turns = np.zeros((len(leads), 2, len(stack.spans)))
+    angles = stack.rest_angles(stack.overlap(gaps), turns).real
+    # All shapes lie in one plane here.
+    heading = np.concatenate([np.zeros((len(leads), 1)), np.cumsum(angles, -1)], -1)
+    x = (np.sin(heading) * stack.link_lengths).sum(-1)
+    z = (np.cos(heading) * stack.link_lengths).sum(-1)
+    chain = np.stack([x, 0 * x, z], axis=-1)
+    rotation = np.zeros(2)
+    curve = [
+        weighted_curve(entity.devices, gap, rotation, length, _COARSE)[1][-1]
+        for gap in gaps
+    ]
+    return chain, np.array(curve)
+
+
+def _smoothness() -> Check:
+    """Steps of the free end as the wire slides at 10 mm/s, against the curve's."""
+    leads = np.arange(-0.06, 0.06, sliding.SPEED * CONTROL_TIMESTEP)
+    chain, curve = free_ends(sliding.SLIDING_PAIR, leads)
+    steps = [np.linalg.norm(np.diff(ends, axis=0), axis=-1) for ends in (chain, curve)]
+    return Check.at_most(
+        "free end while the wire slides at 10 mm/s: largest step over the curve's",
+        steps[0].max() / steps[1].max(),
+        STEP_BOUND,
+        "",
+        f"{1e3 * steps[0].max():.2f} mm in 40 ms, the curve's "
+        f"{1e3 * steps[1].max():.2f} mm, over {len(leads)} steps",
+    )
 
 
 def _rotation(vector: np.ndarray) -> np.ndarray:
@@ -249,6 +296,7 @@ def validate_pair(figure_path: str | Path | None = None) -> Report:
                 f"over {1e3 * load.length:.0f} mm",
             )
         )
+    checks.append(_smoothness())
     moving = sliding.checks()
     checks += moving.checks
     if figure_path is not None:

@@ -18,6 +18,7 @@ from cathsim_dmc.tasks.variations import DEFAULT_RANGES, Randomisation
 
 OUTPUT = Path(__file__).parents[1] / "observations.md"
 TASK = "type1_bca"
+PAIR_TASK = "type1_bca_pair"
 
 INTRODUCTION = f"""# Observations
 
@@ -37,6 +38,15 @@ The world frame is that of the patient (LPS): +x to the patient's left, +y poste
 the shapes, depend on the device and on the length that a task needs. Positions and
 velocities of joints are those at the end of the control step, all other numbers those
 of its last physics step.
+"""
+
+COAXIAL = f"""
+## Coaxial devices
+
+Tasks with the suffix `_wire` or `_pair` add to `internal`, `tracking` and `route`, here
+with the shapes of `{PAIR_TASK}`; `tracking_2d` gets the first two:
+
+{{table}}
 """
 
 FLUOROSCOPY = f"""
@@ -98,6 +108,18 @@ def _row(*cells: str) -> str:
     return "| " + " | ".join(cells) + " |"
 
 
+def coaxial_table() -> str:
+    """What coaxial devices add, from the specs."""
+    environment = suite.load("cathsim", PAIR_TASK, {"observation": "tracking"})
+    specs = dict(environment.observation_spec())
+    rows = [_row("entry", "shape", "unit", "meaning"), _row(*["---"] * 4)]
+    for kind in (observations.DRIVEN, observations.LYING):
+        for entry in kind.entries:
+            shape = _shape(specs[entry.key].shape)
+            rows.append(_row(f"`{entry.key}`", shape, entry.unit, entry.meaning))
+    return "\n".join(rows)
+
+
 def entries_table() -> str:
     """Every entry of every observation, from the specs."""
     drawn = [name for name in observations.OBSERVATIONS if name not in KINDS]
@@ -156,6 +178,7 @@ def options_table(kind: type, values: object, title: str) -> str:
 def page() -> str:
     """The whole page."""
     parts = [INTRODUCTION, entries_table() + "\n"]
+    parts.append(COAXIAL.replace("{table}", coaxial_table()))
     table = options_table(FluoroscopyOptions, FluoroscopyOptions(), "default")
     parts.append(FLUOROSCOPY.replace("{table}", table))
     parts.append(CAMERA_TEXT)

@@ -1,0 +1,64 @@
+"""Coaxial devices against theory; `cathsim validate pair` runs all of it."""
+
+import numpy as np
+import pytest
+
+from cathsim_dmc.validation import pair, sliding
+
+
+def test_a_protruding_wire_bends_as_two_sections():
+    bent = pair.cantilevers(0.05)
+    assert max(one.deviation for one in bent) < 0.01
+    lengths, bending = pair.sections(pair.DeviceStack(pair.PAIR), np.array([0.0, 0.05]))
+    assert lengths[-2:] == pytest.approx([0.02, 0.03])
+    wire = pair.devices.get(pair.PAIR[0])
+    assert bending[-1] == wire.tip.bending_stiffness
+    assert bending[-2] == wire.shaft.bending_stiffness
+    assert bending[0] == pytest.approx(197.3e-6, rel=1e-3)
+
+
+@pytest.mark.parametrize("shape", pair.SHAPES[1:3])
+def test_unloaded_shape_is_the_weighted_curvature(shape):
+    settled = pair.unloaded(*shape)
+    assert settled.deviation < 0.02
+    # The figure would catch a chain that took one device alone.
+    for device, gap, turn in zip(*shape, strict=True):
+        length = settled.expected[-1, 2] + 0.01
+        _, alone = pair.weighted_curve(
+            [pair.devices.get(device)], [gap], [turn], length, 0.5e-3
+        )
+        other = alone[-1, :2] - settled.simulated[-1, :2]
+        assert np.linalg.norm(other) > 1e-3
+
+
+def test_the_free_end_moves_as_smoothly_as_the_curve():
+    check = pair._smoothness()
+    assert check.passed and check.value > 0.5
+
+
+def test_the_curve_is_integrated_right():
+    """A catheter alone has its arcs: the end of 60° of 8 mm, then 8 mm straight."""
+    device = pair.devices.get("berenstein_5f")
+    _, points = pair.weighted_curve([device], [0.0], [0.3], 0.1)
+    angle, radius = np.radians(60), 8e-3
+    across = radius * (1 - np.cos(angle)) + 8e-3 * np.sin(angle)
+    along = 0.1 - radius * angle - 8e-3 + radius * np.sin(angle) + 8e-3 * np.cos(angle)
+    expected = (across * np.cos(0.3), across * np.sin(0.3), along)
+    np.testing.assert_allclose(points[-1], expected, atol=2e-5)
+
+
+@pytest.mark.slow
+def test_buckling_load_of_the_pair():
+    load = pair.buckling("sliding")
+    assert load.critical == pytest.approx(load.expected, rel=0.05)
+
+
+@pytest.mark.slow
+def test_a_bend_whips_in_a_curve_and_follows_in_a_straight_tube():
+    straight, bent = sliding.turn(False), sliding.turn(True)
+    assert np.degrees(straight.lag.max()) < sliding.STRAIGHT_LAG
+    assert bent.shape / bent.stiffness > 1
+    assert bent.whips > sliding.WHIP > straight.whips
+    # Once in each turn of the base, by a whole turn.
+    jumps = np.flatnonzero(np.diff(bent.tip) > 3 * np.diff(bent.base).mean())
+    assert 1 <= (np.diff(jumps) > 20).sum() + 1 <= 3
