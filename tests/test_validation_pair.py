@@ -17,17 +17,17 @@ def test_a_protruding_wire_bends_as_two_sections():
     assert bending[0] == pytest.approx(197.3e-6, rel=1e-3)
 
 
-@pytest.mark.parametrize("shape", pair.SHAPES[1:3])
+@pytest.mark.parametrize("shape", pair.SHAPES[2:])
 def test_unloaded_shape_is_the_weighted_curvature(shape):
     settled = pair.unloaded(*shape)
     assert settled.deviation < 0.02
     # The figure would catch a chain that took one device alone.
     for device, gap, turn in zip(*shape, strict=True):
-        length = settled.expected[-1, 2] + 0.01
+        length = float(np.linalg.norm(np.diff(settled.expected, axis=0), axis=-1).sum())
         _, alone = pair.weighted_curve(
-            [pair.devices.get(device)], [gap], [turn], length, 0.5e-3
+            [pair.devices.get(device)], [gap], [turn], length
         )
-        other = alone[-1, :2] - settled.simulated[-1, :2]
+        other = alone[-1] - settled.simulated[-1]
         assert np.linalg.norm(other) > 1e-3
 
 
@@ -44,7 +44,7 @@ def test_the_curve_is_integrated_right():
     across = radius * (1 - np.cos(angle)) + 8e-3 * np.sin(angle)
     along = 0.1 - radius * angle - 8e-3 + radius * np.sin(angle) + 8e-3 * np.cos(angle)
     expected = (across * np.cos(0.3), across * np.sin(0.3), along)
-    np.testing.assert_allclose(points[-1], expected, atol=2e-5)
+    np.testing.assert_allclose(points[-1], expected, atol=5e-5)
 
 
 @pytest.mark.slow

@@ -162,9 +162,9 @@ def pair(
         end = shape.expected[-1, :2]
         across = end / np.linalg.norm(end)
         colour = _COLOURS[index % len(_COLOURS)]
-        for points, dots in ((shape.expected, "-"), (shape.simulated, ".")):
+        for points, mark in ((shape.expected, "-"), (shape.simulated, ".")):
             left.plot(
-                1e3 * points[:, 2], 1e3 * points[:, :2] @ across, dots, color=colour
+                1e3 * points[:, 2], 1e3 * points[:, :2] @ across, mark, color=colour
             )
     length = 1e3 * shapes[0].expected[-1, 2]
     left.set_xlim(length - 100, length + 10)

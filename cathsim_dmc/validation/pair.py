@@ -34,8 +34,8 @@ SHAPES = (
 )
 # Largest step of the free end as one device slides in the other, in that of the curve:
 # a chain whose hinges jumped one after the other would make several at once.
-STEP_BOUND = 1.5
-_FINE, _COARSE = 0.05e-3, 0.5e-3  # m, of the curve that is integrated
+STEP_BOUND = 1.1
+_FINE = 0.05e-3  # m, of the curve that is integrated
 
 
 def straightened(names: Sequence[str]) -> tuple[Device, ...]:
@@ -145,14 +145,33 @@ def weighted_curve(
     gaps: Sequence[float],
     rotation: Sequence[float],
     length: float,
-    spacing: float = _FINE,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Arc lengths (n,) and points (n, 3) of the curve of the EI-weighted curvature.
 
-    Integrated from the base in steps of a spacing in m, with a frame that does not
-    twist.
+    Integrated from the base, with a frame that does not twist.
     """
-    arc = np.arange(0.0, length, spacing)
+    arc, steps, curvature = weighted_curvature(chosen, gaps, rotation, length)
+    frame, points = np.eye(3), [np.zeros(3)]
+    for bend, step in zip(curvature, steps, strict=True):
+        # The curvature x + iy leads towards x and y: a turn about -y, x of the frame.
+        axis = frame @ np.array([-bend.imag, bend.real, 0.0]) * step
+        half = _rotation(axis / 2) @ frame
+        points.append(points[-1] + half[:, 2] * step)
+        frame = _rotation(axis) @ frame
+    return np.append(arc, length), np.array(points)
+
+
+def weighted_curvature(
+    chosen: Sequence[Device],
+    gaps: Sequence[float],
+    rotation: Sequence[float],
+    length: float,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Pieces (n,) of 0.05 mm: arc length of their beginning, length, curvature x + iy.
+
+    The curvature leads towards x and y; where no device is, there is none.
+    """
+    arc = np.arange(0.0, length, _FINE)
     steps = np.diff(np.append(arc, length))
     middle = length - (arc + steps / 2)  # from the end
     stiffness, moment = np.zeros(len(arc)), np.zeros(len(arc), dtype=complex)
@@ -170,15 +189,10 @@ def weighted_curve(
             moment += np.where(inside, bending * sign * np.exp(1j * turn), 0.0)
             start += bow.length
         stiffness += bending
-    curvature = moment / stiffness
-    frame, points = np.eye(3), [np.zeros(3)]
-    for bend, step in zip(curvature, steps, strict=True):
-        # The curvature x + iy leads towards x and y: a turn about -y, x of the frame.
-        axis = frame @ np.array([-bend.imag, bend.real, 0.0]) * step
-        half = _rotation(axis / 2) @ frame
-        points.append(points[-1] + half[:, 2] * step)
-        frame = _rotation(axis) @ frame
-    return np.append(arc, length), np.array(points)
+    curvature = np.divide(
+        moment, stiffness, out=np.zeros_like(moment), where=stiffness > 0
+    )
+    return arc, steps, curvature
 
 
 def free_ends(names: Sequence[str], leads: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -199,11 +213,14 @@ def free_ends(names: Sequence[str], leads: np.ndarray) -> tuple[np.ndarray, np.n
     x = (np.sin(heading) * stack.link_lengths).sum(-1)
     z = (np.cos(heading) * stack.link_lengths).sum(-1)
     chain = np.stack([x, 0 * x, z], axis=-1)
-    rotation = np.zeros(2)
-    curve = [
-        weighted_curve(entity.devices, gap, rotation, length, _COARSE)[1][-1]
-        for gap in gaps
-    ]
+    curve = []
+    for gap in gaps:
+        _, steps, curvature = weighted_curvature(
+            entity.devices, gap, np.zeros(2), length
+        )
+        heading = np.cumsum(curvature.real * steps) - curvature.real * steps / 2
+        end = (np.sin(heading) @ steps, 0.0, np.cos(heading) @ steps)
+        curve.append(end)
     return chain, np.array(curve)
 
 
