@@ -3,11 +3,15 @@
 import dataclasses
 import math
 
+import gymnasium
 import numpy as np
 import pytest
+import torch
 from bad_values import NONE, Tally, flag, number, options, pixels, span, whole, word
 from hypothesis import strategies as st
+from recording_samples import make_episode
 
+import cathsim_dmc.gym  # noqa: F401  registers the ids
 from cathsim_dmc import suite
 from cathsim_dmc.agents import learners
 from cathsim_dmc.anatomy.anatomy import Goal, Inlet, Surface
@@ -17,6 +21,7 @@ from cathsim_dmc.anatomy.scan.importer import import_scan
 from cathsim_dmc.entities import devices
 from cathsim_dmc.imaging.options import FluoroscopyOptions
 from cathsim_dmc.simulation.batch import BatchSimulation
+from cathsim_dmc.simulation.torchrl import BatchedEnv
 from cathsim_dmc.tasks.cameras import CameraOptions
 from cathsim_dmc.tasks.config import NavigationConfig
 from cathsim_dmc.tasks.variations import Randomisation
@@ -39,8 +44,15 @@ TASK = {
     "randomisation": options() | NONE,
     "goal_radius": POSITIVE,
     "reward": options() | NONE,
+    "start_along_route": span(0, 0.95),
+    "devices": st.sampled_from(["x", 1, [], [1], (None,), {}, ["x"], True]),
+    "lead": number(0, 0.3),
+    "lumen_friction": number(0, 2),
     "random": whole(0, 2**32 - 1, optional=True),
 }
+# Whether these name anything is known where the scene is built.
+CONFIG = TASK.keys() - {"observation", "device", "devices", "goal_radius", "reward"}
+CONFIG -= {"random"}
 NAVIGATE = {"anatomy": word(), "goal": word(), "access": word()}
 ARCHES = {
     "arches": word(),
@@ -48,8 +60,10 @@ ARCHES = {
     "first": whole(0, 10_000),
 }
 FLUOROSCOPY = {
-    "view": word() | st.tuples(number(-360, 360), st.just(0)),
-    "biplane": word(optional=True) | st.tuples(st.just(0), number(-89, 89)),
+    "view": word().filter(lambda value: value != (1, 2))
+    | st.tuples(number(-360, 360), st.just(0)),
+    "biplane": word(optional=True).filter(lambda value: value != (1, 2))
+    | st.tuples(st.just(0), number(-89, 89)),
     "size": pixels(),
     "magnification": number(0.01, 1000),
     "centre": st.tuples(st.just(0), number(-10, 10), st.just(0)),
@@ -143,6 +157,11 @@ TRAINING = {
     "num_threads": whole(1, optional=True),
     "seed": whole(0),
     "total_frames": whole(1),
+    "training_reward": st.sampled_from(["x", 1, [], {"path": "x"}, {1: 2.0}, True]),
+    "training_max_steps": whole(1, optional=True),
+    "training_start": span(0, 1.0),
+    "initial_policy": st.sampled_from([1, True, [], {}, 1.5]),
+    "initial_std": number(positive=True, optional=True),
     "hidden": st.sampled_from([(), [], 64, "64", (0,), (-1,), (1.5,), (10**9,), None]),
     "activation": word(),
     "cnn_features": whole(1, 16_384),
@@ -166,6 +185,10 @@ PPO = {
     "entropy_coefficient": number(0),
     "value_coefficient": number(0),
     "max_grad_norm": POSITIVE,
+    "target_kl": number(positive=True, optional=True),
+    "initial_deviation": POSITIVE,
+    "noise_correlation": number(0, 1),
+    "noise_shared": number(0, 1),
     "anneal": flag(),
 }
 SAC = {
@@ -177,6 +200,8 @@ SAC = {
     "steps_per_env": whole(1),
     "updates_per_frame": POSITIVE,
     "initial_alpha": POSITIVE,
+    "target_entropy": number(optional=True),
+    "demonstrations": st.sampled_from([1, True, [], {}, 1.5]),
 }
 SCAN = {
     "units": word(optional=True),
@@ -199,7 +224,12 @@ INLET = {
 }
 NUMBERS = st.one_of(
     st.sampled_from(["x", None, [], {}, [[1]], 1j, math.nan]),
-    st.tuples(number(), st.just(0.0), st.just(1.0)),
+    # NumPy takes true for 1, where other numbers stand beside it.
+    st.tuples(
+        number().filter(lambda value: not isinstance(value, bool)),
+        st.just(0.0),
+        st.just(1.0),
+    ),
 )
 
 
@@ -219,7 +249,7 @@ def entries(folder):
         ("task options", lambda **o: suite.make_task("type1_bca", **o), TASK),
         ("task navigate", lambda **o: suite.make_task("navigate", **o), NAVIGATE),
         ("task arch_bca", lambda **o: suite.make_task("arch_bca", **o), ARCHES),
-        ("NavigationConfig", NavigationConfig, {k: TASK[k] for k in list(TASK)[2:12]}),
+        ("NavigationConfig", NavigationConfig, {k: TASK[k] for k in CONFIG}),
         ("FluoroscopyOptions", FluoroscopyOptions, FLUOROSCOPY),
         ("CameraOptions", CameraOptions, {"names": word(), "size": pixels()}),
         ("Randomisation", Randomisation, RANDOMISATION),
@@ -264,6 +294,7 @@ SAYS = {
     "radii": "centreline",
     "reward": "reward",
     "random": "random",
+    "training_start": "start",
 }
 
 
@@ -296,6 +327,20 @@ def bad_actions(shape):
     )
 
 
+def bad_numbers(shape):
+    """Arrays of numbers that are no action."""
+
+    def with_value(value, at):
+        action = np.zeros(shape)
+        action.flat[at] = value
+        return action
+
+    size = math.prod(shape)
+    values = st.sampled_from([math.nan, math.inf, -math.inf])
+    shapes = st.lists(st.integers(0, 3), max_size=3).filter(lambda s: tuple(s) != shape)
+    return st.builds(with_value, values, st.integers(0, size - 1)) | shapes.map(np.ones)
+
+
 def try_actions(tally, environment, examples):
     environment.reset()
     before = environment.physics.data.qpos.copy()
@@ -315,6 +360,86 @@ def try_actions(tally, environment, examples):
     np.testing.assert_array_equal(simulation.batch.qpos, state)
 
 
+def test_every_field_is_tried():
+    """A field that is added later must be told here what it does not take."""
+    for kind, tried in (
+        (NavigationConfig, TASK),
+        (FluoroscopyOptions, FLUOROSCOPY),
+        (Randomisation, RANDOMISATION),
+        (devices.Discretisation, DISCRETISATION),
+        (learners.LEARNERS["ppo"].config, TRAINING | PPO),
+        (learners.LEARNERS["sac"].config, TRAINING | SAC),
+    ):
+        fields = {field.name for field in dataclasses.fields(kind)}
+        assert not fields - tried.keys() - {"torch_device"}, kind.__name__
+
+
+def try_faces(tally, examples):
+    """TorchRL checks actions against its spec only when told to: it is the batch's."""
+    vector = gymnasium.make_vec(
+        "cathsim/type1_bca-v0", 2, vectorization_mode="vector_entry_point"
+    )
+    vector.reset(seed=0)
+    batched = BatchedEnv("type1_bca", 2, num_threads=1)
+    start = batched.reset()
+
+    def torchrl(value):
+        value = torch.as_tensor(value, dtype=torch.float32)
+        return batched.step(start.clone().set("action", value))
+
+    for name, step, bad in (
+        ("Gymnasium action", vector.step, bad_actions((2, 21))),
+        ("TorchRL action", torchrl, bad_numbers((2, 21))),
+    ):
+
+        def check(value, name=name, step=step):
+            tally.refused(name, lambda: step(value), [], (ValueError, RuntimeError))
+
+        tally.draw(bad, examples, check)
+    vector.close()
+    batched.close()
+
+
+def spoilt(array):
+    """An array with a row too few or too many, an axis more, or no number in it."""
+
+    def with_value(value, at):
+        other = np.array(array, dtype=np.float64)
+        other.flat[at] = value
+        return other
+
+    values = st.sampled_from([math.nan, math.inf, -math.inf])
+    other = [array[:-1], np.concatenate([array, array[-1:]]), array[..., None]]
+    return st.one_of(
+        st.builds(with_value, values, st.integers(0, array.size - 1)),
+        st.sampled_from([*other, None, "x", {}, object, 1j, [["a"]], [[1.0], [1, 2]]]),
+    )
+
+
+def try_episodes(tally, examples):
+    episode = make_episode()
+    fields = {
+        "task": st.sampled_from([None, "", 1, b"x", [], {}]),
+        "seed": st.sampled_from(["x", 1.5, True, [], {}, math.nan, math.inf]),
+        "meta": st.sampled_from([None, 1, "x", [], {}, {"success": object()}, {1: 2}]),
+    }
+    for field in dataclasses.fields(episode):
+        bad = fields.get(field.name)
+        if bad is None:
+            bad = spoilt(getattr(episode, field.name))
+
+        def check(value, name=field.name):
+            tally.refused(
+                "Episode",
+                lambda: dataclasses.replace(episode, **{name: value}),
+                # Arrays that no longer fit each other are told of by either name.
+                [] if name in ("time", "contact_step") else [name],
+                note=name,
+            )
+
+        tally.draw(bad, examples, check)
+
+
 def settled(tally, folder):
     assert not list(folder.iterdir()), "something was written"
     print(tally.report())
@@ -326,6 +451,8 @@ def test_bad_values_are_refused_by_name(tmp_path, shared_environment):
     tally = Tally()
     try_values(tally, tmp_path, 3)
     try_actions(tally, shared_environment("type1_bca"), 20)
+    try_faces(tally, 20)
+    try_episodes(tally, 5)
     settled(tally, tmp_path)
     assert tally.tried.total() > 300
 
@@ -335,5 +462,7 @@ def test_two_thousand_bad_values_are_refused_by_name(tmp_path, shared_environmen
     tally = Tally()
     try_values(tally, tmp_path, 25)
     try_actions(tally, shared_environment("type1_bca"), 200)
+    try_faces(tally, 100)
+    try_episodes(tally, 30)
     settled(tally, tmp_path)
     assert tally.tried.total() >= 2000

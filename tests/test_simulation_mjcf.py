@@ -85,6 +85,8 @@ def test_what_cannot_be_written_is_refused_before(tmp_path):
         write_mjcf(TASK, tmp_path)
     with pytest.raises(ValueError, match="pool=1"):
         write_mjcf("arch_bca", tmp_path / "b", task_kwargs={"pool": 2})
+    with pytest.raises(ValueError, match="single device"):
+        write_mjcf("type1_lcca_pair", tmp_path / "c")
     assert not list(tmp_path.iterdir())
 
 

@@ -170,6 +170,13 @@ class TrainingConfig:
             steps,
             "a positive integer, or None for the task's own",
         )
+        start = self.training_start
+        require(
+            start is None or (len(start) == 2 and 0 <= start[0] <= start[1] < 1),
+            "training_start",
+            start,
+            "two shares (low, high) with 0 <= low <= high < 1, or None",
+        )
         for name in ("seed", "normalisation_frames"):
             value = getattr(self, name)
             require(value >= 0, name, value, "an integer >= 0")

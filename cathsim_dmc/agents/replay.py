@@ -132,8 +132,8 @@ class ReplayMemory:
             )
         if _described(entries) != state.get("entries"):
             raise ReplayError(
-                f"the transitions in {self.directory} are not made of what the "
-                f"checkpoint says: {_described(entries)}, not {state.get('entries')}."
+                f"replay.json in {self.directory} tells of other transitions than the "
+                f"checkpoint: {_described(entries)}, not {state.get('entries')}."
             )
         self._open(entries, capacity)
         self.cursor, self.size = cursor, size

@@ -341,7 +341,7 @@ def _read_description(path: Path) -> tuple[dict[str, Any], bytes]:
         raise ValueError(f"{path} is damaged: {error}") from error
     if not isinstance(description, dict) or (
         description.get("format") != FORMAT
-        or description.get("version") != FORMAT_VERSION
+        or repr(description.get("version")) != repr(FORMAT_VERSION)  # True is no 1
     ):
         raise ValueError(
             f"{path} is not a {FORMAT} file of version {FORMAT_VERSION}; write it "

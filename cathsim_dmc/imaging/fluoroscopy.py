@@ -220,9 +220,10 @@ class Fluoroscope:
 
     def _depth(self, shadow: Shadow) -> np.ndarray:
         """Optical depth (..., rows, columns) of a device."""
-        material = (shadow.mu, shadow.marker_mu, shadow.marker_length)
         if shadow.mu is None:
             material = (self.device_mu, self.marker_mu, self.marker_length)
+        else:
+            material = (shadow.mu, shadow.marker_mu, shadow.marker_length)
         points = np.asarray(shadow.points, dtype=np.float64)
         return device_attenuation(self.carm, points, shadow.radius, *material)
 

@@ -102,7 +102,7 @@ class Episode:
         if not isinstance(self.task, str) or not self.task:
             raise ValueError(f"task must be a non-empty string, got {self.task!r}")
         if self.seed is not None:
-            if isinstance(self.seed, bool) or int(self.seed) != self.seed:
+            if not _is_whole(self.seed):
                 raise ValueError(f"seed must be an integer or None, got {self.seed!r}")
             object.__setattr__(self, "seed", int(self.seed))
         object.__setattr__(self, "meta", _checked_meta(self.meta))
@@ -269,7 +269,10 @@ class Episode:
 
 
 def _frozen(name: str, value: Any, dtype: type) -> np.ndarray:
-    given = np.asarray(value)
+    try:
+        given = np.asarray(value)
+    except ValueError as error:
+        raise ValueError(f"{name} must be an array, not ragged lists") from error
     if given.dtype.kind not in "biuf":
         raise ValueError(f"{name} must be numeric, got dtype {given.dtype}")
     if dtype is np.int64 and given.dtype.kind == "f" and given.size:
@@ -277,6 +280,12 @@ def _frozen(name: str, value: Any, dtype: type) -> np.ndarray:
     array = np.array(given, dtype=dtype)
     array.setflags(write=False)
     return array
+
+
+def _is_whole(value: Any) -> bool:
+    if isinstance(value, bool) or not isinstance(value, int | float | np.number):
+        return False
+    return bool(np.isfinite(value)) and int(value) == value
 
 
 def _plain(value: Any) -> Any:

@@ -129,7 +129,9 @@ def write_recording(
             stream.set_log_time_enabled(False)
             # Not `save`, which never comes back from a full disk.
             encoded = stream.binary_stream()
-            stream.send_blueprint(layout, make_active=False, make_default=True)
+            # Active at once: a viewer that reads over a network has made itself a
+            # layout by the time that this one arrives.
+            stream.send_blueprint(layout, make_active=True, make_default=True)
             stream.send_recording_name(title)
             fill(stream)
             data = encoded.read()

@@ -139,7 +139,7 @@ class CathSimEnv(gymnasium.Env):
             raise gymnasium.error.ResetNeeded(
                 "the episode has ended, or none has begun; call reset()"
             )
-        timestep = self._environment.step(np.asarray(action, dtype=np.float64))
+        timestep = self._environment.step(action)
         self._ended = timestep.last()
         terminated = self._ended and timestep.discount == 0
         return (
@@ -287,7 +287,7 @@ class CathSimVectorEnv(gymnasium.vector.VectorEnv):
 
     def step(self, actions: np.ndarray):
         """Advances all; see `gymnasium.vector.VectorEnv.step`."""
-        step = self._simulation.step(np.asarray(actions, dtype=np.float64))
+        step = self._simulation.step(actions)
         observation, info = step.observation, step.info()
         ended = step.terminated | step.truncated
         if ended.any():

@@ -49,8 +49,9 @@ def write_mjcf(
         The directory.
 
     Raises:
-        ValueError: the task or an option does not exist, or the task draws its
-            anatomy anew in each episode and has no single scene.
+        ValueError: the task or an option does not exist, or the task has no single
+            scene: it draws its anatomy anew in each episode, or its devices are
+            coaxial.
         FileExistsError: the directory exists.
     """
     directory = Path(directory)
@@ -64,6 +65,11 @@ def write_mjcf(
         raise ValueError(
             f"{task} draws from {env.task.num_anatomies} anatomies; give pool=1 for "
             "the scene of one"
+        )
+    if env.task.scene.coaxial:
+        raise ValueError(
+            f"{task} changes its model in every control step, as one device slides in "
+            "another; no file holds that: give a task with a single device"
         )
     env.reset()
     values = {"name": task, "seed": seed, **describe(env)}

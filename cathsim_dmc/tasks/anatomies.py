@@ -60,8 +60,11 @@ def load_arches(
     """
     from cathsim_dmc.anatomy.arch import arch
 
-    seeds = arch.arch_set(arches)
-    whole = all(isinstance(number, int | np.integer) for number in (pool, first))
+    seeds = arch.arch_set(bounds.choice("arches", arches, arch.SETS))
+    whole = all(
+        isinstance(number, int | np.integer) and not isinstance(number, bool)
+        for number in (pool, first)
+    )
     if not whole or pool < 1 or not 0 <= first <= len(seeds) - pool:
         raise ValueError(
             f"pool is {pool!r} and first is {first!r}; {arches!r} has {len(seeds)} "

@@ -204,7 +204,7 @@ def made_of(
         lightness = np.where(some, 1.0 - links.weight / (links.mass * share), 0.0)
     return Made(
         stiffness=factor[:, None] / overlap.compliance,
-        rest=np.stack([-free.imag, free.real], axis=-1),
+        rest=np.stack([-np.imag(free), np.real(free)], axis=-1),
         links=links,
         inertia=stack.inertia(links.mass, links.radius),
         lightness=lightness,

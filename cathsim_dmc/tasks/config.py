@@ -20,6 +20,7 @@ MAX_STEPS = 2000  # published
 # The device is laid along the route, whose bends its links cut short.
 LARGEST_START = 0.95
 _MOST_JOINTS = 1000
+WORKING_LENGTHS = (0.02, 3.0)  # m, up to the longest wires sold
 _LONGEST_LEAD = 0.3  # m
 MOST_FRICTION = 2.0  # Coulomb coefficient
 # A link shorter than its own radius is no rod; one longer than a vessel is wide does
@@ -153,7 +154,7 @@ class NavigationConfig:
         bounds.number("friction", self.friction, 0.0, MOST_FRICTION)
         bounds.number("shaft_link", self.shaft_link, _LEAST_LINK, _LONGEST_LINK, "m")
         if self.working_length is not None:
-            bounds.number("working_length", self.working_length, positive=True)
+            bounds.number("working_length", self.working_length, *WORKING_LENGTHS, "m")
         timestep = bounds.number("physics_timestep", self.physics_timestep)
         substeps = CONTROL_TIMESTEP / timestep if timestep else 0
         if not (

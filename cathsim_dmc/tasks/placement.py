@@ -8,7 +8,7 @@ import numpy as np
 from cathsim_dmc import bounds
 from cathsim_dmc.anatomy import Anatomy, Goal
 from cathsim_dmc.entities import arena, devices
-from cathsim_dmc.tasks import objectives as objectives
+from cathsim_dmc.tasks.config import WORKING_LENGTHS
 
 # The steerable tip starts free of the sheath wherever the way to the first branching
 # is long enough.
@@ -23,7 +23,6 @@ _BASE_LENGTH = 0.02  # m of device that never leaves the sheath
 # One chain for every registered task, so that observations have one shape and a policy
 # of one task can be tried on any other; longer where a goal lies farther away.
 COMMON_LENGTH = 0.34  # m
-_LONGEST_DEVICE = 3.0  # m, the longest wires sold
 _LINE_SPACING = 1e-3  # m
 # The wall is 4 mm thick; nearer to the inlet the sheath touches the inlet's own.
 _CLEAR_OF_LUMEN = 5.5e-3  # m
@@ -121,10 +120,11 @@ def place_device(
     stroke = working_length - start_depth - _BASE_LENGTH
     least = max(start_depth + _BASE_LENGTH, device.tip_length)
     # Also false for NaN.
-    if not least < working_length <= _LONGEST_DEVICE:
+    if not least < working_length <= WORKING_LENGTHS[1]:
         raise ValueError(
             f"working_length is {working_length} m; {device.name!r} needs more than "
-            f"{least:.3f} m here to be moved at all, and {_LONGEST_DEVICE:g} m at most"
+            f"{least:.3f} m here to be moved at all, and {WORKING_LENGTHS[1]:g} m at "
+            "most"
         )
     direction = sheath_direction(anatomy)
     if direction is None:  # what lies in the way is refused once the device is there

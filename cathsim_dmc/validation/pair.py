@@ -71,14 +71,14 @@ def sections(entity: DeviceStack, gaps: np.ndarray) -> tuple[np.ndarray, np.ndar
 
 def rig_of(
     chosen: Sequence[str | Device],
-    gaps: Sequence[float],
-    rotation: Sequence[float] | None = None,
+    gaps: np.ndarray,
+    rotation: np.ndarray | None = None,
 ) -> Rig:
     """A compiled rig with coaxial devices that stand still."""
     entity = DeviceStack(chosen)
     rig = Rig(catheter=entity)
     rig.compile()
-    coaxial.write_still(entity, rig.model, np.array(gaps), rotation)
+    coaxial.write_still(entity, rig.model, gaps, rotation)
     return rig
 
 
@@ -114,9 +114,10 @@ class Shape:
 
 
 def unloaded(
-    names: Sequence[str], gaps: Sequence[float], rotation: Sequence[float]
+    names: Sequence[str], end_gaps: Sequence[float], turned: Sequence[float]
 ) -> Shape:
     """Lets coaxial devices settle and compares them with Σ EI κ / Σ EI."""
+    gaps, rotation = np.asarray(end_gaps), np.asarray(turned)
     rig = rig_of(names, gaps, rotation)
     entity = rig.catheter
     assert isinstance(entity, DeviceStack)
@@ -142,8 +143,8 @@ def unloaded(
 
 def weighted_curve(
     chosen: Sequence[Device],
-    gaps: Sequence[float],
-    rotation: Sequence[float],
+    gaps: np.ndarray,
+    rotation: np.ndarray,
     length: float,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Arc lengths (n,) and points (n, 3) of the curve of the EI-weighted curvature.
@@ -163,8 +164,8 @@ def weighted_curve(
 
 def weighted_curvature(
     chosen: Sequence[Device],
-    gaps: Sequence[float],
-    rotation: Sequence[float],
+    gaps: np.ndarray,
+    rotation: np.ndarray,
     length: float,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Pieces (n,) of 0.05 mm: arc length of their beginning, length, curvature x + iy.
@@ -207,7 +208,7 @@ def free_ends(names: Sequence[str], leads: np.ndarray) -> tuple[np.ndarray, np.n
     stack, length = entity.stack, float(entity.link_lengths.sum())
     gaps = np.stack([np.maximum(-leads, 0.0), np.maximum(leads, 0.0)], axis=-1)
     turns = np.zeros((len(leads), 2, len(stack.spans)))
-    angles = stack.rest_angles(stack.overlap(gaps), turns).real
+    angles = np.real(stack.rest_angles(stack.overlap(gaps), turns))
     # All shapes lie in one plane here.
     heading = np.concatenate([np.zeros((len(leads), 1)), np.cumsum(angles, -1)], -1)
     x = (np.sin(heading) * stack.link_lengths).sum(-1)
@@ -218,7 +219,8 @@ def free_ends(names: Sequence[str], leads: np.ndarray) -> tuple[np.ndarray, np.n
         _, steps, curvature = weighted_curvature(
             entity.devices, gap, np.zeros(2), length
         )
-        heading = np.cumsum(curvature.real * steps) - curvature.real * steps / 2
+        turning = np.real(curvature) * steps
+        heading = np.cumsum(turning) - turning / 2
         end = (np.sin(heading) @ steps, 0.0, np.cos(heading) @ steps)
         curve.append(end)
     return chain, np.array(curve)

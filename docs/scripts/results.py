@@ -43,8 +43,8 @@ deterministically, by the published rule: 2,000 control steps at most, success w
 reward and length of episodes it was trained with. Published figures are those of Jianu
 et al., whose simulator, phantoms' walls and force readings differ (see
 [physics.md](physics.md), [forces.md](forces.md)): rates can be compared, forces only in
-their order of magnitude. Agents have the preset `tuned` unless their row says otherwise;
-[training.md](training.md) tells how it was found.
+their order of magnitude. Agents have the preset `tuned` unless their row says
+otherwise; [training.md](training.md) tells how it was found.
 """
 
 COLUMNS = """\

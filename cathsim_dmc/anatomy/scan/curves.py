@@ -25,6 +25,7 @@ class Curve:
     radii: np.ndarray | None
 
 
+_FARTHEST = 10.0  # m
 LONGEST = 50e6  # bytes of a file with a centreline
 
 
@@ -67,6 +68,11 @@ def read_curve(path: str | Path, units: str = "mm", frame: str = "LPS") -> Curve
         raise ValueError(
             f"{path} holds {keep.sum()} distinct points; a centreline needs at least "
             "2, all finite."
+        )
+    if np.abs(points).max() > _FARTHEST:
+        raise ValueError(
+            f"{path} has points {np.abs(points).max():.3g} m from the origin, but no "
+            f"scan is {_FARTHEST:g} m wide; is the unit right?"
         )
     name = vessel_name(path)
     return Curve(name, path, points[keep], None if radii is None else radii[keep])
@@ -126,6 +132,8 @@ def _read_markup(path):
         markup = max(content["markups"], key=lambda m: len(m["controlPoints"]))
         given = [p["position"] for p in markup["controlPoints"]]
         points = np.asarray(given, dtype=np.float64).reshape(-1, 3)
+        if any(isinstance(number, bool) for place in given for number in place):
+            raise TypeError("true and false are no places")
         system = markup.get("coordinateSystem", "LPS")
         units = markup.get("coordinateUnits", "mm")
     except (KeyError, TypeError, ValueError, AttributeError) as error:
