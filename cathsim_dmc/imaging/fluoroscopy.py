@@ -223,8 +223,11 @@ class Fluoroscope:
         if shadow.mu is None:
             material = (self.device_mu, self.marker_mu, self.marker_length)
         else:
+            points = np.asarray(shadow.points, dtype=np.float64)
+        if shadow.mu is None:
+            material = (self.device_mu, self.marker_mu, self.marker_length)
+        else:
             material = (shadow.mu, shadow.marker_mu, shadow.marker_length)
-        points = np.asarray(shadow.points, dtype=np.float64)
         return device_attenuation(self.carm, points, shadow.radius, *material)
 
     def _developed(self, depth: np.ndarray, states) -> np.ndarray:
