@@ -138,7 +138,7 @@ def test_wrong_reward():
         ({"working_length": 0.05}, ["working_length", "0.05", "steerable_5f", "more"]),
         ({"torsion_joints": 500}, ["torsion_joints", "500", "joints"]),
         ({"torsion_joints": -1}, ["torsion_joints", "-1", "from 0"]),
-        ({"working_length": 300.0}, ["working_length", "300", "at most"]),
+        ({"working_length": 300.0}, ["working_length", "300", "to 3 m"]),
         ({"fluoroscopy": {"zoom": 2}}, ["fluoroscopy", "zoom", "magnification"]),
         ({"cameras": {"names": ("front",)}}, ["front", "top", "side", "tip"]),
         ({"randomisation": {"gravity": 1}}, ["gravity", "friction"]),

@@ -108,9 +108,10 @@ def test_partial_resets_are_equal(anatomy):
             pair.reset_some([index // 6 % SIMULATIONS])
 
 
-def test_randomised_episodes_are_equal(anatomy):
+def test_randomised_episodes_are_equal():
+    # The wall of the phantom is met at once.
     pair = Pair(
-        anatomy,
+        "type1",
         observation=[*NUMBERS, *PICTURES],
         fluoroscopy=NOISY_BIPLANE,
         randomisation=True,
@@ -120,7 +121,7 @@ def test_randomised_episodes_are_equal(anatomy):
     for episode in range(2):
         pair.reset()
         seen.append(pair.batch.rollout.objective.goal.copy())
-        for index, action in enumerate(actions(30, episode)):
+        for index, action in enumerate(actions(20, episode)):
             touched |= bool((pair.step(action).wall_force.sum > 0).any())
             if index == 15:
                 pair.reset_some([2, 0])

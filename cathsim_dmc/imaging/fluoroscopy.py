@@ -220,10 +220,7 @@ class Fluoroscope:
 
     def _depth(self, shadow: Shadow) -> np.ndarray:
         """Optical depth (..., rows, columns) of a device."""
-        if shadow.mu is None:
-            material = (self.device_mu, self.marker_mu, self.marker_length)
-        else:
-            points = np.asarray(shadow.points, dtype=np.float64)
+        points = np.asarray(shadow.points, dtype=np.float64)
         if shadow.mu is None:
             material = (self.device_mu, self.marker_mu, self.marker_length)
         else:
