@@ -14,6 +14,15 @@ MAX_WIDTH, MAX_LAYERS = 16_384, 16
 MAX_INTEGER = 2**62
 
 
+# What the presets "tuned" learn from, found on type1_lcca (docs/training.md): the way
+# through the lumen as reward, episodes that are short and start anywhere along it.
+TUNED_TRAINING: Mapping[str, Any] = {
+    "training_reward": {"path": -1.0, "success": 10.0},
+    "training_max_steps": 120,
+    "training_start": (0.0, 0.9),
+}
+
+
 class ConfigError(ValueError):
     """A hyper-parameter is outside what is allowed, or contradicts another."""
 

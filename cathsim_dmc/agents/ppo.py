@@ -16,7 +16,12 @@ from torchrl.envs import EnvBase
 from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.value import GAE
 
-from cathsim_dmc.agents.config import ConfigError, TrainingConfig, require
+from cathsim_dmc.agents.config import (
+    TUNED_TRAINING,
+    ConfigError,
+    TrainingConfig,
+    require,
+)
 from cathsim_dmc.agents.exploration import CorrelatedExploration, CorrelatedNoise
 from cathsim_dmc.agents.networks import (
     GaussianActor,
@@ -76,15 +81,11 @@ class PPOConfig(TrainingConfig):
     presets: ClassVar[Mapping[str, Mapping[str, Any]]] = {
         "published": {},
         "demo": {**_LARGE_BATCHES, "anneal": True},
-        # Found on type1_lcca, see docs/training.md: episodes that are short and start
-        # anywhere along the route, the way through the lumen as reward, and noise
-        # that bends the whole tip for a while.
+        # Exploration noise that bends the whole tip for a while (docs/training.md).
         "tuned": {
             **_LARGE_BATCHES,
+            **TUNED_TRAINING,
             "hidden": (128, 128),
-            "training_reward": {"path": -1.0, "success": 10.0},
-            "training_max_steps": 120,
-            "training_start": (0.0, 0.9),
             "initial_deviation": 0.7,
             "noise_correlation": 0.9,
             "noise_shared": 0.8,

@@ -13,7 +13,7 @@ from tensordict.nn import TensorDictSequential
 from torchrl.envs import EnvBase
 from torchrl.objectives import SACLoss, SoftUpdate
 
-from cathsim_dmc.agents.config import TrainingConfig, require
+from cathsim_dmc.agents.config import TUNED_TRAINING, TrainingConfig, require
 from cathsim_dmc.agents.demonstrations import load_transitions
 from cathsim_dmc.agents.networks import (
     GaussianActor,
@@ -58,17 +58,14 @@ class SACConfig(TrainingConfig):
     presets: ClassVar[Mapping[str, Mapping[str, Any]]] = {
         "published": {},
         "demo": {"num_envs": 32, "updates_per_frame": 0.25},
-        # Found on type1_lcca (docs/training.md): reward, episodes and starts of PPO's.
         # The weight of the entropy must start near the size of a step's reward (0.05):
         # at 0.1 and above the actions stay random for tens of thousands of frames.
         "tuned": {
+            **TUNED_TRAINING,
             "updates_per_frame": 0.25,
             "hidden": (256, 256),
             "activation": "relu",
             "initial_alpha": 1e-3,
-            "training_reward": {"path": -1.0, "success": 10.0},
-            "training_max_steps": 120,
-            "training_start": (0.0, 0.9),
             "total_frames": 60_000,
         },
     }

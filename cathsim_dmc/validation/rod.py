@@ -210,6 +210,18 @@ def column(
     return Buckling(end, length, loads, additional, 1 / slope, expected)
 
 
+def buckling_check(name: str, column: Buckling) -> Check:
+    """Its critical load against Euler's."""
+    return Check.deviation(
+        f"{name}, clamped - guided, guide {column.end}",
+        column.critical,
+        column.expected,
+        BUCKLING_BOUND,
+        f"{1e3 * column.critical:.2f} mN, Euler {1e3 * column.expected:.2f} mN "
+        f"over {1e3 * column.length:.0f} mm",
+    )
+
+
 def _add_guide(rig: Rig, index: int, end: str) -> None:
     """Welds a link to a massless slider that cannot turn."""
     origin = float(np.sum(rig.lengths[:index]) - rig.lengths.sum())
@@ -386,16 +398,7 @@ def validate_rod(figure_path: str | Path | None = None) -> Report:
     )
     columns = [buckling("sliding"), buckling("fixed")]
     for column in columns:
-        checks.append(
-            Check.deviation(
-                f"buckling load, clamped - guided, guide {column.end}",
-                column.critical,
-                column.expected,
-                BUCKLING_BOUND,
-                f"{1e3 * column.critical:.2f} mN, Euler {1e3 * column.expected:.2f} mN "
-                f"over {1e3 * column.length:.0f} mm",
-            )
-        )
+        checks.append(buckling_check("buckling load", column))
     for name in ("steerable_5f", "wire_035_amplatz"):
         turned = twist_under_torque(name)
         checks.append(
