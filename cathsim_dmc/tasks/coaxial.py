@@ -272,15 +272,12 @@ class CoaxialDevices:
         self._angles = user[:, count : count * (1 + nodes)].reshape(-1, count, nodes)
         self._places = ChainFields(model, stack.mjcf_model.model)
         self._arrays: list[dict[str, np.ndarray]] = [{} for _ in range(num_simulations)]
+        self._radii = np.array([device.outer_radius for device in stack.devices])
         self._friction = np.full(num_simulations, stack.friction)
         self._factor = np.ones(num_simulations)
         # How fast the devices slide in each other, m/s, and press on each other, N.
         self._sliding = np.zeros((num_simulations, count))
         self._pressing = np.zeros(num_simulations)
-        # One over the lengths of the segments of the rods on both sides of a node.
-        segments = -np.diff(self._stack.nodes)
-        self._per_behind = 1 / np.append(segments[0], segments)
-        self._per_ahead = -1 / np.append(segments, segments[-1])
         # Rates at which they turn at the joints, rad/s.
         self._spin = np.zeros((num_simulations, count, nodes - 2))
 
@@ -350,25 +347,9 @@ class CoaxialDevices:
         held[np.arange(len(held)), leader] = reached
         return held
 
-    def _gaps(self, rows: np.ndarray) -> np.ndarray:
+    def _gaps(self, rows: np.ndarray | slice) -> np.ndarray:
         insertion = self._insertion[rows]
         return insertion.max(axis=1, keepdims=True) - insertion
-
-    def _node_weights(self, gaps: np.ndarray) -> np.ndarray:
-        """Weights (N, K, J, M + 1) of a rod's nodes at the joints of the chain.
-
-        Between two nodes the rotation is linear; a joint beyond a device's end has that
-        of the end.
-        """
-        nodes = self._stack.nodes
-        place = np.maximum(nodes[1:-1] - gaps[..., None], 0.0)
-        offset = place[..., None] - nodes
-        weight = 1.0 - np.maximum(offset * self._per_behind, offset * self._per_ahead)
-        return np.maximum(weight, 0.0, out=weight)
-
-    def _at_joints(self, weights: np.ndarray, rows: np.ndarray) -> np.ndarray:
-        """Rotations (n, K, J) of the devices where the chain has its joints."""
-        return (weights * self._angles[rows][:, :, None]).sum(axis=-1)
 
     def _turn(
         self, rate: np.ndarray, lead: np.ndarray, external_force: np.ndarray
@@ -378,25 +359,19 @@ class CoaxialDevices:
         Returns:
           Overlap, and rotations (N, K, J) at the joints.
         """
-        stack, everyone = self._stack, np.arange(len(rate))
-        gaps = self._gaps(everyone)
-        overlap, weights = stack.overlap(gaps), self._node_weights(gaps)
-        turns = self._at_joints(weights, everyone)
+        stack, rods, gaps = self._stack, self._rods, self._gaps(slice(None))
+        overlap, turns = stack.overlap(gaps), rods.at_joints(self._angles, gaps)
         bends = self._qpos[:, self._places.qpos]
         bends = bends[:, 1::2] - 1j * bends[:, 0::2]
-        torque, stiffening = stack.restoring(overlap, bends, turns)
-        torque = torque * self._factor[:, None, None]
-        stiffening = stiffening * self._factor[:, None, None]
-        friction = self._friction_torque(overlap, bends, turns, lead, external_force)
-        loads = np.stack([torque, stiffening, friction], axis=1)
-        # A load is shared by the nodes on both sides of its joint.
-        loads = (loads[..., None] * weights[:, None, ..., 1:]).sum(axis=-2)
-        torque, stiffening, friction = np.moveaxis(loads, 1, 0)
+        loads = np.empty((3, *turns.shape))
+        loads[0], loads[1] = stack.restoring(overlap, bends, turns)
+        loads[:2] *= self._factor[:, None, None]
+        loads[2] = self._friction_torque(overlap, bends, turns, lead, external_force)
         turned = MAX_ROTATION_SPEED * CONTROL_TIMESTEP * rate
-        self._angles[:] = self._rods.turn(
-            self._angles, turned, CONTROL_TIMESTEP, torque, stiffening, friction
+        self._angles[:] = rods.turn(
+            self._angles, turned, CONTROL_TIMESTEP, *rods.at_nodes(loads, gaps)
         )
-        after = self._at_joints(weights, everyone)
+        after = rods.at_joints(self._angles, gaps)
         self._spin[:] = (after - turns) / CONTROL_TIMESTEP
         return overlap, after
 
@@ -415,19 +390,14 @@ class CoaxialDevices:
         force = np.where(
             lead[:, None] - stack.nodes[1:] > -self._start_depth, force, 0.0
         )
-        outermost = overlap.outermost * force[:, None]
-        outermost = (outermost[..., :-1] + outermost[..., 1:]) / 2
-        outermost[..., -1] += overlap.outermost[..., -1] * force[:, None, -1] / 2
-        radii = np.array([device.outer_radius for device in entity.devices])
-        ratios = np.array([device.friction_ratio for device in entity.devices])
-        torque = self._friction[:, None, None] * (ratios * radii)[:, None] * outermost
+        torque = stack.wall_friction(overlap, force, self._friction)
         if len(entity.devices) > 1:
             pressure = stack.pressure(overlap, bends, turns)
             pressure *= entity.lumen_friction * self._factor[:, None, None]
             self._pressing = pressure.sum(axis=(1, 2))
             # The lumen holds back the device in it; that one is too soft in torsion
             # to turn the lumen in its turn.
-            torque[:, :-1] += pressure * radii[:-1, None]
+            torque[:, :-1] += pressure * self._radii[:-1, None]
         return torque
 
     def _write(self, rows: np.ndarray, overlap: Overlap, turns: np.ndarray) -> None:
