@@ -60,13 +60,16 @@ class Links(NamedTuple):
       radius: of the outermost device, m; in a link on which that changes, its mean.
       friction: Coulomb coefficient on the wall, likewise.
       mass: kg.
-      weight: what gravity pulls in blood, as mass, kg.
+      lightness: share of a link's mass that gravity does not pull at, beside that
+        which blood carries where all devices are.
+      inertia: (N, L, 2), moments of a solid capsule across and along it, kg·m².
     """
 
     radius: np.ndarray
     friction: np.ndarray
     mass: np.ndarray
-    weight: np.ndarray
+    lightness: np.ndarray
+    inertia: np.ndarray
 
 
 class Stack:
@@ -146,19 +149,27 @@ class Stack:
         )
 
     def rest_angles(
-        self, overlap: Overlap, turns: np.ndarray, factor: np.ndarray | complex = 1.0
+        self,
+        overlap: Overlap,
+        turns: np.ndarray,
+        spin: np.ndarray | None = None,
+        relaxation_time: float = 0.0,
     ) -> np.ndarray:
         """Angles of the free joints.
 
         Args:
           overlap: of the devices.
           turns: (N, K, J), rotation of each device at each joint, rad.
-          factor: (N, K, J), of the part of each device.
+          spin: (N, K, J), rate of that rotation, rad/s; 0 if None.
+          relaxation_time: of the joints' dampers, s: the angles lead by it.
 
         Returns:
           (N, J) complex, rad.
         """
-        return (overlap.rest * np.exp(1j * turns) * factor).sum(axis=1)
+        if spin is None:
+            spin = np.zeros(turns.shape)
+        turns = np.ascontiguousarray(turns)
+        return self._loops.rest_angles(overlap.rest, turns, spin, relaxation_time)
 
     def links(self, overlap: Overlap, friction: np.ndarray) -> Links:
         """What the links are made of.
@@ -191,9 +202,7 @@ class Stack:
         Returns:
           (N, K, J), N·m, at the joints, of which each has half of its two links.
         """
-        return self._loops.wall_friction(
-            overlap.outermost, force, friction, self._arms
-        )
+        return self._loops.wall_friction(overlap.outermost, force, friction, self._arms)
 
     def restoring(
         self, overlap: Overlap, bends: np.ndarray, turns: np.ndarray
@@ -242,10 +251,6 @@ class Stack:
             turns,
             self.link_lengths,
         )
-
-    def inertia(self, mass: np.ndarray, radius: np.ndarray) -> np.ndarray:
-        """Moments of inertia (N, L, 2) of solid capsules: across and along, kg·m²."""
-        return self._loops.inertia(mass, radius, self.link_lengths)
 
 
 def weight_density(device: Device) -> float:

@@ -342,8 +342,34 @@ def wall_friction(outermost, force, coefficient, arms):
 
 
 @compiled
+def rest_angles(rest, turns, spin, relaxation):
+    """Angles (N, J) of the free joints, see `Stack.rest_angles`."""
+    count, devices, joints = turns.shape
+    angles = np.zeros((count, joints), np.complex128)
+    for i in range(count):
+        for k in range(devices):
+            for j in range(joints):
+                angle = turns[i, k, j]
+                turned = complex(math.cos(angle), math.sin(angle))
+                lead = complex(1.0, relaxation * spin[i, k, j])
+                angles[i, j] += rest[i, k, j] * turned * lead
+    return angles
+
+
+@compiled
+def _inertia(mass, radius, length):
+    """Moments of inertia of a solid capsule, across and along it, kg·m²."""
+    share = 1 / (1 + 4 * radius / (3 * length))  # of the cylinder in the volume
+    cylinder, ball = mass * share, mass * (1 - share)
+    square = radius * radius
+    across = cylinder * (length * length / 12 + square / 4)
+    across += ball * (2 * square / 5 + length * length / 4 + 3 * length * radius / 8)
+    return across, cylinder * square / 2 + ball * 2 * square / 5
+
+
+@compiled
 def links(outermost, present, lengths, friction, radii, ratios, densities):
-    """Radius, friction, mass and weight of the links, see `coaxial.Links`.
+    """What the links are made of, see `coaxial.Links`.
 
     Args:
         outermost, present: (N, K, L).
@@ -353,32 +379,22 @@ def links(outermost, present, lengths, friction, radii, ratios, densities):
         densities: (2, K), mass and weight in blood, kg/m.
     """
     count, devices, number = outermost.shape
-    made = np.zeros((4, count, number))
+    made, moments = np.zeros((4, count, number)), np.empty((count, number, 2))
+    share = densities[1].sum() / densities[0].sum()
     for i in range(count):
         for link in range(number):
+            radius = mass = weight = 0.0
+            whole = True
             for k in range(devices):
                 outside, there = outermost[i, k, link], present[i, k, link]
-                made[0, i, link] += outside * radii[k]
+                radius += outside * radii[k]
                 made[1, i, link] += outside * ratios[k] * friction[i]
-                made[2, i, link] += there * densities[0, k] * lengths[link]
-                made[3, i, link] += there * densities[1, k] * lengths[link]
-    return made[0], made[1], made[2], made[3]
-
-
-@compiled
-def inertia(mass, radius, lengths):
-    """Moments of inertia (N, L, 2) of solid capsules, see `Stack.inertia`."""
-    count, number = mass.shape
-    moments = np.empty((count, number, 2))
-    for i in range(count):
-        for link in range(number):
-            length, r = lengths[link], radius[i, link]
-            share = 1 / (1 + 4 * r / (3 * length))  # of the cylinder in the volume
-            cylinder = mass[i, link] * share
-            ball = mass[i, link] * (1 - share)
-            square = r * r
-            across = cylinder * (length * length / 12 + square / 4)
-            across += ball * (2 * square / 5 + length * length / 4 + 3 * length * r / 8)
-            moments[i, link, 0] = across
-            moments[i, link, 1] = cylinder * square / 2 + ball * 2 * square / 5
-    return moments
+                mass += there * densities[0, k] * lengths[link]
+                weight += there * densities[1, k] * lengths[link]
+                whole = whole and there == 1.0
+            made[0, i, link], made[2, i, link] = radius, mass
+            # Exactly nothing where all devices are: MuJoCo then passes the link over.
+            if share > 0.0 and not whole:
+                made[3, i, link] = 1.0 - weight / (mass * share)
+            moments[i, link] = _inertia(mass, radius, lengths[link])
+    return made[0], made[1], made[2], made[3], moments
