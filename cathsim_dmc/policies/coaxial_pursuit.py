@@ -66,7 +66,7 @@ class Settings(pursuit.Settings):
     progress: float = 0.5e-3
     patience: int = 60
     lost_patience: int = 15
-    leads: tuple[float, ...] = (0.03, 0.05, 0.012, 0.02)
+    leads: tuple[float, ...] = (0.012, 0.03, 0.02, 0.05)
     lead_gain: float = 0.2
     aside: float = 0.2
     turning: float = 0.2
@@ -86,6 +86,7 @@ class Plan:
         arc_length: (P,), along the route.
         shaped: (K,), length of the pre-shaped end of each device.
         nodes: (L + 1,), ends of the links from the end of the chain.
+        ostium: arc length where the route narrows most, into its last branch.
     """
 
     points: np.ndarray
@@ -93,6 +94,7 @@ class Plan:
     arc_length: np.ndarray
     shaped: np.ndarray
     nodes: np.ndarray
+    ostium: float
 
     @classmethod
     def for_task(cls, task: navigation.Navigation | Case) -> Plan:
@@ -111,6 +113,7 @@ class Plan:
             arc_length=route.arc_length,
             shaped=np.array([sum(lengths) for lengths in shapes]),
             nodes=stack.stack.nodes,
+            ostium=float(route.arc_length[np.diff(route.radii).argmin()]),
         )
 
 
@@ -197,16 +200,24 @@ def decide(
     free = pursuit.ramp(wall_force.max, settings.hard_force, settings.soft_force)
     advance = settings.speed * np.maximum(free * clear, settings.creep)
     speed = np.where(state.retracting, -settings.speed, advance)
-    action[:, 0::2] = _led(settings, state, devices.insertion, speed)
+    deep = np.maximum(place.arc_length - plan.ostium, 0.0)
+    action[:, 0::2] = _led(settings, state, devices.insertion, speed, deep)
     return np.clip(action, -1.0, 1.0), state
 
 
 def _led(
-    settings: Settings, state: State, insertion: np.ndarray, speed: np.ndarray
+    settings: Settings,
+    state: State,
+    insertion: np.ndarray,
+    speed: np.ndarray,
+    deep: np.ndarray,
 ) -> np.ndarray:
-    """Translations (N, K) that keep the devices at their leads."""
+    """Translations (N, K) that keep the devices at their leads.
+
+    A head that is deep (N,), m, in the last branch goes on alone from its ostium.
+    """
     leads = np.asarray(settings.leads)
-    lead = leads[state.attempts % len(leads)][:, None]
+    lead = np.maximum(leads[state.attempts % len(leads)], deep)[:, None]
     wanted = insertion[:, :1] - lead * np.arange(insertion.shape[1])
     follow = speed[:, None] + settings.lead_gain * (wanted - insertion) / _MOVE
     # While the wire goes on, the catheter waits for it rather than coming back.
