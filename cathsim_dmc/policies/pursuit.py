@@ -133,9 +133,16 @@ class Plan:
         """Reads off a task, or one of the anatomies that its episodes draw from.
 
         Raises:
-            ValueError: if the task's device has no motors in its tip.
+            ValueError: if the task's device has no motors in its tip, or it has coaxial
+                devices.
         """
         catheter = task.scene.catheter
+        if task.scene.coaxial:
+            raise ValueError(
+                "this expert steers the tip of one device, and the task has coaxial "
+                "devices; their own expert remembers what it tries, so it answers no "
+                "questions on the way (dagger): learn from its demonstrations (bc)"
+            )
         if not catheter.device.steerable:
             steerable = [d.name for d in devices.DEVICES.values() if d.steerable]
             raise ValueError(
