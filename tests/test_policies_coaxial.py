@@ -55,16 +55,17 @@ def test_turning_by_the_error_turns_the_side_to_the_route(environment):
         return coaxial_pursuit._directions(plan, readings, view.devices, place, ahead)
 
     before, away = directions()
-    assert away[0, 0] > 0.2
-    rate = np.clip(np.angle(np.exp(1j * before[0, 0])) / (8 * 3.14 * 0.04), -1, 1)
-    for _ in range(8):
-        environment.step(np.array([0.0, rate, 0.0, 0.0]))
-    for _ in range(25):
-        environment.step(np.zeros(4))
+    wrong = float(np.angle(np.exp(1j * before[0, 0])))
+    assert away[0, 0] > 0.2 and abs(wrong) > 0.5
+    # Little by little, and until the twist has come through.
+    steps = 26
+    rate = wrong / (steps * 3.14 * 0.04)
+    assert abs(rate) < 1.0
+    for number in range(steps + 12):
+        environment.step(np.array([0.0, rate if number < steps else 0.0, 0.0, 0.0]))
     after, _ = directions()
-    # The wire lies elsewhere once its shape has turned; its twist lags by friction.
+    # Friction keeps some of it.
     assert np.cos(after[0, 0]) > 0.9
-    assert np.cos(after[0, 0]) >= np.cos(before[0, 0]) - 0.05
 
 
 def fresh(arc_length, insertion, **values):
@@ -112,12 +113,16 @@ def test_a_head_that_goes_on_is_left_alone():
     assert state.attempts[0] == 0 and not state.retracting[0]
 
 
-@pytest.mark.parametrize("name", ["simple1_bca_pair", "simple1_bca_wire"])
+@pytest.mark.parametrize(
+    "name",
+    ["simple1_bca_pair", pytest.param("simple1_bca_wire", marks=pytest.mark.slow)],
+)
 def test_the_expert_reaches_the_goal(name):
     result = evaluate("expert", name, 2, 7, task_kwargs={"max_steps": 200})
     assert result.successes == 2
 
 
+@pytest.mark.slow
 def test_it_plays_the_same_on_both_backends():
     batched, composer = (
         evaluate("expert", TASK, 2, 7, task_kwargs={"max_steps": 12}, backend=backend)

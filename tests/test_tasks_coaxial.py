@@ -155,7 +155,7 @@ def test_a_step_of_a_single_device_does_no_pair_work(shared_environment, monkeyp
     environment.step(np.zeros(21))
 
 
-@pytest.mark.parametrize("task", ["simple1_bca_pair", "simple1_bca_wire"])
+@pytest.mark.parametrize("task", ["simple1_bca_pair", "type1_lcca_wire"])
 def test_both_paths_are_equal_bit_for_bit(task):
     """Randomised, with a partial reset, while both devices move at random."""
     options = {"randomisation": True, "observation": ["internal", "tracking", "force"]}
