@@ -9,6 +9,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, ClassVar, Literal
 
+from cathsim_dmc.bounds import MOST_START_SHARE
+
 # Widest layer and most layers of a network: settings must not take all memory.
 MAX_WIDTH, MAX_LAYERS, MAX_FILTERS = 16_384, 16, 1_024
 MAX_INTEGER = 2**62
@@ -212,10 +214,12 @@ class TrainingConfig:
         )
         start = self.training_start
         require(
-            start is None or (len(start) == 2 and 0 <= start[0] <= start[1] < 1),
+            start is None
+            or (len(start) == 2 and 0 <= start[0] <= start[1] <= MOST_START_SHARE),
             "training_start",
             start,
-            "two shares (low, high) with 0 <= low <= high < 1, or None",
+            "two shares (low, high) with 0 <= low <= high <= "
+            f"{MOST_START_SHARE:g}, or None",
         )
         for name in ("seed", "normalisation_frames"):
             value = getattr(self, name)
