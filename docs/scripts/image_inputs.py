@@ -47,11 +47,11 @@ def collect(config):
     )
     noise = CorrelatedNoise(0.9, 0.8, env.base_env.action_groups)
 
-    def act(state):
+    def act(tensordict):
         drawn = noise.draw(torch.zeros(SIMULATIONS, env.action_spec.shape[-1]))
         drawn[:, 0] += 0.5  # forward
-        state["action"] = torch.tanh(0.8 * drawn)
-        return state
+        tensordict["action"] = torch.tanh(0.8 * drawn)
+        return tensordict
 
     rollout = env.rollout(STEPS, act, break_when_any_done=False)
     return rollout[PIXELS], rollout[VECTOR]
