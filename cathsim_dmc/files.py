@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import json
 import os
+import re
 import shutil
 import uuid
 import zipfile
@@ -19,6 +20,7 @@ except ImportError:  # Windows has no advisory locks: leftovers stay there.
     fcntl = None
 
 _PARTIAL = ".partial"
+_DIRECTORY = ".d"  # of an unfinished directory, beside its lock
 # What numpy's reader of archives raises where one is damaged.
 DAMAGED_ARCHIVE = (
     zipfile.BadZipFile,
@@ -57,7 +59,7 @@ def atomic_path(
         raise ValueError(f"the file name must end in {suffix}, got {path.name!r}")
     if not path.parent.is_dir():
         raise FileNotFoundError(f"no directory {path.parent}; create it first")
-    _remove_leftovers(path)
+    remove_abandoned(path.parent, path.name)
     temporary, stream = _create(path)
     try:
         with stream:
@@ -76,7 +78,8 @@ def atomic_path(
 def atomic_directory(path: str | os.PathLike[str]) -> Iterator[Path]:
     """Yield a temporary directory that becomes `path` when the block ends well.
 
-    When the block raises, it is removed.
+    When the block raises, it is removed. What a killed writer has left is removed by
+    the next writer of the same path, or by `remove_abandoned`.
 
     Args:
         path: Path of the directory that is to appear; it must not exist.
@@ -85,9 +88,12 @@ def atomic_directory(path: str | os.PathLike[str]) -> Iterator[Path]:
         OSError: if it exists with something in it, or cannot be written.
     """
     path = Path(path)
-    temporary = path.with_name(f".{path.name}.{uuid.uuid4().hex[:12]}{_PARTIAL}")
-    temporary.mkdir()
+    remove_abandoned(path.parent, path.name)
+    # The lock lies beside the directory, whose own one its users may take.
+    lock, stream = _create(path)
+    temporary = Path(f"{lock}{_DIRECTORY}")
     try:
+        temporary.mkdir()
         yield temporary
         for file in temporary.rglob("*"):
             if file.is_file():
@@ -96,6 +102,8 @@ def atomic_directory(path: str | os.PathLike[str]) -> Iterator[Path]:
         os.rename(temporary, path)
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
+        lock.unlink(missing_ok=True)
+        stream.close()
 
 
 def write_bytes(path: str | os.PathLike[str], data: bytes) -> Path:
@@ -126,20 +134,26 @@ def _create(path: Path) -> tuple[Path, BinaryIO]:
         stream.close()
 
 
-def _remove_leftovers(path: Path) -> None:
-    """Remove temporary files of `path` that no living process holds open."""
-    if fcntl is None:
+def remove_abandoned(folder: Path, name: str | None = None) -> None:
+    """Remove unfinished files and directories that no living process holds open.
+
+    Args:
+        folder: Where they lie.
+        name: Of what they were to become; None takes all of them.
+    """
+    if fcntl is None or not folder.is_dir():
         return
-    prefix = f".{path.name}."
-    for leftover in path.parent.iterdir():
-        name = leftover.name
-        if not (name.startswith(prefix) and name.endswith(_PARTIAL)):
-            continue
-        if len(name) != len(prefix) + 12 + len(_PARTIAL) or leftover.is_symlink():
+    pattern = re.compile(
+        rf"\.{'.+' if name is None else re.escape(name)}\.[0-9a-f]{{12}}"
+        + re.escape(_PARTIAL)
+    )
+    for leftover in folder.iterdir():
+        if not pattern.fullmatch(leftover.name) or leftover.is_symlink():
             continue
         # Another writer may remove it, or have just renamed it.
         with contextlib.suppress(OSError), open(leftover, "rb") as stream:
             fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            shutil.rmtree(f"{leftover}{_DIRECTORY}", ignore_errors=True)
             leftover.unlink()
 
 

@@ -69,9 +69,9 @@ with files.atomic_path(sys.argv[1]) as path:
 """
 
 
-def writer(target):
+def writer(target, script=KILLED):
     process = subprocess.Popen(
-        [sys.executable, "-c", KILLED, str(target)],
+        [sys.executable, "-c", script, str(target)],
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
         text=True,
@@ -102,6 +102,38 @@ def test_what_the_dead_left_goes_and_what_the_living_write_stays(tmp_path):
         ".b.txt.0123456789ab.partial",
         "a.txt",
     ]
+
+
+DIRECTORY = """
+import sys
+from cathsim_dmc import files
+with files.atomic_directory(sys.argv[1]) as path:
+    (path / "half").write_text("half")
+    print("writing", flush=True)
+    sys.stdin.read()
+"""
+
+
+def test_directories_of_the_dead_go_and_those_of_the_living_stay(tmp_path):
+    target = tmp_path / "data"
+    dead, alive = writer(target, DIRECTORY), writer(target, DIRECTORY)
+    dead.send_signal(signal.SIGKILL)
+    dead.communicate()
+    assert len(list(tmp_path.rglob("half"))) == 2
+    files.remove_abandoned(tmp_path, "another")
+    assert len(list(tmp_path.rglob("half"))) == 2
+    files.remove_abandoned(tmp_path)
+    assert len(list(tmp_path.rglob("half"))) == 1
+    alive.communicate("")
+    assert alive.returncode == 0
+    assert names(tmp_path) == ["data"] and names(target) == ["half"]
+    # The next writer of the same path does it too.
+    dead = writer(tmp_path / "more", DIRECTORY)
+    dead.send_signal(signal.SIGKILL)
+    dead.communicate()
+    with files.atomic_directory(tmp_path / "more") as path:
+        (path / "whole").write_text("")
+    assert names(tmp_path) == ["data", "more"]
 
 
 def test_many_writers_of_one_file_all_succeed(tmp_path):
