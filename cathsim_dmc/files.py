@@ -4,15 +4,18 @@ from __future__ import annotations
 
 import contextlib
 import json
+import math
 import os
 import re
 import shutil
 import uuid
 import zipfile
 import zlib
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any, BinaryIO
+
+import numpy as np
 
 try:
     import fcntl
@@ -21,8 +24,8 @@ except ImportError:  # Windows has no advisory locks: leftovers stay there.
 
 _PARTIAL = ".partial"
 _DIRECTORY = ".d"  # of an unfinished directory, beside its lock
-# What numpy's reader of archives raises where one is damaged.
-DAMAGED_ARCHIVE = (
+# What readers of archives and of numpy's arrays raise where one is damaged.
+_DAMAGED = (
     zipfile.BadZipFile,
     zlib.error,
     EOFError,
@@ -155,6 +158,59 @@ def remove_abandoned(folder: Path, name: str | None = None) -> None:
             fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
             shutil.rmtree(f"{leftover}{_DIRECTORY}", ignore_errors=True)
             leftover.unlink()
+
+
+def read_arrays(
+    source: Path | BinaryIO, largest: int, names: Iterable[str] | None = None
+) -> dict[str, np.ndarray]:
+    """Arrays of an .npz archive from outside: no pickle is read, no memory filled.
+
+    Args:
+        source: Path of the archive, or the archive itself.
+        largest: Size of all arrays together that is still read, bytes unpacked.
+        names: Names of the arrays that must be there; None reads all of them.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        ValueError: the archive is damaged, lacks an array or is too large. The message
+            does not name the file.
+    """
+    try:
+        with zipfile.ZipFile(source) as archive:
+            entries = {
+                entry.filename.removesuffix(".npy"): entry
+                for entry in archive.infolist()
+            }
+            size = sum(entry.file_size for entry in entries.values())
+            if size > largest:
+                raise ValueError(f"its arrays unpack to {size:,} bytes")
+            wanted = list(entries if names is None else names)
+            lacking = [name for name in wanted if name not in entries]
+            if lacking:
+                raise ValueError(f"it lacks {', '.join(lacking)}")
+            return {name: _read_array(archive, entries[name]) for name in wanted}
+    except FileNotFoundError:
+        raise
+    except _DAMAGED as error:
+        text = " ".join(str(error).split())
+        raise ValueError(text or type(error).__name__) from error
+
+
+def _read_array(archive: zipfile.ZipFile, entry: zipfile.ZipInfo) -> np.ndarray:
+    formats = {
+        (1, 0): np.lib.format.read_array_header_1_0,
+        (2, 0): np.lib.format.read_array_header_2_0,
+    }
+    with archive.open(entry) as stream:
+        version = np.lib.format.read_magic(stream)
+        if version not in formats:
+            raise ValueError(f"{entry.filename} is of version {version} of npy")
+        shape, _, dtype = formats[version](stream)
+    # Room is made before a byte is read.
+    if math.prod(shape) * dtype.itemsize > entry.file_size:
+        raise ValueError(f"{entry.filename} says that it is of shape {shape}")
+    with archive.open(entry) as stream:
+        return np.lib.format.read_array(stream, allow_pickle=False)
 
 
 def read_json(path: Path, largest: int, what: str) -> Any:

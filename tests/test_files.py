@@ -1,12 +1,15 @@
 """Files that appear whole or not at all, whoever writes or dies meanwhile."""
 
+import io
 import os
 import signal
 import stat
 import subprocess
 import sys
 import threading
+import zipfile
 
+import numpy as np
 import pytest
 
 from cathsim_dmc import files
@@ -165,3 +168,39 @@ def test_many_writers_of_one_file_all_succeed(tmp_path):
     assert not failed
     assert seen <= set(contents) and len(seen) > 1
     assert names(tmp_path) == ["a.bin"]
+
+
+def archive(path, **texts):
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as stream:
+        for name, text in texts.items():
+            stream.writestr(f"{name}.npy", text)
+    return path
+
+
+def npy(array, **header):
+    """Bytes of an array that says of itself what its header says."""
+    buffer = io.BytesIO()
+    wanted = {"descr": "<f8", "fortran_order": False, "shape": array.shape}
+    np.lib.format.write_array_header_1_0(buffer, {**wanted, **header})
+    return buffer.getvalue() + array.tobytes()
+
+
+def test_arrays_from_outside_fill_no_memory_and_run_nothing(tmp_path):
+    path, good = tmp_path / "a.npz", npy(np.arange(3.0))
+    archive(path, a=good, b=good)
+    assert files.read_arrays(path, 10_000, ["a"])["a"].tolist() == [0, 1, 2]
+    assert files.read_arrays(path, 10_000).keys() == {"a", "b"}
+    with pytest.raises(ValueError, match="it lacks c"):
+        files.read_arrays(path, 10_000, ["a", "c"])
+    with pytest.raises(ValueError, match="unpack to"):
+        files.read_arrays(archive(path, a=npy(np.zeros(10**6))), 10**6)
+    assert path.stat().st_size < 20_000  # a bomb
+    for shape in ((2**45,), (2**40, 2**40), (-1,), (4,)):
+        with pytest.raises(ValueError):
+            files.read_arrays(archive(path, a=npy(np.zeros(3), shape=shape)), 10**6)
+    with pytest.raises(ValueError, match="allow_pickle=False"):
+        files.read_arrays(archive(path, a=npy(np.zeros(3), descr="|O")), 10**6)
+    for data in (b"", b"PK", good):
+        path.write_bytes(data)
+        with pytest.raises(ValueError):
+            files.read_arrays(path, 10**6)
