@@ -1,4 +1,4 @@
-"""Tools beside the package: what the audit says of what it did not look at."""
+"""Tools beside the package: the audit, and the matrix of versions."""
 
 import json
 import subprocess
@@ -7,7 +7,8 @@ from pathlib import Path
 
 import pytest
 
-AUDIT = Path(__file__).parents[1] / "tools" / "audit.py"
+TOOLS = Path(__file__).parents[1] / "tools"
+AUDIT = TOOLS / "audit.py"
 HOLE = {"id": "CVE-1", "fix_versions": ["2.1"]}
 SOUND = {"name": "a", "version": "1.0", "vulns": []}
 BROKEN = {"name": "b", "version": "2.0", "vulns": [HOLE]}
@@ -60,3 +61,19 @@ def test_nothing_audited_is_not_called_sound(audit):
         done = audit(**answers)
         assert done.returncode == 0, done.stderr
         assert "audit of 2 packages skipped" in done.stdout
+
+
+def test_an_interpreter_that_is_only_a_name_is_not_there(tmp_path):
+    """As the shims of pyenv are."""
+    shim = tmp_path / "python3.99"
+    shim.write_text("#!/bin/sh\nexit 127\n")
+    shim.chmod(0o755)
+    done = subprocess.run(
+        [sys.executable, TOOLS / "compatibility.py", "--python", shim, "python0"]
+        + ["--versions", "pinned"],
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 0, done.stderr
+    results = [json.loads(line)["result"] for line in done.stdout.splitlines()]
+    assert results == ["no such interpreter"] * 2
