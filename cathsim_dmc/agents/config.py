@@ -9,10 +9,15 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, ClassVar, Literal
 
+from cathsim_dmc.bounds import MOST_START_SHARE
+
 # Widest layer and most layers of a network: settings must not take all memory.
-MAX_WIDTH, MAX_LAYERS = 16_384, 16
+MAX_WIDTH, MAX_LAYERS, MAX_FILTERS = 16_384, 16, 1_024
 MAX_INTEGER = 2**62
 
+
+# Convolutions of the published agents: (filters, kernel size, stride) of each.
+PUBLISHED_CONVOLUTIONS = ((32, 8, 4), (64, 4, 2), (64, 3, 1))
 
 # What the presets "tuned" learn from, found on type1_lcca (docs/training.md): the way
 # through the lumen as reward, episodes that are short and start anywhere along it.
@@ -20,6 +25,16 @@ TUNED_TRAINING: Mapping[str, Any] = {
     "training_reward": {"path": -1.0, "success": 10.0},
     "training_max_steps": 120,
     "training_start": (0.0, 0.9),
+}
+# What the presets "tuned_image" add: images without their background, whose first
+# convolution strides by its size (a fifth of the published cost), and a critic that
+# reads the state.
+TUNED_IMAGES: Mapping[str, Any] = {
+    "observation": "image",
+    "critic_observation": "internal",
+    "subtract_background": True,
+    "convolutions": ((32, 8, 8), (64, 4, 2), (64, 3, 1)),
+    "cnn_features": 256,
 }
 
 
@@ -62,6 +77,10 @@ class TrainingConfig:
             last batch is finished, so a run may end slightly above.
         hidden: Widths of the hidden layers of the vector networks.
         activation: Activation function of the hidden layers.
+        subtract_background: Whether the networks read images as the difference from
+            the mean image, as in digital subtraction angiography; their brightness
+            otherwise.
+        convolutions: Convolutions of the images, each (filters, kernel size, stride).
         cnn_features: Width of the layer behind the convolutions (images only).
         learning_rate: Learning rate of Adam, for every network.
         gamma: Discount factor per control step.
@@ -120,6 +139,8 @@ class TrainingConfig:
     total_frames: int = 600_000
     hidden: tuple[int, ...] = (64, 64)
     activation: Literal["tanh", "relu", "elu"] = "tanh"
+    subtract_background: bool = False
+    convolutions: tuple[tuple[int, int, int], ...] = PUBLISHED_CONVOLUTIONS
     cnn_features: int = 512
     learning_rate: float = 3e-4
     gamma: float = 0.99
@@ -140,6 +161,7 @@ class TrainingConfig:
         for name in ("hidden", "observation", "training_start"):
             if isinstance(getattr(self, name), list):
                 object.__setattr__(self, name, tuple(getattr(self, name)))
+        object.__setattr__(self, "convolutions", _tuples(self.convolutions))
         for name, kind in typing.get_type_hints(type(self)).items():
             if typing.get_origin(kind) is not ClassVar:
                 _require_type(name, getattr(self, name), kind)
@@ -161,6 +183,17 @@ class TrainingConfig:
             self.cnn_features,
             f"a positive integer up to {MAX_WIDTH}",
         )
+        require(
+            0 < len(self.convolutions) <= MAX_LAYERS
+            and all(
+                len(layer) == 3 and 0 < min(layer) and max(layer) <= MAX_FILTERS
+                for layer in self.convolutions
+            ),
+            "convolutions",
+            self.convolutions,
+            f"1 to {MAX_LAYERS} layers (filters, kernel size, stride), each number "
+            f"from 1 to {MAX_FILTERS}",
+        )
         self._require_positive(
             "num_envs",
             "total_frames",
@@ -181,10 +214,12 @@ class TrainingConfig:
         )
         start = self.training_start
         require(
-            start is None or (len(start) == 2 and 0 <= start[0] <= start[1] < 1),
+            start is None
+            or (len(start) == 2 and 0 <= start[0] <= start[1] <= MOST_START_SHARE),
             "training_start",
             start,
-            "two shares (low, high) with 0 <= low <= high < 1, or None",
+            "two shares (low, high) with 0 <= low <= high <= "
+            f"{MOST_START_SHARE:g}, or None",
         )
         for name in ("seed", "normalisation_frames"):
             value = getattr(self, name)
@@ -230,6 +265,11 @@ class TrainingConfig:
         return {**self.task_kwargs, **given}
 
     @property
+    def collected_observation(self) -> str | tuple[str, ...]:
+        """Name or names of the observations that the training collects."""
+        return self.observation
+
+    @property
     def frames_per_batch(self) -> int:
         """Number of frames between two calls of the learner's update."""
         raise NotImplementedError
@@ -243,6 +283,7 @@ class TrainingConfig:
         """The config as JSON-able values, with the algorithm's name."""
         values = dataclasses.asdict(self)
         values["hidden"] = list(self.hidden)
+        values["convolutions"] = [list(layer) for layer in self.convolutions]
         if self.training_start is not None:
             values["training_start"] = list(self.training_start)
         if not isinstance(self.observation, str):
@@ -267,6 +308,53 @@ class TrainingConfig:
             for name in sorted(set(here) | set(there))
             if name not in self.resumable and here.get(name) != there.get(name)
         }
+
+
+@dataclass(frozen=True, kw_only=True)
+class ActorCriticConfig(TrainingConfig):
+    """Settings shared by the algorithms with a critic.
+
+    Attributes:
+        critic_observation: Name or names of the vector observations that the critic
+            reads in place of the images that the policy reads (Pinto et al. 2018,
+            "Asymmetric Actor Critic for Image-Based Robot Learning"); only the
+            training needs them. None lets it read what the policy reads.
+    """
+
+    critic_observation: str | tuple[str, ...] | None = None
+
+    def __post_init__(self):
+        """Validate."""
+        if isinstance(self.critic_observation, list):
+            object.__setattr__(
+                self, "critic_observation", tuple(self.critic_observation)
+            )
+        super().__post_init__()
+
+    @property
+    def collected_observation(self) -> str | tuple[str, ...]:
+        """Those of the policy and those of the critic."""
+        if self.critic_observation is None:
+            return self.observation
+        return (*_names(self.observation), *_names(self.critic_observation))
+
+    def to_dict(self) -> dict[str, Any]:
+        """As in the base class."""
+        values = super().to_dict()
+        if isinstance(self.critic_observation, tuple):
+            values["critic_observation"] = list(self.critic_observation)
+        return values
+
+
+def _names(names: str | tuple[str, ...]) -> tuple[str, ...]:
+    return (names,) if isinstance(names, str) else names
+
+
+def _tuples(value: Any) -> Any:
+    """Lists as tuples, at every depth."""
+    if isinstance(value, list | tuple):
+        return tuple(_tuples(one) for one in value)
+    return value
 
 
 def _require_fields(kind: type[TrainingConfig], names: Mapping[str, Any]) -> None:
