@@ -330,6 +330,12 @@ class ActorCriticConfig(TrainingConfig):
                 self, "critic_observation", tuple(self.critic_observation)
             )
         super().__post_init__()
+        require(
+            self.critic_observation is None or bool(self.critic_observation),
+            "critic_observation",
+            self.critic_observation,
+            "a name, names, or None",
+        )
 
     @property
     def collected_observation(self) -> str | tuple[str, ...]:
