@@ -81,12 +81,14 @@ def kill(server, work, *arguments, longest):
     process = server.Process(target=work, args=arguments, daemon=True)
     process.start()
     moment, end = random.uniform(0.0, longest), time.monotonic() + _PATIENCE
-    while processor_time(process.pid) < moment:
-        assert process.is_alive(), f"ended by itself with {process.exitcode}"
-        assert time.monotonic() < end, "hangs"
-        time.sleep(0.01)
-    os.kill(process.pid, signal.SIGKILL)
-    process.join()
+    try:
+        while processor_time(process.pid) < moment:
+            assert process.is_alive(), f"ended by itself with {process.exitcode}"
+            assert time.monotonic() < end, "hangs"
+            time.sleep(0.01)
+    finally:
+        os.kill(process.pid, signal.SIGKILL)
+        process.join()
     assert process.exitcode == -signal.SIGKILL
 
 
@@ -94,5 +96,8 @@ def finish(server, work, *arguments):
     """Lets a process work to its end."""
     process = server.Process(target=work, args=arguments, daemon=True)
     process.start()
-    process.join(_PATIENCE)
-    assert process.exitcode == 0
+    try:
+        process.join(_PATIENCE)
+        assert process.exitcode == 0
+    finally:
+        process.kill()
