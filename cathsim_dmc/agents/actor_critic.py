@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from cathsim_dmc.agents.config import TrainingConfig
+from cathsim_dmc.agents.config import TrainingConfig, require
 
 # What the presets "tuned" learn from, found on type1_lcca (docs/training.md): the way
 # through the lumen as reward, episodes that are short and start anywhere along it.
@@ -45,6 +45,12 @@ class ActorCriticConfig(TrainingConfig):
                 self, "critic_observation", tuple(self.critic_observation)
             )
         super().__post_init__()
+        require(
+            self.critic_observation is None or bool(self.critic_observation),
+            "critic_observation",
+            self.critic_observation,
+            "a name, names, or None",
+        )
 
     @property
     def collected_observation(self) -> str | tuple[str, ...]:
