@@ -85,9 +85,11 @@ class TrainingRecording:
         self._recording_id = str(uuid.uuid4())
         self._columns: dict[str, None] = {}
         old = self._read()
-        self._viewer = None
+        self._viewer = self._lost = None
         if viewer is not None:
-            self._viewer = rr.RecordingStream(APPLICATION_ID, self._recording_id)
+            self._viewer = rr.RecordingStream(
+                APPLICATION_ID, recording_id=self._recording_id
+            )
             self._viewer.set_log_tick_enabled(False)
             self._viewer.set_log_time_enabled(False)
             self._viewer.connect_grpc(viewer)
@@ -154,7 +156,8 @@ class TrainingRecording:
                 viewer.flush(timeout_sec=VIEWER_PATIENCE)
         except Exception as error:  # Rerun's own are of no common class.
             print(f"the viewer is left alone from now on: {error}", flush=True)
-            self._viewer = None
+            # Kept: closing a stream waits for its viewer, for ever if need be.
+            self._lost, self._viewer = viewer, None
 
     def _read(self) -> list[Chunk]:
         """All of the file, with what is to be known of it."""
