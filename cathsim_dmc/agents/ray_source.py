@@ -184,7 +184,10 @@ def _start_ray() -> None:
         return
     # Ray sends statistics of its use to its makers otherwise.
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
-    ray.init(include_dashboard=False, logging_level=logging.WARNING)
+    # What the workers print lies in Ray's own logs.
+    ray.init(
+        include_dashboard=False, logging_level=logging.WARNING, log_to_driver=False
+    )
 
 
 def _require_room(count: int, threads: int) -> None:
