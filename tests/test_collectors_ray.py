@@ -56,12 +56,28 @@ def test_without_ray_the_extra_is_named(monkeypatch):
 # A cluster of two nodes with one processor each, and a training on it; tells of the
 # collectors that it has, so that they can be killed.
 SCRIPT = """
-import json, sys, logging, os
+import json, sys, logging, os, time
 os.environ["RAY_USAGE_STATS_ENABLED"] = "0"
 logging.basicConfig(level=logging.WARNING)
 import ray
+from ray._private import services
 from ray.cluster_utils import Cluster
 from cathsim_dmc.agents import make_config, ray_source, train
+
+get_node = services.get_node
+
+def patient(*args, **kwargs):
+    # Ray gives a node 30 s to come up, which is short beside other work.
+    end = time.monotonic() + 300
+    while True:
+        try:
+            return get_node(*args, **kwargs)
+        except RuntimeError:
+            if time.monotonic() > end:
+                raise
+            time.sleep(0.5)
+
+services.get_node = patient
 
 cluster = Cluster(
     initialize_head=True, head_node_args={"num_cpus": 1, "include_dashboard": False}
@@ -118,8 +134,6 @@ def test_a_killed_collector_does_not_lose_the_run(tmp_path):
             stdout=subprocess.PIPE,
             stderr=errors,
             text=True,
-            # A raylet may be slow to come up beside other work.
-            env={**os.environ, "RAY_raylet_start_wait_time_s": "300"},
         )
     try:
         lines = iter(process.stdout.readline, "")
@@ -158,7 +172,6 @@ def test_collectors_act_with_the_weights_and_statistics_of_the_learner(tmp_path)
         text=True,
         timeout=900,
         check=True,
-        env={**os.environ, "RAY_raylet_start_wait_time_s": "300"},
     )
     _, *batches, _ = map(json.loads, done.stdout.splitlines())
     assert [shape for *_, shape in batches] == [[8, 64]] * 3

@@ -19,8 +19,6 @@ from cathsim_dmc.agents.config import ConfigError, TrainingConfig
 from cathsim_dmc.agents.evaluation import EnvFactory
 from cathsim_dmc.agents.learners import Learner
 
-# Longest wait for the cluster to have room for the collectors, and for a batch, s.
-START_PATIENCE, BATCH_PATIENCE = 300.0, 1800.0
 # So many losses in a row without a batch end the process; the run can be resumed.
 MOST_LOSSES = 3
 
@@ -87,11 +85,14 @@ class RaySource:
         """
         import ray
 
+        last: Exception | None = None
         for _ in range(MOST_LOSSES):
             try:
                 self._send_weights()
                 batch = next(self._batches)
+            # A process that dies while it is given weights breaks the connection.
             except (ray.exceptions.RayError, RuntimeError) as error:
+                last = error
                 self._replace(error)
                 continue
             self._frames += batch.numel()
@@ -100,7 +101,7 @@ class RaySource:
         raise RuntimeError(
             f"the collectors were lost {MOST_LOSSES} times in a row without a batch; "
             "the run can be resumed from its last checkpoint"
-        )
+        ) from last
 
     def shutdown(self) -> None:
         """End the collectors, and Ray if it was started here."""
