@@ -56,6 +56,7 @@ CONFINED = {
     "torchrl": {*_TORCHRL_FACE, "agents/"},
     "tensordict": {*_TORCHRL_FACE, "agents/"},
     "safetensors": {"agents/pretrained.py"},
+    "ray": {"agents/ray_source.py"},
     "rerun": {"recording/"},
     "coacd": {"anatomy/"},
     "fast_simplification": {"anatomy/scan/repair.py"},
@@ -73,6 +74,7 @@ LATE = (
     "torch",
     "torchrl",
     "numba",
+    "ray",
 )
 
 

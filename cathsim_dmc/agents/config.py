@@ -74,6 +74,16 @@ class TrainingConfig:
             simulation is always on the CPU.
         torch_threads: Number of threads of one torch operation. One is fastest for
             the small published MLP; images profit from all cores.
+        rerun: Whether to record an episode of every checkpoint, and the curves, into
+            training.rrd of the run, beside the training.
+        rerun_every: Number of checkpoints for each of which one is recorded.
+        rerun_steps: Number of control steps after which such an episode is cut off.
+        rerun_viewer: Viewer that shows it too: "spawn" opens one, "connect" takes the
+            one that is open on this machine; or an address,
+            "rerun+http://HOST:PORT/proxy". None for none.
+        collector: Where the simulations are: "local", in this process, or "ray", in
+            processes of a Ray cluster (needs the `ray` extra).
+        collectors: Number of these processes, which share the simulations.
     """
 
     algorithm: ClassVar[str] = ""
@@ -92,6 +102,12 @@ class TrainingConfig:
             "num_threads",
             "torch_threads",
             "torch_device",
+            "rerun",
+            "rerun_every",
+            "rerun_steps",
+            "rerun_viewer",
+            "collector",
+            "collectors",
         }
     )
 
@@ -124,6 +140,12 @@ class TrainingConfig:
     tensorboard: bool = False
     torch_device: str = "cpu"
     torch_threads: int = 1
+    rerun: bool = False
+    rerun_every: int = 1
+    rerun_steps: int = 300
+    rerun_viewer: str | None = None
+    collector: Literal["local", "ray"] = "local"
+    collectors: int = 2
 
     def __post_init__(self):
         """Validate; every message says what was given and what is allowed."""
@@ -170,6 +192,9 @@ class TrainingConfig:
             "keep_checkpoints",
             "metrics_frames",
             "torch_threads",
+            "rerun_every",
+            "rerun_steps",
+            "collectors",
             "learning_rate",
             "observation_clip",
             "checkpoint_seconds",
