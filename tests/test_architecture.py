@@ -59,6 +59,7 @@ CONFINED = {
     "torchrl": {*_TORCHRL_FACE, "agents/"},
     "tensordict": {*_TORCHRL_FACE, "agents/"},
     "safetensors": {"agents/pretrained.py"},
+    "ray": {"agents/ray_source.py"},
     "rerun": {"recording/"},
     "coacd": {"anatomy/"},
     "fast_simplification": {"anatomy/scan/repair.py"},
@@ -76,6 +77,7 @@ LATE = (
     "torch",
     "torchrl",
     "numba",
+    "ray",
 )
 
 
