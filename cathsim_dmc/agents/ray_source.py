@@ -143,7 +143,7 @@ class RaySource:
             int(drawn[1 + index]),
             config.torch_threads,
             config.task,
-            observation=config.observation,
+            observation=config.collected_observation,
             num_envs=share,
             num_threads=threads,
             seed=(int(drawn[0]) + index * share) % 2**31,
