@@ -20,6 +20,9 @@ MOST_SIMULATIONS = 100_000
 MOST_THREADS = 4096
 # Pixels along a side of an image; detectors of angiography have 1,024 to 2,480.
 MOST_PIXELS = 4096
+# Share of the way to the goal that the device may have made when an episode starts: it
+# is laid along the route, whose bends its links cut short.
+MOST_START_SHARE = 0.95
 # Way from the origin of what lies in an anatomy, m.
 FAR = 10.0
 

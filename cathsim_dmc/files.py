@@ -4,14 +4,18 @@ from __future__ import annotations
 
 import contextlib
 import json
+import math
 import os
+import re
 import shutil
 import uuid
 import zipfile
 import zlib
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any, BinaryIO
+
+import numpy as np
 
 try:
     import fcntl
@@ -19,8 +23,9 @@ except ImportError:  # Windows has no advisory locks: leftovers stay there.
     fcntl = None
 
 _PARTIAL = ".partial"
-# What numpy's reader of archives raises where one is damaged.
-DAMAGED_ARCHIVE = (
+_DIRECTORY = ".d"  # of an unfinished directory, beside its lock
+# What readers of archives and of numpy's arrays raise where one is damaged.
+_DAMAGED = (
     zipfile.BadZipFile,
     zlib.error,
     EOFError,
@@ -57,7 +62,7 @@ def atomic_path(
         raise ValueError(f"the file name must end in {suffix}, got {path.name!r}")
     if not path.parent.is_dir():
         raise FileNotFoundError(f"no directory {path.parent}; create it first")
-    _remove_leftovers(path)
+    remove_abandoned(path.parent, path.name)
     temporary, stream = _create(path)
     try:
         with stream:
@@ -76,7 +81,8 @@ def atomic_path(
 def atomic_directory(path: str | os.PathLike[str]) -> Iterator[Path]:
     """Yield a temporary directory that becomes `path` when the block ends well.
 
-    When the block raises, it is removed.
+    When the block raises, it is removed. What a killed writer has left is removed by
+    the next writer of the same path, or by `remove_abandoned`.
 
     Args:
         path: Path of the directory that is to appear; it must not exist.
@@ -85,9 +91,12 @@ def atomic_directory(path: str | os.PathLike[str]) -> Iterator[Path]:
         OSError: if it exists with something in it, or cannot be written.
     """
     path = Path(path)
-    temporary = path.with_name(f".{path.name}.{uuid.uuid4().hex[:12]}{_PARTIAL}")
-    temporary.mkdir()
+    remove_abandoned(path.parent, path.name)
+    # The lock lies beside the directory, whose own one its users may take.
+    lock, stream = _create(path)
+    temporary = Path(f"{lock}{_DIRECTORY}")
     try:
+        temporary.mkdir()
         yield temporary
         for file in temporary.rglob("*"):
             if file.is_file():
@@ -96,6 +105,8 @@ def atomic_directory(path: str | os.PathLike[str]) -> Iterator[Path]:
         os.rename(temporary, path)
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
+        lock.unlink(missing_ok=True)
+        stream.close()
 
 
 def write_bytes(path: str | os.PathLike[str], data: bytes) -> Path:
@@ -126,21 +137,80 @@ def _create(path: Path) -> tuple[Path, BinaryIO]:
         stream.close()
 
 
-def _remove_leftovers(path: Path) -> None:
-    """Remove temporary files of `path` that no living process holds open."""
-    if fcntl is None:
+def remove_abandoned(folder: Path, name: str | None = None) -> None:
+    """Remove unfinished files and directories that no living process holds open.
+
+    Args:
+        folder: Where they lie.
+        name: Of what they were to become; None takes all of them.
+    """
+    if fcntl is None or not folder.is_dir():
         return
-    prefix = f".{path.name}."
-    for leftover in path.parent.iterdir():
-        name = leftover.name
-        if not (name.startswith(prefix) and name.endswith(_PARTIAL)):
-            continue
-        if len(name) != len(prefix) + 12 + len(_PARTIAL) or leftover.is_symlink():
+    pattern = re.compile(
+        rf"\.{'.+' if name is None else re.escape(name)}\.[0-9a-f]{{12}}"
+        + re.escape(_PARTIAL)
+    )
+    for leftover in folder.iterdir():
+        if not pattern.fullmatch(leftover.name) or leftover.is_symlink():
             continue
         # Another writer may remove it, or have just renamed it.
         with contextlib.suppress(OSError), open(leftover, "rb") as stream:
             fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            shutil.rmtree(f"{leftover}{_DIRECTORY}", ignore_errors=True)
             leftover.unlink()
+
+
+def read_arrays(
+    source: Path | BinaryIO, largest: int, names: Iterable[str] | None = None
+) -> dict[str, np.ndarray]:
+    """Arrays of an .npz archive from outside: no pickle is read, no memory filled.
+
+    Args:
+        source: Path of the archive, or the archive itself.
+        largest: Size of all arrays together that is still read, bytes unpacked.
+        names: Names of the arrays that must be there; None reads all of them.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        ValueError: the archive is damaged, lacks an array or is too large. The message
+            does not name the file.
+    """
+    try:
+        with zipfile.ZipFile(source) as archive:
+            entries = {
+                entry.filename.removesuffix(".npy"): entry
+                for entry in archive.infolist()
+            }
+            size = sum(entry.file_size for entry in entries.values())
+            if size > largest:
+                raise ValueError(f"its arrays unpack to {size:,} bytes")
+            wanted = list(entries if names is None else names)
+            lacking = [name for name in wanted if name not in entries]
+            if lacking:
+                raise ValueError(f"it lacks {', '.join(lacking)}")
+            return {name: _read_array(archive, entries[name]) for name in wanted}
+    except FileNotFoundError:
+        raise
+    except _DAMAGED as error:
+        text = " ".join(str(error).split())
+        raise ValueError(text or type(error).__name__) from error
+
+
+def _read_array(archive: zipfile.ZipFile, entry: zipfile.ZipInfo) -> np.ndarray:
+    formats = {
+        (1, 0): np.lib.format.read_array_header_1_0,
+        (2, 0): np.lib.format.read_array_header_2_0,
+    }
+    with archive.open(entry) as stream:
+        version = np.lib.format.read_magic(stream)
+        if version not in formats:
+            raise ValueError(f"{entry.filename} is of version {version} of npy")
+        shape, _, dtype = formats[version](stream)
+    # Room is made before a byte is read.
+    if math.prod(shape) * dtype.itemsize > entry.file_size:
+        raise ValueError(f"{entry.filename} says that it is of shape {shape}")
+    with archive.open(entry) as stream:
+        return np.lib.format.read_array(stream, allow_pickle=False)
 
 
 def read_json(path: Path, largest: int, what: str) -> Any:

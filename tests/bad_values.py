@@ -157,6 +157,10 @@ def damaged_bytes(draw, data):
     return others.get(way) or (b"" if way == "empty" else draw(st.binary(max_size=200)))
 
 
+# What readers of files raise.
+ERRORS = (ValueError, OSError, RuntimeError)
+
+
 class Tally:
     """Counts bad inputs by entry, and what became of them."""
 
@@ -202,3 +206,51 @@ class Tally:
         lines = [f"{count:6d}  {entry}" for entry, count in sorted(self.tried.items())]
         total = f"{self.tried.total():6d}  bad inputs, {len(self.wrong)} not refused"
         return "\n".join([*lines, total])
+
+
+def try_json(tally, entry, path, load, examples, harmless=lambda path, value: False):
+    """Damages one entry of a JSON file, and loads it."""
+    good = path.read_text()
+
+    def check(damaged):
+        text, where = damaged
+        path.write_text(text)
+        tally.refused(f"{entry}, entries", load, [path.name], ERRORS, note=where)
+
+    try:
+        tally.draw(damaged_json(json.loads(good), harmless), examples, check)
+    finally:
+        path.write_text(good)
+    load()
+
+
+def try_bytes(tally, entry, path, load, examples, same=None, named=None):
+    """Damages the bytes of a file, and loads it; `same` tells whether all is there."""
+    good = path.read_bytes()
+
+    def check(data):
+        if data == good:
+            return
+        path.write_bytes(data)
+
+        def read():
+            result = load()
+            if same is not None and same(result):
+                # A flipped bit that nobody reads, such as the time of a zip's entry.
+                raise ValueError(path.name)
+            return result
+
+        tally.refused(f"{entry}, bytes", read, [named or path.name], ERRORS)
+
+    try:
+        tally.draw(damaged_bytes(good), examples, check)
+    finally:
+        path.write_bytes(good)
+
+
+def settled(tally, folder, before):
+    """Nothing was written, and everything was refused."""
+    assert sorted(folder.rglob("*")) == before, "something was written"
+    print(tally.report())
+    shown = "\n".join(sorted(set(tally.wrong))[:200])
+    assert not tally.wrong, f"{len(tally.wrong)} of {tally.tried.total()}:\n{shown}"

@@ -20,10 +20,12 @@ class ReachEnv(EnvBase):
 
     batch_locked = True
 
-    def __init__(self, num_envs, seed=0, max_steps=40, image=False, padding=0):
+    def __init__(
+        self, num_envs, seed=0, max_steps=40, image=False, padding=0, numbers=True
+    ):
         super().__init__(batch_size=[num_envs])
         self.max_steps = max_steps
-        self.image = image
+        self.image, self.numbers = image, numbers
         self.padding = padding
         n = num_envs
         sizes = dict(SIZES, padding=padding) if padding else SIZES
@@ -31,10 +33,10 @@ class ReachEnv(EnvBase):
             name: Unbounded((n, size), dtype=torch.float64)
             for name, size in sizes.items()
         }
+        if not numbers:
+            entries = {}
         if image:
-            entries = {
-                "image": Bounded(0, 255, (n, 128, 128, 1), dtype=torch.uint8),
-            }
+            entries["image"] = Bounded(0, 255, (n, 128, 128, 1), dtype=torch.uint8)
         self.observation_spec = Composite(
             entries
             | {"info": Composite({k: Unbounded((n, 1)) for k in INFO}, shape=(n,))},
@@ -74,13 +76,17 @@ class ReachEnv(EnvBase):
             entries["padding"] = np.tile(self.point, (1, self.padding))[
                 :, : self.padding
             ]
-        out = {name: torch.as_tensor(value.copy()) for name, value in entries.items()}
+        out = {
+            name: torch.as_tensor(value.copy())
+            for name, value in entries.items()
+            if self.numbers
+        }
         if self.image:
             pixels = np.zeros((n, 128, 128, 1), np.uint8)
             centre = np.clip((self.point[:, :2] + 1) * 64, 4, 123).astype(int)
             for i, (x, y) in enumerate(centre):
                 pixels[i, y - 4 : y + 4, x - 4 : x + 4] = 255
-            out = {"image": torch.as_tensor(pixels)}
+            out["image"] = torch.as_tensor(pixels)
         info = {
             "wall_force_sum": force,
             "wall_force_max": 0.5 * force,
@@ -147,5 +153,7 @@ def make_env(
     backend="batched",
     task_kwargs=None,
 ):
-    env = ReachEnv(num_envs, seed, image=observation == "image", **(task_kwargs or {}))
+    names = (observation,) if isinstance(observation, str) else observation
+    kinds = {"image": "image" in names, "numbers": "internal" in names}
+    env = ReachEnv(num_envs, seed, **kinds, **(task_kwargs or {}))
     return standard_observations(env)

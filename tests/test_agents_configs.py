@@ -35,6 +35,8 @@ def test_configs_survive_json(algorithm, preset):
     again = config_from_dict(json.loads(json.dumps(config.to_dict())))
     assert again == config
     assert again.seed == 7
+    # Two minutes of work are lost at most, whatever is not said.
+    assert config.checkpoint_seconds <= 120
 
 
 @pytest.mark.parametrize(

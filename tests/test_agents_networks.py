@@ -7,11 +7,15 @@ from tensordict import TensorDict
 from torchrl.envs import check_env_specs
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from cathsim_dmc.agents import PPOConfig, SACConfig, make_config
+from cathsim_dmc.agents import ConfigError, PPOConfig, SACConfig, make_config
 from cathsim_dmc.agents.exploration import CorrelatedExploration, CorrelatedNoise
 from cathsim_dmc.agents.learners import make_policy
 from cathsim_dmc.agents.networks import NetworkShapes
-from cathsim_dmc.agents.normalisation import ObservationNormaliser
+from cathsim_dmc.agents.normalisation import (
+    SHADOW,
+    ImageNormaliser,
+    ObservationNormaliser,
+)
 from cathsim_dmc.agents.ppo import PPO
 from cathsim_dmc.simulation.environments import VECTOR
 
@@ -60,6 +64,19 @@ def test_normaliser_refuses_what_is_not_finite():
     assert normaliser.count == 0
 
 
+def test_the_mean_image_is_subtracted_whatever_the_batches():
+    torch.manual_seed(0)
+    images = torch.randint(0, 256, (30, 1, 4, 5), dtype=torch.uint8)
+    normaliser = ImageNormaliser((1, 4, 5), subtract=True)
+    for part in images.split([1, 9, 20]):
+        normaliser.update(part)
+    expected = (images.float() - images.float().mean(0)) / SHADOW
+    torch.testing.assert_close(normaliser(images), expected, rtol=0, atol=1e-4)
+    plain = ImageNormaliser((1, 4, 5), subtract=False)
+    plain.update(images)
+    assert torch.equal(plain(images), images.float() / 255.0)
+
+
 def observation_of(shapes, batch):
     entries = {}
     if shapes.vector:
@@ -94,6 +111,14 @@ def test_actions_are_bounded_and_deterministic_ones_repeat(config, shapes):
     with set_exploration_type(ExplorationType.DETERMINISTIC):
         chosen = [policy(observation.clone())["action"] for _ in range(2)]
     assert torch.equal(*chosen)
+
+
+def test_convolutions_that_do_not_fit_the_image_are_refused():
+    config = PPOConfig(convolutions=((8, 8, 8), (8, 17, 1)))
+    with pytest.raises(ConfigError, match="of 17 x 17 meets 16 x 16"):
+        make_policy(NetworkShapes(0, (1, 128, 128), 21), config)
+    smaller = config.replace(convolutions=((8, 8, 8), (8, 16, 1)))
+    assert make_policy(NetworkShapes(0, (1, 128, 128), 21), smaller)
 
 
 @pytest.mark.parametrize("observation", ["internal", "image"])
@@ -136,7 +161,7 @@ def test_truncation_bootstraps_and_termination_does_not(tmp_path):
         },
         [2, steps],
     )
-    learner.normaliser(batch)
+    learner.normalisers.add(batch)
     learner._add_advantages(batch)
     with torch.no_grad():
         clip = config.observation_clip

@@ -132,6 +132,43 @@ def test_images_train(tmp_path):
     assert evaluate(tmp_path, episodes=2, make_env=synthetic_env.make_env).episodes
 
 
+SMALL_IMAGES = {
+    "observation": "image", "critic_observation": "internal",
+    "convolutions": ((4, 8, 8), (4, 3, 2)), "cnn_features": 16, "hidden": (16,),
+    "subtract_background": True,
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("make", [small_ppo, small_sac])
+def test_a_critic_that_reads_more_than_the_policy(tmp_path, make):
+    config = make(**SMALL_IMAGES, total_frames=1_024)
+    run(config, tmp_path)
+    saved = Checkpoint.open(tmp_path)
+    assert saved.shapes == NetworkShapes(0, (1, 128, 128), synthetic_env.ACTIONS)
+    # Its statistics are those of what was collected, and come back on resuming.
+    kept = saved.learning_state()["learner"]["normalisers"]["0.module.count"]
+    assert kept == (512 + 256 + 512 if make is small_ppo else 1_024)
+    assert evaluate(tmp_path, episodes=2, make_env=synthetic_env.make_env).episodes
+    run(config.replace(total_frames=1_536), tmp_path, resume=True)
+    state = Checkpoint.open(tmp_path).learning_state()["learner"]
+    assert state["normalisers"]["0.module.count"] == kept + 512
+
+
+@pytest.mark.parametrize(
+    ("observation", "critic"),
+    [
+        ("internal", "tracking"),
+        ("internal", "image"),
+        (("image", "internal"), "tracking"),
+        ("image", "sequential"),
+    ],
+)
+def test_what_a_critic_cannot_read_is_refused(tmp_path, observation, critic):
+    config = small_ppo(observation=observation, critic_observation=critic)
+    with pytest.raises(ConfigError, match="critic_observation=.* is not allowed"):
+        run(config, tmp_path)
+
+
 @pytest.mark.parametrize("make", [small_ppo, small_sac])
 def test_same_seed_same_run(tmp_path, make):
     config = make(total_frames=1_024)

@@ -2,6 +2,12 @@
 
 from __future__ import annotations
 
+import os
+import signal
+import stat
+import subprocess
+import sys
+
 import numpy as np
 import pytest
 
@@ -74,6 +80,35 @@ def test_old_entries_go_and_nothing_half_written_stays(
         mesh.write_text(f"v 0 0 {number}\n")
         cache.cached_import(mesh, folder=folder)
     assert len(list(folder.iterdir())) == 2
+
+
+KILLED = """
+import os, signal, sys
+from cathsim_dmc.anatomy.arch import arch
+from cathsim_dmc.anatomy.scan import cache
+
+def fake(mesh, curves=(), *, progress=None, notes=None, **options):
+    return arch.load("simple1")
+
+cache.import_scan = fake
+cache.Anatomy.save = lambda *_: os.kill(os.getpid(), signal.SIGKILL)
+cache.cached_import(sys.argv[1], folder=sys.argv[2])
+"""
+
+
+def test_what_a_killed_import_leaves_goes_with_the_next_one(imports, mesh, tmp_path):
+    folder = tmp_path / "cache"
+    died = subprocess.run([sys.executable, "-c", KILLED, str(mesh), str(folder)])
+    assert died.returncode == -signal.SIGKILL
+    assert all(path.name.startswith(".") for path in folder.iterdir())
+    assert len(list(folder.iterdir())) == 2
+    mesh.write_text("v 0 0 1\n")
+    cache.cached_import(mesh, folder=folder)
+    (entry,) = folder.iterdir()
+    # Nor is it the owner's alone, as the folders of tempfile are.
+    mask = os.umask(0)
+    os.umask(mask)
+    assert stat.S_IMODE(entry.stat().st_mode) == 0o777 & ~mask
 
 
 def test_a_cache_that_cannot_be_written_is_said(imports, mesh, tmp_path):

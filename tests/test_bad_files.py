@@ -9,9 +9,8 @@ import numpy as np
 import pytest
 import synthetic_env
 import torch
-from bad_values import Tally, damaged_bytes, damaged_json
+from bad_values import ERRORS, Tally, damaged_json, settled, try_bytes, try_json
 from hypothesis import strategies as st
-from recording_samples import make_episode
 from synthetic_scans import marched, write_markup, write_obj, y_tree
 from test_agents_training import run, small_ppo, small_sac
 
@@ -23,12 +22,7 @@ from cathsim_dmc.anatomy import Anatomy
 from cathsim_dmc.anatomy.scan.curves import read_curve
 from cathsim_dmc.anatomy.scan.mesh import read_triangles
 from cathsim_dmc.anatomy.tree_file import read_tree
-from cathsim_dmc.recording import viewer
-from cathsim_dmc.recording.episode import Episode
-from cathsim_dmc.tasks import physics_errors
 from cathsim_dmc.validation import force_sensors
-
-ERRORS = (ValueError, OSError, RuntimeError)
 
 
 @pytest.fixture(scope="module")
@@ -38,10 +32,6 @@ def store(tmp_path_factory):
     force_sensors.straight_tube(0.06, 4e-3).save(folder / "anatomy")
     run(small_ppo(total_frames=512), folder / "ppo")
     run(small_sac(total_frames=1_024, replay_frames=1_024), folder / "sac")
-    make_episode().save(folder / "episode.npz")
-    physics_errors.dump(
-        "tried", task={}, state=np.ones(9), actions=np.ones((3, 2)), directory=folder
-    ).rename(folder / "dump.npz")
     vertices, faces = marched(y_tree(), 3e-3)
     write_obj(folder / "lumen.obj", vertices, faces)
     import trimesh
@@ -74,46 +64,6 @@ def store(tmp_path_factory):
     }
     (folder / "tree.json").write_text(json.dumps(tree))
     return folder
-
-
-def try_json(tally, entry, path, load, examples, harmless=lambda path, value: False):
-    """Damages one entry of a JSON file, and loads it."""
-    good = path.read_text()
-
-    def check(damaged):
-        text, where = damaged
-        path.write_text(text)
-        tally.refused(f"{entry}, entries", load, [path.name], ERRORS, note=where)
-
-    try:
-        tally.draw(damaged_json(json.loads(good), harmless), examples, check)
-    finally:
-        path.write_text(good)
-    load()
-
-
-def try_bytes(tally, entry, path, load, examples, same=None, named=None):
-    """Damages the bytes of a file, and loads it; `same` tells whether all is there."""
-    good = path.read_bytes()
-
-    def check(data):
-        if data == good:
-            return
-        path.write_bytes(data)
-
-        def read():
-            result = load()
-            if same is not None and same(result):
-                # A flipped bit that nobody reads, such as the time of a zip's entry.
-                raise ValueError(path.name)
-            return result
-
-        tally.refused(f"{entry}, bytes", read, [named or path.name], ERRORS)
-
-    try:
-        tally.draw(damaged_bytes(good), examples, check)
-    finally:
-        path.write_bytes(good)
 
 
 def reseal(folder):
@@ -279,31 +229,6 @@ def try_settings(tally, store, examples):
     tally.draw(damaged_json(kept, harmless), examples, check)
 
 
-def try_recordings(tally, store, examples):
-    path, good = store / "episode.npz", Episode.load(store / "episode.npz")
-    read = lambda: Episode.load(path)  # noqa: E731
-    try_bytes(tally, "episode", path, read, examples, good.equals)
-    dump = store / "dump.npz"
-    first = physics_errors.load(dump)
-
-    def same(other):
-        return other[0] == first[0] and all(
-            np.array_equal(a, b) for a, b in zip(other[1:], first[1:], strict=True)
-        )
-
-    read = lambda: physics_errors.load(dump)  # noqa: E731
-    try_bytes(tally, "dump of an error", dump, read, examples, same)
-    rrd = store / "broken.rrd"
-
-    def check(data):
-        rrd.write_bytes(data)
-        tally.refused("rerun file", lambda: viewer.check_recording(rrd), [rrd.name])
-
-    no_rrd = st.binary(max_size=100).filter(lambda data: not data.startswith(b"RRF2"))
-    tally.draw(no_rrd, examples, check)
-    rrd.unlink()
-
-
 def try_scans(tally, store, examples):
     for kind in ("stl", "ply", "obj", "vtp"):
         path = store / f"broken.{kind}"
@@ -388,17 +313,9 @@ EVERYTHING = (
     try_checkpoint,
     try_replay,
     try_settings,
-    try_recordings,
     try_scans,
     try_curves_and_trees,
 )
-
-
-def settled(tally, store, before):
-    assert sorted(store.rglob("*")) == before, "something was written"
-    print(tally.report())
-    shown = "\n".join(sorted(set(tally.wrong))[:200])
-    assert not tally.wrong, f"{len(tally.wrong)} of {tally.tried.total()}:\n{shown}"
 
 
 def test_damaged_files_are_refused_by_name(store):

@@ -165,6 +165,14 @@ TRAINING = {
     "hidden": st.sampled_from([(), [], 64, "64", (0,), (-1,), (1.5,), (10**9,), None]),
     "activation": word(),
     "cnn_features": whole(1, 16_384),
+    "subtract_background": flag(),
+    "convolutions": st.sampled_from(
+        [
+            *(None, 1, "x", (), [], {}, True, ((32, 8, 8),) * 17, ((1.5, 8, 4),)),
+            *(((32, 8),), ((0, 8, 4),), ((32, -8, 4),), (("a", 8, 4),), (32, 8, 4)),
+            *(((32, 8, 10**9),), ((True, 8, 4),), ((None, 8, 4),), ((32, [8], 4),)),
+        ]
+    ),
     "learning_rate": POSITIVE,
     "gamma": number(0, 1, positive=True),
     "observation_clip": POSITIVE,
@@ -176,7 +184,8 @@ TRAINING = {
     "tensorboard": flag(),
     "torch_threads": whole(1),
 }
-PPO = {
+CRITIC = {"critic_observation": st.sampled_from(["", 1, [], [1], {}, 1.5, (), True])}
+PPO = CRITIC | {
     "steps_per_update": whole(1),
     "minibatch_size": whole(1),
     "epochs": whole(1),
@@ -191,7 +200,7 @@ PPO = {
     "noise_shared": number(0, 1),
     "anneal": flag(),
 }
-SAC = {
+SAC = CRITIC | {
     "batch_size": whole(1),
     "tau": number(0, 1, positive=True),
     "replay_frames": whole(1),

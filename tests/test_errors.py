@@ -248,6 +248,90 @@ def test_actions_of_a_batch(environment):
         simulation.step(action)
 
 
+def composer_face(environment):
+    def reset():
+        environment.task.random.set_state(np.random.RandomState(3).get_state())
+        environment.reset()
+
+    return reset, lambda action: environment.step(action).reward
+
+
+def batch_face(environment):
+    batch = BatchSimulation(environment.task, 1, num_threads=1)
+
+    def reset():
+        batch.seed(3)
+        batch.reset()
+
+    return reset, lambda action: batch.step(action[None]).outcome.reward[0]
+
+
+def gymnasium_face(environment):
+    import cathsim_dmc.gym  # noqa: F401  registers the ids
+
+    env = pytest.importorskip("gymnasium").make("cathsim/type1_bca-v0")
+    return lambda: env.reset(seed=3), lambda action: env.step(np.float32(action))[1]
+
+
+def vector_face(environment):
+    import cathsim_dmc.gym  # noqa: F401  registers the ids
+
+    env = pytest.importorskip("gymnasium").make_vec(
+        "cathsim/type1_bca-v0", 1, vectorization_mode="vector_entry_point"
+    )
+    return (
+        lambda: env.reset(seed=3),
+        lambda action: env.step(np.float32(action[None]))[1][0],
+    )
+
+
+def torchrl_face(environment, backend="batched"):
+    import torch
+
+    from cathsim_dmc.simulation.environments import make_env
+
+    env = make_env("type1_bca", backend=backend)
+    state = env.reset()
+
+    def reset():
+        env.set_seed(3)
+        state.update(env.reset())
+
+    def step(action):
+        state["action"] = torch.as_tensor(action[None], dtype=env.action_spec.dtype)
+        return env.step(state)["next", "reward"].item()
+
+    return reset, step
+
+
+def composer_torchrl_face(environment):
+    return torchrl_face(environment, "composer")
+
+
+SLOW_FACES = (gymnasium_face, vector_face, torchrl_face, composer_torchrl_face)
+
+
+@pytest.mark.parametrize(
+    "face",
+    [
+        composer_face,
+        batch_face,
+        *(pytest.param(face, marks=pytest.mark.slow) for face in SLOW_FACES),
+    ],
+)
+def test_actions_out_of_range_are_clipped_in_every_face(environment, face):
+    """As the drives would: three times the range is the range, bit for bit."""
+    reset, step = face(environment)
+    action = np.where(np.arange(21) % 2, 1.0, -1.0)
+    action[20] = 1.0
+    rewards = []
+    for scale in (1.0, 3.0, 0.5):
+        reset()
+        rewards.append([step(scale * action) for _ in range(3)])
+    assert rewards[0] == rewards[1]
+    assert rewards[0] != rewards[2]
+
+
 def test_batches_of_nothing_and_of_too_few_seeds(environment):
     with pytest.raises(ValueError, match="num_simulations is 0"):
         BatchSimulation(environment.task, 0)

@@ -1,12 +1,15 @@
 """Files that appear whole or not at all, whoever writes or dies meanwhile."""
 
+import io
 import os
 import signal
 import stat
 import subprocess
 import sys
 import threading
+import zipfile
 
+import numpy as np
 import pytest
 
 from cathsim_dmc import files
@@ -69,9 +72,9 @@ with files.atomic_path(sys.argv[1]) as path:
 """
 
 
-def writer(target):
+def writer(target, script=KILLED):
     process = subprocess.Popen(
-        [sys.executable, "-c", KILLED, str(target)],
+        [sys.executable, "-c", script, str(target)],
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
         text=True,
@@ -104,6 +107,38 @@ def test_what_the_dead_left_goes_and_what_the_living_write_stays(tmp_path):
     ]
 
 
+DIRECTORY = """
+import sys
+from cathsim_dmc import files
+with files.atomic_directory(sys.argv[1]) as path:
+    (path / "half").write_text("half")
+    print("writing", flush=True)
+    sys.stdin.read()
+"""
+
+
+def test_directories_of_the_dead_go_and_those_of_the_living_stay(tmp_path):
+    target = tmp_path / "data"
+    dead, alive = writer(target, DIRECTORY), writer(target, DIRECTORY)
+    dead.send_signal(signal.SIGKILL)
+    dead.communicate()
+    assert len(list(tmp_path.rglob("half"))) == 2
+    files.remove_abandoned(tmp_path, "another")
+    assert len(list(tmp_path.rglob("half"))) == 2
+    files.remove_abandoned(tmp_path)
+    assert len(list(tmp_path.rglob("half"))) == 1
+    alive.communicate("")
+    assert alive.returncode == 0
+    assert names(tmp_path) == ["data"] and names(target) == ["half"]
+    # The next writer of the same path does it too.
+    dead = writer(tmp_path / "more", DIRECTORY)
+    dead.send_signal(signal.SIGKILL)
+    dead.communicate()
+    with files.atomic_directory(tmp_path / "more") as path:
+        (path / "whole").write_text("")
+    assert names(tmp_path) == ["data", "more"]
+
+
 def test_many_writers_of_one_file_all_succeed(tmp_path):
     target = tmp_path / "a.bin"
     contents = [bytes([index]) * 100_000 for index in range(8)]
@@ -133,3 +168,39 @@ def test_many_writers_of_one_file_all_succeed(tmp_path):
     assert not failed
     assert seen <= set(contents) and len(seen) > 1
     assert names(tmp_path) == ["a.bin"]
+
+
+def archive(path, **texts):
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as stream:
+        for name, text in texts.items():
+            stream.writestr(f"{name}.npy", text)
+    return path
+
+
+def npy(array, **header):
+    """Bytes of an array that says of itself what its header says."""
+    buffer = io.BytesIO()
+    wanted = {"descr": "<f8", "fortran_order": False, "shape": array.shape}
+    np.lib.format.write_array_header_1_0(buffer, {**wanted, **header})
+    return buffer.getvalue() + array.tobytes()
+
+
+def test_arrays_from_outside_fill_no_memory_and_run_nothing(tmp_path):
+    path, good = tmp_path / "a.npz", npy(np.arange(3.0))
+    archive(path, a=good, b=good)
+    assert files.read_arrays(path, 10_000, ["a"])["a"].tolist() == [0, 1, 2]
+    assert files.read_arrays(path, 10_000).keys() == {"a", "b"}
+    with pytest.raises(ValueError, match="it lacks c"):
+        files.read_arrays(path, 10_000, ["a", "c"])
+    with pytest.raises(ValueError, match="unpack to"):
+        files.read_arrays(archive(path, a=npy(np.zeros(10**6))), 10**6)
+    assert path.stat().st_size < 20_000  # a bomb
+    for shape in ((2**45,), (2**40, 2**40), (-1,), (4,)):
+        with pytest.raises(ValueError):
+            files.read_arrays(archive(path, a=npy(np.zeros(3), shape=shape)), 10**6)
+    with pytest.raises(ValueError, match="allow_pickle=False"):
+        files.read_arrays(archive(path, a=npy(np.zeros(3), descr="|O")), 10**6)
+    for data in (b"", b"PK", good):
+        path.write_bytes(data)
+        with pytest.raises(ValueError):
+            files.read_arrays(path, 10**6)

@@ -54,7 +54,7 @@ def environment(python: str, versions: str, folder: Path, tests: bool) -> tuple:
     if versions == "lowest":
         wanted += lowest()
     done = subprocess.run(
-        [str(inside), "-m", "pip", "install", "--quiet", *wanted],
+        [str(inside), "-m", "pip", "install", "--quiet", "--no-compile", *wanted],
         capture_output=True,
         text=True,
     )
@@ -62,10 +62,17 @@ def environment(python: str, versions: str, folder: Path, tests: bool) -> tuple:
     return inside, None if done.returncode == 0 else (lines or ["pip failed"])[0]
 
 
+def is_there(python: str) -> bool:
+    """Whether an interpreter runs: a name on the path may be an empty promise."""
+    if shutil.which(python) is None:
+        return False
+    return subprocess.run([python, "-c", ""], capture_output=True).returncode == 0
+
+
 def attempt(python: str, versions: str, tests: bool) -> dict:
     """Installs and tries one cell of the matrix."""
     cell = {"python": python, "versions": versions}
-    if shutil.which(python) is None:
+    if not is_there(python):
         return {**cell, "result": "no such interpreter"}
     with tempfile.TemporaryDirectory(prefix="compatibility-") as folder:
         inside, wrong = environment(python, versions, Path(folder) / "venv", tests)

@@ -13,9 +13,10 @@ from cathsim_dmc.simulation.environments import VECTOR, make_env
 
 def main() -> None:
     home = Path(cathsim_dmc.__file__).resolve()
-    checkout = Path(__file__).resolve().parents[1]
+    checkout = Path(__file__).resolve().parents[1] / "cathsim_dmc"
     if len(sys.argv) > 1 and sys.argv[1] == "--installed":
-        assert checkout not in home.parents, f"{home} is the checkout, not the package"
+        # The environment itself may lie in the checkout, as that of `make dist` does.
+        assert home.parent != checkout, f"{home} is the checkout, not the package"
     environment = suite.load("cathsim", "type1_lcca", task_kwargs={"random": 0})
     first = environment.reset()
     later = environment.step(environment.action_spec().maximum)

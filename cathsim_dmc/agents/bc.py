@@ -14,7 +14,6 @@ from cathsim_dmc.agents.config import ConfigError, TrainingConfig
 from cathsim_dmc.agents.demonstrations import load_transitions
 from cathsim_dmc.agents.imitation import Clone, decaying, make_clone
 from cathsim_dmc.agents.networks import NetworkShapes
-from cathsim_dmc.simulation.environments import VECTOR
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -62,6 +61,7 @@ class BC:
     """The learner: a clone, fitted to a dataset.
 
     Attributes:
+        shapes: Sizes of what the policy reads, and of the action.
         policy: Raw observation in, sampled action out.
         random_frames: Number of frames to collect with uniformly random actions
             first (none).
@@ -83,14 +83,13 @@ class BC:
                 "demonstrations is not given: bc needs the directory of a dataset; "
                 "`cathsim demos` writes one."
             )
-        self.config = config
+        self.config, self.shapes = config, shapes
         self.device = torch.device(config.torch_device)
         self.states = load_transitions(
             config.demonstrations, config.observation, shapes
         ).exclude("next")
         self.clone = Clone(config, shapes)
-        if shapes.vector:
-            self.clone.observe(self.states[VECTOR])
+        self.clone.observe(self.states)
         self.policy = self.clone.policy
         self.gradient_steps = 0
 

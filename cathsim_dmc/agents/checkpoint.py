@@ -264,5 +264,8 @@ def save_checkpoint(
     files.write_text(temporary / _DESCRIPTION, json.dumps(description, indent=2) + "\n")
     os.rename(temporary, target)
     for old in checkpoints_in(run)[: -config.keep_checkpoints]:
-        shutil.rmtree(old)
+        # Killed while it removes, it must not leave half a checkpoint with a name.
+        dropped = old.with_name(f"{_UNFINISHED}{old.name}")
+        os.rename(old, dropped)
+        shutil.rmtree(dropped)
     return target

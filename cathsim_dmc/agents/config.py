@@ -2,35 +2,19 @@
 
 import dataclasses
 import json
-import math
-import types
 import typing
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, ClassVar, Literal
 
+from cathsim_dmc.agents.fields import ConfigError, require, require_type, tuples
+from cathsim_dmc.bounds import MOST_START_SHARE
+
 # Widest layer and most layers of a network: settings must not take all memory.
-MAX_WIDTH, MAX_LAYERS = 16_384, 16
-MAX_INTEGER = 2**62
+MAX_WIDTH, MAX_LAYERS, MAX_FILTERS = 16_384, 16, 1_024
 
-
-# What the presets "tuned" learn from, found on type1_lcca (docs/training.md): the way
-# through the lumen as reward, episodes that are short and start anywhere along it.
-TUNED_TRAINING: Mapping[str, Any] = {
-    "training_reward": {"path": -1.0, "success": 10.0},
-    "training_max_steps": 120,
-    "training_start": (0.0, 0.9),
-}
-
-
-class ConfigError(ValueError):
-    """A hyper-parameter is outside what is allowed, or contradicts another."""
-
-
-def require(condition: bool, name: str, given: object, allowed: str) -> None:
-    """Raise ConfigError naming the field, what was given and what is allowed."""
-    if not condition:
-        raise ConfigError(f"{name}={given!r} is not allowed: {name} must be {allowed}.")
+# Convolutions of the published agents: (filters, kernel size, stride) of each.
+PUBLISHED_CONVOLUTIONS = ((32, 8, 4), (64, 4, 2), (64, 3, 1))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -62,6 +46,10 @@ class TrainingConfig:
             last batch is finished, so a run may end slightly above.
         hidden: Widths of the hidden layers of the vector networks.
         activation: Activation function of the hidden layers.
+        subtract_background: Whether the networks read images as the difference from
+            the mean image, as in digital subtraction angiography; their brightness
+            otherwise.
+        convolutions: Convolutions of the images, each (filters, kernel size, stride).
         cnn_features: Width of the layer behind the convolutions (images only).
         learning_rate: Learning rate of Adam, for every network.
         gamma: Discount factor per control step.
@@ -136,6 +124,8 @@ class TrainingConfig:
     total_frames: int = 600_000
     hidden: tuple[int, ...] = (64, 64)
     activation: Literal["tanh", "relu", "elu"] = "tanh"
+    subtract_background: bool = False
+    convolutions: tuple[tuple[int, int, int], ...] = PUBLISHED_CONVOLUTIONS
     cnn_features: int = 512
     learning_rate: float = 3e-4
     gamma: float = 0.99
@@ -162,9 +152,10 @@ class TrainingConfig:
         for name in ("hidden", "observation", "training_start"):
             if isinstance(getattr(self, name), list):
                 object.__setattr__(self, name, tuple(getattr(self, name)))
+        object.__setattr__(self, "convolutions", tuples(self.convolutions))
         for name, kind in typing.get_type_hints(type(self)).items():
             if typing.get_origin(kind) is not ClassVar:
-                _require_type(name, getattr(self, name), kind)
+                require_type(name, getattr(self, name), kind)
         object.__setattr__(self, "task_kwargs", dict(self.task_kwargs))
         if self.training_reward is not None:
             object.__setattr__(self, "training_reward", dict(self.training_reward))
@@ -182,6 +173,17 @@ class TrainingConfig:
             "cnn_features",
             self.cnn_features,
             f"a positive integer up to {MAX_WIDTH}",
+        )
+        require(
+            0 < len(self.convolutions) <= MAX_LAYERS
+            and all(
+                len(layer) == 3 and 0 < min(layer) and max(layer) <= MAX_FILTERS
+                for layer in self.convolutions
+            ),
+            "convolutions",
+            self.convolutions,
+            f"1 to {MAX_LAYERS} layers (filters, kernel size, stride), each number "
+            f"from 1 to {MAX_FILTERS}",
         )
         self._require_positive(
             "num_envs",
@@ -206,10 +208,12 @@ class TrainingConfig:
         )
         start = self.training_start
         require(
-            start is None or (len(start) == 2 and 0 <= start[0] <= start[1] < 1),
+            start is None
+            or (len(start) == 2 and 0 <= start[0] <= start[1] <= MOST_START_SHARE),
             "training_start",
             start,
-            "two shares (low, high) with 0 <= low <= high < 1, or None",
+            "two shares (low, high) with 0 <= low <= high <= "
+            f"{MOST_START_SHARE:g}, or None",
         )
         for name in ("seed", "normalisation_frames"):
             value = getattr(self, name)
@@ -255,6 +259,11 @@ class TrainingConfig:
         return {**self.task_kwargs, **given}
 
     @property
+    def collected_observation(self) -> str | tuple[str, ...]:
+        """Name or names of the observations that the training collects."""
+        return self.observation
+
+    @property
     def frames_per_batch(self) -> int:
         """Number of frames between two calls of the learner's update."""
         raise NotImplementedError
@@ -268,6 +277,7 @@ class TrainingConfig:
         """The config as JSON-able values, with the algorithm's name."""
         values = dataclasses.asdict(self)
         values["hidden"] = list(self.hidden)
+        values["convolutions"] = [list(layer) for layer in self.convolutions]
         if self.training_start is not None:
             values["training_start"] = list(self.training_start)
         if not isinstance(self.observation, str):
@@ -301,53 +311,3 @@ def _require_fields(kind: type[TrainingConfig], names: Mapping[str, Any]) -> Non
         raise ConfigError(
             f"{kind.__name__} has no field {unknown}; valid fields are {valid}."
         )
-
-
-_KINDS = {
-    int: "an integer below 2**62",
-    float: "a finite number",
-    str: "a string",
-    bool: "true or false",
-    type(None): "None",
-}
-
-
-def _require_type(name: str, value: object, kind: Any) -> None:
-    require(_fits(value, kind), name, value, _description(kind))
-
-
-def _fits(value: object, kind: Any) -> bool:
-    """Whether a value is of an annotated type; of numbers only finite ones."""
-    origin, arguments = typing.get_origin(kind), typing.get_args(kind)
-    if origin is Literal:
-        return any(value == choice and isinstance(value, str) for choice in arguments)
-    if origin in (typing.Union, types.UnionType):
-        return any(_fits(value, argument) for argument in arguments)
-    if origin is tuple:
-        return isinstance(value, tuple) and all(_fits(v, arguments[0]) for v in value)
-    if origin is Mapping:
-        return isinstance(value, Mapping) and all(
-            isinstance(name, str) and (arguments[1] is Any or _fits(one, arguments[1]))
-            for name, one in value.items()
-        )
-    if type(value) is int and abs(value) > MAX_INTEGER:
-        return False
-    if kind is float:
-        if not isinstance(value, int | float) or isinstance(value, bool):
-            return False
-        return math.isfinite(value)
-    # A bool is an int to Python, but no number of anything.
-    return type(value) is kind
-
-
-def _description(kind: Any) -> str:
-    origin, arguments = typing.get_origin(kind), typing.get_args(kind)
-    if origin is Literal:
-        return "one of " + ", ".join(map(repr, arguments))
-    if origin in (typing.Union, types.UnionType):
-        return " or ".join(_description(argument) for argument in arguments)
-    if origin is tuple:
-        return f"a list, each entry {_description(arguments[0])}"
-    if origin is Mapping and arguments[1] is not Any:
-        return f"names, each with {_description(arguments[1])}"
-    return _KINDS.get(kind, "an object of settings")

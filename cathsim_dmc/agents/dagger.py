@@ -21,7 +21,6 @@ from cathsim_dmc.agents.networks import NetworkShapes
 from cathsim_dmc.agents.replay import ReplayMemory
 from cathsim_dmc.agents.views import view_of
 from cathsim_dmc.policies import Teacher
-from cathsim_dmc.simulation.environments import VECTOR
 
 _BEGUN = "step_count"  # control steps since an episode began
 
@@ -117,6 +116,7 @@ class DAgger:
     """The learner: a clone, fitted to all states that were visited.
 
     Attributes:
+        shapes: Sizes of what the policy reads, and of the action.
         policy: Raw observation in, action out: that of the expert or the learner.
         random_frames: Number of frames to collect with uniformly random actions
             first (none).
@@ -132,7 +132,7 @@ class DAgger:
     random_frames = 0
 
     def __init__(self, config: DAggerConfig, shapes: NetworkShapes, directory: Path):
-        self.config = config
+        self.config, self.shapes = config, shapes
         self.device = torch.device(config.torch_device)
         self.clone = Clone(config, shapes)
         self.policy: TensorDictModuleBase = self.clone.policy
@@ -174,8 +174,7 @@ class DAgger:
         config = self.config
         share = config.expert_share**self.rounds
         self.replay.extend(batch.select(*self._keys).reshape(-1))
-        if VECTOR in self._keys:
-            self.clone.observe(batch[VECTOR])
+        self.clone.observe(batch)
         rates = decaying(config.learning_rate, 0.0, config.gradient_steps)
         figures = self.clone.fit(self.replay.sample, config.batch_size, rates)
         self.rounds += 1

@@ -14,10 +14,11 @@ from cathsim_dmc.agents.networks import (
     LOG_STD_RANGE,
     GaussianActor,
     NetworkShapes,
+    Normalisers,
     make_actor,
     make_policy,
 )
-from cathsim_dmc.agents.normalisation import ObservationNormaliser
+from cathsim_dmc.agents.normalisation import ImageNormaliser, ObservationNormaliser
 
 # Beyond it an action counts as saturated: its deviation before the tanh says nothing.
 _SATURATED = 0.99
@@ -46,7 +47,7 @@ class Clone:
         self.device = torch.device(config.torch_device)
         self.policy = make_clone(shapes, config).to(self.device)
         self._keys, self._raw_keys = shapes.keys, shapes.raw_keys
-        self._normaliser = self.policy[0] if shapes.vector else None
+        self._normalisers = Normalisers(self.policy, None, config)
         self._network = network_of(self.policy)
         assert isinstance(self._network.log_std, nn.Parameter)
         self._log_std = self._network.log_std
@@ -58,10 +59,9 @@ class Clone:
             self._parameters, lr=config.learning_rate, fused=True
         )
 
-    def observe(self, observation: torch.Tensor) -> None:
-        """Take observation statistics from vectors (..., n)."""
-        if self._normaliser is not None:
-            self._normaliser.module.update(observation.to(self.device))
+    def observe(self, states: TensorDictBase) -> None:
+        """Take observation statistics from raw observations."""
+        self._normalisers.observe(states)
 
     def fit(
         self,
@@ -98,8 +98,7 @@ class Clone:
     def _means(self, states: TensorDictBase) -> tuple[torch.Tensor, torch.Tensor]:
         """Means before the tanh and the actions that are wanted."""
         states = states.select(*self._raw_keys, EXPERT_ACTION).to(self.device)
-        if self._normaliser is not None:
-            self._normaliser(states)
+        self._normalisers.add(states)
         mean, _ = self._network(*(states[key] for key in self._keys))
         return mean, states[EXPERT_ACTION]
 
@@ -128,10 +127,10 @@ def network_of(policy: nn.Module) -> GaussianActor:
     return next(m for m in policy.modules() if isinstance(m, GaussianActor))
 
 
-def normaliser_of(policy: nn.Module) -> ObservationNormaliser | None:
-    """The observation statistics of a policy; None if it reads images alone."""
-    found = (m for m in policy.modules() if isinstance(m, ObservationNormaliser))
-    return next(found, None)
+def statistics_of(policy: nn.Module) -> list[nn.Module]:
+    """The observation statistics of a policy."""
+    kinds = ObservationNormaliser, ImageNormaliser
+    return [module for module in policy.modules() if isinstance(module, kinds)]
 
 
 def decaying(start: float, stop: float, steps: int) -> torch.Tensor:

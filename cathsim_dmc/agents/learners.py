@@ -29,12 +29,14 @@ class Learner(Protocol[Settings]):
         random_frames: Number of frames to collect with uniformly random actions
             first; the observation statistics then come from those.
         device: Torch device of the networks.
+        shapes: Sizes of what the policy reads, and of the action.
         policy: Raw observation in, sampled action out.
     """
 
     metrics: ClassVar[tuple[str, ...]]
     random_frames: int
     device: torch.device
+    shapes: NetworkShapes
     policy: TensorDictModuleBase
 
     def __init__(self, config: Settings, shapes: NetworkShapes, directory: Path):
@@ -42,7 +44,7 @@ class Learner(Protocol[Settings]):
 
         Args:
             config: Settings of the algorithm.
-            shapes: Sizes of observation and action.
+            shapes: Sizes of the observation that is collected, and of the action.
             directory: Directory of the run, for what the algorithm keeps on disk.
         """
 

@@ -1,24 +1,25 @@
 """The published networks, for vector observations, images, or both."""
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
-from typing import Any
+from dataclasses import asdict, dataclass, replace
+from typing import Any, cast
 
 import torch
+from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule, TensorDictSequential
 from torch import nn
 from torchrl.envs import EnvBase
 from torchrl.modules import ProbabilisticActor, TanhNormal, ValueOperator
 
-from cathsim_dmc.agents.config import TrainingConfig
-from cathsim_dmc.agents.normalisation import ObservationNormaliser
+from cathsim_dmc.agents.actor_critic import ActorCriticConfig
+from cathsim_dmc.agents.config import ConfigError, TrainingConfig
+from cathsim_dmc.agents.normalisation import ImageNormaliser, ObservationNormaliser
 from cathsim_dmc.simulation.environments import PIXELS, VECTOR
+from cathsim_dmc.tasks import observations
 
-# The normalised vector: what the networks read in place of VECTOR.
+# What the networks read in place of VECTOR and PIXELS.
 NORMAL = "observation_normal"
-
-# (filters, kernel, stride) of the published convolutions.
-CONVOLUTIONS = ((32, 8, 4), (64, 4, 2), (64, 3, 1))
+NORMAL_PIXELS = "pixels_normal"
 
 # A deviation below exp(-5) before the tanh no longer explores; above exp(2) all
 # actions sit at their bounds.
@@ -88,6 +89,29 @@ class NetworkShapes:
         """JSON-able values."""
         return asdict(self)
 
+    def split(
+        self, config: ActorCriticConfig
+    ) -> "tuple[NetworkShapes, NetworkShapes | None]":
+        """Sizes of what the policy reads and of what the critic reads.
+
+        Returns:
+            The parts of what is collected; None for a critic that reads the same.
+
+        Raises:
+            ConfigError: the critic is to read something else, but the policy does not
+                read images alone or the critic does not read vectors alone.
+        """
+        critic = config.critic_observation
+        if critic is None:
+            return self, None
+        if not _are_images(config.observation, True) or not _are_images(critic, False):
+            raise ConfigError(
+                f"critic_observation={critic!r} beside observation="
+                f"{config.observation!r} is not allowed: the policy must read images "
+                'alone and the critic vectors alone, such as "image" and "internal".'
+            )
+        return replace(self, vector=0), replace(self, pixels=None)
+
     @property
     def raw_keys(self) -> list[str]:
         """Keys of the observation as the environment gives it."""
@@ -96,28 +120,42 @@ class NetworkShapes:
     @property
     def keys(self) -> list[str]:
         """Keys that the networks read."""
-        return [NORMAL] * (self.vector > 0) + [PIXELS] * (self.pixels is not None)
+        images = self.pixels is not None
+        return [NORMAL] * (self.vector > 0) + [NORMAL_PIXELS] * images
+
+
+def _are_images(names: str | tuple[str, ...], images: bool) -> bool:
+    """Whether all the entries of observations are images, or all are vectors."""
+    chosen = observations.resolve(names)
+    specs = observations.entry_specs(chosen, observations.ImageOptions())
+    return all((spec is not None) == images for spec in specs.values())
 
 
 class Convolutions(nn.Module):
-    """Images (..., C, H, W) uint8 to features (..., features) float32."""
+    """Normalised images (..., C, H, W) to features (..., features)."""
 
-    def __init__(self, shape: tuple[int, int, int], features: int):
+    def __init__(self, shape: tuple[int, int, int], config: TrainingConfig):
         super().__init__()
         layers: list[nn.Module] = []
-        channels = shape[0]
-        for filters, kernel, stride in CONVOLUTIONS:
+        channels, *size = shape
+        for filters, kernel, stride in config.convolutions:
+            if min(size) < kernel:
+                raise ConfigError(
+                    f"convolutions={config.convolutions!r} do not fit images of "
+                    f"{shape[1]} x {shape[2]} pixels: one of {kernel} x {kernel} "
+                    f"meets {size[0]} x {size[1]}; give fewer or smaller ones."
+                )
+            size = [(length - kernel) // stride + 1 for length in size]
             layers += [nn.Conv2d(channels, filters, kernel, stride), nn.ReLU()]
             channels = filters
         self.filters = nn.Sequential(*layers, nn.Flatten(-3))
-        with torch.no_grad():
-            size = self.filters(torch.zeros(1, *shape)).shape[-1]
-        self.head = nn.Sequential(nn.Linear(size, features), nn.ReLU())
+        entries = channels * size[0] * size[1]
+        self.head = nn.Sequential(nn.Linear(entries, config.cnn_features), nn.ReLU())
 
     def forward(self, pixels: torch.Tensor) -> torch.Tensor:
-        """Scale to [0, 1] here, so that storage keeps bytes."""
+        """Take any number of dimensions before the channels."""
         batch = pixels.shape[:-3]
-        flat = pixels.reshape(-1, *pixels.shape[-3:]).float() / 255.0
+        flat = pixels.reshape(-1, *pixels.shape[-3:])
         return self.head(self.filters(flat)).reshape(*batch, -1)
 
 
@@ -133,7 +171,7 @@ class Body(nn.Module):
         self.convolutions: Convolutions | None = None
         size = shapes.vector + actions
         if shapes.pixels is not None:
-            self.convolutions = Convolutions(shapes.pixels, config.cnn_features)
+            self.convolutions = Convolutions(shapes.pixels, config)
             size += config.cnn_features
         self.has_vector = shapes.vector > 0
         layers: list[nn.Module] = []
@@ -231,17 +269,62 @@ def make_q_function(shapes: NetworkShapes, config: TrainingConfig) -> ValueOpera
     return ValueOperator(network, in_keys=[*shapes.keys, "action"])
 
 
-def make_normaliser(shapes: NetworkShapes, config: TrainingConfig) -> TensorDictModule:
-    """The module that turns the raw vector into the networks' input."""
-    module = ObservationNormaliser(shapes.vector, config.observation_clip)
-    return TensorDictModule(module, in_keys=[VECTOR], out_keys=[NORMAL])
+def make_normalisers(
+    shapes: NetworkShapes, config: TrainingConfig
+) -> list[TensorDictModule]:
+    """The modules that turn raw observations into what the networks read."""
+    modules: list[TensorDictModule] = []
+    if shapes.vector:
+        vector = ObservationNormaliser(shapes.vector, config.observation_clip)
+        modules.append(TensorDictModule(vector, in_keys=[VECTOR], out_keys=[NORMAL]))
+    if shapes.pixels is not None:
+        images = ImageNormaliser(shapes.pixels, config.subtract_background)
+        modules.append(
+            TensorDictModule(images, in_keys=[PIXELS], out_keys=[NORMAL_PIXELS])
+        )
+    return modules
+
+
+class Normalisers:
+    """The normalisers that a learner needs: of its policy, and of its critic.
+
+    Attributes:
+        critics: Those of what the critic alone reads; none if it reads what the policy
+            reads. The state of the others is that of the policy.
+    """
+
+    def __init__(
+        self,
+        policy: TensorDictSequential,
+        critic_shapes: NetworkShapes | None,
+        config: TrainingConfig,
+    ):
+        """Takes the sizes of what the critic reads, None for those of the policy."""
+        self._policys = cast(list[TensorDictModule], list(policy.module)[:-1])
+        own = [] if critic_shapes is None else make_normalisers(critic_shapes, config)
+        self.critics = nn.ModuleList(own).to(config.torch_device)
+        self._all = [*self._policys, *own]
+
+    def observe(self, batch: TensorDictBase) -> None:
+        """Take observation statistics from raw observations."""
+        for module in self._all:
+            statistics = cast(ObservationNormaliser | ImageNormaliser, module.module)
+            raw = batch[module.in_keys[0]]
+            statistics.update(raw.to(statistics.mean.device))
+
+    def add(self, batch: TensorDictBase) -> None:
+        """Add what policy and critic read to raw observations."""
+        for module in self._all:
+            module(batch)
+
+    def add_for_critic(self, batch: TensorDictBase) -> None:
+        """Add what the critic reads to raw observations."""
+        for module in self.critics or self._policys:
+            module(batch)
 
 
 def make_policy(
     shapes: NetworkShapes, config: TrainingConfig, actor: ProbabilisticActor
 ) -> TensorDictSequential:
-    """Normaliser and actor in one: raw observation in, action out."""
-    modules: list[nn.Module] = []
-    if shapes.vector:
-        modules.append(make_normaliser(shapes, config))
-    return TensorDictSequential(*modules, actor)
+    """Normalisers and actor in one: raw observation in, action out."""
+    return TensorDictSequential(*make_normalisers(shapes, config), actor)

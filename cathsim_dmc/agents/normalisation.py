@@ -1,4 +1,4 @@
-"""Running statistics of a vector observation, frozen wherever nothing learns."""
+"""Running statistics of observations, frozen wherever nothing learns."""
 
 import torch
 from torch import nn
@@ -9,6 +9,9 @@ RELATIVE_FLOOR = 1e-6
 # Spread below which an entry counts as constant whatever its mean. Inertias of the
 # links are about 1e-9 kg m^2 and must stay above it.
 ABSOLUTE_FLOOR = 1e-13
+# Grey levels of an image that the networks read as 1 after subtraction: about the
+# shadow of a device.
+SHADOW = 32.0
 
 
 class ObservationNormaliser(nn.Module):
@@ -70,3 +73,42 @@ class ObservationNormaliser(nn.Module):
         floor = (RELATIVE_FLOOR * self.mean.abs()).clamp_min(ABSOLUTE_FLOOR)
         self.shift.copy_(self.mean)
         self.scale.copy_(torch.where(spread > floor, 1.0 / spread, 0.0))
+
+
+class ImageNormaliser(nn.Module):
+    """Images as networks read them: brightness, or difference from the mean image.
+
+    Of a fluoroscopic image only the few pixels at the device change, by some 30 of 255
+    levels; from the brightness a network learns next to nothing (docs/training.md).
+    Subtracting the mean of all images leaves them alone, as digital subtraction
+    angiography does with a mask image. The mean changes only in `update`.
+
+    Args:
+        shape: channels, height and width of the images.
+        subtract: whether to subtract the mean image.
+    """
+
+    count: torch.Tensor
+    mean: torch.Tensor
+
+    def __init__(self, shape: tuple[int, int, int], subtract: bool):
+        super().__init__()
+        self.subtract = subtract
+        self.register_buffer("count", torch.zeros((), dtype=torch.float64))
+        self.register_buffer("mean", torch.zeros(shape))
+
+    def forward(self, pixels: torch.Tensor) -> torch.Tensor:
+        """Turn bytes (..., c, h, w) into float32."""
+        if self.subtract:
+            return (pixels.float() - self.mean) / SHADOW
+        return pixels.float() / 255.0
+
+    @torch.no_grad()
+    def update(self, pixels: torch.Tensor) -> None:
+        """Merge images (..., c, h, w) into the mean."""
+        if not self.subtract:
+            return
+        images = pixels.reshape(-1, *self.mean.shape)
+        self.count += len(images)
+        difference = images.float().mean(0) - self.mean
+        self.mean += difference * float(len(images) / self.count)

@@ -16,22 +16,22 @@ from torchrl.envs import EnvBase
 from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.value import GAE
 
-from cathsim_dmc.agents.config import (
+from cathsim_dmc.agents.actor_critic import (
+    TUNED_IMAGES,
     TUNED_TRAINING,
-    ConfigError,
-    TrainingConfig,
-    require,
+    ActorCriticConfig,
 )
+from cathsim_dmc.agents.config import ConfigError, TrainingConfig, require
 from cathsim_dmc.agents.exploration import CorrelatedExploration, CorrelatedNoise
 from cathsim_dmc.agents.networks import (
     GaussianActor,
     NetworkShapes,
+    Normalisers,
     make_actor,
     make_critic,
     make_policy,
     orthogonal_,
 )
-from cathsim_dmc.simulation.environments import VECTOR
 
 # Larger minibatches and fewer passes: about a tenth of the published cost of learning
 # per frame.
@@ -43,11 +43,21 @@ _LARGE_BATCHES: Mapping[str, Any] = {
     "clip": 0.2,
     "target_kl": 0.05,
 }
+# Exploration noise that bends the whole tip for a while (docs/training.md).
+_TUNED: Mapping[str, Any] = {
+    **_LARGE_BATCHES,
+    **TUNED_TRAINING,
+    "hidden": (128, 128),
+    "initial_deviation": 0.7,
+    "noise_correlation": 0.9,
+    "noise_shared": 0.8,
+    "total_frames": 300_000,
+}
 _TERMS = ("loss_objective", "loss_critic", "loss_entropy")
 
 
 @dataclass(frozen=True, kw_only=True)
-class PPOConfig(TrainingConfig):
+class PPOConfig(ActorCriticConfig):
     """PPO with the settings of the published agents.
 
     `steps_per_update` counts frames over all environments together. That keeps the
@@ -81,16 +91,8 @@ class PPOConfig(TrainingConfig):
     presets: ClassVar[Mapping[str, Mapping[str, Any]]] = {
         "published": {},
         "demo": {**_LARGE_BATCHES, "anneal": True},
-        # Exploration noise that bends the whole tip for a while (docs/training.md).
-        "tuned": {
-            **_LARGE_BATCHES,
-            **TUNED_TRAINING,
-            "hidden": (128, 128),
-            "initial_deviation": 0.7,
-            "noise_correlation": 0.9,
-            "noise_shared": 0.8,
-            "total_frames": 300_000,
-        },
+        "tuned": _TUNED,
+        "tuned_image": {**_TUNED, **TUNED_IMAGES},
     }
 
     steps_per_update: int = 512
@@ -158,6 +160,7 @@ class PPO:
     """The learner: a policy to collect with, and an update from what it collected.
 
     Attributes:
+        shapes: Sizes of what the policy reads, and of the action.
         policy: Raw observation in, sampled action and its log-probability out.
         random_frames: Number of frames to collect with uniformly random actions
             first (none).
@@ -180,11 +183,12 @@ class PPO:
         del directory  # It keeps nothing on disk.
         self.config = config
         self.device = torch.device(config.torch_device)
-        self.network = self.make_policy(shapes, config).to(self.device)
+        self.shapes, critic_shapes = shapes.split(config)
+        self.network = self.make_policy(self.shapes, config).to(self.device)
         self.policy: TensorDictModuleBase = self.network
         self.actor = self.network[-1]
-        self.normaliser = self.network[0] if shapes.vector else None
-        self.critic = make_critic(shapes, config).to(self.device)
+        self.critic = make_critic(critic_shapes or self.shapes, config).to(self.device)
+        self.normalisers = Normalisers(self.network, critic_shapes, config)
         self.loss = ClipPPOLoss(
             self.actor,
             self.critic,
@@ -208,7 +212,8 @@ class PPO:
             self.parameters, lr=config.learning_rate, eps=1e-5, fused=True
         )
         self.loss_keys = [
-            *shapes.keys,
+            *self.shapes.keys,
+            *(critic_shapes.keys if critic_shapes else []),
             "action",
             "action_log_prob",
             "advantage",
@@ -245,8 +250,7 @@ class PPO:
 
     def observe(self, batch: TensorDictBase) -> None:
         """Take observation statistics from a batch without learning from it."""
-        if self.normaliser is not None:
-            self.normaliser.module.update(batch[VECTOR].to(self.device))
+        self.normalisers.observe(batch)
 
     def update(self, batch: TensorDictBase, progress: float) -> dict[str, float]:
         """Learn from a batch (num_envs, steps) collected with the current policy.
@@ -298,8 +302,8 @@ class PPO:
         terminated one is worth nothing afterwards: GAE reads both flags.
         """
         following = batch["next"]
-        if self.normaliser is not None:
-            self.normaliser(following)
+        self.normalisers.add_for_critic(batch)
+        self.normalisers.add_for_critic(following)
         self.critic(batch)
         self.critic(following)
         self.advantage(batch)
@@ -328,11 +332,14 @@ class PPO:
             "critic": self.critic.state_dict(),
             "optimiser": self.optimiser.state_dict(),
             "gradient_steps": self.gradient_steps,
+            "normalisers": self.normalisers.critics.state_dict(),
         }
 
     def load(self, policy: dict[str, Any], learning: dict[str, Any]) -> None:
         """Restore what policy_state and learning_state gave."""
         self.network.load_state_dict(policy)
         self.critic.load_state_dict(learning["critic"])
+        # Older checkpoints have no critic that reads something else.
+        self.normalisers.critics.load_state_dict(learning.get("normalisers", {}))
         self.optimiser.load_state_dict(learning["optimiser"])
         self.gradient_steps = learning["gradient_steps"]

@@ -13,26 +13,41 @@ from tensordict.nn import TensorDictSequential
 from torchrl.envs import EnvBase
 from torchrl.objectives import SACLoss, SoftUpdate
 
-from cathsim_dmc.agents.config import TUNED_TRAINING, TrainingConfig, require
+from cathsim_dmc.agents.actor_critic import (
+    TUNED_IMAGES,
+    TUNED_TRAINING,
+    ActorCriticConfig,
+)
+from cathsim_dmc.agents.config import require
 from cathsim_dmc.agents.demonstrations import load_transitions
 from cathsim_dmc.agents.networks import (
     GaussianActor,
     NetworkShapes,
+    Normalisers,
     make_actor,
     make_policy,
     make_q_function,
 )
 from cathsim_dmc.agents.replay import ReplayMemory
-from cathsim_dmc.simulation.environments import VECTOR
 
 # 2 GiB hold about 270,000 transitions of the internal observation.
 REPLAY_BYTES = 2 * 1024**3
 
+# The weight of the entropy must start near the size of a step's reward (0.05): at 0.1
+# and above the actions stay random for tens of thousands of frames.
+_TUNED: Mapping[str, Any] = {
+    **TUNED_TRAINING,
+    "updates_per_frame": 0.25,
+    "hidden": (256, 256),
+    "activation": "relu",
+    "initial_alpha": 1e-3,
+    "total_frames": 60_000,
+}
 _TERMS = ("loss_actor", "loss_qvalue", "loss_alpha")
 
 
 @dataclass(frozen=True, kw_only=True)
-class SACConfig(TrainingConfig):
+class SACConfig(ActorCriticConfig):
     """SAC with twin critics and a learned entropy weight.
 
     Attributes:
@@ -58,16 +73,8 @@ class SACConfig(TrainingConfig):
     presets: ClassVar[Mapping[str, Mapping[str, Any]]] = {
         "published": {},
         "demo": {"num_envs": 32, "updates_per_frame": 0.25},
-        # The weight of the entropy must start near the size of a step's reward (0.05):
-        # at 0.1 and above the actions stay random for tens of thousands of frames.
-        "tuned": {
-            **TUNED_TRAINING,
-            "updates_per_frame": 0.25,
-            "hidden": (256, 256),
-            "activation": "relu",
-            "initial_alpha": 1e-3,
-            "total_frames": 60_000,
-        },
+        "tuned": _TUNED,
+        "tuned_image": {**_TUNED, **TUNED_IMAGES},
     }
 
     batch_size: int = 256
@@ -120,6 +127,7 @@ class SAC:
     when sampled, so old and new transitions agree.
 
     Attributes:
+        shapes: Sizes of what the policy reads, and of the action.
         policy: Raw observation in, sampled action out.
         random_frames: Number of frames to collect with uniformly random actions
             first.
@@ -139,10 +147,13 @@ class SAC:
         self.config = config
         self.device = torch.device(config.torch_device)
         self.random_frames = config.random_frames
-        self.policy = self.make_policy(shapes, config).to(self.device)
+        self.shapes, critic_shapes = shapes.split(config)
+        self.policy = self.make_policy(self.shapes, config).to(self.device)
         self.actor = self.policy[-1]
-        self.normaliser = self.policy[0] if shapes.vector else None
-        q_function = make_q_function(shapes, config).to(self.device)
+        self.normalisers = Normalisers(self.policy, critic_shapes, config)
+        q_function = make_q_function(critic_shapes or self.shapes, config).to(
+            self.device
+        )
         target = config.target_entropy
         self.loss = SACLoss(
             self.actor,
@@ -170,7 +181,9 @@ class SAC:
         ]
         self.demonstrations: TensorDictBase | None = None
         if config.demonstrations is not None:
-            shown = load_transitions(config.demonstrations, config.observation, shapes)
+            shown = load_transitions(
+                config.demonstrations, config.collected_observation, shapes
+            )
             self.demonstrations = shown.select(*self.replay_keys)
             self.observe(shown)
         self.gradient_steps = 0
@@ -187,8 +200,7 @@ class SAC:
 
     def observe(self, batch: TensorDictBase) -> None:
         """Take observation statistics from a batch without learning from it."""
-        if self.normaliser is not None:
-            self.normaliser.module.update(batch[VECTOR].to(self.device))
+        self.normalisers.observe(batch)
 
     def update(self, batch: TensorDictBase, progress: float) -> dict[str, float]:
         """Store a batch (num_envs, steps) and take the gradient steps it pays for.
@@ -221,9 +233,8 @@ class SAC:
 
     def _step(self) -> dict[str, torch.Tensor]:
         sample = self._sample(self.config.batch_size).to(self.device)
-        if self.normaliser is not None:
-            self.normaliser(sample)
-            self.normaliser(sample["next"])
+        self.normalisers.add(sample)
+        self.normalisers.add(sample["next"])
         losses = self.loss(sample)
         # Each term has gradients for its own parameters only, so one sum serves.
         loss = functools.reduce(operator.add, (losses[name] for name in _TERMS))
@@ -259,11 +270,14 @@ class SAC:
             "replay": self.replay.state(),
             "gradient_steps": self.gradient_steps,
             "owed_steps": self.owed_steps,
+            "normalisers": self.normalisers.critics.state_dict(),
         }
 
     def load(self, policy: dict[str, Any], learning: dict[str, Any]) -> None:
         """Restore what policy_state and learning_state gave."""
         self.policy.load_state_dict(policy)
+        # Older checkpoints have no critic that reads something else.
+        self.normalisers.critics.load_state_dict(learning.get("normalisers", {}))
         state = self.loss.state_dict()
         for name, value in learning["loss"].items():
             state[name] = value

@@ -101,10 +101,9 @@ def train(
         stack.enter_context(_torch_threads(config.torch_threads))
         env = _make_environment(config, checkpoint, make_env)
         torch.manual_seed(config.seed)
-        shapes = NetworkShapes.of(env)
-        learner = make_learner(config, shapes, run)
+        learner = make_learner(config, NetworkShapes.of(env), run)
         learner.attach(env)
-        state = _start(learner, env, config, shapes, checkpoint)
+        state = _start(learner, env, config, checkpoint)
         make_source = COLLECTORS[config.collector]
         source = make_source(config, learner, env, make_env, state["frames"])
         stack.callback(source.shutdown)
@@ -122,7 +121,7 @@ def train(
             progress=progress,
         )
         stack.enter_context(log)
-        saver = _Saver(run, config, shapes, learner, log, checkpoint, recorder)
+        saver = _Saver(run, config, learner, log, checkpoint, recorder)
         interruption = stack.enter_context(Interruption())
         _loop(config, source, learner, log, saver, interruption)
         # However the loop ended; writes nothing if the last batch has just been saved.
@@ -179,7 +178,7 @@ def _make_environment(
     seed = int(np.random.SeedSequence([config.seed, frames]).generate_state(1)[0])
     return make_env(
         config.task,
-        observation=config.observation,
+        observation=config.collected_observation,
         num_envs=config.num_envs,
         num_threads=config.num_threads,
         seed=seed % 2**31,
@@ -192,7 +191,6 @@ def _start(
     learner: Learner,
     env: EnvBase,
     config: TrainingConfig,
-    shapes: NetworkShapes,
     checkpoint: Checkpoint | None,
 ) -> dict[str, Any]:
     """Give a learner what a checkpoint holds, another's policy, or its first look.
@@ -204,7 +202,7 @@ def _start(
     """
     if checkpoint is None:
         if config.initial_policy is not None:
-            take_over(learner.policy, config, shapes)
+            take_over(learner.policy, config, learner.shapes)
         elif not learner.random_frames:
             _observe_random_actions(env, learner, config)
         return {"frames": 0, "seconds": 0.0, "episodes": 0, "window": []}
@@ -248,7 +246,6 @@ class _Saver:
         self,
         run: Path,
         config: TrainingConfig,
-        shapes: NetworkShapes,
         learner: Learner,
         log: TrainingLog,
         checkpoint: Checkpoint | None,
@@ -256,7 +253,7 @@ class _Saver:
     ):
         self.newest = checkpoint.path if checkpoint else None
         self._recorder = recorder
-        self._run, self._config, self._shapes = run, config, shapes
+        self._run, self._config = run, config
         self._learner, self._log = learner, log
         self._frames, self._time = log.frames, time.monotonic()
 
@@ -272,7 +269,7 @@ class _Saver:
         self.newest = save_checkpoint(
             self._run,
             config=self._config,
-            shapes=self._shapes,
+            shapes=self._learner.shapes,
             frames=self._log.frames,
             seconds=self._log.seconds,
             policy=self._learner.policy_state(),

@@ -5,11 +5,19 @@ from torch import nn
 
 from cathsim_dmc.agents.checkpoint import Checkpoint
 from cathsim_dmc.agents.config import ConfigError, TrainingConfig
-from cathsim_dmc.agents.imitation import network_of, normaliser_of
+from cathsim_dmc.agents.imitation import network_of, statistics_of
 from cathsim_dmc.agents.networks import LOG_STD_RANGE, NetworkShapes
 
 # What must agree for the weights to mean the same.
-_ALIKE = ("observation", "hidden", "activation", "cnn_features", "observation_clip")
+_ALIKE = (
+    "observation",
+    "hidden",
+    "activation",
+    "subtract_background",
+    "convolutions",
+    "cnn_features",
+    "observation_clip",
+)
 
 
 def take_over(policy: nn.Module, config: TrainingConfig, shapes: NetworkShapes) -> None:
@@ -47,8 +55,9 @@ def take_over(policy: nn.Module, config: TrainingConfig, shapes: NetworkShapes) 
     ours.mean.load_state_dict(theirs.mean.state_dict())
     with torch.no_grad():
         _set_deviation(ours.log_std, theirs.log_std, config.initial_std)
-    statistics, own = normaliser_of(given), normaliser_of(policy)
-    if statistics is not None and own is not None:
+    for own, statistics in zip(
+        statistics_of(policy), statistics_of(given), strict=True
+    ):
         own.load_state_dict(statistics.state_dict())
 
 

@@ -6,7 +6,6 @@ import io
 import math
 import os
 import stat
-import zipfile
 from pathlib import Path
 from typing import Any
 
@@ -85,13 +84,8 @@ def read_arrays(data: bytes, path: Path) -> dict[str, np.ndarray]:
         ValueError: if it is damaged or its arrays would fill the memory.
     """
     try:
-        with zipfile.ZipFile(io.BytesIO(data)) as archive:
-            size = sum(entry.file_size for entry in archive.infolist())
-        if size > LARGEST_ARRAYS:
-            raise ValueError(f"its arrays unpack to {size:,} bytes")
-        with np.load(io.BytesIO(data), allow_pickle=False) as archive:
-            return {key: archive[key] for key in archive.files}
-    except files.DAMAGED_ARCHIVE as error:
+        return files.read_arrays(io.BytesIO(data), LARGEST_ARRAYS)
+    except ValueError as error:
         raise ValueError(f"{path} is damaged: {error}.") from error
 
 

@@ -37,6 +37,7 @@ def episode_blueprint(
     head: Sequence[float],
     robot: Sequence[float] | None,
     heights: Mapping[str, tuple[float, float]],
+    rotation: bool = False,
 ) -> rrb.Blueprint:
     """Return the layout: scene on the left, X-ray in the middle, series on the right.
 
@@ -48,6 +49,7 @@ def episode_blueprint(
         head: (3,) where the head is at first, metres.
         robot: (3,) where the robot is, or None if the recording has none.
         heights: Lowest and highest value of the plots "reward" and "force".
+        rotation: Whether the recording has ``series/rotation_deg``, of coaxial devices.
     """
     middle = np.asarray(centre, dtype=np.float64)
     insets: list[rrb.View] = [_tip(np.asarray(head, dtype=np.float64))]
@@ -73,6 +75,8 @@ def episode_blueprint(
             _plot("All actions", "series/action_all"),
         ),
     ]
+    if rotation:
+        plots.insert(3, _plot("Rotation, °", "series/rotation_deg", None, legend=True))
     if distance:
         plots.insert(1, _plot("Distance to goal, mm", "series/distance_mm"))
     columns = [scene, rrb.Vertical(*images, texts), rrb.Vertical(*plots)]

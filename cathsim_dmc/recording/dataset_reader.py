@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from cathsim_dmc import files
+from cathsim_dmc import bounds, files
 
 METADATA = "metadata.json"
 _ARRAYS = "main_data.hdf5"
@@ -74,7 +74,7 @@ def read_metadata(path: str | Path) -> dict[str, Any]:
         )
     if values.get("jpeg_encoding") is not False:
         raise DatasetError(
-            f"{path} holds images as JPEG, which loses what they show; write it anew "
+            f"{file} says images are JPEG, which loses what they show; write it anew "
             "with jpeg_encoding=False"
         )
     return values
@@ -102,8 +102,12 @@ def read_episodes(path: str | Path) -> Iterator[DatasetEpisode]:
         with h5py.File(file, "r") as whole:
             for index in range(len(whole)):
                 yield _episode(_Group(file, whole, f"episode_{index}"))
-    except (OSError, KeyError) as error:
-        raise DatasetError(f"{file} cannot be read: {error}") from error
+    except DatasetError:
+        raise
+    # What h5py raises where the file is damaged.
+    except (OSError, KeyError, ValueError, TypeError, RuntimeError) as error:
+        line = " ".join(str(error).split())
+        raise DatasetError(f"{file} cannot be read: {line}") from error
 
 
 def _data(path: str | Path) -> Path:
@@ -122,8 +126,12 @@ class _Group:
     """A group of an HDF5 file that is looked at with care."""
 
     def __init__(self, file: Path, parent: Any, name: str):
+        import h5py
+
         self._file, self._name = file, name
         self._group = self._hard(parent, name)
+        if not isinstance(self._group, h5py.Group):
+            raise DatasetError(f"{file}: {name} must be a group of arrays")
 
     def _hard(self, parent: Any, name: str) -> Any:
         """A member that lies in this file."""
@@ -136,9 +144,15 @@ class _Group:
         return parent[name]
 
     @property
-    def attributes(self) -> Any:
-        """Attributes of the group."""
-        return self._group.attrs
+    def seed(self) -> int | None:
+        """Seed that is noted as an attribute."""
+        given = self._group.attrs.get("seed")
+        if given is None:
+            return None
+        try:
+            return bounds.whole("seed", given, 0)
+        except ValueError as error:
+            raise DatasetError(f"{self._file}: {self._name}: {error}") from error
 
     def __contains__(self, name: str) -> bool:
         """Whether there is a member of that name."""
@@ -150,10 +164,10 @@ class _Group:
 
         found = self._hard(self._group, name)
         plain = isinstance(found, h5py.Dataset) and found.dtype.kind in "biuf"
-        if not plain or found.is_virtual or found.external:
+        if not plain or not found.shape or found.is_virtual or found.external:
             raise DatasetError(
                 f"{self._file}: {self._name}/{name} must be an array of numbers in "
-                "this file"
+                "this file, with a row for each step"
             )
         if found.nbytes > _MAX_ARRAY:
             raise DatasetError(
@@ -168,9 +182,8 @@ class _Group:
 
 
 def _episode(group: _Group) -> DatasetEpisode:
-    seed = group.attributes.get("seed")
     episode = DatasetEpisode(
-        seed=None if seed is None else int(seed),
+        seed=group.seed,
         observations=group.arrays("observations"),
         actions=group.array("actions"),
         rewards=group.array("rewards"),
@@ -189,8 +202,13 @@ def _episode(group: _Group) -> DatasetEpisode:
         raise DatasetError(
             f"{group._file}: {group._name} has {steps} actions, and {wrong} do not fit"
         )
-    for name in ("actions", "rewards"):
-        if not np.isfinite(getattr(episode, name)).all():
+    numbers = {
+        "actions": episode.actions,
+        "rewards": episode.rewards,
+        **{f"observations/{name}": v for name, v in episode.observations.items()},
+    }
+    for name, values in numbers.items():
+        if not np.isfinite(values).all():
             raise DatasetError(f"{group._file}: {group._name}: {name} are not finite")
     return episode
 

@@ -15,11 +15,12 @@ from typing import Any
 
 import numpy as np
 
-from cathsim_dmc.files import DAMAGED_ARCHIVE, atomic_path
+from cathsim_dmc.files import atomic_path, read_arrays
 
 FORMAT = "cathsim-episode"
 FORMAT_VERSION = 1
 SUFFIX = ".npz"
+_LARGEST = 4_000_000_000  # bytes of all arrays, unpacked
 TERMINATIONS = ("success", "truncated", "physics_error")
 
 # A unit quaternion out of MuJoCo's float64 arithmetic is off by rounding only; this
@@ -241,22 +242,26 @@ class Episode:
         if not path.is_file():
             raise FileNotFoundError(f"no episode at {path}")
         try:
-            with np.load(path, allow_pickle=False) as archive:
-                header = json.loads(str(archive["header"][()]))
-                arrays = {name: archive[name] for name in _AXES}
-        except (*DAMAGED_ARCHIVE, TypeError) as error:
+            arrays = read_arrays(path, _LARGEST, ("header", *_AXES))
+            header = json.loads(str(arrays.pop("header")))
+        except (ValueError, RecursionError) as error:
             raise ValueError(
                 f"{path} is not an episode written by Episode.save: {error}"
             ) from error
         if not isinstance(header, dict) or header.get("format") != FORMAT:
             raise ValueError(f"{path} is an archive of another kind, not an episode")
-        if header.get("version") != FORMAT_VERSION:
+        if repr(header.get("version")) != repr(FORMAT_VERSION):  # True is no 1
             raise ValueError(
                 f"{path} has episode format {header.get('version')!r}; this version "
                 f"reads {FORMAT_VERSION}: record it again or use the version of "
                 "cathsim_dmc that wrote it"
             )
-        return cls(header["task"], header["seed"], header["meta"], **arrays)
+        try:
+            return cls(header["task"], header["seed"], header["meta"], **arrays)
+        except KeyError as error:
+            raise ValueError(f"{path} lacks the entry {error}") from error
+        except ValueError as error:
+            raise ValueError(f"{path}: {error}") from error
 
     def equals(self, other: Episode) -> bool:
         """Whether both hold the same values, bit for bit."""

@@ -20,6 +20,7 @@ from rerun.error_utils import catch_and_log_exceptions
 
 from cathsim_dmc.files import atomic_path
 from cathsim_dmc.recording import blueprint
+from cathsim_dmc.recording.coaxial import CoaxialRecord
 from cathsim_dmc.recording.drawing import Drawing, goal_distance
 from cathsim_dmc.recording.episode import Episode
 from cathsim_dmc.recording.rerun_device import log_catheter, log_contacts
@@ -157,6 +158,7 @@ def layout_of(episode: Episode, drawing: Drawing) -> Blueprint:
         extent=float((high - low).max()),
         planes=planes,
         distance=goal_distance(episode) is not None,
+        rotation=CoaxialRecord.of(episode) is not None,
         head=episode.head[0],
         robot=robot,
         heights=_heights(episode),

@@ -13,6 +13,8 @@ from urllib.parse import quote, urlsplit
 
 # First bytes of every recording of the current format.
 _MAGIC = b"RRF2"
+# Near the end of every whole one, before four bytes of a checksum.
+_FOOTER, _FOOTER_AT = b"RRF2FOOT", -12
 _SUFFIX = ".rrd"
 LOOPBACK = "127.0.0.1"
 WEB_PORT = 9090
@@ -29,21 +31,29 @@ class ViewerError(RuntimeError):
 
 
 def check_recording(path: str | os.PathLike[str]) -> Path:
-    """Return the absolute path of a recording after looking at its first bytes.
+    """Return the absolute path of a recording after looking at both of its ends.
 
     Raises:
         FileNotFoundError: if there is no such file.
-        ValueError: if it is not a Rerun recording.
+        ValueError: if it is not a Rerun recording, or only the beginning of one.
     """
     path = Path(path)
     if not path.is_file():
         raise FileNotFoundError(f"no recording at {path}")
     with open(path, "rb") as stream:
         start = stream.read(len(_MAGIC))
+        stream.seek(0, os.SEEK_END)
+        stream.seek(max(0, stream.tell() + _FOOTER_AT))
+        end = stream.read(len(_FOOTER))
     if path.suffix != _SUFFIX or start != _MAGIC:
         raise ValueError(
             f"{path} is not a Rerun recording (*{_SUFFIX}); write one with write_rrd, "
             "or bring an older one up to date with `rerun rrd migrate`"
+        )
+    if end != _FOOTER:
+        raise ValueError(
+            f"{path} is cut off: the end of a recording is missing; record it again, "
+            "or complete one that an older Rerun wrote with `rerun rrd migrate`"
         )
     return path.resolve()
 

@@ -17,8 +17,6 @@ from cathsim_dmc.tasks.variations import Randomisation
 PHYSICS_TIMESTEP = 0.004  # s
 CONTROL_TIMESTEP = 0.04  # s, one frame of fluoroscopy
 MAX_STEPS = 2000  # published
-# The device is laid along the route, whose bends its links cut short.
-LARGEST_START = 0.95
 _MOST_JOINTS = 1000
 WORKING_LENGTHS = (0.02, 3.0)  # m, up to the longest wires sold
 _LONGEST_LEAD = 0.3  # m
@@ -142,12 +140,13 @@ class NavigationConfig:
         if shares is not None and not (
             isinstance(shares, Sequence)
             and [type(one) in (int, float) for one in shares] == [True, True]
-            and 0 <= shares[0] <= shares[1] <= LARGEST_START
+            and 0 <= shares[0] <= shares[1] <= bounds.MOST_START_SHARE
         ):
             bounds.refuse(
                 "start_along_route",
                 shares,
-                f"None, or (low, high) with 0 <= low <= high <= {LARGEST_START:g}",
+                "None, or (low, high) with 0 <= low <= high <= "
+                f"{bounds.MOST_START_SHARE:g}",
             )
         if self.torsion_joints is not None:
             bounds.whole("torsion_joints", self.torsion_joints, 0, _MOST_JOINTS)

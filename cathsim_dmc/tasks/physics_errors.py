@@ -12,7 +12,7 @@ from typing import Any, cast
 
 import numpy as np
 
-from cathsim_dmc import files
+from cathsim_dmc import bounds, files
 from cathsim_dmc.anatomy import Anatomy
 from cathsim_dmc.tasks.scene import Scene
 
@@ -32,6 +32,7 @@ _MOUTH = 2e-3
 MAX_FORCE = 50.0
 
 _FORMAT = 1
+_LARGEST = 2_000_000_000  # bytes of a dump, unpacked
 _LOG = logging.getLogger(__name__)
 
 
@@ -219,17 +220,23 @@ def load(path: str | Path) -> tuple[dict[str, Any], np.ndarray, np.ndarray]:
       ValueError: if the file is no dump of this format.
     """
     try:
-        # A lone array is no archive, and has nothing to enter.
-        with np.load(path, allow_pickle=False) as data:
-            held = {name: data[name] for name in ("meta", "state", "actions")}
+        held = files.read_arrays(Path(path), _LARGEST, ("meta", "state", "actions"))
         meta = json.loads(str(held["meta"]))
-    except FileNotFoundError:
-        raise
-    except (*files.DAMAGED_ARCHIVE, TypeError) as error:
+        state = bounds.array("state", held["state"])
+        actions = bounds.array("actions", held["actions"])
+        if (state.ndim, actions.ndim) != (1, 2):
+            raise ValueError(f"state is {state.shape}, actions are {actions.shape}")
+    except (ValueError, RecursionError) as error:
         raise ValueError(f"{path} is no dump of an episode: {error}") from error
-    if not isinstance(meta, dict) or meta.get("format") != _FORMAT:
+    if not isinstance(meta, dict) or repr(meta.get("format")) != repr(_FORMAT):
         raise ValueError(
             f"{path} is no dump of an episode of format {_FORMAT}, which this version "
             "reads"
         )
-    return meta, held["state"], held["actions"]
+    for name, kind in (("reason", str), ("task", dict)):
+        if not isinstance(meta.get(name), kind):
+            raise ValueError(
+                f"{path} is no dump of an episode: {name} is "
+                f"{bounds.shown(meta.get(name))}; it must be a {kind.__name__}"
+            )
+    return meta, state, actions

@@ -6,11 +6,11 @@ import hashlib
 import json
 import os
 import shutil
-import tempfile
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
+from cathsim_dmc import files
 from cathsim_dmc.anatomy.anatomy import Anatomy
 from cathsim_dmc.anatomy.scan.importer import import_scan
 from cathsim_dmc.anatomy.scan.mesh import read_triangles
@@ -109,18 +109,16 @@ def _code() -> bytes:
 
 def _keep(anatomy: Anatomy, notes: list[str], place: Path) -> None:
     place.parent.mkdir(parents=True, exist_ok=True)
-    temporary = Path(tempfile.mkdtemp(dir=place.parent, prefix=".writing-"))
+    # What a killed import has left, of whichever scan it was.
+    files.remove_abandoned(place.parent)
     try:
-        anatomy.save(temporary)
-        (temporary / _NOTES).write_text(json.dumps(notes))
-        shutil.rmtree(place, ignore_errors=True)
-        try:
-            os.replace(temporary, place)
-        except OSError:
-            if not place.is_dir():  # else another process was faster
-                raise
-    finally:
-        shutil.rmtree(temporary, ignore_errors=True)
+        with files.atomic_directory(place) as temporary:
+            anatomy.save(temporary)
+            (temporary / _NOTES).write_text(json.dumps(notes))
+            shutil.rmtree(place, ignore_errors=True)
+    except OSError:
+        if not place.is_dir():  # else another process was faster
+            raise
     entries = sorted(
         place.parent.glob(f"{_ENTRY}*"), key=lambda path: -path.stat().st_mtime
     )

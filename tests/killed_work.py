@@ -1,0 +1,103 @@
+"""Work that is killed: functions for processes that a fork server starts.
+
+The server has imported everything, so a process is at work at once; how long it has
+worked is measured by its processor time, which a busy machine does not change.
+"""
+
+import multiprocessing
+import os
+import random
+import signal
+import sys
+import time
+from pathlib import Path
+
+import synthetic_env
+import test_agents_training as trainings
+
+from cathsim_dmc import cli
+from cathsim_dmc.agents import report, train
+
+# Never: what waits for a process this long has found that it hangs, s.
+_PATIENCE = 1200
+
+
+def train_on(run, frames):
+    """Trains in a folder, or goes on there."""
+    config = trainings.small_ppo(
+        total_frames=frames, checkpoint_frames=512, keep_checkpoints=2
+    )
+    make_env = synthetic_env.make_env
+    train(config, run, resume=True, progress=False, make_env=make_env)
+
+
+def import_on(mesh, out, cache, times):
+    """Imports a scan into the same folder, so many times."""
+    os.environ["XDG_CACHE_HOME"] = str(cache)
+    sys.argv = ["cathsim", "phantom", "import", str(mesh), "--out", str(out)]
+    for _ in range(times):
+        try:
+            cli.main()
+        except SystemExit as end:
+            if end.code:
+                raise
+
+
+def record_on(out, seeds):
+    """Records an episode of each seed into the same file."""
+    for seed in seeds:
+        report.record(
+            "push", out, task="type1_bca", seed=seed, max_steps=4, fluoroscopy=False
+        )
+
+
+def context():
+    """A fork server that knows the tests and has imported this module."""
+    paths = [str(Path(__file__).parent), *sys.path]
+    before = os.environ.get("PYTHONPATH")
+    os.environ["PYTHONPATH"] = os.pathsep.join(filter(None, paths))
+    try:
+        server = multiprocessing.get_context("forkserver")
+        server.set_forkserver_preload(["killed_work"])
+        process = server.Process(target=os.getpid)  # starts the server
+        process.start()
+        process.join()
+    finally:
+        if before is None:
+            del os.environ["PYTHONPATH"]
+        else:
+            os.environ["PYTHONPATH"] = before
+    return server
+
+
+def processor_time(pid):
+    """Seconds that a process has worked so far."""
+    fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+
+
+def kill(server, work, *arguments, longest):
+    """Kills a process after up to so many seconds of work, at random."""
+    process = server.Process(target=work, args=arguments, daemon=True)
+    process.start()
+    moment, end = random.uniform(0.0, longest), time.monotonic() + _PATIENCE
+    try:
+        while processor_time(process.pid) < moment:
+            assert process.is_alive(), f"ended by itself with {process.exitcode}"
+            assert time.monotonic() < end, "hangs"
+            time.sleep(0.01)
+    finally:
+        os.kill(process.pid, signal.SIGKILL)
+        process.join()
+    assert process.exitcode == -signal.SIGKILL
+
+
+def finish(server, work, *arguments):
+    """Lets a process work to its end."""
+    process = server.Process(target=work, args=arguments, daemon=True)
+    process.start()
+    try:
+        process.join(_PATIENCE)
+        assert process.exitcode == 0
+    finally:
+        process.kill()
