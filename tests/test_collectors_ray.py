@@ -67,7 +67,6 @@ from cathsim_dmc.agents import make_config, ray_source, train
 get_node = services.get_node
 
 def patient(*args, **kwargs):
-    # Ray gives a node 30 s to come up, which is short beside other work.
     end = time.monotonic() + 300
     while True:
         try:
@@ -124,6 +123,13 @@ ray_source.RaySource.next = watched
 """
 
 
+# Ray gives a node 30 s to come up, which is short beside other work.
+PATIENCE = {
+    "RAY_raylet_start_wait_time_s": "300",
+    "RAY_agent_register_timeout_ms": "300000",
+}
+
+
 @pytest.mark.slow
 def test_a_killed_collector_does_not_lose_the_run(tmp_path):
     """Two nodes; one collector is killed -9 half way, and the training goes on."""
@@ -134,6 +140,7 @@ def test_a_killed_collector_does_not_lose_the_run(tmp_path):
             stdout=subprocess.PIPE,
             stderr=errors,
             text=True,
+            env={**os.environ, **PATIENCE},
         )
     try:
         lines = iter(process.stdout.readline, "")
@@ -170,8 +177,9 @@ def test_collectors_act_with_the_weights_and_statistics_of_the_learner(tmp_path)
         [sys.executable, "-c", script, str(tmp_path / "run"), settings],
         stdout=subprocess.PIPE,
         text=True,
-        timeout=900,
+        timeout=1800,
         check=True,
+        env={**os.environ, **PATIENCE},
     )
     _, *batches, _ = map(json.loads, done.stdout.splitlines())
     assert [shape for *_, shape in batches] == [[8, 64]] * 3
