@@ -42,15 +42,16 @@ PATIENCE = 900  # s
 class Table:
     """`cathsim benchmark table` of a tiny grid in a directory."""
 
-    def __init__(self, directory):
+    def __init__(self, directory, grid=GRID):
         self.directory = directory
-        (directory / "grid.toml").write_text(GRID)
+        (directory / "grid.toml").write_text(grid)
 
-    def start(self):
-        command = [sys.executable, "-m", "cathsim_dmc.cli", "benchmark", "table"]
+    def start(self, program=("-m", "cathsim_dmc.cli"), **environment):
+        command = [sys.executable, *program, "benchmark", "table"]
         return subprocess.Popen(
             [*command, "--grid", "grid.toml"],
             cwd=self.directory,
+            env={**os.environ, **environment},
             stdout=subprocess.DEVNULL,
             stderr=open(self.directory / "errors.txt", "ab"),
         )
@@ -142,6 +143,80 @@ def test_killed_in_training_in_a_checkpoint_and_in_the_evaluation(tmp_path):
     kill_all(runner)
     assert len(before[first]["training"]["sessions"]) == 4
     check(table, before)
+
+
+# `cathsim`, but it stops at one moment and says so; the process of a cell runs its
+# first lines too.
+PAUSING = """
+import os, sys, time
+from pathlib import Path
+import torchrl.collectors
+from cathsim_dmc import files
+from cathsim_dmc.agents import evaluation
+
+MOMENT, steps = os.environ["PAUSE_AT"], 0
+write, replace, step_mdp = files.write_bytes, os.replace, evaluation.step_mdp
+
+def pause():
+    Path("paused").touch()
+    time.sleep(3600)
+
+def write_bytes(path, data):
+    if MOMENT == "checkpoint" and Path(path).name == "learning.pt":
+        pause()
+    return write(path, data)
+
+def put_in_place(source, target):
+    if MOMENT == "result" and Path(target).parent.name == "results":
+        pause()
+    return replace(source, target)
+
+def stepped(*args, **kwargs):
+    global steps
+    steps += 1
+    if MOMENT == "evaluation" and steps == 10:
+        pause()
+    return step_mdp(*args, **kwargs)
+
+files.write_bytes, os.replace, evaluation.step_mdp = write_bytes, put_in_place, stepped
+from cathsim_dmc.cli import main
+
+if __name__ == "__main__":
+    sys.exit(main())
+"""
+# One cell, trained in seconds.
+SHORT = (
+    GRID.replace("[0, 1]", "[0]")
+    .replace("total_frames = 4096", "total_frames = 1024")
+    .replace("max_steps = 300", "max_steps = 30")
+)
+
+
+@pytest.mark.parametrize("moment", ["checkpoint", "evaluation", "result"])
+def test_killed_in_the_midst_of(tmp_path, moment):
+    table, cell = Table(tmp_path, SHORT), CELLS[0]
+    (tmp_path / "pausing.py").write_text(PAUSING)
+    runner = table.start(["pausing.py"], PAUSE_AT=moment)
+    until((tmp_path / "paused").exists, runner, table)
+    kill_all(runner)
+    trained = table.run_of(cell) / "checkpoints/0000001024/checkpoint.json"
+    assert table.results() == {}
+    if moment == "checkpoint":
+        assert table.frames(cell) == 0
+        assert any(table.run_of(cell).glob("checkpoints/.unfinished-*/policy.pt"))
+    else:
+        assert table.frames(cell) == 1024
+        written = trained.stat().st_mtime_ns
+    values = table.finish()[cell]
+    assert values["training"]["frames"] == 1024
+    assert len(values["training"]["sessions"]) == 2
+    frames = values["training"]["curve"]["frames"]
+    assert frames == [512, 1024]
+    assert values["evaluation"]["summary"]["episodes"] == 2
+    if moment != "checkpoint":
+        assert trained.stat().st_mtime_ns == written, "it was trained again"
+    assert [path.name for path in (tmp_path / "results").iterdir()] == [f"{cell}.json"]
+    assert not list(table.run_of(cell).glob("checkpoints/.*"))
 
 
 def test_the_runner_alone_killed_takes_its_cell_along(tmp_path):

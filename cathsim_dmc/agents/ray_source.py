@@ -83,7 +83,7 @@ class RaySource:
         Raises:
             RuntimeError: collectors were lost several times without a batch between.
         """
-        import ray
+        from ray.exceptions import RayError
 
         last: Exception | None = None
         for _ in range(MOST_LOSSES):
@@ -91,7 +91,7 @@ class RaySource:
                 self._send_weights()
                 batch = next(self._batches)
             # A process that dies while it is given weights breaks the connection.
-            except (ray.exceptions.RayError, RuntimeError) as error:
+            except (RayError, RuntimeError) as error:
                 last = error
                 self._replace(error)
                 continue

@@ -135,9 +135,8 @@ def training_blueprint(
         learner: Entity paths of the learner's figures likewise.
     """
     shown = rrb.VisibleTimeRanges([_about(-window, 0)])
-    trails = {entity: shown for entity in ("world/catheter/trail", "world/heat")}
     scene = rrb.Vertical(
-        _scene(np.asarray(centre, dtype=np.float64), extent, overrides=trails),
+        _scene(np.asarray(centre, dtype=np.float64), extent, shown=shown),
         _tip(np.asarray(head, dtype=np.float64), shown),
         row_shares=[3, 2],
     )
@@ -206,7 +205,7 @@ def _scene(
     centre: np.ndarray,
     extent: float,
     devices: Sequence[str] = ("world/catheter",),
-    overrides: Mapping[str, rrb.VisibleTimeRanges] | None = None,
+    shown: rrb.VisibleTimeRanges | None = None,
 ) -> rrb.Spatial3DView:
     entities = [*(f"{device}/trail" for device in devices), "world/heat"]
     return rrb.Spatial3DView(
@@ -221,7 +220,7 @@ def _scene(
         ),
         background=_BACKGROUND,
         line_grid=False,
-        overrides=overrides or {entity: _so_far() for entity in entities},
+        overrides={entity: shown or _so_far() for entity in entities},
     )
 
 

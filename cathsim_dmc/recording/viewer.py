@@ -146,8 +146,8 @@ def live_address(viewer: str) -> str:
             open there; anything else is an address, ``rerun+http://HOST:PORT/proxy``.
 
     Raises:
-        ViewerError: there is no display to open a viewer on, or none listens at the
-            address.
+        ViewerError: there is no display to open a viewer on, or none is installed, or
+            none listens at the address.
     """
     if viewer == "spawn":
         if not has_display():
@@ -181,10 +181,11 @@ def live_address(viewer: str) -> str:
 
 def _executable() -> str:
     """The viewer of the interpreter's own package."""
-    import rerun_cli
-
+    found = importlib.util.find_spec("rerun_cli")
+    if found is None or found.origin is None:
+        raise ViewerError("the Rerun viewer is missing; pip install rerun-sdk")
     name = "rerun.exe" if sys.platform == "win32" else "rerun"
-    return str(Path(rerun_cli.__file__).with_name(name))
+    return str(Path(found.origin).with_name(name))
 
 
 def _checked_ports(host: str, port: int) -> int:
