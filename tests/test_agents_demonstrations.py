@@ -236,3 +236,24 @@ def test_the_teacher_goes_on_from_what_was_really_done():
     # One correction is at most max_bend_rate / steering_angle.
     assert np.abs(taught[0, :20] - done[0, :20]).max() < 0.5
     assert np.abs(alone[0, :20] - done[0, :20]).max() > 0.4
+
+
+def test_demonstrations_of_coaxial_devices_are_what_an_environment_gives(tmp_path):
+    task, options = "simple1_bca_pair", {"max_steps": 150}
+    recorded = record_demonstrations(task, tmp_path, 1, task_kwargs=options)
+    assert recorded.successes == 1
+    env = make_env(task, observation="tracking", seed=2_000_000, task_kwargs=options)
+    size = env.observation_spec["observation_vector"].shape[-1]
+    shapes = NetworkShapes(size, None, 4)
+    transitions = load_transitions(recorded.path, "tracking", shapes)
+    assert len(transitions) == recorded.steps
+    state = env.reset()
+    for row in range(3):
+        torch.testing.assert_close(
+            state["observation_vector"][0],
+            transitions[row]["observation_vector"],
+            rtol=0,
+            atol=0,
+        )
+        state["action"] = transitions[row]["action"][None]
+        state = env.step(state)["next"]

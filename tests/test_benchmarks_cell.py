@@ -175,6 +175,26 @@ def test_estimates_come_from_the_cells_most_alike():
     assert runner.estimate(waiting, [waiting, other]) is None
 
 
+def test_what_is_left_is_told_with_the_speeds_of_all_cells():
+    def standing(state, frames=0, seconds=0.0, **changes):
+        return runner.Standing(_changed(**changes), state, frames, seconds)
+
+    waiting = standing("waiting", total_frames=1000)
+    trained = standing("begun", 1000, 100.0, seed=1, total_frames=2000)
+    foreign = standing("other settings", 500, 5.0, seed=2)
+    wrong = standing("impossible", preset="nonsense")
+    # The speed is that of a cell that was not asked for; 100 s and the evaluation.
+    text = runner.left_over([waiting], [waiting, trained])
+    assert text == "0 of 1 cells finished, 1 left: about 0:03:40"
+    unknown = runner.left_over([waiting], [waiting])
+    assert unknown.endswith("1 left: about 0:00:00 and 1 of unknown length")
+    # What is not run takes no time and is not left.
+    text = runner.left_over([foreign, wrong], [foreign, wrong])
+    assert text == (
+        "0 of 2 cells finished; 1 with other settings, left as they are; 1 impossible"
+    )
+
+
 def test_an_unknown_preset_is_impossible_and_stops_nothing(folders):
     wrong = _changed(preset="nonsense")
     said = []

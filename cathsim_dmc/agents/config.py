@@ -2,50 +2,19 @@
 
 import dataclasses
 import json
-import math
-import types
 import typing
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, ClassVar, Literal
 
+from cathsim_dmc.agents.fields import ConfigError, require, require_type, tuples
 from cathsim_dmc.bounds import MOST_START_SHARE
 
 # Widest layer and most layers of a network: settings must not take all memory.
 MAX_WIDTH, MAX_LAYERS, MAX_FILTERS = 16_384, 16, 1_024
-MAX_INTEGER = 2**62
-
 
 # Convolutions of the published agents: (filters, kernel size, stride) of each.
 PUBLISHED_CONVOLUTIONS = ((32, 8, 4), (64, 4, 2), (64, 3, 1))
-
-# What the presets "tuned" learn from, found on type1_lcca (docs/training.md): the way
-# through the lumen as reward, episodes that are short and start anywhere along it.
-TUNED_TRAINING: Mapping[str, Any] = {
-    "training_reward": {"path": -1.0, "success": 10.0},
-    "training_max_steps": 120,
-    "training_start": (0.0, 0.9),
-}
-# What the presets "tuned_image" add: images without their background, whose first
-# convolution strides by its size (a fifth of the published cost), and a critic that
-# reads the state.
-TUNED_IMAGES: Mapping[str, Any] = {
-    "observation": "image",
-    "critic_observation": "internal",
-    "subtract_background": True,
-    "convolutions": ((32, 8, 8), (64, 4, 2), (64, 3, 1)),
-    "cnn_features": 256,
-}
-
-
-class ConfigError(ValueError):
-    """A hyper-parameter is outside what is allowed, or contradicts another."""
-
-
-def require(condition: bool, name: str, given: object, allowed: str) -> None:
-    """Raise ConfigError naming the field, what was given and what is allowed."""
-    if not condition:
-        raise ConfigError(f"{name}={given!r} is not allowed: {name} must be {allowed}.")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -105,6 +74,16 @@ class TrainingConfig:
             simulation is always on the CPU.
         torch_threads: Number of threads of one torch operation. One is fastest for
             the small published MLP; images profit from all cores.
+        rerun: Whether to record an episode of every checkpoint, and the curves, into
+            training.rrd of the run, beside the training.
+        rerun_every: Number of checkpoints for each of which one is recorded.
+        rerun_steps: Number of control steps after which such an episode is cut off.
+        rerun_viewer: Viewer that shows it too: "spawn" opens one, "connect" takes the
+            one that is open on this machine; or an address,
+            "rerun+http://HOST:PORT/proxy". None for none.
+        collector: Where the simulations are: "local", in this process, or "ray", in
+            processes of a Ray cluster (needs the `ray` extra).
+        collectors: Number of these processes, which share the simulations.
     """
 
     algorithm: ClassVar[str] = ""
@@ -123,6 +102,12 @@ class TrainingConfig:
             "num_threads",
             "torch_threads",
             "torch_device",
+            "rerun",
+            "rerun_every",
+            "rerun_steps",
+            "rerun_viewer",
+            "collector",
+            "collectors",
         }
     )
 
@@ -155,16 +140,22 @@ class TrainingConfig:
     tensorboard: bool = False
     torch_device: str = "cpu"
     torch_threads: int = 1
+    rerun: bool = False
+    rerun_every: int = 1
+    rerun_steps: int = 300
+    rerun_viewer: str | None = None
+    collector: Literal["local", "ray"] = "local"
+    collectors: int = 2
 
     def __post_init__(self):
         """Validate; every message says what was given and what is allowed."""
         for name in ("hidden", "observation", "training_start"):
             if isinstance(getattr(self, name), list):
                 object.__setattr__(self, name, tuple(getattr(self, name)))
-        object.__setattr__(self, "convolutions", _tuples(self.convolutions))
+        object.__setattr__(self, "convolutions", tuples(self.convolutions))
         for name, kind in typing.get_type_hints(type(self)).items():
             if typing.get_origin(kind) is not ClassVar:
-                _require_type(name, getattr(self, name), kind)
+                require_type(name, getattr(self, name), kind)
         object.__setattr__(self, "task_kwargs", dict(self.task_kwargs))
         if self.training_reward is not None:
             object.__setattr__(self, "training_reward", dict(self.training_reward))
@@ -201,6 +192,9 @@ class TrainingConfig:
             "keep_checkpoints",
             "metrics_frames",
             "torch_threads",
+            "rerun_every",
+            "rerun_steps",
+            "collectors",
             "learning_rate",
             "observation_clip",
             "checkpoint_seconds",
@@ -310,59 +304,6 @@ class TrainingConfig:
         }
 
 
-@dataclass(frozen=True, kw_only=True)
-class ActorCriticConfig(TrainingConfig):
-    """Settings shared by the algorithms with a critic.
-
-    Attributes:
-        critic_observation: Name or names of the vector observations that the critic
-            reads in place of the images that the policy reads (Pinto et al. 2018,
-            "Asymmetric Actor Critic for Image-Based Robot Learning"); only the
-            training needs them. None lets it read what the policy reads.
-    """
-
-    critic_observation: str | tuple[str, ...] | None = None
-
-    def __post_init__(self):
-        """Validate."""
-        if isinstance(self.critic_observation, list):
-            object.__setattr__(
-                self, "critic_observation", tuple(self.critic_observation)
-            )
-        super().__post_init__()
-        require(
-            self.critic_observation is None or bool(self.critic_observation),
-            "critic_observation",
-            self.critic_observation,
-            "a name, names, or None",
-        )
-
-    @property
-    def collected_observation(self) -> str | tuple[str, ...]:
-        """Those of the policy and those of the critic."""
-        if self.critic_observation is None:
-            return self.observation
-        return (*_names(self.observation), *_names(self.critic_observation))
-
-    def to_dict(self) -> dict[str, Any]:
-        """As in the base class."""
-        values = super().to_dict()
-        if isinstance(self.critic_observation, tuple):
-            values["critic_observation"] = list(self.critic_observation)
-        return values
-
-
-def _names(names: str | tuple[str, ...]) -> tuple[str, ...]:
-    return (names,) if isinstance(names, str) else names
-
-
-def _tuples(value: Any) -> Any:
-    """Lists as tuples, at every depth."""
-    if isinstance(value, list | tuple):
-        return tuple(_tuples(one) for one in value)
-    return value
-
-
 def _require_fields(kind: type[TrainingConfig], names: Mapping[str, Any]) -> None:
     valid = [item.name for item in dataclasses.fields(kind)]
     unknown = sorted(set(names) - set(valid))
@@ -370,53 +311,3 @@ def _require_fields(kind: type[TrainingConfig], names: Mapping[str, Any]) -> Non
         raise ConfigError(
             f"{kind.__name__} has no field {unknown}; valid fields are {valid}."
         )
-
-
-_KINDS = {
-    int: "an integer below 2**62",
-    float: "a finite number",
-    str: "a string",
-    bool: "true or false",
-    type(None): "None",
-}
-
-
-def _require_type(name: str, value: object, kind: Any) -> None:
-    require(_fits(value, kind), name, value, _description(kind))
-
-
-def _fits(value: object, kind: Any) -> bool:
-    """Whether a value is of an annotated type; of numbers only finite ones."""
-    origin, arguments = typing.get_origin(kind), typing.get_args(kind)
-    if origin is Literal:
-        return any(value == choice and isinstance(value, str) for choice in arguments)
-    if origin in (typing.Union, types.UnionType):
-        return any(_fits(value, argument) for argument in arguments)
-    if origin is tuple:
-        return isinstance(value, tuple) and all(_fits(v, arguments[0]) for v in value)
-    if origin is Mapping:
-        return isinstance(value, Mapping) and all(
-            isinstance(name, str) and (arguments[1] is Any or _fits(one, arguments[1]))
-            for name, one in value.items()
-        )
-    if type(value) is int and abs(value) > MAX_INTEGER:
-        return False
-    if kind is float:
-        if not isinstance(value, int | float) or isinstance(value, bool):
-            return False
-        return math.isfinite(value)
-    # A bool is an int to Python, but no number of anything.
-    return type(value) is kind
-
-
-def _description(kind: Any) -> str:
-    origin, arguments = typing.get_origin(kind), typing.get_args(kind)
-    if origin is Literal:
-        return "one of " + ", ".join(map(repr, arguments))
-    if origin in (typing.Union, types.UnionType):
-        return " or ".join(_description(argument) for argument in arguments)
-    if origin is tuple:
-        return f"a list, each entry {_description(arguments[0])}"
-    if origin is Mapping and arguments[1] is not Any:
-        return f"names, each with {_description(arguments[1])}"
-    return _KINDS.get(kind, "an object of settings")

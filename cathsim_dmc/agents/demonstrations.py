@@ -229,10 +229,8 @@ def load_transitions(
             or observations or actions of other sizes.
         ModuleNotFoundError: h5py is not installed.
     """
-    keys = observations.entry_specs(
-        observations.resolve(observation), observations.ImageOptions()
-    )
-    episodes = [_tensors(path, e, sorted(keys)) for e in read_episodes(path)]
+    names = observations.resolve(observation)
+    episodes = [_tensors(path, e, names) for e in read_episodes(path)]
     succeeded = [one for one in episodes if one is not None]
     if not succeeded:
         raise DatasetError(f"none of the {len(episodes)} episodes in {path} succeeds")
@@ -256,10 +254,18 @@ def _shapes(transitions: TensorDictBase) -> NetworkShapes:
     return NetworkShapes(size, image, transitions["action"].shape[-1])
 
 
+def _keys(names: Sequence[str], coaxial: bool) -> list[str]:
+    """Keys of the named observations in the order in which networks read them."""
+    return sorted(observations.entry_specs(names, observations.ImageOptions(), coaxial))
+
+
 def _tensors(
-    path: str | Path, episode: DatasetEpisode, keys: Sequence[str]
+    path: str | Path, episode: DatasetEpisode, names: Sequence[str]
 ) -> TensorDict | None:
     """Transitions of an episode; None if it did not succeed."""
+    # What only coaxial devices show tells their episodes.
+    own = set(_keys(names, True)) - set(_keys(names, False))
+    keys = _keys(names, bool(own & set(episode.observations)))
     missing = sorted(set(keys) - set(episode.observations))
     if missing:
         raise DatasetError(

@@ -90,17 +90,20 @@ class Algorithm(Generic[Config]):
     Attributes:
         config: Class of its settings.
         learner: Class of its learner.
+        remote: Whether its policy needs nothing but observations, so that it can act
+            in another process.
     """
 
     config: type[Config]
     learner: type[Learner[Config]]
+    remote: bool = True
 
 
 LEARNERS: dict[str, Algorithm[Any]] = {
     "ppo": Algorithm(PPOConfig, PPO),
     "sac": Algorithm(SACConfig, SAC),
     "bc": Algorithm(BCConfig, BC),
-    "dagger": Algorithm(DAggerConfig, DAgger),
+    "dagger": Algorithm(DAggerConfig, DAgger, remote=False),
 }
 
 

@@ -16,14 +16,12 @@ from torchrl.envs import EnvBase
 from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.value import GAE
 
-from cathsim_dmc.agents.config import (
+from cathsim_dmc.agents.actor_critic import (
     TUNED_IMAGES,
     TUNED_TRAINING,
     ActorCriticConfig,
-    ConfigError,
-    TrainingConfig,
-    require,
 )
+from cathsim_dmc.agents.config import ConfigError, TrainingConfig, require
 from cathsim_dmc.agents.exploration import CorrelatedExploration, CorrelatedNoise
 from cathsim_dmc.agents.networks import (
     GaussianActor,

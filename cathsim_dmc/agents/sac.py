@@ -13,12 +13,12 @@ from tensordict.nn import TensorDictSequential
 from torchrl.envs import EnvBase
 from torchrl.objectives import SACLoss, SoftUpdate
 
-from cathsim_dmc.agents.config import (
+from cathsim_dmc.agents.actor_critic import (
     TUNED_IMAGES,
     TUNED_TRAINING,
     ActorCriticConfig,
-    require,
 )
+from cathsim_dmc.agents.config import require
 from cathsim_dmc.agents.demonstrations import load_transitions
 from cathsim_dmc.agents.networks import (
     GaussianActor,

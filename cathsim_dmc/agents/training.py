@@ -4,7 +4,7 @@ import contextlib
 import json
 import math
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -12,10 +12,7 @@ from typing import Any
 import numpy as np
 import torch
 from tensordict import TensorDictBase
-from tensordict.nn import TensorDictModuleBase
-from torchrl.collectors import Collector
 from torchrl.envs import EnvBase
-from torchrl.envs.utils import ExplorationType
 
 from cathsim_dmc import files
 from cathsim_dmc.agents.checkpoint import (
@@ -24,6 +21,8 @@ from cathsim_dmc.agents.checkpoint import (
     checkpoints_in,
     save_checkpoint,
 )
+from cathsim_dmc.agents.checkpoint_recorder import CheckpointRecorder
+from cathsim_dmc.agents.collectors import COLLECTORS, BatchSource, check_collector
 from cathsim_dmc.agents.config import ConfigError, TrainingConfig
 from cathsim_dmc.agents.episodes import INFO, EpisodeTracker
 from cathsim_dmc.agents.evaluation import EnvFactory
@@ -93,16 +92,21 @@ def train(
     """
     run = Path(out_dir)
     _require_device(config.torch_device)
+    check_collector(config)
+    recorder = CheckpointRecorder(run, config) if config.rerun else None
     checkpoint = _prepare(run, config, resume)
     with contextlib.ExitStack() as stack:
+        if recorder is not None:
+            stack.enter_context(recorder)
         stack.enter_context(_torch_threads(config.torch_threads))
         env = _make_environment(config, checkpoint, make_env)
         torch.manual_seed(config.seed)
         learner = make_learner(config, NetworkShapes.of(env), run)
         learner.attach(env)
         state = _start(learner, env, config, checkpoint)
-        collector = _make_collector(env, learner, config, state["frames"])
-        stack.callback(collector.shutdown)
+        make_source = COLLECTORS[config.collector]
+        source = make_source(config, learner, env, make_env, state["frames"])
+        stack.callback(source.shutdown)
         # After everything that draws numbers while being made.
         if checkpoint:
             torch.set_rng_state(state.pop("rng"))
@@ -117,11 +121,11 @@ def train(
             progress=progress,
         )
         stack.enter_context(log)
-        saver = _Saver(run, config, learner, log, checkpoint)
+        saver = _Saver(run, config, learner, log, checkpoint, recorder)
         interruption = stack.enter_context(Interruption())
-        _loop(config, collector, learner, log, saver, interruption)
+        _loop(config, source, learner, log, saver, interruption)
         # However the loop ended; writes nothing if the last batch has just been saved.
-        newest = saver.save()
+        newest = saver.save(last=True)
         short = log.frames < config.total_frames
         return TrainingResult(run, newest, log.frames, log.seconds, short, log.row)
 
@@ -235,25 +239,6 @@ def _observe_random_actions(
     learner.observe(env.rollout(steps, break_when_any_done=False))
 
 
-def _make_collector(
-    env: EnvBase, learner: Learner, config: TrainingConfig, frames: int
-) -> Collector:
-    # Frames still to be collected at random, in whole batches.
-    left = max(learner.random_frames - frames, 0)
-    whole = math.ceil(left / config.frames_per_batch) * config.frames_per_batch
-    return Collector(
-        env,
-        _on_cpu(learner.policy, learner.device),
-        frames_per_batch=config.frames_per_batch,
-        total_frames=-1,
-        init_random_frames=whole or None,
-        exploration_type=ExplorationType.RANDOM,
-        trust_policy=True,
-        track_traj_ids=False,
-        auto_register_policy_transforms=False,
-    )
-
-
 class _Saver:
     """Writes checkpoints, and knows when one is due."""
 
@@ -264,8 +249,10 @@ class _Saver:
         learner: Learner,
         log: TrainingLog,
         checkpoint: Checkpoint | None,
+        recorder: CheckpointRecorder | None,
     ):
         self.newest = checkpoint.path if checkpoint else None
+        self._recorder = recorder
         self._run, self._config = run, config
         self._learner, self._log = learner, log
         self._frames, self._time = log.frames, time.monotonic()
@@ -277,8 +264,8 @@ class _Saver:
             or time.monotonic() - self._time >= self._config.checkpoint_seconds
         )
 
-    def save(self) -> Path:
-        """Write a checkpoint; return its directory."""
+    def save(self, last: bool = False) -> Path:
+        """Write a checkpoint, the last one or not; return its directory."""
         self.newest = save_checkpoint(
             self._run,
             config=self._config,
@@ -294,22 +281,25 @@ class _Saver:
             },
         )
         self._frames, self._time = self._log.frames, time.monotonic()
+        if self._recorder is not None:
+            self._recorder.saved(self.newest, last)
         return self.newest
 
 
 def _loop(
     config: TrainingConfig,
-    collector: Collector,
+    source: BatchSource,
     learner: Learner,
     log: TrainingLog,
     saver: _Saver,
     interruption: Interruption,
 ) -> None:
     """Collect, learn, take note and save until the frames are there or a signal."""
-    tracker = EpisodeTracker(config.num_envs)
-    batches = iter(collector)
+    tracker, restarts = EpisodeTracker(config.num_envs), source.restarts
     while log.frames < config.total_frames and not interruption.requested:
-        batch = next(batches)
+        batch = source.next()
+        if source.restarts != restarts:
+            tracker, restarts = EpisodeTracker(config.num_envs), source.restarts
         finished = tracker.add(batch)
         _truncate_diverged(batch)
         losses = learner.update(batch, min(log.frames / config.total_frames, 1.0))
@@ -335,20 +325,6 @@ def _truncate_diverged(batch: TensorDictBase) -> None:
     error = batch.get(("next", INFO, "physics_error"), None)
     if error is not None:
         batch["next", "terminated"] &= ~error
-
-
-def _on_cpu(
-    policy: TensorDictModuleBase, device: torch.device
-) -> Callable[[TensorDictBase], TensorDictBase]:
-    """A policy that takes and gives CPU tensors wherever its weights are."""
-    if device.type == "cpu":
-        return policy
-
-    def act(observation: TensorDictBase) -> TensorDictBase:
-        outside = observation.select(*policy.in_keys).to(device)
-        return observation.update(policy(outside).to("cpu"))
-
-    return act
 
 
 @contextlib.contextmanager

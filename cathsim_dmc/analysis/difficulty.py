@@ -188,7 +188,8 @@ def _ends(step: Step, number: int, resting: np.ndarray, limit: Limit) -> dict[in
 def tasks() -> tuple[str, ...]:
     """Names of the registered tasks of a steerable device with an anatomy and a goal.
 
-    How hard a task is with coaxial devices is another question: nothing steers them.
+    Those of coaxial devices are played when they are named: a straight push, by which
+    a steerable device shows that a task asks for steering, says little of them.
     """
     return tuple(
         name
@@ -287,13 +288,14 @@ def _trials(
     num_threads: int,
     say: Callable[[str], None],
 ) -> dict[str, Trial]:
-    """The policies on one task, by name; no expert for a device without motors."""
+    """The policies on one task, by name; no expert for what it cannot steer."""
     # Cheapest to observe; none of the policies looks at it.
     task = suite.make_task(name, observation="tracking")
     simulation = BatchSimulation(task, seeds, num_threads=num_threads)
     trials = {}
     for policy in players:
-        if policy == "expert" and not task.scene.device.steerable:
+        steered = task.scene.coaxial or task.scene.device.steerable
+        if policy == "expert" and not steered:
             continue
         player = policies.make_policy(policy, first_seed)
         trials[policy] = trial = play(simulation, player, first_seed, LIMITS[policy])

@@ -23,6 +23,11 @@ from cathsim_dmc.benchmarks.result import Result, ResultError, read_result
 State = Literal[
     "finished", "other settings", "running", "failed", "impossible", "begun", "waiting"
 ]
+# States of cells that are not run, and what is said of them.
+_SETTLED: dict[str, str] = {
+    "other settings": "with other settings, left as they are",
+    "impossible": "impossible",
+}
 # Exit codes of a cell's process.
 _DONE, _FAILED, _INTERRUPTED, _BUSY = 0, 1, 3, 4
 _POLL = 0.5  # s
@@ -112,7 +117,7 @@ def estimate(one: Standing, others: Sequence[Standing]) -> float | None:
     Returns:
         None if no cell of its algorithm and observation has been trained at all.
     """
-    if one.state == "finished":
+    if one.state == "finished" or one.state in _SETTLED:
         return 0.0
     cell = one.cell
     speed = one.frames / one.seconds if one.seconds else None
@@ -146,6 +151,7 @@ def run(
     *,
     limit: float | None = None,
     anew: bool = False,
+    alike: Sequence[Cell] = (),
     say: Callable[[str], None] = print,
 ) -> dict[str, str]:
     """Run what is left of some cells, in their order.
@@ -158,6 +164,7 @@ def run(
         folders: Where they lie.
         limit: Number of seconds after which to stop; None for no limit.
         anew: Whether cells that were trained with other settings are trained again.
+        alike: Further cells, whose speeds tell how long these will take.
         say: Function that is told what happens.
 
     Returns:
@@ -183,7 +190,7 @@ def run(
                 continue
             say(f"{cell.name}: begins at {now.frames:,} of {cell.total_frames:,}")
             outcomes[cell.name] = _run_one(cell, folders, anew, over)
-            say(_report(cell, folders, outcomes[cell.name], cells))
+            say(_report(cell, folders, outcomes[cell.name], cells, alike))
     return outcomes
 
 
@@ -243,8 +250,15 @@ def _end_with_parent() -> None:
     threading.Thread(target=wait, daemon=True).start()
 
 
-def _report(cell: Cell, folders: Folders, outcome: str, cells: Sequence[Cell]) -> str:
+def _report(
+    cell: Cell,
+    folders: Folders,
+    outcome: str,
+    cells: Sequence[Cell],
+    alike: Sequence[Cell],
+) -> str:
     standings = [standing(one, folders) for one in cells]
+    known = [*standings, *(standing(one, folders) for one in alike)]
     here = next(one for one in standings if one.cell is cell)
     text = f"{cell.name}: {outcome}"
     if here.result is not None:
@@ -256,19 +270,29 @@ def _report(cell: Cell, folders: Folders, outcome: str, cells: Sequence[Cell]) -
         )
     elif outcome == "failed":
         text += f" ({here.remark.splitlines()[-1] if here.remark else 'see above'})"
-    return f"{text}\n{left_over(standings)}"
+    return f"{text}\n{left_over(standings, known)}"
 
 
-def left_over(standings: Sequence[Standing]) -> str:
-    """What is done and what is left, in a line."""
+def left_over(standings: Sequence[Standing], known: Sequence[Standing]) -> str:
+    """What is done and what is left, in a line.
+
+    Args:
+        standings: The cells in question.
+        known: Every cell whose speed may tell how long these will take.
+    """
     done = sum(one.state == "finished" for one in standings)
-    times = [estimate(one, standings) for one in standings if one.state != "finished"]
-    known = [seconds for seconds in times if seconds is not None]
+    left = [one for one in standings if one.state not in (*_SETTLED, "finished")]
+    times = [estimate(one, known) for one in left]
+    sure = [seconds for seconds in times if seconds is not None]
     text = f"{done} of {len(standings)} cells finished"
-    if times:
-        text += f", {len(times)} left: about {clock(sum(known))}"
-    if len(known) < len(times):
-        text += f" and {len(times) - len(known)} of unknown length"
+    if left:
+        text += f", {len(left)} left: about {clock(sum(sure))}"
+    if len(sure) < len(times):
+        text += f" and {len(times) - len(sure)} of unknown length"
+    for state in _SETTLED:
+        count = sum(one.state == state for one in standings)
+        if count:
+            text += f"; {count} {_SETTLED[state]}"
     return text
 
 

@@ -47,7 +47,9 @@ def table(
 
     if limit is not None and not limit > 0:
         raise ValueError(f"--limit is {limit:g}; it must be positive")
-    cells = choose(benchmarks.read_grid(grid or DEFAULT_GRID), only)
+    every = benchmarks.read_grid(grid or DEFAULT_GRID)
+    cells = choose(every, only)
+    others = [cell for cell in every if cell not in cells]
     folders = benchmarks.Folders(runs, results)
     outcomes: dict[str, str] = {}
     if not list:
@@ -56,6 +58,7 @@ def table(
             folders,
             limit=limit,
             anew=anew,
+            alike=others,
             say=lambda text: print(text, file=sys.stderr, flush=True),
         )
     standings = [runner.standing(cell, folders) for cell in cells]
@@ -71,22 +74,24 @@ def table(
             }
         )
     else:
-        _print(standings)
+        _print(standings, [runner.standing(cell, folders) for cell in others])
     if failed:
         return CHECK_FAILED
     cut = limit is None and "interrupted" in outcomes.values()
     return INTERRUPTED if cut else 0
 
 
-def _print(standings: "list[Standing]") -> None:
+def _print(standings: "list[Standing]", others: "list[Standing]") -> None:
     from rich.console import Console
     from rich.table import Table
 
     from cathsim_dmc.benchmarks import runner
 
+    # Of all cells of the grid, whichever were asked for.
+    known = [*standings, *others]
     table = Table("cell", "state", "frames", "time", "left", "success", box=None)
     for one in standings:
-        left = runner.estimate(one, standings)
+        left = runner.estimate(one, known)
         total = f"{one.cell.total_frames:,}"
         table.add_row(
             one.cell.name,
@@ -107,4 +112,4 @@ def _print(standings: "list[Standing]") -> None:
     for line, names in remarks.items():
         of = names[0] + (f" and {len(names) - 1} more" if len(names) > 1 else "")
         console.print(f"{of}: {line}", soft_wrap=True, highlight=False)
-    console.print(runner.left_over(standings), highlight=False)
+    console.print(runner.left_over(standings, known), highlight=False)

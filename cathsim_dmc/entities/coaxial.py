@@ -29,9 +29,6 @@ import numpy as np
 from cathsim_dmc.entities.arena import BLOOD_DENSITY
 from cathsim_dmc.entities.device import Device
 
-# Farther from the end than any device is long, m.
-_FAR = 1e3
-
 
 class Overlap(NamedTuple):
     """What the overlap alone decides, whatever the rotations. J joints, L links.
@@ -63,13 +60,16 @@ class Links(NamedTuple):
       radius: of the outermost device, m; in a link on which that changes, its mean.
       friction: Coulomb coefficient on the wall, likewise.
       mass: kg.
-      weight: what gravity pulls in blood, as mass, kg.
+      lightness: share of a link's mass that gravity does not pull at, beside that
+        which blood carries where all devices are.
+      inertia: (N, L, 2), moments of a solid capsule across and along it, kg·m².
     """
 
     radius: np.ndarray
     friction: np.ndarray
     mass: np.ndarray
-    weight: np.ndarray
+    lightness: np.ndarray
+    inertia: np.ndarray
 
 
 class Stack:
@@ -95,6 +95,9 @@ class Stack:
           ValueError: if there is no device, or one does not fit into the next.
         """
         _check_fit(devices)
+        from cathsim_dmc.entities import coaxial_loops  # late, as it takes long
+
+        self._loops = coaxial_loops
         self.devices = tuple(devices)
         self.link_lengths = np.asarray(link_lengths, dtype=np.float64)
         beyond = np.cumsum(self.link_lengths[::-1])[::-1]
@@ -104,16 +107,26 @@ class Stack:
         self.pairs = np.array(
             [(k, j) for k in range(count) for j in range(k + 1, count)], dtype=int
         ).reshape(-1, 2)
-        # Ends of the pieces of each device, and EI and EI κ in them; the first entry
-        # stands for what is beyond the device's end.
+        # Where the pieces of each device begin, and EI and EI κ in them; the first
+        # entry stands for what is beyond the device's end.
         pieces = [_pieces(device) for device in self.devices]
-        self._edges = [edges for edges, _, _ in pieces]
-        self._bending = [np.append(0.0, bending) for _, bending, _ in pieces]
-        self._moment = [np.append(0.0, moment) for _, _, moment in pieces]
+        most = max(len(edges) for edges, _, _ in pieces)
+        self._edges = np.full((count, most), np.inf)
+        self._bending = np.zeros((count, most + 1))
+        self._moment = np.zeros((count, most + 1))
+        for k, (edges, bending, moment) in enumerate(pieces):
+            self._edges[k, : len(edges)] = edges
+            self._bending[k, 1 : len(edges) + 1] = bending
+            self._moment[k, 1 : len(edges) + 1] = moment
         self._radius = np.array([device.outer_radius for device in devices])
         self._ratio = np.array([device.friction_ratio for device in devices])
-        self._density = np.array([device.linear_density for device in devices])
-        self._weight = np.array([weight_density(device) for device in devices])
+        self._densities = np.array(
+            [
+                [device.linear_density for device in devices],
+                [weight_density(device) for device in devices],
+            ]
+        )
+        self._arms = self._ratio * self._radius
 
     def overlap(self, gaps: np.ndarray) -> Overlap:
         """Integrals around the joints and over the links.
@@ -122,85 +135,41 @@ class Stack:
           gaps: (N, K), way from the end of each device to the end of the chain, m, at
             least 0, and 0 for the device that reaches farthest.
         """
-        edges = np.concatenate(
-            [gaps[:, k, None] + edge for k, edge in enumerate(self._edges)], axis=-1
+        gaps = np.ascontiguousarray(gaps, np.float64)
+        integrals = self._loops.overlaps(
+            gaps,
+            self.nodes,
+            self.link_lengths,
+            self._edges,
+            self._bending,
+            self._moment,
         )
-        edges.sort(axis=-1)
-        # Between two of them nothing changes: cells (N, C).
-        edges = np.concatenate([edges, np.full((len(gaps), 1), _FAR)], axis=-1)
-        middles = (edges[:, 1:] + edges[:, :-1]) / 2
-        bending, moment = self._sections(middles, gaps)
-        total = 1 / bending.sum(axis=1)
-        share = moment * total[:, None]
-        first, second = self.pairs[:, 0], self.pairs[:, 1]
-        both = share[:, first] * moment[:, second]
-        values = np.concatenate([total[:, None], share, both, bending, moment], axis=1)
-        weights = np.diff(self._weight_up_to(edges), axis=-1)  # (N, J, C)
-        integrals = (values[:, :, None] * weights[:, None]).sum(axis=-1)
-        count = len(self.devices)
-        cuts = np.cumsum([1, count, len(self.pairs), count])
-        compliance, rest, coupling, stiffness, mean = np.split(integrals, cuts, axis=1)
-        outermost, present = self._shares(gaps)
         return Overlap(
-            compliance[:, 0],
-            rest,
-            coupling,
-            stiffness / self.spans,
-            mean / self.spans,
-            outermost,
-            present,
+            *integrals, *self._loops.shares(gaps, self.nodes, self.link_lengths)
         )
-
-    def _weight_up_to(self, places: np.ndarray) -> np.ndarray:
-        """Integral (N, J, C) of the weight of each joint from the end to places (N, C).
-
-        The weight rises along the link beyond the joint and falls along the one before.
-        """
-        joints = self.nodes[1:-1, None]
-        ahead, behind = self.link_lengths[1:, None], self.link_lengths[:-1, None]
-        offset = places[:, None] - joints
-        rise = np.clip(offset + ahead, 0.0, ahead)
-        fall = np.clip(offset, 0.0, behind)
-        return rise**2 / (2 * ahead) + fall - fall**2 / (2 * behind)
-
-    def _sections(
-        self, places: np.ndarray, gaps: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """EI and EI κ (N, K, C) of each device at places (N, C) from the end."""
-        bending, moment = [], []
-        for k, edges in enumerate(self._edges):
-            own = places - gaps[:, k, None]
-            piece = (own[..., None] >= edges).sum(axis=-1)
-            bending.append(self._bending[k][piece])
-            moment.append(self._moment[k][piece])
-        return np.stack(bending, axis=1), np.stack(moment, axis=1)
-
-    def _shares(self, gaps: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Shares (N, K, L) of the links where a device is outermost, and present."""
-        present = (self.nodes[:-1] - gaps[..., None]) / self.link_lengths
-        np.clip(present, 0.0, 1.0, out=present)
-        # A place is covered by whatever lies farther out and reaches it.
-        covered = np.zeros_like(present[:, 0])
-        outermost = np.empty_like(present)
-        for k in reversed(range(len(self.devices))):
-            outermost[:, k] = np.maximum(present[:, k] - covered, 0.0)
-            covered = np.maximum(covered, present[:, k])
-        return outermost, present
 
     def rest_angles(
-        self, overlap: Overlap, turns: np.ndarray, factor: np.ndarray | complex = 1.0
+        self,
+        overlap: Overlap,
+        turns: np.ndarray,
+        spin: np.ndarray | None = None,
+        relaxation_time: float = 0.0,
     ) -> np.ndarray:
         """Angles of the free joints.
 
         Args:
           overlap: of the devices.
           turns: (N, K, J), rotation of each device at each joint, rad.
-          factor: (N, K, J), of the part of each device.
+          spin: (N, K, J), rate of that rotation, rad/s; 0 if None.
+          relaxation_time: of the joints' dampers, s: the angles lead by it.
 
         Returns:
           (N, J) complex, rad.
         """
-        return (overlap.rest * np.exp(1j * turns) * factor).sum(axis=1)
+        if spin is None:
+            spin = np.zeros(turns.shape)
+        turns = np.ascontiguousarray(turns)
+        return self._loops.rest_angles(overlap.rest, turns, spin, relaxation_time)
 
     def links(self, overlap: Overlap, friction: np.ndarray) -> Links:
         """What the links are made of.
@@ -209,13 +178,31 @@ class Stack:
           overlap: of the devices.
           friction: (N,), Coulomb coefficient of an uncoated device on the wall.
         """
-        outermost, present = overlap.outermost, overlap.present
-        return Links(
-            radius=_sum(outermost, self._radius),
-            friction=_sum(outermost, self._ratio) * friction[:, None],
-            mass=_sum(present, self._density) * self.link_lengths,
-            weight=_sum(present, self._weight) * self.link_lengths,
+        made = self._loops.links(
+            overlap.outermost,
+            overlap.present,
+            self.link_lengths,
+            friction,
+            self._radius,
+            self._ratio,
+            self._densities,
         )
+        return Links(*made)
+
+    def wall_friction(
+        self, overlap: Overlap, force: np.ndarray, friction: np.ndarray
+    ) -> np.ndarray:
+        """Largest torques by which the wall resists the turning of the devices.
+
+        Args:
+          overlap: of the devices.
+          force: (N, L), of the wall on the links, N.
+          friction: (N,), Coulomb coefficient of an uncoated device on the wall.
+
+        Returns:
+          (N, K, J), N·m, at the joints, of which each has half of its two links.
+        """
+        return self._loops.wall_friction(overlap.outermost, force, friction, self._arms)
 
     def restoring(
         self, overlap: Overlap, bends: np.ndarray, turns: np.ndarray
@@ -236,20 +223,9 @@ class Stack:
           Torque (N, K, J) on each device in the direction of its rotation, N·m, and
           minus its derivative by that rotation, N·m/rad.
         """
-        pulls = overlap.rest * np.exp(1j * turns)  # (N, K, J)
-        others = pulls.sum(axis=1, keepdims=True) - pulls
-        torque = (np.conj(bends[:, None] - others) * pulls) / overlap.compliance[
-            :, None
-        ]
-        rate, torque = torque.real, -torque.imag
-        for number, (k, j) in enumerate(self.pairs):
-            angle = turns[:, k] - turns[:, j]
-            energy = overlap.coupling[:, number]
-            torque[:, k] -= energy * np.sin(angle)
-            torque[:, j] += energy * np.sin(angle)
-            rate[:, k] += energy * np.cos(angle)
-            rate[:, j] += energy * np.cos(angle)
-        return torque, rate
+        return self._loops.restoring(
+            overlap.rest, overlap.compliance, overlap.coupling, bends, turns
+        )
 
     def pressure(
         self, overlap: Overlap, bends: np.ndarray, turns: np.ndarray
@@ -267,29 +243,14 @@ class Stack:
         Returns:
           (N, K - 1, J), N, at the joints, of device k on device k + 1.
         """
-        curvature = (bends / self.spans)[:, None]
-        inner = slice(0, len(self.devices) - 1)
-        moment = overlap.stiffness[:, inner] * curvature - overlap.moment[
-            :, inner
-        ] * np.exp(1j * turns[:, inner])
-        shear = np.diff(moment, axis=-1) / self.link_lengths[1:-1]
-        ends = np.zeros((*shear.shape[:-1], 1))
-        force = np.abs(np.diff(np.concatenate([ends, shear, ends], axis=-1), axis=-1))
-        # Only where both are: a joint has the share of the links on its sides.
-        present = overlap.present[:, 1:]
-        return force * (present[..., :-1] + present[..., 1:]) / 2
-
-    def inertia(self, mass: np.ndarray, radius: np.ndarray) -> np.ndarray:
-        """Moments of inertia (N, L, 2) of solid capsules: across and along, kg·m²."""
-        length = self.link_lengths
-        share = 1 / (1 + 4 * radius / (3 * length))  # of the cylinder in the volume
-        cylinder, ball = mass * share, mass * (1 - share)
-        square = radius**2
-        across = cylinder * (length**2 / 12 + square / 4) + ball * (
-            2 * square / 5 + length**2 / 4 + 3 * length * radius / 8
+        return self._loops.pressure(
+            overlap.stiffness,
+            overlap.moment,
+            overlap.present,
+            bends,
+            turns,
+            self.link_lengths,
         )
-        along = cylinder * square / 2 + ball * 2 * square / 5
-        return np.stack([across, along], axis=-1)
 
 
 def weight_density(device: Device) -> float:
@@ -317,11 +278,6 @@ def _pieces(device: Device) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     for start, stop, value in curved:
         curvature[(edges >= start) & (edges < stop)] = value
     return edges, bending, bending * curvature
-
-
-def _sum(shares: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """Sum over the devices (N, L) of shares (N, K, L) times values (K,)."""
-    return (shares * values[:, None]).sum(axis=1)
 
 
 def _check_fit(devices: Sequence[Device]) -> None:

@@ -178,14 +178,15 @@ def follower_posture(
         insertion if guidewire_insertion is None else guidewire_insertion,
         rotation if guidewire_rotation is None else guidewire_rotation,
     )
-    plain = [each for each in given if isinstance(each, float)]
-    if len(plain) == len(given):
-        posture = np.array(_posture(*plain))
+    arrays = [np.asarray(each, np.float64) for each in given]
+    if all(each.size == 1 for each in arrays):  # plain floats take a third of the time
+        plain = [each.item() for each in arrays]
+        shape = np.broadcast_shapes(*(each.shape for each in arrays))
+        posture = np.array(_posture(*plain)).reshape(*shape, len(JOINTS))
         finite = math.isfinite(sum(plain))
     else:
-        arrays = np.broadcast_arrays(*(np.asarray(each, np.float64) for each in given))
-        posture = np.stack(_posture(*arrays), axis=-1)
-        finite = np.isfinite(posture).all()
+        posture = np.stack(_posture(*np.broadcast_arrays(*arrays)), axis=-1)
+        finite = bool(np.isfinite(posture).all())
     if not finite:
         raise ValueError(
             "insertion, rotation, guidewire insertion and guidewire rotation must be "

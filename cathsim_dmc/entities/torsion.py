@@ -17,8 +17,6 @@ from cathsim_dmc.entities.device import Device
 # Rate of turning below which Coulomb friction is taken for viscous, rad/s: a device
 # that sticks creeps by less than this.
 STICKING = 0.02
-# Most rounds in which it is found which nodes stick; two or three are usual.
-_ROUNDS = 5
 
 
 class Rods:
@@ -39,9 +37,10 @@ class Rods:
             to distal, 0 the last.
           relaxation_time: τ, s.
         """
-        from scipy.linalg import lapack  # late, as all that takes long to import
+        from cathsim_dmc.entities import coaxial_loops  # late, as it takes long
 
-        self._solve = lapack.dptsv
+        self._loops = coaxial_loops
+        self._nodes = nodes
         self._relaxation_time = relaxation_time
         self.stiffness = np.stack([1 / _twist(device, nodes) for device in devices])
 
@@ -52,7 +51,7 @@ class Rods:
         duration: float,
         torque: np.ndarray | float = 0.0,
         rate: np.ndarray | float = 0.0,
-        friction: np.ndarray | None = None,
+        friction: np.ndarray | float = 0.0,
         brake: np.ndarray | float = 0.0,
     ) -> np.ndarray:
         """Turns the bases and brings the rods into balance.
@@ -69,67 +68,46 @@ class Rods:
         Returns:
           (N, K, M + 1), rad.
         """
-        stiffness, lag = self.stiffness, self._relaxation_time / duration
-        now = stiffness * np.diff(angles, axis=-1)  # torque of the segments at rest
-        coupling = np.broadcast_to((1 + lag) * stiffness, now.shape)
-        load = (
-            np.concatenate([now[..., 1:] - now[..., :-1], -now[..., -1:]], axis=-1)
-            + torque
+        loads = np.empty((4, *angles.shape[:-1], angles.shape[-1] - 1))
+        loads[0], loads[1], loads[2], loads[3] = torque, rate, friction, brake
+        return self._loops.turned(
+            np.ascontiguousarray(angles),
+            turned,
+            self.stiffness,
+            self._relaxation_time / duration,
+            STICKING * duration,
+            duration,
+            loads,
         )
-        load[..., 0] += coupling[..., 0] * turned
-        # Where the torque grows with the rotation it is taken as it is: no balance is
-        # near, and the rod's own damping bounds the speed.
-        diagonal = coupling + np.maximum(rate, 0.0) + brake / duration
-        diagonal[..., :-1] += coupling[..., 1:]
-        beside = -coupling
-        beside = np.concatenate(
-            [beside[..., 1:], np.zeros_like(beside[..., :1])], axis=-1
-        )
-        if friction is None or not friction.any():
-            move = self._balance(diagonal, beside, load)
-        else:
-            move = self._rubbed(diagonal, beside, load, friction, STICKING * duration)
-        new = angles.copy()
-        new[..., 0] += turned
-        new[..., 1:] += move
-        return new
 
-    def _rubbed(
-        self,
-        diagonal: np.ndarray,
-        beside: np.ndarray,
-        load: np.ndarray,
-        friction: np.ndarray,
-        least: float,
-    ) -> np.ndarray:
-        """Balance with Coulomb friction: each node sticks, or slides one way.
+    def at_joints(self, angles: np.ndarray, gaps: np.ndarray) -> np.ndarray:
+        """Rotations of the devices where the chain has its joints.
 
-        Which one is found by trying (Newton's method on the law of friction, which is
-        linear up to `least`, what a node that sticks may move); what was tried last
-        stands.
+        Between two nodes the rotation is linear; a joint beyond a device's end has that
+        of the end.
+
+        Args:
+          angles: (N, K, M + 1), rotation of the nodes, rad.
+          gaps: (N, K), way from the end of each device to the end of the chain, m.
+
+        Returns:
+          (N, K, J), rad; the chain has its J = M - 1 joints where a device that reaches
+          to its end has its inner nodes.
         """
-        way = np.zeros_like(load)  # +1 and -1 where a node slides, 0 where it sticks
-        move = way
-        for _ in range(_ROUNDS):
-            sticks = np.where(way == 0.0, friction / least, 0.0)
-            move = self._balance(diagonal + sticks, beside, load - friction * way)
-            found = np.where(np.abs(move) > least, np.sign(move), 0.0)
-            found[found * way < 0.0] = 0.0
-            if (found == way).all():
-                break
-            way = found
-        return move
+        return self._loops.at_joints(np.ascontiguousarray(angles), gaps, self._nodes)
 
-    def _balance(
-        self, diagonal: np.ndarray, beside: np.ndarray, load: np.ndarray
-    ) -> np.ndarray:
-        """Solves the tridiagonal systems of all rods, one after the other in a row."""
-        move, status = self._solve(diagonal.ravel(), beside.ravel()[:-1], load.ravel())[
-            2:
-        ]
-        if status:
-            raise RuntimeError(f"the twist of a device has no solution ({status})")
-        return move.reshape(load.shape)
+    def at_nodes(self, loads: np.ndarray, gaps: np.ndarray) -> np.ndarray:
+        """Loads on the nodes, of loads at the joints of the chain.
+
+        Args:
+          loads: (F, N, K, J), F kinds of loads at the joints.
+          gaps: (N, K), m.
+
+        Returns:
+          (F, N, K, M), on the nodes but the base: those on both sides of a joint share
+          its load.
+        """
+        return self._loops.at_nodes(loads, gaps, self._nodes)
 
     def base_torque(self, angles: np.ndarray) -> np.ndarray:
         """Torque (N, K) of the rotary units on the devices at rest, N·m."""

@@ -12,11 +12,10 @@ when there is something to draw.
 """
 
 import math
-from collections.abc import Callable
 
-import numba
 import numpy as np
 
+from cathsim_dmc.compiled import compiled
 from cathsim_dmc.imaging.carm import NEAREST
 
 # Distance of the discs along the projected axis, px. At this distance the ripple of
@@ -28,23 +27,13 @@ RELATIVE_SPACING = 0.1
 WIDEST = 128
 
 
-def _compiled(function: Callable) -> Callable:
-    """Compiles a function, once on each machine where there is a place to keep it."""
-    # No `fastmath`: every frame is to be the same, bit for bit, alone and in a batch.
-    options = {"nogil": True, "error_model": "numpy"}
-    try:
-        return numba.njit(function, cache=True, **options)
-    except RuntimeError:  # neither this folder nor the user's can be written to
-        return numba.njit(function, **options)
-
-
-@_compiled
+@compiled
 def _left(t: float) -> float:
     """Area of the unit disc on one side of a line, t in [-1, 1]."""
     return 0.5 * math.pi + t * math.sqrt(1.0 - t * t) + math.asin(t)
 
 
-@_compiled
+@compiled
 def _below_left(x: float, y: float, left: float, below: float) -> float:
     if x * x + y * y < 1.0:
         return 0.5 * (left + below) + x * y - 0.25 * math.pi
@@ -53,14 +42,14 @@ def _below_left(x: float, y: float, left: float, below: float) -> float:
     return below if y < 0.0 else left + below - math.pi
 
 
-@_compiled
+@compiled
 def disc_quadrant(x: float, y: float) -> float:
     """Area of the part of the unit disc left of `x` and below `y`, in [0, pi]."""
     x, y = min(max(x, -1.0), 1.0), min(max(y, -1.0), 1.0)
     return _below_left(x, y, _left(x), _left(y))
 
 
-@_compiled
+@compiled
 def add_disc(
     image: np.ndarray, row: float, column: float, radius: float, weight: float
 ) -> None:
@@ -101,7 +90,7 @@ def add_disc(
                 image[i, k] += weight * share
 
 
-@_compiled
+@compiled
 def add_devices(
     image: np.ndarray,
     camera: np.ndarray,
@@ -145,7 +134,7 @@ def add_devices(
     return widest
 
 
-@_compiled
+@compiled
 def _add_link(
     image, camera, link, radii, focal, mu, marker_mu, marker_length, to_tip
 ) -> tuple[float, float]:

@@ -28,6 +28,13 @@ VIEWS = {
 }
 GOAL_COLOUR, GOAL_LIGHT = "#12805c", "#5fd7ac"
 DEVICE_COLOUR, DEVICE_LIGHT = "#173a63", "#7fb2e5"
+# Of coaxial devices from the innermost outwards, over and over: a wire, and what a
+# single device has for the catheter around it.
+DEVICES = (
+    ("#0b6b5a", "#7fe0c8"),
+    (DEVICE_COLOUR, DEVICE_LIGHT),
+    ("#5b3a86", "#c3a4ee"),
+)
 HEAD_COLOUR = "#ffb000"
 PATH_COLOUR = "#c77f00"
 # An arrow of the largest force is this long, mm; weaker ones are in proportion, down
@@ -72,7 +79,8 @@ def force_map() -> LinearSegmentedColormap:
 
 
 @functools.lru_cache(maxsize=16)
-def _background(surface: Any, azimuth: float, height: int) -> tuple[Projection, Glass]:
+def background(surface: Any, azimuth: float, height: int) -> tuple[Projection, Glass]:
+    """A vessel as glass, seen from an azimuth, degrees, in so many rows of pixels."""
     projection = Projection.of(surface.vertices, azimuth=azimuth, height=height)
     return projection, glass(surface.vertices, surface.faces, projection)
 
@@ -98,7 +106,7 @@ def scene_figure(
     unknown = [view for view in views if view not in VIEWS]
     if unknown or not (views or fluoroscopy):
         raise ValueError(f"views are {views!r}; give some of {', '.join(VIEWS)}")
-    drawn = [_background(snapshot.surface, VIEWS[v][0], pixels) for v in views]
+    drawn = [background(snapshot.surface, VIEWS[v][0], pixels) for v in views]
     ratios = [p.shape[1] / p.shape[0] for p, _ in drawn] + [1.0] * fluoroscopy
     figure = Picture(
         figsize=(_HEIGHT_IN * 0.84 * sum(ratios) + 1.6, _HEIGHT_IN),
@@ -172,7 +180,12 @@ def _draw_device(axes: Any, snapshot: Snapshot, projection: Projection) -> None:
     # Thicker than in truth, by half: as printed it would be two points wide.
     width = 1.5 * 2e3 * radius * _points_per_mm(axes)
     pieces = np.stack([line[:-1], line[1:]], axis=1)
-    for colour, share in (("white", 1.5), (DEVICE_COLOUR, 1.0), (DEVICE_LIGHT, 0.35)):
+    dark, light = DEVICE_COLOUR, DEVICE_LIGHT
+    if snapshot.outermost is not None:
+        own = [DEVICES[number % len(DEVICES)] for number in snapshot.outermost]
+        dark, light = ([pair[shade] for pair in own] for shade in (0, 1))
+        dark, light = np.repeat(dark, _PIECES), np.repeat(light, _PIECES)
+    for colour, share in (("white", 1.5), (dark, 1.0), (light, 0.35)):
         axes.add_collection(
             LineCollection(
                 list(pieces),
@@ -182,6 +195,11 @@ def _draw_device(axes: Any, snapshot: Snapshot, projection: Projection) -> None:
                 zorder=4,
             )
         )
+    for number, end in enumerate(projection.flat_mm(snapshot.ends)):
+        axes.plot(
+            *end, "o", ms=1.3 * width.max(), mfc=DEVICES[number % len(DEVICES)][1],
+            mec="0.1", mew=0.8, zorder=5,
+        )  # fmt: skip
     axes.plot(
         *line[-1], "o", ms=1.6 * width[-1], mfc=HEAD_COLOUR, mec="white", mew=0.8,
         zorder=5,

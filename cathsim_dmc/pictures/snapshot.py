@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import dataclasses
 import functools
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from cathsim_dmc.imaging import Angiograph, FluoroscopyOptions
+from cathsim_dmc.recording.coaxial import CoaxialRecord
 from cathsim_dmc.recording.episode import Episode
 from cathsim_dmc.recording.geometry import force_scale
 
@@ -16,7 +17,7 @@ from cathsim_dmc.recording.geometry import force_scale
 _VIEWS = 8
 
 
-@dataclass(frozen=True, eq=False)
+@dataclasses.dataclass(frozen=True, eq=False)
 class Snapshot:
     """State of one simulation; lengths in metres, forces in newtons, world frame.
 
@@ -24,6 +25,9 @@ class Snapshot:
         surface: Lumen surface with `vertices` (V, 3) and `faces` (F, 3).
         device: (L + 1, 3) joints of the device from base to head.
         radius: (L,) radii of its links.
+        outermost: (L,) number of the outermost of coaxial devices on each link, 0 for
+            the innermost; None for a device alone.
+        ends: (K, 3) ends of coaxial devices, from the innermost outwards.
         goal: (3,) centre of the goal.
         goal_radius: Radius of the goal.
         position: (K, 3) contacts with the wall.
@@ -43,6 +47,8 @@ class Snapshot:
     force_scale: float
     path: np.ndarray
     title: str
+    outermost: np.ndarray | None = None
+    ends: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros((0, 3)))
 
     @property
     def magnitude(self) -> np.ndarray:
@@ -61,10 +67,10 @@ class Snapshot:
         contacts = task.contacts(env.physics)
         info = task.info()
         links = len(readings.centreline) - 1
+        radius = np.full(links, scene.device.outer_radius)
         return cls(
             surface=scene.anatomy.surface,
             device=readings.centreline,
-            radius=np.full(links, scene.device.outer_radius),
             goal=task.goal_position,
             goal_radius=float(task.objective.goal_radius),
             position=contacts.position[contacts.present],
@@ -72,6 +78,7 @@ class Snapshot:
             force_scale=force_scale(contacts.magnitude[contacts.present]),
             path=np.zeros((0, 3)),
             title=f"{task.name}: {1e3 * info['distance']:.0f} mm to {scene.goal.name}",
+            **_lying(CoaxialRecord.now(task), readings.centreline[None], 0, radius),
         )
 
     @classmethod
@@ -99,10 +106,10 @@ class Snapshot:
         there = episode.contact_step == step - 1
         links = episode.catheter.shape[1] - 1
         radius = np.asarray(episode.meta.get("catheter_radius", 0.835e-3))
+        radius = np.broadcast_to(radius, (links,))
         return cls(
             surface=surface,
             device=episode.catheter[step],
-            radius=np.broadcast_to(radius, (links,)),
             goal=np.asarray(goal, dtype=np.float64),
             goal_radius=float(episode.meta["goal_radius"]),
             position=episode.contact_position[there],
@@ -111,7 +118,29 @@ class Snapshot:
             force_scale=force_scale(np.linalg.norm(episode.contact_force, axis=-1)),
             path=episode.head[: step + 1],
             title=f"{episode.task}, {episode.time[step] - episode.time[0]:.1f} s",
+            **_lying(CoaxialRecord.of(episode), episode.catheter, step, radius),
         )
+
+
+def _lying(
+    coaxial: CoaxialRecord | None, line: np.ndarray, state: int, radius: np.ndarray
+) -> dict[str, np.ndarray]:
+    """Radii of the links (L,), and which of coaxial devices are where on the chain.
+
+    Args:
+        coaxial: The devices; None for one alone.
+        line: (T+1, L+1, 3), the chain in all states.
+        state: Number of the state.
+        radius: (L,), of a device alone.
+    """
+    if coaxial is None:
+        return {"radius": radius}
+    outermost = coaxial.outermost(line)[state]
+    return {
+        "outermost": outermost,
+        "radius": coaxial.radii[outermost],
+        "ends": coaxial.ends(line)[state],
+    }
 
 
 def navigation_of(env: Any) -> Any:

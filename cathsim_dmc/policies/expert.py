@@ -1,7 +1,7 @@
 """A scripted expert that steers along the centreline to the goal.
 
 It proves the tasks solvable and is a yardstick for trained agents. What it decides is
-in `pursuit`; here it meets the simulations.
+in `pursuit`, for coaxial devices in `coaxial_pursuit`; here it meets the simulations.
 """
 
 from __future__ import annotations
@@ -11,11 +11,13 @@ from typing import Any
 
 import numpy as np
 
+from cathsim_dmc.policies import coaxial_pursuit
 from cathsim_dmc.policies.policy import Policy
 from cathsim_dmc.policies.pursuit import Plan, Settings, State, decide
 from cathsim_dmc.policies.view import View
 from cathsim_dmc.tasks import forces, navigation
 from cathsim_dmc.tasks.cases import Case
+from cathsim_dmc.tasks.coaxial import CoaxialReadings
 from cathsim_dmc.tasks.objective_pool import part
 from cathsim_dmc.tasks.readings import Readings
 
@@ -64,8 +66,13 @@ class Expert:
         for field in dataclasses.fields(State):
             getattr(self._state, field.name)[which] = getattr(fresh, field.name)[which]
 
-    def act(self, readings: Readings, wall_force: forces.WallForce) -> np.ndarray:
-        """Action (..., A) in [-1, 1] for the state of the devices.
+    def act(
+        self,
+        readings: Readings,
+        wall_force: forces.WallForce,
+        devices: CoaxialReadings | None = None,
+    ) -> np.ndarray:
+        """Action (..., A) in [-1, 1] for the state of the device.
 
         Raises:
             ValueError: if the leading axes changed since the last call without reset.
@@ -92,6 +99,80 @@ class Expert:
         self._state = dataclasses.replace(self._state, bend=bend)
 
 
+class CoaxialExpert:
+    """The expert at work on one task of coaxial devices."""
+
+    def __init__(
+        self,
+        plan: coaxial_pursuit.Plan,
+        settings: coaxial_pursuit.Settings | None = None,
+    ):
+        """Starts without any memory."""
+        self._plan = plan
+        self._settings = settings or coaxial_pursuit.Settings()
+        self._state: coaxial_pursuit.State | None = None
+
+    @property
+    def state(self) -> coaxial_pursuit.State | None:
+        """What is remembered; None before the first action."""
+        return self._state
+
+    def reset(self, which: np.ndarray | None = None) -> None:
+        """Forgets the simulations that begin a new episode.
+
+        Args:
+            which: Mask or indices of the simulations, None for all.
+        """
+        if which is None or self._state is None:
+            self._state = None
+            return
+        fresh = coaxial_pursuit.State.fresh(len(self._state.attempts))
+        for field in dataclasses.fields(fresh):
+            getattr(self._state, field.name)[which] = getattr(fresh, field.name)[which]
+
+    def act(
+        self,
+        readings: Readings,
+        wall_force: forces.WallForce,
+        devices: CoaxialReadings | None = None,
+    ) -> np.ndarray:
+        """Action (N, 2 K) in [-1, 1] for the state of the devices."""
+        assert devices is not None
+        if self._state is None:
+            self._state = coaxial_pursuit.State.fresh(len(readings.head))
+        action, self._state = coaxial_pursuit.decide(
+            self._plan, self._settings, self._state, readings, devices, wall_force
+        )
+        return action
+
+    def follow(self, action: np.ndarray) -> None:
+        """Nothing: it remembers no action, only where the devices have come to."""
+
+
+def expert_for(
+    task: navigation.Navigation | Case, settings: Settings | None = None
+) -> Expert | CoaxialExpert:
+    """The expert for a task, or for one of the anatomies that its episodes draw from.
+
+    Args:
+        task: Task or anatomy.
+        settings: Settings of its driving; those of coaxial devices are
+            `coaxial_pursuit.Settings`.
+
+    Raises:
+        ValueError: if the device can neither be steered nor turned at its base, or the
+            settings are not for it.
+    """
+    if not task.scene.coaxial:
+        return Expert(Plan.for_task(task), settings)
+    if settings is not None and not isinstance(settings, coaxial_pursuit.Settings):
+        raise ValueError(
+            "these settings are of a steerable device's expert; coaxial devices need "
+            "coaxial_pursuit.Settings"
+        )
+    return CoaxialExpert(coaxial_pursuit.Plan.for_task(task), settings)
+
+
 class Experts:
     """An expert for each simulation, where their anatomies differ."""
 
@@ -99,9 +180,9 @@ class Experts:
         """Starts without knowing any simulation: `reset` comes first."""
         self._view = view
         self._settings = settings
-        self._plans: dict[Case, Plan] = {}
         # By simulation, from its first reset on.
-        self._experts: dict[int, Expert] = {}
+        self._cases: dict[int, Case] = {}
+        self._experts: dict[int, Expert | CoaxialExpert] = {}
 
     def reset(self, which: np.ndarray | None = None) -> None:
         """Looks at the anatomies of the simulations that begin a new episode.
@@ -113,17 +194,27 @@ class Experts:
         chosen = numbers if which is None else numbers[which]
         for index in chosen.tolist():
             case = self._view.case(index)
-            if case not in self._plans:
-                self._plans[case] = Plan.for_task(case)
-            self._experts[index] = Expert(self._plans[case], self._settings)
+            if self._cases.get(index) is not case:
+                self._cases[index] = case
+                self._experts[index] = expert_for(case, self._settings)
+            self._experts[index].reset()
 
-    def act(self, readings: Readings, wall_force: forces.WallForce) -> np.ndarray:
+    def act(
+        self,
+        readings: Readings,
+        wall_force: forces.WallForce,
+        devices: CoaxialReadings | None = None,
+    ) -> np.ndarray:
         """Action (N, A) in [-1, 1] for the state of the devices."""
-        rows = [np.array([index]) for index in range(self._view.num_simulations)]
-        actions = [
-            self._experts[index].act(part(readings, row), part(wall_force, row))
-            for index, row in enumerate(rows)
-        ]
+        actions = []
+        for index in range(self._view.num_simulations):
+            row = np.array([index])
+            state = None if devices is None else part(devices, row)
+            actions.append(
+                self._experts[index].act(
+                    part(readings, row), part(wall_force, row), state
+                )
+            )
         return np.concatenate(actions)
 
     def follow(self, action: np.ndarray) -> None:
@@ -147,7 +238,7 @@ class ExpertPolicy(Policy):
             settings: Settings of its driving.
         """
         self._settings = settings
-        self._expert: Expert | Experts | None = None
+        self._expert: Expert | CoaxialExpert | Experts | None = None
         self._view: View | None = None
 
     def reset(self, view: View, which: np.ndarray) -> None:
@@ -162,7 +253,7 @@ class ExpertPolicy(Policy):
             self._expert = (
                 Experts(view, self._settings)
                 if several
-                else Expert.for_task(view.task, self._settings)
+                else expert_for(view.task, self._settings)
             )
         self._expert.reset(which)
 
@@ -170,7 +261,8 @@ class ExpertPolicy(Policy):
         """Actions (N, A) for the state of the devices."""
         if self._expert is None or self._view is None:
             raise RuntimeError("the expert must be reset before it acts")
-        return self._expert.act(self._view.readings, self._view.wall_force)
+        view = self._view
+        return self._expert.act(view.readings, view.wall_force, view.devices)
 
     def follow(self, action: np.ndarray) -> None:
         """Takes what was carried out in place of its last actions for its own.

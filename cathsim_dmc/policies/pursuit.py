@@ -28,9 +28,9 @@ from cathsim_dmc.entities import devices
 from cathsim_dmc.tasks import forces, navigation
 from cathsim_dmc.tasks.cases import Case
 from cathsim_dmc.tasks.readings import Readings
-from cathsim_dmc.tasks.route import Place, Route, along, locate
+from cathsim_dmc.tasks.route import Place, Route, RouteLike, along, locate
 
-_WITHDRAWN = 2e-3  # m, insertion below which there is nothing left to withdraw
+WITHDRAWN = 2e-3  # m, insertion below which there is nothing left to withdraw
 
 
 @dataclasses.dataclass(frozen=True)
@@ -86,6 +86,21 @@ class Settings:
     backoff_growth: float = 0.5
 
 
+def route_of(task: navigation.Navigation | Case) -> Route:
+    """The route to the goal of a task, or of one of its anatomies.
+
+    Raises:
+        ValueError: if its objective has none.
+    """
+    line = getattr(task.objective, "route", None)
+    if line is None:
+        raise ValueError(
+            f"the objective {type(task.objective).__name__} has no route, a "
+            "centreline from the inlet to the goal, for the expert to follow"
+        )
+    return Route.of(line)
+
+
 @dataclasses.dataclass(frozen=True)
 class Plan:
     """What the expert knows of a task; world frame, SI units.
@@ -118,22 +133,23 @@ class Plan:
         """Reads off a task, or one of the anatomies that its episodes draw from.
 
         Raises:
-            ValueError: if the task's device has no motors in its tip.
+            ValueError: if the task's device has no motors in its tip, or it has coaxial
+                devices.
         """
         catheter = task.scene.catheter
+        if task.scene.coaxial:
+            raise ValueError(
+                "this expert steers the tip of one device, and the task has coaxial "
+                "devices; their own expert remembers what it tries, so it answers no "
+                "questions on the way (dagger): learn from its demonstrations (bc)"
+            )
         if not catheter.device.steerable:
             steerable = [d.name for d in devices.DEVICES.values() if d.steerable]
             raise ValueError(
                 f"device {catheter.device.name!r} has no motors in its tip, so the "
                 f"expert cannot steer it; choose one of {', '.join(steerable)}"
             )
-        line = getattr(task.objective, "route", None)
-        if line is None:
-            raise ValueError(
-                f"the objective {type(task.objective).__name__} has no route, a "
-                "centreline from the inlet to the goal, for the expert to follow"
-            )
-        route = Route.of(line)
+        route = route_of(task)
         hinges, numbers = [], {}
         for column, joint in enumerate(catheter.joints):
             if joint.type == "slide":
@@ -220,7 +236,7 @@ def tip_frames(plan: Plan, joints: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     axes = []
     for column, axis in plan.hinges:
         axes.append(frame[..., axis])
-        frame = _turned(frame, axis, joints[..., column])
+        frame = turned(frame, axis, joints[..., column])
     stacked = np.stack(axes, axis=-2)
     return stacked[..., plan.tip, :], frame[..., 2]
 
@@ -248,14 +264,16 @@ def decide(
     steady = np.where(state.attempts % 2 == 1, state.arc_length, np.nan)
     place = locate(plan, readings.head, steady)
     axes, direction = tip_frames(plan, readings.joint_positions)
-    target = plan.at(place.arc_length + _lookahead(plan, settings, state, place))
+    target = plan.at(
+        place.arc_length + lookahead(plan, settings, state.attempts, place)
+    )
     turn, cosine = _rotation_to(direction, target - readings.head)
     bend = _follow_the_leader(plan, state, readings.insertion)
     bend = bend + _correction(settings, axes, turn)
     bend = np.clip(bend, -plan.steering_angle, plan.steering_angle)
     state = _attempt(settings, state, place, readings.insertion)
-    free = _ramp(wall_force.max, settings.hard_force, settings.soft_force)
-    clear = _ramp(cosine, settings.misaligned, settings.aligned)
+    free = ramp(wall_force.max, settings.hard_force, settings.soft_force)
+    clear = ramp(cosine, settings.misaligned, settings.aligned)
     advance = settings.speed * np.maximum(free * clear, settings.creep)
     translation = np.where(state.retracting, -settings.speed, advance)
     action = np.zeros((*translation.shape, plan.num_actions))
@@ -265,10 +283,10 @@ def decide(
     return action, dataclasses.replace(state, bend=bend)
 
 
-def _lookahead(
-    plan: Plan, settings: Settings, state: State, place: Place
+def lookahead(
+    plan: RouteLike, settings: Settings, attempts: np.ndarray, place: Place
 ) -> np.ndarray:
-    """Way (...) from the place to the point pursued, m."""
+    """Way (...) from the place to the point pursued in an attempt (...), m."""
     # The lumen that counts is the one to come, or a branch is entered too obliquely.
     coming = place.arc_length + settings.least_lookahead
     radius = np.interp(coming, plan.arc_length, plan.radii)
@@ -276,7 +294,7 @@ def _lookahead(
         settings.lookahead_radii * radius, settings.least_lookahead, settings.lookahead
     )
     factors = np.asarray(settings.lookahead_factors)
-    return ahead * factors[state.attempts % len(factors)]
+    return ahead * factors[attempts % len(factors)]
 
 
 def _rotation_to(direction: np.ndarray, way: np.ndarray) -> tuple[np.ndarray, ...]:
@@ -321,7 +339,7 @@ def _attempt(
     give_up = (stale > settings.patience) | (lost > settings.lost_patience)
     growth = 1 + settings.backoff_growth * (state.attempts % 4)
     turn = np.where(give_up, insertion - settings.backoff * growth, state.turn)
-    back = (insertion <= turn) & ~outside | (insertion <= _WITHDRAWN)
+    back = (insertion <= turn) & ~outside | (insertion <= WITHDRAWN)
     retracting = (state.retracting | give_up) & ~back
     again = state.retracting & ~retracting
     best = np.where(gained, place.arc_length, state.best)
@@ -350,7 +368,7 @@ def _matrix(quaternion: np.ndarray) -> np.ndarray:
     )
 
 
-def _turned(frame: np.ndarray, axis: int, angle: np.ndarray) -> np.ndarray:
+def turned(frame: np.ndarray, axis: int, angle: np.ndarray) -> np.ndarray:
     """Frame (..., 3, 3) turned by an angle (...) about its own axis 0, 1 or 2."""
     first, second = (axis + 1) % 3, (axis + 2) % 3
     cosine, sine = np.cos(angle)[..., None], np.sin(angle)[..., None]
@@ -360,6 +378,6 @@ def _turned(frame: np.ndarray, axis: int, angle: np.ndarray) -> np.ndarray:
     return turned
 
 
-def _ramp(value: np.ndarray, none: float, full: float) -> np.ndarray:
+def ramp(value: np.ndarray, none: float, full: float) -> np.ndarray:
     """0 at `none` and on its side, 1 at `full` and on its side, linear between."""
     return np.clip((value - none) / (full - none), 0.0, 1.0)

@@ -15,10 +15,11 @@ from dm_control import composer
 from cathsim_dmc.simulation.batch import BatchSimulation
 from cathsim_dmc.tasks import forces
 from cathsim_dmc.tasks.cases import Case
+from cathsim_dmc.tasks.coaxial import CoaxialReadings
 from cathsim_dmc.tasks.navigation import Navigation
 from cathsim_dmc.tasks.readings import Readings
 
-Stacked = TypeVar("Stacked", Readings, forces.WallForce)
+Stacked = TypeVar("Stacked", Readings, forces.WallForce, CoaxialReadings)
 
 
 class View(Protocol):
@@ -30,6 +31,7 @@ class View(Protocol):
         task: The task that all of them run.
         readings: State of the devices; every array has the leading axis N.
         wall_force: Force on the wall over the last control step, likewise.
+        devices: State of coaxial devices, likewise; None for one device alone.
     """
 
     num_simulations: int
@@ -52,6 +54,11 @@ class View(Protocol):
     @property
     def wall_force(self) -> forces.WallForce:
         """Force on the wall over the last control step; arrays (N,), N."""
+        ...
+
+    @property
+    def devices(self) -> CoaxialReadings | None:
+        """State of coaxial devices, arrays (N, ...); None for one device alone."""
         ...
 
 
@@ -82,6 +89,11 @@ class BatchedView:
         """Force on the wall over the last control step; arrays (N,), N."""
         return self._simulation.wall_force
 
+    @property
+    def devices(self) -> CoaxialReadings | None:
+        """State of coaxial devices, arrays (N, ...); None for one device alone."""
+        return self._simulation.rollout.devices
+
 
 class ComposerView:
     """Composer environments, one simulation each."""
@@ -109,6 +121,12 @@ class ComposerView:
     def wall_force(self) -> forces.WallForce:
         """Force on the wall over the last control step; arrays (N,), N."""
         return _stacked([env.task.wall_force for env in self._environments])
+
+    @property
+    def devices(self) -> CoaxialReadings | None:
+        """State of coaxial devices, arrays (N, ...); None for one device alone."""
+        states = [env.task.devices for env in self._environments]
+        return None if states[0] is None else _stacked(states)
 
 
 def _stacked(parts: list[Stacked]) -> Stacked:

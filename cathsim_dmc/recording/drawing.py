@@ -73,6 +73,8 @@ def action_layout(episode: Episode) -> tuple[list[str], np.ndarray]:
     given = episode.meta.get("action_names")
     if given is not None and len(given) == count:
         names = [str(name).rsplit("/", 1)[-1] for name in given]
+        if len(set(names)) < count:  # of several devices, whose names come first
+            names = [str(name).replace("/", "_") for name in given]
     else:
         tips = min(count, DEFAULT_TIP_MOTORS)
         names = [f"{TIP_PREFIX}{'xy'[i % 2]}_{i // 2}" for i in range(tips)]

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from dm_control.rl import control
 
+from cathsim_dmc.recording.coaxial import SERIES, device_meta
 from cathsim_dmc.recording.episode import TERMINATIONS, Episode
 
 Policy = Callable[[Any], np.ndarray]
@@ -227,13 +228,16 @@ class EpisodeRecorder:
     def _state(self) -> dict[str, Any]:
         data = self._env.physics.data
         head = data.site_xpos[self._head]
+        devices = getattr(self._env.task, "devices", None)
+        coaxial = {} if devices is None else {n: getattr(devices, n) for n in SERIES}
         return {
+            **coaxial,
             "time": float(data.time),
             "qpos": np.array(data.qpos),
             "catheter": np.vstack([data.xpos[self._links], head]),
             "body_pos": np.array(data.xpos),
             "body_quat": np.array(data.xquat),
-            "insertion": float(data.qpos[self._insertion]),
+            "base_insertion": float(data.qpos[self._insertion]),
         }
 
     def _action(self, policy: Policy, timestep: Any) -> np.ndarray:
@@ -269,6 +273,9 @@ class EpisodeRecorder:
             "wall_force_peak_max": rows.get("wall_force_peak_max").tolist(),
             "reward_terms": _columns(rows.columns.get("reward_terms", [])),
         }
+        if SERIES[0] in rows.columns:
+            series = {name: rows.get(name) for name in SERIES}
+            meta["devices"] = device_meta(self._env.task, series)
         goal = read_goal(self._env.task)
         if goal is not None:
             position, radius = goal
@@ -279,13 +286,14 @@ class EpisodeRecorder:
         return meta
 
     def _episode(self, rows: _Rows, seed: int | None, meta: dict) -> Episode:
-        state = ("time", "qpos", "catheter", "body_pos", "body_quat", "insertion")
+        state = ("time", "qpos", "catheter", "body_pos", "body_quat")
         step = ("reward", "wall_force_sum", "wall_force_max", "push_force")
         ragged = {"contact_position": (3,), "contact_force": (3,)}
         return Episode(
             task=self._task_name,
             seed=seed,
             meta=meta,
+            insertion=rows.get("base_insertion"),
             action=rows.get("action", self._env.action_spec().shape),
             contact_step=np.concatenate(
                 [np.zeros(0, np.int64), *rows.columns.get("contact_step", [])]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import rerun as rr
 
+from cathsim_dmc.recording.coaxial import CoaxialRecord
 from cathsim_dmc.recording.episode import Episode
 from cathsim_dmc.recording.geometry import (
     force_colours,
@@ -27,6 +28,9 @@ LABELLED = 0.5
 SHAFT_COLOUR = (215, 228, 255)
 HEAD_COLOUR = (255, 200, 0)
 TRAIL_COLOUR = (255, 200, 0, 160)
+# Of coaxial devices from the innermost outwards, over and over: a wire is teal, the
+# catheter around it looks as a single device does.
+DEVICE_COLOURS = ((90, 220, 190), SHAFT_COLOUR, (200, 170, 255))
 
 
 def log_catheter(
@@ -40,18 +44,29 @@ def log_catheter(
     Args:
         log: Where to.
         radii: (L,) radii of the links, metres.
-        colour: Colour of links that press nothing.
+        colour: Colour of links that press nothing; where it is the default, coaxial
+            devices have their own.
         entity: Path of the device.
     """
     joints = log.episode.catheter
     states, links = joints.shape[0], joints.shape[1] - 1
     along = np.diff(joints, axis=1)
-    log.static(entity, rr.Capsules3D.from_fields(radii=radii, fill_mode="solid"))
+    colours = np.broadcast_to(np.array(colour, dtype=np.uint8), (states, links, 3))
+    thickness = np.broadcast_to(radii, (states, links))
+    coaxial = CoaxialRecord.of(log.episode)
+    if coaxial is not None:
+        outermost = coaxial.outermost(joints)
+        thickness = coaxial.radii[outermost]
+        if colour == SHAFT_COLOUR:  # else it tells episodes apart, not devices
+            colours = device_colours(len(coaxial.names))[outermost]
+        _log_ends(log, coaxial, entity)
+    log.static(entity, rr.Capsules3D.from_fields(fill_mode="solid"))
     capsules = rr.Capsules3D.columns(
         lengths=np.linalg.norm(along, axis=-1).ravel(),
+        radii=thickness.ravel(),
         translations=joints[:, :-1].reshape(-1, 3),
         quaternions=xyzw(z_to(along)).reshape(-1, 4),
-        colors=link_colours(log.episode, colour).reshape(-1, 3),
+        colors=link_colours(log.episode, colours).reshape(-1, 3),
     )
     log.columns(entity, capsules.partition(np.full(states, links)))
     head = log.episode.head
@@ -71,8 +86,32 @@ def log_catheter(
         )
 
 
-def link_colours(episode: Episode, colour: tuple[int, int, int]) -> np.ndarray:
-    """Colours (T+1, L, 3) uint8 of the links: that of the largest force, or none."""
+def device_colours(count: int) -> np.ndarray:
+    """Colours (K, 3) uint8 of coaxial devices, from the innermost outwards."""
+    numbers = np.arange(count) % len(DEVICE_COLOURS)
+    return np.array(DEVICE_COLOURS, dtype=np.uint8)[numbers]
+
+
+def _log_ends(log: Log, coaxial: CoaxialRecord, entity: str) -> None:
+    """Log the end of each coaxial device, in the device's colour."""
+    ends = coaxial.ends(log.episode.catheter)
+    for k, name in enumerate(coaxial.names):
+        where = f"{entity}/{name}"
+        look = rr.Points3D.from_fields(
+            colors=device_colours(len(coaxial.names))[k : k + 1],
+            radii=[HEAD_SCALE * coaxial.radii[k]],
+        )
+        log.static(where, look)
+        log.columns(where, rr.Points3D.columns(positions=ends[:, k]))
+
+
+def link_colours(episode: Episode, colours: np.ndarray) -> np.ndarray:
+    """Colours (T+1, L, 3) uint8 of the links: that of the largest force, or their own.
+
+    Args:
+        episode: What was recorded.
+        colours: (T+1, L, 3) uint8, of links that press nothing.
+    """
     states, links = episode.catheter.shape[0], episode.catheter.shape[1] - 1
     pressed = np.zeros((states, links))
     magnitude = np.linalg.norm(episode.contact_force, axis=-1)
@@ -80,9 +119,8 @@ def link_colours(episode: Episode, colour: tuple[int, int, int]) -> np.ndarray:
     middle = (episode.catheter[row, :-1] + episode.catheter[row, 1:]) / 2
     away = np.linalg.norm(middle - episode.contact_position[:, None], axis=-1)
     np.maximum.at(pressed, (row, away.argmin(axis=1)), magnitude)
-    plain = np.broadcast_to(np.array(colour, dtype=np.uint8), (states, links, 3))
     hot = force_colours(pressed, force_scale(magnitude))
-    return np.where(pressed[..., None] > 0, hot, plain)
+    return np.where(pressed[..., None] > 0, hot, colours)
 
 
 def arrow_scale(episode: Episode) -> float:

@@ -20,6 +20,7 @@ from rerun.error_utils import catch_and_log_exceptions
 
 from cathsim_dmc.files import atomic_path
 from cathsim_dmc.recording import blueprint
+from cathsim_dmc.recording.coaxial import CoaxialRecord
 from cathsim_dmc.recording.drawing import Drawing, goal_distance
 from cathsim_dmc.recording.episode import Episode
 from cathsim_dmc.recording.rerun_device import log_catheter, log_contacts
@@ -91,13 +92,18 @@ def log_episode(
     """Send all of an episode to a stream; arguments as in `write_rrd`."""
     log = Log(stream, episode)
     log_static(log, drawing)
+    log_motion(log, drawing)
+    if drawing.frames is not None:
+        log_frames(log, drawing.frames, lossless)
+
+
+def log_motion(log: Log, drawing: Drawing) -> None:
+    """Send what moves and what is measured: device, robot, contacts, series, events."""
     log_catheter(log, drawing.radii)
     log_bodies(log, drawing.geoms)
     log_contacts(log)
     log_series(log)
     log_events(log)
-    if drawing.frames is not None:
-        log_frames(log, drawing.frames, lossless)
 
 
 def write_recording(
@@ -105,6 +111,7 @@ def write_recording(
     layout: Blueprint,
     title: str,
     fill: Callable[[rr.RecordingStream], None],
+    recording_id: str | None = None,
 ) -> None:
     """Write a recording, whole or not at all.
 
@@ -113,12 +120,13 @@ def write_recording(
         layout: How the viewer opens it.
         title: Name of the recording.
         fill: Function that logs everything into the stream.
+        recording_id: Identity of the recording; None makes a new one.
 
     Raises:
         RuntimeError: if Rerun is switched off by the ``RERUN`` environment variable.
     """
     with atomic_path(path, SUFFIX) as temporary:
-        stream = rr.RecordingStream(APPLICATION_ID)
+        stream = rr.RecordingStream(APPLICATION_ID, recording_id=recording_id)
         if not stream.is_enabled():
             raise RuntimeError(
                 "Rerun is switched off; unset the environment variable RERUN"
@@ -150,6 +158,7 @@ def layout_of(episode: Episode, drawing: Drawing) -> Blueprint:
         extent=float((high - low).max()),
         planes=planes,
         distance=goal_distance(episode) is not None,
+        rotation=CoaxialRecord.of(episode) is not None,
         head=episode.head[0],
         robot=robot,
         heights=_heights(episode),

@@ -21,6 +21,13 @@ SEE_THROUGH = {"sheath": 0.3}
 
 def log_static(log: Log, drawing: Drawing) -> None:
     """Log vessel, goal, directions and the page of text."""
+    log_surroundings(log, drawing)
+    text = rr.TextDocument(episode_markdown(log.episode), media_type="text/markdown")
+    log.static("info", text)
+
+
+def log_surroundings(log: Log, drawing: Drawing) -> None:
+    """Log vessel, goal and directions."""
     vertices, faces = drawing.vertices, drawing.faces
     # Patient frame LPS: x to the patient's left, y to the back, z up.
     log.static("world", rr.ViewCoordinates.LBU)
@@ -44,8 +51,6 @@ def log_static(log: Log, drawing: Drawing) -> None:
                 fill_mode="solid",
             ),
         )
-    text = rr.TextDocument(episode_markdown(log.episode), media_type="text/markdown")
-    log.static("info", text)
 
 
 def log_bodies(log: Log, geoms: tuple[BodyGeom, ...]) -> None:
@@ -60,11 +65,13 @@ def log_bodies(log: Log, geoms: tuple[BodyGeom, ...]) -> None:
             log.static(f"{entity}/{kind}", _shape([g for g in parts if g.kind == kind]))
         position = episode.body_pos[:, body]
         quaternion = xyzw(episode.body_quat[:, body])
-        if np.ptp(position, axis=0).any() or np.ptp(quaternion, axis=0).any():
-            log.columns(
-                entity,
-                rr.Transform3D.columns(translation=position, quaternion=quaternion),
+        moves = np.ptp(position, axis=0).any() or np.ptp(quaternion, axis=0).any()
+        if moves or log.follows:
+            rows = slice(None) if moves else slice(0, 1)
+            columns = rr.Transform3D.columns(
+                translation=position[rows], quaternion=quaternion[rows]
             )
+            log.columns(entity, columns, rows)
         else:
             log.static(
                 entity,

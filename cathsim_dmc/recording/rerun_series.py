@@ -8,8 +8,10 @@ import numpy as np
 import rerun as rr
 
 from cathsim_dmc.recording.blueprint import FLUOROSCOPY
+from cathsim_dmc.recording.coaxial import CoaxialRecord
 from cathsim_dmc.recording.drawing import action_layout, goal_distance
 from cathsim_dmc.recording.events import events
+from cathsim_dmc.recording.rerun_device import device_colours
 from cathsim_dmc.recording.rerun_stream import Log
 
 # At this quality noisy frames take about half of what the exact PNG takes.
@@ -48,6 +50,7 @@ def log_series(log: Log) -> None:
         "insertion, mm",
         colors=[150, 90, 200],
     )
+    _log_devices(log)
     names, tip = action_layout(episode)
     for index in np.flatnonzero(~tip):
         log.series(
@@ -60,6 +63,27 @@ def log_series(log: Log) -> None:
         bend = np.sqrt(np.mean(episode.action[:, tip] ** 2, axis=1))
         log.series("series/action/tip_bend", bend, commanded, "tip bend, rms")
     log.series("series/action_all", episode.action, commanded, names)
+
+
+def _log_devices(log: Log) -> None:
+    """Log how far each coaxial device has been pushed and turned."""
+    coaxial = CoaxialRecord.of(log.episode)
+    if coaxial is None:
+        return
+    colours = device_colours(len(coaxial.names)).tolist()
+    for k, (name, colour) in enumerate(zip(coaxial.names, colours, strict=True)):
+        series = {
+            f"insertion_mm/{name}": (1e3 * coaxial.insertion, f"{name}, mm"),
+            f"rotation_deg/{name}": (np.degrees(coaxial.rotation), f"{name}, base"),
+            f"rotation_deg/{name}_end": (
+                np.degrees(coaxial.tip_rotation),
+                f"{name}, end",
+            ),
+        }
+        for entity, (values, label) in series.items():
+            log.series(
+                f"series/{entity}", values[:, k], slice(None), label, colors=colour
+            )
 
 
 def log_frames(log: Log, frames: np.ndarray, lossless: bool) -> None:

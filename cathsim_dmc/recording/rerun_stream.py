@@ -7,15 +7,30 @@ from typing import Any
 import numpy as np
 import rerun as rr
 
-from cathsim_dmc.recording.blueprint import TIMELINE_STEP, TIMELINE_TIME
+from cathsim_dmc.recording.blueprint import (
+    TIMELINE_FRAMES,
+    TIMELINE_STEP,
+    TIMELINE_TIME,
+)
 from cathsim_dmc.recording.episode import Episode
 
 
 class Log:
-    """Logs under a prefix of entity paths, static or as whole series."""
+    """Logs under a prefix of entity paths, static or as whole series.
+
+    Attributes:
+        stream: Where to.
+        episode: Whose states the rows are.
+        follows: Whether the same entities show other episodes at other times, so that
+            what stands still in this one may move in those.
+    """
 
     def __init__(
-        self, stream: rr.RecordingStream, episode: Episode, from_zero: bool = False
+        self,
+        stream: rr.RecordingStream,
+        episode: Episode,
+        from_zero: bool = False,
+        begin: int | None = None,
     ) -> None:
         """Takes the times of the episode.
 
@@ -23,13 +38,20 @@ class Log:
             stream: Where to.
             episode: Whose states the rows are.
             from_zero: Whether time begins at 0, so that episodes can be compared.
+            begin: Number of frames that a training has seen, from which the states
+                are counted on instead of their times; None for an episode by itself.
         """
         self.stream = stream
         self.episode = episode
+        self.follows = begin is not None
+        steps = np.arange(episode.steps + 1)
+        if begin is not None:
+            self._indexes = {TIMELINE_FRAMES: begin + steps}
+            return
         time = episode.time - episode.time[0] if from_zero else episode.time
         # Rounded here, since Rerun truncates 0.12 s to 119,999,999 ns.
-        self._times = np.round(time * 1e9).astype("timedelta64[ns]")
-        self._steps = np.arange(episode.steps + 1)
+        times = np.round(time * 1e9).astype("timedelta64[ns]")
+        self._indexes = {TIMELINE_TIME: times, TIMELINE_STEP: steps}
 
     def static(self, entity: str, *archetypes: Any) -> None:
         """Logs what never changes."""
@@ -40,13 +62,13 @@ class Log:
         self, entity: str, columns: Any, rows: slice | np.ndarray = slice(None)
     ) -> None:
         """Sends one row per state in ``rows``; nothing at all for no rows."""
-        times = self._times[rows]
-        if not len(times):
-            return
-        indexes = [
-            rr.TimeColumn(TIMELINE_TIME, duration=times),
-            rr.TimeColumn(TIMELINE_STEP, sequence=self._steps[rows]),
-        ]
+        indexes = []
+        for timeline, values in self._indexes.items():
+            chosen = values[rows]
+            if not len(chosen):
+                return
+            kind = "duration" if timeline == TIMELINE_TIME else "sequence"
+            indexes.append(rr.TimeColumn(timeline, **{kind: chosen}))
         self.stream.send_columns(entity, indexes, columns, strict=True)
 
     def series(

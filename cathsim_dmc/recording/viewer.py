@@ -9,7 +9,7 @@ import subprocess
 import sys
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from urllib.parse import quote
+from urllib.parse import quote, urlsplit
 
 # First bytes of every recording of the current format.
 _MAGIC = b"RRF2"
@@ -18,6 +18,9 @@ _FOOTER, _FOOTER_AT = b"RRF2FOOT", -12
 _SUFFIX = ".rrd"
 LOOPBACK = "127.0.0.1"
 WEB_PORT = 9090
+# Where a viewer listens by default for what is logged.
+LIVE_ADDRESS = "rerun+http://127.0.0.1:9876/proxy"
+_LIVE_PATIENCE = 5.0  # s
 # The interpreter's own package, never another `rerun` that PATH may hold: file
 # format and viewer have to be of one version.
 _RERUN = (sys.executable, "-m", "rerun_cli")
@@ -133,6 +136,55 @@ def open_viewer(
     except KeyboardInterrupt:
         # Ctrl-C is how serving ends.
         return 0
+
+
+def live_address(viewer: str) -> str:
+    """The address of a viewer that takes what is logged while it is logged.
+
+    Args:
+        viewer: "spawn" opens a viewer on this machine; "connect" takes the one that is
+            open there; anything else is an address, ``rerun+http://HOST:PORT/proxy``.
+
+    Raises:
+        ViewerError: there is no display to open a viewer on, or none listens at the
+            address.
+    """
+    if viewer == "spawn":
+        if not has_display():
+            raise ViewerError(
+                "no display to open a viewer on; record to the file alone, or connect "
+                "to a viewer on a machine with a screen"
+            )
+        import rerun as rr
+
+        rr.spawn(connect=False, executable_path=_executable())
+    address = LIVE_ADDRESS if viewer in ("spawn", "connect") else viewer
+    parts = urlsplit(address)
+    try:
+        place = (parts.hostname or "", parts.port or 0)
+    except ValueError:
+        place = ("", 0)
+    if not parts.scheme.startswith("rerun") or not all(place):
+        raise ViewerError(
+            f"{viewer!r} is no address of a viewer; give spawn, connect, or an address "
+            f"such as {LIVE_ADDRESS}"
+        )
+    try:
+        socket.create_connection(place, timeout=_LIVE_PATIENCE).close()
+    except OSError as error:
+        raise ViewerError(
+            f"no viewer listens at {address} ({error.strerror or error}); open one "
+            "with `rerun`, or leave the viewer out: the file holds the same"
+        ) from error
+    return address
+
+
+def _executable() -> str:
+    """The viewer of the interpreter's own package."""
+    import rerun_cli
+
+    name = "rerun.exe" if sys.platform == "win32" else "rerun"
+    return str(Path(rerun_cli.__file__).with_name(name))
 
 
 def _checked_ports(host: str, port: int) -> int:

@@ -17,7 +17,7 @@ from cathsim_dmc.entities.contact import wall_contact
 from cathsim_dmc.entities.device_stack import DeviceStack
 from cathsim_dmc.imaging.angiograph import Angiograph
 from cathsim_dmc.imaging.options import FluoroscopyOptions
-from cathsim_dmc.tasks import coaxial
+from cathsim_dmc.tasks import chain_fields
 from cathsim_dmc.tasks.objectives import Objective
 from cathsim_dmc.tasks.readings import ModelIndex
 from cathsim_dmc.tasks.scene import Scene
@@ -71,7 +71,7 @@ class Case:
         self.objective = objective
         index = model_index(scene, model)
         if isinstance(scene.catheter, DeviceStack):
-            coaxial.write_still(scene.catheter, model)
+            chain_fields.write_still(scene.catheter, model)
         self.start = StartPosture(scene, model, index, start_along_route)
         self._fluoroscopy = fluoroscopy
         self._fields = fields or {}

@@ -11,6 +11,7 @@ from dm_control import composer
 from cathsim_dmc import bounds
 from cathsim_dmc.tasks import cameras, cases, forces, observations, readings
 from cathsim_dmc.tasks.actions import check_action
+from cathsim_dmc.tasks.coaxial import CoaxialReadings
 from cathsim_dmc.tasks.config import CONTROL_TIMESTEP, NavigationConfig
 from cathsim_dmc.tasks.objectives import Objective
 from cathsim_dmc.tasks.rollout import (
@@ -330,6 +331,13 @@ class Navigation(composer.Task):
     def wall_force(self) -> forces.WallForce:
         """Force on the wall over the last control step, N, without a leading axis."""
         return _only(self._current().wall_force)
+
+    @property
+    def devices(self) -> CoaxialReadings | None:
+        """State of coaxial devices, without a leading axis; None for one alone."""
+        self._current()
+        state = self._rollout.devices
+        return None if state is None else _only(state)
 
     @property
     def contact_history(self) -> forces.ContactHistory:

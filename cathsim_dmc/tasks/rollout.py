@@ -208,13 +208,6 @@ class Rollout:
         if self._coaxial is not None:
             qpos[..., index.robot_qpos] = self._coaxial.follower_posture()
             return qpos
-        if len(qpos) == 1:  # plain floats take a third of the time
-            (row,) = qpos
-            turned = 0.0 if index.rotation_qpos is None else row[index.rotation_qpos]
-            row[index.robot_qpos] = follower_posture(
-                float(row[index.insertion_qpos]), float(turned)
-            )
-            return qpos
         pushed = qpos[..., index.insertion_qpos]
         turned = 0.0 if index.rotation_qpos is None else qpos[..., index.rotation_qpos]
         qpos[..., index.robot_qpos] = follower_posture(pushed, turned)

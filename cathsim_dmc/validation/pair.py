@@ -12,7 +12,7 @@ import numpy as np
 from cathsim_dmc.entities import devices
 from cathsim_dmc.entities.device import Device
 from cathsim_dmc.entities.device_stack import DeviceStack
-from cathsim_dmc.tasks import coaxial
+from cathsim_dmc.tasks import chain_fields
 from cathsim_dmc.tasks.config import CONTROL_TIMESTEP
 from cathsim_dmc.validation import rod, sliding
 from cathsim_dmc.validation.checks import Check, Report
@@ -77,7 +77,7 @@ def rig_of(
     entity = DeviceStack(chosen)
     rig = Rig(catheter=entity)
     rig.compile()
-    coaxial.write_still(entity, rig.model, gaps, rotation)
+    chain_fields.write_still(entity, rig.model, gaps, rotation)
     return rig
 
 
@@ -264,7 +264,7 @@ def buckling(end: str) -> rod.Buckling:
         end,
         last,
         stiffness,
-        lambda rig: coaxial.write_still(entity, rig.model, gaps),
+        lambda rig: chain_fields.write_still(entity, rig.model, gaps),
     )
 
 

@@ -29,6 +29,8 @@ DOCS = Path(__file__).parents[1]
 PUBLISHED = DOCS / "data/published_results.json"
 DIFFICULTY = DOCS / "data/difficulty.json"
 PUBLISHED_TASKS = ("type1_bca", "type1_lcca", "type2_bca", "type2_lcca")
+# Where learning with and without demonstrations is compared, and who needs them.
+DEMONSTRATED, TAUGHT = "type1_lcca", ("bc", "dagger")
 NAMES = {"internal": "Internal", "image": "Image", "sequential": "Sequential"}
 
 INTRODUCTION = """\
@@ -150,9 +152,17 @@ def standing(results, broken, cells):
 
 def published_label(result):
     """Name of the published agent that a cell repeats, or None."""
+    if taught(result):
+        return None
     observation = result.cell["observation"]
     name = NAMES.get(observation) if isinstance(observation, str) else None
     return f"{result.cell['algorithm'].upper()}-{name}" if name else None
+
+
+def taught(result):
+    """Whether a cell has learnt from demonstrations."""
+    config = result.values["config"]
+    return config["algorithm"] in TAUGHT or bool(config.get("demonstrations"))
 
 
 def beside_published(table):
@@ -378,6 +388,18 @@ def drawn(table, out):
             else "Largest contact force of every evaluation episode on the further "
             "tasks, episodes of all seeds together.",
         )
+    compared = demonstrated(table)
+    if compared:
+        path = images / "results_demonstrations.png"
+        figures.with_demonstrations(compared, looks, path)
+        yield shown(
+            path,
+            f"With and without demonstrations on {DEMONSTRATED}, all from the "
+            "observation `internal`: success of the evaluation (points, with 95 % "
+            "intervals over the episodes of all seeds) where the training ended, and "
+            "of the training episodes on the way there (lines). Frames that the expert "
+            "played for the dataset are not counted.",
+        )
     best = {
         task: max(
             agents_.values(), key=lambda found: np.mean([r.success for r in found])
@@ -392,6 +414,18 @@ def drawn(table, out):
             "most successful agent of each task, seen from the front; the colour scale "
             "ends at the 98th percentile.",
         )
+
+
+def demonstrated(table):
+    """Agents to compare on one task, if one of them has learnt from demonstrations."""
+    compared = {
+        label: found
+        for label, found in table.get(DEMONSTRATED, {}).items()
+        if found[0].cell["observation"] == "internal"
+    }
+    if not any(taught(result) for found in compared.values() for result in found):
+        return {}
+    return compared
 
 
 def shown(path, caption):

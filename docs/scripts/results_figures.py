@@ -10,6 +10,7 @@ from matplotlib.ticker import EngFormatter
 
 from cathsim_dmc import suite
 from cathsim_dmc.analysis.heatmap import AP_AXES, ForceMap
+from cathsim_dmc.analysis.intervals import success_interval
 from cathsim_dmc.benchmarks.result import map_from_values
 from cathsim_dmc.files import atomic_path
 from cathsim_dmc.style import COLOURS
@@ -66,6 +67,43 @@ def learning_curves(by_task, looks, path):
         axes.grid(alpha=0.3)
         if axes.lines:
             axes.legend(fontsize=7, loc="best", framealpha=0.7)
+    return _save(figure, path)
+
+
+def with_demonstrations(agents, looks, path):
+    """Success of agents on one task over the frames that their training took.
+
+    Args:
+        agents: Results of the task by label: {label: [...]}.
+        looks: Looks of the agents.
+        path: Path of the PNG.
+    """
+    figure, (axes,) = _panels(1, height=3.4, width=6.0)
+    for label, results in agents.items():
+        line = looks[label]
+        frames, success = _common(results)
+        if frames is not None:
+            axes.plot(frames, 100 * success.mean(0), lw=1.2, alpha=0.6, **line)
+        rates = [result.success for result in results]
+        counts = [result.evaluation["summary"]["episodes"] for result in results]
+        reached = sum(round(r * n) for r, n in zip(rates, counts, strict=True))
+        rate, interval = reached / sum(counts), success_interval(reached, sum(counts))
+        axes.errorbar(
+            [np.mean([result.training["frames"] for result in results])],
+            [100 * rate],
+            yerr=100 * np.abs(np.array(interval)[:, None] - rate),
+            fmt="o",
+            color=line["color"],
+            capsize=3,
+            label=f"{label} ({_seeds(len(results))})",
+        )
+    axes.set_xscale("log")
+    axes.set_ylim(-3, 103)
+    axes.xaxis.set_major_formatter(EngFormatter(sep=""))
+    axes.set_xlabel("frames")
+    axes.set_ylabel("success, %")
+    axes.grid(alpha=0.3)
+    axes.legend(fontsize=7, loc="best", framealpha=0.7)
     return _save(figure, path)
 
 

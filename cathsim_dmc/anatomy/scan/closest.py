@@ -6,34 +6,25 @@ keeps the result beside it.
 """
 
 import math
-from collections.abc import Callable
 
-import numba
 import numpy as np
+
+from cathsim_dmc.compiled import compiled
 
 _STACK = 64  # nodes; a tree over 2^60 triangles would not fill it
 
 
-def _compiled(function: Callable) -> Callable:
-    """Compiles a function, once on each machine where there is a place to keep it."""
-    options = {"nogil": True, "error_model": "numpy"}
-    try:
-        return numba.njit(function, cache=True, **options)
-    except RuntimeError:  # neither this folder nor the user's can be written to
-        return numba.njit(function, **options)
-
-
-@_compiled
+@compiled
 def _dot(a, b):
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
-@_compiled
+@compiled
 def _difference(a, b):
     return (a[0] - b[0], a[1] - b[1], a[2] - b[2])
 
 
-@_compiled
+@compiled
 def _nearest(p, triangle):
     """Vector from the nearest point of a triangle to ``p``, and where that lies.
 
@@ -77,7 +68,7 @@ def _nearest(p, triangle):
     ), 6
 
 
-@_compiled
+@compiled
 def _outside(p, box):
     """Squared distance of ``p`` from an axis-parallel box (2, 3)."""
     total = 0.0
@@ -87,7 +78,7 @@ def _outside(p, box):
     return total
 
 
-@_compiled
+@compiled
 def _to_nearest(p, triangles, boxes, leaf, first):
     """Distance of ``p`` from the nearest triangle."""
     best = math.inf
@@ -113,7 +104,7 @@ def _to_nearest(p, triangles, boxes, leaf, first):
     return math.sqrt(best)
 
 
-@_compiled
+@compiled
 def _within(p, reach, triangles, boxes, leaf, first, found, gaps):
     """Rows of all triangles nearer than ``reach``, and how far each is; their count."""
     stack = np.empty(_STACK, np.int64)
@@ -137,7 +128,7 @@ def _within(p, reach, triangles, boxes, leaf, first, found, gaps):
     return count
 
 
-@_compiled
+@compiled
 def signed_depths(blocks, points, triangles, normals, boxes, leaf, first):
     """Signed depths of points that lie in blocks, and the nearest triangles.
 
@@ -191,7 +182,7 @@ def signed_depths(blocks, points, triangles, normals, boxes, leaf, first):
     return depth, owner
 
 
-@_compiled
+@compiled
 def _cross(a, b):
     return (
         a[1] * b[2] - a[2] * b[1],
@@ -200,7 +191,7 @@ def _cross(a, b):
     )
 
 
-@_compiled
+@compiled
 def _hit(p, ray, triangle):
     """Where the line p + t ray meets a triangle: t, or infinity if it does not.
 
@@ -222,7 +213,7 @@ def _hit(p, ray, triangle):
     return -_dot(n, ap) / slope
 
 
-@_compiled
+@compiled
 def _misses(p, inverse, reach, box):
     """Whether the ray from ``p`` passes a box (2, 3) within ``reach`` by."""
     near, far = 0.0, reach
@@ -236,7 +227,7 @@ def _misses(p, inverse, reach, box):
     return not near <= far
 
 
-@_compiled
+@compiled
 def blocked_share(points, rays, normals, triangles, boxes, leaf, first):
     """Share (n,) of the rays into the half space of a normal that meet a triangle.
 
@@ -278,7 +269,7 @@ def blocked_share(points, rays, normals, triangles, boxes, leaf, first):
     return share
 
 
-@_compiled
+@compiled
 def crossing_faces(edges, points, faces, triangles, boxes, leaf, first):
     """Rows of edges and faces (n, 2) that cross without a common vertex.
 
@@ -320,7 +311,7 @@ def crossing_faces(edges, points, faces, triangles, boxes, leaf, first):
     return found
 
 
-@_compiled
+@compiled
 def _mixed(values, i, j, k, x, y, z):
     """Trilinear interpolation in a cell (i, j, k) of a lattice."""
     total = 0.0
@@ -334,7 +325,7 @@ def _mixed(values, i, j, k, x, y, z):
     return total
 
 
-@_compiled
+@compiled
 def lattice_depths(points, origin, spacing, cells, quantum, coarse, index, bricks):
     """Depths (n,) m at points (n, 3) m; see ``DepthField.__call__``."""
     out = np.empty(len(points))

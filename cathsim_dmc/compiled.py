@@ -1,0 +1,21 @@
+"""Compiled loops: what a function of plain loops over arrays is decorated with.
+
+Importing numba takes longer than loading a task, so a module with such functions is
+imported only where it is needed, within a function.
+"""
+
+from collections.abc import Callable
+
+import numba
+
+
+def compiled(function: Callable) -> Callable:
+    """Compiles a function, once on each machine where there is a place to keep it.
+
+    Without `fastmath`: the same numbers bit for bit, alone and in a batch.
+    """
+    options = {"nogil": True, "error_model": "numpy"}
+    try:
+        return numba.njit(function, cache=True, **options)
+    except RuntimeError:  # neither this folder nor the user's can be written to
+        return numba.njit(function, **options)

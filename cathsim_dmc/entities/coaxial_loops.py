@@ -1,0 +1,400 @@
+"""Coaxial devices: the compiled loops over simulations, devices and joints.
+
+`coaxial` and `torsion` say what they compute and call them. A chain has some thirty
+joints, too few for numpy: its calls took longer than the sums. Each simulation is
+computed on its own, so that a batch has the bits of its members alone.
+
+Arrays have a leading axis N of simulations; K devices, J joints, L = J + 1 links; a rod
+has M + 1 = L + 1 nodes, of which 0 is its base. All are C-contiguous.
+"""
+
+import math
+
+import numpy as np
+
+from cathsim_dmc.compiled import compiled
+
+# Farther from the end than any device is long, m.
+_FAR = 1e3
+# Most rounds in which it is found which nodes stick; two or three are usual.
+_ROUNDS = 5
+
+
+@compiled
+def _weight(place, joint, nodes, lengths):
+    """Integral of the weight of a joint from the end of the chain to a place.
+
+    The weight rises along the link beyond the joint and falls along the one before.
+    """
+    ahead, behind = lengths[joint + 1], lengths[joint]
+    offset = place - nodes[joint + 1]
+    rise = min(max(offset + ahead, 0.0), ahead)
+    fall = min(max(offset, 0.0), behind)
+    return rise * rise / (2 * ahead) + fall - fall * fall / (2 * behind)
+
+
+@compiled
+def _breaks(gaps, edges):
+    """Places between two of which nothing changes, from the end of the chain on."""
+    places = np.empty(edges.size + 1)
+    for k in range(edges.shape[0]):
+        for e in range(edges.shape[1]):
+            places[k * edges.shape[1] + e] = min(gaps[k] + edges[k, e], _FAR)
+    places[-1] = _FAR
+    places.sort()
+    return places
+
+
+@compiled
+def _piece(place, edges):
+    """Number of the piece of a device at a distance from its end, 0 beyond it."""
+    piece = 0
+    while piece < len(edges) and place >= edges[piece]:
+        piece += 1
+    return piece
+
+
+@compiled
+def overlaps(gaps, nodes, lengths, edges, bending, moment):
+    """Integrals around the joints, see `coaxial.Overlap`.
+
+    Args:
+        gaps: (N, K), m.
+        nodes: (L + 1,), m.
+        lengths: (L,), m.
+        edges: (K, E), where the pieces of the devices begin, m from their ends; filled
+            up with infinity.
+        bending: (K, E + 1), EI of what lies beyond the device and of the pieces, N·m².
+        moment: (K, E + 1), EI κ likewise, N·m.
+
+    Returns:
+        Compliance, rest, coupling, stiffness and moment of `coaxial.Overlap`.
+    """
+    count, devices = gaps.shape
+    joints = len(lengths) - 1
+    compliance = np.zeros((count, joints))
+    rest = np.zeros((count, devices, joints))
+    coupling = np.zeros((count, devices * (devices - 1) // 2, joints))
+    stiffness = np.zeros((count, devices, joints))
+    mean = np.zeros((count, devices, joints))
+    own_bending, own_moment = np.empty(devices), np.empty(devices)
+    for i in range(count):
+        breaks = _breaks(gaps[i], edges)
+        for c in range(len(breaks) - 1):
+            low, high = breaks[c], breaks[c + 1]
+            if high <= low or low >= nodes[0]:
+                continue
+            total = 0.0
+            for k in range(devices):
+                piece = _piece((low + high) / 2 - gaps[i, k], edges[k])
+                own_bending[k], own_moment[k] = bending[k, piece], moment[k, piece]
+                total += own_bending[k]
+            for j in range(joints):
+                if high <= nodes[j + 2] or low >= nodes[j]:
+                    continue
+                weight = _weight(high, j, nodes, lengths)
+                weight -= _weight(low, j, nodes, lengths)
+                compliance[i, j] += weight / total
+                pair = 0
+                for k in range(devices):
+                    share = own_moment[k] / total
+                    rest[i, k, j] += share * weight
+                    stiffness[i, k, j] += own_bending[k] * weight
+                    mean[i, k, j] += own_moment[k] * weight
+                    for other in range(k + 1, devices):
+                        coupling[i, pair, j] += share * own_moment[other] * weight
+                        pair += 1
+        for j in range(joints):
+            span = (lengths[j] + lengths[j + 1]) / 2
+            for k in range(devices):
+                stiffness[i, k, j] /= span
+                mean[i, k, j] /= span
+    return compliance, rest, coupling, stiffness, mean
+
+
+@compiled
+def shares(gaps, nodes, lengths):
+    """Shares (N, K, L) of the links where a device is outermost, and present."""
+    count, devices = gaps.shape
+    outermost = np.empty((count, devices, len(lengths)))
+    present = np.empty_like(outermost)
+    for i in range(count):
+        for link in range(len(lengths)):
+            # A place is covered by whatever lies farther out and reaches it.
+            covered = 0.0
+            for k in range(devices - 1, -1, -1):
+                reached = (nodes[link] - gaps[i, k]) / lengths[link]
+                reached = min(max(reached, 0.0), 1.0)
+                present[i, k, link] = reached
+                outermost[i, k, link] = max(reached - covered, 0.0)
+                covered = max(covered, reached)
+    return outermost, present
+
+
+@compiled
+def restoring(rest, compliance, coupling, bends, turns):
+    """Torques of the shapes and minus their derivatives, see `Stack.restoring`."""
+    count, devices, joints = turns.shape
+    torque, rate = np.empty(turns.shape), np.empty(turns.shape)
+    pulls = np.empty(devices, np.complex128)
+    for i in range(count):
+        for j in range(joints):
+            whole = 0j
+            for k in range(devices):
+                angle = turns[i, k, j]
+                pulls[k] = rest[i, k, j] * complex(math.cos(angle), math.sin(angle))
+                whole += pulls[k]
+            for k in range(devices):
+                force = np.conj(bends[i, j] - (whole - pulls[k])) * pulls[k]
+                torque[i, k, j] = -force.imag / compliance[i, j]
+                rate[i, k, j] = force.real / compliance[i, j]
+            pair = 0
+            for k in range(devices):
+                for other in range(k + 1, devices):
+                    energy = coupling[i, pair, j]
+                    angle = turns[i, k, j] - turns[i, other, j]
+                    torque[i, k, j] -= energy * math.sin(angle)
+                    torque[i, other, j] += energy * math.sin(angle)
+                    rate[i, k, j] += energy * math.cos(angle)
+                    rate[i, other, j] += energy * math.cos(angle)
+                    pair += 1
+    return torque, rate
+
+
+@compiled
+def pressure(stiffness, moment, present, bends, turns, lengths):
+    """Forces (N, K - 1, J) of each device on the next, see `Stack.pressure`."""
+    count, devices, joints = turns.shape
+    force = np.empty((count, devices - 1, joints))
+    own = np.empty(joints, np.complex128)
+    for i in range(count):
+        for k in range(devices - 1):
+            for j in range(joints):
+                span = (lengths[j] + lengths[j + 1]) / 2
+                angle = turns[i, k, j]
+                turned = complex(math.cos(angle), math.sin(angle))
+                own[j] = stiffness[i, k, j] * bends[i, j] / span
+                own[j] -= moment[i, k, j] * turned
+            before = 0j
+            for j in range(joints):
+                shear = 0j
+                if j < joints - 1:
+                    shear = (own[j + 1] - own[j]) / lengths[j + 1]
+                # Only where both are: a joint has the share of the links beside it.
+                both = (present[i, k + 1, j] + present[i, k + 1, j + 1]) / 2
+                force[i, k, j] = abs(shear - before) * both
+                before = shear
+    return force
+
+
+@compiled
+def _segment(place, nodes, first):
+    """Number of the segment, from a first one on, that a place on a rod lies in."""
+    while first < len(nodes) - 2 and nodes[first + 1] > place:
+        first += 1
+    return first
+
+
+@compiled
+def at_joints(angles, gaps, nodes):
+    """Rotations (N, K, J) of rods (N, K, M + 1) where the chain has its joints.
+
+    Linear between two nodes; a joint beyond a device's end has that of the end.
+    """
+    count, devices = gaps.shape
+    joints = len(nodes) - 2
+    turns = np.empty((count, devices, joints))
+    for i in range(count):
+        for k in range(devices):
+            first = 0
+            for j in range(joints):
+                place = max(nodes[j + 1] - gaps[i, k], 0.0)
+                first = _segment(place, nodes, first)
+                share = (nodes[first] - place) / (nodes[first] - nodes[first + 1])
+                near, far = angles[i, k, first], angles[i, k, first + 1]
+                turns[i, k, j] = near + share * (far - near)
+    return turns
+
+
+@compiled
+def at_nodes(loads, gaps, nodes):
+    """Loads (..., N, K, M) on the nodes beyond the base, of loads at the joints.
+
+    A load is shared by the nodes on both sides of its joint.
+    """
+    kinds, count, devices, joints = loads.shape
+    shared = np.zeros((kinds, count, devices, joints + 1))
+    for i in range(count):
+        for k in range(devices):
+            first = 0
+            for j in range(joints):
+                place = max(nodes[j + 1] - gaps[i, k], 0.0)
+                first = _segment(place, nodes, first)
+                share = (nodes[first] - place) / (nodes[first] - nodes[first + 1])
+                for kind in range(kinds):
+                    load = loads[kind, i, k, j]
+                    shared[kind, i, k, first] += share * load
+                    if first > 0:
+                        shared[kind, i, k, first - 1] += (1 - share) * load
+    return shared
+
+
+@compiled
+def _balance(diagonal, beside, load, pivot, move):
+    """Solves a symmetric tridiagonal system that is diagonally dominant."""
+    last = len(load) - 1
+    for m in range(last + 1):
+        pivot[m], move[m] = diagonal[m], load[m]
+        if m > 0:
+            factor = beside[m - 1] / pivot[m - 1]
+            pivot[m] -= factor * beside[m - 1]
+            move[m] -= factor * move[m - 1]
+    move[last] /= pivot[last]
+    for m in range(last - 1, -1, -1):
+        move[m] = (move[m] - beside[m] * move[m + 1]) / pivot[m]
+
+
+@compiled
+def _rubbed(diagonal, beside, load, friction, least, move):
+    """Balance with Coulomb friction: each node sticks, or slides one way.
+
+    Which one is found by trying (Newton's method on the law of friction, which is
+    linear up to `least`, what a node that sticks may move); what was tried last stands.
+    """
+    count = len(load)
+    way = np.zeros(count)
+    stiff, pull, pivot = np.empty(count), np.empty(count), np.empty(count)
+    for _ in range(_ROUNDS):
+        for m in range(count):
+            sticks = friction[m] / least if way[m] == 0.0 else 0.0
+            stiff[m] = diagonal[m] + sticks
+            pull[m] = load[m] - friction[m] * way[m]
+        _balance(stiff, beside, pull, pivot, move)
+        settled = True
+        for m in range(count):
+            found = np.sign(move[m]) if abs(move[m]) > least else 0.0
+            if found * way[m] < 0.0:
+                found = 0.0
+            if found != way[m]:
+                settled, way[m] = False, found
+        if settled:
+            return
+
+
+@compiled
+def turned(angles, base, stiffness, lag, least, duration, loads):
+    """Rotations of rods in balance after their bases were turned, see `Rods.turn`.
+
+    Args:
+        angles: (N, K, M + 1), rad.
+        base: (N, K), by how much the bases are turned, rad.
+        stiffness: (K, M), of the segments, N·m/rad.
+        lag: relaxation time over the duration.
+        least: what a node that sticks may move, rad.
+        duration: s.
+        loads: (4, N, K, M): torque, rate, friction and brake on the nodes.
+
+    Returns:
+        (N, K, M + 1), rad.
+    """
+    count, devices, nodes = angles.shape
+    segments = nodes - 1
+    new = np.empty_like(angles)
+    diagonal, beside = np.empty(segments), np.empty(segments)
+    load, move = np.empty(segments), np.empty(segments)
+    for i in range(count):
+        for k in range(devices):
+            for m in range(segments):
+                now = stiffness[k, m] * (angles[i, k, m + 1] - angles[i, k, m])
+                coupling = (1 + lag) * stiffness[k, m]
+                load[m] = loads[0, i, k, m] - now
+                # Where the torque grows with the rotation it is taken as it is: no
+                # balance is near, and the rod's own damping bounds the speed.
+                rate = max(loads[1, i, k, m], 0.0)
+                diagonal[m] = coupling + rate + loads[3, i, k, m] / duration
+                if m == 0:
+                    load[0] += coupling * base[i, k]
+                else:
+                    load[m - 1] += now
+                    diagonal[m - 1] += coupling
+                    beside[m - 1] = -coupling
+            _rubbed(diagonal, beside, load, loads[2, i, k], least, move)
+            new[i, k, 0] = angles[i, k, 0] + base[i, k]
+            for m in range(segments):
+                new[i, k, m + 1] = angles[i, k, m + 1] + move[m]
+    return new
+
+
+@compiled
+def wall_friction(outermost, force, coefficient, arms):
+    """Largest torques (N, K, J) of friction on the wall, see `Stack.wall_friction`."""
+    count, devices, links = outermost.shape
+    torque = np.empty((count, devices, links - 1))
+    for i in range(count):
+        for k in range(devices):
+            for j in range(links - 1):
+                # The last joint bears what touches beyond it alone.
+                last = 1.0 if j == links - 2 else 0.5
+                borne = 0.5 * outermost[i, k, j] * force[i, j]
+                borne += last * outermost[i, k, j + 1] * force[i, j + 1]
+                torque[i, k, j] = coefficient[i] * arms[k] * borne
+    return torque
+
+
+@compiled
+def rest_angles(rest, turns, spin, relaxation):
+    """Angles (N, J) of the free joints, see `Stack.rest_angles`."""
+    count, devices, joints = turns.shape
+    angles = np.zeros((count, joints), np.complex128)
+    for i in range(count):
+        for k in range(devices):
+            for j in range(joints):
+                angle = turns[i, k, j]
+                turned = complex(math.cos(angle), math.sin(angle))
+                lead = complex(1.0, relaxation * spin[i, k, j])
+                angles[i, j] += rest[i, k, j] * turned * lead
+    return angles
+
+
+@compiled
+def _inertia(mass, radius, length):
+    """Moments of inertia of a solid capsule, across and along it, kg·m²."""
+    share = 1 / (1 + 4 * radius / (3 * length))  # of the cylinder in the volume
+    cylinder, ball = mass * share, mass * (1 - share)
+    square = radius * radius
+    across = cylinder * (length * length / 12 + square / 4)
+    across += ball * (2 * square / 5 + length * length / 4 + 3 * length * radius / 8)
+    return across, cylinder * square / 2 + ball * 2 * square / 5
+
+
+@compiled
+def links(outermost, present, lengths, friction, radii, ratios, densities):
+    """What the links are made of, see `coaxial.Links`.
+
+    Args:
+        outermost, present: (N, K, L).
+        lengths: (L,), m.
+        friction: (N,), of an uncoated device.
+        radii, ratios: (K,), of the devices.
+        densities: (2, K), mass and weight in blood, kg/m.
+    """
+    count, devices, number = outermost.shape
+    made, moments = np.zeros((4, count, number)), np.empty((count, number, 2))
+    share = densities[1].sum() / densities[0].sum()
+    for i in range(count):
+        for link in range(number):
+            radius = mass = weight = 0.0
+            whole = True
+            for k in range(devices):
+                outside, there = outermost[i, k, link], present[i, k, link]
+                radius += outside * radii[k]
+                made[1, i, link] += outside * ratios[k] * friction[i]
+                mass += there * densities[0, k] * lengths[link]
+                weight += there * densities[1, k] * lengths[link]
+                whole = whole and there == 1.0
+            made[0, i, link], made[2, i, link] = radius, mass
+            # Exactly nothing where all devices are: MuJoCo then passes the link over.
+            if share > 0.0 and not whole:
+                made[3, i, link] = 1.0 - weight / (mass * share)
+            moments[i, link] = _inertia(mass, radius, lengths[link])
+    return made[0], made[1], made[2], made[3], moments

@@ -1,0 +1,309 @@
+"""Pursuit of a route by coaxial devices that are pushed and turned at their bases.
+
+Pure functions of arrays with a leading axis N of simulations; K devices, numbered from
+the innermost outwards, which leads: a guidewire, and a catheter around it.
+
+**Steering.** A pre-shaped end leads to one side of its device, and turning the base
+turns that side. Where the route bends away from how a device lies before its shaped
+end, the device is turned until its side looks there, and advances as that comes about.
+Twist reaches the end late and in leaps, so it is the rotation of the end that counts.
+
+**Wire first, catheter after.** The wire goes ahead, the catheter follows at the lead
+of the attempt. Far ahead the wire is limp and follows the vessel; close ahead its bend
+and the catheter's add up to a sharper one.
+
+**Retries.** When the head makes no progress, or has left the tube of the route as in a
+wrong branch, all is withdrawn and tries again with another lead, look-ahead and
+direction. In a sharp take-off the shafts buckle into the arch while the head stays:
+taking up that slack lets the head spring forward, so most retries withdraw only as
+long as the head does not come back.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+
+from cathsim_dmc.entities.chain import MAX_PUSH_SPEED, MAX_ROTATION_SPEED
+from cathsim_dmc.entities.device_stack import DeviceStack
+from cathsim_dmc.policies import pursuit
+from cathsim_dmc.tasks import forces, navigation
+from cathsim_dmc.tasks.cases import Case
+from cathsim_dmc.tasks.coaxial import CoaxialReadings
+from cathsim_dmc.tasks.config import CONTROL_TIMESTEP
+from cathsim_dmc.tasks.readings import Readings
+from cathsim_dmc.tasks.route import Place, along, locate
+
+# What a full action moves (m) and turns (rad) a device by in a control step.
+_MOVE = MAX_PUSH_SPEED * CONTROL_TIMESTEP
+_TURN = MAX_ROTATION_SPEED * CONTROL_TIMESTEP
+
+
+@dataclasses.dataclass(frozen=True)
+class Settings(pursuit.Settings):
+    """How the expert drives coaxial devices; `pursuit.Settings` has what is not here.
+
+    Attributes:
+        leads: by how much each device is ahead of the one around it in successive
+            attempts, over and over, m.
+        lead_gain: share of the error of the lead corrected in a control step.
+        aside: by how much the route must bend away for a device to be turned, rad.
+        turning: share of the error of direction that a base is turned by in a control
+            step.
+        offsets: added to that direction in successive attempts, over and over, rad.
+        slack: what the base may advance while the head does not, m.
+        give: by how much the head may come back while slack is taken up, m.
+        thorough: every so many retries are not content with taking up slack.
+    """
+
+    lookahead: float = 20e-3
+    least_lookahead: float = 12e-3
+    lookahead_factors: tuple[float, ...] = (1.0, 0.75, 1.4)
+    creep: float = 0.1
+    aligned: float = 0.7
+    misaligned: float = 0.0
+    progress: float = 0.5e-3
+    patience: int = 60
+    lost_patience: int = 15
+    leads: tuple[float, ...] = (0.012, 0.03, 0.02, 0.05)
+    lead_gain: float = 0.2
+    aside: float = 0.2
+    turning: float = 0.2
+    offsets: tuple[float, ...] = (0.0, 0.0, 0.0, 0.7, -0.7, 0.0, 1.4, -1.4)
+    slack: float = 12e-3
+    give: float = 2e-3
+    thorough: int = 4
+
+
+@dataclasses.dataclass(frozen=True)
+class Plan:
+    """What the expert knows of a task with coaxial devices; world frame, SI units.
+
+    Attributes:
+        points: (P, 3), route from the inlet to the goal.
+        radii: (P,), of the lumen.
+        arc_length: (P,), along the route.
+        shaped: (K,), length of the pre-shaped end of each device.
+        nodes: (L + 1,), ends of the links from the end of the chain.
+        ostium: arc length where the route narrows most, into its last branch.
+    """
+
+    points: np.ndarray
+    radii: np.ndarray
+    arc_length: np.ndarray
+    shaped: np.ndarray
+    nodes: np.ndarray
+    ostium: float
+
+    @classmethod
+    def for_task(cls, task: navigation.Navigation | Case) -> Plan:
+        """Reads off a task of coaxial devices, or one of its anatomies.
+
+        Raises:
+            ValueError: if the task's objective has no route.
+        """
+        stack = task.scene.catheter
+        assert isinstance(stack, DeviceStack)
+        route = pursuit.route_of(task)
+        shapes = [[arc.length for arc in one.tip_shape] for one in stack.devices]
+        return cls(
+            points=route.points,
+            radii=route.radii,
+            arc_length=route.arc_length,
+            shaped=np.array([sum(lengths) for lengths in shapes]),
+            nodes=stack.stack.nodes,
+            ostium=float(route.arc_length[np.diff(route.radii).argmin()]),
+        )
+
+
+@dataclasses.dataclass(frozen=True)
+class State:
+    """What the expert remembers of each simulation, arrays (N,).
+
+    Attributes:
+        arc_length: of the place on the route at the last step, m; NaN before the
+            first.
+        retracting: bool.
+        taking_up: bool, whether only as long as that takes up slack.
+        turn: insertion to be withdrawn to while retracting, m.
+        best: farthest place on the route in this attempt or this way back, m.
+        held: insertion when the head was there, m.
+        stale: control steps since then.
+        lost: control steps out of the route's tube.
+        attempts: retries so far.
+    """
+
+    arc_length: np.ndarray
+    retracting: np.ndarray
+    taking_up: np.ndarray
+    turn: np.ndarray
+    best: np.ndarray
+    held: np.ndarray
+    stale: np.ndarray
+    lost: np.ndarray
+    attempts: np.ndarray
+
+    @classmethod
+    def fresh(cls, count: int) -> State:
+        """State at the start of N episodes."""
+        return cls(
+            arc_length=np.full(count, np.nan),
+            retracting=np.zeros(count, dtype=bool),
+            taking_up=np.zeros(count, dtype=bool),
+            turn=np.zeros(count),
+            best=np.zeros(count),
+            held=np.zeros(count),
+            stale=np.zeros(count, dtype=int),
+            lost=np.zeros(count, dtype=int),
+            attempts=np.zeros(count, dtype=int),
+        )
+
+
+def decide(
+    plan: Plan,
+    settings: Settings,
+    state: State,
+    readings: Readings,
+    devices: CoaxialReadings,
+    wall_force: forces.WallForce,
+) -> tuple[np.ndarray, State]:
+    """One control step of the expert: a pure function.
+
+    Args:
+        plan: of the task.
+        settings: how to drive.
+        state: after the last step, arrays (N,).
+        readings: of the chain, arrays (N, ...).
+        devices: likewise of the devices.
+        wall_force: arrays (N,); its `max` slows the devices down.
+
+    Returns:
+        Action (N, 2 K) in [-1, 1] and the new state.
+    """
+    # Every other attempt stays near the last place: both ways fail in some branchings.
+    steady = np.where(state.attempts % 2 == 1, state.arc_length, np.nan)
+    place = locate(plan, readings.head, steady)
+    ahead = pursuit.lookahead(plan, settings, state.attempts, place)
+    error, away = _directions(plan, readings, devices, place, ahead)
+    offsets = np.asarray(settings.offsets)
+    error = error + offsets[state.attempts % len(offsets)][:, None]
+    state = _attempt(settings, state, place, readings.insertion)
+    turns = away > settings.aside
+    action = np.zeros((len(error), 2 * error.shape[1]))
+    rate = settings.turning * np.angle(np.exp(1j * error)) / _TURN
+    action[:, 1::2] = np.where(turns, rate, 0.0)
+    leader = devices.insertion.argmax(axis=1)[:, None]
+    looks = np.where(turns, np.cos(error), 1.0)
+    cosine = np.take_along_axis(looks, leader, axis=1)[:, 0]
+    clear = pursuit.ramp(cosine, settings.misaligned, settings.aligned)
+    free = pursuit.ramp(wall_force.max, settings.hard_force, settings.soft_force)
+    advance = settings.speed * np.maximum(free * clear, settings.creep)
+    speed = np.where(state.retracting, -settings.speed, advance)
+    deep = np.maximum(place.arc_length - plan.ostium, 0.0)
+    action[:, 0::2] = _led(settings, state, devices.insertion, speed, deep)
+    return np.clip(action, -1.0, 1.0), state
+
+
+def _led(
+    settings: Settings,
+    state: State,
+    insertion: np.ndarray,
+    speed: np.ndarray,
+    deep: np.ndarray,
+) -> np.ndarray:
+    """Translations (N, K) that keep the devices at their leads.
+
+    A head that is deep (N,), m, in the last branch goes on alone from its ostium.
+    """
+    leads = np.asarray(settings.leads)
+    lead = np.maximum(leads[state.attempts % len(leads)], deep)[:, None]
+    wanted = insertion[:, :1] - lead * np.arange(insertion.shape[1])
+    follow = speed[:, None] + settings.lead_gain * (wanted - insertion) / _MOVE
+    # While the wire goes on, the catheter waits for it rather than coming back.
+    follow = np.where(state.retracting[:, None], follow, np.maximum(follow, 0.0))
+    return np.concatenate([speed[:, None], follow[:, 1:]], axis=1)
+
+
+def _directions(
+    plan: Plan,
+    readings: Readings,
+    devices: CoaxialReadings,
+    place: Place,
+    ahead: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray]:
+    """By what angles the ends of the devices look past the route, and it bends away.
+
+    Returns:
+        Rotation (N, K) that would turn the side of each device to the route, and angle
+        (N, K) from the link before its shaped end to a point of the route ahead, rad.
+    """
+    insertion = devices.insertion
+    gaps = insertion.max(axis=1, keepdims=True) - insertion
+    rows, last = np.arange(len(gaps)), len(plan.nodes) - 2
+    frames = [readings.head_frame]
+    error, away = np.empty(gaps.shape), np.empty(gaps.shape)
+    for k in range(gaps.shape[1]):
+        behind = gaps[:, k] + plan.shaped[k]
+        link = np.maximum((plan.nodes[:-1] > behind[:, None]).sum(axis=1) - 1, 0)
+        while len(frames) <= last - link.min():
+            frames.append(_before(frames[-1], readings.joint_positions, len(frames)))
+        frame = np.stack(frames)[last - link, rows]
+        target = along(plan, place.arc_length - gaps[:, k] + ahead)
+        way = target - readings.centreline[rows, link]
+        x, y, z = np.einsum("nij,ni->jn", frame, way)
+        error[:, k] = np.arctan2(y, x) - devices.tip_rotation[:, k]
+        away[:, k] = np.arctan2(np.hypot(x, y), z)
+    return error, away
+
+
+def _before(frame: np.ndarray, joints: np.ndarray, number: int) -> np.ndarray:
+    """Frames (N, 3, 3) of the links before those of some frames.
+
+    Args:
+        frame: (N, 3, 3), of the links that are the `number`-th from the end.
+        joints: (N, J), `Readings.joint_positions`: in each joint x before y.
+        number: 1 for the last link.
+    """
+    for joint, axis in ((-2 * number + 1, 1), (-2 * number, 0)):
+        frame = pursuit.turned(frame, axis, -joints[:, joint])
+    return frame
+
+
+def _attempt(
+    settings: Settings, state: State, place: Place, insertion: np.ndarray
+) -> State:
+    """Counts progress; begins and ends retries."""
+    outside = place.excess > settings.tolerance
+    gained = place.arc_length > state.best + settings.progress
+    idle = gained | state.retracting
+    stale = np.where(idle, 0, state.stale + 1)
+    lost = np.where(outside & ~state.retracting, state.lost + 1, 0)
+    held = np.where(idle, np.minimum(insertion, state.held), state.held)
+    held = np.where(gained, insertion, held)
+    buckled = ~state.retracting & (insertion > held + settings.slack)
+    strayed = lost > settings.lost_patience
+    give_up = (stale > settings.patience) | buckled | strayed
+    attempts = state.attempts + give_up
+    slack = ~strayed & (attempts % settings.thorough != 0)
+    slack = np.where(give_up, slack, state.taking_up)
+    growth = 1 + settings.backoff_growth * (state.attempts % 4)
+    turn = np.where(give_up, insertion - settings.backoff * growth, state.turn)
+    best = np.where(give_up | gained, place.arc_length, state.best)
+    # Taking up slack ends when the head comes back with the shaft.
+    comes_back = slack & ~give_up & (place.arc_length < best - settings.give)
+    back = ((insertion <= turn) | comes_back) & ~outside
+    back = back | (insertion <= pursuit.WITHDRAWN)
+    retracting = (state.retracting | give_up) & ~back
+    again = state.retracting & ~retracting
+    return State(
+        arc_length=place.arc_length,
+        retracting=retracting,
+        taking_up=slack,
+        turn=turn,
+        best=np.where(again, place.arc_length, best),
+        held=np.where(again, insertion, held),
+        stale=np.where(give_up, 0, stale),
+        lost=lost,
+        attempts=attempts,
+    )

@@ -1,0 +1,138 @@
+"""Coaxial devices of a recorded episode: where each ends, and which lies outermost.
+
+A record holds one chain of links; what the devices in it did stands in ``meta``.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from cathsim_dmc.recording.episode import Episode
+
+# Of one device in ``meta['devices']``: series over the states.
+SERIES = ("insertion", "rotation", "tip_rotation")
+
+
+@dataclass(frozen=True, eq=False)
+class CoaxialRecord:
+    """K devices from the innermost outwards, over T+1 states.
+
+    Attributes:
+        names: What each device is to an operator.
+        radii: (K,), outer radius, metres.
+        insertion: (T+1, K), of the devices' ends, metres.
+        rotation: (T+1, K), of the rotary units, radians.
+        tip_rotation: (T+1, K), of the devices' ends, radians.
+    """
+
+    names: tuple[str, ...]
+    radii: np.ndarray
+    insertion: np.ndarray
+    rotation: np.ndarray
+    tip_rotation: np.ndarray
+
+    @classmethod
+    def of(cls, episode: Episode) -> CoaxialRecord | None:
+        """Reads the devices of an episode; None if it has a single device.
+
+        Raises:
+            ValueError: a device lacks an entry, or has not one value for each state.
+        """
+        devices = episode.meta.get("devices")
+        if not devices:
+            return None
+        try:
+            series = [
+                np.array([one[name] for one in devices], dtype=np.float64).T
+                for name in SERIES
+            ]
+            names = tuple(str(one["name"]) for one in devices)
+            radii = np.array([one["radius"] for one in devices], dtype=np.float64)
+        except (KeyError, TypeError, ValueError) as error:
+            raise ValueError(
+                "meta['devices'] must list devices with name, radius, "
+                f"{', '.join(SERIES)}, all as long: {error!r}"
+            ) from error
+        states = episode.steps + 1
+        for name, values in zip(SERIES, series, strict=True):
+            if values.shape != (states, len(names)):
+                raise ValueError(
+                    f"{name} in meta['devices'] must have one entry per state, "
+                    f"{states}; got {values.shape[:1]}"
+                )
+        return cls(names, radii, *series)
+
+    @classmethod
+    def now(cls, task: Any) -> CoaxialRecord | None:
+        """The present state of a task's devices, T = 0; None for a single device."""
+        state = getattr(task, "devices", None)
+        if state is None:
+            return None
+        chain = task.scene.catheter
+        radii = np.array([device.outer_radius for device in chain.devices])
+        series = [getattr(state, name)[None] for name in SERIES]
+        return cls(tuple(chain.device_names), radii, *series)
+
+    @property
+    def gaps(self) -> np.ndarray:
+        """Way (T+1, K) from the end of each device to that of the chain, metres."""
+        return self.insertion.max(axis=1, keepdims=True) - self.insertion
+
+    def ends(self, line: np.ndarray) -> np.ndarray:
+        """Ends (T+1, K, 3) of the devices on a chain.
+
+        Args:
+            line: (T+1, L+1, 3), joints from proximal to distal, then the head.
+        """
+        beyond = _beyond(line)
+        found = np.empty((*self.gaps.shape, 3))
+        for state, gaps in enumerate(self.gaps):
+            # Ascending for interpolation: from the head backwards.
+            places, points = beyond[state, ::-1], line[state, ::-1]
+            for axis in range(3):
+                found[state, :, axis] = np.interp(gaps, places, points[:, axis])
+        return found
+
+    def outermost(self, line: np.ndarray) -> np.ndarray:
+        """Number (T+1, L) of the outermost device in the middle of each link.
+
+        Args:
+            line: (T+1, L+1, 3), joints from proximal to distal, then the head.
+        """
+        beyond = _beyond(line)
+        middle = (beyond[:, 1:] + beyond[:, :-1]) / 2
+        number = np.broadcast_to(self.gaps.argmin(axis=1)[:, None], middle.shape).copy()
+        for k in range(len(self.names)):
+            number[middle >= self.gaps[:, k, None]] = k
+        return number
+
+
+def _beyond(line: np.ndarray) -> np.ndarray:
+    """Way (T+1, L+1) along the chain from each joint to the head, metres."""
+    lengths = np.linalg.norm(np.diff(line, axis=1), axis=-1)
+    from_base = np.pad(np.cumsum(lengths, axis=1), ((0, 0), (1, 0)))
+    return from_base[:, -1:] - from_base
+
+
+def device_meta(task: Any, rows: dict[str, np.ndarray]) -> list[dict[str, Any]]:
+    """What ``meta['devices']`` holds.
+
+    Args:
+        task: Task with coaxial devices.
+        rows: ``SERIES`` by name, (T+1, K).
+    """
+    chain = task.scene.catheter
+    return [
+        {
+            "name": name,
+            "device": device.name,
+            "radius": device.outer_radius,
+            **{series: rows[series][:, k].tolist() for series in SERIES},
+        }
+        for k, (name, device) in enumerate(
+            zip(chain.device_names, chain.devices, strict=True)
+        )
+    ]

@@ -1,0 +1,167 @@
+"""What the chain of coaxial devices is made of, written into the fields of a model."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import mujoco
+import numpy as np
+
+from cathsim_dmc.entities.chain import BENDING_RELAXATION_TIME
+from cathsim_dmc.entities.coaxial import Links, Overlap
+from cathsim_dmc.entities.device_stack import DeviceStack
+
+# Fields of the model that change as the devices slide. The constants that MuJoCo
+# derives from masses (`body_invweight0`, ...) stay those of the start: the armature of
+# the hinges outweighs the links in them a thousand times.
+FIELDS = (
+    "jnt_stiffness",
+    "dof_damping",
+    "qpos_spring",
+    "geom_size",
+    "geom_rbound",
+    "geom_aabb",
+    "geom_friction",
+    "body_mass",
+    "body_inertia",
+    "body_subtreemass",
+    "body_gravcomp",
+)
+
+
+class ChainFields:
+    """Places in a model of what changes as the devices slide."""
+
+    def __init__(self, model: mujoco.MjModel, scope: str):
+        """Finds the elements of the chain.
+
+        Args:
+          model: the compiled model.
+          scope: MJCF scope of the chain.
+        """
+        from cathsim_dmc.tasks import coaxial_loops  # late, as it takes long
+
+        self._write = coaxial_loops.write
+        bodies = [
+            body
+            for body in range(model.nbody)
+            if model.body(body).name.startswith(f"{scope}/link_")
+        ]
+        joints = [
+            joint
+            for joint in range(model.njnt)
+            if model.joint(joint).name.startswith(f"{scope}/bend_")
+        ]
+        places = [joints, model.jnt_dofadr[joints], model.jnt_qposadr[joints]]
+        # Both kinds of elements follow each other, from proximal to distal.
+        if any((np.diff(each) != 1).any() for each in [bodies, *places]):
+            raise ValueError(f"the links of {scope!r} do not follow each other")
+        self._hinges = np.array([each[0] for each in places], dtype=np.intp)
+        self._body = bodies[0]
+        count = len(bodies)
+        geoms = [model.geom(f"{scope}/link_{link}").id for link in range(count)]
+        self._geoms = np.array(geoms, dtype=np.intp)
+        self._half_lengths = model.geom_size[geoms, 1].copy()
+        # MuJoCo orders the axes of inertia in its own way.
+        self._axes = model.body_inertia[bodies].argmin(axis=-1)
+
+    @property
+    def qpos(self) -> slice:
+        """Places of the hinges in `qpos`, x before y."""
+        start = int(self._hinges[2])
+        return slice(start, start + 2 * (len(self._geoms) - 1))
+
+    def write(self, arrays: Sequence[np.ndarray], made: Made, row: int) -> None:
+        """Writes what the chain of one simulation is made of.
+
+        Args:
+          arrays: live `FIELDS` of its model.
+          made: of some simulations.
+          row: which of them.
+        """
+        self._write(
+            row,
+            self._hinges,
+            self._body,
+            self._geoms,
+            self._axes,
+            self._half_lengths,
+            BENDING_RELAXATION_TIME,
+            made.stiffness,
+            made.rest,
+            *made.links,
+            *arrays,
+        )
+
+
+class Made(NamedTuple):
+    """What chains are made of, arrays with the leading axis N.
+
+    Attributes:
+      stiffness: (N, J), of the hinges, N·m/rad.
+      rest: (N, J, 2), angles of the free hinges about x and y, rad.
+      links: arrays (N, L).
+    """
+
+    stiffness: np.ndarray
+    rest: np.ndarray
+    links: Links
+
+
+def made_of(
+    entity: DeviceStack,
+    overlap: Overlap,
+    turns: np.ndarray,
+    friction: np.ndarray,
+    factor: np.ndarray,
+    spin: np.ndarray | None = None,
+) -> Made:
+    """What chains are made of.
+
+    The damping of a hinge resists how it moves against the turning shape, not against
+    the vessel: else a shaped device would be held back by its own damping when it is
+    turned. So the spring leads by what the damper takes.
+
+    Args:
+      entity: of the devices.
+      overlap: of the devices.
+      turns: (N, K, J), rotation of each device at each joint, rad.
+      friction: (N,), Coulomb coefficient of an uncoated device on the wall.
+      factor: (N,), of all stiffnesses.
+      spin: (N, K, J), rate of that rotation, rad/s; 0 if None.
+    """
+    stack = entity.stack
+    free = stack.rest_angles(overlap, turns, spin, BENDING_RELAXATION_TIME)
+    rest = np.empty((*free.shape, 2))
+    rest[..., 0], rest[..., 1] = -free.imag, free.real
+    return Made(
+        stiffness=factor[:, None] / overlap.compliance,
+        rest=rest,
+        links=stack.links(overlap, friction),
+    )
+
+
+def write_still(
+    entity: DeviceStack,
+    model: mujoco.MjModel,
+    gaps: np.ndarray | None = None,
+    rotation: np.ndarray | None = None,
+) -> None:
+    """Writes into a model what the chain is made of while the devices stand still.
+
+    Args:
+      entity: of the devices.
+      model: the compiled model.
+      gaps: (K,), way from the end of each device to that of the chain, m; those at the
+        start of an episode if None.
+      rotation: (K,), of each device, not twisted, rad; 0 if None.
+    """
+    gaps = entity.start_gaps if gaps is None else np.asarray(gaps, np.float64)
+    turns = np.zeros((1, len(entity.devices), len(entity.stack.spans)))
+    if rotation is not None:
+        turns += np.asarray(rotation)[:, None]
+    overlap = entity.stack.overlap(gaps[None])
+    made = made_of(entity, overlap, turns, np.array([entity.friction]), np.ones(1))
+    arrays = [getattr(model, name) for name in FIELDS]
+    ChainFields(model, entity.mjcf_model.model).write(arrays, made, 0)

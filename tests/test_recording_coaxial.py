@@ -1,0 +1,102 @@
+"""Coaxial devices in a record and in its Rerun file."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from cathsim_dmc import suite
+from cathsim_dmc.recording import rerun_log
+from cathsim_dmc.recording.coaxial import CoaxialRecord
+from cathsim_dmc.recording.drawing import action_layout
+from cathsim_dmc.recording.episode import Episode
+from cathsim_dmc.recording.recorder import EpisodeRecorder
+from cathsim_dmc.recording.rerun_device import DEVICE_COLOURS
+
+STEPS = 12
+
+
+@pytest.fixture(scope="module")
+def recorded():
+    """The catheter is pushed over the wire, turned, and takes the lead."""
+    env = suite.load("cathsim", "simple1_lcca_pair", {"random": 3})
+    seen = []
+
+    def policy(timestep):
+        seen.append(env.task.devices)
+        return np.array([-1.0, 0.0, 1.0, 0.5])
+
+    episode = EpisodeRecorder(env).record_episode(policy, seed=3, max_steps=STEPS)
+    seen.append(env.task.devices)
+    yield episode, seen
+    env.close()
+
+
+def test_the_record_has_both_devices(recorded):
+    episode, seen = recorded
+    coaxial = CoaxialRecord.of(episode)
+    assert coaxial.names == ("guidewire", "catheter")
+    assert coaxial.insertion.shape == (STEPS + 1, 2)
+    for name in ("insertion", "rotation", "tip_rotation"):
+        expected = [getattr(state, name) for state in seen]
+        np.testing.assert_array_equal(getattr(coaxial, name), expected)
+    assert coaxial.rotation[-1, 1] == pytest.approx(STEPS * 0.5 * 3.14 * 0.04)
+    # What the task says of the ends: on the straight chain of the same physics step.
+    ends = coaxial.ends(episode.catheter)
+    for state, readings in zip(ends[1:], seen[1:], strict=True):
+        np.testing.assert_allclose(state, readings.points[:, -1], atol=1e-5)
+
+
+def test_links_look_like_the_outermost_device_there(recorded):
+    episode, _ = recorded
+    coaxial = CoaxialRecord.of(episode)
+    outermost = coaxial.outermost(episode.catheter)
+    # At first 30 mm of wire stand out of the catheter; in the end the wire lies in it.
+    lengths = np.linalg.norm(np.diff(episode.catheter[0], axis=0), axis=-1)
+    bare = lengths[outermost[0] == 0].sum()
+    assert bare == pytest.approx(0.03, abs=lengths.max())
+    assert (outermost[0][:10] == 1).all() and outermost[0][-1] == 0
+    assert coaxial.gaps[-1, 1] < coaxial.gaps[0, 1]
+
+
+def test_a_saved_record_keeps_them(recorded, tmp_path):
+    episode, _ = recorded
+    again = Episode.load(episode.save(tmp_path / "pair.npz"))
+    theirs, ours = CoaxialRecord.of(again), CoaxialRecord.of(episode)
+    np.testing.assert_array_equal(theirs.insertion, ours.insertion)
+
+
+def test_the_rerun_file_has_both(recorded, tmp_path):
+    from rerun.chunk import RrdReader
+
+    episode, _ = recorded
+    path = tmp_path / "pair.rrd"
+    box = (np.eye(3), np.array([[0, 1, 2]]))
+    rerun_log.write_rrd(episode, box, path)
+    entities = {str(chunk.entity_path) for chunk in RrdReader(path).stream()}
+    for name in ("guidewire", "catheter"):
+        assert f"/world/catheter/{name}" in entities
+        assert f"/series/insertion_mm/{name}" in entities
+        assert f"/series/rotation_deg/{name}" in entities
+        assert f"/series/rotation_deg/{name}_end" in entities
+        assert f"/series/action/{name}_insertion" in entities
+
+
+def test_devices_have_colours_of_their_own():
+    assert len(set(DEVICE_COLOURS)) == len(DEVICE_COLOURS) >= 2
+
+
+def test_actions_of_two_devices_do_not_share_a_name(recorded):
+    names, tip = action_layout(recorded[0])
+    assert len(set(names)) == 4 and not tip.any()
+
+
+def test_a_record_with_damaged_devices_is_refused(recorded):
+    episode, _ = recorded
+    device = dict(episode.meta["devices"][0])
+    short = {**device, "insertion": device["insertion"][:-1]}
+    del device["radius"]
+    for wrong, message in ((device, "radius"), (short, "one entry per state")):
+        meta = {**episode.meta, "devices": [wrong]}
+        with pytest.raises(ValueError, match=message):
+            CoaxialRecord.of(dataclasses.replace(episode, meta=meta))
