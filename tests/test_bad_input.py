@@ -182,6 +182,12 @@ TRAINING = {
     "keep_checkpoints": whole(1),
     "metrics_frames": whole(1),
     "tensorboard": flag(),
+    "rerun": flag(),
+    "rerun_every": whole(1),
+    "rerun_steps": whole(1),
+    "rerun_viewer": st.sampled_from([1, True, [], {}, 1.5, ()]),
+    "collector": word(),
+    "collectors": whole(1),
     "torch_threads": whole(1),
 }
 CRITIC = {"critic_observation": st.sampled_from(["", 1, [], [1], {}, 1.5, (), True])}

@@ -4,6 +4,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import torchrl  # noqa: F401  goes before dm_control
 
 import cathsim_dmc
@@ -19,7 +20,7 @@ def main() -> None:
         assert home.parent != checkout, f"{home} is the checkout, not the package"
     environment = suite.load("cathsim", "type1_lcca", task_kwargs={"random": 0})
     first = environment.reset()
-    later = environment.step(environment.action_spec().maximum)
+    later = environment.step(np.ones(environment.action_spec().shape))
     assert first.observation.keys() == later.observation.keys()
     env = make_env("type1_bca", observation=["internal", "image"], num_envs=2)
     rollout = env.rollout(3)
