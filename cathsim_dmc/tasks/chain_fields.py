@@ -134,7 +134,7 @@ def made_of(
     stack = entity.stack
     free = stack.rest_angles(overlap, turns, spin, BENDING_RELAXATION_TIME)
     rest = np.empty((*free.shape, 2))
-    rest[..., 0], rest[..., 1] = -free.imag, free.real
+    rest[..., 0], rest[..., 1] = -np.imag(free), np.real(free)
     return Made(
         stiffness=factor[:, None] / overlap.compliance,
         rest=rest,
