@@ -46,7 +46,8 @@ reward and length of episodes it was trained with. Published figures are those o
 et al., whose simulator, phantoms' walls and force readings differ (see
 [physics.md](physics.md), [forces.md](forces.md)): rates can be compared, forces only in
 their order of magnitude. Agents have the preset `tuned` unless their row says
-otherwise; [training.md](training.md) tells how it was found.
+otherwise, those that read images `tuned_image`; [training.md](training.md) tells how
+these were found.
 """
 
 COLUMNS = """\
