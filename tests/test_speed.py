@@ -35,7 +35,8 @@ def test_every_step_of_a_pace_falls_into_one_depth(environment):
 
 
 def test_the_account_adds_up_and_leaves_nothing_behind(environment):
-    table = pace.account(pace.RANDOM, steps=20, runs=1)
+    # The last part is a difference of two measurements: the median of several runs.
+    table = pace.account(pace.RANDOM, steps=20, runs=7)
     assert list(table)[-1] == "composer and observation"
     assert all(part > 0 for part in table.values()), table
     physics = sum(list(table.values())[:5])
