@@ -113,10 +113,8 @@ def test_a_head_that_goes_on_is_left_alone():
     assert state.attempts[0] == 0 and not state.retracting[0]
 
 
-@pytest.mark.parametrize(
-    "name",
-    ["simple1_bca_pair", pytest.param("simple1_bca_wire", marks=pytest.mark.slow)],
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["simple1_bca_pair", "simple1_bca_wire"])
 def test_the_expert_reaches_the_goal(name):
     result = evaluate("expert", name, 2, 7, task_kwargs={"max_steps": 200})
     assert result.successes == 2
