@@ -149,10 +149,8 @@ class TrainingConfig:
 
     def __post_init__(self):
         """Validate; every message says what was given and what is allowed."""
-        for name in ("hidden", "observation", "training_start"):
-            if isinstance(getattr(self, name), list):
-                object.__setattr__(self, name, tuple(getattr(self, name)))
-        object.__setattr__(self, "convolutions", tuples(self.convolutions))
+        for name in ("hidden", "observation", "training_start", "convolutions"):
+            object.__setattr__(self, name, tuples(getattr(self, name)))
         for name, kind in typing.get_type_hints(type(self)).items():
             if typing.get_origin(kind) is not ClassVar:
                 require_type(name, getattr(self, name), kind)
@@ -161,30 +159,7 @@ class TrainingConfig:
             object.__setattr__(self, "training_reward", dict(self.training_reward))
         require(bool(self.task), "task", self.task, "the name of a task")
         require(bool(self.observation), "observation", self.observation, "a name")
-        require(
-            0 < len(self.hidden) <= MAX_LAYERS
-            and all(0 < width <= MAX_WIDTH for width in self.hidden),
-            "hidden",
-            self.hidden,
-            f"1 to {MAX_LAYERS} widths from 1 to {MAX_WIDTH}",
-        )
-        require(
-            0 < self.cnn_features <= MAX_WIDTH,
-            "cnn_features",
-            self.cnn_features,
-            f"a positive integer up to {MAX_WIDTH}",
-        )
-        require(
-            0 < len(self.convolutions) <= MAX_LAYERS
-            and all(
-                len(layer) == 3 and 0 < min(layer) and max(layer) <= MAX_FILTERS
-                for layer in self.convolutions
-            ),
-            "convolutions",
-            self.convolutions,
-            f"1 to {MAX_LAYERS} layers (filters, kernel size, stride), each number "
-            f"from 1 to {MAX_FILTERS}",
-        )
+        self._require_networks()
         self._require_positive(
             "num_envs",
             "total_frames",
@@ -240,6 +215,32 @@ class TrainingConfig:
                 f"task_kwargs={self.task_kwargs!r} cannot be written to config.json "
                 f"({error}); use finite numbers, strings, lists and dicts only."
             ) from error
+
+    def _require_networks(self) -> None:
+        require(
+            0 < len(self.hidden) <= MAX_LAYERS
+            and all(0 < width <= MAX_WIDTH for width in self.hidden),
+            "hidden",
+            self.hidden,
+            f"1 to {MAX_LAYERS} widths from 1 to {MAX_WIDTH}",
+        )
+        require(
+            0 < self.cnn_features <= MAX_WIDTH,
+            "cnn_features",
+            self.cnn_features,
+            f"a positive integer up to {MAX_WIDTH}",
+        )
+        require(
+            0 < len(self.convolutions) <= MAX_LAYERS
+            and all(
+                len(layer) == 3 and 0 < min(layer) and max(layer) <= MAX_FILTERS
+                for layer in self.convolutions
+            ),
+            "convolutions",
+            self.convolutions,
+            f"1 to {MAX_LAYERS} layers (filters, kernel size, stride), each number "
+            f"from 1 to {MAX_FILTERS}",
+        )
 
     def _require_positive(self, *names: str) -> None:
         for name in names:

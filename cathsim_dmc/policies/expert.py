@@ -7,7 +7,7 @@ in `pursuit`, for coaxial devices in `coaxial_pursuit`; here it meets the simula
 from __future__ import annotations
 
 import dataclasses
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -20,6 +20,8 @@ from cathsim_dmc.tasks.cases import Case
 from cathsim_dmc.tasks.coaxial import CoaxialReadings
 from cathsim_dmc.tasks.objective_pool import part
 from cathsim_dmc.tasks.readings import Readings
+
+Memory = TypeVar("Memory", State, coaxial_pursuit.State)
 
 
 class Expert:
@@ -62,9 +64,7 @@ class Expert:
             self._state = None
             return
         shape = self._state.insertion.shape
-        fresh = State.fresh(shape, len(self._plan.tip))
-        for field in dataclasses.fields(State):
-            getattr(self._state, field.name)[which] = getattr(fresh, field.name)[which]
+        _forget(self._state, State.fresh(shape, len(self._plan.tip)), which)
 
     def act(
         self,
@@ -127,8 +127,7 @@ class CoaxialExpert:
             self._state = None
             return
         fresh = coaxial_pursuit.State.fresh(len(self._state.attempts))
-        for field in dataclasses.fields(fresh):
-            getattr(self._state, field.name)[which] = getattr(fresh, field.name)[which]
+        _forget(self._state, fresh, which)
 
     def act(
         self,
@@ -147,6 +146,12 @@ class CoaxialExpert:
 
     def follow(self, action: np.ndarray) -> None:
         """Nothing: it remembers no action, only where the devices have come to."""
+
+
+def _forget(state: Memory, fresh: Memory, which: np.ndarray) -> None:
+    """Puts a fresh state in the place of that of some simulations."""
+    for field in dataclasses.fields(fresh):
+        getattr(state, field.name)[which] = getattr(fresh, field.name)[which]
 
 
 def expert_for(
