@@ -9,8 +9,9 @@ import pytest
 from synthetic_scans import marched, write_markup, write_obj, y_tree
 
 from cathsim_dmc.anatomy import phantoms
-from cathsim_dmc.anatomy.anatomy import Anatomy, Goal
+from cathsim_dmc.anatomy.anatomy import Anatomy
 from cathsim_dmc.anatomy.centreline import Centreline, Vessel, VesselTree
+from cathsim_dmc.anatomy.parts import Goal
 from cathsim_dmc.anatomy.scan import importer
 from cathsim_dmc.anatomy.scan.check import check_tree
 from cathsim_dmc.anatomy.scan.importer import import_scan

@@ -11,8 +11,9 @@ from pathlib import Path
 import numpy as np
 
 from cathsim_dmc import bounds
-from cathsim_dmc.anatomy.anatomy import Anatomy, Inlet, Surface
+from cathsim_dmc.anatomy.anatomy import Anatomy
 from cathsim_dmc.anatomy.centreline import VesselTree
+from cathsim_dmc.anatomy.parts import Inlet, Surface
 from cathsim_dmc.anatomy.scan import coacd_wall
 from cathsim_dmc.anatomy.scan.check import check_tree
 from cathsim_dmc.anatomy.scan.compiled_field import compiled, plain
