@@ -92,19 +92,20 @@ class Screen(types.ModuleType):
         self.pictures = 0
         self.texts, self.lines, self.said = [], [], []
         self.bound = {}
+        self.Tk = lambda **_: Widget(self)
+        self.Canvas = self._canvas
+        self.Label = self._label
+        self.PhotoImage = self._picture
 
-    def Tk(self, **_):
-        return Widget(self)
-
-    def Canvas(self, *_, **options):
+    def _canvas(self, *_, **options):
         # The panel is black, the screen is not.
         return Panel(self) if "background" in options else Widget(self)
 
-    def Label(self, *_, text, **__):
+    def _label(self, *_, text, **__):
         self.said.append(text)
         return Widget(self)
 
-    def PhotoImage(self, *, data, **_):
+    def _picture(self, *, data, **_):
         assert data.startswith(b"P5 512 512 255 ")
         return data
 
