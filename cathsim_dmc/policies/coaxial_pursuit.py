@@ -64,7 +64,7 @@ class Settings(pursuit.Settings):
     progress: float = 0.5e-3
     patience: int = 60
     lost_patience: int = 15
-    leads: tuple[float, ...] = (0.012, 0.03, 0.02, 0.05)
+    leads: tuple[float, ...] = (0.012, -0.03, -0.045, -0.02)
     lead_gain: float = 0.2
     aside: float = 0.2
     turning: float = 0.2
