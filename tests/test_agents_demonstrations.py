@@ -68,9 +68,11 @@ def test_noise_is_in_the_action_and_not_in_what_the_expert_would_do(recorded):
         assert 0.08 < noise[np.abs(expert) < 0.6].std() < 0.12
 
 
-def test_the_same_seed_gives_the_same_demonstrations(recorded, tmp_path):
+def test_the_same_seed_gives_the_same_demonstrations(recorded, tmp_path, monkeypatch):
+    # Into a relative path this time.
+    monkeypatch.chdir(tmp_path)
     again = record_demonstrations(
-        TASK, tmp_path / "again", 1, observation="tracking", seed=2_000_001, noise=0.1,
+        TASK, "again", 1, observation="tracking", seed=2_000_001, noise=0.1,
         task_kwargs=OPTIONS,
     )  # fmt: skip
     (one,), many = read_episodes(again.path), list(read_episodes(recorded.path))

@@ -129,7 +129,8 @@ def write(
     name = path.name
     with atomic_directory(path) as temporary:
         storage = MinariStorage.new(
-            temporary / "data",
+            # Minari looks for the files of a relative path beneath that path again.
+            temporary.absolute() / "data",
             observation_space,
             action_space,
             env_spec,
