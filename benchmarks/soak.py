@@ -17,6 +17,7 @@ What is measured
   what the wall pieces stay behind the lumen to the penetration.
 - escape: the excess exceeds the device's diameter, so that a part of the device is
   wholly outside.
+- tip step: largest change of the place of the device's end in a control step.
 - warnings: MuJoCo's own counters.
 
 A goal does not end an episode here: its radius is tiny.
@@ -176,6 +177,7 @@ def run(simulation: BatchSimulation, episodes: list[Episode], steps: int) -> lis
     before = simulation.batch.warning.reshape(size, -1).copy()
     excess, force, total = (Peak.none(size) for _ in range(3))
     penetration, overflow = Peak.none(size), Peak.none(size)
+    tip_step, tip = Peak.none(size), simulation.readings.head
     counts = np.zeros((size, BINS), dtype=np.int64)
     force_sum = np.zeros(size)
     errors = np.full(size, -1)
@@ -196,6 +198,9 @@ def run(simulation: BatchSimulation, episodes: list[Episode], steps: int) -> lis
         force.update(contacts.magnitude.max((-1, -2)), step)
         total.update(contacts.magnitude.sum(-1).max(-1), step)
         overflow.update(contacts.found.max(-1), step)
+        moved = np.linalg.norm(result.readings.head - tip, axis=-1)
+        tip_step.update(moved, step)
+        tip = result.readings.head
         excess.update(containment.largest_excess(result.readings.centreline), step)
         force_sum += contacts.magnitude.sum(-1).mean(-1)
         insertion = np.maximum(insertion, result.readings.insertion)
@@ -211,6 +216,8 @@ def run(simulation: BatchSimulation, episodes: list[Episode], steps: int) -> lis
             "excess_step": int(excess.step[index]),
             "penetration_max": float(penetration.value[index]),
             "penetration_step": int(penetration.step[index]),
+            "tip_step_max": float(tip_step.value[index]),
+            "tip_step_step": int(tip_step.step[index]),
             "force_max": float(force.value[index]),
             "force_step": int(force.step[index]),
             "force_sum_max": float(total.value[index]),
@@ -232,6 +239,8 @@ def run(simulation: BatchSimulation, episodes: list[Episode], steps: int) -> lis
 def read_rows(path: Path, steps: int) -> list[dict]:
     """Rows of a file that this program wrote; a torn last line is dropped.
 
+    So are rows that lack a figure of today, to be run again.
+
     Raises:
       ValueError: if they are of another number of steps.
     """
@@ -243,6 +252,7 @@ def read_rows(path: Path, steps: int) -> list[dict]:
             rows.append(json.loads(line))
         except json.JSONDecodeError:
             continue
+    rows = [row for row in rows if "tip_step_max" in row]
     if any(row["steps"] != steps for row in rows):
         raise ValueError(
             f"{path} holds episodes of {rows[0]['steps']} steps, not {steps}; give "
@@ -280,6 +290,7 @@ def summarise(rows: list[dict]) -> dict:
         "excess_max_mm": 1e3 * max(row["excess_max"] for row in rows),
         "penetration_p99_mm": 1e3 * percentile(rows, 99),
         "penetration_max_mm": 1e3 * max(row["penetration_max"] for row in rows),
+        "tip_step_max_mm": 1e3 * max(row["tip_step_max"] for row in rows),
         "force_max": max(row["force_max"] for row in rows),
         "force_sum_max": max(row["force_sum_max"] for row in rows),
         "force_sum_mean": float(np.mean([row["force_sum_mean"] for row in rows])),
@@ -337,7 +348,9 @@ def report(rows: list[dict]) -> dict:
             ),
         ],
         "total": total,
-        "worst": {key: worst(key) for key in ("penetration", "force", "excess")},
+        "worst": {
+            key: worst(key) for key in ("penetration", "force", "excess", "tip_step")
+        },
         "groups": groups,
     }
 
@@ -361,14 +374,15 @@ def markdown(result: dict) -> str:
         ),
         "",
         "| task | policy | episodes | penetration p99 / max, mm | excess max, mm "
-        "| largest force, N | mean sum, N | contacts |",
-        "|---|---|---|---|---|---|---|---|",
+        "| tip step max, mm | largest force, N | mean sum, N | contacts |",
+        "|---|---|---|---|---|---|---|---|---|",
     ]
     for group in [*result["groups"], {"task": "all", "policy": "", **result["total"]}]:
         lines.append(
             f"| {group['task']} | {group['policy']} | {group['episodes']} "
             f"| {group['penetration_p99_mm']:.3f} / {group['penetration_max_mm']:.3f} "
-            f"| {group['excess_max_mm']:.2f} | {group['force_max']:.2f} "
+            f"| {group['excess_max_mm']:.2f} | {group['tip_step_max_mm']:.2f} "
+            f"| {group['force_max']:.2f} "
             f"| {group['force_sum_mean']:.3f} | {group['contacts_max']} |"
         )
     return "\n".join(lines) + "\n"

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from cathsim_dmc import agents, policies, suite
 from cathsim_dmc.anatomy.arch import arch
-from cathsim_dmc.policies import expert, pursuit
+from cathsim_dmc.policies import attempts, expert, pursuit
 from cathsim_dmc.simulation import batch
 from cathsim_dmc.tasks import forces
 
@@ -171,7 +171,7 @@ def test_a_head_that_stands_still_is_withdrawn_and_tried_again():
         # The first gains a millimetre a step, the second nothing.
         arc = np.array([0.1 + 1e-3 * step, 0.1])
         place = pursuit.Place(arc, np.full(2, 0.01), np.full(2, -0.5))
-        state = pursuit._attempt(options, state, place, insertion)
+        state = attempts.advance(options, state, place, insertion)
         retracted.append(state.retracting.copy())
         insertion = insertion - 1e-3 * state.retracting
     retracted = np.array(retracted)
@@ -189,7 +189,7 @@ def test_a_lost_head_is_withdrawn_until_it_is_back():
     for step in range(60):
         excess = np.array(2.0 if insertion > 0.06 else -0.5)
         place = pursuit.Place(np.array(0.1 + 1e-3 * step), np.array(0.004), excess)
-        state = pursuit._attempt(options, state, place, insertion)
+        state = attempts.advance(options, state, place, insertion)
         if state.attempts and not state.retracting:
             break
         insertion = insertion - 1e-3 * state.retracting

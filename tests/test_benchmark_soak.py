@@ -92,9 +92,13 @@ def test_it_goes_on_where_it_stopped(soak, monkeypatch, capsys, tmp_path):
 
 def test_rows_of_another_length_are_refused(soak, tmp_path):
     path = tmp_path / "episodes.jsonl"
-    path.write_text(json.dumps({"number": 0, "steps": 3}) + "\n")
+    row = {"number": 0, "steps": 3, "tip_step_max": 1e-3}
+    path.write_text(json.dumps(row) + "\n")
     with pytest.raises(ValueError, match=r"episodes of 3 steps, not 2000.*--out"):
         soak.read_rows(path, 2000)
+    # What an older version wrote lacks a figure, and is run again.
+    path.write_text(json.dumps({"number": 0, "steps": 3}) + "\n")
+    assert soak.read_rows(path, 3) == []
 
 
 def test_a_broken_bound_fails_the_report(soak):
@@ -110,6 +114,8 @@ def test_a_broken_bound_fails_the_report(soak):
         "excess_step": 3,
         "penetration_max": 1.5e-3,
         "penetration_step": 4,
+        "tip_step_max": 4e-3,
+        "tip_step_step": 6,
         "force_max": 12.0,
         "force_step": 5,
         "force_sum_max": 13.0,
@@ -120,3 +126,5 @@ def test_a_broken_bound_fails_the_report(soak):
     report = soak.report([row])
     assert not any(check["passed"] for check in report["checks"])
     assert report["worst"]["force"]["force_step"] == 5
+    assert report["worst"]["tip_step"]["tip_step_step"] == 6
+    assert "| 4.00 | 12.00 |" in soak.markdown(report)

@@ -125,7 +125,7 @@ def test_the_sheath_is_frictionless_and_only_guides_the_device(straight_rig):
     for rod in sides(straight_rig, "CAPSULE") + sides(straight_rig, "CYLINDER"):
         assert rod.contype[0] == rod.conaffinity[0] == 0
     for box in sides(straight_rig, "BOX"):
-        assert box.condim[0] == 1 and box.priority[0] == 1
+        assert box.condim[0] == 1 and box.priority[0] == 2
         assert box.contype[0] == 1 and box.conaffinity[0] == 0
     assert set(model.pair_dim) == {1}
     for solref in model.pair_solref:

@@ -7,8 +7,9 @@ import pytest
 
 from cathsim_dmc import policies, suite
 from cathsim_dmc.agents import evaluate
-from cathsim_dmc.policies import coaxial_pursuit, pursuit
-from cathsim_dmc.policies.coaxial_pursuit import Plan, Settings, State
+from cathsim_dmc.policies import attempts, coaxial_pursuit, pursuit
+from cathsim_dmc.policies.attempts import Attempts
+from cathsim_dmc.policies.coaxial_pursuit import Plan, Settings
 from cathsim_dmc.policies.expert import CoaxialExpert, expert_for
 from cathsim_dmc.policies.teacher import Teacher
 from cathsim_dmc.simulation.batch import BatchSimulation
@@ -69,7 +70,7 @@ def test_turning_by_the_error_turns_the_side_to_the_route(environment):
 
 
 def fresh(arc_length, insertion, **values):
-    state = State.fresh(1)
+    state = Attempts.none((1,))
     changes = {"arc_length": arc_length, "best": arc_length, "held": insertion}
     changes.update(values)
     return dataclasses.replace(
@@ -79,7 +80,7 @@ def fresh(arc_length, insertion, **values):
 
 def attempt(state, arc_length, insertion, excess=-0.5):
     place = Place(np.array([arc_length]), np.array([5e-3]), np.array([excess]))
-    return coaxial_pursuit._attempt(Settings(), state, place, np.array([insertion]))
+    return attempts.advance(Settings(), state, place, np.array([insertion]))
 
 
 def test_a_shaft_that_buckles_is_taken_back_until_the_head_comes_with_it():

@@ -3,7 +3,9 @@
 import numpy as np
 import pytest
 
-from cathsim_dmc.validation import pair, sliding
+from cathsim_dmc.entities import contact
+from cathsim_dmc.tasks.config import PHYSICS_TIMESTEP
+from cathsim_dmc.validation import pair, pressed, sliding
 
 
 def test_a_protruding_wire_bends_as_two_sections():
@@ -45,6 +47,50 @@ def test_the_curve_is_integrated_right():
     along = 0.1 - radius * angle - 8e-3 + radius * np.sin(angle) + 8e-3 * np.cos(angle)
     expected = (across * np.cos(0.3), across * np.sin(0.3), along)
     np.testing.assert_allclose(points[-1], expected, atol=5e-5)
+
+
+def test_what_is_pressed_on_the_wall_lies_still():
+    """The law of coaxial devices holds newtons; that of the steerable one rattles."""
+    single = contact.CONTACT_SOLREF, contact.CONTACT_SOLIMP
+    depth = 0.0
+    for load in pressed.LOADS:
+        found = pressed.pressed(load)
+        assert found.ripple < 1e-6 and found.depth > depth
+        depth = found.depth
+        rattles = pressed.pressed(load, *single).ripple > 1e-4
+        assert rattles == (load >= 1.0)
+    assert 0.25e-3 < depth < 0.3e-3
+
+
+def test_depth_and_law_agree_with_the_iteration_in_which_they_settle():
+    """α (1 + m) < 2 at every depth, as `entities.contact` says; see docs/pair.md."""
+
+    def growth(solref, solimp):
+        least, most, width, middle, power = solimp
+        depth = np.linspace(0.01, 0.99, 400) * width
+        x = depth / width
+        low = x**power / middle ** (power - 1)
+        high = 1 - (1 - x) ** power / (1 - middle) ** (power - 1)
+        d = least + (most - least) * np.where(x <= middle, low, high)
+        slope = np.gradient(np.log(d * d / (1 - d)), np.log(depth))
+        stiffness, damping = (-value for value in solref)
+        # MuJoCo scales what it is given by the largest impedance.
+        stiffness, damping = stiffness / most**2, damping / most
+        step = stiffness * d * PHYSICS_TIMESTEP
+        return depth, step / (step + damping) * (1 + slope)
+
+    _, coaxial = growth(contact.COAXIAL_SOLREF, contact.COAXIAL_SOLIMP)
+    assert coaxial.max() < 1.7
+    depth, single = growth(contact.CONTACT_SOLREF, contact.CONTACT_SOLIMP)
+    assert depth[np.argmax(single > 2)] == pytest.approx(0.23e-3, abs=0.01e-3)
+
+
+@pytest.mark.slow
+def test_a_jammed_pair_lies_still():
+    jammed = pressed.jam()
+    assert jammed.push_force > 1.0 and jammed.penetration < 0.3e-3
+    least, largest = jammed.forces
+    assert least > 0.5 and largest < 5.0
 
 
 @pytest.mark.slow

@@ -1,5 +1,7 @@
 """A chain of rigid links that stands for slender devices; its base is driven."""
 
+from typing import Any
+
 import numpy as np
 from dm_control import composer, mjcf
 
@@ -74,7 +76,7 @@ class Chain(composer.Entity):
         self._lengths, self._radius, self._stroke = link_lengths, radius, stroke
         self._mjcf_root = mjcf.RootElement(model=name)
         self._mjcf_root.compiler.angle = "radian"
-        self._contact = device_contact(friction)
+        self._contact = self._surface(friction)
         self._links = []
         self._link_geoms = []
         self._bends = []
@@ -113,6 +115,10 @@ class Chain(composer.Entity):
     def _in_tip(self, index: int) -> bool:
         """Whether a link belongs to the tip; for looks."""
         raise NotImplementedError
+
+    def _surface(self, friction: float) -> dict[str, Any]:
+        """Attributes of what touches the wall with a Coulomb coefficient."""
+        return device_contact(friction)
 
     def _add_twist(self, link, index: int) -> None:
         """Adds the torsion hinge of a link, if it has one."""

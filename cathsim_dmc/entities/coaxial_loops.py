@@ -132,6 +132,12 @@ def shares(gaps, nodes, lengths):
 
 
 @compiled
+def _unit(angle):
+    """exp(i angle)."""
+    return complex(math.cos(angle), math.sin(angle))
+
+
+@compiled
 def restoring(rest, compliance, coupling, bends, turns):
     """Torques of the shapes and minus their derivatives, see `Stack.restoring`."""
     count, devices, joints = turns.shape
@@ -141,8 +147,7 @@ def restoring(rest, compliance, coupling, bends, turns):
         for j in range(joints):
             whole = 0j
             for k in range(devices):
-                angle = turns[i, k, j]
-                pulls[k] = rest[i, k, j] * complex(math.cos(angle), math.sin(angle))
+                pulls[k] = rest[i, k, j] * _unit(turns[i, k, j])
                 whole += pulls[k]
             for k in range(devices):
                 force = np.conj(bends[i, j] - (whole - pulls[k])) * pulls[k]
@@ -171,10 +176,8 @@ def pressure(stiffness, moment, present, bends, turns, lengths):
         for k in range(devices - 1):
             for j in range(joints):
                 span = (lengths[j] + lengths[j + 1]) / 2
-                angle = turns[i, k, j]
-                turned = complex(math.cos(angle), math.sin(angle))
                 own[j] = stiffness[i, k, j] * bends[i, j] / span
-                own[j] -= moment[i, k, j] * turned
+                own[j] -= moment[i, k, j] * _unit(turns[i, k, j])
             before = 0j
             for j in range(joints):
                 shear = 0j
@@ -188,11 +191,15 @@ def pressure(stiffness, moment, present, bends, turns, lengths):
 
 
 @compiled
-def _segment(place, nodes, first):
-    """Number of the segment, from a first one on, that a place on a rod lies in."""
+def _on_rod(joint, gap, nodes, first):
+    """Segment of a rod, from a first one on, that a joint lies in, and the way through.
+
+    A joint of the chain in the gap beyond the device's end is at the end of its rod.
+    """
+    place = max(nodes[joint + 1] - gap, 0.0)
     while first < len(nodes) - 2 and nodes[first + 1] > place:
         first += 1
-    return first
+    return first, (nodes[first] - place) / (nodes[first] - nodes[first + 1])
 
 
 @compiled
@@ -208,9 +215,7 @@ def at_joints(angles, gaps, nodes):
         for k in range(devices):
             first = 0
             for j in range(joints):
-                place = max(nodes[j + 1] - gaps[i, k], 0.0)
-                first = _segment(place, nodes, first)
-                share = (nodes[first] - place) / (nodes[first] - nodes[first + 1])
+                first, share = _on_rod(j, gaps[i, k], nodes, first)
                 near, far = angles[i, k, first], angles[i, k, first + 1]
                 turns[i, k, j] = near + share * (far - near)
     return turns
@@ -228,9 +233,7 @@ def at_nodes(loads, gaps, nodes):
         for k in range(devices):
             first = 0
             for j in range(joints):
-                place = max(nodes[j + 1] - gaps[i, k], 0.0)
-                first = _segment(place, nodes, first)
-                share = (nodes[first] - place) / (nodes[first] - nodes[first + 1])
+                first, share = _on_rod(j, gaps[i, k], nodes, first)
                 for kind in range(kinds):
                     load = loads[kind, i, k, j]
                     shared[kind, i, k, first] += share * load
@@ -349,10 +352,8 @@ def rest_angles(rest, turns, spin, relaxation):
     for i in range(count):
         for k in range(devices):
             for j in range(joints):
-                angle = turns[i, k, j]
-                turned = complex(math.cos(angle), math.sin(angle))
                 lead = complex(1.0, relaxation * spin[i, k, j])
-                angles[i, j] += rest[i, k, j] * turned * lead
+                angles[i, j] += rest[i, k, j] * _unit(turns[i, k, j]) * lead
     return angles
 
 

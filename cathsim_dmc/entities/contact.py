@@ -16,6 +16,17 @@ CONTACT_SOLREF = (-1 / _CONTACT_TIME**2, -2 / _CONTACT_TIME)
 # stops rising at 0.97 let 0.2 N push the tip 3 mm deep.
 CONTACT_SOLIMP = (0.7, 0.999, 0.0003, 0.5, 1)
 
+# Coaxial devices: a wire in a catheter is four times as stiff as the steerable device
+# and jams with newtons. MuJoCo keeps the impedance d of a step's beginning through the
+# step: under a dead load the depth r becomes (1 - α) r + α r₀ (r / r₀)^-m about its
+# equilibrium r₀, with α = k d h / (k d h + b) for stiffness k, damping b and time step
+# h, and m = ∂ln(d² / (1 - d)) / ∂ln r. That dies out where α (1 + m) < 2. The barrier
+# above keeps to that up to 0.23 mm, some 0.3 N, and rattles beyond. This one does up to
+# any depth: its end is rounded off, and it is damped six times as much as critically.
+_COAXIAL_TIME = 0.0015  # s
+COAXIAL_SOLREF = (-1 / _COAXIAL_TIME**2, -12 / _COAXIAL_TIME)
+COAXIAL_SOLIMP = (0.3, 0.99, 0.0003, 0.01, 2)
+
 
 def wall_contact(friction: float) -> dict[str, Any]:
     """Attributes of a geom that the device touches as wall; friction is Coulomb's."""
@@ -31,13 +42,27 @@ def device_contact(friction: float) -> dict[str, Any]:
     return {"contype": 0, "conaffinity": 1, **_surface(friction)}
 
 
+def coaxial_contact(friction: float) -> dict[str, Any]:
+    """Attributes of a geom of coaxial devices, whose settings prevail on a wall.
+
+    Args:
+      friction: Coulomb coefficient, whatever that of the wall is.
+    """
+    return {
+        **device_contact(friction),
+        "priority": 1,
+        "solref": COAXIAL_SOLREF,
+        "solimp": COAXIAL_SOLIMP,
+    }
+
+
 def sheath_contact() -> dict[str, Any]:
     """Attributes of a geom of the sheath, frictionless whatever touches it."""
     return {
         "contype": 1,
         "conaffinity": 0,
         # The sheath's settings prevail: one row a contact in place of three.
-        "priority": 1,
+        "priority": 2,
         "condim": 1,
         "solref": CONTACT_SOLREF,
         "solimp": CONTACT_SOLIMP,

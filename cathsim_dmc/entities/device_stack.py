@@ -1,6 +1,7 @@
 """Coaxial devices in the simulation: guidewire, guidewire in catheter, and so on."""
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
@@ -8,7 +9,7 @@ from cathsim_dmc.entities import devices as library
 from cathsim_dmc.entities.arena import BLOOD_DENSITY
 from cathsim_dmc.entities.chain import BENDING_RELAXATION_TIME, Chain
 from cathsim_dmc.entities.coaxial import Stack, weight_density
-from cathsim_dmc.entities.contact import FRICTION
+from cathsim_dmc.entities.contact import FRICTION, coaxial_contact
 from cathsim_dmc.entities.device import Device
 from cathsim_dmc.entities.torsion import Rods
 
@@ -104,6 +105,9 @@ class DeviceStack(Chain):
 
     def _link_mass(self, index: int) -> float:
         return float(self._mass[index])
+
+    def _surface(self, friction: float) -> dict[str, Any]:
+        return coaxial_contact(friction)
 
     def _in_tip(self, index: int) -> bool:
         return bool(self._stack.nodes[index] <= self._devices[0].tip_length + 1e-9)

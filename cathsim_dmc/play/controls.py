@@ -87,11 +87,6 @@ class CoaxialControls:
         action[-2:] += axes["catheter"], axes["catheter_rotation"]
         return np.clip(action, -1.0, 1.0)
 
-    @property
-    def bend(self) -> np.ndarray:
-        """Deflection (2,) of a steerable tip: none."""
-        return np.zeros(2)
-
 
 class _Held:
     """Commands that are held down, and for how long they still count as held."""

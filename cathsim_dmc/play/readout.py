@@ -14,14 +14,34 @@ def lines(task: Any) -> list[tuple[str, str]]:
     state, wall = task.readings, task.wall_force
     distance = float(np.linalg.norm(state.head - task.goal_position))
     return [
-        ("goal", task.goal.name),
-        ("distance", f"{distance * 1e3:5.1f} mm"),
-        ("inserted", f"{float(state.insertion) * 1e3:5.1f} mm"),
+        ("goal", task.scene.goal.name),
+        ("distance", _millimetres(distance)),
+        *_inserted(task),
         ("push force", _newton(state.push_force)),
         ("wall force, sum", _newton(wall.sum)),
         ("largest contact", _newton(wall.max)),
         ("peak in the step", _newton(wall.peak_max)),
     ]
+
+
+def _inserted(task: Any) -> list[tuple[str, str]]:
+    """How far each device is in and, where it is turned at its base, by how much."""
+    devices = task.devices
+    if devices is None:
+        return [("inserted", _millimetres(task.readings.insertion))]
+    rows = []
+    for name, way, angle in zip(
+        task.scene.catheter.device_names,
+        devices.insertion,
+        np.degrees(devices.rotation),
+        strict=True,
+    ):
+        rows += [(name, _millimetres(way)), ("turned", f"{angle:5.0f}°")]
+    return rows
+
+
+def _millimetres(way: float) -> str:
+    return f"{float(way) * 1e3:5.1f} mm"
 
 
 def _newton(force: float) -> str:

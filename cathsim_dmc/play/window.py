@@ -31,6 +31,7 @@ KEYS = {
 _REPEAT = 0.06
 _BAR_FORCE = readout.FORCE_LEVELS[-1][0]  # N at the end of the bar
 _PANEL = 230  # px
+_DIAL = 40  # px, half the size of what shows the bend or a rotation
 
 
 class FluoroscopyWindow:
@@ -161,19 +162,35 @@ class FluoroscopyWindow:
         panel.create_rectangle(
             left, y, left + width, y + 16, fill=readout.colour(force), width=0
         )
-        y += 60
-        # The bend of the tip as a joystick.
-        size, (about_x, about_y) = 40, self._controls.bend
-        middle = _PANEL / 2
-        panel.create_rectangle(
-            middle - size, y, middle + size, y + 2 * size, outline="grey40"
-        )
-        x0, y0 = middle + size * about_y, y + size - size * about_x
-        panel.create_oval(x0 - 5, y0 - 5, x0 + 5, y0 + 5, fill="white")
-        y += 2 * size + 30
+        y += 40
+        if isinstance(self._controls, CoaxialControls):
+            self._draw_rotations(task.devices.rotation, y)
+        else:
+            self._draw_bend(self._controls.bend, y)
+        y += 2 * _DIAL + 20
         panel.create_text(
             left, y, text=message, fill="white", anchor="nw", width=_PANEL - 2 * left
         )
+
+    def _draw_bend(self, bend: np.ndarray, y: float):
+        """The bend (2,) of the tip as a joystick."""
+        middle, (about_x, about_y) = _PANEL / 2, bend
+        self._panel.create_rectangle(
+            middle - _DIAL, y, middle + _DIAL, y + 2 * _DIAL, outline="grey40"
+        )
+        x0, y0 = middle + _DIAL * about_y, y + _DIAL - _DIAL * about_x
+        self._panel.create_oval(x0 - 5, y0 - 5, x0 + 5, y0 + 5, fill="white")
+
+    def _draw_rotations(self, rotation: np.ndarray, y: float):
+        """A dial for the rotary unit of each device (K,), from the innermost on."""
+        size = min(_DIAL, _PANEL / (2 * len(rotation)) - 5)
+        for number, angle in enumerate(rotation.tolist()):
+            middle, level = _PANEL * (number + 0.5) / len(rotation), y + size
+            self._panel.create_oval(
+                middle - size, y, middle + size, y + 2 * size, outline="grey40"
+            )
+            tip = middle + size * np.sin(angle), level - size * np.cos(angle)
+            self._panel.create_line(middle, level, *tip, fill="white")
 
     def close(self) -> None:
         """Closes the window."""

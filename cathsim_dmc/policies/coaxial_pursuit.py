@@ -28,6 +28,7 @@ import numpy as np
 from cathsim_dmc.entities.chain import MAX_PUSH_SPEED, MAX_ROTATION_SPEED
 from cathsim_dmc.entities.device_stack import DeviceStack
 from cathsim_dmc.policies import pursuit
+from cathsim_dmc.policies.attempts import Attempts, advance
 from cathsim_dmc.tasks import forces, navigation
 from cathsim_dmc.tasks.cases import Case
 from cathsim_dmc.tasks.coaxial import CoaxialReadings
@@ -52,9 +53,6 @@ class Settings(pursuit.Settings):
         turning: share of the error of direction that a base is turned by in a control
             step.
         offsets: added to that direction in successive attempts, over and over, rad.
-        slack: what the base may advance while the head does not, m.
-        give: by how much the head may come back while slack is taken up, m.
-        thorough: every so many retries are not content with taking up slack.
     """
 
     lookahead: float = 20e-3
@@ -66,7 +64,7 @@ class Settings(pursuit.Settings):
     progress: float = 0.5e-3
     patience: int = 60
     lost_patience: int = 15
-    leads: tuple[float, ...] = (0.012, 0.03, 0.02, 0.05)
+    leads: tuple[float, ...] = (0.012, -0.03, -0.045, -0.02)
     lead_gain: float = 0.2
     aside: float = 0.2
     turning: float = 0.2
@@ -117,57 +115,14 @@ class Plan:
         )
 
 
-@dataclasses.dataclass(frozen=True)
-class State:
-    """What the expert remembers of each simulation, arrays (N,).
-
-    Attributes:
-        arc_length: of the place on the route at the last step, m; NaN before the
-            first.
-        retracting: bool.
-        taking_up: bool, whether only as long as that takes up slack.
-        turn: insertion to be withdrawn to while retracting, m.
-        best: farthest place on the route in this attempt or this way back, m.
-        held: insertion when the head was there, m.
-        stale: control steps since then.
-        lost: control steps out of the route's tube.
-        attempts: retries so far.
-    """
-
-    arc_length: np.ndarray
-    retracting: np.ndarray
-    taking_up: np.ndarray
-    turn: np.ndarray
-    best: np.ndarray
-    held: np.ndarray
-    stale: np.ndarray
-    lost: np.ndarray
-    attempts: np.ndarray
-
-    @classmethod
-    def fresh(cls, count: int) -> State:
-        """State at the start of N episodes."""
-        return cls(
-            arc_length=np.full(count, np.nan),
-            retracting=np.zeros(count, dtype=bool),
-            taking_up=np.zeros(count, dtype=bool),
-            turn=np.zeros(count),
-            best=np.zeros(count),
-            held=np.zeros(count),
-            stale=np.zeros(count, dtype=int),
-            lost=np.zeros(count, dtype=int),
-            attempts=np.zeros(count, dtype=int),
-        )
-
-
 def decide(
     plan: Plan,
     settings: Settings,
-    state: State,
+    state: Attempts,
     readings: Readings,
     devices: CoaxialReadings,
     wall_force: forces.WallForce,
-) -> tuple[np.ndarray, State]:
+) -> tuple[np.ndarray, Attempts]:
     """One control step of the expert: a pure function.
 
     Args:
@@ -188,7 +143,7 @@ def decide(
     error, away = _directions(plan, readings, devices, place, ahead)
     offsets = np.asarray(settings.offsets)
     error = error + offsets[state.attempts % len(offsets)][:, None]
-    state = _attempt(settings, state, place, readings.insertion)
+    state = advance(settings, state, place, readings.insertion)
     turns = away > settings.aside
     action = np.zeros((len(error), 2 * error.shape[1]))
     rate = settings.turning * np.angle(np.exp(1j * error)) / _TURN
@@ -198,8 +153,8 @@ def decide(
     cosine = np.take_along_axis(looks, leader, axis=1)[:, 0]
     clear = pursuit.ramp(cosine, settings.misaligned, settings.aligned)
     free = pursuit.ramp(wall_force.max, settings.hard_force, settings.soft_force)
-    advance = settings.speed * np.maximum(free * clear, settings.creep)
-    speed = np.where(state.retracting, -settings.speed, advance)
+    forward = settings.speed * np.maximum(free * clear, settings.creep)
+    speed = np.where(state.retracting, -settings.speed, forward)
     deep = np.maximum(place.arc_length - plan.ostium, 0.0)
     action[:, 0::2] = _led(settings, state, devices.insertion, speed, deep)
     return np.clip(action, -1.0, 1.0), state
@@ -207,7 +162,7 @@ def decide(
 
 def _led(
     settings: Settings,
-    state: State,
+    state: Attempts,
     insertion: np.ndarray,
     speed: np.ndarray,
     deep: np.ndarray,
@@ -217,7 +172,8 @@ def _led(
     A head that is deep (N,), m, in the last branch goes on alone from its ostium.
     """
     leads = np.asarray(settings.leads)
-    lead = np.maximum(leads[state.attempts % len(leads)], deep)[:, None]
+    lead = leads[state.attempts % len(leads)]
+    lead = np.where(lead > 0.0, np.maximum(lead, deep), lead)[:, None]
     wanted = insertion[:, :1] - lead * np.arange(insertion.shape[1])
     follow = speed[:, None] + settings.lead_gain * (wanted - insertion) / _MOVE
     # While the wire goes on, the catheter waits for it rather than coming back.
@@ -268,42 +224,3 @@ def _before(frame: np.ndarray, joints: np.ndarray, number: int) -> np.ndarray:
     for joint, axis in ((-2 * number + 1, 1), (-2 * number, 0)):
         frame = pursuit.turned(frame, axis, -joints[:, joint])
     return frame
-
-
-def _attempt(
-    settings: Settings, state: State, place: Place, insertion: np.ndarray
-) -> State:
-    """Counts progress; begins and ends retries."""
-    outside = place.excess > settings.tolerance
-    gained = place.arc_length > state.best + settings.progress
-    idle = gained | state.retracting
-    stale = np.where(idle, 0, state.stale + 1)
-    lost = np.where(outside & ~state.retracting, state.lost + 1, 0)
-    held = np.where(idle, np.minimum(insertion, state.held), state.held)
-    held = np.where(gained, insertion, held)
-    buckled = ~state.retracting & (insertion > held + settings.slack)
-    strayed = lost > settings.lost_patience
-    give_up = (stale > settings.patience) | buckled | strayed
-    attempts = state.attempts + give_up
-    slack = ~strayed & (attempts % settings.thorough != 0)
-    slack = np.where(give_up, slack, state.taking_up)
-    growth = 1 + settings.backoff_growth * (state.attempts % 4)
-    turn = np.where(give_up, insertion - settings.backoff * growth, state.turn)
-    best = np.where(give_up | gained, place.arc_length, state.best)
-    # Taking up slack ends when the head comes back with the shaft.
-    comes_back = slack & ~give_up & (place.arc_length < best - settings.give)
-    back = ((insertion <= turn) | comes_back) & ~outside
-    back = back | (insertion <= pursuit.WITHDRAWN)
-    retracting = (state.retracting | give_up) & ~back
-    again = state.retracting & ~retracting
-    return State(
-        arc_length=place.arc_length,
-        retracting=retracting,
-        taking_up=slack,
-        turn=turn,
-        best=np.where(again, place.arc_length, best),
-        held=np.where(again, insertion, held),
-        stale=np.where(give_up, 0, stale),
-        lost=lost,
-        attempts=attempts,
-    )

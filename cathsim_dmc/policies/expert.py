@@ -12,6 +12,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from cathsim_dmc.policies import coaxial_pursuit
+from cathsim_dmc.policies.attempts import Attempts
 from cathsim_dmc.policies.policy import Policy
 from cathsim_dmc.policies.pursuit import Plan, Settings, State, decide
 from cathsim_dmc.policies.view import View
@@ -21,7 +22,7 @@ from cathsim_dmc.tasks.coaxial import CoaxialReadings
 from cathsim_dmc.tasks.objective_pool import part
 from cathsim_dmc.tasks.readings import Readings
 
-Memory = TypeVar("Memory", State, coaxial_pursuit.State)
+Memory = TypeVar("Memory", State, Attempts)
 
 
 class Expert:
@@ -110,10 +111,10 @@ class CoaxialExpert:
         """Starts without any memory."""
         self._plan = plan
         self._settings = settings or coaxial_pursuit.Settings()
-        self._state: coaxial_pursuit.State | None = None
+        self._state: Attempts | None = None
 
     @property
-    def state(self) -> coaxial_pursuit.State | None:
+    def state(self) -> Attempts | None:
         """What is remembered; None before the first action."""
         return self._state
 
@@ -126,7 +127,7 @@ class CoaxialExpert:
         if which is None or self._state is None:
             self._state = None
             return
-        fresh = coaxial_pursuit.State.fresh(len(self._state.attempts))
+        fresh = Attempts.none(self._state.attempts.shape)
         _forget(self._state, fresh, which)
 
     def act(
@@ -138,7 +139,7 @@ class CoaxialExpert:
         """Action (N, 2 K) in [-1, 1] for the state of the devices."""
         assert devices is not None
         if self._state is None:
-            self._state = coaxial_pursuit.State.fresh(len(readings.head))
+            self._state = Attempts.none((len(readings.head),))
         action, self._state = coaxial_pursuit.decide(
             self._plan, self._settings, self._state, readings, devices, wall_force
         )

@@ -12,10 +12,8 @@ the motors, most to the distal joints. As the device advances, what a joint was 
 moves on to its proximal neighbour, and back again as it is withdrawn (follow the
 leader), so the tip keeps the shape of the way it came.
 
-**Retries.** When the head makes no progress, or has left the tube of the route as in
-a wrong branch, the device is withdrawn until the head is back in the route and then
-tries again, from farther back, with another look-ahead each time, and every other time
-without jumps of its place on the route.
+**Retries** (`attempts`) have another look-ahead each time, and every other time no
+jumps of the head's place on the route.
 """
 
 from __future__ import annotations
@@ -25,17 +23,16 @@ import dataclasses
 import numpy as np
 
 from cathsim_dmc.entities import devices
+from cathsim_dmc.policies import attempts
 from cathsim_dmc.tasks import forces, navigation
 from cathsim_dmc.tasks.cases import Case
 from cathsim_dmc.tasks.readings import Readings
 from cathsim_dmc.tasks.route import Place, Route, RouteLike, along, locate
 
-WITHDRAWN = 2e-3  # m, insertion below which there is nothing left to withdraw
-
 
 @dataclasses.dataclass(frozen=True)
-class Settings:
-    """How the expert drives.
+class Settings(attempts.Settings):
+    """How the expert drives; `attempts.Settings` has when it gives up.
 
     None of the values is critical. The published tasks were solved without a retry
     with 0.5 to 1.6 times the gain or the speed, with 0.75 to 1.4 times the look-ahead,
@@ -57,12 +54,6 @@ class Settings:
             falls from full to creeping.
         soft_force, hard_force: largest contact, N, between which it falls likewise; the
             published forces lie below 0.2 N, with outliers above 0.4 N.
-        progress: m; what the head must gain to count as moving.
-        patience: control steps without progress until a retry.
-        lost_patience: control steps outside the route's tube until a retry.
-        tolerance: by how much of its radius the lumen may exceed the route's tube.
-        backoff: way back of the first retry, m.
-        backoff_growth: of the way back from each retry to the next, up to the fourth.
     """
 
     lookahead: float = 16e-3
@@ -78,12 +69,6 @@ class Settings:
     misaligned: float = 0.5
     soft_force: float = 0.1
     hard_force: float = 0.35
-    progress: float = 0.3e-3
-    patience: int = 40
-    lost_patience: int = 10
-    tolerance: float = 0.25
-    backoff: float = 15e-3
-    backoff_growth: float = 0.5
 
 
 def route_of(task: navigation.Navigation | Case) -> Route:
@@ -180,45 +165,24 @@ class Plan:
 
 
 @dataclasses.dataclass(frozen=True)
-class State:
+class State(attempts.Attempts):
     """What the expert remembers of each simulation, arrays (...).
 
     Attributes:
         bend: (..., M, 2), told to the hinges of the tip, rad.
         insertion: at the last step, m; NaN before the first.
-        arc_length: of the place on the route at the last step, m; NaN before the
-            first.
-        retracting: bool.
-        turn: insertion to be withdrawn to while retracting, m.
-        best: farthest place on the route in this attempt, m.
-        stale: control steps since then.
-        lost: control steps out of the route's tube.
-        attempts: retries so far.
     """
 
     bend: np.ndarray
     insertion: np.ndarray
-    arc_length: np.ndarray
-    retracting: np.ndarray
-    turn: np.ndarray
-    best: np.ndarray
-    stale: np.ndarray
-    lost: np.ndarray
-    attempts: np.ndarray
 
     @classmethod
     def fresh(cls, shape: tuple[int, ...], joints: int) -> State:
         """State at the start of an episode."""
         return cls(
+            **vars(attempts.Attempts.none(shape)),
             bend=np.zeros((*shape, joints, 2)),
             insertion=np.full(shape, np.nan),
-            arc_length=np.full(shape, np.nan),
-            retracting=np.zeros(shape, dtype=bool),
-            turn=np.zeros(shape),
-            best=np.zeros(shape),
-            stale=np.zeros(shape, dtype=int),
-            lost=np.zeros(shape, dtype=int),
-            attempts=np.zeros(shape, dtype=int),
         )
 
 
@@ -271,7 +235,7 @@ def decide(
     bend = _follow_the_leader(plan, state, readings.insertion)
     bend = bend + _correction(settings, axes, turn)
     bend = np.clip(bend, -plan.steering_angle, plan.steering_angle)
-    state = _attempt(settings, state, place, readings.insertion)
+    state = attempts.advance(settings, state, place, readings.insertion)
     free = ramp(wall_force.max, settings.hard_force, settings.soft_force)
     clear = ramp(cosine, settings.misaligned, settings.aligned)
     advance = settings.speed * np.maximum(free * clear, settings.creep)
@@ -280,13 +244,14 @@ def decide(
     motors = plan.tip.size
     action[..., :motors] = (bend / plan.steering_angle).reshape(*translation.shape, -1)
     action[..., motors] = translation
-    return action, dataclasses.replace(state, bend=bend)
+    insertion = np.array(readings.insertion)
+    return action, dataclasses.replace(state, bend=bend, insertion=insertion)
 
 
 def lookahead(
-    plan: RouteLike, settings: Settings, attempts: np.ndarray, place: Place
+    plan: RouteLike, settings: Settings, number: np.ndarray, place: Place
 ) -> np.ndarray:
-    """Way (...) from the place to the point pursued in an attempt (...), m."""
+    """Way (...) from the place to the point pursued in the n-th attempt (...), m."""
     # The lumen that counts is the one to come, or a branch is entered too obliquely.
     coming = place.arc_length + settings.least_lookahead
     radius = np.interp(coming, plan.arc_length, plan.radii)
@@ -294,7 +259,7 @@ def lookahead(
         settings.lookahead_radii * radius, settings.least_lookahead, settings.lookahead
     )
     factors = np.asarray(settings.lookahead_factors)
-    return ahead * factors[attempts % len(factors)]
+    return ahead * factors[number % len(factors)]
 
 
 def _rotation_to(direction: np.ndarray, way: np.ndarray) -> tuple[np.ndarray, ...]:
@@ -325,35 +290,6 @@ def _correction(settings: Settings, axes: np.ndarray, turn: np.ndarray) -> np.nd
     needed = np.einsum("...jai,...i->...ja", axes, turn)
     limit = settings.max_bend_rate
     return np.clip(weight[:, None] * needed, -limit, limit)
-
-
-def _attempt(
-    settings: Settings, state: State, place: Place, insertion: np.ndarray
-) -> State:
-    """Counts progress; begins and ends retries."""
-    outside = place.excess > settings.tolerance
-    gained = place.arc_length > state.best + settings.progress
-    idle = gained | state.retracting
-    stale = np.where(idle, 0, state.stale + 1)
-    lost = np.where(outside & ~state.retracting, state.lost + 1, 0)
-    give_up = (stale > settings.patience) | (lost > settings.lost_patience)
-    growth = 1 + settings.backoff_growth * (state.attempts % 4)
-    turn = np.where(give_up, insertion - settings.backoff * growth, state.turn)
-    back = (insertion <= turn) & ~outside | (insertion <= WITHDRAWN)
-    retracting = (state.retracting | give_up) & ~back
-    again = state.retracting & ~retracting
-    best = np.where(gained, place.arc_length, state.best)
-    return dataclasses.replace(
-        state,
-        insertion=np.array(insertion),
-        arc_length=np.array(place.arc_length),
-        retracting=retracting,
-        turn=turn,
-        best=np.where(again, place.arc_length, best),
-        stale=np.where(give_up, 0, stale),
-        lost=lost,
-        attempts=state.attempts + give_up,
-    )
 
 
 def _matrix(quaternion: np.ndarray) -> np.ndarray:

@@ -14,7 +14,7 @@ from cathsim_dmc.entities.device import Device
 from cathsim_dmc.entities.device_stack import DeviceStack
 from cathsim_dmc.tasks import chain_fields
 from cathsim_dmc.tasks.config import CONTROL_TIMESTEP
-from cathsim_dmc.validation import rod, sliding
+from cathsim_dmc.validation import pressed, rod, sliding
 from cathsim_dmc.validation.checks import Check, Report
 from cathsim_dmc.validation.rig import Rig
 
@@ -305,6 +305,7 @@ def validate_pair(figure_path: str | Path | None = None) -> Report:
     for end in ("sliding", "fixed"):
         checks.append(rod.buckling_check("buckling load of the pair", buckling(end)))
     checks.append(_smoothness())
+    checks += pressed.checks()
     moving = sliding.checks()
     checks += moving.checks
     if figure_path is not None:

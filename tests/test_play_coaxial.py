@@ -1,0 +1,227 @@
+"""Playing coaxial devices by hand: every key from the window to the simulation.
+
+There is no display in these tests: tkinter is replaced by one that presses keys at
+given pictures and remembers what is drawn, everything behind it is the real thing.
+"""
+
+import sys
+import types
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from cathsim_dmc import suite
+from cathsim_dmc.play import controls, play, viewer, window
+from cathsim_dmc.play.controls import COMMANDS, CoaxialControls
+from cathsim_dmc.recording import Episode
+from cathsim_dmc.recording.coaxial import CoaxialRecord
+
+TASK = "simple1_lcca_pair"
+STEP = 0.04
+# Entry of the action of a wire in a catheter, and what it is, by command.
+MEANING = {
+    "up": (0, 1.0),
+    "down": (0, -1.0),
+    "left": (1, 1.0),
+    "right": (1, -1.0),
+    "push": (2, 1.0),
+    "pull": (2, -1.0),
+    "turn_left": (3, 1.0),
+    "turn_right": (3, -1.0),
+}
+
+
+@pytest.mark.parametrize("command", MEANING)
+def test_each_hand_holds_a_device(command):
+    hands = CoaxialControls(2)
+    assert not hands.action(STEP).any()
+    hands.press(command)
+    place, value = MEANING[command]
+    for _ in range(3):
+        np.testing.assert_array_equal(hands.action(STEP), value * np.eye(4)[place])
+    hands.release(command)
+    assert not hands.action(STEP).any()
+    # A press without release lasts for a moment.
+    hands.press(command, hold=2 * STEP)
+    assert [bool(hands.action(STEP).any()) for _ in range(3)] == [True, True, False]
+    hands.press(command)
+    hands.restart()
+    assert not hands.action(STEP).any()
+
+
+def test_of_three_devices_the_hands_hold_the_first_and_the_last():
+    hands = CoaxialControls(3)
+    for command in ("up", "right", "pull", "turn_left"):
+        hands.press(command)
+    np.testing.assert_array_equal(hands.action(STEP), [1, -1, 0, 0, -1, 1])
+
+
+@given(
+    st.integers(1, 3),
+    st.lists(st.tuples(st.sampled_from(COMMANDS), st.booleans()), max_size=40),
+)
+def test_whatever_is_pressed_the_action_is_one(devices, keys):
+    hands = CoaxialControls(devices)
+    for command, down in keys:
+        (hands.press if down else hands.release)(command)
+        action = hands.action(STEP)
+        assert action.shape == (2 * devices,) and np.abs(action).max() <= 1.0
+    assert hands.requested in (None, "restart", "quit")
+    with pytest.raises(ValueError, match="push, pull"):
+        hands.press("jump")
+
+
+class Screen(types.ModuleType):
+    """What `window` needs of tkinter, with keys that come by the number of pictures.
+
+    Attributes:
+      keys: (picture, "KeyPress" or "KeyRelease", name of a key) to come.
+      pictures: shown so far.
+      texts: drawn since the panel was last cleared.
+      lines: likewise, ends of lines.
+      said: texts of labels.
+    """
+
+    TclError = RuntimeError
+
+    def __init__(self, keys):
+        super().__init__("tkinter")
+        self.keys = sorted(keys)
+        self.pictures = 0
+        self.texts, self.lines, self.said = [], [], []
+        self.bound = {}
+        self.Tk = lambda **_: Widget(self)
+        self.Canvas = self._canvas
+        self.Label = self._label
+        self.PhotoImage = self._picture
+
+    def _canvas(self, *_, **options):
+        # The panel is black, the screen is not.
+        return Panel(self) if "background" in options else Widget(self)
+
+    def _label(self, *_, text, **__):
+        self.said.append(text)
+        return Widget(self)
+
+    def _picture(self, *, data, **_):
+        assert data.startswith(b"P5 512 512 255 ")
+        return data
+
+    def deliver(self):
+        while self.keys and self.keys[0][0] <= self.pictures:
+            _, kind, name = self.keys.pop(0)
+            self.bound[f"<{kind}>"](types.SimpleNamespace(keysym=name))
+
+
+class Widget:
+    def __init__(self, screen):
+        self.screen = screen
+
+    def bind(self, event, handler):
+        self.screen.bound[event] = handler
+
+    def update(self):
+        self.screen.deliver()
+
+    def create_image(self, *_, **__):
+        self.screen.pictures += 1
+
+    def __getattr__(self, name):
+        return lambda *_, **__: None
+
+
+class Panel(Widget):
+    def delete(self, *_):
+        self.screen.texts, self.screen.lines = [], []
+
+    def create_text(self, *_, text, **__):
+        self.screen.texts.append(text)
+
+    def create_line(self, x0, y0, x1, y1, **_):
+        self.screen.lines.append((x1 - x0, y1 - y0))
+
+
+def held(key, first, last):
+    return [(first, "KeyPress", key), (last, "KeyRelease", key)]
+
+
+def test_an_operator_moves_wire_and_catheter_in_the_window(monkeypatch, tmp_path):
+    keys = [
+        *held("Up", 2, 12),  # wire forward
+        *held("w", 6, 16),  # and catheter
+        *held("Left", 18, 28),  # wire turned
+        *held("d", 20, 26),  # catheter turned the other way
+        *held("s", 30, 34),
+        *held("Down", 32, 36),
+        (40, "KeyPress", "r"),  # the next episode
+        *held("A", 44, 48),  # with caps lock
+        (50, "KeyPress", "Escape"),
+    ]
+    screen = Screen(keys)
+    monkeypatch.setitem(sys.modules, "tkinter", screen)
+    monkeypatch.setattr(window, "_REPEAT", 0.0)
+    written = play(TASK, out=tmp_path, seed=4, speed=1e3)
+    assert screen.said == [controls.COAXIAL_HELP]
+    first, second = (Episode.load(path) for path in written)
+    devices = [CoaxialRecord.of(episode) for episode in (first, second)]
+
+    def pressed(entry):
+        """Control steps of the first episode in which it was asked for, and its sign.
+
+        The action after the n-th picture is that of control step n - 1.
+        """
+        steps = np.flatnonzero(first.action[:, entry])
+        return steps + 1, np.unique(first.action[steps, entry])
+
+    for entry, (start, stop), sign in (
+        (1, (18, 28), 1.0),
+        (3, (20, 26), -1.0),
+    ):
+        steps, signs = pressed(entry)
+        assert signs == [sign]
+        assert abs(steps[0] - start) <= 1 and abs(steps[-1] + 1 - stop) <= 2
+        assert (np.diff(steps) == 1).all()
+    assert set(first.action[:17, 0]) == set(first.action[:17, 2]) == {0.0, 1.0}
+    assert set(first.action[28:, 0]) == set(first.action[28:, 2]) == {0.0, -1.0}
+    # The devices did as they were told: 1.6 mm and 7.2 degrees in a control step.
+    way = np.cumsum(first.action[:, [0, 2]], axis=0)[-1] * 1.6e-3
+    moved = devices[0].insertion[-1] - devices[0].insertion[0]
+    np.testing.assert_allclose(moved, way, atol=1e-3)
+    turned = devices[0].rotation[-1]
+    expected = first.action[:, [1, 3]].sum(axis=0) * 3.14 * STEP
+    np.testing.assert_allclose(turned, expected, atol=1e-9)
+    assert second.action[:, 3].max() == 1.0 and not second.action[:, :3].any()
+    assert (first.seed, second.seed) == (4, 5)
+    # What is read beside the picture, at the last one shown.
+    assert {"guidewire", "catheter"} <= set(screen.texts)
+    assert screen.texts.count("turned") == 2
+    (wire_x, _), (catheter_x, catheter_y) = screen.lines
+    assert wire_x == 0.0
+    angle = devices[1].rotation[-1, 1]
+    size = np.hypot(catheter_x, catheter_y)
+    assert catheter_x == pytest.approx(size * np.sin(angle), abs=0.13 * size)
+
+
+@pytest.fixture(scope="module")
+def environment():
+    env = suite.load("cathsim", TASK, {"random": 3, "observation": "tracking"})
+    yield env
+    env.close()
+
+
+@pytest.mark.parametrize("code", [c for c, k in viewer.KEYS.items() if k in MEANING])
+def test_every_key_of_the_mujoco_viewer_moves_its_device(environment, code):
+    hands = CoaxialControls(2)
+    face = viewer.MujocoViewer(environment.task, hands)
+    face._key(code)
+    assert not hands.action(STEP).any()
+    face.poll()
+    place, value = MEANING[viewer.KEYS[code]]
+    np.testing.assert_array_equal(hands.action(STEP), value * np.eye(4)[place])
+
+
+def test_both_faces_have_a_key_for_every_motion():
+    assert set(MEANING) <= set(window.KEYS.values())
+    assert set(MEANING) <= set(viewer.KEYS.values())
