@@ -1,3 +1,4 @@
+import io
 import json
 
 import numpy as np
@@ -7,7 +8,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from cathsim_dmc.agents import compare, evaluate
+from cathsim_dmc.agents import compare, evaluate, progress
 from cathsim_dmc.agents.evaluation import paired_bootstrap
 from cathsim_dmc.agents.report import Report
 from cathsim_dmc.analysis.intervals import success_interval
@@ -159,3 +160,13 @@ def test_the_table_says_which_force_is_which(capsys, monkeypatch):
     mean, deviation = result.mean_sd("forces.sum.mean")
     assert mean > 0.1
     assert f"│ {1e3 * mean:.0f} ± {1e3 * deviation:.0f}" in text
+
+
+def test_what_takes_long_says_so_now_and_then(monkeypatch):
+    stream, running = io.StringIO(), np.array([True, False, True])
+    alive = progress.SignOfLife("expert", stream)
+    alive(None, running)
+    assert stream.getvalue() == ""
+    monkeypatch.setattr(progress, "LINE_INTERVAL", 0.0)
+    alive(None, running)
+    assert stream.getvalue() == "expert: 2 control steps, 2 of 3 episodes still run\n"

@@ -3,7 +3,9 @@
 import sys
 import time
 from collections.abc import Mapping
-from typing import TextIO
+from typing import Any, TextIO
+
+import numpy as np
 
 # Seconds between two lines where there is no terminal to redraw.
 LINE_INTERVAL = 15.0
@@ -101,6 +103,35 @@ class Progress:
             self.label, total=self.total, completed=self.start, figures=""
         )
         self.bar.start()
+
+
+class SignOfLife:
+    """A line now and then on standard error while episodes are played side by side.
+
+    An observer of `evaluation.evaluate`.
+
+    Args:
+        label: Name of what plays.
+        stream: Where to write; standard error by default.
+    """
+
+    def __init__(self, label: str, stream: TextIO | None = None):
+        self.label = label
+        self.stream = sys.stderr if stream is None else stream
+        self.steps, self.last_line = 0, time.monotonic()
+
+    def __call__(self, env: Any, running: np.ndarray) -> None:
+        """Count a control step of the episodes (n,) bool that still run."""
+        self.steps += 1
+        if time.monotonic() - self.last_line < LINE_INTERVAL:
+            return
+        self.last_line = time.monotonic()
+        print(
+            f"{self.label}: {self.steps} control steps, {np.count_nonzero(running)} of "
+            f"{len(running)} episodes still run",
+            file=self.stream,
+            flush=True,
+        )
 
 
 def _clock(seconds: float) -> str:

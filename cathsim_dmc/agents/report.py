@@ -11,6 +11,7 @@ from torchrl.envs import EnvBase
 
 from cathsim_dmc import bounds, files, suite
 from cathsim_dmc.agents import evaluation, policies
+from cathsim_dmc.agents.progress import SignOfLife
 from cathsim_dmc.analysis import heatmap
 from cathsim_dmc.analysis.force_statistics import millinewtons
 from cathsim_dmc.pictures.animation import SUFFIXES, animate, check_film
@@ -144,6 +145,8 @@ def evaluate(
 ) -> Report:
     """Evaluates a policy; writes its files into a directory.
 
+    What takes long says so on standard error now and then.
+
     Args:
         policy: Policy, or what names one, see `policies.load_policy`.
         task: Name of the task; None takes the one that the policy was trained on.
@@ -164,7 +167,13 @@ def evaluate(
     if out_dir is not None:
         # Now: an evaluation that cannot be written would be lost.
         Path(out_dir).mkdir(parents=True, exist_ok=True)
-    contacts = ContactLog()
+    contacts, alive = ContactLog(), SignOfLife(player.name)
+
+    def observe(env: EnvBase, running: np.ndarray) -> None:
+        alive(env, running)
+        if backend == "batched":
+            contacts(env, running)
+
     result = evaluation.evaluate(
         policy,
         task,
@@ -173,7 +182,7 @@ def evaluate(
         task_kwargs=task_kwargs,
         backend=backend,
         num_threads=num_threads,
-        observer=contacts if backend == "batched" else None,
+        observer=observe,
     )
     other = comparison = None
     if baseline and str(policy) != "random":
@@ -185,6 +194,7 @@ def evaluate(
             task_kwargs=result.settings["task_kwargs"],
             backend=backend,
             num_threads=num_threads,
+            observer=SignOfLife("random"),
         )
         comparison = evaluation.compare(result, other)
     report = Report(result, other, comparison, time.monotonic() - start)

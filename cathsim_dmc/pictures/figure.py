@@ -50,6 +50,11 @@ FLUOROSCOPY = FluoroscopyOptions(size=400, magnification=1.3)
 # Percentiles of an image that are shown as black and white.
 WINDOW = (0.02, 99.5)
 _HEIGHT_IN = 6.0
+# A scan that lies is wider than high: its figure is no wider than this and less high,
+# apart from titles, axes and caption.
+_WIDEST_IN, _LETTERING_IN = 16.0, 1.2
+# Shaft of an arrow.
+_ARROW_WIDTH_IN = 0.037
 # The palette of a notebook's picture is refined until no more pixels than these
 # change their colour.
 _SETTLED_PIXELS = 1_000
@@ -124,11 +129,10 @@ def scene_figure(
         raise ValueError(f"views are {views!r}; give some of {', '.join(VIEWS)}")
     drawn = [background(snapshot.surface, VIEWS[v][0], pixels) for v in views]
     ratios = [p.shape[1] / p.shape[0] for p, _ in drawn] + [1.0] * fluoroscopy
-    figure = Picture(
-        figsize=(_HEIGHT_IN * 0.84 * sum(ratios) + 1.6, _HEIGHT_IN),
-        dpi=120,
-        layout="constrained",
-    )
+    size = _HEIGHT_IN * 0.84 * sum(ratios) + 1.6, _HEIGHT_IN
+    if size[0] > _WIDEST_IN:
+        size = _WIDEST_IN, (_WIDEST_IN - 1.6) / sum(ratios) + _LETTERING_IN
+    figure = Picture(figsize=size, dpi=120, layout="constrained")
     panels = figure.subplots(1, len(ratios), width_ratios=ratios, squeeze=False)[0]
     for panel, view, (projection, picture) in zip(
         panels[: len(views)], views, drawn, strict=True
@@ -243,8 +247,8 @@ def _draw_forces(axes: Any, snapshot: Snapshot, projection: Projection) -> None:
     along = projection.flat_mm(unit) / 1e3 * length[:, None]
     axes.quiver(
         *place[strong].T, *along[strong].T, color=colours[strong], angles="xy",
-        scale_units="xy", scale=1, width=0.012, edgecolor="0.15", linewidth=0.4,
-        zorder=8,
+        scale_units="xy", scale=1, units="inches", width=_ARROW_WIDTH_IN,
+        edgecolor="0.15", linewidth=0.4, zorder=8,
     )  # fmt: skip
     top = int(magnitude.argmax())
     axes.annotate(

@@ -24,7 +24,7 @@ TRAIL_RADIUS = 0.25e-3
 HEAD_SCALE = 1.8
 # Of the text at the largest force of a step: legible where the viewer is light and
 # where it is dark, as the colours of forces are not. Its point is not to be seen.
-LABEL_COLOUR, LABEL_RADIUS = (213, 94, 0), 1e-5
+LABEL_COLOUR, LABEL_RADIUS = (186, 58, 0), 1e-5
 
 SHAFT_COLOUR = (215, 228, 255)
 HEAD_COLOUR = (255, 200, 0)

@@ -13,11 +13,14 @@ from cathsim_dmc.entities import devices
 from cathsim_dmc.entities.chain import BENDING_RELAXATION_TIME, MAX_ROTATION_SPEED
 from cathsim_dmc.validation import theory
 from cathsim_dmc.validation.checks import Check, Report
-from cathsim_dmc.validation.rig import Rig
+from cathsim_dmc.validation.rig import REST_CHANGE, Rig
 
 CANTILEVER_BOUND = 2.0  # % of the deflection
 BUCKLING_BOUND = 5.0  # % of the load
 TWIST_BOUND = 2.0  # % of the angle
+# Rest of a joint where every device of the library is bent, rad. The softest of them,
+# the microcatheter, never moves less: its head wanders by 0.1 % of the deflection.
+LIBRARY_REST = 1e-4
 END_ANGLES = (2.0, 15.0, 30.0, 45.0, 60.0)  # degrees
 # Fractions of the load of Euler at which the Southwell plot is taken.
 SOUTHWELL_FRACTIONS = (0.5, 0.6, 0.7, 0.8, 0.9)
@@ -61,6 +64,7 @@ def cantilevers(
     *,
     plane: float = np.pi / 4,
     discretisation: devices.Discretisation | None = None,
+    rest_change: float = REST_CHANGE,
 ) -> list[Cantilever]:
     """Loads the end of a straight device across and compares it with the elastica.
 
@@ -70,11 +74,12 @@ def cantilevers(
         plane: direction of the force about the axis, rad. π/4 bends both hinges of
             every joint.
         discretisation: default of the tasks if None.
+        rest_change: of every joint over one relaxation time at rest, rad and m.
     """
     rig = Rig(straight(device), discretisation)
     rig.compile()
     lengths, bending, _ = rig.sections
-    return bent(rig, lengths, bending, end_angles, plane)
+    return bent(rig, lengths, bending, end_angles, plane, rest_change)
 
 
 def bent(
@@ -83,6 +88,7 @@ def bent(
     bending: np.ndarray,
     end_angles: Sequence[float],
     plane: float = np.pi / 4,
+    rest_change: float = REST_CHANGE,
 ) -> list[Cantilever]:
     """Loads the end of a straight chain across and compares it with the elastica.
 
@@ -92,6 +98,7 @@ def bent(
         bending: (S,) their EI, N·m².
         end_angles: of the elastica's end, degrees; they set the forces.
         plane: direction of the force about the axis, rad.
+        rest_change: of every joint over one relaxation time at rest, rad and m.
     """
     across = np.array([np.cos(plane), np.sin(plane), 0.0])
     total = float(np.sum(lengths))
@@ -100,7 +107,7 @@ def bent(
     results = []
     for degrees in end_angles:
         shape = theory.elastica(lengths, bending, np.radians(degrees))
-        rig.settle(shape.force * across)
+        rig.settle(shape.force * across, rest_change=rest_change)
         moved = rig.head_position - unloaded
         expected = shape.position[-1] - (total, 0.0)
         simulated = np.array([moved[2], moved @ across])
@@ -385,7 +392,8 @@ def validate_rod(figure_path: str | Path | None = None) -> Report:
             )
         )
     worst = max(
-        ((cantilevers(name, (45.0,))[0].deviation, name) for name in devices.DEVICES),
+        (cantilevers(name, (45.0,), rest_change=LIBRARY_REST)[0].deviation, name)
+        for name in devices.DEVICES
     )
     checks.append(
         Check.at_most(

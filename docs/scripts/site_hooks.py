@@ -99,6 +99,8 @@ def _notebook(path: Path) -> dict[str, str | bytes]:
     exporter = MarkdownExporter()
     text, resources = exporter.from_notebook_node(notebook)
     text = re.sub(r"<style.*?</style>", "", text, flags=re.DOTALL)
+    # Between two outputs of a cell, which Markdown would take for one with a gap in it.
+    text = re.sub(r"(?m)(^    .*\n)\n{3,}(?=    )", r"\1\n<!-- -->\n\n", text)
     pages: dict[str, str | bytes] = {}
     for name, content in resources.get("outputs", {}).items():
         picture = f"{path.stem}_{name}"

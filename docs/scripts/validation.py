@@ -1,6 +1,8 @@
-"""Runs all validations and rewrites the tables and figures of docs/validation.md.
+"""Runs the validations and rewrites the tables and figures of docs/validation.md.
 
-``python docs/scripts/validation.py [--phantom DIRECTORY ...] [--machine TEXT]``
+``python docs/scripts/validation.py [rod] [wall] [forces] [--phantom DIRECTORY ...]``
+
+Each part is written, with its date, as soon as it has ended.
 """
 
 import argparse
@@ -12,12 +14,12 @@ import time
 
 from rich.console import Console
 
-from cathsim_dmc import validation
+from cathsim_dmc import files, validation
 
 DOCS = pathlib.Path(__file__).parents[1]
 PAGE = DOCS / "validation.md"
 IMAGES = DOCS / "images"
-MACHINE = "2 cores of an AMD EPYC server"
+MACHINE = "2 shared cores of an Intel Xeon server"
 
 
 def between(text: str, name: str, content: str) -> str:
@@ -66,8 +68,21 @@ def convergence(report) -> str:
     return "\n".join(rows) + "\n"
 
 
+def write(name: str, report, machine: str) -> None:
+    """Put a report and its date into the page."""
+    text = PAGE.read_text(encoding="utf-8")
+    text = between(text, name, report.markdown())
+    text = between(text, f"{name} findings", findings(report))
+    if name == "wall":
+        text = between(text, "convergence", convergence(report))
+    when = f"Measured on {datetime.date.today().isoformat()}, {machine}.\n"
+    text = between(text, f"{name} when", when)
+    files.write_text(PAGE, text)
+
+
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("parts", nargs="*", metavar="rod|wall|forces")
     parser.add_argument("--phantom", action="append", default=[])
     parser.add_argument("--machine", default=MACHINE)
     parser.add_argument("--json", type=pathlib.Path, help="also write the reports here")
@@ -77,19 +92,17 @@ def main() -> int:
         "wall": lambda figure: validation.validate_wall(figure, arguments.phantom),
         "forces": validation.validate_forces,
     }
-    text, reports = PAGE.read_text(encoding="utf-8"), {}
-    for name, run in runs.items():
+    chosen = arguments.parts or list(runs)
+    if unknown := set(chosen) - set(runs):
+        parser.error(f"no part is called {', '.join(unknown)}; give some of {[*runs]}")
+    reports = {}
+    for name in chosen:
         start = time.time()
-        report = run(IMAGES / f"validation_{name}.png")
+        report = runs[name](IMAGES / f"validation_{name}.png")
         Console().print(report.table())
-        print(f"{name}: {time.time() - start:.0f} s")
-        text = between(text, name, report.markdown())
-        text = between(text, f"{name} findings", findings(report))
+        print(f"{name}: {time.time() - start:.0f} s", flush=True)
+        write(name, report, arguments.machine)
         reports[name] = report
-    text = between(text, "convergence", convergence(reports["wall"]))
-    today = datetime.date.today().isoformat()
-    text = between(text, "when", f"Measured on {today}, {arguments.machine}.\n")
-    PAGE.write_text(text, encoding="utf-8")
     if arguments.json:
         everything = {name: report.as_dict() for name, report in reports.items()}
         arguments.json.write_text(json.dumps(everything, indent=1), encoding="utf-8")
