@@ -12,13 +12,13 @@ Twist reaches the end late and in leaps, so it is the rotation of the end that c
 of the attempt. Far ahead the wire is limp and follows the vessel; close ahead its bend
 and the catheter's add up to a sharper one.
 
-**Or the catheter alone.** Into a take-off that turns back on the way there, a wire leads
-badly: its shaft, the stiffer one, comes to lie in the bend. With a negative lead the wire
-stays behind in the catheter, whose soft end takes its shape, hooks the branch and goes
-up; the wire holds the shaft in the aorta straight.
+**Or the catheter alone.** Into a take-off that turns back on the way there, a wire
+leads badly: its shaft, the stiffer one, comes to lie in the bend. With a negative lead
+the wire stays behind in the catheter, whose soft end takes its shape, hooks the branch
+and goes up; the wire holds the shaft in the aorta straight.
 
-**Retries** (`attempts`) have another lead, look-ahead and direction, and every other time
-no jumps of the head's place on the route.
+**Retries** (`attempts`) have another lead, look-ahead and direction, and every other
+time no jumps of the head's place on the route.
 """
 
 from __future__ import annotations
