@@ -3,7 +3,8 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 WORKERS ?= 2
-PIP := PIP_DISABLE_PIP_VERSION_CHECK=1 $(BIN)/python -m pip install --quiet --constraint constraints.txt
+# Not quiet: some of the packages are large, and minutes without a word look like a hang.
+PIP := PIP_DISABLE_PIP_VERSION_CHECK=1 $(BIN)/python -m pip install --constraint constraints.txt
 # MuJoCo looks for OpenGL at import; nothing here draws with it.
 export MUJOCO_GL ?= disable
 
@@ -43,7 +44,7 @@ compatibility:
 dist: $(VENV)/.installed
 	rm -rf dist build/wheel build/empty
 	$(PYTHON) -m venv build/empty
-	$(PIP) wheel --no-deps --wheel-dir dist . 2>/dev/null || $(BIN)/python -m pip wheel --quiet --no-deps --wheel-dir dist .
+	PIP_DISABLE_PIP_VERSION_CHECK=1 $(BIN)/python -m pip wheel --quiet --no-deps --wheel-dir dist .
 	PIP_DISABLE_PIP_VERSION_CHECK=1 build/empty/bin/python -m pip install --quiet --constraint constraints.txt dist/*.whl
 	cd build && empty/bin/python ../tools/smoke.py --installed
 
@@ -55,16 +56,16 @@ lint: $(VENV)/.installed-test
 $(VENV)/.created:
 	@$(PYTHON) -c 'import sys; v = sys.version_info[:2]; sys.exit(0 if v >= (3, 11) else f"cathsim needs Python 3.11 or newer, but $(PYTHON) is {v[0]}.{v[1]}; set PYTHON=python3.11")'
 	$(PYTHON) -m venv $(VENV)
-	touch $@
+	@touch $@
 
 $(VENV)/.installed: pyproject.toml constraints.txt $(VENV)/.created
-	@echo "Installing (about a minute, once)"
-	$(PIP) --editable .
-	touch $@
+	@echo "Installing some 70 packages into $(VENV), once: one minute to ten"
+	@$(PIP) --editable .
+	@touch $@
 
 $(VENV)/.installed-test: $(VENV)/.installed
-	$(PIP) --editable '.[test]'
-	touch $@
+	@$(PIP) --editable '.[test]'
+	@touch $@
 
 docs: $(VENV)/.installed-docs
 	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict
@@ -75,8 +76,8 @@ site: docs
 	$(BIN)/python docs/scripts/browser.py
 
 $(VENV)/.installed-docs: $(VENV)/.installed
-	$(PIP) --editable '.[docs]'
-	touch $@
+	@$(PIP) --editable '.[docs]'
+	@touch $@
 
 clean:
 	rm -rf $(VENV) build *.egg-info

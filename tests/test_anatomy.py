@@ -5,8 +5,9 @@ import json
 import numpy as np
 import pytest
 
-from cathsim_dmc.anatomy.anatomy import Anatomy, Goal, Inlet, Surface
+from cathsim_dmc.anatomy.anatomy import Anatomy
 from cathsim_dmc.anatomy.arch import arch
+from cathsim_dmc.anatomy.parts import Goal, Inlet, Surface
 
 
 @pytest.fixture(scope="module")

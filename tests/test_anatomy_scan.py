@@ -14,8 +14,9 @@ import pytest
 from scipy.spatial import ConvexHull, cKDTree
 from synthetic_scans import marched, read_mesh, write_markup, write_obj, y_tree
 
-from cathsim_dmc.anatomy.anatomy import Anatomy, Inlet, Surface
+from cathsim_dmc.anatomy.anatomy import Anatomy
 from cathsim_dmc.anatomy.centreline import Centreline, Vessel, VesselTree
+from cathsim_dmc.anatomy.parts import Inlet, Surface
 from cathsim_dmc.anatomy.scan import coacd_wall as scan_coacd
 from cathsim_dmc.anatomy.scan.curves import read_curve, vessel_name
 from cathsim_dmc.anatomy.scan.importer import import_scan

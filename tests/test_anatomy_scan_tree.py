@@ -8,8 +8,10 @@ import numpy as np
 import pytest
 from synthetic_scans import marched, write_markup, write_obj, y_tree
 
-from cathsim_dmc.anatomy.anatomy import Anatomy, Goal
+from cathsim_dmc.anatomy import phantoms
+from cathsim_dmc.anatomy.anatomy import Anatomy
 from cathsim_dmc.anatomy.centreline import Centreline, Vessel, VesselTree
+from cathsim_dmc.anatomy.parts import Goal
 from cathsim_dmc.anatomy.scan import importer
 from cathsim_dmc.anatomy.scan.check import check_tree
 from cathsim_dmc.anatomy.scan.importer import import_scan
@@ -82,10 +84,18 @@ def along(tree, name, start=0.0, end=None):
     )
 
 
-def test_computed_branches_get_their_anatomical_names(arch_scan):
-    mesh, tree = arch_scan
+@pytest.fixture(scope="module")
+def computed(arch_scan):
+    """The anatomy of the scan, its centrelines computed, and what was noted."""
     notes = []
-    anatomy = import_scan(mesh, spacing=1e-3, notes=notes)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(importer, "build_wall", lambda *a, **k: ((BOX,), None))
+        return import_scan(arch_scan[0], spacing=1e-3, notes=notes), notes
+
+
+def test_computed_branches_get_their_anatomical_names(arch_scan, computed):
+    tree = arch_scan[1]
+    anatomy, notes = computed
     assert set(anatomy.tree.vessels) == {"aorta", "bca", "rcca", "rsa", "lcca", "lsa"}
     parents = {k: v.parent for k, v in anatomy.tree.vessels.items()}
     assert parents["lcca"] == parents["lsa"] == parents["bca"] == "aorta"
@@ -227,13 +237,6 @@ def test_a_lumen_thinner_than_the_device_is_refused(tmp_path):
     assert "\n" not in str(error.value)
 
 
-@pytest.fixture(scope="module")
-def good(arch_scan):
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(importer, "build_wall", lambda *a, **k: ((BOX,), None))
-        return import_scan(arch_scan[0], spacing=1e-3)
-
-
 def changed(anatomy: Anatomy, tree=None, goals=None) -> Anatomy:
     return Anatomy(
         name=anatomy.name,
@@ -247,8 +250,9 @@ def changed(anatomy: Anatomy, tree=None, goals=None) -> Anatomy:
     )
 
 
-def test_the_proof_finds_each_fault(good):
+def test_the_proof_finds_each_fault(computed):
     """What `check_tree` is to find, planted in a tree that passes."""
+    good, _ = computed
     assert failed(good) == {}
     vessels = dict(good.tree.vessels)
     lcca, lsa = vessels["lcca"], vessels["lsa"]
@@ -270,6 +274,30 @@ def test_the_proof_finds_each_fault(good):
     short = Vessel("lcca", lcca.centreline.slice(0.0, 0.06), "aorta", lcca.ostium)
     found = failed(changed(good, VesselTree({**vessels, "lcca": short}), {}))
     assert "its lumen goes on" in found["vessels end at ends of the surface"]
+    # Branches named from the wrong end of the aorta.
+    swapped = {"bca": "lsa", "lsa": "bca"}
+    tree = VesselTree(
+        {
+            (name := swapped.get(key, key)): Vessel(
+                name,
+                vessel.centreline,
+                swapped.get(vessel.parent, vessel.parent),
+                vessel.ostium,
+            )
+            for key, vessel in vessels.items()
+        }
+    )
+    found = failed(changed(good, tree, {}))
+    assert "to the right" in found["branches of the arch on their sides"]
+    # Neighbours that changed places.
+    swapped = {"bca": "lcca", "lcca": "bca"}
+    order = {
+        key: Vessel(key, v.centreline, v.parent, v.ostium) for key, v in vessels.items()
+    }
+    for old, new in swapped.items():
+        order[new] = Vessel(new, vessels[old].centreline, "aorta", vessels[old].ostium)
+    found = failed(changed(good, VesselTree(order), {}))
+    assert "in this order" in found["branches of the arch on their sides"]
     # A goal that lies in another vessel.
     goal = good.goals["lsa"]
     wrong = Goal("lcca", "lcca", goal.position, good.goals["lcca"].arc_length)
@@ -280,6 +308,26 @@ def test_the_proof_finds_each_fault(good):
     vessels.pop("lcca")
     found = failed(changed(good, VesselTree({**vessels, "lcca": adrift}), {}))
     assert "outside of it" in found["branches on their parents"]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["type1", "type2"])
+def test_the_surface_of_a_phantom_is_a_scan(name, tmp_path):
+    """Narrow ends; and at the heart, `type2` is narrower than at its other end."""
+    phantom = phantoms.load(name, access="descending")
+    surface = phantom.surface
+    mesh = write_obj(tmp_path / "lumen.obj", surface.vertices * 1e3, surface.faces)
+    anatomy = import_scan(mesh)
+    gap = np.linalg.norm(anatomy.inlet.position - phantom.inlet.position)
+    assert gap < 40e-3
+    for vessel in ("bca", "lcca", "lsa"):
+        line = anatomy.tree.vessel(vessel).centreline
+        own = line.points[line.arc_length > anatomy.tree.vessel(vessel).ostium]
+        others = {
+            key: np.median(other.centreline.project(own).distance)
+            for key, other in phantom.tree.vessels.items()
+        }
+        assert min(others, key=others.get).split("_")[0] == vessel, others
 
 
 @pytest.mark.slow

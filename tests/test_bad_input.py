@@ -14,9 +14,9 @@ from recording_samples import make_episode
 import cathsim_dmc.gym  # noqa: F401  registers the ids
 from cathsim_dmc import suite
 from cathsim_dmc.agents import learners
-from cathsim_dmc.anatomy.anatomy import Goal, Inlet, Surface
 from cathsim_dmc.anatomy.arch import arch
 from cathsim_dmc.anatomy.centreline import Centreline
+from cathsim_dmc.anatomy.parts import Goal, Inlet, Surface
 from cathsim_dmc.anatomy.scan.importer import import_scan
 from cathsim_dmc.entities import devices
 from cathsim_dmc.imaging.options import FluoroscopyOptions

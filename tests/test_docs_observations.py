@@ -9,6 +9,7 @@ import pytest
 from cathsim_dmc import suite
 from cathsim_dmc.tasks import observations
 from cathsim_dmc.tasks.cameras import CAMERAS, CameraOptions
+from cathsim_dmc.tasks.observation_kind import ImageOptions
 
 SCRIPT = Path(__file__).parents[1] / "docs" / "scripts" / "observations.py"
 
@@ -43,12 +44,12 @@ def test_the_table_names_what_the_functions_return(environment, monkeypatch):
     frame = frames[-1]
     for name in NAMES:
         returned = observations.OBSERVATIONS[name].observe(frame)
-        listed = observations.entry_specs([name], observations.ImageOptions())
+        listed = observations.entry_specs([name], ImageOptions())
         assert list(returned) == list(listed)
 
 
 def test_cameras_have_an_entry_each():
-    options = observations.ImageOptions(cameras=CameraOptions(names=CAMERAS))
+    options = ImageOptions(cameras=CameraOptions(names=CAMERAS))
     for kind in ("rgb", "depth"):
         keys = observations.entry_specs([kind], options)
         assert list(keys) == [f"{kind}_{name}" for name in CAMERAS]

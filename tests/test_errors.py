@@ -8,8 +8,8 @@ from conftest import TASKS
 from dm_control.composer.variation import distributions
 
 from cathsim_dmc import suite
-from cathsim_dmc.anatomy.anatomy import Goal
 from cathsim_dmc.anatomy.arch import arch
+from cathsim_dmc.anatomy.parts import Goal
 from cathsim_dmc.anatomy.scan.importer import import_scan
 from cathsim_dmc.entities import devices
 from cathsim_dmc.simulation.batch import BatchSimulation

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from cathsim_dmc import suite
-from cathsim_dmc.anatomy.anatomy import Goal
 from cathsim_dmc.anatomy.arch import arch
+from cathsim_dmc.anatomy.parts import Goal
 from cathsim_dmc.simulation.batch import BatchSimulation
 
 SIMULATIONS = 3

@@ -146,6 +146,7 @@ def test_every_entity_lives_on_both_timelines_at_the_right_rows(written):
         "/world/catheter/trail": steps,
         "/world/robot/wheel": states,
         "/world/contacts": steps,
+        "/world/contacts/largest": steps,
         "/world/heat": steps,
         "/fluoroscopy": states,
         "/series/reward": steps,
@@ -194,6 +195,23 @@ def test_arrows_show_the_contacts_of_their_step_only(written):
     np.testing.assert_allclose(
         np.concatenate([o for o in origins if o]), episode.contact_position, atol=1e-6
     )
+
+
+def test_the_largest_force_of_a_step_is_written_at_the_end_of_its_arrow(written):
+    episode, _, _, recording = written
+    entity = "/world/contacts/largest"
+    places = recording.values(entity, "Points3D:positions")
+    labels = recording.values(entity, "Points3D:labels")
+    for step in range(STEPS):
+        rows = np.flatnonzero(episode.contact_step == step)
+        if not len(rows):
+            assert places[step] == labels[step] == []
+            continue
+        force = episode.contact_force[rows]
+        top = int(np.linalg.norm(force, axis=1).argmax())
+        assert labels[step] == [force_text(np.linalg.norm(force[top]))]
+        end = episode.contact_position[rows[top]] + arrow_scale(episode) * force[top]
+        np.testing.assert_allclose(places[step], [end], atol=1e-6)
 
 
 def test_series_hold_the_values_of_the_episode(written):

@@ -21,9 +21,11 @@ def recording(tmp_path_factory):
 
 @pytest.fixture
 def commands(monkeypatch):
+    monkeypatch.delenv("RUST_LOG", raising=False)
     started = []
 
-    def run(command, check):
+    def run(command, check, env):
+        assert env["RUST_LOG"] == "warn"
         started.append(command)
         return subprocess.CompletedProcess(command, 3)
 

@@ -66,8 +66,8 @@ def test_seed_of_dm_control_env_is_that_of_the_suite():
 
 
 def test_success_is_terminated_in_torchrl():
-    from cathsim_dmc.anatomy.anatomy import Goal
     from cathsim_dmc.anatomy.arch import arch
+    from cathsim_dmc.anatomy.parts import Goal
 
     anatomy = arch.load("simple1")
     place = anatomy.tree.vessel("aorta").centreline.at(0.09)

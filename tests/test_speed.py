@@ -62,11 +62,15 @@ def test_the_humanoid_is_the_same_work_every_time():
 
 
 def test_calibrated_speed_is_the_product_of_factor_and_humanoid(monkeypatch):
-    monkeypatch.setattr(report, "_BARS", ((pace.RANDOM, 1.0),))
+    monkeypatch.setattr(report, "_BARS", {pace.RANDOM: (1.0, 1e9)})
     monkeypatch.setattr(report, "RUNS", 1)
     monkeypatch.setattr(report, "STEPS", 3)
-    steps = iter((30.0, 10.0))
+    # Before the first scene, between the two and after the second.
+    steps = iter((30.0, 10.0, 20.0))
     monkeypatch.setattr(report, "humanoid_step", lambda: next(steps))
-    (check,), table = report._factors()
-    assert check.value == pytest.approx(20 * table["random"]["real_time_factor"])
-    assert check.unit == "µs" and check.passed
+    checks, table = report._factors()
+    for check, scene, around in zip(checks, report._SCENES, (20, 15), strict=True):
+        factor = table[scene]["random"]["real_time_factor"]
+        assert check.value == pytest.approx(around * factor)
+        assert check.unit == "µs"
+    assert [check.passed for check in checks] == [True, False]

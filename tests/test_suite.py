@@ -14,8 +14,8 @@ from scipy.stats import qmc
 
 from cathsim_dmc import suite
 from cathsim_dmc.analysis.containment import Containment
-from cathsim_dmc.anatomy.anatomy import Goal
 from cathsim_dmc.anatomy.arch import arch
+from cathsim_dmc.anatomy.parts import Goal
 from cathsim_dmc.tasks import forces, observations
 
 # Those that need OpenGL are tested with the cameras.

@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 
 from cathsim_dmc import suite
 from cathsim_dmc.anatomy import phantoms
-from cathsim_dmc.anatomy.anatomy import Inlet
 from cathsim_dmc.anatomy.arch import arch
+from cathsim_dmc.anatomy.parts import Inlet
 from cathsim_dmc.entities import devices
 from cathsim_dmc.simulation.batch import BatchSimulation
 from cathsim_dmc.tasks import placement, readings

@@ -20,6 +20,7 @@ from cathsim_dmc.recording.dataset_reader import (
 )
 from cathsim_dmc.simulation.environments import PIXELS, VECTOR
 from cathsim_dmc.tasks import observations
+from cathsim_dmc.tasks.observation_kind import ImageOptions
 from cathsim_dmc.tasks.step import Step
 
 DEMONSTRATION_SEED = 2_000_000  # apart from the seeds of evaluation
@@ -256,7 +257,7 @@ def _shapes(transitions: TensorDictBase) -> NetworkShapes:
 
 def _keys(names: Sequence[str], coaxial: bool) -> list[str]:
     """Keys of the named observations in the order in which networks read them."""
-    return sorted(observations.entry_specs(names, observations.ImageOptions(), coaxial))
+    return sorted(observations.entry_specs(names, ImageOptions(), coaxial))
 
 
 def _tensors(

@@ -16,6 +16,7 @@ from cathsim_dmc.agents.config import ConfigError, TrainingConfig
 from cathsim_dmc.agents.normalisation import ImageNormaliser, ObservationNormaliser
 from cathsim_dmc.simulation.environments import PIXELS, VECTOR
 from cathsim_dmc.tasks import observations
+from cathsim_dmc.tasks.observation_kind import ImageOptions
 
 # What the networks read in place of VECTOR and PIXELS.
 NORMAL = "observation_normal"
@@ -127,7 +128,7 @@ class NetworkShapes:
 def _are_images(names: str | tuple[str, ...], images: bool) -> bool:
     """Whether all the entries of observations are images, or all are vectors."""
     chosen = observations.resolve(names)
-    specs = observations.entry_specs(chosen, observations.ImageOptions())
+    specs = observations.entry_specs(chosen, ImageOptions())
     return all((spec is not None) == images for spec in specs.values())
 
 

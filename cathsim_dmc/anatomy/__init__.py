@@ -1,6 +1,6 @@
 """Geometry without physics: vessels, arches, lumen surfaces and wall pieces."""
 
-from cathsim_dmc.anatomy.anatomy import Anatomy, End, Goal, Inlet, Surface
+from cathsim_dmc.anatomy.anatomy import Anatomy
 from cathsim_dmc.anatomy.centreline import (
     Centreline,
     CentrelinePoint,
@@ -8,6 +8,7 @@ from cathsim_dmc.anatomy.centreline import (
     Vessel,
     VesselTree,
 )
+from cathsim_dmc.anatomy.parts import End, Goal, Inlet, Surface
 
 __all__ = [
     "Anatomy",

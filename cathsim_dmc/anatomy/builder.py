@@ -8,9 +8,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from cathsim_dmc.anatomy.anatomy import Anatomy, End, Goal, Inlet
+from cathsim_dmc.anatomy.anatomy import Anatomy
 from cathsim_dmc.anatomy.centreline import Array, VesselTree
 from cathsim_dmc.anatomy.curves import FLARE, SMOOTHING, Curve, smooth_tree
+from cathsim_dmc.anatomy.parts import End, Goal, Inlet
 
 # Goals lie this far (m) past the ostium of their branch where it is long enough,
 # at most so near (m) to its free end, and not beyond the ostium of a fork.

@@ -6,8 +6,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from cathsim_dmc.anatomy.anatomy import Surface
 from cathsim_dmc.anatomy.centreline import Array, VesselTree
+from cathsim_dmc.anatomy.parts import Surface
 
 # Grid step, m: at most 20,000 triangles on an aortic arch with its branches.
 SPACING = 2.2e-3

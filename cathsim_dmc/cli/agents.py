@@ -195,7 +195,10 @@ def replay(
     """
     from cathsim_dmc.recording import viewer
 
-    return viewer.open_viewer(recording, web=web, port=port, announce=print)
+    def announce(address: str) -> None:
+        print(f"Open {address} in a browser; Ctrl-C ends it.", flush=True)
+
+    return viewer.open_viewer(recording, web=web, port=port, announce=announce)
 
 
 def play(

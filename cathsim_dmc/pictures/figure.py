@@ -20,6 +20,7 @@ from cathsim_dmc.imaging import FluoroscopyOptions
 from cathsim_dmc.pictures.snapshot import Snapshot, fluoroscope_of, xray
 from cathsim_dmc.pictures.translucent import Glass, Projection, glass
 from cathsim_dmc.recording.geometry import force_colours, force_text
+from cathsim_dmc.style import COLOURS, tidy
 
 # Directions of view by name: azimuth of the viewer, degrees, and the picture's axes.
 VIEWS = {
@@ -49,16 +50,30 @@ FLUOROSCOPY = FluoroscopyOptions(size=400, magnification=1.3)
 # Percentiles of an image that are shown as black and white.
 WINDOW = (0.02, 99.5)
 _HEIGHT_IN = 6.0
+# The palette of a notebook's picture is refined until no more pixels than these
+# change their colour.
+_SETTLED_PIXELS = 1_000
 _POINTS_PER_INCH = 72.0
 
 
 class Picture(Figure):
-    """A figure that notebooks show whether or not pyplot was ever imported."""
+    """A figure that notebooks show whether or not pyplot was ever imported.
+
+    Its axes have the colours and scales of `cathsim_dmc.style`.
+    """
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         """As `matplotlib.figure.Figure`, on the canvas that needs no screen."""
         super().__init__(*args, **kwargs)
         self.agg = FigureCanvasAgg(self)
+
+    def subplots(self, *args: Any, **kwargs: Any) -> Any:
+        """As `matplotlib.figure.Figure.subplots`, in the shared style."""
+        made = super().subplots(*args, **kwargs)
+        for axes in np.ravel(made):
+            axes.set_prop_cycle(color=COLOURS)
+            tidy(axes)
+        return made
 
     def _repr_png_(self) -> bytes:
         """What a notebook shows and keeps: 256 colours take a third of the place."""
@@ -66,8 +81,9 @@ class Picture(Figure):
         self.savefig(full, format="png")
         picture = Image.open(full).convert("RGB")
         # By coverage, not by count: the rare colours of scale and goal keep theirs.
+        # Refined, because coverage alone gives tints to grey images.
         method, dither = Image.Quantize.MAXCOVERAGE, Image.Dither.NONE
-        quantised = picture.quantize(256, method, dither=dither)
+        quantised = picture.quantize(256, method, _SETTLED_PIXELS, dither=dither)
         quantised.save(small, "PNG", optimize=True)
         return small.getvalue()
 
@@ -146,8 +162,8 @@ def draw_scene(
     axes.set_ylim(extent[2:])
     axes.set_aspect("equal")
     axes.set_facecolor("white")
-    for side in ("top", "right"):
-        axes.spines[side].set_visible(False)
+    tidy(axes)
+    axes.grid(False)
     _draw_goal(axes, snapshot, projection)
     if len(snapshot.path) > 1:
         axes.plot(
@@ -268,6 +284,7 @@ def draw_fluoroscopy(
     axes.set_title("fluoroscopy", fontsize=10)
     axes.set_xticks([])
     axes.set_yticks([])
+    axes.spines[:].set_visible(True)
     return image
 
 

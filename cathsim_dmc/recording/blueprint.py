@@ -48,7 +48,8 @@ def episode_blueprint(
         distance: Whether the recording has ``series/distance_mm``.
         head: (3,) where the head is at first, metres.
         robot: (3,) where the robot is, or None if the recording has none.
-        heights: Lowest and highest value of the plots "reward" and "force".
+        heights: Lowest and highest value of the plots "reward", "force", "distance"
+            (if the recording has it) and "insertion".
         rotation: Whether the recording has ``series/rotation_deg``, of coaxial devices.
     """
     middle = np.asarray(centre, dtype=np.float64)
@@ -67,18 +68,19 @@ def episode_blueprint(
         for origin, name in zip(FLUOROSCOPY[:planes], _PLANE_NAMES, strict=False)
     ]
     plots = [
-        _plot("Reward and its terms", "series/reward", heights["reward"]),
-        _plot("Force, mN", "series/force", heights["force"]),
-        _plot("Insertion, mm", "series/insertion_mm"),
+        _plot("Reward and its terms", "series/reward", heights["reward"], legend=True),
+        _plot("Force, mN", "series/force", heights["force"], legend=True),
+        _plot("Insertion, mm", "series/insertion_mm", heights["insertion"]),
         rrb.Tabs(
-            _plot("Action", "series/action", (-1.0, 1.0)),
+            _plot("Action", "series/action", (-1.0, 1.0), legend=True),
             _plot("All actions", "series/action_all"),
         ),
     ]
     if rotation:
         plots.insert(3, _plot("Rotation, °", "series/rotation_deg", None, legend=True))
     if distance:
-        plots.insert(1, _plot("Distance to goal, mm", "series/distance_mm"))
+        way = _plot("Distance to goal, mm", "series/distance_mm", heights["distance"])
+        plots.insert(1, way)
     columns = [scene, rrb.Vertical(*images, texts), rrb.Vertical(*plots)]
     return _page(rrb.Horizontal(*columns, column_shares=[5, 3.4, 3]))
 
@@ -268,16 +270,16 @@ def _plot(
     height: tuple[float, float] | None = None,
     legend: bool = False,
 ) -> rrb.TimeSeriesView:
-    """A plot; one with a known height has a legend in the room above its curves."""
+    """A plot; where its height is known, a legend has room above the curves."""
     axis = None
     if height is not None:
         low, high = height
         rise = max(high - low, 1e-6)
-        axis = rrb.ScalarAxis(range=(low - 0.05 * rise, high + _HEADROOM * rise))
-    shown = legend or height is not None
+        above = _HEADROOM if legend else 0.1
+        axis = rrb.ScalarAxis(range=(low - 0.05 * rise, high + above * rise))
     return rrb.TimeSeriesView(
         origin=origin,
         name=name,
         axis_y=axis,
-        plot_legend=rrb.PlotLegend(corner="LeftTop", visible=shown),
+        plot_legend=rrb.PlotLegend(corner="LeftTop", visible=legend),
     )

@@ -12,7 +12,12 @@ import rerun as rr
 from cathsim_dmc.recording.drawing import Drawing
 from cathsim_dmc.recording.episode import Episode
 from cathsim_dmc.recording.geometry import force_colours, force_scale, force_text
-from cathsim_dmc.recording.rerun_device import ARROW_RADIUS, LONGEST_ARROW
+from cathsim_dmc.recording.rerun_device import (
+    ARROW_RADIUS,
+    LABEL_COLOUR,
+    LABEL_RADIUS,
+    LONGEST_ARROW,
+)
 from cathsim_dmc.recording.rerun_log import APPLICATION_ID, layout_of, log_episode
 from cathsim_dmc.recording.scene import BodyGeom
 
@@ -74,11 +79,22 @@ def _log_moment(
 ) -> None:
     magnitude = np.linalg.norm(force, axis=-1)
     top = force_scale(magnitude)
+    vectors = LONGEST_ARROW / top * force
     arrows = rr.Arrows3D(
-        vectors=LONGEST_ARROW / top * force,
+        vectors=vectors,
         origins=position,
         colors=force_colours(magnitude, top),
         radii=ARROW_RADIUS,
-        labels=[force_text(each) for each in magnitude],
     )
     stream.log("world/contacts", arrows, static=True, strict=True)
+    if not len(magnitude):
+        return
+    largest = int(magnitude.argmax())
+    text = rr.Points3D(
+        position[largest] + vectors[largest],
+        labels=force_text(magnitude[largest]),
+        colors=LABEL_COLOUR,
+        radii=LABEL_RADIUS,
+        show_labels=True,
+    )
+    stream.log("world/contacts/largest", text, static=True, strict=True)

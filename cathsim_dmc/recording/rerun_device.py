@@ -22,8 +22,9 @@ ARROW_RADIUS = 0.7e-3
 HEAT_RADIUS = 0.9e-3
 TRAIL_RADIUS = 0.25e-3
 HEAD_SCALE = 1.8
-# Forces below this share of the largest in their step have no label.
-LABELLED = 0.5
+# Of the text at the largest force of a step: legible where the viewer is light and
+# where it is dark, as the colours of forces are not. Its point is not to be seen.
+LABEL_COLOUR, LABEL_RADIUS = (213, 94, 0), 1e-5
 
 SHAFT_COLOUR = (215, 228, 255)
 HEAD_COLOUR = (255, 200, 0)
@@ -133,15 +134,10 @@ def log_contacts(log: Log) -> None:
     episode = log.episode
     magnitude = np.linalg.norm(episode.contact_force, axis=-1)
     colours = force_colours(magnitude, force_scale(magnitude))
-    log.static(
-        "world/contacts",
-        rr.Arrows3D.from_fields(radii=[ARROW_RADIUS], show_labels=True),
-    )
+    vectors = arrow_scale(episode) * episode.contact_force
+    log.static("world/contacts", rr.Arrows3D.from_fields(radii=[ARROW_RADIUS]))
     arrows = rr.Arrows3D.columns(
-        vectors=arrow_scale(episode) * episode.contact_force,
-        origins=episode.contact_position,
-        colors=colours,
-        labels=_labels(episode, magnitude),
+        vectors=vectors, origins=episode.contact_position, colors=colours
     )
     # A step without contact is an empty row, which takes the old arrows away.
     rows = slice(1, None)
@@ -150,14 +146,20 @@ def log_contacts(log: Log) -> None:
         log.static("world/heat", rr.Points3D.from_fields(radii=[HEAT_RADIUS]))
         heat = rr.Points3D.columns(positions=episode.contact_position, colors=colours)
         log.columns("world/heat", heat.partition(episode.contact_counts), rows)
+        _log_largest(log, episode.contact_position + vectors, magnitude)
 
 
-def _labels(episode: Episode, magnitude: np.ndarray) -> list[str]:
-    """Text of every contact: its force if it is among the largest of its step."""
-    largest = np.zeros(episode.steps)
-    np.maximum.at(largest, episode.contact_step, magnitude)
-    named = (magnitude > 0) & (magnitude >= LABELLED * largest[episode.contact_step])
-    return [
-        force_text(force) if shown else ""
-        for force, shown in zip(magnitude, named, strict=True)
-    ]
+def _log_largest(log: Log, ends: np.ndarray, magnitude: np.ndarray) -> None:
+    """Log the largest force of each step as text at the end of its arrow."""
+    episode, entity = log.episode, "world/contacts/largest"
+    order = np.lexsort((magnitude, episode.contact_step))
+    top = order[np.flatnonzero(np.diff(episode.contact_step[order], append=-1))]
+    look = rr.Points3D.from_fields(
+        colors=[LABEL_COLOUR], radii=[LABEL_RADIUS], show_labels=True
+    )
+    log.static(entity, look)
+    text = rr.Points3D.columns(
+        positions=ends[top], labels=[force_text(force) for force in magnitude[top]]
+    )
+    one = np.minimum(episode.contact_counts, 1)
+    log.columns(entity, text.partition(one), slice(1, None))

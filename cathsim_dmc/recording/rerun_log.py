@@ -31,6 +31,7 @@ from cathsim_dmc.recording.scene import BodyGeom
 
 APPLICATION_ID = "cathsim"
 SUFFIX = ".rrd"
+_LEAST_HEIGHT_MM = 100.0
 
 
 def write_rrd(
@@ -166,7 +167,7 @@ def layout_of(episode: Episode, drawing: Drawing) -> Blueprint:
 
 
 def _heights(episode: Episode) -> dict[str, tuple[float, float]]:
-    """Lowest and highest value of the plots that have a legend."""
+    """Lowest and highest value of the plots."""
     terms = episode.meta.get("reward_terms", {}).values()
     groups = {
         "reward": [episode.reward, *terms],
@@ -183,6 +184,12 @@ def _heights(episode: Episode) -> dict[str, tuple[float, float]]:
     for name, rows in groups.items():
         values = np.concatenate([np.zeros(1), *(np.asarray(row) for row in rows)])
         found[name] = (float(values.min()), float(values.max()))
+    # From 0 to 100 mm at least: the viewer writes hundreds at its scale, not tens.
+    lengths = {"insertion": episode.insertion, "distance": goal_distance(episode)}
+    for name, values in lengths.items():
+        if values is not None:
+            low, high = 1e3 * np.min(values), 1e3 * np.max(values)
+            found[name] = (min(0.0, float(low)), max(_LEAST_HEIGHT_MM, float(high)))
     return found
 
 

@@ -131,8 +131,10 @@ def open_viewer(
         command = serve_command(recording, host, port, data_port)
         if announce is not None:
             announce(web_address(host, port, data_port))
+    # Where it serves has been said, and in a form that a browser elsewhere can use.
+    quiet = {"RUST_LOG": "warn", **os.environ}
     try:
-        return subprocess.run(command, check=False).returncode
+        return subprocess.run(command, check=False, env=quiet).returncode
     except KeyboardInterrupt:
         # Ctrl-C is how serving ends.
         return 0

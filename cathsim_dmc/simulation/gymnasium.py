@@ -9,7 +9,7 @@ from dm_env import specs
 from gymnasium.envs.registration import EnvSpec
 
 from cathsim_dmc import suite
-from cathsim_dmc.anatomy.anatomy import Surface
+from cathsim_dmc.anatomy.parts import Surface
 from cathsim_dmc.imaging import angiograph
 from cathsim_dmc.simulation import batch
 from cathsim_dmc.tasks.config import CONTROL_TIMESTEP

@@ -9,6 +9,7 @@ from cathsim_dmc.imaging import angiograph as machines
 from cathsim_dmc.imaging.device import Shadow
 from cathsim_dmc.imaging.fluoroscopy import Fluoroscope
 from cathsim_dmc.tasks import cameras, observations
+from cathsim_dmc.tasks.frame import NO_IMAGES, Images
 
 
 class ImageSensors:
@@ -66,7 +67,7 @@ class ImageSensors:
         random_states: Sequence[np.random.RandomState] | None,
         fresh: np.ndarray | None = None,
         device_points: np.ndarray | None = None,
-    ) -> observations.Images:
+    ) -> Images:
         """Captures the next images.
 
         Args:
@@ -80,7 +81,7 @@ class ImageSensors:
           device_points: (N, K, P, 3), tracked points of coaxial devices, m.
         """
         if not self._on:
-            return observations.NO_IMAGES
+            return NO_IMAGES
         count = len(qpos)
         chosen = np.arange(count) if fresh is None else fresh
         line = lines[chosen]
@@ -106,7 +107,7 @@ class ImageSensors:
         if kinds and self._cameras is not None:
             for key, view in self._cameras.see(kinds, qpos[chosen]).items():
                 self._views[key] = _merged(self._views.get(key), view, count, fresh)
-        return observations.Images(
+        return Images(
             image=self._images[0] if self._images else None,
             past_images=tuple(self._images[1:]),
             masks=self._masks,

@@ -14,6 +14,7 @@ from cathsim_dmc.tasks.actions import check_action
 from cathsim_dmc.tasks.coaxial import CoaxialReadings
 from cathsim_dmc.tasks.config import CONTROL_TIMESTEP, NavigationConfig
 from cathsim_dmc.tasks.objectives import Objective
+from cathsim_dmc.tasks.observation_kind import FrameObservable, ImageOptions
 from cathsim_dmc.tasks.rollout import (
     ModelAccess,
     Rollout,
@@ -149,11 +150,11 @@ class Navigation(composer.Task):
     def task_observables(self):
         """One observable per entry of the chosen observations."""
         if self._observables is None:
-            options = observations.ImageOptions(
+            options = ImageOptions(
                 self._config.fluoroscopy_options, self._config.camera_options
             )
             self._observables = {
-                key: observations.FrameObservable(
+                key: FrameObservable(
                     lambda physics, key=key: self._current().observation[key][0],
                     spec,
                 )

@@ -4,149 +4,25 @@ An observation is a function of a `Frame`, for one simulation or for many. To ad
 write it here and register it with its entries.
 """
 
-import dataclasses
 import math
-from collections.abc import Callable, Mapping, Sequence
-from types import MappingProxyType
-from typing import NamedTuple, cast
+from collections.abc import Callable, Sequence
+from typing import cast
 
 import numpy as np
-from dm_control.composer.observation import observable
 from dm_env import specs
 
-from cathsim_dmc.imaging.options import FluoroscopyOptions
-from cathsim_dmc.tasks import forces, readings
-from cathsim_dmc.tasks.cameras import CameraOptions
-from cathsim_dmc.tasks.coaxial import DEVICE_PLACES, CoaxialReadings
-from cathsim_dmc.tasks.route import AHEAD, Ahead, into_frame
+from cathsim_dmc.tasks.coaxial import DEVICE_PLACES
+from cathsim_dmc.tasks.frame import Frame
+from cathsim_dmc.tasks.observation_kind import (
+    Entry,
+    ImageOptions,
+    Observation,
+    ObservationKind,
+)
+from cathsim_dmc.tasks.route import AHEAD, into_frame
 
 TRACKED_POINTS = 8
 SEQUENCE_LENGTH = 3
-
-Observation = dict[str, np.ndarray]
-
-
-class Images(NamedTuple):
-    """What the image sensors show; None where no observation needs it.
-
-    Attributes:
-      image: (..., H, W, P) uint8, fluoroscopy of P planes.
-      past_images: the same, one and two control steps before, newest first.
-      masks: (..., H, W, 2 P) uint8, see `imaging.angiograph.masks`.
-      pixels: (..., P, K + 1, 2), tracked points and goal, (column, row).
-      views: images of MuJoCo's cameras by key.
-    """
-
-    image: np.ndarray | None = None
-    past_images: tuple[np.ndarray, ...] = ()
-    masks: np.ndarray | None = None
-    pixels: np.ndarray | None = None
-    views: Mapping[str, np.ndarray] = MappingProxyType({})
-
-
-NO_IMAGES = Images()
-
-
-def _captured(array: np.ndarray | None) -> np.ndarray:
-    """What the image sensors took, as they do where an observation asks for it."""
-    assert array is not None
-    return array
-
-
-class Frame(NamedTuple):
-    """What there is to observe after a control step.
-
-    Attributes:
-      readings: state of the device.
-      wall_force: force on the wall over the control step.
-      action: (..., A), the action that was asked for, zeros after a reset.
-      goal: (3,) or (..., 3), m.
-      images: what the image sensors show.
-      ahead: what lies ahead of the tip on the route; None where nothing asks for it.
-      devices: state of coaxial devices; None for a device alone.
-    """
-
-    readings: readings.Readings
-    wall_force: forces.WallForce
-    action: np.ndarray
-    goal: np.ndarray
-    images: Images = NO_IMAGES
-    ahead: Ahead | None = None
-    devices: CoaxialReadings | None = None
-
-
-@dataclasses.dataclass(frozen=True)
-class ImageOptions:
-    """Options on which the shapes of images depend.
-
-    Attributes:
-      fluoroscopy: set-up of the angiography machine.
-      cameras: MuJoCo's cameras and their size.
-    """
-
-    fluoroscopy: FluoroscopyOptions = FluoroscopyOptions()
-    cameras: CameraOptions = CameraOptions()
-
-    def fluoroscopic(self, channels: int) -> tuple[int, ...]:
-        """Shape (rows, columns, channels of all planes) of a fluoroscopic image."""
-        fluoroscopy = self.fluoroscopy
-        return (*fluoroscopy.resolution, fluoroscopy.planes * channels)
-
-
-@dataclasses.dataclass(frozen=True)
-class Entry:
-    """One array of an observation, as people and specs need to know it.
-
-    Attributes:
-      key: name in the observation; `<camera>` stands for the name of each camera.
-      unit: of its numbers, by part where parts differ.
-      meaning: layout and frame.
-      low: least value, -inf if there is no bound.
-      high: greatest value.
-      dtype: of an image; None for numbers, whose spec composer infers.
-      shape: shape of an image by the options; None for numbers.
-    """
-
-    key: str
-    unit: str
-    meaning: str
-    low: float = -math.inf
-    high: float = math.inf
-    dtype: type | None = None
-    shape: Callable[[ImageOptions], tuple[int, ...]] | None = None
-
-    def keys(self, options: ImageOptions) -> tuple[str, ...]:
-        """Names in the observation."""
-        if "<camera>" not in self.key:
-            return (self.key,)
-        return tuple(self.key.replace("<camera>", n) for n in options.cameras.names)
-
-    def spec(self, options: ImageOptions) -> specs.Array | None:
-        """Spec of an image; None for numbers."""
-        if self.shape is None:
-            return None
-        shape = self.shape(options)
-        if self.dtype is np.uint8:
-            return specs.BoundedArray(shape, np.uint8, int(self.low), int(self.high))
-        return specs.Array(shape, self.dtype)
-
-
-@dataclasses.dataclass(frozen=True)
-class ObservationKind:
-    """One row of the table.
-
-    Attributes:
-      observe: function from a frame to the arrays of the observation.
-      entries: its arrays.
-      fluoroscopic: whether it needs the angiography machine.
-      routed: whether it needs the route to the goal.
-    """
-
-    observe: Callable[[Frame], Observation]
-    entries: tuple[Entry, ...]
-    fluoroscopic: bool = False
-    routed: bool = False
-
 
 OBSERVATIONS: dict[str, ObservationKind] = {}
 
@@ -161,6 +37,12 @@ def _register(*entries: Entry, fluoroscopic: bool = False, routed: bool = False)
         return function
 
     return add
+
+
+def _captured(array: np.ndarray | None) -> np.ndarray:
+    """What the image sensors took, as they do where an observation asks for it."""
+    assert array is not None
+    return array
 
 
 _POINTS = f"{TRACKED_POINTS} points along the device, proximal to head"
@@ -556,17 +438,3 @@ def entry_specs(
         for entry in kind.entries
         for key in entry.keys(options)
     }
-
-
-class FrameObservable(observable.Generic):
-    """One entry of the observation, with the range of an image in its spec."""
-
-    def __init__(self, read: Callable, spec: specs.Array | None):
-        super().__init__(read)
-        self._spec = spec
-        self.enabled = True
-
-    @property
-    def array_spec(self) -> specs.Array | None:
-        """Spec of an image; None for numbers, whose spec composer infers."""
-        return self._spec

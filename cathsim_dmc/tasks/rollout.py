@@ -20,6 +20,7 @@ from cathsim_dmc.tasks import coaxial, forces, observations, readings
 from cathsim_dmc.tasks.cases import Case, model_index
 from cathsim_dmc.tasks.coaxial import CoaxialDevices, CoaxialReadings
 from cathsim_dmc.tasks.config import NavigationConfig
+from cathsim_dmc.tasks.frame import NO_IMAGES, Frame
 from cathsim_dmc.tasks.image_sensors import ImageSensors, open_cameras
 from cathsim_dmc.tasks.objective_pool import together
 from cathsim_dmc.tasks.objectives import (
@@ -28,6 +29,7 @@ from cathsim_dmc.tasks.objectives import (
     ShiftableObjective,
     straight,
 )
+from cathsim_dmc.tasks.observation_kind import Observation
 from cathsim_dmc.tasks.path_tracker import PathTracker
 from cathsim_dmc.tasks.physics_errors import PhysicsMonitor
 from cathsim_dmc.tasks.route import Routes
@@ -315,10 +317,8 @@ class Rollout:
             path_ratio=self._path.ratio,
         )
 
-    def _observe(
-        self, goal: np.ndarray, fresh: np.ndarray | None
-    ) -> observations.Observation:
-        devices, images = self.devices, observations.NO_IMAGES
+    def _observe(self, goal: np.ndarray, fresh: np.ndarray | None) -> Observation:
+        devices, images = self.devices, NO_IMAGES
         if self._sensors.on:
             images = self._sensors.capture(
                 self._readings.centreline,
@@ -332,7 +332,7 @@ class Rollout:
         state, ahead = self._readings, None
         if self._routes is not None:
             ahead = self._routes.ahead(self._case_of, state.head, state.head_frame)
-        frame = observations.Frame(
+        frame = Frame(
             state, self._wall_force, self._action, goal, images, ahead, devices
         )
         return observations.observe(self._names, frame)

@@ -4,7 +4,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from cathsim_dmc.tasks import forces, objectives, observations, readings
+from cathsim_dmc.tasks import forces, objectives, readings
+from cathsim_dmc.tasks.observation_kind import Observation
 
 
 class Step(NamedTuple):
@@ -24,7 +25,7 @@ class Step(NamedTuple):
       path_ratio: (N,), way of the head so far over the shortest way to the goal.
     """
 
-    observation: observations.Observation
+    observation: Observation
     outcome: objectives.Outcome
     terminated: np.ndarray
     truncated: np.ndarray

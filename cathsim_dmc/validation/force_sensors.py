@@ -10,9 +10,10 @@ import mujoco
 import numpy as np
 
 from cathsim_dmc import suite
-from cathsim_dmc.anatomy.anatomy import Anatomy, Goal
+from cathsim_dmc.anatomy.anatomy import Anatomy
 from cathsim_dmc.anatomy.builder import anatomy_frame
 from cathsim_dmc.anatomy.centreline import Centreline, Vessel, VesselTree
+from cathsim_dmc.anatomy.parts import Goal
 from cathsim_dmc.anatomy.surface import lumen_surface
 from cathsim_dmc.anatomy.wall.pieces import build_wall
 from cathsim_dmc.entities.phantom import Phantom

@@ -31,6 +31,8 @@ def executed(path: Path) -> nbformat.NotebookNode:
             notebook,
             timeout=TIMEOUT,
             record_timing=False,
+            # Else how lines are grouped differs from run to run.
+            coalesce_streams=True,
             resources={"metadata": {"path": folder}},
         ).execute()
     for cell in notebook.cells:

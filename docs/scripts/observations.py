@@ -14,6 +14,7 @@ from cathsim_dmc import suite
 from cathsim_dmc.imaging import VIEWS, FluoroscopyOptions
 from cathsim_dmc.tasks import observations
 from cathsim_dmc.tasks.cameras import CAMERAS, KINDS, CameraOptions
+from cathsim_dmc.tasks.observation_kind import Entry, ImageOptions
 from cathsim_dmc.tasks.variations import DEFAULT_RANGES, Randomisation
 
 OUTPUT = Path(__file__).parents[1] / "observations.md"
@@ -95,7 +96,7 @@ def _shape(shape: tuple[int, ...]) -> str:
     return "(" + ", ".join(map(str, shape)) + ("," if len(shape) == 1 else "") + ")"
 
 
-def _range(entry: observations.Entry) -> str:
+def _range(entry: Entry) -> str:
     def bound(value: float) -> str:
         return f"{value:g}" if np.isfinite(value) else "∞"
 
@@ -126,7 +127,7 @@ def entries_table() -> str:
     environment = suite.load("cathsim", TASK, {"observation": drawn})
     specs = dict(environment.observation_spec())
     # Pictures of cameras have a spec without OpenGL, too.
-    specs |= observations.entry_specs(KINDS, observations.ImageOptions())
+    specs |= observations.entry_specs(KINDS, ImageOptions())
     rows = [
         _row("observation", "entry", "shape", "type", "range", "unit", "meaning"),
         _row(*["---"] * 7),

@@ -12,6 +12,7 @@ from scipy.spatial import cKDTree
 from cathsim_dmc.anatomy.anatomy import Anatomy
 from cathsim_dmc.anatomy.centreline import Vessel
 from cathsim_dmc.anatomy.scan.mesh_depth import MeshDepth
+from cathsim_dmc.anatomy.scan.tree import END_TRIM, TAIL, TAIL_RADIUS
 from cathsim_dmc.anatomy.wall.depth import DepthField
 from cathsim_dmc.anatomy.wall.pieces import INLET_HOLE_RADIUS
 
@@ -19,8 +20,10 @@ SLACK = 0.3e-3  # m, by which a triangulated surface may cut into a tube
 STEP = 0.5e-3  # m, between the places of a centreline that are tested
 FREE = 12e-3  # m, of lumen beyond the end of a vessel, or this many radii:
 FREE_RADII = 4.0
+NARROW_END = 1.2  # of `TAIL_RADIUS`: a vessel that ends no wider was cut off there
 JOINS = 15e-3  # m of lumen between the end of a vessel and another that it joins
 PASSABLE = 0.6e-3  # m, depth of a lumen that counts as going on
+ARCH_BRANCHES = ("bca", "lcca", "lsa")  # in their order from the heart
 BESIDE = 15e-3  # m that two vessels may run in one lumen beyond their parting
 VOLUME = (0.5e-6, 2e-3)  # m^3 of a lumen
 RADIUS = (0.3e-3, 30e-3)  # m, median of a vessel
@@ -53,8 +56,8 @@ def check_tree(anatomy: Anatomy) -> list[TreeCheck]:
 
     Returns:
         One finding for each of: centrelines inside the lumen, every vessel in a lumen
-        of its own, branches on their parents, free ends, goals, sizes, the inlet, and
-        the start of the device.
+        of its own, branches on their parents, branches of the arch on their sides,
+        free ends, goals, sizes, the inlet, and the start of the device.
     """
     surface = anatomy.surface
     measure = MeshDepth(surface.vertices, np.asarray(surface.faces, dtype=np.int64))
@@ -62,6 +65,7 @@ def check_tree(anatomy: Anatomy) -> list[TreeCheck]:
         _inside(anatomy, measure),
         _own_lumen(anatomy),
         _parents(anatomy),
+        _sides(anatomy),
         _free_ends(anatomy, measure),
         _goals(anatomy),
         _sizes(anatomy),
@@ -151,6 +155,40 @@ def _parents(anatomy: Anatomy) -> TreeCheck:
     return _finding("branches on their parents", wrong, "in order")
 
 
+def _sides(anatomy: Anatomy) -> TreeCheck:
+    """Whether the arch leads from right and front to left and back, as named.
+
+    A scan whose heart was taken for the end of the descending aorta, or whose frame is
+    not what it was said to be, has its LSA where the BCA is looked for.
+    """
+    tree, wrong = anatomy.tree, []
+    vessels = [tree.vessels[key] for key in ARCH_BRANCHES if key in tree.vessels]
+    vessels = [vessel for vessel in vessels if vessel.parent == tree.root.name]
+    if len(vessels) < 2:
+        return _finding("branches of the arch on their sides", wrong, "no arch")
+    aorta = tree.root.centreline
+    place = [aorta.project(v.centreline.at(v.ostium).position) for v in vessels]
+    along = np.diff([one.arc_length for one in place])
+    if (along > 0).any() and (along < 0).any():
+        names = ", ".join(vessel.name for vessel in vessels)
+        wrong.append(f"{names} do not leave {tree.root.name} in this order")
+    first, last = (
+        vessel.centreline.at(vessel.ostium) for vessel in (vessels[0], vessels[-1])
+    )
+    left, back, _ = last.position - first.position
+    if left + back < 0.0:
+        wrong.append(
+            f"{vessels[-1].name} leaves {tree.root.name} {1e3 * abs(left):.0f} mm to "
+            f"the {'left' if left > 0 else 'right'} and {1e3 * abs(back):.0f} mm to "
+            f"the {'back' if back > 0 else 'front'} of {vessels[0].name}: the scan "
+            "does not lie in the frame that was given, or its inlet is at the other "
+            "end of the aorta"
+        )
+    return _finding(
+        "branches of the arch on their sides", wrong, f"{len(vessels)} in order"
+    )
+
+
 def _free_ends(anatomy: Anatomy, measure: MeshDepth) -> TreeCheck:
     wrong, farthest = [], 0.0
     # The field is the same lumen, sampled, and asking it is faster.
@@ -169,7 +207,9 @@ def _free_ends(anatomy: Anatomy, measure: MeshDepth) -> TreeCheck:
         wide = float(max(tail.max(), end.radius))
         ahead = _lumen_beyond(depth, end.position, end.tangent, wide)
         beyond = float(np.linalg.norm(ahead - end.position, axis=1).max(initial=0.0))
-        if beyond <= max(FREE, FREE_RADII * wide):
+        # What no device can follow was cut off, and is not missing.
+        cut = TAIL + END_TRIM if end.radius < NARROW_END * TAIL_RADIUS else 0.0
+        if beyond <= max(FREE, FREE_RADII * wide, cut):
             farthest = max(farthest, beyond)
             continue
         # Or it ends in another vessel, where a ring of vessels closes.

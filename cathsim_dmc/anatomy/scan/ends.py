@@ -17,6 +17,7 @@ STUB = 3e-3  # m, shortest own vessel beyond that
 WIDE = 0.4  # of the widest free end: narrower ends are no inlet by default
 ROOT_WIDTH = 0.5  # of the inlet: narrower free ends do not continue the root
 LEG = 30e-3  # m, least distance of the top of an arch from both ends of an aorta
+BEHIND = 10e-3  # m by which the descending aorta lies behind the ascending one
 STARTS = 30e-3  # m along the lumen; curves that start nearer to an end start there
 
 
@@ -161,7 +162,8 @@ def plan_inlet(
         inlet: (3,) m near the end to use or in the middle of a vessel that is to be
             cut there, or None to choose: the end at which the curves start, else the
             wide end farthest along the lumen from their starts. Without curves it is
-            the end of an aorta that is not at the heart, else the widest.
+            the end of an aorta that is not at the heart, else the widest. The heart
+            is at the widest end, but for an aorta whose other leg lies in front.
 
     Raises:
         ValueError: if no end can be chosen; lists them.
@@ -188,6 +190,9 @@ def plan_inlet(
         # From the heart an aorta turns back; other trees are entered by their trunk.
         reach = ways.lengths_from(nodes[root])[nodes]
         chosen = int(max(others, key=lambda k: reach[k])) if others else root
+        # A heart that was cut off above its root may be the narrower end.
+        if others and _behind(ways, nodes[root], nodes[chosen]) < -BEHIND:
+            chosen = root
     far = _far_end(ways, ends, at_goal, nodes[chosen], curves, chosen)
     return Entry(position[chosen], True, far)
 
@@ -200,6 +205,19 @@ def _arched(ways: Ways, heart: int, node: int) -> bool:
     one, other = (np.linalg.norm(each, axis=1) for each in (to_heart, to_end))
     cosine = np.einsum("nd,nd->n", to_heart, to_end) / np.maximum(one * other, 1e-12)
     return bool((cosine[(one > LEG) & (other > LEG)] > 0.5).any())
+
+
+def _behind(ways: Ways, one: int, other: int) -> float:
+    """How far (m) the leg of an arch at its other end lies behind that at the one.
+
+    Both are taken at the height of the higher end; +y is the patient's back.
+    """
+    way = ways.points[ways.trace(ways.deepest_from(one), other)]
+    height = max(way[0, 2], way[-1, 2])
+    top = int(way[:, 2].argmax())
+    legs = way[: top + 1], way[top:]
+    first, last = (leg[np.abs(leg[:, 2] - height).argmin()] for leg in legs)
+    return float(last[1] - first[1])
 
 
 def _ends_of_curves(ways, ends, lasts) -> np.ndarray:

@@ -11,8 +11,9 @@ from pathlib import Path
 import numpy as np
 
 from cathsim_dmc import bounds
-from cathsim_dmc.anatomy.anatomy import Anatomy, Inlet, Surface
+from cathsim_dmc.anatomy.anatomy import Anatomy
 from cathsim_dmc.anatomy.centreline import VesselTree
+from cathsim_dmc.anatomy.parts import Inlet, Surface
 from cathsim_dmc.anatomy.scan import coacd_wall
 from cathsim_dmc.anatomy.scan.check import check_tree
 from cathsim_dmc.anatomy.scan.compiled_field import compiled, plain
@@ -47,6 +48,15 @@ SPACINGS, TOLERANCES = (1e-4, 2e-3), (1e-5, 2e-3)
 NEAR_INLET = 15e-3  # m, distance from the lumen of an inlet that is pointed at
 RADII = (0.3e-3, 30e-3)  # m, allowed median radius of a vessel: arteriole, aneurysm
 
+# What to do about a tree that does not agree with the surface.
+_MEND_DRAWN = (
+    "Mend the surface or the centrelines there, leave that branch out, or let the "
+    "centrelines be computed."
+)
+_MEND_COMPUTED = (
+    "Mend the surface there, or give its frame (mesh_frame, axes), the inlet, or "
+    "centrelines that were drawn."
+)
 
 # Share of an import that is done when a step begins, for a progress bar.
 SHARES = {"mesh": 0.0, "depth": 0.06, "tree": 0.35, "wall": 0.65, "done": 1.0}
@@ -160,7 +170,7 @@ def import_scan(
         ends=flat_ends(tree, opening),
         field=field,
     )
-    anatomy = _walled(anatomy, wall, tolerance, threshold, say, note)
+    anatomy = _walled(anatomy, wall, tolerance, threshold, bool(lines), say, note)
     say(
         f"done: {len(anatomy.wall)} wall pieces in {time.monotonic() - started:.0f} s, "
         f"goals {', '.join(anatomy.goals) or 'none'}"
@@ -225,7 +235,7 @@ def _computed(
     return {key: f.points for key, f in zip(names, found, strict=True)}
 
 
-def _walled(anatomy, wall, tolerance, threshold, say, note) -> Anatomy:
+def _walled(anatomy, wall, tolerance, threshold, drawn, say, note) -> Anatomy:
     """The anatomy cut open at its inlet and surrounded by its wall, and proved."""
     vertices, faces = anatomy.surface.vertices, np.asarray(anatomy.surface.faces)
     field, tree, opening = anatomy.field, anatomy.tree, anatomy.inlet
@@ -250,8 +260,7 @@ def _walled(anatomy, wall, tolerance, threshold, say, note) -> Anatomy:
             continue
         raise ValueError(
             f"the tree does not agree with the surface ({check.name}): {check.detail}. "
-            "Mend the surface or the centrelines there, leave that branch out, or let "
-            "the centrelines be computed."
+            + (_MEND_DRAWN if drawn else _MEND_COMPUTED)
         )
     if wall == "coacd":
         pieces, _ = coacd_wall.decompose_wall(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from cathsim_dmc.anatomy.anatomy import Inlet
+from cathsim_dmc.anatomy.parts import Inlet
 from cathsim_dmc.anatomy.scan.mesh_depth import MeshDepth
 from cathsim_dmc.anatomy.scan.wall import adjacent_faces
 from cathsim_dmc.anatomy.wall.depth import BRICK, OUTER, QUANTUM, DepthField

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from cathsim_dmc.anatomy.anatomy import End, Goal, Inlet
 from cathsim_dmc.anatomy.centreline import Vessel, VesselTree
+from cathsim_dmc.anatomy.parts import End, Goal, Inlet
 from cathsim_dmc.anatomy.scan.wall import DEVICE_RADIUS
 
 GOAL_PAST_OSTIUM = 30e-3  # m along a branch, its first goal

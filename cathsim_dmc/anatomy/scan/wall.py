@@ -18,7 +18,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import ConvexHull, QhullError, cKDTree
 
-from cathsim_dmc.anatomy.anatomy import Inlet
+from cathsim_dmc.anatomy.parts import Inlet
 from cathsim_dmc.anatomy.wall.depth import DepthField
 from cathsim_dmc.anatomy.wall.pieces import INLET_HOLE_RADIUS
 

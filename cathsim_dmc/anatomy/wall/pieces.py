@@ -14,8 +14,8 @@ import math
 
 import numpy as np
 
-from cathsim_dmc.anatomy.anatomy import End
 from cathsim_dmc.anatomy.centreline import Array, Centreline, VesselTree
+from cathsim_dmc.anatomy.parts import End
 from cathsim_dmc.anatomy.tube import (
     THICKNESS,
     TOLERANCE,

@@ -1,0 +1,54 @@
+"""What there is to observe after a control step, for one simulation or for many."""
+
+from collections.abc import Mapping
+from types import MappingProxyType
+from typing import NamedTuple
+
+import numpy as np
+
+from cathsim_dmc.tasks import forces, readings
+from cathsim_dmc.tasks.coaxial import CoaxialReadings
+from cathsim_dmc.tasks.route import Ahead
+
+
+class Images(NamedTuple):
+    """What the image sensors show; None where no observation needs it.
+
+    Attributes:
+      image: (..., H, W, P) uint8, fluoroscopy of P planes.
+      past_images: the same, one and two control steps before, newest first.
+      masks: (..., H, W, 2 P) uint8, see `imaging.angiograph.masks`.
+      pixels: (..., P, K + 1, 2), tracked points and goal, (column, row).
+      views: images of MuJoCo's cameras by key.
+    """
+
+    image: np.ndarray | None = None
+    past_images: tuple[np.ndarray, ...] = ()
+    masks: np.ndarray | None = None
+    pixels: np.ndarray | None = None
+    views: Mapping[str, np.ndarray] = MappingProxyType({})
+
+
+NO_IMAGES = Images()
+
+
+class Frame(NamedTuple):
+    """What there is to observe after a control step.
+
+    Attributes:
+      readings: state of the device.
+      wall_force: force on the wall over the control step.
+      action: (..., A), the action that was asked for, zeros after a reset.
+      goal: (3,) or (..., 3), m.
+      images: what the image sensors show.
+      ahead: what lies ahead of the tip on the route; None where nothing asks for it.
+      devices: state of coaxial devices; None for a device alone.
+    """
+
+    readings: readings.Readings
+    wall_force: forces.WallForce
+    action: np.ndarray
+    goal: np.ndarray
+    images: Images = NO_IMAGES
+    ahead: Ahead | None = None
+    devices: CoaxialReadings | None = None
