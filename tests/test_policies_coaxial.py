@@ -139,9 +139,9 @@ def test_a_new_episode_forgets_the_last():
     simulation.reset()
     state = (simulation.readings, simulation.wall_force, simulation.rollout.devices)
     first = expert.act(*state)
-    expert.state.attempts[:] = 3
+    expert.state.attempts[:] = 4  # which has another direction
     expert.reset(np.array([True, False]))
-    np.testing.assert_array_equal(expert.state.attempts, [0, 3])
+    np.testing.assert_array_equal(expert.state.attempts, [0, 4])
     again = expert.act(*state)
     np.testing.assert_array_equal(again[0], first[0])
     assert not np.array_equal(again[1], first[1])

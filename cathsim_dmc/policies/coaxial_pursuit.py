@@ -12,11 +12,13 @@ Twist reaches the end late and in leaps, so it is the rotation of the end that c
 of the attempt. Far ahead the wire is limp and follows the vessel; close ahead its bend
 and the catheter's add up to a sharper one.
 
-**Retries.** When the head makes no progress, or has left the tube of the route as in a
-wrong branch, all is withdrawn and tries again with another lead, look-ahead and
-direction. In a sharp take-off the shafts buckle into the arch while the head stays:
-taking up that slack lets the head spring forward, so most retries withdraw only as
-long as the head does not come back.
+**Or the catheter alone.** Into a take-off that turns back on the way there, a wire
+leads badly: its shaft, the stiffer one, comes to lie in the bend. With a negative lead
+the wire stays behind in the catheter, whose soft end takes its shape, hooks the branch
+and goes up; the wire holds the shaft in the aorta straight.
+
+**Retries** (`attempts`) have another lead, look-ahead and direction, and every other
+time no jumps of the head's place on the route.
 """
 
 from __future__ import annotations
@@ -47,7 +49,7 @@ class Settings(pursuit.Settings):
 
     Attributes:
         leads: by how much each device is ahead of the one around it in successive
-            attempts, over and over, m.
+            attempts, over and over, m; negative where it stays behind in it.
         lead_gain: share of the error of the lead corrected in a control step.
         aside: by how much the route must bend away for a device to be turned, rad.
         turning: share of the error of direction that a base is turned by in a control
@@ -169,7 +171,7 @@ def _led(
 ) -> np.ndarray:
     """Translations (N, K) that keep the devices at their leads.
 
-    A head that is deep (N,), m, in the last branch goes on alone from its ostium.
+    A wire that leads goes on alone when it is deep (N,), m, in the last branch.
     """
     leads = np.asarray(settings.leads)
     lead = leads[state.attempts % len(leads)]
