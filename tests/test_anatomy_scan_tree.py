@@ -213,7 +213,7 @@ def test_a_start_at_the_ostium_is_said(tmp_path):
     assert set(anatomy.tree.vessels) == {"aorta", "branch_1"}
     assert "start of the device" in failed(anatomy)
     assert any("starts" in note and "inlet farther back" in note for note in notes)
-    assert any("geometry names no branch_1" in note for note in notes)
+    assert any("branch_1 (ends at" in note and "--rename" in note for note in notes)
 
 
 @pytest.mark.slow
@@ -226,6 +226,21 @@ def test_a_truncated_centreline_is_continued_and_said(arch_scan, tmp_path):
     assert any("'lcca' stops" in note and "continued" in note for note in notes)
     tip = anatomy.tree.vessel("lcca").centreline.points[-1]
     assert np.linalg.norm(tip - (6e-3, 0, 265e-3)) < 10e-3
+
+
+def test_arms_far_thinner_than_their_trunk_are_branches(tmp_path):
+    """No arm goes on as the trunk, so the first way begins at the inlet's very end."""
+    trunk = tube([(0, 0, 0), (0, 0, 60)], [9, 9])
+    arms = {
+        name: tube([(0, 0, 60), (6 * side, 0, 75), (25 * side, 0, 110)], [6, 3.5, 3.5])
+        for name, side in (("left", 1), ("right", -1))
+    }
+    vessels = {key: Vessel(key, arm, "trunk", 12e-3) for key, arm in arms.items()}
+    tree = VesselTree({"trunk": Vessel("trunk", trunk), **vessels})
+    mesh = write_obj(tmp_path / "fork.obj", *marched(tree, 2e-3))
+    anatomy = import_scan(mesh, spacing=1e-3)
+    assert np.linalg.norm(anatomy.inlet.position) < 15e-3
+    assert {"branch_1", "branch_2"} <= set(anatomy.goals)
 
 
 def test_a_lumen_thinner_than_the_device_is_refused(tmp_path):

@@ -80,6 +80,9 @@ def centrelines(
         own = cover.own_part(way[::-1])[::-1]
         if len(own) < 3:
             continue
+        if len(own) == len(way):
+            # It begins at the inlet, at whose very end the lattice has no depth.
+            own = own[int((ways.depth[own] >= DEVICE_RADIUS).argmax()) :]
         depth = ways.depth[own]
         narrow = np.flatnonzero(depth < DEVICE_RADIUS)
         passable = own[: narrow[0]] if len(narrow) else own

@@ -224,11 +224,11 @@ def _computed(
     open_names = [key for key in names if key.startswith("branch_")]
     if open_names:
         places = ", ".join(
-            f"{key} ends at {_mm(f.tip)}"
+            f"{key} (ends at {_mm(f.tip)})"
             for key, f in zip(names, found, strict=True)
             if key in open_names
         )
-        note(f"geometry names no {places}; name them with rename (--rename)")
+        note(f"geometry gives no anatomical name to {places}; rename (--rename) does")
     if thin:
         note(f"{thin} branches too thin or short for a 5 Fr catheter left out")
     note(f"inlet chosen at {_mm(entry.position)}")
