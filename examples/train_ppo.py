@@ -177,10 +177,10 @@ def train(settings: Settings) -> None:
     optimiser = torch.optim.Adam(loss.parameters(), settings.learning_rate, eps=1e-5)
     policy = TensorDictSequential(normalise, actor)
     explorer = Exploration(policy, env.base_env.action_groups, settings)
+    size = settings.num_envs * settings.steps_per_update
     batches = Collector(
-        env, explorer, total_frames=settings.total_frames,
-        frames_per_batch=settings.num_envs * settings.steps_per_update,
-        auto_register_policy_transforms=False,
+        env, explorer, total_frames=math.ceil(settings.total_frames / size) * size,
+        frames_per_batch=size, auto_register_policy_transforms=False,
     )  # fmt: skip
     start, frames = time.monotonic(), 0
     for batch in batches:
