@@ -40,7 +40,8 @@ from cathsim_dmc.analysis.containment import Containment
 from cathsim_dmc.simulation.batch import BatchSimulation
 from cathsim_dmc.tasks import forces
 
-TASKS = ("type1_bca", "type1_lcca", "type2_bca", "type2_lcca")
+# Both arches from both sides: a goal does not change what these policies do.
+TASKS = ("type1_lcca", "type2_lcca", "femoral_type1_lcca", "femoral_type2_lcca")
 EPISODES, STEPS = 100, 2000
 QUICK_EPISODES, QUICK_STEPS = 16, 200
 TINY_GOAL = 1e-9  # m

@@ -7,7 +7,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from conftest import TASKS
+
+from cathsim_dmc import suite
 
 PATH = Path(__file__).parents[1] / "benchmarks" / "soak.py"
 
@@ -27,10 +28,14 @@ def test_plan_covers_every_task_and_policy_evenly(soak):
     assert [episode.number for episode in episodes] == list(range(100))
     keys = [(episode.task, episode.policy) for episode in episodes]
     counts = {key: keys.count(key) for key in keys}
-    assert set(counts) == {(task, policy) for task in TASKS for policy in soak.POLICIES}
+    assert set(counts) == {
+        (task, policy) for task in soak.TASKS for policy in soak.POLICIES
+    }
     assert set(counts.values()) <= {6, 7}
-    # No episode is another one over again.
+    # No episode is another one over again; tasks that differ in their goal only are.
     assert len({(e.task, e.policy, e.seed) for e in episodes}) == 100
+    scenes = {(suite.TASKS[t].anatomy, suite.TASKS[t].access) for t in soak.TASKS}
+    assert len(scenes) == len(soak.TASKS)
 
 
 @pytest.mark.parametrize("name", ["halton", "push", "bang_bang", "reversals"])
