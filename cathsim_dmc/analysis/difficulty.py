@@ -185,17 +185,23 @@ def _ends(step: Step, number: int, resting: np.ndarray, limit: Limit) -> dict[in
     return found
 
 
-def tasks() -> tuple[str, ...]:
-    """Names of the registered tasks of a steerable device with an anatomy and a goal.
-
-    Those of coaxial devices are played when they are named: a straight push, by which
-    a steerable device shows that a task asks for steering, says little of them.
-    """
+def playable() -> tuple[str, ...]:
+    """Names of the registered tasks with an anatomy and a goal."""
     return tuple(
         name
         for name, definition in suite.TASKS.items()
-        if (definition.anatomy is not None or definition.random_arch)
-        and "devices" not in definition.options
+        if definition.anatomy is not None or definition.random_arch
+    )
+
+
+def tasks() -> tuple[str, ...]:
+    """Those of them that are played by default, of a steerable device.
+
+    Tasks of coaxial devices are played when they are named: a straight push, by which
+    a steerable device shows that a task asks for steering, says little of them.
+    """
+    return tuple(
+        name for name in playable() if "devices" not in suite.TASKS[name].options
     )
 
 
@@ -232,7 +238,7 @@ def difficulty(
     """Plays the policies of `LIMITS` on tasks and judges the tasks.
 
     Args:
-        names: Names of registered tasks; None for all with an anatomy of their own.
+        names: Names out of `playable()`; None for those of `tasks()`.
         seeds: Number of episodes of each policy on each task.
         first_seed: Seed of the first episode; the others count up.
         players: Names of policies in `LIMITS`; None for all.
@@ -245,7 +251,7 @@ def difficulty(
     """
     names = tasks() if names is None else tuple(names)
     players = tuple(LIMITS) if players is None else tuple(players)
-    _refuse("tasks", names, tasks())
+    _refuse("tasks", names, playable())
     _refuse("policies", players, tuple(LIMITS))
     if seeds < 1:
         raise ValueError(f"seeds is {seeds}; at least 1")
