@@ -288,6 +288,7 @@ def test_it_recovers_from_a_wrong_branch(task, plan):
     assert pilot.state.attempts[0] >= 1
 
 
+@pytest.mark.slow
 def test_episodes_are_evaluated_like_those_of_any_policy():
     result = agents.evaluate("expert", "type2_lcca", episodes=3, seed=70, num_threads=1)
     assert isinstance(result, agents.EvaluationResult)

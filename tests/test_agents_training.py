@@ -74,6 +74,7 @@ def without_clocks(rows):
     return [{k: v for k, v in row.items() if k not in CLOCKS} for row in rows]
 
 
+@pytest.mark.slow
 def test_ppo_learns_to_reach(tmp_path):
     run(small_ppo(total_frames=10_240), tmp_path)
     rewards = [row["episode_reward"] for row in read_metrics(tmp_path / "metrics.csv")]
@@ -271,6 +272,7 @@ def test_a_checkpoint_with_other_figures_is_refused(tmp_path, monkeypatch, windo
         run(small_ppo(total_frames=1_024), tmp_path, resume=True)
 
 
+@pytest.mark.slow
 def test_a_run_saves_by_the_clock_too(tmp_path):
     config = small_ppo(
         total_frames=4_096, checkpoint_frames=10**6, keep_checkpoints=100

@@ -149,6 +149,7 @@ def cathsim(monkeypatch, capsys):
     return run
 
 
+@pytest.mark.slow
 def test_check_measures_and_draws(cathsim, tmp_path):
     picture = tmp_path / "views.png"
     code, out, _ = cathsim(

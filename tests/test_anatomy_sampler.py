@@ -59,6 +59,7 @@ def test_samples_are_valid_arches_of_their_type(seed, arch_type, variant):
         assert (past < 12e-3) if variant == "bovine_trunk" else (past < 20e-3)
 
 
+@pytest.mark.slow
 def test_types_are_drawn_by_prevalence():
     kinds = [one.arch_type for one in arch.arch_set("train")]
     share = [kinds.count(kind) / len(kinds) for kind in arch.DROP_RANGES]

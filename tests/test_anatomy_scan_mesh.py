@@ -244,6 +244,7 @@ def thick(outer_radius, capped):
     return np.concatenate(sheets), np.concatenate(faces)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("rims", [True, False], ids=["one surface", "two surfaces"])
 def test_of_a_thick_wall_the_lumen_is_taken(tmp_path, rims):
     vertices, faces = thick(6.5, rims)

@@ -63,6 +63,7 @@ def test_ours_stands_beside_the_published(page, tmp_path):
     }
 
 
+@pytest.mark.slow
 def test_demonstrations_are_compared_with_none_where_there_are_any(page, tmp_path):
     plain = ("SAC-Internal", "sac", "internal")
     taught = ("BC-Internal", "bc", "internal")

@@ -94,6 +94,7 @@ def test_the_fluoroscopy_of_a_state_shows_where_the_head_is(pushed):
         cathsim_dmc.fluoroscopy(env, kontrast=1)
 
 
+@pytest.mark.slow
 def test_a_picture_shows_every_panel_and_is_the_same_again(pushed):
     env, episode = pushed
     figure = cathsim_dmc.show(env)

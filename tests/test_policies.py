@@ -14,7 +14,7 @@ from cathsim_dmc.recording import Episode
 
 TASK = "type1_bca"
 SHORT = {"max_steps": 12}
-QUICK = ("expert",)
+QUICK = ("push",)
 
 
 @pytest.mark.parametrize(

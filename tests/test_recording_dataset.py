@@ -81,6 +81,7 @@ def test_images_are_bytes_in_the_dataset(episodes, directory):
     assert data.observations["image"].dtype == np.uint8
 
 
+@pytest.mark.slow
 def test_torchrl_loads_the_dataset(episodes, directory):
     export(episodes, DATASET, observation="tracking")
     # In a process of its own, which knows nothing of cathsim_dmc.

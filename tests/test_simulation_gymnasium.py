@@ -102,6 +102,7 @@ def _everywhere(objective):
     return dataclasses.replace(objective, branch=wide, ostium=-1.0)
 
 
+@pytest.mark.slow
 def test_render_shows_the_device_as_it_goes():
     env = gymnasium.make(TASK, render_mode="rgb_array", fluoroscopy={"size": 96})
     env.reset(seed=0)

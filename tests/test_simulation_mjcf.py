@@ -78,6 +78,7 @@ def test_what_success_is_stands_beside_the_scene(exported):
     assert task["substeps"] * 0.004 == pytest.approx(task["control_timestep"])
 
 
+@pytest.mark.slow
 def test_what_cannot_be_written_is_refused_before(tmp_path):
     with pytest.raises(ValueError, match="no task 'type9'"):
         write_mjcf("type9", tmp_path / "a")

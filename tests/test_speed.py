@@ -34,6 +34,7 @@ def test_every_step_of_a_pace_falls_into_one_depth(environment):
     assert table["300+ mm"]["steps_per_second"] == pytest.approx(25)
 
 
+@pytest.mark.slow
 def test_the_account_adds_up_and_leaves_nothing_behind(environment):
     # The last part is a difference of two measurements: the median of several runs.
     table = pace.account(pace.RANDOM, steps=20, runs=7)

@@ -123,6 +123,7 @@ def test_noise_does_not_change_where_the_device_starts(anatomy):
     )
 
 
+@pytest.mark.slow
 def test_biplane_sees_both_views(anatomy):
     env = make(
         anatomy,

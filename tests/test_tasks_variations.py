@@ -146,6 +146,7 @@ def test_the_model_takes_what_was_drawn_and_gives_it_back(anatomy):
     np.testing.assert_array_equal(model.body_quat[bodies], usual["body_quat"][bodies])
 
 
+@pytest.mark.slow
 def test_roll_turns_the_plane_in_which_the_tip_bends(anatomy):
     def bent(roll):
         env = make(anatomy, {"roll": (roll, roll), "start_radius": 0.0})
