@@ -1,6 +1,7 @@
 """What `cathsim eval` and `record` do: evaluations, heatmaps, recordings."""
 
 import dataclasses
+import functools
 import time
 from collections.abc import Mapping
 from pathlib import Path
@@ -174,26 +175,20 @@ def evaluate(
         if backend == "batched":
             contacts(env, running)
 
-    result = evaluation.evaluate(
-        policy,
-        task,
-        episodes,
-        seed,
-        task_kwargs=task_kwargs,
+    play = functools.partial(
+        evaluation.evaluate,
+        episodes=episodes,
+        seed=seed,
         backend=backend,
         num_threads=num_threads,
-        observer=observe,
     )
+    result = play(policy, task, task_kwargs=task_kwargs, observer=observe)
     other = comparison = None
     if baseline and str(policy) != "random":
-        other = evaluation.evaluate(
+        other = play(
             "random",
             result.task,
-            episodes,
-            seed,
             task_kwargs=result.settings["task_kwargs"],
-            backend=backend,
-            num_threads=num_threads,
             observer=SignOfLife("random"),
         )
         comparison = evaluation.compare(result, other)

@@ -88,12 +88,12 @@ def _factors() -> tuple[list[Check], dict[str, dict[str, dict[str, float]]]]:
                 runs.append((one, one.factor * (humanoid[-2] + humanoid[-1]) / 2))
         step = statistics.median(humanoid)
         for scene, runs, bar in zip(_SCENES, paces, bars, strict=True):
-            one = runs[-1][0]
-            factor = statistics.median(pace.factor for pace, _ in runs)
+            factor = statistics.median(one.factor for one, _ in runs)
             table[scene][drive] = {
                 "real_time_factor": factor,
                 "humanoid_step_microseconds": step,
             }
+            one, _ = runs[-1]
             note = (
                 f"{factor:.1f} x real time, humanoid {step:.1f} µs; "
                 f"{one.contacts.mean():.1f} contacts, {one.insertion[-1] * 1e3:.0f} mm"

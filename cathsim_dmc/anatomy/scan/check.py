@@ -12,6 +12,7 @@ from scipy.spatial import cKDTree
 from cathsim_dmc.anatomy.anatomy import Anatomy
 from cathsim_dmc.anatomy.centreline import Vessel
 from cathsim_dmc.anatomy.scan.mesh_depth import MeshDepth
+from cathsim_dmc.anatomy.scan.naming import ARCH_BRANCHES
 from cathsim_dmc.anatomy.scan.tree import END_TRIM, TAIL, TAIL_RADIUS
 from cathsim_dmc.anatomy.wall.depth import DepthField
 from cathsim_dmc.anatomy.wall.pieces import INLET_HOLE_RADIUS
@@ -23,7 +24,6 @@ FREE_RADII = 4.0
 NARROW_END = 1.2  # of `TAIL_RADIUS`: a vessel that ends no wider was cut off there
 JOINS = 15e-3  # m of lumen between the end of a vessel and another that it joins
 PASSABLE = 0.6e-3  # m, depth of a lumen that counts as going on
-ARCH_BRANCHES = ("bca", "lcca", "lsa")  # in their order from the heart
 BESIDE = 15e-3  # m that two vessels may run in one lumen beyond their parting
 VOLUME = (0.5e-6, 2e-3)  # m^3 of a lumen
 RADIUS = (0.3e-3, 30e-3)  # m, median of a vessel
@@ -162,31 +162,26 @@ def _sides(anatomy: Anatomy) -> TreeCheck:
     not what it was said to be, has its LSA where the BCA is looked for.
     """
     tree, wrong = anatomy.tree, []
+    root = tree.root
     vessels = [tree.vessels[key] for key in ARCH_BRANCHES if key in tree.vessels]
-    vessels = [vessel for vessel in vessels if vessel.parent == tree.root.name]
-    if len(vessels) < 2:
-        return _finding("branches of the arch on their sides", wrong, "no arch")
-    aorta = tree.root.centreline
-    place = [aorta.project(v.centreline.at(v.ostium).position) for v in vessels]
-    along = np.diff([one.arc_length for one in place])
+    vessels = [vessel for vessel in vessels if vessel.parent == root.name]
+    names = [vessel.name for vessel in vessels]
+    ostia = [vessel.centreline.at(vessel.ostium).position for vessel in vessels]
+    along = np.diff([root.centreline.project(ostium).arc_length for ostium in ostia])
     if (along > 0).any() and (along < 0).any():
-        names = ", ".join(vessel.name for vessel in vessels)
-        wrong.append(f"{names} do not leave {tree.root.name} in this order")
-    first, last = (
-        vessel.centreline.at(vessel.ostium) for vessel in (vessels[0], vessels[-1])
-    )
-    left, back, _ = last.position - first.position
-    if left + back < 0.0:
-        wrong.append(
-            f"{vessels[-1].name} leaves {tree.root.name} {1e3 * abs(left):.0f} mm to "
-            f"the {'left' if left > 0 else 'right'} and {1e3 * abs(back):.0f} mm to "
-            f"the {'back' if back > 0 else 'front'} of {vessels[0].name}: the scan "
-            "does not lie in the frame that was given, or its inlet is at the other "
-            "end of the aorta"
-        )
-    return _finding(
-        "branches of the arch on their sides", wrong, f"{len(vessels)} in order"
-    )
+        wrong.append(f"{', '.join(names)} do not leave {root.name} in this order")
+    if len(vessels) > 1:
+        left, back, _ = ostia[-1] - ostia[0]
+        if left + back < 0.0:
+            wrong.append(
+                f"{names[-1]} leaves {root.name} {1e3 * abs(left):.0f} mm to the "
+                f"{'left' if left > 0 else 'right'} and {1e3 * abs(back):.0f} mm to "
+                f"the {'back' if back > 0 else 'front'} of {names[0]}: the scan does "
+                "not lie in the frame that was given, or its inlet is at the other "
+                "end of the aorta"
+            )
+    fine = f"{len(vessels)} in order" if len(vessels) > 1 else "no arch"
+    return _finding("branches of the arch on their sides", wrong, fine)
 
 
 def _free_ends(anatomy: Anatomy, measure: MeshDepth) -> TreeCheck:

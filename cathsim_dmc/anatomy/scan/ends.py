@@ -184,22 +184,23 @@ def plan_inlet(
     elif curves:
         chosen = _chosen_by_curves(ways, ends, nodes, at_goal, curves)
     else:
-        wide = np.flatnonzero(width >= WIDE * width.max())
+        wide = np.flatnonzero(width >= WIDE * width.max()).tolist()
         root = int(width.argmax())
-        others = [k for k in wide if k != root and _arched(ways, nodes[root], nodes[k])]
+        before = ways.deepest_from(nodes[root])
+        to = {k: ways.points[ways.trace(before, nodes[k])] for k in wide if k != root}
+        others = [k for k, way in to.items() if _arched(way)]
         # From the heart an aorta turns back; other trees are entered by their trunk.
         reach = ways.lengths_from(nodes[root])[nodes]
-        chosen = int(max(others, key=lambda k: reach[k])) if others else root
+        chosen = max(others, key=lambda k: reach[k]) if others else root
         # A heart that was cut off above its root may be the narrower end.
-        if others and _behind(ways, nodes[root], nodes[chosen]) < -BEHIND:
+        if others and _behind(to[chosen]) < -BEHIND:
             chosen = root
     far = _far_end(ways, ends, at_goal, nodes[chosen], curves, chosen)
     return Entry(position[chosen], True, far)
 
 
-def _arched(ways: Ways, heart: int, node: int) -> bool:
-    """Whether the way from one end to another turns back, as an aortic arch does."""
-    way = ways.points[ways.trace(ways.deepest_from(heart), node)]
+def _arched(way: np.ndarray) -> bool:
+    """Whether a way (n, 3) between two ends turns back, as an aortic arch does."""
     # From its top both ends lie on one side.
     to_heart, to_end = way[0] - way, way[-1] - way
     one, other = (np.linalg.norm(each, axis=1) for each in (to_heart, to_end))
@@ -207,12 +208,11 @@ def _arched(ways: Ways, heart: int, node: int) -> bool:
     return bool((cosine[(one > LEG) & (other > LEG)] > 0.5).any())
 
 
-def _behind(ways: Ways, one: int, other: int) -> float:
-    """How far (m) the leg of an arch at its other end lies behind that at the one.
+def _behind(way: np.ndarray) -> float:
+    """How far (m) the last leg of an arch (n, 3) lies behind its first.
 
     Both are taken at the height of the higher end; +y is the patient's back.
     """
-    way = ways.points[ways.trace(ways.deepest_from(one), other)]
     height = max(way[0, 2], way[-1, 2])
     top = int(way[:, 2].argmax())
     legs = way[: top + 1], way[top:]

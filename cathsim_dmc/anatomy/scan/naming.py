@@ -9,6 +9,7 @@ import numpy as np
 
 from cathsim_dmc.anatomy.scan.centring import resample
 
+ARCH_BRANCHES = ("bca", "lcca", "lsa")  # in their order from the heart
 ARCH = 220e-3  # m from the root's far end, in which the arch's branches leave
 CORONARY = 15e-3  # m from there, within which no branch of the arch leaves
 SHARED = 8e-3  # m beyond the root; curves that share more are one branch of the arch
@@ -107,7 +108,7 @@ def _arch_names(root, curves, leave, near) -> dict[int, str]:
 def _order(curves, leave, groups, up) -> list[str]:
     """Which branch of the arch each group is, or nothing where it is not clear."""
     if len(groups) == 3:
-        return ["bca", "lcca", "lsa"]
+        return list(ARCH_BRANCHES)
     if len(groups) == 2:
         return ["bovine", "lsa"]
     if len(groups) == 4 and len(groups[2]) == 1:
