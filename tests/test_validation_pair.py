@@ -87,7 +87,7 @@ def test_depth_and_law_agree_with_the_iteration_in_which_they_settle():
 
 @pytest.mark.slow
 def test_a_jammed_pair_lies_still():
-    jammed = pressed.jam()
+    jammed = pressed.jam(pair.PAIR)
     assert jammed.push_force > 1.0 and jammed.penetration < 0.3e-3
     least, largest = jammed.forces
     assert least > 0.5 and largest < 5.0

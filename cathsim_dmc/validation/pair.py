@@ -305,7 +305,7 @@ def validate_pair(figure_path: str | Path | None = None) -> Report:
     for end in ("sliding", "fixed"):
         checks.append(rod.buckling_check("buckling load of the pair", buckling(end)))
     checks.append(_smoothness())
-    checks += pressed.checks()
+    checks += pressed.checks(PAIR)
     moving = sliding.checks()
     checks += moving.checks
     if figure_path is not None:

@@ -22,7 +22,6 @@ _SETTLING, _WATCHED = 1200, 300  # physics steps
 RIPPLE = 1e-3  # mm, of the depth under a dead load
 DEPTH = 0.3  # mm, 99th percentile; as in the soak
 
-PAIR = ("wire_035_glide", "berenstein_5f")
 _JAMMED = 2.0  # s, of pushing with the stroke used up
 _END = 1.0  # s, of it that counts
 
@@ -90,8 +89,12 @@ class Jam:
     forces: tuple[float, float]
 
 
-def jam() -> Jam:
-    """Pushes both devices at full speed to the end of their stroke, and on."""
+def jam(pair: tuple[str, str]) -> Jam:
+    """Pushes both devices at full speed to the end of their stroke, and on.
+
+    Args:
+        pair: Names of guidewire and catheter.
+    """
     environment = suite.load(
         suite.DOMAIN,
         "navigate",
@@ -99,7 +102,7 @@ def jam() -> Jam:
             "anatomy": tube(bent=False),
             "goal": "end",
             "goal_radius": 1e-6,
-            "devices": PAIR,
+            "devices": pair,
             "random": 0,
             "observation": "tracking",
         },
@@ -125,11 +128,15 @@ def jam() -> Jam:
     return found
 
 
-def checks() -> list[Check]:
-    """Presses and jams, and judges both."""
+def checks(pair: tuple[str, str]) -> list[Check]:
+    """Presses a mass and jams a pair, and judges both.
+
+    Args:
+        pair: Names of guidewire and catheter.
+    """
     masses = [pressed(load) for load in LOADS]
     worst = max(masses, key=lambda one: one.ripple)
-    jammed = jam()
+    jammed = jam(pair)
     least, largest = jammed.forces
     return [
         Check.at_most(
