@@ -46,6 +46,12 @@ def test_a_cell_makes_the_settings_of_its_training(grid):
     assert config.clip == 0.2  # of the preset
 
 
+def test_settings_may_name_the_run_of_the_same_task(grid):
+    more = 'settings = { initial_policy = "runs/{task}-bc" }\n'
+    policies = [cell.config().initial_policy for cell in grid(ROW + more)[:2]]
+    assert policies == ["runs/type1_bca-bc", "runs/type1_lcca-bc"]
+
+
 def test_frames_may_differ_between_tasks(grid):
     text = ROW.replace("= 1000", "= { type1_bca = 500, type1_lcca = 700 }")
     assert [cell.total_frames for cell in grid(text)[:2]] == [500, 700]

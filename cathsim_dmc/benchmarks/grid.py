@@ -55,7 +55,8 @@ class Cell:
         seed: Seed of networks, exploration and environments.
         total_frames: Number of control steps to train for.
         settings: Further fields of the algorithm's settings; `task_kwargs` in them
-            are added to those of the preset.
+            are added to those of the preset, and `{task}` in a string stands for the
+            name of the task.
         variant: Further part of the name, for two rows that differ in settings only.
         evaluation: What differs from the published evaluation: `task`, `episodes`,
             `task_kwargs`; or `each_arch`, a set of random arches to play one episode
@@ -88,7 +89,12 @@ class Cell:
         Raises:
             ConfigError: unknown algorithm, preset or field, or a value not allowed.
         """
-        settings = dict(self.settings)
+        settings = {
+            name: value.replace("{task}", self.task)
+            if isinstance(value, str)
+            else value
+            for name, value in self.settings.items()
+        }
         added = settings.pop("task_kwargs", {})
         config = make_config(
             self.algorithm,
