@@ -232,6 +232,9 @@ def load(
 def environment(task: Navigation, **environment_kwargs: Any) -> composer.Environment:
     """The composer environment of a task, with the settings that the suite uses.
 
+    The MJCF model of the task is compiled here, and not again: what is to change in it
+    changes before.
+
     Args:
       task: Task that no other environment owns.
       **environment_kwargs: Arguments of `composer.Environment` that differ.
