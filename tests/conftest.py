@@ -1,6 +1,7 @@
 """Environments that many tests share; loading one takes a second."""
 
 import contextlib
+import gc
 
 import hypothesis
 import numpy as np
@@ -19,6 +20,17 @@ EACH_TASK = [
     for name, quick in zip(TASKS, (False, True, True, False), strict=True)
 ]
 SHORT_EPISODE = 12  # control steps
+
+
+def pytest_collection_finish():
+    """Leaves what the imports have made out of all later garbage collections.
+
+    A scene is made of so many small objects that each one built begins a full
+    collection, which with torch in memory takes longer than the building.
+    """
+    gc.collect()
+    gc.freeze()
+    gc.set_threshold(5_000, 10, 10)
 
 
 @pytest.fixture(autouse=True, scope="session")

@@ -33,7 +33,7 @@ def small_ppo(**changes):
             "num_envs": 16,
             "steps_per_update": 512,
             "minibatch_size": 128,
-            "epochs": 6,
+            "epochs": 2,
             "learning_rate": 1e-3,
             "total_frames": 1_024,
             "metrics_frames": 512,
@@ -76,7 +76,7 @@ def without_clocks(rows):
 
 @pytest.mark.slow
 def test_ppo_learns_to_reach(tmp_path):
-    run(small_ppo(total_frames=10_240), tmp_path)
+    run(small_ppo(total_frames=10_240, epochs=6), tmp_path)
     rewards = [row["episode_reward"] for row in read_metrics(tmp_path / "metrics.csv")]
     assert rewards[-1] > rewards[1] + 15
 
