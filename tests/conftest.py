@@ -1,6 +1,7 @@
 """Environments that many tests share; loading one takes a second."""
 
 import contextlib
+import dataclasses
 import gc
 
 import hypothesis
@@ -8,6 +9,7 @@ import numpy as np
 import pytest
 
 from cathsim_dmc import suite
+from cathsim_dmc.tasks.navigation import Navigation
 
 # A first call may import scipy or compile; how long it takes is not what is tested.
 hypothesis.settings.register_profile("default", deadline=None)
@@ -20,6 +22,26 @@ EACH_TASK = [
     for name, quick in zip(TASKS, (False, True, True, False), strict=True)
 ]
 SHORT_EPISODE = 12  # control steps
+
+
+def twin(task, seed=0, **changes):
+    """A task on the scene, built already, of another one; for an environment of its own.
+
+    Building a scene takes as long as compiling it. No episode changes one: all that an
+    environment changes is in the model that it compiles.
+
+    Args:
+        task: What to share the scene, the anatomies and the objective of.
+        seed: Seed of the twin.
+        **changes: Fields of the configuration that the scene does not depend on, such
+            as observations, images, and what is randomised but for the goal.
+    """
+    config = dataclasses.replace(task.config, **changes)
+    assert config.ranges.farthest_shift == task.config.ranges.farthest_shift
+    other = Navigation(task.scene, task.objective, config, seed, name=task.name)
+    assert not task._cases or other._fluoroscopy == task._fluoroscopy
+    other._cases = task._cases
+    return other
 
 
 def pytest_collection_finish():
