@@ -25,7 +25,7 @@ SHORT_EPISODE = 12  # control steps
 
 
 def twin(task, seed=0, **changes):
-    """A task on the scene, built already, of another one; for an environment of its own.
+    """Another task on the scene of one that is built already.
 
     Building a scene takes as long as compiling it. No episode changes one: all that an
     environment changes is in the model that it compiles.

@@ -7,7 +7,7 @@ import mujoco
 import numpy as np
 import pytest
 from absl.testing import absltest
-from conftest import EACH_TASK, SHORT_EPISODE, TASKS
+from conftest import EACH_TASK, SHORT_EPISODE, TASKS, twin
 from dm_control import suite as dm_suite
 from dm_env import specs, test_utils
 from scipy.stats import qmc
@@ -185,9 +185,9 @@ def test_start_is_randomised_within_a_millimetre(shared_environment, task_name):
         heads.append(environment.task.readings.head)
     heads = np.array(heads)
     assert len(np.unique(heads.round(9), axis=0)) == len(heads)
-    settled = suite.load("cathsim", task_name, {"randomisation": {"start_radius": 0.0}})
-    settled.reset()
-    displacement = np.linalg.norm(heads - settled.task.readings.head, axis=-1)
+    task = twin(environment.task, randomisation={"start_radius": 0.0})
+    suite.environment(task).reset()
+    displacement = np.linalg.norm(heads - task.readings.head, axis=-1)
     assert 0.3e-3 < displacement.max() < 1.02e-3
 
 
@@ -280,7 +280,7 @@ def test_other_domains_load_too():
 
 def test_environment_kwargs_reach_composer():
     environment = suite.load(
-        "cathsim", "type1_bca", environment_kwargs={"time_limit": 0.1}
+        "cathsim", "simple1_bca", environment_kwargs={"time_limit": 0.1}
     )
     environment.reset()
     last = [environment.step(np.zeros(21)).last() for _ in range(3)]
@@ -293,7 +293,8 @@ def test_environment_kwargs_reach_composer():
 
 @pytest.mark.parametrize("task_name", EACH_TASK)
 def test_time_out_comes_at_max_steps_with_discount_one(shared_environment, task_name):
-    environment = shared_environment(task_name, max_steps=SHORT_EPISODE)
+    task = twin(shared_environment(task_name).task, max_steps=SHORT_EPISODE)
+    environment = suite.environment(task)
     environment.reset()
     steps = [environment.step(np.zeros(21)) for _ in range(SHORT_EPISODE)]
     assert [step.last() for step in steps] == [False] * (SHORT_EPISODE - 1) + [True]
@@ -400,7 +401,7 @@ def test_time_out_one_step_before_success(near_goal, reseed, monkeypatch):
 
 
 def test_time_is_exactly_the_control_steps(shared_environment):
-    environment = shared_environment("type1_bca")
+    environment = shared_environment("type1_lcca")
     environment.reset()
     for step in range(1, 4):
         environment.step(np.zeros(21))
@@ -408,7 +409,7 @@ def test_time_is_exactly_the_control_steps(shared_environment):
 
 
 def test_step_types_are_dm_env_s(shared_environment):
-    environment = shared_environment("type1_bca")
+    environment = shared_environment("type1_lcca")
     assert environment.reset().step_type is dm_env.StepType.FIRST
     assert environment.step(np.zeros(21)).step_type is dm_env.StepType.MID
 

@@ -10,7 +10,6 @@ from test_parity import PICTURES, Pair, actions
 from cathsim_dmc import policies, suite
 from cathsim_dmc.anatomy.arch import arch
 from cathsim_dmc.policies.expert import Expert
-from cathsim_dmc.simulation.batch import BatchSimulation
 from cathsim_dmc.tasks import cases, placement
 from cathsim_dmc.tasks.config import NavigationConfig
 from cathsim_dmc.tasks.navigation import Navigation
