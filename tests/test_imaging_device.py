@@ -111,7 +111,7 @@ def test_a_disc_beside_the_image_is_cut_at_its_edge(radius, row, column):
 
 @pytest.mark.parametrize(
     ("view", "resolution", "supersample"),
-    [(view, 128, 16) for view in VIEWS] + [("LAO45", 256, 8)],
+    [(view, 128, 12) for view in VIEWS] + [("LAO45", 256, 8)],
 )
 def test_tilted_capsule_of_catheter_size(view, resolution, supersample):
     carm = CArm.view(view, resolution=(resolution, resolution))
