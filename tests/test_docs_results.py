@@ -87,7 +87,7 @@ def test_a_task_of_its_own_stands_beside_the_expert(page, tmp_path):
     )
     code, text = page()
     assert code == 0
-    assert line_of(text, "| arch_bca | PPO, any arch | 1 | 80 %")[-1] == "–"
+    assert line_of(text, "| arch_bca | PPO, any arch | 1 | 80 %")[-1] == "100 %"
 
 
 def test_without_results_everything_is_missing(page, tmp_path):

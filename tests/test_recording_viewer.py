@@ -1,3 +1,5 @@
+import contextlib
+import os
 import signal
 import socket
 import subprocess
@@ -90,6 +92,8 @@ def test_a_browser_gets_a_page(recording):
         probe.bind(("127.0.0.1", 0))
         port = probe.getsockname()[1]
     code = (
+        # A shell starts what runs in the background deaf to Ctrl-C.
+        "import signal; signal.signal(signal.SIGINT, signal.default_int_handler); "
         "from cathsim_dmc.recording import open_viewer; "
         f"open_viewer({str(recording)!r}, web=True, port={port})"
     )
@@ -111,8 +115,10 @@ def test_a_browser_gets_a_page(recording):
                 time.sleep(0.1)
         assert "Rerun" in text
     finally:
-        # As Ctrl-C does in a terminal: to the whole group.
-        import os
-
-        os.killpg(server.pid, signal.SIGINT)
-        assert server.wait(timeout=20) == 0
+        try:
+            # As Ctrl-C does in a terminal: to the whole group.
+            os.killpg(server.pid, signal.SIGINT)
+            assert server.wait(timeout=20) == 0
+        finally:
+            with contextlib.suppress(ProcessLookupError):
+                os.killpg(server.pid, signal.SIGKILL)

@@ -273,6 +273,33 @@ def test_dm_control_loads_the_task(shared_environment, reseed, task_name):
     environment.close()
 
 
+def test_a_model_is_compiled_once_unless_a_hook_may_have_changed_it(
+    shared_environment,
+):
+    task = shared_environment("type1_lcca").task
+    environment, hooked = (suite.environment(twin(task)) for _ in range(2))
+    called = []
+    hooked.add_extra_hook("initialize_episode_mjcf", called.append)
+    for env, times in ((environment, 0), (hooked, 1)):
+        model = env.physics.model.ptr
+        env.reset()
+        env.reset()
+        assert (env.physics.model.ptr is model) == (times == 0)
+        assert len(called) == times
+        env.close()
+
+
+@pytest.mark.parametrize(
+    "options", [{"random": -1}, {"observation": "pixels"}, {"friction": -1.0}]
+)
+def test_wrong_options_are_refused_before_an_anatomy_is_made(monkeypatch, options):
+    for name in ("load_anatomy", "load_arches"):
+        monkeypatch.setattr(suite, name, lambda *_, **__: pytest.fail("work is lost"))
+    for task in ("type1_bca", "arch_bca"):
+        with pytest.raises(ValueError, match=next(iter(options))):
+            suite.make_task(task, **options)
+
+
 def test_other_domains_load_too():
     environment = suite.load("cartpole", "balance", task_kwargs={"random": 1})
     assert environment.reset().first()

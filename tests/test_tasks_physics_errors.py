@@ -11,6 +11,7 @@ from cathsim_dmc import suite
 from cathsim_dmc.anatomy.arch import arch
 from cathsim_dmc.simulation import batch
 from cathsim_dmc.tasks import physics_errors as physics_errors
+from cathsim_dmc.tasks.variations import Episode
 
 
 @pytest.fixture
@@ -70,9 +71,11 @@ def test_exploding_force_ends_the_episode_as_a_physics_error(
     assert task.error is None
 
 
-def test_a_dump_replays_the_episode(dumps, load, monkeypatch):
+@pytest.mark.parametrize("randomised", [False, True])
+def test_a_dump_replays_the_episode(randomised, dumps, monkeypatch):
     monkeypatch.setattr(physics_errors, "MAX_FORCE", 1e-5)
-    environment = load()
+    task = suite.make_task("type1_bca", randomisation=randomised)
+    environment = suite.environment(twin(task, 3))
     timestep = environment.reset()
     while not timestep.last():
         timestep = environment.step(_push(environment))
@@ -81,14 +84,16 @@ def test_a_dump_replays_the_episode(dumps, load, monkeypatch):
     meta, state, actions = physics_errors.load(path)
     assert meta["reason"] == physics_errors.EXPLODED
     assert meta["task"]["goal"] == "bca"
-    again = load()
+    assert (meta["drawn"]["friction"] is not None) == randomised
+    again = suite.environment(twin(task, 4))  # not what it drew
     again.reset()
+    rollout, substeps = again.task.rollout, again.task.substeps
     model, data = again.physics.model.ptr, again.physics.data.ptr
+    rollout.take(0, Episode.from_motion(meta["drawn"]))
     mujoco.mj_setState(model, data, state, mujoco.mjtState.mjSTATE_INTEGRATION)
     for action in actions:
-        again.task.rollout.pose_robot(data.qpos[None])
-        data.ctrl[:] = action
-        for _ in range(again.task.substeps):
+        data.ctrl[:] = rollout.command(action[None], lambda: state[None])[0]
+        for _ in range(substeps):
             mujoco.mj_step(model, data)
     np.testing.assert_array_equal(data.qpos, final)
 
@@ -134,7 +139,11 @@ def test_a_dump_may_be_read_by_whom_the_umask_says(dumps):
     before = os.umask(0o027)
     try:
         path = physics_errors.dump(
-            "tried", task={}, state=np.zeros(3), actions=np.zeros((2, 3))
+            "tried",
+            task={},
+            episode=Episode(displacement=np.zeros(3)),
+            state=np.zeros(3),
+            actions=np.zeros((2, 3)),
         )
     finally:
         os.umask(before)

@@ -135,12 +135,37 @@ class BatchSimulation:
         batch = self._batch
         action = check_action(action, (batch.nsim, self.num_actions))
         batch.ctrl[:] = self._rollout.command(action, lambda: batch.state)
-        warnings = batch.warning.copy()
+        before, warnings = batch.state.copy(), batch.warning.copy()
         batch.rollout(
             self._substeps, record=("sensordata",), out={"sensordata": self._rows}
         )
-        warned = (batch.warning != warnings).reshape(self.num_simulations, -1).any(-1)
-        return _own(self._rollout.finish(self._magnitudes(), warned))
+        warned, magnitudes = self._warned(warnings), self._magnitudes()
+        contacts = self._rows[..., self._rollout.index.wall_contacts]
+        coarse = forces.too_coarse(magnitudes, contacts) & ~warned
+        if coarse.any():
+            self._refine(np.flatnonzero(coarse), before)
+            warned, magnitudes = self._warned(warnings), self._magnitudes()
+        return _own(self._rollout.finish(magnitudes, warned))
+
+    def _refine(self, indices: np.ndarray, before: np.ndarray) -> None:
+        """Does the control step of some simulations again, with shorter steps.
+
+        Args:
+          indices: Numbers of the simulations.
+          before: (N, nstate), states before the control step, with the commands.
+        """
+        self._batch.state[indices] = before[indices]
+        with self._models.shorter_steps(indices):
+            record = self._batch.rollout(
+                forces.REFINEMENT * self._substeps, record=("sensordata",), ids=indices
+            )
+        last = slice(forces.REFINEMENT - 1, None, forces.REFINEMENT)
+        self._rows[indices] = record["sensordata"][:, last]
+
+    def _warned(self, before: np.ndarray) -> np.ndarray:
+        """Whether MuJoCo has warned in each simulation (N,) since some counts."""
+        changed = self._batch.warning != before
+        return changed.reshape(self.num_simulations, -1).any(-1)
 
     def _magnitudes(self) -> np.ndarray:
         """Contact forces on the wall (N, S, M) in the S physics steps, N."""
@@ -217,6 +242,16 @@ class _Fields:
         finally:
             flags[indices] &= ~_ACTUATION
 
+    @contextmanager
+    def shorter_steps(self, indices: np.ndarray) -> Iterator[None]:
+        """Shortens the physics steps of some simulations for a while."""
+        timesteps = self._batch.expand("opt.timestep")
+        timesteps[indices] /= forces.REFINEMENT
+        try:
+            yield
+        finally:
+            timesteps[indices] *= forces.REFINEMENT
+
 
 class _Models:
     """A model for each anatomy, shared by the simulations that have drawn it.
@@ -244,16 +279,34 @@ class _Models:
     @contextmanager
     def unactuated(self, indices: np.ndarray) -> Iterator[None]:
         """Switches the actuators of some simulations off for a while."""
-        chosen = {id(m): m for m in (self._models[index] for index in indices)}
-        for model in chosen.values():
+        chosen = self._chosen(indices)
+        for model in chosen:
             model.opt.disableflags |= _ACTUATION
         self._batch.set_models(self._models)
         try:
             yield
         finally:
-            for model in chosen.values():
+            for model in chosen:
                 model.opt.disableflags &= ~_ACTUATION
             self._batch.set_models(self._models)
+
+    @contextmanager
+    def shorter_steps(self, indices: np.ndarray) -> Iterator[None]:
+        """Shortens the physics steps of some simulations for a while."""
+        chosen = self._chosen(indices)
+        for model in chosen:
+            model.opt.timestep /= forces.REFINEMENT
+        self._batch.set_models(self._models)
+        try:
+            yield
+        finally:
+            for model in chosen:
+                model.opt.timestep *= forces.REFINEMENT
+            self._batch.set_models(self._models)
+
+    def _chosen(self, indices: np.ndarray) -> list[mujoco.MjModel]:
+        """The models of some simulations, each once."""
+        return list({id(m): m for m in (self._models[i] for i in indices)}.values())
 
 
 class _OwnModels(_Models):

@@ -9,6 +9,15 @@ import numpy as np
 # The order is MuJoCo's own, whatever the order in the model file.
 CONTACT_SIZE = 1 + 3 + 1 + 3 + 3 + 3
 
+# A physics step was too long if it ends with a contact harder, N, or deeper, m, than
+# this: something crossed the lumen in it and hit the wall. Deeper than its radius, the
+# device is pushed out of the pieces of the wall on whatever side is nearest.
+HARDEST = 5.0
+DEEPEST = 0.8e-3
+# The control step is then done again with steps so many times shorter; a power of two,
+# which divides exactly.
+REFINEMENT = 4
+
 
 def _slots(row: np.ndarray) -> np.ndarray:
     """The sensor's row (..., K * 14) contact by contact (..., K, 14)."""
@@ -72,6 +81,22 @@ def magnitudes(row: np.ndarray) -> np.ndarray:
     occupied = min(int(slots[..., 0, 0].max()), slots.shape[-2])
     force = slots[..., :occupied, 1:4]
     return np.sqrt(np.vecdot(force, force))
+
+
+def too_coarse(magnitude: np.ndarray, rows: np.ndarray) -> np.ndarray:
+    """Whether control steps need shorter physics steps.
+
+    Args:
+      magnitude: (..., S, M), N, of the contacts in S physics steps.
+      rows: (..., S, K * 14) of the sensor, with K >= M.
+
+    Returns:
+      (...) bool: some contact is harder than `HARDEST` or deeper than `DEEPEST`.
+    """
+    # Without `_slots`, which copies long rows that are not contiguous.
+    distance = rows[..., 4 : magnitude.shape[-1] * CONTACT_SIZE : CONTACT_SIZE]
+    wrong = (magnitude > HARDEST) | (distance < -DEEPEST)
+    return wrong.any((-2, -1))
 
 
 class ContactHistory:

@@ -189,6 +189,7 @@ class Navigation(composer.Task):
         self._substeps = self.substeps  # which asks the MJCF model, and takes its time
         self._warnings = self._data.warning.number  # not a copy
         self._state = np.zeros(mujoco.mj_stateSize(model, _STATE))
+        self._before = self._state.copy()  # the control step, with its command
         self._contacts = self._data.sensordata[self._rollout.index.wall_contacts]
         self._contact_history = forces.ContactHistory(
             self._substeps, len(self._contacts)
@@ -209,6 +210,7 @@ class Navigation(composer.Task):
         action = check_action(action, (self._num_actions,))
         control = self._rollout.command(action[None], self._read_state)
         self._data.ctrl[:] = control[0]
+        mujoco.mj_getState(self._model, self._data, self._before, _STATE)
         self._warned_before = self._warnings.tobytes()
         self._contact_history.clear()
         self._substep = 0
@@ -253,9 +255,28 @@ class Navigation(composer.Task):
     def after_step(self, physics, random_state):
         """Decides reward, success and end of the episode, once."""
         del physics, random_state
+        history = self._contact_history
         warned = self._warnings.tobytes() != self._warned_before
-        magnitudes = self._contact_history.magnitudes()[None]
-        self._step = self._rollout.finish(magnitudes, [warned])
+        magnitudes = history.magnitudes()
+        if magnitudes.size and not warned:
+            if forces.too_coarse(magnitudes, history.rows):
+                self._refine()
+                warned = self._warnings.tobytes() != self._warned_before
+                magnitudes = history.magnitudes()
+        self._step = self._rollout.finish(magnitudes[None], [warned])
+
+    def _refine(self):
+        """Does the control step again with shorter physics steps."""
+        model, data, history = self._model, self._data, self._contact_history
+        mujoco.mj_setState(model, data, self._before, _STATE)
+        history.clear()
+        timestep = model.opt.timestep
+        model.opt.timestep = timestep / forces.REFINEMENT
+        for substep in range(self._substeps):
+            for _ in range(forces.REFINEMENT):
+                mujoco.mj_step(model, data)
+            history.keep(substep, self._contacts)
+        model.opt.timestep = timestep
 
     def _current(self) -> Step:
         """The last control step, or the start of the episode, looked at once."""

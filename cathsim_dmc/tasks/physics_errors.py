@@ -15,6 +15,7 @@ import numpy as np
 from cathsim_dmc import bounds, files
 from cathsim_dmc.anatomy import Anatomy
 from cathsim_dmc.tasks.scene import Scene
+from cathsim_dmc.tasks.variations import Episode
 
 DIVERGED = "diverged"
 ESCAPED = "escaped through the wall"
@@ -31,7 +32,7 @@ _MOUTH = 2e-3
 # No contact of a device that is pushed with 5 N at most is harder than this, N.
 MAX_FORCE = 50.0
 
-_FORMAT = 1
+_FORMAT = 2
 _LARGEST = 2_000_000_000  # bytes of a dump, unpacked
 _LOG = logging.getLogger(__name__)
 
@@ -79,13 +80,15 @@ class PhysicsMonitor:
         self._task = task
         self._states: list[np.ndarray | None] = [None] * num_simulations
         self._fresh = set(range(num_simulations))  # whose state is not kept yet
+        self._episodes: list[Episode | None] = [None] * num_simulations
         # Actions (N, A) of all, and where in them the episode of each begins.
         self._actions: list[np.ndarray] = []
         self._first = [0] * num_simulations
 
-    def restart(self, index: int, scene: Scene) -> None:
+    def restart(self, index: int, scene: Scene, episode: Episode) -> None:
         """Forgets the episode of a simulation; the next one is in a scene."""
         self._scenes[index] = scene
+        self._episodes[index] = episode
         self._fresh.add(index)
         self._first[index] = len(self._actions)
         if unused := min(self._first):
@@ -151,6 +154,7 @@ class PhysicsMonitor:
                     reason,
                     task={"anatomy": self._scenes[index].anatomy.name, **self._task},
                     # Kept before the step that went wrong.
+                    episode=cast(Episode, self._episodes[index]),
                     state=cast(np.ndarray, self._states[index]),
                     actions=np.array(
                         [one[index] for one in self._actions[self._first[index] :]]
@@ -176,6 +180,7 @@ def dump(
     reason: str,
     *,
     task: dict[str, Any],
+    episode: Episode,
     state: np.ndarray,
     actions: np.ndarray,
     directory: str | Path | None = None,
@@ -185,6 +190,7 @@ def dump(
     Args:
       reason: what went wrong.
       task: JSON-able description of the task.
+      episode: What was drawn for it.
       state: (nstate,), MuJoCo's mjSTATE_INTEGRATION at the start of the episode.
       actions: (T, A) up to and with the one that failed.
       directory: where to; `CATHSIM_DUMP_DIR` or the system's temporary directory by
@@ -197,7 +203,9 @@ def dump(
         directory or os.environ.get("CATHSIM_DUMP_DIR") or tempfile.gettempdir()
     )
     directory.mkdir(parents=True, exist_ok=True)
-    meta = json.dumps({"format": _FORMAT, "reason": reason, "task": task})
+    meta = json.dumps(
+        {"format": _FORMAT, "reason": reason, "task": task, "drawn": episode.motion}
+    )
     path = directory / f"cathsim-error-{uuid.uuid4().hex[:12]}.npz"
     buffer = io.BytesIO()
     np.savez(buffer, meta=np.array(meta), state=state, actions=actions)
@@ -216,6 +224,10 @@ def dump(
 def load(path: str | Path) -> tuple[dict[str, Any], np.ndarray, np.ndarray]:
     """Reads a dump: description, start state (nstate,) and actions (T, A).
 
+    What was drawn for the episode is `drawn` in the description:
+    `Rollout.take(0, Episode.from_motion(meta["drawn"]))` gives it to a task that was
+    made with the same options.
+
     Raises:
       ValueError: if the file is no dump of this format.
     """
@@ -233,10 +245,14 @@ def load(path: str | Path) -> tuple[dict[str, Any], np.ndarray, np.ndarray]:
             f"{path} is no dump of an episode of format {_FORMAT}, which this version "
             "reads"
         )
-    for name, kind in (("reason", str), ("task", dict)):
+    for name, kind in (("reason", str), ("task", dict), ("drawn", dict)):
         if not isinstance(meta.get(name), kind):
             raise ValueError(
                 f"{path} is no dump of an episode: {name} is "
                 f"{bounds.shown(meta.get(name))}; it must be a {kind.__name__}"
             )
+    try:
+        Episode.from_motion(meta["drawn"])
+    except ValueError as error:
+        raise ValueError(f"{path} is no dump of an episode: {error}") from error
     return meta, state, actions

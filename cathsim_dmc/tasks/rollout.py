@@ -34,7 +34,7 @@ from cathsim_dmc.tasks.path_tracker import PathTracker
 from cathsim_dmc.tasks.physics_errors import PhysicsMonitor
 from cathsim_dmc.tasks.route import Routes
 from cathsim_dmc.tasks.step import Step
-from cathsim_dmc.tasks.variations import ActionDelay, ModelVariation
+from cathsim_dmc.tasks.variations import ActionDelay, Episode, ModelVariation
 
 
 class SimulationState(Protocol):
@@ -190,17 +190,27 @@ class Rollout:
             self._access.load(index, self.case(index))
         case = self.case(index)
         episode = self._config.ranges.draw(random_state)
-        field = self._access.field
-        fields = {name: field(index, name) for name in self._variation.fields}
-        self._variation.write(fields, episode)
-        self._delay.restart(index, episode.delay)
-        self._monitor.restart(index, case.scene)
-        self._sensors.restart(index, case.angiograph, episode.deviation)
-        self._goal_shift[index] = episode.goal_shift or 0.0
         displacement = case.start.clear_of_wall(episode.displacement)
         number = case.start.draw(random_state)
         qpos = self._state.qpos[index]
         case.start.write(qpos, displacement, episode.roll, number)
+        self.take(index, episode)
+
+    def take(self, index: int, episode: Episode) -> None:
+        """Takes what was drawn for one simulation, whose device is at its start.
+
+        Args:
+          index: Number of the simulation.
+          episode: What was drawn; its displacement is in the state already.
+        """
+        case = self.case(index)
+        field = self._access.field
+        fields = {name: field(index, name) for name in self._variation.fields}
+        self._variation.write(fields, episode)
+        self._delay.restart(index, episode.delay)
+        self._monitor.restart(index, case.scene, episode)
+        self._sensors.restart(index, case.angiograph, episode.deviation)
+        self._goal_shift[index] = episode.goal_shift or 0.0
         if self._coaxial is not None:
             self._coaxial.restart(index, episode.friction, episode.stiffness)
 

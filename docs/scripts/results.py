@@ -4,7 +4,8 @@
     python docs/scripts/results.py
 
 Nothing else is read but the published figures (docs/data/published_results.json), the
-expert's (docs/data/difficulty.json) and the grid, which says what is missing.
+expert's (docs/data/difficulty.json, test_arches.jsonl) and the grid, which says what is
+missing.
 """
 
 import argparse
@@ -28,6 +29,7 @@ from cathsim_dmc.benchmarks.runner import clock
 DOCS = Path(__file__).parents[1]
 PUBLISHED = DOCS / "data/published_results.json"
 DIFFICULTY = DOCS / "data/difficulty.json"
+TEST_ARCHES = DOCS / "data/test_arches.jsonl"
 PUBLISHED_TASKS = ("type1_bca", "type1_lcca", "type2_bca", "type2_lcca")
 # Where learning with and without demonstrations is compared, and who needs them.
 DEMONSTRATED, TAUGHT = "type1_lcca", ("bc", "dagger")
@@ -188,18 +190,13 @@ def beside_published(table):
 
 def other_tasks(table):
     """One table for all tasks that were not published, with the expert's figures."""
-    experts = {}
-    if DIFFICULTY.exists():
-        tasks = json.loads(DIFFICULTY.read_text())["findings"]["tasks"]
-        experts = {task: trials.get("expert") for task, trials in tasks.items()}
-    lines = []
+    experts, lines = expert_rates(), []
     for task, agents_ in table.items():
         if task in PUBLISHED_TASKS:
             continue
         for label, found in agents_.items():
             cells = [task, label, *figures_of(found), by_group(found)]
-            expert = experts.get(task)
-            cells.append(f"{100 * expert['success']:.0f} %" if expert else "–")
+            cells.append(percent(experts[task]) if task in experts else "–")
             lines.append(f"| {' | '.join(cells)} |")
     if not lines:
         return ""
@@ -214,6 +211,23 @@ def other_tasks(table):
             "",
         ]
     )
+
+
+def expert_rates():
+    """Success of the scripted expert, task: rate, as far as it was measured."""
+    rates = {}
+    if DIFFICULTY.exists():
+        tasks = json.loads(DIFFICULTY.read_text())["findings"]["tasks"]
+        for task, trials in tasks.items():
+            if "expert" in trials:
+                rates[task] = trials["expert"]["success"]
+    if TEST_ARCHES.exists():
+        ends = {}
+        for line in TEST_ARCHES.read_text().splitlines():
+            episode = json.loads(line)
+            ends.setdefault(episode["task"], []).append(episode["end"] == "success")
+        rates |= {task: sum(reached) / len(reached) for task, reached in ends.items()}
+    return rates
 
 
 def row(label, found, theirs):

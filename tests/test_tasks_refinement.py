@@ -1,0 +1,109 @@
+"""Control steps that are done again with shorter physics steps."""
+
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+
+from cathsim_dmc import suite
+from cathsim_dmc.simulation.batch import BatchSimulation
+from cathsim_dmc.tasks import forces, physics_errors
+from cathsim_dmc.tasks.variations import Episode
+
+# The last ten control steps of an episode of random actions: the device snaps across
+# the aorta and is as deep in the wall as it is thick after one physics step of 4 ms.
+_SNAP = Path(__file__).with_name("data") / "snap_through.npz"
+_STATE = mujoco.mjtState.mjSTATE_INTEGRATION
+
+
+def _snap():
+    """Wall forces, N, and physics steps of the recorded moment."""
+    meta, state, actions = physics_errors.load(_SNAP)
+    environment = suite.load("cathsim", "type1_lcca", {"randomisation": True})
+    environment.reset()
+    task, physics = environment.task, environment.physics
+    task.rollout.take(0, Episode.from_motion(meta["drawn"]))
+    mujoco.mj_setState(physics.model.ptr, physics.data.ptr, state, _STATE)
+    peaks = []
+    for action in actions:
+        environment.step(action)
+        peaks.append(float(task.wall_force.peak_max))
+    assert physics.model.ptr.opt.timestep == task.physics_timestep
+    return peaks, task.error
+
+
+def test_an_impact_is_no_error_of_physics(monkeypatch, tmp_path):
+    peaks, error = _snap()
+    assert max(peaks) < 0.1
+    assert error is None
+    monkeypatch.setenv("CATHSIM_DUMP_DIR", str(tmp_path))
+    monkeypatch.setattr(forces, "HARDEST", np.inf)
+    monkeypatch.setattr(forces, "DEEPEST", np.inf)
+    peaks, error = _snap()
+    assert peaks[-1] > physics_errors.MAX_FORCE
+    assert error == physics_errors.EXPLODED
+
+
+@pytest.mark.parametrize(
+    ("contact", "coarse"),
+    [
+        ((0.1, 1e-4), False),
+        ((4.9, 7e-4), False),
+        ((5.1, 1e-4), True),
+        ((0.1, 9e-4), True),
+    ],
+)
+def test_hard_and_deep_contacts_need_shorter_steps(contact, coarse):
+    force, depth = contact
+    rows = np.zeros((2, 3, 4 * forces.CONTACT_SIZE))
+    rows[1, 2, [0, 1, 4]] = 1, force, -depth
+    assert forces.too_coarse(forces.magnitudes(rows), rows).tolist() == [False, coarse]
+
+
+def test_without_a_contact_no_step_is_too_long():
+    rows = np.zeros((2, 3, 4 * forces.CONTACT_SIZE))
+    assert not forces.too_coarse(forces.magnitudes(rows), rows).any()
+
+
+@pytest.mark.parametrize(
+    ("task", "options"),
+    [
+        ("type1_lcca_pair", {"randomisation": True}),
+        ("femoral_arch_lcca", {"pool": 2, "arches": "test"}),
+    ],
+)
+def test_shorter_steps_are_equal_in_both_paths(task, options, monkeypatch):
+    monkeypatch.setattr(forces, "HARDEST", 1e-3)
+    refined = []
+    original = BatchSimulation._refine
+    monkeypatch.setattr(
+        BatchSimulation,
+        "_refine",
+        lambda self, indices, *rest: (
+            refined.extend(indices.tolist()),
+            original(self, indices, *rest),
+        ),
+    )
+    environments = [
+        suite.load("cathsim", task, {"random": seed, **options}) for seed in (5, 6)
+    ]
+    batch = BatchSimulation(suite.make_task(task, **options), 2, num_threads=1, seeds=5)
+    batch.reset()
+    for environment in environments:
+        environment.reset()
+    rng = np.random.default_rng(0)
+    for _ in range(10):
+        action = rng.uniform(-1, 1, (2, batch.num_actions))
+        action[:, -1 if batch.num_actions == 21 else slice(0, 2)] = 1.0
+        step = batch.step(action)
+        for index, environment in enumerate(environments):
+            environment.step(action[index])
+            data, own = environment.physics.data.ptr, environment.task
+            np.testing.assert_array_equal(batch.batch.qpos[index], data.qpos)
+            assert own.wall_force.peak_max == step.wall_force.peak_max[index]
+            assert own.readings.push_force == step.readings.push_force[index]
+    assert 0 < len(refined) < 20
+    timestep = batch.task.physics_timestep
+    for index in range(2):
+        assert batch.batch.get_model(index).opt.timestep == timestep
