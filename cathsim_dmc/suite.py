@@ -20,8 +20,9 @@ from dm_control import composer
 from dm_control import suite as dm_suite
 from dm_control.utils import containers
 
+from cathsim_dmc import bounds
 from cathsim_dmc.anatomy import Anatomy, Goal
-from cathsim_dmc.tasks import placement
+from cathsim_dmc.tasks import observations, placement
 from cathsim_dmc.tasks.anatomies import load_anatomy, load_arches
 from cathsim_dmc.tasks.config import NavigationConfig
 from cathsim_dmc.tasks.environment import Environment
@@ -132,6 +133,13 @@ def make_task(
         # What this option was called at first.
         own.setdefault("anatomy", options.pop("phantom"))
     _refuse_unknown(definition, options)
+    config = NavigationConfig(
+        **{key: value for key, value in options.items() if key in _CONFIG_FIELDS}
+    )
+    # Before seconds of work are lost.
+    observations.resolve(config.observation)
+    if not (random is None or isinstance(random, np.random.RandomState)):
+        random = bounds.seed("random", random)
     goal = own.get("goal", definition.goal or "bca")
     access = own.get("access", definition.access)
     if definition.random_arch:
@@ -139,9 +147,6 @@ def make_task(
     else:
         chosen = own.get("anatomy", definition.anatomy or "type1")
         anatomies = [load_anatomy(chosen, access)]
-    config = NavigationConfig(
-        **{key: value for key, value in options.items() if key in _CONFIG_FIELDS}
-    )
     chosen = {k: v for k, v in options.items() if k not in _CONFIG_FIELDS}
     if "farthest_shift" in definition.objective_options:
         chosen["farthest_shift"] = config.ranges.farthest_shift
@@ -231,6 +236,9 @@ def load(
 
 def environment(task: Navigation, **environment_kwargs: Any) -> composer.Environment:
     """The composer environment of a task, with the settings that the suite uses.
+
+    The MJCF model of the task is compiled here, and not again: what is to change in it
+    changes before.
 
     Args:
       task: Task that no other environment owns.

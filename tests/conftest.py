@@ -1,12 +1,15 @@
 """Environments that many tests share; loading one takes a second."""
 
 import contextlib
+import dataclasses
+import gc
 
 import hypothesis
 import numpy as np
 import pytest
 
 from cathsim_dmc import suite
+from cathsim_dmc.tasks.navigation import Navigation
 
 # A first call may import scipy or compile; how long it takes is not what is tested.
 hypothesis.settings.register_profile("default", deadline=None)
@@ -19,6 +22,37 @@ EACH_TASK = [
     for name, quick in zip(TASKS, (False, True, True, False), strict=True)
 ]
 SHORT_EPISODE = 12  # control steps
+
+
+def twin(task, seed=0, **changes):
+    """Another task on the scene of one that is built already.
+
+    Building a scene takes as long as compiling it. No episode changes one: all that an
+    environment changes is in the model that it compiles.
+
+    Args:
+        task: What to share the scene, the anatomies and the objective of.
+        seed: Seed of the twin.
+        **changes: Fields of the configuration that the scene does not depend on, such
+            as observations, images, and what is randomised but for the goal.
+    """
+    config = dataclasses.replace(task.config, **changes)
+    assert config.ranges.farthest_shift == task.config.ranges.farthest_shift
+    other = Navigation(task.scene, task.objective, config, seed, name=task.name)
+    assert not task._cases or other._fluoroscopy == task._fluoroscopy
+    other._cases = task._cases
+    return other
+
+
+def pytest_collection_finish():
+    """Leaves what the imports have made out of all later garbage collections.
+
+    A scene is made of so many small objects that each one built begins a full
+    collection, which with torch in memory takes longer than the building.
+    """
+    gc.collect()
+    gc.freeze()
+    gc.set_threshold(5_000, 10, 10)
 
 
 @pytest.fixture(autouse=True, scope="session")

@@ -201,9 +201,14 @@ def test_failed_episodes_are_no_demonstrations(recorded, copied, shapes):
     assert len(kept) == lengths[0] + lengths[2]
 
 
-def test_the_teacher_agrees_with_the_expert_that_it_watches():
+@pytest.fixture(scope="module")
+def task():
+    return make_task("type1_lcca")
+
+
+def test_the_teacher_agrees_with_the_expert_that_it_watches(task):
     """While it needs no second attempt, the expert's action is the teacher's."""
-    simulation = BatchSimulation(make_task("type1_lcca"), 2, seeds=7)
+    simulation = BatchSimulation(task, 2, seeds=7)
     simulation.reset()
     view, everyone = BatchedView(simulation), np.ones(2, dtype=bool)
     expert, teacher = ExpertPolicy(), Teacher(view)
@@ -217,9 +222,9 @@ def test_the_teacher_agrees_with_the_expert_that_it_watches():
         simulation.step(action)
 
 
-def test_the_teacher_goes_on_from_what_was_really_done():
+def test_the_teacher_goes_on_from_what_was_really_done(task):
     """The expert alone believes in commands that it gave and nobody carried out."""
-    simulation = BatchSimulation(make_task("type1_lcca"), 1, seeds=7)
+    simulation = BatchSimulation(task, 1, seeds=7)
     simulation.reset()
     view, everyone = BatchedView(simulation), np.ones(1, dtype=bool)
     expert, followed, teacher = ExpertPolicy(), ExpertPolicy(), Teacher(view)

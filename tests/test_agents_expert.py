@@ -4,6 +4,7 @@ import dataclasses
 
 import numpy as np
 import pytest
+from conftest import twin
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -27,15 +28,18 @@ GENTLE = 0.2  # N, below which most published forces lie
 
 
 def make_task(name="type1_lcca", **options):
-    """A task that no environment steps."""
-    options.setdefault("observation", "tracking")
-    return suite.load(suite.DOMAIN, name, task_kwargs=options).task
+    return suite.make_task(name, **{"observation": "tracking", **options})
 
 
 @pytest.fixture(scope="module")
 def task():
     """The harder published task, which the tests' simulations run one at a time."""
     return make_task()
+
+
+@pytest.fixture(scope="module")
+def to_bca():
+    return make_task("type1_bca")
 
 
 @pytest.fixture(scope="module")
@@ -65,7 +69,7 @@ def jiggled(task, count, steps, seed=0):
 @pytest.mark.parametrize("rotation", [False, True])
 def test_tip_frames_are_mujocos(rotation):
     env = suite.load(
-        suite.DOMAIN, "type2_lcca", task_kwargs={"rotation": rotation, "random": 0}
+        suite.DOMAIN, "simple1_lcca", task_kwargs={"rotation": rotation, "random": 0}
     )
     task, random = env.task, np.random.default_rng(0)
     env.reset()
@@ -128,8 +132,8 @@ def test_beside_the_ostium_the_head_is_still_in_the_parent(task, plan):
     assert place.arc_length <= origin + 1e-3
 
 
-def test_a_sibling_branch_is_outside(plan):
-    lost = make_task("type1_bca").goal_position
+def test_a_sibling_branch_is_outside(plan, to_bca):
+    lost = to_bca.scene.goal.position
     assert pursuit.locate(plan, lost).excess > pursuit.Settings().tolerance
 
 
@@ -234,10 +238,8 @@ def test_a_device_without_motors_is_refused():
         expert.Expert.for_task(make_task(device="diagnostic_5f_j"))
 
 
-def test_policy_reaches_the_goal_in_a_composer_environment():
-    env = suite.load(
-        suite.DOMAIN, "type1_lcca", task_kwargs={"observation": "tracking", "random": 5}
-    )
+def test_policy_reaches_the_goal_in_a_composer_environment(task):
+    env = suite.environment(twin(task, 5))
     act = policies.in_environment(policies.make_policy("expert"), env)
     lengths = []
     for _ in range(2):
@@ -253,8 +255,8 @@ def test_policy_reaches_the_goal_in_a_composer_environment():
     assert max(lengths) < 300
 
 
-def test_policy_needs_no_observation_before_the_first_step():
-    env = suite.load(suite.DOMAIN, "type1_bca", task_kwargs={"random": 5})
+def test_policy_needs_no_observation_before_the_first_step(to_bca):
+    env = suite.environment(twin(to_bca, 5))
     for observable in env.task.task_observables.values():
         observable.enabled = False
     timestep = env.reset()
@@ -264,13 +266,13 @@ def test_policy_needs_no_observation_before_the_first_step():
     assert action[20] > 0
 
 
-def test_it_recovers_from_a_wrong_branch(task, plan):
+def test_it_recovers_from_a_wrong_branch(task, plan, to_bca):
     # A straight push ends in the BCA of this phantom.
     simulation = batch.BatchSimulation(task, 1, num_threads=1, seeds=3)
     simulation.reset()
     push = np.zeros((1, simulation.num_actions))
     push[0, 20] = 1.0
-    bca = make_task("type1_bca").objective
+    bca = to_bca.objective
     for _ in range(150):
         simulation.step(push)
         if bca.in_branch(simulation.readings.head)[0]:

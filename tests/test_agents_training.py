@@ -33,7 +33,7 @@ def small_ppo(**changes):
             "num_envs": 16,
             "steps_per_update": 512,
             "minibatch_size": 128,
-            "epochs": 6,
+            "epochs": 2,
             "learning_rate": 1e-3,
             "total_frames": 1_024,
             "metrics_frames": 512,
@@ -54,7 +54,7 @@ def small_sac(**changes):
             "learning_rate": 1e-3,
             "random_frames": 512,
             "replay_frames": 4_096,
-            "updates_per_frame": 0.0625,
+            "updates_per_frame": 0.03125,
             "initial_alpha": 0.1,
             "total_frames": 1_024,
             "metrics_frames": 256,
@@ -76,7 +76,7 @@ def without_clocks(rows):
 
 @pytest.mark.slow
 def test_ppo_learns_to_reach(tmp_path):
-    run(small_ppo(total_frames=10_240), tmp_path)
+    run(small_ppo(total_frames=10_240, epochs=6), tmp_path)
     rewards = [row["episode_reward"] for row in read_metrics(tmp_path / "metrics.csv")]
     assert rewards[-1] > rewards[1] + 15
 
@@ -142,17 +142,19 @@ SMALL_IMAGES = {
 
 @pytest.mark.parametrize("make", [small_ppo, small_sac])
 def test_a_critic_that_reads_more_than_the_policy(tmp_path, make):
-    config = make(**SMALL_IMAGES, total_frames=1_024)
+    sizes = {"steps_per_update": 128} if make is small_ppo else {"random_frames": 128}
+    sizes |= {"metrics_frames": 128, "checkpoint_frames": 128}
+    config = make(**SMALL_IMAGES, **sizes, normalisation_frames=64, total_frames=256)
     run(config, tmp_path)
     saved = Checkpoint.open(tmp_path)
     assert saved.shapes == NetworkShapes(0, (1, 128, 128), synthetic_env.ACTIONS)
     # Its statistics are those of what was collected, and come back on resuming.
     kept = saved.learning_state()["learner"]["normalisers"]["0.module.count"]
-    assert kept == (512 + 256 + 512 if make is small_ppo else 1_024)
+    assert kept == (128 + 64 + 128 if make is small_ppo else 256)
     assert evaluate(tmp_path, episodes=2, make_env=synthetic_env.make_env).episodes
-    run(config.replace(total_frames=1_536), tmp_path, resume=True)
+    run(config.replace(total_frames=384), tmp_path, resume=True)
     state = Checkpoint.open(tmp_path).learning_state()["learner"]
-    assert state["normalisers"]["0.module.count"] == kept + 512
+    assert state["normalisers"]["0.module.count"] == kept + 128
 
 
 @pytest.mark.parametrize(
@@ -426,14 +428,3 @@ def test_training_has_its_own_reward_and_episodes_and_evaluation_the_tasks(tmp_p
     assert max(episode.length for episode in result.episodes) > 20
     shaped = {"reward": {"path": -1.0, "success": 10.0}, "max_steps": 20}
     assert asked == [{"friction": 0.1, **shaped}, {"friction": 0.1}]
-
-
-def test_importing_agents_loads_torchrl_before_dm_control():
-    script = (
-        "import os, sys; before = dict(os.environ)\n"
-        "import cathsim_dmc.agents\n"
-        "loaded = list(sys.modules)\n"
-        "assert loaded.index('torchrl') < loaded.index('dm_control')\n"
-        "assert dict(os.environ) == before, set(os.environ) ^ set(before)\n"
-    )
-    subprocess.run([sys.executable, "-c", script], check=True, timeout=120)

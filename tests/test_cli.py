@@ -165,7 +165,7 @@ TINY = (
 def test_every_setting_is_a_typed_option(cathsim, tmp_path):
     code, out, err = cathsim(
         "train", "navigate", "--out", tmp_path, *TINY, "--frames", 64,
-        "--phantom", "type2", "--goal", "lcca", "--hidden", 8, 8, "--no-tensorboard",
+        "--phantom", "simple2", "--goal", "lcca", "--hidden", 8, 8, "--no-tensorboard",
         "--target-kl", 0.5, "--friction", 0.1, "--observation", "tracking", "force",
     )  # fmt: skip
     assert code == 0, err
@@ -174,7 +174,7 @@ def test_every_setting_is_a_typed_option(cathsim, tmp_path):
     assert (config.hidden, config.target_kl, config.epochs) == ((8, 8), 0.5, 1)
     assert config.observation == ("tracking", "force")
     assert config.task_kwargs == {
-        "max_steps": 8, "friction": 0.1, "anatomy": "type2", "goal": "lcca",
+        "max_steps": 8, "friction": 0.1, "anatomy": "simple2", "goal": "lcca",
     }  # fmt: skip
     # A run that is resumed keeps its own settings and may go on for longer.
     code, out, err = cathsim("train", "--out", tmp_path, "--resume", "--frames", 128)

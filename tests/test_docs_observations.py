@@ -28,7 +28,7 @@ NAMES = [n for n in observations.OBSERVATIONS if n not in ("rgb", "depth")]
 @pytest.fixture(scope="module")
 def environment():
     """With all observations that need no OpenGL."""
-    return suite.load("cathsim", "type1_bca", {"observation": NAMES, "random": 0})
+    return suite.load("cathsim", "simple1_bca", {"observation": NAMES, "random": 0})
 
 
 def test_the_table_names_what_the_functions_return(environment, monkeypatch):

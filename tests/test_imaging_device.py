@@ -68,7 +68,7 @@ def test_area_of_a_quadrant_of_the_disc(x, y):
     assert disc_quadrant(x, y) == pytest.approx(expected, abs=3e-4)
 
 
-def brute_shares(image_size, row, column, radius, fine=200):
+def brute_shares(image_size, row, column, radius, fine=100):
     """Share of a disc in each pixel, by counting points of a grid."""
     grid = (np.arange(image_size * fine) + 0.5) / fine - 0.5
     inside = (grid[:, None] - row) ** 2 + (grid - column) ** 2 < radius**2
@@ -111,7 +111,7 @@ def test_a_disc_beside_the_image_is_cut_at_its_edge(radius, row, column):
 
 @pytest.mark.parametrize(
     ("view", "resolution", "supersample"),
-    [(view, 128, 16) for view in VIEWS] + [("LAO45", 256, 8)],
+    [(view, 128, 12) for view in VIEWS] + [("LAO45", 256, 6)],
 )
 def test_tilted_capsule_of_catheter_size(view, resolution, supersample):
     carm = CArm.view(view, resolution=(resolution, resolution))

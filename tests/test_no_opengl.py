@@ -35,9 +35,9 @@ options = {
     "observation": ["image", "sequential", "segmentation", "tracking_2d"],
     "fluoroscopy": {"noise": True, "biplane": "LATERAL"},
 }
-env = suite.load("cathsim", "type1_bca", {"random": 0, **options})
+env = suite.load("cathsim", "simple1_bca", {"random": 0, **options})
 env.reset()
-batch = BatchSimulation(suite.load("cathsim", "type1_bca", options).task, 2)
+batch = BatchSimulation(env.task, 2)
 batch.reset()
 action = np.zeros(21)
 action[-1] = 1.0

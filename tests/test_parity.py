@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from conftest import twin
 
 from cathsim_dmc import suite
 from cathsim_dmc.anatomy.arch import arch
@@ -21,21 +22,19 @@ def anatomy():
     return arch.load("simple1")
 
 
-def make(anatomy, seed, **options):
-    options = {"anatomy": anatomy, "goal": "bca", "random": seed, **options}
-    return suite.load("cathsim", "navigate", options)
-
-
 class Pair:
     """A batch and the composer environments with the same seeds."""
 
     def __init__(self, anatomy, **options):
+        options = {"anatomy": anatomy, "goal": "bca", **options}
+        self.simulate(suite.make_task("navigate", **options))
+
+    def simulate(self, task):
+        """Each environment and the batch compile a model of their own."""
         self.environments = [
-            make(anatomy, SEED + i, **options) for i in range(SIMULATIONS)
+            suite.environment(twin(task, SEED + i)) for i in range(SIMULATIONS)
         ]
-        self.batch = BatchSimulation(
-            make(anatomy, 0, **options).task, SIMULATIONS, seeds=SEED, num_threads=2
-        )
+        self.batch = BatchSimulation(task, SIMULATIONS, seeds=SEED, num_threads=2)
 
     def reset(self):
         self.timesteps = [each.reset() for each in self.environments]
@@ -133,7 +132,7 @@ def test_randomised_episodes_are_equal():
 def test_success_ends_both(anatomy):
     # A goal in the aorta ahead of the tip, which a straight push reaches.
     aorta = anatomy.tree.vessel("aorta").centreline
-    start = make(anatomy, 0, observation="tracking").task.scene.placement
+    start = suite.make_task("navigate", anatomy=anatomy, goal="bca").scene.placement
     ahead = aorta.project(start.start + 0.02 * start.direction).arc_length
     goal = Goal("ahead", "aorta", aorta.at(ahead).position, float(ahead))
     pair = Pair(anatomy, goal=goal, observation="tracking")

@@ -12,7 +12,7 @@ from cathsim_dmc.agents.training import train
 from cathsim_dmc.policies import POLICIES, ComposerView, Policy
 from cathsim_dmc.recording import Episode
 
-TASK = "type1_bca"
+TASK = "simple1_bca"
 SHORT = {"max_steps": 12}
 QUICK = ("push",)
 

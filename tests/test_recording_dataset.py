@@ -13,10 +13,10 @@ from cathsim_dmc.recording import EpisodeRecorder  # noqa: E402
 from cathsim_dmc.recording.dataset import export  # noqa: E402
 
 OPTIONS = {"max_steps": 12, "goal_radius": 0.01}
-DATASET = "cathsim/type1_bca/test-v0"
+DATASET = "cathsim/simple1_bca/test-v0"
 
 
-def record(seeds, task="type1_bca", **options):
+def record(seeds, task="simple1_bca", **options):
     options = {**OPTIONS, **options}
     env = suite.load("cathsim", task, options)
     recorder = EpisodeRecorder(env, task, options)

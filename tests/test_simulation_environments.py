@@ -9,7 +9,7 @@ from cathsim_dmc.agents import evaluate, make_config, make_env, train
 from cathsim_dmc.agents.networks import NetworkShapes
 from cathsim_dmc.simulation.environments import standard_observations
 
-TASK = "type1_bca"
+TASK = "simple1_bca"
 
 
 @pytest.mark.slow

@@ -15,7 +15,7 @@ import cathsim_dmc.gym  # noqa: E402
 from cathsim_dmc import suite  # noqa: E402
 from cathsim_dmc.simulation.gymnasium import CathSimEnv  # noqa: E402
 
-TASK = "cathsim/type1_bca-v0"
+TASK = "cathsim/simple1_bca-v0"
 
 
 def run(env, steps, seed):
@@ -43,7 +43,11 @@ def test_every_task_has_an_id():
     "options",
     [
         pytest.param({}, marks=pytest.mark.slow),
-        {"observation": ["image", "tracking_2d", "force"], "randomisation": True},
+        {
+            "observation": ["image", "tracking_2d", "force"],
+            "fluoroscopy": {"size": 32},
+            "randomisation": True,
+        },
         pytest.param(
             {"dtype": "float64", "observation": "segmentation"},
             marks=pytest.mark.slow,
@@ -65,7 +69,7 @@ def test_a_seed_is_the_suites_seed():
     rows, _ = run(env, 5, seed=7)
     again, _ = run(env, 5, seed=7)
     other, _ = run(env, 5, seed=8)
-    plain = suite.load("cathsim", "type1_bca", {"random": 7})
+    plain = suite.load("cathsim", "simple1_bca", {"random": 7})
     timestep = plain.reset()
     for key in rows[0]:
         np.testing.assert_array_equal(rows[0][key], timestep.observation[key])
@@ -85,7 +89,7 @@ def test_time_truncates_and_does_not_terminate():
 
 
 def test_success_terminates():
-    env = gymnasium.make("cathsim/navigate-v0", **{"goal": "bca", "goal_radius": 1.0})
+    env = gymnasium.make(TASK, goal_radius=1.0)
     env.reset(seed=0)
     task = env.unwrapped.environment.task
     # Any place in the branch counts with such a goal, so the branch is moved here.

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import torch
-from conftest import EACH_TASK, SHORT_EPISODE
+from conftest import EACH_TASK, SHORT_EPISODE, twin
 from torchrl.envs import DMControlEnv
 from torchrl.envs.utils import check_env_specs
 
@@ -21,7 +21,7 @@ def batched():
 @pytest.fixture(scope="module")
 def short_batched():
     return BatchedEnv(
-        "type1_bca",
+        "simple1_bca",
         ENVS,
         num_threads=1,
         task_kwargs={"max_steps": SHORT_EPISODE},
@@ -55,9 +55,9 @@ def test_dm_control_env(task_name):
 
 
 def test_seed_of_dm_control_env_is_that_of_the_suite():
-    env = DMControlEnv("cathsim", "type2_bca", max_steps=SHORT_EPISODE)
+    env = DMControlEnv("cathsim", "simple1_bca", max_steps=SHORT_EPISODE)
     env.set_seed(11)
-    expected = suite.load("cathsim", "type2_bca", task_kwargs={"random": 11})
+    expected = suite.load("cathsim", "simple1_bca", task_kwargs={"random": 11})
     expected.reset()  # as set_seed does
     position = expected.reset().observation["position"]
     np.testing.assert_array_equal(env.reset()["position"].numpy(), position)
@@ -105,7 +105,7 @@ def test_batched_env_with_numbers_and_forces(short_batched):
 
 @pytest.mark.parametrize("observation", ["image", "sequential"])
 def test_batched_env_with_images(observation):
-    env = BatchedEnv("type2_lcca", 2, num_threads=1, observation=observation)
+    env = BatchedEnv("simple1_lcca", 2, num_threads=1, observation=observation)
     check_env_specs(env)
     image = env.reset()[observation]
     assert image.dtype == torch.uint8
@@ -194,8 +194,9 @@ def test_the_first_episode_is_that_of_the_seed(backend):
 
     env = make_env("simple1_lcca", num_envs=2, seed=31, backend=backend, num_threads=1)
     distances = env.reset()["info", "distance"].flatten().tolist()
+    task = suite.make_task("simple1_lcca")
     for index, distance in enumerate(distances):
-        single = suite.load("cathsim", "simple1_lcca", {"random": 31 + index})
+        single = suite.environment(twin(task, 31 + index))
         single.reset()
         assert distance == np.float32(single.task.info()["distance"])
         single.close()

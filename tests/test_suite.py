@@ -7,7 +7,7 @@ import mujoco
 import numpy as np
 import pytest
 from absl.testing import absltest
-from conftest import EACH_TASK, SHORT_EPISODE, TASKS
+from conftest import EACH_TASK, SHORT_EPISODE, TASKS, twin
 from dm_control import suite as dm_suite
 from dm_env import specs, test_utils
 from scipy.stats import qmc
@@ -185,9 +185,9 @@ def test_start_is_randomised_within_a_millimetre(shared_environment, task_name):
         heads.append(environment.task.readings.head)
     heads = np.array(heads)
     assert len(np.unique(heads.round(9), axis=0)) == len(heads)
-    settled = suite.load("cathsim", task_name, {"randomisation": {"start_radius": 0.0}})
-    settled.reset()
-    displacement = np.linalg.norm(heads - settled.task.readings.head, axis=-1)
+    task = twin(environment.task, randomisation={"start_radius": 0.0})
+    suite.environment(task).reset()
+    displacement = np.linalg.norm(heads - task.readings.head, axis=-1)
     assert 0.3e-3 < displacement.max() < 1.02e-3
 
 
@@ -273,6 +273,33 @@ def test_dm_control_loads_the_task(shared_environment, reseed, task_name):
     environment.close()
 
 
+def test_a_model_is_compiled_once_unless_a_hook_may_have_changed_it(
+    shared_environment,
+):
+    task = shared_environment("type1_lcca").task
+    environment, hooked = (suite.environment(twin(task)) for _ in range(2))
+    called = []
+    hooked.add_extra_hook("initialize_episode_mjcf", called.append)
+    for env, times in ((environment, 0), (hooked, 1)):
+        model = env.physics.model.ptr
+        env.reset()
+        env.reset()
+        assert (env.physics.model.ptr is model) == (times == 0)
+        assert len(called) == times
+        env.close()
+
+
+@pytest.mark.parametrize(
+    "options", [{"random": -1}, {"observation": "pixels"}, {"friction": -1.0}]
+)
+def test_wrong_options_are_refused_before_an_anatomy_is_made(monkeypatch, options):
+    for name in ("load_anatomy", "load_arches"):
+        monkeypatch.setattr(suite, name, lambda *_, **__: pytest.fail("work is lost"))
+    for task in ("type1_bca", "arch_bca"):
+        with pytest.raises(ValueError, match=next(iter(options))):
+            suite.make_task(task, **options)
+
+
 def test_other_domains_load_too():
     environment = suite.load("cartpole", "balance", task_kwargs={"random": 1})
     assert environment.reset().first()
@@ -280,7 +307,7 @@ def test_other_domains_load_too():
 
 def test_environment_kwargs_reach_composer():
     environment = suite.load(
-        "cathsim", "type1_bca", environment_kwargs={"time_limit": 0.1}
+        "cathsim", "simple1_bca", environment_kwargs={"time_limit": 0.1}
     )
     environment.reset()
     last = [environment.step(np.zeros(21)).last() for _ in range(3)]
@@ -293,7 +320,8 @@ def test_environment_kwargs_reach_composer():
 
 @pytest.mark.parametrize("task_name", EACH_TASK)
 def test_time_out_comes_at_max_steps_with_discount_one(shared_environment, task_name):
-    environment = shared_environment(task_name, max_steps=SHORT_EPISODE)
+    task = twin(shared_environment(task_name).task, max_steps=SHORT_EPISODE)
+    environment = suite.environment(task)
     environment.reset()
     steps = [environment.step(np.zeros(21)) for _ in range(SHORT_EPISODE)]
     assert [step.last() for step in steps] == [False] * (SHORT_EPISODE - 1) + [True]
@@ -400,7 +428,7 @@ def test_time_out_one_step_before_success(near_goal, reseed, monkeypatch):
 
 
 def test_time_is_exactly_the_control_steps(shared_environment):
-    environment = shared_environment("type1_bca")
+    environment = shared_environment("type1_lcca")
     environment.reset()
     for step in range(1, 4):
         environment.step(np.zeros(21))
@@ -408,7 +436,7 @@ def test_time_is_exactly_the_control_steps(shared_environment):
 
 
 def test_step_types_are_dm_env_s(shared_environment):
-    environment = shared_environment("type1_bca")
+    environment = shared_environment("type1_lcca")
     assert environment.reset().step_type is dm_env.StepType.FIRST
     assert environment.step(np.zeros(21)).step_type is dm_env.StepType.MID
 

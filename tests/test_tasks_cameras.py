@@ -66,9 +66,12 @@ print("seen")
 REFUSED = """
 from cathsim_dmc import suite
 try:
-    suite.load("cathsim", "type1_bca", {"observation": "rgb"}).reset()
+    suite.load("cathsim", "simple1_bca", {"observation": "rgb"}).reset()
 except ValueError as error:
     print(error)
+env = suite.load("cathsim", "simple1_bca")
+env.reset()
+env.physics.render(8, 8)
 """
 
 
@@ -93,6 +96,9 @@ def test_cameras_see_what_they_should():
 
 def test_without_opengl_the_message_says_what_to_do():
     done = python(REFUSED, "disable")
-    assert done.returncode == 0, done.stderr
     for hint in ("MUJOCO_GL", "osmesa", "segmentation"):
         assert hint in done.stdout
+    last = done.stderr.strip().splitlines()[-1]
+    assert last.startswith("RuntimeError"), done.stderr
+    for text in ("MUJOCO_GL is disable", "egl", "cathsim_dmc.show(env)", "fluoroscopy"):
+        assert text in last

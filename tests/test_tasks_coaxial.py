@@ -3,6 +3,7 @@
 import mujoco
 import numpy as np
 import pytest
+from conftest import twin
 
 from cathsim_dmc import suite
 from cathsim_dmc.simulation.batch import BatchSimulation
@@ -159,12 +160,9 @@ def test_a_step_of_a_single_device_does_no_pair_work(shared_environment, monkeyp
 def test_both_paths_are_equal_bit_for_bit(task):
     """Randomised, with a partial reset, while both devices move at random."""
     options = {"randomisation": True, "observation": ["internal", "tracking", "force"]}
-    environments = [
-        suite.load("cathsim", task, {"random": 5 + i, **options}) for i in range(2)
-    ]
-    batch = BatchSimulation(
-        suite.make_task(task, random=0, **options), 2, seeds=5, num_threads=2
-    )
+    task = suite.make_task(task, **options)
+    environments = [suite.environment(twin(task, 5 + i)) for i in range(2)]
+    batch = BatchSimulation(task, 2, seeds=5, num_threads=2)
     steps = [env.reset().observation for env in environments]
     batched = batch.reset().observation
     rng = np.random.default_rng(0)

@@ -4,6 +4,7 @@ import json
 
 import numpy as np
 import pytest
+from conftest import twin
 
 from cathsim_dmc import suite
 from cathsim_dmc.anatomy.arch import arch
@@ -19,15 +20,18 @@ def anatomy():
     return arch.load("simple1")
 
 
-def make(anatomy, observation, seed=0, **options):
-    options = {
-        "phantom": anatomy,
-        "goal": "bca",
-        "random": seed,
-        "fluoroscopy": {"size": SIZE, **options.pop("fluoroscopy", {})},
-        **options,
-    }
-    return suite.load("cathsim", "navigate", {"observation": observation, **options})
+@pytest.fixture(scope="module")
+def make():
+    """Returns a function that makes an environment that observes: of one scene."""
+    task = suite.make_task("simple1_bca")
+
+    def environment(observation, seed=0, fluoroscopy=None):
+        images = {"size": SIZE, **(fluoroscopy or {})}
+        return suite.environment(
+            twin(task, seed, observation=observation, fluoroscopy=images)
+        )
+
+    return environment
 
 
 def push(environment, steps, bend=0.0):
@@ -37,8 +41,8 @@ def push(environment, steps, bend=0.0):
 
 
 @pytest.mark.parametrize("noise", [False, True])
-def test_sequential_is_the_last_three_images_oldest_first(anatomy, noise):
-    env = make(anatomy, ["image", "sequential"], fluoroscopy={"noise": noise})
+def test_sequential_is_the_last_three_images_oldest_first(make, noise):
+    env = make(["image", "sequential"], fluoroscopy={"noise": noise})
     for _ in range(2):  # the second time after an episode
         timesteps = [env.reset(), *push(env, 5)]
         images = [t.observation["image"][..., 0] for t in timesteps]
@@ -55,8 +59,8 @@ def test_sequential_is_the_last_three_images_oldest_first(anatomy, noise):
         assert not np.array_equal(images[0], images[5])
 
 
-def test_the_image_is_the_fluoroscopes(anatomy):
-    env = make(anatomy, "image", fluoroscopy={"view": "LAO45", "contrast": 25.0})
+def test_the_image_is_the_fluoroscopes(make, anatomy):
+    env = make("image", fluoroscopy={"view": "LAO45", "contrast": 25.0})
     env.reset()
     image = push(env, 10)[-1].observation["image"]
     options = FluoroscopyOptions(view="LAO45", size=SIZE)
@@ -70,6 +74,11 @@ def test_the_image_is_the_fluoroscopes(anatomy):
     task = env.task
     radius = task.scene.catheter.device.outer_radius
     np.testing.assert_array_equal(image, scope.render(task.readings.centreline, radius))
+
+
+@pytest.fixture(scope="module")
+def plain_image(make):
+    return make("image").reset().observation["image"]
 
 
 @pytest.mark.parametrize(
@@ -94,16 +103,16 @@ def test_the_image_is_the_fluoroscopes(anatomy):
         ),
     ],
 )
-def test_every_option_changes_the_image(anatomy, options):
-    plain = make(anatomy, "image").reset().observation["image"]
-    other = make(anatomy, "image", fluoroscopy=options).reset().observation["image"]
+def test_every_option_changes_the_image(make, plain_image, options):
+    plain = plain_image
+    other = make("image", fluoroscopy=options).reset().observation["image"]
     assert plain.shape == other.shape
     assert (plain != other).mean() > 0.01
 
 
-def test_noise_is_new_in_every_image_and_the_same_for_a_seed(anatomy):
+def test_noise_is_new_in_every_image_and_the_same_for_a_seed(make):
     def images(seed):
-        env = make(anatomy, "image", seed, fluoroscopy={"noise": True})
+        env = make("image", seed, fluoroscopy={"noise": True})
         first = env.reset().observation["image"]
         return [first, *(t.observation["image"] for t in push(env, 2))]
 
@@ -115,18 +124,17 @@ def test_noise_is_new_in_every_image_and_the_same_for_a_seed(anatomy):
     assert 0 < far.mean() < 10
 
 
-def test_noise_does_not_change_where_the_device_starts(anatomy):
-    loud = make(anatomy, ["image", "internal"], 3, fluoroscopy={"noise": True})
-    quiet = make(anatomy, ["image", "internal"], 3)
+def test_noise_does_not_change_where_the_device_starts(make):
+    loud = make(["image", "internal"], 3, fluoroscopy={"noise": True})
+    quiet = make(["image", "internal"], 3)
     np.testing.assert_array_equal(
         loud.reset().observation["position"], quiet.reset().observation["position"]
     )
 
 
 @pytest.mark.slow
-def test_biplane_sees_both_views(anatomy):
+def test_biplane_sees_both_views(make):
     env = make(
-        anatomy,
         ["image", "sequential", "segmentation", "tracking_2d"],
         fluoroscopy={"view": "AP", "biplane": "LATERAL", "size": (32, 48)},
     )
@@ -136,14 +144,14 @@ def test_biplane_sees_both_views(anatomy):
     assert seen["segmentation"].shape == (32, 48, 4)
     assert seen["tracking_pixels"].shape == (2 * observations.TRACKED_POINTS * 2,)
     for channel, view in enumerate(("AP", "LATERAL")):
-        single = make(anatomy, "image", fluoroscopy={"view": view, "size": (32, 48)})
+        single = make("image", fluoroscopy={"view": view, "size": (32, 48)})
         np.testing.assert_array_equal(
             seen["image"][..., channel], single.reset().observation["image"][..., 0]
         )
 
 
-def test_segmentation_is_device_and_vessel(anatomy):
-    env = make(anatomy, ["segmentation", "image", "tracking_2d"])
+def test_segmentation_is_device_and_vessel(make):
+    env = make(["segmentation", "image", "tracking_2d"])
     before = env.reset().observation
     after = push(env, 20)[-1].observation
     assert set(np.unique(after["segmentation"])) == {0, 255}
@@ -165,8 +173,8 @@ def test_segmentation_is_device_and_vessel(anatomy):
     assert far.mean() > 0.9 and not (device & far[..., 0]).any()
 
 
-def test_tracking_follows_device_and_goal_in_space_and_on_the_screen(anatomy):
-    env = make(anatomy, ["tracking", "tracking_2d", "goal"])
+def test_tracking_follows_device_and_goal_in_space_and_on_the_screen(make):
+    env = make(["tracking", "tracking_2d", "goal"])
     env.reset()
     seen = push(env, 8, bend=0.3)[-1].observation
     task = env.task
@@ -191,8 +199,8 @@ def test_tracking_follows_device_and_goal_in_space_and_on_the_screen(anatomy):
     assert seen["tracking_action"][0] == 0.3 and seen["tracking_action"][-1] == 1.0
 
 
-def test_the_route_ahead_is_that_of_the_centreline_seen_from_the_tip(anatomy):
-    env = make(anatomy, "route")
+def test_the_route_ahead_is_that_of_the_centreline_seen_from_the_tip(make):
+    env = make("route")
     env.reset()
     observation = push(env, 25, bend=0.3)[-1].observation
     state, line = env.task.readings, env.task.objective.route
@@ -215,7 +223,7 @@ def test_the_route_ahead_is_that_of_the_centreline_seen_from_the_tip(anatomy):
     np.testing.assert_allclose(device, shown[:-1], atol=1e-12)
 
 
-def test_the_route_goes_straight_on_behind_the_goal(anatomy):
+def test_the_route_goes_straight_on_behind_the_goal():
     objective = suite.make_task("simple1_bca").objective
     line = objective.route
     ahead = route.Routes([objective]).ahead(
@@ -235,9 +243,9 @@ def test_an_objective_without_a_route_cannot_show_one():
         route.Routes([Anywhere()])
 
 
-def test_specs_tell_shapes_and_ranges(anatomy):
+def test_specs_tell_shapes_and_ranges(make):
     names = [n for n in observations.OBSERVATIONS if n not in ("rgb", "depth")]
-    env = make(anatomy, names)
+    env = make(names)
     specs, seen = env.observation_spec(), env.reset().observation
     assert list(specs) == list(seen)
     for key, spec in specs.items():
@@ -246,8 +254,8 @@ def test_specs_tell_shapes_and_ranges(anatomy):
         assert (specs[key].minimum, specs[key].maximum) == (0, 255)
 
 
-def test_observations_are_copies(anatomy):
-    env = make(anatomy, ["image", "segmentation", "tracking"])
+def test_observations_are_copies(make):
+    env = make(["image", "segmentation", "tracking"])
     first = env.reset().observation
     kept = {key: value.copy() for key, value in first.items()}
     for value in first.values():

@@ -5,6 +5,7 @@ import stat
 import mujoco
 import numpy as np
 import pytest
+from conftest import twin
 
 from cathsim_dmc import suite
 from cathsim_dmc.anatomy.arch import arch
@@ -19,8 +20,16 @@ def dumps(tmp_path, monkeypatch):
     return tmp_path
 
 
-def _load(**options):
-    return suite.load("cathsim", "type1_bca", task_kwargs={"random": 3, **options})
+@pytest.fixture(scope="module")
+def task():
+    """A task that environments and batches compile, each for itself."""
+    return suite.make_task("type1_bca")
+
+
+@pytest.fixture
+def load(task):
+    """Returns a function that makes an environment of the task, with seed 3."""
+    return lambda: suite.environment(twin(task, 3))
 
 
 def _push(environment):
@@ -44,10 +53,10 @@ def test_a_device_in_lumen_and_sheath_has_not_escaped():
 
 
 def test_exploding_force_ends_the_episode_as_a_physics_error(
-    dumps, monkeypatch, caplog
+    dumps, load, monkeypatch, caplog
 ):
     monkeypatch.setattr(physics_errors, "MAX_FORCE", 1e-5)
-    environment = _load()
+    environment = load()
     timestep = environment.reset()
     with caplog.at_level(logging.ERROR):
         while not timestep.last():
@@ -65,7 +74,8 @@ def test_exploding_force_ends_the_episode_as_a_physics_error(
 @pytest.mark.parametrize("randomised", [False, True])
 def test_a_dump_replays_the_episode(randomised, dumps, monkeypatch):
     monkeypatch.setattr(physics_errors, "MAX_FORCE", 1e-5)
-    environment = _load(randomisation=randomised)
+    task = suite.make_task("type1_bca", randomisation=randomised)
+    environment = suite.environment(twin(task, 3))
     timestep = environment.reset()
     while not timestep.last():
         timestep = environment.step(_push(environment))
@@ -75,7 +85,7 @@ def test_a_dump_replays_the_episode(randomised, dumps, monkeypatch):
     assert meta["reason"] == physics_errors.EXPLODED
     assert meta["task"]["goal"] == "bca"
     assert (meta["drawn"]["friction"] is not None) == randomised
-    again = _load(randomisation=randomised, random=4)  # not what it drew
+    again = suite.environment(twin(task, 4))  # not what it drew
     again.reset()
     rollout, substeps = again.task.rollout, again.task.substeps
     model, data = again.physics.model.ptr, again.physics.data.ptr
@@ -88,13 +98,13 @@ def test_a_dump_replays_the_episode(randomised, dumps, monkeypatch):
     np.testing.assert_array_equal(data.qpos, final)
 
 
-def test_the_batch_reports_the_same_error(dumps, monkeypatch):
+def test_the_batch_reports_the_same_error(dumps, task, load, monkeypatch):
     monkeypatch.setattr(physics_errors, "MAX_FORCE", 1e-5)
-    environment = _load()
+    environment = load()
     timestep, steps = environment.reset(), 0
     while not timestep.last():
         timestep, steps = environment.step(_push(environment)), steps + 1
-    simulation = batch.BatchSimulation(_load().task, 2, seeds=[3, 3])
+    simulation = batch.BatchSimulation(task, 2, seeds=[3, 3])
     simulation.reset()
     for count in range(1, steps + 1):
         step = simulation.step(np.tile(_push(environment), (2, 1)))
@@ -104,8 +114,8 @@ def test_the_batch_reports_the_same_error(dumps, monkeypatch):
     assert (step.outcome.reward == 0).all()
 
 
-def test_a_diverging_simulation_is_a_physics_error(dumps):
-    simulation = batch.BatchSimulation(_load().task, 2, num_threads=1, seeds=3)
+def test_a_diverging_simulation_is_a_physics_error(dumps, task):
+    simulation = batch.BatchSimulation(task, 2, num_threads=1, seeds=3)
     simulation.reset()
     simulation.batch.qvel[1] = 1e12
     step = simulation.step(np.zeros((2, simulation.num_actions)))
@@ -114,8 +124,8 @@ def test_a_diverging_simulation_is_a_physics_error(dumps):
     assert physics_errors.load(path)[0]["reason"] == physics_errors.DIVERGED
 
 
-def test_composer_reports_divergence(dumps):
-    environment = _load()
+def test_composer_reports_divergence(dumps, load):
+    environment = load()
     environment.reset()
     environment.physics.data.ptr.qvel[:] = 1e12
     timestep = environment.step(np.zeros(21))
@@ -141,8 +151,10 @@ def test_a_dump_may_be_read_by_whom_the_umask_says(dumps):
     assert physics_errors.load(path)[0]["reason"] == "tried"
 
 
-def test_a_full_disk_does_not_end_the_other_simulations(dumps, small_disk, caplog):
-    simulation = batch.BatchSimulation(_load().task, 2, num_threads=1, seeds=3)
+def test_a_full_disk_does_not_end_the_other_simulations(
+    dumps, task, small_disk, caplog
+):
+    simulation = batch.BatchSimulation(task, 2, num_threads=1, seeds=3)
     simulation.reset()
     simulation.batch.qvel[1] = 1e12
     with small_disk(100):
@@ -156,9 +168,9 @@ def test_a_full_disk_does_not_end_the_other_simulations(dumps, small_disk, caplo
 _WILD = -1e3
 
 
-def _unstable(wild, steps=12):
+def _unstable(task, wild, steps=12):
     """States (T, N, nq) and errors (N,) of three simulations, one of them wild."""
-    simulation = batch.BatchSimulation(_load().task, 3, num_threads=1, seeds=3)
+    simulation = batch.BatchSimulation(task, 3, num_threads=1, seeds=3)
     simulation.reset()
     simulation.batch.expand("jnt_stiffness")[wild] *= _WILD
     action = np.tile(np.linspace(-1, 1, simulation.num_actions), (3, 1))
@@ -170,24 +182,24 @@ def _unstable(wild, steps=12):
     return np.array(states), errors
 
 
-def test_an_unstable_model_ends_with_a_reason_and_disturbs_nobody(dumps):
-    disturbed, errors = _unstable(wild=[1])
+def test_an_unstable_model_ends_with_a_reason_and_disturbs_nobody(dumps, task):
+    disturbed, errors = _unstable(task, wild=[1])
     assert errors[1] in (physics_errors.DIVERGED, physics_errors.EXPLODED)
     assert errors[0] is errors[2] is None
-    alone, none = _unstable(wild=[])
+    alone, none = _unstable(task, wild=[])
     assert none == [None] * 3
     np.testing.assert_array_equal(disturbed[:, [0, 2]], alone[:, [0, 2]])
     assert (disturbed[0, 1] != alone[0, 1]).any()
 
 
 @pytest.mark.slow
-def test_the_dump_of_an_unstable_model_replays_it_bit_for_bit(dumps):
-    states, errors = _unstable(wild=[1])
+def test_the_dump_of_an_unstable_model_replays_it_bit_for_bit(dumps, task, load):
+    states, errors = _unstable(task, wild=[1])
     reasons = {}
     for path in dumps.glob("*.npz"):
         meta, state, actions = physics_errors.load(path)
         reasons[len(actions)] = meta["reason"]
-        again = _load()
+        again = load()
         again.reset()
         model, data = again.physics.model.ptr, again.physics.data.ptr
         model.jnt_stiffness[:] *= _WILD

@@ -4,13 +4,15 @@ import time
 
 import numpy as np
 import pytest
+from conftest import twin
 from test_parity import PICTURES, Pair, actions
 
 from cathsim_dmc import policies, suite
 from cathsim_dmc.anatomy.arch import arch
 from cathsim_dmc.policies.expert import Expert
-from cathsim_dmc.simulation.batch import BatchSimulation
 from cathsim_dmc.tasks import cases, placement
+from cathsim_dmc.tasks.config import NavigationConfig
+from cathsim_dmc.tasks.navigation import Navigation
 from cathsim_dmc.tasks.objective_pool import part
 from cathsim_dmc.tasks.physics_errors import ESCAPE_INTERVAL
 
@@ -35,13 +37,8 @@ class ArchPair(Pair):
     """A batch and the composer environments with the same seeds, on one pool."""
 
     def __init__(self, task, **options):
-        self.environments = [
-            load(task, SEED + i, **options) for i in range(SIMULATIONS)
-        ]
         options = {"pool": POOL, "observation": NUMBERS, **options}
-        self.batch = BatchSimulation(
-            suite.make_task(task, **options), SIMULATIONS, seeds=SEED, num_threads=2
-        )
+        self.simulate(suite.make_task(task, **options))
 
     def reset_ended(self, step):
         ended = np.flatnonzero(step.terminated | step.truncated)
@@ -59,13 +56,13 @@ class ArchPair(Pair):
 
 
 @pytest.fixture(scope="module")
-def environment():
-    return load()
+def plain_pair():
+    return ArchPair("femoral_arch_lcca", max_steps=STEPS)
 
 
 @pytest.fixture(scope="module")
-def plain_pair():
-    return ArchPair("femoral_arch_lcca", max_steps=STEPS)
+def environment(plain_pair):
+    return suite.environment(twin(plain_pair.batch.task, SEED))
 
 
 def test_episodes_on_a_pool_are_equal_bit_for_bit(plain_pair):
@@ -255,19 +252,17 @@ def test_bad_pools_are_refused_before_anything_is_built(options):
         suite.make_task("arch_bca", **options)
 
 
-def test_cameras_of_one_model_are_refused():
+def test_cameras_of_one_model_are_refused(plain_pair):
+    task = plain_pair.batch.task
+    room, config = (task.scene, task.objective), NavigationConfig(observation="rgb")
     with pytest.raises(ValueError, match="pool=1"):
-        suite.make_task("arch_bca", pool=2, observation="rgb")
+        Navigation(*room, config, others=[room])
 
 
 def test_anatomies_with_other_goals_are_refused():
     tasks = [
-        suite.make_task("femoral_arch_bca", pool=1),
-        suite.make_task(
-            "navigate",
-            anatomy=arch.build_seed(arch.arch_set("test_variants")[3]),
-            goal="lcca",
-        ),
+        suite.make_task("navigate", anatomy=anatomy, goal="lcca")
+        for anatomy in ("simple1", arch.build_seed(arch.arch_set("test_variants")[3]))
     ]
     with pytest.raises(ValueError, match="take turns"):
         cases.alike([t.scene for t in tasks], [t.objective for t in tasks])

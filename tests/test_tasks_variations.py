@@ -2,12 +2,12 @@
 
 import numpy as np
 import pytest
+from conftest import twin
 from dm_control.composer.variation import distributions
 from hypothesis import given
 from hypothesis import strategies as st
 
 from cathsim_dmc import suite
-from cathsim_dmc.anatomy.arch import arch
 from cathsim_dmc.tasks import objectives as objectives
 from cathsim_dmc.tasks.variations import (
     DEFAULT_RANGES,
@@ -19,14 +19,16 @@ from cathsim_dmc.tasks.variations import (
 
 
 @pytest.fixture(scope="module")
-def anatomy():
-    return arch.load("simple1")
+def make():
+    """Returns a function that makes a randomised environment, all of one scene."""
+    task = suite.make_task("simple1_bca")
 
+    def environment(randomisation, seed=0, **changes):
+        return suite.environment(
+            twin(task, seed, randomisation=randomisation, **changes)
+        )
 
-def make(anatomy, randomisation, **options):
-    options = {"anatomy": anatomy, "goal": "bca", "random": 0, **options}
-    options["randomisation"] = randomisation
-    return suite.load("cathsim", "navigate", options)
+    return environment
 
 
 def elements(environment):
@@ -107,10 +109,8 @@ def test_impossible_ranges_are_refused(options, message):
         Randomisation.make(options)
 
 
-def test_the_model_takes_what_was_drawn_and_gives_it_back(anatomy):
-    env = make(
-        anatomy, {"friction": (0.1, 0.12), "stiffness": (2.0, 3.0), "roll": (0.5, 1.0)}
-    )
+def test_the_model_takes_what_was_drawn_and_gives_it_back(make):
+    env = make({"friction": (0.1, 0.12), "stiffness": (2.0, 3.0), "roll": (0.5, 1.0)})
     usual, at = snapshot(env), elements(env)  # before anything is drawn
     env.reset()
     model = env.physics.model.ptr
@@ -147,9 +147,9 @@ def test_the_model_takes_what_was_drawn_and_gives_it_back(anatomy):
 
 
 @pytest.mark.slow
-def test_roll_turns_the_plane_in_which_the_tip_bends(anatomy):
+def test_roll_turns_the_plane_in_which_the_tip_bends(make):
     def bent(roll):
-        env = make(anatomy, {"roll": (roll, roll), "start_radius": 0.0})
+        env = make({"roll": (roll, roll), "start_radius": 0.0})
         env.reset()
         straight = env.task.scene.placement.direction
         action = np.zeros(21)
@@ -165,10 +165,12 @@ def test_roll_turns_the_plane_in_which_the_tip_bends(anatomy):
     assert bent(0.0) @ bent(np.pi) == pytest.approx(-1.0, abs=0.02)
 
 
-def test_a_shifted_goal_moves_along_its_branch(anatomy):
-    plain = make(anatomy, False).task.objective
-    for reward in (objectives.PUBLISHED_REWARD, {"path": -1.0, "success": 10.0}):
-        env = make(anatomy, {"goal_shift": (-0.01, 0.01)}, reward=reward)
+def test_a_shifted_goal_moves_along_its_branch():
+    plain = suite.make_task("simple1_bca").objective
+    options = {"random": 0, "randomisation": {"goal_shift": (-0.01, 0.01)}}
+    for reward in ({"path": -1.0, "success": 10.0}, objectives.PUBLISHED_REWARD):
+        task = suite.make_task("simple1_bca", reward=reward, **options)
+        env, wide = suite.environment(task), task.objective
         goals = []
         for _ in range(6):
             env.reset()
@@ -183,9 +185,6 @@ def test_a_shifted_goal_moves_along_its_branch(anatomy):
         usual = float(plain.branch.project(plain.goal).arc_length)
         assert len(set(goals)) == 6 and max(np.abs(np.array(goals) - usual)) <= 0.0101
     # Without a shift the objective is that of the task without randomisation.
-    wide = suite.make_task(
-        "navigate", anatomy=anatomy, randomisation={"goal_shift": (-0.01, 0.01)}
-    ).objective
     heads = plain.goal + np.random.default_rng(0).normal(size=(20, 3)) * 0.02
     for figure in ("distance", "in_branch"):
         one, other = (getattr(o, figure)(heads) for o in (plain, wide.shifted(0.0)))
@@ -211,9 +210,9 @@ def test_actions_arrive_as_late_as_drawn(delays, actions):
     assert way.delayed(np.ones((count, 1)))[0, 0] == 0.0
 
 
-def test_delayed_device_does_later_what_it_does_at_once(anatomy):
+def test_delayed_device_does_later_what_it_does_at_once(make):
     def insertions(delay):
-        env = make(anatomy, {"delay": (delay, delay), "start_radius": 0.0})
+        env = make({"delay": (delay, delay), "start_radius": 0.0})
         env.reset()
         push = np.zeros(21)
         push[-1] = 1.0
@@ -224,11 +223,9 @@ def test_delayed_device_does_later_what_it_does_at_once(anatomy):
     assert late[-1] - late[2] == pytest.approx(at_once[4] - 1e-3, abs=2e-4)
 
 
-def test_view_and_gain_change_the_image_and_are_seeded(anatomy):
+def test_view_and_gain_change_the_image_and_are_seeded(make):
     def images(seed, **ranges):
-        env = make(
-            anatomy, ranges, observation="image", fluoroscopy={"size": 64}, random=seed
-        )
+        env = make(ranges, seed, observation="image", fluoroscopy={"size": 64})
         return [env.reset().observation["image"].astype(float) for _ in range(3)]
 
     bright = images(0, gain=(0.9, 1.1))

@@ -1,5 +1,7 @@
 """Sensors against known loads; statistics of the published protocol."""
 
+import functools
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -9,6 +11,12 @@ from cathsim_dmc.validation import force_sensors as forces
 from cathsim_dmc.validation import protocol
 
 RNG = np.random.default_rng(5)
+
+
+@functools.cache
+def dead_end(command):
+    """Two tests look at one of them."""
+    return forces.dead_end(command, settling=2.0)
 
 
 @pytest.mark.parametrize("load", [0.01, 0.5])
@@ -22,7 +30,7 @@ def test_contact_sensor_reads_the_load_of_a_resting_link(load):
 
 @pytest.mark.parametrize("command", [0.1, 1.0])
 def test_push_force_is_load_cell_is_contacts_at_a_dead_end(command):
-    one = forces.dead_end(command, settling=2.0)
+    one = dead_end(command)
     assert one.push > 0.9 * one.motor
     assert one.load_cell == pytest.approx(one.push, rel=0.01)
     assert one.contacts == pytest.approx(one.push, rel=0.01)
@@ -34,7 +42,7 @@ def test_rim_of_the_sheath_closes_the_balance_of_a_buckled_device():
 
 
 def test_quiet_push_of_the_motor_arrives():
-    one = forces.dead_end(0.1, settling=2.0)
+    one = dead_end(0.1)
     assert one.push == pytest.approx(one.motor, rel=0.02)
     assert one.ripple < 0.02 * one.push
 

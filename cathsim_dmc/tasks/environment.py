@@ -1,4 +1,4 @@
-"""The composer environment of a task, which says what to do without OpenGL."""
+"""The composer environment of a task: compiled once, and clear about OpenGL."""
 
 import os
 
@@ -6,7 +6,31 @@ from dm_control import composer, mjcf
 
 
 class Environment(composer.Environment):
-    """`composer.Environment`, but for what `physics.render` says without OpenGL."""
+    """`composer.Environment`, but for the first reset and `physics.render`.
+
+    Composer compiles at construction and once more at the first reset, for tasks that
+    change their MJCF model before an episode. Where nothing does and
+    `recompile_mjcf_every_episode` is off, the first model is kept: an environment is
+    there in two thirds of the time, and `physics` stays what it is. What is to change
+    in the MJCF model changes before the environment is made, see `suite.environment`.
+    """
+
+    def reset(self):
+        """Starts an episode.
+
+        Returns:
+          The first time step.
+        """
+        if not self._changes_model():
+            self._mjcf_never_compiled = False
+        return super().reset()
+
+    def _changes_model(self) -> bool:
+        """Whether the task, an entity or a hook changes the MJCF model."""
+        hook = self._hooks._initialize_episode_mjcf  # noqa: SLF001
+        own = type(self.task).initialize_episode_mjcf
+        none = composer.Task.initialize_episode_mjcf
+        return own is not none or bool(hook.entity_hooks or hook.extra_hooks)
 
     def _recompile_physics(self):
         super()._recompile_physics()
