@@ -89,7 +89,7 @@ class Cell:
         Raises:
             ConfigError: unknown algorithm, preset or field, or a value not allowed.
         """
-        settings = {
+        settings: dict[str, Any] = {
             name: value.replace("{task}", self.task)
             if isinstance(value, str)
             else value

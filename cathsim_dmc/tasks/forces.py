@@ -96,7 +96,7 @@ def too_coarse(magnitude: np.ndarray, rows: np.ndarray) -> np.ndarray:
     # Without `_slots`, which copies long rows that are not contiguous.
     distance = rows[..., 4 : magnitude.shape[-1] * CONTACT_SIZE : CONTACT_SIZE]
     wrong = (magnitude > HARDEST) | (distance < -DEEPEST)
-    return wrong.any((-2, -1))
+    return np.logical_or.reduce(wrong, axis=(-2, -1))
 
 
 class ContactHistory:

@@ -114,7 +114,7 @@ class PhysicsMonitor:
 
     def errors(
         self,
-        diverged: Sequence[bool],
+        diverged: Sequence[bool] | np.ndarray,
         centreline: np.ndarray,
         peak_force: np.ndarray,
     ) -> list[str | None]:

@@ -261,7 +261,9 @@ class Rollout:
         going_on = np.zeros(len(head), dtype=bool)
         return self._step([None] * len(head), indices, going_on)
 
-    def finish(self, magnitudes: np.ndarray, warned: Sequence[bool]) -> Step:
+    def finish(
+        self, magnitudes: np.ndarray, warned: Sequence[bool] | np.ndarray
+    ) -> Step:
         """Measures, judges and observes after the physics steps of a control step.
 
         Args:
