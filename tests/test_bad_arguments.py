@@ -13,6 +13,10 @@ WHOLE = st.one_of(WORDS, st.sampled_from(["1.5", "-1e3", "0x1"]))
 POSITIVE = st.one_of(WHOLE, st.integers(max_value=0).map(str))
 SEED = st.one_of(WHOLE, st.integers(max_value=-1).map(str), st.just("4294967296"))
 NUMBER = st.sampled_from(["", "x", "1,5", "--", "1 mm", "1e", "None"])
+# "None" is a value of options that may be left to the task.
+OPTIONAL_WHOLE, OPTIONAL_NUMBER = (
+    values.filter(lambda word: word != "None") for values in (POSITIVE, NUMBER)
+)
 NAME = st.one_of(
     st.just(""), st.text("abcxyz/._-", min_size=2, max_size=9).map("q".__add__)
 )
@@ -27,10 +31,10 @@ COMMANDS = [
     (EVAL, "--episodes", POSITIVE),
     (EVAL, "--seed", SEED),
     (EVAL, "--backend", NAME),
-    (EVAL, "--threads", POSITIVE),
+    (EVAL, "--threads", OPTIONAL_WHOLE),
     (("eval", "push", "--out", "OUT"), "--task", NAME),
     (RECORD, "--seed", SEED),
-    (RECORD, "--max-steps", POSITIVE),
+    (RECORD, "--max-steps", OPTIONAL_WHOLE),
     (("record", "push", "--out", "OUT.rrd"), "--task", NAME),
     (("record", "push", "--task", "type1_bca"), "--out", NAME),
     (("train", "--out", "OUT"), "", NAME),
@@ -40,8 +44,8 @@ COMMANDS = [
     (TRAIN, "--frames", POSITIVE),
     (TRAIN, "--learning-rate", st.one_of(NUMBER, st.just("-1"), st.just("0"))),
     (TRAIN, "--gamma", st.one_of(NUMBER, st.sampled_from(["2", "-0.1"]))),
-    (TRAIN, "--friction", st.one_of(NUMBER, st.sampled_from(["3", "-0.1"]))),
-    (TRAIN, "--max-steps", POSITIVE),
+    (TRAIN, "--friction", st.one_of(OPTIONAL_NUMBER, st.sampled_from(["3", "-0.1"]))),
+    (TRAIN, "--max-steps", OPTIONAL_WHOLE),
     (TRAIN, "--device", NAME),
     (TRAIN, "--observation", NAME),
     (("phantom", "generate", "--out", "OUT"), "", NAME),
