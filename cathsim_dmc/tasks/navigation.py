@@ -275,6 +275,10 @@ class Navigation(composer.Task):
         for substep in range(self._substeps):
             for _ in range(forces.REFINEMENT):
                 mujoco.mj_step(model, data)
+                if self._warnings.tobytes() != self._warned_before:
+                    # A batch stops there, too.
+                    model.opt.timestep = timestep
+                    return
             history.keep(substep, self._contacts)
         model.opt.timestep = timestep
 
