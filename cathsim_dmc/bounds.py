@@ -83,6 +83,13 @@ def seed(name: str, value: Any) -> int:
     return whole(name, value, 0, MOST_SEED)
 
 
+def random_state(name: str, value: Any) -> np.random.RandomState:
+    """A source of randomness: one that is given, or one of a seed; None takes any."""
+    if isinstance(value, np.random.RandomState):
+        return value
+    return np.random.RandomState(None if value is None else seed(name, value))
+
+
 def switch(name: str, value: Any) -> bool:
     """True or False, and nothing that Python takes for it."""
     if not isinstance(value, bool | np.bool_):

@@ -138,8 +138,7 @@ def make_task(
     )
     # Before seconds of work are lost.
     observations.resolve(config.observation)
-    if not (random is None or isinstance(random, np.random.RandomState)):
-        random = bounds.seed("random", random)
+    random = bounds.random_state("random", random)
     goal = own.get("goal", definition.goal or "bca")
     access = own.get("access", definition.access)
     if definition.random_arch:

@@ -5,11 +5,13 @@ import dataclasses
 import gc
 
 import hypothesis
+import mujoco
 import numpy as np
 import pytest
 
 from cathsim_dmc import suite
 from cathsim_dmc.tasks.navigation import Navigation
+from cathsim_dmc.tasks.variations import Episode
 
 # A first call may import scipy or compile; how long it takes is not what is tested.
 hypothesis.settings.register_profile("default", deadline=None)
@@ -42,6 +44,13 @@ def twin(task, seed=0, **changes):
     assert not task._cases or other._fluoroscopy == task._fluoroscopy
     other._cases = task._cases
     return other
+
+
+def begin_dumped(environment, meta, state):
+    """Puts an environment to where the episode of a dump begins."""
+    environment.task.rollout.take(0, Episode.from_motion(meta["drawn"]))
+    model, data = environment.physics.model.ptr, environment.physics.data.ptr
+    mujoco.mj_setState(model, data, state, mujoco.mjtState.mjSTATE_INTEGRATION)
 
 
 def pytest_collection_finish():

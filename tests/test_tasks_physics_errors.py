@@ -2,10 +2,9 @@ import logging
 import os
 import stat
 
-import mujoco
 import numpy as np
 import pytest
-from conftest import twin
+from conftest import begin_dumped, twin
 
 from cathsim_dmc import suite
 from cathsim_dmc.anatomy.arch import arch
@@ -73,9 +72,7 @@ def test_exploding_force_ends_the_episode_as_a_physics_error(
 
 def replay(environment, meta, state, actions):
     """Steps an environment through the episode of a dump."""
-    environment.task.rollout.take(0, Episode.from_motion(meta["drawn"]))
-    model, data = environment.physics.model.ptr, environment.physics.data.ptr
-    mujoco.mj_setState(model, data, state, mujoco.mjtState.mjSTATE_INTEGRATION)
+    begin_dumped(environment, meta, state)
     for action in actions:
         environment.step(action)
 

@@ -2,34 +2,30 @@
 
 from pathlib import Path
 
-import mujoco
 import numpy as np
 import pytest
+from conftest import begin_dumped
 
 from cathsim_dmc import suite
 from cathsim_dmc.simulation.batch import BatchSimulation
 from cathsim_dmc.tasks import forces, physics_errors
-from cathsim_dmc.tasks.variations import Episode
 
 # The last ten control steps of an episode of random actions: the device snaps across
 # the aorta and is as deep in the wall as it is thick after one physics step of 4 ms.
 _SNAP = Path(__file__).with_name("data") / "snap_through.npz"
-_STATE = mujoco.mjtState.mjSTATE_INTEGRATION
 
 
 def _snap():
-    """Wall forces, N, and physics steps of the recorded moment."""
+    """Wall forces, N, of the recorded moment, and the error that ended it."""
     meta, state, actions = physics_errors.load(_SNAP)
     environment = suite.load("cathsim", "type1_lcca", {"randomisation": True})
     environment.reset()
-    task, physics = environment.task, environment.physics
-    task.rollout.take(0, Episode.from_motion(meta["drawn"]))
-    mujoco.mj_setState(physics.model.ptr, physics.data.ptr, state, _STATE)
-    peaks = []
+    begin_dumped(environment, meta, state)
+    task, peaks = environment.task, []
     for action in actions:
         environment.step(action)
         peaks.append(float(task.wall_force.peak_max))
-    assert physics.model.ptr.opt.timestep == task.physics_timestep
+    assert environment.physics.timestep() == task.physics_timestep
     return peaks, task.error
 
 

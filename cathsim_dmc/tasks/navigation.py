@@ -69,10 +69,7 @@ class Navigation(composer.Task):
         self._scene = scene
         self._objective = objective
         self._config = config = config or NavigationConfig()
-        if not isinstance(random, np.random.RandomState):
-            seed = None if random is None else bounds.seed("random", random)
-            random = np.random.RandomState(seed)
-        self._random_state = random
+        self._random_state = bounds.random_state("random", random)
         if config.ranges.goal_shift and not hasattr(objective, "shifted"):
             raise ValueError(
                 f"randomisation shifts the goal, but {type(objective).__name__} has "
@@ -256,31 +253,36 @@ class Navigation(composer.Task):
         """Decides reward, success and end of the episode, once."""
         del physics, random_state
         history = self._contact_history
-        warned = self._warnings.tobytes() != self._warned_before
         magnitudes = history.magnitudes()
-        if magnitudes.size and not warned:
-            if forces.too_coarse(magnitudes, history.rows):
-                self._refine()
-                warned = self._warnings.tobytes() != self._warned_before
-                magnitudes = history.magnitudes()
-        self._step = self._rollout.finish(magnitudes[None], [warned])
+        if (
+            magnitudes.size
+            and not self._warned
+            and forces.too_coarse(magnitudes, history.rows)
+        ):
+            self._refine()
+            magnitudes = history.magnitudes()
+        self._step = self._rollout.finish(magnitudes[None], [self._warned])
+
+    @property
+    def _warned(self) -> bool:
+        """Whether MuJoCo has warned in the control step."""
+        return self._warnings.tobytes() != self._warned_before
 
     def _refine(self):
         """Does the control step again with shorter physics steps."""
         model, data, history = self._model, self._data, self._contact_history
         mujoco.mj_setState(model, data, self._before, _STATE)
         history.clear()
-        timestep = model.opt.timestep
-        model.opt.timestep = timestep / forces.REFINEMENT
-        for substep in range(self._substeps):
-            for _ in range(forces.REFINEMENT):
-                mujoco.mj_step(model, data)
-                if self._warnings.tobytes() != self._warned_before:
-                    # A batch stops there, too.
-                    model.opt.timestep = timestep
-                    return
-            history.keep(substep, self._contacts)
-        model.opt.timestep = timestep
+        model.opt.timestep /= forces.REFINEMENT
+        try:
+            for substep in range(self._substeps):
+                for _ in range(forces.REFINEMENT):
+                    mujoco.mj_step(model, data)
+                    if self._warned:  # where a batch stops, too
+                        return
+                history.keep(substep, self._contacts)
+        finally:
+            model.opt.timestep *= forces.REFINEMENT
 
     def _current(self) -> Step:
         """The last control step, or the start of the episode, looked at once."""
