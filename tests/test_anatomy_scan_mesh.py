@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import base64
+import tracemalloc
+import zlib
 from pathlib import Path
 
 import numpy as np
@@ -281,3 +284,63 @@ def test_axes_turn_a_lying_scan(y_mesh, tmp_path):
     for axes, match in (("LPX", "three letters"), ("LLS", "twice"), ("RPS", "mirror")):
         with pytest.raises(ValueError, match=match):
             upright(axes)
+
+
+def packed(*header, block=b""):
+    """Content of a compressed array whose header says what it likes."""
+    header = np.array([*header, len(block)], "<u4").tobytes()
+    text = base64.b64encode(header) + base64.b64encode(block)
+    return f'format="binary">{text.decode()}'
+
+
+def polydata(points, corners="> 0 1 2", stops="> 3", compressor="ZLib"):
+    return (
+        f'<VTKFile type="PolyData" compressor="vtk{compressor}DataCompressor">'
+        f'<PolyData><Piece><Points><DataArray type="Float32" {points}</DataArray>'
+        f'</Points><Polys><DataArray type="Int8" Name="connectivity" {corners}'
+        f'</DataArray><DataArray type="Int32" Name="offsets" {stops}</DataArray>'
+        "</Polys></Piece></PolyData></VTKFile>"
+    )
+
+
+@pytest.fixture(scope="module")
+def greedy_files():
+    """Small files that claim much."""
+    zeros = zlib.compress(bytes(2**27), 9)  # 130 kB
+    dictionary = b"]" + b"\xff" * 12 + bytes(20)  # of 4 GB
+    return {
+        "last block": polydata(packed(1, 8, 2**27, block=zeros)),
+        "no size": polydata(packed(1, 0, 0, block=zeros)),
+        "block": polydata("> 0 0 0", packed(1, 2**27, 0, block=zeros)),
+        "dictionary": polydata(packed(1, 8, 8, block=dictionary), compressor="LZMA"),
+        "offsets": polydata(
+            ">" + "0 " * 9000, ">" + "0 " * 9000, ">" + "9000 0 " * 3000 + "9000"
+        ),
+        "elements": "<VTKFile>" + "<a/>" * 400_000,
+    }
+
+
+@pytest.mark.parametrize(
+    "name", ["last block", "no size", "block", "dictionary", "offsets", "elements"]
+)
+def test_a_small_vtp_does_not_take_much_memory(greedy_files, tmp_path, name):
+    path = tmp_path / "greedy.vtp"
+    path.write_text(greedy_files[name])
+    tracemalloc.start()
+    try:
+        with pytest.raises(ValueError, match="cannot be read as VTP"):
+            read_triangles(path)
+        assert tracemalloc.get_traced_memory()[1] < 60e6
+    finally:
+        tracemalloc.stop()
+
+
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-16", "utf-16-be"])
+def test_a_vtp_with_entities_is_refused_in_every_encoding(tmp_path, encoding):
+    good = (DATA / "cylinder-ascii.vtp").read_text()
+    text = '<!DOCTYPE a [<!ENTITY b "c">]>' + good[good.index("<VTKFile") :]
+    text = f'<?xml version="1.0" encoding="{encoding[:6]}"?>' + text
+    path = tmp_path / "entities.vtp"
+    path.write_bytes(text.encode(encoding))
+    with pytest.raises(ValueError, match="declares XML entities"):
+        read_triangles(path)

@@ -6,8 +6,10 @@ import subprocess
 import sys
 import time
 import urllib.request
+from pathlib import Path
 
 import pytest
+import rerun_cli
 from recording_samples import make_episode, make_tube
 
 from cathsim_dmc.recording import viewer
@@ -26,12 +28,12 @@ def commands(monkeypatch):
     monkeypatch.delenv("RUST_LOG", raising=False)
     started = []
 
-    def run(command, check, env):
-        assert env["RUST_LOG"] == "warn"
+    def wait(command, environment):
+        assert environment["RUST_LOG"] == "warn"
         started.append(command)
-        return subprocess.CompletedProcess(command, 3)
+        return 3
 
-    monkeypatch.setattr(viewer.subprocess, "run", run)
+    monkeypatch.setattr(viewer, "_wait", wait)
     return started
 
 
@@ -56,17 +58,9 @@ def test_no_display_is_an_error_that_names_the_way_out(
     assert commands == []
     monkeypatch.setenv("DISPLAY", ":0")
     assert open_viewer(recording) == 3
-    assert commands == [
-        [
-            sys.executable,
-            "-m",
-            "rerun_cli",
-            str(recording.resolve()),
-            "--new",
-            "--bind",
-            "127.0.0.1",
-        ]
-    ]
+    ((executable, *arguments),) = commands
+    assert Path(executable).parent == Path(rerun_cli.__file__).parent
+    assert arguments == [str(recording.resolve()), "--new", "--bind", "127.0.0.1"]
 
 
 def test_serving_needs_no_display_but_a_free_port(recording, commands, monkeypatch):
@@ -87,15 +81,28 @@ def test_serving_needs_no_display_but_a_free_port(recording, commands, monkeypat
     assert f"%3A{data_port}%2F" in addresses[0]
 
 
-def test_a_browser_gets_a_page(recording):
+def answer(port):
+    """Text of the page at a port, or None."""
+    try:
+        with urllib.request.urlopen(f"http://127.0.0.1:{port}/") as page:
+            return page.read().decode()
+    except OSError:
+        return None
+
+
+@pytest.mark.parametrize(
+    ("name", "status"), [("SIGINT", 0), ("SIGTERM", 128 + signal.SIGTERM)]
+)
+def test_a_browser_gets_a_page_until_the_command_ends(recording, name, status):
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         port = probe.getsockname()[1]
     code = (
         # A shell starts what runs in the background deaf to Ctrl-C.
-        "import signal; signal.signal(signal.SIGINT, signal.default_int_handler); "
+        "import signal, sys; "
+        "signal.signal(signal.SIGINT, signal.default_int_handler); "
         "from cathsim_dmc.recording import open_viewer; "
-        f"open_viewer({str(recording)!r}, web=True, port={port})"
+        f"sys.exit(open_viewer({str(recording)!r}, web=True, port={port}))"
     )
     server = subprocess.Popen(
         [sys.executable, "-c", code],
@@ -105,20 +112,14 @@ def test_a_browser_gets_a_page(recording):
     )
     try:
         deadline = time.monotonic() + 20
-        while True:
-            try:
-                with urllib.request.urlopen(f"http://127.0.0.1:{port}/") as page:
-                    text = page.read().decode()
-                break
-            except OSError:
-                assert server.poll() is None and time.monotonic() < deadline
-                time.sleep(0.1)
+        while (text := answer(port)) is None:
+            assert server.poll() is None and time.monotonic() < deadline
+            time.sleep(0.1)
         assert "Rerun" in text
+        # To the command alone: its children end with it.
+        server.send_signal(signal.Signals[name])
+        assert server.wait(timeout=20) == status
+        assert answer(port) is None
     finally:
-        try:
-            # As Ctrl-C does in a terminal: to the whole group.
-            os.killpg(server.pid, signal.SIGINT)
-            assert server.wait(timeout=20) == 0
-        finally:
-            with contextlib.suppress(ProcessLookupError):
-                os.killpg(server.pid, signal.SIGKILL)
+        with contextlib.suppress(ProcessLookupError):
+            os.killpg(server.pid, signal.SIGKILL)

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import importlib.util
 import os
+import signal
 import socket
 import subprocess
 import sys
+import threading
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from urllib.parse import quote, urlsplit
@@ -21,9 +23,6 @@ WEB_PORT = 9090
 # Where a viewer listens by default for what is logged.
 LIVE_ADDRESS = "rerun+http://127.0.0.1:9876/proxy"
 _LIVE_PATIENCE = 5.0  # s
-# The interpreter's own package, never another `rerun` that PATH may hold: file
-# format and viewer have to be of one version.
-_RERUN = (sys.executable, "-m", "rerun_cli")
 
 
 class ViewerError(RuntimeError):
@@ -60,7 +59,7 @@ def check_recording(path: str | os.PathLike[str]) -> Path:
 
 def viewer_command(path: Path) -> list[str]:
     """Return the command that opens a recording in a window of its own."""
-    return [*_RERUN, str(path), "--new", "--bind", LOOPBACK]
+    return [_executable(), str(path), "--new", "--bind", LOOPBACK]
 
 
 def serve_command(path: Path, host: str, port: int, data_port: int) -> list[str]:
@@ -73,7 +72,7 @@ def serve_command(path: Path, host: str, port: int, data_port: int) -> list[str]
         data_port: Port of the data that the page loads.
     """
     ports = ["--port", str(data_port), "--web-viewer-port", str(port)]
-    return [*_RERUN, str(path), "--serve-web", "--bind", host, *ports]
+    return [_executable(), str(path), "--serve-web", "--bind", host, *ports]
 
 
 def web_address(host: str, port: int, data_port: int) -> str:
@@ -117,8 +116,6 @@ def open_viewer(
             no display, or the port is taken.
     """
     recording = check_recording(path)
-    if importlib.util.find_spec("rerun_cli") is None:
-        raise ViewerError("the Rerun viewer is missing; pip install rerun-sdk")
     if not web and not has_display():
         raise ViewerError(
             f"no display to open {recording.name} on; serve it with web=True (in the "
@@ -132,12 +129,29 @@ def open_viewer(
         if announce is not None:
             announce(web_address(host, port, data_port))
     # Where it serves has been said, and in a form that a browser elsewhere can use.
-    quiet = {"RUST_LOG": "warn", **os.environ}
+    return _wait(command, {"RUST_LOG": "warn", **os.environ})
+
+
+def _wait(command: list[str], environment: Mapping[str, str]) -> int:
+    """Runs a command until it ends; it ends with this process at Ctrl-C and SIGTERM."""
+
+    def stop(number: int, frame: object) -> None:
+        raise SystemExit(128 + number)
+
+    handled = threading.current_thread() is threading.main_thread()
+    previous = signal.signal(signal.SIGTERM, stop) if handled else None
     try:
-        return subprocess.run(command, check=False, env=quiet).returncode
+        with subprocess.Popen(command, env=environment) as process:
+            try:
+                return process.wait()
+            finally:
+                process.terminate()
     except KeyboardInterrupt:
         # Ctrl-C is how serving ends.
         return 0
+    finally:
+        if handled:
+            signal.signal(signal.SIGTERM, previous)
 
 
 def live_address(viewer: str) -> str:
@@ -182,12 +196,15 @@ def live_address(viewer: str) -> str:
 
 
 def _executable() -> str:
-    """The viewer of the interpreter's own package."""
+    """The viewer of this interpreter's package: of the version of the recordings."""
     found = importlib.util.find_spec("rerun_cli")
     if found is None or found.origin is None:
         raise ViewerError("the Rerun viewer is missing; pip install rerun-sdk")
-    name = "rerun.exe" if sys.platform == "win32" else "rerun"
-    return str(Path(found.origin).with_name(name))
+    names = ("Rerun.app/Contents/MacOS/Rerun", "rerun.exe", "rerun")
+    for path in (Path(found.origin).with_name(name) for name in names):
+        if path.exists():
+            return str(path)
+    raise ViewerError("the Rerun viewer is missing; install rerun-sdk again")
 
 
 def _checked_ports(host: str, port: int) -> int:

@@ -29,11 +29,20 @@ _TYPES = {
     "UInt16": "u2",
 }
 _APPENDED = re.compile(rb"<AppendedData[^>]*>\s*_")
-_MOST = 2**31  # bytes of one array; larger ones are no vessel's
+# Values of all arrays together: four million triangles have 24 million.
+_MOST_VALUES = 32_000_000
+_MOST_ELEMENTS = 10_000  # of XML; a file with 100 arrays has some 120
+_MOST_DICTIONARY = 2**27  # bytes that an lzma block may claim
+_UNPACKERS = {
+    "vtkZLibDataCompressor": zlib.decompressobj,
+    "vtkLZMADataCompressor": lambda: lzma.LZMADecompressor(memlimit=_MOST_DICTIONARY),
+}
 
 
 def read_vtp(data: bytes) -> tuple[np.ndarray, np.ndarray]:
     """Triangles of a file's polygons and strips; other cells are left out.
+
+    Memory is bounded by the length of the file and 32 million values.
 
     Args:
         data: the whole file.
@@ -43,10 +52,8 @@ def read_vtp(data: bytes) -> tuple[np.ndarray, np.ndarray]:
         more than three corners become fans.
 
     Raises:
-        ValueError: if the file is none or is damaged.
+        ValueError: if the file is none, is damaged or holds too much.
     """
-    if b"<!DOCTYPE" in data[:4096] or b"<!ENTITY" in data:
-        raise ValueError("it declares XML entities, which no VTK file does")
     appended, raw = b"", False
     start = _APPENDED.search(data)
     if start:
@@ -55,133 +62,133 @@ def read_vtp(data: bytes) -> tuple[np.ndarray, np.ndarray]:
         appended = data[start.end() : end]
         data = data[: start.end() - 1] + data[end:]
     try:
-        root = ElementTree.fromstring(data)
+        root = ElementTree.fromstring(data, ElementTree.XMLParser(target=_Elements()))
     except ElementTree.ParseError as error:
         raise ValueError(f"its XML is damaged: {error}") from error
     if root.tag != "VTKFile" or root.get("type") != "PolyData":
         raise ValueError(f"it holds {root.get('type', root.tag)!r}, not PolyData")
-    read = _array_reader(root, appended, raw)
-    vertices, faces, count = [], [], 0
+    arrays = _Arrays(root, appended, raw)
+    vertices, faces, count = [], [np.empty((0, 3), dtype=np.int64)], 0
     for piece in root.iter("Piece"):
         array = piece.find("Points/DataArray")
         if array is None:
             continue
-        points = read(array).astype(np.float64).reshape(-1, 3)
+        points = arrays.read(array).astype(np.float64).reshape(-1, 3)
         vertices.append(points)
-        for kind, split in (("Polys", _fans), ("Strips", _strips)):
-            arrays = {e.get("Name"): e for e in piece.findall(f"{kind}/DataArray")}
-            if {"connectivity", "offsets"} <= set(arrays):
-                corners = read(arrays["connectivity"]).astype(np.int64)
-                stops = read(arrays["offsets"]).astype(np.int64)
-                if len(stops) and (stops[-1] != len(corners) or stops.min() < 0):
-                    raise ValueError("its offsets do not fit its connectivity")
+        for kind in ("Polys", "Strips"):
+            found = {e.get("Name"): e for e in piece.findall(f"{kind}/DataArray")}
+            if {"connectivity", "offsets"} <= set(found):
+                corners = arrays.read(found["connectivity"]).astype(np.int64)
+                stops = arrays.read(found["offsets"]).astype(np.int64)
                 if len(corners) and not 0 <= corners.min() <= corners.max() < len(
                     points
                 ):
                     raise ValueError(f"its cells name points beyond {len(points)}")
-                faces.append(split(corners, stops) + count)
+                faces.append(_triangles(corners, stops, kind == "Strips") + count)
         count += len(points)
     if not vertices:
         raise ValueError("it has no points")
-    empty = np.empty((0, 3), dtype=np.int64)
-    return np.concatenate(vertices), np.concatenate([empty, *faces])
+    return np.concatenate(vertices), np.concatenate(faces)
 
 
-def _fans(corners: np.ndarray, stops: np.ndarray) -> np.ndarray:
-    starts = np.concatenate([[0], stops[:-1]]).astype(np.int64)
-    sizes = stops - starts
-    faces = []
-    for size in np.unique(sizes[sizes >= 3]):
-        rows = corners[starts[sizes == size][:, None] + np.arange(size)]
-        for k in range(1, size - 1):
-            faces.append(rows[:, [0, k, k + 1]])
-    return np.concatenate(faces) if faces else np.empty((0, 3), dtype=np.int64)
+class _Elements(ElementTree.TreeBuilder):
+    """Builds the tree of a file without declarations, in any encoding."""
+
+    _count = 0
+
+    def doctype(self, name: str, pubid: str, system: str) -> None:
+        raise ValueError("it declares XML entities, which no VTK file does")
+
+    def start(self, tag, attrs):
+        self._count += 1
+        if self._count > _MOST_ELEMENTS:
+            raise ValueError(f"it has more than {_MOST_ELEMENTS:,} XML elements")
+        return super().start(tag, attrs)
 
 
-def _strips(corners: np.ndarray, stops: np.ndarray) -> np.ndarray:
-    faces, start = [np.empty((0, 3), dtype=np.int64)], 0
-    for stop in stops:
-        strip = corners[start:stop]
-        if len(strip) >= 3:
-            three = np.stack([strip[:-2], strip[1:-1], strip[2:]], axis=1)
-            three[1::2] = three[1::2, ::-1]  # every other triangle is turned
-            faces.append(three)
-        start = stop
-    return np.concatenate(faces)
+def _triangles(corners: np.ndarray, stops: np.ndarray, strips: bool) -> np.ndarray:
+    """Triangles (F, 3) of cells, fans of polygons or strips."""
+    sizes = np.diff(stops, prepend=0)
+    if (sizes < 0).any() or sizes.sum() != len(corners):
+        raise ValueError("its offsets do not fit its connectivity")
+    first = np.repeat(stops - sizes, sizes)
+    place = np.arange(len(corners)) - first
+    last = np.flatnonzero(place >= 2)
+    if strips:
+        odd = place[last] % 2  # every other triangle is turned
+        return corners[np.stack([last - 2 + 2 * odd, last - 1, last - 2 * odd], axis=1)]
+    return corners[np.stack([first[last], last - 1, last], axis=1)]
 
 
-def _array_reader(
-    root: ElementTree.Element, appended: bytes, raw: bool
-) -> Callable[[ElementTree.Element], np.ndarray]:
-    """A function that reads the values of a DataArray."""
-    order = ">" if root.get("byte_order") == "BigEndian" else "<"
-    header = np.dtype(order + _TYPES[root.get("header_type", "UInt32")])
-    compressor = root.get("compressor", "")
-    unpack = {
-        "": None,
-        "vtkZLibDataCompressor": lambda block, size: zlib.decompressobj().decompress(
-            block, size
-        ),
-        "vtkLZMADataCompressor": lambda block, size: lzma.LZMADecompressor().decompress(
-            block, size
-        ),
-    }.get(compressor, False)
-    if unpack is False:
-        raise ValueError(
-            f"it is compressed with {compressor}; save it uncompressed or with zlib"
-        )
+class _Arrays:
+    """Reads the arrays of a file, `_MOST_VALUES` values in all."""
 
-    def sized(block: bytes, size: int) -> bytes:
-        values = unpack(block, size)
-        if len(values) != size:
-            raise ValueError("a compressed block is damaged")
-        return values
+    def __init__(self, root: ElementTree.Element, appended: bytes, raw: bool):
+        self._appended, self._raw = appended, raw
+        self._left = _MOST_VALUES
+        self._order = ">" if root.get("byte_order") == "BigEndian" else "<"
+        self._header = np.dtype(self._order + _TYPES[root.get("header_type", "UInt32")])
+        compressor = root.get("compressor", "")
+        self._unpacker = _UNPACKERS.get(compressor)
+        if compressor and self._unpacker is None:
+            raise ValueError(
+                f"it is compressed with {compressor}; save it uncompressed or with zlib"
+            )
 
-    def unwrap(fetch: Callable[..., bytes]) -> bytes:
-        """Bytes of an array; ``fetch`` gives decoded bytes from a place on."""
-        wide = header.itemsize
-        if unpack is None:
-            size = int(np.frombuffer(fetch(0, wide), header)[0])
-            if size > _MOST:
-                raise ValueError("an array is larger than 2 GB")
+    def read(self, array: ElementTree.Element) -> np.ndarray:
+        """Values of a DataArray."""
+        kind = array.get("type", "")
+        if kind not in _TYPES:
+            raise ValueError(f"an array is of type {kind!r}")
+        dtype = np.dtype(self._order + _TYPES[kind])
+        try:
+            if array.get("format", "ascii") == "ascii":
+                text = (array.text or "").split(maxsplit=self._left)
+                self._claim(len(text))
+                return np.array(text, dtype=np.float64).astype(_TYPES[kind])
+            return np.frombuffer(self._unwrap(self._fetch(array), dtype), dtype)
+        except (zlib.error, lzma.LZMAError, IndexError, TypeError) as error:
+            raise ValueError(f"an array is damaged: {error}") from error
+
+    def _claim(self, values: int) -> None:
+        if not 0 <= values <= self._left:
+            raise ValueError(f"its arrays hold more than {_MOST_VALUES:,} values")
+        self._left -= values
+
+    def _fetch(self, array: ElementTree.Element) -> Callable[..., bytes]:
+        """A function that gives the bytes of an array from a place on."""
+        start = int(array.get("offset", "0"))
+        if array.get("format") == "appended":
+            if self._raw:
+                return _raw(self._appended, start)
+            text = self._appended[start:]
+        else:
+            text = (array.text or "").strip().encode()
+        return _base64(text)
+
+    def _unwrap(self, fetch: Callable[..., bytes], dtype: np.dtype) -> bytes:
+        wide = self._header.itemsize
+        if self._unpacker is None:
+            size = int(np.frombuffer(fetch(0, wide), self._header)[0])
+            self._claim(size // dtype.itemsize)
             return fetch(wide, size)
-        count, full, last = np.frombuffer(fetch(0, 3 * wide), header).astype(int)
-        if not 0 <= count * max(full, 1) <= _MOST:
-            raise ValueError("an array is larger than 2 GB")
-        packed = np.frombuffer(fetch(3 * wide, count * wide), header).astype(int)
+        header = np.frombuffer(fetch(0, 3 * wide), self._header)
+        count, full, last = (int(number) for number in header)
+        if not 0 <= last <= full or count and full == 0:
+            raise ValueError("the header of a compressed array is damaged")
+        self._claim(max(count * full // dtype.itemsize, count))
+        packed = np.frombuffer(fetch(3 * wide, count * wide), self._header).astype(int)
         data = fetch((3 + count) * wide, int(packed.sum()), after=True)
         stops = np.concatenate([[0], np.cumsum(packed)])
         sizes = [full] * count
         if count and last:
             sizes[-1] = last
-        return b"".join(
-            sized(data[a:b], int(size))
-            for a, b, size in zip(stops[:-1], stops[1:], sizes, strict=True)
-        )
-
-    def read(array: ElementTree.Element) -> np.ndarray:
-        kind = array.get("type", "")
-        if kind not in _TYPES:
-            raise ValueError(f"an array is of type {kind!r}")
-        dtype = np.dtype(order + _TYPES[kind])
-        how = array.get("format", "ascii")
-        try:
-            if how == "ascii":
-                text = (array.text or "").split()
-                return np.array(text, dtype=np.float64).astype(_TYPES[kind])
-            if how == "appended" and raw:
-                start = int(array.get("offset", "0"))
-                data = unwrap(_raw(appended, start))
-            else:
-                text = (array.text or "").strip().encode()
-                if how == "appended":
-                    text = appended[int(array.get("offset", "0")) :]
-                data = unwrap(_base64(text, unpack is not None, header.itemsize))
-            return np.frombuffer(data, dtype)
-        except (zlib.error, lzma.LZMAError, IndexError, TypeError) as error:
-            raise ValueError(f"an array is damaged: {error}") from error
-
-    return read
+        blocks = []
+        for a, b, size in zip(stops[:-1], stops[1:], sizes, strict=True):
+            blocks.append(self._unpacker().decompress(data[a:b], size))
+            if len(blocks[-1]) != size:
+                raise ValueError("a compressed block is damaged")
+        return b"".join(blocks)
 
 
 def _raw(data: bytes, start: int) -> Callable[..., bytes]:
@@ -194,7 +201,7 @@ def _raw(data: bytes, start: int) -> Callable[..., bytes]:
     return fetch
 
 
-def _base64(text: bytes, compressed: bool, wide: int) -> Callable[..., bytes]:
+def _base64(text: bytes) -> Callable[..., bytes]:
     """Decoded bytes; a compressed array's header is encoded apart from its blocks."""
 
     def decoded(begin: int, size: int) -> bytes:
