@@ -201,7 +201,7 @@ def _executable() -> str:
     if found is None or found.origin is None:
         raise ViewerError("the Rerun viewer is missing; pip install rerun-sdk")
     names = ("Rerun.app/Contents/MacOS/Rerun", "rerun.exe", "rerun")
-    for path in (Path(found.origin).with_name(name) for name in names):
+    for path in (Path(found.origin).parent / name for name in names):
         if path.exists():
             return str(path)
     raise ViewerError("the Rerun viewer is missing; install rerun-sdk again")
