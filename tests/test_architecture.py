@@ -15,7 +15,7 @@ PACKAGE = Path(cathsim_dmc.__file__).parent
 NAME = "cathsim_dmc"
 
 BELOW = {"files", "bounds", "style", "compiled"}
-_TASK = {"anatomy", "imaging", "entities", "tasks"}
+_TASK = {"anatomy", "imaging", "entities", "physics", "tasks"}
 _FACE = _TASK | {"suite", "simulation"}
 # Part of the package -> parts that it may import. Arrows point one way: what stands
 # further up knows what stands further down, never the other way round.
@@ -30,7 +30,8 @@ ALLOWED = {
     "anatomy": set(),
     "imaging": {"anatomy"},
     "entities": {"anatomy", "imaging"},
-    "tasks": {"anatomy", "imaging", "entities"},
+    "physics": {"anatomy", "imaging", "entities"},
+    "tasks": {"anatomy", "imaging", "entities", "physics"},
     "suite": _TASK,
     "simulation": _TASK | {"suite"},
     "policies": _FACE,
@@ -61,9 +62,10 @@ CONFINED = {
     "safetensors": {"agents/pretrained.py"},
     "ray": {"agents/ray_source.py"},
     "rerun": {"recording/"},
+    "llvmlite": {"physics/native.py"},
     "coacd": {"anatomy/"},
     "fast_simplification": {"anatomy/scan/repair.py"},
-    "numba": {"compiled.py"},
+    "numba": {"compiled.py", "physics/native.py"},
     "gymnasium": {"simulation/gymnasium.py", "gym.py"},
     "tyro": {"cli/"},
 }
