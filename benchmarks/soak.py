@@ -37,8 +37,8 @@ from scipy.stats import qmc
 
 from cathsim_dmc import files, suite
 from cathsim_dmc.analysis.containment import Containment
+from cathsim_dmc.physics import forces
 from cathsim_dmc.simulation.batch import BatchSimulation
-from cathsim_dmc.tasks import forces
 
 # Both arches from both sides: a goal does not change what these policies do.
 TASKS = ("type1_lcca", "type2_lcca", "femoral_type1_lcca", "femoral_type2_lcca")

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from cathsim_dmc import suite
+from cathsim_dmc.physics.randomisation import Episode
 from cathsim_dmc.tasks.navigation import Navigation
-from cathsim_dmc.tasks.variations import Episode
 
 # A first call may import scipy or compile; how long it takes is not what is tested.
 hypothesis.settings.register_profile("default", deadline=None)

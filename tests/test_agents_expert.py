@@ -10,9 +10,9 @@ from hypothesis import strategies as st
 
 from cathsim_dmc import agents, policies, suite
 from cathsim_dmc.anatomy.arch import arch
+from cathsim_dmc.physics import forces
 from cathsim_dmc.policies import attempts, expert, pursuit
 from cathsim_dmc.simulation import batch
-from cathsim_dmc.tasks import forces
 
 TASKS = (
     "type1_bca",

@@ -20,11 +20,11 @@ from cathsim_dmc.anatomy.parts import Goal, Inlet, Surface
 from cathsim_dmc.anatomy.scan.importer import import_scan
 from cathsim_dmc.entities import devices
 from cathsim_dmc.imaging.options import FluoroscopyOptions
+from cathsim_dmc.physics.randomisation import Randomisation
 from cathsim_dmc.simulation.batch import BatchSimulation
 from cathsim_dmc.simulation.torchrl import BatchedEnv
 from cathsim_dmc.tasks.cameras import CameraOptions
 from cathsim_dmc.tasks.config import NavigationConfig
-from cathsim_dmc.tasks.variations import Randomisation
 
 ARCH = arch.ARCHES["simple1"]
 POSITIVE = number(positive=True)

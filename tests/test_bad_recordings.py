@@ -9,12 +9,12 @@ from bad_values import ERRORS, Tally, damaged_json, settled, try_bytes, try_json
 from hypothesis import strategies as st
 from recording_samples import make_episode, make_tube
 
+from cathsim_dmc.physics.randomisation import Episode as Drawn
 from cathsim_dmc.recording import dataset, viewer
 from cathsim_dmc.recording.dataset_reader import read_episodes
 from cathsim_dmc.recording.episode import Episode
 from cathsim_dmc.recording.rerun_log import write_rrd
 from cathsim_dmc.tasks import physics_errors
-from cathsim_dmc.tasks.variations import Episode as Drawn
 
 
 def write_demonstrations(path):

@@ -12,11 +12,11 @@ from cathsim_dmc.anatomy.arch import arch
 from cathsim_dmc.anatomy.parts import Goal
 from cathsim_dmc.anatomy.scan.importer import import_scan
 from cathsim_dmc.entities import devices
+from cathsim_dmc.physics.randomisation import Randomisation
 from cathsim_dmc.simulation.batch import BatchSimulation
 from cathsim_dmc.tasks import observations
 from cathsim_dmc.tasks.config import NavigationConfig
 from cathsim_dmc.tasks.objectives import Cannulation
-from cathsim_dmc.tasks.variations import Randomisation
 
 
 def fails(words, error=ValueError, **options):

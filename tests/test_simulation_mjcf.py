@@ -8,8 +8,8 @@ import pytest
 from lxml import etree
 
 from cathsim_dmc import suite
+from cathsim_dmc.physics import forces
 from cathsim_dmc.simulation.mjcf import write_mjcf
-from cathsim_dmc.tasks import forces
 
 TASK, SEED, STEPS = "type1_lcca", 3, 30
 

@@ -16,7 +16,8 @@ from cathsim_dmc import suite
 from cathsim_dmc.analysis.containment import Containment
 from cathsim_dmc.anatomy.arch import arch
 from cathsim_dmc.anatomy.parts import Goal
-from cathsim_dmc.tasks import forces, observations
+from cathsim_dmc.physics import forces
+from cathsim_dmc.tasks import observations
 
 # Those that need OpenGL are tested with the cameras.
 WITHOUT_GL = tuple(

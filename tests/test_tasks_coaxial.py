@@ -6,8 +6,8 @@ import pytest
 from conftest import twin
 
 from cathsim_dmc import suite
+from cathsim_dmc.physics import sliding
 from cathsim_dmc.simulation.batch import BatchSimulation
-from cathsim_dmc.tasks import coaxial
 from cathsim_dmc.tasks.config import CONTROL_TIMESTEP, NavigationConfig
 
 TASK = "simple1_lcca_pair"
@@ -150,7 +150,7 @@ def test_a_step_of_a_single_device_does_no_pair_work(shared_environment, monkeyp
     assert environment.task.rollout.devices is None
     assert environment.physics.model.ptr.nuserdata == 0
     monkeypatch.setattr(
-        coaxial, "made_of", lambda *_: pytest.fail("coaxial work for one device")
+        sliding, "made_of", lambda *_: pytest.fail("coaxial work for one device")
     )
     environment.reset()
     environment.step(np.zeros(21))

@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
-from cathsim_dmc.tasks import forces
+from cathsim_dmc.physics import forces
 
 
 def sensor_row(contacts, places):

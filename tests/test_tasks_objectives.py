@@ -11,10 +11,11 @@ from scipy import stats
 
 from cathsim_dmc import suite
 from cathsim_dmc.anatomy.arch import arch
-from cathsim_dmc.tasks import forces, objectives, readings
+from cathsim_dmc.physics import forces, readings
+from cathsim_dmc.physics.randomisation import start_displacement
+from cathsim_dmc.tasks import objectives
 from cathsim_dmc.tasks.actions import check_action
 from cathsim_dmc.tasks.objectives import PUBLISHED_REWARD, Cannulation
-from cathsim_dmc.tasks.variations import start_displacement
 
 PATH_REWARD = {"path": -1.0, "success": 10.0}
 

@@ -8,9 +8,9 @@ from conftest import begin_dumped, twin
 
 from cathsim_dmc import suite
 from cathsim_dmc.anatomy.arch import arch
+from cathsim_dmc.physics.randomisation import Episode
 from cathsim_dmc.simulation import batch
 from cathsim_dmc.tasks import physics_errors as physics_errors
-from cathsim_dmc.tasks.variations import Episode
 
 
 @pytest.fixture

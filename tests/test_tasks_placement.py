@@ -15,8 +15,9 @@ from cathsim_dmc.anatomy import phantoms
 from cathsim_dmc.anatomy.arch import arch
 from cathsim_dmc.anatomy.parts import Inlet
 from cathsim_dmc.entities import devices
+from cathsim_dmc.physics import readings
 from cathsim_dmc.simulation.batch import BatchSimulation
-from cathsim_dmc.tasks import placement, readings
+from cathsim_dmc.tasks import placement
 from cathsim_dmc.tasks.config import NavigationConfig
 
 ANGLES = st.floats(0, 2 * math.pi)

@@ -7,8 +7,9 @@ import pytest
 from conftest import begin_dumped
 
 from cathsim_dmc import suite
+from cathsim_dmc.physics import forces
 from cathsim_dmc.simulation.batch import BatchSimulation
-from cathsim_dmc.tasks import forces, physics_errors
+from cathsim_dmc.tasks import physics_errors
 
 # The last ten control steps of an episode of random actions: the device snaps across
 # the aorta and is as deep in the wall as it is thick after one physics step of 4 ms.

@@ -8,14 +8,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from cathsim_dmc import suite
-from cathsim_dmc.tasks import objectives as objectives
-from cathsim_dmc.tasks.variations import (
+from cathsim_dmc.physics.randomisation import (
     DEFAULT_RANGES,
     ActionDelay,
     Episode,
     Randomisation,
     start_displacement,
 )
+from cathsim_dmc.tasks import objectives as objectives
 
 
 @pytest.fixture(scope="module")

@@ -24,7 +24,7 @@ class DeviceStack(Chain):
 
     The end of the chain is that of the device that reaches farthest; what the links are
     made of slides along it, see `coaxial`. The chain has one motor, which pushes it by
-    the device that leads; `tasks.coaxial` moves the devices and writes what changes
+    the device that leads; `physics.sliding` moves the devices and writes what changes
     into the model, once in a control step. An action has two entries for each device,
     from the innermost outwards: translation and rotation.
     """

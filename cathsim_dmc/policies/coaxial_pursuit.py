@@ -29,13 +29,14 @@ import numpy as np
 
 from cathsim_dmc.entities.chain import MAX_PUSH_SPEED, MAX_ROTATION_SPEED
 from cathsim_dmc.entities.device_stack import DeviceStack
+from cathsim_dmc.physics import forces
+from cathsim_dmc.physics.readings import Readings
+from cathsim_dmc.physics.sliding import CoaxialReadings
 from cathsim_dmc.policies import pursuit
 from cathsim_dmc.policies.attempts import Attempts, advance
-from cathsim_dmc.tasks import forces, navigation
+from cathsim_dmc.tasks import navigation
 from cathsim_dmc.tasks.cases import Case
-from cathsim_dmc.tasks.coaxial import CoaxialReadings
 from cathsim_dmc.tasks.config import CONTROL_TIMESTEP
-from cathsim_dmc.tasks.readings import Readings
 from cathsim_dmc.tasks.route import Place, along, locate
 
 # What a full action moves (m) and turns (rad) a device by in a control step.

@@ -11,16 +11,17 @@ from typing import Any, TypeVar
 
 import numpy as np
 
+from cathsim_dmc.physics import forces
+from cathsim_dmc.physics.readings import Readings
+from cathsim_dmc.physics.sliding import CoaxialReadings
 from cathsim_dmc.policies import coaxial_pursuit
 from cathsim_dmc.policies.attempts import Attempts
 from cathsim_dmc.policies.policy import Policy
 from cathsim_dmc.policies.pursuit import Plan, Settings, State, decide
 from cathsim_dmc.policies.view import View
-from cathsim_dmc.tasks import forces, navigation
+from cathsim_dmc.tasks import navigation
 from cathsim_dmc.tasks.cases import Case
-from cathsim_dmc.tasks.coaxial import CoaxialReadings
 from cathsim_dmc.tasks.objective_pool import part
-from cathsim_dmc.tasks.readings import Readings
 
 Memory = TypeVar("Memory", State, Attempts)
 

@@ -23,10 +23,11 @@ import dataclasses
 import numpy as np
 
 from cathsim_dmc.entities import devices
+from cathsim_dmc.physics import forces
+from cathsim_dmc.physics.readings import Readings
 from cathsim_dmc.policies import attempts
-from cathsim_dmc.tasks import forces, navigation
+from cathsim_dmc.tasks import navigation
 from cathsim_dmc.tasks.cases import Case
-from cathsim_dmc.tasks.readings import Readings
 from cathsim_dmc.tasks.route import Place, Route, RouteLike, along, locate
 
 

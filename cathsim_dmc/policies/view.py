@@ -12,12 +12,12 @@ from typing import Protocol, TypeVar
 import numpy as np
 from dm_control import composer
 
+from cathsim_dmc.physics import forces
+from cathsim_dmc.physics.readings import Readings
+from cathsim_dmc.physics.sliding import CoaxialReadings
 from cathsim_dmc.simulation.batch import BatchSimulation
-from cathsim_dmc.tasks import forces
 from cathsim_dmc.tasks.cases import Case
-from cathsim_dmc.tasks.coaxial import CoaxialReadings
 from cathsim_dmc.tasks.navigation import Navigation
-from cathsim_dmc.tasks.readings import Readings
 
 Stacked = TypeVar("Stacked", Readings, forces.WallForce, CoaxialReadings)
 

@@ -14,13 +14,13 @@ from dm_control import mjcf
 from mujoco import batch as mujoco_batch
 
 from cathsim_dmc import bounds
-from cathsim_dmc.tasks import forces, readings
+from cathsim_dmc.physics import forces, readings
+from cathsim_dmc.physics.randomisation import ModelVariation
 from cathsim_dmc.tasks.actions import check_action
 from cathsim_dmc.tasks.cases import Case
 from cathsim_dmc.tasks.navigation import Navigation
 from cathsim_dmc.tasks.rollout import Rollout
 from cathsim_dmc.tasks.step import Step
-from cathsim_dmc.tasks.variations import ModelVariation
 
 # What composer calls on a task; the batch steps the rollout instead, so a task that
 # overrides one of these would mean something else here.

@@ -18,7 +18,7 @@ from lxml import etree
 from cathsim_dmc import bounds, suite
 from cathsim_dmc.entities.phantom import read_mesh_file
 from cathsim_dmc.files import atomic_directory
-from cathsim_dmc.tasks.forces import CONTACT_SIZE
+from cathsim_dmc.physics.forces import CONTACT_SIZE
 from cathsim_dmc.tasks.navigation import Navigation
 from cathsim_dmc.tasks.objectives import Cannulation
 

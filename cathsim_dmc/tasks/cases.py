@@ -17,9 +17,9 @@ from cathsim_dmc.entities.contact import wall_contact
 from cathsim_dmc.entities.device_stack import DeviceStack
 from cathsim_dmc.imaging.angiograph import Angiograph
 from cathsim_dmc.imaging.options import FluoroscopyOptions
-from cathsim_dmc.tasks import chain_fields
+from cathsim_dmc.physics import chain_fields
+from cathsim_dmc.physics.readings import ModelIndex
 from cathsim_dmc.tasks.objectives import Objective
-from cathsim_dmc.tasks.readings import ModelIndex
 from cathsim_dmc.tasks.scene import Scene
 from cathsim_dmc.tasks.start import StartPosture
 

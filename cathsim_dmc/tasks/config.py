@@ -11,11 +11,10 @@ from cathsim_dmc.entities.contact import FRICTION
 from cathsim_dmc.entities.device import Device
 from cathsim_dmc.entities.device_stack import LEAD, LUMEN_FRICTION
 from cathsim_dmc.imaging.options import FluoroscopyOptions
+from cathsim_dmc.physics.randomisation import Randomisation
+from cathsim_dmc.physics.stepper import CONTROL_TIMESTEP, PHYSICS_TIMESTEP
 from cathsim_dmc.tasks.cameras import CameraOptions
-from cathsim_dmc.tasks.variations import Randomisation
 
-PHYSICS_TIMESTEP = 0.004  # s
-CONTROL_TIMESTEP = 0.04  # s, one frame of fluoroscopy
 MAX_STEPS = 2000  # published
 _MOST_JOINTS = 1000
 WORKING_LENGTHS = (0.02, 3.0)  # m, up to the longest wires sold

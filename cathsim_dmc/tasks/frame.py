@@ -6,8 +6,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from cathsim_dmc.tasks import forces, readings
-from cathsim_dmc.tasks.coaxial import CoaxialReadings
+from cathsim_dmc.physics import forces, readings
+from cathsim_dmc.physics.sliding import CoaxialReadings
 from cathsim_dmc.tasks.route import Ahead
 
 

@@ -9,9 +9,10 @@ import numpy as np
 from dm_control import composer
 
 from cathsim_dmc import bounds
-from cathsim_dmc.tasks import cameras, cases, forces, observations, readings
+from cathsim_dmc.physics import forces, readings
+from cathsim_dmc.physics.sliding import CoaxialReadings
+from cathsim_dmc.tasks import cameras, cases, observations
 from cathsim_dmc.tasks.actions import check_action
-from cathsim_dmc.tasks.coaxial import CoaxialReadings
 from cathsim_dmc.tasks.config import CONTROL_TIMESTEP, NavigationConfig
 from cathsim_dmc.tasks.objectives import Objective
 from cathsim_dmc.tasks.observation_kind import FrameObservable, ImageOptions

@@ -10,7 +10,7 @@ import numpy as np
 from cathsim_dmc import bounds
 from cathsim_dmc.anatomy import Anatomy, Centreline, Goal
 from cathsim_dmc.anatomy.geodesic import LumenDistance
-from cathsim_dmc.tasks import forces, readings
+from cathsim_dmc.physics import forces, readings
 
 _NOTHING = np.zeros(())
 GOAL_RADIUS = 8e-3  # m, δ of the published task

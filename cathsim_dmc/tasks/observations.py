@@ -11,7 +11,7 @@ from typing import cast
 import numpy as np
 from dm_env import specs
 
-from cathsim_dmc.tasks.coaxial import DEVICE_PLACES
+from cathsim_dmc.physics.sliding import DEVICE_PLACES
 from cathsim_dmc.tasks.frame import Frame
 from cathsim_dmc.tasks.observation_kind import (
     Entry,

@@ -14,8 +14,8 @@ import numpy as np
 
 from cathsim_dmc import bounds, files
 from cathsim_dmc.anatomy import Anatomy
+from cathsim_dmc.physics.randomisation import Episode
 from cathsim_dmc.tasks.scene import Scene
-from cathsim_dmc.tasks.variations import Episode
 
 DIVERGED = "diverged"
 ESCAPED = "escaped through the wall"

@@ -16,9 +16,11 @@ from cathsim_dmc.entities.device_stack import DeviceStack
 from cathsim_dmc.entities.robot import follower_posture
 from cathsim_dmc.imaging.device import Shadow
 from cathsim_dmc.imaging.fluoroscopy import Fluoroscope
-from cathsim_dmc.tasks import coaxial, forces, observations, readings
+from cathsim_dmc.physics import forces, readings, sliding
+from cathsim_dmc.physics.randomisation import ActionDelay, Episode, ModelVariation
+from cathsim_dmc.physics.sliding import CoaxialDevices, CoaxialReadings
+from cathsim_dmc.tasks import observations
 from cathsim_dmc.tasks.cases import Case, model_index
-from cathsim_dmc.tasks.coaxial import CoaxialDevices, CoaxialReadings
 from cathsim_dmc.tasks.config import NavigationConfig
 from cathsim_dmc.tasks.frame import NO_IMAGES, Frame
 from cathsim_dmc.tasks.image_sensors import ImageSensors, open_cameras
@@ -34,7 +36,6 @@ from cathsim_dmc.tasks.path_tracker import PathTracker
 from cathsim_dmc.tasks.physics_errors import PhysicsMonitor
 from cathsim_dmc.tasks.route import Routes
 from cathsim_dmc.tasks.step import Step
-from cathsim_dmc.tasks.variations import ActionDelay, Episode, ModelVariation
 
 
 class SimulationState(Protocol):
@@ -116,7 +117,7 @@ class Rollout:
                 scene.catheter,
                 model,
                 self._index,
-                cast(coaxial.State, state),
+                cast(sliding.State, state),
                 access.field,
                 scene.placement.start_depth,
                 num_simulations,

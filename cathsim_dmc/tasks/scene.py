@@ -14,10 +14,11 @@ from cathsim_dmc.entities.device_stack import DeviceStack
 from cathsim_dmc.entities.phantom import Phantom
 from cathsim_dmc.entities.robot import Robot
 from cathsim_dmc.entities.sheath import Sheath, straight
-from cathsim_dmc.tasks import coaxial, placement
+from cathsim_dmc.physics import sliding
+from cathsim_dmc.physics.readings import ModelIndex
+from cathsim_dmc.tasks import placement
 from cathsim_dmc.tasks.config import NavigationConfig
 from cathsim_dmc.tasks.objectives import GOAL_RADIUS
-from cathsim_dmc.tasks.readings import ModelIndex
 
 # Joints of the shaft that twist, where the base turns.
 _TORSION_JOINTS = 4
@@ -104,7 +105,7 @@ class Scene:
 
     def _attach(self):
         if isinstance(self.catheter, DeviceStack):
-            self.arena.mjcf_model.size.nuserdata = coaxial.user_data(self.catheter)
+            self.arena.mjcf_model.size.nuserdata = sliding.user_data(self.catheter)
         self.arena.attach(self.phantom)
         place = self.placement
         for entity, position in (
@@ -132,7 +133,7 @@ class Scene:
     @property
     def fields(self) -> tuple[str, ...]:
         """Fields of `mujoco.MjData` that episodes in the scene read and write."""
-        own = coaxial.FIELDS_READ if self.coaxial else ()
+        own = sliding.FIELDS_READ if self.coaxial else ()
         return (*ModelIndex.FIELDS, *own)
 
     @property

@@ -6,9 +6,9 @@ import mujoco
 import numpy as np
 
 from cathsim_dmc.entities.posture import bends_of, joints_along
-from cathsim_dmc.tasks.readings import ModelIndex
+from cathsim_dmc.physics.randomisation import START_JITTER
+from cathsim_dmc.physics.readings import ModelIndex
 from cathsim_dmc.tasks.scene import Scene
-from cathsim_dmc.tasks.variations import START_JITTER
 
 # How long the device settles; its hinges relax in 0.4 s.
 _SETTLING_TIME = 2.0  # s

@@ -4,7 +4,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from cathsim_dmc.tasks import forces, objectives, readings
+from cathsim_dmc.physics import forces, readings
+from cathsim_dmc.tasks import objectives
 from cathsim_dmc.tasks.observation_kind import Observation
 
 

@@ -17,8 +17,8 @@ from cathsim_dmc.anatomy.parts import Goal
 from cathsim_dmc.anatomy.surface import lumen_surface
 from cathsim_dmc.anatomy.wall.pieces import build_wall
 from cathsim_dmc.entities.phantom import Phantom
+from cathsim_dmc.physics import forces
 from cathsim_dmc.recording.episode import Episode
-from cathsim_dmc.tasks import forces
 from cathsim_dmc.tasks.config import PHYSICS_TIMESTEP
 from cathsim_dmc.validation import insertion, protocol
 from cathsim_dmc.validation.checks import Check, Report

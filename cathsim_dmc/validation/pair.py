@@ -12,7 +12,7 @@ import numpy as np
 from cathsim_dmc.entities import devices
 from cathsim_dmc.entities.device import Device
 from cathsim_dmc.entities.device_stack import DeviceStack
-from cathsim_dmc.tasks import chain_fields
+from cathsim_dmc.physics import chain_fields
 from cathsim_dmc.tasks.config import CONTROL_TIMESTEP
 from cathsim_dmc.validation import pressed, rod, sliding
 from cathsim_dmc.validation.checks import Check, Report

@@ -10,7 +10,7 @@ import numpy as np
 from cathsim_dmc import suite
 from cathsim_dmc.entities import contact
 from cathsim_dmc.entities.chain import MAX_PUSH_FORCE, MAX_PUSH_SPEED
-from cathsim_dmc.tasks import forces
+from cathsim_dmc.physics import forces
 from cathsim_dmc.tasks.config import CONTROL_TIMESTEP, PHYSICS_TIMESTEP
 from cathsim_dmc.validation.checks import Check
 from cathsim_dmc.validation.sliding import tube

@@ -16,8 +16,8 @@ from pathlib import Path
 import numpy as np
 
 from cathsim_dmc import files, policies, suite
+from cathsim_dmc.physics.randomisation import Episode, ModelVariation, Randomisation
 from cathsim_dmc.simulation.batch import BatchSimulation
-from cathsim_dmc.tasks.variations import Episode, ModelVariation, Randomisation
 
 TASK = "type1_bca"
 STIFFNESS = (1.0, 3.0, 10.0, 30.0, 100.0)  # times the device's EI

@@ -12,10 +12,10 @@ import numpy as np
 
 from cathsim_dmc import suite
 from cathsim_dmc.imaging import VIEWS, FluoroscopyOptions
+from cathsim_dmc.physics.randomisation import DEFAULT_RANGES, Randomisation
 from cathsim_dmc.tasks import observations
 from cathsim_dmc.tasks.cameras import CAMERAS, KINDS, CameraOptions
 from cathsim_dmc.tasks.observation_kind import Entry, ImageOptions
-from cathsim_dmc.tasks.variations import DEFAULT_RANGES, Randomisation
 
 OUTPUT = Path(__file__).parents[1] / "observations.md"
 TASK = "type1_bca"

@@ -13,7 +13,7 @@ import mujoco
 import numpy as np
 
 from cathsim_dmc.entities.robot import JOINTS
-from cathsim_dmc.tasks import forces
+from cathsim_dmc.physics import forces
 
 
 class Readings(NamedTuple):

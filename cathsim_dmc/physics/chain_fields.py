@@ -40,7 +40,9 @@ class ChainFields:
           model: the compiled model.
           scope: MJCF scope of the chain.
         """
-        from cathsim_dmc.tasks import coaxial_loops  # late, as it takes long
+        from cathsim_dmc.physics import (
+            sliding_loops as coaxial_loops,  # late, as it takes long
+        )
 
         self._write = coaxial_loops.write
         bodies = [

@@ -19,9 +19,9 @@ from cathsim_dmc.entities.coaxial import Overlap
 from cathsim_dmc.entities.device_stack import DeviceStack
 from cathsim_dmc.entities.robot import follower_posture
 from cathsim_dmc.imaging.device import Shadow
-from cathsim_dmc.tasks.chain_fields import FIELDS, ChainFields, made_of
-from cathsim_dmc.tasks.config import CONTROL_TIMESTEP
-from cathsim_dmc.tasks.readings import ModelIndex, Readings
+from cathsim_dmc.physics.chain_fields import FIELDS, ChainFields, made_of
+from cathsim_dmc.physics.readings import ModelIndex, Readings
+from cathsim_dmc.physics.stepper import CONTROL_TIMESTEP
 
 # Where points of a device are tracked, m from its end.
 DEVICE_PLACES = np.arange(7, -1, -1) * 15e-3
@@ -98,7 +98,9 @@ class CoaxialDevices:
             insertion, m.
           num_simulations: N.
         """
-        from cathsim_dmc.tasks import coaxial_loops  # late, as it takes long
+        from cathsim_dmc.physics import (
+            sliding_loops as coaxial_loops,  # late, as it takes long
+        )
 
         self._loops = coaxial_loops
         self._entity, self._stack, self._rods = stack, stack.stack, stack.rods

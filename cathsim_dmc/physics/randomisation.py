@@ -15,7 +15,6 @@ from dm_control.composer.variation import distributions
 
 from cathsim_dmc import bounds
 from cathsim_dmc.imaging.angiograph import Deviation
-from cathsim_dmc.tasks import objectives as objectives
 
 # Published: radius of the ball of the random displacement of the tip.
 START_JITTER = 1e-3  # m
