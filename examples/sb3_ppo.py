@@ -78,6 +78,12 @@ class BatchedVecEnv(VecEnv):
         return range(self.num_envs) if indices is None else np.atleast_1d(indices)
 
 
+def task_options(observation: str, max_steps: int) -> dict:
+    """Options of the task: it pays for the way left to the goal."""
+    reward = {"path": -1.0, "success": 10.0}
+    return {"observation": observation, "max_steps": max_steps, "reward": reward}
+
+
 def main() -> None:
     """Trains, evaluates, saves."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
@@ -92,11 +98,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=Path("runs/sb3_ppo"))
     options = parser.parse_args()
 
-    task = {
-        "observation": options.observation,
-        "max_steps": options.max_steps,
-        "reward": "path",
-    }
+    task = task_options(options.observation, options.max_steps)
     vector = CathSimVectorEnv(options.envs, options.task, **task)
     env = VecMonitor(BatchedVecEnv(vector, options.seed))
     numbers = [k for k, v in env.observation_space.items() if v.dtype != np.uint8]

@@ -1,5 +1,7 @@
 """The grid of trainings: what its file may say, and which cells it makes."""
 
+import dataclasses
+
 import pytest
 
 from cathsim_dmc.agents import ConfigError
@@ -70,12 +72,34 @@ def test_two_rows_of_one_name_need_a_variant(grid):
 
 
 @pytest.mark.parametrize(
+    "change",
+    [
+        ("total_frames", 'variant = "/../../../../escaped"\ntotal_frames'),
+        ('"type1_bca"', '"/tmp/escaped"'),
+        ('"type1_bca"', '"../escaped"'),
+        ('"type1_bca"', '".."'),
+        ('"internal"', '["a/b"]'),
+        ('"internal"', '"a\\u0000b"'),
+        ('"ppo"', '"..\\\\ppo"'),
+        ('"demo"', f'"{"x" * 200}"'),
+    ],
+)
+def test_a_name_that_leaves_its_folder_is_refused(grid, tmp_path, change):
+    with pytest.raises(GridError, match=r"row 1: a cell is named .*may have letters"):
+        grid(ROW.replace(*change))
+    # However the cell is made.
+    with pytest.raises(GridError):
+        dataclasses.replace(grid(ROW)[0], variant="/../../escaped")
+
+
+@pytest.mark.parametrize(
     ("change", "word"),
     [
         (("seeds = [0, 1]", "seeds = []"), "seeds"),
         (("seeds = [0, 1]", "seeds = [true]"), "seeds"),
         (("seeds = [0, 1]", "seed = 1"), "seed"),
         (('label = "PPO"', "label = 1"), "label"),
+        (('"internal"', "[1]"), "observation"),
         (('label = "PPO"', ""), "label"),
         (("= 1000", "= 0"), "total_frames"),
         (("= 1000", "= { type1_bca = 5 }"), "type1_lcca"),

@@ -6,6 +6,7 @@ import signal
 import subprocess
 import sys
 import time
+from pathlib import Path
 
 import pytest
 import torch
@@ -93,6 +94,14 @@ def test_lost_collectors_begin_anew_and_the_training_goes_on(
     monkeypatch.setattr(ray_source, "_start_ray", lambda: None)
     monkeypatch.setattr(ray_source, "_require_room", lambda *needed: None)
     monkeypatch.setattr(_Mortal, "made", [])
+    following, seen = ray_source.RaySource.next, []
+
+    def watched(source):
+        batch = following(source)
+        seen.append(compared(source, batch))
+        return batch
+
+    monkeypatch.setattr(ray_source.RaySource, "next", watched)
     config = small_ppo(
         total_frames=2_048, epochs=1, collector="ray", collectors=2, num_envs=16
     )
@@ -105,9 +114,26 @@ def test_lost_collectors_begin_anew_and_the_training_goes_on(
     assert (len(first.weights), len(second.weights)) == (3, 2)
     assert caplog.text.count("a collector was lost after 1024 frames") == 1
     # Weights and statistics are those of the learner at that time.
+    assert [count for _, count, _ in seen] == [256, 768, 1_280, 1_792]
+    assert seen[0][0] < 1e-5  # `_Mortal` keeps its first weights
     key = next(key for key in first.weights[0].keys(True, True) if "count" in key)
     counts = [float(weights[key]) for weights in (*first.weights, *second.weights)]
     assert counts == [256, 768, 1_280, 1_280, 1_792]
+
+
+@torch.no_grad()
+def compared(source, batch):
+    """How far a batch is from what the learner's policy makes of it, and its shape.
+
+    Returns:
+        Largest difference of the means of actions, number of observations in the
+        learner's statistics, shape of the batch.
+    """
+    learner = source._learner
+    again = learner.network(batch.clone())
+    worst = float((again["loc"] - batch["loc"]).abs().max())
+    (statistics,) = [m.module for m in learner.network if hasattr(m.module, "count")]
+    return worst, float(statistics.count), list(batch.shape)
 
 
 def told(lines):
@@ -169,16 +195,15 @@ cluster.shutdown()
 """
 
 
-# Compares every batch with what the learner's policy makes of it.
-WATCH = """
+# Tells of every batch how it compares.
+WATCH = f"""
+sys.path.insert(0, {str(Path(__file__).parent)!r})
+from test_collectors_ray import compared
 following = ray_source.RaySource.next
 
 def watched(self):
     batch = following(self)
-    again = self._learner.network(batch.clone())
-    worst = float((again["loc"] - batch["loc"]).abs().max())
-    count = float(self._learner.normaliser.module.count)
-    print("TOLD", json.dumps([worst, count, list(batch.shape)]), flush=True)
+    print("TOLD", json.dumps(compared(self, batch)), flush=True)
     return batch
 
 ray_source.RaySource.next = watched

@@ -2,6 +2,7 @@
 
 import dataclasses
 import fnmatch
+import re
 import tomllib
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
@@ -13,6 +14,8 @@ from cathsim_dmc.agents.learners import make_config
 DEFAULT_GRID = Path(__file__).with_name("grid.toml")
 EPISODES = 30  # published
 _MAX_SIZE = 2**20  # bytes
+# Names of cells are names of folders and files.
+_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_+.-]{0,199}")
 
 # What a row may say, with the type of each.
 _Kinds = Mapping[str, tuple[type, ...]]
@@ -73,6 +76,19 @@ class Cell:
     settings: Mapping[str, Any] = dataclasses.field(default_factory=dict)
     variant: str = ""
     evaluation: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+
+    def __post_init__(self):
+        """Refuse a name that could lie outside of its folder.
+
+        Raises:
+            GridError: the name has a character that is not allowed, or is too long.
+        """
+        if not _NAME.fullmatch(self.name):
+            raise GridError(
+                f"a cell is named {self.name[:250]!r}; task, algorithm, observation, "
+                "preset and variant may have letters, digits and _ + - . and together "
+                "200 characters"
+            )
 
     @property
     def name(self) -> str:
@@ -150,11 +166,12 @@ def read_grid(path: str | Path = DEFAULT_GRID) -> list[Cell]:
             f"{path} has {', '.join(values) or 'no row'}; a grid is a list of tables "
             "[[row]] and nothing else"
         )
-    cells = [
-        cell
-        for number, row in enumerate(rows, 1)
-        for cell in _cells(row, f"{path}, row {number}")
-    ]
+    cells: list[Cell] = []
+    for number, row in enumerate(rows, 1):
+        try:
+            cells += _cells(row)
+        except GridError as error:
+            raise GridError(f"{path}, row {number}: {error}") from error
     seen: set[str] = set()
     for cell in cells:
         if cell.name in seen:
@@ -189,24 +206,24 @@ def choose(cells: Sequence[Cell], patterns: Iterable[str]) -> list[Cell]:
     return [cell for cell in cells if cell.name in chosen]
 
 
-def _cells(row: Any, where: str) -> list[Cell]:
-    _check_fields(row, _ROW, where)
+def _cells(row: Any) -> list[Cell]:
+    _check_fields("the row", row, _ROW)
     missing = [name for name in _REQUIRED if name not in row]
     if missing:
-        raise GridError(f"{where} has no {', '.join(missing)}")
+        raise GridError(f"there is no {', '.join(missing)}")
     evaluation = row.get("evaluation", {})
-    _check_fields(evaluation, _EVALUATION, f"{where}, evaluation")
+    _check_fields("evaluation", evaluation, _EVALUATION)
     if evaluation.get("episodes", 1) < 1:
-        raise GridError(f"{where}: evaluation.episodes must be at least 1")
+        raise GridError("evaluation.episodes must be at least 1")
     if {"episodes", "each_arch"} <= set(evaluation):
-        raise GridError(f"{where}: evaluation has episodes and each_arch; give one")
+        raise GridError("evaluation has episodes and each_arch; give one")
     tasks, seeds = row["tasks"], row.get("seeds", [0])
     for name, given, kind in (("tasks", tasks, str), ("seeds", seeds, int)):
         if not given or any(type(one) is not kind for one in given):
-            raise GridError(
-                f"{where}: {name} is {given!r}; it must list {_WORDS[kind]}s"
-            )
+            raise GridError(f"{name} is {given!r}; it must list {_WORDS[kind]}s")
     observation = row["observation"]
+    if isinstance(observation, list) and any(type(o) is not str for o in observation):
+        raise GridError(f"observation is {observation!r}; it must list strings")
     return [
         Cell(
             label=row["label"],
@@ -217,7 +234,7 @@ def _cells(row: Any, where: str) -> list[Cell]:
             if isinstance(observation, str)
             else tuple(observation),
             seed=seed,
-            total_frames=_frames(row["total_frames"], task, where),
+            total_frames=_frames(row["total_frames"], task),
             settings=row.get("settings", {}),
             variant=row.get("variant", ""),
             evaluation=evaluation,
@@ -227,25 +244,25 @@ def _cells(row: Any, where: str) -> list[Cell]:
     ]
 
 
-def _frames(given: Any, task: str, where: str) -> int:
+def _frames(given: Any, task: str) -> int:
     frames = given.get(task) if isinstance(given, dict) else given
     if type(frames) is not int or frames < 1:
         raise GridError(
-            f"{where}: total_frames is {given!r}; it must be a positive integer, or a "
+            f"total_frames is {given!r}; it must be a positive integer, or a "
             f"table with one for each task ({task} too)"
         )
     return frames
 
 
-def _check_fields(given: Any, known: _Kinds, where: str) -> None:
+def _check_fields(what: str, given: Any, known: _Kinds) -> None:
     if not isinstance(given, dict):
-        raise GridError(f"{where} is {given!r}; it must be a table")
+        raise GridError(f"{what} is {given!r}; it must be a table")
     unknown = sorted(set(given) - set(known))
     if unknown:
         raise GridError(
-            f"{where} has {', '.join(unknown)}; there are {', '.join(known)}"
+            f"{what} has {', '.join(unknown)}; there are {', '.join(known)}"
         )
     for name, value in given.items():
         if type(value) not in known[name]:
             words = " or ".join(_WORDS[kind] for kind in known[name])
-            raise GridError(f"{where}: {name} is {value!r}; it must be {words}")
+            raise GridError(f"{name} is {value!r}; it must be {words}")
