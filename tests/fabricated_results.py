@@ -23,7 +23,8 @@ def values(task, label, algorithm, observation, seed, rate, episodes=30):
         "reward": (-20 - 5 * random.random(episodes)).tolist(),
         "length": random.integers(80, 200, episodes).tolist(),
         "success": [1] * reached + [0] * (episodes - reached),
-        "mean_force_in_contact": (0.01 + 0.003 * random.random(episodes)).tolist(),
+        "mean_force": (0.02 + 0.003 * random.random(episodes)).tolist(),
+        "mean_contact_force": (0.01 + 0.003 * random.random(episodes)).tolist(),
         "max_force": (0.05 + 0.1 * random.random(episodes)).tolist(),
     }
     count = random.integers(0, 20, (97, 51))

@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from cathsim_dmc.agents import compare, evaluate, progress
 from cathsim_dmc.agents.evaluation import paired_bootstrap
 from cathsim_dmc.agents.report import Report
+from cathsim_dmc.analysis.force_statistics import FIGURES
 from cathsim_dmc.analysis.intervals import success_interval
 
 SORTED = sorted(synthetic_env.SIZES)
@@ -62,9 +63,9 @@ def test_force_figures_are_those_of_the_steps():
         if stepped["next", "done"]:
             break
     assert episode.length == len(forces) == 40
-    assert episode.mean_force == pytest.approx(np.mean(forces))
-    assert episode.max_force == pytest.approx(0.5 * max(forces))
-    assert episode.peak_force is None
+    assert episode.forces.mean_force == pytest.approx(np.mean(forces))
+    assert episode.forces.max_force == pytest.approx(0.5 * max(forces))
+    assert episode.forces.peak_force is None
     touching = [force for force in forces if force > 0]
     assert 0 < len(touching) < 40
     assert episode.forces.sum.mean_in_contact == pytest.approx(np.mean(touching))
@@ -155,8 +156,8 @@ def test_the_table_says_which_force_is_which(capsys, monkeypatch):
     result = play(policy=push, episodes=3)
     Report(result, None, None, 1.0).print()
     text = " ".join(capsys.readouterr().out.split())
-    for word in ("mean force, mN", "max force, mN", "peak, mN", "sum over all"):
-        assert word in text
+    for name in FIGURES:
+        assert f"{name.replace('_', ' ')}, mN" in text
     mean, deviation = result.mean_sd("forces.sum.mean")
     assert mean > 0.1
     assert f"│ {1e3 * mean:.0f} ± {1e3 * deviation:.0f}" in text

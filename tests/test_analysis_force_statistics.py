@@ -1,4 +1,7 @@
 import dataclasses
+import re
+from pathlib import Path
+from unittest.mock import MagicMock
 
 import numpy as np
 import pytest
@@ -6,7 +9,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from recording_samples import make_episode
 
+from cathsim_dmc import suite
 from cathsim_dmc.analysis.force_statistics import (
+    FIGURES,
     QUANTITIES,
     EpisodeForces,
     ForceTracker,
@@ -15,6 +20,8 @@ from cathsim_dmc.analysis.force_statistics import (
     millinewtons,
     recorded_forces,
 )
+from cathsim_dmc.entities.devices import DEVICES
+from cathsim_dmc.tasks.step import Step
 
 
 def test_magnitude_has_leading_axes():
@@ -106,3 +113,23 @@ def test_episodes_that_end_at_different_steps_keep_apart(seed, steps, count):
 )
 def test_forces_are_printed_with_three_digits(mean, deviation, text):
     assert millinewtons(mean, deviation) == text
+
+
+def test_every_name_in_the_page_of_forces_exists():
+    text = Path(__file__).parents[1].joinpath("docs/forces.md").read_text()
+    statistics = {field.name for field in dataclasses.fields(Statistics)}
+    infos = Step.info(MagicMock(outcome=MagicMock(terms={})))
+    known = {*infos, *QUANTITIES, *statistics, *FIGURES, *suite.TASKS, *DEVICES}
+    known |= {f"{one}.{other}" for one in QUANTITIES for other in statistics}
+    words = re.findall(r"`([a-z_0-9.]+)`", text)
+    files = (r"[a-z_/]+\.(json|py)", r"summary\.forces", r"cathsim_dmc\.[a-z_.]+")
+    unknown = {word for word in words if not any(re.fullmatch(f, word) for f in files)}
+    assert len(words) > 20
+    assert unknown - known == set()
+    # The table of named figures says what they are.
+    forces = EpisodeForces(*(Statistics(i, i + 0.1, i + 0.2) for i in range(4)))
+    rows = re.findall(r"^\| `(\w+_force)` \| `(\w+)\.(\w+)` \|", text, re.M)
+    assert [name for name, *_ in rows] == list(FIGURES)
+    for name, quantity, statistic in rows:
+        figure = getattr(forces, name)
+        assert figure == getattr(getattr(forces, quantity), statistic)

@@ -210,8 +210,10 @@ ray_source.RaySource.next = watched
 """
 
 
-# Ray gives a node 30 s to come up, which is short beside other work.
+# Ray gives a node 30 s to come up, which is short beside other work, and kills workers
+# when all processes of the machine together take much memory.
 PATIENCE = {
+    "RAY_memory_monitor_refresh_ms": "0",
     "RAY_raylet_start_wait_time_s": "300",
     "RAY_agent_register_timeout_ms": "300000",
 }

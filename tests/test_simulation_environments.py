@@ -24,7 +24,7 @@ def test_both_paths_give_the_same_episodes():
     first, second = batched.episodes
     assert first.reward != second.reward
     assert first.reward < 0
-    assert None not in (first.success, first.max_force, first.mean_force)
+    assert None not in (first.success, first.forces.max_force, first.forces.mean_force)
     json.dumps(batched.to_dict())
 
 

@@ -38,8 +38,8 @@ class Demonstrations:
         episodes: Number of episodes.
         successes: Number of those that reached the goal.
         steps: Number of control steps in all.
-        mean_force: Mean over all steps of the sum over the contacts, N.
-        max_force: Largest single contact at the end of a step, N.
+        mean_force: Mean over the episodes, N, see `EpisodeForces.mean_force`.
+        max_force: Largest single contact at the end of a step of any episode, N.
     """
 
     path: Path
@@ -121,16 +121,16 @@ def record_demonstrations(
 
 
 def _summary(out: Path, buffers: Sequence[Any]) -> Demonstrations:
-    def joined(name: str) -> np.ndarray:
-        return np.concatenate([buffer.infos[name][1:] for buffer in buffers])
+    def steps(name: str) -> list[np.ndarray]:
+        return [np.asarray(buffer.infos[name][1:]) for buffer in buffers]
 
     return Demonstrations(
         path=out,
         episodes=len(buffers),
         successes=sum(bool(buffer.infos["success"][-1]) for buffer in buffers),
         steps=sum(len(buffer.rewards) for buffer in buffers),
-        mean_force=float(joined("wall_force_sum").mean()),
-        max_force=float(joined("wall_force_max").max()),
+        mean_force=float(np.mean([one.mean() for one in steps("wall_force_sum")])),
+        max_force=float(max(one.max() for one in steps("wall_force_max"))),
     )
 
 

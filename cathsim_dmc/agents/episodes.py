@@ -28,7 +28,7 @@ class EpisodeOutcome:
         length: Number of control steps.
         terminated: Whether it was ended by the task, not by the clock.
         success: Whether the goal was reached.
-        forces: Forces on the wall, N.
+        forces: Forces on the wall, N, such as `forces.mean_force`.
         physics_error: Whether the simulation diverged, which ended it.
         path_ratio: Length of the head's path over the route that was left; below 1
             where the head cuts the corner of the route at an ostium.
@@ -42,21 +42,6 @@ class EpisodeOutcome:
     forces: EpisodeForces
     physics_error: bool = False
     path_ratio: float | None = None
-
-    @property
-    def mean_force(self) -> float | None:
-        """Mean over all steps of the sum over contacts at their end, N."""
-        return self.forces.sum and self.forces.sum.mean
-
-    @property
-    def max_force(self) -> float | None:
-        """Largest single contact at the end of any control step, N."""
-        return self.forces.max and self.forces.max.maximum
-
-    @property
-    def peak_force(self) -> float | None:
-        """Largest single contact of any physics step, N."""
-        return self.forces.peak_max and self.forces.peak_max.maximum
 
 
 def information(batch: TensorDictBase, name: str) -> np.ndarray | None:

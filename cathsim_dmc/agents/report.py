@@ -14,7 +14,7 @@ from cathsim_dmc import bounds, files, suite
 from cathsim_dmc.agents import evaluation, policies
 from cathsim_dmc.agents.progress import SignOfLife
 from cathsim_dmc.analysis import heatmap
-from cathsim_dmc.analysis.force_statistics import millinewtons
+from cathsim_dmc.analysis.force_statistics import FIGURES, millinewtons
 from cathsim_dmc.pictures.animation import SUFFIXES, animate, check_film
 from cathsim_dmc.pictures.recorded import film_options, xray_film
 from cathsim_dmc.policies import in_environment
@@ -77,13 +77,15 @@ class Report:
 
 
 _COLUMNS = (
-    "policy", "reward", "steps", "mean force, mN", "max force, mN", "peak, mN",
-    "success",
+    "policy", "reward", "steps", "mean force, mN", "mean contact force, mN",
+    "max force, mN", "peak force, mN", "success",
 )  # fmt: skip
 _CAPTION = (
     "Mean ± standard deviation over episodes. Mean force: sum over all contacts at the "
-    "end of a control step, mean over all steps. Max force: largest single contact at "
-    "the end of any control step. Peak: the same in any physics step."
+    "end of a control step, mean over all steps. Mean contact force: largest single "
+    "contact at the end of a control step, mean over the steps with contact. Max "
+    "force: largest single contact at the end of any control step. Peak force: the "
+    "same in any physics step."
 )
 
 
@@ -98,11 +100,10 @@ def _cells(result: evaluation.EvaluationResult) -> list[str]:
     if rate is not None:
         low, high = (round(100 * bound) for bound in interval)
         success = f"{100 * rate:.0f} % ({low}–{high})"
-    forces = ("mean_force", "max_force", "peak_force")
     return [
         spread("reward", 1),
         spread("length", 0),
-        *(millinewtons(*result.mean_sd(name)) for name in forces),
+        *(millinewtons(*result.mean_sd(f"forces.{name}")) for name in FIGURES),
         success,
     ]
 

@@ -4,6 +4,7 @@ import contextlib
 import time
 from collections import deque
 from collections.abc import Iterable, Mapping, Sequence
+from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
@@ -22,8 +23,8 @@ _FIGURES = {
     "episode_reward": "reward",
     "episode_length": "length",
     "success": "success",
-    "mean_force": "mean_force",
-    "max_force": "max_force",
+    "mean_force": "forces.mean_force",
+    "max_force": "forces.max_force",
 }
 # The rest of metrics.csv's columns are the learner's own.
 COLUMNS = (
@@ -128,7 +129,7 @@ class TrainingLog(contextlib.AbstractContextManager):
         before, self.frames = self.frames, self.frames + frames
         self.episodes += len(finished)
         self._window.extend(
-            [_number(getattr(episode, name)) for name in _FIGURES.values()]
+            [_number(attrgetter(name)(episode)) for name in _FIGURES.values()]
             for episode in finished
         )
         means = _episode_means(self._window)

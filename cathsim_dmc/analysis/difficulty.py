@@ -82,15 +82,12 @@ class Trial:
     def summary(self) -> dict[str, Any]:
         """JSON-able figures over the episodes.
 
-        Forces in N: "mean_force" is the sum over all contacts, mean over the control
-        steps; "max_force" the largest single contact at the end of a control step,
-        "peak_force" in any physics step; each is averaged over the episodes, and
-        "largest_force" is the largest "peak_force" of all.
+        Forces in N, see `EpisodeForces`: "mean_force", "max_force" and "peak_force" are
+        averaged over the episodes, "largest_force" is the largest "peak_force" of all.
         """
         count = len(self.ends)
-        peaks = [one.peak_max.maximum for one in self.forces if one.peak_max]
-        sums = [one.sum.mean for one in self.forces if one.sum]
-        largest = [one.max.maximum for one in self.forces if one.max]
+        names = ("mean_force", "max_force", "peak_force")
+        figures = {name: [getattr(one, name) for one in self.forces] for name in names}
         low, high = success_interval(self.successes, count)
         return {
             "episodes": count,
@@ -99,10 +96,8 @@ class Trial:
             "success_ci95": [low, high],
             "ends": dict(collections.Counter(self.ends)),
             "steps": float(np.mean(self.steps)),
-            "mean_force": float(np.mean(sums)),
-            "max_force": float(np.mean(largest)),
-            "peak_force": float(np.mean(peaks)),
-            "largest_force": float(np.max(peaks)),
+            **{name: float(np.mean(values)) for name, values in figures.items()},
+            "largest_force": float(np.max(figures["peak_force"])),
         }
 
 

@@ -1,7 +1,8 @@
-"""What "mean force" and "maximum force" of an episode mean, once for all.
+"""Definitions of the forces of an episode.
 
-Four quantities of a control step, three statistics of each over an episode; see
-docs/forces.md, which also relates them to the published figures.
+Four quantities of a control step, three statistics of each over an episode, and four
+named figures, which evaluations, results and cards report. docs/forces.md explains
+them and relates them to the published figures.
 """
 
 from __future__ import annotations
@@ -50,8 +51,30 @@ class EpisodeForces:
     peak_sum: Statistics | None = None
     peak_max: Statistics | None = None
 
+    @property
+    def mean_force(self) -> float | None:
+        """Sum over all contacts, mean over all control steps, N."""
+        return self.sum and self.sum.mean
+
+    @property
+    def mean_contact_force(self) -> float | None:
+        """Largest single contact, mean over the control steps with contact, N."""
+        return self.max and self.max.mean_in_contact
+
+    @property
+    def max_force(self) -> float | None:
+        """Largest single contact at the end of any control step, N."""
+        return self.max and self.max.maximum
+
+    @property
+    def peak_force(self) -> float | None:
+        """Largest single contact in any physics step, N."""
+        return self.peak_max and self.peak_max.maximum
+
 
 QUANTITIES = tuple(field.name for field in dataclasses.fields(EpisodeForces))
+# Properties of `EpisodeForces`.
+FIGURES = ("mean_force", "mean_contact_force", "max_force", "peak_force")
 
 
 class ForceTracker:

@@ -90,8 +90,8 @@ def write_list(directory: str | Path = pretrained.DIRECTORY) -> Path:
         "8 mm inside the branch); forces as in docs/forces.md.",
         "",
         "| policy | task | observation | frames | success (95 %) | mean force, mN "
-        "| max force, mN |",
-        "|---|---|---|---|---|---|---|",
+        "| mean contact force, mN | max force, mN |",
+        "|---|---|---|---|---|---|---|---|",
     ]
     commands = []
     for name in pretrained.pretrained_names(directory):
@@ -102,13 +102,17 @@ def write_list(directory: str | Path = pretrained.DIRECTORY) -> Path:
         if not isinstance(observation, str):
             observation = ", ".join(observation)
         forces = summary["forces"]
-        mean, largest = forces["sum"]["mean"], forces["max"]["maximum"]
+        figures = (
+            forces["sum"]["mean"],
+            forces["max"]["mean_in_contact"],
+            forces["max"]["maximum"],
+        )
+        texts = [millinewtons(one["mean"], one["sd"]) for one in figures]
         lines.append(
             f"| `{pretrained.PREFIX}{name}` | {card['task']} | {observation} "
             f"| {card['training']['frames']:,} "
             f"| {100 * summary['success']:.0f} % ({100 * low:.0f}–{100 * high:.0f}) "
-            f"| {millinewtons(mean['mean'], mean['sd'])} "
-            f"| {millinewtons(largest['mean'], largest['sd'])} |"
+            f"| {' | '.join(texts)} |"
         )
         seeds = ", ".join(
             f"seed {one['seed']}: {100 * one['success']:.0f} %"

@@ -11,9 +11,10 @@ import numpy as np
 
 from cathsim_dmc import files
 from cathsim_dmc.agents.training_log import EPISODE_WINDOW
+from cathsim_dmc.analysis.force_statistics import FIGURES
 from cathsim_dmc.analysis.heatmap import ForceMap
 
-FORMAT = 1
+FORMAT = 2
 POINTS = 200  # of the learning curve
 SOLVED = 0.9  # success rate that "solved" stands for
 _DIGITS = 6  # significant ones of a number in a list
@@ -30,18 +31,8 @@ _CURVE = (
     "mean_force",
     "max_force",
 )
-# Figures of every episode: name in the file -> attribute of `EpisodeOutcome`.
-_EPISODE = {
-    "reward": "reward",
-    "length": "length",
-    "success": "success",
-    "physics_error": "physics_error",
-    "path_ratio": "path_ratio",
-    "mean_force": "forces.sum.mean",
-    "mean_force_in_contact": "forces.max.mean_in_contact",
-    "max_force": "forces.max.maximum",
-    "peak_force": "forces.peak_max.maximum",
-}
+# Figures of every episode: attributes of `EpisodeOutcome`, and of its `forces`.
+_EPISODE = ("reward", "length", "success", "physics_error", "path_ratio")
 _PARTS = ("cell", "config", "training", "evaluation", "versions", "machine")
 
 
@@ -159,11 +150,13 @@ def solved(rows: Sequence[Mapping[str, float | None]]) -> dict[str, float] | Non
 
 def episode_figures(evaluation: Any) -> dict[str, list]:
     """Figures of every episode of an `EvaluationResult`, in the order of the seeds."""
-    figures = {}
-    for name, attribute in _EPISODE.items():
-        values = evaluation.values(attribute)
-        figures[name] = _numbers(None if np.isnan(v) else float(v) for v in values)
-    return figures
+    names = {name: name for name in _EPISODE} | {f: f"forces.{f}" for f in FIGURES}
+    return {
+        name: _numbers(
+            None if np.isnan(v) else float(v) for v in evaluation.values(attribute)
+        )
+        for name, attribute in names.items()
+    }
 
 
 def map_values(contacts: ForceMap | None) -> dict[str, Any] | None:

@@ -116,10 +116,10 @@ def record(
     written = " ".join(str(path) for path in (out, gif) if path is not None)
     print(f"{episode.steps} steps, {episode.termination}: {written}")
     forces = recorded_forces(episode)
-    if forces.sum is not None and forces.max is not None:
+    if forces.mean_force is not None:
         print(
-            f"mean force {millinewtons(forces.sum.mean)} mN (sum over contacts), max "
-            f"force {millinewtons(forces.max.maximum)} mN (largest single contact)"
+            f"mean force {millinewtons(forces.mean_force)} mN (sum over contacts), max "
+            f"force {millinewtons(forces.max_force)} mN (largest single contact)"
         )
     return 0
 

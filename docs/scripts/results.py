@@ -54,15 +54,17 @@ these were found.
 
 COLUMNS = """\
 Success counts the episodes of all seeds together, with Wilson's 95 % interval; *worst*
-is that of the worst seed. Mean force is the mean over steps in contact of the largest
-contact, which is nearest to the published f_mean; max force is the largest contact of
-an episode; both ± deviation over episodes, in mN. `–` is not there.
+is that of the worst seed. Forces are those of [forces.md](forces.md), ± deviation over
+episodes, in mN: mean force is the sum over all contacts, mean over all steps; mean
+contact force is the largest contact, mean over the steps with contact, which is nearest
+to the published f_mean; max force is the largest contact of an episode, which is the
+published f_max. `–` is not there.
 """
 
 HEADER = (
-    "| agent | seeds | success (95 %) | worst | reward | mean force | max force "
-    "| published: success | reward | mean force | max force |",
-    "|---|---|---|---|---|---|---|---|---|---|---|",
+    "| agent | seeds | success (95 %) | worst | reward | mean force "
+    "| mean contact force | max force | published: success | reward | f_mean | f_max |",
+    "|---|---|---|---|---|---|---|---|---|---|---|---|",
 )
 
 
@@ -205,8 +207,8 @@ def other_tasks(table):
             "## Further tasks",
             "",
             "| task | agent | seeds | success (95 %) | worst | reward | mean force "
-            "| max force | success by kind of arch | expert |",
-            "|---|---|---|---|---|---|---|---|---|---|",
+            "| mean contact force | max force | success by kind of arch | expert |",
+            "|---|---|---|---|---|---|---|---|---|---|---|",
             *lines,
             "",
         ]
@@ -232,12 +234,12 @@ def expert_rates():
 
 def row(label, found, theirs):
     """A line of a table: ours, and the published figures of the same agent."""
-    ours = figures_of(found) if found else ["–"] * 6
+    ours = figures_of(found) if found else ["–"] * 7
     return f"| {' | '.join([label, *ours, *published_figures(theirs)])} |"
 
 
 def figures_of(found):
-    """Seeds, success, worst seed, reward, mean and max force of one agent, as text."""
+    """Seeds, success, worst seed, reward and forces of one agent, as text."""
     rates = [result.success for result in found]
     counts = [result.evaluation["summary"]["episodes"] for result in found]
     reached = sum(round(r * n) for r, n in zip(rates, counts, strict=True))
@@ -247,7 +249,8 @@ def figures_of(found):
         f"{percent(reached / sum(counts))} ({100 * low:.0f}–{100 * high:.0f})",
         percent(min(rates)),
         spread(found, "reward", 1, 0),
-        spread(found, "mean_force_in_contact", 1e3, 1),
+        spread(found, "mean_force", 1e3, 1),
+        spread(found, "mean_contact_force", 1e3, 1),
         spread(found, "max_force", 1e3, 0),
     ]
 
