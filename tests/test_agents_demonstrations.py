@@ -246,7 +246,7 @@ def test_the_teacher_goes_on_from_what_was_really_done(task):
 
 
 def test_demonstrations_of_coaxial_devices_are_what_an_environment_gives(tmp_path):
-    task, options = "simple1_bca_pair", {"max_steps": 150}
+    task, options = "simple1_bca_pair", {**OPTIONS, "max_steps": 150}
     recorded = record_demonstrations(task, tmp_path / "shown", 1, task_kwargs=options)
     assert recorded.successes == 1
     env = make_env(task, observation="tracking", seed=2_000_000, task_kwargs=options)

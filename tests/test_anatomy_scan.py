@@ -53,7 +53,7 @@ def y_scan(tmp_path_factory):
 @pytest.fixture(scope="module")
 def y_anatomy(y_scan):
     mesh, curves, _ = y_scan
-    return import_scan(mesh, curves, spacing=1e-3, tolerance=0.5e-3)
+    return import_scan(mesh, curves, spacing=1.5e-3, tolerance=0.5e-3)
 
 
 def figures(anatomy: Anatomy, count: int = 4000):

@@ -108,6 +108,7 @@ for _name in suite.SUITE:
     if _name not in QUICK:
         _test = pytest.mark.slow(_test)
     globals()[_class] = _test
+del _test  # not to be collected once more under this name
 
 
 # The sweep over tasks.

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from conftest import begin_dumped
+from conftest import begin_dumped, twin
 
 from cathsim_dmc import suite
 from cathsim_dmc.physics import forces
@@ -16,10 +16,9 @@ from cathsim_dmc.tasks import physics_errors
 _SNAP = Path(__file__).with_name("data") / "snap_through.npz"
 
 
-def _snap():
+def _snap(environment):
     """Wall forces, N, of the recorded moment, and the error that ended it."""
     meta, state, actions = physics_errors.load(_SNAP)
-    environment = suite.load("cathsim", "type1_lcca", {"randomisation": True})
     environment.reset()
     begin_dumped(environment, meta, state)
     task, peaks = environment.task, []
@@ -31,13 +30,14 @@ def _snap():
 
 
 def test_an_impact_is_no_error_of_physics(monkeypatch, tmp_path):
-    peaks, error = _snap()
+    environment = suite.load("cathsim", "type1_lcca", {"randomisation": True})
+    peaks, error = _snap(environment)
     assert max(peaks) < 0.1
     assert error is None
     monkeypatch.setenv("CATHSIM_DUMP_DIR", str(tmp_path))
     monkeypatch.setattr(forces, "HARDEST", np.inf)
     monkeypatch.setattr(forces, "DEEPEST", np.inf)
-    peaks, error = _snap()
+    peaks, error = _snap(environment)
     assert peaks[-1] > physics_errors.MAX_FORCE
     assert error == physics_errors.EXPLODED
 
@@ -82,10 +82,9 @@ def test_shorter_steps_are_equal_in_both_paths(task, options, monkeypatch):
             original(self, indices, *rest),
         ),
     )
-    environments = [
-        suite.load("cathsim", task, {"random": seed, **options}) for seed in (5, 6)
-    ]
-    batch = BatchSimulation(suite.make_task(task, **options), 2, num_threads=1, seeds=5)
+    task = suite.make_task(task, **options)
+    environments = [suite.environment(twin(task, seed)) for seed in (5, 6)]
+    batch = BatchSimulation(task, 2, num_threads=1, seeds=5)
     batch.reset()
     for environment in environments:
         environment.reset()
