@@ -23,9 +23,9 @@ PAIR_TASK = "type1_bca_pair"
 
 INTRODUCTION = f"""# Observations
 
-This page is generated from the specs of `{TASK}` by `docs/scripts/observations.py`.
+`docs/scripts/observations.py` generates this page from the specs of `{TASK}`.
 
-An observation is chosen by name, or by a list of names:
+A name or a list of names selects the observation:
 
 ```python
 env = suite.load("cathsim", "{TASK}", task_kwargs={{
@@ -35,17 +35,16 @@ env = suite.load("cathsim", "{TASK}", task_kwargs={{
 ```
 
 The world frame is that of the patient (LPS): +x to the patient's left, +y posterior,
-+z superior. Joints and links run from proximal to distal; their number, and so some of
-the shapes, depend on the device and on the length that a task needs. Positions and
-velocities of joints are those at the end of the control step, all other numbers those
-of its last physics step.
++z superior. Joints and links run from proximal to distal; their number depends on the
+device and on the length that a task needs. Positions and velocities of joints are those
+at the end of the control step, all other values those of its last physics step.
 """
 
 COAXIAL = f"""
 ## Coaxial devices
 
-Tasks with the suffix `_wire` or `_pair` add to `internal`, `tracking` and `route`, here
-with the shapes of `{PAIR_TASK}`; `tracking_2d` gets the first two:
+Tasks with the suffix `_wire` or `_pair` add these entries to `internal`, `tracking` and
+`route`, and the first two to `tracking_2d`. Shapes are those of `{PAIR_TASK}`:
 
 {{table}}
 """
@@ -53,8 +52,8 @@ with the shapes of `{PAIR_TASK}`; `tracking_2d` gets the first two:
 FLUOROSCOPY = f"""
 ## Fluoroscopy
 
-`image`, `sequential`, `segmentation` and `tracking_2d` look through a C-arm. It needs
-no OpenGL. `task_kwargs={{"fluoroscopy": {{...}}}}` sets it up:
+`image`, `sequential`, `segmentation` and `tracking_2d` use a simulated C-arm, without
+OpenGL. `task_kwargs={{"fluoroscopy": {{...}}}}` configures it:
 
 {{table}}
 
@@ -73,8 +72,10 @@ CAMERA_TEXT = f"""
 ## Cameras
 
 `rgb` and `depth` need OpenGL: set `MUJOCO_GL` to `egl`, `osmesa` or `glfw` before
-Python starts. Cameras are {", ".join(f"`{name}`" for name in CAMERAS)}, an endoscope at
-the distal end; `task_kwargs={{"cameras": {{"names": [...], "size": 128}}}}` chooses.
+Python starts. Cameras are {", ".join(f"`{name}`" for name in CAMERAS)}; the last is an
+endoscope at the distal end.
+`task_kwargs={{"cameras": {{"names": [...], "size": 128}}}}`
+selects them.
 
 ![Cameras](images/camera_views.png)
 """
@@ -82,11 +83,11 @@ the distal end; `task_kwargs={{"cameras": {{"names": [...], "size": 128}}}}` cho
 RANDOMISATION = """
 ## Domain randomisation
 
-Off by default. `task_kwargs={"randomisation": True}` draws from the default ranges at
-every reset, a mapping from its own. A range is `[low, high]` of a uniform distribution,
-or a `dm_control.composer.variation.Variation`. All draws, quantum noise included, come
-from the one source that the environment's seed sets, and the batched path draws what
-composer draws.
+Randomisation is off by default. `task_kwargs={"randomisation": True}` draws from the
+default ranges at every reset, a mapping from its own. A range is `[low, high]` of a
+uniform distribution, or a `dm_control.composer.variation.Variation`. All draws, quantum
+noise included, come from the environment's random state; single and batched
+environments draw the same values.
 
 {table}
 """
@@ -126,7 +127,7 @@ def entries_table() -> str:
     drawn = [name for name in observations.OBSERVATIONS if name not in KINDS]
     environment = suite.load("cathsim", TASK, {"observation": drawn})
     specs = dict(environment.observation_spec())
-    # Pictures of cameras have a spec without OpenGL, too.
+    # Camera images have a spec without OpenGL, too.
     specs |= observations.entry_specs(KINDS, ImageOptions())
     rows = [
         _row("observation", "entry", "shape", "type", "range", "unit", "meaning"),
