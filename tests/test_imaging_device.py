@@ -13,8 +13,10 @@ from test_imaging_thickness import (
 
 from cathsim_dmc.imaging import VIEWS, CArm, device_attenuation, device_thickness
 from cathsim_dmc.imaging.kernel import add_disc, disc_quadrant
+from cathsim_dmc.imaging.kernel import curve as smooth_curve
 
 RADIUS = 0.84e-3
+SCRATCH = np.empty((3, 20))
 
 
 def curve(links=36, phase=0.0):
@@ -80,7 +82,7 @@ def brute_shares(image_size, row, column, radius, fine=100):
 @given(st.floats(0.2, 4.0), st.floats(4.5, 6.5), st.floats(4.5, 6.5))
 def test_a_disc_is_shared_by_the_area_in_each_pixel(radius, row, column):
     image = np.zeros((11, 11))
-    add_disc(image, row, column, radius, 3.0)
+    add_disc(image, row, column, radius, 3.0, SCRATCH)
     shares = brute_shares(11, row, column, radius)
     np.testing.assert_allclose(image / 3.0, shares, atol=0.01 / radius)
     assert image.min() >= 0.0
@@ -94,15 +96,15 @@ def test_a_disc_is_shared_by_the_area_in_each_pixel(radius, row, column):
 )
 def test_nothing_of_a_disc_is_lost(radius, row, column, centre):
     image = np.zeros((17, 17))
-    add_disc(image, centre + row, centre + column, radius, 2.0)
+    add_disc(image, centre + row, centre + column, radius, 2.0, SCRATCH)
     assert image.sum() == pytest.approx(2.0, rel=1e-9)
 
 
 @given(st.floats(0.1, 6.0), st.floats(-9.0, 14.0), st.floats(-9.0, 14.0))
 def test_a_disc_beside_the_image_is_cut_at_its_edge(radius, row, column):
     large, small = np.zeros((37, 37)), np.zeros((5, 5))
-    add_disc(large, row + 16, column + 16, radius, 1.0)
-    add_disc(small, row, column, radius, 1.0)
+    add_disc(large, row + 16, column + 16, radius, 1.0, SCRATCH)
+    add_disc(small, row, column, radius, 1.0, SCRATCH)
     np.testing.assert_allclose(small, large[16:21, 16:21], atol=1e-12)
 
 
@@ -144,10 +146,7 @@ def test_end_on_the_whole_length_is_seen_in_one_spot():
 def test_drawn_centreline_is_the_projected_one(view, magnification):
     carm = CArm.view(view, magnification=magnification)
     points = curve()
-    t = np.linspace(0, 1, 4001)
-    knots = np.linspace(0, 1, len(points))
-    dense = np.stack([np.interp(t, knots, points[:, i]) for i in range(3)], -1)
-    truth, _ = carm.project(dense)
+    truth, _ = carm.project(smooth_curve(points, 111))
     image = device_thickness(carm, points, RADIUS)
 
     # Weight in a window round a point of the curve has its centre of mass on the
@@ -168,6 +167,32 @@ def test_drawn_centreline_is_the_projected_one(view, magnification):
     assert len(distances) >= 8
     assert max(distances) < 0.5
     assert np.mean(distances) < 0.15
+
+
+def arc(links):
+    """Joints on a circle of 20 mm radius, (links + 1, 3)."""
+    angle = np.linspace(0.0, 1.5 * np.pi, links + 1)
+    return 0.02 * np.stack([np.cos(angle), 0.0 * angle, np.sin(angle)], axis=1)
+
+
+def test_the_shadow_has_no_corners():
+    carm = CArm.view("AP", resolution=(256, 256), magnification=4.0)
+    # A joint every 22 degrees, 8 mm apart, as in a bend of the published device.
+    image, circle = (device_thickness(carm, arc(n), RADIUS) for n in (12, 400))
+    length = np.linalg.norm(np.diff(arc(12), axis=0), axis=1).sum()
+    circle *= length / (1.5 * np.pi * 0.02)  # a device is as long as its links
+    assert np.abs(image - circle).sum() < 0.04 * circle.sum()
+
+
+def test_the_curve_passes_the_joints_of_unequal_links():
+    joints = arc(60)[[0, 1, 2, 5, 8, 9, 14, 16, 17, 22, 24, 30, 36, 40]]
+    points = smooth_curve(joints, 8)
+    np.testing.assert_allclose(points[::8], joints, atol=1e-15)
+    assert np.abs(np.linalg.norm(points, axis=1) - 0.02).max() < 2e-4
+    ways = np.diff(points, axis=0)
+    ways /= np.linalg.norm(ways, axis=1)[:, None]
+    # The sharpest corner of the joints has 0.46 rad.
+    assert np.arccos((ways[1:] * ways[:-1]).sum(axis=1)).max() < 0.1
 
 
 @settings(max_examples=60)

@@ -4,7 +4,8 @@ The chord of a ray through a round rod, as a function of the ray's distance from
 axis, is a half ellipse; a uniform disc swept along the projected axis leaves exactly
 that profile, whatever the direction. So the shadow of a device is a sum of discs,
 and what a pixel receives of a disc is the area the two share, which has a closed
-form: nothing is tabulated, and nothing is lost between pixels.
+form: nothing is tabulated, and nothing is lost between pixels. The axis of a device is
+a smooth curve through its joints.
 
 Numba compiles this module when it is first called and keeps the result beside it.
 Importing numba takes longer than loading a task, so `device` imports this module only
@@ -51,7 +52,12 @@ def disc_quadrant(x: float, y: float) -> float:
 
 @compiled
 def add_disc(
-    image: np.ndarray, row: float, column: float, radius: float, weight: float
+    image: np.ndarray,
+    row: float,
+    column: float,
+    radius: float,
+    weight: float,
+    scratch: np.ndarray,
 ) -> None:
     """Spreads a weight over the pixels that a disc covers, by the area they share.
 
@@ -60,6 +66,7 @@ def add_disc(
         row, column: centre of the disc, px.
         radius: of the disc, px, > 0.
         weight: of the whole disc.
+        scratch: (3, columns of the disc or more), overwritten.
     """
     rows, columns = image.shape
     # Pixel k spans [k - 1/2, k + 1/2].
@@ -71,8 +78,9 @@ def add_disc(
     # Area above the lower edge of a row of pixels, column edge by column edge, is the
     # area above its upper edge and what the row adds.
     width = int(last - first) + 1
-    edges, lefts, above = np.empty(width), np.empty(width), np.zeros(width)
+    edges, lefts, above = scratch[0], scratch[1], scratch[2]
     for j in range(width):
+        above[j] = 0.0
         edges[j] = min((first + j + 0.5 - column) / radius, 1.0)
         lefts[j] = _left(edges[j])
     for i in range(int(top), int(bottom) + 1):
@@ -88,6 +96,76 @@ def add_disc(
             k = int(first) + j
             if share > 0.0 and 0 <= i < rows and 0 <= k < columns:
                 image[i, k] += weight * share
+
+
+@compiled
+def _chord(joints: np.ndarray, link: int) -> tuple[float, float, float, float]:
+    """A link from its proximal to its distal joint, and its length."""
+    x = joints[link + 1, 0] - joints[link, 0]
+    y = joints[link + 1, 1] - joints[link, 1]
+    z = joints[link + 1, 2] - joints[link, 2]
+    return x, y, z, math.sqrt(x * x + y * y + z * z)
+
+
+@compiled
+def _turn(joints: np.ndarray, link: int, other: int) -> tuple[float, float, float]:
+    """Tangent less chord of a link where it meets another, times its length.
+
+    The tangent is that of the parabola through the three joints; zero if the other
+    link is none, has no length or is not finite.
+    """
+    if 0 <= other < len(joints) - 1:
+        x, y, z, length = _chord(joints, link)
+        u, v, w, beside = _chord(joints, other)
+        if 0.0 < beside < math.inf:
+            share, ratio = length / (length + beside), length / beside
+            return (
+                share * (u * ratio - x),
+                share * (v * ratio - y),
+                share * (w * ratio - z),
+            )
+    return 0.0, 0.0, 0.0
+
+
+@compiled
+def bends(
+    joints: np.ndarray, link: int
+) -> tuple[float, float, float, float, float, float]:
+    """Turns of a link's curve at its two ends, of a parabola where one end is free."""
+    a, b, c = _turn(joints, link, link - 1)
+    d, e, f = _turn(joints, link, link + 1)
+    if a == b == c == 0.0:
+        a, b, c = -d, -e, -f
+    elif d == e == f == 0.0:
+        d, e, f = -a, -b, -c
+    return a, b, c, d, e, f
+
+
+@compiled
+def curve(joints: np.ndarray, pieces: int) -> np.ndarray:
+    """Smooth curve through joints, a cubic on each link.
+
+    Args:
+        joints: (n, 3), finite and apart.
+        pieces: of each link.
+
+    Returns:
+        ((n - 1) * pieces + 1, 3).
+    """
+    points = np.empty(((len(joints) - 1) * pieces + 1, 3))
+    points[-1] = joints[-1]
+    for link in range(len(joints) - 1):
+        a, b, c, d, e, f = bends(joints, link)
+        for piece in range(pieces):
+            t = piece / pieces
+            row = points[link * pieces + piece]
+            sag = t * (1.0 - t)
+            behind, before = sag * (1.0 - t), sag * t
+            x, y, z, _ = _chord(joints, link)
+            row[0] = joints[link, 0] + t * x + behind * a - before * d
+            row[1] = joints[link, 1] + t * y + behind * b - before * e
+            row[2] = joints[link, 2] + t * z + behind * c - before * f
+    return points
 
 
 @compiled
@@ -115,6 +193,7 @@ def add_devices(
         Radius of the widest shadow in view, px; those above `WIDEST` are not drawn.
     """
     widest = 0.0
+    scratch = np.empty((3, 2 * WIDEST + 2))
     for frame in range(len(image)):
         to_tip = 0.0  # arc length from the tip, m
         for link in range(radius.shape[1] - 1, -1, -1):
@@ -128,6 +207,7 @@ def add_devices(
                 marker_mu,
                 marker_length,
                 to_tip,
+                scratch,
             )
             to_tip += length
             widest = max(widest, wide)
@@ -136,7 +216,7 @@ def add_devices(
 
 @compiled
 def _add_link(
-    image, camera, link, radii, focal, mu, marker_mu, marker_length, to_tip
+    image, camera, link, radii, focal, mu, marker_mu, marker_length, to_tip, scratch
 ) -> tuple[float, float]:
     """Adds one link whose distal end is `to_tip` from the tip.
 
@@ -146,8 +226,7 @@ def _add_link(
     rows, columns = image.shape
     radius = radii[link]
     x0, y0, z0 = camera[link]
-    x1, y1, z1 = camera[link + 1]
-    length = math.sqrt((x1 - x0) ** 2 + (y1 - y0) ** 2 + (z1 - z0) ** 2)
+    dx, dy, dz, length = _chord(camera, link)
     # A link that is not finite cannot be drawn; one without length has no direction.
     if not 0.0 < length < math.inf:
         return 0.0, 0.0
@@ -155,7 +234,6 @@ def _add_link(
     cap = 2.0 / 3.0 * radius / length
     back = cap if link == 0 else 0.0
     ahead = cap if link == len(radii) - 1 else 0.0
-    dx, dy, dz = x1 - x0, y1 - y0, z1 - z0
     x0, y0, z0 = x0 - back * dx, y0 - back * dy, z0 - back * dz
     stretch = 1.0 + back + ahead
     dx, dy, dz, length = dx * stretch, dy * stretch, dz * stretch, length * stretch
@@ -183,9 +261,16 @@ def _add_link(
     most = 4.0 * (rows + columns) / SPACING
     count = int(min(max(math.ceil(math.hypot(u1 - u0, v1 - v0) / spacing), 1.0), most))
     piece = length / count
+    a, b, _, d, e, _ = bends(camera, link)
     for step in range(count):
         fraction = (step + 0.5) / count
-        x, y, z = x0 + fraction * dx, y0 + fraction * dy, z0 + fraction * dz
+        # Of the link without its round ends, which are straight.
+        t = min(max(fraction * stretch - back, 0.0), 1.0)
+        sag = t * (1.0 - t)
+        behind, before = sag * (1.0 - t), sag * t
+        x = x0 + fraction * dx + behind * a - before * d
+        y = y0 + fraction * dy + behind * b - before * e
+        z = z0 + fraction * dz  # a bend hardly changes the magnification
         weight = mu
         if marker_length > 0.0:
             distal = to_tip + (1.0 - fraction) * length
@@ -202,5 +287,6 @@ def _add_link(
             x * scale + 0.5 * (columns - 1),
             radius * scale,
             weight,
+            scratch,
         )
     return length, wide

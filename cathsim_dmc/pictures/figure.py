@@ -14,7 +14,6 @@ from matplotlib.colors import LinearSegmentedColormap, Normalize
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle
 from PIL import Image
-from scipy.interpolate import CubicSpline
 
 from cathsim_dmc.imaging import FluoroscopyOptions
 from cathsim_dmc.pictures.snapshot import Snapshot, fluoroscope_of, xray
@@ -196,7 +195,10 @@ def _points_per_mm(axes: Any) -> float:
 
 
 def _draw_device(axes: Any, snapshot: Snapshot, projection: Projection) -> None:
-    line, radius = _smooth(projection.flat_mm(snapshot.device), snapshot.radius)
+    from cathsim_dmc.imaging.kernel import curve  # late: it brings the compiler
+
+    line = projection.flat_mm(curve(np.float64(snapshot.device), _PIECES))
+    radius = np.repeat(snapshot.radius, _PIECES)
     # Thicker than in truth, by half: as printed it would be two points wide.
     width = 1.5 * 2e3 * radius * _points_per_mm(axes)
     pieces = np.stack([line[:-1], line[1:]], axis=1)
@@ -224,13 +226,6 @@ def _draw_device(axes: Any, snapshot: Snapshot, projection: Projection) -> None:
         *line[-1], "o", ms=1.6 * width[-1], mfc=HEAD_COLOUR, mec="white", mew=0.8,
         zorder=5,
     )  # fmt: skip
-
-
-def _smooth(line: np.ndarray, radius: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """A curve through the joints of the chain, and the radii of its pieces."""
-    joint = np.arange(len(line))
-    fine = np.linspace(0, joint[-1], joint[-1] * _PIECES + 1)
-    return CubicSpline(joint, line)(fine), np.repeat(radius, _PIECES)
 
 
 def _draw_forces(axes: Any, snapshot: Snapshot, projection: Projection) -> None:

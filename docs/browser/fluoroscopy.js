@@ -99,9 +99,14 @@ export class Fluoroscope {
     const reach = Math.ceil(Math.hypot(u1 - u0, v1 - v0) / spacing);
     const count = Math.floor(Math.min(Math.max(reach, 1), most));
     const piece = length / count;
+    const [start, end] = bends(camera, link);
     for (let step = 0; step < count; step += 1) {
       const fraction = (step + 0.5) / count;
-      const [x, y, z] = [x0 + fraction * dx, y0 + fraction * dy, z0 + fraction * dz];
+      const t = Math.min(Math.max(fraction * stretch - back, 0), 1);
+      const [behind, before] = [t * (1 - t) * (1 - t), t * (1 - t) * t];
+      const x = x0 + fraction * dx + behind * start[0] - before * end[0];
+      const y = y0 + fraction * dy + behind * start[1] - before * end[1];
+      const z = z0 + fraction * dz;
       let weight = device_mu;
       if (marker_length > 0) {
         const distal = toTip + (1 - fraction) * length;
@@ -123,6 +128,28 @@ export class Fluoroscope {
     }
     return length;
   }
+}
+
+/** Tangent less chord of a link at the joint it shares with another, times its length. */
+function turn(joints, link, other) {
+  const chord = (i) => joints[i + 1].map((x, axis) => x - joints[i][axis]);
+  if (other >= 0 && other < joints.length - 1) {
+    const [own, next] = [chord(link), chord(other)];
+    const [length, beside] = [Math.hypot(...own), Math.hypot(...next)];
+    if (beside > 0 && beside < Infinity) {
+      const share = length / (length + beside);
+      return own.map((x, axis) => share * ((next[axis] * length) / beside - x));
+    }
+  }
+  return [0, 0, 0];
+}
+
+/** Turns of a link's curve at its two ends, of a parabola where one end is free. */
+function bends(joints, link) {
+  const [start, end] = [turn(joints, link, link - 1), turn(joints, link, link + 1)];
+  if (start.every((x) => x === 0)) return [end.map((x) => -x), end];
+  if (end.every((x) => x === 0)) return [start, start.map((x) => -x)];
+  return [start, end];
 }
 
 function left(t) {
