@@ -13,11 +13,12 @@ from conftest import TASKS
 
 import cathsim_dmc
 from cathsim_dmc import cli, suite
-from cathsim_dmc.agents import LEARNERS, Checkpoint
+from cathsim_dmc.agents import LEARNERS, Checkpoint, report
 from cathsim_dmc.agents.checkpoint import checkpoints_in
+from cathsim_dmc.agents.policies import FunctionPolicy
 from cathsim_dmc.anatomy.anatomy import Anatomy
 from cathsim_dmc.anatomy.arch import arch
-from cathsim_dmc.cli import training
+from cathsim_dmc.cli import task_options
 
 
 @pytest.fixture
@@ -136,6 +137,45 @@ def test_evaluation_prints_one_object(cathsim):
     assert isinstance(only_json(out), dict)
 
 
+def test_every_option_of_a_task_is_one_of_the_evaluation(cathsim, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "200")
+    _, out, _ = cathsim("eval", "--help")
+    for task in ("type1_bca", "navigate", "arch_bca"):
+        for name in set(suite.task_options(task)) - {"observation"}:
+            assert f"--{name.replace('_', '-')}" in out, name
+
+
+def test_an_evaluation_takes_options_of_the_task(cathsim):
+    ranges = {"friction": [0.02, 0.06]}
+    code, out, err = cathsim(
+        *("eval", "push", "--task", "simple1_bca", "--episodes", 1, "--threads", 1),
+        *("--randomisation", json.dumps(ranges), "--device", "steerable_4f"),
+        *("--reward", '{"path": -1}', "--max-steps", 3, "--no-baseline", "--json"),
+    )
+    assert code == 0, err
+    found = only_json(out)["policy"]
+    assert found["settings"]["task_kwargs"] == {
+        "randomisation": ranges, "device": "steerable_4f", "reward": {"path": -1},
+        "max_steps": 3,
+    }  # fmt: skip
+    assert found["episodes"][0]["length"] == 3
+
+
+def test_an_evaluation_keeps_the_options_that_a_policy_was_trained_with(monkeypatch):
+    policy = FunctionPolicy(lambda observation: observation, "trained")
+    policy.task, policy.task_kwargs = "type1_bca", {"rotation": True, "friction": 0.1}
+    seen = {}
+
+    def play(*arguments, task_kwargs, **others):
+        seen.update(task_kwargs)
+        raise InterruptedError
+
+    monkeypatch.setattr(report.evaluation, "evaluate", play)
+    with pytest.raises(InterruptedError):
+        report.evaluate(policy, task_kwargs={"friction": 0.2})
+    assert seen == {"rotation": True, "friction": 0.2}
+
+
 def test_a_reader_that_stops_early_is_no_error():
     program = (
         "import sys; sys.argv = ['cathsim', 'list', '--json']\n"
@@ -194,7 +234,7 @@ def test_the_help_explains_every_setting(cathsim, monkeypatch, algorithm):
             continue
         option = "--" + item.name.replace("_", "-")
         assert option in out
-        text = training._field_helps(LEARNERS[algorithm].config)[item.name]
+        text = task_options.field_helps(LEARNERS[algorithm].config)[item.name]
         assert text[0].isupper() and text.endswith("."), f"{option}: {text}"
         assert not text.startswith("Of "), f"{option}: {text}"
 
@@ -323,6 +363,14 @@ BAD = {
     "arches where there are none": (
         ["eval", "push", "--task", "type1_bca", "--pool", 2],
         ["no task option 'pool'"],
+    ),
+    "an option that is no JSON": (
+        ["eval", "push", "--task", "type1_bca", "--randomisation", "{delay"],
+        ["--randomisation", "{delay", "give JSON"],
+    ),
+    "no such device of the task": (
+        ["eval", "push", "--task", "type1_bca", "--device", "banana"],
+        ["banana", "steerable_5f"],
     ),
     "no such set of arches": (
         ["eval", "push", "--task", "arch_bca", "--arches", "trian"],

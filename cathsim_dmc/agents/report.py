@@ -154,8 +154,7 @@ def evaluate(
         task: Name of the task; None takes the one that the policy was trained on.
         episodes: Number of episodes.
         seed: Seed of the first episode; the others count up.
-        task_kwargs: Further options of the task; None takes those that the policy was
-            trained with.
+        task_kwargs: Options of the task, over those that the policy was trained with.
         backend: Way of simulating, "batched" or "composer".
         num_threads: Number of threads of the simulation; None takes one per core.
         baseline: Whether to play the same seeds with the random policy too.
@@ -183,7 +182,8 @@ def evaluate(
         backend=backend,
         num_threads=num_threads,
     )
-    result = play(policy, task, task_kwargs=task_kwargs, observer=observe)
+    options = {**(player.task_kwargs or {}), **(task_kwargs or {})}
+    result = play(player, task, task_kwargs=options, observer=observe)
     other = comparison = None
     if baseline and str(policy) != "random":
         other = play(
@@ -239,8 +239,7 @@ def record(
         seed: Seed of the episode.
         max_steps: Number of control steps after which the episode is cut off; None
             leaves it to the task.
-        task_kwargs: Further options of the task; None takes those that the policy was
-            trained with.
+        task_kwargs: Options of the task, over those that the policy was trained with.
         fluoroscopy: Whether to include X-ray images.
         gif: Path of the film, .gif, .webp or .mp4; None makes none.
 
@@ -263,7 +262,7 @@ def record(
     # Now: an episode that cannot be written would be lost.
     for target in targets.values():
         target.parent.mkdir(parents=True, exist_ok=True)
-    kwargs = dict(player.task_kwargs or {} if task_kwargs is None else task_kwargs)
+    kwargs = {**(player.task_kwargs or {}), **(task_kwargs or {})}
     if player.observation is not None:
         kwargs["observation"] = player.observation
     environment = suite.load(suite.DOMAIN, task, task_kwargs={**kwargs, "random": seed})

@@ -1,6 +1,7 @@
 """The command line that trains with given settings."""
 
 import dataclasses
+import json
 import shlex
 from collections.abc import Mapping
 from typing import Any
@@ -32,7 +33,7 @@ def training_command(config: TrainingConfig, out: str = "RUN") -> str:
     words += _option("observation", config.observation)
     words += ["--frames", str(config.total_frames), "--seed", str(config.seed)]
     for name, value in changed.items():
-        words += _option(name, value)
+        words += _option(name, value, name in config.task_kwargs)
     return shlex.join(words)
 
 
@@ -54,10 +55,12 @@ def _changes(config: TrainingConfig, preset: str) -> dict[str, Any]:
     return changed | options
 
 
-def _option(name: str, value: Any) -> list[str]:
+def _option(name: str, value: Any, of_task: bool = False) -> list[str]:
     flag = f"--{name.replace('_', '-')}"
     if isinstance(value, bool):
         return [flag if value else f"--no-{flag[2:]}"]
+    if of_task and isinstance(value, Mapping | list | tuple):
+        return [flag, json.dumps(value)]
     if isinstance(value, Mapping):
         return [flag, *(str(word) for pair in value.items() for word in pair)]
     if isinstance(value, list | tuple):

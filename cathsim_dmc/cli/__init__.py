@@ -118,6 +118,7 @@ def _run(arguments: list[str]) -> int:
         print(f"cathsim-dmc {__version__}")
         return 0
     app.command(name="train")(training.command(arguments))
+    app.command(name="eval")(agents.evaluation(arguments))
     return app.cli(
         prog="cathsim",
         description=_DESCRIPTION,

@@ -1,6 +1,8 @@
 """`cathsim eval`, `record`, `replay`, `play`, `export` and `demo`."""
 
+import dataclasses
 import sys
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -16,13 +18,33 @@ from cathsim_dmc.cli.options import (
     Task,
     print_json,
 )
+from cathsim_dmc.cli.task_options import given, task_kind
 
 
 def add_to(app: SubcommandApp) -> None:
     """Adds the commands."""
-    app.command(name="eval")(evaluate)
+    app.command(name="eval")(evaluation([]))
     for command in (record, demos, replay, play, export, demo):
         app.command(command)
+
+
+@dataclasses.dataclass(frozen=True)
+class NoOptions:
+    """Stands for the options of a task where another command is called."""
+
+
+def evaluation(arguments: Sequence[str]) -> Callable[..., int]:
+    """The command `eval` for a command line.
+
+    Args:
+        arguments: Arguments of `cathsim`. If they are for another command, the options
+            of the task, which take time to import, are left out.
+    """
+    kind: type = NoOptions
+    if list(arguments[:1]) == ["eval"]:
+        kind = task_kind(frozenset({"observation"}))
+    evaluate.__annotations__["options"] = Annotated[kind, conf.arg(name="")]
+    return evaluate
 
 
 def evaluate(
@@ -37,6 +59,8 @@ def evaluate(
     backend: Literal["batched", "composer"] = "batched",
     threads: int | None = None,
     json: bool = False,
+    *,
+    options: NoOptions,
 ) -> int:
     """Play episodes with a policy and report reward, forces and success.
 
@@ -53,6 +77,7 @@ def evaluate(
             environments one after the other.
         threads: Number of threads of the simulation; one per core by default.
         json: Whether to print one JSON object and nothing else.
+        options: Options of the task, over those that the policy was trained with.
     """
     from cathsim_dmc.agents import report
 
@@ -61,7 +86,7 @@ def evaluate(
         task=task,
         episodes=episodes,
         seed=seed,
-        task_kwargs=anatomy.task_kwargs or None,
+        task_kwargs={**given(options), **anatomy.task_kwargs},
         backend=backend,
         num_threads=threads,
         baseline=baseline,
@@ -109,7 +134,7 @@ def record(
         task=task,
         seed=seed,
         max_steps=max_steps,
-        task_kwargs=anatomy.task_kwargs or None,
+        task_kwargs=anatomy.task_kwargs,
         fluoroscopy=fluoroscopy,
         gif=gif,
     )

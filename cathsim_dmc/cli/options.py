@@ -21,6 +21,8 @@ class OwnAnatomy:
     Attributes:
         anatomy: Directory of an anatomy, or name of an arch (`navigate`).
         goal: Name of the goal in it (`navigate`).
+        access: Way in: "ascending", from the ascending aorta, or "descending", from
+            the femoral artery (`navigate`).
         arches: Set of random arches that episodes draw from: train, test or
             test_variants (`arch_…`, `femoral_arch_…`).
         pool: Number of arches that episodes draw from (the same tasks).
@@ -29,6 +31,7 @@ class OwnAnatomy:
 
     anatomy: Annotated[str | None, conf.arg(aliases=("--phantom",))] = None
     goal: str | None = None
+    access: str | None = None
     arches: str | None = None
     pool: int | None = None
     first: int | None = None

@@ -5,18 +5,17 @@ import copy
 import dataclasses
 import functools
 import json
-import operator
 import shlex
 import sys
-import typing
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-import docstring_parser
 from tyro import conf
 
 from cathsim_dmc.cli.options import INTERRUPTED, NO_ANATOMY, OwnAnatomy
+from cathsim_dmc.cli.task_options import field_helps, task_kind
+from cathsim_dmc.cli.task_options import given as given_options
 
 _ALGORITHM, _PRESET = "ppo", "published"
 _SUMMARY = "Train an agent."
@@ -137,7 +136,7 @@ def _options(base: Any, resumed: bool) -> type:
             field(default_factory=_task_options(base)),
         ),
     ]
-    helps = _field_helps(type(base))
+    helps = field_helps(type(base))
     for item in dataclasses.fields(base):
         if item.name in ("task", "task_kwargs"):
             continue
@@ -150,46 +149,12 @@ def _options(base: Any, resumed: bool) -> type:
     return dataclasses.make_dataclass("Train", fields, kw_only=True, frozen=True)
 
 
-@functools.cache
-def _task_kind(names: frozenset[str]) -> type:
-    """A dataclass of the task's options that are single values, None by default."""
-    from cathsim_dmc.tasks.config import NavigationConfig
-
-    helps = _field_helps(NavigationConfig)
-    fields = []
-    for name, kind in typing.get_type_hints(NavigationConfig).items():
-        kinds = [one for one in _alternatives(kind) if one in (str, int, float, bool)]
-        if kinds and name not in names:
-            either = functools.reduce(operator.or_, kinds) | None
-            help = f"{helps.get(name, '')} By default the task's own.".strip()
-            option = (name, _explained(either, help), dataclasses.field(default=None))
-            fields.append(option)
-    kind = dataclasses.make_dataclass("TaskOptions", fields, kw_only=True, frozen=True)
-    kind.__doc__ = "Options of the task."
-    return kind
-
-
 def _task_options(base: Any) -> type:
-    return _task_kind(frozenset(item.name for item in dataclasses.fields(base)))
-
-
-def _alternatives(kind: Any) -> tuple[Any, ...]:
-    """Types that a value may have, for a union more than one."""
-    return typing.get_args(kind) if not isinstance(kind, type) else (kind,)
+    return task_kind(frozenset(item.name for item in dataclasses.fields(base)))
 
 
 def _explained(kind: Any, text: str, **more: Any) -> Any:
     return Annotated[kind, conf.arg(help=text, **more)]
-
-
-def _field_helps(kind: type) -> dict[str, str]:
-    """What the docstrings of a dataclass and its bases say of each field."""
-    helps: dict[str, str] = {}
-    for one in reversed(kind.__mro__):
-        if dataclasses.is_dataclass(one):
-            for entry in docstring_parser.parse(one.__doc__ or "").params:
-                helps[entry.arg_name] = " ".join((entry.description or "").split())
-    return helps
 
 
 def _run(options: Any, base: Any) -> int:
@@ -197,10 +162,13 @@ def _run(options: Any, base: Any) -> int:
 
     names = {item.name for item in dataclasses.fields(base)}
     given = {name: value for name, value in vars(options).items() if name in names}
-    wanted = {k: v for k, v in vars(options.options).items() if v is not None}
     config = base.replace(
         **given,
-        task_kwargs={**base.task_kwargs, **wanted, **options.anatomy.task_kwargs},
+        task_kwargs={
+            **base.task_kwargs,
+            **given_options(options.options),
+            **options.anatomy.task_kwargs,
+        },
     )
     _check_task(config)
     result = agents.train(
