@@ -10,7 +10,6 @@ from dm_control.composer.variation import distributions
 from cathsim_dmc import suite
 from cathsim_dmc.anatomy.arch import arch
 from cathsim_dmc.anatomy.parts import Goal
-from cathsim_dmc.anatomy.scan.importer import import_scan
 from cathsim_dmc.entities import devices
 from cathsim_dmc.physics.randomisation import Randomisation
 from cathsim_dmc.simulation.batch import BatchSimulation
@@ -120,69 +119,31 @@ def test_wrong_reward():
     ("options", "words"),
     [
         ({"goal_radius": 0.0}, ["goal_radius", "0.0", "above 0"]),
-        ({"goal_radius": -1e-3}, ["goal_radius", "-0.001", "above 0"]),
         ({"max_steps": 0}, ["max_steps", "0", "at least 1"]),
-        ({"max_steps": 1.5}, ["max_steps", "1.5", "integer"]),
-        ({"max_steps": float("inf")}, ["max_steps", "inf", "integer"]),
-        ({"max_steps": True}, ["max_steps", "True", "integer"]),
         ({"rotation": "False"}, ["rotation", "'False'", "True or False"]),
         ({"shaft_link": 1e9}, ["shaft_link", "1000000000.0", "0.002 to 0.1 m"]),
-        ({"shaft_link": 1e-6}, ["shaft_link", "1e-06", "0.002 to 0.1 m"]),
         ({"friction": "0.1"}, ["friction", "'0.1'", "number"]),
-        ({"physics_timestep": 1e9}, ["physics_timestep", "control step of 0.04"]),
         ({"physics_timestep": 0.003}, ["physics_timestep", "whole part"]),
-        ({"physics_timestep": float("inf")}, ["physics_timestep", "inf", "finite"]),
-        ({"torsion_joints": 1.5}, ["torsion_joints", "1.5", "integer"]),
         ({"friction": -0.1}, ["friction", "-0.1", "from 0 to 2"]),
-        ({"friction": 5.0}, ["friction", "5.0", "from 0 to 2"]),
         ({"working_length": 0.05}, ["working_length", "0.05", "steerable_5f", "more"]),
         ({"torsion_joints": 500}, ["torsion_joints", "500", "joints"]),
-        ({"torsion_joints": -1}, ["torsion_joints", "-1", "from 0"]),
         ({"working_length": 300.0}, ["working_length", "300", "to 3 m"]),
         ({"fluoroscopy": {"zoom": 2}}, ["fluoroscopy", "zoom", "magnification"]),
         ({"cameras": {"names": ("front",)}}, ["front", "top", "side", "tip"]),
         ({"randomisation": {"gravity": 1}}, ["gravity", "friction"]),
         ({"randomisation": {"delay": (0, 10**9)}}, ["randomisation", "delay", "250"]),
-        ({"randomisation": {"delay": (0, 1.5)}}, ["delay", "1.5", "integer"]),
         ({"randomisation": 1}, ["randomisation", "1", "True", "friction"]),
-        ({"randomisation": {"friction": (0, np.inf)}}, ["friction", "inf", "0 to 2"]),
         (
             {"randomisation": {"view": (0, 80)}, "fluoroscopy": {"view": (0, 20)}},
             ["randomisation", "view", "80", "fluoroscopy"],
         ),
-        ({"fluoroscopy": {"size": 10**6}}, ["fluoroscopy", "size", "4096"]),
         ({"fluoroscopy": {"size": (128, 0)}}, ["size", "(128, 0)", "columns"]),
-        ({"fluoroscopy": {"size": "128"}}, ["size", "'128'", "integer"]),
-        ({"fluoroscopy": {"magnification": "2"}}, ["magnification", "number"]),
         ({"fluoroscopy": {"biplane": "TOP"}}, ["biplane", "TOP", "LATERAL"]),
         ({"cameras": {"size": 10**6}}, ["cameras", "size", "4096"]),
     ],
 )
 def test_wrong_values(options, words):
     fails(words, **options)
-
-
-@pytest.mark.parametrize("value", [float("nan"), float("inf"), -1.0, 0.0])
-def test_lengths_and_times_must_be_positive(value):
-    fails(["working_length", str(value)], working_length=value)
-    fails(["shaft_link", str(value), "0.002 to 0.1 m"], shaft_link=value)
-
-
-@pytest.mark.parametrize(
-    ("field", "value"),
-    [
-        ("bca_drop", "0.5"),
-        ("arch_radius", None),
-        ("bovine", "False"),
-        ("lcca", {"radius": 4e-3}),
-        ("lsa_aberrant_spacing", np.nan),
-        ("plane_tilt", np.inf),
-        ("ascending_length", True),
-    ],
-)
-def test_figures_of_an_arch_of_a_wrong_kind(field, value):
-    with pytest.raises(ValueError, match=f"{field} is .*; it must be"):
-        dataclasses.replace(arch.ARCHES["simple1"], **{field: value})
 
 
 def test_a_distribution_of_ones_own_is_held_to_the_bounds_when_it_is_drawn():
@@ -211,11 +172,6 @@ def test_action_of_wrong_shape(environment, shape):
         assert word in str(caught.value)
 
 
-def test_action_with_a_leading_axis(environment):
-    with pytest.raises(ValueError, match=r"\(1, 21\)"):
-        environment.step(np.zeros((1, 21)))
-
-
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
 def test_action_that_is_not_finite(environment, value):
     action = np.zeros(21)
@@ -224,15 +180,6 @@ def test_action_that_is_not_finite(environment, value):
     with pytest.raises(ValueError, match=r"2 NaN or infinite.*\[-1, 1\]"):
         environment.step(action)
     np.testing.assert_array_equal(environment.physics.data.qpos, before)
-
-
-@pytest.mark.parametrize("value", ["x", None, 1j, "0.5", True, [0.0]])
-def test_actions_that_are_no_numbers(environment, value):
-    action = [value] * 21
-    if value == [0.0]:
-        action[3] = 0.0
-    with pytest.raises(ValueError, match=r"the action is .*21.*\[-1, 1\]"):
-        environment.step(action)
 
 
 def test_actions_of_a_batch(environment):
@@ -266,60 +213,8 @@ def batch_face(environment):
     return reset, lambda action: batch.step(action[None]).outcome.reward[0]
 
 
-def gymnasium_face(environment):
-    import cathsim_dmc.gym  # noqa: F401  registers the ids
-
-    env = pytest.importorskip("gymnasium").make("cathsim/type1_bca-v0")
-    return lambda: env.reset(seed=3), lambda action: env.step(np.float32(action))[1]
-
-
-def vector_face(environment):
-    import cathsim_dmc.gym  # noqa: F401  registers the ids
-
-    env = pytest.importorskip("gymnasium").make_vec(
-        "cathsim/type1_bca-v0", 1, vectorization_mode="vector_entry_point"
-    )
-    return (
-        lambda: env.reset(seed=3),
-        lambda action: env.step(np.float32(action[None]))[1][0],
-    )
-
-
-def torchrl_face(environment, backend="batched"):
-    import torch
-
-    from cathsim_dmc.simulation.environments import make_env
-
-    env = make_env("type1_bca", backend=backend)
-    state = env.reset()
-
-    def reset():
-        env.set_seed(3)
-        state.update(env.reset())
-
-    def step(action):
-        state["action"] = torch.as_tensor(action[None], dtype=env.action_spec.dtype)
-        return env.step(state)["next", "reward"].item()
-
-    return reset, step
-
-
-def composer_torchrl_face(environment):
-    return torchrl_face(environment, "composer")
-
-
-SLOW_FACES = (gymnasium_face, vector_face, torchrl_face, composer_torchrl_face)
-
-
-@pytest.mark.parametrize(
-    "face",
-    [
-        composer_face,
-        batch_face,
-        *(pytest.param(face, marks=pytest.mark.slow) for face in SLOW_FACES),
-    ],
-)
-def test_actions_out_of_range_are_clipped_in_every_face(environment, face):
+@pytest.mark.parametrize("face", [composer_face, batch_face])
+def test_actions_out_of_range_are_clipped_in_both_paths(environment, face):
     """As the drives would: three times the range is the range, bit for bit."""
     reset, step = face(environment)
     action = np.where(np.arange(21) % 2, 1.0, -1.0)
@@ -337,54 +232,3 @@ def test_batches_of_nothing_and_of_too_few_seeds(environment):
         BatchSimulation(environment.task, 0)
     with pytest.raises(ValueError, match="3 seeds for 2 simulations"):
         BatchSimulation(environment.task, 2, num_threads=1, seeds=[1, 2, 3])
-
-
-# Scans.
-
-# An octahedron of 50 mm, and its faces.
-CORNERS = "v 50 0 0\nv -50 0 0\nv 0 50 0\nv 0 -50 0\nv 0 0 50\nv 0 0 -50\n"
-FACES = [
-    *("f 1 3 5", "f 3 2 5", "f 2 4 5", "f 4 1 5"),
-    *("f 3 1 6", "f 2 3 6", "f 4 2 6", "f 1 4 6"),
-]
-
-
-@pytest.fixture
-def curve(tmp_path):
-    path = tmp_path / "centreline-LCCA.csv"
-    path.write_text("5,5,5\n8,8,8\n10,10,10\n")
-    return path
-
-
-def test_missing_scan_file(tmp_path, curve):
-    with pytest.raises(FileNotFoundError) as caught:
-        import_scan(tmp_path / "lumen.obj", [curve])
-    for word in ("lumen.obj", "OBJ", "STL", "PLY"):
-        assert word in str(caught.value)
-
-
-def test_missing_centreline(tmp_path):
-    mesh = tmp_path / "lumen.obj"
-    mesh.write_text(CORNERS + "\n".join(FACES) + "\n")
-    with pytest.raises(FileNotFoundError) as caught:
-        import_scan(mesh, [tmp_path / "centreline-LCCA.mrk.json"])
-    for word in ("centreline-LCCA.mrk.json", ".csv"):
-        assert word in str(caught.value)
-
-
-def test_scan_that_is_not_closed(tmp_path, curve):
-    mesh = tmp_path / "lumen.obj"
-    mesh.write_text(CORNERS + "\n".join(FACES[:7]) + "\n")
-    with pytest.raises(ValueError) as caught:
-        import_scan(mesh, [curve])
-    for word in ("lumen.obj", "not closed", "hole", "mm wide", "Fill holes"):
-        assert word in str(caught.value)
-
-
-def test_scan_in_a_format_nobody_reads(tmp_path, curve):
-    mesh = tmp_path / "lumen.docx"
-    mesh.write_text("")
-    with pytest.raises(ValueError) as caught:
-        import_scan(mesh, [curve])
-    for word in ("docx", "obj", "stl", "ply"):
-        assert word in str(caught.value)
