@@ -124,6 +124,63 @@ def test_a_goal_that_cannot_be_shifted_is_refused():
         advancing(randomisation=True)
 
 
+NUMBERS = np.zeros(2)
+
+
+@pytest.fixture(scope="module")
+def judged():
+    """A batch of two, and a function that takes what its objective answers."""
+    task = advancing()
+    batch = BatchSimulation(task, 2, num_threads=1)
+
+    def answer(outcome):
+        task.objective.outcome = lambda measurement: outcome
+        batch.reset()
+
+    return batch, answer
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"reward": np.array([0.0, np.nan])}, r"nan.*finite"),
+        ({"terms": {"near": np.array([0.0, np.inf])}}, r"inf.*finite"),
+        ({"reward": np.zeros(7)}, r"reward of shape \(7,\).*\(2,\)"),
+        ({"terms": {"near": np.zeros((2, 1))}}, r"near of shape \(2, 1\).*\(2,\)"),
+        ({"success": np.bool_(True)}, "success"),
+        ({"success": NUMBERS}, "success"),
+        ({"reward": None}, "reward None"),
+        ({"reward": [0.0, 0.0]}, "reward"),
+        ({"reward": np.array(["a", "b"])}, "reward"),
+        ({"reward": NUMBERS.astype(object)}, "reward"),
+        ({"terms": None}, "terms=None"),
+        ({"terms": {"near": 0.0}}, "near 0.0"),
+    ],
+)
+def test_an_outcome_that_is_none_is_refused_by_the_name_of_its_objective(
+    judged, changes, words
+):
+    batch, answer = judged
+    good = Outcome(NUMBERS, NUMBERS > 0, {"near": NUMBERS})
+    answer(good)
+    assert not batch.step(pushing(0)[0]).terminated.any()
+    with pytest.raises(ValueError, match=rf"Advance returns .*{words}.*Outcome\("):
+        answer(good._replace(**changes))
+    for other in (None, "x", tuple(good)):
+        with pytest.raises(ValueError, match=r"Advance returns .*Outcome\("):
+            answer(other)
+
+
+def test_composer_refuses_an_outcome_that_is_none():
+    task = advancing()
+    environment = suite.environment(task)
+    environment.reset()
+    one = np.zeros(1)
+    task.objective.outcome = lambda measurement: Outcome(one * np.nan, one > 0, {})
+    with pytest.raises(ValueError, match=r"Advance returns .*nan.*finite"):
+        environment.step(np.zeros(21))
+
+
 def test_a_name_that_is_taken_is_refused(example):
     with pytest.raises(ValueError, match=r"'type1_bca' already"):
         suite.register("type1_bca", suite.TASKS[example.TASK])

@@ -11,6 +11,7 @@ from cathsim_dmc.tasks.objectives import (
     Objective,
     Outcome,
     ShiftableObjective,
+    ask,
 )
 
 
@@ -53,7 +54,7 @@ class ObjectivePool:
     def outcome(self, measurement: Measurement) -> Outcome:
         """Judges a control step of N simulations."""
         parts = [
-            (objective.outcome(part(measurement, rows)), rows)
+            (ask(objective, part(measurement, rows)), rows)
             for objective, rows in self._groups
         ]
         terms = {

@@ -29,6 +29,7 @@ from cathsim_dmc.tasks.objectives import (
     Measurement,
     Objective,
     ShiftableObjective,
+    judge,
     straight,
 )
 from cathsim_dmc.tasks.observation_kind import Observation
@@ -299,25 +300,23 @@ class Rollout:
         """
         goal = self._objective.goal
         distance = straight(self._readings.head, goal)
-        outcome = self._objective.outcome(
+        failed = None
+        if errors.count(None) < len(errors):
+            failed = np.array([error is not None for error in errors])
+        outcome = judge(
+            self._objective,
             Measurement(
                 self._readings,
                 self._wall_force,
                 self._action,
                 self._previous_action,
                 distance,
-            )
+            ),
+            failed,
         )
-        success = outcome.success
-        terminated = success.copy() if ended is None else ended
-        if errors.count(None) < len(errors):
-            failed = np.array([error is not None for error in errors])
+        terminated = outcome.success.copy() if ended is None else ended
+        if failed is not None:
             terminated = terminated | failed
-            outcome = outcome._replace(
-                success=success & ~failed,
-                reward=np.where(failed, 0.0, outcome.reward),
-                terms={n: np.where(failed, 0.0, t) for n, t in outcome.terms.items()},
-            )
         return Step(
             observation=self._observe(goal, fresh),
             outcome=outcome,
