@@ -8,6 +8,7 @@ import math
 import os
 import re
 import shutil
+import sys
 import uuid
 import zipfile
 import zlib
@@ -206,8 +207,9 @@ def _read_array(archive: zipfile.ZipFile, entry: zipfile.ZipInfo) -> np.ndarray:
         if version not in formats:
             raise ValueError(f"{entry.filename} is of version {version} of npy")
         shape, _, dtype = formats[version](stream)
-    # Room is made before a byte is read.
-    if math.prod(shape) * dtype.itemsize > entry.file_size:
+    # Room is made before a byte is read; numpy takes True for an extent.
+    possible = all(type(n) is int and 0 <= n <= sys.maxsize for n in shape)
+    if not possible or math.prod(shape) * dtype.itemsize > entry.file_size:
         raise ValueError(f"{entry.filename} says that it is of shape {shape}")
     with archive.open(entry) as stream:
         return np.lib.format.read_array(stream, allow_pickle=False)

@@ -195,7 +195,7 @@ def test_arrays_from_outside_fill_no_memory_and_run_nothing(tmp_path):
     with pytest.raises(ValueError, match="unpack to"):
         files.read_arrays(archive(path, a=npy(np.zeros(10**6))), 10**6)
     assert path.stat().st_size < 20_000  # a bomb
-    for shape in ((2**45,), (2**40, 2**40), (-1,), (4,)):
+    for shape in ((2**45,), (2**40, 2**40), (-1,), (4,), (True,), (0, 10**20)):
         with pytest.raises(ValueError):
             files.read_arrays(archive(path, a=npy(np.zeros(3), shape=shape)), 10**6)
     with pytest.raises(ValueError, match="allow_pickle=False"):

@@ -134,6 +134,56 @@ def test_composer_reports_divergence(dumps, load):
     assert environment.task.error == physics_errors.DIVERGED
 
 
+def test_an_episode_is_dumped_once_and_a_folder_keeps_the_last_few(dumps, load):
+    environment = load()
+    for episode in range(physics_errors.KEPT_DUMPS + 2):
+        environment.reset()
+        before = set(dumps.iterdir())
+        for _ in range(3):
+            environment.physics.data.ptr.qvel[:] = 1e12
+            if environment.step(np.zeros(21)).last():
+                environment._reset_next_step = False  # composer steps on
+        (path,) = set(dumps.iterdir()) - before
+        os.utime(path, ns=(episode, episode))
+    ages = sorted(path.stat().st_mtime_ns for path in dumps.iterdir())
+    assert ages == list(range(2, physics_errors.KEPT_DUMPS + 2))
+
+
+def test_what_is_kept_of_a_simulation_is_bounded_and_its_own(task, monkeypatch, caplog):
+    """One that is never reset keeps nothing of the others."""
+    monkeypatch.setattr(physics_errors, "LONGEST_REPLAY", 10)
+    monitor = physics_errors.PhysicsMonitor(task.scene, 2, {})
+    drawn = Episode(displacement=np.zeros(3))
+    monitor.restart(0, task.scene, drawn)
+
+    def kept():
+        return [len(one.actions or b"") // 8 for one in monitor._watched]
+
+    for _ in range(10):
+        monitor.restart(1, task.scene, drawn)
+        for _ in range(4):
+            monitor.before_step(lambda: np.zeros((2, 1)), np.zeros((2, 1)))
+        assert kept()[0] <= 10 and kept()[1] == 4
+    assert kept() == [0, 4]
+    errors = monitor.errors([True, False], np.zeros((2, 1, 3)), np.zeros(2))
+    assert errors == [physics_errors.DIVERGED, None]
+    assert "more steps than a dump holds" in caplog.text
+
+
+def test_trainings_keep_dumps_in_their_folder(tmp_path, monkeypatch):
+    monkeypatch.delenv("CATHSIM_DUMP_DIR")
+    with physics_errors.dumps_in(tmp_path / "errors"):
+        path = physics_errors.dump(
+            "tried",
+            task={},
+            episode=Episode(displacement=np.zeros(3)),
+            state=np.zeros(3),
+            actions=np.zeros((2, 3)),
+        )
+    assert path.parent == tmp_path / "errors"
+    assert "CATHSIM_DUMP_DIR" not in os.environ
+
+
 def test_a_dump_may_be_read_by_whom_the_umask_says(dumps):
     before = os.umask(0o027)
     try:

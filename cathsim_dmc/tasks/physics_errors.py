@@ -1,12 +1,14 @@
 """Errors of physics: found, named and kept for replay, never clipped away."""
 
+import contextlib
+import dataclasses
 import io
 import json
 import logging
 import os
 import tempfile
 import uuid
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, cast
 
@@ -31,6 +33,12 @@ _ESCAPE_DEPTH = 2e-3
 _MOUTH = 2e-3
 # No contact of a device that is pushed with 5 N at most is harder than this, N.
 MAX_FORCE = 50.0
+
+# Control steps that a dump replays, five published episodes; 1.7 MB of actions.
+LONGEST_REPLAY = 10_000
+# Dumps that stay in a folder; a new one removes the oldest.
+KEPT_DUMPS = 8
+FOLDER_VARIABLE = "CATHSIM_DUMP_DIR"
 
 _FORMAT = 2
 _LARGEST = 2_000_000_000  # bytes of a dump, unpacked
@@ -64,6 +72,27 @@ def escaped(
     return outside.any(-1)
 
 
+@dataclasses.dataclass
+class _Watched:
+    """What replays the episode of one simulation.
+
+    Attributes:
+      scene: Scene whose lumen the device must not leave.
+      episode: What was drawn; None before the first episode.
+      state: (nstate,), MuJoCo's mjSTATE_INTEGRATION at the start of the episode; None
+        before its first control step.
+      steps: Control steps of the episode.
+      actions: Bytes of the actions so far, float64; None once they replay nothing,
+        since the episode is dumped or longer than `LONGEST_REPLAY`.
+    """
+
+    scene: Scene
+    episode: Episode | None = None
+    state: np.ndarray | None = None
+    steps: int = 0
+    actions: bytearray | None = dataclasses.field(default_factory=bytearray)
+
+
 class PhysicsMonitor:
     """Watches N simulations for errors of physics, and keeps what replays them."""
 
@@ -71,29 +100,16 @@ class PhysicsMonitor:
         """Starts with no episode running.
 
         Args:
-          scene: Scene whose lumen the devices must not leave, until an episode begins
-            in another one.
+          scene: Scene of all simulations until an episode begins in another one.
           num_simulations: N.
           task: JSON-able description of the task for the dumps.
         """
-        self._scenes = [scene] * num_simulations
+        self._watched = [_Watched(scene) for _ in range(num_simulations)]
         self._task = task
-        self._states: list[np.ndarray | None] = [None] * num_simulations
-        self._fresh = set(range(num_simulations))  # whose state is not kept yet
-        self._episodes: list[Episode | None] = [None] * num_simulations
-        # Actions (N, A) of all, and where in them the episode of each begins.
-        self._actions: list[np.ndarray] = []
-        self._first = [0] * num_simulations
 
     def restart(self, index: int, scene: Scene, episode: Episode) -> None:
         """Forgets the episode of a simulation; the next one is in a scene."""
-        self._scenes[index] = scene
-        self._episodes[index] = episode
-        self._fresh.add(index)
-        self._first[index] = len(self._actions)
-        if unused := min(self._first):
-            del self._actions[:unused]
-            self._first = [first - unused for first in self._first]
+        self._watched[index] = _Watched(scene, episode)
 
     def before_step(
         self, read_states: Callable[[], np.ndarray], actions: np.ndarray
@@ -103,14 +119,19 @@ class PhysicsMonitor:
         Args:
           read_states: Reads the states (N, nstate), mjSTATE_INTEGRATION; called only
             when an episode begins.
-          actions: (N, A), which nobody changes afterwards.
+          actions: (N, A) float64.
         """
-        if self._fresh:
-            states = read_states()
-            for index in self._fresh:
-                self._states[index] = states[index].copy()
-            self._fresh.clear()
-        self._actions.append(actions)
+        # Plain Python: numpy takes longer over the one simulation of an environment.
+        states, rows, size = None, actions.tobytes(), actions[0].nbytes
+        for index, watched in enumerate(self._watched):
+            if not watched.steps:
+                states = read_states() if states is None else states
+                watched.state = states[index].copy()
+            watched.steps += 1
+            if watched.steps > LONGEST_REPLAY:
+                watched.actions = None
+            if watched.actions is not None:
+                watched.actions += rows[index * size : (index + 1) * size]
 
     def errors(
         self,
@@ -120,6 +141,8 @@ class PhysicsMonitor:
     ) -> list[str | None]:
         """What went wrong in the control step that has just ended; logs and dumps it.
 
+        The first error of an episode is dumped; stepping on adds none.
+
         Args:
           diverged: (N,), MuJoCo warned.
           centreline: (N, n, 3), nodes of the devices, m.
@@ -128,19 +151,16 @@ class PhysicsMonitor:
         Returns:
           A reason for each simulation, None where nothing did.
         """
-        # Plain Python: numpy takes longer over the one simulation of an environment,
-        # and no longer over many.
-        taken = len(self._actions)
         looked = [
             index
-            for index, first in enumerate(self._first)
-            if not (taken - first) % ESCAPE_INTERVAL
+            for index, watched in enumerate(self._watched)
+            if not watched.steps % ESCAPE_INTERVAL
         ]
         wrong = [
             warned or not force <= MAX_FORCE
             for warned, force in zip(diverged, peak_force.tolist(), strict=True)
         ]
-        reasons: list[str | None] = [None] * len(self._first)
+        reasons: list[str | None] = [None] * len(self._watched)
         if not looked and not any(wrong):
             return reasons
         out = np.zeros(len(reasons), dtype=bool)
@@ -149,26 +169,33 @@ class PhysicsMonitor:
         for index in np.flatnonzero(wrong | out).tolist():
             reason = ESCAPED if out[index] and not wrong[index] else EXPLODED
             reasons[index] = reason = DIVERGED if diverged[index] else reason
-            try:
-                dump(
-                    reason,
-                    task={"anatomy": self._scenes[index].anatomy.name, **self._task},
-                    # Kept before the step that went wrong.
-                    episode=cast(Episode, self._episodes[index]),
-                    state=cast(np.ndarray, self._states[index]),
-                    actions=np.array(
-                        [one[index] for one in self._actions[self._first[index] :]]
-                    ),
-                )
-            except OSError as error:
-                # A full disk must not end the other simulations.
-                _LOG.error("%s; what would replay it is lost: %s", reason, error)
+            self._dump(reason, self._watched[index])
         return reasons
+
+    def _dump(self, reason: str, watched: _Watched):
+        """Dumps an episode once, if it is not too long to replay."""
+        if watched.actions is None:
+            if watched.steps > LONGEST_REPLAY:
+                _LOG.error("%s after more steps than a dump holds", reason)
+            return
+        actions, watched.actions = watched.actions, None
+        try:
+            dump(
+                reason,
+                task={"anatomy": watched.scene.anatomy.name, **self._task},
+                # Kept before the step that went wrong.
+                episode=cast(Episode, watched.episode),
+                state=cast(np.ndarray, watched.state),
+                actions=np.frombuffer(actions).reshape(watched.steps, -1),
+            )
+        except OSError as error:
+            # A full disk must not end the other simulations.
+            _LOG.error("%s; what would replay it is lost: %s", reason, error)
 
     def _escaped(self, looked: list[int], centreline: np.ndarray) -> np.ndarray:
         """Whether some simulations have left the lumen, each its own: (len,) bool."""
         out = np.zeros(len(looked), dtype=bool)
-        own = [self._scenes[index] for index in looked]
+        own = [self._watched[index].scene for index in looked]
         for scene in {id(scene): scene for scene in own}.values():
             rows = [row for row, other in enumerate(own) if other is scene]
             nodes = centreline[[looked[row] for row in rows]]
@@ -193,15 +220,15 @@ def dump(
       episode: What was drawn for it.
       state: (nstate,), MuJoCo's mjSTATE_INTEGRATION at the start of the episode.
       actions: (T, A) up to and with the one that failed.
-      directory: where to; `CATHSIM_DUMP_DIR` or the system's temporary directory by
-        default.
+      directory: folder for the last `KEPT_DUMPS` dumps; None for that which the
+        environment variable `CATHSIM_DUMP_DIR` names, or `cathsim-errors` in the
+        system's temporary folder.
 
     Returns:
       The .npz file.
     """
-    directory = Path(
-        directory or os.environ.get("CATHSIM_DUMP_DIR") or tempfile.gettempdir()
-    )
+    temporary = Path(tempfile.gettempdir(), "cathsim-errors")
+    directory = Path(directory or os.environ.get(FOLDER_VARIABLE) or temporary)
     directory.mkdir(parents=True, exist_ok=True)
     meta = json.dumps(
         {"format": _FORMAT, "reason": reason, "task": task, "drawn": episode.motion}
@@ -210,6 +237,11 @@ def dump(
     buffer = io.BytesIO()
     np.savez(buffer, meta=np.array(meta), state=state, actions=actions)
     files.write_bytes(path, buffer.getvalue())
+    others = [one for one in directory.glob("cathsim-error-*.npz") if one != path]
+    with contextlib.suppress(OSError):  # another process removes them too
+        others.sort(key=lambda one: one.stat().st_mtime_ns)
+        for oldest in others[: 1 - KEPT_DUMPS]:
+            oldest.unlink()
     _LOG.error(
         "%s after %d steps of %s; replay it with "
         "cathsim_dmc.tasks.physics_errors.load(%r)",
@@ -219,6 +251,22 @@ def dump(
         str(path),
     )
     return path
+
+
+@contextlib.contextmanager
+def dumps_in(directory: Path) -> Iterator[None]:
+    """Sends dumps to a folder, also from the processes that are started meanwhile.
+
+    A folder that `CATHSIM_DUMP_DIR` names already stays.
+    """
+    if os.environ.get(FOLDER_VARIABLE):
+        yield
+        return
+    os.environ[FOLDER_VARIABLE] = str(directory.absolute())
+    try:
+        yield
+    finally:
+        del os.environ[FOLDER_VARIABLE]
 
 
 def load(path: str | Path) -> tuple[dict[str, Any], np.ndarray, np.ndarray]:
