@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 import numbers
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, NoReturn
 
 import numpy as np
@@ -18,6 +18,8 @@ MOST_SEED = 2**32 - 1
 # Simulations, episodes: more are a slip of the finger, and fill the memory.
 MOST_SIMULATIONS = 100_000
 MOST_THREADS = 4096
+# Control steps of an episode: more than a year of 40 ms.
+MOST_STEPS = 1_000_000_000
 # Pixels along a side of an image; detectors of angiography have 1,024 to 2,480.
 MOST_PIXELS = 4096
 # Share of the way to the goal that the device may have made when an episode starts: it
@@ -81,6 +83,56 @@ def whole(
 def seed(name: str, value: Any) -> int:
     """A seed of numpy's RandomState."""
     return whole(name, value, 0, MOST_SEED)
+
+
+def seeds(name: str, value: Any, count: int) -> list[int | list[int]]:
+    """One seed for each of `count` simulations.
+
+    Args:
+        name: Name of the field.
+        value: Seed of the first simulation, from which the others count up, or one
+            seed for each. A seed is an integer, or a row of integers.
+        count: Number of simulations.
+    """
+    if _is_whole(value):
+        last = whole(name, value, 0, MOST_SEED - count + 1) + count
+        return list(range(last - count, last))
+    each = _row(value)
+    if each is None:
+        refuse(name, value, f"an integer, or {count} seeds")
+    if len(each) != count:
+        raise ValueError(
+            f"{len(each)} seeds for {count} simulations; give one each, or the first"
+        )
+    taken = []
+    for one in each:
+        words = [one] if _is_whole(one) else _row(one)
+        if not words:
+            refuse(name, value, f"an integer, or {count} of them")
+        words = [seed(f"an entry of {name}", word) for word in words]
+        taken.append(words[0] if _is_whole(one) else words)
+    return taken
+
+
+def indices(name: str, value: Any, count: int) -> np.ndarray:
+    """Numbers (K,) of some of `count` simulations, sorted, each once.
+
+    Args:
+        name: Name of the field.
+        value: Integers in one row, at least one; None chooses all.
+        count: Number of simulations.
+    """
+    if value is None:
+        return np.arange(count)
+    row = _row(value)
+    if not row or not all(_is_whole(one) and 0 <= one < count for one in row):
+        refuse(
+            name,
+            value,
+            f"None for all, or at least one integer from 0 to {count - 1} in a row; "
+            "np.flatnonzero(mask) makes one of a mask",
+        )
+    return np.unique(np.array(row, dtype=int))
 
 
 def random_state(name: str, value: Any) -> np.random.RandomState:
@@ -182,11 +234,20 @@ def pixels(name: str, value: Any) -> tuple[int, int]:
     return int(values[0]), int(values[1])
 
 
-def mapping(name: str, value: Any, known: Sequence[str]) -> Mapping[str, Any]:
+def mapping(name: str, value: Any, known: Iterable[str]) -> Mapping[str, Any]:
     """A mapping with some of the known names."""
     if not isinstance(value, Mapping) or set(value) - set(known):
         refuse(name, value, f"a mapping with some of {', '.join(known)}")
     return value
+
+
+def options(name: str, value: Any) -> dict[str, Any]:
+    """Options by name, as a dictionary of the caller's own; None has none."""
+    if value is None:
+        return {}
+    if not isinstance(value, Mapping) or not all(isinstance(key, str) for key in value):
+        refuse(name, value, "None, or a mapping of names to values")
+    return dict(value)
 
 
 def _row(value: Any) -> list[Any] | None:

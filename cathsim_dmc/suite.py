@@ -11,6 +11,7 @@ TorchRL's `DMControlEnv` know it too.
 
 import dataclasses
 import inspect
+import math
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
@@ -37,6 +38,12 @@ SUITE = containers.TaggedTasks()
 _TAGGED = {"BENCHMARKING": "benchmarking", "EASY": "easy", "HARD": "hard"}
 # Rewards are distances, not in [0, 1], and nothing is coloured by them.
 _TAG = "no_reward_visualization"
+# Arguments of `composer.Environment` beside those that the suite gives.
+_SETTINGS = {
+    name: parameter
+    for name, parameter in inspect.signature(composer.Environment).parameters.items()
+    if name not in ("task", "random_state")
+}
 _CONFIG_FIELDS = tuple(field.name for field in dataclasses.fields(NavigationConfig))
 
 
@@ -99,8 +106,8 @@ def register(name: str, definition: TaskDefinition, *tags: str) -> None:
     TASKS[name] = definition
 
     def factory(random=None, environment_kwargs=None, **options):
-        task = make_task(name, random=random, **options)
-        return environment(task, **(environment_kwargs or {}))
+        settings = _environment_settings(environment_kwargs)
+        return environment(make_task(name, random=random, **options), **settings)
 
     factory.__name__, factory.__doc__ = name, definition.description
     SUITE.add(*tags, _TAG)(factory)
@@ -227,8 +234,8 @@ def load(
     return dm_suite.load(
         domain_name,
         task_name,
-        dict(task_kwargs or {}),
-        dict(environment_kwargs) if environment_kwargs else None,
+        bounds.options("task_kwargs", task_kwargs),
+        bounds.options("environment_kwargs", environment_kwargs) or None,
         visualize_reward,
     )
 
@@ -242,6 +249,9 @@ def environment(task: Navigation, **environment_kwargs: Any) -> composer.Environ
     Args:
       task: Task that no other environment owns.
       **environment_kwargs: Arguments of `composer.Environment` that differ.
+
+    Raises:
+      ValueError: if there is no such argument, or its value is not allowed.
     """
     settings = {
         "strip_singleton_obs_buffer_dim": True,
@@ -250,9 +260,22 @@ def environment(task: Navigation, **environment_kwargs: Any) -> composer.Environ
         "legacy_step": False,
         # Divergence ends the episode with a reason; it is no failure of the policy.
         "raise_exception_on_physics_error": False,
-        **environment_kwargs,
+        **_environment_settings(environment_kwargs),
     }
     return Environment(task, random_state=task.random, **settings)
+
+
+def _environment_settings(given: Mapping[str, Any] | None) -> dict[str, Any]:
+    """Arguments of `composer.Environment`, checked."""
+    settings = bounds.options("environment_kwargs", given)
+    bounds.mapping("environment_kwargs", settings, _SETTINGS)
+    limit = settings.get("time_limit", math.inf)
+    if not (isinstance(limit, float) and limit == math.inf):
+        bounds.number("time_limit", limit, positive=True)
+    for name, value in settings.items():
+        if isinstance(_SETTINGS[name].default, bool):
+            bounds.switch(name, value)
+    return settings
 
 
 def _register_domain() -> None:

@@ -1,10 +1,13 @@
 """Bad input: each error says what was given and lists what is allowed."""
 
 import dataclasses
+import os
+import signal
 
 import numpy as np
 import pytest
 from conftest import TASKS
+from dm_control import suite as dm_suite
 from dm_control.composer.variation import distributions
 
 from cathsim_dmc import suite
@@ -119,7 +122,8 @@ def test_wrong_reward():
     ("options", "words"),
     [
         ({"goal_radius": 0.0}, ["goal_radius", "0.0", "above 0"]),
-        ({"max_steps": 0}, ["max_steps", "0", "at least 1"]),
+        ({"max_steps": 0}, ["max_steps", "0", "an integer from 1"]),
+        ({"max_steps": 10**400}, ["max_steps", "an integer from 1"]),
         ({"rotation": "False"}, ["rotation", "'False'", "True or False"]),
         ({"shaft_link": 1e9}, ["shaft_link", "1000000000.0", "0.002 to 0.1 m"]),
         ({"friction": "0.1"}, ["friction", "'0.1'", "number"]),
@@ -232,3 +236,81 @@ def test_batches_of_nothing_and_of_too_few_seeds(environment):
         BatchSimulation(environment.task, 0)
     with pytest.raises(ValueError, match="3 seeds for 2 simulations"):
         BatchSimulation(environment.task, 2, num_threads=1, seeds=[1, 2, 3])
+
+
+@pytest.fixture(scope="module")
+def three(shared_environment):
+    return BatchSimulation(shared_environment("type1_bca").task, 3, num_threads=1)
+
+
+def test_a_step_before_the_reset_is_refused(three):
+    action = np.zeros((3, 21))
+    with pytest.raises(RuntimeError, match=r"\[0, 1, 2\] have no episode.*reset\(\)"):
+        three.step(action)
+    three.reset(np.array([2, 0]))
+    with pytest.raises(RuntimeError, match=r"\[1\] have no episode"):
+        three.step(action)
+    three.reset([1])
+    three.step(action)
+
+
+@pytest.mark.parametrize(
+    "indices",
+    [-1, 1, 0.5, "1", {0}, [], [-1], [3], [0.0], [None], [[0, 1]], [True, False, True]]
+    + [np.array(1), np.eye(3, dtype=int), np.array([True, False, True])],
+)
+def test_indices_that_are_none_are_refused(three, indices):
+    with pytest.raises(ValueError, match=r"indices is .*from 0 to 2.*flatnonzero"):
+        three.reset(indices)
+
+
+@pytest.mark.parametrize(
+    "seeds",
+    [[None] * 3, [True] * 3, None, True, 0.5, "123", -1, 2**32 - 2, [0, 1, -1]]
+    + [[0, 1, [2**32]], [[], 1, 2], {0, 1, 2}, [[0, [1]], 1, 2], np.zeros(3)],
+)
+def test_seeds_that_are_none_are_refused(three, seeds):
+    with pytest.raises(ValueError, match=r"seeds is .*must be"):
+        three.seed(seeds)
+    last = 2**32 - 1
+    for good in (0, np.int64(last - 2), range(3), np.arange(3), [[1, 2], 0, last]):
+        three.seed(good)
+
+
+NO_MAPPINGS = [0, 1, False, "", "random", [], ["random"], [("random", 0)], {1: 0}]
+
+
+@pytest.mark.parametrize("value", NO_MAPPINGS)
+def test_options_that_are_no_mapping_are_refused(value):
+    for name in ("task_kwargs", "environment_kwargs"):
+        with pytest.raises(ValueError, match=f"{name} is .*None, or a mapping"):
+            suite.load("cathsim", "type1_bca", **{name: value})
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [("time_limit", value) for value in (np.nan, -1, 0, None, "1", -np.inf)]
+    + [("legacy_step", 1), ("task", None), ("time_limits", 1.0)],
+)
+def test_settings_of_an_environment_are_checked_before_the_work(name, value):
+    for load in (suite.load, dm_suite.load):
+        with pytest.raises(ValueError, match=name):
+            load("cathsim", "type1_bca", environment_kwargs={name: value})
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="there is no fork")
+def test_a_fork_of_a_batch_is_refused_and_ends(three):
+    """A fork that waits for the threads of the batch never ends."""
+    three.reset()
+    three.step(np.zeros((3, 21)))
+    child = os.fork()
+    if not child:
+        signal.alarm(20)  # ends the fork, not the test, where it waits
+        status = 1
+        try:
+            three.step(np.zeros((3, 21)))
+        except RuntimeError as error:
+            status = 0 if "spawn" in str(error) else 2
+        finally:
+            os._exit(status)
+    assert os.waitpid(child, 0)[1] == 0

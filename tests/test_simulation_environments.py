@@ -29,6 +29,13 @@ def test_both_paths_give_the_same_episodes():
 
 
 @pytest.mark.parametrize("backend", ["batched", "composer"])
+def test_task_kwargs_that_are_no_mapping_are_refused(backend):
+    for value in (0, "", ["random"], {1: 0}):
+        with pytest.raises(ValueError, match="task_kwargs is .*None, or a mapping"):
+            make_env(TASK, backend=backend, task_kwargs=value)
+
+
+@pytest.mark.parametrize("backend", ["batched", "composer"])
 def test_a_task_satisfies_torchrl_and_gives_what_was_asked(backend):
     env = make_env(
         TASK,

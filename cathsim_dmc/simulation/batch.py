@@ -5,6 +5,9 @@ same compiled model, the same `mj_step`, the same `Rollout`.
 """
 
 import copy
+import ctypes
+import os
+import weakref
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 
@@ -35,6 +38,19 @@ _HOOKS = (
     "get_discount",
     "should_terminate_episode",
 )
+
+
+_ALIVE: weakref.WeakSet["BatchSimulation"] = weakref.WeakSet()
+
+
+def _keep_in_fork():
+    """Keeps batches for ever in a fork: freeing one waits for its threads."""
+    for simulation in _ALIVE:
+        ctypes.pythonapi.Py_IncRef(ctypes.py_object(simulation.batch))
+
+
+if hasattr(os, "register_at_fork"):  # not on Windows, which has no fork
+    os.register_at_fork(after_in_child=_keep_in_fork)
 
 
 class BatchSimulation:
@@ -85,37 +101,43 @@ class BatchSimulation:
             self._model, self._batch, self._models, num_simulations
         )
         self.seed(seeds)
+        self._begun = np.zeros(num_simulations, dtype=bool)
+        self._process = os.getpid()
+        _ALIVE.add(self)
 
     def seed(self, seeds: Sequence[int | Sequence[int]] | int) -> None:
-        """Gives each simulation its own source of randomness."""
-        if not isinstance(seeds, Sequence | np.ndarray):
-            bounds.seed("seed", seeds)
-            bounds.seed("seed of the last simulation", seeds + self.num_simulations - 1)
-            seeds = [int(seeds) + index for index in range(self.num_simulations)]
-        if len(seeds) != self.num_simulations:
-            raise ValueError(
-                f"{len(seeds)} seeds for {self.num_simulations} simulations; give one "
-                "each, or the first"
-            )
+        """Gives each simulation its own source of randomness.
+
+        Args:
+          seeds: Seeds of the simulations, or of the first, the others counting up.
+
+        Raises:
+          ValueError: if a seed is none that `numpy.random.RandomState` takes.
+        """
+        seeds = bounds.seeds("seeds", seeds, self.num_simulations)
         self._random_states = [np.random.RandomState(seed) for seed in seeds]
 
     def reset(self, indices: np.ndarray | None = None) -> Step:
         """Starts new episodes.
 
         Args:
-          indices: Numbers of the simulations to reset, all if None.
+          indices: (K,) numbers of the simulations to reset, K > 0; None for all.
 
         Returns:
           All simulations as they stand.
+
+        Raises:
+          ValueError: if the indices are no such numbers.
+          RuntimeError: if the process has forked.
         """
-        everyone = np.arange(self.num_simulations)
-        indices = everyone if indices is None else np.unique(indices)
-        if len(indices):
-            # Without a pass at the default pose, whose solution would warm-start ours.
-            self._batch.reset(indices, stage=mujoco.mjtStage.mjSTAGE_NONE.value)
-            self._rollout.begin(indices, self._random_states)
-            self._forward_unactuated(indices)
-            self._rows[indices] = self._batch.sensordata[indices, None]
+        self._refuse_fork()
+        indices = bounds.indices("indices", indices, self.num_simulations)
+        self._begun[indices] = True
+        # Without a pass at the default pose, whose solution would warm-start ours.
+        self._batch.reset(indices, stage=mujoco.mjtStage.mjSTAGE_NONE.value)
+        self._rollout.begin(indices, self._random_states)
+        self._forward_unactuated(indices)
+        self._rows[indices] = self._batch.sensordata[indices, None]
         return _own(self._rollout.start(indices, self._magnitudes()))
 
     def _forward_unactuated(self, indices: np.ndarray):
@@ -130,8 +152,17 @@ class BatchSimulation:
           action: (N, A) in [-1, 1]; what lies outside is clipped.
 
         Raises:
-          ValueError: if the action has the wrong shape or is not finite.
+          ValueError: if the action has the wrong shape or is not finite, or the
+            objective's outcome is none.
+          RuntimeError: if a simulation has not been reset, or the process has forked.
         """
+        self._refuse_fork()
+        if not self._begun.all():
+            waiting = np.flatnonzero(~self._begun).tolist()
+            raise RuntimeError(
+                f"simulations {bounds.shown(waiting)} have no episode; call reset() "
+                "before step()"
+            )
         batch = self._batch
         action = check_action(action, (batch.nsim, self.num_actions))
         batch.ctrl[:] = self._rollout.command(action, lambda: batch.state)
@@ -146,6 +177,13 @@ class BatchSimulation:
             self._refine(np.flatnonzero(coarse), before)
             warned, magnitudes = self._warned(warnings), self._magnitudes()
         return _own(self._rollout.finish(magnitudes, warned))
+
+    def _refuse_fork(self):
+        if os.getpid() != self._process:
+            raise RuntimeError(
+                "the process has forked, and a fork has no threads of the batch; make "
+                "the batch after the fork, or start processes by spawn"
+            )
 
     def _refine(self, indices: np.ndarray, before: np.ndarray) -> None:
         """Does the control step of some simulations again, with shorter steps.

@@ -18,6 +18,7 @@ from torchrl.envs import (
     TransformedEnv,
 )
 
+from cathsim_dmc import bounds
 from cathsim_dmc.simulation.composer import composer_env
 
 # All numeric entries of an observation, concatenated in the order of their names.
@@ -57,7 +58,7 @@ def make_env(
     Raises:
         ValueError: the backend, the task or one of its options is unknown.
     """
-    kwargs = dict(task_kwargs or {})
+    kwargs = bounds.options("task_kwargs", task_kwargs)
     if backend == "batched":
         # Imported late: importing this module must not load MuJoCo.
         from cathsim_dmc.simulation.torchrl import BatchedEnv

@@ -9,7 +9,7 @@ from tensordict import TensorDict
 from torchrl.data import Binary, Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase
 
-from cathsim_dmc import suite
+from cathsim_dmc import bounds, suite
 from cathsim_dmc.simulation.batch import BatchSimulation
 from cathsim_dmc.tasks.step import Step
 
@@ -42,9 +42,9 @@ class BatchedEnv(EnvBase):
           observation: Name or names of observations.
           task_kwargs: Further options of the task.
         """
-        options = {**(task_kwargs or {}), "observation": observation}
+        options = bounds.options("task_kwargs", task_kwargs)
         self._simulation = BatchSimulation(
-            suite.make_task(task_name, **options),
+            suite.make_task(task_name, **{**options, "observation": observation}),
             num_envs,
             num_threads=num_threads or 0,
             seeds=seed,

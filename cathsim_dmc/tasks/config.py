@@ -134,7 +134,7 @@ class NavigationConfig:
         bounds.number("lead", self.lead, 0.0, _LONGEST_LEAD, "m")
         bounds.number("lumen_friction", self.lumen_friction, 0.0, MOST_FRICTION)
         bounds.switch("rotation", self.rotation)
-        bounds.whole("max_steps", self.max_steps, 1)
+        bounds.whole("max_steps", self.max_steps, 1, bounds.MOST_STEPS)
         shares = self.start_along_route
         if shares is not None and not (
             isinstance(shares, Sequence)
