@@ -66,7 +66,7 @@ def atomic_path(
     remove_abandoned(path.parent, path.name)
     temporary, stream = _create(path)
     try:
-        with stream:
+        with stream, naming(path):
             yield temporary
             if not temporary.is_file() or not temporary.stat().st_size:
                 raise RuntimeError(f"nothing was written for {path}")
@@ -108,6 +108,17 @@ def atomic_directory(path: str | os.PathLike[str]) -> Iterator[Path]:
         shutil.rmtree(temporary, ignore_errors=True)
         lock.unlink(missing_ok=True)
         stream.close()
+
+
+@contextlib.contextmanager
+def naming(path: str | os.PathLike[str]) -> Iterator[None]:
+    """Name the file in an OSError of the block that names none, as on a full disk."""
+    try:
+        yield
+    except OSError as error:
+        if error.filename is None and error.errno is not None:
+            error.filename = str(path)
+        raise
 
 
 def write_bytes(path: str | os.PathLike[str], data: bytes) -> Path:

@@ -112,9 +112,12 @@ class Checkpoint:
         """Weights and statistics of the policy, on the CPU.
 
         Raises:
-            CheckpointError: the file is missing or is not what was written.
+            CheckpointError: the file is missing, is not what was written, or holds
+                weights of another network.
         """
-        return self._load(_POLICY)
+        state = self._load(_POLICY)
+        require_fit(self.path / _POLICY, state, self.shapes, self.config)
+        return state
 
     def learning_state(self) -> dict[str, Any]:
         """Everything else that continuing the run needs.
@@ -131,14 +134,8 @@ class Checkpoint:
             CheckpointError: the weights are damaged or of another network.
         """
         state = self.policy_state()
-        try:
-            policy = make_policy(self.shapes, self.config)
-            policy.load_state_dict(state)
-        except (RuntimeError, TypeError, AttributeError) as error:
-            raise CheckpointError(
-                f"{self.path / _POLICY} does not fit the network that "
-                f"{_DESCRIPTION} describes: {_line(error)}"
-            ) from error
+        policy = make_policy(self.shapes, self.config)
+        policy.load_state_dict(state)
         return policy.eval().requires_grad_(False)
 
     def _load(self, name: str) -> dict[str, Any]:
@@ -164,6 +161,50 @@ class Checkpoint:
                 "weights and numbers."
             )
         return state
+
+
+def require_fit(
+    path: Path,
+    state: Mapping[str, Any],
+    shapes: NetworkShapes,
+    config: TrainingConfig,
+) -> None:
+    """Check weights before a network of the size described is built.
+
+    Args:
+        path: Path of the file, for the message.
+        state: Weights and statistics of a policy by name.
+        shapes: Sizes of its observation and action.
+        config: Settings of its network.
+
+    Raises:
+        CheckpointError: they are of another network, or not finite.
+    """
+    try:
+        # Takes no memory for the weights.
+        with torch.device("meta"):
+            network = make_policy(shapes, config).state_dict()
+        expected = {name: (one.shape, one.dtype) for name, one in network.items()}
+        given = {name: (one.shape, one.dtype) for name, one in state.items()}
+    except (RuntimeError, TypeError, AttributeError, ValueError) as error:
+        raise CheckpointError(
+            f"{path} does not fit the network described beside it: {_line(error)}"
+        ) from error
+    wrong = sorted(
+        name for name in {*expected, *given} if expected.get(name) != given.get(name)
+    )
+    if wrong:
+        raise CheckpointError(
+            f"{path} does not fit the network described beside it: {wrong[0]} is "
+            f"{given.get(wrong[0])}, the network has {expected.get(wrong[0])}; "
+            f"{len(wrong)} entries differ."
+        )
+    broken = [name for name, one in state.items() if not one.isfinite().all()]
+    if broken:
+        raise CheckpointError(
+            f"{path} holds weights that are not finite ({', '.join(broken[:3])}): "
+            "use an older checkpoint, or train anew."
+        )
 
 
 def _read_description(path: Path) -> dict[str, Any]:

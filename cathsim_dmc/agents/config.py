@@ -59,8 +59,9 @@ class TrainingConfig:
             from which the first observation statistics come; they are not counted as
             frames. An algorithm that begins with random actions anyway (SAC) needs
             none, nor does one that starts from another policy.
-        initial_policy: Directory of the run or checkpoint whose policy the networks
-            start from, with its observation statistics; None starts afresh.
+        initial_policy: Directory of the run or checkpoint, or "pretrained:NAME", whose
+            policy the networks start from, with its observation statistics; None
+            starts afresh.
         initial_std: Deviation before the tanh that every action of such a policy
             starts with; None keeps the policy's own.
         checkpoint_frames: Number of frames between two checkpoints.

@@ -136,10 +136,13 @@ class DAgger:
         self.device = torch.device(config.torch_device)
         self.clone = Clone(config, shapes)
         self.policy: TensorDictModuleBase = self.clone.policy
-        self.replay = ReplayMemory(
-            directory / "replay", config.replay_frames, config.replay_bytes
-        )
         self._keys = [*shapes.raw_keys, EXPERT_ACTION]
+        self.replay = ReplayMemory(
+            directory / "replay",
+            self._keys,
+            config.replay_frames,
+            config.replay_bytes,
+        )
         self.rounds = 0
 
     @staticmethod
@@ -201,6 +204,7 @@ class DAgger:
     def load(self, policy: dict[str, Any], learning: dict[str, Any]) -> None:
         """Restore what policy_state and learning_state gave."""
         self.clone.load(policy, learning["clone"])
-        self.replay.load(learning["replay"])
+        if "replay" in learning:
+            self.replay.load(learning["replay"])
         self.rounds = learning["rounds"]
         self._set_share()

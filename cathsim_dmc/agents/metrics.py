@@ -2,7 +2,6 @@
 
 import csv
 import io
-import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -34,18 +33,13 @@ class MetricsFile:
         files.write_text(self.path, text.getvalue())
 
     def append(self, values: Mapping[str, float | int | None]) -> None:
-        """Write one row in a single system call; None leaves a field empty."""
+        """Write one row; None leaves a field empty."""
         unknown = set(values) - set(self.columns)
         if unknown:
             raise MetricsError(f"metrics without a column: {sorted(unknown)}.")
         cells = [_cell(values.get(name)) for name in self.columns]
-        text = io.StringIO()
-        csv.writer(text, lineterminator="\n").writerow(cells)
-        descriptor = os.open(self.path, os.O_WRONLY | os.O_APPEND)
-        try:
-            os.write(descriptor, text.getvalue().encode())
-        finally:
-            os.close(descriptor)
+        with files.naming(self.path), open(self.path, "a", newline="") as file:
+            csv.writer(file, lineterminator="\n").writerow(cells)
 
     def _rows_until(self, frames: int) -> list[list[str]]:
         if not self.path.exists():

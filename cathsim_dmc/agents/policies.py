@@ -9,7 +9,10 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
+from cathsim_dmc.agents import learners
 from cathsim_dmc.agents.checkpoint import Checkpoint
+from cathsim_dmc.agents.config import TrainingConfig
+from cathsim_dmc.agents.networks import NetworkShapes
 from cathsim_dmc.policies import POLICIES, Policy, make_policy
 from cathsim_dmc.simulation import environments
 
@@ -49,8 +52,41 @@ class FunctionPolicy(Policy):
         return action.to(torch.float32).numpy()
 
 
-class TrainedPolicy(FunctionPolicy):
-    """The policy of a checkpoint, with frozen observation statistics."""
+class NetworkPolicy(FunctionPolicy):
+    """A trained policy, with frozen observation statistics.
+
+    Attributes:
+        network: Raw observation in, action out.
+        config: Settings of its training.
+        shapes: Sizes of its observation and action.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        state: Mapping[str, Any],
+        shapes: NetworkShapes,
+        config: TrainingConfig,
+    ):
+        """Builds the network.
+
+        Args:
+            name: Name for reports.
+            state: Weights and statistics, as `checkpoint.require_fit` allows them.
+            shapes: Sizes of observation and action.
+            config: Settings of the training.
+        """
+        network = learners.make_policy(shapes, config)
+        network.load_state_dict(dict(state))
+        super().__init__(network.eval().requires_grad_(False), name)
+        self.network, self.config, self.shapes = network, config, shapes
+        self.task = config.task
+        self.observation = config.observation
+        self.task_kwargs = config.task_kwargs
+
+
+class TrainedPolicy(NetworkPolicy):
+    """The policy of a checkpoint."""
 
     def __init__(self, checkpoint: Checkpoint):
         """Loads the weights.
@@ -63,11 +99,8 @@ class TrainedPolicy(FunctionPolicy):
         """
         config = checkpoint.config
         name = f"{config.algorithm} {checkpoint.path.name}"
-        super().__init__(checkpoint.policy(), name)
+        super().__init__(name, checkpoint.policy_state(), checkpoint.shapes, config)
         self.checkpoint = checkpoint
-        self.task = config.task
-        self.observation = config.observation
-        self.task_kwargs = config.task_kwargs
 
 
 def load_policy(policy: PolicyLike, seed: int = 0) -> Policy:

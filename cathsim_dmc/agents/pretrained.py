@@ -10,11 +10,11 @@ from typing import Any
 import torch
 
 from cathsim_dmc import files
-from cathsim_dmc.agents.checkpoint import CheckpointError
+from cathsim_dmc.agents.checkpoint import CheckpointError, require_fit
 from cathsim_dmc.agents.config import ConfigError
-from cathsim_dmc.agents.learners import config_from_dict, make_policy
+from cathsim_dmc.agents.learners import config_from_dict
 from cathsim_dmc.agents.networks import NetworkShapes
-from cathsim_dmc.agents.policies import FunctionPolicy
+from cathsim_dmc.agents.policies import NetworkPolicy
 
 FORMAT = 1
 PREFIX = "pretrained:"
@@ -34,7 +34,7 @@ _PARTS: Mapping[str, type] = {
 }
 
 
-class PretrainedPolicy(FunctionPolicy):
+class PretrainedPolicy(NetworkPolicy):
     """A trained policy from a file, acting deterministically.
 
     Attributes:
@@ -66,17 +66,16 @@ class PretrainedPolicy(FunctionPolicy):
             )
         try:
             config = config_from_dict(self.card["config"])
-            policy = make_policy(NetworkShapes.from_dict(self.card["shapes"]), config)
-            policy.load_state_dict(load(data))
-        except (ConfigError, SafetensorError, RuntimeError, ValueError) as error:
+            shapes = NetworkShapes.from_dict(self.card["shapes"])
+            state = load(data)
+        except (ConfigError, SafetensorError, ValueError) as error:
             line = " ".join(str(error).split())[:200]
             raise CheckpointError(
                 f"{weights} does not fit the network of its card: {line}"
             ) from error
-        name = f"{PREFIX}{self.card['name']}"
-        super().__init__(policy.eval().requires_grad_(False), name)
+        require_fit(weights, state, shapes, config)
+        super().__init__(f"{PREFIX}{self.card['name']}", state, shapes, config)
         self.task = self.card["task"]
-        self.observation = config.observation
         self.task_kwargs = self.card["task_kwargs"]
 
 

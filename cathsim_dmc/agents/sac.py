@@ -170,15 +170,18 @@ class SAC:
             lr=config.learning_rate,
             fused=True,
         )
-        self.replay = ReplayMemory(
-            directory / "replay", config.replay_frames, config.replay_bytes
-        )
         keys = [*shapes.raw_keys, "reward", "done", "terminated"]
         self.replay_keys = [
             *shapes.raw_keys,
             "action",
             *[("next", key) for key in keys],
         ]
+        self.replay = ReplayMemory(
+            directory / "replay",
+            self.replay_keys,
+            config.replay_frames,
+            config.replay_bytes,
+        )
         self.demonstrations: TensorDictBase | None = None
         if config.demonstrations is not None:
             shown = load_transitions(
@@ -283,6 +286,7 @@ class SAC:
             state[name] = value
         self.loss.load_state_dict(state)
         self.optimiser.load_state_dict(learning["optimiser"])
-        self.replay.load(learning["replay"])
+        if "replay" in learning:
+            self.replay.load(learning["replay"])
         self.gradient_steps = learning["gradient_steps"]
         self.owed_steps = learning["owed_steps"]

@@ -3,6 +3,7 @@
 import contextlib
 import json
 import math
+import os
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -11,6 +12,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from filelock import FileLock, Timeout
 from tensordict import TensorDictBase
 from torchrl.envs import EnvBase
 
@@ -35,6 +37,7 @@ from cathsim_dmc.agents.warm_start import take_over
 from cathsim_dmc.simulation import environments
 
 CONFIG_FILE = "config.json"
+_LOCK_FILE = ".lock"
 
 
 @dataclass(frozen=True)
@@ -64,6 +67,7 @@ def train(
     resume: bool = False,
     progress: bool = True,
     make_env: EnvFactory = environments.make_env,
+    without_replay: bool = False,
 ) -> TrainingResult:
     """Train an agent, or continue a run from its newest checkpoint.
 
@@ -71,7 +75,8 @@ def train(
     also replay/); errors/ holds dumps of the last physics errors. SIGINT or SIGTERM
     end the run after the current batch with a checkpoint. After kill -9, `resume=True`
     continues from the newest complete checkpoint: frames are counted from there, rows
-    of metrics.csv beyond it are dropped, episodes that were running start anew.
+    of metrics.csv beyond it are dropped, episodes that were running start anew. One
+    process at a time trains in a directory.
 
     Args:
         config: Settings: what to train, and how.
@@ -80,13 +85,15 @@ def train(
             first checkpoint starts anew.
         progress: Whether to show progress on standard error.
         make_env: Function that makes the environment, as `environments.make_env`.
+        without_replay: Whether a run that is resumed starts with an empty replay
+            (SAC), as when its files are lost.
 
     Raises:
         ConfigError: the directory holds a run that was not to be resumed, or one with
-            other settings, or none that could be resumed; or the torch device cannot
-            be used.
+            other settings, or none that could be resumed; another process trains in
+            it; or the torch device cannot be used.
         CheckpointError: the checkpoint to continue from is damaged.
-        ReplayError: so are the files of its replay.
+        ReplayError: the files of its replay are missing or damaged.
         FloatingPointError: a loss is not finite; the last checkpoint stays.
         OSError: the disk is full, or the directory cannot be written to.
     """
@@ -96,8 +103,10 @@ def train(
     _require_device(config.torch_device)
     check_collector(config)
     recorder = CheckpointRecorder(run, config) if config.rerun else None
-    checkpoint = _prepare(run, config, resume)
     with contextlib.ExitStack() as stack:
+        stack.enter_context(_only_process(run))
+        stack.enter_context(_naming_what_is_safe(run))
+        checkpoint = _prepare(run, config, resume)
         if recorder is not None:
             stack.enter_context(recorder)
         stack.enter_context(_torch_threads(config.torch_threads))
@@ -106,10 +115,12 @@ def train(
         torch.manual_seed(config.seed)
         learner = make_learner(config, NetworkShapes.of(env), run)
         learner.attach(env)
-        state = _start(learner, env, config, checkpoint)
+        state = _start(learner, env, config, checkpoint, without_replay)
         make_source = COLLECTORS[config.collector]
         source = make_source(config, learner, env, make_env, state["frames"])
         stack.callback(source.shutdown)
+        text = json.dumps(config.to_dict(), indent=2) + "\n"
+        files.write_text(run / CONFIG_FILE, text)
         # After everything that draws numbers while being made.
         if checkpoint:
             torch.set_rng_state(state.pop("rng"))
@@ -143,6 +154,52 @@ def _require_device(name: str) -> None:
         ) from error
 
 
+@contextlib.contextmanager
+def _only_process(run: Path) -> Iterator[None]:
+    """Make the directory of a run and lock it against other processes.
+
+    The operating system releases the lock of a process that is killed.
+    """
+    run.mkdir(parents=True, exist_ok=True)
+    lock = FileLock(run / _LOCK_FILE)
+    try:
+        lock.acquire(blocking=False)
+    except Timeout as error:
+        raise ConfigError(
+            f"another process trains in {run}: wait for its end, or choose another "
+            "directory."
+        ) from error
+    try:
+        yield
+    finally:
+        # Where no run was begun, as little as possible stays.
+        if not (run / CONFIG_FILE).exists():
+            with contextlib.suppress(OSError):
+                os.unlink(lock.lock_file)
+                run.rmdir()
+        lock.release()
+
+
+@contextlib.contextmanager
+def _naming_what_is_safe(run: Path) -> Iterator[None]:
+    """Say of a file that cannot be written what is saved and how to go on."""
+    try:
+        yield
+    except OSError as error:
+        if error.filename is None or error.errno is None:
+            raise
+        saved = checkpoints_in(run)
+        safe = (
+            f"the first {int(saved[-1].name):,} frames are safe in {saved[-1]}; mend "
+            "it and go on with resume=True (--resume)"
+            if saved
+            else "no checkpoint has been saved; mend it and start again"
+        )
+        raise type(error)(
+            error.errno, f"{error.filename}: {error.strerror}; {safe}"
+        ) from error
+
+
 def _prepare(run: Path, config: TrainingConfig, resume: bool) -> Checkpoint | None:
     """Check the directory against the request; return where to continue from."""
     existing = checkpoints_in(run)
@@ -168,8 +225,8 @@ def _prepare(run: Path, config: TrainingConfig, resume: bool) -> Checkpoint | No
                 f"the run's own, or start a new run in another directory. These may "
                 f"change: {sorted(config.resumable)}."
             )
-    run.mkdir(parents=True, exist_ok=True)
-    files.write_text(run / CONFIG_FILE, json.dumps(config.to_dict(), indent=2) + "\n")
+        # Before networks of the size that it describes are built.
+        checkpoint.policy_state()
     return checkpoint
 
 
@@ -195,6 +252,7 @@ def _start(
     env: EnvBase,
     config: TrainingConfig,
     checkpoint: Checkpoint | None,
+    without_replay: bool,
 ) -> dict[str, Any]:
     """Give a learner what a checkpoint holds, another's policy, or its first look.
 
@@ -211,6 +269,8 @@ def _start(
         return {"frames": 0, "seconds": 0.0, "episodes": 0, "window": []}
     policy, state = checkpoint.policy_state(), checkpoint.learning_state()
     try:
+        if without_replay:
+            state["learner"].pop("replay", None)
         learner.load(policy, state["learner"])
         # Tried here: a later error would name no file.
         rng = torch.Generator().set_state(state["rng"]).get_state()

@@ -3,10 +3,10 @@
 import torch
 from torch import nn
 
-from cathsim_dmc.agents.checkpoint import Checkpoint
 from cathsim_dmc.agents.config import ConfigError, TrainingConfig
 from cathsim_dmc.agents.imitation import network_of, statistics_of
 from cathsim_dmc.agents.networks import LOG_STD_RANGE, NetworkShapes
+from cathsim_dmc.agents.policies import NetworkPolicy, load_policy
 
 # What must agree for the weights to mean the same.
 _ALIKE = (
@@ -35,7 +35,12 @@ def take_over(policy: nn.Module, config: TrainingConfig, shapes: NetworkShapes) 
         ConfigError: the other policy has another network or observation.
         CheckpointError: there is none, or it is damaged.
     """
-    source = Checkpoint.open(str(config.initial_policy))
+    source = load_policy(str(config.initial_policy))
+    if not isinstance(source, NetworkPolicy):
+        raise ConfigError(
+            f"initial_policy={config.initial_policy!r} has no network: give the "
+            'directory of a run or of a checkpoint, or "pretrained:NAME".'
+        )
     differing = [
         f"{name}: it has {getattr(source.config, name)!r}, given is "
         f"{getattr(config, name)!r}"
@@ -49,7 +54,7 @@ def take_over(policy: nn.Module, config: TrainingConfig, shapes: NetworkShapes) 
             f"initial_policy={config.initial_policy!r} does not fit "
             f"({'; '.join(differing)}); give the same settings, or another policy."
         )
-    given = source.policy()
+    given = source.network
     theirs, ours = network_of(given), network_of(policy)
     ours.body.load_state_dict(theirs.body.state_dict())
     ours.mean.load_state_dict(theirs.mean.state_dict())

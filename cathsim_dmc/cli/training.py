@@ -125,6 +125,15 @@ def _options(base: Any, resumed: bool) -> type:
             field(default=False),
         ),
         (
+            "without_replay",
+            _explained(
+                bool,
+                "Whether a run that is resumed starts with an empty replay (SAC), as "
+                "when its files are lost.",
+            ),
+            field(default=False),
+        ),
+        (
             "quiet",
             _explained(bool, "Whether to show no progress."),
             field(default=False),
@@ -170,9 +179,12 @@ def _run(options: Any, base: Any) -> int:
             **options.anatomy.task_kwargs,
         },
     )
-    _check_task(config)
     result = agents.train(
-        config, options.out, resume=options.resume, progress=not options.quiet
+        config,
+        options.out,
+        resume=options.resume,
+        progress=not options.quiet,
+        without_replay=options.without_replay,
     )
     if result.interrupted:
         again = ["cathsim", "train", config.task, "--out", str(options.out), "--resume"]
@@ -184,11 +196,3 @@ def _run(options: Any, base: Any) -> int:
         return INTERRUPTED
     print(f"{result.frames} frames in {result.seconds:.0f} s: {result.checkpoint}")
     return 0
-
-
-def _check_task(config: Any) -> None:
-    """Load the task once, so that bad input fails before a run is set up."""
-    from cathsim_dmc import suite
-
-    kwargs = {**config.training_kwargs, "observation": config.observation}
-    suite.load(suite.DOMAIN, config.task, task_kwargs=kwargs).close()
