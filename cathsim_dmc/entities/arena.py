@@ -16,14 +16,14 @@ class AngiographyArena(composer.Arena):
         """Sets the physics.
 
         Args:
-          device_density: mean density of the device, kg/m³. It floats in blood, so
-            only the rest of its weight pulls.
-          name: of the arena.
+            device_density: mean density of the device, kg/m³; gravity is reduced by
+                its buoyancy in blood.
+            name: name of the arena.
         """
         super()._build(name=name)
         root = self._mjcf_root
-        # composer.Arena's own file raises small masses and inertias and asks for
-        # no-slip iterations; a catheter's links are lighter than its bounds.
+        # composer.Arena bounds masses and inertias from below and sets no-slip
+        # iterations; a catheter's links are lighter than these bounds.
         root.compiler.boundmass = 0
         root.compiler.boundinertia = 0
         root.option.noslip_iterations = 0
@@ -65,11 +65,11 @@ class AngiographyArena(composer.Arena):
         """Adds a camera that looks at a point.
 
         Args:
-          name: of the camera.
-          target: point (3,) that the optical axis meets, m.
-          distance: from the point, m.
-          xyaxes: right and up directions (6,) of the image.
-          fovy: vertical field of view, degrees.
+            name: name of the camera.
+            target: point (3,) on the optical axis, m.
+            distance: distance from the point, m.
+            xyaxes: right and up directions (6,) of the image.
+            fovy: vertical field of view, degrees.
         """
         right, up = xyaxes[:3], xyaxes[3:]
         backward = (

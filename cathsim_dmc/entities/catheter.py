@@ -14,7 +14,7 @@ STEERING_LAG = 0.05
 
 
 class Catheter(Chain):
-    """One device: its base is pushed, perhaps turned, and its tip perhaps steered."""
+    """One device: pushed at its base, optionally rotated and steered at its tip."""
 
     def _build(
         self,
@@ -29,12 +29,12 @@ class Catheter(Chain):
         """Builds the chain.
 
         Args:
-          device: what it is made of, or its name in `devices.DEVICES`.
-          discretisation: how it is divided into links.
-          stroke: longest insertion, m.
-          rotation: whether the base can be rotated.
-          friction: Coulomb coefficient; MuJoCo takes the larger of the two bodies'.
-          name: of the entity.
+            device: a device, or its name in `devices.DEVICES`.
+            discretisation: division into links.
+            stroke: longest insertion, m.
+            rotation: whether the base has a rotation joint.
+            friction: Coulomb coefficient; MuJoCo takes the larger of the two geoms'.
+            name: name of the entity.
         """
         self._device = devices.get(device)
         self._discretisation = discretisation or devices.Discretisation()
@@ -57,7 +57,7 @@ class Catheter(Chain):
         return self._device.tip if self._in_tip(index) else self._device.shaft
 
     def _joint_compliance(self, index: int) -> float:
-        """Compliance in rad/(N·m) of the bending of the rod next to a joint.
+        """Bending compliance of a joint, rad/(N·m).
 
         A joint stands for the half links on both of its sides, l/2EI each.
         """
@@ -67,11 +67,11 @@ class Catheter(Chain):
         )
 
     def _torsion_hinges(self) -> dict[int, float]:
-        """Compliance in rad/(N·m) of the torsion hinges, by the link they turn.
+        """Compliance of the torsion hinges, rad/(N·m), by link.
 
-        The hinges share the joints of the chain evenly. Each one lies in the middle
-        of its share and stands for the twist of the whole of it, l/GJ, whatever
-        sections it spans; the last one also for the distal half link.
+        The hinges divide the joints of the chain evenly. Each one lies in the middle
+        of its part and has the compliance of all of it, ∫ds/GJ; the last one includes
+        the distal half link.
         """
         count = self._discretisation.torsion_joints
         last = len(self._lengths) - 1
@@ -128,8 +128,8 @@ class Catheter(Chain):
         if self._device.steerable:
             first = len(self._lengths) - self._device.tip_links
             for index in range(first, len(self._lengths)):
-                # The torque that bends the free joint by the steering angle: a motor
-                # shifts the rest shape and adds no stiffness.
+                # This torque bends the free joint by the steering angle: a motor shifts
+                # the rest shape and adds no stiffness.
                 compliance = self._joint_compliance(index)
                 torque = self._device.steering_angle / compliance
                 for axis in ("x", "y"):
@@ -150,12 +150,12 @@ class Catheter(Chain):
 
     @property
     def device(self) -> devices.Device:
-        """What the catheter is made of."""
+        """The device."""
         return self._device
 
     @property
     def devices(self) -> tuple[devices.Device, ...]:
-        """What the catheter is made of, alone."""
+        """The device, as a tuple of one."""
         return (self._device,)
 
     @property

@@ -1,4 +1,4 @@
-"""A chain of rigid links that stands for slender devices; its base is driven."""
+"""A chain of rigid links with a driven base, the model of slender devices."""
 
 from typing import Any
 
@@ -8,38 +8,38 @@ from dm_control import composer, mjcf
 from cathsim_dmc.entities.contact import device_contact
 from cathsim_dmc.entities.device import Device
 
-# Relaxation time of bending: joint damping = time * stiffness, s. It lumps the loss
-# inside the polymer with the drag of blood: a 0.2 m cantilever of 50 N·mm² with a drag
-# of 0.15 N·s/m² relaxes in c L⁴ / (12.4 EI) = 0.4 s. With half of it, a buckled shaft
-# that snaps through outruns steps of 4 ms (docs/soak.md).
+# Relaxation time of bending: joint damping = time * stiffness, s. It represents the
+# loss inside the polymer and the drag of blood: a 0.2 m cantilever of 50 N·mm² with a
+# drag of 0.15 N·s/m² relaxes in c L⁴ / (12.4 EI) = 0.4 s. With half of it, a buckled
+# shaft snaps through too fast for steps of 4 ms (docs/soak.md).
 BENDING_RELAXATION_TIME = 0.4
-# Rotor inertia of the hinges, kg·m². Next to the damping it acts within 2 ms, far
-# below the relaxation time, and it gives the contact solver the scale of mass at
-# which the wall is as hard as silicone (docs/physics.md).
+# Rotor inertia of the hinges, kg·m². With the damping it acts within 2 ms, far below
+# the relaxation time. It sets the mass scale of the contact solver, at which the wall
+# is as hard as silicone (docs/physics.md).
 HINGE_ARMATURE = 1e-6
-# The same of the torsion hinges. They are softer: more would delay the twist by more
-# than a few milliseconds.
+# Rotor inertia of the torsion hinges, kg·m². They are softer, so a larger one would
+# delay the twist by more than a few milliseconds.
 TORSION_ARMATURE = 1e-7
 CARRIAGE_MASS = 0.2  # kg, platform of the follower that pushes the device
 MAX_PUSH_FORCE = 5.0  # N, slip of the clamps
 MAX_PUSH_SPEED = 0.04  # m/s
 CARRIAGE_GAIN = 100.0  # N·s/m, stiff: 1 N of load costs 1 cm/s
 
-# The links are rigid; the axial compliance of the whole device, L / EA, sits in a
-# spring at its base. Without it a jam stops the carriage within a step, and the push
-# force chatters. Damping ratio of the carriage on that spring.
+# Damping ratio of the carriage on the spring at the base. The links are rigid; the
+# spring has the axial compliance of the whole device, L / EA. Without it a jam stops
+# the carriage within a step, and the push force oscillates.
 COMPRESSION_DAMPING = 0.5
 COMPRESSION_ARMATURE = 1e-3  # kg, about the mass of the device
 
-# Rotary unit as seen by the device, kg·m²: a 0.3 kg clamp of 2 cm. The bounded torque
-# then changes the speed by less in a time step than the range in which the servo is
-# linear (4 rad/s); a rotor 100 times lighter went bang-bang between 0 and 80 rad/s.
+# Inertia of the rotary unit, kg·m²: a 0.3 kg clamp of 2 cm. The limited torque then
+# changes the speed in a time step by less than the linear range of the servo (4 rad/s).
+# A rotor 100 times lighter oscillates between 0 and 80 rad/s.
 ROTOR_INERTIA = 1e-4
 MAX_TORQUE = 0.02  # N·m
 MAX_ROTATION_SPEED = 3.14  # rad/s
 ROTATION_GAIN = 0.01  # N·m·s/rad
 
-_VISIBLE_SHAFT = 0.45  # m of device behind the simulated part, at full insertion
+_VISIBLE_SHAFT = 0.45  # m, drawn behind the simulated part at full insertion
 COLOUR = (0.85, 0.32, 0.08, 1.0)
 TIP_COLOUR = (0.95, 0.75, 0.1, 1.0)
 
@@ -47,8 +47,8 @@ TIP_COLOUR = (0.95, 0.75, 0.1, 1.0)
 class Chain(composer.Entity):
     """Links with hinges about x and y; +z of every link points to the distal end.
 
-    The origin of the entity is the place of the distal end at zero insertion. What the
-    links are made of is what `Catheter` and `DeviceStack` say.
+    The origin of the entity is the position of the distal end at zero insertion.
+    `Catheter` and `DeviceStack` define the properties of the links.
     """
 
     def _assemble(
@@ -64,12 +64,12 @@ class Chain(composer.Entity):
         """Builds base, links, head, motors and sensors.
 
         Args:
-          link_lengths: (n,), from proximal to distal, m.
-          radius: of all links, m.
-          stroke: longest insertion, m.
-          rotation: whether the base can be rotated.
-          friction: Coulomb coefficient; MuJoCo takes the larger of the two bodies'.
-          name: of the entity.
+            link_lengths: (n,) lengths from proximal to distal, m.
+            radius: radius of all links, m.
+            stroke: longest insertion, m.
+            rotation: whether the base has a rotation joint.
+            friction: Coulomb coefficient; MuJoCo takes the larger of the two geoms'.
+            name: name of the entity.
         """
         if not stroke > 0:
             raise ValueError(f"stroke is {stroke} m; it must be positive")
@@ -94,18 +94,18 @@ class Chain(composer.Entity):
         self._build_motors()
         self._build_sensors()
 
-    # What the links are made of.
+    # Properties of the links.
 
     def _axial_stiffness(self) -> float:
         """EA of the whole device, N."""
         raise NotImplementedError
 
     def _joint_compliance(self, index: int) -> float:
-        """Compliance in rad/(N·m) of the bending of the rod next to a joint."""
+        """Bending compliance of a joint, rad/(N·m)."""
         raise NotImplementedError
 
     def _rest_angles(self, index: int) -> tuple[float, float]:
-        """Angles of the unloaded hinges of a joint about x and y, rad."""
+        """Rest angles of the hinges of a joint about x and y, rad."""
         raise NotImplementedError
 
     def _link_mass(self, index: int) -> float:
@@ -113,11 +113,11 @@ class Chain(composer.Entity):
         raise NotImplementedError
 
     def _in_tip(self, index: int) -> bool:
-        """Whether a link belongs to the tip; for looks."""
+        """Whether a link is drawn as part of the tip."""
         raise NotImplementedError
 
     def _surface(self, friction: float) -> dict[str, Any]:
-        """Attributes of what touches the wall with a Coulomb coefficient."""
+        """Contact attributes of the geoms."""
         return device_contact(friction)
 
     def _add_twist(self, link, index: int) -> None:
@@ -125,7 +125,7 @@ class Chain(composer.Entity):
 
     @property
     def device(self) -> Device:
-        """The device, or of several the outermost."""
+        """The device; of coaxial devices the outermost."""
         raise NotImplementedError
 
     @property
@@ -135,10 +135,10 @@ class Chain(composer.Entity):
 
     @property
     def density(self) -> float:
-        """Density (kg/m³) of a body that blood carries as much of."""
+        """Effective density, kg/m³, that determines the buoyancy in blood."""
         raise NotImplementedError
 
-    # How they are put together.
+    # Assembly.
 
     def _build_base(self, rotation: bool):
         base = self._mjcf_root.worldbody.add(
@@ -174,7 +174,7 @@ class Chain(composer.Entity):
             )
         self._links.append(base)
         self._add_capsule(base, 0)
-        # The rest of the device, which the follower holds; for looks only.
+        # The part of the device that the follower holds, drawn only.
         base.add(
             "geom",
             name="shaft",
@@ -325,15 +325,14 @@ class Chain(composer.Entity):
 
     @property
     def translations(self) -> tuple[int, ...]:
-        """Places in the action of what pushes."""
+        """Indices of the translations in the action."""
         return (len(self.tip_motors),)
 
     @property
     def action_groups(self) -> tuple[int, ...]:
-        """Number of the group of each entry of an action.
+        """Group index of each entry of an action.
 
-        Motors of the tip that bend about one axis are one group, the others stand
-        alone.
+        The tip motors of one bending axis form a group; every other entry is its own.
         """
         tip = len(self.tip_motors)
         axes = [number % 2 for number in range(tip)]

@@ -1,17 +1,16 @@
-"""Coaxial devices: what a chain is made of where devices lie in each other.
+"""Coaxial devices: the properties of one chain that stands for all of them.
 
-Devices are numbered from the innermost outwards. One chain of links stands for all of
-them: its end is the farthest of their ends, and device k ends `gap_k` before it. Along
-the chain, at a place s from its end,
+Devices are numbered from the innermost outwards. The end of the chain is the farthest
+of their ends; device k ends `gap_k` before it. At a distance s from the end of the
+chain,
 
     EI(s) = Σ EI_k(s),    κ(s) EI(s) = Σ EI_k(s) κ_k(s),
 
-over the devices that reach so far, each with the curvature κ_k of its unloaded shape,
-turned by its own rotation there. What a hinge needs are integrals of 1/EI and κ over
-its two links, with a weight that falls linearly from 1 at the hinge to 0 at their far
-ends: so the hinges bend by as much as the rod does, and about the same place on
-average, wherever the end of a device lies in a link, and everything changes
-continuously as devices slide and turn.
+over the devices present there. κ_k is the curvature of the unloaded shape of device k,
+turned by its local rotation. A hinge has the integrals of 1/EI and κ over its two
+links, with a weight that falls linearly from 1 at the hinge to 0 at their far ends. The
+chain then has the angle and the mean position of each bend of the rod, wherever the end
+of a device lies in a link, and all properties are continuous in insertion and rotation.
 
 Pure functions of arrays with a leading axis N of simulations; SI units. Directions
 across the chain are complex numbers x + iy in the frame of a link: a hinge bent by
@@ -31,17 +30,20 @@ from cathsim_dmc.entities.device import Device
 
 
 class Overlap(NamedTuple):
-    """What the overlap alone decides, whatever the rotations. J joints, L links.
+    """Properties that depend on the overlap but not on the rotations.
+
+    N simulations, K devices, P pairs of devices, J joints, L links.
 
     Attributes:
-      compliance: (N, J), ∫h ds/EI of a joint with its weight h, rad/(N·m).
-      rest: (N, K, J), ∫h κ_k EI_k/EI ds: by what each device bends the free joint, rad.
-      coupling: (N, P, J), ∫h κ_k κ_l EI_k EI_l/EI ds for each pair of `Stack.pairs`:
-        the energy of two devices that bend against each other, N·m.
-      stiffness: (N, K, J), weighted mean of EI_k, N·m².
-      moment: (N, K, J), weighted mean of EI_k κ_k, N·m.
-      outermost: (N, K, L), share of each link on which a device is the outermost.
-      present: (N, K, L), share of each link that a device reaches.
+        compliance: (N, J), ∫h ds/EI of a joint with weight h, rad/(N·m).
+        rest: (N, K, J), ∫h κ_k EI_k/EI ds, angle by which a device bends the free
+            joint, rad.
+        coupling: (N, P, J), ∫h κ_k κ_l EI_k EI_l/EI ds for each pair of `Stack.pairs`:
+            energy of two devices that bend against each other, N·m.
+        stiffness: (N, K, J), weighted mean of EI_k, N·m².
+        moment: (N, K, J), weighted mean of EI_k κ_k, N·m.
+        outermost: (N, K, L), fraction of each link on which a device is the outermost.
+        present: (N, K, L), fraction of each link on which a device is present.
     """
 
     compliance: np.ndarray
@@ -54,15 +56,16 @@ class Overlap(NamedTuple):
 
 
 class Links(NamedTuple):
-    """What the links are, arrays (N, L).
+    """Properties of the links, arrays (N, L).
 
     Attributes:
-      radius: of the outermost device, m; in a link on which that changes, its mean.
-      friction: Coulomb coefficient on the wall, likewise.
-      mass: kg.
-      lightness: share of a link's mass that gravity does not pull at, beside that
-        which blood carries where all devices are.
-      inertia: (N, L, 2), moments of a solid capsule across and along it, kg·m².
+        radius: radius of the outermost device, its mean over the link, m.
+        friction: Coulomb coefficient on the wall, its mean over the link.
+        mass: mass, kg.
+        lightness: fraction of the link's weight that buoyancy cancels, beyond the
+            buoyancy of all devices together, which reduces gravity (`gravcomp`).
+        inertia: (N, L, 2), moments of inertia of a solid capsule across and along its
+            axis, kg·m².
     """
 
     radius: np.ndarray
@@ -76,26 +79,26 @@ class Stack:
     """Coaxial devices on one chain of links.
 
     Attributes:
-      devices: from the innermost outwards.
-      link_lengths: (L,), from proximal to distal, m.
-      nodes: (L + 1,), distance of the ends of the links from the end of the chain, m,
-        from proximal to distal.
-      spans: (J,), length of rod that each joint stands for, half of its two links, m.
-      pairs: (P, 2), numbers of every two devices.
+        devices: devices from the innermost outwards.
+        link_lengths: (L,), from proximal to distal, m.
+        nodes: (L + 1,), distances of the ends of the links from the end of the chain,
+            from proximal to distal, m.
+        spans: (J,), length of rod of each joint, half of its two links, m.
+        pairs: (P, 2), indices of every two devices.
     """
 
     def __init__(self, devices: Sequence[Device], link_lengths: np.ndarray):
-        """Prepares the sections of the devices.
+        """Tabulates the sections of the devices.
 
         Args:
-          devices: from the innermost outwards.
-          link_lengths: (L,), from proximal to distal, m.
+            devices: from the innermost outwards.
+            link_lengths: (L,), from proximal to distal, m.
 
         Raises:
-          ValueError: if there is no device, or one does not fit into the next.
+            ValueError: if `devices` is empty, or one does not fit into the next.
         """
         _check_fit(devices)
-        from cathsim_dmc.entities import coaxial_loops  # late, as it takes long
+        from cathsim_dmc.entities import coaxial_loops  # imports numba, which is slow
 
         self._loops = coaxial_loops
         self.devices = tuple(devices)
@@ -107,8 +110,8 @@ class Stack:
         self.pairs = np.array(
             [(k, j) for k in range(count) for j in range(k + 1, count)], dtype=int
         ).reshape(-1, 2)
-        # Where the pieces of each device begin, and EI and EI κ in them; the first
-        # entry stands for what is beyond the device's end.
+        # Start of the uniform pieces of each device, their EI and EI κ; the first entry
+        # of the latter two is the space beyond the device's end.
         pieces = [_pieces(device) for device in self.devices]
         most = max(len(edges) for edges, _, _ in pieces)
         self._edges = np.full((count, most), np.inf)
@@ -132,8 +135,8 @@ class Stack:
         """Integrals around the joints and over the links.
 
         Args:
-          gaps: (N, K), way from the end of each device to the end of the chain, m, at
-            least 0, and 0 for the device that reaches farthest.
+            gaps: (N, K), distance from the end of each device to the end of the chain,
+                m; 0 for the device that reaches farthest.
         """
         gaps = np.ascontiguousarray(gaps, np.float64)
         integrals = self._loops.overlaps(
@@ -155,16 +158,17 @@ class Stack:
         spin: np.ndarray | None = None,
         relaxation_time: float = 0.0,
     ) -> np.ndarray:
-        """Angles of the free joints.
+        """Rest angles of the joints.
 
         Args:
-          overlap: of the devices.
-          turns: (N, K, J), rotation of each device at each joint, rad.
-          spin: (N, K, J), rate of that rotation, rad/s; 0 if None.
-          relaxation_time: of the joints' dampers, s: the angles lead by it.
+            overlap: overlap of the devices.
+            turns: (N, K, J), rotation of each device at each joint, rad.
+            spin: (N, K, J), rate of that rotation, rad/s; None means 0.
+            relaxation_time: time by which the angles lead, that of the joints' damping,
+                s.
 
         Returns:
-          (N, J) complex, rad.
+            (N, J) complex, rad.
         """
         if spin is None:
             spin = np.zeros(turns.shape)
@@ -172,11 +176,11 @@ class Stack:
         return self._loops.rest_angles(overlap.rest, turns, spin, relaxation_time)
 
     def links(self, overlap: Overlap, friction: np.ndarray) -> Links:
-        """What the links are made of.
+        """Properties of the links.
 
         Args:
-          overlap: of the devices.
-          friction: (N,), Coulomb coefficient of an uncoated device on the wall.
+            overlap: overlap of the devices.
+            friction: (N,), Coulomb coefficient of an uncoated device on the wall.
         """
         made = self._loops.links(
             overlap.outermost,
@@ -192,36 +196,36 @@ class Stack:
     def wall_friction(
         self, overlap: Overlap, force: np.ndarray, friction: np.ndarray
     ) -> np.ndarray:
-        """Largest torques by which the wall resists the turning of the devices.
+        """Limits of the friction torque of the wall on the devices.
 
         Args:
-          overlap: of the devices.
-          force: (N, L), of the wall on the links, N.
-          friction: (N,), Coulomb coefficient of an uncoated device on the wall.
+            overlap: overlap of the devices.
+            force: (N, L), force of the wall on the links, N.
+            friction: (N,), Coulomb coefficient of an uncoated device on the wall.
 
         Returns:
-          (N, K, J), N·m, at the joints, of which each has half of its two links.
+            (N, K, J), N·m; each joint has half of its two links.
         """
         return self._loops.wall_friction(overlap.outermost, force, friction, self._arms)
 
     def restoring(
         self, overlap: Overlap, bends: np.ndarray, turns: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Torques that turn the shaped parts of the devices, and how they stiffen.
+        """Restoring torques of the shapes of the devices, and their stiffness.
 
-        The energy of a joint that is bent by θ is |θ - Σ R_k e_k|²/2C, e_k = exp(iφ_k),
-        and that of two devices against each other -S cos(φ_k - φ_l). Its derivative by
-        a rotation is what makes a shaped device in a curved vessel lie in the curve,
-        and whip round when it is turned.
+        The energy of a joint bent by θ is |θ - Σ R_k e_k|²/2C, e_k = exp(iφ_k), and
+        that of two devices against each other -S cos(φ_k - φ_l). The derivative by a
+        rotation turns a shaped device into the plane of a curved vessel and makes it
+        whip.
 
         Args:
-          overlap: of the devices.
-          bends: (N, J) complex, how far the joints are bent, rad.
-          turns: (N, K, J), rotation of each device at each joint, rad.
+            overlap: overlap of the devices.
+            bends: (N, J) complex, bending angles of the joints, rad.
+            turns: (N, K, J), rotation of each device at each joint, rad.
 
         Returns:
-          Torque (N, K, J) on each device in the direction of its rotation, N·m, and
-          minus its derivative by that rotation, N·m/rad.
+            Torque (N, K, J) on each device about its axis, N·m, and minus its
+            derivative by the rotation, N·m/rad.
         """
         return self._loops.restoring(
             overlap.rest, overlap.compliance, overlap.coupling, bends, turns
@@ -230,18 +234,18 @@ class Stack:
     def pressure(
         self, overlap: Overlap, bends: np.ndarray, turns: np.ndarray
     ) -> np.ndarray:
-        """Forces by which each device presses on the lumen of the next one.
+        """Lateral forces of each device on the lumen of the next one.
 
-        Each device carries its own share of the bending moment; where that share is
-        not straight along the device, it leans on the other.
+        Each device carries its share of the bending moment; the shear of that share
+        acts on the other device.
 
         Args:
-          overlap: of the devices.
-          bends: (N, J) complex, how far the joints are bent, rad.
-          turns: (N, K, J), rotation of each device at each joint, rad.
+            overlap: overlap of the devices.
+            bends: (N, J) complex, bending angles of the joints, rad.
+            turns: (N, K, J), rotation of each device at each joint, rad.
 
         Returns:
-          (N, K - 1, J), N, at the joints, of device k on device k + 1.
+            (N, K - 1, J), force of device k on device k + 1 at the joints, N.
         """
         return self._loops.pressure(
             overlap.stiffness,
@@ -254,15 +258,15 @@ class Stack:
 
 
 def weight_density(device: Device) -> float:
-    """Mass per length that gravity pulls at in blood, which fills the lumen, kg/m."""
+    """Mass per length less that of the displaced blood, kg/m; blood fills the lumen."""
     section = np.pi * (device.outer_radius**2 - device.inner_radius**2)
     return max(0.0, device.linear_density - BLOOD_DENSITY * section)
 
 
 def _pieces(device: Device) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Where the uniform pieces of a device begin, m from its end; their EI, and EI κ.
+    """Start of the uniform pieces of a device, m from its end; their EI and EI κ.
 
-    The positive curvature of an arc leads towards +x.
+    Positive curvature bends towards +x.
     """
     curved, end = [], 0.0
     for arc in reversed(device.tip_shape):
@@ -282,7 +286,7 @@ def _pieces(device: Device) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 def _check_fit(devices: Sequence[Device]) -> None:
     if not devices:
-        raise ValueError("there is no device; give one or more, the innermost first")
+        raise ValueError("there is no device in devices; give at least one")
     for inner, outer in zip(devices[:-1], devices[1:], strict=True):
         if not inner.outer_radius < outer.inner_radius:
             lumen = (
@@ -292,6 +296,6 @@ def _check_fit(devices: Sequence[Device]) -> None:
             )
             raise ValueError(
                 f"device {inner.name!r} is {2e3 * inner.outer_radius:.3g} mm thick, "
-                f"but {outer.name!r}, in which it is to lie, {lumen}; give devices "
+                f"but {outer.name!r} around it {lumen}; give devices "
                 "from the innermost outwards, each thinner than the lumen of the next"
             )

@@ -1,8 +1,8 @@
-"""Coaxial devices: the compiled loops over simulations, devices and joints.
+"""Coaxial devices: compiled loops over simulations, devices and joints.
 
-`coaxial` and `torsion` say what they compute and call them. A chain has some thirty
-joints, too few for numpy: its calls took longer than the sums. Each simulation is
-computed on its own, so that a batch has the bits of its members alone.
+`coaxial` and `torsion` call them and define the quantities. A chain has some thirty
+joints, for which compiled loops are faster than numpy. Each simulation is computed on
+its own, so single and batched simulations agree bit for bit.
 
 Arrays have a leading axis N of simulations; K devices, J joints, L = J + 1 links; a rod
 has M + 1 = L + 1 nodes, of which 0 is its base. All are C-contiguous.
@@ -14,9 +14,9 @@ import numpy as np
 
 from cathsim_dmc.compiled import compiled
 
-# Farther from the end than any device is long, m.
+# A distance beyond the end of any device, m.
 _FAR = 1e3
-# Most rounds in which it is found which nodes stick; two or three are usual.
+# Largest number of iterations that find the sticking nodes; two or three are usual.
 _ROUNDS = 5
 
 
@@ -24,7 +24,8 @@ _ROUNDS = 5
 def _weight(place, joint, nodes, lengths):
     """Integral of the weight of a joint from the end of the chain to a place.
 
-    The weight rises along the link beyond the joint and falls along the one before.
+    The weight rises along the link distal of the joint and falls along the proximal
+    one.
     """
     ahead, behind = lengths[joint + 1], lengths[joint]
     offset = place - nodes[joint + 1]
@@ -35,7 +36,7 @@ def _weight(place, joint, nodes, lengths):
 
 @compiled
 def _breaks(gaps, edges):
-    """Places between two of which nothing changes, from the end of the chain on."""
+    """Boundaries of the uniform pieces of the chain, from its end on."""
     places = np.empty(edges.size + 1)
     for k in range(edges.shape[0]):
         for e in range(edges.shape[1]):
@@ -47,7 +48,7 @@ def _breaks(gaps, edges):
 
 @compiled
 def _piece(place, edges):
-    """Number of the piece of a device at a distance from its end, 0 beyond it."""
+    """Index of the piece of a device at a distance from its end, 0 beyond it."""
     piece = 0
     while piece < len(edges) and place >= edges[piece]:
         piece += 1
@@ -62,9 +63,9 @@ def overlaps(gaps, nodes, lengths, edges, bending, moment):
         gaps: (N, K), m.
         nodes: (L + 1,), m.
         lengths: (L,), m.
-        edges: (K, E), where the pieces of the devices begin, m from their ends; filled
-            up with infinity.
-        bending: (K, E + 1), EI of what lies beyond the device and of the pieces, N·m².
+        edges: (K, E), start of the pieces of the devices, m from their ends; padded
+            with infinity.
+        bending: (K, E + 1), EI beyond the device (0) and of the pieces, N·m².
         moment: (K, E + 1), EI κ likewise, N·m.
 
     Returns:
@@ -114,13 +115,13 @@ def overlaps(gaps, nodes, lengths, edges, bending, moment):
 
 @compiled
 def shares(gaps, nodes, lengths):
-    """Shares (N, K, L) of the links where a device is outermost, and present."""
+    """Fractions (N, K, L) of the links where a device is outermost, and present."""
     count, devices = gaps.shape
     outermost = np.empty((count, devices, len(lengths)))
     present = np.empty_like(outermost)
     for i in range(count):
         for link in range(len(lengths)):
-            # A place is covered by whatever lies farther out and reaches it.
+            # A device farther out covers a place that it reaches.
             covered = 0.0
             for k in range(devices - 1, -1, -1):
                 reached = (nodes[link] - gaps[i, k]) / lengths[link]
@@ -139,7 +140,7 @@ def _unit(angle):
 
 @compiled
 def restoring(rest, compliance, coupling, bends, turns):
-    """Torques of the shapes and minus their derivatives, see `Stack.restoring`."""
+    """Restoring torques and minus their derivatives, see `Stack.restoring`."""
     count, devices, joints = turns.shape
     torque, rate = np.empty(turns.shape), np.empty(turns.shape)
     pulls = np.empty(devices, np.complex128)
@@ -183,7 +184,7 @@ def pressure(stiffness, moment, present, bends, turns, lengths):
                 shear = 0j
                 if j < joints - 1:
                     shear = (own[j + 1] - own[j]) / lengths[j + 1]
-                # Only where both are: a joint has the share of the links beside it.
+                # Only where both devices are present: the mean of both links.
                 both = (present[i, k + 1, j] + present[i, k + 1, j + 1]) / 2
                 force[i, k, j] = abs(shear - before) * both
                 before = shear
@@ -192,9 +193,10 @@ def pressure(stiffness, moment, present, bends, turns, lengths):
 
 @compiled
 def _on_rod(joint, gap, nodes, first):
-    """Segment of a rod, from a first one on, that a joint lies in, and the way through.
+    """Segment of a rod that contains a joint, and the fraction of it before the joint.
 
-    A joint of the chain in the gap beyond the device's end is at the end of its rod.
+    The search begins at segment `first`. A joint beyond the device's end is at the end
+    of its rod.
     """
     place = max(nodes[joint + 1] - gap, 0.0)
     while first < len(nodes) - 2 and nodes[first + 1] > place:
@@ -204,7 +206,7 @@ def _on_rod(joint, gap, nodes, first):
 
 @compiled
 def at_joints(angles, gaps, nodes):
-    """Rotations (N, K, J) of rods (N, K, M + 1) where the chain has its joints.
+    """Rotations (N, K, J) of rods (N, K, M + 1) at the joints of the chain.
 
     Linear between two nodes; a joint beyond a device's end has that of the end.
     """
@@ -223,9 +225,9 @@ def at_joints(angles, gaps, nodes):
 
 @compiled
 def at_nodes(loads, gaps, nodes):
-    """Loads (..., N, K, M) on the nodes beyond the base, of loads at the joints.
+    """Loads (..., N, K, M) on the nodes distal of the base, from loads at the joints.
 
-    A load is shared by the nodes on both sides of its joint.
+    The nodes on both sides of a joint share its load.
     """
     kinds, count, devices, joints = loads.shape
     shared = np.zeros((kinds, count, devices, joints + 1))
@@ -244,7 +246,7 @@ def at_nodes(loads, gaps, nodes):
 
 @compiled
 def _balance(diagonal, beside, load, pivot, move):
-    """Solves a symmetric tridiagonal system that is diagonally dominant."""
+    """Solves a symmetric, diagonally dominant, tridiagonal system."""
     last = len(load) - 1
     for m in range(last + 1):
         pivot[m], move[m] = diagonal[m], load[m]
@@ -258,11 +260,11 @@ def _balance(diagonal, beside, load, pivot, move):
 
 
 @compiled
-def _rubbed(diagonal, beside, load, friction, least, move):
-    """Balance with Coulomb friction: each node sticks, or slides one way.
+def _balance_with_friction(diagonal, beside, load, friction, least, move):
+    """Balance with Coulomb friction: each node sticks, or slides in one direction.
 
-    Which one is found by trying (Newton's method on the law of friction, which is
-    linear up to `least`, what a node that sticks may move); what was tried last stands.
+    Newton's method on the friction law, which is linear up to `least`, the largest
+    movement of a sticking node. The last iterate is the result.
     """
     count = len(load)
     way = np.zeros(count)
@@ -286,14 +288,14 @@ def _rubbed(diagonal, beside, load, friction, least, move):
 
 @compiled
 def turned(angles, base, stiffness, lag, least, duration, loads):
-    """Rotations of rods in balance after their bases were turned, see `Rods.turn`.
+    """Equilibrium rotations of rods after a rotation of their bases, see `Rods.turn`.
 
     Args:
         angles: (N, K, M + 1), rad.
-        base: (N, K), by how much the bases are turned, rad.
-        stiffness: (K, M), of the segments, N·m/rad.
-        lag: relaxation time over the duration.
-        least: what a node that sticks may move, rad.
+        base: (N, K), rotations of the bases, rad.
+        stiffness: (K, M), torsional stiffness of the segments, N·m/rad.
+        lag: relaxation time divided by the duration.
+        least: largest movement of a sticking node, rad.
         duration: s.
         loads: (4, N, K, M): torque, rate, friction and brake on the nodes.
 
@@ -311,8 +313,8 @@ def turned(angles, base, stiffness, lag, least, duration, loads):
                 now = stiffness[k, m] * (angles[i, k, m + 1] - angles[i, k, m])
                 coupling = (1 + lag) * stiffness[k, m]
                 load[m] = loads[0, i, k, m] - now
-                # Where the torque grows with the rotation it is taken as it is: no
-                # balance is near, and the rod's own damping bounds the speed.
+                # A negative rate has no equilibrium nearby; there the torque is
+                # explicit, and the damping of the rod bounds the speed.
                 rate = max(loads[1, i, k, m], 0.0)
                 diagonal[m] = coupling + rate + loads[3, i, k, m] / duration
                 if m == 0:
@@ -321,7 +323,8 @@ def turned(angles, base, stiffness, lag, least, duration, loads):
                     load[m - 1] += now
                     diagonal[m - 1] += coupling
                     beside[m - 1] = -coupling
-            _rubbed(diagonal, beside, load, loads[2, i, k], least, move)
+            friction = loads[2, i, k]
+            _balance_with_friction(diagonal, beside, load, friction, least, move)
             new[i, k, 0] = angles[i, k, 0] + base[i, k]
             for m in range(segments):
                 new[i, k, m + 1] = angles[i, k, m + 1] + move[m]
@@ -330,13 +333,13 @@ def turned(angles, base, stiffness, lag, least, duration, loads):
 
 @compiled
 def wall_friction(outermost, force, coefficient, arms):
-    """Largest torques (N, K, J) of friction on the wall, see `Stack.wall_friction`."""
+    """Friction limits (N, K, J) on the wall, see `Stack.wall_friction`."""
     count, devices, links = outermost.shape
     torque = np.empty((count, devices, links - 1))
     for i in range(count):
         for k in range(devices):
             for j in range(links - 1):
-                # The last joint bears what touches beyond it alone.
+                # The last joint bears all of the last link.
                 last = 1.0 if j == links - 2 else 0.5
                 borne = 0.5 * outermost[i, k, j] * force[i, j]
                 borne += last * outermost[i, k, j + 1] * force[i, j + 1]
@@ -346,7 +349,7 @@ def wall_friction(outermost, force, coefficient, arms):
 
 @compiled
 def rest_angles(rest, turns, spin, relaxation):
-    """Angles (N, J) of the free joints, see `Stack.rest_angles`."""
+    """Rest angles (N, J) of the joints, see `Stack.rest_angles`."""
     count, devices, joints = turns.shape
     angles = np.zeros((count, joints), np.complex128)
     for i in range(count):
@@ -370,13 +373,13 @@ def _inertia(mass, radius, length):
 
 @compiled
 def links(outermost, present, lengths, friction, radii, ratios, densities):
-    """What the links are made of, see `coaxial.Links`.
+    """Properties of the links, see `coaxial.Links`.
 
     Args:
         outermost, present: (N, K, L).
         lengths: (L,), m.
-        friction: (N,), of an uncoated device.
-        radii, ratios: (K,), of the devices.
+        friction: (N,), Coulomb coefficient of an uncoated device.
+        radii, ratios: (K,), radii (m) and friction ratios of the devices.
         densities: (2, K), mass and weight in blood, kg/m.
     """
     count, devices, number = outermost.shape
@@ -394,7 +397,7 @@ def links(outermost, present, lengths, friction, radii, ratios, densities):
                 weight += there * densities[1, k] * lengths[link]
                 whole = whole and there == 1.0
             made[0, i, link], made[2, i, link] = radius, mass
-            # Exactly nothing where all devices are: MuJoCo then passes the link over.
+            # Exactly 0 where all devices are present: MuJoCo then skips the link.
             if share > 0.0 and not whole:
                 made[3, i, link] = 1.0 - weight / (mass * share)
             moments[i, link] = _inertia(mass, radius, lengths[link])

@@ -1,4 +1,4 @@
-"""What a catheter or guidewire is: a rod of two sections with a shape, in SI units."""
+"""Catheters and guidewires: rods of two sections with a shape, in SI units."""
 
 import dataclasses
 import math
@@ -11,11 +11,11 @@ _MOST_LINKS = 200
 
 @dataclasses.dataclass(frozen=True)
 class Section:
-    """A stretch of uniform rod.
+    """A uniform section of a rod.
 
     Attributes:
-      bending_stiffness: EI in N·m².
-      torsional_stiffness: GJ in N·m².
+        bending_stiffness: EI in N·m².
+        torsional_stiffness: GJ in N·m².
     """
 
     bending_stiffness: float
@@ -40,8 +40,8 @@ class Arc:
     """A circular arc of a pre-shaped tip.
 
     Attributes:
-      radius: radius of curvature of the centreline, m.
-      angle: turning angle, rad; the sign is the side to which it turns.
+        radius: radius of curvature of the centreline, m.
+        angle: turning angle, rad; the sign gives the side.
     """
 
     radius: float
@@ -62,24 +62,25 @@ class Device:
     """A catheter or guidewire.
 
     Attributes:
-      name: key in `DEVICES`.
-      outer_radius: m.
-      linear_density: mass per length, kg/m.
-      shaft: section proximal of the tip.
-      tip: section of the distal `tip_length`.
-      tip_length: m.
-      tip_links: rigid links that the tip is divided into.
-      steering_angle: largest angle that the motor of one tip joint bends it by
-        when nothing else loads it, rad. 0 makes a passive device without motors.
-      tip_shape: arcs of the unloaded shape, from proximal to distal; they end at
-        the distal end and bend in the local x-z plane.
-      inner_radius: of the lumen, m; 0 for a wire.
-      friction_ratio: Coulomb friction on the wall, against that of an uncoated device
-        in the same vessel.
-      attenuation: excess over water of X-rays, homogenised over its section, 1/m.
-      marker_attenuation: that of the radiopaque marker at its end, 1/m.
-      marker_length: of the marker, m.
-      source: where its figures come from, for people.
+        name: key in `DEVICES`.
+        outer_radius: outer radius, m.
+        linear_density: mass per length, kg/m.
+        shaft: section proximal of the tip.
+        tip: section of the distal `tip_length`.
+        tip_length: length of the tip, m.
+        tip_links: number of rigid links of the tip.
+        steering_angle: largest angle by which the motor bends an unloaded tip joint,
+            rad. 0 makes a passive device without motors.
+        tip_shape: arcs of the unloaded shape in the local x-z plane, from proximal to
+            distal; the last one ends at the distal end.
+        inner_radius: radius of the lumen, m; 0 for a wire.
+        friction_ratio: Coulomb coefficient on the wall relative to that of an uncoated
+            device in the same vessel.
+        attenuation: X-ray attenuation above that of water, averaged over the section,
+            1/m.
+        marker_attenuation: that of the radiopaque marker at the distal end, 1/m.
+        marker_length: length of the marker, m.
+        source: source of the figures, as text.
     """
 
     name: str
@@ -122,28 +123,28 @@ class Device:
 
     @property
     def steerable(self) -> bool:
-        """Whether the joints of the tip carry motors."""
+        """Whether the tip joints have motors."""
         return self.steering_angle > 0
 
     @property
     def axial_stiffness(self) -> float:
-        """EA of the shaft in N, as of a solid round rod: EA = 4 EI / r²."""
+        """EA of the shaft, N; that of a solid round rod, 4 EI / r²."""
         return 4 * self.shaft.bending_stiffness / self.outer_radius**2
 
     @property
     def is_wire(self) -> bool:
-        """Whether it is solid, so that nothing fits into it."""
+        """Whether the device is solid."""
         return self.inner_radius == 0.0
 
     def rest_angle(self, start: float, stop: float) -> float:
         """Turning angle of the unloaded shape between two places.
 
         Args:
-          start: distance from the distal end, m.
-          stop: distance from the distal end, m, at most `start`.
+            start: distance from the distal end, m.
+            stop: distance from the distal end, m, at most `start`.
 
         Returns:
-          The angle in rad that the centreline turns by from `start` to `stop`.
+            The turning angle of the centreline from `start` to `stop`, rad.
         """
         total, distal = 0.0, 0.0
         for arc in reversed(self.tip_shape):

@@ -15,18 +15,18 @@ from cathsim_dmc.entities.torsion import Rods
 
 # Coulomb coefficient between a device and the lined lumen around it (Lin 2020).
 LUMEN_FRICTION = 0.04
-# By how much each device starts ahead of the one around it, m.
+# Distance by which each device starts ahead of the one around it, m.
 LEAD = 0.03
 
 
 class DeviceStack(Chain):
     """Coaxial devices, each pushed and turned at its base, on one chain of links.
 
-    The end of the chain is that of the device that reaches farthest; what the links are
-    made of slides along it, see `coaxial`. The chain has one motor, which pushes it by
-    the device that leads; `physics.sliding` moves the devices and writes what changes
-    into the model, once in a control step. An action has two entries for each device,
-    from the innermost outwards: translation and rotation.
+    The end of the chain is that of the device that reaches farthest, the leading one;
+    the properties of the links change as the devices slide, see `coaxial`. The chain
+    has one motor, which drives the leading device. `physics.sliding` moves the devices
+    and writes the properties into the model once per control step. An action has two
+    entries for each device, from the innermost outwards: translation and rotation.
     """
 
     def _build(
@@ -43,24 +43,26 @@ class DeviceStack(Chain):
         """Builds the chain.
 
         Args:
-          devices: from the innermost outwards, or their names in `devices.DEVICES`.
-          discretisation: how the chain is divided into links.
-          stroke: longest insertion, m.
-          lead: by how much each device starts ahead of the one around it, m.
-          friction: Coulomb coefficient of an uncoated device on the wall.
-          lumen_friction: Coulomb coefficient between a device and the lumen it is in.
-          name: of the entity.
+            devices: devices from the innermost outwards, or their names in
+                `devices.DEVICES`.
+            discretisation: division into links.
+            stroke: longest insertion, m.
+            lead: distance by which each device starts ahead of the one around it, m.
+            friction: Coulomb coefficient of an uncoated device on the wall.
+            lumen_friction: Coulomb coefficient between a device and the lumen around
+                it.
+            name: name of the entity.
 
         Raises:
-          ValueError: if a device does not fit into the next one, or is to be steered.
+            ValueError: if a device does not fit into the next one, or is steerable.
         """
         self._devices = tuple(library.get(device) for device in devices)
         for device in self._devices:
             if device.steerable:
                 raise ValueError(
-                    f"device {device.name!r} has motors in its tip, which coaxial "
-                    "devices cannot have yet; give a passive one, or the option "
-                    "`device` for a steerable device alone"
+                    f"device {device.name!r} has motors in its tip, but coaxial "
+                    "devices must be passive; give a passive one, or the option "
+                    "`device` for a single steerable device"
                 )
         chosen = discretisation or library.Discretisation()
         self._friction, self._lumen_friction = friction, lumen_friction
@@ -74,7 +76,7 @@ class DeviceStack(Chain):
         self._mass = self._stack.links(overlap, np.zeros(1)).mass[0]
         self._assemble(
             self._stack.link_lengths,
-            # The thickest anywhere, so that the bounding volumes hold for all.
+            # The largest radius, so that the bounding volumes enclose all devices.
             max(device.outer_radius for device in self._devices),
             stroke=stroke,
             rotation=False,
@@ -85,8 +87,8 @@ class DeviceStack(Chain):
     def _divide(self, discretisation: library.Discretisation) -> np.ndarray:
         if len(self._devices) == 1:
             return discretisation.link_lengths(self._devices[0])
-        # The end of the chain has links as short as those of the tips. A shape that
-        # lies behind it, under a wire that leads by more, is drawn by longer ones.
+        # The distal part of the chain has links as short as those of the tips. A shape
+        # proximal of it, under a wire that leads by more, has longer links.
         end = max(device.tip_length for device in self._devices)
         shortest = min(device.tip_length / device.tip_links for device in self._devices)
         links = round(end / shortest)
@@ -124,7 +126,7 @@ class DeviceStack(Chain):
 
     @property
     def device_names(self) -> tuple[str, ...]:
-        """What each device is to an operator, such as "guidewire" and "catheter"."""
+        """Kind of each device, such as "guidewire" and "catheter"."""
         names: list[str] = []
         for device in self._devices:
             kind = "guidewire" if device.is_wire else "catheter"
@@ -143,22 +145,22 @@ class DeviceStack(Chain):
 
     @property
     def translations(self) -> tuple[int, ...]:
-        """Places in the action of what pushes."""
+        """Indices of the translations in the action."""
         return tuple(range(0, 2 * len(self._devices), 2))
 
     @property
     def stack(self) -> Stack:
-        """What the chain is made of, as a function of how the devices lie."""
+        """Properties of the chain as functions of insertions and rotations."""
         return self._stack
 
     @property
     def rods(self) -> Rods:
-        """The twist of the devices."""
+        """Torsional rods of the devices."""
         return self._rods
 
     @property
     def start_gaps(self) -> np.ndarray:
-        """Way (K,) from the end of each device to that of the chain at the start, m."""
+        """Distances (K,) of the devices' ends from the end of the chain at start, m."""
         return self._gaps.copy()
 
     @property
@@ -168,16 +170,12 @@ class DeviceStack(Chain):
 
     @property
     def lumen_friction(self) -> float:
-        """Coulomb coefficient between a device and the lumen that it is in."""
+        """Coulomb coefficient between a device and the lumen around it."""
         return self._lumen_friction
 
     @property
-    def buoyant_share(self) -> float:
-        """Weight in blood of a link of all devices over that in air."""
-        weight = sum(weight_density(device) for device in self._devices)
-        return weight / sum(device.linear_density for device in self._devices)
-
-    @property
     def density(self) -> float:
-        """Density (kg/m³) of a body that blood carries as much of."""
-        return BLOOD_DENSITY / (1 - self.buoyant_share)
+        """Effective density, kg/m³: its buoyancy in blood is that of all devices."""
+        weight = sum(weight_density(device) for device in self._devices)
+        mass = sum(device.linear_density for device in self._devices)
+        return BLOOD_DENSITY / (1 - weight / mass)

@@ -1,4 +1,4 @@
-"""The library of endovascular devices, and how a device is divided into links."""
+"""The library of endovascular devices, and their division into links."""
 
 import dataclasses
 import math
@@ -19,8 +19,8 @@ NITINOL_MODULUS = 48e9  # Pa, austenite in bending
 POLYURETHANE_DENSITY = 1200.0  # kg/m^3, jacket of a hydrophilic wire, unfilled
 POLYMER_POISSON_RATIO = 0.4
 METAL_POISSON_RATIO = 0.33
-# Friction of a hydrophilic coat against that of PTFE, which has half, as the coat has a
-# sixth, of that of bare steel (Schröder 1993).
+# Friction of a hydrophilic coat relative to PTFE: a sixth and a half of bare steel
+# (Schröder 1993).
 HYDROPHILIC = 1 / 3
 
 
@@ -36,7 +36,7 @@ def _metal(bending_stiffness: float) -> Section:
     return Section.isotropic(bending_stiffness, METAL_POISSON_RATIO)
 
 
-# Sources, named by the devices below.
+# Sources of the devices below.
 _HARRISON = "EI: flexural modulus in three-point bending, Harrison 2011 (11-3592.1)"
 _STEERABLE_TUBE = (
     "EI: 22.7 and 2.8 N·mm² of body and tip of a 1.33/0.8 mm steerable tube"
@@ -47,10 +47,10 @@ _FIVE_FRENCH = (
 )
 
 # The device of the registered tasks: the published discretisation of the tip (ten links
-# over 7 cm, 20 motors) on a 5F body. The published stiffness equals a rod stiffer than
-# any metal, so real ones take its place: a shaft between the body of a steerable 4F
-# tube (22.7 N·mm²) and an Amplatz wire (291 N·mm²), and that body's own figure for the
-# steerable part.
+# over 7 cm, 20 motors) on a 5F body. The published stiffness is that of a rod stiffer
+# than any metal; the stiffness of real devices replaces it: a shaft between the body of
+# a steerable 4F tube (22.7 N·mm²) and an Amplatz wire (291 N·mm²), and that body's own
+# stiffness for the tip.
 STEERABLE_5F = Device(
     name="steerable_5f",
     outer_radius=5 * FRENCH / 2,
@@ -102,14 +102,14 @@ DIAGNOSTIC_5F_SIMMONS = dataclasses.replace(
 
 
 def _straight(length: float) -> Arc:
-    """A stretch without a bend, as an arc of the largest radius that is one."""
+    """A straight section, as an arc of a very large radius."""
     return Arc(1e3, length / 1e3)
 
 
-_OUTLINE = "one bend, as the type has it; its size assumed, to some 10° and 2 mm"
+_OUTLINE = "one bend, as the type has; its size assumed, within some 10° and 2 mm"
 
-# A single bend near the end, the short one steep, the long one gentle: the catheters
-# that carotids are tried with first.
+# Catheters with a single bend near the end, steep and short or gentle and long: the
+# first choice for carotids.
 BERENSTEIN_5F = dataclasses.replace(
     DIAGNOSTIC_5F_J,
     name="berenstein_5f",
@@ -123,8 +123,8 @@ VERTEBRAL_5F = dataclasses.replace(
     source=f"{_FIVE_FRENCH}; {_OUTLINE}: 45° over 14 mm, then 10 mm straight",
 )
 
-# Distal part of a 2.1F tube of 0.021 inch lumen: I = π (R⁴ - r⁴) / 4 = 7.9e-15 m⁴, in
-# polyether block amides of the moduli on the data sheets of Pebax 5533 and 4033.
+# Distal part of a 2.1F tube of 0.021 inch lumen: I = π (R⁴ - r⁴) / 4 = 7.9e-15 m⁴, of
+# polyether block amides with the moduli of the data sheets of Pebax 5533 and 4033.
 MICROCATHETER_021 = Device(
     name="microcatheter_021",
     outer_radius=2.1 * FRENCH / 2,
@@ -147,7 +147,7 @@ def _guidewire(name: str, shaft: float) -> Device:
         outer_radius=radius,
         linear_density=_tube_density(radius, 0.0, NITINOL_DENSITY),
         shaft=_metal(shaft),
-        # Floppy ends are an order of magnitude softer than their shafts.
+        # A floppy end is an order of magnitude softer than its shaft.
         tip=_metal(shaft / 10),
         tip_shape=(Arc(12.1e-3, math.radians(72)),),
         attenuation=materials.STEEL_WIRE,
@@ -180,7 +180,15 @@ def _hydrophilic_wire(
     bend: Arc,
     tip_links: int,
 ) -> Device:
-    """A jacketed wire with a nitinol core; its diameters in shaft and tip, m."""
+    """A jacketed wire with a nitinol core.
+
+    Args:
+        name: name of the device.
+        outer: outer diameter, m.
+        cores: diameters of the core in shaft and tip, m.
+        bend: bend of the tip, before 4 mm straight.
+        tip_links: number of links of the tip.
+    """
     shaft, tip = cores
     jacket = _tube_density(outer / 2, shaft / 2, POLYURETHANE_DENSITY)
     core = _tube_density(shaft / 2, 0.0, NITINOL_DENSITY)
@@ -240,24 +248,22 @@ DEVICES: dict[str, Device] = {
 }
 
 
-# Names that devices had before; runs and scripts that were made then say them.
-FORMER_NAMES = {"published": "steerable_5f"}
-PUBLISHED = STEERABLE_5F
+# Deprecated names of devices.
+_DEPRECATED = {"published": "steerable_5f"}
 
 
 def get(device: "str | Device") -> Device:
-    """Returns a device by name; a `Device` is returned as it is.
+    """Returns a device by name, or the given `Device` itself.
 
     Raises:
-      ValueError: if no device has that name.
+        ValueError: if no device has that name.
     """
     if isinstance(device, Device):
         return device
-    if isinstance(device, str) and device in FORMER_NAMES:
-        name = FORMER_NAMES[device]
+    if isinstance(device, str) and device in _DEPRECATED:
+        name = _DEPRECATED[device]
         warnings.warn(
-            f"device {device!r} is called {name!r} now: only the layout of its tip is "
-            "that of the publication",
+            f"the device name {device!r} is deprecated; use {name!r} now",
             FutureWarning,
             stacklevel=2,
         )
@@ -271,14 +277,14 @@ def get(device: "str | Device") -> Device:
 
 @dataclasses.dataclass(frozen=True)
 class Discretisation:
-    """How a device is divided into rigid links.
+    """Division of a device into rigid links.
 
     Attributes:
-      working_length: length of the simulated distal part, m.
-      shaft_link: longest link of the shaft, m. The default is what the convergence
-        study in docs/validation.md supports.
-      torsion_joints: hinges about the device's axis, evenly spread along the shaft.
-        0 makes the shaft torsionally rigid.
+        working_length: length of the simulated distal part, m.
+        shaft_link: longest link of the shaft, m. The convergence study in
+            docs/validation.md supports the default.
+        torsion_joints: number of hinges about the device's axis, evenly spread along
+            the chain. 0 makes it torsionally rigid.
     """
 
     working_length: float = 0.35
@@ -295,15 +301,15 @@ class Discretisation:
         return self.divided(device.tip_length, device.tip_links, repr(device.name))
 
     def divided(self, tip_length: float, tip_links: int, name: str) -> np.ndarray:
-        """Lengths (n,) of the links of a chain whose end has shorter ones, m.
+        """Lengths (n,) of the links of a chain with shorter links at its end, m.
 
         Args:
-          tip_length: of that end, m.
-          tip_links: number of links that it is divided into.
-          name: of the device, for the error.
+            tip_length: length of that end, m.
+            tip_links: number of its links.
+            name: name of the device, for the error.
 
         Raises:
-          ValueError: if the end alone is as long as the chain.
+            ValueError: if the end is as long as the chain.
         """
         shaft_length = self.working_length - tip_length
         if shaft_length <= 0:

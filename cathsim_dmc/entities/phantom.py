@@ -1,4 +1,4 @@
-"""The phantom: the wall of an anatomy as convex pieces, its goals and its sensors."""
+"""The phantom: the wall of an anatomy as convex pieces, with goals and sensors."""
 
 import numpy as np
 from dm_control import composer, mjcf
@@ -6,8 +6,8 @@ from dm_control import composer, mjcf
 from cathsim_dmc.anatomy import Anatomy
 from cathsim_dmc.entities.contact import FRICTION, wall_contact
 
-# Contacts that the wall sensor can report. A device jammed in a narrow tube has about
-# a hundred; `Contacts.found` tells when there are more.
+# Largest number of contacts that the wall sensor reports. A device jammed in a narrow
+# tube has about a hundred; `Contacts.found` is the true number.
 MAX_CONTACTS = 192
 CONTACT_FIELDS = ("found", "force", "dist", "pos", "normal", "tangent")
 
@@ -28,10 +28,10 @@ class Phantom(composer.Entity):
         """Builds the wall.
 
         Args:
-          anatomy: lumen, wall pieces and goals.
-          friction: Coulomb coefficient of device on wall.
-          goal_radius: of the goal sites, m.
-          name: of the entity.
+            anatomy: lumen, wall pieces and goals.
+            friction: Coulomb coefficient of the device on the wall.
+            goal_radius: radius of the goal sites, m.
+            name: name of the entity.
         """
         if not 0 <= friction <= 2:
             raise ValueError(f"friction is {friction}; it must be between 0 and 2")
@@ -39,7 +39,7 @@ class Phantom(composer.Entity):
         self._mjcf_root = mjcf.RootElement(model=name)
         self._body = self._mjcf_root.worldbody.add("body", name="wall")
         self._friction = friction
-        self._add_looks()
+        self._add_surface()
         self._goals = {
             goal.name: self._body.add(
                 "site",
@@ -52,7 +52,7 @@ class Phantom(composer.Entity):
             for goal in anatomy.goals.values()
         }
 
-    def _add_looks(self):
+    def _add_surface(self):
         surface = self._anatomy.surface
         self._mjcf_root.asset.add(
             "mesh",
@@ -72,19 +72,19 @@ class Phantom(composer.Entity):
             rgba=_LUMEN_COLOUR,
         )
 
-    def stand(self, device_body) -> None:
-        """Puts the wall into the world, with sensors of what a device does to it.
+    def add_wall(self, device_body) -> None:
+        """Adds the wall pieces and the sensors of their contacts with a device.
 
-        The pieces belong to the world itself, not to a body of the phantom: MuJoCo's
-        broad phase goes through every piece of every other body in every step, which
-        took a sixth of a free one.
+        The pieces are geoms of the world body, not of a body of the phantom: MuJoCo's
+        broad phase visits every geom of every other body in every step, which takes a
+        sixth of a step without contacts.
 
         Args:
-          device_body: root body of the device, an element of the same model tree.
+            device_body: root body of the device, an element of the same model tree.
         """
         root = self._mjcf_root.root_model
-        # What the pieces have in common is said once, and their vertices are binary:
-        # as text in each of some 600 geoms they took most of the time to compile.
+        # A default class and binary vertices: as text in each of some 600 geoms, they
+        # take most of the compile time.
         shared = self._mjcf_root.default.add("default", dclass="wall")
         shared.mesh.inertia = "shell"
         shared.geom.set_attributes(
@@ -105,7 +105,7 @@ class Phantom(composer.Entity):
             data=" ".join(CONTACT_FIELDS),
             reduce="none",
         )
-        # A load cell under the phantom carries what the contacts add up to.
+        # A load cell under the phantom carries the sum of the contacts.
         root.sensor.add(
             "contact",
             name="load_cell",
@@ -127,7 +127,7 @@ class Phantom(composer.Entity):
 
     @property
     def body(self):
-        """The static body that carries looks and goals."""
+        """The static body of the drawn surface and the goals."""
         return self._body
 
     @property
@@ -140,8 +140,8 @@ def _mesh_file(vertices: np.ndarray, faces: np.ndarray | None = None) -> mjcf.As
     """A mesh in MuJoCo's own binary format (MSH).
 
     Args:
-      vertices: (n, 3), m.
-      faces: (m, 3) numbers of vertices; None for the convex hull.
+        vertices: (n, 3), m.
+        faces: (m, 3) indices of vertices; None for the convex hull.
     """
     faces = np.empty((0, 3)) if faces is None else faces
     counts = np.array([len(vertices), 0, 0, len(faces)], dtype="<i4")

@@ -3,31 +3,31 @@
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-# The first link has no hinge: the line must begin along it. rad
+# Largest angle between the first link, which has no hinge, and the line, rad.
 _LARGEST_START_ANGLE = 1e-3
 
 
 def joints_along(
     link_lengths: ArrayLike, line: ArrayLike, advance: float = 0.0
 ) -> NDArray[np.float64]:
-    """Angles of the bending hinges that put every node of a chain on a line.
+    """Angles of the bending hinges that place every node of a chain on a line.
 
-    The chain is that of `entities.catheter`: link 0 slides along +z, every further
-    link bends about x, then about y of the link before it. Twist is zero, so rows in
-    order are the positions of `Catheter.bends`.
+    In the chain of `entities.catheter`, link 0 slides along +z, and every other link
+    bends about x, then about y of the previous link. Twist is zero. The rows are the
+    positions of `Catheter.bends` in order.
 
     Args:
-      link_lengths: (n,) lengths of the links from proximal to distal, m.
-      line: points (k, 3) of the line, m, from the proximal end of link 0 at zero
-        insertion, in its frame: the line begins along +z, at least as far as
-        `advance` and link 0 reach.
-      advance: insertion of the chain, m: its way along the line from the first point.
+        link_lengths: (n,) lengths of the links from proximal to distal, m.
+        line: points (k, 3) of the line, m, from the proximal end of link 0 at zero
+            insertion, in its frame; straight along +z over at least `advance` and the
+            length of link 0.
+        advance: insertion of the chain, m: arc length from the first point of the line.
 
     Returns:
-      (n - 1, 2) float64, rad: about x and about y of joints 1 to n - 1.
+        (n - 1, 2) float64, rad: about x and about y of joints 1 to n - 1.
 
     Raises:
-      ValueError: if the line is too short, or does not begin along +z.
+        ValueError: if the line is too short, or does not begin along +z.
     """
     lengths = np.asarray(link_lengths, np.float64)
     points = np.asarray(line, np.float64)
@@ -39,21 +39,21 @@ def bends_of(directions: NDArray[np.float64]) -> NDArray[np.float64]:
     """Angles of the bending hinges of a chain whose links point in given directions.
 
     Args:
-      directions: unit vectors (n, 3) of the links in the frame of link 0; the first
-        is +z.
+        directions: unit vectors (n, 3) of the links in the frame of link 0; the first
+            is +z.
 
     Returns:
-      (n - 1, 2) float64, rad: about x and about y of joints 1 to n - 1.
+        (n - 1, 2) float64, rad: about x and about y of joints 1 to n - 1.
 
     Raises:
-      ValueError: if the first link does not point along +z.
+        ValueError: if the first link does not point along +z.
     """
     start = float(np.arccos(np.clip(directions[0, 2], -1.0, 1.0)))
     if start > _LARGEST_START_ANGLE:
         raise ValueError(
             f"link 0 points {np.degrees(start):.2f}° away from +z, but it has no "
-            "hinge; begin the line with a straight piece along +z, as long as the link "
-            "and the way that it is advanced"
+            "hinge; begin the line with a straight piece along +z, as long as link 0 "
+            "and `advance` together"
         )
     frame = np.eye(3)
     angles = np.empty((len(directions) - 1, 2))
@@ -66,7 +66,7 @@ def bends_of(directions: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _nodes(lengths: np.ndarray, points: np.ndarray, advance: float) -> np.ndarray:
-    """Nodes (n + 1, 3) on the line, each one link from the one before it."""
+    """Nodes (n + 1, 3) on the line, a link length apart."""
     steps = np.linalg.norm(np.diff(points, axis=0), axis=-1)
     arc = np.concatenate([[0.0], np.cumsum(steps)])
     if not 0 <= advance < arc[-1]:
@@ -78,12 +78,12 @@ def _nodes(lengths: np.ndarray, points: np.ndarray, advance: float) -> np.ndarra
     nodes = [points[piece] + share * (points[piece + 1] - points[piece])]
     for number, length in enumerate(lengths):
         centre = nodes[-1]
-        # First point of the line, from the last node on, that is one link away.
+        # First point of the line after the last node at least one link away.
         beyond = np.linalg.norm(points[piece + 1 :] - centre, axis=-1) >= length
         if not beyond.any():
             raise ValueError(
                 f"the line is {1e3 * arc[-1]:.1f} mm long and ends before link "
-                f"{number} of {len(lengths)}; the chain takes "
+                f"{number} of {len(lengths)}; the chain needs "
                 f"{1e3 * (advance + lengths.sum()):.1f} mm"
             )
         following = piece + int(np.argmax(beyond))
@@ -94,7 +94,7 @@ def _nodes(lengths: np.ndarray, points: np.ndarray, advance: float) -> np.ndarra
 
 
 def _crossing(begin, end, centre, radius: float) -> np.ndarray:
-    """Point between two points, the first in a sphere, the second not, on it."""
+    """Intersection of a segment that leaves a sphere with the sphere."""
     way, offset = end - begin, begin - centre
     a, b, c = way @ way, way @ offset, offset @ offset - radius**2
     return begin + (-b + np.sqrt(b * b - a * c)) / a * way

@@ -1,22 +1,21 @@
-"""Follower of a CathBot-like catheter robot: looks and joints, no forces.
+"""Follower of a CathBot-like catheter robot: geometry and joints, no forces.
 
 A main rail carries four platforms on prismatic joints. From the patient
 backwards: front clamps, catheter rotary unit, rear clamps, guidewire rotary
-unit. The two pairs of clamps hold one device in turn while it advances, or one of
-two devices each; the rotary units turn them and let them slide between their rollers.
+unit. The two pairs of clamps grip one device in turn while it advances, or one of two
+devices each; the rotary units turn the devices and let them slide between rollers.
 
 **Frame.** ``+z`` runs along the device towards the patient, the origin is the
 proximal mouth of the introducer sheath and the device lies on the ``z`` axis.
-``+y`` is down: in the LPS frame of a supine patient that is posterior, so a
-robot attached without rotation lies on the table below the device. ``+x`` is
-then the patient's left.
+``+y`` is down: posterior in the LPS frame of a supine patient, so a robot attached
+without rotation lies on the table below the device. ``+x`` is then the patient's
+left.
 
-**Motion** is perfect, as in the published system: the device's own joints are
-driven and the robot is posed after them. :func:`follower_posture` gives every
-robot joint as a function of how far the device was pushed and turned; the task
-writes that into the simulation. The joints are ordinary
-slides and hinges which nothing pushes (gravity compensated, no actuator, no
-contact, no limit in the solver): between two poses they stand still.
+**Motion** is perfect, as in the published system: the joints of the device are driven,
+and the robot is posed accordingly. :func:`follower_posture` gives every robot joint as
+a function of insertion and rotation; the task writes the joints into the simulation.
+They are slides and hinges without load (gravity compensated, no actuator, no contact,
+no limit in the solver), so they do not move between two poses.
 """
 
 from __future__ import annotations
@@ -29,11 +28,11 @@ import numpy as np
 from dm_control import composer, mjcf
 from numpy.typing import ArrayLike, NDArray
 
-# --- The clamp-advance-release cycle, measured in metres of device insertion. ---
-# The stroke is a choice: short enough for a rail of 0.35 m, long enough that a
-# hand-over happens about once a second at the fastest push (40 mm/s).
+# --- The clamp-advance-release cycle, in metres of insertion. ---
+# The stroke fits a rail of 0.35 m, and the clamps change about once a second at the
+# fastest push (40 mm/s).
 STROKE = 0.040  # m, insertion over which a pair of clamps stays closed
-OVERLAP = 0.002  # m, both pairs are closed at each hand-over
+OVERLAP = 0.002  # m, both pairs are closed at each change
 JAW_TRAVEL = 0.004  # m, insertion during which the jaws open, or close
 CYCLE = 2 * (STROKE - OVERLAP)  # m, the two pairs work half a cycle apart
 RETURN = CYCLE - STROKE - 2 * JAW_TRAVEL  # m, insertion while a platform returns
@@ -51,13 +50,13 @@ GEAR_MODULE = 0.002  # m of pitch diameter per tooth
 PINION_ANGLE = np.deg2rad(25.0)  # about z from +x: beside the ring, a little below
 PLATFORM_RANGE = 0.026  # m, either side of home; the cycle itself needs 0.0249
 
-# Nothing is ever accelerated by a force here, so real masses would only enter the
-# mean inertia of the model, which scales the solver's stopping rule for the
-# catheter. Masses are therefore a trifle; damping calms a viewer's mouse.
+# No force accelerates the robot. Real masses would only raise the mean inertia of the
+# model, which scales the solver's tolerance for the catheter, so the masses are small.
+# Damping limits the motion under a viewer's mouse.
 GEOM_MASS = 2e-5  # kg
 SLIDE_DAMPING = 1.0  # N s/m
 HINGE_DAMPING = 1e-4  # N m s/rad
-VISUAL_GROUP = 2  # geom group of everything drawn for looks
+VISUAL_GROUP = 2  # geom group of geoms that are drawn only
 
 #: name, RGBA, specular, shininess
 MATERIALS = (
@@ -112,7 +111,7 @@ JOINTS: tuple[RobotJoint, ...] = (
 )
 
 
-# Insertion 0 lies in the middle of an overlap: both pairs hold at the start.
+# Insertion 0 lies in the middle of an overlap: both pairs are closed at the start.
 _FRONT_PHASE, _REAR_PHASE = OVERLAP / 2, OVERLAP / 2 + CYCLE / 2
 
 # One number, or an array of them.
@@ -120,13 +119,13 @@ Scalars = float | NDArray[np.float64]
 
 
 def _clamp(insertion: Scalars, offset: float) -> tuple[Scalars, Scalars]:
-    """One pair of clamps: travel of its platform from home, opening of each jaw, m.
+    """Travel of a pair's platform from home, and opening of each of its jaws, m.
 
-    A platform moves with the device while its jaws are closed, opening or closing,
-    and swings back in between: the insertion minus a smooth staircase,
-    ``travel = phase - STROKE / 2 - CYCLE * smoothstep(return progress)``. Both
-    position and speed are continuous. It depends on the insertion alone, so a
-    withdrawn device retraces it backwards.
+    A platform moves with the device while its jaws are closed, opening or closing, and
+    returns in between:
+    ``travel = phase - STROKE / 2 - CYCLE * smoothstep(return progress)``. Position and
+    speed are continuous. Both depend on the insertion alone, so a withdrawal reverses
+    the motion.
     """
     # The jaws are closed over phases [0, STROKE].
     phase = (insertion + offset) % CYCLE
@@ -137,8 +136,8 @@ def _clamp(insertion: Scalars, offset: float) -> tuple[Scalars, Scalars]:
 
 
 def _smoothstep(u: Scalars) -> Scalars:
-    # Plain floats are worth it: this runs in every control step, on caches that the
-    # physics has just filled, where each call of numpy takes microseconds.
+    # Plain floats are faster than numpy here: this runs in every control step, on
+    # caches that the physics has just filled.
     if not isinstance(u, float):
         u = np.clip(u, 0.0, 1.0)
     elif u <= 0.0:
@@ -155,22 +154,22 @@ def follower_posture(
     guidewire_insertion: ArrayLike | None = None,
     guidewire_rotation: ArrayLike | None = None,
 ) -> NDArray[np.float64]:
-    """Every joint of the follower for a device pushed and turned so far.
+    """Joint positions of the follower for an insertion and a rotation.
 
     Args:
-      insertion: (...,) metres from the start, positive into the patient.
-      rotation: (...,) radians about +z from the start.
-      guidewire_insertion: (...,) metres; the catheter's if omitted: both pairs of
-        clamps and both rotary units then work on one device. With a guidewire of its
-        own, the front clamps hold the catheter and the rear ones the guidewire.
-      guidewire_rotation: (...,) radians; the catheter's if omitted.
+        insertion: (...,) metres from the start, positive into the patient.
+        rotation: (...,) radians about +z from the start.
+        guidewire_insertion: (...,) metres; the catheter's if omitted, so that both
+            pairs of clamps and both rotary units hold one device. Otherwise the front
+            clamps hold the catheter and the rear clamps the guidewire.
+        guidewire_rotation: (...,) radians; the catheter's if omitted.
 
     Returns:
-      (..., len(JOINTS)) float64 in the order of ``JOINTS``; metres for slides,
-      radians for hinges, continuous in every argument (angles do not wrap).
+        (..., len(JOINTS)) float64 in the order of ``JOINTS``; metres for slides,
+        radians for hinges, continuous in every argument (angles do not wrap).
 
     Raises:
-      ValueError: an argument is not finite, or the shapes do not broadcast.
+        ValueError: an argument is not finite, or the shapes do not broadcast.
     """
     given = (
         insertion,
@@ -201,8 +200,8 @@ def _posture(
     """The joints in the order of ``JOINTS``."""
     front, front_opening = _clamp(pushed, _FRONT_PHASE)
     rear, rear_opening = _clamp(wire_pushed, _REAR_PHASE)
-    # The catheter unit stays half-way between the clamps, so the free lengths of
-    # shaft either side of it stay equal; the guidewire unit rides with the rear.
+    # The catheter unit stays half-way between the clamps, so the free lengths of shaft
+    # on both sides are equal; the guidewire unit moves with the rear clamps.
     middle = (front + rear) / 2
     return (
         *(front, middle, rear, rear),
@@ -213,7 +212,7 @@ def _posture(
 
 
 def _wheels(slip: Scalars, turned: Scalars) -> tuple[Scalars, ...]:
-    """Ring, pinion and rollers; ``slip`` is how far the device is past the platform."""
+    """Ring, pinion and rollers; ``slip`` is the device relative to the platform, m."""
     rolled = slip / ROLLER_RADIUS
     return turned, -turned * (RING_TEETH / PINION_TEETH), rolled, -rolled
 
@@ -225,12 +224,12 @@ class Robot(composer.Entity):
         """Builds the model.
 
         Args:
-          device_radius: metres; jaws and rollers touch a device this thick.
-          name: name of the model, the prefix of its elements once attached.
+            device_radius: radius of the device between jaws and rollers, m.
+            name: name of the model, the prefix of its elements once attached.
         """
         if not 1e-4 <= device_radius <= 4e-3:
             raise ValueError(
-                f"device_radius is {device_radius} m, allowed are 1e-4 to 4e-3 m "
+                f"device_radius is {device_radius} m; allowed are 1e-4 to 4e-3 m "
                 "(devices up to 24 French); did you mean millimetres?"
             )
         self._device_radius = device_radius
@@ -301,7 +300,7 @@ class Robot(composer.Entity):
             self._mjcf_root.worldbody, f"{name}_platform", (0, 0, home), (0, 0, 1)
         )
         _box(body, "plate", (0, 0.030, 0), (0.042, 0.004, half_length), "graphite")
-        # One block rides on both rods, one stripe shows on both flanks.
+        # One block spans both rods, one stripe both flanks.
         _box(body, "block", (0, 0.040, 0), (0.032, 0.006, 0.017), "steel")
         half_sizes = (0.0427, 0.0022, half_length - 0.003)
         _box(body, "stripe", (0, 0.030, 0), half_sizes, accent)
@@ -346,7 +345,7 @@ class Robot(composer.Entity):
             roller = self._add_body(ring, f"{name}_roller_{word}", at, (0, 1, 0))
             start, end = (0, -0.005, 0), (0, 0.005, 0)
             _rod(roller, "tyre", start, end, ROLLER_RADIUS, "rubber")
-            # A stripe, without which a turning cylinder looks still.
+            # A stripe makes the rotation of the cylinder visible.
             _box(roller, "stripe", (0, 0, 0), (0.0052, 0.0044, 0.001), accent)
 
         pinion = self._add_body(platform, f"{name}_pinion", (x, y, 0.002), (0, 0, 1))
@@ -355,7 +354,7 @@ class Robot(composer.Entity):
         _gear(pinion, PINION_TEETH, gap, "brass")
 
     def _add_body(self, parent, name: str, pos, axis) -> mjcf.Element:
-        """A body with gravity compensated, and its one joint of the same name."""
+        """Adds a body with compensated gravity and one joint of the same name."""
         body = parent.add("body", name=name, pos=pos, gravcomp=1)
         joint = self._kinds[name]
         slides = joint.kind == "slide"
@@ -397,7 +396,7 @@ def _gear(body, teeth: int, angle: float, material: str) -> None:
     root_radius = pitch - 0.8 * GEAR_MODULE
     _rod(body, "blank", (0, 0, -0.004), (0, 0, 0.004), root_radius, material)
     half_sizes = (pitch + 0.75 * GEAR_MODULE, 0.9 * GEAR_MODULE, 0.0038)
-    for i in range(teeth // 2):  # a box across the gear makes two opposite teeth
+    for i in range(teeth // 2):  # a box makes two opposite teeth
         half_turn = (angle + 2 * np.pi * i / teeth) / 2
         quat = (np.cos(half_turn), 0, 0, np.sin(half_turn))
         _box(body, f"teeth_{i}", (0, 0, 0), half_sizes, material, quat)

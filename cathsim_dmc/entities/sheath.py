@@ -7,39 +7,38 @@ from cathsim_dmc.entities.catheter import Catheter
 from cathsim_dmc.entities.contact import CONTACT_SOLIMP, CONTACT_SOLREF, sheath_contact
 
 CLEARANCE = 0.35e-3  # m between the device and each side of the bore
-# Thickness of the sides, m: their front covers the hole in the cap of the inlet, and
-# a loaded shaft cannot tunnel through them.
+# Thickness of the sides, m: their front covers the hole in the cap of the inlet, and a
+# loaded shaft cannot tunnel through them.
 WALL = 8e-3
-# Longest way behind the mouth that has flat sides and a sharp rim, m. It is where the
-# device leans on the sheath with a bending moment.
+# Longest part behind the mouth with flat sides and a sharp rim, m. There the device
+# leans on the sheath with a bending moment.
 _MOUTH_LENGTH = 0.02
-# A straight piece of rod leaves the line by no more than this, m.
+# Largest distance of a straight piece of rod from the line, m.
 _CHORD_TOLERANCE = 0.1e-3
-_SPACING = 0.5e-3  # m, of the points at which a curved line is looked at
-_LEAST_CURVE_RADIUS = 0.01  # m, no device of ours is led round a sharper bend
+_SPACING = 0.5e-3  # m, of the points that sample a curved line
+_LEAST_CURVE_RADIUS = 0.01  # m
 _VISIBLE_WALL = 0.4e-3  # m, as drawn
 _COLOUR = (0.35, 0.45, 0.6, 0.35)
 _SIDES = {"right": (1, 0), "left": (-1, 0), "top": (0, 1), "bottom": (0, -1)}
 
 
 def straight(length: float) -> np.ndarray:
-    """Line (2, 3) of a straight sheath of a length in m, along +z to the origin."""
+    """Line (2, 3) along +z to the origin, of a straight sheath of a length in m."""
     return np.array([[0.0, 0.0, -length], [0.0, 0.0, 0.0]])
 
 
 class Sheath(composer.Entity):
     """A bore that follows a line; its mouth is the line's last point.
 
-    Published and real followers grip the device just outside the sheath and support
-    it up to there; the bore reaches back over the whole chain and stands for both.
-    Friction of clamps and valve is not modelled ("perfect motion"), so the bore has
-    none.
+    Real followers grip the device just outside the sheath and support it up to there.
+    The bore reaches back over the whole chain and represents both. Friction of clamps
+    and valve is not modelled ("perfect motion"), so the bore has none.
 
-    The bore is square. The last piece before the mouth has flat sides and a sharp rim:
-    four boxes, which few links are near. The rest lies between four rods, chains of
-    capsules that turn with the line: a link against a rod is MuJoCo's cheapest test,
-    and a chain of them has no edge at which a link could catch. `guide` lists in the
-    model which link is tested against which rod.
+    The bore is square. The last piece before the mouth is four boxes with flat sides
+    and a sharp rim. The rest is four rods, chains of capsules that turn with the line:
+    capsule against capsule is MuJoCo's cheapest collision test, and a chain of capsules
+    has no edge at which a link could catch. `guide` lists the pairs of links and rods
+    that collide.
     """
 
     def _build(
@@ -53,18 +52,19 @@ class Sheath(composer.Entity):
         """Builds the sides of the bore.
 
         Args:
-          centreline: points (n, 3) of the axis of the bore from its proximal end to
-            its mouth, m, in the frame of the entity; `straight` gives a straight one.
-          device_radius: outer radius of the device that it guides, m.
-          link_length: longest link of the device, m. Links are straight, so in a bend
-            their middles lie further in than their ends; the inner side of the bend
-            is that much wider. Without effect where the line is straight.
-          wall: thickness of the sides, m.
-          name: name of the entity.
+            centreline: points (n, 3) of the axis of the bore from its proximal end to
+                its mouth, m, in the frame of the entity; `straight` gives a straight
+                one.
+            device_radius: outer radius of the guided device, m.
+            link_length: longest link of the device, m. Links are straight, so in a bend
+                their middles lie inside the line; the inner side of the bend is wider
+                by that distance. No effect where the line is straight.
+            wall: thickness of the sides, m.
+            name: name of the entity.
 
         Raises:
-          ValueError: if the line has fewer than two points, repeats a point or bends
-            with a radius below 10 mm, or if a size is not positive.
+            ValueError: if the line has fewer than two points, repeats a point or bends
+                with a radius below 10 mm, or if a size is not positive.
         """
         for what, value in (("device_radius", device_radius), ("wall", wall)):
             if not value > 0:
@@ -73,11 +73,12 @@ class Sheath(composer.Entity):
         self._axis = _Axis(centreline)
         self._mjcf_root = mjcf.RootElement(model=name)
         self._bore = self._mjcf_root.worldbody.add("body", name="bore")
-        # A body of its own: the broad phase takes a body for as long as all its geoms.
+        # A body of its own, because the broad phase bounds all geoms of a body
+        # together.
         self._mouth = self._mjcf_root.worldbody.add("body", name="mouth")
         faces, outwards = self._axis.sides(self._bore_half_width, link_length)
         last = len(self._axis.arcs) - 2
-        # Sides of the bore, piece by piece from the proximal end.
+        # Sides of the bore, by piece from the proximal end.
         self._pieces: list[list] = []
         for index in range(last + 1):
             add = self._add_box if index == last else self._add_rod
@@ -106,7 +107,7 @@ class Sheath(composer.Entity):
             )
 
     def _add_rod(self, name: str, face: np.ndarray, outwards: np.ndarray, wall: float):
-        """A rod that touches a line (2, 3) of the bore's face from outside."""
+        """Adds a rod that touches a line (2, 3) of the bore's face from outside."""
         return self._bore.add(
             "geom",
             name=name,
@@ -120,7 +121,7 @@ class Sheath(composer.Entity):
         )
 
     def _add_box(self, name: str, face: np.ndarray, outwards: np.ndarray, wall: float):
-        """A box whose inner face has a middle line (2, 3)."""
+        """Adds a box whose inner face has a middle line (2, 3)."""
         along = face[1] - face[0]
         length = np.linalg.norm(along)
         along /= length
@@ -139,22 +140,21 @@ class Sheath(composer.Entity):
         )
 
     def guide(self, catheter: Catheter, start_depth: float) -> None:
-        """Lets the rods touch a catheter, once both are attached to one model.
+        """Adds the contact pairs of rods and links; both must be attached to one model.
 
         Args:
-          catheter: the device in the bore.
-          start_depth: way of the device's head past the mouth at zero insertion, m;
-            negative while it is inside. Only pieces and links that can meet are
-            paired.
+            catheter: the device in the bore.
+            start_depth: distance of the device's head past the mouth at zero insertion,
+                m; negative inside. Only pieces and links that can meet are paired.
         """
         contact = self._mjcf_root.root_model.contact
         lengths = catheter.link_lengths
-        # Way of the links' proximal ends past the proximal end of the sheath.
+        # Distance of the links' proximal ends past the proximal end of the sheath.
         starts = self.length + start_depth - np.cumsum(lengths[::-1])[::-1]
         # Bends and the axial compliance shift a link by less than its own length.
         spare = lengths.max()
-        # Every other link would hold all nodes too, but half the contacts give way
-        # twice as far: 0.6 mm in place of 0.25 mm under 1 N on a link.
+        # All links are paired: with every other link, 1 N on a link makes a depth of
+        # 0.6 mm instead of 0.25 mm.
         for link, (start, length) in enumerate(zip(starts, lengths, strict=True)):
             for index, sides in enumerate(self._pieces[:-1]):
                 low, high = self._axis.arcs[index : index + 2]
@@ -168,7 +168,7 @@ class Sheath(composer.Entity):
                         name=f"{self._mjcf_root.model}_{side.name}_link_{link}",
                         geom1=side,
                         geom2=catheter.link_geoms[link],
-                        # One row a contact: frictionless whatever the device is.
+                        # Frictionless for every device: one row a contact.
                         condim=1,
                         solref=CONTACT_SOLREF,
                         solimp=CONTACT_SOLIMP,
@@ -181,7 +181,7 @@ class Sheath(composer.Entity):
 
     @property
     def bodies(self) -> tuple:
-        """The static bodies of the sheath: the bore, and its mouth."""
+        """The static bodies of the sheath: bore and mouth."""
         return self._bore, self._mouth
 
     @property
@@ -196,13 +196,13 @@ class Sheath(composer.Entity):
 
 
 class _Axis:
-    """The line of a sheath as few straight pieces, with a frame that does not twist.
+    """The line of a sheath as straight pieces with a twist-free frame.
 
     Attributes:
-      vertices: (p + 1, 3), ends of the pieces, m.
-      arcs: (p + 1,), their arc lengths, m.
-      tangents: (p + 1, 3), unit directions of the line at the vertices.
-      normals: (p + 1, 2, 3), unit vectors across it, turned along without twist.
+        vertices: (p + 1, 3), ends of the pieces, m.
+        arcs: (p + 1,), arc lengths of the vertices, m.
+        tangents: (p + 1, 3), unit directions of the line at the vertices.
+        normals: (p + 1, 2, 3), unit vectors across it, transported without twist.
     """
 
     def __init__(self, centreline: np.ndarray):
@@ -214,7 +214,7 @@ class _Axis:
         steps = np.linalg.norm(np.diff(points, axis=0), axis=-1)
         if not (np.isfinite(steps).all() and (steps > 0).all()):
             raise ValueError(
-                "centreline repeats a point or holds a number that is not finite"
+                "centreline repeats a point or has a coordinate that is not finite"
             )
         arc = np.concatenate([[0.0], np.cumsum(steps)])
         self._fine_arc = np.linspace(0, arc[-1], max(2, round(arc[-1] / _SPACING) + 1))
@@ -231,7 +231,7 @@ class _Axis:
         self.normals = _untwisted(tangents)[chosen]
 
     def _check_bends(self, tangents: np.ndarray) -> None:
-        # Over a stretch, so that a line given by a few points is not all corners.
+        # Over a window, because a line given by a few points has corners.
         window = round(_LEAST_CURVE_RADIUS / _SPACING)
         if len(tangents) <= window:
             return
@@ -244,7 +244,7 @@ class _Axis:
             )
 
     def _pieces(self) -> list[int]:
-        """Indices of the fine points between which a straight piece will do."""
+        """Indices of the fine points at the ends of the straight pieces."""
         chosen, last = [0], len(self._fine) - 1
         while chosen[-1] < last:
             start = chosen[-1]
@@ -271,15 +271,15 @@ class _Axis:
     def sides(
         self, half_width: float, link_length: float
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Middle lines of the four faces of the bore, and the ways out of it.
+        """Middle lines of the four faces of the bore, and their outward normals.
 
         Args:
-          half_width: from the axis to a face where the line is straight, m.
-          link_length: chord that the bore must let pass, m.
+            half_width: from the axis to a face where the line is straight, m.
+            link_length: length of the chord that must fit into the bore, m.
 
         Returns:
-          points (p + 1, 4, 3) of the faces, m; unit vectors (p + 1, 4, 3) from the
-          axis to them.
+            points (p + 1, 4, 3) of the faces, m; unit vectors (p + 1, 4, 3) from the
+            axis to them.
         """
         inwards = self._sagitta(link_length)
         outwards = np.einsum("sa,pad->psd", list(_SIDES.values()), self.normals)
@@ -288,11 +288,11 @@ class _Axis:
         return faces, outwards
 
     def _sagitta(self, chord: float) -> np.ndarray:
-        """(p + 1, 3): from the line to the middle of a chord with ends on it, m."""
+        """Vectors (p + 1, 3) from the line to the middle of a chord of it, m."""
         half, end = chord / 2, self._fine_arc[-1]
         if not 0 < chord < end:
             return np.zeros_like(self.vertices)
-        # Beyond the ends the line is unknown: it goes on bending as it does there.
+        # Beyond its ends, the line is assumed to bend as at its ends.
         arcs = np.clip(self.arcs, half, end - half)
 
         def at(arc: np.ndarray) -> np.ndarray:
@@ -304,7 +304,7 @@ class _Axis:
 
 
 def _untwisted(tangents: np.ndarray) -> np.ndarray:
-    """Two normals (n, 2, 3) carried along unit tangents (n, 3) without twist."""
+    """Two normals (n, 2, 3) transported along unit tangents (n, 3) without twist."""
     x = np.array([1.0, 0.0, 0.0])
     if abs(tangents[0] @ x) > 0.9:
         x = np.array([0.0, 0.0, -1.0])

@@ -1,9 +1,9 @@
 """Twist of coaxial devices: a one-dimensional rod along each of them.
 
-The rod of a device has a node wherever the chain has one when the device reaches to its
-end; node 0 is held by the rotary unit, the last one is the device's end. A segment has
-the torque GJ/l (Δφ + τ Δφ'), as the torsion hinges of a single catheter do, and there
-is no inertia: between two control steps the rod is in balance with what acts on it.
+The nodes of a rod are those of the chain when the device reaches its end. The rotary
+unit holds node 0; the last node is the device's end. A segment has the torque
+GJ/l (Δφ + τ Δφ'), as the torsion hinges of a single catheter have. The rod has no
+inertia: it is in equilibrium with its loads at the end of every control step.
 """
 
 from __future__ import annotations
@@ -14,8 +14,8 @@ import numpy as np
 
 from cathsim_dmc.entities.device import Device
 
-# Rate of turning below which Coulomb friction is taken for viscous, rad/s: a device
-# that sticks creeps by less than this.
+# Rate of rotation below which Coulomb friction is viscous, rad/s; a sticking device
+# creeps more slowly.
 STICKING = 0.02
 
 
@@ -23,21 +23,21 @@ class Rods:
     """The rods of K devices in N simulations.
 
     Attributes:
-      stiffness: (K, M), torsional stiffness of the M segments, N·m/rad.
+        stiffness: (K, M), torsional stiffness of the M segments, N·m/rad.
     """
 
     def __init__(
         self, devices: Sequence[Device], nodes: np.ndarray, relaxation_time: float
     ):
-        """Finds the stiffness of the segments.
+        """Computes the stiffness of the segments.
 
         Args:
-          devices: K devices.
-          nodes: (M + 1,), distance of the nodes from a device's end, m, from proximal
-            to distal, 0 the last.
-          relaxation_time: τ, s.
+            devices: K devices.
+            nodes: (M + 1,), distances of the nodes from a device's end, from proximal
+                to distal, m; the last one is 0.
+            relaxation_time: relaxation time τ, s.
         """
-        from cathsim_dmc.entities import coaxial_loops  # late, as it takes long
+        from cathsim_dmc.entities import coaxial_loops  # imports numba, which is slow
 
         self._loops = coaxial_loops
         self._nodes = nodes
@@ -54,19 +54,19 @@ class Rods:
         friction: np.ndarray | float = 0.0,
         brake: np.ndarray | float = 0.0,
     ) -> np.ndarray:
-        """Turns the bases and brings the rods into balance.
+        """Rotates the bases and returns the equilibrium of the rods.
 
         Args:
-          angles: (N, K, M + 1), rotation of the nodes, rad.
-          turned: (N, K), by how much the bases are turned, rad.
-          duration: in which they are, s.
-          torque: (N, K, M), on the nodes but the base, N·m.
-          rate: likewise, minus the derivative of the torque by the rotation, N·m/rad.
-          friction: likewise, largest torque of Coulomb friction, N·m.
-          brake: likewise, torque per rate of turning, N·m·s/rad.
+            angles: (N, K, M + 1), rotation of the nodes, rad.
+            turned: (N, K), rotations of the bases, rad.
+            duration: duration of that rotation, s.
+            torque: (N, K, M), torque on the nodes except the base, N·m.
+            rate: (N, K, M), minus its derivative by the rotation, N·m/rad.
+            friction: (N, K, M), largest torque of Coulomb friction, N·m.
+            brake: (N, K, M), torque per rate of rotation, N·m·s/rad.
 
         Returns:
-          (N, K, M + 1), rad.
+            (N, K, M + 1), rotation of the nodes, rad.
         """
         loads = np.empty((4, *angles.shape[:-1], angles.shape[-1] - 1))
         loads[0], loads[1], loads[2], loads[3] = torque, rate, friction, brake
@@ -81,31 +81,31 @@ class Rods:
         )
 
     def at_joints(self, angles: np.ndarray, gaps: np.ndarray) -> np.ndarray:
-        """Rotations of the devices where the chain has its joints.
+        """Rotations of the devices at the joints of the chain.
 
-        Between two nodes the rotation is linear; a joint beyond a device's end has that
+        The rotation is linear between two nodes; a joint beyond a device's end has that
         of the end.
 
         Args:
-          angles: (N, K, M + 1), rotation of the nodes, rad.
-          gaps: (N, K), way from the end of each device to the end of the chain, m.
+            angles: (N, K, M + 1), rotation of the nodes, rad.
+            gaps: (N, K), distance from the end of each device to that of the chain, m.
 
         Returns:
-          (N, K, J), rad; the chain has its J = M - 1 joints where a device that reaches
-          to its end has its inner nodes.
+            (N, K, J), rad; the J = M - 1 joints are the inner nodes of a device that
+            reaches the end of the chain.
         """
         return self._loops.at_joints(np.ascontiguousarray(angles), gaps, self._nodes)
 
     def at_nodes(self, loads: np.ndarray, gaps: np.ndarray) -> np.ndarray:
-        """Loads on the nodes, of loads at the joints of the chain.
+        """Loads on the nodes, from loads at the joints of the chain.
 
         Args:
-          loads: (F, N, K, J), F kinds of loads at the joints.
-          gaps: (N, K), m.
+            loads: (F, N, K, J), F kinds of loads at the joints.
+            gaps: (N, K), distance from the end of each device to that of the chain, m.
 
         Returns:
-          (F, N, K, M), on the nodes but the base: those on both sides of a joint share
-          its load.
+            (F, N, K, M), loads on the nodes except the base; the nodes on both sides of
+            a joint share its load.
         """
         return self._loops.at_nodes(loads, gaps, self._nodes)
 

@@ -122,7 +122,7 @@ class Scene:
             )
             self.arena.attach(entity, site)
         self.sheath.guide(self.catheter, place.start_depth)
-        self.phantom.stand(self.catheter.links[0])
+        self.phantom.add_wall(self.catheter.links[0])
         placement.add_cameras(self.arena, self.anatomy)
 
     @property
