@@ -76,13 +76,18 @@ def processor_time(pid):
     return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
 
-def kill(server, work, *arguments, longest):
-    """Kills a process after up to so many seconds of work, at random."""
+def moments(longest, count=6):
+    """Seconds of work after which to kill, a random one in each part of `longest`."""
+    return [longest * (index + random.random()) / count for index in range(count)]
+
+
+def kill(server, work, *arguments, after):
+    """Kills a process after so many seconds of work."""
     process = server.Process(target=work, args=arguments, daemon=True)
     process.start()
-    moment, end = random.uniform(0.0, longest), time.monotonic() + _PATIENCE
+    end = time.monotonic() + _PATIENCE
     try:
-        while processor_time(process.pid) < moment:
+        while processor_time(process.pid) < after:
             assert process.is_alive(), f"ended by itself with {process.exitcode}"
             assert time.monotonic() < end, "hangs"
             time.sleep(0.01)

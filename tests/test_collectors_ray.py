@@ -141,8 +141,9 @@ def told(lines):
     return (json.loads(line[5:]) for line in lines if line.startswith("TOLD "))
 
 
+TESTS = str(Path(__file__).parent)
 # A cluster of two nodes with one processor each, and a training on it; tells of the
-# collectors that it has, so that they can be killed.
+# collectors that it has, so that they can be killed, and how each batch compares.
 SCRIPT = """
 import json, sys, logging, os, time
 os.environ["RAY_USAGE_STATS_ENABLED"] = "0"
@@ -187,26 +188,21 @@ def tell(self):
     return collector
 
 ray_source.RaySource._start = tell
-config = make_config("ppo", **json.loads(sys.argv[2]))
-result = train(config, sys.argv[1], progress=False)
-print("TOLD", json.dumps({"frames": result.frames, "interrupted": result.interrupted}))
-ray.shutdown()
-cluster.shutdown()
-"""
-
-
-# Tells of every batch how it compares.
-WATCH = f"""
-sys.path.insert(0, {str(Path(__file__).parent)!r})
+sys.path.insert(0, sys.argv[3])
 from test_collectors_ray import compared
 following = ray_source.RaySource.next
 
 def watched(self):
     batch = following(self)
-    print("TOLD", json.dumps(compared(self, batch)), flush=True)
+    print("TOLD", json.dumps({"compared": compared(self, batch)}), flush=True)
     return batch
 
 ray_source.RaySource.next = watched
+config = make_config("ppo", **json.loads(sys.argv[2]))
+result = train(config, sys.argv[1], progress=False)
+print("TOLD", json.dumps({"frames": result.frames, "interrupted": result.interrupted}))
+ray.shutdown()
+cluster.shutdown()
 """
 
 
@@ -221,11 +217,14 @@ PATIENCE = {
 
 @pytest.mark.slow
 def test_a_killed_collector_does_not_lose_the_run(tmp_path):
-    """Two nodes; one collector is killed -9 half way, and the training goes on."""
+    """Two nodes; one collector is killed -9 half way, and the training goes on.
+
+    The log-probabilities of each batch are those that the learner's policy gives.
+    """
     settings = json.dumps({**SETTINGS, "total_frames": 3_072})
     with open(tmp_path / "errors.txt", "w") as errors:
         process = subprocess.Popen(
-            [sys.executable, "-c", SCRIPT, str(tmp_path / "run"), settings],
+            [sys.executable, "-c", SCRIPT, tmp_path / "run", settings, TESTS],
             stdout=subprocess.PIPE,
             stderr=errors,
             text=True,
@@ -242,36 +241,20 @@ def test_a_killed_collector_does_not_lose_the_run(tmp_path):
             assert time.monotonic() < end
             time.sleep(0.05)
         os.kill(first[0][0], signal.SIGKILL)
-        second = next(lines)
-        result = next(lines)
+        *rest, result = lines
         assert process.wait(300) == 0
     finally:
         process.kill()
         process.wait()
+    (second,) = [line for line in rest if isinstance(line, list)]
     assert not {pid for pid, *_ in first} & {pid for pid, *_ in second}
+    batches = [line["compared"] for line in rest if isinstance(line, dict)]
+    assert all(worst < 1e-5 for worst, *_ in batches), batches
+    counts = [(count, shape) for _, count, shape in batches]
+    assert counts == [(64 + 512 * index, [8, 64]) for index in range(6)]
     assert result == {"frames": 3_072, "interrupted": False}
     rows = read_metrics(table)
     assert [row["frames"] for row in rows] == list(range(512, 3_073, 512))
     assert all(row["kl_approx"] < 0.5 for row in rows)
     text = (tmp_path / "errors.txt").read_text()
     assert text.count("a collector was lost after") == 1
-
-
-@pytest.mark.slow
-def test_collectors_act_with_the_weights_and_statistics_of_the_learner(tmp_path):
-    """The log-probabilities of a batch are those that the learner's policy gives."""
-    script = SCRIPT.replace("config = make_config", f"{WATCH}config = make_config")
-    settings = json.dumps({**SETTINGS, "total_frames": 1_536})
-    done = subprocess.run(
-        [sys.executable, "-c", script, str(tmp_path / "run"), settings],
-        stdout=subprocess.PIPE,
-        text=True,
-        timeout=1800,
-        check=True,
-        env={**os.environ, **PATIENCE},
-    )
-    _, *batches, _ = told(done.stdout.splitlines())
-    assert [shape for *_, shape in batches] == [[8, 64]] * 3
-    counts = [count for _, count, _ in batches]
-    assert counts == [64, 64 + 512, 64 + 1024]
-    assert all(worst < 1e-5 for worst, *_ in batches), batches

@@ -88,8 +88,8 @@ def test_processes_agree_on_trajectories_images_and_anatomies():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("options", [RANDOM, {"observation": "image"}])
-def test_the_number_of_threads_changes_nothing(options):
+def test_the_number_of_threads_changes_nothing():
+    options = {**RANDOM, "observation": ["internal", "image"]}
     assert trajectory(1, **options) == trajectory(2, **options)
 
 
@@ -104,22 +104,6 @@ def test_another_seed_is_another_trajectory():
     assert digest(batch.batch.qpos[0]) != digest(batch.batch.qpos[1])
 
 
-@pytest.mark.slow
-def test_composer_and_batch_give_the_same_bytes():
-    environment = suite.load("cathsim", "type1_lcca", task_kwargs={"random": 7})
-    environment.reset()
-    task = suite.make_task("type1_lcca")
-    batch = BatchSimulation(task, 1, num_threads=1, seeds=7)
-    batch.reset()
-    for action in actions(1, batch.num_actions):
-        timestep = environment.step(action[0])
-        step = batch.step(action)
-        assert digest(environment.physics.data.qpos) == digest(batch.batch.qpos[0])
-        assert timestep.reward == step.outcome.reward[0]
-        for key, value in timestep.observation.items():
-            np.testing.assert_array_equal(value, step.observation[key][0])
-
-
 def weights(state, prefix=""):
     for key, value in sorted(state.items()):
         if isinstance(value, dict):
@@ -130,12 +114,12 @@ def weights(state, prefix=""):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("algorithm", ["ppo", "sac"])
-def test_a_training_of_2000_frames_gives_the_same_weights_twice(tmp_path, algorithm):
-    settings = {"random_frames": 512} if algorithm == "sac" else {}
+def test_a_training_gives_the_same_weights_twice(tmp_path, algorithm):
+    settings = {"random_frames": 256} if algorithm == "sac" else {}
     config = make_config(
         algorithm,
         task="type1_bca",
-        total_frames=2_000,
+        total_frames=1_000,
         num_envs=8,
         normalisation_frames=256,
         seed=5,

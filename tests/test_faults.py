@@ -10,7 +10,7 @@ import killed_work
 import numpy as np
 import pytest
 import synthetic_env
-from killed_work import finish, import_on, kill, record_on, train_on
+from killed_work import finish, import_on, kill, moments, record_on, train_on
 from synthetic_scans import marched, write_obj, y_tree
 from test_agents_training import run, small_ppo
 
@@ -20,8 +20,6 @@ from cathsim_dmc.agents.metrics import read_metrics
 from cathsim_dmc.anatomy import Anatomy
 from cathsim_dmc.recording import Episode, viewer
 from cathsim_dmc.validation import force_sensors
-
-KILLS = 20
 
 
 def names(folder):
@@ -187,13 +185,11 @@ def server():
 
 
 @pytest.mark.slow
-def test_a_training_that_is_killed_twenty_times_loses_nothing_finished(
-    tmp_path, server
-):
+def test_a_training_that_is_killed_loses_nothing_finished(tmp_path, server):
     (tmp_path / "config.json").write_text("{}")
     reached = []
-    for _ in range(KILLS):
-        kill(server, train_on, tmp_path, 10**9, longest=4.0)
+    for moment in moments(4.0):
+        kill(server, train_on, tmp_path, 10**9, after=moment)
         found = checkpoints_in(tmp_path)
         for path in found:
             Checkpoint.open(path).policy()
@@ -205,18 +201,16 @@ def test_a_training_that_is_killed_twenty_times_loses_nothing_finished(
     finish(server, train_on, tmp_path, goal)
     frames = [row["frames"] for row in read_metrics(tmp_path / "metrics.csv")]
     assert frames == sorted(set(frames)) and frames[-1] == goal
-    print(f"killed {KILLS} times, frames {reached}")
 
 
 @pytest.mark.slow
-def test_an_import_that_is_killed_twenty_times_is_whole_or_not_there(tmp_path, server):
+def test_an_import_that_is_killed_is_whole_or_not_there(tmp_path, server):
     cache = tmp_path / "cache"
     mesh = write_obj(tmp_path / "lumen.obj", *marched(y_tree()))
     out, whole = tmp_path / "anatomy", 0
-    for _ in range(KILLS):
-        # Once the cache has it, a process writes the anatomy again and again.
-        longest = 4.0 if whole else 14.0
-        kill(server, import_on, mesh, out, cache, 10**9, longest=longest)
+    # Once the cache has it, a process writes the anatomy again and again.
+    for moment in moments(14.0):
+        kill(server, import_on, mesh, out, cache, 10**9, after=moment)
         if (out / "anatomy.json").exists():
             whole += 1
             Anatomy.load(out)
@@ -228,16 +222,13 @@ def test_an_import_that_is_killed_twenty_times_is_whole_or_not_there(tmp_path, s
         np.testing.assert_array_equal(a, b)
     assert len(names(out)) == 2
     assert whole
-    print(f"killed {KILLS} times, an anatomy was there after {whole} of them")
 
 
 @pytest.mark.slow
-def test_a_recording_that_is_killed_twenty_times_is_whole_or_not_there(
-    tmp_path, server
-):
+def test_a_recording_that_is_killed_is_whole_or_not_there(tmp_path, server):
     out, seen = tmp_path / "a.rrd", 0
-    for _ in range(KILLS):
-        kill(server, record_on, out, range(1, 1000), longest=6.0)
+    for moment in moments(6.0):
+        kill(server, record_on, out, range(1, 1000), after=moment)
         arrays = out.with_suffix(".npz")
         if arrays.exists():
             seen += 1
@@ -249,7 +240,6 @@ def test_a_recording_that_is_killed_twenty_times_is_whole_or_not_there(
     report.record("push", out, task="type1_bca", max_steps=2, fluoroscopy=False)
     assert sorted(p.name for p in tmp_path.iterdir()) == ["a.npz", "a.rrd"]
     assert seen
-    print(f"killed {KILLS} times, a recording was there after {seen} of them")
 
 
 def test_half_a_checkpoint_is_never_taken_for_one(tmp_path):

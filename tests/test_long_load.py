@@ -22,20 +22,6 @@ def run(*arguments):
     )
 
 
-@pytest.mark.slow
-def test_a_short_load_is_measured(tmp_path):
-    out = tmp_path / "load.json"
-    done = run("--steps", 400, "--simulations", 4, "--rounds", 1, "--out", out)
-    report = json.loads(out.read_text())
-    assert done.stdout == out.read_text()
-    checks = {check["name"]: check for check in report["checks"]}
-    assert report["steps"] >= 400
-    assert done.returncode == (0 if report["passed"] else 1)
-    for name in ("MuJoCo warnings", "observations with NaN", "physics errors"):
-        assert checks[name]["value"] == 0
-    assert len(report["speeds"]["fresh"]) == 1
-
-
 def test_a_folder_that_is_not_there_is_refused_before_the_load(tmp_path):
     done = run("--out", tmp_path / "none" / "load.json")
     assert done.returncode == 2
@@ -43,9 +29,13 @@ def test_a_folder_that_is_not_there_is_refused_before_the_load(tmp_path):
 
 
 @pytest.mark.slow
-def test_forty_thousand_steps_keep_the_bounds():
-    done = run("--steps", 40_000, "--rounds", 5)
-    report = json.loads(done.stdout)
+def test_eight_thousand_steps_keep_the_bounds(tmp_path):
+    out = tmp_path / "load.json"
+    done = run("--steps", 8_000, "--rounds", 2, "--out", out)
+    report = json.loads(out.read_text())
+    assert done.stdout == out.read_text()
+    assert done.returncode == (0 if report["passed"] else 1)
+    assert report["steps"] >= 8_000 and len(report["speeds"]["fresh"]) == 2
     broken = [check for check in report["checks"] if not check["passed"]]
     # How fast a busy machine is says nothing.
     assert [c for c in broken if not c["name"].startswith("speed")] == []

@@ -210,12 +210,6 @@ def test_two_environments_with_one_seed_are_equal():
     assert_bitwise_equal(*(first_observations("type1_lcca", 20) for _ in range(2)))
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("task_name", EACH_TASK)
-def test_first_200_observations_are_equal_bit_for_bit(task_name):
-    assert_bitwise_equal(*(first_observations(task_name, 199) for _ in range(2)))
-
-
 @pytest.mark.parametrize("task_name", EACH_TASK)
 def test_no_memory_is_shared(shared_environment, task_name):
     assert_no_shared_memory(shared_environment(task_name))
