@@ -187,23 +187,6 @@ def test_no_other_file_of_a_run_is_executed(tmp_path, marker, trained):
     assert not marker.exists()
 
 
-@pytest.mark.parametrize("name", ["policy.pt", "learning.pt"])
-def test_flipped_bits_are_found(tmp_path, trained, name):
-    random = np.random.default_rng(0)
-    for index in range(10):
-        folder = tmp_path / str(index)
-        shutil.copytree(trained / "ppo", folder)
-        path = checkpoint_of(folder) / name
-        data = bytearray(path.read_bytes())
-        place = random.integers(len(data))
-        data[place] ^= 1 << int(random.integers(8))
-        path.write_bytes(bytes(data))
-        checkpoint = Checkpoint.open(folder)
-        with pytest.raises(CheckpointError, match=f"{name} is damaged: its SHA-256"):
-            checkpoint.policy()
-            checkpoint.learning_state()
-
-
 @pytest.mark.parametrize("content", [b"", b"weights", b"PK\x03\x04", b"\x80\x02."])
 def test_a_file_without_weights_says_so(tmp_path, trained, content):
     shutil.copytree(trained / "ppo", tmp_path / "run")

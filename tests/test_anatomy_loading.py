@@ -5,8 +5,6 @@ from __future__ import annotations
 import hashlib
 import io
 import json
-import subprocess
-import sys
 
 import numpy as np
 import pytest
@@ -71,40 +69,24 @@ def spoilt(row, value):
 
 WRONG = {
     "unit": (put("units", "mm"), "units is 'mm'"),
-    "frame": (put("frame", "RAS"), "frame is 'RAS'"),
     "name": (put("name", 3), "name is 3; give a text"),
-    "no vessels": (put("vessels", {}), "vessels is {}; give a list"),
     "vessel": (put("vessels", 0, "left"), r"vessels\[0\] is 'left'"),
-    "ostium": (
-        put("vessels", 0, "ostium", "0"),
-        r"ostium is '0'; give a finite number",
-    ),
     "inlet far": (put("inlet", "position", [99.0, 0, 0]), "inlet lies 9.* outside"),
     "inlet text": (put("inlet", "position", "here"), "give three finite numbers"),
-    "inlet nan": (put("inlet", "radius", float("nan")), "inlet.radius is nan"),
-    "inlet bool": (put("inlet", "radius", True), "inlet.radius is True"),
-    "inlet null": (put("inlet", None), "inlet is None"),
     "goal": (put("goals", 0, "vessel", "renal"), "no vessel 'renal'"),
     "goal far": (
         put("goals", 0, "position", [0, 0, 3.0]),
         "goal .* outside the vessel",
     ),
-    "goal arc": (put("goals", 0, "arc_length", 9.0), "arc length 9"),
-    "goal key": (put("goals", 0, {"name": "x"}), r"goals\[0\] is"),
-    "end": (put("ends", 0, "open", "yes"), "give true or false"),
     "nan": (array("surface_vertices", spoilt(5, np.nan)), "surface_vertices holds NaN"),
     "scale": (array("surface_vertices", lambda v: v * 1e3), "unit is not the metre"),
     "zeros": (
         array("wall_vertices", lambda v: v * 0.0),
         "wall piece 0 has no volume|box",
     ),
-    "wall far": (array("wall_vertices", lambda v: v + 5.0), "wall piece 0 lies"),
-    "counts": (array("wall_counts", spoilt(0, 999)), "do not fit"),
     "shape": (array("vessel_0_radii", lambda v: v[:-1]), "vessel_0_radii is float64"),
-    "dtype": (array("surface_faces", lambda f: f.astype(float)), "whole numbers"),
     "faces": (array("surface_faces", spoilt(0, 10**8)), "faces name vertices"),
     "empty": (array("surface_faces", lambda f: f[:0]), "no triangles"),
-    "radius": (array("vessel_0_radii", lambda v: -v), "radii must be > 0"),
     "pickle": (
         lambda d, a: a.update(wall_counts=np.array([{}], dtype=object)),
         "damaged.*allow_pickle",
@@ -148,40 +130,3 @@ def test_an_archive_that_unpacks_to_gigabytes_is_refused(forged, tmp_path, monke
     forged(lambda description, arrays: None)
     with pytest.raises(ValueError, match="its arrays unpack to"):
         Anatomy.load(tmp_path)
-
-
-WRITER = """
-import sys
-from cathsim_dmc.anatomy.arch import arch
-anatomy = arch.load(sys.argv[2])
-print("ready", flush=True)
-sys.stdin.readline()
-for _ in range(int(sys.argv[3])):
-    anatomy.save(sys.argv[1])
-"""
-
-
-@pytest.mark.slow
-def test_two_writers_and_a_reader_never_break_a_directory(tmp_path):
-    arch.load("simple1").save(tmp_path)
-    writers = [
-        subprocess.Popen(
-            [sys.executable, "-c", WRITER, str(tmp_path), name, "15"],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            text=True,
-        )
-        for name in ("simple1", "simple2")
-    ]
-    for writer in writers:
-        assert writer.stdout.readline() == "ready\n"
-    for writer in writers:
-        writer.stdin.write("\n")
-        writer.stdin.close()
-    seen = set()
-    while any(writer.poll() is None for writer in writers):
-        seen.add(Anatomy.load(tmp_path).name)
-    assert all(writer.wait() == 0 for writer in writers)
-    seen.add(Anatomy.load(tmp_path).name)
-    assert seen <= {"simple1", "simple2"}
-    assert len(list(tmp_path.iterdir())) == 2

@@ -313,25 +313,15 @@ BAD = {
     "no such command": (["trian"], ["train", "eval"]),
     "no arguments": (["train"], ["TASK", "--out"]),
     "no such task": (["train", "type9", "--out", "OUT"], ["type9", *TASKS]),
-    "no such algorithm": (
-        ["train", "type1_bca", "--out", "OUT", "--algo", "dqn"],
-        ["ppo", "sac"],
-    ),
     "no such observation": (
         ["train", "type1_bca", "--out", "OUT", "--observation", "pixels"],
         ["pixels", "internal", "image", "sequential", "tracking"],
     ),
     "no such hyper-parameter": ([*TRAIN, "--gama", 0.9], ["--gama", "gamma"]),
-    "text for an integer": ([*TRAIN, "--num-envs", "many"], ["--num-envs", "many"]),
-    "text for a number": ([*TRAIN, "--gamma", "x"], ["--gamma", "'x'"]),
     "text in a list": ([*TRAIN, "--hidden", 64, "x"], ["--hidden", "x"]),
     "a value out of range": ([*TRAIN, "--gamma", 2], ["gamma=2.0", "(0, 1]"]),
-    "not a number": ([*TRAIN, "--learning-rate", "nan"], ["learning_rate=nan"]),
-    "a negative seed": ([*TRAIN, "--seed", -1], ["seed=-1", ">= 0"]),
     "an option of another algorithm": ([*TRAIN, "--tau", 0.1], ["--tau"]),
     "no such preset": ([*TRAIN, "--preset", "best"], ["best", "published", "demo"]),
-    "no such backend": ([*TRAIN, "--backend", "gpu"], ["gpu", "batched", "composer"]),
-    "no such device": ([*TRAIN, "--torch-device", "banana"], ["banana", "cpu"]),
     "an option of the task": ([*TRAIN, "--max-steps", 0], ["max_steps", "0"]),
     "nothing to resume": ([*TRAIN, "--resume"], ["no run in OUT to resume"]),
     "settings as JSON": ([*TRAIN, "--settings", "{}"], ["--settings"]),
@@ -341,10 +331,6 @@ BAD = {
             *("--anatomy", "type1", "--goal", "x"),
         ],
         ["bca", "lcca", "lsa"],
-    ),
-    "no such arch": (
-        ["phantom", "generate", "type7", "--out", "OUT"],
-        ["type7", *arch.ARCHES],
     ),
     "no such phantom": (
         ["phantom", "check", "OUT"],
@@ -356,10 +342,6 @@ BAD = {
     ),
     "no such checkpoint": (["eval", "OUT"], ["no checkpoint", "OUT"]),
     "no task to evaluate on": (["eval", "random"], ["needs a task"]),
-    "no such task to evaluate on": (
-        ["eval", "random", "--task", "type9"],
-        ["type9", *TASKS],
-    ),
     "arches where there are none": (
         ["eval", "push", "--task", "type1_bca", "--pool", 2],
         ["no task option 'pool'"],
@@ -372,19 +354,7 @@ BAD = {
         ["eval", "push", "--task", "type1_bca", "--device", "banana"],
         ["banana", "steerable_5f"],
     ),
-    "no such set of arches": (
-        ["eval", "push", "--task", "arch_bca", "--arches", "trian"],
-        ["trian", "train", "test_variants"],
-    ),
-    "text for a number of arches": (
-        ["record", "push", "--task", "arch_bca", "--out", "OUT.rrd", "--first", "x"],
-        ["--first", "x"],
-    ),
     "no such recording": (["replay", "OUT.rrd"], ["OUT.rrd"]),
-    "no such task to record": (
-        ["record", "push", "--task", "type9", "--out", "OUT.rrd"],
-        ["type9", *TASKS],
-    ),
 }
 
 

@@ -115,23 +115,6 @@ def test_posture_stays_in_range(insertion, rotation):
             assert low <= value <= high, joint.name
 
 
-def test_ranges_are_not_idle():
-    posture = follower_posture(np.linspace(0, CYCLE, 5001))
-    for i, joint in enumerate(JOINTS):
-        if joint.range is not None and joint.name != "catheter_platform":
-            width = joint.range[1] - joint.range[0]
-            assert np.ptp(posture[:, i]) > 0.9 * width, joint.name
-
-
-@given(insertions, rotations)
-def test_posture_repeats_each_cycle_but_for_the_rollers(insertion, rotation):
-    a = follower_posture(insertion, rotation)
-    b = follower_posture(insertion + CYCLE, rotation)
-    rollers = np.array(["roller" in name for name in NAMES])
-    np.testing.assert_allclose(a[~rollers], b[~rollers], atol=1e-12)
-    np.testing.assert_allclose(np.abs(b - a)[rollers], CYCLE / ROLLER_RADIUS, atol=1e-9)
-
-
 def test_posture_broadcasts_over_batch_axes():
     insertion = np.linspace(0, 0.3, 12).reshape(3, 4)
     rotation = np.linspace(-1, 1, 4)
@@ -282,34 +265,6 @@ def test_rollers_roll_on_the_device_without_slip(unit, word, insertion, rotation
     np.testing.assert_allclose(surface, [0.0, 0.0, 1.0], atol=1e-4)
 
 
-def test_meshing_gears_turn_without_slip_and_teeth_meet_gaps():
-    assert follower_posture(0.0, 0.7)[COLUMN["catheter_ring"]] == 0.7
-    robot, physics, jacobian = _solo()
-    model, data = physics.model.ptr, physics.data.ptr
-    pose(physics, robot, 0.0, 0.0)
-    mujoco.mj_comPos(model, data)
-    velocity = follower_posture(0.0, 1.0) - follower_posture(0.0, 0.0)
-    order = [model.joint(name).dofadr[0] for name in NAMES]
-    for unit in ("catheter", "guidewire"):
-        ring = data.xpos[model.body(f"{unit}_ring").id].copy()
-        pinion = data.xpos[model.body(f"{unit}_pinion").id].copy()
-        teeth = robot_module.RING_TEETH, robot_module.PINION_TEETH
-        pitch_point = ring + (pinion - ring) * teeth[0] / sum(teeth)
-        speeds = []
-        for name in ("ring", "pinion"):
-            body = model.body(f"{unit}_{name}").id
-            mujoco.mj_jac(model, data, jacobian, None, pitch_point, body)
-            speeds.append(jacobian[:, order] @ velocity)
-        np.testing.assert_allclose(speeds[0], speeds[1], atol=1e-12)
-        assert np.linalg.norm(speeds[0]) == pytest.approx(0.016, rel=1e-9)
-        # On the line of centres: a ring tooth against a pinion gap.
-        line = np.arctan2(*(pinion - ring)[[1, 0]])
-        offset_ring = _nearest_tooth(physics, f"{unit}_ring", line)
-        offset_pinion = _nearest_tooth(physics, f"{unit}_pinion", line + np.pi)
-        assert offset_ring == pytest.approx(0.0, abs=1e-9)
-        assert offset_pinion == pytest.approx(np.pi / teeth[1], abs=1e-9)
-
-
 _SOLO = []
 
 
@@ -320,17 +275,3 @@ def _solo():
         physics = mjcf.Physics.from_mjcf_model(robot.mjcf_model)
         _SOLO.extend([robot, physics, np.zeros((3, physics.model.nv))])
     return _SOLO
-
-
-def _nearest_tooth(physics, body, angle):
-    """Angle (rad, unsigned) from ``angle`` to the nearest tooth of a gear."""
-    model = physics.model.ptr
-    geoms = np.flatnonzero(
-        (model.geom_bodyid == model.body(body).id)
-        & (model.geom_type == mujoco.mjtGeom.mjGEOM_BOX)
-        & (np.abs(model.geom_pos).max(axis=1) == 0)
-    )
-    across = physics.data.geom_xmat[geoms].reshape(-1, 3, 3)[:, :, 0]
-    teeth = np.arctan2(across[:, 1], across[:, 0])
-    difference = np.mod(teeth - angle + np.pi / 2, np.pi) - np.pi / 2
-    return np.abs(difference).min()

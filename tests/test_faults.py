@@ -129,14 +129,6 @@ def test_folders_that_cannot_be_written_are_refused_before_the_work(
 
 # Two at once.
 
-COMPILE = """
-import numpy as np, sys
-from cathsim_dmc.imaging.device import device_attenuation
-from cathsim_dmc.imaging.carm import CArm
-points = np.linspace([0, 0, -0.05], [0.01, 0, 0.05], 30)
-print(float(device_attenuation(CArm(), points, 1e-3, 50.0, None, 1e-3).sum()))
-"""
-
 BUILD = """
 import sys
 from cathsim_dmc.validation import force_sensors
@@ -151,16 +143,6 @@ def finished(processes):
     for process, (_, errors) in zip(processes, outputs, strict=True):
         assert process.returncode == 0, errors
     return [out for out, _ in outputs]
-
-
-@pytest.mark.slow
-def test_two_processes_compile_the_same_kernels_at_once(tmp_path, monkeypatch):
-    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "cache"))
-    outputs = finished([spawn(COMPILE) for _ in range(2)])
-    assert outputs[0] == outputs[1]
-    assert float(outputs[0]) > 0
-    # A third one, with what they left.
-    assert finished([spawn(COMPILE)]) == outputs[:1]
 
 
 @pytest.mark.slow

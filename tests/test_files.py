@@ -6,7 +6,6 @@ import signal
 import stat
 import subprocess
 import sys
-import threading
 import zipfile
 
 import numpy as np
@@ -137,37 +136,6 @@ def test_directories_of_the_dead_go_and_those_of_the_living_stay(tmp_path):
     with files.atomic_directory(tmp_path / "more") as path:
         (path / "whole").write_text("")
     assert names(tmp_path) == ["data", "more"]
-
-
-def test_many_writers_of_one_file_all_succeed(tmp_path):
-    target = tmp_path / "a.bin"
-    contents = [bytes([index]) * 100_000 for index in range(8)]
-    seen, failed, stop = set(), [], threading.Event()
-
-    def write(data):
-        try:
-            for _ in range(30):
-                files.write_bytes(target, data)
-        except Exception as error:
-            failed.append(error)
-
-    def read():
-        while not stop.is_set():
-            if target.exists():
-                seen.add(target.read_bytes())
-
-    threads = [threading.Thread(target=write, args=(data,)) for data in contents]
-    reader = threading.Thread(target=read)
-    reader.start()
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    stop.set()
-    reader.join()
-    assert not failed
-    assert seen <= set(contents) and len(seen) > 1
-    assert names(tmp_path) == ["a.bin"]
 
 
 def archive(path, **texts):

@@ -51,15 +51,10 @@ def test_arrays_are_read_only_copies():
         ("reward", np.zeros(5), "reward must have shape"),
         ("action", np.zeros(6), "action must have shape"),
         ("catheter", np.zeros((7, 5, 2)), "catheter must have shape"),
-        ("catheter", np.zeros((7, 1, 3)), "at least one joint"),
-        ("body_quat", np.ones((7, 4, 4)) / 2, r"body_quat must have shape \(7, 3, 4\)"),
         ("body_quat", np.ones((7, 3, 4)), "unit quaternions"),
         ("time", np.zeros(7), "increase strictly"),
-        ("time", np.zeros(()), "time must have shape"),
         ("insertion", np.full(7, np.nan), "not finite in row 0"),
         ("wall_force_sum", np.full(6, -1.0), "must not be negative"),
-        ("push_force", np.array(["a"] * 6), "must be numeric"),
-        ("task", "", "non-empty"),
     ],
 )
 def test_wrong_values_are_named(name, value, message):
@@ -87,12 +82,9 @@ def test_contacts_must_belong_to_steps_in_order(steps, message):
 @pytest.mark.parametrize(
     ("meta", "message"),
     [
-        ({"termination": "success"}, "success"),
         ({"success": True, "termination": "won"}, "must be one of"),
         ({"success": False, "termination": "success"}, "but"),
-        ({"success": False, "termination": "truncated", "x": {1, 2}}, "JSON"),
         ({"success": False, "termination": "truncated", "x": float("nan")}, "JSON"),
-        ([], "dict"),
     ],
 )
 def test_wrong_metadata_is_refused(meta, message):
@@ -100,32 +92,9 @@ def test_wrong_metadata_is_refused(meta, message):
         make_episode(meta=meta)
 
 
-@pytest.mark.parametrize("seed", [1.5, True])
-def test_a_seed_is_an_integer(seed):
-    with pytest.raises(ValueError, match="integer"):
-        dataclasses.replace(make_episode(), seed=seed)
-
-
 def test_numpy_values_in_metadata_become_plain():
     meta = {"success": np.True_, "termination": "success", "goal": np.arange(3)}
     assert make_episode(meta=meta).meta["goal"] == [0, 1, 2]
-
-
-def test_an_interrupted_save_leaves_the_old_file(tmp_path, monkeypatch):
-    path = tmp_path / "e.npz"
-    episode = make_episode()
-    episode.save(path)
-    before = path.read_bytes()
-
-    def broken(stream, **arrays):
-        stream.write(b"half")
-        raise OSError("disk full")
-
-    monkeypatch.setattr(np, "savez_compressed", broken)
-    with pytest.raises(OSError, match="disk full"):
-        make_episode(seed=1).save(path)
-    assert path.read_bytes() == before
-    assert [p.name for p in tmp_path.iterdir()] == ["e.npz"]
 
 
 def test_loading_refuses_pickles_and_strangers(tmp_path):

@@ -1,6 +1,4 @@
 import logging
-import os
-import stat
 
 import numpy as np
 import pytest
@@ -8,7 +6,6 @@ from conftest import begin_dumped, twin
 
 from cathsim_dmc import suite
 from cathsim_dmc.anatomy.arch import arch
-from cathsim_dmc.physics.randomisation import Episode
 from cathsim_dmc.simulation import batch
 from cathsim_dmc.tasks import physics_errors as physics_errors
 
@@ -182,22 +179,6 @@ def test_trainings_keep_dumps_in_their_folder(tmp_path, monkeypatch):
         )
     assert path.parent == tmp_path / "errors"
     assert "CATHSIM_DUMP_DIR" not in os.environ
-
-
-def test_a_dump_may_be_read_by_whom_the_umask_says(dumps):
-    before = os.umask(0o027)
-    try:
-        path = physics_errors.dump(
-            "tried",
-            task={},
-            episode=Episode(displacement=np.zeros(3)),
-            state=np.zeros(3),
-            actions=np.zeros((2, 3)),
-        )
-    finally:
-        os.umask(before)
-    assert stat.S_IMODE(path.stat().st_mode) == 0o640
-    assert physics_errors.load(path)[0]["reason"] == "tried"
 
 
 def test_a_full_disk_does_not_end_the_other_simulations(
