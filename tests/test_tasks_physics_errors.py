@@ -1,4 +1,5 @@
 import logging
+import os
 
 import numpy as np
 import pytest
@@ -6,6 +7,7 @@ from conftest import begin_dumped, twin
 
 from cathsim_dmc import suite
 from cathsim_dmc.anatomy.arch import arch
+from cathsim_dmc.physics.randomisation import Episode
 from cathsim_dmc.simulation import batch
 from cathsim_dmc.tasks import physics_errors as physics_errors
 
