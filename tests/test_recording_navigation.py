@@ -1,7 +1,11 @@
-"""The recorder on the navigation task itself."""
+"""The recorder on the navigation task."""
 
+import mujoco
 import numpy as np
 import pytest
+from conftest import twin
+from dm_control import composer
+from test_own_objective import advancing
 
 from cathsim_dmc import suite
 from cathsim_dmc.analysis.force_statistics import magnitude, recorded_forces
@@ -62,11 +66,72 @@ def test_poses_are_those_of_the_task(env, episode):
     np.testing.assert_allclose(episode.reward, -np.array(episode.meta["distance"])[1:])
 
 
+def test_the_record_follows_the_simulation(env, episode):
+    assert (episode.steps, episode.termination, episode.success) == (
+        STEPS, "truncated", False
+    )  # fmt: skip
+    np.testing.assert_array_equal(episode.qpos[-1], env.physics.data.qpos)
+    np.testing.assert_array_equal(episode.head[-1], env.task.readings.head)
+    np.testing.assert_array_equal(episode.action[0], bend_and_push(None))
+    meta = episode.meta
+    assert meta["action_names"] == env.action_spec().name.split("\t")
+    assert meta["task_kwargs"] == {"goal": "bca"}
+    assert meta["versions"]["mujoco"] == mujoco.__version__
+    radius = env.task.scene.device.outer_radius
+    np.testing.assert_allclose(meta["catheter_radius"], radius)
+    assert set(meta["reward_terms"]) == set(env.task.objective.weights)
+    link = meta["body_names"].index("catheter/link_2")
+    np.testing.assert_array_equal(episode.catheter[:, 2], episode.body_pos[:, link])
+
+
 def test_a_seed_repeats_the_episode(env, episode):
-    again = EpisodeRecorder(env, "navigate", {"goal": "bca"}).record_episode(
-        bend_and_push, seed=2, max_steps=STEPS
-    )
+    recorder = EpisodeRecorder(env, "navigate", {"goal": "bca"})
+    again = recorder.record_episode(bend_and_push, seed=2, max_steps=STEPS)
     assert again.equals(episode)
+    for seed in (3, None):
+        other = recorder.record_episode(bend_and_push, seed=seed, max_steps=1)
+        assert other.seed == seed
+        assert not np.array_equal(other.qpos[0], again.qpos[0])
+
+
+def test_success_ends_the_episode():
+    near = suite.environment(advancing())  # 20 mm are success
+    episode = EpisodeRecorder(near).record_episode(bend_and_push, seed=0)
+    assert episode.success and episode.meta["discount"] == 0.0
+    assert 10 < episode.steps < 40
+
+
+@pytest.mark.parametrize("raises", [True, False])
+def test_a_diverged_step_is_left_out(env, raises):
+    wild = suite.environment(twin(env.task), raise_exception_on_physics_error=raises)
+
+    def diverge(timestep):
+        if wild.task.rollout.steps[0] == 3:
+            wild.physics.data.ptr.qvel[:] = np.nan
+        return bend_and_push(timestep)
+
+    episode = EpisodeRecorder(wild).record_episode(diverge, seed=0)
+    assert episode.termination == "physics_error" and episode.meta["error"]
+    assert episode.steps == 3
+
+
+def test_wrong_actions_are_refused(env):
+    recorder = EpisodeRecorder(env)
+    for wrong, message in (
+        (np.zeros(2), r"shape \(2,\)"),
+        (np.full(21, np.nan), "nan"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            recorder.record_episode(lambda timestep, wrong=wrong: wrong)
+    with pytest.raises(ValueError, match="at least 1"):
+        recorder.record_episode(bend_and_push, max_steps=0)
+
+
+def test_a_model_without_a_catheter_is_refused():
+    empty = composer.NullTask(composer.Arena())
+    other = composer.Environment(empty, strip_singleton_obs_buffer_dim=True)
+    with pytest.raises(ValueError, match="no body 'catheter/link_0'"):
+        EpisodeRecorder(other)
 
 
 def test_the_episode_is_drawn_with_its_robot(env, episode, tmp_path):
@@ -74,6 +139,7 @@ def test_the_episode_is_drawn_with_its_robot(env, episode, tmp_path):
     assert {g.body_name.split("/")[0] for g in geoms} == {"robot", "sheath"}
     # The tube that is seen, not the thick sides of the bore that the device touches.
     assert {g.kind for g in geoms if g.body_name.startswith("sheath")} == {"cylinder"}
+    assert body_geoms(env.physics, ["no such entity"]) == ()
     loaded = Episode.load(episode.save(tmp_path / "e.npz"))
     path = write_rrd(
         loaded, env.task.scene.anatomy.surface, tmp_path / "e.rrd", robot_geoms=geoms
