@@ -16,7 +16,7 @@ TASK = "gentle_type1_lcca"
 
 @dataclasses.dataclass(frozen=True)
 class GentleCannulation(Cannulation):
-    """Cannulation that pays for every newton above what the wall bears well."""
+    """Cannulation with a penalty on the wall force above 0.1 N."""
 
     TERMS = {
         **Cannulation.TERMS,
