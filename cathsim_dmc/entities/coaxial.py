@@ -62,7 +62,7 @@ class Links(NamedTuple):
         radius: radius of the outermost device, its mean over the link, m.
         friction: Coulomb coefficient on the wall, its mean over the link.
         mass: mass, kg.
-        lightness: fraction of the link's weight that buoyancy cancels, beyond the
+        buoyancy: fraction of the link's weight that buoyancy cancels, beyond the
             buoyancy of all devices together, which reduces gravity (`gravcomp`).
         inertia: (N, L, 2), moments of inertia of a solid capsule across and along its
             axis, kg·m².
@@ -71,7 +71,7 @@ class Links(NamedTuple):
     radius: np.ndarray
     friction: np.ndarray
     mass: np.ndarray
-    lightness: np.ndarray
+    buoyancy: np.ndarray
     inertia: np.ndarray
 
 

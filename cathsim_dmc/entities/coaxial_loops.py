@@ -206,10 +206,7 @@ def _on_rod(joint, gap, nodes, first):
 
 @compiled
 def at_joints(angles, gaps, nodes):
-    """Rotations (N, K, J) of rods (N, K, M + 1) at the joints of the chain.
-
-    Linear between two nodes; a joint beyond a device's end has that of the end.
-    """
+    """Rotations (N, K, J) at the joints of the chain, see `Rods.at_joints`."""
     count, devices = gaps.shape
     joints = len(nodes) - 2
     turns = np.empty((count, devices, joints))
@@ -225,10 +222,7 @@ def at_joints(angles, gaps, nodes):
 
 @compiled
 def at_nodes(loads, gaps, nodes):
-    """Loads (..., N, K, M) on the nodes distal of the base, from loads at the joints.
-
-    The nodes on both sides of a joint share its load.
-    """
+    """Loads (F, N, K, M) on the nodes distal of the base, see `Rods.at_nodes`."""
     kinds, count, devices, joints = loads.shape
     shared = np.zeros((kinds, count, devices, joints + 1))
     for i in range(count):
@@ -260,7 +254,7 @@ def _balance(diagonal, beside, load, pivot, move):
 
 
 @compiled
-def _balance_with_friction(diagonal, beside, load, friction, least, move):
+def _balance_sticking(diagonal, beside, load, friction, least, move):
     """Balance with Coulomb friction: each node sticks, or slides in one direction.
 
     Newton's method on the friction law, which is linear up to `least`, the largest
@@ -323,8 +317,7 @@ def turned(angles, base, stiffness, lag, least, duration, loads):
                     load[m - 1] += now
                     diagonal[m - 1] += coupling
                     beside[m - 1] = -coupling
-            friction = loads[2, i, k]
-            _balance_with_friction(diagonal, beside, load, friction, least, move)
+            _balance_sticking(diagonal, beside, load, loads[2, i, k], least, move)
             new[i, k, 0] = angles[i, k, 0] + base[i, k]
             for m in range(segments):
                 new[i, k, m + 1] = angles[i, k, m + 1] + move[m]

@@ -18,11 +18,11 @@ CONTACT_SOLIMP = (0.7, 0.999, 0.0003, 0.5, 1)
 
 # Coaxial devices: a wire in a catheter is four times as stiff as the steerable device
 # and jams with several newtons. MuJoCo evaluates the impedance d at the beginning of a
-# step: under a dead load with equilibrium depth r₀, the depth r becomes (1 - α) r + α
-# r₀ (r / r₀)^-m, with α = k d h / (k d h + b) for stiffness k, damping b and time step
-# h, and m = ∂ln(d² / (1 - d)) / ∂ln r. It converges if α (1 + m) < 2. The parameters
-# above satisfy this up to 0.23 mm, some 0.3 N. These satisfy it at every depth: d stays
-# below 0.99, and the damping is six times critical.
+# step: under a dead load with equilibrium depth r₀, the depth r becomes
+# (1 - α) r + α r₀ (r / r₀)^-m, with α = k d h / (k d h + b) for stiffness k, damping b
+# and time step h, and m = ∂ln(d² / (1 - d)) / ∂ln r. It converges if α (1 + m) < 2. The
+# parameters above satisfy this up to 0.23 mm, some 0.3 N. These satisfy it at every
+# depth: d stays below 0.99, and the damping is six times critical.
 _COAXIAL_TIME = 0.0015  # s
 COAXIAL_SOLREF = (-1 / _COAXIAL_TIME**2, -12 / _COAXIAL_TIME)
 COAXIAL_SOLIMP = (0.3, 0.99, 0.0003, 0.01, 2)

@@ -95,9 +95,9 @@ def _nodes(lengths: np.ndarray, points: np.ndarray, advance: float) -> np.ndarra
 
 def _crossing(begin, end, centre, radius: float) -> np.ndarray:
     """Intersection of a segment that leaves a sphere with the sphere."""
-    way, offset = end - begin, begin - centre
-    a, b, c = way @ way, way @ offset, offset @ offset - radius**2
-    return begin + (-b + np.sqrt(b * b - a * c)) / a * way
+    along, offset = end - begin, begin - centre
+    a, b, c = along @ along, along @ offset, offset @ offset - radius**2
+    return begin + (-b + np.sqrt(b * b - a * c)) / a * along
 
 
 def _turn_x(angle: float) -> np.ndarray:

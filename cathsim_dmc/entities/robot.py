@@ -136,8 +136,7 @@ def _clamp(insertion: Scalars, offset: float) -> tuple[Scalars, Scalars]:
 
 
 def _smoothstep(u: Scalars) -> Scalars:
-    # Plain floats are faster than numpy here: this runs in every control step, on
-    # caches that the physics has just filled.
+    # Plain floats are faster than numpy for one robot, posed in every control step.
     if not isinstance(u, float):
         u = np.clip(u, 0.0, 1.0)
     elif u <= 0.0:
@@ -300,7 +299,6 @@ class Robot(composer.Entity):
             self._mjcf_root.worldbody, f"{name}_platform", (0, 0, home), (0, 0, 1)
         )
         _box(body, "plate", (0, 0.030, 0), (0.042, 0.004, half_length), "graphite")
-        # One block spans both rods, one stripe both flanks.
         _box(body, "block", (0, 0.040, 0), (0.032, 0.006, 0.017), "steel")
         half_sizes = (0.0427, 0.0022, half_length - 0.003)
         _box(body, "stripe", (0, 0.030, 0), half_sizes, accent)
