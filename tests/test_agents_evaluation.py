@@ -1,4 +1,3 @@
-import io
 import json
 
 import numpy as np
@@ -163,11 +162,12 @@ def test_the_table_says_which_force_is_which(capsys, monkeypatch):
     assert f"│ {1e3 * mean:.0f} ± {1e3 * deviation:.0f}" in text
 
 
-def test_what_takes_long_says_so_now_and_then(monkeypatch):
-    stream, running = io.StringIO(), np.array([True, False, True])
-    alive = progress.SignOfLife("expert", stream)
-    alive(None, running)
-    assert stream.getvalue() == ""
+def test_what_takes_long_says_so_now_and_then(monkeypatch, capsys):
+    running = np.array([True, False, True])
+    progress.EvaluationProgress("expert")(None, running)
+    assert capsys.readouterr().err == ""
     monkeypatch.setattr(progress, "LINE_INTERVAL", 0.0)
-    alive(None, running)
-    assert stream.getvalue() == "expert: 2 control steps, 2 of 3 episodes still run\n"
+    shown = progress.EvaluationProgress("expert")
+    shown(None, running)
+    assert "expert: 1 steps" in (text := capsys.readouterr().err), text
+    assert "2 of 3 episodes run" in text

@@ -1,32 +1,23 @@
-"""Episodes of checkpoints, recorded beside a training."""
+"""Episodes of checkpoints, recorded during a training."""
 
-import os
-import signal
 import subprocess
 import sys
 import time
-from pathlib import Path
 
 import pytest
+import torch
 from test_agents_training import run, small_ppo, without_clocks
 from test_recording_training import Contents
 
 from cathsim_dmc import suite
-from cathsim_dmc.agents import ConfigError, checkpoint_recorder, make_config, make_env
+from cathsim_dmc.agents import ConfigError, make_config, make_env
 from cathsim_dmc.agents.checkpoint import checkpoints_in, save_checkpoint
 from cathsim_dmc.agents.checkpoint_recorder import CheckpointRecorder
-from cathsim_dmc.agents.checkpoint_recording import newest_lines, record
 from cathsim_dmc.agents.learners import make_learner
 from cathsim_dmc.agents.metrics import MetricsFile, read_metrics
 from cathsim_dmc.agents.networks import NetworkShapes
 
 STEPS = 6
-
-
-@pytest.fixture
-def reach(monkeypatch):
-    """Lets the synthetic task pass for one of the suite."""
-    monkeypatch.setattr(suite, "SUITE", {"reach": None})
 
 
 def checkpoints_of_fresh_policies(directory, *frames):
@@ -53,12 +44,27 @@ def checkpoints_of_fresh_policies(directory, *frames):
     return paths
 
 
-def test_each_checkpoint_plays_the_same_episode_by_the_rule_of_the_task(tmp_path):
+def recorder_of(directory, **changes):
+    config = make_config("ppo", task="simple1_bca", rerun_steps=STEPS, **changes)
+    return CheckpointRecorder(directory, config)
+
+
+def test_each_checkpoint_plays_the_same_episode_by_the_rule_of_the_task(
+    tmp_path, capsys
+):
     paths = checkpoints_of_fresh_policies(tmp_path, 100, 200, 300)
-    gone = paths.pop(1).with_name("0000000150")
-    assert record(tmp_path, STEPS, None, [paths[0], gone])
+    state = torch.get_rng_state()
+    recorder = recorder_of(tmp_path)
+    recorder.saved(paths[0])
+    recorder.saved(paths[1].with_name("0000000150"))
+    assert "0000000150 is not recorded, the training goes on" in capsys.readouterr().err
     # Another process goes on; what is there already is not recorded again.
-    assert record(tmp_path, STEPS, None, paths)
+    again = recorder_of(tmp_path, rerun_every=2)
+    again.saved(paths[0])
+    again.saved(paths[0])
+    again.saved(paths[1])
+    again.saved(paths[2], last=True)
+    assert torch.equal(torch.get_rng_state(), state)
     found = Contents(tmp_path / "training.rrd")
     assert found.scalars("/training/checkpoint") == {100: 100, 300: 300}
     head = dict(found.temporal["/world/catheter/head", "Points3D:positions"])
@@ -72,21 +78,10 @@ def test_each_checkpoint_plays_the_same_episode_by_the_rule_of_the_task(tmp_path
     assert ("/world/vessel", "Mesh3D:vertex_positions") in found.static
 
 
-def test_of_several_checkpoints_that_wait_the_newest_is_taken():
-    reading, writing = os.pipe()
-    os.write(writing, b"a\nb\nc")
-    lines = newest_lines(reading)
-    assert next(lines) == Path("b")
-    os.write(writing, b"d\n")
-    os.close(writing)
-    assert list(lines) == [Path("cd")]
-    os.close(reading)
-
-
-def test_a_recorder_that_crashes_leaves_the_training_as_it_is(
-    tmp_path, reach, monkeypatch, capsys
+def test_a_recording_that_fails_leaves_the_training_as_it_is(
+    tmp_path, monkeypatch, capsys
 ):
-    monkeypatch.setattr(checkpoint_recorder, "_PROCESS", "cathsim_dmc.no_such_module")
+    monkeypatch.setattr(suite, "SUITE", {"reach": None})
     result = run(small_ppo(rerun=True), tmp_path / "with")
     run(small_ppo(), tmp_path / "without")
     assert result.frames == 1_024
@@ -95,48 +90,7 @@ def test_a_recorder_that_crashes_leaves_the_training_as_it_is(
         for name in ("with", "without")
     )
     assert with_it == without
-    assert "the training is untouched, see" in capsys.readouterr().err
-    log = tmp_path / "with" / checkpoint_recorder.LOG_FILE
-    assert "no_such_module" in log.read_text()
-
-
-def test_a_recorder_that_reads_nothing_keeps_nobody_waiting(
-    tmp_path, reach, monkeypatch
-):
-    monkeypatch.setattr(checkpoint_recorder, "PATIENCE", 0.2)
-    recorder = CheckpointRecorder(tmp_path, small_ppo(rerun=True))
-    recorder._command = [sys.executable, "-c", "import time; time.sleep(600)"]
-    began = time.monotonic()
-    with recorder:
-        # More than any pipe holds.
-        for _ in range(20_000):
-            recorder.saved(tmp_path / "checkpoints" / "0000000001")
-        process = recorder._process
-    assert time.monotonic() - began < 20
-    assert process.returncode == -signal.SIGKILL
-
-
-@pytest.mark.skipif(not hasattr(os, "SCHED_IDLE"), reason="needs Linux")
-def test_it_runs_only_when_a_core_is_idle(tmp_path, reach, monkeypatch):
-    recorder = CheckpointRecorder(tmp_path, small_ppo(rerun=True))
-    recorder._command = [sys.executable, "-c", "import sys; sys.stdin.read()"]
-    with recorder:
-        pid = recorder._process.pid
-        assert os.sched_getscheduler(pid) == os.SCHED_IDLE
-        assert os.getpriority(os.PRIO_PROCESS, pid) == 19
-        assert os.getsid(pid) == pid
-
-
-def test_every_nth_checkpoint_and_the_last_one_are_told(tmp_path, reach):
-    recorder = CheckpointRecorder(tmp_path, small_ppo(rerun=True, rerun_every=3))
-    told = tmp_path / "told"
-    script = f"import sys; open({str(told)!r}, 'w').write(sys.stdin.read())"
-    recorder._command = [sys.executable, "-c", script]
-    with recorder:
-        for number in range(1, 8):
-            recorder.saved(Path(str(number)))
-        recorder.saved(Path("8"), last=True)
-    assert told.read_text().split() == ["3", "6", "8"]
+    assert "is not recorded, the training goes on" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
@@ -177,11 +131,8 @@ def test_a_killed_training_goes_on_with_its_recording(tmp_path):
         time.sleep(0.05)
     process.kill()
     process.wait()
-    # Whatever moment it was, the file is whole, now and when the recorder is done.
+    # Whatever moment it was, the file is whole.
     before = Contents(path)
-    while _recorders(out):
-        assert time.monotonic() < end
-        time.sleep(0.1)
     frames = int(checkpoints_in(out)[-1].name) + 512
     subprocess.run(train_command(out, frames, "--resume"), check=True, timeout=900)
     after = Contents(path)
@@ -191,16 +142,3 @@ def test_a_killed_training_goes_on_with_its_recording(tmp_path):
     assert list(after.scalars("/training/checkpoint").values())[-1] == frames
     metrics = [row["frames"] for row in read_metrics(out / "metrics.csv")]
     assert list(after.scalars("/training/learner/entropy")) == metrics
-
-
-def _recorders(out):
-    """Processes that record a run."""
-    found = []
-    for entry in Path("/proc").glob("[0-9]*/cmdline"):
-        try:
-            words = entry.read_bytes().split(b"\0")
-        except OSError:
-            continue
-        if b"cathsim_dmc.agents.checkpoint_recording" in words:
-            found += [entry] if str(out).encode() in words else []
-    return found

@@ -1,29 +1,32 @@
-"""Records an episode of every checkpoint of a run, beside the training.
+"""Records an episode of every checkpoint of a run in training.rrd."""
 
-In a process of its own that runs only when a core is idle: the training hands it the
-directory of a checkpoint through a pipe and never waits for it, so neither a slow
-viewer nor a crash there reaches the training. Behind the training it leaves
-checkpoints out and takes the newest.
-"""
-
-import contextlib
-import os
-import subprocess
 import sys
 from pathlib import Path
+from typing import Any
+
+import torch
 
 from cathsim_dmc import suite
+from cathsim_dmc.agents.checkpoint import Checkpoint
 from cathsim_dmc.agents.config import ConfigError, TrainingConfig
+from cathsim_dmc.agents.evaluation import EVALUATION_SEED
+from cathsim_dmc.agents.metrics import read_metrics
+from cathsim_dmc.agents.policies import TrainedPolicy
+from cathsim_dmc.policies import in_environment
+from cathsim_dmc.recording.drawing import Drawing
+from cathsim_dmc.recording.recorder import EpisodeRecorder
+from cathsim_dmc.recording.rerun_training import TrainingRecording
+from cathsim_dmc.recording.scene import body_geoms
 from cathsim_dmc.recording.viewer import ViewerError, live_address
 
-LOG_FILE = "training_rrd.log"
-_PROCESS = "cathsim_dmc.agents.checkpoint_recording"
-# Longest wait for the last episode after the end of the training, s.
-PATIENCE = 120.0
+RECORDING_FILE = "training.rrd"
 
 
-class CheckpointRecorder(contextlib.AbstractContextManager):
-    """The training's end: starts the process and tells it of checkpoints."""
+class CheckpointRecorder:
+    """Plays the evaluation's first episode with each checkpoint and records it.
+
+    The training waits for the episode; its random numbers are not touched.
+    """
 
     def __init__(self, run: Path, config: TrainingConfig):
         """Checks that it can be done.
@@ -40,84 +43,56 @@ class CheckpointRecorder(contextlib.AbstractContextManager):
                 f"rerun=True needs a task of the suite, task is {config.task!r}: "
                 "record its checkpoints with EpisodeRecorder, or leave rerun out."
             )
-        self._run, self._every, self._count = run, config.rerun_every, 0
-        self._command = [sys.executable, "-m", _PROCESS, str(run)]
-        self._command += [str(config.rerun_steps)]
+        self._run, self._config, self._count = run, config, 0
+        self._viewer = None
         if config.rerun_viewer is not None:
             try:
-                self._command.append(live_address(config.rerun_viewer))
+                self._viewer = live_address(config.rerun_viewer)
             except ViewerError as error:
                 raise ConfigError(f"rerun_viewer: {error}.") from error
-        self._process: subprocess.Popen | None = None
-
-    def __enter__(self) -> "CheckpointRecorder":
-        """Start the process."""
-        with open(self._run / LOG_FILE, "ab") as log:
-            process = subprocess.Popen(
-                self._command,
-                stdin=subprocess.PIPE,
-                stdout=log,
-                stderr=log,
-                # Ctrl-C is for the training.
-                start_new_session=True,
-                env={**os.environ, "OMP_NUM_THREADS": "1"},
-            )
-        _run_when_idle(process.pid)
-        if process.stdin is not None and hasattr(os, "set_blocking"):
-            os.set_blocking(process.stdin.fileno(), False)
-        self._process = process
-        return self
+        self._recording: TrainingRecording | None = None
+        self._env: Any = None
 
     def saved(self, checkpoint: Path, last: bool = False) -> None:
-        """Tell of a checkpoint; costs a system call.
+        """Record a checkpoint if it is due; an error is printed and ends nothing.
 
         Args:
             checkpoint: Directory of the checkpoint.
             last: Whether it is the last one, which is recorded whatever its number.
         """
         self._count += 1
-        if self._process is None or self._process.stdin is None:
+        if not last and self._count % self._config.rerun_every:
             return
-        if last or not self._count % self._every:
-            # A process that is gone, or that has not read for long.
-            with contextlib.suppress(OSError):
-                line = f"{checkpoint}\n".encode()
-                os.write(self._process.stdin.fileno(), line)
-
-    def __exit__(self, *exception: object) -> None:
-        """Let it record the last checkpoint, and say what went wrong, if anything."""
-        process = self._process
-        if process is None or process.stdin is None:
-            return
-        with contextlib.suppress(OSError):
-            process.stdin.close()
-        if exception[0] is not None:
-            # It ends by itself; the error is not to wait.
-            return
-        # What is left is not beside the training any more.
-        _run_as_usual(process.pid)
         try:
-            code = process.wait(PATIENCE)
-        except (subprocess.TimeoutExpired, KeyboardInterrupt):
-            process.kill()
-            code = process.wait()
-        if code:
+            with torch.random.fork_rng(devices=[]):
+                self._record(Checkpoint.open(checkpoint))
+        except Exception as error:
             print(
-                f"the recording of the checkpoints ended early (exit code {code}); the "
-                f"training is untouched, see {self._run / LOG_FILE}",
+                f"checkpoint {checkpoint.name} is not recorded, the training goes on: "
+                f"{type(error).__name__}: {error}",
                 file=sys.stderr,
             )
 
-
-def _run_when_idle(pid: int) -> None:
-    """Let a process run only on cores that nobody else wants."""
-    with contextlib.suppress(OSError, AttributeError):
-        os.setpriority(os.PRIO_PROCESS, pid, 19)
-        os.sched_setscheduler(pid, os.SCHED_IDLE, os.sched_param(0))
-
-
-def _run_as_usual(pid: int) -> None:
-    """Take a process out of the class that may starve; its niceness stays."""
-    with contextlib.suppress(OSError, AttributeError, ValueError):
-        for thread in map(int, os.listdir(f"/proc/{pid}/task")):
-            os.sched_setscheduler(thread, os.SCHED_OTHER, os.sched_param(0))
+    def _record(self, checkpoint: Checkpoint) -> None:
+        config, steps = self._config, self._config.rerun_steps
+        if self._recording is None:
+            path = self._run / RECORDING_FILE
+            self._recording = TrainingRecording(path, steps, self._viewer)
+        if checkpoint.frames <= self._recording.frames:
+            return
+        if self._env is None:
+            options = {**config.task_kwargs, "observation": config.observation}
+            self._env = suite.load(
+                suite.DOMAIN, config.task, task_kwargs={**options, "random": 0}
+            )
+        env = self._env
+        recorder = EpisodeRecorder(env, config.task, dict(config.task_kwargs))
+        policy = in_environment(TrainedPolicy(checkpoint), env)
+        episode = recorder.record_episode(policy, EVALUATION_SEED, steps)
+        drawing = Drawing.of(
+            episode,
+            env.task.scene.anatomy.surface,
+            robot_geoms=body_geoms(env.physics),
+        )
+        rows = read_metrics(self._run / "metrics.csv")
+        self._recording.add(episode, drawing, checkpoint.frames, rows)

@@ -76,7 +76,7 @@ class TrainingConfig:
         torch_threads: Number of threads of one torch operation. One is fastest for
             the small published MLP; images profit from all cores.
         rerun: Whether to record an episode of every checkpoint, and the curves, into
-            training.rrd of the run, beside the training.
+            training.rrd of the run; the training waits for the episode.
         rerun_every: Number of checkpoints for each of which one is recorded.
         rerun_steps: Number of control steps after which such an episode is cut off.
         rerun_viewer: Viewer that shows it too: "spawn" opens one, "connect" takes the

@@ -13,18 +13,20 @@ class MetricsError(ValueError):
 
 
 class MetricsFile:
-    """Append rows of numbers keyed by the frame counter.
-
-    Args:
-        path: Path of the CSV file.
-        columns: Names of the columns; the first is the frame counter.
-        resume_at: Frame up to which existing rows are kept; later ones are dropped (a
-            killed run writes rows past its last checkpoint). None starts a new file.
-    """
+    """A CSV file of numbers, a row for each value of the frame counter."""
 
     def __init__(
         self, path: Path, columns: Sequence[str], resume_at: int | None = None
     ):
+        """Starts the file, or keeps the first rows of one.
+
+        Args:
+            path: Path of the file.
+            columns: Names of the columns; the first is the frame counter.
+            resume_at: Frame up to which existing rows are kept; later ones are dropped
+                (a killed run writes rows past its last checkpoint). None starts a new
+                file.
+        """
         self.path = Path(path)
         self.columns = list(columns)
         kept = [] if resume_at is None else self._rows_until(resume_at)
@@ -32,14 +34,15 @@ class MetricsFile:
         csv.writer(text, lineterminator="\n").writerows([self.columns, *kept])
         files.write_text(self.path, text.getvalue())
 
-    def append(self, values: Mapping[str, float | int | None]) -> None:
-        """Write one row; None leaves a field empty."""
-        unknown = set(values) - set(self.columns)
-        if unknown:
-            raise MetricsError(f"metrics without a column: {sorted(unknown)}.")
-        cells = [_cell(values.get(name)) for name in self.columns]
+    def append(self, values: Mapping[str, float | None]) -> None:
+        """Writes one row; None and what is left out leave a field empty.
+
+        Raises:
+            ValueError: a value has no column.
+        """
+        row = {k: f"{v:.9g}" if isinstance(v, float) else v for k, v in values.items()}
         with files.naming(self.path), open(self.path, "a", newline="") as file:
-            csv.writer(file, lineterminator="\n").writerow(cells)
+            csv.DictWriter(file, self.columns, lineterminator="\n").writerow(row)
 
     def _rows_until(self, frames: int) -> list[list[str]]:
         if not self.path.exists():
@@ -53,12 +56,6 @@ class MetricsFile:
         # A row cut short by a crash has fewer fields.
         whole = (row for row in rows if len(row) == len(header))
         return [row for row in whole if row[0].isdecimal() and int(row[0]) <= frames]
-
-
-def _cell(value: float | int | None) -> str:
-    if value is None:
-        return ""
-    return str(value) if isinstance(value, int) else f"{value:.9g}"
 
 
 def read_metrics(path: Path) -> list[dict[str, float | None]]:

@@ -12,7 +12,7 @@ from torchrl.envs import EnvBase
 
 from cathsim_dmc import bounds, files, suite
 from cathsim_dmc.agents import evaluation, policies
-from cathsim_dmc.agents.progress import SignOfLife
+from cathsim_dmc.agents.progress import EvaluationProgress
 from cathsim_dmc.analysis import heatmap
 from cathsim_dmc.analysis.force_statistics import FIGURES, millinewtons
 from cathsim_dmc.pictures.animation import SUFFIXES, animate, check_film
@@ -168,7 +168,7 @@ def evaluate(
     if out_dir is not None:
         # Now: an evaluation that cannot be written would be lost.
         Path(out_dir).mkdir(parents=True, exist_ok=True)
-    contacts, alive = ContactLog(), SignOfLife(player.name)
+    contacts, alive = ContactLog(), EvaluationProgress(player.name)
 
     def observe(env: EnvBase, running: np.ndarray) -> None:
         alive(env, running)
@@ -190,7 +190,7 @@ def evaluate(
             "random",
             result.task,
             task_kwargs=result.settings["task_kwargs"],
-            observer=SignOfLife("random"),
+            observer=EvaluationProgress("random"),
         )
         comparison = evaluation.compare(result, other)
     report = Report(result, other, comparison, time.monotonic() - start)

@@ -107,8 +107,6 @@ def train(
         stack.enter_context(_only_process(run))
         stack.enter_context(_naming_what_is_safe(run))
         checkpoint = _prepare(run, config, resume)
-        if recorder is not None:
-            stack.enter_context(recorder)
         stack.enter_context(_torch_threads(config.torch_threads))
         stack.enter_context(physics_errors.dumps_in(run / "errors"))
         env = _make_environment(config, checkpoint, make_env)
@@ -134,7 +132,7 @@ def train(
             resumed=checkpoint is not None,
             progress=progress,
         )
-        stack.enter_context(log)
+        stack.callback(log.close)
         saver = _Saver(run, config, learner, log, checkpoint, recorder)
         interruption = stack.enter_context(Interruption())
         _loop(config, source, learner, log, saver, interruption)
@@ -340,7 +338,7 @@ class _Saver:
                 "learner": self._learner.learning_state(),
                 "rng": torch.get_rng_state(),
                 "episodes": self._log.episodes,
-                "window": self._log.window,
+                "window": list(self._log.window),
             },
         )
         self._frames, self._time = self._log.frames, time.monotonic()

@@ -1,6 +1,5 @@
-"""What a training run says about itself: metrics.csv, TensorBoard, progress."""
+"""Figures of a training run: metrics.csv, TensorBoard, progress."""
 
-import contextlib
 import time
 from collections import deque
 from collections.abc import Iterable, Mapping, Sequence
@@ -13,7 +12,7 @@ import numpy as np
 from cathsim_dmc.agents.config import ConfigError, TrainingConfig
 from cathsim_dmc.agents.episodes import EpisodeOutcome
 from cathsim_dmc.agents.metrics import MetricsFile
-from cathsim_dmc.agents.progress import Progress
+from cathsim_dmc.agents.progress import progress_bar
 
 # Number of finished episodes over which the running figures are taken.
 EPISODE_WINDOW = 100
@@ -37,12 +36,13 @@ COLUMNS = (
 )
 
 
-class TrainingLog(contextlib.AbstractContextManager):
+class TrainingLog:
     """Counts frames, episodes and seconds of a run and writes them down.
 
     Attributes:
         frames: Number of frames so far, over all processes of the run.
         episodes: Number of finished episodes likewise.
+        window: Figures of the last `EPISODE_WINDOW` of these.
         row: Last row of metrics.csv that was written; empty before the first.
     """
 
@@ -55,11 +55,11 @@ class TrainingLog(contextlib.AbstractContextManager):
         frames: int,
         seconds: float,
         episodes: int,
-        window: Sequence[Sequence[float | None]],
+        window: Iterable[Sequence[float | None]],
         resumed: bool,
         progress: bool,
     ):
-        """Open the files.
+        """Opens the files, shows the progress and starts the clock.
 
         Args:
             run: Directory of the run.
@@ -68,46 +68,38 @@ class TrainingLog(contextlib.AbstractContextManager):
             frames: Number of frames that earlier processes of the run have seen.
             seconds: Wall time that they have taken.
             episodes: Number of episodes that they have finished.
-            window: Figures of the last of these, as `window` gave them.
+            window: Figures of the last of these.
             resumed: Whether there were any.
             progress: Whether to show progress on standard error.
         """
         self.frames, self.episodes = frames, episodes
         self.row: dict[str, float | None] = {}
-        self._config = config
-        self._frames_before, self._seconds_before = frames, seconds
-        self._window = deque(map(list, window), maxlen=EPISODE_WINDOW)
-        self._stack = contextlib.ExitStack()
-        columns = [*COLUMNS, *metrics]
+        self.window = deque(map(list, window), maxlen=EPISODE_WINDOW)
+        self._interval = config.metrics_frames
         self._table = MetricsFile(
-            run / "metrics.csv", columns, frames if resumed else None
+            run / "metrics.csv", [*COLUMNS, *metrics], frames if resumed else None
         )
         self._board = _tensorboard(run) if config.tensorboard else None
-        label = f"{config.algorithm} {config.task}"
-        self._bar = Progress(label, config.total_frames, start=frames, enabled=progress)
+        self._bar = progress_bar(
+            f"{config.algorithm} {config.task}",
+            " frames",
+            total=config.total_frames,
+            initial=frames,
+            disable=not progress,
+        )
+        self._frames_before, self._seconds_before = frames, seconds
         self._began = time.monotonic()
 
-    def __enter__(self) -> "TrainingLog":
-        """Show the progress and start the clock."""
+    def close(self) -> None:
+        """Closes what is open."""
+        self._bar.close()
         if self._board is not None:
-            self._stack.callback(self._board.close)
-        self._stack.enter_context(self._bar)
-        self._began = time.monotonic()
-        return self
-
-    def __exit__(self, *exception: object) -> None:
-        """Close what is open."""
-        self._stack.close()
+            self._board.close()
 
     @property
     def seconds(self) -> float:
         """Wall time of the run so far, over all its processes."""
         return self._seconds_before + time.monotonic() - self._began
-
-    @property
-    def window(self) -> list[list[float | None]]:
-        """Figures of the last `EPISODE_WINDOW` episodes, for who goes on from here."""
-        return list(self._window)
 
     def add(
         self,
@@ -117,7 +109,7 @@ class TrainingLog(contextlib.AbstractContextManager):
         losses: Mapping[str, float],
         last: bool,
     ) -> None:
-        """Take note of a batch.
+        """Takes note of a batch.
 
         Args:
             frames: Number of frames of the batch.
@@ -128,16 +120,17 @@ class TrainingLog(contextlib.AbstractContextManager):
         """
         before, self.frames = self.frames, self.frames + frames
         self.episodes += len(finished)
-        self._window.extend(
+        self.window.extend(
             [_number(attrgetter(name)(episode)) for name in _FIGURES.values()]
             for episode in finished
         )
-        means = _episode_means(self._window)
-        if last or crossed(before, self.frames, self._config.metrics_frames):
-            elapsed = self.seconds - self._seconds_before
+        means = _episode_means(self.window)
+        if last or crossed(before, self.frames, self._interval):
+            seconds = self.seconds
+            elapsed = seconds - self._seconds_before
             self.row = {
                 "frames": self.frames,
-                "seconds": self._seconds_before + elapsed,
+                "seconds": seconds,
                 "frames_per_second": (self.frames - self._frames_before) / elapsed,
                 "episodes": self.episodes,
                 **means,
@@ -145,15 +138,15 @@ class TrainingLog(contextlib.AbstractContextManager):
                 **losses,
             }
             self._table.append(self.row)
-            self._show_on_board()
-        self._bar.update(self.frames, {"step_reward": step_reward, **means})
-
-    def _show_on_board(self) -> None:
-        if self._board is None:
-            return
-        for name, value in self.row.items():
-            if name != "frames" and value is not None:
-                self._board.add_scalar(name, value, self.frames)
+            for name, value in self.row.items():
+                if self._board is not None and name != "frames" and value is not None:
+                    self._board.add_scalar(name, value, self.frames)
+        shown = {"step_reward": step_reward, **means}
+        self._bar.set_postfix(
+            {name: value for name, value in shown.items() if value is not None},
+            refresh=False,
+        )
+        self._bar.update(frames)
 
 
 def crossed(before: int, after: int, interval: int) -> bool:
@@ -171,7 +164,7 @@ def _episode_means(window: Iterable[Sequence[float | None]]) -> dict[str, float 
 
 
 def read_window(rows: Sequence[Sequence[float | None]]) -> list[list[float | None]]:
-    """Checks what `TrainingLog.window` gave and a checkpoint has kept.
+    """Checks the `TrainingLog.window` of a checkpoint.
 
     Raises:
         ValueError: A row has another number of figures than one for each column.
