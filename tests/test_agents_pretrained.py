@@ -14,7 +14,7 @@ from cathsim_dmc.agents import Checkpoint, CheckpointError, load_policy, pretrai
 from cathsim_dmc.agents.learners import make_config
 from cathsim_dmc.agents.training import train
 from cathsim_dmc.benchmarks import export, protocol
-from cathsim_dmc.benchmarks.command import training_command
+from cathsim_dmc.benchmarks.export import training_command
 from cathsim_dmc.tasks.config import MAX_STEPS
 
 SHIPPED = pretrained.pretrained_names()
@@ -39,7 +39,7 @@ def exported(tmp_path_factory):
     run = directory / "run"
     train(config, run, progress=False, make_env=synthetic_env.make_env)
 
-    def judge(policy, task, *, observation, task_kwargs, episodes, name, num_threads):
+    def judge(policy, task, task_kwargs, episodes, name, num_threads):
         found = agents.evaluate(
             policy, task, episodes, name=name, task_kwargs={},
             make_env=synthetic_env.make_env,

@@ -2,16 +2,14 @@
 
 import dataclasses
 import json
-import subprocess
-import sys
 
 import numpy as np
 import pytest
 import synthetic_env
 
-from cathsim_dmc.agents import ConfigError, evaluation, training
+from cathsim_dmc.agents import evaluation, training
 from cathsim_dmc.analysis.heatmap import force_map
-from cathsim_dmc.benchmarks import Folders, cell, protocol, result, runner
+from cathsim_dmc.benchmarks import protocol, result, table
 from cathsim_dmc.benchmarks.grid import Cell
 from cathsim_dmc.tasks.config import MAX_STEPS
 
@@ -36,7 +34,12 @@ CELL = Cell(
 
 @pytest.fixture
 def folders(tmp_path):
-    return Folders(tmp_path / "runs", tmp_path / "results")
+    """Directories of runs and of results."""
+    return tmp_path / "runs", tmp_path / "results"
+
+
+def result_of(folders):
+    return folders[1] / f"{CELL.name}.json"
 
 
 @pytest.fixture
@@ -49,23 +52,23 @@ def synthetic(monkeypatch):
         make_env = synthetic_env.make_env
         return training.train(config, run, resume, progress=False, make_env=make_env)
 
-    def judge(policy, task, *, observation, task_kwargs, episodes, name, num_threads):
+    def judge(policy, task, task_kwargs, episodes, name):
         counts["judge"] += 1
         counts["options"] = task_kwargs
         found = evaluation.evaluate(
             policy, task, episodes, name=name, task_kwargs={},
             make_env=synthetic_env.make_env,
         )  # fmt: skip
-        return protocol.Judgement(found, None)
+        return protocol.Judgement(found)
 
-    monkeypatch.setattr(cell, "train", train)
+    monkeypatch.setattr(table, "train", train)
     monkeypatch.setattr(protocol, "judge", judge)
     return counts
 
 
 def test_a_finished_cell_tells_how_it_came_about(folders, synthetic):
-    done = cell.work(CELL, folders)
-    written = json.loads(folders.result(CELL).read_text())
+    done = table.work(CELL, *folders)
+    written = json.loads(result_of(folders).read_text())
     assert written["cell"]["name"] == CELL.name
     assert written["config"] == json.loads(json.dumps(CELL.config().to_dict()))
     assert done.training["frames"] == 512 and done.training["seconds"] > 0
@@ -74,13 +77,12 @@ def test_a_finished_cell_tells_how_it_came_about(folders, synthetic):
     assert len(done.evaluation["episodes"]["max_force"]) == 3
     assert {"python", "torch", "mujoco"} <= set(written["versions"])
     assert written["machine"]["cores"] >= 1 and "commit" in written
-    assert len(done.training["sessions"]) == 1
-    assert runner.standing(CELL, folders).state == "finished"
+    assert table.standing(CELL, *folders)[:2] == ("finished", 512)
 
 
 def test_the_evaluation_is_the_published_one_whatever_was_trained(folders, synthetic):
     options = {"max_steps": 20}
-    cell.work(_changed(settings={**CELL.settings, "task_kwargs": options}), folders)
+    table.work(_changed(settings={**CELL.settings, "task_kwargs": options}), *folders)
     assert synthetic["options"] == {"max_steps": MAX_STEPS}
     more = {"reward": "path", "goal_radius": 0.1, "friction": 0.1, "rotation": True}
     assert protocol.published_options({**options, **more}) == {
@@ -91,115 +93,75 @@ def test_the_evaluation_is_the_published_one_whatever_was_trained(folders, synth
 
 
 def test_what_is_done_is_not_done_again(folders, synthetic):
-    cell.work(CELL, folders)
-    cell.work(CELL, folders)
+    table.work(CELL, *folders)
+    assert table.run([CELL], *folders) == {}
     assert synthetic["train"] == synthetic["judge"] == 1
 
 
 def test_a_damaged_file_costs_an_evaluation_and_no_training(folders, synthetic):
-    cell.work(CELL, folders)
-    path = folders.result(CELL)
+    table.work(CELL, *folders)
+    path = result_of(folders)
     path.write_text(path.read_text()[:100])
-    assert "cannot be read" in runner.standing(CELL, folders).remark
-    cell.work(CELL, folders)
+    state, frames, remark = table.standing(CELL, *folders)
+    assert (state, frames) == ("begun", 512) and "cannot be read" in remark
+    table.work(CELL, *folders)
     assert synthetic["train"] == 1 and synthetic["judge"] == 2
-    assert runner.standing(CELL, folders).state == "finished"
+    assert table.standing(CELL, *folders)[0] == "finished"
 
 
-def test_other_settings_are_left_alone_unless_asked_for(folders, synthetic):
-    cell.work(CELL, folders)
-    other = _changed(settings={**CELL.settings, "clip": 0.3})
-    assert other.name == CELL.name
-    before = runner.standing(other, folders)
-    assert before.state == "other settings" and "clip: 0.2, now 0.3" in before.remark
-    with pytest.raises(ConfigError, match="clip.*--anew"):
-        cell.work(other, folders)
-    cell.work(other, folders, anew=True)
-    assert runner.standing(other, folders).state == "finished"
-    assert folders.run(CELL).with_name(f"{CELL.name}.old1").is_dir()
-    assert synthetic["train"] == 2
+def test_other_settings_are_left_alone(folders, synthetic):
+    table.work(CELL, *folders)
+    said = []
+    for changes in (
+        {"settings": {**CELL.settings, "clip": 0.3}},
+        {"total_frames": 1024},
+        {"evaluation": {"episodes": 4}},
+    ):
+        other = _changed(**changes)
+        state, frames, remark = table.standing(other, *folders)
+        assert (state, frames) == ("other settings", 512)
+        assert next(iter(changes)) in remark and str(result_of(folders)) in remark
+        assert table.run([other], *folders, say=said.append) == {}
+    assert synthetic["train"] == 1 and len(said) == 3
+    # A label is a matter of the page.
+    assert table.standing(_changed(label="other"), *folders)[0] == "finished"
 
 
-def test_more_frames_are_other_settings(folders, synthetic):
-    cell.work(CELL, folders)
-    longer = _changed(total_frames=1024)
-    assert "total_frames" in runner.standing(longer, folders).remark
+def test_a_cell_that_fails_does_not_stop_the_others(folders, synthetic, monkeypatch):
+    work, said = table.work, []
+
+    def fail_once(cell, *directories):
+        if cell.seed == 0:
+            raise FloatingPointError("loss is not finite")
+        return work(cell, *directories)
+
+    wrong, other = _changed(preset="nonsense"), _changed(seed=1)
+    assert table.standing(wrong, *folders)[0] == "impossible"
+    with monkeypatch.context() as patch:
+        patch.setattr(table, "work", fail_once)
+        found = table.run([CELL, wrong, other], *folders, say=said.append)
+    outcomes = ("failed", "failed", "finished")
+    assert found == dict(
+        zip((CELL.name, wrong.name, other.name), outcomes, strict=True)
+    )
+    assert any("loss is not finite" in line for line in said)
+    # The next call does what is left.
+    assert table.run([CELL, other], *folders) == {CELL.name: "finished"}
 
 
-def test_a_failure_is_noted_until_it_is_mended(folders, synthetic, monkeypatch):
-    def fail(*arguments, **options):
-        raise FloatingPointError("loss is not finite")
+def test_an_interrupted_training_ends_the_loop(folders, synthetic, monkeypatch):
+    train = table.train
+
+    def interrupted(config, run, resume):
+        return dataclasses.replace(train(config, run, resume), interrupted=True)
 
     with monkeypatch.context() as patch:
-        patch.setattr(cell, "train", fail)
-        with pytest.raises(FloatingPointError):
-            cell.work(CELL, folders)
-    now = runner.standing(CELL, folders)
-    assert now.state == "failed" and "loss is not finite" in now.remark
-    cell.work(CELL, folders)
-    assert folders.failure(CELL) is None
-
-
-def test_a_cell_belongs_to_one_process(folders):
-    folders.runs.mkdir()
-    lock = folders.runs / f".{CELL.name}.lock"
-    hold = "import fcntl, sys, time; f = open(sys.argv[1], 'ab'); "
-    hold += "fcntl.flock(f, fcntl.LOCK_EX); print('held', flush=True); time.sleep(120)"
-    command = [sys.executable, "-c", hold, str(lock)]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as holder:
-        try:
-            assert holder.stdout.readline() == "held\n"
-            assert cell.is_busy(folders, CELL)
-            assert runner.standing(CELL, folders).state == "running"
-            with pytest.raises(cell.BusyError, match=CELL.name):
-                cell.work(CELL, folders)
-        finally:
-            holder.kill()
-    assert not cell.is_busy(folders, CELL)
-
-
-def test_estimates_come_from_the_cells_most_alike():
-    def standing(frames, seconds, state="begun", **changes):
-        return runner.Standing(_changed(**changes), state, frames, seconds)
-
-    waiting = standing(0, 0.0, "waiting", task="type2_bca", total_frames=1000)
-    slow = standing(1000, 100.0, task="type2_bca", seed=1)
-    fast = standing(1000, 10.0, task="type1_lcca", seed=1)
-    other = standing(1000, 1.0, algorithm="sac")
-    evaluation_alone = 120.0
-    both = runner.estimate(waiting, [waiting, slow, fast, other])
-    assert both == pytest.approx(100 + evaluation_alone)
-    assert runner.estimate(waiting, [waiting, fast]) == pytest.approx(
-        10 + evaluation_alone
-    )
-    assert runner.estimate(waiting, [waiting, other]) is None
-
-
-def test_what_is_left_is_told_with_the_speeds_of_all_cells():
-    def standing(state, frames=0, seconds=0.0, **changes):
-        return runner.Standing(_changed(**changes), state, frames, seconds)
-
-    waiting = standing("waiting", total_frames=1000)
-    trained = standing("begun", 1000, 100.0, seed=1, total_frames=2000)
-    foreign = standing("other settings", 500, 5.0, seed=2)
-    wrong = standing("impossible", preset="nonsense")
-    # The speed is that of a cell that was not asked for; 100 s and the evaluation.
-    text = runner.left_over([waiting], [waiting, trained])
-    assert text == "0 of 1 cells finished, 1 left: about 0:03:40"
-    unknown = runner.left_over([waiting], [waiting])
-    assert unknown.endswith("1 left: about 0:00:00 and 1 of unknown length")
-    # What is not run takes no time and is not left.
-    text = runner.left_over([foreign, wrong], [foreign, wrong])
-    assert text == (
-        "0 of 2 cells finished; 1 with other settings, left as they are; 1 impossible"
-    )
-
-
-def test_an_unknown_preset_is_impossible_and_stops_nothing(folders):
-    wrong = _changed(preset="nonsense")
-    said = []
-    assert runner.standing(wrong, folders).state == "impossible"
-    assert runner.run([], folders, say=said.append) == {}
+        patch.setattr(table, "train", interrupted)
+        cells = [CELL, _changed(seed=1)]
+        assert table.run(cells, *folders) == {CELL.name: "interrupted"}
+    # It was complete in fact, so nothing is trained again.
+    assert table.run([CELL], *folders) == {CELL.name: "finished"}
+    assert synthetic["train"] == 1
 
 
 def test_learning_curves_are_thinned_to_200_points():
@@ -237,10 +199,10 @@ def test_force_maps_survive_the_file():
 
 
 def test_a_result_under_another_name_is_refused(folders, synthetic):
-    cell.work(CELL, folders)
-    path = folders.result(CELL)
+    table.work(CELL, *folders)
+    path = result_of(folders)
     moved = path.rename(path.with_name("type2_bca-ppo.json"))
-    with pytest.raises(result.ResultError, match="another cell"):
+    with pytest.raises(result.ResultError, match="type2_bca-ppo.json is damaged"):
         result.read_result(moved)
 
 

@@ -7,6 +7,6 @@ import cathsim_dmc.agents  # noqa: F401
 # isort: on
 
 from cathsim_dmc.benchmarks.grid import Cell, GridError, read_grid
-from cathsim_dmc.benchmarks.runner import Folders, run
+from cathsim_dmc.benchmarks.table import run
 
-__all__ = ["Cell", "Folders", "GridError", "read_grid", "run"]
+__all__ = ["Cell", "GridError", "read_grid", "run"]

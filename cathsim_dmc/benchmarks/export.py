@@ -1,21 +1,39 @@
 """From a run to a policy that ships: weights, a card, a line in the list."""
 
+import dataclasses
 import json
+import shlex
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from cathsim_dmc import files
 from cathsim_dmc.agents import pretrained
 from cathsim_dmc.agents.checkpoint import Checkpoint
-from cathsim_dmc.agents.evaluation import EvaluationResult
+from cathsim_dmc.agents.config import ConfigError, TrainingConfig
+from cathsim_dmc.agents.learners import LEARNERS, config_from_dict, make_config
 from cathsim_dmc.analysis.force_statistics import millinewtons
-from cathsim_dmc.benchmarks import protocol, provenance
-from cathsim_dmc.benchmarks.cell import SESSIONS
-from cathsim_dmc.benchmarks.command import training_command
+from cathsim_dmc.benchmarks import protocol
 from cathsim_dmc.benchmarks.grid import EPISODES
-from cathsim_dmc.benchmarks.result import ResultError, episode_figures, read_result
+from cathsim_dmc.benchmarks.result import (
+    ResultError,
+    episode_figures,
+    read_result,
+    versions,
+)
 
 _FIGURES = ("success", "length", "max_force")
+_HEAD = """\
+# Policies that ship
+
+Written by `cathsim export`; each has a card beside it, NAME.json. Evaluated over 30 \
+episodes by the published rule (2,000 control steps, success within 8 mm inside the \
+branch); forces as in docs/forces.md.
+
+| policy | task | observation | frames | success (95 %) | mean force, mN \
+| mean contact force, mN | max force, mN |
+|---|---|---|---|---|---|---|---|
+"""
 
 
 def export(
@@ -49,15 +67,15 @@ def export(
     checkpoint = Checkpoint.open(run)
     config, state = checkpoint.config, checkpoint.policy_state()
     options = protocol.published_options(config.task_kwargs)
-    judgement = protocol.judge(
+    evaluation = protocol.judge(
         checkpoint,
         config.task,
-        observation=config.observation,
-        task_kwargs=options,
-        episodes=episodes,
-        name=f"{pretrained.PREFIX}{name}",
-        num_threads=num_threads,
-    )
+        options,
+        episodes,
+        f"{pretrained.PREFIX}{name}",
+        num_threads,
+    ).result
+    figures = episode_figures(evaluation)
     card = {
         "task": config.task,
         "task_kwargs": options,
@@ -68,11 +86,14 @@ def export(
             "frames": checkpoint.frames,
             "seconds": round(checkpoint.seconds, 1),
             "seed": config.seed,
-            "sessions": _sessions(checkpoint.path),
         },
-        "seeds": _seeds(checkpoint, Path(results)),
-        "evaluation": _evaluation(judgement.result),
-        "versions": provenance.versions(),
+        "seeds": _seeds(config, Path(results)),
+        "evaluation": {
+            "seed": evaluation.seed,
+            "summary": evaluation.summary(),
+            "episodes": {name: figures[name] for name in _FIGURES},
+        },
+        "versions": versions(),
     }
     weights = pretrained.write_pretrained(directory, name, state, card)
     write_list(weights.parent)
@@ -81,82 +102,94 @@ def export(
 
 def write_list(directory: str | Path = pretrained.DIRECTORY) -> Path:
     """Write README.md of a directory of policies from their cards."""
-    directory = Path(directory)
-    lines = [
-        "# Policies that ship",
-        "",
-        "Written by `cathsim export`; each has a card beside it, NAME.json. Evaluated "
-        "over 30 episodes by the published rule (2,000 control steps, success within "
-        "8 mm inside the branch); forces as in docs/forces.md.",
-        "",
-        "| policy | task | observation | frames | success (95 %) | mean force, mN "
-        "| mean contact force, mN | max force, mN |",
-        "|---|---|---|---|---|---|---|---|",
-    ]
-    commands = []
+    directory, commands, lines = Path(directory), "", _HEAD
     for name in pretrained.pretrained_names(directory):
         card = pretrained.read_card(directory / f"{name}.json")
-        summary = card["evaluation"]["summary"]
+        summary, training = card["evaluation"]["summary"], card["training"]
         low, high = summary["success_ci95"]
         observation = card["config"]["observation"]
         if not isinstance(observation, str):
             observation = ", ".join(observation)
         forces = summary["forces"]
-        figures = (
-            forces["sum"]["mean"],
-            forces["max"]["mean_in_contact"],
-            forces["max"]["maximum"],
-        )
-        texts = [millinewtons(one["mean"], one["sd"]) for one in figures]
-        lines.append(
-            f"| `{pretrained.PREFIX}{name}` | {card['task']} | {observation} "
-            f"| {card['training']['frames']:,} "
-            f"| {100 * summary['success']:.0f} % ({100 * low:.0f}–{100 * high:.0f}) "
-            f"| {' | '.join(texts)} |"
-        )
-        seeds = ", ".join(
-            f"seed {one['seed']}: {100 * one['success']:.0f} %"
-            for one in card.get("seeds", [])
-        )
-        commands += ["", f"`{name}`: `{card['training']['command']}`"]
-        commands += [f"({seeds})"] * bool(seeds)
-    text = "\n".join([*lines, *commands]) + "\n"
-    return files.write_text(directory / "README.md", text)
+        cells = [
+            f"`{pretrained.PREFIX}{name}`",
+            card["task"],
+            observation,
+            f"{training['frames']:,}",
+            f"{100 * summary['success']:.0f} % ({100 * low:.0f}–{100 * high:.0f})",
+            *(
+                millinewtons(one["mean"], one["sd"])
+                for one in (
+                    forces["sum"]["mean"],
+                    forces["max"]["mean_in_contact"],
+                    forces["max"]["maximum"],
+                )
+            ),
+        ]
+        lines += f"| {' | '.join(cells)} |\n"
+        commands += f"\n`{name}`: `{training['command']}`\n"
+        seeds = (f"seed {s['seed']}: {100 * s['success']:.0f} %" for s in card["seeds"])
+        commands += f"({', '.join(seeds)})\n" if card["seeds"] else ""
+    return files.write_text(directory / "README.md", lines + commands)
 
 
-def _evaluation(result: EvaluationResult) -> dict[str, Any]:
-    figures = episode_figures(result)
-    return {
-        "seed": result.seed,
-        "summary": result.summary(),
-        "episodes": {name: figures[name] for name in _FIGURES},
-    }
-
-
-def _sessions(checkpoint: Path) -> list[Any]:
-    """Commits that a run was trained with, as far as the runner has noted them."""
-    path = checkpoint.parents[1] / SESSIONS
-    return json.loads(path.read_text()) if path.exists() else []
-
-
-def _seeds(checkpoint: Checkpoint, results: Path) -> list[dict[str, Any]]:
-    """Success of finished cells that differ from a run in the seed only."""
-    from cathsim_dmc.agents.config import ConfigError
-    from cathsim_dmc.agents.learners import config_from_dict
-
+def _seeds(config: TrainingConfig, results: Path) -> list[dict[str, Any]]:
+    """Success of finished cells that differ from a training in the seed only."""
     found = []
     for path in sorted(results.glob("*.json")):
         try:
             other = read_result(path)
-            config = config_from_dict(other.values["config"])
+            theirs = config_from_dict(other.values["config"])
         except (ResultError, ConfigError):
             continue
-        same = config.replace(seed=checkpoint.config.seed)
-        lengths = {config.total_frames, checkpoint.config.total_frames}
-        if not checkpoint.config.changed_for_resume(same) and len(lengths) == 1:
-            summary = other.evaluation["summary"]
-            success, interval = summary["success"], summary["success_ci95"]
-            found.append(
-                {"seed": config.seed, "success": success, "success_ci95": interval}
-            )
-    return sorted(found, key=lambda one: one["seed"])
+        same = theirs.replace(seed=config.seed)
+        if same.total_frames == config.total_frames and not (
+            config.changed_for_resume(same)
+        ):
+            interval = other.evaluation["summary"]["success_ci95"]
+            found.append((theirs.seed, other.success, interval))
+    names = ("seed", "success", "success_ci95")
+    return [dict(zip(names, one, strict=True)) for one in sorted(found)]
+
+
+def training_command(config: TrainingConfig, out: str = "RUN") -> str:
+    """The call of `cathsim train` that trains with some settings, as a line of shell.
+
+    Args:
+        config: Settings of the training.
+        out: Directory of the run in it.
+    """
+    presets = LEARNERS[config.algorithm].config.presets
+    changes = {preset: _changes(config, preset) for preset in presets}
+    preset = min(changes, key=lambda name: len(changes[name]))
+    words = ["cathsim", "train", config.task, "--algo", config.algorithm]
+    words += ["--preset", preset, "--out", out]
+    words += _option("observation", config.observation)
+    words += ["--frames", str(config.total_frames), "--seed", str(config.seed)]
+    for name, value in changes[preset].items():
+        words += _option(name, value, name in config.task_kwargs)
+    return shlex.join(words)
+
+
+def _changes(config: TrainingConfig, preset: str) -> dict[str, Any]:
+    """Settings that a preset does not have already, options of the task among them."""
+    base = make_config(config.algorithm, preset)
+    skipped = {"task", "task_kwargs", "total_frames", "seed", "observation"}
+    names = {item.name for item in dataclasses.fields(config)} - skipped
+    given = {name: getattr(config, name) for name in sorted(names - config.resumable)}
+    changed = {k: v for k, v in given.items() if v != getattr(base, k)}
+    options = config.task_kwargs.items()
+    return changed | {k: v for k, v in options if base.task_kwargs.get(k) != v}
+
+
+def _option(name: str, value: Any, of_task: bool = False) -> list[str]:
+    flag = f"--{name.replace('_', '-')}"
+    if of_task and isinstance(value, Mapping | list | tuple):
+        return [flag, json.dumps(value)]
+    if isinstance(value, bool):
+        return (
+            [flag, str(value)] if of_task else [flag if value else f"--no-{flag[2:]}"]
+        )
+    if isinstance(value, Mapping):
+        return [flag, *(str(word) for pair in value.items() for word in pair)]
+    return [flag, *map(str, value if isinstance(value, list | tuple) else [value])]

@@ -2,6 +2,7 @@
 
 import dataclasses
 import fnmatch
+import json
 import re
 import tomllib
 from collections.abc import Iterable, Mapping, Sequence
@@ -16,29 +17,17 @@ EPISODES = 30  # published
 _MAX_SIZE = 2**20  # bytes
 # Names of cells are names of folders and files.
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_+.-]{0,199}")
-
-# What a row may say, with the type of each.
-_Kinds = Mapping[str, tuple[type, ...]]
-_ROW: _Kinds = {
-    "label": (str,),
-    "algorithm": (str,),
-    "preset": (str,),
-    "observation": (str, list),
-    "tasks": (list,),
-    "seeds": (list,),
-    "total_frames": (int, dict),
-    "settings": (dict,),
-    "variant": (str,),
-    "evaluation": (dict,),
+# What a row must and may say, and its evaluation, with the type of each.
+_REQUIRED = {"label": str, "algorithm": str, "preset": str, "observation": str | list}
+_REQUIRED |= {"tasks": list, "total_frames": int | dict}
+_ROW = {
+    "seeds": list,
+    "settings": dict,
+    "variant": str,
+    "evaluation": dict,
+    **_REQUIRED,
 }
-_REQUIRED = ("label", "algorithm", "preset", "observation", "tasks", "total_frames")
-_EVALUATION: _Kinds = {
-    "task": (str,),
-    "episodes": (int,),
-    "task_kwargs": (dict,),
-    "each_arch": (str,),
-}
-_WORDS = {str: "a string", int: "an integer", list: "a list", dict: "a table"}
+_EVALUATION = {"task": str, "episodes": int, "task_kwargs": dict, "each_arch": str}
 
 
 class GridError(ValueError):
@@ -78,11 +67,7 @@ class Cell:
     evaluation: Mapping[str, Any] = dataclasses.field(default_factory=dict)
 
     def __post_init__(self):
-        """Refuse a name that could lie outside of its folder.
-
-        Raises:
-            GridError: the name has a character that is not allowed, or is too long.
-        """
+        """Refuse a name that could lie outside of its folder, as GridError."""
         if not _NAME.fullmatch(self.name):
             raise GridError(
                 f"a cell is named {self.name[:250]!r}; task, algorithm, observation, "
@@ -99,43 +84,25 @@ class Cell:
         parts = (self.task, self.algorithm, observation, self.preset, self.variant)
         return "-".join(part for part in (*parts, f"seed{self.seed}") if part)
 
+    def to_dict(self) -> dict[str, Any]:
+        """JSON-able values, with the name."""
+        return json.loads(json.dumps({"name": self.name, **dataclasses.asdict(self)}))
+
     def config(self) -> TrainingConfig:
         """Settings of the training.
 
         Raises:
             ConfigError: unknown algorithm, preset or field, or a value not allowed.
         """
-        settings: dict[str, Any] = {
-            name: value.replace("{task}", self.task)
-            if isinstance(value, str)
-            else value
-            for name, value in self.settings.items()
-        }
+        settings = dict(self.settings)
+        for name, value in settings.items():
+            if isinstance(value, str):
+                settings[name] = value.replace("{task}", self.task)
         added = settings.pop("task_kwargs", {})
-        config = make_config(
-            self.algorithm,
-            self.preset,
-            **{
-                **settings,
-                "task": self.task,
-                "observation": self.observation,
-                "seed": self.seed,
-                "total_frames": self.total_frames,
-            },
-        )
+        for name in ("task", "observation", "seed", "total_frames"):
+            settings[name] = getattr(self, name)
+        config = make_config(self.algorithm, self.preset, **settings)
         return config.replace(task_kwargs={**config.task_kwargs, **added})
-
-    @property
-    def episodes(self) -> int:
-        """Number of episodes of the evaluation."""
-        return self.evaluation.get("episodes", EPISODES)
-
-    def to_dict(self) -> dict[str, Any]:
-        """JSON-able values, with the name."""
-        values = {"name": self.name, **dataclasses.asdict(self)}
-        if not isinstance(self.observation, str):
-            values["observation"] = list(self.observation)
-        return values
 
 
 def read_grid(path: str | Path = DEFAULT_GRID) -> list[Cell]:
@@ -151,14 +118,12 @@ def read_grid(path: str | Path = DEFAULT_GRID) -> list[Cell]:
     Raises:
         GridError: it cannot be read, or a row says something that cannot be.
     """
-    path = Path(path)
+    path, cells = Path(path), {}
     try:
         if path.stat().st_size > _MAX_SIZE:
-            raise GridError(f"{path} is too long for a grid")
+            raise ValueError("too long for a grid")
         values = tomllib.loads(path.read_text())
     except (OSError, ValueError) as error:
-        if isinstance(error, GridError):
-            raise
         raise GridError(f"{path} cannot be read as a grid: {error}") from error
     rows = values.pop("row", None)
     if values or not isinstance(rows, list) or not rows:
@@ -166,20 +131,15 @@ def read_grid(path: str | Path = DEFAULT_GRID) -> list[Cell]:
             f"{path} has {', '.join(values) or 'no row'}; a grid is a list of tables "
             "[[row]] and nothing else"
         )
-    cells: list[Cell] = []
     for number, row in enumerate(rows, 1):
         try:
-            cells += _cells(row)
+            for cell in _cells(row):
+                if cell.name in cells:
+                    raise GridError(f"{cell.name} is there already; give a variant")
+                cells[cell.name] = cell
         except GridError as error:
             raise GridError(f"{path}, row {number}: {error}") from error
-    seen: set[str] = set()
-    for cell in cells:
-        if cell.name in seen:
-            raise GridError(
-                f"{path} has two cells {cell.name}; give one of the rows a variant"
-            )
-        seen.add(cell.name)
-    return cells
+    return list(cells.values())
 
 
 def choose(cells: Sequence[Cell], patterns: Iterable[str]) -> list[Cell]:
@@ -192,10 +152,9 @@ def choose(cells: Sequence[Cell], patterns: Iterable[str]) -> list[Cell]:
     Raises:
         GridError: a pattern fits none; lists the names.
     """
-    patterns = list(patterns)
-    if not patterns:
-        return list(cells)
-    chosen: set[str] = set()
+    chosen = (
+        {cell.name for cell in cells} if not (patterns := list(patterns)) else set()
+    )
     for pattern in patterns:
         whole = pattern if set(pattern) & set("*?[") else f"*{pattern}*"
         fits = {c.name for c in cells if fnmatch.fnmatchcase(c.name, whole)}
@@ -207,62 +166,46 @@ def choose(cells: Sequence[Cell], patterns: Iterable[str]) -> list[Cell]:
 
 
 def _cells(row: Any) -> list[Cell]:
-    _check_fields("the row", row, _ROW)
-    missing = [name for name in _REQUIRED if name not in row]
-    if missing:
+    _check(row, _ROW)
+    if missing := sorted(set(_REQUIRED) - set(row)):
         raise GridError(f"there is no {', '.join(missing)}")
-    evaluation = row.get("evaluation", {})
-    _check_fields("evaluation", evaluation, _EVALUATION)
-    if evaluation.get("episodes", 1) < 1:
+    row = {"seeds": [0], "evaluation": {}, **row}
+    _check(row["evaluation"], _EVALUATION)
+    if row["evaluation"].get("episodes", 1) < 1:
         raise GridError("evaluation.episodes must be at least 1")
-    if {"episodes", "each_arch"} <= set(evaluation):
+    if {"episodes", "each_arch"} <= set(row["evaluation"]):
         raise GridError("evaluation has episodes and each_arch; give one")
-    tasks, seeds = row["tasks"], row.get("seeds", [0])
-    for name, given, kind in (("tasks", tasks, str), ("seeds", seeds, int)):
+    names = row["observation"]
+    observation = names if isinstance(names, str) else tuple(names)
+    tasks, seeds, frames = (row.pop(key) for key in ("tasks", "seeds", "total_frames"))
+    for name, given, kind in (
+        ("tasks", tasks, str),
+        ("seeds", seeds, int),
+        ("observation", [names] if isinstance(names, str) else names, str),
+    ):
         if not given or any(type(one) is not kind for one in given):
-            raise GridError(f"{name} is {given!r}; it must list {_WORDS[kind]}s")
-    observation = row["observation"]
-    if isinstance(observation, list) and any(type(o) is not str for o in observation):
-        raise GridError(f"observation is {observation!r}; it must list strings")
-    return [
-        Cell(
-            label=row["label"],
-            task=task,
-            algorithm=row["algorithm"],
-            preset=row["preset"],
-            observation=observation
-            if isinstance(observation, str)
-            else tuple(observation),
-            seed=seed,
-            total_frames=_frames(row["total_frames"], task),
-            settings=row.get("settings", {}),
-            variant=row.get("variant", ""),
-            evaluation=evaluation,
-        )
-        for seed in seeds
-        for task in tasks
-    ]
+            raise GridError(f"{name} is {given!r}; it must list {kind.__name__}s")
+    cells = []
+    for seed in seeds:
+        for task in tasks:
+            total = frames.get(task) if isinstance(frames, dict) else frames
+            if type(total) is not int or total < 1:
+                raise GridError(
+                    f"total_frames of {task} is {total!r}; it must be a positive "
+                    "integer, or a table with one for each task"
+                )
+            own = {"task": task, "seed": seed, "total_frames": total}
+            cells.append(Cell(**{**row, **own, "observation": observation}))
+    return cells
 
 
-def _frames(given: Any, task: str) -> int:
-    frames = given.get(task) if isinstance(given, dict) else given
-    if type(frames) is not int or frames < 1:
-        raise GridError(
-            f"total_frames is {given!r}; it must be a positive integer, or a "
-            f"table with one for each task ({task} too)"
-        )
-    return frames
-
-
-def _check_fields(what: str, given: Any, known: _Kinds) -> None:
-    if not isinstance(given, dict):
-        raise GridError(f"{what} is {given!r}; it must be a table")
-    unknown = sorted(set(given) - set(known))
-    if unknown:
-        raise GridError(
-            f"{what} has {', '.join(unknown)}; there are {', '.join(known)}"
-        )
-    for name, value in given.items():
-        if type(value) not in known[name]:
-            words = " or ".join(_WORDS[kind] for kind in known[name])
-            raise GridError(f"{name} is {value!r}; it must be {words}")
+def _check(table: Any, known: Mapping[str, Any]) -> None:
+    """Refuse a table with other keys or types."""
+    if not isinstance(table, dict):
+        raise GridError(f"{table!r} must be a table")
+    for name, value in table.items():
+        if name not in known:
+            raise GridError(f"{name} is unknown; there are {', '.join(known)}")
+        if isinstance(value, bool) or not isinstance(value, known[name]):
+            kind = getattr(known[name], "__name__", known[name])
+            raise GridError(f"{name} is {value!r}; it must be {kind}")

@@ -1,16 +1,18 @@
 """The evaluation that every agent is judged by, whatever it was trained with."""
 
 import dataclasses
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
 from cathsim_dmc import suite
 from cathsim_dmc.agents import evaluation
-from cathsim_dmc.agents.policies import PolicyLike, load_policy
+from cathsim_dmc.agents.checkpoint import Checkpoint
+from cathsim_dmc.agents.policies import TrainedPolicy
 from cathsim_dmc.agents.report import ContactLog
 from cathsim_dmc.analysis.heatmap import AP_AXES, MARGIN, ForceMap, force_map
 from cathsim_dmc.anatomy.arch.arch import arch_set, build_seed
+from cathsim_dmc.benchmarks.grid import EPISODES, Cell
 from cathsim_dmc.tasks.config import MAX_STEPS
 from cathsim_dmc.tasks.placement import sheath_direction
 
@@ -19,18 +21,9 @@ from cathsim_dmc.tasks.placement import sheath_direction
 # in training and are the published ones in the evaluation.
 _KEPT = frozenset(
     {
-        "anatomy",
-        "access",
-        "goal",
-        "device",
-        "rotation",
-        "friction",
-        "shaft_link",
-        "torsion_joints",
-        "working_length",
-        "physics_timestep",
-        "fluoroscopy",
-        "cameras",
+        *("anatomy", "access", "goal", "device", "rotation", "friction"),
+        *("shaft_link", "torsion_joints", "working_length", "physics_timestep"),
+        *("fluoroscopy", "cameras"),
     }
 )
 
@@ -47,7 +40,7 @@ class Judgement:
     """
 
     result: evaluation.EvaluationResult
-    contacts: ForceMap | None
+    contacts: ForceMap | None = None
     groups: tuple[str, ...] | None = None
 
 
@@ -65,11 +58,21 @@ def published_options(task_kwargs: Mapping[str, Any]) -> dict[str, Any]:
     return {**kept, "max_steps": MAX_STEPS}
 
 
+def judge_cell(cell: Cell, checkpoint: Checkpoint) -> Judgement:
+    """Evaluate the policy of a cell as its row says."""
+    task = cell.evaluation.get("task", cell.task)
+    options = published_options(checkpoint.config.task_kwargs)
+    options |= cell.evaluation.get("task_kwargs", {})
+    arches = cell.evaluation.get("each_arch")
+    if arches is not None:
+        return judge_each_arch(checkpoint, task, arches, options, cell.name)
+    episodes = cell.evaluation.get("episodes", EPISODES)
+    return judge(checkpoint, task, options, episodes, cell.name)
+
+
 def judge(
-    policy: PolicyLike,
+    checkpoint: Checkpoint,
     task: str,
-    *,
-    observation: str | Sequence[str],
     task_kwargs: Mapping[str, Any],
     episodes: int,
     name: str,
@@ -78,9 +81,8 @@ def judge(
     """Evaluate a policy over episodes with fixed seeds.
 
     Args:
-        policy: Policy, or what names one, see `agents.load_policy`.
+        checkpoint: Checkpoint of the policy.
         task: Name of the task.
-        observation: Name or names of the observations that it reads.
         task_kwargs: Options of the task, see `published_options`.
         episodes: Number of episodes.
         name: Name of the policy for the reports.
@@ -88,30 +90,26 @@ def judge(
     """
     log = ContactLog()
     result = evaluation.evaluate(
-        policy,
+        checkpoint,
         task,
         episodes,
         name=name,
-        observation=observation,
         task_kwargs=task_kwargs,
         num_threads=num_threads,
         observer=log,
     )
-    contacts = None
-    if not suite.TASKS[task].random_arch:
-        scene = suite.make_task(task, **task_kwargs).scene
-        outline = scene.anatomy.surface.vertices[:, AP_AXES]
-        low, high = outline.min(0) - MARGIN, outline.max(0) + MARGIN
-        contacts = force_map(log.positions, log.magnitudes, low, high)
-    return Judgement(result, contacts)
+    if suite.TASKS[task].random_arch:
+        return Judgement(result)
+    scene = suite.make_task(task, **task_kwargs).scene
+    outline = scene.anatomy.surface.vertices[:, AP_AXES]
+    low, high = outline.min(0) - MARGIN, outline.max(0) + MARGIN
+    return Judgement(result, force_map(log.positions, log.magnitudes, low, high))
 
 
 def judge_each_arch(
-    policy: PolicyLike,
+    checkpoint: Checkpoint,
     task: str,
     arches: str,
-    *,
-    observation: str | Sequence[str],
     task_kwargs: Mapping[str, Any],
     name: str,
     numbers: Iterable[int] | None = None,
@@ -121,10 +119,9 @@ def judge_each_arch(
     Arches before whose inlet no sheath fits are passed over.
 
     Args:
-        policy: Policy, or what names one, see `agents.load_policy`.
+        checkpoint: Checkpoint of the policy.
         task: Name of a task with random arches.
         arches: Name of the set, such as "test".
-        observation: Name or names of the observations that it reads.
         task_kwargs: Options of the task, see `published_options`.
         name: Name of the policy for the reports.
         numbers: Numbers of the arches in the set; None for all.
@@ -136,36 +133,30 @@ def judge_each_arch(
     definition = suite.TASKS[task]
     if not definition.random_arch:
         raise ValueError(f"{task} has one anatomy; give a task with random arches")
-    seeds = arch_set(arches)
+    seeds, player = arch_set(arches), TrainedPolicy(checkpoint)
     played: list[evaluation.EvaluationResult] = []
     groups: list[str] = []
-    player = load_policy(policy)
     for number in range(len(seeds)) if numbers is None else numbers:
         anatomy = build_seed(seeds[number], access=definition.access)
         if sheath_direction(anatomy) is None:
             continue
-        own = {"arches": arches, "pool": 1, "first": number}
         one = evaluation.evaluate(
             player,
             task,
             1,
             evaluation.EVALUATION_SEED + number,
             name=name,
-            observation=observation,
-            task_kwargs={**task_kwargs, **own},
-            # A single simulation has no use for more.
+            task_kwargs={**task_kwargs, "arches": arches, "pool": 1, "first": number},
             num_threads=1,
         )
         played.append(one)
         groups.append(f"type {seeds[number].arch_type}")
     if not played:
         raise ValueError(f"no device can enter any of the arches {arches!r}")
+    options = {**task_kwargs, "arches": arches, "pool": 1}
     whole = dataclasses.replace(
         played[0],
         episodes=tuple(one.episodes[0] for one in played),
-        settings={
-            **played[0].settings,
-            "task_kwargs": {**task_kwargs, "arches": arches, "pool": 1},
-        },
+        settings={**played[0].settings, "task_kwargs": options},
     )
-    return Judgement(whole, None, tuple(groups))
+    return Judgement(whole, groups=tuple(groups))

@@ -2,14 +2,17 @@
 
 import json
 import math
+import platform
+import subprocess
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from cathsim_dmc import files
+from cathsim_dmc import __version__, files
 from cathsim_dmc.agents.training_log import EPISODE_WINDOW
 from cathsim_dmc.analysis.force_statistics import FIGURES
 from cathsim_dmc.analysis.heatmap import ForceMap
@@ -19,18 +22,10 @@ POINTS = 200  # of the learning curve
 SOLVED = 0.9  # success rate that "solved" stands for
 _DIGITS = 6  # significant ones of a number in a list
 _MAX_SIZE = 2**24  # bytes
+_PACKAGES = ("mujoco", "dm-control", "torch", "torchrl", "tensordict", "numpy", "scipy")
 # Columns of metrics.csv that make the learning curve, as far as they are there.
-_CURVE = (
-    "frames",
-    "seconds",
-    "episodes",
-    "episode_reward",
-    "episode_length",
-    "success",
-    "distance",
-    "mean_force",
-    "max_force",
-)
+_CURVE = ("frames", "seconds", "episodes", "episode_reward", "episode_length")
+_CURVE += ("success", "distance", "mean_force", "max_force")
 # Figures of every episode: attributes of `EpisodeOutcome`, and of its `forces`.
 _EPISODE = ("reward", "length", "success", "physics_error", "path_ratio")
 _PARTS = ("cell", "config", "training", "evaluation", "versions", "machine")
@@ -46,36 +41,21 @@ class Result:
 
     Attributes:
         path: Path of the file.
-        values: What is in it.
+        values: All that is in it, by part.
+        cell: What was trained, see `grid.Cell`.
+        training: Frames, seconds, learning curve.
+        evaluation: Task, summary, figures of every episode.
+        success: Success rate of the evaluation.
+        frames_per_second: Speed of the training.
     """
 
     path: Path
     values: Mapping[str, Any]
-
-    @property
-    def cell(self) -> Mapping[str, Any]:
-        """What was trained, see `grid.Cell`."""
-        return self.values["cell"]
-
-    @property
-    def training(self) -> Mapping[str, Any]:
-        """Frames, seconds, learning curve."""
-        return self.values["training"]
-
-    @property
-    def evaluation(self) -> Mapping[str, Any]:
-        """Task, summary, figures of every episode."""
-        return self.values["evaluation"]
-
-    @property
-    def success(self) -> float:
-        """Success rate of the evaluation."""
-        return self.evaluation["summary"]["success"]
-
-    @property
-    def frames_per_second(self) -> float:
-        """Speed of the training."""
-        return self.training["frames"] / self.training["seconds"]
+    cell: Mapping[str, Any]
+    training: Mapping[str, Any]
+    evaluation: Mapping[str, Any]
+    success: float
+    frames_per_second: float
 
 
 def read_result(path: str | Path) -> Result:
@@ -94,19 +74,17 @@ def read_result(path: str | Path) -> Result:
     missing = [name for name in _PARTS if not isinstance(values.get(name), dict)]
     if missing:
         raise ResultError(f"{path} lacks {', '.join(missing)}")
-    result = Result(path, values)
+    cell, training, evaluation = (values[part] for part in ("cell", *_PARTS[2:4]))
     try:
-        for rate in (result.success, result.frames_per_second):
-            if not math.isfinite(rate):
-                raise ValueError(f"{rate} is no rate")
-        name = result.cell["name"]
+        success = float(evaluation["summary"]["success"])
+        speed = training["frames"] / training["seconds"]
+        if not math.isfinite(success + speed) or cell["name"] != path.stem:
+            raise ValueError(f"rates {success}, {speed} of the cell {cell['name']}")
     except (KeyError, TypeError, ValueError, ZeroDivisionError) as error:
         raise ResultError(f"{path} is damaged: {type(error).__name__}: {error}") from (
             error
         )
-    if name != path.stem:
-        raise ResultError(f"{path} is named for another cell than the {name} it holds")
-    return result
+    return Result(path, values, cell, training, evaluation, success, speed)
 
 
 def write_result(path: Path, values: Mapping[str, Any]) -> Path:
@@ -117,6 +95,25 @@ def write_result(path: Path, values: Mapping[str, Any]) -> Path:
         for name, value in {"format": FORMAT, **values}.items()
     ]
     return files.write_text(path, "{\n" + ",\n".join(lines) + "\n}\n")
+
+
+def versions() -> dict[str, str]:
+    """Versions of Python, this package and those that results depend on."""
+    own = {"python": platform.python_version(), "cathsim-dmc": __version__}
+    return own | {name: version(name) for name in _PACKAGES}
+
+
+def commit() -> str | None:
+    """Commit of the source tree, with "+" if files differ; None outside of git."""
+    git = ["git", "-C", str(Path(__file__).parent)]
+    head = [*git, "describe", "--always", "--abbrev=40", "--exclude=*", "--dirty=+"]
+    try:
+        # An installed package may lie in a repository that does not know it.
+        for command in ([*git, "ls-files", "--error-unmatch", "grid.py"], head):
+            done = subprocess.run(command, capture_output=True, text=True, check=True)
+    except (OSError, subprocess.SubprocessError):
+        return None
+    return done.stdout.strip()
 
 
 def learning_curve(rows: Sequence[Mapping[str, float | None]]) -> dict[str, list]:
@@ -140,11 +137,9 @@ def solved(rows: Sequence[Mapping[str, float | None]]) -> dict[str, float] | Non
     over: those that end early are the successful ones. None if it never did.
     """
     for row in rows:
-        episodes, success = row.get("episodes"), row.get("success")
-        if episodes is None or success is None or row["frames"] is None:
-            continue
-        if episodes >= EPISODE_WINDOW and success >= SOLVED:
-            return {"frames": row["frames"], "seconds": row["seconds"] or 0.0}
+        enough = (row.get("episodes") or 0) >= EPISODE_WINDOW
+        if enough and (row.get("success") or 0.0) >= SOLVED:
+            return {"frames": row["frames"] or 0.0, "seconds": row["seconds"] or 0.0}
     return None
 
 
@@ -182,29 +177,22 @@ def map_from_values(values: Mapping[str, Any]) -> ForceMap:
         ValueError: lengths differ, or an index lies outside.
     """
     rows, columns = values["shape"]
-    mean, count = np.full(rows * columns, np.nan), np.zeros(rows * columns, np.int64)
-    index = np.asarray(values["index"], dtype=np.int64)
-    if not len(index) == len(values["mean"]) == len(values["count"]):
-        raise ValueError("the lists of a force map differ in length")
-    if len(index) and not 0 <= index.min() <= index.max() < rows * columns:
-        raise ValueError("a force map has a cell outside of it")
+    (left, right), (low, high) = values["x"], values["z"]
+    mean, count = np.full((rows, columns), np.nan), np.zeros((rows, columns), np.int64)
+    index = np.unravel_index(np.asarray(values["index"], np.int64), mean.shape)
     mean[index], count[index] = values["mean"], values["count"]
     return ForceMap(
-        x_edges=np.linspace(values["x"][0], values["x"][1], columns + 1),
-        z_edges=np.linspace(values["z"][0], values["z"][1], rows + 1),
-        mean=mean.reshape(rows, columns),
-        count=count.reshape(rows, columns),
+        x_edges=np.linspace(left, right, columns + 1),
+        z_edges=np.linspace(low, high, rows + 1),
+        mean=mean,
+        count=count,
         outside=values["outside"],
     )
 
 
 def _numbers(values: Any) -> list[float | int | None]:
     """Numbers short enough for a file; whole ones as integers."""
-    short = []
-    for value in values:
-        if value is not None and value == int(value):
-            value = int(value)
-        elif value is not None:
-            value = float(f"{value:.{_DIGITS}g}")
-        short.append(value)
-    return short
+    return [
+        v if v is None else int(v) if v == int(v) else float(f"{v:.{_DIGITS}g}")
+        for v in values
+    ]

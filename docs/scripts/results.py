@@ -24,7 +24,6 @@ from cathsim_dmc import files
 from cathsim_dmc.analysis.intervals import interquartile_mean, success_interval
 from cathsim_dmc.benchmarks.grid import DEFAULT_GRID, read_grid
 from cathsim_dmc.benchmarks.result import ResultError, read_result
-from cathsim_dmc.benchmarks.runner import clock
 
 DOCS = Path(__file__).parents[1]
 PUBLISHED = DOCS / "data/published_results.json"
@@ -330,6 +329,12 @@ def aggregates(table):
     return "\n".join(lines) + "\n" if labels else ""
 
 
+def clock(seconds):
+    """Hours, minutes and seconds."""
+    minutes, rest = divmod(round(seconds), 60)
+    return f"{minutes // 60}:{minutes % 60:02}:{rest:02}"
+
+
 def cost(results, cells):
     """Frames and time of every training."""
     lines = [
@@ -358,10 +363,17 @@ def cost(results, cells):
             clock(solved["seconds"]) if solved else "–",
             f"{training['load']}" if training.get("load") is not None else "–",
             f"{machine['cores']} × {machine['processor']}",
-            (values.get("commit") or "–")[:7] + ("+" if values.get("modified") else ""),
+            commit_of(values),
         ]
         lines.append(f"| {' | '.join(columns)} |")
     return "\n".join(lines) + "\n"
+
+
+def commit_of(values):
+    """The commit of a result, with "+" where files differed from it."""
+    commit = values.get("commit") or "–"
+    differed = values.get("modified") or commit.endswith("+")
+    return commit[:7] + "+" * bool(differed)
 
 
 def drawn(table, out):
