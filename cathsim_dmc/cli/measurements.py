@@ -19,34 +19,31 @@ benchmarks = SubcommandApp()
 
 
 @validations.command
-def rod(figure: Path | None = None, json: bool = False) -> int:
+def rod(json: bool = False) -> int:
     """Bending, buckling and twist of the device against theory.
 
     Args:
-        figure: Path of a PNG to draw the comparison into.
         json: Whether to print one JSON object and nothing else.
     """
     from cathsim_dmc import validation
 
-    return show(validation.validate_rod(figure), json)
+    return show(validation.validate_rod(), json)
 
 
 @validations.command
-def pair(figure: Path | None = None, json: bool = False) -> int:
+def pair(json: bool = False) -> int:
     """Devices in each other: bending, shape, buckling, sliding and torque.
 
     Args:
-        figure: Path of a PNG to draw the comparison into.
         json: Whether to print one JSON object and nothing else.
     """
     from cathsim_dmc import validation
 
-    return show(validation.validate_pair(figure), json)
+    return show(validation.validate_pair(), json)
 
 
 @validations.command
 def wall(
-    figure: Path | None = None,
     anatomy: Annotated[list[str], conf.arg(aliases=("--phantom",))] = [],  # noqa: B006
     convergence: bool = True,
     json: bool = False,
@@ -54,20 +51,18 @@ def wall(
     """Fidelity of the wall, friction against the capstan equation, convergence.
 
     Args:
-        figure: Path of a PNG to draw the comparison into.
         anatomy: Directories of further anatomies, such as an imported scan.
         convergence: Whether to include the studies of time step and link length.
         json: Whether to print one JSON object and nothing else.
     """
     from cathsim_dmc import validation
 
-    report = validation.validate_wall(figure, anatomy, with_convergence=convergence)
+    report = validation.validate_wall(anatomy, with_convergence=convergence)
     return show(report, json)
 
 
 @validations.command
 def forces(
-    figure: Path | None = None,
     episode: Path | None = None,
     mean: float = 0.4,
     sd: float = 0.02,
@@ -77,7 +72,6 @@ def forces(
     """Force balance, known loads, and the published protocol.
 
     Args:
-        figure: Path of a PNG to draw density and cumulative plots into.
         episode: Recorded cannulation (.npz of `cathsim record`) for the protocol;
             scripted insertions by default.
         mean: Mean of the normal reference, N; the published one is unverified.
@@ -87,7 +81,7 @@ def forces(
     """
     from cathsim_dmc import validation
 
-    report = validation.validate_forces(figure, episode, mean, sd, margin)
+    report = validation.validate_forces(episode, mean, sd, margin)
     return show(report, json)
 
 

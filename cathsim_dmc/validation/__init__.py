@@ -1,14 +1,18 @@
 """Validation of the physics against closed forms and the published protocol.
 
-The functions of `cathsim validate`, and of `cathsim phantom check`; each loads its
-parts when it is called.
+Each `validate_…` returns a `Report`. Its module is imported when it is first used.
 """
 
-from __future__ import annotations
-
-from typing import Any
+import importlib
+from typing import TYPE_CHECKING
 
 from cathsim_dmc.validation.checks import Check, Report
+
+if TYPE_CHECKING:
+    from cathsim_dmc.validation.force_sensors import validate_forces
+    from cathsim_dmc.validation.pair import validate_pair
+    from cathsim_dmc.validation.rod import validate_rod
+    from cathsim_dmc.validation.wall import validate_anatomy, validate_wall
 
 __all__ = [
     "Check",
@@ -20,37 +24,16 @@ __all__ = [
     "validate_wall",
 ]
 
-
-def validate_rod(*args: Any, **kwargs: Any) -> Report:
-    """Bending, buckling and twist: see `validation.rod.validate_rod`."""
-    from cathsim_dmc.validation import rod
-
-    return rod.validate_rod(*args, **kwargs)
-
-
-def validate_pair(*args: Any, **kwargs: Any) -> Report:
-    """Coaxial devices at rest and on the move: see `validation.pair.validate_pair`."""
-    from cathsim_dmc.validation import pair
-
-    return pair.validate_pair(*args, **kwargs)
+_MODULES = {
+    "validate_anatomy": "wall",
+    "validate_forces": "force_sensors",
+    "validate_pair": "pair",
+    "validate_rod": "rod",
+    "validate_wall": "wall",
+}
 
 
-def validate_anatomy(*args: Any, **kwargs: Any) -> Report:
-    """Lumen fidelity of given anatomies: see `wall.validate_anatomy`."""
-    from cathsim_dmc.validation import wall
-
-    return wall.validate_anatomy(*args, **kwargs)
-
-
-def validate_wall(*args: Any, **kwargs: Any) -> Report:
-    """Lumen fidelity, friction and convergence: see `wall.validate_wall`."""
-    from cathsim_dmc.validation import wall
-
-    return wall.validate_wall(*args, **kwargs)
-
-
-def validate_forces(*args: Any, **kwargs: Any) -> Report:
-    """Sensors and published protocol: see `force_sensors.validate_forces`."""
-    from cathsim_dmc.validation import force_sensors
-
-    return force_sensors.validate_forces(*args, **kwargs)
+def __getattr__(name: str):
+    if name in _MODULES:
+        return getattr(importlib.import_module(f"{__name__}.{_MODULES[name]}"), name)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -28,6 +28,11 @@ class Check:
     passed: bool
     note: str = ""
 
+    @property
+    def measured(self) -> str:
+        """The value in three digits with its unit."""
+        return f"{self.value:.3g} {self.unit}".rstrip()
+
     @classmethod
     def at_most(
         cls, name: str, value: float, bound: float, unit: str, note: str = ""
@@ -74,11 +79,13 @@ class Report:
         title: of the validation.
         checks: figures with a bound.
         findings: figures without one, plain values that JSON can hold.
+        data: measurements behind the checks by name, for figures; not in JSON.
     """
 
     title: str
     checks: Sequence[Check]
     findings: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+    data: Mapping[str, Any] = dataclasses.field(default_factory=dict, repr=False)
 
     def __post_init__(self):
         names = [check.name for check in self.checks]
@@ -120,29 +127,12 @@ class Report:
         for check in self.checks:
             table.add_row(
                 check.name,
-                _number(check),
+                check.measured,
                 f"{check.bound} {check.unit}".rstrip(),
                 "[green]pass[/]" if check.passed else "[bold red]FAIL[/]",
                 check.note,
             )
         return table
-
-    def markdown(self) -> str:
-        """The same table in Markdown."""
-        lines = [
-            "| check | measured | bound | | behind it |",
-            "|---|---|---|---|---|",
-        ]
-        lines += [
-            f"| {check.name} | {_number(check)} | {check.bound} {check.unit} | "
-            f"{'pass' if check.passed else '**FAIL**'} | {check.note} |"
-            for check in self.checks
-        ]
-        return "\n".join(lines) + "\n"
-
-
-def _number(check: Check) -> str:
-    return f"{check.value:.3g} {check.unit}".rstrip()
 
 
 def _plain(value: Any) -> Any:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Sequence
 from typing import Any
 
@@ -14,72 +13,53 @@ from cathsim_dmc.validation.checks import Check
 
 TIMESTEPS = (0.001, 0.002, 0.004, 0.008)  # s
 SHAFT_LINKS = (0.005, 0.007, 0.010, 0.014, 0.0175, 0.025)  # m
+DEFAULTS = {
+    "physics_timestep": PHYSICS_TIMESTEP,
+    "shaft_link": NavigationConfig().shaft_link,
+}
 # The start of an episode is displaced by up to 1 mm; a coarser model may not move the
 # path by more than that on average.
 PATH_BOUND = 1.0  # mm
 FORCE_BOUND = 10.0  # % of the mean wall force
 # A script with less wall force than this on average says nothing about it, N.
-_LEAST_FORCE = 1e-3
+LEAST_FORCE = 1e-3
 
 
-@dataclasses.dataclass(frozen=True)
-class Study:
-    """One script at several resolutions; the first is the finest.
+def study(
+    script: insertion.Script, parameter: str, values: Sequence[float]
+) -> dict[str, Any]:
+    """Runs a script at several resolutions, other settings at their defaults.
 
-    Attributes:
+    Args:
         script: which insertion.
-        parameter: "physics_timestep" or "shaft_link".
-        values: (n,), s or m, ascending.
-        links: (n,), number of links.
-        path_mean: (n,), mean distance of the head from the finest run's at the same
-            time, m.
-        path_max: (n,), largest, m. A tip that slips a moment later is far from itself.
-        track_max: (n,), largest distance of the head from the finest run's track,
-            whatever the time, m.
-        force_mean: (n,), mean wall force, N.
-        force_p95: (n,), N.
-        penetration_max: (n,), m.
+        parameter: "physics_timestep" (s) or "shaft_link" (m).
+        values: of the parameter.
+
+    Returns:
+        "script" (name), "parameter", and lists with an entry for each value: "value",
+        number of "links", mean and largest distance (mm) of the head from the finest
+        run's at the same time ("path_mean_mm", "path_max_mm") and from its track
+        whatever the time ("track_max_mm"), wall force ("force_mean", "force_p95", N)
+        and "penetration_max_mm".
     """
-
-    script: insertion.Script
-    parameter: str
-    values: np.ndarray
-    links: np.ndarray
-    path_mean: np.ndarray
-    path_max: np.ndarray
-    track_max: np.ndarray
-    force_mean: np.ndarray
-    force_p95: np.ndarray
-    penetration_max: np.ndarray
-
-    def at(self, value: float) -> int:
-        """Index of a value of the parameter."""
-        return int(np.flatnonzero(np.isclose(self.values, value))[0])
-
-    def force_deviation(self, value: float) -> float:
-        """Deviation of the mean wall force from the finest run, %; signed."""
-        return float(100 * (self.force_mean[self.at(value)] / self.force_mean[0] - 1))
-
-
-def study(script: insertion.Script, parameter: str, values: Sequence[float]) -> Study:
-    """Runs a script at several resolutions, other settings at their defaults."""
-    ascending = np.sort(np.asarray(values, dtype=float))
-    runs = [insertion.run(script, **{parameter: value}) for value in ascending.tolist()]
-    distance = [np.linalg.norm(run.head - runs[0].head, axis=1) for run in runs]
-    return Study(
-        script=script,
-        parameter=parameter,
-        values=ascending,
-        links=np.array([run.links for run in runs]),
-        path_mean=np.array([each.mean() for each in distance]),
-        path_max=np.array([each.max() for each in distance]),
-        track_max=np.array(
-            [polyline_distance(run.head, runs[0].head).max() for run in runs]
-        ),
-        force_mean=np.array([run.wall_force.mean() for run in runs]),
-        force_p95=np.array([np.percentile(run.wall_force, 95) for run in runs]),
-        penetration_max=np.array([run.penetration.max() for run in runs]),
-    )
+    ascending = sorted(float(value) for value in values)
+    # A tiny goal: the script runs to its end.
+    options = [{"goal_radius": 1e-5, parameter: value} for value in ascending]
+    runs = [insertion.run(script, **each) for each in options]  # type: ignore
+    away = [1e3 * np.linalg.norm(run.head - runs[0].head, axis=1) for run in runs]
+    track = [1e3 * polyline_distance(run.head, runs[0].head) for run in runs]
+    return {
+        "script": script.name,
+        "parameter": parameter,
+        "value": ascending,
+        "links": [run.links for run in runs],
+        "path_mean_mm": [float(each.mean()) for each in away],
+        "path_max_mm": [float(each.max()) for each in away],
+        "track_max_mm": [float(each.max()) for each in track],
+        "force_mean": [float(run.wall_force.mean()) for run in runs],
+        "force_p95": [float(np.percentile(run.wall_force, 95)) for run in runs],
+        "penetration_max_mm": [1e3 * float(run.penetration.max()) for run in runs],
+    }
 
 
 def polyline_distance(points: np.ndarray, line: np.ndarray) -> np.ndarray:
@@ -92,72 +72,44 @@ def polyline_distance(points: np.ndarray, line: np.ndarray) -> np.ndarray:
     return np.sqrt((nearest**2).sum(-1).min(axis=1))
 
 
-def studies(
-    scripts: Sequence[insertion.Script] = insertion.SCRIPTS,
-    timesteps: Sequence[float] = TIMESTEPS,
-    shaft_links: Sequence[float] = SHAFT_LINKS,
-) -> list[Study]:
-    """Studies of both parameters for each script; default values must be among them."""
+def studies() -> list[dict[str, Any]]:
+    """Studies of both parameters for each script."""
+    resolutions = {"physics_timestep": TIMESTEPS, "shaft_link": SHAFT_LINKS}
     return [
         study(script, parameter, values)
-        for script in scripts
-        for parameter, values in (
-            ("physics_timestep", timesteps),
-            ("shaft_link", shaft_links),
-        )
+        for script in insertion.SCRIPTS
+        for parameter, values in resolutions.items()
     ]
 
 
-def checks(results: Sequence[Study]) -> list[Check]:
-    """Whether the defaults are converged."""
-    defaults = {
-        "physics_timestep": PHYSICS_TIMESTEP,
-        "shaft_link": NavigationConfig().shaft_link,
-    }
+def checks(results: Sequence[dict[str, Any]]) -> list[Check]:
+    """Whether the defaults, which are among the values, are converged."""
     found = []
     for one in results:
-        default = defaults[one.parameter]
-        label = (
-            f"step of {1e3 * default:g} ms against {1e3 * one.values[0]:g} ms"
-            if one.parameter == "physics_timestep"
-            else f"links of {1e3 * default:g} mm against {1e3 * one.values[0]:g} mm"
-        )
-        index = one.at(default)
+        default, finest = DEFAULTS[one["parameter"]], one["value"][0]
+        of_step = one["parameter"] == "physics_timestep"
+        kind, unit = ("step", "ms") if of_step else ("links", "mm")
+        label = f"{kind} of {1e3 * default:g} {unit} against {1e3 * finest:g} {unit}"
+        index = int(np.flatnonzero(np.isclose(one["value"], default))[0])
         found.append(
             Check.at_most(
-                f"{label}, {one.script.name}: mean distance of the tip paths",
-                1e3 * one.path_mean[index],
+                f"{label}, {one['script']}: mean distance of the tip paths",
+                one["path_mean_mm"][index],
                 PATH_BOUND,
                 "mm",
-                f"largest {1e3 * one.path_max[index]:.2f} mm, off the track by at "
-                f"most {1e3 * one.track_max[index]:.2f} mm",
+                f"largest {one['path_max_mm'][index]:.2f} mm, off the track by at "
+                f"most {one['track_max_mm'][index]:.2f} mm",
             )
         )
-        if one.force_mean[0] > _LEAST_FORCE:
+        force, reference = one["force_mean"][index], one["force_mean"][0]
+        if reference > LEAST_FORCE:
             found.append(
-                Check.at_most(
-                    f"{label}, {one.script.name}: mean wall force",
-                    abs(one.force_deviation(default)),
+                Check.deviation(
+                    f"{label}, {one['script']}: mean wall force",
+                    force,
+                    reference,
                     FORCE_BOUND,
-                    "%",
-                    f"{1e3 * one.force_mean[index]:.1f} mN against "
-                    f"{1e3 * one.force_mean[0]:.1f} mN",
+                    f"{1e3 * force:.1f} mN against {1e3 * reference:.1f} mN",
                 )
             )
     return found
-
-
-def summary(one: Study) -> dict[str, Any]:
-    """Plain values of a study; lengths in mm, forces in N."""
-    return {
-        "script": one.script.name,
-        "parameter": one.parameter,
-        "value": one.values.tolist(),
-        "links": one.links.tolist(),
-        "path_mean_mm": (1e3 * one.path_mean).tolist(),
-        "path_max_mm": (1e3 * one.path_max).tolist(),
-        "track_max_mm": (1e3 * one.track_max).tolist(),
-        "force_mean": one.force_mean.tolist(),
-        "force_p95": one.force_p95.tolist(),
-        "penetration_max_mm": (1e3 * one.penetration_max).tolist(),
-    }

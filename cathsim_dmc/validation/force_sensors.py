@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 import mujoco
 import numpy as np
@@ -40,23 +41,14 @@ USUAL_FORCE = 0.2  # N, most forces on phantoms lie below
 USUAL_SHARE = 90.0  # %, "most"
 
 
-@dataclasses.dataclass(frozen=True)
-class Resting:
-    """The last link resting on a plate under a load, N.
+class Resting(NamedTuple):
+    """The last link resting on a plate under a load, N."""
 
-    Attributes:
-        load: on the middle of the link.
-        contacts: sum of the contact sensor, force of the device on the plate.
-        load_cell: of the plate on its support.
-        base: share of the load that the base carries, by its sensor.
-        penetration: m.
-    """
-
-    load: float
-    contacts: float
-    load_cell: float
-    base: float
-    penetration: float
+    load: float  # on the middle of the link
+    contacts: float  # sum of the contact sensor, force of the device on the plate
+    load_cell: float  # of the plate on its support
+    base: float  # share of the load that the base carries, by its sensor
+    penetration: float  # m
 
 
 def resting_link(load: float, settling: float = 5.0) -> Resting:
@@ -120,25 +112,15 @@ def straight_tube(length: float, radius: float) -> Anatomy:
     )
 
 
-@dataclasses.dataclass(frozen=True)
-class DeadEnd:
-    """The device pushed against the blind end of a tube; averages over a second, N.
+class DeadEnd(NamedTuple):
+    """The device pushed against the blind end of a tube; averages over a second, N."""
 
-    Attributes:
-        motor: what the stalled carriage pushes with.
-        push: push force at the base.
-        load_cell: of the phantom, along the axis.
-        contacts: sum of the contact sensor along the axis.
-        sheath: axial force on the rim of the sheath.
-        ripple: standard deviation of the push force.
-    """
-
-    motor: float
-    push: float
-    load_cell: float
-    contacts: float
-    sheath: float
-    ripple: float
+    motor: float  # what the stalled carriage pushes with
+    push: float  # push force at the base
+    load_cell: float  # of the phantom, along the axis
+    contacts: float  # sum of the contact sensor along the axis
+    sheath: float  # axial force on the rim of the sheath
+    ripple: float  # standard deviation of the push force
 
 
 def dead_end(
@@ -225,7 +207,6 @@ def scripted_cannulations(
                 insertion.Script("into the BCA", speed, curl, 4.0 / speed),
                 seed=seed,
                 goal="bca",
-                goal_radius=8e-3,
             )
             for curl in INSERTION_CURLS
             for seed in range(seeds)
@@ -235,7 +216,6 @@ def scripted_cannulations(
 
 
 def validate_forces(
-    figure_path: str | Path | None = None,
     episode: str | Path | Episode | Sequence[float] | None = None,
     reference_mean: float = protocol.REFERENCE_MEAN,
     reference_sd: float = protocol.REFERENCE_SD,
@@ -244,7 +224,6 @@ def validate_forces(
     """Runs every check of the forces, and the published protocol.
 
     Args:
-        figure_path: PNG to write, or None.
         episode: cannulation of the BCA for the protocol: a recorded episode, its
             file, or force samples in N. None for scripted insertions.
         reference_mean: of the normal reference, N.
@@ -310,17 +289,14 @@ def validate_forces(
     samples = _samples(episode, cannulations)
     comparison = protocol.compare(samples, reference_mean, reference_sd, margin)
     findings = {
-        "protocol": comparison.as_dict(),
+        "protocol": comparison,
         "ripple of the push force against a dead end, N": {
             tube: {f"{one.motor:g} N": one.ripple for one in runs}
             for tube, runs in pushed.items()
         },
     }
-    if figure_path is not None:
-        from cathsim_dmc.validation import figures
-
-        figures.forces(pushed, samples, comparison, figure_path)
-    return Report("forces", checks, findings)
+    data = {"pushed": pushed, "samples": samples, "comparison": comparison}
+    return Report("forces", checks, findings, data)
 
 
 def _samples(episode, cannulations) -> np.ndarray:

@@ -1,15 +1,20 @@
-"""Scripted insertions in an arch, for convergence and for force statistics."""
+"""Scripted insertions, for convergence, force statistics and straight pushes."""
 
 from __future__ import annotations
 
 import dataclasses
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from cathsim_dmc import suite
-from cathsim_dmc.tasks import objectives as objectives
+from cathsim_dmc.anatomy import Anatomy, Goal
+from cathsim_dmc.entities.chain import MAX_PUSH_SPEED
 from cathsim_dmc.tasks.config import CONTROL_TIMESTEP
+
+CURL_TIME = 2.0  # s
+# Way of the base (m) beside that to the goal, after which a straight push has missed.
+_SPARE = 0.08
 
 
 @dataclasses.dataclass(frozen=True)
@@ -29,16 +34,16 @@ class Script:
     curl: tuple[float, float]
     duration: float
 
-    def action(self, step: int, size: int) -> np.ndarray:
-        """Action (size,) of a control step."""
-        action = np.zeros(size)
+    def action(self, step: int, task: Any) -> np.ndarray:
+        """Action (A,) of a control step of a task."""
+        catheter, action = task.scene.catheter, np.zeros(task.num_actions)
         ramp = min(1.0, (step + 1) * CONTROL_TIMESTEP / CURL_TIME)
-        action[0:20:2], action[1:20:2] = ramp * np.array(self.curl)[:, None]
-        action[20] = self.speed
+        motors = len(catheter.tip_motors)
+        action[0:motors:2], action[1:motors:2] = ramp * np.array(self.curl)[:, None]
+        action[list(catheter.translations)] = self.speed
         return action
 
 
-CURL_TIME = 2.0  # s
 # Over the arch along its wall, into the first branch, into the last one.
 SCRIPTS = (
     Script("over the arch", 0.5, (0.3, 0.0), 8.0),
@@ -47,71 +52,47 @@ SCRIPTS = (
 )
 
 
-@dataclasses.dataclass(frozen=True)
-class Insertion:
-    """What an insertion measured at T control steps.
+class Insertion(NamedTuple):
+    """What an insertion measured at T control steps."""
 
-    Attributes:
-        head: (T, 3), m.
-        wall_force: (T,), sum of the magnitudes of all contacts, N.
-        peak: (T,), largest single contact of any substep, N.
-        resultant: (T,), magnitude of the force on the phantom's load cell, N.
-        contact_forces: (K,), magnitudes of the single contacts of all steps, N.
-        penetration: (T,), largest, m.
-        links: number of links of the device.
-        success: whether the goal was reached.
-    """
-
-    head: np.ndarray
-    wall_force: np.ndarray
-    peak: np.ndarray
-    resultant: np.ndarray
-    contact_forces: np.ndarray
-    penetration: np.ndarray
-    links: int
-    success: bool
+    head: np.ndarray  # (T, 3), m
+    wall_force: np.ndarray  # (T,), sum of the magnitudes of all contacts, N
+    peak: np.ndarray  # (T,), largest single contact of any physics step, N
+    resultant: np.ndarray  # (T,), force on the phantom's load cell, N
+    contact_forces: np.ndarray  # (K,), single contacts of all steps, N
+    penetration: np.ndarray  # (T,), largest, m
+    links: int  # of the device
+    success: bool  # whether the goal was reached
 
 
 def run(
     script: Script,
     *,
     seed: int = 0,
-    phantom: str = "type1",
-    goal: str = "lcca",
-    goal_radius: float = 1e-5,
+    anatomy: str | Anatomy = "type1",
+    goal: str | Goal = "lcca",
     **options: Any,
 ) -> Insertion:
-    """Runs a script.
+    """Runs a script until its end or that of the episode.
 
     Args:
         script: what to do.
         seed: of the displaced start.
-        phantom: name of an arch.
-        goal: it sets the stroke of the base; reaching it ends the run.
-        goal_radius: m; tiny by default, so that the script runs to its end.
+        anatomy: name of an arch, or an anatomy.
+        goal: it sets the stroke of the base.
         **options: further fields of `tasks.navigation.NavigationConfig`.
 
     Raises:
         RuntimeError: if the simulation diverges.
     """
-    environment = suite.load(
-        "cathsim",
-        "navigate",
-        task_kwargs={
-            "random": seed,
-            "anatomy": phantom,
-            "goal": goal,
-            "goal_radius": goal_radius,
-            **options,
-        },
-    )
+    kwargs = {"random": seed, "anatomy": anatomy, "goal": goal, **options}
+    environment = suite.load(suite.DOMAIN, "navigate", kwargs)
     task = environment.task
     environment.reset()
     rows: list[tuple] = []
     single: list[np.ndarray] = []
-    size = len(task.scene.catheter.actuators)
     for step in range(round(script.duration / CONTROL_TIMESTEP)):
-        timestep = environment.step(script.action(step, size))
+        timestep = environment.step(script.action(step, task))
         if environment.physics.data.ptr.warning.number.any():
             raise RuntimeError(
                 f"insertion {script.name!r} with {options} diverged at step {step}"
@@ -132,13 +113,40 @@ def run(
     head, wall_force, peak, resultant, penetration = map(
         np.array, zip(*rows, strict=True)
     )
+    environment.close()
     return Insertion(
-        head=head,
-        wall_force=wall_force,
-        peak=peak,
-        resultant=resultant,
-        contact_forces=np.concatenate(single),
-        penetration=penetration,
-        links=len(task.scene.catheter.links),
-        success=task.termination == "success",
+        head,
+        wall_force,
+        peak,
+        resultant,
+        np.concatenate(single),
+        penetration,
+        len(task.scene.catheter.links),
+        task.termination == "success",
     )
+
+
+def straight_push(
+    anatomy: Anatomy, goal: str | Goal, seed: int = 0, **options: Any
+) -> dict[str, float]:
+    """Pushes the device at full speed without steering it.
+
+    Args:
+        anatomy: where.
+        goal: of the anatomy.
+        seed: of the start of the episode.
+        **options: of the task, fields of `tasks.navigation.NavigationConfig`.
+
+    Returns:
+        Whether the goal was reached ("success"), "steps" until then or until it was
+        given up, "mean_force" of the wall and the "peak_force" of a contact, N.
+    """
+    duration = (anatomy.route(goal).length + _SPARE) / MAX_PUSH_SPEED
+    script = Script("straight push", 1.0, (0.0, 0.0), duration)
+    pushed = run(script, seed=seed, anatomy=anatomy, goal=goal, **options)
+    return {
+        "success": pushed.success,
+        "steps": len(pushed.head),
+        "mean_force": float(pushed.wall_force.mean()),
+        "peak_force": float(pushed.peak.max(initial=0.0)),
+    }

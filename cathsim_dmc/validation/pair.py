@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
-from pathlib import Path
+from typing import NamedTuple
 
 import mujoco
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from cathsim_dmc.entities import devices
 from cathsim_dmc.entities.device import Device
@@ -90,31 +91,22 @@ def cantilevers(protrusion: float) -> list[rod.Cantilever]:
     return rod.bent(rig, *sections(entity, gaps), END_ANGLES)
 
 
-@dataclasses.dataclass(frozen=True)
-class Shape:
-    """An unloaded shape.
+class UnloadedShape(NamedTuple):
+    """Coaxial devices at rest."""
 
-    Attributes:
-        devices: names, from the innermost outwards.
-        gaps: (K,) from the end of each device to that of the chain, m.
-        rotation: (K,) of each device, rad.
-        simulated: (L + 1, 3), joints and head, m, from the base of the chain.
-        expected: (n, 3), the curve of the EI-weighted curvature.
-        deviation: of head and joints from the curve at the same arc lengths, the
-            largest, over the displacement of the end from the straight line.
-    """
-
-    devices: tuple[str, ...]
-    gaps: np.ndarray
-    rotation: np.ndarray
-    simulated: np.ndarray
-    expected: np.ndarray
+    devices: tuple[str, ...]  # from the innermost outwards
+    gaps: np.ndarray  # (K,) from the end of each device to that of the chain, m
+    rotation: np.ndarray  # (K,) of each device, rad
+    simulated: np.ndarray  # (L + 1, 3), joints and head, m, from the base of the chain
+    expected: np.ndarray  # (n, 3), the curve of the EI-weighted curvature
+    # Largest of head and joints from the curve at the same arc lengths, over the
+    # displacement of the end from the straight line.
     deviation: float
 
 
 def unloaded(
     names: Sequence[str], end_gaps: Sequence[float], turned: Sequence[float]
-) -> Shape:
+) -> UnloadedShape:
     """Lets coaxial devices settle and compares them with Σ EI κ / Σ EI."""
     gaps, rotation = np.asarray(end_gaps), np.asarray(turned)
     rig = rig_of(names, gaps, rotation)
@@ -130,7 +122,7 @@ def unloaded(
     )
     moved = np.linalg.norm(curve[-1] - (0.0, 0.0, length))
     error = np.linalg.norm(points - there, axis=-1).max()
-    return Shape(
+    return UnloadedShape(
         tuple(names),
         np.array(gaps),
         np.array(rotation),
@@ -155,9 +147,9 @@ def weighted_curve(
     for bend, step in zip(curvature, steps, strict=True):
         # The curvature x + iy leads towards x and y: a turn about -y, x of the frame.
         axis = frame @ np.array([-bend.imag, bend.real, 0.0]) * step
-        half = _rotation(axis / 2) @ frame
+        half = Rotation.from_rotvec(axis / 2).as_matrix() @ frame
         points.append(points[-1] + half[:, 2] * step)
-        frame = _rotation(axis) @ frame
+        frame = Rotation.from_rotvec(axis).as_matrix() @ frame
     return np.append(arc, length), np.array(points)
 
 
@@ -240,16 +232,6 @@ def _smoothness() -> Check:
     )
 
 
-def _rotation(vector: np.ndarray) -> np.ndarray:
-    """Rotation matrix of a rotation vector."""
-    angle = np.linalg.norm(vector)
-    if angle == 0.0:
-        return np.eye(3)
-    x, y, z = vector / angle
-    skew = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-    return np.eye(3) + np.sin(angle) * skew + (1 - np.cos(angle)) * skew @ skew
-
-
 def buckling(end: str) -> rod.Buckling:
     """Critical load of the shafts of the pair, one in the other."""
     entity = DeviceStack(straightened(PAIR))
@@ -268,12 +250,8 @@ def buckling(end: str) -> rod.Buckling:
     )
 
 
-def validate_pair(figure_path: str | Path | None = None) -> Report:
-    """Runs every check of coaxial devices.
-
-    Args:
-        figure_path: PNG to write, or None.
-    """
+def validate_pair() -> Report:
+    """Runs every check of coaxial devices."""
     checks: list[Check] = []
     for protrusion in PROTRUSIONS:
         for one in cantilevers(protrusion):
@@ -306,10 +284,6 @@ def validate_pair(figure_path: str | Path | None = None) -> Report:
         checks.append(rod.buckling_check("buckling load of the pair", buckling(end)))
     checks.append(_smoothness())
     checks += pressed.checks(PAIR)
-    moving = sliding.checks()
-    checks += moving.checks
-    if figure_path is not None:
-        from cathsim_dmc.validation import figures
-
-        figures.pair(shapes, moving.turned, figure_path)
-    return Report("pair", checks, moving.findings)
+    moving, findings, turned = sliding.checks()
+    data = {"shapes": shapes, "turned": turned}
+    return Report("pair", [*checks, *moving], findings, data)

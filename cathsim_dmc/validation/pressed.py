@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import dataclasses
+from typing import NamedTuple
 
 import mujoco
 import numpy as np
@@ -26,19 +26,12 @@ _JAMMED = 2.0  # s, of pushing with the stroke used up
 _END = 1.0  # s, of it that counts
 
 
-@dataclasses.dataclass(frozen=True)
-class Pressed:
-    """A mass under a dead load on a plane.
+class Pressed(NamedTuple):
+    """A mass under a dead load on a plane."""
 
-    Attributes:
-        load: N.
-        depth: mean, m.
-        ripple: largest depth less the smallest, m.
-    """
-
-    load: float
-    depth: float
-    ripple: float
+    load: float  # N
+    depth: float  # mean, m
+    ripple: float  # largest depth less the smallest, m
 
 
 def pressed(
@@ -74,19 +67,12 @@ def pressed(
     return Pressed(load, float(depth.mean()), float(np.ptp(depth)))
 
 
-@dataclasses.dataclass(frozen=True)
-class Jam:
-    """A pair pushed into the dead end of a tube until its drive gives way.
+class Jam(NamedTuple):
+    """A pair pushed into the dead end of a tube until its drive gives way."""
 
-    Attributes:
-        push_force: at the end, N.
-        penetration: 99th percentile of the deepest contact of a physics step, m.
-        forces: least and largest of the largest contact of a physics step, N.
-    """
-
-    push_force: float
-    penetration: float
-    forces: tuple[float, float]
+    push_force: float  # at the end, N
+    penetration: float  # 99th percentile of the deepest contact of a physics step, m
+    forces: tuple[float, float]  # least and largest of the largest contact, N
 
 
 def jam(pair: tuple[str, str]) -> Jam:

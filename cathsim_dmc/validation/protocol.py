@@ -8,7 +8,6 @@ these proves no equality, so effect sizes and an equivalence test stand beside t
 
 from __future__ import annotations
 
-import dataclasses
 from typing import Any
 
 import numpy as np
@@ -26,54 +25,6 @@ SIGNIFICANCE = 0.05
 # Shapiro-Wilk's p-value holds up to so many samples.
 _SHAPIRO_LIMIT = 5000
 _LEAST_SAMPLES = 3
-
-
-@dataclasses.dataclass(frozen=True)
-class Comparison:
-    """Force samples against a normal reference, N.
-
-    Attributes:
-        count: number of samples n.
-        effective_count: number of independent samples that tell as much of the mean.
-        mean: of the samples.
-        sd: of the samples, n - 1.
-        reference_mean: of the reference.
-        reference_sd: of the reference.
-        shapiro_w: Shapiro-Wilk statistic of the samples.
-        shapiro_p: p-value of normality.
-        levene: Levene statistic, about the means.
-        levene_p: p-value of equal variances.
-        mann_whitney_u: Mann-Whitney U of the samples.
-        mann_whitney_p: two-sided p-value of equal distributions.
-        cliffs_delta: P(sample > reference) - P(sample < reference), in [-1, 1].
-        cohens_d: difference of the means over the pooled deviation.
-        margin: of the equivalence test.
-        equivalence_p: p-value of the two one-sided tests; below `SIGNIFICANCE` the
-            means are equal within the margin.
-        equivalent: whether they are.
-    """
-
-    count: int
-    effective_count: float
-    mean: float
-    sd: float
-    reference_mean: float
-    reference_sd: float
-    shapiro_w: float
-    shapiro_p: float
-    levene: float
-    levene_p: float
-    mann_whitney_u: float
-    mann_whitney_p: float
-    cliffs_delta: float
-    cohens_d: float
-    margin: float
-    equivalence_p: float
-    equivalent: bool
-
-    def as_dict(self) -> dict[str, Any]:
-        """Plain values."""
-        return dataclasses.asdict(self)
 
 
 def load_cell_samples(episode: Episode) -> np.ndarray:
@@ -113,12 +64,6 @@ def effective_count(samples: np.ndarray) -> float:
     return float(max(1.0, n / (1 + 2 * correlation[1:stop].sum())))
 
 
-def cliffs_delta(samples: np.ndarray, reference: np.ndarray) -> float:
-    """Cliff's delta of samples (n,) over a reference (m,), in [-1, 1]."""
-    u = stats.mannwhitneyu(samples, reference, alternative="two-sided").statistic
-    return float(2 * u / (len(samples) * len(reference)) - 1)
-
-
 def equivalence(
     mean: float,
     sd: float,
@@ -151,10 +96,20 @@ def compare(
     reference_mean: float = REFERENCE_MEAN,
     reference_sd: float = REFERENCE_SD,
     margin: float = EQUIVALENCE_MARGIN,
-) -> Comparison:
+) -> dict[str, Any]:
     """Compares force samples (n,), in N and in the order of time, with a reference.
 
     The reference has as many samples as there are.
+
+    Returns:
+        "count" n and "effective_count", that of independent samples that tell as much
+        of the mean; "mean", "sd" (n - 1), "reference_mean", "reference_sd", N;
+        "shapiro_w", "shapiro_p" of normality; "levene", "levene_p" of equal variances
+        about the means; "mann_whitney_u", "mann_whitney_p" (two-sided) of equal
+        distributions; "cliffs_delta", P(sample > reference) - P(sample < reference);
+        "cohens_d", difference of the means over the pooled deviation; "margin" (N) and
+        "equivalence_p" of the two one-sided tests; "equivalent", whether the means are
+        equal within the margin.
 
     Raises:
         ValueError: if there are too few samples, one is not finite, or an argument is
@@ -177,34 +132,28 @@ def compare(
     shapiro = stats.shapiro(thinned)
     levene = stats.levene(samples, reference, center="mean")
     ranks = stats.mannwhitneyu(samples, reference, alternative="two-sided")
-    sd = float(samples.std(ddof=1))
+    mean, sd = float(samples.mean()), float(samples.std(ddof=1))
     independent = effective_count(samples)
     p_value = equivalence(
-        float(samples.mean()),
-        sd,
-        independent,
-        reference_mean,
-        reference_sd,
-        count,
-        margin,
+        mean, sd, independent, reference_mean, reference_sd, count, margin
     )
     pooled = np.sqrt((sd**2 + reference_sd**2) / 2)
-    return Comparison(
-        count=count,
-        effective_count=independent,
-        mean=float(samples.mean()),
-        sd=sd,
-        reference_mean=float(reference_mean),
-        reference_sd=float(reference_sd),
-        shapiro_w=float(shapiro.statistic),
-        shapiro_p=float(shapiro.pvalue),
-        levene=float(levene.statistic),
-        levene_p=float(levene.pvalue),
-        mann_whitney_u=float(ranks.statistic),
-        mann_whitney_p=float(ranks.pvalue),
-        cliffs_delta=float(2 * ranks.statistic / count**2 - 1),
-        cohens_d=float((samples.mean() - reference_mean) / pooled),
-        margin=float(margin),
-        equivalence_p=p_value,
-        equivalent=bool(p_value < SIGNIFICANCE),
-    )
+    return {
+        "count": count,
+        "effective_count": independent,
+        "mean": mean,
+        "sd": sd,
+        "reference_mean": float(reference_mean),
+        "reference_sd": float(reference_sd),
+        "shapiro_w": float(shapiro.statistic),
+        "shapiro_p": float(shapiro.pvalue),
+        "levene": float(levene.statistic),
+        "levene_p": float(levene.pvalue),
+        "mann_whitney_u": float(ranks.statistic),
+        "mann_whitney_p": float(ranks.pvalue),
+        "cliffs_delta": float(2 * ranks.statistic / count**2 - 1),
+        "cohens_d": float((mean - reference_mean) / pooled),
+        "margin": float(margin),
+        "equivalence_p": p_value,
+        "equivalent": bool(p_value < SIGNIFICANCE),
+    }

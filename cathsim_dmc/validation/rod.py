@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Sequence
-from pathlib import Path
+from typing import NamedTuple
 
 import mujoco
 import numpy as np
@@ -33,24 +33,15 @@ TORSION_JOINTS = 4  # default of the tasks with rotation
 TWIST = 0.35  # rad, of the whole device under the end torque; lag of the braked tip
 
 
-@dataclasses.dataclass(frozen=True)
-class Cantilever:
-    """A cantilever under end load, simulated and as elastica.
+class Cantilever(NamedTuple):
+    """A cantilever under end load, simulated and as elastica."""
 
-    Attributes:
-        end_angle: of the elastica, rad.
-        force: N.
-        simulated: (n + 1, 2), axial and transverse places of joints and head from the
-            clamp on, m.
-        expected: the elastica.
-        deviation: of the displacement of the end, per displacement of the end.
-    """
-
-    end_angle: float
-    force: float
+    end_angle: float  # of the elastica, rad
+    force: float  # N
+    # (n + 1, 2), axial and transverse places of joints and head from the clamp on, m.
     simulated: np.ndarray
     expected: theory.Elastica
-    deviation: float
+    deviation: float  # of the displacement of the end, per displacement of the end
 
 
 def straight(device: str | devices.Device) -> devices.Device:
@@ -126,25 +117,15 @@ def bent(
     return results
 
 
-@dataclasses.dataclass(frozen=True)
-class Buckling:
-    """Southwell plot of a column.
+class Buckling(NamedTuple):
+    """Southwell plot of a column."""
 
-    Attributes:
-        end: "sliding" or "fixed", see `theory.buckling_load`.
-        length: of the column, m.
-        load: (n,), axial loads, N.
-        deflection: (n,), additional deflection under the axial load, m.
-        critical: load from the plot, N.
-        expected: load of Euler, N.
-    """
-
-    end: str
-    length: float
-    load: np.ndarray
-    deflection: np.ndarray
-    critical: float
-    expected: float
+    end: str  # "sliding" or "fixed", see `theory.buckling_load`
+    length: float  # of the column, m
+    load: np.ndarray  # (n,), axial loads, N
+    deflection: np.ndarray  # (n,), additional deflection under the axial load, m
+    critical: float  # load from the plot, N
+    expected: float  # load of Euler, N
 
 
 def buckling(
@@ -192,7 +173,7 @@ def column(
     """
     middles = np.cumsum(rig.lengths) - rig.lengths / 2
     length = middles[last] - middles[0]
-    expected = theory.buckling_load([length], [stiffness], end=end)
+    expected = theory.buckling_load(length, stiffness, end)
     _add_guide(rig, last, end)
     rig.compile()
     prepare(rig)
@@ -248,8 +229,7 @@ def _add_guide(rig: Rig, index: int, end: str) -> None:
     )
 
 
-@dataclasses.dataclass(frozen=True)
-class TwistUnderTorque:
+class TwistUnderTorque(NamedTuple):
     """Twist of the straight device under an end torque: N·m, rad, rad."""
 
     torque: float
@@ -271,29 +251,17 @@ def twist_under_torque(
     return TwistUnderTorque(torque, _twist(rig), TWIST)
 
 
-@dataclasses.dataclass(frozen=True)
-class TwistLag:
-    """Lag of the tip behind the turning base.
+class TwistLag(NamedTuple):
+    """Lag of the tip behind the turning base."""
 
-    Attributes:
-        time: (n,), s.
-        base: (n,), angle of the base, rad.
-        tip: (n,), angle of the tip, rad.
-        expected: (n,), angle of the tip that theory gives for that of the base, rad.
-        lag: of the tip in steady rotation, rad.
-        expected_lag: rad.
-        rise_time: time in which the lag reaches 1 - 1/e of its final value, s.
-        expected_rise_time: s, for the measured motion of the base.
-    """
-
-    time: np.ndarray
-    base: np.ndarray
-    tip: np.ndarray
-    expected: np.ndarray
-    lag: float
-    expected_lag: float
-    rise_time: float
-    expected_rise_time: float
+    time: np.ndarray  # (n,), s
+    base: np.ndarray  # (n,), angle of the base, rad
+    tip: np.ndarray  # (n,), angle of the tip, rad
+    expected: np.ndarray  # (n,), angle of the tip by theory, for that of the base, rad
+    lag: float  # of the tip in steady rotation, rad
+    expected_lag: float  # rad
+    rise_time: float  # in which the lag reaches 1 - 1/e of its final value, s
+    expected_rise_time: float  # s, for the measured motion of the base
 
 
 def twist_lag(
@@ -372,12 +340,8 @@ def _twist(rig: Rig, wrapped: bool = False) -> float:
     return -angle if wrapped else angle
 
 
-def validate_rod(figure_path: str | Path | None = None) -> Report:
-    """Runs every check of the rod.
-
-    Args:
-        figure_path: PNG to write, or None.
-    """
+def validate_rod() -> Report:
+    """Runs every check of the rod."""
     checks: list[Check] = []
     loaded = cantilevers()
     for one in loaded:
@@ -443,8 +407,5 @@ def validate_rod(figure_path: str | Path | None = None) -> Report:
             for one in short
         }
     }
-    if figure_path is not None:
-        from cathsim_dmc.validation import figures
-
-        figures.rod(loaded, columns, short, lag, figure_path)
-    return Report("rod", checks, findings)
+    data = {"cantilevers": loaded, "columns": columns, "short": short, "lag": lag}
+    return Report("rod", checks, findings, data)

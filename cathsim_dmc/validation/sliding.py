@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -41,23 +41,14 @@ STRAIGHT_LAG = 45.0  # °, of the end in a straight tube
 WHIP = 3.0  # least rate of turning of the end in a bend, in that of the base
 
 
-@dataclasses.dataclass(frozen=True)
-class Part:
-    """What happened in a part of the script.
-
-    Attributes:
-        name: of the part.
-        largest_step: of the end of the chain in a control step, m.
-        moved: distance of the end of the chain from where it was before the part, m.
-        peak_force: largest single contact, N.
-        warnings: of MuJoCo.
-    """
+class Part(NamedTuple):
+    """What happened in a part of the script."""
 
     name: str
-    largest_step: float
-    moved: float
-    peak_force: float
-    warnings: int
+    largest_step: float  # of the end of the chain in a control step, m
+    moved: float  # of the end of the chain from where it was before the part, m
+    peak_force: float  # largest single contact, N
+    warnings: int  # of MuJoCo
 
 
 def slide(
@@ -199,17 +190,8 @@ def turn(bent: bool, **options: Any) -> Torque:
     return Torque(name, base, tip, torque, stiffness, shape)
 
 
-@dataclasses.dataclass(frozen=True)
-class Moving:
-    """Checks and findings of devices on the move, and what a figure shows."""
-
-    checks: list[Check]
-    findings: dict[str, Any]
-    turned: list[Torque]
-
-
-def checks() -> Moving:
-    """Runs the devices and judges them."""
+def checks() -> tuple[list[Check], dict[str, Any], list[Torque]]:
+    """Runs the devices; returns checks, findings and the turned devices."""
     parts, _ = slide()
     found = [
         Check.at_most(
@@ -244,7 +226,7 @@ def checks() -> Moving:
         ),
     ]
     findings = {
-        "sliding": [dataclasses.asdict(part) for part in parts],
+        "sliding": [part._asdict() for part in parts],
         "torque": {
             one.name: {
                 "largest lag, °": float(np.degrees(one.lag.max())),
@@ -257,4 +239,4 @@ def checks() -> Moving:
             for one in turned
         },
     }
-    return Moving(found, findings, turned)
+    return found, findings, turned

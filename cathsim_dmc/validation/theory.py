@@ -12,7 +12,6 @@ from typing import NamedTuple
 import numpy as np
 from scipy.integrate import solve_ivp
 from scipy.optimize import brentq
-from scipy.special import ellipe, ellipeinc, ellipk, ellipkinc
 
 
 class Elastica(NamedTuple):
@@ -87,77 +86,16 @@ def _tip_compliance(lengths, stiffnesses) -> float:
     return total
 
 
-def elastica_by_elliptic_integrals(
-    length: float, stiffness: float, end_angle: float
-) -> tuple[float, np.ndarray]:
-    """Force and end (2,), axial and transverse, of a uniform cantilever's elastica.
+def buckling_load(length: float, stiffness: float, end: str = "sliding") -> float:
+    """Euler's load (N) of a uniform column of EI (N·m²), clamped at its start.
 
-    With k² = (1 + sin α)/2 and sin φ = 1/(k√2): L√(F/EI) = K(k) - F(φ, k), the
-    deflection is L - 2√(EI/F) (E(k) - E(φ, k)) and the axial place √(2 EI sin α / F)
-    (Bisshopp and Drucker, Quart. Appl. Math. 3 (1945) 272).
+    The end keeps its direction. "sliding": it is free to move sideways (π²EI/L²);
+    "fixed": it is not (4π²EI/L²).
     """
-    parameter = (1 + np.sin(end_angle)) / 2
-    amplitude = np.arcsin(1 / np.sqrt(2 * parameter))
-    number = ellipk(parameter) - ellipkinc(amplitude, parameter)
-    force = stiffness * (number / length) ** 2
-    scale = np.sqrt(stiffness / force)
-    deflection = length - 2 * scale * (
-        ellipe(parameter) - ellipeinc(amplitude, parameter)
-    )
-    return float(force), np.array([scale * np.sqrt(2 * np.sin(end_angle)), deflection])
-
-
-def buckling_load(
-    lengths: Sequence[float] | np.ndarray,
-    stiffnesses: Sequence[float] | np.ndarray,
-    *,
-    end: str = "sliding",
-) -> float:
-    """Lowest critical axial load (N) of a stepped column, clamped at its start.
-
-    The end keeps its direction. "sliding": it is free to move sideways (effective
-    length L, π²EI/L² if uniform); "fixed": it is not (L/2, 4π²EI/L²). From the
-    transfer matrices of EI w'''' + P w'' = 0 (Timoshenko and Gere, Theory of Elastic
-    Stability, ch. 2).
-    """
-    rows = {"sliding": (1, 3), "fixed": (0, 1)}
-    if end not in rows:
-        raise ValueError(f"end is {end!r}; allowed are {', '.join(rows)}")
-    total = float(np.sum(lengths))
-    scale = float(np.max(stiffnesses)) / total**2
-
-    def determinant(load):
-        # Deflection, slope, moment and transverse force, scaled to order one.
-        matrix = np.eye(4)
-        for length, stiffness in zip(lengths, stiffnesses, strict=True):
-            matrix = _column(length / total, stiffness / scale / total**2, load) @ (
-                matrix
-            )
-        # Clamped: only moment and transverse force are free at the start.
-        return np.linalg.det(matrix[np.ix_(rows[end], (2, 3))])
-
-    # The stiffest section alone bounds the load by 4π² of these units.
-    loads = np.linspace(1e-3, 60, 6001)
-    values = np.array([determinant(load) for load in loads])
-    index = int(np.flatnonzero(np.sign(values[1:]) != np.sign(values[:-1]))[0])
-    return brentq(determinant, loads[index], loads[index + 1]) * scale
-
-
-def _column(length: float, stiffness: float, load: float) -> np.ndarray:
-    """Transfer matrix of a uniform column; V is the force normal to the *line* of load.
-
-    w' = θ, EI θ' = M, M' = V - Pθ, V' = 0.
-    """
-    k = np.sqrt(load / stiffness)
-    c, s = np.cos(k * length), np.sin(k * length)
-    return np.array(
-        [
-            [1, s / k, (1 - c) / load, (length - s / k) / load],
-            [0, c, s / (k * stiffness), (1 - c) / load],
-            [0, -k * stiffness * s, c, s / k],
-            [0, 0, 0, 1],
-        ]
-    )
+    factors = {"sliding": 1, "fixed": 4}
+    if end not in factors:
+        raise ValueError(f"end is {end!r}; allowed are {', '.join(factors)}")
+    return factors[end] * np.pi**2 * stiffness / length**2
 
 
 def twist(torque: float, lengths, torsional_stiffnesses) -> float:

@@ -10,8 +10,8 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import PolyCollection
 from matplotlib.figure import Figure
 
+from cathsim_dmc import style
 from cathsim_dmc.anatomy import Anatomy
-from cathsim_dmc.validation.figures import save_figure
 
 # Name, axis to the right, axis upwards or downwards, axis towards the reader or away.
 VIEWS = (
@@ -20,7 +20,6 @@ VIEWS = (
     ("from below", 0, (1, -1), (2, -1)),
 )
 _AXES = ("x, to the left", "y, posterior", "z, superior")
-_COLOURS = ("#1f4e79", "#c0501f", "#6a9a4b", "#9467bd", "#b08d20", "#2a9d8f", "#8c564b")
 _GOAL_RADIUS = 8.0  # mm, the published task's
 
 
@@ -40,7 +39,7 @@ def draw(anatomy: Anatomy, path: str | Path, title: str | None = None) -> None:
     names, labels = axes[0].get_legend_handles_labels()
     figure.legend(names, labels, fontsize=8, loc="outside lower center", ncols=7)
     figure.suptitle(title or anatomy.name)
-    save_figure(figure, path)
+    style.save(figure, path)
 
 
 def draw_view(ax: Axes, anatomy: Anatomy, view: tuple = VIEWS[0]) -> None:
@@ -69,7 +68,12 @@ def draw_view(ax: Axes, anatomy: Anatomy, view: tuple = VIEWS[0]) -> None:
     )
     for index, (vessel, branch) in enumerate(anatomy.tree.vessels.items()):
         line = flat(branch.centreline.points)
-        ax.plot(*line.T, color=_COLOURS[index % len(_COLOURS)], lw=1.4, label=vessel)
+        ax.plot(
+            *line.T,
+            color=style.COLOURS[index % len(style.COLOURS)],
+            lw=1.4,
+            label=vessel,
+        )
     for goal in anatomy.goals.values():
         place = flat(goal.position)
         angle = np.linspace(0.0, 2.0 * np.pi, 60)
@@ -91,4 +95,5 @@ def draw_view(ax: Axes, anatomy: Anatomy, view: tuple = VIEWS[0]) -> None:
     if sign < 0:
         ax.invert_yaxis()
     ax.set_title(name, fontsize=10)
-    ax.spines[["top", "right"]].set_visible(False)
+    style.tidy(ax)
+    ax.grid(False)

@@ -16,7 +16,7 @@ from cathsim_dmc.anatomy.scan.check import check_tree
 from cathsim_dmc.anatomy.wall import fidelity
 from cathsim_dmc.entities import devices
 from cathsim_dmc.entities.contact import FRICTION, wall_contact
-from cathsim_dmc.validation import convergence, theory
+from cathsim_dmc.validation import convergence
 from cathsim_dmc.validation.checks import Check, Report
 from cathsim_dmc.validation.rig import Rig
 
@@ -120,7 +120,7 @@ def capstan(
         ratio=ratio,
         mean=float(ratio[travel > _LEAD].mean()),
         free=float(free[far > _LEAD].mean()),
-        expected=theory.capstan_ratio(friction, angle),
+        expected=float(np.exp(friction * angle)),
     )
 
 
@@ -280,11 +280,10 @@ def validate_anatomy(
         checks += tree_checks(dataclasses.replace(anatomy, name=name))
         findings[name] = {"measures": shape(anatomy)}
         if push:
-            from cathsim_dmc.validation.push import straight_push
+            from cathsim_dmc.validation.insertion import straight_push
 
             findings[name]["straight push"] = {
-                goal: dataclasses.asdict(straight_push(anatomy, goal))
-                for goal in anatomy.goals
+                goal: straight_push(anatomy, goal) for goal in anatomy.goals
             }
     if figure_path is not None:
         from cathsim_dmc.validation import views
@@ -345,7 +344,6 @@ def _for_people(values: Mapping[str, Any], inside: str = "") -> dict[str, Any]:
 
 
 def validate_wall(
-    figure_path: str | Path | None = None,
     phantoms: Sequence[str | Path | Anatomy] = (),
     rays: int = RAYS,
     with_convergence: bool = True,
@@ -353,7 +351,6 @@ def validate_wall(
     """Runs every check of the wall.
 
     Args:
-        figure_path: PNG to write, or None.
         phantoms: further anatomies beside the arches, such as an imported scan: the
             directory of one, or the anatomy.
         rays: of the coverage of each anatomy.
@@ -380,13 +377,8 @@ def validate_wall(
         checks += lumen_checks(anatomy, rays)
     pulled = [capstan(friction, wrap) for friction, wrap in CAPSTANS]
     checks += [one.check() for one in pulled]
-    findings: dict[str, Any] = {}
     studies = convergence.studies() if with_convergence else []
-    if studies:
-        checks += convergence.checks(studies)
-        findings["convergence"] = [convergence.summary(one) for one in studies]
-    if figure_path is not None:
-        from cathsim_dmc.validation import figures
-
-        figures.wall(anatomies, pulled, studies, figure_path)
-    return Report("wall", checks, findings)
+    checks += convergence.checks(studies)
+    findings = {"convergence": studies} if studies else {}
+    data = {"anatomies": anatomies, "capstans": pulled, "studies": studies}
+    return Report("wall", checks, findings, data)

@@ -11,13 +11,13 @@ import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
+from cathsim_dmc import style
 from cathsim_dmc.anatomy import measures, phantoms
 from cathsim_dmc.anatomy.arch import arch, sampler
 from cathsim_dmc.anatomy.scan.mesh_depth import MeshDepth
 from cathsim_dmc.anatomy.surface import lumen_surface
 from cathsim_dmc.validation import views, wall
-from cathsim_dmc.validation.figures import save_figure
-from cathsim_dmc.validation.push import straight_push
+from cathsim_dmc.validation.insertion import straight_push
 
 ROOT = Path(__file__).parents[1]
 PAGE, IMAGES = ROOT / "anatomies.md", ROOT / "images"
@@ -140,8 +140,13 @@ def pushes(names):
                         name,
                         access,
                         goal,
-                        f"reached, {push.steps} steps" if push.success else "missed",
-                        f"{1e3 * push.mean_force:.0f} / {1e3 * push.peak_force:.0f}",
+                        f"reached, {push['steps']} steps"
+                        if push["success"]
+                        else "missed",
+                        " / ".join(
+                            f"{1e3 * push[key]:.0f}"
+                            for key in ("mean_force", "peak_force")
+                        ),
                     ]
                 )
     header = ["", "access", "goal", "straight push"]
@@ -206,7 +211,7 @@ def gallery():
             ax.set_ylabel("")
             ax.tick_params(labelsize=6)
             ax.set_title(seed.name if side == 0 else "from the left", fontsize=7)
-    save_figure(figure, IMAGES / "random_arches.png")
+    style.save(figure, IMAGES / "random_arches.png")
 
 
 def write(blocks):

@@ -1,8 +1,8 @@
 """Runs the validations and rewrites the tables and figures of docs/validation.md.
 
-``python docs/scripts/validation.py [rod] [wall] [forces] [--phantom DIRECTORY ...]``
+``python docs/scripts/validation.py [rod] [pair] [wall] [forces] [--phantom DIRECTORY]``
 
-Each part is written, with its date, as soon as it has ended.
+Each part is written, with its date, as soon as it has ended; of pair the figure alone.
 """
 
 import argparse
@@ -12,6 +12,7 @@ import pathlib
 import sys
 import time
 
+import validation_figures
 from rich.console import Console
 
 from cathsim_dmc import files, validation
@@ -28,6 +29,16 @@ def between(text: str, name: str, content: str) -> str:
     head, rest = text.split(start)
     _, tail = rest.split(stop)
     return f"{head}{start}{content}{stop}{tail}"
+
+
+def checks(report) -> str:
+    lines = ["| check | measured | bound | | behind it |", "|---|---|---|---|---|"]
+    for check in report.checks:
+        passed = "pass" if check.passed else "**FAIL**"
+        bound = f"{check.bound} {check.unit}"
+        cells = (check.name, check.measured, bound, passed, check.note)
+        lines.append(f"| {' | '.join(cells)} |")
+    return "\n".join(lines) + "\n"
 
 
 def findings(report) -> str:
@@ -71,7 +82,7 @@ def convergence(report) -> str:
 def write(name: str, report, machine: str) -> None:
     """Put a report and its date into the page."""
     text = PAGE.read_text(encoding="utf-8")
-    text = between(text, name, report.markdown())
+    text = between(text, name, checks(report))
     text = between(text, f"{name} findings", findings(report))
     if name == "wall":
         text = between(text, "convergence", convergence(report))
@@ -82,14 +93,15 @@ def write(name: str, report, machine: str) -> None:
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("parts", nargs="*", metavar="rod|wall|forces")
+    parser.add_argument("parts", nargs="*", metavar="rod|pair|wall|forces")
     parser.add_argument("--phantom", action="append", default=[])
     parser.add_argument("--machine", default=MACHINE)
     parser.add_argument("--json", type=pathlib.Path, help="also write the reports here")
     arguments = parser.parse_args()
     runs = {
         "rod": validation.validate_rod,
-        "wall": lambda figure: validation.validate_wall(figure, arguments.phantom),
+        "pair": validation.validate_pair,
+        "wall": lambda: validation.validate_wall(arguments.phantom),
         "forces": validation.validate_forces,
     }
     chosen = arguments.parts or list(runs)
@@ -98,10 +110,12 @@ def main() -> int:
     reports = {}
     for name in chosen:
         start = time.time()
-        report = runs[name](IMAGES / f"validation_{name}.png")
+        report = runs[name]()
+        validation_figures.draw(name, report, IMAGES / f"validation_{name}.png")
         Console().print(report.table())
         print(f"{name}: {time.time() - start:.0f} s", flush=True)
-        write(name, report, arguments.machine)
+        if name != "pair":
+            write(name, report, arguments.machine)
         reports[name] = report
     if arguments.json:
         everything = {name: report.as_dict() for name, report in reports.items()}

@@ -1,10 +1,4 @@
-"""Figures of the validation, one PNG per command."""
-
-from __future__ import annotations
-
-from collections.abc import Mapping, Sequence
-from pathlib import Path
-from typing import TYPE_CHECKING
+"""Figures of the validation, one for each report; `validation.py` draws them."""
 
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -12,22 +6,20 @@ from matplotlib.figure import Figure
 from scipy import stats
 
 from cathsim_dmc import style
-from cathsim_dmc.anatomy.anatomy import Anatomy
 from cathsim_dmc.anatomy.wall import fidelity
-from cathsim_dmc.files import atomic_path
-from cathsim_dmc.tasks.config import PHYSICS_TIMESTEP, NavigationConfig
-
-if TYPE_CHECKING:
-    from cathsim_dmc.validation import convergence, force_sensors, protocol, sliding
-    from cathsim_dmc.validation import pair as pairs
-    from cathsim_dmc.validation import rod as rods
-    from cathsim_dmc.validation import wall as walls
+from cathsim_dmc.validation.convergence import DEFAULTS, LEAST_FORCE
 
 THEORY, SIMULATED, THIRD = style.COLOURS[:3]
-_COLOURS = (SIMULATED, THEORY, *style.COLOURS[2:5])
+COLOURS = (SIMULATED, THEORY, *style.COLOURS[2:5])
 
 
-def _canvas(rows: int, columns: int) -> tuple[Figure, np.ndarray]:
+def draw(name, report, path):
+    """Draws the measurements behind a report, by its name, into a PNG."""
+    figure = DRAWN[name](**report.data)
+    style.save(figure, path)
+
+
+def canvas(rows, columns):
     figure = Figure(figsize=(4.6 * columns, 3.6 * rows), layout="constrained")
     FigureCanvasAgg(figure)
     axes = figure.subplots(rows, columns, squeeze=False)
@@ -36,28 +28,13 @@ def _canvas(rows: int, columns: int) -> tuple[Figure, np.ndarray]:
     return figure, axes
 
 
-def save_figure(figure: Figure, path: str | Path) -> None:
-    """Writes a figure as PNG in one step."""
-    path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with atomic_path(path) as temporary:
-        figure.savefig(temporary, dpi=110, format="png")
-
-
-def rod(
-    bent: Sequence[rods.Cantilever],
-    columns: Sequence[rods.Buckling],
-    short: Sequence[rods.Buckling],
-    lag: rods.TwistLag,
-    path: str | Path,
-) -> None:
-    """Draws cantilevers, columns and twist."""
-    figure, axes = _canvas(2, 2)
-    _cantilevers(axes[0, 0], bent)
+def rod(cantilevers, columns, short, lag):
+    figure, axes = canvas(2, 2)
+    _cantilevers(axes[0, 0], cantilevers)
     _lag(axes[0, 1], lag)
     _southwell(axes[1, 0], columns)
     _short_columns(axes[1, 1], [*short, *columns])
-    save_figure(figure, path)
+    return figure
 
 
 def _cantilevers(ax, bent):
@@ -94,7 +71,7 @@ def _cantilevers(ax, bent):
 
 
 def _southwell(ax, columns):
-    for colour, one in zip(_COLOURS, columns, strict=False):
+    for colour, one in zip(COLOURS, columns, strict=False):
         w = 1e3 * one.deflection
         # Scaled by Euler's load, so that its line has slope 1.
         y = w / (one.load / one.expected)
@@ -115,7 +92,7 @@ def _southwell(ax, columns):
 
 
 def _short_columns(ax, columns):
-    for colour, end in zip(_COLOURS, ("sliding", "fixed"), strict=False):
+    for colour, end in zip(COLOURS, ("sliding", "fixed"), strict=False):
         those = sorted((c for c in columns if c.end == end), key=lambda c: c.length)
         ax.plot(
             [1e3 * c.length for c in those],
@@ -152,16 +129,13 @@ def _lag(ax, lag):
     ax.legend(frameon=False, fontsize=8, loc="lower right")
 
 
-def pair(
-    shapes: Sequence[pairs.Shape], turned: Sequence[sliding.Torque], path: str | Path
-) -> None:
-    """Draws unloaded shapes of coaxial devices, and torque through tubes."""
-    figure, axes = _canvas(1, 2)
+def pair(shapes, turned):
+    figure, axes = canvas(1, 2)
     left, right = axes[0]
     for index, shape in enumerate(shapes):
         end = shape.expected[-1, :2]
         across = end / np.linalg.norm(end)
-        colour = _COLOURS[index % len(_COLOURS)]
+        colour = COLOURS[index % len(COLOURS)]
         for points, mark in ((shape.expected, "-"), (shape.simulated, ".")):
             left.plot(
                 1e3 * points[:, 2], 1e3 * points[:, :2] @ across, mark, color=colour
@@ -178,38 +152,36 @@ def pair(
         right.plot(
             np.degrees(one.base),
             np.degrees(one.tip),
-            color=_COLOURS[index],
+            color=COLOURS[index],
             label=one.name,
         )
     ends = [0, np.degrees(turned[0].base[-1])]
     right.plot(ends, ends, color="0.6", linewidth=0.8)
     right.set(title="torque", xlabel="base, °", ylabel="end of the device, °")
     right.legend(frameon=False)
-    save_figure(figure, path)
+    return figure
 
 
 def _convergence(axes, studies):
     (by_step, force_by_step), (by_link, force_by_link) = axes
-    defaults = {
-        "physics_timestep": 1e3 * PHYSICS_TIMESTEP,
-        "shaft_link": 1e3 * NavigationConfig().shaft_link,
+    panels = {
+        "physics_timestep": (by_step, force_by_step, "time step, ms"),
+        "shaft_link": (by_link, force_by_link, "longest link, mm"),
     }
-    labels = {"physics_timestep": "time step, ms", "shaft_link": "longest link, mm"}
-    scripts = list(dict.fromkeys(one.script.name for one in studies))
+    scripts = list(dict.fromkeys(one["script"] for one in studies))
     for one in studies:
-        colour = _COLOURS[scripts.index(one.script.name)]
-        of_step = one.parameter == "physics_timestep"
-        path = by_step if of_step else by_link
-        force = force_by_step if of_step else force_by_link
-        x = 1e3 * one.values
+        path, force, label = panels[one["parameter"]]
+        x = 1e3 * np.array(one["value"])
+        colour = COLOURS[scripts.index(one["script"])]
         look = {"color": colour, "linewidth": 1, "markersize": 4}
-        path.plot(x[1:], 1e3 * one.path_mean[1:], "o-", label=one.script.name, **look)
-        path.plot(x[1:], 1e3 * one.track_max[1:], "^:", **look)
-        if one.force_mean[0] > 1e-3:
-            force.plot(x, 1e3 * one.force_mean, "o-", **look)
+        path.plot(x[1:], one["path_mean_mm"][1:], "o-", label=one["script"], **look)
+        path.plot(x[1:], one["track_max_mm"][1:], "^:", **look)
+        if one["force_mean"][0] > LEAST_FORCE:
+            force.plot(x, 1e3 * np.array(one["force_mean"]), "o-", **look)
         for ax in (path, force):
-            ax.set_xlabel(labels[one.parameter])
-            ax.axvline(defaults[one.parameter], color="0.6", linewidth=0.8, zorder=0)
+            ax.set_xlabel(label)
+            default = 1e3 * DEFAULTS[one["parameter"]]
+            ax.axvline(default, color="0.6", linewidth=0.8, zorder=0)
     for path, force in axes:
         path.set(
             title="Tip path against the finest run",
@@ -221,19 +193,13 @@ def _convergence(axes, studies):
     by_step.legend(frameon=False, fontsize=8, loc="lower right")
 
 
-def wall(
-    anatomies: Sequence[Anatomy],
-    pulled: Sequence[walls.Capstan],
-    studies: Sequence[convergence.Study],
-    path: str | Path,
-) -> None:
-    """Draws the distribution of intrusion, the capstan and the convergence."""
-    figure, rows = _canvas(3 if studies else 1, 2)
+def wall(anatomies, capstans, studies):
+    figure, rows = canvas(3 if studies else 1, 2)
     axes = rows[0]
     if studies:
         _convergence(rows[1:], studies)
     ax = axes[0]
-    for colour, anatomy in zip(_COLOURS * 3, anatomies, strict=False):
+    for colour, anatomy in zip(COLOURS * 3, anatomies, strict=False):
         inside, _ = fidelity.wall_intervals(anatomy.wall, _lumen(anatomy), 4e-3)
         values = np.sort(1e3 * inside)
         share = 100 * (1 - np.arange(1, len(values) + 1) / len(values))
@@ -251,7 +217,7 @@ def wall(
     )
     ax.legend(frameon=False, fontsize=8)
     ax = axes[1]
-    for colour, one in zip(_COLOURS * 2, pulled, strict=False):
+    for colour, one in zip(COLOURS * 2, capstans, strict=False):
         label = f"μ = {one.friction:g}, {np.degrees(one.angle):.0f}°"
         ax.plot(1e3 * one.travel, one.ratio, color=colour, label=label)
         ax.axhline(one.expected, color=colour, linestyle="--", linewidth=1)
@@ -262,26 +228,20 @@ def wall(
         ylabel="tension ratio (dashed: exp μθ)",
     )
     ax.legend(frameon=False, fontsize=8)
-    save_figure(figure, path)
+    return figure
 
 
-def _lumen(anatomy: Anatomy) -> fidelity.SurfaceSamples:
+def _lumen(anatomy):
     """The same places as `fidelity.intrusion` measures."""
     if anatomy.field is None:
         return fidelity.tube_samples(anatomy.tree, 1e-3)
     return fidelity.mesh_samples(anatomy, 1e-3)
 
 
-def forces(
-    pushed: Mapping[str, Sequence[force_sensors.DeadEnd]],
-    samples: np.ndarray,
-    comparison: protocol.Comparison,
-    path: str | Path,
-) -> None:
-    """Draws the dead end, and density and cumulative plots of the protocol."""
-    figure, (axes,) = _canvas(1, 3)
+def forces(pushed, samples, comparison):
+    figure, (axes,) = canvas(1, 3)
     ax = axes[0]
-    for colour, (name, runs) in zip(_COLOURS, pushed.items(), strict=False):
+    for colour, (name, runs) in zip(COLOURS, pushed.items(), strict=False):
         push = [one.push for one in runs]
         closed = [
             one.load_cell + (one.sheath if name == "wide" else 0.0) for one in runs
@@ -305,7 +265,7 @@ def forces(
         ylabel="load cell, N",
     )
     ax.legend(frameon=False, fontsize=8)
-    reference = stats.norm(comparison.reference_mean, comparison.reference_sd)
+    reference = stats.norm(comparison["reference_mean"], comparison["reference_sd"])
     grid = np.linspace(0, max(samples.max(), reference.ppf(0.9999)) * 1.05, 800)
     ax = axes[1]
     ax.hist(samples, bins=40, density=True, color=SIMULATED, alpha=0.6)
@@ -324,14 +284,17 @@ def forces(
         np.arange(1, len(ordered) + 1) / len(ordered),
         where="post",
         color=SIMULATED,
-        label=f"simulated, n = {comparison.count}",
+        label=f"simulated, n = {comparison['count']}",
     )
     ax.plot(
         grid,
         reference.cdf(grid),
         color=THEORY,
-        label=f"normal, {comparison.reference_mean:g} ± {comparison.reference_sd:g} N",
+        label="normal, {reference_mean:g} ± {reference_sd:g} N".format(**comparison),
     )
     ax.set(title="Cumulative", xlabel="force on the phantom, N", ylabel="share")
     ax.legend(frameon=False, fontsize=8, loc="center", bbox_to_anchor=(0.42, 0.5))
-    save_figure(figure, path)
+    return figure
+
+
+DRAWN = {"rod": rod, "pair": pair, "wall": wall, "forces": forces}
