@@ -1,7 +1,7 @@
-"""An objective of one's own: reach the branch, and press the wall as little as one can.
+"""A user's own objective: reach the branch with little force on the wall.
 
-`python examples/own_objective.py` registers a task with it and trains PPO on that
-task for 20,000 frames; `cathsim_dmc.suite` knows the task like any other.
+`python examples/own_objective.py` registers a task with this objective and trains PPO
+on it for 20,000 frames. The task works like every other task of `cathsim_dmc.suite`.
 """
 
 import argparse
@@ -25,7 +25,7 @@ class GentleCannulation(Cannulation):
 
 
 def gentle(anatomy, goal, *, tolerance_weight: float = 1.0):
-    """The objective of the task; what stands behind the star is an option of it."""
+    """The objective of the task; keyword arguments become options of the task."""
     reward = {"distance": -1.0, "success": 10.0, "excess_force": -tolerance_weight}
     return GentleCannulation.to(anatomy, goal, reward=reward)
 

@@ -20,7 +20,7 @@ from cathsim_dmc.simulation.gymnasium import CathSimVectorEnv
 
 
 class BatchedVecEnv(VecEnv):
-    """The vector environment as Stable-Baselines3 wants it."""
+    """The vector environment with the interface of Stable-Baselines3."""
 
     def __init__(self, vector: CathSimVectorEnv, seed: int):
         """Wraps a vector environment; `seed` is that of its first simulation."""
@@ -56,7 +56,7 @@ class BatchedVecEnv(VecEnv):
         return observation, reward, terminated | truncated, infos
 
     def close(self):
-        """Nothing to free."""
+        """Has nothing to release."""
 
     def get_attr(self, attr_name, indices=None):
         """Attribute of the vector environment, once for each simulation."""

@@ -1,10 +1,10 @@
-"""PPO in one file, on TorchRL's collector and losses: the one to copy and to change.
+"""PPO in one file, on TorchRL's collector and losses, to copy and change.
 
     python examples/train_ppo.py --task type1_lcca --total-frames 300000
 
 It reads from top to bottom: settings, environment, networks, noise, loop, evaluation.
-The settings are those of `cathsim train type1_lcca --preset tuned`. What a long run
-needs beside them (checkpoints that survive kill -9, metrics, images) is there.
+The settings are those of `cathsim train type1_lcca --preset tuned`, which adds what a
+long run needs: checkpoints that survive kill -9, metrics, images.
 """
 
 import dataclasses
@@ -34,11 +34,11 @@ class Settings:
     observation: str = "internal"  # of numbers, not images
     seed: int = 0  # of networks, exploration and environments
     total_frames: int = 300_000
-    # Training episodes are short and start anywhere along the way, and what counts is
-    # the way left through the lumen. The evaluation is that of the task.
+    # Training episodes are short and start anywhere along the route; the reward is the
+    # remaining path through the lumen. The evaluation is that of the task.
     max_steps: int = 120
-    start: tuple[float, float] = (0.0, 0.9)  # least and largest share of the way
-    num_envs: int = 32  # simulations side by side
+    start: tuple[float, float] = (0.0, 0.9)  # fractions of the route
+    num_envs: int = 32  # parallel simulations
     steps_per_update: int = 64  # of each simulation
     epochs: int = 10
     minibatch_size: int = 256
@@ -47,15 +47,15 @@ class Settings:
     clip: float = 0.2
     target_kl: float = 0.05  # ends the epochs of an update
     hidden: int = 128
-    deviation: float = 0.7  # of the actions at first, before the tanh
+    deviation: float = 0.7  # initial deviation of the actions, before the tanh
     correlation: float = 0.9  # of the noise between two control steps
-    shared: float = 0.8  # share of its variance that motors of one axis have in common
-    evaluation_episodes: int = 30  # each with a seed of its own
+    shared: float = 0.8  # fraction of its variance that the motors of an axis share
+    evaluation_episodes: int = 30  # each with its own seed
     evaluation_steps: int = 2_000  # at most, of an episode
 
 
 def environment(settings: Settings, num_envs: int, seed: int, max_steps: int, **more):
-    """Simulations side by side, with one vector of numbers to observe."""
+    """Parallel simulations with a vector observation."""
     options = {"max_steps": max_steps, **more}
     kwargs = {"observation": settings.observation, "task_kwargs": options}
     return make_env(settings.task, num_envs=num_envs, seed=seed, **kwargs)
@@ -72,7 +72,7 @@ def network(inputs: int, outputs: int, hidden: int, gain: float) -> MLP:
 
 
 def make_actor(inputs: int, actions: int, settings: Settings) -> ProbabilisticActor:
-    """A Gaussian before a tanh, whose spread is learnt, and the same everywhere."""
+    """A Gaussian before a tanh; its learnt deviation is the same in all states."""
     mean = network(inputs, actions, settings.hidden, gain=0.01)
     scale = LearntScale(actions, init_value=math.log(settings.deviation))
     return ProbabilisticActor(
@@ -84,7 +84,7 @@ def make_actor(inputs: int, actions: int, settings: Settings) -> ProbabilisticAc
 
 
 class Exploration(TensorDictModuleBase):
-    """The policy with noise that lasts, and that motors of one axis share.
+    """The policy with noise correlated in time and over the motors of an axis.
 
     White noise on twenty motors averages out along the tip and over time. Each action
     is still normal about the mean, and PPO takes its log-probability as if the noise

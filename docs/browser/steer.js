@@ -41,11 +41,11 @@ class Page {
     this.milliseconds += (spent - this.milliseconds) / Math.min(simulation.steps, 25);
     this.trace.add(simulation.wall.peakMax);
     if (simulation.success) {
-      this.end(`Reached after ${simulation.time.toFixed(1)} s. R begins again.`, "good");
+      this.end(`Reached after ${simulation.time.toFixed(1)} s. Press R to reset.`, "good");
     } else if (simulation.failed) {
-      this.end("The physics failed. R begins again.", "bad");
+      this.end("The physics failed. Press R to reset.", "bad");
     } else if (simulation.steps >= simulation.task.max_steps) {
-      this.end("Out of time. R begins again.", "bad");
+      this.end("Out of time. Press R to reset.", "bad");
     }
   }
 
