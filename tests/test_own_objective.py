@@ -31,6 +31,7 @@ class Advance:
     """No relative of `Cannulation`: pays for insertion, done at 20 mm of it."""
 
     goal_radius = 1e-3
+    terms = ("advance", "load")
 
     def __init__(self, goal):
         self.goal = goal
@@ -119,6 +120,18 @@ def test_what_the_batch_cannot_honour_is_refused():
         BatchSimulation(shaped, 2, num_threads=1)
 
 
+def test_what_an_objective_can_is_declared_not_found():
+    class Lookalike(Advance):
+        route = Scene
+        shifted = Advance.path_distance
+
+    anatomy = suite.load_anatomy("simple1")
+    for config in (NavigationConfig(randomisation=True), NavigationConfig("route")):
+        scene = Scene.build(anatomy, "lcca", config)
+        with pytest.raises(ValueError, match=r"Lookalike has no.*derive it from"):
+            suite.environment(Navigation(scene, Lookalike(np.zeros(3)), config))
+
+
 def test_a_goal_that_cannot_be_shifted_is_refused():
     with pytest.raises(ValueError, match=r"goal.*Advance.*shifted"):
         advancing(randomisation=True)
@@ -132,6 +145,8 @@ def judged():
     """A batch of two, and a function that takes what its objective answers."""
     task = advancing()
     batch = BatchSimulation(task, 2, num_threads=1)
+
+    task.objective.terms = ("near",)
 
     def answer(outcome):
         task.objective.outcome = lambda measurement: outcome
@@ -155,6 +170,8 @@ def judged():
         ({"reward": NUMBERS.astype(object)}, "reward"),
         ({"terms": None}, "terms=None"),
         ({"terms": {"near": 0.0}}, "near 0.0"),
+        ({"terms": {}}, r"the terms \[\], not \['near'\]"),
+        ({"terms": {"far": NUMBERS}}, r"the terms \['far'\], not \['near'\]"),
     ],
 )
 def test_an_outcome_that_is_none_is_refused_by_the_name_of_its_objective(
@@ -176,6 +193,7 @@ def test_composer_refuses_an_outcome_that_is_none():
     environment = suite.environment(task)
     environment.reset()
     one = np.zeros(1)
+    task.objective.terms = ()
     task.objective.outcome = lambda measurement: Outcome(one * np.nan, one > 0, {})
     with pytest.raises(ValueError, match=r"Advance returns .*nan.*finite"):
         environment.step(np.zeros(21))

@@ -37,7 +37,7 @@ from cathsim_dmc.policies.attempts import Attempts, advance
 from cathsim_dmc.tasks import navigation
 from cathsim_dmc.tasks.cases import Case
 from cathsim_dmc.tasks.config import CONTROL_TIMESTEP
-from cathsim_dmc.tasks.route import Place, along, locate
+from cathsim_dmc.tasks.route import Place, Route, along, locate
 
 # What a full action moves (m) and turns (rad) a device by in a control step.
 _MOVE = MAX_PUSH_SPEED * CONTROL_TIMESTEP
@@ -106,7 +106,7 @@ class Plan:
         """
         stack = task.scene.catheter
         assert isinstance(stack, DeviceStack)
-        route = pursuit.route_of(task)
+        route = Route.of(task.objective)
         shapes = [[arc.length for arc in one.tip_shape] for one in stack.devices]
         return cls(
             points=route.points,

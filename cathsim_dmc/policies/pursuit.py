@@ -72,21 +72,6 @@ class Settings(attempts.Settings):
     hard_force: float = 0.35
 
 
-def route_of(task: navigation.Navigation | Case) -> Route:
-    """The route to the goal of a task, or of one of its anatomies.
-
-    Raises:
-        ValueError: if its objective has none.
-    """
-    line = getattr(task.objective, "route", None)
-    if line is None:
-        raise ValueError(
-            f"the objective {type(task.objective).__name__} has no route, a "
-            "centreline from the inlet to the goal, for the expert to follow"
-        )
-    return Route.of(line)
-
-
 @dataclasses.dataclass(frozen=True)
 class Plan:
     """What the expert knows of a task; world frame, SI units.
@@ -135,7 +120,7 @@ class Plan:
                 f"device {catheter.device.name!r} has no motors in its tip, so the "
                 f"expert cannot steer it; choose one of {', '.join(steerable)}"
             )
-        route = route_of(task)
+        route = Route.of(task.objective)
         hinges, numbers = [], {}
         for column, joint in enumerate(catheter.joints):
             if joint.type == "slide":

@@ -14,7 +14,7 @@ from cathsim_dmc.physics.sliding import CoaxialReadings
 from cathsim_dmc.tasks import cameras, cases, observations
 from cathsim_dmc.tasks.actions import check_action
 from cathsim_dmc.tasks.config import CONTROL_TIMESTEP, NavigationConfig
-from cathsim_dmc.tasks.objectives import Objective
+from cathsim_dmc.tasks.objectives import Objective, Shiftable
 from cathsim_dmc.tasks.observation_kind import FrameObservable, ImageOptions
 from cathsim_dmc.tasks.rollout import (
     ModelAccess,
@@ -71,10 +71,11 @@ class Navigation(composer.Task):
         self._objective = objective
         self._config = config = config or NavigationConfig()
         self._random_state = bounds.random_state("random", random)
-        if config.ranges.goal_shift and not hasattr(objective, "shifted"):
+        if config.ranges.goal_shift and not isinstance(objective, Shiftable):
             raise ValueError(
-                f"randomisation shifts the goal, but {type(objective).__name__} has "
-                "no method shifted(shift): add one, or leave goal_shift out"
+                f"randomisation shifts the goal, but {type(objective).__name__} has no "
+                "shifted(shift): derive it from tasks.objectives.Shiftable, or leave "
+                "goal_shift out"
             )
         self._num_actions = len(scene.catheter.action_names)
         self._names = observations.resolve(config.observation)

@@ -10,7 +10,7 @@ from cathsim_dmc.tasks.objectives import (
     Measurement,
     Objective,
     Outcome,
-    ShiftableObjective,
+    Shiftable,
     ask,
 )
 
@@ -30,7 +30,7 @@ def together(objectives: Sequence[Objective], chosen: np.ndarray) -> Objective:
     )
 
 
-class ObjectivePool:
+class ObjectivePool(Shiftable):
     """Objectives of groups of simulations, each asked about its own."""
 
     def __init__(self, groups: Sequence[tuple[Objective, np.ndarray]]):
@@ -50,6 +50,11 @@ class ObjectivePool:
     def goal_radius(self) -> float:
         """Distance from the goal that counts as reached, m."""
         return self._groups[0][0].goal_radius
+
+    @property
+    def terms(self) -> Sequence[str]:
+        """Names of the reward terms, which all objectives share."""
+        return self._groups[0][0].terms
 
     def outcome(self, measurement: Measurement) -> Outcome:
         """Judges a control step of N simulations."""
@@ -80,7 +85,7 @@ class ObjectivePool:
         """The same objectives with the goals moved along their branches by (N,) m."""
         return ObjectivePool(
             [
-                (cast(ShiftableObjective, objective).shifted(shift[rows]), rows)
+                (cast(Shiftable, objective).shifted(shift[rows]), rows)
                 for objective, rows in self._groups
             ]
         )

@@ -1,8 +1,9 @@
 """What a task asks for: when it succeeds, and what it rewards."""
 
+import abc
 import dataclasses
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from types import MappingProxyType
 from typing import ClassVar, NamedTuple, NoReturn, Protocol
 
@@ -69,6 +70,9 @@ class Objective(Protocol):
     Attributes:
       goal: (3,), or (N, 3) where it differs between simulations, m, world frame.
       goal_radius: distance from the goal that counts as reached, m.
+      terms: names of the reward terms of every outcome.
+
+    An objective that can do more derives from `Shiftable` or `Routed`.
     """
 
     @property
@@ -76,6 +80,9 @@ class Objective(Protocol):
 
     @property
     def goal_radius(self) -> float: ...  # noqa: D102
+
+    @property
+    def terms(self) -> Sequence[str]: ...  # noqa: D102
 
     def outcome(self, measurement: Measurement) -> Outcome:
         """Judges a control step."""
@@ -119,6 +126,8 @@ def ask(objective: Objective, measurement: Measurement) -> Outcome:
     outcome, shape = objective.outcome(measurement), measurement.distance.shape
     if not isinstance(outcome, Outcome) or not isinstance(outcome.terms, Mapping):
         _refuse(objective, bounds.shown(outcome))
+    if (*outcome.terms,) != (*objective.terms,):
+        _refuse(objective, f"the terms {[*outcome.terms]}, not {[*objective.terms]}")
     _refuse_misfit(objective, "success", outcome.success, "b", shape)
     _refuse_misfit(objective, "reward", outcome.reward, "fiu", shape)
     for name, term in outcome.terms.items():
@@ -141,16 +150,26 @@ def _refuse(objective: Objective, given: str) -> NoReturn:
     )
 
 
-class ShiftableObjective(Objective, Protocol):
-    """An objective whose goal can be moved along its branch from episode to episode."""
+class Shiftable(abc.ABC):
+    """An objective whose goal randomisation can move along its branch."""
 
-    def shifted(self, shift: np.ndarray) -> "ShiftableObjective":
+    @abc.abstractmethod
+    def shifted(self, shift: np.ndarray) -> Objective:
         """The same objective with the goal moved by `shift` () or (N,), m."""
-        ...
+
+
+class Routed:
+    """An objective with a route, for the observation `route` and for the expert.
+
+    Attributes:
+      route: centreline from the inlet to the goal.
+    """
+
+    route: Centreline
 
 
 @dataclasses.dataclass(frozen=True)
-class Cannulation:
+class Cannulation(Shiftable, Routed):
     """Bring the head of the device into a branch.
 
     Success: the head is within `goal_radius` of the goal and inside the lumen of the
@@ -180,6 +199,11 @@ class Cannulation:
     )
     goal_arc_length: np.ndarray | None = None
     lumen: LumenDistance | None = None
+
+    @property
+    def terms(self) -> tuple[str, ...]:
+        """Names of the reward terms with a weight."""
+        return tuple(self.weights)
 
     # Reward terms before weighting: arrays (...) of an objective and a measurement. A
     # subclass adds terms of its own.

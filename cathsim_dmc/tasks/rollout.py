@@ -28,7 +28,7 @@ from cathsim_dmc.tasks.objective_pool import together
 from cathsim_dmc.tasks.objectives import (
     Measurement,
     Objective,
-    ShiftableObjective,
+    Shiftable,
     judge,
     straight,
 )
@@ -177,7 +177,7 @@ class Rollout:
         )
         if self._config.ranges.goal_shift is not None:
             # Navigation has made sure that it can be shifted.
-            shiftable = cast(ShiftableObjective, self._objective)
+            shiftable = cast(Shiftable, self._objective)
             self._objective = shiftable.shifted(self._goal_shift)
         self._steps[indices] = 0
         # New arrays: those handed out before stay what they were.

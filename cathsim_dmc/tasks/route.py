@@ -12,7 +12,7 @@ from typing import NamedTuple, Protocol
 import numpy as np
 
 from cathsim_dmc.anatomy import Centreline
-from cathsim_dmc.tasks.objectives import Objective
+from cathsim_dmc.tasks.objectives import Objective, Routed
 
 ROUTE_SPACING = 1e-3  # m, resolution of the route
 # Way along the route from the place of the head to each of the points ahead, m.
@@ -48,10 +48,25 @@ class Route:
     arc_length: np.ndarray
 
     @classmethod
-    def of(cls, line: Centreline) -> Route:
-        """The route along a centreline."""
-        fine = line.resampled(ROUTE_SPACING)
+    def of(cls, objective: Objective) -> Route:
+        """The route of an objective.
+
+        Raises:
+            ValueError: the objective is not `Routed`.
+        """
+        fine = line_of(objective).resampled(ROUTE_SPACING)
         return cls(fine.points, fine.radii, fine.arc_length)
+
+
+def line_of(objective: Objective) -> Centreline:
+    """The route of an objective as a centreline; ValueError if it is not `Routed`."""
+    if not isinstance(objective, Routed):
+        raise ValueError(
+            f"the objective {type(objective).__name__} has no route, a centreline from "
+            "the inlet to the goal, which the observation 'route' and the expert need; "
+            "derive it from tasks.objectives.Routed"
+        )
+    return objective.route
 
 
 def along(route: RouteLike, arc_length: np.ndarray) -> np.ndarray:
@@ -139,16 +154,9 @@ class Routes:
         Raises:
             ValueError: one of them has no route.
         """
-        self._lines: list[Centreline] = []
         for objective in objectives:
-            line = getattr(objective, "route", None)
-            if not isinstance(line, Centreline):
-                raise ValueError(
-                    f"the objective {type(objective).__name__} has no route, a "
-                    "centreline from the inlet to the goal, for the observation "
-                    "'route' to show; observe 'tracking' instead"
-                )
-            self._lines.append(line)
+            line_of(objective)
+        self._objectives = objectives
         self._routes: dict[int, Route] = {}
 
     def ahead(self, chosen: np.ndarray, head: np.ndarray, frame: np.ndarray) -> Ahead:
@@ -163,7 +171,7 @@ class Routes:
         radii = np.empty((len(head), len(AHEAD)))
         for number in np.unique(chosen).tolist():
             if number not in self._routes:
-                self._routes[number] = Route.of(self._lines[number])
+                self._routes[number] = Route.of(self._objectives[number])
             route, rows = self._routes[number], np.flatnonzero(chosen == number)
             place = locate(route, head[rows]).arc_length[:, None] + AHEAD
             points[rows] = along(route, place)
