@@ -464,9 +464,9 @@ def settled(tally, folder):
 
 def test_bad_values_are_refused_by_name(tmp_path, shared_environment):
     tally = Tally()
-    try_values(tally, tmp_path, 3)
+    try_values(tally, tmp_path, 2)
     try_actions(tally, shared_environment("type1_bca"), 20)
-    try_faces(tally, 20)
+    try_faces(tally, 10)
     try_episodes(tally, 5)
     settled(tally, tmp_path)
     assert tally.tried.total() > 300

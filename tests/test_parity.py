@@ -9,7 +9,7 @@ from cathsim_dmc.anatomy.arch import arch
 from cathsim_dmc.anatomy.parts import Goal
 from cathsim_dmc.simulation.batch import BatchSimulation
 
-SIMULATIONS = 3
+SIMULATIONS = 2
 STEPS = 60
 SEED = 10
 NUMBERS = ("internal", "tracking", "route", "goal", "force")
@@ -123,7 +123,7 @@ def test_randomised_episodes_are_equal():
         for index, action in enumerate(actions(20, episode)):
             touched |= bool((pair.step(action).wall_force.sum > 0).any())
             if index == 15:
-                pair.reset_some([2, 0])
+                pair.reset_some([1, 0])
     assert touched
     # It is randomised indeed: no two goals of an episode and none of two are alike.
     assert len(np.unique(np.concatenate(seen), axis=0)) == 2 * SIMULATIONS

@@ -1,5 +1,3 @@
-import json
-
 import pytest
 import synthetic_env
 import torch
@@ -10,22 +8,6 @@ from cathsim_dmc.agents.networks import NetworkShapes
 from cathsim_dmc.simulation.environments import standard_observations
 
 TASK = "simple1_bca"
-
-
-@pytest.mark.slow
-def test_both_paths_give_the_same_episodes():
-    settings = {"task": TASK, "episodes": 2, "task_kwargs": {"max_steps": 6}}
-    batched, composer = (
-        evaluate("random", backend=backend, **settings)
-        for backend in ("batched", "composer")
-    )
-    assert batched.episodes == composer.episodes
-    assert [episode.length for episode in batched.episodes] == [6, 6]
-    first, second = batched.episodes
-    assert first.reward != second.reward
-    assert first.reward < 0
-    assert None not in (first.success, first.forces.max_force, first.forces.mean_force)
-    json.dumps(batched.to_dict())
 
 
 @pytest.mark.parametrize("backend", ["batched", "composer"])

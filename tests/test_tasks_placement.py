@@ -78,7 +78,7 @@ def test_working_length_is_checked(length):
 
 # Start.
 
-STARTS = ["simple1_bca", "type1_bca", "type2_lcca", "femoral_type1_lcca"]
+STARTS = ["simple1_bca", "type1_bca", "femoral_type1_lcca"]
 
 
 def posture(environment):
