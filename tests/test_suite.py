@@ -486,7 +486,7 @@ def test_halton_noise_breaks_nothing(
         assert timestep.last() == (count == 2000)  # noise finds no branch
         excess.append(containment.largest_excess(task.readings.centreline))
         force.append(task.wall_force.peak_max)
-        contacts = forces.Contacts.from_sensor(task.contact_history.rows)
+        contacts = forces.Contacts.from_sensor(task.contact_rows)
         depth.append(contacts.penetration.max(initial=0.0))
     assert count == steps
     warnings = [warning.number for warning in environment.physics.data.ptr.warning]

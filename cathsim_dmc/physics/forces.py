@@ -130,12 +130,6 @@ class ContactHistory:
         """Rows (S, M * 14) of the S physics steps, of the M places used."""
         return self._rows[:, : self._width]
 
-    def magnitudes(self) -> np.ndarray:
-        """Contact force magnitudes (S, M), N."""
-        rows = self.rows
-        # Without a contact there is nothing to work out, which is the usual case.
-        return magnitudes(rows) if rows.size else rows
-
 
 class WallForce(NamedTuple):
     """Force on the wall over one control step, N.

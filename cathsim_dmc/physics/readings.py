@@ -160,7 +160,7 @@ class ModelIndex:
         self.push_force = _sensor(model, f"{catheter}/push_force")
         self.push_torque = _sensor(model, f"{catheter}/push_torque")
         self.load_cell = _sensor(model, "load_cell")
-        self.wall_contacts = _sensor(model, "wall_contacts")
+        self.wall_contacts = wall_contacts(model)
 
     def views(self, data) -> Views:
         """Finds the readings in a simulator's arrays.
@@ -198,6 +198,11 @@ class ModelIndex:
     def contacts(self, sensordata: np.ndarray) -> forces.Contacts:
         """Contacts with the wall from sensor rows (..., nsensordata)."""
         return forces.Contacts.from_sensor(sensordata[..., self.wall_contacts])
+
+
+def wall_contacts(model: mujoco.MjModel) -> slice:
+    """Place in `sensordata` of what the device does to the wall."""
+    return _sensor(model, "wall_contacts")
 
 
 def _id(model: mujoco.MjModel, kind: mujoco.mjtObj, name: str) -> int:

@@ -1,4 +1,253 @@
-"""The physics steps of a control step."""
+"""The physics steps of a control step, for N simulations and whoever runs them.
+
+    begin → physics steps → end
+
+`Stepper` does what is the same in every simulator: it notices warnings, does a control
+step again with shorter physics steps, switches actuators off. `SingleStepper` adapts
+the simulation that composer steps, `simulation.batch` those of `mujoco.batch`.
+"""
+
+import abc
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from typing import Any, Protocol
+
+import mujoco
+import numpy as np
+
+from cathsim_dmc.physics import forces, readings
 
 PHYSICS_TIMESTEP = 0.004  # s
 CONTROL_TIMESTEP = 0.04  # s, one frame of fluoroscopy
+_STATE = mujoco.mjtState.mjSTATE_INTEGRATION.value
+_ACTUATION = mujoco.mjtDisableBit.mjDSBL_ACTUATION.value
+
+
+class Anatomic(Protocol):
+    """An anatomy that can be written into a compiled model."""
+
+    def write(self, model: mujoco.MjModel) -> None:
+        """Puts the anatomy into a model, in place of the one in it."""
+        ...
+
+
+class Stepper(abc.ABC):
+    """Steps N simulations of one compiled scene.
+
+    Attributes:
+      arrays: Views of the state, with MuJoCo's names and a leading axis N;
+        `readings.ModelIndex.FIELDS` says which are there. `qpos`, `ctrl` and
+        `userdata` are written.
+      warnings: (N, ...) int, how often MuJoCo has warned, a view.
+      num_simulations: N.
+      substeps: S, physics steps in a control step.
+    """
+
+    arrays: Any
+    warnings: np.ndarray
+
+    def __init__(self, model: mujoco.MjModel, num_simulations: int, substeps: int):
+        """Finds the sensor of the wall in the compiled scene."""
+        self.num_simulations, self.substeps = num_simulations, substeps
+        self._contacts = readings.wall_contacts(model)
+        self._before = self._warnings_before = np.empty(0)
+
+    # What a simulator does.
+
+    @abc.abstractmethod
+    def field(self, index: int, name: str) -> np.ndarray:
+        """A field of the model that one simulation has for itself, to be written."""
+
+    @abc.abstractmethod
+    def load(self, index: int, case: Anatomic) -> None:
+        """Puts an anatomy into the model of one simulation."""
+
+    @abc.abstractmethod
+    def states(self) -> np.ndarray:
+        """States (N, nstate) of all simulations, mjSTATE_INTEGRATION, a copy."""
+
+    @abc.abstractmethod
+    def set_states(self, indices: np.ndarray, states: np.ndarray) -> None:
+        """Writes states (K, nstate) of some simulations (K,)."""
+
+    @property
+    @abc.abstractmethod
+    def contact_rows(self) -> np.ndarray:
+        """Rows (N, S, M * 14) of the wall's sensor in the last control step."""
+
+    @abc.abstractmethod
+    def _run(self, indices: np.ndarray, parts: int) -> None:
+        """Does S * parts physics steps, and keeps the contacts of every last part."""
+
+    @abc.abstractmethod
+    def _keep_still(self, indices: np.ndarray) -> None:
+        """Keeps the contacts as they stand, without a physics step."""
+
+    @abc.abstractmethod
+    def _forward(self, indices: np.ndarray) -> None:
+        """Computes what MuJoCo derives from the states of some simulations."""
+
+    @abc.abstractmethod
+    def _change(
+        self, indices: np.ndarray, option: str, change: Callable[[Any], Any]
+    ) -> None:
+        """Changes an option of the models of some simulations."""
+
+    # What is the same for all.
+
+    def begin(self, control: np.ndarray) -> None:
+        """Begins a control step with the control (N, U) of all its physics steps."""
+        self.arrays.ctrl[:] = control
+        self._before = self.states()
+        self._warnings_before = self.warnings.copy()
+
+    def end(self) -> tuple[np.ndarray, np.ndarray]:
+        """Ends a control step, done again in shorter steps where it was too coarse.
+
+        Returns:
+          Contact forces on the wall (N, S, M) in its physics steps, N, and whether
+          MuJoCo has warned in it, (N,) bool.
+        """
+        warned, magnitudes = self._warned(), self._magnitudes()
+        if magnitudes.size:
+            coarse = forces.too_coarse(magnitudes, self.contact_rows) & ~warned
+            if coarse.any():
+                self._refine(np.flatnonzero(coarse))
+                warned, magnitudes = self._warned(), self._magnitudes()
+        return magnitudes, warned
+
+    def still(self, indices: np.ndarray) -> np.ndarray:
+        """Contact forces on the wall (N, S, M), N, where some have not moved yet."""
+        self._keep_still(indices)
+        return self._magnitudes()
+
+    def forward_unactuated(self, indices: np.ndarray) -> None:
+        """What dm_control does at a reset, when there is no control yet."""
+        with self._changed(
+            indices,
+            "disableflags",
+            lambda flags: flags | _ACTUATION,
+            lambda flags: flags & ~_ACTUATION,
+        ):
+            self._forward(indices)
+
+    def _refine(self, indices: np.ndarray) -> None:
+        """Does the control step of some simulations again, with shorter steps."""
+        self.set_states(indices, self._before[indices])
+        with self._changed(
+            indices,
+            "timestep",
+            lambda timestep: timestep / forces.REFINEMENT,
+            lambda timestep: timestep * forces.REFINEMENT,
+        ):
+            self._run(indices, forces.REFINEMENT)
+
+    @contextmanager
+    def _changed(self, indices, option, change, undo) -> Iterator[None]:
+        self._change(indices, option, change)
+        try:
+            yield
+        finally:
+            self._change(indices, option, undo)
+
+    def _warned(self) -> np.ndarray:
+        """Whether MuJoCo has warned in each simulation (N,) in the control step."""
+        changed = self.warnings != self._warnings_before
+        return changed.reshape(self.num_simulations, -1).any(-1)
+
+    def _magnitudes(self) -> np.ndarray:
+        """Contact forces on the wall (N, S, M) in the S physics steps, N."""
+        rows = self.contact_rows
+        # Without a contact there is nothing to work out, which is the usual case.
+        return forces.magnitudes(rows) if rows.size else rows
+
+
+class SingleStepper(Stepper):
+    """One simulation, stepped by somebody else who calls `keep` after each step."""
+
+    def __init__(
+        self,
+        model: mujoco.MjModel,
+        data: mujoco.MjData,
+        fields: Sequence[str],
+        substeps: int,
+    ):
+        """Takes views, which stay valid as long as `data` lives."""
+        super().__init__(model, 1, substeps)
+        self._model, self._data = model, data
+        self.arrays = _Arrays(data, fields)
+        self.warnings = data.warning.number[None]
+        self._case: Anatomic | None = None
+        self._sensor = data.sensordata[self._contacts]
+        self._history = forces.ContactHistory(substeps, len(self._sensor))
+        self._substep = 0
+
+    def begin(self, control: np.ndarray) -> None:
+        """Begins a control step with the control (1, U) of all its physics steps."""
+        super().begin(control)
+        self._history.clear()
+        self._substep = 0
+
+    def keep(self) -> None:
+        """Keeps the contacts of the physics step that has just been done."""
+        self._history.keep(self._substep, self._sensor)
+        self._substep += 1
+
+    @property
+    def contact_rows(self) -> np.ndarray:
+        """Rows (1, S, M * 14) of the wall's sensor in the last control step."""
+        return self._history.rows[None]
+
+    def field(self, index: int, name: str) -> np.ndarray:
+        """A field of the model, to be written."""
+        del index
+        return getattr(self._model, name)
+
+    def load(self, index: int, case: Anatomic) -> None:
+        """Puts an anatomy into the model; the data begin anew."""
+        del index
+        if case is not self._case:
+            case.write(self._model)
+            self._case = case
+        # Without what a pass in the last anatomy has left.
+        mujoco.mj_resetData(self._model, self._data)
+
+    def states(self) -> np.ndarray:
+        """State (1, nstate), mjSTATE_INTEGRATION, a copy."""
+        state = np.empty((1, mujoco.mj_stateSize(self._model, _STATE)))
+        mujoco.mj_getState(self._model, self._data, state[0], _STATE)
+        return state
+
+    def set_states(self, indices: np.ndarray, states: np.ndarray) -> None:
+        """Writes the state (1, nstate)."""
+        del indices
+        mujoco.mj_setState(self._model, self._data, states[0], _STATE)
+
+    def _run(self, indices: np.ndarray, parts: int) -> None:
+        self._history.clear()
+        for substep in range(self.substeps):
+            for _ in range(parts):
+                mujoco.mj_step(self._model, self._data)
+                if self._warned().any():  # where a batch stops, too
+                    return
+            self._history.keep(substep, self._sensor)
+
+    def _keep_still(self, indices: np.ndarray) -> None:
+        self._history.clear()
+        self._history.keep(-1, self._sensor)
+
+    def _forward(self, indices: np.ndarray) -> None:
+        mujoco.mj_forward(self._model, self._data)
+
+    def _change(
+        self, indices: np.ndarray, option: str, change: Callable[[Any], Any]
+    ) -> None:
+        setattr(self._model.opt, option, change(getattr(self._model.opt, option)))
+
+
+class _Arrays:
+    """Arrays of one `mujoco.MjData`, not copied, with a leading axis of length 1."""
+
+    def __init__(self, data: mujoco.MjData, fields: Sequence[str]):
+        for field in (*fields, "ctrl"):
+            setattr(self, field, getattr(data, field)[None])

@@ -8,8 +8,8 @@ import copy
 import ctypes
 import os
 import weakref
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -19,8 +19,8 @@ from mujoco import batch as mujoco_batch
 from cathsim_dmc import bounds
 from cathsim_dmc.physics import forces, readings
 from cathsim_dmc.physics.randomisation import ModelVariation
+from cathsim_dmc.physics.stepper import Anatomic, Stepper
 from cathsim_dmc.tasks.actions import check_action
-from cathsim_dmc.tasks.cases import Case
 from cathsim_dmc.tasks.navigation import Navigation
 from cathsim_dmc.tasks.rollout import Rollout
 from cathsim_dmc.tasks.step import Step
@@ -85,21 +85,18 @@ class BatchSimulation:
         self._task = task
         physics = mjcf.Physics.from_mjcf_model(task.root_entity.mjcf_model)
         self._model = physics.model.ptr
-        self._substeps = task.substeps
-        self._batch = mujoco_batch.Batch(self._model, num_simulations, num_threads)
-        for field in task.scene.fields:
-            self._batch.bind(field)
-        self._rows = np.zeros(
-            (num_simulations, self._substeps, self._model.nsensordata)
-        )
-        self._models = _Fields(self._batch)
         if task.num_anatomies > 1:
-            varies = bool(ModelVariation.fields_of(task.config.ranges))
-            writes = varies or task.scene.coaxial
-            self._models = _OwnModels(self._batch) if writes else _Models(self._batch)
-        self._rollout = task.make_rollout(
-            self._model, self._batch, self._models, num_simulations
-        )
+            writes = task.scene.coaxial or bool(
+                ModelVariation.fields_of(task.config.ranges)
+            )
+            self._stepper = _PoolStepper(
+                task, self._model, num_simulations, num_threads, own=writes
+            )
+        else:
+            self._stepper = _BatchStepper(
+                task, self._model, num_simulations, num_threads
+            )
+        self._rollout = task.make_rollout(self._model, self._stepper)
         self.seed(seeds)
         self._begun = np.zeros(num_simulations, dtype=bool)
         self._process = os.getpid()
@@ -133,17 +130,10 @@ class BatchSimulation:
         self._refuse_fork()
         indices = bounds.indices("indices", indices, self.num_simulations)
         self._begun[indices] = True
-        # Without a pass at the default pose, whose solution would warm-start ours.
-        self._batch.reset(indices, stage=mujoco.mjtStage.mjSTAGE_NONE.value)
+        self._stepper.reset(indices)
         self._rollout.begin(indices, self._random_states)
-        self._forward_unactuated(indices)
-        self._rows[indices] = self._batch.sensordata[indices, None]
-        return _own(self._rollout.start(indices, self._magnitudes()))
-
-    def _forward_unactuated(self, indices: np.ndarray):
-        """What dm_control does at a reset, when there is no control yet."""
-        with self._models.unactuated(indices):
-            self._batch.forward(indices)
+        self._stepper.forward_unactuated(indices)
+        return _own(self._rollout.start(indices))
 
     def step(self, action: np.ndarray) -> Step:
         """Advances every simulation by one control step.
@@ -163,20 +153,10 @@ class BatchSimulation:
                 f"simulations {bounds.shown(waiting)} have no episode; call reset() "
                 "before step()"
             )
-        batch = self._batch
-        action = check_action(action, (batch.nsim, self.num_actions))
-        batch.ctrl[:] = self._rollout.command(action, lambda: batch.state)
-        before, warnings = batch.state.copy(), batch.warning.copy()
-        batch.rollout(
-            self._substeps, record=("sensordata",), out={"sensordata": self._rows}
-        )
-        warned, magnitudes = self._warned(warnings), self._magnitudes()
-        contacts = self._rows[..., self._rollout.index.wall_contacts]
-        coarse = forces.too_coarse(magnitudes, contacts) & ~warned
-        if coarse.any():
-            self._refine(np.flatnonzero(coarse), before)
-            warned, magnitudes = self._warned(warnings), self._magnitudes()
-        return _own(self._rollout.finish(magnitudes, warned))
+        action = check_action(action, (self.num_simulations, self.num_actions))
+        self._rollout.command(action)
+        self._stepper.run()
+        return _own(self._rollout.finish())
 
     def _refuse_fork(self):
         if os.getpid() != self._process:
@@ -185,34 +165,10 @@ class BatchSimulation:
                 "the batch after the fork, or start processes by spawn"
             )
 
-    def _refine(self, indices: np.ndarray, before: np.ndarray) -> None:
-        """Does the control step of some simulations again, with shorter steps.
-
-        Args:
-          indices: Numbers of the simulations.
-          before: (N, nstate), states before the control step, with the commands.
-        """
-        self._batch.state[indices] = before[indices]
-        with self._models.shorter_steps(indices):
-            record = self._batch.rollout(
-                forces.REFINEMENT * self._substeps, record=("sensordata",), ids=indices
-            )
-        last = slice(forces.REFINEMENT - 1, None, forces.REFINEMENT)
-        self._rows[indices] = record["sensordata"][:, last]
-
-    def _warned(self, before: np.ndarray) -> np.ndarray:
-        """Whether MuJoCo has warned in each simulation (N,) since some counts."""
-        changed = self._batch.warning != before
-        return changed.reshape(self.num_simulations, -1).any(-1)
-
-    def _magnitudes(self) -> np.ndarray:
-        """Contact forces on the wall (N, S, M) in the S physics steps, N."""
-        return forces.magnitudes(self._rows[..., self._rollout.index.wall_contacts])
-
     @property
     def num_simulations(self) -> int:
         """N."""
-        return self._batch.nsim
+        return self._stepper.num_simulations
 
     @property
     def num_actions(self) -> int:
@@ -242,124 +198,124 @@ class BatchSimulation:
     @property
     def batch(self) -> mujoco_batch.Batch:
         """The simulations; `expand` gives model fields of their own to each."""
-        return self._batch
+        return self._stepper.batch
 
     @property
     def sensor_rows(self) -> np.ndarray:
         """Sensor rows (N, S, nsensordata) of the S physics steps of the last step."""
-        return self._rows
+        return self._stepper.rows
 
     def contacts(self) -> forces.Contacts:
         """Contacts with the wall in the last physics step, arrays (N, K, ...)."""
-        return self._rollout.index.contacts(self._rows[:, -1])
+        return self._rollout.index.contacts(self.sensor_rows[:, -1])
 
 
-_ACTUATION = mujoco.mjtDisableBit.mjDSBL_ACTUATION.value
+class _BatchStepper(Stepper):
+    """Simulations on a thread pool, in one anatomy."""
 
+    def __init__(
+        self,
+        task: Navigation,
+        model: mujoco.MjModel,
+        num_simulations: int,
+        num_threads: int,
+    ):
+        super().__init__(model, num_simulations, task.substeps)
+        self.batch = mujoco_batch.Batch(model, num_simulations, num_threads)
+        for field in task.scene.fields:
+            self.batch.bind(field)
+        self.arrays, self.warnings = self.batch, self.batch.warning
+        self.rows = np.zeros((num_simulations, self.substeps, model.nsensordata))
 
-class _Fields:
-    """One model for all simulations, with fields of their own."""
+    def reset(self, indices: np.ndarray) -> None:
+        """Puts some simulations to the model's default state."""
+        # Without a pass at the default pose, whose solution would warm-start ours.
+        self.batch.reset(indices, stage=mujoco.mjtStage.mjSTAGE_NONE.value)
 
-    def __init__(self, batch: mujoco_batch.Batch):
-        self._batch = batch
+    def run(self) -> None:
+        """Does the physics steps of a control step."""
+        self.batch.rollout(
+            self.substeps, record=("sensordata",), out={"sensordata": self.rows}
+        )
+
+    @property
+    def contact_rows(self) -> np.ndarray:
+        """Rows (N, S, K * 14) of the wall's sensor in the last control step."""
+        return self.rows[..., self._contacts]
 
     def field(self, index: int, name: str) -> np.ndarray:
         """A field of the model of one simulation, to be written."""
-        return self._batch.expand(name)[index]
+        return self.batch.expand(name)[index]
 
-    def load(self, index: int, case: Case) -> None:
+    def load(self, index: int, case: Anatomic) -> None:
         """There is one anatomy."""
 
-    @contextmanager
-    def unactuated(self, indices: np.ndarray) -> Iterator[None]:
-        """Switches the actuators of some simulations off for a while."""
-        flags = self._batch.expand("opt.disableflags")
-        flags[indices] |= _ACTUATION
-        try:
-            yield
-        finally:
-            flags[indices] &= ~_ACTUATION
+    def states(self) -> np.ndarray:
+        """States (N, nstate), mjSTATE_INTEGRATION, a copy."""
+        return self.batch.state.copy()
 
-    @contextmanager
-    def shorter_steps(self, indices: np.ndarray) -> Iterator[None]:
-        """Shortens the physics steps of some simulations for a while."""
-        timesteps = self._batch.expand("opt.timestep")
-        timesteps[indices] /= forces.REFINEMENT
-        try:
-            yield
-        finally:
-            timesteps[indices] *= forces.REFINEMENT
+    def set_states(self, indices: np.ndarray, states: np.ndarray) -> None:
+        """Writes states (K, nstate) of some simulations (K,)."""
+        self.batch.state[indices] = states
+
+    def _run(self, indices: np.ndarray, parts: int) -> None:
+        record = self.batch.rollout(
+            parts * self.substeps, record=("sensordata",), ids=indices
+        )
+        self.rows[indices] = record["sensordata"][:, parts - 1 :: parts]
+
+    def _keep_still(self, indices: np.ndarray) -> None:
+        self.rows[indices] = self.batch.sensordata[indices, None]
+
+    def _forward(self, indices: np.ndarray) -> None:
+        self.batch.forward(indices)
+
+    def _change(
+        self, indices: np.ndarray, option: str, change: Callable[[Any], Any]
+    ) -> None:
+        values = self.batch.expand(f"opt.{option}")
+        values[indices] = change(values[indices])
 
 
-class _Models:
-    """A model for each anatomy, shared by the simulations that have drawn it.
+class _PoolStepper(_BatchStepper):
+    """Simulations each in the anatomy that it has drawn."""
 
-    Simulations whose episodes write to their models need `_OwnModels`.
-    """
+    def __init__(self, *arguments, own: bool):
+        """Makes the models.
 
-    def __init__(self, batch: mujoco_batch.Batch):
-        self._batch = batch
-        self._models = [batch.model] * batch.nsim
-        self._by_case: dict[Case, mujoco.MjModel] = {}
+        Args:
+          *arguments: Those of `_BatchStepper`.
+          own: Whether each simulation needs a model of its own, into which episodes
+            write; those that have drawn one anatomy share a model otherwise.
+        """
+        super().__init__(*arguments)
+        model = self.batch.model
+        self._own = own
+        self._models = [copy.copy(model) if own else model for _ in self.rows]
+        self._loaded: dict[int | Anatomic, Any] = {}
 
     def field(self, index: int, name: str) -> np.ndarray:
         """A field of the model of one simulation, to be written."""
         return getattr(self._models[index], name)
 
-    def load(self, index: int, case: Case) -> None:
-        """Lets one simulation run in an anatomy, from `unactuated` on."""
-        if case not in self._by_case:
-            model = copy.copy(self._batch.model)
-            case.write(model)
-            self._by_case[case] = model
-        self._models[index] = self._by_case[case]
+    def load(self, index: int, case: Anatomic) -> None:
+        """Puts an anatomy into the model of one simulation, before a forward pass."""
+        if self._own:
+            if self._loaded.get(index) is not case:
+                case.write(self._models[index])
+                self._loaded[index] = case
+            return
+        if case not in self._loaded:
+            self._loaded[case] = copy.copy(self.batch.model)
+            case.write(self._loaded[case])
+        self._models[index] = self._loaded[case]
 
-    @contextmanager
-    def unactuated(self, indices: np.ndarray) -> Iterator[None]:
-        """Switches the actuators of some simulations off for a while."""
-        chosen = self._chosen(indices)
-        for model in chosen:
-            model.opt.disableflags |= _ACTUATION
-        self._batch.set_models(self._models)
-        try:
-            yield
-        finally:
-            for model in chosen:
-                model.opt.disableflags &= ~_ACTUATION
-            self._batch.set_models(self._models)
-
-    @contextmanager
-    def shorter_steps(self, indices: np.ndarray) -> Iterator[None]:
-        """Shortens the physics steps of some simulations for a while."""
-        chosen = self._chosen(indices)
-        for model in chosen:
-            model.opt.timestep /= forces.REFINEMENT
-        self._batch.set_models(self._models)
-        try:
-            yield
-        finally:
-            for model in chosen:
-                model.opt.timestep *= forces.REFINEMENT
-            self._batch.set_models(self._models)
-
-    def _chosen(self, indices: np.ndarray) -> list[mujoco.MjModel]:
-        """The models of some simulations, each once."""
-        return list({id(m): m for m in (self._models[i] for i in indices)}.values())
-
-
-class _OwnModels(_Models):
-    """A model for each simulation, into which its anatomy is written."""
-
-    def __init__(self, batch: mujoco_batch.Batch):
-        super().__init__(batch)
-        self._models = [copy.copy(batch.model) for _ in range(batch.nsim)]
-        self._cases: list[Case | None] = [None] * batch.nsim
-
-    def load(self, index: int, case: Case) -> None:
-        """Lets one simulation run in an anatomy, from `unactuated` on."""
-        if case is not self._cases[index]:
-            case.write(self._models[index])
-            self._cases[index] = case
+    def _change(
+        self, indices: np.ndarray, option: str, change: Callable[[Any], Any]
+    ) -> None:
+        for model in {id(m): m for m in (self._models[i] for i in indices)}.values():
+            setattr(model.opt, option, change(getattr(model.opt, option)))
+        self.batch.set_models(self._models)
 
 
 def _own(step: Step) -> Step:

@@ -11,21 +11,16 @@ from dm_control import composer
 from cathsim_dmc import bounds
 from cathsim_dmc.physics import forces, readings
 from cathsim_dmc.physics.sliding import CoaxialReadings
+from cathsim_dmc.physics.stepper import SingleStepper, Stepper
 from cathsim_dmc.tasks import cameras, cases, observations
 from cathsim_dmc.tasks.actions import check_action
 from cathsim_dmc.tasks.config import CONTROL_TIMESTEP, NavigationConfig
 from cathsim_dmc.tasks.objectives import Objective, Shiftable
 from cathsim_dmc.tasks.observation_kind import FrameObservable, ImageOptions
-from cathsim_dmc.tasks.rollout import (
-    ModelAccess,
-    Rollout,
-    SimulationState,
-    SingleState,
-)
+from cathsim_dmc.tasks.rollout import Rollout
 from cathsim_dmc.tasks.scene import Scene
 from cathsim_dmc.tasks.step import Step
 
-_STATE = mujoco.mjtState.mjSTATE_INTEGRATION.value
 _ONLY = np.zeros(1, dtype=int)  # number of the one simulation
 
 
@@ -107,9 +102,7 @@ class Navigation(composer.Task):
     def make_rollout(
         self,
         model: mujoco.MjModel,
-        state: SimulationState,
-        access: ModelAccess,
-        num_simulations: int = 1,
+        stepper: Stepper,
     ) -> Rollout:
         """The course of the task's episodes; see `Rollout`."""
         chosen = self._cases or [
@@ -121,7 +114,7 @@ class Navigation(composer.Task):
                 start_along_route=self._config.start_along_route,
             )
         ]
-        return Rollout(chosen, self._config, model, state, access, num_simulations)
+        return Rollout(chosen, self._config, model, stepper)
 
     def __repr__(self) -> str:
         """Name, anatomy, goal, device and what is observed."""
@@ -178,21 +171,11 @@ class Navigation(composer.Task):
     def after_compile(self, physics, random_state):
         """Starts a rollout on the new model."""
         del random_state
-        self._model, self._data = physics.model.ptr, physics.data.ptr
-        model = self._model
-        self._rollout = self.make_rollout(
-            model,
-            SingleState(self._data, self._scene.fields),
-            _SingleAccess(model, self._data),
+        model = physics.model.ptr
+        self._stepper = SingleStepper(
+            model, physics.data.ptr, self._scene.fields, self.substeps
         )
-        self._substeps = self.substeps  # which asks the MJCF model, and takes its time
-        self._warnings = self._data.warning.number  # not a copy
-        self._state = np.zeros(mujoco.mj_stateSize(model, _STATE))
-        self._before = self._state.copy()  # the control step, with its command
-        self._contacts = self._data.sensordata[self._rollout.index.wall_contacts]
-        self._contact_history = forces.ContactHistory(
-            self._substeps, len(self._contacts)
-        )
+        self._rollout = self.make_rollout(model, self._stepper)
         self._step = None
 
     def initialize_episode(self, physics, random_state):
@@ -206,93 +189,27 @@ class Navigation(composer.Task):
     def before_step(self, physics, action, random_state):
         """Applies the action and moves the robot along."""
         del physics, random_state
-        action = check_action(action, (self._num_actions,))
-        control = self._rollout.command(action[None], self._read_state)
-        self._data.ctrl[:] = control[0]
-        mujoco.mj_getState(self._model, self._data, self._before, _STATE)
-        self._warned_before = self._warnings.tobytes()
-        self._contact_history.clear()
-        self._substep = 0
-
-    def _read_state(self) -> np.ndarray:
-        mujoco.mj_getState(self._model, self._data, self._state, _STATE)
-        return self._state[None]
-
-    @property
-    def physics_steps_per_control_step(self) -> int:
-        """What composer is to step: the last two, see `before_substep`."""
-        return 2
+        self._rollout.command(check_action(action, (self._num_actions,))[None])
 
     @property
     def substeps(self) -> int:
         """Physics steps in a control step."""
-        return round(self.control_timestep / self.physics_timestep)
-
-    def before_substep(self, physics, action, random_state):
-        """Runs all physics steps of the control step but the two that composer does.
-
-        Composer's bookkeeping between two of them takes as long as a fifth of a free
-        step. (With a single one, its schedule of observations takes longer still.)
-        The contacts of each are kept, as peaks within the step count.
-        """
-        del physics, action, random_state
-        if self._substep:
-            return
-        self._substep = self._substeps - self.physics_steps_per_control_step
-        model, data, contacts = self._model, self._data, self._contacts
-        for substep in range(self._substep):
-            mujoco.mj_step(model, data)
-            if contacts[0]:
-                self._contact_history.keep(substep, contacts)
+        return self.physics_steps_per_control_step
 
     def after_substep(self, physics, random_state):
-        """Keeps the contacts of the physics step that composer did."""
+        """Keeps the contacts of a physics step."""
         del physics, random_state
-        self._contact_history.keep(self._substep, self._contacts)
-        self._substep += 1
+        self._stepper.keep()
 
     def after_step(self, physics, random_state):
         """Decides reward, success and end of the episode, once."""
         del physics, random_state
-        history = self._contact_history
-        magnitudes = history.magnitudes()
-        if (
-            magnitudes.size
-            and not self._warned
-            and forces.too_coarse(magnitudes, history.rows)
-        ):
-            self._refine()
-            magnitudes = history.magnitudes()
-        self._step = self._rollout.finish(magnitudes[None], [self._warned])
-
-    @property
-    def _warned(self) -> bool:
-        """Whether MuJoCo has warned in the control step."""
-        return self._warnings.tobytes() != self._warned_before
-
-    def _refine(self):
-        """Does the control step again with shorter physics steps."""
-        model, data, history = self._model, self._data, self._contact_history
-        mujoco.mj_setState(model, data, self._before, _STATE)
-        history.clear()
-        model.opt.timestep /= forces.REFINEMENT
-        try:
-            for substep in range(self._substeps):
-                for _ in range(forces.REFINEMENT):
-                    mujoco.mj_step(model, data)
-                    if self._warned:  # where a batch stops, too
-                        return
-                history.keep(substep, self._contacts)
-        finally:
-            model.opt.timestep *= forces.REFINEMENT
+        self._step = self._rollout.finish()
 
     def _current(self) -> Step:
         """The last control step, or the start of the episode, looked at once."""
         if self._step is None:
-            self._contact_history.clear()
-            self._contact_history.keep(-1, self._contacts)
-            magnitudes = self._contact_history.magnitudes()[None]
-            self._step = self._rollout.start(_ONLY, magnitudes)
+            self._step = self._rollout.start(_ONLY)
         return self._step
 
     def get_reward(self, physics) -> float:
@@ -370,9 +287,9 @@ class Navigation(composer.Task):
         return None if state is None else _only(state)
 
     @property
-    def contact_history(self) -> forces.ContactHistory:
-        """Contacts with the wall in each physics step of the last control step."""
-        return self._contact_history
+    def contact_rows(self) -> np.ndarray:
+        """Rows (S, M * 14) of the wall's sensor in the last control step's S steps."""
+        return self._stepper.contact_rows[0]
 
     @property
     def termination(self) -> str | None:
@@ -414,28 +331,6 @@ class Navigation(composer.Task):
     @_random.setter
     def _random(self, random_state: np.random.RandomState):
         self._random_state.set_state(random_state.get_state())
-
-
-class _SingleAccess:
-    """Access to the model of a composer environment."""
-
-    def __init__(self, model: mujoco.MjModel, data: mujoco.MjData):
-        self._model, self._data = model, data
-        self._case: cases.Case | None = None
-
-    def field(self, index: int, name: str) -> np.ndarray:
-        """A field of the model, to be written."""
-        del index
-        return getattr(self._model, name)
-
-    def load(self, index: int, case: cases.Case) -> None:
-        """Puts an anatomy into the model; the data begin anew."""
-        del index
-        if case is not self._case:
-            case.write(self._model)
-            self._case = case
-        # Without what a pass in the last anatomy has left.
-        mujoco.mj_resetData(self._model, self._data)
 
 
 def _only(measured):

@@ -6,8 +6,8 @@ The composer environment steps a `Rollout` of one simulation, the batched simula
 one of N; so both draw, command, judge and observe alike, bit for bit.
 """
 
-from collections.abc import Callable, Sequence
-from typing import Protocol, cast
+from collections.abc import Sequence
+from typing import cast
 
 import mujoco
 import numpy as np
@@ -16,9 +16,10 @@ from cathsim_dmc.entities.device_stack import DeviceStack
 from cathsim_dmc.entities.robot import follower_posture
 from cathsim_dmc.imaging.device import Shadow
 from cathsim_dmc.imaging.fluoroscopy import Fluoroscope
-from cathsim_dmc.physics import forces, readings, sliding
+from cathsim_dmc.physics import forces, readings
 from cathsim_dmc.physics.randomisation import ActionDelay, Episode, ModelVariation
 from cathsim_dmc.physics.sliding import CoaxialDevices, CoaxialReadings
+from cathsim_dmc.physics.stepper import Stepper
 from cathsim_dmc.tasks import observations
 from cathsim_dmc.tasks.cases import Case, model_index
 from cathsim_dmc.tasks.config import NavigationConfig
@@ -39,42 +40,6 @@ from cathsim_dmc.tasks.route import Routes
 from cathsim_dmc.tasks.step import Step
 
 
-class SimulationState(Protocol):
-    """State of N simulations: arrays with MuJoCo's names and a leading axis N.
-
-    A `mujoco.batch.Batch` is one; `SingleState` makes one of an `mujoco.MjData`.
-    `readings.ModelIndex.FIELDS` says which arrays are read; `qpos` is written.
-    """
-
-    qpos: np.ndarray
-
-
-class SingleState:
-    """Arrays of one `mujoco.MjData`, not copied, with a leading axis of length 1."""
-
-    qpos: np.ndarray
-
-    def __init__(self, data: mujoco.MjData, fields: Sequence[str]):
-        """Takes the views of some fields; they stay valid as long as `data` lives."""
-        for field in fields:
-            setattr(self, field, getattr(data, field)[None])
-
-
-class ModelAccess(Protocol):
-    """The models that N simulations run on."""
-
-    def field(self, index: int, name: str) -> np.ndarray:
-        """A field of the model that one simulation has for itself, to be written."""
-        ...
-
-    def load(self, index: int, case: Case) -> None:
-        """Puts the anatomy of a case into the model of one simulation.
-
-        Called only where a task has several cases.
-        """
-        ...
-
-
 class Rollout:
     """Episodes of N simulations of one task."""
 
@@ -83,9 +48,7 @@ class Rollout:
         cases: Sequence[Case],
         config: NavigationConfig,
         model: mujoco.MjModel,
-        state: SimulationState,
-        access: ModelAccess,
-        num_simulations: int = 1,
+        stepper: Stepper,
     ):
         """Prepares what an episode needs; no episode has begun yet.
 
@@ -94,17 +57,16 @@ class Rollout:
             there are several.
           config: Options of the task.
           model: The compiled scene of the first case.
-          state: Arrays of the simulations.
-          access: Access to the models of the simulations.
-          num_simulations: N.
+          stepper: Steps the N simulations.
         """
         self._cases = tuple(cases)
+        num_simulations = stepper.num_simulations
         self._case_of = np.zeros(num_simulations, dtype=int)
         self._objective = cases[0].objective
         scene = cases[0].scene
         self._config = config
-        self._state = state
-        self._access = access
+        self._stepper = stepper
+        self._state = state = stepper.arrays
         self._names = observations.resolve(config.observation)
         catheter = scene.catheter.mjcf_model.model
         self._index = model_index(scene, model)
@@ -118,8 +80,8 @@ class Rollout:
                 scene.catheter,
                 model,
                 self._index,
-                cast(sliding.State, state),
-                access.field,
+                state,
+                stepper.field,
                 scene.placement.start_depth,
                 num_simulations,
             )
@@ -189,7 +151,7 @@ class Rollout:
         """Draws the episode of one simulation and puts its device to the start."""
         if len(self._cases) > 1:
             self._case_of[index] = random_state.randint(len(self._cases))
-            self._access.load(index, self.case(index))
+            self._stepper.load(index, self.case(index))
         case = self.case(index)
         episode = self._config.ranges.draw(random_state)
         displacement = case.start.clear_of_wall(episode.displacement)
@@ -206,7 +168,7 @@ class Rollout:
           episode: What was drawn; its displacement is in the state already.
         """
         case = self.case(index)
-        field = self._access.field
+        field = self._stepper.field
         fields = {name: field(index, name) for name in self._variation.fields}
         self._variation.write(fields, episode)
         self._delay.restart(index, episode.delay)
@@ -227,51 +189,38 @@ class Rollout:
         qpos[..., index.robot_qpos] = follower_posture(pushed, turned)
         return qpos
 
-    def command(
-        self, action: np.ndarray, read_states: Callable[[], np.ndarray]
-    ) -> np.ndarray:
-        """Takes the actions of a control step and poses the robot.
+    def command(self, action: np.ndarray) -> None:
+        """Takes the actions of a control step; its physics steps must follow.
 
         Args:
           action: (N, A) float64 as `actions.check_action` returns it.
-          read_states: Reads the states (N, nstate), mjSTATE_INTEGRATION.
-
-        Returns:
-          Control (N, U) of the actuators for all physics steps.
         """
         self._previous_action, self._action = self._action, action
         self.pose_robot(self._state.qpos)
-        self._monitor.before_step(read_states, action)
+        self._monitor.before_step(self._stepper.states, action)
         action = self._delay.delayed(action)
-        if self._coaxial is None:
-            return action
-        return self._coaxial.command(action, self._readings.external_force)
+        if self._coaxial is not None:
+            action = self._coaxial.command(action, self._readings.external_force)
+        self._stepper.begin(action)
 
-    def start(self, indices: np.ndarray, magnitudes: np.ndarray) -> Step:
+    def start(self, indices: np.ndarray) -> Step:
         """First measurement of new episodes, after the forward pass.
 
         Args:
           indices: (K,) numbers of the simulations that have begun an episode.
-          magnitudes: (N, S, M), N, contact forces on the wall.
 
         Returns:
           All simulations as they stand; no episode ends at its start.
         """
-        self._measure(magnitudes)
+        self._measure(self._stepper.still(indices))
         head = self._readings.head
         self._path.restart(indices, head, self._objective.path_distance(head))
         going_on = np.zeros(len(head), dtype=bool)
         return self._step([None] * len(head), indices, going_on)
 
-    def finish(
-        self, magnitudes: np.ndarray, warned: Sequence[bool] | np.ndarray
-    ) -> Step:
-        """Measures, judges and observes after the physics steps of a control step.
-
-        Args:
-          magnitudes: (N, S, M), N, contact forces on the wall in S physics steps.
-          warned: (N,), whether MuJoCo warned in one of them.
-        """
+    def finish(self) -> Step:
+        """Measures, judges and observes after the physics steps of a control step."""
+        magnitudes, warned = self._stepper.end()
         self._steps += 1
         self._measure(magnitudes)
         self._path.add(self._readings.head)

@@ -100,7 +100,7 @@ def jam(pair: tuple[str, str]) -> Jam:
     depth, force = [], []
     for _ in range(count):
         environment.step(np.array([1.0, 0.0, 1.0, 0.0]))
-        contacts = forces.Contacts.from_sensor(task.contact_history.rows)
+        contacts = forces.Contacts.from_sensor(task.contact_rows)
         depth.append(contacts.penetration.max(-1, initial=0.0))
         force.append(contacts.magnitude.max(-1, initial=0.0))
     last = round(_END / CONTROL_TIMESTEP)
