@@ -40,10 +40,6 @@ class ActorCriticConfig(TrainingConfig):
 
     def __post_init__(self):
         """Validate."""
-        if isinstance(self.critic_observation, list):
-            object.__setattr__(
-                self, "critic_observation", tuple(self.critic_observation)
-            )
         super().__post_init__()
         require(
             self.critic_observation is None or bool(self.critic_observation),
@@ -58,13 +54,6 @@ class ActorCriticConfig(TrainingConfig):
         if self.critic_observation is None:
             return self.observation
         return (*_names(self.observation), *_names(self.critic_observation))
-
-    def to_dict(self) -> dict[str, Any]:
-        """As in the base class."""
-        values = super().to_dict()
-        if isinstance(self.critic_observation, tuple):
-            values["critic_observation"] = list(self.critic_observation)
-        return values
 
 
 def _names(names: str | tuple[str, ...]) -> tuple[str, ...]:

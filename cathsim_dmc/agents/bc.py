@@ -3,16 +3,15 @@
 import math
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import torch
 from tensordict import TensorDictBase
-from tensordict.nn import TensorDictSequential
-from torchrl.envs import EnvBase
+from typing_extensions import override
 
 from cathsim_dmc.agents.config import ConfigError, TrainingConfig
 from cathsim_dmc.agents.demonstrations import load_transitions
-from cathsim_dmc.agents.imitation import Clone, decaying, make_clone
+from cathsim_dmc.agents.imitation import CloningLearner, decaying
 from cathsim_dmc.agents.networks import NetworkShapes
 
 
@@ -57,83 +56,38 @@ class BCConfig(TrainingConfig):
         return self.num_envs * self.steps_per_env
 
 
-class BC:
-    """The learner: a clone, fitted to a dataset.
-
-    Attributes:
-        shapes: Sizes of what the policy reads, and of the action.
-        policy: Raw observation in, sampled action out.
-        random_frames: Number of frames to collect with uniformly random actions
-            first (none).
-    """
+class BC(CloningLearner):
+    """Fits a policy to a dataset."""
 
     metrics: ClassVar[tuple[str, ...]] = ("loss", "deviation", "gradient_steps")
-    random_frames = 0
 
     def __init__(self, config: BCConfig, shapes: NetworkShapes, directory: Path):
-        """Make the clone and load the dataset.
+        """Makes the policy and loads the dataset.
 
         Raises:
             ConfigError: no dataset is given.
             DatasetError: it cannot be used, see `demonstrations.load_transitions`.
         """
-        del directory  # It keeps nothing on disk.
         if not config.demonstrations:
             raise ConfigError(
                 "demonstrations is not given: bc needs the directory of a dataset; "
                 "`cathsim demos` writes one."
             )
-        self.config, self.shapes = config, shapes
-        self.device = torch.device(config.torch_device)
         self.states = load_transitions(
             config.demonstrations, config.observation, shapes
         ).exclude("next")
-        self.clone = Clone(config, shapes)
-        self.clone.observe(self.states)
-        self.policy = self.clone.policy
-        self.gradient_steps = 0
+        super().__init__(config, shapes, directory)
+        self.normalisers.observe(self.states)
 
-    @staticmethod
-    def make_policy(shapes: NetworkShapes, config: BCConfig) -> TensorDictSequential:
-        """A policy with fresh weights: raw observation in, action out."""
-        return make_clone(shapes, config)
-
-    def attach(self, env: EnvBase) -> None:
-        """Look at the environment to collect from; not needed."""
-
-    def observe(self, batch: TensorDictBase) -> None:
-        """Take no statistics: they are those of the dataset."""
-
+    @override
     def update(self, batch: TensorDictBase, progress: float) -> dict[str, float]:
-        """Fit the next part of all gradient steps; the batch is only looked at.
-
-        Args:
-            batch: Steps as the collector gives them.
-            progress: Share of the run that is done, in [0, 1].
-
-        Returns:
-            The figures in `metrics`.
-        """
+        # The next part of all gradient steps; the batch is only looked at.
         config = self.config
         after = min(progress + batch.numel() / config.total_frames, 1.0)
         steps = math.ceil(config.gradient_steps * after) - self.gradient_steps
         rates = decaying(1.0 - progress, 1.0 - after, steps) * config.learning_rate
-        figures = self.clone.fit(self._sample, config.batch_size, rates)
-        self.gradient_steps += steps
+        figures = self.fit(self._sample, config.batch_size, rates)
         return {**figures, "gradient_steps": float(self.gradient_steps)}
 
     def _sample(self, count: int) -> TensorDictBase:
         return self.states[torch.randint(len(self.states), (count,))]
-
-    def policy_state(self) -> dict[str, Any]:
-        """Weights and statistics that acting needs."""
-        return self.policy.state_dict()
-
-    def learning_state(self) -> dict[str, Any]:
-        """What learning needs beyond the policy and the dataset."""
-        return {"clone": self.clone.learning_state(), "steps": self.gradient_steps}
-
-    def load(self, policy: dict[str, Any], learning: dict[str, Any]) -> None:
-        """Restore what policy_state and learning_state gave."""
-        self.clone.load(policy, learning["clone"])
-        self.gradient_steps = learning["steps"]

@@ -1,5 +1,7 @@
 """Where the frames of a training come from: a new place is a line in `COLLECTORS`."""
 
+import functools
+import importlib.util
 import math
 from collections.abc import Callable
 from typing import Protocol
@@ -10,10 +12,12 @@ from torch import device
 from torchrl.collectors import Collector
 from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType
+from typing_extensions import override
 
 from cathsim_dmc.agents.config import ConfigError, TrainingConfig
 from cathsim_dmc.agents.evaluation import EnvFactory
-from cathsim_dmc.agents.learners import LEARNERS, Learner
+from cathsim_dmc.agents.learner import Learner
+from cathsim_dmc.agents.learners import LEARNERS
 
 
 class BatchSource(Protocol):
@@ -33,7 +37,16 @@ class BatchSource(Protocol):
         """Close the environments."""
 
 
-class LocalSource:
+# Of every collector.
+OPTIONS = {
+    "exploration_type": ExplorationType.RANDOM,
+    "trust_policy": True,
+    "track_traj_ids": False,
+    "auto_register_policy_transforms": False,
+}
+
+
+class LocalSource(BatchSource):
     """One collector in this process, with the environment that is given."""
 
     restarts = 0
@@ -52,16 +65,17 @@ class LocalSource:
             _on_cpu(learner.policy, learner.device),
             frames_per_batch=config.frames_per_batch,
             init_random_frames=random_frames(config, learner, frames) or None,
+            total_frames=-1,
             **OPTIONS,
         )
         self._batches = iter(self._collector)
 
+    @override
     def next(self) -> TensorDictBase:
-        """The next batch (num_envs, steps)."""
         return next(self._batches)
 
+    @override
     def shutdown(self) -> None:
-        """Close the environment."""
         self._collector.shutdown()
 
 
@@ -75,7 +89,8 @@ def _ray_source(
     # Imported late: Ray is an extra, and slow to import.
     from cathsim_dmc.agents.ray_source import RaySource
 
-    return RaySource(config, learner, env, make_env, frames)
+    left = functools.partial(random_frames, config, learner)
+    return RaySource(config, learner, env, make_env, frames, left, OPTIONS)
 
 
 # Settings, learner, environment of this process, function that makes others, number of
@@ -84,15 +99,6 @@ SourceFactory = Callable[
     [TrainingConfig, Learner, EnvBase, EnvFactory, int], BatchSource
 ]
 COLLECTORS: dict[str, SourceFactory] = {"local": LocalSource, "ray": _ray_source}
-
-# Of every collector.
-OPTIONS = {
-    "total_frames": -1,
-    "exploration_type": ExplorationType.RANDOM,
-    "trust_policy": True,
-    "track_traj_ids": False,
-    "auto_register_policy_transforms": False,
-}
 
 
 def check_collector(config: TrainingConfig) -> None:
@@ -103,7 +109,7 @@ def check_collector(config: TrainingConfig) -> None:
     """
     if config.collector == "local":
         return
-    if not LEARNERS[config.algorithm].remote:
+    if not LEARNERS[config.algorithm].learner.remote:
         raise ConfigError(
             f"collector={config.collector!r} cannot collect for {config.algorithm}, "
             "whose expert looks at the simulations of this process: choose "
@@ -114,9 +120,10 @@ def check_collector(config: TrainingConfig) -> None:
             f"num_envs={config.num_envs} is not a multiple of "
             f"collectors={config.collectors}: every collector has as many."
         )
-    from cathsim_dmc.agents.ray_source import require_ray
-
-    require_ray()
+    if importlib.util.find_spec("ray") is None:
+        raise ConfigError(
+            "collector='ray' needs the extra: pip install 'cathsim-dmc[ray]'."
+        )
 
 
 def random_frames(config: TrainingConfig, learner: Learner, frames: int) -> int:

@@ -3,7 +3,7 @@
 import dataclasses
 import json
 import typing
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, ClassVar, Literal
 
@@ -150,20 +150,22 @@ class TrainingConfig:
 
     def __post_init__(self):
         """Validate; every message says what was given and what is allowed."""
-        for name in ("hidden", "observation", "training_start", "convolutions"):
-            object.__setattr__(self, name, tuples(getattr(self, name)))
         for name, kind in typing.get_type_hints(type(self)).items():
-            if typing.get_origin(kind) is not ClassVar:
-                require_type(name, getattr(self, name), kind)
-        object.__setattr__(self, "task_kwargs", dict(self.task_kwargs))
-        if self.training_reward is not None:
-            object.__setattr__(self, "training_reward", dict(self.training_reward))
+            if typing.get_origin(kind) is ClassVar:
+                continue
+            value = getattr(self, name)
+            value = dict(value) if isinstance(value, Mapping) else tuples(value)
+            require_type(name, value, kind)
+            object.__setattr__(self, name, value)
         require(bool(self.task), "task", self.task, "the name of a task")
         require(bool(self.observation), "observation", self.observation, "a name")
         self._require_networks()
         self._require_positive(
             "num_envs",
+            "num_threads",
             "total_frames",
+            "training_max_steps",
+            "initial_std",
             "checkpoint_frames",
             "keep_checkpoints",
             "metrics_frames",
@@ -174,13 +176,6 @@ class TrainingConfig:
             "learning_rate",
             "observation_clip",
             "checkpoint_seconds",
-        )
-        steps = self.training_max_steps
-        require(
-            steps is None or steps > 0,
-            "training_max_steps",
-            steps,
-            "a positive integer, or None for the task's own",
         )
         start = self.training_start
         require(
@@ -194,20 +189,6 @@ class TrainingConfig:
         for name in ("seed", "normalisation_frames"):
             value = getattr(self, name)
             require(value >= 0, name, value, "an integer >= 0")
-        threads = self.num_threads
-        require(
-            threads is None or threads > 0,
-            "num_threads",
-            threads,
-            "a positive integer, or None for every core",
-        )
-        deviation = self.initial_std
-        require(
-            deviation is None or deviation > 0,
-            "initial_std",
-            deviation,
-            "positive, or None for the policy's own",
-        )
         require(0 < self.gamma <= 1, "gamma", self.gamma, "in (0, 1]")
         try:
             json.dumps(self.task_kwargs, allow_nan=False)
@@ -218,36 +199,26 @@ class TrainingConfig:
             ) from error
 
     def _require_networks(self) -> None:
-        require(
-            0 < len(self.hidden) <= MAX_LAYERS
-            and all(0 < width <= MAX_WIDTH for width in self.hidden),
-            "hidden",
-            self.hidden,
-            f"1 to {MAX_LAYERS} widths from 1 to {MAX_WIDTH}",
-        )
-        require(
-            0 < self.cnn_features <= MAX_WIDTH,
-            "cnn_features",
-            self.cnn_features,
-            f"a positive integer up to {MAX_WIDTH}",
-        )
-        require(
-            0 < len(self.convolutions) <= MAX_LAYERS
-            and all(
-                len(layer) == 3 and 0 < min(layer) and max(layer) <= MAX_FILTERS
-                for layer in self.convolutions
-            ),
-            "convolutions",
-            self.convolutions,
-            f"1 to {MAX_LAYERS} layers (filters, kernel size, stride), each number "
-            f"from 1 to {MAX_FILTERS}",
-        )
+        def sizes(name: str, layers: Sequence[int], largest: int, what: str) -> None:
+            fit = all(0 < size <= largest for size in layers) and layers
+            require(bool(fit), name, getattr(self, name), f"{what} from 1 to {largest}")
+
+        deep = f"1 to {MAX_LAYERS}"
+        for name in ("hidden", "convolutions"):
+            value = getattr(self, name)
+            require(0 < len(value) <= MAX_LAYERS, name, value, f"{deep} layers")
+        sizes("hidden", self.hidden, MAX_WIDTH, f"{deep} widths")
+        sizes("cnn_features", [self.cnn_features], MAX_WIDTH, "an integer")
+        for layer in self.convolutions:
+            numbers = layer if len(layer) == 3 else ()
+            what = "layers (filters, kernel size, stride), each number"
+            sizes("convolutions", numbers, MAX_FILTERS, what)
 
     def _require_positive(self, *names: str) -> None:
         for name in names:
             value = getattr(self, name)
             kind = "a positive integer" if isinstance(value, int) else "positive"
-            require(value > 0, name, value, kind)
+            require(value is None or value > 0, name, value, kind)
 
     @property
     def training_kwargs(self) -> dict[str, Any]:
@@ -278,13 +249,8 @@ class TrainingConfig:
     def to_dict(self) -> dict[str, Any]:
         """The config as JSON-able values, with the algorithm's name."""
         values = dataclasses.asdict(self)
-        values["hidden"] = list(self.hidden)
-        values["convolutions"] = [list(layer) for layer in self.convolutions]
-        if self.training_start is not None:
-            values["training_start"] = list(self.training_start)
-        if not isinstance(self.observation, str):
-            values["observation"] = list(self.observation)
-        return {"algorithm": self.algorithm, **values}
+        # Tuples become lists.
+        return {"algorithm": self.algorithm, **json.loads(json.dumps(values))}
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> "TrainingConfig":

@@ -13,10 +13,11 @@ import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase, TensorDictSequential
 from torchrl.envs import EnvBase
+from typing_extensions import override
 
 from cathsim_dmc.agents.config import TrainingConfig, require
 from cathsim_dmc.agents.demonstrations import EXPERT_ACTION
-from cathsim_dmc.agents.imitation import Clone, decaying, make_clone
+from cathsim_dmc.agents.imitation import CloningLearner, decaying
 from cathsim_dmc.agents.networks import NetworkShapes
 from cathsim_dmc.agents.replay import ReplayMemory
 from cathsim_dmc.agents.views import view_of
@@ -112,15 +113,8 @@ class _Guided(TensorDictModuleBase):
         return tensordict
 
 
-class DAgger:
-    """The learner: a clone, fitted to all states that were visited.
-
-    Attributes:
-        shapes: Sizes of what the policy reads, and of the action.
-        policy: Raw observation in, action out: that of the expert or the learner.
-        random_frames: Number of frames to collect with uniformly random actions
-            first (none).
-    """
+class DAgger(CloningLearner):
+    """Fits a policy to all states that expert and learner have visited."""
 
     metrics: ClassVar[tuple[str, ...]] = (
         "loss",
@@ -129,13 +123,10 @@ class DAgger:
         "replay_frames",
         "gradient_steps",
     )
-    random_frames = 0
+    remote: ClassVar[bool] = False
 
     def __init__(self, config: DAggerConfig, shapes: NetworkShapes, directory: Path):
-        self.config, self.shapes = config, shapes
-        self.device = torch.device(config.torch_device)
-        self.clone = Clone(config, shapes)
-        self.policy: TensorDictModuleBase = self.clone.policy
+        super().__init__(config, shapes, directory)
         self._keys = [*shapes.raw_keys, EXPERT_ACTION]
         self.replay = ReplayMemory(
             directory / "replay",
@@ -143,68 +134,43 @@ class DAgger:
             config.replay_frames,
             config.replay_bytes,
         )
-        self.rounds = 0
 
-    @staticmethod
-    def make_policy(
-        shapes: NetworkShapes, config: DAggerConfig
-    ) -> TensorDictSequential:
-        """A policy with fresh weights: raw observation in, action out."""
-        return make_clone(shapes, config)
-
+    @override
     def attach(self, env: EnvBase) -> None:
-        """Take the simulations of the environment, for the expert to look at."""
-        self.policy = _Guided(self.clone.policy, env)
+        self.policy = _Guided(self.network, env)
         self._set_share()
 
-    def _set_share(self) -> None:
+    def _set_share(self) -> float:
+        """The share of the expert in the next round."""
+        share = self.config.expert_share ** (
+            self.gradient_steps // self.config.gradient_steps
+        )
         if isinstance(self.policy, _Guided):
-            self.policy.share = self.config.expert_share**self.rounds
+            self.policy.share = share
+        return share
 
-    def observe(self, batch: TensorDictBase) -> None:
-        """Take no statistics: they are those of the states in the rounds."""
-
+    @override
     def update(self, batch: TensorDictBase, progress: float) -> dict[str, float]:
-        """Add a round's states (num_envs, steps) and fit to all.
-
-        Args:
-            batch: Steps as the collector gives them.
-            progress: Share of the run that is done; not used.
-
-        Returns:
-            The figures in `metrics`.
-        """
-        config = self.config
-        share = config.expert_share**self.rounds
+        config, share = self.config, self._set_share()
         self.replay.extend(batch.select(*self._keys).reshape(-1))
-        self.clone.observe(batch)
+        self.normalisers.observe(batch)
         rates = decaying(config.learning_rate, 0.0, config.gradient_steps)
-        figures = self.clone.fit(self.replay.sample, config.batch_size, rates)
-        self.rounds += 1
+        figures = self.fit(self.replay.sample, config.batch_size, rates)
         self._set_share()
         return {
             **figures,
             "expert_share": share,
             "replay_frames": float(len(self.replay)),
-            "gradient_steps": float(self.rounds * config.gradient_steps),
+            "gradient_steps": float(self.gradient_steps),
         }
 
-    def policy_state(self) -> dict[str, Any]:
-        """Weights and statistics that acting without the expert needs."""
-        return self.clone.policy.state_dict()
-
+    @override
     def learning_state(self) -> dict[str, Any]:
-        """What learning needs beyond the policy and the files of the states."""
-        return {
-            "clone": self.clone.learning_state(),
-            "replay": self.replay.state(),
-            "rounds": self.rounds,
-        }
+        return {**super().learning_state(), "replay": self.replay.state()}
 
+    @override
     def load(self, policy: dict[str, Any], learning: dict[str, Any]) -> None:
-        """Restore what policy_state and learning_state gave."""
-        self.clone.load(policy, learning["clone"])
+        super().load(policy, learning)
         if "replay" in learning:
             self.replay.load(learning["replay"])
-        self.rounds = learning["rounds"]
         self._set_share()

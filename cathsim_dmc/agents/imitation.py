@@ -1,20 +1,22 @@
 """Regression of a policy on actions that are known to be good."""
 
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictSequential
 from torch import nn
+from typing_extensions import override
 
 from cathsim_dmc.agents.config import TrainingConfig
 from cathsim_dmc.agents.demonstrations import EXPERT_ACTION
+from cathsim_dmc.agents.learner import Learner
 from cathsim_dmc.agents.networks import (
     LOG_STD_RANGE,
     GaussianActor,
     NetworkShapes,
-    Normalisers,
     make_actor,
     make_policy,
 )
@@ -26,42 +28,35 @@ _SATURATED = 0.99
 _SAMPLE = 4_096
 
 
-def make_clone(shapes: NetworkShapes, config: TrainingConfig) -> TensorDictSequential:
-    """PPO's policy with fresh weights, so that PPO can go on from it."""
-    network = GaussianActor(shapes, config, state_dependent_std=False)
-    return make_policy(shapes, config, make_actor(shapes, network))
-
-
-class Clone:
-    """A policy that is fitted to the expert's actions by least squares.
+class CloningLearner(Learner):
+    """Fits PPO's policy to the expert's actions by least squares.
 
     Its deviation, with which it explores while it collects, and from which PPO may
     start, is that of the expert's actions around its own.
-
-    Attributes:
-        policy: Raw observation in, sampled action out.
     """
 
-    def __init__(self, config: TrainingConfig, shapes: NetworkShapes):
-        """Make the policy with fresh weights, drawn from torch's generator."""
-        self.device = torch.device(config.torch_device)
-        self.policy = make_clone(shapes, config).to(self.device)
-        self._keys, self._raw_keys = shapes.keys, shapes.raw_keys
-        self._normalisers = Normalisers(self.policy, None, config)
-        self._network = network_of(self.policy)
-        assert isinstance(self._network.log_std, nn.Parameter)
-        self._log_std = self._network.log_std
-        self._parameters = [
-            *self._network.body.parameters(),
-            *self._network.mean.parameters(),
-        ]
+    def __init__(self, config: TrainingConfig, shapes: NetworkShapes, directory: Path):
+        super().__init__(config, shapes, directory)
+        self._actor = network_of(self.network)
+        assert isinstance(self._actor.log_std, nn.Parameter)
+        self._log_std = self._actor.log_std
         self._optimiser = torch.optim.Adam(
-            self._parameters, lr=config.learning_rate, fused=True
+            [*self._actor.body.parameters(), *self._actor.mean.parameters()],
+            lr=config.learning_rate,
+            fused=True,
         )
 
-    def observe(self, states: TensorDictBase) -> None:
-        """Take observation statistics from raw observations."""
-        self._normalisers.observe(states)
+    @staticmethod
+    @override
+    def make_policy(
+        shapes: NetworkShapes, config: TrainingConfig
+    ) -> TensorDictSequential:
+        network = GaussianActor(shapes, config, state_dependent_std=False)
+        return make_policy(shapes, config, make_actor(shapes, network))
+
+    @override
+    def observe(self, batch: TensorDictBase) -> None:
+        """Take no statistics: they are those of the states that are fitted."""
 
     def fit(
         self,
@@ -90,6 +85,7 @@ class Clone:
             loss.backward()
             self._optimiser.step()
             total += loss.detach()
+        self.gradient_steps += len(rates)
         return {
             "loss": float(total) / max(len(rates), 1),
             "deviation": self._set_deviation(sample(_SAMPLE)),
@@ -97,9 +93,9 @@ class Clone:
 
     def _means(self, states: TensorDictBase) -> tuple[torch.Tensor, torch.Tensor]:
         """Means before the tanh and the actions that are wanted."""
-        states = states.select(*self._raw_keys, EXPERT_ACTION).to(self.device)
-        self._normalisers.add(states)
-        mean, _ = self._network(*(states[key] for key in self._keys))
+        states = states.select(*self.shapes.raw_keys, EXPERT_ACTION).to(self.device)
+        self.normalisers.add(states)
+        mean, _ = self._actor(*(states[key] for key in self.shapes.keys))
         return mean, states[EXPERT_ACTION]
 
     @torch.no_grad()
@@ -112,14 +108,16 @@ class Clone:
         self._log_std.data.copy_(log_std.clamp(*LOG_STD_RANGE))
         return float((mean.tanh() - target).square().mean().sqrt())
 
+    @override
     def learning_state(self) -> dict[str, Any]:
-        """What fitting needs beyond the policy."""
-        return {"optimiser": self._optimiser.state_dict()}
+        state = {"optimiser": self._optimiser.state_dict()}
+        return {"clone": state, "steps": self.gradient_steps}
 
+    @override
     def load(self, policy: dict[str, Any], learning: dict[str, Any]) -> None:
-        """Restore the policy's state and what learning_state gave."""
-        self.policy.load_state_dict(policy)
-        self._optimiser.load_state_dict(learning["optimiser"])
+        self.network.load_state_dict(policy)
+        self._optimiser.load_state_dict(learning["clone"]["optimiser"])
+        self.gradient_steps = learning["steps"]
 
 
 def network_of(policy: nn.Module) -> GaussianActor:

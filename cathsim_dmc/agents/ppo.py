@@ -10,11 +10,12 @@ from typing import Any, ClassVar, cast
 
 import torch
 from tensordict import TensorDictBase
-from tensordict.nn import TensorDictModuleBase, TensorDictSequential
+from tensordict.nn import TensorDictSequential
 from torch import nn
 from torchrl.envs import EnvBase
 from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.value import GAE
+from typing_extensions import override
 
 from cathsim_dmc.agents.actor_critic import (
     TUNED_IMAGES,
@@ -23,10 +24,10 @@ from cathsim_dmc.agents.actor_critic import (
 )
 from cathsim_dmc.agents.config import ConfigError, TrainingConfig, require
 from cathsim_dmc.agents.exploration import CorrelatedExploration, CorrelatedNoise
+from cathsim_dmc.agents.learner import Learner
 from cathsim_dmc.agents.networks import (
     GaussianActor,
     NetworkShapes,
-    Normalisers,
     make_actor,
     make_critic,
     make_policy,
@@ -118,6 +119,7 @@ class PPOConfig(ActorCriticConfig):
             "epochs",
             "max_grad_norm",
             "initial_deviation",
+            "target_kl",
         )
         for name in ("noise_correlation", "noise_shared"):
             value = getattr(self, name)
@@ -140,8 +142,6 @@ class PPOConfig(ActorCriticConfig):
         for name in ("entropy_coefficient", "value_coefficient"):
             value = getattr(self, name)
             require(value >= 0, name, value, ">= 0")
-        kl = self.target_kl
-        require(kl is None or kl > 0, "target_kl", kl, "positive, or None")
 
     @property
     def frames_per_batch(self) -> int:
@@ -156,15 +156,8 @@ class PPOConfig(ActorCriticConfig):
         return changed
 
 
-class PPO:
-    """The learner: a policy to collect with, and an update from what it collected.
-
-    Attributes:
-        shapes: Sizes of what the policy reads, and of the action.
-        policy: Raw observation in, sampled action and its log-probability out.
-        random_frames: Number of frames to collect with uniformly random actions
-            first (none).
-    """
+class PPO(Learner):
+    """Updates from whole batches, collected with the policy of the moment."""
 
     metrics: ClassVar[tuple[str, ...]] = (
         "loss_objective",
@@ -177,18 +170,12 @@ class PPO:
         "learning_rate",
         "gradient_steps",
     )
-    random_frames = 0
 
     def __init__(self, config: PPOConfig, shapes: NetworkShapes, directory: Path):
-        del directory  # It keeps nothing on disk.
-        self.config = config
-        self.device = torch.device(config.torch_device)
-        self.shapes, critic_shapes = shapes.split(config)
-        self.network = self.make_policy(self.shapes, config).to(self.device)
-        self.policy: TensorDictModuleBase = self.network
+        own, critic_shapes = shapes.split(config)
+        super().__init__(config, own, directory, critic_shapes)
         self.actor = self.network[-1]
-        self.critic = make_critic(critic_shapes or self.shapes, config).to(self.device)
-        self.normalisers = Normalisers(self.network, critic_shapes, config)
+        self.critic = make_critic(critic_shapes or own, config).to(self.device)
         self.loss = ClipPPOLoss(
             self.actor,
             self.critic,
@@ -219,11 +206,10 @@ class PPO:
             "advantage",
             "value_target",
         ]
-        self.gradient_steps = 0
 
     @staticmethod
+    @override
     def make_policy(shapes: NetworkShapes, config: PPOConfig) -> TensorDictSequential:
-        """A policy with fresh weights: raw observation in, action out."""
         network = GaussianActor(shapes, config, state_dependent_std=False)
         log_std = cast(nn.Parameter, network.log_std)
         nn.init.constant_(log_std, math.log(config.initial_deviation))
@@ -231,8 +217,8 @@ class PPO:
         orthogonal_(network, network.mean, 0.01)
         return make_policy(shapes, config, make_actor(shapes, network))
 
+    @override
     def attach(self, env: EnvBase) -> None:
-        """Look at the environment to collect from: which motors bend together."""
         config = self.config
         if not config.noise_correlation and not config.noise_shared:
             return
@@ -248,20 +234,8 @@ class PPO:
         noise = CorrelatedNoise(config.noise_correlation, config.noise_shared, groups)
         self.policy = CorrelatedExploration(self.network, noise)
 
-    def observe(self, batch: TensorDictBase) -> None:
-        """Take observation statistics from a batch without learning from it."""
-        self.normalisers.observe(batch)
-
+    @override
     def update(self, batch: TensorDictBase, progress: float) -> dict[str, float]:
-        """Learn from a batch (num_envs, steps) collected with the current policy.
-
-        Args:
-            batch: Steps as the collector gives them.
-            progress: Share of the run that is done, in [0, 1].
-
-        Returns:
-            Means over the update's gradient steps of the quantities in `metrics`.
-        """
         config = self.config
         if config.anneal:
             for group in self.optimiser.param_groups:
@@ -322,12 +296,8 @@ class PPO:
         terms = {name: losses[name].detach() for name in (*names, "clip_fraction")}
         return {**terms, "grad_norm": norm}
 
-    def policy_state(self) -> dict[str, Any]:
-        """Weights and statistics that acting needs."""
-        return self.network.state_dict()
-
+    @override
     def learning_state(self) -> dict[str, Any]:
-        """What learning needs beyond the policy."""
         return {
             "critic": self.critic.state_dict(),
             "optimiser": self.optimiser.state_dict(),
@@ -335,8 +305,8 @@ class PPO:
             "normalisers": self.normalisers.critics.state_dict(),
         }
 
+    @override
     def load(self, policy: dict[str, Any], learning: dict[str, Any]) -> None:
-        """Restore what policy_state and learning_state gave."""
         self.network.load_state_dict(policy)
         self.critic.load_state_dict(learning["critic"])
         # Older checkpoints have no critic that reads something else.

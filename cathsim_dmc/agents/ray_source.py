@@ -6,6 +6,7 @@ import functools
 import logging
 import os
 import sys
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
@@ -14,27 +15,12 @@ from tensordict import TensorDict, TensorDictBase
 from torchrl.collectors.distributed import RayCollector
 from torchrl.envs import EnvBase
 
-from cathsim_dmc.agents.collectors import OPTIONS, random_frames
 from cathsim_dmc.agents.config import ConfigError, TrainingConfig
 from cathsim_dmc.agents.evaluation import EnvFactory
-from cathsim_dmc.agents.learners import Learner
+from cathsim_dmc.agents.learner import Learner
 
 # So many losses in a row without a batch end the process; the run can be resumed.
 MOST_LOSSES = 3
-
-
-def require_ray() -> None:
-    """Refuse a training on Ray without Ray.
-
-    Raises:
-        ConfigError: it is not installed.
-    """
-    try:
-        import ray  # noqa: F401
-    except ImportError as error:
-        raise ConfigError(
-            "collector='ray' needs the extra: pip install 'cathsim-dmc[ray]'."
-        ) from error
 
 
 class RaySource:
@@ -55,8 +41,10 @@ class RaySource:
         env: EnvBase,
         make_env: EnvFactory,
         frames: int,
+        random_frames: Callable[[int], int],
+        options: Mapping[str, Any],
     ):
-        """Start the collectors.
+        """Starts the collectors.
 
         Args:
             config: Settings of the training.
@@ -65,6 +53,8 @@ class RaySource:
             make_env: Function that makes the environments; the workers must be able to
                 import it.
             frames: Number of frames of earlier processes of the run.
+            random_frames: Frames still to be collected at random, after so many.
+            options: Options of TorchRL's collectors.
 
         Raises:
             ConfigError: the cluster has too few processors.
@@ -72,6 +62,7 @@ class RaySource:
         self.restarts = 0
         self._config, self._learner = config, learner
         self._make_env, self._frames = make_env, frames
+        self._random_frames, self._options = random_frames, options
         env.close()
         _start_ray()
         self._collector = self._start()
@@ -113,21 +104,18 @@ class RaySource:
         threads = config.num_threads or 1
         _require_room(count, threads)
         policy = copy.deepcopy(self._learner.policy).to("cpu").requires_grad_(False)
-        options = {
-            name: OPTIONS[name]
-            for name in ("track_traj_ids", "auto_register_policy_transforms")
-        }
+        of_each = dict(self._options)
+        shared = {n: of_each.pop(n) for n in ("exploration_type", "trust_policy")}
         return RayCollector(
             [self._worker(index, threads) for index in range(count)],
             policy,
             frames_per_batch=config.frames_per_batch,
             total_frames=sys.maxsize,
-            init_random_frames=random_frames(config, self._learner, self._frames),
-            exploration_type=OPTIONS["exploration_type"],
-            trust_policy=True,
+            init_random_frames=self._random_frames(self._frames),
             sync=True,
-            collector_kwargs=[dict(options) for _ in range(count)],
+            collector_kwargs=[dict(of_each) for _ in range(count)],
             remote_configs={"num_cpus": threads},
+            **shared,
         )
 
     def _worker(self, index: int, threads: int) -> functools.partial[EnvBase]:

@@ -10,8 +10,8 @@ from typing import Any, ClassVar
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictSequential
-from torchrl.envs import EnvBase
 from torchrl.objectives import SACLoss, SoftUpdate
+from typing_extensions import override
 
 from cathsim_dmc.agents.actor_critic import (
     TUNED_IMAGES,
@@ -20,10 +20,10 @@ from cathsim_dmc.agents.actor_critic import (
 )
 from cathsim_dmc.agents.config import require
 from cathsim_dmc.agents.demonstrations import load_transitions
+from cathsim_dmc.agents.learner import Learner
 from cathsim_dmc.agents.networks import (
     GaussianActor,
     NetworkShapes,
-    Normalisers,
     make_actor,
     make_policy,
     make_q_function,
@@ -120,17 +120,11 @@ class SACConfig(ActorCriticConfig):
         return self.num_envs * self.steps_per_env
 
 
-class SAC:
-    """The learner: a policy to collect with, and updates from a replay memory.
+class SAC(Learner):
+    """Updates from a replay memory.
 
     The replay keeps raw observations; they are normalised with today's statistics
     when sampled, so old and new transitions agree.
-
-    Attributes:
-        shapes: Sizes of what the policy reads, and of the action.
-        policy: Raw observation in, sampled action out.
-        random_frames: Number of frames to collect with uniformly random actions
-            first.
     """
 
     metrics: ClassVar[tuple[str, ...]] = (
@@ -144,16 +138,11 @@ class SAC:
     )
 
     def __init__(self, config: SACConfig, shapes: NetworkShapes, directory: Path):
-        self.config = config
-        self.device = torch.device(config.torch_device)
+        own, critic_shapes = shapes.split(config)
+        super().__init__(config, own, directory, critic_shapes)
         self.random_frames = config.random_frames
-        self.shapes, critic_shapes = shapes.split(config)
-        self.policy = self.make_policy(self.shapes, config).to(self.device)
-        self.actor = self.policy[-1]
-        self.normalisers = Normalisers(self.policy, critic_shapes, config)
-        q_function = make_q_function(critic_shapes or self.shapes, config).to(
-            self.device
-        )
+        self.actor = self.network[-1]
+        q_function = make_q_function(critic_shapes or own, config).to(self.device)
         target = config.target_entropy
         self.loss = SACLoss(
             self.actor,
@@ -189,32 +178,16 @@ class SAC:
             )
             self.demonstrations = shown.select(*self.replay_keys)
             self.observe(shown)
-        self.gradient_steps = 0
         self.owed_steps = 0.0
 
     @staticmethod
+    @override
     def make_policy(shapes: NetworkShapes, config: SACConfig) -> TensorDictSequential:
-        """A policy with fresh weights: raw observation in, action out."""
         network = GaussianActor(shapes, config, state_dependent_std=True)
         return make_policy(shapes, config, make_actor(shapes, network))
 
-    def attach(self, env: EnvBase) -> None:
-        """Look at the environment to collect from; not needed."""
-
-    def observe(self, batch: TensorDictBase) -> None:
-        """Take observation statistics from a batch without learning from it."""
-        self.normalisers.observe(batch)
-
+    @override
     def update(self, batch: TensorDictBase, progress: float) -> dict[str, float]:
-        """Store a batch (num_envs, steps) and take the gradient steps it pays for.
-
-        Args:
-            batch: Steps as the collector gives them.
-            progress: Share of the run that is done; not used.
-
-        Returns:
-            Means over the gradient steps of the quantities in `metrics`.
-        """
         transitions = batch.select(*self.replay_keys).reshape(-1)
         self.replay.extend(transitions)
         self.observe(batch)
@@ -256,12 +229,8 @@ class SAC:
         chosen = shown[torch.randint(len(shown), (half,))]
         return torch.cat([chosen, self.replay.sample(count - half)])
 
-    def policy_state(self) -> dict[str, Any]:
-        """Weights and statistics that acting needs."""
-        return self.policy.state_dict()
-
+    @override
     def learning_state(self) -> dict[str, Any]:
-        """What learning needs beyond the policy and the replay files."""
         loss = {
             name: value
             for name, value in self.loss.state_dict().items()
@@ -276,9 +245,9 @@ class SAC:
             "normalisers": self.normalisers.critics.state_dict(),
         }
 
+    @override
     def load(self, policy: dict[str, Any], learning: dict[str, Any]) -> None:
-        """Restore what policy_state and learning_state gave."""
-        self.policy.load_state_dict(policy)
+        self.network.load_state_dict(policy)
         # Older checkpoints have no critic that reads something else.
         self.normalisers.critics.load_state_dict(learning.get("normalisers", {}))
         state = self.loss.state_dict()

@@ -1,0 +1,94 @@
+"""What training asks of an algorithm."""
+
+import abc
+from pathlib import Path
+from typing import Any, ClassVar
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase, TensorDictSequential
+from torchrl.envs import EnvBase
+
+from cathsim_dmc.agents.networks import NetworkShapes, Normalisers
+
+
+class Learner(abc.ABC):
+    """An algorithm with its networks.
+
+    Attributes:
+        metrics: Names of the figures that `update` returns, columns of metrics.csv.
+        remote: Whether the policy needs nothing but observations, so that it can act
+            in another process.
+        random_frames: Number of frames to collect with uniformly random actions
+            first; the observation statistics then come from those.
+        device: Torch device of the networks.
+        shapes: Sizes of what the policy reads, and of the action.
+        network: The policy that is learnt: raw observation in, sampled action out.
+        policy: The policy to collect with; `network`, or one around it.
+        normalisers: Observation statistics of policy and critic.
+        gradient_steps: Number of gradient steps so far.
+    """
+
+    metrics: ClassVar[tuple[str, ...]]
+    remote: ClassVar[bool] = True
+    random_frames: int = 0
+
+    def __init__(
+        self,
+        config: Any,
+        shapes: NetworkShapes,
+        directory: Path,
+        critic_shapes: NetworkShapes | None = None,
+    ):
+        """Makes the policy with fresh weights, drawn from torch's generator.
+
+        Args:
+            config: Settings of the algorithm.
+            shapes: Sizes of what the policy reads, and of the action.
+            directory: Directory of the run, for what the algorithm keeps on disk.
+            critic_shapes: Sizes of what the critic reads; None for the policy's.
+        """
+        del directory
+        self.config, self.shapes = config, shapes
+        self.device = torch.device(config.torch_device)
+        self.network = self.make_policy(shapes, config).to(self.device)
+        self.policy: TensorDictModuleBase = self.network
+        self.normalisers = Normalisers(self.network, critic_shapes, config)
+        self.gradient_steps = 0
+
+    @staticmethod
+    @abc.abstractmethod
+    def make_policy(shapes: NetworkShapes, config: Any) -> TensorDictSequential:
+        """A policy with fresh weights: raw observation in, action out."""
+
+    def attach(self, env: EnvBase) -> None:  # noqa: B027
+        """Look at the environment that `policy` is to collect from, once, first."""
+
+    def observe(self, batch: TensorDictBase) -> None:
+        """Take observation statistics from a batch without learning from it."""
+        self.normalisers.observe(batch)
+
+    @abc.abstractmethod
+    def update(self, batch: TensorDictBase, progress: float) -> dict[str, float]:
+        """Learn from a batch (num_envs, steps) collected with the current policy.
+
+        Args:
+            batch: Steps as the collector gives them.
+            progress: Share of the run that is done, in [0, 1].
+
+        Returns:
+            Figures by the names in `metrics`, means over the gradient steps; what is
+            not known yet is left out.
+        """
+
+    def policy_state(self) -> dict[str, Any]:
+        """Weights and statistics that acting needs."""
+        return self.network.state_dict()
+
+    @abc.abstractmethod
+    def learning_state(self) -> dict[str, Any]:
+        """What learning needs beyond the policy: tensors, numbers, strings."""
+
+    @abc.abstractmethod
+    def load(self, policy: dict[str, Any], learning: dict[str, Any]) -> None:
+        """Restore what policy_state and learning_state gave."""
