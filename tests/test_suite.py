@@ -3,7 +3,6 @@
 import dataclasses
 
 import dm_env
-import mujoco
 import numpy as np
 import pytest
 from absl.testing import absltest
@@ -118,27 +117,6 @@ def test_the_published_tasks_are_there():
     assert set(TASKS) <= set(suite.SUITE)
     for name in TASKS:
         assert suite.SUITE[name].__doc__.count("\n") == 0, "one line for `cathsim list`"
-
-
-@pytest.mark.parametrize("task_name", EACH_TASK)
-def test_components_have_names(shared_environment, task_name):
-    model = shared_environment(task_name).physics.model.ptr
-    kinds = {
-        "body": model.nbody,
-        "joint": model.njnt,
-        "actuator": model.nu,
-        "sensor": model.nsensor,
-        "camera": model.ncam,
-        "mesh": model.nmesh,
-    }
-    kinds_of = {kind: getattr(mujoco.mjtObj, f"mjOBJ_{kind.upper()}") for kind in kinds}
-    for kind, count in kinds.items():
-        names = [
-            mujoco.mj_id2name(model, kinds_of[kind], index) for index in range(count)
-        ]
-        assert all(names), f"a {kind} has no name"
-    for name in ("catheter/link_0", "phantom/wall", "sheath/bore", "robot/rail"):
-        assert model.body(name).id > 0
 
 
 @pytest.mark.parametrize("task_name", EACH_TASK)

@@ -1,7 +1,5 @@
 """Tasks on random arches: the pool, the draw, and both paths bit for bit."""
 
-import time
-
 import numpy as np
 import pytest
 from conftest import twin
@@ -156,24 +154,6 @@ def test_one_seed_gives_the_same_bits_and_another_seed_another_arch(
         assert runs.setdefault(seed, run) == run
     assert len(set(runs.values())) == 5
     assert drawn == set(names())
-
-
-def test_a_reset_with_a_new_arch_is_cheap(environment, reseed, record_property):
-    """The middle of many resets, of processor time: machines are busy."""
-    times, last = [], None
-    for seed in range(40):
-        begun = time.thread_time()
-        reseed(environment, seed)
-        passed = time.thread_time() - begun
-        name = environment.task.scene.anatomy.name
-        if last not in (None, name):
-            times.append(passed)
-        last = name
-    assert len(times) > 10
-    milliseconds = 1e3 * float(np.median(times))
-    record_property("reset_with_a_new_arch_ms", milliseconds)
-    print(f"reset with a new arch: {milliseconds:.2f} ms of processor time")
-    assert milliseconds < 20.0  # 10 on a machine of its own
 
 
 def test_models_of_a_pool_take_few_megabytes(plain_pair, record_property):
