@@ -15,8 +15,6 @@ from cathsim_dmc.anatomy.arch.tree import arch_tree
 from cathsim_dmc.anatomy.centreline import Centreline, Vessel, VesselTree
 from cathsim_dmc.validation import wall
 
-TYPES = ("type1", "type2")
-
 
 def half_ring(radius=40e-3, lumen=10e-3, tilt=0.0):
     """An aorta that is half a ring over straight limbs of 50 mm, in the x-z plane."""

@@ -6,12 +6,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from conftest import assert_wall_fits
 
 from cathsim_dmc.anatomy import phantoms
 from cathsim_dmc.anatomy import surface as surfaces
 from cathsim_dmc.anatomy.scan.mesh_depth import MeshDepth
 from cathsim_dmc.anatomy.surface import lumen_surface
-from cathsim_dmc.anatomy.wall import fidelity
 
 MEASURED = Path(__file__).parent / "data/measured"
 SCRIPT = Path(__file__).parents[1] / "docs/scripts/measured_phantoms.py"
@@ -60,17 +60,11 @@ def test_inscribed_spheres_have_the_measured_radii(name):
 
 
 @pytest.mark.parametrize("name", phantoms.MEASURED)
-@pytest.mark.parametrize("access", ["ascending", "descending"])
+@pytest.mark.parametrize(
+    "access", ["ascending", pytest.param("descending", marks=pytest.mark.slow)]
+)
 def test_walls_keep_the_lumen_free_and_closed(name, access):
-    anatomy = phantoms.load(name, access=access)
-    found = fidelity.intrusion(anatomy, 2e-3)
-    assert found.inside.mean <= 0.10e-3
-    assert found.inside.p95 <= 0.30e-3
-    assert found.inside.max <= 0.60e-3
-    assert found.recession.p95 <= 0.30e-3
-    assert fidelity.coverage(anatomy, 10_000).fraction == 1.0
-    assert fidelity.patency(anatomy, 1e-3, spacing=2e-3).passed
-    assert len(anatomy.wall) <= 850
+    assert_wall_fits(phantoms.load(name, access=access))
 
 
 @pytest.mark.parametrize("name", phantoms.MEASURED)

@@ -4,13 +4,13 @@ import math
 
 import numpy as np
 import pytest
+from conftest import assert_wall_fits
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from cathsim_dmc.anatomy import measures
 from cathsim_dmc.anatomy.arch import arch, sampler
 from cathsim_dmc.anatomy.arch.tree import arch_tree
-from cathsim_dmc.anatomy.wall import fidelity
 
 RADII = [7.492, 4.211, 6.129]  # mm, of the BCA in the first three test arches
 
@@ -37,7 +37,7 @@ def test_same_seed_gives_the_same_bytes():
     assert first.inlet.position.tobytes() == again.inlet.position.tobytes()
 
 
-@settings(max_examples=15)
+@settings(max_examples=8)
 @given(
     st.integers(0, 2**31 - 1),
     st.sampled_from(list(arch.DROP_RANGES)),
@@ -98,7 +98,7 @@ def test_unknown_kinds_list_the_known():
 def test_arches_curve_as_measured_ones_do():
     found = [
         measures.measure(arch_tree(one.parameters()))
-        for one in arch.arch_set("test")[:30]
+        for one in arch.arch_set("test")[:20]
     ]
     turns = np.degrees([one.ascending_turn for one in found])
     # The published phantoms: 47, 93 and 107 degrees.
@@ -114,21 +114,12 @@ def test_arches_curve_as_measured_ones_do():
     assert np.percentile(aside, 75) > 7
 
 
-def check(anatomy, rays):
-    found = fidelity.intrusion(anatomy, 2e-3)
-    assert found.inside.mean <= 0.10e-3
-    assert found.inside.p95 <= 0.30e-3
-    assert found.inside.max <= 0.60e-3
-    assert found.recession.p95 <= 0.30e-3
-    assert fidelity.coverage(anatomy, rays).fraction == 1.0
-    assert fidelity.patency(anatomy, 1e-3, spacing=2e-3).passed
-    assert len(anatomy.wall) <= 700
-
-
-@pytest.mark.parametrize("place", range(4))
+@pytest.mark.parametrize(
+    "place", [0, 1, *(pytest.param(n, marks=pytest.mark.slow) for n in (2, 3))]
+)
 def test_arches_of_every_variant_are_free_and_closed(place):
     seed = arch.arch_set("test_variants")[place]
-    check(arch.build_seed(seed, access="descending"), 10_000)
+    assert_wall_fits(arch.build_seed(seed, access="descending"))
 
 
 @pytest.mark.slow
@@ -141,7 +132,7 @@ def test_two_hundred_arches_are_valid_and_distributed_as_the_tables():
         assert found.arch_type == seed.arch_type, seed.name
         drawn.append((seed.parameters(), found))
         if number % 10 == 0:
-            check(arch.build_seed(seed), 20_000)
+            assert_wall_fits(arch.build_seed(seed))
 
     def agrees(values, mean, deviation):
         # A quarter of a deviation is 3.5 standard errors of a mean of 200.

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from conftest import assert_wall_fits
 from synthetic_scans import marched, read_mesh, write_markup, write_obj, y_tree
 
 from cathsim_dmc.anatomy.anatomy import Anatomy
@@ -25,8 +26,6 @@ from cathsim_dmc.anatomy.scan.trunk import name_trunk
 from cathsim_dmc.anatomy.wall import fidelity
 from cathsim_dmc.anatomy.wall.depth import DepthField
 
-# Bounds of the wall (m): mean, 95th percentile and largest intrusion.
-INTRUSION = (0.10e-3, 0.30e-3, 0.60e-3)
 DEVICE_RADIUS = 0.84e-3
 SCAN = os.environ.get("CATHSIM_SCAN_DIR")
 
@@ -402,18 +401,8 @@ def test_inlet_off_the_lumen(y_scan):
         import_scan(*y_scan[:2], inlet=(90.0, 0.0, 0.0))
 
 
-def assert_general_check(anatomy):
-    """The figures of every anatomy hold for a scan: wall, leaks, patency."""
-    found = fidelity.intrusion(anatomy, 1e-3).inside
-    assert found.mean <= INTRUSION[0]
-    assert found.p95 <= INTRUSION[1]
-    assert found.max <= INTRUSION[2]
-    assert fidelity.coverage(anatomy, 10_000).leaks == 0
-    assert fidelity.patency(anatomy, DEVICE_RADIUS, spacing=1e-3).passed
-
-
 def test_wall_meets_the_figures(y_anatomy):
-    assert_general_check(y_anatomy)
+    assert_wall_fits(y_anatomy)
     assert len(y_anatomy.wall) < 0.25 * len(y_anatomy.surface.faces)
 
 
@@ -421,7 +410,7 @@ def test_wall_meets_the_figures(y_anatomy):
 def test_fine_mesh_at_the_default_tolerance(y_scan, tmp_path):
     mesh = write_obj(tmp_path / "lumen.obj", *marched(y_scan[2], 1.1e-3))
     anatomy = import_scan(mesh, y_scan[1], spacing=0.7e-3)
-    assert_general_check(anatomy)
+    assert_wall_fits(anatomy)
     assert len(anatomy.wall) < 0.03 * len(anatomy.surface.faces)
 
 
@@ -432,7 +421,7 @@ def test_real_patient():
     mesh = next(iter(sorted(folder.glob("*.obj"))))
     curves = sorted(folder.glob("*.mrk.json"))
     anatomy = import_scan(mesh, curves)
-    assert_general_check(anatomy)
+    assert_wall_fits(anatomy)
     assert len(anatomy.wall) <= 1500
     assert {vessel_name(path) for path in curves} < set(anatomy.tree.vessels)
     for goal in anatomy.goals:

@@ -6,13 +6,13 @@ import sys
 
 import numpy as np
 import pytest
+from conftest import assert_wall_fits
 
 from cathsim_dmc import cli
 from cathsim_dmc.anatomy import Anatomy
 from cathsim_dmc.anatomy.builder import Place
 from cathsim_dmc.anatomy.curves import Curve, smooth_tree
 from cathsim_dmc.anatomy.tree_file import parse_tree, read_tree
-from cathsim_dmc.anatomy.wall import fidelity
 
 BEND = 40.0  # mm
 
@@ -60,19 +60,10 @@ def content():
     }
 
 
-def check(anatomy):
-    found = fidelity.intrusion(anatomy, 1.5e-3).inside
-    assert found.mean <= 0.10e-3
-    assert found.p95 <= 0.30e-3
-    assert found.max <= 0.60e-3
-    assert fidelity.coverage(anatomy, 10_000).fraction == 1.0
-    assert fidelity.patency(anatomy, 1e-3, spacing=2e-3).passed
-
-
 @pytest.mark.parametrize("access", ["low", "high", "cut", "side"])
 def test_tree_along_a_space_curve_is_free_and_closed(access):
     anatomy = parse_tree(content()).build(access)
-    check(anatomy)
+    assert_wall_fits(anatomy)
     assert [end.open for end in anatomy.ends].count(True) == 1
     entered = next(end for end in anatomy.ends if end.open)
     np.testing.assert_allclose(entered.position, anatomy.inlet.position)

@@ -4,6 +4,7 @@ import time
 
 import numpy as np
 import pytest
+from conftest import assert_wall_fits
 from scipy.spatial import ConvexHull
 
 from cathsim_dmc.anatomy import surface, tube
@@ -12,33 +13,19 @@ from cathsim_dmc.anatomy.centreline import Centreline, Vessel, VesselTree
 from cathsim_dmc.anatomy.wall import fidelity, polytope
 from cathsim_dmc.anatomy.wall import pieces as wall
 
-# Bounds on the intrusion of wall pieces into the lumen, m.
-MEAN, P95, MAX = 0.10e-3, 0.30e-3, 0.60e-3
-
 
 def cylinder(radius=0.01, length=0.1):
     line = Centreline([[0, 0, 0], [0, 0, length / 2], [0, 0, length]], [radius] * 3)
     return VesselTree({"aorta": Vessel("aorta", line)})
 
 
-def check(anatomy, n_rays=10_000):
-    found = fidelity.intrusion(anatomy, 2e-3)
-    assert found.inside.mean <= MEAN
-    assert found.inside.p95 <= P95
-    assert found.inside.max <= MAX
-    assert found.recession.p95 <= P95
-    assert fidelity.coverage(anatomy, n_rays).fraction == 1.0
-    assert fidelity.patency(anatomy, 1e-3, spacing=2e-3).passed
-    assert len(anatomy.wall) <= 700
-
-
 @pytest.mark.parametrize("name", arch.ARCHES)
 def test_presets_keep_the_lumen_free_and_closed(name):
-    check(arch.load(name))
+    assert_wall_fits(arch.load(name))
 
 
 def test_femoral_access_is_closed_but_for_its_inlet():
-    check(arch.load("simple1", access="descending"))
+    assert_wall_fits(arch.load("simple1", access="descending"))
 
 
 def test_pieces_are_convex_with_few_vertices():

@@ -36,15 +36,6 @@ def random_actions(environment, steps, seed=0):
     return random.uniform(spec.minimum, spec.maximum, (steps, *spec.shape))
 
 
-def first_observations(task_name, steps):
-    """Observations of the first steps of a new environment with seed 7."""
-    environment = suite.load("cathsim", task_name, task_kwargs={"random": 7})
-    timesteps = [environment.reset()]
-    timesteps += [environment.step(a) for a in random_actions(environment, steps)]
-    environment.close()
-    return [timestep.observation for timestep in timesteps]
-
-
 def assert_bitwise_equal(first, second):
     assert len(first) == len(second)
     for one, other in zip(first, second, strict=True):
