@@ -1,6 +1,7 @@
 """Expert demonstrations: recorded as Minari datasets, read back for learning."""
 
 import dataclasses
+import functools
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -19,6 +20,7 @@ from cathsim_dmc.recording.dataset_reader import (
     read_episodes,
 )
 from cathsim_dmc.simulation.environments import PIXELS, VECTOR
+from cathsim_dmc.simulation.episodes import BatchedSimulations, play
 from cathsim_dmc.tasks import observations
 from cathsim_dmc.tasks.observation_kind import ImageOptions
 from cathsim_dmc.tasks.step import Step
@@ -65,8 +67,7 @@ def record_demonstrations(
     """Let the expert play and write what it saw and did as a Minari dataset.
 
     With noise the expert is pushed off its way and shows how it comes back; what it
-    would have done stands in the infos as "expert_action", at the end of the episode
-    too.
+    would have done stands in the infos as "expert_action".
 
     Args:
         task: Name of the task.
@@ -143,28 +144,30 @@ def _play(simulation: Any, seeds: np.ndarray, noise: float) -> list[Any]:
     generators = [np.random.default_rng(int(seed)) for seed in seeds]
     expert, view = ExpertPolicy(), BatchedView(simulation)
     rows = [_Rows() for _ in seeds]
-    step = simulation.reset()
-    expert.reset(view, np.ones(count, dtype=bool))
-    running = np.ones(count, dtype=bool)
-    for row in np.flatnonzero(running).tolist():
-        rows[row].see(step, row)
-    while running.any():
+    chosen = np.zeros(0, np.float32)
+
+    def act(observation: Any) -> np.ndarray:
+        nonlocal chosen
         chosen = expert.act(None).astype(np.float32)
-        action = chosen
-        if noise:
-            size = chosen.shape[-1]
-            drawn = np.stack([draw.normal(0.0, noise, size) for draw in generators])
-            action = np.clip(chosen + drawn, -1.0, 1.0).astype(np.float32)
-            expert.follow(action)
-        step = simulation.step(action.astype(np.float64))
+        if not noise:
+            return chosen
+        size = chosen.shape[-1]
+        drawn = np.stack([draw.normal(0.0, noise, size) for draw in generators])
+        action = np.clip(chosen + drawn, -1.0, 1.0).astype(np.float32)
+        expert.follow(action)
+        return action
+
+    begin = functools.partial(expert.reset, view)
+    for action, step, running in play(
+        BatchedSimulations(simulation), act, begin, count
+    ):
         for row in np.flatnonzero(running).tolist():
-            rows[row].do(chosen[row], action[row], step, row)
+            if action is not None:
+                rows[row].do(chosen[row], action[row], step, row)
             rows[row].see(step, row)
-        running &= ~(step.terminated | step.truncated)
-    last = expert.act(None).astype(np.float32)
     return [
-        EpisodeBuffer(seed=int(seed), **one.columns(last[row]))
-        for row, (seed, one) in enumerate(zip(seeds, rows, strict=True))
+        EpisodeBuffer(seed=int(seed), **one.columns())
+        for seed, one in zip(seeds, rows, strict=True)
     ]
 
 
@@ -186,11 +189,11 @@ class _Rows:
         ends = bool(step.terminated[row]), bool(step.truncated[row])
         self.steps.append((chosen, action, float(step.outcome.reward[row]), *ends))
 
-    def columns(self, last: np.ndarray) -> dict[str, Any]:
-        """Fields of Minari's buffer, given what the expert would do at the end."""
+    def columns(self) -> dict[str, Any]:
+        """Fields of Minari's buffer; at the end the expert chooses what it chose."""
         chosen, actions, rewards, terminated, truncated = zip(*self.steps, strict=True)
         infos = {key: np.array([i[key] for i in self.infos]) for key in self.infos[0]}
-        infos[EXPERT_ACTION] = np.stack([*chosen, last])
+        infos[EXPERT_ACTION] = np.stack([*chosen, chosen[-1]])
         return {
             "observations": {
                 key: np.stack([one[key] for one in self.seen]) for key in self.seen[0]

@@ -1,6 +1,7 @@
 """Evaluation: fixed seeds, each episode counted once, intervals beside every mean."""
 
 import dataclasses
+import itertools
 import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
@@ -9,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from tensordict import TensorDictBase
 from torchrl.envs import EnvBase
 from torchrl.envs.utils import step_mdp
 
@@ -18,8 +20,9 @@ from cathsim_dmc.agents.policies import PolicyLike, load_policy
 from cathsim_dmc.agents.views import view_of
 from cathsim_dmc.analysis.force_statistics import QUANTITIES, Statistics
 from cathsim_dmc.analysis.intervals import success_interval
-from cathsim_dmc.policies import Policy
+from cathsim_dmc.policies import Policy, View
 from cathsim_dmc.simulation import environments
+from cathsim_dmc.simulation.episodes import play
 
 EnvFactory = Callable[..., EnvBase]
 # Called after every step with the environment and which episodes (n,) bool still run.
@@ -319,29 +322,55 @@ def require_task(policy: Policy, task: str | None) -> str:
     return chosen
 
 
+class _Environments:
+    """The environments of a TorchRL environment; their state is the step's TensorDict.
+
+    Attributes:
+        seen: Present observations (N, ...).
+        view: What a policy may know of the simulations, once they have begun.
+    """
+
+    seen: TensorDictBase
+    view: View
+
+    def __init__(self, env: EnvBase):
+        self._env = env
+
+    def reset(self, which: np.ndarray | None) -> TensorDictBase:
+        """Begin episodes, in all environments or where one has ended."""
+        if which is not None:
+            self.seen = self._env.maybe_reset(self.seen)
+            return self.seen
+        self.seen = self._env.reset()
+        # Environments of composer are made by the first reset.
+        self.view = view_of(self._env)
+        return self.seen
+
+    def step(self, action: np.ndarray) -> tuple[TensorDictBase, np.ndarray]:
+        """Advance by a control step."""
+        self.seen["action"] = torch.as_tensor(action).to(torch.float32)
+        stepped = self._env.step(self.seen)
+        self.seen = step_mdp(stepped)
+        return stepped, stepped["next", "done"].reshape(-1).numpy()
+
+
 @torch.no_grad()
 def _first_episodes(
     env: EnvBase, policy: Policy, observer: Observer | None
 ) -> tuple[EpisodeOutcome, ...]:
     (count,) = env.batch_size
-    tracker = EpisodeTracker(count)
+    tracker, environments_ = EpisodeTracker(count), _Environments(env)
     outcomes: dict[int, EpisodeOutcome] = {}
-    current = env.reset()
-    view = view_of(env)
-    begins = np.ones(count, dtype=bool)
-    while len(outcomes) < count:
-        if begins.any():
-            policy.reset(view, begins)
-        action = torch.as_tensor(policy.act(current))
-        current["action"] = action.to(torch.float32)
-        stepped = env.step(current)
+
+    def begin(which: np.ndarray) -> None:
+        policy.reset(environments_.view, which)
+
+    turns = play(environments_, policy.act, begin, count)
+    for _, stepped, running in itertools.islice(turns, 1, None):
         if observer is not None:
-            running = np.array([index not in outcomes for index in range(count)])
             observer(env, running)
         for outcome in tracker.add(stepped.unsqueeze(1)):
             outcomes.setdefault(outcome.env, outcome)
-        begins = stepped["next", "done"].reshape(count).numpy()
-        current = env.maybe_reset(step_mdp(stepped))
     return tuple(outcomes[env_index] for env_index in range(count))
 
 

@@ -82,7 +82,7 @@ benchmarks.command(table.table)
 app.command(
     benchmarks,
     name="benchmark",
-    help="Measure speed, difficulty, learning.",
+    help="Measure speed and learning.",
 )
 
 

@@ -1,18 +1,13 @@
-"""`cathsim validate rod`, `pair`, `wall`, `forces`; `benchmark speed`, `difficulty`."""
+"""`cathsim validate rod`, `pair`, `wall`, `forces`; `cathsim benchmark speed`."""
 
 import sys
-from json import dumps
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 from tyro import conf
 from tyro.extras import SubcommandApp
 
-from cathsim_dmc import files
-from cathsim_dmc.cli.options import EVALUATION_SEED, show
-
-if TYPE_CHECKING:
-    from cathsim_dmc.validation.checks import Report
+from cathsim_dmc.cli.options import show
 
 validations = SubcommandApp()
 benchmarks = SubcommandApp()
@@ -95,50 +90,3 @@ def speed(json: bool = False) -> int:
     from cathsim_dmc.analysis.speed import report
 
     return show(report.speed(lambda text: print(text, file=sys.stderr)), json)
-
-
-@benchmarks.command
-def difficulty(
-    task: conf.UseAppendAction[list[str]] = [],  # noqa: B006
-    policy: conf.UseAppendAction[list[str]] = [],  # noqa: B006
-    seeds: int = 30,
-    seed: int = EVALUATION_SEED,
-    threads: int = 0,
-    out: Path | None = None,
-    json: bool = False,
-) -> int:
-    """Play straight push, random actions, random curls and the expert on every task.
-
-    Push and curls are cut off when the device is stuck (2 s without 0.5 mm of
-    insertion), and like random actions after 500 control steps.
-
-    Args:
-        task: Task of `cathsim list`, repeated for several; all but `navigate` by
-            default.
-        policy: Policy of the four, repeated for several; all by default: "push",
-            "random", "random_curl", "expert".
-        seeds: Number of episodes of each policy on each task.
-        seed: Seed of the first episode; the others count up.
-        threads: Number of threads of the simulation, 0 for one per core.
-        out: Path of a file for the report as JSON, written after every task.
-        json: Whether to print one JSON object and nothing else.
-    """
-    from cathsim_dmc.analysis import difficulty as measure
-
-    if out is not None and not out.parent.is_dir():
-        raise ValueError(f"--out is {out}: make the directory {out.parent} first")
-
-    def keep(report: "Report") -> None:
-        if out is not None:
-            files.write_text(out, dumps(report.as_dict(), indent=2) + "\n")
-
-    report = measure.difficulty(
-        task or None,
-        seeds,
-        seed,
-        players=policy or None,
-        num_threads=threads,
-        say=lambda text: print(text, file=sys.stderr, flush=True),
-        keep=keep,
-    )
-    return show(report, json)

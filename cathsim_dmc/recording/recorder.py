@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import functools
+import itertools
 import logging
 import platform
 from collections.abc import Callable
@@ -14,6 +16,7 @@ from dm_control.rl import control
 
 from cathsim_dmc.recording.coaxial import SERIES, device_meta
 from cathsim_dmc.recording.episode import TERMINATIONS, Episode
+from cathsim_dmc.simulation.episodes import ComposerSimulation, play
 
 Policy = Callable[[Any], np.ndarray]
 
@@ -171,44 +174,41 @@ class EpisodeRecorder:
             raise ValueError(f"max_steps must be at least 1, got {max_steps}")
         if seed is not None:
             self._env.random_state.seed(seed)
-        timestep = self._env.reset()
+        turns = play(
+            ComposerSimulation(self._env), functools.partial(self._action, policy)
+        )
+        next(turns)
         self._bind()
         rows = _Rows()
         rows.add(**self._state())
         steps, error, termination, discount = 0, None, None, 1.0
-        while not timestep.last() and (max_steps is None or steps < max_steps):
-            try:
-                action = self._action(policy, timestep)
-            except StopIteration:
-                break
-            try:
-                timestep = self._env.step(action)
-            except control.PhysicsError as caught:
-                error, termination = str(caught), "physics_error"
-                break
-            discount = float(timestep.discount)
-            termination = read_termination(self._env.task, timestep)
-            if termination == "physics_error":
-                error = "the environment ended the episode"
-                break
-            state = self._state()
-            readout = read_step(self._env.task, self._env.physics)
-            count = len(readout.contact_force)
-            rows.add(**state)
-            rows.add(
-                action=action,
-                reward=float(timestep.reward),
-                wall_force_sum=readout.wall_force_sum,
-                wall_force_max=readout.wall_force_max,
-                wall_force_peak_sum=readout.wall_force_peak_sum,
-                wall_force_peak_max=readout.wall_force_peak_max,
-                push_force=readout.push_force,
-                reward_terms=readout.reward_terms,
-                contact_step=np.full(count, steps),
-                contact_position=readout.contact_position,
-                contact_force=readout.contact_force,
-            )
-            steps += 1
+        try:
+            for action, timestep, _ in itertools.islice(turns, max_steps):
+                discount = float(timestep.discount)
+                termination = read_termination(self._env.task, timestep)
+                if termination == "physics_error":
+                    error = "the environment ended the episode"
+                    break
+                state = self._state()
+                readout = read_step(self._env.task, self._env.physics)
+                count = len(readout.contact_force)
+                rows.add(**state)
+                rows.add(
+                    action=action,
+                    reward=float(timestep.reward),
+                    wall_force_sum=readout.wall_force_sum,
+                    wall_force_max=readout.wall_force_max,
+                    wall_force_peak_sum=readout.wall_force_peak_sum,
+                    wall_force_peak_max=readout.wall_force_peak_max,
+                    push_force=readout.push_force,
+                    reward_terms=readout.reward_terms,
+                    contact_step=np.full(count, steps),
+                    contact_position=readout.contact_position,
+                    contact_force=readout.contact_force,
+                )
+                steps += 1
+        except control.PhysicsError as caught:
+            error, termination = str(caught), "physics_error"
         if error is not None:
             logging.getLogger(__name__).warning(
                 "physics diverged after %d steps: %s", steps, error

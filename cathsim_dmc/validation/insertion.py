@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -10,6 +11,7 @@ import numpy as np
 from cathsim_dmc import suite
 from cathsim_dmc.anatomy import Anatomy, Goal
 from cathsim_dmc.entities.chain import MAX_PUSH_SPEED
+from cathsim_dmc.simulation.episodes import ComposerSimulation, play
 from cathsim_dmc.tasks.config import CONTROL_TIMESTEP
 
 CURL_TIME = 2.0  # s
@@ -88,14 +90,15 @@ def run(
     kwargs = {"random": seed, "anatomy": anatomy, "goal": goal, **options}
     environment = suite.load(suite.DOMAIN, "navigate", kwargs)
     task = environment.task
-    environment.reset()
+    steps = round(script.duration / CONTROL_TIMESTEP)
+    actions = (script.action(step, task) for step in range(steps))
+    turns = play(ComposerSimulation(environment), lambda timestep: next(actions))
     rows: list[tuple] = []
     single: list[np.ndarray] = []
-    for step in range(round(script.duration / CONTROL_TIMESTEP)):
-        timestep = environment.step(script.action(step, task))
+    for _ in itertools.islice(turns, 1, None):
         if environment.physics.data.ptr.warning.number.any():
             raise RuntimeError(
-                f"insertion {script.name!r} with {options} diverged at step {step}"
+                f"insertion {script.name!r} with {options} diverged at step {len(rows)}"
             )
         contacts = task.contacts(environment.physics)
         single.append(contacts.magnitude[contacts.present])
@@ -108,8 +111,6 @@ def run(
                 contacts.penetration.max(initial=0.0),
             )
         )
-        if timestep.last():
-            break
     head, wall_force, peak, resultant, penetration = map(
         np.array, zip(*rows, strict=True)
     )

@@ -1,6 +1,6 @@
-"""Writes docs/difficulty.md's tables from reports of `cathsim benchmark difficulty`.
+"""Writes docs/difficulty.md's tables from reports of `python benchmarks/difficulty.py`.
 
-    cathsim benchmark difficulty --out docs/data/difficulty.json
+    python benchmarks/difficulty.py --out docs/data/difficulty.json
     python docs/scripts/difficulty.py
 
 Further reports, such as of single tasks or policies, are merged into that file when

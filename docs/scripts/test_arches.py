@@ -11,15 +11,18 @@ import argparse
 import dataclasses
 import json
 import re
+import sys
 from pathlib import Path
 
 import numpy as np
 
 from cathsim_dmc import policies, suite
-from cathsim_dmc.analysis import difficulty
 from cathsim_dmc.analysis.intervals import success_interval
 from cathsim_dmc.anatomy.arch import arch
 from cathsim_dmc.simulation.batch import BatchSimulation
+
+sys.path.append(str(Path(__file__).parents[2] / "benchmarks"))
+import difficulty
 
 TASKS = ("arch_bca", "arch_lcca", "femoral_arch_bca", "femoral_arch_lcca")
 PAGE = Path(__file__).parents[1] / "difficulty.md"

@@ -3,6 +3,7 @@
 import contextlib
 import dataclasses
 import functools
+import itertools
 import time
 from collections.abc import Callable, Iterator
 
@@ -11,6 +12,7 @@ import numpy as np
 
 from cathsim_dmc import suite
 from cathsim_dmc.policies import in_environment, make_policy
+from cathsim_dmc.simulation.episodes import ComposerSimulation, play
 from cathsim_dmc.tasks.config import CONTROL_TIMESTEP
 
 DEPTHS = (0.0, 0.1, 0.2, 0.3, np.inf)  # m of insertion, edges of the bins
@@ -95,16 +97,25 @@ def load(task: str = "type1_bca", **options):
 def pace(environment, policy: str, steps: int, seed: int = 0) -> Pace:
     """Runs an episode of a suite environment and times every control step."""
     act = in_environment(make_policy(policy, seed), environment)
-    timestep = environment.reset()
-    insertion, seconds, contacts = [], [], []
-    for _ in range(steps):
-        action = act(timestep)
-        start = time.process_time()
-        timestep = environment.step(action)
-        seconds.append(time.process_time() - start)
+    timed, insertion, contacts = _Timed(environment), [], []
+    for _ in itertools.islice(play(timed, act), 1, steps + 1):
         insertion.append(float(environment.task.readings.insertion))
         contacts.append(float(environment.task.contacts(environment.physics).found))
-    return Pace(np.array(insertion), np.array(seconds), np.array(contacts))
+    return Pace(np.array(insertion), np.array(timed.seconds), np.array(contacts))
+
+
+class _Timed(ComposerSimulation):
+    """A composer environment with the CPU seconds of each control step."""
+
+    def __init__(self, environment):
+        super().__init__(environment)
+        self.seconds: list[float] = []
+
+    def step(self, action: np.ndarray):
+        start = time.process_time()
+        answer = super().step(action)
+        self.seconds.append(time.process_time() - start)
+        return answer
 
 
 # MuJoCo's timers of the stages of `mj_step`.

@@ -1,24 +1,34 @@
-"""How hard the registered tasks are: what policies without learning make of them.
+"""Difficulty of the registered tasks: success of policies without learning.
+
+    python benchmarks/difficulty.py --out runs/difficulty.json
+    python benchmarks/difficulty.py --task type1_bca --policy push --seeds 5 --json
 
 Four policies play the same seeds of every task: a straight push, random actions, a
 push with a random fixed curl of the tip, and the scripted expert. A task that a
 straight push solves measures nothing but force; one that the expert cannot solve may
-be unsolvable.
+be unsolvable. Push and curls are cut off when the device is stuck (2 s without 0.5 mm
+of insertion), and like random actions after 500 control steps.
 """
 
 from __future__ import annotations
 
 import collections
 import dataclasses
-import itertools
+import functools
+import json as json_
+import sys
 from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
+import tyro
 
-from cathsim_dmc import policies, suite
+from cathsim_dmc import files, policies, suite
 from cathsim_dmc.analysis.force_statistics import EpisodeForces, ForceTracker
 from cathsim_dmc.analysis.intervals import success_interval
+from cathsim_dmc.cli.options import BAD_INPUT, EVALUATION_SEED, show
+from cathsim_dmc.simulation import episodes
 from cathsim_dmc.simulation.batch import BatchSimulation
 from cathsim_dmc.tasks.step import Step
 from cathsim_dmc.validation.checks import Check, Report
@@ -124,8 +134,7 @@ def play(
     """Plays one episode in each simulation of a batch.
 
     Args:
-        simulation: Simulations, which are seeded and reset; those whose episode has
-            ended rest at the start until the last has.
+        simulation: Simulations, which are seeded and reset.
         policy: Policy without memory of other simulations.
         seed: Seed of the first simulation; the others count up.
         limit: When episodes are cut off; None for when the task ends them.
@@ -133,32 +142,29 @@ def play(
     limit = limit or Limit()
     count = simulation.num_simulations
     simulation.seed(seed)
-    step = simulation.reset()
     view = policies.BatchedView(simulation)
-    policy.reset(view, np.ones(count, dtype=bool))
-    tracker = ForceTracker(count)
-    slides = _Slides(step.readings.insertion, limit.growth)
+    tracker, slides = ForceTracker(count), None
     ends: dict[int, str] = {}
-    lengths, forces = np.zeros(count, dtype=int), {}
-    for number in itertools.count(1):
-        action = np.array(policy.act(step.observation))
-        action[list(ends)] = 0.0
-        step = simulation.step(action)
+    lengths, forces = [0] * count, {}
+    begin = functools.partial(policy.reset, view)
+    turns = episodes.play(
+        episodes.BatchedSimulations(simulation), policy.act, begin, count
+    )
+    for number, (action, step, running) in enumerate(turns):
+        if action is None:
+            slides = _Slides(step.readings.insertion, limit.growth)
+            continue
         tracker.add(step.wall_force._asdict())
         slides.add(step.readings.insertion)
-        ended = _ends(step, number, slides.steps, limit)
-        ended = {i: end for i, end in ended.items() if i not in ends}
-        for index, end in ended.items():
-            ends[index], lengths[index] = end, number
-            forces[index] = tracker.finish(index)
-        if len(ends) == count:
-            break
-        if ended:
-            step = simulation.reset(np.array(list(ended)))
+        for index, end in _ends(step, number, slides.steps, limit).items():
+            if running[index]:
+                ends[index], lengths[index] = end, number
+                forces[index] = tracker.finish(index)
+                running[index] = False
     everyone = range(count)
     return Trial(
         tuple(ends[i] for i in everyone),
-        tuple(int(length) for length in lengths),
+        tuple(lengths),
         tuple(forces[i] for i in everyone),
     )
 
@@ -334,3 +340,51 @@ def _note(trial: Trial) -> str:
         f"{found['steps']:.0f} steps; {1e3 * found['mean_force']:.1f} mN mean, "
         f"{1e3 * found['largest_force']:.0f} mN largest"
     )
+
+
+def main(
+    task: tyro.conf.UseAppendAction[list[str]] = [],  # noqa: B006
+    policy: tyro.conf.UseAppendAction[list[str]] = [],  # noqa: B006
+    seeds: int = 30,
+    seed: int = EVALUATION_SEED,
+    threads: int = 0,
+    out: Path | None = None,
+    json: bool = False,
+) -> int:
+    """Play straight push, random actions, random curls and the expert on every task.
+
+    Args:
+        task: Task of `cathsim list`, repeated for several; by default all of a
+            steerable device but `navigate`.
+        policy: Policy of the four, repeated for several; all by default.
+        seeds: Number of episodes of each policy on each task.
+        seed: Seed of the first episode; the others count up.
+        threads: Number of threads of the simulation, 0 for one per core.
+        out: Path of a file for the report as JSON, written after every task.
+        json: Whether to print one JSON object and nothing else.
+    """
+
+    def keep(report: Report) -> None:
+        if out is not None:
+            files.write_text(out, json_.dumps(report.as_dict(), indent=2) + "\n")
+
+    try:
+        if out is not None and not out.parent.is_dir():
+            raise ValueError(f"--out is {out}: make the directory {out.parent} first")
+        report = difficulty(
+            task or None,
+            seeds,
+            seed,
+            players=policy or None,
+            num_threads=threads,
+            say=lambda text: print(text, file=sys.stderr, flush=True),
+            keep=keep,
+        )
+    except ValueError as error:
+        print(f"difficulty: {error}", file=sys.stderr)
+        return BAD_INPUT
+    return show(report, json)
+
+
+if __name__ == "__main__":
+    sys.exit(tyro.cli(main))
