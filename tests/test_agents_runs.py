@@ -16,7 +16,7 @@ from cathsim_dmc.agents import checkpoint as checkpoints
 from cathsim_dmc.agents.learners import make_config, make_policy
 from cathsim_dmc.agents.metrics import MetricsFile, read_metrics
 from cathsim_dmc.agents.networks import NetworkShapes
-from cathsim_dmc.agents.pretrained import load_pretrained
+from cathsim_dmc.agents.policies import load_policy
 from cathsim_dmc.agents.replay import ReplayError
 from cathsim_dmc.agents.warm_start import take_over
 
@@ -168,7 +168,7 @@ def test_a_row_on_a_full_disk_names_the_file(tmp_path, small_disk):
 
 
 def test_a_policy_that_ships_starts_a_training():
-    source = load_pretrained("type1_bca")
+    source = load_policy("pretrained:type1_bca")
     settings = {**source.config.to_dict(), "initial_policy": "pretrained:type1_bca"}
     config = make_config(settings.pop("algorithm"), **settings)
     policy = make_policy(source.shapes, config)

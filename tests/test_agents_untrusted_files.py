@@ -206,14 +206,14 @@ def test_a_file_without_weights_says_so(tmp_path, trained, content):
     ("group", "name", "value", "match"),
     [
         (None, "format", "2", "format is"),
-        (None, "frames", -5, "frames is .* integer >= 0"),
-        (None, "seconds", float("nan"), "seconds is .* number >= 0"),
-        (None, "sha256", {"policy.pt": 3}, "sha256 is .* checksums"),
+        (None, "frames", -5, "frames=-5 .* >= 0"),
+        (None, "seconds", float("nan"), "seconds=nan .*a finite number"),
+        (None, "sha256", {"policy.pt": 3}, "sha256=.* names, each with"),
         ("config", "algorithm", "dqn", "algorithm .* is unknown.*ppo"),
         ("config", "hidden", [10**9], "hidden=.* not allowed"),
         ("config", "strange", 1, "no field .*strange"),
-        ("shapes", "vector", 10**12, "shapes.vector is"),
-        ("shapes", "pixels", [1, 2, 0], "shapes.pixels is"),
+        ("shapes", "vector", 10**12, "shapes.vector="),
+        ("shapes", "pixels", [1, 2, 0], "shapes.pixels="),
     ],
 )
 def test_a_wrong_description_names_the_field(

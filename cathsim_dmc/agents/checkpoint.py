@@ -3,10 +3,9 @@
 import hashlib
 import io
 import json
-import math
 import os
 import shutil
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
@@ -16,7 +15,8 @@ import torch
 from tensordict.nn import TensorDictSequential
 
 from cathsim_dmc import files
-from cathsim_dmc.agents.config import ConfigError, TrainingConfig
+from cathsim_dmc.agents.config import TrainingConfig
+from cathsim_dmc.agents.fields import require, require_type
 from cathsim_dmc.agents.learners import config_from_dict, make_policy
 from cathsim_dmc.agents.networks import NetworkShapes
 
@@ -27,6 +27,13 @@ _POLICY = "policy.pt"
 _LEARNING = "learning.pt"
 _UNFINISHED = ".unfinished-"
 _MAX_DESCRIPTION = 2**20  # bytes
+_FIELDS = {
+    "config": Mapping[str, Any],
+    "shapes": Mapping[str, Any],
+    "sha256": Mapping[str, str],
+    "frames": int,
+    "seconds": float,
+}
 
 
 class CheckpointError(RuntimeError):
@@ -75,37 +82,22 @@ class Checkpoint:
             path = found[-1]
         description = path / _DESCRIPTION
         values = _read_description(description)
-
-        def field(name: str, allowed: str, fits: Callable[[Any], bool]) -> Any:
-            if name not in values or not fits(values[name]):
-                given = repr(values[name]) if name in values else "missing"
-                raise CheckpointError(
-                    f"{description}: {name} is {given}; it must be {allowed}."
-                )
-            return values[name]
-
-        config = field("config", "an object of settings", _is_object)
-        shapes = field("shapes", "an object of sizes", _is_object)
-        checksums = field(
-            "sha256",
-            f"an object with the checksums of {_POLICY} and {_LEARNING}",
-            lambda value: (
-                _is_object(value)
-                and all(isinstance(value.get(n), str) for n in (_POLICY, _LEARNING))
-            ),
-        )
         try:
+            for name, kind in _FIELDS.items():
+                require_type(name, values.get(name), kind)
+            for name in ("frames", "seconds"):
+                require(values[name] >= 0, name, values[name], ">= 0")
+            sums = values["sha256"]
+            require({_POLICY, _LEARNING} <= set(sums), "sha256", sums, "of both files")
             return cls(
                 path=path,
-                config=config_from_dict(config),
-                shapes=NetworkShapes.from_dict(shapes),
-                frames=field(
-                    "frames", "an integer >= 0", lambda v: type(v) is int and v >= 0
-                ),
-                seconds=float(field("seconds", "a number >= 0", _is_duration)),
-                sha256=checksums,
+                config=config_from_dict(values["config"]),
+                shapes=NetworkShapes.from_dict(values["shapes"]),
+                frames=values["frames"],
+                seconds=float(values["seconds"]),
+                sha256=sums,
             )
-        except (ConfigError, ValueError) as error:
+        except ValueError as error:
             raise CheckpointError(f"{description}: {error}") from error
 
     def policy_state(self) -> dict[str, Any]:
@@ -213,23 +205,13 @@ def _read_description(path: Path) -> dict[str, Any]:
         values = files.read_json(path, _MAX_DESCRIPTION, "a checkpoint's description")
     except ValueError as error:
         raise CheckpointError(f"{error}.") from error
-    if not _is_object(values):
+    if not isinstance(values, dict):
         raise CheckpointError(f"{path} is no JSON object.")
     if type(values.get("format")) is not int or values["format"] != FORMAT:
         raise CheckpointError(
             f"{path}: format is {values.get('format')!r}; this version reads {FORMAT}."
         )
     return values
-
-
-def _is_object(value: object) -> bool:
-    return isinstance(value, dict)
-
-
-def _is_duration(value: object) -> bool:
-    if not isinstance(value, int | float) or isinstance(value, bool):
-        return False
-    return math.isfinite(value) and value >= 0
 
 
 def _line(error: Exception) -> str:

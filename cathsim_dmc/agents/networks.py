@@ -1,5 +1,6 @@
 """The published networks, for vector observations, images, or both."""
 
+import typing
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 from typing import Any, cast
@@ -13,6 +14,7 @@ from torchrl.modules import ProbabilisticActor, TanhNormal, ValueOperator
 
 from cathsim_dmc.agents.actor_critic import ActorCriticConfig
 from cathsim_dmc.agents.config import ConfigError, TrainingConfig
+from cathsim_dmc.agents.fields import require, require_type, tuples
 from cathsim_dmc.agents.normalisation import ImageNormaliser, ObservationNormaliser
 from cathsim_dmc.simulation.environments import PIXELS, VECTOR
 from cathsim_dmc.tasks import observations
@@ -60,31 +62,27 @@ class NetworkShapes:
         """The inverse of to_dict.
 
         Raises:
-            ValueError: a size is missing, no integer or out of range.
+            ConfigError: a size is missing, no integer or out of range.
         """
-
-        def size(value: object, name: str, least: int) -> int:
-            if type(value) is not int or not least <= value <= MAX_SIZE:
-                raise ValueError(
-                    f"shapes.{name} is {value!r}; it must be an integer from {least} "
-                    f"to {MAX_SIZE:,}."
-                )
-            return value
-
-        pixels = values.get("pixels")
-        if pixels is not None:
-            if not isinstance(pixels, list | tuple) or len(pixels) != 3:
-                raise ValueError(
-                    f"shapes.pixels is {pixels!r}; it must be null or [channels, "
-                    "height, width]."
-                )
-            channels, height, width = (size(one, "pixels", 1) for one in pixels)
-            pixels = (channels, height, width)
-        return cls(
-            vector=size(values.get("vector"), "vector", 0),
-            pixels=pixels,
-            actions=size(values.get("actions"), "actions", 1),
+        fields = {name: tuples(values.get(name)) for name in ("vector", "actions")}
+        pixels = fields["pixels"] = tuples(values.get("pixels"))
+        for name, kind in typing.get_type_hints(cls).items():
+            require_type(f"shapes.{name}", fields[name], kind)
+        require(
+            pixels is None or len(pixels) == 3,
+            "shapes.pixels",
+            pixels,
+            "None or [channels, height, width]",
         )
+        for name, sizes, least in (
+            ("vector", [fields["vector"]], 0),
+            ("pixels", pixels or (), 1),
+            ("actions", [fields["actions"]], 1),
+        ):
+            fit = all(least <= size <= MAX_SIZE for size in sizes)
+            allowed = f"integers from {least} to {MAX_SIZE:,}"
+            require(fit, f"shapes.{name}", fields[name], allowed)
+        return cls(**fields)
 
     def to_dict(self) -> dict[str, Any]:
         """JSON-able values."""

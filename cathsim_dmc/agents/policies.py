@@ -9,7 +9,7 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from cathsim_dmc.agents import learners
+from cathsim_dmc.agents import learners, pretrained
 from cathsim_dmc.agents.checkpoint import Checkpoint
 from cathsim_dmc.agents.config import TrainingConfig
 from cathsim_dmc.agents.networks import NetworkShapes
@@ -103,6 +103,29 @@ class TrainedPolicy(NetworkPolicy):
         self.checkpoint = checkpoint
 
 
+class PretrainedPolicy(NetworkPolicy):
+    """The policy of a file, such as those that ship.
+
+    Attributes:
+        card: What it was trained for and what it reached, see `pretrained.read_card`.
+    """
+
+    def __init__(self, weights: str | Path):
+        """Loads the weights.
+
+        Args:
+            weights: Path of the `.safetensors` file; the card lies beside it.
+
+        Raises:
+            CheckpointError: there is none, or it is damaged.
+        """
+        self.card, state, shapes, config = pretrained.read_pretrained(weights)
+        name = f"{pretrained.PREFIX}{self.card['name']}"
+        super().__init__(name, state, shapes, config)
+        self.task = self.card["task"]
+        self.task_kwargs = self.card["task_kwargs"]
+
+
 def load_policy(policy: PolicyLike, seed: int = 0) -> Policy:
     """A policy from whatever names one.
 
@@ -122,13 +145,10 @@ def load_policy(policy: PolicyLike, seed: int = 0) -> Policy:
     if isinstance(policy, str | Path):
         if str(policy) in POLICIES:
             return make_policy(str(policy), seed)
-        # Imported late: it knows this module.
-        from cathsim_dmc.agents import pretrained
-
         if str(policy).startswith(pretrained.PREFIX):
-            return pretrained.load_pretrained(str(policy))
+            policy = pretrained.pretrained_path(str(policy))
         if Path(policy).suffix == pretrained.SUFFIX:
-            return pretrained.PretrainedPolicy(policy)
+            return PretrainedPolicy(policy)
         return TrainedPolicy(Checkpoint.open(policy))
     return FunctionPolicy(policy)
 

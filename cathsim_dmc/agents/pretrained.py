@@ -11,10 +11,9 @@ import torch
 
 from cathsim_dmc import files
 from cathsim_dmc.agents.checkpoint import CheckpointError, require_fit
-from cathsim_dmc.agents.config import ConfigError
+from cathsim_dmc.agents.config import ConfigError, TrainingConfig
 from cathsim_dmc.agents.learners import config_from_dict
 from cathsim_dmc.agents.networks import NetworkShapes
-from cathsim_dmc.agents.policies import NetworkPolicy
 
 FORMAT = 1
 PREFIX = "pretrained:"
@@ -34,69 +33,61 @@ _PARTS: Mapping[str, type] = {
 }
 
 
-class PretrainedPolicy(NetworkPolicy):
-    """A trained policy from a file, acting deterministically.
-
-    Attributes:
-        card: What the policy was trained for and what it reached, see `read_card`.
-    """
-
-    def __init__(self, weights: str | Path):
-        """Load the weights and their card.
-
-        Args:
-            weights: Path of the `.safetensors` file; the card lies beside it.
-
-        Raises:
-            CheckpointError: there is none, or it is damaged.
-        """
-        from safetensors import SafetensorError
-        from safetensors.torch import load
-
-        weights = Path(weights)
-        self.card = read_card(weights.with_suffix(".json"))
-        try:
-            data = weights.read_bytes()
-        except OSError as error:
-            raise CheckpointError(f"{weights} cannot be read: {error}.") from error
-        if hashlib.sha256(data).hexdigest() != self.card["sha256"]:
-            raise CheckpointError(
-                f"{weights} is damaged, or its card is that of another policy: the "
-                "SHA-256 differs."
-            )
-        try:
-            config = config_from_dict(self.card["config"])
-            shapes = NetworkShapes.from_dict(self.card["shapes"])
-            state = load(data)
-        except (ConfigError, SafetensorError, ValueError) as error:
-            line = " ".join(str(error).split())[:200]
-            raise CheckpointError(
-                f"{weights} does not fit the network of its card: {line}"
-            ) from error
-        require_fit(weights, state, shapes, config)
-        super().__init__(f"{PREFIX}{self.card['name']}", state, shapes, config)
-        self.task = self.card["task"]
-        self.task_kwargs = self.card["task_kwargs"]
-
-
 def pretrained_names(directory: str | Path = DIRECTORY) -> list[str]:
     """Names of the policies that ship, as in "pretrained:NAME"."""
     return sorted(path.stem for path in Path(directory).glob(f"*{SUFFIX}"))
 
 
-def load_pretrained(name: str) -> PretrainedPolicy:
-    """The policy that ships under a name.
+def pretrained_path(name: str) -> Path:
+    """Weights of the policy that ships under a name.
 
     Raises:
-        CheckpointError: there is none of that name (lists those that exist), or it
-            is damaged.
+        CheckpointError: there is none of that name (lists those that exist).
     """
     name = name.removeprefix(PREFIX)
     names = pretrained_names()
     if name not in names:
         there = ", ".join(PREFIX + one for one in names) or "none yet"
         raise CheckpointError(f"no policy {PREFIX}{name}; there are {there}.")
-    return PretrainedPolicy(DIRECTORY / f"{name}{SUFFIX}")
+    return DIRECTORY / f"{name}{SUFFIX}"
+
+
+def read_pretrained(
+    weights: str | Path,
+) -> tuple[dict[str, Any], dict[str, torch.Tensor], NetworkShapes, TrainingConfig]:
+    """Card, weights and statistics by name, sizes and settings of a policy.
+
+    Args:
+        weights: Path of the `.safetensors` file; the card lies beside it.
+
+    Raises:
+        CheckpointError: there is none, or it is damaged.
+    """
+    from safetensors import SafetensorError
+    from safetensors.torch import load
+
+    weights = Path(weights)
+    card = read_card(weights.with_suffix(".json"))
+    try:
+        data = weights.read_bytes()
+    except OSError as error:
+        raise CheckpointError(f"{weights} cannot be read: {error}.") from error
+    if hashlib.sha256(data).hexdigest() != card["sha256"]:
+        raise CheckpointError(
+            f"{weights} is damaged, or its card is that of another policy: the "
+            "SHA-256 differs."
+        )
+    try:
+        config = config_from_dict(card["config"])
+        shapes = NetworkShapes.from_dict(card["shapes"])
+        state = load(data)
+    except (ConfigError, SafetensorError, ValueError) as error:
+        line = " ".join(str(error).split())[:200]
+        raise CheckpointError(
+            f"{weights} does not fit the network of its card: {line}"
+        ) from error
+    require_fit(weights, state, shapes, config)
+    return card, state, shapes, config
 
 
 def read_card(path: str | Path) -> dict[str, Any]:
