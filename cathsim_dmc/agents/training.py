@@ -48,8 +48,8 @@ class TrainingResult:
     Attributes:
         run: Directory of the run.
         checkpoint: Directory of the newest checkpoint.
-        frames: Number of frames seen in all, over all processes of the run.
-        seconds: Wall time in all.
+        frames: Number of frames, over all processes of the run.
+        seconds: Wall time, likewise.
         interrupted: Whether a signal ended it before total_frames.
         metrics: Last row of metrics.csv.
     """
@@ -134,11 +134,13 @@ def train(
             progress=progress,
         )
         stack.callback(log.close)
-        saver = _Saver(run, config, learner, log, checkpoint, recorder)
         interruption = stack.enter_context(Interruption())
-        _loop(config, source, learner, log, saver, interruption)
-        # However the loop ended; writes nothing if the last batch has just been saved.
-        newest = saver.save(last=True)
+        newest = checkpoint.path if checkpoint else None
+        loop = _Loop(run, config, source, learner, log, recorder, newest)
+        while log.frames < config.total_frames and not interruption.requested:
+            loop.step(interruption)
+        # However it ended; writes nothing if the last batch has just been saved.
+        newest = loop.save(last=True)
         short = log.frames < config.total_frames
         return TrainingResult(run, newest, log.frames, log.seconds, short, log.row)
 
@@ -263,8 +265,10 @@ def _start(
     if checkpoint is None:
         if config.initial_policy is not None:
             take_over(learner.policy, config, learner.shapes)
-        elif not learner.random_frames:
-            _observe_random_actions(env, learner, config)
+        elif config.normalisation_frames and not learner.random_frames:
+            # The first update sees normalised observations.
+            steps = math.ceil(config.normalisation_frames / config.num_envs)
+            learner.observe(env.rollout(steps, break_when_any_done=False))
         return {"frames": 0, "seconds": 0.0, "episodes": 0, "window": []}
     policy, state = checkpoint.policy_state(), checkpoint.learning_state()
     try:
@@ -291,82 +295,35 @@ def _start(
     return {"frames": checkpoint.frames, "seconds": checkpoint.seconds, **counted}
 
 
-def _observe_random_actions(
-    env: EnvBase, learner: Learner, config: TrainingConfig
-) -> None:
-    """Start the observation statistics, so that the first update sees sane inputs."""
-    if not config.normalisation_frames:
-        return
-    steps = math.ceil(config.normalisation_frames / config.num_envs)
-    learner.observe(env.rollout(steps, break_when_any_done=False))
+@dataclass
+class _Loop:
+    """Collects, learns, takes note and saves."""
 
+    run: Path
+    config: TrainingConfig
+    source: BatchSource
+    learner: Learner
+    log: TrainingLog
+    recorder: CheckpointRecorder | None
+    newest: Path | None
 
-class _Saver:
-    """Writes checkpoints, and knows when one is due."""
+    def __post_init__(self):
+        self._tracker, self._restarts = EpisodeTracker(self.config.num_envs), 0
+        self._frames, self._time = self.log.frames, time.monotonic()
 
-    def __init__(
-        self,
-        run: Path,
-        config: TrainingConfig,
-        learner: Learner,
-        log: TrainingLog,
-        checkpoint: Checkpoint | None,
-        recorder: CheckpointRecorder | None,
-    ):
-        self.newest = checkpoint.path if checkpoint else None
-        self._recorder = recorder
-        self._run, self._config = run, config
-        self._learner, self._log = learner, log
-        self._frames, self._time = log.frames, time.monotonic()
-
-    def due(self) -> bool:
-        """Whether so many frames or seconds have passed since the last one."""
-        return (
-            crossed(self._frames, self._log.frames, self._config.checkpoint_frames)
-            or time.monotonic() - self._time >= self._config.checkpoint_seconds
-        )
-
-    def save(self, last: bool = False) -> Path:
-        """Write a checkpoint, the last one or not; return its directory."""
-        self.newest = save_checkpoint(
-            self._run,
-            config=self._config,
-            shapes=self._learner.shapes,
-            frames=self._log.frames,
-            seconds=self._log.seconds,
-            policy=self._learner.policy_state(),
-            learning={
-                "learner": self._learner.learning_state(),
-                "rng": torch.get_rng_state(),
-                "episodes": self._log.episodes,
-                "window": list(self._log.window),
-            },
-        )
-        self._frames, self._time = self._log.frames, time.monotonic()
-        if self._recorder is not None:
-            self._recorder.saved(self.newest, last)
-        return self.newest
-
-
-def _loop(
-    config: TrainingConfig,
-    source: BatchSource,
-    learner: Learner,
-    log: TrainingLog,
-    saver: _Saver,
-    interruption: Interruption,
-) -> None:
-    """Collect, learn, take note and save until the frames are there or a signal."""
-    tracker, restarts = EpisodeTracker(config.num_envs), source.restarts
-    while log.frames < config.total_frames and not interruption.requested:
-        batch = source.next()
-        if source.restarts != restarts:
-            tracker, restarts = EpisodeTracker(config.num_envs), source.restarts
-        finished = tracker.add(batch)
+    def step(self, interruption: Interruption) -> None:
+        """Collect a batch and learn from it."""
+        config, log = self.config, self.log
+        batch = self.source.next()
+        if self.source.restarts != self._restarts:
+            self._tracker = EpisodeTracker(config.num_envs)
+            self._restarts = self.source.restarts
+        finished = self._tracker.add(batch)
         _truncate_diverged(batch)
-        losses = learner.update(batch, min(log.frames / config.total_frames, 1.0))
+        progress = min(log.frames / config.total_frames, 1.0)
+        losses = self.learner.update(batch, progress)
         frames = log.frames + batch.numel()
-        _require_finite(losses, frames, saver.newest)
+        _require_finite(losses, frames, self.newest)
         log.add(
             batch.numel(),
             finished,
@@ -374,8 +331,32 @@ def _loop(
             losses=losses,
             last=frames >= config.total_frames or interruption.requested,
         )
-        if saver.due():
-            saver.save()
+        if (
+            crossed(self._frames, log.frames, config.checkpoint_frames)
+            or time.monotonic() - self._time >= config.checkpoint_seconds
+        ):
+            self.save()
+
+    def save(self, last: bool = False) -> Path:
+        """Write a checkpoint, the last one or not; return its directory."""
+        self.newest = save_checkpoint(
+            self.run,
+            config=self.config,
+            shapes=self.learner.shapes,
+            frames=self.log.frames,
+            seconds=self.log.seconds,
+            policy=self.learner.policy_state(),
+            learning={
+                "learner": self.learner.learning_state(),
+                "rng": torch.get_rng_state(),
+                "episodes": self.log.episodes,
+                "window": list(self.log.window),
+            },
+        )
+        self._frames, self._time = self.log.frames, time.monotonic()
+        if self.recorder is not None:
+            self.recorder.saved(self.newest, last)
+        return self.newest
 
 
 def _truncate_diverged(batch: TensorDictBase) -> None:
