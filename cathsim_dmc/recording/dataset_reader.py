@@ -101,11 +101,18 @@ def read_episodes(path: str | Path) -> Iterator[DatasetEpisode]:
     try:
         with h5py.File(file, "r") as whole:
             for index in range(len(whole)):
-                yield _episode(_Group(file, whole, f"episode_{index}"))
+                yield _episode(file, whole, f"episode_{index}")
     except DatasetError:
         raise
-    # What h5py raises where the file is damaged.
-    except (OSError, KeyError, ValueError, TypeError, RuntimeError) as error:
+    # What a damaged file leads to.
+    except (
+        OSError,
+        LookupError,
+        ValueError,
+        TypeError,
+        RuntimeError,
+        AttributeError,
+    ) as error:
         line = " ".join(str(error).split())
         raise DatasetError(f"{file} cannot be read: {line}") from error
 
@@ -122,95 +129,57 @@ def _data(path: str | Path) -> Path:
     )
 
 
-class _Group:
-    """A group of an HDF5 file that is looked at with care."""
+def _member(file: Path, group: Any, name: str) -> Any:
+    """A member of a group: an array of numbers, or a group as a dictionary of these."""
+    import h5py
 
-    def __init__(self, file: Path, parent: Any, name: str):
-        import h5py
-
-        self._file, self._name = file, name
-        self._group = self._hard(parent, name)
-        if not isinstance(self._group, h5py.Group):
-            raise DatasetError(f"{file}: {name} must be a group of arrays")
-
-    def _hard(self, parent: Any, name: str) -> Any:
-        """A member that lies in this file."""
-        import h5py
-
-        link = parent.get(name, getlink=True)
-        if not isinstance(link, h5py.HardLink):
-            what = "is missing" if link is None else "leads elsewhere"
-            raise DatasetError(f"{self._file}: {self._name}: {name} {what}")
-        return parent[name]
-
-    @property
-    def seed(self) -> int | None:
-        """Seed that is noted as an attribute."""
-        given = self._group.attrs.get("seed")
-        if given is None:
-            return None
-        try:
-            return bounds.whole("seed", given, 0)
-        except ValueError as error:
-            raise DatasetError(f"{self._file}: {self._name}: {error}") from error
-
-    def __contains__(self, name: str) -> bool:
-        """Whether there is a member of that name."""
-        return name in self._group
-
-    def array(self, name: str) -> np.ndarray:
-        """Member that is an array of numbers."""
-        import h5py
-
-        found = self._hard(self._group, name)
-        plain = isinstance(found, h5py.Dataset) and found.dtype.kind in "biuf"
-        if not plain or not found.shape or found.is_virtual or found.external:
-            raise DatasetError(
-                f"{self._file}: {self._name}/{name} must be an array of numbers in "
-                "this file, with a row for each step"
-            )
-        if found.nbytes > _MAX_ARRAY:
-            raise DatasetError(
-                f"{self._file}: {self._name}/{name} takes {found.nbytes / 1e9:.0f} GB"
-            )
-        return found[()]
-
-    def arrays(self, name: str) -> dict[str, np.ndarray]:
-        """Members of a group that are arrays of numbers."""
-        inner = _Group(self._file, self._group, name)
-        return {key: inner.array(key) for key in inner._group}
+    where = f"{file}: {group.name.strip('/')}"
+    link = group.get(name, getlink=True)
+    if not isinstance(link, h5py.HardLink):
+        what = "is missing" if link is None else "leads elsewhere"
+        raise DatasetError(f"{where}: {name} {what}")
+    found = group[name]
+    if isinstance(found, h5py.Group):
+        return {inner: _member(file, found, inner) for inner in found}
+    if (
+        found.dtype.kind not in "biuf"
+        or not found.shape
+        or (found.is_virtual or found.external)
+    ):
+        raise DatasetError(
+            f"{where}/{name} must be an array of numbers in this file, with a row for "
+            "each step"
+        )
+    if found.nbytes > _MAX_ARRAY:
+        raise DatasetError(f"{where}/{name} takes {found.nbytes / 1e9:.0f} GB")
+    return found[()]
 
 
-def _episode(group: _Group) -> DatasetEpisode:
+def _episode(file: Path, whole: Any, name: str) -> DatasetEpisode:
+    for part in (name, *(f"{name}/{field}" for field in _FIELDS)):
+        if part not in whole:
+            raise DatasetError(f"{file}: {part} is missing")
+    members = _member(file, whole, name)
+    seed = whole[name].attrs.get("seed")
     episode = DatasetEpisode(
-        seed=group.seed,
-        observations=group.arrays("observations"),
-        actions=group.array("actions"),
-        rewards=group.array("rewards"),
-        terminations=group.array("terminations"),
-        truncations=group.array("truncations"),
-        infos=group.arrays("infos") if "infos" in group else {},
+        seed=None if seed is None else bounds.whole("seed", seed, 0),
+        infos=members.get("infos", {}),
+        **{field: members[field] for field in _FIELDS},
     )
+    parts = {f"infos/{key}": value for key, value in episode.infos.items()}
+    numbers = {f"observations/{key}": v for key, v in episode.observations.items()}
+    by_step = {key: getattr(episode, key) for key in _FIELDS[1:]}
     steps = len(episode.actions)
-    lengths = {
-        **{name: len(getattr(episode, name)) for name in _BY_STEP},
-        **{name: len(v) - 1 for name, v in episode.observations.items()},
-        **{name: len(v) - 1 for name, v in episode.infos.items()},
-    }
-    wrong = [name for name, length in lengths.items() if length != steps]
+    wrong = [key for key, value in by_step.items() if len(value) != steps]
+    wrong += [k for k, value in {**parts, **numbers}.items() if len(value) != steps + 1]
     if wrong or not steps:
         raise DatasetError(
-            f"{group._file}: {group._name} has {steps} actions, and {wrong} do not fit"
+            f"{file}: {name} has {steps} actions, and {wrong} do not fit"
         )
-    numbers = {
-        "actions": episode.actions,
-        "rewards": episode.rewards,
-        **{f"observations/{name}": v for name, v in episode.observations.items()},
-    }
-    for name, values in numbers.items():
+    for key, values in {**by_step, **numbers}.items():
         if not np.isfinite(values).all():
-            raise DatasetError(f"{group._file}: {group._name}: {name} are not finite")
+            raise DatasetError(f"{file}: {name}: {key} are not finite")
     return episode
 
 
-_BY_STEP = ("rewards", "terminations", "truncations")
+_FIELDS = ("observations", "actions", "rewards", "terminations", "truncations")
