@@ -10,7 +10,7 @@ from conftest import assert_wall_fits
 
 from cathsim_dmc import cli
 from cathsim_dmc.anatomy import Anatomy
-from cathsim_dmc.anatomy.builder import Place
+from cathsim_dmc.anatomy.builder import VesselPlace
 from cathsim_dmc.anatomy.curves import Curve, smooth_tree
 from cathsim_dmc.anatomy.tree_file import parse_tree, read_tree
 
@@ -131,7 +131,7 @@ def test_from_tree_sets_a_goal_in_each_branch():
     side = anatomy.tree.vessel("side")
     assert anatomy.goal("side").arc_length == pytest.approx(side.ostium + 27e-3)
     again = Anatomy.from_tree(
-        anatomy.tree, "b", goals={"x": Place("trunk", arc_length=0.03)}
+        anatomy.tree, "b", goals={"x": VesselPlace("trunk", arc_length=0.03)}
     )
     assert again.tree is anatomy.tree
     assert list(again.goals) == ["x"]

@@ -13,7 +13,7 @@ from cathsim_dmc.pictures import video
 from cathsim_dmc.pictures.animation import animate
 from cathsim_dmc.pictures.figure import scene_figure
 from cathsim_dmc.pictures.snapshot import Snapshot
-from cathsim_dmc.pictures.translucent import Projection, glass
+from cathsim_dmc.pictures.translucent import ParallelProjection, glass
 from cathsim_dmc.recording.episode import Episode
 from cathsim_dmc.recording.geometry import force_scale, force_text
 
@@ -119,7 +119,7 @@ def test_the_moment_of_a_record_is_that_of_the_environment(pushed):
 
 def test_glass_covers_what_the_surface_covers_and_darkens_at_the_rim():
     vertices, faces = make_tube(radius=0.02, length=0.08, sides=48, rings=9)
-    projection = Projection.of(vertices, margin=0.01, height=200)
+    projection = ParallelProjection.of(vertices, margin=0.01, height=200)
     picture = glass(vertices, faces, projection)
     alpha = picture.behind[..., 3]
     rows, columns = projection.shape
@@ -137,7 +137,7 @@ def test_glass_covers_what_the_surface_covers_and_darkens_at_the_rim():
 @pytest.mark.parametrize("azimuth", [0.0, 90.0, 37.0])
 def test_a_projection_maps_points_to_their_pixels(azimuth):
     points = np.random.default_rng(0).normal(size=(20, 3))
-    projection = Projection.of(points, azimuth=azimuth)
+    projection = ParallelProjection.of(points, azimuth=azimuth)
     np.testing.assert_allclose(projection.right @ projection.towards, 0, atol=1e-12)
     # The viewer of the front stands before the chest: towards him is -y.
     if azimuth == 0:

@@ -127,10 +127,10 @@ def test_wrong_actions_are_refused(env):
         recorder.record_episode(bend_and_push, max_steps=0)
 
 
-def test_a_model_without_a_catheter_is_refused():
+def test_another_environment_is_refused():
     empty = composer.NullTask(composer.Arena())
     other = composer.Environment(empty, strip_singleton_obs_buffer_dim=True)
-    with pytest.raises(ValueError, match="no body 'catheter/link_0'"):
+    with pytest.raises(TypeError, match="no environment of cathsim"):
         EpisodeRecorder(other)
 
 

@@ -274,7 +274,7 @@ def test_bodies_carry_their_geoms(written):
     capsule = f"{moved}/capsule"
     lower = recording.fixed(capsule, "Capsules3D:translations")[0]
     geom = make_geoms()[3]
-    centre = np.array(lower) + rotate(geom.quaternion, np.array([0, 0, 0.02]))
+    centre = np.array(lower) + rotate(np.array(geom.quaternion), np.array([0, 0, 0.02]))
     np.testing.assert_allclose(centre, geom.position, atol=1e-6)
     np.testing.assert_allclose(recording.fixed(capsule, "Capsules3D:lengths"), [0.04])
     half = recording.fixed("/world/robot/base/box", "Boxes3D:half_sizes")
@@ -419,10 +419,10 @@ def test_two_episodes_are_two_recordings(tmp_path):
     [
         ({"fluoroscopy": np.zeros((STEPS, 4, 4, 1), np.uint8)}, "must have shape"),
         ({"fluoroscopy": np.zeros((STEPS + 1, 4, 4, 1))}, "uint8"),
-        ({"catheter_radius": [0.001, 0.002]}, "4 of them"),
-        ({"catheter_radius": 0.0}, "positive"),
-        ({"goal_position": GOAL}, "both position and radius"),
-        ({"goal_position": GOAL[:2], "goal_radius": 0.1}, "position"),
+        ({"meta": {"catheter_radius": [0.001, 0.002]}}, "4 of them"),
+        ({"meta": {"catheter_radius": 0.0}}, "positive"),
+        ({"meta": {"goal_position": GOAL}}, "a positive radius"),
+        ({"meta": {"goal_position": GOAL[:2], "goal_radius": 0.1}}, "position"),
         (
             {
                 "robot_geoms": [
@@ -434,8 +434,11 @@ def test_two_episodes_are_two_recordings(tmp_path):
     ],
 )
 def test_wrong_inputs_leave_no_file(tmp_path, options, message):
+    options = dict(options)
+    meta = {"success": True, "termination": "success", **options.pop("meta", {})}
+    episode = make_episode(STEPS, meta=meta)
     with pytest.raises(ValueError, match=message):
-        write_rrd(make_episode(STEPS), make_tube(), tmp_path / "e.rrd", **options)
+        write_rrd(episode, make_tube(), tmp_path / "e.rrd", **options)
     assert list(tmp_path.iterdir()) == []
 
 

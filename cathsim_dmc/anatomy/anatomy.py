@@ -13,13 +13,14 @@ import os
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from cathsim_dmc import files
-from cathsim_dmc.anatomy import loading
+from cathsim_dmc.anatomy import builder, loading
+from cathsim_dmc.anatomy.builder import VesselPlace
 from cathsim_dmc.anatomy.centreline import (
     Array,
     Centreline,
@@ -28,12 +29,9 @@ from cathsim_dmc.anatomy.centreline import (
     _readonly,
     as_points,
 )
+from cathsim_dmc.anatomy.curves import Curve, smooth_tree
 from cathsim_dmc.anatomy.parts import End, Goal, Inlet, Surface
 from cathsim_dmc.anatomy.wall.depth import DepthField
-
-if TYPE_CHECKING:
-    from cathsim_dmc.anatomy.builder import Place
-    from cathsim_dmc.anatomy.curves import Curve
 
 FORMAT = "cathsim-anatomy"
 FORMAT_VERSION = 1
@@ -98,8 +96,8 @@ class Anatomy:
         tree: VesselTree | Mapping[str, Curve],
         name: str = "tree",
         *,
-        inlet: Place | None = None,
-        goals: Mapping[str, Place] | None = None,
+        inlet: VesselPlace | None = None,
+        goals: Mapping[str, VesselPlace] | None = None,
         **smoothing: float,
     ) -> Anatomy:
         """Build lumen surface, wall pieces, inlet and goals around centrelines.
@@ -118,10 +116,14 @@ class Anatomy:
             ValueError: if the centrelines give no valid lumen, or a place is not on
                 its vessel; names the vessel.
         """
-        # The builder needs this class.
-        from cathsim_dmc.anatomy.builder import build_anatomy
+        from cathsim_dmc.anatomy.surface import lumen_surface
+        from cathsim_dmc.anatomy.wall.pieces import build_wall
 
-        return build_anatomy(tree, name, inlet=inlet, goals=goals, **smoothing)
+        if not isinstance(tree, VesselTree):
+            tree = smooth_tree(tree, **smoothing)
+        tree, ends, entry, places = builder.placed(tree, inlet, goals)
+        surface, wall = lumen_surface(tree), build_wall(tree, ends)
+        return cls(name, tree, surface, wall, entry, places, ends)
 
     def depth(self, points: ArrayLike) -> Array:
         """Signed depth (...) of `points` (..., 3) in the lumen, metres, > 0 inside."""

@@ -1,4 +1,4 @@
-"""From a vessel tree to an anatomy: ends, inlet, goals, surface and wall."""
+"""Ends, inlet and goals of a vessel tree."""
 
 from __future__ import annotations
 
@@ -8,9 +8,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from cathsim_dmc.anatomy.anatomy import Anatomy
 from cathsim_dmc.anatomy.centreline import Array, VesselTree
-from cathsim_dmc.anatomy.curves import FLARE, SMOOTHING, Curve, smooth_tree
 from cathsim_dmc.anatomy.parts import End, Goal, Inlet
 
 # Goals lie this far (m) past the ostium of their branch where it is long enough,
@@ -21,7 +19,7 @@ ACCESSES = ("ascending", "descending")
 
 
 @dataclass(frozen=True, eq=False)
-class Place:
+class VesselPlace:
     """A place on a vessel: exactly one of the three ways to say where.
 
     Attributes:
@@ -68,50 +66,40 @@ class Place:
         return min(max(arc, 0.0), line.length)
 
 
-def build_anatomy(
-    tree: VesselTree | Mapping[str, Curve],
-    name: str = "tree",
-    *,
-    inlet: Place | None = None,
-    goals: Mapping[str, Place] | None = None,
-    smoothing: float = SMOOTHING,
-    flare: float = FLARE,
-) -> Anatomy:
-    """Anatomy around a tree of centrelines; see `Anatomy.from_tree`."""
-    from cathsim_dmc.anatomy.surface import lumen_surface
-    from cathsim_dmc.anatomy.wall.pieces import build_wall
+def placed(
+    tree: VesselTree, inlet: VesselPlace | None, goals: Mapping[str, VesselPlace] | None
+) -> tuple[VesselTree, tuple[End, ...], Inlet, dict[str, Goal]]:
+    """The tree from its inlet on, its flat ends, inlet and goals.
 
-    if not isinstance(tree, VesselTree):
-        tree = smooth_tree(tree, smoothing=smoothing, flare=flare)
-    placed = (
+    Args:
+        tree: vessels.
+        inlet: where the device enters; the first point of the root if None.
+        goals: by name; see `default_goals` if None.
+
+    Raises:
+        ValueError: if a place is not on its vessel, or lies behind the inlet.
+    """
+    found = (
         default_goals(tree)
         if goals is None
         else {key: _goal(key, place, tree) for key, place in goals.items()}
     )
-    inlet = inlet or Place(tree.root.name, arc_length=0.0)
-    tree, entered = _cut_at(tree, inlet, placed)
+    inlet = inlet or VesselPlace(tree.root.name, arc_length=0.0)
+    tree, entered = _cut_at(tree, inlet, found)
     if inlet.vessel == tree.root.name:
         # Arc lengths count from the new first point.
-        placed = {key: _moved(goal, tree) for key, goal in placed.items()}
+        found = {key: _moved(goal, tree) for key, goal in found.items()}
     ends = flat_ends(tree, *entered)
-    return Anatomy(
-        name=name,
-        tree=tree,
-        surface=lumen_surface(tree),
-        wall=build_wall(tree, ends),
-        inlet=_inlet(ends),
-        goals=placed,
-        ends=ends,
-    )
+    return tree, ends, _inlet(ends), found
 
 
-def access_inlet(tree: VesselTree, access: str) -> Place:
+def access_inlet(tree: VesselTree, access: str) -> VesselPlace:
     """Place of the inlet: "ascending", the root's first point, or "descending"."""
     if access not in ACCESSES:
         raise ValueError(f"access is {access!r}; choose one of {', '.join(ACCESSES)}.")
     root = tree.root
     arc = 0.0 if access == "ascending" else root.centreline.length
-    return Place(root.name, arc_length=arc)
+    return VesselPlace(root.name, arc_length=arc)
 
 
 def anatomy_frame(tree: VesselTree, access: str) -> tuple[Inlet, tuple[End, ...]]:
@@ -164,11 +152,11 @@ def default_goals(tree: VesselTree) -> dict[str, Goal]:
                 ostium = fork.centreline.at(fork.ostium).position
                 level = float(vessel.centreline.project(ostium).arc_length)
                 deepest = min(deepest, level)
-        goals[name] = _goal(name, Place(name, arc_length=deepest), tree)
+        goals[name] = _goal(name, VesselPlace(name, arc_length=deepest), tree)
     return goals
 
 
-def _goal(name: str, place: Place, tree: VesselTree) -> Goal:
+def _goal(name: str, place: VesselPlace, tree: VesselTree) -> Goal:
     arc = place.arc(tree)
     centre = tree.vessel(place.vessel).centreline.at(arc)
     position = centre.position if place.position is None else place.position
@@ -193,7 +181,7 @@ def _inlet(ends: tuple[End, ...]) -> Inlet:
 
 
 def _cut_at(
-    tree: VesselTree, inlet: Place, goals: Mapping[str, Goal]
+    tree: VesselTree, inlet: VesselPlace, goals: Mapping[str, Goal]
 ) -> tuple[VesselTree, tuple[str, bool]]:
     """The tree without what lies behind the inlet; vessel and end that is entered.
 

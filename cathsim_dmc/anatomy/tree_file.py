@@ -36,7 +36,7 @@ from typing import Any
 import numpy as np
 
 from cathsim_dmc.anatomy.anatomy import Anatomy
-from cathsim_dmc.anatomy.builder import Place, build_anatomy
+from cathsim_dmc.anatomy.builder import VesselPlace
 from cathsim_dmc.anatomy.centreline import VesselTree
 from cathsim_dmc.anatomy.curves import Curve, smooth_tree
 
@@ -58,13 +58,13 @@ class InletPlace:
     end: str | None = None
     arc_length: float | None = None
 
-    def place(self, tree: VesselTree) -> Place:
+    def place(self, tree: VesselTree) -> VesselPlace:
         """The same as an arc length on the built centreline."""
         arc = self.arc_length
         if arc is None:
             length = tree.vessel(self.vessel).centreline.length
             arc = 0.0 if self.end == "first" else length
-        return Place(self.vessel, arc_length=arc)
+        return VesselPlace(self.vessel, arc_length=arc)
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,7 +82,7 @@ class TreeFile:
     name: str
     curves: Mapping[str, Curve]
     inlets: Mapping[str, InletPlace]
-    goals: Mapping[str, Place] | None = None
+    goals: Mapping[str, VesselPlace] | None = None
     note: str = field(default="", repr=False)
 
     def tree(self) -> VesselTree:
@@ -103,7 +103,7 @@ class TreeFile:
             )
         tree = self.tree()
         inlet = self.inlets[access].place(tree)
-        return build_anatomy(tree, self.name, inlet=inlet, goals=self.goals)
+        return Anatomy.from_tree(tree, self.name, inlet=inlet, goals=self.goals)
 
 
 def read_tree(path: str | os.PathLike[str]) -> TreeFile:
@@ -299,7 +299,7 @@ def _inlet(name: str, entry: Any, curves: Mapping[str, Curve], root: str) -> Inl
 
 def _goal(
     name: str, entry: Any, curves: Mapping[str, Curve], flip: np.ndarray
-) -> Place:
+) -> VesselPlace:
     where = f"goal {name!r}"
     ways = {"arc_length_mm", "past_ostium_mm", "position_mm"}
     _entries(entry, where, {"vessel"}, ways)
@@ -310,8 +310,8 @@ def _goal(
     (way,) = given
     if way == "position_mm":
         (position,) = _numbers([entry[way]], f"{where}: {way}", 3)
-        return Place(vessel, position=position * flip * _MM)
+        return VesselPlace(vessel, position=position * flip * _MM)
     length = _length(entry[way], f"{where}: {way}")
     if way == "past_ostium_mm":
-        return Place(vessel, past_ostium=length)
-    return Place(vessel, arc_length=length)
+        return VesselPlace(vessel, past_ostium=length)
+    return VesselPlace(vessel, arc_length=length)

@@ -15,8 +15,9 @@ import numpy as np
 from cathsim_dmc.imaging import FluoroscopyOptions
 from cathsim_dmc.pictures.readout import ForceReadout, forces
 from cathsim_dmc.pictures.recorded import record, write
-from cathsim_dmc.pictures.snapshot import Snapshot, navigation_of
+from cathsim_dmc.pictures.snapshot import Snapshot
 from cathsim_dmc.recording.episode import Episode
+from cathsim_dmc.recording.recorder import navigation_of
 
 VIEWERS = ("figure", "rerun")
 

@@ -15,7 +15,7 @@ from cathsim_dmc.files import atomic_path
 from cathsim_dmc.pictures import figure as drawing
 from cathsim_dmc.pictures import video
 from cathsim_dmc.pictures.snapshot import Snapshot, xray
-from cathsim_dmc.pictures.translucent import Glass, Projection, glass
+from cathsim_dmc.pictures.translucent import Glass, ParallelProjection, glass
 from cathsim_dmc.recording.episode import Episode
 
 SUFFIXES = (".gif", ".webp", video.SUFFIX)
@@ -135,12 +135,12 @@ class _Film:
         # Points; in a small film the label must not run under the X-ray image.
         self._font = float(np.clip(width / 65, 6.5, 10))
         azimuth = drawing.VIEWS[view][0]
-        rough = Projection.of(surface.vertices, azimuth=azimuth, margin=_MARGIN)
+        rough = ParallelProjection.of(surface.vertices, azimuth=azimuth, margin=_MARGIN)
         rows, columns = rough.shape
         left = columns / rows  # width of the scene as a share of the height
         height = width / (left + 0.66)
         # One pixel of the glass for each of the film.
-        self._projection = Projection.of(
+        self._projection = ParallelProjection.of(
             surface.vertices, azimuth=azimuth, margin=_MARGIN, height=round(height)
         )
         self._glass: Glass = glass(surface.vertices, surface.faces, self._projection)

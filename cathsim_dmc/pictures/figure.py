@@ -17,7 +17,7 @@ from PIL import Image
 
 from cathsim_dmc.imaging import FluoroscopyOptions
 from cathsim_dmc.pictures.snapshot import Snapshot, fluoroscope_of, xray
-from cathsim_dmc.pictures.translucent import Glass, Projection, glass
+from cathsim_dmc.pictures.translucent import Glass, ParallelProjection, glass
 from cathsim_dmc.recording.geometry import force_colours, force_text
 from cathsim_dmc.style import COLOURS, tidy
 
@@ -99,9 +99,11 @@ def force_map() -> LinearSegmentedColormap:
 
 
 @functools.lru_cache(maxsize=16)
-def background(surface: Any, azimuth: float, height: int) -> tuple[Projection, Glass]:
+def background(
+    surface: Any, azimuth: float, height: int
+) -> tuple[ParallelProjection, Glass]:
     """A vessel as glass, seen from an azimuth, degrees, in so many rows of pixels."""
-    projection = Projection.of(surface.vertices, azimuth=azimuth, height=height)
+    projection = ParallelProjection.of(surface.vertices, azimuth=azimuth, height=height)
     return projection, glass(surface.vertices, surface.faces, projection)
 
 
@@ -156,7 +158,7 @@ def scene_figure(
 
 
 def draw_scene(
-    axes: Any, snapshot: Snapshot, projection: Projection, picture: Glass
+    axes: Any, snapshot: Snapshot, projection: ParallelProjection, picture: Glass
 ) -> None:
     """Draw a snapshot into axes whose units are millimetres."""
     extent = projection.extent_mm
@@ -177,7 +179,7 @@ def draw_scene(
     _draw_forces(axes, snapshot, projection)
 
 
-def _draw_goal(axes: Any, snapshot: Snapshot, projection: Projection) -> None:
+def _draw_goal(axes: Any, snapshot: Snapshot, projection: ParallelProjection) -> None:
     x, z = projection.flat_mm(snapshot.goal)
     radius = 1e3 * snapshot.goal_radius
     axes.add_patch(
@@ -194,7 +196,7 @@ def _points_per_mm(axes: Any) -> float:
     return height / (high - low)
 
 
-def _draw_device(axes: Any, snapshot: Snapshot, projection: Projection) -> None:
+def _draw_device(axes: Any, snapshot: Snapshot, projection: ParallelProjection) -> None:
     from cathsim_dmc.imaging.kernel import curve  # late: it brings the compiler
 
     line = projection.flat_mm(curve(np.float64(snapshot.device), _PIECES))
@@ -228,7 +230,7 @@ def _draw_device(axes: Any, snapshot: Snapshot, projection: Projection) -> None:
     )  # fmt: skip
 
 
-def _draw_forces(axes: Any, snapshot: Snapshot, projection: Projection) -> None:
+def _draw_forces(axes: Any, snapshot: Snapshot, projection: ParallelProjection) -> None:
     magnitude = snapshot.magnitude
     if not len(magnitude):
         return

@@ -6,9 +6,8 @@ from typing import Any
 
 from cathsim_dmc.pictures.readout import forces
 from cathsim_dmc.pictures.recorded import film_options, xray_film
-from cathsim_dmc.pictures.snapshot import navigation_of
 from cathsim_dmc.recording.episode import Episode
-from cathsim_dmc.recording.recorder import EpisodeRecorder
+from cathsim_dmc.recording.recorder import EpisodeRecorder, navigation_of
 from cathsim_dmc.recording.scene import body_geoms
 
 

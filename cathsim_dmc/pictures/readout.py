@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from cathsim_dmc.pictures.snapshot import navigation_of
+from cathsim_dmc.recording.recorder import navigation_of
 
 
 @dataclass(frozen=True, eq=False, repr=False)

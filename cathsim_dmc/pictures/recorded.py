@@ -13,9 +13,9 @@ import numpy as np
 from cathsim_dmc import policies
 from cathsim_dmc.imaging import Angiograph, FluoroscopyOptions
 from cathsim_dmc.pictures import video
-from cathsim_dmc.pictures.snapshot import navigation_of
+from cathsim_dmc.recording.drawing import link_radii
 from cathsim_dmc.recording.episode import Episode
-from cathsim_dmc.recording.recorder import EpisodeRecorder
+from cathsim_dmc.recording.recorder import EpisodeRecorder, navigation_of
 from cathsim_dmc.recording.scene import body_geoms
 
 # A name of `policies.POLICIES`, a policy, or a function from the observation (a
@@ -161,9 +161,8 @@ def xray_film(
         the brightest of each plane's grey levels are black and white.
     """
     machine = Angiograph(surface.vertices, surface.faces, options)
-    radius = np.asarray(episode.meta.get("catheter_radius", 0.835e-3))
-    if radius.ndim:
-        radius = np.broadcast_to(radius, (episode.steps + 1, len(radius)))
+    radii = link_radii(episode)
+    radius = np.broadcast_to(radii, (episode.steps + 1, len(radii)))
     films = [plane.render(episode.catheter, radius) for plane in machine.planes()]
     return np.concatenate([_windowed(film) for film in films], axis=-1)
 

@@ -10,8 +10,10 @@ import numpy as np
 
 from cathsim_dmc.imaging import Angiograph, FluoroscopyOptions
 from cathsim_dmc.recording.coaxial import CoaxialRecord
+from cathsim_dmc.recording.drawing import link_radii
 from cathsim_dmc.recording.episode import Episode
 from cathsim_dmc.recording.geometry import force_scale
+from cathsim_dmc.recording.recorder import EpisodeRecorder, navigation_of
 
 # Prepared views of anatomies that are kept: each holds some megabytes.
 _VIEWS = 8
@@ -63,22 +65,16 @@ class Snapshot:
             TypeError: if it is no environment of this package.
         """
         task = navigation_of(env)
-        scene, readings = task.scene, task.readings
-        contacts = task.contacts(env.physics)
-        info = task.info()
-        links = len(readings.centreline) - 1
-        radius = np.full(links, scene.device.outer_radius)
-        return cls(
-            surface=scene.anatomy.surface,
-            device=readings.centreline,
-            goal=task.goal_position,
-            goal_radius=float(task.objective.goal_radius),
+        contacts, scene = task.contacts(env.physics), task.scene
+        episode = EpisodeRecorder(env, task.name).present()
+        distance = 1e3 * episode.meta["distance"][0]
+        return dataclasses.replace(
+            cls.of_episode(episode, scene.anatomy.surface),
             position=contacts.position[contacts.present],
             force=contacts.force[contacts.present],
             force_scale=force_scale(contacts.magnitude[contacts.present]),
             path=np.zeros((0, 3)),
-            title=f"{task.name}: {1e3 * info['distance']:.0f} mm to {scene.goal.name}",
-            **_lying(CoaxialRecord.now(task), readings.centreline[None], 0, radius),
+            title=f"{task.name}: {distance:.0f} mm to {scene.goal.name}",
         )
 
     @classmethod
@@ -104,9 +100,6 @@ class Snapshot:
             raise ValueError("the episode was recorded without a goal")
         # Contacts of state t + 1 belong to step t.
         there = episode.contact_step == step - 1
-        links = episode.catheter.shape[1] - 1
-        radius = np.asarray(episode.meta.get("catheter_radius", 0.835e-3))
-        radius = np.broadcast_to(radius, (links,))
         return cls(
             surface=surface,
             device=episode.catheter[step],
@@ -118,45 +111,27 @@ class Snapshot:
             force_scale=force_scale(np.linalg.norm(episode.contact_force, axis=-1)),
             path=episode.head[: step + 1],
             title=f"{episode.task}, {episode.time[step] - episode.time[0]:.1f} s",
-            **_lying(CoaxialRecord.of(episode), episode.catheter, step, radius),
+            **_coaxial(episode, step, link_radii(episode)),
         )
 
 
-def _lying(
-    coaxial: CoaxialRecord | None, line: np.ndarray, state: int, radius: np.ndarray
-) -> dict[str, np.ndarray]:
-    """Radii of the links (L,), and which of coaxial devices are where on the chain.
+def _coaxial(episode: Episode, state: int, radius: np.ndarray) -> dict[str, np.ndarray]:
+    """Radii (L,) of the links in a state, and where coaxial devices lie and end.
 
     Args:
-        coaxial: The devices; None for one alone.
-        line: (T+1, L+1, 3), the chain in all states.
+        episode: The record.
         state: Number of the state.
         radius: (L,), of a device alone.
     """
+    coaxial = CoaxialRecord.of(episode)
     if coaxial is None:
         return {"radius": radius}
-    outermost = coaxial.outermost(line)[state]
+    outermost = coaxial.outermost(episode.catheter)[state]
     return {
         "outermost": outermost,
         "radius": coaxial.radii[outermost],
-        "ends": coaxial.ends(line)[state],
+        "ends": coaxial.ends(episode.catheter)[state],
     }
-
-
-def navigation_of(env: Any) -> Any:
-    """The task of an environment of this package.
-
-    Raises:
-        TypeError: if it is none; says what is wanted.
-    """
-    task = getattr(env, "task", None)
-    if not hasattr(task, "scene") or not hasattr(env, "physics"):
-        raise TypeError(
-            f"{type(env).__name__} is no environment of cathsim; give what "
-            "cathsim_dmc.suite.load returns (a Gymnasium or TorchRL environment: the "
-            "composer environment inside it)"
-        )
-    return task
 
 
 @functools.lru_cache(maxsize=_VIEWS)

@@ -26,7 +26,7 @@ _LAYERS = 16  # walls behind each other; further ones are hidden by these
 
 
 @dataclass(frozen=True)
-class Projection:
+class ParallelProjection:
     """A parallel projection of the world onto a picture.
 
     Attributes:
@@ -49,7 +49,7 @@ class Projection:
         azimuth: float = 0.0,
         margin: float = 6e-3,
         height: int = 900,
-    ) -> Projection:
+    ) -> ParallelProjection:
         """A view upright in the patient frame (LPS) that shows all vertices.
 
         Args:
@@ -111,7 +111,7 @@ class Glass:
 def glass(
     vertices: np.ndarray,
     faces: np.ndarray,
-    projection: Projection,
+    projection: ParallelProjection,
     colour: tuple[float, float, float] = WALL_COLOUR,
 ) -> Glass:
     """Draw a closed surface as translucent glass.

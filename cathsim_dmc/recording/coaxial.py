@@ -65,17 +65,6 @@ class CoaxialRecord:
                 )
         return cls(names, radii, *series)
 
-    @classmethod
-    def now(cls, task: Any) -> CoaxialRecord | None:
-        """The present state of a task's devices, T = 0; None for a single device."""
-        state = getattr(task, "devices", None)
-        if state is None:
-            return None
-        chain = task.scene.catheter
-        radii = np.array([device.outer_radius for device in chain.devices])
-        series = [getattr(state, name)[None] for name in SERIES]
-        return cls(tuple(chain.device_names), radii, *series)
-
     @property
     def gaps(self) -> np.ndarray:
         """Way (T+1, K) from the end of each device to that of the chain, metres."""

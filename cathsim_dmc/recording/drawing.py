@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
 
@@ -46,12 +46,9 @@ class Drawing:
         surface: Any,
         *,
         robot_geoms: Iterable[BodyGeom] = (),
-        goal_position: Sequence[float] | None = None,
-        goal_radius: float | None = None,
-        catheter_radius: float | Sequence[float] | None = None,
         fluoroscopy: np.ndarray | None = None,
     ) -> Drawing:
-        """Check the arguments of ``write_rrd``; what is None comes from ``meta``.
+        """Check the arguments of ``write_rrd``; radii and goal come from ``meta``.
 
         Raises:
             ValueError: on anything that does not fit the episode.
@@ -61,8 +58,8 @@ class Drawing:
             vertices,
             faces,
             _checked_geoms(episode, robot_geoms),
-            _checked_radii(episode, catheter_radius),
-            _checked_goal(episode, goal_position, goal_radius),
+            link_radii(episode),
+            _goal(episode),
             _checked_frames(episode, fluoroscopy),
         )
 
@@ -116,39 +113,32 @@ def _checked_geoms(episode: Episode, geoms: Iterable[BodyGeom]) -> tuple[BodyGeo
     return geoms
 
 
-def _checked_radii(
-    episode: Episode, given: float | Sequence[float] | None
-) -> np.ndarray:
-    if given is None:
-        given = episode.meta.get("catheter_radius", CATHETER_RADIUS)
+def link_radii(episode: Episode) -> np.ndarray:
+    """Radii (L,) of the links in metres, from ``meta['catheter_radius']`` if there.
+
+    Raises:
+        ValueError: if it is neither one positive radius nor one for each link.
+    """
+    given = episode.meta.get("catheter_radius", CATHETER_RADIUS)
     links = episode.catheter.shape[1] - 1
     radii = np.asarray(given, dtype=np.float64)
     if radii.shape not in ((), (links,)) or not (radii > 0).all():
         raise ValueError(
-            f"catheter_radius must be one positive radius or {links} of them, in "
-            f"metres; got {given}"
+            f"meta['catheter_radius'] must be one positive radius or {links} of them, "
+            f"in metres; got {given}"
         )
     return np.broadcast_to(radii, (links,))
 
 
-def _checked_goal(
-    episode: Episode, position: Sequence[float] | None, radius: float | None
-) -> tuple[np.ndarray, float] | None:
-    if position is None:
-        position = episode.meta.get("goal_position")
-    if radius is None:
-        radius = episode.meta.get("goal_radius")
+def _goal(episode: Episode) -> tuple[np.ndarray, float] | None:
+    position, radius = (episode.meta.get(f"goal_{k}") for k in ("position", "radius"))
     if position is None and radius is None:
         return None
-    if position is None or radius is None:
-        raise ValueError(
-            f"a goal needs both position and radius, got {position} and {radius}"
-        )
     place = np.asarray(position, dtype=np.float64)
-    if place.shape != (3,) or not radius > 0:
+    if place.shape != (3,) or radius is None or not radius > 0:
         raise ValueError(
-            "a goal is a position (3,) and a positive radius in metres, got shape "
-            f"{place.shape} and {radius}"
+            "a goal is a position (3,) and a positive radius in metres, got "
+            f"{position} and {radius}"
         )
     return place, float(radius)
 

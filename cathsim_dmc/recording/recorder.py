@@ -7,7 +7,6 @@ import itertools
 import logging
 import platform
 from collections.abc import Callable
-from dataclasses import dataclass
 from importlib import metadata
 from typing import Any
 
@@ -20,55 +19,23 @@ from cathsim_dmc.simulation.episodes import ComposerSimulation, play
 
 Policy = Callable[[Any], np.ndarray]
 
-HEAD_SITE = "catheter/head"
-INSERTION_JOINT = "catheter/insertion"
-LINK_PREFIX = "catheter/link_"
-
 _VERSIONED = ("cathsim-dmc", "mujoco", "dm-control", "numpy")
 
 
-@dataclass(frozen=True)
-class StepReadout:
-    """What the task says about the control step that has just ended.
+def navigation_of(env: Any) -> Any:
+    """The task of an environment of this package.
 
-    Forces in newtons, world frame, on the wall by the device. Contacts, sum and
-    largest force are those of the last physics step; the peaks are over all physics
-    steps of the control step.
+    Raises:
+        TypeError: if it is none; says what is wanted.
     """
-
-    contact_position: np.ndarray
-    contact_force: np.ndarray
-    wall_force_sum: float
-    wall_force_max: float
-    wall_force_peak_sum: float
-    wall_force_peak_max: float
-    push_force: float
-    reward_terms: dict[str, float]
-
-
-def read_step(task: Any, physics: Any) -> StepReadout:
-    """Ask a task for its forces; the one place that knows the task's attributes."""
-    contacts, wall = task.contacts(physics), task.wall_force
-    return StepReadout(
-        contact_position=np.array(contacts.position[contacts.present]),
-        contact_force=np.array(contacts.force[contacts.present]),
-        wall_force_sum=float(wall.sum),
-        wall_force_max=float(wall.max),
-        wall_force_peak_sum=float(wall.peak_sum),
-        wall_force_peak_max=float(wall.peak_max),
-        push_force=float(task.readings.push_force),
-        reward_terms=_reward_terms(task),
-    )
-
-
-def _reward_terms(task: Any) -> dict[str, float]:
-    """Weighted terms of the last reward by name."""
-    prefix = "reward_"
-    return {
-        name.removeprefix(prefix): value
-        for name, value in task.info().items()
-        if name.startswith(prefix)
-    }
+    task = getattr(env, "task", None)
+    if not hasattr(task, "scene") or not hasattr(env, "physics"):
+        raise TypeError(
+            f"{type(env).__name__} is no environment of cathsim; give what "
+            "cathsim_dmc.suite.load returns (a Gymnasium or TorchRL environment: the "
+            "composer environment inside it)"
+        )
+    return task
 
 
 def read_termination(task: Any, timestep: Any) -> str | None:
@@ -82,16 +49,7 @@ def read_termination(task: Any, timestep: Any) -> str | None:
     return "truncated" if timestep.discount else "physics_error"
 
 
-def read_goal(task: Any) -> tuple[np.ndarray, float] | None:
-    """Return goal position (3,) and radius in metres, or None without a goal."""
-    position = getattr(task, "goal_position", None)
-    if position is None:
-        return None
-    radius = float(task.objective.goal_radius)
-    return np.array(position, dtype=np.float64).reshape(3), radius
-
-
-class _Rows:
+class _EpisodeRows:
     """Growing lists, one per array of an episode."""
 
     def __init__(self) -> None:
@@ -115,14 +73,13 @@ class EpisodeRecorder:
     and ``time`` belong to its end.
 
     Args:
-        env: A ``composer.Environment`` whose model holds the catheter and whose task
-            answers ``read_step`` and has a ``termination``.
+        env: What ``cathsim_dmc.suite.load`` returns.
         task_name: Registered name to write into episodes; the class name of the task
             otherwise.
         task_kwargs: Keyword arguments the environment was made with, for ``meta``.
 
     Raises:
-        ValueError: if the model lacks the catheter's links, head or insertion joint.
+        TypeError: if it is no environment of this package.
     """
 
     def __init__(
@@ -131,25 +88,10 @@ class EpisodeRecorder:
         task_name: str | None = None,
         task_kwargs: dict[str, Any] | None = None,
     ) -> None:
+        navigation_of(env)
         self._env = env
         self._task_name = task_name or type(env.task).__name__
         self._task_kwargs = dict(task_kwargs or {})
-        self._bind()
-
-    def _bind(self) -> None:
-        # A reset may compile a new model, so names are looked up once per episode.
-        model = self._env.physics.model
-        bodies = _names(model, "body", model.nbody)
-        count = 0
-        while f"{LINK_PREFIX}{count}" in bodies:
-            count += 1
-        # Asking for link 0 makes the error of a model without a catheter.
-        self._links = [
-            _find(bodies, f"{LINK_PREFIX}{i}", "body") for i in range(max(count, 1))
-        ]
-        self._head = _find(_names(model, "site", model.nsite), HEAD_SITE, "site")
-        joint = _find(_names(model, "joint", model.njnt), INSERTION_JOINT, "joint")
-        self._insertion = int(model.jnt_qposadr[joint])
 
     def record_episode(
         self, policy: Policy, seed: int | None = None, max_steps: int | None = None
@@ -178,8 +120,7 @@ class EpisodeRecorder:
             ComposerSimulation(self._env), functools.partial(self._action, policy)
         )
         next(turns)
-        self._bind()
-        rows = _Rows()
+        rows = _EpisodeRows()
         rows.add(**self._state())
         steps, error, termination, discount = 0, None, None, 1.0
         try:
@@ -189,23 +130,9 @@ class EpisodeRecorder:
                 if termination == "physics_error":
                     error = "the environment ended the episode"
                     break
-                state = self._state()
-                readout = read_step(self._env.task, self._env.physics)
-                count = len(readout.contact_force)
-                rows.add(**state)
-                rows.add(
-                    action=action,
-                    reward=float(timestep.reward),
-                    wall_force_sum=readout.wall_force_sum,
-                    wall_force_max=readout.wall_force_max,
-                    wall_force_peak_sum=readout.wall_force_peak_sum,
-                    wall_force_peak_max=readout.wall_force_peak_max,
-                    push_force=readout.push_force,
-                    reward_terms=readout.reward_terms,
-                    contact_step=np.full(count, steps),
-                    contact_position=readout.contact_position,
-                    contact_force=readout.contact_force,
-                )
+                rows.add(**self._state())
+                rows.add(action=action, reward=float(timestep.reward))
+                rows.add(**self._forces(steps))
                 steps += 1
         except control.PhysicsError as caught:
             error, termination = str(caught), "physics_error"
@@ -220,24 +147,43 @@ class EpisodeRecorder:
 
     def present(self) -> Episode:
         """The present state as an episode of no steps."""
-        self._bind()
-        rows = _Rows()
+        rows = _EpisodeRows()
         rows.add(**self._state())
         return self._episode(rows, None, self._meta(rows, "truncated", 1.0))
 
     def _state(self) -> dict[str, Any]:
-        data = self._env.physics.data
-        head = data.site_xpos[self._head]
-        devices = getattr(self._env.task, "devices", None)
+        data, task = self._env.physics.data, self._env.task
+        devices = task.devices
         coaxial = {} if devices is None else {n: getattr(devices, n) for n in SERIES}
         return {
             **coaxial,
             "time": float(data.time),
             "qpos": np.array(data.qpos),
-            "catheter": np.vstack([data.xpos[self._links], head]),
+            "catheter": np.array(task.readings.centreline),
             "body_pos": np.array(data.xpos),
             "body_quat": np.array(data.xquat),
-            "base_insertion": float(data.qpos[self._insertion]),
+            "base_insertion": float(task.readings.insertion),
+        }
+
+    def _forces(self, step: int) -> dict[str, Any]:
+        """Forces and reward terms of the control step that has just ended."""
+        task, wall = self._env.task, self._env.task.wall_force
+        contacts = task.contacts(self._env.physics)
+        prefix = "reward_"
+        return {
+            "contact_step": np.full(contacts.present.sum(), step),
+            "contact_position": np.array(contacts.position[contacts.present]),
+            "contact_force": np.array(contacts.force[contacts.present]),
+            "wall_force_sum": float(wall.sum),
+            "wall_force_max": float(wall.max),
+            "wall_force_peak_sum": float(wall.peak_sum),
+            "wall_force_peak_max": float(wall.peak_max),
+            "push_force": float(task.readings.push_force),
+            "reward_terms": {
+                name.removeprefix(prefix): value
+                for name, value in task.info().items()
+                if name.startswith(prefix)
+            },
         }
 
     def _action(self, policy: Policy, timestep: Any) -> np.ndarray:
@@ -252,8 +198,10 @@ class EpisodeRecorder:
             raise ValueError(f"the policy returned an action with {action}")
         return action
 
-    def _meta(self, rows: _Rows, termination: str, discount: float) -> dict[str, Any]:
-        model = self._env.physics.model
+    def _meta(
+        self, rows: _EpisodeRows, termination: str, discount: float
+    ) -> dict[str, Any]:
+        model, task = self._env.physics.model, self._env.task
         if termination not in TERMINATIONS:
             raise ValueError(
                 f"the task ended with termination {termination!r}; it must be one of "
@@ -268,24 +216,23 @@ class EpisodeRecorder:
             "control_timestep": float(self._env.control_timestep()),
             "action_names": self._env.action_spec().name.split("\t"),
             "body_names": [model.id2name(i, "body") for i in range(model.nbody)],
-            "catheter_radius": _link_radii(model, self._links),
+            "catheter_radius": [float(task.scene.device.outer_radius)]
+            * len(task.scene.catheter.links),
             "wall_force_peak_sum": rows.get("wall_force_peak_sum").tolist(),
             "wall_force_peak_max": rows.get("wall_force_peak_max").tolist(),
             "reward_terms": _columns(rows.columns.get("reward_terms", [])),
         }
         if SERIES[0] in rows.columns:
             series = {name: rows.get(name) for name in SERIES}
-            meta["devices"] = device_meta(self._env.task, series)
-        goal = read_goal(self._env.task)
-        if goal is not None:
-            position, radius = goal
-            head = rows.get("catheter")[:, -1]
-            meta["goal_position"] = position.tolist()
-            meta["goal_radius"] = radius
-            meta["distance"] = np.linalg.norm(head - position, axis=-1).tolist()
+            meta["devices"] = device_meta(task, series)
+        position = np.array(task.goal_position)
+        head = rows.get("catheter")[:, -1]
+        meta["goal_position"] = position.tolist()
+        meta["goal_radius"] = float(task.objective.goal_radius)
+        meta["distance"] = np.linalg.norm(head - position, axis=-1).tolist()
         return meta
 
-    def _episode(self, rows: _Rows, seed: int | None, meta: dict) -> Episode:
+    def _episode(self, rows: _EpisodeRows, seed: int | None, meta: dict) -> Episode:
         state = ("time", "qpos", "catheter", "body_pos", "body_quat")
         step = ("reward", "wall_force_sum", "wall_force_max", "push_force")
         ragged = {"contact_position": (3,), "contact_force": (3,)}
@@ -311,23 +258,6 @@ class EpisodeRecorder:
 def _columns(rows: list[dict[str, float]]) -> dict[str, list[float]]:
     """Rows of named numbers as a list for each name."""
     return {name: [row[name] for row in rows] for name in (rows[0] if rows else ())}
-
-
-def _names(model: Any, kind: str, count: int) -> dict[str, int]:
-    return {model.id2name(i, kind): i for i in range(count)}
-
-
-def _find(names: dict[str, int], name: str, kind: str) -> int:
-    if name not in names:
-        raise ValueError(
-            f"the model has no {kind} {name!r}; it has {', '.join(sorted(names))}"
-        )
-    return names[name]
-
-
-def _link_radii(model: Any, links: list[int]) -> list[float]:
-    """Radius in metres of the first geom of every link."""
-    return [float(model.geom_size[model.body_geomadr[i], 0]) for i in links]
 
 
 def _versions() -> dict[str, str]:

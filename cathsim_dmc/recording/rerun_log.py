@@ -9,7 +9,7 @@ calls per step.
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
@@ -40,23 +40,16 @@ def write_rrd(
     path: str | os.PathLike[str],
     *,
     robot_geoms: Iterable[BodyGeom] = (),
-    goal_position: Sequence[float] | None = None,
-    goal_radius: float | None = None,
-    catheter_radius: float | Sequence[float] | None = None,
     fluoroscopy: np.ndarray | None = None,
     lossless: bool = False,
 ) -> Path:
     """Write one episode as a Rerun recording, whole or not at all.
 
     Args:
-        episode: What to draw.
+        episode: What to draw; radii of the device and the goal are in ``meta``.
         surface: The vessel, ``(vertices, faces)`` or an object with these, metres.
         path: Target, ``*.rrd``; an existing file is replaced.
         robot_geoms: Primitives that the body poses of the episode move.
-        goal_position: (3,) world; from ``meta['goal_position']`` if not given.
-        goal_radius: Metres; from ``meta['goal_radius']`` if not given.
-        catheter_radius: One radius or (L,) radii in metres; from
-            ``meta['catheter_radius']`` if not given, else ``CATHETER_RADIUS``.
         fluoroscopy: (T+1, H, W, P) uint8 frames, one per state, of one plane or two.
         lossless: Store the frames as PNG instead of JPEG.
 
@@ -71,9 +64,6 @@ def write_rrd(
         episode,
         surface,
         robot_geoms=robot_geoms,
-        goal_position=goal_position,
-        goal_radius=goal_radius,
-        catheter_radius=catheter_radius,
         fluoroscopy=fluoroscopy,
     )
 

@@ -86,7 +86,7 @@ def _shape(parts: list[BodyGeom]) -> Any:
     size = np.stack([g.size for g in parts])
     centre = np.stack([g.position for g in parts])
     turn = np.stack([g.quaternion for g in parts])
-    rgba = np.stack([g.rgba for g in parts])
+    rgba = np.array([g.rgba for g in parts], dtype=np.float64)
     rgba[:, 3] *= SEE_THROUGH.get(parts[0].body_name.split("/", 1)[0], 1.0)
     common = {
         "quaternions": xyzw(turn),

@@ -42,23 +42,11 @@ class BodyGeom:
     rgba: np.ndarray
 
     def __post_init__(self) -> None:
-        if self.kind not in SIZES:
-            raise ValueError(f"kind must be one of {', '.join(SIZES)}; got {self.kind}")
-        shapes = {
-            "size": (SIZES[self.kind],),
-            "position": (3,),
-            "quaternion": (4,),
-            "rgba": (4,),
-        }
-        for name, shape in shapes.items():
-            array = np.array(getattr(self, name), dtype=np.float64)
-            if array.shape != shape:
-                raise ValueError(
-                    f"{name} of a {self.kind} must have shape {shape}, "
-                    f"got {array.shape}"
-                )
-            array.setflags(write=False)
-            object.__setattr__(self, name, array)
+        if self.kind not in SIZES or len(self.size) != SIZES[self.kind]:
+            raise ValueError(
+                f"a {self.kind} with {len(self.size)} sizes; kinds and their numbers "
+                f"of sizes are {SIZES}"
+            )
 
 
 def body_geoms(

@@ -10,7 +10,7 @@ import numpy as np
 
 from cathsim_dmc import suite
 from cathsim_dmc.anatomy import Anatomy, Centreline, Vessel, VesselTree
-from cathsim_dmc.anatomy.builder import Place
+from cathsim_dmc.anatomy.builder import VesselPlace
 from cathsim_dmc.entities.chain import MAX_PUSH_SPEED, MAX_ROTATION_SPEED
 from cathsim_dmc.entities.devices import get
 from cathsim_dmc.tasks.config import CONTROL_TIMESTEP
@@ -106,7 +106,7 @@ def tube(bent: bool) -> Anatomy:
     return Anatomy.from_tree(
         tree,
         "half circle" if bent else "straight tube",
-        goals={"end": Place("tube", arc_length=length - 2e-3)},
+        goals={"end": VesselPlace("tube", arc_length=length - 2e-3)},
     )
 
 

@@ -31,7 +31,7 @@ from cathsim_dmc.agents import report
 from cathsim_dmc.imaging import FluoroscopyOptions
 from cathsim_dmc.imaging.angiograph import Angiograph
 from cathsim_dmc.pictures.figure import VIEWS
-from cathsim_dmc.pictures.translucent import Projection, glass
+from cathsim_dmc.pictures.translucent import ParallelProjection, glass
 from cathsim_dmc.simulation.mjcf import write_mjcf
 
 ROOT = Path(__file__).parents[2]
@@ -104,7 +104,7 @@ def write_scene(name: str, out: Path) -> None:
     surface = suite.make_task(name).scene.anatomy.surface
     views = {"glass": [], "fluoroscopy": _fluoroscopy(surface, out)}
     for view, (azimuth, _) in VIEWS.items():
-        projection = Projection.of(
+        projection = ParallelProjection.of(
             surface.vertices, azimuth=azimuth, height=GLASS_HEIGHT
         )
         drawn = glass(surface.vertices, surface.faces, projection)

@@ -32,7 +32,7 @@ from cathsim_dmc.anatomy.arch.sampler import (
     sample,
 )
 from cathsim_dmc.anatomy.arch.tree import arch_tree
-from cathsim_dmc.anatomy.builder import Place, access_inlet
+from cathsim_dmc.anatomy.builder import VesselPlace, access_inlet
 from cathsim_dmc.anatomy.centreline import VesselTree
 
 __all__ = [
@@ -49,19 +49,19 @@ __all__ = [
 ]
 
 
-def _goals(params: ArchParameters, tree: VesselTree) -> dict[str, Place]:
+def _goals(params: ArchParameters, tree: VesselTree) -> dict[str, VesselPlace]:
     goals = {
-        name: Place(name, past_ostium=getattr(params, name).goal_depth)
+        name: VesselPlace(name, past_ostium=getattr(params, name).goal_depth)
         for name in ("bca", "lcca", "lsa")
     }
     if params.aberrant is not None:
         goals = {
             "rcca": replace(goals.pop("bca"), vessel="rcca"),
             **goals,
-            "rsa": Place("rsa", past_ostium=params.aberrant.goal_depth),
+            "rsa": VesselPlace("rsa", past_ostium=params.aberrant.goal_depth),
         }
     arc = tree.root.centreline.length - params.descending_goal_depth
-    goals["descending"] = Place("aorta", arc_length=arc)
+    goals["descending"] = VesselPlace("aorta", arc_length=arc)
     return goals
 
 

@@ -16,7 +16,7 @@ INSIDE = 0.7  # share of a centreline's points that must lie in the lumen
 
 
 @dataclass(frozen=True)
-class Curve:
+class ScanCentreline:
     """A centreline as given: points (n, 3) m in LPS, radii (n,) m or None."""
 
     name: str
@@ -29,7 +29,9 @@ _FARTHEST = 10.0  # m
 LONGEST = 50e6  # bytes of a file with a centreline
 
 
-def read_curve(path: str | Path, units: str = "mm", frame: str = "LPS") -> Curve:
+def read_curve(
+    path: str | Path, units: str = "mm", frame: str = "LPS"
+) -> ScanCentreline:
     """Read a centreline from a 3D Slicer markup (.json) or a table (.csv, .txt).
 
     A table holds x, y, z and optionally the radius per line, in ``units`` and
@@ -75,7 +77,9 @@ def read_curve(path: str | Path, units: str = "mm", frame: str = "LPS") -> Curve
             f"scan is {_FARTHEST:g} m wide; is the unit right?"
         )
     name = vessel_name(path)
-    return Curve(name, path, points[keep], None if radii is None else radii[keep])
+    return ScanCentreline(
+        name, path, points[keep], None if radii is None else radii[keep]
+    )
 
 
 def vessel_name(path: str | Path) -> str:
@@ -91,7 +95,9 @@ def vessel_name(path: str | Path) -> str:
     return stem
 
 
-def check_inside(curve: Curve, depth: np.ndarray, mirrored: np.ndarray) -> np.ndarray:
+def check_inside(
+    curve: ScanCentreline, depth: np.ndarray, mirrored: np.ndarray
+) -> np.ndarray:
     """Indices of the points of ``curve`` to keep: from the first to the last inside.
 
     Args:

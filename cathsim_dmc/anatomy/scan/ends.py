@@ -133,7 +133,7 @@ def _local_maxima(ways: Ways, reach: np.ndarray) -> np.ndarray:
 
 
 @dataclass(frozen=True)
-class Entry:
+class LumenEntry:
     """Where the device enters and where the root vessel leads.
 
     Attributes:
@@ -152,7 +152,7 @@ def plan_inlet(
     ends: Sequence[FreeEnd],
     curves: Sequence[np.ndarray],
     inlet: np.ndarray | None,
-) -> Entry:
+) -> LumenEntry:
     """Choose where the device enters and where the root vessel leads.
 
     Args:
@@ -178,7 +178,7 @@ def plan_inlet(
         # Beyond the last place where the vessel has its width, there is nothing to
         # cut off but the end itself.
         if gap[chosen] > 2.5 * ends[chosen].radius:
-            return Entry(
+            return LumenEntry(
                 inlet, False, _far_end(ways, ends, at_goal, ways.node(inlet), curves)
             )
     elif curves:
@@ -196,7 +196,7 @@ def plan_inlet(
         if others and _behind(to[chosen]) < -BEHIND:
             chosen = root
     far = _far_end(ways, ends, at_goal, nodes[chosen], curves, chosen)
-    return Entry(position[chosen], True, far)
+    return LumenEntry(position[chosen], True, far)
 
 
 def _arched(way: np.ndarray) -> bool:

@@ -9,7 +9,7 @@ import numpy as np
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
-from cathsim_dmc.anatomy.scan.ends import Cover, Entry, FreeEnd, length_of
+from cathsim_dmc.anatomy.scan.ends import Cover, FreeEnd, LumenEntry, length_of
 from cathsim_dmc.anatomy.scan.ways import Ways
 
 DEVICE_RADIUS = 0.84e-3  # m, 5 Fr catheter (1 Fr = 1/3 mm diameter)
@@ -38,7 +38,7 @@ class Found:
 
 
 def centrelines(
-    ways: Ways, ends: Sequence[FreeEnd], entry: Entry
+    ways: Ways, ends: Sequence[FreeEnd], entry: LumenEntry
 ) -> tuple[list[Found], int]:
     """Deepest ways from the inlet to every branch that a 5 Fr catheter can enter.
 
@@ -100,7 +100,7 @@ def continued(
     ways: Ways,
     ends: Sequence[FreeEnd],
     curves: dict[str, np.ndarray],
-    entry: Entry,
+    entry: LumenEntry,
 ) -> tuple[dict[str, np.ndarray], dict[str, float]]:
     """Given centrelines, each drawn on to the end of its vessel.
 

@@ -17,8 +17,14 @@ from cathsim_dmc.anatomy.parts import Inlet, Surface
 from cathsim_dmc.anatomy.scan import coacd_wall
 from cathsim_dmc.anatomy.scan.check import check_tree
 from cathsim_dmc.anatomy.scan.compiled_field import compiled, plain
-from cathsim_dmc.anatomy.scan.curves import Curve, check_inside, read_curve
-from cathsim_dmc.anatomy.scan.ends import Entry, FreeEnd, free_ends, listed, plan_inlet
+from cathsim_dmc.anatomy.scan.curves import ScanCentreline, check_inside, read_curve
+from cathsim_dmc.anatomy.scan.ends import (
+    FreeEnd,
+    LumenEntry,
+    free_ends,
+    listed,
+    plan_inlet,
+)
 from cathsim_dmc.anatomy.scan.extract import centrelines, continued
 from cathsim_dmc.anatomy.scan.inlet import cut_open, shut_behind
 from cathsim_dmc.anatomy.scan.lumen import Lumen, read_lumen
@@ -202,7 +208,7 @@ def _tree(field, ways, lines, place, root, rename, note) -> tuple[VesselTree, In
 def _computed(
     ways: Ways,
     ends: Sequence[FreeEnd],
-    entry: Entry,
+    entry: LumenEntry,
     root: str,
     rename: Mapping[str, str],
     note: Callable[[str], None],
@@ -334,7 +340,7 @@ def _check_paths(paths: Sequence[str | Path]) -> None:
         )
 
 
-def _read_curves(paths, lumen: Lumen, frame, axes, root) -> list[Curve]:
+def _read_curves(paths, lumen: Lumen, frame, axes, root) -> list[ScanCentreline]:
     curves = [read_curve(path, lumen.units, frame) for path in paths]
     turn = upright(axes)
     curves = [replace(curve, points=curve.points @ turn.T) for curve in curves]
@@ -348,7 +354,7 @@ def _read_curves(paths, lumen: Lumen, frame, axes, root) -> list[Curve]:
     return curves
 
 
-def _inside_part(curve: Curve, measure: MeshDepth, units: str) -> np.ndarray:
+def _inside_part(curve: ScanCentreline, measure: MeshDepth, units: str) -> np.ndarray:
     depth = measure(curve.points)
     mirrored = measure(curve.points * (-1.0, -1.0, 1.0))
     keep = check_inside(curve, depth, mirrored)
