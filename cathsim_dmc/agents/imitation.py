@@ -2,7 +2,6 @@
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import torch
 from tensordict import TensorDictBase
@@ -17,7 +16,6 @@ from cathsim_dmc.agents.networks import (
     LOG_STD_RANGE,
     GaussianActor,
     NetworkShapes,
-    make_actor,
     make_policy,
 )
 from cathsim_dmc.agents.normalisation import ImageNormaliser, ObservationNormaliser
@@ -40,7 +38,7 @@ class CloningLearner(Learner):
         self._actor = network_of(self.network)
         assert isinstance(self._actor.log_std, nn.Parameter)
         self._log_std = self._actor.log_std
-        self._optimiser = torch.optim.Adam(
+        self.optimiser = torch.optim.Adam(
             [*self._actor.body.parameters(), *self._actor.mean.parameters()],
             lr=config.learning_rate,
             fused=True,
@@ -52,7 +50,7 @@ class CloningLearner(Learner):
         shapes: NetworkShapes, config: TrainingConfig
     ) -> TensorDictSequential:
         network = GaussianActor(shapes, config, state_dependent_std=False)
-        return make_policy(shapes, config, make_actor(shapes, network))
+        return make_policy(shapes, config, network)
 
     @override
     def observe(self, batch: TensorDictBase) -> None:
@@ -77,13 +75,13 @@ class CloningLearner(Learner):
         """
         total = torch.zeros((), device=self.device)
         for rate in rates.tolist():
-            for group in self._optimiser.param_groups:
+            for group in self.optimiser.param_groups:
                 group["lr"] = rate
             mean, target = self._means(sample(batch_size))
             loss = (mean.tanh() - target).square().mean()
-            self._optimiser.zero_grad()
+            self.optimiser.zero_grad()
             loss.backward()
-            self._optimiser.step()
+            self.optimiser.step()
             total += loss.detach()
         self.gradient_steps += len(rates)
         return {
@@ -107,17 +105,6 @@ class CloningLearner(Learner):
         log_std = squares.clamp_min(1e-12).log() / 2
         self._log_std.data.copy_(log_std.clamp(*LOG_STD_RANGE))
         return float((mean.tanh() - target).square().mean().sqrt())
-
-    @override
-    def learning_state(self) -> dict[str, Any]:
-        state = {"optimiser": self._optimiser.state_dict()}
-        return {"clone": state, "steps": self.gradient_steps}
-
-    @override
-    def load(self, policy: dict[str, Any], learning: dict[str, Any]) -> None:
-        self.network.load_state_dict(policy)
-        self._optimiser.load_state_dict(learning["clone"]["optimiser"])
-        self.gradient_steps = learning["steps"]
 
 
 def network_of(policy: nn.Module) -> GaussianActor:

@@ -26,12 +26,14 @@ class Learner(abc.ABC):
         network: The policy that is learnt: raw observation in, sampled action out.
         policy: The policy to collect with; `network`, or one around it.
         normalisers: Observation statistics of policy and critic.
+        optimiser: Adam with the parameters of all networks, made by the subclass.
         gradient_steps: Number of gradient steps so far.
     """
 
     metrics: ClassVar[tuple[str, ...]]
     remote: ClassVar[bool] = True
     random_frames: int = 0
+    optimiser: torch.optim.Optimizer
 
     def __init__(
         self,
@@ -85,10 +87,18 @@ class Learner(abc.ABC):
         """Weights and statistics that acting needs."""
         return self.network.state_dict()
 
-    @abc.abstractmethod
     def learning_state(self) -> dict[str, Any]:
         """What learning needs beyond the policy: tensors, numbers, strings."""
+        return {
+            "optimiser": self.optimiser.state_dict(),
+            "gradient_steps": self.gradient_steps,
+            "normalisers": self.normalisers.critics.state_dict(),
+        }
 
-    @abc.abstractmethod
     def load(self, policy: dict[str, Any], learning: dict[str, Any]) -> None:
         """Restore what policy_state and learning_state gave."""
+        self.network.load_state_dict(policy)
+        self.optimiser.load_state_dict(learning["optimiser"])
+        self.gradient_steps = learning["gradient_steps"]
+        # Older checkpoints have no critic that reads something else.
+        self.normalisers.critics.load_state_dict(learning.get("normalisers", {}))

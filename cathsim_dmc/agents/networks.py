@@ -244,17 +244,6 @@ def orthogonal_(module: nn.Module, head: nn.Linear, gain: float) -> None:
                 nn.init.zeros_(layer.bias)
 
 
-def make_actor(shapes: NetworkShapes, network: GaussianActor) -> ProbabilisticActor:
-    """The stochastic actor on a network; actions in [-1, 1]."""
-    return ProbabilisticActor(
-        TensorDictModule(network, in_keys=shapes.keys, out_keys=["loc", "scale"]),
-        in_keys=["loc", "scale"],
-        out_keys=["action"],
-        distribution_class=TanhNormal,
-        return_log_prob=True,
-    )
-
-
 def make_critic(shapes: NetworkShapes, config: TrainingConfig) -> ValueOperator:
     """State value, key "state_value"."""
     network = Value(shapes, config)
@@ -323,7 +312,14 @@ class Normalisers:
 
 
 def make_policy(
-    shapes: NetworkShapes, config: TrainingConfig, actor: ProbabilisticActor
+    shapes: NetworkShapes, config: TrainingConfig, network: GaussianActor
 ) -> TensorDictSequential:
-    """Normalisers and actor in one: raw observation in, action out."""
+    """Normalisers and stochastic actor: raw observation in, action in [-1, 1] out."""
+    actor = ProbabilisticActor(
+        TensorDictModule(network, in_keys=shapes.keys, out_keys=["loc", "scale"]),
+        in_keys=["loc", "scale"],
+        out_keys=["action"],
+        distribution_class=TanhNormal,
+        return_log_prob=True,
+    )
     return TensorDictSequential(*make_normalisers(shapes, config), actor)

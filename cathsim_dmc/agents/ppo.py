@@ -28,7 +28,6 @@ from cathsim_dmc.agents.learner import Learner
 from cathsim_dmc.agents.networks import (
     GaussianActor,
     NetworkShapes,
-    make_actor,
     make_critic,
     make_policy,
     orthogonal_,
@@ -215,7 +214,7 @@ class PPO(Learner):
         nn.init.constant_(log_std, math.log(config.initial_deviation))
         # A small head starts the policy near the middle of every action's range.
         orthogonal_(network, network.mean, 0.01)
-        return make_policy(shapes, config, make_actor(shapes, network))
+        return make_policy(shapes, config, network)
 
     @override
     def attach(self, env: EnvBase) -> None:
@@ -298,18 +297,9 @@ class PPO(Learner):
 
     @override
     def learning_state(self) -> dict[str, Any]:
-        return {
-            "critic": self.critic.state_dict(),
-            "optimiser": self.optimiser.state_dict(),
-            "gradient_steps": self.gradient_steps,
-            "normalisers": self.normalisers.critics.state_dict(),
-        }
+        return {**super().learning_state(), "critic": self.critic.state_dict()}
 
     @override
     def load(self, policy: dict[str, Any], learning: dict[str, Any]) -> None:
-        self.network.load_state_dict(policy)
+        super().load(policy, learning)
         self.critic.load_state_dict(learning["critic"])
-        # Older checkpoints have no critic that reads something else.
-        self.normalisers.critics.load_state_dict(learning.get("normalisers", {}))
-        self.optimiser.load_state_dict(learning["optimiser"])
-        self.gradient_steps = learning["gradient_steps"]

@@ -24,7 +24,6 @@ from cathsim_dmc.agents.learner import Learner
 from cathsim_dmc.agents.networks import (
     GaussianActor,
     NetworkShapes,
-    make_actor,
     make_policy,
     make_q_function,
 )
@@ -184,7 +183,7 @@ class SAC(Learner):
     @override
     def make_policy(shapes: NetworkShapes, config: SACConfig) -> TensorDictSequential:
         network = GaussianActor(shapes, config, state_dependent_std=True)
-        return make_policy(shapes, config, make_actor(shapes, network))
+        return make_policy(shapes, config, network)
 
     @override
     def update(self, batch: TensorDictBase, progress: float) -> dict[str, float]:
@@ -237,25 +236,16 @@ class SAC(Learner):
             if isinstance(value, torch.Tensor)
         }
         return {
+            **super().learning_state(),
             "loss": loss,
-            "optimiser": self.optimiser.state_dict(),
             "replay": self.replay.state(),
-            "gradient_steps": self.gradient_steps,
             "owed_steps": self.owed_steps,
-            "normalisers": self.normalisers.critics.state_dict(),
         }
 
     @override
     def load(self, policy: dict[str, Any], learning: dict[str, Any]) -> None:
-        self.network.load_state_dict(policy)
-        # Older checkpoints have no critic that reads something else.
-        self.normalisers.critics.load_state_dict(learning.get("normalisers", {}))
-        state = self.loss.state_dict()
-        for name, value in learning["loss"].items():
-            state[name] = value
-        self.loss.load_state_dict(state)
-        self.optimiser.load_state_dict(learning["optimiser"])
+        super().load(policy, learning)
+        self.loss.load_state_dict({**self.loss.state_dict(), **learning["loss"]})
         if "replay" in learning:
             self.replay.load(learning["replay"])
-        self.gradient_steps = learning["gradient_steps"]
         self.owed_steps = learning["owed_steps"]
