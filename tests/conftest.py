@@ -136,3 +136,14 @@ def reseed():
         return environment.reset()
 
     return reset
+
+
+@pytest.fixture(scope="session")
+def trained(tmp_path_factory):
+    """Folder of finished runs, ppo and sac, of the synthetic task; to be copied."""
+    from test_agents_training import run, small_ppo, small_sac
+
+    runs = tmp_path_factory.mktemp("trained")
+    run(small_ppo(total_frames=512), runs / "ppo")
+    run(small_sac(total_frames=768), runs / "sac")
+    return runs

@@ -157,3 +157,23 @@ def make_env(
     kinds = {"image": "image" in names, "numbers": "internal" in names}
     env = ReachEnv(num_envs, seed, **kinds, **(task_kwargs or {}))
     return standard_observations(env)
+
+
+def calling(action, at=3):
+    """`make_env` whose environment calls a function at a control step."""
+
+    def make(task, **kwargs):
+        env = make_env(task, **kwargs)
+        steps, count = env.base_env._step, 0
+
+        def step(tensordict):
+            nonlocal count
+            count += 1
+            if count == at:
+                action()
+            return steps(tensordict)
+
+        env.base_env._step = step
+        return env
+
+    return make

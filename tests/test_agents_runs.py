@@ -21,35 +21,6 @@ from cathsim_dmc.agents.replay import ReplayError
 from cathsim_dmc.agents.warm_start import take_over
 
 
-@pytest.fixture(scope="module")
-def trained(tmp_path_factory):
-    """Finished runs of both algorithms, to be copied."""
-    runs = tmp_path_factory.mktemp("trained")
-    run(small_ppo(total_frames=512), runs / "ppo")
-    run(small_sac(total_frames=768), runs / "sac")
-    return runs
-
-
-def calling(action, at=3):
-    """`make_env` whose environment calls a function at a control step."""
-
-    def make_env(task, **kwargs):
-        env = synthetic_env.make_env(task, **kwargs)
-        steps, count = env.base_env._step, 0
-
-        def step(tensordict):
-            nonlocal count
-            count += 1
-            if count == at:
-                action()
-            return steps(tensordict)
-
-        env.base_env._step = step
-        return env
-
-    return make_env
-
-
 def test_a_second_training_in_a_folder_is_refused(tmp_path):
     def second():
         refused = pytest.raises(ConfigError, match="another process trains in")
@@ -63,7 +34,7 @@ def test_a_second_training_in_a_folder_is_refused(tmp_path):
         raise AssertionError("work was begun")
 
     called = []
-    result = run(small_ppo(), tmp_path, make_env=calling(second))
+    result = run(small_ppo(), tmp_path, make_env=synthetic_env.calling(second))
     assert called and result.frames == 1_024
     frames = [row["frames"] for row in read_metrics(tmp_path / "metrics.csv")]
     assert frames == sorted(set(frames))
@@ -83,7 +54,7 @@ def test_a_folder_is_free_again_after_a_kill(tmp_path):
 
 
 def test_a_replay_that_is_deleted_during_the_training_is_written_again(tmp_path):
-    remove = calling(lambda: shutil.rmtree(tmp_path / "replay"), at=40)
+    remove = synthetic_env.calling(lambda: shutil.rmtree(tmp_path / "replay"), at=40)
     result = run(small_sac(), tmp_path, make_env=remove)
     assert (tmp_path / "replay").is_dir()
     more = run(small_sac(total_frames=1_280), tmp_path, resume=True)

@@ -284,21 +284,9 @@ def file_header(path):
 
 
 def test_an_interrupt_saves_and_can_be_resumed(tmp_path):
-    def interrupting(task, **kwargs):
-        env = synthetic_env.make_env(task, **kwargs)
-        steps = env.base_env._step
-        count = 0
-
-        def step(tensordict):
-            nonlocal count
-            count += 1
-            if count == 70:
-                os.kill(os.getpid(), signal.SIGINT)
-            return steps(tensordict)
-
-        env.base_env._step = step
-        return env
-
+    interrupting = synthetic_env.calling(
+        lambda: os.kill(os.getpid(), signal.SIGINT), at=70
+    )
     config = small_ppo(total_frames=10_240, checkpoint_frames=10_240)
     result = run(config, tmp_path, make_env=interrupting)
     assert result.interrupted

@@ -126,15 +126,6 @@ def test_replay_files_of_another_kind_are_refused_and_not_executed(tmp_path, mar
     replay(folder).load(state)
 
 
-@pytest.fixture(scope="module")
-def trained(tmp_path_factory):
-    """Finished runs of both algorithms, to be copied."""
-    runs = tmp_path_factory.mktemp("trained")
-    run(small_ppo(total_frames=512), runs / "ppo")
-    run(small_sac(total_frames=768), runs / "sac")
-    return runs
-
-
 def checkpoint_of(folder):
     return Checkpoint.open(folder).path
 
