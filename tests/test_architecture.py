@@ -62,6 +62,7 @@ CONFINED = {
     "safetensors": {"agents/pretrained.py"},
     "ray": {"agents/ray_source.py"},
     "rerun": {"recording/"},
+    "igl": {"anatomy/field.py"},
     "llvmlite": {"physics/native.py"},
     "coacd": {"anatomy/"},
     "fast_simplification": {"anatomy/scan/repair.py"},
@@ -79,6 +80,7 @@ LATE = (
     "torch",
     "torchrl",
     "numba",
+    "igl",
     "ray",
 )
 

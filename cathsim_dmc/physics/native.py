@@ -193,6 +193,40 @@ def wholes(address, count):
     return carray(pointer(address), count, np.int32)
 
 
+@register_jitable
+def shorts(address, count):
+    """The array (count,) of int16 at an address; it owns nothing."""
+    return carray(pointer(address), count, np.int16)
+
+
+@_intrinsic
+def call_collision(_, address, model, data, contacts, geom1, geom2, margin):
+    """Calls a function of MuJoCo's collision table; returns the number of contacts."""
+
+    def generate(context, builder, signature, values):
+        kinds = [value.type for value in values[1:]]
+        kind = ir.FunctionType(ir.IntType(32), kinds)
+        place = builder.inttoptr(values[0], kind.as_pointer())
+        return builder.call(place, values[1:])
+
+    places = [types.int64] * 4
+    return types.int32(*places, types.int32, types.int32, types.float64), generate
+
+
+@_intrinsic
+def call_error(_, address, text, number):
+    """Calls `mju_error` with the text at an address, and an int32 for its %d."""
+
+    def generate(context, builder, signature, values):
+        kind = ir.FunctionType(ir.VoidType(), [cgutils.voidptr_t], var_arg=True)
+        place = builder.inttoptr(values[0], kind.as_pointer())
+        line = builder.inttoptr(values[1], cgutils.voidptr_t)
+        builder.call(place, [line, values[2]])
+        return context.get_dummy_value()
+
+    return types.void(types.int64, types.int64, types.int32), generate
+
+
 def callback(signature: str) -> Callable:
     """Compiles a function that C calls, once on each machine as `compiled` does.
 

@@ -1,0 +1,317 @@
+"""The lumen as a field: signed depth on sparse bricks, looked up by all that ask."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from cathsim_dmc.anatomy.centreline import Array, VesselTree
+from cathsim_dmc.anatomy.parts import End, Surface
+from cathsim_dmc.anatomy.segments import as_points
+
+EDGE = 4e-3  # m, of a brick
+# Depths, m, between which a device touches the wall: from as deep as an impact takes
+# its axis into the wall to somewhat more than the radius of the thickest.
+SHELL = (-1e-3, 1.3e-3)
+# By how much, m, linear interpolation may miss the depth there: at 95 % of the points
+# of a brick, and at any of a brick that keeps the coarse lattice.
+TOLERANCE = 8e-6
+_COARSE = 3e-5
+LARGEST = 5_000_000  # bytes; where tolerance asks for more, it grows
+MOST_CELLS = 12  # along the edge of a brick
+MARGIN = 4e-3  # m, by which the box of the field exceeds the lumen
+QUANTUM = 1e-6  # m, of the depths kept in 16 bits, which reach to 32.767 mm
+_LARGEST = 32767
+_STEP = 0.25e-3  # m, to both sides, over which a gradient is taken
+_CHUNK = 2048  # bricks measured at once
+_TOGETHER = 4  # corners along each axis that are measured at once
+_BEFORE = 0.9  # cosine up to which a triangle's normal tells inside from outside
+_CAP = 1e-6  # m, within which a triangle lies in the plane of an open end
+
+# Depths (n, m) m at blocks (n, 3) + points (m, 3) m.
+Measure = Callable[[Array, Array], Array]
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Field:
+    """Signed depth in a lumen: distance to its wall, m, > 0 inside.
+
+    Space is divided into bricks of `EDGE`. A brick next to the wall holds a lattice as
+    fine as the curvature of the depth asks for; between its points the depth is
+    linear. All other bricks have the depths at their eight corners.
+
+    Attributes:
+        head: float64; origin (3) m, edge m, bricks along x, y and z (3), m a unit,
+            number of open ends, and of each: position (3) m, direction out of the
+            lumen (3), radius m.
+        coarse: ((a + 1)(b + 1)(c + 1),) int16, depths at the corners of the bricks.
+        index: (a b c,) int32, first place of a brick in `samples`, -1 for none.
+        samples: int16; of each brick the cells n along its edge and (n + 1)^3 depths.
+    """
+
+    head: Array
+    coarse: np.ndarray
+    index: np.ndarray
+    samples: np.ndarray
+
+    def __call__(self, points: ArrayLike, free: bool = False) -> Array:
+        """Depths (...) m at points (..., 3) m.
+
+        Args:
+            points: m.
+            free: what lies behind an open end, in the straight continuation of the
+                lumen, is `field_loops.FREE` deep; otherwise it is outside, by its
+                distance from the plane of the end.
+        """
+        from cathsim_dmc.anatomy.field_loops import depths
+
+        points = as_points(points)
+        flat = np.ascontiguousarray(points.reshape(-1, 3))
+        out = np.empty(len(flat))
+        depths(*self.arrays, flat, free, out)
+        return out.reshape(points.shape[:-1])
+
+    def gradient(self, points: ArrayLike) -> Array:
+        """Gradients (..., 3) of the depth at points (..., 3) m; open ends do not count.
+
+        They point away from the wall and change without jumps from cell to cell.
+        """
+        from cathsim_dmc.anatomy.field_loops import gradients
+
+        points = as_points(points)
+        flat = np.ascontiguousarray(points.reshape(-1, 3))
+        out = np.empty(flat.shape)
+        gradients(*self.arrays, flat, _STEP, out)
+        return out.reshape(points.shape)
+
+    @property
+    def arrays(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """Head, coarse lattice, index and samples."""
+        return self.head, self.coarse, self.index, self.samples
+
+    @property
+    def nbytes(self) -> int:
+        """Memory of the arrays, bytes."""
+        return sum(array.nbytes for array in self.arrays)
+
+    @property
+    def box(self) -> tuple[Array, Array]:
+        """Corners (3,), (3,) m, of the box of all bricks."""
+        return self.head[:3], self.head[:3] + self.head[3] * self.head[4:7]
+
+    @cached_property
+    def digest(self) -> bytes:
+        """SHA-256 of the arrays."""
+        joined = hashlib.sha256()
+        for array in self.arrays:
+            joined.update(array.tobytes())
+        return joined.digest()
+
+    def __repr__(self) -> str:
+        """Bricks and memory."""
+        bricks = int((self.index >= 0).sum())
+        return f"<Field: {bricks:,} bricks, {self.nbytes / 1e6:.1f} MB>"
+
+    @classmethod
+    def from_tree(cls, tree: VesselTree, ends: Sequence[End] = ()) -> Field:
+        """Field of the union of a tree's tubes.
+
+        Args:
+            tree: vessels.
+            ends: flat ends; those that are open let a device pass.
+        """
+        from cathsim_dmc.anatomy.tree_depth import TreeDepth
+
+        measure = TreeDepth(tree, ends)
+        return cls.sampled(measure.around, *measure.box, ends)
+
+    @classmethod
+    def from_surface(cls, surface: Surface, ends: Sequence[End] = ()) -> Field:
+        """Field of what a closed surface encloses.
+
+        Args:
+            surface: closed, normals outwards; flat over the ends.
+            ends: flat ends; those that are open let a device pass.
+        """
+        measure = SurfaceDepth(surface, ends)
+        low, high = surface.vertices.min(axis=0), surface.vertices.max(axis=0)
+        return cls.sampled(measure.around, low, high, ends)
+
+    @classmethod
+    def sampled(
+        cls, measure: Measure, low: Array, high: Array, ends: Sequence[End] = ()
+    ) -> Field:
+        """Field of a measured depth.
+
+        Args:
+            measure: exact depths; open ends do not limit them.
+            low: (3,) m, least corner of a box around the lumen.
+            high: (3,) m, largest corner.
+            ends: flat ends of the lumen.
+        """
+        origin = np.asarray(low) - MARGIN
+        shape = np.ceil((np.asarray(high) + MARGIN - origin) / EDGE).astype(int)
+        coarse = _corners(measure, origin, shape + 1)
+        rows = np.argwhere(_near_wall(coarse))
+        middles = origin + EDGE * (rows + 0.5)
+        exact = _measured(measure, middles, 4)
+        eight = np.stack([coarse[tuple((rows + c).T)] for c in np.ndindex(2, 2, 2)], 1)
+        cells = _cells(exact, eight.reshape(-1, 2, 2, 2), LARGEST - 6 * coarse.size)
+        index = np.full(tuple(shape), -1, dtype=np.int32)
+        parts, end = [], 0
+        for n in np.unique(cells[cells > 1]):
+            chosen = cells == n
+            if n in (2, 4):
+                depth = exact[chosen, :: 4 // n, :: 4 // n, :: 4 // n]
+            else:
+                depth = _measured(measure, middles[chosen], n)
+            size = 1 + (n + 1) ** 3
+            index[tuple(rows[chosen].T)] = end + size * np.arange(len(depth))
+            bricks = np.full((len(depth), size), n, dtype=np.int16)
+            bricks[:, 1:] = _whole(depth).reshape(len(depth), -1)
+            parts.append(bricks.ravel())
+            end += bricks.size
+        free = [(*e.position, *e.direction, e.radius) for e in ends if e.open]
+        head = np.concatenate([origin, [EDGE], shape, [QUANTUM, len(free)], *free])
+        samples = np.concatenate([*parts, np.zeros(1, np.int16)])
+        return cls(head, _whole(coarse).ravel(), index.ravel(), samples)
+
+
+class SurfaceDepth:
+    """Distance to a closed surface, inside and outside of it, by libigl."""
+
+    def __init__(self, surface: Surface, ends: Sequence[End] = ()):
+        """Prepares for a surface; open ends of it are no wall."""
+        import igl
+
+        faces = np.ascontiguousarray(surface.faces, dtype=np.int64)
+        vertices = np.ascontiguousarray(surface.vertices)
+        self._free = [end for end in ends if end.open]
+        cap = np.zeros(len(faces), dtype=bool)
+        for end in self._free:
+            level = np.abs((vertices - end.position) @ end.direction)
+            cap |= (level[faces] < _CAP).all(axis=1)
+        self._vertices, self._wall = vertices, faces[~cap]
+        self._boxes = igl.AABB()
+        self._boxes.init(vertices, self._wall)
+        self._winding = igl.FastWindingNumberBVH()
+        self._winding.init(vertices, faces, 2)
+        corners = vertices[self._wall]
+        normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        sizes = np.linalg.norm(normals, axis=1, keepdims=True)
+        self._normals = normals / np.maximum(sizes, 1e-300)
+
+    def __call__(self, points: Array) -> Array:
+        """Signed distances (n,) m at points (n, 3) m, > 0 inside."""
+        squared, face, place = self._boxes.squared_distance(
+            self._vertices, self._wall, points
+        )
+        distance = np.sqrt(squared)
+        # Before the middle of a triangle its normal says on which side a point lies;
+        # before an edge, and at an open end, the winding number does.
+        level = np.vecdot(place - points, self._normals[face])
+        depth = np.copysign(distance, level)
+        doubtful = np.abs(level) < _BEFORE * distance
+        # Beyond an open end the lumen goes on as a straight tube.
+        moved = points.copy()
+        for end in self._free:
+            offset = points - end.position
+            level = offset @ end.direction
+            across = np.linalg.norm(offset - level[:, None] * end.direction, axis=1)
+            beyond = (level > -_CAP) & (across < 2.0 * end.radius)
+            beyond &= level < 4.0 * MARGIN
+            moved[beyond] -= (level[beyond] + 2.0 * _CAP)[:, None] * end.direction
+            doubtful |= beyond
+        winding = self._winding.winding_number(moved[doubtful], 2.0)
+        depth[doubtful] = np.where(winding > 0.5, 1.0, -1.0) * distance[doubtful]
+        return depth
+
+    def around(self, blocks: Array, points: Array) -> Array:
+        """Signed distances (n, m) m at blocks (n, 3) + points (m, 3) m, > 0 inside."""
+        everywhere = np.asarray(blocks)[:, None] + points
+        depth = self(np.ascontiguousarray(everywhere.reshape(-1, 3)))
+        return depth.reshape(len(blocks), len(points))
+
+
+def _corners(measure: Measure, origin: Array, shape: np.ndarray) -> Array:
+    """Depths at the corners of all bricks, m, a lattice of a shape."""
+    blocks = -(-shape // _TOGETHER)
+    rows = np.stack(np.meshgrid(*(np.arange(n) for n in blocks), indexing="ij"), -1)
+    steps = EDGE * (np.arange(_TOGETHER) - (_TOGETHER - 1) / 2)
+    local = np.stack(np.meshgrid(steps, steps, steps, indexing="ij"), -1)
+    middles: Array = origin + EDGE * (_TOGETHER * rows + (_TOGETHER - 1) / 2)
+    depth = measure(middles.reshape(-1, 3), local.reshape(-1, 3))
+    depth = depth.reshape(*blocks, _TOGETHER, _TOGETHER, _TOGETHER)
+    depth = depth.transpose(0, 3, 1, 4, 2, 5).reshape(_TOGETHER * blocks)
+    return depth[: shape[0], : shape[1], : shape[2]]
+
+
+def _near_wall(coarse: Array) -> np.ndarray:
+    """Which bricks (a, b, c) may come into the shell, from the depths at corners."""
+    reach = EDGE * np.sqrt(3.0) / 2.0
+    cells = np.lib.stride_tricks.sliding_window_view(coarse, (2, 2, 2))
+    low, high = cells.min(axis=(3, 4, 5)), cells.max(axis=(3, 4, 5))
+    # The depth changes by at most the distance moved.
+    return (high + reach > SHELL[0]) & (low - reach < SHELL[1])
+
+
+def _measured(measure: Measure, middles: Array, cells: int) -> Array:
+    """Depths (n, c + 1, c + 1, c + 1) m in bricks with middles (n, 3) m."""
+    steps = EDGE * (np.arange(cells + 1) / cells - 0.5)
+    local = np.stack(np.meshgrid(steps, steps, steps, indexing="ij"), -1)
+    parts = [
+        measure(middles[first : first + _CHUNK], local.reshape(-1, 3))
+        for first in range(0, len(middles), _CHUNK)
+    ]
+    return np.concatenate(parts or [np.empty((0, local.size // 3))]).reshape(
+        -1, *local.shape[:-1]
+    )
+
+
+def _cells(exact: Array, eight: Array, room: int) -> np.ndarray:
+    """Cells (n,) along the edges of bricks; 1 for those that need no lattice.
+
+    Args:
+        exact: (n, 5, 5, 5) m.
+        eight: (n, 2, 2, 2) m, the same at the corners.
+        room: memory of all bricks, bytes.
+    """
+    shell = exact.clip(*SHELL)
+    plain = np.abs(_refined(eight, 4).clip(*SHELL) - shell).reshape(len(exact), -1)
+    halves = np.abs(_refined(exact[:, ::2, ::2, ::2], 2).clip(*SHELL) - shell)
+    # Of the points in the shell, of which a brick may have few.
+    within = (exact == shell).reshape(len(exact), -1)
+    halves = np.sort(np.where(within, halves.reshape(within.shape), -1.0), axis=1)
+    rank = within.shape[1] - 1 - (0.05 * within.sum(axis=1)).astype(int)
+    error = halves[np.arange(len(exact)), rank].clip(0.0)
+    plain = plain.max(axis=1, initial=0.0)
+    tolerance = TOLERANCE
+    while True:
+        # The error grows with the square of the cells' size.
+        cells = np.ceil(2.0 * np.sqrt(error / tolerance)).astype(int)
+        cells = np.clip(cells, 2, MOST_CELLS)
+        cells[plain <= max(_COARSE, tolerance)] = 1
+        if 2 * ((cells[cells > 1] + 1) ** 3 + 1).sum() < room or cells.max() <= 2:
+            return cells
+        tolerance *= 1.1
+
+
+def _refined(values: Array, times: int) -> Array:
+    """Lattices (n, ...) interpolated to `times` as many cells along each axis."""
+    for axis in (1, 2, 3):
+        count = values.shape[axis] - 1
+        at = np.arange(times * count + 1) / times
+        low = np.minimum(at.astype(int), count - 1)
+        share = np.expand_dims(at - low, [k for k in range(4) if k != axis])
+        first, second = values.take(low, axis), values.take(low + 1, axis)
+        values = first + share * (second - first)
+    return values
+
+
+def _whole(depth: Array) -> np.ndarray:
+    return np.clip(np.rint(depth / QUANTUM), -_LARGEST, _LARGEST).astype(np.int16)

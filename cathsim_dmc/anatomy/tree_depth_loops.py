@@ -1,0 +1,227 @@
+"""Distances to the wall of a vessel tree, compiled; see `anatomy.tree_depth`."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from cathsim_dmc.compiled import compiled
+
+# A place on a wall that lies no further than this inside another vessel is wall, m.
+_TOUCHING = 5e-6
+
+
+@compiled
+def ring(nodes, k, u, x, y, z):
+    """A ring between nodes k and k + 1: axial and radial place of a point, radius.
+
+    Nodes are rows of centre (3), unit tangent (3) and radius.
+    """
+    v = 1.0 - u
+    a, b = nodes[k], nodes[k + 1]
+    dx = x - (v * a[0] + u * b[0])
+    dy = y - (v * a[1] + u * b[1])
+    dz = z - (v * a[2] + u * b[2])
+    tx, ty, tz = v * a[3] + u * b[3], v * a[4] + u * b[4], v * a[5] + u * b[5]
+    axial = (dx * tx + dy * ty + dz * tz) / math.sqrt(tx * tx + ty * ty + tz * tz)
+    across = max(dx * dx + dy * dy + dz * dz - axial * axial, 0.0)
+    return axial, math.sqrt(across), v * a[6] + u * b[6]
+
+
+@compiled
+def squared(nodes, k, u, x, y, z):
+    """Squared distance of a point from a ring."""
+    axial, radial, radius = ring(nodes, k, u, x, y, z)
+    return axial * axial + (radial - radius) ** 2
+
+
+@compiled
+def at_node(nodes, k, x, y, z):
+    """Squared distance of a point from the ring of a node."""
+    dx, dy, dz = x - nodes[k, 0], y - nodes[k, 1], z - nodes[k, 2]
+    axial = dx * nodes[k, 3] + dy * nodes[k, 4] + dz * nodes[k, 5]
+    whole = dx * dx + dy * dy + dz * dz
+    radius = nodes[k, 6]
+    # axial² + (radial - radius)²
+    across = math.sqrt(max(whole - axial * axial, 0.0))
+    return whole + radius * (radius - 2.0 * across)
+
+
+@compiled
+def nearest(nodes, first, last, chosen, count, x, y, z):
+    """The ring of one vessel that is nearest to a point: (segment, share, square)."""
+    best, at = np.inf, first
+    for n in range(count):
+        k = chosen[n]
+        value = at_node(nodes, k, x, y, z)
+        if value < best:
+            best, at = value, k
+    # In a segment the square is a parabola, but for how much the tangent turns.
+    place, value = min(at, last - 1), best
+    share = 1.0 if at == last else 0.0
+    for k in range(max(at - 1, first), min(at + 1, last)):
+        f0, f1 = at_node(nodes, k, x, y, z), at_node(nodes, k + 1, x, y, z)
+        middle = squared(nodes, k, 0.5, x, y, z)
+        bend, slope = 2.0 * f0 - 4.0 * middle + 2.0 * f1, 4.0 * middle - 3.0 * f0 - f1
+        if bend <= 0.0 or slope >= 0.0 or -slope >= 2.0 * bend:
+            continue
+        u = -0.5 * slope / bend
+        lower = squared(nodes, k, u, x, y, z)
+        if lower < value:
+            place, share, value = k, u, lower
+    return place, share, value
+
+
+@compiled
+def signed(nodes, first, last, flats, chosen, count, x, y, z, out):
+    """Signed depth (m) in one vessel, and the nearest place of its wall in `out`.
+
+    `flats` says of the first and of the last end: 0 open, 1 closed by a flat wall.
+    """
+    k, u, value = nearest(nodes, first, last, chosen, count, x, y, z)
+    axial, radial, radius = ring(nodes, k, u, x, y, z)
+    inside = radial < radius
+    # The place on the ring, in the point's half plane.
+    a, b, v = nodes[k], nodes[k + 1], 1.0 - u
+    tx, ty, tz = v * a[3] + u * b[3], v * a[4] + u * b[4], v * a[5] + u * b[5]
+    shift = axial / math.sqrt(tx * tx + ty * ty + tz * tz)
+    cx, cy, cz = v * a[0] + u * b[0], v * a[1] + u * b[1], v * a[2] + u * b[2]
+    ex, ey, ez = x - cx - shift * tx, y - cy - shift * ty, z - cz - shift * tz
+    length = math.sqrt(ex * ex + ey * ey + ez * ez)
+    if length < 1e-12:
+        ex, ey, ez = ty - tz, tz - tx, tx - ty
+        length = math.sqrt(ex * ex + ey * ey + ez * ez)
+    scale = radius / length
+    out[0], out[1], out[2] = cx + scale * ex, cy + scale * ey, cz + scale * ez
+    distance = math.sqrt(max(value, 0.0))
+    place = k + u
+    for end in range(2):
+        k, u, way = (first, 0.0, -1.0) if end == 0 else (last - 1, 1.0, 1.0)
+        axial, radial, radius = ring(nodes, k, u, x, y, z)
+        level = way * axial
+        if radial > radius:
+            continue
+        if level > 0.0:
+            if abs(place - k - u) > 0.01:
+                continue  # beside another part of a vessel that turns back
+            # Beyond an open end the lumen goes on as a straight tube.
+            inside = flats[end] == 0
+        if flats[end] == 1 and abs(level) < distance:
+            distance = abs(level)
+            node = nodes[first] if end == 0 else nodes[last]
+            out[0] = x - axial * node[3]
+            out[1] = y - axial * node[4]
+            out[2] = z - axial * node[5]
+    return distance if inside else -distance
+
+
+@compiled
+def tree_depths(nodes, spans, flats, creases, blocks, points, reach, slack, out):
+    """Signed distance to the wall at every point of every block.
+
+    Args:
+        nodes: (m, 7) centres, unit tangents and radii of all vessels.
+        spans: (v, 2) first and last node of each vessel.
+        flats: (v, 2) 0 open, 1 closed, 2 within another vessel, of both ends.
+        creases: (c, 3) points where walls of two vessels meet.
+        blocks: (n, 3) middles of the blocks, m.
+        points: (q, 3) relative to the middle of a block, m, within `reach`.
+        reach: m.
+        slack: m; farther vessels do not matter.
+        out: (n, q) m, > 0 inside.
+    """
+    vessels = len(spans)
+    chosen = np.empty((vessels, len(nodes)), np.int64)
+    counts = np.empty(vessels, np.int64)
+    level = np.empty(vessels)
+    near = np.empty(len(creases), np.int64)
+    wall, there = np.empty(3), np.empty(3)
+    for n in range(len(blocks)):
+        x, y, z = blocks[n]
+        for v in range(vessels):
+            first, last = spans[v]
+            best, deepest = np.inf, -np.inf
+            for k in range(first, last + 1):
+                best = min(best, at_node(nodes, k, x, y, z))
+                far = (nodes[k, 0] - x) ** 2 + (nodes[k, 1] - y) ** 2
+                far += (nodes[k, 2] - z) ** 2
+                deepest = max(deepest, nodes[k, 6] - math.sqrt(far))
+            limit = (math.sqrt(best) + 2.0 * reach + slack) ** 2
+            count = 0
+            for k in range(first, last + 1):
+                if at_node(nodes, k, x, y, z) <= limit:
+                    chosen[v, count] = k
+                    count += 1
+            counts[v], level[v] = count, deepest
+        bar = level.max() - 2.0 * reach - slack
+        found, closest = 0, np.inf
+        for c in range(len(creases)):
+            d = (creases[c, 0] - x) ** 2 + (creases[c, 1] - y) ** 2
+            closest = min(closest, d + (creases[c, 2] - z) ** 2)
+        limit = (math.sqrt(closest) + 2.0 * reach + 1e-6) ** 2
+        for c in range(len(creases)):
+            d = (creases[c, 0] - x) ** 2 + (creases[c, 1] - y) ** 2
+            if d + (creases[c, 2] - z) ** 2 <= limit:
+                near[found] = c
+                found += 1
+        for q in range(len(points)):
+            px, py, pz = x + points[q, 0], y + points[q, 1], z + points[q, 2]
+            inside, distance = False, np.inf
+            for v in range(vessels):
+                if level[v] < bar:
+                    continue
+                first, last = spans[v]
+                depth = signed(
+                    nodes, first, last, flats[v], chosen[v], counts[v], px, py, pz, wall
+                )
+                inside = inside or depth > 0.0
+                if abs(depth) >= distance:
+                    continue
+                valid = True
+                for w in range(vessels):
+                    if w == v or level[w] < bar - slack:
+                        continue
+                    first, last = spans[w]
+                    other = signed(
+                        nodes, first, last, flats[w], chosen[w], counts[w],
+                        wall[0], wall[1], wall[2], there,
+                    )  # fmt: skip
+                    if other > _TOUCHING:
+                        valid = False
+                        break
+                if valid:
+                    distance = abs(depth)
+            if found:
+                best = np.inf
+                for c in range(found):
+                    d = (creases[near[c], 0] - px) ** 2 + (
+                        creases[near[c], 1] - py
+                    ) ** 2
+                    best = min(best, d + (creases[near[c], 2] - pz) ** 2)
+                distance = min(distance, math.sqrt(best))
+            out[n, q] = distance if inside else -distance
+
+
+@compiled
+def onto_creases(nodes, spans, flats, one, two, seeds, rounds, out):
+    """Moves seeds (n, 3) to where the walls of two vessels meet; (n, 2) depths left."""
+    place = np.empty(3)
+    first1, last1 = spans[one]
+    first2, last2 = spans[two]
+    all1, all2 = np.arange(first1, last1 + 1), np.arange(first2, last2 + 1)
+    for n in range(len(seeds)):
+        for _ in range(rounds):
+            x, y, z = seeds[n]
+            signed(nodes, first1, last1, flats[one], all1, len(all1), x, y, z, place)
+            x, y, z = place
+            signed(nodes, first2, last2, flats[two], all2, len(all2), x, y, z, place)
+            seeds[n] = place
+        x, y, z = seeds[n]
+        for row in range(2):
+            v = one if row == 0 else two
+            first, last = spans[v]
+            nodes_of = all1 if row == 0 else all2
+            out[n, row] = signed(
+                nodes, first, last, flats[v], nodes_of, len(nodes_of), x, y, z, place
+            )

@@ -1,0 +1,323 @@
+"""The collider, compiled: capsules and spheres against a field; see `contact`."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from cathsim_dmc.anatomy.field_loops import FREE, behind, depth_at, gradient_at
+from cathsim_dmc.compiled import compiled
+from cathsim_dmc.physics.native import (
+    address_of,
+    call_collision,
+    call_error,
+    callback,
+    numbers,
+    shorts,
+    symbol,
+    wholes,
+    word,
+)
+
+# Words in the head of the table: offsets in mjModel and mjData, the functions that
+# stood in MuJoCo's collision table, and how an error is raised.
+(
+    NUSER_GEOM,
+    GEOM_USER,
+    GEOM_SIZE,
+    GEOM_BODYID,
+    BODY_PARENTID,
+    GEOM_XPOS,
+    GEOM_XMAT,
+    XPOS,
+    OF_CAPSULE,
+    OF_SPHERE,
+    ERROR,
+    MESSAGE,
+) = range(0, 96, 8)
+HEAD = 16  # words
+# An entry: key, kind, addresses of head, coarse lattice, index and samples.
+ENTRY, CAPACITY = 8, 1 << 14
+LUMEN, BORE = 0, 1
+# Numbers of a carrier geom: the mark, then the key of its field in three parts, which
+# any printing of a model file keeps.
+USER, MARK, PART = 4, 730155.0, 1 << 20
+SYMBOL = "cathsim_fields"
+# Before anything that knows it by the symbol is loaded.
+TABLE = np.zeros(HEAD + ENTRY * CAPACITY, np.int64)
+symbol(SYMBOL, TABLE)
+
+_EVERY = 1e-3  # m, apart are the places of a capsule that are looked at first
+_PLACES = 65  # at most
+_SEARCHES = 8  # of a golden section
+_GOLDEN = 0.6180339887498949
+# A dent of the clearance must be so deep, m, to be a contact of its own: a capsule
+# that lies flat on a wall has many that are none.
+_DENT = 5e-6
+_FLAT = 2e-6
+_STEP = 0.25e-3  # m, to both sides, over which the wall's normal is taken
+_FAR = 1e-3  # m, by which the coarse lattice may be wrong far from the wall
+_COUNT = 1 << 40  # more than any array has; nothing checks it
+_JOINED = 1e-6  # m
+
+
+@compiled
+def entry_of(table, key):
+    """Address of the entry with a key, 0 for none."""
+    slot = key % CAPACITY
+    for _ in range(CAPACITY):
+        at = table + 8 * (HEAD + ENTRY * slot)
+        found = word(at)
+        if found == key:
+            return at
+        if found == 0:
+            return 0
+        slot = (slot + 1) % CAPACITY
+    return 0
+
+
+@compiled
+def bore_at(head, x, y, z, out):
+    """Clearance in a bore around a line, m, and where its axis is nearest, in `out`."""
+    count = int(head[0])
+    best, value = np.inf, FREE
+    for k in range(count - 1):
+        a, b = 1 + 4 * k, 5 + 4 * k
+        dx, dy, dz = (
+            head[b] - head[a],
+            head[b + 1] - head[a + 1],
+            head[b + 2] - head[a + 2],
+        )
+        px, py, pz = x - head[a], y - head[a + 1], z - head[a + 2]
+        u = (px * dx + py * dy + pz * dz) / (dx * dx + dy * dy + dz * dz)
+        beyond = (k == 0 and u < 0.0) or (k == count - 2 and u > 1.0)
+        u = min(max(u, 0.0), 1.0)
+        qx, qy, qz = px - u * dx, py - u * dy, pz - u * dz
+        square = qx * qx + qy * qy + qz * qz
+        if square < best:
+            best = square
+            value = FREE
+            if not beyond:
+                value = (1.0 - u) * head[a + 3] + u * head[b + 3] - math.sqrt(square)
+            out[0], out[1], out[2] = -qx, -qy, -qz
+    return value
+
+
+@compiled
+def clearance(entry, x, y, z, out):
+    """Distance (m) from the wall of an entry's field, `FREE` past its open ends."""
+    head = numbers(word(entry + 16), _COUNT)
+    if word(entry + 8) == BORE:
+        return bore_at(head, x, y, z, out)
+    if behind(head, x, y, z) > 0.0:
+        return FREE
+    return depth_at(
+        head,
+        shorts(word(entry + 24), _COUNT),
+        wholes(word(entry + 32), _COUNT),
+        shorts(word(entry + 40), _COUNT),
+        x,
+        y,
+        z,
+    )
+
+
+@compiled
+def away(entry, x, y, z, out):
+    """Unit vector away from the wall in `out`; whether there is one."""
+    head = numbers(word(entry + 16), _COUNT)
+    if word(entry + 8) == BORE:
+        bore_at(head, x, y, z, out)
+    else:
+        coarse = shorts(word(entry + 24), _COUNT)
+        index = wholes(word(entry + 32), _COUNT)
+        samples = shorts(word(entry + 40), _COUNT)
+        out[0], out[1], out[2] = gradient_at(
+            head, coarse, index, samples, x, y, z, _STEP
+        )
+    length = math.sqrt(out[0] ** 2 + out[1] ** 2 + out[2] ** 2)
+    if length < 1e-12:
+        return False
+    out[0] /= length
+    out[1] /= length
+    out[2] /= length
+    return True
+
+
+@compiled
+def at_least(entry, centre, axis, low, high, out):
+    """Place (m along a capsule) between two where the clearance is least, and it."""
+    one, two = high - _GOLDEN * (high - low), low + _GOLDEN * (high - low)
+    c, a = centre, axis
+    f1 = clearance(entry, c[0] + one * a[0], c[1] + one * a[1], c[2] + one * a[2], out)
+    f2 = clearance(entry, c[0] + two * a[0], c[1] + two * a[1], c[2] + two * a[2], out)
+    for _ in range(_SEARCHES):
+        if f1 < f2:
+            high, two, f2 = two, one, f1
+            one = high - _GOLDEN * (high - low)
+            f1 = clearance(
+                entry, c[0] + one * a[0], c[1] + one * a[1], c[2] + one * a[2], out
+            )
+        else:
+            low, one, f1 = one, two, f2
+            two = low + _GOLDEN * (high - low)
+            f2 = clearance(
+                entry, c[0] + two * a[0], c[1] + two * a[1], c[2] + two * a[2], out
+            )
+    return (one, f1) if f1 < f2 else (two, f2)
+
+
+@compiled
+def dented(values, count, i):
+    """Whether the clearance rises by `_DENT` on both sides of a place."""
+    for way in (-1, 1):
+        rise, k = 0.0, i + way
+        while 0 <= k < count and values[k] >= values[i] and rise < _DENT:
+            rise = max(rise, values[k] - values[i])
+            k += way
+        if rise < _DENT:
+            return False
+    return True
+
+
+@compiled
+def touches(entry, centre, axis, half, closed, limit, places, depths):
+    """Places of a capsule's axis that are nearest to the wall, two at most.
+
+    Args:
+        entry: address of the field's entry.
+        centre: (3,) m, of the capsule.
+        axis: (3,) unit vector along it.
+        half: m, half its length without the round ends.
+        closed: (2,) whether the ends at -half and half are looked at.
+        limit: m; what is farther from the wall does not count.
+        places: (2,) m along the axis, out.
+        depths: (2,) m, clearances of the axis there, out.
+
+    Returns:
+        Number of places.
+    """
+    out = np.empty(3)
+    middle = clearance(entry, centre[0], centre[1], centre[2], out)
+    if middle < FREE and middle - half > limit + _FAR:
+        return 0
+    count = 1
+    if half > 0.0:
+        count += min(max(int(math.ceil(2.0 * half / _EVERY)), 2), _PLACES - 1)
+    values = np.empty(_PLACES)
+    step = 2.0 * half / max(count - 1, 1)
+    least = np.inf
+    for i in range(count):
+        t = -half + i * step
+        x, y, z = (
+            centre[0] + t * axis[0],
+            centre[1] + t * axis[1],
+            centre[2] + t * axis[2],
+        )
+        values[i] = clearance(entry, x, y, z, out)
+        least = min(least, values[i])
+    if least > limit + step:
+        return 0
+    found = 0
+    for i in range(count):
+        value, t = values[i], -half + i * step
+        if i == 0 or i == count - 1:
+            beside = values[min(1, count - 1)] if i == 0 else values[i - 1]
+            if value > beside + _FLAT or not closed[0 if i == 0 else 1]:
+                continue
+        elif not (value <= values[i - 1] and value < values[i + 1]):
+            continue
+        elif not dented(values, count, i):
+            continue
+        if value > limit + step:
+            continue
+        if 0 < i < count - 1:
+            place, lower = at_least(entry, centre, axis, t - step, t + step, out)
+            if lower < value:
+                t, value = place, lower
+        if value > limit:
+            continue
+        # The two that are nearest to the wall, in the order of the axis.
+        if found == 2:
+            worse = 0 if depths[0] > depths[1] else 1
+            if value >= depths[worse]:
+                continue
+            if worse == 0:
+                places[0], depths[0] = places[1], depths[1]
+            found = 1
+        places[found], depths[found] = t, value
+        found += 1
+    return found
+
+
+@compiled
+def collide(model, data, contacts, geom1, geom2, margin, before):
+    """Contacts of a capsule or a sphere with a box, which may carry a field.
+
+    `before` is the place in the table of the function for boxes that do not.
+    """
+    table = address_of(SYMBOL)
+    stride = word(model + word(table + NUSER_GEOM))
+    key = np.int64(0)
+    if stride >= USER:
+        user = numbers(word(model + word(table + GEOM_USER)) + 8 * stride * geom2, USER)
+        if user[0] == MARK:
+            key = (np.int64(user[1]) * PART + np.int64(user[2])) * PART
+            key += np.int64(user[3])
+    if key == 0:
+        old = word(table + before)
+        return call_collision(old, model, data, contacts, geom1, geom2, margin)
+    entry = entry_of(table, key)
+    if entry == 0:
+        call_error(word(table + ERROR), word(table + MESSAGE), geom2)
+        return np.int32(0)
+    size = numbers(word(model + word(table + GEOM_SIZE)) + 24 * geom1, 3)
+    centre = numbers(word(data + word(table + GEOM_XPOS)) + 24 * geom1, 3)
+    turned = numbers(word(data + word(table + GEOM_XMAT)) + 72 * geom1, 9)
+    axis, radius = turned[2:9:3], size[0]
+    half = size[1] if before == OF_CAPSULE else 0.0
+    closed = np.ones(2, np.bool_)
+    body = wholes(word(model + word(table + GEOM_BODYID)) + 4 * geom1, 1)[0]
+    parent = wholes(word(model + word(table + BODY_PARENTID)) + 4 * body, 1)[0]
+    if parent != 0 and half > 0.0:
+        joint = numbers(word(data + word(table + XPOS)) + 24 * body, 3)
+        for end in range(2):
+            way = half if end else -half
+            apart = 0.0
+            for k in range(3):
+                apart += (centre[k] + way * axis[k] - joint[k]) ** 2
+            closed[end] = apart > _JOINED * _JOINED
+    places, depths, normal = np.empty(2), np.empty(2), np.empty(3)
+    found = touches(entry, centre, axis, half, closed, radius + margin, places, depths)
+    written = 0
+    for n in range(found):
+        x = centre[0] + places[n] * axis[0]
+        y = centre[1] + places[n] * axis[1]
+        z = centre[2] + places[n] * axis[2]
+        if not away(entry, x, y, z, normal):
+            continue
+        contact = numbers(contacts + 80 * written, 10)
+        distance = depths[n] - radius
+        reach = radius + 0.5 * distance
+        contact[0] = distance
+        contact[1] = x - reach * normal[0]
+        contact[2] = y - reach * normal[1]
+        contact[3] = z - reach * normal[2]
+        for k in range(3):
+            contact[4 + k] = -normal[k]
+            contact[7 + k] = 0.0
+        written += 1
+    return np.int32(written)
+
+
+@callback("int32(int64, int64, int64, int32, int32, float64)")
+def of_capsule(model, data, contacts, geom1, geom2, margin):
+    """Entry of MuJoCo's collision table for a capsule and a box."""
+    return collide(model, data, contacts, geom1, geom2, margin, OF_CAPSULE)
+
+
+@callback("int32(int64, int64, int64, int32, int32, float64)")
+def of_sphere(model, data, contacts, geom1, geom2, margin):
+    """Entry of MuJoCo's collision table for a sphere and a box."""
+    return collide(model, data, contacts, geom1, geom2, margin, OF_SPHERE)

@@ -1,0 +1,167 @@
+"""The lumen as a field: distances to the wall, and what is kept of them."""
+
+import numpy as np
+import pytest
+
+from cathsim_dmc.anatomy import phantoms
+from cathsim_dmc.anatomy.centreline import Centreline, Vessel, VesselTree
+from cathsim_dmc.anatomy.field import Field, SurfaceDepth
+from cathsim_dmc.anatomy.field_loops import FREE
+from cathsim_dmc.anatomy.parts import End, Surface
+from cathsim_dmc.anatomy.tree_depth import TreeDepth
+
+RADIUS, LENGTH = 4e-3, 40e-3
+UP = np.array([0.0, 0.0, 1.0])
+
+
+def line(first, last, radius, count=41):
+    share = np.linspace(0.0, 1.0, count)[:, None]
+    points = (1 - share) * np.asarray(first) + share * np.asarray(last)
+    return Centreline(points, np.broadcast_to(radius, count))
+
+
+def tree_of(*vessels):
+    return VesselTree({vessel.name: vessel for vessel in vessels})
+
+
+@pytest.fixture(scope="module")
+def tube():
+    """A straight tube along z, open at z = 0."""
+    tree = tree_of(Vessel("root", line((0, 0, 0), (0, 0, LENGTH), RADIUS)))
+    ends = (
+        End("root", np.zeros(3), -UP, RADIUS, True),
+        End("root", LENGTH * UP, UP, RADIUS, False),
+    )
+    return tree, ends, Field.from_tree(tree, ends)
+
+
+@pytest.fixture(scope="module")
+def fork():
+    """Tubes of 5 and 2.5 mm that meet at a right angle."""
+    return tree_of(
+        Vessel("root", line((0, 0, -25e-3), (0, 0, 25e-3), 5e-3)),
+        Vessel("branch", line((0, 0, 0), (25e-3, 0, 0), 2.5e-3), "root", 5e-3),
+    )
+
+
+def dense_wall(tree):
+    """Points (n, 3) all over the wall, 0.2 mm apart, by what a tree says of itself."""
+    parts = []
+    for name, vessel in tree.vessels.items():
+        place = vessel.centreline.at(np.arange(0.0, vessel.centreline.length, 0.15e-3))
+        across = np.cross(place.tangent, np.roll(place.tangent, 1, axis=1) + (0, 0, 1))
+        across /= np.linalg.norm(across, axis=1, keepdims=True)
+        other = np.cross(place.tangent, across)
+        angle = np.linspace(0, 2 * np.pi, 180, endpoint=False)[:, None, None]
+        spokes = np.cos(angle) * across + np.sin(angle) * other
+        points = (place.position + place.radius[:, None] * spokes).reshape(-1, 3)
+        others = [v for key, v in tree.depths(points).items() if key != name]
+        parts.append(points[np.all(np.less(others, 1e-9), axis=0)])
+    return np.concatenate(parts)
+
+
+def test_the_depth_at_a_junction_is_the_distance_to_the_wall(fork):
+    """Where `VesselTree.depth` is not: in an ostium it knows no edge."""
+    from scipy.spatial import cKDTree
+
+    random = np.random.default_rng(0)
+    points = random.uniform((3e-3, -4e-3, -4e-3), (9e-3, 4e-3, 4e-3), (4000, 3))
+    distance, _ = cKDTree(dense_wall(fork)).query(points)
+    inside = fork.depth(points) > 0.0
+    exact = np.where(inside, distance, -distance)
+    measured = TreeDepth(fork)(points)
+    # The reference's points are 0.2 mm apart.
+    clear = distance > 0.3e-3
+    np.testing.assert_allclose(measured[clear], exact[clear], atol=0.06e-3)
+    assert np.abs(fork.depth(points) - exact)[clear].max() > 0.5e-3
+    field = Field.from_tree(fork)(points)
+    close = np.abs(measured) < 1e-3
+    assert np.quantile(np.abs(field - measured)[close], 0.99) < 0.06e-3
+
+
+def test_the_wall_of_a_taper_is_nearer_than_its_radius():
+    """A cone of 45°: the distance is that to its flank."""
+    cone = tree_of(
+        Vessel("root", line((0, 0, 0), (0, 0, 8e-3), np.linspace(2, 10, 41) / 1e3))
+    )
+    depth = TreeDepth(cone)(np.array([[3e-3, 0.0, 4e-3]]))
+    assert depth[0] == pytest.approx(3e-3 / np.sqrt(2), abs=1e-6)
+
+
+def test_the_field_of_a_tube_is_exact_at_its_ends(tube):
+    _, _, field = tube
+    x = RADIUS - 0.7e-3
+    places = [(x, 0, 0.01e-3), (x, 0, 20e-3), (x, 0, LENGTH - 0.5e-3), (0, x, 5e-3)]
+    np.testing.assert_allclose(
+        field(places), [0.7e-3, 0.7e-3, 0.5e-3, 0.7e-3], atol=0.02e-3
+    )
+    # Behind the open end a device is free; the lumen it has left.
+    behind = np.array([(x, 0, -0.01e-3), (0, 0, -30e-3)])
+    assert (field(behind, free=True) == FREE).all()
+    np.testing.assert_allclose(field(behind), [-0.01e-3, -30e-3])
+    beyond = field([(0, 0, LENGTH + 2e-3), (RADIUS + 1e-3, 0, -1e-3)], free=True)
+    assert (beyond < 0).all()
+
+
+def test_the_gradient_points_away_from_the_wall(tube):
+    _, _, field = tube
+    angle = np.linspace(0, 2 * np.pi, 50)
+    spokes = np.stack([np.cos(angle), np.sin(angle), 0 * angle], axis=-1)
+    gradient = field.gradient(3.2e-3 * spokes + (0, 0, 21e-3))
+    np.testing.assert_allclose(gradient, -spokes, atol=0.03)
+    # An impact is pushed back whatever its depth.
+    deep = field.gradient(12e-3 * spokes[::10] + (0, 0, 21e-3))
+    assert (np.vecdot(deep, -spokes[::10]) > 0.7).all()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["type1", "type2"])
+def test_a_phantom_is_small_and_as_exact_as_contact_needs(name):
+    anatomy = phantoms.load(name)
+    field = Field.from_tree(anatomy.tree, anatomy.ends)
+    assert field.nbytes < 5e6
+    random = np.random.default_rng(1)
+    points = anatomy.surface.vertices[::7] + random.normal(0, 0.6e-3, (1, 3))
+    exact = TreeDepth(anatomy.tree, anatomy.ends)(points)
+    looked_up = field(points, free=True)
+    close = (np.abs(exact) < 1e-3) & (looked_up < FREE)
+    assert close.sum() > 500
+    assert np.quantile(np.abs(looked_up - exact)[close], 0.99) < 0.02e-3
+
+
+def box(side):
+    import trimesh
+
+    mesh = trimesh.creation.box(extents=side)
+    return Surface(mesh.vertices, mesh.faces)
+
+
+def test_a_surface_gives_the_same_field_by_libigl():
+    """A box, open at z = -10 mm."""
+    end = End("root", -10e-3 * UP, -UP, 5e-3, True)
+    field = Field.from_surface(box((12e-3, 12e-3, 20e-3)), [end])
+    points = [(5.2e-3, 0, 0), (0, -6.4e-3, 3e-3), (0, 0, 9.5e-3), (4e-3, 0, -9.9e-3)]
+    np.testing.assert_allclose(
+        field(points), [0.8e-3, -0.4e-3, 0.5e-3, 2e-3], atol=0.02e-3
+    )
+    assert field((0, 0, -11e-3), free=True) == FREE
+
+
+def test_a_surface_knows_inside_from_outside():
+    """By normals and winding numbers; trimesh's ray test is the reference."""
+    import trimesh
+
+    mesh = trimesh.creation.annulus(3e-3, 6e-3, 10e-3)
+    random = np.random.default_rng(0)
+    points = random.uniform(-8e-3, 8e-3, (2000, 3))
+    depth = SurfaceDepth(Surface(mesh.vertices, mesh.faces))(points)
+    across = np.linalg.norm(points[:, :2], axis=1)
+    inside = (across > 3e-3) & (across < 6e-3) & (np.abs(points[:, 2]) < 5e-3)
+    clear = np.abs(depth) > 0.2e-3  # the annulus has 32 sides
+    assert ((depth > 0) == inside)[clear].all()
+
+
+def test_equal_fields_have_one_digest(tube):
+    tree, ends, field = tube
+    assert Field.from_tree(tree, ends).digest == field.digest
+    assert Field.from_tree(tree).digest != field.digest

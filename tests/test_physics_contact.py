@@ -1,0 +1,291 @@
+"""Contact with a field through MuJoCo's collision table."""
+
+import copy
+import subprocess
+import sys
+
+import mujoco
+import numpy as np
+import pytest
+from mujoco.batch import Batch
+
+from cathsim_dmc.anatomy.centreline import Centreline, Vessel, VesselTree
+from cathsim_dmc.anatomy.field import Field
+from cathsim_dmc.anatomy.parts import End
+from cathsim_dmc.physics import contact
+
+RADIUS, DEVICE, HALF = 5e-3, 0.8e-3, 3.5e-3
+
+
+def tree_along(points, radius=RADIUS):
+    line = Centreline(points, np.full(len(points), radius))
+    return VesselTree({"root": Vessel("root", line)})
+
+
+@pytest.fixture(scope="module")
+def tube():
+    """Along z from 0, where it is open, to 60 mm."""
+    tree = tree_along(np.linspace((0, 0, 0), (0, 0, 60e-3), 61))
+    return Field.from_tree(
+        tree, [End("root", np.zeros(3), np.array([0, 0, -1.0]), RADIUS, True)]
+    )
+
+
+def numbers(values):
+    return " ".join(repr(float(value)) for value in np.ravel(values))
+
+
+def carrier(field, name="wall", more=""):
+    made = contact.carrier(field)
+    values = " ".join(
+        f'{key}="{value if key == "type" else numbers(value)}"'
+        for key, value in made.items()
+    )
+    return f'<geom name="{name}" {values} {more}/>'
+
+
+def capsule(place, inner="", euler="0 0 0", size=(DEVICE, HALF), more=""):
+    return (
+        f'<body pos="{numbers(place)}" euler="{euler}"><freejoint/>'
+        f'<geom type="capsule" size="{numbers(size)}" mass="1e-3" '
+        f'contype="0" conaffinity="1" solref="0.008 1" {more}/>{inner}</body>'
+    )
+
+
+def compiled(body, option='gravity="0 0 0"', visual=""):
+    model = mujoco.MjModel.from_xml_string(
+        f'<mujoco><option {option} timestep="0.004"/>'
+        f"<worldbody>{body}{visual}</worldbody></mujoco>"
+    )
+    return model, mujoco.MjData(model)
+
+
+def contacts_of(body):
+    model, data = compiled(body)
+    mujoco.mj_forward(model, data)
+    return data.contact
+
+
+def test_a_capsule_in_a_straight_tube_overlaps_by_what_it_does(tube):
+    overlap, axis = 0.2e-3, RADIUS - DEVICE + 0.2e-3
+    angles = np.linspace(0, 2 * np.pi, 12, endpoint=False)
+    spokes = np.stack([np.cos(angles), np.sin(angles), 0 * angles], axis=-1)
+    body = carrier(tube)
+    for number, spoke in enumerate(spokes):
+        body += capsule(axis * spoke + (0, 0, 20e-3 + number * 1e-3))
+    found = contacts_of(body)
+    assert len(found.dist) == 2 * len(spokes)  # both ends of each
+    np.testing.assert_allclose(found.dist, -overlap, atol=0.01e-3)
+    place = RADIUS + overlap / 2
+    for n, spoke in enumerate(np.repeat(spokes, 2, axis=0)):
+        np.testing.assert_allclose(found.frame[n, :3] @ spoke, 1, atol=1e-3)
+        np.testing.assert_allclose(found.pos[n] @ spoke, place, atol=0.01e-3)
+
+
+def test_a_capsule_in_a_bend_touches_once_inside_and_twice_outside():
+    angle = np.linspace(0, np.pi / 2, 61)
+    circle = np.stack([np.cos(angle), np.sin(angle), 0 * angle], axis=-1)
+    field = Field.from_tree(tree_along(30e-3 * circle))
+    middle = np.array([np.cos(np.pi / 4), np.sin(np.pi / 4), 0])
+    along = "90 45 0"  # the capsule lies along the bend there
+    for reach, count in ((25e-3 + DEVICE - 0.1e-3, 1), (35e-3 - DEVICE + 0.1e-3, 2)):
+        found = contacts_of(carrier(field) + capsule(reach * middle, euler=along))
+        assert len(found.dist) == count
+        if count == 1:
+            assert found.dist[0] == pytest.approx(-0.1e-3, abs=0.01e-3)
+        else:
+            # Its ends stand further out than its middle.
+            more = np.hypot(reach, HALF) - reach
+            np.testing.assert_allclose(found.dist, -0.1e-3 - more, atol=0.015e-3)
+
+
+def test_a_capsule_across_an_ostium_touches_its_edge():
+    root = tree_along(np.linspace((0, 0, -20e-3), (0, 0, 20e-3), 41)).root
+    side = tree_along(np.linspace((0, 0, 0), (20e-3, 0, 0), 21), 3e-3).root
+    branch = Vessel("branch", side.centreline, "root", RADIUS)
+    field = Field.from_tree(VesselTree({"root": root, "branch": branch}))
+    # Along z before the ostium: it rests on the two rims, at z = +-3 mm.
+    place = (RADIUS - DEVICE + 0.1e-3, 0, 0)
+    found = contacts_of(carrier(field) + capsule(place, size=(DEVICE, 8e-3)))
+    assert len(found.dist) == 2
+    across = contacts_of(carrier(field) + capsule(place, size=(DEVICE, 2e-3)))
+    assert len(across.dist) == 0
+
+
+def test_behind_the_open_end_nothing_touches(tube):
+    outside = (RADIUS - DEVICE + 0.2e-3, 0, -10e-3)
+    assert len(contacts_of(carrier(tube) + capsule(outside)).dist) == 0
+    # One that reaches in touches the part of the wall that it reaches.
+    half_in = contacts_of(carrier(tube) + capsule((*outside[:2], 1e-3)))
+    assert len(half_in.dist) and (half_in.pos[:, 2] > 0).all()
+
+
+def chain(place):
+    """Two links whose joint is at the origin of the second."""
+    second = (
+        '<body pos="0 0 7e-3"><joint axis="1 0 0" stiffness="1e-4" damping="1e-5"/>'
+        f'<geom type="capsule" fromto="0 0 0 0 0 7e-3" size="{DEVICE}" mass="1e-3" '
+        'contype="0" conaffinity="1"/></body>'
+    )
+    return (
+        f'<body pos="{numbers(place)}"><freejoint/><geom type="capsule" '
+        f'fromto="0 0 0 0 0 7e-3" size="{DEVICE}" mass="1e-3" contype="0" '
+        f'conaffinity="1"/>{second}</body>'
+    )
+
+
+def test_a_joint_is_touched_once(tube):
+    """The proximal end of a link is left to the link before it."""
+    place = (RADIUS - DEVICE + 0.1e-3, 0, 20e-3)
+    found = contacts_of(carrier(tube) + chain(place))
+    # The free body's own end, the joint and the distal end.
+    np.testing.assert_allclose(
+        np.sort(found.pos[:, 2]), [20e-3, 27e-3, 34e-3], atol=1e-4
+    )
+
+
+def test_a_bore_is_exact_and_frictionless():
+    bore = contact.Bore(np.array([(0, 0, -50e-3), (0, 0, 0)]), 1.2e-3)
+    inside = (0.5e-3, 0, -20e-3)
+    body = carrier(bore, more='condim="1" priority="1"') + capsule(inside)
+    found = contacts_of(body)
+    np.testing.assert_allclose(found.dist, -0.1e-3, atol=1e-9)
+    assert (found.dim == 1).all()
+    past = contacts_of(carrier(bore) + capsule((0.5e-3, 0, 10e-3)))
+    assert len(past.dist) == 0
+
+
+@pytest.mark.parametrize("load", [0.02, 0.1, 0.5])
+def test_force_over_depth_is_the_stiffness_asked_for(tube, load):
+    """Whatever the mass of the link: N/m link by link."""
+    stiffness = 2000.0
+    for mass in (1e-4, 1e-3):
+        body = f"""<body pos="{RADIUS - DEVICE} 0 30e-3">
+            <joint type="slide" axis="1 0 0"/><geom name="ball" type="sphere"
+            size="{DEVICE}" mass="{mass}" contype="0" conaffinity="1" priority="1"
+            solimp="{numbers(contact.solimp())}"
+            friction="0 0 0"/></body>"""
+        model, data = compiled(
+            carrier(tube) + body,
+            'gravity="0 0 0" integrator="discrete" cone="elliptic"',
+        )
+        ball = model.geom("ball").id
+        model.geom_solref[ball] = contact.springs(
+            model, np.array([ball]), stiffness, 0.02
+        )
+        data.qfrc_applied[0] = load
+        for _ in range(400):
+            mujoco.mj_step(model, data)
+        assert data.ncon == 1
+        assert -data.contact.dist[0] == pytest.approx(load / stiffness, rel=0.01)
+        assert abs(data.qvel[0]) < 1e-6
+
+
+def rolling(field):
+    """A small scene that moves: capsules that fall in the tube."""
+    bodies = "".join(
+        capsule(((n - 2) * 1e-3, 0, 10e-3 + 9e-3 * n), euler=f"{10 * n} 20 0")
+        for n in range(5)
+    )
+    return compiled(carrier(field) + bodies, 'gravity="0 -9.81 1"')
+
+
+def test_batch_and_composer_step_alike_on_any_number_of_threads(tube):
+    model, data = rolling(tube)
+    for _ in range(60):
+        mujoco.mj_step(model, data)
+    assert data.ncon > 2
+    for threads in (1, 2, 8):
+        batch = Batch(model, 8, threads)
+        batch.step(nstep=60)
+        assert (np.asarray(batch.qpos) == data.qpos).all()
+
+
+def test_copies_and_models_of_a_batch_keep_their_fields(tube):
+    other = Field.from_tree(tree_along(np.linspace((0, 0, 0), (0, 0, 60e-3), 61), 4e-3))
+    model, _ = rolling(tube)
+    narrow = copy.copy(model)
+    narrow.geom_user[model.geom("wall").id] = contact.register(other)
+    contact.check(narrow)
+    alone = []
+    for each in (model, narrow):
+        data = mujoco.MjData(each)
+        for _ in range(30):
+            mujoco.mj_step(each, data)
+        alone.append(data.qpos.copy())
+    assert not np.array_equal(*alone)
+    batch = Batch(model, 4, 2)
+    batch.set_models([model, narrow, model, narrow])
+    batch.step(nstep=30)
+    for row, expected in zip(np.asarray(batch.qpos), alone * 2, strict=True):
+        assert (row == expected).all()
+
+
+OTHER = """
+import mujoco, numpy as np, sys
+{first}
+model = mujoco.MjModel.from_xml_string('''<mujoco><worldbody>
+  <geom type="box" size="1 1 .1"/><geom type="box" size=".1 1 1" pos="1 0 0"/>
+  <body pos=".2 0 .5" euler="20 60 0"><freejoint/>
+  <geom type="capsule" size=".05 .3"/><geom type="sphere" size=".1" pos="0 .2 0"/>
+  <geom type="box" size=".1 .1 .1" pos="0 -.3 0"/></body></worldbody></mujoco>''')
+data = mujoco.MjData(model)
+for _ in range(1500): mujoco.mj_step(model, data)
+assert data.ncon
+print(data.qpos.tobytes().hex(), data.qacc.tobytes().hex())
+"""
+
+
+def test_other_models_are_untouched_bit_for_bit():
+    """In a process that has a field, and in one that has none."""
+    register = (
+        "from cathsim_dmc.physics import contact\n"
+        "contact.register(contact.Bore(np.array([(0, 0, 0), (0, 0, 1)]), 0.1))\n"
+    )
+    answers = [
+        subprocess.run(
+            [sys.executable, "-c", OTHER.format(first=first)],
+            capture_output=True,
+            text=True,
+            check=True,
+        ).stdout
+        for first in ("", register)
+    ]
+    assert answers[0] == answers[1]
+
+
+def test_a_model_without_its_field_does_not_run(tube):
+    model, data = rolling(tube)
+    model.geom_user[model.geom("wall").id, 1] += 1
+    with pytest.raises(mujoco.FatalError, match="carries a field that this process"):
+        mujoco.mj_step(model, data)
+    with pytest.raises(ValueError, match="'wall' carries a field that this process"):
+        contact.check(model)
+
+
+def test_a_saved_model_finds_its_field_again(tube, tmp_path):
+    model, _ = rolling(tube)
+    path = tmp_path / "saved.xml"
+    mujoco.mj_saveLastXML(str(path), model)
+    again = mujoco.MjModel.from_xml_path(str(path))
+    contact.check(again)
+    data = mujoco.MjData(again)
+    for _ in range(60):
+        mujoco.mj_step(again, data)
+    # Elsewhere the carrier is a solid box, which throws the device out.
+    again.geom_user[:] = 0
+    elsewhere = mujoco.MjData(again)
+    mujoco.mj_step(again, elsewhere)
+    assert data.contact.dist.min() > -1e-3
+    assert elsewhere.contact.dist.min() < -3e-3
+
+
+def test_what_a_field_cannot_meet_is_refused(tube):
+    body = carrier(tube, more='contype="1"') + (
+        '<body name="b"><freejoint/><geom name="cube" type="box" size="1 1 1"/></body>'
+    )
+    model, _ = compiled(body)
+    with pytest.raises(ValueError, match="'cube' cannot touch the field"):
+        contact.check(model)
+    with pytest.raises(ValueError, match="radii 0 m"):
+        contact.Bore(np.array([(0, 0, 0), (0, 0, 1)]), 0.0)
