@@ -55,8 +55,7 @@ _TORCHRL_FACE = (
 )
 # Package -> files that may import it, wherever in the file the import stands.
 CONFINED = {
-    # The benchmark compares the TorchRL environment with the simulation underneath.
-    "torch": {*_TORCHRL_FACE, "agents/", "analysis/speed/ratios.py"},
+    "torch": {*_TORCHRL_FACE, "agents/"},
     "torchrl": {*_TORCHRL_FACE, "agents/"},
     "tensordict": {*_TORCHRL_FACE, "agents/"},
     "safetensors": {"agents/pretrained.py"},

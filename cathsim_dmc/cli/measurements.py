@@ -82,11 +82,11 @@ def forces(
 
 @benchmarks.command
 def speed(json: bool = False) -> int:
-    """Measure how fast the simulator is. Run it with nothing else running.
+    """Measure calibrated speed and overhead; run it with nothing else running.
 
     Args:
         json: Whether to print one JSON object and nothing else.
     """
-    from cathsim_dmc.analysis.speed import report
+    from cathsim_dmc.analysis import speed as measured
 
-    return show(report.speed(lambda text: print(text, file=sys.stderr)), json)
+    return show(measured.speed(lambda text: print(text, file=sys.stderr)), json)

@@ -1,4 +1,4 @@
-"""Writes docs/performance.md's tables from `cathsim benchmark speed --json`.
+"""Writes docs/performance.md's tables from `benchmarks/speed.py --json`.
 
 python docs/scripts/performance.py  (with nothing else running)
 """
@@ -16,7 +16,7 @@ BEGIN, END = "<!-- measured -->", "<!-- end -->"
 
 def main():
     result = subprocess.run(
-        [sys.executable, "-m", "cathsim_dmc.cli", "benchmark", "speed", "--json"],
+        [sys.executable, str(PAGE.parents[1] / "benchmarks/speed.py"), "--json"],
         stdout=subprocess.PIPE,
         text=True,
         check=False,

@@ -1,0 +1,213 @@
+"""Speed of the simulator, for `cathsim benchmark speed`.
+
+Real-time factor: simulated seconds per CPU second of this process, one thread. It says
+as much about the machine as about the program, so what the checks bound is the
+calibrated speed: the real-time factor times the microseconds of one `mj_step` of
+dm_control's humanoid, both timed in turns. Every figure is the median of repeated runs
+after a warm-up. `benchmarks/speed.py` measures more: threads, images, stages, memory.
+"""
+
+import dataclasses
+import functools
+import itertools
+import statistics
+import time
+from collections.abc import Callable
+
+import mujoco
+import numpy as np
+from dm_control import composer
+
+from cathsim_dmc import suite
+from cathsim_dmc.policies import in_environment, make_policy
+from cathsim_dmc.simulation.episodes import ComposerSimulation, play
+from cathsim_dmc.tasks.config import CONTROL_TIMESTEP
+from cathsim_dmc.validation.checks import Check, Report
+
+RUNS = 5
+STEPS = 150  # control steps; a push is then in the branch
+RATIOS = 24  # runs of a ratio
+# A curved arch, and the straight idealised one that it is held against.
+SCENES = ("type1_bca", "simple1_bca")
+# Calibrated speed that each policy must keep on each of them, µs.
+BARS = {"push": (150.0, 280.0), "random": (420.0, 850.0), "curl": (220.0, 280.0)}
+MOST_OVERHEAD = 1.25  # of a suite step over its mj_step calls
+NEVER = 1e-6  # m, goal radius that no policy meets
+_WARM_STEPS = 1000  # of the humanoid, 5 s: it has come to lie on the floor
+
+
+@dataclasses.dataclass(frozen=True)
+class Pace:
+    """Speed of one episode.
+
+    Attributes:
+        insertion: (T,), m, after each control step.
+        seconds: (T,), CPU seconds of each control step.
+        contacts: (T,), with the wall at its end.
+    """
+
+    insertion: np.ndarray
+    seconds: np.ndarray
+    contacts: np.ndarray
+
+    @property
+    def factor(self) -> float:
+        """Real-time factor of the whole episode."""
+        return len(self.seconds) * CONTROL_TIMESTEP / self.seconds.sum()
+
+
+def speed(say: Callable[[str], None] = lambda text: None) -> Report:
+    """Calibrated speeds and the overhead of a suite step, as checks.
+
+    Args:
+        say: Function that is told of progress.
+    """
+    say("real-time factors")
+    checks, calibration = calibrated_speeds()
+    say("overhead")
+    for policy in ("random", "push"):
+        runs = suite_overhead(policy)
+        low, middle, high = np.quantile(runs, [0.25, 0.5, 0.75])
+        name, note = (
+            f"suite step / mj_step, {policy}",
+            f"quartiles {low:.2f}–{high:.2f}",
+        )
+        checks.append(Check.at_most(name, float(middle), MOST_OVERHEAD, "x", note))
+    return Report("speed, one core", checks, {"calibration": calibration})
+
+
+def calibrated_speeds() -> tuple[list[Check], dict[str, dict[str, dict[str, float]]]]:
+    """Calibrated speeds, and their two factors by scene and policy.
+
+    The scenes and the humanoid take turns, so that their figures can be compared
+    though the machine's speed drifts.
+    """
+    environments = [load(scene) for scene in SCENES]
+    checks, table = [], {scene: {} for scene in SCENES}
+    for policy, bars in BARS.items():
+        for environment in environments:
+            pace(environment, policy, STEPS)
+        humanoid, paces = [humanoid_step()], [[] for _ in SCENES]
+        for _ in range(RUNS):
+            for environment, runs in zip(environments, paces, strict=True):
+                one = pace(environment, policy, STEPS)
+                humanoid.append(humanoid_step())
+                runs.append((one, one.factor * (humanoid[-2] + humanoid[-1]) / 2))
+        step = statistics.median(humanoid)
+        for scene, runs, bar in zip(SCENES, paces, bars, strict=True):
+            factor = statistics.median(one.factor for one, _ in runs)
+            table[scene][policy] = {
+                "real_time_factor": factor,
+                "humanoid_step_microseconds": step,
+            }
+            one, _ = runs[-1]
+            note = (
+                f"{factor:.1f} x real time, humanoid {step:.1f} µs; "
+                f"{one.contacts.mean():.1f} contacts, {one.insertion[-1] * 1e3:.0f} mm"
+            )
+            product = statistics.median(product for _, product in runs)
+            name = f"calibrated speed, {scene}, {policy}"
+            checks.append(Check.at_least(name, product, bar, "µs", note))
+    return checks, table
+
+
+def load(task: str = "type1_bca", **options) -> composer.Environment:
+    """A suite environment whose episodes never end in success."""
+    options.setdefault("goal_radius", NEVER)
+    return suite.load(suite.DOMAIN, task, task_kwargs={"random": 0, **options})
+
+
+def pace(
+    environment: composer.Environment, policy: str, steps: int, seed: int = 0
+) -> Pace:
+    """Play an episode of a suite environment and time every control step.
+
+    Args:
+        environment: The environment.
+        policy: Name of a policy in `cathsim_dmc.policies.POLICIES`.
+        steps: Number of control steps.
+        seed: Seed of the policy.
+    """
+    act = in_environment(make_policy(policy, seed), environment)
+    timed, insertion, contacts = _Timed(environment), [], []
+    for _ in itertools.islice(play(timed, act), 1, steps + 1):
+        insertion.append(float(environment.task.readings.insertion))
+        contacts.append(float(environment.task.contacts(environment.physics).found))
+    return Pace(np.array(insertion), np.array(timed.seconds), np.array(contacts))
+
+
+class _Timed(ComposerSimulation):
+    """A composer environment with the CPU seconds of each control step."""
+
+    def __init__(self, environment: composer.Environment):
+        super().__init__(environment)
+        self.seconds: list[float] = []
+
+    def step(self, action: np.ndarray):
+        start = time.process_time()
+        answer = super().step(action)
+        self.seconds.append(time.process_time() - start)
+        return answer
+
+
+def suite_overhead(policy: str, steps: int = STEPS) -> list[float]:
+    """CPU time of suite environment steps over that of their bare mj_step calls."""
+    environment = load()
+    pairs = [
+        against_bare_steps(environment, policy, steps, run) for run in range(RATIOS + 1)
+    ]
+    return [ours / bare for ours, bare in pairs[1:]]
+
+
+def against_bare_steps(
+    environment: composer.Environment, policy: str, steps: int, seed: int
+) -> tuple[float, float]:
+    """CPU seconds of an episode, and of bare `mj_step` calls with the same controls.
+
+    The two take turns by episodes: by steps each would find the caches full of the
+    other's data.
+    """
+    substeps = environment.task.substeps
+    timestep = environment.reset()
+    # None of these policies looks at the observation.
+    act = in_environment(make_policy(policy, seed), environment)
+    actions = [act(timestep) for _ in range(steps)]
+    model, data = environment.physics.model.ptr, environment.physics.data.ptr
+    bare = mujoco.MjData(model)
+    mujoco.mj_copyData(bare, model, data)
+    start = time.process_time()
+    for action in actions:
+        environment.step(action)
+    middle = time.process_time()
+    for action in actions:
+        bare.ctrl[:] = action
+        for _ in range(substeps):
+            mujoco.mj_step(model, bare)
+    return middle - start, time.process_time() - middle
+
+
+def humanoid_step(steps: int = 2000) -> float:
+    """CPU time of one `mj_step` of dm_control's humanoid, µs: the speed of the machine.
+
+    The humanoid of `stand` falls without controls from its standing pose; the first
+    steps warm it up and are not timed.
+
+    Args:
+        steps: Number of timed physics steps.
+    """
+    model, start = _humanoid()
+    data = mujoco.MjData(model)
+    mujoco.mj_copyData(data, model, start)
+    mujoco.mj_step(model, data, nstep=_WARM_STEPS)
+    begin = time.process_time()
+    mujoco.mj_step(model, data, nstep=steps)
+    return 1e6 * (time.process_time() - begin) / steps
+
+
+@functools.cache
+def _humanoid() -> tuple[mujoco.MjModel, mujoco.MjData]:
+    from dm_control import suite as control_suite
+
+    environment = control_suite.load("humanoid", "stand", task_kwargs={"random": 0})
+    environment.reset()
+    return environment.physics.model.ptr, environment.physics.data.ptr
