@@ -11,8 +11,6 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from cathsim_dmc.agents import learners, pretrained
 from cathsim_dmc.agents.checkpoint import Checkpoint
-from cathsim_dmc.agents.config import TrainingConfig
-from cathsim_dmc.agents.networks import NetworkShapes
 from cathsim_dmc.policies import POLICIES, Policy, make_policy
 from cathsim_dmc.simulation import environments
 
@@ -52,78 +50,41 @@ class FunctionPolicy(Policy):
         return action.to(torch.float32).numpy()
 
 
-class NetworkPolicy(FunctionPolicy):
+class TrainedPolicy(FunctionPolicy):
     """A trained policy, with frozen observation statistics.
 
     Attributes:
         network: Raw observation in, action out.
         config: Settings of its training.
         shapes: Sizes of its observation and action.
+        checkpoint: Where it is from; None for that of a file.
+        card: What the policy of a file reached, see `pretrained.read_card`.
     """
 
-    def __init__(
-        self,
-        name: str,
-        state: Mapping[str, Any],
-        shapes: NetworkShapes,
-        config: TrainingConfig,
-    ):
-        """Builds the network.
-
-        Args:
-            name: Name for reports.
-            state: Weights and statistics, as `checkpoint.require_fit` allows them.
-            shapes: Sizes of observation and action.
-            config: Settings of the training.
-        """
-        network = learners.make_policy(shapes, config)
-        network.load_state_dict(dict(state))
-        super().__init__(network.eval().requires_grad_(False), name)
-        self.network, self.config, self.shapes = network, config, shapes
-        self.task = config.task
-        self.observation = config.observation
-        self.task_kwargs = config.task_kwargs
-
-
-class TrainedPolicy(NetworkPolicy):
-    """The policy of a checkpoint."""
-
-    def __init__(self, checkpoint: Checkpoint):
+    def __init__(self, source: Checkpoint | Path):
         """Loads the weights.
 
         Args:
-            checkpoint: Checkpoint of a run.
+            source: Checkpoint, or path of a `.safetensors` file with its card.
 
         Raises:
             CheckpointError: its weights cannot be used.
         """
-        config = checkpoint.config
-        name = f"{config.algorithm} {checkpoint.path.name}"
-        super().__init__(name, checkpoint.policy_state(), checkpoint.shapes, config)
-        self.checkpoint = checkpoint
-
-
-class PretrainedPolicy(NetworkPolicy):
-    """The policy of a file, such as those that ship.
-
-    Attributes:
-        card: What it was trained for and what it reached, see `pretrained.read_card`.
-    """
-
-    def __init__(self, weights: str | Path):
-        """Loads the weights.
-
-        Args:
-            weights: Path of the `.safetensors` file; the card lies beside it.
-
-        Raises:
-            CheckpointError: there is none, or it is damaged.
-        """
-        self.card, state, shapes, config = pretrained.read_pretrained(weights)
-        name = f"{pretrained.PREFIX}{self.card['name']}"
-        super().__init__(name, state, shapes, config)
-        self.task = self.card["task"]
-        self.task_kwargs = self.card["task_kwargs"]
+        self.checkpoint = self.card = None
+        if isinstance(source, Checkpoint):
+            self.checkpoint = source
+            state, shapes, config = source.policy_state(), source.shapes, source.config
+            self.task, self.task_kwargs = config.task, config.task_kwargs
+            name = f"{config.algorithm} {source.path.name}"
+        else:
+            self.card, state, shapes, config = pretrained.read_pretrained(source)
+            self.task, self.task_kwargs = self.card["task"], self.card["task_kwargs"]
+            name = f"{pretrained.PREFIX}{self.card['name']}"
+        network = learners.make_policy(shapes, config)
+        network.load_state_dict(state)
+        super().__init__(network.eval().requires_grad_(False), name)
+        self.network, self.config, self.shapes = network, config, shapes
+        self.observation = config.observation
 
 
 def load_policy(policy: PolicyLike, seed: int = 0) -> Policy:
@@ -147,9 +108,9 @@ def load_policy(policy: PolicyLike, seed: int = 0) -> Policy:
             return make_policy(str(policy), seed)
         if str(policy).startswith(pretrained.PREFIX):
             policy = pretrained.pretrained_path(str(policy))
-        if Path(policy).suffix == pretrained.SUFFIX:
-            return PretrainedPolicy(policy)
-        return TrainedPolicy(Checkpoint.open(policy))
+        path = Path(policy)
+        is_file = path.suffix == pretrained.SUFFIX
+        return TrainedPolicy(path if is_file else Checkpoint.open(path))
     return FunctionPolicy(policy)
 
 

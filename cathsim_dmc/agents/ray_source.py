@@ -44,15 +44,11 @@ class RaySource:
         random_frames: Callable[[int], int],
         options: Mapping[str, Any],
     ):
-        """Starts the collectors.
+        """Starts the collectors and closes `env`, which was only looked at.
 
         Args:
-            config: Settings of the training.
-            learner: Learner whose policy collects.
-            env: Environment of this process, which is closed: it was only looked at.
-            make_env: Function that makes the environments; the workers must be able to
-                import it.
-            frames: Number of frames of earlier processes of the run.
+            config, learner, env, make_env, frames: As for every source; the workers
+                must be able to import `make_env`.
             random_frames: Frames still to be collected at random, after so many.
             options: Options of TorchRL's collectors.
 
@@ -65,8 +61,7 @@ class RaySource:
         self._random_frames, self._options = random_frames, options
         env.close()
         _start_ray()
-        self._collector = self._start()
-        self._batches = iter(self._collector)
+        self._start()
 
     def next(self) -> TensorDictBase:
         """The next batch (num_envs, steps).
@@ -79,7 +74,8 @@ class RaySource:
         last: Exception | None = None
         for _ in range(MOST_LOSSES):
             try:
-                self._send_weights()
+                weights = TensorDict.from_module(self._learner.policy).data.to("cpu")
+                self._collector.update_policy_weights_(weights)
                 batch = next(self._batches)
             # A process that dies while it is given weights breaks the connection.
             except (RayError, RuntimeError) as error:
@@ -99,14 +95,14 @@ class RaySource:
         with contextlib.suppress(Exception):
             self._collector.shutdown()
 
-    def _start(self) -> RayCollector:
+    def _start(self) -> None:
         config, count = self._config, self._config.collectors
         threads = config.num_threads or 1
         _require_room(count, threads)
         policy = copy.deepcopy(self._learner.policy).to("cpu").requires_grad_(False)
         of_each = dict(self._options)
         shared = {n: of_each.pop(n) for n in ("exploration_type", "trust_policy")}
-        return RayCollector(
+        self._collector = RayCollector(
             [self._worker(index, threads) for index in range(count)],
             policy,
             frames_per_batch=config.frames_per_batch,
@@ -117,6 +113,7 @@ class RaySource:
             remote_configs={"num_cpus": threads},
             **shared,
         )
+        self._batches = iter(self._collector)
 
     def _worker(self, index: int, threads: int) -> functools.partial[EnvBase]:
         """Function that makes the environment of one collector."""
@@ -139,10 +136,6 @@ class RaySource:
             task_kwargs=config.training_kwargs,
         )
 
-    def _send_weights(self) -> None:
-        weights = TensorDict.from_module(self._learner.policy).data.to("cpu")
-        self._collector.update_policy_weights_(weights)
-
     def _replace(self, error: Exception) -> None:
         line = (str(error).strip().splitlines() or [type(error).__name__])[0]
         logging.getLogger(__name__).warning(
@@ -152,8 +145,7 @@ class RaySource:
         )
         self.shutdown()
         self.restarts += 1
-        self._collector = self._start()
-        self._batches = iter(self._collector)
+        self._start()
 
 
 def _make_worker_env(

@@ -171,9 +171,8 @@ def read_window(rows: Sequence[Sequence[float | None]]) -> list[list[float | Non
         TypeError: A figure is no number.
     """
     window = [[_number(value) for value in row] for row in rows]
-    for row in window:
-        if len(row) != len(_FIGURES):
-            raise ValueError(f"{len(row)} figures of an episode, not {len(_FIGURES)}")
+    if any(len(row) != len(_FIGURES) for row in window):
+        raise ValueError(f"an episode has other figures than {', '.join(_FIGURES)}")
     return window
 
 

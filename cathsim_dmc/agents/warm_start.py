@@ -6,7 +6,7 @@ from torch import nn
 from cathsim_dmc.agents.config import ConfigError, TrainingConfig
 from cathsim_dmc.agents.imitation import network_of, statistics_of
 from cathsim_dmc.agents.networks import LOG_STD_RANGE, NetworkShapes
-from cathsim_dmc.agents.policies import NetworkPolicy, load_policy
+from cathsim_dmc.agents.policies import TrainedPolicy, load_policy
 
 # What must agree for the weights to mean the same.
 _ALIKE = (
@@ -36,7 +36,7 @@ def take_over(policy: nn.Module, config: TrainingConfig, shapes: NetworkShapes) 
         CheckpointError: there is none, or it is damaged.
     """
     source = load_policy(str(config.initial_policy))
-    if not isinstance(source, NetworkPolicy):
+    if not isinstance(source, TrainedPolicy):
         raise ConfigError(
             f"initial_policy={config.initial_policy!r} has no network: give the "
             'directory of a run or of a checkpoint, or "pretrained:NAME".'
