@@ -133,7 +133,7 @@ def test_not_a_number(y_mesh, tmp_path):
         read_lumen(path)
 
 
-def test_holes_flips_slivers_and_crumbs_are_mended(y_mesh, tmp_path):
+def test_holes_flips_slivers_and_small_parts_are_mended(y_mesh, tmp_path):
     vertices, faces = y_mesh
     rng = np.random.default_rng(0)
     flipped = rng.choice(len(faces), 40, replace=False)
@@ -146,13 +146,13 @@ def test_holes_flips_slivers_and_crumbs_are_mended(y_mesh, tmp_path):
     m = len(vertices) - 1
     faces[100] = (m, b, c)
     faces = np.concatenate([faces, [(a, m, c), (a, b, m)]])
-    crumb = trimesh.creation.icosphere(1, 0.5)
+    speck = trimesh.creation.icosphere(1, 0.5)
     count = len(vertices)
-    vertices = np.concatenate([vertices, crumb.vertices + (40, 0, 0)])
-    faces = np.concatenate([np.delete(faces, [300, 500], axis=0), crumb.faces + count])
+    vertices = np.concatenate([vertices, speck.vertices + (40, 0, 0)])
+    faces = np.concatenate([np.delete(faces, [300, 500], axis=0), speck.faces + count])
     lumen = read_lumen(write_obj(tmp_path / "rough.obj", vertices, faces))
     assert_closed(lumen)
-    for text in ("flipped", "holes filled", "crumbs", "without area"):
+    for text in ("flipped", "holes filled", "small parts", "without area"):
         assert said(lumen, text), text
 
 

@@ -9,9 +9,9 @@ from test_imaging_thickness import ball, tube
 
 from cathsim_dmc.imaging import (
     VIEWS,
-    Biplane,
     CArm,
     Fluoroscope,
+    angiograph,
     detector,
     materials,
     rgb,
@@ -277,17 +277,16 @@ def test_biplane_stacks_two_views(vessel, frames):
         Fluoroscope.from_surface(*vessel, carm=CArm.view(v).centred_on(vessel[0]))
         for v in ("AP", "LATERAL")
     ]
-    image = Biplane(*planes).render(frames, RADIUS)
+    machines = [tuple(planes)] * 20
+    image = angiograph.render(machines, frames, RADIUS)
     assert image.shape == (20, 128, 128, 2)
     for channel, plane in enumerate(planes):
         assert (image[..., channel] == plane.render(frames, RADIUS)[..., 0]).all()
     states = [np.random.RandomState(k) for k in range(20)]
-    noisy = Biplane(*planes).render(frames, RADIUS, states)
-    single = Biplane(*planes).render(frames[4], RADIUS, np.random.RandomState(4))
-    assert (noisy[4] == single).all()
-    small = replace(planes[0].carm, resolution=(64, 64))
-    with pytest.raises(ValueError, match="resolution"):
-        Biplane(planes[0], Fluoroscope.from_surface(*vessel, carm=small))
+    noisy = angiograph.render(machines, frames, RADIUS, states)
+    state = np.random.RandomState(4)
+    single = angiograph.render(machines[:1], frames[4:5], RADIUS, [state])
+    assert (noisy[4] == single[0]).all()
 
 
 def test_rgb_repeats_the_grey_channel(fluoroscope, frames):

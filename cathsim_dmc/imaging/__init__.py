@@ -3,14 +3,13 @@
 from cathsim_dmc.imaging.angiograph import Angiograph, Deviation
 from cathsim_dmc.imaging.carm import VIEWS, CArm
 from cathsim_dmc.imaging.device import device_attenuation, device_thickness
-from cathsim_dmc.imaging.fluoroscopy import Biplane, Fluoroscope, Masks, rgb
+from cathsim_dmc.imaging.fluoroscopy import Fluoroscope, Masks, rgb
 from cathsim_dmc.imaging.options import FluoroscopyOptions
 from cathsim_dmc.imaging.thickness import closed, surface_thickness
 
 __all__ = [
     "VIEWS",
     "Angiograph",
-    "Biplane",
     "CArm",
     "Deviation",
     "Fluoroscope",

@@ -272,43 +272,6 @@ class Fluoroscope:
         return thickness >= MASK_SHARE * 2.0 * radii[..., None, None]
 
 
-@dataclass(frozen=True, eq=False)
-class Biplane:
-    """Two C-arms that look at the same instant, as a two-channel image.
-
-    Attributes:
-        frontal, lateral: fluoroscopes of the same resolution.
-    """
-
-    frontal: Fluoroscope
-    lateral: Fluoroscope
-
-    def __post_init__(self) -> None:
-        shapes = self.frontal.carm.resolution, self.lateral.carm.resolution
-        if shapes[0] != shapes[1]:
-            raise ValueError(
-                f"the planes have {shapes[0]} and {shapes[1]} pixels; give both the "
-                "same resolution."
-            )
-
-    def render(
-        self,
-        points: ArrayLike,
-        radius: ArrayLike,
-        random_state: RandomStates | None = None,
-    ) -> np.ndarray:
-        """(..., rows, columns, 2) uint8: frontal, lateral; see `Fluoroscope.render`.
-
-        With noise and one random state, give one frame at a time or one state per
-        frame if a batch must equal its frames: the frontal plane draws first.
-        """
-        planes = [
-            plane.render(points, radius, random_state)
-            for plane in (self.frontal, self.lateral)
-        ]
-        return np.concatenate(planes, axis=-1)
-
-
 def rgb(image: ArrayLike) -> np.ndarray:
     """Grey images (..., rows, columns, 1) as (..., rows, columns, 3), for viewers."""
     image = np.asarray(image)

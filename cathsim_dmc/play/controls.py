@@ -2,8 +2,8 @@
 
 import numpy as np
 
-# Commands that act while they are held: axis of the hand and sign.
-_HELD = {
+# Commands that act while they are held: what they move, and sign.
+_STEERABLE = {
     "push": ("translation", 1.0),
     "pull": ("translation", -1.0),
     "right": ("bend_y", 1.0),
@@ -13,7 +13,7 @@ _HELD = {
     "turn_left": ("rotation", 1.0),
     "turn_right": ("rotation", -1.0),
 }
-# With coaxial devices the same hands hold another one: axis of the hand and sign.
+# The same with coaxial devices.
 _COAXIAL = {
     "push": ("catheter", 1.0),
     "pull": ("catheter", -1.0),
@@ -26,7 +26,7 @@ _COAXIAL = {
 }
 # Commands that act once.
 _ONCE = ("straight", "restart", "quit")
-COMMANDS = (*_HELD, *_ONCE)
+COMMANDS = (*_STEERABLE, *_ONCE)
 
 BEND_RATE = 1.0  # share of the full deflection per second while a key is held
 
@@ -40,13 +40,57 @@ COAXIAL_HELP = (
 )
 
 
-class CoaxialControls:
-    """What an operator's two hands hold: the innermost device and the outermost one.
+class _Keys:
+    """Commands that are held down, and those that were asked for once.
+
+    Attributes:
+      requested: "restart" or "quit" since the last `restart`, or None.
+    """
+
+    help = ""
+    _meaning: dict[str, tuple[str, float]] = {}
+
+    def __init__(self):
+        self._left: dict[str, float] = {}  # seconds for which a command still counts
+        self.requested: str | None = None
+
+    def press(self, command: str, hold: float = np.inf) -> None:
+        """Begins to hold a command, for `hold` seconds or until `release`."""
+        if command not in COMMANDS:
+            raise ValueError(f"no command {command!r}; there are {', '.join(COMMANDS)}")
+        if command in self._meaning:
+            self._left[command] = hold
+        elif command in ("restart", "quit"):
+            self.requested = command
+
+    def release(self, command: str) -> None:
+        """Ends a command."""
+        self._left.pop(command, None)
+
+    def restart(self) -> None:
+        """Ends all commands."""
+        self._left.clear()
+        self.requested = None
+
+    def _axes(self, duration: float) -> dict[str, float]:
+        """What is asked of each axis, in [-2, 2]; so many seconds pass."""
+        axes = dict.fromkeys((axis for axis, _ in self._meaning.values()), 0.0)
+        for command in self._left:
+            axis, sign = self._meaning[command]
+            axes[axis] += sign
+        rest = {command: left - duration for command, left in self._left.items()}
+        self._left = {command: left for command, left in rest.items() if left > 1e-9}
+        return axes
+
+
+class CoaxialControls(_Keys):
+    """Keys of the innermost and of the outermost of coaxial devices.
 
     One device alone is both.
     """
 
     help = COAXIAL_HELP
+    _meaning = _COAXIAL
 
     def __init__(self, devices: int):
         """Starts with nothing held.
@@ -54,78 +98,30 @@ class CoaxialControls:
         Args:
           devices: number of coaxial devices.
         """
+        super().__init__()
         self._devices = devices
-        self._held = _Held(_COAXIAL)
-        self.requested: str | None = None
-
-    def press(self, command: str, hold: float = np.inf) -> None:
-        """Begins to hold a command, for `hold` seconds or until `release`."""
-        if command not in COMMANDS:
-            raise ValueError(f"no command {command!r}; there are {', '.join(COMMANDS)}")
-        if command in _COAXIAL:
-            self._held.press(command, hold)
-        elif command in ("restart", "quit"):
-            self.requested = command
-
-    def release(self, command: str) -> None:
-        """Lets go of a command."""
-        self._held.release(command)
-
-    def restart(self) -> None:
-        """Lets go of everything."""
-        self._held.clear()
-        self.requested = None
 
     def action(self, duration: float) -> np.ndarray:
         """Action (2 K,) float64 of the next control step of a duration in seconds.
 
         float32 holds it exactly, as that of `Controls`.
         """
-        axes = self._held.axes(duration)
+        axes = self._axes(duration)
         action = np.zeros(2 * self._devices)
         action[:2] = axes["guidewire"], axes["guidewire_rotation"]
         action[-2:] += axes["catheter"], axes["catheter_rotation"]
         return np.clip(action, -1.0, 1.0)
 
 
-class _Held:
-    """Commands that are held down, and for how long they still count as held."""
-
-    def __init__(self, meaning: dict[str, tuple[str, float]]):
-        self._meaning = meaning
-        self._left: dict[str, float] = {}  # command -> seconds
-
-    def press(self, command: str, hold: float) -> None:
-        self._left[command] = hold
-
-    def release(self, command: str) -> None:
-        self._left.pop(command, None)
-
-    def clear(self) -> None:
-        self._left.clear()
-
-    def axes(self, duration: float) -> dict[str, float]:
-        """What is asked of each axis of the hands; so much time passes."""
-        axes = dict.fromkeys((axis for axis, _ in self._meaning.values()), 0.0)
-        for command in self._left:
-            axis, sign = self._meaning[command]
-            axes[axis] += sign
-        self._left = {
-            command: rest - duration
-            for command, rest in self._left.items()
-            if rest - duration > 1e-9
-        }
-        return axes
-
-
-class Controls:
-    """What an operator's hands hold: speeds while a key is down, a bend that stays.
+class Controls(_Keys):
+    """Keys of a steerable device: speeds while a key is held, a bend that stays.
 
     In the AP view, "right" bends the tip to the right of the image and "up" towards
     the observer, as long as the base is not rotated.
     """
 
     help = HELP
+    _meaning = _STEERABLE
 
     def __init__(self, tip_joints: int, rotation: bool):
         """Starts with nothing held and a straight tip.
@@ -134,32 +130,21 @@ class Controls:
           tip_joints: number of steerable joints of the device, two motors each.
           rotation: whether the action has a rotation.
         """
+        super().__init__()
         self._tip_joints = tip_joints
         self._has_rotation = rotation
-        self._held = _Held(_HELD)
         self._bend = np.zeros(2)
-        self.requested: str | None = None
 
     def press(self, command: str, hold: float = np.inf) -> None:
         """Begins to hold a command, for `hold` seconds or until `release`."""
-        if command not in COMMANDS:
-            raise ValueError(f"no command {command!r}; there are {', '.join(COMMANDS)}")
+        super().press(command, hold)
         if command == "straight":
             self._bend[:] = 0.0
-        elif command in _HELD:
-            self._held.press(command, hold)
-        else:
-            self.requested = command
-
-    def release(self, command: str) -> None:
-        """Lets go of a command."""
-        self._held.release(command)
 
     def restart(self) -> None:
-        """Lets go of everything and straightens the tip."""
-        self._held.clear()
+        """Ends all commands and straightens the tip."""
+        super().restart()
         self._bend[:] = 0.0
-        self.requested = None
 
     def action(self, duration: float) -> np.ndarray:
         """Action of the next control step of a duration in seconds.
@@ -168,7 +153,7 @@ class Controls:
           (A,) float64 that float32 holds exactly, so that a demonstration can be
           repeated through interfaces of single precision.
         """
-        axes = self._held.axes(duration)
+        axes = self._axes(duration)
         self._bend += BEND_RATE * duration * np.array([axes["bend_x"], axes["bend_y"]])
         np.clip(self._bend, -1.0, 1.0, out=self._bend)
         action = [*np.tile(self._bend, self._tip_joints), axes["translation"]]

@@ -20,7 +20,7 @@ _PAUSE = 1.0  # s, for which the end of an episode is shown
 
 
 class Session:
-    """Runs episodes at the pace of the clock, with a face and a pair of hands."""
+    """Runs episodes in a window at the pace of the clock, by keyboard or policy."""
 
     def __init__(
         self,
@@ -58,8 +58,8 @@ class Session:
         self._policy = policy and in_environment(policy, self._environment)
         self._task_name, self._seed, self._speed = task, seed, speed
         navigation = self._environment.task
-        self._controls = _hands(navigation.scene)
-        self._face = _face(mode, navigation, self._controls)
+        self._controls = _controls_of(navigation.scene)
+        self._window = _window(mode, navigation, self._controls)
         self._next = time.monotonic()
 
     def run(self, out: Path | None = None, episodes: int | None = None) -> list[Path]:
@@ -81,28 +81,28 @@ class Session:
             while episodes is None or played < episodes:
                 self._controls.restart()
                 self._next = time.monotonic()
-                episode = recorder.record_episode(self._hand, self._seed + played)
+                episode = recorder.record_episode(self._act, self._seed + played)
                 played += 1
                 if out is not None and episode.steps:
                     written.append(_save(episode, Path(out)))
                 if self._quits():
                     break
-                self._farewell(episode)
+                self._show_end(episode)
         finally:
-            self._face.close()
+            self._window.close()
         return written
 
-    def _hand(self, timestep: Any) -> np.ndarray:
-        """The operator, or the policy watched; stops the episode when asked to."""
-        self._face.open(self._environment.physics)
-        self._face.show(self._environment.task)
+    def _act(self, timestep: Any) -> np.ndarray:
+        """Action of the operator or of the policy; StopIteration when asked to stop."""
+        self._window.open(self._environment.physics)
+        self._window.show(self._environment.task)
         self._next += CONTROL_TIMESTEP / self._speed
         while (left := self._next - time.monotonic()) > 0:
-            self._face.poll()
+            self._window.poll()
             time.sleep(min(left, 0.005))
         # A machine that cannot keep pace runs slower and does not catch up later.
         self._next = max(self._next, time.monotonic() - CONTROL_TIMESTEP)
-        self._face.poll()
+        self._window.poll()
         if self._quits() or self._controls.requested == "restart":
             raise StopIteration
         if self._policy is not None:
@@ -110,27 +110,27 @@ class Session:
         return self._controls.action(CONTROL_TIMESTEP)
 
     def _quits(self) -> bool:
-        return self._face.closed or self._controls.requested == "quit"
+        return self._window.closed or self._controls.requested == "quit"
 
-    def _farewell(self, episode: Episode):
+    def _show_end(self, episode: Episode):
         if self._controls.requested == "restart":
             return
         text = f"{episode.termination} after {episode.time[-1]:.1f} s"
         until = time.monotonic() + _PAUSE / self._speed
         while time.monotonic() < until and not self._quits():
-            self._face.show(self._environment.task, text)
-            self._face.poll()
+            self._window.show(self._environment.task, text)
+            self._window.poll()
             time.sleep(0.02)
 
 
-def _hands(scene: Scene) -> Controls | CoaxialControls:
+def _controls_of(scene: Scene) -> Controls | CoaxialControls:
     catheter = scene.catheter
     if scene.coaxial:
         return CoaxialControls(len(catheter.devices))
     return Controls(len(catheter.tip_motors) // 2, catheter.rotation is not None)
 
 
-def _face(mode: str, task: Any, controls: Controls | CoaxialControls):
+def _window(mode: str, task: Any, controls: Controls | CoaxialControls):
     if mode == "viewer":
         from cathsim_dmc.play.viewer import MujocoViewer
 

@@ -101,7 +101,7 @@ class MujocoViewer:
         return self._viewer is not None and not self._viewer.is_running()
 
     def poll(self) -> None:
-        """Takes the keys pressed since the last call."""
+        """Reads the keys pressed since the last call."""
         with self._lock:
             pressed, self._pressed = self._pressed, []
         for command in pressed:

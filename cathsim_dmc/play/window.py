@@ -112,7 +112,7 @@ class FluoroscopyWindow:
         self.closed = True
 
     def poll(self) -> None:
-        """Takes the keys pressed since the last call."""
+        """Reads the keys pressed since the last call."""
         self._root.update()
         for command, when in list(self._released.items()):
             if time.monotonic() - when > _REPEAT:

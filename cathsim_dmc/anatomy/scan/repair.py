@@ -21,9 +21,9 @@ from cathsim_dmc.anatomy.scan.topology import (
     without_slivers,
 )
 
-CRUMB = 0.03  # of the surface's area: smaller separate parts are dropped
-CRUMB_WIDTH = 12e-3  # m, and if they are not wider
-CROWDED = 0.01  # of the triangles: more around crowded edges are not mended
+PART_AREA = 0.03  # of the surface's area: smaller separate parts are dropped
+PART_WIDTH = 12e-3  # m, and if they are not wider
+NON_MANIFOLD = 0.01  # of the triangles: more at non-manifold edges are not mended
 HOLE = 8e-3  # m, widest hole in the side of a vessel that is filled
 SPIKE = 4e-3  # m, widest patch around a self-intersection that is cut out
 END = 0.55  # largest |cosine| between an end's axis and the normals around it
@@ -77,9 +77,9 @@ def mend(name: str, vertices: np.ndarray, faces: np.ndarray) -> Mended:
     work.merge()
     work.keep_one_part()
     work.decimate()
-    work.uncrowd()
-    work.turn_alike()
-    work.take_lumen()
+    work.cut_non_manifold()
+    work.orient()
+    work.keep_inner_surface()
     work.close()
     work.keep_one_part(quiet=True)
     work.turn_outwards()
@@ -125,7 +125,8 @@ class _Work:
         area = areas(self.vertices, self.faces)
         share = np.bincount(label, area) / area.sum()
         large = np.flatnonzero(
-            (share > CRUMB) | (widths(self.vertices, self.faces, label) > CRUMB_WIDTH)
+            (share > PART_AREA)
+            | (widths(self.vertices, self.faces, label) > PART_WIDTH)
         )
         if len(large) == 2 and not quiet:
             inner = inner_shell(self.vertices, *(self.faces[label == k] for k in large))
@@ -146,7 +147,7 @@ class _Work:
         if len(share) > 1:
             if not quiet:
                 self._notes.append(
-                    f"{len(share) - 1} crumbs beside the lumen dropped "
+                    f"{len(share) - 1} small parts beside the lumen dropped "
                     f"({100 * (1 - share[large[0]]):.2g} % of the area)"
                 )
             self._keep(label == large[0])
@@ -175,17 +176,17 @@ class _Work:
         )
         self.vertices, self.faces = points, faces
 
-    def uncrowd(self) -> None:
-        """Cut out the triangles around edges that more than two triangles share."""
+    def cut_non_manifold(self) -> None:
+        """Cuts out the triangles at edges that more than two triangles share."""
         first = None
         for _ in range(ROUNDS):
             edges, times = edge_counts(self.faces)
-            crowded = edges[times > 2]
-            if not len(crowded):
+            shared = edges[times > 2]
+            if not len(shared):
                 break
-            bad = np.asarray(np.isin(self.faces, crowded).any(axis=1))
-            first = first or (len(crowded), self.vertices[crowded[0, 0]])
-            if bad.sum() > max(CROWDED * len(self.faces), 40):
+            bad = np.asarray(np.isin(self.faces, shared).any(axis=1))
+            first = first or (len(shared), self.vertices[shared[0, 0]])
+            if bad.sum() > max(NON_MANIFOLD * len(self.faces), 40):
                 raise ValueError(
                     f"{self.name} has {first[0]} edges shared by more than two "
                     f"triangles, one at {_mm(first[1])} mm, too many to mend: parts "
@@ -198,15 +199,15 @@ class _Work:
                 f"{first[0]} edges shared by more than two triangles, near "
                 f"{_mm(first[1])} mm: the triangles around them cut out"
             )
-            self._drop_flakes()
+            self._drop_small_parts()
 
-    def _drop_flakes(self) -> None:
+    def _drop_small_parts(self) -> None:
         label = parts(self.faces, len(self.vertices))
         share = np.bincount(label, areas(self.vertices, self.faces))
-        self._keep(np.isin(label, np.flatnonzero(share > CRUMB * share.sum())))
+        self._keep(np.isin(label, np.flatnonzero(share > PART_AREA * share.sum())))
 
-    def turn_alike(self) -> None:
-        """Give neighbouring triangles the same orientation."""
+    def orient(self) -> None:
+        """Gives neighbouring triangles the same orientation."""
         turned = turned_faces(self.faces)
         if turned is None:
             raise ValueError(
@@ -218,14 +219,14 @@ class _Work:
             self._notes.append(f"{int(turned.sum())} flipped triangles turned")
             self.faces = np.where(turned[:, None], self.faces[:, ::-1], self.faces)
 
-    def take_lumen(self) -> None:
-        """The inner surface of a wall whose surfaces hang together at open ends."""
+    def keep_inner_surface(self) -> None:
+        """Keeps the inner surface of a wall that is open at its ends."""
         inner = lumen_of_wall(self.vertices, self.faces)
         if inner is not None:
             self._notes.append("thick wall: its inner surface taken as the lumen")
             self._keep(inner)
             self.faces = self.faces[:, ::-1]
-            self._drop_flakes()
+            self._drop_small_parts()
 
     def close(self) -> None:
         """Cap the ends of vessels and fill small holes."""
@@ -302,7 +303,7 @@ class _Work:
             where = self.vertices[edges[0, 0]]
             first = first or (len(np.unique(faces)), where)
             patch = self._widest_patch(tangled)
-            if patch > SPIKE or tangled.mean() > CROWDED:
+            if patch > SPIKE or tangled.mean() > NON_MANIFOLD:
                 raise ValueError(
                     f"{self.name} intersects itself: {first[0]} triangles, one at "
                     f"{_mm(where)} mm, are pierced by others. Smooth or remesh that "
@@ -310,8 +311,8 @@ class _Work:
                 )
             touched = np.isin(self.faces, self.faces[tangled]).any(axis=1)
             self._keep(np.asarray(~touched))
-            self._drop_flakes()
-            self.uncrowd()
+            self._drop_small_parts()
+            self.cut_non_manifold()
             self.close()
         else:
             assert first is not None  # every round has found some
