@@ -9,13 +9,14 @@ from collections.abc import Callable
 import numba
 
 
-def compiled(function: Callable) -> Callable:
+def compiled(function: Callable, cache: bool = True) -> Callable:
     """Compiles a function, once on each machine where there is a place to keep it.
 
-    Without `fastmath`: the same numbers bit for bit, alone and in a batch.
+    Without `fastmath`: the same numbers bit for bit, alone and in a batch. A function
+    that refers to others which change from call to call must not be kept (`cache`).
     """
     options = {"nogil": True, "error_model": "numpy"}
     try:
-        return numba.njit(function, cache=True, **options)
+        return numba.njit(function, cache=cache, **options)
     except RuntimeError:  # neither this folder nor the user's can be written to
         return numba.njit(function, **options)

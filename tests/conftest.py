@@ -61,7 +61,8 @@ def assert_wall_fits(anatomy, rays=10_000):
 
 def begin_dumped(environment, meta, state):
     """Puts an environment to where the episode of a dump begins."""
-    environment.task.rollout.take(0, Episode.from_motion(meta["drawn"]))
+    episode = Episode.from_motion(meta["drawn"])
+    environment.task.rollout.take(0, episode, environment.random_state)
     model, data = environment.physics.model.ptr, environment.physics.data.ptr
     mujoco.mj_setState(model, data, state, mujoco.mjtState.mjSTATE_INTEGRATION)
 

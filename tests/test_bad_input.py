@@ -46,6 +46,7 @@ TASK = {
     "reward": options() | NONE,
     "start_along_route": span(0, 0.95),
     "devices": st.sampled_from(["x", 1, [], [1], (None,), {}, ["x"], True]),
+    "effects": st.sampled_from(["x", 1, [1], [None], {}, True, None]),
     "lead": number(0, 0.3),
     "lumen_friction": number(0, 2),
     "random": whole(0, 2**32 - 1, optional=True),

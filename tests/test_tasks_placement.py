@@ -15,6 +15,8 @@ from cathsim_dmc.anatomy import phantoms
 from cathsim_dmc.anatomy.arch import arch
 from cathsim_dmc.anatomy.parts import Inlet
 from cathsim_dmc.entities import devices
+from cathsim_dmc.entities.catheter import Catheter
+from cathsim_dmc.entities.robot import Robot
 from cathsim_dmc.physics import readings
 from cathsim_dmc.simulation.batch import BatchSimulation
 from cathsim_dmc.tasks import placement
@@ -208,17 +210,14 @@ def test_insertion_is_what_the_base_has_moved(shared_environment):
     assert (now.head - start.head) @ axis == pytest.approx(moved, abs=3e-4)
 
 
-@pytest.mark.parametrize(
-    ("scopes", "message"),
-    [
-        (("guidewire", "robot"), "guidewire/link_0"),
-        (("catheter", "arm"), "joint named 'arm/"),
-    ],
-)
-def test_a_model_without_the_names(shared_environment, scopes, message):
-    model = shared_environment("type1_bca").physics.model.ptr
-    with pytest.raises(ValueError, match=message):
-        readings.ModelIndex(model, *scopes)
+def test_a_model_without_the_elements(shared_environment):
+    environment = shared_environment("type1_bca")
+    model, scene = environment.physics.model.ptr, environment.task.scene
+    strangers = Catheter(), Robot()
+    with pytest.raises(ValueError, match="joint named 'insertion'"):
+        readings.ModelIndex(model, strangers[0], scene.robot)
+    with pytest.raises(ValueError, match="joint named 'front"):
+        readings.ModelIndex(model, scene.catheter, strangers[1])
 
 
 @pytest.mark.slow

@@ -1,5 +1,7 @@
 """Domain randomisation: what is drawn, and what it does to the model."""
 
+import types
+
 import numpy as np
 import pytest
 from conftest import twin
@@ -8,9 +10,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from cathsim_dmc import suite
+from cathsim_dmc.physics.delay import ActionDelay
 from cathsim_dmc.physics.randomisation import (
     DEFAULT_RANGES,
-    ActionDelay,
     Episode,
     Randomisation,
     start_displacement,
@@ -198,16 +200,22 @@ def test_a_shifted_goal_moves_along_its_branch():
 )
 def test_actions_arrive_as_late_as_drawn(delays, actions):
     count = len(delays)
-    way = ActionDelay(count, 1, longest=4)
+    way = ActionDelay(longest=4)
+    chain = types.SimpleNamespace(action_names=("push",))
+    way.bind(types.SimpleNamespace(chain=chain, num_simulations=count))
+
+    def restart(index, delay):
+        way.restart(index, Episode(np.zeros(3), delay=delay), np.random.RandomState())
+
     for index, delay in enumerate(delays):
-        way.restart(index, delay)
+        restart(index, delay)
     sent = [np.full((count, 1), a) for a in actions]
-    arrived = [way.delayed(a).copy() for a in sent]
+    arrived = [way.act(a, None).copy() for a in sent]
     for index, delay in enumerate(delays):
         expected = ([0.0] * delay + actions)[: len(actions)]
         assert [float(a[index, 0]) for a in arrived] == expected
-    way.restart(0, 1)
-    assert way.delayed(np.ones((count, 1)))[0, 0] == 0.0
+    restart(0, 1)
+    assert way.act(np.ones((count, 1)), None)[0, 0] == 0.0
 
 
 def test_delayed_device_does_later_what_it_does_at_once(make):

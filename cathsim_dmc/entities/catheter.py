@@ -165,6 +165,11 @@ class Catheter(Chain):
         return self._device.linear_density / (np.pi * radius**2)
 
     @property
+    def hinges(self) -> tuple:
+        """Hinges that stand for the bending and torsion of the rod."""
+        return (*self.bends, *self._twists)
+
+    @property
     def tip_motors(self) -> tuple:
         """Motors of the tip from proximal to distal, x before y."""
         return tuple(self._tip_motors)

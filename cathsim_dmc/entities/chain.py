@@ -49,7 +49,12 @@ class Chain(composer.Entity):
 
     The origin of the entity is the position of the distal end at zero insertion.
     `Catheter` and `DeviceStack` define the properties of the links.
+
+    Attributes:
+        coaxial: Whether the devices are coaxial ones, each moved by itself.
     """
+
+    coaxial = False
 
     def _assemble(
         self,
@@ -259,8 +264,9 @@ class Chain(composer.Entity):
 
     def _build_sensors(self):
         grip = self._links[0].add("site", name="grip", size=[1e-3], group=4)
-        self._mjcf_root.sensor.add("force", name="push_force", site=grip)
-        self._mjcf_root.sensor.add("torque", name="push_torque", site=grip)
+        sensors = self._mjcf_root.sensor
+        self._push_force = sensors.add("force", name="push_force", site=grip)
+        self._push_torque = sensors.add("torque", name="push_torque", site=grip)
 
     @property
     def mjcf_model(self) -> mjcf.RootElement:
@@ -306,6 +312,21 @@ class Chain(composer.Entity):
     def bends(self) -> tuple:
         """Bending hinges from proximal to distal, x before y."""
         return tuple(self._bends)
+
+    @property
+    def hinges(self) -> tuple:
+        """Hinges that stand for the bending and torsion of the rod."""
+        return self.bends
+
+    @property
+    def push_force(self):
+        """Sensor of the force on the base."""
+        return self._push_force
+
+    @property
+    def push_torque(self):
+        """Sensor of the torque on the base."""
+        return self._push_torque
 
     @property
     def tip_motors(self) -> tuple:

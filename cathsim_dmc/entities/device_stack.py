@@ -29,6 +29,8 @@ class DeviceStack(Chain):
     entries for each device, from the innermost outwards: translation and rotation.
     """
 
+    coaxial = True
+
     def _build(
         self,
         devices: Sequence[str | Device] = ("wire_035_glide", "berenstein_5f"),

@@ -91,7 +91,7 @@ class Phantom(composer.Entity):
             type="mesh", **wall_contact(self._friction), mass=0, group=3
         )
         for index, piece in enumerate(self._anatomy.wall):
-            name = f"wall_{index:03d}"
+            name = piece_name(index)
             mesh = self._mjcf_root.asset.add(
                 "mesh", name=name, dclass=shared, file=_mesh_file(piece)
             )
@@ -134,6 +134,11 @@ class Phantom(composer.Entity):
     def goals(self) -> dict:
         """Goal sites by name."""
         return self._goals
+
+
+def piece_name(index: int) -> str:
+    """Name of a wall piece in the model."""
+    return f"wall_{index:03d}"
 
 
 def _mesh_file(vertices: np.ndarray, faces: np.ndarray | None = None) -> mjcf.Asset:

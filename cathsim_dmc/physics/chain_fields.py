@@ -11,6 +11,7 @@ import numpy as np
 from cathsim_dmc.entities.chain import BENDING_RELAXATION_TIME
 from cathsim_dmc.entities.coaxial import Links, Overlap
 from cathsim_dmc.entities.device_stack import DeviceStack
+from cathsim_dmc.physics.readings import ids
 
 # Fields of the model that change as the devices slide. The constants that MuJoCo
 # derives from masses (`body_invweight0`, ...) stay those of the start: the armature of
@@ -33,38 +34,20 @@ FIELDS = (
 class ChainFields:
     """Places in a model of what changes as the devices slide."""
 
-    def __init__(self, model: mujoco.MjModel, scope: str):
-        """Finds the elements of the chain.
+    def __init__(self, model: mujoco.MjModel, chain: DeviceStack):
+        """Finds the elements of the chain in a compiled model."""
+        from cathsim_dmc.physics import sliding_loops  # late, as it takes long
 
-        Args:
-          model: the compiled model.
-          scope: MJCF scope of the chain.
-        """
-        from cathsim_dmc.physics import (
-            sliding_loops as coaxial_loops,  # late, as it takes long
-        )
-
-        self._write = coaxial_loops.write
-        bodies = [
-            body
-            for body in range(model.nbody)
-            if model.body(body).name.startswith(f"{scope}/link_")
-        ]
-        joints = [
-            joint
-            for joint in range(model.njnt)
-            if model.joint(joint).name.startswith(f"{scope}/bend_")
-        ]
+        self._write = sliding_loops.write
+        bodies, joints = ids(model, chain.links), ids(model, chain.bends)
         places = [joints, model.jnt_dofadr[joints], model.jnt_qposadr[joints]]
         # Both kinds of elements follow each other, from proximal to distal.
         if any((np.diff(each) != 1).any() for each in [bodies, *places]):
-            raise ValueError(f"the links of {scope!r} do not follow each other")
+            raise ValueError(f"the links of {chain!r} do not follow each other")
         self._hinges = np.array([each[0] for each in places], dtype=np.intp)
-        self._body = bodies[0]
-        count = len(bodies)
-        geoms = [model.geom(f"{scope}/link_{link}").id for link in range(count)]
-        self._geoms = np.array(geoms, dtype=np.intp)
-        self._half_lengths = model.geom_size[geoms, 1].copy()
+        self._body = int(bodies[0])
+        self._geoms = ids(model, chain.link_geoms).astype(np.intp)
+        self._half_lengths = model.geom_size[self._geoms, 1].copy()
         # MuJoCo orders the axes of inertia in its own way.
         self._axes = model.body_inertia[bodies].argmin(axis=-1)
 
@@ -166,4 +149,4 @@ def write_still(
     overlap = entity.stack.overlap(gaps[None])
     made = made_of(entity, overlap, turns, np.array([entity.friction]), np.ones(1))
     arrays = [getattr(model, name) for name in FIELDS]
-    ChainFields(model, entity.mjcf_model.model).write(arrays, made, 0)
+    ChainFields(model, entity).write(arrays, made, 0)

@@ -227,17 +227,18 @@ def call_error(_, address, text, number):
     return types.void(types.int64, types.int64, types.int32), generate
 
 
-def callback(signature: str) -> Callable:
+def callback(signature: str, cache: bool = True) -> Callable:
     """Compiles a function that C calls, once on each machine as `compiled` does.
 
     Args:
       signature: numba's, such as "void(int64, int64)"; a pointer is an int64.
+      cache: Whether it is kept on disk.
     """
 
     def decorate(function: Callable):
         options = {"nopython": True, "error_model": "numpy"}
         try:
-            return cfunc(signature, cache=True, **options)(function)
+            return cfunc(signature, cache=cache, **options)(function)
         except RuntimeError:  # neither this folder nor the user's can be written to
             return cfunc(signature, **options)(function)
 

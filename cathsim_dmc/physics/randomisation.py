@@ -1,7 +1,8 @@
 """Domain randomisation: what differs from episode to episode, drawn from one source.
 
-Composer and the batched path draw the same `Episode` in the same order and write it
-to fields of the compiled model, so nothing is compiled again.
+Composer and the batched path draw the same `Episode` in the same order;
+`RandomisedModel` writes it to fields of the compiled model, so nothing is compiled
+again.
 """
 
 import dataclasses
@@ -15,6 +16,8 @@ from dm_control.composer.variation import distributions
 
 from cathsim_dmc import bounds
 from cathsim_dmc.imaging.angiograph import Deviation
+from cathsim_dmc.physics.effects import Effect, World
+from cathsim_dmc.physics.readings import ids
 
 # Published: radius of the ball of the random displacement of the tip.
 START_JITTER = 1e-3  # m
@@ -222,91 +225,67 @@ class Episode:
         return cls(displacement=np.zeros(3), **given)
 
 
-class ModelVariation:
-    """Writes an episode to the fields of a compiled model that it changes."""
+class RandomisedModel(Effect):
+    """Friction, stiffness and roll of the device as drawn for each episode."""
 
-    def __init__(
-        self,
-        model: mujoco.MjModel,
-        randomisation: Randomisation,
-        catheter: str,
-        walls: bool = True,
-    ):
-        """Finds the elements.
-
-        Args:
-          model: the compiled model, as it is without randomisation.
-          randomisation: which fields will change.
-          catheter: MJCF scope of the catheter.
-          walls: whether the friction drawn is that of the walls too.
-        """
-
-        def named(kind: str, count: int, *prefixes: str) -> np.ndarray:
-            accessor = getattr(model, kind)
-            return np.array(
-                [i for i in range(count) if accessor(i).name.startswith(prefixes)],
-                dtype=int,
-            )
-
-        rubbing = (f"{catheter}/", "wall_") if walls else (f"{catheter}/",)
-        self._geoms = named("geom", model.ngeom, *rubbing)
-        self._hinges = named(
-            "joint", model.njnt, f"{catheter}/bend_", f"{catheter}/twist_"
-        )
-        self._dofs = model.jnt_dofadr[self._hinges]
-        self._motors = named("actuator", model.nu, f"{catheter}/tip_")
-        self._base = model.body(f"{catheter}/link_0").id
-        self.fields = self.fields_of(randomisation)
-        self._nominal = {field: getattr(model, field).copy() for field in self.fields}
-
-    @staticmethod
-    def fields_of(randomisation: Randomisation) -> tuple[str, ...]:
-        """Names of the fields of the model that a randomisation changes."""
-        fields = []
+    def __init__(self, randomisation: Randomisation):
+        """Names the fields of the model that the randomisation changes."""
+        fields, drawn = [], []
         if randomisation.friction is not None:
-            fields += ["geom_friction"]
+            drawn, fields = ["friction"], ["geom_friction"]
         if randomisation.stiffness is not None:
+            drawn.append("stiffness")
             fields += ["jnt_stiffness", "dof_damping", "actuator_gainprm"]
         if randomisation.roll is not None:
-            fields += ["body_quat"]
-        return tuple(fields)
+            drawn.append("roll")
+            fields.append("body_quat")
+        self.model_fields = tuple(fields)
+        self._drawn = drawn
 
-    def write(self, arrays: Mapping[str, np.ndarray], episode: Episode) -> None:
-        """Writes to `arrays`, live fields `self.fields` of one simulation's model."""
-        if episode.friction is not None:
-            arrays["geom_friction"][self._geoms, 0] = episode.friction
-        if episode.stiffness is not None:
-            for field, where in (
+    def bind(self, world: World) -> None:
+        """Finds the elements in the model, as it is without randomisation."""
+        super().bind(world)
+        model, chain = world.model, world.chain
+        self._nominal = {
+            name: getattr(model, name).copy() for name in self.model_fields
+        }
+        self._geoms = np.concatenate([world.index.walls, world.index.geoms])
+        self._hinges = ids(model, chain.hinges)
+        self._dofs = model.jnt_dofadr[self._hinges]
+        self._motors = ids(model, chain.tip_motors)
+        self._base = world.index.links.start
+        self._state = {name: np.zeros(world.num_simulations) for name in self._drawn}
+
+    def restart(
+        self, index: int, episode: Episode, random_state: np.random.RandomState
+    ) -> None:
+        """Writes what was drawn into the model of one simulation."""
+        for name, values in self._state.items():
+            values[index] = getattr(episode, name)
+        self.refresh(index)
+
+    @property
+    def state(self) -> dict[str, np.ndarray]:
+        """What was drawn."""
+        return self._state
+
+    def refresh(self, index: int) -> None:
+        """Writes the model of one simulation."""
+        field = self.world.field
+        if (friction := self._state.get("friction")) is not None:
+            field(index, "geom_friction")[self._geoms, 0] = friction[index]
+        if (stiffness := self._state.get("stiffness")) is not None:
+            for name, where in (
                 ("jnt_stiffness", self._hinges),
                 ("dof_damping", self._dofs),
                 ("actuator_gainprm", (self._motors, 0)),
             ):
-                arrays[field][where] = self._nominal[field][where] * episode.stiffness
-        if episode.roll is not None:
-            half = episode.roll / 2
+                field(index, name)[where] = (
+                    self._nominal[name][where] * stiffness[index]
+                )
+        if (roll := self._state.get("roll")) is not None:
+            half = roll[index] / 2
             turn = np.array([np.cos(half), 0.0, 0.0, np.sin(half)])
             quaternion = np.empty(4)
             mujoco.mju_mulQuat(quaternion, self._nominal["body_quat"][self._base], turn)
-            arrays["body_quat"][self._base] = quaternion
-
-
-class ActionDelay:
-    """Commands of N simulations on their way to the drives."""
-
-    def __init__(self, num_simulations: int, num_actions: int, longest: int):
-        """Starts without delay; `longest` bounds the delays, control steps."""
-        self._past = np.zeros((longest + 1, num_simulations, num_actions))
-        self._delay = np.zeros(num_simulations, dtype=int)
-
-    def restart(self, index: int, delay: int) -> None:
-        """Begins an episode of one simulation, with drives at rest."""
-        self._past[:, index] = 0.0
-        self._delay[index] = delay
-
-    def delayed(self, action: np.ndarray) -> np.ndarray:
-        """Takes the action (N, A) of this step, returns the one that takes effect."""
-        if len(self._past) == 1:
-            return action
-        self._past = np.roll(self._past, 1, axis=0)
-        self._past[0] = action
-        return self._past[self._delay, np.arange(len(self._delay))]
+            field(index, "body_quat")[self._base] = quaternion

@@ -7,12 +7,14 @@ then takes them, step after step. Every array of the result has the leading axes
 source, written `...` below.
 """
 
-from typing import NamedTuple
+from collections.abc import Sequence
+from typing import Any, NamedTuple
 
 import mujoco
 import numpy as np
 
-from cathsim_dmc.entities.robot import JOINTS
+from cathsim_dmc.entities.chain import Chain
+from cathsim_dmc.entities.robot import Robot
 from cathsim_dmc.physics import forces
 
 
@@ -120,45 +122,39 @@ class ModelIndex:
         "sensordata",
     )
 
-    def __init__(self, model: mujoco.MjModel, catheter: str, robot: str):
-        """Finds the quantities by name.
+    def __init__(self, model: mujoco.MjModel, chain: Chain, robot: Robot):
+        """Finds the elements of the entities.
 
         Args:
           model: the compiled model.
-          catheter: MJCF scope of the catheter, such as "catheter".
-          robot: MJCF scope of the follower robot.
+          chain: entity of the devices.
+          robot: entity of the follower robot.
 
         Raises:
-          ValueError: if the model lacks one of the names.
+          ValueError: if the model lacks one of the elements.
         """
-        links = [
-            body
-            for body in range(model.nbody)
-            if model.body(body).name.startswith(f"{catheter}/link_")
-        ]
-        if not links:
-            raise ValueError(f"the model has no body named {catheter}/link_0")
-        joints = [
-            joint for joint in range(model.njnt) if model.jnt_bodyid[joint] in links
-        ]
-        self.links = _as_slice(links)
+        joints = ids(model, chain.joints)
+        self.links = _as_slice(ids(model, chain.links))
+        self.geoms = ids(model, chain.link_geoms)
+        # What touches the device and belongs to the world itself is the wall.
+        world = (model.geom_bodyid == 0) & (model.geom_contype != 0)
+        self.walls = np.flatnonzero(world)
         self.qpos = _as_slice(model.jnt_qposadr[joints])
         self.dofs = _as_slice(model.jnt_dofadr[joints])
-        insertion = _id(model, mujoco.mjtObj.mjOBJ_JOINT, f"{catheter}/insertion")
-        self.insertion_qpos = int(model.jnt_qposadr[insertion])
-        rotation = mujoco.mj_name2id(
-            model, mujoco.mjtObj.mjOBJ_JOINT, f"{catheter}/rotation"
-        )
-        self.rotation_qpos = None if rotation < 0 else int(model.jnt_qposadr[rotation])
-        follower = [
-            _id(model, mujoco.mjtObj.mjOBJ_JOINT, f"{robot}/{joint.name}")
-            for joint in JOINTS
-        ]
+        # (n - 1, 2), of the hinges about x and y.
+        self.bends_qpos = model.jnt_qposadr[ids(model, chain.bends)].reshape(-1, 2)
+        (self.insertion_qpos,) = model.jnt_qposadr[
+            ids(model, [chain.insertion])
+        ].tolist()
+        self.rotation_qpos: int | None = None
+        if chain.rotation is not None:
+            (rotation,) = ids(model, [chain.rotation])
+            self.rotation_qpos = int(model.jnt_qposadr[rotation])
         # Whole numbers of the size that numpy indexes with: others are cast each time.
-        self.robot_qpos = model.jnt_qposadr[follower].astype(np.intp)
-        self.head_site = _id(model, mujoco.mjtObj.mjOBJ_SITE, f"{catheter}/head")
-        self.push_force = _sensor(model, f"{catheter}/push_force")
-        self.push_torque = _sensor(model, f"{catheter}/push_torque")
+        self.robot_qpos = model.jnt_qposadr[ids(model, robot.joints)].astype(np.intp)
+        (self.head_site,) = ids(model, [chain.head]).tolist()
+        self.push_force = _sensor(model, chain.push_force.full_identifier)
+        self.push_torque = _sensor(model, chain.push_torque.full_identifier)
         self.load_cell = _sensor(model, "load_cell")
         self.wall_contacts = wall_contacts(model)
 
@@ -203,6 +199,20 @@ class ModelIndex:
 def wall_contacts(model: mujoco.MjModel) -> slice:
     """Place in `sensordata` of what the device does to the wall."""
     return _sensor(model, "wall_contacts")
+
+
+def ids(model: mujoco.MjModel, elements: Sequence[Any]) -> np.ndarray:
+    """Numbers (n,) of MJCF elements in a compiled model.
+
+    Raises:
+      ValueError: if the model lacks one of them.
+    """
+    kinds = mujoco.mjtObj.__members__
+    found = [
+        _id(model, kinds[f"mjOBJ_{each.spec.namespace.upper()}"], each.full_identifier)
+        for each in elements
+    ]
+    return np.array(found, dtype=int)
 
 
 def _id(model: mujoco.MjModel, kind: mujoco.mjtObj, name: str) -> int:

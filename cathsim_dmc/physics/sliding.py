@@ -8,19 +8,20 @@ saved, dumped and replayed.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import mujoco
 import numpy as np
 
-from cathsim_dmc.entities.chain import MAX_PUSH_SPEED, MAX_ROTATION_SPEED
+from cathsim_dmc.entities.chain import MAX_PUSH_SPEED, MAX_ROTATION_SPEED, Chain
 from cathsim_dmc.entities.coaxial import Overlap
 from cathsim_dmc.entities.device_stack import DeviceStack
 from cathsim_dmc.entities.robot import follower_posture
 from cathsim_dmc.imaging.device import Shadow
-from cathsim_dmc.physics.chain_fields import FIELDS, ChainFields, made_of
-from cathsim_dmc.physics.readings import ModelIndex, Readings
+from cathsim_dmc.physics.chain_fields import FIELDS, ChainFields, made_of, write_still
+from cathsim_dmc.physics.effects import Effect, World
+from cathsim_dmc.physics.randomisation import Episode
+from cathsim_dmc.physics.readings import Readings
 from cathsim_dmc.physics.stepper import CONTROL_TIMESTEP
 
 # Where points of a device are tracked, m from its end.
@@ -56,98 +57,127 @@ class CoaxialReadings(NamedTuple):
     lumen_friction: np.ndarray
 
 
-class State(Protocol):
-    """The arrays of the simulations that coaxial devices read; see `FIELDS_READ`."""
+class SingleDevice(Effect):
+    """One device, whose own motors move it."""
 
-    qpos: np.ndarray
-    userdata: np.ndarray
-    cfrc_int: np.ndarray
+    def __init__(self, chain: Chain):
+        """Takes the entity of the device."""
+        self._radius = chain.device.outer_radius
 
+    def settle(self, model: mujoco.MjModel) -> None:
+        """Writes into a model what the chain is made of at the start."""
 
-# Fields of `mujoco.MjData` beside `ModelIndex.FIELDS`, for a batch to bind beforehand.
-FIELDS_READ = ("userdata", "cfrc_int")
+    def follower_posture(self) -> np.ndarray:
+        """Joints (N, len(JOINTS)) of the robot that holds the devices."""
+        index, qpos = self.world.index, self.world.arrays.qpos
+        turned = 0.0 if index.rotation_qpos is None else qpos[:, index.rotation_qpos]
+        return follower_posture(qpos[:, index.insertion_qpos], turned)
 
-
-def user_data(stack: DeviceStack) -> int:
-    """Numbers of `userdata` that the devices take: insertions, rotations of nodes."""
-    return len(stack.devices) * (1 + len(stack.stack.nodes))
-
-
-class CoaxialDevices:
-    """The devices of N simulations."""
-
-    def __init__(
-        self,
-        stack: DeviceStack,
-        model: mujoco.MjModel,
-        index: ModelIndex,
-        state: State,
-        field: Callable[[int, str], np.ndarray],
-        start_depth: float,
-        num_simulations: int,
-    ):
-        """Finds the places; no episode has begun yet.
+    def shadows(self, line: np.ndarray) -> list[Shadow]:
+        """The devices as X-rays meet them, from the innermost outwards.
 
         Args:
-          stack: entity of the devices.
-          model: the compiled model.
-          index: places of the task's quantities in it.
-          state: arrays of the simulations.
-          field: gives a field of the model of one simulation, to be written.
-          start_depth: way of the chain's end past the mouth of the sheath at zero
-            insertion, m.
-          num_simulations: N.
+          line: (N, L + 1, 3), `Readings.centreline`.
         """
-        from cathsim_dmc.physics import (
-            sliding_loops as coaxial_loops,  # late, as it takes long
-        )
+        return [Shadow(line, self._radius)]
 
-        self._loops = coaxial_loops
+    def read(self, readings: Readings) -> CoaxialReadings | None:
+        """State of coaxial devices at some readings; None for one alone."""
+        del readings
+        return None
+
+
+def devices_of(chain: Chain) -> SingleDevice:
+    """The effect by which actions move the devices of a chain."""
+    return (
+        SlidingDevices(chain) if isinstance(chain, DeviceStack) else SingleDevice(chain)
+    )
+
+
+class SlidingDevices(SingleDevice):
+    """Coaxial devices, each moved along and about its axis by its actions."""
+
+    data_fields = ("cfrc_int",)
+    model_fields = FIELDS
+
+    def __init__(self, stack: DeviceStack):
+        """Takes the entity of the devices."""
         self._entity, self._stack, self._rods = stack, stack.stack, stack.rods
-        self._index, self._qpos, self._field = index, state.qpos, field
-        self._internal_force = state.cfrc_int[:, index.links]
-        self._start_depth = start_depth
-        count, nodes = len(stack.devices), len(self._stack.nodes)
-        user = state.userdata
+
+    def settle(self, model: mujoco.MjModel) -> None:
+        """Writes into a model what the chain is made of at the start."""
+        write_still(self._entity, model)
+
+    def num_parameters(self, chain: Chain) -> int:
+        """Insertions, and rotations of nodes."""
+        return len(self._entity.devices) * (1 + len(self._stack.nodes))
+
+    def bind(self, world: World) -> None:
+        """Finds the places in the model."""
+        from cathsim_dmc.physics import sliding_loops  # late, as it takes long
+
+        super().bind(world)
+        self._loops = sliding_loops
+        self._index, self._qpos = world.index, world.arrays.qpos
+        self._internal_force = world.arrays.cfrc_int[:, world.index.links]
+        self._start_depth = world.start_depth
+        count, nodes = len(self._entity.devices), len(self._stack.nodes)
         # Views: writing to them writes the state.
-        self._insertion = user[:, :count]
-        self._angles = user[:, count : count * (1 + nodes)].reshape(-1, count, nodes)
-        self._places = ChainFields(model, stack.mjcf_model.model)
-        self._arrays: list[list[np.ndarray]] = [[]] * num_simulations
-        self._radii = np.array([device.outer_radius for device in stack.devices])
-        self._friction = np.full(num_simulations, stack.friction)
-        self._factor = np.ones(num_simulations)
+        self._insertion = world.parameters[:, :count]
+        self._angles = world.parameters[:, count:].reshape(-1, count, nodes)
+        self._places = ChainFields(world.model, self._entity)
+        total = world.num_simulations
+        self._arrays: list[list[np.ndarray]] = [[]] * total
+        self._radii = np.array([device.outer_radius for device in self._entity.devices])
+        self._friction = np.full(total, self._entity.friction)
+        self._factor = np.ones(total)
         # How fast the devices slide in each other, m/s, and press on each other, N.
-        self._sliding = np.zeros((num_simulations, count))
-        self._pressing = np.zeros(num_simulations)
+        self._sliding = np.zeros((total, count))
+        self._pressing = np.zeros(total)
         # Rates at which they turn at the joints, rad/s.
-        self._spin = np.zeros((num_simulations, count, nodes - 2))
+        self._spin = np.zeros((total, count, nodes - 2))
 
     # The course of an episode.
 
     def restart(
-        self, index: int, friction: float | None, stiffness: float | None
+        self, index: int, episode: Episode, random_state: np.random.RandomState
     ) -> None:
-        """Puts the devices of one simulation, whose chain lies at the start, there.
-
-        Args:
-          index: of the simulation.
-          friction: Coulomb coefficient of an uncoated device on the wall in this
-            episode; None for that of the entity.
-          stiffness: factor of all stiffnesses in this episode; None for 1.
-        """
+        """Puts the devices of one simulation to the start of the chain."""
+        friction, stiffness = episode.friction, episode.stiffness
         gaps = self._entity.start_gaps
         self._insertion[index] = self._qpos[index, self._index.insertion_qpos] - gaps
         self._angles[index] = 0.0
         self._sliding[index] = self._pressing[index] = self._spin[index] = 0.0
         self._friction[index] = self._entity.friction if friction is None else friction
         self._factor[index] = 1.0 if stiffness is None else stiffness
-        self._arrays[index] = [self._field(index, name) for name in FIELDS]
-        row = np.array([index])
+        row = self._live(index)
         turns = np.zeros((1, *self._spin.shape[1:]))
         self._write(row, self._stack.overlap(gaps[None]), turns)
 
-    def command(self, action: np.ndarray, external_force: np.ndarray) -> np.ndarray:
+    def _live(self, index: int) -> np.ndarray:
+        """Takes the fields of a simulation's model as they are now; (1,) its number."""
+        self._arrays[index] = [self.world.field(index, name) for name in FIELDS]
+        return np.array([index])
+
+    @property
+    def state(self) -> dict[str, np.ndarray]:
+        """What is not in MuJoCo's state."""
+        return {
+            "friction": self._friction,
+            "factor": self._factor,
+            "sliding": self._sliding,
+            "pressing": self._pressing,
+            "spin": self._spin,
+        }
+
+    def refresh(self, index: int) -> None:
+        """Writes what the chain of one simulation is made of."""
+        row = self._live(index)
+        gaps = self._loops.gaps(np.ascontiguousarray(self._insertion[row]))
+        turns = self._rods.at_joints(self._angles[row], gaps)
+        self._write(row, self._stack.overlap(gaps), turns)
+
+    def act(self, action: np.ndarray, state: Readings) -> np.ndarray:
         """Moves the devices and writes what the chains are made of then.
 
         The chain is driven to where the device will be that reaches farthest; the
@@ -155,7 +185,7 @@ class CoaxialDevices:
 
         Args:
           action: (N, 2 K) in [-1, 1], translation and rotation of each device.
-          external_force: (N, L, 6), contact force on the links, `Readings`.
+          state: Readings after the last control step.
 
         Returns:
           Control (N, 1) of the chain's motor.
@@ -174,7 +204,7 @@ class CoaxialDevices:
             CONTROL_TIMESTEP
         )
         self._insertion[:] = target
-        overlap, turns = self._turn(action[:, 1::2], lead, external_force)
+        overlap, turns = self._turn(action[:, 1::2], lead, state.external_force)
         self._write(np.arange(len(target)), overlap, turns)
         return ((lead - reached) / step)[:, None]
 

@@ -249,5 +249,5 @@ class _Arrays:
     """Arrays of one `mujoco.MjData`, not copied, with a leading axis of length 1."""
 
     def __init__(self, data: mujoco.MjData, fields: Sequence[str]):
-        for field in (*fields, "ctrl"):
+        for field in (*fields, "ctrl", "userdata"):
             setattr(self, field, getattr(data, field)[None])

@@ -18,7 +18,6 @@ from mujoco import batch as mujoco_batch
 
 from cathsim_dmc import bounds
 from cathsim_dmc.physics import forces, readings
-from cathsim_dmc.physics.randomisation import ModelVariation
 from cathsim_dmc.physics.stepper import Anatomic, Stepper
 from cathsim_dmc.tasks.actions import check_action
 from cathsim_dmc.tasks.navigation import Navigation
@@ -86,9 +85,7 @@ class BatchSimulation:
         physics = mjcf.Physics.from_mjcf_model(task.root_entity.mjcf_model)
         self._model = physics.model.ptr
         if task.num_anatomies > 1:
-            writes = task.scene.coaxial or bool(
-                ModelVariation.fields_of(task.config.ranges)
-            )
+            writes = any(effect.model_fields for effect in task.effects)
             self._stepper = _PoolStepper(
                 task, self._model, num_simulations, num_threads, own=writes
             )
@@ -222,7 +219,7 @@ class _BatchStepper(Stepper):
     ):
         super().__init__(model, num_simulations, task.substeps)
         self.batch = mujoco_batch.Batch(model, num_simulations, num_threads)
-        for field in task.scene.fields:
+        for field in task.data_fields:
             self.batch.bind(field)
         self.arrays, self.warnings = self.batch, self.batch.warning
         self.rows = np.zeros((num_simulations, self.substeps, model.nsensordata))

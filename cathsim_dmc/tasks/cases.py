@@ -14,11 +14,11 @@ import numpy as np
 from dm_control import mjcf
 
 from cathsim_dmc.entities.contact import wall_contact
-from cathsim_dmc.entities.device_stack import DeviceStack
+from cathsim_dmc.entities.phantom import piece_name
 from cathsim_dmc.imaging.angiograph import Angiograph
 from cathsim_dmc.imaging.options import FluoroscopyOptions
-from cathsim_dmc.physics import chain_fields
 from cathsim_dmc.physics.readings import ModelIndex
+from cathsim_dmc.physics.sliding import devices_of
 from cathsim_dmc.tasks.objectives import Objective
 from cathsim_dmc.tasks.scene import Scene
 from cathsim_dmc.tasks.start import StartPosture
@@ -70,8 +70,7 @@ class Case:
         self.scene = scene
         self.objective = objective
         index = model_index(scene, model)
-        if isinstance(scene.catheter, DeviceStack):
-            chain_fields.write_still(scene.catheter, model)
+        devices_of(scene.catheter).settle(model)
         self.start = StartPosture(scene, model, index, start_along_route)
         self._fluoroscopy = fluoroscopy
         self._fields = fields or {}
@@ -100,9 +99,7 @@ class Case:
 
 def model_index(scene: Scene, model: mujoco.MjModel) -> ModelIndex:
     """Places of a task's quantities in a compiled scene."""
-    return ModelIndex(
-        model, scene.catheter.mjcf_model.model, scene.robot.mjcf_model.model
-    )
+    return ModelIndex(model, scene.catheter, scene.robot)
 
 
 def alike(
@@ -169,7 +166,7 @@ def _filled(scene: Scene, pieces: int) -> mujoco.MjModel:
     spec = _spec(scene)
     for index in range(len(scene.anatomy.wall), pieces):
         spec.worldbody.add_geom(
-            name=f"wall_{index:03d}",
+            name=piece_name(index),
             type=mujoco.mjtGeom.mjGEOM_SPHERE,
             size=[_FILLER_SIZE, 0, 0],
             pos=_corner(scene),
@@ -197,7 +194,7 @@ def _make_room(
     vertices = max(16, int(1.3 * least / count) + 1)
     meshes = [
         root.asset.add(
-            "mesh", name=f"wall_{first + index:03d}", inertia="shell", vertex=[0] * 12
+            "mesh", name=piece_name(first + index), inertia="shell", vertex=[0] * 12
         )
         for index in range(count)
     ]
@@ -205,7 +202,7 @@ def _make_room(
         mesh = meshes[min(index - first, count - 1)]
         root.worldbody.add(
             "geom",
-            name=f"wall_{index:03d}",
+            name=piece_name(index),
             type="mesh",
             mesh=mesh,
             pos=_corner(scene),

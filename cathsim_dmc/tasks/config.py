@@ -1,5 +1,6 @@
 """Options of a navigation task."""
 
+import copy
 import dataclasses
 from collections.abc import Mapping, Sequence
 from typing import Any, cast
@@ -7,11 +8,15 @@ from typing import Any, cast
 import numpy as np
 
 from cathsim_dmc import bounds
+from cathsim_dmc.entities.chain import Chain
 from cathsim_dmc.entities.contact import FRICTION
 from cathsim_dmc.entities.device import Device
 from cathsim_dmc.entities.device_stack import LEAD, LUMEN_FRICTION
 from cathsim_dmc.imaging.options import FluoroscopyOptions
-from cathsim_dmc.physics.randomisation import Randomisation
+from cathsim_dmc.physics.delay import ActionDelay
+from cathsim_dmc.physics.effects import Effect
+from cathsim_dmc.physics.randomisation import Randomisation, RandomisedModel
+from cathsim_dmc.physics.sliding import devices_of
 from cathsim_dmc.physics.stepper import CONTROL_TIMESTEP, PHYSICS_TIMESTEP
 from cathsim_dmc.tasks.cameras import CameraOptions
 
@@ -75,6 +80,7 @@ class NavigationConfig:
     fluoroscopy: FluoroscopyOptions | Mapping[str, Any] = FluoroscopyOptions()
     cameras: CameraOptions | Mapping[str, Any] = CameraOptions()
     randomisation: Randomisation | Mapping[str, Any] | bool = False
+    effects: Sequence[Effect] = ()
 
     def __post_init__(self):
         self._check_devices()
@@ -88,6 +94,10 @@ class NavigationConfig:
             self, "randomisation", Randomisation.make(self.randomisation)
         )
         self._check_views()
+        if not isinstance(self.effects, Sequence) or not all(
+            isinstance(effect, Effect) for effect in self.effects
+        ):
+            bounds.refuse("effects", self.effects, "a list of physics.effects.Effect")
 
     # Three fields with the types that they have once the config is made.
 
@@ -105,6 +115,12 @@ class NavigationConfig:
     def camera_options(self) -> CameraOptions:
         """`cameras`, whatever they were given as."""
         return cast(CameraOptions, self.cameras)
+
+    def effects_on(self, chain: Chain) -> list[Effect]:
+        """The effects of one rollout, in the order in which they act."""
+        own = [copy.copy(effect) for effect in self.effects]
+        delay = ActionDelay(self.ranges.longest_delay)
+        return [RandomisedModel(self.ranges), delay, *own, devices_of(chain)]
 
     def _check_devices(self):
         if self.devices is None:

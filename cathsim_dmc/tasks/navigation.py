@@ -10,6 +10,7 @@ from dm_control import composer
 
 from cathsim_dmc import bounds
 from cathsim_dmc.physics import forces, readings
+from cathsim_dmc.physics.effects import Effect
 from cathsim_dmc.physics.sliding import CoaxialReadings
 from cathsim_dmc.physics.stepper import SingleStepper, Stepper
 from cathsim_dmc.tasks import cameras, cases, observations
@@ -116,6 +117,17 @@ class Navigation(composer.Task):
         ]
         return Rollout(chosen, self._config, model, stepper)
 
+    @property
+    def effects(self) -> list[Effect]:
+        """What changes the simulation, in order; new ones for each rollout."""
+        return self._config.effects_on(self._scene.catheter)
+
+    @property
+    def data_fields(self) -> tuple[str, ...]:
+        """Fields of `mujoco.MjData` that an episode reads."""
+        own = (name for effect in self.effects for name in effect.data_fields)
+        return (*readings.ModelIndex.FIELDS, *own)
+
     def __repr__(self) -> str:
         """Name, anatomy, goal, device and what is observed."""
         scene = self.scene
@@ -173,7 +185,7 @@ class Navigation(composer.Task):
         del random_state
         model = physics.model.ptr
         self._stepper = SingleStepper(
-            model, physics.data.ptr, self._scene.fields, self.substeps
+            model, physics.data.ptr, self.data_fields, self.substeps
         )
         self._rollout = self.make_rollout(model, self._stepper)
         self._step = None

@@ -12,13 +12,12 @@ from typing import cast
 import mujoco
 import numpy as np
 
-from cathsim_dmc.entities.device_stack import DeviceStack
-from cathsim_dmc.entities.robot import follower_posture
 from cathsim_dmc.imaging.device import Shadow
 from cathsim_dmc.imaging.fluoroscopy import Fluoroscope
 from cathsim_dmc.physics import forces, readings
-from cathsim_dmc.physics.randomisation import ActionDelay, Episode, ModelVariation
-from cathsim_dmc.physics.sliding import CoaxialDevices, CoaxialReadings
+from cathsim_dmc.physics.effects import Effects, World
+from cathsim_dmc.physics.randomisation import Episode
+from cathsim_dmc.physics.sliding import CoaxialReadings, SingleDevice
 from cathsim_dmc.physics.stepper import Stepper
 from cathsim_dmc.tasks import observations
 from cathsim_dmc.tasks.cases import Case, model_index
@@ -71,25 +70,20 @@ class Rollout:
         catheter = scene.catheter.mjcf_model.model
         self._index = model_index(scene, model)
         self._views = self._index.views(state)
-        self._device_radius = scene.device.outer_radius
         num_actions = len(scene.catheter.action_names)
-        randomisation = config.ranges
-        self._coaxial: CoaxialDevices | None = None
-        if isinstance(scene.catheter, DeviceStack):
-            self._coaxial = CoaxialDevices(
-                scene.catheter,
+        listed = config.effects_on(scene.catheter)
+        self._devices = cast(SingleDevice, listed[-1])
+        self._effects = Effects(
+            listed,
+            World(
                 model,
+                scene.catheter,
                 self._index,
+                scene.placement.start_depth,
                 state,
                 stepper.field,
-                scene.placement.start_depth,
-                num_simulations,
-            )
-        self._variation = ModelVariation(
-            model, randomisation, catheter, walls=self._coaxial is None
-        )
-        self._delay = ActionDelay(
-            num_simulations, num_actions, randomisation.longest_delay
+                state.userdata,
+            ),
         )
         self._routes: Routes | None = None
         if observations.needs_route(self._names):
@@ -133,7 +127,7 @@ class Rollout:
         self._random_states = list(random_states)
         for index in indices:
             self._draw(index, random_states[index])
-        self.pose_robot(self._state.qpos)
+        self._pose_robot()
         self._objective = together(
             [case.objective for case in self._cases], self._case_of
         )
@@ -158,36 +152,27 @@ class Rollout:
         number = case.start.draw(random_state)
         qpos = self._state.qpos[index]
         case.start.write(qpos, displacement, episode.roll, number)
-        self.take(index, episode)
+        self.take(index, episode, random_state)
 
-    def take(self, index: int, episode: Episode) -> None:
+    def take(
+        self, index: int, episode: Episode, random_state: np.random.RandomState
+    ) -> None:
         """Takes what was drawn for one simulation, whose device is at its start.
 
         Args:
           index: Number of the simulation.
           episode: What was drawn; its displacement is in the state already.
+          random_state: Source of what the effects draw.
         """
         case = self.case(index)
-        field = self._stepper.field
-        fields = {name: field(index, name) for name in self._variation.fields}
-        self._variation.write(fields, episode)
-        self._delay.restart(index, episode.delay)
+        self._effects.restart(index, episode, random_state)
         self._monitor.restart(index, case.scene, episode)
         self._sensors.restart(index, case.angiograph, episode.deviation)
         self._goal_shift[index] = episode.goal_shift or 0.0
-        if self._coaxial is not None:
-            self._coaxial.restart(index, episode.friction, episode.stiffness)
 
-    def pose_robot(self, qpos: np.ndarray) -> np.ndarray:
-        """Poses the follower's joints after the device, in place: qpos (N, nq)."""
-        index = self._index
-        if self._coaxial is not None:
-            qpos[..., index.robot_qpos] = self._coaxial.follower_posture()
-            return qpos
-        pushed = qpos[..., index.insertion_qpos]
-        turned = 0.0 if index.rotation_qpos is None else qpos[..., index.rotation_qpos]
-        qpos[..., index.robot_qpos] = follower_posture(pushed, turned)
-        return qpos
+    def _pose_robot(self) -> None:
+        """Poses the follower's joints after the devices."""
+        self._state.qpos[:, self._index.robot_qpos] = self._devices.follower_posture()
 
     def command(self, action: np.ndarray) -> None:
         """Takes the actions of a control step; its physics steps must follow.
@@ -196,12 +181,9 @@ class Rollout:
           action: (N, A) float64 as `actions.check_action` returns it.
         """
         self._previous_action, self._action = self._action, action
-        self.pose_robot(self._state.qpos)
+        self._pose_robot()
         self._monitor.before_step(self._stepper.states, action)
-        action = self._delay.delayed(action)
-        if self._coaxial is not None:
-            action = self._coaxial.command(action, self._readings.external_force)
-        self._stepper.begin(action)
+        self._stepper.begin(self._effects.act(action, self._readings))
 
     def start(self, indices: np.ndarray) -> Step:
         """First measurement of new episodes, after the forward pass.
@@ -327,15 +309,12 @@ class Rollout:
     @property
     def shadows(self) -> Sequence[Shadow]:
         """The devices as X-rays meet them, with points (N, n, 3)."""
-        line = self._readings.centreline
-        if self._coaxial is not None:
-            return self._coaxial.shadows(line)
-        return [Shadow(line, self._device_radius)]
+        return self._devices.shadows(self._readings.centreline)
 
     @property
     def devices(self) -> CoaxialReadings | None:
         """State of coaxial devices after the last step or reset; None for one alone."""
-        return None if self._coaxial is None else self._coaxial.read(self._readings)
+        return self._devices.read(self._readings)
 
     @property
     def wall_force(self) -> forces.WallForce:

@@ -14,8 +14,7 @@ from cathsim_dmc.entities.device_stack import DeviceStack
 from cathsim_dmc.entities.phantom import Phantom
 from cathsim_dmc.entities.robot import Robot
 from cathsim_dmc.entities.sheath import Sheath, straight
-from cathsim_dmc.physics import sliding
-from cathsim_dmc.physics.readings import ModelIndex
+from cathsim_dmc.physics import effects
 from cathsim_dmc.tasks import placement
 from cathsim_dmc.tasks.config import NavigationConfig
 from cathsim_dmc.tasks.objectives import GOAL_RADIUS
@@ -83,15 +82,12 @@ class Scene:
         )
         catheter = catheter or _chain(chosen, place, config)
         radius = catheter.device.outer_radius
-        friction = config.friction
-        if isinstance(catheter, DeviceStack):
-            # The larger of two bodies' coefficients counts, and the devices differ.
-            friction = 0.0
         scene = cls(
             goal=goal,
             placement=place,
             arena=arena or AngiographyArena(device_density=catheter.density),
-            phantom=phantom or Phantom(anatomy, friction, goal_radius=goal_radius),
+            phantom=phantom
+            or Phantom(anatomy, config.friction, goal_radius=goal_radius),
             catheter=catheter,
             sheath=sheath
             or Sheath(
@@ -100,12 +96,12 @@ class Scene:
             ),
             robot=robot or Robot(device_radius=radius),
         )
-        scene._attach()
+        scene._attach(effects.room(config.effects_on(catheter), catheter))
         return scene
 
-    def _attach(self):
-        if isinstance(self.catheter, DeviceStack):
-            self.arena.mjcf_model.size.nuserdata = sliding.user_data(self.catheter)
+    def _attach(self, user_data: int):
+        if user_data:
+            self.arena.mjcf_model.size.nuserdata = user_data
         self.arena.attach(self.phantom)
         place = self.placement
         for entity, position in (
@@ -128,13 +124,7 @@ class Scene:
     @property
     def coaxial(self) -> bool:
         """Whether the devices are coaxial ones, each moved by itself."""
-        return isinstance(self.catheter, DeviceStack)
-
-    @property
-    def fields(self) -> tuple[str, ...]:
-        """Fields of `mujoco.MjData` that episodes in the scene read and write."""
-        own = sliding.FIELDS_READ if self.coaxial else ()
-        return (*ModelIndex.FIELDS, *own)
+        return self.catheter.coaxial
 
     @property
     def anatomy(self) -> Anatomy:

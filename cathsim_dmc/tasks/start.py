@@ -51,15 +51,7 @@ class StartPosture:
           ValueError: if the device comes to rest outside the lumen or in its wall.
         """
         catheter = scene.catheter
-        columns = {
-            joint.name: index.qpos.start + number
-            for number, joint in enumerate(catheter.joints)
-        }
-        links = range(1, len(catheter.links))
-        # (n - 1, 2): places in qpos of the hinges about x and y.
-        self._bends = np.array(
-            [[columns[f"bend_{axis}_{link}"] for axis in "xy"] for link in links]
-        )
+        self._bends = index.bends_qpos
         self._insertion = index.insertion_qpos
         # The base cannot go back behind its start, so the stroke begins 1 mm later.
         data = self._settle(scene, model, START_JITTER)
@@ -202,8 +194,7 @@ def _refuse_outside(
     # Those behind the mouth lie in the sheath, and touch the wall where that does.
     entered = (nodes - place.inlet) @ place.direction > 0.0
     out = -float(anatomy.depth(nodes[entered]).min(initial=0.0))
-    wall = [i for i in range(model.ngeom) if model.geom(i).name.startswith("wall_")]
-    touching = np.isin(data.contact.geom, wall).any(axis=-1)
+    touching = np.isin(data.contact.geom, index.walls).any(axis=-1)
     deepest = -float(data.contact.dist[touching].min(initial=0.0))
     if out > _OUTSIDE or deepest > _DEEPEST:
         raise ValueError(

@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from cathsim_dmc import files, policies, suite
-from cathsim_dmc.physics.randomisation import Episode, ModelVariation, Randomisation
+from cathsim_dmc.physics.randomisation import Episode, Randomisation, RandomisedModel
 from cathsim_dmc.simulation.batch import BatchSimulation
 
 TASK = "type1_bca"
@@ -48,12 +48,11 @@ def play(name, threads):
     """A row of figures for every stiffness and friction."""
     settings = list(itertools.product(STIFFNESS, FRICTION))
     count = len(settings)
-    task = suite.make_task(TASK, observation="tracking")
+    task = suite.make_task(TASK, observation="tracking", effects=[Settings(settings)])
     simulation = BatchSimulation(task, count, num_threads=threads)
     # The same start for all.
     simulation.seed([0] * count)
     step = simulation.reset()
-    vary(simulation, task, settings)
     policy = policies.make_policy(name, 0)
     policy.reset(policies.BatchedView(simulation), np.ones(count, dtype=bool))
     samples = [[] for _ in settings]
@@ -96,16 +95,19 @@ def play(name, threads):
     ]
 
 
-def vary(simulation, task, settings):
-    """Writes stiffness and friction into the model of each simulation."""
-    model = simulation.batch.model
-    ranges = Randomisation(friction=(0.0, 1.0), stiffness=(1.0, 100.0))
-    variation = ModelVariation(model, ranges, task.scene.catheter.mjcf_model.model)
-    arrays = {name: simulation.batch.expand(name) for name in variation.fields}
-    for index, (stiffness, friction) in enumerate(settings):
-        own = {name: array[index] for name, array in arrays.items()}
-        episode = Episode(np.zeros(3), friction=friction, stiffness=stiffness)
-        variation.write(own, episode)
+class Settings(RandomisedModel):
+    """Stiffness and friction of each simulation."""
+
+    def __init__(self, settings):
+        """Takes a factor of the stiffness and a friction for each simulation."""
+        super().__init__(Randomisation(friction=(0.0, 1.0), stiffness=(1.0, 100.0)))
+        self._settings = settings
+
+    def restart(self, index, episode, random_state):
+        """Writes the model of one simulation."""
+        stiffness, friction = self._settings[index]
+        own = Episode(np.zeros(3), friction=friction, stiffness=stiffness)
+        super().restart(index, own, random_state)
 
 
 def figures(samples, cell, steps):

@@ -1,0 +1,225 @@
+"""What changes the simulation: forces, fields of the model, commands of the drives.
+
+An effect is a small class, listed by a task: `suite.make_task(name, effects=[...])`.
+It restarts with each episode and acts once in a control step on the arrays of all
+simulations. Where it must act in every physics step, it has a function that is
+compiled and that MuJoCo calls, so that no Python runs in the loop; see `Effect.forces`.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import mujoco
+import numpy as np
+
+from cathsim_dmc.entities.chain import Chain
+from cathsim_dmc.physics.readings import ModelIndex, Readings
+
+if TYPE_CHECKING:
+    from cathsim_dmc.physics.randomisation import Episode
+
+# Numbers of `userdata` before the parameters of an effect: its mark and their number.
+_HEADER = 2
+# The last number of `userdata` where a compiled function may act.
+MARK = 0.7389056098930650
+
+
+@dataclasses.dataclass(frozen=True)
+class World:
+    """N simulations, as an effect finds them.
+
+    Attributes:
+      model: The compiled scene, as it is without effects.
+      chain: The entity of the device, or of several in each other.
+      index: Places of the task's quantities in the model.
+      start_depth: Way of the chain's end past the mouth of the sheath at zero
+        insertion, m.
+      arrays: The state, arrays (N, ...) with MuJoCo's names: those of
+        `ModelIndex.FIELDS` and of `Effect.data_fields`.
+      field: Gives a field of the model that one simulation has for itself, by its
+        number and MuJoCo's name, to be written.
+      parameters: (N, P) numbers of the effect's own, which the compiled function
+        reads; they are part of MuJoCo's state, and 0 when an episode begins.
+    """
+
+    model: mujoco.MjModel
+    chain: Chain
+    index: ModelIndex
+    start_depth: float
+    arrays: Any
+    field: Callable[[int, str], np.ndarray]
+    parameters: np.ndarray
+
+    @property
+    def num_simulations(self) -> int:
+        """N."""
+        return len(self.arrays.qpos)
+
+
+class Bodies(NamedTuple):
+    """The bodies in a physics step, arrays of MuJoCo's, world frame, SI units.
+
+    Attributes:
+      xipos: (nbody, 3), centres of mass.
+      ximat: (nbody, 9), orientations of the principal axes, row by row.
+      xmat: (nbody, 9), orientations of the bodies, row by row.
+      cvel: (nbody, 6), rotational and translational velocity about the centre of mass
+        of the kinematic tree.
+      subtree_com: (nbody, 3), that centre is the row of the tree's first body.
+      xfrc_applied: (nbody, 6), force and torque on the centres of mass, N and N·m,
+        zeroed before the effects of a physics step, to be added to.
+    """
+
+    xipos: np.ndarray
+    ximat: np.ndarray
+    xmat: np.ndarray
+    cvel: np.ndarray
+    subtree_com: np.ndarray
+    xfrc_applied: np.ndarray
+
+
+class Effect:
+    """Changes nothing; a subclass overrides what it needs.
+
+    Attributes:
+      data_fields: Fields of `mujoco.MjData` that it reads, beside `ModelIndex.FIELDS`.
+      model_fields: Fields of `mujoco.MjModel` that it writes.
+      forces: Static method with parameters (P,), time in s and `Bodies`: plain loops
+        that add to `xfrc_applied`, which numba compiles and MuJoCo calls in every
+        physics step; None for none.
+      world: The simulations, there from `bind` on.
+    """
+
+    data_fields: tuple[str, ...] = ()
+    model_fields: tuple[str, ...] = ()
+    forces: Callable[[np.ndarray, float, Bodies], None] | None = None
+    world: World
+
+    def num_parameters(self, chain: Chain) -> int:
+        """P, how many parameters it has; the compiled function needs one or more."""
+        del chain
+        return 0
+
+    def bind(self, world: World) -> None:
+        """Finds what it acts on; no episode has begun yet."""
+        self.world = world
+
+    def restart(
+        self, index: int, episode: Episode, random_state: np.random.RandomState
+    ) -> None:
+        """Begins an episode of one simulation, whose device lies at its start.
+
+        Args:
+          index: Number of the simulation.
+          episode: What the task has drawn for it.
+          random_state: Source of what the effect draws itself.
+        """
+
+    def act(self, action: np.ndarray, state: Readings) -> np.ndarray:
+        """Acts once, before the physics steps of a control step.
+
+        Args:
+          action: (N, A), of the agent or of the effect before this one.
+          state: Readings after the last control step.
+
+        Returns:
+          What the next effect gets, and after the last one the actuators.
+        """
+        del state
+        return action
+
+    @property
+    def state(self) -> dict[str, np.ndarray]:
+        """Arrays (N, ...) by name that a snapshot keeps; not copied.
+
+        Parameters need not be among them.
+        """
+        return {}
+
+    def refresh(self, index: int) -> None:
+        """Writes the model of one simulation, whose state has been restored."""
+
+
+def room(effects: Sequence[Effect], chain: Chain) -> int:
+    """Numbers of MuJoCo's `userdata` that some effects take."""
+    counts = [effect.num_parameters(chain) for effect in effects]
+    taken = sum(_HEADER + count for count in counts if count)
+    return taken + 1 if taken else 0
+
+
+class Effects:
+    """The effects of a task, one after the other."""
+
+    def __init__(self, effects: Sequence[Effect], world: World):
+        """Gives each effect its part of the world.
+
+        Args:
+          effects: Of one rollout only.
+          world: Simulations; its parameters are all of `userdata`.
+
+        Raises:
+          ValueError: if the scene was built for other effects.
+        """
+        self._effects, self._user = tuple(effects), world.parameters
+        needed = room(effects, world.chain)
+        if self._user.shape[1] != needed:
+            raise ValueError(
+                f"the effects of the task take {needed} numbers of userdata, and the "
+                f"scene has room for {self._user.shape[1]}: build it with the same "
+                "configuration"
+            )
+        self._labels = np.zeros(needed)
+        self._labelled = []
+        start = 0
+        for effect in self._effects:
+            count = effect.num_parameters(world.chain)
+            first = start + _HEADER if count else start
+            parameters = self._user[:, first : first + count]
+            if count:
+                self._label(start, effect, count)
+                start = first + count
+            effect.bind(dataclasses.replace(world, parameters=parameters))
+
+    def _label(self, start: int, effect: Effect, count: int) -> None:
+        mark = 0
+        if effect.forces is not None:
+            from cathsim_dmc.physics import callbacks  # late, as numba takes long
+
+            mark = callbacks.install(effect.forces)
+            self._labels[-1] = MARK
+            self._labelled.append(-1)
+        self._labels[start : start + _HEADER] = mark, count
+        self._labelled += [start, start + 1]
+
+    def restart(
+        self, index: int, episode: Episode, random_state: np.random.RandomState
+    ) -> None:
+        """Begins an episode of one simulation; see `Effect.restart`."""
+        self._user[index, self._labelled] = self._labels[self._labelled]
+        for effect in self._effects:
+            effect.restart(index, episode, random_state)
+
+    def act(self, action: np.ndarray, state: Readings) -> np.ndarray:
+        """Control (N, U) of the actuators for an action (N, A)."""
+        for effect in self._effects:
+            action = effect.act(action, state)
+        return action
+
+    @property
+    def state(self) -> dict[str, np.ndarray]:
+        """Arrays (N, ...) of all effects, not copied."""
+        return {
+            f"{type(effect).__name__}_{number}.{name}": array
+            for number, effect in enumerate(self._effects)
+            for name, array in effect.state.items()
+        }
+
+    def refresh(self, index: int) -> None:
+        """Writes the model of one simulation, whose state has been restored."""
+        # Marks are those of this process.
+        self._user[index, self._labelled] = self._labels[self._labelled]
+        for effect in self._effects:
+            effect.refresh(index)
