@@ -342,16 +342,6 @@ def test_vessels_are_called_after_their_files(file, name):
     assert vessel_name(file) == name
 
 
-def test_missing_files(y_scan, tmp_path):
-    mesh, curves, _ = y_scan
-    with pytest.raises(FileNotFoundError, match="no mesh file"):
-        import_scan(tmp_path / "none.obj", curves)
-    with pytest.raises(FileNotFoundError, match="no centreline file"):
-        import_scan(mesh, [tmp_path / "none.mrk.json"])
-    with pytest.raises(ValueError, match="give a list of files"):
-        import_scan(mesh, curves[0])
-
-
 def test_centreline_elsewhere(y_scan, tmp_path):
     mesh, curves, _ = y_scan
     points = read_curve(curves[0]).points * 1e3

@@ -404,16 +404,6 @@ def test_without_the_extra_a_notebook_says_what_to_install(monkeypatch):
         notebook.episode_viewer(make_recorded(), make_tube())
 
 
-def test_two_episodes_are_two_recordings(tmp_path):
-    found = {
-        Recording(write_rrd(make_episode(2), make_tube(), tmp_path / f"{i}.rrd"))
-        .recordings[0]
-        .recording_id
-        for i in range(2)
-    }
-    assert len(found) == 2
-
-
 @pytest.mark.parametrize(
     ("options", "message"),
     [
@@ -442,35 +432,11 @@ def test_wrong_inputs_leave_no_file(tmp_path, options, message):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_failure_half_way_keeps_the_old_file(tmp_path, monkeypatch):
-    import rerun as rr
-
-    path = tmp_path / "e.rrd"
-    write_rrd(make_episode(2), make_tube(), path)
-    before = path.read_bytes()
-
-    def broken(**kwargs):
-        raise OSError("no more")
-
-    monkeypatch.setattr(rr.Scalars, "columns", broken)
-    with pytest.raises(OSError, match="no more"):
-        write_rrd(make_episode(3), make_tube(), path)
-    assert path.read_bytes() == before
-    assert [p.name for p in tmp_path.iterdir()] == ["e.rrd"]
-
-
 def test_rerun_switched_off_is_an_error(tmp_path, monkeypatch):
     monkeypatch.setenv("RERUN", "off")
     with pytest.raises(RuntimeError, match="switched off"):
         write_rrd(make_episode(2), make_tube(), tmp_path / "e.rrd")
     assert list(tmp_path.iterdir()) == []
-
-
-def test_a_long_episode_stays_small(tmp_path):
-    episode = make_episode(500, links=100, counts=np.full(500, 6))
-    path = write_rrd(episode, make_tube(sides=64, rings=100), tmp_path / "e.rrd")
-    # Random joints do not compress; a real catheter takes less.
-    assert path.stat().st_size < 5e6
 
 
 def test_reading_episodes_needs_no_rerun():

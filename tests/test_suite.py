@@ -265,11 +265,6 @@ def test_wrong_options_are_refused_before_an_anatomy_is_made(monkeypatch, option
             suite.make_task(task, **options)
 
 
-def test_other_domains_load_too():
-    environment = suite.load("cartpole", "balance", task_kwargs={"random": 1})
-    assert environment.reset().first()
-
-
 def test_environment_kwargs_reach_composer():
     environment = suite.load(
         "cathsim", "simple1_bca", environment_kwargs={"time_limit": 0.1}

@@ -77,8 +77,6 @@ def test_the_image_is_the_fluoroscopes(make, anatomy):
     np.testing.assert_array_equal(image, scope.render(task.readings.centreline, radius))
 
 
-
-
 def test_every_option_changes_the_image(make):
     env = make("image")
     env.reset()

@@ -117,7 +117,8 @@ def _settings(arguments: Sequence[str]) -> tuple[Any, bool]:
         if found.algo in (None, config.algorithm):
             return config, True
     algorithm = found.algo if found.algo in LEARNERS else _Run.algo
-    return make_config(algorithm, found.preset or _Run.preset), False
+    preset = _Run.preset if found.preset is None else found.preset
+    return make_config(algorithm, preset), False
 
 
 def _setting_options(settings: Any) -> type:
