@@ -9,18 +9,15 @@ import numpy as np
 import pytest
 import synthetic_env
 import torch
-from bad_values import ERRORS, Tally, damaged_json, settled, try_bytes, try_json
+from bad_values import ERRORS, Tally, settled, try_bytes, try_json
 from hypothesis import strategies as st
-from synthetic_scans import marched, write_markup, write_obj, y_tree
-from test_agents_training import run, small_ppo, small_sac
+from synthetic_scans import write_markup
+from test_agents_training import run, small_ppo
 
 from cathsim_dmc.agents import Checkpoint
 from cathsim_dmc.agents.checkpoint import checkpoints_in
-from cathsim_dmc.agents.learners import config_from_dict
-from cathsim_dmc.agents.replay import ReplayMemory
 from cathsim_dmc.anatomy import Anatomy
 from cathsim_dmc.anatomy.scan.curves import read_curve
-from cathsim_dmc.anatomy.scan.mesh import read_triangles
 from cathsim_dmc.anatomy.tree_file import read_tree
 from cathsim_dmc.validation import force_sensors
 
@@ -31,14 +28,6 @@ def store(tmp_path_factory):
     folder = tmp_path_factory.mktemp("store")
     force_sensors.straight_tube(0.06, 4e-3).save(folder / "anatomy")
     run(small_ppo(total_frames=512), folder / "ppo")
-    run(small_sac(total_frames=1_024, replay_frames=1_024), folder / "sac")
-    vertices, faces = marched(y_tree(), 3e-3)
-    write_obj(folder / "lumen.obj", vertices, faces)
-    import trimesh
-
-    mesh = trimesh.Trimesh(vertices, faces, process=False)
-    for kind in ("stl", "ply"):
-        mesh.export(folder / f"lumen.{kind}")
     points = [[0, 0, z] for z in range(0, 50, 5)]
     write_markup(folder / "centreline-lcca.mrk.json", points, radii=[4.0] * 10)
     tree = {
@@ -195,80 +184,6 @@ def try_checkpoint(tally, store, examples):
         (path / "checkpoint.json").write_text(good[1])
 
 
-def try_replay(tally, store, examples):
-    folder = store / "sac" / "replay"
-    state = Checkpoint.open(store / "sac").learning_state()["learner"]["replay"]
-
-    def load():
-        ReplayMemory(folder, 1_024, 10**9).load(state)
-
-    try_json(tally, "replay", folder / "replay.json", load, examples)
-
-
-def try_settings(tally, store, examples):
-    values = json.loads((store / "ppo" / "config.json").read_text())
-    kept = {
-        k: v
-        for k, v in values.items()
-        if k not in ("task_kwargs", "num_threads", "target_kl", "observation")
-    }
-
-    def harmless(path, value):
-        number = isinstance(value, int | float) and not isinstance(value, bool)
-        return value == "left out" or (number and np.isfinite(value) and value > 0)
-
-    def check(damaged):
-        text, where = damaged
-        if where:
-            word = "config" if where[0] == "algorithm" else where[0]
-            word = "algorithm" if where[0] == "algorithm" else word
-            tally.refused(
-                "config.json", lambda: config_from_dict(json.loads(text)), [word]
-            )
-
-    tally.draw(damaged_json(kept, harmless), examples, check)
-
-
-def try_scans(tally, store, examples):
-    for kind in ("stl", "ply", "obj", "vtp"):
-        path = store / f"broken.{kind}"
-        good = b""
-        if kind != "vtp":
-            good = (store / f"lumen.{kind}").read_bytes()
-        # Halves, and files of another kind; a flipped bit may give a lumen too.
-        halves = st.integers(1, max(1, len(good) // 2)).map(lambda n, g=good: g[:n])
-        texts = st.sampled_from(
-            [
-                b"",
-                b"\0" * 84,
-                b"\0" * 80 + b"\xff\xff\xff\x7f" + b"\0" * 50,
-                b"solid x\nfacet normal 0 0 1\nouter loop\nvertex 1 2\n",
-                b"ply\nformat ascii 1.0\nelement vertex 99999999999\nend_header\n",
-                b"v nan nan nan\nv 0 0 0\nv 1 1 1\nf 1 2 3\n",
-                b"v 0 0 0\nf 1 2 9\n",
-                b"v 0 0 0\nv 1 0 0\nv 0 1 0\n",
-                b"<?xml version='1.0'?><VTKFile type='PolyData'></VTKFile>",
-                b"<!DOCTYPE x [<!ENTITY a 'aaaa'>]><VTKFile>&a;</VTKFile>",
-            ]
-        )
-        few = st.binary(max_size=300)
-        strategy = st.one_of(texts, few, halves) if good else st.one_of(texts, few)
-        if kind == "obj":
-            # Half an OBJ is an OBJ with fewer triangles, and is found out later.
-            strategy = st.one_of(
-                texts.filter(lambda t: not t.startswith(b"v 0 0 0\nv 1"))
-            )
-
-        def check(data, path=path, kind=kind):
-            path.write_bytes(data)
-            tally.refused(
-                f"scan, {kind}", lambda: read_triangles(path), [path.name], ERRORS
-            )
-
-        tally.draw(strategy, examples, check)
-        path.unlink()
-
-
 def try_curves_and_trees(tally, store, examples):
     curve = store / "centreline-lcca.mrk.json"
 
@@ -311,9 +226,6 @@ def try_curves_and_trees(tally, store, examples):
 EVERYTHING = (
     try_anatomy,
     try_checkpoint,
-    try_replay,
-    try_settings,
-    try_scans,
     try_curves_and_trees,
 )
 
@@ -324,7 +236,7 @@ def test_damaged_files_are_refused_by_name(store, examples):
     for one in EVERYTHING:
         one(tally, store, examples)
     settled(tally, store, before)
-    assert tally.tried.total() > 11 * examples
+    assert tally.tried.total() > 7 * examples
 
 
 def test_a_run_with_damaged_settings_can_still_be_evaluated(store, tmp_path):

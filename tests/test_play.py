@@ -179,31 +179,6 @@ print(play("type1_bca", out={str(tmp_path)!r}, seed=4, task_kwargs=options))
     assert second.meta["task_kwargs"] == {"max_steps": 500}
 
 
-def test_the_mujoco_viewer_takes_keys_too(screen, tmp_path):
-    code = f"""
-from cathsim_dmc.play import play
-options = {{"max_steps": 60}}
-play("type1_bca", "viewer", {str(tmp_path)!r}, episodes=1, task_kwargs=options)
-"""
-    probe = """
-import glfw
-assert glfw.init() and glfw.create_window(9, 9, "", None, None)
-"""
-    if Player(screen, probe, "glfw").process.wait() != 0:
-        pytest.skip("no OpenGL on this display")
-    player = Player(screen, code, "glfw")
-    player.find("MuJoCo")
-    for _ in range(12):
-        player.xdotool("key", "Prior")  # page up pushes
-        player.xdotool("key", "Right")
-        time.sleep(0.1)
-    player.finish()
-    episode = Episode.load(tmp_path / "type1_bca_000.npz")
-    assert episode.steps == 60
-    assert episode.action[:, 20].max() == 1.0 and episode.action[:, 20].min() == 0.0
-    assert episode.action[-1, 1] > 0.1
-
-
 def test_without_a_display_the_message_says_so(monkeypatch):
     from cathsim_dmc.play import play
 
