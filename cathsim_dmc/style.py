@@ -31,4 +31,5 @@ def save(figure: Any, path: str | Path, dpi: int = 110) -> None:
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     with atomic_path(path) as temporary:
-        figure.savefig(temporary, dpi=dpi, format="png")
+        options = {"format": "png", "pil_kwargs": {"optimize": True}}
+        figure.savefig(temporary, dpi=dpi, **options)

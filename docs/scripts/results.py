@@ -263,13 +263,8 @@ def by_group(found):
             groups, result.evaluation["episodes"]["success"], strict=False
         ):
             reached.setdefault(group, []).append(success)
-    return (
-        ", ".join(
-            f"{group}: {sum(one)} of {len(one)}"
-            for group, one in sorted(reached.items())
-        )
-        or "–"
-    )
+    parts = (f"{name}: {sum(one)} of {len(one)}" for name, one in reached.items())
+    return ", ".join(sorted(parts)) or "–"
 
 
 def published_figures(theirs):
@@ -377,89 +372,25 @@ def commit_of(values):
 
 
 def drawn(table, out):
-    """Draws the figures; yields the parts of the page that show them."""
-    images = out.parent / "images"
-    looks = figures.Looks(
-        dict.fromkeys(label for one in table.values() for label in one)
-    )
-    main = {task: table[task] for task in PUBLISHED_TASKS if task in table}
-    further = {task: one for task, one in table.items() if task not in main}
+    """The parts of the page that show figures, which are drawn beside it."""
     published = json.loads(PUBLISHED.read_text())["agents"]
-    yield "## Figures\n"
-    for name, tasks in (("", main), ("_further", further)):
-        if not tasks:
-            continue
-        which = "further" if name else "published"
-        path = figures.learning_curves(
-            tasks, looks, images / f"results_curves{name}.png"
-        )
-        yield shown(
-            path,
-            f"Success in training on the {which} tasks, mean over seeds (number in the "
-            "legend) with a band from the least to the most successful seed. Training "
-            "episodes explore.",
-        )
-        theirs = {
-            task: {
-                label: published[published_label(found[0])][task]["max_force"]
-                for label, found in tasks[task].items()
-                if task in published.get(published_label(found[0]), {})
-            }
-            for task in tasks
-        }
-        path = images / f"results_forces{name}.png"
-        figures.force_boxes(tasks, looks, theirs, path)
-        yield shown(
-            path,
-            f"Largest contact force of every evaluation episode on the {which} tasks, "
-            "episodes of all seeds together; whiskers at 1.5 interquartile ranges. "
-            "Diamonds are the published mean ± deviation."
-            if not name
-            else "Largest contact force of every evaluation episode on the further "
-            "tasks, episodes of all seeds together.",
-        )
-    compared = demonstrated(table)
-    if compared:
-        path = images / "results_demonstrations.png"
-        figures.with_demonstrations(compared, looks, path)
-        yield shown(
-            path,
-            f"With and without demonstrations on {DEMONSTRATED}, all from the "
-            "observation `internal`: success of the evaluation (points, with 95 % "
-            "intervals over the episodes of all seeds) where the training ended, and "
-            "of the training episodes on the way there (lines). Frames that the expert "
-            "played for the dataset are not counted.",
-        )
-    best = {
-        task: max(
-            agents_.values(), key=lambda found: np.mean([r.success for r in found])
-        )
-        for task, agents_ in table.items()
-    }
-    path = figures.force_maps(best, images / "results_force_maps.png")
-    if path is not None:
-        yield shown(
-            path,
-            "Mean contact force per place (2 mm) over all evaluation episodes of the "
-            "most successful agent of each task, seen from the front; the colour scale "
-            "ends at the 98th percentile.",
-        )
+    reference = {task: {} for task in PUBLISHED_TASKS}
+    for task, of_task in reference.items():
+        for label, found in table.get(task, {}).items():
+            theirs = published.get(published_label(found[0]), {})
+            if task in theirs:
+                of_task[label] = theirs[task]["max_force"]
+    images = out.parent / "images"
+    return figures.drawn(table, reference, demonstrated(table), images)
 
 
 def demonstrated(table):
     """Agents to compare on one task, if one of them has learnt from demonstrations."""
-    compared = {
-        label: found
-        for label, found in table.get(DEMONSTRATED, {}).items()
-        if found[0].cell["observation"] == "internal"
-    }
-    if not any(taught(result) for found in compared.values() for result in found):
-        return {}
-    return compared
-
-
-def shown(path, caption):
-    return f"![{caption}](images/{path.name})\n\n{caption}\n"
+    agents_ = table.get(DEMONSTRATED, {}).items()
+    compared = {k: v for k, v in agents_ if v[0].cell["observation"] == "internal"}
+    if any(taught(result) for found in compared.values() for result in found):
+        return compared
+    return {}
 
 
 if __name__ == "__main__":

@@ -8,11 +8,10 @@ from matplotlib.collections import PolyCollection
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter
 
-from cathsim_dmc import suite
+from cathsim_dmc import style, suite
 from cathsim_dmc.analysis.heatmap import AP_AXES, ForceMap
 from cathsim_dmc.analysis.intervals import success_interval
 from cathsim_dmc.benchmarks.result import map_from_values
-from cathsim_dmc.files import atomic_path
 from cathsim_dmc.style import COLOURS
 
 DPI = 90
@@ -29,8 +28,8 @@ class Looks:
 
     def __getitem__(self, label):
         index = self._order[label]
-        style = STYLES[index // len(COLOURS) % len(STYLES)]
-        return {"color": COLOURS[index % len(COLOURS)], "linestyle": style}
+        line = STYLES[index // len(COLOURS) % len(STYLES)]
+        return {"color": COLOURS[index % len(COLOURS)], "linestyle": line}
 
 
 def learning_curves(by_task, looks, path):
@@ -271,7 +270,73 @@ def _seeds(count):
 
 
 def _save(figure, path):
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with atomic_path(path, ".png") as temporary:
-        figure.savefig(temporary, format="png", dpi=DPI, pil_kwargs={"optimize": True})
+    style.save(figure, path, DPI)
     return path
+
+
+def drawn(table, reference, compared, images):
+    """Draws the figures; yields the parts of the page that show them.
+
+    Args:
+        table: {task: {label: [results by seed]}}.
+        reference: Published mean and deviation of the largest force, N, by task and
+            label, for every published task.
+        compared: {label: [results]} with and without demonstrations on one task.
+        images: Folder of the figures.
+    """
+    looks = Looks(dict.fromkeys(label for one in table.values() for label in one))
+    main = {task: table[task] for task in reference if task in table}
+    further = {task: one for task, one in table.items() if task not in main}
+    yield "## Figures\n"
+    for name, tasks in (("", main), ("_further", further)):
+        if not tasks:
+            continue
+        which = "further" if name else "published"
+        path = learning_curves(tasks, looks, images / f"results_curves{name}.png")
+        yield shown(
+            path,
+            f"Success in training on the {which} tasks, mean over seeds (number in the "
+            "legend) with a band from the least to the most successful seed. Training "
+            "episodes explore.",
+        )
+        path = images / f"results_forces{name}.png"
+        force_boxes(tasks, looks, reference, path)
+        yield shown(
+            path,
+            f"Largest contact force of every evaluation episode on the {which} tasks, "
+            "episodes of all seeds together; whiskers at 1.5 interquartile ranges. "
+            "Diamonds are the published mean ± deviation."
+            if not name
+            else "Largest contact force of every evaluation episode on the further "
+            "tasks, episodes of all seeds together.",
+        )
+    if compared:
+        task = next(iter(compared.values()))[0].evaluation["task"]
+        path = images / "results_demonstrations.png"
+        with_demonstrations(compared, looks, path)
+        yield shown(
+            path,
+            f"With and without demonstrations on {task}, all from the "
+            "observation `internal`: success of the evaluation (points, with 95 % "
+            "intervals over the episodes of all seeds) where the training ended, and "
+            "of the training episodes on the way there (lines). Frames that the expert "
+            "played for the dataset are not counted.",
+        )
+    best = {
+        task: max(
+            agents_.values(), key=lambda found: np.mean([r.success for r in found])
+        )
+        for task, agents_ in table.items()
+    }
+    path = force_maps(best, images / "results_force_maps.png")
+    if path is not None:
+        yield shown(
+            path,
+            "Mean contact force per place (2 mm) over all evaluation episodes of the "
+            "most successful agent of each task, seen from the front; the colour scale "
+            "ends at the 98th percentile.",
+        )
+
+
+def shown(path, caption):
+    return f"![{caption}](images/{path.name})\n\n{caption}\n"

@@ -67,7 +67,7 @@ def read_vtp(data: bytes) -> tuple[np.ndarray, np.ndarray]:
         raise ValueError(f"its XML is damaged: {error}") from error
     if root.tag != "VTKFile" or root.get("type") != "PolyData":
         raise ValueError(f"it holds {root.get('type', root.tag)!r}, not PolyData")
-    arrays = _Arrays(root, appended, raw)
+    arrays = _VtpArrays(root, appended, raw)
     vertices, faces, count = [], [np.empty((0, 3), dtype=np.int64)], 0
     for piece in root.iter("Piece"):
         array = piece.find("Points/DataArray")
@@ -120,7 +120,7 @@ def _triangles(corners: np.ndarray, stops: np.ndarray, strips: bool) -> np.ndarr
     return corners[np.stack([first[last], last - 1, last], axis=1)]
 
 
-class _Arrays:
+class _VtpArrays:
     """Reads the arrays of a file, `_MOST_VALUES` values in all."""
 
     def __init__(self, root: ElementTree.Element, appended: bytes, raw: bool):
