@@ -13,7 +13,7 @@ What is measured
   a substep, over the substeps that have a contact.
 - wall force: magnitude of every single contact in every substep, and their sum.
 - excess: every control step, by how much the device stands out of the true lumen (or
-  of the sheath), at points 1 mm apart along its axis: `analysis.containment`. It adds
+  of the sheath), at points 1 mm apart along its axis: `containment.py`. It adds
   what the wall pieces stay behind the lumen to the penetration.
 - escape: the excess exceeds the device's diameter, so that a part of the device is
   wholly outside.
@@ -33,10 +33,10 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
+from containment import Containment
 from scipy.stats import qmc
 
 from cathsim_dmc import files, suite
-from cathsim_dmc.analysis.containment import Containment
 from cathsim_dmc.physics import forces
 from cathsim_dmc.simulation.batch import BatchSimulation
 

@@ -1,29 +1,16 @@
 """The soak's policies, its book-keeping, and that it goes on where it stopped."""
 
-import importlib.util
 import json
 import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
+import soak
 
 from cathsim_dmc import suite
 
-PATH = Path(__file__).parents[1] / "benchmarks" / "soak.py"
 
-
-@pytest.fixture(scope="module")
-def soak():
-    spec = importlib.util.spec_from_file_location("soak", PATH)
-    module = importlib.util.module_from_spec(spec)
-    sys.modules["soak"] = module
-    spec.loader.exec_module(module)
-    yield module
-    del sys.modules["soak"]
-
-
-def test_plan_covers_every_task_and_policy_evenly(soak):
+def test_plan_covers_every_task_and_policy_evenly():
     episodes = soak.plan(100)
     assert [episode.number for episode in episodes] == list(range(100))
     keys = [(episode.task, episode.policy) for episode in episodes]
@@ -39,7 +26,7 @@ def test_plan_covers_every_task_and_policy_evenly(soak):
 
 
 @pytest.mark.parametrize("name", ["halton", "push", "bang_bang", "reversals"])
-def test_policies_are_repeatable_and_use_the_whole_range(soak, name):
+def test_policies_are_repeatable_and_use_the_whole_range(name):
     policy = soak.POLICIES[name]
     actions = policy(400, 21, 1)
     assert actions.shape == (400, 21)
@@ -55,7 +42,7 @@ def test_policies_are_repeatable_and_use_the_whole_range(soak, name):
         assert set(forward) == {1.0}
 
 
-def test_percentile_is_that_of_all_rows_together(soak):
+def test_percentile_is_that_of_all_rows_together():
     rows = [
         {"penetration_histogram": {"0": 98, "100": 1}},
         {"penetration_histogram": {"300": 1}},
@@ -66,7 +53,7 @@ def test_percentile_is_that_of_all_rows_together(soak):
     assert soak.percentile([{"penetration_histogram": {}}], 99) == 0
 
 
-def run(soak, monkeypatch, capsys, out, episodes):
+def run(monkeypatch, capsys, out, episodes):
     arguments = ["--out", out, "--episodes", episodes, "--steps", 3, "--threads", 1]
     monkeypatch.setattr(sys, "argv", ["soak", *map(str, arguments), "--json"])
     code = soak.main()
@@ -75,13 +62,13 @@ def run(soak, monkeypatch, capsys, out, episodes):
 
 
 @pytest.mark.slow
-def test_it_goes_on_where_it_stopped(soak, monkeypatch, capsys, tmp_path):
-    code, first, _ = run(soak, monkeypatch, capsys, tmp_path, 1)
+def test_it_goes_on_where_it_stopped(monkeypatch, capsys, tmp_path):
+    code, first, _ = run(monkeypatch, capsys, tmp_path, 1)
     assert code == 0
     assert first["total"]["episodes"] == 1
     path = tmp_path / "episodes.jsonl"
     before = path.read_text()
-    code, second, err = run(soak, monkeypatch, capsys, tmp_path, 2)
+    code, second, err = run(monkeypatch, capsys, tmp_path, 2)
     assert code == 0
     assert path.read_text().startswith(before)
     assert second["total"]["episodes"] == 2
@@ -90,12 +77,12 @@ def test_it_goes_on_where_it_stopped(soak, monkeypatch, capsys, tmp_path):
     assert (tmp_path / "soak.md").read_text().count("|") > 20
     # A line that was cut off is run again.
     path.write_text(path.read_text()[:-20])
-    _, third, err = run(soak, monkeypatch, capsys, tmp_path, 2)
+    _, third, err = run(monkeypatch, capsys, tmp_path, 2)
     assert err.count("episodes in") == 1
     assert third["total"] == second["total"]
 
 
-def test_rows_of_another_length_are_refused(soak, tmp_path):
+def test_rows_of_another_length_are_refused(tmp_path):
     path = tmp_path / "episodes.jsonl"
     row = {"number": 0, "steps": 3, "tip_step_max": 1e-3}
     path.write_text(json.dumps(row) + "\n")
@@ -106,7 +93,7 @@ def test_rows_of_another_length_are_refused(soak, tmp_path):
     assert soak.read_rows(path, 3) == []
 
 
-def test_a_broken_bound_fails_the_report(soak):
+def test_a_broken_bound_fails_the_report():
     row = {
         "number": 0,
         "task": "type1_bca",

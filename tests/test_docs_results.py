@@ -9,23 +9,27 @@ import fabricated_results
 import numpy as np
 import pytest
 
-from cathsim_dmc.analysis.intervals import interquartile_mean
-
 SCRIPTS = Path(__file__).parents[1] / "docs/scripts"
 
 
 @pytest.fixture
-def page(tmp_path, monkeypatch):
-    """Writes the page of `tmp_path`/results; returns (exit code, text)."""
+def script(monkeypatch):
+    """The module docs/scripts/results.py."""
     monkeypatch.syspath_prepend(str(SCRIPTS))
     spec = importlib.util.spec_from_file_location("results", SCRIPTS / "results.py")
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     monkeypatch.delitem(sys.modules, "results_figures", raising=False)
+    return module
+
+
+@pytest.fixture
+def page(script, tmp_path):
+    """Writes the page of `tmp_path`/results; returns (exit code, text)."""
 
     def write():
         out = tmp_path / "docs/results.md"
-        code = module.main(["--results", str(tmp_path / "results"), "--out", str(out)])
+        code = script.main(["--results", str(tmp_path / "results"), "--out", str(out)])
         return code, out.read_text()
 
     return write
@@ -123,7 +127,8 @@ def test_a_broken_file_is_named_and_left_out(page, tmp_path, capsys, damage):
     assert "0 of the" in text
 
 
-def test_the_interquartile_mean_drops_a_quarter_on_either_side():
+def test_the_interquartile_mean_drops_a_quarter_on_either_side(script):
+    interquartile_mean = script.interquartile_mean
     scores = [[0.0, 0.9], [0.8, 1.0], [0.9, 1.0], [0.1, 0.9]]
     mean, interval = interquartile_mean(scores)
     assert mean == pytest.approx(np.mean([0.8, 0.9, 0.9, 0.9]))

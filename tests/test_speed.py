@@ -1,18 +1,11 @@
 """The speed benchmark: what it measures, not how fast this machine is."""
 
-import importlib.util
-from pathlib import Path
-
 import mujoco
 import numpy as np
 import pytest
+import speed as script
 
 from cathsim_dmc.analysis import speed
-
-PATH = Path(__file__).parents[1] / "benchmarks" / "speed.py"
-_spec = importlib.util.spec_from_file_location("all_speeds", PATH)
-script = importlib.util.module_from_spec(_spec)
-_spec.loader.exec_module(script)
 
 
 @pytest.fixture(scope="module")

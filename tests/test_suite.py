@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 from absl.testing import absltest
 from conftest import EACH_TASK, SHORT_EPISODE, TASKS, twin
+from containment import Containment
 from dm_control import suite as dm_suite
 from dm_env import specs, test_utils
 from scipy.stats import qmc
 
 from cathsim_dmc import suite
-from cathsim_dmc.analysis.containment import Containment
 from cathsim_dmc.anatomy.arch import arch
 from cathsim_dmc.anatomy.parts import Goal
 from cathsim_dmc.physics import forces

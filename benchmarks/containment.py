@@ -78,7 +78,7 @@ class Containment:
         In the lumen it is the device's radius less the depth of the point in the true
         lumen (not in the wall pieces, which approximate it). Before the inlet it is
         the distance by which the device's side lies beyond that of the bore. The
-        smaller of the two counts: a device that is in neither has nowhere to hide.
+        smaller of the two counts: a device that is in neither is always detected.
 
         Args:
           points: (..., 3) on the axis of the device, m, world frame.

@@ -1,25 +1,17 @@
 """How hard tasks are: ends of episodes, independence, bounds, bad input."""
 
 import dataclasses
-import importlib.util
 import re
-import sys
-from pathlib import Path
 
+import difficulty
 import numpy as np
 import pytest
 import tyro
+from difficulty import Limit, Trial
 
 from cathsim_dmc import policies, suite
 from cathsim_dmc.analysis.force_statistics import EpisodeForces, Statistics
 from cathsim_dmc.simulation.batch import BatchSimulation
-
-PATH = Path(__file__).parents[1] / "benchmarks" / "difficulty.py"
-_spec = importlib.util.spec_from_file_location("difficulty", PATH)
-difficulty = importlib.util.module_from_spec(_spec)
-sys.modules["difficulty"] = difficulty  # dataclasses look their module up
-_spec.loader.exec_module(difficulty)
-Limit, Trial = difficulty.Limit, difficulty.Trial
 
 
 class PushSome(policies.Policy):

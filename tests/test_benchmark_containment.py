@@ -2,10 +2,10 @@
 
 import numpy as np
 import pytest
+from containment import Containment, points_along
 from hypothesis import given
 from hypothesis import strategies as st
 
-from cathsim_dmc.analysis.containment import Containment, points_along
 from cathsim_dmc.anatomy.arch import arch
 
 RADIUS, BORE = 0.8e-3, 1.15e-3
