@@ -183,7 +183,7 @@ def _inlet(ends: tuple[End, ...]) -> Inlet:
 def _cut_at(
     tree: VesselTree, inlet: VesselPlace, goals: Mapping[str, Goal]
 ) -> tuple[VesselTree, tuple[str, bool]]:
-    """The tree without what lies behind the inlet; vessel and end that is entered.
+    """The tree cut at the inlet; vessel and end that is entered.
 
     Raises:
         ValueError: if a branch or a goal lies behind the inlet.

@@ -1,4 +1,4 @@
-"""The shortest way through the lumen, from anywhere in it to one point."""
+"""Length of the shortest path inside the lumen to one point."""
 
 from collections.abc import Callable
 
@@ -29,7 +29,7 @@ class LumenDistance:
         origin: np.ndarray,
         spacing: float = SPACING,
     ):
-        """Works out the ways to a target: 0.4 to 0.8 s.
+        """Computes the distances to a target; takes 0.4 to 0.8 s.
 
         Args:
           depth: Signed depth (n,) of points (n, 3) in the lumen, m, > 0 inside.
@@ -70,7 +70,7 @@ class LumenDistance:
         self._ways = (costs * spacing)[tuple(nearest)].astype(np.float32)
 
     def _lumen(self, depth: Callable, shape: np.ndarray) -> np.ndarray:
-        """Which lattice points are inside; only blocks that may be are looked at."""
+        """Mask of the lattice points inside; evaluates only blocks near the lumen."""
         blocks = -(-shape // _BLOCK)
         first = _BLOCK * np.argwhere(np.ones(blocks, bool))
         edge = (_BLOCK - 1) * self._spacing

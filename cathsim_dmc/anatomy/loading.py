@@ -1,4 +1,4 @@
-"""What a saved anatomy may hold: types, shapes, finite values, plausible places."""
+"""Checks of a saved anatomy: types, shapes, finite values, plausible places."""
 
 from __future__ import annotations
 

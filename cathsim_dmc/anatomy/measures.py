@@ -1,4 +1,4 @@
-"""What an arch is like: type, sizes, take-offs, curvature, how its ostia lie.
+"""Measures of an arch: type, sizes, take-offs, curvature, places of the ostia.
 
 Computed from centrelines and radii, so alike for generated, measured and imported
 anatomies. Lengths are metres and angles radians; the vertical is +z (superior).

@@ -69,7 +69,7 @@ class InletPlace:
 
 @dataclass(frozen=True, eq=False)
 class TreeFile:
-    """What a tree file says; lengths in metres, frame LPS.
+    """Content of a tree file; lengths in metres, frame LPS.
 
     Attributes:
         name: of the anatomy.

@@ -34,7 +34,7 @@ class Deviation:
 class Angiograph:
     """C-arms before an anatomy; images have the leading axis N of the devices.
 
-    The path through the vessel is computed once per pair of angles and kept.
+    The path length through the vessel is cached for each pair of angles.
     """
 
     def __init__(
@@ -43,7 +43,7 @@ class Angiograph:
         faces: np.ndarray,
         options: FluoroscopyOptions | None = None,
     ):
-        """Computes what does not move.
+        """Computes the path length through the vessel for the default angles.
 
         Args:
             vertices: (V, 3) of the lumen surface, world frame, m.

@@ -1,4 +1,4 @@
-"""The C-arm: where the X-ray source and the detector stand about the patient.
+"""The C-arm: position of X-ray source and detector about the patient.
 
 Frames. The world is the patient frame LPS in metres (+x left, +y posterior, +z
 superior). Pixel coordinates are (column, row): column grows to the right, row

@@ -18,7 +18,7 @@ from cathsim_dmc.imaging.carm import CArm
 
 @dataclass(frozen=True, eq=False)
 class Shadow:
-    """A device, or one of several in each other, as the beam meets it.
+    """A device, or one of several coaxial ones, in the beam.
 
     Attributes:
         points: (..., n, 3) joints from base to tip, world frame, m.

@@ -1,8 +1,7 @@
 """Fluoroscopy: the picture an operator sees, computed without OpenGL.
 
-What does not move, the path through vessel and patient, is computed once per anatomy
-and view (`Fluoroscope.from_surface`); what moves, the device, is drawn in every frame
-(`Fluoroscope.render`).
+The path length through vessel and patient is computed once per anatomy and view
+(`Fluoroscope.from_surface`); the device is drawn in every frame (`Fluoroscope.render`).
 """
 
 from __future__ import annotations

@@ -15,7 +15,7 @@ from cathsim_dmc.imaging import detector, materials
 # the inlet to the ends of the branches.
 DETECTOR_SIZE = 0.38
 
-# What a suite can be set to: far beyond what is built, within what can be computed.
+# Bounds of the options: wider than real systems, within the computable.
 _BOUNDS = {
     "magnification": (0.01, 1000.0, ""),
     "kerma": (0.0, 1.0, "Gy"),

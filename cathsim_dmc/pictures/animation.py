@@ -128,7 +128,7 @@ def _one_palette(pictures: list[Image.Image]) -> list[Image.Image]:
 
 
 class _Film:
-    """A figure of which each frame changes only what moves."""
+    """A figure in which each frame redraws only moving parts."""
 
     def __init__(self, episode: Episode, surface: Any, view: str, width: int):
         self._episode, self._surface = episode, surface

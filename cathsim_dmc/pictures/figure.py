@@ -44,7 +44,7 @@ ARROW_MM, ARROW_LEAST_MM = 22.0, 5.0
 ARROW_LEAST_N = 1e-4
 # Pieces of the drawn curve in each link.
 _PIECES = 6
-# The X-ray image of `scene_figure` unless another is asked for; the arch fills it.
+# Default X-ray image of `scene_figure`; the arch fills it.
 FLUOROSCOPY = FluoroscopyOptions(size=400, magnification=1.3)
 # Percentiles of an image that are shown as black and white.
 WINDOW = (0.02, 99.5)
@@ -61,7 +61,7 @@ _POINTS_PER_INCH = 72.0
 
 
 class Picture(Figure):
-    """A figure that notebooks show whether or not pyplot was ever imported.
+    """A figure that notebooks show without pyplot.
 
     Its axes have the colours and scales of `cathsim_dmc.style`.
     """
@@ -80,7 +80,7 @@ class Picture(Figure):
         return made
 
     def _repr_png_(self) -> bytes:
-        """What a notebook shows and keeps: 256 colours take a third of the place."""
+        """PNG for notebooks, with 256 colours: a third of the size."""
         full, small = io.BytesIO(), io.BytesIO()
         self.savefig(full, format="png")
         picture = Image.open(full).convert("RGB")

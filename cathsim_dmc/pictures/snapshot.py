@@ -1,4 +1,4 @@
-"""One moment of an episode, with all that a picture of it needs."""
+"""One state of an episode, with everything that a picture needs."""
 
 from __future__ import annotations
 
@@ -116,7 +116,7 @@ class Snapshot:
 
 
 def _coaxial(episode: Episode, state: int, radius: np.ndarray) -> dict[str, np.ndarray]:
-    """Radii (L,) of the links in a state, and where coaxial devices lie and end.
+    """Radii (L,) of the links in a state, and outermost and ends of coaxial devices.
 
     Args:
         episode: The record.

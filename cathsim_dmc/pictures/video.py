@@ -15,7 +15,7 @@ _QUALITY = "20"
 
 
 def require_encoder() -> None:
-    """Raise ImportError, which says what to install, where no MP4 can be written."""
+    """Raise ImportError if PyAV is not installed."""
     if importlib.util.find_spec("av") is None:
         raise ImportError(
             "an MP4 needs PyAV: pip install 'cathsim-dmc[mp4]'; a .webp or .gif film "

@@ -1,4 +1,4 @@
-"""From keys that are held to the action of a task."""
+"""Actions of a task from keys that are held."""
 
 import numpy as np
 
@@ -41,7 +41,7 @@ COAXIAL_HELP = (
 
 
 class _Keys:
-    """Commands that are held down, and those that were asked for once.
+    """Commands that are held, and single requests.
 
     Attributes:
       requested: "restart" or "quit" since the last `restart`, or None.
@@ -73,7 +73,7 @@ class _Keys:
         self.requested = None
 
     def _axes(self, duration: float) -> dict[str, float]:
-        """What is asked of each axis, in [-2, 2]; so many seconds pass."""
+        """Sum of the held commands of each axis; advances time by `duration`, s."""
         axes = dict.fromkeys((axis for axis, _ in self._meaning.values()), 0.0)
         for command in self._left:
             axis, sign = self._meaning[command]

@@ -1,4 +1,4 @@
-"""What the operator reads beside the picture."""
+"""Quantities shown beside the image."""
 
 from typing import Any
 

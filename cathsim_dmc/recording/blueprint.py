@@ -248,7 +248,7 @@ def _tip(
 
 
 def _robot(place: np.ndarray) -> rrb.Spatial3DView:
-    """The follower robot, which stands far from the anatomy."""
+    """View of the follower robot, which is far from the anatomy."""
     return rrb.Spatial3DView(
         origin="world",
         name="Robot",

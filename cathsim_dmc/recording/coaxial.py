@@ -1,4 +1,4 @@
-"""Coaxial devices of a recorded episode: where each ends, and which lies outermost.
+"""Coaxial devices of a recorded episode: their ends, and the outermost on each link.
 
 A record holds one chain of links; what the devices in it did stands in ``meta``.
 """

@@ -214,7 +214,7 @@ def _repeat(environment, episode: Episode):
                 f"episode with seed {episode.seed} ends at step {step} instead of "
                 f"{episode.steps - 1}; export it with the options it was recorded with"
             )
-    # Who recorded may have stopped it, which no step says.
+    # The operator may have stopped the recording, which no step shows.
     terminated, truncated = np.array(ends).T
     truncated[-1] |= not terminated[-1]
     return EpisodeBuffer(

@@ -23,7 +23,7 @@ _MAX_ARRAY = 2**33  # bytes of one array of one episode
 
 
 class DatasetError(ValueError):
-    """A dataset is missing, damaged, or not what was asked for."""
+    """A dataset is missing, damaged or of another kind."""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""What goes into a recording beside the episode, checked against it."""
+"""Inputs of a recording beside the episode, checked against it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""One recorded episode: what the device did, what it was told, what it pressed.
+"""One recorded episode: states, actions, rewards and contact forces.
 
 The record is independent of any scene: it holds world-frame arrays and a JSON
 dictionary, so statistics, heatmaps and Rerun files can be made from it long after
@@ -294,7 +294,7 @@ def _is_whole(value: Any) -> bool:
 
 
 def _plain(value: Any) -> Any:
-    """Turn numpy values into what JSON knows; everything else is refused."""
+    """Numpy values as JSON values; TypeError for all others."""
     if isinstance(value, np.generic | np.ndarray):
         return value.tolist()
     raise TypeError(f"{type(value).__name__} ({value!r}) has no JSON form")

@@ -7,7 +7,7 @@ import numpy as np
 from cathsim_dmc.recording.episode import Episode
 from cathsim_dmc.recording.geometry import force_text
 
-# A contact is told of anew when nothing was touched for so many steps before.
+# Steps without contact after which the next contact is an event again.
 _QUIET = 10
 INFO, WARN, ERROR = "INFO", "WARN", "ERROR"
 _END = {"success": INFO, "truncated": WARN, "physics_error": ERROR}

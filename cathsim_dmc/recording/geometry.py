@@ -125,7 +125,7 @@ def force_colours(
 
 
 def force_scale(magnitude: np.ndarray) -> float:
-    """Return the top of a colour scale in newtons that tells forces (...,) apart.
+    """Return the top of a colour scale for forces (...,), newtons.
 
     It is at most ``FORCE_COLOUR_MAX``, and no less than the largest force below that.
     """

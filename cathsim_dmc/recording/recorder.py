@@ -26,7 +26,7 @@ def navigation_of(env: Any) -> Any:
     """The task of an environment of this package.
 
     Raises:
-        TypeError: if it is none; says what is wanted.
+        TypeError: if it is no such environment.
     """
     task = getattr(env, "task", None)
     if not hasattr(task, "scene") or not hasattr(env, "physics"):

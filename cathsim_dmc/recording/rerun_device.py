@@ -58,7 +58,7 @@ def log_catheter(
     if coaxial is not None:
         outermost = coaxial.outermost(joints)
         thickness = coaxial.radii[outermost]
-        if colour == SHAFT_COLOUR:  # else it tells episodes apart, not devices
+        if colour == SHAFT_COLOUR:  # another colour marks the episode, not the device
             colours = device_colours(len(coaxial.names))[outermost]
         _log_ends(log, coaxial, entity)
     log.static(entity, rr.Capsules3D.from_fields(fill_mode="solid"))

@@ -122,11 +122,11 @@ def write_recording(
             raise RuntimeError(
                 "Rerun is switched off; unset the environment variable RERUN"
             )
-        # Rerun turns mistakes into warnings unless it is told to be strict.
+        # By default Rerun turns errors into warnings.
         with catch_and_log_exceptions(strict=True):
             stream.set_log_tick_enabled(False)
             stream.set_log_time_enabled(False)
-            # Not `save`, which never comes back from a full disk.
+            # Not `save`, which hangs on a full disk.
             encoded = stream.binary_stream()
             # Active at once: a viewer that reads over a network has made itself a
             # layout by the time that this one arrives.

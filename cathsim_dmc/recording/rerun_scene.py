@@ -1,4 +1,4 @@
-"""What stands still, and the bodies that the record moves, as Rerun entities."""
+"""Static parts of the scene, and the moving bodies, as Rerun entities."""
 
 from __future__ import annotations
 

@@ -14,7 +14,7 @@ from cathsim_dmc.recording.events import events
 from cathsim_dmc.recording.rerun_device import device_colours
 from cathsim_dmc.recording.rerun_stream import Log
 
-# At this quality noisy frames take about half of what the exact PNG takes.
+# At this quality noisy frames take about half the size of a PNG.
 JPEG_QUALITY = 90
 
 

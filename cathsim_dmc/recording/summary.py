@@ -13,7 +13,7 @@ _LONG = 8
 
 
 def episode_markdown(episode: Episode) -> str:
-    """Return a Markdown page: outcome, forces, how the episode was made."""
+    """Return a Markdown page: outcome, forces, versions and options."""
     force = np.linalg.norm(episode.contact_force, axis=-1)
     head_path = np.linalg.norm(np.diff(episode.head, axis=0), axis=-1).sum()
     rows = {

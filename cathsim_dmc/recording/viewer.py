@@ -26,7 +26,7 @@ _LIVE_PATIENCE = 5.0  # s
 
 
 class ViewerError(RuntimeError):
-    """The viewer cannot be opened here; the message says what would help."""
+    """The viewer cannot be opened; the message says how to mend it."""
 
 
 def check_recording(path: str | os.PathLike[str]) -> Path:
@@ -82,7 +82,7 @@ def web_address(host: str, port: int, data_port: int) -> str:
 
 
 def has_display(environment: Mapping[str, str] | None = None) -> bool:
-    """Whether a window can be opened, as far as the environment tells."""
+    """Whether the environment variables name a display."""
     if not sys.platform.startswith("linux"):
         return True
     environment = os.environ if environment is None else environment
@@ -128,7 +128,7 @@ def open_viewer(
         command = serve_command(recording, host, port, data_port)
         if announce is not None:
             announce(web_address(host, port, data_port))
-    # Where it serves has been said, and in a form that a browser elsewhere can use.
+    # `announce` has given the address already.
     return _wait(command, {"RUST_LOG": "warn", **os.environ})
 
 

@@ -21,7 +21,7 @@ DEFAULTS = {
 # path by more than that on average.
 PATH_BOUND = 1.0  # mm
 FORCE_BOUND = 10.0  # % of the mean wall force
-# A script with less wall force than this on average says nothing about it, N.
+# Least mean wall force of a script whose force is compared, N.
 LEAST_FORCE = 1e-3
 
 

@@ -47,7 +47,7 @@ class Resting(NamedTuple):
     load: float  # on the middle of the link
     contacts: float  # sum of the contact sensor, force of the device on the plate
     load_cell: float  # of the plate on its support
-    base: float  # share of the load that the base carries, by its sensor
+    base: float  # part of the load on the base, by its sensor
     penetration: float  # m
 
 

@@ -74,7 +74,7 @@ def rig_of(
     gaps: np.ndarray,
     rotation: np.ndarray | None = None,
 ) -> Rig:
-    """A compiled rig with coaxial devices that stand still."""
+    """A compiled rig with coaxial devices at rest."""
     entity = DeviceStack(chosen)
     rig = Rig(catheter=entity)
     rig.compile()

@@ -1,4 +1,4 @@
-"""Devices pressed on a wall: a law of contact that holds them still, or rattles."""
+"""Devices pressed on a wall: whether the contact law keeps them at rest."""
 
 from __future__ import annotations
 

@@ -24,7 +24,7 @@ class Rig:
     It lies along +z, its base at insertion 0.
 
     Integrator, time step, solver and contact parameters are those of the tasks.
-    Gravity is off; what the default device weighs in blood is nothing anyway.
+    Gravity is off; the default device is neutrally buoyant in blood.
 
     Attributes:
         arena: to which a test adds its own fixtures before `compile`.

@@ -20,7 +20,7 @@ from cathsim_dmc.validation import convergence
 from cathsim_dmc.validation.checks import Check, Report
 from cathsim_dmc.validation.rig import Rig
 
-# Bounds on how far the wall stands in the lumen, mm.
+# Bounds on how far the wall protrudes into the lumen, mm.
 INTRUSION_MEAN, INTRUSION_P95, INTRUSION_MAX = 0.10, 0.30, 0.60
 CAPSTAN_BOUND = 10.0  # % of the coefficient of friction
 ARCHES = ("type1", "type2")

@@ -1,4 +1,4 @@
-"""The figures of an aortic arch and what is allowed for each of them."""
+"""Parameters of an aortic arch, with the bounds of each."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def _check(name: str, value: object, low: float, high: float, unit: str) -> None
 
 @dataclass(frozen=True)
 class BranchParameters:
-    """Figures of one branch of the arch (metres, radians).
+    """Parameters of one branch of the arch (metres, radians).
 
     Attributes:
         radius: lumen radius at the origin, before the flare of the ostium.
@@ -69,7 +69,7 @@ class BranchParameters:
 
 @dataclass(frozen=True)
 class ArchParameters:
-    """Every figure of an aortic arch (metres, radians).
+    """Parameters of an aortic arch (metres, radians).
 
     Attributes:
         ascending_radius, bca_level_radius, lcca_level_radius, lsa_level_radius,

@@ -283,7 +283,7 @@ def _wrapped(angle: float) -> float:
 
 @dataclass(frozen=True)
 class ArchSeed:
-    """One arch of a set: what is drawn, and its seed.
+    """One arch of a set: kind and seed.
 
     Attributes:
         seed: of the `RandomState` that draws it.

@@ -1,4 +1,4 @@
-"""Imports kept by the content of what went into them."""
+"""Cache of imports, by the content of their files and options."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def cached_import(
     notes: list[str] | None = None,
     **options: Any,
 ) -> Anatomy:
-    """As ``import_scan``, but what was imported before is read from a cache.
+    """As ``import_scan``, with a cache of earlier imports.
 
     An entry is found by the bytes of mesh and centrelines, their names, the options
     and this package's code, and is put in place in one step: readers find a whole one

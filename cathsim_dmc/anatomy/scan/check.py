@@ -1,4 +1,4 @@
-"""Proof of a vessel tree against the surface it claims to run in."""
+"""Checks of a vessel tree against the surface of its lumen."""
 
 from __future__ import annotations
 

@@ -37,7 +37,7 @@ class FreeEnd:
 
 
 class Cover:
-    """What lies in or close to vessels that are already known."""
+    """Nodes in or close to vessels that are already known."""
 
     def __init__(self, ways: Ways):
         """Nothing is covered yet."""

@@ -291,7 +291,7 @@ def _compact(vertices, faces) -> Surface:
 
 
 def _check_wall(wall: str, threshold: float | None) -> float:
-    """CoACD's threshold (m), before an import takes its time to no avail."""
+    """CoACD's threshold (m), checked before the import."""
     if wall not in WALLS:
         raise ValueError(f"wall is {wall!r}; give one of {', '.join(WALLS)}.")
     if wall != "coacd" and threshold is not None:

@@ -1,4 +1,4 @@
-"""The inlet of a scan: the lumen is cut across it, and what lies behind is shut."""
+"""The inlet of a scan: the lumen is cut across it and closed behind it."""
 
 from __future__ import annotations
 

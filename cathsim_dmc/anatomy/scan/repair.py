@@ -120,7 +120,7 @@ class _Work:
             )
 
     def keep_one_part(self, quiet: bool = False) -> None:
-        """Drop crumbs; of a wall's two surfaces keep the inner one."""
+        """Drops small parts; keeps the inner of the two surfaces of a wall."""
         label = parts(self.faces, len(self.vertices))
         area = areas(self.vertices, self.faces)
         share = np.bincount(label, area) / area.sum()

@@ -1,4 +1,4 @@
-"""What an import gave, in figures."""
+"""Figures of an imported anatomy."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ RAYS = 20_000  # shot at the wall to find leaks
 
 
 def describe(anatomy: Anatomy) -> dict[str, Any]:
-    """What an import gave, as JSON values in millimetres.
+    """Figures of an imported anatomy, JSON values in millimetres.
 
-    The wall is measured, not quoted: how far it stands in the lumen, rays that slip
-    through it, and vessels it closes to a 5 Fr catheter.
+    The wall is measured: how far it protrudes into the lumen, rays that escape through
+    it, and vessels that it closes to a 5 Fr catheter.
     """
     vessels = {}
     for key, vessel in anatomy.tree.vessels.items():
