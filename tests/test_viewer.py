@@ -1,12 +1,13 @@
 """dm_control's own viewer on a display that nobody sees."""
 
+import contextlib
 import os
+import shutil
 import subprocess
 import sys
 import time
 
 import pytest
-from test_play import display
 
 _PROGRAM = """
 import numpy as np
@@ -29,6 +30,31 @@ def policy(timestep):
 
 viewer.launch(env, policy)
 """
+
+
+@contextlib.contextmanager
+def display():
+    """An X server of one's own, and its name."""
+    for program in ("Xvfb", "xdotool"):
+        if shutil.which(program) is None:
+            pytest.skip(f"no {program} here")
+    pytest.importorskip("tkinter")
+    read, write = os.pipe()
+    server = subprocess.Popen(
+        ["Xvfb", "-displayfd", str(write), "-screen", "0", "1024x768x24"],
+        pass_fds=[write],
+        stderr=subprocess.DEVNULL,
+    )
+    os.close(write)
+    try:
+        with os.fdopen(read) as pipe:
+            number = pipe.readline().strip()
+        if not number:
+            pytest.skip("Xvfb does not start here")
+        yield f":{number}"
+    finally:
+        server.terminate()
+        server.wait()
 
 
 @pytest.mark.slow
