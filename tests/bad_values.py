@@ -247,9 +247,13 @@ def try_bytes(tally, entry, path, load, examples, same=None, named=None):
         path.write_bytes(good)
 
 
-def settled(tally, folder, before):
-    """Nothing was written, and everything was refused."""
+def try_all(attempts, folder, examples, least):
+    """Tries what damages files of a folder; all is refused and nothing is written."""
+    tally, before = Tally(), sorted(folder.rglob("*"))
+    for one in attempts:
+        one(tally, folder, examples)
     assert sorted(folder.rglob("*")) == before, "something was written"
     print(tally.report())
     shown = "\n".join(sorted(set(tally.wrong))[:200])
     assert not tally.wrong, f"{len(tally.wrong)} of {tally.tried.total()}:\n{shown}"
+    assert tally.tried.total() > least

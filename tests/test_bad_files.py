@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import synthetic_env
 import torch
-from bad_values import ERRORS, Tally, settled, try_bytes, try_json
+from bad_values import ERRORS, try_all, try_bytes, try_json
 from hypothesis import strategies as st
 from synthetic_scans import write_markup
 from test_agents_training import run, small_ppo
@@ -232,11 +232,7 @@ EVERYTHING = (
 
 @pytest.mark.parametrize("examples", [8, pytest.param(60, marks=pytest.mark.slow)])
 def test_damaged_files_are_refused_by_name(store, examples):
-    tally, before = Tally(), sorted(store.rglob("*"))
-    for one in EVERYTHING:
-        one(tally, store, examples)
-    settled(tally, store, before)
-    assert tally.tried.total() > 7 * examples
+    try_all(EVERYTHING, store, examples, 7 * examples)
 
 
 def test_a_run_with_damaged_settings_can_still_be_evaluated(store, tmp_path):

@@ -5,7 +5,7 @@ import json
 
 import numpy as np
 import pytest
-from bad_values import ERRORS, Tally, damaged_json, settled, try_bytes, try_json
+from bad_values import ERRORS, damaged_json, try_all, try_bytes, try_json
 from hypothesis import strategies as st
 from recording_samples import make_episode, make_tube
 
@@ -270,8 +270,4 @@ EVERYTHING = (try_episodes, try_dumps, try_rerun_files, try_datasets)
 
 @pytest.mark.parametrize("examples", [8, pytest.param(80, marks=pytest.mark.slow)])
 def test_damaged_recordings_are_refused_by_name(store, examples):
-    tally, before = Tally(), sorted(store.rglob("*"))
-    for one in EVERYTHING:
-        one(tally, store, examples)
-    settled(tally, store, before)
-    assert tally.tried.total() > 6 * examples
+    try_all(EVERYTHING, store, examples, 6 * examples)

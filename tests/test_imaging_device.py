@@ -2,12 +2,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from test_imaging_thickness import (
-    cylinder_interval,
-    pixel_mean,
-    rays,
-    sphere_interval,
-)
+from test_imaging_thickness import true_capsule
 
 from cathsim_dmc.imaging import CArm, device_attenuation, device_thickness
 from cathsim_dmc.imaging.kernel import add_disc, disc_quadrant
@@ -40,19 +35,6 @@ def seen_volume(carm, image, depth):
     """Volume that an image of thickness shows of an object at one depth."""
     area = (depth / carm.focal_length) ** 2 / carm.slant()
     return (image * area).sum(axis=(-2, -1))
-
-
-def true_capsule(carm, start, stop, radius, supersample):
-    direction = rays(carm, supersample)
-    spans = [
-        cylinder_interval(carm.source, direction, start, stop, radius),
-        sphere_interval(carm.source, direction, start, radius),
-        sphere_interval(carm.source, direction, stop, radius),
-    ]
-    enter = np.min([np.where(b > a, a, np.inf) for a, b in spans], axis=0)
-    leave = np.max([np.where(b > a, b, -np.inf) for a, b in spans], axis=0)
-    chord = np.where(leave > enter, leave - enter, 0.0)
-    return pixel_mean(chord, supersample)
 
 
 # ---------------------------------------------------------------- the disc kernel
