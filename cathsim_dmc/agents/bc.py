@@ -11,6 +11,7 @@ from typing_extensions import override
 
 from cathsim_dmc.agents.config import ConfigError, TrainingConfig
 from cathsim_dmc.agents.demonstrations import load_transitions
+from cathsim_dmc.agents.fields import positive
 from cathsim_dmc.agents.imitation import CloningLearner, decaying
 from cathsim_dmc.agents.networks import NetworkShapes
 
@@ -35,20 +36,15 @@ class BCConfig(TrainingConfig):
     resumable: ClassVar[frozenset[str]] = TrainingConfig.resumable - {"total_frames"}
 
     demonstrations: str = ""
-    gradient_steps: int = 10_000
-    batch_size: int = 256
-    steps_per_env: int = 128
+    gradient_steps: int = positive(10_000)
+    batch_size: int = positive(256)
+    steps_per_env: int = positive(128)
     total_frames: int = 20_480
     hidden: tuple[int, ...] = (128, 128)
     learning_rate: float = 1e-3
     normalisation_frames: int = 0
     training_max_steps: int | None = 300
     checkpoint_frames: int = 10_240
-
-    def __post_init__(self):
-        """Validate the algorithm's own fields after the shared ones."""
-        super().__post_init__()
-        self._require_positive("gradient_steps", "batch_size", "steps_per_env")
 
     @property
     def frames_per_batch(self) -> int:

@@ -2,12 +2,17 @@
 
 import dataclasses
 import json
-import typing
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, ClassVar, Literal
 
-from cathsim_dmc.agents.fields import ConfigError, require, require_type, tuples
+from cathsim_dmc.agents.fields import (
+    ConfigError,
+    check_fields,
+    positive,
+    require,
+    within,
+)
 from cathsim_dmc.bounds import MOST_START_SHARE
 
 # Widest layer and most layers of a network: settings must not take all memory.
@@ -116,67 +121,44 @@ class TrainingConfig:
     observation: str | tuple[str, ...] = "internal"
     task_kwargs: Mapping[str, Any] = field(default_factory=dict)
     training_reward: Mapping[str, float] | None = None
-    training_max_steps: int | None = None
+    training_max_steps: int | None = positive(None)
     training_start: tuple[float, float] | None = None
     backend: Literal["batched", "composer"] = "batched"
-    num_envs: int = 16
-    num_threads: int | None = None
-    seed: int = 0
-    total_frames: int = 600_000
+    num_envs: int = positive(16)
+    num_threads: int | None = positive(None)
+    seed: int = within(0, 0)
+    total_frames: int = positive(600_000)
     hidden: tuple[int, ...] = (64, 64)
     activation: Literal["tanh", "relu", "elu"] = "tanh"
     subtract_background: bool = False
     convolutions: tuple[tuple[int, int, int], ...] = PUBLISHED_CONVOLUTIONS
     cnn_features: int = 512
-    learning_rate: float = 3e-4
-    gamma: float = 0.99
-    observation_clip: float = 10.0
-    normalisation_frames: int = 4_096
+    learning_rate: float = positive(3e-4)
+    gamma: float = within(0.99, 0, 1, "(]")
+    observation_clip: float = positive(10.0)
+    normalisation_frames: int = within(4_096, 0)
     initial_policy: str | None = None
-    initial_std: float | None = None
-    checkpoint_frames: int = 51_200
-    checkpoint_seconds: float = 120.0
-    keep_checkpoints: int = 3
-    metrics_frames: int = 2_048
+    initial_std: float | None = positive(None)
+    checkpoint_frames: int = positive(51_200)
+    checkpoint_seconds: float = positive(120.0)
+    keep_checkpoints: int = positive(3)
+    metrics_frames: int = positive(2_048)
     tensorboard: bool = False
     torch_device: str = "cpu"
-    torch_threads: int = 1
+    torch_threads: int = positive(1)
     rerun: bool = False
-    rerun_every: int = 1
-    rerun_steps: int = 300
+    rerun_every: int = positive(1)
+    rerun_steps: int = positive(300)
     rerun_viewer: str | None = None
     collector: Literal["local", "ray"] = "local"
-    collectors: int = 2
+    collectors: int = positive(2)
 
     def __post_init__(self):
         """Validate; every message says what was given and what is allowed."""
-        for name, kind in typing.get_type_hints(type(self)).items():
-            if typing.get_origin(kind) is ClassVar:
-                continue
-            value = getattr(self, name)
-            value = dict(value) if isinstance(value, Mapping) else tuples(value)
-            require_type(name, value, kind)
-            object.__setattr__(self, name, value)
+        check_fields(self)
         require(bool(self.task), "task", self.task, "the name of a task")
         require(bool(self.observation), "observation", self.observation, "a name")
         self._require_networks()
-        self._require_positive(
-            "num_envs",
-            "num_threads",
-            "total_frames",
-            "training_max_steps",
-            "initial_std",
-            "checkpoint_frames",
-            "keep_checkpoints",
-            "metrics_frames",
-            "torch_threads",
-            "rerun_every",
-            "rerun_steps",
-            "collectors",
-            "learning_rate",
-            "observation_clip",
-            "checkpoint_seconds",
-        )
         start = self.training_start
         require(
             start is None
@@ -186,10 +168,6 @@ class TrainingConfig:
             "two shares (low, high) with 0 <= low <= high <= "
             f"{MOST_START_SHARE:g}, or None",
         )
-        for name in ("seed", "normalisation_frames"):
-            value = getattr(self, name)
-            require(value >= 0, name, value, "an integer >= 0")
-        require(0 < self.gamma <= 1, "gamma", self.gamma, "in (0, 1]")
         try:
             json.dumps(self.task_kwargs, allow_nan=False)
         except (TypeError, ValueError) as error:
@@ -213,12 +191,6 @@ class TrainingConfig:
             numbers = layer if len(layer) == 3 else ()
             what = "layers (filters, kernel size, stride), each number"
             sizes("convolutions", numbers, MAX_FILTERS, what)
-
-    def _require_positive(self, *names: str) -> None:
-        for name in names:
-            value = getattr(self, name)
-            kind = "a positive integer" if isinstance(value, int) else "positive"
-            require(value is None or value > 0, name, value, kind)
 
     @property
     def training_kwargs(self) -> dict[str, Any]:

@@ -17,6 +17,7 @@ from typing_extensions import override
 
 from cathsim_dmc.agents.config import TrainingConfig, require
 from cathsim_dmc.agents.demonstrations import EXPERT_ACTION
+from cathsim_dmc.agents.fields import positive, within
 from cathsim_dmc.agents.imitation import CloningLearner, decaying
 from cathsim_dmc.agents.networks import NetworkShapes
 from cathsim_dmc.agents.replay import ReplayMemory
@@ -51,12 +52,12 @@ class DAggerConfig(TrainingConfig):
         "demo": {"observation": "tracking", "training_max_steps": 250},
     }
 
-    steps_per_env: int = 128
-    expert_share: float = 0.5
-    gradient_steps: int = 2_000
-    batch_size: int = 256
+    steps_per_env: int = positive(128)
+    expert_share: float = within(0.5, 0, 1)
+    gradient_steps: int = positive(2_000)
+    batch_size: int = positive(256)
     replay_frames: int = 1_000_000
-    replay_bytes: int = 2 * 1024**3
+    replay_bytes: int = positive(2 * 1024**3)
     total_frames: int = 20_480
     hidden: tuple[int, ...] = (128, 128)
     learning_rate: float = 1e-3
@@ -67,11 +68,6 @@ class DAggerConfig(TrainingConfig):
     def __post_init__(self):
         """Validate the algorithm's own fields after the shared ones."""
         super().__post_init__()
-        self._require_positive(
-            "steps_per_env", "gradient_steps", "batch_size", "replay_bytes"
-        )
-        share = self.expert_share
-        require(0 <= share <= 1, "expert_share", share, "in [0, 1]")
         require(
             self.replay_frames >= self.frames_per_batch,
             "replay_frames",

@@ -1,10 +1,11 @@
 """Values of settings: refused by the name of the field, with what is allowed."""
 
+import dataclasses
 import math
 import types
 import typing
-from collections.abc import Mapping
-from typing import Any, Literal
+from collections.abc import Callable, Mapping
+from typing import Any, ClassVar, Literal
 
 MAX_INTEGER = 2**62
 
@@ -17,6 +18,49 @@ def require(condition: bool, name: str, given: object, allowed: str) -> None:
     """Raise ConfigError naming the field, what was given and what is allowed."""
     if not condition:
         raise ConfigError(f"{name}={given!r} is not allowed: {name} must be {allowed}.")
+
+
+def positive(default: Any) -> Any:
+    """A field greater than zero; None passes where its type allows it."""
+    return _checked(default, lambda value: value > 0, "positive")
+
+
+def within(default: Any, low: float, high: float = math.inf, ends: str = "[]") -> Any:
+    """A field in an interval, whose `ends` belong to it ("[]") or not ("()")."""
+
+    def fits(value: float) -> bool:
+        above = value > low if ends[0] == "(" else value >= low
+        return above and (value < high if ends[1] == ")" else value <= high)
+
+    bounds = f"in {ends[0]}{low:g}, {high:g}{ends[1]}"
+    return _checked(default, fits, bounds if high < math.inf else f">= {low:g}")
+
+
+def _checked(default: Any, fits: Callable[[Any], bool], allowed: str) -> Any:
+    return dataclasses.field(default=default, metadata={"check": (fits, allowed)})
+
+
+def check_fields(config: Any) -> None:
+    """Raise ConfigError unless the fields of a dataclass have their types and bounds.
+
+    Lists become tuples. The bounds of a base class hold in its subclasses.
+    """
+    for name, kind in typing.get_type_hints(type(config)).items():
+        if typing.get_origin(kind) is ClassVar:
+            continue
+        value = getattr(config, name)
+        value = dict(value) if isinstance(value, Mapping) else tuples(value)
+        require_type(name, value, kind)
+        object.__setattr__(config, name, value)
+        for base in type(config).__mro__:
+            field = getattr(base, "__dataclass_fields__", {}).get(name)
+            if field is None or value is None or "check" not in field.metadata:
+                continue
+            fits, allowed = field.metadata["check"]
+            whole = isinstance(value, int) and allowed == "positive"
+            require(
+                fits(value), name, value, "a positive integer" if whole else allowed
+            )
 
 
 _KINDS = {

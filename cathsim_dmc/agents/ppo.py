@@ -24,6 +24,7 @@ from cathsim_dmc.agents.actor_critic import (
 )
 from cathsim_dmc.agents.config import ConfigError, TrainingConfig, require
 from cathsim_dmc.agents.exploration import CorrelatedExploration, CorrelatedNoise
+from cathsim_dmc.agents.fields import positive, within
 from cathsim_dmc.agents.learner import Learner
 from cathsim_dmc.agents.networks import (
     GaussianActor,
@@ -95,34 +96,23 @@ class PPOConfig(ActorCriticConfig):
         "tuned_image": {**_TUNED, **TUNED_IMAGES},
     }
 
-    steps_per_update: int = 512
-    minibatch_size: int = 32
-    epochs: int = 20
-    gae_lambda: float = 0.95
-    clip: float = 0.1
-    entropy_coefficient: float = 5.85e-4
-    value_coefficient: float = 0.872
-    max_grad_norm: float = 1.0
-    target_kl: float | None = None
-    initial_deviation: float = 1.0
-    noise_correlation: float = 0.0
-    noise_shared: float = 0.0
+    steps_per_update: int = positive(512)
+    minibatch_size: int = positive(32)
+    epochs: int = positive(20)
+    gae_lambda: float = within(0.95, 0, 1)
+    clip: float = within(0.1, 0, 1, "()")
+    entropy_coefficient: float = within(5.85e-4, 0)
+    value_coefficient: float = within(0.872, 0)
+    max_grad_norm: float = positive(1.0)
+    target_kl: float | None = positive(None)
+    initial_deviation: float = positive(1.0)
+    noise_correlation: float = within(0.0, 0, 1, "[)")
+    noise_shared: float = within(0.0, 0, 1, "[)")
     anneal: bool = False
 
     def __post_init__(self):
         """Validate the algorithm's own fields after the shared ones."""
         super().__post_init__()
-        self._require_positive(
-            "steps_per_update",
-            "minibatch_size",
-            "epochs",
-            "max_grad_norm",
-            "initial_deviation",
-            "target_kl",
-        )
-        for name in ("noise_correlation", "noise_shared"):
-            value = getattr(self, name)
-            require(0 <= value < 1, name, value, "in [0, 1)")
         if self.steps_per_update % self.num_envs:
             raise ConfigError(
                 f"steps_per_update={self.steps_per_update} is not a multiple of "
@@ -136,11 +126,6 @@ class PPOConfig(ActorCriticConfig):
                 f"would weigh its frames more than the others."
             )
         require(self.minibatch_size > 1, "minibatch_size", self.minibatch_size, "> 1")
-        require(0 <= self.gae_lambda <= 1, "gae_lambda", self.gae_lambda, "in [0, 1]")
-        require(0 < self.clip < 1, "clip", self.clip, "in (0, 1)")
-        for name in ("entropy_coefficient", "value_coefficient"):
-            value = getattr(self, name)
-            require(value >= 0, name, value, ">= 0")
 
     @property
     def frames_per_batch(self) -> int:

@@ -20,6 +20,7 @@ from cathsim_dmc.agents.actor_critic import (
 )
 from cathsim_dmc.agents.config import require
 from cathsim_dmc.agents.demonstrations import load_transitions
+from cathsim_dmc.agents.fields import positive, within
 from cathsim_dmc.agents.learner import Learner
 from cathsim_dmc.agents.networks import (
     GaussianActor,
@@ -76,29 +77,20 @@ class SACConfig(ActorCriticConfig):
         "tuned_image": {**_TUNED, **TUNED_IMAGES},
     }
 
-    batch_size: int = 256
-    tau: float = 0.005
-    replay_frames: int = 600_000
-    replay_bytes: int = REPLAY_BYTES
+    batch_size: int = positive(256)
+    tau: float = within(0.005, 0, 1, "(]")
+    replay_frames: int = positive(600_000)
+    replay_bytes: int = positive(REPLAY_BYTES)
     random_frames: int = 5_000
-    steps_per_env: int = 4
-    updates_per_frame: float = 1.0
-    initial_alpha: float = 1.0
+    steps_per_env: int = positive(4)
+    updates_per_frame: float = positive(1.0)
+    initial_alpha: float = positive(1.0)
     target_entropy: float | None = None
     demonstrations: str | None = None
 
     def __post_init__(self):
         """Validate the algorithm's own fields after the shared ones."""
         super().__post_init__()
-        self._require_positive(
-            "batch_size",
-            "replay_frames",
-            "replay_bytes",
-            "steps_per_env",
-            "updates_per_frame",
-            "initial_alpha",
-        )
-        require(0 < self.tau <= 1, "tau", self.tau, "in (0, 1]")
         require(
             self.random_frames >= self.batch_size,
             "random_frames",
