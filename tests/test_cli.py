@@ -123,7 +123,7 @@ def test_every_option_of_a_task_is_one_of_the_evaluation(cathsim, monkeypatch):
     monkeypatch.setenv("COLUMNS", "200")
     _, out, _ = cathsim("eval", "--help")
     for task in ("type1_bca", "navigate", "arch_bca"):
-        for name in set(suite.task_options(task)) - {"observation"}:
+        for name in set(suite.task_options(task)) - {"observation", "effects"}:
             assert f"--{name.replace('_', '-')}" in out, name
 
 

@@ -15,6 +15,7 @@ from tyro import conf
 _SINGLE = (str, int, float, bool)
 _JSON = " As JSON; by default the task's own."
 _OWN = " By default the task's own."
+_OBJECTS = frozenset({"effects"})  # Python objects: no text stands for them
 
 
 @functools.cache
@@ -34,7 +35,7 @@ def task_kind(omitted: frozenset[str]) -> type:
     helps = field_helps(NavigationConfig) | _helps(Cannulation.to)
     fields = []
     for name, kind in kinds.items():
-        if name in omitted:
+        if name in omitted | _OBJECTS:
             continue
         either, text = _single(kind), _OWN
         if _has_parts(kind):
