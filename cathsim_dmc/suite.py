@@ -144,7 +144,7 @@ def make_task(
         **{key: value for key, value in options.items() if key in _CONFIG_FIELDS}
     )
     # Before seconds of work are lost.
-    observations.resolve(config.observation)
+    observations.resolve(config.observation, config.devices is not None)
     random = bounds.random_state("random", random)
     goal = own.get("goal", definition.goal or "bca")
     access = own.get("access", definition.access)

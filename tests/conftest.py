@@ -12,6 +12,7 @@ import pytest
 from cathsim_dmc import suite
 from cathsim_dmc.anatomy.wall import fidelity
 from cathsim_dmc.physics.randomisation import Episode
+from cathsim_dmc.tasks import observations
 from cathsim_dmc.tasks.navigation import Navigation
 
 # A first call may import scipy or compile; how long it takes is not what is tested.
@@ -23,6 +24,12 @@ TASKS = ("type1_bca", "type1_lcca", "type2_bca", "type2_lcca")
 EACH_TASK = [
     pytest.param(name, marks=() if quick else pytest.mark.slow)
     for name, quick in zip(TASKS, (False, True, True, False), strict=True)
+]
+# Of one device; those of cameras need OpenGL.
+OBSERVATIONS = [
+    name
+    for name, row in observations.OBSERVATIONS.items()
+    if not row.coaxial and name not in ("rgb", "depth")
 ]
 SHORT_EPISODE = 12  # control steps
 

@@ -5,11 +5,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from conftest import OBSERVATIONS
 
 from cathsim_dmc import suite
 from cathsim_dmc.tasks import observations
 from cathsim_dmc.tasks.cameras import CAMERAS, CameraOptions
-from cathsim_dmc.tasks.observation_kind import ImageOptions
+from cathsim_dmc.tasks.observation_kind import Sizes
 
 SCRIPT = Path(__file__).parents[1] / "docs" / "scripts" / "observations.py"
 
@@ -22,13 +23,11 @@ def script():
     return module
 
 
-NAMES = [n for n in observations.OBSERVATIONS if n not in ("rgb", "depth")]
-
-
 @pytest.fixture(scope="module")
 def environment():
     """With all observations that need no OpenGL."""
-    return suite.load("cathsim", "simple1_bca", {"observation": NAMES, "random": 0})
+    options = {"observation": OBSERVATIONS, "random": 0}
+    return suite.load("cathsim", "simple1_bca", options)
 
 
 def test_the_table_names_what_the_functions_return(environment, monkeypatch):
@@ -42,18 +41,19 @@ def test_the_table_names_what_the_functions_return(environment, monkeypatch):
     )
     environment.reset()
     frame = frames[-1]
-    for name in NAMES:
+    for name in OBSERVATIONS:
         returned = observations.OBSERVATIONS[name].observe(frame)
-        listed = observations.entry_specs([name], ImageOptions())
+        listed = observations.entry_specs([name], Sizes())
         assert list(returned) == list(listed)
 
 
 def test_cameras_have_an_entry_each():
-    options = ImageOptions(cameras=CameraOptions(names=CAMERAS))
+    sizes = Sizes(cameras=CameraOptions(names=CAMERAS))
     for kind in ("rgb", "depth"):
-        keys = observations.entry_specs([kind], options)
+        keys = observations.entry_specs([kind], sizes)
         assert list(keys) == [f"{kind}_{name}" for name in CAMERAS]
-        assert all(spec is not None for spec in keys.values())
+        channels = 3 if kind == "rgb" else 1
+        assert {spec.shape for spec in keys.values()} == {(128, 128, channels)}
 
 
 def test_the_page_is_what_the_specs_say(script):
@@ -66,7 +66,7 @@ def test_values_lie_in_the_ranges_of_the_table(environment):
     random = np.random.default_rng(0)
     timesteps = [environment.reset()]
     timesteps += [environment.step(random.uniform(-1, 1, 21)) for _ in range(20)]
-    for name in NAMES:
+    for name in OBSERVATIONS:
         for entry in observations.OBSERVATIONS[name].entries:
             values = np.stack([t.observation[entry.key] for t in timesteps])
             assert entry.low <= values.min(), entry.key

@@ -6,7 +6,7 @@ import signal
 
 import numpy as np
 import pytest
-from conftest import TASKS
+from conftest import OBSERVATIONS, TASKS
 from dm_control import suite as dm_suite
 from dm_control.composer.variation import distributions
 
@@ -16,7 +16,6 @@ from cathsim_dmc.anatomy.parts import Goal
 from cathsim_dmc.entities import devices
 from cathsim_dmc.physics.randomisation import Randomisation
 from cathsim_dmc.simulation.batch import BatchSimulation
-from cathsim_dmc.tasks import observations
 from cathsim_dmc.tasks.config import NavigationConfig
 from cathsim_dmc.tasks.objectives import Cannulation
 
@@ -42,12 +41,12 @@ def test_wrong_domain_name():
 
 
 def test_wrong_observation_name():
-    fails(["pixels", *observations.OBSERVATIONS], observation="pixels")
+    fails(["pixels", *OBSERVATIONS], observation="pixels")
 
 
 @pytest.mark.parametrize("names", [["internal", "pixels"], ["force", "force"], []])
 def test_wrong_list_of_observations(names):
-    fails([names, *observations.OBSERVATIONS, "list"], observation=names)
+    fails([names, *OBSERVATIONS, "list"], observation=names)
 
 
 def test_wrong_option_name():

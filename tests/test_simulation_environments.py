@@ -1,11 +1,19 @@
+import numpy as np
 import pytest
 import synthetic_env
 import torch
+from conftest import twin
+from dm_env.specs import BoundedArray
+from torchrl.data import Bounded
 from torchrl.envs import check_env_specs
 
+from cathsim_dmc import suite
 from cathsim_dmc.agents import evaluate, make_config, make_env, train
 from cathsim_dmc.agents.networks import NetworkShapes
+from cathsim_dmc.simulation.composer import composer_env
 from cathsim_dmc.simulation.environments import standard_observations
+from cathsim_dmc.simulation.torchrl import BatchedEnv
+from cathsim_dmc.tasks.rollout import Rollout
 
 TASK = "simple1_bca"
 
@@ -15,6 +23,47 @@ def test_task_kwargs_that_are_no_mapping_are_refused(backend):
     for value in (0, "", ["random"], {1: 0}):
         with pytest.raises(ValueError, match="task_kwargs is .*None, or a mapping"):
             make_env(TASK, backend=backend, task_kwargs=value)
+
+
+def test_every_face_takes_its_specs_from_the_table_without_an_episode(monkeypatch):
+    gymnasium = pytest.importorskip("gymnasium")
+    import cathsim_dmc.gym  # noqa: F401  registers the ids
+
+    task_name = f"{TASK}_pair"
+    task = suite.make_task(task_name)
+    monkeypatch.setattr(
+        suite, "make_task", lambda name, random=0, **options: twin(task, **options)
+    )
+    monkeypatch.setattr(Rollout, "begin", None)
+    options = {"observation": ("image", "route", "tracking_2d", "force")}
+    table = twin(task, **options).observation_specs
+    assert {"image", "device_points"} < table.keys()
+    composer = suite.load("cathsim", task_name, options)
+    assert dict(composer.observation_spec()) == table
+    single = gymnasium.make(f"cathsim/{task_name}-v0", **options).unwrapped
+    many = gymnasium.make_vec(f"cathsim/{task_name}-v0", 2, **options).unwrapped
+    spaces = dict(single.observation_space)
+    assert dict(many.single_observation_space) == spaces
+    assert spaces.keys() == table.keys()
+    batched = BatchedEnv(task_name, 2, num_threads=1, **options)
+    of_composer = composer_env(task_name, options, 0).observation_spec
+    for specs in (batched.observation_spec, of_composer):
+        assert set(specs.keys()) == {*table, "info"}
+        assert list(specs["info"].keys()) == list(task.info_types)
+    for key, spec in table.items():
+        box, bounded = spaces[key], isinstance(spec, BoundedArray)
+        ends = (spec.minimum, spec.maximum) if bounded else (-np.inf, np.inf)
+        assert box.shape == spec.shape
+        assert (box.low == np.float32(ends[0])).all()
+        assert (box.high == np.float32(ends[1])).all()
+        for tensors in (batched.observation_spec[key][0], of_composer[key]):
+            assert tensors.shape == spec.shape
+            assert isinstance(tensors, Bounded) == bounded
+            if bounded:
+                assert (tensors.space.low == float(ends[0])).all()
+                assert (tensors.space.high == float(ends[1])).all()
+    monkeypatch.undo()
+    assert tuple(batched.reset()["info"].keys()) == tuple(task.info_types)
 
 
 @pytest.mark.parametrize("backend", ["batched", "composer"])

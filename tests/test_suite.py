@@ -6,7 +6,7 @@ import dm_env
 import numpy as np
 import pytest
 from absl.testing import absltest
-from conftest import EACH_TASK, SHORT_EPISODE, TASKS, twin
+from conftest import EACH_TASK, OBSERVATIONS, SHORT_EPISODE, TASKS, twin
 from containment import Containment
 from dm_control import suite as dm_suite
 from dm_env import specs, test_utils
@@ -16,18 +16,13 @@ from cathsim_dmc import suite
 from cathsim_dmc.anatomy.arch import arch
 from cathsim_dmc.anatomy.parts import Goal
 from cathsim_dmc.physics import forces
-from cathsim_dmc.tasks import observations
 
-# Those that need OpenGL are tested with the cameras.
-WITHOUT_GL = tuple(
-    name for name in observations.OBSERVATIONS if name not in ("rgb", "depth")
-)
 # The goal does not move within an anatomy, unless it is randomised.
 CONSTANT = {"tracking_goal", "tracking_goal_pixels", "goal_position"}
 
 
 def all_observations(shared_environment):
-    return shared_environment("type1_lcca", observation=WITHOUT_GL)
+    return shared_environment("type1_lcca", observation=tuple(OBSERVATIONS))
 
 
 def random_actions(environment, steps, seed=0):

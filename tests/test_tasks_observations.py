@@ -4,7 +4,7 @@ import json
 
 import numpy as np
 import pytest
-from conftest import twin
+from conftest import OBSERVATIONS, twin
 
 import cathsim_dmc
 from cathsim_dmc import suite
@@ -226,8 +226,7 @@ def test_an_objective_without_a_route_cannot_show_one():
 
 
 def test_specs_tell_shapes_and_ranges(make):
-    names = [n for n in observations.OBSERVATIONS if n not in ("rgb", "depth")]
-    env = make(names)
+    env = make(OBSERVATIONS)
     specs, seen = env.observation_spec(), env.reset().observation
     assert list(specs) == list(seen)
     for key, spec in specs.items():

@@ -19,10 +19,11 @@ from cathsim_dmc.recording.dataset_reader import (
     DatasetError,
     read_episodes,
 )
+from cathsim_dmc.simulation import environments
 from cathsim_dmc.simulation.environments import PIXELS, VECTOR
 from cathsim_dmc.simulation.episodes import BatchedSimulations, play
 from cathsim_dmc.tasks import observations
-from cathsim_dmc.tasks.observation_kind import ImageOptions
+from cathsim_dmc.tasks.observation_kind import Sizes
 from cathsim_dmc.tasks.step import Step
 
 DEMONSTRATION_SEED = 2_000_000  # apart from the seeds of evaluation
@@ -258,9 +259,10 @@ def _shapes(transitions: TensorDictBase) -> NetworkShapes:
     return NetworkShapes(size, image, transitions["action"].shape[-1])
 
 
-def _keys(names: Sequence[str], coaxial: bool) -> list[str]:
-    """Keys of the named observations in the order in which networks read them."""
-    return sorted(observations.entry_specs(names, ImageOptions(), coaxial))
+def _keys(names: Sequence[str], coaxial: bool) -> set[str]:
+    """Keys of the named observations."""
+    rows = observations.resolve(names, coaxial or None)
+    return set(observations.entry_specs(rows, Sizes()))
 
 
 def _tensors(
@@ -268,9 +270,9 @@ def _tensors(
 ) -> TensorDict | None:
     """Transitions of an episode; None if it did not succeed."""
     # What only coaxial devices show tells their episodes.
-    own = set(_keys(names, True)) - set(_keys(names, False))
+    own = _keys(names, True) - _keys(names, False)
     keys = _keys(names, bool(own & set(episode.observations)))
-    missing = sorted(set(keys) - set(episode.observations))
+    missing = sorted(keys - set(episode.observations))
     if missing:
         raise DatasetError(
             f"{path} lacks {', '.join(missing)}; it has "
@@ -279,15 +281,8 @@ def _tensors(
         )
     if not episode.success:
         return None
-    # In the order in which `environments.standard_observations` joins them.
-    arrays = [torch.as_tensor(episode.observations[key]) for key in keys]
-    numbers = [a.flatten(1).float() for a in arrays if a.dtype != torch.uint8]
-    images = [a.movedim(-1, -3) for a in arrays if a.dtype == torch.uint8]
-    seen = {}
-    if numbers:
-        seen[VECTOR] = torch.cat(numbers, -1)
-    if images:
-        seen[PIXELS] = torch.cat(images, -3)
+    arrays = {key: torch.as_tensor(episode.observations[key]) for key in keys}
+    seen = environments.standard(arrays, 1)
     steps = len(episode.actions)
     done = episode.terminations.astype(bool) | episode.truncations.astype(bool)
     chosen = episode.infos.get(EXPERT_ACTION, episode.actions)[:steps]

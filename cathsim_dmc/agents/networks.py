@@ -18,7 +18,6 @@ from cathsim_dmc.agents.fields import require, require_type, tuples
 from cathsim_dmc.agents.normalisation import ImageNormaliser, ObservationNormaliser
 from cathsim_dmc.simulation.environments import PIXELS, VECTOR
 from cathsim_dmc.tasks import observations
-from cathsim_dmc.tasks.observation_kind import ImageOptions
 
 # What the networks read in place of VECTOR and PIXELS.
 NORMAL = "observation_normal"
@@ -126,8 +125,7 @@ class NetworkShapes:
 def _are_images(names: str | tuple[str, ...], images: bool) -> bool:
     """Whether all the entries of observations are images, or all are vectors."""
     chosen = observations.resolve(names)
-    specs = observations.entry_specs(chosen, ImageOptions())
-    return all((spec is not None) == images for spec in specs.values())
+    return all(one.is_image == images for one in observations.entries(chosen))
 
 
 class Convolutions(nn.Module):

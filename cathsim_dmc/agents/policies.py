@@ -116,15 +116,5 @@ def load_policy(policy: PolicyLike, seed: int = 0) -> Policy:
 
 def _tensors(observation: Mapping[str, np.ndarray]) -> TensorDict:
     """One observation as `environments.standard_observations` arranges it."""
-    vectors, images = [], []
-    for _, value in sorted(observation.items()):
-        if value.dtype == np.uint8:
-            images.append(torch.as_tensor(value).movedim(-1, 0))
-        else:
-            vectors.append(torch.as_tensor(np.ravel(value)).float())
-    entries = {}
-    if vectors:
-        entries[environments.VECTOR] = torch.cat(vectors)[None]
-    if images:
-        entries[environments.PIXELS] = torch.cat(images)[None]
-    return TensorDict(entries, batch_size=[1])
+    entries = {name: torch.as_tensor(one)[None] for name, one in observation.items()}
+    return TensorDict(environments.standard(entries, 1), batch_size=[1])

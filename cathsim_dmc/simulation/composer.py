@@ -41,8 +41,8 @@ class TaskInformation(Transform):
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
         """Declares "info"."""
-        info = self.environment.task.info()
-        observation_spec["info"] = info_spec(info, torch.Size([]))
+        types = self.environment.task.info_types
+        observation_spec["info"] = info_spec(types, torch.Size([]))
         return observation_spec
 
 

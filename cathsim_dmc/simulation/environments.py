@@ -5,16 +5,15 @@ from functools import partial
 from typing import Any
 
 import torch
-from torchrl.data import Composite
+from tensordict import TensorDictBase
+from torchrl.data import Bounded, Composite, Unbounded
 from torchrl.envs import (
-    CatTensors,
     Compose,
     DoubleToFloat,
     EnvBase,
-    FlattenObservation,
-    PermuteTransform,
     SerialEnv,
     StepCounter,
+    Transform,
     TransformedEnv,
 )
 
@@ -90,41 +89,75 @@ def composer_of(env: EnvBase) -> Any:
     return env.base_env._env
 
 
-def standard_observations(env: EnvBase) -> TransformedEnv:
-    """Append the transforms from an environment's entries to VECTOR and PIXELS.
+def standard(
+    entries: Mapping[str, torch.Tensor], batch_dims: int
+) -> dict[str, torch.Tensor]:
+    """An observation as networks read it, with VECTOR and/or PIXELS.
 
-    Floating-point entries at the top level of the observation are cast to float32,
-    flattened and concatenated in the order of their names; so are bytes of shape
-    (..., h, w, c), channels first. Nested entries (forces and other information) are
-    no part of the observation and stay as they are.
+    Args:
+        entries: Entries by name, in any order: numbers (*batch, ...) are flattened,
+            images (*batch, h, w, c) uint8 get their channels first. Either are joined
+            in the order of their names.
+        batch_dims: Number of batch dimensions.
     """
-    spec = env.observation_spec
-    batch = len(env.batch_size)
-    leaves = {
-        name: spec[name]
-        for name in sorted(spec.keys())
-        if not isinstance(spec[name], Composite)
-    }
-    vectors = [name for name, leaf in leaves.items() if leaf.dtype.is_floating_point]
-    images = [
+    named = [entries[name] for name in sorted(entries)]
+    images = [one.movedim(-1, -3) for one in named if one.dtype == torch.uint8]
+    numbers = [one for one in named if one.dtype != torch.uint8]
+    seen = {}
+    if numbers:
+        seen[VECTOR] = torch.cat([n.flatten(batch_dims).float() for n in numbers], -1)
+    if images:
+        seen[PIXELS] = torch.cat(images, -3)
+    return seen
+
+
+class StandardObservation(Transform):
+    """Replaces entries of the observation of an environment as `standard` does."""
+
+    def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
+        entries = {key: next_tensordict.get(key) for key in self.in_keys}
+        seen = standard(entries, next_tensordict.batch_dims)
+        return next_tensordict.exclude(*self.in_keys, inplace=True).update(seen)
+
+    def _reset(
+        self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
+    ) -> TensorDictBase:
+        return self._call(tensordict_reset)
+
+    def transform_observation_spec(self, observation_spec: Composite) -> Composite:
+        """Declares VECTOR and PIXELS."""
+        zeros = {key: observation_spec[key].zero() for key in self.in_keys}
+        for key in self.in_keys:
+            del observation_spec[key]
+        for key, value in standard(zeros, len(observation_spec.shape)).items():
+            observation_spec[key] = (
+                Bounded(0, 255, value.shape, dtype=torch.uint8)
+                if key == PIXELS
+                else Unbounded(value.shape)
+            )
+        return observation_spec
+
+
+def standard_observations(env: EnvBase) -> TransformedEnv:
+    """An environment whose observation is VECTOR and/or PIXELS, see `standard`.
+
+    Nested entries (forces and other information) are no part of the observation and
+    stay as they are; double precision becomes single.
+    """
+    spec, batch = env.observation_spec, len(env.batch_size)
+    keys = [
         name
-        for name, leaf in leaves.items()
-        if leaf.dtype == torch.uint8 and leaf.ndim - batch == 3
+        for name, leaf in spec.items()
+        if not isinstance(leaf, Composite)
+        and (
+            leaf.dtype.is_floating_point
+            or (leaf.dtype == torch.uint8 and leaf.ndim - batch == 3)
+        )
     ]
-    if not vectors and not images:
+    if not keys:
         raise ValueError(
             f"the environment offers neither numbers nor images to observe; its "
             f"entries are {sorted(map(str, spec.keys(True, True)))}."
         )
-    transforms = Compose(DoubleToFloat())
-    for name in vectors:
-        if leaves[name].ndim - batch > 1:
-            first = batch - leaves[name].ndim
-            transforms.append(FlattenObservation(first, -1, in_keys=[name]))
-    if vectors:
-        transforms.append(CatTensors(vectors, out_key=VECTOR, del_keys=True))
-    if images:
-        transforms.append(PermuteTransform((-1, -3, -2), in_keys=images))
-        transforms.append(CatTensors(images, dim=-3, out_key=PIXELS, del_keys=True))
-    transforms.append(StepCounter())
-    return TransformedEnv(env, transforms)
+    observe = StandardObservation(in_keys=keys, out_keys=[VECTOR, PIXELS])
+    return TransformedEnv(env, Compose(DoubleToFloat(), observe, StepCounter()))

@@ -34,14 +34,10 @@ def space(spec: specs.Array, dtype: np.dtype) -> gymnasium.spaces.Box:
     return gymnasium.spaces.Box(-np.inf, np.inf, spec.shape, dtype)
 
 
-def _spaces(environment, dtype: np.dtype):
-    observation = gymnasium.spaces.Dict(
-        {
-            key: space(spec, dtype)
-            for key, spec in environment.observation_spec().items()
-        }
-    )
-    return observation, space(environment.action_spec(), dtype)
+def _space_of(
+    entries: Mapping[str, specs.Array], dtype: np.dtype
+) -> gymnasium.spaces.Dict:
+    return gymnasium.spaces.Dict({k: space(spec, dtype) for k, spec in entries.items()})
 
 
 def _float_type(dtype: str) -> np.dtype:
@@ -116,9 +112,9 @@ class CathSimEnv(gymnasium.Env):
         self.render_mode = render_mode
         self._dtype = _float_type(dtype)
         self._environment = suite.load(suite.DOMAIN, task, task_kwargs)
-        self.observation_space, self.action_space = _spaces(
-            self._environment, self._dtype
-        )
+        entries = self._environment.task.observation_specs
+        self.observation_space = _space_of(entries, self._dtype)
+        self.action_space = space(self._environment.action_spec(), self._dtype)
         self._machines: dict[Surface, angiograph.Angiograph] = {}
         self._begun, self._ended = False, True
         self._closed = False
@@ -254,20 +250,11 @@ class CathSimVectorEnv(gymnasium.vector.VectorEnv):
             num_threads=num_threads,
             seeds=np.random.SeedSequence().generate_state(num_envs).tolist(),
         )
-        self._make_spaces(self._simulation.reset().observation)
-
-    def _make_spaces(self, observation: Mapping[str, np.ndarray]) -> None:
-        def box(array: np.ndarray) -> gymnasium.spaces.Box:
-            pixels = array.dtype == np.uint8
-            dtype = np.dtype(np.uint8) if pixels else self._dtype
-            spec = specs.Array(array.shape[1:], dtype)
-            return space(spec, dtype)
-
         action = specs.BoundedArray(
             (self._simulation.num_actions,), self._dtype, -1.0, 1.0
         )
-        self.single_observation_space = gymnasium.spaces.Dict(
-            {key: box(value) for key, value in observation.items()}
+        self.single_observation_space = _space_of(
+            self._simulation.task.observation_specs, self._dtype
         )
         self.single_action_space = space(action, self._dtype)
         many = gymnasium.vector.utils.batch_space

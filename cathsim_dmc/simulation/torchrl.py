@@ -5,12 +5,14 @@ from typing import Any
 
 import numpy as np
 import torch
+from dm_env import specs
 from tensordict import TensorDict
-from torchrl.data import Binary, Bounded, Composite, Unbounded
+from torchrl.data import Binary, Bounded, Composite, TensorSpec, Unbounded
 from torchrl.envs import EnvBase
 
 from cathsim_dmc import bounds, suite
 from cathsim_dmc.simulation.batch import BatchSimulation
+from cathsim_dmc.tasks.navigation import Navigation
 from cathsim_dmc.tasks.step import Step
 
 
@@ -50,19 +52,12 @@ class BatchedEnv(EnvBase):
             seeds=seed,
         )
         super().__init__(device="cpu", batch_size=[num_envs])
-        self._make_specs(self._simulation.reset())
-        # The look at the shapes has drawn: the first episode is that of the seed.
-        self._simulation.seed(seed)
+        self._make_specs(self._simulation.task)
 
-    def _make_specs(self, step: Step) -> None:
+    def _make_specs(self, task: Navigation) -> None:
         shape = self.batch_size
-        entries = {
-            key: Bounded(0, 255, value.shape, dtype=torch.uint8)
-            if value.dtype == np.uint8
-            else Unbounded(value.shape, dtype=torch.float32)
-            for key, value in step.observation.items()
-        }
-        entries["info"] = info_spec(step.info(), shape)
+        entries = {k: _spec(spec, shape) for k, spec in task.observation_specs.items()}
+        entries["info"] = info_spec(task.info_types, shape)
         self.observation_spec = Composite(entries, shape=shape)
         self.action_spec = Bounded(
             -1.0, 1.0, (*shape, self._simulation.num_actions), dtype=torch.float32
@@ -117,14 +112,23 @@ class BatchedEnv(EnvBase):
         return self._simulation
 
 
-def info_spec(info: Mapping[str, Any], shape: torch.Size) -> Composite:
+def _spec(spec: specs.Array, batch: torch.Size) -> TensorSpec:
+    """Spec of an entry of the observation; numbers are float32."""
+    shape = (*batch, *spec.shape)
+    dtype = torch.uint8 if spec.dtype == np.uint8 else torch.float32
+    if not isinstance(spec, specs.BoundedArray):
+        return Unbounded(shape, dtype=dtype)
+    return Bounded(spec.minimum.item(), spec.maximum.item(), shape, dtype=dtype)
+
+
+def info_spec(types: Mapping[str, type], shape: torch.Size) -> Composite:
     """Spec of "info": one column of bool or float32 for each figure."""
     return Composite(
         {
             key: Binary(1, (*shape, 1), dtype=torch.bool)
-            if np.asarray(value).dtype == bool
+            if kind is bool
             else Unbounded((*shape, 1), dtype=torch.float32)
-            for key, value in info.items()
+            for key, kind in types.items()
         },
         shape=shape,
     )

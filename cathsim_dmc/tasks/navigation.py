@@ -17,10 +17,10 @@ from cathsim_dmc.tasks import cameras, cases, observations
 from cathsim_dmc.tasks.actions import check_action
 from cathsim_dmc.tasks.config import CONTROL_TIMESTEP, NavigationConfig
 from cathsim_dmc.tasks.objectives import Objective, Shiftable
-from cathsim_dmc.tasks.observation_kind import FrameObservable, ImageOptions
+from cathsim_dmc.tasks.observation_kind import FrameObservable, Sizes
 from cathsim_dmc.tasks.rollout import Rollout
 from cathsim_dmc.tasks.scene import Scene
-from cathsim_dmc.tasks.step import Step
+from cathsim_dmc.tasks.step import Step, info_types
 
 _ONLY = np.zeros(1, dtype=int)  # number of the one simulation
 
@@ -74,9 +74,9 @@ class Navigation(composer.Task):
                 "goal_shift out"
             )
         self._num_actions = len(scene.catheter.action_names)
-        self._names = observations.resolve(config.observation)
+        self._names = observations.resolve(config.observation, scene.coaxial)
         self._fluoroscopy = None
-        if observations.needs_fluoroscopy(self._names):
+        if observations.needs(self._names, "fluoroscopic"):
             self._fluoroscopy = config.fluoroscopy_options
         if set(cameras.KINDS) & set(self._names):
             if others:
@@ -154,19 +154,34 @@ class Navigation(composer.Task):
     def task_observables(self):
         """One observable per entry of the chosen observations."""
         if self._observables is None:
-            options = ImageOptions(
-                self._config.fluoroscopy_options, self._config.camera_options
-            )
             self._observables = {
                 key: FrameObservable(
                     lambda physics, key=key: self._current().observation[key][0],
                     spec,
                 )
-                for key, spec in observations.entry_specs(
-                    self._names, options, self._scene.coaxial
-                ).items()
+                for key, spec in self.observation_specs.items()
             }
         return self._observables
+
+    @property
+    def observation_specs(self) -> dict[str, dm_env.specs.Array]:
+        """Spec of each entry of the observation of one simulation."""
+        chain, config = self._scene.catheter, self._config
+        joints = chain.mjcf_model.find_all("joint", exclude_attachments=True)
+        sizes = Sizes(
+            actions=self._num_actions,
+            joints=len(joints),
+            links=len(chain.links),
+            devices=len(chain.devices) if self._scene.coaxial else 0,
+            fluoroscopy=config.fluoroscopy_options,
+            cameras=config.camera_options,
+        )
+        return observations.entry_specs(self._names, sizes)
+
+    @property
+    def info_types(self) -> dict[str, type]:
+        """Type of each figure of `info`: float or bool."""
+        return info_types(self._objective.terms)
 
     def action_spec(self, physics) -> dm_env.specs.BoundedArray:
         """Bounds [-1, 1] for each actuator."""

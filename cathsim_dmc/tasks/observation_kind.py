@@ -1,8 +1,9 @@
-"""What a row of the table of observations is: its function, its arrays, their specs."""
+"""What the table of observations is made of: rows, their arrays and specs."""
 
 import dataclasses
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from typing import cast
 
 import numpy as np
 from dm_control.composer.observation import observable
@@ -13,62 +14,72 @@ from cathsim_dmc.tasks.cameras import CameraOptions
 from cathsim_dmc.tasks.frame import Frame
 
 Observation = dict[str, np.ndarray]
+Shape = int | tuple[int, ...]
 
 
 @dataclasses.dataclass(frozen=True)
-class ImageOptions:
-    """Options on which the shapes of images depend.
+class Sizes:
+    """What the shapes of observations depend on.
 
     Attributes:
+      actions: entries of an action.
+      joints: joints of the chain.
+      links: links of the chain.
+      devices: coaxial devices; 0 for a single device.
       fluoroscopy: set-up of the angiography machine.
-      cameras: MuJoCo's cameras and their size.
+      cameras: MuJoCo's cameras and the size of their images.
     """
 
+    actions: int = 0
+    joints: int = 0
+    links: int = 0
+    devices: int = 0
     fluoroscopy: FluoroscopyOptions = FluoroscopyOptions()
     cameras: CameraOptions = CameraOptions()
-
-    def fluoroscopic(self, channels: int) -> tuple[int, ...]:
-        """Shape (rows, columns, channels of all planes) of a fluoroscopic image."""
-        fluoroscopy = self.fluoroscopy
-        return (*fluoroscopy.resolution, fluoroscopy.planes * channels)
 
 
 @dataclasses.dataclass(frozen=True)
 class Entry:
-    """One array of an observation, as people and specs need to know it.
+    """One array of an observation.
 
     Attributes:
       key: name in the observation; `<camera>` stands for the name of each camera.
+      shape: shape for one simulation or length of a vector, or a function of the sizes
+        that returns it.
       unit: of its numbers, by part where parts differ.
       meaning: layout and frame.
       low: least value, -inf if there is no bound.
       high: greatest value.
-      dtype: of an image; None for numbers, whose spec composer infers.
-      shape: shape of an image by the options; None for numbers.
+      dtype: float64 for numbers, another type for images.
     """
 
     key: str
+    shape: Shape | Callable[[Sizes], Shape]
     unit: str
     meaning: str
     low: float = -math.inf
     high: float = math.inf
-    dtype: type | None = None
-    shape: Callable[[ImageOptions], tuple[int, ...]] | None = None
+    dtype: type = np.float64
 
-    def keys(self, options: ImageOptions) -> tuple[str, ...]:
-        """Names in the observation."""
-        if "<camera>" not in self.key:
-            return (self.key,)
-        return tuple(self.key.replace("<camera>", n) for n in options.cameras.names)
+    @property
+    def is_image(self) -> bool:
+        """Whether it is an image."""
+        return self.dtype is not np.float64
 
-    def spec(self, options: ImageOptions) -> specs.Array | None:
-        """Spec of an image; None for numbers."""
-        if self.shape is None:
-            return None
-        shape = self.shape(options)
-        if self.dtype is np.uint8:
-            return specs.BoundedArray(shape, np.uint8, int(self.low), int(self.high))
-        return specs.Array(shape, self.dtype)
+    def named_specs(self, sizes: Sizes) -> dict[str, specs.Array]:
+        """Names in the observation, with the spec of each for one simulation."""
+        shape = self.shape(sizes) if callable(self.shape) else self.shape
+        shape = (shape,) if isinstance(shape, int) else shape
+        names = [self.key]
+        if "<camera>" in self.key:
+            names = [self.key.replace("<camera>", n) for n in sizes.cameras.names]
+        return {name: self._spec(name, shape) for name in names}
+
+    def _spec(self, name: str, shape: tuple[int, ...]) -> specs.Array:
+        if math.isinf(self.low) and math.isinf(self.high):
+            return specs.Array(shape, self.dtype, name)
+        low, high = (np.asarray(end, self.dtype) for end in (self.low, self.high))
+        return specs.BoundedArray(shape, self.dtype, low, high, name)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -80,23 +91,91 @@ class ObservationKind:
       entries: its arrays.
       fluoroscopic: whether it needs the angiography machine.
       routed: whether it needs the route to the goal.
+      coaxial: whether it needs coaxial devices.
+      joined: names of the rows that coaxial devices add to it.
     """
 
     observe: Callable[[Frame], Observation]
     entries: tuple[Entry, ...]
     fluoroscopic: bool = False
     routed: bool = False
+    coaxial: bool = False
+    joined: tuple[str, ...] = ()
+
+
+class ObservationTable(dict[str, ObservationKind]):
+    """Observations by name."""
+
+    def row(self, *entries: Entry, **needs) -> Callable:
+        """Puts the decorated function into the table under its own name."""
+
+        def add(function: Callable[[Frame], Observation]):
+            self[function.__name__] = ObservationKind(function, entries, **needs)
+            return function
+
+        return add
+
+    def resolve(
+        self, names: str | Sequence[str], coaxial: bool | None = None
+    ) -> tuple[str, ...]:
+        """Names of the rows of an observation.
+
+        Args:
+          names: Name or names of observations.
+          coaxial: Whether the devices are coaxial, so that the rows that they add
+            follow; None where that is not known, and none follow.
+
+        Raises:
+          ValueError: if a name is unknown or comes twice, if there is none, or if one
+            needs coaxial devices.
+        """
+        listed = isinstance(names, Sequence) and not isinstance(names, str | bytes)
+        chosen = cast(tuple[str, ...], tuple(names) if listed else (names,))
+        allowed = [
+            n for n, row in self.items() if coaxial is not False or not row.coaxial
+        ]
+        unknown = [n for n in chosen if not isinstance(n, str) or n not in allowed]
+        if unknown or not chosen or len(set(chosen)) < len(chosen):
+            raise ValueError(
+                f"observation is {names!r}; give one of {', '.join(allowed)}, "
+                "or a list of different ones"
+            )
+        joined = [n for name in chosen for n in self[name].joined if coaxial]
+        return tuple(dict.fromkeys([*chosen, *joined]))
+
+    def needs(self, names: Sequence[str], what: str) -> bool:
+        """Whether any of the named rows is "fluoroscopic", "routed" or "coaxial"."""
+        return any(getattr(self[name], what) for name in names)
+
+    def observe(self, names: Sequence[str], frame: Frame) -> Observation:
+        """Computes the named rows; arrays may share memory with the frame."""
+        observation: Observation = {}
+        for name in names:
+            observation.update(self[name].observe(frame))
+        return observation
+
+    def entries(self, names: Sequence[str]) -> list[Entry]:
+        """Entries of the named rows."""
+        return [entry for name in names for entry in self[name].entries]
+
+    def entry_specs(self, names: Sequence[str], sizes: Sizes) -> dict[str, specs.Array]:
+        """Specs of the entries of the named rows, for one simulation."""
+        return {
+            key: spec
+            for entry in self.entries(names)
+            for key, spec in entry.named_specs(sizes).items()
+        }
 
 
 class FrameObservable(observable.Generic):
-    """One entry of the observation, with the range of an image in its spec."""
+    """One entry of the observation, with its spec."""
 
-    def __init__(self, read: Callable, spec: specs.Array | None):
+    def __init__(self, read: Callable, spec: specs.Array):
         super().__init__(read)
         self._spec = spec
         self.enabled = True
 
     @property
-    def array_spec(self) -> specs.Array | None:
-        """Spec of an image; None for numbers, whose spec composer infers."""
+    def array_spec(self) -> specs.Array:
+        """Shape, type and bounds."""
         return self._spec

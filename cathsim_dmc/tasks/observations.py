@@ -1,42 +1,28 @@
 """The table of observations: what each holds, beside the function that computes it.
 
 An observation is a function of a `Frame`, for one simulation or for many. To add one,
-write it here and register it with its entries.
+write it here as a row with its entries.
 """
 
 import math
-from collections.abc import Callable, Sequence
-from typing import cast
+from operator import attrgetter
 
 import numpy as np
-from dm_env import specs
 
 from cathsim_dmc.physics.sliding import DEVICE_PLACES
 from cathsim_dmc.tasks.frame import Frame
 from cathsim_dmc.tasks.observation_kind import (
     Entry,
-    ImageOptions,
     Observation,
-    ObservationKind,
+    ObservationTable,
+    Sizes,
 )
 from cathsim_dmc.tasks.route import AHEAD, into_frame
 
 TRACKED_POINTS = 8
 SEQUENCE_LENGTH = 3
 
-OBSERVATIONS: dict[str, ObservationKind] = {}
-
-
-def _register(*entries: Entry, fluoroscopic: bool = False, routed: bool = False):
-    """Puts the decorated function into the table under its own name."""
-
-    def add(function: Callable[[Frame], Observation]):
-        OBSERVATIONS[function.__name__] = ObservationKind(
-            function, entries, fluoroscopic, routed
-        )
-        return function
-
-    return add
+OBSERVATIONS = ObservationTable()
 
 
 def _captured(array: np.ndarray | None) -> np.ndarray:
@@ -45,15 +31,28 @@ def _captured(array: np.ndarray | None) -> np.ndarray:
     return array
 
 
+_actions, _joints, _devices = map(attrgetter, ("actions", "joints", "devices"))
+
+
+def _fluoroscopic(key: str, channels: int, unit: str, meaning: str) -> Entry:
+    """An image with so many channels for each plane."""
+
+    def shape(sizes: Sizes) -> tuple[int, ...]:
+        return (*sizes.fluoroscopy.resolution, sizes.fluoroscopy.planes * channels)
+
+    return Entry(key, shape, unit, meaning, 0, 255, np.uint8)
+
+
 _POINTS = f"{TRACKED_POINTS} points along the device, proximal to head"
 _OPERATOR = (
     Entry(
         "tracking_insertion",
+        1,
         "m",
         "slide of the base, 0 at the start of the stroke; its stops are soft",
         -0.001,
     ),
-    Entry("tracking_action", "1", "the last action, zeros after a reset", -1, 1),
+    Entry("tracking_action", _actions, "1", "the last action, 0 after a reset", -1, 1),
 )
 
 
@@ -69,29 +68,34 @@ def _flat(array: np.ndarray, axes: int) -> np.ndarray:
     return array.reshape(array.shape[:-axes] + (-1,))
 
 
-@_register(
+@OBSERVATIONS.row(
     Entry(
         "position",
+        _joints,
         "m, rad",
         "joints in the order of the chain: slide of the base, then hinges",
     ),
-    Entry("velocity", "m/s, rad/s", "of the same joints"),
+    Entry("velocity", _joints, "m/s, rad/s", "of the same joints"),
     Entry(
         "com_inertia",
+        lambda sizes: 10 * sizes.links,
         "kg·m², kg·m, kg",
         "10 numbers a link: inertia about the subtree's centre of mass (`cinert`)",
     ),
     Entry(
         "com_velocity",
+        lambda sizes: 6 * sizes.links,
         "rad/s, m/s",
         "6 numbers a link: rotation, translation (`cvel`)",
     ),
-    Entry("actuator_force", "N, N·m", "of the motors, by joint"),
+    Entry("actuator_force", _joints, "N, N·m", "of the motors, by joint"),
     Entry(
         "external_force",
+        lambda sizes: 6 * sizes.links,
         "N·m, N",
         "6 numbers a link: contact torque, contact force (`cfrc_ext`)",
     ),
+    joined=("drives", "devices"),
 )
 def internal(frame: Frame) -> Observation:
     """State of joints and links, as published."""
@@ -106,16 +110,8 @@ def internal(frame: Frame) -> Observation:
     }
 
 
-@_register(
-    Entry(
-        "image",
-        "grey level",
-        "fluoroscopy, dark = opaque, one channel a plane",
-        0,
-        255,
-        np.uint8,
-        lambda options: options.fluoroscopic(1),
-    ),
+@OBSERVATIONS.row(
+    _fluoroscopic("image", 1, "grey level", "fluoroscopy, dark = opaque, by plane"),
     fluoroscopic=True,
 )
 def image(frame: Frame) -> Observation:
@@ -123,15 +119,12 @@ def image(frame: Frame) -> Observation:
     return {"image": _captured(frame.images.image)}
 
 
-@_register(
-    Entry(
+@OBSERVATIONS.row(
+    _fluoroscopic(
         "sequential",
+        SEQUENCE_LENGTH,
         "grey level",
         "three consecutive images, oldest first; equal after a reset",
-        0,
-        255,
-        np.uint8,
-        lambda options: options.fluoroscopic(SEQUENCE_LENGTH),
     ),
     fluoroscopic=True,
 )
@@ -141,16 +134,8 @@ def sequential(frame: Frame) -> Observation:
     return {"sequential": np.concatenate(images, axis=-1)}
 
 
-@_register(
-    Entry(
-        "segmentation",
-        "0 or 255",
-        "channels: device, vessel (of each plane)",
-        0,
-        255,
-        np.uint8,
-        lambda options: options.fluoroscopic(2),
-    ),
+@OBSERVATIONS.row(
+    _fluoroscopic("segmentation", 2, "0 or 255", "channels: device, vessel, by plane"),
     fluoroscopic=True,
 )
 def segmentation(frame: Frame) -> Observation:
@@ -168,10 +153,11 @@ def tracked(line: np.ndarray) -> np.ndarray:
     return line[..., np.round(chosen).astype(int), :]
 
 
-@_register(
-    Entry("tracking_points", "m", f"{_POINTS}, world frame"),
-    Entry("tracking_goal", "m", "centre of the goal, world frame"),
+@OBSERVATIONS.row(
+    Entry("tracking_points", 3 * TRACKED_POINTS, "m", f"{_POINTS}, world frame"),
+    Entry("tracking_goal", 3, "m", "centre of the goal, world frame"),
     *_OPERATOR,
+    joined=("drives", "devices"),
 )
 def tracking(frame: Frame) -> Observation:
     """Points along the device in space, the goal, the insertion, the last action."""
@@ -183,16 +169,28 @@ def tracking(frame: Frame) -> Observation:
     }
 
 
-@_register(
+def _pixels(sizes: Sizes) -> int:
+    points = TRACKED_POINTS + sizes.devices * len(DEVICE_PLACES)
+    return 2 * sizes.fluoroscopy.planes * points
+
+
+@OBSERVATIONS.row(
     Entry(
         "tracking_pixels",
+        _pixels,
         "pixel",
         f"{_POINTS}: column, row (plane by plane); pixel centres are whole numbers. "
         "Those of each coaxial device follow",
     ),
-    Entry("tracking_goal_pixels", "pixel", "goal: column, row"),
+    Entry(
+        "tracking_goal_pixels",
+        lambda sizes: 2 * sizes.fluoroscopy.planes,
+        "pixel",
+        "goal: column, row",
+    ),
     *_OPERATOR,
     fluoroscopic=True,
+    joined=("drives",),
 )
 def tracking_2d(frame: Frame) -> Observation:
     """The same points and the goal in pixels, as fluoroscopy shows them."""
@@ -204,23 +202,26 @@ def tracking_2d(frame: Frame) -> Observation:
     }
 
 
-@_register(
+@OBSERVATIONS.row(
     Entry(
         "route_points",
+        3 * len(AHEAD),
         "m",
         f"{len(AHEAD)} points of the centreline of the route, every "
         f"{1e3 * AHEAD[1]:g} mm from the place of the head on, tip frame",
     ),
-    Entry("route_radii", "m", "of the lumen at these points", 0),
-    Entry("route_goal", "m", "centre of the goal, tip frame"),
+    Entry("route_radii", len(AHEAD), "m", "of the lumen at these points", 0),
+    Entry("route_goal", 3, "m", "centre of the goal, tip frame"),
     Entry(
         "route_device",
+        3 * (TRACKED_POINTS - 1),
         "m",
         f"{TRACKED_POINTS - 1} points along the device, proximal to the head and "
         "without it, tip frame",
     ),
-    Entry("route_action", "1", "the last action, zeros after a reset", -1, 1),
+    Entry("route_action", _actions, "1", "the last action, 0 after a reset", -1, 1),
     routed=True,
+    joined=("drives", "devices"),
 )
 def route(frame: Frame) -> Observation:
     """The way ahead as the tip sees it: nothing tells one anatomy from another."""
@@ -238,9 +239,9 @@ def route(frame: Frame) -> Observation:
     }
 
 
-@_register(
-    Entry("goal_position", "m", "centre of the goal, world frame"),
-    Entry("goal_from_head", "m", "from the head to the goal, world frame"),
+@OBSERVATIONS.row(
+    Entry("goal_position", 3, "m", "centre of the goal, world frame"),
+    Entry("goal_from_head", 3, "m", "from the head to the goal, world frame"),
 )
 def goal(frame: Frame) -> Observation:
     """Where the goal is, in the world and from the head."""
@@ -251,9 +252,10 @@ def goal(frame: Frame) -> Observation:
     }
 
 
-@_register(
+@OBSERVATIONS.row(
     Entry(
         "wall_force",
+        4,
         "N",
         "on the wall: sum and largest contact at the end of the step, and their "
         "peaks within it",
@@ -261,10 +263,11 @@ def goal(frame: Frame) -> Observation:
     ),
     Entry(
         "push_force",
+        2,
         "N, N·m",
         "force and torque of the base on the device, positive forward",
     ),
-    Entry("load_cell", "N", "force of the phantom on its support, world frame"),
+    Entry("load_cell", 3, "N", "force of the phantom on its support, world frame"),
 )
 def force(frame: Frame) -> Observation:
     """Force sensing beside any other observation."""
@@ -278,15 +281,15 @@ def force(frame: Frame) -> Observation:
     }
 
 
-@_register(
+@OBSERVATIONS.row(
     Entry(
         "rgb_<camera>",
+        lambda sizes: (*sizes.cameras.resolution, 3),
         "colour level",
         "red, green, blue",
         0,
         255,
         np.uint8,
-        lambda options: (*options.cameras.resolution, 3),
     )
 )
 def rgb(frame: Frame) -> Observation:
@@ -294,15 +297,15 @@ def rgb(frame: Frame) -> Observation:
     return _views(frame, "rgb")
 
 
-@_register(
+@OBSERVATIONS.row(
     Entry(
         "depth_<camera>",
+        lambda sizes: (*sizes.cameras.resolution, 1),
         "m",
         "distance along the optical axis",
         0,
         math.inf,
         np.float32,
-        lambda options: (*options.cameras.resolution, 1),
     )
 )
 def depth(frame: Frame) -> Observation:
@@ -315,21 +318,47 @@ def _views(frame: Frame, kind: str) -> Observation:
     return {key: view for key, view in views.items() if key.startswith(kind)}
 
 
-# What coaxial devices add to the observations of numbers.
+# Coaxial devices.
 
 
-def _driven(frame: Frame) -> Observation:
+@OBSERVATIONS.row(
+    Entry(
+        "device_insertion",
+        _devices,
+        "m",
+        "of each device from the innermost outwards: way of its end, 0 where the "
+        "chain's end is at the start of the stroke",
+    ),
+    Entry("device_rotation", _devices, "rad", "of the rotary unit of each device"),
+    coaxial=True,
+)
+def drives(frame: Frame) -> Observation:
     """How far the operator has pushed and turned each coaxial device."""
     state = frame.devices
     assert state is not None
-    return {
-        "device_insertion": state.insertion,
-        "device_rotation": state.rotation,
-    }
+    return {"device_insertion": state.insertion, "device_rotation": state.rotation}
 
 
-def _lying(frame: Frame) -> Observation:
-    """Where each coaxial device lies, and what it bears."""
+@OBSERVATIONS.row(
+    Entry("device_tip_rotation", _devices, "rad", "of the end of each device"),
+    Entry(
+        "device_points",
+        lambda sizes: 3 * sizes.devices * len(DEVICE_PLACES),
+        "m",
+        f"{len(DEVICE_PLACES)} points along each device, every "
+        f"{1e3 * DEVICE_PLACES[-2]:g} mm, proximal to its end, world frame",
+    ),
+    Entry(
+        "device_load",
+        2,
+        "N",
+        "axial force in the device that reaches farthest where it leaves the others, "
+        "and friction between the devices that slide",
+    ),
+    coaxial=True,
+)
+def devices(frame: Frame) -> Observation:
+    """Shape of each coaxial device and the load on it."""
     state = frame.devices
     assert state is not None
     return {
@@ -339,102 +368,5 @@ def _lying(frame: Frame) -> Observation:
     }
 
 
-DRIVEN = ObservationKind(
-    _driven,
-    (
-        Entry(
-            "device_insertion",
-            "m",
-            "of each device from the innermost outwards: way of its end, 0 where the "
-            "chain's end is at the start of the stroke",
-        ),
-        Entry("device_rotation", "rad", "of the rotary unit of each device"),
-    ),
-)
-LYING = ObservationKind(
-    _lying,
-    (
-        Entry("device_tip_rotation", "rad", "of the end of each device"),
-        Entry(
-            "device_points",
-            "m",
-            f"{len(DEVICE_PLACES)} points along each device, every "
-            f"{1e3 * DEVICE_PLACES[-2]:g} mm, proximal to its end, world frame",
-        ),
-        Entry(
-            "device_load",
-            "N",
-            "axial force in the device that reaches farthest where it leaves the "
-            "others, and friction between the devices that slide",
-        ),
-    ),
-)
-
-
-_IN_SPACE = {"internal", "tracking", "route"}
-_OF_NUMBERS = {*_IN_SPACE, "tracking_2d"}
-
-
-def _kinds(names: Sequence[str], coaxial: bool) -> list[ObservationKind]:
-    kinds = [OBSERVATIONS[name] for name in names]
-    if coaxial and _OF_NUMBERS.intersection(names):
-        kinds.append(DRIVEN)
-        if _IN_SPACE.intersection(names):
-            kinds.append(LYING)
-    return kinds
-
-
-# The use of the table.
-
-
-def resolve(names: str | Sequence[str]) -> tuple[str, ...]:
-    """Returns the names of observations as a tuple.
-
-    Raises:
-      ValueError: if a name is unknown or comes twice, or if there is none.
-    """
-    listed = isinstance(names, Sequence) and not isinstance(names, str | bytes)
-    chosen = tuple(names) if listed else (names,)
-    unknown = [n for n in chosen if not isinstance(n, str) or n not in OBSERVATIONS]
-    if unknown or not chosen or len(set(chosen)) < len(chosen):
-        raise ValueError(
-            f"observation is {names!r}; give one of {', '.join(OBSERVATIONS)}, "
-            "or a list of different ones"
-        )
-    return cast(tuple[str, ...], chosen)
-
-
-def needs_fluoroscopy(names: Sequence[str]) -> bool:
-    """Whether any of the observations needs the angiography machine."""
-    return any(OBSERVATIONS[name].fluoroscopic for name in names)
-
-
-def needs_route(names: Sequence[str]) -> bool:
-    """Whether any of the observations needs the route to the goal."""
-    return any(OBSERVATIONS[name].routed for name in names)
-
-
-def observe(names: Sequence[str], frame: Frame) -> Observation:
-    """Computes the named observations; arrays may share memory with the frame."""
-    observation: Observation = {}
-    for kind in _kinds(names, frame.devices is not None):
-        observation.update(kind.observe(frame))
-    return observation
-
-
-def entry_specs(
-    names: Sequence[str], options: ImageOptions, coaxial: bool = False
-) -> dict[str, specs.Array | None]:
-    """Keys of the named observations, with the specs of those that are images.
-
-    Args:
-      names: of observations.
-      options: on which the shapes of images depend.
-      coaxial: whether the devices are coaxial ones.
-    """
-    return {
-        key: entry.spec(options)
-        for kind in _kinds(names, coaxial)
-        for entry in kind.entries
-        for key in entry.keys(options)
-    }
+resolve, observe, needs = OBSERVATIONS.resolve, OBSERVATIONS.observe, OBSERVATIONS.needs
+entries, entry_specs = OBSERVATIONS.entries, OBSERVATIONS.entry_specs

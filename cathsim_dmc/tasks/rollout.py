@@ -66,7 +66,7 @@ class Rollout:
         self._config = config
         self._stepper = stepper
         self._state = state = stepper.arrays
-        self._names = observations.resolve(config.observation)
+        self._names = observations.resolve(config.observation, scene.coaxial)
         catheter = scene.catheter.mjcf_model.model
         self._index = model_index(scene, model)
         self._views = self._index.views(state)
@@ -86,7 +86,7 @@ class Rollout:
             ),
         )
         self._routes: Routes | None = None
-        if observations.needs_route(self._names):
+        if observations.needs(self._names, "routed"):
             self._routes = Routes([case.objective for case in cases])
         self._sensors = ImageSensors(
             self._names,

@@ -1,5 +1,6 @@
 """What N simulations have to say after a control step."""
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -7,6 +8,19 @@ import numpy as np
 from cathsim_dmc.physics import forces, readings
 from cathsim_dmc.tasks import objectives
 from cathsim_dmc.tasks.observation_kind import Observation
+
+_INFO = ("distance", "insertion", "push_force", "wall_force_sum", "wall_force_max")
+_INFO += ("wall_force_peak_sum", "wall_force_peak_max", "path_ratio")
+
+
+def info_types(terms: Sequence[str]) -> dict[str, type]:
+    """Type of each figure of `Step.info`, float or bool, by the names of the terms."""
+    return {
+        **dict.fromkeys(_INFO, float),
+        "success": bool,
+        "physics_error": bool,
+        **{f"reward_{name}": float for name in terms},
+    }
 
 
 class Step(NamedTuple):

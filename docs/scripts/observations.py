@@ -14,8 +14,8 @@ from cathsim_dmc import suite
 from cathsim_dmc.imaging import VIEWS, FluoroscopyOptions
 from cathsim_dmc.physics.randomisation import DEFAULT_RANGES, Randomisation
 from cathsim_dmc.tasks import observations
-from cathsim_dmc.tasks.cameras import CAMERAS, KINDS, CameraOptions
-from cathsim_dmc.tasks.observation_kind import Entry, ImageOptions
+from cathsim_dmc.tasks.cameras import CAMERAS, CameraOptions
+from cathsim_dmc.tasks.observation_kind import Entry
 
 OUTPUT = Path(__file__).parents[1] / "observations.md"
 TASK = "type1_bca"
@@ -112,28 +112,23 @@ def _row(*cells: str) -> str:
 
 def coaxial_table() -> str:
     """What coaxial devices add, from the specs."""
-    environment = suite.load("cathsim", PAIR_TASK, {"observation": "tracking"})
-    specs = dict(environment.observation_spec())
+    specs = suite.make_task(PAIR_TASK, observation="tracking").observation_specs
     rows = [_row("entry", "shape", "unit", "meaning"), _row(*["---"] * 4)]
-    for kind in (observations.DRIVEN, observations.LYING):
-        for entry in kind.entries:
-            shape = _shape(specs[entry.key].shape)
-            rows.append(_row(f"`{entry.key}`", shape, entry.unit, entry.meaning))
+    for entry in observations.entries(("drives", "devices")):
+        shape = _shape(specs[entry.key].shape)
+        rows.append(_row(f"`{entry.key}`", shape, entry.unit, entry.meaning))
     return "\n".join(rows)
 
 
 def entries_table() -> str:
     """Every entry of every observation, from the specs."""
-    drawn = [name for name in observations.OBSERVATIONS if name not in KINDS]
-    environment = suite.load("cathsim", TASK, {"observation": drawn})
-    specs = dict(environment.observation_spec())
-    # Camera images have a spec without OpenGL, too.
-    specs |= observations.entry_specs(KINDS, ImageOptions())
+    kinds = {n: k for n, k in observations.OBSERVATIONS.items() if not k.coaxial}
+    specs = suite.make_task(TASK, observation=list(kinds)).observation_specs
     rows = [
         _row("observation", "entry", "shape", "type", "range", "unit", "meaning"),
         _row(*["---"] * 7),
     ]
-    for name, kind in observations.OBSERVATIONS.items():
+    for name, kind in kinds.items():
         for entry in kind.entries:
             spec = specs[entry.key.replace("<camera>", CameraOptions().names[0])]
             rows.append(
