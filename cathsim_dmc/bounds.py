@@ -64,7 +64,7 @@ def number(
         unit: Unit of the bounds, for the message.
         positive: Whether it must be greater than zero, beside the range.
     """
-    good = _is_real(value) and low <= value <= high and (value > 0 or not positive)
+    good = is_number(value) and low <= value <= high and (value > 0 or not positive)
     if not good:
         refuse(name, value, _allowed("a finite number", low, high, unit, positive))
     return float(value)
@@ -149,6 +149,13 @@ def switch(name: str, value: Any) -> bool:
     return bool(value)
 
 
+def text(name: str, value: Any) -> str:
+    """A text of 1 to 200 characters."""
+    if not isinstance(value, str) or not 0 < len(value) <= 200:
+        refuse(name, value, "a text of 1 to 200 characters")
+    return value
+
+
 def choice(name: str, value: Any, choices: Sequence[str] | Mapping[str, Any]) -> str:
     """One of some words."""
     if not isinstance(value, str) or value not in choices:
@@ -169,7 +176,7 @@ def vector(
     if (
         values is None
         or len(values) != count
-        or not all(_is_real(one) and low <= one <= high for one in values)
+        or not all(is_number(one) and low <= one <= high for one in values)
     ):
         allowed = _allowed("a finite number", low, high, unit)
         refuse(name, value, f"{count} numbers, each {allowed}")
@@ -187,7 +194,7 @@ def interval(
 ) -> tuple[float, float]:
     """The ends of a range within a range, the lower one first."""
     values = _row(value)
-    fits = _is_whole if integers else _is_real
+    fits = _is_whole if integers else is_number
     if (
         values is None
         or len(values) != 2
@@ -203,14 +210,34 @@ def interval(
     return values[0], values[1]
 
 
-def array(name: str, value: Any, kinds: str = "fiu") -> np.ndarray:
-    """An array of finite numbers; `kinds` are those of numpy's dtypes."""
+def array(
+    name: str, value: Any, kinds: str = "fiu", shape: tuple[int, ...] | None = None
+) -> np.ndarray:
+    """An array of finite numbers.
+
+    Args:
+        name: Name of the field.
+        value: What was given.
+        kinds: Kinds of numpy's dtypes that are allowed.
+        shape: Shape that it must have, -1 for any size; None for any shape.
+    """
     try:
         given = np.asarray(value)
     except ValueError:  # rows of different lengths
         given = np.array(None)
-    if given.size and (given.dtype.kind not in kinds or not np.isfinite(given).all()):
-        refuse(name, value, "an array of finite numbers")
+    what = f"an array of {'finite numbers' if 'f' in kinds else 'integers'}"
+    fits = not given.size or given.dtype.kind in kinds
+    if shape is not None:
+        sizes = zip(shape, given.shape, strict=False)
+        fits &= len(shape) == given.ndim and all(m in (-1, n) for m, n in sizes)
+        wanted = ", ".join("n" if n < 0 else str(n) for n in shape)
+        what = f"{what} of shape ({wanted})"
+        if not fits:
+            raise ValueError(
+                f"{name} is {given.dtype} of shape {given.shape}; it must be {what}"
+            )
+    if given.size and not (fits and np.isfinite(given).all()):
+        refuse(name, value, what)
     return given
 
 
@@ -259,7 +286,8 @@ def _row(value: Any) -> list[Any] | None:
     return None
 
 
-def _is_real(value: Any) -> bool:
+def is_number(value: Any) -> bool:
+    """Whether a value is a finite number; a bool is none."""
     if isinstance(value, bool) or not isinstance(value, numbers.Real):
         return False
     try:

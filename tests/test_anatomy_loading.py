@@ -69,16 +69,22 @@ def spoilt(row, value):
 
 WRONG = {
     "unit": (put("units", "mm"), "units is 'mm'"),
-    "name": (put("name", 3), "name is 3; give a text"),
+    "name": (put("name", 3), "name is 3; it must be a text"),
     "vessel": (put("vessels", 0, "left"), r"vessels\[0\] is 'left'"),
     "inlet far": (put("inlet", "position", [99.0, 0, 0]), "inlet lies 9.* outside"),
-    "inlet text": (put("inlet", "position", "here"), "give three finite numbers"),
+    "inlet text": (
+        put("inlet", "position", "here"),
+        "must be 3 numbers, each a finite",
+    ),
     "goal": (put("goals", 0, "vessel", "renal"), "no vessel 'renal'"),
     "goal far": (
         put("goals", 0, "position", [0, 0, 3.0]),
         "goal .* outside the vessel",
     ),
-    "nan": (array("surface_vertices", spoilt(5, np.nan)), "surface_vertices holds NaN"),
+    "nan": (
+        array("surface_vertices", spoilt(5, np.nan)),
+        "surface_vertices is .*finite numbers",
+    ),
     "scale": (array("surface_vertices", lambda v: v * 1e3), "unit is not the metre"),
     "zeros": (
         array("wall_vertices", lambda v: v * 0.0),

@@ -190,7 +190,10 @@ def change(path, value):
         (change(["inlets", "low", "arc_length_mm"], 3.0), "one of end and"),
         (change(["goals", "side", "vessel"], "lcca"), "there are trunk, side"),
         (change(["goals", "side"], {"vessel": "side"}), "give one of"),
-        (change(["goals", "side", "past_ostium_mm"], "deep"), "give 0 to"),
+        (
+            change(["goals", "side", "past_ostium_mm"], "deep"),
+            "finite number from 0 to 2000 mm",
+        ),
     ],
 )
 def test_wrong_entries_are_named(apply, message):

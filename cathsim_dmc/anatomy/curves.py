@@ -12,6 +12,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy import interpolate
 
+from cathsim_dmc import bounds
 from cathsim_dmc.anatomy.centreline import Array, Centreline, Vessel, VesselTree
 from cathsim_dmc.anatomy.septa import check_septa
 
@@ -81,8 +82,7 @@ def smooth_tree(
             into each other; names the vessel and the place.
     """
     for name, value in (("smoothing", smoothing), ("flare", flare)):
-        if not (math.isfinite(value) and 0.0 <= value <= 5e-3):
-            raise ValueError(f"{name} is {value:g} m; allowed is 0 to 0.005 m.")
+        bounds.number(name, value, 0.0, 5e-3, "m")
     vessels: dict[str, Vessel] = {}
     for name, curve in curves.items():
         if curve.parent is None:

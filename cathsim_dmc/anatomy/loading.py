@@ -3,18 +3,17 @@
 from __future__ import annotations
 
 import io
-import math
 import os
 import stat
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from cathsim_dmc import files
+from cathsim_dmc import bounds, files
 
 EXTENT = 2.5  # m, diagonal of the box around an anatomy
-FAR = 10.0  # m from the origin; scanners' frames begin within a few metres
 AROUND = 50e-3  # m, of the wall and of places outside the lumen's box
 OFF = 5e-3  # m, of inlet and goals off their centrelines, beside the radius
 WIDEST = 0.1  # m, radius of a vessel; the largest aneurysms have half of it
@@ -22,27 +21,37 @@ FLAT = 1e-7  # m, least thickness of a wall piece
 LARGEST_TEXT = 20_000_000  # bytes of anatomy.json
 LARGEST_ARRAYS = 2_000_000_000  # bytes of all arrays, unpacked
 
-_NUMBER, _VECTOR, _TEXT = "a finite number", "three finite numbers", "a text"
-_FIELDS = {
-    "vessels": {"name": _TEXT, "parent": "a text or null", "ostium": _NUMBER},
+
+def _vector(name: str, value: Any) -> None:
+    bounds.vector(name, value, 3)
+
+
+def _parent(name: str, value: Any) -> None:
+    if value is not None:
+        bounds.text(name, value)
+
+
+_NUMBER, _TEXT = bounds.number, bounds.text
+_FIELDS: dict[str, dict[str, Callable[[str, Any], Any]]] = {
+    "vessels": {"name": _TEXT, "parent": _parent, "ostium": _NUMBER},
     "inlet": {
         "vessel": _TEXT,
-        "position": _VECTOR,
-        "direction": _VECTOR,
+        "position": _vector,
+        "direction": _vector,
         "radius": _NUMBER,
     },
     "goals": {
         "name": _TEXT,
         "vessel": _TEXT,
-        "position": _VECTOR,
+        "position": _vector,
         "arc_length": _NUMBER,
     },
     "ends": {
         "vessel": _TEXT,
-        "position": _VECTOR,
-        "direction": _VECTOR,
+        "position": _vector,
+        "direction": _vector,
         "radius": _NUMBER,
-        "open": "true or false",
+        "open": bounds.switch,
     },
 }
 
@@ -97,22 +106,22 @@ def check_description(description: dict[str, Any], path: Path) -> None:
                 f"{path}: {key} is {description.get(key)!r}; an anatomy is saved in "
                 f"{allowed!r} only. Write it again with Anatomy.save."
             )
-    _check(path, "name", description.get("name"), _TEXT)
+    bounds.text(f"{path}: name", description.get("name"))
     for key, fields in _FIELDS.items():
         entries = description.get(key)
         if key == "inlet":
             entries = [entries]
         if not isinstance(entries, list):
-            raise ValueError(f"{path}: {key} is {_short(entries)}; give a list.")
+            raise ValueError(f"{path}: {key} is {bounds.shown(entries)}; give a list.")
         for number, entry in enumerate(entries):
             where = key if key == "inlet" else f"{key}[{number}]"
             if not isinstance(entry, dict) or set(entry) != set(fields):
                 raise ValueError(
-                    f"{path}: {where} is {_short(entry)}; give an object with "
+                    f"{path}: {where} is {bounds.shown(entry)}; give an object with "
                     f"{', '.join(fields)}."
                 )
-            for name, kind in fields.items():
-                _check(path, f"{where}.{name}", entry[name], kind)
+            for name, check in fields.items():
+                check(f"{path}: {where}.{name}", entry[name])
     for key in ("vessels", "goals"):
         names = [entry["name"] for entry in description[key]]
         twice = next((name for name in names if names.count(name) > 1), None)
@@ -128,7 +137,7 @@ def check_arrays(arrays: dict[str, np.ndarray], vessels: int, path: Path) -> Non
     counts = _array(arrays, "wall_counts", "iu", (-1,), path)
     if len(counts) and (counts.min() < 4 or counts.sum() != len(corners)):
         raise ValueError(
-            f"{path}: wall_counts {_short(counts.tolist())} do not fit the "
+            f"{path}: wall_counts {bounds.shown(counts.tolist())} do not fit the "
             f"{len(corners)} wall_vertices (at least 4 for each piece)."
         )
     vertices = arrays["surface_vertices"]
@@ -146,11 +155,11 @@ def check_places(anatomy: Any, path: Path) -> None:
     vertices = anatomy.surface.vertices
     low, high = vertices.min(axis=0), vertices.max(axis=0)
     size = float(np.linalg.norm(high - low))
-    if not 1e-3 <= size <= EXTENT or np.abs(vertices).max() > FAR:
+    if not 1e-3 <= size <= EXTENT or np.abs(vertices).max() > bounds.FAR:
         raise ValueError(
             f"{path}: the surface is {size:.3g} m across and reaches "
             f"{np.abs(vertices).max():.3g} m from the origin (allowed 0.001 to "
-            f"{EXTENT:g} m, {FAR:g} m); its unit is not the metre."
+            f"{EXTENT:g} m, {bounds.FAR:g} m); its unit is not the metre."
         )
 
     def near(points: np.ndarray, what: str) -> None:
@@ -204,7 +213,7 @@ def _check_field(arrays: dict[str, np.ndarray], path: Path) -> None:
     shape = tuple(n + 1 for n in index.shape)
     _array(arrays, "field_coarse", "f", shape, path)
     bricks = _array(arrays, "field_bricks", "i", (-1, 9, 9, 9), path)
-    if not 1e-5 <= float(spacing) <= 0.1 or np.abs(origin).max() > FAR:
+    if not 1e-5 <= float(spacing) <= 0.1 or np.abs(origin).max() > bounds.FAR:
         raise ValueError(
             f"{path}: the depth field has a spacing of {float(spacing):.3g} m and the "
             f"origin {origin.tolist()}; its unit is not the metre."
@@ -226,40 +235,4 @@ def _array(
     """The array of a name, of one of the numpy ``kinds``; -1 stands for any size."""
     if name not in arrays:
         raise ValueError(f"{path} lacks the array {name!r}.")
-    array = arrays[name]
-    fits = array.ndim == len(shape) and all(
-        want in (-1, size) for want, size in zip(shape, array.shape, strict=True)
-    )
-    if array.dtype.kind not in kinds or not fits:
-        wanted = ", ".join("n" if n < 0 else str(n) for n in shape)
-        raise ValueError(
-            f"{path}: {name} is {array.dtype} of shape {array.shape}; it must be "
-            f"{'whole numbers' if 'f' not in kinds else 'floats'} of shape ({wanted})."
-        )
-    if not np.isfinite(array).all():
-        raise ValueError(f"{path}: {name} holds NaN or infinite values.")
-    return array
-
-
-def _check(path: Path, name: str, value: Any, kind: str) -> None:
-    def number(x: Any) -> bool:
-        return (
-            isinstance(x, int | float) and not isinstance(x, bool) and math.isfinite(x)
-        )
-
-    fine = {
-        _NUMBER: lambda: number(value),
-        _VECTOR: lambda: (
-            isinstance(value, list) and len(value) == 3 and all(map(number, value))
-        ),
-        _TEXT: lambda: isinstance(value, str) and 0 < len(value) < 200,
-        "a text or null": lambda: value is None or isinstance(value, str),
-        "true or false": lambda: isinstance(value, bool),
-    }[kind]()
-    if not fine:
-        raise ValueError(f"{path}: {name} is {_short(value)}; give {kind}.")
-
-
-def _short(value: Any) -> str:
-    text = repr(value)
-    return text if len(text) <= 80 else text[:77] + "..."
+    return bounds.array(f"{path}: {name}", arrays[name], kinds, shape)

@@ -26,7 +26,6 @@ and `goals` may be left out.
 from __future__ import annotations
 
 import json
-import math
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -35,6 +34,7 @@ from typing import Any
 
 import numpy as np
 
+from cathsim_dmc import bounds
 from cathsim_dmc.anatomy.anatomy import Anatomy
 from cathsim_dmc.anatomy.builder import VesselPlace
 from cathsim_dmc.anatomy.centreline import VesselTree
@@ -203,25 +203,14 @@ def _numbers(value: Any, name: str, columns: int | None) -> np.ndarray:
         if (
             not isinstance(cells, list)
             or (columns is not None and len(cells) != columns)
-            or not all(_is_number(cell) for cell in cells)
+            or not all(bounds.is_number(cell) for cell in cells)
         ):
             raise ValueError(f"{name}[{index}] is {row!r}; give {shape}.")
     return np.array(value, dtype=np.float64)
 
 
-def _is_number(value: Any) -> bool:
-    # True is an int to Python, NaN and Infinity are numbers to its JSON reader.
-    return (
-        isinstance(value, int | float)
-        and not isinstance(value, bool)
-        and math.isfinite(value)
-    )
-
-
 def _length(value: Any, name: str) -> float:
-    if not _is_number(value) or not 0.0 <= value <= _FARTHEST:
-        raise ValueError(f"{name} is {value!r}; give 0 to {_FARTHEST:g} mm.")
-    return float(value) * _MM
+    return bounds.number(name, value, 0.0, _FARTHEST, "mm") * _MM
 
 
 def _curve(name: str, entry: Any, flip: np.ndarray) -> Curve:

@@ -159,5 +159,6 @@ def standard_observations(env: EnvBase) -> TransformedEnv:
             f"the environment offers neither numbers nor images to observe; its "
             f"entries are {sorted(map(str, spec.keys(True, True)))}."
         )
-    observe = StandardObservation(in_keys=keys, out_keys=[VECTOR, PIXELS])
+    seen = standard({key: spec[key].zero() for key in keys}, batch)
+    observe = StandardObservation(in_keys=keys, out_keys=list(seen))
     return TransformedEnv(env, Compose(DoubleToFloat(), observe, StepCounter()))

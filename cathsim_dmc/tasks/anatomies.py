@@ -2,8 +2,6 @@
 
 from pathlib import Path
 
-import numpy as np
-
 from cathsim_dmc import bounds
 from cathsim_dmc.anatomy import Anatomy
 from cathsim_dmc.tasks import placement
@@ -61,16 +59,8 @@ def load_arches(
     from cathsim_dmc.anatomy.arch import arch
 
     seeds = arch.arch_set(bounds.choice("arches", arches, arch.SETS))
-    whole = all(
-        isinstance(number, int | np.integer) and not isinstance(number, bool)
-        for number in (pool, first)
-    )
-    if not whole or pool < 1 or not 0 <= first <= len(seeds) - pool:
-        raise ValueError(
-            f"pool is {pool!r} and first is {first!r}; {arches!r} has {len(seeds)} "
-            "arches, numbered from 0: give whole numbers, pool of at least 1 and first "
-            f"+ pool of at most {len(seeds)}"
-        )
+    bounds.whole("pool", pool, 1, len(seeds))
+    bounds.whole("first", first, 0, len(seeds) - pool)
     found = [arch.build_seed(seed, access=access) for seed in seeds[first:][:pool]]
     closed = [a.name for a in found if placement.sheath_direction(a) is None]
     if closed:
