@@ -108,7 +108,7 @@ def test_what_cannot_be_recorded_is_refused_at_once(tmp_path, settings, message)
 
 
 SMALL = (
-    "--algo ppo --preset demo --num-envs 4 --steps-per-update 256 --rerun "
+    "--algo ppo --preset demo --no-anneal --num-envs 4 --steps-per-update 256 --rerun "
     "--minibatch-size 64 --epochs 1 --checkpoint-frames 512 --metrics-frames 256 "
     "--normalisation-frames 16 --rerun-steps 20"
 ).split()

@@ -87,7 +87,7 @@ def train(
         progress: Whether to show progress on standard error.
         make_env: Function that makes the environment, as `environments.make_env`.
         without_replay: Whether a run that is resumed starts with an empty replay
-            (SAC), as when its files are lost.
+            (SAC, DAgger), as when its files are lost.
 
     Raises:
         ConfigError: the directory holds a run that was not to be resumed, or one with

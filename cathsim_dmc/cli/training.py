@@ -9,7 +9,7 @@ import shlex
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 from tyro import conf
 
@@ -31,7 +31,7 @@ class _Run:
 
     Attributes:
         out: Directory of the run: checkpoints, metrics.csv, config.json.
-        algo: Algorithm that learns; each has settings of its own.
+        algo: Algorithm that learns, with settings of its own: ppo, sac, bc or dagger.
         preset: Named settings that the options below start from: published, demo,
             tuned or tuned_image.
         resume: Whether to continue the run in OUT from its newest checkpoint.
@@ -41,7 +41,7 @@ class _Run:
     """
 
     out: Path
-    algo: Literal["ppo", "sac", "bc", "dagger"] = "ppo"
+    algo: str = "ppo"
     preset: str = "published"
     resume: bool = False
     without_replay: bool = False
@@ -57,7 +57,7 @@ def command(arguments: Sequence[str]) -> Callable[..., int]:
 
     Raises:
         ValueError: the run to be resumed has no readable settings, or there is no such
-            preset.
+            algorithm or preset.
     """
     if list(arguments[:1]) != ["train"]:
 
@@ -100,7 +100,7 @@ def command(arguments: Sequence[str]) -> Callable[..., int]:
 def _settings(arguments: Sequence[str]) -> tuple[Any, bool]:
     """Settings that the options start from, and whether they are those of a run."""
     # torchrl goes before dm_control.
-    from cathsim_dmc.agents.learners import LEARNERS, config_from_dict, make_config
+    from cathsim_dmc.agents.learners import config_from_dict, make_config
 
     parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
     # Wrong values are refused by the parser of all options.
@@ -116,7 +116,7 @@ def _settings(arguments: Sequence[str]) -> tuple[Any, bool]:
             raise ValueError(f"{path} holds no settings of a run: {error}") from error
         if found.algo in (None, config.algorithm):
             return config, True
-    algorithm = found.algo if found.algo in LEARNERS else _Run.algo
+    algorithm = _Run.algo if found.algo is None else found.algo
     preset = _Run.preset if found.preset is None else found.preset
     return make_config(algorithm, preset), False
 
