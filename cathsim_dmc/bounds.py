@@ -297,18 +297,22 @@ def is_number(value: Any) -> bool:
 
 
 def _is_whole(value: Any) -> bool:
-    return isinstance(value, numbers.Integral) and not isinstance(value, bool)
+    # numpy counts durations among the integers.
+    other = isinstance(value, bool | np.timedelta64)
+    return isinstance(value, numbers.Integral) and not other
 
 
 def _allowed(
     kind: str, low: float, high: float, unit: str = "", positive: bool = False
 ) -> str:
     unit = f" {unit}" if unit else ""
+    # An integer in full: a seed may be 4294967295, not 4.29497e+09.
+    least, most = (f"{n}" if isinstance(n, int) else f"{n:g}" for n in (low, high))
     above = " above 0" if positive and low <= 0 else ""
     if math.isinf(low) and math.isinf(high):
         return kind + above
     if math.isinf(high):
-        return f"{kind}{above}" if above else f"{kind}, at least {low:g}{unit}"
+        return f"{kind}{above}" if above else f"{kind}, at least {least}{unit}"
     if math.isinf(low) or above:
-        return f"{kind}{above}, at most {high:g}{unit}"
-    return f"{kind} from {low:g} to {high:g}{unit}"
+        return f"{kind}{above}, at most {most}{unit}"
+    return f"{kind} from {least} to {most}{unit}"

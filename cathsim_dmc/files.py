@@ -226,6 +226,25 @@ def _read_array(archive: zipfile.ZipFile, entry: zipfile.ZipInfo) -> np.ndarray:
         return np.lib.format.read_array(stream, allow_pickle=False)
 
 
+def read_text(path: Path, largest: int, what: str) -> str:
+    """The UTF-8 text of a file from outside, which may have no end.
+
+    Args:
+        path: Path of the file.
+        largest: Size of the longest file that is read, bytes.
+        what: What the file should be, for the message of one that is longer.
+
+    Raises:
+        OSError: it cannot be read.
+        ValueError: it is too long or no text. The message does not name the file.
+    """
+    with open(path, "rb") as stream:
+        data = stream.read(largest + 1)
+    if len(data) > largest:
+        raise ValueError(f"it is too long for {what}")
+    return data.decode()
+
+
 def read_json(path: Path, largest: int, what: str) -> Any:
     """The content of a JSON file from outside, which may be anything.
 
@@ -238,8 +257,6 @@ def read_json(path: Path, largest: int, what: str) -> Any:
         ValueError: it is missing, too long or no JSON; the message names it.
     """
     try:
-        if path.stat().st_size <= largest:
-            return json.loads(path.read_text())
+        return json.loads(read_text(path, largest, what))
     except (OSError, ValueError, RecursionError) as error:
         raise ValueError(f"{path} cannot be read: {error}") from error
-    raise ValueError(f"{path} is too long for {what}")

@@ -138,6 +138,15 @@ def test_a_row_on_a_full_disk_names_the_file(tmp_path, small_disk):
         table.append({"frames": 1, "reward": 0.25})
 
 
+def test_a_table_that_is_removed_begins_anew(tmp_path):
+    table = MetricsFile(tmp_path / "metrics.csv", ["frames", "reward"])
+    table.append({"frames": 1, "reward": 0.25})
+    table.path.unlink()
+    table.append({"frames": 2, "reward": 0.5})
+    assert read_metrics(table.path) == [{"frames": 2, "reward": 0.5}]
+    MetricsFile(table.path, table.columns, resume_at=2)
+
+
 def test_a_policy_that_ships_starts_a_training():
     source = load_policy("pretrained:type1_bca")
     settings = {**source.config.to_dict(), "initial_policy": "pretrained:type1_bca"}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import re
 import tracemalloc
 import zlib
 from pathlib import Path
@@ -343,4 +344,20 @@ def test_a_vtp_with_entities_is_refused_in_every_encoding(tmp_path, encoding):
     path = tmp_path / "entities.vtp"
     path.write_bytes(text.encode(encoding))
     with pytest.raises(ValueError, match="declares XML entities"):
+        read_triangles(path)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (("<VTKFile", '<VTKFile header_type="Int8"'), "header_type is 'Int8'.*UInt64"),
+        (("<VTKFile", '<?xml version="1.0" encoding="x"?><VTKFile'), "encoding: x"),
+    ],
+)
+def test_a_vtp_of_a_kind_that_is_none_says_what(tmp_path, change, words):
+    good = (DATA / "cylinder-ascii.vtp").read_text()
+    text = re.sub(' header_type="[^"]*"', "", good[good.index("<VTKFile") :])
+    path = tmp_path / "other.vtp"
+    path.write_text(text.replace(*change, 1))
+    with pytest.raises(ValueError, match=words):
         read_triangles(path)

@@ -105,15 +105,29 @@ def test_a_name_that_leaves_its_folder_is_refused(grid, tmp_path, change):
         (("= 1000", "= { type1_bca = 5 }"), "type1_lcca"),
         (("= 1000", "= 1\nevaluation = { episodes = 0 }"), "episodes"),
         (("= 1000", "= 1\nevaluation = { seed = 0 }"), "seed"),
+        (("= 1000", '= 1\nsettings = { task = "x" }'), "settings has task"),
         (("[[row]]", "[row]"), "row"),
         (("[[row]]", "extra = 1\n[[row]]"), "extra"),
         (("[[row]]", "[[row"), "cannot be read"),
+        (("[[row]]", "a = " + "[" * 9_999), "cannot be read"),
+        (("[[row]]", "#" * 2**20), "cannot be read .*too long for a grid"),
     ],
 )
 def test_a_bad_grid_is_refused_with_its_place(grid, change, word):
     with pytest.raises(GridError, match=word) as error:
         grid(ROW.replace(*change))
     assert "grid.toml" in str(error.value)
+
+
+def test_options_of_a_task_that_are_no_table_make_a_cell_impossible(grid):
+    cell = grid(ROW.replace("= 1000", "= 1\nsettings = { task_kwargs = [1] }"))[0]
+    with pytest.raises(ConfigError, match="task_kwargs=.1. is not allowed"):
+        cell.config()
+
+
+def test_a_file_without_an_end_is_no_grid():
+    with pytest.raises(GridError, match="/dev/zero cannot be read .*too long"):
+        read_grid("/dev/zero")
 
 
 def test_cells_are_chosen_by_parts_of_names_and_patterns(grid):

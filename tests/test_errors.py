@@ -234,7 +234,9 @@ def test_batches_of_nothing_and_of_too_few_seeds(environment):
     with pytest.raises(ValueError, match="num_simulations is 0"):
         BatchSimulation(environment.task, 0)
     with pytest.raises(ValueError, match="3 seeds for 2 simulations"):
-        BatchSimulation(environment.task, 2, num_threads=1, seeds=[1, 2, 3])
+        BatchSimulation(environment.task, np.int8(2), num_threads=1, seeds=[1, 2, 3])
+    with pytest.raises(ValueError, match="from 0 to 4294967294"):
+        BatchSimulation(environment.task, np.int8(2), num_threads=1, seeds=2**32 - 1)
 
 
 @pytest.fixture(scope="module")
@@ -256,7 +258,12 @@ def test_a_step_before_the_reset_is_refused(three):
 @pytest.mark.parametrize(
     "indices",
     [-1, 1, 0.5, "1", {0}, [], [-1], [3], [0.0], [None], [[0, 1]], [True, False, True]]
-    + [np.array(1), np.eye(3, dtype=int), np.array([True, False, True])],
+    + [
+        np.array(1),
+        np.array([0], "m8[s]"),
+        np.eye(3, dtype=int),
+        np.array([True, False, True]),
+    ],
 )
 def test_indices_that_are_none_are_refused(three, indices):
     with pytest.raises(ValueError, match=r"indices is .*from 0 to 2.*flatnonzero"):

@@ -158,8 +158,10 @@ def judged():
 @pytest.mark.parametrize(
     ("changes", "words"),
     [
-        ({"reward": np.array([0.0, np.nan])}, r"nan.*finite"),
-        ({"terms": {"near": np.array([0.0, np.inf])}}, r"inf.*finite"),
+        ({"reward": np.array([0.0, np.nan])}, r"reward .*nan.*finite"),
+        ({"terms": {"near": np.array([0.0, np.inf])}}, r"near .*inf.*finite"),
+        ({"reward": np.ma.masked_array(NUMBERS, [1, 0])}, "reward masked_array"),
+        ({"success": np.ma.masked_array(NUMBERS > 0, [1, 0])}, "success masked_array"),
         ({"reward": np.zeros(7)}, r"reward of shape \(7,\).*\(2,\)"),
         ({"terms": {"near": np.zeros((2, 1))}}, r"near of shape \(2, 1\).*\(2,\)"),
         ({"success": np.bool_(True)}, "success"),
@@ -186,6 +188,17 @@ def test_an_outcome_that_is_none_is_refused_by_the_name_of_its_objective(
     for other in (None, "x", tuple(good)):
         with pytest.raises(ValueError, match=r"Advance returns .*Outcome\("):
             answer(other)
+
+
+def test_an_outcome_is_the_callers_own_in_float64(judged):
+    batch, answer = judged
+    reward = np.zeros(2, dtype=np.float32)
+    answer(Outcome(reward, reward > 1, {"near": np.broadcast_to(reward[0], 2)}))
+    outcome = batch.step(pushing(0)[0]).outcome
+    reward += 1  # an objective may use its array again
+    assert outcome.reward.tolist() == [0, 0]
+    assert {outcome.reward.dtype, outcome.terms["near"].dtype} == {np.dtype(float)}
+    outcome.terms["near"] += 1
 
 
 def test_composer_refuses_an_outcome_that_is_none():

@@ -42,7 +42,10 @@ class MetricsFile:
         """
         row = {k: f"{v:.9g}" if isinstance(v, float) else v for k, v in values.items()}
         with files.naming(self.path), open(self.path, "a", newline="") as file:
-            csv.DictWriter(file, self.columns, lineterminator="\n").writerow(row)
+            writer = csv.DictWriter(file, self.columns, lineterminator="\n")
+            if not file.tell():  # the file was removed, and begins anew
+                writer.writeheader()
+            writer.writerow(row)
 
     def _rows_until(self, frames: int) -> list[list[str]]:
         if not self.path.exists():

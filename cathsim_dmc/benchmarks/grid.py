@@ -9,7 +9,9 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from cathsim_dmc import files
 from cathsim_dmc.agents.config import TrainingConfig
+from cathsim_dmc.agents.fields import require_type
 from cathsim_dmc.agents.learners import make_config
 
 DEFAULT_GRID = Path(__file__).with_name("grid.toml")
@@ -27,6 +29,7 @@ _ROW = {
     "evaluation": dict,
     **_REQUIRED,
 }
+_OWN = {"task", "observation", "seed", "total_frames"}  # fields that a cell sets
 _EVALUATION = {"task": str, "episodes": int, "task_kwargs": dict, "each_arch": str}
 
 
@@ -99,6 +102,7 @@ class Cell:
             if isinstance(value, str):
                 settings[name] = value.replace("{task}", self.task)
         added = settings.pop("task_kwargs", {})
+        require_type("task_kwargs", added, Mapping[str, Any])
         for name in ("task", "observation", "seed", "total_frames"):
             settings[name] = getattr(self, name)
         config = make_config(self.algorithm, self.preset, **settings)
@@ -120,10 +124,8 @@ def read_grid(path: str | Path = DEFAULT_GRID) -> list[Cell]:
     """
     path, cells = Path(path), {}
     try:
-        if path.stat().st_size > _MAX_SIZE:
-            raise ValueError("too long for a grid")
-        values = tomllib.loads(path.read_text())
-    except (OSError, ValueError) as error:
+        values = tomllib.loads(files.read_text(path, _MAX_SIZE, "a grid"))
+    except (OSError, ValueError, RecursionError) as error:
         raise GridError(f"{path} cannot be read as a grid: {error}") from error
     rows = values.pop("row", None)
     if values or not isinstance(rows, list) or not rows:
@@ -170,6 +172,8 @@ def _cells(row: Any) -> list[Cell]:
     if missing := sorted(set(_REQUIRED) - set(row)):
         raise GridError(f"there is no {', '.join(missing)}")
     row = {"seeds": [0], "evaluation": {}, **row}
+    if own := sorted(_OWN & set(row.get("settings", {}))):
+        raise GridError(f"settings has {', '.join(own)}, which the row itself gives")
     _check(row["evaluation"], _EVALUATION)
     if row["evaluation"].get("episodes", 1) < 1:
         raise GridError("evaluation.episodes must be at least 1")

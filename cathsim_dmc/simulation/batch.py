@@ -78,8 +78,10 @@ class BatchSimulation:
         Raises:
           ValueError: if the task overrides what composer calls, or a number is wrong.
         """
-        bounds.whole("num_simulations", num_simulations, 1, bounds.MOST_SIMULATIONS)
-        bounds.whole("num_threads", num_threads, 0, bounds.MOST_THREADS)
+        num_simulations = bounds.whole(
+            "num_simulations", num_simulations, 1, bounds.MOST_SIMULATIONS
+        )
+        num_threads = bounds.whole("num_threads", num_threads, 0, bounds.MOST_THREADS)
         _refuse_overrides(type(task))
         self._task = task
         physics = mjcf.Physics.from_mjcf_model(task.root_entity.mjcf_model)

@@ -115,31 +115,37 @@ def judge(
             terms={n: np.where(failed, 0.0, t) for n, t in outcome.terms.items()},
         )
     # A sum of plain numbers takes a tenth of the time of `isfinite` and `all`.
-    for value in (outcome.reward, *outcome.terms.values()):
+    for name, value in (("reward", outcome.reward), *outcome.terms.items()):
         if not math.isfinite(sum(value.tolist())) and not np.isfinite(value).all():
-            _refuse(objective, f"{bounds.shown(value)}, which is not finite")
+            _refuse(objective, f"{name} {bounds.shown(value)}, which is not finite")
     return outcome
 
 
 def ask(objective: Objective, measurement: Measurement) -> Outcome:
-    """Outcome of an objective, of the right types and shapes; it may be infinite."""
+    """Outcome of an objective, copied as float64 and bool; it may be infinite."""
     outcome, shape = objective.outcome(measurement), measurement.distance.shape
     if not isinstance(outcome, Outcome) or not isinstance(outcome.terms, Mapping):
         _refuse(objective, bounds.shown(outcome))
     if (*outcome.terms,) != (*objective.terms,):
         _refuse(objective, f"the terms {[*outcome.terms]}, not {[*objective.terms]}")
-    _refuse_misfit(objective, "success", outcome.success, "b", shape)
-    _refuse_misfit(objective, "reward", outcome.reward, "fiu", shape)
-    for name, term in outcome.terms.items():
-        _refuse_misfit(objective, name, term, "fiu", shape)
-    return outcome
+    terms = {
+        name: _copied(objective, name, term, "fiu", shape)
+        for name, term in outcome.terms.items()
+    }
+    return Outcome(
+        reward=_copied(objective, "reward", outcome.reward, "fiu", shape),
+        success=_copied(objective, "success", outcome.success, "b", shape),
+        terms=terms,
+    )
 
 
-def _refuse_misfit(objective, name, value, kinds, shape):
-    if not isinstance(value, np.ndarray) or value.dtype.kind not in kinds:
+def _copied(objective, name, value, kinds, shape) -> np.ndarray:
+    masked = isinstance(value, np.ma.MaskedArray)
+    if masked or not isinstance(value, np.ndarray) or value.dtype.kind not in kinds:
         _refuse(objective, f"{name} {bounds.shown(value)}")
     if value.shape != shape:
         _refuse(objective, f"{name} of shape {value.shape}; it must be {shape}")
+    return np.array(value, dtype=bool if kinds == "b" else float)
 
 
 def _refuse(objective: Objective, given: str) -> NoReturn:

@@ -63,7 +63,7 @@ def read_vtp(data: bytes) -> tuple[np.ndarray, np.ndarray]:
         data = data[: start.end() - 1] + data[end:]
     try:
         root = ElementTree.fromstring(data, ElementTree.XMLParser(target=_Elements()))
-    except ElementTree.ParseError as error:
+    except (ElementTree.ParseError, LookupError) as error:
         raise ValueError(f"its XML is damaged: {error}") from error
     if root.tag != "VTKFile" or root.get("type") != "PolyData":
         raise ValueError(f"it holds {root.get('type', root.tag)!r}, not PolyData")
@@ -127,7 +127,10 @@ class _VtpArrays:
         self._appended, self._raw = appended, raw
         self._left = _MOST_VALUES
         self._order = ">" if root.get("byte_order") == "BigEndian" else "<"
-        self._header = np.dtype(self._order + _TYPES[root.get("header_type", "UInt32")])
+        header = root.get("header_type", "UInt32")
+        if header not in ("UInt32", "UInt64"):
+            raise ValueError(f"header_type is {header!r}; it must be UInt32 or UInt64")
+        self._header = np.dtype(self._order + _TYPES[header])
         compressor = root.get("compressor", "")
         self._unpacker = _UNPACKERS.get(compressor)
         if compressor and self._unpacker is None:
