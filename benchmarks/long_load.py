@@ -153,7 +153,7 @@ def measure(arguments: argparse.Namespace) -> dict:
         "checks": [dict(zip(keys, check, strict=True)) for check in checks],
         "passed": all(check[-1] for check in checks),
         "task": arguments.task,
-        "steps": load.count * arguments.simulations,
+        "steps": calls * arguments.simulations,
         "resets": load.resets,
         "series": series,
         "speeds": {"here": here, "fresh": fresh},
