@@ -13,7 +13,7 @@ from cathsim_dmc.recording import EpisodeRecorder  # noqa: E402
 from cathsim_dmc.recording.dataset import export  # noqa: E402
 
 OPTIONS = {"max_steps": 12, "goal_radius": 0.01}
-DATASET = "cathsim/simple1_bca/test-v0"
+DATASET = "simple1_bca-v0"
 
 
 def record(seeds, task="simple1_bca", **options):
@@ -40,11 +40,11 @@ def episodes():
 @pytest.fixture
 def directory(tmp_path, monkeypatch):
     monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path))
-    return tmp_path
+    return tmp_path / DATASET
 
 
 def test_a_dataset_holds_what_happened(episodes, directory):
-    export(episodes, DATASET, observation=["tracking", "force"], author="tests")
+    export(episodes, directory, observation=["tracking", "force"])
     dataset = minari.load_dataset(DATASET)
     assert dataset.total_episodes == 4
     assert dataset.total_steps == 9 + 10 + 11 + 12
@@ -72,7 +72,7 @@ def test_a_dataset_holds_what_happened(episodes, directory):
 def test_images_are_bytes_in_the_dataset(episodes, directory):
     export(
         episodes[:1],
-        DATASET,
+        directory,
         observation="image",
         task_kwargs={"fluoroscopy": {"size": 32, "biplane": "LATERAL", "noise": True}},
     )
@@ -83,12 +83,12 @@ def test_images_are_bytes_in_the_dataset(episodes, directory):
 
 @pytest.mark.slow
 def test_torchrl_loads_the_dataset(episodes, directory):
-    export(episodes, DATASET, observation="tracking")
+    export(episodes, directory, observation="tracking")
     # In a process of its own, which knows nothing of cathsim_dmc.
     code = f"""
 import sys
 from torchrl.data.datasets import MinariExperienceReplay
-root = {str(directory / "torch")!r}
+root = {str(directory.parent / "torch")!r}
 data = MinariExperienceReplay(
     {DATASET!r}, batch_size=8, root=root, load_from_local_minari=True
 )
@@ -106,14 +106,15 @@ assert "cathsim_dmc" not in sys.modules
 @pytest.mark.slow
 def test_what_cannot_be_repeated_is_refused(episodes, directory):
     with pytest.raises(ValueError, match="no episodes"):
-        export([], DATASET)
+        export([], directory)
     with pytest.raises(ValueError, match="of its own"):
-        export([episodes[0], *record([1], task="type1_lcca")], DATASET)
+        export([episodes[0], *record([1], task="type1_lcca")], directory)
     with pytest.raises(ValueError, match="seed None"):
-        export(record([None]), DATASET)
+        export(record([None]), directory)
     with pytest.raises(ValueError, match="does not repeat"):
         export(
-            episodes, DATASET, task_kwargs={"friction": 0.5, "reward": {"path": -1.0}}
+            episodes, directory, task_kwargs={"friction": 0.5, "reward": {"path": -1.0}}
         )
     with pytest.raises(ValueError, match="instead of"):
-        export(episodes, DATASET, task_kwargs={"max_steps": 5})
+        export(episodes, directory, task_kwargs={"max_steps": 5})
+    assert not directory.exists()

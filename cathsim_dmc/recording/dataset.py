@@ -25,42 +25,32 @@ _VERSION = re.compile(r"-v\d+$")
 
 def export(
     episodes: Iterable[Episode],
-    dataset_id: str,
+    path: str | os.PathLike[str],
     *,
     observation: str | Sequence[str] | None = None,
     task_kwargs: Mapping[str, Any] | None = None,
-    author: str = "",
-    description: str = "",
-):
-    """Repeats episodes and writes them as a dataset to Minari's own directory.
+) -> Path:
+    """Repeats recorded episodes and writes them as a dataset, see `write`.
 
-    The directory is `~/.minari/datasets`, or where MINARI_DATASETS_PATH says. Every
-    step is taken anew from the episode's seed and compared with the record, so the
-    dataset holds what happened and nothing else.
+    Every step is taken again from the episode's seed and compared with the record.
 
     Args:
       episodes: of one task, with the same options, seeded and not empty.
-      dataset_id: such as "cathsim/type1_bca/human-v0".
+      path: directory of the dataset, which must not exist.
       observation: names of observations; None for those of the record, or
         "internal".
       task_kwargs: further options of what is observed, such as `fluoroscopy`.
-      author: for the dataset's metadata.
-      description: the same.
-
-    Returns:
-      The `minari.MinariDataset`. `recover_environment()` gives its environment, and
-      the infos of each step are those of the Gymnasium environment.
 
     Raises:
       ValueError: if the episodes do not belong together or do not repeat.
+      FileExistsError: the directory exists.
       ModuleNotFoundError: if minari is not installed.
     """
     try:
-        import minari
-
         from cathsim_dmc.simulation.gymnasium import make
     except ModuleNotFoundError as error:
         raise ModuleNotFoundError(_NO_MINARI) from error
+    check_free(Path(path))
     episodes = list(episodes)
     task, options = _common(episodes)
     options.update(task_kwargs or {})
@@ -69,17 +59,15 @@ def export(
     single = all((e.action == e.action.astype(np.float32)).all() for e in episodes)
     environment = make(task, dtype="float32" if single else "float64", **options)
     try:
-        return minari.create_dataset_from_buffers(
-            dataset_id,
-            # Buffers filled here: Minari's own collector asks for JAX.
+        return write(
+            path,
             [_repeat(environment, episode) for episode in episodes],
-            env=environment,
-            algorithm_name="recorded episodes",
-            author=author or None,
-            description=description
-            or f"{len(episodes)} recorded episodes of the task {task} of cathsim_dmc",
-            data_format="hdf5",
-            jpeg_encoding=False,
+            env_spec=environment.spec,
+            observation_space=environment.observation_space,
+            action_space=environment.action_space,
+            algorithm="recorded episodes",
+            description=f"{len(episodes)} recorded episodes of the task {task} of "
+            "cathsim_dmc",
         )
     finally:
         environment.close()
