@@ -10,7 +10,7 @@ from cathsim_dmc.agents import evaluate
 from cathsim_dmc.policies import attempts, coaxial_pursuit, pursuit
 from cathsim_dmc.policies.attempts import Attempts
 from cathsim_dmc.policies.coaxial_pursuit import Plan, Settings
-from cathsim_dmc.policies.expert import CoaxialExpert, expert_for
+from cathsim_dmc.policies.expert import Expert
 from cathsim_dmc.policies.teacher import Teacher
 from cathsim_dmc.simulation.batch import BatchSimulation
 from cathsim_dmc.tasks.route import Place, locate
@@ -133,8 +133,8 @@ def test_it_plays_the_same_on_both_backends():
 
 def test_a_new_episode_forgets_the_last():
     task = suite.make_task(TASK, random=0, observation="tracking")
-    expert = expert_for(task)
-    assert isinstance(expert, CoaxialExpert)
+    expert = Expert.for_task(task)
+    assert not hasattr(expert.plan, "tip")
     simulation = BatchSimulation(task, 2, seeds=3)
     simulation.reset()
     state = (simulation.readings, simulation.wall_force, simulation.rollout.devices)
@@ -150,7 +150,7 @@ def test_a_new_episode_forgets_the_last():
 def test_what_is_for_one_device_is_refused_for_several():
     task = suite.make_task(TASK, random=0, observation="tracking")
     with pytest.raises(ValueError, match="coaxial_pursuit.Settings"):
-        expert_for(task, pursuit.Settings())
+        Expert.for_task(task, pursuit.Settings())
     simulation = BatchSimulation(task, 1)
     simulation.reset()
     with pytest.raises(ValueError, match=r"coaxial devices.*demonstrations"):

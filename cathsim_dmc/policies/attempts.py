@@ -51,7 +51,7 @@ class Settings:
 
 @dataclasses.dataclass(frozen=True)
 class Attempts:
-    """Where each simulation stands, arrays (...).
+    """Progress of each simulation, arrays (...).
 
     Attributes:
         arc_length: of the place on the route at the last step, m; NaN before the

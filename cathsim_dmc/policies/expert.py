@@ -1,13 +1,13 @@
 """A scripted expert that steers along the centreline to the goal.
 
-It proves the tasks solvable and is a yardstick for trained agents. What it decides is
-in `pursuit`, for coaxial devices in `coaxial_pursuit`; here it meets the simulations.
+Its success shows that a task can be solved, and is compared with that of trained
+agents. `pursuit` has its decisions, `coaxial_pursuit` those for coaxial devices.
 """
 
 from __future__ import annotations
 
 import dataclasses
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 
@@ -23,38 +23,54 @@ from cathsim_dmc.tasks import navigation
 from cathsim_dmc.tasks.cases import Case
 from cathsim_dmc.tasks.objective_pool import part
 
-Memory = TypeVar("Memory", State, Attempts)
-
 
 class Expert:
-    """The expert at work on one task; remembers where each simulation stands."""
+    """The expert on one task; remembers the attempt of each simulation.
 
-    def __init__(self, plan: Plan, settings: Settings | None = None):
-        """Starts without any memory; see `for_task`."""
-        self._plan = plan
-        self._settings = settings or Settings()
-        self._state: State | None = None
+    Attributes:
+        plan: What is known of the task.
+        state: What is remembered; None before the first action.
+    """
+
+    def __init__(
+        self, plan: Plan | coaxial_pursuit.Plan, settings: Settings | None = None
+    ):
+        """Takes what is known of the task; see `for_task`.
+
+        Args:
+            plan: Of a steerable device, or of coaxial devices.
+            settings: Of the same kind; None for the defaults.
+        """
+        coaxial = isinstance(plan, coaxial_pursuit.Plan)
+        self.plan = plan
+        self._settings = settings or (
+            coaxial_pursuit.Settings() if coaxial else Settings()
+        )
+        self.state: Attempts | None = None
 
     @classmethod
     def for_task(
-        cls, task: navigation.Navigation, settings: Settings | None = None
+        cls, task: navigation.Navigation | Case, settings: Settings | None = None
     ) -> Expert:
-        """The expert for a task.
+        """The expert for a task, or for one of the anatomies that episodes draw from.
+
+        Args:
+            task: Task or anatomy.
+            settings: Settings of its driving; those of coaxial devices are
+                `coaxial_pursuit.Settings`.
 
         Raises:
-            ValueError: if the task's device cannot be steered.
+            ValueError: if the device can neither be steered nor turned at its base, or
+                the settings are not for it.
         """
-        return cls(Plan.for_task(task), settings)
-
-    @property
-    def plan(self) -> Plan:
-        """What is known of the task."""
-        return self._plan
-
-    @property
-    def state(self) -> State | None:
-        """What is remembered; None before the first action."""
-        return self._state
+        if not task.scene.coaxial:
+            return cls(Plan.for_task(task), settings)
+        if settings is not None and not isinstance(settings, coaxial_pursuit.Settings):
+            raise ValueError(
+                "these settings are of a steerable device's expert; coaxial devices "
+                "need coaxial_pursuit.Settings"
+            )
+        return cls(coaxial_pursuit.Plan.for_task(task), settings)
 
     def reset(self, which: np.ndarray | None = None) -> None:
         """Forgets the simulations that begin a new episode.
@@ -62,11 +78,17 @@ class Expert:
         Args:
             which: Mask or indices of the simulations, None for all.
         """
-        if which is None or self._state is None:
-            self._state = None
+        if which is None or self.state is None:
+            self.state = None
             return
-        shape = self._state.insertion.shape
-        _forget(self._state, State.fresh(shape, len(self._plan.tip)), which)
+        fresh = self._fresh(self.state.attempts.shape)
+        for field in dataclasses.fields(fresh):
+            getattr(self.state, field.name)[which] = getattr(fresh, field.name)[which]
+
+    def _fresh(self, shape: tuple[int, ...]) -> Attempts:
+        if isinstance(self.plan, Plan):
+            return State.fresh(shape, len(self.plan.tip))
+        return Attempts.none(shape)
 
     def act(
         self,
@@ -74,110 +96,37 @@ class Expert:
         wall_force: forces.WallForce,
         devices: CoaxialReadings | None = None,
     ) -> np.ndarray:
-        """Action (..., A) in [-1, 1] for the state of the device.
+        """Action (..., A) in [-1, 1] for the state of the devices.
 
         Raises:
             ValueError: if the leading axes changed since the last call without reset.
         """
         shape = readings.head.shape[:-1]
-        if self._state is None:
-            self._state = State.fresh(shape, len(self._plan.tip))
-        if self._state.insertion.shape != shape:
+        if self.state is None:
+            self.state = self._fresh(shape)
+        if self.state.attempts.shape != shape:
             raise ValueError(
                 f"the readings have leading axes {shape}, those before had "
-                f"{self._state.insertion.shape}; call reset() in between"
+                f"{self.state.attempts.shape}; call reset() in between"
             )
-        action, self._state = decide(
-            self._plan, self._settings, self._state, readings, wall_force
-        )
+        plan, state = self.plan, self.state
+        settings: Any = self._settings
+        if isinstance(plan, Plan):
+            assert isinstance(state, State)
+            action, self.state = decide(plan, settings, state, readings, wall_force)
+        else:
+            assert devices is not None
+            action, self.state = coaxial_pursuit.decide(
+                plan, settings, state, readings, devices, wall_force
+            )
         return action
 
     def follow(self, action: np.ndarray) -> None:
         """Takes what was carried out, (..., A) in [-1, 1], for its own last action."""
-        if self._state is None:
-            return
-        told = action[..., : self._plan.tip.size] * self._plan.steering_angle
-        bend = told.reshape(self._state.bend.shape)
-        self._state = dataclasses.replace(self._state, bend=bend)
-
-
-class CoaxialExpert:
-    """The expert at work on one task of coaxial devices."""
-
-    def __init__(
-        self,
-        plan: coaxial_pursuit.Plan,
-        settings: coaxial_pursuit.Settings | None = None,
-    ):
-        """Starts without any memory."""
-        self._plan = plan
-        self._settings = settings or coaxial_pursuit.Settings()
-        self._state: Attempts | None = None
-
-    @property
-    def state(self) -> Attempts | None:
-        """What is remembered; None before the first action."""
-        return self._state
-
-    def reset(self, which: np.ndarray | None = None) -> None:
-        """Forgets the simulations that begin a new episode.
-
-        Args:
-            which: Mask or indices of the simulations, None for all.
-        """
-        if which is None or self._state is None:
-            self._state = None
-            return
-        fresh = Attempts.none(self._state.attempts.shape)
-        _forget(self._state, fresh, which)
-
-    def act(
-        self,
-        readings: Readings,
-        wall_force: forces.WallForce,
-        devices: CoaxialReadings | None = None,
-    ) -> np.ndarray:
-        """Action (N, 2 K) in [-1, 1] for the state of the devices."""
-        assert devices is not None
-        if self._state is None:
-            self._state = Attempts.none((len(readings.head),))
-        action, self._state = coaxial_pursuit.decide(
-            self._plan, self._settings, self._state, readings, devices, wall_force
-        )
-        return action
-
-    def follow(self, action: np.ndarray) -> None:
-        """Nothing: it remembers no action, only where the devices have come to."""
-
-
-def _forget(state: Memory, fresh: Memory, which: np.ndarray) -> None:
-    """Puts a fresh state in the place of that of some simulations."""
-    for field in dataclasses.fields(fresh):
-        getattr(state, field.name)[which] = getattr(fresh, field.name)[which]
-
-
-def expert_for(
-    task: navigation.Navigation | Case, settings: Settings | None = None
-) -> Expert | CoaxialExpert:
-    """The expert for a task, or for one of the anatomies that its episodes draw from.
-
-    Args:
-        task: Task or anatomy.
-        settings: Settings of its driving; those of coaxial devices are
-            `coaxial_pursuit.Settings`.
-
-    Raises:
-        ValueError: if the device can neither be steered nor turned at its base, or the
-            settings are not for it.
-    """
-    if not task.scene.coaxial:
-        return Expert(Plan.for_task(task), settings)
-    if settings is not None and not isinstance(settings, coaxial_pursuit.Settings):
-        raise ValueError(
-            "these settings are of a steerable device's expert; coaxial devices need "
-            "coaxial_pursuit.Settings"
-        )
-    return CoaxialExpert(coaxial_pursuit.Plan.for_task(task), settings)
+        if isinstance(self.plan, Plan) and isinstance(self.state, State):
+            told = action[..., : self.plan.tip.size] * self.plan.steering_angle
+            bend = told.reshape(self.state.bend.shape)
+            self.state = dataclasses.replace(self.state, bend=bend)
 
 
 class Experts:
@@ -189,7 +138,7 @@ class Experts:
         self._settings = settings
         # By simulation, from its first reset on.
         self._cases: dict[int, Case] = {}
-        self._experts: dict[int, Expert | CoaxialExpert] = {}
+        self._experts: dict[int, Expert] = {}
 
     def reset(self, which: np.ndarray | None = None) -> None:
         """Looks at the anatomies of the simulations that begin a new episode.
@@ -203,7 +152,7 @@ class Experts:
             case = self._view.case(index)
             if self._cases.get(index) is not case:
                 self._cases[index] = case
-                self._experts[index] = expert_for(case, self._settings)
+                self._experts[index] = Expert.for_task(case, self._settings)
             self._experts[index].reset()
 
     def act(
@@ -245,7 +194,7 @@ class ExpertPolicy(Policy):
             settings: Settings of its driving.
         """
         self._settings = settings
-        self._expert: Expert | CoaxialExpert | Experts | None = None
+        self._expert: Expert | Experts | None = None
         self._view: View | None = None
 
     def reset(self, view: View, which: np.ndarray) -> None:
@@ -260,7 +209,7 @@ class ExpertPolicy(Policy):
             self._expert = (
                 Experts(view, self._settings)
                 if several
-                else expert_for(view.task, self._settings)
+                else Expert.for_task(view.task, self._settings)
             )
         self._expert.reset(which)
 

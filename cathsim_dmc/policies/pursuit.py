@@ -8,9 +8,9 @@ that would turn the head towards that point, a vector in the world, has componen
 along the two hinges of every joint of the tip: what each hinge would have to bend. A
 positive `bend_x` turns the distal part from +z towards -y of its link, a positive
 `bend_y` from +z towards +x (right-hand rule). Every step adds a fraction of these to
-the motors, most to the distal joints. As the device advances, what a joint was told
-moves on to its proximal neighbour, and back again as it is withdrawn (follow the
-leader), so the tip keeps the shape of the way it came.
+the motors, most to the distal joints. As the device advances, the command of a joint
+moves to its proximal neighbour, and back as the device is withdrawn (follow the
+leader): the tip keeps the shape of its path.
 
 **Retries** (`attempts`) have another look-ahead each time, and every other time no
 jumps of the head's place on the route.
@@ -301,5 +301,5 @@ def turned(frame: np.ndarray, axis: int, angle: np.ndarray) -> np.ndarray:
 
 
 def ramp(value: np.ndarray, none: float, full: float) -> np.ndarray:
-    """0 at `none` and on its side, 1 at `full` and on its side, linear between."""
+    """Linear from 0 at `none` to 1 at `full`, constant beyond either."""
     return np.clip((value - none) / (full - none), 0.0, 1.0)

@@ -1,4 +1,4 @@
-"""Policies that look at nothing: yardsticks of agents, loads of the simulator."""
+"""Policies that ignore the observation: baselines of agents, loads of the simulator."""
 
 from __future__ import annotations
 

@@ -1,10 +1,10 @@
-"""The expert as a teacher: what it would do where somebody else has come to.
+"""The expert as a teacher: its actions in states that another policy reaches.
 
-The expert remembers: what it told the tip, since every correction adds to that, and
-retries. Somebody else at the controls is elsewhere than it believes, and a learner
-sees nothing of its retries. So a teacher takes the action that was really carried out
-for its own and judges every state afresh: outside the tube of the route it withdraws,
-inside it advances. Both can be told from what is observed, if the last action is.
+The expert remembers its commands to the tip, to which every correction adds, and its
+retries. Neither fits the state that another policy has reached, and a learner does not
+observe retries. The teacher therefore takes the action that was carried out for its
+own and judges every state by itself: it withdraws outside the tube of the route and
+advances inside it. Both follow from the observation if that has the last action.
 """
 
 from __future__ import annotations
