@@ -116,6 +116,17 @@ def test_weights_that_are_not_finite_are_refused(tmp_path, trained):
         evaluate(tmp_path / "run", episodes=1, make_env=synthetic_env.make_env)
 
 
+@pytest.mark.parametrize("change", [torch.Tensor.to_sparse, lambda w: w.to("meta")])
+def test_weights_that_are_no_plain_arrays_are_refused(change):
+    shapes, config = NetworkShapes(3, None, 2), small_ppo()
+    state = make_policy(shapes, config).state_dict()
+    checkpoints.require_fit("policy.pt", state, shapes, config)
+    name = next(key for key, weight in state.items() if weight.ndim == 2)
+    with pytest.raises(CheckpointError, match="policy.pt holds weights without numb"):
+        state[name] = change(state[name])
+        checkpoints.require_fit("policy.pt", state, shapes, config)
+
+
 @pytest.mark.parametrize(
     ("name", "full"), [("policy.pt", 20_000), ("config.json", 400)]
 )

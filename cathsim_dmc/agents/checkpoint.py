@@ -191,7 +191,10 @@ def require_fit(
             f"{given.get(wrong[0])}, the network has {expected.get(wrong[0])}; "
             f"{len(wrong)} entries differ."
         )
-    broken = [name for name, one in state.items() if not one.isfinite().all()]
+    try:
+        broken = [name for name, one in state.items() if not one.isfinite().all()]
+    except RuntimeError as error:  # sparse, or without data
+        raise CheckpointError(f"{path} holds weights without numbers.") from error
     if broken:
         raise CheckpointError(
             f"{path} holds weights that are not finite ({', '.join(broken[:3])}): "
