@@ -9,6 +9,7 @@ import sys
 import pytest
 import synthetic_env
 import torch
+from tensordict import TensorDict
 from test_agents_training import run, small_ppo, small_sac
 
 from cathsim_dmc.agents import Checkpoint, CheckpointError, ConfigError, evaluate
@@ -19,6 +20,7 @@ from cathsim_dmc.agents.networks import NetworkShapes
 from cathsim_dmc.agents.policies import load_policy
 from cathsim_dmc.agents.replay import ReplayError
 from cathsim_dmc.agents.warm_start import take_over
+from cathsim_dmc.simulation import environments
 
 
 def test_a_second_training_in_a_folder_is_refused(tmp_path):
@@ -147,6 +149,13 @@ def test_a_row_on_a_full_disk_names_the_file(tmp_path, small_disk):
     table = MetricsFile(tmp_path / "metrics.csv", ["frames", "reward"])
     with small_disk(18), pytest.raises(OSError, match="large: .*metrics.csv"):
         table.append({"frames": 1, "reward": 0.25})
+
+
+def test_a_policy_names_an_observation_of_another_size(trained):
+    policy = load_policy(trained / "ppo")
+    for entries in ({}, {environments.VECTOR: torch.zeros(1, 3)}):
+        with pytest.raises(ValueError, match="reads 20 numbers, the task gives [03]:"):
+            policy.act(TensorDict(entries, [1]))
 
 
 def test_a_table_that_is_removed_begins_anew(tmp_path):

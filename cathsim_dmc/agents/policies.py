@@ -86,6 +86,23 @@ class TrainedPolicy(FunctionPolicy):
         self.network, self.config, self.shapes = network, config, shapes
         self.observation = config.observation
 
+    def act(self, observation: Any) -> np.ndarray:
+        """Actions (N, A) float32.
+
+        Raises:
+            ValueError: the observation has another size than in training.
+        """
+        if not isinstance(observation, TensorDictBase):
+            observation = _tensors(observation)
+        vector = observation.get(environments.VECTOR, None)
+        size = 0 if vector is None else vector.shape[-1]
+        if size < self.shapes.vector or size > self.shapes.vector > 0:
+            raise ValueError(
+                f"{self.name} reads {self.shapes.vector} numbers, the task gives {size}"
+                ": play it with the options that it was trained with"
+            )
+        return super().act(observation)
+
 
 def load_policy(policy: PolicyLike, seed: int = 0) -> Policy:
     """A policy from whatever names one.
