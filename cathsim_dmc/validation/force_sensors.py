@@ -61,7 +61,7 @@ def resting_link(load: float, settling: float = 5.0) -> Resting:
     rig = Rig()
     plate = Phantom(_plate(rig.device.outer_radius))
     rig.arena.attach(plate)
-    plate.stand(rig.catheter.links[0])
+    plate.add_wall(rig.catheter.links[0])
     rig.compile()
     steps = round(settling / rig.model.opt.timestep)
     last = round(AVERAGING / rig.model.opt.timestep)
