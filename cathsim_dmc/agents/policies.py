@@ -96,7 +96,9 @@ class TrainedPolicy(FunctionPolicy):
             observation = _tensors(observation)
         vector = observation.get(environments.VECTOR, None)
         size = 0 if vector is None else vector.shape[-1]
-        if size < self.shapes.vector or size > self.shapes.vector > 0:
+        # In training its critic may have read numbers that it does not.
+        reads = environments.VECTOR in self.network.in_keys
+        if reads and size != self.shapes.vector:
             raise ValueError(
                 f"{self.name} reads {self.shapes.vector} numbers, the task gives {size}"
                 ": play it with the options that it was trained with"
