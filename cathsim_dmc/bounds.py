@@ -1,4 +1,4 @@
-"""Values from outside: of the right kind, finite and within bounds.
+"""Checks of values that a user gives: type, finite, within bounds.
 
 Every function returns the value as plain Python, or raises a ValueError that names the
 field, what was given and what is allowed.
@@ -15,32 +15,31 @@ import numpy as np
 
 # Seeds that numpy's RandomState takes.
 MOST_SEED = 2**32 - 1
-# Simulations, episodes: more are a slip of the finger, and fill the memory.
+# Simulations or episodes; more would fill the memory.
 MOST_SIMULATIONS = 100_000
 MOST_THREADS = 4096
 # Control steps of an episode: more than a year of 40 ms.
 MOST_STEPS = 1_000_000_000
 # Pixels along a side of an image; detectors of angiography have 1,024 to 2,480.
 MOST_PIXELS = 4096
-# Share of the way to the goal that the device may have made when an episode starts: it
-# is laid along the route, whose bends its links cut short.
+# Largest fraction of the route at which an episode may start.
 MOST_START_SHARE = 0.95
-# Way from the origin of what lies in an anatomy, m.
+# Largest distance of an anatomy from the origin, m.
 FAR = 10.0
 
-_SHOWN = 80  # characters of what was given
+_SHOWN = 80  # characters of a value in an error
 
 
 def refuse(name: str, value: Any, allowed: str) -> NoReturn:
-    """Raise the error of a value that is not allowed."""
+    """Raise the ValueError of a value that is not allowed."""
     raise ValueError(f"{name} is {shown(value)}; it must be {allowed}")
 
 
 def shown(value: Any) -> str:
-    """What was given, on one line and short."""
+    """A value as text: one line, at most 80 characters."""
     try:
         text = " ".join(repr(value).split())
-    except Exception:  # a class of somebody else's
+    except Exception:  # a class of the user
         text = f"a {type(value).__name__}"
     return text if len(text) <= _SHOWN else text[: _SHOWN - 3] + "..."
 
@@ -54,7 +53,7 @@ def number(
     *,
     positive: bool = False,
 ) -> float:
-    """A finite number of a range, which includes its ends.
+    """A finite number in a closed range.
 
     Args:
         name: Name of the field.
@@ -62,7 +61,7 @@ def number(
         low: Least value.
         high: Largest value.
         unit: Unit of the bounds, for the message.
-        positive: Whether it must be greater than zero, beside the range.
+        positive: Whether it must also be greater than zero.
     """
     good = is_number(value) and low <= value <= high and (value > 0 or not positive)
     if not good:
@@ -73,7 +72,7 @@ def number(
 def whole(
     name: str, value: Any, low: int | None = None, high: int | None = None
 ) -> int:
-    """An integer of a range, which includes its ends; a bool is none."""
+    """An integer in a closed range; a bool is refused."""
     least, most = -math.inf if low is None else low, math.inf if high is None else high
     if not _is_whole(value) or not least <= value <= most:
         refuse(name, value, _allowed("an integer", least, most))
@@ -136,14 +135,14 @@ def indices(name: str, value: Any, count: int) -> np.ndarray:
 
 
 def random_state(name: str, value: Any) -> np.random.RandomState:
-    """A source of randomness: one that is given, or one of a seed; None takes any."""
+    """A RandomState: the given one, or one of a seed; None draws a seed."""
     if isinstance(value, np.random.RandomState):
         return value
     return np.random.RandomState(None if value is None else seed(name, value))
 
 
 def switch(name: str, value: Any) -> bool:
-    """True or False, and nothing that Python takes for it."""
+    """True or False; 0 and 1 are refused."""
     if not isinstance(value, bool | np.bool_):
         refuse(name, value, "True or False")
     return bool(value)
@@ -157,7 +156,7 @@ def text(name: str, value: Any) -> str:
 
 
 def choice(name: str, value: Any, choices: Sequence[str] | Mapping[str, Any]) -> str:
-    """One of some words."""
+    """One of `choices`."""
     if not isinstance(value, str) or value not in choices:
         refuse(name, value, f"one of {', '.join(choices)}")
     return value
@@ -171,7 +170,7 @@ def vector(
     high: float = math.inf,
     unit: str = "",
 ) -> tuple[float, ...]:
-    """So many finite numbers of a range."""
+    """`count` finite numbers in a closed range."""
     values = _row(value)
     if (
         values is None
@@ -192,7 +191,7 @@ def interval(
     *,
     integers: bool = False,
 ) -> tuple[float, float]:
-    """The ends of a range within a range, the lower one first."""
+    """The ends (low, high) of a range within another."""
     values = _row(value)
     fits = _is_whole if integers else is_number
     if (
@@ -249,7 +248,7 @@ def instance(name: str, value: Any, kind: type) -> Any:
 
 
 def pixels(name: str, value: Any) -> tuple[int, int]:
-    """Rows and columns of an image, given as both or as one number for both."""
+    """Rows and columns of an image, from (rows, columns) or one number for both."""
     values = [value, value] if _is_whole(value) else _row(value)
     if (
         values is None
@@ -269,7 +268,7 @@ def mapping(name: str, value: Any, known: Iterable[str]) -> Mapping[str, Any]:
 
 
 def options(name: str, value: Any) -> dict[str, Any]:
-    """Options by name, as a dictionary of the caller's own; None has none."""
+    """A new dictionary of options by name; empty for None."""
     if value is None:
         return {}
     if not isinstance(value, Mapping) or not all(isinstance(key, str) for key in value):
@@ -287,7 +286,7 @@ def _row(value: Any) -> list[Any] | None:
 
 
 def is_number(value: Any) -> bool:
-    """Whether a value is a finite number; a bool is none."""
+    """Whether a value is a finite number; a bool is not."""
     if isinstance(value, bool) or not isinstance(value, numbers.Real):
         return False
     try:

@@ -49,16 +49,16 @@ _CONFIG_FIELDS = tuple(field.name for field in dataclasses.fields(NavigationConf
 
 @dataclasses.dataclass(frozen=True)
 class TaskDefinition:
-    """What a registered task is made of.
+    """A registered task: its anatomy, goal, objective and options.
 
     Attributes:
-      description: one line for people.
+      description: one line.
       anatomy: anatomy or its name; None where the user chooses.
       goal: name of a goal; None where the user chooses.
       access: where the device enters, see `anatomy.phantoms.load`.
-      objective: function of an anatomy, a goal and options by name; they become
-        options of the task. With an option `farthest_shift` it is told how far past
-        its place randomisation may shift the goal, m.
+      objective: function of an anatomy, a goal and keyword options, which become
+        options of the task. An option `farthest_shift` receives the largest shift of
+        the goal by randomisation, m.
       options: fields of `NavigationConfig` that differ from their defaults.
       random_arch: whether each episode draws a random arch, from those that the
         task's options `arches`, `pool` and `first` name; there is no `anatomy` then.
@@ -91,7 +91,7 @@ TASKS: dict[str, TaskDefinition] = {}
 
 
 def register(name: str, definition: TaskDefinition, *tags: str) -> None:
-    """Adds a task to the suite, under which name everything else knows it.
+    """Adds a task to the suite.
 
     Args:
       name: Name of the task.
@@ -136,14 +136,11 @@ def make_task(
     definition = TASKS[name]
     options = {**definition.options, **options}
     own = {key: options.pop(key) for key in definition.own_options if key in options}
-    if definition.own_options and not definition.random_arch and "phantom" in options:
-        # What this option was called at first.
-        own.setdefault("anatomy", options.pop("phantom"))
     _refuse_unknown(definition, options)
     config = NavigationConfig(
         **{key: value for key, value in options.items() if key in _CONFIG_FIELDS}
     )
-    # Before seconds of work are lost.
+    # Checked before the anatomy is built, which takes seconds.
     observations.resolve(config.observation, config.devices is not None)
     random = bounds.random_state("random", random)
     goal = own.get("goal", definition.goal or "bca")
@@ -158,13 +155,13 @@ def make_task(
         chosen["farthest_shift"] = config.ranges.farthest_shift
     goals = [placement.resolve_goal(anatomy, goal) for anatomy in anatomies]
     config = _one_length(config, anatomies, goals)
-    rooms = []
+    scenes = []
     for anatomy, place in zip(anatomies, goals, strict=True):
         objective = definition.objective(anatomy, place, **chosen)
         scene = Scene.build(anatomy, place, config, goal_radius=objective.goal_radius)
-        rooms.append((scene, objective))
-    scene, objective = rooms[0]
-    return Navigation(scene, objective, config, random, others=rooms[1:], name=name)
+        scenes.append((scene, objective))
+    scene, objective = scenes[0]
+    return Navigation(scene, objective, config, random, others=scenes[1:], name=name)
 
 
 def _one_length(
@@ -217,7 +214,7 @@ def load(
       task_name: Name of a task of the domain, see `SUITE`.
       task_kwargs: Options of the task: `random` (a seed), and see `make_task`.
       environment_kwargs: Arguments of `composer.Environment`.
-      visualize_reward: Accepted as dm_control does; there is nothing to colour.
+      visualize_reward: Has no effect.
 
     Raises:
       ValueError: if domain, task or an option does not exist; lists those that do.
@@ -243,12 +240,12 @@ def load(
 def environment(task: Navigation, **environment_kwargs: Any) -> composer.Environment:
     """The composer environment of a task, with the settings that the suite uses.
 
-    The MJCF model of the task is compiled here, and not again: what is to change in it
-    changes before.
+    The MJCF model of the task is compiled once, here; later changes of it have no
+    effect.
 
     Args:
       task: Task that no other environment owns.
-      **environment_kwargs: Arguments of `composer.Environment` that differ.
+      **environment_kwargs: Arguments of `composer.Environment`.
 
     Raises:
       ValueError: if there is no such argument, or its value is not allowed.
@@ -256,9 +253,9 @@ def environment(task: Navigation, **environment_kwargs: Any) -> composer.Environ
     settings = {
         "strip_singleton_obs_buffer_dim": True,
         "recompile_mjcf_every_episode": False,
-        # mj_step as it is, which the batched path runs too, bit for bit.
+        # Plain mj_step, as in the batched simulation.
         "legacy_step": False,
-        # Divergence ends the episode with a reason; it is no failure of the policy.
+        # Divergence ends the episode with a reason.
         "raise_exception_on_physics_error": False,
         **_environment_settings(environment_kwargs),
     }
@@ -279,7 +276,7 @@ def _environment_settings(given: Mapping[str, Any] | None) -> dict[str, Any]:
 
 
 def _register_domain() -> None:
-    """Tells dm_control.suite of the domain and its tasks; as often as one likes."""
+    """Registers the domain and its tasks in dm_control.suite; may be repeated."""
     needed = ("_DOMAINS", "_get_tasks", "_get_tasks_by_domain", "ALL_TASKS", *_TAGGED)
     missing = [name for name in needed if not hasattr(dm_suite, name)]
     if missing:
@@ -317,7 +314,7 @@ _PHANTOMS = {
 
 
 def _register_published() -> None:
-    """From the ascending aorta, as published, and the same in idealised arches."""
+    """Tasks that start in the ascending aorta: published and idealised arches."""
     for anatomy in ("type1", "type2", "simple1", "simple2"):
         for goal in ("bca", "lcca"):
             text = f"cannulate {_ARTERIES[goal]} from the ascending aorta."
@@ -329,7 +326,7 @@ def _register_published() -> None:
 
 
 def _register_femoral() -> None:
-    """The clinical route: from the groin, through the descending aorta."""
+    """Tasks of the clinical route, through the descending aorta."""
     for anatomy in ("type1", "type2", "type3", "bovine"):
         for goal, artery in _ARTERIES.items():
             text = f"cannulate {artery} from the descending aorta."
@@ -343,7 +340,7 @@ def _register_femoral() -> None:
 
 
 def _register_random() -> None:
-    """Another arch in each episode, both ways."""
+    """Tasks that draw a random arch for each episode, for both accesses."""
     for access, prefix in (("ascending", ""), ("descending", "femoral_")):
         for goal in ("bca", "lcca"):
             text = f"cannulate {_ARTERIES[goal]} from the {access} aorta."
@@ -354,7 +351,7 @@ def _register_random() -> None:
                     None,
                     goal,
                     access,
-                    # One chain for all arches, whichever are drawn from.
+                    # One length for all arches.
                     options={"working_length": placement.COMMON_LENGTH},
                     random_arch=True,
                 ),
@@ -363,7 +360,7 @@ def _register_random() -> None:
 
 
 def _register_coaxial() -> None:
-    """Beside each of them, with a guidewire alone and with one in a catheter."""
+    """Variants of each task: a guidewire, and a guidewire in a catheter."""
     for name, definition in list(TASKS.items()):
         for suffix, (chosen, words) in _COAXIAL.items():
             register(

@@ -72,12 +72,12 @@ def test_generated_phantom_can_be_navigated(cathsim, tmp_path):
     code, out, err = cathsim("phantom", "generate", "type2", "--out", directory)
     assert code == 0, err
     assert str(directory) in out and "bca" in out
-    kwargs = {"phantom": str(directory), "goal": "lcca", "random": 1}
+    kwargs = {"anatomy": str(directory), "goal": "lcca", "random": 1}
     environment = suite.load("cathsim", "navigate", task_kwargs=kwargs)
     made = environment.reset().observation
     environment.close()
     named = suite.load(
-        "cathsim", "navigate", task_kwargs={**kwargs, "phantom": "type2"}
+        "cathsim", "navigate", task_kwargs={**kwargs, "anatomy": "type2"}
     )
     expected = named.reset().observation
     named.close()

@@ -65,7 +65,7 @@ def test_wrong_goal_name():
     fails(
         ["carotid", *arch.load("simple1").goals],
         task_name="navigate",
-        phantom="type1",
+        anatomy="type1",
         goal="carotid",
     )
 
@@ -75,7 +75,7 @@ def test_goal_outside_the_lumen():
     fails(
         ["beside", "outside the lumen", "mm", "point inside", "bca", "lcca"],
         task_name="navigate",
-        phantom="type1",
+        anatomy="type1",
         goal=goal,
     )
 
@@ -95,7 +95,7 @@ def test_missing_phantom(phantom):
     fails(
         [phantom, "directory", "cathsim phantom", *arch.ARCHES],
         task_name="navigate",
-        phantom=phantom,
+        anatomy=phantom,
     )
 
 
@@ -104,7 +104,7 @@ def test_directory_without_an_anatomy(tmp_path):
         [tmp_path, "anatomy.json"],
         FileNotFoundError,
         task_name="navigate",
-        phantom=str(tmp_path),
+        anatomy=str(tmp_path),
     )
 
 

@@ -73,7 +73,7 @@ def test_success_is_terminated_in_torchrl():
     env = DMControlEnv(
         "cathsim",
         "navigate",
-        phantom=anatomy,
+        anatomy=anatomy,
         goal=Goal("near", "aorta", place.position, 0.09),
     )
     forward = torch.zeros(21, dtype=torch.float64)

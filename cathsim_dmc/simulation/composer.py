@@ -1,4 +1,4 @@
-"""The composer environments as TorchRL environments with the batched path's keys."""
+"""Composer environments in TorchRL, with the keys of `BatchedEnv`."""
 
 from collections.abc import Mapping
 from typing import Any

@@ -1,4 +1,4 @@
-"""TorchRL environments of the tasks, with observations as the networks take them."""
+"""TorchRL environments of the tasks, with observations for networks."""
 
 from collections.abc import Mapping, Sequence
 from functools import partial
@@ -46,8 +46,8 @@ def make_env(
         num_threads: Number of threads of the batched simulation, None for one per
             core.
         seed: Seed of the first simulation.
-        backend: Way of simulating: "batched" (mujoco.batch, all side by side) or
-            "composer" (dm_control environments, one after the other).
+        backend: "batched" (mujoco.batch, in parallel) or "composer" (dm_control
+            environments, one after the other).
         task_kwargs: Further options of the task.
 
     Returns:

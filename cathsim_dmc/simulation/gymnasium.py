@@ -17,7 +17,7 @@ from cathsim_dmc.tasks.config import CONTROL_TIMESTEP
 RENDER_MODES = ("rgb_array",)
 VERSION = 0  # of the ids
 # Arguments of the suite's factories beside the options of the task.
-_FACTORY_OPTIONS = ("phantom", "random", "environment_kwargs")
+_FACTORY_OPTIONS = ("random", "environment_kwargs")
 _MOST_SEED = 2**32  # first seed that numpy's RandomState does not take
 
 
@@ -47,7 +47,7 @@ def _float_type(dtype: str) -> np.dtype:
 
 
 def _refuse_unknown(task: str, options: Mapping[str, Any]) -> None:
-    """Raises TypeError as for any call: TorchRL tries arguments and looks for it."""
+    """Raises TypeError for an unknown option: TorchRL catches it."""
     known = suite.task_options(task) if task in suite.TASKS else ()
     for name in options if known else ():
         if name not in (*_FACTORY_OPTIONS, *known):
@@ -186,17 +186,17 @@ def fluoroscopy_frame(task, machine: angiograph.Angiograph) -> np.ndarray:
 
 
 def make(task: str, **options: Any) -> gymnasium.Env:
-    """An environment with a spec that says how to make it again, without wrappers.
+    """An environment without wrappers, with the spec that makes it again.
 
     Args:
       task: of `suite.SUITE`.
-      **options: of `CathSimEnv`; JSON can hold them if the spec shall be written.
+      **options: of `CathSimEnv`, JSON-able if the spec is to be written.
     """
     return gymnasium.make(env_spec(task, **options))
 
 
 def env_spec(task: str, **options: Any) -> EnvSpec:
-    """What says how to make an environment, see `make`; nothing is built."""
+    """Spec of an environment, see `make`."""
     return EnvSpec(
         id=f"{suite.DOMAIN}/{task}-v{VERSION}",
         entry_point=f"{__name__}:{CathSimEnv.__name__}",

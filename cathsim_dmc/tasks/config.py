@@ -25,8 +25,7 @@ _MOST_JOINTS = 1000
 WORKING_LENGTHS = (0.02, 3.0)  # m, up to the longest wires sold
 _LONGEST_LEAD = 0.3  # m
 MOST_FRICTION = 2.0  # Coulomb coefficient
-# A link shorter than its own radius is no rod; one longer than a vessel is wide does
-# not follow its bends.
+# A link is longer than its radius and shorter than the diameter of a large vessel.
 _LEAST_LINK, _LONGEST_LINK = 2e-3, 0.1  # m
 # Composer does the last two of them itself.
 _FEWEST_SUBSTEPS, _MOST_SUBSTEPS = 2, 1000
@@ -34,34 +33,32 @@ _FEWEST_SUBSTEPS, _MOST_SUBSTEPS = 2, 1000
 
 @dataclasses.dataclass(frozen=True)
 class NavigationConfig:
-    """Options of a navigation task; scene and objective come beside them.
+    """Options of a navigation task.
 
     Attributes:
       observation: Name or names of observations, see `observations.OBSERVATIONS`.
       device: Name of a device in `devices.DEVICES`, or a device.
-      devices: Coaxial devices from the innermost outwards, or their names, each pushed
-        and rotated by an action of its own, in place of `device`; None for `device`.
-      lead: By how much each coaxial device starts ahead of the one around it, m.
-      lumen_friction: Coulomb coefficient between a coaxial device and the lumen that it
-        lies in.
+      devices: Coaxial devices or their names, from the innermost outwards, in place of
+        `device`; each has two actions, translation and rotation. None for `device`.
+      lead: Length by which each coaxial device starts ahead of the next outer one, m.
+      lumen_friction: Coulomb coefficient between coaxial devices.
       rotation: Whether the action has a rotation of the base.
-      start_along_route: Least and largest share of the way to the goal that the head
-        of the device has made when an episode starts, drawn anew for each; None for
-        none of it. For curricula.
+      start_along_route: Range (low, high) of the fraction of the route at which an
+        episode starts, for curricula; None starts every episode at the inlet.
       max_steps: Number of control steps until the episode is truncated.
-      friction: Coulomb coefficient of device on wall.
+      friction: Coulomb coefficient between device and wall.
       shaft_link: Length of the longest link of the shaft, m.
       torsion_joints: Number of torsion hinges along the shaft; None for 4 with
         rotation and a torsionally rigid shaft without.
       working_length: Simulated length of the device, m; None for the length that all
         registered tasks share, or what the goal needs if that is more.
-      physics_timestep: Time of a physics step, s; a control step is a whole number
-        of them.
-      fluoroscopy: Set-up of the image observations: `imaging.FluoroscopyOptions`, or
-        a mapping of its fields.
-      cameras: Cameras of `rgb` and `depth`: `cameras.CameraOptions`, or a mapping.
-      randomisation: What differs from episode to episode: `variations.Randomisation`,
-        a mapping of its fields, True for `variations.DEFAULT_RANGES`, False for none.
+      physics_timestep: Length of a physics step, s; it divides the control step.
+      fluoroscopy: `imaging.FluoroscopyOptions` of the images, or a mapping of its
+        fields.
+      cameras: `cameras.CameraOptions` of `rgb` and `depth`, or a mapping of its fields.
+      randomisation: Ranges that each episode draws from: True for
+        `randomisation.DEFAULT_RANGES`, False for none, a `randomisation.Randomisation`
+        or a mapping of its fields.
     """
 
     observation: str | Sequence[str] = "internal"
@@ -99,21 +96,21 @@ class NavigationConfig:
         ):
             bounds.refuse("effects", self.effects, "a list of physics.effects.Effect")
 
-    # Three fields with the types that they have once the config is made.
+    # Fields with their types after validation.
 
     @property
     def ranges(self) -> Randomisation:
-        """`randomisation`, whatever it was given as."""
+        """`randomisation` as an object."""
         return cast(Randomisation, self.randomisation)
 
     @property
     def fluoroscopy_options(self) -> FluoroscopyOptions:
-        """`fluoroscopy`, whatever it was given as."""
+        """`fluoroscopy` as an object."""
         return cast(FluoroscopyOptions, self.fluoroscopy)
 
     @property
     def camera_options(self) -> CameraOptions:
-        """`cameras`, whatever they were given as."""
+        """`cameras` as an object."""
         return cast(CameraOptions, self.cameras)
 
     def effects_on(self, chain: Chain) -> list[Effect]:
@@ -142,8 +139,7 @@ class NavigationConfig:
             if option:
                 raise ValueError(
                     f"{name} is {getattr(self, name)!r}, but devices is "
-                    f"{self.devices!r}: coaxial devices are all named by `devices`, "
-                    "and turned as they are; leave one of the two out"
+                    f"{self.devices!r}, which replaces it; leave one of the two out"
                 )
 
     def _check_numbers(self):
@@ -151,18 +147,8 @@ class NavigationConfig:
         bounds.number("lumen_friction", self.lumen_friction, 0.0, MOST_FRICTION)
         bounds.switch("rotation", self.rotation)
         bounds.whole("max_steps", self.max_steps, 1, bounds.MOST_STEPS)
-        shares = self.start_along_route
-        if shares is not None and not (
-            isinstance(shares, Sequence)
-            and [type(one) in (int, float) for one in shares] == [True, True]
-            and 0 <= shares[0] <= shares[1] <= bounds.MOST_START_SHARE
-        ):
-            bounds.refuse(
-                "start_along_route",
-                shares,
-                "None, or (low, high) with 0 <= low <= high <= "
-                f"{bounds.MOST_START_SHARE:g}",
-            )
+        if (shares := self.start_along_route) is not None:
+            bounds.interval("start_along_route", shares, 0.0, bounds.MOST_START_SHARE)
         if self.torsion_joints is not None:
             bounds.whole("torsion_joints", self.torsion_joints, 0, _MOST_JOINTS)
         bounds.number("friction", self.friction, 0.0, MOST_FRICTION)
@@ -185,7 +171,7 @@ class NavigationConfig:
             )
 
     def _check_views(self):
-        """Check that every C-arm stays possible, however far its angles deviate."""
+        """Check that the C-arms are possible at the largest deviations of the view."""
         view = self.ranges.view
         ends = view if isinstance(view, Sequence) else (0.0,)
         for deviation in {round(end) for end in ends}:
@@ -193,9 +179,8 @@ class NavigationConfig:
                 self.fluoroscopy_options.carms(np.zeros((1, 3)), (deviation, deviation))
             except ValueError as error:
                 raise ValueError(
-                    f"randomisation: view is {view!r}, by which the view of "
-                    f"fluoroscopy may deviate; at {deviation} degrees it is none: "
-                    f"{error}"
+                    f"randomisation: view is {view!r}, but fluoroscopy has no view "
+                    f"that deviates by {deviation} degrees: {error}"
                 ) from error
 
 

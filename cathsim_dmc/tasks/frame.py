@@ -1,4 +1,4 @@
-"""What there is to observe after a control step, for one simulation or for many."""
+"""Input of the observations after a control step."""
 
 from collections.abc import Mapping
 from types import MappingProxyType
@@ -12,7 +12,7 @@ from cathsim_dmc.tasks.route import Ahead
 
 
 class Images(NamedTuple):
-    """What the image sensors show; None where no observation needs it.
+    """Images of the sensors; None where no observation needs them.
 
     Attributes:
       image: (..., H, W, P) uint8, fluoroscopy of P planes.
@@ -33,15 +33,15 @@ NO_IMAGES = Images()
 
 
 class Frame(NamedTuple):
-    """What there is to observe after a control step.
+    """Input of the observations after a control step.
 
     Attributes:
       readings: state of the device.
       wall_force: force on the wall over the control step.
-      action: (..., A), the action that was asked for, zeros after a reset.
+      action: (..., A), the last action, zeros after a reset.
       goal: (3,) or (..., 3), m.
-      images: what the image sensors show.
-      ahead: what lies ahead of the tip on the route; None where nothing asks for it.
+      images: images of the sensors.
+      ahead: route ahead of the tip; None where no observation needs it.
       devices: state of coaxial devices; None for a device alone.
     """
 

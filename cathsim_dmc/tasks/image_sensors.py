@@ -1,4 +1,4 @@
-"""The live images of N simulations and their recent past."""
+"""Image sensors of N simulations, with the last few images of each."""
 
 from collections.abc import Sequence
 
@@ -22,14 +22,13 @@ class ImageSensors:
         num_simulations: int,
         gl_cameras: cameras.Cameras | None = None,
     ):
-        """Switches the sensors on.
+        """Prepares the sensors.
 
         Args:
           names: Names of the observations.
-          angiograph: Angiography machine, needed by fluoroscopic observations; an
-            episode may have another one of the same set-up.
+          angiograph: Angiography machine; None without fluoroscopic observations.
           num_simulations: N.
-          gl_cameras: MuJoCo's cameras, needed by `rgb` and `depth`.
+          gl_cameras: MuJoCo's cameras; None without `rgb` and `depth`.
         """
         self._names = names
         self._on = angiograph is not None or gl_cameras is not None
@@ -54,7 +53,7 @@ class ImageSensors:
         angiograph: machines.Angiograph | None,
         deviation: machines.Deviation,
     ) -> None:
-        """Begins an episode of one simulation, before a machine that deviates."""
+        """Begins an episode of one simulation with its machine and its deviation."""
         if angiograph is not None:
             self._planes[index] = angiograph.planes(deviation)
 
@@ -72,12 +71,12 @@ class ImageSensors:
 
         Args:
           lines: (N, n, 3), centrelines of the chains, m.
-          shadows: What of them the beam meets: one device, or several in each other.
+          shadows: Shadow of each device.
           goal: (3,) or (N, 3), m.
           qpos: (N, nq).
           random_states: N sources of quantum noise, None for images without.
-          fresh: indices of simulations that have just begun an episode: only theirs
-            are captured and fill their whole history. None for all, one step on.
+          fresh: indices of simulations that begin an episode: only their images are
+            captured, and fill their history. None for a control step of all.
           device_points: (N, K, P, 3), tracked points of coaxial devices, m.
         """
         if not self._on:

@@ -1,4 +1,4 @@
-"""Objectives that differ between simulations, as one."""
+"""One objective for simulations with different objectives."""
 
 from collections.abc import Sequence
 from types import MappingProxyType
@@ -31,7 +31,7 @@ def together(objectives: Sequence[Objective], chosen: np.ndarray) -> Objective:
 
 
 class ObjectivePool(Shiftable):
-    """Objectives of groups of simulations, each asked about its own."""
+    """Objectives of groups of simulations."""
 
     def __init__(self, groups: Sequence[tuple[Objective, np.ndarray]]):
         """Takes each objective with the numbers of its simulations, N in all."""

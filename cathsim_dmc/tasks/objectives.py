@@ -1,4 +1,4 @@
-"""What a task asks for: when it succeeds, and what it rewards."""
+"""Objectives of tasks: success and reward."""
 
 import abc
 import dataclasses
@@ -23,7 +23,7 @@ PUBLISHED_REWARD: Mapping[str, float] = MappingProxyType(
 
 
 class Measurement(NamedTuple):
-    """What there is to judge after a control step; SI units, world frame.
+    """Measurement of a control step, which an objective judges; SI, world frame.
 
     Attributes:
       readings: state of the devices, arrays with the leading axes `...`.
@@ -62,10 +62,9 @@ def straight(start: np.ndarray, end: np.ndarray) -> np.ndarray:
 
 
 class Objective(Protocol):
-    """What a navigation task asks for; pure functions of arrays.
+    """Success and reward of a navigation task; pure functions of arrays.
 
-    The composer environment calls it with one leading axis of length 1, the batched
-    simulation with one of length N: work on the last axes only.
+    Arrays have a leading axis of length N; N is 1 in a composer environment.
 
     Attributes:
       goal: (3,), or (N, 3) where it differs between simulations, m, world frame.
@@ -189,10 +188,10 @@ class Cannulation(Shiftable, Routed):
       ostium: arc length at which the branch leaves its parent's lumen, m.
       route: centreline from the inlet to the goal.
       goal_radius: δ, m.
-      weights: reward term to its weight; terms without one are not worked out.
+      weights: reward term to its weight; terms without one are not computed.
       goal_arc_length: () or (N,), of the goal on the route, m; None for its end.
-      lumen: shortest ways through the lumen to the end of the route; None where no
-        term asks for them.
+      lumen: shortest paths in the lumen to the end of the route; None without the
+        term `path`.
     """
 
     goal: np.ndarray

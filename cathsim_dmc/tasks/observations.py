@@ -1,7 +1,6 @@
-"""The table of observations: what each holds, beside the function that computes it.
+"""The table of observations: functions of a `Frame`, with their entries.
 
-An observation is a function of a `Frame`, for one simulation or for many. To add one,
-write it here as a row with its entries.
+To add an observation, write it here as a row.
 """
 
 import math
@@ -26,7 +25,7 @@ OBSERVATIONS = ObservationTable()
 
 
 def _captured(array: np.ndarray | None) -> np.ndarray:
-    """What the image sensors took, as they do where an observation asks for it."""
+    """An image of the sensors, which an observation has requested."""
     assert array is not None
     return array
 
@@ -193,7 +192,7 @@ def _pixels(sizes: Sizes) -> int:
     joined=("drives",),
 )
 def tracking_2d(frame: Frame) -> Observation:
-    """The same points and the goal in pixels, as fluoroscopy shows them."""
+    """Tracked points and goal in pixels of fluoroscopy."""
     pixels = _captured(frame.images.pixels)
     return {
         "tracking_pixels": _flat(pixels[..., :-1, :], 3),
@@ -224,7 +223,7 @@ def tracking_2d(frame: Frame) -> Observation:
     joined=("drives", "devices"),
 )
 def route(frame: Frame) -> Observation:
-    """The way ahead as the tip sees it: nothing tells one anatomy from another."""
+    """Route ahead, device and goal in the tip frame."""
     ahead, state = frame.ahead, frame.readings
     assert ahead is not None
     head, axes = state.head[..., None, :], state.head_frame
@@ -270,7 +269,7 @@ def goal(frame: Frame) -> Observation:
     Entry("load_cell", 3, "N", "force of the phantom on its support, world frame"),
 )
 def force(frame: Frame) -> Observation:
-    """Force sensing beside any other observation."""
+    """Forces on wall, base and support."""
     wall, state = frame.wall_force, frame.readings
     return {
         "wall_force": np.stack(

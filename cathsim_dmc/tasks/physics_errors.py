@@ -1,4 +1,4 @@
-"""Errors of physics: found, named and kept for replay, never clipped away."""
+"""Physics errors: detection, names, and dumps that replay them."""
 
 import contextlib
 import dataclasses
@@ -23,8 +23,7 @@ DIVERGED = "diverged"
 ESCAPED = "escaped through the wall"
 EXPLODED = "exploding force"
 
-# Control steps between two looks for an escape; a device that has left the lumen does
-# not find back within two seconds.
+# Control steps between two checks for an escape.
 ESCAPE_INTERVAL = 50
 # Deeper outside the lumen than this, m, the axis of the device is behind the wall:
 # the wall is 4 mm thick, and penetration stays below 1 mm.

@@ -1,4 +1,4 @@
-"""What N simulations have to say after a control step."""
+"""Result of a control step of N simulations."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
