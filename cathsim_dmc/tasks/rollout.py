@@ -100,7 +100,7 @@ class Rollout:
             {"goal": scene.goal.name, "config": repr(config)},
         )
         self._path = PathTracker(num_simulations)
-        # None before the first episode: specs are made of images without noise.
+        # None before the first episode.
         self._random_states: list[np.random.RandomState] | None = None
         self._goal_shift = np.zeros(num_simulations)
         self._steps = np.zeros(num_simulations, dtype=int)
