@@ -103,6 +103,18 @@ def test_the_field_of_a_tube_is_exact_at_its_ends(tube):
     assert (beyond < 0).all()
 
 
+def test_a_hole_in_the_cap_of_the_inlet_is_all_that_lets_a_device_out(tube):
+    _, _, field = tube
+    capped = field.with_hole(2e-3)
+    assert capped((0, 0, -5e-3), free=True) == FREE
+    places = [(1.5e-3, 0, 0.01e-3), (3e-3, 0, 0.4e-3), (3e-3, 0, -0.3e-3)]
+    np.testing.assert_allclose(
+        capped(places, free=True), [0.5e-3, 0.4e-3, -0.3e-3], atol=0.01e-3
+    )
+    assert (capped.gradient(places[1:]) @ UP > 0.9).all()
+    assert (field(places, free=True)[:2] > 0.9e-3).all()
+
+
 def test_the_gradient_points_away_from_the_wall(tube):
     _, _, field = tube
     angle = np.linspace(0, 2 * np.pi, 50)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -48,7 +48,7 @@ class Field:
     Attributes:
         head: float64; origin (3) m, edge m, bricks along x, y and z (3), m a unit,
             number of open ends, and of each: position (3) m, direction out of the
-            lumen (3), radius m.
+            lumen (3), radii of the lumen and of the hole in its cap, m.
         coarse: ((a + 1)(b + 1)(c + 1),) int16, depths at the corners of the bricks.
         index: (a b c,) int32, first place of a brick in `samples`, -1 for none.
         samples: int16; of each brick the cells n along its edge and (n + 1)^3 depths.
@@ -111,6 +111,14 @@ class Field:
         for array in self.arrays:
             joined.update(array.tobytes())
         return joined.digest()
+
+    def with_hole(self, radius: float) -> Field:
+        """The same lumen with flat caps over its open ends, but for a hole (m) each."""
+        from cathsim_dmc.anatomy.field_loops import END, FIRST_END
+
+        head = self.head.copy()
+        head[FIRST_END + END - 1 :: END] = radius
+        return replace(self, head=head)
 
     def __repr__(self) -> str:
         """Bricks and memory."""
@@ -176,7 +184,7 @@ class Field:
             bricks[:, 1:] = _whole(depth).reshape(len(depth), -1)
             parts.append(bricks.ravel())
             end += bricks.size
-        free = [(*e.position, *e.direction, e.radius) for e in ends if e.open]
+        free = [(*e.position, *e.direction, e.radius, e.radius) for e in ends if e.open]
         head = np.concatenate([origin, [EDGE], shape, [QUANTUM, len(free)], *free])
         samples = np.concatenate([*parts, np.zeros(1, np.int16)])
         return cls(head, _whole(coarse).ravel(), index.ravel(), samples)
@@ -243,9 +251,10 @@ def _corners(measure: Measure, origin: Array, shape: np.ndarray) -> Array:
     blocks = -(-shape // _TOGETHER)
     rows = np.stack(np.meshgrid(*(np.arange(n) for n in blocks), indexing="ij"), -1)
     steps = EDGE * (np.arange(_TOGETHER) - (_TOGETHER - 1) / 2)
-    local = np.stack(np.meshgrid(steps, steps, steps, indexing="ij"), -1)
+    lattice = np.meshgrid(steps, steps, steps, indexing="ij")
+    local = np.stack(lattice, -1).reshape(-1, 3).astype(np.float64)
     middles: Array = origin + EDGE * (_TOGETHER * rows + (_TOGETHER - 1) / 2)
-    depth = measure(middles.reshape(-1, 3), local.reshape(-1, 3))
+    depth = measure(middles.reshape(-1, 3), local)
     depth = depth.reshape(*blocks, _TOGETHER, _TOGETHER, _TOGETHER)
     depth = depth.transpose(0, 3, 1, 4, 2, 5).reshape(_TOGETHER * blocks)
     return depth[: shape[0], : shape[1], : shape[2]]

@@ -8,9 +8,11 @@ from cathsim_dmc.compiled import compiled
 
 # Places in the head of a field.
 ORIGIN, EDGE, SHAPE, QUANTUM, ENDS = 0, 3, 4, 7, 8
-# Numbers of an open end: position, outward direction, radius.
-END, FIRST_END = 7, 9
+# Numbers of an open end: position, outward direction, radii of lumen and of its hole.
+END, FIRST_END = 8, 9
 FREE = 1.0  # m, depth of what lies behind an open end
+# Past the plane of an open end, no wall is so thick, m.
+_THICK = 5e-3
 
 
 @compiled
@@ -22,9 +24,38 @@ def behind(head, x, y, z):
         level = dx * head[at + 3] + dy * head[at + 4] + dz * head[at + 5]
         if level > 0.0:
             across = dx * dx + dy * dy + dz * dz - level * level
-            if across < head[at + 6] * head[at + 6]:
+            if across < min(head[at + 6], head[at + 7]) ** 2:
                 return level
     return 0.0
+
+
+@compiled
+def capped(head, value, x, y, z):
+    """Depth (m) where flat caps leave holes in open ends, from that without caps."""
+    for number in range(int(head[ENDS])):
+        at = FIRST_END + END * number
+        radius, hole = head[at + 6], head[at + 7]
+        if hole >= radius:
+            continue
+        dx, dy, dz = x - head[at], y - head[at + 1], z - head[at + 2]
+        level = dx * head[at + 3] + dy * head[at + 4] + dz * head[at + 5]
+        across = math.sqrt(max(dx * dx + dy * dy + dz * dz - level * level, 0.0))
+        if hole < across <= radius:
+            value = min(value, -level)
+        elif across <= hole and level <= 0.0:
+            value = min(value, math.hypot(level, hole - across))
+    return value
+
+
+@compiled
+def past(head, x, y, z):
+    """Whether a point lies past the plane of an open end."""
+    for number in range(int(head[ENDS])):
+        at = FIRST_END + END * number
+        level = (x - head[at]) * head[at + 3] + (y - head[at + 1]) * head[at + 4]
+        if level + (z - head[at + 2]) * head[at + 5] > 0.0:
+            return True
+    return False
 
 
 @compiled
@@ -66,27 +97,44 @@ def depth_at(head, coarse, index, samples, x, y, z):
 
 
 @compiled
+def walled_at(head, coarse, index, samples, x, y, z):
+    """Depth (m) at a point, without the holes of open ends."""
+    return capped(head, depth_at(head, coarse, index, samples, x, y, z), x, y, z)
+
+
+@compiled
+def clearance_at(head, coarse, index, samples, x, y, z):
+    """Depth (m) at a point; `FREE` behind an open end, and beside it but for a wall."""
+    if behind(head, x, y, z) > 0.0:
+        return FREE
+    depth = walled_at(head, coarse, index, samples, x, y, z)
+    return FREE if depth < -_THICK and past(head, x, y, z) else depth
+
+
+@compiled
 def depths(head, coarse, index, samples, points, free, out):
     """Depths (n,) m at points (n, 3) m; behind open ends `FREE`, or outside."""
     for n in range(len(points)):
         x, y, z = points[n]
+        if free:
+            out[n] = clearance_at(head, coarse, index, samples, x, y, z)
+            continue
         level = behind(head, x, y, z)
+        out[n] = depth_at(head, coarse, index, samples, x, y, z)
         if level > 0.0:
-            out[n] = FREE if free else -level
-        else:
-            out[n] = depth_at(head, coarse, index, samples, x, y, z)
+            out[n] = -level
 
 
 @compiled
 def gradient_at(head, coarse, index, samples, x, y, z, step):
     """Central differences of the depth at a point, over `step` (m) to each side."""
     return (
-        depth_at(head, coarse, index, samples, x + step, y, z)
-        - depth_at(head, coarse, index, samples, x - step, y, z),
-        depth_at(head, coarse, index, samples, x, y + step, z)
-        - depth_at(head, coarse, index, samples, x, y - step, z),
-        depth_at(head, coarse, index, samples, x, y, z + step)
-        - depth_at(head, coarse, index, samples, x, y, z - step),
+        walled_at(head, coarse, index, samples, x + step, y, z)
+        - walled_at(head, coarse, index, samples, x - step, y, z),
+        walled_at(head, coarse, index, samples, x, y + step, z)
+        - walled_at(head, coarse, index, samples, x, y - step, z),
+        walled_at(head, coarse, index, samples, x, y, z + step)
+        - walled_at(head, coarse, index, samples, x, y, z - step),
     )
 
 

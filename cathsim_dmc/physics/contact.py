@@ -96,7 +96,9 @@ class _Table:
         table[_CAPSULE * _TYPES + _BOX] = loops.of_capsule.address
         table[_SPHERE * _TYPES + _BOX] = loops.of_sphere.address
 
-    def put(self, key: int, kind: int, arrays: Sequence[np.ndarray]) -> None:
+    def put(
+        self, key: int, kind: int, middle: np.ndarray, arrays: Sequence[np.ndarray]
+    ) -> None:
         """Adds an entry, unless there is one."""
         from cathsim_dmc.physics.contact_loops import CAPACITY, ENTRY, HEAD
 
@@ -110,7 +112,7 @@ class _Table:
         while self._words[HEAD + ENTRY * slot]:
             slot = (slot + 1) % CAPACITY
         row = self._words[HEAD + ENTRY * slot :][:ENTRY]
-        kept = [np.ascontiguousarray(array) for array in arrays]
+        kept = [np.ascontiguousarray(array) for array in (middle, *arrays)]
         self._kept[key] = kept
         row[1] = kind
         row[2 : 2 + len(kept)] = [array.ctypes.data for array in kept]
@@ -146,12 +148,13 @@ def register(field: Field | Bore) -> tuple[float, ...]:
     parts = [int.from_bytes(digest[3 * k : 3 * k + 3], "big") % PART for k in range(3)]
     parts[0] = parts[0] or 1  # a key of 0 is none
     kind = BORE if isinstance(field, Bore) else LUMEN
-    _get_table().put(_key(parts), kind, field.arrays)
+    low, high = field.box
+    _get_table().put(_key(parts), kind, (low + high) / 2, field.arrays)
     return (MARK, *map(float, parts))
 
 
 def carrier(field: Field | Bore) -> dict[str, Any]:
-    """Attributes of the geom that carries a field; it belongs to the world."""
+    """Attributes of the geom that carries a field, on a body that has its frame."""
     low, high = field.box
     return {
         "type": "box",

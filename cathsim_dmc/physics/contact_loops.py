@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from cathsim_dmc.anatomy.field_loops import FREE, behind, depth_at, gradient_at
+from cathsim_dmc.anatomy.field_loops import FREE, clearance_at, gradient_at
 from cathsim_dmc.compiled import compiled
 from cathsim_dmc.physics.native import (
     address_of,
@@ -37,7 +37,8 @@ from cathsim_dmc.physics.native import (
     MESSAGE,
 ) = range(0, 96, 8)
 HEAD = 16  # words
-# An entry: key, kind, addresses of head, coarse lattice, index and samples.
+# An entry: key, kind, addresses of the place of the carrier's middle in the field's
+# frame, and of head, coarse lattice, index and samples.
 ENTRY, CAPACITY = 8, 1 << 14
 LUMEN, BORE = 0, 1
 # Numbers of a carrier geom: the mark, then the key of its field in three parts, which
@@ -56,6 +57,9 @@ _GOLDEN = 0.6180339887498949
 # that lies flat on a wall has many that are none.
 _DENT = 5e-6
 _FLAT = 2e-6
+_ASIDE = 0.4e-3  # m, to both sides, from where the planes of a hollow wall are taken
+_MOST = 4  # contacts of a capsule and a box; more are fatal
+_HOLLOW = 5e-6  # m, least distance of their edge from the wall
 _STEP = 0.25e-3  # m, to both sides, over which the wall's normal is taken
 _FAR = 1e-3  # m, by which the coarse lattice may be wrong far from the wall
 _COUNT = 1 << 40  # more than any array has; nothing checks it
@@ -107,16 +111,14 @@ def bore_at(head, x, y, z, out):
 @compiled
 def clearance(entry, x, y, z, out):
     """Distance (m) from the wall of an entry's field, `FREE` past its open ends."""
-    head = numbers(word(entry + 16), _COUNT)
+    head = numbers(word(entry + 24), _COUNT)
     if word(entry + 8) == BORE:
         return bore_at(head, x, y, z, out)
-    if behind(head, x, y, z) > 0.0:
-        return FREE
-    return depth_at(
+    return clearance_at(
         head,
-        shorts(word(entry + 24), _COUNT),
-        wholes(word(entry + 32), _COUNT),
-        shorts(word(entry + 40), _COUNT),
+        shorts(word(entry + 32), _COUNT),
+        wholes(word(entry + 40), _COUNT),
+        shorts(word(entry + 48), _COUNT),
         x,
         y,
         z,
@@ -126,13 +128,13 @@ def clearance(entry, x, y, z, out):
 @compiled
 def away(entry, x, y, z, out):
     """Unit vector away from the wall in `out`; whether there is one."""
-    head = numbers(word(entry + 16), _COUNT)
+    head = numbers(word(entry + 24), _COUNT)
     if word(entry + 8) == BORE:
         bore_at(head, x, y, z, out)
     else:
-        coarse = shorts(word(entry + 24), _COUNT)
-        index = wholes(word(entry + 32), _COUNT)
-        samples = shorts(word(entry + 40), _COUNT)
+        coarse = shorts(word(entry + 32), _COUNT)
+        index = wholes(word(entry + 40), _COUNT)
+        samples = shorts(word(entry + 48), _COUNT)
         out[0], out[1], out[2] = gradient_at(
             head, coarse, index, samples, x, y, z, _STEP
         )
@@ -252,6 +254,74 @@ def touches(entry, centre, axis, half, closed, limit, places, depths):
 
 
 @compiled
+def tangents(entry, place, axis, normal, depth, limit, turns, rows):
+    """Planes (1 or 2 rows of unit normal and clearance) that stand for the wall.
+
+    Where the wall is hollow across the device, one plane turns with the device as it
+    rolls there, from step to step: a force f at a radius r of its way is a stiffness
+    f / r that no implicit step knows of, and throws light links to and fro. The wall
+    is then two planes that touch it to both sides: the field made linear there.
+    """
+    found, side, out = 0, np.empty((2, 4)), np.empty(3)
+    for turn in range(turns):
+        bx = axis[1] * normal[2] - axis[2] * normal[1]
+        by = axis[2] * normal[0] - axis[0] * normal[2]
+        bz = axis[0] * normal[1] - axis[1] * normal[0]
+        if turn:
+            bx, by, bz = (
+                normal[1] * bz - normal[2] * by,
+                normal[2] * bx - normal[0] * bz,
+                normal[0] * by - normal[1] * bx,
+            )
+        length = math.sqrt(bx * bx + by * by + bz * bz)
+        if length < 0.1:
+            continue
+        bx, by, bz = _ASIDE * bx / length, _ASIDE * by / length, _ASIDE * bz / length
+        hollow = True
+        for row in range(2):
+            way = 2.0 * row - 1.0
+            x, y, z = place[0] + way * bx, place[1] + way * by, place[2] + way * bz
+            there = clearance(entry, x, y, z, out)
+            if there >= FREE or not away(entry, x, y, z, out):
+                hollow = False
+                break
+            side[row, :3] = out
+            side[row, 3] = there - way * (out[0] * bx + out[1] * by + out[2] * bz)
+            hollow = hollow and side[row, 3] > depth + _HOLLOW
+        # Moved so that their edge lies at the true depth.
+        excess = 0.5 * (side[0, 3] + side[1, 3]) - depth
+        for row in range(2):
+            if hollow and side[row, 3] - excess <= limit:
+                rows[found] = side[row]
+                rows[found, 3] -= excess
+                found += 1
+    if found == 0:
+        rows[0, :3] = normal
+        rows[0, 3] = depth
+        found = 1
+    return found
+
+
+@compiled
+def ends(table, model, data, geom, half):
+    """Which ends (2,) of a capsule count: one at its body's joint is another link's."""
+    looked = np.ones(2, np.bool_)
+    body = wholes(word(model + word(table + GEOM_BODYID)) + 4 * geom, 1)[0]
+    parent = wholes(word(model + word(table + BODY_PARENTID)) + 4 * body, 1)[0]
+    if parent == 0 or half == 0.0:
+        return looked
+    centre = numbers(word(data + word(table + GEOM_XPOS)) + 24 * geom, 3)
+    turned = numbers(word(data + word(table + GEOM_XMAT)) + 72 * geom, 9)
+    joint = numbers(word(data + word(table + XPOS)) + 24 * body, 3)
+    for end in range(2):
+        way, apart = half if end else -half, 0.0
+        for k in range(3):
+            apart += (centre[k] + way * turned[3 * k + 2] - joint[k]) ** 2
+        looked[end] = apart > _JOINED * _JOINED
+    return looked
+
+
+@compiled
 def collide(model, data, contacts, geom1, geom2, margin, before):
     """Contacts of a capsule or a sphere with a box, which may carry a field.
 
@@ -273,41 +343,48 @@ def collide(model, data, contacts, geom1, geom2, margin, before):
         call_error(word(table + ERROR), word(table + MESSAGE), geom2)
         return np.int32(0)
     size = numbers(word(model + word(table + GEOM_SIZE)) + 24 * geom1, 3)
-    centre = numbers(word(data + word(table + GEOM_XPOS)) + 24 * geom1, 3)
-    turned = numbers(word(data + word(table + GEOM_XMAT)) + 72 * geom1, 9)
-    axis, radius = turned[2:9:3], size[0]
-    half = size[1] if before == OF_CAPSULE else 0.0
-    closed = np.ones(2, np.bool_)
-    body = wholes(word(model + word(table + GEOM_BODYID)) + 4 * geom1, 1)[0]
-    parent = wholes(word(model + word(table + BODY_PARENTID)) + 4 * body, 1)[0]
-    if parent != 0 and half > 0.0:
-        joint = numbers(word(data + word(table + XPOS)) + 24 * body, 3)
-        for end in range(2):
-            way = half if end else -half
-            apart = 0.0
-            for k in range(3):
-                apart += (centre[k] + way * axis[k] - joint[k]) ** 2
-            closed[end] = apart > _JOINED * _JOINED
-    places, depths, normal = np.empty(2), np.empty(2), np.empty(3)
-    found = touches(entry, centre, axis, half, closed, radius + margin, places, depths)
+    radius, half = size[0], size[1] if before == OF_CAPSULE else 0.0
+    closed = ends(table, model, data, geom1, half)
+    # The capsule in the frame of the field.
+    places = word(data + word(table + GEOM_XPOS))
+    turns = word(data + word(table + GEOM_XMAT))
+    centre, origin = numbers(places + 24 * geom1, 3), numbers(places + 24 * geom2, 3)
+    turned, frame = numbers(turns + 72 * geom1, 9), numbers(turns + 72 * geom2, 9)
+    middle = numbers(word(entry + 16), 3)
+    local, axis, normal = np.empty(3), np.empty(3), np.empty(3)
+    place, rows = np.empty(3), np.empty((4, 4))
+    for k in range(3):
+        local[k], axis[k] = middle[k], 0.0
+        for i in range(3):
+            local[k] += frame[3 * i + k] * (centre[i] - origin[i])
+            axis[k] += frame[3 * i + k] * turned[3 * i + 2]
+    alongs, depths = np.empty(2), np.empty(2)
+    found = touches(entry, local, axis, half, closed, radius + margin, alongs, depths)
     written = 0
     for n in range(found):
-        x = centre[0] + places[n] * axis[0]
-        y = centre[1] + places[n] * axis[1]
-        z = centre[2] + places[n] * axis[2]
-        if not away(entry, x, y, z, normal):
-            continue
-        contact = numbers(contacts + 80 * written, 10)
-        distance = depths[n] - radius
-        reach = radius + 0.5 * distance
-        contact[0] = distance
-        contact[1] = x - reach * normal[0]
-        contact[2] = y - reach * normal[1]
-        contact[3] = z - reach * normal[2]
         for k in range(3):
-            contact[4 + k] = -normal[k]
-            contact[7 + k] = 0.0
-        written += 1
+            place[k] = local[k] + alongs[n] * axis[k]
+        if not away(entry, place[0], place[1], place[2], normal):
+            continue
+        # A sphere may have one contact, so one plane.
+        around = 0 if half == 0.0 else 1 + int(abs(alongs[n]) >= half)
+        planes = tangents(
+            entry, place, axis, normal, depths[n], radius + margin, around, rows
+        )
+        for plane in range(min(planes, _MOST - written)):
+            contact = numbers(contacts + 80 * written, 10)
+            distance = rows[plane, 3] - radius
+            reach = radius + 0.5 * distance
+            contact[0] = distance
+            for k in range(3):
+                towards = 0.0
+                for i in range(3):
+                    towards -= frame[3 * k + i] * rows[plane, i]
+                along = alongs[n] * turned[3 * k + 2]
+                contact[1 + k] = centre[k] + along + reach * towards
+                contact[4 + k] = towards
+                contact[7 + k] = 0.0
+            written += 1
     return np.int32(written)
 
 
