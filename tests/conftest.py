@@ -5,13 +5,11 @@ import dataclasses
 import gc
 
 import hypothesis
-import mujoco
 import numpy as np
 import pytest
 
 from cathsim_dmc import suite
 from cathsim_dmc.anatomy.wall import fidelity
-from cathsim_dmc.physics.randomisation import Episode
 from cathsim_dmc.tasks import observations
 from cathsim_dmc.tasks.navigation import Navigation
 
@@ -64,14 +62,6 @@ def assert_wall_fits(anatomy, rays=10_000):
     assert fidelity.coverage(anatomy, rays).fraction == 1.0
     assert fidelity.patency(anatomy, 1e-3, spacing=2e-3).passed
     assert len(anatomy.wall) <= 850
-
-
-def begin_dumped(environment, meta, state):
-    """Puts an environment to where the episode of a dump begins."""
-    episode = Episode.from_motion(meta["drawn"])
-    environment.task.rollout.take(0, episode, environment.random_state)
-    model, data = environment.physics.model.ptr, environment.physics.data.ptr
-    mujoco.mj_setState(model, data, state, mujoco.mjtState.mjSTATE_INTEGRATION)
 
 
 def pytest_collection_finish():

@@ -1,6 +1,5 @@
 """Coaxial devices in a task: how they move, what is written, both paths alike."""
 
-import mujoco
 import numpy as np
 import pytest
 from conftest import twin
@@ -127,22 +126,6 @@ def test_pushing_on_a_wall_loads_the_leading_device(environment):
     push = float(environment.task.readings.push_force)
     assert push > 0.02
     assert 0.0 < seen.leading_load[0] <= push * 1.5 + 0.05
-
-
-def test_the_state_holds_the_devices(environment):
-    """What is saved and put back goes on alike: insertions and twist are in it."""
-    environment.reset()
-    run(environment, [0.5, 0.7, 1.0, -0.3], 10)
-    model, data = environment.physics.model.ptr, environment.physics.data.ptr
-    kind = mujoco.mjtState.mjSTATE_INTEGRATION.value
-    state = np.zeros(mujoco.mj_stateSize(model, kind))
-    mujoco.mj_getState(model, data, state, kind)
-    seen = environment.task.rollout.devices
-    run(environment, [0.5, 0.7, 1.0, -0.3], 5)
-    mujoco.mj_setState(model, data, state, kind)
-    again = environment.task.rollout.devices
-    np.testing.assert_array_equal(again.insertion, seen.insertion)
-    np.testing.assert_array_equal(again.tip_rotation, seen.tip_rotation)
 
 
 def test_a_step_of_a_single_device_does_no_pair_work(shared_environment, monkeypatch):

@@ -3,13 +3,13 @@ import os
 
 import numpy as np
 import pytest
-from conftest import begin_dumped, twin
+from conftest import twin
 
 from cathsim_dmc import suite
 from cathsim_dmc.anatomy.arch import arch
-from cathsim_dmc.physics.randomisation import Episode
 from cathsim_dmc.simulation import batch
 from cathsim_dmc.tasks import physics_errors as physics_errors
+from cathsim_dmc.tasks.snapshot import Snapshot
 
 
 @pytest.fixture
@@ -69,9 +69,9 @@ def test_exploding_force_ends_the_episode_as_a_physics_error(
     assert task.error is None
 
 
-def replay(environment, meta, state, actions):
+def replay(environment, start, actions):
     """Steps an environment through the episode of a dump."""
-    begin_dumped(environment, meta, state)
+    environment.restore(start)
     for action in actions:
         environment.step(action)
 
@@ -86,13 +86,11 @@ def test_a_dump_replays_the_episode(randomised, dumps, monkeypatch):
         timestep = environment.step(_push(environment))
     final = environment.physics.data.qpos.copy()
     (path,) = dumps.glob("*.npz")
-    meta, state, actions = physics_errors.load(path)
-    assert meta["reason"] == physics_errors.EXPLODED
-    assert meta["task"]["goal"] == "bca"
-    assert (meta["drawn"]["friction"] is not None) == randomised
+    reason, start, actions = physics_errors.load(path)
+    assert reason == physics_errors.EXPLODED
+    assert start.task["goal"] == "bca"
     again = suite.environment(twin(task, 4))  # not what it drew
-    again.reset()
-    replay(again, meta, state, actions)
+    replay(again, start, actions)
     np.testing.assert_array_equal(again.physics.data.qpos, final)
 
 
@@ -119,7 +117,7 @@ def test_a_diverging_simulation_is_a_physics_error(dumps, task):
     step = simulation.step(np.zeros((2, simulation.num_actions)))
     assert step.physics_error.tolist() == [False, True]
     (path,) = dumps.glob("*.npz")
-    assert physics_errors.load(path)[0]["reason"] == physics_errors.DIVERGED
+    assert physics_errors.load(path)[0] == physics_errors.DIVERGED
 
 
 def test_composer_reports_divergence(dumps, load):
@@ -151,34 +149,32 @@ def test_an_episode_is_dumped_once_and_a_folder_keeps_the_last_few(dumps, load):
 def test_what_is_kept_of_a_simulation_is_bounded_and_its_own(task, monkeypatch, caplog):
     """One that is never reset keeps nothing of the others."""
     monkeypatch.setattr(physics_errors, "LONGEST_REPLAY", 10)
-    monitor = physics_errors.PhysicsMonitor(task.scene, 2, {})
-    drawn = Episode(displacement=np.zeros(3))
-    monitor.restart(0, task.scene, drawn)
+    monitor = physics_errors.PhysicsMonitor(task.scene, 2)
+    monitor.restart(0, task.scene)
+
+    def take(indices):
+        return Snapshot({}, {"state": np.zeros((len(indices), 1))})
 
     def kept():
         return [len(one.actions or b"") // 8 for one in monitor._watched]
 
     for _ in range(10):
-        monitor.restart(1, task.scene, drawn)
+        monitor.restart(1, task.scene)
         for _ in range(4):
-            monitor.before_step(lambda: np.zeros((2, 1)), np.zeros((2, 1)))
+            monitor.before_step(take, np.zeros((2, 1)))
         assert kept()[0] <= 10 and kept()[1] == 4
     assert kept() == [0, 4]
-    errors = monitor.errors([True, False], np.zeros((2, 1, 3)), np.zeros(2))
-    assert errors == [physics_errors.DIVERGED, None]
+    steps, nodes = np.array([40, 4]), np.zeros((2, 1, 3))
+    errors = monitor.errors([True, False], steps, nodes, np.zeros(2))
+    assert errors == (physics_errors.DIVERGED, None)
     assert "more steps than a dump holds" in caplog.text
 
 
 def test_trainings_keep_dumps_in_their_folder(tmp_path, monkeypatch):
     monkeypatch.delenv("CATHSIM_DUMP_DIR")
     with physics_errors.dumps_in(tmp_path / "errors"):
-        path = physics_errors.dump(
-            "tried",
-            task={},
-            episode=Episode(displacement=np.zeros(3)),
-            state=np.zeros(3),
-            actions=np.zeros((2, 3)),
-        )
+        start = Snapshot({}, {"state": np.zeros((1, 3))})
+        path = physics_errors.dump("tried", start, np.zeros((2, 3)))
     assert path.parent == tmp_path / "errors"
     assert "CATHSIM_DUMP_DIR" not in os.environ
 
@@ -229,17 +225,16 @@ def test_the_dump_of_an_unstable_model_replays_it_bit_for_bit(dumps, task, load)
     states, _ = _unstable(task, wild=[1])
     dumped = [physics_errors.load(path) for path in dumps.glob("*.npz")]
     # That of the error which ends the episode; nobody steps on.
-    meta, state, actions = min(dumped, key=lambda one: len(one[2]))
+    reason, start, actions = min(dumped, key=lambda one: len(one[2]))
     again = load()
-    again.reset()
     again.physics.model.jnt_stiffness[:] *= _WILD
-    replay(again, meta, state, actions)
-    assert again.task.error == meta["reason"]
+    replay(again, start, actions)
+    assert again.task.error == reason
     expected = states[len(actions) - 1, 1]
     np.testing.assert_array_equal(again.physics.data.qpos, expected)
 
 
 def test_a_file_that_is_no_dump_is_refused(tmp_path):
     np.savez(tmp_path / "other.npz", a=np.zeros(3))
-    with pytest.raises(ValueError, match="no dump"):
+    with pytest.raises(ValueError, match="no snapshot"):
         physics_errors.load(tmp_path / "other.npz")

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from conftest import begin_dumped, twin
+from conftest import twin
 
 from cathsim_dmc import suite
 from cathsim_dmc.physics import forces
@@ -19,9 +19,8 @@ _SNAP = Path(__file__).with_name("data") / "snap_through.npz"
 
 def _snap(environment):
     """Wall forces, N, of the recorded moment, and the error that ended it."""
-    meta, state, actions = physics_errors.load(_SNAP)
-    environment.reset()
-    begin_dumped(environment, meta, state)
+    _, start, actions = physics_errors.load(_SNAP)
+    environment.restore(start)
     task, peaks = environment.task, []
     for action in actions:
         environment.step(action)

@@ -217,9 +217,10 @@ class Effects:
             for name, array in effect.state.items()
         }
 
-    def refresh(self, index: int) -> None:
-        """Writes the model of one simulation, whose state has been restored."""
-        # Marks are those of this process.
-        self._user[index, self._labelled] = self._labels[self._labelled]
-        for effect in self._effects:
-            effect.refresh(index)
+    def refresh(self, indices: np.ndarray) -> None:
+        """Writes the models of some simulations, whose state has been restored."""
+        for index in indices:
+            # Marks are those of this process.
+            self._user[index, self._labelled] = self._labels[self._labelled]
+            for effect in self._effects:
+                effect.refresh(index)

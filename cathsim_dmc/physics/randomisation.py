@@ -38,8 +38,6 @@ _RANGES = {
     "delay": (0, 250, "control steps"),
 }
 _FARTHEST_START = 0.02  # m; the lumen is no wider
-# What is drawn that changes how the device moves from where it starts.
-_MOTION = ("friction", "stiffness", "roll", "delay")
 
 
 def start_displacement(
@@ -200,29 +198,6 @@ class Episode:
     goal_shift: float | None = None
     roll: float | None = None
     delay: int = 0
-
-    @property
-    def motion(self) -> dict[str, float | None]:
-        """What was drawn that moves the device, beside where it starts; JSON-able."""
-        return {name: getattr(self, name) for name in _MOTION}
-
-    @classmethod
-    def from_motion(cls, values: Mapping[str, Any]) -> "Episode":
-        """An episode in which the device moves as in the one that gave `motion`.
-
-        Raises:
-          ValueError: a name is missing or unknown, or a value cannot have been drawn.
-        """
-        given = bounds.mapping("drawn", values, _MOTION)
-        if missing := [name for name in _MOTION if name not in given]:
-            raise ValueError(f"drawn has no {', '.join(missing)}")
-        for name, value in given.items():
-            low, high, unit = _RANGES[name]
-            if name == "delay":
-                bounds.whole("drawn delay", value, int(low), int(high))
-            elif value is not None:
-                bounds.number(f"drawn {name}", value, low, high, unit)
-        return cls(displacement=np.zeros(3), **given)
 
 
 class RandomisedModel(Effect):

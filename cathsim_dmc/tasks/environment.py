@@ -2,9 +2,12 @@
 
 import os
 
+import dm_env
 import mujoco
 from dm_control import composer, mjcf
 from dm_control.rl import control
+
+from cathsim_dmc.tasks.snapshot import Snapshot
 
 
 class Environment(composer.Environment):
@@ -26,6 +29,37 @@ class Environment(composer.Environment):
         if not self._changes_model():
             self._mjcf_never_compiled = False
         return super().reset()
+
+    def snapshot(self) -> Snapshot:
+        """The state between two steps, from which an episode goes on bit for bit.
+
+        Raises:
+          RuntimeError: if no episode has begun.
+        """
+        return self.task.snapshot()
+
+    def restore(self, snapshot: Snapshot) -> dm_env.TimeStep:
+        """Puts the environment to a snapshot, in place of a reset.
+
+        Args:
+          snapshot: Of one simulation of the same task, perhaps of another process.
+
+        Returns:
+          The time step that was the last one when the snapshot was taken.
+
+        Raises:
+          ValueError: if the snapshot is of another task.
+        """
+        task, physics = self.task, self._physics_proxy
+        task.restore(physics, snapshot, self._random_state)
+        self._observation_updater.reset(physics, self._random_state)
+        observation = self._observation_updater.get_observation()
+        self._reset_next_step = task.termination is not None
+        if not task.rollout.steps[0]:
+            return dm_env.restart(observation)
+        kind = dm_env.StepType.LAST if self._reset_next_step else dm_env.StepType.MID
+        reward, discount = task.get_reward(physics), task.get_discount(physics)
+        return dm_env.TimeStep(kind, reward, discount, observation)
 
     def _changes_model(self) -> bool:
         """Whether the task, an entity or a hook changes the MJCF model."""

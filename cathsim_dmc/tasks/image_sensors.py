@@ -1,11 +1,12 @@
 """Image sensors of N simulations, with the last few images of each."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import astuple
 
 import mujoco
 import numpy as np
 
-from cathsim_dmc.imaging import angiograph as machines
+from cathsim_dmc.imaging import angiograph as angiographs
 from cathsim_dmc.imaging.device import Shadow
 from cathsim_dmc.imaging.fluoroscopy import Fluoroscope
 from cathsim_dmc.tasks import cameras, observations
@@ -18,7 +19,7 @@ class ImageSensors:
     def __init__(
         self,
         names: Sequence[str],
-        angiograph: machines.Angiograph | None,
+        angiograph: angiographs.Angiograph | None,
         num_simulations: int,
         gl_cameras: cameras.Cameras | None = None,
     ):
@@ -33,14 +34,14 @@ class ImageSensors:
         self._names = names
         self._on = angiograph is not None or gl_cameras is not None
         self._cameras = gl_cameras
-        self._planes: list[machines.Planes] = []
+        self._planes: list[angiographs.Planes] = []
+        self._deviations = [angiographs.Deviation()] * num_simulations
         self._noise = False
         if angiograph is not None:
             self._planes = [angiograph.planes()] * num_simulations
             self._noise = angiograph.options.noise
-        self._images: list[np.ndarray] = []
-        self._masks = self._pixels = None
-        self._views: dict[str, np.ndarray] = {}
+        # The last images (N, ...) by name, and those before: past_0 is the last one.
+        self._held: dict[str, np.ndarray] = {}
 
     @property
     def on(self) -> bool:
@@ -50,12 +51,13 @@ class ImageSensors:
     def restart(
         self,
         index: int,
-        angiograph: machines.Angiograph | None,
-        deviation: machines.Deviation,
+        angiograph: angiographs.Angiograph | None,
+        deviation: angiographs.Deviation,
     ) -> None:
         """Begins an episode of one simulation with its machine and its deviation."""
         if angiograph is not None:
             self._planes[index] = angiograph.planes(deviation)
+            self._deviations[index] = deviation
 
     def capture(
         self,
@@ -79,8 +81,8 @@ class ImageSensors:
             captured, and fill their history. None for a control step of all.
           device_points: (N, K, P, 3), tracked points of coaxial devices, m.
         """
-        if not self._on:
-            return NO_IMAGES
+        if not self._on or (fresh is not None and not len(fresh)):
+            return self._latest() if self._on else NO_IMAGES
         count = len(qpos)
         chosen = np.arange(count) if fresh is None else fresh
         line = lines[chosen]
@@ -89,41 +91,87 @@ class ImageSensors:
             states = None
             if random_states is not None and self._noise:
                 states = [random_states[index] for index in chosen.tolist()]
-            image = machines.images(planes, [s.of(chosen) for s in shadows], states)
+            image = angiographs.images(planes, [s.of(chosen) for s in shadows], states)
             self._remember(image, count, fresh)
         if self._wants("segmentation"):
-            masks = machines.masks(planes, [s.of(chosen) for s in shadows])
-            self._masks = _merged(self._masks, masks, count, fresh)
+            masks = angiographs.masks(planes, [s.of(chosen) for s in shadows])
+            self._hold("masks", masks, count, fresh)
         if self._wants("tracking_2d"):
             ends = np.broadcast_to(goal, (count, 3))[chosen, None]
             points = [observations.tracked(line)]
             if device_points is not None:
                 points.append(device_points[chosen].reshape(len(line), -1, 3))
             points = np.concatenate([*points, ends], axis=-2)
-            pixels = machines.pixels(planes, points)
-            self._pixels = _merged(self._pixels, pixels, count, fresh)
+            self._hold("pixels", angiographs.pixels(planes, points), count, fresh)
         kinds = [kind for kind in cameras.KINDS if kind in self._names]
         if kinds and self._cameras is not None:
             for key, view in self._cameras.see(kinds, qpos[chosen]).items():
-                self._views[key] = _merged(self._views.get(key), view, count, fresh)
+                self._hold(f"view_{key}", view, count, fresh)
+        return self._latest()
+
+    def _latest(self) -> Images:
+        past = tuple(self._named("past_").values())
         return Images(
-            image=self._images[0] if self._images else None,
-            past_images=tuple(self._images[1:]),
-            masks=self._masks,
-            pixels=self._pixels,
-            views=dict(self._views),
+            image=past[0] if past else None,
+            past_images=past[1:],
+            masks=self._held.get("masks"),
+            pixels=self._held.get("pixels"),
+            views=self._named("view_"),
         )
+
+    def _named(self, prefix: str) -> dict[str, np.ndarray]:
+        return {
+            name.removeprefix(prefix): image
+            for name, image in self._held.items()
+            if name.startswith(prefix)
+        }
+
+    def _hold(self, name, image, count, fresh):
+        self._held[name] = _merged(self._held.get(name), image, count, fresh)
+
+    @property
+    def state(self) -> dict[str, np.ndarray]:
+        """Arrays (N, ...) that a snapshot keeps."""
+        kept = dict(self._held)
+        if self._planes:
+            kept["deviation"] = np.array([astuple(one) for one in self._deviations])
+        return kept
+
+    def restore(
+        self,
+        indices: np.ndarray,
+        machines: Sequence[angiographs.Angiograph | None],
+        kept: Mapping[str, np.ndarray],
+    ) -> None:
+        """Puts some simulations to arrays (K, ...) of `state`.
+
+        Args:
+          indices: (K,) numbers of the simulations.
+          machines: Of their anatomies.
+          kept: Arrays.
+        """
+        for row, (index, machine) in enumerate(zip(indices, machines, strict=True)):
+            if "deviation" in kept:
+                primary, secondary, *factors = kept["deviation"][row].tolist()
+                deviation = angiographs.Deviation(
+                    round(primary), round(secondary), *factors
+                )
+                self.restart(index, machine, deviation)
+
+        for name, image in self._held.items():
+            self._held[name] = _merged(image, kept[name], len(image), indices)
 
     def _wants(self, *names: str) -> bool:
         return any(name in self._names for name in names)
 
     def _remember(self, image, count, fresh):
-        length = observations.SEQUENCE_LENGTH
-        if fresh is None and self._images:
-            self._images = [image, *self._images[: length - 1]]
+        ages = [f"past_{age}" for age in range(observations.SEQUENCE_LENGTH)]
+        if fresh is None and ages[0] in self._held:
+            past = [image, *(self._held[age] for age in ages[:-1])]
+            self._held.update(zip(ages, past, strict=True))
             return
-        past = self._images or [None] * length
-        self._images = [_merged(each, image, count, fresh) for each in past]
+        for age in ages:
+            self._hold(age, image, count, fresh)
 
     @property
     def fluoroscope(self) -> Fluoroscope | None:

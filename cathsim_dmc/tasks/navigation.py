@@ -20,6 +20,7 @@ from cathsim_dmc.tasks.objectives import Objective, Shiftable
 from cathsim_dmc.tasks.observation_kind import FrameObservable, Sizes
 from cathsim_dmc.tasks.rollout import Rollout
 from cathsim_dmc.tasks.scene import Scene
+from cathsim_dmc.tasks.snapshot import Snapshot
 from cathsim_dmc.tasks.step import Step, info_types
 
 _ONLY = np.zeros(1, dtype=int)  # number of the one simulation
@@ -209,9 +210,24 @@ class Navigation(composer.Task):
         """Draws what differs between episodes and puts the device to its start."""
         self._step = None
         self._rollout.begin(_ONLY, [random_state])
+        self._show_goal(physics)
+
+    def _show_goal(self, physics):
+        """Puts the marker to a shifted goal; it only looks."""
         goal = self._scene.phantom.goals.get(self._scene.goal.name)
-        if goal is not None and self._config.ranges.goal_shift:  # only looks
+        if goal is not None and self._config.ranges.goal_shift:
             physics.bind(goal).pos = self.goal_position
+
+    def snapshot(self) -> Snapshot:
+        """The state of the simulation; see `environment.Environment.snapshot`."""
+        self._current()
+        return self._rollout.snapshot(_ONLY)
+
+    def restore(self, physics, snapshot: Snapshot, random_state):
+        """Puts the simulation to a snapshot; see `environment.Environment.restore`."""
+        self._current()
+        self._step = self._rollout.restore(_ONLY, snapshot, [random_state])
+        self._show_goal(physics)
 
     def before_step(self, physics, action, random_state):
         """Applies the action and moves the robot along."""

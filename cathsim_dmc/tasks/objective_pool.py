@@ -99,6 +99,6 @@ class ObjectivePool(Shiftable):
 
 def part(measured: Any, rows: np.ndarray) -> Any:
     """Rows of all arrays of a named tuple, and of the tuples in it."""
-    if isinstance(measured, np.ndarray):
-        return measured[rows]
+    if measured is None or isinstance(measured, np.ndarray):
+        return measured if measured is None else measured[rows]
     return type(measured)._make(part(value, rows) for value in measured)

@@ -1,43 +1,32 @@
 """How far the heads have gone, and how much of it was detour."""
 
+from __future__ import annotations
+
+from typing import NamedTuple
+
 import numpy as np
 
 from cathsim_dmc.tasks.objectives import straight
 
 
-class PathTracker:
-    """Paths of the heads of N simulations in their episodes."""
+class Path(NamedTuple):
+    """Paths of the heads of N simulations in their episodes.
 
-    def __init__(self, num_simulations: int):
-        """Starts with all heads at rest."""
-        self._head = np.zeros((num_simulations, 3))
-        self._length = np.zeros(num_simulations)
-        self._shortest = np.ones(num_simulations)
+    Attributes:
+      head: (N, 3), m.
+      length: (N,), m, of the paths so far.
+      shortest: (N,), m, shortest ways from the starts to the goals.
+    """
 
-    def restart(
-        self, indices: np.ndarray, head: np.ndarray, shortest: np.ndarray
-    ) -> None:
-        """Begins episodes of some simulations.
+    head: np.ndarray
+    length: np.ndarray
+    shortest: np.ndarray
 
-        Args:
-          indices: (K,) numbers of the simulations.
-          head: (N, 3), heads of all simulations, m.
-          shortest: (N,), shortest ways from there to the goals, m.
-        """
-        # New arrays: those handed out before stay what they were.
-        self._head = self._head.copy()
-        self._head[indices] = head[indices]
-        self._length = self._length.copy()
-        self._length[indices] = 0.0
-        self._shortest = self._shortest.copy()
-        self._shortest[indices] = shortest[indices]
-
-    def add(self, head: np.ndarray) -> None:
-        """Adds the ways to the heads (N, 3), m."""
-        self._length = self._length + straight(self._head, head)
-        self._head = head
+    def to(self, head: np.ndarray) -> Path:
+        """The paths longer by the ways to heads (N, 3), m."""
+        return Path(head, self.length + straight(self.head, head), self.shortest)
 
     @property
     def ratio(self) -> np.ndarray:
         """(N,), length of each path over the shortest way from start to goal."""
-        return self._length / self._shortest
+        return self.length / self.shortest

@@ -2,22 +2,18 @@
 
 import contextlib
 import dataclasses
-import io
-import json
 import logging
 import os
 import tempfile
 import uuid
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import Any, cast
 
 import numpy as np
 
-from cathsim_dmc import bounds, files
 from cathsim_dmc.anatomy import Anatomy
-from cathsim_dmc.physics.randomisation import Episode
 from cathsim_dmc.tasks.scene import Scene
+from cathsim_dmc.tasks.snapshot import Snapshot
 
 DIVERGED = "diverged"
 ESCAPED = "escaped through the wall"
@@ -39,8 +35,8 @@ LONGEST_REPLAY = 10_000
 KEPT_DUMPS = 8
 FOLDER_VARIABLE = "CATHSIM_DUMP_DIR"
 
-_FORMAT = 2
-_LARGEST = 2_000_000_000  # bytes of a dump, unpacked
+# Arrays of a dump beside those of a snapshot.
+_ACTIONS, _REASON = "dump.actions", "dump.reason"
 _LOG = logging.getLogger(__name__)
 
 
@@ -77,17 +73,15 @@ class _Watched:
 
     Attributes:
       scene: Scene whose lumen the device must not leave.
-      episode: What was drawn; None before the first episode.
-      state: (nstate,), MuJoCo's mjSTATE_INTEGRATION at the start of the episode; None
-        before its first control step.
-      steps: Control steps of the episode.
+      start: The state before the first control step, None until then: a snapshot of
+        some simulations, and which of them.
+      steps: Control steps since then.
       actions: Bytes of the actions so far, float64; None once they replay nothing,
         since the episode is dumped or longer than `LONGEST_REPLAY`.
     """
 
     scene: Scene
-    episode: Episode | None = None
-    state: np.ndarray | None = None
+    start: tuple[Snapshot, int] | None = None
     steps: int = 0
     actions: bytearray | None = dataclasses.field(default_factory=bytearray)
 
@@ -95,37 +89,31 @@ class _Watched:
 class PhysicsMonitor:
     """Watches N simulations for errors of physics, and keeps what replays them."""
 
-    def __init__(self, scene: Scene, num_simulations: int, task: dict):
-        """Starts with no episode running.
-
-        Args:
-          scene: Scene of all simulations until an episode begins in another one.
-          num_simulations: N.
-          task: JSON-able description of the task for the dumps.
-        """
+    def __init__(self, scene: Scene, num_simulations: int):
+        """Starts with no episode running, all in one scene until one begins."""
         self._watched = [_Watched(scene) for _ in range(num_simulations)]
-        self._task = task
 
-    def restart(self, index: int, scene: Scene, episode: Episode) -> None:
+    def restart(self, index: int, scene: Scene) -> None:
         """Forgets the episode of a simulation; the next one is in a scene."""
-        self._watched[index] = _Watched(scene, episode)
+        self._watched[index] = _Watched(scene)
 
     def before_step(
-        self, read_states: Callable[[], np.ndarray], actions: np.ndarray
+        self, take: Callable[[np.ndarray], Snapshot], actions: np.ndarray
     ) -> None:
         """Keeps the start of each episode, and the actions.
 
         Args:
-          read_states: Reads the states (N, nstate), mjSTATE_INTEGRATION; called only
-            when an episode begins.
+          take: Takes a snapshot of some simulations, by their numbers.
           actions: (N, A) float64.
         """
         # Plain Python: numpy takes longer over the one simulation of an environment.
-        states, rows, size = None, actions.tobytes(), actions[0].nbytes
+        fresh = [i for i, watched in enumerate(self._watched) if watched.start is None]
+        if fresh:
+            snapshot = take(np.array(fresh))
+            for row, index in enumerate(fresh):
+                self._watched[index].start = snapshot, row
+        rows, size = actions.tobytes(), actions[0].nbytes
         for index, watched in enumerate(self._watched):
-            if not watched.steps:
-                states = read_states() if states is None else states
-                watched.state = states[index].copy()
             watched.steps += 1
             if watched.steps > LONGEST_REPLAY:
                 watched.actions = None
@@ -135,15 +123,17 @@ class PhysicsMonitor:
     def errors(
         self,
         diverged: Sequence[bool] | np.ndarray,
+        steps: np.ndarray,
         centreline: np.ndarray,
         peak_force: np.ndarray,
-    ) -> list[str | None]:
+    ) -> tuple[str | None, ...]:
         """What went wrong in the control step that has just ended; logs and dumps it.
 
         The first error of an episode is dumped; stepping on adds none.
 
         Args:
           diverged: (N,), MuJoCo warned.
+          steps: (N,), control steps of the episodes.
           centreline: (N, n, 3), nodes of the devices, m.
           peak_force: (N,), largest single contact force within the step, N.
 
@@ -151,9 +141,7 @@ class PhysicsMonitor:
           A reason for each simulation, None where nothing did.
         """
         looked = [
-            index
-            for index, watched in enumerate(self._watched)
-            if not watched.steps % ESCAPE_INTERVAL
+            i for i, taken in enumerate(steps.tolist()) if not taken % ESCAPE_INTERVAL
         ]
         wrong = [
             warned or not force <= MAX_FORCE
@@ -161,7 +149,7 @@ class PhysicsMonitor:
         ]
         reasons: list[str | None] = [None] * len(self._watched)
         if not looked and not any(wrong):
-            return reasons
+            return tuple(reasons)
         out = np.zeros(len(reasons), dtype=bool)
         if looked:
             out[looked] = self._escaped(looked, centreline)
@@ -169,23 +157,21 @@ class PhysicsMonitor:
             reason = ESCAPED if out[index] and not wrong[index] else EXPLODED
             reasons[index] = reason = DIVERGED if diverged[index] else reason
             self._dump(reason, self._watched[index])
-        return reasons
+        return tuple(reasons)
 
     def _dump(self, reason: str, watched: _Watched):
         """Dumps an episode once, if it is not too long to replay."""
-        if watched.actions is None:
+        if watched.actions is None or watched.start is None:
             if watched.steps > LONGEST_REPLAY:
                 _LOG.error("%s after more steps than a dump holds", reason)
             return
         actions, watched.actions = watched.actions, None
+        snapshot, row = watched.start
         try:
             dump(
                 reason,
-                task={"anatomy": watched.scene.anatomy.name, **self._task},
-                # Kept before the step that went wrong.
-                episode=cast(Episode, watched.episode),
-                state=cast(np.ndarray, watched.state),
-                actions=np.frombuffer(actions).reshape(watched.steps, -1),
+                snapshot[row : row + 1],
+                np.frombuffer(actions).reshape(watched.steps, -1),
             )
         except OSError as error:
             # A full disk must not end the other simulations.
@@ -204,10 +190,7 @@ class PhysicsMonitor:
 
 def dump(
     reason: str,
-    *,
-    task: dict[str, Any],
-    episode: Episode,
-    state: np.ndarray,
+    start: Snapshot,
     actions: np.ndarray,
     directory: str | Path | None = None,
 ) -> Path:
@@ -215,9 +198,7 @@ def dump(
 
     Args:
       reason: what went wrong.
-      task: JSON-able description of the task.
-      episode: What was drawn for it.
-      state: (nstate,), MuJoCo's mjSTATE_INTEGRATION at the start of the episode.
+      start: Snapshot of one simulation at the start of the episode.
       actions: (T, A) up to and with the one that failed.
       directory: folder for the last `KEPT_DUMPS` dumps; None for that which the
         environment variable `CATHSIM_DUMP_DIR` names, or `cathsim-errors` in the
@@ -229,13 +210,9 @@ def dump(
     temporary = Path(tempfile.gettempdir(), "cathsim-errors")
     directory = Path(directory or os.environ.get(FOLDER_VARIABLE) or temporary)
     directory.mkdir(parents=True, exist_ok=True)
-    meta = json.dumps(
-        {"format": _FORMAT, "reason": reason, "task": task, "drawn": episode.motion}
-    )
     path = directory / f"cathsim-error-{uuid.uuid4().hex[:12]}.npz"
-    buffer = io.BytesIO()
-    np.savez(buffer, meta=np.array(meta), state=state, actions=actions)
-    files.write_bytes(path, buffer.getvalue())
+    more = {_ACTIONS: actions[None], _REASON: np.array([reason])}
+    Snapshot(start.task, {**start.arrays, **more}).save(path)
     others = [one for one in directory.glob("cathsim-error-*.npz") if one != path]
     with contextlib.suppress(OSError):  # another process removes them too
         others.sort(key=lambda one: one.stat().st_mtime_ns)
@@ -246,7 +223,7 @@ def dump(
         "cathsim_dmc.tasks.physics_errors.load(%r)",
         reason,
         len(actions),
-        task.get("goal", "an episode"),
+        start.task.get("goal", "an episode"),
         str(path),
     )
     return path
@@ -268,38 +245,17 @@ def dumps_in(directory: Path) -> Iterator[None]:
         del os.environ[FOLDER_VARIABLE]
 
 
-def load(path: str | Path) -> tuple[dict[str, Any], np.ndarray, np.ndarray]:
-    """Reads a dump: description, start state (nstate,) and actions (T, A).
+def load(path: str | Path) -> tuple[str, Snapshot, np.ndarray]:
+    """Reads a dump: the reason, the start of the episode and actions (T, A).
 
-    What was drawn for the episode is `drawn` in the description:
-    `Rollout.take(0, Episode.from_motion(meta["drawn"]))` gives it to a task that was
-    made with the same options.
+    `environment.restore(start)` puts an environment of the same task there.
 
     Raises:
-      ValueError: if the file is no dump of this format.
+      ValueError: if the file is no dump.
     """
-    try:
-        held = files.read_arrays(Path(path), _LARGEST, ("meta", "state", "actions"))
-        meta = json.loads(str(held["meta"]))
-        state = bounds.array("state", held["state"])
-        actions = bounds.array("actions", held["actions"])
-        if (state.ndim, actions.ndim) != (1, 2):
-            raise ValueError(f"state is {state.shape}, actions are {actions.shape}")
-    except (ValueError, RecursionError) as error:
-        raise ValueError(f"{path} is no dump of an episode: {error}") from error
-    if not isinstance(meta, dict) or repr(meta.get("format")) != repr(_FORMAT):
-        raise ValueError(
-            f"{path} is no dump of an episode of format {_FORMAT}, which this version "
-            "reads"
-        )
-    for name, kind in (("reason", str), ("task", dict), ("drawn", dict)):
-        if not isinstance(meta.get(name), kind):
-            raise ValueError(
-                f"{path} is no dump of an episode: {name} is "
-                f"{bounds.shown(meta.get(name))}; it must be a {kind.__name__}"
-            )
-    try:
-        Episode.from_motion(meta["drawn"])
-    except ValueError as error:
-        raise ValueError(f"{path} is no dump of an episode: {error}") from error
-    return meta, state, actions
+    held = Snapshot.load(path)
+    arrays = dict(held.arrays)
+    if _ACTIONS not in arrays or _REASON not in arrays:
+        raise ValueError(f"{path} is a snapshot, but no dump of an episode")
+    actions, reason = arrays.pop(_ACTIONS)[0], str(arrays.pop(_REASON)[0])
+    return reason, Snapshot(held.task, arrays), actions

@@ -16,7 +16,6 @@ from cathsim_dmc.imaging.device import Shadow
 from cathsim_dmc.imaging.fluoroscopy import Fluoroscope
 from cathsim_dmc.physics import forces, readings
 from cathsim_dmc.physics.effects import Effects, World
-from cathsim_dmc.physics.randomisation import Episode
 from cathsim_dmc.physics.sliding import CoaxialReadings, SingleDevice
 from cathsim_dmc.physics.stepper import Stepper
 from cathsim_dmc.tasks import observations
@@ -24,7 +23,8 @@ from cathsim_dmc.tasks.cases import Case, model_index
 from cathsim_dmc.tasks.config import NavigationConfig
 from cathsim_dmc.tasks.frame import NO_IMAGES, Frame
 from cathsim_dmc.tasks.image_sensors import ImageSensors, open_cameras
-from cathsim_dmc.tasks.objective_pool import together
+from cathsim_dmc.tasks.measured import Measured
+from cathsim_dmc.tasks.objective_pool import part, together
 from cathsim_dmc.tasks.objectives import (
     Measurement,
     Objective,
@@ -33,10 +33,23 @@ from cathsim_dmc.tasks.objectives import (
     straight,
 )
 from cathsim_dmc.tasks.observation_kind import Observation
-from cathsim_dmc.tasks.path_tracker import PathTracker
+from cathsim_dmc.tasks.path_tracker import Path
 from cathsim_dmc.tasks.physics_errors import PhysicsMonitor
 from cathsim_dmc.tasks.route import Routes
+from cathsim_dmc.tasks.snapshot import (
+    Snapshot,
+    describe,
+    merged,
+    named,
+    random_arrays,
+    set_random,
+)
 from cathsim_dmc.tasks.step import Step
+
+# Reasons of errors, empty for none.
+_REASON = "U64"
+# Arrays (N, ...) of a rollout that a snapshot keeps as they are.
+_KEPT = ("case_of", "goal_shift", "steps", "action", "previous_action", "errors")
 
 
 class Rollout:
@@ -94,21 +107,19 @@ class Rollout:
             num_simulations,
             open_cameras(self._names, model, config.camera_options, catheter),
         )
-        self._monitor = PhysicsMonitor(
-            scene,
-            num_simulations,
-            {"goal": scene.goal.name, "config": repr(config)},
-        )
-        self._path = PathTracker(num_simulations)
+        self._monitor = PhysicsMonitor(scene, num_simulations)
+        self._description = describe([case.scene for case in cases], listed)
+        still = np.zeros((num_simulations, 3))
+        self._path = Path(still, still[:, 0], np.ones(num_simulations))
         # None before the first episode.
         self._random_states: list[np.random.RandomState] | None = None
         self._goal_shift = np.zeros(num_simulations)
         self._steps = np.zeros(num_simulations, dtype=int)
         self._action = np.zeros((num_simulations, num_actions))
         self._previous_action = self._action
+        self._errors = np.zeros(num_simulations, dtype=_REASON)
         # There from the first measurement on.
-        self._readings: readings.Readings
-        self._wall_force: forces.WallForce
+        self._measured: Measured
 
     # The course of an episode.
 
@@ -128,6 +139,15 @@ class Rollout:
         for index in indices:
             self._draw(index, random_states[index])
         self._pose_robot()
+        self._choose_objective()
+        self._steps[indices] = 0
+        # New arrays: those handed out before stay what they were.
+        self._action = self._action.copy()
+        self._action[indices] = 0.0
+        self._previous_action = self._action
+
+    def _choose_objective(self) -> None:
+        """Takes the objective of each simulation's anatomy, with its goal."""
         self._objective = together(
             [case.objective for case in self._cases], self._case_of
         )
@@ -135,11 +155,6 @@ class Rollout:
             # Navigation has made sure that it can be shifted.
             shiftable = cast(Shiftable, self._objective)
             self._objective = shiftable.shifted(self._goal_shift)
-        self._steps[indices] = 0
-        # New arrays: those handed out before stay what they were.
-        self._action = self._action.copy()
-        self._action[indices] = 0.0
-        self._previous_action = self._action
 
     def _draw(self, index: int, random_state: np.random.RandomState) -> None:
         """Draws the episode of one simulation and puts its device to the start."""
@@ -152,21 +167,8 @@ class Rollout:
         number = case.start.draw(random_state)
         qpos = self._state.qpos[index]
         case.start.write(qpos, displacement, episode.roll, number)
-        self.take(index, episode, random_state)
-
-    def take(
-        self, index: int, episode: Episode, random_state: np.random.RandomState
-    ) -> None:
-        """Takes what was drawn for one simulation, whose device is at its start.
-
-        Args:
-          index: Number of the simulation.
-          episode: What was drawn; its displacement is in the state already.
-          random_state: Source of what the effects draw.
-        """
-        case = self.case(index)
         self._effects.restart(index, episode, random_state)
-        self._monitor.restart(index, case.scene, episode)
+        self._monitor.restart(index, case.scene)
         self._sensors.restart(index, case.angiograph, episode.deviation)
         self._goal_shift[index] = episode.goal_shift or 0.0
 
@@ -180,10 +182,10 @@ class Rollout:
         Args:
           action: (N, A) float64 as `actions.check_action` returns it.
         """
+        self._monitor.before_step(self.snapshot, action)
         self._previous_action, self._action = self._action, action
         self._pose_robot()
-        self._monitor.before_step(self._stepper.states, action)
-        self._stepper.begin(self._effects.act(action, self._readings))
+        self._stepper.begin(self._effects.act(action, self.readings))
 
     def start(self, indices: np.ndarray) -> Step:
         """First measurement of new episodes, after the forward pass.
@@ -194,58 +196,63 @@ class Rollout:
         Returns:
           All simulations as they stand; no episode ends at its start.
         """
-        self._measure(self._stepper.still(indices))
-        head = self._readings.head
-        self._path.restart(indices, head, self._objective.path_distance(head))
-        going_on = np.zeros(len(head), dtype=bool)
-        return self._step([None] * len(head), indices, going_on)
+        self._measure(self._stepper.still(indices), indices)
+        head = self.readings.head
+        shortest = self._objective.path_distance(head)
+        begun = Path(head, np.zeros(len(head)), shortest)
+        self._path = merged(self._path, part(begun, indices), indices)
+        self._errors = np.zeros(len(head), dtype=_REASON)
+        return self._step(indices, np.zeros(len(head), dtype=bool))
 
     def finish(self) -> Step:
         """Measures, judges and observes after the physics steps of a control step."""
         magnitudes, warned = self._stepper.end()
         self._steps += 1
         self._measure(magnitudes)
-        self._path.add(self._readings.head)
+        self._path = self._path.to(self.readings.head)
         errors = self._monitor.errors(
-            warned, self._readings.centreline, self._wall_force.peak_max
+            warned, self._steps, self.readings.centreline, self.wall_force.peak_max
         )
-        return self._step(errors)
+        self._errors = np.array([error or "" for error in errors], dtype=_REASON)
+        return self._step()
 
-    def _measure(self, magnitudes: np.ndarray):
-        self._readings = self._views.read()
-        self._wall_force = forces.wall_force(magnitudes)
+    def _measure(self, magnitudes: np.ndarray, rows: np.ndarray | None = None) -> None:
+        """Measures all simulations, or some, when the others have not moved."""
+        now = self._views.read()
+        new = Measured(now, forces.wall_force(magnitudes), self._devices.read(now))
+        if rows is not None and hasattr(self, "_measured"):
+            new = self._measured.updated(new.rows(rows), rows)
+        self._measured = new
 
     def _step(
-        self,
-        errors: Sequence[str | None],
-        fresh: np.ndarray | None = None,
-        ended: np.ndarray | None = None,
+        self, fresh: np.ndarray | None = None, ended: np.ndarray | None = None
     ) -> Step:
         """Judges and observes what was measured.
 
         Args:
-          errors: N errors of physics, None where there is none.
           fresh: (K,) numbers of simulations that have just begun an episode: only
             their images are captured. None for all, one control step on.
           ended: (N,) bool, None for what the objective and the physics say.
         """
+        errors = tuple(error or None for error in self._errors.tolist())
         goal = self._objective.goal
-        distance = straight(self._readings.head, goal)
+        distance = straight(self.readings.head, goal)
         failed = None
         if errors.count(None) < len(errors):
             failed = np.array([error is not None for error in errors])
         outcome = judge(
             self._objective,
             Measurement(
-                self._readings,
-                self._wall_force,
+                self.readings,
+                self.wall_force,
                 self._action,
                 self._previous_action,
                 distance,
             ),
             failed,
         )
-        terminated = outcome.success.copy() if ended is None else ended
+        # A restored start is no end.
+        terminated = outcome.success & (self._steps > 0) if ended is None else ended
         if failed is not None:
             terminated = terminated | failed
         return Step(
@@ -253,9 +260,9 @@ class Rollout:
             outcome=outcome,
             terminated=terminated,
             truncated=~terminated & (self._steps >= self._config.max_steps),
-            errors=tuple(errors),
-            readings=self._readings,
-            wall_force=self._wall_force,
+            errors=errors,
+            readings=self.readings,
+            wall_force=self.wall_force,
             distance=distance,
             path_ratio=self._path.ratio,
         )
@@ -264,7 +271,7 @@ class Rollout:
         devices, images = self.devices, NO_IMAGES
         if self._sensors.on:
             images = self._sensors.capture(
-                self._readings.centreline,
+                self.readings.centreline,
                 self.shadows,
                 goal,
                 self._state.qpos,
@@ -272,13 +279,86 @@ class Rollout:
                 fresh,
                 None if devices is None else devices.points,
             )
-        state, ahead = self._readings, None
+        state, ahead = self.readings, None
         if self._routes is not None:
             ahead = self._routes.ahead(self._case_of, state.head, state.head_frame)
         frame = Frame(
-            state, self._wall_force, self._action, goal, images, ahead, devices
+            state, self.wall_force, self._action, goal, images, ahead, devices
         )
         return observations.observe(self._names, frame)
+
+    # Snapshots.
+
+    def snapshot(self, indices: np.ndarray) -> Snapshot:
+        """The state of some simulations (K,), between two control steps.
+
+        Raises:
+          RuntimeError: if no episode has begun.
+        """
+        if self._random_states is None:
+            raise RuntimeError(
+                "there is no episode to take a snapshot of; call reset()"
+            )
+        arrays = {
+            "state": self._stepper.states(),
+            **{name: getattr(self, f"_{name}") for name in _KEPT},
+            **named("path", self._path._asdict()),
+            **self._measured.arrays(),
+            **named("effects", self._effects.state),
+            **named("images", self._sensors.state),
+        }
+        arrays = {name: array[indices] for name, array in arrays.items()}
+        sources = random_arrays([self._random_states[index] for index in indices])
+        return Snapshot(self._description, {**arrays, **named("random", sources)})
+
+    def restore(
+        self,
+        indices: np.ndarray,
+        snapshot: Snapshot,
+        random_states: Sequence[np.random.RandomState],
+    ) -> Step:
+        """Puts some simulations (K,) to a snapshot of as many.
+
+        Args:
+          indices: Numbers of the simulations; an episode has begun in each.
+          snapshot: Of this task, perhaps of another process.
+          random_states: N sources of randomness, of which some are put back.
+
+        Returns:
+          All simulations as they stand.
+
+        Raises:
+          ValueError: if the snapshot is of another task.
+        """
+        self._random_states = list(random_states)
+        snapshot.require(self.snapshot(indices))
+        kept = snapshot.arrays
+        cases = kept["case_of"]
+        if cases.min() < 0 or cases.max() >= len(self._cases):
+            raise ValueError(f"the snapshot is of anatomies {cases.tolist()}")
+        set_random([random_states[i] for i in indices], snapshot.part("random"))
+        for name in _KEPT:
+            array = getattr(self, f"_{name}").copy()
+            array[indices] = kept[name]
+            setattr(self, f"_{name}", array)
+        for index in indices:
+            if len(self._cases) > 1:
+                self._stepper.load(index, self.case(index))
+            self._monitor.restart(index, self.case(index).scene)
+        self._stepper.set_states(indices, kept["state"])
+        for name, array in snapshot.part("effects").items():
+            self._effects.state[name][indices] = array
+        self._effects.refresh(indices)
+        # What MuJoCo derives is for pictures; the pass changes the state.
+        state = self._stepper.states()[indices]
+        self._stepper.forward_unactuated(indices)
+        self._stepper.set_states(indices, state)
+        self._choose_objective()
+        self._path = merged(self._path, Path(**snapshot.part("path")), indices)
+        self._measured = self._measured.restored(snapshot, indices)
+        machines = [self.case(index).angiograph for index in indices]
+        self._sensors.restore(indices, machines, snapshot.part("images"))
+        return self._step(np.empty(0, dtype=int))
 
     # What others may read.
 
@@ -304,22 +384,22 @@ class Rollout:
     @property
     def readings(self) -> readings.Readings:
         """State of the devices after the last step or reset."""
-        return self._readings
+        return self._measured.readings
 
     @property
     def shadows(self) -> Sequence[Shadow]:
         """The devices as X-rays meet them, with points (N, n, 3)."""
-        return self._devices.shadows(self._readings.centreline)
+        return self._devices.shadows(self.readings.centreline)
 
     @property
     def devices(self) -> CoaxialReadings | None:
         """State of coaxial devices after the last step or reset; None for one alone."""
-        return self._devices.read(self._readings)
+        return self._measured.devices
 
     @property
     def wall_force(self) -> forces.WallForce:
         """Force on the wall over the last step."""
-        return self._wall_force
+        return self._measured.wall_force
 
     @property
     def steps(self) -> np.ndarray:
