@@ -7,11 +7,14 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
+from cathsim_dmc import suite
 from cathsim_dmc.agents import compare, evaluate, progress
 from cathsim_dmc.agents.evaluation import paired_bootstrap
 from cathsim_dmc.agents.report import Report
+from cathsim_dmc.agents.report import evaluate as evaluated
 from cathsim_dmc.analysis.force_statistics import FIGURES
 from cathsim_dmc.analysis.intervals import success_interval
+from cathsim_dmc.simulation.batch import BatchSimulation
 
 SORTED = sorted(synthetic_env.SIZES)
 # Where "position" begins in the concatenated observation.
@@ -171,3 +174,22 @@ def test_what_takes_long_says_so_now_and_then(monkeypatch, capsys):
     shown(None, running)
     assert "expert: 1 steps" in (text := capsys.readouterr().err), text
     assert "2 of 3 episodes run" in text
+
+
+def test_an_evaluation_goes_on_from_a_snapshot(tmp_path):
+    task = suite.make_task("simple1_bca", max_steps=12)
+    simulation = BatchSimulation(task, 2, num_threads=1, seeds=5)
+    simulation.reset()
+    push = np.zeros((2, simulation.num_actions))
+    push[:, 20] = 1.0
+    for _ in range(4):
+        simulation.step(push)
+    path = simulation.snapshot().save(tmp_path / "state.npz")
+    report = evaluated("push", task="simple1_bca", task_kwargs={"max_steps": 12},
+                       num_threads=1, baseline=False, start=path)  # fmt: skip
+    step = [simulation.step(push) for _ in range(8)]
+    assert [one.length for one in report.policy.episodes] == [8, 8]
+    reward = sum(one.outcome.reward for one in step)
+    np.testing.assert_allclose(report.policy.values("reward"), reward, rtol=1e-6)
+    with pytest.raises(ValueError, match="batched"):
+        evaluated("push", task="simple1_bca", backend="composer", start=path)

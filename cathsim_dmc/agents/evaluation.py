@@ -23,6 +23,7 @@ from cathsim_dmc.analysis.intervals import success_interval
 from cathsim_dmc.policies import Policy, View
 from cathsim_dmc.simulation import environments
 from cathsim_dmc.simulation.episodes import play
+from cathsim_dmc.tasks.snapshot import Snapshot
 
 EnvFactory = Callable[..., EnvBase]
 # Called after every step with the environment and which episodes (n,) bool still run.
@@ -223,6 +224,7 @@ def evaluate(
     num_threads: int | None = None,
     out_dir: str | Path | None = None,
     observer: Observer | None = None,
+    start: Snapshot | None = None,
     make_env: EnvFactory = environments.make_env,
 ) -> EvaluationResult:
     """Play episodes with a policy, each with a seed of its own, all side by side.
@@ -251,13 +253,19 @@ def evaluate(
         out_dir: Directory for evaluation.json; None writes none.
         observer: Function that is called after every step, before any environment is
             reset.
+        start: State in the middle of as many episodes, which are played on from there
+            (batched); rewards, lengths and forces count from there. None for the
+            starts of the task.
         make_env: Function that makes the environment, as `environments.make_env`.
 
     Raises:
-        ValueError: no task is known, or episodes < 1.
+        ValueError: no task is known, episodes < 1, or `start` is of another task or of
+            another number of episodes.
         CheckpointError: there is no such checkpoint, or it is damaged.
     """
     check_numbers(episodes, seed, num_threads)
+    if start is not None and backend != "batched":
+        raise ValueError(f"backend is {backend!r}; a start needs 'batched'")
     player = load_policy(policy, seed)
     task = require_task(player, task)
     settings = _settings(player, observation, task_kwargs, backend)
@@ -271,7 +279,7 @@ def evaluate(
         task_kwargs=settings["task_kwargs"],
     )
     try:
-        outcomes = _first_episodes(env, player, observer)
+        outcomes = _first_episodes(env, player, observer, start)
     finally:
         env.close()
     result = EvaluationResult(task, name or player.name, seed, outcomes, settings)
@@ -333,8 +341,8 @@ class _Environments:
     seen: TensorDictBase
     view: View
 
-    def __init__(self, env: EnvBase):
-        self._env = env
+    def __init__(self, env: EnvBase, start: Snapshot | None):
+        self._env, self._start = env, start
 
     def reset(self, which: np.ndarray | None) -> TensorDictBase:
         """Begin episodes, in all environments or where one has ended."""
@@ -342,6 +350,9 @@ class _Environments:
             self.seen = self._env.maybe_reset(self.seen)
             return self.seen
         self.seen = self._env.reset()
+        if self._start is not None:
+            restored = self._env.base_env.restore(self._start)
+            self.seen.update(self._env.transform._reset(self.seen, restored))
         # Environments of composer are made by the first reset.
         self.view = view_of(self._env)
         return self.seen
@@ -356,10 +367,13 @@ class _Environments:
 
 @torch.no_grad()
 def _first_episodes(
-    env: EnvBase, policy: Policy, observer: Observer | None
+    env: EnvBase,
+    policy: Policy,
+    observer: Observer | None,
+    start: Snapshot | None = None,
 ) -> tuple[EpisodeOutcome, ...]:
     (count,) = env.batch_size
-    tracker, environments_ = EpisodeTracker(count), _Environments(env)
+    tracker, environments_ = EpisodeTracker(count), _Environments(env, start)
     outcomes: dict[int, EpisodeOutcome] = {}
 
     def begin(which: np.ndarray) -> None:

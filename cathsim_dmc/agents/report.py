@@ -21,6 +21,7 @@ from cathsim_dmc.policies import in_environment
 from cathsim_dmc.recording import recorder, rerun_log
 from cathsim_dmc.recording.episode import Episode
 from cathsim_dmc.recording.scene import body_geoms
+from cathsim_dmc.tasks.snapshot import Snapshot
 
 
 @dataclasses.dataclass(frozen=True)
@@ -144,6 +145,7 @@ def evaluate(
     num_threads: int | None = None,
     baseline: bool = True,
     out_dir: str | Path | None = None,
+    start: str | Path | None = None,
 ) -> Report:
     """Evaluates a policy; writes its files into a directory.
 
@@ -160,8 +162,12 @@ def evaluate(
         baseline: Whether to play the same seeds with the random policy too.
         out_dir: Directory for evaluation.json and, from the batched backend,
             heatmap.png; None writes none.
+        start: File of a `Snapshot`, one episode for each of its simulations, from there
+            on; None plays `episodes` from their starts.
     """
-    start = time.monotonic()
+    began = time.monotonic()
+    snapshot = None if start is None else Snapshot.load(start)
+    episodes = episodes if snapshot is None else len(snapshot)
     evaluation.check_numbers(episodes, seed, num_threads)
     player = policies.load_policy(policy, seed)
     _require_registered(evaluation.require_task(player, task))
@@ -181,6 +187,7 @@ def evaluate(
         seed=seed,
         backend=backend,
         num_threads=num_threads,
+        start=snapshot,
     )
     options = {**(player.task_kwargs or {}), **(task_kwargs or {})}
     result = play(player, task, task_kwargs=options, observer=observe)
@@ -193,7 +200,7 @@ def evaluate(
             observer=EvaluationProgress("random"),
         )
         comparison = evaluation.compare(result, other)
-    report = Report(result, other, comparison, time.monotonic() - start)
+    report = Report(result, other, comparison, time.monotonic() - began)
     if out_dir is not None:
         evaluation.write_evaluation(out_dir, report.to_dict())
         if backend == "batched":

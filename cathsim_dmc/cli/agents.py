@@ -58,6 +58,7 @@ def evaluate(
     anatomy: OwnAnatomy = NO_ANATOMY,
     backend: Literal["batched", "composer"] = "batched",
     threads: int | None = None,
+    start: Path | None = None,
     json: bool = False,
     *,
     options: NoOptions,
@@ -76,6 +77,8 @@ def evaluate(
         backend: Way of simulating: all episodes side by side, or dm_control's
             environments one after the other.
         threads: Number of threads of the simulation; one per core by default.
+        start: File of a snapshot (`snapshot().save`): one episode for each of its
+            simulations, from there on.
         json: Whether to print one JSON object and nothing else.
         options: Options of the task, over those that the policy was trained with.
     """
@@ -91,6 +94,7 @@ def evaluate(
         num_threads=threads,
         baseline=baseline,
         out_dir=out,
+        start=start,
     )
     if json:
         # No figure of a policy has a bar to keep.
