@@ -96,9 +96,10 @@ def test_the_field_of_a_tube_is_exact_at_its_ends(tube):
         field(places), [0.7e-3, 0.7e-3, 0.5e-3, 0.7e-3], atol=0.02e-3
     )
     # Behind the open end a device is free; the lumen it has left.
-    behind = np.array([(x, 0, -0.01e-3), (0, 0, -30e-3)])
+    behind = np.array([(x, 0, -0.01e-3), (0, 0, -20e-3)])
     assert (field(behind, free=True) == FREE).all()
-    np.testing.assert_allclose(field(behind), [-0.01e-3, -30e-3])
+    np.testing.assert_allclose(field(behind), [-0.01e-3, -20e-3])
+    assert field((0, 0, -80e-3), free=True) == FREE
     beyond = field([(0, 0, LENGTH + 2e-3), (RADIUS + 1e-3, 0, -1e-3)], free=True)
     assert (beyond < 0).all()
 
@@ -113,6 +114,22 @@ def test_a_hole_in_the_cap_of_the_inlet_is_all_that_lets_a_device_out(tube):
     )
     assert (capped.gradient(places[1:]) @ UP > 0.9).all()
     assert (field(places, free=True)[:2] > 0.9e-3).all()
+
+
+def test_a_vessel_that_passes_behind_the_inlet_keeps_its_wall():
+    """60 mm behind it, in the straight continuation of the lumen."""
+    turn = np.linspace(0.0, np.pi, 40)
+    arch = np.stack([30e-3 * (1 - np.cos(turn)), 0 * turn, 30e-3 * np.sin(turn)], -1)
+    down = np.linspace((60e-3, 0, -2e-3), (60e-3, 0, -59e-3), 40)
+    back = np.linspace((58e-3, 0, -60e-3), (-20e-3, 0, -60e-3), 60)
+    points = np.concatenate([arch, down, back])
+    tree = tree_of(Vessel("root", Centreline(points, np.full(len(points), RADIUS))))
+    field = Field.from_tree(tree, [End("root", np.zeros(3), -UP, RADIUS, True)])
+    wall = np.array(
+        [(0, 0, -60e-3 + RADIUS - 0.5e-3), (0, 0, -60e-3 + RADIUS + 0.5e-3)]
+    )
+    np.testing.assert_allclose(field(wall, free=True), [0.5e-3, -0.5e-3], atol=0.02e-3)
+    assert field((0, 0, -20e-3), free=True) == FREE
 
 
 def test_the_gradient_points_away_from_the_wall(tube):

@@ -232,7 +232,7 @@ class SurfaceDepth:
             level = offset @ end.direction
             across = np.linalg.norm(offset - level[:, None] * end.direction, axis=1)
             beyond = (level > -_CAP) & (across < 2.0 * end.radius)
-            beyond &= level < 4.0 * MARGIN
+            beyond &= level < 5.0 * MARGIN
             moved[beyond] -= (level[beyond] + 2.0 * _CAP)[:, None] * end.direction
             doubtful |= beyond
         winding = self._winding.winding_number(moved[doubtful], 2.0)

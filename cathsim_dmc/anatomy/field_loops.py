@@ -11,6 +11,9 @@ ORIGIN, EDGE, SHAPE, QUANTUM, ENDS = 0, 3, 4, 7, 8
 # Numbers of an open end: position, outward direction, radii of lumen and of its hole.
 END, FIRST_END = 8, 9
 FREE = 1.0  # m, depth of what lies behind an open end
+# As far behind an open end a device is free, m: two bricks more than the lattices there
+# belong to it. Farther off another vessel may pass.
+_NEAR = 28e-3
 # Past the plane of an open end, no wall is so thick, m.
 _THICK = 5e-3
 
@@ -22,7 +25,7 @@ def behind(head, x, y, z):
         at = FIRST_END + END * number
         dx, dy, dz = x - head[at], y - head[at + 1], z - head[at + 2]
         level = dx * head[at + 3] + dy * head[at + 4] + dz * head[at + 5]
-        if level > 0.0:
+        if 0.0 < level < _NEAR:
             across = dx * dx + dy * dy + dz * dz - level * level
             if across < min(head[at + 6], head[at + 7]) ** 2:
                 return level

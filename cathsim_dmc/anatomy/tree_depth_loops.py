@@ -10,6 +10,8 @@ from cathsim_dmc.compiled import compiled
 
 # A place on a wall that lies no further than this inside another vessel is wall, m.
 _TOUCHING = 5e-6
+# As far behind an open end, m, its lumen goes on; another vessel may pass farther off.
+_BEHIND = 20e-3
 
 
 @compiled
@@ -106,7 +108,7 @@ def signed(nodes, first, last, flats, chosen, count, x, y, z, out):
             if abs(place - k - u) > 0.01:
                 continue  # beside another part of a vessel that turns back
             # Beyond an open end the lumen goes on as a straight tube.
-            inside = flats[end] == 0
+            inside = flats[end] == 0 and level < _BEHIND
         if flats[end] == 1 and abs(level) < distance:
             distance = abs(level)
             node = nodes[first] if end == 0 else nodes[last]
