@@ -21,7 +21,7 @@ def task_of(env_id: str) -> str:
     """Name of the task of an id.
 
     Raises:
-      ValueError: if it is none of `IDS`.
+        ValueError: if it is none of `IDS`.
     """
     if env_id not in IDS:
         raise ValueError(f"no environment {env_id!r}; there are {', '.join(IDS)}")

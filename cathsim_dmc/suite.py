@@ -52,16 +52,17 @@ class TaskDefinition:
     """A registered task: its anatomy, goal, objective and options.
 
     Attributes:
-      description: one line.
-      anatomy: anatomy or its name; None where the user chooses.
-      goal: name of a goal; None where the user chooses.
-      access: where the device enters, see `anatomy.phantoms.load`.
-      objective: function of an anatomy, a goal and keyword options, which become
-        options of the task. An option `farthest_shift` receives the largest shift of
-        the goal by randomisation, m.
-      options: fields of `NavigationConfig` that differ from their defaults.
-      random_arch: whether each episode draws a random arch, from those that the
-        task's options `arches`, `pool` and `first` name; there is no `anatomy` then.
+        description: one line.
+        anatomy: anatomy or its name; None where the user chooses.
+        goal: name of a goal; None where the user chooses.
+        access: where the device enters, see `anatomy.phantoms.load`.
+        objective: function of an anatomy, a goal and keyword options, which become
+            options of the task. An option `farthest_shift` receives the largest shift
+            of the goal by randomisation, m.
+        options: fields of `NavigationConfig` that differ from their defaults.
+        random_arch: whether each episode draws a random arch, from those that the
+            task's options `arches`, `pool` and `first` name; there is no `anatomy`
+            then.
     """
 
     description: str
@@ -94,12 +95,12 @@ def register(name: str, definition: TaskDefinition, *tags: str) -> None:
     """Adds a task to the suite.
 
     Args:
-      name: Name of the task.
-      definition: What the task is made of.
-      *tags: Tags of dm_control's suite, such as "easy".
+        name: Name of the task.
+        definition: What the task is made of.
+        *tags: Tags of dm_control's suite, such as "easy".
 
     Raises:
-      ValueError: if the name is taken.
+        ValueError: if the name is taken.
     """
     if name in TASKS:
         raise ValueError(f"there is a task {name!r} already; choose another name")
@@ -120,14 +121,15 @@ def make_task(
     """A task of the suite, without compiling an environment.
 
     Args:
-      name: Name of a task in `SUITE`.
-      random: Seed or source of randomness.
-      **options: Fields of `NavigationConfig`, options of the task's objective (such
-        as `reward` and `goal_radius`); for `navigate`, `anatomy`, `goal` and
-        `access`; for random arches, `arches`, `pool` and `first`, see `load_arches`.
+        name: Name of a task in `SUITE`.
+        random: Seed or source of randomness.
+        **options: Fields of `NavigationConfig`, options of the task's objective (such
+            as `reward` and `goal_radius`); for `navigate`, `anatomy`, `goal` and
+            `access`; for random arches, `arches`, `pool` and `first`, see
+            `load_arches`.
 
     Raises:
-      ValueError: if the task or an option does not exist; lists those that do.
+        ValueError: if the task or an option does not exist; lists those that do.
     """
     if name not in TASKS:
         raise ValueError(
@@ -210,14 +212,14 @@ def load(
     """Returns an environment, as `dm_control.suite.load` does.
 
     Args:
-      domain_name: "cathsim", or any other domain of dm_control.suite.
-      task_name: Name of a task of the domain, see `SUITE`.
-      task_kwargs: Options of the task: `random` (a seed), and see `make_task`.
-      environment_kwargs: Arguments of `composer.Environment`.
-      visualize_reward: Has no effect.
+        domain_name: "cathsim", or any other domain of dm_control.suite.
+        task_name: Name of a task of the domain, see `SUITE`.
+        task_kwargs: Options of the task: `random` (a seed), and see `make_task`.
+        environment_kwargs: Arguments of `composer.Environment`.
+        visualize_reward: Has no effect.
 
     Raises:
-      ValueError: if domain, task or an option does not exist; lists those that do.
+        ValueError: if domain, task or an option does not exist; lists those that do.
     """
     if domain_name == DOMAIN and task_name not in SUITE:
         raise ValueError(
@@ -244,11 +246,11 @@ def environment(task: Navigation, **environment_kwargs: Any) -> composer.Environ
     effect.
 
     Args:
-      task: Task that no other environment owns.
-      **environment_kwargs: Arguments of `composer.Environment`.
+        task: Task that no other environment owns.
+        **environment_kwargs: Arguments of `composer.Environment`.
 
     Raises:
-      ValueError: if there is no such argument, or its value is not allowed.
+        ValueError: if there is no such argument, or its value is not allowed.
     """
     settings = {
         "strip_singleton_obs_buffer_dim": True,

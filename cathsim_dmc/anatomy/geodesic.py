@@ -32,14 +32,14 @@ class LumenDistance:
         """Computes the distances to a target; takes 0.4 to 0.8 s.
 
         Args:
-          depth: Signed depth (n,) of points (n, 3) in the lumen, m, > 0 inside.
-          bounds: (2, 3), m, corners of a box that holds the lumen.
-          target: (3,), m, point in the lumen.
-          origin: (3,), m, another point in it, which must be connected to the target.
-          spacing: Edge of a cell, m; halved while target and origin are apart.
+            depth: Signed depth (n,) of points (n, 3) in the lumen, m, > 0 inside.
+            bounds: (2, 3), m, corners of a box that holds the lumen.
+            target: (3,), m, point in the lumen.
+            origin: (3,), m, another point in it, which must be connected to the target.
+            spacing: Edge of a cell, m; halved while target and origin are apart.
 
         Raises:
-          ValueError: if no way inside the lumen joins origin and target.
+            ValueError: if no way inside the lumen joins origin and target.
         """
         # Slow to import, and only a reward along the path needs it.
         from skimage import graph

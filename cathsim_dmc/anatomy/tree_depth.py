@@ -37,8 +37,8 @@ class TreeDepth:
         """Finds the creases.
 
         Args:
-          tree: vessels.
-          ends: flat ends of the tree; those that are not named are closed.
+            tree: vessels.
+            ends: flat ends of the tree; those that are not named are closed.
         """
         lines = [vessel.centreline for vessel in tree.vessels.values()]
         self._nodes = np.concatenate([_rings(line) for line in lines])

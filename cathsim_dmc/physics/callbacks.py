@@ -34,13 +34,13 @@ def install(function: Callable) -> int:
     """Has MuJoCo call a function in every physics step of the models with its mark.
 
     Args:
-      function: See `effects.Effect.forces`.
+        function: See `effects.Effect.forces`.
 
     Returns:
-      Its mark.
+        Its mark.
 
     Raises:
-      RuntimeError: if a Python function stands in `mjcb_control`.
+        RuntimeError: if a Python function stands in `mjcb_control`.
     """
     if not _marks:
         _append(_clear, 0)

@@ -61,9 +61,9 @@ class ChainFields:
         """Writes what the chain of one simulation is made of.
 
         Args:
-          arrays: live `FIELDS` of its model.
-          made: of some simulations.
-          row: which of them.
+            arrays: live `FIELDS` of its model.
+            made: of some simulations.
+            row: which of them.
         """
         self._write(
             row,
@@ -84,9 +84,9 @@ class Made(NamedTuple):
     """What chains are made of, arrays with the leading axis N.
 
     Attributes:
-      stiffness: (N, J), of the hinges, N·m/rad.
-      rest: (N, J, 2), angles of the free hinges about x and y, rad.
-      links: arrays (N, L).
+        stiffness: (N, J), of the hinges, N·m/rad.
+        rest: (N, J, 2), angles of the free hinges about x and y, rad.
+        links: arrays (N, L).
     """
 
     stiffness: np.ndarray
@@ -109,12 +109,12 @@ def made_of(
     turned. So the spring leads by what the damper takes.
 
     Args:
-      entity: of the devices.
-      overlap: of the devices.
-      turns: (N, K, J), rotation of each device at each joint, rad.
-      friction: (N,), Coulomb coefficient of an uncoated device on the wall.
-      factor: (N,), of all stiffnesses.
-      spin: (N, K, J), rate of that rotation, rad/s; 0 if None.
+        entity: of the devices.
+        overlap: of the devices.
+        turns: (N, K, J), rotation of each device at each joint, rad.
+        friction: (N,), Coulomb coefficient of an uncoated device on the wall.
+        factor: (N,), of all stiffnesses.
+        spin: (N, K, J), rate of that rotation, rad/s; 0 if None.
     """
     stack = entity.stack
     free = stack.rest_angles(overlap, turns, spin, BENDING_RELAXATION_TIME)
@@ -136,11 +136,11 @@ def write_still(
     """Writes into a model what the chain is made of while the devices stand still.
 
     Args:
-      entity: of the devices.
-      model: the compiled model.
-      gaps: (K,), way from the end of each device to that of the chain, m; those at the
-        start of an episode if None.
-      rotation: (K,), of each device, not twisted, rad; 0 if None.
+        entity: of the devices.
+        model: the compiled model.
+        gaps: (K,), way from the end of each device to that of the chain, m; those at
+            the start of an episode if None.
+        rotation: (K,), of each device, not twisted, rad; 0 if None.
     """
     gaps = entity.start_gaps if gaps is None else np.asarray(gaps, np.float64)
     turns = np.zeros((1, len(entity.devices), len(entity.stack.spans)))

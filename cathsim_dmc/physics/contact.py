@@ -44,11 +44,11 @@ class Bore:
         """Makes the bore.
 
         Args:
-          points: (n, 3) of its axis, m.
-          radii: (n,) or one for all, m.
+            points: (n, 3) of its axis, m.
+            radii: (n,) or one for all, m.
 
         Raises:
-          ValueError: if the line repeats a point, or a radius is not positive.
+            ValueError: if the line repeats a point, or a radius is not positive.
         """
         points = np.asarray(points, dtype=np.float64)
         if points.ndim != 2 or points.shape[1] != 3 or len(points) < 2:
@@ -137,10 +137,10 @@ def register(field: Field | Bore) -> tuple[float, ...]:
     """Makes a field known to this process's collisions, for as long as it lives.
 
     Args:
-      field: wall that touches from its inside.
+        field: wall that touches from its inside.
 
     Returns:
-      What the `geom_user` of its carrier is to hold.
+        What the `geom_user` of its carrier is to hold.
     """
     from cathsim_dmc.physics.contact_loops import BORE, LUMEN, MARK, PART
 
@@ -168,8 +168,8 @@ def check(model: mujoco.MjModel) -> None:
     """Refuses a model with carriers that cannot do what they are for.
 
     Raises:
-      ValueError: if a carrier's field is unknown, or something other than capsules and
-        spheres can touch it; names the geoms.
+        ValueError: if a carrier's field is unknown, or something other than capsules
+            and spheres can touch it; names the geoms.
     """
     from cathsim_dmc.physics.contact_loops import MARK, USER
 
@@ -208,14 +208,14 @@ def springs(
     |solref₀| r / ((1 - d) A), A the inverse weight of the link, `body_invweight0`.
 
     Args:
-      model: compiled, with the masses that count.
-      geoms: (n,) numbers of the geoms, each on a body of its own.
-      stiffness: N/m.
-      relaxation: s, within which a contact without load returns: damping over
-        stiffness.
+        model: compiled, with the masses that count.
+        geoms: (n,) numbers of the geoms, each on a body of its own.
+        stiffness: N/m.
+        relaxation: s, within which a contact without load returns: damping over
+            stiffness.
 
     Returns:
-      (n, 2), for an impedance of `IMPEDANCE`, see `solimp`.
+        (n, 2), for an impedance of `IMPEDANCE`, see `solimp`.
     """
     weight = model.body_invweight0[model.geom_bodyid[geoms], 0]
     scaled = stiffness * (1 - IMPEDANCE) * weight

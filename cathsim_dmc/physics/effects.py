@@ -32,17 +32,17 @@ class World:
     """N simulations, as an effect finds them.
 
     Attributes:
-      model: The compiled scene, as it is without effects.
-      chain: The entity of the device, or of several in each other.
-      index: Places of the task's quantities in the model.
-      start_depth: Way of the chain's end past the mouth of the sheath at zero
-        insertion, m.
-      arrays: The state, arrays (N, ...) with MuJoCo's names: those of
-        `ModelIndex.FIELDS` and of `Effect.data_fields`.
-      field: Gives a field of the model that one simulation has for itself, by its
-        number and MuJoCo's name, to be written.
-      parameters: (N, P) numbers of the effect's own, which the compiled function
-        reads; they are part of MuJoCo's state, and 0 when an episode begins.
+        model: The compiled scene, as it is without effects.
+        chain: The entity of the device, or of several in each other.
+        index: Places of the task's quantities in the model.
+        start_depth: Way of the chain's end past the mouth of the sheath at zero
+            insertion, m.
+        arrays: The state, arrays (N, ...) with MuJoCo's names: those of
+            `ModelIndex.FIELDS` and of `Effect.data_fields`.
+        field: Gives a field of the model that one simulation has for itself, by its
+            number and MuJoCo's name, to be written.
+        parameters: (N, P) numbers of the effect's own, which the compiled function
+            reads; they are part of MuJoCo's state, and 0 when an episode begins.
     """
 
     model: mujoco.MjModel
@@ -63,14 +63,14 @@ class Bodies(NamedTuple):
     """The bodies in a physics step, arrays of MuJoCo's, world frame, SI units.
 
     Attributes:
-      xipos: (nbody, 3), centres of mass.
-      ximat: (nbody, 9), orientations of the principal axes, row by row.
-      xmat: (nbody, 9), orientations of the bodies, row by row.
-      cvel: (nbody, 6), rotational and translational velocity about the centre of mass
-        of the kinematic tree.
-      subtree_com: (nbody, 3), that centre is the row of the tree's first body.
-      xfrc_applied: (nbody, 6), force and torque on the centres of mass, N and N·m,
-        zeroed before the effects of a physics step, to be added to.
+        xipos: (nbody, 3), centres of mass.
+        ximat: (nbody, 9), orientations of the principal axes, row by row.
+        xmat: (nbody, 9), orientations of the bodies, row by row.
+        cvel: (nbody, 6), rotational and translational velocity about the centre of mass
+            of the kinematic tree.
+        subtree_com: (nbody, 3), that centre is the row of the tree's first body.
+        xfrc_applied: (nbody, 6), force and torque on the centres of mass, N and N·m,
+            zeroed before the effects of a physics step, to be added to.
     """
 
     xipos: np.ndarray
@@ -85,12 +85,13 @@ class Effect:
     """Changes nothing; a subclass overrides what it needs.
 
     Attributes:
-      data_fields: Fields of `mujoco.MjData` that it reads, beside `ModelIndex.FIELDS`.
-      model_fields: Fields of `mujoco.MjModel` that it writes.
-      forces: Static method with parameters (P,), time in s and `Bodies`: plain loops
-        that add to `xfrc_applied`, which numba compiles and MuJoCo calls in every
-        physics step; None for none.
-      world: The simulations, there from `bind` on.
+        data_fields: Fields of `mujoco.MjData` that it reads, beside
+            `ModelIndex.FIELDS`.
+        model_fields: Fields of `mujoco.MjModel` that it writes.
+        forces: Static method with parameters (P,), time in s and `Bodies`: plain loops
+            that add to `xfrc_applied`, which numba compiles and MuJoCo calls in every
+            physics step; None for none.
+        world: The simulations, there from `bind` on.
     """
 
     data_fields: tuple[str, ...] = ()
@@ -113,20 +114,20 @@ class Effect:
         """Begins an episode of one simulation, whose device lies at its start.
 
         Args:
-          index: Number of the simulation.
-          episode: What the task has drawn for it.
-          random_state: Source of what the effect draws itself.
+            index: Number of the simulation.
+            episode: What the task has drawn for it.
+            random_state: Source of what the effect draws itself.
         """
 
     def act(self, action: np.ndarray, state: Readings) -> np.ndarray:
         """Acts once, before the physics steps of a control step.
 
         Args:
-          action: (N, A), of the agent or of the effect before this one.
-          state: Readings after the last control step.
+            action: (N, A), of the agent or of the effect before this one.
+            state: Readings after the last control step.
 
         Returns:
-          What the next effect gets, and after the last one the actuators.
+            What the next effect gets, and after the last one the actuators.
         """
         del state
         return action
@@ -157,11 +158,11 @@ class Effects:
         """Gives each effect its part of the world.
 
         Args:
-          effects: Of one rollout only.
-          world: Simulations; its parameters are all of `userdata`.
+            effects: Of one rollout only.
+            world: Simulations; its parameters are all of `userdata`.
 
         Raises:
-          ValueError: if the scene was built for other effects.
+            ValueError: if the scene was built for other effects.
         """
         self._effects, self._user = tuple(effects), world.parameters
         needed = room(effects, world.chain)

@@ -32,12 +32,12 @@ class Contacts:
     World frame, SI units, float64. Empty places hold zeros.
 
     Attributes:
-      present: (..., K) bool.
-      force: (..., K, 3), N, force of the device on the wall.
-      magnitude: (..., K), N, norm of normal and friction force together.
-      position: (..., K, 3), m.
-      penetration: (..., K), m, depth of the device in the wall; 0 where empty.
-      found: (...), number of contacts, which exceeds K if the sensor overflowed.
+        present: (..., K) bool.
+        force: (..., K, 3), N, force of the device on the wall.
+        magnitude: (..., K), N, norm of normal and friction force together.
+        position: (..., K, 3), m.
+        penetration: (..., K), m, depth of the device in the wall; 0 where empty.
+        found: (...), number of contacts, which exceeds K if the sensor overflowed.
     """
 
     present: np.ndarray
@@ -74,8 +74,8 @@ def magnitudes(row: np.ndarray) -> np.ndarray:
     """Contact force magnitudes in N from the sensor's row (..., K * 14).
 
     Returns:
-      (..., M) with M <= K, the most contacts of any row: the sensor fills its places
-      from the first, and most are empty.
+        (..., M) with M <= K, the most contacts of any row: the sensor fills its places
+        from the first, and most are empty.
     """
     slots = _slots(row)
     occupied = min(int(slots[..., 0, 0].max()), slots.shape[-2])
@@ -87,11 +87,11 @@ def too_coarse(magnitude: np.ndarray, rows: np.ndarray) -> np.ndarray:
     """Whether control steps need shorter physics steps.
 
     Args:
-      magnitude: (..., S, M), N, of the contacts in S physics steps.
-      rows: (..., S, K * 14) of the sensor, with K >= M.
+        magnitude: (..., S, M), N, of the contacts in S physics steps.
+        rows: (..., S, K * 14) of the sensor, with K >= M.
 
     Returns:
-      (...) bool: some contact is harder than `HARDEST` or deeper than `DEEPEST`.
+        (...) bool: some contact is harder than `HARDEST` or deeper than `DEEPEST`.
     """
     # Without `_slots`, which copies long rows that are not contiguous.
     distance = rows[..., 4 : magnitude.shape[-1] * CONTACT_SIZE : CONTACT_SIZE]
@@ -135,10 +135,10 @@ class WallForce(NamedTuple):
     """Force on the wall over one control step, N.
 
     Attributes:
-      sum: (...), sum of the magnitudes of all contacts, last substep.
-      max: (...), largest single contact, last substep.
-      peak_sum: (...), largest sum of any substep of the control step.
-      peak_max: (...), largest single contact of any substep.
+        sum: (...), sum of the magnitudes of all contacts, last substep.
+        max: (...), largest single contact, last substep.
+        peak_sum: (...), largest sum of any substep of the control step.
+        peak_max: (...), largest single contact of any substep.
     """
 
     sum: np.ndarray

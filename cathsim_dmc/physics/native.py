@@ -52,16 +52,16 @@ def offsets(struct: str, names: Sequence[str]) -> np.ndarray:
     """Bytes from the beginning of a struct to some of its fields, proved.
 
     Args:
-      struct: "mjModel" or "mjData".
-      names: Fields that are arrays behind a pointer, sizes, or numbers of 8 bytes;
-        "opt.timestep" is one of `mjOption`.
+        struct: "mjModel" or "mjData".
+        names: Fields that are arrays behind a pointer, sizes, or numbers of 8 bytes;
+            "opt.timestep" is one of `mjOption`.
 
     Returns:
-      (n,) int64.
+        (n,) int64.
 
     Raises:
-      RuntimeError: if a field of this MuJoCo does not lie where its own description
-        says, or has no proof.
+        RuntimeError: if a field of this MuJoCo does not lie where its own description
+            says, or has no proof.
     """
     model, data = _probe()
     owner = {"mjModel": model, "mjData": data}[struct]
@@ -231,8 +231,8 @@ def callback(signature: str, cache: bool = True) -> Callable:
     """Compiles a function that C calls, once on each machine as `compiled` does.
 
     Args:
-      signature: numba's, such as "void(int64, int64)"; a pointer is an int64.
-      cache: Whether it is kept on disk.
+        signature: numba's, such as "void(int64, int64)"; a pointer is an int64.
+        cache: Whether it is kept on disk.
     """
 
     def decorate(function: Callable):

@@ -56,16 +56,16 @@ class Randomisation:
     A range is `(low, high)` of a uniform distribution, or a composer Variation.
 
     Attributes:
-      friction: Coulomb coefficient of device on wall.
-      stiffness: factor of EI and GJ; damping and steering torques follow, so that
-        relaxation time and steering angles stay.
-      start_radius: of the ball in which the tip starts, m.
-      view: deviation of the C-arm's angles, degrees, rounded to whole ones.
-      gain: factor of the image's gain.
-      kerma: factor of the kerma, which sets the quantum noise if there is any.
-      goal_shift: of the goal along its branch, m, positive away from the ostium.
-      roll: of the device about its own axis, rad.
-      delay: least and longest delay of the action, whole control steps.
+        friction: Coulomb coefficient of device on wall.
+        stiffness: factor of EI and GJ; damping and steering torques follow, so that
+            relaxation time and steering angles stay.
+        start_radius: of the ball in which the tip starts, m.
+        view: deviation of the C-arm's angles, degrees, rounded to whole ones.
+        gain: factor of the image's gain.
+        kerma: factor of the kerma, which sets the quantum noise if there is any.
+        goal_shift: of the goal along its branch, m, positive away from the ostium.
+        roll: of the device about its own axis, rad.
+        delay: least and longest delay of the action, whole control steps.
     """
 
     friction: Range | None = None
@@ -182,13 +182,13 @@ class Episode:
     """What was drawn for an episode; None where the model's own value stands.
 
     Attributes:
-      displacement: (3,) of the tip at the start, frame of the inlet, m.
-      friction: Coulomb coefficient.
-      stiffness: factor.
-      deviation: of the angiography machine.
-      goal_shift: m along the branch.
-      roll: rad.
-      delay: control steps.
+        displacement: (3,) of the tip at the start, frame of the inlet, m.
+        friction: Coulomb coefficient.
+        stiffness: factor.
+        deviation: of the angiography machine.
+        goal_shift: m along the branch.
+        roll: rad.
+        delay: control steps.
     """
 
     displacement: np.ndarray

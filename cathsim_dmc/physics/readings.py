@@ -26,22 +26,22 @@ class Readings(NamedTuple):
     (some 4 ms) earlier. World frame, SI units, float64. J joints, L links.
 
     Attributes:
-      insertion: (...), slide of the base, m, 0 at the start of the stroke.
-      joint_positions: (..., J), in the order of the chain, m and rad.
-      joint_velocities: (..., J), m/s and rad/s.
-      com_inertia: (..., L, 10), inertia of each link about the subtree's centre of
-        mass (MuJoCo `cinert`), kg·m², kg·m and kg.
-      com_velocity: (..., L, 6), rotational and translational velocity of each link
-        about the subtree's centre of mass (`cvel`), rad/s and m/s.
-      actuator_force: (..., J), generalised force of the motors, N and N·m.
-      external_force: (..., L, 6), contact torque and force on each link about the
-        subtree's centre of mass (`cfrc_ext`), N·m and N.
-      centreline: (..., L + 1, 3), proximal ends of the links and the head, m.
-      head: (..., 3), distal end, m.
-      head_frame: (..., 3, 3), orientation of the last link, its axes in columns.
-      push_force: (...), N, positive when the base pushes the device forward.
-      push_torque: (...), N·m, torque of the base on the device about its axis.
-      load_cell: (..., 3), N, force of the phantom on its support.
+        insertion: (...), slide of the base, m, 0 at the start of the stroke.
+        joint_positions: (..., J), in the order of the chain, m and rad.
+        joint_velocities: (..., J), m/s and rad/s.
+        com_inertia: (..., L, 10), inertia of each link about the subtree's centre of
+            mass (MuJoCo `cinert`), kg·m², kg·m and kg.
+        com_velocity: (..., L, 6), rotational and translational velocity of each link
+            about the subtree's centre of mass (`cvel`), rad/s and m/s.
+        actuator_force: (..., J), generalised force of the motors, N and N·m.
+        external_force: (..., L, 6), contact torque and force on each link about the
+            subtree's centre of mass (`cfrc_ext`), N·m and N.
+        centreline: (..., L + 1, 3), proximal ends of the links and the head, m.
+        head: (..., 3), distal end, m.
+        head_frame: (..., 3, 3), orientation of the last link, its axes in columns.
+        push_force: (...), N, positive when the base pushes the device forward.
+        push_torque: (...), N·m, torque of the base on the device about its axis.
+        load_cell: (..., 3), N, force of the phantom on its support.
     """
 
     insertion: np.ndarray
@@ -63,10 +63,10 @@ class Views(NamedTuple):
     """Where the readings lie in a simulator's arrays, which change under them.
 
     Attributes:
-      links: (..., L, 3), proximal ends of the links.
-      tip: (..., 1, 3), the head, in line with the links.
-      rotation: (..., 9), orientation of the last link, row by row.
-      load_cell: (..., 3), force of the support on the phantom.
+        links: (..., L, 3), proximal ends of the links.
+        tip: (..., 1, 3), the head, in line with the links.
+        rotation: (..., 9), orientation of the last link, row by row.
+        load_cell: (..., 3), force of the support on the phantom.
 
     The others are those of `Readings`.
     """
@@ -126,12 +126,12 @@ class ModelIndex:
         """Finds the elements of the entities.
 
         Args:
-          model: the compiled model.
-          chain: entity of the devices.
-          robot: entity of the follower robot.
+            model: the compiled model.
+            chain: entity of the devices.
+            robot: entity of the follower robot.
 
         Raises:
-          ValueError: if the model lacks one of the elements.
+            ValueError: if the model lacks one of the elements.
         """
         joints = ids(model, chain.joints)
         self.links = _as_slice(ids(model, chain.links))
@@ -162,10 +162,10 @@ class ModelIndex:
         """Finds the readings in a simulator's arrays.
 
         Args:
-          data: an `mujoco.MjData` or a `mujoco.batch.Batch` with `FIELDS` bound.
+            data: an `mujoco.MjData` or a `mujoco.batch.Batch` with `FIELDS` bound.
 
         Returns:
-          Views, not copied; they stay valid as long as `data` lives.
+            Views, not copied; they stay valid as long as `data` lives.
         """
         qpos, sensors = data.qpos, data.sensordata
         head = data.site_xpos[..., self.head_site, :]
@@ -205,7 +205,7 @@ def ids(model: mujoco.MjModel, elements: Sequence[Any]) -> np.ndarray:
     """Numbers (n,) of MJCF elements in a compiled model.
 
     Raises:
-      ValueError: if the model lacks one of them.
+        ValueError: if the model lacks one of them.
     """
     kinds = mujoco.mjtObj.__members__
     found = [

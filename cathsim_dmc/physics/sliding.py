@@ -34,18 +34,18 @@ class CoaxialReadings(NamedTuple):
     """State of K devices after a control step, arrays with the leading axis N.
 
     Attributes:
-      insertion: (N, K), way of the end of each device from where the chain's end is at
-        zero insertion, m; negative for one that has been withdrawn farther.
-      rotation: (N, K), of the rotary units, rad.
-      tip_rotation: (N, K), of the ends of the devices, rad.
-      twist: (N, K), torque of the rotary units on the devices at rest, N·m.
-      points: (N, K, P, 3), points of each device `DEVICE_PLACES` from its end, m, world
-        frame; the last one is its end.
-      leading_load: (N,), N, axial force in the device that reaches farthest where it
-        leaves the others, positive when it is pushed forward; for one device alone,
-        the push force.
-      lumen_friction: (N,), N, friction between the devices, that resists their sliding
-        in each other; 0 while they do not.
+        insertion: (N, K), way of the end of each device from where the chain's end is
+            at zero insertion, m; negative for one that has been withdrawn farther.
+        rotation: (N, K), of the rotary units, rad.
+        tip_rotation: (N, K), of the ends of the devices, rad.
+        twist: (N, K), torque of the rotary units on the devices at rest, N·m.
+        points: (N, K, P, 3), points of each device `DEVICE_PLACES` from its end, m,
+            world frame; the last one is its end.
+        leading_load: (N,), N, axial force in the device that reaches farthest where it
+            leaves the others, positive when it is pushed forward; for one device alone,
+            the push force.
+        lumen_friction: (N,), N, friction between the devices, that resists their
+            sliding in each other; 0 while they do not.
     """
 
     insertion: np.ndarray
@@ -77,7 +77,7 @@ class SingleDevice(Effect):
         """The devices as X-rays meet them, from the innermost outwards.
 
         Args:
-          line: (N, L + 1, 3), `Readings.centreline`.
+            line: (N, L + 1, 3), `Readings.centreline`.
         """
         return [Shadow(line, self._radius)]
 
@@ -184,11 +184,11 @@ class SlidingDevices(SingleDevice):
         others move as they are told. A device that leads is held up with the chain.
 
         Args:
-          action: (N, 2 K) in [-1, 1], translation and rotation of each device.
-          state: Readings after the last control step.
+            action: (N, 2 K) in [-1, 1], translation and rotation of each device.
+            state: Readings after the last control step.
 
         Returns:
-          Control (N, 1) of the chain's motor.
+            Control (N, 1) of the chain's motor.
         """
         reached = self._reached()
         step = MAX_PUSH_SPEED * CONTROL_TIMESTEP
@@ -222,7 +222,7 @@ class SlidingDevices(SingleDevice):
         """Turns the devices, against their shape in the vessel and friction.
 
         Returns:
-          Overlap, and rotations (N, K, J) at the joints.
+            Overlap, and rotations (N, K, J) at the joints.
         """
         stack, rods = self._stack, self._rods
         gaps = self._loops.gaps(np.ascontiguousarray(self._insertion))
@@ -301,7 +301,7 @@ class SlidingDevices(SingleDevice):
         """State of the devices.
 
         Args:
-          readings: of the same control step.
+            readings: of the same control step.
         """
         insertion = self.pushed()
         gaps = self._loops.gaps(insertion)
@@ -322,8 +322,8 @@ class SlidingDevices(SingleDevice):
         """Points (N, K, P, 3) of the chain at places (N, K, P), m, from its end.
 
         Args:
-          line: (N, L + 1, 3), `Readings.centreline`.
-          places: those beyond the base are the base.
+            line: (N, L + 1, 3), `Readings.centreline`.
+            places: those beyond the base are the base.
         """
         return self._loops.points(line, places, self._stack.nodes)
 
@@ -331,7 +331,7 @@ class SlidingDevices(SingleDevice):
         """The devices as X-rays meet them, from the innermost outwards.
 
         Args:
-          line: (N, L + 1, 3), `Readings.centreline`.
+            line: (N, L + 1, 3), `Readings.centreline`.
         """
         nodes = self._stack.nodes
         insertion = self.pushed()

@@ -35,12 +35,12 @@ class Stepper(abc.ABC):
     """Steps N simulations of one compiled scene.
 
     Attributes:
-      arrays: Views of the state, with MuJoCo's names and a leading axis N;
-        `readings.ModelIndex.FIELDS` says which are there. `qpos`, `ctrl` and
-        `userdata` are written.
-      warnings: (N, ...) int, how often MuJoCo has warned, a view.
-      num_simulations: N.
-      substeps: S, physics steps in a control step.
+        arrays: Views of the state, with MuJoCo's names and a leading axis N;
+            `readings.ModelIndex.FIELDS` says which are there. `qpos`, `ctrl` and
+            `userdata` are written.
+        warnings: (N, ...) int, how often MuJoCo has warned, a view.
+        num_simulations: N.
+        substeps: S, physics steps in a control step.
     """
 
     arrays: Any
@@ -105,8 +105,8 @@ class Stepper(abc.ABC):
         """Ends a control step, done again in shorter steps where it was too coarse.
 
         Returns:
-          Contact forces on the wall (N, S, M) in its physics steps, N, and whether
-          MuJoCo has warned in it, (N,) bool.
+            Contact forces on the wall (N, S, M) in its physics steps, N, and whether
+            MuJoCo has warned in it, (N,) bool.
         """
         warned, magnitudes = self._warned(), self._magnitudes()
         if magnitudes.size:

@@ -44,7 +44,7 @@ class _Keys:
     """Commands that are held, and single requests.
 
     Attributes:
-      requested: "restart" or "quit" since the last `restart`, or None.
+        requested: "restart" or "quit" since the last `restart`, or None.
     """
 
     help = ""
@@ -96,7 +96,7 @@ class CoaxialControls(_Keys):
         """Starts with nothing held.
 
         Args:
-          devices: number of coaxial devices.
+            devices: number of coaxial devices.
         """
         super().__init__()
         self._devices = devices
@@ -127,8 +127,8 @@ class Controls(_Keys):
         """Starts with nothing held and a straight tip.
 
         Args:
-          tip_joints: number of steerable joints of the device, two motors each.
-          rotation: whether the action has a rotation.
+            tip_joints: number of steerable joints of the device, two motors each.
+            rotation: whether the action has a rotation.
         """
         super().__init__()
         self._tip_joints = tip_joints
@@ -150,8 +150,8 @@ class Controls(_Keys):
         """Action of the next control step of a duration in seconds.
 
         Returns:
-          (A,) float64 that float32 holds exactly, so that a demonstration can be
-          repeated through interfaces of single precision.
+            (A,) float64 that float32 holds exactly, so that a demonstration can be
+            repeated through interfaces of single precision.
         """
         axes = self._axes(duration)
         self._bend += BEND_RATE * duration * np.array([axes["bend_x"], axes["bend_y"]])

@@ -35,15 +35,15 @@ class Session:
         """Loads the task and opens the window.
 
         Args:
-          task: of `suite.SUITE`.
-          mode: "fluoroscopy" is a plain window, "viewer" MuJoCo's.
-          seed: of the first episode; the others count up.
-          speed: of the simulation against the clock.
-          task_kwargs: options of the task.
-          policy: that plays while the operator watches; None for the operator.
+            task: of `suite.SUITE`.
+            mode: "fluoroscopy" is a plain window, "viewer" MuJoCo's.
+            seed: of the first episode; the others count up.
+            speed: of the simulation against the clock.
+            task_kwargs: options of the task.
+            policy: that plays while the operator watches; None for the operator.
 
         Raises:
-          ValueError: if an argument is wrong or no window can be opened.
+            ValueError: if an argument is wrong or no window can be opened.
         """
         if mode not in MODES:
             raise ValueError(f"mode is {mode!r}; give one of {', '.join(MODES)}")
@@ -66,11 +66,11 @@ class Session:
         """Plays until the operator quits, or for a number of episodes.
 
         Args:
-          out: directory for the records, made if it is not there; None for none.
-          episodes: None for no limit.
+            out: directory for the records, made if it is not there; None for none.
+            episodes: None for no limit.
 
         Returns:
-          The files written, one for each episode of at least one step.
+            The files written, one for each episode of at least one step.
         """
         if out is not None:
             Path(out).mkdir(parents=True, exist_ok=True)
@@ -162,17 +162,17 @@ def play(
     """Plays a task by keyboard and records demonstrations.
 
     Args:
-      task: of `suite.SUITE`.
-      mode: "fluoroscopy", a plain window without OpenGL, or "viewer", MuJoCo's.
-      out: directory for the episodes (npz), None for none.
-      seed: of the first episode; the others count up.
-      episodes: to play, None until the operator quits.
-      speed: of the simulation against the clock.
-      task_kwargs: options of the task.
-      policy: that plays while the operator watches; None for the operator.
+        task: of `suite.SUITE`.
+        mode: "fluoroscopy", a plain window without OpenGL, or "viewer", MuJoCo's.
+        out: directory for the episodes (npz), None for none.
+        seed: of the first episode; the others count up.
+        episodes: to play, None until the operator quits.
+        speed: of the simulation against the clock.
+        task_kwargs: options of the task.
+        policy: that plays while the operator watches; None for the operator.
 
     Returns:
-      The files written.
+        The files written.
     """
     session = Session(
         task, mode, seed=seed, speed=speed, task_kwargs=task_kwargs, policy=policy

@@ -59,7 +59,7 @@ class MujocoViewer:
         """Opens the window on a simulation.
 
         Raises:
-          ValueError: if there is no OpenGL or no display.
+            ValueError: if there is no OpenGL or no display.
         """
         model, data = physics.model.ptr, physics.data.ptr
         if self._model is model:

@@ -41,12 +41,12 @@ class FluoroscopyWindow:
         """Opens the window.
 
         Args:
-          task: a navigation task; its fluoroscopy options are used, with as many
-            pixels as the window has and with quantum noise.
-          controls: that the keys act on.
+            task: a navigation task; its fluoroscopy options are used, with as many
+                pixels as the window has and with quantum noise.
+            controls: that the keys act on.
 
         Raises:
-          ValueError: if there is no Tk or no display.
+            ValueError: if there is no Tk or no display.
         """
         try:
             import tkinter

@@ -35,16 +35,15 @@ def export(
     Every step is taken again from the episode's seed and compared with the record.
 
     Args:
-      episodes: of one task, with the same options, seeded and not empty.
-      path: directory of the dataset, which must not exist.
-      observation: names of observations; None for those of the record, or
-        "internal".
-      task_kwargs: further options of what is observed, such as `fluoroscopy`.
+        episodes: of one task, with the same options, seeded and not empty.
+        path: directory of the dataset, which must not exist.
+        observation: names of observations; None for those of the record, or "internal".
+        task_kwargs: further options of what is observed, such as `fluoroscopy`.
 
     Raises:
-      ValueError: if the episodes do not belong together or do not repeat.
-      FileExistsError: the directory exists.
-      ModuleNotFoundError: if minari is not installed.
+        ValueError: if the episodes do not belong together or do not repeat.
+        FileExistsError: the directory exists.
+        ModuleNotFoundError: if minari is not installed.
     """
     try:
         from cathsim_dmc.simulation.gymnasium import make
@@ -90,21 +89,22 @@ def write(
     MINARI_DATASETS_PATH is the directory around it.
 
     Args:
-      path: Directory of the dataset, which must not exist.
-      buffers: `minari.data_collector.EpisodeBuffer` of each episode.
-      env_spec: Spec of the Gymnasium environment, see `simulation.gymnasium.env_spec`.
-      observation_space: Its space of observations.
-      action_space: Its space of actions.
-      algorithm: What acted, for the metadata.
-      description: For the metadata.
+        path: Directory of the dataset, which must not exist.
+        buffers: `minari.data_collector.EpisodeBuffer` of each episode.
+        env_spec: Spec of the Gymnasium environment, see
+            `simulation.gymnasium.env_spec`.
+        observation_space: Its space of observations.
+        action_space: Its space of actions.
+        algorithm: What acted, for the metadata.
+        description: For the metadata.
 
     Returns:
-      The directory.
+        The directory.
 
     Raises:
-      FileExistsError: the directory exists.
-      FileNotFoundError: the directory around it does not.
-      ModuleNotFoundError: minari is not installed.
+        FileExistsError: the directory exists.
+        FileNotFoundError: the directory around it does not.
+        ModuleNotFoundError: minari is not installed.
     """
     path = Path(path)
     check_free(path)
@@ -179,7 +179,7 @@ def _repeat(environment, episode: Episode):
     """Takes every step of an episode again; returns it as Minari's buffer.
 
     Raises:
-      ValueError: if it goes another way.
+        ValueError: if it goes another way.
     """
     from minari.data_collector import EpisodeBuffer
 

@@ -71,13 +71,13 @@ class BatchSimulation:
         """Compiles the task's model and starts the threads.
 
         Args:
-          task: Task that no environment owns; the batch takes it over.
-          num_simulations: N.
-          num_threads: Number of worker threads, 0 for one per core.
-          seeds: Seeds of the simulations, or of the first, the others counting up.
+            task: Task that no environment owns; the batch takes it over.
+            num_simulations: N.
+            num_threads: Number of worker threads, 0 for one per core.
+            seeds: Seeds of the simulations, or of the first, the others counting up.
 
         Raises:
-          ValueError: if the task overrides what composer calls, or a number is wrong.
+            ValueError: if the task overrides what composer calls, or a number is wrong.
         """
         num_simulations = bounds.whole(
             "num_simulations", num_simulations, 1, bounds.MOST_SIMULATIONS
@@ -106,10 +106,10 @@ class BatchSimulation:
         """Gives each simulation its own source of randomness.
 
         Args:
-          seeds: Seeds of the simulations, or of the first, the others counting up.
+            seeds: Seeds of the simulations, or of the first, the others counting up.
 
         Raises:
-          ValueError: if a seed is none that `numpy.random.RandomState` takes.
+            ValueError: if a seed is none that `numpy.random.RandomState` takes.
         """
         seeds = bounds.seeds("seeds", seeds, self.num_simulations)
         self._random_states = [np.random.RandomState(seed) for seed in seeds]
@@ -118,14 +118,14 @@ class BatchSimulation:
         """Starts new episodes.
 
         Args:
-          indices: (K,) numbers of the simulations to reset, K > 0; None for all.
+            indices: (K,) numbers of the simulations to reset, K > 0; None for all.
 
         Returns:
-          All simulations as they stand.
+            All simulations as they stand.
 
         Raises:
-          ValueError: if the indices are no such numbers.
-          RuntimeError: if the process has forked.
+            ValueError: if the indices are no such numbers.
+            RuntimeError: if the process has forked.
         """
         self._refuse_fork()
         indices = bounds.indices("indices", indices, self.num_simulations)
@@ -139,12 +139,12 @@ class BatchSimulation:
         """Advances every simulation by one control step.
 
         Args:
-          action: (N, A) in [-1, 1]; what lies outside is clipped.
+            action: (N, A) in [-1, 1]; what lies outside is clipped.
 
         Raises:
-          ValueError: if the action has the wrong shape or is not finite, or the
-            objective's outcome is none.
-          RuntimeError: if a simulation has not been reset, or the process has forked.
+            ValueError: if the action has the wrong shape or is not finite, or the
+                objective's outcome is none.
+            RuntimeError: if a simulation has not been reset, or the process has forked.
         """
         self._refuse_fork()
         self._refuse_waiting(np.arange(self.num_simulations))
@@ -157,10 +157,10 @@ class BatchSimulation:
         """The state between two steps, from which episodes go on bit for bit.
 
         Args:
-          indices: Numbers of the simulations, all if None, in ascending order.
+            indices: Numbers of the simulations, all if None, in ascending order.
 
         Raises:
-          RuntimeError: if one of them has not been reset.
+            RuntimeError: if one of them has not been reset.
         """
         indices = bounds.indices("indices", indices, self.num_simulations)
         self._refuse_waiting(indices)
@@ -170,14 +170,14 @@ class BatchSimulation:
         """Puts simulations to a snapshot, in place of a reset.
 
         Args:
-          snapshot: Of as many simulations of the same task, batched or composer.
-          indices: Numbers of the simulations, all if None, in ascending order.
+            snapshot: Of as many simulations of the same task, batched or composer.
+            indices: Numbers of the simulations, all if None, in ascending order.
 
         Returns:
-          All simulations as they stand.
+            All simulations as they stand.
 
         Raises:
-          ValueError: if the snapshot is of another task, or of fewer simulations.
+            ValueError: if the snapshot is of another task, or of fewer simulations.
         """
         indices = bounds.indices("indices", indices, self.num_simulations)
         if not self._begun[indices].all():
@@ -318,9 +318,9 @@ class _PoolStepper(_BatchStepper):
         """Makes the models.
 
         Args:
-          *arguments: Those of `_BatchStepper`.
-          own: Whether each simulation needs a model of its own, into which episodes
-            write; those that have drawn one anatomy share a model otherwise.
+            *arguments: Those of `_BatchStepper`.
+            own: Whether each simulation needs a model of its own, into which episodes
+                write; those that have drawn one anatomy share a model otherwise.
         """
         super().__init__(*arguments)
         model = self.batch.model

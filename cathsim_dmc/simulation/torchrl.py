@@ -38,12 +38,12 @@ class BatchedEnv(EnvBase):
         """Builds the simulations.
 
         Args:
-          task_name: Name of a task in `suite.SUITE`.
-          num_envs: N.
-          num_threads: Number of threads of the simulation, None for one per core.
-          seed: Seed of the first simulation; the others count up from it.
-          observation: Name or names of observations.
-          task_kwargs: Further options of the task.
+            task_name: Name of a task in `suite.SUITE`.
+            num_envs: N.
+            num_threads: Number of threads of the simulation, None for one per core.
+            seed: Seed of the first simulation; the others count up from it.
+            observation: Name or names of observations.
+            task_kwargs: Further options of the task.
         """
         options = bounds.options("task_kwargs", task_kwargs)
         self._simulation = BatchSimulation(

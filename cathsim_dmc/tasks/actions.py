@@ -9,11 +9,11 @@ def check_action(given: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
     """Returns the action as float64, clipped to [-1, 1] as the drives would.
 
     Args:
-      given: action of one simulation (A,), or of many (N, A).
-      shape: that it must have.
+        given: action of one simulation (A,), or of many (N, A).
+        shape: that it must have.
 
     Raises:
-      ValueError: if its shape is another or it is not finite.
+        ValueError: if its shape is another or it is not finite.
     """
     try:
         action = np.asarray(given)

@@ -13,12 +13,12 @@ def load_anatomy(anatomy: str | Path | Anatomy, access: str = "ascending") -> An
     """Returns an anatomy: itself, a phantom by name, or one saved in a directory.
 
     Args:
-      anatomy: Anatomy, name in `anatomy.phantoms.PHANTOMS`, or directory.
-      access: Where the device enters a phantom, "ascending" or "descending"; an
-        anatomy or a directory has its own inlet.
+        anatomy: Anatomy, name in `anatomy.phantoms.PHANTOMS`, or directory.
+        access: Where the device enters a phantom, "ascending" or "descending"; an
+            anatomy or a directory has its own inlet.
 
     Raises:
-      ValueError: if there is none; lists the names.
+        ValueError: if there is none; lists the names.
     """
     if isinstance(anatomy, Anatomy):
         return anatomy
@@ -47,14 +47,14 @@ def load_arches(
     """Random arches of a named set, in the order of their seeds; see `arch_set`.
 
     Args:
-      arches: Name of the set: "train", "test" or "test_variants".
-      pool: Number of arches; building one takes about a second and a half.
-      first: Number in the set of the first one.
-      access: Where the device enters, "ascending" or "descending".
+        arches: Name of the set: "train", "test" or "test_variants".
+        pool: Number of arches; building one takes about a second and a half.
+        first: Number in the set of the first one.
+        access: Where the device enters, "ascending" or "descending".
 
     Raises:
-      ValueError: if there is no such set, it has no such arches, or one of them
-        cannot be entered.
+        ValueError: if there is no such set, it has no such arches, or one of them
+            cannot be entered.
     """
     from cathsim_dmc.anatomy.arch import arch
 

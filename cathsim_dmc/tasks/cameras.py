@@ -32,8 +32,8 @@ class CameraOptions:
     """Which cameras `rgb` and `depth` show.
 
     Attributes:
-      names: of `CAMERAS`: "top" as published, "side", and "tip", an endoscope.
-      size: pixels along a side of the image, or (rows, columns).
+        names: of `CAMERAS`: "top" as published, "side", and "tip", an endoscope.
+        size: pixels along a side of the image, or (rows, columns).
     """
 
     names: Sequence[str] = ("top",)
@@ -86,12 +86,12 @@ class Cameras:
         """Opens the context.
 
         Args:
-          model: the compiled model.
-          options: cameras and size.
-          catheter: MJCF scope of the catheter, which carries the endoscope.
+            model: the compiled model.
+            options: cameras and size.
+            catheter: MJCF scope of the catheter, which carries the endoscope.
 
         Raises:
-          ValueError: if there is no OpenGL here.
+            ValueError: if there is no OpenGL here.
         """
         rows, columns = options.resolution
         model.vis.global_.offheight = max(rows, model.vis.global_.offheight)
@@ -124,12 +124,12 @@ class Cameras:
         """Pictures of N configurations.
 
         Args:
-          kinds: of `KINDS`.
-          qpos: (N, nq).
+            kinds: of `KINDS`.
+            qpos: (N, nq).
 
         Returns:
-          "rgb_<camera>": (N, rows, columns, 3) uint8; "depth_<camera>":
-          (N, rows, columns, 1) float32, m.
+            "rgb_<camera>": (N, rows, columns, 3) uint8; "depth_<camera>": (N, rows,
+            columns, 1) float32, m.
         """
         pictures: dict[str, list[np.ndarray]] = {}
         for row in qpos:

@@ -60,12 +60,12 @@ class Case:
         """Lets the device settle in the anatomy.
 
         Args:
-          scene: Entities and where they stand.
-          objective: Success and reward.
-          model: The compiled scene.
-          fluoroscopy: Set-up of the angiography machine, None for no machine.
-          fields: What `write` writes, by name in MuJoCo's model.
-          start_along_route: As in `NavigationConfig`.
+            scene: Entities and where they stand.
+            objective: Success and reward.
+            model: The compiled scene.
+            fluoroscopy: Set-up of the angiography machine, None for no machine.
+            fields: What `write` writes, by name in MuJoCo's model.
+            start_along_route: As in `NavigationConfig`.
         """
         self.scene = scene
         self.objective = objective
@@ -114,13 +114,13 @@ def alike(
     with a mesh that makes room for the meshes of the others.
 
     Args:
-      scenes: Scenes of one device, not compiled yet.
-      objectives: Success and reward in each of them.
-      fluoroscopy: Set-up of the angiography machines, None for none.
-      start_along_route: As in `NavigationConfig`.
+        scenes: Scenes of one device, not compiled yet.
+        objectives: Success and reward in each of them.
+        fluoroscopy: Set-up of the angiography machines, None for none.
+        start_along_route: As in `NavigationConfig`.
 
     Raises:
-      ValueError: if the scenes differ in more than wall and places.
+        ValueError: if the scenes differ in more than wall and places.
     """
     _share_pairs([scene.arena.mjcf_model for scene in scenes])
     pieces = 1 + max(len(scene.anatomy.wall) for scene in scenes)

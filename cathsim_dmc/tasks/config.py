@@ -36,29 +36,31 @@ class NavigationConfig:
     """Options of a navigation task.
 
     Attributes:
-      observation: Name or names of observations, see `observations.OBSERVATIONS`.
-      device: Name of a device in `devices.DEVICES`, or a device.
-      devices: Coaxial devices or their names, from the innermost outwards, in place of
-        `device`; each has two actions, translation and rotation. None for `device`.
-      lead: Length by which each coaxial device starts ahead of the next outer one, m.
-      lumen_friction: Coulomb coefficient between coaxial devices.
-      rotation: Whether the action has a rotation of the base.
-      start_along_route: Range (low, high) of the fraction of the route at which an
-        episode starts, for curricula; None starts every episode at the inlet.
-      max_steps: Number of control steps until the episode is truncated.
-      friction: Coulomb coefficient between device and wall.
-      shaft_link: Length of the longest link of the shaft, m.
-      torsion_joints: Number of torsion hinges along the shaft; None for 4 with
-        rotation and a torsionally rigid shaft without.
-      working_length: Simulated length of the device, m; None for the length that all
-        registered tasks share, or what the goal needs if that is more.
-      physics_timestep: Length of a physics step, s; it divides the control step.
-      fluoroscopy: `imaging.FluoroscopyOptions` of the images, or a mapping of its
-        fields.
-      cameras: `cameras.CameraOptions` of `rgb` and `depth`, or a mapping of its fields.
-      randomisation: Ranges that each episode draws from: True for
-        `randomisation.DEFAULT_RANGES`, False for none, a `randomisation.Randomisation`
-        or a mapping of its fields.
+        observation: Name or names of observations, see `observations.OBSERVATIONS`.
+        device: Name of a device in `devices.DEVICES`, or a device.
+        devices: Coaxial devices or their names, from the innermost outwards, in place
+            of `device`; each has two actions, translation and rotation. None for
+            `device`.
+        lead: Length by which each coaxial device starts ahead of the next outer one, m.
+        lumen_friction: Coulomb coefficient between coaxial devices.
+        rotation: Whether the action has a rotation of the base.
+        start_along_route: Range (low, high) of the fraction of the route at which an
+            episode starts, for curricula; None starts every episode at the inlet.
+        max_steps: Number of control steps until the episode is truncated.
+        friction: Coulomb coefficient between device and wall.
+        shaft_link: Length of the longest link of the shaft, m.
+        torsion_joints: Number of torsion hinges along the shaft; None for 4 with
+            rotation and a torsionally rigid shaft without.
+        working_length: Simulated length of the device, m; None for the length that all
+            registered tasks share, or what the goal needs if that is more.
+        physics_timestep: Length of a physics step, s; it divides the control step.
+        fluoroscopy: `imaging.FluoroscopyOptions` of the images, or a mapping of its
+            fields.
+        cameras: `cameras.CameraOptions` of `rgb` and `depth`, or a mapping of its
+            fields.
+        randomisation: Ranges that each episode draws from: True for
+            `randomisation.DEFAULT_RANGES`, False for none, a
+            `randomisation.Randomisation` or a mapping of its fields.
     """
 
     observation: str | Sequence[str] = "internal"

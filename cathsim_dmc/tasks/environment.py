@@ -24,7 +24,7 @@ class Environment(composer.Environment):
         """Starts an episode.
 
         Returns:
-          The first time step.
+            The first time step.
         """
         if not self._changes_model():
             self._mjcf_never_compiled = False
@@ -34,7 +34,7 @@ class Environment(composer.Environment):
         """The state between two steps, from which an episode goes on bit for bit.
 
         Raises:
-          RuntimeError: if no episode has begun.
+            RuntimeError: if no episode has begun.
         """
         return self.task.snapshot()
 
@@ -42,13 +42,13 @@ class Environment(composer.Environment):
         """Puts the environment to a snapshot, in place of a reset.
 
         Args:
-          snapshot: Of one simulation of the same task, perhaps of another process.
+            snapshot: Of one simulation of the same task, perhaps of another process.
 
         Returns:
-          The time step that was the last one when the snapshot was taken.
+            The time step that was the last one when the snapshot was taken.
 
         Raises:
-          ValueError: if the snapshot is of another task.
+            ValueError: if the snapshot is of another task.
         """
         task, physics = self.task, self._physics_proxy
         task.restore(physics, snapshot, self._random_state)
@@ -93,7 +93,7 @@ class NavigationPhysics(mjcf.Physics):
         dm_control's own check for warnings takes a tenth as long as a free step.
 
         Raises:
-          PhysicsError: if MuJoCo warns.
+            PhysicsError: if MuJoCo warns.
         """
         if self.legacy_step:
             return super().step(nstep)
@@ -106,7 +106,7 @@ class NavigationPhysics(mjcf.Physics):
         """Opens the off-screen context that pictures are drawn in.
 
         Raises:
-          RuntimeError: there is no OpenGL; says what to do.
+            RuntimeError: there is no OpenGL; says what to do.
         """
         try:
             super()._make_rendering_contexts()

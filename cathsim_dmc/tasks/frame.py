@@ -15,11 +15,11 @@ class Images(NamedTuple):
     """Images of the sensors; None where no observation needs them.
 
     Attributes:
-      image: (..., H, W, P) uint8, fluoroscopy of P planes.
-      past_images: the same, one and two control steps before, newest first.
-      masks: (..., H, W, 2 P) uint8, see `imaging.angiograph.masks`.
-      pixels: (..., P, K + 1, 2), tracked points and goal, (column, row).
-      views: images of MuJoCo's cameras by key.
+        image: (..., H, W, P) uint8, fluoroscopy of P planes.
+        past_images: the same, one and two control steps before, newest first.
+        masks: (..., H, W, 2 P) uint8, see `imaging.angiograph.masks`.
+        pixels: (..., P, K + 1, 2), tracked points and goal, (column, row).
+        views: images of MuJoCo's cameras by key.
     """
 
     image: np.ndarray | None = None
@@ -36,13 +36,13 @@ class Frame(NamedTuple):
     """Input of the observations after a control step.
 
     Attributes:
-      readings: state of the device.
-      wall_force: force on the wall over the control step.
-      action: (..., A), the last action, zeros after a reset.
-      goal: (3,) or (..., 3), m.
-      images: images of the sensors.
-      ahead: route ahead of the tip; None where no observation needs it.
-      devices: state of coaxial devices; None for a device alone.
+        readings: state of the device.
+        wall_force: force on the wall over the control step.
+        action: (..., A), the last action, zeros after a reset.
+        goal: (3,) or (..., 3), m.
+        images: images of the sensors.
+        ahead: route ahead of the tip; None where no observation needs it.
+        devices: state of coaxial devices; None for a device alone.
     """
 
     readings: readings.Readings

@@ -26,10 +26,10 @@ class ImageSensors:
         """Prepares the sensors.
 
         Args:
-          names: Names of the observations.
-          angiograph: Angiography machine; None without fluoroscopic observations.
-          num_simulations: N.
-          gl_cameras: MuJoCo's cameras; None without `rgb` and `depth`.
+            names: Names of the observations.
+            angiograph: Angiography machine; None without fluoroscopic observations.
+            num_simulations: N.
+            gl_cameras: MuJoCo's cameras; None without `rgb` and `depth`.
         """
         self._names = names
         self._on = angiograph is not None or gl_cameras is not None
@@ -72,14 +72,14 @@ class ImageSensors:
         """Captures the next images.
 
         Args:
-          lines: (N, n, 3), centrelines of the chains, m.
-          shadows: Shadow of each device.
-          goal: (3,) or (N, 3), m.
-          qpos: (N, nq).
-          random_states: N sources of quantum noise, None for images without.
-          fresh: indices of simulations that begin an episode: only their images are
-            captured, and fill their history. None for a control step of all.
-          device_points: (N, K, P, 3), tracked points of coaxial devices, m.
+            lines: (N, n, 3), centrelines of the chains, m.
+            shadows: Shadow of each device.
+            goal: (3,) or (N, 3), m.
+            qpos: (N, nq).
+            random_states: N sources of quantum noise, None for images without.
+            fresh: indices of simulations that begin an episode: only their images are
+                captured, and fill their history. None for a control step of all.
+            device_points: (N, K, P, 3), tracked points of coaxial devices, m.
         """
         if not self._on or (fresh is not None and not len(fresh)):
             return self._latest() if self._on else NO_IMAGES
@@ -146,9 +146,9 @@ class ImageSensors:
         """Puts some simulations to arrays (K, ...) of `state`.
 
         Args:
-          indices: (K,) numbers of the simulations.
-          machines: Of their anatomies.
-          kept: Arrays.
+            indices: (K,) numbers of the simulations.
+            machines: Of their anatomies.
+            kept: Arrays.
         """
         for row, (index, machine) in enumerate(zip(indices, machines, strict=True)):
             if "deviation" in kept:

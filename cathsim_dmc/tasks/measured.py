@@ -18,9 +18,9 @@ class Measured(NamedTuple):
     """What was measured of N simulations, arrays (N, ...).
 
     Attributes:
-      readings: State of the devices.
-      wall_force: Force on the wall over the control step.
-      devices: State of coaxial devices; None for one alone.
+        readings: State of the devices.
+        wall_force: Force on the wall over the control step.
+        devices: State of coaxial devices; None for one alone.
     """
 
     readings: Readings

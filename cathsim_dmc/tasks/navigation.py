@@ -50,18 +50,18 @@ class Navigation(composer.Task):
         """Takes over the scene.
 
         Args:
-          scene: Entities, attached to the arena, and where they stand.
-          objective: Success and reward.
-          config: Options; those that shape the scene must be the scene's.
-          random: Seed or source of randomness of the environment.
-          others: Scenes and objectives beside the first, if each episode is to draw
-            one of them: another anatomy, with the same device and goals of the same
-            names. All are compiled here, which takes a second each.
-          name: Name of the task for people; None takes the class's.
+            scene: Entities, attached to the arena, and where they stand.
+            objective: Success and reward.
+            config: Options; those that shape the scene must be the scene's.
+            random: Seed or source of randomness of the environment.
+            others: Scenes and objectives beside the first, if each episode is to draw
+                one of them: another anatomy, with the same device and goals of the same
+                names. All are compiled here, which takes a second each.
+            name: Name of the task for people; None takes the class's.
 
         Raises:
-          ValueError: if the objective cannot do what the randomisation asks for, or
-            the scenes differ in more than their anatomies.
+            ValueError: if the objective cannot do what the randomisation asks for, or
+                the scenes differ in more than their anatomies.
         """
         self.name = name or type(self).__name__
         self._scene = scene

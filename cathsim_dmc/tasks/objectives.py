@@ -26,12 +26,12 @@ class Measurement(NamedTuple):
     """Measurement of a control step, which an objective judges; SI, world frame.
 
     Attributes:
-      readings: state of the devices, arrays with the leading axes `...`.
-      wall_force: force on the wall over the control step, arrays (...).
-      action: (..., A), action of this control step in [-1, 1].
-      previous_action: (..., A), action of the control step before, zeros after a
-        reset.
-      distance: (...), straight from the head to the goal of the objective, m.
+        readings: state of the devices, arrays with the leading axes `...`.
+        wall_force: force on the wall over the control step, arrays (...).
+        action: (..., A), action of this control step in [-1, 1].
+        previous_action: (..., A), action of the control step before, zeros after a
+            reset.
+        distance: (...), straight from the head to the goal of the objective, m.
     """
 
     readings: readings.Readings
@@ -45,9 +45,9 @@ class Outcome(NamedTuple):
     """Judgement of a control step; arrays have the leading axes of the measurement.
 
     Attributes:
-      reward: (...) float64, the sum of the terms.
-      success: (...) bool, which ends the episode.
-      terms: name to weighted reward term (...).
+        reward: (...) float64, the sum of the terms.
+        success: (...) bool, which ends the episode.
+        terms: name to weighted reward term (...).
     """
 
     reward: np.ndarray
@@ -67,9 +67,9 @@ class Objective(Protocol):
     Arrays have a leading axis of length N; N is 1 in a composer environment.
 
     Attributes:
-      goal: (3,), or (N, 3) where it differs between simulations, m, world frame.
-      goal_radius: distance from the goal that counts as reached, m.
-      terms: names of the reward terms of every outcome.
+        goal: (3,), or (N, 3) where it differs between simulations, m, world frame.
+        goal_radius: distance from the goal that counts as reached, m.
+        terms: names of the reward terms of every outcome.
 
     An objective that can do more derives from `Shiftable` or `Routed`.
     """
@@ -98,13 +98,13 @@ def judge(
     """Asks an objective about a control step of N simulations and checks its answer.
 
     Args:
-      objective: Success and reward.
-      measurement: What there is to judge, arrays (N, ...).
-      failed: (N,) bool, where the physics failed: there the reward and its terms are
-        0 and there is no success. None for nowhere.
+        objective: Success and reward.
+        measurement: What there is to judge, arrays (N, ...).
+        failed: (N,) bool, where the physics failed: there the reward and its terms are
+            0 and there is no success. None for nowhere.
 
     Raises:
-      ValueError: if the outcome has a wrong type or shape, or is not finite.
+        ValueError: if the outcome has a wrong type or shape, or is not finite.
     """
     outcome = ask(objective, measurement)
     if failed is not None:
@@ -167,7 +167,7 @@ class Routed:
     """An objective with a route, for the observation `route` and for the expert.
 
     Attributes:
-      route: centreline from the inlet to the goal.
+        route: centreline from the inlet to the goal.
     """
 
     route: Centreline
@@ -183,15 +183,15 @@ class Cannulation(Shiftable, Routed):
     published weights the last reward is 10, and minus the distance before.
 
     Attributes:
-      goal: (3,) or, if it differs between simulations, (N, 3), m, world frame.
-      branch: centreline of the whole target branch.
-      ostium: arc length at which the branch leaves its parent's lumen, m.
-      route: centreline from the inlet to the goal.
-      goal_radius: δ, m.
-      weights: reward term to its weight; terms without one are not computed.
-      goal_arc_length: () or (N,), of the goal on the route, m; None for its end.
-      lumen: shortest paths in the lumen to the end of the route; None without the
-        term `path`.
+        goal: (3,) or, if it differs between simulations, (N, 3), m, world frame.
+        branch: centreline of the whole target branch.
+        ostium: arc length at which the branch leaves its parent's lumen, m.
+        route: centreline from the inlet to the goal.
+        goal_radius: δ, m.
+        weights: reward term to its weight; terms without one are not computed.
+        goal_arc_length: () or (N,), of the goal on the route, m; None for its end.
+        lumen: shortest paths in the lumen to the end of the route; None without the
+            term `path`.
     """
 
     goal: np.ndarray
@@ -272,11 +272,11 @@ class Cannulation(Shiftable, Routed):
         """The objective of reaching a goal of an anatomy.
 
         Args:
-          anatomy: Anatomy to navigate.
-          goal: Goal in the lumen of one of its vessels.
-          reward: Weights of the reward terms.
-          goal_radius: Distance from the goal that counts as reached, m.
-          farthest_shift: How far past the goal its place may be shifted, m.
+            anatomy: Anatomy to navigate.
+            goal: Goal in the lumen of one of its vessels.
+            reward: Weights of the reward terms.
+            goal_radius: Distance from the goal that counts as reached, m.
+            farthest_shift: How far past the goal its place may be shifted, m.
         """
         vessel = anatomy.tree.vessel(goal.vessel)
         route = anatomy.route(goal, farthest_shift)
@@ -350,8 +350,8 @@ class Cannulation(Shiftable, Routed):
         """The same objective with the goal moved along its branch.
 
         Args:
-          shift: () or (N,), m, positive away from the ostium; the goal stays
-            between the ostium and the end of the branch.
+            shift: () or (N,), m, positive away from the ostium; the goal stays between
+                the ostium and the end of the branch.
         """
         branch = self.branch
         start = branch.project(self.goal).arc_length

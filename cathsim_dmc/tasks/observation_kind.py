@@ -22,12 +22,12 @@ class Sizes:
     """What the shapes of observations depend on.
 
     Attributes:
-      actions: entries of an action.
-      joints: joints of the chain.
-      links: links of the chain.
-      devices: coaxial devices; 0 for a single device.
-      fluoroscopy: set-up of the angiography machine.
-      cameras: MuJoCo's cameras and the size of their images.
+        actions: entries of an action.
+        joints: joints of the chain.
+        links: links of the chain.
+        devices: coaxial devices; 0 for a single device.
+        fluoroscopy: set-up of the angiography machine.
+        cameras: MuJoCo's cameras and the size of their images.
     """
 
     actions: int = 0
@@ -43,14 +43,14 @@ class Entry:
     """One array of an observation.
 
     Attributes:
-      key: name in the observation; `<camera>` stands for the name of each camera.
-      shape: shape for one simulation or length of a vector, or a function of the sizes
-        that returns it.
-      unit: of its numbers, by part where parts differ.
-      meaning: layout and frame.
-      low: least value, -inf if there is no bound.
-      high: greatest value.
-      dtype: float64 for numbers, another type for images.
+        key: name in the observation; `<camera>` stands for the name of each camera.
+        shape: shape for one simulation or length of a vector, or a function of the
+            sizes that returns it.
+        unit: of its numbers, by part where parts differ.
+        meaning: layout and frame.
+        low: least value, -inf if there is no bound.
+        high: greatest value.
+        dtype: float64 for numbers, another type for images.
     """
 
     key: str
@@ -87,12 +87,12 @@ class ObservationKind:
     """One row of the table.
 
     Attributes:
-      observe: function from a frame to the arrays of the observation.
-      entries: its arrays.
-      fluoroscopic: whether it needs the angiography machine.
-      routed: whether it needs the route to the goal.
-      coaxial: whether it needs coaxial devices.
-      joined: names of the rows that coaxial devices add to it.
+        observe: function from a frame to the arrays of the observation.
+        entries: its arrays.
+        fluoroscopic: whether it needs the angiography machine.
+        routed: whether it needs the route to the goal.
+        coaxial: whether it needs coaxial devices.
+        joined: names of the rows that coaxial devices add to it.
     """
 
     observe: Callable[[Frame], Observation]
@@ -121,13 +121,13 @@ class ObservationTable(dict[str, ObservationKind]):
         """Names of the rows of an observation.
 
         Args:
-          names: Name or names of observations.
-          coaxial: Whether the devices are coaxial, so that the rows that they add
-            follow; None where that is not known, and none follow.
+            names: Name or names of observations.
+            coaxial: Whether the devices are coaxial, so that the rows that they add
+                follow; None where that is not known, and none follow.
 
         Raises:
-          ValueError: if a name is unknown or comes twice, if there is none, or if one
-            needs coaxial devices.
+            ValueError: if a name is unknown or comes twice, if there is none, or if one
+                needs coaxial devices.
         """
         listed = isinstance(names, Sequence) and not isinstance(names, str | bytes)
         chosen = cast(tuple[str, ...], tuple(names) if listed else (names,))

@@ -13,9 +13,9 @@ class Path(NamedTuple):
     """Paths of the heads of N simulations in their episodes.
 
     Attributes:
-      head: (N, 3), m.
-      length: (N,), m, of the paths so far.
-      shortest: (N,), m, shortest ways from the starts to the goals.
+        head: (N, 3), m.
+        length: (N,), m, of the paths so far.
+        shortest: (N,), m, shortest ways from the starts to the goals.
     """
 
     head: np.ndarray

@@ -46,13 +46,13 @@ def escaped(
     """Whether devices have left the lumen.
 
     Args:
-      anatomy: whose lumen, and whose inlet.
-      centreline: (..., n, 3), nodes of the devices, m, world frame.
-      along: (3,) unit vector of the sheath, which need not stand as the vessel does;
-        None for the inlet's direction.
+        anatomy: whose lumen, and whose inlet.
+        centreline: (..., n, 3), nodes of the devices, m, world frame.
+        along: (3,) unit vector of the sheath, which need not stand as the vessel does;
+            None for the inlet's direction.
 
     Returns:
-      (...) bool: some node past the inlet lies more than 2 mm outside the lumen.
+        (...) bool: some node past the inlet lies more than 2 mm outside the lumen.
     """
     inlet = anatomy.inlet
     along = inlet.direction if along is None else along
@@ -72,12 +72,12 @@ class _Watched:
     """What replays the episode of one simulation.
 
     Attributes:
-      scene: Scene whose lumen the device must not leave.
-      start: The state before the first control step, None until then: a snapshot of
-        some simulations, and which of them.
-      steps: Control steps since then.
-      actions: Bytes of the actions so far, float64; None once they replay nothing,
-        since the episode is dumped or longer than `LONGEST_REPLAY`.
+        scene: Scene whose lumen the device must not leave.
+        start: The state before the first control step, None until then: a snapshot of
+            some simulations, and which of them.
+        steps: Control steps since then.
+        actions: Bytes of the actions so far, float64; None once they replay nothing,
+            since the episode is dumped or longer than `LONGEST_REPLAY`.
     """
 
     scene: Scene
@@ -103,8 +103,8 @@ class PhysicsMonitor:
         """Keeps the start of each episode, and the actions.
 
         Args:
-          take: Takes a snapshot of some simulations, by their numbers.
-          actions: (N, A) float64.
+            take: Takes a snapshot of some simulations, by their numbers.
+            actions: (N, A) float64.
         """
         # Plain Python: numpy takes longer over the one simulation of an environment.
         fresh = [i for i, watched in enumerate(self._watched) if watched.start is None]
@@ -132,13 +132,13 @@ class PhysicsMonitor:
         The first error of an episode is dumped; stepping on adds none.
 
         Args:
-          diverged: (N,), MuJoCo warned.
-          steps: (N,), control steps of the episodes.
-          centreline: (N, n, 3), nodes of the devices, m.
-          peak_force: (N,), largest single contact force within the step, N.
+            diverged: (N,), MuJoCo warned.
+            steps: (N,), control steps of the episodes.
+            centreline: (N, n, 3), nodes of the devices, m.
+            peak_force: (N,), largest single contact force within the step, N.
 
         Returns:
-          A reason for each simulation, None where nothing did.
+            A reason for each simulation, None where nothing did.
         """
         looked = [
             i for i, taken in enumerate(steps.tolist()) if not taken % ESCAPE_INTERVAL
@@ -197,15 +197,15 @@ def dump(
     """Writes what replays an episode that ended in an error, and logs where.
 
     Args:
-      reason: what went wrong.
-      start: Snapshot of one simulation at the start of the episode.
-      actions: (T, A) up to and with the one that failed.
-      directory: folder for the last `KEPT_DUMPS` dumps; None for that which the
-        environment variable `CATHSIM_DUMP_DIR` names, or `cathsim-errors` in the
-        system's temporary folder.
+        reason: what went wrong.
+        start: Snapshot of one simulation at the start of the episode.
+        actions: (T, A) up to and with the one that failed.
+        directory: folder for the last `KEPT_DUMPS` dumps; None for that which the
+            environment variable `CATHSIM_DUMP_DIR` names, or `cathsim-errors` in the
+            system's temporary folder.
 
     Returns:
-      The .npz file.
+        The .npz file.
     """
     temporary = Path(tempfile.gettempdir(), "cathsim-errors")
     directory = Path(directory or os.environ.get(FOLDER_VARIABLE) or temporary)
@@ -251,7 +251,7 @@ def load(path: str | Path) -> tuple[str, Snapshot, np.ndarray]:
     `environment.restore(start)` puts an environment of the same task there.
 
     Raises:
-      ValueError: if the file is no dump.
+        ValueError: if the file is no dump.
     """
     held = Snapshot.load(path)
     arrays = dict(held.arrays)

@@ -38,14 +38,14 @@ class Placement:
     """Poses of the device at the start; world frame, SI units.
 
     Attributes:
-      inlet: (3,), mouth of the sheath in the plane of the inlet.
-      direction: (3,), unit vector of insertion at the inlet, see `sheath_direction`.
-      quaternion: (4,) wxyz, turns +z into the direction of insertion.
-      start_depth: way of the tip past the inlet at zero insertion, m.
-      stroke: longest insertion, m.
-      working_length: simulated length of the device, m.
-      line: (k, 3), m, frame of the base at zero insertion: way of the device from its
-        base through the sheath, and on along the vessel's centreline.
+        inlet: (3,), mouth of the sheath in the plane of the inlet.
+        direction: (3,), unit vector of insertion at the inlet, see `sheath_direction`.
+        quaternion: (4,) wxyz, turns +z into the direction of insertion.
+        start_depth: way of the tip past the inlet at zero insertion, m.
+        stroke: longest insertion, m.
+        working_length: simulated length of the device, m.
+        line: (k, 3), m, frame of the base at zero insertion: way of the device from its
+            base through the sheath, and on along the vessel's centreline.
     """
 
     inlet: np.ndarray
@@ -71,7 +71,7 @@ def resolve_goal(anatomy: Anatomy, goal: "str | Goal") -> Goal:
     """Returns the goal, by name or as given.
 
     Raises:
-      ValueError: if the anatomy has no such goal, or the goal is outside the lumen.
+        ValueError: if the anatomy has no such goal, or the goal is outside the lumen.
     """
     if isinstance(goal, str):
         goal = anatomy.goal(goal)
@@ -96,16 +96,16 @@ def place_device(
     """Puts a device to the inlet of an anatomy.
 
     Args:
-      anatomy: Anatomy to navigate.
-      goal: Goal that the device must be able to reach.
-      device: Device; the length of its tip decides how far it starts inside.
-      working_length: Simulated length, m; None for the common one, or what the goal
-        needs if that is more.
-      farthest_shift: How far past its place the goal may be shifted, m.
+        anatomy: Anatomy to navigate.
+        goal: Goal that the device must be able to reach.
+        device: Device; the length of its tip decides how far it starts inside.
+        working_length: Simulated length, m; None for the common one, or what the goal
+            needs if that is more.
+        farthest_shift: How far past its place the goal may be shifted, m.
 
     Raises:
-      ValueError: if `working_length` is shorter than the tip and its start need, or
-        longer than any device is.
+        ValueError: if `working_length` is shorter than the tip and its start need, or
+            longer than any device is.
     """
     inlet = anatomy.inlet
     route = anatomy.route(goal, farthest_shift)
@@ -158,11 +158,11 @@ def sheath_direction(anatomy: Anatomy) -> np.ndarray | None:
     by as little as it takes.
 
     Args:
-      anatomy: Anatomy that the sheath stands before.
+        anatomy: Anatomy that the sheath stands before.
 
     Returns:
-      Unit vector, or None if the sheath crosses a vessel at any tilt that a device can
-      be expected to enter with.
+        Unit vector, or None if the sheath crosses a vessel at any tilt that a device
+        can be expected to enter with.
     """
     inlet = anatomy.inlet
     along = np.asarray(inlet.direction, dtype=float)
@@ -185,7 +185,7 @@ def _clear(anatomy: Anatomy, directions: np.ndarray) -> np.ndarray:
     """Whether sheaths of some directions (k, 3) of insertion run outside all vessels.
 
     Returns:
-      (k,) bool.
+        (k,) bool.
     """
     behind = np.arange(_NEAR_INLET, COMMON_LENGTH, _LINE_SPACING)
     lines = anatomy.inlet.position - behind[:, None] * directions[:, None]

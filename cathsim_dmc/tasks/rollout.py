@@ -65,11 +65,11 @@ class Rollout:
         """Prepares what an episode needs; no episode has begun yet.
 
         Args:
-          cases: Anatomies with their objectives; an episode draws one of them, if
-            there are several.
-          config: Options of the task.
-          model: The compiled scene of the first case.
-          stepper: Steps the N simulations.
+            cases: Anatomies with their objectives; an episode draws one of them, if
+                there are several.
+            config: Options of the task.
+            model: The compiled scene of the first case.
+            stepper: Steps the N simulations.
         """
         self._cases = tuple(cases)
         num_simulations = stepper.num_simulations
@@ -131,9 +131,9 @@ class Rollout:
         A forward pass must follow, then `start`.
 
         Args:
-          indices: (K,) numbers of the simulations, whose state has been reset.
-          random_states: N sources of randomness; those of other simulations are left
-            alone.
+            indices: (K,) numbers of the simulations, whose state has been reset.
+            random_states: N sources of randomness; those of other simulations are left
+                alone.
         """
         self._random_states = list(random_states)
         for index in indices:
@@ -180,7 +180,7 @@ class Rollout:
         """Takes the actions of a control step; its physics steps must follow.
 
         Args:
-          action: (N, A) float64 as `actions.check_action` returns it.
+            action: (N, A) float64 as `actions.check_action` returns it.
         """
         self._monitor.before_step(self.snapshot, action)
         self._previous_action, self._action = self._action, action
@@ -191,10 +191,10 @@ class Rollout:
         """First measurement of new episodes, after the forward pass.
 
         Args:
-          indices: (K,) numbers of the simulations that have begun an episode.
+            indices: (K,) numbers of the simulations that have begun an episode.
 
         Returns:
-          All simulations as they stand; no episode ends at its start.
+            All simulations as they stand; no episode ends at its start.
         """
         self._measure(self._stepper.still(indices), indices)
         head = self.readings.head
@@ -230,9 +230,9 @@ class Rollout:
         """Judges and observes what was measured.
 
         Args:
-          fresh: (K,) numbers of simulations that have just begun an episode: only
-            their images are captured. None for all, one control step on.
-          ended: (N,) bool, None for what the objective and the physics say.
+            fresh: (K,) numbers of simulations that have just begun an episode: only
+                their images are captured. None for all, one control step on.
+            ended: (N,) bool, None for what the objective and the physics say.
         """
         errors = tuple(error or None for error in self._errors.tolist())
         goal = self._objective.goal
@@ -293,7 +293,7 @@ class Rollout:
         """The state of some simulations (K,), between two control steps.
 
         Raises:
-          RuntimeError: if no episode has begun.
+            RuntimeError: if no episode has begun.
         """
         if self._random_states is None:
             raise RuntimeError(
@@ -320,15 +320,15 @@ class Rollout:
         """Puts some simulations (K,) to a snapshot of as many.
 
         Args:
-          indices: Numbers of the simulations; an episode has begun in each.
-          snapshot: Of this task, perhaps of another process.
-          random_states: N sources of randomness, of which some are put back.
+            indices: Numbers of the simulations; an episode has begun in each.
+            snapshot: Of this task, perhaps of another process.
+            random_states: N sources of randomness, of which some are put back.
 
         Returns:
-          All simulations as they stand.
+            All simulations as they stand.
 
         Raises:
-          ValueError: if the snapshot is of another task.
+            ValueError: if the snapshot is of another task.
         """
         self._random_states = list(random_states)
         snapshot.require(self.snapshot(indices))

@@ -28,13 +28,13 @@ class Scene:
     """Entities of a task, attached to the arena.
 
     Attributes:
-      goal: where the device is to go.
-      placement: where device, sheath and robot stand.
-      arena: the root, with light and the density of blood.
-      phantom: wall, goals and load cell.
-      catheter: the device, or several in each other.
-      sheath: holds the device before the inlet.
-      robot: the follower, which moves along with the device.
+        goal: where the device is to go.
+        placement: where device, sheath and robot stand.
+        arena: the root, with light and the density of blood.
+        phantom: wall, goals and load cell.
+        catheter: the device, or several in each other.
+        sheath: holds the device before the inlet.
+        robot: the follower, which moves along with the device.
     """
 
     goal: Goal
@@ -62,15 +62,15 @@ class Scene:
         """Builds the entities that are not given, and attaches all to the arena.
 
         Args:
-          anatomy: Anatomy to navigate.
-          goal: Name in `anatomy.goals`, or a goal inside the lumen.
-          config: Options of the task.
-          goal_radius: Radius of the goal markers, m; for looks only.
-          arena: Arena of one's own.
-          phantom: Phantom of one's own, of the same anatomy.
-          catheter: Device of one's own; it must reach the goal.
-          sheath: Introducer sheath of one's own.
-          robot: Follower of one's own.
+            anatomy: Anatomy to navigate.
+            goal: Name in `anatomy.goals`, or a goal inside the lumen.
+            config: Options of the task.
+            goal_radius: Radius of the goal markers, m; for looks only.
+            arena: Arena of one's own.
+            phantom: Phantom of one's own, of the same anatomy.
+            catheter: Device of one's own; it must reach the goal.
+            sheath: Introducer sheath of one's own.
+            robot: Follower of one's own.
         """
         goal = placement.resolve_goal(anatomy, goal)
         chosen = chosen_devices(config) if catheter is None else catheter.devices

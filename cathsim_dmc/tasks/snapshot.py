@@ -27,8 +27,8 @@ class Snapshot:
     """State of N simulations of a task, with their random states and image history.
 
     Attributes:
-      task: Description of the task, JSON-able: another task refuses the snapshot.
-      arrays: Arrays (N, ...) by name.
+        task: Description of the task, JSON-able: another task refuses the snapshot.
+        arrays: Arrays (N, ...) by name.
     """
 
     task: Mapping[str, Any]
@@ -93,7 +93,7 @@ class Snapshot:
         """Reads a file that `save` has written.
 
         Raises:
-          ValueError: the file is damaged or something else.
+            ValueError: the file is damaged or something else.
         """
         try:
             held = files.read_arrays(Path(path), _LARGEST)

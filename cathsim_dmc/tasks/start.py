@@ -40,15 +40,15 @@ class StartPosture:
         """Lets the device settle.
 
         Args:
-          scene: Entities and where they stand.
-          model: The compiled scene.
-          index: Places of the task's quantities in the model.
-          along_route: Least and largest share of the way to the goal that the head
-            has made, for episodes that do not begin at the inlet; None for those
-            that do.
+            scene: Entities and where they stand.
+            model: The compiled scene.
+            index: Places of the task's quantities in the model.
+            along_route: Least and largest share of the way to the goal that the head
+                has made, for episodes that do not begin at the inlet; None for those
+                that do.
 
         Raises:
-          ValueError: if the device comes to rest outside the lumen or in its wall.
+            ValueError: if the device comes to rest outside the lumen or in its wall.
         """
         catheter = scene.catheter
         self._bends = index.bends_qpos
@@ -143,10 +143,10 @@ class StartPosture:
         """The displacement, or its opposite where it would press on the wall.
 
         Args:
-          displacement: (3,) of the head in the frame of the inlet, m.
+            displacement: (3,) of the head in the frame of the inlet, m.
 
         Returns:
-          (3,) m, of the same length.
+            (3,) m, of the same length.
         """
         depth = float(self._anatomy.depth(self._head + self._frame @ displacement))
         return (
@@ -165,13 +165,13 @@ class StartPosture:
         """Writes the start configuration of one simulation.
 
         Args:
-          qpos: (nq,), written in place; joints of other entities are left alone.
-          displacement: (3,) of the head in the frame of the inlet, whose z points
-            into the lumen, m.
-          roll: Angle by which the device is turned about its own axis, rad: its
-            hinges stand otherwise, its shape is the same.
-          number: What `draw` returned: a device that lies along the route is neither
-            displaced nor turned.
+            qpos: (nq,), written in place; joints of other entities are left alone.
+            displacement: (3,) of the head in the frame of the inlet, whose z points
+                into the lumen, m.
+            roll: Angle by which the device is turned about its own axis, rad: its
+                hinges stand otherwise, its shape is the same.
+            number: What `draw` returned: a device that lies along the route is neither
+                displaced nor turned.
         """
         if number is not None:
             qpos[self._bends], qpos[self._insertion] = self._ahead[number]

@@ -27,17 +27,17 @@ class Step(NamedTuple):
     """State of N simulations after a control step, or at the start of an episode.
 
     Attributes:
-      observation: arrays (N, ...), which may share memory with the readings.
-      outcome: reward, success and reward terms, arrays (N,); the reward is 0 and
-        there is no success where the physics failed.
-      terminated: (N,) bool, success or a physics error.
-      truncated: (N,) bool, out of time.
-      errors: N reasons, None where the physics went well; the others are logged with
-        a dump that replays the episode, which says nothing about the policy.
-      readings: state of the devices.
-      wall_force: force on the wall over the control step.
-      distance: (N,), straight from head to goal, m.
-      path_ratio: (N,), way of the head so far over the shortest way to the goal.
+        observation: arrays (N, ...), which may share memory with the readings.
+        outcome: reward, success and reward terms, arrays (N,); the reward is 0 and
+            there is no success where the physics failed.
+        terminated: (N,) bool, success or a physics error.
+        truncated: (N,) bool, out of time.
+        errors: N reasons, None where the physics went well; the others are logged with
+            a dump that replays the episode, which says nothing about the policy.
+        readings: state of the devices.
+        wall_force: force on the wall over the control step.
+        distance: (N,), straight from head to goal, m.
+        path_ratio: (N,), way of the head so far over the shortest way to the goal.
     """
 
     observation: Observation
