@@ -59,8 +59,8 @@ def load_arches(
     from cathsim_dmc.anatomy.arch import arch
 
     seeds = arch.arch_set(bounds.choice("arches", arches, arch.SETS))
-    bounds.whole("pool", pool, 1, len(seeds))
-    bounds.whole("first", first, 0, len(seeds) - pool)
+    bounds.whole(f"pool of arches {arches!r}", pool, 1, len(seeds))
+    bounds.whole(f"first of arches {arches!r}", first, 0, len(seeds) - pool)
     found = [arch.build_seed(seed, access=access) for seed in seeds[first:][:pool]]
     closed = [a.name for a in found if placement.sheath_direction(a) is None]
     if closed:
