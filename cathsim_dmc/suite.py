@@ -283,7 +283,7 @@ def _register_domain() -> None:
     missing = [name for name in needed if not hasattr(dm_suite, name)]
     if missing:
         raise ImportError(
-            f"dm_control.suite has no {', '.join(missing)} any more, so the domain "
+            f"dm_control.suite lacks {', '.join(missing)}, so the domain "
             f"{DOMAIN!r} cannot be registered; install dm-control 1.0.50"
         )
     dm_suite._DOMAINS[DOMAIN] = sys.modules[__name__]  # noqa: SLF001

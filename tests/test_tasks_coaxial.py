@@ -133,7 +133,9 @@ def test_a_step_of_a_single_device_does_no_pair_work(shared_environment, monkeyp
     assert environment.task.rollout.devices is None
     assert environment.physics.model.ptr.nuserdata == 0
     monkeypatch.setattr(
-        sliding, "made_of", lambda *_: pytest.fail("coaxial work for one device")
+        sliding,
+        "chain_properties",
+        lambda *_: pytest.fail("coaxial work for one device"),
     )
     environment.reset()
     environment.step(np.zeros(21))

@@ -246,7 +246,7 @@ def test_anatomies_with_other_goals_are_refused():
         for anatomy in ("simple1", arch.build_seed(arch.arch_set("test_variants")[3]))
     ]
     with pytest.raises(ValueError, match="take turns"):
-        cases.alike([t.scene for t in tasks], [t.objective for t in tasks])
+        cases.compile_together([t.scene for t in tasks], [t.objective for t in tasks])
 
 
 # Number 4 of "train" bends back across the straight sheath: the device stood 45 mm

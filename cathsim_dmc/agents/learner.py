@@ -100,5 +100,5 @@ class Learner(abc.ABC):
         self.network.load_state_dict(policy)
         self.optimiser.load_state_dict(learning["optimiser"])
         self.gradient_steps = learning["gradient_steps"]
-        # Older checkpoints have no critic that reads something else.
+        # A checkpoint may have no critic with an observation of its own.
         self.normalisers.critics.load_state_dict(learning.get("normalisers", {}))

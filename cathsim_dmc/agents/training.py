@@ -280,7 +280,7 @@ def _start(
         counted = {
             "rng": rng,
             "episodes": int(state["episodes"]),
-            # Older checkpoints do not have it.
+            # A checkpoint may lack it.
             "window": read_window(state.get("window", [])),
         }
     except ReplayError:

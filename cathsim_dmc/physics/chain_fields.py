@@ -1,4 +1,4 @@
-"""What the chain of coaxial devices is made of, written into the fields of a model."""
+"""Local properties of the chain of coaxial devices, written into a model's fields."""
 
 from __future__ import annotations
 
@@ -57,8 +57,10 @@ class ChainFields:
         start = int(self._hinges[2])
         return slice(start, start + 2 * (len(self._geoms) - 1))
 
-    def write(self, arrays: Sequence[np.ndarray], made: Made, row: int) -> None:
-        """Writes what the chain of one simulation is made of.
+    def write(
+        self, arrays: Sequence[np.ndarray], made: ChainProperties, row: int
+    ) -> None:
+        """Writes the properties of the chain of one simulation.
 
         Args:
             arrays: live `FIELDS` of its model.
@@ -80,8 +82,8 @@ class ChainFields:
         )
 
 
-class Made(NamedTuple):
-    """What chains are made of, arrays with the leading axis N.
+class ChainProperties(NamedTuple):
+    """Properties of chains, arrays with the leading axis N.
 
     Attributes:
         stiffness: (N, J), of the hinges, N·m/rad.
@@ -94,15 +96,15 @@ class Made(NamedTuple):
     links: Links
 
 
-def made_of(
+def chain_properties(
     entity: DeviceStack,
     overlap: Overlap,
     turns: np.ndarray,
     friction: np.ndarray,
     factor: np.ndarray,
     spin: np.ndarray | None = None,
-) -> Made:
-    """What chains are made of.
+) -> ChainProperties:
+    """Properties of chains at an overlap of their devices.
 
     The damping of a hinge resists how it moves against the turning shape, not against
     the vessel: else a shaped device would be held back by its own damping when it is
@@ -120,7 +122,7 @@ def made_of(
     free = stack.rest_angles(overlap, turns, spin, BENDING_RELAXATION_TIME)
     rest = np.empty((*free.shape, 2))
     rest[..., 0], rest[..., 1] = -np.imag(free), np.real(free)
-    return Made(
+    return ChainProperties(
         stiffness=factor[:, None] / overlap.compliance,
         rest=rest,
         links=stack.links(overlap, friction),
@@ -133,7 +135,7 @@ def write_still(
     gaps: np.ndarray | None = None,
     rotation: np.ndarray | None = None,
 ) -> None:
-    """Writes into a model what the chain is made of while the devices stand still.
+    """Writes into a model the properties of the chain while the devices stand still.
 
     Args:
         entity: of the devices.
@@ -147,6 +149,8 @@ def write_still(
     if rotation is not None:
         turns += np.asarray(rotation)[:, None]
     overlap = entity.stack.overlap(gaps[None])
-    made = made_of(entity, overlap, turns, np.array([entity.friction]), np.ones(1))
+    made = chain_properties(
+        entity, overlap, turns, np.array([entity.friction]), np.ones(1)
+    )
     arrays = [getattr(model, name) for name in FIELDS]
     ChainFields(model, entity).write(arrays, made, 0)

@@ -144,7 +144,7 @@ class Effect:
         """Writes the model of one simulation, whose state has been restored."""
 
 
-def room(effects: Sequence[Effect], chain: Chain) -> int:
+def userdata_size(effects: Sequence[Effect], chain: Chain) -> int:
     """Numbers of MuJoCo's `userdata` that some effects take."""
     counts = [effect.num_parameters(chain) for effect in effects]
     taken = sum(_HEADER + count for count in counts if count)
@@ -165,7 +165,7 @@ class Effects:
             ValueError: if the scene was built for other effects.
         """
         self._effects, self._user = tuple(effects), world.parameters
-        needed = room(effects, world.chain)
+        needed = userdata_size(effects, world.chain)
         if self._user.shape[1] != needed:
             raise ValueError(
                 f"the effects of the task take {needed} numbers of userdata, and the "

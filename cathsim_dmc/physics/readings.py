@@ -60,7 +60,7 @@ class Readings(NamedTuple):
 
 
 class Views(NamedTuple):
-    """Where the readings lie in a simulator's arrays, which change under them.
+    """Views of a simulator's arrays: they change with the simulation.
 
     Attributes:
         links: (..., L, 3), proximal ends of the links.

@@ -1,7 +1,7 @@
 """Coaxial devices of N simulations, moved by the actions.
 
 Once in a control step, before its physics steps, the devices are moved along and about
-their axis; `chain_fields` then writes what the chain is made of. Where each device is
+their axis; `chain_fields` then writes the properties of the chain. Where each device is
 and how it is turned lies in MuJoCo's `userdata`, so it is part of the state that is
 saved, dumped and replayed.
 """
@@ -18,7 +18,12 @@ from cathsim_dmc.entities.coaxial import Overlap
 from cathsim_dmc.entities.device_stack import DeviceStack
 from cathsim_dmc.entities.robot import follower_posture
 from cathsim_dmc.imaging.device import Shadow
-from cathsim_dmc.physics.chain_fields import FIELDS, ChainFields, made_of, write_still
+from cathsim_dmc.physics.chain_fields import (
+    FIELDS,
+    ChainFields,
+    chain_properties,
+    write_still,
+)
 from cathsim_dmc.physics.effects import Effect, World
 from cathsim_dmc.physics.randomisation import Episode
 from cathsim_dmc.physics.readings import Readings
@@ -65,7 +70,7 @@ class SingleDevice(Effect):
         self._radius = chain.device.outer_radius
 
     def settle(self, model: mujoco.MjModel) -> None:
-        """Writes into a model what the chain is made of at the start."""
+        """Writes the properties of the chain at the start into a model."""
 
     def follower_posture(self) -> np.ndarray:
         """Joints (N, len(JOINTS)) of the robot that holds the devices."""
@@ -105,7 +110,7 @@ class SlidingDevices(SingleDevice):
         self._entity, self._stack, self._rods = stack, stack.stack, stack.rods
 
     def settle(self, model: mujoco.MjModel) -> None:
-        """Writes into a model what the chain is made of at the start."""
+        """Writes the properties of the chain at the start into a model."""
         write_still(self._entity, model)
 
     def num_parameters(self, chain: Chain) -> int:
@@ -171,14 +176,14 @@ class SlidingDevices(SingleDevice):
         }
 
     def refresh(self, index: int) -> None:
-        """Writes what the chain of one simulation is made of."""
+        """Writes the properties of the chain of one simulation."""
         row = self._live(index)
         gaps = self._loops.gaps(np.ascontiguousarray(self._insertion[row]))
         turns = self._rods.at_joints(self._angles[row], gaps)
         self._write(row, self._stack.overlap(gaps), turns)
 
     def act(self, action: np.ndarray, state: Readings) -> np.ndarray:
-        """Moves the devices and writes what the chains are made of then.
+        """Moves the devices and writes the properties of the chains.
 
         The chain is driven to where the device will be that reaches farthest; the
         others move as they are told. A device that leads is held up with the chain.
@@ -213,7 +218,7 @@ class SlidingDevices(SingleDevice):
         return self._qpos[:, self._index.insertion_qpos].copy()
 
     def _held(self, reached: np.ndarray) -> np.ndarray:
-        """Insertions (N, K) with those that lead where the chain has come to."""
+        """Insertions (N, K): leading devices as measured, the others as commanded."""
         return self._loops.held(np.ascontiguousarray(self._insertion), reached)
 
     def _turn(
@@ -266,10 +271,10 @@ class SlidingDevices(SingleDevice):
         return torque
 
     def _write(self, rows: np.ndarray, overlap: Overlap, turns: np.ndarray) -> None:
-        """Writes what the chains of some simulations are made of."""
+        """Writes the properties of the chains of some simulations."""
         friction, factor = self._friction[rows], self._factor[rows]
         spin = self._spin[rows]
-        made = made_of(self._entity, overlap, turns, friction, factor, spin)
+        made = chain_properties(self._entity, overlap, turns, friction, factor, spin)
         for row, number in enumerate(rows.tolist()):
             self._places.write(self._arrays[number], made, row)
 

@@ -10,7 +10,7 @@ from cathsim_dmc.compiled import compiled
 
 @compiled
 def held(insertion, reached):
-    """Insertions (N, K) with those that lead where the chain has come to (N,)."""
+    """Insertions (N, K): the leading devices at (N,), the others as commanded."""
     count, devices = insertion.shape
     where = np.empty((count, devices))
     for i in range(count):
@@ -148,7 +148,7 @@ def write(
     radius,
     friction,
     mass,
-    lightness,
+    buoyancy,
     inertia,
     jnt_stiffness,
     dof_damping,
@@ -172,8 +172,8 @@ def write(
         axes: (L,), which of a link's axes of inertia lies along it.
         half_lengths: (L,), of the cylinders of the links, m.
         relaxation: damping over stiffness, s.
-        stiffness, rest, radius, friction, mass, lightness, inertia: of N simulations,
-            see `chain_fields.Made`.
+        stiffness, rest, radius, friction, mass, buoyancy, inertia: of N simulations,
+            see `chain_fields.ChainProperties`.
         jnt_stiffness, ...: the fields, named as in MuJoCo.
     """
     for j in range(stiffness.shape[1]):
@@ -193,7 +193,7 @@ def write(
         beyond += mass[row, link]
         body_mass[body] = mass[row, link]
         body_subtreemass[body] = beyond
-        body_gravcomp[body] = lightness[row, link]
+        body_gravcomp[body] = buoyancy[row, link]
         for axis in range(3):
             along = 1 if axis == axes[link] else 0
             body_inertia[body, axis] = inertia[row, link, along]

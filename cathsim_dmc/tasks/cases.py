@@ -102,7 +102,7 @@ def model_index(scene: Scene, model: mujoco.MjModel) -> ModelIndex:
     return ModelIndex(model, scene.catheter, scene.robot)
 
 
-def alike(
+def compile_together(
     scenes: Sequence[Scene],
     objectives: Sequence[Objective],
     fluoroscopy: FluoroscopyOptions | None = None,

@@ -90,7 +90,7 @@ class NavigationPhysics(mjcf.Physics):
     def step(self, nstep: int = 1) -> None:
         """Does physics steps.
 
-        dm_control's own check for warnings takes a tenth as long as a free step.
+        dm_control's own check for warnings takes a tenth of a step without contact.
 
         Raises:
             PhysicsError: if MuJoCo warns.

@@ -94,7 +94,7 @@ class Navigation(composer.Task):
             scenes, objectives = zip((scene, objective), *others, strict=True)
             for each in scenes:
                 each.arena.mjcf_model.option.timestep = config.physics_timestep
-            self._cases = cases.alike(
+            self._cases = cases.compile_together(
                 scenes, objectives, self._fluoroscopy, config.start_along_route
             )
         self._rollout: Rollout  # there once the model is compiled

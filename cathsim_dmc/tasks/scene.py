@@ -96,7 +96,7 @@ class Scene:
             ),
             robot=robot or Robot(device_radius=radius),
         )
-        scene._attach(effects.room(config.effects_on(catheter), catheter))
+        scene._attach(effects.userdata_size(config.effects_on(catheter), catheter))
         return scene
 
     def _attach(self, user_data: int):
