@@ -59,11 +59,11 @@ class Report:
             caption=_CAPTION,
             caption_justify="left",
         )
-        for column in _COLUMNS:
+        results = [one for one in (self.policy, self.baseline) if one is not None]
+        for column in ("policy", *(result.policy for result in results)):
             table.add_column(column)
-        for result in (self.policy, self.baseline):
-            if result is not None:
-                table.add_row(result.policy, *_cells(result))
+        for row in zip(_ROWS, *map(_cells, results), strict=True):
+            table.add_row(*row)
         console = Console()
         console.print(table)
         if self.comparison is not None:
@@ -77,8 +77,8 @@ class Report:
             )
 
 
-_COLUMNS = (
-    "policy", "reward", "steps", "mean force, mN", "mean contact force, mN",
+_ROWS = (
+    "reward", "steps", "mean force, mN", "mean contact force, mN",
     "max force, mN", "peak force, mN", "success",
 )  # fmt: skip
 _CAPTION = (
