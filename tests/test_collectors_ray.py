@@ -5,6 +5,7 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 import time
 from pathlib import Path
 
@@ -175,17 +176,16 @@ ray.init(address=cluster.address, log_to_driver=False)
 start = ray_source.RaySource._start
 
 def tell(self):
-    collector = start(self)
+    start(self)
     def where():
         import os, ray, torch
         context = ray.get_runtime_context()
         return os.getpid(), context.get_node_id(), torch.initial_seed()
     places = [
         ray.get(one.__ray_call__.remote(lambda self, f=where: f()))
-        for one in collector.remote_collectors
+        for one in self._collector.remote_collectors
     ]
     print("TOLD", json.dumps(places), flush=True)
-    return collector
 
 ray_source.RaySource._start = tell
 sys.path.insert(0, sys.argv[3])
@@ -212,6 +212,8 @@ PATIENCE = {
     "RAY_memory_monitor_refresh_ms": "0",
     "RAY_raylet_start_wait_time_s": "300",
     "RAY_agent_register_timeout_ms": "300000",
+    # A collector that is deleted after Ray has ended would start it again and wait.
+    "RAY_ENABLE_AUTO_CONNECT": "0",
 }
 
 
@@ -230,6 +232,8 @@ def test_a_killed_collector_does_not_lose_the_run(tmp_path):
             text=True,
             env={**os.environ, **PATIENCE},
         )
+    watchdog = threading.Timer(600, process.kill)  # reading its lines has no limit
+    watchdog.start()
     try:
         lines = told(iter(process.stdout.readline, ""))
         first = next(lines)
@@ -244,6 +248,7 @@ def test_a_killed_collector_does_not_lose_the_run(tmp_path):
         *rest, result = lines
         assert process.wait(300) == 0
     finally:
+        watchdog.cancel()
         process.kill()
         process.wait()
     (second,) = [line for line in rest if isinstance(line, list)]
