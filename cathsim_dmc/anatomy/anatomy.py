@@ -12,6 +12,7 @@ import json
 import os
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +20,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from cathsim_dmc import files
-from cathsim_dmc.anatomy import builder, loading
+from cathsim_dmc.anatomy import builder, field_cache, loading
 from cathsim_dmc.anatomy.builder import VesselPlace
 from cathsim_dmc.anatomy.centreline import (
     Array,
@@ -30,6 +31,7 @@ from cathsim_dmc.anatomy.centreline import (
     as_points,
 )
 from cathsim_dmc.anatomy.curves import Curve, smooth_tree
+from cathsim_dmc.anatomy.field import Field
 from cathsim_dmc.anatomy.parts import End, Goal, Inlet, Surface
 from cathsim_dmc.anatomy.wall.depth import DepthField
 
@@ -124,6 +126,16 @@ class Anatomy:
         tree, ends, entry, places = builder.placed(tree, inlet, goals)
         surface, wall = lumen_surface(tree), build_wall(tree, ends)
         return cls(name, tree, surface, wall, entry, places, ends)
+
+    @cached_property
+    def lumen(self) -> Field:
+        """Signed depth to the true wall, which a device touches.
+
+        Built when first asked for, and kept in `field_cache.cache_folder()`.
+        """
+        if self.field is None:
+            return field_cache.tree_field(self.tree, self.ends)
+        return field_cache.surface_field(self.surface, self.ends)
 
     def depth(self, points: ArrayLike) -> Array:
         """Signed depth (...) of `points` (..., 3) in the lumen, metres, > 0 inside."""

@@ -1,0 +1,97 @@
+"""Cache of fields, by the content that they are built from."""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import os
+from collections.abc import Callable, Sequence
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+
+from cathsim_dmc import files
+from cathsim_dmc.anatomy.centreline import VesselTree
+from cathsim_dmc.anatomy.field import LARGEST, Field
+from cathsim_dmc.anatomy.parts import End, Surface
+
+KEPT = 512_000_000  # bytes of all fields; the ones used longest ago are dropped
+_NAMES = ("head", "coarse", "index", "samples")
+_SUFFIX = ".npz"
+# Modules whose code decides what a field holds.
+_MODULES = ("field", "tree_depth", "tree_depth_loops")
+
+
+def cache_folder() -> Path:
+    """Where fields are kept: ``cathsim_dmc/fields`` in the user's cache folder."""
+    home = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+    return Path(home) / "cathsim_dmc" / "fields"
+
+
+def tree_field(tree: VesselTree, ends: Sequence[End] = ()) -> Field:
+    """As `Field.from_tree`, read from the cache if it was built before."""
+    parts = []
+    for vessel in tree.vessels.values():
+        parts += [vessel.centreline.points, vessel.centreline.radii]
+    return _cached(parts, ends, lambda: Field.from_tree(tree, ends))
+
+
+def surface_field(surface: Surface, ends: Sequence[End] = ()) -> Field:
+    """As `Field.from_surface`, read from the cache if it was built before."""
+    parts = [surface.vertices, surface.faces]
+    return _cached(parts, ends, lambda: Field.from_surface(surface, ends))
+
+
+def _cached(
+    parts: Sequence[np.ndarray], ends: Sequence[End], build: Callable[[], Field]
+) -> Field:
+    """A field from the cache, or built and kept.
+
+    A file appears whole or not at all, and holds checksums: a damaged one is built
+    again. Where the folder cannot be written to, nothing is kept.
+    """
+    flat = [(*e.position, *e.direction, e.radius, e.open) for e in ends]
+    digest = hashlib.sha256(_code())
+    for part in (*parts, np.array(flat)):
+        digest.update(f"{part.dtype}{part.shape}".encode() + part.tobytes())
+    path = cache_folder() / f"{digest.hexdigest()[:32]}{_SUFFIX}"
+    try:
+        arrays = files.read_arrays(path, 2 * LARGEST, _NAMES)
+        field = Field(*(arrays[name] for name in _NAMES))
+    except (OSError, ValueError):
+        field = build()
+        with contextlib.suppress(OSError):
+            _keep(field, path)
+    else:
+        with contextlib.suppress(OSError):
+            os.utime(path)
+    return field
+
+
+@cache
+def _code() -> bytes:
+    """Digest of the code that builds fields."""
+    digest = hashlib.sha256()
+    for name in _MODULES:
+        digest.update(Path(__file__).with_name(f"{name}.py").read_bytes())
+    return digest.digest()
+
+
+def _keep(field: Field, path: Path) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    # What a killed process has left, of whichever field it was.
+    files.remove_abandoned(path.parent)
+    with files.atomic_path(path) as temporary, open(temporary, "wb") as stream:
+        arrays = dict(zip(_NAMES, field.arrays, strict=True))
+        np.savez(stream, allow_pickle=False, **arrays)
+    sizes = []
+    for entry in path.parent.glob(f"*{_SUFFIX}"):
+        with contextlib.suppress(OSError):  # another process drops it
+            found = entry.stat()
+            sizes.append((found.st_mtime, found.st_size, entry))
+    total = 0
+    for _, size, entry in sorted(sizes, reverse=True):
+        total += size
+        if total > KEPT:
+            entry.unlink(missing_ok=True)

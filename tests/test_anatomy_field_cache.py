@@ -1,0 +1,82 @@
+"""The cache of fields: found by content, whole or not at all."""
+
+import numpy as np
+import pytest
+
+from cathsim_dmc.anatomy import field_cache
+from cathsim_dmc.anatomy.centreline import Centreline, Vessel, VesselTree
+from cathsim_dmc.anatomy.field import Field
+from cathsim_dmc.anatomy.parts import End
+
+UP = np.array([0.0, 0.0, 1.0])
+
+
+def tube(radius=4e-3):
+    points = np.linspace(0.0, 20e-3, 11)[:, None] * UP
+    line = Centreline(points, np.full(11, radius))
+    return VesselTree({"root": Vessel("root", line)})
+
+
+@pytest.fixture
+def folder(monkeypatch, tmp_path):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    return tmp_path / "cathsim_dmc" / "fields"
+
+
+@pytest.fixture
+def built(monkeypatch, folder):
+    """Counts the fields that are built; they stand for any."""
+    done = []
+    one = Field(np.full(9, 7.5), np.zeros(8, np.int16), *np.zeros((2, 1), np.int32))
+
+    def fake(*content):
+        done.append(content)
+        return one
+
+    monkeypatch.setattr(Field, "from_tree", fake)
+    return done
+
+
+def test_a_field_is_built_once_and_read_as_it_was(folder):
+    ends = [End("root", np.zeros(3), -UP, 4e-3, True)]
+    first, again = (field_cache.tree_field(tube(), ends) for _ in range(2))
+    assert first is not again and first.digest == again.digest
+    for one, other in zip(first.arrays, again.arrays, strict=True):
+        assert one.dtype == other.dtype and one.shape == other.shape
+
+
+def test_lumen_and_ends_count(built):
+    end = End("root", np.zeros(3), -UP, 4e-3, True)
+    for radius in (4e-3, 5e-3):
+        for ends in ((), (end,)):
+            for _ in range(2):
+                field_cache.tree_field(tube(radius), ends)
+    assert len(built) == 4
+
+
+def test_a_damaged_field_is_built_again(built, folder):
+    field_cache.tree_field(tube())
+    (path,) = folder.iterdir()
+    data = path.read_bytes()
+    path.write_bytes(data[:-200])
+    field_cache.tree_field(tube())
+    path.write_bytes(data.replace(np.float64(7.5).tobytes(), b"x" * 8, 1))
+    field_cache.tree_field(tube())
+    field_cache.tree_field(tube())
+    assert len(built) == 3
+
+
+def test_the_folder_stays_within_its_bound(built, folder, monkeypatch):
+    field_cache.tree_field(tube())
+    (path,) = folder.iterdir()
+    monkeypatch.setattr(field_cache, "KEPT", 2.5 * path.stat().st_size)
+    for number in range(5, 9):
+        field_cache.tree_field(tube(1e-3 * number))
+    assert len(list(folder.iterdir())) == 2
+
+
+def test_a_folder_that_cannot_be_written_to_keeps_nothing(built, folder):
+    folder.parent.write_text("a file")
+    field_cache.tree_field(tube())
+    field_cache.tree_field(tube())
+    assert len(built) == 2
