@@ -30,6 +30,14 @@ def test_round_trip(anatomy, tmp_path):
     assert [end.open for end in again.ends] == [end.open for end in anatomy.ends]
 
 
+def test_the_wall_of_a_tree_is_built_when_it_is_asked_for(anatomy):
+    lazy = Anatomy.from_tree(anatomy.tree, "lazy")
+    assert "wall" not in vars(lazy)
+    assert lazy.wall is lazy.wall and len(lazy.wall) > 100
+    with pytest.raises(AttributeError, match="no 'walls'"):
+        _ = lazy.walls
+
+
 def test_saving_again_leaves_one_geometry(anatomy, tmp_path):
     anatomy.save(tmp_path)
     arch.load("simple2").save(tmp_path)

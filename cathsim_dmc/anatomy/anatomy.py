@@ -50,7 +50,8 @@ class Anatomy:
         tree: centrelines and radii; defines the true lumen.
         surface: triangles of the lumen surface, for looks and for images.
         wall: one array (n_i, 3) of vertices per convex wall piece, metres, world
-            frame; the pieces lie outside the lumen.
+            frame; the pieces lie outside the lumen. None builds those around the tree
+            when they are first asked for.
         inlet: where the device enters.
         goals: places to reach, by name.
         ends: flat ends of the lumen, open or capped.
@@ -67,7 +68,7 @@ class Anatomy:
     field: DepthField | None = None
 
     def __post_init__(self) -> None:
-        wall = tuple(_readonly(piece) for piece in self.wall)
+        wall = tuple(_readonly(piece) for piece in self.wall or ())
         for index, piece in enumerate(wall):
             if piece.ndim != 2 or piece.shape[1] != 3 or len(piece) < 4:
                 raise ValueError(
@@ -78,9 +79,21 @@ class Anatomy:
                 raise ValueError(f"goal {goal.name!r} is filed under {key!r}.")
             self.tree.vessel(goal.vessel)
         self.tree.vessel(self.inlet.vessel)
-        object.__setattr__(self, "wall", wall)
+        if self.wall is None:
+            object.__delattr__(self, "wall")
+        else:
+            object.__setattr__(self, "wall", wall)
         object.__setattr__(self, "goals", dict(self.goals))
         object.__setattr__(self, "ends", tuple(self.ends))
+
+    def __getattr__(self, name: str) -> tuple[Array, ...]:
+        if name != "wall":
+            raise AttributeError(f"an anatomy has no {name!r}.")
+        from cathsim_dmc.anatomy.wall.pieces import build_wall
+
+        wall = tuple(_readonly(piece) for piece in build_wall(self.tree, self.ends))
+        object.__setattr__(self, "wall", wall)
+        return wall
 
     def __repr__(self) -> str:
         """Name, vessels, size, goals and wall in one line."""
@@ -119,13 +132,12 @@ class Anatomy:
                 its vessel; names the vessel.
         """
         from cathsim_dmc.anatomy.surface import lumen_surface
-        from cathsim_dmc.anatomy.wall.pieces import build_wall
 
         if not isinstance(tree, VesselTree):
             tree = smooth_tree(tree, **smoothing)
         tree, ends, entry, places = builder.placed(tree, inlet, goals)
-        surface, wall = lumen_surface(tree), build_wall(tree, ends)
-        return cls(name, tree, surface, wall, entry, places, ends)
+        wall: Any = None
+        return cls(name, tree, lumen_surface(tree), wall, entry, places, ends)
 
     @cached_property
     def lumen(self) -> Field:
