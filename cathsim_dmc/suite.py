@@ -315,6 +315,10 @@ _PHANTOMS = {
 }
 
 
+# What the longest routes to BCA and LCCA need, 0.167 and 0.274 m, see `placement`.
+_ARCH_LENGTHS = {"ascending": 0.24, "descending": placement.COMMON_LENGTH}
+
+
 def _register_published() -> None:
     """Tasks that start in the ascending aorta: published and idealised arches."""
     for anatomy in ("type1", "type2", "simple1", "simple2"):
@@ -353,8 +357,8 @@ def _register_random() -> None:
                     None,
                     goal,
                     access,
-                    # One length for all arches.
-                    options={"working_length": placement.COMMON_LENGTH},
+                    # One length for all arches of the sets, in every pool.
+                    options={"working_length": _ARCH_LENGTHS[access]},
                     random_arch=True,
                 ),
                 "hard",

@@ -11,6 +11,7 @@ from cathsim_dmc import suite
 from cathsim_dmc.anatomy.arch import arch
 from cathsim_dmc.imaging import Fluoroscope, FluoroscopyOptions
 from cathsim_dmc.tasks import observations, route
+from cathsim_dmc.tasks.common_chain import CommonChain
 from cathsim_dmc.tasks.config import NavigationConfig
 
 SIZE = 64
@@ -201,7 +202,7 @@ def test_the_route_ahead_is_that_of_the_centreline_seen_from_the_tip(make):
     goal = frame @ observation["route_goal"] + state.head
     np.testing.assert_allclose(goal, env.task.objective.goal, atol=1e-12)
     device = observation["route_device"].reshape(-1, 3) @ frame.T + state.head
-    shown = observations.tracked(state.centreline)
+    shown = CommonChain(env.task.scene.catheter, 0.0175).tracked(state.centreline)
     np.testing.assert_allclose(device, shown[:-1], atol=1e-12)
 
 

@@ -159,10 +159,17 @@ def test_no_start_is_beyond_a_goal():
                 assert placed.start_depth <= max(0.5 * way, 5e-3)
 
 
-def test_every_registered_task_has_one_chain(shared_environment):
-    tasks = [suite.make_task(name) for name in ("simple2_lcca", "femoral_type3_bca")]
-    tasks.append(shared_environment("type1_bca").task)
-    assert len({len(task.scene.catheter.links) for task in tasks}) == 1
+def test_a_task_simulates_what_its_goal_needs():
+    """The route, 40 mm beyond it, 20 mm in the sheath, and less than one link more."""
+    for name, access in (("type1", "ascending"), ("bovine", "descending")):
+        anatomy = phantoms.load(name, access=access)
+        for goal in anatomy.goals.values():
+            placed = placement.place_device(anatomy, goal, devices.STEERABLE_5F)
+            spare = placed.working_length - anatomy.route(goal).length
+            assert 0.06 <= spare < 0.06 + 0.0169 or placed.working_length < 0.0869
+            # Whole links of the common chain: its joints are joints of every task.
+            links = (placement.COMMON_LENGTH - placed.working_length) / 0.016875
+            assert links == pytest.approx(round(links), abs=1e-6)
 
 
 # Readings.

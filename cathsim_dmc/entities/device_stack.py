@@ -68,7 +68,7 @@ class DeviceStack(Chain):
                 )
         chosen = discretisation or library.Discretisation()
         self._friction, self._lumen_friction = friction, lumen_friction
-        self._stack = Stack(self._devices, self._divide(chosen))
+        self._stack = Stack(self._devices, chosen.link_lengths(*self._devices))
         self._rods = Rods(self._devices, self._stack.nodes, BENDING_RELAXATION_TIME)
         self._gaps = lead * np.arange(len(self._devices), dtype=np.float64)
         overlap = self._stack.overlap(self._gaps[None])
@@ -85,17 +85,6 @@ class DeviceStack(Chain):
             friction=friction,
             name=name,
         )
-
-    def _divide(self, discretisation: library.Discretisation) -> np.ndarray:
-        if len(self._devices) == 1:
-            return discretisation.link_lengths(self._devices[0])
-        # The distal part of the chain has links as short as those of the tips. A shape
-        # proximal of it, under a wire that leads by more, has longer links.
-        end = max(device.tip_length for device in self._devices)
-        shortest = min(device.tip_length / device.tip_links for device in self._devices)
-        links = round(end / shortest)
-        names = " in ".join(repr(device.name) for device in self._devices)
-        return discretisation.divided(end, links, names)
 
     def _axial_stiffness(self) -> float:
         return sum(device.axial_stiffness for device in self._devices)

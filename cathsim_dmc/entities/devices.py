@@ -296,31 +296,30 @@ class Discretisation:
             bounds.number(name, getattr(self, name), positive=True)
         bounds.whole("torsion_joints", self.torsion_joints, 0)
 
-    def link_lengths(self, device: Device) -> np.ndarray:
-        """Lengths (n,) of the links from proximal to distal, m."""
-        return self.divided(device.tip_length, device.tip_links, repr(device.name))
+    def link_lengths(self, *devices: Device) -> np.ndarray:
+        """Lengths (n,) of the links of a chain from proximal to distal, m.
 
-    def divided(self, tip_length: float, tip_links: int, name: str) -> np.ndarray:
-        """Lengths (n,) of the links of a chain with shorter links at its end, m.
+        The distal part of a chain of coaxial devices has links as short as those of
+        their tips. A shape proximal of it, under a wire that leads by more, has longer
+        links.
 
         Args:
-            tip_length: length of that end, m.
-            tip_links: number of its links.
-            name: name of the device, for the error.
+            *devices: one, or coaxial ones.
 
         Raises:
-            ValueError: if the end is as long as the chain.
+            ValueError: if the longest tip is as long as the chain.
         """
+        tip_length = max(device.tip_length for device in devices)
+        shortest = min(device.tip_length / device.tip_links for device in devices)
         shaft_length = self.working_length - tip_length
         if shaft_length <= 0:
+            names = " in ".join(repr(device.name) for device in devices)
             raise ValueError(
                 f"working_length is {self.working_length} m, but the tip of "
-                f"{name} alone takes {tip_length} m"
+                f"{names} alone takes {tip_length} m"
             )
         shaft = math.ceil(round(shaft_length / self.shaft_link, 6))
+        tip = round(tip_length / shortest)
         return np.concatenate(
-            [
-                np.full(shaft, shaft_length / shaft),
-                np.full(tip_links, tip_length / tip_links),
-            ]
+            [np.full(shaft, shaft_length / shaft), np.full(tip, tip_length / tip)]
         )

@@ -31,6 +31,8 @@ from cathsim_dmc.physics.stepper import CONTROL_TIMESTEP
 
 # Where points of a device are tracked, m from its end.
 DEVICE_PLACES = np.arange(7, -1, -1) * 15e-3
+# Length of the straight device behind its base that X-rays meet, m.
+_BEHIND = 0.3
 # Rate of sliding above which the friction between devices acts in full, m/s.
 _SLIDING = 1e-3
 
@@ -68,6 +70,7 @@ class SingleDevice(Effect):
     def __init__(self, chain: Chain):
         """Takes the entity of the device."""
         self._radius = chain.device.outer_radius
+        self._behind = _BEHIND / float(chain.link_lengths[0])  # links
 
     def settle(self, model: mujoco.MjModel) -> None:
         """Writes the properties of the chain at the start into a model."""
@@ -84,7 +87,8 @@ class SingleDevice(Effect):
         Args:
             line: (N, L + 1, 3), `Readings.centreline`.
         """
-        return [Shadow(line, self._radius)]
+        first = line[:, :1] + self._behind * (line[:, :1] - line[:, 1:2])
+        return [Shadow(np.concatenate([first, line], axis=1), self._radius)]
 
     def read(self, readings: Readings) -> CoaxialReadings | None:
         """State of coaxial devices at some readings; None for one alone."""
@@ -328,7 +332,7 @@ class SlidingDevices(SingleDevice):
 
         Args:
             line: (N, L + 1, 3), `Readings.centreline`.
-            places: those beyond the base are the base.
+            places: behind its base the device is straight.
         """
         return self._loops.points(line, places, self._stack.nodes)
 
@@ -341,11 +345,12 @@ class SlidingDevices(SingleDevice):
         nodes = self._stack.nodes
         insertion = self.pushed()
         gaps = self._loops.gaps(insertion)
-        # A device has as many points as the chain: its own nodes, and its end.
+        # A device has one point more than the chain: behind, its own nodes, its end.
         beyond = (nodes < gaps[..., None]).sum(axis=-1, keepdims=True)
         own = np.arange(len(nodes)) - np.maximum(beyond - 1, 0)
         places = np.maximum(nodes[np.maximum(own, 0)], gaps[..., None])
-        points = self.points(line, places)
+        behind = np.full((*places.shape[:2], 1), nodes[0] + _BEHIND)
+        points = self.points(line, np.concatenate([behind, places], axis=-1))
         return [
             Shadow(
                 points[:, k],

@@ -86,7 +86,7 @@ def points(line, places, nodes):
 
     Args:
         line: joints and head, from proximal to distal, m.
-        places: m; those beyond the base are the base.
+        places: m; behind its base the device is straight.
         nodes: (L + 1,), distance of the line's points from the end, m.
     """
     found = np.empty((*places.shape, 3))
@@ -94,7 +94,7 @@ def points(line, places, nodes):
     for i in range(places.shape[0]):
         for k in range(places.shape[1]):
             for p in range(places.shape[2]):
-                place = min(max(places[i, k, p], 0.0), nodes[0])
+                place = max(places[i, k, p], 0.0)
                 # The node behind the place, and the one before it.
                 far = last - 1
                 while far > 0 and nodes[far] <= place:

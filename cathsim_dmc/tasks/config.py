@@ -51,8 +51,8 @@ class NavigationConfig:
         shaft_link: Length of the longest link of the shaft, m.
         torsion_joints: Number of torsion hinges along the shaft; None for 4 with
             rotation and a torsionally rigid shaft without.
-        working_length: Simulated length of the device, m; None for the length that all
-            registered tasks share, or what the goal needs if that is more.
+        working_length: Simulated length of the device, m; None for what the goal needs.
+            Observations have one shape whatever it is.
         physics_timestep: Length of a physics step, s; it divides the control step.
         fluoroscopy: `imaging.FluoroscopyOptions` of the images, or a mapping of its
             fields.

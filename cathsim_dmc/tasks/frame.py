@@ -8,6 +8,7 @@ import numpy as np
 
 from cathsim_dmc.physics import forces, readings
 from cathsim_dmc.physics.sliding import CoaxialReadings
+from cathsim_dmc.tasks.common_chain import CommonChain
 from cathsim_dmc.tasks.route import Ahead
 
 
@@ -40,6 +41,7 @@ class Frame(NamedTuple):
         wall_force: force on the wall over the control step.
         action: (..., A), the last action, zeros after a reset.
         goal: (3,) or (..., 3), m.
+        chain: the device as observations show it.
         images: images of the sensors.
         ahead: route ahead of the tip; None where no observation needs it.
         devices: state of coaxial devices; None for a device alone.
@@ -49,6 +51,7 @@ class Frame(NamedTuple):
     wall_force: forces.WallForce
     action: np.ndarray
     goal: np.ndarray
+    chain: CommonChain
     images: Images = NO_IMAGES
     ahead: Ahead | None = None
     devices: CoaxialReadings | None = None

@@ -10,6 +10,7 @@ from cathsim_dmc.imaging import angiograph as angiographs
 from cathsim_dmc.imaging.device import Shadow
 from cathsim_dmc.imaging.fluoroscopy import Fluoroscope
 from cathsim_dmc.tasks import cameras, observations
+from cathsim_dmc.tasks.common_chain import CommonChain
 from cathsim_dmc.tasks.frame import NO_IMAGES, Images
 
 
@@ -21,6 +22,7 @@ class ImageSensors:
         names: Sequence[str],
         angiograph: angiographs.Angiograph | None,
         num_simulations: int,
+        chain: CommonChain,
         gl_cameras: cameras.Cameras | None = None,
     ):
         """Prepares the sensors.
@@ -29,9 +31,10 @@ class ImageSensors:
             names: Names of the observations.
             angiograph: Angiography machine; None without fluoroscopic observations.
             num_simulations: N.
+            chain: The device as observations show it.
             gl_cameras: MuJoCo's cameras; None without `rgb` and `depth`.
         """
-        self._names = names
+        self._names, self._chain = names, chain
         self._on = angiograph is not None or gl_cameras is not None
         self._cameras = gl_cameras
         self._planes: list[angiographs.Planes] = []
@@ -98,7 +101,7 @@ class ImageSensors:
             self._hold("masks", masks, count, fresh)
         if self._wants("tracking_2d"):
             ends = np.broadcast_to(goal, (count, 3))[chosen, None]
-            points = [observations.tracked(line)]
+            points = [self._chain.tracked(line)]
             if device_points is not None:
                 points.append(device_points[chosen].reshape(len(line), -1, 3))
             points = np.concatenate([*points, ends], axis=-2)

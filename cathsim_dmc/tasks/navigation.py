@@ -15,6 +15,7 @@ from cathsim_dmc.physics.sliding import CoaxialReadings
 from cathsim_dmc.physics.stepper import SingleStepper, Stepper
 from cathsim_dmc.tasks import cameras, cases, observations
 from cathsim_dmc.tasks.actions import check_action
+from cathsim_dmc.tasks.common_chain import CommonChain
 from cathsim_dmc.tasks.config import CONTROL_TIMESTEP, NavigationConfig
 from cathsim_dmc.tasks.objectives import Objective, Shiftable
 from cathsim_dmc.tasks.observation_kind import FrameObservable, Sizes
@@ -168,11 +169,11 @@ class Navigation(composer.Task):
     def observation_specs(self) -> dict[str, dm_env.specs.Array]:
         """Spec of each entry of the observation of one simulation."""
         chain, config = self._scene.catheter, self._config
-        joints = chain.mjcf_model.find_all("joint", exclude_attachments=True)
+        common = CommonChain(chain, config.shaft_link)
         sizes = Sizes(
             actions=self._num_actions,
-            joints=len(joints),
-            links=len(chain.links),
+            joints=common.num_joints,
+            links=common.num_links,
             devices=len(chain.devices) if self._scene.coaxial else 0,
             fluoroscopy=config.fluoroscopy_options,
             cameras=config.camera_options,

@@ -23,8 +23,8 @@ class Sizes:
 
     Attributes:
         actions: entries of an action.
-        joints: joints of the chain.
-        links: links of the chain.
+        joints: joints that are shown, see `common_chain.CommonChain`.
+        links: links that are shown.
         devices: coaxial devices; 0 for a single device.
         fluoroscopy: set-up of the angiography machine.
         cameras: MuJoCo's cameras and the size of their images.

@@ -9,6 +9,7 @@ from operator import attrgetter
 import numpy as np
 
 from cathsim_dmc.physics.sliding import DEVICE_PLACES
+from cathsim_dmc.tasks.common_chain import TRACKED_PLACES
 from cathsim_dmc.tasks.frame import Frame
 from cathsim_dmc.tasks.observation_kind import (
     Entry,
@@ -18,7 +19,7 @@ from cathsim_dmc.tasks.observation_kind import (
 )
 from cathsim_dmc.tasks.route import AHEAD, into_frame
 
-TRACKED_POINTS = 8
+TRACKED_POINTS = len(TRACKED_PLACES)
 SEQUENCE_LENGTH = 3
 
 OBSERVATIONS = ObservationTable()
@@ -42,6 +43,7 @@ def _fluoroscopic(key: str, channels: int, unit: str, meaning: str) -> Entry:
     return Entry(key, shape, unit, meaning, 0, 255, np.uint8)
 
 
+_PLACES = ", ".join(f"{1e3 * place:.4g}" for place in TRACKED_PLACES)
 _POINTS = f"{TRACKED_POINTS} points along the device, proximal to head"
 _OPERATOR = (
     Entry(
@@ -72,14 +74,15 @@ def _flat(array: np.ndarray, axes: int) -> np.ndarray:
         "position",
         _joints,
         "m, rad",
-        "joints in the order of the chain: slide of the base, then hinges",
+        "joints: slides of the base, its rotation, torsion, then the bending hinges; 0 "
+        "for those behind the simulated links",
     ),
     Entry("velocity", _joints, "m/s, rad/s", "of the same joints"),
     Entry(
         "com_inertia",
         lambda sizes: 10 * sizes.links,
         "kg·m², kg·m, kg",
-        "10 numbers a link: inertia about the subtree's centre of mass (`cinert`)",
+        "10 numbers a link: inertia about the device's centre of mass (`cinert`)",
     ),
     Entry(
         "com_velocity",
@@ -98,14 +101,15 @@ def _flat(array: np.ndarray, axes: int) -> np.ndarray:
 )
 def internal(frame: Frame) -> Observation:
     """State of joints and links, as published."""
-    state = frame.readings
+    state, chain = frame.readings, frame.chain
+    inertia, velocity, force = chain.links(state)
     return {
-        "position": state.joint_positions,
-        "velocity": state.joint_velocities,
-        "com_inertia": _flat(state.com_inertia, 2),
-        "com_velocity": _flat(state.com_velocity, 2),
-        "actuator_force": state.actuator_force,
-        "external_force": _flat(state.external_force, 2),
+        "position": chain.joints(state.joint_positions),
+        "velocity": chain.joints(state.joint_velocities),
+        "com_inertia": _flat(inertia, 2),
+        "com_velocity": _flat(velocity, 2),
+        "actuator_force": chain.joints(state.actuator_force),
+        "external_force": _flat(force, 2),
     }
 
 
@@ -142,18 +146,13 @@ def segmentation(frame: Frame) -> Observation:
     return {"segmentation": _captured(frame.images.masks)}
 
 
-def tracked(line: np.ndarray) -> np.ndarray:
-    """Tracked points (..., K, 3) of a centreline (..., n, 3).
-
-    Equidistant joints along the steerable part and the shaft next to it, from
-    proximal to the head.
-    """
-    chosen = np.linspace(line.shape[-2] // 2, line.shape[-2] - 1, TRACKED_POINTS)
-    return line[..., np.round(chosen).astype(int), :]
-
-
 @OBSERVATIONS.row(
-    Entry("tracking_points", 3 * TRACKED_POINTS, "m", f"{_POINTS}, world frame"),
+    Entry(
+        "tracking_points",
+        3 * TRACKED_POINTS,
+        "m",
+        f"{_POINTS}: {_PLACES} mm from the head, world frame",
+    ),
     Entry("tracking_goal", 3, "m", "centre of the goal, world frame"),
     *_OPERATOR,
     joined=("drives", "devices"),
@@ -162,7 +161,7 @@ def tracking(frame: Frame) -> Observation:
     """Points along the device in space, the goal, the insertion, the last action."""
     line = frame.readings.centreline
     return {
-        "tracking_points": _flat(tracked(line), 2),
+        "tracking_points": _flat(frame.chain.tracked(line), 2),
         "tracking_goal": np.broadcast_to(frame.goal, (*line.shape[:-2], 3)),
         **_operator(frame),
     }
@@ -227,7 +226,7 @@ def route(frame: Frame) -> Observation:
     ahead, state = frame.ahead, frame.readings
     assert ahead is not None
     head, axes = state.head[..., None, :], state.head_frame
-    device = tracked(state.centreline)[..., :-1, :] - head
+    device = frame.chain.tracked(state.centreline)[..., :-1, :] - head
     goal = np.broadcast_to(frame.goal, state.head.shape)[..., None, :] - head
     return {
         "route_points": _flat(ahead.points, 2),

@@ -1,6 +1,7 @@
 """Where device, sheath and robot stand in an anatomy, and where the goal is."""
 
 import dataclasses
+import math
 
 import mujoco
 import numpy as np
@@ -17,11 +18,13 @@ _LEAST_START_DEPTH = 0.005  # m
 # At the start the head has come no further than this part of the way to the first
 # branching, to the end of the vessel and to the goal, so that all of them lie ahead.
 _LARGEST_SHARE = 0.5
-# Way beyond the goal that the stroke leaves for bends, detours and wrong branches.
-_SPARE_STROKE = 0.08  # m
+# Way beyond the goal that the stroke leaves for detours and wrong branches: half a turn
+# along the outer wall of an arch of 14 mm radius is 41 mm longer than its centreline.
+# The way of a device that arrives is shorter than the centreline.
+_SPARE_STROKE = 0.04  # m
 _BASE_LENGTH = 0.02  # m of device that never leaves the sheath
-# One chain for every registered task, so that observations have one shape and a policy
-# of one task can be tried on any other; longer where a goal lies farther away.
+# Length of the device that observations show, see `common_chain`. It is divided into
+# links; a task simulates as many of the distal ones as can leave the sheath.
 COMMON_LENGTH = 0.34  # m
 _LINE_SPACING = 1e-3  # m
 # The wall is 4 mm thick; nearer to the inlet the sheath touches the inlet's own.
@@ -99,8 +102,7 @@ def place_device(
         anatomy: Anatomy to navigate.
         goal: Goal that the device must be able to reach.
         device: Device; the length of its tip decides how far it starts inside.
-        working_length: Simulated length, m; None for the common one, or what the goal
-            needs if that is more.
+        working_length: Simulated length, m; None for what the goal needs.
         farthest_shift: How far past its place the goal may be shifted, m.
 
     Raises:
@@ -115,8 +117,8 @@ def place_device(
         max(_LARGEST_SHARE * way, _LEAST_START_DEPTH),
     )
     if working_length is None:
-        stroke = max(route.length - start_depth, 0.0) + _SPARE_STROKE
-        working_length = max(start_depth + stroke + _BASE_LENGTH, COMMON_LENGTH)
+        needed = max(route.length, start_depth) + _SPARE_STROKE + _BASE_LENGTH
+        working_length = _whole_links(needed, device)
     stroke = working_length - start_depth - _BASE_LENGTH
     least = max(start_depth + _BASE_LENGTH, device.tip_length)
     # Also false for NaN.
@@ -147,6 +149,14 @@ def place_device(
         working_length=working_length,
         line=line,
     )
+
+
+def _whole_links(length: float, device: devices.Device) -> float:
+    """The length, or a little more, that whole links of the common chain have, m."""
+    common = devices.Discretisation(max(COMMON_LENGTH, 2 * device.tip_length))
+    link = common.link_lengths(device)[0]
+    count = math.ceil(round((length - device.tip_length) / link, 6))
+    return device.tip_length + max(count, 1) * link
 
 
 def sheath_direction(anatomy: Anatomy) -> np.ndarray | None:

@@ -20,6 +20,7 @@ from cathsim_dmc.physics.sliding import CoaxialReadings, SingleDevice
 from cathsim_dmc.physics.stepper import Stepper
 from cathsim_dmc.tasks import observations
 from cathsim_dmc.tasks.cases import Case, model_index
+from cathsim_dmc.tasks.common_chain import CommonChain
 from cathsim_dmc.tasks.config import NavigationConfig
 from cathsim_dmc.tasks.frame import NO_IMAGES, Frame
 from cathsim_dmc.tasks.image_sensors import ImageSensors, open_cameras
@@ -101,10 +102,12 @@ class Rollout:
         self._routes: Routes | None = None
         if observations.needs(self._names, "routed"):
             self._routes = Routes([case.objective for case in cases])
+        self._chain = CommonChain(scene.catheter, config.shaft_link)
         self._sensors = ImageSensors(
             self._names,
             cases[0].angiograph,
             num_simulations,
+            self._chain,
             open_cameras(self._names, model, config.camera_options, catheter),
         )
         self._monitor = PhysicsMonitor(scene, num_simulations)
@@ -282,9 +285,8 @@ class Rollout:
         state, ahead = self.readings, None
         if self._routes is not None:
             ahead = self._routes.ahead(self._case_of, state.head, state.head_frame)
-        frame = Frame(
-            state, self.wall_force, self._action, goal, images, ahead, devices
-        )
+        force, chain = self.wall_force, self._chain
+        frame = Frame(state, force, self._action, goal, chain, images, ahead, devices)
         return observations.observe(self._names, frame)
 
     # Snapshots.

@@ -16,6 +16,7 @@ from cathsim_dmc.physics.randomisation import DEFAULT_RANGES, Randomisation
 from cathsim_dmc.tasks import observations
 from cathsim_dmc.tasks.cameras import CAMERAS, CameraOptions
 from cathsim_dmc.tasks.observation_kind import Entry
+from cathsim_dmc.tasks.placement import COMMON_LENGTH
 
 OUTPUT = Path(__file__).parents[1] / "observations.md"
 TASK = "type1_bca"
@@ -35,9 +36,14 @@ env = suite.load("cathsim", "{TASK}", task_kwargs={{
 ```
 
 The world frame is that of the patient (LPS): +x to the patient's left, +y posterior,
-+z superior. Joints and links run from proximal to distal; their number depends on the
-device and on the length that a task needs. Positions and velocities of joints are those
-at the end of the control step, all other values those of its last physics step.
++z superior. Joints and links run from proximal to distal. Positions and velocities of
+joints are those at the end of the control step, all other values those of its last
+physics step.
+
+A task simulates what can leave the sheath (`working_length`, 0.14 to 0.32 m).
+Observations show a device of {COMMON_LENGTH:g} m, so their shapes depend on the device
+alone: behind the simulated links the device is straight and moves with its base, its
+hinges are 0 and nothing touches it. Of a longer device they show the distal part.
 """
 
 COAXIAL = f"""

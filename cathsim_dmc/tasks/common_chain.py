@@ -1,0 +1,118 @@
+"""The device as observations show it, whatever length of it is simulated.
+
+A task simulates what can leave the sheath. Observations show a device of
+`COMMON_LENGTH`, so they have one shape: behind the simulated links the device is
+straight and moves with its base.
+"""
+
+import numpy as np
+
+from cathsim_dmc.entities.chain import Chain
+from cathsim_dmc.entities.devices import Discretisation
+from cathsim_dmc.physics.readings import Readings
+from cathsim_dmc.tasks.placement import COMMON_LENGTH
+
+# Distances of the tracked points from the head, m. They are joints of the steerable
+# device, whose links are 7 mm long in the tip and 16.9 mm in the shaft.
+TRACKED_PLACES = np.array([120.625, 86.875, 63.0, 49.0, 42.0, 28.0, 14.0, 0.0]) * 1e-3
+
+_LEAST_MASS = 1e-12  # kg
+# (3, 9): v @ _ACROSS is the matrix of which u @ matrix is the cross product u x v.
+_ACROSS = np.cross(np.eye(3)[:, None], np.eye(3)).transpose(1, 0, 2).reshape(3, 9)
+# (9, 6), from products of coordinates to (xx, yy, zz, xy, xz, yz) of an inertia.
+_PARALLEL = np.zeros((9, 6))
+_PARALLEL[[4, 8, 0, 8, 0, 4], [0, 0, 1, 1, 2, 2]] = 1.0
+_PARALLEL[[1, 3, 2, 6, 5, 7], [3, 3, 4, 4, 5, 5]] = -0.5
+
+
+class CommonChain:
+    """Joints, links and tracked points of a device of `COMMON_LENGTH`.
+
+    A longer chain is cut: the observation then shows its distal links.
+
+    Attributes:
+        num_links: L, number of links that observations show.
+        num_joints: J, number of joints that they show.
+    """
+
+    def __init__(self, chain: Chain, shaft_link: float):
+        """Finds the places of the simulated joints and links.
+
+        Args:
+            chain: entity of the devices.
+            shaft_link: longest link of the shaft, m.
+        """
+        tip = max(device.tip_length for device in chain.devices)
+        whole = Discretisation(max(COMMON_LENGTH, 2 * tip), shaft_link)
+        self.num_links = len(whole.link_lengths(*chain.devices))
+        lengths = chain.link_lengths
+        self._behind = max(self.num_links - len(lengths), 0)
+        behind = np.arange(self._behind, self._behind - self.num_links, -1)
+        # The simulated link that each link continues, and by how many of its lengths.
+        self._links = np.maximum(-behind, 0)
+        self._steps = np.maximum(behind, 0)[:, None]
+        self._touched = behind[:, None] <= 0
+
+        names = [joint.full_identifier for joint in chain.joints]
+        bends = [names.index(joint.full_identifier) for joint in chain.bends]
+        others = [place for place in range(len(names)) if place not in bends]
+        shown = 2 * (self.num_links - 1)
+        missing = [len(names)] * (shown - len(bends))
+        # Places in the simulated joints; the place past the last one stands for zero.
+        self._joints = np.array([*others, *missing, *bends[-shown:]])
+        self.num_joints = len(self._joints)
+
+        nodes = np.append(np.cumsum(lengths[::-1])[::-1], 0.0)
+        # The link that each place lies on; the first one continues behind the base.
+        after = np.sum(nodes[1:-1, None] > TRACKED_PLACES + 1e-9, axis=0)
+        share = (nodes[after] - TRACKED_PLACES) / (nodes[after] - nodes[after + 1])
+        self._after = after
+        self._share = np.round(share, 9)[:, None]  # without rounding errors at joints
+
+    def joints(self, values: np.ndarray) -> np.ndarray:
+        """Values (..., J) of the joints shown, from those (..., j) of the chain.
+
+        Base and torsion come first, then the bending hinges, of which those behind the
+        simulated links are 0.
+        """
+        zero = np.zeros((*values.shape[:-1], 1))
+        return np.concatenate([values, zero], axis=-1)[..., self._joints]
+
+    def links(self, state: Readings) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Inertia (N, L, 10), velocity and force (N, L, 6) of the links shown.
+
+        They are MuJoCo's `cinert`, `cvel` and `cfrc_ext`, about the centre of mass of
+        the whole device. Links behind the simulated ones continue the first of these;
+        nothing touches them.
+
+        Args:
+            state: readings of N simulations.
+        """
+        if not self._behind:
+            arrays = state.com_inertia, state.com_velocity, state.external_force
+            inertia, velocity, force = (a[:, -self.num_links :] for a in arrays)
+            return inertia, velocity, force
+        inertia = state.com_inertia[:, self._links]
+        velocity = state.com_velocity[:, self._links]
+        force = state.external_force[:, self._links] * self._touched
+        mass, place = inertia[..., 9:], inertia[..., 6:9]
+        behind = self._steps * (state.centreline[:, :1] - state.centreline[:, 1:2])
+        # From the centre of mass of the simulated links to that of all links; before
+        # the first episode nothing has a mass.
+        total = np.maximum(mass.sum(axis=1), _LEAST_MASS)
+        shift = (place + mass * behind).sum(axis=1) / total
+        # Theorem of parallel axes.
+        way = behind - shift[:, None]
+        sums = 2 * place + mass * way
+        place += mass * way
+        products = (way[..., None] * sums[..., None, :]).reshape(*mass.shape[:2], 9)
+        inertia[..., :6] += products @ _PARALLEL
+        across = (shift @ _ACROSS).reshape(-1, 3, 3)
+        velocity[..., 3:] += velocity[..., :3] @ across
+        force[..., :3] += force[..., 3:] @ across
+        return inertia, velocity, force
+
+    def tracked(self, line: np.ndarray) -> np.ndarray:
+        """Tracked points (..., K, 3) of a centreline (..., l + 1, 3), the head last."""
+        start, stop = line[..., self._after, :], line[..., self._after + 1, :]
+        return start + self._share * (stop - start)
