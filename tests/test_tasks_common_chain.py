@@ -72,6 +72,16 @@ def test_a_short_chain_shows_what_a_long_one_shows(states):
     np.testing.assert_allclose(offset, [0, 0, -6 * LINK], atol=1e-12)
 
 
+def test_a_simulation_shows_the_same_bits_alone_and_beside_others(states):
+    (common, state), _ = states
+    random = np.random.default_rng(1)
+    several = Readings(
+        *(np.concatenate([a, *random.normal(size=(4, *a.shape))]) for a in state)
+    )
+    for one, both in zip(common.links(state), common.links(several), strict=True):
+        np.testing.assert_array_equal(one[0], both[0])
+
+
 def test_tracked_points_are_joints_of_the_steerable_device(states):
     for common, state in states:
         points = common.tracked(state.centreline)[0]

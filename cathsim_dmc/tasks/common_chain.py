@@ -92,9 +92,10 @@ class CommonChain:
             arrays = state.com_inertia, state.com_velocity, state.external_force
             inertia, velocity, force = (a[:, -self.num_links :] for a in arrays)
             return inertia, velocity, force
-        inertia = state.com_inertia[:, self._links]
-        velocity = state.com_velocity[:, self._links]
-        force = state.external_force[:, self._links] * self._touched
+        # Taken, not indexed: in one order of memory, and so added up in one order.
+        inertia = state.com_inertia.take(self._links, axis=1)
+        velocity = state.com_velocity.take(self._links, axis=1)
+        force = state.external_force.take(self._links, axis=1) * self._touched
         mass, place = inertia[..., 9:], inertia[..., 6:9]
         behind = self._steps * (state.centreline[:, :1] - state.centreline[:, 1:2])
         # From the centre of mass of the simulated links to that of all links; before
