@@ -80,13 +80,8 @@ class TrainingConfig:
             simulation is always on the CPU.
         torch_threads: Number of threads of one torch operation. One is fastest for
             the small published MLP; images profit from all cores.
-        rerun: Whether to record an episode of every checkpoint, and the curves, into
-            training.rrd of the run; the training waits for the episode.
-        rerun_every: Number of checkpoints for each of which one is recorded.
-        rerun_steps: Number of control steps after which such an episode is cut off.
-        rerun_viewer: Viewer that shows it too: "spawn" opens one, "connect" takes the
-            one that is open on this machine; or an address,
-            "rerun+http://HOST:PORT/proxy". None for none.
+        rerun: Whether to record an episode of every checkpoint into the directory
+            recordings of the run; the training waits for the episode.
         collector: Where the simulations are: "local", in this process, or "ray", in
             processes of a Ray cluster (needs the `ray` extra).
         collectors: Number of these processes, which share the simulations.
@@ -109,9 +104,6 @@ class TrainingConfig:
             "torch_threads",
             "torch_device",
             "rerun",
-            "rerun_every",
-            "rerun_steps",
-            "rerun_viewer",
             "collector",
             "collectors",
         }
@@ -147,9 +139,6 @@ class TrainingConfig:
     torch_device: str = "cpu"
     torch_threads: int = positive(1)
     rerun: bool = False
-    rerun_every: int = positive(1)
-    rerun_steps: int = positive(300)
-    rerun_viewer: str | None = None
     collector: Literal["local", "ray"] = "local"
     collectors: int = positive(2)
 

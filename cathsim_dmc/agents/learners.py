@@ -15,6 +15,10 @@ from cathsim_dmc.agents.ppo import PPO, PPOConfig
 from cathsim_dmc.agents.sac import SAC, SACConfig
 
 
+# Fields of configs in older files that mean nothing any more.
+_RETIRED = frozenset({"rerun_every", "rerun_steps", "rerun_viewer"})
+
+
 class Algorithm(NamedTuple):
     """Settings and learner of one algorithm."""
 
@@ -49,12 +53,12 @@ def make_config(
 
 
 def config_from_dict(values: Mapping[str, Any]) -> TrainingConfig:
-    """The inverse of TrainingConfig.to_dict.
+    """The inverse of TrainingConfig.to_dict; reads older configs, too.
 
     Raises:
         ConfigError: unknown algorithm or field, or a value not allowed.
     """
-    values = dict(values)
+    values = {name: one for name, one in values.items() if name not in _RETIRED}
     kind = _choice(LEARNERS, values.pop("algorithm", None), "algorithm").config
     return kind.from_dict(values)
 

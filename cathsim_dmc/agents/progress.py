@@ -8,17 +8,20 @@ from tqdm import tqdm
 
 # Seconds between two lines in a log file, where no terminal redraws them.
 LINE_INTERVAL = 15.0
+_LINE = "{desc}: {n_fmt} of {total_fmt}{unit} [{elapsed}, {rate_fmt}{postfix}]\n"
 
 
 def progress_bar(label: str, unit: str, **options: Any) -> tqdm:
-    """A bar of tqdm that a log file gets every 15 s."""
-    interval = 0.1 if sys.stderr.isatty() else LINE_INTERVAL
+    """A bar of tqdm; a log file gets a line every 15 s."""
+    terminal = sys.stderr.isatty()
+    interval = 0.1 if terminal else LINE_INTERVAL
     return tqdm(
         desc=label,
         unit=unit,
         mininterval=interval,
         maxinterval=max(interval, 10.0),
-        dynamic_ncols=True,
+        dynamic_ncols=terminal,
+        bar_format=None if terminal else _LINE,
         **options,
     )
 

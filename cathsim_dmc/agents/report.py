@@ -2,12 +2,14 @@
 
 import dataclasses
 import functools
+import logging
 import time
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 from torchrl.envs import EnvBase
 
 from cathsim_dmc import bounds, files, suite
@@ -22,6 +24,8 @@ from cathsim_dmc.recording import recorder, rerun_log
 from cathsim_dmc.recording.episode import Episode
 from cathsim_dmc.recording.scene import body_geoms
 from cathsim_dmc.tasks.snapshot import Snapshot
+
+CHECKPOINT_STEPS = 300  # longest episode that is recorded of a checkpoint
 
 
 @dataclasses.dataclass(frozen=True)
@@ -170,7 +174,7 @@ def evaluate(
     episodes = episodes if snapshot is None else len(snapshot)
     evaluation.check_numbers(episodes, seed, num_threads)
     player = policies.load_policy(policy, seed)
-    _require_registered(evaluation.require_task(player, task))
+    require_registered(evaluation.require_task(player, task))
     if out_dir is not None:
         # Now: an evaluation that cannot be written would be lost.
         Path(out_dir).mkdir(parents=True, exist_ok=True)
@@ -221,7 +225,8 @@ def _draw_heatmap(
     )
 
 
-def _require_registered(task: str) -> None:
+def require_registered(task: str) -> None:
+    """Raise ValueError unless a task is one of the suite."""
     if task not in suite.SUITE:
         raise ValueError(f"no task {task!r}; there are {', '.join(suite.SUITE)}")
 
@@ -265,7 +270,7 @@ def record(
         bounds.whole("max_steps", max_steps, 1)
     player = policies.load_policy(policy, seed)
     task = evaluation.require_task(player, task)
-    _require_registered(task)
+    require_registered(task)
     # Now: an episode that cannot be written would be lost.
     for target in targets.values():
         target.parent.mkdir(parents=True, exist_ok=True)
@@ -281,6 +286,27 @@ def record(
     if "gif" in targets:
         animate(episode, environment.task.scene.anatomy.surface, targets["gif"])
     return episode
+
+
+def record_checkpoint(run: Path, checkpoint: Path) -> None:
+    """Records the first episode of the evaluation with a checkpoint of a training.
+
+    Random numbers of the training are not drawn; an error is logged and ends nothing.
+
+    Args:
+        run: Directory of the run; recordings/<frames>.rrd in it is written.
+        checkpoint: Directory of the checkpoint.
+    """
+    out = run / "recordings" / f"{checkpoint.name}.rrd"
+    if out.exists():
+        return
+    try:
+        with torch.random.fork_rng(devices=[]):
+            record(checkpoint, out, max_steps=CHECKPOINT_STEPS, fluoroscopy=False)
+    except Exception:
+        logging.getLogger(__name__).exception(
+            "checkpoint %s is not recorded, the training goes on", checkpoint.name
+        )
 
 
 def _targets(out: str | Path | None, gif: str | Path | None) -> dict[str, Path]:

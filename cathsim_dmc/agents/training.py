@@ -23,7 +23,6 @@ from cathsim_dmc.agents.checkpoint import (
     checkpoints_in,
     save_checkpoint,
 )
-from cathsim_dmc.agents.checkpoint_recorder import CheckpointRecorder
 from cathsim_dmc.agents.collectors import COLLECTORS, BatchSource, check_collector
 from cathsim_dmc.agents.config import ConfigError, TrainingConfig
 from cathsim_dmc.agents.episodes import INFO, EpisodeTracker
@@ -103,7 +102,10 @@ def train(
     run = Path(out_dir)
     _require_device(config.torch_device)
     check_collector(config)
-    recorder = CheckpointRecorder(run, config) if config.rerun else None
+    if config.rerun:
+        from cathsim_dmc.agents import report  # loads matplotlib
+
+        report.require_registered(config.task)
     with contextlib.ExitStack() as stack:
         stack.enter_context(_only_process(run))
         stack.enter_context(_naming_what_is_safe(run))
@@ -136,11 +138,11 @@ def train(
         stack.callback(log.close)
         interruption = stack.enter_context(Interruption())
         newest = checkpoint.path if checkpoint else None
-        loop = _Loop(run, config, source, learner, log, recorder, newest)
+        loop = _Loop(run, config, source, learner, log, newest)
         while log.frames < config.total_frames and not interruption.requested:
             loop.step(interruption)
         # However it ended; writes nothing if the last batch has just been saved.
-        newest = loop.save(last=True)
+        newest = loop.save()
         short = log.frames < config.total_frames
         return TrainingResult(run, newest, log.frames, log.seconds, short, log.row)
 
@@ -304,7 +306,6 @@ class _Loop:
     source: BatchSource
     learner: Learner
     log: TrainingLog
-    recorder: CheckpointRecorder | None
     newest: Path | None
 
     def __post_init__(self):
@@ -337,8 +338,8 @@ class _Loop:
         ):
             self.save()
 
-    def save(self, last: bool = False) -> Path:
-        """Write a checkpoint, the last one or not; return its directory."""
+    def save(self) -> Path:
+        """Write a checkpoint; return its directory."""
         self.newest = save_checkpoint(
             self.run,
             config=self.config,
@@ -354,8 +355,10 @@ class _Loop:
             },
         )
         self._frames, self._time = self.log.frames, time.monotonic()
-        if self.recorder is not None:
-            self.recorder.saved(self.newest, last)
+        if self.config.rerun:
+            from cathsim_dmc.agents import report
+
+            report.record_checkpoint(self.run, self.newest)
         return self.newest
 
 

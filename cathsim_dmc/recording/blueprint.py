@@ -3,16 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 import numpy as np
 import rerun.blueprint as rrb
-from rerun.blueprint.components import AbsoluteTimeRange
 
 TIMELINE_TIME = "sim_time"
 TIMELINE_STEP = "step"
-# Of the recording of a training: frames seen, counted on through an episode's states.
-TIMELINE_FRAMES = "frames"
 # Entities of the X-ray planes, frontal first.
 FLUOROSCOPY = ("fluoroscopy", "fluoroscopy_lateral")
 _PLANE_NAMES = ("Fluoroscopy, frontal", "Fluoroscopy, second plane")
@@ -111,73 +107,17 @@ def comparison_blueprint(
     return _page(rrb.Horizontal(left, rrb.Vertical(*plots), column_shares=[3, 2]))
 
 
-def training_blueprint(
-    centre: Sequence[float],
-    extent: float,
-    head: Sequence[float],
-    *,
-    newest: tuple[int, int],
-    window: int,
-    distance: bool,
-    plots: Mapping[str, str],
-    learner: Mapping[str, str],
-) -> rrb.Blueprint:
-    """Return the layout of a training: its newest episode, and its curves.
-
-    Args:
-        centre: (3,) point the eye looks at, world frame (LPS), metres.
-        extent: Largest side of the scene in metres.
-        head: (3,) where the head is at first, metres.
-        newest: First and last frame of the newest episode, which is played over and
-            over.
-        window: Number of frames about the cursor that plots of an episode show, and
-            before it whose path and contacts the scene shows.
-        distance: Whether the recording has ``series/distance_mm``.
-        plots: Entity paths of the curves of the training by the title of their plot.
-        learner: Entity paths of the learner's figures likewise.
-    """
-    shown = rrb.VisibleTimeRanges([_about(-window, 0)])
-    scene = rrb.Vertical(
-        _scene(np.asarray(centre, dtype=np.float64), extent, shown=shown),
-        _tip(np.asarray(head, dtype=np.float64), shown),
-        row_shares=[3, 2],
-    )
-    series = {"Force, mN": "series/force", "Reward and its terms": "series/reward"}
-    if distance:
-        series = {"Distance to goal, mm": "series/distance_mm", **series}
-    episode = rrb.Vertical(
-        *(
-            rrb.TimeSeriesView(
-                origin=origin, name=name, time_ranges=_about(-window, window)
-            )
-            for name, origin in series.items()
-        ),
-        rrb.Tabs(
-            rrb.TextDocumentView(origin="info", name="Episode"),
-            rrb.TextLogView(origin="events", name="Events"),
-        ),
-    )
-    curves = rrb.Vertical(
-        *(_plot(name, origin, legend=True) for name, origin in plots.items()),
-        rrb.Tabs(*(_plot(name, origin) for name, origin in learner.items())),
-    )
-    return _page(
-        rrb.Horizontal(scene, episode, curves, column_shares=[4, 3, 3]),
-        timeline=TIMELINE_FRAMES,
-        # Frames of the fluoroscopy a second, as fast as it was.
-        fps=25.0,
-        loop_mode="selection",
-        time_selection=AbsoluteTimeRange(*newest),
-    )
-
-
-def _page(content: rrb.Container, **time: Any) -> rrb.Blueprint:
-    playing = {"timeline": TIMELINE_TIME, "loop_mode": "all", **time}
+def _page(content: rrb.Container) -> rrb.Blueprint:
     return rrb.Blueprint(
         content,
         rrb.BlueprintPanel(state="collapsed"),
         rrb.SelectionPanel(state="collapsed"),
-        rrb.TimePanel(state="collapsed", play_state="playing", **playing),
+        rrb.TimePanel(
+            state="collapsed",
+            play_state="playing",
+            timeline=TIMELINE_TIME,
+            loop_mode="all",
+        ),
         auto_views=False,
         auto_layout=False,
     )
@@ -197,17 +137,10 @@ def _so_far() -> rrb.VisibleTimeRanges:
     )
 
 
-def _about(first: int, last: int) -> rrb.VisibleTimeRange:
-    """So many frames of a training before and after the cursor."""
-    ends = [rrb.TimeRangeBoundary.cursor_relative(seq=end) for end in (first, last)]
-    return rrb.VisibleTimeRange(TIMELINE_FRAMES, start=ends[0], end=ends[1])
-
-
 def _scene(
     centre: np.ndarray,
     extent: float,
     devices: Sequence[str] = ("world/catheter",),
-    shown: rrb.VisibleTimeRanges | None = None,
 ) -> rrb.Spatial3DView:
     entities = [*(f"{device}/trail" for device in devices), "world/heat"]
     return rrb.Spatial3DView(
@@ -222,13 +155,11 @@ def _scene(
         ),
         background=_BACKGROUND,
         line_grid=False,
-        overrides={entity: shown or _so_far() for entity in entities},
+        overrides={entity: _so_far() for entity in entities},
     )
 
 
-def _tip(
-    head: np.ndarray, heat: rrb.VisibleTimeRanges | None = None
-) -> rrb.Spatial3DView:
+def _tip(head: np.ndarray) -> rrb.Spatial3DView:
     """The neighbourhood of the tip, which the eye follows."""
     return rrb.Spatial3DView(
         origin="world",
@@ -243,7 +174,7 @@ def _tip(
         ),
         background=_BACKGROUND,
         line_grid=False,
-        overrides={"world/heat": heat or _so_far()},
+        overrides={"world/heat": _so_far()},
     )
 
 

@@ -83,13 +83,8 @@ def log_episode(
     """Send all of an episode to a stream; arguments as in `write_rrd`."""
     log = Log(stream, episode)
     log_static(log, drawing)
-    log_motion(log, drawing)
     if drawing.frames is not None:
         log_frames(log, drawing.frames, lossless)
-
-
-def log_motion(log: Log, drawing: Drawing) -> None:
-    """Send what moves and what is measured: device, robot, contacts, series, events."""
     log_catheter(log, drawing.radii)
     log_bodies(log, drawing.geoms)
     log_contacts(log)
@@ -102,7 +97,6 @@ def write_recording(
     layout: Blueprint,
     title: str,
     fill: Callable[[rr.RecordingStream], None],
-    recording_id: str | None = None,
 ) -> None:
     """Write a recording, whole or not at all.
 
@@ -111,13 +105,12 @@ def write_recording(
         layout: How the viewer opens it.
         title: Name of the recording.
         fill: Function that logs everything into the stream.
-        recording_id: Identity of the recording; None makes a new one.
 
     Raises:
         RuntimeError: if Rerun is switched off by the ``RERUN`` environment variable.
     """
     with atomic_path(path, SUFFIX) as temporary:
-        stream = rr.RecordingStream(APPLICATION_ID, recording_id=recording_id)
+        stream = rr.RecordingStream(APPLICATION_ID)
         if not stream.is_enabled():
             raise RuntimeError(
                 "Rerun is switched off; unset the environment variable RERUN"

@@ -21,13 +21,8 @@ SEE_THROUGH = {"sheath": 0.3}
 
 def log_static(log: Log, drawing: Drawing) -> None:
     """Log vessel, goal, directions and the page of text."""
-    log_surroundings(log, drawing)
     text = rr.TextDocument(episode_markdown(log.episode), media_type="text/markdown")
     log.static("info", text)
-
-
-def log_surroundings(log: Log, drawing: Drawing) -> None:
-    """Log vessel, goal and directions."""
     vertices, faces = drawing.vertices, drawing.faces
     # Patient frame LPS: x to the patient's left, y to the back, z up.
     log.static("world", rr.ViewCoordinates.LBU)
@@ -66,12 +61,11 @@ def log_bodies(log: Log, geoms: tuple[BodyGeom, ...]) -> None:
         position = episode.body_pos[:, body]
         quaternion = xyzw(episode.body_quat[:, body])
         moves = np.ptp(position, axis=0).any() or np.ptp(quaternion, axis=0).any()
-        if moves or log.follows:
-            rows = slice(None) if moves else slice(0, 1)
-            columns = rr.Transform3D.columns(
-                translation=position[rows], quaternion=quaternion[rows]
+        if moves:
+            log.columns(
+                entity,
+                rr.Transform3D.columns(translation=position, quaternion=quaternion),
             )
-            log.columns(entity, columns, rows)
         else:
             log.static(
                 entity,

@@ -7,11 +7,7 @@ from typing import Any
 import numpy as np
 import rerun as rr
 
-from cathsim_dmc.recording.blueprint import (
-    TIMELINE_FRAMES,
-    TIMELINE_STEP,
-    TIMELINE_TIME,
-)
+from cathsim_dmc.recording.blueprint import TIMELINE_STEP, TIMELINE_TIME
 from cathsim_dmc.recording.episode import Episode
 
 
@@ -21,8 +17,6 @@ class Log:
     Attributes:
         stream: Where to.
         episode: Whose states the rows are.
-        follows: Whether the same entities show other episodes at other times, so that
-            what stands still in this one may move in those.
     """
 
     def __init__(
@@ -30,7 +24,6 @@ class Log:
         stream: rr.RecordingStream,
         episode: Episode,
         from_zero: bool = False,
-        begin: int | None = None,
     ) -> None:
         """Takes the times of the episode.
 
@@ -38,16 +31,10 @@ class Log:
             stream: Where to.
             episode: Whose states the rows are.
             from_zero: Whether time begins at 0, so that episodes can be compared.
-            begin: Number of frames that a training has seen, from which the states
-                are counted on instead of their times; None for an episode by itself.
         """
         self.stream = stream
         self.episode = episode
-        self.follows = begin is not None
         steps = np.arange(episode.steps + 1)
-        if begin is not None:
-            self._indexes = {TIMELINE_FRAMES: begin + steps}
-            return
         time = episode.time - episode.time[0] if from_zero else episode.time
         # Rounded here, since Rerun truncates 0.12 s to 119,999,999 ns.
         times = np.round(time * 1e9).astype("timedelta64[ns]")

@@ -11,7 +11,7 @@ import sys
 import threading
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from urllib.parse import quote, urlsplit
+from urllib.parse import quote
 
 # First bytes of every recording of the current format.
 _MAGIC = b"RRF2"
@@ -20,9 +20,6 @@ _FOOTER, _FOOTER_AT = b"RRF2FOOT", -12
 _SUFFIX = ".rrd"
 LOOPBACK = "127.0.0.1"
 WEB_PORT = 9090
-# Where a viewer listens by default for what is logged.
-LIVE_ADDRESS = "rerun+http://127.0.0.1:9876/proxy"
-_LIVE_PATIENCE = 5.0  # s
 
 
 class ViewerError(RuntimeError):
@@ -152,47 +149,6 @@ def _wait(command: list[str], environment: Mapping[str, str]) -> int:
     finally:
         if handled:
             signal.signal(signal.SIGTERM, previous)
-
-
-def live_address(viewer: str) -> str:
-    """The address of a viewer that takes what is logged while it is logged.
-
-    Args:
-        viewer: "spawn" opens a viewer on this machine; "connect" takes the one that is
-            open there; anything else is an address, ``rerun+http://HOST:PORT/proxy``.
-
-    Raises:
-        ViewerError: there is no display to open a viewer on, or none is installed, or
-            none listens at the address.
-    """
-    if viewer == "spawn":
-        if not has_display():
-            raise ViewerError(
-                "no display to open a viewer on; record to the file alone, or connect "
-                "to a viewer on a machine with a screen"
-            )
-        import rerun as rr
-
-        rr.spawn(connect=False, executable_path=_executable())
-    address = LIVE_ADDRESS if viewer in ("spawn", "connect") else viewer
-    parts = urlsplit(address)
-    try:
-        place = (parts.hostname or "", parts.port or 0)
-    except ValueError:
-        place = ("", 0)
-    if not parts.scheme.startswith("rerun") or not all(place):
-        raise ViewerError(
-            f"{viewer!r} is no address of a viewer; give spawn, connect, or an address "
-            f"such as {LIVE_ADDRESS}"
-        )
-    try:
-        socket.create_connection(place, timeout=_LIVE_PATIENCE).close()
-    except OSError as error:
-        raise ViewerError(
-            f"no viewer listens at {address} ({error.strerror or error}); open one "
-            "with `rerun`, or leave the viewer out: the file holds the same"
-        ) from error
-    return address
 
 
 def _executable() -> str:
