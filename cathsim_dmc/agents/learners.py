@@ -14,7 +14,6 @@ from cathsim_dmc.agents.networks import NetworkShapes
 from cathsim_dmc.agents.ppo import PPO, PPOConfig
 from cathsim_dmc.agents.sac import SAC, SACConfig
 
-
 # Fields of configs in older files that mean nothing any more.
 _RETIRED = frozenset({"rerun_every", "rerun_steps", "rerun_viewer"})
 

@@ -233,7 +233,6 @@ def replay(
 def play(
     task: Task,
     /,
-    mode: Literal["fluoroscopy", "viewer"] = "fluoroscopy",
     out: Path | None = None,
     seed: int = 0,
     episodes: int | None = None,
@@ -245,8 +244,6 @@ def play(
 
     Args:
         task: Task of `cathsim list`.
-        mode: Kind of window: a plain one with the X-ray image, or MuJoCo's viewer
-            (needs OpenGL).
         out: Directory for the episodes as demonstrations (.npz).
         seed: Seed of the first episode; the others count up.
         episodes: Number of episodes; by default until you quit.
@@ -265,7 +262,6 @@ def play(
 
     written = run(
         task,
-        mode,
         out,
         seed=seed,
         episodes=episodes,

@@ -51,35 +51,33 @@ class _Keys:
     _meaning: dict[str, tuple[str, float]] = {}
 
     def __init__(self):
-        self._left: dict[str, float] = {}  # seconds for which a command still counts
+        self._held: set[str] = set()
         self.requested: str | None = None
 
-    def press(self, command: str, hold: float = np.inf) -> None:
-        """Begins to hold a command, for `hold` seconds or until `release`."""
+    def press(self, command: str) -> None:
+        """Begins to hold a command until `release`."""
         if command not in COMMANDS:
             raise ValueError(f"no command {command!r}; there are {', '.join(COMMANDS)}")
         if command in self._meaning:
-            self._left[command] = hold
+            self._held.add(command)
         elif command in ("restart", "quit"):
             self.requested = command
 
     def release(self, command: str) -> None:
         """Ends a command."""
-        self._left.pop(command, None)
+        self._held.discard(command)
 
     def restart(self) -> None:
         """Ends all commands."""
-        self._left.clear()
+        self._held.clear()
         self.requested = None
 
-    def _axes(self, duration: float) -> dict[str, float]:
-        """Sum of the held commands of each axis; advances time by `duration`, s."""
+    def _axes(self) -> dict[str, float]:
+        """Sum of the held commands of each axis."""
         axes = dict.fromkeys((axis for axis, _ in self._meaning.values()), 0.0)
-        for command in self._left:
+        for command in self._held:
             axis, sign = self._meaning[command]
             axes[axis] += sign
-        rest = {command: left - duration for command, left in self._left.items()}
-        self._left = {command: left for command, left in rest.items() if left > 1e-9}
         return axes
 
 
@@ -106,7 +104,7 @@ class CoaxialControls(_Keys):
 
         float32 holds it exactly, as that of `Controls`.
         """
-        axes = self._axes(duration)
+        axes = self._axes()
         action = np.zeros(2 * self._devices)
         action[:2] = axes["guidewire"], axes["guidewire_rotation"]
         action[-2:] += axes["catheter"], axes["catheter_rotation"]
@@ -135,9 +133,9 @@ class Controls(_Keys):
         self._has_rotation = rotation
         self._bend = np.zeros(2)
 
-    def press(self, command: str, hold: float = np.inf) -> None:
-        """Begins to hold a command, for `hold` seconds or until `release`."""
-        super().press(command, hold)
+    def press(self, command: str) -> None:
+        """Begins to hold a command until `release`."""
+        super().press(command)
         if command == "straight":
             self._bend[:] = 0.0
 
@@ -153,7 +151,7 @@ class Controls(_Keys):
             (A,) float64 that float32 holds exactly, so that a demonstration can be
             repeated through interfaces of single precision.
         """
-        axes = self._axes(duration)
+        axes = self._axes()
         self._bend += BEND_RATE * duration * np.array([axes["bend_x"], axes["bend_y"]])
         np.clip(self._bend, -1.0, 1.0, out=self._bend)
         action = [*np.tile(self._bend, self._tip_joints), axes["translation"]]

@@ -9,13 +9,13 @@ import numpy as np
 
 from cathsim_dmc import suite
 from cathsim_dmc.play.controls import CoaxialControls, Controls
+from cathsim_dmc.play.window import FluoroscopyWindow
 from cathsim_dmc.policies import Policy, in_environment
 from cathsim_dmc.recording.episode import SUFFIX, Episode
 from cathsim_dmc.recording.recorder import EpisodeRecorder
 from cathsim_dmc.tasks.config import CONTROL_TIMESTEP
 from cathsim_dmc.tasks.scene import Scene
 
-MODES = ("fluoroscopy", "viewer")
 _PAUSE = 1.0  # s, for which the end of an episode is shown
 
 
@@ -25,28 +25,12 @@ class Session:
     def __init__(
         self,
         task: str,
-        mode: str = "fluoroscopy",
-        *,
-        seed: int = 0,
-        speed: float = 1.0,
-        task_kwargs: Mapping[str, Any] | None = None,
-        policy: Policy | None = None,
+        seed: int,
+        speed: float,
+        task_kwargs: Mapping[str, Any] | None,
+        policy: Policy | None,
     ):
-        """Loads the task and opens the window.
-
-        Args:
-            task: of `suite.SUITE`.
-            mode: "fluoroscopy" is a plain window, "viewer" MuJoCo's.
-            seed: of the first episode; the others count up.
-            speed: of the simulation against the clock.
-            task_kwargs: options of the task.
-            policy: that plays while the operator watches; None for the operator.
-
-        Raises:
-            ValueError: if an argument is wrong or no window can be opened.
-        """
-        if mode not in MODES:
-            raise ValueError(f"mode is {mode!r}; give one of {', '.join(MODES)}")
+        """Loads the task and opens the window; arguments as of `play`."""
         if not speed > 0:
             raise ValueError(f"speed is {speed}; it must be > 0")
         self._options = dict(task_kwargs or {})
@@ -59,19 +43,11 @@ class Session:
         self._task_name, self._seed, self._speed = task, seed, speed
         navigation = self._environment.task
         self._controls = _controls_of(navigation.scene)
-        self._window = _window(mode, navigation, self._controls)
+        self._window = FluoroscopyWindow(navigation, self._controls)
         self._next = time.monotonic()
 
     def run(self, out: Path | None = None, episodes: int | None = None) -> list[Path]:
-        """Plays until the operator quits, or for a number of episodes.
-
-        Args:
-            out: directory for the records, made if it is not there; None for none.
-            episodes: None for no limit.
-
-        Returns:
-            The files written, one for each episode of at least one step.
-        """
+        """Plays until the operator quits, or for a number of episodes."""
         if out is not None:
             Path(out).mkdir(parents=True, exist_ok=True)
         recorder = EpisodeRecorder(self._environment, self._task_name, self._options)
@@ -94,7 +70,6 @@ class Session:
 
     def _act(self, timestep: Any) -> np.ndarray:
         """Action of the operator or of the policy; StopIteration when asked to stop."""
-        self._window.open(self._environment.physics)
         self._window.show(self._environment.task)
         self._next += CONTROL_TIMESTEP / self._speed
         while (left := self._next - time.monotonic()) > 0:
@@ -130,16 +105,6 @@ def _controls_of(scene: Scene) -> Controls | CoaxialControls:
     return Controls(len(catheter.tip_motors) // 2, catheter.rotation is not None)
 
 
-def _window(mode: str, task: Any, controls: Controls | CoaxialControls):
-    if mode == "viewer":
-        from cathsim_dmc.play.viewer import MujocoViewer
-
-        return MujocoViewer(task, controls)
-    from cathsim_dmc.play.window import FluoroscopyWindow
-
-    return FluoroscopyWindow(task, controls)
-
-
 def _save(episode: Episode, directory: Path) -> Path:
     """Saves under the first number that is free."""
     number = 0
@@ -150,7 +115,6 @@ def _save(episode: Episode, directory: Path) -> Path:
 
 def play(
     task: str,
-    mode: str = "fluoroscopy",
     out: str | Path | None = None,
     *,
     seed: int = 0,
@@ -163,8 +127,7 @@ def play(
 
     Args:
         task: of `suite.SUITE`.
-        mode: "fluoroscopy", a plain window without OpenGL, or "viewer", MuJoCo's.
-        out: directory for the episodes (npz), None for none.
+        out: directory for the episodes (npz), made if it is not there; None for none.
         seed: of the first episode; the others count up.
         episodes: to play, None until the operator quits.
         speed: of the simulation against the clock.
@@ -172,9 +135,10 @@ def play(
         policy: that plays while the operator watches; None for the operator.
 
     Returns:
-        The files written.
+        The files written, one for each episode of at least one step.
+
+    Raises:
+        ValueError: if an argument is wrong or no window can be opened.
     """
-    session = Session(
-        task, mode, seed=seed, speed=speed, task_kwargs=task_kwargs, policy=policy
-    )
+    session = Session(task, seed, speed, task_kwargs, policy)
     return session.run(None if out is None else Path(out), episodes)

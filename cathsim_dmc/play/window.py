@@ -52,8 +52,7 @@ class FluoroscopyWindow:
             import tkinter
         except ImportError as error:
             raise ValueError(
-                "the fluoroscopy window needs tkinter; install your system's "
-                "python3-tk, or play with mode='viewer'"
+                "the fluoroscopy window needs tkinter; install your system's python3-tk"
             ) from error
         self._controls = controls
         try:
@@ -118,9 +117,6 @@ class FluoroscopyWindow:
             if time.monotonic() - when > _REPEAT:
                 self._controls.release(command)
                 del self._released[command]
-
-    def open(self, physics: Any) -> None:
-        """Needs nothing of the simulation: the window is open since it was made."""
 
     def show(self, task: Any, message: str = "") -> None:
         """Draws the state of a task."""
