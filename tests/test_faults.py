@@ -68,7 +68,7 @@ def test_a_failed_recording_leaves_no_arrays(tmp_path, monkeypatch):
     def fail(*arguments, **options):
         raise RuntimeError("no stream")
 
-    monkeypatch.setattr(report.rerun_log, "write_rrd", fail)
+    monkeypatch.setattr("cathsim_dmc.recording.rerun_log.write_rrd", fail)
     with pytest.raises(RuntimeError, match="no stream"):
         report.record("push", tmp_path / "a.rrd", task="type1_bca", max_steps=1)
     assert not list(tmp_path.iterdir())

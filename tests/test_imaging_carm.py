@@ -33,16 +33,6 @@ def test_signs_of_the_angles_follow_dicom():
     )
 
 
-def test_field_of_view_and_magnification():
-    carm = CArm.view("AP")
-    edge = 0.5 * carm.field_of_view[1]
-    pixel, _ = carm.project([edge, 0.0, 0.0])
-    assert pixel[0] == pytest.approx(127.5)
-    zoomed = CArm.view("AP", magnification=2.0)
-    assert zoomed.field_of_view[0] == pytest.approx(0.5 * carm.field_of_view[0])
-    assert CArm(resolution=(64, 128)).field_of_view == pytest.approx((edge, 2 * edge))
-
-
 @given(angles, tilts, coordinates)
 def test_axes_are_a_rotation_and_unproject_inverts_project(primary, secondary, point):
     carm = CArm(primary, secondary, isocentre=(0.01, -0.02, 0.03))

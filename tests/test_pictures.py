@@ -201,7 +201,6 @@ def test_the_frames_of_a_film_differ_where_the_device_moves(pushed, tmp_path):
             FileNotFoundError,
             "no folder none",
         ),
-        (lambda env: cathsim_dmc.show(env, viewer="tv"), ValueError, "figure"),
         (lambda env: cathsim_dmc.show(env, views=("top",)), ValueError, "front"),
         (lambda env: cathsim_dmc.show("env"), TypeError, "suite.load"),
         (lambda env: cathsim_dmc.forces(env.task), TypeError, "suite.load"),

@@ -384,26 +384,6 @@ def test_episodes_with_different_goals_are_not_compared(tmp_path):
         )
 
 
-def test_a_notebook_shows_an_episode_and_a_single_state():
-    pytest.importorskip("rerun_notebook")
-    from rerun.notebook import Viewer
-
-    from cathsim_dmc.recording.notebook import episode_viewer
-
-    assert isinstance(episode_viewer(make_recorded(), make_tube()), Viewer)
-    contacts = np.zeros((2, 3)), np.ones((2, 3))
-    state = episode_viewer(make_episode(0), make_tube(), contacts=contacts)
-    assert isinstance(state, Viewer)
-
-
-def test_without_the_extra_a_notebook_says_what_to_install(monkeypatch):
-    from cathsim_dmc.recording import notebook
-
-    monkeypatch.setattr(notebook.importlib.util, "find_spec", lambda name: None)
-    with pytest.raises(ImportError, match=r"cathsim-dmc\[notebook\]"):
-        notebook.episode_viewer(make_recorded(), make_tube())
-
-
 @pytest.mark.parametrize(
     ("options", "message"),
     [

@@ -17,12 +17,11 @@ from cathsim_dmc.agents import evaluation, policies
 from cathsim_dmc.agents.progress import EvaluationProgress
 from cathsim_dmc.analysis import heatmap
 from cathsim_dmc.analysis.force_statistics import FIGURES, millinewtons
-from cathsim_dmc.pictures.animation import SUFFIXES, animate, check_film
-from cathsim_dmc.pictures.recorded import film_options, xray_film
+from cathsim_dmc.pictures import recorded
+from cathsim_dmc.pictures.animation import SUFFIXES, check_film
 from cathsim_dmc.policies import in_environment
-from cathsim_dmc.recording import recorder, rerun_log
+from cathsim_dmc.recording import recorder
 from cathsim_dmc.recording.episode import Episode
-from cathsim_dmc.recording.scene import body_geoms
 from cathsim_dmc.tasks.snapshot import Snapshot
 
 CHECKPOINT_STEPS = 300  # longest episode that is recorded of a checkpoint
@@ -282,9 +281,12 @@ def record(
         in_environment(player, environment), seed=seed, max_steps=max_steps
     )
     if "out" in targets:
-        _write_both(environment, episode, targets["out"], fluoroscopy)
+        # Put in place last, once both are written.
+        with files.atomic_path(targets["out"].with_suffix(".npz")) as arrays:
+            episode.write(arrays)
+            recorded.write(episode, environment, targets["out"], fluoroscopy)
     if "gif" in targets:
-        animate(episode, environment.task.scene.anatomy.surface, targets["gif"])
+        recorded.write(episode, environment, targets["gif"])
     return episode
 
 
@@ -329,22 +331,3 @@ def _targets(out: str | Path | None, gif: str | Path | None) -> dict[str, Path]:
             f"a {' or '.join(SUFFIXES)} file"
         )
     return targets
-
-
-def _write_both(environment, episode: Episode, out: Path, fluoroscopy: bool) -> None:
-    """Writes .npz and .rrd, or neither."""
-    task = environment.task
-    surface = task.scene.anatomy.surface
-    # Put in place last, once both are written.
-    with files.atomic_path(out.with_suffix(".npz")) as arrays:
-        episode.write(arrays)
-        frames = None
-        if fluoroscopy:
-            frames = xray_film(episode, surface, film_options(task))
-        rerun_log.write_rrd(
-            episode,
-            surface,
-            out,
-            robot_geoms=body_geoms(environment.physics),
-            fluoroscopy=frames,
-        )

@@ -96,27 +96,6 @@ class Angiograph:
         return self._options
 
 
-def render(
-    machines: Sequence[Planes],
-    points: np.ndarray,
-    radius: float,
-    random_states: Sequence[np.random.RandomState] | None = None,
-) -> np.ndarray:
-    """Images of N devices, each before its own machine.
-
-    Args:
-        machines: N times the planes of a machine, all with as many.
-        points: (N, n, 3) joints from base to tip, world frame, m.
-        radius: of the devices, m.
-        random_states: one for each device, or None for images without noise. Of two
-            planes the frontal one draws first.
-
-    Returns:
-        (N, rows, columns, planes) uint8.
-    """
-    return images(machines, [Shadow(points, radius)], random_states)
-
-
 def images(
     machines: Sequence[Planes],
     shadows: Sequence[Shadow],
@@ -127,7 +106,8 @@ def images(
     Args:
         machines: N times the planes of a machine, all with as many.
         shadows: of the devices, with points (N, n, 3) and one radius.
-        random_states: as in `render`.
+        random_states: one for each device, or None for images without noise. Of two
+            planes the frontal one draws first.
 
     Returns:
         (N, rows, columns, planes) uint8.

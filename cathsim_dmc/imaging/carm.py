@@ -151,13 +151,6 @@ class CArm:
         return self.detector_size / (self.resolution[1] * self.magnification)
 
     @property
-    def field_of_view(self) -> tuple[float, float]:
-        """Height and width (m) of what is seen in the plane of the isocentre."""
-        rows, columns = self.resolution
-        scale = self.pitch * self.source_isocentre / self.source_detector
-        return rows * scale, columns * scale
-
-    @property
     def focal_length(self) -> float:
         """Source to detector distance in pixels."""
         return self.source_detector / self.pitch

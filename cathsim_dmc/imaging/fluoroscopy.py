@@ -19,9 +19,6 @@ from cathsim_dmc.imaging.carm import CArm
 from cathsim_dmc.imaging.device import Shadow, device_attenuation, device_thickness
 from cathsim_dmc.imaging.thickness import closed, surface_thickness
 
-# Water equivalent of a chest from front to back, m: the usual 20 cm phantom.
-PATIENT_THICKNESS = 0.20
-
 # A pixel shows the device if the path through it is at least this share of its
 # diameter: half the pixel covered to half the depth.
 MASK_SHARE = 0.25
@@ -39,28 +36,12 @@ class Masks(NamedTuple):
     vessel: np.ndarray
 
 
-def background_signal(background: ArrayLike) -> np.ndarray:
-    """Signal behind the patient alone, relative to its mean over the image.
-
-    Automatic exposure keeps the mean signal at the detector constant, so only
-    differences of patient thickness are seen.
-
-    Args:
-        background: water equivalent of the patient, m: a number, or (rows, columns).
-
-    Returns:
-        float32 of the same shape, with mean 1.
-    """
-    passed = np.exp(-materials.WATER * np.asarray(background, dtype=np.float64))
-    return (passed / passed.mean()).astype(np.float32)
-
-
 @dataclass(frozen=True, eq=False)
 class Fluoroscope:
     """One C-arm view of one anatomy.
 
-    I = I0 exp(-(mu_bg L_bg + mu_iodine c L_vessel + mu_device L_device)), scaled so
-    that plain tissue has the signal 1; then quantum noise, detector blur, and grey
+    I = I0 exp(-(mu_iodine c L_vessel + mu_device L_device)), scaled so that plain
+    tissue has the signal 1; then quantum noise, detector blur, and grey
     level = round(255 gain signal). Vessel and device count with their excess over
     the tissue whose place they take.
 
@@ -69,7 +50,6 @@ class Fluoroscope:
         vessel: (rows, columns) path length through the lumen, m.
         vessel_mask: (rows, columns) bool, pixels whose central ray meets the lumen.
         contrast: iodine in the lumen, kg/m³ (mg/ml); 0 is contrast off.
-        background: water equivalent of the patient, m, a number or (rows, columns).
         device_mu: excess attenuation of the device, homogenised, 1/m.
         marker_mu: the same for the marker at its tip, 1/m; None for no marker.
         marker_length: length of the marker, m.
@@ -85,7 +65,6 @@ class Fluoroscope:
     vessel: np.ndarray
     vessel_mask: np.ndarray
     contrast: float = materials.CONTRAST
-    background: float | np.ndarray = PATIENT_THICKNESS
     device_mu: float = materials.CATHETER
     marker_mu: float | None = materials.MARKER
     marker_length: float = materials.MARKER_LENGTH
@@ -105,19 +84,6 @@ class Fluoroscope:
                 )
             value.flags.writeable = False
             object.__setattr__(self, name, value)
-        if np.ndim(self.background) and np.shape(self.background) != shape:
-            raise ValueError(
-                f"background has shape {np.shape(self.background)}; give one number "
-                f"or {shape}, in metres of water."
-            )
-        for name in ("contrast", "device_mu", "marker_length", "blur"):
-            if not getattr(self, name) >= 0.0:
-                raise ValueError(f"{name} is {getattr(self, name)}; it must be >= 0.")
-        for name in ("kerma", "gain"):
-            if not getattr(self, name) > 0.0:
-                raise ValueError(f"{name} is {getattr(self, name)}; it must be > 0.")
-        if not 0.0 <= self.roadmap <= 1.0:
-            raise ValueError(f"roadmap is {self.roadmap}; it must lie in [0, 1].")
 
     @classmethod
     def from_surface(
@@ -152,7 +118,7 @@ class Fluoroscope:
     def signal(self) -> np.ndarray:
         """(rows, columns) float32, signal behind patient and vessel, no device."""
         vessel = materials.IODINE * self.contrast * self.vessel
-        signal = background_signal(self.background) * detector.transmission(vessel)
+        signal = detector.transmission(vessel)
         signal.flags.writeable = False
         return signal
 
@@ -243,19 +209,11 @@ class Fluoroscope:
         return detector.roadmap_gain(self.vessel_mask, self.roadmap, self.gain)
 
     def masks(self, points: ArrayLike, radius: ArrayLike) -> Masks:
-        """Which pixels show the device, and which the vessel.
-
-        Args:
-            points, radius: as in `render`.
-        """
+        """Which pixels show the device, and which the vessel; arguments of `render`."""
         return self.masks_of([Shadow(np.asarray(points), radius)])
 
     def masks_of(self, shadows: Sequence[Shadow]) -> Masks:
-        """Which pixels show one of several devices, and which the vessel.
-
-        Args:
-            shadows: as in `image`.
-        """
+        """Which pixels show one of several devices, and which the vessel."""
         seen = self._shows(shadows[0])
         for shadow in shadows[1:]:
             seen |= self._shows(shadow)

@@ -19,8 +19,6 @@ from cathsim_dmc.pictures.snapshot import Snapshot
 from cathsim_dmc.recording.episode import Episode
 from cathsim_dmc.recording.recorder import navigation_of
 
-VIEWERS = ("figure", "rerun")
-
 __all__ = [
     "Episode",
     "ForceReadout",
@@ -38,7 +36,6 @@ def show(
     episode: Episode | None = None,
     *,
     step: int = -1,
-    viewer: str = "figure",
     **options: Any,
 ) -> Any:
     """Draw anatomy, device, goal and contact forces.
@@ -48,26 +45,16 @@ def show(
         episode: An episode recorded in it, whose state `step` is drawn; None draws the
             present state of the environment.
         step: Number of the episode's state; negative ones count from the end.
-        viewer: "figure" for a matplotlib figure, or "rerun" for Rerun's viewer in a
-            notebook, which shows all of an episode.
         **options: Options of `pictures.figure.scene_figure`, such as `views` and
-            `fluoroscopy`; or `width` and `height` (pixels) of Rerun's viewer.
+            `fluoroscopy`.
 
     Returns:
-        The figure (a notebook draws it; `.savefig(path)` writes it), or the viewer.
+        The figure; a notebook draws it, `.savefig(path)` writes it.
 
     Raises:
         TypeError: it is no environment of this package.
-        ValueError: there is no such viewer.
-        ImportError: Rerun's notebook viewer is not installed.
     """
-    if viewer not in VIEWERS:
-        raise ValueError(f"no viewer {viewer!r}; there are {', '.join(VIEWERS)}")
     surface = navigation_of(env).scene.anatomy.surface
-    if viewer == "rerun":
-        from cathsim_dmc.pictures.interactive import rerun_viewer
-
-        return rerun_viewer(env, episode, **options)
     from cathsim_dmc.pictures.figure import scene_figure
 
     if episode is None:

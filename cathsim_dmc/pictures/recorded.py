@@ -105,33 +105,37 @@ def as_function(
     return lambda timestep: np.asarray(function(timestep.observation))
 
 
-def write(episode: Episode, env: Any, path: str | os.PathLike[str]) -> Path:
+def write(
+    episode: Episode,
+    env: Any,
+    path: str | os.PathLike[str],
+    fluoroscopy: bool = True,
+) -> Path:
     """Write an episode in the format that the file's name asks for.
 
     Args:
         episode: An episode of this environment.
         env: The environment, for the anatomy and the shapes of the robot.
         path: File to write, see `record`.
+        fluoroscopy: Whether a Rerun file has X-ray images.
     """
     target = _checked(path)
-    scene = navigation_of(env).scene
+    surface = navigation_of(env).scene.anatomy.surface
     if target.suffix == ".npz":
         return episode.save(target)
     if target.suffix == ".rrd":
         from cathsim_dmc.recording.rerun_log import write_rrd
 
+        frames = None
+        if fluoroscopy:
+            frames = xray_film(episode, surface, film_options(env.task))
+        geoms = body_geoms(env.physics)
         return write_rrd(
-            episode,
-            scene.anatomy.surface,
-            target,
-            robot_geoms=body_geoms(env.physics),
-            fluoroscopy=xray_film(
-                episode, scene.anatomy.surface, film_options(env.task)
-            ),
+            episode, surface, target, robot_geoms=geoms, fluoroscopy=frames
         )
     from cathsim_dmc.pictures.animation import animate
 
-    return animate(episode, scene.anatomy.surface, target)
+    return animate(episode, surface, target)
 
 
 def film_options(task: Any) -> FluoroscopyOptions:

@@ -18,6 +18,7 @@ import numpy as np
 from cathsim_dmc import policies, suite
 from cathsim_dmc.imaging import Angiograph, FluoroscopyOptions
 from cathsim_dmc.imaging import angiograph as machines
+from cathsim_dmc.imaging.device import Shadow
 
 OUTPUT = Path(__file__).parents[1] / "images" / "cannulation_strip.png"
 TASK, SEED, MOMENTS = "type1_lcca", 3, 6
@@ -65,12 +66,10 @@ def main() -> None:
         radius = task.objective.goal_radius * carm.focal_length / depth
         for axis, index in zip(row, chosen, strict=True):
             state = states[index]
-            image = machines.render(
-                [planes],
-                state["line"][None],
-                task.scene.catheter.device.outer_radius,
-                [random],
-            )[0]
+            device = Shadow(
+                state["line"][None], task.scene.catheter.device.outer_radius
+            )
+            image = machines.images([planes], [device], [random])[0]
             axis.imshow(image[..., 0], cmap="gray", vmin=0, vmax=255)
             axis.add_patch(plt.Circle(goal, radius, fill=False, color="limegreen"))
             axis.set_axis_off()
