@@ -96,9 +96,8 @@ def read_card(path: str | Path) -> dict[str, Any]:
     Returns:
         "name", "task", "task_kwargs" (options of the task as it was evaluated),
         "config" and "shapes" (what the network is made from), "sha256" of the
-        weights, "training" (command, frames, seconds, seed), "seeds" (success
-        of every seed that was trained alike), "evaluation" (episodes, success with
-        interval, forces) and "versions".
+        weights, "training" (frames, seconds, seed), "evaluation" (episodes, success
+        with interval, forces) and "versions".
 
     Raises:
         CheckpointError: it is missing or damaged.

@@ -5,13 +5,13 @@ import fnmatch
 import json
 import re
 import tomllib
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from cathsim_dmc import files
 from cathsim_dmc.agents.config import TrainingConfig
-from cathsim_dmc.agents.fields import require_type
+from cathsim_dmc.agents.fields import check_fields, positive, require, require_type
 from cathsim_dmc.agents.learners import make_config
 
 DEFAULT_GRID = Path(__file__).with_name("grid.toml")
@@ -19,18 +19,7 @@ EPISODES = 30  # published
 _MAX_SIZE = 2**20  # bytes
 # Names of cells are names of folders and files.
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_+.-]{0,199}")
-# What a row must and may say, and its evaluation, with the type of each.
-_REQUIRED = {"label": str, "algorithm": str, "preset": str, "observation": str | list}
-_REQUIRED |= {"tasks": list, "total_frames": int | dict}
-_ROW = {
-    "seeds": list,
-    "settings": dict,
-    "variant": str,
-    "evaluation": dict,
-    **_REQUIRED,
-}
 _OWN = {"task", "observation", "seed", "total_frames"}  # fields that a cell sets
-_EVALUATION = {"task": str, "episodes": int, "task_kwargs": dict, "each_arch": str}
 
 
 class GridError(ValueError):
@@ -103,7 +92,7 @@ class Cell:
                 settings[name] = value.replace("{task}", self.task)
         added = settings.pop("task_kwargs", {})
         require_type("task_kwargs", added, Mapping[str, Any])
-        for name in ("task", "observation", "seed", "total_frames"):
+        for name in _OWN:
             settings[name] = getattr(self, name)
         config = make_config(self.algorithm, self.preset, **settings)
         return config.replace(task_kwargs={**config.task_kwargs, **added})
@@ -135,11 +124,11 @@ def read_grid(path: str | Path = DEFAULT_GRID) -> list[Cell]:
         )
     for number, row in enumerate(rows, 1):
         try:
-            for cell in _cells(row):
+            for cell in _Row(**row).cells():
                 if cell.name in cells:
                     raise GridError(f"{cell.name} is there already; give a variant")
                 cells[cell.name] = cell
-        except GridError as error:
+        except (TypeError, ValueError) as error:
             raise GridError(f"{path}, row {number}: {error}") from error
     return list(cells.values())
 
@@ -167,49 +156,59 @@ def choose(cells: Sequence[Cell], patterns: Iterable[str]) -> list[Cell]:
     return [cell for cell in cells if cell.name in chosen]
 
 
-def _cells(row: Any) -> list[Cell]:
-    _check(row, _ROW)
-    if missing := sorted(set(_REQUIRED) - set(row)):
-        raise GridError(f"there is no {', '.join(missing)}")
-    row = {"seeds": [0], "evaluation": {}, **row}
-    if own := sorted(_OWN & set(row.get("settings", {}))):
-        raise GridError(f"settings has {', '.join(own)}, which the row itself gives")
-    _check(row["evaluation"], _EVALUATION)
-    if row["evaluation"].get("episodes", 1) < 1:
-        raise GridError("evaluation.episodes must be at least 1")
-    if {"episodes", "each_arch"} <= set(row["evaluation"]):
-        raise GridError("evaluation has episodes and each_arch; give one")
-    names = row["observation"]
-    observation = names if isinstance(names, str) else tuple(names)
-    tasks, seeds, frames = (row.pop(key) for key in ("tasks", "seeds", "total_frames"))
-    for name, given, kind in (
-        ("tasks", tasks, str),
-        ("seeds", seeds, int),
-        ("observation", [names] if isinstance(names, str) else names, str),
-    ):
-        if not given or any(type(one) is not kind for one in given):
-            raise GridError(f"{name} is {given!r}; it must list {kind.__name__}s")
-    cells = []
-    for seed in seeds:
-        for task in tasks:
-            total = frames.get(task) if isinstance(frames, dict) else frames
-            if type(total) is not int or total < 1:
-                raise GridError(
-                    f"total_frames of {task} is {total!r}; it must be a positive "
-                    "integer, or a table with one for each task"
-                )
-            own = {"task": task, "seed": seed, "total_frames": total}
-            cells.append(Cell(**{**row, **own, "observation": observation}))
-    return cells
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class _Evaluation:
+    """The evaluation of a row, see `Cell.evaluation`."""
+
+    task: str | None = None
+    episodes: int | None = positive(None)
+    task_kwargs: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+    each_arch: str | None = None
+
+    def __post_init__(self):
+        check_fields(self)
+        if self.episodes and self.each_arch:
+            raise GridError("evaluation has episodes and each_arch; give one")
 
 
-def _check(table: Any, known: Mapping[str, Any]) -> None:
-    """Refuse a table with other keys or types."""
-    if not isinstance(table, dict):
-        raise GridError(f"{table!r} must be a table")
-    for name, value in table.items():
-        if name not in known:
-            raise GridError(f"{name} is unknown; there are {', '.join(known)}")
-        if isinstance(value, bool) or not isinstance(value, known[name]):
-            kind = getattr(known[name], "__name__", known[name])
-            raise GridError(f"{name} is {value!r}; it must be {kind}")
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class _Row:
+    """A table of the file, one cell for each task and seed."""
+
+    label: str
+    algorithm: str
+    preset: str
+    observation: str | tuple[str, ...]
+    tasks: tuple[str, ...]
+    total_frames: int | Mapping[str, int]
+    seeds: tuple[int, ...] = (0,)
+    settings: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+    variant: str = ""
+    evaluation: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+
+    def __post_init__(self):
+        check_fields(self)
+        _Evaluation(**self.evaluation)
+        for name in ("tasks", "seeds", "observation"):
+            value = getattr(self, name)
+            require(bool(value), name, value, "a list with one entry or more")
+        if own := sorted(_OWN & set(self.settings)):
+            raise GridError(
+                f"settings has {', '.join(own)}, which the row itself gives"
+            )
+
+    def cells(self) -> Iterator[Cell]:
+        """The cells, the first seed of every task first."""
+        shared = {n: v for n, v in vars(self).items() if n not in ("tasks", "seeds")}
+        for seed in self.seeds:
+            for task in self.tasks:
+                total = self.total_frames
+                if isinstance(total, Mapping):
+                    total = total.get(task)
+                if total is None or total < 1:
+                    raise GridError(
+                        f"total_frames of {task} is {total!r}; it must be a positive "
+                        "integer, or a table with one for each task"
+                    )
+                own = {"task": task, "seed": seed, "total_frames": total}
+                yield Cell(**{**shared, **own})

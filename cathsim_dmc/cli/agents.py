@@ -279,7 +279,6 @@ def export(
     name: Annotated[str, conf.Positional],
     /,
     out: Path | None = None,
-    results: Path = Path("results"),
     episodes: int = 30,
     threads: int | None = None,
 ) -> int:
@@ -289,7 +288,6 @@ def export(
         run: Directory of a run or of a checkpoint.
         name: Name of the policy, "type1_bca" for `pretrained:type1_bca`.
         out: Directory to write to; by default that of the package.
-        results: Directory of `cathsim benchmark table`, for the other seeds.
         episodes: Number of episodes of the evaluation by the published rule.
         threads: Number of threads of the simulation; one per core by default.
     """
@@ -301,7 +299,6 @@ def export(
             run,
             name,
             directory=out or DIRECTORY,
-            results=results,
             episodes=episodes,
             num_threads=threads,
         )
