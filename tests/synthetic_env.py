@@ -150,7 +150,6 @@ def make_env(
     num_envs=1,
     num_threads=None,
     seed=0,
-    backend="batched",
     task_kwargs=None,
 ):
     names = (observation,) if isinstance(observation, str) else observation

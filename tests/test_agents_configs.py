@@ -46,7 +46,7 @@ def test_configs_survive_json(algorithm, preset):
         (PPOConfig, {"minibatch_size": 100}, "minibatch_size=100"),
         (PPOConfig, {"clip": 0.0}, r"clip=0.0.*\(0, 1\)"),
         (PPOConfig, {"epochs": 0}, "epochs=0.*positive integer"),
-        (PPOConfig, {"backend": "gpu"}, "backend='gpu'.*batched"),
+        (PPOConfig, {"activation": "gelu"}, "activation='gelu'.*relu"),
         (PPOConfig, {"num_envs": "many"}, "num_envs='many'.*an integer"),
         (PPOConfig, {"seed": 10**400}, "seed=1000.*an integer"),
         (PPOConfig, {"anneal": "False"}, "anneal='False'.*true or false"),

@@ -191,5 +191,3 @@ def test_an_evaluation_goes_on_from_a_snapshot(tmp_path):
     assert [one.length for one in report.policy.episodes] == [8, 8]
     reward = sum(one.outcome.reward for one in step)
     np.testing.assert_allclose(report.policy.values("reward"), reward, rtol=1e-6)
-    with pytest.raises(ValueError, match="batched"):
-        evaluated("push", task="simple1_bca", backend="composer", start=path)

@@ -50,7 +50,6 @@ ALLOWED = {
 }
 _TORCHRL_FACE = (
     "simulation/torchrl.py",
-    "simulation/composer.py",
     "simulation/environments.py",
 )
 # Package -> files that may import it, wherever in the file the import stands.

@@ -30,7 +30,6 @@ COMMANDS = [
     (("eval", "--task", "type1_bca", "--out", "OUT"), "", NAME),
     (EVAL, "--episodes", POSITIVE),
     (EVAL, "--seed", SEED),
-    (EVAL, "--backend", NAME),
     (EVAL, "--threads", OPTIONAL_WHOLE),
     (("eval", "push", "--out", "OUT"), "--task", NAME),
     (RECORD, "--seed", SEED),

@@ -153,7 +153,6 @@ TRAINING = {
     "task_kwargs": st.sampled_from(
         [None, 1, "x", [1], {"a": object()}, {"a": math.nan}]
     ),
-    "backend": word(),
     "num_envs": whole(1),
     "num_threads": whole(1, optional=True),
     "seed": whole(0),

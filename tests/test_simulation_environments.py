@@ -5,12 +5,11 @@ import torch
 from conftest import twin
 from dm_env.specs import BoundedArray
 from torchrl.data import Bounded
-from torchrl.envs import check_env_specs
+from torchrl.envs import DMControlEnv, check_env_specs
 
 from cathsim_dmc import suite
 from cathsim_dmc.agents import evaluate, make_config, make_env, train
 from cathsim_dmc.agents.networks import NetworkShapes
-from cathsim_dmc.simulation.composer import composer_env
 from cathsim_dmc.simulation.environments import standard_observations
 from cathsim_dmc.simulation.torchrl import BatchedEnv
 from cathsim_dmc.tasks.rollout import Rollout
@@ -18,11 +17,10 @@ from cathsim_dmc.tasks.rollout import Rollout
 TASK = "simple1_bca"
 
 
-@pytest.mark.parametrize("backend", ["batched", "composer"])
-def test_task_kwargs_that_are_no_mapping_are_refused(backend):
+def test_task_kwargs_that_are_no_mapping_are_refused():
     for value in (0, "", ["random"], {1: 0}):
         with pytest.raises(ValueError, match="task_kwargs is .*None, or a mapping"):
-            make_env(TASK, backend=backend, task_kwargs=value)
+            make_env(TASK, task_kwargs=value)
 
 
 def test_every_face_takes_its_specs_from_the_table_without_an_episode(monkeypatch):
@@ -46,10 +44,9 @@ def test_every_face_takes_its_specs_from_the_table_without_an_episode(monkeypatc
     assert dict(many.single_observation_space) == spaces
     assert spaces.keys() == table.keys()
     batched = BatchedEnv(task_name, 2, num_threads=1, **options)
-    of_composer = composer_env(task_name, options, 0).observation_spec
-    for specs in (batched.observation_spec, of_composer):
-        assert set(specs.keys()) == {*table, "info"}
-        assert list(specs["info"].keys()) == list(task.info_types)
+    assert set(batched.observation_spec.keys()) == {*table, "info"}
+    assert list(batched.observation_spec["info"].keys()) == list(task.info_types)
+    of_composer = DMControlEnv("cathsim", task_name, **options).observation_spec
     for key, spec in table.items():
         box, bounded = spaces[key], isinstance(spec, BoundedArray)
         ends = (spec.minimum, spec.maximum) if bounded else (-np.inf, np.inf)
@@ -66,14 +63,12 @@ def test_every_face_takes_its_specs_from_the_table_without_an_episode(monkeypatc
     assert tuple(batched.reset()["info"].keys()) == tuple(task.info_types)
 
 
-@pytest.mark.parametrize("backend", ["batched", "composer"])
-def test_a_task_satisfies_torchrl_and_gives_what_was_asked(backend):
+def test_a_task_satisfies_torchrl_and_gives_what_was_asked():
     env = make_env(
         TASK,
         observation=("sequential", "tracking"),
         num_envs=2,
         num_threads=1,
-        backend=backend,
         task_kwargs={"max_steps": 5},
     )
     check_env_specs(env)
@@ -106,9 +101,7 @@ def test_a_task_trains_and_evaluates(tmp_path):
     assert [episode.length for episode in outcome.episodes] == [8, 8]
 
 
-def test_unknown_paths_and_empty_observations_are_refused():
-    with pytest.raises(ValueError, match="backend=.gpu..*batched.*composer"):
-        make_env(TASK, backend="gpu")
+def test_empty_observations_are_refused():
     bare = synthetic_env.ReachEnv(2)
     for name in synthetic_env.SIZES:
         del bare.observation_spec[name]

@@ -179,14 +179,11 @@ def test_episodes_start_over_by_themselves(short_batched):
     ]
 
 
-@pytest.mark.parametrize(
-    "backend", ["batched", pytest.param("composer", marks=pytest.mark.slow)]
-)
-def test_the_first_episode_is_that_of_the_seed(backend):
+def test_the_first_episode_is_that_of_the_seed():
     """So that an episode of an evaluation can be recorded by its seed."""
     from cathsim_dmc.simulation.environments import make_env
 
-    env = make_env("simple1_lcca", num_envs=2, seed=31, backend=backend, num_threads=1)
+    env = make_env("simple1_lcca", num_envs=2, seed=31, num_threads=1)
     distances = env.reset()["info", "distance"].flatten().tolist()
     task = suite.make_task("simple1_lcca")
     for index, distance in enumerate(distances):

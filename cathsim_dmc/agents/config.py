@@ -40,9 +40,6 @@ class TrainingConfig:
         training_start: Least and largest share of the way to the goal that the device
             has made when an episode of the training starts; None takes the task's.
             Evaluation and recordings always take the task's.
-        backend: Way of simulating: "batched" steps all simulations in one thread
-            pool, "composer" runs one dm_control environment after the other (slow;
-            the reference).
         num_envs: Number of simulations stepped side by side.
         num_threads: Number of threads of the batched simulation; None takes one per
             core.
@@ -115,7 +112,6 @@ class TrainingConfig:
     training_reward: Mapping[str, float] | None = None
     training_max_steps: int | None = positive(None)
     training_start: tuple[float, float] | None = None
-    backend: Literal["batched", "composer"] = "batched"
     num_envs: int = positive(16)
     num_threads: int | None = positive(None)
     seed: int = within(0, 0)

@@ -20,7 +20,7 @@ from cathsim_dmc.agents.policies import PolicyLike, load_policy
 from cathsim_dmc.agents.views import view_of
 from cathsim_dmc.analysis.force_statistics import QUANTITIES, Statistics
 from cathsim_dmc.analysis.intervals import success_interval
-from cathsim_dmc.policies import Policy, View
+from cathsim_dmc.policies import Policy
 from cathsim_dmc.simulation import environments
 from cathsim_dmc.simulation.episodes import play
 from cathsim_dmc.tasks.snapshot import Snapshot
@@ -44,7 +44,7 @@ class EvaluationResult:
         policy: Name of the policy.
         seed: Seed of the first episode; episode i was played with seed + i.
         episodes: Episodes in the order of their seeds.
-        settings: Observation, task_kwargs, backend and, for a checkpoint, its frames.
+        settings: Observation, task_kwargs and, for a checkpoint, its frames.
     """
 
     task: str
@@ -220,7 +220,6 @@ def evaluate(
     name: str | None = None,
     observation: str | Sequence[str] | None = None,
     task_kwargs: Mapping[str, Any] | None = None,
-    backend: str = "batched",
     num_threads: int | None = None,
     out_dir: str | Path | None = None,
     observer: Observer | None = None,
@@ -247,14 +246,13 @@ def evaluate(
             policy reads.
         task_kwargs: Further options of the task; None takes those that the policy was
             trained with.
-        backend: Way of simulating, "batched" or "composer".
         num_threads: Number of threads of the batched simulation; None takes one per
             core.
         out_dir: Directory for evaluation.json; None writes none.
         observer: Function that is called after every step, before any environment is
             reset.
-        start: State in the middle of as many episodes, which are played on from there
-            (batched); rewards, lengths and forces count from there. None for the
+        start: State in the middle of as many episodes, which are played on from there;
+            rewards, lengths and forces count from there. None for the
             starts of the task.
         make_env: Function that makes the environment, as `environments.make_env`.
 
@@ -264,18 +262,15 @@ def evaluate(
         CheckpointError: there is no such checkpoint, or it is damaged.
     """
     check_numbers(episodes, seed, num_threads)
-    if start is not None and backend != "batched":
-        raise ValueError(f"backend is {backend!r}; a start needs 'batched'")
     player = load_policy(policy, seed)
     task = require_task(player, task)
-    settings = _settings(player, observation, task_kwargs, backend)
+    settings = _settings(player, observation, task_kwargs)
     env = make_env(
         task,
         observation=settings["observation"],
         num_envs=episodes,
         num_threads=num_threads,
         seed=seed,
-        backend=backend,
         task_kwargs=settings["task_kwargs"],
     )
     try:
@@ -300,7 +295,6 @@ def _settings(
     policy: Policy,
     observation: str | Sequence[str] | None,
     task_kwargs: Mapping[str, Any] | None,
-    backend: str,
 ) -> dict[str, Any]:
     """What was asked for, and where nothing was, what the policy was made for."""
     checkpoint = getattr(policy, "checkpoint", None)
@@ -308,7 +302,6 @@ def _settings(
     return {
         "observation": observation or policy.observation or "internal",
         "task_kwargs": dict(options or {}),
-        "backend": backend,
         "frames": checkpoint.frames if checkpoint else None,
     }
 
@@ -335,14 +328,13 @@ class _Environments:
 
     Attributes:
         seen: Present observations (N, ...).
-        view: What a policy may know of the simulations, once they have begun.
+        view: What a policy may know of the simulations.
     """
 
     seen: TensorDictBase
-    view: View
 
     def __init__(self, env: EnvBase, start: Snapshot | None):
-        self._env, self._start = env, start
+        self._env, self._start, self.view = env, start, view_of(env)
 
     def reset(self, which: np.ndarray | None) -> TensorDictBase:
         """Begin episodes, in all environments or where one has ended."""
@@ -353,8 +345,6 @@ class _Environments:
         if self._start is not None:
             restored = self._env.base_env.restore(self._start)
             self.seen.update(self._env.transform._reset(self.seen, restored))
-        # Environments of composer are made by the first reset.
-        self.view = view_of(self._env)
         return self.seen
 
     def step(self, action: np.ndarray) -> tuple[TensorDictBase, np.ndarray]:

@@ -211,8 +211,7 @@ class PPO(Learner):
             if config.noise_shared:
                 raise ConfigError(
                     f"noise_shared={config.noise_shared!r} needs an environment that "
-                    "tells which motors bend together: choose backend='batched', or "
-                    "noise_shared=0."
+                    "tells which motors bend together: choose noise_shared=0."
                 )
             groups = range(env.action_spec.shape[-1])
         noise = CorrelatedNoise(config.noise_correlation, config.noise_shared, groups)

@@ -8,7 +8,7 @@ from tqdm import tqdm
 
 # Seconds between two lines in a log file, where no terminal redraws them.
 LINE_INTERVAL = 15.0
-_LINE = "{desc}: {n_fmt} of {total_fmt}{unit} [{elapsed}, {rate_fmt}{postfix}]\n"
+_LINE = "{desc}: {n_fmt}{unit} [{elapsed}, {rate_fmt}{postfix}]\n"
 
 
 def progress_bar(label: str, unit: str, **options: Any) -> tqdm:

@@ -132,7 +132,6 @@ class RaySource:
             num_envs=share,
             num_threads=threads,
             seed=(int(drawn[0]) + index * share) % 2**31,
-            backend=config.backend,
             task_kwargs=config.training_kwargs,
         )
 

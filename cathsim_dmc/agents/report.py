@@ -144,7 +144,6 @@ def evaluate(
     episodes: int = 30,
     seed: int = evaluation.EVALUATION_SEED,
     task_kwargs: Mapping[str, Any] | None = None,
-    backend: str = "batched",
     num_threads: int | None = None,
     baseline: bool = True,
     out_dir: str | Path | None = None,
@@ -160,11 +159,9 @@ def evaluate(
         episodes: Number of episodes.
         seed: Seed of the first episode; the others count up.
         task_kwargs: Options of the task, over those that the policy was trained with.
-        backend: Way of simulating, "batched" or "composer".
         num_threads: Number of threads of the simulation; None takes one per core.
         baseline: Whether to play the same seeds with the random policy too.
-        out_dir: Directory for evaluation.json and, from the batched backend,
-            heatmap.png; None writes none.
+        out_dir: Directory for evaluation.json and heatmap.png; None writes none.
         start: File of a `Snapshot`, one episode for each of its simulations, from there
             on; None plays `episodes` from their starts.
     """
@@ -181,14 +178,12 @@ def evaluate(
 
     def observe(env: EnvBase, running: np.ndarray) -> None:
         alive(env, running)
-        if backend == "batched":
-            contacts(env, running)
+        contacts(env, running)
 
     play = functools.partial(
         evaluation.evaluate,
         episodes=episodes,
         seed=seed,
-        backend=backend,
         num_threads=num_threads,
         start=snapshot,
     )
@@ -206,8 +201,7 @@ def evaluate(
     report = Report(result, other, comparison, time.monotonic() - began)
     if out_dir is not None:
         evaluation.write_evaluation(out_dir, report.to_dict())
-        if backend == "batched":
-            _draw_heatmap(contacts, result, Path(out_dir) / "heatmap.png")
+        _draw_heatmap(contacts, result, Path(out_dir) / "heatmap.png")
     return report
 
 

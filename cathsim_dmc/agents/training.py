@@ -245,7 +245,6 @@ def _make_environment(
         num_envs=config.num_envs,
         num_threads=config.num_threads,
         seed=seed % 2**31,
-        backend=config.backend,
         task_kwargs=config.training_kwargs,
     )
 

@@ -2,10 +2,9 @@
 
 from typing import Any, cast
 
-from torchrl.envs import EnvBase, SerialEnv
+from torchrl.envs import EnvBase
 
-from cathsim_dmc.policies import BatchedView, ComposerView, View
-from cathsim_dmc.simulation import environments
+from cathsim_dmc.policies import BatchedView, View
 
 
 class _ForeignView:
@@ -27,7 +26,5 @@ def view_of(env: EnvBase) -> View:
     base = getattr(env, "base_env", env)
     if hasattr(base, "simulation"):
         return BatchedView(base.simulation)
-    if isinstance(base, SerialEnv):
-        return ComposerView([environments.composer_of(one) for one in base._envs])
     # Whatever a policy asks of it beyond its numbers is an error that says so.
     return cast(View, _ForeignView(env))

@@ -15,8 +15,8 @@ _HEAD = """\
 # Policies that ship
 
 Written by `cathsim export`; the card beside each, NAME.json, has its settings. \
-Evaluated over 30 episodes by the published rule (2,000 control steps, success within 8 mm inside the \
-branch); forces as in docs/forces.md.
+Evaluated over 30 episodes by the published rule (2,000 control steps, success within \
+8 mm inside the branch); forces as in docs/forces.md.
 
 | policy | task | observation | frames | success (95 %) | mean force, mN \
 | mean contact force, mN | max force, mN |

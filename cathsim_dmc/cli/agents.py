@@ -4,7 +4,7 @@ import dataclasses
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated
 
 from tyro import conf
 from tyro.extras import SubcommandApp
@@ -56,7 +56,6 @@ def evaluate(
     out: Path | None = None,
     baseline: bool = True,
     anatomy: OwnAnatomy = NO_ANATOMY,
-    backend: Literal["batched", "composer"] = "batched",
     threads: int | None = None,
     start: Path | None = None,
     json: bool = False,
@@ -74,8 +73,6 @@ def evaluate(
         out: Directory for evaluation.json and heatmap.png.
         baseline: Whether to compare with the random policy on the same seeds.
         anatomy: Where the task takes place.
-        backend: Way of simulating: all episodes side by side, or dm_control's
-            environments one after the other.
         threads: Number of threads of the simulation; one per core by default.
         start: File of a snapshot (`snapshot().save`): one episode for each of its
             simulations, from there on.
@@ -90,7 +87,6 @@ def evaluate(
         episodes=episodes,
         seed=seed,
         task_kwargs={**given(options), **anatomy.task_kwargs},
-        backend=backend,
         num_threads=threads,
         baseline=baseline,
         out_dir=out,

@@ -1,8 +1,6 @@
 """`cathsim phantom import`, `build`, `generate` and `check`."""
 
-import contextlib
 import sys
-from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -54,23 +52,26 @@ def import_phantom(
 
     changes = dict(_change(text) for text in rename)
     notes: list[str] = []
-    with _progress() as progress:
-        anatomy = (cached_import if cache else import_scan)(
-            mesh,
-            centreline,
-            units=units,
-            mesh_frame=frame,
-            axes=axes,
-            name=name or out.name,
-            inlet=inlet,
-            rename=changes,
-            wall=wall,
-            threshold=None if threshold_mm is None else threshold_mm * 1e-3,
-            progress=progress,
-            notes=notes,
-        )
-        progress("wall: measuring it")
-        figures = report.describe(anatomy)
+
+    def progress(text: str) -> None:
+        print(text, file=sys.stderr, flush=True)
+
+    anatomy = (cached_import if cache else import_scan)(
+        mesh,
+        centreline,
+        units=units,
+        mesh_frame=frame,
+        axes=axes,
+        name=name or out.name,
+        inlet=inlet,
+        rename=changes,
+        wall=wall,
+        threshold=None if threshold_mm is None else threshold_mm * 1e-3,
+        progress=progress,
+        notes=notes,
+    )
+    progress("wall: measuring it")
+    figures = report.describe(anatomy)
     anatomy.save(out)
     print_json({"directory": str(out), "notes": notes, **figures})
     return 0
@@ -81,29 +82,6 @@ def _change(text: str) -> tuple[str, str]:
     if not equals or not old or not new:
         raise ValueError(f"rename is {text!r}; give computed=wanted, e.g. branch_1=lra")
     return old, new
-
-
-@contextlib.contextmanager
-def _progress() -> Iterator[Callable[[str], None]]:
-    """Lines of an import as a bar on standard error; notes stay above it."""
-    from rich.console import Console
-    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
-
-    from cathsim_dmc.anatomy.scan.importer import SHARES
-
-    console = Console(stderr=True, soft_wrap=True)
-    columns = (BarColumn(30), TimeElapsedColumn(), TextColumn("{task.description}"))
-    with Progress(*columns, console=console) as bar:
-        task = bar.add_task("mesh: reading", total=1.0)
-
-        def show(text: str) -> None:
-            step, _, rest = text.partition(": ")
-            if step == "note" or not console.is_terminal:
-                console.print(text, markup=False, highlight=False)
-            if step in SHARES:
-                bar.update(task, completed=SHARES[step], description=text[:60])
-
-        yield show
 
 
 @phantoms.command

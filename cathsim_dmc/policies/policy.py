@@ -54,7 +54,7 @@ def in_environment(
     policy: Policy, environment: composer.Environment
 ) -> Callable[[dm_env.TimeStep], np.ndarray]:
     """A policy as a function from a composer environment's timestep to its action."""
-    view = ComposerView([environment])
+    view = ComposerView(environment)
 
     def act(timestep: dm_env.TimeStep) -> np.ndarray:
         if timestep.first():

@@ -1,12 +1,11 @@
 """What a policy may know beyond the observation: the simulations themselves.
 
-One face for many simulations side by side and for composer environments, so that a
+One face for many simulations side by side and for a composer environment, so that a
 policy that looks at positions and forces needs no second version of itself.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Protocol, TypeVar
 
 import numpy as np
@@ -19,7 +18,7 @@ from cathsim_dmc.simulation.batch import BatchSimulation
 from cathsim_dmc.tasks.cases import Case
 from cathsim_dmc.tasks.navigation import Navigation
 
-Stacked = TypeVar("Stacked", Readings, forces.WallForce, CoaxialReadings)
+State = TypeVar("State", Readings, forces.WallForce, CoaxialReadings)
 
 
 class View(Protocol):
@@ -96,39 +95,40 @@ class BatchedView:
 
 
 class ComposerView:
-    """Composer environments, one simulation each."""
+    """A composer environment, one simulation."""
 
-    def __init__(self, environments: Sequence[composer.Environment]):
-        self._environments = list(environments)
-        self.num_simulations = len(self._environments)
-        self.num_actions = int(self._environments[0].action_spec().shape[0])
+    num_simulations = 1
+
+    def __init__(self, environment: composer.Environment):
+        self._environment = environment
+        self.num_actions = int(environment.action_spec().shape[0])
 
     @property
     def task(self) -> Navigation:
-        """The task of the first; the others' differ in their randomness only."""
-        return self._environments[0].task
+        """The task that the simulation runs."""
+        return self._environment.task
 
     def case(self, index: int) -> Case:
-        """Scene and objective of the episode of one simulation."""
-        return self._environments[index].task.rollout.case()
+        """Scene and objective of the episode."""
+        return self._environment.task.rollout.case()
 
     @property
     def readings(self) -> Readings:
-        """State of the devices; every array has the leading axis N."""
-        return _stacked([env.task.readings for env in self._environments])
+        """State of the devices; every array has the leading axis 1."""
+        return _batch(self.task.readings)
 
     @property
     def wall_force(self) -> forces.WallForce:
-        """Force on the wall over the last control step; arrays (N,), N."""
-        return _stacked([env.task.wall_force for env in self._environments])
+        """Force on the wall over the last control step; arrays (1,), N."""
+        return _batch(self.task.wall_force)
 
     @property
     def devices(self) -> CoaxialReadings | None:
-        """State of coaxial devices, arrays (N, ...); None for one device alone."""
-        states = [env.task.devices for env in self._environments]
-        return None if states[0] is None else _stacked(states)
+        """State of coaxial devices, arrays (1, ...); None for one device alone."""
+        devices = self.task.devices
+        return None if devices is None else _batch(devices)
 
 
-def _stacked(parts: list[Stacked]) -> Stacked:
-    """Tuples of arrays (...,) as one of arrays (N, ...)."""
-    return type(parts[0])(*map(np.stack, zip(*parts, strict=True)))
+def _batch(state: State) -> State:
+    """A tuple of arrays (...,) as one of arrays (1, ...)."""
+    return type(state)(*(np.stack([value]) for value in state))

@@ -1,7 +1,6 @@
 """TorchRL environments of the tasks, with observations for networks."""
 
 from collections.abc import Mapping, Sequence
-from functools import partial
 from typing import Any
 
 import torch
@@ -11,14 +10,10 @@ from torchrl.envs import (
     Compose,
     DoubleToFloat,
     EnvBase,
-    SerialEnv,
     StepCounter,
     Transform,
     TransformedEnv,
 )
-
-from cathsim_dmc import bounds
-from cathsim_dmc.simulation.composer import composer_env
 
 # All numeric entries of an observation, concatenated in the order of their names.
 # Not called "state": TorchRL gives that name a meaning of its own.
@@ -34,7 +29,6 @@ def make_env(
     num_envs: int = 1,
     num_threads: int | None = None,
     seed: int = 0,
-    backend: str = "batched",
     task_kwargs: Mapping[str, Any] | None = None,
 ) -> EnvBase:
     """A seeded environment of batch size [num_envs] whose observations are standard.
@@ -46,8 +40,6 @@ def make_env(
         num_threads: Number of threads of the batched simulation, None for one per
             core.
         seed: Seed of the first simulation.
-        backend: "batched" (mujoco.batch, in parallel) or "composer" (dm_control
-            environments, one after the other).
         task_kwargs: Further options of the task.
 
     Returns:
@@ -55,38 +47,20 @@ def make_env(
         "pixels" (num_envs, c, h, w) uint8.
 
     Raises:
-        ValueError: the backend, the task or one of its options is unknown.
+        ValueError: the task or one of its options is unknown.
     """
-    kwargs = bounds.options("task_kwargs", task_kwargs)
-    if backend == "batched":
-        # Imported late: importing this module must not load MuJoCo.
-        from cathsim_dmc.simulation.torchrl import BatchedEnv
+    # Imported late: importing this module must not load MuJoCo.
+    from cathsim_dmc.simulation.torchrl import BatchedEnv
 
-        env = BatchedEnv(
-            task,
-            num_envs,
-            num_threads=num_threads,
-            seed=seed,
-            observation=observation,
-            task_kwargs=kwargs,
-        )
-    elif backend == "composer":
-        kwargs["observation"] = observation
-        # Each factory seeds its own: SerialEnv.set_seed would hash the seeds apart.
-        env = SerialEnv(
-            num_envs,
-            [partial(composer_env, task, kwargs, seed + i) for i in range(num_envs)],
-        )
-    else:
-        raise ValueError(
-            f"backend={backend!r} is unknown; choose 'batched' or 'composer'."
-        )
+    env = BatchedEnv(
+        task,
+        num_envs,
+        num_threads=num_threads,
+        seed=seed,
+        observation=observation,
+        task_kwargs=task_kwargs,
+    )
     return standard_observations(env)
-
-
-def composer_of(env: EnvBase) -> Any:
-    """The composer environment under one environment of the backend "composer"."""
-    return env.base_env._env
 
 
 def standard(

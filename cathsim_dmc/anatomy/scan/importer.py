@@ -64,9 +64,6 @@ _MEND_COMPUTED = (
     "centrelines that were drawn."
 )
 
-# Share of an import that is done when a step begins, for a progress bar.
-SHARES = {"mesh": 0.0, "depth": 0.06, "tree": 0.35, "wall": 0.65, "done": 1.0}
-
 
 def import_scan(
     mesh_path: str | Path,
@@ -110,7 +107,7 @@ def import_scan(
         tolerance: m, of the prisms; see ``scan.wall.build_wall``.
         threshold: m, of CoACD; see ``coacd_wall.decompose_wall``.
         progress: called with a line of text for every step, which begins with the
-            step's name, a key of ``SHARES``, or with "note".
+            step's name or with "note".
         notes: list to which what was guessed, mended and left out is added.
 
     Returns:
