@@ -124,7 +124,7 @@ def test_weights_that_are_no_plain_arrays_are_refused(change):
     state = make_policy(shapes, config).state_dict()
     checkpoints.require_fit("policy.pt", state, shapes, config)
     name = next(key for key, weight in state.items() if weight.ndim == 2)
-    with pytest.raises(CheckpointError, match="policy.pt holds weights without numb"):
+    with pytest.raises(CheckpointError, match="policy.pt does not fit the network"):
         state[name] = change(state[name])
         checkpoints.require_fit("policy.pt", state, shapes, config)
 

@@ -18,6 +18,8 @@ from types import MappingProxyType
 import numpy as np
 from numpy.typing import ArrayLike
 
+from cathsim_dmc import bounds
+
 # Primary and secondary angle of the views used for the arch, degrees. Signs are those
 # of the DICOM positioner angles: LAO and cranial positive.
 VIEWS: Mapping[str, tuple[float, float]] = MappingProxyType(
@@ -39,6 +41,7 @@ RESOLUTION = (128, 128)  # the published image observation
 
 # Closer to the source than this (m) nothing is imaged: the tube housing is there.
 NEAREST = 0.05
+_STEEPEST = np.deg2rad(89.0)  # largest secondary angle
 
 
 @dataclass(frozen=True)
@@ -67,39 +70,24 @@ class CArm:
     isocentre: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
     def __post_init__(self) -> None:
-        for name in ("primary", "secondary"):
-            object.__setattr__(self, name, float(getattr(self, name)))
-            if not np.isfinite(getattr(self, name)):
-                raise ValueError(f"{name} is not finite; give an angle in radians.")
-        if not abs(self.secondary) < np.pi / 2:
-            raise ValueError(
-                f"secondary is {self.secondary:g} rad; it must lie between -pi/2 and "
-                "pi/2 (give radians, or use CArm.view for degrees)."
-            )
-        for name in ("magnification", "detector_size", "source_isocentre"):
-            value = float(getattr(self, name))
+        checked = {
+            "primary": bounds.number("primary", self.primary, unit="rad"),
+            "secondary": bounds.number(
+                "secondary", self.secondary, -_STEEPEST, _STEEPEST, "rad"
+            ),
+            "source_detector": bounds.number(
+                "source_detector", self.source_detector, self.source_isocentre, unit="m"
+            ),
+            "source_isocentre": bounds.number(
+                "source_isocentre", self.source_isocentre, NEAREST, unit="m"
+            ),
+            "resolution": bounds.pixels("resolution", self.resolution),
+            "isocentre": bounds.vector("isocentre", self.isocentre, 3, unit="m"),
+        }
+        for name in ("magnification", "detector_size"):
+            checked[name] = bounds.number(name, getattr(self, name), positive=True)
+        for name, value in checked.items():
             object.__setattr__(self, name, value)
-            if not (np.isfinite(value) and value > 0.0):
-                raise ValueError(f"{name} is {value:g}; it must be > 0.")
-        object.__setattr__(self, "source_detector", float(self.source_detector))
-        if not self.source_detector > self.source_isocentre > NEAREST:
-            raise ValueError(
-                f"source_detector is {self.source_detector:g} m and source_isocentre "
-                f"{self.source_isocentre:g} m; the isocentre lies between source and "
-                f"detector and more than {NEAREST:g} m from the source."
-            )
-        resolution = tuple(int(n) for n in self.resolution)
-        if len(resolution) != 2 or min(resolution) < 1:
-            raise ValueError(
-                f"resolution is {self.resolution!r}; give (rows, columns), both >= 1."
-            )
-        object.__setattr__(self, "resolution", resolution)
-        isocentre = tuple(float(x) for x in np.asarray(self.isocentre).ravel())
-        if len(isocentre) != 3 or not np.isfinite(isocentre).all():
-            raise ValueError(
-                f"isocentre is {self.isocentre!r}; give three finite numbers in metres."
-            )
-        object.__setattr__(self, "isocentre", isocentre)
 
     @classmethod
     def view(cls, name: str = "AP", **fields) -> CArm:
@@ -108,12 +96,7 @@ class CArm:
         Raises:
             ValueError: if the name is not one of `VIEWS`.
         """
-        if name not in VIEWS:
-            raise ValueError(
-                f"view is {name!r}; choose one of {', '.join(VIEWS)} or give the "
-                "angles primary and secondary."
-            )
-        primary, secondary = np.deg2rad(VIEWS[name])
+        primary, secondary = np.deg2rad(VIEWS[bounds.choice("view", name, VIEWS)])
         return cls(primary=primary, secondary=secondary, **fields)
 
     def centred_on(self, points: ArrayLike) -> CArm:

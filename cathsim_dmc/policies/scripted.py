@@ -10,34 +10,35 @@ from cathsim_dmc.policies.policy import Policy
 from cathsim_dmc.policies.view import View
 
 
-class Random(Policy):
+class _Drawn(Policy):
+    """Draws simulation i's actions from seed + i, on from episode to episode."""
+
+    def __init__(self, seed: int = 0):
+        self._seed = seed
+        self._generators: list[np.random.Generator] = []
+        self._action = np.zeros((0, 0))
+
+    def reset(self, view: View, which: np.ndarray) -> None:
+        """Make the generators with the first episodes."""
+        count = view.num_simulations
+        if len(self._generators) != count:
+            seeds = range(self._seed, self._seed + count)
+            self._generators = [np.random.default_rng(seed) for seed in seeds]
+            self._action = np.zeros((count, view.num_actions))
+
+
+class Random(_Drawn):
     """Uniform actions in [-1, 1], from a generator for each simulation."""
 
     name = "random"
 
-    def __init__(self, seed: int = 0):
-        """Draws simulation i's actions from seed + i.
-
-        Args:
-            seed: Seed of the first simulation's actions.
-        """
-        self._seed = seed
-        self._generators: list[np.random.Generator] = []
-        self._size = 0
-
-    def reset(self, view: View, which: np.ndarray) -> None:
-        """Begin; a further episode goes on with the generator of its simulation."""
-        self._size = view.num_actions
-        if len(self._generators) != view.num_simulations:
-            seeds = range(self._seed, self._seed + view.num_simulations)
-            self._generators = [np.random.default_rng(seed) for seed in seeds]
-
     def act(self, observation: Any) -> np.ndarray:
         """Actions (N, A), whatever is observed."""
-        return np.stack([g.uniform(-1, 1, self._size) for g in self._generators])
+        size = self._action.shape[1]
+        return np.stack([g.uniform(-1, 1, size) for g in self._generators])
 
 
-class RandomCurl(Policy):
+class RandomCurl(_Drawn):
     """Full push, the tip bent all the way in one direction drawn for each episode.
 
     Every x hinge of the tip gets the same command and every y hinge the same: a point
@@ -46,23 +47,9 @@ class RandomCurl(Policy):
 
     name = "random_curl"
 
-    def __init__(self, seed: int = 0):
-        """Draws simulation i's curls from seed + i.
-
-        Args:
-            seed: Seed of the first simulation's curls.
-        """
-        self._seed = seed
-        self._generators: list[np.random.Generator] = []
-        self._action = np.zeros((0, 0))
-
     def reset(self, view: View, which: np.ndarray) -> None:
         """Draw the curls of the simulations that begin a new episode."""
-        count = view.num_simulations
-        if len(self._generators) != count:
-            seeds = range(self._seed, self._seed + count)
-            self._generators = [np.random.default_rng(seed) for seed in seeds]
-            self._action = np.zeros((count, view.num_actions))
+        super().reset(view, which)
         catheter = view.task.scene.catheter
         motors = len(catheter.tip_motors)
         self._action = self._action.copy()
