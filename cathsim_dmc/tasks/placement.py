@@ -20,7 +20,7 @@ _LEAST_START_DEPTH = 0.005  # m
 _LARGEST_SHARE = 0.5
 # Way beyond the goal that the stroke leaves for detours and wrong branches: half a turn
 # along the outer wall of an arch of 14 mm radius is 41 mm longer than its centreline.
-# The way of a device that arrives is shorter than the centreline.
+# The expert arrives with 4 to 33 mm less than the route to the goal.
 _SPARE_STROKE = 0.04  # m
 _BASE_LENGTH = 0.02  # m of device that never leaves the sheath
 # Length of the device that observations show, see `common_chain`. It is divided into
