@@ -160,6 +160,14 @@ def edit(directory, change):
         change(file["episode_1"])
 
 
+FILE = [("/etc/passwd", 0, 24)]
+
+
+def made(group, **kind):
+    del group["actions"]
+    group.create_dataset("actions", dtype="f8", **kind)
+
+
 def replace(group, name, value):
     del group[name]
     group[name] = value
@@ -171,6 +179,10 @@ def replace(group, name, value):
         (lambda g: replace(g, "actions", h5py.ExternalLink("x.h5", "/a")), "elsewhere"),
         (lambda g: replace(g, "actions", h5py.SoftLink("/episode_0")), "elsewhere"),
         (lambda g: replace(g, "actions", np.array([b"text"])), "array of numbers"),
+        (lambda g: replace(g, "actions", np.float64(1.0)), "array of numbers"),
+        (lambda g: made(g, shape=(3,), external=FILE), "array of numbers"),
+        (lambda g: made(g, shape=(2**50, 2**10), chunks=(1, 2**10)), "takes .* GB"),
+        (lambda g: g.attrs.__setitem__("seed", "x"), "cannot be read: seed"),
         (lambda g: replace(g, "actions", np.zeros((3, 21))), "do not fit"),
         (lambda g: g["actions"].__setitem__((0, 0), np.nan), "not finite"),
         (lambda g: g.__delitem__("rewards"), "rewards is missing"),

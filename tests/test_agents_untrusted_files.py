@@ -14,7 +14,6 @@ from tensordict import TensorDict
 from test_agents_training import run, small_ppo, small_sac
 
 from cathsim_dmc.agents import Checkpoint, CheckpointError, evaluate
-from cathsim_dmc.agents.metrics import MetricsError, MetricsFile, read_metrics
 from cathsim_dmc.agents.replay import ReplayError, ReplayMemory
 
 
@@ -157,42 +156,6 @@ def test_nothing_in_a_checkpoint_is_executed(
     assert not marker.exists()
 
 
-def test_no_other_file_of_a_run_is_executed(tmp_path, marker, trained):
-    folder = tmp_path / "run"
-    for kind, bomb in bombs(marker).items():
-        shutil.copytree(trained / "sac", folder)
-        (folder / "replay" / "other.npy").write_bytes(bomb)
-        (folder / "config.json").write_bytes(bomb)
-        (folder / "evaluation.json").write_bytes(bomb)
-        run(small_sac(total_frames=832), folder, resume=True)
-        (checkpoint_of(folder) / "checkpoint.json").write_bytes(bomb)
-        with pytest.raises(CheckpointError, match="checkpoint.json"):
-            Checkpoint.open(folder)
-        (folder / "metrics.csv").write_bytes(bomb)
-        with pytest.raises(ValueError):
-            MetricsFile(folder / "metrics.csv", ["frames"], resume_at=1)
-        with pytest.raises(ValueError):
-            assert not read_metrics(folder / "metrics.csv"), kind
-            raise MetricsError
-        shutil.rmtree(folder)
-    assert not marker.exists()
-
-
-@pytest.mark.parametrize("content", [b"", b"weights", b"PK\x03\x04", b"\x80\x02."])
-def test_a_file_without_weights_says_so(tmp_path, trained, content):
-    shutil.copytree(trained / "ppo", tmp_path / "run")
-    path = checkpoint_of(tmp_path / "run")
-    (path / "policy.pt").write_bytes(content)
-    with pytest.raises(CheckpointError, match="policy.pt is damaged"):
-        Checkpoint.open(path).policy()
-    values = json.loads((path / "checkpoint.json").read_text())
-    values["sha256"]["policy.pt"] = hashlib.sha256(content).hexdigest()
-    (path / "checkpoint.json").write_text(json.dumps(values))
-    with pytest.raises(CheckpointError, match="policy.pt holds no weights") as caught:
-        Checkpoint.open(path).policy()
-    assert "\n" not in str(caught.value)
-
-
 @pytest.mark.parametrize(
     ("group", "name", "value", "match"),
     [
@@ -219,17 +182,6 @@ def test_a_wrong_description_names_the_field(
         Checkpoint.open(path)
     assert "\n" not in str(caught.value)
     assert str(path) in str(caught.value)
-
-
-def test_weights_of_another_network_are_refused(tmp_path, trained):
-    shutil.copytree(trained / "ppo", tmp_path / "run")
-    path = checkpoint_of(tmp_path / "run")
-    values = json.loads((path / "checkpoint.json").read_text())
-    values["shapes"]["vector"] += 1
-    (path / "checkpoint.json").write_text(json.dumps(values))
-    with pytest.raises(CheckpointError, match="does not fit the network") as caught:
-        Checkpoint.open(path).policy()
-    assert "\n" not in str(caught.value)
 
 
 @pytest.mark.parametrize("name", ["rng", "learner", "episodes"])

@@ -3,13 +3,10 @@
 import dataclasses
 import math
 
-import gymnasium
 import numpy as np
 import pytest
-import torch
 from bad_values import NONE, Tally, flag, number, options, pixels, span, whole, word
 from hypothesis import strategies as st
-from recording_samples import make_episode
 
 import cathsim_dmc.gym  # noqa: F401  registers the ids
 from cathsim_dmc import suite
@@ -21,8 +18,6 @@ from cathsim_dmc.anatomy.scan.importer import import_scan
 from cathsim_dmc.entities import devices
 from cathsim_dmc.imaging.options import FluoroscopyOptions
 from cathsim_dmc.physics.randomisation import Randomisation
-from cathsim_dmc.simulation.batch import BatchSimulation
-from cathsim_dmc.simulation.torchrl import BatchedEnv
 from cathsim_dmc.tasks.cameras import CameraOptions
 from cathsim_dmc.tasks.config import NavigationConfig
 
@@ -321,57 +316,6 @@ def try_values(tally, folder, examples):
             tally.draw(bad, examples, check)
 
 
-def bad_actions(shape):
-    """Actions of a wrong shape, kind or with a wrong value."""
-    size = math.prod(shape)
-
-    def with_value(value, at):
-        action = [0.0] * size
-        action[at] = value
-        return np.reshape(np.array(action, dtype=object), shape).tolist()
-
-    values = st.sampled_from([math.nan, math.inf, -math.inf, "x", None, 1j, [], "0"])
-    shapes = st.lists(st.integers(0, 3), max_size=3).filter(lambda s: tuple(s) != shape)
-    return st.one_of(
-        st.builds(with_value, values, st.integers(0, size - 1)),
-        shapes.map(np.zeros),
-        st.sampled_from([None, "x", 1j, {}, object, np.zeros(shape, bool)]),
-    )
-
-
-def bad_numbers(shape):
-    """Arrays of numbers that are no action."""
-
-    def with_value(value, at):
-        action = np.zeros(shape)
-        action.flat[at] = value
-        return action
-
-    size = math.prod(shape)
-    values = st.sampled_from([math.nan, math.inf, -math.inf])
-    shapes = st.lists(st.integers(0, 3), max_size=3).filter(lambda s: tuple(s) != shape)
-    return st.builds(with_value, values, st.integers(0, size - 1)) | shapes.map(np.ones)
-
-
-def try_actions(tally, environment, examples):
-    environment.reset()
-    before = environment.physics.data.qpos.copy()
-    simulation = BatchSimulation(environment.task, 2, num_threads=1)
-    simulation.reset()
-    state = simulation.batch.qpos.copy()
-    for name, step, shape in (
-        ("composer action", environment.step, environment.action_spec().shape),
-        ("batch action", simulation.step, (2, simulation.num_actions)),
-    ):
-
-        def check(value, name=name, step=step):
-            tally.refused(name, lambda: step(value), ["action", "[-1, 1]"])
-
-        tally.draw(bad_actions(shape), examples, check)
-    np.testing.assert_array_equal(environment.physics.data.qpos, before)
-    np.testing.assert_array_equal(simulation.batch.qpos, state)
-
-
 def test_every_field_is_tried():
     """A field that is added later must be told here what it does not take."""
     for kind, tried in (
@@ -386,72 +330,6 @@ def test_every_field_is_tried():
         assert not fields - tried.keys() - {"torch_device"}, kind.__name__
 
 
-def try_faces(tally, examples):
-    """TorchRL checks actions against its spec only when told to: it is the batch's."""
-    vector = gymnasium.make_vec(
-        "cathsim/type1_bca-v0", 2, vectorization_mode="vector_entry_point"
-    )
-    vector.reset(seed=0)
-    batched = BatchedEnv("type1_bca", 2, num_threads=1)
-    start = batched.reset()
-
-    def torchrl(value):
-        value = torch.as_tensor(value, dtype=torch.float32)
-        return batched.step(start.clone().set("action", value))
-
-    for name, step, bad in (
-        ("Gymnasium action", vector.step, bad_actions((2, 21))),
-        ("TorchRL action", torchrl, bad_numbers((2, 21))),
-    ):
-
-        def check(value, name=name, step=step):
-            tally.refused(name, lambda: step(value), [], (ValueError, RuntimeError))
-
-        tally.draw(bad, examples, check)
-    vector.close()
-    batched.close()
-
-
-def spoilt(array):
-    """An array with a row too few or too many, an axis more, or no number in it."""
-
-    def with_value(value, at):
-        other = np.array(array, dtype=np.float64)
-        other.flat[at] = value
-        return other
-
-    values = st.sampled_from([math.nan, math.inf, -math.inf])
-    other = [array[:-1], np.concatenate([array, array[-1:]]), array[..., None]]
-    return st.one_of(
-        st.builds(with_value, values, st.integers(0, array.size - 1)),
-        st.sampled_from([*other, None, "x", {}, object, 1j, [["a"]], [[1.0], [1, 2]]]),
-    )
-
-
-def try_episodes(tally, examples):
-    episode = make_episode()
-    fields = {
-        "task": st.sampled_from([None, "", 1, b"x", [], {}]),
-        "seed": st.sampled_from(["x", 1.5, True, [], {}, math.nan, math.inf]),
-        "meta": st.sampled_from([None, 1, "x", [], {}, {"success": object()}, {1: 2}]),
-    }
-    for field in dataclasses.fields(episode):
-        bad = fields.get(field.name)
-        if bad is None:
-            bad = spoilt(getattr(episode, field.name))
-
-        def check(value, name=field.name):
-            tally.refused(
-                "Episode",
-                lambda: dataclasses.replace(episode, **{name: value}),
-                # Arrays that no longer fit each other are told of by either name.
-                [] if name in ("time", "contact_step") else [name],
-                note=name,
-            )
-
-        tally.draw(bad, examples, check)
-
-
 def settled(tally, folder):
     assert not list(folder.iterdir()), "something was written"
     print(tally.report())
@@ -460,11 +338,8 @@ def settled(tally, folder):
 
 
 @pytest.mark.parametrize("examples", [2, pytest.param(20, marks=pytest.mark.slow)])
-def test_bad_values_are_refused_by_name(tmp_path, shared_environment, examples):
+def test_bad_values_are_refused_by_name(tmp_path, examples):
     tally = Tally()
     try_values(tally, tmp_path, examples)
-    try_actions(tally, shared_environment("type1_bca"), 10 * examples)
-    try_faces(tally, 5 * examples)
-    try_episodes(tally, 2 * examples)
     settled(tally, tmp_path)
     assert tally.tried.total() > 100 * examples

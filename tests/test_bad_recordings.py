@@ -1,6 +1,5 @@
 """Damaged recordings, dumps and datasets: refused, by path, nothing is written."""
 
-import itertools
 import json
 
 import numpy as np
@@ -173,47 +172,7 @@ def try_rerun_files(tally, store, examples):
     rrd.unlink()
 
 
-def members(group, path=""):
-    """Paths of all that lies in an HDF5 file."""
-    import h5py
-
-    for name, member in group.items():
-        yield f"{path}{name}"
-        if isinstance(member, h5py.Group):
-            yield from members(member, f"{path}{name}/")
-
-
-def hdf5_damage(group, name, kind):
-    """Damages a member of an HDF5 file."""
-    import h5py
-
-    member = group[name]
-    value = member[()] if isinstance(member, h5py.Dataset) else np.zeros(3)
-    del group[name]
-    if kind == "soft link":
-        group[name] = h5py.SoftLink("/episode_0/rewards")
-    elif kind == "link elsewhere":
-        group[name] = h5py.ExternalLink("lumen.stl", "/a")
-    elif kind == "group":
-        group.create_group(f"{name}/x")
-    elif kind == "huge":
-        group.create_dataset(name, shape=(2**50, 2**10), dtype="f8", chunks=(1, 2**10))
-    elif kind == "elsewhere":
-        group.create_dataset(
-            name, shape=(3,), dtype="f8", external=[("/etc/passwd", 0, 24)]
-        )
-    elif kind != "missing":
-        group[name] = {
-            "nan": lambda: np.full_like(value, np.nan, dtype=np.float64),
-            "text": lambda: np.array([b"x"] * len(value)),
-            "shorter": lambda: value[:-1],
-            "one": lambda: np.float64(1.0),
-            "complex": lambda: np.full(value.shape, 1j),
-        }[kind]()
-
-
 def try_datasets(tally, store, examples):
-    h5py = pytest.importorskip("h5py")
     folder = store / "demos-v0" / "data"
 
     def load():
@@ -226,38 +185,6 @@ def try_datasets(tally, store, examples):
     try_json(tally, "dataset", metadata, load, examples, harmless)
     # HDF5 has no checksums: other numbers are read as what they are.
     try_bytes(tally, "dataset", arrays, load, examples, lambda _: True)
-    good = arrays.read_bytes()
-    with h5py.File(arrays) as file:
-        # One info that nobody needs may be missing.
-        names = sorted(members(file))
-    kinds = "nan text shorter one complex soft huge group missing elsewhere".split()
-    kinds[kinds.index("soft")] = "soft link"
-    kinds += ["link elsewhere", "attribute"]
-
-    def fits(case):
-        name, kind = case
-        optional = name.count("/") == 2 or name.endswith("/infos")
-        if kind == "missing":
-            return not optional and name != "episode_1"
-        if kind == "nan":
-            return name.endswith(("actions", "rewards", "position"))
-        if kind == "group":
-            return "/" in name and not name.endswith(("infos", "observations"))
-        return kind != "attribute" or name.startswith("episode") and "/" not in name
-
-    def check(case):
-        name, kind = case
-        with h5py.File(arrays, "r+") as file:
-            if kind == "attribute":
-                file[name].attrs["seed"] = "x"
-            else:
-                way, _, last = name.rpartition("/")
-                hdf5_damage(file[way] if way else file, last, kind)
-        tally.refused("dataset, arrays", load, [arrays.name], ERRORS, note=case)
-        arrays.write_bytes(good)
-
-    cases = [case for case in itertools.product(names, kinds) if fits(case)]
-    tally.draw(st.sampled_from(cases), examples, check)
 
 
 EVERYTHING = (try_episodes, try_dumps, try_rerun_files, try_datasets)

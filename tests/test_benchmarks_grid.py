@@ -125,11 +125,6 @@ def test_options_of_a_task_that_are_no_table_make_a_cell_impossible(grid):
         cell.config()
 
 
-def test_a_file_without_an_end_is_no_grid():
-    with pytest.raises(GridError, match="/dev/zero cannot be read .*too long"):
-        read_grid("/dev/zero")
-
-
 def test_cells_are_chosen_by_parts_of_names_and_patterns(grid):
     cells = grid(ROW)
     assert choose(cells, []) == cells

@@ -294,7 +294,6 @@ TRAIN = ("train", "type1_bca", "--out", "OUT")
 BAD = {
     "no such command": (["trian"], ["train", "eval"]),
     "no arguments": (["train"], ["TASK", "--out"]),
-    "no such task": (["train", "type9", "--out", "OUT"], ["type9", *TASKS]),
     "no such observation": (
         ["train", "type1_bca", "--out", "OUT", "--observation", "pixels"],
         ["pixels", "internal", "image", "sequential", "tracking"],
@@ -303,21 +302,8 @@ BAD = {
     "text in a list": ([*TRAIN, "--hidden", 64, "x"], ["--hidden", "x"]),
     "a value out of range": ([*TRAIN, "--gamma", 2], ["gamma=2.0", "(0, 1]"]),
     "an option of another algorithm": ([*TRAIN, "--tau", 0.1], ["--tau"]),
-    "no such preset": ([*TRAIN, "--preset", "best"], ["best", "published", "demo"]),
-    "an option of the task": ([*TRAIN, "--max-steps", 0], ["max_steps", "0"]),
     "nothing to resume": ([*TRAIN, "--resume"], ["no run in OUT to resume"]),
     "settings as JSON": ([*TRAIN, "--settings", "{}"], ["--settings"]),
-    "no such goal": (
-        [
-            *("train", "navigate", "--out", "OUT"),
-            *("--anatomy", "type1", "--goal", "x"),
-        ],
-        ["bca", "lcca", "lsa"],
-    ),
-    "no such phantom": (
-        ["phantom", "check", "OUT"],
-        ["directory", *arch.ARCHES],
-    ),
     "no such scan": (
         ["phantom", "import", "OUT.obj", "--centreline", "OUT.csv", "--out", "OUT"],
         ["OUT.obj", "no mesh file", "STL"],
@@ -332,11 +318,6 @@ BAD = {
         ["eval", "push", "--task", "type1_bca", "--randomisation", "{delay"],
         ["--randomisation", "{delay", "give JSON"],
     ),
-    "no such device of the task": (
-        ["eval", "push", "--task", "type1_bca", "--device", "banana"],
-        ["banana", "steerable_5f"],
-    ),
-    "no such recording": (["replay", "OUT.rrd"], ["OUT.rrd"]),
 }
 
 

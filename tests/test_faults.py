@@ -1,10 +1,7 @@
 """Processes that are killed, disks that are full, folders that cannot be written."""
 
-import json
 import os
-import subprocess
 import sys
-from pathlib import Path
 
 import killed_work
 import numpy as np
@@ -28,18 +25,6 @@ def names(folder):
     return sorted(name for name in left if not name.endswith(".partial"))
 
 
-def spawn(script, *arguments):
-    """Python in a process of its own that finds the tests."""
-    paths = [str(Path(__file__).parent), *sys.path]
-    return subprocess.Popen(
-        [sys.executable, "-c", script, *map(str, arguments)],
-        env={**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, paths))},
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-    )
-
-
 # Disks.
 
 
@@ -61,29 +46,6 @@ def test_a_recording_on_a_full_disk_leaves_the_older_one(tmp_path, small_disk):
         assert names(tmp_path) == ["a.npz", "a.rrd"]
         assert out.read_bytes() == before
         assert Episode.load(out.with_suffix(".npz")).equals(first)
-
-
-@pytest.mark.slow
-def test_a_failed_recording_leaves_no_arrays(tmp_path, monkeypatch):
-    def fail(*arguments, **options):
-        raise RuntimeError("no stream")
-
-    monkeypatch.setattr("cathsim_dmc.recording.rerun_log.write_rrd", fail)
-    with pytest.raises(RuntimeError, match="no stream"):
-        report.record("push", tmp_path / "a.rrd", task="type1_bca", max_steps=1)
-    assert not list(tmp_path.iterdir())
-
-
-def test_a_full_disk_ends_a_training_with_its_name(tmp_path, small_disk):
-    run(small_ppo(total_frames=512), tmp_path)
-    before = Checkpoint.open(tmp_path)
-    with small_disk(20_000), pytest.raises(OSError) as caught:
-        run(small_ppo(total_frames=4_096), tmp_path, resume=True)
-    assert "File too large" in str(caught.value)
-    assert "enforce fail" not in str(caught.value)
-    assert Checkpoint.open(tmp_path) == before
-    result = run(small_ppo(total_frames=1_024), tmp_path, resume=True)
-    assert result.frames == 1_024
 
 
 def test_a_full_disk_leaves_the_older_anatomy(tmp_path, small_disk):
@@ -125,35 +87,6 @@ def test_folders_that_cannot_be_written_are_refused_before_the_work(
         report.record("push", out / "a.rrd", task="type1_bca")
     if kind != "read-only":
         assert (tmp_path / "out").read_text() == "mine"
-
-
-# Two at once.
-
-BUILD = """
-import sys
-from cathsim_dmc.validation import force_sensors
-for _ in range(5):
-    force_sensors.straight_tube(float(sys.argv[2]), 4e-3).save(sys.argv[1])
-"""
-
-
-def finished(processes):
-    """Standard output of processes, all of which must succeed."""
-    outputs = [process.communicate(timeout=300) for process in processes]
-    for process, (_, errors) in zip(processes, outputs, strict=True):
-        assert process.returncode == 0, errors
-    return [out for out, _ in outputs]
-
-
-@pytest.mark.slow
-def test_two_processes_write_the_same_anatomy_at_once(tmp_path):
-    lengths = ("0.06", "0.05")
-    finished([spawn(BUILD, tmp_path / "tube", length) for length in lengths])
-    held = Anatomy.load(tmp_path / "tube")
-    assert held.tree.vessel("tube").centreline.length in map(
-        pytest.approx, map(float, lengths)
-    )
-    assert len(names(tmp_path / "tube")) == 2
 
 
 # Kills.
@@ -222,14 +155,3 @@ def test_a_recording_that_is_killed_is_whole_or_not_there(tmp_path, server):
     report.record("push", out, task="type1_bca", max_steps=2, fluoroscopy=False)
     assert sorted(p.name for p in tmp_path.iterdir()) == ["a.npz", "a.rrd"]
     assert seen
-
-
-def test_half_a_checkpoint_is_never_taken_for_one(tmp_path):
-    run(small_ppo(total_frames=512), tmp_path)
-    path = checkpoints_in(tmp_path)[-1]
-    later = path.with_name("0000000900")
-    later.mkdir()
-    (later / "policy.pt").write_bytes((path / "policy.pt").read_bytes())
-    assert checkpoints_in(tmp_path) == [path]
-    values = json.loads((path / "checkpoint.json").read_text())
-    assert Checkpoint.open(tmp_path).frames == values["frames"]

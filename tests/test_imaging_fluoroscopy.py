@@ -38,13 +38,6 @@ def frames():
 # ------------------------------------------------------------------- detector
 
 
-def test_transmission_is_beer_lambert():
-    mu, length = 20.6, np.array([[0.0, 0.05], [0.1, 0.2]])
-    np.testing.assert_allclose(
-        detector.transmission(mu * length), np.exp(-20.6 * length), rtol=1e-6
-    )
-
-
 @pytest.mark.parametrize("quanta", [5.0, 20.0, 400.0, 4000.0])
 def test_noise_has_the_moments_of_poisson(quanta):
     signal = np.ones((8, 256, 256), dtype=np.float32)

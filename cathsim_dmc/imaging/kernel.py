@@ -44,13 +44,6 @@ def _below_left(x: float, y: float, left: float, below: float) -> float:
 
 
 @compiled
-def disc_quadrant(x: float, y: float) -> float:
-    """Area of the part of the unit disc left of `x` and below `y`, in [0, pi]."""
-    x, y = min(max(x, -1.0), 1.0), min(max(y, -1.0), 1.0)
-    return _below_left(x, y, _left(x), _left(y))
-
-
-@compiled
 def add_disc(
     image: np.ndarray,
     row: float,
