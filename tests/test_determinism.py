@@ -8,11 +8,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 
 from cathsim_dmc import suite
-from cathsim_dmc.agents import make_config, train
-from cathsim_dmc.agents.checkpoint import Checkpoint
 from cathsim_dmc.anatomy.arch import arch
 from cathsim_dmc.simulation.batch import BatchSimulation
 
@@ -102,34 +99,3 @@ def test_another_seed_is_another_trajectory():
     batch.step(action)
     assert (batch.batch.qpos[0] != batch.batch.qpos[1]).any()
     assert digest(batch.batch.qpos[0]) != digest(batch.batch.qpos[1])
-
-
-def weights(state, prefix=""):
-    for key, value in sorted(state.items()):
-        if isinstance(value, dict):
-            yield from weights(value, f"{prefix}{key}.")
-        elif isinstance(value, torch.Tensor):
-            yield f"{prefix}{key}", value
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("algorithm", ["ppo", "sac"])
-def test_a_training_gives_the_same_weights_twice(tmp_path, algorithm):
-    settings = {"random_frames": 256} if algorithm == "sac" else {}
-    config = make_config(
-        algorithm,
-        task="type1_bca",
-        total_frames=1_000,
-        num_envs=8,
-        normalisation_frames=256,
-        seed=5,
-        **settings,
-    )
-    states = []
-    for index, threads in enumerate((1, 2)):
-        out = tmp_path / str(index)
-        train(config.replace(num_threads=threads), out, progress=False)
-        states.append(dict(weights(Checkpoint.open(out).policy_state())))
-    assert states[0].keys() == states[1].keys() and states[0]
-    for name, value in states[0].items():
-        assert torch.equal(value, states[1][name]), name

@@ -120,21 +120,13 @@ def test_wrong_reward():
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        ({"goal_radius": 0.0}, ["goal_radius", "0.0", "above 0"]),
-        ({"max_steps": 0}, ["max_steps", "0", "an integer from 1"]),
         ({"max_steps": 10**400}, ["max_steps", "an integer from 1"]),
-        ({"rotation": "False"}, ["rotation", "'False'", "True or False"]),
-        ({"shaft_link": 1e9}, ["shaft_link", "1000000000.0", "0.002 to 0.1 m"]),
-        ({"friction": "0.1"}, ["friction", "'0.1'", "number"]),
         ({"physics_timestep": 0.003}, ["physics_timestep", "whole part"]),
         ({"friction": -0.1}, ["friction", "-0.1", "from 0 to 2"]),
         ({"working_length": 0.05}, ["working_length", "0.05", "steerable_5f", "more"]),
-        ({"torsion_joints": 500}, ["torsion_joints", "500", "joints"]),
-        ({"working_length": 300.0}, ["working_length", "300", "to 3 m"]),
         ({"fluoroscopy": {"zoom": 2}}, ["fluoroscopy", "zoom", "magnification"]),
         ({"cameras": {"names": ("front",)}}, ["front", "top", "side", "tip"]),
         ({"randomisation": {"gravity": 1}}, ["gravity", "friction"]),
-        ({"randomisation": {"delay": (0, 10**9)}}, ["randomisation", "delay", "250"]),
         ({"randomisation": 1}, ["randomisation", "1", "True", "friction"]),
         (
             {"randomisation": {"view": (0, 80)}, "fluoroscopy": {"view": (0, 20)}},

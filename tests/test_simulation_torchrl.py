@@ -98,10 +98,6 @@ def test_batched_env(batched):
         assert info[name].dtype == torch.bool
 
 
-def test_batched_env_with_numbers_and_forces(short_batched):
-    check_env_specs(short_batched)
-
-
 def test_batched_env_with_images():
     shown = ["image", "sequential"]
     env = BatchedEnv("simple1_lcca", 2, num_threads=1, observation=shown)
@@ -159,24 +155,6 @@ def test_tensors_of_steps_share_no_memory(short_batched):
         tensordict = short_batched.step(tensordict)["next"].clone(False)
     for key, value in kept.items():
         assert torch.equal(first[key], value)
-
-
-def test_bad_actions_are_refused(batched):
-    tensordict = batched.reset()
-    tensordict["action"] = torch.full((ENVS, 21), float("nan"))
-    with pytest.raises(ValueError, match="NaN"):
-        batched.step(tensordict)
-
-
-def test_episodes_start_over_by_themselves(short_batched):
-    steps = 2 * SHORT_EPISODE + 3
-    rollout = short_batched.rollout(steps, break_when_any_done=False)
-    assert rollout.shape == (ENVS, steps)
-    done = rollout["next", "done"][..., 0]
-    assert done.nonzero()[:, 1].unique().tolist() == [
-        SHORT_EPISODE - 1,
-        2 * SHORT_EPISODE - 1,
-    ]
 
 
 def test_the_first_episode_is_that_of_the_seed():

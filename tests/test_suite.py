@@ -2,7 +2,6 @@
 
 import dataclasses
 
-import dm_env
 import numpy as np
 import pytest
 from absl.testing import absltest
@@ -370,30 +369,12 @@ def test_success_at_the_last_step_is_success(near_goal, reseed, monkeypatch):
     assert near_goal.task.termination == "success"
 
 
-def test_time_out_one_step_before_success(near_goal, reseed, monkeypatch):
-    reseed(near_goal, 3)
-    steps = 1
-    while not near_goal.step(push()).last():
-        steps += 1
-    limit_steps(near_goal, monkeypatch, steps - 1)
-    reseed(near_goal, 3)
-    timesteps = [near_goal.step(push()) for _ in range(steps - 1)]
-    assert timesteps[-1].last() and timesteps[-1].discount == 1.0
-    assert timesteps[-1].reward < 0
-
-
 def test_time_is_exactly_the_control_steps(shared_environment):
     environment = shared_environment("type1_lcca")
     environment.reset()
     for step in range(1, 4):
         environment.step(np.zeros(21))
         assert environment.physics.time() == pytest.approx(0.04 * step, abs=1e-12)
-
-
-def test_step_types_are_dm_env_s(shared_environment):
-    environment = shared_environment("type1_lcca")
-    assert environment.reset().step_type is dm_env.StepType.FIRST
-    assert environment.step(np.zeros(21)).step_type is dm_env.StepType.MID
 
 
 # Noise.

@@ -31,7 +31,6 @@ KEYS = {
 _REPEAT = 0.06
 _BAR_FORCE = readout.FORCE_LEVELS[-1][0]  # N at the end of the bar
 _PANEL = 230  # px
-_DIAL = 40  # px, half the size of what shows the bend or a rotation
 
 
 class FluoroscopyWindow:
@@ -148,7 +147,11 @@ class FluoroscopyWindow:
     def _draw_panel(self, task, message):
         panel, left, y = self._panel, 14, 24
         panel.delete("all")
-        for name, value in readout.lines(task):
+        lines = readout.lines(task)
+        if isinstance(self._controls, Controls):
+            bend = " ".join(f"{100 * share:4.0f} %" for share in self._controls.bend)
+            lines.append(("bend about x, y", bend))
+        for name, value in lines:
             panel.create_text(left, y, text=name, fill="grey70", anchor="w")
             panel.create_text(_PANEL - 14, y, text=value, fill="white", anchor="e")
             y += 24
@@ -159,34 +162,9 @@ class FluoroscopyWindow:
             left, y, left + width, y + 16, fill=readout.colour(force), width=0
         )
         y += 40
-        if isinstance(self._controls, CoaxialControls):
-            self._draw_rotations(task.devices.rotation, y)
-        else:
-            self._draw_bend(self._controls.bend, y)
-        y += 2 * _DIAL + 20
         panel.create_text(
             left, y, text=message, fill="white", anchor="nw", width=_PANEL - 2 * left
         )
-
-    def _draw_bend(self, bend: np.ndarray, y: float):
-        """The bend (2,) of the tip as a joystick."""
-        middle, (about_x, about_y) = _PANEL / 2, bend
-        self._panel.create_rectangle(
-            middle - _DIAL, y, middle + _DIAL, y + 2 * _DIAL, outline="grey40"
-        )
-        x0, y0 = middle + _DIAL * about_y, y + _DIAL - _DIAL * about_x
-        self._panel.create_oval(x0 - 5, y0 - 5, x0 + 5, y0 + 5, fill="white")
-
-    def _draw_rotations(self, rotation: np.ndarray, y: float):
-        """A dial for the rotary unit of each device (K,), from the innermost on."""
-        size = min(_DIAL, _PANEL / (2 * len(rotation)) - 5)
-        for number, angle in enumerate(rotation.tolist()):
-            middle, level = _PANEL * (number + 0.5) / len(rotation), y + size
-            self._panel.create_oval(
-                middle - size, y, middle + size, y + 2 * size, outline="grey40"
-            )
-            tip = middle + size * np.sin(angle), level - size * np.cos(angle)
-            self._panel.create_line(middle, level, *tip, fill="white")
 
     def close(self) -> None:
         """Closes the window."""

@@ -143,55 +143,51 @@ def _scene(
     devices: Sequence[str] = ("world/catheter",),
 ) -> rrb.Spatial3DView:
     entities = [*(f"{device}/trail" for device in devices), "world/heat"]
-    return rrb.Spatial3DView(
-        origin="world",
-        name="Scene",
-        # From the front, as in an antero-posterior projection; y points backwards.
-        eye_controls=rrb.EyeControls3D(
-            kind="orbital",
-            position=centre + [0.0, -EYE_DISTANCE * extent, 0.0],
-            look_target=centre,
-            eye_up=[0.0, 0.0, 1.0],
-        ),
-        background=_BACKGROUND,
-        line_grid=False,
-        overrides={entity: _so_far() for entity in entities},
-    )
+    # From the front, as in an antero-posterior projection; y points backwards.
+    eye = centre + [0.0, -EYE_DISTANCE * extent, 0.0]
+    return _world("Scene", eye, centre, so_far=entities)
 
 
 def _tip(head: np.ndarray) -> rrb.Spatial3DView:
     """The neighbourhood of the tip, which the eye follows."""
-    return rrb.Spatial3DView(
-        origin="world",
-        name="Tip",
+    return _world(
+        "Tip",
+        head + [0.0, -TIP_DISTANCE, 0.0],
+        head,
+        "world/catheter/head",
         contents=["+ $origin/**", "- $origin/goal"],
-        eye_controls=rrb.EyeControls3D(
-            kind="orbital",
-            position=head + [0.0, -TIP_DISTANCE, 0.0],
-            look_target=head,
-            eye_up=[0.0, 0.0, 1.0],
-            tracking_entity="world/catheter/head",
-        ),
-        background=_BACKGROUND,
-        line_grid=False,
-        overrides={"world/heat": _so_far()},
     )
 
 
 def _robot(place: np.ndarray) -> rrb.Spatial3DView:
     """View of the follower robot, which is far from the anatomy."""
+    parts = ["+ $origin/robot/**", "+ $origin/sheath/**", "+ $origin/catheter"]
+    return _world("Robot", place + ROBOT_OFFSET, place, contents=parts)
+
+
+def _world(
+    name: str,
+    eye: np.ndarray,
+    target: np.ndarray,
+    tracked: str | None = None,
+    contents: Sequence[str] = ("+ $origin/**",),
+    so_far: Sequence[str] = ("world/heat",),
+) -> rrb.Spatial3DView:
+    """A view of the scene from an eye (3,) to a target (3,), m, world frame."""
     return rrb.Spatial3DView(
         origin="world",
-        name="Robot",
-        contents=["+ $origin/robot/**", "+ $origin/sheath/**", "+ $origin/catheter"],
+        name=name,
+        contents=list(contents),
         eye_controls=rrb.EyeControls3D(
             kind="orbital",
-            position=place + ROBOT_OFFSET,
-            look_target=place,
+            position=eye,
+            look_target=target,
             eye_up=[0.0, 0.0, 1.0],
+            tracking_entity=tracked,
         ),
         background=_BACKGROUND,
         line_grid=False,
+        overrides={entity: _so_far() for entity in so_far},
     )
 
 
