@@ -12,7 +12,7 @@ from cathsim_dmc import suite
 from cathsim_dmc.pictures import video
 from cathsim_dmc.pictures.animation import animate
 from cathsim_dmc.pictures.figure import scene_figure
-from cathsim_dmc.pictures.snapshot import Snapshot
+from cathsim_dmc.pictures.moment import Moment
 from cathsim_dmc.pictures.translucent import ParallelProjection, glass
 from cathsim_dmc.recording.episode import Episode
 from cathsim_dmc.recording.geometry import force_scale, force_text
@@ -107,13 +107,13 @@ def test_a_picture_shows_every_panel_and_is_the_same_again(pushed):
 
 def test_the_moment_of_a_record_is_that_of_the_environment(pushed):
     env, episode = pushed
-    live = Snapshot.of(env)
-    kept = Snapshot.of_episode(episode, live.surface)
+    live = Moment.of(env)
+    kept = Moment.of_episode(episode, live.surface)
     for name in ("device", "radius", "goal", "position", "force"):
         np.testing.assert_allclose(
             getattr(kept, name), getattr(live, name), atol=1e-12, err_msg=name
         )
-    start = Snapshot.of_episode(episode, live.surface, 0)
+    start = Moment.of_episode(episode, live.surface, 0)
     assert len(start.force) == 0 and len(start.path) == 1
 
 
@@ -215,7 +215,7 @@ def test_steps_beyond_the_episode_are_refused(pushed):
     env, episode = pushed
     surface = env.task.scene.anatomy.surface
     with pytest.raises(IndexError, match="61 states"):
-        Snapshot.of_episode(episode, surface, 61)
+        Moment.of_episode(episode, surface, 61)
     with pytest.raises(ValueError, match="film"):
         animate(episode, surface, "episode.avi")
 
@@ -245,4 +245,4 @@ def test_tasks_and_anatomies_say_what_they_are(pushed):
 
 def test_scene_figure_needs_something_to_draw(pushed):
     with pytest.raises(ValueError, match="front"):
-        scene_figure(Snapshot.of(pushed[0]), views=(), fluoroscopy=False)
+        scene_figure(Moment.of(pushed[0]), views=(), fluoroscopy=False)

@@ -10,7 +10,7 @@ from cathsim_dmc import policies, suite
 from cathsim_dmc.agents import evaluate
 from cathsim_dmc.policies import attempts, coaxial_pursuit, pursuit
 from cathsim_dmc.policies.attempts import Attempts
-from cathsim_dmc.policies.coaxial_pursuit import Plan, Settings
+from cathsim_dmc.policies.coaxial_pursuit import CoaxialPlan, CoaxialSettings
 from cathsim_dmc.policies.expert import Expert
 from cathsim_dmc.policies.teacher import Teacher
 from cathsim_dmc.simulation.batch import BatchSimulation
@@ -47,7 +47,7 @@ def test_frames_of_the_links_are_those_of_the_simulator(environment):
 
 def test_turning_by_the_error_turns_the_side_to_the_route(environment):
     environment.reset()
-    plan = Plan.for_task(environment.task)
+    plan = CoaxialPlan.for_task(environment.task)
     view = policies.ComposerView(environment)
 
     def directions():
@@ -81,11 +81,11 @@ def fresh(arc_length, insertion, **values):
 
 def attempt(state, arc_length, insertion, excess=-0.5):
     place = Place(np.array([arc_length]), np.array([5e-3]), np.array([excess]))
-    return attempts.advance(Settings(), state, place, np.array([insertion]))
+    return attempts.advance(CoaxialSettings(), state, place, np.array([insertion]))
 
 
 def test_a_shaft_that_buckles_is_taken_back_until_the_head_comes_with_it():
-    settings = Settings()
+    settings = CoaxialSettings()
     state = fresh(0.1, 0.05)
     state = attempt(state, 0.1, 0.05 + settings.slack + 1e-4)
     assert state.retracting[0] and state.taking_up[0] and state.attempts[0] == 1
@@ -98,7 +98,7 @@ def test_a_shaft_that_buckles_is_taken_back_until_the_head_comes_with_it():
 
 
 def test_a_head_that_has_strayed_is_withdrawn_all_the_way():
-    settings = Settings()
+    settings = CoaxialSettings()
     state = fresh(0.1, 0.05, lost=settings.lost_patience)
     state = attempt(state, 0.1, 0.05, excess=1.0)
     assert state.retracting[0] and not state.taking_up[0]
@@ -149,7 +149,7 @@ def test_a_new_episode_forgets_the_last():
 
 def test_what_is_for_one_device_is_refused_for_several():
     task = suite.make_task(TASK, random=0, observation="tracking")
-    with pytest.raises(ValueError, match="coaxial_pursuit.Settings"):
+    with pytest.raises(ValueError, match="coaxial_pursuit.CoaxialSettings"):
         Expert.for_task(task, pursuit.Settings())
     simulation = BatchSimulation(task, 1)
     simulation.reset()

@@ -28,7 +28,7 @@ CHECKPOINT_STEPS = 300  # longest episode that is recorded of a checkpoint
 
 
 @dataclasses.dataclass(frozen=True)
-class Report:
+class EvaluationReport:
     """An evaluation, with a baseline on the same seeds.
 
     Attributes:
@@ -148,7 +148,7 @@ def evaluate(
     baseline: bool = True,
     out_dir: str | Path | None = None,
     start: str | Path | None = None,
-) -> Report:
+) -> EvaluationReport:
     """Evaluates a policy; writes its files into a directory.
 
     What takes long says so on standard error now and then.
@@ -198,7 +198,7 @@ def evaluate(
             observer=EvaluationProgress("random"),
         )
         comparison = evaluation.compare(result, other)
-    report = Report(result, other, comparison, time.monotonic() - began)
+    report = EvaluationReport(result, other, comparison, time.monotonic() - began)
     if out_dir is not None:
         evaluation.write_evaluation(out_dir, report.to_dict())
         _draw_heatmap(contacts, result, Path(out_dir) / "heatmap.png")

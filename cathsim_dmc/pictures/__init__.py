@@ -13,16 +13,16 @@ from typing import Any
 import numpy as np
 
 from cathsim_dmc.imaging import FluoroscopyOptions
+from cathsim_dmc.pictures.moment import Moment
 from cathsim_dmc.pictures.readout import ForceReadout, forces
 from cathsim_dmc.pictures.recorded import record, write
-from cathsim_dmc.pictures.snapshot import Snapshot
 from cathsim_dmc.recording.episode import Episode
 from cathsim_dmc.recording.recorder import navigation_of
 
 __all__ = [
     "Episode",
     "ForceReadout",
-    "Snapshot",
+    "Moment",
     "fluoroscopy",
     "forces",
     "record",
@@ -58,8 +58,8 @@ def show(
     from cathsim_dmc.pictures.figure import scene_figure
 
     if episode is None:
-        return scene_figure(Snapshot.of(env), **options)
-    return scene_figure(Snapshot.of_episode(episode, surface, step), **options)
+        return scene_figure(Moment.of(env), **options)
+    return scene_figure(Moment.of_episode(episode, surface, step), **options)
 
 
 def fluoroscopy(env: Any, seed: int = 0, **options: Any) -> np.ndarray:
@@ -78,7 +78,7 @@ def fluoroscopy(env: Any, seed: int = 0, **options: Any) -> np.ndarray:
         TypeError: it is no environment of this package, or there is no such option.
         ValueError: an option's value is not possible.
     """
-    from cathsim_dmc.pictures.snapshot import xray
+    from cathsim_dmc.pictures.moment import xray
 
     base: FluoroscopyOptions = navigation_of(env).config.fluoroscopy_options
-    return xray(Snapshot.of(env), dataclasses.replace(base, **options), seed)
+    return xray(Moment.of(env), dataclasses.replace(base, **options), seed)

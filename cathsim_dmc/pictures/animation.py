@@ -14,7 +14,7 @@ from PIL import Image
 from cathsim_dmc.files import atomic_path
 from cathsim_dmc.pictures import figure as drawing
 from cathsim_dmc.pictures import video
-from cathsim_dmc.pictures.snapshot import Snapshot, xray
+from cathsim_dmc.pictures.moment import Moment, xray
 from cathsim_dmc.pictures.translucent import Glass, ParallelProjection, glass
 from cathsim_dmc.recording.episode import Episode
 
@@ -175,7 +175,7 @@ class _Film:
         """RGB pictures (rows, columns, 3) uint8 of some states."""
         image = None
         for step in steps:
-            moment = Snapshot.of_episode(self._episode, self._surface, int(step))
+            moment = Moment.of_episode(self._episode, self._surface, int(step))
             self._scene.clear()
             self._scene.axis("off")
             drawing.draw_scene(self._scene, moment, self._projection, self._glass)
@@ -192,7 +192,7 @@ class _Film:
             self._figure.agg.draw()
             yield np.asarray(self._figure.agg.buffer_rgba())[..., :3].copy()
 
-    def _label(self, moment: Snapshot, step: int) -> None:
+    def _label(self, moment: Moment, step: int) -> None:
         time = self._episode.time[step] - self._episode.time[0]
         text = f"{self._episode.task}   {time:4.1f} s"
         if step == self._episode.steps:

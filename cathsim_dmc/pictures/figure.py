@@ -16,7 +16,7 @@ from matplotlib.patches import Circle
 from PIL import Image
 
 from cathsim_dmc.imaging import FluoroscopyOptions
-from cathsim_dmc.pictures.snapshot import Snapshot, fluoroscope_of, xray
+from cathsim_dmc.pictures.moment import Moment, fluoroscope_of, xray
 from cathsim_dmc.pictures.translucent import Glass, ParallelProjection, glass
 from cathsim_dmc.recording.geometry import force_colours, force_text
 from cathsim_dmc.style import COLOURS, tidy
@@ -108,7 +108,7 @@ def background(
 
 
 def scene_figure(
-    snapshot: Snapshot,
+    moment: Moment,
     *,
     views: tuple[str, ...] = ("front", "left"),
     fluoroscopy: bool = True,
@@ -117,7 +117,7 @@ def scene_figure(
     """Draw a moment of an episode, without OpenGL.
 
     Args:
-        snapshot: What to draw.
+        moment: What to draw.
         views: Directions of view, of `VIEWS`.
         fluoroscopy: Whether to put the X-ray image beside them.
         pixels: Number of rows of the drawn vessel.
@@ -128,7 +128,7 @@ def scene_figure(
     unknown = [view for view in views if view not in VIEWS]
     if unknown or not (views or fluoroscopy):
         raise ValueError(f"views are {views!r}; give some of {', '.join(VIEWS)}")
-    drawn = [background(snapshot.surface, VIEWS[v][0], pixels) for v in views]
+    drawn = [background(moment.surface, VIEWS[v][0], pixels) for v in views]
     ratios = [p.shape[1] / p.shape[0] for p, _ in drawn] + [1.0] * fluoroscopy
     size = _HEIGHT_IN * 0.84 * sum(ratios) + 1.6, _HEIGHT_IN
     if size[0] > _WIDEST_IN:
@@ -138,13 +138,13 @@ def scene_figure(
     for panel, view, (projection, picture) in zip(
         panels[: len(views)], views, drawn, strict=True
     ):
-        draw_scene(panel, snapshot, projection, picture)
+        draw_scene(panel, moment, projection, picture)
         panel.set_xlabel(VIEWS[view][1])
         panel.set_title(f"from the {view}", fontsize=10)
     if len(views):
         panels[0].set_ylabel("z, mm (head ↑)")
         bar = figure.colorbar(
-            ScalarMappable(Normalize(0, 1e3 * snapshot.force_scale), force_map()),
+            ScalarMappable(Normalize(0, 1e3 * moment.force_scale), force_map()),
             ax=panels[: len(views)].tolist(),
             shrink=0.55,
             pad=0.01,
@@ -152,15 +152,15 @@ def scene_figure(
         )
         bar.set_label("contact force on the wall, mN")
     if fluoroscopy:
-        draw_fluoroscopy(panels[-1], snapshot)
-    figure.suptitle(_caption(snapshot), fontsize=11)
+        draw_fluoroscopy(panels[-1], moment)
+    figure.suptitle(_caption(moment), fontsize=11)
     return figure
 
 
 def draw_scene(
-    axes: Any, snapshot: Snapshot, projection: ParallelProjection, picture: Glass
+    axes: Any, moment: Moment, projection: ParallelProjection, picture: Glass
 ) -> None:
-    """Draw a snapshot into axes whose units are millimetres."""
+    """Draw a moment into axes whose units are millimetres."""
     extent = projection.extent_mm
     axes.imshow(picture.behind, extent=extent, zorder=1, interpolation="bilinear")
     axes.set_xlim(extent[:2])
@@ -169,19 +169,19 @@ def draw_scene(
     axes.set_facecolor("white")
     tidy(axes)
     axes.grid(False)
-    _draw_goal(axes, snapshot, projection)
-    if len(snapshot.path) > 1:
+    _draw_goal(axes, moment, projection)
+    if len(moment.path) > 1:
         axes.plot(
-            *projection.flat_mm(snapshot.path).T, color=PATH_COLOUR, lw=0.9, zorder=3
+            *projection.flat_mm(moment.path).T, color=PATH_COLOUR, lw=0.9, zorder=3
         )
-    _draw_device(axes, snapshot, projection)
+    _draw_device(axes, moment, projection)
     axes.imshow(picture.glaze, extent=extent, zorder=6, interpolation="bilinear")
-    _draw_forces(axes, snapshot, projection)
+    _draw_forces(axes, moment, projection)
 
 
-def _draw_goal(axes: Any, snapshot: Snapshot, projection: ParallelProjection) -> None:
-    x, z = projection.flat_mm(snapshot.goal)
-    radius = 1e3 * snapshot.goal_radius
+def _draw_goal(axes: Any, moment: Moment, projection: ParallelProjection) -> None:
+    x, z = projection.flat_mm(moment.goal)
+    radius = 1e3 * moment.goal_radius
     axes.add_patch(
         Circle((x, z), radius, fc=GOAL_COLOUR, ec=GOAL_COLOUR, alpha=0.22, zorder=2)
     )
@@ -196,17 +196,17 @@ def _points_per_mm(axes: Any) -> float:
     return height / (high - low)
 
 
-def _draw_device(axes: Any, snapshot: Snapshot, projection: ParallelProjection) -> None:
+def _draw_device(axes: Any, moment: Moment, projection: ParallelProjection) -> None:
     from cathsim_dmc.imaging.kernel import curve  # late: it brings the compiler
 
-    line = projection.flat_mm(curve(np.float64(snapshot.device), _PIECES))
-    radius = np.repeat(snapshot.radius, _PIECES)
+    line = projection.flat_mm(curve(np.float64(moment.device), _PIECES))
+    radius = np.repeat(moment.radius, _PIECES)
     # Thicker than in truth, by half: as printed it would be two points wide.
     width = 1.5 * 2e3 * radius * _points_per_mm(axes)
     pieces = np.stack([line[:-1], line[1:]], axis=1)
     dark, light = DEVICE_COLOUR, DEVICE_LIGHT
-    if snapshot.outermost is not None:
-        own = [DEVICES[number % len(DEVICES)] for number in snapshot.outermost]
+    if moment.outermost is not None:
+        own = [DEVICES[number % len(DEVICES)] for number in moment.outermost]
         dark, light = ([pair[shade] for pair in own] for shade in (0, 1))
         dark, light = np.repeat(dark, _PIECES), np.repeat(light, _PIECES)
     for colour, share in (("white", 1.5), (dark, 1.0), (light, 0.35)):
@@ -219,7 +219,7 @@ def _draw_device(axes: Any, snapshot: Snapshot, projection: ParallelProjection) 
                 zorder=4,
             )
         )
-    for number, end in enumerate(projection.flat_mm(snapshot.ends)):
+    for number, end in enumerate(projection.flat_mm(moment.ends)):
         axes.plot(
             *end, "o", ms=1.3 * width.max(), mfc=DEVICES[number % len(DEVICES)][1],
             mec="0.1", mew=0.8, zorder=5,
@@ -230,17 +230,17 @@ def _draw_device(axes: Any, snapshot: Snapshot, projection: ParallelProjection) 
     )  # fmt: skip
 
 
-def _draw_forces(axes: Any, snapshot: Snapshot, projection: ParallelProjection) -> None:
-    magnitude = snapshot.magnitude
+def _draw_forces(axes: Any, moment: Moment, projection: ParallelProjection) -> None:
+    magnitude = moment.magnitude
     if not len(magnitude):
         return
-    place = projection.flat_mm(snapshot.position)
-    colours = force_colours(magnitude, snapshot.force_scale) / 255
+    place = projection.flat_mm(moment.position)
+    colours = force_colours(magnitude, moment.force_scale) / 255
     axes.scatter(*place.T, s=16, c=colours, edgecolors="0.15", linewidths=0.5, zorder=8)
     largest = magnitude.max()
     strong = magnitude > ARROW_LEAST_N
     length = np.maximum(ARROW_MM * magnitude / largest, ARROW_LEAST_MM)
-    unit = snapshot.force / np.maximum(magnitude, 1e-12)[:, None]
+    unit = moment.force / np.maximum(magnitude, 1e-12)[:, None]
     along = projection.flat_mm(unit) / 1e3 * length[:, None]
     axes.quiver(
         *place[strong].T, *along[strong].T, color=colours[strong], angles="xy",
@@ -263,24 +263,24 @@ def _draw_forces(axes: Any, snapshot: Snapshot, projection: ParallelProjection) 
 
 def draw_fluoroscopy(
     axes: Any,
-    snapshot: Snapshot,
+    moment: Moment,
     options: FluoroscopyOptions | None = None,
     seed: int = 0,
 ) -> Any:
-    """Draw the X-ray image of a snapshot, with the goal as a ring.
+    """Draw the X-ray image of a moment, with the goal as a ring.
 
     Returns:
         matplotlib's image, whose data another moment may replace.
     """
     options = options or FLUOROSCOPY
-    fluoroscope = fluoroscope_of(snapshot.surface, options)
-    frame = xray(snapshot, options, seed)
+    fluoroscope = fluoroscope_of(moment.surface, options)
+    frame = xray(moment, options, seed)
     black, white = np.percentile(frame, WINDOW)
     image = axes.imshow(
         frame, cmap="gray", vmin=black, vmax=white, interpolation="bilinear"
     )
-    (column, row), depth = fluoroscope.carm.project(snapshot.goal)
-    radius = snapshot.goal_radius * fluoroscope.carm.focal_length / float(depth)
+    (column, row), depth = fluoroscope.carm.project(moment.goal)
+    radius = moment.goal_radius * fluoroscope.carm.focal_length / float(depth)
     axes.add_patch(Circle((column, row), radius, fill=False, ec=GOAL_LIGHT, lw=1.4))
     axes.set_title("fluoroscopy", fontsize=10)
     axes.set_xticks([])
@@ -289,12 +289,12 @@ def draw_fluoroscopy(
     return image
 
 
-def _caption(snapshot: Snapshot) -> str:
-    magnitude = snapshot.magnitude
+def _caption(moment: Moment) -> str:
+    magnitude = moment.magnitude
     if not len(magnitude):
-        return f"{snapshot.title}; no contact with the wall"
+        return f"{moment.title}; no contact with the wall"
     contacts = "1 contact" if len(magnitude) == 1 else f"{len(magnitude)} contacts"
     return (
-        f"{snapshot.title}; {contacts}, {force_text(magnitude.sum())} in all, "
+        f"{moment.title}; {contacts}, {force_text(magnitude.sum())} in all, "
         f"{force_text(magnitude.max())} the largest"
     )

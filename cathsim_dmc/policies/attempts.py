@@ -23,7 +23,7 @@ _GROWING = 4  # retries over which the way back grows
 
 
 @dataclasses.dataclass(frozen=True)
-class Settings:
+class AttemptSettings:
     """When to give up and how far to withdraw.
 
     Attributes:
@@ -96,7 +96,7 @@ State = TypeVar("State", bound=Attempts)
 
 
 def advance(
-    settings: Settings, state: State, place: Place, insertion: np.ndarray
+    settings: AttemptSettings, state: State, place: Place, insertion: np.ndarray
 ) -> State:
     """Counts progress over a control step; begins and ends retries.
 

@@ -45,7 +45,7 @@ _TURN = MAX_ROTATION_SPEED * CONTROL_TIMESTEP
 
 
 @dataclasses.dataclass(frozen=True)
-class Settings(pursuit.Settings):
+class CoaxialSettings(pursuit.Settings):
     """How the expert drives coaxial devices; `pursuit.Settings` has what is not here.
 
     Attributes:
@@ -78,7 +78,7 @@ class Settings(pursuit.Settings):
 
 
 @dataclasses.dataclass(frozen=True)
-class Plan:
+class CoaxialPlan:
     """What the expert knows of a task with coaxial devices; world frame, SI units.
 
     Attributes:
@@ -98,7 +98,7 @@ class Plan:
     ostium: float
 
     @classmethod
-    def for_task(cls, task: navigation.Navigation | Case) -> Plan:
+    def for_task(cls, task: navigation.Navigation | Case) -> CoaxialPlan:
         """Reads off a task of coaxial devices, or one of its anatomies.
 
         Raises:
@@ -119,8 +119,8 @@ class Plan:
 
 
 def decide(
-    plan: Plan,
-    settings: Settings,
+    plan: CoaxialPlan,
+    settings: CoaxialSettings,
     state: Attempts,
     readings: Readings,
     devices: CoaxialReadings,
@@ -164,7 +164,7 @@ def decide(
 
 
 def _led(
-    settings: Settings,
+    settings: CoaxialSettings,
     state: Attempts,
     insertion: np.ndarray,
     speed: np.ndarray,
@@ -185,7 +185,7 @@ def _led(
 
 
 def _directions(
-    plan: Plan,
+    plan: CoaxialPlan,
     readings: Readings,
     devices: CoaxialReadings,
     place: Place,

@@ -16,6 +16,7 @@ from cathsim_dmc.physics.readings import Readings
 from cathsim_dmc.physics.sliding import CoaxialReadings
 from cathsim_dmc.policies import coaxial_pursuit
 from cathsim_dmc.policies.attempts import Attempts
+from cathsim_dmc.policies.coaxial_pursuit import CoaxialPlan, CoaxialSettings
 from cathsim_dmc.policies.policy import Policy
 from cathsim_dmc.policies.pursuit import Plan, Settings, State, decide
 from cathsim_dmc.policies.view import View
@@ -32,20 +33,16 @@ class Expert:
         state: What is remembered; None before the first action.
     """
 
-    def __init__(
-        self, plan: Plan | coaxial_pursuit.Plan, settings: Settings | None = None
-    ):
+    def __init__(self, plan: Plan | CoaxialPlan, settings: Settings | None = None):
         """Takes what is known of the task; see `for_task`.
 
         Args:
             plan: Of a steerable device, or of coaxial devices.
             settings: Of the same kind; None for the defaults.
         """
-        coaxial = isinstance(plan, coaxial_pursuit.Plan)
+        coaxial = isinstance(plan, CoaxialPlan)
         self.plan = plan
-        self._settings = settings or (
-            coaxial_pursuit.Settings() if coaxial else Settings()
-        )
+        self._settings = settings or (CoaxialSettings() if coaxial else Settings())
         self.state: Attempts | None = None
 
     @classmethod
@@ -57,7 +54,7 @@ class Expert:
         Args:
             task: Task or anatomy.
             settings: Settings of its driving; those of coaxial devices are
-                `coaxial_pursuit.Settings`.
+                `coaxial_pursuit.CoaxialSettings`.
 
         Raises:
             ValueError: if the device can neither be steered nor turned at its base, or
@@ -65,12 +62,14 @@ class Expert:
         """
         if not task.scene.coaxial:
             return cls(Plan.for_task(task), settings)
-        if settings is not None and not isinstance(settings, coaxial_pursuit.Settings):
+        if settings is not None and not isinstance(
+            settings, coaxial_pursuit.CoaxialSettings
+        ):
             raise ValueError(
                 "these settings are of a steerable device's expert; coaxial devices "
-                "need coaxial_pursuit.Settings"
+                "need coaxial_pursuit.CoaxialSettings"
             )
-        return cls(coaxial_pursuit.Plan.for_task(task), settings)
+        return cls(CoaxialPlan.for_task(task), settings)
 
     def reset(self, which: np.ndarray | None = None) -> None:
         """Forgets the simulations that begin a new episode.

@@ -17,7 +17,7 @@ from matplotlib.lines import Line2D
 
 from cathsim_dmc import policies, suite
 from cathsim_dmc.pictures.figure import DEVICES, VIEWS, Picture, background, draw_scene
-from cathsim_dmc.pictures.snapshot import Snapshot
+from cathsim_dmc.pictures.moment import Moment
 
 IMAGES = Path(__file__).parents[1] / "images"
 DPI, HEIGHT = 130, 3.2
@@ -25,7 +25,7 @@ BELOW = 0.18  # share of the picture below which nothing happens
 SIMMONS = ("wire_035_amplatz", "diagnostic_5f_simmons")
 
 
-def simmons() -> list[Snapshot]:
+def simmons() -> list[Moment]:
     """A stiff wire straightens a Simmons catheter in the arch; then it is withdrawn."""
     env = suite.load(
         "cathsim",
@@ -49,7 +49,7 @@ def simmons() -> list[Snapshot]:
 
 def cannulation(
     task: str = "femoral_type1_lcca_pair", seed: int = 0, moments: int = 6
-) -> list[Snapshot]:
+) -> list[Moment]:
     """The scripted expert drives both devices from the groin into a carotid."""
     env = suite.load("cathsim", task, {"random": seed, "observation": "tracking"})
     act = policies.in_environment(policies.make_policy("expert"), env)
@@ -67,15 +67,15 @@ def cannulation(
     return [seen[index] for index in chosen]
 
 
-def _titled(env, words: str) -> Snapshot:
+def _titled(env, words: str) -> Moment:
     """The present state without contact forces, which would hide the small shapes."""
     nothing = np.zeros((0, 3))
     return dataclasses.replace(
-        Snapshot.of(env), title=words, position=nothing, force=nothing
+        Moment.of(env), title=words, position=nothing, force=nothing
     )
 
 
-def strip(snapshots: Sequence[Snapshot], path: Path) -> None:
+def strip(snapshots: Sequence[Moment], path: Path) -> None:
     """Draws snapshots of one anatomy side by side, from the front."""
     projection, picture = background(snapshots[0].surface, VIEWS["front"][0], 700)
     left, right, low, high = projection.extent_mm

@@ -20,7 +20,7 @@ _VIEWS = 8
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class Snapshot:
+class Moment:
     """State of one simulation; lengths in metres, forces in newtons, world frame.
 
     Attributes:
@@ -58,7 +58,7 @@ class Snapshot:
         return np.linalg.norm(self.force, axis=-1)
 
     @classmethod
-    def of(cls, env: Any) -> Snapshot:
+    def of(cls, env: Any) -> Moment:
         """The present state of a composer environment.
 
         Raises:
@@ -78,7 +78,7 @@ class Snapshot:
         )
 
     @classmethod
-    def of_episode(cls, episode: Episode, surface: Any, step: int = -1) -> Snapshot:
+    def of_episode(cls, episode: Episode, surface: Any, step: int = -1) -> Moment:
         """A state of a recorded episode.
 
         Args:
@@ -140,14 +140,14 @@ def fluoroscope_of(surface: Any, options: FluoroscopyOptions) -> Any:
     return Angiograph(surface.vertices, surface.faces, options).planes()[0]
 
 
-def xray(snapshot: Snapshot, options: FluoroscopyOptions, seed: int = 0) -> np.ndarray:
-    """The X-ray image (rows, columns) uint8 of a snapshot.
+def xray(moment: Moment, options: FluoroscopyOptions, seed: int = 0) -> np.ndarray:
+    """The X-ray image (rows, columns) uint8 of a moment.
 
     Args:
-        snapshot: State of the device.
+        moment: State of the device.
         options: Set-up of the angiography machine.
         seed: Seed of the quantum noise, if the options ask for noise.
     """
     state = np.random.RandomState(seed) if options.noise else None
-    fluoroscope = fluoroscope_of(snapshot.surface, options)
-    return fluoroscope.render(snapshot.device, snapshot.radius, state)[..., 0]
+    fluoroscope = fluoroscope_of(moment.surface, options)
+    return fluoroscope.render(moment.device, moment.radius, state)[..., 0]
