@@ -7,6 +7,7 @@ from dm_control import composer, mjcf
 
 from cathsim_dmc.entities.contact import device_contact
 from cathsim_dmc.entities.device import Device
+from cathsim_dmc.entities.posture import x_first
 
 # Relaxation time of bending: joint damping = time * stiffness, s. It represents the
 # loss inside the polymer and the drag of blood: a 0.2 m cantilever of 50 N·mm² with a
@@ -201,18 +202,19 @@ class Chain(composer.Entity):
         stiffness = 1 / self._joint_compliance(index)
         rest = dict(zip("xy", self._rest_angles(index), strict=True))
         self._add_twist(link, index)
-        for axis, direction in (("x", (1, 0, 0)), ("y", (0, 1, 0))):
-            self._bends.append(
-                link.add(
-                    "joint",
-                    name=f"bend_{axis}_{index}",
-                    axis=direction,
-                    stiffness=stiffness,
-                    damping=BENDING_RELAXATION_TIME * stiffness,
-                    springref=rest[axis],
-                    armature=HINGE_ARMATURE,
-                )
+        bends = {
+            axis: link.add(
+                "joint",
+                name=f"bend_{axis}_{index}",
+                axis=(1, 0, 0) if axis == "x" else (0, 1, 0),
+                stiffness=stiffness,
+                damping=BENDING_RELAXATION_TIME * stiffness,
+                springref=rest[axis],
+                armature=HINGE_ARMATURE,
             )
+            for axis in ("xy" if x_first(index) else "yx")
+        }
+        self._bends += [bends["x"], bends["y"]]
         self._add_capsule(link, index)
 
     def _add_capsule(self, body, index: int):
@@ -362,5 +364,8 @@ class Chain(composer.Entity):
 
     @property
     def joints(self) -> tuple:
-        """All joints in the order of the chain."""
-        return tuple(self._mjcf_root.find_all("joint"))
+        """All joints in the order of the chain, of each link x before y."""
+        joints = self._mjcf_root.find_all("joint")
+        bends = iter(self._bends)
+        mine = set(self._bends)
+        return tuple(next(bends) if joint in mine else joint for joint in joints)

@@ -13,9 +13,10 @@ chain then has the angle and the mean position of each bend of the rod, wherever
 of a device lies in a link, and all properties are continuous in insertion and rotation.
 
 Pure functions of arrays with a leading axis N of simulations; SI units. Directions
-across the chain are complex numbers x + iy in the frame of a link: a hinge bent by
-`bend_y` about y and `bend_x` about x leads towards bend_y - i bend_x, and a rotation by
-φ about the device multiplies by exp(iφ).
+across the chain are complex numbers x + iy in frames that do not twist along the chain:
+a joint bent by a small `bend_y` about y and `bend_x` about x leads towards
+bend_y - i bend_x, and a rotation by φ about the device multiplies by exp(iφ). The
+frames of the links twist, because two hinges do (`Stack.bent`).
 """
 
 from __future__ import annotations
@@ -98,9 +99,10 @@ class Stack:
             ValueError: if `devices` is empty, or one does not fit into the next.
         """
         _check_fit(devices)
-        from cathsim_dmc.entities import coaxial_loops  # imports numba, which is slow
+        # Both import numba, which is slow.
+        from cathsim_dmc.entities import coaxial_loops, hinge_loops
 
-        self._loops = coaxial_loops
+        self._loops, self._hinges = coaxial_loops, hinge_loops
         self.devices = tuple(devices)
         self.link_lengths = np.asarray(link_lengths, dtype=np.float64)
         beyond = np.cumsum(self.link_lengths[::-1])[::-1]
@@ -151,29 +153,69 @@ class Stack:
             *integrals, *self._loops.shares(gaps, self.nodes, self.link_lengths)
         )
 
-    def rest_angles(
-        self,
-        overlap: Overlap,
-        turns: np.ndarray,
-        spin: np.ndarray | None = None,
-        relaxation_time: float = 0.0,
-    ) -> np.ndarray:
-        """Rest angles of the joints.
+    def rest_angles(self, overlap: Overlap, turns: np.ndarray) -> np.ndarray:
+        """Rest angles (N, J) of the joints, complex, rad.
 
         Args:
             overlap: overlap of the devices.
             turns: (N, K, J), rotation of each device at each joint, rad.
-            spin: (N, K, J), rate of that rotation, rad/s; None means 0.
-            relaxation_time: time by which the angles lead, that of the joints' damping,
-                s.
+        """
+        return (overlap.rest * np.exp(1j * turns)).sum(axis=1)
+
+    def bent(self, angles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Bends of the joints, and twists of the links before them.
+
+        The twist is that of the chain's frames against frames that do not twist along
+        the chain, in which bends and rotations of the devices are measured.
+
+        Args:
+            angles: (N, 2 J), positions of the hinges in the order of the chain, rad.
 
         Returns:
-            (N, J) complex, rad.
+            Bends (N, J) complex, and twists (N, J), rad.
         """
-        if spin is None:
-            spin = np.zeros(turns.shape)
-        turns = np.ascontiguousarray(turns)
-        return self._loops.rest_angles(overlap.rest, turns, spin, relaxation_time)
+        return self._hinges.bent(np.ascontiguousarray(angles))
+
+    def unloaded_hinges(self, overlap: Overlap, turns: np.ndarray) -> np.ndarray:
+        """Angles (N, J, 2) of the hinges about x and y of the unloaded chain, rad.
+
+        Args:
+            overlap: overlap of the devices.
+            turns: (N, K, J), rotation of each device at each joint, rad.
+        """
+        return self._hinges.unloaded_hinges(self.rest_angles(overlap, turns))
+
+    def free_hinges(
+        self,
+        overlap: Overlap,
+        turns: np.ndarray,
+        spin: np.ndarray,
+        relaxation_time: float,
+        angles: np.ndarray,
+    ) -> np.ndarray:
+        """Rest angles of the hinges of the chain as it is bent.
+
+        Two hinges measure a bend differently in each direction, and twist. The springs
+        have the torques of the isotropic energy Σ|β_j - ΣR_k e_k|²/2C_j, in which β_j
+        depends on the hinges of the joint and on the twist of those before it: at
+        angles θ, the rest angles are θ - C ∂E/∂θ.
+
+        Args:
+            overlap: overlap of the devices.
+            turns: (N, K, J), rotation of each device at each joint, rad.
+            spin: (N, K, J), rate of that rotation, rad/s.
+            relaxation_time: time by which the angles lead, that of the joints' damping,
+                s.
+            angles: (N, 2 J), positions of the hinges in the order of the chain, rad.
+
+        Returns:
+            (N, J, 2), about x and about y, rad.
+        """
+        own = overlap.rest * np.exp(1j * turns)
+        lead = 1j * relaxation_time * (own * spin).sum(axis=1)
+        return self._hinges.free_hinges(
+            own.sum(axis=1), lead, overlap.compliance, np.ascontiguousarray(angles)
+        )
 
     def links(self, overlap: Overlap, friction: np.ndarray) -> Links:
         """Properties of the links.

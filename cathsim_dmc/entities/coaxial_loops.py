@@ -13,6 +13,7 @@ import math
 import numpy as np
 
 from cathsim_dmc.compiled import compiled
+from cathsim_dmc.entities.hinge_loops import unit
 
 # A distance beyond the end of any device, m.
 _FAR = 1e3
@@ -133,12 +134,6 @@ def shares(gaps, nodes, lengths):
 
 
 @compiled
-def _unit(angle):
-    """exp(i angle)."""
-    return complex(math.cos(angle), math.sin(angle))
-
-
-@compiled
 def restoring(rest, compliance, coupling, bends, turns):
     """Restoring torques and minus their derivatives, see `Stack.restoring`."""
     count, devices, joints = turns.shape
@@ -148,7 +143,7 @@ def restoring(rest, compliance, coupling, bends, turns):
         for j in range(joints):
             whole = 0j
             for k in range(devices):
-                pulls[k] = rest[i, k, j] * _unit(turns[i, k, j])
+                pulls[k] = rest[i, k, j] * unit(turns[i, k, j])
                 whole += pulls[k]
             for k in range(devices):
                 force = np.conj(bends[i, j] - (whole - pulls[k])) * pulls[k]
@@ -178,7 +173,7 @@ def pressure(stiffness, moment, present, bends, turns, lengths):
             for j in range(joints):
                 span = (lengths[j] + lengths[j + 1]) / 2
                 own[j] = stiffness[i, k, j] * bends[i, j] / span
-                own[j] -= moment[i, k, j] * _unit(turns[i, k, j])
+                own[j] -= moment[i, k, j] * unit(turns[i, k, j])
             before = 0j
             for j in range(joints):
                 shear = 0j
@@ -338,19 +333,6 @@ def wall_friction(outermost, force, coefficient, arms):
                 borne += last * outermost[i, k, j + 1] * force[i, j + 1]
                 torque[i, k, j] = coefficient[i] * arms[k] * borne
     return torque
-
-
-@compiled
-def rest_angles(rest, turns, spin, relaxation):
-    """Rest angles (N, J) of the joints, see `Stack.rest_angles`."""
-    count, devices, joints = turns.shape
-    angles = np.zeros((count, joints), np.complex128)
-    for i in range(count):
-        for k in range(devices):
-            for j in range(joints):
-                lead = complex(1.0, relaxation * spin[i, k, j])
-                angles[i, j] += rest[i, k, j] * _unit(turns[i, k, j]) * lead
-    return angles
 
 
 @compiled

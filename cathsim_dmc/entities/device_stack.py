@@ -74,7 +74,7 @@ class DeviceStack(Chain):
         overlap = self._stack.overlap(self._gaps[None])
         turns = np.zeros((1, len(self._devices), len(self._stack.spans)))
         self._compliance = overlap.compliance[0]
-        self._rest = self._stack.rest_angles(overlap, turns)[0]
+        self._rest = self._stack.unloaded_hinges(overlap, turns)[0]
         self._mass = self._stack.links(overlap, np.zeros(1)).mass[0]
         self._assemble(
             self._stack.link_lengths,
@@ -93,8 +93,8 @@ class DeviceStack(Chain):
         return float(self._compliance[index - 1])
 
     def _rest_angles(self, index: int) -> tuple[float, float]:
-        rest = self._rest[index - 1]
-        return -float(rest.imag), float(rest.real)
+        about_x, about_y = self._rest[index - 1].tolist()
+        return about_x, about_y
 
     def _link_mass(self, index: int) -> float:
         return float(self._mass[index])

@@ -12,9 +12,9 @@ def joints_along(
 ) -> NDArray[np.float64]:
     """Angles of the bending hinges that place every node of a chain on a line.
 
-    In the chain of `entities.catheter`, link 0 slides along +z, and every other link
-    bends about x, then about y of the previous link. Twist is zero. The rows are the
-    positions of `Catheter.bends` in order.
+    Link 0 of a `Chain` slides along +z; every other link bends about x, then about y of
+    the previous link, or in the other order (`x_first`). Torsion hinges stand at zero.
+    The rows are the positions of `Chain.bends` in order.
 
     Args:
         link_lengths: (n,) lengths of the links from proximal to distal, m.
@@ -33,6 +33,15 @@ def joints_along(
     points = np.asarray(line, np.float64)
     nodes = _nodes(lengths, points, advance)
     return bends_of(np.diff(nodes, axis=0) / lengths[:, None])
+
+
+def x_first(joint: int) -> bool:
+    """Whether a joint, from 1 on, bends about x first and about y then.
+
+    Two hinges twist by about θxθy/2, with the sign of their order. The order alternates
+    from joint to joint, so the twists of neighbours cancel.
+    """
+    return joint % 2 == 1
 
 
 def bends_of(directions: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -59,9 +68,13 @@ def bends_of(directions: NDArray[np.float64]) -> NDArray[np.float64]:
     angles = np.empty((len(directions) - 1, 2))
     for index, direction in enumerate(directions[1:]):
         x, y, z = frame.T @ direction
-        about_x, about_y = np.arctan2(-y, z), np.arcsin(np.clip(x, -1.0, 1.0))
+        if x_first(index + 1):
+            about_x, about_y = np.arctan2(-y, z), np.arcsin(np.clip(x, -1.0, 1.0))
+            frame = frame @ _turn_x(about_x) @ _turn_y(about_y)
+        else:
+            about_x, about_y = np.arcsin(np.clip(-y, -1.0, 1.0)), np.arctan2(x, z)
+            frame = frame @ _turn_y(about_y) @ _turn_x(about_x)
         angles[index] = about_x, about_y
-        frame = frame @ _turn_x(about_x) @ _turn_y(about_y)
     return angles
 
 

@@ -39,7 +39,8 @@ class ChainFields:
         from cathsim_dmc.physics import sliding_loops  # late, as it takes long
 
         self._write = sliding_loops.write
-        bodies, joints = ids(model, chain.links), ids(model, chain.bends)
+        bodies = ids(model, chain.links)
+        joints = np.sort(ids(model, chain.bends))
         places = [joints, model.jnt_dofadr[joints], model.jnt_qposadr[joints]]
         # Both kinds of elements follow each other, from proximal to distal.
         if any((np.diff(each) != 1).any() for each in [bodies, *places]):
@@ -53,7 +54,7 @@ class ChainFields:
 
     @property
     def qpos(self) -> slice:
-        """Places of the hinges in `qpos`, x before y."""
+        """Places of the hinges in `qpos`, in the order of the chain."""
         start = int(self._hinges[2])
         return slice(start, start + 2 * (len(self._geoms) - 1))
 
@@ -103,6 +104,7 @@ def chain_properties(
     friction: np.ndarray,
     factor: np.ndarray,
     spin: np.ndarray | None = None,
+    angles: np.ndarray | None = None,
 ) -> ChainProperties:
     """Properties of chains at an overlap of their devices.
 
@@ -116,12 +118,15 @@ def chain_properties(
         turns: (N, K, J), rotation of each device at each joint, rad.
         friction: (N,), Coulomb coefficient of an uncoated device on the wall.
         factor: (N,), of all stiffnesses.
-        spin: (N, K, J), rate of that rotation, rad/s; 0 if None.
+        spin: (N, K, J), rate of that rotation, rad/s.
+        angles: (N, 2 J), of the hinges as they stand, in the order of the chain, rad;
+            None for the unloaded chain at rest.
     """
     stack = entity.stack
-    free = stack.rest_angles(overlap, turns, spin, BENDING_RELAXATION_TIME)
-    rest = np.empty((*free.shape, 2))
-    rest[..., 0], rest[..., 1] = -np.imag(free), np.real(free)
+    if angles is None or spin is None:
+        rest = stack.unloaded_hinges(overlap, turns)
+    else:
+        rest = stack.free_hinges(overlap, turns, spin, BENDING_RELAXATION_TIME, angles)
     return ChainProperties(
         stiffness=factor[:, None] / overlap.compliance,
         rest=rest,

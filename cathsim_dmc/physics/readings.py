@@ -27,7 +27,7 @@ class Readings(NamedTuple):
 
     Attributes:
         insertion: (...), slide of the base, m, 0 at the start of the stroke.
-        joint_positions: (..., J), in the order of the chain, m and rad.
+        joint_positions: (..., J), in the order of the chain, x before y, m and rad.
         joint_velocities: (..., J), m/s and rad/s.
         com_inertia: (..., L, 10), inertia of each link about the subtree's centre of
             mass (MuJoCo `cinert`), kg·m², kg·m and kg.
@@ -67,6 +67,7 @@ class Views(NamedTuple):
         tip: (..., 1, 3), the head, in line with the links.
         rotation: (..., 9), orientation of the last link, row by row.
         load_cell: (..., 3), force of the support on the phantom.
+        order: (J,), places of the joints among those of the chain in MuJoCo's order.
 
     The others are those of `Readings`.
     """
@@ -85,16 +86,17 @@ class Views(NamedTuple):
     push_force: np.ndarray
     push_torque: np.ndarray
     load_cell: np.ndarray
+    order: np.ndarray
 
     def read(self) -> Readings:
         """Takes the readings as they stand, as copies."""
         return Readings(
             insertion=self.insertion.copy(),
-            joint_positions=self.joint_positions.copy(),
-            joint_velocities=self.joint_velocities.copy(),
+            joint_positions=self.joint_positions.take(self.order, axis=-1),
+            joint_velocities=self.joint_velocities.take(self.order, axis=-1),
             com_inertia=self.com_inertia.copy(),
             com_velocity=self.com_velocity.copy(),
-            actuator_force=self.actuator_force.copy(),
+            actuator_force=self.actuator_force.take(self.order, axis=-1),
             external_force=self.external_force.copy(),
             centreline=np.concatenate([self.links, self.tip], axis=-2),
             head=self.head.copy(),
@@ -139,8 +141,9 @@ class ModelIndex:
         # What touches the device and belongs to the world itself is the wall.
         world = (model.geom_bodyid == 0) & (model.geom_contype != 0)
         self.walls = np.flatnonzero(world)
-        self.qpos = _as_slice(model.jnt_qposadr[joints])
-        self.dofs = _as_slice(model.jnt_dofadr[joints])
+        self.qpos = _as_slice(np.sort(model.jnt_qposadr[joints]))
+        self.dofs = _as_slice(np.sort(model.jnt_dofadr[joints]))
+        self._order = joints - joints.min()
         # (n - 1, 2), of the hinges about x and y.
         self.bends_qpos = model.jnt_qposadr[ids(model, chain.bends)].reshape(-1, 2)
         (self.insertion_qpos,) = model.jnt_qposadr[
@@ -185,6 +188,7 @@ class ModelIndex:
             push_force=sensors[..., self.push_force.start + 2],
             push_torque=sensors[..., self.push_torque.start + 2],
             load_cell=sensors[..., self.load_cell],
+            order=self._order,
         )
 
     def read(self, data) -> Readings:

@@ -236,8 +236,7 @@ class SlidingDevices(SingleDevice):
         stack, rods = self._stack, self._rods
         gaps = self._loops.gaps(np.ascontiguousarray(self._insertion))
         overlap, turns = stack.overlap(gaps), rods.at_joints(self._angles, gaps)
-        bends = self._qpos[:, self._places.qpos]
-        bends = bends[:, 1::2] - 1j * bends[:, 0::2]
+        bends, _ = stack.bent(self._qpos[:, self._places.qpos])
         loads = np.empty((3, *turns.shape))
         loads[0], loads[1] = stack.restoring(overlap, bends, turns)
         loads[:2] *= self._factor[:, None, None]
@@ -277,8 +276,10 @@ class SlidingDevices(SingleDevice):
     def _write(self, rows: np.ndarray, overlap: Overlap, turns: np.ndarray) -> None:
         """Writes the properties of the chains of some simulations."""
         friction, factor = self._friction[rows], self._factor[rows]
-        spin = self._spin[rows]
-        made = chain_properties(self._entity, overlap, turns, friction, factor, spin)
+        angles, spin = self._qpos[rows, self._places.qpos], self._spin[rows]
+        made = chain_properties(
+            self._entity, overlap, turns, friction, factor, spin, angles
+        )
         for row, number in enumerate(rows.tolist()):
             self._places.write(self._arrays[number], made, row)
 

@@ -178,9 +178,10 @@ def write(
     """
     for j in range(stiffness.shape[1]):
         for axis in range(2):
-            jnt_stiffness[hinges[0] + 2 * j + axis] = stiffness[row, j]
-            dof_damping[hinges[1] + 2 * j + axis] = relaxation * stiffness[row, j]
-            qpos_spring[hinges[2] + 2 * j + axis] = rest[row, j, axis]
+            hinge = 2 * j + (axis + j) % 2  # see `posture.x_first`
+            jnt_stiffness[hinges[0] + hinge] = stiffness[row, j]
+            dof_damping[hinges[1] + hinge] = relaxation * stiffness[row, j]
+            qpos_spring[hinges[2] + hinge] = rest[row, j, axis]
     beyond = 0.0
     for link in range(len(geoms) - 1, -1, -1):
         geom, body = geoms[link], bodies + link

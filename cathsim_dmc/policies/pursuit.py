@@ -122,11 +122,12 @@ class Plan:
             )
         route = Route.of(task.objective)
         hinges, numbers = [], {}
-        for column, joint in enumerate(catheter.joints):
+        columns = {joint.name: n for n, joint in enumerate(catheter.joints)}
+        for joint in catheter.mjcf_model.find_all("joint"):
             if joint.type == "slide":
                 continue
             numbers[joint.name] = len(hinges)
-            hinges.append((column, int(np.argmax(joint.axis))))
+            hinges.append((columns[joint.name], int(np.argmax(joint.axis))))
         motors = [numbers[motor.joint.name] for motor in catheter.tip_motors]
         return cls(
             points=route.points,

@@ -15,7 +15,7 @@ from cathsim_dmc.entities.device import Device
 from cathsim_dmc.entities.device_stack import DeviceStack
 from cathsim_dmc.physics import chain_fields
 from cathsim_dmc.tasks.config import CONTROL_TIMESTEP
-from cathsim_dmc.validation import pressed, rod, sliding
+from cathsim_dmc.validation import pressed, rod, shapes, sliding
 from cathsim_dmc.validation.checks import Check, Report
 from cathsim_dmc.validation.rig import Rig
 
@@ -266,8 +266,8 @@ def validate_pair() -> Report:
                     f"{1e3 * one.expected.position[-1, 1]:.1f} mm",
                 )
             )
-    shapes = [unloaded(*each) for each in SHAPES]
-    for shape in shapes:
+    resting = [unloaded(*each) for each in SHAPES]
+    for shape in resting:
         gaps = " and ".join(f"{1e3 * gap:.0f}" for gap in shape.gaps)
         turned = np.degrees(shape.rotation[-1] - shape.rotation[0])
         checks.append(
@@ -280,10 +280,11 @@ def validate_pair() -> Report:
                 f"end {1e3 * np.hypot(*shape.expected[-1, :2]):.1f} mm off the axis",
             )
         )
+    checks += shapes.checks()
     for end in ("sliding", "fixed"):
         checks.append(rod.buckling_check("buckling load of the pair", buckling(end)))
     checks.append(_smoothness())
     checks += pressed.checks(PAIR)
     moving, findings, turned = sliding.checks()
-    data = {"shapes": shapes, "turned": turned}
+    data = {"shapes": resting, "turned": turned}
     return Report("pair", [*checks, *moving], findings, data)

@@ -1,0 +1,168 @@
+"""Joints of two hinges: their bend and twist, and the springs of an isotropic joint.
+
+A joint bends by a complex angle, see `coaxial`. The order of its hinges alternates
+from joint to joint (`posture.x_first`): x is first where the joint's number is even.
+"""
+
+import math
+
+import numpy as np
+
+from cathsim_dmc.compiled import compiled
+
+# Largest bend that is divided exactly between two hinges, rad.
+_LARGEST_BEND = 1.2
+# Difference that replaces a derivative, rad.
+_STEP = 1e-5
+
+
+@compiled
+def unit(angle):
+    """exp(i angle)."""
+    return complex(math.cos(angle), math.sin(angle))
+
+
+@compiled
+def _hinges(bend, first):
+    """Angles of two hinges, x and y, that bend a joint by a complex angle.
+
+    Exact up to `_LARGEST_BEND`, in proportion beyond it.
+
+    Args:
+        bend: in the frame of the link before the joint.
+        first: hinge that is nearer to that link, 0 for x and 1 for y.
+    """
+    angle = abs(bend)
+    if angle == 0.0:
+        return 0.0, 0.0
+    taken = min(angle, _LARGEST_BEND)
+    along, across = math.cos(taken), math.sin(taken) / angle
+    x, y = across * bend.real, across * bend.imag
+    scale = angle / taken
+    if first == 0:
+        return scale * math.atan2(-y, along), scale * math.asin(x)
+    return scale * math.asin(-y), scale * math.atan2(x, along)
+
+
+@compiled
+def _twist(x, y, first):
+    """Angle by which two hinges turn the distal link about its axis, rad."""
+    sines, cosines = (
+        math.sin(x / 2) * math.sin(y / 2),
+        math.cos(x / 2) * math.cos(y / 2),
+    )
+    return 2 * math.atan2(sines if first == 0 else -sines, cosines)
+
+
+@compiled
+def _bend(x, y, first):
+    """Complex angle by which two hinges bend a joint, the inverse of `_hinges`."""
+    if first == 0:
+        way = complex(math.sin(y), -math.sin(x) * math.cos(y))
+    else:
+        way = complex(math.sin(y) * math.cos(x), -math.sin(x))
+    sine = abs(way)
+    if sine == 0.0:
+        return way
+    return way * (math.atan2(sine, math.cos(x) * math.cos(y)) / sine)
+
+
+@compiled
+def _difference(x, y, first, dx, dy):
+    """Derivative of `_bend` by x or y, of which the other step is 0."""
+    ahead, behind = _bend(x + dx, y + dy, first), _bend(x - dx, y - dy, first)
+    return (ahead - behind) / (2 * (dx + dy))
+
+
+@compiled
+def _twist_rates(x, y, first):
+    """Derivatives of `_twist` by x and y."""
+    twist = _twist(x, y, first)
+    if twist == 0.0:
+        sign = 1.0 if first == 0 else -1.0
+        return sign * math.tan(y / 2), sign * math.tan(x / 2)
+    return math.sin(twist) / math.sin(x), math.sin(twist) / math.sin(y)
+
+
+@compiled
+def bent(angles):
+    """Bends and twists (N, J) of joints, see `Stack.bent`."""
+    count, joints = angles.shape[0], angles.shape[1] // 2
+    bends = np.empty((count, joints), np.complex128)
+    twists = np.empty((count, joints))
+    for i in range(count):
+        twist = 0.0
+        for j in range(joints):
+            first = j % 2
+            x, y = angles[i, 2 * j + first], angles[i, 2 * j + 1 - first]
+            bends[i, j], twists[i, j] = _bend(x, y, first) * unit(twist), twist
+            twist += _twist(x, y, first)
+    return bends, twists
+
+
+@compiled
+def _dot(one, other):
+    return one.real * other.real + one.imag * other.imag
+
+
+@compiled
+def unloaded_hinges(shape):
+    """Rest angles (N, J, 2) of the hinges of the unloaded chain."""
+    free = np.empty((*shape.shape, 2))
+    for i in range(shape.shape[0]):
+        twist = 0.0
+        for j in range(shape.shape[1]):
+            x, y = _hinges(shape[i, j] * unit(-twist), j % 2)
+            free[i, j, 0], free[i, j, 1] = x, y
+            twist += _twist(x, y, j % 2)
+    return free
+
+
+@compiled
+def free_hinges(shape, lead, compliance, angles):
+    """Rest angles (N, J, 2) of the hinges, see `Stack.free_hinges`.
+
+    Args:
+        shape: (N, J) complex, rest angles of the joints, rad.
+        lead: (N, J) complex, by which the shape turns in the time of the damping, rad.
+        compliance: (N, J), rad/(N·m).
+        angles: (N, 2 J), positions of the hinges, rad.
+    """
+    count, joints = shape.shape
+    bends, twists = bent(angles)
+    free = np.empty((count, joints, 2))
+    over = np.empty(2, np.complex128)
+    for i in range(count):
+        # What is proximal of the joint twists by this as the shapes turn.
+        twisting = 0.0
+        for j in range(joints):
+            first = j % 2
+            x, y = angles[i, 2 * j + first], angles[i, 2 * j + 1 - first]
+            back = unit(-twists[i, j])
+            turn = _twist_rates(x, y, first)
+            over[0] = _difference(x, y, first, _STEP, 0.0)
+            over[1] = _difference(x, y, first, 0.0, _STEP)
+            size = abs(shape[i, j])
+            # As far as the joint is bent along its shape.
+            ahead = -1j * twisting * bends[i, j]
+            if size > 0.0:
+                share = _dot(shape[i, j], bends[i, j]) / size**2
+                ahead += min(max(share, 0.0), 1.0) * lead[i, j]
+            ahead *= back
+            pull = (shape[i, j] - bends[i, j]) * back
+            area = (over[0].conjugate() * over[1]).imag
+            lead_x = (ahead.conjugate() * over[1]).imag / area
+            lead_y = (over[0].conjugate() * ahead).imag / area
+            twisting += turn[0] * lead_x + turn[1] * lead_y
+            free[i, j, 0] = x + _dot(over[0], pull) + lead_x
+            free[i, j, 1] = y + _dot(over[1], pull) + lead_y
+        # Torsional moment of all beyond the joint: derivative of the energy by a twist.
+        moment = 0.0
+        for j in range(joints - 1, -1, -1):
+            first = j % 2
+            x, y = angles[i, 2 * j + first], angles[i, 2 * j + 1 - first]
+            turn = _twist_rates(x, y, first)
+            for axis in range(2):
+                free[i, j, axis] -= compliance[i, j] * moment * turn[axis]
+            moment -= _dot(shape[i, j], 1j * bends[i, j]) / compliance[i, j]
+    return free
