@@ -8,7 +8,7 @@ import torch
 from cathsim_dmc import suite
 from cathsim_dmc.agents import compare, evaluate, progress
 from cathsim_dmc.agents.evaluation import paired_bootstrap
-from cathsim_dmc.agents.report import Report
+from cathsim_dmc.agents.report import EvaluationReport
 from cathsim_dmc.agents.report import evaluate as evaluated
 from cathsim_dmc.analysis.force_statistics import FIGURES
 from cathsim_dmc.analysis.intervals import success_interval
@@ -135,7 +135,7 @@ def test_the_table_says_which_force_is_which(capsys, monkeypatch):
         return torch.ones(*observation.batch_size, synthetic_env.ACTIONS)
 
     result = play(policy=push, episodes=3)
-    Report(result, None, None, 1.0).print()
+    EvaluationReport(result, None, None, 1.0).print()
     text = " ".join(capsys.readouterr().out.split())
     for name in FIGURES:
         assert f"{name.replace('_', ' ')}, mN" in text

@@ -62,9 +62,7 @@ class Expert:
         """
         if not task.scene.coaxial:
             return cls(Plan.for_task(task), settings)
-        if settings is not None and not isinstance(
-            settings, coaxial_pursuit.CoaxialSettings
-        ):
+        if settings is not None and not isinstance(settings, CoaxialSettings):
             raise ValueError(
                 "these settings are of a steerable device's expert; coaxial devices "
                 "need coaxial_pursuit.CoaxialSettings"
