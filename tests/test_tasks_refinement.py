@@ -30,7 +30,8 @@ def _snap(environment):
 
 
 def test_an_impact_is_no_error_of_physics(monkeypatch, tmp_path):
-    environment = suite.load("cathsim", "type1_lcca", {"randomisation": True})
+    options = {"randomisation": True, "working_length": 0.34}
+    environment = suite.load("cathsim", "type1_lcca", options)
     peaks, error = _snap(environment)
     assert max(peaks) < 0.1
     assert error is None
