@@ -16,17 +16,11 @@ from cathsim_dmc.analysis.force_statistics import (
     EpisodeForces,
     ForceTracker,
     Statistics,
-    magnitude,
     millinewtons,
     recorded_forces,
 )
 from cathsim_dmc.entities.devices import DEVICES
 from cathsim_dmc.tasks.step import Step
-
-
-def test_magnitude_has_leading_axes():
-    force = np.array([[[3.0, 4.0, 0.0]], [[1.0, 2.0, 2.0]]])
-    np.testing.assert_allclose(magnitude(force), [[5.0], [3.0]])
 
 
 def known_episode(**meta):

@@ -3,54 +3,8 @@
 import json
 import sys
 
-import numpy as np
 import pytest
 import soak
-
-from cathsim_dmc import suite
-
-
-def test_plan_covers_every_task_and_policy_evenly():
-    episodes = soak.plan(100)
-    assert [episode.number for episode in episodes] == list(range(100))
-    keys = [(episode.task, episode.policy) for episode in episodes]
-    counts = {key: keys.count(key) for key in keys}
-    assert set(counts) == {
-        (task, policy) for task in soak.TASKS for policy in soak.POLICIES
-    }
-    assert set(counts.values()) <= {6, 7}
-    # No episode is another one over again; tasks that differ in their goal only are.
-    assert len({(e.task, e.policy, e.seed) for e in episodes}) == 100
-    scenes = {(suite.TASKS[t].anatomy, suite.TASKS[t].access) for t in soak.TASKS}
-    assert len(scenes) == len(soak.TASKS)
-
-
-@pytest.mark.parametrize("name", ["halton", "push", "bang_bang", "reversals"])
-def test_policies_are_repeatable_and_use_the_whole_range(name):
-    policy = soak.POLICIES[name]
-    actions = policy(400, 21, 1)
-    assert actions.shape == (400, 21)
-    assert np.abs(actions).max() <= 1
-    np.testing.assert_array_equal(actions, policy(400, 21, 1))
-    assert (actions != policy(400, 21, 2)).any()
-    forward = actions[:, -1]
-    if name == "halton":
-        assert forward.min() < -0.98 and forward.max() > 0.98
-    elif name == "reversals":
-        assert set(forward) == {-1.0, 1.0}
-    else:
-        assert set(forward) == {1.0}
-
-
-def test_percentile_is_that_of_all_rows_together():
-    rows = [
-        {"penetration_histogram": {"0": 98, "100": 1}},
-        {"penetration_histogram": {"300": 1}},
-    ]
-    assert soak.percentile(rows, 98) == pytest.approx(1e-6)
-    assert soak.percentile(rows, 99) == pytest.approx(101e-6)
-    assert soak.percentile(rows, 100) == pytest.approx(301e-6)
-    assert soak.percentile([{"penetration_histogram": {}}], 99) == 0
 
 
 def run(monkeypatch, capsys, out, episodes):

@@ -11,7 +11,6 @@ from cathsim_dmc.recording.coaxial import CoaxialRecord
 from cathsim_dmc.recording.drawing import action_layout
 from cathsim_dmc.recording.episode import Episode
 from cathsim_dmc.recording.recorder import EpisodeRecorder
-from cathsim_dmc.recording.rerun_device import DEVICE_COLOURS
 
 STEPS = 12
 
@@ -80,10 +79,6 @@ def test_the_rerun_file_has_both(recorded, tmp_path):
         assert f"/series/rotation_deg/{name}" in entities
         assert f"/series/rotation_deg/{name}_end" in entities
         assert f"/series/action/{name}_insertion" in entities
-
-
-def test_devices_have_colours_of_their_own():
-    assert len(set(DEVICE_COLOURS)) == len(DEVICE_COLOURS) >= 2
 
 
 def test_actions_of_two_devices_do_not_share_a_name(recorded):

@@ -22,18 +22,6 @@ def test_a_pace_has_a_time_for_every_control_step(environment):
     assert run.factor == pytest.approx(20 * 0.04 / run.seconds.sum())
 
 
-def test_every_step_of_a_pace_falls_into_one_depth(environment):
-    run = speed.Pace(
-        insertion=np.array([0.0, 0.05, 0.1, 0.25, 0.4]),
-        seconds=np.array([0.01, 0.03, 0.02, 0.04, 0.04]),
-        contacts=np.array([0, 2, 5, 7, 9]),
-    )
-    table = script.by_depth(run)
-    assert list(table) == ["0–100 mm", "100–200 mm", "200–300 mm", "300+ mm"]
-    assert table["0–100 mm"]["real_time_factor"] == pytest.approx(2 * 0.04 / 0.04)
-    assert table["0–100 mm"]["contacts"] == 1
-
-
 @pytest.mark.slow
 def test_the_account_adds_up_and_leaves_nothing_behind(environment):
     # The last part is a difference of two measurements: the median of several runs.
@@ -44,14 +32,6 @@ def test_the_account_adds_up_and_leaves_nothing_behind(environment):
     # Half of a free step and more is physics, on any machine.
     assert physics > 0.5 * sum(table.values())
     assert mujoco.get_mjcb_time() is None
-
-
-def test_timed_hooks_are_put_back(environment):
-    task = environment.task
-    with script._timed_hooks(task) as seconds:
-        speed.pace(environment, "random", 3)
-        assert "after_step" in vars(task)
-    assert "after_step" not in vars(task) and seconds["after_step"] > 0
 
 
 def test_the_humanoid_is_the_same_work_every_time():

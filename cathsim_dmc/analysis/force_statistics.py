@@ -149,11 +149,6 @@ def recorded_forces(episode: Episode) -> EpisodeForces:
     return tracker.finish(0)
 
 
-def magnitude(force: np.ndarray) -> np.ndarray:
-    """Return |f| (...,) of forces (..., 3), in the unit of the forces."""
-    return np.linalg.norm(np.asarray(force, dtype=np.float64), axis=-1)
-
-
 def millinewtons(mean: float | None, deviation: float | None = None) -> str:
     """Text of a force given in N, in mN with three digits and its deviation alike."""
     if mean is None:

@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 
-from cathsim_dmc.analysis.force_statistics import magnitude
 from cathsim_dmc.files import atomic_path
 from cathsim_dmc.recording.episode import Episode
 from cathsim_dmc.recording.geometry import surface_arrays
@@ -132,7 +131,7 @@ def heatmap(
     if not episodes:
         raise ValueError("a heatmap needs at least one episode")
     position = np.concatenate([e.contact_position for e in episodes])
-    force = np.concatenate([magnitude(e.contact_force) for e in episodes])
+    force = np.concatenate([np.linalg.norm(e.contact_force, axis=-1) for e in episodes])
     if title is None:
         tasks = ", ".join(sorted({e.task for e in episodes}))
         title = f"{tasks}\nepisodes {len(episodes)}, contacts {len(force)}"

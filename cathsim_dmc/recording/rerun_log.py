@@ -61,35 +61,22 @@ def write_rrd(
         RuntimeError: if Rerun is switched off by the ``RERUN`` environment variable.
     """
     drawing = Drawing.of(
-        episode,
-        surface,
-        robot_geoms=robot_geoms,
-        fluoroscopy=fluoroscopy,
+        episode, surface, robot_geoms=robot_geoms, fluoroscopy=fluoroscopy
     )
 
     def fill(stream: rr.RecordingStream) -> None:
-        log_episode(stream, episode, drawing, lossless)
+        log = Log(stream, episode)
+        log_static(log, drawing)
+        if drawing.frames is not None:
+            log_frames(log, drawing.frames, lossless)
+        log_catheter(log, drawing.radii)
+        log_bodies(log, drawing.geoms)
+        log_contacts(log)
+        log_series(log)
+        log_events(log)
 
-    write_recording(path, layout_of(episode, drawing), _title(episode), fill)
+    write_recording(path, _layout(episode, drawing), _title(episode), fill)
     return Path(path)
-
-
-def log_episode(
-    stream: rr.RecordingStream,
-    episode: Episode,
-    drawing: Drawing,
-    lossless: bool = False,
-) -> None:
-    """Send all of an episode to a stream; arguments as in `write_rrd`."""
-    log = Log(stream, episode)
-    log_static(log, drawing)
-    if drawing.frames is not None:
-        log_frames(log, drawing.frames, lossless)
-    log_catheter(log, drawing.radii)
-    log_bodies(log, drawing.geoms)
-    log_contacts(log)
-    log_series(log)
-    log_events(log)
 
 
 def write_recording(
@@ -131,7 +118,7 @@ def write_recording(
         temporary.write_bytes(data or b"")
 
 
-def layout_of(episode: Episode, drawing: Drawing) -> Blueprint:
+def _layout(episode: Episode, drawing: Drawing) -> Blueprint:
     """How the viewer opens an episode."""
     low, high = drawing.vertices.min(0), drawing.vertices.max(0)
     planes = 0 if drawing.frames is None else drawing.frames.shape[-1]
