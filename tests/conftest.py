@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 from cathsim_dmc import suite
-from cathsim_dmc.anatomy.wall import fidelity
 from cathsim_dmc.tasks import observations
 from cathsim_dmc.tasks.navigation import Navigation
 
@@ -50,18 +49,6 @@ def twin(task, seed=0, **changes):
     assert not task._cases or other._fluoroscopy == task._fluoroscopy
     other._cases = task._cases
     return other
-
-
-def assert_wall_fits(anatomy, rays=10_000):
-    """The wall of an anatomy keeps its lumen free and closed; bounds in m."""
-    found = fidelity.intrusion(anatomy, 2e-3)
-    assert found.inside.mean <= 0.10e-3
-    assert found.inside.p95 <= 0.30e-3
-    assert found.inside.max <= 0.60e-3
-    assert found.recession.p95 <= 0.30e-3
-    assert fidelity.coverage(anatomy, rays).fraction == 1.0
-    assert fidelity.patency(anatomy, 1e-3, spacing=2e-3).passed
-    assert len(anatomy.wall) <= 850
 
 
 def pytest_collection_finish():

@@ -19,23 +19,12 @@ def test_round_trip(anatomy, tmp_path):
     anatomy.save(tmp_path / "a")
     again = Anatomy.load(tmp_path / "a")
     assert again.name == anatomy.name
-    assert len(again.wall) == len(anatomy.wall)
-    for a, b in zip(anatomy.wall, again.wall, strict=True):
-        np.testing.assert_array_equal(a, b)
     np.testing.assert_array_equal(again.surface.faces, anatomy.surface.faces)
     points = np.random.default_rng(0).uniform(-0.05, 0.2, (200, 3))
     np.testing.assert_array_equal(again.depth(points), anatomy.depth(points))
     assert again.goals.keys() == anatomy.goals.keys()
     np.testing.assert_array_equal(again.inlet.direction, anatomy.inlet.direction)
     assert [end.open for end in again.ends] == [end.open for end in anatomy.ends]
-
-
-def test_the_wall_of_a_tree_is_built_when_it_is_asked_for(anatomy):
-    lazy = Anatomy.from_tree(anatomy.tree, "lazy")
-    assert "wall" not in vars(lazy)
-    assert lazy.wall is lazy.wall and len(lazy.wall) > 100
-    with pytest.raises(AttributeError, match="no 'walls'"):
-        _ = lazy.walls
 
 
 def test_saving_again_leaves_one_geometry(anatomy, tmp_path):
@@ -87,7 +76,6 @@ def test_names_and_shapes_are_checked(anatomy):
             "x",
             anatomy.tree,
             anatomy.surface,
-            (),
             anatomy.inlet,
             {"rca": Goal("rca", "rca", [0, 0, 0], 0.0)},
         )

@@ -130,20 +130,11 @@ def test_depth_of_a_cylinder_and_its_open_ends():
         [[0, 0, 0.05], [0.004, 0, 0.05], [0.013, 0, 0.05], [0, 0, -0.003], [0, 0, 0.1]]
     )
     np.testing.assert_allclose(
-        vessels.depth(points), [0.01, 0.006, -0.003, -0.003, 0.01], atol=1e-12
+        vessels.depths(points)["aorta"],
+        [0.01, 0.006, -0.003, -0.003, 0.01],
+        atol=1e-12,
     )
-    closed = vessels.depth(points, closed=True)
-    np.testing.assert_allclose(closed, [0.01, 0.006, -0.003, -0.003, 0.0], atol=1e-12)
-
-
-def test_depth_of_a_union_is_the_deepest_vessel():
-    vessels = tree()
-    points = np.random.default_rng(1).uniform(-0.02, 0.1, (300, 3))
-    single = vessels.depths(points)
-    np.testing.assert_array_equal(
-        vessels.depth(points), np.max(list(single.values()), axis=0)
-    )
-    assert vessels.depth(np.array([0.05, 0.0, 0.05])) == pytest.approx(0.004)
+    assert tree().depths(np.array([0.05, 0, 0.05]))["bca"] == pytest.approx(0.004)
 
 
 def test_route_into_a_branch_and_between_branches():
@@ -182,4 +173,4 @@ def test_trees_can_be_sent_to_workers():
 
     vessels = pickle.loads(pickle.dumps(tree()))
     point = np.array([0.01, 0.0, 0.05])
-    assert vessels.depth(point) == tree().depth(point)
+    assert vessels.depths(point) == tree().depths(point)

@@ -86,18 +86,15 @@ WRONG = {
         "surface_vertices is .*finite numbers",
     ),
     "scale": (array("surface_vertices", lambda v: v * 1e3), "unit is not the metre"),
-    "zeros": (
-        array("wall_vertices", lambda v: v * 0.0),
-        "wall piece 0 has no volume|box",
-    ),
+    "scanned": (put("scanned", "yes"), "scanned is 'yes'"),
     "shape": (array("vessel_0_radii", lambda v: v[:-1]), "vessel_0_radii is float64"),
     "faces": (array("surface_faces", spoilt(0, 10**8)), "faces name vertices"),
     "empty": (array("surface_faces", lambda f: f[:0]), "no triangles"),
     "pickle": (
-        lambda d, a: a.update(wall_counts=np.array([{}], dtype=object)),
+        lambda d, a: a.update(vessel_0_radii=np.array([{}], dtype=object)),
         "damaged.*allow_pickle",
     ),
-    "missing": (lambda d, a: a.pop("wall_vertices", None) is None, "lacks the array"),
+    "missing": (lambda d, a: a.pop("surface_faces", None) is None, "lacks the array"),
 }
 
 

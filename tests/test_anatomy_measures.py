@@ -180,6 +180,6 @@ def test_check_fails_where_a_goal_is_in_another_vessel():
     anatomy = phantoms.load("type2")
     astray = replace(anatomy.goal("lcca"), position=anatomy.goal("lsa").position)
     wrong = replace(anatomy, goals={"lcca": astray})
-    failed = [one for one in wall.lumen_checks(wrong, 1000) if not one.passed]
+    failed = [one for one in wall.lumen_checks(wrong) if not one.passed]
     assert len(failed) == 1
     assert "lcca" in failed[0].note

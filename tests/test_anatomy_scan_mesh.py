@@ -13,9 +13,10 @@ import pytest
 import trimesh
 from synthetic_scans import marched, write_obj, y_tree
 
+from cathsim_dmc.anatomy.parts import Surface
 from cathsim_dmc.anatomy.scan.lumen import read_lumen
 from cathsim_dmc.anatomy.scan.mesh import read_triangles
-from cathsim_dmc.anatomy.scan.topology import edge_counts, volume
+from cathsim_dmc.anatomy.scan.topology import edge_counts
 from cathsim_dmc.anatomy.scan.units import upright
 
 DATA = Path(__file__).parent / "data"
@@ -25,6 +26,10 @@ DATA = Path(__file__).parent / "data"
 def y_mesh():
     """Closed surface of the Y: vertices (mm), faces with outward normals."""
     return marched(y_tree(), 2.0e-3)
+
+
+def volume(vertices, faces):
+    return Surface(vertices, faces).volume
 
 
 def assert_closed(lumen):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from types import SimpleNamespace
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -12,18 +12,8 @@ from cathsim_dmc.anatomy import phantoms
 from cathsim_dmc.anatomy.anatomy import Anatomy
 from cathsim_dmc.anatomy.centreline import Centreline, Vessel, VesselTree
 from cathsim_dmc.anatomy.parts import Goal
-from cathsim_dmc.anatomy.scan import importer
 from cathsim_dmc.anatomy.scan.check import check_tree
 from cathsim_dmc.anatomy.scan.importer import import_scan
-
-BOX = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)]) * 1e-3
-
-
-@pytest.fixture(autouse=True)
-def no_wall(monkeypatch):
-    """The tree is what is tested; the wall takes most of an import's time."""
-    report = SimpleNamespace(pieces=1)
-    monkeypatch.setattr(importer, "build_wall", lambda *a, **k: ((BOX,), report))
 
 
 def tube(points, radii):
@@ -88,9 +78,7 @@ def along(tree, name, start=0.0, end=None):
 def computed(arch_scan):
     """The anatomy of the scan, its centrelines computed, and what was noted."""
     notes = []
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(importer, "build_wall", lambda *a, **k: ((BOX,), None))
-        return import_scan(arch_scan[0], spacing=1.5e-3, notes=notes), notes
+    return import_scan(arch_scan[0], notes=notes), notes
 
 
 def test_computed_branches_get_their_anatomical_names(arch_scan, computed):
@@ -117,8 +105,8 @@ def test_a_turned_scan_gets_the_same_names(arch_scan, tmp_path):
     vertices, faces = marched(arch_scan[1], 2.2e-3)
     lying = vertices[:, [2, 0, 1]] * (-1, 1, -1)
     mesh = write_obj(tmp_path / "lying.obj", lying, faces)
-    free = import_scan(mesh, spacing=1.5e-3)
-    turned = import_scan(mesh, spacing=1.5e-3, axes="ILA")
+    free = import_scan(mesh)
+    turned = import_scan(mesh, axes="ILA")
     names = {"aorta", "bca", "rcca", "rsa", "lcca", "lsa"}
     assert set(free.tree.vessels) == set(turned.tree.vessels) == names
     assert turned.goals["lcca"].position[2] > 0.15
@@ -128,7 +116,7 @@ def test_a_turned_scan_gets_the_same_names(arch_scan, tmp_path):
 @pytest.mark.slow
 def test_names_can_be_changed(arch_scan):
     with pytest.raises(ValueError, match="no vessel 'rva' to rename; there are"):
-        import_scan(arch_scan[0], spacing=1.5e-3, rename={"rva": "x"})
+        import_scan(arch_scan[0], rename={"rva": "x"})
 
 
 @pytest.mark.slow
@@ -141,7 +129,7 @@ def test_curves_that_part_early_at_a_wide_flat_end(arch_scan, tmp_path):
         # Off the middle of the aorta's first 40 mm, to either side.
         fade = np.clip(1.0 - np.arange(len(way)) / 40.0, 0.0, 1.0)
         paths.append(drawn(tmp_path, name, way + fade[:, None] * (side, 0, 0)))
-    anatomy = import_scan(mesh, paths, spacing=1.5e-3)
+    anatomy = import_scan(mesh, paths)
     assert failed(anatomy) == {}
     for name in ("lcca", "rcca"):
         # 207 mm beside the aorta is what was found once.
@@ -184,7 +172,7 @@ def test_curves_that_start_12_mm_from_an_end_start_there(arch_scan, tmp_path):
     length = tree.root.centreline.length - origin
     way = way[12 : int(length * 1e3)]
     lcca = tree.vessel("lcca").centreline.points * 1e3
-    anatomy = import_scan(mesh, [drawn(tmp_path, "lcca", way, lcca)], spacing=1.5e-3)
+    anatomy = import_scan(mesh, [drawn(tmp_path, "lcca", way, lcca)])
     assert anatomy.inlet.position[0] < -0.03
     assert anatomy.inlet.position[2] < 0.1
 
@@ -196,9 +184,9 @@ def test_an_inlet_at_a_bulge_is_not_its_end(tmp_path):
     bulge = Vessel("bulge", tube([(35, 0, 50), (46, 0, 50)], [8, 7]), "aorta", 5e-3)
     bulged = VesselTree({**tree.vessels, "bulge": bulge})
     mesh = write_obj(tmp_path / "lumen.obj", *marched(bulged, 2.2e-3))
-    anatomy = import_scan(mesh, spacing=1.5e-3)
+    anatomy = import_scan(mesh)
     assert "branch_1" not in anatomy.tree.vessels
-    cut = import_scan(mesh, spacing=1.5e-3, inlet=(35.0, 0.0, 50.0))
+    cut = import_scan(mesh, inlet=(35.0, 0.0, 50.0))
     assert abs(cut.inlet.direction[2]) > 0.9
     assert abs(cut.inlet.position[2] - 50e-3) < 3e-3
     assert failed(cut).keys() <= {"start of the device"}
@@ -209,7 +197,7 @@ def test_a_start_at_the_ostium_is_said(tmp_path):
     tree = y_tree()
     mesh = write_obj(tmp_path / "lumen.obj", *marched(tree, 2e-3))
     notes = []
-    anatomy = import_scan(mesh, spacing=1e-3, notes=notes)
+    anatomy = import_scan(mesh, notes=notes)
     assert set(anatomy.tree.vessels) == {"aorta", "branch_1"}
     assert "start of the device" in failed(anatomy)
     assert any("starts" in note and "inlet farther back" in note for note in notes)
@@ -222,7 +210,7 @@ def test_a_truncated_centreline_is_continued_and_said(arch_scan, tmp_path):
     length = tree.route("aorta", "lcca").length * 1e3
     path = drawn(tmp_path, "lcca", along(tree, "lcca", 5.0, length - 60.0))
     notes = []
-    anatomy = import_scan(mesh, [path], spacing=1.5e-3, notes=notes)
+    anatomy = import_scan(mesh, [path], notes=notes)
     assert any("'lcca' stops" in note and "continued" in note for note in notes)
     tip = anatomy.tree.vessel("lcca").centreline.points[-1]
     assert np.linalg.norm(tip - (6e-3, 0, 265e-3)) < 10e-3
@@ -238,30 +226,25 @@ def test_arms_far_thinner_than_their_trunk_are_branches(tmp_path):
     vessels = {key: Vessel(key, arm, "trunk", 12e-3) for key, arm in arms.items()}
     tree = VesselTree({"trunk": Vessel("trunk", trunk), **vessels})
     mesh = write_obj(tmp_path / "fork.obj", *marched(tree, 2e-3))
-    anatomy = import_scan(mesh, spacing=1.5e-3)
+    anatomy = import_scan(mesh)
     assert np.linalg.norm(anatomy.inlet.position) < 15e-3
     assert {"branch_1", "branch_2"} <= set(anatomy.goals)
 
 
 def test_a_lumen_thinner_than_the_device_is_refused(tmp_path):
-    line = tube([(0, 0, 0), (0, 0, 20), (0, 0, 60)], [3, 0.6, 0.6])
+    line = tube([(0, 0, 0), (0, 0, 14), (0, 0, 60)], [3, 0.6, 0.6])
     tree = VesselTree({"aorta": Vessel("aorta", line)})
     mesh = write_obj(tmp_path / "thin.obj", *marched(tree, 0.4e-3))
     with pytest.raises(ValueError, match="5 Fr catheter") as error:
-        import_scan(mesh, spacing=0.4e-3)
+        import_scan(mesh, units="mm")
     assert "\n" not in str(error.value)
 
 
 def changed(anatomy: Anatomy, tree=None, goals=None) -> Anatomy:
-    return Anatomy(
-        name=anatomy.name,
+    return replace(
+        anatomy,
         tree=tree or anatomy.tree,
-        surface=anatomy.surface,
-        wall=anatomy.wall,
-        inlet=anatomy.inlet,
         goals=anatomy.goals if goals is None else goals,
-        ends=anatomy.ends,
-        field=anatomy.field,
     )
 
 

@@ -60,10 +60,9 @@ CONFINED = {
     "safetensors": {"agents/pretrained.py"},
     "ray": {"agents/ray_source.py"},
     "rerun": {"recording/"},
-    "igl": {"anatomy/field.py"},
+    "igl": {"anatomy/surface_depth.py", "anatomy/scan/"},
     "llvmlite": {"physics/native.py"},
-    "coacd": {"anatomy/"},
-    "fast_simplification": {"anatomy/scan/repair.py"},
+    "fast_simplification": {"anatomy/scan/topology.py"},
     "numba": {"compiled.py", "physics/native.py"},
     "gymnasium": {"simulation/gymnasium.py", "gym.py"},
     "tyro": {"cli/"},
@@ -71,7 +70,6 @@ CONFINED = {
 # Slow to import: only within functions, unless a module is itself loaded late.
 LATE = (
     "trimesh",
-    "coacd",
     "skimage",
     "matplotlib",
     "rerun",
@@ -181,7 +179,6 @@ def test_files_are_replaced_in_one_place(word):
     allowed = {
         "files.py",
         "agents/checkpoint.py",
-        "anatomy/scan/cache.py",
     }
     found = {
         path.relative_to(PACKAGE).as_posix()

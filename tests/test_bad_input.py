@@ -215,11 +215,7 @@ SCAN = {
     "mesh_frame": word(),
     "axes": word(optional=True),
     "inlet": st.one_of(word(optional=True), st.tuples(number(), st.just(0.0))),
-    "wall": word(),
-    "threshold": number(optional=True),
     "rename": st.sampled_from([1, "x", ["a"], {"a": 1}, {1: "a"}]),
-    "spacing": number(1e-4, 2e-3),
-    "tolerance": number(1e-5, 2e-3),
     "centreline_paths": st.sampled_from(["x.csv", 1, [1], None, [None]]),
 }
 PLACE = {"name": "g", "vessel": "v", "position": np.zeros(3), "arc_length": 0.0}

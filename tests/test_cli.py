@@ -18,6 +18,7 @@ from cathsim_dmc.agents.checkpoint import checkpoints_in
 from cathsim_dmc.agents.policies import FunctionPolicy
 from cathsim_dmc.anatomy.anatomy import Anatomy
 from cathsim_dmc.anatomy.arch import arch
+from cathsim_dmc.anatomy.parts import Surface
 from cathsim_dmc.cli import task_options
 
 
@@ -109,14 +110,14 @@ def test_check_prints_one_object_and_passes(cathsim):
 
 @pytest.mark.slow
 def test_a_failed_check_exits_with_one(cathsim, tmp_path):
-    """An arch that has lost three pieces of its wall leaks."""
+    """An arch that has lost a triangle of its surface has edges without two."""
     whole = arch.load("simple1")
-    leaking = dataclasses.replace(whole, name="leaking", wall=whole.wall[3:])
-    leaking.save(tmp_path)
+    surface = Surface(whole.surface.vertices, whole.surface.faces[1:])
+    dataclasses.replace(whole, name="torn", surface=surface).save(tmp_path)
     code, out, _ = cathsim("phantom", "check", tmp_path, "--no-push", "--json")
     assert code == 1
     failed = [c["name"] for c in only_json(out)["checks"] if not c["passed"]]
-    assert any("coverage" in name for name in failed), failed
+    assert any("edges of the surface" in name for name in failed), failed
 
 
 def test_every_option_of_a_task_is_one_of_the_evaluation(cathsim, monkeypatch):

@@ -46,7 +46,9 @@ def trajectory(threads, simulations=3, **options):
 
 def anatomy_digest():
     anatomy = arch.build_seed(arch.arch_set("train")[3])
-    return digest(anatomy.surface.vertices, anatomy.surface.faces, *anatomy.wall)
+    return digest(
+        anatomy.surface.vertices, anatomy.surface.faces, *anatomy.lumen.arrays
+    )
 
 
 IN_PROCESS = """

@@ -123,7 +123,7 @@ def test_an_import_that_is_killed_is_whole_or_not_there(tmp_path, server):
     cache = tmp_path / "cache"
     mesh = write_obj(tmp_path / "lumen.obj", *marched(y_tree()))
     out, whole = tmp_path / "anatomy", 0
-    # Once the cache has it, a process writes the anatomy again and again.
+    # A process imports and writes the anatomy again and again.
     for moment in moments(14.0):
         kill(server, import_on, mesh, out, cache, 10**9, after=moment)
         if (out / "anatomy.json").exists():
@@ -133,8 +133,7 @@ def test_an_import_that_is_killed_is_whole_or_not_there(tmp_path, server):
     anatomy = Anatomy.load(out)
     finish(server, import_on, mesh, tmp_path / "again", tmp_path / "other", 1)
     again = Anatomy.load(tmp_path / "again")
-    for a, b in zip(anatomy.wall, again.wall, strict=True):
-        np.testing.assert_array_equal(a, b)
+    assert anatomy.lumen.digest == again.lumen.digest
     assert len(names(out)) == 2
     assert whole
 

@@ -37,20 +37,18 @@ def test_the_capstan_check_sees_an_eighth_less_friction(friction, wrap):
 
 def test_tube_passes_the_checks_of_the_lumen():
     tube = forces.straight_tube(0.06, 4e-3)
-    checks = wall.lumen_checks(tube, rays=5_000)
+    checks = wall.lumen_checks(tube)
     assert all(check.passed for check in checks), checks
 
 
-def test_a_hole_and_a_plug_fail_the_checks_of_the_lumen():
+def test_a_false_field_and_a_narrow_tube_fail_the_checks_of_the_lumen():
     tube = forces.straight_tube(0.06, 4e-3)
-    half = dataclasses.replace(tube, wall=tube.wall[::2])
-    checks = {check.name: check for check in wall.lumen_checks(half, rays=5_000)}
-    assert not checks["tube: coverage"].passed
-    corners = np.stack(np.meshgrid(*[(-1e-3, 1e-3)] * 3), axis=-1).reshape(-1, 3)
-    plug = corners + (0, 0, 0.03)
-    plugged = dataclasses.replace(tube, wall=(*tube.wall, plug))
-    checks = {check.name: check for check in wall.lumen_checks(plugged, rays=1_000)}
-    assert not checks["tube: contacts of a sphere on the centrelines"].passed
+    false = dataclasses.replace(tube)
+    vars(false)["lumen"] = forces.straight_tube(0.06, 3.9e-3).lumen
+    checks = {check.name: check for check in wall.lumen_checks(false)}
+    assert not checks["tube: error of the field, 99th percentile"].passed
+    narrow = wall.lumen_checks(forces.straight_tube(0.06, 0.8e-3))
+    assert any(one.name.endswith("does not pass") for one in narrow if not one.passed)
 
 
 def test_validate_wall_names_a_missing_directory(tmp_path):

@@ -1,4 +1,4 @@
-"""The anatomy as the simulator sees it: lumen, wall pieces, inlet and goals.
+"""The anatomy as the simulator sees it: lumen, inlet and goals.
 
 Lengths are metres, positions are in the patient frame LPS.
 """
@@ -27,16 +27,13 @@ from cathsim_dmc.anatomy.centreline import (
     Centreline,
     Vessel,
     VesselTree,
-    _readonly,
-    as_points,
 )
 from cathsim_dmc.anatomy.curves import Curve, smooth_tree
 from cathsim_dmc.anatomy.field import Field
 from cathsim_dmc.anatomy.parts import End, Goal, Inlet, Surface
-from cathsim_dmc.anatomy.wall.depth import DepthField
 
 FORMAT = "cathsim-anatomy"
-FORMAT_VERSION = 1
+FORMAT_VERSION = 2
 _DESCRIPTION = "anatomy.json"
 _READS = 50  # of a description that is replaced while it is read
 
@@ -47,62 +44,39 @@ class Anatomy:
 
     Attributes:
         name: what to call it.
-        tree: centrelines and radii; defines the true lumen.
-        surface: triangles of the lumen surface, for looks and for images.
-        wall: one array (n_i, 3) of vertices per convex wall piece, metres, world
-            frame; the pieces lie outside the lumen. None builds those around the tree
-            when they are first asked for.
+        tree: centrelines and radii.
+        surface: triangles of the lumen surface, closed.
         inlet: where the device enters.
         goals: places to reach, by name.
         ends: flat ends of the lumen, open or capped.
-        field: measured depth of a lumen that is no union of tubes (a scan), or None.
+        scanned: whether the surface bounds the true lumen, as that of a scan; it is the
+            union of the tree's tubes if not.
     """
 
     name: str
     tree: VesselTree
     surface: Surface
-    wall: tuple[Array, ...]
     inlet: Inlet
     goals: Mapping[str, Goal]
     ends: tuple[End, ...] = ()
-    field: DepthField | None = None
+    scanned: bool = False
 
     def __post_init__(self) -> None:
-        wall = tuple(_readonly(piece) for piece in self.wall or ())
-        for index, piece in enumerate(wall):
-            if piece.ndim != 2 or piece.shape[1] != 3 or len(piece) < 4:
-                raise ValueError(
-                    f"wall piece {index} has shape {piece.shape}; give (n, 3), n >= 4."
-                )
         for key, goal in self.goals.items():
             if key != goal.name:
                 raise ValueError(f"goal {goal.name!r} is filed under {key!r}.")
             self.tree.vessel(goal.vessel)
         self.tree.vessel(self.inlet.vessel)
-        if self.wall is None:
-            object.__delattr__(self, "wall")
-        else:
-            object.__setattr__(self, "wall", wall)
         object.__setattr__(self, "goals", dict(self.goals))
         object.__setattr__(self, "ends", tuple(self.ends))
 
-    def __getattr__(self, name: str) -> tuple[Array, ...]:
-        if name != "wall":
-            raise AttributeError(f"an anatomy has no {name!r}.")
-        from cathsim_dmc.anatomy.wall.pieces import build_wall
-
-        wall = tuple(_readonly(piece) for piece in build_wall(self.tree, self.ends))
-        object.__setattr__(self, "wall", wall)
-        return wall
-
     def __repr__(self) -> str:
-        """Name, vessels, size, goals and wall in one line."""
+        """Name, vessels, size, goals and inlet in one line."""
         box = 1e3 * np.ptp(self.surface.vertices, axis=0)
         return (
             f"<Anatomy {self.name!r}: vessels {', '.join(self.tree.vessels)}; "
             f"{' x '.join(f'{side:.0f}' for side in box)} mm; goals "
-            f"{', '.join(self.goals) or 'none'}; inlet in {self.inlet.vessel}; "
-            f"{len(self.wall)} wall pieces>"
+            f"{', '.join(self.goals) or 'none'}; inlet in {self.inlet.vessel}>"
         )
 
     @classmethod
@@ -115,7 +89,7 @@ class Anatomy:
         goals: Mapping[str, VesselPlace] | None = None,
         **smoothing: float,
     ) -> Anatomy:
-        """Build lumen surface, wall pieces, inlet and goals around centrelines.
+        """Build lumen surface, inlet and goals around centrelines.
 
         Args:
             tree: measured centrelines (`anatomy.curves.Curve`) by name, parents
@@ -136,24 +110,37 @@ class Anatomy:
         if not isinstance(tree, VesselTree):
             tree = smooth_tree(tree, **smoothing)
         tree, ends, entry, places = builder.placed(tree, inlet, goals)
-        wall: Any = None
-        return cls(name, tree, lumen_surface(tree), wall, entry, places, ends)
+        return cls(name, tree, lumen_surface(tree), entry, places, ends)
 
     @cached_property
     def lumen(self) -> Field:
-        """Signed depth to the true wall, which a device touches.
+        """Signed depth to the wall, which a device touches.
 
         Built when first asked for, and kept in `field_cache.cache_folder()`.
         """
-        if self.field is None:
-            return field_cache.tree_field(self.tree, self.ends)
-        return field_cache.surface_field(self.surface, self.ends)
+        if self.scanned:
+            return field_cache.surface_field(self.surface, self.ends)
+        return field_cache.tree_field(self.tree, self.ends)
+
+    @cached_property
+    def wall(self) -> tuple[Array, ...]:
+        """Vertices (n_i, 3) m of convex pieces around the lumen; takes seconds."""
+        if self.scanned:
+            from cathsim_dmc.anatomy.convex_wall import wall_pieces
+
+            return wall_pieces(self)
+        from cathsim_dmc.anatomy.wall.pieces import build_wall
+
+        return build_wall(self.tree, self.ends)
 
     def depth(self, points: ArrayLike) -> Array:
-        """Signed depth (...) of `points` (..., 3) in the lumen, metres, > 0 inside."""
-        if self.field is not None:
-            return self.field(as_points(points))
-        return self.tree.depth(points)
+        """Signed depth (...) of `points` (..., 3) in the lumen, metres, > 0 inside.
+
+        Behind an open end it is minus the distance from the plane of the end.
+        """
+        if self.scanned:
+            return self.lumen(points)
+        return np.maximum.reduce(list(self.tree.depths(points).values()))
 
     def goal(self, name: str) -> Goal:
         """Goal called `name`.
@@ -299,12 +286,7 @@ def _pack(anatomy: Anatomy) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     arrays: dict[str, np.ndarray] = {
         "surface_vertices": anatomy.surface.vertices,
         "surface_faces": anatomy.surface.faces,
-        "wall_vertices": np.concatenate([np.empty((0, 3)), *anatomy.wall]),
-        "wall_counts": np.array([len(piece) for piece in anatomy.wall], np.int64),
     }
-    if anatomy.field is not None:
-        for key, values in anatomy.field.arrays().items():
-            arrays[f"field_{key}"] = values
     vessels = []
     for index, vessel in enumerate(anatomy.tree.vessels.values()):
         arrays[f"vessel_{index}_points"] = vessel.centreline.points
@@ -318,6 +300,7 @@ def _pack(anatomy: Anatomy) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
         "units": "m",
         "frame": "LPS",
         "name": anatomy.name,
+        "scanned": anatomy.scanned,
         "vessels": vessels,
         "inlet": {
             "vessel": anatomy.inlet.vessel,
@@ -357,17 +340,12 @@ def _unpack(description: dict[str, Any], arrays: dict[str, np.ndarray]) -> Anato
         vessels[entry["name"]] = Vessel(
             entry["name"], line, entry["parent"], entry["ostium"]
         )
-    stops = np.cumsum(arrays["wall_counts"])[:-1]
-    field = {k.removeprefix("field_"): v for k, v in arrays.items() if "field_" in k}
     return Anatomy(
         name=description["name"],
         tree=VesselTree(vessels),
         surface=Surface(arrays["surface_vertices"], arrays["surface_faces"]),
-        wall=tuple(np.split(arrays["wall_vertices"], stops))
-        if len(arrays["wall_counts"])
-        else (),
         inlet=Inlet(**description["inlet"]),
         goals={entry["name"]: Goal(**entry) for entry in description["goals"]},
         ends=tuple(End(**entry) for entry in description["ends"]),
-        field=DepthField.from_arrays(field) if field else None,
+        scanned=description["scanned"],
     )

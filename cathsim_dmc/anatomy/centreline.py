@@ -273,8 +273,13 @@ class VesselTree:
             [slice(*pair) for pair in zip(stops[:-1], stops[1:], strict=True)],
         )
 
-    def depths(self, points: ArrayLike, *, closed: bool = False) -> dict[str, Array]:
-        """Signed depth (m) of `points` (..., 3) in each vessel's own tube."""
+    def depths(self, points: ArrayLike) -> dict[str, Array]:
+        """Radius less distance (m) of `points` (..., 3) in each vessel's own tube.
+
+        Both are taken at the nearest point of the vessel's centreline: not the
+        distance to the wall, but > 0 inside. The flat ends are open; beyond one the
+        value is at most minus the distance to its plane.
+        """
         points = as_points(points)
         flat = points.reshape(-1, 3)
         out = np.empty((len(self.vessels), len(flat)))
@@ -291,10 +296,6 @@ class VesselTree:
                     flat[part], squared[:, columns], raw[:, columns]
                 )
                 depth = radius - distance
-                if closed:
-                    depth = np.minimum(depth, line.length - arc)
-                    if vessel.parent is None:
-                        depth = np.minimum(depth, arc)
                 # Rounding must not put the end plane itself outside.
                 beyond = overshoot > _END_PLANE
                 depth[beyond] = np.minimum(depth[beyond], -overshoot[beyond])
@@ -303,17 +304,6 @@ class VesselTree:
             name: row.reshape(points.shape[:-1])
             for name, row in zip(self.vessels, out, strict=True)
         }
-
-    def depth(self, points: ArrayLike, *, closed: bool = False) -> Array:
-        """Signed depth (...) of `points` (..., 3) in the union of tubes, metres.
-
-        Positive inside, negative outside: lumen radius less distance, both taken
-        at the nearest point of a vessel's centreline, the largest over vessels.
-        Beyond the flat end of a tube the depth is at most minus the distance to
-        the end plane. With `closed` the flat ends count as wall, which makes the
-        field continuous; otherwise they are open and do not limit the depth.
-        """
-        return np.maximum.reduce(list(self.depths(points, closed=closed).values()))
 
     def _lineage(self, name: str) -> list[str]:
         """Names from `name` up to the root."""

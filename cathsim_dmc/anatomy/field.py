@@ -29,9 +29,8 @@ QUANTUM = 1e-6  # m, of the depths kept in 16 bits, which reach to 32.767 mm
 _LARGEST = 32767
 _STEP = 0.25e-3  # m, to both sides, over which a gradient is taken
 _CHUNK = 2048  # bricks measured at once
+_FAR = -25e-3  # m; nothing asks for the depth farther outside of the lumen
 _TOGETHER = 4  # corners along each axis that are measured at once
-_BEFORE = 0.9  # cosine up to which a triangle's normal tells inside from outside
-_CAP = 1e-6  # m, within which a triangle lies in the plane of an open end
 
 # Depths (n, m) m at blocks (n, 3) + points (m, 3) m.
 Measure = Callable[[Array, Array], Array]
@@ -146,9 +145,10 @@ class Field:
             surface: closed, normals outwards; flat over the ends.
             ends: flat ends; those that are open let a device pass.
         """
+        from cathsim_dmc.anatomy.surface_depth import SurfaceDepth
+
         measure = SurfaceDepth(surface, ends)
-        low, high = surface.vertices.min(axis=0), surface.vertices.max(axis=0)
-        return cls.sampled(measure.around, low, high, ends)
+        return cls.sampled(measure.around, *measure.box, ends)
 
     @classmethod
     def sampled(
@@ -190,71 +190,21 @@ class Field:
         return cls(head, _whole(coarse).ravel(), index.ravel(), samples)
 
 
-class SurfaceDepth:
-    """Distance to a closed surface, inside and outside of it, by libigl."""
-
-    def __init__(self, surface: Surface, ends: Sequence[End] = ()):
-        """Prepares for a surface; open ends of it are no wall."""
-        import igl
-
-        faces = np.ascontiguousarray(surface.faces, dtype=np.int64)
-        vertices = np.ascontiguousarray(surface.vertices)
-        self._free = [end for end in ends if end.open]
-        cap = np.zeros(len(faces), dtype=bool)
-        for end in self._free:
-            level = np.abs((vertices - end.position) @ end.direction)
-            cap |= (level[faces] < _CAP).all(axis=1)
-        self._vertices, self._wall = vertices, faces[~cap]
-        self._boxes = igl.AABB()
-        self._boxes.init(vertices, self._wall)
-        self._winding = igl.FastWindingNumberBVH()
-        self._winding.init(vertices, faces, 2)
-        corners = vertices[self._wall]
-        normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-        sizes = np.linalg.norm(normals, axis=1, keepdims=True)
-        self._normals = normals / np.maximum(sizes, 1e-300)
-
-    def __call__(self, points: Array) -> Array:
-        """Signed distances (n,) m at points (n, 3) m, > 0 inside."""
-        squared, face, place = self._boxes.squared_distance(
-            self._vertices, self._wall, points
-        )
-        distance = np.sqrt(squared)
-        # Before the middle of a triangle its normal says on which side a point lies;
-        # before an edge, and at an open end, the winding number does.
-        level = np.vecdot(place - points, self._normals[face])
-        depth = np.copysign(distance, level)
-        doubtful = np.abs(level) < _BEFORE * distance
-        # Beyond an open end the lumen goes on as a straight tube.
-        moved = points.copy()
-        for end in self._free:
-            offset = points - end.position
-            level = offset @ end.direction
-            across = np.linalg.norm(offset - level[:, None] * end.direction, axis=1)
-            beyond = (level > -_CAP) & (across < 2.0 * end.radius)
-            beyond &= level < 5.0 * MARGIN
-            moved[beyond] -= (level[beyond] + 2.0 * _CAP)[:, None] * end.direction
-            doubtful |= beyond
-        winding = self._winding.winding_number(moved[doubtful], 2.0)
-        depth[doubtful] = np.where(winding > 0.5, 1.0, -1.0) * distance[doubtful]
-        return depth
-
-    def around(self, blocks: Array, points: Array) -> Array:
-        """Signed distances (n, m) m at blocks (n, 3) + points (m, 3) m, > 0 inside."""
-        everywhere = np.asarray(blocks)[:, None] + points
-        depth = self(np.ascontiguousarray(everywhere.reshape(-1, 3)))
-        return depth.reshape(len(blocks), len(points))
-
-
 def _corners(measure: Measure, origin: Array, shape: np.ndarray) -> Array:
-    """Depths at the corners of all bricks, m, a lattice of a shape."""
+    """Depths at the corners of all bricks, m, a lattice of a shape.
+
+    Far outside of the lumen all corners of a block have the depth of its middle.
+    """
     blocks = -(-shape // _TOGETHER)
     rows = np.stack(np.meshgrid(*(np.arange(n) for n in blocks), indexing="ij"), -1)
     steps = EDGE * (np.arange(_TOGETHER) - (_TOGETHER - 1) / 2)
     lattice = np.meshgrid(steps, steps, steps, indexing="ij")
     local = np.stack(lattice, -1).reshape(-1, 3).astype(np.float64)
     middles: Array = origin + EDGE * (_TOGETHER * rows + (_TOGETHER - 1) / 2)
-    depth = measure(middles.reshape(-1, 3), local)
+    middles = middles.reshape(-1, 3)
+    depth = np.repeat(measure(middles, np.zeros((1, 3))), len(local), axis=1)
+    near = depth[:, 0] > _FAR
+    depth[near] = measure(middles[near], local)
     depth = depth.reshape(*blocks, _TOGETHER, _TOGETHER, _TOGETHER)
     depth = depth.transpose(0, 3, 1, 4, 2, 5).reshape(_TOGETHER * blocks)
     return depth[: shape[0], : shape[1], : shape[2]]

@@ -96,7 +96,9 @@ def depth_at(head, coarse, index, samples, x, y, z):
         i, j, k = int(uu), int(vv), int(ww)
         uu, vv, ww = uu - i, vv - j, ww - k
         value = trilinear(samples, start + 1, n + 1, n + 1, i, j, k, uu, vv, ww)
-    return head[QUANTUM] * value - beyond
+    depth = head[QUANTUM] * value
+    # Beyond the box nothing is inside, though a lumen may leave it by an open end.
+    return depth if beyond == 0.0 else min(depth, 0.0) - beyond
 
 
 @compiled

@@ -5,11 +5,10 @@ from collections.abc import Callable
 import numpy as np
 from scipy import ndimage
 
+from cathsim_dmc.anatomy import lattice
+
 SPACING = 1.5e-3  # m: vessels down to a radius of 1.3 mm stay connected
 FINEST = 0.4e-3  # m: the lattice is refined down to here where they do not
-_BLOCK = 5  # cells along the edge of the blocks that are looked at first
-# The depth of a tree of tubes changes by a little more than 1 m per m at branchings.
-_SLOPE = 1.2
 
 
 class LumenDistance:
@@ -48,8 +47,9 @@ class LumenDistance:
         while True:
             self._low, self._spacing = low - 1.5 * spacing, spacing
             shape = np.ceil((high - low) / spacing).astype(int) + 4
-            inside = self._lumen(depth, shape)
-            cells = np.argwhere(inside)
+            cells, _ = lattice.inside(depth, self._low, shape, spacing)
+            inside = np.zeros(shape, bool)
+            inside[tuple(cells.T)] = True
             start, end = (self._nearest(cells, point) for point in (target, origin))
             costs = graph.MCP_Geometric(np.where(inside, 1.0, -1.0)).find_costs(
                 [start]
@@ -68,20 +68,6 @@ class LumenDistance:
             ~self._inside, return_distances=False, return_indices=True
         )
         self._ways = (costs * spacing)[tuple(nearest)].astype(np.float32)
-
-    def _lumen(self, depth: Callable, shape: np.ndarray) -> np.ndarray:
-        """Mask of the lattice points inside; evaluates only blocks near the lumen."""
-        blocks = -(-shape // _BLOCK)
-        first = _BLOCK * np.argwhere(np.ones(blocks, bool))
-        edge = (_BLOCK - 1) * self._spacing
-        centre = self._low + self._spacing * first + edge / 2
-        first = first[depth(centre) > -_SLOPE * np.sqrt(3) * edge / 2]
-        cell = np.argwhere(np.ones((_BLOCK,) * 3, bool))
-        ijk = (first[:, None] + cell).reshape(-1, 3)
-        ijk = ijk[(ijk < shape).all(-1)]
-        inside = np.zeros(shape, bool)
-        inside[tuple(ijk.T)] = depth(self._low + self._spacing * ijk) > 0
-        return inside
 
     def _nearest(self, cells: np.ndarray, point: np.ndarray) -> tuple[int, ...]:
         offset = self._low + self._spacing * cells - point

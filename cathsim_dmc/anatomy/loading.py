@@ -14,10 +14,9 @@ import numpy as np
 from cathsim_dmc import bounds, files
 
 EXTENT = 2.5  # m, diagonal of the box around an anatomy
-AROUND = 50e-3  # m, of the wall and of places outside the lumen's box
+AROUND = 50e-3  # m, of places outside the lumen's box
 OFF = 5e-3  # m, of inlet and goals off their centrelines, beside the radius
 WIDEST = 0.1  # m, radius of a vessel; the largest aneurysms have half of it
-FLAT = 1e-7  # m, least thickness of a wall piece
 LARGEST_TEXT = 20_000_000  # bytes of anatomy.json
 LARGEST_ARRAYS = 2_000_000_000  # bytes of all arrays, unpacked
 
@@ -107,6 +106,7 @@ def check_description(description: dict[str, Any], path: Path) -> None:
                 f"{allowed!r} only. Write it again with Anatomy.save."
             )
     bounds.text(f"{path}: name", description.get("name"))
+    bounds.switch(f"{path}: scanned", description.get("scanned"))
     for key, fields in _FIELDS.items():
         entries = description.get(key)
         if key == "inlet":
@@ -133,25 +133,16 @@ def check_arrays(arrays: dict[str, np.ndarray], vessels: int, path: Path) -> Non
     """Checks shapes, types and values of the arrays of an anatomy with ``vessels``."""
     _array(arrays, "surface_vertices", "f", (-1, 3), path)
     faces = _array(arrays, "surface_faces", "iu", (-1, 3), path)
-    corners = _array(arrays, "wall_vertices", "f", (-1, 3), path)
-    counts = _array(arrays, "wall_counts", "iu", (-1,), path)
-    if len(counts) and (counts.min() < 4 or counts.sum() != len(corners)):
-        raise ValueError(
-            f"{path}: wall_counts {bounds.shown(counts.tolist())} do not fit the "
-            f"{len(corners)} wall_vertices (at least 4 for each piece)."
-        )
     vertices = arrays["surface_vertices"]
     if not len(faces) or not len(vertices):
         raise ValueError(f"{path}: the surface has no triangles.")
     for index in range(vessels):
         points = _array(arrays, f"vessel_{index}_points", "f", (-1, 3), path)
         _array(arrays, f"vessel_{index}_radii", "f", (len(points),), path)
-    if "field_origin" in arrays:
-        _check_field(arrays, path)
 
 
 def check_places(anatomy: Any, path: Path) -> None:
-    """Checks that wall, inlet, goals and vessels lie where the lumen is."""
+    """Checks that inlet, goals and vessels lie where the lumen is."""
     vertices = anatomy.surface.vertices
     low, high = vertices.min(axis=0), vertices.max(axis=0)
     size = float(np.linalg.norm(high - low))
@@ -170,12 +161,6 @@ def check_places(anatomy: Any, path: Path) -> None:
                 f"(at most {AROUND:g} m)."
             )
 
-    for index, piece in enumerate(anatomy.wall):
-        near(piece, f"wall piece {index}")
-        if np.linalg.svd(piece - piece.mean(axis=0), compute_uv=False)[-1] < FLAT:
-            raise ValueError(
-                f"{path}: wall piece {index} has no volume; write the anatomy again."
-            )
     for vessel in anatomy.tree.vessels.values():
         near(vessel.centreline.points, f"vessel {vessel.name!r}")
         widest = float(vessel.centreline.radii.max())
@@ -204,25 +189,6 @@ def check_places(anatomy: Any, path: Path) -> None:
             )
     for end in anatomy.ends:
         near(end.position[None], f"an end of {end.vessel!r}")
-
-
-def _check_field(arrays: dict[str, np.ndarray], path: Path) -> None:
-    origin = _array(arrays, "field_origin", "f", (3,), path)
-    spacing = _array(arrays, "field_spacing", "f", (), path)
-    index = _array(arrays, "field_index", "i", (-1, -1, -1), path)
-    shape = tuple(n + 1 for n in index.shape)
-    _array(arrays, "field_coarse", "f", shape, path)
-    bricks = _array(arrays, "field_bricks", "i", (-1, 9, 9, 9), path)
-    if not 1e-5 <= float(spacing) <= 0.1 or np.abs(origin).max() > bounds.FAR:
-        raise ValueError(
-            f"{path}: the depth field has a spacing of {float(spacing):.3g} m and the "
-            f"origin {origin.tolist()}; its unit is not the metre."
-        )
-    if index.size and not -1 <= index.min() <= index.max() < len(bricks):
-        raise ValueError(
-            f"{path}: field_index names bricks {index.min()} to {index.max()}; there "
-            f"are {len(bricks)}."
-        )
 
 
 def _array(

@@ -13,6 +13,10 @@ from numpy.typing import ArrayLike
 from cathsim_dmc import bounds
 from cathsim_dmc.anatomy.centreline import Array, _readonly
 
+# Radius of the hole in the cap over the inlet of an exported wall, m. The front of the
+# introducer sheath covers it; its rim stays clear of the device.
+INLET_HOLE_RADIUS = 2.5e-3
+
 
 def _vector(value: ArrayLike, name: str) -> Array:
     vector = _readonly(bounds.array(name, value))

@@ -26,11 +26,11 @@ class TreeDepth:
 
     A tube is the union of its cross-sections: rings around the centreline, across it,
     whose centres, directions and radii change linearly between its points. Next to a
-    tapered wall and within an ostium, `VesselTree.depth` (radius less distance from the
-    centreline) is not the distance to the wall; this is. Where a ring lies in another
-    vessel there is no wall, and where two walls meet there is an edge, a crease, which
-    is kept as points. Closed ends are flat walls; an open end goes on as a straight
-    tube.
+    tapered wall and within an ostium, `VesselTree.depths` (radius less distance from
+    the centreline) is not the distance to the wall; this is. Where a ring lies in
+    another vessel there is no wall, and where two walls meet there is an edge, a
+    crease, which is kept as points. Closed ends are flat walls; an open end goes on as
+    a straight tube.
     """
 
     def __init__(self, tree: VesselTree, ends: Sequence[End] = ()):

@@ -1,13 +1,16 @@
-"""`cathsim phantom import`, `build`, `generate` and `check`."""
+"""`cathsim phantom import`, `build`, `generate`, `check` and `export`."""
 
 import sys
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 from tyro import conf
 from tyro.extras import SubcommandApp
 
 from cathsim_dmc.cli.options import print_json, show
+
+if TYPE_CHECKING:
+    from cathsim_dmc.anatomy import Anatomy
 
 phantoms = SubcommandApp()
 
@@ -24,9 +27,6 @@ def import_phantom(
     axes: str | None = None,
     inlet: tuple[float, float, float] | None = None,
     rename: tuple[str, ...] = (),
-    wall: Literal["prisms", "coacd"] = "prisms",
-    threshold_mm: float | None = None,
-    cache: bool = True,
 ) -> int:
     """Turn the surface of a lumen into an anatomy.
 
@@ -42,12 +42,8 @@ def import_phantom(
             does not stand upright: three of L, R, A, P, S, I, such as ILA.
         inlet: Where the device enters: a free end, or a place to cut the lumen at.
         rename: Names of computed branches, each as computed=wanted.
-        wall: Pieces near the surface, or CoACD's coarse ones.
-        threshold_mm: CoACD's concavity of a piece; 3.5 by default.
-        cache: Whether to use what was imported from the same files before.
     """
     from cathsim_dmc.anatomy.scan import report
-    from cathsim_dmc.anatomy.scan.cache import cached_import
     from cathsim_dmc.anatomy.scan.importer import import_scan
 
     changes = dict(_change(text) for text in rename)
@@ -56,7 +52,7 @@ def import_phantom(
     def progress(text: str) -> None:
         print(text, file=sys.stderr, flush=True)
 
-    anatomy = (cached_import if cache else import_scan)(
+    anatomy = import_scan(
         mesh,
         centreline,
         units=units,
@@ -65,14 +61,11 @@ def import_phantom(
         name=name or out.name,
         inlet=inlet,
         rename=changes,
-        wall=wall,
-        threshold=None if threshold_mm is None else threshold_mm * 1e-3,
         progress=progress,
         notes=notes,
     )
-    progress("wall: measuring it")
-    figures = report.describe(anatomy)
     anatomy.save(out)
+    figures = report.describe(anatomy)
     print_json({"directory": str(out), "notes": notes, **figures})
     return 0
 
@@ -103,7 +96,7 @@ def build(
 
     anatomy = read_tree(tree).build(access)
     anatomy.save(out)
-    print(f"{len(anatomy.wall)} wall pieces, goals {', '.join(anatomy.goals)}: {out}")
+    print(f"{anatomy.name}: goals {', '.join(anatomy.goals)}: {out}")
     return 0
 
 
@@ -156,10 +149,7 @@ def generate(
             f"{', '.join((*shipped.PHANTOMS, *arch.DROP_RANGES, *arch.SETS))}"
         )
     anatomy.save(out)
-    print(
-        f"{anatomy.name}: {len(anatomy.wall)} wall pieces, goals "
-        f"{', '.join(anatomy.goals)}: {out}"
-    )
+    print(f"{anatomy.name}: goals {', '.join(anatomy.goals)}: {out}")
     return 0
 
 
@@ -184,7 +174,7 @@ def check(
 ) -> int:
     """Check an anatomy and measure what it is like.
 
-    The wall's intrusion and coverage, patency, goals; type of the arch, diameters,
+    Its surface, the field of its lumen, passage, goals; type of the arch, diameters,
     take-offs, curvature; whether a device that is only pushed reaches each goal.
 
     Args:
@@ -196,18 +186,9 @@ def check(
         push: Try a straight push to each goal.
         json: Print one JSON object and nothing else.
     """
-    from cathsim_dmc import suite, validation
-    from cathsim_dmc.anatomy import phantoms as shipped
+    from cathsim_dmc import validation
 
-    if access is None:
-        anatomy = suite.load_anatomy(phantom)
-    elif phantom in shipped.PHANTOMS:
-        anatomy = shipped.load(phantom, access=access)
-    else:
-        raise ValueError(
-            f"{phantom!r} is no named phantom, so its access is as built; named are "
-            f"{', '.join(shipped.PHANTOMS)}"
-        )
+    anatomy = _loaded(phantom, access)
     if figure is None and Path(phantom).is_dir():
         figure = Path(phantom) / "check.png"
     report = validation.validate_anatomy(
@@ -219,6 +200,53 @@ def check(
     if figure is not None:
         print(f"three views: {figure}", file=sys.stderr)
     return code
+
+
+@phantoms.command
+def export(
+    phantom: Annotated[str, conf.Positional],
+    /,
+    out: Path,
+    access: str | None = None,
+) -> int:
+    """Write an anatomy as MJCF with convex wall pieces, for other engines.
+
+    Args:
+        phantom: Directory of an anatomy, or the name of a phantom.
+        out: File of the model, ending in .xml.
+        access: End of the aorta that the device enters, ascending or descending, of a
+            named phantom.
+    """
+    from cathsim_dmc.anatomy import export as exported
+
+    anatomy = _loaded(phantom, access)
+    pieces, found = exported.write_mjcf(anatomy, out)
+    mean, p95, largest = (round(1e3 * value, 3) for value in found.intrusion)
+    print_json(
+        {
+            "file": str(out),
+            "pieces": pieces,
+            "intrusion_mm": {"mean": mean, "p95": p95, "max": largest},
+            "open_places": found.open,
+            "places": found.places,
+            "closed_to_5fr": list(found.blocked),
+        }
+    )
+    return 0
+
+
+def _loaded(phantom: str, access: str | None) -> "Anatomy":
+    from cathsim_dmc import suite
+    from cathsim_dmc.anatomy import phantoms as shipped
+
+    if access is None:
+        return suite.load_anatomy(phantom)
+    if phantom in shipped.PHANTOMS:
+        return shipped.load(phantom, access=access)
+    raise ValueError(
+        f"{phantom!r} is no named phantom, so its access is as built; named are "
+        f"{', '.join(shipped.PHANTOMS)}"
+    )
 
 
 def print_measures(findings: dict) -> None:

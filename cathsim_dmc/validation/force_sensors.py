@@ -14,9 +14,9 @@ from cathsim_dmc import suite
 from cathsim_dmc.anatomy.anatomy import Anatomy
 from cathsim_dmc.anatomy.builder import anatomy_frame
 from cathsim_dmc.anatomy.centreline import Centreline, Vessel, VesselTree
+from cathsim_dmc.anatomy.field import Field
 from cathsim_dmc.anatomy.parts import Goal
 from cathsim_dmc.anatomy.surface import lumen_surface
-from cathsim_dmc.anatomy.wall.pieces import build_wall
 from cathsim_dmc.entities.phantom import Phantom
 from cathsim_dmc.physics import forces
 from cathsim_dmc.recording.episode import Episode
@@ -87,11 +87,15 @@ def resting_link(load: float, settling: float = 5.0) -> Resting:
 
 def _plate(height: float) -> Anatomy:
     """An anatomy whose wall is a plate at y = `height` (m), touching the device."""
-    tube = straight_tube(*GUIDING_TUBE)
-    corners = np.stack(
-        np.meshgrid((-0.05, 0.05), (height, height + 4e-3), (-0.5, 0.5)), axis=-1
+    plate = dataclasses.replace(straight_tube(*GUIDING_TUBE), name="plate")
+    corners = np.meshgrid((-0.05, 0.05), (height, height + 4e-3), (-0.5, 0.5))
+    vars(plate)["wall"] = (np.stack(corners, axis=-1).reshape(-1, 3),)
+    vars(plate)["lumen"] = Field.sampled(
+        lambda blocks, points: height - blocks[:, None, 1] - points[:, 1],
+        np.array([-0.05, -0.05, -0.5]),
+        np.array([0.05, height, 0.5]),
     )
-    return dataclasses.replace(tube, name="plate", wall=(corners.reshape(-1, 3),))
+    return plate
 
 
 def straight_tube(length: float, radius: float) -> Anatomy:
@@ -105,7 +109,6 @@ def straight_tube(length: float, radius: float) -> Anatomy:
         name="tube",
         tree=tree,
         surface=lumen_surface(tree),
-        wall=build_wall(tree, ends),
         inlet=inlet,
         goals={"end": Goal("end", "tube", line.at(place).position, place)},
         ends=ends,

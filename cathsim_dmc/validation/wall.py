@@ -13,18 +13,23 @@ import numpy as np
 from cathsim_dmc.anatomy import measures, surface
 from cathsim_dmc.anatomy.anatomy import Anatomy
 from cathsim_dmc.anatomy.scan.check import check_tree
-from cathsim_dmc.anatomy.wall import fidelity
+from cathsim_dmc.anatomy.surface_depth import SurfaceDepth
+from cathsim_dmc.anatomy.tree_depth import TreeDepth
 from cathsim_dmc.entities import devices
 from cathsim_dmc.entities.contact import FRICTION, wall_contact
 from cathsim_dmc.validation import convergence
 from cathsim_dmc.validation.checks import Check, Report
 from cathsim_dmc.validation.rig import Rig
 
-# Bounds on how far the wall protrudes into the lumen, mm.
-INTRUSION_MEAN, INTRUSION_P95, INTRUSION_MAX = 0.10, 0.30, 0.60
+# Bounds (mm) on the difference between the field and the distance that it stands for,
+# at the 99th percentile of places within 1 mm of the wall: of a union of tubes, and of
+# a surface, at whose edges the distance has edges too, which a lattice rounds.
+ERROR_TREE, ERROR_SURFACE = 0.02, 0.20
+LARGEST_FIELD = 5.0  # MB
 CAPSTAN_BOUND = 10.0  # % of the coefficient of friction
 ARCHES = ("type1", "type2")
-RAYS = 100_000
+_NEAR_WALL = 1e-3  # m
+_PLACES = 20_000
 DRUM_RADIUS = 0.05  # m
 WRAP = np.pi  # rad, angle of the wrap at the start
 # Coefficient and angle of the wrap: default friction, and about the ends of the range
@@ -185,19 +190,36 @@ def _full_speed(rig: Rig) -> float:
     return float(actuator.gainprm[0] / -actuator.biasprm[2])
 
 
-def lumen_checks(anatomy: Anatomy, rays: int = RAYS) -> list[Check]:
-    """Surface, intrusion, coverage, patency and goals of an anatomy.
+def field_error(anatomy: Anatomy) -> np.ndarray:
+    """Difference (n,) between field and exact depth within 1 mm of the wall, m."""
+    from cathsim_dmc.anatomy.field_loops import FREE
 
-    Args:
-        anatomy: generated or imported.
-        rays: of the coverage.
-    """
+    rng = np.random.default_rng(0)
+    triangles = anatomy.surface.vertices[anatomy.surface.faces]
+    cross = np.cross(
+        triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]
+    )
+    area = np.linalg.norm(cross, axis=1)
+    face = rng.choice(len(area), _PLACES, p=area / area.sum())
+    points = np.einsum(
+        "nk,nkd->nd", rng.dirichlet(np.ones(3), _PLACES), triangles[face]
+    )
+    points += rng.uniform(-1.2e-3, 1.2e-3, (_PLACES, 1)) * (cross / area[:, None])[face]
+    if anatomy.scanned:
+        exact = SurfaceDepth(anatomy.surface, anatomy.ends)(points)
+    else:
+        exact = TreeDepth(anatomy.tree, anatomy.ends)(points)
+    found = anatomy.lumen(points, free=True)
+    near = (np.abs(exact) < _NEAR_WALL) & (found < FREE)
+    return np.abs(found - exact)[near]
+
+
+def lumen_checks(anatomy: Anatomy) -> list[Check]:
+    """Surface, field, passage and goals of an anatomy, generated or imported."""
     name = anatomy.name
-    inside = fidelity.intrusion(anatomy).inside
-    cover = fidelity.coverage(anatomy, rays)
-    device = devices.get("steerable_5f")
-    passage = fidelity.patency(anatomy, device.outer_radius)
-    bounds = {"mean": INTRUSION_MEAN, "p95": INTRUSION_P95, "max": INTRUSION_MAX}
+    error = 1e3 * field_error(anatomy)
+    radius = devices.get("steerable_5f").outer_radius
+    narrow = _narrow(anatomy, radius)
     loose = surface.loose_edges(anatomy.surface)
     astray = [
         goal.name
@@ -206,7 +228,7 @@ def lumen_checks(anatomy: Anatomy, rays: int = RAYS) -> list[Check]:
             float(anatomy.depth(goal.position)),
             float(anatomy.tree.depths(goal.position)[goal.vessel]),
         )
-        > device.outer_radius
+        > radius
     ]
     return [
         Check.at_most(
@@ -223,30 +245,27 @@ def lumen_checks(anatomy: Anatomy, rays: int = RAYS) -> list[Check]:
             1,
             "",
         ),
-        *(
-            Check.at_most(
-                f"{name}: intrusion, {which}",
-                1e3 * getattr(inside, which),
-                bound,
-                "mm",
-                f"{inside.count} places, {len(anatomy.wall)} pieces",
-            )
-            for which, bound in bounds.items()
-        ),
-        Check.at_least(
-            f"{name}: coverage",
-            100 * cover.fraction,
-            100.0,
-            "%",
-            f"{cover.leaks} of {cover.rays} rays escape",
+        Check.at_most(
+            f"{name}: error of the field, 99th percentile",
+            float(np.percentile(error, 99)),
+            ERROR_SURFACE if anatomy.scanned else ERROR_TREE,
+            "mm",
+            f"mean {error.mean():.4f} mm, at most {error.max():.3f} mm, at "
+            f"{len(error)} places within {1e3 * _NEAR_WALL:g} mm of the wall",
         ),
         Check.at_most(
-            f"{name}: contacts of a sphere on the centrelines",
-            passage.contacts,
+            f"{name}: memory of the field",
+            anatomy.lumen.nbytes / 1e6,
+            LARGEST_FIELD,
+            "MB",
+        ),
+        Check.at_most(
+            f"{name}: places of the centrelines that the device does not pass",
+            sum(narrow.values()),
             0,
             "",
-            f"radius {1e3 * passage.radius:.2f} mm, {passage.positions} places"
-            + (f", blocked: {', '.join(passage.blocked)}" if passage.blocked else ""),
+            f"radius {1e3 * radius:.2f} mm"
+            + (f", blocked: {', '.join(narrow)}" if narrow else ""),
         ),
         Check.at_most(
             f"{name}: goals that the device cannot reach in their vessel",
@@ -259,9 +278,20 @@ def lumen_checks(anatomy: Anatomy, rays: int = RAYS) -> list[Check]:
     ]
 
 
+def _narrow(anatomy: Anatomy, radius: float) -> dict[str, int]:
+    """Places, 0.5 mm apart, of each vessel on the way to a goal that are too narrow."""
+    narrow = {}
+    for name in anatomy.goals:
+        route = anatomy.route(name)
+        s = np.arange(1.5 * radius, route.length - 1.5 * radius, 0.5e-3)
+        count = int((anatomy.lumen(route.at(s).position, free=True) < radius).sum())
+        if count:
+            narrow[name] = count
+    return narrow
+
+
 def validate_anatomy(
     anatomies: Mapping[str, Anatomy],
-    rays: int = RAYS,
     figure_path: str | Path | None = None,
     push: bool = False,
 ) -> Report:
@@ -269,14 +299,13 @@ def validate_anatomy(
 
     Args:
         anatomies: generated, measured or imported.
-        rays: of the coverage of each.
         figure_path: PNG of three views of the first one, or None.
         push: whether to try a straight push to each goal, which takes seconds.
     """
     checks: list[Check] = []
     findings: dict[str, Any] = {}
     for name, anatomy in anatomies.items():
-        checks += lumen_checks(dataclasses.replace(anatomy, name=name), rays)
+        checks += lumen_checks(dataclasses.replace(anatomy, name=name))
         checks += tree_checks(dataclasses.replace(anatomy, name=name))
         findings[name] = {"measures": shape(anatomy)}
         if push:
@@ -313,7 +342,7 @@ def shape(anatomy: Anatomy) -> dict[str, Any]:
             anatomy.tree, anatomy.inlet.position, measures.inlet_axis(anatomy)
         )
     )
-    return {"pieces": len(anatomy.wall), **_for_people(found)}
+    return _for_people(found)
 
 
 _ANGLES = {
@@ -345,7 +374,6 @@ def _for_people(values: Mapping[str, Any], inside: str = "") -> dict[str, Any]:
 
 def validate_wall(
     phantoms: Sequence[str | Path | Anatomy] = (),
-    rays: int = RAYS,
     with_convergence: bool = True,
 ) -> Report:
     """Runs every check of the wall.
@@ -353,7 +381,6 @@ def validate_wall(
     Args:
         phantoms: further anatomies beside the arches, such as an imported scan: the
             directory of one, or the anatomy.
-        rays: of the coverage of each anatomy.
         with_convergence: whether to run the convergence studies, which take longer
             than all the rest.
 
@@ -374,7 +401,7 @@ def validate_wall(
         anatomies.append(phantom)
     checks: list[Check] = []
     for anatomy in anatomies:
-        checks += lumen_checks(anatomy, rays)
+        checks += lumen_checks(anatomy)
     pulled = [capstan(friction, wrap) for friction, wrap in CAPSTANS]
     checks += [one.check() for one in pulled]
     studies = convergence.studies() if with_convergence else []

@@ -14,8 +14,8 @@ from matplotlib.figure import Figure
 from cathsim_dmc import style
 from cathsim_dmc.anatomy import measures, phantoms
 from cathsim_dmc.anatomy.arch import arch, sampler
-from cathsim_dmc.anatomy.scan.mesh_depth import MeshDepth
 from cathsim_dmc.anatomy.surface import lumen_surface
+from cathsim_dmc.anatomy.surface_depth import SurfaceDepth
 from cathsim_dmc.validation import views, wall
 from cathsim_dmc.validation.insertion import straight_push
 
@@ -73,26 +73,22 @@ def shapes(anatomies):
     return table(["", *anatomies], rows)
 
 
-def walls(anatomies):
-    """Fidelity of the walls."""
+def fields(anatomies):
+    """Exactness of the fields."""
     rows = []
     for name, anatomy in anatomies.items():
+        error = 1e3 * wall.field_error(anatomy)
+        figures = (error.mean(), np.percentile(error, 99), error.max())
         checks = wall.lumen_checks(anatomy)
-        by_name = {check.name.split(": ", 1)[1]: check for check in checks}
-        intrusion = [
-            f"{by_name[f'intrusion, {which}'].value:.2f}"
-            for which in ("mean", "p95", "max")
-        ]
         rows.append(
             [
                 name,
-                len(anatomy.wall),
-                " / ".join(intrusion),
-                f"{by_name['coverage'].value:g} %",
+                " / ".join(f"{each:.3f}" for each in figures),
+                f"{anatomy.lumen.nbytes / 1e6:.1f}",
                 "yes" if all(check.passed for check in checks) else "**no**",
             ]
         )
-    header = ["", "pieces", "intrusion mean / p95 / max, mm", "rays stopped"]
+    header = ["", "error of the field mean / p99 / max, mm", "memory, MB"]
     return table([*header, "all checks pass"], rows)
 
 
@@ -102,7 +98,7 @@ def against_measured():
     for name in phantoms.MEASURED:
         tree = phantoms.load(name).tree
         surface = lumen_surface(tree, 1e-3)
-        depth = MeshDepth(surface.vertices, surface.faces)
+        depth = SurfaceDepth(surface)
         measured = json.loads((MEASUREMENTS / f"{name}.json").read_text())["vessels"]
         away, errors = [], []
         for key, vessel in measured.items():
@@ -231,7 +227,7 @@ def main():
     gallery()
     blocks = {
         "shapes": shapes(anatomies),
-        "walls": walls(anatomies),
+        "fields": fields(anatomies),
         "against measured": against_measured(),
         "distributions": distributions(),
     }

@@ -6,8 +6,8 @@ from matplotlib.figure import Figure
 from scipy import stats
 
 from cathsim_dmc import style
-from cathsim_dmc.anatomy.wall import fidelity
 from cathsim_dmc.validation.convergence import DEFAULTS, LEAST_FORCE
+from cathsim_dmc.validation.wall import ERROR_TREE, field_error
 
 THEORY, SIMULATED, THIRD = style.COLOURS[:3]
 COLOURS = (SIMULATED, THEORY, *style.COLOURS[2:5])
@@ -200,20 +200,18 @@ def wall(anatomies, capstans, studies):
         _convergence(rows[1:], studies)
     ax = axes[0]
     for colour, anatomy in zip(COLOURS * 3, anatomies, strict=False):
-        inside, _ = fidelity.wall_intervals(anatomy.wall, _lumen(anatomy), 4e-3)
-        values = np.sort(1e3 * inside)
+        values = np.sort(1e3 * field_error(anatomy))
         share = 100 * (1 - np.arange(1, len(values) + 1) / len(values))
         ax.plot(values[:-1], share[:-1], color=colour, label=anatomy.name)
-    for x, y, text in ((0.30, 5, "p95 ≤ 0.30"), (0.60, 5e-3, "max ≤ 0.60")):
-        ax.plot(x, y, "v", color="0.4", markersize=6)
-        ax.annotate(text, (x, y), xytext=(5, 3), textcoords="offset points", fontsize=8)
+    ax.plot(ERROR_TREE, 1, "v", color="0.4", markersize=6)
     ax.set(
-        title="Wall inside the lumen",
-        xlabel="intrusion, mm",
-        ylabel="share of the lumen surface above, %",
+        title="Field against the exact distance to the wall",
+        xlabel="error within 1 mm of the wall, mm",
+        ylabel="share of the places above, %",
+        xscale="log",
         yscale="log",
-        xlim=(0, 0.75),
-        ylim=(2e-3, 120),
+        xlim=(1e-4, 0.5),
+        ylim=(1e-2, 120),
     )
     ax.legend(frameon=False, fontsize=8)
     ax = axes[1]
@@ -229,13 +227,6 @@ def wall(anatomies, capstans, studies):
     )
     ax.legend(frameon=False, fontsize=8)
     return figure
-
-
-def _lumen(anatomy):
-    """The same places as `fidelity.intrusion` measures."""
-    if anatomy.field is None:
-        return fidelity.tube_samples(anatomy.tree, 1e-3)
-    return fidelity.mesh_samples(anatomy, 1e-3)
 
 
 def forces(pushed, samples, comparison):

@@ -5,10 +5,11 @@ from __future__ import annotations
 import numpy as np
 from scipy.ndimage import gaussian_filter1d
 
-from cathsim_dmc.anatomy.wall.depth import DepthField
+from cathsim_dmc.anatomy.surface_depth import SurfaceDepth
 
 STEP = 1e-3  # m, spacing of the centrelines that result
 SMOOTH = 0.6  # radii, standard deviation of the smoothing along a centreline
+REACH = 0.5e-3  # m, to both sides of a curve, at which the depth is compared
 NARROW = 1.5e-3  # m, radius below which smoothing would cut bends
 
 
@@ -24,11 +25,11 @@ def resample(points: np.ndarray, step: float = STEP) -> np.ndarray:
 
 
 def centred(
-    field: DepthField,
+    field: SurfaceDepth,
     curve: np.ndarray,
     *,
     fixed_start: bool = False,
-    rounds: int = 240,
+    rounds: int = 80,
 ) -> np.ndarray:
     """Move a curve (n, 3) sideways towards the middle of the lumen.
 
@@ -40,8 +41,12 @@ def centred(
         share = 1.0 - turn / rounds
         tangent = np.gradient(points, axis=0)
         tangent /= np.maximum(np.linalg.norm(tangent, axis=1, keepdims=True), 1e-12)
-        uphill = field.gradient(points)
-        uphill -= np.einsum("nd,nd->n", uphill, tangent)[:, None] * tangent
+        u = np.cross(tangent, np.eye(3)[np.abs(tangent).argmin(axis=1)])
+        u /= np.linalg.norm(u, axis=1, keepdims=True)
+        sides = np.stack([u, np.cross(tangent, u)], axis=1)
+        offsets = REACH * np.concatenate([sides, -sides], axis=1)
+        around = field(points[:, None] + offsets) / (2.0 * REACH)
+        uphill = np.einsum("ns,nsd->nd", around[:, :2] - around[:, 2:], sides)
         move = 0.3e-3 * share * uphill
         smooth = gaussian_filter1d(points, 1.0, axis=0, mode="nearest")
         # Smoothing fades with the step: a constant one would cut tight bends.

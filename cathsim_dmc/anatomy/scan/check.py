@@ -11,11 +11,11 @@ from scipy.spatial import cKDTree
 
 from cathsim_dmc.anatomy.anatomy import Anatomy
 from cathsim_dmc.anatomy.centreline import Vessel
-from cathsim_dmc.anatomy.scan.mesh_depth import MeshDepth
+from cathsim_dmc.anatomy.field import Field
+from cathsim_dmc.anatomy.parts import INLET_HOLE_RADIUS
 from cathsim_dmc.anatomy.scan.naming import ARCH_BRANCHES
 from cathsim_dmc.anatomy.scan.tree import END_TRIM, TAIL, TAIL_RADIUS
-from cathsim_dmc.anatomy.wall.depth import DepthField
-from cathsim_dmc.anatomy.wall.pieces import INLET_HOLE_RADIUS
+from cathsim_dmc.anatomy.surface_depth import SurfaceDepth
 
 SLACK = 0.3e-3  # m, by which a triangulated surface may cut into a tube
 STEP = 0.5e-3  # m, between the places of a centreline that are tested
@@ -59,14 +59,13 @@ def check_tree(anatomy: Anatomy) -> list[TreeCheck]:
         of its own, branches on their parents, branches of the arch on their sides,
         free ends, goals, sizes, the inlet, and the start of the device.
     """
-    surface = anatomy.surface
-    measure = MeshDepth(surface.vertices, np.asarray(surface.faces, dtype=np.int64))
+    measure = SurfaceDepth(anatomy.surface)
     return [
         _inside(anatomy, measure),
         _own_lumen(anatomy),
         _parents(anatomy),
         _sides(anatomy),
-        _free_ends(anatomy, measure),
+        _free_ends(anatomy),
         _goals(anatomy),
         _sizes(anatomy),
         _inlet(anatomy, measure),
@@ -82,7 +81,7 @@ def _mm(point: np.ndarray) -> str:
     return "(" + ", ".join(f"{x * 1e3:.0f}" for x in point) + ") mm"
 
 
-def _inside(anatomy: Anatomy, measure: MeshDepth) -> TreeCheck:
+def _inside(anatomy: Anatomy, measure: SurfaceDepth) -> TreeCheck:
     wrong, least = [], np.inf
     for key, vessel in anatomy.tree.vessels.items():
         line = vessel.centreline
@@ -184,10 +183,8 @@ def _sides(anatomy: Anatomy) -> TreeCheck:
     return _finding("branches of the arch on their sides", wrong, fine)
 
 
-def _free_ends(anatomy: Anatomy, measure: MeshDepth) -> TreeCheck:
+def _free_ends(anatomy: Anatomy) -> TreeCheck:
     wrong, farthest = [], 0.0
-    # The field is the same lumen, sampled, and asking it is faster.
-    depth = anatomy.field or measure
     tree = anatomy.tree
     for key, vessel in tree.vessels.items():
         line = vessel.centreline
@@ -200,7 +197,7 @@ def _free_ends(anatomy: Anatomy, measure: MeshDepth) -> TreeCheck:
         end = line.at(line.length)
         tail = line.radii[line.arc_length > line.length - 30e-3]
         wide = float(max(tail.max(), end.radius))
-        ahead = _lumen_beyond(depth, end.position, end.tangent, wide)
+        ahead = _lumen_beyond(anatomy.lumen, end.position, end.tangent, wide)
         beyond = float(np.linalg.norm(ahead - end.position, axis=1).max(initial=0.0))
         # What no device can follow was cut off, and is not missing.
         cut = TAIL + END_TRIM if end.radius < NARROW_END * TAIL_RADIUS else 0.0
@@ -225,7 +222,7 @@ def _free_ends(anatomy: Anatomy, measure: MeshDepth) -> TreeCheck:
 
 
 def _lumen_beyond(
-    depth: DepthField | MeshDepth,
+    depth: Field,
     position: np.ndarray,
     tangent: np.ndarray,
     radius: float,
@@ -299,7 +296,7 @@ def _sizes(anatomy: Anatomy) -> TreeCheck:
     return _finding("sizes of vessels", wrong, f"{volume * 1e6:.0f} ml")
 
 
-def _inlet(anatomy: Anatomy, measure: MeshDepth) -> TreeCheck:
+def _inlet(anatomy: Anatomy, measure: SurfaceDepth) -> TreeCheck:
     inlet, wrong = anatomy.inlet, []
     line = anatomy.tree.vessel(inlet.vessel).centreline
     place = line.project(inlet.position)
@@ -320,7 +317,7 @@ def _inlet(anatomy: Anatomy, measure: MeshDepth) -> TreeCheck:
     return _finding("inlet", wrong, f"{inlet.radius * 2e3:.1f} mm wide")
 
 
-def _start(anatomy: Anatomy, measure: MeshDepth) -> TreeCheck:
+def _start(anatomy: Anatomy, measure: SurfaceDepth) -> TreeCheck:
     """Whether a device that starts straight begins before every goal's ostium."""
     inlet, wrong = anatomy.inlet, []
     s = np.arange(START_CLEARANCE, START, STEP)

@@ -14,9 +14,7 @@ from cathsim_dmc import bounds
 from cathsim_dmc.anatomy.anatomy import Anatomy
 from cathsim_dmc.anatomy.centreline import VesselTree
 from cathsim_dmc.anatomy.parts import Inlet, Surface
-from cathsim_dmc.anatomy.scan import coacd_wall
 from cathsim_dmc.anatomy.scan.check import check_tree
-from cathsim_dmc.anatomy.scan.compiled_field import compiled, plain
 from cathsim_dmc.anatomy.scan.curves import ScanCentreline, check_inside, read_curve
 from cathsim_dmc.anatomy.scan.ends import (
     FreeEnd,
@@ -25,32 +23,21 @@ from cathsim_dmc.anatomy.scan.ends import (
     listed,
     plan_inlet,
 )
-from cathsim_dmc.anatomy.scan.extract import centrelines, continued
-from cathsim_dmc.anatomy.scan.inlet import cut_open, shut_behind
+from cathsim_dmc.anatomy.scan.extract import DEVICE_RADIUS, centrelines, continued
+from cathsim_dmc.anatomy.scan.inlet import cut_open
 from cathsim_dmc.anatomy.scan.lumen import Lumen, read_lumen
-from cathsim_dmc.anatomy.scan.mesh_depth import MeshDepth, depth_field
 from cathsim_dmc.anatomy.scan.naming import name_branches, renamed
 from cathsim_dmc.anatomy.scan.places import flat_ends, place_goals, place_inlet
 from cathsim_dmc.anatomy.scan.tree import grow_tree
 from cathsim_dmc.anatomy.scan.trunk import name_trunk
 from cathsim_dmc.anatomy.scan.units import frame_sign, metres_per, upright
-from cathsim_dmc.anatomy.scan.wall import (
-    DEVICE_RADIUS,
-    TOLERANCE,
-    build_wall,
-    inlet_cap,
-)
 from cathsim_dmc.anatomy.scan.ways import Ways
-from cathsim_dmc.anatomy.wall.depth import SPACING, DepthField
+from cathsim_dmc.anatomy.surface_depth import SurfaceDepth
 
 log = logging.getLogger(__name__)
 
 ROOT = "aorta"
-WALLS = ("prisms", "coacd")
 FRAMES = ("LPS", "RAS")
-# Of the lattice of depths and of the prisms, m: finer ones take all memory, coarser
-# ones no longer see the vessels.
-SPACINGS, TOLERANCES = (1e-4, 2e-3), (1e-5, 2e-3)
 NEAR_INLET = 15e-3  # m, distance from the lumen of an inlet that is pointed at
 RADII = (0.3e-3, 30e-3)  # m, allowed median radius of a vessel: arteriole, aneurysm
 
@@ -76,10 +63,6 @@ def import_scan(
     inlet: Sequence[float] | None = None,
     root: str = ROOT,
     rename: Mapping[str, str] | None = None,
-    spacing: float = SPACING,
-    wall: str = "prisms",
-    tolerance: float = TOLERANCE,
-    threshold: float | None = None,
     progress: Callable[[str], None] | None = None,
     notes: list[str] | None = None,
 ) -> Anatomy:
@@ -101,11 +84,6 @@ def import_scan(
             else the wide end farthest from their starts or from the widest end.
         root: name of the vessel that starts at the inlet.
         rename: new names of computed vessels by their computed names.
-        spacing: m, of the fine lattice of depths.
-        wall: "prisms" (merged triangle prisms, near the surface) or "coacd" (convex
-            decomposition, coarse).
-        tolerance: m, of the prisms; see ``scan.wall.build_wall``.
-        threshold: m, of CoACD; see ``coacd_wall.decompose_wall``.
         progress: called with a line of text for every step, which begins with the
             step's name or with "note".
         notes: list to which what was guessed, mended and left out is added.
@@ -119,10 +97,7 @@ def import_scan(
         ValueError: if a file or an option is not as stated, or the tree that results
             does not agree with the surface; says how to mend it.
     """
-    threshold = _check_wall(wall, threshold)
     bounds.choice("mesh_frame", mesh_frame, FRAMES)
-    bounds.number("spacing", spacing, *SPACINGS, "m")
-    bounds.number("tolerance", tolerance, *TOLERANCES, "m")
     _check_rename(rename)
     started = time.monotonic()
 
@@ -150,32 +125,30 @@ def import_scan(
     if place is not None:
         turn = upright(axes)
         place = turn @ (place * frame_sign(mesh_frame) * metres_per(lumen.units))
-    vertices, faces = lumen.vertices, lumen.faces
-    measure = MeshDepth(vertices, faces)
+    surface = Surface(lumen.vertices, lumen.faces)
+    measure = SurfaceDepth(surface)
     _check_near(place, measure)
     curves = _read_curves(centreline_paths, lumen, mesh_frame, axes, root)
     lines = {curve.name: _inside_part(curve, measure, lumen.units) for curve in curves}
-    say(f"depth: measuring the lumen of {len(faces):,} triangles")
-    field = compiled(depth_field(vertices, faces, spacing))
-    say(f"tree: {len(field.bricks):,} bricks of depth, looking for vessels")
-    ways = Ways(field)
+    say(f"tree: looking for vessels in {len(surface.faces):,} triangles")
+    ways = Ways(measure)
     for pinch in ways.pinches:
         note(f"the lumen is pinched to a slit at {_mm(pinch)}; vessels go on beyond")
-    tree, opening = _tree(field, ways, lines, place, root, rename or {}, note)
+    tree, opening = _tree(measure, ways, lines, place, root, rename or {}, note)
     say(f"tree: {', '.join(_summary(tree))}")
     anatomy = Anatomy(
         name=name or Path(mesh_path).stem,
         tree=tree,
-        surface=Surface(vertices, faces),
-        wall=(),
+        surface=_cut(surface, opening),
         inlet=opening,
         goals=place_goals(tree, root),
         ends=flat_ends(tree, opening),
-        field=field,
+        scanned=True,
     )
-    anatomy = _walled(anatomy, wall, tolerance, threshold, bool(lines), say, note)
+    say("field: measuring the lumen")
+    _prove(anatomy, _MEND_DRAWN if lines else _MEND_COMPUTED, note)
     say(
-        f"done: {len(anatomy.wall)} wall pieces in {time.monotonic() - started:.0f} s, "
+        f"done: {anatomy.lumen} in {time.monotonic() - started:.0f} s, "
         f"goals {', '.join(anatomy.goals) or 'none'}"
     )
     return anatomy
@@ -238,23 +211,8 @@ def _computed(
     return {key: f.points for key, f in zip(names, found, strict=True)}
 
 
-def _walled(anatomy, wall, tolerance, threshold, drawn, say, note) -> Anatomy:
-    """The anatomy cut open at its inlet and surrounded by its wall, and proved."""
-    vertices, faces = anatomy.surface.vertices, np.asarray(anatomy.surface.faces)
-    field, tree, opening = anatomy.field, anatomy.tree, anatomy.inlet
-    cut_vertices, shell, cap = cut_open(vertices, faces.astype(np.int64), opening)
-    closed = np.concatenate([shell, cap])
-    shut = compiled(shut_behind(field, cut_vertices, closed, opening))
-    anatomy = Anatomy(
-        name=anatomy.name,
-        tree=tree,
-        surface=_compact(cut_vertices, closed),
-        wall=(),
-        inlet=opening,
-        goals=anatomy.goals,
-        ends=anatomy.ends,
-        field=shut,
-    )
+def _prove(anatomy: Anatomy, mend: str, note: Callable[[str], None]) -> None:
+    """Checks the tree against the surface; notes what a user may accept."""
     for check in check_tree(anatomy):
         if check.passed:
             continue
@@ -263,39 +221,15 @@ def _walled(anatomy, wall, tolerance, threshold, drawn, say, note) -> Anatomy:
             continue
         raise ValueError(
             f"the tree does not agree with the surface ({check.name}): {check.detail}. "
-            + (_MEND_DRAWN if drawn else _MEND_COMPUTED)
+            + mend
         )
-    if wall == "coacd":
-        pieces, _ = coacd_wall.decompose_wall(
-            cut_vertices, shell, field, tree, threshold=threshold, progress=say
-        )
-    else:
-        pieces, _ = build_wall(
-            cut_vertices,
-            shell,
-            field,
-            np.concatenate([v.centreline.points for v in tree.vessels.values()]),
-            tolerance=tolerance,
-            progress=say,
-        )
-    pieces += tuple(inlet_cap(cut_vertices[cap[:, :2]], opening))
-    return replace(anatomy, wall=pieces, field=plain(shut))
 
 
-def _compact(vertices, faces) -> Surface:
-    used, numbers = np.unique(faces, return_inverse=True)
-    return Surface(vertices[used], numbers.reshape(-1, 3).astype(np.int32))
-
-
-def _check_wall(wall: str, threshold: float | None) -> float:
-    """CoACD's threshold (m), checked before the import."""
-    if wall not in WALLS:
-        raise ValueError(f"wall is {wall!r}; give one of {', '.join(WALLS)}.")
-    if wall != "coacd" and threshold is not None:
-        raise ValueError("a threshold is for wall='coacd' only; leave it out.")
-    return coacd_wall.check_threshold(
-        coacd_wall.THRESHOLD if threshold is None else threshold
-    )
+def _cut(surface: Surface, opening: Inlet) -> Surface:
+    """What of a closed surface lies ahead of the inlet, with a flat cap there."""
+    vertices, shell, cap = cut_open(surface.vertices, surface.faces, opening)
+    used, numbers = np.unique(np.concatenate([shell, cap]), return_inverse=True)
+    return Surface(vertices[used], numbers.reshape(-1, 3))
 
 
 def _as_point(inlet: Sequence[float] | None) -> np.ndarray | None:
@@ -310,7 +244,7 @@ def _as_point(inlet: Sequence[float] | None) -> np.ndarray | None:
     return point
 
 
-def _check_near(place: np.ndarray | None, measure: MeshDepth) -> None:
+def _check_near(place: np.ndarray | None, measure: SurfaceDepth) -> None:
     if place is not None and measure(place[None])[0] < -NEAR_INLET:
         raise ValueError(
             f"inlet is {-measure(place[None])[0] * 1e3:.1f} mm away from the lumen; "
@@ -351,7 +285,9 @@ def _read_curves(paths, lumen: Lumen, frame, axes, root) -> list[ScanCentreline]
     return curves
 
 
-def _inside_part(curve: ScanCentreline, measure: MeshDepth, units: str) -> np.ndarray:
+def _inside_part(
+    curve: ScanCentreline, measure: SurfaceDepth, units: str
+) -> np.ndarray:
     depth = measure(curve.points)
     mirrored = measure(curve.points * (-1.0, -1.0, 1.0))
     keep = check_inside(curve, depth, mirrored)
@@ -373,7 +309,7 @@ def _inside_part(curve: ScanCentreline, measure: MeshDepth, units: str) -> np.nd
     return curve.points[keep]
 
 
-def _proximal_first(line: np.ndarray, field: DepthField) -> np.ndarray:
+def _proximal_first(line: np.ndarray, field: SurfaceDepth) -> np.ndarray:
     """Turn a centreline so that its wider end comes first."""
     part = max(1, len(line) // 8)
     first, last = field(line[:part]).max(), field(line[-part:]).max()

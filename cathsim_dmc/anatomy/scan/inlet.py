@@ -1,13 +1,11 @@
-"""The inlet of a scan: the lumen is cut across it and closed behind it."""
+"""The inlet of a scan: the lumen is cut across it."""
 
 from __future__ import annotations
 
 import numpy as np
 
 from cathsim_dmc.anatomy.parts import Inlet
-from cathsim_dmc.anatomy.scan.mesh_depth import MeshDepth
-from cathsim_dmc.anatomy.scan.wall import adjacent_faces
-from cathsim_dmc.anatomy.wall.depth import BRICK, OUTER, QUANTUM, DepthField
+from cathsim_dmc.anatomy.scan.topology import adjacent, groups
 
 
 def cut_open(
@@ -33,14 +31,14 @@ def cut_open(
     side = np.where(np.abs(side) < 1e-9, 1e-9, side)
     front = np.asarray(side[faces] > 0.0)
     crossing: np.ndarray = np.asarray(front.any(axis=1) & ~front.all(axis=1))
-    pairs = adjacent_faces(faces)
+    pairs = adjacent(faces)
     ring_pairs = pairs[crossing[pairs].all(1)]
     ring = _component(len(faces), ring_pairs, crossing, vertices, faces, inlet.position)
     others = pairs[~ring[pairs].any(1)]
     behind = ring.copy()
     touching = pairs[ring[pairs].sum(1) == 1]
     outer = np.where(ring[touching[:, 0]], touching[:, 1], touching[:, 0])
-    label = _labels(len(faces), others)
+    label = groups(len(faces), others)
     # A triangle beyond the ring lies wholly on one side of the plane there.
     gone = np.unique(label[outer[~front[outer].any(1)]])
     stay = np.unique(label[outer[front[outer].all(1)]])
@@ -83,65 +81,9 @@ def cut_open(
     return points, shell, cap
 
 
-def shut_behind(
-    field: DepthField, vertices: np.ndarray, faces: np.ndarray, inlet: Inlet
-) -> DepthField:
-    """The field of a lumen with the part behind the inlet taken out.
-
-    Behind the inlet's plane, points get their depth in what is left of the lumen,
-    which is minus their distance from it; in front of it nothing changes: the end
-    is open and does not limit the depth.
-
-    Args:
-        field: of the whole lumen.
-        vertices: (V, 3) m.
-        faces: (F, 3) of what is left, closed by a flat cap in the inlet's plane.
-        inlet: its direction points to what is left.
-    """
-    measure = MeshDepth(vertices, faces)
-    wide, shape = field.spacing * BRICK, np.asarray(field.index.shape)
-    axes = [np.arange(n + 1) for n in shape]
-    corners = np.stack(np.meshgrid(*axes, indexing="ij"), -1)
-    behind = (field.origin + wide * corners - inlet.position) @ inlet.direction < 0.0
-    # Far outside the lumen the sign is all that counts, and it does not change.
-    todo = behind & (field.coarse > -2.0 * wide)
-    coarse = field.coarse.copy()
-    coarse[todo] = measure(field.origin + wide * corners[todo])
-    cells = np.lib.stride_tricks.sliding_window_view(todo, (2, 2, 2)).any((3, 4, 5))
-    whole = np.lib.stride_tricks.sliding_window_view(behind, (2, 2, 2)).all((3, 4, 5))
-    deepest = np.lib.stride_tricks.sliding_window_view(coarse, (2, 2, 2)).max((3, 4, 5))
-    # The plane itself needs the fine lattice, also where the lumen is wide.
-    across = cells & ~whole & (deepest > -wide)
-    near = cells & whole & (deepest + wide > -OUTER) & (field.index >= 0)
-    rows = np.argwhere(across | near)
-    steps = field.spacing * np.arange(BRICK + 1)
-    local = np.stack(np.meshgrid(steps, steps, steps, indexing="ij"), -1)
-    points = field.origin + wide * rows[:, None] + local.reshape(-1, 3)
-    depth = field(points)
-    hidden = (points - inlet.position) @ inlet.direction < 0.0
-    depth[hidden] = measure(points[hidden])
-    fresh = np.clip(np.rint(depth / QUANTUM), -32767, 32767).astype(np.int16)
-    kept = (field.index >= 0) & ~cells
-    index = np.full_like(field.index, -1)
-    index[kept] = np.arange(kept.sum())
-    index[tuple(rows.T)] = kept.sum() + np.arange(len(rows))
-    bricks = np.concatenate(
-        [field.bricks[field.index[kept]], fresh.reshape(-1, *field.bricks.shape[1:])]
-    )
-    return DepthField(field.origin, field.spacing, coarse, index, bricks)
-
-
-def _labels(count, pairs):
-    from scipy.sparse import coo_matrix
-    from scipy.sparse.csgraph import connected_components
-
-    link = coo_matrix((np.ones(len(pairs)), pairs.T), shape=(count, count))
-    return connected_components(link, directed=False)[1]
-
-
 def _component(count, pairs, among, vertices, faces, position):
     """The connected group of faces in ``among`` whose middle is next to a point."""
-    label = _labels(count, pairs)
+    label = groups(count, pairs)
     keys = np.unique(label[among])
     if not len(keys):
         raise ValueError(

@@ -6,7 +6,7 @@ import numpy as np
 
 from cathsim_dmc.anatomy.centreline import Vessel, VesselTree
 from cathsim_dmc.anatomy.parts import End, Goal, Inlet
-from cathsim_dmc.anatomy.scan.wall import DEVICE_RADIUS
+from cathsim_dmc.anatomy.scan.extract import DEVICE_RADIUS
 
 GOAL_PAST_OSTIUM = 30e-3  # m along a branch, its first goal
 GOAL_DISTAL = 0.8  # of the passable part of a branch, its second goal

@@ -6,20 +6,21 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from cathsim_dmc.anatomy.scan.mesh_depth import MeshDepth
+from cathsim_dmc.anatomy.parts import Surface
 from cathsim_dmc.anatomy.scan.thick import inner_shell, lumen_of_wall
 from cathsim_dmc.anatomy.scan.topology import (
     areas,
     border_loops,
+    decimated,
     edge_counts,
     loop_axis,
     merged,
+    oriented,
     parts,
-    turned_faces,
-    volume,
     widths,
     without_slivers,
 )
+from cathsim_dmc.anatomy.surface_depth import SurfaceDepth
 
 PART_AREA = 0.03  # of the surface's area: smaller separate parts are dropped
 PART_WIDTH = 12e-3  # m, and if they are not wider
@@ -121,7 +122,7 @@ class _Work:
 
     def keep_one_part(self, quiet: bool = False) -> None:
         """Drops small parts; keeps the inner of the two surfaces of a wall."""
-        label = parts(self.faces, len(self.vertices))
+        label = parts(self.faces)
         area = areas(self.vertices, self.faces)
         share = np.bincount(label, area) / area.sum()
         large = np.flatnonzero(
@@ -156,19 +157,10 @@ class _Work:
         """Fewer triangles where there are very many."""
         if len(self.faces) <= DENSE:
             return
-        from fast_simplification import simplify
-
-        scale = 1e3  # its tolerances suit coordinates of order one
-        points, faces = simplify(
-            (self.vertices * scale).astype(np.float32),
-            self.faces.astype(np.int32),
-            target_count=FEW,
-        )
-        points = points.astype(np.float64) / scale
-        points, faces = merged(points, faces.astype(np.int64))
+        points, faces = decimated(self.vertices, self.faces, FEW)
         rng = np.random.default_rng(0)
         some = self.vertices[rng.integers(len(self.vertices), size=4000)]
-        off = np.abs(MeshDepth(points, faces)(some))
+        off = np.abs(SurfaceDepth(Surface(points, faces))(some))
         self._notes.append(
             f"decimated from {len(self.faces):,} to {len(faces):,} triangles; the "
             f"surface moved by {off.mean() * 1e3:.2f} mm in the mean, "
@@ -202,22 +194,21 @@ class _Work:
             self._drop_small_parts()
 
     def _drop_small_parts(self) -> None:
-        label = parts(self.faces, len(self.vertices))
+        label = parts(self.faces)
         share = np.bincount(label, areas(self.vertices, self.faces))
         self._keep(np.isin(label, np.flatnonzero(share > PART_AREA * share.sum())))
 
     def orient(self) -> None:
         """Gives neighbouring triangles the same orientation."""
-        turned = turned_faces(self.faces)
-        if turned is None:
+        found = oriented(self.faces)
+        if found is None:
             raise ValueError(
                 f"{self.name} is a surface with one side only (a Moebius strip): its "
                 "triangles cannot all face outwards. Export it again."
             )
-        turned = min(turned, ~turned, key=np.sum)
-        if turned.any():
-            self._notes.append(f"{int(turned.sum())} flipped triangles turned")
-            self.faces = np.where(turned[:, None], self.faces[:, ::-1], self.faces)
+        self.faces, turned = found
+        if turned:
+            self._notes.append(f"{turned} flipped triangles turned")
 
     def keep_inner_surface(self) -> None:
         """Keeps the inner surface of a wall that is open at its ends."""
@@ -287,7 +278,7 @@ class _Work:
 
     def turn_outwards(self) -> None:
         """Turn the whole surface if its normals point inwards."""
-        if volume(self.vertices, self.faces) < 0.0:
+        if Surface(self.vertices, self.faces).volume < 0.0:
             self.faces = self.faces[:, ::-1]
             self._notes.append("surface turned inside out: normals pointed inwards")
 
@@ -295,7 +286,7 @@ class _Work:
         """Cut out small patches that pierce the surface, refuse large ones."""
         first = None
         for _ in range(ROUNDS):
-            faces, edges = MeshDepth(self.vertices, self.faces).crossings()
+            faces, edges = SurfaceDepth(Surface(self.vertices, self.faces)).crossings()
             if not len(faces):
                 break
             tangled = np.isin(self.faces, np.unique(edges)).sum(axis=1) >= 2
@@ -327,7 +318,7 @@ class _Work:
             )
 
     def _widest_patch(self, chosen: np.ndarray) -> float:
-        label = parts(self.faces[chosen], len(self.vertices))
+        label = parts(self.faces[chosen])
         return float(widths(self.vertices, self.faces[chosen], label).max())
 
     def _keep(self, chosen: np.ndarray) -> None:

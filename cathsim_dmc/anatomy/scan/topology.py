@@ -41,60 +41,69 @@ def widths(vertices: np.ndarray, faces: np.ndarray, label: np.ndarray) -> np.nda
     return np.linalg.norm(high - low, axis=1)
 
 
-def volume(vertices: np.ndarray, faces: np.ndarray) -> float:
-    """Enclosed volume (m^3) of a closed surface, > 0 if its normals point outwards."""
-    a, b, c = (vertices[faces[:, k]] - vertices[0] for k in range(3))
-    return float(np.einsum("nd,nd->", a, np.cross(b, c)) / 6.0)
-
-
 def edge_counts(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Edges (E, 2), lower vertex first, and the triangles at each (E,)."""
     edges = np.sort(faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
     return np.unique(edges, axis=0, return_counts=True)
 
 
-def parts(faces: np.ndarray, count: int) -> np.ndarray:
+def parts(faces: np.ndarray) -> np.ndarray:
     """Number (F,) of the connected part that each triangle belongs to, from 0."""
-    rows = faces[:, [0, 1, 2]].reshape(-1)
-    cols = faces[:, [1, 2, 0]].reshape(-1)
-    link = coo_matrix((np.ones(len(rows)), (rows, cols)), shape=(count, count))
-    label = connected_components(link, directed=False)[1][faces[:, 0]]
+    import igl
+
+    label = igl.vertex_components(np.ascontiguousarray(faces))[faces[:, 0]]
     return np.unique(label, return_inverse=True)[1]
 
 
-def _neighbours(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Pairs (n, 2) of triangles at an edge, and whether they are oriented alike."""
-    directed = faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
-    edges = np.sort(directed, axis=1)
+def adjacent(faces: np.ndarray) -> np.ndarray:
+    """Pairs (n, 2) of triangles that share an edge."""
+    edges = np.sort(faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
     owner = np.repeat(np.arange(len(faces)), 3)
     order = np.lexsort((edges[:, 1], edges[:, 0]))
-    edges, owner, directed = edges[order], owner[order], directed[order]
+    edges, owner = edges[order], owner[order]
     same = (edges[1:] == edges[:-1]).all(axis=1)
-    alike = directed[:-1, 0][same] != directed[1:, 0][same]
-    return np.stack([owner[:-1][same], owner[1:][same]], axis=1), alike
+    return np.stack([owner[:-1][same], owner[1:][same]], axis=1)
 
 
-def turned_faces(faces: np.ndarray) -> np.ndarray | None:
-    """Triangles (F,) to turn so that all neighbours agree, or None if none would do.
+def groups(count: int, pairs: np.ndarray) -> np.ndarray:
+    """Number (count,) of the group that each of some things joined in pairs is in."""
+    link = coo_matrix((np.ones(len(pairs)), pairs.T), shape=(count, count))
+    return connected_components(link, directed=False)[1]
 
-    Every triangle stands in a graph twice, as it is and turned; neighbours that agree
-    are joined side to side, others crosswise.
+
+def oriented(faces: np.ndarray) -> tuple[np.ndarray, int] | None:
+    """Faces (F, 3) turned so that all neighbours agree, and how many were turned.
+
+    None where no turning does, as on a Moebius strip.
     """
-    pairs, alike = _neighbours(faces)
-    n = len(faces)
-    if alike.all():
-        return np.zeros(n, dtype=bool)
-    a, b = pairs.T
-    cross = np.where(alike, 0, n)
-    rows = np.concatenate([a, a + n])
-    cols = np.concatenate([b + cross, (b + n - cross)])
-    link = coo_matrix((np.ones(len(rows)), (rows, cols)), shape=(2 * n, 2 * n))
-    label = connected_components(link, directed=False)[1]
-    if (label[:n] == label[n:]).any():
+    import igl
+
+    out, part = igl.bfs_orient(np.ascontiguousarray(faces))
+    sides = out[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
+    if len(np.unique(sides, axis=0)) < len(sides):
         return None
-    # Of the two sheets of each part, the one of which more triangles stay as given.
-    own, sizes = label[:n], np.bincount(label[:n], minlength=label.max() + 1)
-    return sizes[own] < sizes[label[n:]]
+    changed = (out != faces).any(axis=1)
+    # Of both ways to orient a part, the one in which more triangles stay as given.
+    other = (np.bincount(part, changed) > 0.5 * np.bincount(part))[part]
+    out[other] = out[other, ::-1]
+    return out, int((changed != other).sum())
+
+
+def decimated(
+    vertices: np.ndarray, faces: np.ndarray, count: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """The same surface of about so many triangles, or as it is if it has no more."""
+    if len(faces) <= count:
+        return vertices, np.asarray(faces, dtype=np.int64)
+    from fast_simplification import simplify
+
+    scale = 1e3  # its tolerances suit coordinates of order one
+    points, fewer = simplify(
+        (vertices * scale).astype(np.float32),
+        faces.astype(np.int32),
+        target_count=count,
+    )
+    return merged(points.astype(np.float64) / scale, fewer.astype(np.int64))
 
 
 def border_loops(faces: np.ndarray) -> list[np.ndarray]:

@@ -14,7 +14,7 @@ from scipy.spatial import cKDTree
 from cathsim_dmc.anatomy.centreline import Centreline, Vessel, VesselTree
 from cathsim_dmc.anatomy.scan.centring import STEP, centred, resample
 from cathsim_dmc.anatomy.scan.ways import Ways
-from cathsim_dmc.anatomy.wall.depth import DepthField
+from cathsim_dmc.anatomy.surface_depth import SurfaceDepth
 
 TAIL = 15e-3  # m, end of a centreline that is cut off where it is too narrow
 TAIL_RADIUS = 1.1e-3  # m, of a 6 Fr device (1.0 mm) and a tenth to spare
@@ -25,7 +25,7 @@ MIN_RADIUS = 0.1e-3  # m, floor of a centreline's radius where it scrapes the wa
 
 
 def grow_tree(
-    field: DepthField,
+    field: SurfaceDepth,
     ways: Ways,
     curves: dict[str, np.ndarray],
     inlet: np.ndarray,
@@ -82,12 +82,12 @@ def grow_tree(
     return VesselTree(ordered)
 
 
-def _bulk(field: DepthField, curve: np.ndarray) -> float:
+def _bulk(field: SurfaceDepth, curve: np.ndarray) -> float:
     """Length times mean depth: the larger of two branches becomes the parent."""
     return float(np.maximum(field(curve), 0.0).sum())
 
 
-def _separation(curve: np.ndarray, other: np.ndarray, field: DepthField) -> int:
+def _separation(curve: np.ndarray, other: np.ndarray, field: SurfaceDepth) -> int:
     """Index of the last point of ``curve`` before it leaves ``other`` for good."""
     distance, nearest = cKDTree(other).query(curve)
     apart = distance > np.maximum(0.4 * field(curve), 1e-3)
@@ -130,7 +130,7 @@ def _parent(curve, lines, vessels, field) -> tuple[str, int]:
     return key, at[key]
 
 
-def _shared_beginning(curves: list[np.ndarray], field: DepthField) -> np.ndarray:
+def _shared_beginning(curves: list[np.ndarray], field: SurfaceDepth) -> np.ndarray:
     """Part that the first curve shares with any other, or 60 % of it if alone."""
     longest = max(curves, key=lambda curve: _bulk(field, curve))
     others = [curve for curve in curves if curve is not longest]
@@ -140,7 +140,7 @@ def _shared_beginning(curves: list[np.ndarray], field: DepthField) -> np.ndarray
     return longest[: max(4, shared + 1)]
 
 
-def _deep_start(curve: np.ndarray, field: DepthField) -> np.ndarray:
+def _deep_start(curve: np.ndarray, field: SurfaceDepth) -> np.ndarray:
     """Cut the beginning up to where the lumen has its full width."""
     depth = field(curve)
     head = depth[: max(2, len(curve) // 3)]
@@ -149,7 +149,7 @@ def _deep_start(curve: np.ndarray, field: DepthField) -> np.ndarray:
 
 
 def _finish(
-    field: DepthField, curve: np.ndarray, anchor: np.ndarray | None
+    field: SurfaceDepth, curve: np.ndarray, anchor: np.ndarray | None
 ) -> Centreline:
     """Centre a curve in the lumen and measure its radii."""
     # Towards a blind end the depth tells the distance to the end, not the middle.

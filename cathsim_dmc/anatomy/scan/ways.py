@@ -7,8 +7,9 @@ from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import connected_components, dijkstra
 from scipy.spatial import cKDTree
 
+from cathsim_dmc.anatomy import lattice
 from cathsim_dmc.anatomy.scan.centring import resample
-from cathsim_dmc.anatomy.wall.depth import DepthField
+from cathsim_dmc.anatomy.surface_depth import SurfaceDepth
 
 LATTICE = 1e-3  # m, spacing of the lattice on which ways are searched
 CORRIDOR = 2e-3  # m, distance from a drawn curve at which a way costs twice
@@ -31,9 +32,12 @@ class Ways:
         pinches: (k, 3) m, where pieces were joined through a narrow place.
     """
 
-    def __init__(self, field: DepthField, spacing: float = LATTICE):
-        """Build the lattice graph of ``field`` (26 neighbours)."""
-        ijk, points, depth = field.lattice(spacing, SHALLOW)
+    def __init__(self, field: SurfaceDepth, spacing: float = LATTICE):
+        """Build the lattice graph of a depth ``field`` (26 neighbours)."""
+        low, high = field.box
+        size = np.ceil((high - low) / spacing).astype(int) + 1
+        ijk, depth = lattice.inside(field, low, size, spacing, SHALLOW)
+        points = low + spacing * ijk
         shape = tuple((ijk.max(axis=0) + 3).tolist())
         key = np.asarray(np.ravel_multi_index(tuple((ijk + 1).T), shape))
         order = np.argsort(key)
@@ -51,6 +55,8 @@ class Ways:
         self._rows, self._cols = np.concatenate(rows), np.concatenate(cols)
         self._lengths = np.concatenate(lengths)
         self._pattern: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None
+        self._reach: dict[int, np.ndarray] = {}
+        self._before: dict[int, np.ndarray] = {}
         self.pinches = np.empty((0, 3))
         self._join(field)
         label = self._pieces()
@@ -61,7 +67,7 @@ class Ways:
     def _pieces(self) -> np.ndarray:
         return connected_components(self._graph(self._lengths), directed=False)[1]
 
-    def _join(self, field: DepthField) -> None:
+    def _join(self, field: SurfaceDepth) -> None:
         """Connect pieces of the lattice through places narrower than its cells."""
         label = self._pieces()
         sizes = np.bincount(label)
@@ -177,8 +183,10 @@ class Ways:
 
     def lengths_from(self, node: int) -> np.ndarray:
         """Length (n,) m of the shortest way from ``node`` to every point."""
-        graph = self._graph(self._lengths)
-        return dijkstra(graph, directed=False, indices=node)
+        if node not in self._reach:
+            graph = self._graph(self._lengths)
+            self._reach[node] = dijkstra(graph, directed=False, indices=node)
+        return self._reach[node]
 
     def deepest_from(self, node: int) -> np.ndarray:
         """Predecessors (n,) on the deepest ways from ``node``.
@@ -187,12 +195,13 @@ class Ways:
         does (Poiseuille): a way keeps to the middle, and in a ring of vessels it
         takes the artery, not the thin communicating one.
         """
-        depth = 0.5 * (self.depth[self._rows] + self.depth[self._cols])
-        graph = self._graph(self._lengths * (LATTICE / depth) ** 4)
-        _, before = dijkstra(
-            graph, directed=False, indices=node, return_predecessors=True
-        )
-        return before
+        if node not in self._before:
+            depth = 0.5 * (self.depth[self._rows] + self.depth[self._cols])
+            graph = self._graph(self._lengths * (LATTICE / depth) ** 4)
+            _, self._before[node] = dijkstra(
+                graph, directed=False, indices=node, return_predecessors=True
+            )
+        return self._before[node]
 
     def along(self, curve: np.ndarray, name: str) -> np.ndarray:
         """Deepest way (m, 3) near ``curve`` (n, 3) m, from its start to its end.

@@ -15,7 +15,7 @@ import math
 import numpy as np
 
 from cathsim_dmc.anatomy.centreline import Array, Centreline, VesselTree
-from cathsim_dmc.anatomy.parts import End
+from cathsim_dmc.anatomy.parts import INLET_HOLE_RADIUS, End
 from cathsim_dmc.anatomy.tube import (
     THICKNESS,
     TOLERANCE,
@@ -26,9 +26,6 @@ from cathsim_dmc.anatomy.tube import (
 )
 from cathsim_dmc.anatomy.wall.polytope import clip, clip_all, volume_and_width
 
-# Radius of the hole in the inlet cap, m. The front of the introducer sheath covers
-# it; its rim stays clear of the device, which the bore of the sheath guides.
-INLET_HOLE_RADIUS = 2.5e-3
 # A branch has sectors enough for this share of its radius at the flared start.
 _START_SHARE = 0.85
 # A run of slabs may form one piece while the vessel bends less than this, rad.

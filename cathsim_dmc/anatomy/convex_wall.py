@@ -1,4 +1,4 @@
-"""Convex wall pieces around the lumen of a scan.
+"""Convex pieces around a lumen, for engines that collide nothing but convex shapes.
 
 Every triangle of the lumen surface carries a prism that reaches outwards along the
 vertex normals; neighbours share their side faces, so nothing can pass between two of
@@ -12,92 +12,59 @@ from __future__ import annotations
 
 import heapq
 import itertools
-from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.spatial import ConvexHull, QhullError, cKDTree
 
-from cathsim_dmc.anatomy.parts import Inlet
-from cathsim_dmc.anatomy.wall.depth import DepthField
-from cathsim_dmc.anatomy.wall.pieces import INLET_HOLE_RADIUS
+from cathsim_dmc.anatomy.anatomy import Anatomy
+from cathsim_dmc.anatomy.parts import INLET_HOLE_RADIUS, Inlet
+from cathsim_dmc.anatomy.scan.extract import DEVICE_RADIUS
+from cathsim_dmc.anatomy.scan.inlet import cut_open
+from cathsim_dmc.anatomy.scan.topology import adjacent, decimated
 
+TRIANGLES = 5_000  # of the surface that carries prisms; others are decimated
 THICKNESS = 4e-3  # m, of the wall where no other lumen is near
 THINNEST = 0.3e-3  # m, of the wall between two lumens
 TOLERANCE = 0.65e-3  # m, largest chord inside the lumen before moving outwards
 CHORD = 0.4e-3  # m, largest chord after it; pieces above are split again
 MOVE = 0.3e-3  # m, largest outward movement of a vertex
-FLAT = 0.02e-3  # m, triangles this close to one plane merge without asking
 EXTENT = 40e-3  # m, largest piece; longer ones slow the broad phase
-DEVICE_RADIUS = 0.84e-3  # m, 5 Fr catheter (1 Fr = 1/3 mm diameter)
-CLEARANCE = 0.1e-3  # m, kept between that device on the centreline and a merged hull
+CLEARANCE = 0.1e-3  # m, kept between a 5 Fr device on the centreline and a merged hull
 CAP_OVERLAP = 2e-3  # m, of the inlet's cap under the wall around it
 CAPS = (1.0, 0.5, 0.25, 0.1)  # shares of the thickness tried for a lone triangle
+BORE_THICKNESS = 1e-3  # m, of the pieces around a bore
+_SECTORS = 12  # of a bore
 _ORDER = 6  # subdivision of a hull's triangles where its depth is sampled
+_BEHIND = 0.05e-3  # m, of the surface that is cut off ahead of the inlet's flat cap
 
 
-@dataclass(frozen=True)
-class WallReport:
-    """How the wall came about: counts and the intrusion seen while building (m)."""
+def wall_pieces(anatomy: Anatomy) -> tuple[np.ndarray, ...]:
+    """Vertices (n_i, 3) m of convex pieces around the lumen; takes seconds.
 
-    triangles: int
-    pieces: int
-    worst: float
-    moved: float
-
-
-def build_wall(
-    vertices: np.ndarray,
-    faces: np.ndarray,
-    field: DepthField,
-    centres: np.ndarray,
-    *,
-    tolerance: float = TOLERANCE,
-    thickness: float = THICKNESS,
-    move: float = MOVE,
-    progress: Callable[[str], None] | None = None,
-) -> tuple[tuple[np.ndarray, ...], WallReport]:
-    """Convex pieces that surround a lumen.
-
-    Args:
-        vertices: (V, 3) m.
-        faces: (F, 3) int, normals out of the lumen; open where the device enters.
-        field: depth of the lumen.
-        centres: (n, 3) m, places a device must be able to pass.
-        tolerance: m, how far the hull of a merged piece may cut into the lumen.
-        thickness: m, of the wall.
-        move: m, largest outward movement of the inner vertices.
-        progress: called with a line of text now and then.
-
-    Returns:
-        (vertices of each convex piece (n_i, 3) m, report).
+    The pieces lie outside the lumen but for chords of some tenths of a millimetre. The
+    inlet is closed but for a hole of `INLET_HOLE_RADIUS`.
     """
-    say = progress or (lambda text: None)
-    builder = _Builder(vertices, faces, field, centres, thickness)
-    patches = _flat_patches(builder.vertices, builder.faces, EXTENT)
-    say(f"wall: {len(faces)} triangles in {len(patches)} flat patches")
-    pieces = builder.merge(patches, tolerance, say)
+    inlet, surface = anatomy.inlet, anatomy.surface
+    vertices, faces = decimated(surface.vertices, surface.faces, TRIANGLES)
+    at = inlet.position + _BEHIND * inlet.direction
+    points, shell, cap = cut_open(vertices, faces, replace(inlet, position=at))
+    lines = [vessel.centreline for vessel in anatomy.tree.vessels.values()]
+    builder = _Builder(points, shell, anatomy.lumen, [line.points for line in lines])
+    tolerance = TOLERANCE
+    pieces = builder.merge(range(len(shell)), tolerance)
     for _ in range(5):
-        builder.shift = builder.relax(pieces, move)
-        after = [builder.after(piece) for piece in pieces]
-        bad = [
-            piece
-            for piece, cost in zip(pieces, after, strict=True)
-            if cost > CHORD and len(piece.faces) > 1
-        ]
+        builder.relax(pieces)
+        bad = [each for each in pieces if len(each.faces) > 1 and builder.after(each)]
         if not bad:
             break
         # Where moving outwards did not help, merge again more carefully.
         tolerance *= 0.6
-        good = [piece for piece in pieces if not any(piece is other for other in bad)]
-        split = [[face] for piece in bad for face in piece.faces]
-        say(f"wall: {len(bad)} pieces cut too deep; merged again")
-        pieces = good + builder.merge(split, tolerance, say)
-    hulls, worst = builder.hulls(pieces), max(after, default=0.0)
-    moved = float(builder.shift.max(initial=0.0))
-    report = WallReport(len(faces), len(hulls), worst, moved)
-    say(f"wall: {report.pieces} pieces, chords up to {worst * 1e3:.2f} mm")
-    return hulls, report
+        kept = [each for each in pieces if all(each is not other for other in bad)]
+        pieces = kept + builder.merge(
+            [f for each in bad for f in each.faces], tolerance
+        )
+    return (*builder.hulls(pieces), *_inlet_cap(points[cap[:, :2]], inlet))
 
 
 @dataclass
@@ -109,17 +76,15 @@ class _Piece:
 
 
 class _Builder:
-    def __init__(self, vertices, faces, field, centres, thickness):
-        self.vertices = np.asarray(vertices, dtype=np.float64)
-        self.faces = np.asarray(faces)
-        self.field = field
-        self.normals = outward_normals(self.vertices, self.faces)
-        self.reach = free_thickness(field, self.vertices, self.normals, thickness)
-        self.shift = np.zeros(len(self.vertices))
-        self._centres = centres
-        depth = field(centres) if len(centres) else np.zeros(0)
+    def __init__(self, vertices, faces, field, lines):
+        self.vertices, self.faces, self.field = vertices, faces, field
+        self.normals = _outward_normals(vertices, faces)
+        self.reach = _free_thickness(field, vertices, self.normals)
+        self.shift = np.zeros(len(vertices))
+        self._centres = np.concatenate(lines)
+        depth = field(self._centres)
         self._required = np.minimum(DEVICE_RADIUS + CLEARANCE, 0.8 * depth)
-        self._near = cKDTree(centres) if len(centres) else None
+        self._near = cKDTree(self._centres)
         self._pattern = _barycentric(_ORDER)
 
     def corners(self, ids, cap):
@@ -144,7 +109,7 @@ class _Builder:
         corners = points[hull.simplices]
         samples = np.einsum("pk,nkd->npd", self._pattern, corners).reshape(-1, 3)
         cost = float(self.field(samples).max())
-        if cost <= limit < np.inf and self._near is not None:
+        if cost <= limit < np.inf:
             middle = 0.5 * (low + high)
             radius = 0.5 * np.linalg.norm(high - low) + 1.5e-3
             close = self._near.query_ball_point(middle, radius)
@@ -157,39 +122,28 @@ class _Builder:
                     return np.inf, ids
         return cost, ids[np.unique(hull.vertices % len(ids))]
 
-    def lone(self, faces):
-        """A piece over one patch, as thick as its surroundings allow."""
-        every = np.unique(self.faces[faces])
+    def lone(self, face):
+        """A piece over one triangle, as thick as its surroundings allow."""
         best = None
         for cap in CAPS:
-            cost, ids = self.measure(every, cap, np.inf)
+            cost, ids = self.measure(np.unique(self.faces[face]), cap, np.inf)
             if best is None or cost < best.cost - 1e-6:
-                best = _Piece(list(faces), ids, cap, cost)
+                best = _Piece([face], ids, cap, cost)
             if cost <= 0.05e-3:
                 break
         assert best is not None  # there are CAPS
         return best
 
-    def merge(self, patches, tolerance, say):
-        """Merge pieces greedily, the pair whose hull cuts the least first."""
+    def merge(self, faces, tolerance):
+        """Merge triangles greedily, the pair whose hull cuts the least first."""
         self.shift = np.zeros(len(self.vertices))
-        pieces = {}
-        for index, patch in enumerate(patches):
-            piece = self.lone(patch)
-            if piece.cost > tolerance and len(patch) > 1:
-                for face in patch:
-                    pieces[len(patches) + face] = self.lone([face])
-            else:
-                pieces[index] = piece
-        owner = np.full(len(self.faces), -1, dtype=np.int64)
-        for key, piece in pieces.items():
-            owner[piece.faces] = key
+        pieces = {face: self.lone(face) for face in faces}
         neighbours = {key: set() for key in pieces}
-        for a, b in adjacent_faces(self.faces):
-            if owner[a] != owner[b] and min(owner[a], owner[b]) >= 0:
-                neighbours[owner[a]].add(owner[b])
-                neighbours[owner[b]].add(owner[a])
-        fresh = itertools.count(len(patches) + len(self.faces))
+        for a, b in adjacent(self.faces).tolist():
+            if a in pieces and b in pieces:
+                neighbours[a].add(b)
+                neighbours[b].add(a)
+        fresh = itertools.count(len(self.faces))
         heap = []
 
         def propose(a, b):
@@ -204,7 +158,6 @@ class _Builder:
             for b in neighbours[a]:
                 if a < b:
                     propose(a, b)
-        say(f"wall: {len(pieces)} pieces, {len(heap)} pairs can merge")
         while heap:
             cost, a, b, cap, ids = heapq.heappop(heap)
             if a not in pieces or b not in pieces:
@@ -220,38 +173,33 @@ class _Builder:
                 propose(key, other)
         return list(pieces.values())
 
-    def relax(self, pieces, move):
-        """Outward movement (V,) m: half of the chords around every vertex."""
+    def relax(self, pieces):
+        """Move vertices outwards by half of the chords around them."""
         shift = np.zeros(len(self.vertices))
         for piece in pieces:
             ids = np.unique(self.faces[piece.faces])
             shift[ids] = np.maximum(shift[ids], 0.5 * max(piece.cost, 0.0))
         # Between two lumens there is no room to move into.
-        return np.minimum(np.minimum(shift, move), 0.5 * self.reach)
+        self.shift = np.minimum(np.minimum(shift, MOVE), 0.5 * self.reach)
 
     def after(self, piece):
-        """Deepest point (m) of a piece's hull in the lumen after the movement."""
-        return self.measure(np.unique(self.faces[piece.faces]), piece.cap, np.inf)[0]
+        """Whether a piece's hull cuts too deep after the movement."""
+        ids = np.unique(self.faces[piece.faces])
+        return self.measure(ids, piece.cap, np.inf)[0] > CHORD
 
     def hulls(self, pieces):
         """Hull vertices (n, 3) m of every piece after the movement."""
-        hulls = []
         for piece in pieces:
-            every = np.unique(self.faces[piece.faces])
-            points = self.corners(every, piece.cap)
-            hulls.append(points[ConvexHull(points).vertices])
-        return tuple(hulls)
+            points = self.corners(np.unique(self.faces[piece.faces]), piece.cap)
+            yield points[ConvexHull(points).vertices]
 
 
-def inlet_cap(
-    border: np.ndarray, inlet: Inlet, thickness: float = THICKNESS
-) -> list[np.ndarray]:
+def _inlet_cap(border: np.ndarray, inlet: Inlet) -> list[np.ndarray]:
     """Convex sectors that close the cut at the inlet but for the sheath's hole.
 
     Args:
         border: (n, 2, 3) m, edges of the cut through the lumen.
         inlet: the plane of the cut and the middle of the hole.
-        thickness: m, of the cap, which lies behind the plane.
     """
     # A chord between two spokes cuts into the hole less than this at 12 sectors.
     hole = INLET_HOLE_RADIUS / np.cos(np.pi / 12)
@@ -265,11 +213,11 @@ def inlet_cap(
         face = inlet.position + np.concatenate(
             [hole * spoke, np.maximum(far, hole) * spoke + CAP_OVERLAP * spoke]
         )
-        sectors.append(np.concatenate([face, face - thickness * inlet.direction]))
+        sectors.append(np.concatenate([face, face - THICKNESS * inlet.direction]))
     return sectors
 
 
-def outward_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+def _outward_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     """Unit normals (V, 3) that lean outwards from all triangles around a vertex.
 
     The angle-weighted mean can point into one of the triangles where the surface
@@ -300,11 +248,11 @@ def outward_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     return normals
 
 
-def free_thickness(field, vertices, normals, thickness):
+def _free_thickness(field, vertices, normals):
     """How far (V,) m each vertex can move out before another lumen comes near."""
     reach = np.full(len(vertices), THINNEST)
     going = np.ones(len(vertices), dtype=bool)
-    for s in np.arange(0.4e-3, thickness + 1e-9, 0.2e-3):
+    for s in np.arange(0.4e-3, THICKNESS + 1e-9, 0.2e-3):
         outside = -field(vertices + s * normals)
         going &= outside > 0.35 * s
         reach[going] = s
@@ -320,45 +268,28 @@ def _barycentric(order: int) -> np.ndarray:
     return weights
 
 
-def adjacent_faces(faces: np.ndarray) -> np.ndarray:
-    """Pairs (n, 2) of triangles that share an edge."""
-    edges = np.sort(faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
-    owner = np.repeat(np.arange(len(faces)), 3)
-    order = np.lexsort((edges[:, 1], edges[:, 0]))
-    edges, owner = edges[order], owner[order]
-    same = (edges[1:] == edges[:-1]).all(axis=1)
-    return np.stack([owner[:-1][same], owner[1:][same]], -1)
+def bore_pieces(points: np.ndarray, radii: np.ndarray) -> list[np.ndarray]:
+    """Convex sectors (8, 3) m around a round bore that is open at both ends.
 
-
-def _flat_patches(vertices, faces, extent) -> list[list[int]]:
-    """Triangles grouped where they lie in one plane: a fine scan has many such."""
-    corners = vertices[faces]
-    cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    area = np.linalg.norm(cross, axis=1)
-    normal = cross / np.maximum(area, 1e-30)[:, None]
-    neighbours: list[list[int]] = [[] for _ in range(len(faces))]
-    for a, b in adjacent_faces(faces):
-        neighbours[a].append(int(b))
-        neighbours[b].append(int(a))
-    patch = np.full(len(faces), -1)
-    patches = []
-    for seed in np.argsort(-area):
-        if patch[seed] >= 0:
-            continue
-        origin, axis = corners[seed].mean(0), normal[seed]
-        group, queue = [int(seed)], [int(seed)]
-        patch[seed] = len(patches)
-        while queue:
-            for other in neighbours[queue.pop()]:
-                if patch[other] >= 0 or normal[other] @ axis < 0.95:
-                    continue
-                away = corners[other] - origin
-                if np.abs(away @ axis).max() > FLAT:
-                    continue
-                if np.linalg.norm(away, axis=1).max() > 0.25 * extent:
-                    continue
-                patch[other] = len(patches)
-                group.append(other)
-                queue.append(other)
-        patches.append(group)
-    return patches
+    Args:
+        points: (n, 3) m, of its axis.
+        radii: (n,) m.
+    """
+    steps = np.diff(points, axis=0)
+    along = np.concatenate([steps[:1], steps[:-1] + steps[1:], steps[-1:]])
+    along /= np.linalg.norm(along, axis=1, keepdims=True)
+    u = np.zeros_like(along)
+    u[0] = np.cross(along[0], np.eye(3)[np.abs(along[0]).argmin()])
+    for i, tangent in enumerate(along):
+        u[i] = u[max(i - 1, 0)] - (u[max(i - 1, 0)] @ tangent) * tangent
+        u[i] /= np.linalg.norm(u[i])
+    v = np.cross(along, u)
+    angle = 2.0 * np.pi * np.arange(_SECTORS)[:, None, None] / _SECTORS
+    spokes = (np.cos(angle) * u + np.sin(angle) * v) / np.cos(np.pi / _SECTORS)
+    rings = [points + (radii + t)[:, None] * spokes for t in (0.0, BORE_THICKNESS)]
+    corners = np.stack(rings, axis=2)
+    return [
+        corners[[k, k - 1], i : i + 2].reshape(-1, 3)
+        for k in range(_SECTORS)
+        for i in range(len(steps))
+    ]

@@ -1,0 +1,140 @@
+"""An anatomy as MJCF with convex wall pieces, and how well they stand for its lumen."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial import ConvexHull, cKDTree
+
+from cathsim_dmc import files
+from cathsim_dmc.anatomy.anatomy import Anatomy
+from cathsim_dmc.anatomy.convex_wall import wall_pieces
+from cathsim_dmc.anatomy.scan.extract import DEVICE_RADIUS
+
+_SPACING = 1.5e-3  # m, between places of the wall that are looked at
+# Levels (m) along the normal at which pieces are looked for, > 0 in the lumen.
+_LEVELS = np.arange(-1.5e-3, 1.5e-3, 0.05e-3)
+_GRAZE = 0.05e-3  # m, by which a piece may touch a 5 Fr catheter on a centreline
+_OFF = 0.3e-3  # m; farther from the wall a place of the surface is on an open end
+
+
+@dataclass(frozen=True)
+class Fidelity:
+    """How well convex pieces stand for a lumen.
+
+    Attributes:
+        intrusion: mean, 95th percentile and maximum of how far the pieces stand in the
+            lumen, m, over places all over its wall; 0 where they do not.
+        recession: the same of how far they stay behind the wall.
+        places: number of places.
+        open: number of them where no piece is met within 1.5 mm behind the wall.
+        blocked: vessels whose centreline the pieces close to a 5 Fr catheter.
+    """
+
+    intrusion: tuple[float, float, float]
+    recession: tuple[float, float, float]
+    places: int
+    open: int
+    blocked: tuple[str, ...]
+
+
+def fidelity(anatomy: Anatomy, pieces: Sequence[np.ndarray]) -> Fidelity:
+    """Measures convex pieces (n_i, 3) m against the lumen of an anatomy."""
+    planes = [ConvexHull(1e3 * piece).equations * (1, 1, 1, 1e-3) for piece in pieces]
+    points, inward = _wall_places(anatomy)
+    lines = points[:, None] + _LEVELS[:, None] * inward[:, None]
+    met = np.zeros(lines.shape[:2], dtype=bool)
+    near = cKDTree(points)
+    for piece, plane in zip(pieces, planes, strict=True):
+        middle = piece.mean(axis=0)
+        reach = np.linalg.norm(piece - middle, axis=1).max() - _LEVELS[0]
+        rows = near.query_ball_point(middle, reach)
+        height = lines[rows] @ plane[:, :3].T + plane[:, 3]
+        met[rows] |= (height < 1e-6).all(axis=-1)
+    inside = np.where(met, _LEVELS, 0.0).max(axis=1).clip(0.0)
+    behind = np.where(met, -_LEVELS, np.inf).min(axis=1).clip(0.0)
+    closed = np.isfinite(behind)
+    blocked = []
+    for name, vessel in anatomy.tree.vessels.items():
+        line = vessel.centreline
+        margin = 1.5 * DEVICE_RADIUS
+        s = np.arange(margin, max(line.length - margin, 1.1 * margin), 1e-3)
+        place = line.at(s).position
+        free = np.minimum(DEVICE_RADIUS, 0.8 * anatomy.depth(place)) - _GRAZE
+        if any(
+            ((place @ plane[:, :3].T + plane[:, 3]).max(axis=1) < free).any()
+            for plane in planes
+        ):
+            blocked.append(name)
+    return Fidelity(
+        _summary(inside),
+        _summary(behind[closed]),
+        len(points),
+        int((~closed).sum()),
+        tuple(blocked),
+    )
+
+
+def _wall_places(anatomy: Anatomy) -> tuple[np.ndarray, np.ndarray]:
+    """Places (n, 3) m all over the wall, and unit normals (n, 3) into the lumen."""
+    rng = np.random.default_rng(0)
+    corners = anatomy.surface.vertices[anatomy.surface.faces]
+    cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    area = 0.5 * np.linalg.norm(cross, axis=1)
+    count = round(area.sum() / _SPACING**2)
+    face = rng.choice(len(area), count, p=area / area.sum())
+    share = rng.dirichlet(np.ones(3), count)
+    points = np.einsum("nk,nkd->nd", share, corners[face])
+    depth, inward = anatomy.depth(points), anatomy.lumen.gradient(points)
+    inward /= np.maximum(np.linalg.norm(inward, axis=1, keepdims=True), 1e-9)
+    wall = np.abs(depth) < _OFF
+    for end in anatomy.ends:
+        beyond = (points - end.position) @ end.direction > -_SPACING
+        near = np.linalg.norm(points - end.position, axis=1) < 3.0 * end.radius
+        wall &= ~(end.open & beyond & near)
+    return (points - depth[:, None] * inward)[wall], inward[wall]
+
+
+def _summary(values: np.ndarray) -> tuple[float, float, float]:
+    p95 = np.percentile(values, 95)
+    return float(values.mean()), float(p95), float(values.max())
+
+
+def write_mjcf(anatomy: Anatomy, path: str | os.PathLike[str]) -> tuple[int, Fidelity]:
+    """Write an anatomy as a model of convex geoms, with a site at the inlet and goals.
+
+    Args:
+        anatomy: what to write.
+        path: of the file, which must end in .xml; lengths in it are metres.
+
+    Returns:
+        How many pieces there are, and how well they stand for the lumen.
+
+    Raises:
+        ValueError: if the file name has another ending.
+    """
+    import mujoco
+
+    path = Path(path)
+    if path.suffix != ".xml":
+        raise ValueError(f"the file name must end in .xml, got {path.name!r}.")
+    pieces = wall_pieces(anatomy)
+    spec = mujoco.MjSpec()
+    spec.modelname = anatomy.name
+    for index, piece in enumerate(pieces):
+        name = f"wall_{index:04d}"
+        mesh = spec.add_mesh(name=name, uservert=piece.ravel().tolist())
+        mesh.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL
+        spec.worldbody.add_geom(
+            name=name, type=mujoco.mjtGeom.mjGEOM_MESH, meshname=name
+        )
+    places = {"inlet": anatomy.inlet, **anatomy.goals}
+    for name, place in places.items():
+        spec.worldbody.add_site(name=name, pos=place.position.tolist())
+    spec.compile()
+    files.write_text(path, spec.to_xml())
+    return len(pieces), fidelity(anatomy, pieces)

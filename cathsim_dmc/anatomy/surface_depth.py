@@ -1,0 +1,123 @@
+"""Distances to a triangulated surface, by libigl."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from scipy.sparse import coo_array
+
+from cathsim_dmc.anatomy.field import MARGIN
+from cathsim_dmc.anatomy.parts import End, Surface
+from cathsim_dmc.anatomy.segments import Array
+
+# Cosines: of normals of neighbours, and up to which a normal tells inside from outside.
+_SMOOTH, _BEFORE = 0.5, 0.9
+_CAP = 1e-6  # m, within which a triangle lies in the plane of an open end
+_SAME = 1e-6  # m; points nearer to each other than this are one
+_TOUCH = 1e-6  # share of an edge or a triangle that counts as its border
+
+
+class SurfaceDepth:
+    """Distance to a closed surface, inside and outside of it."""
+
+    def __init__(self, surface: Surface, ends: Sequence[End] = ()):
+        """Prepares for a surface, normals outwards; open ends of it are no wall."""
+        import igl
+
+        faces = np.ascontiguousarray(surface.faces, dtype=np.int64)
+        vertices = np.ascontiguousarray(surface.vertices)
+        self._free = [end for end in ends if end.open]
+        cap = np.zeros(len(faces), dtype=bool)
+        for end in self._free:
+            level = np.abs((vertices - end.position) @ end.direction)
+            cap |= (level[faces] < _CAP).all(axis=1)
+        self._vertices, self._wall = vertices, faces[~cap]
+        self._boxes = igl.AABB()
+        self._boxes.init(vertices, self._wall)
+        self._winding = igl.FastWindingNumberBVH()
+        self._winding.init(vertices, faces, 2)
+        corners = vertices[self._wall]
+        normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        sizes = np.linalg.norm(normals, axis=1, keepdims=True)
+        self._normals = normals / np.maximum(sizes, 1e-300)
+        self._sharp = self._turns()
+
+    def __call__(self, points: Array) -> Array:
+        """Signed distances (...) m at points (..., 3) m, > 0 inside."""
+        shape = np.shape(points)[:-1]
+        points = np.ascontiguousarray(np.reshape(points, (-1, 3)), dtype=np.float64)
+        squared, face, place = self._boxes.squared_distance(
+            self._vertices, self._wall, points
+        )
+        distance = np.sqrt(squared)
+        # The normal of a triangle says on which side a point lies, unless the surface
+        # turns sharply there; then, and at an open end, the winding number does.
+        level = np.vecdot(place - points, self._normals[face])
+        depth = np.copysign(distance, level)
+        doubtful = self._sharp[face] & (np.abs(level) < _BEFORE * distance)
+        # Beyond an open end the lumen goes on as a straight tube.
+        moved = points.copy()
+        for end in self._free:
+            offset = points - end.position
+            level = offset @ end.direction
+            across = np.linalg.norm(offset - level[:, None] * end.direction, axis=1)
+            beyond = (level > -_CAP) & (across < 2.0 * end.radius)
+            beyond &= level < 5.0 * MARGIN
+            moved[beyond] -= (level[beyond] + 2.0 * _CAP)[:, None] * end.direction
+            doubtful |= beyond
+        if doubtful.any():
+            winding = self._winding.winding_number(moved[doubtful], 2.0)
+            sign = np.where(winding > 0.5, 1.0, -1.0)
+            depth[doubtful] = sign * distance[doubtful]
+        return depth.reshape(shape)
+
+    def _turns(self) -> np.ndarray:
+        """Triangles (F,) with a neighbour, at a corner, whose normal turns sharply."""
+        count = len(self._wall)
+        rows = np.repeat(np.arange(count), 3)
+        shape = (count, len(self._vertices))
+        at = coo_array((np.ones(3 * count), (rows, self._wall.ravel())), shape).tocsr()
+        one, other = (at @ at.T).nonzero()
+        sharp = np.vecdot(self._normals[one], self._normals[other]) < _SMOOTH
+        return np.bincount(one, sharp, count) > 0
+
+    @property
+    def box(self) -> tuple[Array, Array]:
+        """Corners (3,), (3,) of a box around the surface, m."""
+        return self._vertices.min(axis=0), self._vertices.max(axis=0)
+
+    def around(self, blocks: Array, points: Array) -> Array:
+        """Signed distances (n, m) m at blocks (n, 3) + points (m, 3) m, > 0 inside."""
+        every = np.asarray(blocks)[:, None] + points
+        # Lattices of neighbouring blocks share their faces.
+        cell = np.rint((every - every.min(axis=(0, 1))) / _SAME).astype(np.int64)
+        _, y, z = cell.max(axis=(0, 1)) + 1
+        key = (cell[..., 0] * y + cell[..., 1]) * z + cell[..., 2]
+        _, first, same = np.unique(key, return_index=True, return_inverse=True)
+        return self(every.reshape(-1, 3)[first])[same].reshape(every.shape[:-1])
+
+    def crossings(self) -> tuple[np.ndarray, np.ndarray]:
+        """Faces that an edge of another face pierces, and those edges' vertices.
+
+        Returns:
+            (faces (n,), edges (n, 2)), one pair for every crossing.
+        """
+        import igl
+
+        sides = self._wall[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
+        edges = np.unique(np.sort(sides, axis=1), axis=0)
+        vertices = 1e3 * self._vertices  # its tolerances suit coordinates of order one
+        boxes = igl.AABB()
+        boxes.init(vertices, self._wall)
+        start, end = vertices[edges[:, 0]], vertices[edges[:, 1]]
+        hits = boxes.intersect_ray(vertices, self._wall, start, end - start)
+        found = [
+            (face, row)
+            for row, along in enumerate(hits)
+            for face, share, u, v in along
+            if _TOUCH < share < 1.0 - _TOUCH and min(u, v, 1.0 - u - v) > _TOUCH
+        ]
+        faces, rows = np.array(found, dtype=np.int64).reshape(-1, 2).T
+        own = (self._wall[faces][:, :, None] == edges[rows][:, None]).any(axis=(1, 2))
+        return faces[~own], edges[rows[~own]]
