@@ -171,20 +171,6 @@ class CArm:
         row = down * scale + 0.5 * (rows - 1)
         return np.stack([column, row], axis=-1), depth
 
-    def unproject(self, pixels: ArrayLike, depth: ArrayLike) -> np.ndarray:
-        """World points (..., 3) at `pixels` (..., 2) and `depth` (...) (m).
-
-        The inverse of `project`.
-        """
-        pixels = np.asarray(pixels, dtype=np.float64)
-        depth = np.asarray(depth, dtype=np.float64)[..., None]
-        rows, columns = self.resolution
-        centre = 0.5 * np.array([columns - 1, rows - 1])
-        plane = (pixels - centre) / self.focal_length
-        right, down, beam = self.axes
-        direction = plane[..., :1] * right + plane[..., 1:] * down + beam
-        return self.source + depth * direction
-
     def slant(self, supersample: int = 1) -> np.ndarray:
         """Path along each ray per unit of depth, 1 / cos of its angle to the axis.
 
