@@ -1,7 +1,5 @@
 """Control steps that are done again with shorter physics steps."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 from conftest import twin
@@ -10,37 +8,6 @@ from cathsim_dmc import suite
 from cathsim_dmc.physics import forces
 from cathsim_dmc.physics.stepper import Stepper
 from cathsim_dmc.simulation.batch import BatchSimulation, _BatchStepper
-from cathsim_dmc.tasks import physics_errors
-
-# The last ten control steps of an episode of random actions: the device snaps across
-# the aorta and is as deep in the wall as it is thick after one physics step of 4 ms.
-_SNAP = Path(__file__).with_name("data") / "snap_through.npz"
-
-
-def _snap(environment):
-    """Wall forces, N, of the recorded moment, and the error that ended it."""
-    _, start, actions = physics_errors.load(_SNAP)
-    environment.restore(start)
-    task, peaks = environment.task, []
-    for action in actions:
-        environment.step(action)
-        peaks.append(float(task.wall_force.peak_max))
-    assert environment.physics.timestep() == task.physics_timestep
-    return peaks, task.error
-
-
-def test_an_impact_is_no_error_of_physics(monkeypatch, tmp_path):
-    options = {"randomisation": True, "working_length": 0.34}
-    environment = suite.load("cathsim", "type1_lcca", options)
-    peaks, error = _snap(environment)
-    assert max(peaks) < 0.1
-    assert error is None
-    monkeypatch.setenv("CATHSIM_DUMP_DIR", str(tmp_path))
-    monkeypatch.setattr(forces, "HARDEST", np.inf)
-    monkeypatch.setattr(forces, "DEEPEST", np.inf)
-    peaks, error = _snap(environment)
-    assert peaks[-1] > physics_errors.MAX_FORCE
-    assert error == physics_errors.EXPLODED
 
 
 @pytest.mark.parametrize(

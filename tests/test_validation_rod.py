@@ -5,7 +5,7 @@ import pytest
 
 from cathsim_dmc.entities import devices
 from cathsim_dmc.entities.chain import MAX_ROTATION_SPEED
-from cathsim_dmc.validation import rod
+from cathsim_dmc.validation import drive, rod
 from cathsim_dmc.validation.rig import Rig
 
 
@@ -86,3 +86,20 @@ def test_settle_says_when_it_does_not():
 def test_rod_report_passes():
     report = rod.validate_rod()
     assert report.passed, report.failures
+
+
+def test_the_drive_holds_and_is_exact_until_its_clamp_slips():
+    """A dashpot of 100 N·s/m gave way by 30 mm a second."""
+    driven = drive.Driven()
+    assert abs(driven.move(1.0, 0.0, 3.0)) < 1e-5
+    driven.move(0.2, 1.0, 3.0)
+    assert driven.move(0.4, 1.0, 3.0) == pytest.approx(0.4 * 0.04, rel=0.01)
+    driven.move(0.2, 0.0, 4.9)
+    before = driven.drives.slipped[0, 0]
+    assert abs(driven.move(0.4, 0.0, 4.9)) < 1e-5
+    assert driven.drives.slipped[0, 0] == before
+    assert driven.move(0.4, 0.0, 5.1) < -1e-3
+    assert driven.drives.slipped[0, 0] > before + 1e-3
+    # What has slipped follows the next command at once.
+    driven.move(0.2, 0.0, 0.0)
+    assert driven.move(0.4, 0.5, 0.0) == pytest.approx(0.2 * 0.04, rel=0.05)

@@ -24,7 +24,10 @@ TORSION_ARMATURE = 1e-7
 CARRIAGE_MASS = 0.2  # kg, platform of the follower that pushes the device
 MAX_PUSH_FORCE = 5.0  # N, slip of the clamps
 MAX_PUSH_SPEED = 0.04  # m/s
-CARRIAGE_GAIN = 100.0  # N·s/m, stiff: 1 N of load costs 1 cm/s
+# Stiffness of the servo of the carriage, N/m. The largest force moves the carriage in a
+# time step of 4 ms by less than the servo's linear range, F/k = 0.5 mm, or the force
+# would jump from one limit to the other.
+CARRIAGE_STIFFNESS = 1e4
 
 # Damping ratio of the carriage on the spring at the base. The links are rigid; the
 # spring has the axial compliance of the whole device, L / EA. Without it a jam stops
@@ -32,13 +35,11 @@ CARRIAGE_GAIN = 100.0  # N·s/m, stiff: 1 N of load costs 1 cm/s
 COMPRESSION_DAMPING = 0.5
 COMPRESSION_ARMATURE = 1e-3  # kg, about the mass of the device
 
-# Inertia of the rotary unit, kg·m²: a 0.3 kg clamp of 2 cm. The limited torque then
-# changes the speed in a time step by less than the linear range of the servo (4 rad/s).
-# A rotor 100 times lighter oscillates between 0 and 80 rad/s.
-ROTOR_INERTIA = 1e-4
-MAX_TORQUE = 0.02  # N·m
+ROTOR_INERTIA = 1e-4  # kg·m², rotary unit: a 0.3 kg clamp of 2 cm
+MAX_TORQUE = 0.02  # N·m, slip of the clamps
 MAX_ROTATION_SPEED = 3.14  # rad/s
-ROTATION_GAIN = 0.01  # N·m·s/rad
+ROTATION_STIFFNESS = 0.4  # N·m/rad, of the servo
+SERVO_DAMPING = 1.0  # of the critical damping: the speed does not overshoot
 
 _VISIBLE_SHAFT = 0.45  # m, drawn behind the simulated part at full insertion
 COLOUR = (0.85, 0.32, 0.08, 1.0)
@@ -233,35 +234,30 @@ class Chain(composer.Entity):
         )
 
     def _build_motors(self):
-        self._insertion_motor = self._add_velocity_motor(
-            "insertion",
-            self._insertion,
-            CARRIAGE_GAIN,
-            MAX_PUSH_SPEED,
-            MAX_PUSH_FORCE,
+        self._insertion_motor = self._add_servo(
+            self._insertion, CARRIAGE_STIFFNESS, MAX_PUSH_SPEED, MAX_PUSH_FORCE
         )
         self._rotation_motor = None
         if self._rotation is not None:
-            self._rotation_motor = self._add_velocity_motor(
-                "rotation",
-                self._rotation,
-                ROTATION_GAIN,
-                MAX_ROTATION_SPEED,
-                MAX_TORQUE,
+            self._rotation_motor = self._add_servo(
+                self._rotation, ROTATION_STIFFNESS, MAX_ROTATION_SPEED, MAX_TORQUE
             )
 
-    def _add_velocity_motor(self, name, joint, gain, max_speed, max_effort):
+    def _add_servo(self, joint, stiffness, max_speed, max_effort):
+        """A servo on the integral of a speed, see `physics.drives`."""
+        damping = 2 * SERVO_DAMPING * (stiffness * joint.armature) ** 0.5
         return self._mjcf_root.actuator.add(
             "general",
-            name=name,
+            name=joint.name,
             joint=joint,
             ctrllimited=True,
             ctrlrange=(-1, 1),
             forcelimited=True,
             forcerange=(-max_effort, max_effort),
-            gainprm=[gain * max_speed],
+            dyntype="integrator",
+            gainprm=[stiffness * max_speed],
             biastype="affine",
-            biasprm=[0, 0, -gain],
+            biasprm=[0, -stiffness, -damping],
         )
 
     def _build_sensors(self):

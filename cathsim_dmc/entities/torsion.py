@@ -109,6 +109,25 @@ class Rods:
         """
         return self._loops.at_nodes(loads, gaps, self._nodes)
 
+    def slip(self, angles: np.ndarray, torque: float) -> tuple[np.ndarray, np.ndarray]:
+        """Bases whose clamps slip at a torque.
+
+        Args:
+            angles: (N, K, M + 1), rotation of the nodes, rad.
+            torque: of slip, N·m.
+
+        Returns:
+            Way (N, K) of the slip, and rotation (N, K) of the bases after it, rad.
+        """
+        most = torque / self.stiffness[:, 0]
+        lead = angles[..., 0] - angles[..., 1]
+        held = np.where(
+            np.abs(lead) > most,
+            angles[..., 1] + np.clip(lead, -most, most),
+            angles[..., 0],
+        )
+        return np.abs(angles[..., 0] - held), held
+
     def base_torque(self, angles: np.ndarray) -> np.ndarray:
         """Torque (N, K) of the rotary units on the devices at rest, N·m."""
         return -self.stiffness[:, 0] * np.diff(angles[..., :2], axis=-1)[..., 0]

@@ -13,7 +13,12 @@ from typing import NamedTuple
 import mujoco
 import numpy as np
 
-from cathsim_dmc.entities.chain import MAX_PUSH_SPEED, MAX_ROTATION_SPEED, Chain
+from cathsim_dmc.entities.chain import (
+    MAX_PUSH_SPEED,
+    MAX_ROTATION_SPEED,
+    MAX_TORQUE,
+    Chain,
+)
 from cathsim_dmc.entities.coaxial import Overlap
 from cathsim_dmc.entities.device_stack import DeviceStack
 from cathsim_dmc.entities.robot import follower_posture
@@ -24,15 +29,14 @@ from cathsim_dmc.physics.chain_fields import (
     chain_properties,
     write_still,
 )
-from cathsim_dmc.physics.effects import Effect, World
+from cathsim_dmc.physics.effects import World
 from cathsim_dmc.physics.randomisation import Episode
 from cathsim_dmc.physics.readings import Readings
+from cathsim_dmc.physics.single_device import BEHIND, SingleDevice
 from cathsim_dmc.physics.stepper import CONTROL_TIMESTEP
 
 # Where points of a device are tracked, m from its end.
 DEVICE_PLACES = np.arange(7, -1, -1) * 15e-3
-# Length of the straight device behind its base that X-rays meet, m.
-_BEHIND = 0.3
 # Rate of sliding above which the friction between devices acts in full, m/s.
 _SLIDING = 1e-3
 
@@ -64,38 +68,6 @@ class CoaxialReadings(NamedTuple):
     lumen_friction: np.ndarray
 
 
-class SingleDevice(Effect):
-    """One device, whose own motors move it."""
-
-    def __init__(self, chain: Chain):
-        """Takes the entity of the device."""
-        self._radius = chain.device.outer_radius
-        self._behind = _BEHIND / float(chain.link_lengths[0])  # links
-
-    def settle(self, model: mujoco.MjModel) -> None:
-        """Writes the properties of the chain at the start into a model."""
-
-    def follower_posture(self) -> np.ndarray:
-        """Joints (N, len(JOINTS)) of the robot that holds the devices."""
-        index, qpos = self.world.index, self.world.arrays.qpos
-        turned = 0.0 if index.rotation_qpos is None else qpos[:, index.rotation_qpos]
-        return follower_posture(qpos[:, index.insertion_qpos], turned)
-
-    def shadows(self, line: np.ndarray) -> list[Shadow]:
-        """The devices as X-rays meet them, from the innermost outwards.
-
-        Args:
-            line: (N, L + 1, 3), `Readings.centreline`.
-        """
-        first = line[:, :1] + self._behind * (line[:, :1] - line[:, 1:2])
-        return [Shadow(np.concatenate([first, line], axis=1), self._radius)]
-
-    def read(self, readings: Readings) -> CoaxialReadings | None:
-        """State of coaxial devices at some readings; None for one alone."""
-        del readings
-        return None
-
-
 def devices_of(chain: Chain) -> SingleDevice:
     """The effect by which actions move the devices of a chain."""
     return (
@@ -106,7 +78,7 @@ def devices_of(chain: Chain) -> SingleDevice:
 class SlidingDevices(SingleDevice):
     """Coaxial devices, each moved along and about its axis by its actions."""
 
-    data_fields = ("cfrc_int",)
+    data_fields = ("cfrc_int", "act")
     model_fields = FIELDS
 
     def __init__(self, stack: DeviceStack):
@@ -126,6 +98,7 @@ class SlidingDevices(SingleDevice):
         from cathsim_dmc.physics import sliding_loops  # late, as it takes long
 
         super().bind(world)
+        self._slipped = np.zeros((world.num_simulations, 2 * len(self._entity.devices)))
         self._loops = sliding_loops
         self._index, self._qpos = world.index, world.arrays.qpos
         self._internal_force = world.arrays.cfrc_int[:, world.index.links]
@@ -152,7 +125,9 @@ class SlidingDevices(SingleDevice):
         self, index: int, episode: Episode, random_state: np.random.RandomState
     ) -> None:
         """Puts the devices of one simulation to the start of the chain."""
+        super().restart(index, episode, random_state)
         friction, stiffness = episode.friction, episode.stiffness
+        self._slipped[index] = 0.0
         gaps = self._entity.start_gaps
         self._insertion[index] = self._qpos[index, self._index.insertion_qpos] - gaps
         self._angles[index] = 0.0
@@ -177,7 +152,14 @@ class SlidingDevices(SingleDevice):
             "sliding": self._sliding,
             "pressing": self._pressing,
             "spin": self._spin,
+            "slipped": self._slipped,
+            "told": self._drives.told,
         }
+
+    @property
+    def slipped(self) -> np.ndarray:
+        """Way (N, 2 K) by which the clamps have slipped, see `SingleDevice.slipped`."""
+        return self._slipped
 
     def refresh(self, index: int) -> None:
         """Writes the properties of the chain of one simulation."""
@@ -209,13 +191,17 @@ class SlidingDevices(SingleDevice):
             -self._start_depth,
             self._entity.stroke,
         )
+        every, leaders = np.arange(len(target)), np.argmax(self._insertion, axis=1)
         self._sliding[:] = (target - lead[:, None] - before + reached[:, None]) / (
             CONTROL_TIMESTEP
         )
         self._insertion[:] = target
         overlap, turns = self._turn(action[:, 1::2], lead, state.external_force)
-        self._write(np.arange(len(target)), overlap, turns)
-        return ((lead - reached) / step)[:, None]
+        self._write(every, overlap, turns)
+        command = ((lead - reached) / step)[:, None]
+        slip = np.abs(self._drives.follow(command)[:, 0])
+        self._slipped[every, 2 * leaders] += slip
+        return command
 
     def _reached(self) -> np.ndarray:
         """Insertion (N,) of the chain, m."""
@@ -245,6 +231,8 @@ class SlidingDevices(SingleDevice):
         self._angles[:] = rods.turn(
             self._angles, turned, CONTROL_TIMESTEP, *rods.at_nodes(loads, gaps)
         )
+        slip, self._angles[..., 0] = rods.slip(self._angles, MAX_TORQUE)
+        self._slipped[:, 1::2] += slip
         after = rods.at_joints(self._angles, gaps)
         self._spin[:] = (after - turns) / CONTROL_TIMESTEP
         return overlap, after
@@ -350,7 +338,7 @@ class SlidingDevices(SingleDevice):
         beyond = (nodes < gaps[..., None]).sum(axis=-1, keepdims=True)
         own = np.arange(len(nodes)) - np.maximum(beyond - 1, 0)
         places = np.maximum(nodes[np.maximum(own, 0)], gaps[..., None])
-        behind = np.full((*places.shape[:2], 1), nodes[0] + _BEHIND)
+        behind = np.full((*places.shape[:2], 1), nodes[0] + BEHIND)
         points = self.points(line, np.concatenate([behind, places], axis=-1))
         return [
             Shadow(

@@ -16,7 +16,8 @@ from cathsim_dmc.imaging.device import Shadow
 from cathsim_dmc.imaging.fluoroscopy import Fluoroscope
 from cathsim_dmc.physics import forces, readings
 from cathsim_dmc.physics.effects import Effects, World
-from cathsim_dmc.physics.sliding import CoaxialReadings, SingleDevice
+from cathsim_dmc.physics.single_device import SingleDevice
+from cathsim_dmc.physics.sliding import CoaxialReadings
 from cathsim_dmc.physics.stepper import Stepper
 from cathsim_dmc.tasks import observations
 from cathsim_dmc.tasks.cases import Case, model_index
@@ -397,6 +398,11 @@ class Rollout:
     def devices(self) -> CoaxialReadings | None:
         """State of coaxial devices after the last step or reset; None for one alone."""
         return self._measured.devices
+
+    @property
+    def slipped(self) -> np.ndarray:
+        """Way by which the clamps have slipped, see `SingleDevice.slipped`."""
+        return self._devices.slipped.copy()
 
     @property
     def wall_force(self) -> forces.WallForce:

@@ -6,6 +6,7 @@ import mujoco
 import numpy as np
 
 from cathsim_dmc.entities.posture import bends_of, joints_along
+from cathsim_dmc.physics.drives import hold
 from cathsim_dmc.physics.randomisation import START_JITTER
 from cathsim_dmc.physics.readings import ModelIndex
 from cathsim_dmc.tasks.scene import Scene
@@ -82,6 +83,7 @@ class StartPosture:
         data.qpos[self._bends] = joints_along(
             scene.catheter.link_lengths, scene.placement.line, advance
         )
+        hold(model, data)
         for _ in range(round(_SETTLING_TIME / model.opt.timestep)):
             mujoco.mj_step(model, data)
         return data

@@ -89,7 +89,7 @@ def jam(pair: tuple[str, str]) -> Jam:
             "goal": "end",
             "goal_radius": 1e-6,
             "devices": pair,
-            "random": 3,
+            "random": 1,
             "observation": "tracking",
         },
     )

@@ -11,7 +11,7 @@ import numpy as np
 
 from cathsim_dmc.entities import devices
 from cathsim_dmc.entities.chain import BENDING_RELAXATION_TIME, MAX_ROTATION_SPEED
-from cathsim_dmc.validation import theory
+from cathsim_dmc.validation import drive, theory
 from cathsim_dmc.validation.checks import Check, Report
 from cathsim_dmc.validation.rig import REST_CHANGE, Rig
 
@@ -382,6 +382,7 @@ def validate_rod() -> Report:
             f"{lag.rise_time:.4f} s, theory {lag.expected_rise_time:.4f} s",
         ),
     ]
+    checks += drive.checks()
     short = [buckling(end, count) for end, count in SHORT_COLUMNS]
     findings = {
         "buckling load of shorter columns, deviation from Euler, %": {
