@@ -9,9 +9,9 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
+from cathsim_dmc.anatomy import lattice
 from cathsim_dmc.anatomy.anatomy import Anatomy
 from cathsim_dmc.anatomy.centreline import Vessel
-from cathsim_dmc.anatomy.field import Field
 from cathsim_dmc.anatomy.parts import INLET_HOLE_RADIUS
 from cathsim_dmc.anatomy.scan.naming import ARCH_BRANCHES
 from cathsim_dmc.anatomy.scan.tree import END_TRIM, TAIL, TAIL_RADIUS
@@ -65,8 +65,8 @@ def check_tree(anatomy: Anatomy) -> list[TreeCheck]:
         _own_lumen(anatomy),
         _parents(anatomy),
         _sides(anatomy),
-        _free_ends(anatomy),
-        _goals(anatomy),
+        _free_ends(anatomy, measure),
+        _goals(anatomy, measure),
         _sizes(anatomy),
         _inlet(anatomy, measure),
         _start(anatomy, measure),
@@ -183,7 +183,7 @@ def _sides(anatomy: Anatomy) -> TreeCheck:
     return _finding("branches of the arch on their sides", wrong, fine)
 
 
-def _free_ends(anatomy: Anatomy) -> TreeCheck:
+def _free_ends(anatomy: Anatomy, measure: SurfaceDepth) -> TreeCheck:
     wrong, farthest = [], 0.0
     tree = anatomy.tree
     for key, vessel in tree.vessels.items():
@@ -197,7 +197,7 @@ def _free_ends(anatomy: Anatomy) -> TreeCheck:
         end = line.at(line.length)
         tail = line.radii[line.arc_length > line.length - 30e-3]
         wide = float(max(tail.max(), end.radius))
-        ahead = _lumen_beyond(anatomy.lumen, end.position, end.tangent, wide)
+        ahead = _lumen_beyond(measure, end.position, end.tangent, wide)
         beyond = float(np.linalg.norm(ahead - end.position, axis=1).max(initial=0.0))
         # What no device can follow was cut off, and is not missing.
         cut = TAIL + END_TRIM if end.radius < NARROW_END * TAIL_RADIUS else 0.0
@@ -222,7 +222,7 @@ def _free_ends(anatomy: Anatomy) -> TreeCheck:
 
 
 def _lumen_beyond(
-    depth: Field,
+    depth: SurfaceDepth,
     position: np.ndarray,
     tangent: np.ndarray,
     radius: float,
@@ -237,14 +237,14 @@ def _lumen_beyond(
     """
     spacing = float(np.clip(radius / 3.0, 0.5e-3, 2.0e-3))
     reach = max(24 * spacing, (FREE_RADII + 1.5) * radius)
-    steps = np.arange(-reach, reach + 1e-9, spacing)
-    local = np.stack(np.meshgrid(steps, steps, steps, indexing="ij"), -1)
-    local = local.reshape(-1, 3)
+    shape = np.full(3, 2 * round(reach / spacing) + 1)
+    low = position - 0.5 * (shape - 1) * spacing
+    ijk, _ = lattice.inside(depth, low, shape, spacing, PASSABLE)
+    local = low + spacing * ijk - position
     along = local @ tangent
     aside = np.linalg.norm(local - along[:, None] * tangent, axis=1)
     behind = (along < 0.0) & (along > -2.0 * spacing) & (aside < 1.6 * radius + 2e-3)
     points = local[~behind] + position
-    points = points[depth(points) > PASSABLE]
     if not len(points):
         return points
     pairs = cKDTree(points).query_pairs(1.8 * spacing, output_type="ndarray")
@@ -259,7 +259,7 @@ def _lumen_beyond(
     return points[label == label[nearest]]
 
 
-def _goals(anatomy: Anatomy) -> TreeCheck:
+def _goals(anatomy: Anatomy, measure: SurfaceDepth) -> TreeCheck:
     wrong = []
     for name, goal in anatomy.goals.items():
         line = anatomy.tree.vessel(goal.vessel).centreline
@@ -272,7 +272,7 @@ def _goals(anatomy: Anatomy) -> TreeCheck:
         best = max(depths, key=lambda key: float(depths[key]))
         if float(depths[goal.vessel]) < float(depths[best]) - 0.5e-3:
             wrong.append(f"{name} lies in {best}, not in {goal.vessel}")
-        if not float(anatomy.depth(goal.position)) > 0.0:
+        if not float(measure(goal.position)) > 0.0:
             wrong.append(f"{name} lies outside the lumen")
     return _finding("goals in their vessels", wrong, f"{len(anatomy.goals)} goals")
 

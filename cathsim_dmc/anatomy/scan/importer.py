@@ -145,11 +145,10 @@ def import_scan(
         ends=flat_ends(tree, opening),
         scanned=True,
     )
-    say("field: measuring the lumen")
     _prove(anatomy, _MEND_DRAWN if lines else _MEND_COMPUTED, note)
     say(
-        f"done: {anatomy.lumen} in {time.monotonic() - started:.0f} s, "
-        f"goals {', '.join(anatomy.goals) or 'none'}"
+        f"done in {time.monotonic() - started:.0f} s, goals "
+        f"{', '.join(anatomy.goals) or 'none'}"
     )
     return anatomy
 
