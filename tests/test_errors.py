@@ -19,6 +19,10 @@ from cathsim_dmc.simulation.batch import BatchSimulation
 from cathsim_dmc.tasks.config import NavigationConfig
 from cathsim_dmc.tasks.objectives import Cannulation
 
+STIFF = dataclasses.replace(
+    devices.get("steerable_5f"), name="stiff", shaft=devices.Section(6e-3, 5e-3)
+)
+
 
 def fails(words, error=ValueError, **options):
     """Loads a task with options; the message must hold all the words."""
@@ -122,6 +126,8 @@ def test_wrong_reward():
     [
         ({"max_steps": 10**400}, ["max_steps", "an integer from 1"]),
         ({"physics_timestep": 0.003}, ["physics_timestep", "whole part"]),
+        ({"physics_timestep": 0.02}, ["physics_timestep", "0.005", "outside_range"]),
+        ({"device": STIFF}, ["'stiff'", "0.005 N·m²", "outside_range"]),
         ({"friction": -0.1}, ["friction", "-0.1", "from 0 to 2"]),
         ({"working_length": 0.05}, ["working_length", "0.05", "steerable_5f", "more"]),
         ({"fluoroscopy": {"zoom": 2}}, ["fluoroscopy", "zoom", "magnification"]),
@@ -312,3 +318,8 @@ def test_a_fork_of_a_batch_is_refused_and_ends(three):
         finally:
             os._exit(status)
     assert os.waitpid(child, 0)[1] == 0
+
+
+def test_what_lies_outside_the_range_is_taken_with_a_warning():
+    with pytest.warns(UserWarning, match=r"0.02 s, but the physics holds up to 0.005"):
+        NavigationConfig(physics_timestep=0.02, outside_range=True)

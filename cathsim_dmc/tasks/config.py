@@ -2,6 +2,7 @@
 
 import copy
 import dataclasses
+import warnings
 from collections.abc import Mapping, Sequence
 from typing import Any, cast
 
@@ -27,6 +28,9 @@ _LONGEST_LEAD = 0.3  # m
 MOST_FRICTION = 2.0  # Coulomb coefficient
 # A link is longer than its radius and shorter than the diameter of a large vessel.
 _LEAST_LINK, _LONGEST_LINK = 2e-3, 0.1  # m
+# Range in which the physics holds (docs/physics.md); the library stays within it.
+_LONGEST_TIMESTEP = 5e-3  # s
+_STIFFEST = 5e-3  # N·m², EI
 # Composer does the last two of them itself.
 _FEWEST_SUBSTEPS, _MOST_SUBSTEPS = 2, 1000
 
@@ -54,6 +58,9 @@ class NavigationConfig:
         working_length: Simulated length of the device, m; None for what the goal needs.
             Observations have one shape whatever it is.
         physics_timestep: Length of a physics step, s; it divides the control step.
+        outside_range: Whether a physics step longer than 5 ms and a device stiffer than
+            5000 N·mm², with which the physics does not hold, are warned of and not
+            refused.
         fluoroscopy: `imaging.FluoroscopyOptions` of the images, or a mapping of its
             fields.
         cameras: `cameras.CameraOptions` of `rgb` and `depth`, or a mapping of its
@@ -76,6 +83,7 @@ class NavigationConfig:
     torsion_joints: int | None = None
     working_length: float | None = None
     physics_timestep: float = PHYSICS_TIMESTEP
+    outside_range: bool = False
     fluoroscopy: FluoroscopyOptions | Mapping[str, Any] = FluoroscopyOptions()
     cameras: CameraOptions | Mapping[str, Any] = CameraOptions()
     randomisation: Randomisation | Mapping[str, Any] | bool = False
@@ -84,6 +92,7 @@ class NavigationConfig:
     def __post_init__(self):
         self._check_devices()
         self._check_numbers()
+        self._check_range()
         kinds = {"fluoroscopy": FluoroscopyOptions, "cameras": CameraOptions}
         for name, kind in kinds.items():
             value = getattr(self, name)
@@ -171,6 +180,30 @@ class NavigationConfig:
                 f"a whole part of the control step of {CONTROL_TIMESTEP:g} s, from "
                 f"{_FEWEST_SUBSTEPS} to {_MOST_SUBSTEPS} physics steps each",
             )
+
+    def _check_range(self):
+        bounds.switch("outside_range", self.outside_range)
+        faults = []
+        if self.physics_timestep > _LONGEST_TIMESTEP * (1 + 1e-9):
+            faults.append(
+                f"physics_timestep is {self.physics_timestep:g} s, but the physics "
+                f"holds up to {_LONGEST_TIMESTEP:g} s"
+            )
+        for device in (self.device, *(self.devices or ())):
+            if not isinstance(device, Device):
+                continue
+            stiffest = max(
+                part.bending_stiffness for part in (device.shaft, device.tip)
+            )
+            if stiffest > _STIFFEST:
+                faults.append(
+                    f"device {device.name!r} has an EI of {stiffest:g} N·m², but the "
+                    f"physics holds up to {_STIFFEST:g} N·m²"
+                )
+        if faults and not self.outside_range:
+            raise ValueError(f"{faults[0]}; outside_range=True takes it with a warning")
+        for fault in faults:
+            warnings.warn(fault, stacklevel=4)
 
     def _check_views(self):
         """Check that the C-arms are possible at the largest deviations of the view."""

@@ -44,7 +44,8 @@ def study(
     """
     ascending = sorted(float(value) for value in values)
     # A tiny goal: the script runs to its end.
-    options = [{"goal_radius": 1e-5, parameter: value} for value in ascending]
+    fixed = {"goal_radius": 1e-5, "outside_range": True}
+    options = [{**fixed, parameter: value} for value in ascending]
     runs = [insertion.run(script, **each) for each in options]  # type: ignore
     away = [1e3 * np.linalg.norm(run.head - runs[0].head, axis=1) for run in runs]
     track = [1e3 * polyline_distance(run.head, runs[0].head) for run in runs]

@@ -17,6 +17,7 @@ from cathsim_dmc.anatomy.centreline import Centreline, Vessel, VesselTree
 from cathsim_dmc.anatomy.field import Field
 from cathsim_dmc.anatomy.parts import Goal
 from cathsim_dmc.anatomy.surface import lumen_surface
+from cathsim_dmc.entities.chain import MAX_PUSH_SPEED
 from cathsim_dmc.entities.phantom import Phantom
 from cathsim_dmc.physics import forces
 from cathsim_dmc.recording.episode import Episode
@@ -33,6 +34,7 @@ PUSHES = (0.1, 0.25, 0.5, 1.0)
 GUIDING_TUBE = (0.04, 1.5e-3)
 WIDE_TUBE = (0.1, 2e-3)
 AVERAGING = 1.0  # s
+LARGEST_PUSH = 4.0  # N, in a dead end
 INSERTION_SPEEDS = (0.25, 0.5, 1.0)  # of 40 mm/s
 INSERTION_SEEDS = 5
 # The tip straight, and bent towards the wall of the branch.
@@ -157,10 +159,11 @@ def dead_end(
     model, data = environment.physics.model.ptr, environment.physics.data.ptr
     motor = model.actuator(f"{task.scene.catheter.mjcf_model.model}/insertion")
     data.actuator(motor.id).ctrl[0] = command
+    push = command * LARGEST_PUSH
+    model.actuator_forcerange[motor.id] = -push, push
     sheath = environment.physics.bind(task.scene.sheath.bodies).element_id
     way = tube[0] - task.scene.placement.start_depth
-    full_speed = motor.gainprm[0] / -motor.biasprm[2]
-    steps = round((settling + way / (command * full_speed)) / timestep)
+    steps = round((settling + way / (command * MAX_PUSH_SPEED)) / timestep)
     rows = []
     for step in range(steps):
         mujoco.mj_step(model, data)
@@ -178,7 +181,7 @@ def dead_end(
         )
     rows = np.array(rows)
     return DeadEnd(
-        command * float(motor.gainprm[0]),
+        push,
         *rows.mean(axis=0).tolist(),
         ripple=float(rows[:, 0].std()),
     )

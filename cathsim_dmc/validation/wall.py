@@ -16,7 +16,9 @@ from cathsim_dmc.anatomy.scan.check import check_tree
 from cathsim_dmc.anatomy.surface_depth import SurfaceDepth
 from cathsim_dmc.anatomy.tree_depth import TreeDepth
 from cathsim_dmc.entities import devices
+from cathsim_dmc.entities.chain import MAX_PUSH_SPEED
 from cathsim_dmc.entities.contact import FRICTION, wall_contact
+from cathsim_dmc.physics.drives import hold
 from cathsim_dmc.validation import convergence
 from cathsim_dmc.validation.checks import Check, Report
 from cathsim_dmc.validation.rig import Rig
@@ -157,6 +159,7 @@ def _pulled(
     middles = np.cumsum(rig.lengths) - rig.lengths / 2
     heading = np.clip((middles - _LEAD) / radius, 0.0, wrap)
     rig.data.joint(f"{rig.name}/insertion").qpos = _PULL
+    hold(rig.model, rig.data)
     for index in range(1, len(middles)):
         angle = heading[index] - heading[index - 1]
         rig.data.joint(f"{rig.name}/bend_y_{index}").qpos = angle
@@ -165,7 +168,7 @@ def _pulled(
     motor = rig.data.actuator(f"{rig.name}/insertion")
     for _ in range(round(_SETTLING / rig.model.opt.timestep)):
         rig.step(load)
-    motor.ctrl[0] = -PULL_SPEED / _full_speed(rig)
+    motor.ctrl[0] = -PULL_SPEED / MAX_PUSH_SPEED
     travel, force = [], []
     while not travel or travel[-1] < _PULL - 0.02:
         rig.step(load)
@@ -183,11 +186,6 @@ def _pulled(
     heading = np.arctan2(-force[sliding, 0], -force[sliding, 2])
     angle = float(wrap - heading.mean())
     return angle, travel, tension / TENSION
-
-
-def _full_speed(rig: Rig) -> float:
-    actuator = rig.model.actuator(f"{rig.name}/insertion")
-    return float(actuator.gainprm[0] / -actuator.biasprm[2])
 
 
 def field_error(anatomy: Anatomy) -> np.ndarray:
