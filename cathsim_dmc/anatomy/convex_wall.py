@@ -33,8 +33,6 @@ EXTENT = 40e-3  # m, largest piece; longer ones slow the broad phase
 CLEARANCE = 0.1e-3  # m, kept between a 5 Fr device on the centreline and a merged hull
 CAP_OVERLAP = 2e-3  # m, of the inlet's cap under the wall around it
 CAPS = (1.0, 0.5, 0.25, 0.1)  # shares of the thickness tried for a lone triangle
-BORE_THICKNESS = 1e-3  # m, of the pieces around a bore
-_SECTORS = 12  # of a bore
 _ORDER = 6  # subdivision of a hull's triangles where its depth is sampled
 _BEHIND = 0.05e-3  # m, of the surface that is cut off ahead of the inlet's flat cap
 
@@ -266,30 +264,3 @@ def _barycentric(order: int) -> np.ndarray:
     ]
     weights = np.array([row for row in rows if max(row) < order]) / order
     return weights
-
-
-def bore_pieces(points: np.ndarray, radii: np.ndarray) -> list[np.ndarray]:
-    """Convex sectors (8, 3) m around a round bore that is open at both ends.
-
-    Args:
-        points: (n, 3) m, of its axis.
-        radii: (n,) m.
-    """
-    steps = np.diff(points, axis=0)
-    along = np.concatenate([steps[:1], steps[:-1] + steps[1:], steps[-1:]])
-    along /= np.linalg.norm(along, axis=1, keepdims=True)
-    u = np.zeros_like(along)
-    u[0] = np.cross(along[0], np.eye(3)[np.abs(along[0]).argmin()])
-    for i, tangent in enumerate(along):
-        u[i] = u[max(i - 1, 0)] - (u[max(i - 1, 0)] @ tangent) * tangent
-        u[i] /= np.linalg.norm(u[i])
-    v = np.cross(along, u)
-    angle = 2.0 * np.pi * np.arange(_SECTORS)[:, None, None] / _SECTORS
-    spokes = (np.cos(angle) * u + np.sin(angle) * v) / np.cos(np.pi / _SECTORS)
-    rings = [points + (radii + t)[:, None] * spokes for t in (0.0, BORE_THICKNESS)]
-    corners = np.stack(rings, axis=2)
-    return [
-        corners[[k, k - 1], i : i + 2].reshape(-1, 3)
-        for k in range(_SECTORS)
-        for i in range(len(steps))
-    ]
