@@ -36,7 +36,7 @@ def test_frames_of_the_links_are_those_of_the_simulator(environment):
     model, data = physics.model.ptr, physics.data.ptr
     links = [i for i in range(model.nbody) if "catheter/link_" in model.body(i).name]
     rotations = data.xmat[links].reshape(-1, 3, 3)
-    joints = data.qpos[environment.task.rollout.index.qpos][None]
+    joints = environment.task.rollout.index.read(data).joint_positions[None]
     assert np.abs(joints[0, 2:]).max() > 0.02
     frame = rotations[-1:]
     for number in range(1, 9):

@@ -1,6 +1,7 @@
 """A task as files: another program that steps the scene gets what the task gets."""
 
 import json
+import types
 
 import mujoco
 import numpy as np
@@ -9,6 +10,7 @@ from lxml import etree
 
 from cathsim_dmc import suite
 from cathsim_dmc.physics import forces
+from cathsim_dmc.physics.drives import Drives
 from cathsim_dmc.simulation.mjcf import write_mjcf
 
 TASK, SEED, STEPS = "type1_lcca", 3, 30
@@ -33,6 +35,9 @@ def test_the_scene_moves_as_the_task_bit_for_bit(exported):
     data = mujoco.MjData(model)
     data.qpos[:] = task["qpos"]
     mujoco.mj_forward(model, data)
+    views = {name: getattr(data, name)[None] for name in ("qpos", "qvel", "act")}
+    drives = Drives(model, types.SimpleNamespace(**views))
+    drives.hold(0)
     env = suite.load("cathsim", TASK, task_kwargs={"random": SEED})
     env.reset()
     order = [model.actuator(name).id for name in task["actuators"]]
@@ -41,6 +46,7 @@ def test_the_scene_moves_as_the_task_bit_for_bit(exported):
     assert contacts.dim[0] % task["contact_size"] == 0
     touched = 0
     for action in actions():
+        drives.follow(action[None, 20:])
         data.ctrl[order] = np.clip(action, -1, 1)
         for _ in range(task["substeps"]):
             mujoco.mj_step(model, data)

@@ -27,6 +27,7 @@ import dataclasses
 
 import numpy as np
 
+from cathsim_dmc.entities import posture
 from cathsim_dmc.entities.chain import MAX_PUSH_SPEED, MAX_ROTATION_SPEED
 from cathsim_dmc.entities.device_stack import DeviceStack
 from cathsim_dmc.physics import forces
@@ -224,6 +225,7 @@ def _before(frame: np.ndarray, joints: np.ndarray, number: int) -> np.ndarray:
         joints: (N, J), `Readings.joint_positions`: in each joint x before y.
         number: 1 for the last link.
     """
-    for joint, axis in ((-2 * number + 1, 1), (-2 * number, 0)):
-        frame = pursuit.turned(frame, axis, -joints[:, joint])
+    place = joints.shape[1] // 2 - number  # of the joint; two slides precede it
+    for axis in (1, 0) if posture.x_first(place) else (0, 1):
+        frame = pursuit.turned(frame, axis, -joints[:, -2 * number + axis])
     return frame

@@ -89,7 +89,8 @@ def describe(env: Any) -> dict[str, Any]:
 
     Returns:
         "qpos" (the start, at rest), "control_timestep" and "substeps" (`mj_step` with
-        the same control), "actuators" (order of the action, which is the control),
+        the same control, after `physics.drives.Drives.follow`), "actuators" (order of
+        the action, which is the control),
         "links" (bodies from base to tip), "head" (site), "insertion" (joint),
         "sensors" (name by quantity, and "contact_size", the numbers a contact takes in
         the sensor of the wall: found, force, dist, pos, normal, tangent), "goal" and
