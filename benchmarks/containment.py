@@ -2,7 +2,6 @@
 
 import dataclasses
 
-import mujoco
 import numpy as np
 
 from cathsim_dmc.anatomy import Anatomy
@@ -51,25 +50,23 @@ class Containment:
     Attributes:
       anatomy: lumen and inlet.
       device_radius: m.
-      bore_half_width: half the inner width of the sheath's square bore, m.
-      bore_sides: (2, 3), unit normals of the two pairs of sides, world frame.
+      bore_radius: of the sheath, m.
+      axis: (3,), unit direction of the sheath, world frame.
     """
 
     anatomy: Anatomy
     device_radius: float
-    bore_half_width: float
-    bore_sides: np.ndarray
+    bore_radius: float
+    axis: np.ndarray
 
     @classmethod
     def of(cls, task) -> "Containment":
         """Containment of the device of a `tasks.navigation.Navigation`."""
-        matrix = np.empty(9)
-        mujoco.mju_quat2Mat(matrix, task.scene.placement.quaternion)
         return cls(
             task.scene.anatomy,
             task.scene.catheter.device.outer_radius,
-            task.scene.sheath.bore_half_width,
-            matrix.reshape(3, 3).T[:2],
+            task.scene.sheath.bore_radius,
+            task.scene.placement.direction,
         )
 
     def excess(self, points: np.ndarray) -> np.ndarray:
@@ -77,7 +74,7 @@ class Containment:
 
         In the lumen it is the device's radius less the depth of the point in the true
         lumen (not in the wall pieces, which approximate it). Before the inlet it is
-        the distance by which the device's side lies beyond that of the bore. The
+        the distance by which the device's side lies beyond the bore. The
         smaller of the two counts: a device that is in neither is always detected.
 
         Args:
@@ -89,8 +86,8 @@ class Containment:
         points = np.asarray(points, dtype=np.float64)
         in_lumen = self.device_radius - self.anatomy.depth(points)
         offset = points - self.anatomy.inlet.position
-        lateral = np.abs(offset @ self.bore_sides.T).max(-1)
-        in_sheath = lateral + self.device_radius - self.bore_half_width
+        lateral = np.linalg.norm(np.cross(offset, self.axis), axis=-1)
+        in_sheath = lateral + self.device_radius - self.bore_radius
         before = offset @ self.anatomy.inlet.direction <= 0
         return np.where(before, np.minimum(in_lumen, in_sheath), in_lumen)
 

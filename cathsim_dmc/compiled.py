@@ -4,9 +4,55 @@ Importing numba takes longer than loading a task, so a module with such function
 imported only where it is needed, within a function.
 """
 
+import functools
+import hashlib
 from collections.abc import Callable
+from pathlib import Path
 
 import numba
+from numba.core import caching
+
+_PACKAGE = Path(__file__).parent
+
+
+@functools.cache
+def _stamp() -> bytes:
+    """Digest of all sources that hold compiled loops."""
+    digest = hashlib.sha256()
+    for path in sorted(_PACKAGE.rglob("*.py")):
+        if (source := path.read_bytes()).find(b"compiled") >= 0:
+            digest.update(source)
+    return digest.digest()
+
+
+class _Together:
+    """A place of compiled loops that are made anew when any of them changes.
+
+    Compiled code holds what it calls in other modules, of which numba's own stamp
+    knows nothing.
+    """
+
+    @classmethod
+    def from_function(cls, py_func, py_file):
+        """The place for a function of this package, None for any other."""
+        if not Path(py_file).is_relative_to(_PACKAGE):
+            return None
+        return super().from_function(py_func, py_file)  # type: ignore[misc]
+
+    def get_source_stamp(self) -> bytes:
+        """Changes with any source of compiled loops."""
+        return _stamp()
+
+
+class _BesideSource(_Together, caching.InTreeCacheLocator):
+    pass
+
+
+class _OfUser(_Together, caching.UserWideCacheLocator):
+    pass
+
+
+caching.CacheImpl._locator_classes[1:1] = [_BesideSource, _OfUser]  # noqa: SLF001
 
 
 def compiled(function: Callable, cache: bool = True) -> Callable:

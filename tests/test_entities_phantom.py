@@ -55,13 +55,13 @@ def wall_contacts(model, data):
     for index in range(data.ncon):
         contact = data.contact[index]
         names = [model.geom(geom).name for geom in contact.geom]
-        if not any(name.startswith("wall_") for name in names):
+        if not any(name == "wall" for name in names):
             continue
         local = np.zeros(6)
         mujoco.mj_contactForce(model, data, index, local)
         # The frame's normal points from geom 0 to geom 1: force on geom 1.
         force = contact.frame.reshape(3, 3).T @ local[:3]
-        if names[0].startswith("wall_"):
+        if names[0] == "wall":
             force = -force
         result.append((force, contact.pos.copy(), -contact.dist))
     return result
@@ -161,22 +161,18 @@ def test_friction_stays_in_its_cone(pressed, environment):
 # Wall.
 
 
-def test_every_piece_collides_with_the_device_only(model, environment):
-    wall = [
-        model.geom(f"wall_{index:03d}")
-        for index in range(len(environment.task.scene.anatomy.wall))
-    ]
-    for geom in wall:
-        assert geom.contype[0] == 1 and geom.conaffinity[0] == 0
-        assert geom.condim[0] == 3
-        # The contact surface is the wall itself.
-        assert geom.margin[0] == 0 and geom.gap[0] == 0
+def test_the_wall_is_one_geom_that_touches_the_device_only(model):
+    wall = model.geom("wall")
+    assert wall.contype[0] == 1 and wall.conaffinity[0] == 0
+    assert wall.condim[0] == 3
+    # The contact surface is the wall itself.
+    assert wall.margin[0] == 0 and wall.gap[0] == 0
     lumen = model.geom("phantom/lumen")
     assert lumen.contype[0] == 0 and lumen.conaffinity[0] == 0
 
 
 def test_device_and_wall_have_the_same_contact(model):
-    wall, link = model.geom("wall_000"), model.geom("catheter/link_3")
+    wall, link = model.geom("wall"), model.geom("catheter/link_3")
     np.testing.assert_array_equal(wall.solref, link.solref)
     np.testing.assert_array_equal(wall.solimp, link.solimp)
     np.testing.assert_array_equal(wall.solref, contact.CONTACT_SOLREF)
@@ -184,20 +180,14 @@ def test_device_and_wall_have_the_same_contact(model):
     assert wall.friction[0] == link.friction[0] == contact.FRICTION
 
 
-def test_pieces_lie_where_the_anatomy_puts_them(model, environment):
+def test_contacts_lie_on_the_wall_of_the_anatomy(environment, pressed):
+    """MuJoCo puts a contact halfway into the overlap of link and wall."""
     anatomy = environment.task.scene.anatomy
-    data = mujoco.MjData(model)
-    mujoco.mj_kinematics(model, data)
-    for index in range(0, len(anatomy.wall), 50):
-        geom = model.geom(f"wall_{index:03d}")
-        mesh = model.mesh(int(geom.dataid[0]))
-        start, count = int(mesh.vertadr[0]), int(mesh.vertnum[0])
-        vertices = model.mesh_vert[start : start + count]
-        rotation = data.geom_xmat[geom.id].reshape(3, 3)
-        world = vertices @ rotation.T + data.geom_xpos[geom.id]
-        piece = anatomy.wall[index]
-        gap = np.linalg.norm(world[:, None] - piece[None], axis=-1).min(1)
-        assert gap.max() < 1e-6
+    contacts = [each for _, found in pressed for each in found]
+    depths = anatomy.lumen([position for _, position, _ in contacts])
+    error = np.abs(depths + [depth / 2 for *_, depth in contacts])
+    # In a narrow dead end the planes that stand for the wall meet it at an angle.
+    assert np.median(error) < 0.02e-3 and error.max() < 0.4e-3
 
 
 def test_goals_are_where_the_anatomy_puts_them(environment):

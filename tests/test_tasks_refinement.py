@@ -10,6 +10,28 @@ from cathsim_dmc.physics.stepper import Stepper
 from cathsim_dmc.simulation.batch import BatchSimulation, _BatchStepper
 
 
+def _deepest(steps):
+    """Deepest contact, m, of a tip that swings from wall to wall."""
+    task = suite.make_task("type1_bca", random=0, randomisation=True)
+    batch = BatchSimulation(task, 4, num_threads=1, seeds=0)
+    batch.reset()
+    deepest = 0.0
+    for step in range(steps):
+        action = np.zeros((4, batch.num_actions))
+        action[:, -1] = 1.0
+        action[:, :-1] = np.sign(np.sin(step / 20 + np.arange(4)))[:, None]
+        batch.step(action)
+        deepest = max(deepest, batch.contacts().penetration.max(initial=0.0))
+    return deepest
+
+
+def test_an_impact_in_shorter_steps_is_not_as_deep(monkeypatch):
+    deepest = forces.DEEPEST
+    assert _deepest(70) < deepest
+    monkeypatch.setattr(forces, "DEEPEST", np.inf)
+    assert _deepest(70) > deepest
+
+
 @pytest.mark.parametrize(
     ("contact", "coarse"),
     [

@@ -51,6 +51,17 @@ def capped(head, value, x, y, z):
 
 
 @compiled
+def boxed(head, x, y, z):
+    """Whether a point lies in the box of the field."""
+    edge = head[EDGE]
+    return (
+        0.0 <= x - head[0] <= edge * head[SHAPE]
+        and 0.0 <= y - head[1] <= edge * head[SHAPE + 1]
+        and 0.0 <= z - head[2] <= edge * head[SHAPE + 2]
+    )
+
+
+@compiled
 def past(head, x, y, z):
     """Whether a point lies past the plane of an open end."""
     for number in range(int(head[ENDS])):
@@ -113,7 +124,9 @@ def clearance_at(head, coarse, index, samples, x, y, z):
     if behind(head, x, y, z) > 0.0:
         return FREE
     depth = walled_at(head, coarse, index, samples, x, y, z)
-    return FREE if depth < -_THICK and past(head, x, y, z) else depth
+    if (depth < -_THICK or not boxed(head, x, y, z)) and past(head, x, y, z):
+        return FREE
+    return depth
 
 
 @compiled

@@ -1,9 +1,10 @@
-"""The phantom: the wall of an anatomy as convex pieces, with goals and sensors."""
+"""The phantom: the wall of an anatomy as a field, with goals and sensors."""
 
 import numpy as np
 from dm_control import composer, mjcf
 
 from cathsim_dmc.anatomy import Anatomy
+from cathsim_dmc.collision import fields
 from cathsim_dmc.entities.contact import FRICTION, wall_contact
 
 # Largest number of contacts that the wall sensor reports. A device jammed in a narrow
@@ -28,7 +29,7 @@ class Phantom(composer.Entity):
         """Builds the wall.
 
         Args:
-            anatomy: lumen, wall pieces and goals.
+            anatomy: lumen and goals.
             friction: Coulomb coefficient of the device on the wall.
             goal_radius: radius of the goal sites, m.
             name: name of the entity.
@@ -60,7 +61,7 @@ class Phantom(composer.Entity):
             file=_mesh_file(surface.vertices, surface.faces),
             inertia="shell",
         )
-        self._body.add(
+        self._surface = self._body.add(
             "geom",
             name="lumen",
             type="mesh",
@@ -72,30 +73,24 @@ class Phantom(composer.Entity):
             rgba=_LUMEN_COLOUR,
         )
 
-    def add_wall(self, device_body) -> None:
-        """Adds the wall pieces and the sensors of their contacts with a device.
-
-        The pieces are geoms of the world body, not of a body of the phantom: MuJoCo's
-        broad phase visits every geom of every other body in every step, which takes a
-        sixth of a step without contacts.
+    def add_wall(self, device_body, hole: float = np.inf) -> None:
+        """Adds the carrier of the wall and the sensors of its contacts with a device.
 
         Args:
             device_body: root body of the device, an element of the same model tree.
+            hole: radius of the hole in the cap over the inlet, m; open if larger.
         """
         root = self._mjcf_root.root_model
-        # A default class and binary vertices: as text in each of some 600 geoms, they
-        # take most of the compile time.
-        shared = self._mjcf_root.default.add("default", dclass="wall")
-        shared.mesh.inertia = "shell"
-        shared.geom.set_attributes(
-            type="mesh", **wall_contact(self._friction), mass=0, group=3
+        lumen = self._anatomy.lumen.with_hole(hole)
+        root.worldbody.add(
+            "geom",
+            name="wall",
+            **fields.carrier(lumen),
+            **wall_contact(self._friction),
+            mass=0,
+            group=5,
+            rgba=(0, 0, 0, 0),
         )
-        for index, piece in enumerate(self._anatomy.wall):
-            name = piece_name(index)
-            mesh = self._mjcf_root.asset.add(
-                "mesh", name=name, dclass=shared, file=_mesh_file(piece)
-            )
-            root.worldbody.add("geom", name=name, dclass=shared, mesh=mesh)
         root.sensor.add(
             "contact",
             name="wall_contacts",
@@ -122,7 +117,7 @@ class Phantom(composer.Entity):
 
     @property
     def anatomy(self) -> Anatomy:
-        """Lumen, wall pieces and goals."""
+        """Lumen and goals."""
         return self._anatomy
 
     @property
@@ -131,14 +126,14 @@ class Phantom(composer.Entity):
         return self._body
 
     @property
+    def surface(self):
+        """The geom of the drawn surface."""
+        return self._surface
+
+    @property
     def goals(self) -> dict:
         """Goal sites by name."""
         return self._goals
-
-
-def piece_name(index: int) -> str:
-    """Name of a wall piece in the model."""
-    return f"wall_{index:03d}"
 
 
 def _mesh_file(vertices: np.ndarray, faces: np.ndarray | None = None) -> mjcf.Asset:

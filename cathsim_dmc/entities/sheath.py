@@ -3,23 +3,16 @@
 import numpy as np
 from dm_control import composer, mjcf
 
-from cathsim_dmc.entities.catheter import Catheter
-from cathsim_dmc.entities.contact import CONTACT_SOLIMP, CONTACT_SOLREF, sheath_contact
+from cathsim_dmc.collision import fields
+from cathsim_dmc.entities.contact import sheath_contact
 
-CLEARANCE = 0.35e-3  # m between the device and each side of the bore
-# Thickness of the sides, m: their front covers the hole in the cap of the inlet, and a
-# loaded shaft cannot tunnel through them.
-WALL = 8e-3
-# Longest part behind the mouth with flat sides and a sharp rim, m. There the device
-# leans on the sheath with a bending moment.
-_MOUTH_LENGTH = 0.02
-# Largest distance of a straight piece of rod from the line, m.
+CLEARANCE = 0.35e-3  # m between the device and the bore all round
+# Largest distance of a straight piece of the bore from the line, m.
 _CHORD_TOLERANCE = 0.1e-3
 _SPACING = 0.5e-3  # m, of the points that sample a curved line
 _LEAST_CURVE_RADIUS = 0.01  # m
 _VISIBLE_WALL = 0.4e-3  # m, as drawn
 _COLOUR = (0.35, 0.45, 0.6, 0.35)
-_SIDES = {"right": (1, 0), "left": (-1, 0), "top": (0, 1), "bottom": (0, -1)}
 
 
 def straight(length: float) -> np.ndarray:
@@ -34,11 +27,8 @@ class Sheath(composer.Entity):
     The bore reaches back over the whole chain and represents both. Friction of clamps
     and valve is not modelled ("perfect motion"), so the bore has none.
 
-    The bore is square. The last piece before the mouth is four boxes with flat sides
-    and a sharp rim. The rest is four rods, chains of capsules that turn with the line:
-    capsule against capsule is MuJoCo's cheapest collision test, and a chain of capsules
-    has no edge at which a link could catch. `guide` lists the pairs of links and rods
-    that collide.
+    The bore is round: one geom that carries it as a field (`collision.fields`), which
+    touches capsules from inside, with no edge at which a link could catch.
     """
 
     def _build(
@@ -46,10 +36,9 @@ class Sheath(composer.Entity):
         centreline: np.ndarray,
         device_radius: float,
         link_length: float = 0.0,
-        wall: float = WALL,
         name: str = "sheath",
     ):
-        """Builds the sides of the bore.
+        """Builds the bore.
 
         Args:
             centreline: points (n, 3) of the axis of the bore from its proximal end to
@@ -59,120 +48,41 @@ class Sheath(composer.Entity):
             link_length: longest link of the device, m. Links are straight, so in a bend
                 their middles lie inside the line; the inner side of the bend is wider
                 by that distance. No effect where the line is straight.
-            wall: thickness of the sides, m.
             name: name of the entity.
 
         Raises:
             ValueError: if the line has fewer than two points, repeats a point or bends
                 with a radius below 10 mm, or if a size is not positive.
         """
-        for what, value in (("device_radius", device_radius), ("wall", wall)):
-            if not value > 0:
-                raise ValueError(f"{what} is {value} m; it must be positive")
-        self._bore_half_width = device_radius + CLEARANCE
+        if not device_radius > 0:
+            raise ValueError(f"device_radius is {device_radius} m; it must be positive")
+        self._bore_radius = device_radius + CLEARANCE
         self._axis = _Axis(centreline)
         self._mjcf_root = mjcf.RootElement(model=name)
         self._bore = self._mjcf_root.worldbody.add("body", name="bore")
-        # A body of its own, because the broad phase bounds all geoms of a body
-        # together.
-        self._mouth = self._mjcf_root.worldbody.add("body", name="mouth")
-        faces, outwards = self._axis.sides(self._bore_half_width, link_length)
-        last = len(self._axis.arcs) - 2
-        # Sides of the bore, by piece from the proximal end.
-        self._pieces: list[list] = []
-        for index in range(last + 1):
-            add = self._add_box if index == last else self._add_rod
-            self._pieces.append(
-                [
-                    add(
-                        f"{side}_{index}",
-                        faces[index : index + 2, number],
-                        outwards[index : index + 2, number],
-                        wall,
-                    )
-                    for number, side in enumerate(_SIDES)
-                ]
-            )
+        points, widths = self._axis.bore(self._bore_radius, link_length)
+        self._bore_geom = self._bore.add(
+            "geom",
+            name="bore",
+            **fields.carrier(fields.Bore(points, widths)),
+            **sheath_contact(),
+            mass=0,
+            group=5,
+            rgba=(0, 0, 0, 0),
+        )
+        for index in range(len(self._axis.arcs) - 1):
             self._bore.add(
                 "geom",
                 name=f"tube_{index}",
                 type="cylinder",
                 fromto=self._axis.vertices[index : index + 2].ravel(),
-                size=[self._bore_half_width + _VISIBLE_WALL],
+                size=[self._bore_radius + _VISIBLE_WALL],
                 contype=0,
                 conaffinity=0,
                 mass=0,
                 group=2,
                 rgba=_COLOUR,
             )
-
-    def _add_rod(self, name: str, face: np.ndarray, outwards: np.ndarray, wall: float):
-        """Adds a rod that touches a line (2, 3) of the bore's face from outside."""
-        return self._bore.add(
-            "geom",
-            name=name,
-            type="capsule",
-            fromto=(face + wall * outwards).ravel(),
-            size=[wall],
-            contype=0,
-            conaffinity=0,
-            mass=0,
-            group=3,
-        )
-
-    def _add_box(self, name: str, face: np.ndarray, outwards: np.ndarray, wall: float):
-        """Adds a box whose inner face has a middle line (2, 3)."""
-        along = face[1] - face[0]
-        length = np.linalg.norm(along)
-        along /= length
-        outward = outwards.sum(0) - outwards.sum(0) @ along * along
-        outward /= np.linalg.norm(outward)
-        return self._mouth.add(
-            "geom",
-            name=name,
-            type="box",
-            pos=face.mean(0) + wall / 2 * outward,
-            xyaxes=(*outward, *np.cross(along, outward)),
-            size=(wall / 2, self._bore_half_width + wall, length / 2),
-            **sheath_contact(),
-            mass=0,
-            group=3,
-        )
-
-    def guide(self, catheter: Catheter, start_depth: float) -> None:
-        """Adds the contact pairs of rods and links; both must be attached to one model.
-
-        Args:
-            catheter: the device in the bore.
-            start_depth: distance of the device's head past the mouth at zero insertion,
-                m; negative inside. Only pieces and links that can meet are paired.
-        """
-        contact = self._mjcf_root.root_model.contact
-        lengths = catheter.link_lengths
-        # Distance of the links' proximal ends past the proximal end of the sheath.
-        starts = self.length + start_depth - np.cumsum(lengths[::-1])[::-1]
-        # Bends and the axial compliance shift a link by less than its own length.
-        spare = lengths.max()
-        # All links are paired: with every other link, 1 N on a link makes a depth of
-        # 0.6 mm instead of 0.25 mm.
-        for link, (start, length) in enumerate(zip(starts, lengths, strict=True)):
-            for index, sides in enumerate(self._pieces[:-1]):
-                low, high = self._axis.arcs[index : index + 2]
-                if high < start - spare:
-                    continue
-                if low > start + length + catheter.stroke + spare:
-                    continue
-                for side in sides:
-                    contact.add(
-                        "pair",
-                        name=f"{self._mjcf_root.model}_{side.name}_link_{link}",
-                        geom1=side,
-                        geom2=catheter.link_geoms[link],
-                        # Frictionless for every device: one row a contact.
-                        condim=1,
-                        solref=CONTACT_SOLREF,
-                        solimp=CONTACT_SOLIMP,
-                    )
 
     @property
     def mjcf_model(self) -> mjcf.RootElement:
@@ -181,8 +91,18 @@ class Sheath(composer.Entity):
 
     @property
     def bodies(self) -> tuple:
-        """The static bodies of the sheath: bore and mouth."""
-        return self._bore, self._mouth
+        """The static body of the sheath."""
+        return (self._bore,)
+
+    @property
+    def bore(self):
+        """The geom that carries the bore."""
+        return self._bore_geom
+
+    @property
+    def vertices(self) -> np.ndarray:
+        """Ends (p + 1, 3) of the straight pieces of the axis, m, entity's frame."""
+        return self._axis.vertices
 
     @property
     def length(self) -> float:
@@ -190,19 +110,17 @@ class Sheath(composer.Entity):
         return float(self._axis.arcs[-1])
 
     @property
-    def bore_half_width(self) -> float:
-        """Half the inner width of the straight bore, m."""
-        return self._bore_half_width
+    def bore_radius(self) -> float:
+        """Radius of the bore where it is straight, m."""
+        return self._bore_radius
 
 
 class _Axis:
-    """The line of a sheath as straight pieces with a twist-free frame.
+    """The line of a sheath as straight pieces.
 
     Attributes:
         vertices: (p + 1, 3), ends of the pieces, m.
         arcs: (p + 1,), arc lengths of the vertices, m.
-        tangents: (p + 1, 3), unit directions of the line at the vertices.
-        normals: (p + 1, 2, 3), unit vectors across it, transported without twist.
     """
 
     def __init__(self, centreline: np.ndarray):
@@ -227,8 +145,6 @@ class _Axis:
         chosen = self._pieces()
         self.vertices = self._fine[chosen]
         self.arcs = self._fine_arc[chosen]
-        self.tangents = tangents[chosen]
-        self.normals = _untwisted(tangents)[chosen]
 
     def _check_bends(self, tangents: np.ndarray) -> None:
         # Over a window, because a line given by a few points has corners.
@@ -256,10 +172,6 @@ class _Axis:
                 else:
                     high = middle - 1
             chosen.append(low)
-        # The last piece, the mouth, is straight and short.
-        mouth = last - round(_MOUTH_LENGTH / self._fine_arc[1])
-        if mouth > chosen[-2]:
-            chosen.insert(-1, mouth)
         return chosen
 
     def _deviation(self, start: int, stop: int) -> float:
@@ -268,24 +180,19 @@ class _Axis:
         across = np.cross(offsets, chord / np.linalg.norm(chord))
         return float(np.linalg.norm(across, axis=-1).max())
 
-    def sides(
-        self, half_width: float, link_length: float
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Middle lines of the four faces of the bore, and their outward normals.
+    def bore(self, radius: float, link_length: float) -> tuple[np.ndarray, np.ndarray]:
+        """Axis and radii of a bore that lets a chord pass.
 
         Args:
-            half_width: from the axis to a face where the line is straight, m.
-            link_length: length of the chord that must fit into the bore, m.
+            radius: radius where the line is straight, m.
+            link_length: chord that the bore must let pass, m.
 
         Returns:
-            points (p + 1, 4, 3) of the faces, m; unit vectors (p + 1, 4, 3) from the
-            axis to them.
+            points (p + 1, 3) and radii (p + 1,), m.
         """
         inwards = self._sagitta(link_length)
-        outwards = np.einsum("sa,pad->psd", list(_SIDES.values()), self.normals)
-        wider = np.maximum(np.einsum("psd,pd->ps", outwards, inwards), 0.0)
-        faces = self.vertices[:, None] + (half_width + wider)[..., None] * outwards
-        return faces, outwards
+        wider = np.linalg.norm(inwards, axis=-1) / 2
+        return self.vertices + inwards / 2, radius + wider
 
     def _sagitta(self, chord: float) -> np.ndarray:
         """Vectors (p + 1, 3) from the line to the middle of a chord of it, m."""
@@ -301,16 +208,3 @@ class _Axis:
             )
 
         return (at(arcs - half) + at(arcs + half)) / 2 - at(arcs)
-
-
-def _untwisted(tangents: np.ndarray) -> np.ndarray:
-    """Two normals (n, 2, 3) transported along unit tangents (n, 3) without twist."""
-    x = np.array([1.0, 0.0, 0.0])
-    if abs(tangents[0] @ x) > 0.9:
-        x = np.array([0.0, 0.0, -1.0])
-    normals = np.empty((len(tangents), 2, 3))
-    for index, tangent in enumerate(tangents):
-        x = x - (x @ tangent) * tangent
-        x /= np.linalg.norm(x)
-        normals[index] = x, np.cross(tangent, x)
-    return normals

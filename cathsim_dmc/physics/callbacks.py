@@ -11,8 +11,8 @@ from collections.abc import Callable
 
 import mujoco
 
+from cathsim_dmc.collision import native
 from cathsim_dmc.compiled import compiled
-from cathsim_dmc.physics import native
 from cathsim_dmc.physics.effects import MARK, Bodies
 
 # Links refer to each other: none is kept on disk.

@@ -6,24 +6,30 @@ the browser is one of them.
 
 from __future__ import annotations
 
+import itertools
 import json
 import os
+from collections.abc import Iterator
 from importlib import metadata
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from dm_control import mjcf
 from lxml import etree
 
 from cathsim_dmc import bounds, suite
 from cathsim_dmc.entities.phantom import read_mesh_file
+from cathsim_dmc.entities.sheath import Sheath
 from cathsim_dmc.files import atomic_directory
 from cathsim_dmc.physics.forces import CONTACT_SIZE
 from cathsim_dmc.tasks.navigation import Navigation
 from cathsim_dmc.tasks.objectives import Cannulation
+from cathsim_dmc.tasks.scene import Scene
 
 FORMAT = 1
 SCENE, TASK = "scene.xml", "task.json"
+_SIDE = 8e-3  # m, thickness of the boxes around the bore of the sheath
 
 
 def write_mjcf(
@@ -35,9 +41,9 @@ def write_mjcf(
 ) -> Path:
     """Write the scene of a task and the start of one of its episodes.
 
-    `scene.xml` holds everything that the task simulates, meshes included, with as many
-    digits as were compiled: stepped with the same actions it moves as the task does,
-    bit for bit, on the same version of MuJoCo. `task.json` says how, see `describe`.
+    `scene.xml` is a file of plain MuJoCo: convex pieces stand for the wall, and boxes
+    for the bore of the sheath, whose fields only this package knows. Stepped with the
+    same actions it moves nearly as the task does. `task.json` says how, see `describe`.
 
     Args:
         task: Name of a task of `suite.SUITE`.
@@ -76,7 +82,7 @@ def write_mjcf(
     directory.parent.mkdir(parents=True, exist_ok=True)
     with atomic_directory(directory) as folder:
         mjcf.export_with_assets(env.task.root_entity.mjcf_model, folder, SCENE)
-        _in_one_file(folder / SCENE)
+        _in_one_file(folder / SCENE, env.task.scene)
         (folder / TASK).write_text(json.dumps(values, indent=1) + "\n")
     return directory
 
@@ -132,27 +138,71 @@ def describe(env: Any) -> dict[str, Any]:
     }
 
 
-def _in_one_file(scene: Path) -> None:
-    """Writes the meshes into the scene, and drops what older versions refuse.
+def _in_one_file(path: Path, scene: Scene) -> None:
+    """Writes meshes and convex walls into the scene, drops what older versions refuse.
 
     MuJoCo up to 3.14 refuses a defaults class of textures. Nothing is lost: PyMJCF
     names a class in every element, and has none of textures.
     """
-    tree = etree.parse(str(scene))
+    tree = etree.parse(str(path))
     for texture in tree.iter("texture"):
         texture.attrib.pop("class", None)
-    files = set()  # two equal pieces share one
+    files = set()
     for mesh in tree.iterfind("asset/mesh[@file]"):
-        file = scene.parent / mesh.attrib.pop("file")
+        file = path.parent / mesh.attrib.pop("file")
         files.add(file)
         vertices, faces = read_mesh_file(file.read_bytes())
-        # Nine digits tell every float32.
-        mesh.set("vertex", " ".join(f"{x:.9g}" for x in vertices.ravel().tolist()))
-        if len(faces):
-            mesh.set("face", " ".join(map(str, faces.ravel().tolist())))
+        mesh.set("vertex", _text(vertices))
+        mesh.set("face", " ".join(map(str, faces.ravel().tolist())))
+    carrier = tree.find(".//geom[@name='wall']")
+    for number, piece in enumerate(scene.anatomy.wall):
+        name = f"wall_{number:03d}"
+        etree.SubElement(
+            tree.find("asset"), "mesh", name=name, vertex=_text(piece), inertia="shell"
+        )
+        geom = etree.SubElement(carrier.getparent(), "geom", dict(carrier.attrib))
+        geom.attrib.update({"name": name, "type": "mesh", "mesh": name, "group": "3"})
+        for attribute in ("pos", "size", "user"):
+            del geom.attrib[attribute]
+    carrier.getparent().remove(carrier)
+    carrier = tree.find(f".//geom[@name='{scene.sheath.bore.full_identifier}']")
+    for number, side in enumerate(_sides(scene.sheath)):
+        geom = etree.SubElement(carrier.getparent(), "geom", dict(carrier.attrib))
+        name = f"{carrier.get('name')}_{number}"
+        geom.attrib.update({"name": name, "group": "3", **side})
+        del geom.attrib["user"]
+    carrier.getparent().remove(carrier)
     for file in files:
         file.unlink()
-    tree.write(str(scene))
+    tree.write(str(path))
+
+
+def _text(points: np.ndarray) -> str:
+    """Coordinates as text; nine digits tell every float32."""
+    return " ".join(f"{x:.9g}" for x in np.ravel(points).tolist())
+
+
+def _sides(sheath: Sheath) -> Iterator[dict[str, str]]:
+    """Attributes of boxes around the straight pieces of a sheath's bore."""
+    for start, stop in itertools.pairwise(sheath.vertices):
+        along = (stop - start) / np.linalg.norm(stop - start)
+        first = np.cross(along, np.eye(3)[np.argmin(np.abs(along))])
+        first /= np.linalg.norm(first)
+        half = (
+            _SIDE / 2,
+            sheath.bore_radius + _SIDE,
+            float(np.linalg.norm(stop - start)) / 2,
+        )
+        for turn in range(4):
+            angle = turn * np.pi / 2
+            out = np.cos(angle) * first + np.sin(angle) * np.cross(along, first)
+            middle = (start + stop) / 2 + (sheath.bore_radius + _SIDE / 2) * out
+            yield {
+                "type": "box",
+                "pos": _text(middle),
+                "xyaxes": _text(np.concatenate([out, np.cross(along, out)])),
+                "size": _text(np.array(half)),
+            }
 
 
 def _branch(objective: Any) -> dict[str, Any] | None:

@@ -19,6 +19,8 @@ from cathsim_dmc.tasks import placement
 from cathsim_dmc.tasks.config import NavigationConfig
 from cathsim_dmc.tasks.objectives import GOAL_RADIUS
 
+# Wall of the sheath, m: what a tilted one needs of the hole by which it comes in.
+_AROUND_SHEATH = 2e-3
 # Joints of the shaft that twist, where the base turns.
 _TORSION_JOINTS = 4
 
@@ -117,8 +119,9 @@ class Scene:
                 quat=place.quaternion,
             )
             self.arena.attach(entity, site)
-        self.sheath.guide(self.catheter, place.start_depth)
-        self.phantom.add_wall(self.catheter.links[0])
+        self.phantom.add_wall(
+            self.catheter.links[0], self.sheath.bore_radius + _AROUND_SHEATH
+        )
         placement.add_cameras(self.arena, self.anatomy)
 
     @property

@@ -36,8 +36,8 @@ class Pressed(NamedTuple):
 
 def pressed(
     load: float,
-    solref: tuple[float, ...] = contact.COAXIAL_SOLREF,
-    solimp: tuple[float, ...] = contact.COAXIAL_SOLIMP,
+    solref: tuple[float, ...] = contact.CONTACT_SOLREF,
+    solimp: tuple[float, ...] = contact.CONTACT_SOLIMP,
 ) -> Pressed:
     """Presses a mass on a plane, by the integrator and time step of the tasks.
 

@@ -7,8 +7,7 @@ import math
 import numpy as np
 
 from cathsim_dmc.anatomy.field_loops import FREE, clearance_at, gradient_at
-from cathsim_dmc.compiled import compiled
-from cathsim_dmc.physics.native import (
+from cathsim_dmc.collision.native import (
     address_of,
     call_collision,
     call_error,
@@ -19,6 +18,7 @@ from cathsim_dmc.physics.native import (
     wholes,
     word,
 )
+from cathsim_dmc.compiled import compiled
 
 # Words in the head of the table: offsets in mjModel and mjData, the functions that
 # stood in MuJoCo's collision table, and how an error is raised.
@@ -51,8 +51,6 @@ symbol(SYMBOL, TABLE)
 
 _EVERY = 1e-3  # m, apart are the places of a capsule that are looked at first
 _PLACES = 65  # at most
-_SEARCHES = 8  # of a golden section
-_GOLDEN = 0.6180339887498949
 # A dent of the clearance must be so deep, m, to be a contact of its own: a capsule
 # that lies flat on a wall has many that are none.
 _DENT = 5e-6
@@ -60,10 +58,15 @@ _FLAT = 2e-6
 _ASIDE = 0.4e-3  # m, to both sides, from where the planes of a hollow wall are taken
 _MOST = 4  # contacts of a capsule and a box; more are fatal
 _HOLLOW = 5e-6  # m, least distance of their edge from the wall
+_CORNER = -0.3  # slope of the clearance beside a place in a corner
 _STEP = 0.25e-3  # m, to both sides, over which the wall's normal is taken
 _FAR = 1e-3  # m, by which the coarse lattice may be wrong far from the wall
 _COUNT = 1 << 40  # more than any array has; nothing checks it
 _JOINED = 1e-6  # m
+# A link this close, m, is held: between contacts under load, one physics step without
+# any lets the light tip jump by most of a millimetre.
+_TOUCH = 2e-5
+_AT_WALL = -1e-9  # m, the depth of a link so close
 
 
 @compiled
@@ -148,29 +151,6 @@ def away(entry, x, y, z, out):
 
 
 @compiled
-def at_least(entry, centre, axis, low, high, out):
-    """Place (m along a capsule) between two where the clearance is least, and it."""
-    one, two = high - _GOLDEN * (high - low), low + _GOLDEN * (high - low)
-    c, a = centre, axis
-    f1 = clearance(entry, c[0] + one * a[0], c[1] + one * a[1], c[2] + one * a[2], out)
-    f2 = clearance(entry, c[0] + two * a[0], c[1] + two * a[1], c[2] + two * a[2], out)
-    for _ in range(_SEARCHES):
-        if f1 < f2:
-            high, two, f2 = two, one, f1
-            one = high - _GOLDEN * (high - low)
-            f1 = clearance(
-                entry, c[0] + one * a[0], c[1] + one * a[1], c[2] + one * a[2], out
-            )
-        else:
-            low, one, f1 = one, two, f2
-            two = low + _GOLDEN * (high - low)
-            f2 = clearance(
-                entry, c[0] + two * a[0], c[1] + two * a[1], c[2] + two * a[2], out
-            )
-    return (one, f1) if f1 < f2 else (two, f2)
-
-
-@compiled
 def dented(values, count, i):
     """Whether the clearance rises by `_DENT` on both sides of a place."""
     for way in (-1, 1):
@@ -181,6 +161,55 @@ def dented(values, count, i):
         if rise < _DENT:
             return False
     return True
+
+
+@compiled
+def straight(entry):
+    """Whether an entry is a bore with one piece."""
+    return word(entry + 8) == BORE and numbers(word(entry + 24), 1)[0] == 2.0
+
+
+@compiled
+def in_straight_bore(head, centre, axis, half, closed, limit, places, depths):
+    """As `touches`, in a bore with one piece: nearest to it are ends, or its rim.
+
+    Within, the clearance is a concave function of the place along the capsule.
+    """
+    dx, dy, dz = head[5] - head[1], head[6] - head[2], head[7] - head[3]
+    length = math.sqrt(dx * dx + dy * dy + dz * dz)
+    dx, dy, dz = dx / length, dy / length, dz / length
+    level = (
+        (centre[0] - head[1]) * dx
+        + (centre[1] - head[2]) * dy
+        + (centre[2] - head[3]) * dz
+    )
+    rate = axis[0] * dx + axis[1] * dy + axis[2] * dz
+    low, high, first, second = -half, half, closed[0], closed[1]
+    if abs(rate) > 1e-9:
+        near, far = -level / rate, (length - level) / rate
+        near, far = min(near, far), max(near, far)
+        if near > low:
+            low, first = near, True
+        if far < high:
+            high, second = far, True
+    elif not 0.0 <= level <= length:
+        return 0
+    found = 0
+    for end in range(2):
+        t = high if end else low
+        if low > high or not (second if end else first) or (end and half == 0.0):
+            continue
+        px = centre[0] + t * axis[0] - head[1]
+        py = centre[1] + t * axis[1] - head[2]
+        pz = centre[2] + t * axis[2] - head[3]
+        along = px * dx + py * dy + pz * dz
+        qx, qy, qz = px - along * dx, py - along * dy, pz - along * dz
+        radius = head[4] + (head[8] - head[4]) * along / length
+        value = radius - math.sqrt(qx * qx + qy * qy + qz * qz)
+        if value <= limit:
+            places[found], depths[found] = t, value
+            found += 1
+    return found
 
 
 @compiled
@@ -200,25 +229,45 @@ def touches(entry, centre, axis, half, closed, limit, places, depths):
     Returns:
         Number of places.
     """
+    if straight(entry):
+        head = numbers(word(entry + 24), _COUNT)
+        return in_straight_bore(head, centre, axis, half, closed, limit, places, depths)
     out = np.empty(3)
     middle = clearance(entry, centre[0], centre[1], centre[2], out)
     if middle < FREE and middle - half > limit + _FAR:
         return 0
+    if middle >= FREE and half > 0.0:
+        ends_free = True
+        for way in (-half, half):
+            x, y, z = (
+                centre[0] + way * axis[0],
+                centre[1] + way * axis[1],
+                centre[2] + way * axis[2],
+            )
+            ends_free &= clearance(entry, x, y, z, out) >= FREE
+        if ends_free:
+            return 0
     count = 1
     if half > 0.0:
         count += min(max(int(math.ceil(2.0 * half / _EVERY)), 2), _PLACES - 1)
     values = np.empty(_PLACES)
     step = 2.0 * half / max(count - 1, 1)
-    least = np.inf
-    for i in range(count):
+    least, i = np.inf, 0
+    while i < count:
         t = -half + i * step
         x, y, z = (
             centre[0] + t * axis[0],
             centre[1] + t * axis[1],
             centre[2] + t * axis[2],
         )
-        values[i] = clearance(entry, x, y, z, out)
-        least = min(least, values[i])
+        value = values[i] = clearance(entry, x, y, z, out)
+        least = min(least, value)
+        i += 1
+        # The clearance changes by at most the way, but where an open end begins.
+        while i < count and value < FREE and value - step > limit + _FAR:
+            value -= step
+            values[i] = value
+            i += 1
     if least > limit + step:
         return 0
     found = 0
@@ -235,9 +284,18 @@ def touches(entry, centre, axis, half, closed, limit, places, depths):
         if value > limit + step:
             continue
         if 0 < i < count - 1:
-            place, lower = at_least(entry, centre, axis, t - step, t + step, out)
-            if lower < value:
-                t, value = place, lower
+            # The lowest point of the parabola through three places.
+            bend = values[i - 1] - 2.0 * value + values[i + 1]
+            if bend > 0.0:
+                place = t + 0.5 * step * (values[i - 1] - values[i + 1]) / bend
+                x, y, z = (
+                    centre[0] + place * axis[0],
+                    centre[1] + place * axis[1],
+                    centre[2] + place * axis[2],
+                )
+                lower = clearance(entry, x, y, z, out)
+                if lower < value:
+                    t, value = place, lower
         if value > limit:
             continue
         # The two that are nearest to the wall, in the order of the axis.
@@ -262,7 +320,7 @@ def tangents(entry, place, axis, normal, depth, limit, turns, rows):
     f / r that no implicit step knows of, and throws light links to and fro. The wall
     is then two planes that touch it to both sides: the field made linear there.
     """
-    found, side, out = 0, np.empty((2, 4)), np.empty(3)
+    found, out, side = 0, np.empty(3), np.empty((2, 4))
     for turn in range(turns):
         bx = axis[1] * normal[2] - axis[2] * normal[1]
         by = axis[2] * normal[0] - axis[0] * normal[2]
@@ -276,22 +334,39 @@ def tangents(entry, place, axis, normal, depth, limit, turns, rows):
         length = math.sqrt(bx * bx + by * by + bz * bz)
         if length < 0.1:
             continue
-        bx, by, bz = _ASIDE * bx / length, _ASIDE * by / length, _ASIDE * bz / length
-        hollow = True
+        bx, by, bz = bx / length, by / length, bz / length
+        dx, dy, dz = _ASIDE * bx, _ASIDE * by, _ASIDE * bz
+        low = clearance(entry, place[0] - dx, place[1] - dy, place[2] - dz, out)
+        high = clearance(entry, place[0] + dx, place[1] + dy, place[2] + dz, out)
+        if low >= FREE or high >= FREE:
+            continue
+        # To both sides the clearance slopes by its bend, times the way there.
+        rise = 0.5 * (low + high) - depth
+        slope = 2.0 * rise / _ASIDE
+        if rise >= -_HOLLOW:
+            continue
+        corner = slope < _CORNER
         for row in range(2):
             way = 2.0 * row - 1.0
-            x, y, z = place[0] + way * bx, place[1] + way * by, place[2] + way * bz
-            there = clearance(entry, x, y, z, out)
-            if there >= FREE or not away(entry, x, y, z, out):
-                hollow = False
-                break
-            side[row, :3] = out
-            side[row, 3] = there - way * (out[0] * bx + out[1] * by + out[2] * bz)
-            hollow = hollow and side[row, 3] > depth + _HOLLOW
-        # Moved so that their edge lies at the true depth.
-        excess = 0.5 * (side[0, 3] + side[1, 3]) - depth
+            there = high if row else low
+            if corner:
+                x, y, z = place[0] + way * dx, place[1] + way * dy, place[2] + way * dz
+                if not away(entry, x, y, z, out):
+                    return 0
+                side[row, :3] = out
+                side[row, 3] = there - way * (out[0] * dx + out[1] * dy + out[2] * dz)
+            else:
+                size = math.sqrt(1.0 + slope * slope)
+                side[row, 0] = (normal[0] + way * slope * bx) / size
+                side[row, 1] = (normal[1] + way * slope * by) / size
+                side[row, 2] = (normal[2] + way * slope * bz) / size
+                side[row, 3] = there - slope / size * _ASIDE
+        # Planes of a smooth wall are moved so that their edge lies at the true depth.
+        excess = 0.0
+        if not corner:
+            excess = 0.5 * (side[0, 3] + side[1, 3]) - depth
         for row in range(2):
-            if hollow and side[row, 3] - excess <= limit:
+            if side[row, 3] - excess <= limit:
                 rows[found] = side[row]
                 rows[found, 3] -= excess
                 found += 1
@@ -359,7 +434,10 @@ def collide(model, data, contacts, geom1, geom2, margin, before):
             local[k] += frame[3 * i + k] * (centre[i] - origin[i])
             axis[k] += frame[3 * i + k] * turned[3 * i + 2]
     alongs, depths = np.empty(2), np.empty(2)
-    found = touches(entry, local, axis, half, closed, radius + margin, alongs, depths)
+    # A straight sheath holds the shaft without any load.
+    near = 0.0 if margin > 0.0 or straight(entry) else _TOUCH
+    limit = radius + margin + near
+    found = touches(entry, local, axis, half, closed, limit, alongs, depths)
     written = 0
     for n in range(found):
         for k in range(3):
@@ -368,14 +446,12 @@ def collide(model, data, contacts, geom1, geom2, margin, before):
             continue
         # A sphere may have one contact, so one plane.
         around = 0 if half == 0.0 else 1 + int(abs(alongs[n]) >= half)
-        planes = tangents(
-            entry, place, axis, normal, depths[n], radius + margin, around, rows
-        )
+        planes = tangents(entry, place, axis, normal, depths[n], limit, around, rows)
         for plane in range(min(planes, _MOST - written)):
             contact = numbers(contacts + 80 * written, 10)
             distance = rows[plane, 3] - radius
             reach = radius + 0.5 * distance
-            contact[0] = distance
+            contact[0] = min(distance, _AT_WALL) if near > 0.0 else distance
             for k in range(3):
                 towards = 0.0
                 for i in range(3):

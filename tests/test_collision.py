@@ -12,7 +12,7 @@ from mujoco.batch import Batch
 from cathsim_dmc.anatomy.centreline import Centreline, Vessel, VesselTree
 from cathsim_dmc.anatomy.field import Field
 from cathsim_dmc.anatomy.parts import End
-from cathsim_dmc.physics import contact
+from cathsim_dmc.collision import fields
 
 RADIUS, DEVICE, HALF = 5e-3, 0.8e-3, 3.5e-3
 
@@ -36,7 +36,7 @@ def numbers(values):
 
 
 def carrier(field, name="wall", more=""):
-    made = contact.carrier(field)
+    made = fields.carrier(field)
     values = " ".join(
         f'{key}="{value if key == "type" else numbers(value)}"'
         for key, value in made.items()
@@ -149,7 +149,7 @@ def test_a_joint_is_touched_once(tube):
 
 
 def test_a_bore_is_exact_and_frictionless():
-    bore = contact.Bore(np.array([(0, 0, -50e-3), (0, 0, 0)]), 1.2e-3)
+    bore = fields.Bore(np.array([(0, 0, -50e-3), (0, 0, 0)]), 1.2e-3)
     inside = (0.5e-3, 0, -20e-3)
     body = carrier(bore, more='condim="1" priority="1"') + capsule(inside)
     found = contacts_of(body)
@@ -167,14 +167,14 @@ def test_force_over_depth_is_the_stiffness_asked_for(tube, load):
         body = f"""<body pos="{RADIUS - DEVICE} 0 30e-3">
             <joint type="slide" axis="1 0 0"/><geom name="ball" type="sphere"
             size="{DEVICE}" mass="{mass}" contype="0" conaffinity="1" priority="1"
-            solimp="{numbers(contact.solimp())}"
+            solimp="{numbers(fields.solimp())}"
             friction="0 0 0"/></body>"""
         model, data = compiled(
             carrier(tube) + body,
             'gravity="0 0 0" integrator="discrete" cone="elliptic"',
         )
         ball = model.geom("ball").id
-        model.geom_solref[ball] = contact.springs(
+        model.geom_solref[ball] = fields.springs(
             model, np.array([ball]), stiffness, 0.02
         )
         data.qfrc_applied[0] = load
@@ -190,12 +190,12 @@ def test_a_light_link_pressed_into_a_hollow_comes_to_rest(tube):
     body = f"""<body pos="{RADIUS - DEVICE} 0 30e-3"><joint type="slide" axis="1 0 0"/>
         <joint name="side" type="slide" axis="0 1 0"/><geom name="link" type="capsule"
         size="{DEVICE} {HALF}" mass="1e-4" contype="0" conaffinity="1" priority="1"
-        solimp="{numbers(contact.solimp())}" friction="0 0 0"/></body>"""
+        solimp="{numbers(fields.solimp())}" friction="0 0 0"/></body>"""
     model, data = compiled(
         carrier(tube) + body, 'gravity="0 0 0" integrator="discrete" cone="elliptic"'
     )
     link = np.array([model.geom("link").id])
-    model.geom_solref[link] = contact.springs(model, link, 1000.0, 0.02)
+    model.geom_solref[link] = fields.springs(model, link, 1000.0, 0.02)
     data.qfrc_applied[0], data.qpos[1] = 0.5, 0.1e-3
     speeds = []
     for _ in range(300):
@@ -228,8 +228,8 @@ def test_copies_and_models_of_a_batch_keep_their_fields(tube):
     other = Field.from_tree(tree_along(np.linspace((0, 0, 0), (0, 0, 60e-3), 61), 4e-3))
     model, _ = rolling(tube)
     narrow = copy.copy(model)
-    narrow.geom_user[model.geom("wall").id] = contact.register(other)
-    contact.check(narrow)
+    narrow.geom_user[model.geom("wall").id] = fields.register(other)
+    fields.check(narrow)
     alone = []
     for each in (model, narrow):
         data = mujoco.MjData(each)
@@ -262,8 +262,8 @@ print(data.qpos.tobytes().hex(), data.qacc.tobytes().hex())
 def test_other_models_are_untouched_bit_for_bit():
     """In a process that has a field, and in one that has none."""
     register = (
-        "from cathsim_dmc.physics import contact\n"
-        "contact.register(contact.Bore(np.array([(0, 0, 0), (0, 0, 1)]), 0.1))\n"
+        "from cathsim_dmc.collision import fields\n"
+        "fields.register(fields.Bore(np.array([(0, 0, 0), (0, 0, 1)]), 0.1))\n"
     )
     answers = [
         subprocess.run(
@@ -283,7 +283,7 @@ def test_a_model_without_its_field_does_not_run(tube):
     with pytest.raises(mujoco.FatalError, match="carries a field that this process"):
         mujoco.mj_step(model, data)
     with pytest.raises(ValueError, match="'wall' carries a field that this process"):
-        contact.check(model)
+        fields.check(model)
 
 
 def test_a_saved_model_finds_its_field_again(tube, tmp_path):
@@ -291,7 +291,7 @@ def test_a_saved_model_finds_its_field_again(tube, tmp_path):
     path = tmp_path / "saved.xml"
     mujoco.mj_saveLastXML(str(path), model)
     again = mujoco.MjModel.from_xml_path(str(path))
-    contact.check(again)
+    fields.check(again)
     data = mujoco.MjData(again)
     for _ in range(60):
         mujoco.mj_step(again, data)
@@ -309,6 +309,6 @@ def test_what_a_field_cannot_meet_is_refused(tube):
     )
     model, _ = compiled(body)
     with pytest.raises(ValueError, match="'cube' cannot touch the field"):
-        contact.check(model)
+        fields.check(model)
     with pytest.raises(ValueError, match="radii 0 m"):
-        contact.Bore(np.array([(0, 0, 0), (0, 0, 1)]), 0.0)
+        fields.Bore(np.array([(0, 0, 0), (0, 0, 1)]), 0.0)

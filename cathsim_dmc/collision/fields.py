@@ -25,7 +25,7 @@ from cathsim_dmc.anatomy.field import Field
 
 _MESSAGE = (
     b"geom %d carries a field that this process does not know; register it "
-    b"(cathsim_dmc.physics.contact.register) or load the task anew"
+    b"(cathsim_dmc.collision.fields.register) or load the task anew"
 )
 _CAPSULE = int(mujoco.mjtGeom.mjGEOM_CAPSULE)
 _SPHERE = int(mujoco.mjtGeom.mjGEOM_SPHERE)
@@ -71,8 +71,7 @@ class _Table:
     """The process's fields, by their keys, where compiled functions find them."""
 
     def __init__(self):
-        from cathsim_dmc.physics import contact_loops as loops
-        from cathsim_dmc.physics import native
+        from cathsim_dmc.collision import loops, native
 
         self._words = loops.TABLE
         # The arrays whose addresses are in the table, for as long as the process.
@@ -100,7 +99,7 @@ class _Table:
         self, key: int, kind: int, middle: np.ndarray, arrays: Sequence[np.ndarray]
     ) -> None:
         """Adds an entry, unless there is one."""
-        from cathsim_dmc.physics.contact_loops import CAPACITY, ENTRY, HEAD
+        from cathsim_dmc.collision.loops import CAPACITY, ENTRY, HEAD
 
         if key in self._kept:
             return
@@ -142,7 +141,7 @@ def register(field: Field | Bore) -> tuple[float, ...]:
     Returns:
         What the `geom_user` of its carrier is to hold.
     """
-    from cathsim_dmc.physics.contact_loops import BORE, LUMEN, MARK, PART
+    from cathsim_dmc.collision.loops import BORE, LUMEN, MARK, PART
 
     digest = _digest(field)
     parts = [int.from_bytes(digest[3 * k : 3 * k + 3], "big") % PART for k in range(3)]
@@ -171,7 +170,7 @@ def check(model: mujoco.MjModel) -> None:
         ValueError: if a carrier's field is unknown, or something other than capsules
             and spheres can touch it; names the geoms.
     """
-    from cathsim_dmc.physics.contact_loops import MARK, USER
+    from cathsim_dmc.collision.loops import MARK, USER
 
     if model.nuser_geom < USER:
         return
@@ -228,7 +227,7 @@ def solimp() -> tuple[float, ...]:
 
 
 def _key(parts: Sequence[int]) -> int:
-    from cathsim_dmc.physics.contact_loops import PART
+    from cathsim_dmc.collision.loops import PART
 
     return (parts[0] * PART + parts[1]) * PART + parts[2]
 

@@ -6,7 +6,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from cathsim_dmc.physics import native
+from cathsim_dmc.collision import native
 
 XML = """
 <mujoco>

@@ -1,0 +1,1 @@
+"""Contact of devices with fields, through the collision table of MuJoCo."""
