@@ -306,7 +306,7 @@ BAD = {
     "nothing to resume": ([*TRAIN, "--resume"], ["no run in OUT to resume"]),
     "settings as JSON": ([*TRAIN, "--settings", "{}"], ["--settings"]),
     "no such scan": (
-        ["phantom", "import", "OUT.obj", "--centreline", "OUT.csv", "--out", "OUT"],
+        ["phantom", "import", "OUT.obj", "--out", "OUT"],
         ["OUT.obj", "no mesh file", "STL"],
     ),
     "no such checkpoint": (["eval", "OUT"], ["no checkpoint", "OUT"]),
