@@ -63,6 +63,7 @@ _STEP = 0.25e-3  # m, to both sides, over which the wall's normal is taken
 _FAR = 1e-3  # m, by which the coarse lattice may be wrong far from the wall
 _COUNT = 1 << 40  # more than any array has; nothing checks it
 _JOINED = 1e-6  # m
+NONE = (0, 0.0, FREE, 0.0, FREE)  # of `touches`
 # A link this close, m, is held: between contacts under load, one physics step without
 # any lets the light tip jump by most of a millimetre.
 _TOUCH = 2e-5
@@ -85,10 +86,10 @@ def entry_of(table, key):
 
 
 @compiled
-def bore_at(head, x, y, z, out):
-    """Clearance in a bore around a line, m, and where its axis is nearest, in `out`."""
+def bore_at(head, x, y, z):
+    """Clearance in a bore around a line, m, and the way (3) m to the nearest place."""
     count = int(head[0])
-    best, value = np.inf, FREE
+    best, value, way = np.inf, FREE, (0.0, 0.0, 0.0)
     for k in range(count - 1):
         a, b = 1 + 4 * k, 5 + 4 * k
         dx, dy, dz = (
@@ -107,16 +108,16 @@ def bore_at(head, x, y, z, out):
             value = FREE
             if not beyond:
                 value = (1.0 - u) * head[a + 3] + u * head[b + 3] - math.sqrt(square)
-            out[0], out[1], out[2] = -qx, -qy, -qz
-    return value
+            way = (-qx, -qy, -qz)
+    return value, way
 
 
 @compiled
-def clearance(entry, x, y, z, out):
+def clearance(entry, x, y, z):
     """Distance (m) from the wall of an entry's field, `FREE` past its open ends."""
     head = numbers(word(entry + 24), _COUNT)
     if word(entry + 8) == BORE:
-        return bore_at(head, x, y, z, out)
+        return bore_at(head, x, y, z)[0]
     return clearance_at(
         head,
         shorts(word(entry + 32), _COUNT),
@@ -129,25 +130,37 @@ def clearance(entry, x, y, z, out):
 
 
 @compiled
-def away(entry, x, y, z, out):
-    """Unit vector away from the wall in `out`; whether there is one."""
+def away(entry, x, y, z):
+    """Unit vector (3) away from the wall; zeros where there is none."""
     head = numbers(word(entry + 24), _COUNT)
     if word(entry + 8) == BORE:
-        bore_at(head, x, y, z, out)
+        way = bore_at(head, x, y, z)[1]
     else:
         coarse = shorts(word(entry + 32), _COUNT)
         index = wholes(word(entry + 40), _COUNT)
         samples = shorts(word(entry + 48), _COUNT)
-        out[0], out[1], out[2] = gradient_at(
-            head, coarse, index, samples, x, y, z, _STEP
-        )
-    length = math.sqrt(out[0] ** 2 + out[1] ** 2 + out[2] ** 2)
+        way = gradient_at(head, coarse, index, samples, x, y, z, _STEP)
+    length = math.sqrt(way[0] ** 2 + way[1] ** 2 + way[2] ** 2)
     if length < 1e-12:
-        return False
-    out[0] /= length
-    out[1] /= length
-    out[2] /= length
-    return True
+        return (0.0, 0.0, 0.0)
+    return (way[0] / length, way[1] / length, way[2] / length)
+
+
+@compiled
+def along(centre, axis, t):
+    """Place (3) m along a capsule's axis."""
+    return (
+        centre[0] + t * axis[0],
+        centre[1] + t * axis[1],
+        centre[2] + t * axis[2],
+    )
+
+
+@compiled
+def clearance_along(entry, centre, axis, t):
+    """Clearance (m) of a place along a capsule's axis."""
+    x, y, z = along(centre, axis, t)
+    return clearance(entry, x, y, z)
 
 
 @compiled
@@ -170,7 +183,7 @@ def straight(entry):
 
 
 @compiled
-def in_straight_bore(head, centre, axis, half, closed, limit, places, depths):
+def in_straight_bore(head, centre, axis, half, closed, limit):
     """As `touches`, in a bore with one piece: nearest to it are ends, or its rim.
 
     Within, the clearance is a concave function of the place along the capsule.
@@ -193,74 +206,64 @@ def in_straight_bore(head, centre, axis, half, closed, limit, places, depths):
         if far < high:
             high, second = far, True
     elif not 0.0 <= level <= length:
-        return 0
-    found = 0
-    for end in range(2):
-        t = high if end else low
-        if low > high or not (second if end else first) or (end and half == 0.0):
+        return NONE
+    if low > high:
+        return NONE
+    lower, higher = FREE, FREE
+    for end in range(1 if half == 0.0 else 2):
+        if not (second if end else first):
             continue
-        px = centre[0] + t * axis[0] - head[1]
-        py = centre[1] + t * axis[1] - head[2]
-        pz = centre[2] + t * axis[2] - head[3]
-        along = px * dx + py * dy + pz * dz
-        qx, qy, qz = px - along * dx, py - along * dy, pz - along * dz
-        radius = head[4] + (head[8] - head[4]) * along / length
+        x, y, z = along(centre, axis, high if end else low)
+        px, py, pz = x - head[1], y - head[2], z - head[3]
+        way = px * dx + py * dy + pz * dz
+        qx, qy, qz = px - way * dx, py - way * dy, pz - way * dz
+        radius = head[4] + (head[8] - head[4]) * way / length
         value = radius - math.sqrt(qx * qx + qy * qy + qz * qz)
-        if value <= limit:
-            places[found], depths[found] = t, value
-            found += 1
-    return found
+        if end:
+            higher = value
+        else:
+            lower = value
+    if lower > limit:
+        return (int(higher <= limit), high, higher, 0.0, FREE)
+    return (1 + int(higher <= limit), low, lower, high, higher)
 
 
 @compiled
-def touches(entry, centre, axis, half, closed, limit, places, depths):
+def touches(entry, centre, axis, half, closed, limit):
     """Places of a capsule's axis that are nearest to the wall, two at most.
 
     Args:
         entry: address of the field's entry.
-        centre: (3,) m, of the capsule.
-        axis: (3,) unit vector along it.
+        centre: (3) m, of the capsule.
+        axis: (3) unit vector along it.
         half: m, half its length without the round ends.
-        closed: (2,) whether the ends at -half and half are looked at.
+        closed: (2) whether the ends at -half and half are looked at.
         limit: m; what is farther from the wall does not count.
-        places: (2,) m along the axis, out.
-        depths: (2,) m, clearances of the axis there, out.
 
     Returns:
-        Number of places.
+        Number of places; of each, m along the axis and the clearance there, m.
     """
     if straight(entry):
         head = numbers(word(entry + 24), _COUNT)
-        return in_straight_bore(head, centre, axis, half, closed, limit, places, depths)
-    out = np.empty(3)
-    middle = clearance(entry, centre[0], centre[1], centre[2], out)
+        return in_straight_bore(head, centre, axis, half, closed, limit)
+    middle = clearance(entry, centre[0], centre[1], centre[2])
     if middle < FREE and middle - half > limit + _FAR:
-        return 0
-    if middle >= FREE and half > 0.0:
-        ends_free = True
-        for way in (-half, half):
-            x, y, z = (
-                centre[0] + way * axis[0],
-                centre[1] + way * axis[1],
-                centre[2] + way * axis[2],
-            )
-            ends_free &= clearance(entry, x, y, z, out) >= FREE
-        if ends_free:
-            return 0
+        return NONE
+    if (
+        middle >= FREE
+        and half > 0.0
+        and clearance_along(entry, centre, axis, -half) >= FREE
+        and clearance_along(entry, centre, axis, half) >= FREE
+    ):
+        return NONE
     count = 1
     if half > 0.0:
         count += min(max(int(math.ceil(2.0 * half / _EVERY)), 2), _PLACES - 1)
-    values = np.empty(_PLACES)
+    values = np.empty(count)
     step = 2.0 * half / max(count - 1, 1)
     least, i = np.inf, 0
     while i < count:
-        t = -half + i * step
-        x, y, z = (
-            centre[0] + t * axis[0],
-            centre[1] + t * axis[1],
-            centre[2] + t * axis[2],
-        )
-        value = values[i] = clearance(entry, x, y, z, out)
+        value = values[i] = clearance_along(entry, centre, axis, -half + i * step)
         least = min(least, value)
         i += 1
         # The clearance changes by at most the way, but where an open end begins.
@@ -269,8 +272,8 @@ def touches(entry, centre, axis, half, closed, limit, places, depths):
             values[i] = value
             i += 1
     if least > limit + step:
-        return 0
-    found = 0
+        return NONE
+    found, first, low, second, lower = NONE
     for i in range(count):
         value, t = values[i], -half + i * step
         if i == 0 or i == count - 1:
@@ -288,27 +291,24 @@ def touches(entry, centre, axis, half, closed, limit, places, depths):
             bend = values[i - 1] - 2.0 * value + values[i + 1]
             if bend > 0.0:
                 place = t + 0.5 * step * (values[i - 1] - values[i + 1]) / bend
-                x, y, z = (
-                    centre[0] + place * axis[0],
-                    centre[1] + place * axis[1],
-                    centre[2] + place * axis[2],
-                )
-                lower = clearance(entry, x, y, z, out)
-                if lower < value:
-                    t, value = place, lower
+                there = clearance_along(entry, centre, axis, place)
+                if there < value:
+                    t, value = place, there
         if value > limit:
             continue
         # The two that are nearest to the wall, in the order of the axis.
         if found == 2:
-            worse = 0 if depths[0] > depths[1] else 1
-            if value >= depths[worse]:
+            if value >= max(low, lower):
                 continue
-            if worse == 0:
-                places[0], depths[0] = places[1], depths[1]
+            if low > lower:
+                first, low = second, lower
             found = 1
-        places[found], depths[found] = t, value
+        if found:
+            second, lower = t, value
+        else:
+            first, low = t, value
         found += 1
-    return found
+    return (found, first, low, second, lower)
 
 
 @compiled
@@ -318,9 +318,10 @@ def tangents(entry, place, axis, normal, depth, limit, turns, rows):
     Where the wall is hollow across the device, one plane turns with the device as it
     rolls there, from step to step: a force f at a radius r of its way is a stiffness
     f / r that no implicit step knows of, and throws light links to and fro. The wall
-    is then two planes that touch it to both sides: the field made linear there.
+    is then two planes that touch it to both sides: the field made linear there. The
+    last two of 6 rows are scratch.
     """
-    found, out, side = 0, np.empty(3), np.empty((2, 4))
+    found = 0
     for turn in range(turns):
         bx = axis[1] * normal[2] - axis[2] * normal[1]
         by = axis[2] * normal[0] - axis[0] * normal[2]
@@ -336,8 +337,8 @@ def tangents(entry, place, axis, normal, depth, limit, turns, rows):
             continue
         bx, by, bz = bx / length, by / length, bz / length
         dx, dy, dz = _ASIDE * bx, _ASIDE * by, _ASIDE * bz
-        low = clearance(entry, place[0] - dx, place[1] - dy, place[2] - dz, out)
-        high = clearance(entry, place[0] + dx, place[1] + dy, place[2] + dz, out)
+        low = clearance(entry, place[0] - dx, place[1] - dy, place[2] - dz)
+        high = clearance(entry, place[0] + dx, place[1] + dy, place[2] + dz)
         if low >= FREE or high >= FREE:
             continue
         # To both sides the clearance slopes by its bend, times the way there.
@@ -351,27 +352,29 @@ def tangents(entry, place, axis, normal, depth, limit, turns, rows):
             there = high if row else low
             if corner:
                 x, y, z = place[0] + way * dx, place[1] + way * dy, place[2] + way * dz
-                if not away(entry, x, y, z, out):
+                nx, ny, nz = away(entry, x, y, z)
+                if nx == 0.0 and ny == 0.0 and nz == 0.0:
                     return 0
-                side[row, :3] = out
-                side[row, 3] = there - way * (out[0] * dx + out[1] * dy + out[2] * dz)
+                there -= way * (nx * dx + ny * dy + nz * dz)
             else:
                 size = math.sqrt(1.0 + slope * slope)
-                side[row, 0] = (normal[0] + way * slope * bx) / size
-                side[row, 1] = (normal[1] + way * slope * by) / size
-                side[row, 2] = (normal[2] + way * slope * bz) / size
-                side[row, 3] = there - slope / size * _ASIDE
+                nx = (normal[0] + way * slope * bx) / size
+                ny = (normal[1] + way * slope * by) / size
+                nz = (normal[2] + way * slope * bz) / size
+                there -= slope / size * _ASIDE
+            side = rows[4 + row]
+            side[0], side[1], side[2], side[3] = nx, ny, nz, there
         # Planes of a smooth wall are moved so that their edge lies at the true depth.
         excess = 0.0
         if not corner:
-            excess = 0.5 * (side[0, 3] + side[1, 3]) - depth
-        for row in range(2):
-            if side[row, 3] - excess <= limit:
-                rows[found] = side[row]
+            excess = 0.5 * (rows[4, 3] + rows[5, 3]) - depth
+        for row in range(4, 6):
+            if rows[row, 3] - excess <= limit:
+                rows[found] = rows[row]
                 rows[found, 3] -= excess
                 found += 1
     if found == 0:
-        rows[0, :3] = normal
+        rows[0, 0], rows[0, 1], rows[0, 2] = normal
         rows[0, 3] = depth
         found = 1
     return found
@@ -379,21 +382,29 @@ def tangents(entry, place, axis, normal, depth, limit, turns, rows):
 
 @compiled
 def ends(table, model, data, geom, half):
-    """Which ends (2,) of a capsule count: one at its body's joint is another link's."""
-    looked = np.ones(2, np.bool_)
+    """Which ends (2) of a capsule count: one at its body's joint is another link's."""
     body = wholes(word(model + word(table + GEOM_BODYID)) + 4 * geom, 1)[0]
     parent = wholes(word(model + word(table + BODY_PARENTID)) + 4 * body, 1)[0]
     if parent == 0 or half == 0.0:
-        return looked
+        return (True, True)
     centre = numbers(word(data + word(table + GEOM_XPOS)) + 24 * geom, 3)
     turned = numbers(word(data + word(table + GEOM_XMAT)) + 72 * geom, 9)
     joint = numbers(word(data + word(table + XPOS)) + 24 * body, 3)
-    for end in range(2):
-        way, apart = half if end else -half, 0.0
-        for k in range(3):
-            apart += (centre[k] + way * turned[3 * k + 2] - joint[k]) ** 2
-        looked[end] = apart > _JOINED * _JOINED
-    return looked
+    low, high = 0.0, 0.0
+    for k in range(3):
+        low += (centre[k] - half * turned[3 * k + 2] - joint[k]) ** 2
+        high += (centre[k] + half * turned[3 * k + 2] - joint[k]) ** 2
+    return (low > _JOINED * _JOINED, high > _JOINED * _JOINED)
+
+
+@compiled
+def into(frame, way):
+    """A vector (3) in the frame of a matrix (9)."""
+    return (
+        frame[0] * way[0] + frame[3] * way[1] + frame[6] * way[2],
+        frame[1] * way[0] + frame[4] * way[1] + frame[7] * way[2],
+        frame[2] * way[0] + frame[5] * way[1] + frame[8] * way[2],
+    )
 
 
 @compiled
@@ -426,27 +437,26 @@ def collide(model, data, contacts, geom1, geom2, margin, before):
     centre, origin = numbers(places + 24 * geom1, 3), numbers(places + 24 * geom2, 3)
     turned, frame = numbers(turns + 72 * geom1, 9), numbers(turns + 72 * geom2, 9)
     middle = numbers(word(entry + 16), 3)
-    local, axis, normal = np.empty(3), np.empty(3), np.empty(3)
-    place, rows = np.empty(3), np.empty((4, 4))
-    for k in range(3):
-        local[k], axis[k] = middle[k], 0.0
-        for i in range(3):
-            local[k] += frame[3 * i + k] * (centre[i] - origin[i])
-            axis[k] += frame[3 * i + k] * turned[3 * i + 2]
-    alongs, depths = np.empty(2), np.empty(2)
+    apart = (centre[0] - origin[0], centre[1] - origin[1], centre[2] - origin[2])
+    apart = into(frame, apart)
+    local = (middle[0] + apart[0], middle[1] + apart[1], middle[2] + apart[2])
+    axis = into(frame, (turned[2], turned[5], turned[8]))
     # A straight sheath holds the shaft without any load.
     near = 0.0 if margin > 0.0 or straight(entry) else _TOUCH
     limit = radius + margin + near
-    found = touches(entry, local, axis, half, closed, limit, alongs, depths)
-    written = 0
-    for n in range(found):
-        for k in range(3):
-            place[k] = local[k] + alongs[n] * axis[k]
-        if not away(entry, place[0], place[1], place[2], normal):
+    seen = touches(entry, local, axis, half, closed, limit)
+    if seen[0] == 0:
+        return np.int32(0)
+    rows, written = np.empty((6, 4)), 0
+    for n in range(seen[0]):
+        t, depth = (seen[3], seen[4]) if n else (seen[1], seen[2])
+        place = along(local, axis, t)
+        normal = away(entry, place[0], place[1], place[2])
+        if normal == (0.0, 0.0, 0.0):
             continue
         # A sphere may have one contact, so one plane.
-        around = 0 if half == 0.0 else 1 + int(abs(alongs[n]) >= half)
-        planes = tangents(entry, place, axis, normal, depths[n], limit, around, rows)
+        around = 0 if half == 0.0 else 1 + int(abs(t) >= half)
+        planes = tangents(entry, place, axis, normal, depth, limit, around, rows)
         for plane in range(min(planes, _MOST - written)):
             contact = numbers(contacts + 80 * written, 10)
             distance = rows[plane, 3] - radius
@@ -456,8 +466,7 @@ def collide(model, data, contacts, geom1, geom2, margin, before):
                 towards = 0.0
                 for i in range(3):
                     towards -= frame[3 * k + i] * rows[plane, i]
-                along = alongs[n] * turned[3 * k + 2]
-                contact[1 + k] = centre[k] + along + reach * towards
+                contact[1 + k] = centre[k] + t * turned[3 * k + 2] + reach * towards
                 contact[4 + k] = towards
                 contact[7 + k] = 0.0
             written += 1
