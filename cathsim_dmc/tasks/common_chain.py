@@ -16,14 +16,6 @@ from cathsim_dmc.tasks.placement import COMMON_LENGTH
 # device, whose links are 7 mm long in the tip and 16.9 mm in the shaft.
 TRACKED_PLACES = np.array([120.625, 86.875, 63.0, 49.0, 42.0, 28.0, 14.0, 0.0]) * 1e-3
 
-_LEAST_MASS = 1e-12  # kg
-# (3, 9): v @ _ACROSS is the matrix of which u @ matrix is the cross product u x v.
-_ACROSS = np.cross(np.eye(3)[:, None], np.eye(3)).transpose(1, 0, 2).reshape(3, 9)
-# (9, 6), from products of coordinates to (xx, yy, zz, xy, xz, yz) of an inertia.
-_PARALLEL = np.zeros((9, 6))
-_PARALLEL[[4, 8, 0, 8, 0, 4], [0, 0, 1, 1, 2, 2]] = 1.0
-_PARALLEL[[1, 3, 2, 6, 5, 7], [3, 3, 4, 4, 5, 5]] = -0.5
-
 
 class CommonChain:
     """Joints, links and tracked points of a device of `COMMON_LENGTH`.
@@ -47,11 +39,6 @@ class CommonChain:
         self.num_links = len(whole.link_lengths(*chain.devices))
         lengths = chain.link_lengths
         self._behind = max(self.num_links - len(lengths), 0)
-        behind = np.arange(self._behind, self._behind - self.num_links, -1)
-        # The simulated link that each link continues, and by how many of its lengths.
-        self._links = np.maximum(-behind, 0)
-        self._steps = np.maximum(behind, 0)[:, None]
-        self._touched = behind[:, None] <= 0
 
         names = [joint.full_identifier for joint in chain.joints]
         bends = [names.index(joint.full_identifier) for joint in chain.bends]
@@ -88,30 +75,13 @@ class CommonChain:
         Args:
             state: readings of N simulations.
         """
+        arrays = state.com_inertia, state.com_velocity, state.external_force
         if not self._behind:
-            arrays = state.com_inertia, state.com_velocity, state.external_force
             inertia, velocity, force = (a[:, -self.num_links :] for a in arrays)
             return inertia, velocity, force
-        # Taken, not indexed: in one order of memory, and so added up in one order.
-        inertia = state.com_inertia.take(self._links, axis=1)
-        velocity = state.com_velocity.take(self._links, axis=1)
-        force = state.external_force.take(self._links, axis=1) * self._touched
-        mass, place = inertia[..., 9:], inertia[..., 6:9]
-        behind = self._steps * (state.centreline[:, :1] - state.centreline[:, 1:2])
-        # From the centre of mass of the simulated links to that of all links; before
-        # the first episode nothing has a mass.
-        total = np.maximum(mass.sum(axis=1), _LEAST_MASS)
-        shift = (place + mass * behind).sum(axis=1) / total
-        # Theorem of parallel axes.
-        way = behind - shift[:, None]
-        sums = 2 * place + mass * way
-        place += mass * way
-        products = (way[..., None] * sums[..., None, :]).reshape(*mass.shape[:2], 9)
-        inertia[..., :6] += products @ _PARALLEL
-        across = (shift @ _ACROSS).reshape(-1, 3, 3)
-        velocity[..., 3:] += velocity[..., :3] @ across
-        force[..., :3] += force[..., 3:] @ across
-        return inertia, velocity, force
+        from cathsim_dmc.tasks import common_chain_loops  # late, as it takes long
+
+        return common_chain_loops.continued(*arrays, state.centreline, self._behind)
 
     def tracked(self, line: np.ndarray) -> np.ndarray:
         """Tracked points (..., K, 3) of a centreline (..., l + 1, 3), the head last."""
