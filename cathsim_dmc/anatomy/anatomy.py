@@ -122,25 +122,12 @@ class Anatomy:
             return field_cache.surface_field(self.surface, self.ends)
         return field_cache.tree_field(self.tree, self.ends)
 
-    @cached_property
-    def wall(self) -> tuple[Array, ...]:
-        """Vertices (n_i, 3) m of convex pieces around the lumen; takes seconds."""
-        if self.scanned:
-            from cathsim_dmc.anatomy.convex_wall import wall_pieces
-
-            return wall_pieces(self)
-        from cathsim_dmc.anatomy.wall.pieces import build_wall
-
-        return build_wall(self.tree, self.ends)
-
     def depth(self, points: ArrayLike) -> Array:
         """Signed depth (...) of `points` (..., 3) in the lumen, metres, > 0 inside.
 
         Behind an open end it is minus the distance from the plane of the end.
         """
-        if self.scanned:
-            return self.lumen(points)
-        return np.maximum.reduce(list(self.tree.depths(points).values()))
+        return self.lumen(points)
 
     def goal(self, name: str) -> Goal:
         """Goal called `name`.

@@ -19,6 +19,7 @@ from dm_control import mjcf
 from lxml import etree
 
 from cathsim_dmc import bounds, suite
+from cathsim_dmc.anatomy.convex_wall import wall_pieces
 from cathsim_dmc.entities.phantom import read_mesh_file
 from cathsim_dmc.entities.sheath import Sheath
 from cathsim_dmc.files import atomic_directory
@@ -155,7 +156,7 @@ def _in_one_file(path: Path, scene: Scene) -> None:
         mesh.set("vertex", _text(vertices))
         mesh.set("face", " ".join(map(str, faces.ravel().tolist())))
     carrier = tree.find(".//geom[@name='wall']")
-    for number, piece in enumerate(scene.anatomy.wall):
+    for number, piece in enumerate(wall_pieces(scene.anatomy)):
         name = f"wall_{number:03d}"
         etree.SubElement(
             tree.find("asset"), "mesh", name=name, vertex=_text(piece), inertia="shell"

@@ -90,8 +90,6 @@ def resting_link(load: float, settling: float = 5.0) -> Resting:
 def _plate(height: float) -> Anatomy:
     """An anatomy whose wall is a plate at y = `height` (m), touching the device."""
     plate = dataclasses.replace(straight_tube(*GUIDING_TUBE), name="plate")
-    corners = np.meshgrid((-0.05, 0.05), (height, height + 4e-3), (-0.5, 0.5))
-    vars(plate)["wall"] = (np.stack(corners, axis=-1).reshape(-1, 3),)
     vars(plate)["lumen"] = Field.sampled(
         lambda blocks, points: height - blocks[:, None, 1] - points[:, 1],
         np.array([-0.05, -0.05, -0.5]),

@@ -1,1 +1,0 @@
-"""The wall of a lumen: convex pieces, measured depth, fidelity."""
