@@ -215,7 +215,7 @@ def test_steps_beyond_the_episode_are_refused(pushed):
     env, episode = pushed
     surface = env.task.scene.anatomy.surface
     with pytest.raises(IndexError, match="66 states"):
-        Moment.of_episode(episode, surface, 61)
+        Moment.of_episode(episode, surface, 66)
     with pytest.raises(ValueError, match="film"):
         animate(episode, surface, "episode.avi")
 
