@@ -288,11 +288,12 @@ def test_an_interrupt_saves_and_can_be_resumed(tmp_path):
         lambda: os.kill(os.getpid(), signal.SIGINT), at=70
     )
     config = small_ppo(total_frames=10_240, checkpoint_frames=10_240)
+    handler = signal.getsignal(signal.SIGINT)
     result = run(config, tmp_path, make_env=interrupting)
     assert result.interrupted
     assert 0 < result.frames < 10_240
     assert Checkpoint.open(tmp_path).frames == result.frames
-    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    assert signal.getsignal(signal.SIGINT) is handler
     more = config.replace(total_frames=result.frames + 512)
     assert run(more, tmp_path, resume=True).frames == result.frames + 512
 
