@@ -59,7 +59,6 @@ CONFINED = {
     "torchrl": {*_TORCHRL_FACE, "agents/"},
     "tensordict": {*_TORCHRL_FACE, "agents/"},
     "safetensors": {"agents/pretrained.py"},
-    "ray": {"agents/ray_source.py"},
     "rerun": {"recording/"},
     "igl": {"anatomy/surface_depth.py", "anatomy/scan/"},
     "llvmlite": {"collision/native.py"},
@@ -78,7 +77,6 @@ LATE = (
     "torchrl",
     "numba",
     "igl",
-    "ray",
 )
 
 

@@ -77,11 +77,6 @@ class TrainingConfig:
             simulation is always on the CPU.
         torch_threads: Number of threads of one torch operation. One is fastest for
             the small published MLP; images profit from all cores.
-        rerun: Whether to record an episode of every checkpoint into the directory
-            recordings of the run; the training waits for the episode.
-        collector: Where the simulations are: "local", in this process, or "ray", in
-            processes of a Ray cluster (needs the `ray` extra).
-        collectors: Number of these processes, which share the simulations.
     """
 
     algorithm: ClassVar[str] = ""
@@ -100,9 +95,6 @@ class TrainingConfig:
             "num_threads",
             "torch_threads",
             "torch_device",
-            "rerun",
-            "collector",
-            "collectors",
         }
     )
 
@@ -134,9 +126,6 @@ class TrainingConfig:
     tensorboard: bool = False
     torch_device: str = "cpu"
     torch_threads: int = positive(1)
-    rerun: bool = False
-    collector: Literal["local", "ray"] = "local"
-    collectors: int = positive(2)
 
     def __post_init__(self):
         """Validate; every message says what was given and what is allowed."""

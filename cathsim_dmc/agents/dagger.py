@@ -119,7 +119,6 @@ class DAgger(CloningLearner):
         "replay_frames",
         "gradient_steps",
     )
-    remote: ClassVar[bool] = False
 
     def __init__(self, config: DAggerConfig, shapes: NetworkShapes, directory: Path):
         super().__init__(config, shapes, directory)

@@ -17,8 +17,6 @@ class Learner(abc.ABC):
 
     Attributes:
         metrics: Names of the figures that `update` returns, columns of metrics.csv.
-        remote: Whether the policy needs nothing but observations, so that it can act
-            in another process.
         random_frames: Number of frames to collect with uniformly random actions
             first; the observation statistics then come from those.
         device: Torch device of the networks.
@@ -31,7 +29,6 @@ class Learner(abc.ABC):
     """
 
     metrics: ClassVar[tuple[str, ...]]
-    remote: ClassVar[bool] = True
     random_frames: int = 0
     optimiser: torch.optim.Optimizer
 

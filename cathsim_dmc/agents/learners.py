@@ -15,7 +15,10 @@ from cathsim_dmc.agents.ppo import PPO, PPOConfig
 from cathsim_dmc.agents.sac import SAC, SACConfig
 
 # Fields of configs in older files that mean nothing any more.
-_RETIRED = frozenset({"backend", "rerun_every", "rerun_steps", "rerun_viewer"})
+_RETIRED = frozenset(
+    {"backend", "collector", "collectors"}
+    | {"rerun", "rerun_every", "rerun_steps", "rerun_viewer"}
+)
 
 
 class Algorithm(NamedTuple):

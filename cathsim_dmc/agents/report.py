@@ -2,14 +2,12 @@
 
 import dataclasses
 import functools
-import logging
 import time
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 from torchrl.envs import EnvBase
 
 from cathsim_dmc import bounds, files, suite
@@ -23,8 +21,6 @@ from cathsim_dmc.policies import in_environment
 from cathsim_dmc.recording import recorder
 from cathsim_dmc.recording.episode import Episode
 from cathsim_dmc.tasks.snapshot import Snapshot
-
-CHECKPOINT_STEPS = 300  # longest episode that is recorded of a checkpoint
 
 
 @dataclasses.dataclass(frozen=True)
@@ -282,27 +278,6 @@ def record(
     if "gif" in targets:
         recorded.write(episode, environment, targets["gif"])
     return episode
-
-
-def record_checkpoint(run: Path, checkpoint: Path) -> None:
-    """Records the first episode of the evaluation with a checkpoint of a training.
-
-    Random numbers of the training are not drawn; an error is logged and ends nothing.
-
-    Args:
-        run: Directory of the run; recordings/<frames>.rrd in it is written.
-        checkpoint: Directory of the checkpoint.
-    """
-    out = run / "recordings" / f"{checkpoint.name}.rrd"
-    if out.exists():
-        return
-    try:
-        with torch.random.fork_rng(devices=[]):
-            record(checkpoint, out, max_steps=CHECKPOINT_STEPS, fluoroscopy=False)
-    except Exception:
-        logging.getLogger(__name__).exception(
-            "checkpoint %s is not recorded, the training goes on", checkpoint.name
-        )
 
 
 def _targets(out: str | Path | None, gif: str | Path | None) -> dict[str, Path]:

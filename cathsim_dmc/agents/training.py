@@ -23,7 +23,7 @@ from cathsim_dmc.agents.checkpoint import (
     checkpoints_in,
     save_checkpoint,
 )
-from cathsim_dmc.agents.collectors import COLLECTORS, BatchSource, check_collector
+from cathsim_dmc.agents.collection import make_collector
 from cathsim_dmc.agents.config import ConfigError, TrainingConfig
 from cathsim_dmc.agents.episodes import INFO, EpisodeTracker
 from cathsim_dmc.agents.evaluation import EnvFactory
@@ -101,11 +101,6 @@ def train(
 
     run = Path(out_dir)
     _require_device(config.torch_device)
-    check_collector(config)
-    if config.rerun:
-        from cathsim_dmc.agents import report  # loads matplotlib
-
-        report.require_registered(config.task)
     with contextlib.ExitStack() as stack:
         stack.enter_context(_only_process(run))
         stack.enter_context(_naming_what_is_safe(run))
@@ -117,9 +112,8 @@ def train(
         learner = make_learner(config, NetworkShapes.of(env), run)
         learner.attach(env)
         state = _start(learner, env, config, checkpoint, without_replay)
-        make_source = COLLECTORS[config.collector]
-        source = make_source(config, learner, env, make_env, state["frames"])
-        stack.callback(source.shutdown)
+        collector = make_collector(config, learner, env, state["frames"])
+        stack.callback(collector.shutdown)
         text = json.dumps(config.to_dict(), indent=2) + "\n"
         files.write_text(run / CONFIG_FILE, text)
         # After everything that draws numbers while being made.
@@ -138,7 +132,7 @@ def train(
         stack.callback(log.close)
         interruption = stack.enter_context(Interruption())
         newest = checkpoint.path if checkpoint else None
-        loop = _Loop(run, config, source, learner, log, newest)
+        loop = _Loop(run, config, iter(collector), learner, log, newest)
         while log.frames < config.total_frames and not interruption.requested:
             loop.step(interruption)
         # However it ended; writes nothing if the last batch has just been saved.
@@ -302,22 +296,19 @@ class _Loop:
 
     run: Path
     config: TrainingConfig
-    source: BatchSource
+    batches: Iterator[TensorDictBase]
     learner: Learner
     log: TrainingLog
     newest: Path | None
 
     def __post_init__(self):
-        self._tracker, self._restarts = EpisodeTracker(self.config.num_envs), 0
+        self._tracker = EpisodeTracker(self.config.num_envs)
         self._frames, self._time = self.log.frames, time.monotonic()
 
     def step(self, interruption: Interruption) -> None:
         """Collect a batch and learn from it."""
         config, log = self.config, self.log
-        batch = self.source.next()
-        if self.source.restarts != self._restarts:
-            self._tracker = EpisodeTracker(config.num_envs)
-            self._restarts = self.source.restarts
+        batch = next(self.batches)
         finished = self._tracker.add(batch)
         _truncate_diverged(batch)
         progress = min(log.frames / config.total_frames, 1.0)
@@ -354,10 +345,6 @@ class _Loop:
             },
         )
         self._frames, self._time = self.log.frames, time.monotonic()
-        if self.config.rerun:
-            from cathsim_dmc.agents import report
-
-            report.record_checkpoint(self.run, self.newest)
         return self.newest
 
 
