@@ -105,7 +105,7 @@ def test_missing_phantom(phantom):
 
 def test_directory_without_an_anatomy(tmp_path):
     fails(
-        [tmp_path, "anatomy.json"],
+        [tmp_path, "anatomy.npz"],
         FileNotFoundError,
         task_name="navigate",
         anatomy=str(tmp_path),

@@ -31,7 +31,7 @@ def loaders(folder):
     for name in ("lcca.mrk.json", "lcca.csv", "lcca.vtp"):
         yield folder / name, read_curve
     yield folder / "tree.json", read_tree
-    yield folder / "anatomy" / "anatomy.json", lambda path: Anatomy.load(path.parent)
+    yield folder / "anatomy" / "anatomy.npz", lambda path: Anatomy.load(path.parent)
 
 
 def test_no_loader_executes_a_pickle(store, marker):

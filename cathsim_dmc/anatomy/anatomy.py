@@ -5,13 +5,10 @@ Lengths are metres, positions are in the patient frame LPS.
 
 from __future__ import annotations
 
-import contextlib
-import hashlib
-import io
 import json
 import os
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -19,8 +16,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from cathsim_dmc import files
-from cathsim_dmc.anatomy import builder, field_cache, loading
+from cathsim_dmc import bounds, files
+from cathsim_dmc.anatomy import builder, field_cache
 from cathsim_dmc.anatomy.builder import VesselPlace
 from cathsim_dmc.anatomy.centreline import (
     Array,
@@ -30,12 +27,12 @@ from cathsim_dmc.anatomy.centreline import (
 )
 from cathsim_dmc.anatomy.curves import Curve, smooth_tree
 from cathsim_dmc.anatomy.field import Field
+from cathsim_dmc.anatomy.loading import check_places
 from cathsim_dmc.anatomy.parts import End, Goal, Inlet, Surface
 
-FORMAT = "cathsim-anatomy"
-FORMAT_VERSION = 2
-_DESCRIPTION = "anatomy.json"
-_READS = 50  # of a description that is replaced while it is read
+_FORMAT = {"format": "cathsim-anatomy", "version": 3, "units": "m", "frame": "LPS"}
+_FILE = "anatomy.npz"
+_LARGEST = 2_000_000_000  # bytes of all arrays, unpacked
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -161,29 +158,15 @@ class Anatomy:
     def save(self, directory: str | os.PathLike[str]) -> Path:
         """Write the anatomy into `directory` and return that path.
 
-        The geometry goes into an npz named by its content, the description into
-        `anatomy.json`, which is replaced last: a reader finds the old anatomy or
-        the new one, never a mixture. Of processes that save into one directory at
-        once, one waits for the other, and the last one's anatomy stays.
+        A reader finds the old anatomy or the new one. Of processes that save into one
+        directory at once, the last one's anatomy stays.
         """
         directory = Path(directory)
         directory.mkdir(parents=True, exist_ok=True)
-        arrays, description = _pack(self)
-        buffer = io.BytesIO()
-        np.savez_compressed(buffer, allow_pickle=False, **arrays)
-        data = buffer.getvalue()
-        digest = hashlib.sha256(data).hexdigest()
-        description["geometry"] = f"geometry-{digest[:16]}.npz"
-        description["sha256"] = digest
-        text = json.dumps(description, indent=2) + "\n"
-        with _alone(directory) as alone:
-            files.write_bytes(directory / description["geometry"], data)
-            files.write_text(directory / _DESCRIPTION, text)
-            # Others may be about to name what they have just written.
-            if alone:
-                stale = {*directory.glob("geometry-*.npz")}
-                for path in stale - {directory / description["geometry"]}:
-                    path.unlink(missing_ok=True)
+        arrays, header = _pack(self)
+        text = np.array(json.dumps(header))
+        with files.atomic_path(directory / _FILE) as path, open(path, "wb") as stream:
+            np.savez_compressed(stream, allow_pickle=False, header=text, **arrays)
         return directory
 
     @classmethod
@@ -192,81 +175,21 @@ class Anatomy:
 
         Raises:
             FileNotFoundError: if `directory` holds no anatomy.
-            ValueError: if a file is damaged, of another format, or holds what no
+            ValueError: if the file is damaged, of another format, or holds what no
                 anatomy does; names the file and the entry.
         """
-        path = Path(directory) / _DESCRIPTION
-        for _ in range(_READS):
-            description, text = _read_description(path)
-            # Only the bare file name counts: a description may not point elsewhere.
-            geometry = path.parent / Path(str(description.get("geometry"))).name
-            try:
-                data = loading.read_regular(geometry, loading.LARGEST_ARRAYS)
-                break
-            except FileNotFoundError:
-                # Replaced between the two reads, unless the description still stands.
-                if _read_description(path)[1] == text:
-                    raise ValueError(
-                        f"{path} names {geometry.name}, which is missing."
-                    ) from None
-        else:
-            raise ValueError(f"{path} was replaced {_READS} times while it was read.")
-        if hashlib.sha256(data).hexdigest() != description.get("sha256"):
-            raise ValueError(f"{geometry} is damaged: its checksum differs.")
-        loading.check_description(description, path)
-        arrays = loading.read_arrays(data, geometry)
-        loading.check_arrays(arrays, len(description["vessels"]), geometry)
+        path = Path(directory) / _FILE
+        if not path.is_file():
+            raise FileNotFoundError(
+                f"no {_FILE} in {path.parent}; give a directory that Anatomy.save "
+                "wrote. One with anatomy.json is of an older version: write it again."
+            )
         try:
-            anatomy = _unpack(description, arrays)
-        except ValueError as error:
+            anatomy = _unpack(files.read_arrays(path, _LARGEST))
+            check_places(anatomy)
+        except (ValueError, RecursionError) as error:
             raise ValueError(f"{path}: {error}") from error
-        loading.check_places(anatomy, path)
         return anatomy
-
-
-def _read_description(path: Path) -> tuple[dict[str, Any], bytes]:
-    """The description of an anatomy, and its text."""
-    try:
-        text = loading.read_regular(path, loading.LARGEST_TEXT)
-    except FileNotFoundError:
-        raise FileNotFoundError(
-            f"no {_DESCRIPTION} in {path.parent}; give a directory that "
-            "Anatomy.save wrote."
-        ) from None
-    try:
-        description = json.loads(text)
-    except (json.JSONDecodeError, UnicodeDecodeError, RecursionError) as error:
-        raise ValueError(f"{path} is damaged: {error}") from error
-    if not isinstance(description, dict) or (
-        description.get("format") != FORMAT
-        or repr(description.get("version")) != repr(FORMAT_VERSION)  # True is no 1
-    ):
-        raise ValueError(
-            f"{path} is not a {FORMAT} file of version {FORMAT_VERSION}; write it "
-            "again with Anatomy.save."
-        )
-    return description, text
-
-
-@contextlib.contextmanager
-def _alone(directory: Path) -> Iterator[bool]:
-    """Holds other processes' `save` off a directory; false where that is not known."""
-    try:
-        import fcntl
-
-        handle = os.open(directory, os.O_RDONLY)
-    except (ImportError, OSError):
-        yield False
-        return
-    try:
-        try:
-            fcntl.flock(handle, fcntl.LOCK_EX)
-            locked = True
-        except OSError:
-            locked = False
-        yield locked
-    finally:
-        os.close(handle)
 
 
 def _pack(anatomy: Anatomy) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
@@ -282,57 +205,58 @@ def _pack(anatomy: Anatomy) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
             {"name": vessel.name, "parent": vessel.parent, "ostium": vessel.ostium}
         )
     description = {
-        "format": FORMAT,
-        "version": FORMAT_VERSION,
-        "units": "m",
-        "frame": "LPS",
+        **_FORMAT,
         "name": anatomy.name,
         "scanned": anatomy.scanned,
         "vessels": vessels,
-        "inlet": {
-            "vessel": anatomy.inlet.vessel,
-            "position": anatomy.inlet.position.tolist(),
-            "direction": anatomy.inlet.direction.tolist(),
-            "radius": float(anatomy.inlet.radius),
-        },
-        "goals": [
-            {
-                "name": goal.name,
-                "vessel": goal.vessel,
-                "position": goal.position.tolist(),
-                "arc_length": float(goal.arc_length),
-            }
-            for goal in anatomy.goals.values()
-        ],
-        "ends": [
-            {
-                "vessel": end.vessel,
-                "position": end.position.tolist(),
-                "direction": end.direction.tolist(),
-                "radius": float(end.radius),
-                "open": bool(end.open),
-            }
-            for end in anatomy.ends
-        ],
+        "inlet": _plain(anatomy.inlet),
+        "goals": [_plain(goal) for goal in anatomy.goals.values()],
+        "ends": [_plain(end) for end in anatomy.ends],
     }
     return arrays, description
 
 
-def _unpack(description: dict[str, Any], arrays: dict[str, np.ndarray]) -> Anatomy:
-    vessels = {}
-    for index, entry in enumerate(description["vessels"]):
-        line = Centreline(
-            arrays[f"vessel_{index}_points"], arrays[f"vessel_{index}_radii"]
+def _plain(part: Goal | Inlet | End) -> dict[str, Any]:
+    """Fields as JSON values."""
+    values = {field.name: getattr(part, field.name) for field in fields(part)}
+    return {name: np.asarray(value).tolist() for name, value in values.items()}
+
+
+def _unpack(arrays: dict[str, np.ndarray]) -> Anatomy:
+    """The anatomy of a file's arrays.
+
+    Raises:
+        ValueError: if an entry is missing or wrong.
+    """
+    try:
+        header = json.loads(str(arrays["header"]))
+        kept = {key: header[key] for key in ("format", "version", "units", "frame")}
+        if repr(kept) != repr(_FORMAT):  # True is no 1
+            raise ValueError(f"it is {kept}, not {_FORMAT}; write it again")
+        vessels: dict[str, Vessel] = {}
+        for index, entry in enumerate(_listed(header, "vessels")):
+            points, radii = (arrays[f"vessel_{index}_{k}"] for k in ("points", "radii"))
+            vessel = Vessel(centreline=Centreline(points, radii), **entry)
+            if vessel.name in vessels:
+                raise ValueError(f"vessels has {vessel.name!r} twice")
+            vessels[vessel.name] = vessel
+        goals = [Goal(**entry) for entry in _listed(header, "goals")]
+        if len({goal.name for goal in goals}) < len(goals):
+            raise ValueError("goals has a name twice")
+        return Anatomy(
+            name=bounds.text("name", header["name"]),
+            tree=VesselTree(vessels),
+            surface=Surface(arrays["surface_vertices"], arrays["surface_faces"]),
+            inlet=Inlet(**header["inlet"]),
+            goals={goal.name: goal for goal in goals},
+            ends=tuple(End(**entry) for entry in _listed(header, "ends")),
+            scanned=bounds.switch("scanned", header["scanned"]),
         )
-        vessels[entry["name"]] = Vessel(
-            entry["name"], line, entry["parent"], entry["ostium"]
-        )
-    return Anatomy(
-        name=description["name"],
-        tree=VesselTree(vessels),
-        surface=Surface(arrays["surface_vertices"], arrays["surface_faces"]),
-        inlet=Inlet(**description["inlet"]),
-        goals={entry["name"]: Goal(**entry) for entry in description["goals"]},
-        ends=tuple(End(**entry) for entry in description["ends"]),
-        scanned=description["scanned"],
-    )
+    except KeyError as error:
+        raise ValueError(f"it lacks the entry {error}") from error
+    except TypeError as error:  # no object, or one with other entries
+        raise ValueError(f"an entry is wrong: {error}") from error
+
+
+def _listed(header: dict[str, Any], name: str) -> list[Any]:
+    return bounds.instance(name, header[name], list)

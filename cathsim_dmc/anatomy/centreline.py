@@ -197,6 +197,10 @@ class Vessel:
     ostium: float = 0.0
 
     def __post_init__(self) -> None:
+        bounds.text("vessel name", self.name)
+        if self.parent is not None:
+            bounds.text(f"parent of vessel {self.name!r}", self.parent)
+        bounds.number(f"ostium of vessel {self.name!r}", self.ostium)
         if not 0.0 <= self.ostium < self.centreline.length:
             raise ValueError(
                 f"ostium of vessel {self.name!r} is {self.ostium:g} m; it must lie on "

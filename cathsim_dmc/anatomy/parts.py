@@ -8,7 +8,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from cathsim_dmc import bounds
 from cathsim_dmc.anatomy.centreline import Array, _readonly
@@ -18,19 +17,18 @@ from cathsim_dmc.anatomy.centreline import Array, _readonly
 INLET_HOLE_RADIUS = 2.5e-3
 
 
-def _vector(value: ArrayLike, name: str) -> Array:
-    vector = _readonly(bounds.array(name, value))
-    if vector.shape != (3,) or not np.isfinite(vector).all():
-        raise ValueError(f"{name} is {value!r}; give three finite numbers in metres.")
-    return vector
-
-
-def _unit(value: ArrayLike, name: str) -> Array:
-    vector = _vector(value, name)
-    norm = np.linalg.norm(vector)
-    if norm < 1e-9:
-        raise ValueError(f"{name} is zero; give a direction.")
-    return _readonly(vector / norm)
+def _checked(part: Goal | Inlet | End, what: str) -> None:
+    """Checks the fields that goals, inlets and ends share, and freezes the vectors."""
+    bounds.text(f"{what} vessel", part.vessel)
+    for field in ("position", "direction"):
+        if hasattr(part, field):
+            vector = np.array(bounds.vector(f"{what} {field}", getattr(part, field), 3))
+            if field == "direction":
+                norm = np.linalg.norm(vector)
+                if norm < 1e-9:
+                    raise ValueError(f"{what} direction is zero; give a direction.")
+                vector = vector / norm
+            object.__setattr__(part, field, _readonly(vector))
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,7 +41,9 @@ class Goal:
     arc_length: float
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "position", _vector(self.position, "goal position"))
+        _checked(self, "goal")
+        bounds.text("goal name", self.name)
+        bounds.number("goal arc_length", self.arc_length)
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,8 +59,7 @@ class Inlet:
     radius: float
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "position", _vector(self.position, "inlet position"))
-        object.__setattr__(self, "direction", _unit(self.direction, "inlet direction"))
+        _checked(self, "inlet")
         bounds.number("inlet radius", self.radius, positive=True)
 
 
@@ -78,8 +77,9 @@ class End:
     open: bool
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "position", _vector(self.position, "end position"))
-        object.__setattr__(self, "direction", _unit(self.direction, "end direction"))
+        _checked(self, "end")
+        bounds.number("end radius", self.radius)
+        bounds.switch("end open", self.open)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -95,13 +95,10 @@ class Surface:
     faces: np.ndarray
 
     def __post_init__(self) -> None:
-        vertices = _readonly(bounds.array("vertices", self.vertices))
-        faces = np.array(bounds.array("faces", self.faces, "iu"), dtype=np.int32)
+        vertices = _readonly(bounds.array("vertices", self.vertices, shape=(-1, 3)))
+        faces = bounds.array("faces", self.faces, "iu", shape=(-1, 3))
+        faces = np.array(faces, dtype=np.int32)
         faces.setflags(write=False)
-        if vertices.ndim != 2 or vertices.shape[1] != 3:
-            raise ValueError(f"vertices have shape {vertices.shape}; give (V, 3).")
-        if faces.ndim != 2 or faces.shape[1] != 3:
-            raise ValueError(f"faces have shape {faces.shape}; give (F, 3).")
         if faces.size and (faces.min() < 0 or faces.max() >= len(vertices)):
             raise ValueError(
                 f"faces name vertices {faces.min()} to {faces.max()}; there are "
