@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import io
 import re
 from pathlib import Path
@@ -47,6 +48,10 @@ def read_triangles(path: str | Path) -> tuple[np.ndarray, np.ndarray]:
         raise ValueError(
             f"{path} has the ending {path.suffix!r}; give a mesh in one of the formats "
             f"{', '.join(FORMATS)}."
+        )
+    if kind == "vtp" and importlib.util.find_spec("vtkmodules") is None:
+        raise ValueError(
+            f"{path} needs VTK: pip install 'cathsim-dmc[vtp]', or save it as STL."
         )
     size = path.stat().st_size
     if size == 0:
@@ -194,9 +199,7 @@ def _ball(
 
 def _parsed(data: bytes, kind: str) -> tuple[np.ndarray, np.ndarray]:
     if kind == "vtp":
-        from cathsim_dmc.anatomy.scan.vtp import read_vtp
-
-        return read_vtp(data)
+        return _read_vtp(data)
     import trimesh
 
     # From bytes and without a resolver: nothing beside the file is opened.
@@ -206,3 +209,35 @@ def _parsed(data: bytes, kind: str) -> tuple[np.ndarray, np.ndarray]:
         mesh = mesh.to_mesh()
     faces = np.asarray(mesh.faces, dtype=np.int64).reshape(-1, 3)
     return np.array(mesh.vertices, dtype=np.float64).reshape(-1, 3), faces
+
+
+def _read_vtp(data: bytes) -> tuple[np.ndarray, np.ndarray]:
+    """Triangles of a VTK PolyData file, by VTK; polygons and strips are divided."""
+    from vtkmodules.util.numpy_support import vtk_to_numpy
+    from vtkmodules.vtkCommonCore import vtkObject
+    from vtkmodules.vtkFiltersCore import vtkTriangleFilter
+    from vtkmodules.vtkIOXML import vtkXMLPolyDataReader
+
+    vtkObject.GlobalWarningDisplayOff()  # it prints what it cannot read
+    reader, triangles = vtkXMLPolyDataReader(), vtkTriangleFilter()
+    reader.SetReadFromInputString(True)
+    reader.SetInputString(data)
+    reader.Update()
+    read = reader.GetOutput()
+    for cells in (read.GetVerts(), read.GetLines(), read.GetPolys(), read.GetStrips()):
+        # VTK does not look, and would read beyond the arrays.
+        corners = vtk_to_numpy(cells.GetConnectivityArray())
+        stops = vtk_to_numpy(cells.GetOffsetsArray())
+        beyond = stops[-1:] != len(corners) or np.diff(stops, prepend=0).min() < 0
+        if beyond or np.any((corners < 0) | (corners >= read.GetNumberOfPoints())):
+            raise ValueError("its cells name points that it does not have")
+    if reader.GetErrorCode() or not read.GetNumberOfPoints():
+        raise ValueError("it is damaged, or no PolyData")
+    triangles.SetInputData(read)
+    triangles.PassLinesOff()
+    triangles.PassVertsOff()
+    triangles.Update()
+    found = triangles.GetOutput()
+    corners = vtk_to_numpy(found.GetPolys().GetConnectivityArray())
+    points = np.array(vtk_to_numpy(found.GetPoints().GetData()), dtype=np.float64)
+    return points, corners.astype(np.int64).reshape(-1, 3)
