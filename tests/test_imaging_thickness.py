@@ -3,7 +3,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from cathsim_dmc.imaging import VIEWS, CArm, closed, surface_thickness
+from cathsim_dmc.imaging import VIEWS, CArm, surface_thickness
 
 
 def unproject(carm, pixels, depth):
@@ -61,8 +61,8 @@ def cylinder_interval(origin, direction, start, stop, radius):
     return np.where(root > 0.0, enter, 0.0), np.where(root > 0.0, leave, -1.0)
 
 
-def tube(line, radius, sides=48, cap=True):
-    """Triangle tube round a polyline, closed by fans unless cap is False."""
+def tube(line, radius, sides=48):
+    """Triangle tube round a polyline, closed by fans."""
     line = np.asarray(line, dtype=float)
     radius = np.broadcast_to(radius, len(line))
     tangent = np.gradient(line, axis=0)
@@ -84,19 +84,15 @@ def tube(line, radius, sides=48, cap=True):
     faces = np.concatenate(
         [np.stack([a, b, d], -1).reshape(-1, 3), np.stack([a, d, c], -1).reshape(-1, 3)]
     )
-    if cap:
-        last = (len(line) - 1) * sides
-        k = np.arange(sides)
-        n = len(vertices)
-        vertices = np.concatenate([vertices, line[[0, -1]]])
-        faces = np.concatenate(
-            [
-                faces,
-                np.stack([np.full(sides, n), (k + 1) % sides, k], -1),
-                np.stack([np.full(sides, n + 1), last + k, last + (k + 1) % sides], -1),
-            ]
-        )
-    return vertices, faces
+    last = (len(line) - 1) * sides
+    k = np.arange(sides)
+    n = len(vertices)
+    vertices = np.concatenate([vertices, line[[0, -1]]])
+    fans = [
+        np.stack([np.full(sides, n), (k + 1) % sides, k], -1),
+        np.stack([np.full(sides, n + 1), last + k, last + (k + 1) % sides], -1),
+    ]
+    return vertices, np.concatenate([faces, *fans])
 
 
 def ball(centre, radius, count=90):
@@ -234,24 +230,6 @@ def test_two_bodies_add_and_a_hollow_one_subtracts():
     )
 
 
-def test_open_ends_are_closed_flat():
-    line = np.linspace([0, 0, -0.05], [0.02, 0.01, 0.05], 9)
-    open_tube = tube(line, 0.01, cap=False)
-    capped = tube(line, 0.01, cap=True)
-    carm = CArm.view("LAO45")
-    vertices, faces = closed(*open_tube)
-    assert len(faces) == len(capped[1])
-    np.testing.assert_allclose(
-        surface_thickness(carm, vertices, faces),
-        surface_thickness(carm, *capped),
-        atol=1e-9,
-    )
-    # Vertices stored once per face, as in an STL file, are merged.
-    soup = open_tube[0][open_tube[1]].reshape(-1, 3)
-    merged, _ = closed(soup, np.arange(len(soup)).reshape(-1, 3))
-    assert len(merged) == len(vertices)
-
-
 def test_parts_outside_the_image_are_cut_off():
     line = np.linspace([0, 0, -0.4], [0, 0, 0.4], 60)
     image = surface_thickness(CArm.view("AP"), *tube(line, 0.01))
@@ -262,18 +240,14 @@ def test_parts_outside_the_image_are_cut_off():
 def test_bad_surfaces_are_refused():
     vertices, faces = ball([0, 0, 0], 0.03, count=10)
     with pytest.raises(ValueError, match="outwards"):
-        closed(vertices, faces[:, ::-1])
-    turned = faces.copy()
-    turned[5] = turned[5, ::-1]
-    with pytest.raises(ValueError, match="wound"):
-        closed(vertices, turned)
-    with pytest.raises(ValueError, match="indices"):
-        closed(vertices, faces + 5)
-    with pytest.raises(ValueError, match="no faces"):
-        closed(vertices, faces[:0])
+        surface_thickness(CArm(), vertices, faces[:, ::-1])
+    with pytest.raises(ValueError, match="outwards"):
+        surface_thickness(CArm(), vertices, faces[:0])
+    with pytest.raises(ValueError, match="faces name vertices"):
+        surface_thickness(CArm(), vertices, faces + 5)
     with pytest.raises(ValueError, match="supersample"):
         surface_thickness(CArm(), vertices, faces, 0)
     with pytest.raises(ValueError, match="source"):
         surface_thickness(CArm(), vertices + [0.0, 0.75, 0.0], faces)
-    with pytest.raises(ValueError, match=r"\(V, 3\)"):
+    with pytest.raises(ValueError, match=r"shape \(n, 3\)"):
         surface_thickness(CArm(), vertices[:, :2], faces)

@@ -5,7 +5,7 @@ from cathsim_dmc.imaging.carm import VIEWS, CArm
 from cathsim_dmc.imaging.device import device_attenuation, device_thickness
 from cathsim_dmc.imaging.fluoroscopy import Fluoroscope, Masks, rgb
 from cathsim_dmc.imaging.options import FluoroscopyOptions
-from cathsim_dmc.imaging.thickness import closed, surface_thickness
+from cathsim_dmc.imaging.thickness import surface_thickness
 
 __all__ = [
     "VIEWS",
@@ -15,7 +15,6 @@ __all__ = [
     "Fluoroscope",
     "FluoroscopyOptions",
     "Masks",
-    "closed",
     "device_attenuation",
     "device_thickness",
     "rgb",

@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike
 from cathsim_dmc.imaging import detector, materials
 from cathsim_dmc.imaging.carm import CArm
 from cathsim_dmc.imaging.device import Shadow, device_attenuation, device_thickness
-from cathsim_dmc.imaging.thickness import closed, surface_thickness
+from cathsim_dmc.imaging.thickness import surface_thickness
 
 # A pixel shows the device if the path through it is at least this share of its
 # diameter: half the pixel covered to half the depth.
@@ -98,7 +98,7 @@ class Fluoroscope:
 
         Args:
             vertices: (V, 3) of the lumen surface, world frame, m.
-            faces: (F, 3), counter-clockwise seen from outside. Open ends are closed.
+            faces: (F, 3), counter-clockwise seen from outside, without open ends.
             carm: the view; by default AP with the isocentre in the middle of the
                 surface.
             supersample: rays along each side of a pixel.
@@ -109,7 +109,6 @@ class Fluoroscope:
         """
         if carm is None:
             carm = CArm.view("AP").centred_on(vertices)
-        vertices, faces = closed(vertices, faces)
         thickness = surface_thickness(carm, vertices, faces, supersample)
         central = surface_thickness(carm, vertices, faces, 1)
         return cls(carm=carm, vessel=thickness, vessel_mask=central > 0.0, **fields)

@@ -12,6 +12,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
+from cathsim_dmc.anatomy.parts import Surface
 from cathsim_dmc.imaging.carm import NEAREST, CArm
 
 # Sub-divisions of the ray spacing to which projected vertices are rounded; edge
@@ -19,81 +20,6 @@ from cathsim_dmc.imaging.carm import NEAREST, CArm
 _SUBDIVISIONS = 4096
 # Triangle-ray pairs looked at together; bounds the working memory to some 100 MB.
 _CHUNK = 1_000_000
-
-
-def closed(vertices: ArrayLike, faces: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
-    """Close the open ends of a surface.
-
-    Every hole gets a fan from its rim to the mean of the rim, which is flat for the
-    cut end of a vessel. Coincident vertices are merged if the surface is open
-    without that, as triangles from an STL file are.
-
-    Args:
-        vertices: (V, 3) m.
-        faces: (F, 3) indices, counter-clockwise seen from outside.
-
-    Returns:
-        vertices (V', 3) float64 and faces (F', 3) int64 of a closed surface.
-
-    Raises:
-        ValueError: if shapes are wrong, faces disagree about the outside, or the
-            surface is wound inside out.
-    """
-    vertices, faces = _mesh(vertices, faces)
-    rim = _rim(faces, len(vertices))[0]
-    if len(rim):
-        vertices, index = np.unique(vertices, axis=0, return_inverse=True)
-        faces = index.reshape(-1)[faces]
-        a, b, c = faces.T
-        faces = faces[(a != b) & (b != c) & (c != a)]
-        rim, excess = _rim(faces, len(vertices))
-        if len(rim) and excess.max() > 1:
-            raise ValueError(
-                "faces of the surface are wound against their neighbours; orient "
-                "them alike (for example with trimesh.repair.fix_winding)."
-            )
-    if len(rim):
-        vertices, faces = _filled(vertices, faces, rim)
-
-    volume = np.linalg.det(vertices[faces]).sum() / 6.0
-    if volume <= 0.0:
-        raise ValueError(
-            f"the surface encloses {volume:g} m³; normals must point outwards (reverse "
-            "the order of the vertices of every face)."
-        )
-    return vertices, faces
-
-
-def _rim(faces: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Edges run more often one way than the other: (E, 2), and by how much (E,).
-
-    Without such edges the signed sum of ray depths is right, even where more than
-    two faces share an edge.
-    """
-    edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
-    low, high = edges.min(axis=1), edges.max(axis=1)
-    edge, index = np.unique(low * count + high, return_inverse=True)
-    net = np.bincount(index, weights=np.where(edges[:, 0] == low, 1, -1))
-    ends = np.stack(np.divmod(edge, count), axis=-1)
-    ends[net < 0] = ends[net < 0][:, ::-1]
-    return ends[net != 0], np.abs(net[net != 0])
-
-
-def _filled(vertices, faces, rim) -> tuple[np.ndarray, np.ndarray]:
-    """Surface with a fan over every hole of the rim."""
-    from scipy.sparse import coo_array
-    from scipy.sparse.csgraph import connected_components
-
-    count = len(vertices)
-    graph = coo_array((np.ones(len(rim)), tuple(rim.T)), shape=(count, count))
-    label = connected_components(graph, directed=False)[1][rim[:, 0]]
-    label = np.unique(label, return_inverse=True)[1]
-    middle = np.stack(
-        [np.bincount(label, weights=vertices[rim[:, 0], i]) for i in range(3)], axis=-1
-    )
-    middle /= np.bincount(label)[:, None]
-    fan = np.stack([rim[:, 1], rim[:, 0], count + label], axis=-1)
-    return np.concatenate([vertices, middle]), np.concatenate([faces, fan])
 
 
 def surface_thickness(
@@ -106,8 +32,7 @@ def surface_thickness(
     Args:
         carm: the view.
         vertices: (V, 3) world frame, m.
-        faces: (F, 3) indices, counter-clockwise seen from outside, closed (`closed`
-            makes it so).
+        faces: (F, 3) indices, counter-clockwise seen from outside, without open ends.
         supersample: rays along each side of a pixel, evenly spaced; 1 gives the
             chord of the ray through the pixel's centre.
 
@@ -115,10 +40,16 @@ def surface_thickness(
         (rows, columns) float64, m.
 
     Raises:
-        ValueError: if shapes are wrong, `supersample` < 1, or the surface reaches
-            the X-ray source.
+        ValueError: if shapes are wrong, normals point inwards, `supersample` < 1, or
+            the surface reaches the X-ray source.
     """
-    vertices, faces = _mesh(vertices, faces)
+    surface = Surface(np.asarray(vertices), np.asarray(faces))
+    if surface.volume <= 0.0:
+        raise ValueError(
+            f"the surface encloses {surface.volume:g} m³; it must be closed and its "
+            "normals must point outwards."
+        )
+    vertices, faces = surface.vertices, surface.faces
     if int(supersample) != supersample or supersample < 1:
         raise ValueError(f"supersample is {supersample!r}; give a whole number >= 1.")
     supersample = int(supersample)
@@ -202,26 +133,3 @@ def _rasterised(corners, inverse, low, width, pairs, columns):
     # One over depth, not depth, is linear across the image of a plane.
     depth = weights.sum(axis=0) / (weights * inverse[face].T).sum(axis=0)
     return row * columns + column, face, depth
-
-
-def _mesh(vertices: ArrayLike, faces: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
-    vertices = np.asarray(vertices, dtype=np.float64)
-    faces = np.asarray(faces)
-    if vertices.ndim != 2 or vertices.shape[1] != 3 or not np.isfinite(vertices).all():
-        raise ValueError(
-            f"vertices have shape {vertices.shape}; give (V, 3) finite, in metres."
-        )
-    if faces.ndim != 2 or faces.shape[1] != 3 or faces.dtype.kind not in "iu":
-        raise ValueError(
-            f"faces have shape {faces.shape} and type {faces.dtype}; give (F, 3) "
-            "whole numbers."
-        )
-    if not len(faces):
-        raise ValueError("the surface has no faces; give at least four.")
-    faces = faces.astype(np.int64)
-    if faces.min() < 0 or faces.max() >= len(vertices):
-        raise ValueError(
-            f"faces refer to vertices {faces.min()} to {faces.max()} of "
-            f"{len(vertices)}; indices must lie in 0..{len(vertices) - 1}."
-        )
-    return vertices, faces
