@@ -1,10 +1,7 @@
 """Files of finished cells with made-up figures, for the page of results."""
 
-import json
-
 import numpy as np
-
-from cathsim_dmc.benchmarks import result
+import trainings
 
 
 def values(task, label, algorithm, observation, seed, rate, episodes=30):
@@ -38,6 +35,7 @@ def values(task, label, algorithm, observation, seed, rate, episodes=30):
         "outside": 0,
     }
     return {
+        "format": trainings.FORMAT,
         "cell": {
             "name": name, "label": label, "task": task, "algorithm": algorithm,
             "preset": "tuned", "observation": observation, "seed": seed,
@@ -45,8 +43,8 @@ def values(task, label, algorithm, observation, seed, rate, episodes=30):
         },
         "config": {"algorithm": algorithm, "seed": seed},
         "training": {
-            "frames": 409_600, "seconds": 4096.0, "solved": result.solved(rows),
-            "curve": result.learning_curve(rows), "sessions": [], "load": 2.1,
+            "frames": 409_600, "seconds": 4096.0, "solved": trainings.solved(rows),
+            "curve": trainings.learning_curve(rows), "sessions": [], "load": 2.1,
         },
         "evaluation": {
             "task": task, "seed": 1_000_000, "seconds": 60.0,
@@ -69,5 +67,4 @@ def write(directory, *arguments, **options):
     """Writes a file; returns its path."""
     made = values(*arguments, **options)
     path = directory / f"{made['cell']['name']}.json"
-    json.dumps(made, allow_nan=False)
-    return result.write_result(path, made)
+    return trainings.write_result(path, made)

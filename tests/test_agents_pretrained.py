@@ -2,6 +2,8 @@
 
 import json
 
+import export
+import judgement
 import pytest
 import synthetic_env
 import torch
@@ -10,7 +12,6 @@ from cathsim_dmc import agents
 from cathsim_dmc.agents import Checkpoint, CheckpointError, load_policy, pretrained
 from cathsim_dmc.agents.learners import make_config
 from cathsim_dmc.agents.training import train
-from cathsim_dmc.benchmarks import export, protocol
 from cathsim_dmc.tasks.config import MAX_STEPS
 
 SHIPPED = pretrained.pretrained_names()
@@ -35,16 +36,16 @@ def exported(tmp_path_factory):
     run = directory / "run"
     train(config, run, progress=False, make_env=synthetic_env.make_env)
 
-    def judge(policy, task, task_kwargs, episodes, name, num_threads):
+    def judge(policy, task, task_kwargs, episodes, name):
         found = agents.evaluate(
             policy, task, episodes, name=name, task_kwargs={},
             make_env=synthetic_env.make_env,
         )  # fmt: skip
-        return protocol.Judgement(found, None)
+        return found, None
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(protocol, "judge", judge)
-        weights = export.export(run, "small", directory=directory / "ship", episodes=4)
+        patch.setattr(judgement, "judge", judge)
+        weights = export.export(run, "small", directory / "ship", episodes=4)
     return Checkpoint.open(run), weights
 
 
@@ -88,7 +89,7 @@ def test_an_unknown_name_lists_those_that_ship():
 @pytest.mark.parametrize("name", ["", "a/b", "../up", "Upper", "a b"])
 def test_a_name_that_is_no_file_name_is_refused(exported, name, tmp_path):
     with pytest.raises(ValueError, match="lower-case"):
-        export.export(exported[0].path, name, directory=tmp_path)
+        export.export(exported[0].path, name, tmp_path)
     assert not list(tmp_path.iterdir())
 
 

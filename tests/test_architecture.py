@@ -41,12 +41,11 @@ ALLOWED = {
     "validation": _FACE | {"recording"},
     "pictures": _FACE | {"recording", "policies"},
     "agents": _FACE | {"recording", "analysis", "policies", "pictures"},
-    "benchmarks": _FACE | {"recording", "analysis", "policies", "agents"},
     # The faces to the outside: everything but each other.
     "gym": _FACE,
     "play": _FACE | {"recording", "policies"},
     "cli": _FACE
-    | {"recording", "analysis", "validation", "policies", "agents", "benchmarks"}
+    | {"recording", "analysis", "validation", "policies", "agents"}
     | {"play", "pictures"},
 }
 _TORCHRL_FACE = (

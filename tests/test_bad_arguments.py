@@ -61,8 +61,6 @@ COMMANDS = [
     (("validate",), "", NAME),
     (("validate", "forces"), "--mean", NUMBER),
     (("benchmark",), "", NAME),
-    (("benchmark", "difficulty"), "--seeds", WORDS),
-    (("benchmark", "difficulty"), "--task", NAME),
 ]
 
 

@@ -1,4 +1,4 @@
-"""`cathsim eval`, `record`, `replay`, `play`, `export` and `demo`."""
+"""`cathsim eval`, `record`, `demos`, `replay`, `play` and `demo`."""
 
 import dataclasses
 import sys
@@ -24,7 +24,7 @@ from cathsim_dmc.cli.task_options import given, task_kind
 def add_to(app: SubcommandApp) -> None:
     """Adds the commands."""
     app.command(name="eval")(evaluation([]))
-    for command in (record, demos, replay, play, export, demo):
+    for command in (record, demos, replay, play, demo):
         app.command(command)
 
 
@@ -267,38 +267,6 @@ def play(
     )
     for path in written:
         print(path)
-    return 0
-
-
-def export(
-    run: Annotated[Path, conf.Positional],
-    name: Annotated[str, conf.Positional],
-    /,
-    out: Path | None = None,
-    episodes: int = 30,
-    threads: int | None = None,
-) -> int:
-    """Make a policy that ships from a run: evaluate it, write weights and a card.
-
-    Args:
-        run: Directory of a run or of a checkpoint.
-        name: Name of the policy, "type1_bca" for `pretrained:type1_bca`.
-        out: Directory to write to; by default that of the package.
-        episodes: Number of episodes of the evaluation by the published rule.
-        threads: Number of threads of the simulation; one per core by default.
-    """
-    from cathsim_dmc.agents.pretrained import DIRECTORY
-    from cathsim_dmc.benchmarks.export import export as write
-
-    print(
-        write(
-            run,
-            name,
-            directory=out or DIRECTORY,
-            episodes=episodes,
-            num_threads=threads,
-        )
-    )
     return 0
 
 

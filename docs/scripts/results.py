@@ -1,6 +1,6 @@
 """Writes docs/results.md and its figures from the files of finished cells.
 
-    cathsim benchmark table            # trains what is missing, into results/
+    python benchmarks/trainings.py     # trains what is missing, into results/
     python docs/scripts/results.py
 
 Nothing else is read but the published figures (docs/data/published_results.json), the
@@ -18,13 +18,14 @@ from pathlib import Path
 from cathsim_dmc import agents  # isort: skip  # noqa: F401
 
 import numpy as np
-import results_figures as figures
 from scipy import stats
 
 from cathsim_dmc import files
 from cathsim_dmc.analysis.intervals import success_interval
-from cathsim_dmc.benchmarks.grid import DEFAULT_GRID, read_grid
-from cathsim_dmc.benchmarks.result import ResultError, read_result
+
+sys.path.append(str(Path(__file__).parents[2] / "benchmarks"))
+import results_figures as figures
+from trainings import HERE, read_grid, read_result
 
 DOCS = Path(__file__).parents[1]
 PUBLISHED = DOCS / "data/published_results.json"
@@ -39,7 +40,7 @@ INTRODUCTION = """\
 # Results
 
 Written by `python docs/scripts/results.py` from the JSON files in `results/`, one for
-each training; `cathsim benchmark table` makes those that are missing.
+each training; `python benchmarks/trainings.py` makes those that are missing.
 
 Every policy is evaluated over 30 episodes with seeds of their own, acting
 deterministically, by the published rule: 2,000 control steps at most, success within
@@ -71,7 +72,7 @@ HEADER = (
 def main(arguments=None):
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--results", type=Path, default=DOCS.parent / "results")
-    parser.add_argument("--grid", type=Path, default=DEFAULT_GRID)
+    parser.add_argument("--grid", type=Path, default=HERE / "grid.toml")
     parser.add_argument("--out", type=Path, default=DOCS / "results.md")
     options = parser.parse_args(arguments)
     results, broken = read_all(options.results)
@@ -90,7 +91,7 @@ def read_all(directory):
     for path in sorted(directory.glob("*.json")):
         try:
             results[path.stem] = read_result(path)
-        except ResultError as error:
+        except ValueError as error:
             broken.append(str(error).replace(f"{path.parent}{os.sep}", ""))
     return results, broken
 
@@ -131,7 +132,7 @@ def standing(results, broken, cells):
         "## What is there",
         "",
         f"{len(cells) - len(missing)} of the {len(cells)} cells of the grid "
-        f"(`cathsim_dmc/benchmarks/grid.toml`) are finished.",
+        f"(`benchmarks/grid.toml`) are finished.",
     ]
     others = sorted(set(results) - {cell.name for cell in cells})
     if others:

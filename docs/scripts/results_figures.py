@@ -3,6 +3,7 @@
 import math
 
 import numpy as np
+from judgement import map_from_values
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import PolyCollection
 from matplotlib.figure import Figure
@@ -11,7 +12,6 @@ from matplotlib.ticker import EngFormatter
 from cathsim_dmc import style, suite
 from cathsim_dmc.analysis.heatmap import AP_AXES, ForceMap
 from cathsim_dmc.analysis.intervals import success_interval
-from cathsim_dmc.benchmarks.result import map_from_values
 from cathsim_dmc.style import COLOURS
 
 DPI = 90

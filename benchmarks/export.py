@@ -1,0 +1,109 @@
+"""Makes a policy that ships from a run: evaluates it, writes weights and a card.
+
+python benchmarks/export.py RUN NAME [--out DIRECTORY]
+"""
+
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import judgement
+import tyro
+
+from cathsim_dmc import files
+from cathsim_dmc.agents import pretrained
+from cathsim_dmc.agents.checkpoint import Checkpoint
+from cathsim_dmc.analysis.force_statistics import millinewtons
+
+_FIGURES = ("success", "length", "max_force")
+_HEAD = """\
+# Policies that ship
+
+Written by `python benchmarks/export.py`; the card beside each, NAME.json, has its \
+settings. Evaluated over 30 episodes by the published rule (2,000 control steps, \
+success within 8 mm inside the branch); forces as in docs/forces.md.
+
+| policy | task | observation | frames | success (95 %) | mean force, mN \
+| mean contact force, mN | max force, mN |
+|---|---|---|---|---|---|---|---|
+"""
+
+
+def export(
+    run: Annotated[Path, tyro.conf.Positional],
+    name: Annotated[str, tyro.conf.Positional],
+    out: Path = pretrained.DIRECTORY,
+    episodes: int = judgement.EPISODES,
+) -> Path:
+    """Write the policy of a run with its card, after judging it.
+
+    Args:
+        run: Directory of a run or of a checkpoint.
+        name: Name of the policy, "type1_bca" for `pretrained:type1_bca`.
+        out: Directory to write to; by default that of the package.
+        episodes: Number of episodes of the evaluation.
+
+    Returns:
+        Path of the weights.
+    """
+    pretrained.require_name(name)
+    checkpoint = Checkpoint.open(run)
+    config, state = checkpoint.config, checkpoint.policy_state()
+    options = judgement.published_options(config.task_kwargs)
+    label = f"{pretrained.PREFIX}{name}"
+    found, _ = judgement.judge(checkpoint, config.task, options, episodes, label)
+    figures = judgement.episode_figures(found)
+    card = {
+        "task": config.task,
+        "task_kwargs": options,
+        "config": config.to_dict(),
+        "shapes": checkpoint.shapes.to_dict(),
+        "training": {
+            "frames": checkpoint.frames,
+            "seconds": round(checkpoint.seconds, 1),
+            "seed": config.seed,
+        },
+        "evaluation": {
+            "seed": found.seed,
+            "summary": found.summary(),
+            "episodes": {name: figures[name] for name in _FIGURES},
+        },
+        "versions": judgement.versions(),
+    }
+    weights = pretrained.write_pretrained(out, name, state, card)
+    write_list(weights.parent)
+    return weights
+
+
+def write_list(directory):
+    """Write README.md of a directory of policies from their cards."""
+    lines = _HEAD
+    for name in pretrained.pretrained_names(directory):
+        card = pretrained.read_card(directory / f"{name}.json")
+        summary, training = card["evaluation"]["summary"], card["training"]
+        low, high = summary["success_ci95"]
+        forces, observation = summary["forces"], card["config"]["observation"]
+        if not isinstance(observation, str):
+            observation = ", ".join(observation)
+        shown = (
+            forces["sum"]["mean"],
+            forces["max"]["mean_in_contact"],
+            forces["max"]["maximum"],
+        )
+        cells = [
+            f"`{pretrained.PREFIX}{name}`",
+            card["task"],
+            observation,
+            f"{training['frames']:,}",
+            f"{100 * summary['success']:.0f} % ({100 * low:.0f}–{100 * high:.0f})",
+            *(millinewtons(one["mean"], one["sd"]) for one in shown),
+        ]
+        lines += f"| {' | '.join(cells)} |\n"
+    files.write_text(directory / "README.md", lines)
+
+
+if __name__ == "__main__":
+    try:
+        print(tyro.cli(export))
+    except (ValueError, RuntimeError, OSError) as error:
+        sys.exit(f"export: {error}")

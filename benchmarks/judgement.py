@@ -1,0 +1,154 @@
+"""The published evaluation of a trained policy, as JSON."""
+
+import dataclasses
+from importlib.metadata import version
+
+# torchrl goes before dm_control.
+from cathsim_dmc.agents import evaluation  # isort: skip
+
+import numpy as np
+
+from cathsim_dmc import suite
+from cathsim_dmc.agents.report import ContactLog
+from cathsim_dmc.analysis.force_statistics import FIGURES
+from cathsim_dmc.analysis.heatmap import AP_AXES, MARGIN, ForceMap, force_map
+from cathsim_dmc.anatomy.arch.arch import arch_set, build_seed
+from cathsim_dmc.tasks.config import MAX_STEPS
+from cathsim_dmc.tasks.placement import sheath_direction
+
+EPISODES = 30  # published
+_DIGITS = 6  # significant ones of a number in a list
+# Options that say what the device, its surroundings and the observations are. All
+# others (reward, goal radius, length of an episode, randomisation, starts) may differ
+# in training and are the published ones in the evaluation.
+_KEPT = frozenset(
+    {
+        *("anatomy", "access", "goal", "device", "rotation", "friction"),
+        *("shaft_link", "torsion_joints", "working_length", "physics_timestep"),
+        *("fluoroscopy", "cameras"),
+    }
+)
+_EPISODE = ("reward", "length", "success", "physics_error", "path_ratio")
+_PACKAGES = ("mujoco", "dm-control", "torch", "torchrl", "tensordict", "numpy", "scipy")
+
+
+def published_options(task_kwargs):
+    """Options of a task for the evaluation of what was trained with others.
+
+    Reward and rule of success are the task's own, the number of steps the published.
+    """
+    kept = {name: value for name, value in task_kwargs.items() if name in _KEPT}
+    return {**kept, "max_steps": MAX_STEPS}
+
+
+def judge(policy, task, task_kwargs, episodes=EPISODES, name=None):
+    """Evaluate a policy; return the result and the map of its contact forces.
+
+    The map is None where every episode has an anatomy of its own.
+    """
+    log = ContactLog()
+    found = evaluation.evaluate(
+        policy, task, episodes, name=name, task_kwargs=task_kwargs, observer=log
+    )
+    if suite.TASKS[task].random_arch:
+        return found, None
+    surface = suite.make_task(task, **task_kwargs).scene.anatomy.surface
+    outline = surface.vertices[:, AP_AXES]
+    low, high = outline.min(0) - MARGIN, outline.max(0) + MARGIN
+    return found, force_map(log.positions, log.magnitudes, low, high)
+
+
+def judge_each_arch(policy, task, task_kwargs, arches, name=None, numbers=None):
+    """Evaluate a policy in every arch of a set, one episode each.
+
+    Arches before whose inlet no sheath fits are passed over.
+
+    Args:
+        policy: As for `evaluation.evaluate`.
+        task: Name of a task with random arches.
+        task_kwargs: Options of the task.
+        arches: Name of the set, such as "test".
+        name: Name of the policy for the reports.
+        numbers: Numbers of the arches in the set; None for all.
+
+    Returns:
+        The result, and the kind of arch of each episode.
+    """
+    seeds, played, groups = arch_set(arches), [], []
+    options = {**task_kwargs, "arches": arches, "pool": 1}
+    for number in range(len(seeds)) if numbers is None else numbers:
+        anatomy = build_seed(seeds[number], access=suite.TASKS[task].access)
+        if sheath_direction(anatomy) is None:
+            continue
+        one = evaluation.evaluate(
+            policy,
+            task,
+            1,
+            evaluation.EVALUATION_SEED + number,
+            name=name,
+            task_kwargs={**options, "first": number},
+            num_threads=1,
+        )
+        played.append(one)
+        groups.append(f"type {seeds[number].arch_type}")
+    if not played:
+        raise ValueError(f"no device can enter any of the arches {arches!r}")
+    whole = dataclasses.replace(
+        played[0],
+        episodes=tuple(one.episodes[0] for one in played),
+        settings={**played[0].settings, "task_kwargs": options},
+    )
+    return whole, groups
+
+
+def episode_figures(found):
+    """Figures of every episode of an `EvaluationResult`, in the order of the seeds."""
+    names = {name: name for name in _EPISODE} | {f: f"forces.{f}" for f in FIGURES}
+    return {
+        name: numbers(
+            None if np.isnan(v) else float(v) for v in found.values(attribute)
+        )
+        for name, attribute in names.items()
+    }
+
+
+def map_values(contacts):
+    """A force map as JSON: only cells with contacts, row after row from below."""
+    index = np.flatnonzero(contacts.count)
+    return {
+        "x": [float(contacts.x_edges[0]), float(contacts.x_edges[-1])],
+        "z": [float(contacts.z_edges[0]), float(contacts.z_edges[-1])],
+        "shape": list(contacts.count.shape),
+        "index": index.tolist(),
+        "mean": numbers(map(float, contacts.mean.ravel()[index])),
+        "count": contacts.count.ravel()[index].tolist(),
+        "outside": contacts.outside,
+    }
+
+
+def map_from_values(values):
+    """The inverse of `map_values`."""
+    rows, columns = values["shape"]
+    mean, count = np.full((rows, columns), np.nan), np.zeros((rows, columns), np.int64)
+    mean.flat[values["index"]] = values["mean"]
+    count.flat[values["index"]] = values["count"]
+    return ForceMap(
+        x_edges=np.linspace(*values["x"], columns + 1),
+        z_edges=np.linspace(*values["z"], rows + 1),
+        mean=mean,
+        count=count,
+        outside=values["outside"],
+    )
+
+
+def numbers(values):
+    """Numbers short enough for a file; whole ones as integers."""
+    return [
+        v if v is None else int(v) if v == int(v) else float(f"{v:.{_DIGITS}g}")
+        for v in values
+    ]
+
+
+def versions():
+    """Versions of this package and those that results depend on."""
+    return {name: version(name) for name in ("cathsim-dmc", *_PACKAGES)}

@@ -1,0 +1,321 @@
+"""Trains and evaluates the agents of docs/results.md, as far as they are missing.
+
+    python benchmarks/trainings.py
+    python benchmarks/trainings.py --only lcca-sac --list
+
+Stopped at any moment, it continues where it was. Each cell of grid.toml (task,
+algorithm, preset, observation, seed) is trained in a folder of its own; when it is
+finished, its evaluation by the published rule appears as a JSON file.
+"""
+
+import dataclasses
+import fnmatch
+import json
+import os
+import platform
+import subprocess
+import sys
+import time
+import tomllib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import judgement
+import numpy as np
+import tyro
+
+from cathsim_dmc import files, suite
+from cathsim_dmc.agents import training
+from cathsim_dmc.agents.checkpoint import Checkpoint
+from cathsim_dmc.agents.learners import make_config
+from cathsim_dmc.agents.metrics import read_metrics
+from cathsim_dmc.agents.training_log import EPISODE_WINDOW
+from cathsim_dmc.cli.options import BAD_INPUT, CHECK_FAILED, INTERRUPTED
+
+HERE = Path(__file__).parent
+FORMAT = 2
+POINTS = 200  # of the learning curve
+SOLVED = 0.9  # success rate that "solved" stands for
+# Columns of metrics.csv that make the learning curve, as far as they are there.
+_CURVE = ("frames", "seconds", "episodes", "episode_reward", "episode_length")
+_CURVE += ("success", "distance", "mean_force", "max_force")
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Cell:
+    """One training with its evaluation; grid.toml tells what the fields mean."""
+
+    label: str
+    task: str
+    algorithm: str
+    preset: str
+    observation: str | list[str]
+    seed: int
+    total_frames: int
+    settings: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+    variant: str = ""
+    evaluation: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+
+    @property
+    def name(self):
+        """Name of its folder and its JSON file."""
+        observation = self.observation
+        if not isinstance(observation, str):
+            observation = "+".join(observation)
+        parts = (self.task, self.algorithm, observation, self.preset, self.variant)
+        return "-".join(part for part in (*parts, f"seed{self.seed}") if part)
+
+    def to_dict(self):
+        """JSON-able values, with the name."""
+        return {"name": self.name, **dataclasses.asdict(self)}
+
+    def config(self):
+        """Settings of the training; ConfigError names what is not allowed."""
+        settings = {
+            name: value.replace("{task}", self.task)
+            if isinstance(value, str)
+            else value
+            for name, value in self.settings.items()
+        }
+        own = ("task", "observation", "seed", "total_frames")
+        settings |= {name: getattr(self, name) for name in own}
+        added = settings.pop("task_kwargs", {})
+        config = make_config(self.algorithm, self.preset, **settings)
+        return config.replace(task_kwargs={**config.task_kwargs, **added})
+
+    def evaluated(self, config):
+        """Task, options, set of arches and number of episodes of the evaluation."""
+        asked = dict(self.evaluation)
+        task = asked.pop("task", self.task)
+        options = judgement.published_options(config.task_kwargs)
+        options |= asked.pop("task_kwargs", {})
+        arches = asked.pop("each_arch", None)
+        episodes = asked.pop("episodes", judgement.EPISODES)
+        if task not in suite.TASKS or asked or not episodes > 0:
+            raise ValueError(
+                f"evaluation={dict(self.evaluation)!r} is not allowed: it may have "
+                "task (of `cathsim list`), task_kwargs, episodes (1 or more), each_arch"
+            )
+        if arches is not None and not suite.TASKS[task].random_arch:
+            raise ValueError(f"each_arch needs a task with random arches, not {task}")
+        return task, options, arches, episodes
+
+
+def read_grid(path=HERE / "grid.toml"):
+    """The cells of a grid file, in the order in which they are to be run.
+
+    Within a row the first seed of every task comes before the second seed of any.
+
+    Raises:
+        ValueError: it cannot be read, or a row says something that cannot be.
+    """
+    cells, where = {}, ""
+    try:
+        rows = tomllib.loads(Path(path).read_text())["row"]
+        for number, row in enumerate(rows, 1):
+            where = f"row {number}: "
+            tasks, seeds = row.pop("tasks"), row.pop("seeds", [0])
+            frames = row.pop("total_frames")
+            for seed in seeds:
+                for task in tasks:
+                    total = frames[task] if isinstance(frames, dict) else frames
+                    cell = Cell(task=task, seed=seed, total_frames=total, **row)
+                    if task not in suite.TASKS or "/" in cell.name:
+                        raise ValueError(f"no task {task!r}, or a name with /")
+                    cell.evaluated(cell.config())
+                    if cell.name in cells:
+                        raise ValueError(f"{cell.name} is there twice; give a variant")
+                    cells[cell.name] = cell
+    except (OSError, KeyError, TypeError, ValueError, AttributeError) as error:
+        kind = "lacks " if isinstance(error, KeyError) else ""
+        raise ValueError(f"{path}, {where}{kind}{error}") from error
+    return list(cells.values())
+
+
+class Result(NamedTuple):
+    """A finished cell, as its file tells it."""
+
+    path: Path
+    values: dict[str, Any]
+    cell: dict[str, Any]
+    training: dict[str, Any]
+    evaluation: dict[str, Any]
+    success: float
+    frames_per_second: float
+
+
+def read_result(path):
+    """The result in the file of a cell; ValueError names one that is damaged."""
+    try:
+        values = json.loads(Path(path).read_text())
+        if values["format"] != FORMAT or values["cell"]["name"] != Path(path).stem:
+            raise ValueError(f"it is no result of format {FORMAT} with this name")
+        cell, training, evaluation = map(values.get, ("cell", "training", "evaluation"))
+        success = float(evaluation["summary"]["success"])
+        speed = training["frames"] / training["seconds"]
+    except (KeyError, TypeError, ValueError) as error:
+        line = f"{type(error).__name__}: {error}"
+        raise ValueError(f"{path} is damaged: {line}") from error
+    return Result(path, values, cell, training, evaluation, success, speed)
+
+
+def standing(cell, runs, results):
+    """State of a cell, and a remark.
+
+    The state is "finished", "other settings" (finished with others than the grid's),
+    "begun" (there is a training) or "waiting".
+    """
+    path, remark = results / f"{cell.name}.json", ""
+    if path.exists():
+        try:
+            found = read_result(path)
+        except ValueError as error:
+            remark = str(error)
+        else:
+            there, asked = found.cell, cell.to_dict()
+            changed = [k for k in asked if k != "label" and there.get(k) != asked[k]]
+            if changed:
+                differ = f"{', '.join(changed)} differ; move {path} away"
+                return "other settings", differ
+            return "finished", f"success {100 * found.success:.0f} %"
+    begun = (runs / cell.name / training.CONFIG_FILE).exists()
+    return "begun" if begun else "waiting", remark
+
+
+def work(cell, runs, results):
+    """Train or continue a cell, evaluate it and write its file.
+
+    Returns:
+        Whether it came to the end; a signal ends the training with a checkpoint.
+    """
+    config, folder = cell.config(), runs / cell.name
+    task, options, arches, episodes = cell.evaluated(config)
+    suite.make_task(task, **options)  # refuses options before the training
+    resume = (folder / training.CONFIG_FILE).exists()
+    done = training.train(config, folder, resume=resume)
+    if done.interrupted:
+        return False
+    checkpoint, began = Checkpoint.open(done.checkpoint), time.monotonic()
+    contacts = groups = None
+    if arches is None:
+        found, contacts = judgement.judge(
+            checkpoint, task, options, episodes, cell.name
+        )
+    else:
+        found, groups = judgement.judge_each_arch(
+            checkpoint, task, options, arches, cell.name
+        )
+    rows = read_metrics(folder / "metrics.csv")
+    values = {
+        "format": FORMAT,
+        "cell": cell.to_dict(),
+        "config": config.to_dict(),
+        "training": {
+            "frames": checkpoint.frames,
+            "seconds": round(checkpoint.seconds, 1),
+            "solved": solved(rows),
+            "curve": learning_curve(rows),
+        },
+        "evaluation": {
+            "task": found.task,
+            "seed": found.seed,
+            "settings": dict(found.settings),
+            "seconds": round(time.monotonic() - began, 1),
+            "summary": found.summary(),
+            "episodes": judgement.episode_figures(found),
+            "groups": groups,
+            "force_map": None if contacts is None else judgement.map_values(contacts),
+        },
+        "versions": judgement.versions(),
+        "commit": commit(),
+        "machine": {"processor": platform.processor(), "cores": os.cpu_count()},
+        "finished": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
+    }
+    write_result(results / f"{cell.name}.json", values)
+    return True
+
+
+def write_result(path, values):
+    """Write the file of a cell, one line for each of its parts; return its path."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    lines = [
+        f"{json.dumps(name)}: {json.dumps(value, allow_nan=False)}"
+        for name, value in values.items()
+    ]
+    return files.write_text(path, "{\n" + ",\n".join(lines) + "\n}\n")
+
+
+def commit():
+    """Commit of the source tree, with "+" if files differ; None outside of git."""
+    head = ["describe", "--always", "--abbrev=40", "--exclude=*", "--dirty=+"]
+    git = ["git", "-C", str(HERE), *head]
+    done = subprocess.run(git, capture_output=True, text=True, check=False)
+    return done.stdout.strip() or None
+
+
+def learning_curve(rows):
+    """At most `POINTS` rows of metrics.csv as columns, the last row among them."""
+    if not rows:
+        return {}
+    count = min(len(rows), POINTS)
+    chosen = np.unique(np.linspace(0, len(rows) - 1, count).round().astype(int))
+    columns = [name for name in _CURVE if name in rows[0]]
+    return {n: judgement.numbers(rows[i][n] for i in chosen) for n in columns}
+
+
+def solved(rows):
+    """Frames and seconds at which the success of training episodes reached `SOLVED`.
+
+    It is the mean over the last 100 finished episodes, so the first 100 are passed
+    over: those that end early are the successful ones. None if it never did.
+    """
+    for row in rows:
+        enough = (row.get("episodes") or 0) >= EPISODE_WINDOW
+        if enough and (row.get("success") or 0.0) >= SOLVED:
+            return {"frames": row["frames"], "seconds": row["seconds"]}
+    return None
+
+
+def main(
+    grid: Path = HERE / "grid.toml",
+    runs: Path = Path("runs/table"),
+    results: Path = Path("results"),
+    only: tyro.conf.UseAppendAction[list[str]] = [],  # noqa: B006
+    list: bool = False,
+) -> int:
+    """Train and evaluate the cells of a grid, as far as they are missing.
+
+    Args:
+        grid: Path of the TOML file with the cells.
+        runs: Directory with a folder for each training.
+        results: Directory with a JSON file for each finished cell.
+        only: Part of the names of cells, or a pattern with *; repeated for several.
+        list: Whether to list what is done and what is left, and run nothing.
+    """
+    try:
+        cells = read_grid(grid)
+    except ValueError as error:
+        print(f"trainings: {error}", file=sys.stderr)
+        return BAD_INPUT
+    code = 0
+    for cell in cells:
+        if only and not any(fnmatch.fnmatch(cell.name, f"*{one}*") for one in only):
+            continue
+        state, remark = standing(cell, runs, results)
+        print(f"{cell.name}: {state} {remark}".rstrip(), flush=True)
+        if list or state in ("finished", "other settings"):
+            continue
+        try:
+            if not work(cell, runs, results):
+                return INTERRUPTED
+        except (ValueError, OSError, RuntimeError, ArithmeticError) as error:
+            code = CHECK_FAILED
+            print(f"{cell.name}: failed, {type(error).__name__}: {error}", flush=True)
+        else:
+            print(f"{cell.name}: finished", flush=True)
+    return code
+
+
+if __name__ == "__main__":
+    sys.exit(tyro.cli(main))

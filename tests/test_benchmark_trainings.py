@@ -1,0 +1,247 @@
+"""The grid of trainings: read, trained, judged, written, continued."""
+
+import dataclasses
+import json
+
+import judgement
+import numpy as np
+import pytest
+import synthetic_env
+import trainings
+
+from cathsim_dmc.agents import evaluation, training
+from cathsim_dmc.analysis.heatmap import force_map
+from cathsim_dmc.tasks.config import MAX_STEPS
+
+CELL = trainings.Cell(
+    label="PPO",
+    task="type1_bca",
+    algorithm="ppo",
+    preset="demo",
+    observation="internal",
+    seed=0,
+    total_frames=512,
+    settings={
+        "num_envs": 8,
+        "steps_per_update": 256,
+        "normalisation_frames": 16,
+        "metrics_frames": 128,
+        "hidden": [8],
+    },
+    evaluation={"episodes": 3},
+)
+ROW = """
+[[row]]
+label = "PPO"
+algorithm = "ppo"
+preset = "demo"
+observation = "internal"
+tasks = ["type1_bca", "type1_lcca"]
+seeds = [0, 1]
+total_frames = 1000
+"""
+
+
+@pytest.fixture
+def folders(tmp_path):
+    """Directories of runs and of results."""
+    return tmp_path / "runs", tmp_path / "results"
+
+
+def result_of(folders):
+    return folders[1] / f"{CELL.name}.json"
+
+
+def changed(**changes):
+    return dataclasses.replace(CELL, **changes)
+
+
+@pytest.fixture
+def grid(tmp_path):
+    def write(text):
+        path = tmp_path / "grid.toml"
+        path.write_text(text)
+        return trainings.read_grid(path)
+
+    return write
+
+
+@pytest.fixture
+def synthetic(monkeypatch):
+    """Trains and judges on a small environment; keeps the options of evaluations."""
+    asked, train = [], training.train
+
+    def small(config, run, resume):
+        return train(
+            config, run, resume, progress=False, make_env=synthetic_env.make_env
+        )
+
+    def judge(policy, task, task_kwargs, episodes, name):
+        asked.append(task_kwargs)
+        found = evaluation.evaluate(
+            policy, task, episodes, name=name, task_kwargs={},
+            make_env=synthetic_env.make_env,
+        )  # fmt: skip
+        return found, None
+
+    monkeypatch.setattr(training, "train", small)
+    monkeypatch.setattr(judgement, "judge", judge)
+    return asked
+
+
+def test_a_finished_cell_tells_how_it_came_about(folders, synthetic):
+    assert trainings.standing(CELL, *folders) == ("waiting", "")
+    assert trainings.work(CELL, *folders)
+    done = trainings.read_result(result_of(folders))
+    assert done.cell["name"] == CELL.name
+    assert done.values["config"] == json.loads(json.dumps(CELL.config().to_dict()))
+    assert done.training["frames"] == 512 and done.frames_per_second > 0
+    assert done.training["curve"]["frames"] == [256, 512]
+    assert done.evaluation["summary"]["episodes"] == 3
+    assert len(done.evaluation["episodes"]["max_force"]) == 3
+    assert trainings.standing(CELL, *folders)[0] == "finished"
+    # A label is a matter of the page; other settings are left alone.
+    assert trainings.standing(changed(label="other"), *folders)[0] == "finished"
+    state, remark = trainings.standing(changed(total_frames=1024), *folders)
+    assert state == "other settings" and "total_frames differ; move" in remark
+
+
+def test_a_damaged_file_costs_an_evaluation_and_no_training(folders, synthetic):
+    trainings.work(CELL, *folders)
+    path = result_of(folders)
+    metrics = (folders[0] / CELL.name / "metrics.csv").read_text()
+    path.write_text(path.read_text()[:100])
+    state, remark = trainings.standing(CELL, *folders)
+    assert state == "begun" and f"{path} is damaged" in remark
+    trainings.work(CELL, *folders)
+    assert (folders[0] / CELL.name / "metrics.csv").read_text() == metrics
+    assert trainings.standing(CELL, *folders)[0] == "finished"
+
+
+def test_the_evaluation_is_the_published_one_whatever_was_trained(folders, synthetic):
+    options = {"max_steps": 20}
+    cell = changed(settings={**CELL.settings, "task_kwargs": options})
+    trainings.work(cell, *folders)
+    assert synthetic == [{"max_steps": MAX_STEPS}]
+    more = {"reward": "path", "goal_radius": 0.1, "friction": 0.1, "rotation": True}
+    assert judgement.published_options({**options, **more}) == {
+        "friction": 0.1,
+        "rotation": True,
+        "max_steps": MAX_STEPS,
+    }
+
+
+def test_a_cell_that_fails_does_not_stop_the_others(tmp_path, monkeypatch, capsys):
+    (tmp_path / "grid.toml").write_text(ROW)
+    did = []
+
+    def work(cell, runs, results):
+        did.append(cell.name)
+        if cell.seed == 0:
+            raise FloatingPointError("loss is not finite")
+        return cell.task != "type1_lcca"
+
+    monkeypatch.setattr(trainings, "work", work)
+    where = (tmp_path / "grid.toml", tmp_path / "runs", tmp_path / "results")
+    # The last one is interrupted.
+    assert trainings.main(*where) == 130 and len(did) == 4
+    assert "failed, FloatingPointError: loss is not finite" in capsys.readouterr().out
+    assert trainings.main(*where, only=["bca"]) == 1 and len(did) == 6
+    assert trainings.main(*where, list=True) == 0 and len(did) == 6
+    assert trainings.main(tmp_path / "none.toml") == 2
+
+
+def test_first_seed_of_every_task_comes_first(grid):
+    assert [cell.name for cell in grid(ROW)] == [
+        "type1_bca-ppo-internal-demo-seed0",
+        "type1_lcca-ppo-internal-demo-seed0",
+        "type1_bca-ppo-internal-demo-seed1",
+        "type1_lcca-ppo-internal-demo-seed1",
+    ]
+    text = ROW.replace("= 1000", "= { type1_bca = 512, type1_lcca = 1024 }")
+    assert [cell.total_frames for cell in grid(text)[:2]] == [512, 1024]
+    cell = grid(ROW.replace('"internal"', '["goal", "force"]'))[0]
+    assert cell.name == "type1_bca-ppo-goal+force-demo-seed0"
+
+
+def test_a_cell_makes_the_settings_of_its_training(grid):
+    more = (
+        "settings = { num_envs = 8, task_kwargs = { friction = 0.1 }, "
+        'initial_policy = "runs/{task}-bc" }\n'
+    )
+    config = grid(ROW + more)[3].config()
+    assert (config.algorithm, config.task, config.seed) == ("ppo", "type1_lcca", 1)
+    assert (config.total_frames, config.num_envs) == (1000, 8)
+    assert config.task_kwargs == {"friction": 0.1}
+    assert config.initial_policy == "runs/type1_lcca-bc"
+    assert config.clip == 0.2  # of the preset
+
+
+@pytest.mark.parametrize(
+    ("change", "word"),
+    [
+        (("seeds = [0, 1]", "seeds = [true]"), "seed"),
+        (("seeds = [0, 1]", "seed = 1"), "seed"),
+        (('label = "PPO"', ""), "label"),
+        (('"type1_bca"', '"../escaped"'), "no task"),
+        (("[[row]]", '[[row]]\nvariant = "/x"'), "name with /"),
+        (('"demo"', '"nonsense"'), "preset"),
+        (("= 1000", "= 0"), "total_frames"),
+        (("= 1000", "= { type1_bca = 5 }"), "lacks 'type1_lcca'"),
+        (("= 1000", "= 1\nevaluation = { episodes = 0 }"), "evaluation=.*episodes"),
+        (("= 1000", "= 1\nevaluation = { seed = 0 }"), "evaluation=.*may have task"),
+        (("= 1000", '= 1\nevaluation = { task = "none" }'), "of `cathsim list`"),
+        (("= 1000", '= 1\nevaluation = { each_arch = "test" }'), "random arches"),
+        (("[[row]]", "[row]"), "grid.toml"),
+        (("[[row]]", "[[row"), "grid.toml"),
+        (("[[row]]", ROW + "[[row]]"), "row 2: .*twice; give a variant"),
+    ],
+)
+def test_a_bad_grid_is_refused_before_any_work(grid, change, word):
+    with pytest.raises(ValueError, match=word) as error:
+        grid(ROW.replace(*change))
+    assert "grid.toml" in str(error.value)
+
+
+def test_options_of_the_evaluation_are_refused_before_the_training(folders):
+    cell = changed(evaluation={"task_kwargs": {"frction": 1}})
+    with pytest.raises(ValueError, match="frction"):
+        trainings.work(cell, *folders)
+    assert not folders[0].exists()
+
+
+def test_the_grid_that_ships_has_the_order_of_the_time_budget():
+    cells = trainings.read_grid()
+    labels = list(dict.fromkeys(cell.label for cell in cells))
+    assert labels[:3] == ["PPO-Internal", "SAC-Internal", "PPO-Image"]
+    four = {"type1_bca", "type1_lcca", "type2_bca", "type2_lcca"}
+    assert {cell.task for cell in cells[:4]} == four
+    assert {cell.seed for cell in cells[:4]} == {0}
+
+
+def test_learning_curves_are_thinned_to_200_points():
+    rows = [{"frames": float(i), "seconds": i / 2, "success": None} for i in range(999)]
+    curve = trainings.learning_curve(rows)
+    assert len(curve["frames"]) == 200
+    assert (curve["frames"][0], curve["frames"][-1]) == (0, 998)
+    assert set(curve["success"]) == {None} and "distance" not in curve
+    assert trainings.learning_curve([]) == {}
+
+
+def test_the_first_few_episodes_solve_nothing():
+    names = ("frames", "episodes", "success", "seconds")
+    rows = [(10, 5, 1.0, 1), (20, 120, 0.89, 2), (30, 150, 0.9, 3), (40, 160, 1.0, 4)]
+    rows = [dict(zip(names, row, strict=True)) for row in rows]
+    assert trainings.solved(rows) == {"frames": 30, "seconds": 3}
+    assert trainings.solved(rows[:2]) is None
+
+
+def test_force_maps_survive_the_file():
+    random = np.random.default_rng(0)
+    place = random.uniform(-0.02, 0.02, (50, 3))
+    made = force_map(place, random.random(50), np.full(2, -0.021), np.full(2, 0.021))
+    values = json.loads(json.dumps(judgement.map_values(made)))
+    read = judgement.map_from_values(values)
+    np.testing.assert_array_equal(read.count, made.count)
+    np.testing.assert_allclose(read.mean, made.mean, rtol=1e-5)
+    np.testing.assert_allclose(read.x_edges, made.x_edges, atol=1e-9)
