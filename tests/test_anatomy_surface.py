@@ -6,6 +6,7 @@ import pytest
 from cathsim_dmc.anatomy import lattice, surface
 from cathsim_dmc.anatomy.arch import arch
 from cathsim_dmc.anatomy.centreline import Centreline, Vessel, VesselTree
+from cathsim_dmc.anatomy.scan import topology
 from cathsim_dmc.anatomy.tree_depth import TreeDepth
 
 
@@ -19,7 +20,9 @@ def test_surface_is_closed_points_outwards_and_follows_the_lumen(name):
     anatomy = arch.load(name)
     found = anatomy.surface
     assert len(found.faces) <= 30_000
-    assert surface.loose_edges(found) == 0 and surface.bodies(found) == 1
+    faces = found.faces.astype(np.int64)
+    assert (topology.edge_counts(faces)[1] == 2).all()
+    assert (topology.parts(faces) == 0).all()
     assert found.volume > 0.0
     measure = TreeDepth(anatomy.tree)
     assert np.percentile(np.abs(measure(found.vertices)), 95) < 0.3e-3

@@ -102,19 +102,6 @@ def access_inlet(tree: VesselTree, access: str) -> VesselPlace:
     return VesselPlace(root.name, arc_length=arc)
 
 
-def anatomy_frame(tree: VesselTree, access: str) -> tuple[Inlet, tuple[End, ...]]:
-    """Inlet at one end of the root, and every flat end of the tree.
-
-    Args:
-        tree: vessels.
-        access: "ascending" enters at the root's first point, "descending" (as from
-            the femoral artery) at its last.
-    """
-    access_inlet(tree, access)
-    ends = flat_ends(tree, tree.root.name, access == "ascending")
-    return _inlet(ends), ends
-
-
 def flat_ends(tree: VesselTree, entered: str, at_first: bool) -> tuple[End, ...]:
     """Every flat end of a tree, the one where the device enters open.
 

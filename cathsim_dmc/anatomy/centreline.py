@@ -123,34 +123,22 @@ class Centreline:
         """Nearest point of the polyline to each of `points` (..., 3), metres."""
         points = as_points(points)
         flat = points.reshape(-1, 3)
-        out = [np.empty(len(flat)) for _ in range(3)]
-        chunk = max(1, _CHUNK_ELEMENTS // len(self._segments.length))
-        for first in range(0, len(flat), chunk):
-            part = slice(first, first + chunk)
-            squared, raw = self._segments.squared_distance(flat[part])
-            arc, distance, radius, _ = self._nearest(flat[part], squared, raw)
-            out[0][part], out[1][part], out[2][part] = arc, distance, radius
-        return Projection(*(values.reshape(points.shape[:-1]) for values in out))
-
-    def _nearest(
-        self, points: Array, squared: Array, raw: Array
-    ) -> tuple[Array, Array, Array, Array]:
-        """Arc length, distance, radius and overshoot past an end, each (n,)."""
+        out = np.empty((3, len(flat)))
         segments = self._segments
-        index = squared.argmin(axis=1)
-        t_raw = raw[np.arange(len(points)), index]
-        t = np.clip(t_raw, 0.0, 1.0)
-        nearest = segments.start[index] + t[:, None] * segments.direction[index]
-        offset = points - nearest
-        distance = np.sqrt(np.einsum("nj,nj->n", offset, offset))
-        radius = self.radii[index] * (1.0 - t) + self.radii[index + 1] * t
-        arc = self.arc_length[index] + t * segments.length[index]
-        overshoot = np.zeros(len(points))
-        low = (index == 0) & (t_raw < 0.0)
-        high = (index == len(segments.length) - 1) & (t_raw > 1.0)
-        overshoot[low] = -t_raw[low] * segments.length[0]
-        overshoot[high] = (t_raw[high] - 1.0) * segments.length[-1]
-        return arc, distance, radius, overshoot
+        chunk = max(1, _CHUNK_ELEMENTS // len(segments.length))
+        for first in range(0, len(flat), chunk):
+            part = flat[first : first + chunk]
+            squared, raw = segments.squared_distance(part)
+            index = squared.argmin(axis=1)
+            t = np.clip(raw[np.arange(len(part)), index], 0.0, 1.0)
+            nearest = segments.start[index] + t[:, None] * segments.direction[index]
+            offset = part - nearest
+            out[:, first : first + chunk] = (
+                self.arc_length[index] + t * segments.length[index],
+                np.sqrt(np.einsum("nj,nj->n", offset, offset)),
+                self.radii[index] * (1.0 - t) + self.radii[index + 1] * t,
+            )
+        return Projection(*(values.reshape(points.shape[:-1]) for values in out))
 
     def resampled(self, spacing: float) -> Centreline:
         """Same curve with equal steps of about `spacing` (m), ends kept."""
@@ -265,18 +253,6 @@ class VesselTree:
                 f"no vessel {name!r}; there are {', '.join(self.vessels)}."
             ) from None
 
-    @cached_property
-    def _segments(self) -> tuple[Segments, list[slice]]:
-        lines = [vessel.centreline for vessel in self.vessels.values()]
-        stops = np.cumsum([0] + [len(line.points) - 1 for line in lines])
-        return (
-            Segments(
-                np.concatenate([line.points[:-1] for line in lines]),
-                np.concatenate([line.points[1:] for line in lines]),
-            ),
-            [slice(*pair) for pair in zip(stops[:-1], stops[1:], strict=True)],
-        )
-
     def depths(self, points: ArrayLike) -> dict[str, Array]:
         """Radius less distance (m) of `points` (..., 3) in each vessel's own tube.
 
@@ -285,29 +261,19 @@ class VesselTree:
         value is at most minus the distance to its plane.
         """
         points = as_points(points)
-        flat = points.reshape(-1, 3)
-        out = np.empty((len(self.vessels), len(flat)))
-        segments, slices = self._segments
-        chunk = max(1, _CHUNK_ELEMENTS // len(segments.length))
-        for first in range(0, len(flat), chunk):
-            part = slice(first, first + chunk)
-            squared, raw = segments.squared_distance(flat[part])
-            for row, vessel, columns in zip(
-                out, self.vessels.values(), slices, strict=True
-            ):
-                line = vessel.centreline
-                arc, distance, radius, overshoot = line._nearest(
-                    flat[part], squared[:, columns], raw[:, columns]
-                )
-                depth = radius - distance
+        depths = {}
+        for name, vessel in self.vessels.items():
+            line = vessel.centreline
+            near = line.project(points)
+            depth = near.radius - near.distance
+            for s, outward in ((0.0, -1.0), (line.length, 1.0)):
+                end = line.at(s)
+                beyond = outward * ((points - end.position) @ end.tangent)
                 # Rounding must not put the end plane itself outside.
-                beyond = overshoot > _END_PLANE
-                depth[beyond] = np.minimum(depth[beyond], -overshoot[beyond])
-                row[part] = depth
-        return {
-            name: row.reshape(points.shape[:-1])
-            for name, row in zip(self.vessels, out, strict=True)
-        }
+                cut = np.isclose(near.arc_length, s) & (beyond > _END_PLANE)
+                depth = np.where(cut, np.minimum(depth, -beyond), depth)
+            depths[name] = depth
+        return depths
 
     def _lineage(self, name: str) -> list[str]:
         """Names from `name` up to the root."""

@@ -98,23 +98,3 @@ def lumen_surface(tree: VesselTree, spacing: float | None = None) -> Surface:
     if surface.volume < 0.0:
         surface = Surface(surface.vertices, surface.faces[:, ::-1])
     return surface
-
-
-def loose_edges(surface: Surface) -> int:
-    """Number of edges of a surface that do not have exactly two triangles."""
-    edges = surface.faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
-    _, counts = np.unique(np.sort(edges, axis=1), axis=0, return_counts=True)
-    return int((counts != 2).sum())
-
-
-def bodies(surface: Surface) -> int:
-    """Number of parts of a surface that no edge connects."""
-    from scipy.sparse import coo_array
-    from scipy.sparse.csgraph import connected_components
-
-    first, second = surface.faces[:, :2].T, surface.faces[:, 1:].T
-    ends = np.concatenate([first, second], axis=1)
-    count = len(surface.vertices)
-    edges = coo_array((np.ones(ends.shape[1]), ends), shape=(count, count))
-    _, labels = connected_components(edges, directed=False)
-    return len(np.unique(labels[surface.faces[:, 0]]))

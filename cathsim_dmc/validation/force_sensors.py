@@ -12,11 +12,9 @@ import numpy as np
 
 from cathsim_dmc import suite
 from cathsim_dmc.anatomy.anatomy import Anatomy
-from cathsim_dmc.anatomy.builder import anatomy_frame
+from cathsim_dmc.anatomy.builder import VesselPlace
 from cathsim_dmc.anatomy.centreline import Centreline, Vessel, VesselTree
 from cathsim_dmc.anatomy.field import Field
-from cathsim_dmc.anatomy.parts import Goal
-from cathsim_dmc.anatomy.surface import lumen_surface
 from cathsim_dmc.entities.chain import MAX_PUSH_SPEED
 from cathsim_dmc.entities.phantom import Phantom
 from cathsim_dmc.physics import forces
@@ -103,16 +101,8 @@ def straight_tube(length: float, radius: float) -> Anatomy:
     z = np.linspace(0.0, length, 13)
     line = Centreline(np.stack([0 * z, 0 * z, z], axis=-1), np.full(len(z), radius))
     tree = VesselTree({"tube": Vessel("tube", line, None, 0.0)})
-    inlet, ends = anatomy_frame(tree, "ascending")
-    place = length - 1e-3
-    return Anatomy(
-        name="tube",
-        tree=tree,
-        surface=lumen_surface(tree),
-        inlet=inlet,
-        goals={"end": Goal("end", "tube", line.at(place).position, place)},
-        ends=ends,
-    )
+    end = VesselPlace("tube", arc_length=length - 1e-3)
+    return Anatomy.from_tree(tree, "tube", goals={"end": end})
 
 
 class DeadEnd(NamedTuple):

@@ -10,8 +10,9 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from cathsim_dmc.anatomy import measures, surface
+from cathsim_dmc.anatomy import measures
 from cathsim_dmc.anatomy.anatomy import Anatomy
+from cathsim_dmc.anatomy.scan import topology
 from cathsim_dmc.anatomy.scan.check import check_tree
 from cathsim_dmc.anatomy.surface_depth import SurfaceDepth
 from cathsim_dmc.anatomy.tree_depth import TreeDepth
@@ -218,7 +219,8 @@ def lumen_checks(anatomy: Anatomy) -> list[Check]:
     error = 1e3 * field_error(anatomy)
     radius = devices.get("steerable_5f").outer_radius
     narrow = _narrow(anatomy, radius)
-    loose = surface.loose_edges(anatomy.surface)
+    faces = anatomy.surface.faces.astype(np.int64)
+    loose = int((topology.edge_counts(faces)[1] != 2).sum())
     astray = [
         goal.name
         for goal in anatomy.goals.values()
@@ -239,7 +241,7 @@ def lumen_checks(anatomy: Anatomy) -> list[Check]:
         ),
         Check.at_most(
             f"{name}: separate parts of the surface",
-            surface.bodies(anatomy.surface),
+            int(topology.parts(faces).max()) + 1,
             1,
             "",
         ),

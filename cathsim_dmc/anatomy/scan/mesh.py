@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import importlib.util
 import io
 import re
@@ -213,21 +214,20 @@ def _parsed(data: bytes, kind: str) -> tuple[np.ndarray, np.ndarray]:
 
 def _read_vtp(data: bytes) -> tuple[np.ndarray, np.ndarray]:
     """Triangles of a VTK PolyData file, by VTK; polygons and strips are divided."""
-    from vtkmodules.util.numpy_support import vtk_to_numpy
-    from vtkmodules.vtkCommonCore import vtkObject
-    from vtkmodules.vtkFiltersCore import vtkTriangleFilter
-    from vtkmodules.vtkIOXML import vtkXMLPolyDataReader
-
-    vtkObject.GlobalWarningDisplayOff()  # it prints what it cannot read
-    reader, triangles = vtkXMLPolyDataReader(), vtkTriangleFilter()
+    modules = ("vtkCommonCore", "vtkFiltersCore", "vtkIOXML", "util.numpy_support")
+    core, filters, xml, arrays = (
+        importlib.import_module(f"vtkmodules.{name}") for name in modules
+    )
+    core.vtkObject.GlobalWarningDisplayOff()  # it prints what it cannot read
+    reader, triangles = xml.vtkXMLPolyDataReader(), filters.vtkTriangleFilter()
     reader.SetReadFromInputString(True)
     reader.SetInputString(data)
     reader.Update()
     read = reader.GetOutput()
     for cells in (read.GetVerts(), read.GetLines(), read.GetPolys(), read.GetStrips()):
         # VTK does not look, and would read beyond the arrays.
-        corners = vtk_to_numpy(cells.GetConnectivityArray())
-        stops = vtk_to_numpy(cells.GetOffsetsArray())
+        corners = arrays.vtk_to_numpy(cells.GetConnectivityArray())
+        stops = arrays.vtk_to_numpy(cells.GetOffsetsArray())
         beyond = stops[-1:] != len(corners) or np.diff(stops, prepend=0).min() < 0
         if beyond or np.any((corners < 0) | (corners >= read.GetNumberOfPoints())):
             raise ValueError("its cells name points that it does not have")
@@ -238,6 +238,8 @@ def _read_vtp(data: bytes) -> tuple[np.ndarray, np.ndarray]:
     triangles.PassVertsOff()
     triangles.Update()
     found = triangles.GetOutput()
-    corners = vtk_to_numpy(found.GetPolys().GetConnectivityArray())
-    points = np.array(vtk_to_numpy(found.GetPoints().GetData()), dtype=np.float64)
+    corners = arrays.vtk_to_numpy(found.GetPolys().GetConnectivityArray())
+    points = np.array(
+        arrays.vtk_to_numpy(found.GetPoints().GetData()), dtype=np.float64
+    )
     return points, corners.astype(np.int64).reshape(-1, 3)
