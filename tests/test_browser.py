@@ -78,20 +78,19 @@ def test_webassembly_moves_and_draws_as_python_does(builder, scene, tmp_path):
     command = ["node", PAGES / "replay.mjs", module, scene, tmp_path / "actions.json"]
     subprocess.run([*command, out, image], check=True)
     page = json.loads(out.read_text())
-    env = suite.load("cathsim", "type1_lcca", {"random": builder.SEED})
-    env.reset()
+    exported = builder.ExportedScene(scene)
     heads, forces = [], []
     for action in actions:
-        env.step(action)
-        heads.append(env.task.readings.head)
-        forces.append(float(env.task.wall_force.peak_max))
+        exported.step(action)
+        heads.append(exported.head)
+        forces.append(float(exported.wall_force.peak_max))
     # Until a contact is found otherwise they agree to the last digits of a float64;
     # two versions of MuJoCo find some otherwise.
     apart = np.linalg.norm(np.array(heads) - page["head"], axis=1)
     assert np.median(apart) < 1e-9 and apart.max() < 0.5e-3
     assert max(forces) > 0.0
     np.testing.assert_allclose(page["peak_max"], forces, atol=0.02)
-    surface = env.task.scene.anatomy.surface
+    surface = suite.make_task("type1_lcca").scene.anatomy.surface
     options = builder.FLUOROSCOPY
     plane = Angiograph(surface.vertices, surface.faces, options).planes()[0]
     drawn = plane.render(np.array(page["line"]), builder.DEVICE_RADIUS)[..., 0]

@@ -76,7 +76,7 @@ class CArm:
                 "secondary", self.secondary, -_STEEPEST, _STEEPEST, "rad"
             ),
             "source_detector": bounds.number(
-                "source_detector", self.source_detector, self.source_isocentre, unit="m"
+                "source_detector", self.source_detector, NEAREST, unit="m"
             ),
             "source_isocentre": bounds.number(
                 "source_isocentre", self.source_isocentre, NEAREST, unit="m"
@@ -86,6 +86,11 @@ class CArm:
         }
         for name in ("magnification", "detector_size"):
             checked[name] = bounds.number(name, getattr(self, name), positive=True)
+        if checked["source_detector"] < checked["source_isocentre"]:
+            raise ValueError(
+                f"source_detector is {self.source_detector} m and source_isocentre "
+                f"{self.source_isocentre} m; the detector must lie beyond the isocentre"
+            )
         for name, value in checked.items():
             object.__setattr__(self, name, value)
 

@@ -31,6 +31,7 @@ export class Simulation {
       const sensor = id("mjOBJ_SENSOR", name);
       this.sensors[key] = [model.sensor_adr[sensor], model.sensor_dim[sensor]];
     }
+    this.drives = drives(mujoco, model);
     this.branch = task.branch && new Branch(task.branch);
     this.reset();
   }
@@ -40,6 +41,7 @@ export class Simulation {
     this.mujoco.mj_resetData(this.model, this.data);
     this.data.qpos.set(this.task.qpos);
     this.mujoco.mj_forward(this.model, this.data);
+    for (const drive of this.drives) hold(drive, this.data);
     this.steps = 0;
     this.success = false;
     this.wall = { sum: 0, max: 0, peakSum: 0, peakMax: 0 };
@@ -55,6 +57,9 @@ export class Simulation {
     this.actuators.forEach((actuator, i) => {
       control[actuator] = Math.min(Math.max(action[i], -1), 1);
     });
+    for (const drive of this.drives) {
+      follow(drive, data, this.task.control_timestep);
+    }
     let peakSum = 0;
     let peakMax = 0;
     let force = { sum: 0, max: 0 };
@@ -161,6 +166,47 @@ export class Simulation {
   get failed() {
     return !this.headPosition.every(Number.isFinite);
   }
+}
+
+/** Servos of the base, see cathsim_dmc/physics/drives.py. */
+function drives(mujoco, model) {
+  const found = [];
+  for (let actuator = 0; actuator < model.nu; actuator += 1) {
+    const kind = model.actuator_dyntype[actuator];
+    if (kind !== mujoco.mjtDyn.mjDYN_INTEGRATOR.value) continue;
+    const joint = model.actuator_trnid[2 * actuator];
+    const width = model.actuator_gainprm.length / model.nu;
+    found.push({
+      actuator,
+      act: model.actuator_actadr[actuator],
+      qpos: model.jnt_qposadr[joint],
+      dof: model.jnt_dofadr[joint],
+      gain: model.actuator_gainprm[width * actuator],
+      stiffness: -model.actuator_biasprm[width * actuator + 1],
+      damping: -model.actuator_biasprm[width * actuator + 2],
+      limit: model.actuator_forcerange[2 * actuator + 1],
+      told: 0,
+    });
+  }
+  return found;
+}
+
+/** Sets the command of a drive to where its base stands. */
+function hold(drive, data) {
+  drive.told = data.qpos[drive.qpos];
+  data.act[drive.act] = (drive.told * drive.stiffness) / drive.gain;
+}
+
+/** Corrects a servo for its load and its slip, before a control step of some seconds. */
+function follow(drive, data, seconds) {
+  const { gain, stiffness, limit } = drive;
+  const place = data.qpos[drive.qpos];
+  const brake = drive.damping * data.qvel[drive.dof];
+  const effort = gain * data.act[drive.act] - (stiffness * place + brake);
+  if (Math.abs(effort) >= limit) drive.told = place;
+  const borne = Math.min(Math.max(effort, -limit), limit);
+  data.act[drive.act] = (stiffness * drive.told + borne + brake) / gain;
+  drive.told += data.ctrl[drive.actuator] * (gain / stiffness) * seconds;
 }
 
 /** The target branch: whether a point lies in it, past its ostium. */

@@ -21,7 +21,9 @@ import time
 import urllib.error
 import urllib.request
 from pathlib import Path
+from types import SimpleNamespace
 
+import mujoco
 import numpy as np
 import rerun_cli
 from PIL import Image
@@ -30,6 +32,8 @@ from cathsim_dmc import agents, suite  # agents before anything of dm_control
 from cathsim_dmc.agents import report
 from cathsim_dmc.imaging import FluoroscopyOptions
 from cathsim_dmc.imaging.angiograph import Angiograph
+from cathsim_dmc.physics import forces
+from cathsim_dmc.physics.drives import Drives
 from cathsim_dmc.pictures.figure import VIEWS
 from cathsim_dmc.pictures.translucent import ParallelProjection, glass
 from cathsim_dmc.simulation.mjcf import write_mjcf
@@ -72,6 +76,47 @@ def main() -> None:
     size = sum(path.stat().st_size for path in out.rglob("*") if path.is_file())
     print(f"{out}: {size / 1e6:.0f} MB")
     print(f"python -m http.server --directory {site}  # and open browser/index.html")
+
+
+class ExportedScene:
+    """A scene that `cathsim mjcf` wrote, at the start of its episode.
+
+    Attributes:
+        model, data: MuJoCo's.
+        wall_force: force on the wall of the last control step.
+    """
+
+    def __init__(self, folder: Path):
+        self._task = json.loads((folder / "task.json").read_text())
+        self.model = mujoco.MjModel.from_xml_path(str(folder / "scene.xml"))
+        self.data = mujoco.MjData(self.model)
+        self.data.qpos[:] = self._task["qpos"]
+        mujoco.mj_forward(self.model, self.data)
+        names = ("qpos", "qvel", "act")
+        views = {name: getattr(self.data, name)[None] for name in names}
+        self._drives = Drives(self.model, SimpleNamespace(**views))
+        self._drives.hold(0)
+        self._order = [self.model.actuator(name).id for name in self._task["actuators"]]
+        kinds = self.model.actuator_dyntype[self._order]
+        self._driven = kinds == mujoco.mjtDyn.mjDYN_INTEGRATOR.value
+        sensor = self.model.sensor(self._task["sensors"]["wall_contacts"])
+        self._row = slice(sensor.adr[0], sensor.adr[0] + sensor.dim[0])
+
+    def step(self, action: np.ndarray) -> None:
+        """A control step."""
+        action = np.clip(action, -1.0, 1.0)
+        self.data.ctrl[self._order] = action
+        self._drives.follow(action[None, self._driven])
+        rows = []
+        for _ in range(self._task["substeps"]):
+            mujoco.mj_step(self.model, self.data)
+            rows.append(self.data.sensordata[self._row].copy())
+        self.wall_force = forces.wall_force(forces.magnitudes(np.array(rows)))
+
+    @property
+    def head(self) -> np.ndarray:
+        """Position (3,) of the head, m."""
+        return self.data.site(self._task["head"]).xpos.copy()
 
 
 def write_mujoco(out: Path) -> None:

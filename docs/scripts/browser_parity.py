@@ -1,8 +1,9 @@
-"""The page in the browser beside the Python task: the same actions, step by step.
+"""The page in the browser beside Python: the same scene and actions, step by step.
 
     python docs/scripts/browser_parity.py
 
-Replays episodes in MuJoCo's WebAssembly build (Node.js) and in the suite; writes
+Plays episodes of the task, and replays their actions in the scene that `cathsim mjcf`
+exports, in Python and in MuJoCo's WebAssembly build (Node.js); writes
 docs/images/browser_parity.png and docs/data/browser_parity.json, and the table of
 docs/browser/index.md.
 """
@@ -68,7 +69,7 @@ def main() -> None:
 
 
 def compared(name: str, policy: str, steps: int, module: Path, scene: Path) -> dict:
-    """An episode in Python, and the same actions in WebAssembly."""
+    """An episode of the task, and its actions in the exported scene, twice."""
     played = play(policy, steps)
     actions, out = scene.parent / "actions.json", scene.parent / "out.json"
     image = scene.parent / "image.bin"
@@ -81,7 +82,8 @@ def compared(name: str, policy: str, steps: int, module: Path, scene: Path) -> d
     return {
         "name": name,
         "version": replayed["version"],
-        "python": {key: np.array(value) for key, value in played.items()},
+        "task": {key: np.array(value) for key, value in played.items()},
+        "python": replay(scene, played["action"]),
         "browser": {
             key: np.array(value)
             for key, value in replayed.items()
@@ -92,26 +94,33 @@ def compared(name: str, policy: str, steps: int, module: Path, scene: Path) -> d
 
 
 def play(policy: str, steps: int) -> dict[str, list]:
-    """Heads, forces and times of an episode of the suite."""
+    """Actions, heads and success of an episode of the suite."""
     player = load_policy(policy, SEED)
     kwargs = {"random": SEED, "observation": player.observation or "tracking"}
     env = suite.load("cathsim", TASK, kwargs)
     act = as_function(player, env, SEED)
     timestep = env.reset()
-    names = ("action", "head", "max", "peak_max", "push", "milliseconds")
-    kept: dict[str, list] = {name: [] for name in (*names, "success")}
+    kept: dict[str, list] = {name: [] for name in ("action", "head", "success")}
     while not timestep.last() and len(kept["head"]) < steps:
         action = np.array(act(timestep), dtype=np.float64)
-        start = time.process_time()
         timestep = env.step(action)
-        kept["milliseconds"].append(1e3 * (time.process_time() - start))
         kept["action"].append(action.tolist())
         kept["head"].append(env.task.readings.head.tolist())
-        kept["max"].append(float(env.task.wall_force.max))
-        kept["peak_max"].append(float(env.task.wall_force.peak_max))
-        kept["push"].append(float(env.task.readings.push_force))
         kept["success"].append(env.task.termination == "success")
     return kept
+
+
+def replay(scene: Path, actions: list) -> dict[str, np.ndarray]:
+    """Heads, forces and times of the exported scene in Python."""
+    exported = browser.ExportedScene(scene)
+    kept: dict[str, list] = {"head": [], "peak_max": [], "milliseconds": []}
+    for action in np.array(actions):
+        start = time.process_time()
+        exported.step(action)
+        kept["milliseconds"].append(1e3 * (time.process_time() - start))
+        kept["head"].append(exported.head)
+        kept["peak_max"].append(exported.wall_force.peak_max)
+    return {name: np.array(values) for name, values in kept.items()}
 
 
 def drawn(line: list) -> np.ndarray:
@@ -125,13 +134,15 @@ def row(each: dict) -> dict:
     """The figures of an episode."""
     python, page = each["python"], each["browser"]
     apart = 1e3 * np.linalg.norm(python["head"] - page["head"], axis=1)
+    task = 1e3 * np.linalg.norm(each["task"]["head"] - page["head"], axis=1)
     force = 1e3 * np.abs(python["peak_max"] - page["peak_max"])
     spent = page["processor_milliseconds"]
     return {
         "name": each["name"],
         "steps": len(apart),
-        "success": [bool(python["success"][-1]), bool(page["success"][-1])],
+        "success": [bool(each["task"]["success"][-1]), bool(page["success"][-1])],
         "head_mm": [float(np.median(apart)), float(apart.max()), float(apart[-1])],
+        "task_mm": [float(np.median(task)), float(task.max()), float(task[-1])],
         "largest_mN": [
             float(1e3 * python["peak_max"].max()),
             float(1e3 * page["peak_max"].max()),
@@ -181,17 +192,20 @@ def write_table(values: dict, page: Path) -> None:
         "WebAssembly (Node.js). A control step is 40 ms; times are of the processor.",
         "",
         "| episode | control steps | heads apart, mm: median / largest / at the end "
+        "| from the task, the same | success: task / WebAssembly "
         "| largest contact, mN: Python / WebAssembly | control step, ms: median / 95 % "
         "| the same in Python, ms |",
-        "|---|---|---|---|---|---|",
+        "|---|---|---|---|---|---|---|---|",
     ]
     for each in values["episodes"]:
         apart = " / ".join(f"{value:.2g}" for value in each["head_mm"])
+        task = " / ".join(f"{value:.2g}" for value in each["task_mm"])
+        success = " / ".join("yes" if one else "no" for one in each["success"])
         force = " / ".join(f"{value:.2f}" for value in each["largest_mN"])
         spent = " / ".join(f"{value:.1f}" for value in each["milliseconds"])
         lines.append(
-            f"| {each['name']} | {each['steps']} | {apart} | {force} | {spent} | "
-            f"{each['python_milliseconds']:.1f} |"
+            f"| {each['name']} | {each['steps']} | {apart} | {task} | {success} | "
+            f"{force} | {spent} | {each['python_milliseconds']:.1f} |"
         )
     text = page.read_text()
     before, rest = text.split(_BEGIN)
