@@ -11,7 +11,10 @@ export MUJOCO_GL ?= disable
 .PHONY: demo test test-slow nightly lint audit compatibility dist docs site clean
 
 demo: $(VENV)/.installed
-	$(BIN)/cathsim demo --out runs/demo
+	$(BIN)/cathsim train type1_lcca --algo dagger --preset demo --frames 8192 --out runs/demo $$(test ! -e runs/demo/config.json || echo --resume)
+	$(BIN)/cathsim eval runs/demo --out runs/demo
+	$(BIN)/cathsim record runs/demo --out runs/demo/episode.rrd
+	@echo "runs/demo: checkpoints/ (policy), metrics.csv, evaluation.json, heatmap.png, episode.rrd (open it: $(BIN)/cathsim replay runs/demo/episode.rrd)"
 
 # One thread a worker: those of torch and numpy only wait for each other.
 test test-slow: export OMP_NUM_THREADS ?= 1

@@ -15,8 +15,7 @@ from pathlib import Path
 import synthetic_env
 import test_agents_training as trainings
 
-from cathsim_dmc import cli
-from cathsim_dmc.agents import report, train
+from cathsim_dmc.agents import train
 
 # Never: what waits for a process this long has found that it hangs, s.
 _PATIENCE = 1200
@@ -29,26 +28,6 @@ def train_on(run, frames):
     )
     make_env = synthetic_env.make_env
     train(config, run, resume=True, progress=False, make_env=make_env)
-
-
-def import_on(mesh, out, cache, times):
-    """Imports a scan into the same folder, so many times."""
-    os.environ["XDG_CACHE_HOME"] = str(cache)
-    sys.argv = ["cathsim", "phantom", "import", str(mesh), "--out", str(out)]
-    for _ in range(times):
-        try:
-            cli.main()
-        except SystemExit as end:
-            if end.code:
-                raise
-
-
-def record_on(out, seeds):
-    """Records an episode of each seed into the same file."""
-    for seed in seeds:
-        report.record(
-            "push", out, task="type1_bca", seed=seed, max_steps=4, fluoroscopy=False
-        )
 
 
 def context():

@@ -5,6 +5,7 @@ import shutil
 import signal
 import subprocess
 import sys
+import types
 
 import pytest
 import synthetic_env
@@ -53,6 +54,21 @@ def test_a_folder_is_free_again_after_a_kill(tmp_path):
     assert subprocess.run(command).returncode == -signal.SIGKILL
     assert (tmp_path / ".lock").exists()
     assert run(small_ppo(total_frames=512), tmp_path).frames == 512
+
+
+def test_a_lock_that_is_removed_during_the_training_ends_it(tmp_path):
+    remove = synthetic_env.calling((tmp_path / ".lock").unlink, at=40)
+    with pytest.raises(RuntimeError, match="lock was removed.*resume the run"):
+        run(small_ppo(), tmp_path, make_env=remove)
+    assert not (tmp_path / "checkpoints").exists()
+    assert run(small_ppo(), tmp_path, resume=True).frames == 1_024
+
+
+def test_a_policy_is_not_played_with_another_device(trained):
+    policy = load_policy(trained / "ppo")
+    view = types.SimpleNamespace(num_actions=2)
+    with pytest.raises(ValueError, match="21 entries, the task has 2.*reach"):
+        policy.reset(view, None)
 
 
 def test_a_replay_that_is_deleted_during_the_training_is_written_again(tmp_path):

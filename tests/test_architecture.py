@@ -290,3 +290,19 @@ def test_the_order_that_crashes_is_refused(backend="egl"):
     assert "ImportError" in done.stderr
     for word in (backend, "torchrl", "first", "MUJOCO_GL=disable"):
         assert word in done.stderr
+
+
+def test_nothing_that_is_read_is_unpickled():
+    """NumPy refuses pickles unless it is told otherwise, torch if it is told so."""
+    for path in modules():
+        names = {name.split(".")[0] for name in imported(path)}
+        assert not names & {"pickle", "cloudpickle", "dill", "joblib", "shelve"}, path
+        for node in ast.walk(ast.parse(path.read_text())):
+            if not isinstance(node, ast.Call):
+                continue
+            given = {one.arg: ast.unparse(one.value) for one in node.keywords}
+            assert given.get("allow_pickle", "False") == "False", path
+            called = ast.unparse(node.func)
+            assert not called.endswith(".load_memmap"), path
+            if called == "torch.load":
+                assert given.get("weights_only") == "True", path

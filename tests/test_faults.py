@@ -7,15 +7,14 @@ import killed_work
 import numpy as np
 import pytest
 import synthetic_env
-from killed_work import finish, import_on, kill, moments, record_on, train_on
-from synthetic_scans import marched, write_obj, y_tree
+from killed_work import finish, kill, moments, train_on
 from test_agents_training import run, small_ppo
 
 from cathsim_dmc.agents import ConfigError, report
 from cathsim_dmc.agents.checkpoint import Checkpoint, checkpoints_in
 from cathsim_dmc.agents.metrics import read_metrics
 from cathsim_dmc.anatomy import Anatomy
-from cathsim_dmc.recording import Episode, viewer
+from cathsim_dmc.recording import Episode
 from cathsim_dmc.validation import force_sensors
 
 
@@ -116,41 +115,3 @@ def test_a_training_that_is_killed_loses_nothing_finished(tmp_path, server):
     finish(server, train_on, tmp_path, goal)
     frames = [row["frames"] for row in read_metrics(tmp_path / "metrics.csv")]
     assert frames == sorted(set(frames)) and frames[-1] == goal
-
-
-@pytest.mark.slow
-def test_an_import_that_is_killed_is_whole_or_not_there(tmp_path, server):
-    cache = tmp_path / "cache"
-    mesh = write_obj(tmp_path / "lumen.obj", *marched(y_tree()))
-    out, whole = tmp_path / "anatomy", 0
-    # A process imports and writes the anatomy again and again.
-    for moment in moments(14.0):
-        kill(server, import_on, mesh, out, cache, 10**9, after=moment)
-        if (out / "anatomy.npz").exists():
-            whole += 1
-            Anatomy.load(out)
-    finish(server, import_on, mesh, out, cache, 1)
-    anatomy = Anatomy.load(out)
-    finish(server, import_on, mesh, tmp_path / "again", tmp_path / "other", 1)
-    again = Anatomy.load(tmp_path / "again")
-    assert anatomy.lumen.digest == again.lumen.digest
-    assert names(out) == ["anatomy.npz"]
-    assert whole
-
-
-@pytest.mark.slow
-def test_a_recording_that_is_killed_is_whole_or_not_there(tmp_path, server):
-    out, seen = tmp_path / "a.rrd", 0
-    for moment in moments(6.0):
-        kill(server, record_on, out, range(1, 1000), after=moment)
-        arrays = out.with_suffix(".npz")
-        if arrays.exists():
-            seen += 1
-            assert Episode.load(arrays).steps == 4
-            viewer.check_recording(out)
-            # The end of a whole one.
-            assert out.read_bytes()[-12:-4] == b"RRF2FOOT"
-    assert names(tmp_path) in (["a.npz", "a.rrd"], ["a.rrd"], [])
-    report.record("push", out, task="type1_bca", max_steps=2, fluoroscopy=False)
-    assert sorted(p.name for p in tmp_path.iterdir()) == ["a.npz", "a.rrd"]
-    assert seen

@@ -13,6 +13,7 @@ from typing import Any
 
 import torch
 from tensordict.nn import TensorDictSequential
+from torch.utils._pytree import tree_leaves
 
 from cathsim_dmc import files
 from cathsim_dmc.agents.config import TrainingConfig
@@ -115,9 +116,17 @@ class Checkpoint:
         """Everything else that continuing the run needs.
 
         Raises:
-            CheckpointError: the file is missing or is not what was written.
+            CheckpointError: the file is missing, is not what was written, or has NaN.
         """
-        return self._load(_LEARNING)
+        state = self._load(_LEARNING)
+        tensors = (v for v in tree_leaves(state) if isinstance(v, torch.Tensor))
+        if any(bool(one.isnan().any()) for one in tensors):
+            raise CheckpointError(
+                f"{self.path / _LEARNING} has NaN, so learning cannot go on: delete "
+                f"{self.path} to resume from the checkpoint before it, or start a new "
+                "run with this policy (initial_policy)."
+            )
+        return state
 
     def policy(self) -> TensorDictSequential:
         """The policy, ready to act: raw observation in, action out.

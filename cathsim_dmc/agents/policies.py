@@ -11,7 +11,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from cathsim_dmc.agents import learners, pretrained
 from cathsim_dmc.agents.checkpoint import Checkpoint
-from cathsim_dmc.policies import POLICIES, Policy, make_policy
+from cathsim_dmc.policies import POLICIES, Policy, View, make_policy
 from cathsim_dmc.simulation import environments
 
 # Gets the standard observations (N, ...), returns the actions (N, A) or the TensorDict
@@ -86,6 +86,15 @@ class TrainedPolicy(FunctionPolicy):
         self.network, self.config, self.shapes = network, config, shapes
         self.observation = config.observation
 
+    def reset(self, view: View, which: np.ndarray) -> None:
+        """Refuse simulations of a device with other motors, as ValueError."""
+        if view.num_actions != self.shapes.actions:
+            raise ValueError(
+                f"{self.name} has actions of {self.shapes.actions} entries, the task "
+                f"has {view.num_actions}: play it with the device that it was trained "
+                f"with, that of {self.task} with {self.task_kwargs}"
+            )
+
     def act(self, observation: Any) -> np.ndarray:
         """Actions (N, A) float32.
 
@@ -100,8 +109,9 @@ class TrainedPolicy(FunctionPolicy):
         reads = environments.VECTOR in self.network.in_keys
         if reads and size != self.shapes.vector:
             raise ValueError(
-                f"{self.name} reads {self.shapes.vector} numbers, the task gives {size}"
-                ": play it with the options that it was trained with"
+                f"{self.name} reads {self.shapes.vector} numbers, the task gives "
+                f"{size}: play it with the device and the options that it was trained "
+                f"with, {self.task} with {self.task_kwargs}"
             )
         return super().act(observation)
 

@@ -5,7 +5,7 @@ import json
 import math
 import os
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -102,7 +102,7 @@ def train(
     run = Path(out_dir)
     _require_device(config.torch_device)
     with contextlib.ExitStack() as stack:
-        stack.enter_context(_only_process(run))
+        require_alone = stack.enter_context(_only_process(run))
         stack.enter_context(_naming_what_is_safe(run))
         checkpoint = _prepare(run, config, resume)
         stack.enter_context(_torch_threads(config.torch_threads))
@@ -132,7 +132,8 @@ def train(
         stack.callback(log.close)
         interruption = stack.enter_context(Interruption())
         newest = checkpoint.path if checkpoint else None
-        loop = _Loop(run, config, iter(collector), learner, log, newest)
+        batches = iter(collector)
+        loop = _Loop(run, config, batches, learner, log, require_alone, newest)
         while log.frames < config.total_frames and not interruption.requested:
             loop.step(interruption)
         # However it ended; writes nothing if the last batch has just been saved.
@@ -152,10 +153,14 @@ def _require_device(name: str) -> None:
 
 
 @contextlib.contextmanager
-def _only_process(run: Path) -> Iterator[None]:
+def _only_process(run: Path) -> Iterator[Callable[[], None]]:
     """Make the directory of a run and lock it against other processes.
 
     The operating system releases the lock of a process that is killed.
+
+    Yields:
+        Function that raises RuntimeError where the file of the lock is not there any
+        more, without which another process may train here too.
     """
     run.mkdir(parents=True, exist_ok=True)
     lock = FileLock(run / _LOCK_FILE)
@@ -166,8 +171,19 @@ def _only_process(run: Path) -> Iterator[None]:
             f"another process trains in {run}: wait for its end, or choose another "
             "directory."
         ) from error
+    locked = os.stat(lock.lock_file)
+
+    def require_alone() -> None:
+        with contextlib.suppress(OSError):
+            if os.path.samestat(os.stat(lock.lock_file), locked):
+                return
+        raise RuntimeError(
+            f"{lock.lock_file} was removed, so another process may train in {run}: "
+            "nothing more is written; resume the run (--resume)."
+        )
+
     try:
-        yield
+        yield require_alone
     finally:
         # Where no run was begun, as little as possible stays.
         if not (run / CONFIG_FILE).exists():
@@ -299,6 +315,7 @@ class _Loop:
     batches: Iterator[TensorDictBase]
     learner: Learner
     log: TrainingLog
+    require_alone: Callable[[], None]
     newest: Path | None
 
     def __post_init__(self):
@@ -330,6 +347,7 @@ class _Loop:
 
     def save(self) -> Path:
         """Write a checkpoint; return its directory."""
+        self.require_alone()
         self.newest = save_checkpoint(
             self.run,
             config=self.config,

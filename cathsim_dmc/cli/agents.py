@@ -1,4 +1,4 @@
-"""`cathsim eval`, `record`, `demos`, `replay`, `play` and `demo`."""
+"""`cathsim eval`, `record`, `demos`, `replay` and `play`."""
 
 import dataclasses
 import sys
@@ -12,7 +12,6 @@ from tyro.extras import SubcommandApp
 from cathsim_dmc.cli.options import (
     DEMONSTRATION_SEED,
     EVALUATION_SEED,
-    INTERRUPTED,
     NO_ANATOMY,
     OwnAnatomy,
     Task,
@@ -24,7 +23,7 @@ from cathsim_dmc.cli.task_options import given, task_kind
 def add_to(app: SubcommandApp) -> None:
     """Adds the commands."""
     app.command(name="eval")(evaluation([]))
-    for command in (record, demos, replay, play, demo):
+    for command in (record, demos, replay, play):
         app.command(command)
 
 
@@ -268,19 +267,3 @@ def play(
     for path in written:
         print(path)
     return 0
-
-
-def demo(out: Path = Path("runs/demo"), frames: int = 8_192, seed: int = 0) -> int:
-    """Learn type1_lcca from the expert, evaluate it, draw and record it.
-
-    Args:
-        out: Directory of the run.
-        frames: Number of control steps of training.
-        seed: Seed of networks, exploration and environments.
-    """
-    from cathsim_dmc.agents.demo import demo as run
-
-    def say(text: str) -> None:
-        print(text, file=sys.stderr, flush=True)
-
-    return 0 if run(out, frames, seed, say) else INTERRUPTED
