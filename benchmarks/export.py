@@ -5,7 +5,7 @@ python benchmarks/export.py RUN NAME [--out DIRECTORY]
 
 import sys
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import judgement
 import tyro
@@ -30,7 +30,7 @@ success within 8 mm inside the branch); forces as in docs/forces.md.
 
 
 def export(
-    run: Annotated[Path, tyro.conf.Positional],
+    run: Annotated[str, tyro.conf.Positional],
     name: Annotated[str, tyro.conf.Positional],
     out: Path = pretrained.DIRECTORY,
     episodes: int = judgement.EPISODES,
@@ -38,7 +38,8 @@ def export(
     """Write the policy of a run with its card, after judging it.
 
     Args:
-        run: Directory of a run or of a checkpoint.
+        run: Directory of a run or of a checkpoint, or a policy that ships, which is
+            judged anew ("pretrained:type1_bca").
         name: Name of the policy, "type1_bca" for `pretrained:type1_bca`.
         out: Directory to write to; by default that of the package.
         episodes: Number of episodes of the evaluation.
@@ -47,22 +48,29 @@ def export(
         Path of the weights.
     """
     pretrained.require_name(name)
-    checkpoint = Checkpoint.open(run)
-    config, state = checkpoint.config, checkpoint.policy_state()
+    if run.startswith(pretrained.PREFIX):
+        path = pretrained.pretrained_path(run)
+        policy: Any = run
+        old, state, shapes, config = pretrained.read_pretrained(path)
+        training = old["training"]
+    else:
+        policy = Checkpoint.open(run)
+        state, shapes, config = policy.policy_state(), policy.shapes, policy.config
+        training = {
+            "frames": policy.frames,
+            "seconds": round(policy.seconds, 1),
+            "seed": config.seed,
+        }
     options = judgement.published_options(config.task_kwargs)
     label = f"{pretrained.PREFIX}{name}"
-    found, _ = judgement.judge(checkpoint, config.task, options, episodes, label)
+    found, _ = judgement.judge(policy, config.task, options, episodes, label)
     figures = judgement.episode_figures(found)
     card = {
         "task": config.task,
         "task_kwargs": options,
         "config": config.to_dict(),
-        "shapes": checkpoint.shapes.to_dict(),
-        "training": {
-            "frames": checkpoint.frames,
-            "seconds": round(checkpoint.seconds, 1),
-            "seed": config.seed,
-        },
+        "shapes": shapes.to_dict(),
+        "training": training,
         "evaluation": {
             "seed": found.seed,
             "summary": found.summary(),
