@@ -8,14 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from cathsim_dmc.anatomy.centreline import Centreline, Vessel, VesselTree
-from cathsim_dmc.anatomy.scan.lumen import read_lumen
 from cathsim_dmc.anatomy.surface import lumen_surface
-
-
-def read_mesh(path, units="mm"):
-    """Vertices (V, 3) m and faces (F, 3) of a lumen's file, mended."""
-    lumen = read_lumen(path, units)
-    return lumen.vertices, lumen.faces
 
 
 def y_tree() -> VesselTree:

@@ -30,7 +30,7 @@ def intersecting(y_mesh, folder):
     spiked = vertices.copy()
     spiked[np.linalg.norm(spiked - (6, 0, 25), axis=1).argmin()] = (-25, 0, 25)
     write_obj(folder / "scan.obj", spiked, faces)
-    return ["scan.obj"], "intersects itself"
+    return ["scan.obj"], "intersects itself: 5 triangles, one at"
 
 
 def two_components(y_mesh, folder):
@@ -51,7 +51,7 @@ def not_finite(y_mesh, folder):
     broken = vertices.copy()
     broken[7] = np.nan
     write_obj(folder / "scan.obj", broken, faces)
-    return ["scan.obj"], "NaN"
+    return ["scan.obj"], "1 vertices whose coordinates are NaN"
 
 
 def wrong_unit(y_mesh, folder):

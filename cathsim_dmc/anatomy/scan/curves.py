@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import json
 import re
 from dataclasses import dataclass
@@ -17,12 +16,11 @@ INSIDE = 0.7  # share of a centreline's points that must lie in the lumen
 
 @dataclass(frozen=True)
 class ScanCentreline:
-    """A centreline as given: points (n, 3) m in LPS, radii (n,) m or None."""
+    """A centreline as given: points (n, 3) m in LPS."""
 
     name: str
     path: Path
     points: np.ndarray
-    radii: np.ndarray | None
 
 
 _FARTHEST = 10.0  # m
@@ -34,8 +32,8 @@ def read_curve(
 ) -> ScanCentreline:
     """Read a centreline from a 3D Slicer markup (.json) or a table (.csv, .txt).
 
-    A table holds x, y, z and optionally the radius per line, in ``units`` and
-    ``frame``; a markup says both itself.
+    A table holds x, y, z per line, in ``units`` and ``frame``, and may hold the radius,
+    which is not used; a markup says both itself.
 
     Raises:
         FileNotFoundError: if there is no such file.
@@ -54,11 +52,9 @@ def read_curve(
             "the curve again."
         )
     if path.suffix.lower() == ".json":
-        points, radii = _read_markup(path)
+        points = _read_markup(path)
     elif path.suffix.lower() in (".csv", ".txt", ".tsv"):
-        points, radii = _read_table(path)
-        points = points * frame_sign(frame) * metres_per(units)
-        radii = None if radii is None else radii * metres_per(units)
+        points = _read_table(path) * frame_sign(frame) * metres_per(units)
     else:
         raise ValueError(
             f"{path} has the ending {path.suffix!r}; give a 3D Slicer markup "
@@ -76,10 +72,7 @@ def read_curve(
             f"{path} has points {np.abs(points).max():.3g} m from the origin, but no "
             f"scan is {_FARTHEST:g} m wide; is the unit right?"
         )
-    name = vessel_name(path)
-    return ScanCentreline(
-        name, path, points[keep], None if radii is None else radii[keep]
-    )
+    return ScanCentreline(vessel_name(path), path, points[keep])
 
 
 def vessel_name(path: str | Path) -> str:
@@ -148,25 +141,12 @@ def _read_markup(path):
             "markups[0].controlPoints[i].position with three numbers each."
         ) from error
     scale = metres_per(units if isinstance(units, str) else "mm")
-    points = points * frame_sign(system) * scale
-    radii = None
-    for entry in markup.get("measurements") or []:
-        values = entry.get("controlPointValues")
-        if entry.get("name") == "Radius" and values is not None:
-            values = np.asarray(values, dtype=np.float64).reshape(-1)
-            if len(values) == len(points):
-                radii = values * scale
-    return points, radii
+    return points * frame_sign(system) * scale
 
 
 def _read_table(path):
-    text = path.read_text(encoding="utf-8-sig")
-    try:
-        dialect = csv.Sniffer().sniff(text[:2000], delimiters=",;\t ")
-        rows = list(csv.reader(text.splitlines(), dialect, skipinitialspace=True))
-    except csv.Error:
-        rows = [line.split(",") for line in text.splitlines()]
-    rows = [[cell for cell in row if cell.strip()] for row in rows]
+    lines = path.read_text(encoding="utf-8-sig").splitlines()
+    rows = [re.findall(r"[^,;\s]+", line) for line in lines]
     rows = [row for row in rows if row]
     try:
         [float(cell) for cell in rows[0]]
@@ -182,4 +162,4 @@ def _read_table(path):
         raise ValueError(
             f"{path} has a table of shape {table.shape}; give x,y,z[,radius] per line."
         )
-    return table[:, :3], (table[:, 3] if table.shape[1] == 4 else None)
+    return table[:, :3]

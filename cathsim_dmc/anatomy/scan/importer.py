@@ -115,7 +115,9 @@ def import_scan(
     upright(axes)
     if units is not None:
         metres_per(units)
-    place = _as_point(inlet)
+    place = None
+    if inlet is not None:
+        place = np.array(bounds.vector("inlet", inlet, 3, unit="the mesh's unit"))
     _check_paths(centreline_paths)
     for path in centreline_paths:
         read_curve(path, units or "mm", mesh_frame)  # before the long steps
@@ -125,7 +127,7 @@ def import_scan(
     if place is not None:
         turn = upright(axes)
         place = turn @ (place * frame_sign(mesh_frame) * metres_per(lumen.units))
-    surface = Surface(lumen.vertices, lumen.faces)
+    surface = lumen.surface
     measure = SurfaceDepth(surface)
     _check_near(place, measure)
     curves = _read_curves(centreline_paths, lumen, mesh_frame, axes, root)
@@ -231,18 +233,6 @@ def _cut(surface: Surface, opening: Inlet) -> Surface:
     return Surface(vertices[used], numbers.reshape(-1, 3))
 
 
-def _as_point(inlet: Sequence[float] | None) -> np.ndarray | None:
-    if inlet is None:
-        return None
-    try:
-        point = np.asarray(inlet, dtype=np.float64)
-    except (TypeError, ValueError):
-        point = np.empty(0)
-    if point.shape != (3,) or not np.isfinite(point).all():
-        raise ValueError(f"inlet is {inlet!r}; give (x, y, z) in the mesh's unit.")
-    return point
-
-
 def _check_near(place: np.ndarray | None, measure: SurfaceDepth) -> None:
     if place is not None and measure(place[None])[0] < -NEAR_INLET:
         raise ValueError(
@@ -297,14 +287,6 @@ def _inside_part(
             f"the unit is {units!r} (allowed {RADII[0] * 1e3:g} to {RADII[1] * 1e3:g} "
             "mm); pass the right units."
         )
-    if curve.radii is not None:
-        ratio = float(np.median(curve.radii[keep] / np.maximum(depth[keep], 1e-5)))
-        if not 1.0 / 3.0 < ratio < 3.0:
-            log.warning(
-                "%s: its radii are %.2g times those of the mesh, which are used",
-                curve.path,
-                ratio,
-            )
     return curve.points[keep]
 
 

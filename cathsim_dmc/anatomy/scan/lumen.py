@@ -8,8 +8,9 @@ from pathlib import Path
 
 import numpy as np
 
+from cathsim_dmc.anatomy.parts import Surface
 from cathsim_dmc.anatomy.scan.mesh import guess_units, read_triangles
-from cathsim_dmc.anatomy.scan.repair import Opening, mend
+from cathsim_dmc.anatomy.scan.repair import mend
 from cathsim_dmc.anatomy.scan.units import UNITS, frame_sign, metres_per, upright
 
 # Diagonal of the box around a vessel tree, m: an intracranial segment, a whole aorta
@@ -22,17 +23,13 @@ class Lumen:
     """The closed surface of a lumen.
 
     Attributes:
-        vertices: (V, 3) m, LPS.
-        faces: (F, 3) int64, normals outwards.
+        surface: closed, normals outwards, m, LPS.
         units: of the file.
-        openings: vessel ends that were open and are capped now.
         notes: what was guessed and what was mended, a line for each.
     """
 
-    vertices: np.ndarray
-    faces: np.ndarray
+    surface: Surface
     units: str
-    openings: tuple[Opening, ...]
     notes: tuple[str, ...]
 
 
@@ -76,7 +73,5 @@ def read_lumen(
             f"vessel tree is (allowed {SIZE[0]:g} to {SIZE[1]:g} m). Check the unit in "
             "which the mesh was exported."
         )
-    mended = mend(str(path), vertices, faces)
-    return Lumen(
-        mended.vertices, mended.faces, units, mended.openings, (why, *mended.notes)
-    )
+    surface, changed = mend(str(path), vertices, faces)
+    return Lumen(surface, units, (why, *changed))

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from cathsim_dmc.anatomy.parts import Surface
@@ -27,49 +25,25 @@ PART_WIDTH = 12e-3  # m, and if they are not wider
 NON_MANIFOLD = 0.01  # of the triangles: more at non-manifold edges are not mended
 HOLE = 8e-3  # m, widest hole in the side of a vessel that is filled
 SPIKE = 4e-3  # m, widest patch around a self-intersection that is cut out
+END_AREA = 0.5e-6  # m^2, least area of an open end
 END = 0.55  # largest |cosine| between an end's axis and the normals around it
 DENSE = 30_000  # triangles; more are decimated
 FEW = 12_000  # triangles that are left then
 ROUNDS = 6
 
 
-@dataclass(frozen=True)
-class Opening:
-    """An end of a vessel that was open and has been closed by a flat cap.
-
-    Attributes:
-        position: (3,) m, its middle.
-        radius: m, of a circle of the same area.
-    """
-
-    position: np.ndarray
-    radius: float
-
-
-@dataclass(frozen=True)
-class Mended:
-    """A closed surface of one part, normals outwards.
-
-    Attributes:
-        vertices: (V, 3) m.
-        faces: (F, 3) int64.
-        openings: ends that were open.
-        notes: what was changed, a line for each.
-    """
-
-    vertices: np.ndarray
-    faces: np.ndarray
-    openings: tuple[Opening, ...]
-    notes: tuple[str, ...]
-
-
-def mend(name: str, vertices: np.ndarray, faces: np.ndarray) -> Mended:
+def mend(
+    name: str, vertices: np.ndarray, faces: np.ndarray
+) -> tuple[Surface, list[str]]:
     """Close a surface, turn it outwards, and leave one part of it.
 
     Args:
         name: of the file, for messages.
         vertices: (V, 3) m.
         faces: (F, 3).
+
+    Returns:
+        The closed surface of one part, and what was changed, a line for each.
 
     Raises:
         ValueError: if it cannot be mended; says what is wrong and where.
@@ -85,24 +59,14 @@ def mend(name: str, vertices: np.ndarray, faces: np.ndarray) -> Mended:
     work.keep_one_part(quiet=True)
     work.turn_outwards()
     work.untangle()
-    return Mended(
-        work.vertices, np.ascontiguousarray(work.faces), work.openings, work.said
-    )
+    return Surface(work.vertices, work.faces), work.notes
 
 
 class _Work:
     def __init__(self, name: str, vertices: np.ndarray, faces: np.ndarray):
         self.name, self.vertices, self.faces = name, vertices, faces
-        self._openings: list[Opening] = []
-        self._notes: list[str] = []
-
-    @property
-    def openings(self) -> tuple[Opening, ...]:
-        return tuple(self._openings)
-
-    @property
-    def said(self) -> tuple[str, ...]:
-        return tuple(self._notes)
+        self.notes: list[str] = []
+        self._ends = 0
 
     def merge(self) -> None:
         """One vertex per place, and no triangle without area or twice."""
@@ -111,7 +75,7 @@ class _Work:
         dropped = before - len(self.faces)
         self.faces, flipped = without_slivers(self.vertices, self.faces)
         if dropped + flipped:
-            self._notes.append(
+            self.notes.append(
                 f"{dropped + flipped} triangles without area or given twice taken out"
             )
         if len(self.faces) < 4:
@@ -132,7 +96,7 @@ class _Work:
         if len(large) == 2 and not quiet:
             inner = inner_shell(self.vertices, *(self.faces[label == k] for k in large))
             if inner is not None:
-                self._notes.append(
+                self.notes.append(
                     "thick wall: the inner of two surfaces taken as the lumen"
                 )
                 self._keep(label == large[inner])
@@ -147,7 +111,7 @@ class _Work:
             )
         if len(share) > 1:
             if not quiet:
-                self._notes.append(
+                self.notes.append(
                     f"{len(share) - 1} small parts beside the lumen dropped "
                     f"({100 * (1 - share[large[0]]):.2g} % of the area)"
                 )
@@ -161,7 +125,7 @@ class _Work:
         rng = np.random.default_rng(0)
         some = self.vertices[rng.integers(len(self.vertices), size=4000)]
         off = np.abs(SurfaceDepth(Surface(points, faces))(some))
-        self._notes.append(
+        self.notes.append(
             f"decimated from {len(self.faces):,} to {len(faces):,} triangles; the "
             f"surface moved by {off.mean() * 1e3:.2f} mm in the mean, "
             f"{off.max() * 1e3:.2f} mm at most"
@@ -187,7 +151,7 @@ class _Work:
                 )
             self._keep(~bad)
         if first:
-            self._notes.append(
+            self.notes.append(
                 f"{first[0]} edges shared by more than two triangles, near "
                 f"{_mm(first[1])} mm: the triangles around them cut out"
             )
@@ -208,13 +172,13 @@ class _Work:
             )
         self.faces, turned = found
         if turned:
-            self._notes.append(f"{turned} flipped triangles turned")
+            self.notes.append(f"{turned} flipped triangles turned")
 
     def keep_inner_surface(self) -> None:
         """Keeps the inner surface of a wall that is open at its ends."""
         inner = lumen_of_wall(self.vertices, self.faces)
         if inner is not None:
-            self._notes.append("thick wall: its inner surface taken as the lumen")
+            self.notes.append("thick wall: its inner surface taken as the lumen")
             self._keep(inner)
             self.faces = self.faces[:, ::-1]
             self._drop_small_parts()
@@ -227,9 +191,9 @@ class _Work:
             middle = points.mean(axis=0)
             wide = 2.0 * float(np.linalg.norm(points - middle, axis=1).max())
             axis, area = loop_axis(points)
-            radius = float(np.sqrt(area / np.pi))
-            if len(loop) > 3 and self._is_end(loop, axis) and radius > 0.4e-3:
-                self._openings.append(Opening(middle, radius))
+            large = len(loop) > 3 and area > END_AREA
+            if large and self._is_end(loop, axis):
+                self._ends += 1
             elif wide > HOLE:
                 raise ValueError(
                     f"{self.name} is not closed: a hole {wide * 1e3:.1f} mm wide in "
@@ -242,12 +206,12 @@ class _Work:
             self._fan(loop, middle)
         if filled:
             wide, middle = max(filled, key=lambda hole: hole[0])
-            self._notes.append(
+            self.notes.append(
                 f"{len(filled)} holes filled, the widest {wide * 1e3:.1f} mm at "
                 f"{_mm(middle)} mm"
             )
-        if self._openings:
-            self._notes.append(f"{len(self._openings)} open vessel ends capped")
+        if self._ends:
+            self.notes.append(f"{self._ends} open vessel ends capped")
         edges, times = edge_counts(self.faces)
         if (times != 2).any():
             where = self.vertices[edges[times != 2][0, 0]]
@@ -280,7 +244,7 @@ class _Work:
         """Turn the whole surface if its normals point inwards."""
         if Surface(self.vertices, self.faces).volume < 0.0:
             self.faces = self.faces[:, ::-1]
-            self._notes.append("surface turned inside out: normals pointed inwards")
+            self.notes.append("surface turned inside out: normals pointed inwards")
 
     def untangle(self) -> None:
         """Cut out small patches that pierce the surface, refuse large ones."""
@@ -312,7 +276,7 @@ class _Work:
                 "the place out did not help. Smooth or remesh it."
             )
         if first:
-            self._notes.append(
+            self.notes.append(
                 f"{first[0]} self-intersecting triangles near {_mm(first[1])} mm cut "
                 "out"
             )
