@@ -195,20 +195,70 @@ def test_links_have_the_outermost_devices_outside(pair):
     assert links.mass[1].sum() == pytest.approx(total)
 
 
+def pressed(stack, overlap, bends, turns, ways=1.0):
+    """Pressure and friction of devices without axial forces of the joints."""
+    force, start = np.zeros(turns.shape), np.zeros(turns.shape[:2])
+    ways = np.full((len(bends), turns.shape[1] - 1), ways)
+    return stack.pressure(overlap, bends, turns, force, start, ways, 0.04)
+
+
+def energy(stack, gaps, bends, angles):
+    """Of a pair at given bends and rotations of the nodes of its rods, N·m."""
+    nodes, devices = stack.nodes, stack.devices
+    rods = Rods(devices, nodes, 0.4)
+    overlap, turns = stack.overlap(gaps[None]), rods.at_joints(angles, gaps[None])
+    found = np.abs(bends - stack.rest_angles(overlap, turns)) ** 2
+    found = (found / (2 * overlap.compliance)).sum()
+    found -= (overlap.coupling * np.cos(turns[:, 0] - turns[:, 1])[:, None]).sum()
+    # What the shapes store in each other, apart from the angle between them.
+    last, first = stack.link_lengths[-1], stack.link_lengths[0]
+    breaks = [last, nodes[0] - first]
+    for device, gap in zip(devices, gaps, strict=True):
+        arcs = np.cumsum([arc.length for arc in reversed(device.tip_shape)])
+        breaks += [gap, gap + device.tip_length, *(gap + arcs)]
+
+    def own(s):
+        stiff = [bending(d, s - g) for d, g in zip(devices, gaps, strict=True)]
+        bent = [curvature(d, s - g) for d, g in zip(devices, gaps, strict=True)]
+        stiff, bent = np.array(stiff), np.array(bent)
+        stored = (stiff * bent**2).sum() - ((stiff * bent) ** 2).sum() / stiff.sum()
+        return min(s / last, (nodes[0] - s) / first, 1.0) * stored / 2
+
+    return found + integral(own, 0.0, nodes[0], breaks)
+
+
+@pytest.mark.parametrize("gaps", [(0.0, 0.031), (0.0237, 0.0), (0.06, 0.0), (0.2, 0.0)])
+def test_axial_forces_are_the_derivative_of_the_energy(pair, gaps):
+    rng = np.random.default_rng(7)
+    gaps, joints = np.array(gaps), len(pair.spans)
+    follower = int(gaps.argmax())
+    bends = rng.normal(scale=0.1, size=(1, joints)) * np.exp(0.8j)
+    angles = np.cumsum(rng.normal(scale=0.2, size=(1, 2, joints + 2)), axis=-1)
+    rods = Rods(pair.devices, pair.nodes, 0.4)
+    overlap, turns = pair.overlap(gaps[None]), rods.at_joints(angles, gaps[None])
+    slopes = (rods.at_joints(angles, gaps[None] + 1e-8) - turns) / 1e-8
+    slopes *= pair.restoring(overlap, bends, turns)[0]
+    force = pair.axial(overlap, gaps[None], bends, turns, slopes).sum(axis=-1)[0]
+    step = 2e-5 * (np.arange(2) == follower)
+    ends = [energy(pair, gaps + side * step, bends, angles) for side in (1, -1)]
+    assert force[follower] == pytest.approx(-(ends[0] - ends[1]) / 4e-5, rel=1e-3)
+    assert force[1 - follower] == -force[follower]
+
+
 def test_devices_press_on_each_other_where_they_bend_against_each_other(pair):
     still = np.zeros((1, 2, len(pair.spans)))
     free = pair.overlap(np.array([[0.0, 0.0]]))
     shape = pair.rest_angles(free, still)
-    assert pair.pressure(free, shape, still).max() > 0.1
+    assert pressed(pair, free, shape, still)[0].max() > 0.1
     # A straight tube on a straight wire does not press at all.
     straight = [dataclasses.replace(d, tip_shape=()) for d in pair.devices]
     alike = Stack(straight, LENGTHS)
-    nothing = alike.pressure(alike.overlap(np.zeros((1, 2))), 0 * shape, still)
-    assert nothing.max() == 0.0
+    free = alike.overlap(np.zeros((1, 2)))
+    assert pressed(alike, free, 0 * shape, still)[0].max() == 0.0
     # Nor do devices of which one has been withdrawn altogether.
     apart = pair.overlap(np.array([[1.0, 0.0]]))
-    bent = pair.pressure(apart, pair.rest_angles(apart, still), still)
-    assert bent.max() == 0.0
+    bent = pressed(pair, apart, pair.rest_angles(apart, still), still)
+    assert bent[0].max() == 0.0
 
 
 def test_devices_that_do_not_fit_are_refused():
@@ -311,7 +361,7 @@ def test_overlaps_of_many_are_those_of_each(pair):
         one = pair.overlap(gaps[row])
         for mine, theirs in zip(one, many, strict=True):
             assert mine.tobytes() == np.ascontiguousarray(theirs[row]).tobytes()
-        for function in (pair.restoring, lambda *a: [pair.pressure(*a)]):
+        for function in (pair.restoring, lambda *a: pressed(pair, *a)):
             alone = function(one, bends[row], turns[row])
             for mine, theirs in zip(alone, function(many, bends, turns), strict=True):
                 assert mine.tobytes() == np.ascontiguousarray(theirs[row]).tobytes()

@@ -119,13 +119,55 @@ def test_rotation_turns_the_shape_of_the_end(environment):
     assert seen.rotation[0, 1] == 0.0
 
 
-def test_pushing_on_a_wall_loads_the_leading_device(environment):
+@pytest.mark.parametrize("catheter", [1.0, 0.0], ids=["apart", "coinciding ends"])
+def test_the_load_is_what_touches_the_leading_device(environment, catheter):
+    """It bears the wall's force on its links where it has left the others."""
     environment.reset()
-    run(environment, [1.0, 0.0, 1.0, 0.0], 110)
+    run(environment, [1.0, 0.0, 1.0, 0.0], 100)
+    if catheter == 0.0:
+        run(environment, [0.0, 0.0, 1.0, 0.0], 30)
+    run(environment, [0.5, 0.0, 0.5, 0.0], 10)
+    run(environment, [0.0, 0.0, 0.0, 0.0], 40)
+    task = environment.task
+    seen, state = task.rollout.devices, task.readings
+    gap = np.ptp(seen.insertion)
+    assert (gap > 0.02) == (catheter > 0)
+    nodes = task.scene.catheter.stack.nodes
+    link = min(int((nodes[1:] > gap).sum()) + 1, len(nodes) - 2)
+    along = state.centreline[link + 1] - state.centreline[link]
+    borne = -state.external_force[link:, 3:].sum(0) @ along / np.linalg.norm(along)
+    assert borne > 0.005
+    assert seen.leading_load[0] == pytest.approx(borne, rel=0.02, abs=2e-3)
+    assert seen.push.sum() == pytest.approx(float(state.push_force), abs=1e-9)
+
+
+def test_a_clamp_slips_that_pushes_a_wire_into_a_bend(monkeypatch):
+    """The wire stays behind its command; the drive of the catheter bears as much."""
+    options = {
+        "devices": ("wire_035_glide", "diagnostic_5f_simmons"),
+        "observation": "tracking",
+        "random": 0,
+    }
+    environment = suite.load("cathsim", TASK, options)
+    environment.reset()
+    run(environment, [0.0, 0.0, 1.0, 0.0], 60)  # the wire's end is behind the bend
+    before = environment.task.rollout.devices.insertion[0, 0]
+    monkeypatch.setattr(sliding, "MAX_PUSH_FORCE", 0.04)
+    run(environment, [0.1, 0.0, 0.0, 0.0], 100)
     seen = environment.task.rollout.devices
-    push = float(environment.task.readings.push_force)
-    assert push > 0.02
-    assert 0.0 < seen.leading_load[0] <= push * 1.5 + 0.05
+    (slipped,) = environment.task.rollout.slipped[:, 0]
+    moved = seen.insertion[0, 0] - before
+    assert slipped > 1e-3
+    assert moved == pytest.approx(100 * 0.1 * STEP - slipped, abs=1e-4)
+    assert 0.02 < seen.push[0, 0] < 0.05
+    applied = environment.physics.data.ptr.qfrc_applied
+    assert applied.max() == pytest.approx(seen.push[0, 0])
+    # The friction in the lumen stays when the devices stop.
+    rubbing = seen.lumen_friction[0]
+    run(environment, [0.0, 0.0, 0.0, 0.0], 1)
+    assert 0.0 < environment.task.rollout.devices.lumen_friction[0]
+    assert rubbing > 0.0
+    environment.close()
 
 
 def test_a_step_of_a_single_device_does_no_pair_work(shared_environment, monkeypatch):

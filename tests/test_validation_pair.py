@@ -6,7 +6,7 @@ import pytest
 from cathsim_dmc.entities import contact
 from cathsim_dmc.entities.devices import Discretisation, get
 from cathsim_dmc.tasks.config import PHYSICS_TIMESTEP
-from cathsim_dmc.validation import pair, pressed, shapes, sliding
+from cathsim_dmc.validation import pair, pressed, shapes, sliding, two_rods
 from cathsim_dmc.validation.rig import Rig
 
 
@@ -119,6 +119,30 @@ def test_a_turned_shape_is_the_shape_turned():
     )
     assert end < 0.001 and direction < 0.001
     assert 0.001 < curve < 0.025
+
+
+def test_two_rods_in_half_a_circle_are_those_of_the_reference():
+    case = two_rods.CASES[2]
+    found, expected = two_rods.in_half_circle(*case)
+    assert np.linalg.norm(found.end - expected.end) < 0.01 * 0.35
+    # The bend turns the catheter's end by 42°.
+    np.testing.assert_allclose(found.rotation, expected.rotation, atol=0.05)
+    assert np.abs(expected.rotation - case[2]).max() > 0.7
+
+
+def test_a_wire_in_a_bend_is_pushed_with_the_derivative_of_the_energy():
+    """A moment M does the work M²/2 (1/EI - 1/EI') where a stiffer piece comes."""
+    names, gaps = two_rods.SLIDES[2]
+    wire, catheter = (get(name) for name in names)
+    alone = catheter.tip.bending_stiffness
+    both = alone + wire.tip.bending_stiffness
+    # The end lies in the arc of 6 mm, the wire's shaft in the one of 20 mm.
+    expected = (alone / 6e-3) ** 2 / 2 * (1 / alone - 1 / both)
+    shaft = alone + wire.shaft.bending_stiffness
+    expected += (alone / 20e-3) ** 2 / 2 * (1 / both - 1 / shaft)
+    found = two_rods.simulate(names, gaps, (0.0, 0.0), duration=6.0)
+    assert found.force is not None
+    np.testing.assert_allclose(found.force, [expected, -expected], rtol=0.01)
 
 
 def test_a_bend_does_not_twist_the_chain():

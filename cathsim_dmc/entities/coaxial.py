@@ -273,21 +273,73 @@ class Stack:
             overlap.rest, overlap.compliance, overlap.coupling, bends, turns
         )
 
-    def pressure(
-        self, overlap: Overlap, bends: np.ndarray, turns: np.ndarray
+    def axial(
+        self,
+        overlap: Overlap,
+        gaps: np.ndarray,
+        bends: np.ndarray,
+        turns: np.ndarray,
+        slopes: np.ndarray,
     ) -> np.ndarray:
-        """Lateral forces of each device on the lumen of the next one.
+        """Axial forces by which the joints resist the sliding of the devices.
 
-        Each device carries its share of the bending moment; the shear of that share
-        acts on the other device.
+        Minus the derivative of the energy by the gap of a device, at given bends and
+        rotations of its rod; that of the leading device is minus the others' sum.
+
+        Args:
+            overlap: overlap of the devices.
+            gaps: (N, K), see `overlap`.
+            bends: (N, J) complex, bending angles of the joints, rad.
+            turns: (N, K, J), rotation of each device at each joint, rad.
+            slopes: (N, K, J), torque of `restoring` times the derivative of `turns` by
+                the gap, N.
+
+        Returns:
+            (N, K, J), N, positive where a device must be pushed forward.
+        """
+        return self._loops.axial(
+            np.ascontiguousarray(gaps),
+            self.nodes,
+            self.link_lengths,
+            self._edges,
+            self._bending,
+            self._moment,
+            overlap.compliance,
+            overlap.rest,
+            bends,
+            turns,
+            slopes,
+        )
+
+    def pressure(
+        self,
+        overlap: Overlap,
+        bends: np.ndarray,
+        turns: np.ndarray,
+        axial: np.ndarray,
+        start: np.ndarray,
+        ways: np.ndarray,
+        coefficient: float,
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Lateral forces of each device on the lumen of the next one, and friction.
+
+        The force of a device with the moment M and the compression P is M'' + Pκ per
+        length. P is EI (κ² - κ_k²)/2, the axial forces of the joints distal of the
+        place, and their friction.
 
         Args:
             overlap: overlap of the devices.
             bends: (N, J) complex, bending angles of the joints, rad.
             turns: (N, K, J), rotation of each device at each joint, rad.
+            axial: (N, K, J), see `axial`, N.
+            start: (N, K), compression where each device leaves the others, N.
+            ways: (N, K - 1) in [-1, 1], fraction of the friction that acts on device k,
+                positive when it slides forward in the next one.
+            coefficient: Coulomb coefficient between the devices.
 
         Returns:
-            (N, K - 1, J), force of device k on device k + 1 at the joints, N.
+            (N, K - 1, J), force of device k on device k + 1 at the joints, N, and
+            (N, K - 1), the axial force that their friction demands of device k, N.
         """
         return self._loops.pressure(
             overlap.stiffness,
@@ -296,6 +348,10 @@ class Stack:
             bends,
             turns,
             self.link_lengths,
+            axial,
+            start,
+            ways,
+            coefficient,
         )
 
 

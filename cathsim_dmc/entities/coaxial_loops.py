@@ -163,27 +163,104 @@ def restoring(rest, compliance, coupling, bends, turns):
 
 
 @compiled
-def pressure(stiffness, moment, present, bends, turns, lengths):
-    """Forces (N, K - 1, J) of each device on the next, see `Stack.pressure`."""
+def _pull(place, load, turns, gaps, edges, bending, moment, piece, device):
+    """Force (N) at a place that bears a bending moment: |EI κ|²/2EI - Σ EI_k κ_k²/2.
+
+    It is the derivative of the energy by the length of the rod. One device has a given
+    piece there.
+    """
+    total, whole, own = 0.0, load, 0.0
+    for k in range(len(gaps)):
+        here = piece if k == device else _piece(place - gaps[k], edges[k])
+        if bending[k, here] > 0.0:
+            total += bending[k, here]
+            whole += moment[k, here] * unit(turns[k])
+            own += moment[k, here] ** 2 / bending[k, here]
+    return (abs(whole) ** 2 / total - own) / 2
+
+
+@compiled
+def axial(
+    gaps, nodes, lengths, edges, bending, moment, compliance, rest, bends, turns, slopes
+):
+    """Axial forces (N, K, J) of the joints, see `Stack.axial`.
+
+    Args:
+        gaps, nodes, lengths, edges, bending, moment: see `overlaps`.
+        compliance, rest, bends, turns: see `restoring`.
+        slopes: (N, K, J), torque times the derivative of the rotation by the gap, N.
+    """
+    count, devices, joints = turns.shape
+    force = np.zeros(turns.shape)
+    loads = np.empty(joints, np.complex128)
+    for i in range(count):
+        leader = gaps[i].argmin()
+        for j in range(joints):
+            whole = bends[i, j]
+            for k in range(devices):
+                whole -= rest[i, k, j] * unit(turns[i, k, j])
+            loads[j] = whole / compliance[i, j]
+        for k in range(devices):
+            if k == leader:
+                continue
+            force[i, k] += slopes[i, k]
+            link = joints
+            for piece in range(edges.shape[1]):
+                place = gaps[i, k] + edges[k, piece]
+                if place >= nodes[0]:
+                    break
+                while place >= nodes[link]:
+                    link -= 1
+                share = (place - nodes[link + 1]) / lengths[link]
+                # The joints at both ends of the link share what it bends.
+                for j, weight in ((link - 1, share), (link, 1 - share)):
+                    if 0 <= j < joints:
+                        here = (place, loads[j], turns[i, :, j], gaps[i], edges)
+                        jump = _pull(*here, bending, moment, piece, k)
+                        jump -= _pull(*here, bending, moment, piece + 1, k)
+                        force[i, k, j] += weight * jump
+            force[i, leader] -= force[i, k]
+    return force
+
+
+@compiled
+def pressure(
+    stiffness, moment, present, bends, turns, lengths, axial, start, ways, coefficient
+):
+    """Forces of each device on the next, and friction, see `Stack.pressure`."""
     count, devices, joints = turns.shape
     force = np.empty((count, devices - 1, joints))
+    drag = np.zeros((count, devices - 1))
     own = np.empty(joints, np.complex128)
+    shear = np.zeros(joints, np.complex128)
     for i in range(count):
         for k in range(devices - 1):
             for j in range(joints):
                 span = (lengths[j] + lengths[j + 1]) / 2
                 own[j] = stiffness[i, k, j] * bends[i, j] / span
                 own[j] -= moment[i, k, j] * unit(turns[i, k, j])
-            before = 0j
-            for j in range(joints):
-                shear = 0j
-                if j < joints - 1:
-                    shear = (own[j + 1] - own[j]) / lengths[j + 1]
+            for j in range(joints - 1):
+                shear[j] = (own[j + 1] - own[j]) / lengths[j + 1]
+            # Compression of the device, from its end on.
+            pushed = start[i, k]
+            for j in range(joints - 1, -1, -1):
+                span = (lengths[j] + lengths[j + 1]) / 2
+                pushed += axial[i, k, j]
+                here = pushed
+                if stiffness[i, k, j] > 0.0:
+                    square = abs(stiffness[i, k, j] * bends[i, j] / span) ** 2
+                    square -= moment[i, k, j] ** 2
+                    here += square / (2 * stiffness[i, k, j])
+                lateral = shear[j] + here * bends[i, j]
+                if j > 0:
+                    lateral -= shear[j - 1]
                 # Only where both devices are present: the mean of both links.
                 both = (present[i, k + 1, j] + present[i, k + 1, j + 1]) / 2
-                force[i, k, j] = abs(shear - before) * both
-                before = shear
-    return force
+                force[i, k, j] = abs(lateral) * both
+                rubbing = ways[i, k] * coefficient * force[i, k, j]
+                pushed += rubbing
+                drag[i, k] += rubbing
+    return force, drag
 
 
 @compiled

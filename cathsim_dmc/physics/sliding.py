@@ -14,6 +14,7 @@ import mujoco
 import numpy as np
 
 from cathsim_dmc.entities.chain import (
+    MAX_PUSH_FORCE,
     MAX_PUSH_SPEED,
     MAX_ROTATION_SPEED,
     MAX_TORQUE,
@@ -37,8 +38,9 @@ from cathsim_dmc.physics.stepper import CONTROL_TIMESTEP
 
 # Where points of a device are tracked, m from its end.
 DEVICE_PLACES = np.arange(7, -1, -1) * 15e-3
-# Rate of sliding above which the friction between devices acts in full, m/s.
-_SLIDING = 1e-3
+# Way by which a device slides before the friction in the lumen acts in full, m.
+_PRESLIDING = 40e-6
+_GAP_STEP = 1e-8  # m, for a derivative
 
 
 class CoaxialReadings(NamedTuple):
@@ -55,8 +57,10 @@ class CoaxialReadings(NamedTuple):
         leading_load: (N,), N, axial force in the device that reaches farthest where it
             leaves the others, positive when it is pushed forward; for one device alone,
             the push force.
-        lumen_friction: (N,), N, friction between the devices, that resists their
-            sliding in each other; 0 while they do not.
+        lumen_friction: (N,), N, sum of the friction forces between the devices, which
+            stay when the devices stop.
+        push: (N, K), N, force of each drive on its device, positive when it pushes it
+            forward; their sum is the push force.
     """
 
     insertion: np.ndarray
@@ -66,6 +70,7 @@ class CoaxialReadings(NamedTuple):
     points: np.ndarray
     leading_load: np.ndarray
     lumen_friction: np.ndarray
+    push: np.ndarray
 
 
 def devices_of(chain: Chain) -> SingleDevice:
@@ -78,7 +83,7 @@ def devices_of(chain: Chain) -> SingleDevice:
 class SlidingDevices(SingleDevice):
     """Coaxial devices, each moved along and about its axis by its actions."""
 
-    data_fields = ("cfrc_int", "act")
+    data_fields = ("cfrc_int", "act", "qfrc_applied")
     model_fields = FIELDS
 
     def __init__(self, stack: DeviceStack):
@@ -103,6 +108,9 @@ class SlidingDevices(SingleDevice):
         self._index, self._qpos = world.index, world.arrays.qpos
         self._internal_force = world.arrays.cfrc_int[:, world.index.links]
         self._start_depth = world.start_depth
+        (base,) = np.flatnonzero(world.model.jnt_qposadr == self._index.insertion_qpos)
+        dof = world.model.jnt_dofadr[base]
+        self._others = world.arrays.qfrc_applied[:, dof]
         count, nodes = len(self._entity.devices), len(self._stack.nodes)
         # Views: writing to them writes the state.
         self._insertion = world.parameters[:, :count]
@@ -113,9 +121,14 @@ class SlidingDevices(SingleDevice):
         self._radii = np.array([device.outer_radius for device in self._entity.devices])
         self._friction = np.full(total, self._entity.friction)
         self._factor = np.ones(total)
-        # How fast the devices slide in each other, m/s, and press on each other, N.
-        self._sliding = np.zeros((total, count))
-        self._pressing = np.zeros(total)
+        # Fraction of the friction between devices that acts, positive when the inner
+        # one has slid forward; that friction, and the forces of the drives but for the
+        # push force, which the leading device bears, N.
+        self._ways = np.zeros((total, count - 1))
+        self._drag = np.zeros((total, count - 1))
+        self._axial = np.zeros((total, count))
+        length = self._stack.link_lengths.sum()
+        self._give = [length / each.axial_stiffness for each in self._entity.devices]
         # Rates at which they turn at the joints, rad/s.
         self._spin = np.zeros((total, count, nodes - 2))
 
@@ -131,7 +144,8 @@ class SlidingDevices(SingleDevice):
         gaps = self._entity.start_gaps
         self._insertion[index] = self._qpos[index, self._index.insertion_qpos] - gaps
         self._angles[index] = 0.0
-        self._sliding[index] = self._pressing[index] = self._spin[index] = 0.0
+        for each in (self._ways, self._drag, self._axial, self._others, self._spin):
+            each[index] = 0.0
         self._friction[index] = self._entity.friction if friction is None else friction
         self._factor[index] = 1.0 if stiffness is None else stiffness
         row = self._live(index)
@@ -149,8 +163,9 @@ class SlidingDevices(SingleDevice):
         return {
             "friction": self._friction,
             "factor": self._factor,
-            "sliding": self._sliding,
-            "pressing": self._pressing,
+            "ways": self._ways,
+            "drag": self._drag,
+            "axial": self._axial,
             "spin": self._spin,
             "slipped": self._slipped,
             "told": self._drives.told,
@@ -184,24 +199,40 @@ class SlidingDevices(SingleDevice):
         reached = self._reached()
         step = MAX_PUSH_SPEED * CONTROL_TIMESTEP
         before = self._held(reached)
+        every, leaders = np.arange(len(before)), np.argmax(self._insertion, axis=1)
+        told = step * action[:, 0::2]
+        moved = self._clamped(told, leaders)
+        self._slipped[:, 0::2] += np.abs(told - moved)
         target, lead = self._loops.advance(
             before,
-            step * action[:, 0::2],
+            moved,
             # A device may be withdrawn until its end has left the patient.
             -self._start_depth,
             self._entity.stroke,
         )
-        every, leaders = np.arange(len(target)), np.argmax(self._insertion, axis=1)
-        self._sliding[:] = (target - lead[:, None] - before + reached[:, None]) / (
-            CONTROL_TIMESTEP
-        )
+        slid = -np.diff(target - before, axis=1) / _PRESLIDING
+        self._ways[:] = np.clip(self._ways + slid, -1.0, 1.0)
         self._insertion[:] = target
-        overlap, turns = self._turn(action[:, 1::2], lead, state.external_force)
+        overlap, turns = self._turn(action[:, 1::2], lead, state)
         self._write(every, overlap, turns)
         command = ((lead - reached) / step)[:, None]
         slip = np.abs(self._drives.follow(command)[:, 0])
         self._slipped[every, 2 * leaders] += slip
         return command
+
+    def _clamped(self, told: np.ndarray, leaders: np.ndarray) -> np.ndarray:
+        """Ways (N, K) of devices whose clamps slip at the largest force, m.
+
+        The device gives way as far as its axial compliance takes the excess. The clamp
+        of the leading device slips in the physics steps.
+        """
+        excess = np.abs(self._axial) - MAX_PUSH_FORCE
+        excess[np.arange(len(excess)), leaders] = -1.0
+        if (excess < 0.0).all():
+            return told
+        way = np.sign(self._axial)
+        given = way * np.minimum(way * told, -excess * self._give)
+        return np.where(excess < 0.0, told, given)
 
     def _reached(self) -> np.ndarray:
         """Insertion (N,) of the chain, m."""
@@ -212,9 +243,11 @@ class SlidingDevices(SingleDevice):
         return self._loops.held(np.ascontiguousarray(self._insertion), reached)
 
     def _turn(
-        self, rate: np.ndarray, lead: np.ndarray, external_force: np.ndarray
+        self, rate: np.ndarray, lead: np.ndarray, state: Readings
     ) -> tuple[Overlap, np.ndarray]:
         """Turns the devices, against their shape in the vessel and friction.
+
+        The forces of the drives are those of the devices as they are before.
 
         Returns:
             Overlap, and rotations (N, K, J) at the joints.
@@ -226,7 +259,17 @@ class SlidingDevices(SingleDevice):
         loads = np.empty((3, *turns.shape))
         loads[0], loads[1] = stack.restoring(overlap, bends, turns)
         loads[:2] *= self._factor[:, None, None]
-        loads[2] = self._friction_torque(overlap, bends, turns, lead, external_force)
+        # Nothing rubs in the sheath.
+        force = self._loops.rubbing(
+            state.external_force, lead, self._start_depth, stack.nodes
+        )
+        loads[2] = stack.wall_friction(overlap, force, self._friction)
+        if len(self._entity.devices) > 1:
+            pressure = self._push(overlap, gaps, bends, turns, loads[0], state)
+            # The lumen holds back the device in it; that one is too soft in torsion
+            # to turn the lumen in its turn.
+            rubbing = self._entity.lumen_friction * pressure
+            loads[2, :, :-1] += rubbing * self._radii[:-1, None]
         turned = MAX_ROTATION_SPEED * CONTROL_TIMESTEP * rate
         self._angles[:] = rods.turn(
             self._angles, turned, CONTROL_TIMESTEP, *rods.at_nodes(loads, gaps)
@@ -237,29 +280,40 @@ class SlidingDevices(SingleDevice):
         self._spin[:] = (after - turns) / CONTROL_TIMESTEP
         return overlap, after
 
-    def _friction_torque(
+    def _push(
         self,
         overlap: Overlap,
+        gaps: np.ndarray,
         bends: np.ndarray,
         turns: np.ndarray,
-        lead: np.ndarray,
-        external_force: np.ndarray,
+        torque: np.ndarray,
+        state: Readings,
     ) -> np.ndarray:
-        """Largest torques (N, K, J) of friction on the devices at the joints, N·m."""
-        stack, entity = self._stack, self._entity
-        # Nothing rubs in the sheath.
-        force = self._loops.rubbing(
-            external_force, lead, self._start_depth, stack.nodes
+        """Computes the forces of the drives from the devices in each other.
+
+        Returns:
+            Forces (N, K - 1, J) of each device on the next one at the joints, N.
+        """
+        stack, factor = self._stack, self._factor[:, None, None]
+        slopes = self._rods.at_joints(self._angles, gaps + _GAP_STEP) - turns
+        slopes *= torque / factor / _GAP_STEP
+        axial = factor * stack.axial(overlap, gaps, bends, turns, slopes)
+        start = np.zeros(gaps.shape)
+        every, leaders = np.arange(len(gaps)), np.argmin(gaps, axis=1)
+        start[every, leaders] = self._leading_load(state, gaps)
+        stiff = overlap._replace(
+            stiffness=factor * overlap.stiffness, moment=factor * overlap.moment
         )
-        torque = stack.wall_friction(overlap, force, self._friction)
-        if len(entity.devices) > 1:
-            pressure = stack.pressure(overlap, bends, turns)
-            pressure *= entity.lumen_friction * self._factor[:, None, None]
-            self._pressing = pressure.sum(axis=(1, 2))
-            # The lumen holds back the device in it; that one is too soft in torsion
-            # to turn the lumen in its turn.
-            torque[:, :-1] += pressure * self._radii[:-1, None]
-        return torque
+        pressure, drag = stack.pressure(
+            stiff, bends, turns, axial, start, self._ways, self._entity.lumen_friction
+        )
+        self._drag[:] = drag
+        self._axial[:] = axial.sum(axis=-1)
+        self._axial[:, :-1] += drag
+        self._axial[:, 1:] -= drag
+        # The drive of the leading device bears what the chain's does, and these.
+        self._others[:] = -self._axial[every, leaders]
+        return pressure
 
     def _write(self, rows: np.ndarray, overlap: Overlap, turns: np.ndarray) -> None:
         """Writes the properties of the chains of some simulations."""
@@ -303,9 +357,8 @@ class SlidingDevices(SingleDevice):
         """
         insertion = self.pushed()
         gaps = self._loops.gaps(insertion)
-        friction = self._pressing * np.clip(
-            np.abs(np.diff(self._sliding, axis=1)).sum(axis=1) / _SLIDING, 0.0, 1.0
-        )
+        push = self._axial.copy()
+        push[np.arange(len(gaps)), gaps.argmin(axis=1)] += readings.push_force
         return CoaxialReadings(
             insertion=insertion,
             rotation=self.turned(),
@@ -313,7 +366,8 @@ class SlidingDevices(SingleDevice):
             twist=self._rods.base_torque(self._angles),
             points=self.points(readings.centreline, gaps[..., None] + DEVICE_PLACES),
             leading_load=self._leading_load(readings, gaps),
-            lumen_friction=friction,
+            lumen_friction=np.abs(self._drag).sum(axis=1),
+            push=push,
         )
 
     def points(self, line: np.ndarray, places: np.ndarray) -> np.ndarray:

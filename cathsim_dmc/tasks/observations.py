@@ -351,7 +351,7 @@ def drives(frame: Frame) -> Observation:
         2,
         "N",
         "axial force in the device that reaches farthest where it leaves the others, "
-        "and friction between the devices that slide",
+        "and friction between the devices",
     ),
     coaxial=True,
 )

@@ -15,7 +15,7 @@ from cathsim_dmc.entities.device import Device
 from cathsim_dmc.entities.device_stack import DeviceStack
 from cathsim_dmc.physics import chain_fields
 from cathsim_dmc.tasks.config import CONTROL_TIMESTEP
-from cathsim_dmc.validation import pressed, rod, shapes, sliding
+from cathsim_dmc.validation import pressed, rod, shapes, sliding, two_rods
 from cathsim_dmc.validation.checks import Check, Report
 from cathsim_dmc.validation.rig import Rig
 
@@ -280,7 +280,7 @@ def validate_pair() -> Report:
                 f"end {1e3 * np.hypot(*shape.expected[-1, :2]):.1f} mm off the axis",
             )
         )
-    checks += shapes.checks()
+    checks += shapes.checks() + two_rods.checks()
     for end in ("sliding", "fixed"):
         checks.append(rod.buckling_check("buckling load of the pair", buckling(end)))
     checks.append(_smoothness())

@@ -1,0 +1,270 @@
+"""Coaxial devices against two rods of one shape, each with its own twist.
+
+The reference minimises the bending and twist energy over the increments of shape and
+twists on a fine grid; it shares no code with the model but the devices' data.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import mujoco
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.optimize import minimize
+from scipy.spatial.transform import Rotation
+
+from cathsim_dmc.entities import posture
+from cathsim_dmc.entities.device import Device
+from cathsim_dmc.entities.device_stack import DeviceStack
+from cathsim_dmc.physics import chain_fields
+from cathsim_dmc.physics.stepper import CONTROL_TIMESTEP
+from cathsim_dmc.validation.checks import Check
+from cathsim_dmc.validation.rig import Rig
+
+_FINE = 0.5e-3  # m
+BEND_RADIUS = 0.04  # m, of half a circle in which the pairs are held
+_HELD = 1e6  # kg·m², armature of a hinge that does not move
+_STEP = 1e-3  # m, by which a device slides for the derivative of the energy
+# Devices from the innermost outwards, distances of their ends from the chain's end (m),
+# rotations of their bases (rad), length beyond the half circle (m).
+CASES = (
+    (("wire_035_glide", "berenstein_5f"), (0.10, 0.0), (0.8, -0.5), 0.063),
+    (("wire_035_amplatz", "diagnostic_5f_simmons"), (0.0, 0.09), (0.5, 0.3), 0.065),
+    (("wire_035_glide", "vertebral_5f"), (0.0, 0.08), (-0.6, 0.9), 0.063),
+)
+TIP_BOUND = 1.0  # % of the length
+ROTATION_BOUND = 3.0  # °
+# Free devices, and distances of their ends from the chain's end (m).
+SLIDES = (
+    (("wire_035_glide", "berenstein_5f"), (0.0155, 0.0)),
+    (("wire_035_glide", "berenstein_5f"), (0.0, 0.018)),
+    (("wire_035_glide", "diagnostic_5f_simmons"), (0.0065, 0.0)),
+    (("wire_035_glide", "diagnostic_5f_simmons"), (0.0, 0.025)),
+)
+SLIDE_TURN = 0.6  # rad, of the base of the outer device
+RESISTANCE_BOUND = 5.0  # %
+
+
+class Rods(NamedTuple):
+    """Devices in equilibrium.
+
+    Attributes:
+        rotation: (K,), of the ends of the devices, rad.
+        end: (3,), of the chain from its base, m.
+        energy: of the reference, N·m.
+        force: (K,), axial forces on the bases of simulated devices, N.
+    """
+
+    rotation: np.ndarray
+    end: np.ndarray
+    energy: float = np.nan
+    force: np.ndarray | None = None
+
+
+def _profile(device: Device, places: np.ndarray) -> tuple[np.ndarray, ...]:
+    """EI, GJ and curvature at places (n,) from the device's end, 0 beyond it."""
+    there, tip = places >= 0, places < device.tip_length
+    parts = [
+        there * np.where(tip, getattr(device.tip, name), getattr(device.shaft, name))
+        for name in ("bending_stiffness", "torsional_stiffness")
+    ]
+    curvature, start = np.zeros(len(places)), 0.0
+    for arc in reversed(device.tip_shape):
+        inside = (places >= start) & (places < start + arc.length)
+        curvature[inside] = np.copysign(1 / arc.radius, arc.angle)
+        start += arc.length
+    return (*parts, curvature)
+
+
+def reference(
+    devices: Sequence[Device],
+    gaps: ArrayLike,
+    rotation: Sequence[float],
+    length: float,
+    held: np.ndarray | None = None,
+) -> Rods:
+    """Minimises the energy of devices that share one shape.
+
+    Args:
+        devices: K, from the innermost outwards.
+        gaps: (K,), m.
+        rotation: (K,), of their bases, rad.
+        length: of the chain, m.
+        held: (n,) complex, given curvatures of the first n pieces of `_FINE`, 1/m.
+    """
+    count = round(length / _FINE)
+    places = length - (np.arange(count) + 0.5) * _FINE
+    given = np.zeros(0, complex) if held is None else held
+    made = [
+        _profile(device, places - gap)
+        for device, gap in zip(devices, np.asarray(gaps), strict=True)
+    ]
+    bending, torsion, own = (np.array(each) for each in zip(*made, strict=True))
+    free, shape = count - len(given), (len(devices), count)
+    # Unknowns scaled by the roots of the stiffnesses: the energy is well conditioned.
+    scales = np.sqrt(_FINE * np.where(torsion > 0, torsion, 1e-6))
+    root = np.sqrt(_FINE * bending.sum(axis=0)[len(given) :])
+    base = np.asarray(rotation, float)[:, None]
+
+    def parts(unknowns):
+        twist = unknowns[: scales.size].reshape(shape) / scales
+        turns = base + np.cumsum(twist, axis=1) * _FINE
+        bent = unknowns[scales.size :].reshape(2, free) / root
+        return twist, turns, np.concatenate([given, bent[0] + 1j * bent[1]])
+
+    def energy(unknowns):
+        twist, turns, curvature = parts(unknowns)
+        unloaded = own * np.exp(1j * turns)
+        off = bending * (curvature - unloaded)
+        value = np.abs(off * (curvature - unloaded)) + torsion * twist**2
+        by_turn = -np.real(off.conj() * 1j * unloaded) * _FINE
+        by_twist = by_turn[:, ::-1].cumsum(axis=1)[:, ::-1] * _FINE
+        by_twist += torsion * twist * _FINE
+        by_bend = off.sum(axis=0)[len(given) :] * _FINE / root
+        slope = [(by_twist / scales).ravel(), np.real(by_bend), np.imag(by_bend)]
+        return 1e6 * value.sum() * _FINE / 2, 1e6 * np.concatenate(slope)
+
+    found = minimize(
+        energy,
+        np.zeros(scales.size + 2 * free),
+        jac=True,
+        method="L-BFGS-B",
+        options={"maxiter": 5000, "maxfun": 5000, "ftol": 1e-15, "gtol": 1e-9},
+    )
+    _, turns, curvature = parts(found.x)
+    last = [turns[k, torsion[k] > 0][-1] for k in range(len(devices))]
+    return Rods(np.array(last), _end(curvature), found.fun / 1e6)
+
+
+def _end(curvature: np.ndarray) -> np.ndarray:
+    """End (3,) of a curve whose frame does not twist, m."""
+    frame, place = Rotation.identity(), np.zeros(3)
+    for bend in curvature:
+        half = Rotation.from_rotvec(np.array([-bend.imag, bend.real, 0]) * _FINE / 2)
+        place = place + (frame * half).apply([0, 0, _FINE])
+        frame = frame * half * half
+    return place
+
+
+def simulate(
+    names: Sequence[str],
+    gaps: Sequence[float],
+    rotation: Sequence[float],
+    beyond: float | None = None,
+    duration: float = 12.0,
+) -> Rods:
+    """Lets a chain come to rest, free or held along half a circle; see `reference`.
+
+    Args:
+        names: of the devices.
+        gaps: (K,), m.
+        rotation: (K,), of their bases, rad.
+        beyond: free length of the chain after the half circle, m; None where all is.
+        duration: s.
+    """
+    entity = DeviceStack(names)
+    rig = Rig(catheter=entity)
+    rig.compile()
+    stack, rods = entity.stack, entity.rods
+    fields = chain_fields.ChainFields(rig.model, entity)
+    arrays = [getattr(rig.model, name) for name in chain_fields.FIELDS]
+    if beyond is not None:
+        angles = posture.joints_along(rig.lengths, _line(stack.nodes[0] - beyond))
+        order = [posture.x_first(joint) for joint in range(1, len(rig.lengths))]
+        hinges = np.where(np.array(order)[:, None], angles, angles[:, ::-1]).ravel()
+        # Joints before the end of the half circle and at it do not move.
+        held = 2 * int((stack.nodes[1:-1] > beyond - 1e-6).sum())
+        rig.data.qpos[fields.qpos] = hinges
+        start = int(rig.model.jnt_dofadr[rig.model.joint(f"{rig.name}/bend_x_1").id])
+        rig.model.dof_armature[start : start + held] = _HELD
+    gap, ones = np.asarray(gaps, float)[None], np.ones(1)
+    overlap = stack.overlap(gap)
+    turns = np.zeros((1, len(names), len(stack.nodes)))
+    turns += np.asarray(rotation)[:, None]
+    for _ in range(round(duration / CONTROL_TIMESTEP)):
+        at = rods.at_joints(turns, gap)
+        qpos = rig.data.qpos[None, fields.qpos]
+        loads = np.array(stack.restoring(overlap, stack.bent(qpos)[0], at))
+        turns = rods.turn(
+            turns, np.zeros(gap.shape), CONTROL_TIMESTEP, *rods.at_nodes(loads, gap)
+        )
+        after = rods.at_joints(turns, gap)
+        spin = (after - at) / CONTROL_TIMESTEP
+        made = chain_fields.chain_properties(
+            entity, overlap, after, ones * 0, ones, spin, qpos
+        )
+        fields.write(arrays, made, 0)
+        for _ in range(round(CONTROL_TIMESTEP / rig.model.opt.timestep)):
+            rig.step()
+    mujoco.mj_kinematics(rig.model, rig.data)
+    bends, _ = stack.bent(rig.data.qpos[None, fields.qpos])
+    slopes = rods.at_joints(turns, gap + 1e-8) - rods.at_joints(turns, gap)
+    slopes *= loads[0] / 1e-8
+    force = stack.axial(overlap, gap, bends, after, slopes)[0].sum(axis=-1)
+    end = rig.head_position - rig.joints[0]
+    return Rods(turns[0, :, -1], end, force=force)
+
+
+def _line(length: float) -> np.ndarray:
+    """A line along +z that ends with half a circle at a length; straight after it."""
+    angle = np.linspace(0.0, np.pi, 2000)
+    arc = np.stack([1 - np.cos(angle), 0 * angle, np.sin(angle)], axis=-1)
+    arc = BEND_RADIUS * arc + (0, 0, length - np.pi * BEND_RADIUS)
+    return np.vstack([[[0, 0, 0]], arc, arc[-1:] - (0, 0, 1)])
+
+
+def in_half_circle(
+    names: Sequence[str],
+    gaps: Sequence[float],
+    rotation: Sequence[float],
+    beyond: float,
+) -> tuple[Rods, Rods]:
+    """Simulated devices held along half a circle, and their reference; `simulate`."""
+    entity = DeviceStack(names)
+    length = float(entity.link_lengths.sum())
+    held = np.zeros(round((length - beyond) / _FINE), complex)
+    held[-round(np.pi * BEND_RADIUS / _FINE) :] = 1 / BEND_RADIUS
+    expected = reference(entity.devices, gaps, rotation, length, held)
+    return simulate(names, gaps, rotation, beyond), expected
+
+
+def checks() -> list[Check]:
+    """Pairs held in half a circle, and the axial force of a bend."""
+    made = []
+    for names, gaps, rotation, beyond in CASES:
+        found, expected = in_half_circle(names, gaps, rotation, beyond)
+        length = DeviceStack(names).link_lengths.sum()
+        name = f"two rods in half a circle, {' in '.join(names)}"
+        off = 100 * float(np.linalg.norm(found.end - expected.end)) / length
+        made.append(Check.at_most(f"{name}, tip", off, TIP_BOUND, "% of its length"))
+        off = float(np.degrees(np.abs(found.rotation - expected.rotation).max()))
+        turned = np.degrees(np.abs(expected.rotation - rotation).max())
+        detail = f"the bend turns an end by {turned:.0f}°"
+        made.append(
+            Check.at_most(f"{name}, rotation", off, ROTATION_BOUND, "°", detail)
+        )
+    for names, gaps in SLIDES:
+        rotation, gap = (0.0, SLIDE_TURN), np.asarray(gaps)
+        found, entity = simulate(names, gaps, rotation), DeviceStack(names)
+        length, step = float(entity.link_lengths.sum()), _STEP * (gap > 0)
+        low, high = (
+            reference(entity.devices, gap + side * step, rotation, length).energy
+            for side in (-1, 1)
+        )
+        expected = (low - high) / (2 * _STEP)
+        assert found.force is not None
+        force = found.force[int(gap.argmax())]
+        made.append(
+            Check.at_most(
+                f"axial force of a bend, {' in '.join(names)}, ends "
+                + " and ".join(f"{1e3 * each:.1f}" for each in gaps)
+                + " mm back",
+                100 * abs(force / expected - 1),
+                RESISTANCE_BOUND,
+                "%",
+                f"{force:.4f} N, derivative of the energy {expected:.4f} N",
+            )
+        )
+    return made
