@@ -1,7 +1,5 @@
 """Values that no field takes, as hypothesis strategies, and how a refusal must look."""
 
-import copy
-import json
 import math
 from collections import Counter
 
@@ -82,84 +80,6 @@ def options():
     return st.sampled_from(values)
 
 
-def wrong(value):
-    """Values of another kind than that of an entry of a JSON document."""
-    if isinstance(value, bool):
-        return st.sampled_from([None, "true", 2, [], {}])
-    if isinstance(value, int | float):
-        bad = [None, "1", True, math.nan, math.inf, -math.inf, 1e300, [], {}, [1]]
-        return st.sampled_from(bad)
-    if isinstance(value, str):
-        return st.sampled_from([None, 1, 1.5, True, [], {}, ["x"]])
-    if isinstance(value, list):
-        return st.sampled_from([None, 1, "x", True, {}, {"a": 1}])
-    if isinstance(value, dict):
-        return st.sampled_from([None, 1, "x", True, [], [1]])
-    return st.sampled_from([1, True, [], {}, 0.5])
-
-
-def places(document, path=()):
-    """Paths of all entries of a JSON document; of a list the first two and the last."""
-    items = {}
-    if isinstance(document, dict):
-        items = document
-    elif isinstance(document, list):
-        chosen = {0, 1, len(document) - 1}
-        items = {i: document[i] for i in chosen if 0 <= i < len(document)}
-    for key, value in items.items():
-        yield (*path, key)
-        yield from places(value, (*path, key))
-
-
-@st.composite
-def damaged_json(draw, document, harmless=lambda path, value: False):
-    """A document with one entry of a wrong kind or left out, and where.
-
-    Args:
-        draw: From hypothesis.
-        document: What is right.
-        harmless: Whether an entry at a path may have a value, None for left out.
-    """
-    path = draw(st.sampled_from(sorted(places(document), key=repr)))
-    changed = copy.deepcopy(document)
-    *way, last = path
-    inner = changed
-    for key in way:
-        inner = inner[key]
-    leave_out = isinstance(inner, dict) and draw(st.integers(0, 4)) == 0
-    value = "left out" if leave_out else draw(wrong(inner[last]))
-    if harmless(path, value):
-        value = "left out"  # of all
-        return json.dumps([]), ()
-    if leave_out:
-        del inner[last]
-    else:
-        inner[last] = value
-    return json.dumps(changed), path
-
-
-@st.composite
-def damaged_bytes(draw, data):
-    """A file cut off, emptied, overwritten or with flipped bits."""
-    way = draw(st.sampled_from(["cut", "empty", "text", "noise", "flip", "zeros"]))
-    if way == "cut":
-        return data[: draw(st.integers(1, len(data) - 1))]
-    if way == "flip":
-        at = draw(st.integers(0, len(data) - 1))
-        return (
-            data[:at] + bytes([data[at] ^ draw(st.integers(1, 255))]) + data[at + 1 :]
-        )
-    if way == "zeros":
-        at = draw(st.integers(0, len(data) - 1))
-        return data[:at] + bytes(len(data) - at)
-    others = {"empty": b"", "text": b"not what it seems\n"}
-    return others.get(way) or (b"" if way == "empty" else draw(st.binary(max_size=200)))
-
-
-# What readers of files raise.
-ERRORS = (ValueError, OSError, RuntimeError)
-
-
 class Tally:
     """Counts bad inputs by entry, and what became of them."""
 
@@ -205,55 +125,3 @@ class Tally:
         lines = [f"{count:6d}  {entry}" for entry, count in sorted(self.tried.items())]
         total = f"{self.tried.total():6d}  bad inputs, {len(self.wrong)} not refused"
         return "\n".join([*lines, total])
-
-
-def try_json(tally, entry, path, load, examples, harmless=lambda path, value: False):
-    """Damages one entry of a JSON file, and loads it."""
-    good = path.read_text()
-
-    def check(damaged):
-        text, where = damaged
-        path.write_text(text)
-        tally.refused(f"{entry}, entries", load, [path.name], ERRORS, note=where)
-
-    try:
-        tally.draw(damaged_json(json.loads(good), harmless), examples, check)
-    finally:
-        path.write_text(good)
-    load()
-
-
-def try_bytes(tally, entry, path, load, examples, same=None, named=None):
-    """Damages the bytes of a file, and loads it; `same` tells whether all is there."""
-    good = path.read_bytes()
-
-    def check(data):
-        if data == good:
-            return
-        path.write_bytes(data)
-
-        def read():
-            result = load()
-            if same is not None and same(result):
-                # A flipped bit that nobody reads, such as the time of a zip's entry.
-                raise ValueError(path.name)
-            return result
-
-        tally.refused(f"{entry}, bytes", read, [named or path.name], ERRORS)
-
-    try:
-        tally.draw(damaged_bytes(good), examples, check)
-    finally:
-        path.write_bytes(good)
-
-
-def try_all(attempts, folder, examples, least):
-    """Tries what damages files of a folder; all is refused and nothing is written."""
-    tally, before = Tally(), sorted(folder.rglob("*"))
-    for one in attempts:
-        one(tally, folder, examples)
-    assert sorted(folder.rglob("*")) == before, "something was written"
-    print(tally.report())
-    shown = "\n".join(sorted(set(tally.wrong))[:200])
-    assert not tally.wrong, f"{len(tally.wrong)} of {tally.tried.total()}:\n{shown}"
-    assert tally.tried.total() > least

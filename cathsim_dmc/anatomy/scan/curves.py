@@ -145,7 +145,10 @@ def _read_markup(path):
 
 
 def _read_table(path):
-    lines = path.read_text(encoding="utf-8-sig").splitlines()
+    try:
+        lines = path.read_text(encoding="utf-8-sig").splitlines()
+    except ValueError as error:
+        raise ValueError(f"{path} is no text in UTF-8: {error}") from error
     rows = [re.findall(r"[^,;\s]+", line) for line in lines]
     rows = [row for row in rows if row]
     try:
