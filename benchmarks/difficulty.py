@@ -142,7 +142,7 @@ def play(
     limit = limit or Limit()
     count = simulation.num_simulations
     simulation.seed(seed)
-    view = policies.BatchedView(simulation)
+    view = policies.View(simulation)
     tracker, slides = ForceTracker(count), None
     ends: dict[int, str] = {}
     lengths, forces = [0] * count, {}

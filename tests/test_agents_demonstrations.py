@@ -11,7 +11,7 @@ import torch
 from cathsim_dmc.agents import make_env, record_demonstrations
 from cathsim_dmc.agents.demonstrations import EXPERT_ACTION, load_transitions
 from cathsim_dmc.agents.networks import NetworkShapes
-from cathsim_dmc.policies import BatchedView, Teacher
+from cathsim_dmc.policies import Teacher, View
 from cathsim_dmc.policies.expert import ExpertPolicy
 from cathsim_dmc.recording.dataset_reader import DatasetError, read_episodes
 from cathsim_dmc.simulation.batch import BatchSimulation
@@ -222,7 +222,7 @@ def test_the_teacher_agrees_with_the_expert_that_it_watches(task):
     """While it needs no second attempt, the expert's action is the teacher's."""
     simulation = BatchSimulation(task, 2, seeds=7)
     simulation.reset()
-    view, everyone = BatchedView(simulation), np.ones(2, dtype=bool)
+    view, everyone = View(simulation), np.ones(2, dtype=bool)
     expert, teacher = ExpertPolicy(), Teacher(view)
     expert.reset(view, everyone)
     teacher.reset(everyone)
@@ -238,7 +238,7 @@ def test_the_teacher_goes_on_from_what_was_really_done(task):
     """The expert alone believes in commands that it gave and nobody carried out."""
     simulation = BatchSimulation(task, 1, seeds=7)
     simulation.reset()
-    view, everyone = BatchedView(simulation), np.ones(1, dtype=bool)
+    view, everyone = View(simulation), np.ones(1, dtype=bool)
     expert, followed, teacher = ExpertPolicy(), ExpertPolicy(), Teacher(view)
     for one in (expert, followed):
         one.reset(view, everyone)

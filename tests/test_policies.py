@@ -11,8 +11,8 @@ from cathsim_dmc.agents import evaluate, load_policy, report
 from cathsim_dmc.agents.training import train
 from cathsim_dmc.policies import (
     POLICIES,
-    ComposerView,
     Policy,
+    View,
     in_environment,
     make_policy,
 )
@@ -116,7 +116,7 @@ def test_a_policy_is_told_which_simulations_begin_anew():
 
 
 def test_random_actions_of_a_simulation_do_not_depend_on_the_others():
-    view = ComposerView(suite.load("cathsim", TASK, {"random": 0}))
+    view = View(suite.load("cathsim", TASK, {"random": 0}))
     alone = policies.make_policy("random", seed=8)
     together = policies.make_policy("random", seed=6)
 

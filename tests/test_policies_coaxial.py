@@ -31,7 +31,7 @@ def test_frames_of_the_links_are_those_of_the_simulator(environment):
     for _ in range(5):
         environment.step(np.array([1.0, 1.0, 1.0, -1.0]))
     # Without moving on, so that joints and frames are of the same moment.
-    physics, view = environment.physics, policies.ComposerView(environment)
+    physics, view = environment.physics, policies.View(environment)
     physics.forward()
     model, data = physics.model.ptr, physics.data.ptr
     links = [i for i in range(model.nbody) if "catheter/link_" in model.body(i).name]
@@ -48,7 +48,7 @@ def test_frames_of_the_links_are_those_of_the_simulator(environment):
 def test_turning_by_the_error_turns_the_side_to_the_route(environment):
     environment.reset()
     plan = CoaxialPlan.for_task(environment.task)
-    view = policies.ComposerView(environment)
+    view = policies.View(environment)
 
     def directions():
         readings = view.readings
@@ -154,7 +154,7 @@ def test_what_is_for_one_device_is_refused_for_several():
     simulation = BatchSimulation(task, 1)
     simulation.reset()
     with pytest.raises(ValueError, match=r"coaxial devices.*demonstrations"):
-        Teacher(policies.BatchedView(simulation)).reset(np.array([True]))
+        Teacher(policies.View(simulation)).reset(np.array([True]))
 
 
 @pytest.mark.slow

@@ -173,7 +173,7 @@ def test_the_expert_follows_the_arch_of_each_simulation(plain_pair):
     plain_pair.reset()
     while len(set(plain_pair.anatomies)) == 1:
         plain_pair.reset()
-    view = policies.BatchedView(simulation)
+    view = policies.View(simulation)
     policy = policies.make_policy("expert")
     policy.reset(view, np.ones(SIMULATIONS, dtype=bool))
     alone = [Expert.for_task(simulation.rollout.case(i)) for i in range(SIMULATIONS)]

@@ -11,7 +11,7 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 
 from cathsim_dmc.agents.networks import NetworkShapes
-from cathsim_dmc.policies import BatchedView
+from cathsim_dmc.policies import View
 from cathsim_dmc.policies.expert import ExpertPolicy
 from cathsim_dmc.recording import dataset
 from cathsim_dmc.recording.dataset_reader import (
@@ -143,7 +143,7 @@ def _play(simulation: Any, seeds: np.ndarray, noise: float) -> list[Any]:
     count = len(seeds)
     simulation.seed(seeds.tolist())
     generators = [np.random.default_rng(int(seed)) for seed in seeds]
-    expert, view = ExpertPolicy(), BatchedView(simulation)
+    expert, view = ExpertPolicy(), View(simulation)
     rows = [_Rows() for _ in seeds]
     chosen = np.zeros(0, np.float32)
 

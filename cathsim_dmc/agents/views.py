@@ -4,7 +4,7 @@ from typing import Any, cast
 
 from torchrl.envs import EnvBase
 
-from cathsim_dmc.policies import BatchedView, View
+from cathsim_dmc.policies import View
 
 
 class _ForeignView:
@@ -25,6 +25,6 @@ def view_of(env: EnvBase) -> View:
     """What a policy may know of the simulations of a TorchRL environment."""
     base = getattr(env, "base_env", env)
     if hasattr(base, "simulation"):
-        return BatchedView(base.simulation)
+        return View(base.simulation)
     # Whatever a policy asks of it beyond its numbers is an error that says so.
     return cast(View, _ForeignView(env))

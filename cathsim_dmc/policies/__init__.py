@@ -6,7 +6,7 @@ from cathsim_dmc.policies.expert import ExpertPolicy
 from cathsim_dmc.policies.policy import Policy, in_environment
 from cathsim_dmc.policies.scripted import Curl, Idle, Push, Random, RandomCurl
 from cathsim_dmc.policies.teacher import Teacher
-from cathsim_dmc.policies.view import BatchedView, ComposerView, View
+from cathsim_dmc.policies.view import View
 
 # Policies by name: a new one is a class and a line here.
 POLICIES: dict[str, Callable[[int], Policy]] = {
@@ -37,8 +37,6 @@ def make_policy(name: str, seed: int = 0) -> Policy:
 
 __all__ = [
     "POLICIES",
-    "BatchedView",
-    "ComposerView",
     "Policy",
     "Teacher",
     "View",

@@ -9,7 +9,7 @@ import dm_env
 import numpy as np
 from dm_control import composer
 
-from cathsim_dmc.policies.view import ComposerView, View
+from cathsim_dmc.policies.view import View
 
 
 class Policy:
@@ -54,7 +54,7 @@ def in_environment(
     policy: Policy, environment: composer.Environment
 ) -> Callable[[dm_env.TimeStep], np.ndarray]:
     """A policy as a function from a composer environment's timestep to its action."""
-    view = ComposerView(environment)
+    view = View(environment)
 
     def act(timestep: dm_env.TimeStep) -> np.ndarray:
         if timestep.first():

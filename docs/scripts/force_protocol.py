@@ -54,7 +54,7 @@ def play(name, threads):
     simulation.seed([0] * count)
     step = simulation.reset()
     policy = policies.make_policy(name, 0)
-    policy.reset(policies.BatchedView(simulation), np.ones(count, dtype=bool))
+    policy.reset(policies.View(simulation), np.ones(count, dtype=bool))
     samples = [[] for _ in settings]
     cell, ends = [[] for _ in settings], [None] * count
     lengths, best = np.zeros(count, dtype=int), np.full(count, -1.0)
