@@ -13,6 +13,8 @@ import numba
 from numba.core import caching
 
 _PACKAGE = Path(__file__).parent
+# What a source that holds compiled loops, or helps to compile, has in it.
+_MARKS = (b"\n@compiled", b"\n@callback", b"import numba", b"from numba")
 
 
 @functools.cache
@@ -20,7 +22,8 @@ def _stamp() -> bytes:
     """Digest of all sources that hold compiled loops."""
     digest = hashlib.sha256()
     for path in sorted(_PACKAGE.rglob("*.py")):
-        if (source := path.read_bytes()).find(b"compiled") >= 0:
+        source = path.read_bytes()
+        if any(mark in source for mark in _MARKS):
             digest.update(source)
     return digest.digest()
 

@@ -248,6 +248,28 @@ def test_a_model_is_compiled_once_unless_a_hook_may_have_changed_it(
         env.close()
 
 
+def test_steps_in_one_loop_are_those_of_composer(shared_environment):
+    task = shared_environment("type1_lcca").task
+    alone, watched, buffered = (suite.environment(twin(task, 5)) for _ in range(3))
+    times = []
+    watched.add_extra_hook("after_substep", lambda physics, _: times.append(1))
+    buffered.task.task_observables["position"].buffer_size = 2
+    environments = alone, watched, buffered
+    rows = [[environment.reset()] for environment in environments]
+    for action in random_actions(alone, 8):
+        for row, environment in zip(rows, environments, strict=True):
+            row.append(environment.step(action))
+    assert len(times) == 8 * task.substeps
+    seen = [[timestep.observation for timestep in row] for row in rows]
+    assert_bitwise_equal(seen[0], seen[1])
+    assert [row.reward for row in rows[0]] == [row.reward for row in rows[1]]
+    old, new = seen[2][-1]["position"]
+    np.testing.assert_array_equal(new, seen[0][-1]["position"])
+    assert (old != new).any()
+    for environment in environments:
+        environment.close()
+
+
 @pytest.mark.parametrize(
     "options", [{"random": -1}, {"observation": "pixels"}, {"friction": -1.0}]
 )

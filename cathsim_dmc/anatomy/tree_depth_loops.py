@@ -218,7 +218,7 @@ def onto_creases(nodes, spans, flats, one, two, seeds, rounds, out):
             signed(nodes, first1, last1, flats[one], all1, len(all1), x, y, z, place)
             x, y, z = place
             signed(nodes, first2, last2, flats[two], all2, len(all2), x, y, z, place)
-            seeds[n] = place
+            seeds[n, 0], seeds[n, 1], seeds[n, 2] = place[0], place[1], place[2]
         x, y, z = seeds[n]
         for row in range(2):
             v = one if row == 0 else two

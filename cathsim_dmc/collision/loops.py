@@ -370,7 +370,8 @@ def tangents(entry, place, axis, normal, depth, limit, turns, rows):
             excess = 0.5 * (rows[4, 3] + rows[5, 3]) - depth
         for row in range(4, 6):
             if rows[row, 3] - excess <= limit:
-                rows[found] = rows[row]
+                for k in range(4):  # copying a slice takes seconds to compile
+                    rows[found, k] = rows[row, k]
                 rows[found, 3] -= excess
                 found += 1
     if found == 0:
@@ -411,7 +412,8 @@ def into(frame, way):
 def collide(model, data, contacts, geom1, geom2, margin, before):
     """Contacts of a capsule or a sphere with a box, which may carry a field.
 
-    `before` is the place in the table of the function for boxes that do not.
+    `before` is the place in the table of the function for boxes that do not; a constant
+    would be compiled once for each.
     """
     table = address_of(SYMBOL)
     stride = word(model + word(table + NUSER_GEOM))
@@ -476,10 +478,10 @@ def collide(model, data, contacts, geom1, geom2, margin, before):
 @callback("int32(int64, int64, int64, int32, int32, float64)")
 def of_capsule(model, data, contacts, geom1, geom2, margin):
     """Entry of MuJoCo's collision table for a capsule and a box."""
-    return collide(model, data, contacts, geom1, geom2, margin, OF_CAPSULE)
+    return collide(model, data, contacts, geom1, geom2, margin, np.int64(OF_CAPSULE))
 
 
 @callback("int32(int64, int64, int64, int32, int32, float64)")
 def of_sphere(model, data, contacts, geom1, geom2, margin):
     """Entry of MuJoCo's collision table for a sphere and a box."""
-    return collide(model, data, contacts, geom1, geom2, margin, OF_SPHERE)
+    return collide(model, data, contacts, geom1, geom2, margin, np.int64(OF_SPHERE))

@@ -223,14 +223,19 @@ class SingleStepper(Stepper):
         del indices
         mujoco.mj_setState(self._model, self._data, states[0], _STATE)
 
-    def _run(self, indices: np.ndarray, parts: int) -> None:
+    def run(self, parts: int = 1) -> None:
+        """Does the physics steps of a control step, each in so many parts."""
         self._history.clear()
+        before = self._warnings_before.tobytes()
         for substep in range(self.substeps):
             for _ in range(parts):
                 mujoco.mj_step(self._model, self._data)
-                if self._warned().any():  # where a batch stops, too
+                if self.warnings.tobytes() != before:  # where a batch stops, too
                     return
             self._history.keep(substep, self._sensor)
+
+    def _run(self, indices: np.ndarray, parts: int) -> None:
+        self.run(parts)
 
     def _keep_still(self, indices: np.ndarray) -> None:
         self._history.clear()

@@ -3,22 +3,30 @@
 import os
 
 import dm_env
-import mujoco
+import numpy as np
 from dm_control import composer, mjcf
-from dm_control.rl import control
 
+from cathsim_dmc.tasks.observation_kind import FrameObservable
 from cathsim_dmc.tasks.snapshot import Snapshot
+
+# What composer does with an observable between physics steps, or to its values.
+_SETTINGS = ("buffer_size", "delay", "aggregator", "corruptor")
 
 
 class Environment(composer.Environment):
-    """`composer.Environment`, but for the first reset and `physics.render`.
+    """`composer.Environment`, but for the first reset, plain steps and rendering.
 
     Composer compiles at construction and once more at the first reset, for tasks that
     change their MJCF model before an episode. Where nothing does and
     `recompile_mjcf_every_episode` is off, the first model is kept: an environment is
     there in two thirds of the time, and `physics` stays what it is. What is to change
     in the MJCF model changes before the environment is made, see `suite.environment`.
+
+    Where nobody but the task does anything between physics steps, and no observable is
+    delayed, buffered or of an entity, these steps run in one loop.
     """
+
+    _plain = False
 
     def reset(self):
         """Starts an episode.
@@ -28,7 +36,26 @@ class Environment(composer.Environment):
         """
         if not self._changes_model():
             self._mjcf_never_compiled = False
-        return super().reset()
+        timestep = super().reset()
+        self._plain = self._is_plain()
+        return timestep
+
+    def step(self, action) -> dm_env.TimeStep:
+        """Does a control step, or starts an episode after the end of one.
+
+        Args:
+            action: As `action_spec` says.
+        """
+        if self._reset_next_step or not self._plain or self._is_watched():
+            return super().step(action)
+        self._hooks.before_step(self._physics_proxy, action, self._random_state)
+        self.task.run_substeps()
+        self._hooks.after_step(self._physics_proxy, self._random_state)
+        seen = self.task.observation
+        observation = {name: np.array(seen[name][0]) for name in self._enabled}
+        ends = self.task.should_terminate_episode(self._physics_proxy)
+        self._reset_next_step = ends or self._physics.time() >= self._time_limit
+        return self._timestep(observation)
 
     def snapshot(self) -> Snapshot:
         """The state between two steps, from which an episode goes on bit for bit.
@@ -54,12 +81,36 @@ class Environment(composer.Environment):
         task.restore(physics, snapshot, self._random_state)
         self._observation_updater.reset(physics, self._random_state)
         observation = self._observation_updater.get_observation()
+        self._plain = self._is_plain()
         self._reset_next_step = task.termination is not None
         if not task.rollout.steps[0]:
             return dm_env.restart(observation)
+        return self._timestep(observation)
+
+    def _timestep(self, observation) -> dm_env.TimeStep:
         kind = dm_env.StepType.LAST if self._reset_next_step else dm_env.StepType.MID
+        task, physics = self.task, self._physics_proxy
         reward, discount = task.get_reward(physics), task.get_discount(physics)
         return dm_env.TimeStep(kind, reward, discount, observation)
+
+    def _is_watched(self) -> bool:
+        """Whether somebody is called between physics steps."""
+        hooks = self._hooks
+        between = hooks._before_substep, hooks._after_substep  # noqa: SLF001
+        return any(hook.entity_hooks or hook.extra_hooks for hook in between)
+
+    def _is_plain(self) -> bool:
+        """Whether composer's own step would do no more for an episode."""
+        seen = {n: o for n, o in self.task.observables.items() if o.enabled}
+        self._enabled = tuple(seen)
+        return not (
+            self._legacy_step
+            or self._raise_exception_on_physics_error
+            or type(self.task).before_substep is not composer.Task.before_substep
+            or any(not isinstance(one, FrameObservable) for one in seen.values())
+            or any(getattr(one, s) for one in seen.values() for s in _SETTINGS)
+            or any(one.update_interval not in (None, 1) for one in seen.values())
+        )
 
     def _changes_model(self) -> bool:
         """Whether the task, an entity or a hook changes the MJCF model."""
@@ -85,22 +136,7 @@ class Environment(composer.Environment):
 
 
 class NavigationPhysics(mjcf.Physics):
-    """The simulator: quick steps, and pictures that need OpenGL."""
-
-    def step(self, nstep: int = 1) -> None:
-        """Does physics steps.
-
-        dm_control's own check for warnings takes a tenth of a step without contact.
-
-        Raises:
-            PhysicsError: if MuJoCo warns.
-        """
-        if self.legacy_step:
-            return super().step(nstep)
-        before = self._warnings.tobytes()
-        mujoco.mj_step(self.model.ptr, self.data.ptr, nstep)
-        if self._warnings.tobytes() != before:
-            raise control.PhysicsError("MuJoCo has warned in a physics step")
+    """The simulator, with pictures that need OpenGL."""
 
     def _make_rendering_contexts(self):
         """Opens the off-screen context that pictures are drawn in.

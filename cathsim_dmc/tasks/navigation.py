@@ -1,6 +1,6 @@
 """Navigation of a catheter through an anatomy, as a composer task."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import dm_env.specs
@@ -158,12 +158,17 @@ class Navigation(composer.Task):
         if self._observables is None:
             self._observables = {
                 key: FrameObservable(
-                    lambda physics, key=key: self._current().observation[key][0],
+                    lambda physics, key=key: self.observation[key][0],
                     spec,
                 )
                 for key, spec in self.observation_specs.items()
             }
         return self._observables
+
+    @property
+    def observation(self) -> Mapping[str, np.ndarray]:
+        """Arrays (1, ...) of the last control step, or of the start."""
+        return self._current().observation
 
     @property
     def observation_specs(self) -> dict[str, dm_env.specs.Array]:
@@ -244,6 +249,10 @@ class Navigation(composer.Task):
         """Keeps the contacts of a physics step."""
         del physics, random_state
         self._stepper.keep()
+
+    def run_substeps(self) -> None:
+        """Does all physics steps of a control step, in place of composer."""
+        self._stepper.run()
 
     def after_step(self, physics, random_state):
         """Decides reward, success and end of the episode, once."""
