@@ -55,6 +55,7 @@ _PLACES = 65  # at most
 # that lies flat on a wall has many that are none.
 _DENT = 5e-6
 _FLAT = 2e-6
+_BISECTIONS = 6
 _ASIDE = 0.4e-3  # m, to both sides, from where the planes of a hollow wall are taken
 _MOST = 4  # contacts of a capsule and a box; more are fatal
 _HOLLOW = 5e-6  # m, least distance of their edge from the wall
@@ -164,16 +165,55 @@ def clearance_along(entry, centre, axis, t):
 
 
 @compiled
-def dented(values, count, i):
-    """Whether the clearance rises by `_DENT` on both sides of a place."""
-    for way in (-1, 1):
+def dented(values, count, i, closed):
+    """Whether the clearance rises to both sides of a place: it is a contact by itself.
+
+    It rises by `_DENT`, or up to an end that is no contact.
+    """
+    for side, way in enumerate((-1, 1)):
         rise, k = 0.0, i + way
         while 0 <= k < count and values[k] >= values[i] and rise < _DENT:
             rise = max(rise, values[k] - values[i])
             k += way
-        if rise < _DENT:
+        if rise >= _DENT:
+            continue
+        if 0 <= k < count or not closed[side]:
+            return False
+        if values[k - way] <= values[k - 2 * way] + _FLAT:
             return False
     return True
+
+
+@compiled
+def lowest(entry, centre, axis, half, t, value, step):
+    """Place (m along a capsule) of the least clearance within a step of t, and it.
+
+    Bisected, because the clearance has a kink at an edge of the wall; then a parabola.
+    """
+    left, right = max(t - step, -half), min(t + step, half)
+    before = clearance_along(entry, centre, axis, left)
+    after = clearance_along(entry, centre, axis, right)
+    for _ in range(_BISECTIONS):
+        upper = right - t > t - left
+        place = 0.5 * (t + (right if upper else left))
+        there = clearance_along(entry, centre, axis, place)
+        if there < value:
+            if upper:
+                left, before = t, value
+            else:
+                right, after = t, value
+            t, value = place, there
+        elif upper:
+            right, after = place, there
+        else:
+            left, before = place, there
+    one, other = (after - value) * (t - left), (before - value) * (right - t)
+    if one > 0.0 and other > 0.0:
+        place = t + 0.5 * (other * (right - t) - one * (t - left)) / (one + other)
+        there = clearance_along(entry, centre, axis, place)
+        if there < value:
+            t, value = place, there
+    return t, value
 
 
 @compiled
@@ -276,24 +316,22 @@ def touches(entry, centre, axis, half, closed, limit):
     found, first, low, second, lower = NONE
     for i in range(count):
         value, t = values[i], -half + i * step
-        if i == 0 or i == count - 1:
+        at_end, open_end = i == 0 or i == count - 1, False
+        if at_end:
             beside = values[min(1, count - 1)] if i == 0 else values[i - 1]
-            if value > beside + _FLAT or not closed[0 if i == 0 else 1]:
+            if value > beside + _FLAT:
                 continue
+            open_end = not closed[0 if i == 0 else 1]
         elif not (value <= values[i - 1] and value < values[i + 1]):
             continue
-        elif not dented(values, count, i):
+        elif not dented(values, count, i, closed):
             continue
         if value > limit + step:
             continue
-        if 0 < i < count - 1:
-            # The lowest point of the parabola through three places.
-            bend = values[i - 1] - 2.0 * value + values[i + 1]
-            if bend > 0.0:
-                place = t + 0.5 * step * (values[i - 1] - values[i + 1]) / bend
-                there = clearance_along(entry, centre, axis, place)
-                if there < value:
-                    t, value = place, there
+        if half > 0.0 and (open_end or not at_end):
+            t, value = lowest(entry, centre, axis, half, t, value, step)
+            if open_end and values[i] - value < _DENT:
+                continue
         if value > limit:
             continue
         # The two that are nearest to the wall, in the order of the axis.
