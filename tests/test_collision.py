@@ -138,6 +138,26 @@ def chain(place):
     )
 
 
+def test_an_edge_of_the_wall_is_never_lost_between_two_links():
+    """A chain slides over it: at places before, at and behind the joint at 7 mm."""
+
+    def wedge(blocks, points):
+        apart = -(blocks[:, None, :] + points)[..., [0, 2]]
+        outside = np.linalg.norm(np.maximum(apart, 0.0), axis=-1)
+        return outside + np.minimum(apart.max(axis=-1), 0.0)
+
+    corner = Field.sampled(wedge, np.full(3, -0.03), np.full(3, 0.03))
+    turned = chain((0, 0, 0)).replace("<body", '<body euler="0 -45 0"', 1)
+    model, data = compiled(carrier(corner) + turned)
+    along, away = np.array([-1, 0, 1]) / 2**0.5, np.array([-1, 0, -1]) / 2**0.5
+    depth = []
+    for way in np.arange(1.5e-3, 12.5e-3, 0.05e-3):
+        data.qpos[:3] = (DEVICE - 0.1e-3) * away - way * along
+        mujoco.mj_forward(model, data)
+        depth.append(-data.contact.dist.min(initial=1.0))
+    assert 0.0 < min(depth) and np.ptp(depth) < 0.06e-3
+
+
 def test_a_joint_is_touched_once(tube):
     """The proximal end of a link is left to the link before it."""
     place = (RADIUS - DEVICE + 0.1e-3, 0, 20e-3)

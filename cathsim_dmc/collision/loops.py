@@ -328,7 +328,7 @@ def touches(entry, centre, axis, half, closed, limit):
             continue
         if value > limit + step:
             continue
-        if half > 0.0 and (open_end or not at_end):
+        if half > 0.0:
             t, value = lowest(entry, centre, axis, half, t, value, step)
             if open_end and values[i] - value < _DENT:
                 continue

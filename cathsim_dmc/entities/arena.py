@@ -2,6 +2,8 @@
 
 from dm_control import composer
 
+from cathsim_dmc.entities.contact import FRICTION_STIFFNESS
+
 BLOOD_DENSITY = 1060.0  # kg/m^3
 GRAVITY = 9.81  # m/s^2
 
@@ -32,6 +34,7 @@ class AngiographyArena(composer.Arena):
         root.option.integrator = "discrete"
         # Pyramidal cones diverge under full-amplitude steps of the tip.
         root.option.cone = "elliptic"
+        root.option.impratio = FRICTION_STIFFNESS
         root.option.density = 0
         root.option.viscosity = 0
         buoyancy = max(0.0, 1 - BLOOD_DENSITY / device_density)
