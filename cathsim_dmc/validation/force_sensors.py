@@ -59,9 +59,9 @@ def resting_link(load: float, settling: float = 5.0) -> Resting:
         settling: s, of which the first is for raising the load.
     """
     rig = Rig()
-    plate = Phantom(_plate(rig.device.outer_radius))
-    rig.arena.attach(plate)
-    plate.add_wall(rig.catheter.links[0])
+    wall = Phantom(plate(rig.device.outer_radius))
+    rig.arena.attach(wall)
+    wall.add_wall(rig.catheter.links[0])
     rig.compile()
     steps = round(settling / rig.model.opt.timestep)
     last = round(AVERAGING / rig.model.opt.timestep)
@@ -85,15 +85,21 @@ def resting_link(load: float, settling: float = 5.0) -> Resting:
     return Resting(load, *np.mean(rows, axis=0).tolist())
 
 
-def _plate(height: float) -> Anatomy:
-    """An anatomy whose wall is a plate at y = `height` (m), touching the device."""
-    plate = dataclasses.replace(straight_tube(*GUIDING_TUBE), name="plate")
-    vars(plate)["lumen"] = Field.sampled(
+def walled(field: Field, name: str) -> Anatomy:
+    """An anatomy whose wall is any field; its tree stands for nothing."""
+    anatomy = dataclasses.replace(straight_tube(*GUIDING_TUBE), name=name)
+    vars(anatomy)["lumen"] = field
+    return anatomy
+
+
+def plate(height: float) -> Anatomy:
+    """An anatomy whose wall is a plate at y = `height`, m."""
+    field = Field.sampled(
         lambda blocks, points: height - blocks[:, None, 1] - points[:, 1],
         np.array([-0.05, -0.05, -0.5]),
         np.array([0.05, height, 0.5]),
     )
-    return plate
+    return walled(field, "plate")
 
 
 def straight_tube(length: float, radius: float) -> Anatomy:

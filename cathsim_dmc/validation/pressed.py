@@ -22,6 +22,9 @@ _SETTLING, _WATCHED = 1200, 300  # physics steps
 RIPPLE = 1e-3  # mm, of the depth under a dead load
 DEPTH = 0.3  # mm, 99th percentile; as in the soak
 
+# Radius of the tube, m. In one of 4 mm, a link of 7 mm wedges across the lumen as the
+# tip folds, and bears up to four times the push, because links do not bend.
+JAM_RADIUS = 5e-3
 _JAMMED = 2.0  # s, of pushing with the stroke used up
 _END = 1.0  # s, of it that counts
 
@@ -85,7 +88,7 @@ def jam(pair: tuple[str, str]) -> Jam:
         suite.DOMAIN,
         "navigate",
         {
-            "anatomy": tube(bent=False),
+            "anatomy": tube(bent=False, radius=JAM_RADIUS),
             "goal": "end",
             "goal_radius": 1e-6,
             "devices": pair,

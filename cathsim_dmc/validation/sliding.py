@@ -85,8 +85,8 @@ def slide(
     return parts, lines
 
 
-def tube(bent: bool) -> Anatomy:
-    """A tube of 4 mm radius, straight or with half a circle of 40 mm in it."""
+def tube(bent: bool, radius: float = TUBE_RADIUS) -> Anatomy:
+    """A tube with a radius (m), straight or with half a circle of 40 mm in it."""
     s = np.linspace(0.0, 0.05, 11)
     points = [np.stack([0 * s, 0 * s, s], axis=-1)]
     if bent:
@@ -100,7 +100,7 @@ def tube(bent: bool) -> Anatomy:
         points.append(np.stack([0 * s, 0 * s, s], axis=-1))
     line = np.concatenate(points)
     tree = VesselTree(
-        {"tube": Vessel("tube", Centreline(line, np.full(len(line), TUBE_RADIUS)))}
+        {"tube": Vessel("tube", Centreline(line, np.full(len(line), radius)))}
     )
     length = tree.root.centreline.length
     return Anatomy.from_tree(

@@ -7,7 +7,6 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import mujoco
 import numpy as np
 
 from cathsim_dmc.anatomy import measures
@@ -17,176 +16,17 @@ from cathsim_dmc.anatomy.scan.check import check_tree
 from cathsim_dmc.anatomy.surface_depth import SurfaceDepth
 from cathsim_dmc.anatomy.tree_depth import TreeDepth
 from cathsim_dmc.entities import devices
-from cathsim_dmc.entities.chain import MAX_PUSH_SPEED
-from cathsim_dmc.entities.contact import FRICTION, wall_contact
-from cathsim_dmc.physics.drives import hold
-from cathsim_dmc.validation import convergence
+from cathsim_dmc.validation import convergence, friction
 from cathsim_dmc.validation.checks import Check, Report
-from cathsim_dmc.validation.rig import Rig
 
 # Bounds (mm) on the difference between the field and the distance that it stands for,
 # at the 99th percentile of places within 1 mm of the wall: of a union of tubes, and of
 # a surface, at whose edges the distance has edges too, which a lattice rounds.
 ERROR_TREE, ERROR_SURFACE = 0.02, 0.20
 LARGEST_FIELD = 5.0  # MB
-CAPSTAN_BOUND = 10.0  # % of the coefficient of friction
 ARCHES = ("type1", "type2")
 _NEAR_WALL = 1e-3  # m
 _PLACES = 20_000
-DRUM_RADIUS = 0.05  # m
-WRAP = np.pi  # rad, angle of the wrap at the start
-# Coefficient and angle of the wrap: default friction, and about the ends of the range
-# of lubricated silicone to bare steel; less and more than half a turn.
-CAPSTANS = (
-    (FRICTION, WRAP),
-    (0.1, WRAP),
-    (0.2, WRAP),
-    (0.05, 0.5 * WRAP),
-    (FRICTION, 1.5 * WRAP),
-    (0.1, 1.5 * WRAP),
-)
-TENSION = 0.5  # N, dead load on the distal end: far above EI/R² = 0.02 N
-PULL_SPEED = 0.02  # m/s, no load
-_SETTLING = 0.5  # s, before the pull
-_LEAD = 0.02  # m of rod between the clamp and the drum; first part of the pull
-_PULL = 0.1  # m
-
-
-@dataclasses.dataclass(frozen=True)
-class Capstan:
-    """A rod pulled round a drum.
-
-    Attributes:
-        friction: Coulomb coefficient.
-        angle: by which the drum turns the force in the rod, rad.
-        travel: (n,), way of the base, m.
-        ratio: (n,), tension at the base over that at the end.
-        mean: of the ratio in steady sliding.
-        free: the same without friction. Bending and straightening the rod dissipates
-            a little, by however much it is wrapped.
-        expected: exp(μθ).
-    """
-
-    friction: float
-    angle: float
-    travel: np.ndarray
-    ratio: np.ndarray
-    mean: float
-    free: float
-    expected: float
-
-    @property
-    def acting(self) -> float:
-        """Coefficient of friction that the exponent shows."""
-        return float(np.log(self.mean / self.free) / self.angle)
-
-    def check(self) -> Check:
-        """The coefficient that acts against the one that was set.
-
-        The ratio of a slippery rod is near 1 whatever happens: 12 % less friction
-        over a quarter turn are 0.9 % of it at 0.05. So the exponent is bounded.
-        """
-        return Check.deviation(
-            f"capstan, friction {self.friction:g} over {np.degrees(self.angle):.0f}°",
-            self.acting,
-            self.friction,
-            CAPSTAN_BOUND,
-            f"friction {self.acting:.4f} acts, ratio {self.mean:.4f}, "
-            f"{self.free:.4f} without friction, exp(μθ) = {self.expected:.4f}",
-        )
-
-
-def capstan(
-    friction: float,
-    wrap: float = WRAP,
-    device: str | devices.Device = "steerable_5f",
-) -> Capstan:
-    """Pulls the rod over a drum with and without friction.
-
-    The contact parameters are those of the phantom.
-
-    The distal end carries a dead load; the base retracts. Both forces are measured,
-    and so is the angle between them, because a rod with bending stiffness leaves the
-    drum earlier than a string.
-
-    Args:
-        friction: Coulomb coefficient.
-        wrap: angle by which the drum turns the rod at the start, rad; above half a
-            turn the rod passes beside itself, for it does not touch itself.
-        device: whose rod.
-
-    Raises:
-        RuntimeError: if the rod sticks to the drum.
-    """
-    device = dataclasses.replace(devices.get(device), tip_shape=())
-    angle, travel, ratio = _pulled(device, friction, wrap)
-    _, far, free = _pulled(device, 0.0, wrap)
-    return Capstan(
-        friction=friction,
-        angle=angle,
-        travel=travel,
-        ratio=ratio,
-        mean=float(ratio[travel > _LEAD].mean()),
-        free=float(free[far > _LEAD].mean()),
-        expected=float(np.exp(friction * angle)),
-    )
-
-
-def _pulled(
-    device: devices.Device, friction: float, wrap: float
-) -> tuple[float, np.ndarray, np.ndarray]:
-    """Angle of the wrap, way of the base (n,) and ratio of the tensions (n,)."""
-    radius = DRUM_RADIUS + device.outer_radius
-    length = 2 * _LEAD + _PULL + wrap * radius
-    rig = Rig(
-        device,
-        devices.Discretisation(working_length=length),
-        friction=friction,
-        stroke=_PULL,
-    )
-    base = _PULL - rig.lengths.sum()
-    drum = rig.arena.mjcf_model.worldbody.add(
-        "body", name="drum", pos=(radius, 0, base + _LEAD)
-    )
-    drum.add(
-        "geom",
-        name="drum",
-        type="cylinder",
-        size=(DRUM_RADIUS, 0.05),
-        zaxis=(0, 1, 0),
-        **wall_contact(friction),
-    )
-    rig.compile()
-    middles = np.cumsum(rig.lengths) - rig.lengths / 2
-    heading = np.clip((middles - _LEAD) / radius, 0.0, wrap)
-    rig.data.joint(f"{rig.name}/insertion").qpos = _PULL
-    hold(rig.model, rig.data)
-    for index in range(1, len(middles)):
-        angle = heading[index] - heading[index - 1]
-        rig.data.joint(f"{rig.name}/bend_y_{index}").qpos = angle
-    mujoco.mj_forward(rig.model, rig.data)
-    load = TENSION * np.array([np.sin(wrap), 0.0, np.cos(wrap)])
-    motor = rig.data.actuator(f"{rig.name}/insertion")
-    for _ in range(round(_SETTLING / rig.model.opt.timestep)):
-        rig.step(load)
-    motor.ctrl[0] = -PULL_SPEED / MAX_PUSH_SPEED
-    travel, force = [], []
-    while not travel or travel[-1] < _PULL - 0.02:
-        rig.step(load)
-        travel.append(_PULL - rig.qpos("insertion"))
-        force.append(rig.sensor(f"{rig.name}/push_force"))
-        if len(travel) > 10_000:
-            raise RuntimeError(
-                f"the rod stuck on the drum after {1e3 * travel[-1]:.1f} mm"
-            )
-    travel, force = np.array(travel), np.array(force)
-    tension = np.linalg.norm(force, axis=1)
-    # Link 0 never turns, so its frame is the world's. Both forces point away from
-    # the drum; that of the base against its heading, which is about 0.
-    sliding = travel > _LEAD
-    heading = np.arctan2(-force[sliding, 0], -force[sliding, 2])
-    angle = float(wrap - heading.mean())
-    return angle, travel, tension / TENSION
 
 
 def field_error(anatomy: Anatomy) -> np.ndarray:
@@ -402,8 +242,8 @@ def validate_wall(
     checks: list[Check] = []
     for anatomy in anatomies:
         checks += lumen_checks(anatomy)
-    pulled = [capstan(friction, wrap) for friction, wrap in CAPSTANS]
-    checks += [one.check() for one in pulled]
+    rubbed, pulled = friction.checks()
+    checks += rubbed
     studies = convergence.studies() if with_convergence else []
     checks += convergence.checks(studies)
     findings = {"convergence": studies} if studies else {}

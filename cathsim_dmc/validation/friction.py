@@ -1,0 +1,318 @@
+"""Friction of devices on a wall: sliding, sticking, and pulled round a drum."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from typing import NamedTuple
+
+import mujoco
+import numpy as np
+
+from cathsim_dmc.anatomy.field import Field
+from cathsim_dmc.entities import devices
+from cathsim_dmc.entities.chain import MAX_PUSH_SPEED
+from cathsim_dmc.entities.contact import FRICTION
+from cathsim_dmc.entities.device_stack import DeviceStack
+from cathsim_dmc.entities.phantom import Phantom
+from cathsim_dmc.physics import chain_fields
+from cathsim_dmc.physics.drives import hold
+from cathsim_dmc.validation.checks import Check
+from cathsim_dmc.validation.force_sensors import plate, walled
+from cathsim_dmc.validation.pair import PAIR, straightened
+from cathsim_dmc.validation.rig import Rig
+
+LOADS = (0.02, 0.2, 2.0)  # N
+SPEEDS = (0.001, 0.01, 0.04)  # m/s
+ACTING_BOUND = 5.0  # % of the coefficient of friction
+RIPPLE_BOUND = 5.0  # % of the pull, its standard deviation
+CREEP_LOAD = 0.2  # N
+CREEP_BOUND = 0.02  # mm/s, pulled sideways with half of what friction can hold
+_PRESSED = 0.07  # m of the end of the device, under the load
+_DROP = 1e-3  # m, from the base to the plate: what is not pressed does not touch
+_SETTLED = 2.0  # s
+_SLID = 0.02  # m, after which the device slides as a whole
+_WATCHED = 0.02  # m
+
+CAPSTAN_BOUND = 3.0  # % of the coefficient of friction
+DRUM_RADIUS = 0.05  # m
+# Coefficient and angle of the wrap, rad: default friction, and about the ends of the
+# range of lubricated silicone to bare steel.
+CAPSTANS = (
+    (0.05, 0.5 * np.pi),
+    (FRICTION, np.pi),
+    (0.05, np.pi),
+    (0.2, np.pi),
+    (0.05, 1.5 * np.pi),
+    (0.2, 0.5 * np.pi),
+    (0.2, 1.5 * np.pi),
+)
+TENSION = 0.5  # N, dead load on the distal end: far above EI/R² = 0.02 N
+PULL_SPEED = 0.02  # m/s, no load
+_SETTLING = 0.5  # s, before the pull
+_LEAD = 0.02  # m of rod between the clamp and the drum; first part of the pull
+_PULL = 0.1  # m
+
+
+def _on_plate(names: tuple[str, ...]) -> tuple[Rig, np.ndarray, np.ndarray]:
+    """A straight device over a plate; numbers (n,) and shares of its pressed links."""
+    chosen = list(straightened(names))
+    coaxial = len(chosen) > 1
+    rig = Rig(catheter=DeviceStack(chosen)) if coaxial else Rig(chosen[0])
+    wall = Phantom(plate(rig.device.outer_radius + _DROP))
+    rig.arena.attach(wall)
+    wall.add_wall(rig.catheter.links[0])
+    rig.compile()
+    if isinstance(rig.catheter, DeviceStack):
+        chain_fields.write_still(rig.catheter, rig.model, np.zeros(len(chosen)))
+    rig.data.joint(f"{rig.name}/insertion").qpos = 0.09
+    hold(rig.model, rig.data)
+    beyond = np.cumsum(rig.lengths[::-1])[::-1] - rig.lengths
+    pressed = np.flatnonzero(beyond < _PRESSED - 1e-9)
+    bodies = rig.tip_body + 1 - len(rig.lengths) + pressed
+    return rig, bodies, rig.lengths[pressed] / rig.lengths[pressed].sum()
+
+
+def _steps(rig: Rig, duration: float) -> range:
+    return range(round(duration / rig.model.opt.timestep))
+
+
+class Slid(NamedTuple):
+    """A device pulled over a plate."""
+
+    acting: float  # coefficient of friction, pull over load
+    ripple: float  # standard deviation of the pull over its mean
+
+
+def slid(names: tuple[str, ...], load: float, speed: float) -> Slid:
+    """Pulls a device over a plate.
+
+    Args:
+        names: of the device, or of coaxial ones.
+        load: of its end on the plate, N.
+        speed: m/s.
+    """
+    rig, bodies, shares = _on_plate(names)
+    rig.data.xfrc_applied[bodies, 1] = load * shares
+    for _ in _steps(rig, _SETTLED):
+        rig.step()
+    rig.data.actuator(f"{rig.name}/insertion").ctrl[0] = -speed / MAX_PUSH_SPEED
+    for _ in _steps(rig, _SLID / speed):
+        rig.step()
+    pull = []
+    for _ in _steps(rig, _WATCHED / speed):
+        rig.step()
+        pull.append(-rig.sensor(f"{rig.name}/push_force")[2])
+    mean = float(np.mean(pull))
+    return Slid(mean / load, float(np.std(pull)) / abs(mean))
+
+
+def creep(names: tuple[str, ...], load: float = CREEP_LOAD) -> float:
+    """Speed (m/s) of a device that sticks, pulled sideways at half the limit.
+
+    Args:
+        names: of the device, or of coaxial ones.
+        load: of its end on the plate, N.
+    """
+    rig, bodies, shares = _on_plate(names)
+    rig.data.xfrc_applied[bodies, 1] = load * shares
+    for _ in _steps(rig, _SETTLED):
+        rig.step()
+    rig.data.xfrc_applied[bodies, 0] = 0.5 * FRICTION * load * shares
+    for _ in _steps(rig, 0.5 * _SETTLED):
+        rig.step()
+    before = rig.head_position
+    for _ in _steps(rig, _SETTLED):
+        rig.step()
+    return float(np.linalg.norm(rig.head_position - before)) / _SETTLED
+
+
+@dataclasses.dataclass(frozen=True)
+class Capstan:
+    """A rod pulled round a drum.
+
+    Attributes:
+        friction: Coulomb coefficient.
+        angle: by which the drum turns the force in the rod, rad.
+        travel: (n,), way of the base, m.
+        ratio: (n,), tension at the base over that at the end.
+        mean: of the ratio in steady sliding.
+        free: the same without friction. Bending and straightening the rod dissipates
+            a little, by however much it is wrapped.
+        lever: radius of the drum over that of the rod's axis: friction acts on the
+            surface, tension in the axis.
+        bent: energy of bending per length over the tension at the end, EI κ² / 2 T,
+            by which the rod is less tense on the drum than beside it.
+    """
+
+    friction: float
+    angle: float
+    travel: np.ndarray
+    ratio: np.ndarray
+    mean: float
+    free: float
+    lever: float = 1.0
+    bent: float = 0.0
+
+    @property
+    def expected(self) -> float:
+        """Ratio of the tensions of this rod with the friction that was set."""
+        exponent = self.friction * self.angle * self.lever
+        return float(self.bent + (1 - self.bent) * np.exp(exponent))
+
+    @property
+    def acting(self) -> float:
+        """Coefficient of friction that the exponent shows."""
+        ratio = (self.mean - (self.free - 1) - self.bent) / (1 - self.bent)
+        return float(np.log(ratio) / (self.angle * self.lever))
+
+    def check(self) -> Check:
+        """The coefficient that acts against the one that was set.
+
+        The ratio of a slippery rod is near 1 whatever happens: 12 % less friction
+        over a quarter turn are 0.9 % of it at 0.05. So the exponent is bounded.
+        """
+        return Check.deviation(
+            f"capstan, friction {self.friction:g} over {np.degrees(self.angle):.0f}°",
+            self.acting,
+            self.friction,
+            CAPSTAN_BOUND,
+            f"friction {self.acting:.4f} acts, ratio {self.mean:.4f}, "
+            f"{self.free:.4f} without friction, expected {self.expected:.4f}",
+        )
+
+
+def capstan(
+    friction: float,
+    wrap: float = np.pi,
+    device: str | devices.Device = "steerable_5f",
+) -> Capstan:
+    """Pulls the rod over a drum with and without friction.
+
+    The drum is a field. The distal end carries a dead load; the base retracts. Both
+    forces are measured, and so is the angle between them, because a rod with bending
+    stiffness leaves the drum earlier than a string.
+
+    Args:
+        friction: Coulomb coefficient.
+        wrap: angle by which the drum turns the rod at the start, rad; above half a
+            turn the rod passes beside itself, for it does not touch itself.
+        device: whose rod.
+
+    Raises:
+        RuntimeError: if the rod sticks to the drum.
+    """
+    device = dataclasses.replace(devices.get(device), tip_shape=())
+    angle, travel, ratio = _pulled(device, friction, wrap)
+    _, far, free = _pulled(device, 0.0, wrap)
+    axis = DRUM_RADIUS + device.outer_radius
+    return Capstan(
+        friction=friction,
+        angle=angle,
+        travel=travel,
+        ratio=ratio,
+        mean=float(ratio[travel > _LEAD].mean()),
+        free=float(free[far > _LEAD].mean()),
+        lever=DRUM_RADIUS / axis,
+        bent=device.shaft.bending_stiffness / (2 * axis**2 * TENSION),
+    )
+
+
+def _drum(x: float, z: float) -> Callable[[np.ndarray, np.ndarray], np.ndarray]:
+    """Measure of the clearance outside a drum about a line along y at x, z."""
+
+    def measure(blocks: np.ndarray, points: np.ndarray) -> np.ndarray:
+        there = blocks[:, None, :] + points
+        return np.hypot(there[..., 0] - x, there[..., 2] - z) - DRUM_RADIUS
+
+    return measure
+
+
+def _pulled(
+    device: devices.Device, friction: float, wrap: float
+) -> tuple[float, np.ndarray, np.ndarray]:
+    """Angle of the wrap, way of the base (n,) and ratio of the tensions (n,)."""
+    radius = DRUM_RADIUS + device.outer_radius
+    length = 2 * _LEAD + _PULL + wrap * radius
+    rig = Rig(
+        device,
+        devices.Discretisation(working_length=length),
+        friction=friction,
+        stroke=_PULL,
+    )
+    base = _PULL - rig.lengths.sum()
+    middle = np.array([radius, 0, base + _LEAD])
+    half = np.array([length, 0.02, length])  # around the whole rod
+    field = Field.sampled(_drum(middle[0], middle[2]), middle - half, middle + half)
+    drum = Phantom(walled(field, "drum"), friction=friction)
+    rig.arena.attach(drum)
+    drum.add_wall(rig.catheter.links[0])
+    rig.compile()
+    middles = np.cumsum(rig.lengths) - rig.lengths / 2
+    heading = np.clip((middles - _LEAD) / radius, 0.0, wrap)
+    rig.data.joint(f"{rig.name}/insertion").qpos = _PULL
+    hold(rig.model, rig.data)
+    for index in range(1, len(middles)):
+        angle = heading[index] - heading[index - 1]
+        rig.data.joint(f"{rig.name}/bend_y_{index}").qpos = angle
+    mujoco.mj_forward(rig.model, rig.data)
+    load = TENSION * np.array([np.sin(wrap), 0.0, np.cos(wrap)])
+    motor = rig.data.actuator(f"{rig.name}/insertion")
+    for _ in _steps(rig, _SETTLING):
+        rig.step(load)
+    motor.ctrl[0] = -PULL_SPEED / MAX_PUSH_SPEED
+    travel, force = [], []
+    while not travel or travel[-1] < _PULL - 0.02:
+        rig.step(load)
+        travel.append(_PULL - rig.qpos("insertion"))
+        force.append(rig.sensor(f"{rig.name}/push_force"))
+        if len(travel) > 10_000:
+            raise RuntimeError(
+                f"the rod stuck on the drum after {1e3 * travel[-1]:.1f} mm"
+            )
+    travel, force = np.array(travel), np.array(force)
+    tension = np.linalg.norm(force, axis=1)
+    # Link 0 never turns, so its frame is the world's. Both forces point away from
+    # the drum; that of the base against its heading, which is about 0.
+    sliding = travel > _LEAD
+    heading = np.arctan2(-force[sliding, 0], -force[sliding, 2])
+    angle = float(wrap - heading.mean())
+    return angle, travel, tension / TENSION
+
+
+def checks() -> tuple[list[Check], list[Capstan]]:
+    """Friction that acts on devices, sliding and sticking, and the capstans."""
+    found = []
+    for name, names in (("steerable_5f", ("steerable_5f",)), ("pair", PAIR)):
+        for load in LOADS:
+            runs = [slid(names, load, speed) for speed in SPEEDS]
+            worst = max(runs, key=lambda one: abs(one.acting - FRICTION))
+            found += [
+                Check.deviation(
+                    f"{name} sliding under {load:g} N: friction that acts",
+                    worst.acting,
+                    FRICTION,
+                    ACTING_BOUND,
+                    ", ".join(
+                        f"{one.acting:.4f} at {1e3 * speed:g} mm/s"
+                        for speed, one in zip(SPEEDS, runs, strict=True)
+                    ),
+                ),
+                Check.at_most(
+                    f"{name} sliding under {load:g} N: ripple of the pull",
+                    100 * max(one.ripple for one in runs),
+                    RIPPLE_BOUND,
+                    "%",
+                ),
+            ]
+        found.append(
+            Check.at_most(
+                f"{name} under {CREEP_LOAD:g} N, pulled sideways at half the limit: "
+                "creep",
+                1e3 * creep(names),
+                CREEP_BOUND,
+                "mm/s",
+            )
+        )
+    pulled = [capstan(friction, wrap) for friction, wrap in CAPSTANS]
+    return found + [one.check() for one in pulled], pulled
