@@ -196,3 +196,12 @@ def test_equal_fields_have_one_digest(tube):
     tree, ends, field = tube
     assert Field.from_tree(tree, ends).digest == field.digest
     assert Field.from_tree(tree).digest != field.digest
+
+
+def test_points_that_are_not_finite_have_no_depth():
+    def measure(blocks, points):
+        return 0.01 - np.linalg.norm(blocks[:, None] + points, axis=-1)
+
+    ball = Field.sampled(measure, np.full(3, -0.01), np.full(3, 0.01))
+    found = ball([[0.0, 0.0, 0.0], [np.nan, 0.0, 0.0], [0.0, np.inf, 0.0]])
+    assert found[0] > 0.0 and np.isnan(found[1:]).all()

@@ -59,7 +59,7 @@ CONFINED = {
     "tensordict": {*_TORCHRL_FACE, "agents/"},
     "safetensors": {"agents/pretrained.py"},
     "rerun": {"recording/"},
-    "igl": {"anatomy/surface_depth.py", "anatomy/scan/"},
+    "igl": {"anatomy/"},
     "llvmlite": {"collision/native.py"},
     "fast_simplification": {"anatomy/scan/topology.py"},
     "numba": {"compiled.py", "collision/native.py"},

@@ -10,7 +10,7 @@ from recording_samples import make_episode, make_tube
 from scipy.spatial.transform import Rotation
 
 from cathsim_dmc.recording.comparison import write_comparison
-from cathsim_dmc.recording.geometry import force_text, rotate
+from cathsim_dmc.recording.geometry import force_text
 from cathsim_dmc.recording.rerun_device import arrow_scale
 from cathsim_dmc.recording.rerun_log import write_rrd
 from cathsim_dmc.recording.scene import BodyGeom
@@ -274,7 +274,9 @@ def test_bodies_carry_their_geoms(written):
     capsule = f"{moved}/capsule"
     lower = recording.fixed(capsule, "Capsules3D:translations")[0]
     geom = make_geoms()[3]
-    centre = np.array(lower) + rotate(np.array(geom.quaternion), np.array([0, 0, 0.02]))
+    centre = np.array(lower) + Rotation.from_quat(
+        geom.quaternion, scalar_first=True
+    ).apply([0, 0, 0.02])
     np.testing.assert_allclose(centre, geom.position, atol=1e-6)
     np.testing.assert_allclose(recording.fixed(capsule, "Capsules3D:lengths"), [0.04])
     half = recording.fixed("/world/robot/base/box", "Boxes3D:half_sizes")

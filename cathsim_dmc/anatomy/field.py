@@ -59,7 +59,7 @@ class Field:
     samples: np.ndarray
 
     def __call__(self, points: ArrayLike, free: bool = False) -> Array:
-        """Depths (...) m at points (..., 3) m.
+        """Depths (...) m at points (..., 3) m; NaN at points that are not finite.
 
         Args:
             points: m.
@@ -71,8 +71,12 @@ class Field:
 
         points = as_points(points)
         flat = np.ascontiguousarray(points.reshape(-1, 3))
-        out = np.empty(len(flat))
-        depths(*self.arrays, flat, free, out)
+        out = np.full(len(flat), np.nan)
+        fine = np.isfinite(flat).all(axis=1)
+        if fine.all():
+            depths(*self.arrays, flat, free, out)
+        else:  # the compiled lookup would read beyond its arrays
+            out[fine] = self(flat[fine], free)
         return out.reshape(points.shape[:-1])
 
     def gradient(self, points: ArrayLike) -> Array:

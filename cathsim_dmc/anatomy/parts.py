@@ -116,3 +116,14 @@ class Surface:
         """Enclosed volume (m^3), positive when normals point outwards."""
         a, b, c = (self.vertices[self.faces[:, i]] for i in range(3))
         return float(np.einsum("fj,fj->", a, np.cross(b, c)) / 6.0)
+
+    @property
+    def normals(self) -> Array:
+        """Unit normals (V, 3) of the vertices, by area; +z where there is no area."""
+        import igl
+
+        weighting = igl.PER_VERTEX_NORMALS_WEIGHTING_TYPE_AREA
+        faces = self.faces.astype(np.int64)
+        normals = igl.per_vertex_normals(self.vertices, faces, weighting)
+        fine = np.isfinite(normals).all(axis=1, keepdims=True)
+        return np.where(fine, normals, [0.0, 0.0, 1.0])

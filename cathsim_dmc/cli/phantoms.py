@@ -208,6 +208,7 @@ def export(
     /,
     out: Path,
     access: str | None = None,
+    pieces: Literal["prisms", "coacd"] = "prisms",
 ) -> int:
     """Write an anatomy as MJCF with convex wall pieces, for other engines.
 
@@ -216,16 +217,18 @@ def export(
         out: File of the model, ending in .xml.
         access: End of the aorta that the device enters, ascending or descending, of a
             named phantom.
+        pieces: Merged prisms on the surface, or CoACD's pieces (extra `export`), which
+            take minutes.
     """
     from cathsim_dmc.anatomy import export as exported
 
     anatomy = _loaded(phantom, access)
-    pieces, found = exported.write_mjcf(anatomy, out)
+    count, found = exported.write_mjcf(anatomy, out, pieces)
     mean, p95, largest = (round(1e3 * value, 3) for value in found.intrusion)
     print_json(
         {
             "file": str(out),
-            "pieces": pieces,
+            "pieces": count,
             "intrusion_mm": {"mean": mean, "p95": p95, "max": largest},
             "open_places": found.open,
             "places": found.places,

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from cathsim_dmc.recording.geometry import vertex_normals
+from cathsim_dmc.anatomy.parts import Surface
 
 # Colour of the wall, RGB in [0, 1], as lit from the left above the viewer's eye.
 WALL_COLOUR = (0.80, 0.36, 0.33)
@@ -152,7 +152,7 @@ def _hits(vertices, faces, projection, shape):
     """Pixels (H,), depths (H,) towards the viewer and unit normals (H, 3) of hits."""
     rows, columns = shape
     frame = np.stack([projection.right, projection.up, projection.towards], axis=1)
-    normals = vertex_normals(vertices, faces) @ frame
+    normals = Surface(vertices, faces).normals @ frame
     flat = projection.pixel(vertices)[faces]  # (F, 3, 2)
     depth = (vertices @ projection.towards)[faces]
     low = np.maximum(np.ceil(flat.min(1) - 0.5).astype(int), 0)

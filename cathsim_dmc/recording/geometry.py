@@ -6,6 +6,9 @@ from typing import Any
 
 import numpy as np
 
+from cathsim_dmc.anatomy.parts import Surface
+
+UP = np.array([0.0, 0.0, 1.0])
 # Top of the colour scale, newtons. Published in-contact forces lie mostly within
 # 0-0.2 N with outliers above 0.4 N, so ordinary contacts use half the scale.
 FORCE_COLOUR_MAX = 0.4
@@ -29,41 +32,13 @@ def surface_arrays(surface: Any) -> tuple[np.ndarray, np.ndarray]:
     Raises:
         ValueError: on a wrong shape or a face that names a missing vertex.
     """
-    if hasattr(surface, "vertices"):
-        surface = surface.vertices, surface.faces
-    vertices = np.asarray(surface[0], dtype=np.float64)
-    faces = np.asarray(surface[1], dtype=np.int64)
-    for name, array in (("vertices", vertices), ("faces", faces)):
-        if array.ndim != 2 or array.shape[1] != 3:
-            raise ValueError(f"{name} must have shape (n, 3), got {array.shape}")
-    if not len(vertices) or not np.isfinite(vertices).all():
-        raise ValueError("a surface needs vertices with finite coordinates")
-    if faces.size and (faces.min() < 0 or faces.max() >= len(vertices)):
-        raise ValueError(
-            f"faces must index {len(vertices)} vertices, got indices "
-            f"{faces.min()} to {faces.max()}"
-        )
-    return vertices, faces
-
-
-def vertex_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Return unit vertex normals (V, 3), faces weighted by their area.
-
-    A vertex without a face of positive area gets +z.
-    """
-    corners = vertices[faces]
-    face_normals = np.cross(
-        corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
-    )
-    normals = np.zeros_like(vertices)
-    for corner in range(3):
-        for axis in range(3):
-            normals[:, axis] += np.bincount(
-                faces[:, corner], face_normals[:, axis], minlength=len(vertices)
-            )
-    length = np.linalg.norm(normals, axis=1, keepdims=True)
-    upright = np.broadcast_to([0.0, 0.0, 1.0], normals.shape)
-    return np.where(length > 0, normals / np.where(length > 0, length, 1), upright)
+    if not isinstance(surface, Surface):
+        if hasattr(surface, "vertices"):
+            surface = surface.vertices, surface.faces
+        surface = Surface(*surface)
+    if not len(surface.vertices):
+        raise ValueError("a surface needs vertices")
+    return surface.vertices, surface.faces.astype(np.int64)
 
 
 def z_to(direction: np.ndarray) -> np.ndarray:
@@ -80,8 +55,7 @@ def z_to(direction: np.ndarray) -> np.ndarray:
     """
     direction = np.asarray(direction, dtype=np.float64)
     length = np.linalg.norm(direction, axis=-1, keepdims=True)
-    up = np.broadcast_to([0.0, 0.0, 1.0], direction.shape)
-    unit = np.where(length > 0, direction / np.where(length > 0, length, 1), up)
+    unit = np.where(length > 0, direction / np.where(length > 0, length, 1), UP)
     quaternion = np.stack(
         [
             1 + unit[..., 2],
@@ -99,13 +73,6 @@ def z_to(direction: np.ndarray) -> np.ndarray:
 def xyzw(quaternion_wxyz: np.ndarray) -> np.ndarray:
     """Reorder quaternions (..., 4) from MuJoCo's wxyz to Rerun's xyzw."""
     return np.roll(quaternion_wxyz, -1, axis=-1)
-
-
-def rotate(quaternion_wxyz: np.ndarray, vector: np.ndarray) -> np.ndarray:
-    """Rotate vectors (..., 3) by unit quaternions (..., 4) wxyz."""
-    scalar, axis = quaternion_wxyz[..., :1], quaternion_wxyz[..., 1:]
-    twice = 2 * np.cross(axis, vector)
-    return vector + scalar * twice + np.cross(axis, twice)
 
 
 def force_colours(

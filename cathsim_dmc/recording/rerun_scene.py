@@ -6,9 +6,11 @@ from typing import Any
 
 import numpy as np
 import rerun as rr
+from scipy.spatial.transform import Rotation
 
+from cathsim_dmc.anatomy.parts import Surface
 from cathsim_dmc.recording.drawing import Drawing
-from cathsim_dmc.recording.geometry import rotate, vertex_normals, xyzw
+from cathsim_dmc.recording.geometry import xyzw
 from cathsim_dmc.recording.rerun_stream import Log
 from cathsim_dmc.recording.scene import BodyGeom
 from cathsim_dmc.recording.summary import episode_markdown
@@ -30,7 +32,7 @@ def log_static(log: Log, drawing: Drawing) -> None:
         "world/vessel",
         rr.Mesh3D(
             vertex_positions=vertices.astype(np.float32),
-            vertex_normals=vertex_normals(vertices, faces).astype(np.float32),
+            vertex_normals=Surface(vertices, faces).normals.astype(np.float32),
             triangle_indices=faces.astype(np.uint32),
             albedo_factor=VESSEL_COLOUR,
         ),
@@ -98,5 +100,6 @@ def _shape(parts: list[BodyGeom]) -> Any:
     if kind == "cylinder":
         return rr.Cylinders3D(radii=radii, lengths=lengths, centers=centre, **common)
     # MuJoCo centres a capsule, Rerun starts it at its lower end.
-    lower = centre + rotate(turn, size[:, 1:] * [0.0, 0.0, -1.0])
+    along = Rotation.from_quat(turn, scalar_first=True).apply([0.0, 0.0, 1.0])
+    lower = centre - size[:, 1:] * along
     return rr.Capsules3D(radii=radii, lengths=lengths, translations=lower, **common)
