@@ -295,7 +295,7 @@ def _trials(
     num_threads: int,
     say: Callable[[str], None],
 ) -> dict[str, Trial]:
-    """The policies on one task, by name; no expert for what it cannot steer."""
+    """Trials of the policies on one task; the expert needs a device that it steers."""
     # Cheapest to observe; none of the policies looks at it.
     task = suite.make_task(name, observation="tracking")
     simulation = BatchSimulation(task, seeds, num_threads=num_threads)

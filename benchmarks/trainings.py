@@ -29,8 +29,7 @@ from cathsim_dmc import files, suite
 from cathsim_dmc.agents import training
 from cathsim_dmc.agents.checkpoint import Checkpoint
 from cathsim_dmc.agents.learners import make_config
-from cathsim_dmc.agents.metrics import read_metrics
-from cathsim_dmc.agents.training_log import EPISODE_WINDOW
+from cathsim_dmc.agents.training_log import EPISODE_WINDOW, read_metrics
 from cathsim_dmc.cli.options import BAD_INPUT, CHECK_FAILED, INTERRUPTED
 
 HERE = Path(__file__).parent

@@ -16,10 +16,10 @@ from test_agents_training import run, small_ppo, small_sac
 from cathsim_dmc.agents import Checkpoint, CheckpointError, ConfigError, evaluate
 from cathsim_dmc.agents import checkpoint as checkpoints
 from cathsim_dmc.agents.learners import make_config, make_policy
-from cathsim_dmc.agents.metrics import MetricsFile, read_metrics
 from cathsim_dmc.agents.networks import NetworkShapes
 from cathsim_dmc.agents.policies import load_policy
 from cathsim_dmc.agents.replay import ReplayError
+from cathsim_dmc.agents.training_log import read_metrics
 from cathsim_dmc.agents.warm_start import take_over
 from cathsim_dmc.simulation import environments
 
@@ -161,26 +161,11 @@ def test_a_full_disk_names_the_file_and_what_is_safe(
     assert run(small_ppo(), tmp_path / "run", resume=True).frames == 1_024
 
 
-def test_a_row_on_a_full_disk_names_the_file(tmp_path, small_disk):
-    table = MetricsFile(tmp_path / "metrics.csv", ["frames", "reward"])
-    with small_disk(18), pytest.raises(OSError, match="large: .*metrics.csv"):
-        table.append({"frames": 1, "reward": 0.25})
-
-
 def test_a_policy_names_an_observation_of_another_size(trained):
     policy = load_policy(trained / "ppo")
     for entries in ({}, {environments.VECTOR: torch.zeros(1, 3)}):
         with pytest.raises(ValueError, match="reads 20 numbers, the task gives [03]:"):
             policy.act(TensorDict(entries, [1]))
-
-
-def test_a_table_that_is_removed_begins_anew(tmp_path):
-    table = MetricsFile(tmp_path / "metrics.csv", ["frames", "reward"])
-    table.append({"frames": 1, "reward": 0.25})
-    table.path.unlink()
-    table.append({"frames": 2, "reward": 0.5})
-    assert read_metrics(table.path) == [{"frames": 2, "reward": 0.5}]
-    MetricsFile(table.path, table.columns, resume_at=2)
 
 
 def test_a_policy_that_ships_starts_a_training():

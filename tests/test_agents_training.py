@@ -13,10 +13,10 @@ from cathsim_dmc.agents.checkpoint import (
     CheckpointError,
     checkpoints_in,
 )
-from cathsim_dmc.agents.metrics import MetricsFile, read_metrics
 from cathsim_dmc.agents.networks import NetworkShapes
 from cathsim_dmc.agents.sac import SAC
 from cathsim_dmc.agents.training import _truncate_diverged
+from cathsim_dmc.agents.training_log import read_metrics
 
 CLOCKS = ("seconds", "frames_per_second")
 
@@ -352,21 +352,15 @@ def test_a_diverged_simulation_is_truncated_not_terminated():
     assert torch.equal(batch["next", "done"], flags)
 
 
-def test_metrics_file_appends_whole_rows_and_names_strangers(tmp_path):
+def test_columns_of_an_older_version_are_left_out(tmp_path):
+    run(small_ppo(), tmp_path)
     path = tmp_path / "metrics.csv"
-    table = MetricsFile(path, ["frames", "reward"])
-    table.append({"frames": 1, "reward": None})
-    table.append({"frames": 2, "reward": 0.1})
-    assert read_metrics(path) == [
-        {"frames": 1.0, "reward": None},
-        {"frames": 2.0, "reward": 0.1},
-    ]
-    with pytest.raises(ValueError, match="loss"):
-        table.append({"frames": 3, "loss": 1.0})
-    with pytest.raises(ValueError, match="columns"):
-        MetricsFile(path, ["frames", "length"], resume_at=1)
-    MetricsFile(path, ["frames", "reward"], resume_at=1)
-    assert [row["frames"] for row in read_metrics(path)] == [1.0]
+    before = read_metrics(path)
+    path.write_text(path.read_text().replace("step_reward", "older"))
+    run(small_ppo(total_frames=1_536), tmp_path, resume=True)
+    rows = read_metrics(path)
+    assert [row["frames"] for row in rows] == [512, 1_024, 1_536]
+    assert rows[0] == {**before[0], "step_reward": None}
 
 
 def test_training_has_its_own_reward_and_episodes_and_evaluation_the_tasks(tmp_path):

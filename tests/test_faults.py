@@ -12,7 +12,7 @@ from test_agents_training import run, small_ppo
 
 from cathsim_dmc.agents import ConfigError, report
 from cathsim_dmc.agents.checkpoint import Checkpoint, checkpoints_in
-from cathsim_dmc.agents.metrics import read_metrics
+from cathsim_dmc.agents.training_log import read_metrics
 from cathsim_dmc.anatomy import Anatomy
 from cathsim_dmc.recording import Episode
 from cathsim_dmc.validation import force_sensors

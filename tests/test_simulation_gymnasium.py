@@ -1,10 +1,6 @@
 """The tasks as Gymnasium environments."""
 
-import ast
-import subprocess
-import sys
 import warnings
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -17,7 +13,6 @@ from cathsim_dmc import suite  # noqa: E402
 from cathsim_dmc.simulation.gymnasium import CathSimEnv  # noqa: E402
 
 TASK = "cathsim/simple1_bca-v0"
-SB3 = Path(__file__).parents[1] / "examples" / "sb3_ppo.py"
 
 
 def run(env, steps, seed):
@@ -175,24 +170,3 @@ def test_torchrl_takes_the_id():
     rollout = env.rollout(20)
     assert rollout["next", "truncated"].flatten().tolist() == [False] * 4 + [True]
     assert rollout["image"].shape == (5, 128, 128, 1)
-
-
-def test_the_options_of_the_stable_baselines_example_make_its_task():
-    """Without Stable-Baselines3: the function is taken out of the script."""
-    tree = ast.parse(SB3.read_text())
-    (function,) = [n for n in tree.body if getattr(n, "name", "") == "task_options"]
-    names = {}
-    exec(compile(ast.Module([function], []), SB3, "exec"), names)
-    options = names["task_options"]("tracking", 40)
-    weights = suite.make_task("simple1_bca", **options).objective.weights
-    assert set(weights) >= {"path", "success"}
-
-
-@pytest.mark.slow
-def test_the_stable_baselines_example_runs(tmp_path):
-    pytest.importorskip("stable_baselines3")
-    sizes = "--steps 512 --envs 4 --rollout 64 --max-steps 40 --episodes 1".split()
-    command = [sys.executable, SB3, *sizes, "--out", tmp_path]
-    done = subprocess.run(command, capture_output=True, text=True, check=True)
-    assert "episode 0: {'distance'" in done.stdout
-    assert (tmp_path / "model.zip").stat().st_size > 1000

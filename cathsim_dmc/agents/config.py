@@ -1,4 +1,4 @@
-"""What every training run must say, whichever algorithm learns."""
+"""Settings that all algorithms share."""
 
 import dataclasses
 import json

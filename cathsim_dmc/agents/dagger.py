@@ -1,4 +1,4 @@
-"""DAgger: the expert says what to do in the states that the learner comes to.
+"""DAgger: the expert labels the states that the learner reaches.
 
 Ross, Gordon and Bagnell, "A Reduction of Imitation Learning and Structured Prediction
 to No-Regret Online Learning", AISTATS 2011.
@@ -82,7 +82,7 @@ class DAggerConfig(TrainingConfig):
 
 
 class _Guided(TensorDictModuleBase):
-    """Expert and learner in turns; notes what the expert would do."""
+    """Acts with expert or learner at random; records the expert's action."""
 
     def __init__(self, policy: TensorDictSequential, env: EnvBase):
         super().__init__()

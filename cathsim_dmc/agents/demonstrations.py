@@ -65,10 +65,10 @@ def record_demonstrations(
     num_threads: int | None = None,
     say: Callable[[str], None] | None = None,
 ) -> Demonstrations:
-    """Let the expert play and write what it saw and did as a Minari dataset.
+    """Write episodes of the expert as a Minari dataset.
 
-    With noise the expert is pushed off its way and shows how it comes back; what it
-    would have done stands in the infos as "expert_action".
+    Noise moves the device off the route, so that the dataset has corrections; the
+    expert's action without noise is "expert_action" in the infos.
 
     Args:
         task: Name of the task.
@@ -173,7 +173,7 @@ def _play(simulation: Any, seeds: np.ndarray, noise: float) -> list[Any]:
 
 
 class _Rows:
-    """What happens to one simulation."""
+    """Record of one simulation."""
 
     def __init__(self) -> None:
         self.seen: list[dict[str, np.ndarray]] = []
@@ -181,17 +181,17 @@ class _Rows:
         self.steps: list[tuple[np.ndarray, np.ndarray, float, bool, bool]] = []
 
     def see(self, step: Step, row: int) -> None:
-        """Take note of the observation before the next step."""
+        """Record the observation before the next step."""
         self.seen.append({key: _single(v[row]) for key, v in step.observation.items()})
         self.infos.append({key: v[row] for key, v in step.info().items()})
 
     def do(self, chosen: np.ndarray, action: np.ndarray, step: Step, row: int) -> None:
-        """Take note of what the expert chose, what was done and how it ended."""
+        """Record the expert's action, the action with noise and the outcome."""
         ends = bool(step.terminated[row]), bool(step.truncated[row])
         self.steps.append((chosen, action, float(step.outcome.reward[row]), *ends))
 
     def columns(self) -> dict[str, Any]:
-        """Fields of Minari's buffer; at the end the expert chooses what it chose."""
+        """Fields of Minari's buffer; the last of the expert's actions is repeated."""
         chosen, actions, rewards, terminated, truncated = zip(*self.steps, strict=True)
         infos = {key: np.array([i[key] for i in self.infos]) for key in self.infos[0]}
         infos[EXPERT_ACTION] = np.stack([*chosen, chosen[-1]])

@@ -296,7 +296,7 @@ def _settings(
     observation: str | Sequence[str] | None,
     task_kwargs: Mapping[str, Any] | None,
 ) -> dict[str, Any]:
-    """What was asked for, and where nothing was, what the policy was made for."""
+    """Options of the evaluation; by default those that the policy was trained with."""
     checkpoint = getattr(policy, "checkpoint", None)
     options = policy.task_kwargs if task_kwargs is None else task_kwargs
     return {

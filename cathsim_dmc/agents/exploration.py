@@ -1,4 +1,4 @@
-"""Exploration noise that lasts for several steps and bends a device as a whole.
+"""Exploration noise that is correlated in time and between motors.
 
 White noise at 25 Hz on twenty motors averages out along the tip and over time: the head
 hardly leaves its way. Noise that keeps its direction for a while, and that motors which
@@ -21,10 +21,10 @@ _LARGEST = 1.0 - 1e-6
 
 
 class CorrelatedNoise:
-    """Standard normal noise (num_envs, actions) with a memory, step after step."""
+    """Standard normal noise (num_envs, actions), correlated in time."""
 
     def __init__(self, correlation: float, shared: float, groups: Sequence[int]):
-        """Starts with nothing remembered.
+        """Starts without a previous step.
 
         Args:
             correlation: Correlation between two consecutive steps, in [0, 1).

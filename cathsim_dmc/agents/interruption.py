@@ -1,4 +1,4 @@
-"""A request to stop that a loop can honour at a good moment."""
+"""Signals that end a loop after its current turn."""
 
 import signal
 import threading

@@ -1,4 +1,4 @@
-"""What training asks of an algorithm."""
+"""Interface of a learning algorithm."""
 
 import abc
 from pathlib import Path
@@ -61,7 +61,7 @@ class Learner(abc.ABC):
         """A policy with fresh weights: raw observation in, action out."""
 
     def attach(self, env: EnvBase) -> None:  # noqa: B027
-        """Look at the environment that `policy` is to collect from, once, first."""
+        """Adapt `policy` to the environment; called once, before the first batch."""
 
     def observe(self, batch: TensorDictBase) -> None:
         """Take observation statistics from a batch without learning from it."""
@@ -85,7 +85,7 @@ class Learner(abc.ABC):
         return self.network.state_dict()
 
     def learning_state(self) -> dict[str, Any]:
-        """What learning needs beyond the policy: tensors, numbers, strings."""
+        """State of learning beside the policy: tensors, numbers, strings."""
         return {
             "optimiser": self.optimiser.state_dict(),
             "gradient_steps": self.gradient_steps,

@@ -1,4 +1,4 @@
-"""Policies of every kind behind one face: by name, from a checkpoint, a function."""
+"""Policies by name, from a checkpoint, or from a function."""
 
 from collections.abc import Callable, Mapping
 from pathlib import Path

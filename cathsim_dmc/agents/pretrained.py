@@ -1,4 +1,4 @@
-"""Policies that ship with the package: weights as safetensors, a card beside them."""
+"""Policies that ship with the package: weights in safetensors, and a card."""
 
 import hashlib
 import json

@@ -27,10 +27,10 @@ def progress_bar(label: str, unit: str, **options: Any) -> tqdm:
 
 
 class EvaluationProgress:
-    """An observer of `evaluation.evaluate` that shows how far a long one is."""
+    """An observer of `evaluation.evaluate` that shows progress."""
 
     def __init__(self, label: str):
-        """Takes the name of what plays."""
+        """Starts the bar with a label."""
         self._bar = progress_bar(label, " steps", delay=LINE_INTERVAL)
 
     def __call__(self, env: Any, running: np.ndarray) -> None:

@@ -1,4 +1,4 @@
-"""A ring of transitions in memory-mapped .npy files that outlives the process."""
+"""A ring buffer of transitions in memory-mapped .npy files."""
 
 import os
 import shutil

@@ -1,4 +1,4 @@
-"""What `cathsim eval` and `record` do: evaluations, heatmaps, recordings."""
+"""Evaluations with a baseline and heatmaps, and recordings of one episode."""
 
 import dataclasses
 import functools

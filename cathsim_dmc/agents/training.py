@@ -42,7 +42,7 @@ _LOCK_FILE = ".lock"
 
 @dataclass(frozen=True)
 class TrainingResult:
-    """What a call of `train` leaves behind.
+    """Result of a call of `train`.
 
     Attributes:
         run: Directory of the run.
@@ -195,7 +195,7 @@ def _only_process(run: Path) -> Iterator[Callable[[], None]]:
 
 @contextlib.contextmanager
 def _naming_what_is_safe(run: Path) -> Iterator[None]:
-    """Say of a file that cannot be written what is saved and how to go on."""
+    """Add the newest checkpoint to the error of a file that cannot be written."""
     try:
         yield
     except OSError as error:
@@ -266,7 +266,7 @@ def _start(
     checkpoint: Checkpoint | None,
     without_replay: bool,
 ) -> dict[str, Any]:
-    """Give a learner what a checkpoint holds, another's policy, or its first look.
+    """Load a checkpoint or an initial policy, or take the first statistics.
 
     Returns:
         What earlier processes of the run have counted: frames, seconds, episodes, and
@@ -308,7 +308,7 @@ def _start(
 
 @dataclass
 class _Loop:
-    """Collects, learns, takes note and saves."""
+    """Collects, learns, logs and saves."""
 
     run: Path
     config: TrainingConfig

@@ -1,5 +1,7 @@
 """Figures of a training run: metrics.csv, TensorBoard, progress."""
 
+import csv
+import io
 import time
 from collections import deque
 from collections.abc import Iterable, Mapping, Sequence
@@ -9,9 +11,9 @@ from typing import Any
 
 import numpy as np
 
+from cathsim_dmc import files
 from cathsim_dmc.agents.config import ConfigError, TrainingConfig
 from cathsim_dmc.agents.episodes import EpisodeOutcome
-from cathsim_dmc.agents.metrics import MetricsFile
 from cathsim_dmc.agents.progress import progress_bar
 
 # Number of finished episodes over which the running figures are taken.
@@ -76,9 +78,9 @@ class TrainingLog:
         self.row: dict[str, float | None] = {}
         self.window = deque(map(list, window), maxlen=EPISODE_WINDOW)
         self._interval = config.metrics_frames
-        self._table = MetricsFile(
-            run / "metrics.csv", [*COLUMNS, *metrics], frames if resumed else None
-        )
+        self._path, self._columns = run / "metrics.csv", [*COLUMNS, *metrics]
+        self._rows = _rows_until(self._path, frames) if resumed else []
+        self._write()
         self._board = _tensorboard(run) if config.tensorboard else None
         self._bar = progress_bar(
             f"{config.algorithm} {config.task}",
@@ -109,7 +111,7 @@ class TrainingLog:
         losses: Mapping[str, float],
         last: bool,
     ) -> None:
-        """Takes note of a batch.
+        """Logs a batch.
 
         Args:
             frames: Number of frames of the batch.
@@ -137,7 +139,12 @@ class TrainingLog:
                 "step_reward": step_reward,
                 **losses,
             }
-            self._table.append(self.row)
+            texts = {
+                name: f"{value:.9g}" if isinstance(value, float) else value
+                for name, value in self.row.items()
+            }
+            self._rows.append(texts)
+            self._write()
             for name, value in self.row.items():
                 if self._board is not None and name != "frames" and value is not None:
                     self._board.add_scalar(name, value, self.frames)
@@ -147,6 +154,37 @@ class TrainingLog:
             refresh=False,
         )
         self._bar.update(frames)
+
+    def _write(self) -> None:
+        """Write metrics.csv whole."""
+        text = io.StringIO()
+        # An older version may have had other columns.
+        writer = csv.DictWriter(
+            text, self._columns, extrasaction="ignore", lineterminator="\n"
+        )
+        writer.writeheader()
+        writer.writerows(self._rows)
+        files.write_text(self._path, text.getvalue())
+
+
+def _rows_until(path: Path, frames: int) -> list[dict[str, Any]]:
+    """Rows of a metrics.csv up to a frame: a killed run has some beyond it."""
+    rows = _texts(path) if path.exists() else []
+    return [row for row in rows if int(row["frames"]) <= frames]
+
+
+def read_metrics(path: Path) -> list[dict[str, float | None]]:
+    """The rows of a metrics.csv; empty fields become None."""
+    return [
+        {name: float(cell) if cell else None for name, cell in row.items()}
+        for row in _texts(path)
+    ]
+
+
+def _texts(path: Path) -> list[dict[str, str]]:
+    """The whole rows of a metrics.csv."""
+    with open(path, newline="") as file:
+        return [row for row in csv.DictReader(file) if None not in row.values()]
 
 
 def crossed(before: int, after: int, interval: int) -> bool:

@@ -1,4 +1,4 @@
-"""What a policy may know of the simulations under a TorchRL environment."""
+"""Views of the simulations of TorchRL environments."""
 
 from typing import Any, cast
 
@@ -22,7 +22,7 @@ class _ForeignView:
 
 
 def view_of(env: EnvBase) -> View:
-    """What a policy may know of the simulations of a TorchRL environment."""
+    """The view of the simulations of a TorchRL environment."""
     base = getattr(env, "base_env", env)
     if hasattr(base, "simulation"):
         return View(base.simulation)

@@ -1,1 +1,1 @@
-"""What recorded episodes say: force statistics, success rates, heatmaps."""
+"""Force statistics, success rates and heatmaps of episodes."""

@@ -42,7 +42,7 @@ def show(json: bool) -> int:
 
 
 def figures(device: Device) -> dict[str, Any]:
-    """What a device is made of, in the units that people use for it."""
+    """Properties of a device, in the units of data sheets."""
     return {
         "outer_diameter_mm": 2e3 * device.outer_radius,
         "lumen_diameter_mm": 2e3 * device.inner_radius,

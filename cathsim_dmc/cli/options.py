@@ -1,4 +1,4 @@
-"""What several commands share: options, exit codes, printing."""
+"""Options, exit codes and printing that several commands share."""
 
 import dataclasses
 import json
@@ -38,7 +38,7 @@ class OwnAnatomy:
 
     @property
     def task_kwargs(self) -> dict[str, Any]:
-        """What was given, as options of the task."""
+        """Options of the task that were given."""
         given = dataclasses.asdict(self)
         return {key: value for key, value in given.items() if value is not None}
 

@@ -95,7 +95,7 @@ def _has_parts(kind: Any) -> bool:
 
 
 def field_helps(kind: type) -> dict[str, str]:
-    """What the docstrings of a dataclass and its bases say of each field."""
+    """Descriptions of the fields in the docstrings of a dataclass and its bases."""
     helps: dict[str, str] = {}
     for one in reversed(kind.__mro__):
         if dataclasses.is_dataclass(one):

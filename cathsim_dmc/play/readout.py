@@ -1,4 +1,4 @@
-"""Quantities shown beside the image."""
+"""Quantities on the screen of `cathsim play`."""
 
 from typing import Any
 

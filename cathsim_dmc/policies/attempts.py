@@ -34,8 +34,8 @@ class AttemptSettings:
         backoff: way back of the first retry, m.
         backoff_growth: of the way back from each retry to the next, up to the fourth.
         slack: what the base may advance while the head does not, m.
-        give: by how much the head may come back while slack is taken up, m.
-        thorough: every so many retries are not content with taking up slack.
+        give: distance that the head may move back while slack is taken up, m.
+        thorough: every n-th retry withdraws the whole way, not the slack alone.
     """
 
     progress: float = 0.3e-3
@@ -57,7 +57,7 @@ class Attempts:
         arc_length: of the place on the route at the last step, m; NaN before the
             first.
         retracting: bool.
-        taking_up: bool, whether only as long as that takes up slack.
+        taking_up: bool, whether the retraction ends when the slack is taken up.
         turn: insertion to be withdrawn to while retracting, m.
         best: farthest place on the route in this attempt, m.
         held: insertion when the head was there, m.

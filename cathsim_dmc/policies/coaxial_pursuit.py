@@ -80,7 +80,7 @@ class CoaxialSettings(pursuit.Settings):
 
 @dataclasses.dataclass(frozen=True)
 class CoaxialPlan:
-    """What the expert knows of a task with coaxial devices; world frame, SI units.
+    """Route and devices of a task with coaxial devices; world frame, SI units.
 
     Attributes:
         points: (P, 3), route from the inlet to the goal.

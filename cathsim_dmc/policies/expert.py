@@ -34,7 +34,7 @@ class Expert:
     """
 
     def __init__(self, plan: Plan | CoaxialPlan, settings: Settings | None = None):
-        """Takes what is known of the task; see `for_task`.
+        """Starts before the first episode; `for_task` makes the plan.
 
         Args:
             plan: Of a steerable device, or of coaxial devices.
@@ -119,80 +119,33 @@ class Expert:
         return action
 
     def follow(self, action: np.ndarray) -> None:
-        """Takes what was carried out, (..., A) in [-1, 1], for its own last action."""
+        """Replace the last action by the one (..., A) that was carried out."""
         if isinstance(self.plan, Plan) and isinstance(self.state, State):
             told = action[..., : self.plan.tip.size] * self.plan.steering_angle
             bend = told.reshape(self.state.bend.shape)
             self.state = dataclasses.replace(self.state, bend=bend)
 
 
-class Experts:
-    """An expert for each simulation, where their anatomies differ."""
-
-    def __init__(self, view: View, settings: Settings | None = None):
-        """Starts without knowing any simulation: `reset` comes first."""
-        self._view = view
-        self._settings = settings
-        # By simulation, from its first reset on.
-        self._cases: dict[int, Case] = {}
-        self._experts: dict[int, Expert] = {}
-
-    def reset(self, which: np.ndarray | None = None) -> None:
-        """Looks at the anatomies of the simulations that begin a new episode.
-
-        Args:
-            which: Mask or indices of the simulations, None for all.
-        """
-        numbers = np.arange(self._view.num_simulations)
-        chosen = numbers if which is None else numbers[which]
-        for index in chosen.tolist():
-            case = self._view.case(index)
-            if self._cases.get(index) is not case:
-                self._cases[index] = case
-                self._experts[index] = Expert.for_task(case, self._settings)
-            self._experts[index].reset()
-
-    def act(
-        self,
-        readings: Readings,
-        wall_force: forces.WallForce,
-        devices: CoaxialReadings | None = None,
-    ) -> np.ndarray:
-        """Action (N, A) in [-1, 1] for the state of the devices."""
-        actions = []
-        for index in range(self._view.num_simulations):
-            row = np.array([index])
-            state = None if devices is None else part(devices, row)
-            actions.append(
-                self._experts[index].act(
-                    part(readings, row), part(wall_force, row), state
-                )
-            )
-        return np.concatenate(actions)
-
-    def follow(self, action: np.ndarray) -> None:
-        """Takes what was carried out, (N, A) in [-1, 1], for their last actions."""
-        for index, expert in self._experts.items():
-            expert.follow(action[[index]])
-
-
 class ExpertPolicy(Policy):
-    """The expert as a policy; it looks at the simulations, not at the observation."""
+    """The expert as a policy; it reads the simulations, not the observation."""
 
     name = "expert"
     # Cheapest to observe.
     observation = "tracking"
 
     def __init__(self, seed: int = 0, settings: Settings | None = None):
-        """Takes a seed as all policies do, and draws nothing from it.
+        """Starts before the first episode.
 
         Args:
-            seed: Seed, not used.
+            seed: Not used: the expert draws no random numbers.
             settings: Settings of its driving.
         """
         self._settings = settings
-        self._expert: Expert | Experts | None = None
         self._view: View | None = None
+        # One for all simulations; where their anatomies differ, one for each.
+        self._experts: dict[int, Expert] = {}
+        self._cases: dict[int, Case] = {}
+        self._several = False
 
     def reset(self, view: View, which: np.ndarray) -> None:
         """Forget the simulations that begin a new episode.
@@ -200,28 +153,42 @@ class ExpertPolicy(Policy):
         Raises:
             ValueError: the task's device cannot be steered.
         """
-        if self._expert is None or self._view is not view:
-            self._view = view
-            several = view.task.num_anatomies > 1
-            self._expert = (
-                Experts(view, self._settings)
-                if several
-                else Expert.for_task(view.task, self._settings)
-            )
-        self._expert.reset(which)
+        if self._view is not view:
+            self._view, self._experts, self._cases = view, {}, {}
+            self._several = view.task.num_anatomies > 1
+        if not self._several:
+            if not self._experts:
+                self._experts[0] = Expert.for_task(view.task, self._settings)
+            self._experts[0].reset(which)
+            return
+        for index in np.flatnonzero(which).tolist():
+            case = view.case(index)
+            if self._cases.get(index) is not case:
+                self._cases[index] = case
+                self._experts[index] = Expert.for_task(case, self._settings)
+            self._experts[index].reset()
 
     def act(self, observation: Any) -> np.ndarray:
         """Actions (N, A) for the state of the devices."""
-        if self._expert is None or self._view is None:
-            raise RuntimeError("the expert must be reset before it acts")
         view = self._view
-        return self._expert.act(view.readings, view.wall_force, view.devices)
+        if view is None:
+            raise RuntimeError("the expert must be reset before it acts")
+        readings, wall_force, devices = view.readings, view.wall_force, view.devices
+        if not self._several:
+            return self._experts[0].act(readings, wall_force, devices)
+        actions = []
+        for index in range(view.num_simulations):
+            row = np.array([index])
+            own = None if devices is None else part(devices, row)
+            state = part(readings, row), part(wall_force, row), own
+            actions.append(self._experts[index].act(*state))
+        return np.concatenate(actions)
 
     def follow(self, action: np.ndarray) -> None:
-        """Takes what was carried out in place of its last actions for its own.
+        """Replace the last actions by those that were carried out.
 
         Args:
             action: (N, A) in [-1, 1].
         """
-        if self._expert is not None:
-            self._expert.follow(action)
+        for index, expert in self._experts.items():
+            expert.follow(action[[index]] if self._several else action)

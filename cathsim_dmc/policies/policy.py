@@ -1,4 +1,4 @@
-"""What every policy is, whether scripted, learnt or a person's hands."""
+"""Base class of all policies."""
 
 from __future__ import annotations
 

@@ -74,7 +74,7 @@ class Settings(attempts.AttemptSettings):
 
 @dataclasses.dataclass(frozen=True)
 class Plan:
-    """What the expert knows of a task; world frame, SI units.
+    """Route and device of a task; world frame, SI units.
 
     Attributes:
         points: (P, 3), route from the inlet to the goal.
@@ -153,7 +153,7 @@ class Plan:
 
 @dataclasses.dataclass(frozen=True)
 class State(attempts.Attempts):
-    """What the expert remembers of each simulation, arrays (...).
+    """Memory of the expert for each simulation, arrays (...).
 
     Attributes:
         bend: (..., M, 2), told to the hinges of the tip, rad.

@@ -69,7 +69,7 @@ class _Constant(Policy):
     """The same action in every step."""
 
     def __init__(self, seed: int = 0):
-        """Takes a seed as all policies do, and draws nothing from it."""
+        """Starts; `seed` is not used."""
         self._action = np.zeros((0, 0))
 
     def reset(self, view: View, which: np.ndarray) -> None:

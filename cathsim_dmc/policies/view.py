@@ -1,4 +1,4 @@
-"""What a policy may know beyond the observation: the simulations themselves."""
+"""State of the simulations, for policies that do not act on observations."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ class View:
     """
 
     def __init__(self, simulations: BatchSimulation | composer.Environment):
-        """Looks at simulations, which may still have no episode."""
+        """Takes simulations; they need no episode yet."""
         batched = isinstance(simulations, BatchSimulation)
         self.task = simulations.task
         self.num_simulations = simulations.num_simulations if batched else 1
