@@ -15,11 +15,14 @@ from numpy.typing import ArrayLike
 from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation
 
+from cathsim_dmc import suite
 from cathsim_dmc.entities import posture
+from cathsim_dmc.entities.chain import MAX_PUSH_SPEED
 from cathsim_dmc.entities.device import Device
 from cathsim_dmc.entities.device_stack import DeviceStack
 from cathsim_dmc.physics import chain_fields
 from cathsim_dmc.physics.stepper import CONTROL_TIMESTEP
+from cathsim_dmc.validation import sliding
 from cathsim_dmc.validation.checks import Check
 from cathsim_dmc.validation.rig import Rig
 
@@ -45,6 +48,9 @@ SLIDES = (
 )
 SLIDE_TURN = 0.6  # rad, of the base of the outer device
 RESISTANCE_BOUND = 5.0  # %
+WORKING = ("wire_035_glide", "diagnostic_5f_simmons")
+WITHDRAWN = 0.02  # m, of the wire, at two speeds (m/s)
+SPEEDS = (1e-3, 5e-4)
 
 
 class Rods(NamedTuple):
@@ -215,6 +221,50 @@ def _line(length: float) -> np.ndarray:
     return np.vstack([[[0, 0, 0]], arc, arc[-1:] - (0, 0, 1)])
 
 
+def work(speed: float) -> tuple[float, float]:
+    """Withdraws a wire from a free catheter, without friction and weight.
+
+    Args:
+        speed: m/s.
+
+    Returns:
+        Work of the drives, and change of the energy by `reference`, J.
+    """
+    environment = suite.load(
+        suite.DOMAIN,
+        "navigate",
+        {
+            "anatomy": sliding.tube(bent=False, radius=0.07),
+            "goal": "end",
+            "devices": WORKING,
+            "goal_radius": 1e-4,
+            "friction": 0.0,
+            "lumen_friction": 0.0,
+            "observation": "tracking",
+            "random": 0,
+        },
+    )
+    environment.reset()
+    environment.physics.model.ptr.opt.gravity[:] = 0.0
+    task = environment.task
+    for push in [1.0] * 40 + [0.0] * 60:
+        environment.step(np.array([push, 0.0, push, 0.0]))
+    chain, insertions, pushes = task.scene.catheter, [], []
+    for _ in range(round(WITHDRAWN / (speed * CONTROL_TIMESTEP)) + 1):
+        state = task.rollout.devices
+        insertions.append(state.insertion[0])
+        pushes.append(state.push[0])
+        environment.step(np.array([-speed / MAX_PUSH_SPEED, 0.0, 0.0, 0.0]))
+    environment.close()
+    length = float(chain.link_lengths.sum())
+    first, last = (
+        reference(chain.devices, each.max() - each, (0.0, 0.0), length).energy
+        for each in (insertions[0], insertions[-1])
+    )
+    done = (np.array(pushes[1:]) * np.diff(insertions, axis=0)).sum()
+    return float(done), last - first
+
+
 def in_half_circle(
     names: Sequence[str],
     gaps: Sequence[float],
@@ -267,4 +317,16 @@ def checks() -> list[Check]:
                 f"{force:.4f} N, derivative of the energy {expected:.4f} N",
             )
         )
+    (fast, _), (slow, change) = (work(speed) for speed in SPEEDS)
+    done = (SPEEDS[0] * slow - SPEEDS[1] * fast) / (SPEEDS[0] - SPEEDS[1])
+    made.append(
+        Check.at_most(
+            f"work of the drives, {' in '.join(WORKING)}, wire withdrawn by 20 mm",
+            100 * abs(done / change - 1),
+            RESISTANCE_BOUND,
+            "%",
+            f"{1e3 * done:.3f} mJ at rest, energy {1e3 * change:.3f} mJ; "
+            f"{1e3 * slow:.3f} and {1e3 * fast:.3f} mJ at 0.5 and 1 mm/s",
+        )
+    )
     return made
