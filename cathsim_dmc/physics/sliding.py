@@ -300,7 +300,11 @@ class SlidingDevices(SingleDevice):
         axial = factor * stack.axial(overlap, gaps, bends, turns, slopes)
         start = np.zeros(gaps.shape)
         every, leaders = np.arange(len(gaps)), np.argmin(gaps, axis=1)
-        start[every, leaders] = self._leading_load(state, gaps)
+        # What the wall does to the links beyond; forces within are not MuJoCo's state.
+        beyond = -np.cumsum(state.external_force[:, ::-1], axis=1)[:, ::-1]
+        start[every, leaders] = self._loops.leading_load(
+            np.ascontiguousarray(beyond), state.centreline, gaps, stack.nodes
+        )
         stiff = overlap._replace(
             stiffness=factor * overlap.stiffness, moment=factor * overlap.moment
         )
