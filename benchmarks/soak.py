@@ -344,9 +344,6 @@ def report(rows: list[dict]) -> dict:
                 PENETRATION_MAX * 1e3,
             ),
             check("largest wall force", total["force_max"], "N", FORCE_MAX),
-            check(
-                "contacts in the sensor", total["contacts_max"], "", sensor_capacity()
-            ),
         ],
         "total": total,
         "worst": {
@@ -354,13 +351,6 @@ def report(rows: list[dict]) -> dict:
         },
         "groups": groups,
     }
-
-
-def sensor_capacity() -> int:
-    """Contacts that the wall sensor can report."""
-    from cathsim_dmc.entities import phantom
-
-    return phantom.MAX_CONTACTS
 
 
 def markdown(result: dict) -> str:

@@ -7,9 +7,8 @@ from cathsim_dmc.anatomy import Anatomy
 from cathsim_dmc.collision import fields
 from cathsim_dmc.entities.contact import FRICTION, wall_contact
 
-# Largest number of contacts that the wall sensor reports. A device jammed in a narrow
-# tube has about a hundred; `Contacts.found` is the true number.
-MAX_CONTACTS = 192
+# Of a geom of the device with the wall, at most; the wall's sensor has room for all.
+MOST_CONTACTS = 4
 CONTACT_FIELDS = ("found", "force", "dist", "pos", "normal", "tangent")
 
 _LUMEN_COLOUR = (0.8, 0.25, 0.25, 0.25)
@@ -96,7 +95,7 @@ class Phantom(composer.Entity):
             name="wall_contacts",
             body1="world",
             subtree2=device_body,
-            num=MAX_CONTACTS,
+            num=MOST_CONTACTS * len(device_body.find_all("geom")),
             data=" ".join(CONTACT_FIELDS),
             reduce="none",
         )

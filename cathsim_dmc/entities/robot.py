@@ -179,7 +179,7 @@ def follower_posture(
     arrays = [np.asarray(each, np.float64) for each in given]
     if all(each.size == 1 for each in arrays):  # plain floats take a third of the time
         plain = [each.item() for each in arrays]
-        shape = np.broadcast_shapes(*(each.shape for each in arrays))
+        shape = max((each.shape for each in arrays), key=len)
         posture = np.array(_posture(*plain)).reshape(*shape, len(JOINTS))
         finite = math.isfinite(sum(plain))
     else:

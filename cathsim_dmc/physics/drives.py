@@ -38,8 +38,10 @@ class Drives:
         )
         joints = model.actuator_trnid[found, 0]
         self._arrays = arrays
-        self._places = model.actuator_actadr[found]
-        self._qpos, self._dofs = model.jnt_qposadr[joints], model.jnt_dofadr[joints]
+        # Whole numbers of the size that numpy indexes with: others are cast each time.
+        self._places = model.actuator_actadr[found].astype(np.intp)
+        self._qpos = model.jnt_qposadr[joints].astype(np.intp)
+        self._dofs = model.jnt_dofadr[joints].astype(np.intp)
         self._gain = model.actuator_gainprm[found, 0]
         self._stiffness = -model.actuator_biasprm[found, 1]
         self._damping = -model.actuator_biasprm[found, 2]
@@ -69,13 +71,15 @@ class Drives:
         effort = self._gain * self._arrays.act[:, self._places]
         effort -= self._stiffness * place + brake
         slips = np.abs(effort) >= self._limit
-        slip = np.where(slips, self.told - place, 0.0)
-        self.told -= slip
-        effort = np.clip(effort, -self._limit, self._limit)
+        slip = np.zeros_like(place)
+        if np.count_nonzero(slips):  # which is rare, and takes long to work out
+            slip[slips] = (self.told - place)[slips]
+            self.told -= slip
+            self.slipped += np.abs(slip)
+            effort = np.clip(effort, -self._limit, self._limit)
         pulled = self._stiffness * self.told + effort + brake
         self._arrays.act[:, self._places] = pulled / self._gain
         self.told += command * (self._gain / self._stiffness * CONTROL_TIMESTEP)
-        self.slipped += np.abs(slip)
         return slip
 
 

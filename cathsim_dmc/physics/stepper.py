@@ -152,6 +152,8 @@ class Stepper(abc.ABC):
 
     def _warned(self) -> np.ndarray:
         """Whether MuJoCo has warned in each simulation (N,) in the control step."""
+        if self.warnings.tobytes() == self._warnings_before.tobytes():
+            return np.zeros(self.num_simulations, dtype=bool)
         changed = self.warnings != self._warnings_before
         return changed.reshape(self.num_simulations, -1).any(-1)
 
