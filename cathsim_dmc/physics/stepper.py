@@ -39,6 +39,7 @@ class Stepper(abc.ABC):
             `readings.ModelIndex.FIELDS` says which are there. `qpos`, `ctrl` and
             `userdata` are written.
         warnings: (N, ...) int, how often MuJoCo has warned, a view.
+        repeated: (N,) int, control steps done again in shorter physics steps.
         num_simulations: N.
         substeps: S, physics steps in a control step.
     """
@@ -49,6 +50,7 @@ class Stepper(abc.ABC):
     def __init__(self, model: mujoco.MjModel, num_simulations: int, substeps: int):
         """Finds the sensor of the wall in the compiled scene."""
         self.num_simulations, self.substeps = num_simulations, substeps
+        self.repeated = np.zeros(num_simulations, np.int64)
         self._contacts = readings.wall_contacts(model)
         self._before = self._warnings_before = np.empty(0)
 
@@ -133,6 +135,7 @@ class Stepper(abc.ABC):
 
     def _refine(self, indices: np.ndarray) -> None:
         """Does the control step of some simulations again, with shorter steps."""
+        self.repeated[indices] += 1
         self.set_states(indices, self._before[indices])
         with self._changed(
             indices,

@@ -366,6 +366,11 @@ class Rollout:
     # What others may read.
 
     @property
+    def repeated(self) -> np.ndarray:
+        """Number (N,) of control steps done again in shorter physics steps, a view."""
+        return self._stepper.repeated
+
+    @property
     def objective(self) -> Objective:
         """Goals, which may differ between simulations, reward and success rule."""
         return self._objective

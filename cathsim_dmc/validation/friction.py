@@ -49,6 +49,9 @@ CAPSTANS = (
 )
 TENSION = 0.5  # N, dead load on the distal end: far above EI/R² = 0.02 N
 PULL_SPEED = 0.02  # m/s, no load
+# Radius, m, of the tube that is bent into an arch about the drum.
+ARCH_RADIUS = 9e-3
+ARCH_RIPPLE = 2.0  # % of the force at the base, its standard deviation
 _SETTLING = 0.5  # s, before the pull
 _LEAD = 0.02  # m of rod between the clamp and the drum; first part of the pull
 _PULL = 0.1  # m
@@ -218,18 +221,31 @@ def capstan(
     )
 
 
-def _drum(x: float, z: float) -> Callable[[np.ndarray, np.ndarray], np.ndarray]:
-    """Measure of the clearance outside a drum about a line along y at x, z."""
+Measure = Callable[[np.ndarray, np.ndarray], np.ndarray]
+
+
+def _drum(x: float, z: float, tube: float | None) -> Measure:
+    """Measure of the clearance outside a drum about a line along y at x, z, m.
+
+    Args:
+        x, z: m.
+        tube: radius (m) of a tube that leads round the drum by half a turn, from below
+            and back, with the drum as its inner wall; None for the drum alone.
+    """
 
     def measure(blocks: np.ndarray, points: np.ndarray) -> np.ndarray:
         there = blocks[:, None, :] + points
-        return np.hypot(there[..., 0] - x, there[..., 2] - z) - DRUM_RADIUS
+        across, y, along = there[..., 0] - x, there[..., 1], there[..., 2] - z
+        if tube is None:
+            return np.hypot(across, along) - DRUM_RADIUS
+        reach = np.hypot(across, np.maximum(along, 0.0))
+        return tube - np.hypot(reach - DRUM_RADIUS - tube, y)
 
     return measure
 
 
 def _pulled(
-    device: devices.Device, friction: float, wrap: float
+    device: devices.Device, friction: float, wrap: float, tube: float | None = None
 ) -> tuple[float, np.ndarray, np.ndarray]:
     """Angle of the wrap, way of the base (n,) and ratio of the tensions (n,)."""
     radius = DRUM_RADIUS + device.outer_radius
@@ -243,7 +259,8 @@ def _pulled(
     base = _PULL - rig.lengths.sum()
     middle = np.array([radius, 0, base + _LEAD])
     half = np.array([length, 0.02, length])  # around the whole rod
-    field = Field.sampled(_drum(middle[0], middle[2]), middle - half, middle + half)
+    measure = _drum(middle[0], middle[2], tube)
+    field = Field.sampled(measure, middle - half, middle + half)
     drum = Phantom(walled(field, "drum"), friction=friction)
     rig.arena.attach(drum)
     drum.add_wall(rig.catheter.links[0])
@@ -280,6 +297,21 @@ def _pulled(
     return angle, travel, tension / TENSION
 
 
+def arch_ripple(friction: float = FRICTION) -> float:
+    """Ripple of the force that draws a device round an arch under a constant load.
+
+    Args:
+        friction: Coulomb coefficient.
+
+    Returns:
+        Standard deviation over the mean.
+    """
+    device = dataclasses.replace(devices.get("steerable_5f"), tip_shape=())
+    _, travel, ratio = _pulled(device, friction, np.pi, ARCH_RADIUS)
+    sliding = ratio[travel > _LEAD]
+    return float(sliding.std() / sliding.mean())
+
+
 def checks() -> tuple[list[Check], list[Capstan]]:
     """Friction that acts on devices, sliding and sticking, and the capstans."""
     found = []
@@ -314,5 +346,15 @@ def checks() -> tuple[list[Check], list[Capstan]]:
                 "mm/s",
             )
         )
+    found.append(
+        Check.at_most(
+            f"drawn round an arch under {TENSION:g} N: ripple of the force",
+            100 * arch_ripple(),
+            ARCH_RIPPLE,
+            "%",
+            f"tube of {1e3 * ARCH_RADIUS:g} mm about a drum of "
+            f"{1e3 * DRUM_RADIUS:g} mm",
+        )
+    )
     pulled = [capstan(friction, wrap) for friction, wrap in CAPSTANS]
     return found + [one.check() for one in pulled], pulled

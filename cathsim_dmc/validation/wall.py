@@ -16,7 +16,7 @@ from cathsim_dmc.anatomy.scan.check import check_tree
 from cathsim_dmc.anatomy.surface_depth import SurfaceDepth
 from cathsim_dmc.anatomy.tree_depth import TreeDepth
 from cathsim_dmc.entities import devices
-from cathsim_dmc.validation import convergence, friction
+from cathsim_dmc.validation import convergence, friction, pushing
 from cathsim_dmc.validation.checks import Check, Report
 
 # Bounds (mm) on the difference between the field and the distance that it stands for,
@@ -244,8 +244,12 @@ def validate_wall(
         checks += lumen_checks(anatomy)
     rubbed, pulled = friction.checks()
     checks += rubbed
+    pushes, pushed = pushing.checks()
+    checks += pushes
     studies = convergence.studies() if with_convergence else []
     checks += convergence.checks(studies)
-    findings = {"convergence": studies} if studies else {}
+    findings: dict[str, Any] = {"pushed": [one._asdict() for one in pushed]}
+    if studies:
+        findings["convergence"] = studies
     data = {"anatomies": anatomies, "capstans": pulled, "studies": studies}
     return Report("wall", checks, findings, data)
