@@ -276,7 +276,8 @@ def test_devices_that_do_not_fit_are_refused():
 
 def rods(names=("berenstein_5f",), relaxation=0.4):
     nodes = stack(("berenstein_5f",)).nodes
-    return Rods([devices.get(name) for name in names], nodes, relaxation)
+    times = np.full(len(names), relaxation)
+    return Rods([devices.get(name) for name in names], nodes, times)
 
 
 def test_lag_behind_a_brake_is_b_omega_over_k():

@@ -6,6 +6,8 @@ from conftest import twin
 
 from cathsim_dmc import suite
 from cathsim_dmc.physics import sliding
+from cathsim_dmc.physics.blood import StillBlood
+from cathsim_dmc.physics.effects import userdata_size
 from cathsim_dmc.simulation.batch import BatchSimulation
 from cathsim_dmc.tasks.config import CONTROL_TIMESTEP, NavigationConfig
 
@@ -173,7 +175,9 @@ def test_a_clamp_slips_that_pushes_a_wire_into_a_bend(monkeypatch):
 def test_a_step_of_a_single_device_does_no_pair_work(shared_environment, monkeypatch):
     environment = shared_environment("type1_bca")
     assert environment.task.rollout.devices is None
-    assert environment.physics.model.ptr.nuserdata == 0
+    chain = environment.task.scene.catheter
+    own = userdata_size([StillBlood()], chain)
+    assert environment.physics.model.ptr.nuserdata == own
     monkeypatch.setattr(
         sliding,
         "chain_properties",

@@ -70,7 +70,8 @@ def test_nothing_is_drawn_but_the_displacement_by_default():
 def test_draws_lie_in_their_ranges(seed):
     episode = DEFAULT_RANGES.draw(np.random.RandomState(seed))
     assert np.linalg.norm(episode.displacement) <= DEFAULT_RANGES.start_radius
-    for name in ("friction", "stiffness", "goal_shift", "roll", "delay"):
+    drawn = ("friction", "stiffness", "loss", "viscosity", "goal_shift", "roll")
+    for name in (*drawn, "delay"):
         low, high = getattr(DEFAULT_RANGES, name)
         assert low <= getattr(episode, name) <= high
     deviation = episode.deviation
@@ -146,6 +147,17 @@ def test_the_model_takes_what_was_drawn_and_gives_it_back(make):
     )
     bodies = np.setdiff1d(np.arange(model.nbody), [at["base"]])
     np.testing.assert_array_equal(model.body_quat[bodies], usual["body_quat"][bodies])
+
+
+def test_the_loss_of_the_material_is_randomised_and_follows_stiffness(make):
+    env = make({"loss": (2.0, 2.0), "stiffness": (3.0, 3.0)})
+    usual, at = snapshot(env), elements(env)
+    env.reset()
+    model = env.physics.model.ptr
+    dofs, stiffness = model.jnt_dofadr[at["hinges"]], usual["jnt_stiffness"]
+    material = env.task.scene.catheter.device.relaxation_time
+    expected = usual["dof_damping"][dofs] + material * stiffness[at["hinges"]]
+    np.testing.assert_allclose(model.dof_damping[dofs], 3.0 * expected)
 
 
 @pytest.mark.slow

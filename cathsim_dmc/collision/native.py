@@ -214,6 +214,19 @@ def call_collision(_, address, model, data, contacts, geom1, geom2, margin):
 
 
 @_intrinsic
+def call_callback(_, address, model, data):
+    """Calls one of MuJoCo's callbacks on a model and its data, given by addresses."""
+
+    def generate(context, builder, signature, values):
+        kind = ir.FunctionType(ir.VoidType(), [value.type for value in values[1:]])
+        place = builder.inttoptr(values[0], kind.as_pointer())
+        builder.call(place, values[1:])
+        return context.get_dummy_value()
+
+    return types.void(types.int64, types.int64, types.int64), generate
+
+
+@_intrinsic
 def call_error(_, address, text, number):
     """Calls `mju_error` with the text at an address, and an int32 for its %d."""
 

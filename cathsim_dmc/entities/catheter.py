@@ -3,11 +3,7 @@
 import numpy as np
 
 from cathsim_dmc.entities import devices
-from cathsim_dmc.entities.chain import (
-    BENDING_RELAXATION_TIME,
-    TORSION_ARMATURE,
-    Chain,
-)
+from cathsim_dmc.entities.chain import TIMESTEP, TORSION_ARMATURE, Chain
 
 # Lag of the drives of the tip, s.
 STEERING_LAG = 0.05
@@ -24,6 +20,7 @@ class Catheter(Chain):
         stroke: float = 0.25,
         rotation: bool = False,
         friction: float = 0.0,
+        timestep: float = TIMESTEP,
         name: str = "catheter",
     ):
         """Builds the chain.
@@ -34,6 +31,7 @@ class Catheter(Chain):
             stroke: longest insertion, m.
             rotation: whether the base has a rotation joint.
             friction: Coulomb coefficient; MuJoCo takes the larger of the two geoms'.
+            timestep: physics step with which the chain will be simulated, s.
             name: name of the entity.
         """
         self._device = devices.get(device)
@@ -47,6 +45,7 @@ class Catheter(Chain):
             stroke=stroke,
             rotation=rotation,
             friction=friction,
+            timestep=timestep,
             name=name,
         )
 
@@ -118,7 +117,7 @@ class Catheter(Chain):
                 name=f"twist_{index}",
                 axis=(0, 0, 1),
                 stiffness=twist,
-                damping=BENDING_RELAXATION_TIME * twist,
+                damping=self._relaxation_time * twist,
                 armature=TORSION_ARMATURE,
             )
         )

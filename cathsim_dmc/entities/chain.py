@@ -9,11 +9,13 @@ from cathsim_dmc.entities.contact import device_contact
 from cathsim_dmc.entities.device import Device
 from cathsim_dmc.entities.posture import x_first
 
-# Relaxation time of bending: joint damping = time * stiffness, s. It represents the
-# loss inside the polymer and the drag of blood: a 0.2 m cantilever of 50 N·mm² with a
-# drag of 0.15 N·s/m² relaxes in c L⁴ / (12.4 EI) = 0.4 s. With half of it, a buckled
-# shaft snaps through too fast for steps of 4 ms (docs/soak.md).
+# Damping over stiffness of the hinges beyond that of the material, s. It has no source:
+# with half of it, a buckled shaft snaps through too fast for steps of 4 ms
+# (docs/soak.md), and the shipped policies were trained with it.
 BENDING_RELAXATION_TIME = 0.4
+# Physics step of the tasks, s. An implicit step of length h damps a spring like a
+# relaxation time of h, so the hinges have that much less.
+TIMESTEP = 4e-3
 # Rotor inertia of the hinges, kg·m². With the damping it acts within 2 ms, far below
 # the relaxation time. It sets the mass scale of the contact solver, at which the wall
 # is as hard as silicone (docs/physics.md).
@@ -46,6 +48,16 @@ COLOUR = (0.85, 0.32, 0.08, 1.0)
 TIP_COLOUR = (0.95, 0.75, 0.1, 1.0)
 
 
+def hinge_time(material: Any, timestep: float) -> Any:
+    """Damping over stiffness of a hinge, s.
+
+    Args:
+        material: relaxation time of the material, s; a number or an array.
+        timestep: physics step, s.
+    """
+    return np.maximum(BENDING_RELAXATION_TIME + material - timestep, 0.0)
+
+
 class Chain(composer.Entity):
     """Links with hinges about x and y; +z of every link points to the distal end.
 
@@ -66,6 +78,7 @@ class Chain(composer.Entity):
         stroke: float,
         rotation: bool,
         friction: float,
+        timestep: float,
         name: str,
     ) -> None:
         """Builds base, links, head, motors and sensors.
@@ -76,11 +89,13 @@ class Chain(composer.Entity):
             stroke: longest insertion, m.
             rotation: whether the base has a rotation joint.
             friction: Coulomb coefficient; MuJoCo takes the larger of the two geoms'.
+            timestep: physics step with which the chain will be simulated, s.
             name: name of the entity.
         """
         if not stroke > 0:
             raise ValueError(f"stroke is {stroke} m; it must be positive")
         self._lengths, self._radius, self._stroke = link_lengths, radius, stroke
+        self._timestep = timestep
         self._mjcf_root = mjcf.RootElement(model=name)
         self._mjcf_root.compiler.angle = "radian"
         self._contact = self._surface(friction)
@@ -209,7 +224,7 @@ class Chain(composer.Entity):
                 name=f"bend_{axis}_{index}",
                 axis=(1, 0, 0) if axis == "x" else (0, 1, 0),
                 stiffness=stiffness,
-                damping=BENDING_RELAXATION_TIME * stiffness,
+                damping=self._relaxation_time * stiffness,
                 springref=rest[axis],
                 armature=HINGE_ARMATURE,
             )
@@ -265,6 +280,16 @@ class Chain(composer.Entity):
         sensors = self._mjcf_root.sensor
         self._push_force = sensors.add("force", name="push_force", site=grip)
         self._push_torque = sensors.add("torque", name="push_torque", site=grip)
+
+    @property
+    def _relaxation_time(self) -> float:
+        """Damping over stiffness of the hinges, s."""
+        return float(hinge_time(self.device.relaxation_time, self._timestep))
+
+    @property
+    def timestep(self) -> float:
+        """Physics step with which the chain is simulated, s."""
+        return self._timestep
 
     @property
     def mjcf_model(self) -> mjcf.RootElement:

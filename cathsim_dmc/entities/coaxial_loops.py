@@ -360,7 +360,7 @@ def turned(angles, base, stiffness, lag, least, duration, loads):
         angles: (N, K, M + 1), rad.
         base: (N, K), rotations of the bases, rad.
         stiffness: (K, M), torsional stiffness of the segments, N·m/rad.
-        lag: relaxation time divided by the duration.
+        lag: (K,), relaxation times divided by the duration.
         least: largest movement of a sticking node, rad.
         duration: s.
         loads: (4, N, K, M): torque, rate, friction and brake on the nodes.
@@ -377,7 +377,7 @@ def turned(angles, base, stiffness, lag, least, duration, loads):
         for k in range(devices):
             for m in range(segments):
                 now = stiffness[k, m] * (angles[i, k, m + 1] - angles[i, k, m])
-                coupling = (1 + lag) * stiffness[k, m]
+                coupling = (1 + lag[k]) * stiffness[k, m]
                 load[m] = loads[0, i, k, m] - now
                 # A negative rate has no equilibrium nearby; there the torque is
                 # explicit, and the damping of the rod bounds the speed.

@@ -7,7 +7,7 @@ import numpy as np
 
 from cathsim_dmc.entities import devices as library
 from cathsim_dmc.entities.arena import BLOOD_DENSITY
-from cathsim_dmc.entities.chain import BENDING_RELAXATION_TIME, Chain
+from cathsim_dmc.entities.chain import BENDING_RELAXATION_TIME, TIMESTEP, Chain
 from cathsim_dmc.entities.coaxial import Stack, weight_density
 from cathsim_dmc.entities.contact import FRICTION, coaxial_contact
 from cathsim_dmc.entities.device import Device
@@ -27,9 +27,13 @@ class DeviceStack(Chain):
     has one motor, which drives the leading device. `physics.sliding` moves the devices
     and writes the properties into the model once per control step. An action has two
     entries for each device, from the innermost outwards: translation and rotation.
+
+    Attributes:
+        material_times: (K,), relaxation times of the materials of the devices, s.
     """
 
     coaxial = True
+    material_times: np.ndarray
 
     def _build(
         self,
@@ -40,6 +44,7 @@ class DeviceStack(Chain):
         lead: float = LEAD,
         friction: float = FRICTION,
         lumen_friction: float = LUMEN_FRICTION,
+        timestep: float = TIMESTEP,
         name: str = "catheter",
     ):
         """Builds the chain.
@@ -53,6 +58,7 @@ class DeviceStack(Chain):
             friction: Coulomb coefficient of an uncoated device on the wall.
             lumen_friction: Coulomb coefficient between a device and the lumen around
                 it.
+            timestep: physics step with which the chain will be simulated, s.
             name: name of the entity.
 
         Raises:
@@ -69,7 +75,14 @@ class DeviceStack(Chain):
         chosen = discretisation or library.Discretisation()
         self._friction, self._lumen_friction = friction, lumen_friction
         self._stack = Stack(self._devices, chosen.link_lengths(*self._devices))
-        self._rods = Rods(self._devices, self._stack.nodes, BENDING_RELAXATION_TIME)
+        self.material_times = np.array(
+            [device.relaxation_time for device in self._devices]
+        )
+        self._rods = Rods(
+            self._devices,
+            self._stack.nodes,
+            BENDING_RELAXATION_TIME + self.material_times,
+        )
         self._gaps = lead * np.arange(len(self._devices), dtype=np.float64)
         overlap = self._stack.overlap(self._gaps[None])
         turns = np.zeros((1, len(self._devices), len(self._stack.spans)))
@@ -83,6 +96,7 @@ class DeviceStack(Chain):
             stroke=stroke,
             rotation=False,
             friction=friction,
+            timestep=timestep,
             name=name,
         )
 

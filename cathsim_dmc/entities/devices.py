@@ -19,6 +19,10 @@ NITINOL_MODULUS = 48e9  # Pa, austenite in bending
 POLYURETHANE_DENSITY = 1200.0  # kg/m^3, jacket of a hydrophilic wire, unfilled
 POLYMER_POISSON_RATIO = 0.4
 METAL_POISSON_RATIO = 0.33
+# Loss factors: loss moduli are 0.1 to 1 % of storage moduli in metals, 1 to 200 % in
+# polymers (Gerdeen 2012, 10.1201/9781420056372). A metal shaft is a coil on a core, so
+# the upper end; for polymers `Device.loss_factor`, within a factor of two.
+METAL_LOSS = 0.01
 # Friction of a hydrophilic coat relative to PTFE: a sixth and a half of bare steel
 # (Schröder 1993).
 HYDROPHILIC = 1 / 3
@@ -150,6 +154,7 @@ def _guidewire(name: str, shaft: float) -> Device:
         # A floppy end is an order of magnitude softer than its shaft.
         tip=_metal(shaft / 10),
         tip_shape=(Arc(12.1e-3, math.radians(72)),),
+        loss_factor=METAL_LOSS,
         attenuation=materials.STEEL_WIRE,
         marker_attenuation=materials.STEEL_WIRE,
         source=f"{_HARRISON}; tip: a tenth, assumed",
@@ -201,6 +206,7 @@ def _hydrophilic_wire(
         tip_length=0.03,
         tip_links=tip_links,
         tip_shape=(bend, _straight(4e-3)),
+        loss_factor=METAL_LOSS,
         friction_ratio=HYDROPHILIC,
         attenuation=materials.NITINOL_WIRE * (shaft / outer) ** 2,
         marker_attenuation=materials.MARKER,

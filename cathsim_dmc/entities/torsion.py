@@ -27,7 +27,10 @@ class Rods:
     """
 
     def __init__(
-        self, devices: Sequence[Device], nodes: np.ndarray, relaxation_time: float
+        self,
+        devices: Sequence[Device],
+        nodes: np.ndarray,
+        relaxation_times: np.ndarray,
     ):
         """Computes the stiffness of the segments.
 
@@ -35,13 +38,13 @@ class Rods:
             devices: K devices.
             nodes: (M + 1,), distances of the nodes from a device's end, from proximal
                 to distal, m; the last one is 0.
-            relaxation_time: relaxation time τ, s.
+            relaxation_times: (K,), relaxation times τ, s.
         """
         from cathsim_dmc.entities import coaxial_loops  # imports numba, which is slow
 
         self._loops = coaxial_loops
         self._nodes = nodes
-        self._relaxation_time = relaxation_time
+        self._relaxation_times = relaxation_times
         self.stiffness = np.stack([1 / _twist(device, nodes) for device in devices])
 
     def turn(
@@ -74,7 +77,7 @@ class Rods:
             np.ascontiguousarray(angles),
             turned,
             self.stiffness,
-            self._relaxation_time / duration,
+            self._relaxation_times / duration,
             STICKING * duration,
             duration,
             loads,

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import mujoco
 import numpy as np
 
-from cathsim_dmc.entities.chain import BENDING_RELAXATION_TIME
+from cathsim_dmc.entities.chain import BENDING_RELAXATION_TIME, hinge_time
 from cathsim_dmc.entities.coaxial import Links, Overlap
 from cathsim_dmc.entities.device_stack import DeviceStack
 from cathsim_dmc.physics.readings import ids
@@ -75,8 +75,8 @@ class ChainFields:
             self._geoms,
             self._axes,
             self._half_lengths,
-            BENDING_RELAXATION_TIME,
             made.stiffness,
+            made.damping,
             made.rest,
             *made.links,
             *arrays,
@@ -88,11 +88,13 @@ class ChainProperties(NamedTuple):
 
     Attributes:
         stiffness: (N, J), of the hinges, N·m/rad.
+        damping: (N, J), of the hinges, N·m·s/rad.
         rest: (N, J, 2), angles of the free hinges about x and y, rad.
         links: arrays (N, L).
     """
 
     stiffness: np.ndarray
+    damping: np.ndarray
     rest: np.ndarray
     links: Links
 
@@ -103,14 +105,15 @@ def chain_properties(
     turns: np.ndarray,
     friction: np.ndarray,
     factor: np.ndarray,
+    loss: np.ndarray,
     spin: np.ndarray | None = None,
     angles: np.ndarray | None = None,
 ) -> ChainProperties:
     """Properties of chains at an overlap of their devices.
 
-    The damping of a hinge resists how it moves against the turning shape, not against
-    the vessel: else a shaped device would be held back by its own damping when it is
-    turned. So the spring leads by what the damper takes.
+    The damping of a hinge beyond that of the material resists how it moves against the
+    turning shape, not against the vessel: else a shaped device would be held back by it
+    when it is turned. So the spring leads by what the damper takes.
 
     Args:
         entity: of the devices.
@@ -118,6 +121,7 @@ def chain_properties(
         turns: (N, K, J), rotation of each device at each joint, rad.
         friction: (N,), Coulomb coefficient of an uncoated device on the wall.
         factor: (N,), of all stiffnesses.
+        loss: (N,), factor of all loss factors.
         spin: (N, K, J), rate of that rotation, rad/s.
         angles: (N, 2 J), of the hinges as they stand, in the order of the chain, rad;
             None for the unloaded chain at rest.
@@ -127,8 +131,12 @@ def chain_properties(
         rest = stack.unloaded_hinges(overlap, turns)
     else:
         rest = stack.free_hinges(overlap, turns, spin, BENDING_RELAXATION_TIME, angles)
+    stiffness = factor[:, None] / overlap.compliance
+    shares = overlap.stiffness / overlap.stiffness.sum(axis=1, keepdims=True)
+    material = loss[:, None] * (entity.material_times[:, None] * shares).sum(axis=1)
     return ChainProperties(
-        stiffness=factor[:, None] / overlap.compliance,
+        stiffness=stiffness,
+        damping=hinge_time(material, entity.timestep) * stiffness,
         rest=rest,
         links=stack.links(overlap, friction),
     )
@@ -155,7 +163,7 @@ def write_still(
         turns += np.asarray(rotation)[:, None]
     overlap = entity.stack.overlap(gaps[None])
     made = chain_properties(
-        entity, overlap, turns, np.array([entity.friction]), np.ones(1)
+        entity, overlap, turns, np.array([entity.friction]), np.ones(1), np.ones(1)
     )
     arrays = [getattr(model, name) for name in FIELDS]
     ChainFields(model, entity).write(arrays, made, 0)

@@ -15,6 +15,7 @@ from dm_control.composer import variation
 from dm_control.composer.variation import distributions
 
 from cathsim_dmc import bounds
+from cathsim_dmc.entities.chain import hinge_time
 from cathsim_dmc.imaging.angiograph import Deviation
 from cathsim_dmc.physics.effects import Effect, World
 from cathsim_dmc.physics.readings import ids
@@ -30,6 +31,8 @@ Range = Sequence[float] | variation.Variation
 _RANGES = {
     "friction": (0.0, 2.0, ""),
     "stiffness": (0.01, 100.0, ""),
+    "loss": (0.0, 100.0, ""),
+    "viscosity": (0.0, 100.0, ""),
     "view": (-90.0, 90.0, "degrees"),
     "gain": (0.01, 100.0, ""),
     "kerma": (1e-3, 1e6, ""),
@@ -59,6 +62,8 @@ class Randomisation:
         friction: Coulomb coefficient of device on wall.
         stiffness: factor of EI and GJ; damping and steering torques follow, so that
             relaxation time and steering angles stay.
+        loss: factor of the loss factor of the material.
+        viscosity: factor of the viscosity of blood.
         start_radius: of the ball in which the tip starts, m.
         view: deviation of the C-arm's angles, degrees, rounded to whole ones.
         gain: factor of the image's gain.
@@ -70,6 +75,8 @@ class Randomisation:
 
     friction: Range | None = None
     stiffness: Range | None = None
+    loss: Range | None = None
+    viscosity: Range | None = None
     start_radius: float = START_JITTER
     view: Range | None = None
     gain: Range | None = None
@@ -139,6 +146,7 @@ class Randomisation:
 
         displacement = start_displacement(random_state, self.start_radius)
         friction, stiffness = value("friction"), value("stiffness")
+        loss, viscosity = value("loss"), value("viscosity")
         primary, secondary = value("view"), value("view")
         gain, kerma = value("gain"), value("kerma")
         shift, roll = value("goal_shift"), value("roll")
@@ -150,6 +158,8 @@ class Randomisation:
             displacement=displacement,
             friction=friction,
             stiffness=stiffness,
+            loss=loss,
+            viscosity=viscosity,
             deviation=Deviation(
                 primary=round(primary or 0.0),
                 secondary=round(secondary or 0.0),
@@ -167,6 +177,8 @@ class Randomisation:
 DEFAULT_RANGES = Randomisation(
     friction=(0.02, 0.15),
     stiffness=(0.8, 1.25),
+    loss=(0.5, 2.0),
+    viscosity=(0.5, 2.0),
     start_radius=2e-3,
     view=(-5.0, 5.0),
     gain=(0.85, 1.15),
@@ -185,6 +197,8 @@ class Episode:
         displacement: (3,) of the tip at the start, frame of the inlet, m.
         friction: Coulomb coefficient.
         stiffness: factor.
+        loss: factor.
+        viscosity: factor.
         deviation: of the angiography machine.
         goal_shift: m along the branch.
         roll: rad.
@@ -194,6 +208,8 @@ class Episode:
     displacement: np.ndarray
     friction: float | None = None
     stiffness: float | None = None
+    loss: float | None = None
+    viscosity: float | None = None
     deviation: Deviation = Deviation()
     goal_shift: float | None = None
     roll: float | None = None
@@ -201,7 +217,7 @@ class Episode:
 
 
 class RandomisedModel(Effect):
-    """Friction, stiffness and roll of the device as drawn for each episode."""
+    """Friction, stiffness, loss and roll of the device as drawn for each episode."""
 
     def __init__(self, randomisation: Randomisation):
         """Names the fields of the model that the randomisation changes."""
@@ -210,7 +226,11 @@ class RandomisedModel(Effect):
             drawn, fields = ["friction"], ["geom_friction"]
         if randomisation.stiffness is not None:
             drawn.append("stiffness")
-            fields += ["jnt_stiffness", "dof_damping", "actuator_gainprm"]
+            fields += ["jnt_stiffness", "actuator_gainprm"]
+        if randomisation.loss is not None:
+            drawn.append("loss")
+        if "stiffness" in drawn or "loss" in drawn:
+            fields.append("dof_damping")
         if randomisation.roll is not None:
             drawn.append("roll")
             fields.append("body_quat")
@@ -229,6 +249,7 @@ class RandomisedModel(Effect):
         self._dofs = model.jnt_dofadr[self._hinges]
         self._motors = ids(model, chain.tip_motors)
         self._base = world.index.links.start
+        self._stiffness = model.jnt_stiffness[self._hinges].copy()
         self._state = {name: np.zeros(world.num_simulations) for name in self._drawn}
 
     def restart(
@@ -249,10 +270,18 @@ class RandomisedModel(Effect):
         field = self.world.field
         if (friction := self._state.get("friction")) is not None:
             field(index, "geom_friction")[self._geoms, 0] = friction[index]
-        if (stiffness := self._state.get("stiffness")) is not None:
+        stiffness = self._state.get("stiffness")
+        loss = self._state.get("loss")
+        if loss is not None or stiffness is not None:
+            device, timestep = self.world.chain.device, self.world.chain.timestep
+            factor = 1.0 if stiffness is None else stiffness[index]
+            material = device.relaxation_time * (1.0 if loss is None else loss[index])
+            field(index, "dof_damping")[self._dofs] = (
+                hinge_time(material, timestep) * factor * self._stiffness
+            )
+        if stiffness is not None:
             for name, where in (
                 ("jnt_stiffness", self._hinges),
-                ("dof_damping", self._dofs),
                 ("actuator_gainprm", (self._motors, 0)),
             ):
                 field(index, name)[where] = (

@@ -123,7 +123,7 @@ class SlidingDevices(SingleDevice):
         self._arrays: list[list[np.ndarray]] = [[]] * total
         self._radii = np.array([device.outer_radius for device in self._entity.devices])
         self._friction = np.full(total, self._entity.friction)
-        self._factor = np.ones(total)
+        self._factor, self._loss = np.ones(total), np.ones(total)
         # Fraction of the friction between devices that acts, positive when the inner
         # one has slid forward; that friction, and the forces of the drives but for the
         # push force, which the leading device bears, N.
@@ -149,6 +149,7 @@ class SlidingDevices(SingleDevice):
             each[index] = 0.0
         self._friction[index] = self._entity.friction if friction is None else friction
         self._factor[index] = 1.0 if stiffness is None else stiffness
+        self._loss[index] = 1.0 if episode.loss is None else episode.loss
         row = self._live(index)
         turns = np.zeros((1, *self._spin.shape[1:]))
         self._write(row, self._stack.overlap(gaps[None]), turns)
@@ -164,6 +165,7 @@ class SlidingDevices(SingleDevice):
         return {
             "friction": self._friction,
             "factor": self._factor,
+            "loss": self._loss,
             "ways": self._ways,
             "drag": self._drag,
             "axial": self._axial,
@@ -324,7 +326,14 @@ class SlidingDevices(SingleDevice):
         friction, factor = self._friction[rows], self._factor[rows]
         angles, spin = self._qpos[rows, self._places.qpos], self._spin[rows]
         made = chain_properties(
-            self._entity, overlap, turns, friction, factor, spin, angles
+            self._entity,
+            overlap,
+            turns,
+            friction,
+            factor,
+            self._loss[rows],
+            spin,
+            angles,
         )
         for row, number in enumerate(rows.tolist()):
             self._places.write(self._arrays[number], made, row)

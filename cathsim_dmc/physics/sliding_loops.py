@@ -142,8 +142,8 @@ def write(
     geoms,
     axes,
     half_lengths,
-    relaxation,
     stiffness,
+    damping,
     rest,
     radius,
     friction,
@@ -171,16 +171,15 @@ def write(
         geoms: (L,), of the links.
         axes: (L,), which of a link's axes of inertia lies along it.
         half_lengths: (L,), of the cylinders of the links, m.
-        relaxation: damping over stiffness, s.
-        stiffness, rest, radius, friction, mass, buoyancy, inertia: of N simulations,
-            see `chain_fields.ChainProperties`.
+        stiffness, damping, rest, radius, friction, mass, buoyancy, inertia: of N
+            simulations, see `chain_fields.ChainProperties`.
         jnt_stiffness, ...: the fields, named as in MuJoCo.
     """
     for j in range(stiffness.shape[1]):
         for axis in range(2):
             hinge = 2 * j + (axis + j) % 2  # see `posture.x_first`
             jnt_stiffness[hinges[0] + hinge] = stiffness[row, j]
-            dof_damping[hinges[1] + hinge] = relaxation * stiffness[row, j]
+            dof_damping[hinges[1] + hinge] = damping[row, j]
             qpos_spring[hinges[2] + hinge] = rest[row, j, axis]
     beyond = 0.0
     for link in range(len(geoms) - 1, -1, -1):

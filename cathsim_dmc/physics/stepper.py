@@ -15,9 +15,10 @@ from typing import Any, Protocol
 import mujoco
 import numpy as np
 
+from cathsim_dmc.entities.chain import TIMESTEP
 from cathsim_dmc.physics import forces, readings
 
-PHYSICS_TIMESTEP = 0.004  # s
+PHYSICS_TIMESTEP = TIMESTEP
 CONTROL_TIMESTEP = 0.04  # s, one frame of fluoroscopy
 _STATE = mujoco.mjtState.mjSTATE_INTEGRATION.value
 _ACTUATION = mujoco.mjtDisableBit.mjDSBL_ACTUATION.value

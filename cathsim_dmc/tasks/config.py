@@ -14,6 +14,7 @@ from cathsim_dmc.entities.contact import FRICTION
 from cathsim_dmc.entities.device import Device
 from cathsim_dmc.entities.device_stack import LEAD, LUMEN_FRICTION
 from cathsim_dmc.imaging.options import FluoroscopyOptions
+from cathsim_dmc.physics.blood import StillBlood
 from cathsim_dmc.physics.delay import ActionDelay
 from cathsim_dmc.physics.effects import Effect
 from cathsim_dmc.physics.randomisation import Randomisation, RandomisedModel
@@ -128,7 +129,8 @@ class NavigationConfig:
         """The effects of one rollout, in the order in which they act."""
         own = [copy.copy(effect) for effect in self.effects]
         delay = ActionDelay(self.ranges.longest_delay)
-        return [RandomisedModel(self.ranges), delay, *own, devices_of(chain)]
+        model = RandomisedModel(self.ranges)
+        return [StillBlood(), model, delay, *own, devices_of(chain)]
 
     def _check_devices(self):
         if self.devices is None:

@@ -178,6 +178,7 @@ def _chain(
             lead=config.lead,
             friction=config.friction,
             lumen_friction=config.lumen_friction,
+            timestep=config.physics_timestep,
         )
     return Catheter(
         chosen[0],
@@ -185,4 +186,5 @@ def _chain(
         stroke=place.stroke,
         rotation=config.rotation,
         friction=config.friction,
+        timestep=config.physics_timestep,
     )

@@ -48,6 +48,7 @@ class Rig:
             stroke=stroke,
             rotation=rotation,
             friction=friction,
+            timestep=timestep,
         )
         self.device = self.catheter.device
         self.arena = AngiographyArena(self.catheter.density)

@@ -11,7 +11,7 @@ import numpy as np
 
 from cathsim_dmc.entities import devices
 from cathsim_dmc.entities.chain import BENDING_RELAXATION_TIME, MAX_ROTATION_SPEED
-from cathsim_dmc.validation import drive, theory
+from cathsim_dmc.validation import damping, drive, theory
 from cathsim_dmc.validation.checks import Check, Report
 from cathsim_dmc.validation.rig import REST_CHANGE, Rig
 
@@ -290,6 +290,7 @@ def twist_lag(
     base, tip = np.array(base), np.array(tip)
     time = timestep * np.arange(len(base))
     constant = brake / stiffness + BENDING_RELAXATION_TIME
+    constant += rig.device.relaxation_time
     # The motor takes some 20 ms to its speed; the lag is driven by what it does.
     lag, speed = np.zeros(len(base)), np.diff(base) / timestep
     for index, omega in enumerate(speed):
@@ -382,14 +383,21 @@ def validate_rod() -> Report:
             f"{lag.rise_time:.4f} s, theory {lag.expected_rise_time:.4f} s",
         ),
     ]
-    checks += drive.checks()
+    checks += drive.checks() + damping.checks()
     short = [buckling(end, count) for end, count in SHORT_COLUMNS]
+    coarse = {
+        f"{1e3 * span:.0f} mm, load on a {'joint' if on_joint else 'link'}": 100
+        * (damping.three_point(span, damping.LINK, on_joint) - 1)
+        for span in damping.SPANS
+        for on_joint in (True, False)
+    }
     findings = {
+        "deflection in three-point bending of links of 17.5 mm, deviation, %": coarse,
         "buckling load of shorter columns, deviation from Euler, %": {
             f"{1e3 * one.length:.0f} mm, guide {one.end}": 100
             * (one.critical / one.expected - 1)
             for one in short
-        }
+        },
     }
     data = {"cantilevers": loaded, "columns": columns, "short": short, "lag": lag}
     return Report("rod", checks, findings, data)

@@ -1,0 +1,66 @@
+"""Drag of still blood across the links of the device, in every physics step.
+
+On a length l of a device of diameter d that moves across its axis through blood with a
+velocity u, Re = ρ|u|d/µ,
+
+    F = -½ ρ d l C_d |u| u,
+    C_d = 1.18 + 6.8 / Re^0.89 + 1.96 / √Re - 0.0004 Re / (1 + 3.64e-7 Re²)
+
+(Sucker and Brauer 1975, Wärme- und Stoffübertragung 8, 149; Re from 1e-4 to 2e5):
+viscous like that of a slender body at a small Re, quadratic at a large one. Drag along
+the axis and by rotation about it are left out, and so is the history of the motion. The
+blood that the device carries with it is no part of the links' mass
+(`carried_mass`).
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from cathsim_dmc.entities.arena import BLOOD_DENSITY
+from cathsim_dmc.entities.chain import Chain
+from cathsim_dmc.entities.device import Device
+from cathsim_dmc.physics.effects import Effect, World
+from cathsim_dmc.physics.randomisation import Episode
+
+BLOOD_VISCOSITY = 3.5e-3  # Pa·s, of whole blood at high shear rates
+
+
+def carried_mass(device: Device) -> float:
+    """Mass per length of the blood that a device carries across its axis, kg/m.
+
+    As much as it displaces (potential flow), and all blood in its lumen.
+    """
+    return BLOOD_DENSITY * math.pi * (device.outer_radius**2 + device.inner_radius**2)
+
+
+class StillBlood(Effect):
+    """Blood at rest, the first of a task's effects; a flow writes its velocity."""
+
+    def num_parameters(self, chain: Chain) -> int:
+        """A header, and the velocity of the blood at each link."""
+        from cathsim_dmc.physics import blood_loops  # late, as numba takes long
+
+        self._loops = blood_loops
+        return blood_loops.HEADER + blood_loops.OF_LINK * len(chain.links)
+
+    def bind(self, world: World) -> None:
+        """Has MuJoCo call the drag, and finds its parameters."""
+        super().bind(world)
+        self._loops.install()
+        self._header = world.parameters[:, : self._loops.HEADER]
+        # (N, L, 3), of the blood at the links, m/s, world frame.
+        self.velocity = world.parameters[:, self._loops.HEADER :].reshape(
+            world.num_simulations, -1, self._loops.OF_LINK
+        )
+
+    def restart(
+        self, index: int, episode: Episode, random_state: np.random.RandomState
+    ) -> None:
+        """Fills one simulation with blood at rest."""
+        factor = 1.0 if episode.viscosity is None else episode.viscosity
+        viscosity, first = factor * BLOOD_VISCOSITY, self.world.index.links.start
+        self._header[index] = self._loops.MARK, BLOOD_DENSITY, viscosity, first
+        self.velocity[index] = 0.0

@@ -1,0 +1,107 @@
+"""Drag of blood, compiled; MuJoCo calls it in every physics step. See `blood`."""
+
+import ctypes
+import math
+
+import mujoco
+import numpy as np
+
+from cathsim_dmc.collision import native
+from cathsim_dmc.collision.native import (
+    address_of,
+    call_callback,
+    numbers,
+    wholes,
+    word,
+)
+
+# Parameters before those of the links: the mark of blood, its density and viscosity,
+# and the first link's number among the bodies.
+HEADER, MARK = 4, 1843.0
+# Parameters of a link: velocity of the blood there, m/s.
+OF_LINK = 3
+# Numbers of `userdata` before the parameters of the first effect.
+_FIRST = 2
+_MODEL = ("nuserdata", "body_geomadr", "geom_size", "body_dofadr", "body_dofnum", "nv")
+_DATA = ("userdata", "xipos", "xmat", "cvel", "subtree_com", "cdof", "qfrc_passive")
+_BEFORE = 8 * (len(_MODEL) + len(_DATA))
+_SYMBOL = "cathsim_blood"
+# Offsets of these fields, and the function that stood in `mjcb_passive`.
+_TABLE = np.zeros(len(_MODEL) + len(_DATA) + 1, np.int64)
+native.symbol(_SYMBOL, _TABLE)
+
+
+@native.callback("void(int64, int64)")
+def _drag(model, data):
+    """Adds the drag on each link to the passive forces of a model with blood."""
+    table = address_of(_SYMBOL)
+    before = word(table + _BEFORE)
+    if before != 0:
+        call_callback(before, model, data)
+    count = word(model + word(table))
+    if count < _FIRST + HEADER:
+        return
+    user = numbers(word(data + word(table + 48)), count)
+    if user[_FIRST] != MARK:
+        return
+    links, user = (int(user[1]) - HEADER) // OF_LINK, user[_FIRST:]
+    density, viscosity, first = user[1], user[2], int(user[3])
+    if viscosity == 0.0:
+        return
+    bodies, nv = first + links, word(model + word(table + 40))
+    geoms = wholes(word(model + word(table + 8)), bodies)
+    sizes = numbers(word(model + word(table + 16)), 3 * (geoms[bodies - 1] + 1))
+    dofs = wholes(word(model + word(table + 24)), bodies)
+    counts = wholes(word(model + word(table + 32)), bodies)
+    xipos = numbers(word(data + word(table + 56)), 3 * bodies)
+    xmat = numbers(word(data + word(table + 64)), 9 * bodies)
+    cvel = numbers(word(data + word(table + 72)), 6 * bodies)
+    pole = numbers(word(data + word(table + 80)), 3 * bodies)[3 * first :]
+    cdof = numbers(word(data + word(table + 88)), 6 * nv)
+    passive = numbers(word(data + word(table + 96)), nv)
+    # Force of all links from here to the end, and its torque about the pole.
+    fx = fy = fz = tx = ty = tz = 0.0
+    for link in range(links - 1, -1, -1):
+        body, flow = first + link, user[HEADER + OF_LINK * link :]
+        radius, half = sizes[3 * geoms[body]], sizes[3 * geoms[body] + 1]
+        spin, axes, place = cvel[6 * body :], xmat[9 * body :], xipos[3 * body :]
+        x, y, z = place[0] - pole[0], place[1] - pole[1], place[2] - pole[2]
+        u = flow[0] - spin[3] - spin[1] * z + spin[2] * y
+        v = flow[1] - spin[4] - spin[2] * x + spin[0] * z
+        w = flow[2] - spin[5] - spin[0] * y + spin[1] * x
+        along = u * axes[2] + v * axes[5] + w * axes[8]
+        u, v, w = u - along * axes[2], v - along * axes[5], w - along * axes[8]
+        speed = math.sqrt(u * u + v * v + w * w)
+        reynolds = density * speed * 2 * radius / viscosity
+        # ½ Re C_d, which is 0 at rest.
+        drag = (0.59 - 2e-4 * reynolds / (1 + 3.64e-7 * reynolds**2)) * reynolds
+        drag += 3.4 * reynolds**0.11 + 0.98 * math.sqrt(reynolds)
+        drag *= viscosity * 2 * half
+        u, v, w = drag * u, drag * v, drag * w
+        fx, fy, fz = fx + u, fy + v, fz + w
+        tx, ty, tz = tx + y * w - z * v, ty + z * u - x * w, tz + x * v - y * u
+        for dof in range(dofs[body], dofs[body] + counts[body]):
+            way = cdof[6 * dof :]
+            passive[dof] += way[0] * tx + way[1] * ty + way[2] * tz
+            passive[dof] += way[3] * fx + way[4] * fy + way[5] * fz
+
+
+def install() -> None:
+    """Has MuJoCo add the drag in every physics step of models with blood.
+
+    Raises:
+        RuntimeError: if a Python function stands in `mjcb_passive`.
+    """
+    if _TABLE[0]:
+        return
+    before = mujoco.get_mjcb_passive()
+    if before is not None:
+        if not hasattr(before, "argtypes"):
+            raise RuntimeError(
+                f"mjcb_passive is the Python function {before!r}, which compiled blood "
+                "cannot call; remove it with mujoco.set_mjcb_passive(None)"
+            )
+        _TABLE[-1] = ctypes.cast(before, ctypes.c_void_p).value
+    _TABLE[len(_MODEL) : -1] = native.offsets("mjData", _DATA)
+    _TABLE[: len(_MODEL)] = native.offsets("mjModel", _MODEL)
+    mujoco.set_mjcb_passive(_drag.ctypes)

@@ -1,0 +1,358 @@
+"""Release of a bent device in blood and air, its turning in a bend, its deflection.
+
+The release is compared with the equation of a beam whose material damps as it is stated
+(Kelvin-Voigt) and on which blood acts as it is stated, in four modes.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import types
+from typing import NamedTuple
+
+import mujoco
+import numpy as np
+from scipy.integrate import solve_ivp
+
+from cathsim_dmc.entities import devices
+from cathsim_dmc.entities.arena import BLOOD_DENSITY
+from cathsim_dmc.entities.chain import (
+    BENDING_RELAXATION_TIME,
+    HINGE_ARMATURE,
+    MAX_ROTATION_SPEED,
+)
+from cathsim_dmc.entities.posture import joints_along
+from cathsim_dmc.entities.sheath import Sheath
+from cathsim_dmc.physics.blood import BLOOD_VISCOSITY, StillBlood, carried_mass
+from cathsim_dmc.physics.drives import Drives
+from cathsim_dmc.physics.effects import Effects, World, userdata_size
+from cathsim_dmc.physics.randomisation import Episode
+from cathsim_dmc.physics.readings import ids
+from cathsim_dmc.physics.single_device import Turning
+from cathsim_dmc.physics.stepper import CONTROL_TIMESTEP
+from cathsim_dmc.validation.checks import Check
+from cathsim_dmc.validation.rig import Rig
+
+RELEASE_BOUND = 5.0  # % of frequency and decay
+RELEASE = 0.01  # m, deflection of the end before the release
+_FREE = 0.2  # m
+LINK = 0.0175  # m, default of the tasks
+# Roots β L of a clamped beam with a free end.
+_ROOTS = np.array([1.875104069, 4.694091133, 7.854757438, 10.99554073])
+SPEEDS = (0.05, 0.3, 1.0, MAX_ROTATION_SPEED)  # rad/s
+SPIN_BOUND = 4.0  # °; the whip of a chain in a bore takes 3° at 0.3 rad/s
+_BEND = 0.04  # m, radius of the half circle
+SPANS = (0.06, 0.1, 0.15)  # m
+SPAN_BOUND = 3.0  # % of the deflection
+SPAN_LINK = 7e-3  # m, that of the tip
+
+
+def _uniform(device: str) -> devices.Device:
+    """A straight device that is all shaft."""
+    one = devices.get(device)
+    return dataclasses.replace(
+        one, tip=one.shaft, tip_shape=(), tip_length=LINK, tip_links=1
+    )
+
+
+class Release(NamedTuple):
+    """End of a device after its release, and that of the beam."""
+
+    time: np.ndarray  # (n,), s
+    simulated: np.ndarray  # (n,), m
+    expected: np.ndarray  # (n,), m
+
+    @property
+    def figures(self) -> tuple[float, float, float, float]:
+        """Frequencies (Hz) and decay rates (1/s), simulated and expected."""
+        mine, theirs = (
+            _swing(self.time, curve) for curve in (self.simulated, self.expected)
+        )
+        return mine[0], theirs[0], mine[1], theirs[1]
+
+
+def _swing(time: np.ndarray, curve: np.ndarray) -> tuple[float, float]:
+    """Frequency (Hz) and decay rate (1/s) of the first swings of a curve."""
+    crossings = np.flatnonzero(curve[:-1] * curve[1:] < 0)[:5]
+    share = curve[crossings] / (curve[crossings] - curve[crossings + 1])
+    zeros = time[crossings] + share * (time[1] - time[0])
+    half = np.diff(zeros).mean()
+    peaks = [
+        np.abs(curve[a:b]).max()
+        for a, b in zip(crossings[:-1], crossings[1:], strict=True)
+    ]
+    decay = np.log(peaks[0] / peaks[-1]) / (len(peaks) - 1) / half
+    return 0.5 / half, float(decay)
+
+
+def release(
+    device: str = "steerable_5f", *, blood: bool = True, duration: float = 3.0
+) -> Release:
+    """Releases a bent cantilever of 0.2 m from the shape of its first mode.
+
+    Args:
+        device: taken as uniform and straight.
+        blood: whether it is in blood, or without any fluid.
+        duration: s.
+    """
+    one = _uniform(device)
+    rig = Rig(one, devices.Discretisation(working_length=_FREE + LINK / 2))
+    effect = StillBlood()
+    if blood:
+        rig.arena.mjcf_model.size.nuserdata = userdata_size([effect], rig.catheter)
+    rig.compile()
+    hinges = ids(rig.model, rig.catheter.bends)
+    _as_stated(rig, hinges, blood)
+    if blood:
+        fill(rig, effect)
+    length = float(rig.sections[0].sum())
+    nodes = np.cumsum(rig.lengths)[:-1] - rig.lengths[0] / 2
+    slope = _modes(np.append(nodes, length) / length)[0]
+    ends = np.append(nodes, length)
+    # Turning angles of the links along the mode shape.
+    angle = np.arctan(np.diff(RELEASE * slope / 2) / np.diff(ends))
+    turning = np.diff(np.append([0.0], angle))
+    for joint, turn in enumerate(turning, start=1):
+        rig.data.joint(f"{rig.name}/bend_y_{joint}").qpos = turn
+    mujoco.mj_forward(rig.model, rig.data)
+    start = rig.head_position[0]
+    curve = [start]
+    for _ in range(round(duration / rig.model.opt.timestep)):
+        rig.step()
+        mujoco.mj_kinematics(rig.model, rig.data)
+        curve.append(rig.head_position[0])
+    time = rig.model.opt.timestep * np.arange(len(curve))
+    return Release(time, np.array(curve), _beam(one, length, start, time, blood))
+
+
+def _as_stated(rig: Rig, hinges: np.ndarray, blood: bool) -> None:
+    """Leaves the damping of the material, and adds the mass of the blood carried."""
+    model, device = rig.model, rig.device
+    dofs = model.jnt_dofadr[hinges]
+    # The damping of an implicit step is part of that of the material.
+    left = max(device.relaxation_time - model.opt.timestep, 0.0)
+    model.dof_damping[dofs] = left * model.jnt_stiffness[hinges]
+    if blood:
+        factor = 1 + carried_mass(device) / device.linear_density
+        links = ids(model, rig.catheter.links)
+        model.body_mass[links] *= factor
+        model.body_inertia[links] *= factor
+        mujoco.mj_setConst(model, rig.data)
+
+
+def fill(rig: Rig, blood: StillBlood) -> None:
+    """Lets blood at rest act on the device of a rig that has userdata for it."""
+    links = ids(rig.model, rig.catheter.links)
+    index = types.SimpleNamespace(links=slice(int(links[0]), int(links[-1]) + 1))
+    world = World(
+        rig.model,
+        rig.catheter,
+        index,  # type: ignore[arg-type]
+        0.0,
+        types.SimpleNamespace(qpos=rig.data.qpos[None]),
+        lambda _, name: getattr(rig.model, name),
+        rig.data.userdata[None],
+    )
+    Effects([blood], world).restart(0, Episode(np.zeros(3)), np.random.RandomState(0))
+
+
+def _modes(places: np.ndarray) -> np.ndarray:
+    """Modes (4, n) of a beam at fractions of its length; their squares have mean 1."""
+    ratio = (np.cosh(_ROOTS) + np.cos(_ROOTS)) / (np.sinh(_ROOTS) + np.sin(_ROOTS))
+    x = _ROOTS[:, None] * places
+    return np.cosh(x) - np.cos(x) - ratio[:, None] * (np.sinh(x) - np.sin(x))
+
+
+def _beam(
+    device: devices.Device, length: float, start: float, time: np.ndarray, blood: bool
+) -> np.ndarray:
+    """Deflection (n,) of the end of a beam released from its first mode, m."""
+    mass = device.linear_density + (carried_mass(device) if blood else 0.0)
+    squares = (_ROOTS / length) ** 4
+    # The rotors of the hinges stand for no mass of the device; in blood they are left
+    # out, as they matter less there.
+    rotors = 0.0 if blood else HINGE_ARMATURE * LINK / mass * squares
+    rates = device.shaft.bending_stiffness / mass * squares / (1 + rotors)
+    places, weights = np.polynomial.legendre.leggauss(40)
+    modes, weights = _modes((places + 1) / 2), weights / 2
+    diameter = 2 * device.outer_radius
+
+    def change(_, state):
+        amplitudes, velocities = state[:4], state[4:]
+        force = -rates * (amplitudes + device.relaxation_time * velocities)
+        if blood:
+            across = velocities @ modes
+            force -= modes @ (weights * drag(across, diameter)) / mass
+        return np.concatenate([velocities, force])
+
+    first = np.zeros(8)
+    first[0] = start / _modes(np.ones(1))[0, 0]
+    solved = solve_ivp(
+        change, (0, time[-1]), first, "LSODA", time, rtol=1e-8, atol=1e-10
+    )
+    return _modes(np.ones(1))[:, 0] @ solved.y[:4]
+
+
+def drag(velocity: np.ndarray, diameter: float) -> np.ndarray:
+    """Drag of still blood on a cylinder per length, N/m (Sucker and Brauer 1975)."""
+    speed = np.maximum(np.abs(velocity), 1e-12)
+    reynolds = BLOOD_DENSITY * speed * diameter / BLOOD_VISCOSITY
+    coefficient = 1.18 + 6.8 / reynolds**0.89 + 1.96 / np.sqrt(reynolds)
+    coefficient -= 4e-4 * reynolds / (1 + 3.64e-7 * reynolds**2)
+    return 0.5 * BLOOD_DENSITY * diameter * coefficient * speed * velocity
+
+
+class Spin(NamedTuple):
+    """Lag of the end of a device that turns in a frictionless half circle."""
+
+    speed: float  # rad/s
+    lag: float  # mean over a turn, rad
+    expected: float  # Σ of τ ω θ² / C over the joints, through the twist, rad
+
+
+def spin(speed: float, device: str = "steerable_5f") -> Spin:
+    """Turns a device in a half circle of 40 mm, for one turn after the first quarter.
+
+    A joint of compliance C that is bent by θ brakes the turning with τ ω θ²/C, where τ
+    is the relaxation time of the material; the torsion hinges bear the sum of all
+    joints beyond them.
+    """
+    length = devices.Discretisation(working_length=0.3, torsion_joints=4)
+    rig = Rig(device, length, rotation=True, friction=0.0)
+    turn = np.linspace(0.0, np.pi, 120)
+    arc = _BEND * np.stack([1 - np.cos(turn), 0 * turn, np.sin(turn)], axis=-1)
+    line = np.vstack([[[0, 0, -0.1]], arc, [[2 * _BEND, 0, -0.2]]])
+    line[:, 2] += 0.1 - rig.lengths.sum()
+    rig.arena.attach(Sheath(line[:-1], rig.device.outer_radius, rig.lengths.max()))
+    rig.compile()
+    for joint, bends in enumerate(joints_along(rig.lengths, line), start=1):
+        for axis, angle in zip("xy", bends, strict=True):
+            rig.data.joint(f"{rig.name}/bend_{axis}_{joint}").qpos = angle
+    mujoco.mj_forward(rig.model, rig.data)
+    twists = _turned(rig, speed)
+    turning = Turning(rig.model, rig.catheter)
+    bends = rig.data.qpos[turning.qpos].reshape(-1, 2)
+    hinges = np.sort(ids(rig.model, rig.catheter.bends))[::2]
+    brakes = (bends**2).sum(axis=1) * rig.model.jnt_stiffness[hinges]
+    brakes *= rig.device.relaxation_time * speed
+    expected = sum(
+        brakes[hinges > twist].sum() / rig.model.jnt_stiffness[twist]
+        for twist in _twist_hinges(rig)
+    )
+    return Spin(speed, float(-twists.sum(axis=1).mean()), float(expected))
+
+
+def _twist_hinges(rig: Rig) -> np.ndarray:
+    return ids(rig.model, rig.catheter.hinges[len(rig.catheter.bends) :])
+
+
+def _turned(rig: Rig, speed: float) -> np.ndarray:
+    """Twists (T, H) of the torsion hinges after the control steps of one turn, rad."""
+    names = ("qpos", "qvel", "act")
+    arrays = types.SimpleNamespace(
+        **{name: getattr(rig.data, name)[None] for name in names}
+    )
+    drives, turning = Drives(rig.model, arrays), Turning(rig.model, rig.catheter)
+    drives.hold(0)
+    rest = rig.model.qpos_spring[turning.qpos].copy()
+    places = rig.model.jnt_qposadr[_twist_hinges(rig)]
+    command = np.array([[0.0, speed / MAX_ROTATION_SPEED]])
+    twists = []
+    steps = round(2 * np.pi / speed / CONTROL_TIMESTEP)
+    settling = max(round(2.0 / CONTROL_TIMESTEP), steps // 4)
+    for _ in range(settling + steps):
+        drives.follow(command)
+        rig.data.ctrl[-2:] = command[0]
+        lead = BENDING_RELAXATION_TIME * turning.rates(arrays.qpos, arrays.qvel)[0]
+        rig.model.qpos_spring[turning.qpos] = rest + lead
+        for _ in range(round(CONTROL_TIMESTEP / rig.model.opt.timestep)):
+            rig.step()
+        twists.append(rig.data.qpos[places].copy())
+    return np.array(twists[settling:])
+
+
+def three_point(
+    span: float, link: float, on_joint: bool, device: str = "steerable_5f"
+) -> float:
+    """Deflection of a device in three-point bending over that of a beam, FS³/48EI.
+
+    Args:
+        span: distance of the supports, m.
+        link: length of the links, m.
+        on_joint: whether the load is on a joint, or in the middle of a link.
+        device: taken as uniform and straight.
+    """
+    rig = Rig(_uniform(device), devices.Discretisation(shaft_link=link))
+    rig.compile()
+    joints = np.append(rig.joints[:, 2], rig.head_position[2])
+    near = int(np.argmin(np.abs(joints - joints.mean())))
+    middle = joints[near] + (0.0 if on_joint else (joints[near + 1] - joints[near]) / 2)
+    places = middle + span * np.array([-0.5, 0.0, 0.5])
+    links = np.searchsorted(joints, places, side="right") - 1
+    bodies = ids(rig.model, rig.catheter.links)[links]
+    bending = rig.device.shaft.bending_stiffness
+    expected = 0.01 * span
+    force = 48 * bending * expected / span**3
+    local = places - joints[links]
+
+    def points() -> np.ndarray:
+        mujoco.mj_kinematics(rig.model, rig.data)
+        axes = rig.data.xmat[bodies].reshape(-1, 3, 3)[:, :, 2]
+        return rig.data.xpos[bodies] + local[:, None] * axes
+
+    for body, share, point in zip(bodies, (-0.5, 1.0, -0.5), points(), strict=True):
+        lever = point - rig.data.xipos[body]
+        push = np.array([share * force, 0.0, 0.0])
+        rig.data.xfrc_applied[body] += np.concatenate([push, np.cross(lever, push)])
+    rig.settle()
+    across = points()[:, 0]
+    return float((across[1] - (across[0] + across[2]) / 2) / expected)
+
+
+def checks() -> list[Check]:
+    """Release, turning and three-point bending."""
+    made = []
+    for medium, blood in (("still blood", True), ("air", False)):
+        mine, theirs, decay, expected = release(blood=blood).figures
+        label = f"release of a cantilever in {medium}"
+        made += [
+            Check.deviation(
+                f"{label}, frequency",
+                mine,
+                theirs,
+                RELEASE_BOUND,
+                f"{mine:.3f} Hz, beam {theirs:.3f} Hz",
+            ),
+            Check.deviation(
+                f"{label}, decay",
+                decay,
+                expected,
+                RELEASE_BOUND,
+                f"{decay:.3f} 1/s, beam {expected:.3f} 1/s",
+            ),
+        ]
+    for one in map(spin, SPEEDS):
+        lag, expected = np.degrees([one.lag, one.expected])
+        made.append(
+            Check.at_most(
+                f"lag in a frictionless half circle at {one.speed:g} rad/s, "
+                "deviation from that of the material",
+                abs(lag - expected),
+                SPIN_BOUND,
+                "°",
+                f"{lag:.1f}°, Σ τωθ²/C {expected:.1f}°",
+            )
+        )
+    for span in SPANS:
+        ratios = [three_point(span, SPAN_LINK, on_joint) for on_joint in (True, False)]
+        worst = max(ratios, key=lambda ratio: abs(ratio - 1))
+        made.append(
+            Check.deviation(
+                f"three-point bending, span {1e3 * span:.0f} mm, links of 7 mm",
+                worst,
+                1.0,
+                SPAN_BOUND,
+                f"load on a joint {ratios[0]:.4f}, on a link {ratios[1]:.4f} FS³/48EI",
+            )
+        )
+    return made

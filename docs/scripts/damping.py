@@ -1,0 +1,74 @@
+"""Writes how the expert's episodes depend on the damping into docs/physics.md.
+
+    python docs/scripts/damping.py
+
+The expert's actions with the damping as stated are played again with other damping
+(open loop), and the expert plays with that damping (closed loop).
+"""
+
+import re
+from pathlib import Path
+
+import numpy as np
+
+from cathsim_dmc import policies, suite
+from cathsim_dmc.entities import chain
+
+PAGE = Path(__file__).parents[1] / "physics.md"
+BEGIN, END = "<!-- damping -->", "<!-- /damping -->"
+TASK, SEEDS = "type1_lcca", range(4)
+STATED = chain.BENDING_RELAXATION_TIME
+# Factors of the loss factor and the viscosity, and further damping of the hinges, s.
+CASES = {
+    "as stated": (1.0, STATED),
+    "half": (0.5, STATED / 2),
+    "twice": (2.0, 2 * STATED),
+    "half of material and blood": (0.5, STATED),
+    "twice of material and blood": (2.0, STATED),
+    "material and blood alone": (1.0, 0.0),
+    "half of them": (0.5, 0.0),
+    "twice of them": (2.0, 0.0),
+}
+
+
+def episode(case, seed, actions=None):
+    """Actions, end of the tip (3,) m, mean wall force (N) and success of an episode."""
+    factor, chain.BENDING_RELAXATION_TIME = CASES[case]
+    ranges = {"loss": (factor, factor), "viscosity": (factor, factor)}
+    env = suite.load("cathsim", TASK, {"random": seed, "randomisation": ranges})
+    act = policies.in_environment(policies.make_policy("expert"), env)
+    step, done, forces = env.reset(), [], []
+    while not step.last() and len(done) < (300 if actions is None else len(actions)):
+        done.append(act(step) if actions is None else actions[len(done)])
+        step = env.step(done[-1])
+        forces.append(float(env.task.wall_force.sum))
+    return done, env.task.readings.head, np.mean(forces), step.discount == 0.0
+
+
+def main():
+    """Measures and writes the table."""
+    stated = [episode("as stated", seed) for seed in SEEDS]
+    rows = ["| damping | tip, mm, median (max) | force | steps of the expert |"]
+    rows.append("|---|---|---|---|")
+    for case in CASES:
+        again = [episode(case, s, one[0]) for s, one in zip(SEEDS, stated, strict=True)]
+        away = [
+            1e3 * np.linalg.norm(a[1] - b[1])
+            for a, b in zip(again, stated, strict=True)
+        ]
+        ratio = np.mean([a[2] for a in again]) / np.mean([b[2] for b in stated])
+        own = [episode(case, seed) for seed in SEEDS]
+        steps = np.mean([len(one[0]) for one in own])
+        reached = sum(one[3] for one in own)
+        rows.append(
+            f"| {case} | {np.median(away):.1f} ({max(away):.1f}) | × {ratio:.2f} | "
+            f"{steps:.0f}, {reached} of {len(own)} at the goal |"
+        )
+        print(rows[-1], flush=True)
+    block = "\n".join([BEGIN, *rows, END])
+    page = PAGE.read_text()
+    PAGE.write_text(re.sub(f"{BEGIN}.*{END}", lambda _: block, page, flags=re.S))
+
+
+if __name__ == "__main__":
+    main()

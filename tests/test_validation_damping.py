@@ -1,0 +1,78 @@
+"""Damping of the device as stated, turning in a bend, short spans."""
+
+import mujoco
+import numpy as np
+import pytest
+
+from cathsim_dmc import suite
+from cathsim_dmc.physics.blood import BLOOD_VISCOSITY, StillBlood
+from cathsim_dmc.physics.effects import userdata_size
+from cathsim_dmc.simulation.batch import BatchSimulation
+from cathsim_dmc.validation import damping
+from cathsim_dmc.validation.rig import Rig
+
+
+@pytest.mark.parametrize("blood", [True, False])
+def test_a_released_device_swings_as_the_beam_with_stated_losses(blood):
+    mine, theirs, decay, expected = damping.release(blood=blood).figures
+    assert mine == pytest.approx(theirs, rel=damping.RELEASE_BOUND / 100)
+    assert decay == pytest.approx(expected, rel=damping.RELEASE_BOUND / 100)
+
+
+def test_blood_slows_the_swing_and_damps_it():
+    (blood, _, damped, _), (air, _, free, _) = (
+        damping.release(blood=blood).figures for blood in (True, False)
+    )
+    assert blood < 0.7 * air
+    assert damped > 1.1 * free
+
+
+@pytest.mark.parametrize("speed", [1.0, 3.14])
+def test_a_device_turned_in_a_bend_lags_by_the_losses_of_its_material(speed):
+    one = damping.spin(speed)
+    assert np.degrees(abs(one.lag - one.expected)) < damping.SPIN_BOUND
+
+
+@pytest.mark.parametrize("on_joint", [True, False])
+def test_three_point_bending_is_that_of_the_beam(on_joint):
+    ratio = damping.three_point(0.06, damping.SPAN_LINK, on_joint)
+    assert ratio == pytest.approx(1.0, abs=damping.SPAN_BOUND / 100)
+
+
+def test_drag_is_that_of_the_correlation_against_the_velocity_of_the_blood():
+    rig = Rig("diagnostic_5f_j", rotation=True)
+    blood = StillBlood()
+    rig.arena.mjcf_model.size.nuserdata = userdata_size([blood], rig.catheter)
+    rig.compile()
+    damping.fill(rig, blood)
+    model, data, rng = rig.model, rig.data, np.random.default_rng(1)
+    data.qpos[:], data.qvel[:] = rng.normal(0, 0.1, (2, model.nv))
+    flow = np.array([0.3, -0.2, 0.5])
+    blood.velocity[0] = flow
+    mujoco.mj_forward(model, data)
+    found = data.qfrc_passive - data.qfrc_spring - data.qfrc_damper
+    expected = np.zeros(model.nv)
+    for body, length in zip(
+        range(rig.tip_body + 1 - len(rig.lengths), rig.tip_body + 1),
+        rig.lengths,
+        strict=True,
+    ):
+        jacobian = np.zeros((3, model.nv))
+        mujoco.mj_jacBodyCom(model, data, jacobian, None, body)
+        axis = data.xmat[body].reshape(3, 3)[:, 2]
+        across = flow - jacobian @ data.qvel
+        across -= (across @ axis) * axis
+        speed = np.linalg.norm(across)
+        force = length * damping.drag(speed, 2 * rig.device.outer_radius)
+        expected += jacobian.T @ (force * across / speed)
+    np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-15)
+
+
+def test_blood_is_still_in_every_simulation_of_a_task():
+    options = {"randomisation": {"viscosity": (0.5, 2.0)}}
+    batch = BatchSimulation(suite.make_task("simple1_bca", **options), 2, seeds=0)
+    batch.reset()
+    user = batch.batch.userdata[:, 2:]
+    one, two = user[:, 2] / BLOOD_VISCOSITY
+    assert 0.5 <= min(one, two) < max(one, two) <= 2.0
+    assert not user[:, 4:].any()
