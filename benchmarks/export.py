@@ -30,7 +30,7 @@ success within 8 mm inside the branch); forces as in docs/forces.md.
 
 
 def export(
-    run: Annotated[str, tyro.conf.Positional],
+    run: Annotated[str | Path, tyro.conf.Positional],
     name: Annotated[str, tyro.conf.Positional],
     out: Path = pretrained.DIRECTORY,
     episodes: int = judgement.EPISODES,
@@ -48,9 +48,9 @@ def export(
         Path of the weights.
     """
     pretrained.require_name(name)
-    if run.startswith(pretrained.PREFIX):
-        path = pretrained.pretrained_path(run)
-        policy: Any = run
+    if str(run).startswith(pretrained.PREFIX):
+        path = pretrained.pretrained_path(str(run))
+        policy: Any = str(run)
         old, state, shapes, config = pretrained.read_pretrained(path)
         training = old["training"]
     else:
