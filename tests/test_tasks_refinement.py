@@ -27,9 +27,9 @@ def _deepest(steps):
 
 def test_an_impact_in_shorter_steps_is_not_as_deep(monkeypatch):
     deepest = forces.DEEPEST
-    assert _deepest(70) < deepest
+    assert _deepest(80) < deepest
     monkeypatch.setattr(forces, "DEEPEST", np.inf)
-    assert _deepest(70) > deepest
+    assert _deepest(80) > deepest
 
 
 @pytest.mark.parametrize(
