@@ -77,6 +77,8 @@ FLUOROSCOPY = {
 RANDOMISATION = {
     "friction": span(0, 2),
     "stiffness": span(0.01, 100),
+    "loss": span(0, 100),
+    "viscosity": span(0, 100),
     "start_radius": number(0, 0.02),
     "view": span(-90, 90),
     "gain": span(0.01, 100),

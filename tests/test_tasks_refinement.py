@@ -61,7 +61,7 @@ def test_without_a_contact_no_step_is_too_long():
     ],
 )
 def test_shorter_steps_are_equal_in_both_paths(task, options, monkeypatch):
-    monkeypatch.setattr(forces, "HARDEST", 1e-3)
+    monkeypatch.setattr(forces, "HARDEST", 2e-4)
     refined = []
     original = Stepper._refine
     monkeypatch.setattr(

@@ -199,7 +199,7 @@ def simulate(
         after = rods.at_joints(turns, gap)
         spin = (after - at) / CONTROL_TIMESTEP
         made = chain_fields.chain_properties(
-            entity, overlap, after, ones * 0, ones, spin, qpos
+            entity, overlap, after, ones * 0, ones, ones, spin, qpos
         )
         fields.write(arrays, made, 0)
         for _ in range(round(CONTROL_TIMESTEP / rig.model.opt.timestep)):
