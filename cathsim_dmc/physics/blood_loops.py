@@ -101,7 +101,7 @@ def install() -> None:
                 f"mjcb_passive is the Python function {before!r}, which compiled blood "
                 "cannot call; remove it with mujoco.set_mjcb_passive(None)"
             )
-        _TABLE[-1] = ctypes.cast(before, ctypes.c_void_p).value
+        _TABLE[-1] = ctypes.cast(before, ctypes.c_void_p).value or 0
     _TABLE[len(_MODEL) : -1] = native.offsets("mjData", _DATA)
     _TABLE[: len(_MODEL)] = native.offsets("mjModel", _MODEL)
     mujoco.set_mjcb_passive(_drag.ctypes)
