@@ -203,5 +203,7 @@ def test_points_that_are_not_finite_have_no_depth():
         return 0.01 - np.linalg.norm(blocks[:, None] + points, axis=-1)
 
     ball = Field.sampled(measure, np.full(3, -0.01), np.full(3, 0.01))
-    found = ball([[0.0, 0.0, 0.0], [np.nan, 0.0, 0.0], [0.0, np.inf, 0.0]])
+    points = [[0.0, 0.0, 0.009], [np.nan, 0.0, 0.0], [0.0, np.inf, 0.0]]
+    found, slope = ball(points), ball.gradient(points)
     assert found[0] > 0.0 and np.isnan(found[1:]).all()
+    assert slope[0, 2] == pytest.approx(-1.0, abs=0.1) and np.isnan(slope[1:]).all()

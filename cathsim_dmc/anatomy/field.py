@@ -82,14 +82,18 @@ class Field:
     def gradient(self, points: ArrayLike) -> Array:
         """Gradients (..., 3) of the depth at points (..., 3) m; open ends do not count.
 
-        They point away from the wall and change without jumps from cell to cell.
+        They point away from the wall and change without jumps from cell to cell; NaN
+        at points that are not finite.
         """
         from cathsim_dmc.anatomy.field_loops import gradients
 
         points = as_points(points)
         flat = np.ascontiguousarray(points.reshape(-1, 3))
-        out = np.empty(flat.shape)
-        gradients(*self.arrays, flat, _STEP, out)
+        out = np.full(flat.shape, np.nan)
+        fine = np.isfinite(flat).all(axis=1)
+        found = np.empty((fine.sum(), 3))
+        gradients(*self.arrays, flat[fine], _STEP, found)
+        out[fine] = found
         return out.reshape(points.shape)
 
     @property
