@@ -243,7 +243,7 @@ def test_imports_leave_the_environment_as_it_is():
         "import cathsim_dmc.agents\n"
         "loaded = list(sys.modules)\n"
         "assert loaded.index('torchrl') < loaded.index('dm_control')\n"
-        "import ray, rerun, tyro\n"
+        "import rerun, tyro\n"
         "before = dict(os.environ)\n"
         "import cathsim_dmc.suite, cathsim_dmc.cli\n"
         "import cathsim_dmc.recording.viewer, cathsim_dmc.simulation.torchrl\n"
