@@ -23,7 +23,7 @@ def main():
     )
     report = json.loads(result.stdout)
     lines = [
-        f"Measured on {datetime.date.today()}, 2 cores of an AMD EPYC server:",
+        f"Measured on {datetime.date.today()}, 2 shared cores of an Intel Xeon server:",
         "",
         "| figure | measured | bar | |",
         "|---|---|---|---|",

@@ -1,8 +1,9 @@
-"""Runs the validations and rewrites the tables and figures of docs/validation.md.
+"""Runs the validations and rewrites their tables and figures.
 
 ``python docs/scripts/validation.py [rod] [pair] [wall] [forces] [--phantom DIRECTORY]``
 
-Each part is written, with its date, as soon as it has ended; of pair the figure alone.
+Each part is written into docs/validation.md, pair into docs/pair.md, with its date,
+as soon as it has ended.
 """
 
 import argparse
@@ -18,7 +19,7 @@ from rich.console import Console
 from cathsim_dmc import files, validation
 
 DOCS = pathlib.Path(__file__).parents[1]
-PAGE = DOCS / "validation.md"
+PAGE, PAIR = DOCS / "validation.md", DOCS / "pair.md"
 IMAGES = DOCS / "images"
 MACHINE = "2 shared cores of an Intel Xeon server"
 
@@ -80,15 +81,17 @@ def convergence(report) -> str:
 
 
 def write(name: str, report, machine: str) -> None:
-    """Put a report and its date into the page."""
-    text = PAGE.read_text(encoding="utf-8")
+    """Put a report and its date into its page."""
+    page = PAIR if name == "pair" else PAGE
+    text = page.read_text(encoding="utf-8")
     text = between(text, name, checks(report))
-    text = between(text, f"{name} findings", findings(report))
+    if name != "pair":
+        text = between(text, f"{name} findings", findings(report))
     if name == "wall":
         text = between(text, "convergence", convergence(report))
     when = f"Measured on {datetime.date.today().isoformat()}, {machine}.\n"
     text = between(text, f"{name} when", when)
-    files.write_text(PAGE, text)
+    files.write_text(page, text)
 
 
 def main() -> int:
@@ -114,8 +117,7 @@ def main() -> int:
         validation_figures.draw(name, report, IMAGES / f"validation_{name}.png")
         Console().print(report.table())
         print(f"{name}: {time.time() - start:.0f} s", flush=True)
-        if name != "pair":
-            write(name, report, arguments.machine)
+        write(name, report, arguments.machine)
         reports[name] = report
     if arguments.json:
         everything = {name: report.as_dict() for name, report in reports.items()}
