@@ -247,3 +247,22 @@ def test_axes_turn_a_lying_scan(y_mesh, tmp_path):
     for axes, match in (("LPX", "three letters"), ("LLS", "twice"), ("RPS", "mirror")):
         with pytest.raises(ValueError, match=match):
             upright(axes)
+
+
+@pytest.mark.parametrize("form", [str, np.array])
+def test_axes_take_any_rotation(form):
+    """The nearest rotation to rounded directions of left, back and head."""
+    numbers = "-0.5,0,0.87,-0.87,0,-0.5,0,-1,0"
+    turn = upright(numbers if form is str else np.fromstring(numbers, sep=","))
+    np.testing.assert_allclose(turn @ turn.T, np.eye(3), atol=1e-12)
+    np.testing.assert_allclose(turn @ (0, -1, 0), (0, 0, 1), atol=1e-12)
+    np.testing.assert_allclose(turn[0], (-0.5, 0, 0.87), atol=5e-3)
+    bad = {
+        "1,0,0,0,1,0": "nine numbers",
+        "1,0,0,0,1,0,0,0,nan": "nine numbers",
+        "1,0,0,0.5,1,0,0,0,1": "right angles",
+        "1,0,0,0,1,0,0,0,-1": "mirror",
+    }
+    for axes, match in bad.items():
+        with pytest.raises(ValueError, match=match):
+            upright(axes)

@@ -38,8 +38,9 @@ def import_phantom(
         name: Name of the anatomy.
         units: Unit of mesh, CSV centrelines and inlet; guessed if not given.
         frame: Frame of mesh, CSV centrelines and inlet.
-        axes: Where +x, +y and +z of that frame point in the patient, for a scan that
-            does not stand upright: three of L, R, A, P, S, I, such as ILA.
+        axes: Of a scan that does not stand upright: where +x, +y and +z of that frame
+            point in the patient, three of L, R, A, P, S, I, such as ILA; or nine
+            numbers, the patient's left, back and head as directions in that frame.
         inlet: Where the device enters: a free end, or a place to cut the lumen at.
         rename: Names of computed branches, each as computed=wanted.
     """

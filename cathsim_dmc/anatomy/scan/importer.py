@@ -9,6 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from cathsim_dmc import bounds
 from cathsim_dmc.anatomy.anatomy import Anatomy
@@ -58,7 +59,7 @@ def import_scan(
     *,
     units: str | None = None,
     mesh_frame: str = "LPS",
-    axes: str | None = None,
+    axes: str | ArrayLike | None = None,
     name: str | None = None,
     inlet: Sequence[float] | None = None,
     root: str = ROOT,
@@ -76,8 +77,8 @@ def import_scan(
         units: of the mesh, of tables and of ``inlet``: "mm", "cm" or "m"; None
             guesses by the width of the lumen, and says so.
         mesh_frame: "LPS" or "RAS", of the mesh, of tables and of ``inlet``.
-        axes: where +x, +y and +z of that frame point in the patient, if the scan does
-            not stand upright, such as "ILA"; see ``units.upright``.
+        axes: how that frame is turned in the patient, if the scan does not stand
+            upright, such as "ILA", or nine numbers; see ``units.upright``.
         name: of the anatomy, by default the mesh file's.
         inlet: (x, y, z) where the device enters: a free end if one is near, else the
             lumen is cut there. By default the end at which the centrelines start,

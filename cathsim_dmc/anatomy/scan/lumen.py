@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from cathsim_dmc.anatomy.parts import Surface
 from cathsim_dmc.anatomy.scan.mesh import guess_units, read_triangles
@@ -37,7 +38,7 @@ def read_lumen(
     path: str | Path,
     units: str | None = None,
     frame: str = "LPS",
-    axes: str | None = None,
+    axes: str | ArrayLike | None = None,
     say: Callable[[str], None] = lambda text: None,
 ) -> Lumen:
     """Read the surface of a lumen and mend it.
@@ -48,7 +49,7 @@ def read_lumen(
         units: of its coordinates, a key of ``units.UNITS``, or None to guess by the
             lumen's width.
         frame: "LPS" or "RAS".
-        axes: where +x, +y and +z of the scan point if it does not stand upright; see
+        axes: how the scan is turned if it does not stand upright; see
             ``units.upright``.
         say: called with a line of text for every step.
 
