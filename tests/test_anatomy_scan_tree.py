@@ -333,3 +333,14 @@ def test_generated_arches_are_proved_too():
 
     found = failed(arch.load("simple1"))
     assert found.keys() <= {"start of the device"}
+
+
+def test_the_aorta_has_its_radius(arch_scan, computed):
+    """Neither smoothing over the bend nor the smallest reach makes it narrower."""
+    truth = arch_scan[1].root.centreline
+    line = computed[0].tree.root.centreline
+    near = truth.project(line.points)
+    inner = (near.arc_length > 15e-3) & (near.arc_length < truth.length - 15e-3)
+    error = (line.radii - near.radius)[inner]
+    assert np.median(np.abs(error)) < 0.2e-3, np.median(error)
+    assert np.median(near.distance[inner]) < 0.4e-3

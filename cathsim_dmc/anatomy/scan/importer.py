@@ -90,8 +90,8 @@ def import_scan(
         notes: list to which what was guessed, mended and left out is added.
 
     Returns:
-        The anatomy, in metres, LPS. Radii are those of the largest sphere in the
-        mesh at each place of a centreline that was moved to the lumen's middle.
+        The anatomy, in metres, LPS. Radii are those of the lumen's sections
+        along centrelines that were moved to its middle; see `centring.section_radii`.
 
     Raises:
         FileNotFoundError: if a file is missing.

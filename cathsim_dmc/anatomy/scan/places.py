@@ -30,8 +30,8 @@ def place_inlet(tree: VesselTree, at_end: bool) -> tuple[VesselTree, Inlet]:
         near = line.arc_length <= min(INLET_SEARCH, 0.3 * line.length)
         wide = INLET_WIDTH * np.median(line.radii[near])
         first = int((line.radii >= wide).argmax())
-        # One radius more, because a vessel's end may be cut off at a slant.
-        start = float(line.arc_length[first] + line.radii[first])
+        # Further by that width, because a vessel's end may be cut off at a slant.
+        start = float(line.arc_length[first] + INLET_WIDTH * line.radii[first])
     if start > 0.0:
         line = line.slice(start, line.length)
     place = line.at(0.0)

@@ -12,7 +12,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from cathsim_dmc.anatomy.centreline import Centreline, Vessel, VesselTree
-from cathsim_dmc.anatomy.scan.centring import STEP, centred, resample
+from cathsim_dmc.anatomy.scan.centring import STEP, centred, resample, section_radii
 from cathsim_dmc.anatomy.scan.ways import Ways
 from cathsim_dmc.anatomy.surface_depth import SurfaceDepth
 
@@ -164,7 +164,8 @@ def _finish(
     narrow = np.nonzero(depth[tail:] < TAIL_RADIUS)[0]
     if narrow.size:
         points, depth = points[: tail + narrow[0]], depth[: tail + narrow[0]]
-    return Centreline(points, np.maximum(depth, MIN_RADIUS))
+    radii = section_radii(field, points)
+    return Centreline(points, np.maximum(radii, MIN_RADIUS))
 
 
 def ostium_of(line: Centreline, trunk: Centreline) -> float:
