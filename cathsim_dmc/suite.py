@@ -157,13 +157,18 @@ def make_task(
         chosen["farthest_shift"] = config.ranges.farthest_shift
     goals = [placement.resolve_goal(anatomy, goal) for anatomy in anatomies]
     config = _one_length(config, anatomies, goals)
-    scenes = []
-    for anatomy, place in zip(anatomies, goals, strict=True):
-        objective = definition.objective(anatomy, place, **chosen)
-        scene = Scene.build(anatomy, place, config, goal_radius=objective.goal_radius)
-        scenes.append((scene, objective))
-    scene, objective = scenes[0]
-    return Navigation(scene, objective, config, random, others=scenes[1:], name=name)
+
+    def room(number: int) -> tuple[Scene, Objective]:
+        anatomy, goal = anatomies[number], goals[number]
+        objective = definition.objective(anatomy, goal, **chosen)
+        radius, drawn = objective.goal_radius, number == 0
+        return (
+            Scene.build(anatomy, goal, config, goal_radius=radius, drawn=drawn),
+            objective,
+        )
+
+    others = map(room, range(1, len(anatomies)))
+    return Navigation(*room(0), config, random, others=others, name=name)
 
 
 def _one_length(

@@ -1,8 +1,11 @@
 """The anatomy container."""
 
+import pickle
+
 import numpy as np
 import pytest
 
+from cathsim_dmc import suite
 from cathsim_dmc.anatomy.anatomy import Anatomy
 from cathsim_dmc.anatomy.arch import arch
 from cathsim_dmc.anatomy.parts import Goal, Inlet, Surface
@@ -19,6 +22,12 @@ def test_route_starts_at_the_inlet_and_ends_at_the_goal(anatomy):
     goal = anatomy.goal("lcca").position
     np.testing.assert_allclose(route.points[-1], goal, atol=1e-9)
     assert anatomy.depth(route.points[1:-1]).min() > 0.0
+
+
+def test_triangles_of_a_tree_are_built_when_they_are_asked_for():
+    (arch,) = suite.load_arches(pool=1, first=40)
+    assert "vertices" not in vars(arch.surface)
+    assert pickle.loads(pickle.dumps(arch)).surface.volume == arch.surface.volume > 0
 
 
 def test_names_and_shapes_are_checked(anatomy):

@@ -1,5 +1,7 @@
 """The cache of fields: found by content, whole or not at all."""
 
+import copy
+
 import numpy as np
 import pytest
 
@@ -43,6 +45,21 @@ def test_a_field_is_built_once_and_read_as_it_was(folder):
     assert first is not again and first.digest == again.digest
     for one, other in zip(first.arrays, again.arrays, strict=True):
         assert one.dtype == other.dtype and one.shape == other.shape
+
+
+def test_a_cached_field_lies_in_its_file(folder):
+    ends = [End("root", np.zeros(3), -UP, 4e-3, True)]
+    fields = [field_cache.tree_field(tube(), ends) for _ in range(2)]
+    points = np.random.default_rng(0).uniform(-5e-3, 5e-3, (50, 3))
+    built = Field.from_tree(tube(), ends)
+    for field in fields:
+        assert built.pages is None and field.pages is not None
+        assert np.shares_memory(field.samples, field.pages)
+        with_hole, copied = field.with_hole(1e-3), copy.deepcopy(field)
+        field.release(), copied.release()
+        np.testing.assert_array_equal(copied(points), built(points))
+        np.testing.assert_array_equal(field(points), built(points))
+        assert with_hole.digest == built.with_hole(1e-3).digest != field.digest
 
 
 def test_lumen_and_ends_count(built):

@@ -237,6 +237,13 @@ def test_bad_pools_are_refused_before_anything_is_built(options):
         suite.make_task("arch_bca", **options)
 
 
+def test_all_cases_share_the_entities(plain_pair):
+    scenes = [case.scene for case in plain_pair.batch.task._cases]
+    assert [scene.anatomy.name for scene in scenes] == names()
+    for scene in scenes[1:]:
+        assert scene.arena is scenes[0].arena and scene.sheath is scenes[0].sheath
+
+
 def test_cameras_of_one_model_are_refused(plain_pair):
     task = plain_pair.batch.task
     room, config = (task.scene, task.objective), NavigationConfig(observation="rgb")
@@ -250,7 +257,7 @@ def test_anatomies_with_other_goals_are_refused():
         for anatomy in ("simple1", arch.build_seed(arch.arch_set("test_variants")[3]))
     ]
     with pytest.raises(ValueError, match="take turns"):
-        cases.compile_together([t.scene for t in tasks], [t.objective for t in tasks])
+        cases.compile_together([(t.scene, t.objective) for t in tasks], 4e-3)
 
 
 # Number 4 of "train" bends back across the straight sheath: the device stood 45 mm

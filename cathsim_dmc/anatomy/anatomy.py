@@ -102,12 +102,12 @@ class Anatomy:
             ValueError: if the centrelines give no valid lumen, or a place is not on
                 its vessel; names the vessel.
         """
-        from cathsim_dmc.anatomy.surface import lumen_surface
+        from cathsim_dmc.anatomy.surface import TubeSurface
 
         if not isinstance(tree, VesselTree):
             tree = smooth_tree(tree, **smoothing)
         tree, ends, entry, places = builder.placed(tree, inlet, goals)
-        return cls(name, tree, lumen_surface(tree), entry, places, ends)
+        return cls(name, tree, TubeSurface(tree), entry, places, ends)
 
     @cached_property
     def lumen(self) -> Field:

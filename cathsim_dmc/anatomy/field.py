@@ -10,6 +10,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike
 
+from cathsim_dmc import file_maps
 from cathsim_dmc.anatomy.centreline import Array, VesselTree
 from cathsim_dmc.anatomy.parts import End, Surface
 from cathsim_dmc.anatomy.segments import as_points
@@ -51,12 +52,14 @@ class Field:
         coarse: ((a + 1)(b + 1)(c + 1),) int16, depths at the corners of the bricks.
         index: (a b c,) int32, first place of a brick in `samples`, -1 for none.
         samples: int16; of each brick the cells n along its edge and (n + 1)^3 depths.
+        pages: the mapped file that the arrays lie in, if there is one.
     """
 
     head: Array
     coarse: np.ndarray
     index: np.ndarray
     samples: np.ndarray
+    pages: np.ndarray | None = None
 
     def __call__(self, points: ArrayLike, free: bool = False) -> Array:
         """Depths (...) m at points (..., 3) m; NaN at points that are not finite.
@@ -112,12 +115,17 @@ class Field:
         return self.head[:3], self.head[:3] + self.head[3] * self.head[4:7]
 
     @cached_property
+    def body(self) -> bytes:
+        """SHA-256 of the arrays but for the head."""
+        joined = hashlib.sha256()
+        for array in self.arrays[1:]:
+            joined.update(np.ascontiguousarray(array).data)
+        return joined.digest()
+
+    @property
     def digest(self) -> bytes:
         """SHA-256 of the arrays."""
-        joined = hashlib.sha256()
-        for array in self.arrays:
-            joined.update(array.tobytes())
-        return joined.digest()
+        return hashlib.sha256(self.head.tobytes() + self.body).digest()
 
     def with_hole(self, radius: float) -> Field:
         """The same lumen with flat caps over its open ends, but for a hole (m) each."""
@@ -125,7 +133,18 @@ class Field:
 
         head = self.head.copy()
         head[FIRST_END + END - 1 :: END] = radius
-        return replace(self, head=head)
+        field = replace(self, head=head)
+        vars(field)["body"] = self.body
+        return field
+
+    def release(self) -> None:
+        """Gives back memory that can be read again from the file it is mapped from."""
+        if self.pages is not None:
+            file_maps.release(self.pages)
+
+    def __getstate__(self) -> dict[str, object]:
+        """What copies hold: arrays in memory of their own."""
+        return {**vars(self), "pages": None}
 
     def __repr__(self) -> str:
         """Bricks and memory."""

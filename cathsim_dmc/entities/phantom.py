@@ -12,6 +12,7 @@ MOST_CONTACTS = 4
 CONTACT_FIELDS = ("found", "force", "dist", "pos", "normal", "tangent")
 
 _LUMEN_COLOUR = (0.8, 0.25, 0.25, 0.25)
+_UNSEEN = 1e-4  # m
 _GOAL_COLOUR = (0.1, 0.7, 0.3, 0.5)
 
 
@@ -23,6 +24,7 @@ class Phantom(composer.Entity):
         anatomy: Anatomy,
         friction: float = FRICTION,
         goal_radius: float = 8e-3,
+        drawn: bool = True,
         name: str = "phantom",
     ):
         """Builds the wall.
@@ -31,6 +33,8 @@ class Phantom(composer.Entity):
             anatomy: lumen and goals.
             friction: Coulomb coefficient of the device on the wall.
             goal_radius: radius of the goal sites, m.
+            drawn: whether its surface is there to be seen; a point stands for it if
+                not, so that the models have as many geoms.
             name: name of the entity.
         """
         if not 0 <= friction <= 2:
@@ -39,7 +43,7 @@ class Phantom(composer.Entity):
         self._mjcf_root = mjcf.RootElement(model=name)
         self._body = self._mjcf_root.worldbody.add("body", name="wall")
         self._friction = friction
-        self._add_surface()
+        self._add_surface(drawn)
         self._goals = {
             goal.name: self._body.add(
                 "site",
@@ -52,24 +56,26 @@ class Phantom(composer.Entity):
             for goal in anatomy.goals.values()
         }
 
-    def _add_surface(self):
-        surface = self._anatomy.surface
-        self._mjcf_root.asset.add(
-            "mesh",
-            name="lumen",
-            file=_mesh_file(surface.vertices, surface.faces),
-            inertia="shell",
-        )
+    def _add_surface(self, drawn: bool):
+        shape = {"type": "sphere", "size": [_UNSEEN]}
+        if drawn:
+            surface = self._anatomy.surface
+            self._mjcf_root.asset.add(
+                "mesh",
+                name="lumen",
+                file=_mesh_file(surface.vertices, surface.faces),
+                inertia="shell",
+            )
+            shape = {"type": "mesh", "mesh": "lumen"}
         self._surface = self._body.add(
             "geom",
             name="lumen",
-            type="mesh",
-            mesh="lumen",
+            **shape,
             contype=0,
             conaffinity=0,
             mass=0,
             group=2,
-            rgba=_LUMEN_COLOUR,
+            rgba=_LUMEN_COLOUR if drawn else (0, 0, 0, 0),
         )
 
     def add_wall(self, device_body, hole: float = np.inf) -> None:

@@ -339,10 +339,13 @@ class _PoolStepper(_BatchStepper):
                 case.write(self._models[index])
                 self._loaded[index] = case
             return
-        if case not in self._loaded:
-            self._loaded[case] = copy.copy(self.batch.model)
-            case.write(self._loaded[case])
-        self._models[index] = self._loaded[case]
+        model = self._loaded.get(case)
+        if model is None:
+            model = copy.copy(self.batch.model)
+            case.write(model)
+        self._models[index] = self._loaded[case] = model
+        kept = set(map(id, self._models))
+        self._loaded = {c: m for c, m in self._loaded.items() if id(m) in kept}
 
     def _change(
         self, indices: np.ndarray, option: str, change: Callable[[Any], Any]

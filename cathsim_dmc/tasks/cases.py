@@ -7,7 +7,7 @@ everything that was bound to the model stays bound.
 """
 
 import functools
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Sequence
 
 import mujoco
 import numpy as np
@@ -22,14 +22,11 @@ from cathsim_dmc.tasks.start import StartPosture
 
 # Of mjStatistic; the mean inertia scales the tolerance of the solver.
 _STATISTICS = ("meaninertia", "meanmass", "meansize", "extent", "center")
-# Arrays over meshes: a model may have more of them than it uses.
 # Arrays of the mesh of the surface, which stays that of the first anatomy, and of the
 # tree of its triangles, which follows those of the bodies.
 _OF_MESH, _TREES = "mesh_", "bvh_"
-_UNSEEN = 1e-4  # m, size of what stands for the surface of any other
 
-
-Fields = Mapping[str, np.ndarray]
+Fields = dict[str, np.ndarray]
 
 
 class Case:
@@ -51,7 +48,8 @@ class Case:
             objective: Success and reward.
             model: The compiled scene.
             fluoroscopy: Set-up of the angiography machine, None for no machine.
-            fields: What `write` writes, by name in MuJoCo's model.
+            fields: What `write` writes beside the statistics, by its name in MuJoCo's
+                model.
             start_along_route: As in `NavigationConfig`.
         """
         self.scene = scene
@@ -60,15 +58,15 @@ class Case:
         devices_of(scene.catheter).settle(model)
         self.start = StartPosture(scene, model, index, start_along_route)
         self._fluoroscopy = fluoroscopy
-        self._fields = fields or {}
+        self.fields = fields or {}
+        self._statistics = {n: np.copy(getattr(model.stat, n)) for n in _STATISTICS}
 
     def write(self, model: mujoco.MjModel) -> None:
         """Puts the anatomy into a model of the task, in place of the one in it."""
-        for name, value in self._fields.items():
-            if name in _STATISTICS:
-                setattr(model.stat, name, value)
-            else:
-                getattr(model, name)[: len(value)] = value
+        for name, value in self._statistics.items():
+            setattr(model.stat, name, value)
+        for name, value in self.fields.items():
+            getattr(model, name)[: len(value)] = value
 
     @functools.cached_property
     def angiograph(self) -> Angiograph | None:
@@ -78,11 +76,6 @@ class Case:
         surface = self.scene.anatomy.surface
         return Angiograph(surface.vertices, surface.faces, self._fluoroscopy)
 
-    @property
-    def nbytes(self) -> int:
-        """Memory of the fields that `write` writes, bytes."""
-        return sum(np.asarray(value).nbytes for value in self._fields.values())
-
 
 def model_index(scene: Scene, model: mujoco.MjModel) -> ModelIndex:
     """Places of a task's quantities in a compiled scene."""
@@ -90,72 +83,67 @@ def model_index(scene: Scene, model: mujoco.MjModel) -> ModelIndex:
 
 
 def compile_together(
-    scenes: Sequence[Scene],
-    objectives: Sequence[Objective],
+    rooms: Iterable[tuple[Scene, Objective]],
+    physics_timestep: float,
     fluoroscopy: FluoroscopyOptions | None = None,
     start_along_route: Sequence[float] | None = None,
 ) -> tuple[Case, ...]:
     """Compiles scenes so that any of them can be written into a model of the first.
 
-    The first scene alone is drawn with its surface: a model holds one mesh of it.
+    One scene is held at a time: a case has the entities of the first one.
 
     Args:
-        scenes: Scenes of one device, not compiled yet.
-        objectives: Success and reward in each of them.
+        rooms: Scenes of one device, not compiled yet, with success and reward in each;
+            the first one alone is drawn.
+        physics_timestep: s.
         fluoroscopy: Set-up of the angiography machines, None for none.
         start_along_route: As in `NavigationConfig`.
 
     Raises:
         ValueError: if the scenes differ in more than wall and places.
     """
-    host, *models = (_compiled(scene, scene is scenes[0]) for scene in scenes)
-    fields = _differences(host, models, [scene.anatomy.name for scene in scenes])
-    return tuple(
-        Case(scene, objective, model, fluoroscopy, own, start_along_route)
-        for scene, objective, model, own in zip(
-            scenes, objectives, (host, *models), fields, strict=True
-        )
-    )
-
-
-def _compiled(scene: Scene, drawn: bool) -> mujoco.MjModel:
-    """The model of a scene, with the mesh of its surface or with nothing there."""
-    root = scene.arena.mjcf_model
-    spec = mujoco.MjSpec.from_string(root.to_xml_string(), assets=root.get_assets())
-    if not drawn:
-        geom = spec.geom(scene.phantom.surface.full_identifier)
-        mesh = spec.mesh(geom.meshname)
-        geom.meshname, geom.type = "", mujoco.mjtGeom.mjGEOM_SPHERE
-        geom.size, geom.rgba = [_UNSEEN, 0, 0], [0, 0, 0, 0]
-        spec.delete(mesh)
-    return spec.compile()
+    found: list[Case] = []
+    sizes: dict[str, int] = {}  # of all that differs in any of them
+    first, host = None, None
+    for scene, objective in rooms:
+        root = scene.arena.mjcf_model
+        root.option.timestep = physics_timestep
+        spec = mujoco.MjSpec.from_string(root.to_xml_string(), assets=root.get_assets())
+        model, fields = spec.compile(), {}
+        if first is None or host is None:
+            first, host = scene, model
+        else:
+            fields = _differences(host, model, scene, first)
+            sizes |= {name: len(value) for name, value in fields.items()}
+        case = Case(scene, objective, model, fluoroscopy, fields, start_along_route)
+        case.scene = first.in_anatomy(scene)
+        scene.anatomy.lumen.release()
+        found.append(case)
+    for case in found:
+        for name, size in sizes.items():
+            case.fields.setdefault(name, getattr(host, name)[:size].copy())
+    return tuple(found)
 
 
 def _differences(
-    host: mujoco.MjModel, models: Sequence[mujoco.MjModel], names: Sequence[str]
-) -> list[Fields]:
-    """What to write into the host for itself and each model; the same for all."""
-    differing = {}
+    host: mujoco.MjModel, model: mujoco.MjModel, scene: Scene, first: Scene
+) -> Fields:
+    """What of a model differs from the host, and its statistics."""
+    names = f"{scene.anatomy.name!r} cannot take turns with {first.anatomy.name!r}"
+    fields: Fields = {}
     for name in _array_names(host):
-        room = getattr(host, name)
-        values = [getattr(model, name) for model in models]
-        size = len(values[0]) if name.startswith(_TREES) else len(room)
-        for value, anatomy in zip(values, names[1:], strict=True):
-            if value.shape != (size, *room.shape[1:]):
-                raise ValueError(
-                    f"{anatomy!r} cannot take turns with {names[0]!r}: {name} has the "
-                    f"shape {value.shape}, and {room.shape} there; give anatomies with "
-                    "as many goals, and one device of one length"
-                )
-        if not all(np.array_equal(room[:size], value) for value in values):
-            differing[name] = size
-    for model, anatomy in zip(models, names[1:], strict=True):
-        _check_names(host, model, anatomy)
-    return [
-        {name: getattr(model, name)[:size].copy() for name, size in differing.items()}
-        | {name: np.copy(getattr(model.stat, name)) for name in _STATISTICS}
-        for model in (host, *models)
-    ]
+        room, value = getattr(host, name), getattr(model, name)
+        size = len(value) if name.startswith(_TREES) else len(room)
+        if value.shape != (size, *room.shape[1:]) or size > len(room):
+            raise ValueError(
+                f"{names}: {name} has the shape {value.shape}, and {room.shape} "
+                "there; give anatomies with as many goals, one device of one length, "
+                "and scenes after the first that are not drawn"
+            )
+        if not np.array_equal(room[:size], value):
+            fields[name] = value.copy()
+    _check_names(host, model, names)
+    return fields
 
 
 def _array_names(model: mujoco.MjModel) -> list[str]:
@@ -168,7 +156,7 @@ def _array_names(model: mujoco.MjModel) -> list[str]:
     ]
 
 
-def _check_names(host: mujoco.MjModel, model: mujoco.MjModel, anatomy: str) -> None:
+def _check_names(host: mujoco.MjModel, model: mujoco.MjModel, names: str) -> None:
     """Raises if what has a number in one model has another one in the other."""
     for kind, count in (
         ("body", model.nbody),
@@ -183,7 +171,6 @@ def _check_names(host: mujoco.MjModel, model: mujoco.MjModel, anatomy: str) -> N
             ours = getattr(host, kind)(index).name
             if theirs != ours:
                 raise ValueError(
-                    f"{anatomy!r} cannot take turns with the first anatomy: {kind} "
-                    f"{index} is {theirs!r}, and {ours!r} there; give anatomies with "
-                    "the same goals"
+                    f"{names}: {kind} {index} is {theirs!r}, and {ours!r} there; give "
+                    "anatomies with the same goals"
                 )

@@ -1,6 +1,7 @@
 """Navigation of a catheter through an anatomy, as a composer task."""
 
-from collections.abc import Mapping, Sequence
+import itertools
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 import dm_env.specs
@@ -45,7 +46,7 @@ class Navigation(composer.Task):
         objective: Objective,
         config: NavigationConfig | None = None,
         random: np.random.RandomState | int | None = None,
-        others: Sequence[tuple[Scene, Objective]] = (),
+        others: Iterable[tuple[Scene, Objective]] = (),
         name: str | None = None,
     ):
         """Takes over the scene.
@@ -55,9 +56,9 @@ class Navigation(composer.Task):
             objective: Success and reward.
             config: Options; those that shape the scene must be the scene's.
             random: Seed or source of randomness of the environment.
-            others: Scenes and objectives beside the first, if each episode is to draw
-                one of them: another anatomy, with the same device and goals of the same
-                names. All are compiled here, which takes a second each.
+            others: Scenes that are not drawn, and objectives, beside the first, if each
+                episode is to draw one of them: another anatomy, with the same device
+                and goals of the same names. All are compiled here, one after the other.
             name: Name of the task for people; None takes the class's.
 
         Raises:
@@ -80,23 +81,25 @@ class Navigation(composer.Task):
         self._fluoroscopy = None
         if observations.needs(self._names, "fluoroscopic"):
             self._fluoroscopy = config.fluoroscopy_options
+        rooms = iter(others)
+        second = next(rooms, None)
         if set(cameras.KINDS) & set(self._names):
-            if others:
+            if second is not None:
                 raise ValueError(
                     f"the observation {config.observation!r} needs MuJoCo's cameras, "
-                    "which show one anatomy only, and this task draws from "
-                    f"{1 + len(others)}; observe image, sequential or segmentation, or "
-                    "make the task with pool=1"
+                    "which show one anatomy only, and this task draws from several; "
+                    "observe image, sequential or segmentation, or make the task with "
+                    "pool=1"
                 )
             cameras.add_tip_camera(scene.arena, scene.catheter)
         self.set_timesteps(CONTROL_TIMESTEP, config.physics_timestep)
         self._cases: tuple[cases.Case, ...] = ()
-        if others:
-            scenes, objectives = zip((scene, objective), *others, strict=True)
-            for each in scenes:
-                each.arena.mjcf_model.option.timestep = config.physics_timestep
+        if second is not None:
             self._cases = cases.compile_together(
-                scenes, objectives, self._fluoroscopy, config.start_along_route
+                itertools.chain([(scene, objective), second], rooms),
+                config.physics_timestep,
+                self._fluoroscopy,
+                config.start_along_route,
             )
         self._rollout: Rollout  # there once the model is compiled
         self._observables = None

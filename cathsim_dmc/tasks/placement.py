@@ -241,10 +241,10 @@ def _frame(direction: np.ndarray) -> np.ndarray:
     return np.concatenate([[0.0], vectors[:, np.argmax(values)]])
 
 
-def add_cameras(scene: arena.AngiographyArena, anatomy: Anatomy) -> None:
-    """Adds the published top view and a view from the side."""
-    vertices = anatomy.surface.vertices
-    low, high = vertices.min(0), vertices.max(0)
+def add_cameras(
+    scene: arena.AngiographyArena, low: np.ndarray, high: np.ndarray
+) -> None:
+    """Adds the published top view and a view from the side of a box (3,), (3,) m."""
     centre, size = (low + high) / 2, float((high - low).max())
     distance = 2.6 * size
     # Seen from the front, the patient's left is on the right of the image.

@@ -163,6 +163,7 @@ class Rollout:
     def _draw(self, index: int, random_state: np.random.RandomState) -> None:
         """Draws the episode of one simulation and puts its device to the start."""
         if len(self._cases) > 1:
+            self.case(index).scene.anatomy.lumen.release()
             self._case_of[index] = random_state.randint(len(self._cases))
             self._stepper.load(index, self.case(index))
         case = self.case(index)

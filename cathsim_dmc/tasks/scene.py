@@ -33,6 +33,7 @@ class Scene:
     """Entities of a task, attached to the arena.
 
     Attributes:
+        anatomy: lumen, wall and goals.
         goal: where the device is to go.
         placement: where device, sheath and robot stand.
         arena: the root, with light and the density of blood.
@@ -42,6 +43,7 @@ class Scene:
         robot: the follower, which moves along with the device.
     """
 
+    anatomy: Anatomy
     goal: Goal
     placement: placement.Placement
     arena: AngiographyArena
@@ -63,6 +65,7 @@ class Scene:
         catheter: Chain | None = None,
         sheath: Sheath | None = None,
         robot: Robot | None = None,
+        drawn: bool = True,
     ) -> "Scene":
         """Builds the entities that are not given, and attaches all to the arena.
 
@@ -76,6 +79,7 @@ class Scene:
             catheter: Device of one's own; it must reach the goal.
             sheath: Introducer sheath of one's own.
             robot: Follower of one's own.
+            drawn: Whether the surface of the lumen is there to be seen.
         """
         goal = placement.resolve_goal(anatomy, goal)
         chosen = chosen_devices(config) if catheter is None else catheter.devices
@@ -88,11 +92,12 @@ class Scene:
         catheter = catheter or _chain(chosen, place, config)
         radius = catheter.device.outer_radius
         scene = cls(
+            anatomy=anatomy,
             goal=goal,
             placement=place,
             arena=arena or AngiographyArena(device_density=catheter.density),
             phantom=phantom
-            or Phantom(anatomy, config.friction, goal_radius=goal_radius),
+            or Phantom(anatomy, config.friction, goal_radius=goal_radius, drawn=drawn),
             catheter=catheter,
             sheath=sheath
             or Sheath(
@@ -102,7 +107,18 @@ class Scene:
             robot=robot or Robot(device_radius=radius),
         )
         scene._attach(effects.userdata_size(config.effects_on(catheter), catheter))
+        box = anatomy.lumen.box
+        if drawn:
+            vertices = anatomy.surface.vertices
+            box = vertices.min(0), vertices.max(0)
+        placement.add_cameras(scene.arena, *box)
         return scene
+
+    def in_anatomy(self, other: "Scene") -> "Scene":
+        """These entities, in the anatomy and at the places of another scene."""
+        return dataclasses.replace(
+            self, anatomy=other.anatomy, goal=other.goal, placement=other.placement
+        )
 
     def _attach(self, user_data: int):
         if user_data:
@@ -127,17 +143,11 @@ class Scene:
         self.phantom.add_wall(
             self.catheter.links[0], self.sheath.bore_radius + _AROUND_SHEATH
         )
-        placement.add_cameras(self.arena, self.anatomy)
 
     @property
     def coaxial(self) -> bool:
         """Whether the devices are coaxial ones, each moved by itself."""
         return self.catheter.coaxial
-
-    @property
-    def anatomy(self) -> Anatomy:
-        """Lumen, wall and goals."""
-        return self.phantom.anatomy
 
     @property
     def device(self) -> devices.Device:
