@@ -13,6 +13,7 @@ from synthetic_scans import marched, write_obj, y_tree
 from cathsim_dmc.anatomy.parts import Surface
 from cathsim_dmc.anatomy.scan.lumen import read_lumen
 from cathsim_dmc.anatomy.scan.mesh import read_triangles
+from cathsim_dmc.anatomy.scan.repair import mend
 from cathsim_dmc.anatomy.scan.topology import edge_counts
 from cathsim_dmc.anatomy.scan.units import upright
 
@@ -266,3 +267,30 @@ def test_axes_take_any_rotation(form):
     for axes, match in bad.items():
         with pytest.raises(ValueError, match=match):
             upright(axes)
+
+
+def test_a_small_tangle_between_large_triangles_is_mended():
+    profile = [(0.0, 0.0), *((10e-3, 9e-3 * k) for k in range(60)), (0.0, 0.531)]
+    tube = trimesh.creation.revolve(profile, sections=8)
+    face = int(np.argmax(tube.area_faces))
+    a, b, c = tube.faces[face]
+    normal = tube.face_normals[face]
+    middle = tube.triangles_center[face]
+    # A fold of 1 mm in one triangle: the edge from p to t pierces that of q, r and s.
+    along = (tube.vertices[a] - middle) / np.linalg.norm(tube.vertices[a] - middle)
+    across = np.cross(normal, along)
+    turns = np.radians([0.0, 120.0, 240.0])[:, None]
+    base = middle + 0.5e-3 * (np.cos(turns) * along + np.sin(turns) * across)
+    s = middle + 0.5e-3 * normal
+    t = middle - 0.6e-3 * along + 0.25e-3 * normal
+    vertices = np.vstack([tube.vertices, base, s, t])
+    p, q, r, s, t = range(len(tube.vertices), len(vertices))
+    patch = [(a, b, q), (a, q, p), (b, c, r), (b, r, q), (c, a, p), (c, p, r)]
+    patch += [(q, r, s), (r, p, s), (p, q, t), (q, s, t), (s, p, t)]
+    faces = np.vstack([np.delete(tube.faces, face, axis=0), patch])
+
+    surface, notes = mend("tube", vertices, faces)
+
+    assert len(surface.faces) == len(tube.faces)
+    assert surface.volume == pytest.approx(tube.volume)
+    assert any("self-intersecting" in note for note in notes)

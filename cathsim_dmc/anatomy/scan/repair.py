@@ -25,6 +25,7 @@ PART_WIDTH = 12e-3  # m, and if they are not wider
 NON_MANIFOLD = 0.01  # of the triangles: more at non-manifold edges are not mended
 HOLE = 8e-3  # m, widest hole in the side of a vessel that is filled
 SPIKE = 4e-3  # m, widest patch around a self-intersection that is cut out
+CUT = 16e-3  # m, widest hole that is filled where it was cut out
 END_AREA = 0.5e-6  # m^2, least area of an open end
 END = 0.55  # largest |cosine| between an end's axis and the normals around it
 DENSE = 30_000  # triangles; more are decimated
@@ -183,8 +184,8 @@ class _Work:
             self.faces = self.faces[:, ::-1]
             self._drop_small_parts()
 
-    def close(self) -> None:
-        """Cap the ends of vessels and fill small holes."""
+    def close(self, widest: float = HOLE) -> None:
+        """Cap the ends of vessels and fill holes of up to a width, m."""
         filled = []
         for loop in border_loops(self.faces):
             points = self.vertices[loop]
@@ -194,12 +195,12 @@ class _Work:
             large = len(loop) > 3 and area > END_AREA
             if large and self._is_end(loop, axis):
                 self._ends += 1
-            elif wide > HOLE:
+            elif wide > widest:
                 raise ValueError(
                     f"{self.name} is not closed: a hole {wide * 1e3:.1f} mm wide in "
-                    f"the side of a vessel at {_mm(middle)} mm (at most {HOLE * 1e3:g} "
-                    "mm are filled). Fill holes (3D Slicer: Surface Toolbox, Fill "
-                    "holes), then export again."
+                    f"the side of a vessel at {_mm(middle)} mm (at most "
+                    f"{widest * 1e3:g} mm are filled). Fill holes (3D Slicer: Surface "
+                    "Toolbox, Fill holes), then export again."
                 )
             else:
                 filled.append((wide, middle))
@@ -268,7 +269,7 @@ class _Work:
             self._keep(np.asarray(~touched))
             self._drop_small_parts()
             self.cut_non_manifold()
-            self.close()
+            self.close(CUT)
         else:
             assert first is not None  # every round has found some
             raise ValueError(
