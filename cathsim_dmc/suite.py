@@ -143,7 +143,8 @@ def make_task(
         **{key: value for key, value in options.items() if key in _CONFIG_FIELDS}
     )
     # Checked before the anatomy is built, which takes seconds.
-    observations.resolve(config.observation, config.devices is not None)
+    coaxial, living = config.devices is not None, config.vessel_options.living
+    observations.resolve(config.observation, coaxial, living)
     random = bounds.random_state("random", random)
     goal = own.get("goal", definition.goal or "bca")
     access = own.get("access", definition.access)

@@ -26,7 +26,7 @@ EACH_TASK = [
 OBSERVATIONS = [
     name
     for name, row in observations.OBSERVATIONS.items()
-    if not row.coaxial and name not in ("rgb", "depth")
+    if not (row.coaxial or row.living) and name not in ("rgb", "depth")
 ]
 SHORT_EPISODE = 12  # control steps
 

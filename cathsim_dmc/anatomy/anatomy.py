@@ -25,6 +25,7 @@ from cathsim_dmc.anatomy.centreline import (
     Vessel,
     VesselTree,
 )
+from cathsim_dmc.anatomy.circulation import Circulation
 from cathsim_dmc.anatomy.curves import Curve, smooth_tree
 from cathsim_dmc.anatomy.field import Field
 from cathsim_dmc.anatomy.loading import check_places
@@ -118,6 +119,15 @@ class Anatomy:
         if self.scanned:
             return field_cache.surface_field(self.surface, self.ends)
         return field_cache.tree_field(self.tree, self.ends)
+
+    @cached_property
+    def circulation(self) -> Circulation:
+        """How the inflow of blood is shared among the vessels.
+
+        Raises:
+            ValueError: if there is no free end for the inflow, or no outlet.
+        """
+        return Circulation.of(self)
 
     def depth(self, points: ArrayLike) -> Array:
         """Signed depth (...) of `points` (..., 3) in the lumen, metres, > 0 inside.

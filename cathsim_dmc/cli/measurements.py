@@ -1,4 +1,4 @@
-"""`cathsim validate rod`, `pair`, `wall`, `forces`; `cathsim benchmark speed`."""
+"""`cathsim validate rod`, `pair`, `wall`, `vessel`, `forces`; `benchmark speed`."""
 
 import sys
 from pathlib import Path
@@ -54,6 +54,18 @@ def wall(
 
     report = validation.validate_wall(anatomy, with_convergence=convergence)
     return show(report, json)
+
+
+@validations.command
+def vessel(json: bool = False) -> int:
+    """Blood that flows, against closed forms.
+
+    Args:
+        json: Whether to print one JSON object and nothing else.
+    """
+    from cathsim_dmc import validation
+
+    return show(validation.validate_vessel(), json)
 
 
 @validations.command

@@ -51,10 +51,13 @@ class StillBlood(Effect):
         super().bind(world)
         self._loops.install()
         self._header = world.parameters[:, : self._loops.HEADER]
-        # (N, L, 3), of the blood at the links, m/s, world frame.
-        self.velocity = world.parameters[:, self._loops.HEADER :].reshape(
+        links = world.parameters[:, self._loops.HEADER :].reshape(
             world.num_simulations, -1, self._loops.OF_LINK
         )
+        # Of the blood at the links, world frame: (N, L, 3) m/s, (N, L) s; and (N, L)
+        # N·s/m², see `blood_loops.OF_LINK`.
+        self.velocity, self._delay = links[..., :3], links[..., 3]
+        self._friction = links[..., 4]
 
     def restart(
         self, index: int, episode: Episode, random_state: np.random.RandomState
@@ -62,5 +65,6 @@ class StillBlood(Effect):
         """Fills one simulation with blood at rest."""
         factor = 1.0 if episode.viscosity is None else episode.viscosity
         viscosity, first = factor * BLOOD_VISCOSITY, self.world.index.links.start
-        self._header[index] = self._loops.MARK, BLOOD_DENSITY, viscosity, first
-        self.velocity[index] = 0.0
+        self._header[index] = 0.0
+        self._header[index, :4] = self._loops.MARK, BLOOD_DENSITY, viscosity, first
+        self.velocity[index] = self._delay[index] = self._friction[index] = 0.0

@@ -14,21 +14,38 @@ from cathsim_dmc.collision.native import (
     wholes,
     word,
 )
+from cathsim_dmc.compiled import compiled
 
 # Parameters before those of the links: the mark of blood, its density and viscosity,
-# and the first link's number among the bodies.
-HEADER, MARK = 4, 1843.0
-# Parameters of a link: velocity of the blood there, m/s.
-OF_LINK = 3
+# the first link's number among the bodies; and of the factor b beat(r t + p) of all
+# velocities the peak b, 0 for a steady flow, the rate r in 1/s and the phase p.
+HEADER, MARK = 7, 1843.0
+# Parameters of a link: velocity of the blood there, m/s at a factor of 1, its delay, s,
+# and the friction along the link's axis per length and velocity, N·s/m².
+OF_LINK = 5
 # Numbers of `userdata` before the parameters of the first effect.
 _FIRST = 2
 _MODEL = ("nuserdata", "body_geomadr", "geom_size", "body_dofadr", "body_dofnum", "nv")
 _DATA = ("userdata", "xipos", "xmat", "cvel", "subtree_com", "cdof", "qfrc_passive")
+_DATA += ("time",)
+# Inflow over a beat of 1 s: ms and mL/s (ADAN56, Boileau 2015, as in openBF).
+_TIMES = (0, 22, 41, 61, 80, 99, 128, 158, 177, 196, 245, 322, 351, 390, 415, 438, 1000)
+_FLOWS = (0, 0, 105, 273, 405, 536, 573, 536, 489, 452, 315, 179, 137, 0, -163, 0, 0)
+_BEAT = np.interp(np.arange(1001), _TIMES, _FLOWS) / max(_FLOWS)
 _BEFORE = 8 * (len(_MODEL) + len(_DATA))
 _SYMBOL = "cathsim_blood"
 # Offsets of these fields, and the function that stood in `mjcb_passive`.
 _TABLE = np.zeros(len(_MODEL) + len(_DATA) + 1, np.int64)
 native.symbol(_SYMBOL, _TABLE)
+
+
+@compiled
+def beat(phase):
+    """Inflow of the aorta over that at its peak, at a phase in beats."""
+    place = (phase - math.floor(phase)) * (len(_BEAT) - 1)
+    first = min(int(place), len(_BEAT) - 2)
+    share = place - first
+    return (1.0 - share) * _BEAT[first] + share * _BEAT[first + 1]
 
 
 @native.callback("void(int64, int64)")
@@ -59,6 +76,8 @@ def _drag(model, data):
     pole = numbers(word(data + word(table + 80)), 3 * bodies)[3 * first :]
     cdof = numbers(word(data + word(table + 88)), 6 * nv)
     passive = numbers(word(data + word(table + 96)), nv)
+    peak, rate, factor = user[4], user[5], 1.0
+    phase = rate * numbers(data + word(table + 104), 1)[0] + user[6]
     # Force of all links from here to the end, and its torque about the pole.
     fx = fy = fz = tx = ty = tz = 0.0
     for link in range(links - 1, -1, -1):
@@ -66,9 +85,11 @@ def _drag(model, data):
         radius, half = sizes[3 * geoms[body]], sizes[3 * geoms[body] + 1]
         spin, axes, place = cvel[6 * body :], xmat[9 * body :], xipos[3 * body :]
         x, y, z = place[0] - pole[0], place[1] - pole[1], place[2] - pole[2]
-        u = flow[0] - spin[3] - spin[1] * z + spin[2] * y
-        v = flow[1] - spin[4] - spin[2] * x + spin[0] * z
-        w = flow[2] - spin[5] - spin[0] * y + spin[1] * x
+        if peak != 0.0:
+            factor = peak * beat(phase - rate * flow[3])
+        u = factor * flow[0] - spin[3] - spin[1] * z + spin[2] * y
+        v = factor * flow[1] - spin[4] - spin[2] * x + spin[0] * z
+        w = factor * flow[2] - spin[5] - spin[0] * y + spin[1] * x
         along = u * axes[2] + v * axes[5] + w * axes[8]
         u, v, w = u - along * axes[2], v - along * axes[5], w - along * axes[8]
         speed = math.sqrt(u * u + v * v + w * w)
@@ -78,6 +99,8 @@ def _drag(model, data):
         drag += 3.4 * reynolds**0.11 + 0.98 * math.sqrt(reynolds)
         drag *= viscosity * 2 * half
         u, v, w = drag * u, drag * v, drag * w
+        along *= flow[4] * 2 * half
+        u, v, w = u + along * axes[2], v + along * axes[5], w + along * axes[8]
         fx, fy, fz = fx + u, fy + v, fz + w
         tx, ty, tz = tx + y * w - z * v, ty + z * u - x * w, tz + x * v - y * u
         for dof in range(dofs[body], dofs[body] + counts[body]):

@@ -19,6 +19,7 @@ from cathsim_dmc.entities.chain import Chain
 from cathsim_dmc.physics.readings import ModelIndex, Readings
 
 if TYPE_CHECKING:
+    from cathsim_dmc.anatomy import Anatomy
     from cathsim_dmc.physics.randomisation import Episode
 
 # Numbers of `userdata` before the parameters of an effect: its mark and their number.
@@ -108,6 +109,9 @@ class Effect:
         """Finds what it acts on; no episode has begun yet."""
         self.world = world
 
+    def enter(self, index: int, anatomy: Anatomy) -> None:
+        """Takes the anatomy of one simulation, before an episode begins in it."""
+
     def restart(
         self, index: int, episode: Episode, random_state: np.random.RandomState
     ) -> None:
@@ -194,6 +198,11 @@ class Effects:
             self._labelled.append(-1)
         self._labels[start : start + _HEADER] = mark, count
         self._labelled += [start, start + 1]
+
+    def enter(self, index: int, anatomy: Anatomy) -> None:
+        """Takes the anatomy of one simulation; see `Effect.enter`."""
+        for effect in self._effects:
+            effect.enter(index, anatomy)
 
     def restart(
         self, index: int, episode: Episode, random_state: np.random.RandomState

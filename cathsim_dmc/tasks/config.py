@@ -14,12 +14,12 @@ from cathsim_dmc.entities.contact import FRICTION
 from cathsim_dmc.entities.device import Device
 from cathsim_dmc.entities.device_stack import LEAD, LUMEN_FRICTION
 from cathsim_dmc.imaging.options import FluoroscopyOptions
-from cathsim_dmc.physics.blood import StillBlood
 from cathsim_dmc.physics.delay import ActionDelay
 from cathsim_dmc.physics.effects import Effect
 from cathsim_dmc.physics.randomisation import Randomisation, RandomisedModel
 from cathsim_dmc.physics.sliding import devices_of
 from cathsim_dmc.physics.stepper import CONTROL_TIMESTEP, PHYSICS_TIMESTEP
+from cathsim_dmc.physics.vessel import VesselOptions
 from cathsim_dmc.tasks.cameras import CameraOptions
 
 MAX_STEPS = 2000  # published
@@ -69,6 +69,9 @@ class NavigationConfig:
         randomisation: Ranges that each episode draws from: True for
             `randomisation.DEFAULT_RANGES`, False for none, a
             `randomisation.Randomisation` or a mapping of its fields.
+        effects: Effects of one's own, see `physics.effects.Effect`.
+        vessel: Name of a preset in `physics.vessel.PRESETS`, or a mapping of the fields
+            of `physics.vessel.VesselOptions`.
     """
 
     observation: str | Sequence[str] = "internal"
@@ -89,6 +92,7 @@ class NavigationConfig:
     cameras: CameraOptions | Mapping[str, Any] = CameraOptions()
     randomisation: Randomisation | Mapping[str, Any] | bool = False
     effects: Sequence[Effect] = ()
+    vessel: str | Mapping[str, Any] | VesselOptions = "rigid"
 
     def __post_init__(self):
         self._check_devices()
@@ -102,6 +106,7 @@ class NavigationConfig:
         object.__setattr__(
             self, "randomisation", Randomisation.make(self.randomisation)
         )
+        object.__setattr__(self, "vessel", VesselOptions.make(self.vessel))
         self._check_views()
         if not isinstance(self.effects, Sequence) or not all(
             isinstance(effect, Effect) for effect in self.effects
@@ -125,12 +130,18 @@ class NavigationConfig:
         """`cameras` as an object."""
         return cast(CameraOptions, self.cameras)
 
+    @property
+    def vessel_options(self) -> VesselOptions:
+        """`vessel` as an object."""
+        return cast(VesselOptions, self.vessel)
+
     def effects_on(self, chain: Chain) -> list[Effect]:
         """The effects of one rollout, in the order in which they act."""
         own = [copy.copy(effect) for effect in self.effects]
         delay = ActionDelay(self.ranges.longest_delay)
         model = RandomisedModel(self.ranges)
-        return [StillBlood(), model, delay, *own, devices_of(chain)]
+        blood = self.vessel_options.blood
+        return [blood, model, delay, *own, devices_of(chain)]
 
     def _check_devices(self):
         if self.devices is None:

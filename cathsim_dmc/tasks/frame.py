@@ -8,6 +8,7 @@ import numpy as np
 
 from cathsim_dmc.physics import forces, readings
 from cathsim_dmc.physics.sliding import CoaxialReadings
+from cathsim_dmc.physics.vessel import VesselReadings
 from cathsim_dmc.tasks.common_chain import CommonChain
 from cathsim_dmc.tasks.route import Ahead
 
@@ -45,6 +46,7 @@ class Frame(NamedTuple):
         images: images of the sensors.
         ahead: route ahead of the tip; None where no observation needs it.
         devices: state of coaxial devices; None for a device alone.
+        vessel: state of the vessel; None for a rigid one with blood at rest.
     """
 
     readings: readings.Readings
@@ -55,3 +57,4 @@ class Frame(NamedTuple):
     images: Images = NO_IMAGES
     ahead: Ahead | None = None
     devices: CoaxialReadings | None = None
+    vessel: VesselReadings | None = None

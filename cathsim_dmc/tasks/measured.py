@@ -10,6 +10,7 @@ import numpy as np
 from cathsim_dmc.physics.forces import WallForce
 from cathsim_dmc.physics.readings import Readings
 from cathsim_dmc.physics.sliding import CoaxialReadings
+from cathsim_dmc.physics.vessel import VesselReadings
 from cathsim_dmc.tasks.objective_pool import part
 from cathsim_dmc.tasks.snapshot import Snapshot, merged, named
 
@@ -21,11 +22,13 @@ class Measured(NamedTuple):
         readings: State of the devices.
         wall_force: Force on the wall over the control step.
         devices: State of coaxial devices; None for one alone.
+        vessel: State of the vessels; None for rigid ones with blood at rest.
     """
 
     readings: Readings
     wall_force: WallForce
     devices: CoaxialReadings | None
+    vessel: VesselReadings | None
 
     def rows(self, indices: np.ndarray) -> dict[str, Any]:
         """What is of some simulations, by the names of the fields."""

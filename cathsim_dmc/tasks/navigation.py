@@ -77,7 +77,8 @@ class Navigation(composer.Task):
                 "goal_shift out"
             )
         self._num_actions = len(scene.catheter.action_names)
-        self._names = observations.resolve(config.observation, scene.coaxial)
+        living = config.vessel_options.living
+        self._names = observations.resolve(config.observation, scene.coaxial, living)
         self._fluoroscopy = None
         if observations.needs(self._names, "fluoroscopic"):
             self._fluoroscopy = config.fluoroscopy_options
@@ -191,7 +192,7 @@ class Navigation(composer.Task):
     @property
     def info_types(self) -> dict[str, type]:
         """Type of each figure of `info`: float or bool."""
-        return info_types(self._objective.terms)
+        return info_types(self._objective.terms, self._config.vessel_options.living)
 
     def action_spec(self, physics) -> dm_env.specs.BoundedArray:
         """Bounds [-1, 1] for each actuator."""

@@ -92,6 +92,7 @@ class ObservationKind:
         fluoroscopic: whether it needs the angiography machine.
         routed: whether it needs the route to the goal.
         coaxial: whether it needs coaxial devices.
+        living: whether it needs a vessel that lives.
         joined: names of the rows that coaxial devices add to it.
     """
 
@@ -100,6 +101,7 @@ class ObservationKind:
     fluoroscopic: bool = False
     routed: bool = False
     coaxial: bool = False
+    living: bool = False
     joined: tuple[str, ...] = ()
 
 
@@ -116,7 +118,10 @@ class ObservationTable(dict[str, ObservationKind]):
         return add
 
     def resolve(
-        self, names: str | Sequence[str], coaxial: bool | None = None
+        self,
+        names: str | Sequence[str],
+        coaxial: bool | None = None,
+        living: bool | None = None,
     ) -> tuple[str, ...]:
         """Names of the rows of an observation.
 
@@ -124,15 +129,19 @@ class ObservationTable(dict[str, ObservationKind]):
             names: Name or names of observations.
             coaxial: Whether the devices are coaxial, so that the rows that they add
                 follow; None where that is not known, and none follow.
+            living: Whether the vessel lives; None where that is not known.
 
         Raises:
             ValueError: if a name is unknown or comes twice, if there is none, or if one
-                needs coaxial devices.
+                needs coaxial devices or a vessel that lives.
         """
         listed = isinstance(names, Sequence) and not isinstance(names, str | bytes)
         chosen = cast(tuple[str, ...], tuple(names) if listed else (names,))
         allowed = [
-            n for n, row in self.items() if coaxial is not False or not row.coaxial
+            name
+            for name, row in self.items()
+            if (coaxial is not False or not row.coaxial)
+            and (living is not False or not row.living)
         ]
         unknown = [n for n in chosen if not isinstance(n, str) or n not in allowed]
         if unknown or not chosen or len(set(chosen)) < len(chosen):

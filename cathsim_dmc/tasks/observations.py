@@ -311,6 +311,22 @@ def depth(frame: Frame) -> Observation:
     return _views(frame, "depth")
 
 
+@OBSERVATIONS.row(
+    Entry("heart_phase", 2, "1", "sine and cosine of the phase of the heart", -1, 1),
+    Entry("blood_velocity", 3, "m/s", "of the blood at the head, world frame"),
+    living=True,
+)
+def vessel(frame: Frame) -> Observation:
+    """Heart and blood, of a vessel that lives."""
+    state = frame.vessel
+    assert state is not None
+    angle = 2 * np.pi * state.heart_phase
+    return {
+        "heart_phase": np.stack([np.sin(angle), np.cos(angle)], axis=-1),
+        "blood_velocity": state.blood_velocity,
+    }
+
+
 def _views(frame: Frame, kind: str) -> Observation:
     views = frame.images.views
     return {key: view for key, view in views.items() if key.startswith(kind)}

@@ -14,11 +14,11 @@ import numpy as np
 
 from cathsim_dmc.imaging.device import Shadow
 from cathsim_dmc.imaging.fluoroscopy import Fluoroscope
-from cathsim_dmc.physics import forces, readings
+from cathsim_dmc.physics import forces, readings, vessel
 from cathsim_dmc.physics.effects import Effects, World
 from cathsim_dmc.physics.single_device import SingleDevice
 from cathsim_dmc.physics.sliding import CoaxialReadings
-from cathsim_dmc.physics.stepper import Stepper
+from cathsim_dmc.physics.stepper import CONTROL_TIMESTEP, Stepper
 from cathsim_dmc.tasks import observations
 from cathsim_dmc.tasks.cases import Case, model_index
 from cathsim_dmc.tasks.common_chain import CommonChain
@@ -81,12 +81,14 @@ class Rollout:
         self._config = config
         self._stepper = stepper
         self._state = state = stepper.arrays
-        self._names = observations.resolve(config.observation, scene.coaxial)
+        living = config.vessel_options.living
+        self._names = observations.resolve(config.observation, scene.coaxial, living)
         catheter = scene.catheter.mjcf_model.model
         self._index = model_index(scene, model)
         self._views = self._index.views(state)
         num_actions = len(scene.catheter.action_names)
         listed = config.effects_on(scene.catheter)
+        self._listed = listed
         self._devices = cast(SingleDevice, listed[-1])
         self._effects = Effects(
             listed,
@@ -100,6 +102,8 @@ class Rollout:
                 state.userdata,
             ),
         )
+        for index in range(num_simulations):
+            self._effects.enter(index, scene.anatomy)
         self._routes: Routes | None = None
         if observations.needs(self._names, "routed"):
             self._routes = Routes([case.objective for case in cases])
@@ -172,6 +176,7 @@ class Rollout:
         number = case.start.draw(random_state)
         qpos = self._state.qpos[index]
         case.start.write(qpos, displacement, episode.roll, number)
+        self._effects.enter(index, case.scene.anatomy)
         self._effects.restart(index, episode, random_state)
         self._monitor.restart(index, case.scene)
         self._sensors.restart(index, case.angiograph, episode.deviation)
@@ -224,7 +229,9 @@ class Rollout:
     def _measure(self, magnitudes: np.ndarray, rows: np.ndarray | None = None) -> None:
         """Measures all simulations, or some, when the others have not moved."""
         now = self._views.read()
-        new = Measured(now, forces.wall_force(magnitudes), self._devices.read(now))
+        vessel_now = vessel.read(self._listed, CONTROL_TIMESTEP * self._steps, now)
+        force, devices = forces.wall_force(magnitudes), self._devices.read(now)
+        new = Measured(now, force, devices, vessel_now)
         if rows is not None and hasattr(self, "_measured"):
             new = self._measured.updated(new.rows(rows), rows)
         self._measured = new
@@ -270,6 +277,7 @@ class Rollout:
             wall_force=self.wall_force,
             distance=distance,
             path_ratio=self._path.ratio,
+            vessel=self._measured.vessel,
         )
 
     def _observe(self, goal: np.ndarray, fresh: np.ndarray | None) -> Observation:
@@ -289,6 +297,7 @@ class Rollout:
             ahead = self._routes.ahead(self._case_of, state.head, state.head_frame)
         force, chain = self.wall_force, self._chain
         frame = Frame(state, force, self._action, goal, chain, images, ahead, devices)
+        frame = frame._replace(vessel=self._measured.vessel)
         return observations.observe(self._names, frame)
 
     # Snapshots.
@@ -348,6 +357,7 @@ class Rollout:
         for index in indices:
             if len(self._cases) > 1:
                 self._stepper.load(index, self.case(index))
+            self._effects.enter(index, self.case(index).scene.anatomy)
             self._monitor.restart(index, self.case(index).scene)
         self._stepper.set_states(indices, kept["state"])
         for name, array in snapshot.part("effects").items():

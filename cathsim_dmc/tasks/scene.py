@@ -82,6 +82,7 @@ class Scene:
             drawn: Whether the surface of the lumen is there to be seen.
         """
         goal = placement.resolve_goal(anatomy, goal)
+        config.vessel_options.check(anatomy)
         chosen = chosen_devices(config) if catheter is None else catheter.devices
         length = config.working_length
         if catheter is not None:

@@ -6,6 +6,7 @@ from typing import NamedTuple
 import numpy as np
 
 from cathsim_dmc.physics import forces, readings
+from cathsim_dmc.physics.vessel import INFO, VesselReadings
 from cathsim_dmc.tasks import objectives
 from cathsim_dmc.tasks.observation_kind import Observation
 
@@ -13,10 +14,16 @@ _INFO = ("distance", "insertion", "push_force", "wall_force_sum", "wall_force_ma
 _INFO += ("wall_force_peak_sum", "wall_force_peak_max", "path_ratio")
 
 
-def info_types(terms: Sequence[str]) -> dict[str, type]:
-    """Type of each figure of `Step.info`, float or bool, by the names of the terms."""
+def info_types(terms: Sequence[str], living: bool = False) -> dict[str, type]:
+    """Type of each figure of `Step.info`, float or bool.
+
+    Args:
+        terms: Names of the terms of the reward.
+        living: Whether there are figures of the vessel.
+    """
     return {
         **dict.fromkeys(_INFO, float),
+        **dict.fromkeys(INFO if living else (), float),
         "success": bool,
         "physics_error": bool,
         **{f"reward_{name}": float for name in terms},
@@ -38,6 +45,7 @@ class Step(NamedTuple):
         wall_force: force on the wall over the control step.
         distance: (N,), straight from head to goal, m.
         path_ratio: (N,), way of the head so far over the shortest way to the goal.
+        vessel: state of the vessel; None for a rigid one with blood at rest.
     """
 
     observation: Observation
@@ -49,6 +57,7 @@ class Step(NamedTuple):
     wall_force: forces.WallForce
     distance: np.ndarray
     path_ratio: np.ndarray
+    vessel: VesselReadings | None = None
 
     @property
     def physics_error(self) -> np.ndarray:
@@ -60,7 +69,8 @@ class Step(NamedTuple):
 
         "distance" and "insertion" in m; "push_force" in N; "wall_force_sum",
         "wall_force_max" and their peaks within the control step in N (see
-        `forces.WallForce`); "path_ratio"; "success" and "physics_error" (bool); and
+        `forces.WallForce`); "path_ratio"; of a vessel that lives "heart_phase" and
+        "blood_speed" (at the head, m/s); "success" and "physics_error" (bool); and
         "reward_<term>" for each weighted term of the reward.
         """
         wall = self.wall_force
@@ -73,6 +83,7 @@ class Step(NamedTuple):
             "wall_force_peak_sum": wall.peak_sum,
             "wall_force_peak_max": wall.peak_max,
             "path_ratio": self.path_ratio,
+            **({} if self.vessel is None else self.vessel.info()),
             "success": self.outcome.success,
             "physics_error": self.physics_error,
             **{f"reward_{name}": term for name, term in self.outcome.terms.items()},

@@ -12,6 +12,7 @@ if TYPE_CHECKING:
     from cathsim_dmc.validation.force_sensors import validate_forces
     from cathsim_dmc.validation.pair import validate_pair
     from cathsim_dmc.validation.rod import validate_rod
+    from cathsim_dmc.validation.vessel import validate_vessel
     from cathsim_dmc.validation.wall import validate_anatomy, validate_wall
 
 __all__ = [
@@ -21,6 +22,7 @@ __all__ = [
     "validate_forces",
     "validate_pair",
     "validate_rod",
+    "validate_vessel",
     "validate_wall",
 ]
 
@@ -29,6 +31,7 @@ _MODULES = {
     "validate_forces": "force_sensors",
     "validate_pair": "pair",
     "validate_rod": "rod",
+    "validate_vessel": "vessel",
     "validate_wall": "wall",
 }
 

@@ -128,7 +128,11 @@ def coaxial_table() -> str:
 
 def entries_table() -> str:
     """Every entry of every observation, from the specs."""
-    kinds = {n: k for n, k in observations.OBSERVATIONS.items() if not k.coaxial}
+    kinds = {
+        n: k
+        for n, k in observations.OBSERVATIONS.items()
+        if not (k.coaxial or k.living)
+    }
     specs = suite.make_task(TASK, observation=list(kinds)).observation_specs
     rows = [
         _row("observation", "entry", "shape", "type", "range", "unit", "meaning"),

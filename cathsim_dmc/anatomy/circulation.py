@@ -1,0 +1,161 @@
+"""How the inflow of an aorta is shared among its branches.
+
+The heart is at the wider end of the root; every other free end of a vessel is an
+outlet. Arteries with a measured share have it together with all that branches off them;
+within an artery, and in an imported scan, outlets share by Murray's law, as their radii
+cubed. A vessel loses at each ostium what the branch takes, so volume is conserved.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from cathsim_dmc.anatomy.centreline import Array, VesselTree
+
+if TYPE_CHECKING:
+    from cathsim_dmc.anatomy.anatomy import Anatomy
+
+# Mean shares of the inflow, from the resistances of ADAN56 (Boileau 2015).
+SHARES = {"bca": 0.120, "lcca": 0.069, "lsa": 0.050}
+_SPACING = 3e-3  # m, of the places along a vessel
+_AT_END = 1e-6  # m
+
+
+class Course(NamedTuple):
+    """How blood goes through a vessel.
+
+    Attributes:
+        begin: way from the heart to where blood enters the vessel, m.
+        reverse: whether blood goes towards the first point of the centreline.
+        outlet: share of the inflow that leaves through the vessel's own free end.
+        branches: (B, 2), way in the vessel to each ostium, m, and the share it takes.
+    """
+
+    begin: float
+    reverse: bool
+    outlet: float
+    branches: Array
+
+    def share(self, way: Array) -> Array:
+        """Share (n,) of the inflow at ways (n,) m in the vessel."""
+        ahead = self.branches[:, 0] > np.asarray(way)[..., None]
+        return self.outlet + (ahead * self.branches[:, 1]).sum(axis=-1)
+
+
+@dataclass(frozen=True, eq=False)
+class Circulation:
+    """The inflow along the vessels, in S straight segments.
+
+    Attributes:
+        courses: of blood, by vessel.
+        radius: of the lumen at the heart, m.
+        ends: (S, 2, 3), m.
+        radii: (S, 2), of the lumen, m.
+        shares: (S, 2), of the inflow, negative against the segment.
+        ways: (S, 2), from the heart, m.
+        vessel: (S,) int64, number of the vessel.
+    """
+
+    courses: dict[str, Course]
+    radius: float
+    ends: Array
+    radii: Array
+    shares: Array
+    ways: Array
+    vessel: np.ndarray
+
+    @classmethod
+    def of(cls, anatomy: Anatomy) -> Circulation:
+        """The circulation of an anatomy.
+
+        Raises:
+            ValueError: if the heart's end is no free end, or there is no outlet.
+        """
+        tree = anatomy.tree
+        root = tree.root.centreline
+        reverse = bool(root.radii[-1] > root.radii[0])
+        heart = -1 if reverse else 0
+        distances = [
+            np.linalg.norm(e.position - root.points[heart]) for e in anatomy.ends
+        ]
+        if min(distances, default=np.inf) > _AT_END or len(distances) < 2:
+            raise ValueError(
+                f"anatomy {anatomy.name!r} has no flow: it has {len(distances)} free "
+                f"ends, and needs one at the wider end of {tree.root.name!r}, for the "
+                "inflow, and an outlet; import it with its ends cut open, or leave "
+                "flow out"
+            )
+        courses = _courses(tree, reverse, anatomy.scanned)
+        columns = [
+            _along(vessel.centreline, courses[name], number)
+            for number, (name, vessel) in enumerate(tree.vessels.items())
+        ]
+        joined = [np.concatenate(column) for column in zip(*columns, strict=True)]
+        return cls(courses, float(root.radii[heart]), *joined)
+
+    @property
+    def arrays(self) -> tuple[np.ndarray, ...]:
+        """The segments, in the order of the attributes."""
+        return self.ends, self.radii, self.shares, self.ways, self.vessel
+
+
+def _along(line, course: Course, number: int) -> tuple[np.ndarray, ...]:
+    count = max(2, round(line.length / _SPACING) + 1)
+    s = np.linspace(0.0, line.length, count)
+    way = line.length - s if course.reverse else s
+    place, sign = line.at(s), -1.0 if course.reverse else 1.0
+    values = (
+        place.position,
+        place.radius,
+        sign * course.share(way),
+        course.begin + way,
+    )
+    pairs = [np.stack([value[:-1], value[1:]], axis=1) for value in values]
+    return (*pairs, np.full(count - 1, number))
+
+
+def _courses(tree: VesselTree, reverse: bool, scanned: bool) -> dict[str, Course]:
+    outlets = _outlets(tree, reverse, scanned)
+    taken = dict(outlets)
+    for name in reversed(tuple(tree.vessels)):  # branches before their parents
+        parent = tree.vessels[name].parent
+        if parent is not None:
+            taken[parent] += taken[name]
+    courses: dict[str, Course] = {}
+    for name, vessel in tree.vessels.items():
+        back = reverse and vessel.parent is None
+        length = vessel.centreline.length
+        branches, begin = [], 0.0
+        for child, other in tree.vessels.items():
+            if other.parent == name:
+                origin = tree.origin(child)
+                branches.append((length - origin if back else origin, taken[child]))
+        if vessel.parent is not None:
+            above, origin = courses[vessel.parent], tree.origin(name)
+            if above.reverse:
+                origin = tree.vessels[vessel.parent].centreline.length - origin
+            begin = above.begin + origin
+        branches = np.array(branches).reshape(-1, 2)
+        courses[name] = Course(begin, back, outlets[name], branches)
+    return courses
+
+
+def _outlets(tree: VesselTree, reverse: bool, scanned: bool) -> dict[str, float]:
+    """Share of the inflow that leaves through the free end of each vessel."""
+    cubes, artery = {}, {}
+    measured = not scanned and set(SHARES) <= set(tree.vessels)
+    for name, vessel in tree.vessels.items():
+        first = reverse and vessel.parent is None
+        cubes[name] = float(vessel.centreline.radii[0 if first else -1]) ** 3
+        inherited = artery.get(vessel.parent, "")
+        artery[name] = name if measured and name in SHARES else inherited
+    totals = {**SHARES, "": 1.0 - sum(SHARES.values())} if measured else {"": 1.0}
+    summed = dict.fromkeys(totals, 0.0)
+    for name, cube in cubes.items():
+        summed[artery[name]] += cube
+    return {
+        n: totals[artery[n]] * cube / summed[artery[n]] for n, cube in cubes.items()
+    }

@@ -1,0 +1,158 @@
+"""Blood that flows: a pulsatile flow past the links of the device.
+
+The inflow follows `blood_loops.beat` at a heart rate; time scales with its period. At a
+way s from the heart it comes s / c later, c the pulse wave velocity. Branches take
+their shares (`anatomy.circulation`). Across the lumen of radius R the velocity is
+blunted, u = Q / πR² · (n + 2) / n · (1 - (r/R)ⁿ) with n = 9, as one-dimensional models
+of the aorta have it (Smith, Pullan and Hunter 2002; openBF). Womersley's profile is
+that of a developed flow; the aorta is shorter than its entrance length, and measured
+profiles are flat (the Stokes layer at 1 Hz is 1 mm thick).
+
+The velocity at each link is taken once a control step where the link is, its course in
+time in every physics step. Across the link the drag is that of `blood`, from the
+velocity relative to the link; along it, the blood rubs like a flow between the link of
+radius a and the wall, 2πµu / ln(R/a) per length.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+
+import numpy as np
+
+from cathsim_dmc import bounds
+from cathsim_dmc.anatomy import Anatomy
+from cathsim_dmc.anatomy.circulation import Circulation
+from cathsim_dmc.entities.chain import Chain
+from cathsim_dmc.physics.blood import StillBlood
+from cathsim_dmc.physics.effects import World
+from cathsim_dmc.physics.randomisation import Episode
+from cathsim_dmc.physics.readings import Readings
+
+Range = float | Sequence[float]
+
+# Least ratio of the radii of lumen and link, for the friction along the link.
+_LEAST_GAP = 1.2
+
+
+@dataclasses.dataclass(frozen=True)
+class FlowOptions:
+    """How blood flows; a range (low, high) is drawn from uniformly in each episode.
+
+    Attributes:
+        rate: Heart rate, 1/min, 30 to 200.
+        peak: Mean velocity across the lumen at the heart at its peak, m/s, 0 to 2;
+            0.72 are 573 mL/s in an aorta of 31.9 mm (ADAN56).
+        phase: Phase of the heart at the start of an episode, 0 to 1; 0 is the beginning
+            of the ejection.
+        wave_speed: Pulse wave velocity, m/s, 2 to 20.
+    """
+
+    rate: Range = 60.0
+    peak: Range = 0.72
+    phase: Range = 0.0
+    wave_speed: Range = 4.6
+
+    def __post_init__(self):
+        for name, (low, high, unit) in _LIMITS.items():
+            value = getattr(self, name)
+            if bounds.is_number(value):
+                bounds.number(name, value, low, high, unit)
+            else:
+                ends = bounds.interval(name, value, low, high, unit)
+                object.__setattr__(self, name, ends)
+
+
+_LIMITS = {
+    "rate": (30.0, 200.0, "1/min"),
+    "peak": (0.0, 2.0, "m/s"),
+    "phase": (0.0, 1.0, ""),
+    "wave_speed": (2.0, 20.0, "m/s"),
+}
+
+
+def drawn(value: Range, random_state: np.random.RandomState) -> float:
+    """A number as it is, or one drawn from a range (low, high)."""
+    if isinstance(value, Sequence):
+        low, high = value
+        return float(random_state.uniform(low, high))
+    return float(value)
+
+
+class Flow(StillBlood):
+    """Pulsatile flow in each simulation's anatomy."""
+
+    def __init__(self, options: FlowOptions):
+        """Takes the options of the task."""
+        self._options = options
+
+    def num_parameters(self, chain: Chain) -> int:
+        """Those of blood."""
+        from cathsim_dmc.physics import flow_loops  # late, as numba takes long
+
+        self._velocities = flow_loops.velocities
+        return super().num_parameters(chain)
+
+    def bind(self, world: World) -> None:
+        """Finds the parameters of blood and the radii of the links."""
+        super().bind(world)
+        links = world.index.geoms
+        self._link_radii = world.model.geom_size[links, 0]
+        self._circulations: dict[int, Circulation] = {}
+        self._wave_speed = np.ones(world.num_simulations)
+
+    def enter(self, index: int, anatomy: Anatomy) -> None:
+        """Fills the vessels of an anatomy."""
+        self._circulations[index] = anatomy.circulation
+
+    def restart(
+        self, index: int, episode: Episode, random_state: np.random.RandomState
+    ) -> None:
+        """Draws rate, peak and phase of the heart, and pulse wave velocity."""
+        super().restart(index, episode, random_state)
+        rate, peak, phase, speed = (
+            drawn(getattr(self._options, name), random_state) for name in _LIMITS
+        )
+        inflow = peak * np.pi * self._circulations[index].radius ** 2
+        self._header[index, 4:] = inflow, rate / 60.0, phase
+        self._wave_speed[index] = speed
+
+    @property
+    def state(self) -> dict[str, np.ndarray]:
+        """The pulse wave velocity; the rest are parameters."""
+        return {"wave_speed": self._wave_speed}
+
+    def act(self, action: np.ndarray, state: Readings) -> np.ndarray:
+        """Finds the velocity at the middle of each link, and its delay."""
+        middles = 0.5 * (state.centreline[:, :-1] + state.centreline[:, 1:])
+        found = self._at(middles)
+        self.velocity[:] = found[..., :3]
+        self._delay[:] = found[..., 3] / self._wave_speed[:, None]
+        inside = found[..., 4] > 0.0
+        gap = np.maximum(found[..., 4] / self._link_radii, _LEAST_GAP)
+        friction = 2 * np.pi * self._header[:, 2:3] / np.log(gap)
+        self._friction[:] = np.where(inside, friction, 0.0)
+        return action
+
+    def _at(self, points: np.ndarray) -> np.ndarray:
+        """What `flow_loops.velocities` finds at points (N, P, 3): (N, P, 5)."""
+        out = np.empty((*points.shape[:2], 5))
+        for index, row in enumerate(np.ascontiguousarray(points)):
+            self._velocities(row, *self._circulations[index].arrays, out[index])
+        return out
+
+    def read(self, time: np.ndarray, state: Readings) -> dict[str, np.ndarray]:
+        """Figures of `vessel.VesselReadings`.
+
+        Args:
+            time: (N,) of the episodes, s.
+            state: At that time.
+        """
+        inflow, rate, phase = self._header[:, 4:].T
+        phases = rate * time + phase
+        found = self._at(state.head[:, None])[:, 0]
+        delays = found[:, 3] / self._wave_speed
+        beats = [self._loops.beat(phase) for phase in (phases - rate * delays).tolist()]
+        velocity = (inflow * np.array(beats))[:, None] * found[:, :3]
+        return {"heart_phase": phases % 1.0, "blood_velocity": velocity}

@@ -1,0 +1,93 @@
+"""Velocity of blood at many places at once, compiled; see `flow`."""
+
+import math
+
+import numpy as np
+
+from cathsim_dmc.compiled import compiled
+
+# Exponent of the profile across the lumen.
+EXPONENT = 9
+# Distance over which the flow of a vessel passes into that of its branch, m.
+_BLEND = 5e-4
+
+
+@compiled
+def profile(share):
+    """Velocity over its mean at a share of the lumen's radius; 0 outside."""
+    return (1.0 - share**EXPONENT) * (EXPONENT + 2) / EXPONENT if share < 1.0 else 0.0
+
+
+@compiled
+def velocities(points, ends, radii, shares, ways, vessel, out):
+    """Writes velocity, way from the heart and radius of the lumen at some places.
+
+    Args:
+        points: (P, 3), m.
+        ends: as the others, of `anatomy.circulation.Circulation`.
+        radii: (S, 2), m.
+        shares: (S, 2).
+        ways: (S, 2), m.
+        vessel: (S,).
+        out: (P, 5): velocity for an inflow of 1 m³/s, 1/m²; way, m; radius, m.
+    """
+    count = len(vessel)
+    nearest = np.empty(vessel[-1] + 1)
+    segment = np.empty(vessel[-1] + 1, np.int64)
+    for p in range(len(points)):
+        nearest[:] = np.inf
+        for k in range(count):
+            square = 0.0
+            t = _place(points[p], ends[k])
+            clipped = min(max(t, 0.0), 1.0)
+            for i in range(3):
+                there = (1.0 - clipped) * ends[k, 0, i] + clipped * ends[k, 1, i]
+                square += (points[p, i] - there) ** 2
+            if square < nearest[vessel[k]]:
+                nearest[vessel[k]], segment[vessel[k]] = square, k
+        out[p] = 0.0
+        deepest = -np.inf
+        for v in range(len(nearest)):
+            k, t = segment[v], _place(points[p], ends[segment[v]])
+            before = t < 0.0 and (k == 0 or vessel[k - 1] != v)
+            after = t > 1.0 and (k == count - 1 or vessel[k + 1] != v)
+            t = min(max(t, 0.0), 1.0)
+            radius = (1.0 - t) * radii[k, 0] + t * radii[k, 1]
+            # Depth in the tube of the vessel, none past its ends.
+            nearest[v] = radius - math.sqrt(nearest[v])
+            if before or after:
+                nearest[v] = -np.inf
+            deepest = max(deepest, nearest[v])
+        total = 0.0
+        if deepest <= 0.0:
+            continue
+        for v in range(len(nearest)):
+            weight = math.exp((nearest[v] - deepest) / _BLEND)
+            if weight < 1e-6:
+                continue
+            k = segment[v]
+            t = min(max(_place(points[p], ends[k]), 0.0), 1.0)
+            radius = (1.0 - t) * radii[k, 0] + t * radii[k, 1]
+            length = 0.0
+            for i in range(3):
+                length += (ends[k, 1, i] - ends[k, 0, i]) ** 2
+            speed = (1.0 - t) * shares[k, 0] + t * shares[k, 1]
+            speed *= weight * profile(1.0 - nearest[v] / radius)
+            speed /= math.pi * radius * radius * math.sqrt(length)
+            for i in range(3):
+                out[p, i] += speed * (ends[k, 1, i] - ends[k, 0, i])
+            out[p, 3] += weight * ((1.0 - t) * ways[k, 0] + t * ways[k, 1])
+            out[p, 4] += weight * radius
+            total += weight
+        out[p] /= total
+
+
+@compiled
+def _place(point, ends):
+    """Place of a point along a segment, 0 at its start and 1 at its end."""
+    along, square = 0.0, 0.0
+    for i in range(3):
+        way = ends[1, i] - ends[0, i]
+        along += (point[i] - ends[0, i]) * way
+        square += way * way
+    return along / square

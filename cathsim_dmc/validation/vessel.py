@@ -1,0 +1,188 @@
+"""The vessel against closed forms: blood that flows."""
+
+from __future__ import annotations
+
+import mujoco
+import numpy as np
+from scipy.integrate import solve_bvp
+from scipy.optimize import brentq
+
+from cathsim_dmc.anatomy import phantoms
+from cathsim_dmc.anatomy.anatomy import Anatomy
+from cathsim_dmc.entities import devices
+from cathsim_dmc.entities.arena import BLOOD_DENSITY
+from cathsim_dmc.physics.blood import BLOOD_VISCOSITY, StillBlood
+from cathsim_dmc.physics.effects import userdata_size
+from cathsim_dmc.validation.checks import Check, Report
+from cathsim_dmc.validation.damping import LINK, _uniform, drag, fill
+from cathsim_dmc.validation.rig import Rig
+
+ANATOMIES = ("type1", "type2", "bovine")
+FLOW_BOUND = 2.0  # %
+VOLUME_BOUND = 1e-9  # of the inflow
+PROFILE_BOUND = 1e-6  # of the mean velocity
+CROSS_FLOWS = (0.1, 0.4)  # m/s
+FORCES = (1e-4, 5e-3)  # N
+_FREE = 0.2  # m
+
+
+def cantilever(
+    speed: float, device: str = "steerable_5f", link: float = LINK
+) -> tuple[float, float]:
+    """Deflection of the end of a cantilever in a uniform cross-flow, m, and expected.
+
+    The elastica bears ½ρ d C_d(Re) u² per length across its axis, u the velocity of the
+    blood across it.
+    """
+    one = _uniform(device)
+    rig = Rig(
+        one, devices.Discretisation(working_length=_FREE + link / 2, shaft_link=link)
+    )
+    blood = StillBlood()
+    rig.arena.mjcf_model.size.nuserdata = userdata_size([blood], rig.catheter)
+    rig.compile()
+    fill(rig, blood)
+    blood.velocity[0] = [speed, 0.0, 0.0]
+    rig.settle()
+    length = float(rig.sections[0].sum())
+    bending, diameter = one.shaft.bending_stiffness, 2 * one.outer_radius
+
+    def change(s, state):
+        # Angle from the axis at rest, moment / EI, shear and tension, deflection.
+        angle, curvature, shear, tension, _ = state
+        load = drag(speed * np.cos(angle), diameter)
+        return np.stack(
+            [
+                curvature,
+                -shear / bending,
+                -load - tension * curvature,
+                shear * curvature,
+                np.sin(angle),
+            ]
+        )
+
+    def ends(first, last):
+        return np.array([first[0], first[4], last[1], last[2], last[3]])
+
+    s = np.linspace(0.0, length, 60)
+    solved = solve_bvp(change, ends, s, np.zeros((5, len(s))), tol=1e-8)
+    return float(rig.head_position[0]), float(solved.y[4, -1])
+
+
+def terminal_velocity(force: float, length: float = LINK) -> tuple[float, float]:
+    """Velocity of a free link under a force across its axis, m/s, and expected.
+
+    Args:
+        force: N.
+        length: m.
+    """
+    from cathsim_dmc.physics import blood_loops
+
+    blood_loops.install()
+    radius = devices.get("steerable_5f").outer_radius
+    size = 2 + blood_loops.HEADER + blood_loops.OF_LINK + 1
+    model = mujoco.MjModel.from_xml_string(f"""
+        <mujoco>
+          <option timestep="0.004" gravity="0 0 0" integrator="implicitfast"/>
+          <size nuserdata="{size}"/>
+          <worldbody>
+            <body>
+              <freejoint/>
+              <geom type="capsule" size="{radius} {length / 2}" density="1060"/>
+            </body>
+          </worldbody>
+        </mujoco>""")
+    data = mujoco.MjData(model)
+    data.userdata[1] = blood_loops.HEADER + blood_loops.OF_LINK
+    data.userdata[2:6] = blood_loops.MARK, BLOOD_DENSITY, BLOOD_VISCOSITY, 1
+    data.xfrc_applied[1, 0] = force
+    mujoco.mj_step(model, data, 2000)
+    expected = brentq(lambda u: length * drag(u, 2 * radius) - force, 1e-6, 10.0)
+    return float(data.qvel[0]), float(expected)
+
+
+def volume_defect(anatomy: Anatomy) -> float:
+    """Largest flow lost at a junction at any phase, over the largest inflow."""
+    from cathsim_dmc.physics.blood_loops import beat
+
+    circulation, tree = anatomy.circulation, anatomy.tree
+    beats = np.array([beat(phase) for phase in np.linspace(0.0, 1.0, 101)])
+    worst = 0.0
+    for course in circulation.courses.values():
+        for place, taken in course.branches:
+            before, after = course.share(np.array([place - 1e-9, place + 1e-9]))
+            worst = max(worst, np.abs((before - after - taken) * beats).max())
+    for name, vessel in tree.vessels.items():
+        if vessel.parent is not None:
+            branches = circulation.courses[vessel.parent].branches[:, 1]
+            entering = circulation.courses[name].share(np.zeros(1))[0]
+            worst = max(worst, np.abs(branches - entering).min())
+    entering = circulation.courses[tree.root.name].share(np.full(1, -1.0))[0]
+    leaving = sum(course.outlet for course in circulation.courses.values())
+    return float(max(worst, abs(entering - 1), abs(leaving - 1)))
+
+
+def profile() -> tuple[float, float]:
+    """Profile in a straight tube: deviation over the mean, and flow over prescribed."""
+    from cathsim_dmc.anatomy.centreline import Centreline, Vessel, VesselTree
+    from cathsim_dmc.physics.flow_loops import EXPONENT, velocities
+
+    radius, z = 0.01, np.linspace(0.0, 0.2, 21)
+    line = Centreline(np.outer(z, [0, 0, 1.0]), np.full(len(z), radius))
+    tube = Anatomy.from_tree(VesselTree({"aorta": Vessel("aorta", line)}), "tube")
+    places, weights = np.polynomial.legendre.leggauss(64)
+    r = radius * (places + 1) / 2
+    points = np.stack([r, 0 * r, 0.1 + 0 * r], axis=-1)
+    out = np.empty((len(r), 5))
+    velocities(points, *tube.circulation.arrays, out)
+    mean, n = 1 / (np.pi * radius**2), EXPONENT
+    expected = mean * (n + 2) / n * (1 - (r / radius) ** n)
+    flow = (out[:, 2] * 2 * np.pi * r * weights).sum() * radius / 2
+    return float(np.abs(out[:, 2] - expected).max() / mean), float(flow)
+
+
+def flow_checks() -> list[Check]:
+    """Flow of blood."""
+    made = []
+    for speed in CROSS_FLOWS:
+        mine, theirs = cantilever(speed)
+        made.append(
+            Check.deviation(
+                f"cantilever of 0.2 m in a cross-flow of {speed:g} m/s",
+                mine,
+                theirs,
+                FLOW_BOUND,
+                f"{1e3 * mine:.2f} mm, elastica {1e3 * theirs:.2f} mm",
+            )
+        )
+    for force in FORCES:
+        mine, theirs = terminal_velocity(force)
+        made.append(
+            Check.deviation(
+                f"terminal velocity of a free link under {1e3 * force:g} mN",
+                mine,
+                theirs,
+                FLOW_BOUND,
+                f"{mine:.4f} m/s, drag {theirs:.4f} m/s",
+            )
+        )
+    for name in ANATOMIES:
+        defect = volume_defect(phantoms.load(name))
+        made.append(
+            Check.at_most(
+                f"volume lost at the junctions of {name}", defect, VOLUME_BOUND, ""
+            )
+        )
+    deviation, flow = profile()
+    made.append(
+        Check.at_most(
+            "profile in a tube, deviation over the mean", deviation, PROFILE_BOUND, ""
+        )
+    )
+    made.append(Check.deviation("flow through the profile", flow, 1.0, 1e-6))
+    return made
+
+
+def validate_vessel() -> Report:
+    """Checks what `vessel` does to blood."""
+    return Report("vessel", flow_checks())

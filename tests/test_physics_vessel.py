@@ -1,0 +1,135 @@
+"""Vessels that live: blood that flows, in both paths, on any threads."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from conftest import twin
+
+from cathsim_dmc import suite
+from cathsim_dmc.anatomy import phantoms
+from cathsim_dmc.physics.vessel import VesselOptions
+from cathsim_dmc.simulation.batch import BatchSimulation
+from cathsim_dmc.validation import vessel
+
+STEPS = 8
+DRAWN = {"flow": {"rate": (60, 90), "peak": (0.4, 1.0), "phase": (0, 1)}}
+
+
+@pytest.fixture(scope="module")
+def living():
+    """A task whose heart is drawn for each episode."""
+    return suite.make_task(
+        "simple1_bca", vessel=DRAWN, observation=["tracking", "vessel"]
+    )
+
+
+def run(task, count, threads):
+    """Joint positions (STEPS, N, nq) and the observed velocity (STEPS, N, 3)."""
+    batch = BatchSimulation(task, count, num_threads=threads, seeds=3)
+    batch.reset()
+    action = np.full((count, batch.num_actions), 0.3)
+    steps = [(batch.step(action), batch.batch.qpos.copy()) for _ in range(STEPS)]
+    velocities = [step.observation["blood_velocity"] for step, _ in steps]
+    return np.array([qpos for _, qpos in steps]), np.array(velocities)
+
+
+def test_flow_is_alike_in_both_paths_and_on_any_threads(living):
+    one, velocity = run(twin(living), 8, 1)
+    for threads in (2, 8):
+        np.testing.assert_array_equal(one, run(twin(living), 8, threads)[0])
+    environment = suite.environment(twin(living, 5))
+    environment.reset()
+    for k in range(STEPS):
+        observed = environment.step(np.full(21, 0.3)).observation
+        np.testing.assert_array_equal(environment.physics.data.qpos, one[k, 2])
+        np.testing.assert_array_equal(observed["blood_velocity"], velocity[k, 2])
+    assert np.ptp(np.linalg.norm(velocity, axis=-1)) > 0.1
+
+
+def test_an_episode_in_a_flow_goes_on_from_a_snapshot(living):
+    environment = suite.environment(twin(living))
+    environment.reset()
+    environment.step(np.zeros(21))
+    snapshot = environment.snapshot()
+    ends = []
+    for _ in range(2):
+        for _ in range(3):
+            step = environment.step(np.full(21, 0.5))
+        ends.append((environment.physics.data.qpos.copy(), step.observation))
+        environment.restore(snapshot)
+    np.testing.assert_array_equal(ends[0][0], ends[1][0])
+    for key, value in ends[0][1].items():
+        np.testing.assert_array_equal(value, ends[1][1][key])
+
+
+@pytest.mark.parametrize("access", ["ascending", "descending"])
+def test_blood_comes_from_the_heart_delayed_by_the_way(access):
+    anatomy = phantoms.load("type1", access=access)
+    circulation, root = anatomy.circulation, anatomy.tree.root.centreline
+    course = circulation.courses["aorta"]
+    assert not course.reverse and course.begin == 0.0
+    of_root = circulation.vessel == 0
+    np.testing.assert_allclose(circulation.shares[of_root][0], 1.0)
+    np.testing.assert_allclose(circulation.shares[of_root][-1], 0.761, atol=1e-12)
+    np.testing.assert_allclose(circulation.ways[of_root][-1, 1], root.length)
+    lcca = list(anatomy.tree.vessels).index("lcca")
+    np.testing.assert_allclose(
+        circulation.ways[circulation.vessel == lcca][0, 0], anatomy.tree.origin("lcca")
+    )
+
+
+def test_volume_and_profile_are_those_prescribed():
+    for name in vessel.ANATOMIES:
+        assert vessel.volume_defect(phantoms.load(name)) < vessel.VOLUME_BOUND
+    deviation, flow = vessel.profile()
+    assert deviation < vessel.PROFILE_BOUND
+    assert flow == pytest.approx(1.0, abs=1e-8)
+
+
+@pytest.mark.parametrize("force", vessel.FORCES)
+def test_a_free_link_reaches_the_terminal_velocity_of_its_drag(force):
+    mine, expected = vessel.terminal_velocity(force)
+    assert mine == pytest.approx(expected, rel=vessel.FLOW_BOUND / 100)
+
+
+def test_a_cantilever_in_a_cross_flow_bends_like_the_elastica():
+    mine, expected = vessel.cantilever(0.1)
+    assert mine == pytest.approx(expected, rel=vessel.FLOW_BOUND / 100)
+
+
+def test_what_is_drawn_and_shown_of_the_heart(living):
+    batch = BatchSimulation(twin(living), 6, seeds=0)
+    batch.reset()
+    inflow, rate, phase = batch.batch.userdata[:, 6:9].T
+    assert np.ptp(rate) > 0.1 and np.ptp(phase) > 0.3 and np.ptp(inflow) > 0
+    step = batch.step(np.zeros((6, 21)))
+    shown = step.info()["heart_phase"]
+    np.testing.assert_allclose(shown, (phase + 0.04 * rate) % 1.0, atol=1e-12)
+    assert set(step.info()) == set(living.info_types)
+
+
+@pytest.mark.parametrize(
+    ("given", "words"),
+    [
+        ("liquid", "rigid, living"),
+        (3, "mapping of flow"),
+        ({"flow": {"rate": 500}}, "vessel flow: rate is 500.*30 to 200 1/min"),
+        ({"flow": {"peak": (0.5, 9)}}, "vessel flow: peak.*0 to 2 m/s"),
+        ({"flow": {"wave_speed": float("nan")}}, "wave_speed.*2 to 20 m/s"),
+        ({"flow": {"pulse": 1}}, "rate, peak, phase, wave_speed"),
+        ({"flow": "fast"}, "True, False, or some of rate"),
+        ({"flows": True}, "some of flow"),
+    ],
+)
+def test_what_no_vessel_does_is_refused(given, words):
+    with pytest.raises(ValueError, match=words):
+        VesselOptions.make(given)
+
+
+def test_what_cannot_flow_or_be_observed_is_refused():
+    anatomy = dataclasses.replace(phantoms.load("simple1"), ends=())
+    with pytest.raises(ValueError, match="leave flow out"):
+        VesselOptions.make("living").check(anatomy)
+    with pytest.raises(ValueError, match="observation is 'vessel'; give one of"):
+        suite.make_task("simple1_bca", observation="vessel")
