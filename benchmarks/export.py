@@ -23,7 +23,7 @@ Written by `python benchmarks/export.py`; the card beside each, NAME.json, has i
 settings. Evaluated over 30 episodes by the published rule (2,000 control steps, \
 success within 8 mm inside the branch); forces as in docs/forces.md.
 
-| policy | task | observation | frames | success (95 %) | mean force, mN \
+| policy | task | observation | frames | success | mean force, mN \
 | mean contact force, mN | max force, mN |
 |---|---|---|---|---|---|---|---|
 """
@@ -72,7 +72,7 @@ def export(
         "shapes": shapes.to_dict(),
         "training": training,
         "evaluation": {
-            "seed": found.seed,
+            "seed": found.seeds[0],
             "summary": found.summary(),
             "episodes": {name: figures[name] for name in _FIGURES},
         },
@@ -89,7 +89,6 @@ def write_list(directory):
     for name in pretrained.pretrained_names(directory):
         card = pretrained.read_card(directory / f"{name}.json")
         summary, training = card["evaluation"]["summary"], card["training"]
-        low, high = summary["success_ci95"]
         forces, observation = summary["forces"], card["config"]["observation"]
         if not isinstance(observation, str):
             observation = ", ".join(observation)
@@ -103,7 +102,7 @@ def write_list(directory):
             card["task"],
             observation,
             f"{training['frames']:,}",
-            f"{100 * summary['success']:.0f} % ({100 * low:.0f}–{100 * high:.0f})",
+            f"{summary['success'] * summary['episodes']:.0f} of {summary['episodes']}",
             *(millinewtons(one["mean"], one["sd"]) for one in shown),
         ]
         lines += f"| {' | '.join(cells)} |\n"

@@ -95,6 +95,7 @@ def judge_each_arch(policy, task, task_kwargs, arches, name=None, numbers=None):
         raise ValueError(f"no device can enter any of the arches {arches!r}")
     whole = dataclasses.replace(
         played[0],
+        seeds=tuple(one.seeds[0] for one in played),
         episodes=tuple(one.episodes[0] for one in played),
         settings={**played[0].settings, "task_kwargs": options},
     )

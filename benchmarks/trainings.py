@@ -218,7 +218,7 @@ def work(cell, runs, results):
         },
         "evaluation": {
             "task": found.task,
-            "seed": found.seed,
+            "seed": found.seeds[0],
             "settings": dict(found.settings),
             "seconds": round(time.monotonic() - began, 1),
             "summary": found.summary(),

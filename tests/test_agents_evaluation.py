@@ -6,11 +6,12 @@ import synthetic_env
 import torch
 
 from cathsim_dmc import suite
-from cathsim_dmc.agents import compare, evaluate, progress
-from cathsim_dmc.agents.evaluation import paired_bootstrap
+from cathsim_dmc.agents import compare, evaluate, progress, protocols
+from cathsim_dmc.agents.episodes import EpisodeOutcome
+from cathsim_dmc.agents.evaluation import EvaluationResult, paired_bootstrap
 from cathsim_dmc.agents.report import EvaluationReport
 from cathsim_dmc.agents.report import evaluate as evaluated
-from cathsim_dmc.analysis.force_statistics import FIGURES
+from cathsim_dmc.analysis.force_statistics import FIGURES, EpisodeForces, Statistics
 from cathsim_dmc.analysis.intervals import success_interval
 from cathsim_dmc.simulation.batch import BatchSimulation
 
@@ -83,7 +84,7 @@ def test_evaluation_repeats_and_is_json(tmp_path):
     written = json.loads((tmp_path / "evaluation.json").read_text())
     assert written == json.loads(json.dumps(first.to_dict()))
     assert len(written["episodes"]) == written["summary"]["episodes"] == 5
-    assert written["episodes"][1]["seed"] == first.seed + 1
+    assert written["episodes"][1]["seed"] == first.seeds[1]
     forces = written["summary"]["forces"]
     sums = [episode["forces"]["sum"]["mean"] for episode in written["episodes"]]
     assert forces["sum"]["mean"]["mean"] == pytest.approx(np.mean(sums))
@@ -91,6 +92,54 @@ def test_evaluation_repeats_and_is_json(tmp_path):
     assert forces["peak_sum"]["maximum"] == {"mean": None, "sd": None}
     low, high = written["summary"]["success_ci95"]
     assert low <= written["summary"]["success"] <= high
+
+
+def test_the_varied_protocol_has_distinct_conditions():
+    """Every tenth of each range holds a tenth of the episodes, by seeds alone."""
+    varied = protocols.get("varied")
+    parts = protocols.parts(varied, "type1_lcca", {}, 100, 1_000_000)
+    assert [part.task_kwargs["device"] for part in parts] == list(varied.devices)
+    drawn = [one for part in parts for one in part.conditions]
+    seeds = [seed for part in parts for seed in part.seeds]
+    assert len(set(seeds)) == len(drawn) == 100
+    for name in ("friction", "stiffness", "loss", "viscosity", "roll", "insertion"):
+        low, high = getattr(protocols.VARIED_RANGES, name, None) or (0.0, 0.06)
+        values = [one[name] for one in drawn]
+        counts, _ = np.histogram(values, 10, (low, high))
+        assert counts.min() >= 7 and counts.max() <= 13, (name, counts)
+    again = np.random.RandomState(seeds[3])
+    assert (
+        drawn[3]["friction"] == varied.task_kwargs["randomisation"].draw(again).friction
+    )
+    (pair,) = protocols.parts(varied, "type1_lcca_pair", {}, 3, 0)
+    assert "device" not in pair.task_kwargs
+    with pytest.raises(ValueError, match="no protocol 'hard'; there are published, v"):
+        play(policy="random", protocol="hard")
+
+
+def test_one_condition_has_no_interval_over_its_episodes():
+    options = {"task": "type1_bca", "task_kwargs": {"max_steps": 2}, "episodes": 3}
+    one = evaluate("push", **options)
+    assert not one.distinct and one.summary()["success_ci95"] is None
+    rates = one.summary()["safe_success"]
+    assert rates == {"0.5 N": 0.0, "1 N": 0.0, "2 N": 0.0}
+    many = evaluate("push", protocol="varied", **options)
+    assert many.distinct and many.summary()["success_ci95"] is not None
+    assert [e["conditions"]["device"] for e in many.to_dict()["episodes"]] == [
+        "steerable_5f", "steerable_5f", "steerable_4f",
+    ]  # fmt: skip
+
+
+def test_safe_success_counts_the_force_in_every_physics_step():
+    def episode(success, force):
+        largest = Statistics(0.0, None, force)
+        forces = EpisodeForces(peak_sum=largest)
+        return EpisodeOutcome(0, 0.0, 1, True, success, forces)
+
+    episodes = (episode(True, 0.4), episode(True, 0.6), episode(False, 0.1))
+    result = EvaluationResult("reach", "x", (1, 2, 3), episodes, {})
+    assert result.safe_success(0.5) == pytest.approx(1 / 3)
+    assert result.safe_success(1.0) == pytest.approx(2 / 3)
 
 
 def test_expert_is_better_than_chance():

@@ -86,6 +86,8 @@ RANDOMISATION = {
     "goal_shift": span(-1, 1),
     "roll": span(-7, 7),
     "delay": span(0, 250, integers=True),
+    "start_insertion": span(0, 1),
+    "tracking_noise": number(0, 0.01),
 }
 BRANCH = {
     "radius": number(1.5e-3, 12e-3),

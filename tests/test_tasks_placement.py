@@ -18,6 +18,7 @@ from cathsim_dmc.entities import devices
 from cathsim_dmc.entities.catheter import Catheter
 from cathsim_dmc.entities.robot import Robot
 from cathsim_dmc.physics import readings
+from cathsim_dmc.physics.randomisation import Episode
 from cathsim_dmc.simulation.batch import BatchSimulation
 from cathsim_dmc.tasks import placement
 from cathsim_dmc.tasks.config import NavigationConfig
@@ -91,7 +92,8 @@ def posture(environment):
 
     def nodes(displacement, roll=None):
         data.qpos[:] = model.qpos0
-        rollout.case().start.write(data.qpos, np.asarray(displacement), roll)
+        episode = Episode(np.asarray(displacement), roll=roll)
+        rollout.case().start.write(data.qpos, episode)
         mujoco.mj_kinematics(model, data)
         return rollout.index.read(data).centreline
 
@@ -109,6 +111,8 @@ def test_the_head_is_displaced_as_asked(shared_environment, task_name):
     mujoco.mju_quat2Mat(matrix, environment.task.scene.placement.quaternion)
     # The tip swings on an arc: a few hundredths of a millimetre beside the tangent.
     expected = asked @ matrix.reshape(3, 3).T
+    # Those that would press on the wall are reversed.
+    expected *= np.sign(np.sum(moved * expected, axis=-1, keepdims=True))
     np.testing.assert_allclose(moved, expected, atol=4e-5)
 
 
@@ -245,6 +249,32 @@ def test_an_episode_may_start_along_the_route():
     batch = BatchSimulation(suite.make_task("type1_lcca", **options), 1, seeds=0)
     for start in starts[:3]:
         np.testing.assert_array_equal(batch.reset().readings.head[0], start)
+
+
+def test_episodes_may_start_farther_in_and_off_the_line():
+    """No start presses on the wall, and composer and batch start alike."""
+    ranges = {
+        "start_insertion": (0, 0.06), "start_radius": 0.01, "roll": (-3, 3),
+        "tracking_noise": 5e-4,
+    }  # fmt: skip
+    options = {"randomisation": ranges, "observation": "tracking"}
+    batch = BatchSimulation(suite.make_task("type1_lcca", **options), 24, seeds=0)
+    start = batch.reset()
+    heads, anatomy = start.readings.head, batch.task.scene.anatomy
+    radius = batch.task.scene.device.outer_radius
+    assert anatomy.depth(heads).min() > 0.8 * radius
+    way = batch.task.objective.path_distance(heads)
+    assert np.ptp(way) > 0.03
+    spread = [np.ptp(heads[abs(way - place) < 4e-3], axis=0).max() for place in way]
+    assert max(spread) > 6e-3
+    for _ in range(3):
+        step = batch.step(np.zeros((24, batch.num_actions)))
+        assert not any(step.errors) and step.wall_force.peak_max.max() < 0.5
+    seen = step.observation["tracking_points"][:, -3:] - step.readings.head
+    assert 3e-4 < seen.std() < 7e-4
+    environment = suite.environment(suite.make_task("type1_lcca", random=5, **options))
+    first = environment.reset().observation["tracking_points"]
+    np.testing.assert_array_equal(first, start.observation["tracking_points"][5])
 
 
 @pytest.mark.parametrize("given", [0.5, (0.5,), (0.5, 0.2), (0, 2), ("0", 1), (-1, 0)])

@@ -15,6 +15,7 @@ from torchrl.envs import EnvBase
 from torchrl.envs.utils import step_mdp
 
 from cathsim_dmc import bounds, files
+from cathsim_dmc.agents import protocols
 from cathsim_dmc.agents.episodes import EpisodeOutcome, EpisodeTracker
 from cathsim_dmc.agents.policies import PolicyLike, load_policy
 from cathsim_dmc.agents.views import view_of
@@ -32,6 +33,8 @@ Observer = Callable[[EnvBase, np.ndarray], None]
 EVALUATION_SEED = 1_000_000  # apart from the seeds of training
 BOOTSTRAP_SAMPLES = 10_000
 
+# Largest sums of the force on the wall up to which success is called safe, N.
+SAFE_FORCES = (0.5, 1.0, 2.0)
 _REPORTED = ("reward", "length", "path_ratio")
 
 
@@ -42,16 +45,21 @@ class EvaluationResult:
     Attributes:
         task: Name of the task.
         policy: Name of the policy.
-        seed: Seed of the first episode; episode i was played with seed + i.
+        seeds: Seed of each episode.
         episodes: Episodes in the order of their seeds.
-        settings: Observation, task_kwargs and, for a checkpoint, its frames.
+        settings: Protocol, observation, task_kwargs and, for a checkpoint, its frames.
+        distinct: Whether episodes differ by more than the jitter of the start. If not,
+            they are nearly one, and no interval over them is given.
+        conditions: What was drawn for each episode; empty without randomisation.
     """
 
     task: str
     policy: str
-    seed: int
+    seeds: tuple[int, ...]
     episodes: tuple[EpisodeOutcome, ...]
     settings: Mapping[str, Any]
+    distinct: bool = True
+    conditions: tuple[Mapping[str, Any], ...] = ()
 
     def values(self, name: str) -> np.ndarray:
         """A figure of every episode, float64 (episodes,); NaN where unknown.
@@ -83,10 +91,28 @@ class EvaluationResult:
         known = [e.success for e in self.episodes if e.success is not None]
         return sum(known) if len(known) == len(self.episodes) else None
 
+    def safe_success(self, limit: float) -> float | None:
+        """Share of episodes that reach the goal with little force on the wall.
+
+        Args:
+            limit: The sum of the magnitudes over all contacts stays at or below it in
+                every physics step, N.
+
+        Returns:
+            As a fraction; None where success or force is not known.
+        """
+        if self.successes is None:
+            return None
+        largest = self.values("forces.peak_sum.maximum")
+        if np.isnan(largest).any():
+            return None
+        return float(np.mean((self.values("success") > 0) & (largest <= limit)))
+
     def summary(self) -> dict[str, Any]:
         """Means with deviations over the episodes, success rate with its interval.
 
-        Forces in N, by quantity and statistic as docs/forces.md defines them.
+        The interval is None where the episodes are not distinct. Forces in N, by
+        quantity and statistic as docs/forces.md defines them.
         """
         result: dict[str, Any] = {"episodes": len(self.episodes)}
         for name in _REPORTED:
@@ -109,23 +135,32 @@ class EvaluationResult:
         rate = interval = None
         if successes is not None:
             rate = successes / len(self.episodes)
-            interval = list(success_interval(successes, len(self.episodes)))
+            if self.distinct:
+                interval = list(success_interval(successes, len(self.episodes)))
         result["success"] = rate
         result["success_ci95"] = interval
+        result["safe_success"] = {
+            f"{limit:g} N": self.safe_success(limit) for limit in SAFE_FORCES
+        }
         return result
 
     def to_dict(self) -> dict[str, Any]:
         """JSON-able: identity, summary and every episode."""
+        episodes = [
+            {"seed": seed, **asdict(episode)}
+            for seed, episode in zip(self.seeds, self.episodes, strict=True)
+        ]
+        if self.conditions:
+            for episode, drawn in zip(episodes, self.conditions, strict=True):
+                episode["conditions"] = dict(drawn)
         return {
             "task": self.task,
             "policy": self.policy,
-            "seed": self.seed,
+            "seed": self.seeds[0],
             "settings": dict(self.settings),
+            "distinct": self.distinct,
             "summary": self.summary(),
-            "episodes": [
-                {"seed": self.seed + index, **asdict(episode)}
-                for index, episode in enumerate(self.episodes)
-            ],
+            "episodes": episodes,
         }
 
 
@@ -185,12 +220,13 @@ def compare(policy: EvaluationResult, baseline: EvaluationResult) -> Comparison:
     Raises:
         ValueError: they are of different tasks or seeds.
     """
-    here = (policy.task, policy.seed, len(policy.episodes))
-    there = (baseline.task, baseline.seed, len(baseline.episodes))
+    here = (policy.task, policy.seeds)
+    there = (baseline.task, baseline.seeds)
     if here != there:
+        one, other = ((task, seeds[0], len(seeds)) for task, seeds in (here, there))
         raise ValueError(
             f"only evaluations of the same (task, seed, episodes) can be compared: "
-            f"given are {here} and {there}."
+            f"given are {one} and {other}."
         )
     reward, reward_ci = paired_bootstrap(
         policy.values("reward"), baseline.values("reward")
@@ -214,9 +250,10 @@ def compare(policy: EvaluationResult, baseline: EvaluationResult) -> Comparison:
 def evaluate(
     policy: PolicyLike,
     task: str | None = None,
-    episodes: int = 30,
+    episodes: int | None = None,
     seed: int = EVALUATION_SEED,
     *,
+    protocol: str = "published",
     name: str | None = None,
     observation: str | Sequence[str] | None = None,
     task_kwargs: Mapping[str, Any] | None = None,
@@ -238,9 +275,10 @@ def evaluate(
             (episodes, ...) that returns the actions (episodes, A) or the TensorDict
             with "action" in it.
         task: Name of the task; None takes the one that the policy was trained on.
-        episodes: Number of episodes.
-        seed: Seed of the first episode; the others count up. The default lies apart
-            from training seeds.
+        episodes: Number of episodes; None for that of the protocol.
+        seed: Seed of the first episode; the others lie above it. The default lies
+            apart from training seeds.
+        protocol: Name of the conditions in `protocols.PROTOCOLS`.
         name: Name of the policy for the reports.
         observation: Name or names of the observations; None takes those that the
             policy reads.
@@ -261,23 +299,37 @@ def evaluate(
             another number of episodes.
         CheckpointError: there is no such checkpoint, or it is damaged.
     """
+    conditions = protocols.get(protocol)
+    episodes = conditions.episodes if episodes is None else episodes
     check_numbers(episodes, seed, num_threads)
     player = load_policy(policy, seed)
     task = require_task(player, task)
     settings = _settings(player, observation, task_kwargs)
-    env = make_env(
+    options = settings["task_kwargs"]
+    outcomes: list[EpisodeOutcome] = []
+    parts = protocols.parts(conditions, task, options, episodes, seed)
+    for part in parts:
+        env = make_env(
+            task,
+            observation=settings["observation"],
+            num_envs=len(part.seeds),
+            num_threads=num_threads,
+            seed=part.seeds if conditions.task_kwargs else part.seeds[0],
+            task_kwargs=part.task_kwargs,
+        )
+        try:
+            outcomes += _first_episodes(env, player, observer, start)
+        finally:
+            env.close()
+    result = EvaluationResult(
         task,
-        observation=settings["observation"],
-        num_envs=episodes,
-        num_threads=num_threads,
-        seed=seed,
-        task_kwargs=settings["task_kwargs"],
+        name or player.name,
+        tuple(seed for part in parts for seed in part.seeds),
+        tuple(outcomes),
+        {"protocol": protocol, **settings},
+        start is not None or protocols.distinct(task, parts[0].task_kwargs),
+        tuple(drawn for part in parts for drawn in part.conditions),
     )
-    try:
-        outcomes = _first_episodes(env, player, observer, start)
-    finally:
-        env.close()
-    result = EvaluationResult(task, name or player.name, seed, outcomes, settings)
     if out_dir is not None:
         write_evaluation(out_dir, result.to_dict())
     return result

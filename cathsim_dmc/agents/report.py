@@ -11,7 +11,7 @@ import numpy as np
 from torchrl.envs import EnvBase
 
 from cathsim_dmc import bounds, files, suite
-from cathsim_dmc.agents import evaluation, policies
+from cathsim_dmc.agents import evaluation, policies, protocols
 from cathsim_dmc.agents.progress import EvaluationProgress
 from cathsim_dmc.analysis import heatmap
 from cathsim_dmc.analysis.force_statistics import FIGURES, millinewtons
@@ -54,8 +54,8 @@ class EvaluationReport:
         from rich.table import Table
 
         table = Table(
-            title=f"{self.policy.task}, seeds from {self.policy.seed}",
-            caption=_CAPTION,
+            title=f"{self.policy.task}, seeds from {self.policy.seeds[0]}",
+            caption=_CAPTION if self.policy.distinct else f"{_CAPTION} {_NEARLY_ONE}",
             caption_justify="left",
         )
         results = [one for one in (self.policy, self.baseline) if one is not None]
@@ -79,13 +79,19 @@ class EvaluationReport:
 _ROWS = (
     "reward", "steps", "mean force, mN", "mean contact force, mN",
     "max force, mN", "peak force, mN", "success",
+    *(f"safe success, {limit:g} N" for limit in evaluation.SAFE_FORCES),
 )  # fmt: skip
 _CAPTION = (
     "Mean ± standard deviation over episodes. Mean force: sum over all contacts at the "
     "end of a control step, mean over all steps. Mean contact force: largest single "
     "contact at the end of a control step, mean over the steps with contact. Max "
     "force: largest single contact at the end of any control step. Peak force: the "
-    "same in any physics step."
+    "same in any physics step. Safe success: the goal reached while the sum over all "
+    "contacts stays at or below a limit in every physics step."
+)
+_NEARLY_ONE = (
+    "Success without interval: the episodes differ by 1 mm of the start, so they are "
+    "nearly one; `--protocol varied` plays distinct ones."
 )
 
 
@@ -96,16 +102,21 @@ def _cells(result: evaluation.EvaluationResult) -> list[str]:
 
     summary = result.summary()
     rate, interval = summary["success"], summary["success_ci95"]
-    success = "–"
-    if rate is not None:
+    success = _percent(rate)
+    if interval is not None:
         low, high = (round(100 * bound) for bound in interval)
-        success = f"{100 * rate:.0f} % ({low}–{high})"
+        success += f" ({low}–{high})"
     return [
         spread("reward", 1),
         spread("length", 0),
         *(millinewtons(*result.mean_sd(f"forces.{name}")) for name in FIGURES),
         success,
+        *map(_percent, summary["safe_success"].values()),
     ]
+
+
+def _percent(rate: float | None) -> str:
+    return "–" if rate is None else f"{100 * rate:.0f} %"
 
 
 class ContactLog:
@@ -137,8 +148,9 @@ def evaluate(
     policy: policies.PolicyLike,
     *,
     task: str | None = None,
-    episodes: int = 30,
+    episodes: int | None = None,
     seed: int = evaluation.EVALUATION_SEED,
+    protocol: str = "published",
     task_kwargs: Mapping[str, Any] | None = None,
     num_threads: int | None = None,
     baseline: bool = True,
@@ -152,8 +164,9 @@ def evaluate(
     Args:
         policy: Policy, or what names one, see `policies.load_policy`.
         task: Name of the task; None takes the one that the policy was trained on.
-        episodes: Number of episodes.
-        seed: Seed of the first episode; the others count up.
+        episodes: Number of episodes; None for that of the protocol.
+        seed: Seed of the first episode; the others lie above it.
+        protocol: Name of the conditions in `protocols.PROTOCOLS`.
         task_kwargs: Options of the task, over those that the policy was trained with.
         num_threads: Number of threads of the simulation; None takes one per core.
         baseline: Whether to play the same seeds with the random policy too.
@@ -163,7 +176,10 @@ def evaluate(
     """
     began = time.monotonic()
     snapshot = None if start is None else Snapshot.load(start)
-    episodes = episodes if snapshot is None else len(snapshot)
+    if snapshot is not None:
+        episodes = len(snapshot)
+    elif episodes is None:
+        episodes = protocols.get(protocol).episodes
     evaluation.check_numbers(episodes, seed, num_threads)
     player = policies.load_policy(policy, seed)
     require_registered(evaluation.require_task(player, task))
@@ -180,6 +196,7 @@ def evaluate(
         evaluation.evaluate,
         episodes=episodes,
         seed=seed,
+        protocol=protocol,
         num_threads=num_threads,
         start=snapshot,
     )

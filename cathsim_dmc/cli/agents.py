@@ -4,7 +4,7 @@ import dataclasses
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 from tyro import conf
 from tyro.extras import SubcommandApp
@@ -50,8 +50,9 @@ def evaluate(
     policy: Annotated[str, conf.Positional],
     /,
     task: str | None = None,
-    episodes: int = 30,
+    episodes: int | None = None,
     seed: int = EVALUATION_SEED,
+    protocol: Literal["published", "varied"] = "published",
     out: Path | None = None,
     baseline: bool = True,
     anatomy: OwnAnatomy = NO_ANATOMY,
@@ -67,8 +68,12 @@ def evaluate(
         policy: Directory of a run or of a checkpoint, or name of a policy: "random",
             "push", "expert", "idle", "curl", "random_curl", "pretrained:NAME".
         task: Task of `cathsim list`; by default the one that the policy was trained on.
-        episodes: Number of episodes, each with a seed of its own.
-        seed: Seed of the first episode; the others count up.
+        episodes: Number of episodes, each with a seed of its own; by default 30, and
+            100 of the varied protocol.
+        seed: Seed of the first episode; the others lie above it.
+        protocol: Conditions: "published", where episodes differ by 1 mm of the start,
+            or "varied", where start, roll, friction, stiffness, damping, delay, device
+            and noise differ from episode to episode.
         out: Directory for evaluation.json and heatmap.png.
         baseline: Whether to compare with the random policy on the same seeds.
         anatomy: Where the task takes place.
@@ -85,6 +90,7 @@ def evaluate(
         task=task,
         episodes=episodes,
         seed=seed,
+        protocol=protocol,
         task_kwargs={**given(options), **anatomy.task_kwargs},
         num_threads=threads,
         baseline=baseline,

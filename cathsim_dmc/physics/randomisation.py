@@ -39,8 +39,10 @@ _RANGES = {
     "goal_shift": (-1.0, 1.0, "m"),
     "roll": (-2 * np.pi, 2 * np.pi, "rad"),
     "delay": (0, 250, "control steps"),
+    "start_insertion": (0.0, 1.0, "m"),
 }
 _FARTHEST_START = 0.02  # m; the lumen is no wider
+_MOST_NOISE = 0.01  # m
 
 
 def start_displacement(
@@ -71,6 +73,11 @@ class Randomisation:
         goal_shift: of the goal along its branch, m, positive away from the ostium.
         roll: of the device about its own axis, rad.
         delay: least and longest delay of the action, whole control steps.
+        start_insertion: how much farther in than the task's own start an episode
+            begins, m, in steps of 5 mm; less in proportion where the farthest is more
+            than half of the way to the goal.
+        tracking_noise: standard deviation of each coordinate of the tracked points,
+            m, drawn anew in every control step.
     """
 
     friction: Range | None = None
@@ -84,6 +91,8 @@ class Randomisation:
     goal_shift: Sequence[float] | None = None
     roll: Range | None = None
     delay: Sequence[int] | None = None
+    start_insertion: Sequence[float] | None = None
+    tracking_noise: float = 0.0
 
     def __post_init__(self):
         for name, (low, high, unit) in _RANGES.items():
@@ -91,7 +100,7 @@ class Randomisation:
             if value is None:
                 continue
             if isinstance(value, variation.Variation):
-                if name in ("delay", "goal_shift"):
+                if name in ("delay", "goal_shift", "start_insertion"):
                     raise ValueError(
                         f"{name} is a Variation; its bounds must be known before, so "
                         "give (low, high)"
@@ -101,6 +110,7 @@ class Randomisation:
             ends = bounds.interval(name, value, low, high, unit, integers=whole)
             object.__setattr__(self, name, ends)
         bounds.number("start_radius", self.start_radius, 0.0, _FARTHEST_START, "m")
+        bounds.number("tracking_noise", self.tracking_noise, 0.0, _MOST_NOISE, "m")
 
     @classmethod
     def make(cls, value: "Randomisation | Mapping[str, Any] | bool") -> "Randomisation":
@@ -130,6 +140,11 @@ class Randomisation:
         """How far past its place a goal may be shifted, m."""
         return max(0.0, *(self.goal_shift or (0.0,)))
 
+    @property
+    def farthest_insertion(self) -> float:
+        """How much farther in an episode may begin, m."""
+        return 0.0 if self.start_insertion is None else self.start_insertion[1]
+
     def draw(self, random_state: np.random.RandomState) -> "Episode":
         """Draws an episode; what is None takes nothing from the source."""
 
@@ -154,6 +169,7 @@ class Randomisation:
         if self.delay is not None:
             low, high = map(int, self.delay)
             delay = int(random_state.randint(low, high + 1))
+        insertion = value("start_insertion")
         return Episode(
             displacement=displacement,
             friction=friction,
@@ -169,6 +185,7 @@ class Randomisation:
             goal_shift=shift,
             roll=roll,
             delay=delay,
+            insertion=insertion,
         )
 
 
@@ -203,6 +220,7 @@ class Episode:
         goal_shift: m along the branch.
         roll: rad.
         delay: control steps.
+        insertion: m, beyond the task's own start.
     """
 
     displacement: np.ndarray
@@ -214,6 +232,7 @@ class Episode:
     goal_shift: float | None = None
     roll: float | None = None
     delay: int = 0
+    insertion: float | None = None
 
 
 class RandomisedModel(Effect):

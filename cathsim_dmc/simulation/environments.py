@@ -28,7 +28,7 @@ def make_env(
     observation: str | Sequence[str] = "internal",
     num_envs: int = 1,
     num_threads: int | None = None,
-    seed: int = 0,
+    seed: int | Sequence[int] = 0,
     task_kwargs: Mapping[str, Any] | None = None,
 ) -> EnvBase:
     """A seeded environment of batch size [num_envs] whose observations are standard.
@@ -39,7 +39,7 @@ def make_env(
         num_envs: Number of simulations; simulation i draws from seed + i.
         num_threads: Number of threads of the batched simulation, None for one per
             core.
-        seed: Seed of the first simulation.
+        seed: Seed of each simulation, or of the first.
         task_kwargs: Further options of the task.
 
     Returns:

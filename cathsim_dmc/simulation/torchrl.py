@@ -31,7 +31,7 @@ class BatchedEnv(EnvBase):
         num_envs: int = 16,
         *,
         num_threads: int | None = None,
-        seed: int = 0,
+        seed: int | Sequence[int] = 0,
         observation: str | Sequence[str] = "internal",
         task_kwargs: Mapping[str, Any] | None = None,
     ):
@@ -41,7 +41,7 @@ class BatchedEnv(EnvBase):
             task_name: Name of a task in `suite.SUITE`.
             num_envs: N.
             num_threads: Number of threads of the simulation, None for one per core.
-            seed: Seed of the first simulation; the others count up from it.
+            seed: Seed of each simulation, or of the first, the others counting up.
             observation: Name or names of observations.
             task_kwargs: Further options of the task.
         """

@@ -40,6 +40,7 @@ class Case:
         fluoroscopy: FluoroscopyOptions | None = None,
         fields: Fields | None = None,
         start_along_route: Sequence[float] | None = None,
+        farthest_start: float = 0.0,
     ):
         """Lets the device settle in the anatomy.
 
@@ -51,12 +52,15 @@ class Case:
             fields: What `write` writes beside the statistics, by its name in MuJoCo's
                 model.
             start_along_route: As in `NavigationConfig`.
+            farthest_start: How much farther in an episode may begin, m.
         """
         self.scene = scene
         self.objective = objective
         index = model_index(scene, model)
         devices_of(scene.catheter).settle(model)
-        self.start = StartPosture(scene, model, index, start_along_route)
+        self.start = StartPosture(
+            scene, model, index, start_along_route, farthest_start
+        )
         self._fluoroscopy = fluoroscopy
         self.fields = fields or {}
         self._statistics = {n: np.copy(getattr(model.stat, n)) for n in _STATISTICS}
@@ -87,6 +91,7 @@ def compile_together(
     physics_timestep: float,
     fluoroscopy: FluoroscopyOptions | None = None,
     start_along_route: Sequence[float] | None = None,
+    farthest_start: float = 0.0,
 ) -> tuple[Case, ...]:
     """Compiles scenes so that any of them can be written into a model of the first.
 
@@ -98,6 +103,7 @@ def compile_together(
         physics_timestep: s.
         fluoroscopy: Set-up of the angiography machines, None for none.
         start_along_route: As in `NavigationConfig`.
+        farthest_start: How much farther in an episode may begin, m.
 
     Raises:
         ValueError: if the scenes differ in more than wall and places.
@@ -115,7 +121,15 @@ def compile_together(
         else:
             fields = _differences(host, model, scene, first)
             sizes |= {name: len(value) for name, value in fields.items()}
-        case = Case(scene, objective, model, fluoroscopy, fields, start_along_route)
+        case = Case(
+            scene,
+            objective,
+            model,
+            fluoroscopy,
+            fields,
+            start_along_route,
+            farthest_start,
+        )
         case.scene = first.in_anatomy(scene)
         scene.anatomy.lumen.release()
         found.append(case)

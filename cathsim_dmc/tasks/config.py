@@ -107,6 +107,11 @@ class NavigationConfig:
             self, "randomisation", Randomisation.make(self.randomisation)
         )
         object.__setattr__(self, "vessel", VesselOptions.make(self.vessel))
+        if self.start_along_route is not None and self.ranges.start_insertion:
+            raise ValueError(
+                "start_along_route and randomisation start_insertion both say where an "
+                "episode begins; leave one of the two out"
+            )
         self._check_views()
         if not isinstance(self.effects, Sequence) or not all(
             isinstance(effect, Effect) for effect in self.effects

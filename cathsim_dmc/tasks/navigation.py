@@ -101,6 +101,7 @@ class Navigation(composer.Task):
                 config.physics_timestep,
                 self._fluoroscopy,
                 config.start_along_route,
+                config.ranges.farthest_insertion,
             )
         self._rollout: Rollout  # there once the model is compiled
         self._observables = None
@@ -119,6 +120,7 @@ class Navigation(composer.Task):
                 model,
                 self._fluoroscopy,
                 start_along_route=self._config.start_along_route,
+                farthest_start=self._config.ranges.farthest_insertion,
             )
         ]
         return Rollout(chosen, self._config, model, stepper)

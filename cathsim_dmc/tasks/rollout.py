@@ -47,6 +47,7 @@ from cathsim_dmc.tasks.snapshot import (
     set_random,
 )
 from cathsim_dmc.tasks.step import Step
+from cathsim_dmc.tasks.tracking_noise import TrackingNoise
 
 # Reasons of errors, empty for none.
 _REASON = "U64"
@@ -115,6 +116,7 @@ class Rollout:
             self._chain,
             open_cameras(self._names, model, config.camera_options, catheter),
         )
+        self._tracking = TrackingNoise(config.ranges.tracking_noise, num_simulations)
         self._monitor = PhysicsMonitor(scene, num_simulations)
         self._description = describe([case.scene for case in cases], listed)
         still = np.zeros((num_simulations, 3))
@@ -172,10 +174,8 @@ class Rollout:
             self._stepper.load(index, self.case(index))
         case = self.case(index)
         episode = self._config.ranges.draw(random_state)
-        displacement = case.start.clear_of_wall(episode.displacement)
         number = case.start.draw(random_state)
-        qpos = self._state.qpos[index]
-        case.start.write(qpos, displacement, episode.roll, number)
+        case.start.write(self._state.qpos[index], episode, number)
         self._effects.enter(index, case.scene.anatomy)
         self._effects.restart(index, episode, random_state)
         self._monitor.restart(index, case.scene)
@@ -281,10 +281,14 @@ class Rollout:
         )
 
     def _observe(self, goal: np.ndarray, fresh: np.ndarray | None) -> Observation:
-        devices, images = self.devices, NO_IMAGES
+        if self._tracking.on and self._random_states is not None:
+            devices = self._measured.devices
+            self._tracking.draw(self.readings, devices, self._random_states, fresh)
+        state, devices = self._tracking.seen(self.readings, self.devices)
+        ahead, images = None, NO_IMAGES
         if self._sensors.on:
             images = self._sensors.capture(
-                self.readings.centreline,
+                state.centreline,
                 self.shadows,
                 goal,
                 self._state.qpos,
@@ -292,7 +296,6 @@ class Rollout:
                 fresh,
                 None if devices is None else devices.points,
             )
-        state, ahead = self.readings, None
         if self._routes is not None:
             ahead = self._routes.ahead(self._case_of, state.head, state.head_frame)
         force, chain = self.wall_force, self._chain
@@ -319,6 +322,7 @@ class Rollout:
             **self._measured.arrays(),
             **named("effects", self._effects.state),
             **named("images", self._sensors.state),
+            **named("tracking", self._tracking.state),
         }
         arrays = {name: array[indices] for name, array in arrays.items()}
         sources = random_arrays([self._random_states[index] for index in indices])
@@ -372,6 +376,7 @@ class Rollout:
         self._measured = self._measured.restored(snapshot, indices)
         machines = [self.case(index).angiograph for index in indices]
         self._sensors.restore(indices, machines, snapshot.part("images"))
+        self._tracking.restore(indices, snapshot.part("tracking"))
         return self._step(np.empty(0, dtype=int))
 
     # What others may read.

@@ -1,19 +1,28 @@
 """The posture in which a device waits for its episode to begin."""
 
-from collections.abc import Sequence
+import contextlib
+import functools
+import math
+from collections.abc import Callable, Sequence
 
 import mujoco
 import numpy as np
 
 from cathsim_dmc.entities.posture import bends_of, joints_along
 from cathsim_dmc.physics.drives import hold
-from cathsim_dmc.physics.randomisation import START_JITTER
+from cathsim_dmc.physics.randomisation import START_JITTER, Episode
 from cathsim_dmc.physics.readings import ModelIndex
 from cathsim_dmc.tasks.scene import Scene
 
 # How long the device settles; its hinges relax in 0.4 s.
 _SETTLING_TIME = 2.0  # s
 _STARTS_ALONG_ROUTE = 16
+# How much deeper a displacement may put the links behind the head into the wall, m.
+_PRESSED = 2e-4
+_LARGEST_START = 0.5  # share of the way to the goal
+_START_SPACING = 5e-3  # m, between the postures that a start farther in chooses from
+# Displacements that are tried where the whole one presses on the wall.
+_SMALLER = tuple(sign * 0.5**half for half in range(1, 6) for sign in (1.0, -1.0))
 # By how much the axis of a settled device may stand out of the lumen, m: the pieces of
 # the wall stay behind it by less, the device's radius not counted.
 _OUTSIDE = 0.5e-3
@@ -37,6 +46,7 @@ class StartPosture:
         model: mujoco.MjModel,
         index: ModelIndex,
         along_route: Sequence[float] | None = None,
+        farthest: float = 0.0,
     ):
         """Lets the device settle.
 
@@ -47,124 +57,133 @@ class StartPosture:
             along_route: Least and largest share of the way to the goal that the head
                 has made, for episodes that do not begin at the inlet; None for those
                 that do.
+            farthest: How much farther in an episode may begin, m. Where that is more
+                than half of the way to the goal, starts are closer in proportion.
 
         Raises:
             ValueError: if the device comes to rest outside the lumen or in its wall.
         """
-        catheter = scene.catheter
-        self._bends = index.bends_qpos
-        self._insertion = index.insertion_qpos
         # The base cannot go back behind its start, so the stroke begins 1 mm later.
-        data = self._settle(scene, model, START_JITTER)
-        _refuse_outside(scene, model, index, data)
-        data.qvel[:] = 0.0
-        mujoco.mj_kinematics(model, data)
-        mujoco.mj_comPos(model, data)
-        self._angles = data.qpos[self._bends].copy()
-        self._advance = float(data.qpos[self._insertion])
-        self._directions = self._link_directions(index, data)
-        self._find_levers(model, data, index, catheter.link_lengths, scene)
-        self._anatomy = scene.anatomy
-        self._radius = scene.device.outer_radius
-        self._frame = data.xmat[index.links.start].reshape(3, 3).copy()
-        self._head = data.site_xpos[index.head_site].copy()
-        self._head_depth = float(scene.anatomy.depth(self._head))
-
-        self._ahead: list[tuple[np.ndarray, float]] = []
-        if along_route is not None:
-            self._ahead = self._settled_along(scene, model, index, along_route)
-
-    def _settle(
-        self, scene: Scene, model: mujoco.MjModel, advance: float
-    ) -> mujoco.MjData:
-        """Lays the device along the line, so far advanced (m), and lets it go."""
-        data = mujoco.MjData(model)
-        data.qpos[self._insertion] = advance
-        data.qpos[self._bends] = joints_along(
-            scene.catheter.link_lengths, scene.placement.line, advance
-        )
-        hold(model, data)
-        for _ in range(round(_SETTLING_TIME / model.opt.timestep)):
-            mujoco.mj_step(model, data)
-        return data
-
-    def _settled_along(
-        self,
-        scene: Scene,
-        model: mujoco.MjModel,
-        index: ModelIndex,
-        shares: Sequence[float],
-    ) -> list[tuple[np.ndarray, float]]:
-        """Angles of the hinges and insertions, further and further in.
-
-        What springs out of a branch comes to rest elsewhere in the lumen; where a
-        device cannot lie at all, none is kept.
-        """
+        settle = functools.partial(_settle, scene, model, index)
+        rest = settle(0.0)
         place = scene.placement
         way = np.linalg.norm(np.diff(place.line, axis=0), axis=-1).sum()
         way -= float(np.sum(scene.catheter.link_lengths)) + START_JITTER
-        settled = []
-        for share in np.linspace(shares[0], shares[1], _STARTS_ALONG_ROUTE):
-            data = self._settle(scene, model, START_JITTER + share * way)
-            try:
-                _refuse_outside(scene, model, index, data)
-            except ValueError:
-                continue
-            advance = float(data.qpos[self._insertion])
-            settled.append((data.qpos[self._bends].copy(), advance))
-        if not settled:
-            raise ValueError(
-                f"start_along_route is {tuple(shares)}: {scene.device.name!r} can be "
-                f"laid nowhere there in {scene.anatomy.name!r}; give smaller shares"
-            )
-        return settled
+        self._ahead: list[_Posture] = []
+        if along_route is not None:
+            low, high = (share * way for share in along_route)
+            self._ahead = _settled(settle, low, high, _STARTS_ALONG_ROUTE)
+            if not self._ahead:
+                raise ValueError(
+                    f"start_along_route is {tuple(along_route)}: "
+                    f"{scene.device.name!r} can be laid nowhere there in "
+                    f"{scene.anatomy.name!r}; give smaller shares"
+                )
+        self._starts = [rest]
+        self._scale = 1.0
+        if farthest:
+            reach = min(farthest, _LARGEST_START * way)
+            count = math.ceil(reach / _START_SPACING)
+            self._starts += _settled(settle, reach / count, reach, count)
+            self._scale = reach / farthest
 
     def draw(self, random_state: np.random.RandomState) -> int | None:
         """Draws where along the route an episode starts; None for the inlet."""
         return random_state.randint(len(self._ahead)) if self._ahead else None
 
-    def _link_directions(self, index: ModelIndex, data: mujoco.MjData) -> np.ndarray:
-        """Unit vectors (n, 3) of the links in the frame of link 0."""
-        frames = data.xmat[index.links].reshape(-1, 3, 3)
-        return frames[..., 2] @ frames[0]
+    def write(
+        self, qpos: np.ndarray, episode: Episode, number: int | None = None
+    ) -> None:
+        """Writes the start configuration of one simulation.
 
-    def _find_levers(self, model, data, index, link_lengths, scene):
-        """How base and the first free joint move the head, for the displacement."""
-        beyond = np.cumsum(link_lengths[::-1])[::-1]  # from joint i to the head
-        free = np.flatnonzero(beyond[1:] <= scene.placement.start_depth)
-        self._free = int(free[0]) if free.size else len(link_lengths) - 2
+        A displacement that would press the device on the wall is reversed, then
+        halved until it does not.
+
+        Args:
+            qpos: (nq,), written in place; joints of other entities are left alone.
+            episode: What was drawn for it.
+            number: What `draw` returned: a device that lies along the route is not
+                displaced.
+        """
+        if number is not None:
+            self._ahead[number].write(qpos, np.zeros(3), episode.roll)
+            return
+        wanted = self._scale * (episode.insertion or 0.0)
+        posture = min(self._starts, key=lambda one: abs(one.advance - wanted))
+        displacement = posture.clear_of_wall(episode.displacement)
+        posture.write(qpos, displacement, episode.roll)
+
+
+class _Posture:
+    """A device at rest, and how its joints displace its head.
+
+    Attributes:
+        advance: How much farther in than the first posture, m.
+    """
+
+    def __init__(
+        self,
+        scene: Scene,
+        model: mujoco.MjModel,
+        index: ModelIndex,
+        data: mujoco.MjData,
+        advance: float,
+    ):
+        """Takes the posture of a device that has settled."""
+        self.advance = advance
+        self._bends, self._insertion = index.bends_qpos, index.insertion_qpos
+        data.qvel[:] = 0.0
+        mujoco.mj_kinematics(model, data)
+        mujoco.mj_comPos(model, data)
+        self._angles = data.qpos[self._bends].copy()
+        self._inserted = float(data.qpos[self._insertion])
+        frames = data.xmat[index.links].reshape(-1, 3, 3)
+        self._directions = frames[..., 2] @ frames[0]
+        self._frame = frames[0].copy()
+        lengths = scene.catheter.link_lengths
+        beyond = np.cumsum(lengths[::-1])[::-1]  # from joint i to the head
+        inside = scene.placement.start_depth + advance
+        free = np.flatnonzero(beyond[1:] <= inside)
+        self._free = int(free[0]) if free.size else len(lengths) - 2
         jacobian = np.zeros((3, model.nv))
         mujoco.mj_jacSite(model, data, jacobian, None, index.head_site)
-        frame = data.xmat[index.links.start].reshape(3, 3)
         places = [self._insertion, *self._bends[self._free]]
         dofs = [_dof_of(model, place) for place in places]
         # Joint steps for a displacement in the frame of the inlet.
-        self._steps = np.linalg.inv(frame.T @ jacobian[:, dofs])
+        self._steps = np.linalg.inv(self._frame.T @ jacobian[:, dofs])
+        # The joints that the first free one moves and the head, as far as they move.
+        swinging = slice(index.links.start + self._free + 2, index.links.stop)
+        self._nodes = np.vstack([data.xpos[swinging], data.site_xpos[index.head_site]])
+        self._shares = (
+            1.0
+            - np.append(beyond[self._free + 2 :], 0.0)[:, None]
+            / (beyond[self._free + 1])
+        )
+        self._anatomy = scene.anatomy
+        depth = scene.anatomy.depth(self._nodes)
+        self._least = np.minimum(depth, scene.device.outer_radius)
+        self._least[:-1] -= _PRESSED
 
     def clear_of_wall(self, displacement: np.ndarray) -> np.ndarray:
-        """The displacement, or its opposite where it would press on the wall.
+        """The displacement, reversed or halved where it would press on the wall.
 
         Args:
             displacement: (3,) of the head in the frame of the inlet, m.
 
         Returns:
-            (3,) m, of the same length.
+            (3,) m.
         """
-        depth = float(self._anatomy.depth(self._head + self._frame @ displacement))
-        return (
-            displacement
-            if depth >= min(self._radius, self._head_depth)
-            else -displacement
-        )
+        for factor in (1.0, -1.0, *_SMALLER):
+            displaced = self._frame @ (factor * displacement)
+            depth = self._anatomy.depth(self._nodes + self._shares * displaced)
+            if (depth >= self._least).all():
+                return factor * displacement
+        return np.zeros(3)
 
     def write(
-        self,
-        qpos: np.ndarray,
-        displacement: np.ndarray,
-        roll: float | None = None,
-        number: int | None = None,
+        self, qpos: np.ndarray, displacement: np.ndarray, roll: float | None
     ) -> None:
-        """Writes the start configuration of one simulation.
+        """Writes the posture.
 
         Args:
             qpos: (nq,), written in place; joints of other entities are left alone.
@@ -172,19 +191,46 @@ class StartPosture:
                 into the lumen, m.
             roll: Angle by which the device is turned about its own axis, rad: its
                 hinges stand otherwise, its shape is the same.
-            number: What `draw` returned: a device that lies along the route is neither
-                displaced nor turned.
         """
-        if number is not None:
-            qpos[self._bends], qpos[self._insertion] = self._ahead[number]
-            return
         angles, step = self._angles, self._steps @ displacement
         if roll:
             angles = bends_of(_turned(self._directions, -roll))
             step = np.concatenate([step[:1], _turn(-roll) @ step[1:]])
         qpos[self._bends] = angles
         qpos[self._bends[self._free]] += step[1:]
-        qpos[self._insertion] = max(self._advance + step[0], 0.0)
+        qpos[self._insertion] = max(self._inserted + step[0], 0.0)
+
+
+def _settle(
+    scene: Scene, model: mujoco.MjModel, index: ModelIndex, advance: float
+) -> _Posture:
+    """Lays the device along the line, so far advanced (m), and lets it go."""
+    data = mujoco.MjData(model)
+    at = START_JITTER + advance
+    data.qpos[index.insertion_qpos] = at
+    data.qpos[index.bends_qpos] = joints_along(
+        scene.catheter.link_lengths, scene.placement.line, at
+    )
+    hold(model, data)
+    for _ in range(round(_SETTLING_TIME / model.opt.timestep)):
+        mujoco.mj_step(model, data)
+    _refuse_outside(scene, model, index, data)
+    return _Posture(scene, model, index, data, advance)
+
+
+def _settled(
+    settle: Callable[[float], _Posture], low: float, high: float, count: int
+) -> list[_Posture]:
+    """Postures further and further in, m.
+
+    What springs out of a branch comes to rest elsewhere in the lumen; where a device
+    cannot lie at all, none is kept.
+    """
+    settled = []
+    for advance in np.linspace(low, high, count):
+        with contextlib.suppress(ValueError):
+            settled.append(settle(float(advance)))
+    return settled
 
 
 def _refuse_outside(
