@@ -38,6 +38,7 @@ TASK = {
     "fluoroscopy": options() | NONE,
     "cameras": options() | NONE,
     "randomisation": options() | NONE,
+    "vessel": options() | NONE,
     "goal_radius": POSITIVE,
     "reward": options() | NONE,
     "start_along_route": span(0, 0.95),
