@@ -73,7 +73,8 @@ class Field:
         from cathsim_dmc.anatomy.field_loops import depths
 
         points = as_points(points)
-        flat = np.ascontiguousarray(points.reshape(-1, 3))
+        # Writable: numba would compile another function for those that are not.
+        flat = np.require(points.reshape(-1, 3), None, ["C", "W"])
         out = np.full(len(flat), np.nan)
         fine = np.isfinite(flat).all(axis=1)
         if fine.all():

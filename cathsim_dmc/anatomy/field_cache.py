@@ -1,9 +1,16 @@
-"""Cache of fields, by the content that they are built from."""
+"""Cache of fields, by the content that they are built from.
+
+The fields of the measured phantoms come with the package, in `data`: building the first
+field on a machine takes longer than all else that a task needs. `tools/ship_fields.py`
+writes them.
+"""
 
 from __future__ import annotations
 
 import contextlib
 import hashlib
+import io
+import lzma
 import os
 from collections.abc import Callable, Sequence
 from functools import cache
@@ -22,6 +29,8 @@ from cathsim_dmc.file_maps import mapped
 KEPT = 4_000_000_000
 _NAMES = ("head", "coarse", "index", "samples")
 _DIGEST = "digest"
+_SHIPPED = Path(__file__).parent / "data"
+_DIGITS = 9  # of lengths, m, that count: processors round differently
 _SUFFIX, _SUFFIXES = ".npy", "*.np[yz]"  # older versions wrote the other
 # Modules whose code decides what a field holds.
 _MODULES = ("field", "tree_depth", "tree_depth_loops")
@@ -35,36 +44,50 @@ def cache_folder() -> Path:
 
 def tree_field(tree: VesselTree, ends: Sequence[End] = ()) -> Field:
     """As `Field.from_tree`, read from the cache if it was built before."""
-    parts = []
-    for vessel in tree.vessels.values():
-        parts += [vessel.centreline.points, vessel.centreline.radii]
-    return _cached(parts, ends, lambda: Field.from_tree(tree, ends))
+    name = _name(_parts(tree), ends)
+    return _cached(name, lambda: Field.from_tree(tree, ends))
+
+
+def shipped_path(tree: VesselTree, ends: Sequence[End] = ()) -> Path:
+    """Where the field of a tree is, if it comes with the package."""
+    return _SHIPPED / f"{_name(_parts(tree), ends)[:16]}.field"
 
 
 def surface_field(surface: Surface, ends: Sequence[End] = ()) -> Field:
     """As `Field.from_surface`, read from the cache if it was built before."""
-    parts = [surface.vertices, surface.faces]
-    return _cached(parts, ends, lambda: Field.from_surface(surface, ends))
+    name = _name([surface.vertices, surface.faces], ends)
+    return _cached(name, lambda: Field.from_surface(surface, ends))
 
 
-def _cached(
-    parts: Sequence[np.ndarray], ends: Sequence[End], build: Callable[[], Field]
-) -> Field:
+def _parts(tree: VesselTree) -> list[np.ndarray]:
+    lines = [vessel.centreline for vessel in tree.vessels.values()]
+    return [part for line in lines for part in (line.points, line.radii)]
+
+
+def _name(parts: Sequence[np.ndarray], ends: Sequence[End]) -> str:
+    """Digest of what a field is built from."""
+    flat = [(*e.position, *e.direction, e.radius, e.open) for e in ends]
+    digest = hashlib.sha256()
+    for part in (*parts, np.array(flat)):
+        rounded = np.round(part, _DIGITS) + 0  # no negative zeros
+        digest.update(f"{part.dtype}{part.shape}".encode() + rounded.tobytes())
+    return digest.hexdigest()
+
+
+def _cached(name: str, build: Callable[[], Field]) -> Field:
     """A field from the cache, or built and kept.
 
     It lies in the file, which is mapped into memory. A file appears whole or not at
     all, and holds its checksum: a damaged one is built again. Where the folder cannot
     be written to, nothing is kept.
     """
-    flat = [(*e.position, *e.direction, e.radius, e.open) for e in ends]
-    digest = hashlib.sha256(_code())
-    for part in (*parts, np.array(flat)):
-        digest.update(f"{part.dtype}{part.shape}".encode() + part.tobytes())
-    path = cache_folder() / f"{digest.hexdigest()[:32]}{_SUFFIX}"
+    shipped = _SHIPPED / f"{name[:16]}.field"
+    digest = hashlib.sha256(name.encode() + _code()).hexdigest()
+    path = cache_folder() / f"{digest[:32]}{_SUFFIX}"
     try:
         field = _read(path)
     except (OSError, ValueError):
-        field = build()
+        field = _unpacked(shipped.read_bytes()) if shipped.is_file() else build()
         with contextlib.suppress(OSError, ValueError):
             _keep(field, path)
             field = _read(path)
@@ -95,6 +118,25 @@ def _code() -> bytes:
     for name in _MODULES:
         digest.update(Path(__file__).with_name(f"{name}.py").read_bytes())
     return digest.digest()
+
+
+def packed(field: Field) -> bytes:
+    """A field in a third of its size, see `_unpacked`."""
+    stream = io.BytesIO()
+    np.save(stream, _record(field), allow_pickle=False)
+    words = np.frombuffer(stream.getvalue(), np.uint16)
+    bends = np.diff(words, 2, prepend=np.zeros(2, np.uint16))
+    return lzma.compress(bends.view(np.uint8).reshape(-1, 2).T.tobytes())
+
+
+def _unpacked(data: bytes) -> Field:
+    """The field of a file that ships: bytes of second differences, low ones first."""
+    halves = np.frombuffer(lzma.decompress(data), np.uint8).reshape(2, -1)
+    words = np.ascontiguousarray(halves.T).view(np.uint16)[:, 0]
+    for _ in range(2):
+        words = np.cumsum(words, dtype=np.uint16)
+    record = np.load(io.BytesIO(words.tobytes()), allow_pickle=False)[0]
+    return Field(*(record[name] for name in _NAMES))
 
 
 def _record(field: Field) -> np.ndarray:
