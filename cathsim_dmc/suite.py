@@ -323,52 +323,32 @@ _PHANTOMS = {
 
 # What the longest routes to BCA and LCCA need, 0.167 and 0.274 m, see `placement`.
 _ARCH_LENGTHS = {"ascending": 0.24, "descending": placement.COMMON_LENGTH}
+# Access, prefix of the name, anatomies ("arch" for random ones) and goals.
+_TABLE = (
+    ("ascending", "", ("type1", "type2", "simple1", "simple2"), ("bca", "lcca")),
+    ("descending", "femoral_", ("type1", "type2", "type3", "bovine"), _ARTERIES),
+    ("ascending", "", ("arch",), ("bca", "lcca")),
+    ("descending", "femoral_", ("arch",), ("bca", "lcca")),
+)
 
 
-def _register_published() -> None:
-    """Tasks that start in the ascending aorta: published and idealised arches."""
-    for anatomy in ("type1", "type2", "simple1", "simple2"):
-        for goal in ("bca", "lcca"):
-            text = f"cannulate {_ARTERIES[goal]} from the ascending aorta."
-            register(
-                f"{anatomy}_{goal}",
-                TaskDefinition(f"{_PHANTOMS[anatomy]}: {text}", anatomy, goal),
-                "easy" if goal == "bca" else "hard",
-            )
-
-
-def _register_femoral() -> None:
-    """Tasks of the clinical route, through the descending aorta."""
-    for anatomy in ("type1", "type2", "type3", "bovine"):
-        for goal, artery in _ARTERIES.items():
-            text = f"cannulate {artery} from the descending aorta."
-            register(
-                f"femoral_{anatomy}_{goal}",
-                TaskDefinition(
-                    f"{_PHANTOMS[anatomy]}: {text}", anatomy, goal, "descending"
-                ),
-                "hard",
-            )
-
-
-def _register_random() -> None:
-    """Tasks that draw a random arch for each episode, for both accesses."""
-    for access, prefix in (("ascending", ""), ("descending", "femoral_")):
-        for goal in ("bca", "lcca"):
-            text = f"cannulate {_ARTERIES[goal]} from the {access} aorta."
-            register(
-                f"{prefix}arch_{goal}",
-                TaskDefinition(
-                    f"A random arch in each episode: {text}",
-                    None,
-                    goal,
-                    access,
-                    # One length for all arches of the sets, in every pool.
-                    options={"working_length": _ARCH_LENGTHS[access]},
-                    random_arch=True,
-                ),
-                "hard",
-            )
+def _register_plain() -> None:
+    """Tasks with one device: phantoms and random arches, by both accesses."""
+    rows = [(*row[:2], a, g) for row in _TABLE for a in row[2] for g in row[3]]
+    for access, prefix, anatomy, goal in rows:
+        drawn = anatomy == "arch"
+        where = "A random arch in each episode" if drawn else _PHANTOMS[anatomy]
+        definition = TaskDefinition(
+            f"{where}: cannulate {_ARTERIES[goal]} from the {access} aorta.",
+            None if drawn else anatomy,
+            goal,
+            access,
+            # One length for all arches of the sets, in every pool.
+            options={"working_length": _ARCH_LENGTHS[access]} if drawn else {},
+            random_arch=drawn,
+        )
+        easy = goal == "bca" and not (drawn or prefix)
+        register(f"{prefix}{anatomy}_{goal}", definition, "easy" if easy else "hard")
 
 
 def _register_coaxial() -> None:
@@ -395,9 +375,7 @@ _COAXIAL = {
     ),
 }
 
-_register_published()
-_register_femoral()
-_register_random()
+_register_plain()
 _register_coaxial()
 register(
     "navigate",

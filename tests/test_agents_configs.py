@@ -52,7 +52,6 @@ def test_configs_survive_json(algorithm, preset):
         (PPOConfig, {"anneal": "False"}, "anneal='False'.*true or false"),
         (PPOConfig, {"learning_rate": 10**400}, "learning_rate=.*finite number"),
         (PPOConfig, {"hidden": [64, "x"]}, "hidden.*each entry an integer"),
-        (PPOConfig, {"hidden": [10**9]}, "hidden.*16384"),
         (PPOConfig, {"task_kwargs": {"a": float("inf")}}, "task_kwargs.*finite"),
         (PPOConfig, {"activation": "sine"}, "activation='sine'.*tanh.*relu"),
         (PPOConfig, {"training_start": [0.1, "x"]}, "training_start.*finite number"),

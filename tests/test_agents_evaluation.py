@@ -6,7 +6,7 @@ import synthetic_env
 import torch
 
 from cathsim_dmc import suite
-from cathsim_dmc.agents import compare, evaluate, progress, protocols
+from cathsim_dmc.agents import compare, evaluate, protocols
 from cathsim_dmc.agents.episodes import EpisodeOutcome
 from cathsim_dmc.agents.evaluation import EvaluationResult, paired_bootstrap
 from cathsim_dmc.agents.report import EvaluationReport
@@ -157,15 +157,6 @@ def test_expert_is_better_than_chance():
         compare(expertly, play(policy="random", episodes=9))
 
 
-def test_bad_requests_are_refused(tmp_path):
-    with pytest.raises(ValueError, match="episodes is 0"):
-        play(policy="random", episodes=0)
-    with pytest.raises(ValueError, match="task"):
-        evaluate(expert, make_env=synthetic_env.make_env)
-    with pytest.raises(RuntimeError, match="no checkpoint"):
-        evaluate(tmp_path, make_env=synthetic_env.make_env)
-
-
 def test_success_interval_against_a_published_value():
     # Newcombe 1998, table I: 81 of 263 gives 0.2553 to 0.3662.
     assert success_interval(81, 263) == pytest.approx((0.2553, 0.3662), abs=1e-4)
@@ -191,17 +182,6 @@ def test_the_table_says_which_force_is_which(capsys, monkeypatch):
     mean, deviation = result.mean_sd("forces.sum.mean")
     assert mean > 0.1
     assert f"│ {1e3 * mean:.0f} ± {1e3 * deviation:.0f}" in text
-
-
-def test_what_takes_long_says_so_now_and_then(monkeypatch, capsys):
-    running = np.array([True, False, True])
-    progress.EvaluationProgress("expert")(None, running)
-    assert capsys.readouterr().err == ""
-    monkeypatch.setattr(progress, "LINE_INTERVAL", 0.0)
-    shown = progress.EvaluationProgress("expert")
-    shown(None, running)
-    assert "expert: 1 steps" in (text := capsys.readouterr().err), text
-    assert "2 of 3 episodes run" in text
 
 
 def test_an_evaluation_goes_on_from_a_snapshot(tmp_path):

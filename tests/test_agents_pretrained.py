@@ -6,7 +6,6 @@ import export
 import judgement
 import pytest
 import synthetic_env
-import torch
 
 from cathsim_dmc import agents
 from cathsim_dmc.agents import Checkpoint, CheckpointError, load_policy, pretrained
@@ -110,7 +109,7 @@ def test_damaged_weights_are_refused(exported, tmp_path):
     with pytest.raises(CheckpointError, match="damaged"):
         load_policy(weights)
     weights.unlink()
-    with pytest.raises(CheckpointError, match="cannot be read"):
+    with pytest.raises(CheckpointError, match="cannot be used"):
         load_policy(weights)
 
 
@@ -120,7 +119,7 @@ def test_damaged_weights_are_refused(exported, tmp_path):
         ("format", 2, "format"),
         ("sha256", 3, "sha256"),
         ("task", None, "task"),
-        ("config", {"algorithm": "none"}, "does not fit"),
+        ("config", {"algorithm": "none"}, "cannot be used"),
         ("shapes", {"vector": 3, "pixels": None, "actions": 2}, "does not fit"),
         ("shapes", {"vector": 3, "pixels": None, "actions": 1e9}, "actions"),
     ],
@@ -132,13 +131,6 @@ def test_a_card_that_does_not_fit_is_refused(exported, tmp_path, part, value, wo
     card.write_text(json.dumps({**values, part: value}))
     with pytest.raises(CheckpointError, match=word):
         load_policy(weights)
-
-
-def test_only_tensors_are_written(tmp_path):
-    with pytest.raises(ValueError, match="number"):
-        state = {"weight": torch.ones(2), "number": 3}
-        pretrained.write_pretrained(tmp_path, "small", state, {})
-    assert not list(tmp_path.iterdir())
 
 
 # Those that ship.

@@ -16,7 +16,6 @@ from cathsim_dmc.analysis.force_statistics import (
     EpisodeForces,
     ForceTracker,
     Statistics,
-    millinewtons,
     recorded_forces,
 )
 from cathsim_dmc.entities.devices import DEVICES
@@ -47,12 +46,6 @@ def test_statistics_of_known_forces():
         peak_sum=Statistics(mean=2.625, mean_in_contact=3.5, maximum=5.0),
         peak_max=Statistics(mean=1.625, mean_in_contact=6.5 / 3, maximum=3.5),
     )
-
-
-def test_what_was_not_recorded_is_unknown():
-    found = recorded_forces(known_episode())
-    assert found.peak_sum is None and found.peak_max is None
-    assert found.max.maximum == 3.0
 
 
 def test_without_contact_forces_are_zero_and_in_contact_unknown():
@@ -91,22 +84,6 @@ def test_episodes_that_end_at_different_steps_keep_apart(seed, steps, count):
                 else:
                     assert touching is None
             begun[simulation] = step + 1
-
-
-@pytest.mark.parametrize(
-    ("mean", "deviation", "text"),
-    [
-        (None, None, "–"),
-        (0.0, 0.0, "0.00 ± 0.00"),
-        (0.00123, 0.0004, "1.23 ± 0.40"),
-        (0.0123, 0.02, "12.3 ± 20.0"),
-        (0.4567, 0.01, "457 ± 10"),
-        (0.05, 0.3, "50 ± 300"),
-        (0.0312, None, "31.2"),
-    ],
-)
-def test_forces_are_printed_with_three_digits(mean, deviation, text):
-    assert millinewtons(mean, deviation) == text
 
 
 def test_every_name_in_the_page_of_forces_exists():

@@ -1,5 +1,3 @@
-import sys
-
 import numpy as np
 import pytest
 from hypothesis import given
@@ -76,13 +74,6 @@ def test_the_picture_shows_contacts_where_they_are(tmp_path):
     silhouette = np.argwhere(np.abs(without - 0.9).max(axis=-1) < 0.01)
     assert changed[:, 1].mean() > silhouette[:, 1].mean()
     assert changed[:, 0].mean() < silhouette[:, 0].mean()
-
-
-def test_a_heatmap_touches_no_global_state_and_leaves_one_file(tmp_path):
-    heatmap([make_episode()], make_tube(), tmp_path / "map.png")
-    assert [p.name for p in tmp_path.iterdir()] == ["map.png"]
-    pyplot = sys.modules.get("matplotlib.pyplot")
-    assert pyplot is None or not pyplot.get_fignums()
 
 
 def test_wrong_heatmaps_are_refused(tmp_path):

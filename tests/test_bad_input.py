@@ -163,15 +163,15 @@ TRAINING = {
     "training_start": span(0, 1.0),
     "initial_policy": st.sampled_from([1, True, [], {}, 1.5]),
     "initial_std": number(positive=True, optional=True),
-    "hidden": st.sampled_from([(), [], 64, "64", (0,), (-1,), (1.5,), (10**9,), None]),
+    "hidden": st.sampled_from([(), [], 64, "64", (0,), (-1,), (1.5,), None]),
     "activation": word(),
-    "cnn_features": whole(1, 16_384),
+    "cnn_features": whole(1),
     "subtract_background": flag(),
     "convolutions": st.sampled_from(
         [
-            *(None, 1, "x", (), [], {}, True, ((32, 8, 8),) * 17, ((1.5, 8, 4),)),
+            *(None, 1, "x", (), [], {}, True, ((1.5, 8, 4),)),
             *(((32, 8),), ((0, 8, 4),), ((32, -8, 4),), (("a", 8, 4),), (32, 8, 4)),
-            *(((32, 8, 10**9),), ((True, 8, 4),), ((None, 8, 4),), ((32, [8], 4),)),
+            *(((True, 8, 4),), ((None, 8, 4),), ((32, [8], 4),)),
         ]
     ),
     "learning_rate": POSITIVE,

@@ -4,13 +4,11 @@ import dataclasses
 import json
 
 import judgement
-import numpy as np
 import pytest
 import synthetic_env
 import trainings
 
 from cathsim_dmc.agents import evaluation, training
-from cathsim_dmc.analysis.heatmap import force_map
 from cathsim_dmc.tasks.config import MAX_STEPS
 
 CELL = trainings.Cell(
@@ -106,18 +104,6 @@ def test_a_finished_cell_tells_how_it_came_about(folders, synthetic):
     assert state == "other settings" and "total_frames differ; move" in remark
 
 
-def test_a_damaged_file_costs_an_evaluation_and_no_training(folders, synthetic):
-    trainings.work(CELL, *folders)
-    path = result_of(folders)
-    metrics = (folders[0] / CELL.name / "metrics.csv").read_text()
-    path.write_text(path.read_text()[:100])
-    state, remark = trainings.standing(CELL, *folders)
-    assert state == "begun" and f"{path} is damaged" in remark
-    trainings.work(CELL, *folders)
-    assert (folders[0] / CELL.name / "metrics.csv").read_text() == metrics
-    assert trainings.standing(CELL, *folders)[0] == "finished"
-
-
 def test_the_evaluation_is_the_published_one_whatever_was_trained(folders, synthetic):
     options = {"max_steps": 20}
     cell = changed(settings={**CELL.settings, "task_kwargs": options})
@@ -201,47 +187,3 @@ def test_a_bad_grid_is_refused_before_any_work(grid, change, word):
     with pytest.raises(ValueError, match=word) as error:
         grid(ROW.replace(*change))
     assert "grid.toml" in str(error.value)
-
-
-def test_options_of_the_evaluation_are_refused_before_the_training(folders):
-    cell = changed(evaluation={"task_kwargs": {"frction": 1}})
-    with pytest.raises(ValueError, match="frction"):
-        trainings.work(cell, *folders)
-    assert not folders[0].exists()
-
-
-def test_the_grid_that_ships_has_the_order_of_the_time_budget():
-    cells = trainings.read_grid()
-    labels = list(dict.fromkeys(cell.label for cell in cells))
-    assert labels[:3] == ["PPO-Internal", "SAC-Internal", "PPO-Image"]
-    four = {"type1_bca", "type1_lcca", "type2_bca", "type2_lcca"}
-    assert {cell.task for cell in cells[:4]} == four
-    assert {cell.seed for cell in cells[:4]} == {0}
-
-
-def test_learning_curves_are_thinned_to_200_points():
-    rows = [{"frames": float(i), "seconds": i / 2, "success": None} for i in range(999)]
-    curve = trainings.learning_curve(rows)
-    assert len(curve["frames"]) == 200
-    assert (curve["frames"][0], curve["frames"][-1]) == (0, 998)
-    assert set(curve["success"]) == {None} and "distance" not in curve
-    assert trainings.learning_curve([]) == {}
-
-
-def test_the_first_few_episodes_solve_nothing():
-    names = ("frames", "episodes", "success", "seconds")
-    rows = [(10, 5, 1.0, 1), (20, 120, 0.89, 2), (30, 150, 0.9, 3), (40, 160, 1.0, 4)]
-    rows = [dict(zip(names, row, strict=True)) for row in rows]
-    assert trainings.solved(rows) == {"frames": 30, "seconds": 3}
-    assert trainings.solved(rows[:2]) is None
-
-
-def test_force_maps_survive_the_file():
-    random = np.random.default_rng(0)
-    place = random.uniform(-0.02, 0.02, (50, 3))
-    made = force_map(place, random.random(50), np.full(2, -0.021), np.full(2, 0.021))
-    values = json.loads(json.dumps(judgement.map_values(made)))
-    read = judgement.map_from_values(values)
-    np.testing.assert_array_equal(read.count, made.count)
-    np.testing.assert_allclose(read.mean, made.mean, rtol=1e-5)
-    np.testing.assert_allclose(read.x_edges, made.x_edges, atol=1e-9)

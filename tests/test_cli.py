@@ -11,12 +11,10 @@ import time
 import pytest
 from conftest import TASKS
 
-import cathsim_dmc
 from cathsim_dmc import cli, suite
 from cathsim_dmc.agents import LEARNERS, Checkpoint, report
 from cathsim_dmc.agents.checkpoint import checkpoints_in
 from cathsim_dmc.agents.policies import FunctionPolicy
-from cathsim_dmc.anatomy.anatomy import Anatomy
 from cathsim_dmc.anatomy.arch import arch
 from cathsim_dmc.anatomy.parts import Surface
 from cathsim_dmc.cli import task_options
@@ -61,13 +59,6 @@ def test_list_as_json(cathsim):
     assert all(line and "\n" not in line for line in printed["tasks"].values())
 
 
-def test_help_names_every_command(cathsim):
-    code, out, _ = cathsim("--help")
-    assert code == 0
-    for command in ("list", "train", "eval", "record", "replay", "phantom", "validate"):
-        assert command in out
-
-
 def test_generated_phantom_can_be_navigated(cathsim, tmp_path):
     directory = tmp_path / "arch"
     code, out, err = cathsim("phantom", "generate", "type2", "--out", directory)
@@ -84,18 +75,6 @@ def test_generated_phantom_can_be_navigated(cathsim, tmp_path):
     named.close()
     for key, value in expected.items():
         assert made[key].tobytes() == value.tobytes(), key
-
-
-def test_generated_phantom_of_a_seed(cathsim, tmp_path):
-    code, _, err = cathsim(
-        "phantom", "generate", "I", "--seed", 4, "--out", tmp_path / "random"
-    )
-    assert code == 0, err
-    anatomy = Anatomy.load(tmp_path / "random")
-    usual = arch.load("simple1")
-    assert set(anatomy.goals) >= {"bca", "lcca"}
-    drawn = anatomy.tree.vessel("bca").centreline.length
-    assert drawn != usual.tree.vessel("bca").centreline.length
 
 
 @pytest.mark.slow
@@ -157,26 +136,6 @@ def test_an_evaluation_keeps_the_options_that_a_policy_was_trained_with(monkeypa
     with pytest.raises(InterruptedError):
         report.evaluate(policy, task_kwargs={"friction": 0.2})
     assert seen == {"rotation": True, "friction": 0.2}
-
-
-def test_a_reader_that_stops_early_is_no_error():
-    program = (
-        "import sys; sys.argv = ['cathsim', 'list', '--json']\n"
-        "from cathsim_dmc import cli; cli.main()"
-    )
-    with subprocess.Popen(
-        [sys.executable, "-c", program],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-    ) as process:
-        process.stdout.close()
-        assert process.wait(timeout=60) == 0
-        assert process.stderr.read() == ""
-
-
-def test_version(cathsim):
-    assert cathsim("--version") == (0, f"cathsim-dmc {cathsim_dmc.__version__}\n", "")
 
 
 TINY = (

@@ -58,10 +58,6 @@ def test_tutorials_run(notebook):
     assert all(cell.execution_count for cell in code)
 
 
-def test_there_are_six_tutorials():
-    assert [path.name[0] for path in NOTEBOOKS] == list("123456")
-
-
 def test_notebooks_hold_nothing_of_the_machine_they_ran_on():
     for path in NOTEBOOKS:
         text = path.read_text()

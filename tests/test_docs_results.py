@@ -72,40 +72,6 @@ def test_ours_stands_beside_the_published(page, tmp_path):
     }
 
 
-@pytest.mark.slow
-def test_demonstrations_are_compared_with_none_where_there_are_any(page, tmp_path):
-    plain = ("SAC-Internal", "sac", "internal")
-    taught = ("BC-Internal", "bc", "internal")
-    directory, task = tmp_path / "results", "type1_lcca"
-    picture = tmp_path / "docs/images/results_demonstrations.png"
-    fabricated_results.write(directory, task, *plain, 0, 0.9)
-    # Another observation, and another task.
-    fabricated_results.write(directory, task, "BC-Image", "bc", "image", 0, 0.9)
-    fabricated_results.write(directory, "type1_bca", *taught, 0, 0.9)
-    _, text = page()
-    assert "With and without demonstrations" not in text and not picture.exists()
-    fabricated_results.write(directory, task, *taught, 0, 0.5)
-    _, text = page()
-    assert "With and without demonstrations on type1_lcca" in text
-    assert picture.stat().st_size > 5_000
-
-
-def test_a_task_of_its_own_stands_beside_the_expert(page, tmp_path):
-    fabricated_results.write(
-        tmp_path / "results", "arch_bca", "PPO, any arch", "ppo", "tracking", 0, 0.8
-    )
-    code, text = page()
-    assert code == 0
-    assert line_of(text, "| arch_bca | PPO, any arch | 1 | 80 %")[-1] == "100 %"
-
-
-def test_without_results_everything_is_missing(page, tmp_path):
-    code, text = page()
-    assert code == 0
-    assert re.search(r"\n0 of the \d+ cells", text)
-    assert "## Figures" not in text
-
-
 @pytest.mark.parametrize(
     "damage",
     [

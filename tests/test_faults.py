@@ -1,21 +1,20 @@
 """Processes that are killed, disks that are full, folders that cannot be written."""
 
 import os
+import signal
+import subprocess
 import sys
+import time
 
-import killed_work
 import numpy as np
 import pytest
 import synthetic_env
-from killed_work import finish, kill, moments, train_on
 from test_agents_training import run, small_ppo
 
 from cathsim_dmc.agents import ConfigError, report
 from cathsim_dmc.agents.checkpoint import Checkpoint, checkpoints_in
 from cathsim_dmc.agents.training_log import read_metrics
-from cathsim_dmc.anatomy import Anatomy
 from cathsim_dmc.recording import Episode
-from cathsim_dmc.validation import force_sensors
 
 
 def names(folder):
@@ -45,17 +44,6 @@ def test_a_recording_on_a_full_disk_leaves_the_older_one(tmp_path, small_disk):
         assert names(tmp_path) == ["a.npz", "a.rrd"]
         assert out.read_bytes() == before
         assert Episode.load(out.with_suffix(".npz")).equals(first)
-
-
-def test_a_full_disk_leaves_the_older_anatomy(tmp_path, small_disk):
-    tube = force_sensors.straight_tube(0.06, 4e-3)
-    tube.save(tmp_path / "tube")
-    before = names(tmp_path / "tube")
-    with small_disk(1_000), pytest.raises(OSError, match="File too large"):
-        force_sensors.straight_tube(0.05, 4e-3).save(tmp_path / "tube")
-    assert names(tmp_path / "tube") == before
-    held = Anatomy.load(tmp_path / "tube")
-    np.testing.assert_array_equal(held.surface.vertices, tube.surface.vertices)
 
 
 @pytest.mark.parametrize("kind", ["a file", "under a file", "read-only"])
@@ -90,28 +78,40 @@ def test_folders_that_cannot_be_written_are_refused_before_the_work(
 
 # Kills.
 
-
-@pytest.fixture(scope="module")
-def server():
-    if not sys.platform.startswith("linux"):
-        pytest.skip("needs /proc")
-    return killed_work.context()
+TRAIN = """
+import sys
+sys.path[:0] = sys.argv[3:]
+import synthetic_env
+from test_agents_training import small_ppo
+from cathsim_dmc.agents import train
+config = small_ppo(total_frames=int(sys.argv[2]), checkpoint_frames=512)
+print("begins", flush=True)
+train(config, sys.argv[1], True, False, synthetic_env.make_env)
+"""
 
 
 @pytest.mark.slow
-def test_a_training_that_is_killed_loses_nothing_finished(tmp_path, server):
+def test_a_training_that_is_killed_loses_nothing_finished(tmp_path):
     (tmp_path / "config.json").write_text("{}")
+
+    def started(frames):
+        command = [sys.executable, "-c", TRAIN, str(tmp_path), str(frames), *sys.path]
+        process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+        assert process.stdout.readline() == "begins\n"
+        return process
+
     reached = []
-    for moment in moments(4.0):
-        kill(server, train_on, tmp_path, 10**9, after=moment)
+    for moment in np.random.default_rng().uniform(0.5, 5.0, 5):
+        process = started(10**9)
+        time.sleep(moment)
+        process.kill()
+        assert process.wait() == -signal.SIGKILL
         found = checkpoints_in(tmp_path)
         for path in found:
             Checkpoint.open(path).policy()
             Checkpoint.open(path).learning_state()
         reached.append(int(found[-1].name) if found else 0)
-    assert reached == sorted(reached)
-    assert reached[-1] > 0
-    goal = reached[-1] + 512
-    finish(server, train_on, tmp_path, goal)
+    assert reached == sorted(reached) and reached[-1] > 0
+    assert started(reached[-1] + 512).wait() == 0
     frames = [row["frames"] for row in read_metrics(tmp_path / "metrics.csv")]
-    assert frames == sorted(set(frames)) and frames[-1] == goal
+    assert frames == sorted(set(frames)) and frames[-1] == reached[-1] + 512

@@ -188,39 +188,3 @@ def test_an_outcome_that_is_none_is_refused_by_the_name_of_its_objective(
     for other in (None, "x", tuple(good)):
         with pytest.raises(ValueError, match=r"Advance returns .*Outcome\("):
             answer(other)
-
-
-def test_an_outcome_is_the_callers_own_in_float64(judged):
-    batch, answer = judged
-    reward = np.zeros(2, dtype=np.float32)
-    answer(Outcome(reward, reward > 1, {"near": np.broadcast_to(reward[0], 2)}))
-    outcome = batch.step(pushing(0)[0]).outcome
-    reward += 1  # an objective may use its array again
-    assert outcome.reward.tolist() == [0, 0]
-    assert {outcome.reward.dtype, outcome.terms["near"].dtype} == {np.dtype(float)}
-    outcome.terms["near"] += 1
-
-
-def test_composer_refuses_an_outcome_that_is_none():
-    task = advancing()
-    environment = suite.environment(task)
-    environment.reset()
-    one = np.zeros(1)
-    task.objective.terms = ()
-    task.objective.outcome = lambda measurement: Outcome(one * np.nan, one > 0, {})
-    with pytest.raises(ValueError, match=r"Advance returns .*nan.*finite"):
-        environment.step(np.zeros(21))
-
-
-def test_a_name_that_is_taken_is_refused(example):
-    with pytest.raises(ValueError, match=r"'type1_bca' already"):
-        suite.register("type1_bca", suite.TASKS[example.TASK])
-
-
-def test_entities_of_ones_own_are_used():
-    from cathsim_dmc.entities.robot import Robot
-
-    anatomy, config = suite.load_anatomy("simple1"), NavigationConfig()
-    robot = Robot(device_radius=2e-3)
-    scene = Scene.build(anatomy, "bca", config, robot=robot)
-    assert scene.robot is robot

@@ -8,7 +8,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 from test_play_coaxial import Screen, held
 
-from cathsim_dmc import suite
 from cathsim_dmc.play import play, window
 from cathsim_dmc.play.controls import BEND_RATE, COMMANDS, Controls
 from cathsim_dmc.recording import Episode
@@ -77,8 +76,3 @@ def test_without_a_display_the_message_says_so(monkeypatch):
     monkeypatch.delenv("DISPLAY", raising=False)
     with pytest.raises(ValueError, match="DISPLAY|tkinter"):
         play("simple1_bca")
-
-
-def test_unknown_tasks_are_refused():
-    with pytest.raises(ValueError, match=next(iter(suite.SUITE))):
-        play("type9_bca")

@@ -47,13 +47,6 @@ def test_each_hand_holds_a_device(command):
     assert not hands.action(STEP).any()
 
 
-def test_of_three_devices_the_hands_hold_the_first_and_the_last():
-    hands = CoaxialControls(3)
-    for command in ("up", "right", "pull", "turn_left"):
-        hands.press(command)
-    np.testing.assert_array_equal(hands.action(STEP), [1, -1, 0, 0, -1, 1])
-
-
 @given(
     st.integers(1, 3),
     st.lists(st.tuples(st.sampled_from(COMMANDS), st.booleans()), max_size=40),

@@ -16,7 +16,7 @@ from cathsim_dmc.policies import (
     in_environment,
     make_policy,
 )
-from cathsim_dmc.recording import Episode, EpisodeRecorder
+from cathsim_dmc.recording import EpisodeRecorder
 
 TASK = "simple1_bca"
 SHORT = {"max_steps": 12}
@@ -51,14 +51,6 @@ def test_a_named_policy_plays_the_same_in_composer(name):
     for seed, episode in enumerate(batched.episodes, 7):
         assert_same_in_composer(episode, name, TASK, seed, SHORT)
     assert batched.episodes[0].reward != batched.episodes[1].reward
-
-
-def test_a_random_recording_has_the_actions_of_its_seed(tmp_path):
-    out = tmp_path / "episode.rrd"
-    report.record("random", out, task=TASK, seed=71, task_kwargs=SHORT)
-    episode = Episode.load(out.with_suffix(".npz"))
-    expected = np.random.default_rng(71).uniform(-1, 1, (12, 21))
-    np.testing.assert_array_equal(episode.action, expected)
 
 
 class Backwards(Policy):
@@ -113,23 +105,6 @@ def test_a_policy_is_told_which_simulations_begin_anew():
     lengths = np.array([episode.length for episode in result.episodes])
     assert begun[0].all() and len(begun) > 1
     assert begun[1].tolist() == (lengths == lengths.min()).tolist()
-
-
-def test_random_actions_of_a_simulation_do_not_depend_on_the_others():
-    view = View(suite.load("cathsim", TASK, {"random": 0}))
-    alone = policies.make_policy("random", seed=8)
-    together = policies.make_policy("random", seed=6)
-
-    class Three:
-        num_simulations, num_actions = 3, view.num_actions
-
-    alone.reset(view, np.ones(1, bool))
-    together.reset(Three(), np.ones(3, bool))
-    first = together.act(None)
-    np.testing.assert_array_equal(first[2], alone.act(None)[0])
-    # A further episode goes on, it does not repeat.
-    alone.reset(view, np.ones(1, bool))
-    assert not np.array_equal(alone.act(None)[0], first[2])
 
 
 def test_a_random_curl_is_one_direction_for_each_episode():
@@ -199,3 +174,20 @@ def test_what_is_no_policy_is_refused(tmp_path):
         evaluate("push")
     with pytest.raises(AttributeError, match="'task'.*only environments of"):
         evaluate("push", "reach", 1, make_env=synthetic_env.make_env)
+
+
+def test_random_actions_of_a_simulation_do_not_depend_on_the_others():
+    view = View(suite.load("cathsim", TASK, {"random": 0}))
+    alone = policies.make_policy("random", seed=8)
+    together = policies.make_policy("random", seed=6)
+
+    class Three:
+        num_simulations, num_actions = 3, view.num_actions
+
+    alone.reset(view, np.ones(1, bool))
+    together.reset(Three(), np.ones(3, bool))
+    first = together.act(None)
+    np.testing.assert_array_equal(first[2], alone.act(None)[0])
+    # A further episode goes on, it does not repeat.
+    alone.reset(view, np.ones(1, bool))
+    assert not np.array_equal(alone.act(None)[0], first[2])

@@ -1,4 +1,3 @@
-import dataclasses
 import json
 
 import numpy as np
@@ -29,22 +28,6 @@ def test_save_and_load_return_the_same_bits(
     assert loaded.contact_counts.sum() == len(loaded.contact_step)
 
 
-def test_equals_notices_one_changed_value():
-    episode = make_episode()
-    reward = episode.reward.copy()
-    reward[3] = np.nextafter(reward[3], np.inf)
-    assert not episode.equals(dataclasses.replace(episode, reward=reward))
-
-
-def test_arrays_are_read_only_copies():
-    reward = np.zeros(6)
-    episode = make_episode(reward=reward)
-    reward[0] = 5
-    assert episode.reward[0] == 0
-    with pytest.raises(ValueError, match="read-only"):
-        episode.reward[0] = 1
-
-
 @pytest.mark.parametrize(
     ("name", "value", "message"),
     [
@@ -53,8 +36,8 @@ def test_arrays_are_read_only_copies():
         ("catheter", np.zeros((7, 5, 2)), "catheter must have shape"),
         ("body_quat", np.ones((7, 3, 4)), "unit quaternions"),
         ("time", np.zeros(7), "increase strictly"),
-        ("insertion", np.full(7, np.nan), "not finite in row 0"),
-        ("wall_force_sum", np.full(6, -1.0), "must not be negative"),
+        ("insertion", np.full(7, np.nan), "finite numbers"),
+        ("wall_force_sum", np.full(6, -1.0), "not be negative"),
     ],
 )
 def test_wrong_values_are_named(name, value, message):
@@ -68,7 +51,7 @@ def test_wrong_values_are_named(name, value, message):
         ([0, 6], "must lie in"),
         ([-1, 0], "must lie in"),
         ([3, 2], "must not decrease"),
-        ([0.0, 1.0], "must hold integers"),
+        ([0.0, 1.0], "array of integers"),
     ],
 )
 def test_contacts_must_belong_to_steps_in_order(steps, message):
@@ -90,11 +73,6 @@ def test_contacts_must_belong_to_steps_in_order(steps, message):
 def test_wrong_metadata_is_refused(meta, message):
     with pytest.raises(ValueError, match=message):
         make_episode(meta=meta)
-
-
-def test_numpy_values_in_metadata_become_plain():
-    meta = {"success": np.True_, "termination": "success", "goal": np.arange(3)}
-    assert make_episode(meta=meta).meta["goal"] == [0, 1, 2]
 
 
 def test_a_later_format_is_refused(tmp_path):

@@ -6,7 +6,6 @@ import types
 import mujoco
 import numpy as np
 import pytest
-from lxml import etree
 
 from cathsim_dmc import suite
 from cathsim_dmc.physics import forces
@@ -65,13 +64,6 @@ def test_the_scene_moves_nearly_as_the_task(exported):
     assert model.sensor(task["sensors"]["load_cell"]).dim == 3
 
 
-def test_older_versions_of_mujoco_can_read_the_scene(exported):
-    # The WebAssembly build is of 3.14, whose schema knows no class of a texture.
-    tree = etree.parse(str(exported / "scene.xml"))
-    textures = list(tree.iter("texture"))
-    assert textures and not any("class" in one.attrib for one in textures)
-
-
 def test_what_success_is_stands_beside_the_scene(exported):
     task = json.loads((exported / "task.json").read_text())
     objective = suite.make_task(TASK).objective
@@ -93,10 +85,3 @@ def test_what_cannot_be_written_is_refused_before(tmp_path):
     with pytest.raises(ValueError, match="single device"):
         write_mjcf("type1_lcca_pair", tmp_path / "c")
     assert not list(tmp_path.iterdir())
-
-
-def test_equal_pieces_of_a_wall_are_no_trouble(tmp_path):
-    """Those of the straight arches repeat; the scene stays one file."""
-    folder = write_mjcf("simple1_bca", tmp_path / "scene")
-    assert sorted(path.name for path in folder.iterdir()) == ["scene.xml", "task.json"]
-    assert mujoco.MjModel.from_xml_path(str(folder / "scene.xml")).nmesh > 100

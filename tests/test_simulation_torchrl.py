@@ -64,28 +64,6 @@ def test_seed_of_dm_control_env_is_that_of_the_suite():
     expected.close()
 
 
-def test_success_is_terminated_in_torchrl():
-    from cathsim_dmc.anatomy.arch import arch
-    from cathsim_dmc.anatomy.parts import Goal
-
-    anatomy = arch.load("simple1")
-    place = anatomy.tree.vessel("aorta").centreline.at(0.09)
-    env = DMControlEnv(
-        "cathsim",
-        "navigate",
-        anatomy=anatomy,
-        goal=Goal("near", "aorta", place.position, 0.09),
-    )
-    forward = torch.zeros(21, dtype=torch.float64)
-    forward[-1] = 1.0
-    rollout = env.rollout(60, policy=lambda td: td.set("action", forward.clone()))
-    last = rollout[-1]["next"]
-    assert last["terminated"].item() and not last["truncated"].item()
-    assert last["reward"].item() == 10.0
-    assert len(rollout) < 60
-    env.close()
-
-
 def test_batched_env(batched):
     check_env_specs(batched)
     assert batched.batch_size == (ENVS,)
@@ -136,16 +114,6 @@ def test_only_what_is_done_is_reset(batched):
     assert batched.simulation.rollout.steps.tolist() == [0, 3, 0]
 
 
-def test_time_limit_truncates_the_batch(short_batched):
-    rollout = short_batched.rollout(2 * SHORT_EPISODE, break_when_any_done=True)
-    assert rollout.shape == (ENVS, SHORT_EPISODE)
-    last = rollout[:, -1]["next"]
-    assert last["truncated"].all() and last["done"].all()
-    assert not last["terminated"].any()
-    assert not last["info", "physics_error"].any()
-    assert not rollout[:, :-1]["next", "done"].any()
-
-
 def test_tensors_of_steps_share_no_memory(short_batched):
     tensordict = short_batched.reset()
     kept = {key: tensordict[key].clone() for key in ("tracking_points", "wall_force")}
@@ -170,3 +138,35 @@ def test_the_first_episode_is_that_of_the_seed():
         assert distance == np.float32(single.task.info()["distance"])
         single.close()
     env.close()
+
+
+def test_success_is_terminated_in_torchrl():
+    from cathsim_dmc.anatomy.arch import arch
+    from cathsim_dmc.anatomy.parts import Goal
+
+    anatomy = arch.load("simple1")
+    place = anatomy.tree.vessel("aorta").centreline.at(0.09)
+    env = DMControlEnv(
+        "cathsim",
+        "navigate",
+        anatomy=anatomy,
+        goal=Goal("near", "aorta", place.position, 0.09),
+    )
+    forward = torch.zeros(21, dtype=torch.float64)
+    forward[-1] = 1.0
+    rollout = env.rollout(60, policy=lambda td: td.set("action", forward.clone()))
+    last = rollout[-1]["next"]
+    assert last["terminated"].item() and not last["truncated"].item()
+    assert last["reward"].item() == 10.0
+    assert len(rollout) < 60
+    env.close()
+
+
+def test_time_limit_truncates_the_batch(short_batched):
+    rollout = short_batched.rollout(2 * SHORT_EPISODE, break_when_any_done=True)
+    assert rollout.shape == (ENVS, SHORT_EPISODE)
+    last = rollout[:, -1]["next"]
+    assert last["truncated"].all() and last["done"].all()
+    assert not last["terminated"].any()
+    assert not last["info", "physics_error"].any()
+    assert not rollout[:, :-1]["next", "done"].any()

@@ -49,27 +49,6 @@ def test_overflow_is_told():
 NUMBERS = st.floats(-5, 5, allow_subnormal=False)
 
 
-@given(arrays.arrays(float, (2, 3, 4 * 14), elements=NUMBERS))
-def test_leading_axes_are_kept(rows):
-    rows.reshape(2, 3, 4, 14)[..., 0] = 4  # every place is occupied
-    together = forces.Contacts.from_sensor(rows)
-    assert together.force.shape == (2, 3, 4, 3)
-    for index in np.ndindex(2, 3):
-        alone = forces.Contacts.from_sensor(rows[index])
-        np.testing.assert_array_equal(alone.force, together.force[index])
-        np.testing.assert_array_equal(alone.present, together.present[index])
-    np.testing.assert_allclose(forces.magnitudes(rows), together.magnitude, atol=1e-12)
-
-
-def test_empty_places_are_left_out():
-    forces_of = [(np.ones(3), 0.0, (0, 0, 0), Y, Z)]
-    few, many = sensor_row(forces_of, 3), sensor_row(forces_of, 9)
-    assert forces.magnitudes(few).shape == forces.magnitudes(many).shape == (1,)
-    none = forces.wall_force(forces.magnitudes(np.zeros((2, 5, 3 * 14))))
-    for each in (none.sum, none.max, none.peak_sum, none.peak_max):
-        np.testing.assert_array_equal(each, np.zeros(2))
-
-
 @given(arrays.arrays(float, (6, 3), elements=NUMBERS))
 def test_magnitude_is_the_norm_of_the_force(local):
     row = sensor_row([(force, 0.0, (0, 0, 0), Y, Z) for force in local], 6)

@@ -48,11 +48,6 @@ def test_hard_and_deep_contacts_need_shorter_steps(contact, coarse):
     assert forces.too_coarse(forces.magnitudes(rows), rows).tolist() == [False, coarse]
 
 
-def test_without_a_contact_no_step_is_too_long():
-    rows = np.zeros((2, 3, 4 * forces.CONTACT_SIZE))
-    assert not forces.too_coarse(forces.magnitudes(rows), rows).any()
-
-
 @pytest.mark.parametrize(
     ("task", "options"),
     [

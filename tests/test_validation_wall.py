@@ -65,11 +65,6 @@ def test_a_false_field_and_a_narrow_tube_fail_the_checks_of_the_lumen():
     assert any(one.name.endswith("does not pass") for one in narrow if not one.passed)
 
 
-def test_validate_wall_names_a_missing_directory(tmp_path):
-    with pytest.raises(ValueError, match="no phantom at"):
-        wall.validate_wall(phantoms=[tmp_path / "nowhere"])
-
-
 @pytest.mark.slow
 def test_insertion_is_reproducible_and_the_default_step_converged():
     script = dataclasses.replace(insertion.SCRIPTS[0], duration=1.0)

@@ -13,11 +13,9 @@ from typing import Any
 
 import torch
 from tensordict.nn import TensorDictSequential
-from torch.utils._pytree import tree_leaves
 
 from cathsim_dmc import files
 from cathsim_dmc.agents.config import TrainingConfig
-from cathsim_dmc.agents.fields import require, require_type
 from cathsim_dmc.agents.learners import config_from_dict, make_policy
 from cathsim_dmc.agents.networks import NetworkShapes
 
@@ -27,14 +25,6 @@ _DESCRIPTION = "checkpoint.json"
 _POLICY = "policy.pt"
 _LEARNING = "learning.pt"
 _UNFINISHED = ".unfinished-"
-_MAX_DESCRIPTION = 2**20  # bytes
-_FIELDS = {
-    "config": Mapping[str, Any],
-    "shapes": Mapping[str, Any],
-    "sha256": Mapping[str, str],
-    "frames": int,
-    "seconds": float,
-}
 
 
 class CheckpointError(RuntimeError):
@@ -65,12 +55,8 @@ class Checkpoint:
     def open(cls, path: str | Path) -> "Checkpoint":
         """Open a checkpoint, or the newest one of a run.
 
-        Args:
-            path: Directory of a checkpoint or of a run.
-
         Raises:
-            CheckpointError: there is none, or its description cannot be used; the
-                message names the field, what was given and what is allowed.
+            CheckpointError: there is none, or its description cannot be used.
         """
         path = Path(path)
         if not (path / _DESCRIPTION).exists():
@@ -82,51 +68,32 @@ class Checkpoint:
                 )
             path = found[-1]
         description = path / _DESCRIPTION
-        values = _read_description(description)
         try:
-            for name, kind in _FIELDS.items():
-                require_type(name, values.get(name), kind)
-            for name in ("frames", "seconds"):
-                require(values[name] >= 0, name, values[name], ">= 0")
-            sums = values["sha256"]
-            require({_POLICY, _LEARNING} <= set(sums), "sha256", sums, "of both files")
+            values = json.loads(description.read_text())
+            if values["format"] != FORMAT:
+                raise ValueError(f"format is {values['format']!r}, not {FORMAT}")
             return cls(
                 path=path,
                 config=config_from_dict(values["config"]),
                 shapes=NetworkShapes.from_dict(values["shapes"]),
-                frames=values["frames"],
+                frames=int(values["frames"]),
                 seconds=float(values["seconds"]),
-                sha256=sums,
+                sha256={name: values["sha256"][name] for name in (_POLICY, _LEARNING)},
             )
-        except ValueError as error:
-            raise CheckpointError(f"{description}: {error}") from error
+        except (OSError, LookupError, TypeError, AttributeError, ValueError) as error:
+            raise CheckpointError(f"{description}: {line_of(error)}") from error
 
     def policy_state(self) -> dict[str, Any]:
         """Weights and statistics of the policy, on the CPU.
 
         Raises:
-            CheckpointError: the file is missing, is not what was written, or holds
-                weights of another network.
+            CheckpointError: the file is missing, or is not what was written.
         """
-        state = self._load(_POLICY)
-        require_fit(self.path / _POLICY, state, self.shapes, self.config)
-        return state
+        return self._load(_POLICY)
 
     def learning_state(self) -> dict[str, Any]:
-        """Everything else that continuing the run needs.
-
-        Raises:
-            CheckpointError: the file is missing, is not what was written, or has NaN.
-        """
-        state = self._load(_LEARNING)
-        tensors = (v for v in tree_leaves(state) if isinstance(v, torch.Tensor))
-        if any(bool(one.isnan().any()) for one in tensors):
-            raise CheckpointError(
-                f"{self.path / _LEARNING} has NaN, so learning cannot go on: delete "
-                f"{self.path} to resume from the checkpoint before it, or start a new "
-                "run with this policy (initial_policy)."
-            )
-        return state
+        """Everything else that continuing the run needs; raises as `policy_state`."""
+        return self._load(_LEARNING)
 
     def policy(self) -> TensorDictSequential:
         """The policy, ready to act: raw observation in, action out.
@@ -134,10 +101,8 @@ class Checkpoint:
         Raises:
             CheckpointError: the weights are damaged or of another network.
         """
-        state = self.policy_state()
-        policy = make_policy(self.shapes, self.config)
-        policy.load_state_dict(state)
-        return policy.eval().requires_grad_(False)
+        file = self.path / _POLICY
+        return policy_of(file, self.policy_state(), self.shapes, self.config)
 
     def _load(self, name: str) -> dict[str, Any]:
         path = self.path / name
@@ -155,67 +120,33 @@ class Checkpoint:
             # weights_only: a checkpoint from elsewhere must not be able to run code.
             state = torch.load(io.BytesIO(data), map_location="cpu", weights_only=True)
         except Exception as error:  # torch's reader of weights fails in many ways
-            raise CheckpointError(f"{path} holds no weights: {_line(error)}") from error
-        if not isinstance(state, dict):
             raise CheckpointError(
-                f"{path} holds a {type(state).__name__}; it must be a dictionary of "
-                "weights and numbers."
-            )
+                f"{path} holds no weights: {line_of(error)}"
+            ) from error
         return state
 
 
-def require_fit(
-    path: Path,
-    state: Mapping[str, Any],
-    shapes: NetworkShapes,
-    config: TrainingConfig,
-) -> None:
-    """Check weights before a network of the size described is built.
-
-    Args:
-        path: Path of the file, for the message.
-        state: Weights and statistics of a policy by name.
-        shapes: Sizes of its observation and action.
-        config: Settings of its network.
+def policy_of(
+    path: Path, state: Mapping[str, Any], shapes: NetworkShapes, config: TrainingConfig
+) -> TensorDictSequential:
+    """A policy with weights from a file, ready to act.
 
     Raises:
-        CheckpointError: they are of another network, or not finite.
+        CheckpointError: the weights are of another network.
     """
     try:
-        # Takes no memory for the weights.
-        with torch.device("meta"):
-            make_policy(shapes, config).load_state_dict(dict(state), assign=True)
-        broken = [name for name, one in state.items() if not one.isfinite().all()]
-    except Exception as error:  # torch fails in many ways
+        policy = make_policy(shapes, config)
+        policy.load_state_dict(dict(state))
+    except (ValueError, TypeError, RuntimeError) as error:
         raise CheckpointError(
-            f"{path} does not fit the network described beside it: {_line(error)}"
+            f"{path} does not fit the network described beside it: {line_of(error)}"
         ) from error
-    if broken:
-        raise CheckpointError(
-            f"{path} holds weights that are not finite ({', '.join(broken[:3])}): "
-            "use an older checkpoint, or train anew."
-        )
+    return policy.eval().requires_grad_(False)
 
 
-def _read_description(path: Path) -> dict[str, Any]:
-    """A checkpoint.json of this format."""
-    try:
-        values = files.read_json(path, _MAX_DESCRIPTION, "a checkpoint's description")
-    except ValueError as error:
-        raise CheckpointError(f"{error}.") from error
-    if not isinstance(values, dict):
-        raise CheckpointError(f"{path} is no JSON object.")
-    if type(values.get("format")) is not int or values["format"] != FORMAT:
-        raise CheckpointError(
-            f"{path}: format is {values.get('format')!r}; this version reads {FORMAT}."
-        )
-    return values
-
-
-def _line(error: Exception) -> str:
-    """The first line that says something."""
-    lines = [line.strip() for line in str(error).splitlines() if line.strip()]
-    return " ".join(lines[:2])[:200] or type(error).__name__
+def line_of(error: Exception) -> str:
+    """An error as one line."""
+    return " ".join(str(error).split())[:200] or type(error).__name__
 
 
 def checkpoints_in(run: Path) -> list[Path]:
@@ -243,14 +174,10 @@ def save_checkpoint(
 ) -> Path:
     """Write a checkpoint into a run's directory and drop the oldest ones.
 
-    It is written under another name, flushed to disk and renamed, so a directory
-    with a checkpoint's name is always complete.
+    A directory with a checkpoint's name is always complete.
 
     Returns:
         Its directory.
-
-    Raises:
-        OSError: it cannot be written, as on a full disk; the others stay.
     """
     directory = Path(run) / _DIRECTORY
     directory.mkdir(parents=True, exist_ok=True)

@@ -21,7 +21,6 @@ def make_collector(
 
     Args:
         config: Settings of the run.
-        learner: Learner, whose policy acts.
         env: Environment, which the collector closes.
         frames: Number of frames that earlier processes of the run have seen.
     """

@@ -2,7 +2,7 @@
 
 import dataclasses
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, ClassVar, Literal
 
@@ -14,9 +14,6 @@ from cathsim_dmc.agents.fields import (
     within,
 )
 from cathsim_dmc.bounds import MOST_START_SHARE
-
-# Widest layer and most layers of a network: settings must not take all memory.
-MAX_WIDTH, MAX_LAYERS, MAX_FILTERS = 16_384, 16, 1_024
 
 # Convolutions of the published agents: (filters, kernel size, stride) of each.
 PUBLISHED_CONVOLUTIONS = ((32, 8, 4), (64, 4, 2), (64, 3, 1))
@@ -132,7 +129,13 @@ class TrainingConfig:
         check_fields(self)
         require(bool(self.task), "task", self.task, "the name of a task")
         require(bool(self.observation), "observation", self.observation, "a name")
-        self._require_networks()
+        for name in ("hidden", "convolutions"):
+            require(bool(getattr(self, name)), name, (), "one layer or more")
+        layers = self.convolutions
+        fit = all(len(layer) == 3 and min(layer) > 0 for layer in layers)
+        require(fit, "convolutions", layers, "positive (filters, kernel size, stride)")
+        widths = (*self.hidden, self.cnn_features)
+        require(min(widths) > 0, "hidden or cnn_features", widths, "positive")
         start = self.training_start
         require(
             start is None
@@ -149,22 +152,6 @@ class TrainingConfig:
                 f"task_kwargs={self.task_kwargs!r} cannot be written to config.json "
                 f"({error}); use finite numbers, strings, lists and dicts only."
             ) from error
-
-    def _require_networks(self) -> None:
-        def sizes(name: str, layers: Sequence[int], largest: int, what: str) -> None:
-            fit = all(0 < size <= largest for size in layers) and layers
-            require(bool(fit), name, getattr(self, name), f"{what} from 1 to {largest}")
-
-        deep = f"1 to {MAX_LAYERS}"
-        for name in ("hidden", "convolutions"):
-            value = getattr(self, name)
-            require(0 < len(value) <= MAX_LAYERS, name, value, f"{deep} layers")
-        sizes("hidden", self.hidden, MAX_WIDTH, f"{deep} widths")
-        sizes("cnn_features", [self.cnn_features], MAX_WIDTH, "an integer")
-        for layer in self.convolutions:
-            numbers = layer if len(layer) == 3 else ()
-            what = "layers (filters, kernel size, stride), each number"
-            sizes("convolutions", numbers, MAX_FILTERS, what)
 
     @property
     def training_kwargs(self) -> dict[str, Any]:

@@ -14,17 +14,12 @@ from cathsim_dmc.agents.networks import NetworkShapes
 from cathsim_dmc.policies import View
 from cathsim_dmc.policies.expert import ExpertPolicy
 from cathsim_dmc.recording import dataset
-from cathsim_dmc.recording.dataset_reader import (
-    DatasetEpisode,
-    DatasetError,
-    read_episodes,
-)
+from cathsim_dmc.recording.dataset import DatasetError, read_episodes
 from cathsim_dmc.simulation import environments
 from cathsim_dmc.simulation.environments import PIXELS, VECTOR
 from cathsim_dmc.simulation.episodes import BatchedSimulations, play
 from cathsim_dmc.tasks import observations
 from cathsim_dmc.tasks.observation_kind import Sizes
-from cathsim_dmc.tasks.step import Step
 
 DEMONSTRATION_SEED = 2_000_000  # apart from the seeds of evaluation
 # Among the infos: what the expert would do, where noise was added to what it did.
@@ -71,10 +66,7 @@ def record_demonstrations(
     expert's action without noise is "expert_action" in the infos.
 
     Args:
-        task: Name of the task.
         out: Directory of the dataset, which must not exist.
-        episodes: Number of episodes.
-        observation: Name or names of the observations.
         seed: Seed of the first episode; the others count up. The noise of an episode
             is drawn from its seed too.
         noise: Standard deviation of normal noise added to every entry of the
@@ -138,13 +130,10 @@ def _summary(out: Path, buffers: Sequence[Any]) -> Demonstrations:
 
 def _play(simulation: Any, seeds: np.ndarray, noise: float) -> list[Any]:
     """An episode of the expert for each seed, side by side, as Minari's buffers."""
-    from minari.data_collector import EpisodeBuffer
-
     count = len(seeds)
     simulation.seed(seeds.tolist())
     generators = [np.random.default_rng(int(seed)) for seed in seeds]
     expert, view = ExpertPolicy(), View(simulation)
-    rows = [_Rows() for _ in seeds]
     chosen = np.zeros(0, np.float32)
 
     def act(observation: Any) -> np.ndarray:
@@ -159,56 +148,47 @@ def _play(simulation: Any, seeds: np.ndarray, noise: float) -> list[Any]:
         return action
 
     begin = functools.partial(expert.reset, view)
+    turns: list[dict[str, Any]] = []
     for action, step, running in play(
         BatchedSimulations(simulation), act, begin, count
     ):
-        for row in np.flatnonzero(running).tolist():
-            if action is not None:
-                rows[row].do(chosen[row], action[row], step, row)
-            rows[row].see(step, row)
-    return [
-        EpisodeBuffer(seed=int(seed), **one.columns())
-        for seed, one in zip(seeds, rows, strict=True)
-    ]
+        ends = step.terminated, step.truncated
+        own = (chosen, action, running, step.outcome.reward, *ends)
+        turns.append({
+            "observations": step.observation,
+            "infos": {key: np.array(value) for key, value in step.info().items()},
+            "own": [np.array(one) for one in own],
+        })  # fmt: skip
+    return [_buffer(int(seed), row, turns) for row, seed in enumerate(seeds)]
 
 
-class _Rows:
-    """Record of one simulation."""
+def _buffer(seed: int, row: int, turns: Sequence[Mapping[str, Any]]) -> Any:
+    """The first episode of a simulation; its expert's last action is repeated."""
+    from minari.data_collector import EpisodeBuffer
 
-    def __init__(self) -> None:
-        self.seen: list[dict[str, np.ndarray]] = []
-        self.infos: list[dict[str, np.ndarray]] = []
-        self.steps: list[tuple[np.ndarray, np.ndarray, float, bool, bool]] = []
-
-    def see(self, step: Step, row: int) -> None:
-        """Record the observation before the next step."""
-        self.seen.append({key: _single(v[row]) for key, v in step.observation.items()})
-        self.infos.append({key: v[row] for key, v in step.info().items()})
-
-    def do(self, chosen: np.ndarray, action: np.ndarray, step: Step, row: int) -> None:
-        """Record the expert's action, the action with noise and the outcome."""
-        ends = bool(step.terminated[row]), bool(step.truncated[row])
-        self.steps.append((chosen, action, float(step.outcome.reward[row]), *ends))
-
-    def columns(self) -> dict[str, Any]:
-        """Fields of Minari's buffer; the last of the expert's actions is repeated."""
-        chosen, actions, rewards, terminated, truncated = zip(*self.steps, strict=True)
-        infos = {key: np.array([i[key] for i in self.infos]) for key in self.infos[0]}
-        infos[EXPERT_ACTION] = np.stack([*chosen, chosen[-1]])
-        return {
-            "observations": {
-                key: np.stack([one[key] for one in self.seen]) for key in self.seen[0]
-            },
-            "actions": np.stack(actions),
-            "rewards": list(rewards),
-            "terminations": list(terminated),
-            "truncations": list(truncated),
-            "infos": infos,
+    turns = [turn for turn in turns if turn["own"][2][row]]
+    steps = [[one[row] for one in turn["own"]] for turn in turns[1:]]
+    chosen, actions, _, *others = (np.stack(each) for each in zip(*steps, strict=True))
+    rewards, terminations, truncations = (each.tolist() for each in others)
+    columns = {
+        kind: {
+            key: np.stack([turn[kind][key][row] for turn in turns])
+            for key in turns[0][kind]
         }
-
-
-def _single(array: np.ndarray) -> np.ndarray:
-    return array if array.dtype == np.uint8 else array.astype(np.float32)
+        for kind in ("observations", "infos")
+    }
+    columns["infos"][EXPERT_ACTION] = np.stack([*chosen, chosen[-1]])
+    for key, value in columns["observations"].items():
+        if value.dtype != np.uint8:
+            columns["observations"][key] = value.astype(np.float32)
+    return EpisodeBuffer(
+        seed=seed,
+        actions=actions,
+        rewards=rewards,
+        terminations=terminations,
+        truncations=truncations,
+        **columns,
+    )
 
 
 def load_transitions(
@@ -265,9 +245,7 @@ def _keys(names: Sequence[str], coaxial: bool) -> set[str]:
     return set(observations.entry_specs(rows, Sizes()))
 
 
-def _tensors(
-    path: str | Path, episode: DatasetEpisode, names: Sequence[str]
-) -> TensorDict | None:
+def _tensors(path: str | Path, episode: Any, names: Sequence[str]) -> TensorDict | None:
     """Transitions of an episode; None if it did not succeed."""
     # What only coaxial devices show tells their episodes.
     own = _keys(names, True) - _keys(names, False)
@@ -279,7 +257,7 @@ def _tensors(
             f"{', '.join(sorted(episode.observations))}: record the observation that "
             "the learner is to see"
         )
-    if not episode.success:
+    if not np.any(episode.infos.get("success", False)):
         return None
     arrays = {key: torch.as_tensor(episode.observations[key]) for key in keys}
     seen = environments.standard(arrays, 1)

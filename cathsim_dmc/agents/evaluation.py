@@ -119,14 +119,14 @@ class EvaluationResult:
             result[name], result[f"{name}_sd"] = self.mean_sd(name)
         result["forces"] = {
             quantity: {
-                statistic.name: dict(
+                field.name: dict(
                     zip(
                         ("mean", "sd"),
-                        self.mean_sd(f"forces.{quantity}.{statistic.name}"),
+                        self.mean_sd(f"forces.{quantity}.{field.name}"),
                         strict=True,
                     )
                 )
-                for statistic in dataclasses.fields(Statistics)
+                for field in dataclasses.fields(Statistics)
             }
             for quantity in QUANTITIES
         }
@@ -172,8 +172,7 @@ class Comparison:
         policy: Name of the policy in question.
         baseline: Name of the other one.
         reward_difference: Mean over seeds of the difference of episode rewards.
-        reward_ci95: Bootstrap interval of that mean, resampling seeds; None for a
-            single seed.
+        reward_ci95: Bootstrap interval of that mean; None for a single seed.
         success_difference: Difference of the success rates; None if unknown.
         success_ci95: Bootstrap interval of that difference; None if unknown.
         better: Whether the reward interval lies above zero.
@@ -193,7 +192,7 @@ class Comparison:
 
 
 def paired_bootstrap(
-    first: np.ndarray, second: np.ndarray, seed: int = 0
+    first: np.ndarray, second: np.ndarray
 ) -> tuple[float, tuple[float, float] | None]:
     """Mean of first - second over pairs (n,), with its 95 % percentile interval.
 
@@ -205,12 +204,9 @@ def paired_bootstrap(
     if len(difference) < 2:
         return float(difference.mean()), None
     interval = stats.bootstrap(
-        (difference,),
-        np.mean,
-        n_resamples=BOOTSTRAP_SAMPLES,
-        method="percentile",
-        random_state=np.random.default_rng(seed),
-    ).confidence_interval
+        (difference,), np.mean, n_resamples=BOOTSTRAP_SAMPLES, method="percentile",
+        random_state=np.random.default_rng(0),
+    ).confidence_interval  # fmt: skip
     return float(difference.mean()), (float(interval.low), float(interval.high))
 
 
@@ -266,14 +262,11 @@ def evaluate(
     """Play episodes with a policy, each with a seed of its own, all side by side.
 
     A trained policy acts deterministically (the middle of its distribution) with
-    frozen observation statistics. Each environment plays one episode; what it does
-    while others finish is not counted.
+    frozen observation statistics. What an environment does after its episode, while
+    others finish, is not counted.
 
     Args:
-        policy: Directory of a run or of a checkpoint, Checkpoint, name in
-            `cathsim_dmc.policies.POLICIES`, policy, or function of the observations
-            (episodes, ...) that returns the actions (episodes, A) or the TensorDict
-            with "action" in it.
+        policy: Policy, or what names one, see `policies.load_policy`.
         task: Name of the task; None takes the one that the policy was trained on.
         episodes: Number of episodes; None for that of the protocol.
         seed: Seed of the first episode; the others lie above it. The default lies
@@ -284,19 +277,14 @@ def evaluate(
             policy reads.
         task_kwargs: Further options of the task; None takes those that the policy was
             trained with.
-        num_threads: Number of threads of the batched simulation; None takes one per
-            core.
+        num_threads: Number of threads of the simulation; None takes one per core.
         out_dir: Directory for evaluation.json; None writes none.
-        observer: Function that is called after every step, before any environment is
-            reset.
-        start: State in the middle of as many episodes, which are played on from there;
-            rewards, lengths and forces count from there. None for the
-            starts of the task.
-        make_env: Function that makes the environment, as `environments.make_env`.
+        observer: Function that is called after every step, before any reset.
+        start: State in the middle of as many episodes, which are played on, and
+            counted, from there; None for the starts of the task.
 
     Raises:
-        ValueError: no task is known, episodes < 1, or `start` is of another task or of
-            another number of episodes.
+        ValueError: no task is known, episodes < 1, or `start` does not fit.
         CheckpointError: there is no such checkpoint, or it is damaged.
     """
     conditions = protocols.get(protocol)
@@ -378,9 +366,7 @@ def require_task(policy: Policy, task: str | None) -> str:
 class _Environments:
     """The environments of a TorchRL environment; their state is the step's TensorDict.
 
-    Attributes:
-        seen: Present observations (N, ...).
-        view: What a policy may know of the simulations.
+    `seen` holds the present observations (N, ...).
     """
 
     seen: TensorDictBase

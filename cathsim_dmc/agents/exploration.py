@@ -29,7 +29,6 @@ class CorrelatedNoise:
         Args:
             correlation: Correlation between two consecutive steps, in [0, 1).
             shared: Share of the variance that actions of one group have in common.
-            groups: Number of the group of each action.
         """
         self._correlation, self._shared = correlation, shared
         self._groups = torch.as_tensor(groups)

@@ -70,8 +70,7 @@ class CloningLearner(Learner):
             rates: (steps,), learning rate of each step.
 
         Returns:
-            "loss", the mean over the steps, and "deviation", root mean square error of
-            an entry of the action at the end.
+            "loss", the mean, and "deviation", root mean square error at the end.
         """
         total = torch.zeros((), device=self.device)
         for rate in rates.tolist():

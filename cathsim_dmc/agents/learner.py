@@ -15,17 +15,15 @@ from cathsim_dmc.agents.networks import NetworkShapes, Normalisers
 class Learner(abc.ABC):
     """An algorithm with its networks.
 
-    Attributes:
-        metrics: Names of the figures that `update` returns, columns of metrics.csv.
-        random_frames: Number of frames to collect with uniformly random actions
-            first; the observation statistics then come from those.
-        device: Torch device of the networks.
-        shapes: Sizes of what the policy reads, and of the action.
-        network: The policy that is learnt: raw observation in, sampled action out.
-        policy: The policy to collect with; `network`, or one around it.
-        normalisers: Observation statistics of policy and critic.
-        optimiser: Adam with the parameters of all networks, made by the subclass.
-        gradient_steps: Number of gradient steps so far.
+    metrics: Names of the figures that `update` returns, columns of metrics.csv.
+    random_frames: Number of frames to collect with uniformly random actions first.
+    device: Torch device of the networks.
+    shapes: Sizes of what the policy reads, and of the action.
+    network: The policy that is learnt: raw observation in, sampled action out.
+    policy: The policy to collect with; `network`, or one around it.
+    normalisers: Observation statistics of policy and critic.
+    optimiser: Adam with the parameters of all networks, made by the subclass.
+    gradient_steps: Number of gradient steps so far.
     """
 
     metrics: ClassVar[tuple[str, ...]]

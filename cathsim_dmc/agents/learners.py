@@ -41,11 +41,6 @@ def make_config(
 ) -> TrainingConfig:
     """The config of an algorithm: a preset with some fields overridden.
 
-    Args:
-        algorithm: Name of an algorithm in `LEARNERS`.
-        preset: Name of a preset of it.
-        **overrides: Fields of the algorithm's config.
-
     Raises:
         ConfigError: unknown algorithm, preset or field, or a value not allowed.
     """

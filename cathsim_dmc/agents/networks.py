@@ -14,7 +14,7 @@ from torchrl.modules import ProbabilisticActor, TanhNormal, ValueOperator
 
 from cathsim_dmc.agents.actor_critic import ActorCriticConfig
 from cathsim_dmc.agents.config import ConfigError, TrainingConfig
-from cathsim_dmc.agents.fields import require, require_type, tuples
+from cathsim_dmc.agents.fields import require_type, tuples
 from cathsim_dmc.agents.normalisation import ImageNormaliser, ObservationNormaliser
 from cathsim_dmc.simulation.environments import PIXELS, VECTOR
 from cathsim_dmc.tasks import observations
@@ -27,8 +27,6 @@ NORMAL_PIXELS = "pixels_normal"
 # actions sit at their bounds.
 LOG_STD_RANGE = (-5.0, 2.0)
 
-# Largest size that a description of networks may ask for: it must not take all memory.
-MAX_SIZE = 65_536
 
 _ACTIVATIONS = {"tanh": nn.Tanh, "relu": nn.ReLU, "elu": nn.ELU}
 
@@ -61,26 +59,11 @@ class NetworkShapes:
         """The inverse of to_dict.
 
         Raises:
-            ConfigError: a size is missing, no integer or out of range.
+            ConfigError: a size is missing or no integer.
         """
-        fields = {name: tuples(values.get(name)) for name in ("vector", "actions")}
-        pixels = fields["pixels"] = tuples(values.get("pixels"))
+        fields = {name: tuples(values.get(name)) for name in cls.__annotations__}
         for name, kind in typing.get_type_hints(cls).items():
             require_type(f"shapes.{name}", fields[name], kind)
-        require(
-            pixels is None or len(pixels) == 3,
-            "shapes.pixels",
-            pixels,
-            "None or [channels, height, width]",
-        )
-        for name, sizes, least in (
-            ("vector", [fields["vector"]], 0),
-            ("pixels", pixels or (), 1),
-            ("actions", [fields["actions"]], 1),
-        ):
-            fit = all(least <= size <= MAX_SIZE for size in sizes)
-            allowed = f"integers from {least} to {MAX_SIZE:,}"
-            require(fit, f"shapes.{name}", fields[name], allowed)
         return cls(**fields)
 
     def to_dict(self) -> dict[str, Any]:

@@ -9,7 +9,7 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from cathsim_dmc.agents import learners, pretrained
+from cathsim_dmc.agents import pretrained
 from cathsim_dmc.agents.checkpoint import Checkpoint
 from cathsim_dmc.policies import POLICIES, Policy, View, make_policy
 from cathsim_dmc.simulation import environments
@@ -28,16 +28,9 @@ class FunctionPolicy(Policy):
     """
 
     def __init__(self, function: PolicyFunction, name: str | None = None):
-        """Wraps a function.
-
-        Args:
-            function: Function from the observations (N, ...) to the actions (N, A) or
-                to the TensorDict with "action" in it.
-            name: Name for reports; by default the function's.
-        """
+        """Wraps a function; its name for reports is its own by default."""
         self._function = function
-        default = getattr(function, "__name__", type(function).__name__)
-        self.name = name or default
+        self.name = name or getattr(function, "__name__", type(function).__name__)
 
     @torch.no_grad()
     def act(self, observation: Any) -> np.ndarray:
@@ -62,10 +55,7 @@ class TrainedPolicy(FunctionPolicy):
     """
 
     def __init__(self, source: Checkpoint | Path):
-        """Loads the weights.
-
-        Args:
-            source: Checkpoint, or path of a `.safetensors` file with its card.
+        """Loads the weights of a checkpoint, or of a `.safetensors` file with its card.
 
         Raises:
             CheckpointError: its weights cannot be used.
@@ -73,18 +63,19 @@ class TrainedPolicy(FunctionPolicy):
         self.checkpoint = self.card = None
         if isinstance(source, Checkpoint):
             self.checkpoint = source
-            state, shapes, config = source.policy_state(), source.shapes, source.config
-            self.task, self.task_kwargs = config.task, config.task_kwargs
-            name = f"{config.algorithm} {source.path.name}"
+            network, self.shapes, self.config = (
+                source.policy(), source.shapes, source.config,
+            )  # fmt: skip
+            self.task, self.task_kwargs = source.config.task, source.config.task_kwargs
+            name = f"{source.config.algorithm} {source.path.name}"
         else:
-            self.card, state, shapes, config = pretrained.read_pretrained(source)
+            self.card, network, self.shapes, self.config = pretrained.read_pretrained(
+                source
+            )
             self.task, self.task_kwargs = self.card["task"], self.card["task_kwargs"]
             name = f"{pretrained.PREFIX}{self.card['name']}"
-        network = learners.make_policy(shapes, config)
-        network.load_state_dict(state)
-        super().__init__(network.eval().requires_grad_(False), name)
-        self.network, self.config, self.shapes = network, config, shapes
-        self.observation = config.observation
+        super().__init__(network, name)
+        self.network, self.observation = network, self.config.observation
 
     def reset(self, view: View, which: np.ndarray) -> None:
         """Refuse simulations of a device with other motors, as ValueError."""

@@ -8,10 +8,11 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from tensordict.nn import TensorDictSequential
 
 from cathsim_dmc import files
-from cathsim_dmc.agents.checkpoint import CheckpointError, require_fit
-from cathsim_dmc.agents.config import ConfigError, TrainingConfig
+from cathsim_dmc.agents.checkpoint import CheckpointError, line_of, policy_of
+from cathsim_dmc.agents.config import TrainingConfig
 from cathsim_dmc.agents.learners import config_from_dict
 from cathsim_dmc.agents.networks import NetworkShapes
 
@@ -20,7 +21,6 @@ PREFIX = "pretrained:"
 SUFFIX = ".safetensors"
 DIRECTORY = Path(__file__).parents[1] / "pretrained"
 _NAME = re.compile(r"[a-z0-9][a-z0-9_]*")
-_MAX_CARD = 2**20  # bytes
 _PARTS: Mapping[str, type] = {
     "name": str,
     "task": str,
@@ -54,8 +54,8 @@ def pretrained_path(name: str) -> Path:
 
 def read_pretrained(
     weights: str | Path,
-) -> tuple[dict[str, Any], dict[str, torch.Tensor], NetworkShapes, TrainingConfig]:
-    """Card, weights and statistics by name, sizes and settings of a policy.
+) -> tuple[dict[str, Any], TensorDictSequential, NetworkShapes, TrainingConfig]:
+    """Card, network, sizes and settings of a policy.
 
     Args:
         weights: Path of the `.safetensors` file; the card lies beside it.
@@ -70,24 +70,16 @@ def read_pretrained(
     card = read_card(weights.with_suffix(".json"))
     try:
         data = weights.read_bytes()
-    except OSError as error:
-        raise CheckpointError(f"{weights} cannot be read: {error}.") from error
-    if hashlib.sha256(data).hexdigest() != card["sha256"]:
-        raise CheckpointError(
-            f"{weights} is damaged, or its card is that of another policy: the "
-            "SHA-256 differs."
-        )
-    try:
+        if hashlib.sha256(data).hexdigest() != card["sha256"]:
+            raise ValueError("the SHA-256 differs from that in its card")
         config = config_from_dict(card["config"])
         shapes = NetworkShapes.from_dict(card["shapes"])
-        state = load(data)
-    except (ConfigError, SafetensorError, ValueError) as error:
-        line = " ".join(str(error).split())[:200]
+        return card, policy_of(weights, load(data), shapes, config), shapes, config
+    except (OSError, SafetensorError, ValueError) as error:
         raise CheckpointError(
-            f"{weights} does not fit the network of its card: {line}"
+            f"{weights} cannot be used; it or its card is missing or damaged: "
+            f"{line_of(error)}"
         ) from error
-    require_fit(weights, state, shapes, config)
-    return card, state, shapes, config
 
 
 def read_card(path: str | Path) -> dict[str, Any]:
@@ -102,16 +94,13 @@ def read_card(path: str | Path) -> dict[str, Any]:
     Raises:
         CheckpointError: it is missing or damaged.
     """
-    path = Path(path)
     try:
-        card = files.read_json(path, _MAX_CARD, "a card")
-    except ValueError as error:
-        raise CheckpointError(f"{error}.") from error
-    if not isinstance(card, dict) or card.get("format") != FORMAT:
-        raise CheckpointError(f"{path} is no card of format {FORMAT}.")
-    wrong = [name for name, kind in _PARTS.items() if type(card.get(name)) is not kind]
-    if wrong:
-        raise CheckpointError(f"{path}: {', '.join(wrong)} missing or of another type.")
+        card = json.loads(Path(path).read_text())
+        wrong = [n for n, kind in _PARTS.items() if type(card.get(n)) is not kind]
+    except (OSError, AttributeError, ValueError) as error:
+        raise CheckpointError(f"{path} cannot be read: {error}.") from error
+    if wrong or card.get("format") != FORMAT:
+        raise CheckpointError(f"{path}: no card of format {FORMAT}; wrong is {wrong}.")
     return card
 
 
@@ -124,23 +113,18 @@ def write_pretrained(
     """Write weights and card; the card last, which makes them a policy.
 
     Args:
-        directory: Directory to write to.
         name: Name of the policy: lower-case letters, digits and underscores.
-        state: Weights and statistics of the policy by name.
         card: Card without "format", "name" and "sha256".
 
     Returns:
         Path of the weights.
 
     Raises:
-        ValueError: the name is not allowed, or the state holds more than tensors.
+        ValueError: the name is not allowed.
     """
     from safetensors.torch import save
 
     require_name(name)
-    others = sorted(k for k, v in state.items() if not isinstance(v, torch.Tensor))
-    if others:
-        raise ValueError(f"the policy's state holds {', '.join(others)}: no tensors")
     directory = Path(directory)
     directory.mkdir(parents=True, exist_ok=True)
     data = save({key: value.cpu().contiguous() for key, value in state.items()})

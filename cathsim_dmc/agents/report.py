@@ -53,24 +53,21 @@ class EvaluationReport:
         from rich.console import Console
         from rich.table import Table
 
-        table = Table(
-            title=f"{self.policy.task}, seeds from {self.policy.seeds[0]}",
-            caption=_CAPTION if self.policy.distinct else f"{_CAPTION} {_NEARLY_ONE}",
-            caption_justify="left",
-        )
+        title = f"{self.policy.task}, seeds from {self.policy.seeds[0]}"
+        caption = _CAPTION if self.policy.distinct else f"{_CAPTION} {_NEARLY_ONE}"
+        table = Table(title=title, caption=caption, caption_justify="left")
         results = [one for one in (self.policy, self.baseline) if one is not None]
         for column in ("policy", *(result.policy for result in results)):
             table.add_column(column)
         for row in zip(_ROWS, *map(_cells, results), strict=True):
             table.add_row(*row)
-        console = Console()
-        console.print(table)
+        Console().print(table)
         if self.comparison is not None:
             interval = "one episode tells no interval"
             if self.comparison.reward_ci95 is not None:
                 low, high = self.comparison.reward_ci95
                 interval = f"95 % interval {low:+.1f} to {high:+.1f}"
-            console.print(
+            Console().print(
                 f"reward over {self.comparison.baseline}: "
                 f"{self.comparison.reward_difference:+.1f} ({interval})"
             )
@@ -123,8 +120,8 @@ class ContactLog:
     """Contacts with the wall over the episodes of a batched evaluation."""
 
     def __init__(self):
-        self._positions: list[np.ndarray] = []
-        self._magnitudes: list[np.ndarray] = []
+        self._positions = [np.zeros((0, 3))]
+        self._magnitudes = [np.zeros(0)]
 
     def __call__(self, env: EnvBase, running: np.ndarray) -> None:
         """Adds the contacts at the end of a control step; an evaluation observer."""
@@ -136,12 +133,23 @@ class ContactLog:
     @property
     def positions(self) -> np.ndarray:
         """(K, 3), m, world frame."""
-        return np.concatenate(self._positions or [np.zeros((0, 3))])
+        return np.concatenate(self._positions)
 
     @property
     def magnitudes(self) -> np.ndarray:
         """(K,), N."""
-        return np.concatenate(self._magnitudes or [np.zeros(0)])
+        return np.concatenate(self._magnitudes)
+
+    def draw(self, result: evaluation.EvaluationResult, path: Path) -> None:
+        """Writes the heatmap of an evaluation as PNG."""
+        task = suite.make_task(result.task, **result.settings["task_kwargs"])
+        heatmap.contact_heatmap(
+            self.positions,
+            self.magnitudes,
+            task.scene.anatomy.surface,
+            path,
+            title=f"{result.task}, {result.policy}: {len(result.episodes)} episodes",
+        )
 
 
 def evaluate(
@@ -214,21 +222,8 @@ def evaluate(
     report = EvaluationReport(result, other, comparison, time.monotonic() - began)
     if out_dir is not None:
         evaluation.write_evaluation(out_dir, report.to_dict())
-        _draw_heatmap(contacts, result, Path(out_dir) / "heatmap.png")
+        contacts.draw(result, Path(out_dir) / "heatmap.png")
     return report
-
-
-def _draw_heatmap(
-    contacts: ContactLog, result: evaluation.EvaluationResult, path: Path
-) -> None:
-    task = suite.make_task(result.task, **result.settings["task_kwargs"])
-    heatmap.contact_heatmap(
-        contacts.positions,
-        contacts.magnitudes,
-        task.scene.anatomy.surface,
-        path,
-        title=f"{result.task}, {result.policy}: {len(result.episodes)} episodes",
-    )
 
 
 def require_registered(task: str) -> None:
@@ -254,7 +249,6 @@ def record(
         policy: Policy, or what names one, see `policies.load_policy`.
         out: Path of the .rrd file; None writes none.
         task: Name of the task; None takes the one that the policy was trained on.
-        seed: Seed of the episode.
         max_steps: Number of control steps after which the episode is cut off; None
             leaves it to the task.
         task_kwargs: Options of the task, over those that the policy was trained with.
@@ -299,15 +293,13 @@ def record(
 
 def _targets(out: str | Path | None, gif: str | Path | None) -> dict[str, Path]:
     """The files to write by kind."""
-    targets = {}
-    for kind, path, suffixes in (("out", out, (".rrd",)), ("gif", gif, SUFFIXES)):
-        if path is None:
-            continue
-        targets[kind] = Path(path)
-        if targets[kind].suffix not in suffixes:
+    given = {"out": (out, (".rrd",)), "gif": (gif, SUFFIXES)}
+    targets = {kind: Path(path) for kind, (path, _) in given.items() if path}
+    for kind, path in targets.items():
+        if path.suffix not in given[kind][1]:
             raise ValueError(
                 f"the recording is to be written to {path}; give an "
-                f"{' or '.join(suffixes)} file"
+                f"{' or '.join(given[kind][1])} file"
             )
     if "gif" in targets:
         check_film(targets["gif"])

@@ -5,7 +5,7 @@ import json
 import math
 import os
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -21,6 +21,7 @@ from cathsim_dmc.agents.checkpoint import (
     Checkpoint,
     CheckpointError,
     checkpoints_in,
+    line_of,
     save_checkpoint,
 )
 from cathsim_dmc.agents.collection import make_collector
@@ -31,8 +32,7 @@ from cathsim_dmc.agents.interruption import Interruption
 from cathsim_dmc.agents.learner import Learner
 from cathsim_dmc.agents.learners import make_learner
 from cathsim_dmc.agents.networks import NetworkShapes
-from cathsim_dmc.agents.replay import ReplayError
-from cathsim_dmc.agents.training_log import TrainingLog, crossed, read_window
+from cathsim_dmc.agents.training_log import TrainingLog, crossed
 from cathsim_dmc.agents.warm_start import take_over
 from cathsim_dmc.simulation import environments
 
@@ -80,11 +80,9 @@ def train(
 
     Args:
         config: Settings: what to train, and how.
-        out_dir: Directory of the run.
         resume: Whether to continue the run there. One that was killed before its
             first checkpoint starts anew.
         progress: Whether to show progress on standard error.
-        make_env: Function that makes the environment, as `environments.make_env`.
         without_replay: Whether a run that is resumed starts with an empty replay
             (SAC, DAgger), as when its files are lost.
 
@@ -102,8 +100,7 @@ def train(
     run = Path(out_dir)
     _require_device(config.torch_device)
     with contextlib.ExitStack() as stack:
-        require_alone = stack.enter_context(_only_process(run))
-        stack.enter_context(_naming_what_is_safe(run))
+        stack.enter_context(_only_process(run))
         checkpoint = _prepare(run, config, resume)
         stack.enter_context(_torch_threads(config.torch_threads))
         stack.enter_context(physics_errors.dumps_in(run / "errors"))
@@ -133,7 +130,7 @@ def train(
         interruption = stack.enter_context(Interruption())
         newest = checkpoint.path if checkpoint else None
         batches = iter(collector)
-        loop = _Loop(run, config, batches, learner, log, require_alone, newest)
+        loop = _Loop(run, config, batches, learner, log, newest)
         while log.frames < config.total_frames and not interruption.requested:
             loop.step(interruption)
         # However it ended; writes nothing if the last batch has just been saved.
@@ -153,14 +150,10 @@ def _require_device(name: str) -> None:
 
 
 @contextlib.contextmanager
-def _only_process(run: Path) -> Iterator[Callable[[], None]]:
+def _only_process(run: Path) -> Iterator[None]:
     """Make the directory of a run and lock it against other processes.
 
     The operating system releases the lock of a process that is killed.
-
-    Yields:
-        Function that raises RuntimeError where the file of the lock is not there any
-        more, without which another process may train here too.
     """
     run.mkdir(parents=True, exist_ok=True)
     lock = FileLock(run / _LOCK_FILE)
@@ -171,19 +164,8 @@ def _only_process(run: Path) -> Iterator[Callable[[], None]]:
             f"another process trains in {run}: wait for its end, or choose another "
             "directory."
         ) from error
-    locked = os.stat(lock.lock_file)
-
-    def require_alone() -> None:
-        with contextlib.suppress(OSError):
-            if os.path.samestat(os.stat(lock.lock_file), locked):
-                return
-        raise RuntimeError(
-            f"{lock.lock_file} was removed, so another process may train in {run}: "
-            "nothing more is written; resume the run (--resume)."
-        )
-
     try:
-        yield require_alone
+        yield
     finally:
         # Where no run was begun, as little as possible stays.
         if not (run / CONFIG_FILE).exists():
@@ -191,26 +173,6 @@ def _only_process(run: Path) -> Iterator[Callable[[], None]]:
                 os.unlink(lock.lock_file)
                 run.rmdir()
         lock.release()
-
-
-@contextlib.contextmanager
-def _naming_what_is_safe(run: Path) -> Iterator[None]:
-    """Add the newest checkpoint to the error of a file that cannot be written."""
-    try:
-        yield
-    except OSError as error:
-        if error.filename is None or error.errno is None:
-            raise
-        saved = checkpoints_in(run)
-        safe = (
-            f"the first {int(saved[-1].name):,} frames are safe in {saved[-1]}; mend "
-            "it and go on with resume=True (--resume)"
-            if saved
-            else "no checkpoint has been saved; mend it and start again"
-        )
-        raise type(error)(
-            error.errno, f"{error.filename}: {error.strerror}; {safe}"
-        ) from error
 
 
 def _prepare(run: Path, config: TrainingConfig, resume: bool) -> Checkpoint | None:
@@ -238,8 +200,6 @@ def _prepare(run: Path, config: TrainingConfig, resume: bool) -> Checkpoint | No
                 f"the run's own, or start a new run in another directory. These may "
                 f"change: {sorted(config.resumable)}."
             )
-        # Before networks of the size that it describes are built.
-        checkpoint.policy_state()
     return checkpoint
 
 
@@ -282,28 +242,24 @@ def _start(
             learner.observe(env.rollout(steps, break_when_any_done=False))
         return {"frames": 0, "seconds": 0.0, "episodes": 0, "window": []}
     policy, state = checkpoint.policy_state(), checkpoint.learning_state()
+    if without_replay:
+        state["learner"].pop("replay", None)
     try:
-        if without_replay:
-            state["learner"].pop("replay", None)
         learner.load(policy, state["learner"])
-        # Tried here: a later error would name no file.
-        rng = torch.Generator().set_state(state["rng"]).get_state()
-        counted = {
-            "rng": rng,
-            "episodes": int(state["episodes"]),
-            # A checkpoint may lack it.
-            "window": read_window(state.get("window", [])),
-        }
-    except ReplayError:
-        raise
-    except (KeyError, TypeError, ValueError, AttributeError, RuntimeError) as error:
-        line = " ".join(str(error).split())[:200]
+    except (KeyError, TypeError, AttributeError, RuntimeError) as error:
         raise CheckpointError(
             f"{checkpoint.path} cannot be continued from: it does not fit what "
-            f"{checkpoint.config.algorithm} learns with ({type(error).__name__}: "
-            f"{line}). Its policy may still be evaluated."
+            f"{checkpoint.config.algorithm} learns with ({line_of(error)}). Its policy "
+            "may still be evaluated."
         ) from error
-    return {"frames": checkpoint.frames, "seconds": checkpoint.seconds, **counted}
+    return {
+        "frames": checkpoint.frames,
+        "seconds": checkpoint.seconds,
+        "rng": state["rng"],
+        "episodes": state["episodes"],
+        # A checkpoint may lack it.
+        "window": state.get("window", []),
+    }
 
 
 @dataclass
@@ -315,7 +271,6 @@ class _Loop:
     batches: Iterator[TensorDictBase]
     learner: Learner
     log: TrainingLog
-    require_alone: Callable[[], None]
     newest: Path | None
 
     def __post_init__(self):
@@ -347,7 +302,6 @@ class _Loop:
 
     def save(self) -> Path:
         """Write a checkpoint; return its directory."""
-        self.require_alone()
         self.newest = save_checkpoint(
             self.run,
             config=self.config,

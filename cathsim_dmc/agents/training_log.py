@@ -27,15 +27,10 @@ _FIGURES = {
     "mean_force": "forces.mean_force",
     "max_force": "forces.max_force",
 }
+_VALUES = attrgetter(*_FIGURES.values())
 # The rest of metrics.csv's columns are the learner's own.
-COLUMNS = (
-    "frames",
-    "seconds",
-    "frames_per_second",
-    "episodes",
-    *_FIGURES,
-    "step_reward",
-)
+_COUNTS = ("frames", "seconds", "frames_per_second", "episodes")
+COLUMNS = (*_COUNTS, *_FIGURES, "step_reward")
 
 
 class TrainingLog:
@@ -64,14 +59,11 @@ class TrainingLog:
         """Opens the files, shows the progress and starts the clock.
 
         Args:
-            run: Directory of the run.
-            config: Settings of the run.
             metrics: Names of the learner's own figures.
             frames: Number of frames that earlier processes of the run have seen.
             seconds: Wall time that they have taken.
             episodes: Number of episodes that they have finished.
             window: Figures of the last of these.
-            resumed: Whether there were any.
             progress: Whether to show progress on standard error.
         """
         self.frames, self.episodes = frames, episodes
@@ -79,7 +71,9 @@ class TrainingLog:
         self.window = deque(map(list, window), maxlen=EPISODE_WINDOW)
         self._interval = config.metrics_frames
         self._path, self._columns = run / "metrics.csv", [*COLUMNS, *metrics]
-        self._rows = _rows_until(self._path, frames) if resumed else []
+        # A killed run has rows beyond its checkpoint.
+        rows = _texts(self._path) if resumed and self._path.exists() else []
+        self._rows: list[dict] = [r for r in rows if int(r["frames"]) <= frames]
         self._write()
         self._board = _tensorboard(run) if config.tensorboard else None
         self._bar = progress_bar(
@@ -116,14 +110,13 @@ class TrainingLog:
         Args:
             frames: Number of frames of the batch.
             finished: Episodes that ended in it.
-            step_reward: Mean reward of its steps.
             losses: Figures of the learner's update.
             last: Whether no other batch follows, so that a row is due anyway.
         """
         before, self.frames = self.frames, self.frames + frames
         self.episodes += len(finished)
         self.window.extend(
-            [_number(attrgetter(name)(episode)) for name in _FIGURES.values()]
+            [v if v is None else float(v) for v in _VALUES(episode)]
             for episode in finished
         )
         means = _episode_means(self.window)
@@ -167,10 +160,10 @@ class TrainingLog:
         files.write_text(self._path, text.getvalue())
 
 
-def _rows_until(path: Path, frames: int) -> list[dict[str, Any]]:
-    """Rows of a metrics.csv up to a frame: a killed run has some beyond it."""
-    rows = _texts(path) if path.exists() else []
-    return [row for row in rows if int(row["frames"]) <= frames]
+def _texts(path: Path) -> list[dict[str, str]]:
+    """The whole rows of a metrics.csv."""
+    with open(path, newline="") as file:
+        return [row for row in csv.DictReader(file) if None not in row.values()]
 
 
 def read_metrics(path: Path) -> list[dict[str, float | None]]:
@@ -179,12 +172,6 @@ def read_metrics(path: Path) -> list[dict[str, float | None]]:
         {name: float(cell) if cell else None for name, cell in row.items()}
         for row in _texts(path)
     ]
-
-
-def _texts(path: Path) -> list[dict[str, str]]:
-    """The whole rows of a metrics.csv."""
-    with open(path, newline="") as file:
-        return [row for row in csv.DictReader(file) if None not in row.values()]
 
 
 def crossed(before: int, after: int, interval: int) -> bool:
@@ -199,23 +186,6 @@ def _episode_means(window: Iterable[Sequence[float | None]]) -> dict[str, float 
         known = [value for value in values if value is not None]
         means[name] = float(np.mean(known)) if known else None
     return means
-
-
-def read_window(rows: Sequence[Sequence[float | None]]) -> list[list[float | None]]:
-    """Checks the `TrainingLog.window` of a checkpoint.
-
-    Raises:
-        ValueError: A row has another number of figures than one for each column.
-        TypeError: A figure is no number.
-    """
-    window = [[_number(value) for value in row] for row in rows]
-    if any(len(row) != len(_FIGURES) for row in window):
-        raise ValueError(f"an episode has other figures than {', '.join(_FIGURES)}")
-    return window
-
-
-def _number(value: float | None) -> float | None:
-    return None if value is None else float(value)
 
 
 def _tensorboard(run: Path) -> Any:

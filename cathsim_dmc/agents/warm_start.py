@@ -9,15 +9,8 @@ from cathsim_dmc.agents.networks import LOG_STD_RANGE, NetworkShapes
 from cathsim_dmc.agents.policies import TrainedPolicy, load_policy
 
 # What must agree for the weights to mean the same.
-_ALIKE = (
-    "observation",
-    "hidden",
-    "activation",
-    "subtract_background",
-    "convolutions",
-    "cnn_features",
-    "observation_clip",
-)
+_ALIKE = ("observation", "hidden", "activation", "subtract_background",
+          "convolutions", "cnn_features", "observation_clip")  # fmt: skip
 
 
 def take_over(policy: nn.Module, config: TrainingConfig, shapes: NetworkShapes) -> None:
@@ -26,13 +19,9 @@ def take_over(policy: nn.Module, config: TrainingConfig, shapes: NetworkShapes) 
     A deviation that depends on the state (SAC) starts as one that does not (PPO,
     cloning), and the other way round as its value in the middle of all states.
 
-    Args:
-        policy: Policy of the learner, changed in place.
-        config: Settings of the run that begins.
-        shapes: Sizes of its observation and action.
-
     Raises:
-        ConfigError: the other policy has another network or observation.
+        ConfigError: the other policy has another network, sizes or observation.
+        CheckpointError: there is none, or it is damaged.
         CheckpointError: there is none, or it is damaged.
     """
     source = load_policy(str(config.initial_policy))

@@ -22,9 +22,7 @@ MARGIN = 5e-3
 # Columns of the antero-posterior projection: x (lateral, patient left on the right
 # of the picture, as the reader faces the patient) and z (up).
 AP_AXES = (0, 2)
-_PICTURE_HEIGHT_IN = 7.0
-_PICTURE_WIDTH_RANGE_IN = (4.0, 14.0)
-_COLOUR_BAR_IN = 1.6
+_PICTURE_HEIGHT_IN, _PICTURE_WIDTH_RANGE_IN, _COLOUR_BAR_IN = 7.0, (4.0, 14.0), 1.6
 _DPI = 150
 
 
@@ -83,32 +81,25 @@ def force_map(
             f"cell and extent must be positive, got cell {cell}, {low} to {high}"
         )
     shape = np.maximum(np.ceil((high - low) / cell - 1e-9).astype(int), 1)
-    index = np.floor((position[:, AP_AXES] - low) / cell).astype(int)
-    inside = ((index >= 0) & (index < shape)).all(axis=1)
-    index, force = index[inside], force[inside]
-    flat = index[:, 1] * shape[0] + index[:, 0]
-    size = int(shape.prod())
-    count = np.bincount(flat, minlength=size)
-    total = np.bincount(flat, force, minlength=size)
-    mean = np.full(size, np.nan)
+    # Half a cell more on either side keeps what lies on the far edges out of the map.
+    edges = [
+        low[k] + cell * np.append(np.arange(n + 1), n + 0.5)
+        for k, n in enumerate(shape)
+    ]
+    x, z = position[:, AP_AXES].T
+    count = np.histogram2d(z, x, edges[::-1])[0][:-1, :-1].astype(np.int64)
+    total = np.histogram2d(z, x, edges[::-1], weights=force)[0][:-1, :-1]
+    mean = np.full(count.shape, np.nan)
     np.divide(total, count, out=mean, where=count > 0)
-    return ForceMap(
-        x_edges=low[0] + cell * np.arange(shape[0] + 1),
-        z_edges=low[1] + cell * np.arange(shape[1] + 1),
-        mean=mean.reshape(shape[::-1]),
-        count=count.reshape(shape[::-1]),
-        outside=int(np.count_nonzero(~inside)),
-    )
+    outside = len(force) - int(count.sum())
+    return ForceMap(edges[0][:-1], edges[1][:-1], mean, count, outside)
 
 
 def heatmap(
     episodes: Iterable[Episode],
     surface: Any,
     path: str | os.PathLike[str],
-    *,
-    cell: float = CELL,
-    force_limit: float | None = None,
-    title: str | None = None,
+    **options: Any,
 ) -> ForceMap:
     """Draw the mean contact force of some episodes over the vessel, as a PNG.
 
@@ -116,13 +107,6 @@ def heatmap(
         episodes: All evaluation episodes; one without contact adds nothing.
         surface: The vessel, ``(vertices, faces)`` or an object with these, metres.
         path: Target, ``*.png``; appears whole or not at all.
-        cell: Side of a cell of the map, metres.
-        force_limit: Top of the colour scale in newtons, to compare pictures; by
-            default the largest mean of the map.
-        title: Text above the picture.
-
-    Returns:
-        The map that was drawn.
 
     Raises:
         ValueError: if there are no episodes, or ``force_limit`` is not positive.
@@ -132,12 +116,10 @@ def heatmap(
         raise ValueError("a heatmap needs at least one episode")
     position = np.concatenate([e.contact_position for e in episodes])
     force = np.concatenate([np.linalg.norm(e.contact_force, axis=-1) for e in episodes])
-    if title is None:
-        tasks = ", ".join(sorted({e.task for e in episodes}))
-        title = f"{tasks}\nepisodes {len(episodes)}, contacts {len(force)}"
-    return contact_heatmap(
-        position, force, surface, path, cell=cell, force_limit=force_limit, title=title
-    )
+    tasks = ", ".join(sorted({e.task for e in episodes}))
+    title = f"{tasks}\nepisodes {len(episodes)}, contacts {len(force)}"
+    options.setdefault("title", title)
+    return contact_heatmap(position, force, surface, path, **options)
 
 
 def contact_heatmap(
@@ -150,7 +132,16 @@ def contact_heatmap(
     force_limit: float | None = None,
     title: str = "",
 ) -> ForceMap:
-    """Draw the mean of contact forces (K,) in N at positions (K, 3), see `heatmap`."""
+    """Draw contact forces (K,) in N at positions (K, 3), m, see `heatmap`.
+
+    Args:
+        position: World frame.
+        path: Target, ``*.png``.
+        cell: Side of a cell of the map, metres.
+        force_limit: Top of the colour scale in newtons, to compare pictures; by
+            default the largest mean of the map.
+        title: Text above the picture.
+    """
     if force_limit is not None and not force_limit > 0:
         raise ValueError(f"force_limit must be positive, got {force_limit}")
     vertices, faces = surface_arrays(surface)
@@ -178,21 +169,16 @@ def _figure(
 
     x_mm, z_mm = 1e3 * field.x_edges, 1e3 * field.z_edges
     width = _PICTURE_HEIGHT_IN * np.ptp(x_mm) / np.ptp(z_mm) + _COLOUR_BAR_IN
-    figure = Figure(
-        figsize=(np.clip(width, *_PICTURE_WIDTH_RANGE_IN), _PICTURE_HEIGHT_IN),
-        layout="constrained",
-    )
+    size = np.clip(width, *_PICTURE_WIDTH_RANGE_IN), _PICTURE_HEIGHT_IN
+    figure = Figure(figsize=size, layout="constrained")
     FigureCanvasAgg(figure)
     axes = figure.add_subplot()
-    triangles = 1e3 * outline[faces]
+    triangles = list(1e3 * outline[faces])
     # All triangles twice: dark and wide, then light on top, which leaves a dark rim
     # around the silhouette without computing it.
     for colour, rim in (("0.45", 2.2), ("0.9", 0.6)):
-        axes.add_collection(
-            PolyCollection(
-                list(triangles), facecolors=colour, edgecolors=colour, lw=rim
-            )
-        )
+        look = {"facecolors": colour, "edgecolors": colour, "lw": rim}
+        axes.add_collection(PolyCollection(triangles, **look))
     if force_limit is None:
         force_limit = float(np.nanmax(field.mean)) if field.count.any() else 0.0
     image = axes.pcolormesh(
@@ -210,10 +196,7 @@ def _figure(
         image, ax=axes, extend="max" if over else "neither", shrink=0.8
     )
     bar.set_label("mean contact force, mN")
-    axes.set_xlim(x_mm[0], x_mm[-1])
-    axes.set_ylim(z_mm[0], z_mm[-1])
-    axes.set_aspect("equal")
-    axes.set_xlabel("x, mm (patient left →)")
-    axes.set_ylabel("z, mm (head ↑)")
+    axes.set(xlim=x_mm[[0, -1]], ylim=z_mm[[0, -1]], aspect="equal")
+    axes.set(xlabel="x, mm (patient left →)", ylabel="z, mm (head ↑)")
     axes.set_title(title, fontsize=11)
     return figure

@@ -123,10 +123,7 @@ def pace(
     """Play an episode of a suite environment and time every control step.
 
     Args:
-        environment: The environment.
         policy: Name of a policy in `cathsim_dmc.policies.POLICIES`.
-        steps: Number of control steps.
-        seed: Seed of the policy.
     """
     act = in_environment(make_policy(policy, seed), environment)
     timed, insertion, contacts = _Timed(environment), [], []

@@ -14,10 +14,11 @@ from cathsim_dmc.cli.options import (
     BAD_INPUT,
     INTERRUPTED,
     NO_ANATOMY,
+    Json,
     OwnAnatomy,
     Task,
     print_json,
-)
+)  # fmt: skip
 from cathsim_dmc.cli.phantoms import phantoms
 
 _DESCRIPTION = (
@@ -31,12 +32,11 @@ app.command(name="train")(training.command([]))
 
 
 @app.command(name="list")
-def list_tasks(devices: bool = False, json: bool = False) -> int:
+def list_tasks(devices: bool = False, json: Json = False) -> int:
     """List the tasks, with one line each, or the devices and what they are made of.
 
     Args:
         devices: Whether to list the devices in place of the tasks.
-        json: Whether to print JSON instead of a table.
     """
     from rich.console import Console
     from rich.table import Table
@@ -63,7 +63,6 @@ def mjcf(task: Task, /, out: Path, seed: int = 0, anatomy: OwnAnatomy = NO_ANATO
     """Write the scene of a task as MJCF, with the start of an episode as JSON.
 
     Args:
-        task: Task of `cathsim list`.
         out: Directory to write, which must not exist: scene.xml, which MuJoCo's
             viewer opens, and task.json.
         seed: Seed of the episode.

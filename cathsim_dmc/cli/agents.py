@@ -13,10 +13,14 @@ from cathsim_dmc.cli.options import (
     DEMONSTRATION_SEED,
     EVALUATION_SEED,
     NO_ANATOMY,
+    Json,
+    MaxSteps,
     OwnAnatomy,
+    PolicyName,
     Task,
+    Threads,
     print_json,
-)
+)  # fmt: skip
 from cathsim_dmc.cli.task_options import given, task_kind
 
 
@@ -47,7 +51,7 @@ def evaluation(arguments: Sequence[str]) -> Callable[..., int]:
 
 
 def evaluate(
-    policy: Annotated[str, conf.Positional],
+    policy: PolicyName,
     /,
     task: str | None = None,
     episodes: int | None = None,
@@ -56,17 +60,15 @@ def evaluate(
     out: Path | None = None,
     baseline: bool = True,
     anatomy: OwnAnatomy = NO_ANATOMY,
-    threads: int | None = None,
+    threads: Threads = None,
     start: Path | None = None,
-    json: bool = False,
+    json: Json = False,
     *,
     options: NoOptions,
 ) -> int:
     """Play episodes with a policy and report reward, forces and success.
 
     Args:
-        policy: Directory of a run or of a checkpoint, or name of a policy: "random",
-            "push", "expert", "idle", "curl", "random_curl", "pretrained:NAME".
         task: Task of `cathsim list`; by default the one that the policy was trained on.
         episodes: Number of episodes, each with a seed of its own; by default 30, and
             100 of the varied protocol.
@@ -77,10 +79,8 @@ def evaluate(
         out: Directory for evaluation.json and heatmap.png.
         baseline: Whether to compare with the random policy on the same seeds.
         anatomy: Where the task takes place.
-        threads: Number of threads of the simulation; one per core by default.
         start: File of a snapshot (`snapshot().save`): one episode for each of its
             simulations, from there on.
-        json: Whether to print one JSON object and nothing else.
         options: Options of the task, over those that the policy was trained with.
     """
     from cathsim_dmc.agents import report
@@ -106,27 +106,24 @@ def evaluate(
 
 
 def record(
-    policy: Annotated[str, conf.Positional],
+    policy: PolicyName,
     /,
     out: Path | None = None,
     gif: Annotated[Path | None, conf.arg(aliases=("--mp4",))] = None,
     task: str | None = None,
     seed: int = EVALUATION_SEED,
-    max_steps: int | None = None,
+    max_steps: MaxSteps = None,
     anatomy: OwnAnatomy = NO_ANATOMY,
     fluoroscopy: bool = True,
 ) -> int:
     """Record one episode: as a Rerun file, and as .npz beside it; or as a film.
 
     Args:
-        policy: Directory of a run or of a checkpoint, or name of a policy: "random",
-            "push", "expert", "idle", "curl", "random_curl", "pretrained:NAME".
         out: Path of the .rrd file.
         gif: Path of a film for slides, .gif, .webp or, with the extra `mp4`, .mp4;
             needs no OpenGL.
         task: Task of `cathsim list`; by default the one that the policy was trained on.
         seed: Seed of the episode.
-        max_steps: Number of control steps after which the episode is cut off.
         anatomy: Where the task takes place.
         fluoroscopy: Whether to include X-ray images.
     """
@@ -162,15 +159,14 @@ def demos(
     observation: tuple[str, ...] = ("tracking",),
     noise: float = 0.0,
     seed: int = DEMONSTRATION_SEED,
-    max_steps: int | None = None,
+    max_steps: MaxSteps = None,
     anatomy: OwnAnatomy = NO_ANATOMY,
-    threads: int | None = None,
-    json: bool = False,
+    threads: Threads = None,
+    json: Json = False,
 ) -> int:
     """Write demonstrations of the expert as a Minari dataset.
 
     Args:
-        task: Task of `cathsim list`.
         out: Directory of the dataset, which must not exist. `minari.load_dataset`
             knows it if its name ends in a version, such as lcca-v0.
         episodes: Number of episodes, each with a seed of its own.
@@ -178,11 +174,7 @@ def demos(
         noise: Standard deviation of normal noise added to every entry of the expert's
             action, so that it shows how it comes back to its way.
         seed: Seed of the first episode; the others count up.
-        max_steps: Number of control steps after which an episode is cut off; by
-            default the task's own.
         anatomy: Anatomy of one's own, for the task `navigate`.
-        threads: Number of threads of the simulation; one per core by default.
-        json: Whether to print one JSON object and nothing else.
     """
     from cathsim_dmc import agents
     from cathsim_dmc.analysis.force_statistics import millinewtons
@@ -244,7 +236,6 @@ def play(
     """Cannulate by keyboard, with the forces on the screen.
 
     Args:
-        task: Task of `cathsim list`.
         out: Directory for the episodes as demonstrations (.npz).
         seed: Seed of the first episode; the others count up.
         episodes: Number of episodes; by default until you quit.

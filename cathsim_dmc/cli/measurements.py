@@ -7,31 +7,23 @@ from typing import Annotated
 from tyro import conf
 from tyro.extras import SubcommandApp
 
-from cathsim_dmc.cli.options import show
+from cathsim_dmc.cli.options import Json, show
 
 validations = SubcommandApp()
 benchmarks = SubcommandApp()
 
 
 @validations.command
-def rod(json: bool = False) -> int:
-    """Bending, buckling and twist of the device against theory.
-
-    Args:
-        json: Whether to print one JSON object and nothing else.
-    """
+def rod(json: Json = False) -> int:
+    """Bending, buckling and twist of the device against theory."""
     from cathsim_dmc import validation
 
     return show(validation.validate_rod(), json)
 
 
 @validations.command
-def pair(json: bool = False) -> int:
-    """Devices in each other: bending, shape, buckling, sliding and torque.
-
-    Args:
-        json: Whether to print one JSON object and nothing else.
-    """
+def pair(json: Json = False) -> int:
+    """Devices in each other: bending, shape, buckling, sliding and torque."""
     from cathsim_dmc import validation
 
     return show(validation.validate_pair(), json)
@@ -41,14 +33,13 @@ def pair(json: bool = False) -> int:
 def wall(
     anatomy: Annotated[list[str], conf.arg(aliases=("--phantom",))] = [],  # noqa: B006
     convergence: bool = True,
-    json: bool = False,
+    json: Json = False,
 ) -> int:
     """Fidelity of the wall, friction against the capstan equation, convergence.
 
     Args:
         anatomy: Directories of further anatomies, such as an imported scan.
         convergence: Whether to include the studies of time step and link length.
-        json: Whether to print one JSON object and nothing else.
     """
     from cathsim_dmc import validation
 
@@ -74,7 +65,7 @@ def forces(
     mean: float = 0.4,
     sd: float = 0.02,
     margin: float = 0.1,
-    json: bool = False,
+    json: Json = False,
 ) -> int:
     """Force balance, known loads, and the published protocol.
 
@@ -84,7 +75,6 @@ def forces(
         mean: Mean of the normal reference, N; the published one is unverified.
         sd: Standard deviation of the reference, N.
         margin: Margin of the equivalence test, N.
-        json: Whether to print one JSON object and nothing else.
     """
     from cathsim_dmc import validation
 
@@ -93,12 +83,8 @@ def forces(
 
 
 @benchmarks.command
-def speed(json: bool = False) -> int:
-    """Measure calibrated speed and overhead; run it with nothing else running.
-
-    Args:
-        json: Whether to print one JSON object and nothing else.
-    """
+def speed(json: Json = False) -> int:
+    """Measure calibrated speed and overhead; run it with nothing else running."""
     from cathsim_dmc.analysis import speed as measured
 
     return show(measured.speed(lambda text: print(text, file=sys.stderr)), json)

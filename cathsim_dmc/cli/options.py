@@ -11,7 +11,23 @@ CHECK_FAILED, BAD_INPUT, INTERRUPTED = 1, 2, 130
 EVALUATION_SEED = 1_000_000  # apart from the seeds of training
 DEMONSTRATION_SEED = 2_000_000  # apart from both
 
-Task = Annotated[str, conf.Positional]
+_TASK = "Task of `cathsim list`."
+Task = Annotated[str, conf.Positional, conf.arg(help=_TASK)]
+PolicyName = Annotated[
+    str,
+    conf.Positional,
+    conf.arg(
+        help="Directory of a run or checkpoint, or name of a policy: random, push, "
+        "expert, idle, curl, random_curl, pretrained:NAME."
+    ),
+]
+Json = Annotated[bool, conf.arg(help="Whether to print one JSON object alone.")]
+_THREADS = "Number of threads of the simulation; one per core by default."
+Threads = Annotated[int | None, conf.arg(help=_THREADS)]
+_MAX_STEPS = "Number of control steps after which an episode is cut off."
+MaxSteps = Annotated[int | None, conf.arg(help=_MAX_STEPS)]
+_ACCESS = "End of the aorta to enter, ascending or descending, of a named phantom."
+Access = Annotated[str | None, conf.arg(help=_ACCESS)]
 
 
 @dataclasses.dataclass(frozen=True)

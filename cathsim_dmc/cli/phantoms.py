@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 from tyro import conf
 from tyro.extras import SubcommandApp
 
-from cathsim_dmc.cli.options import print_json, show
+from cathsim_dmc.cli.options import Access, Json, print_json, show
 
 if TYPE_CHECKING:
     from cathsim_dmc.anatomy import Anatomy
@@ -169,9 +169,9 @@ def check(
     phantom: Annotated[str, conf.Positional],
     /,
     figure: Path | None = None,
-    access: str | None = None,
+    access: Access = None,
     push: bool = True,
-    json: bool = False,
+    json: Json = False,
 ) -> int:
     """Check an anatomy and measure what it is like.
 
@@ -182,10 +182,7 @@ def check(
         phantom: Directory of an anatomy, or the name of a phantom.
         figure: PNG of three views; check.png in a directory of an anatomy if left
             out.
-        access: End of the aorta that the device enters, ascending or descending, of a
-            named phantom.
         push: Try a straight push to each goal.
-        json: Print one JSON object and nothing else.
     """
     from cathsim_dmc import validation
 
@@ -208,7 +205,7 @@ def export(
     phantom: Annotated[str, conf.Positional],
     /,
     out: Path,
-    access: str | None = None,
+    access: Access = None,
     pieces: Literal["prisms", "coacd"] = "prisms",
 ) -> int:
     """Write an anatomy as MJCF with convex wall pieces, for other engines.
@@ -216,8 +213,6 @@ def export(
     Args:
         phantom: Directory of an anatomy, or the name of a phantom.
         out: File of the model, ending in .xml.
-        access: End of the aorta that the device enters, ascending or descending, of a
-            named phantom.
         pieces: Merged prisms on the surface, or CoACD's pieces (extra `export`), which
             take minutes.
     """

@@ -48,7 +48,6 @@ def device_thickness(
     """Path length through a device, averaged over each pixel.
 
     Args:
-        carm: the view.
         points: (..., n, 3) joints of the device from its base to its tip, world
             frame, m, n >= 2.
         radius: its radius, m: one number, one per device (...,), or one per link
@@ -77,7 +76,6 @@ def device_attenuation(
     """Optical depth of a device with a marker at its tip, averaged over each pixel.
 
     Args:
-        carm, points, radius: as in `device_thickness`.
         mu: attenuation of the device, homogenised over its cross-section, 1/m.
         marker_mu: attenuation of the marker, 1/m; None for a device without one.
         marker_length: length of the marker, m, measured back from the tip.

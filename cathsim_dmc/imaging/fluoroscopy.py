@@ -157,7 +157,6 @@ class Fluoroscope:
         Args:
             shadows: of one device, or of several in each other, with the same leading
                 axes.
-            random_state: as in `render`.
 
         Returns:
             (..., rows, columns, 1) uint8, as `render`.

@@ -58,7 +58,6 @@ def add_disc(
         image: (rows, columns), added to in place; what falls beside it is left out.
         row, column: centre of the disc, px.
         radius: of the disc, px, > 0.
-        weight: of the whole disc.
         scratch: (3, columns of the disc or more), overwritten.
     """
     rows, columns = image.shape
@@ -140,7 +139,6 @@ def curve(joints: np.ndarray, pieces: int) -> np.ndarray:
 
     Args:
         joints: (n, 3), finite and apart.
-        pieces: of each link.
 
     Returns:
         ((n - 1) * pieces + 1, 3).

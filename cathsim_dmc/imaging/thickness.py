@@ -30,7 +30,6 @@ def surface_thickness(
     Parts of a self-overlapping surface count as often as they are enclosed.
 
     Args:
-        carm: the view.
         vertices: (V, 3) world frame, m.
         faces: (F, 3) indices, counter-clockwise seen from outside, without open ends.
         supersample: rays along each side of a pixel, evenly spaced; 1 gives the

@@ -47,7 +47,6 @@ def animate(
     the X-ray image over the force on the wall.
 
     Args:
-        episode: What happens.
         surface: Lumen surface with `vertices` and `faces`.
         path: File to write, `.gif`, `.webp` or, with the extra `mp4`, `.mp4`.
         view: Direction of view, of `figure.VIEWS`.

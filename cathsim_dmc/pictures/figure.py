@@ -117,8 +117,6 @@ def scene_figure(
     """Draw a moment of an episode, without OpenGL.
 
     Args:
-        moment: What to draw.
-        views: Directions of view, of `VIEWS`.
         fluoroscopy: Whether to put the X-ray image beside them.
         pixels: Number of rows of the drawn vessel.
 

@@ -82,8 +82,6 @@ class Moment:
         """A state of a recorded episode.
 
         Args:
-            episode: The record.
-            surface: Lumen surface that it was recorded in.
             step: Number of the state, 0 at the start; negative ones count from the
                 end.
 
@@ -119,8 +117,6 @@ def _coaxial(episode: Episode, state: int, radius: np.ndarray) -> dict[str, np.n
     """Radii (L,) of the links in a state, and outermost and ends of coaxial devices.
 
     Args:
-        episode: The record.
-        state: Number of the state.
         radius: (L,), of a device alone.
     """
     coaxial = CoaxialRecord.of(episode)

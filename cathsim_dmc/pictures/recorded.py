@@ -114,7 +114,6 @@ def write(
     """Write an episode in the format that the file's name asks for.
 
     Args:
-        episode: An episode of this environment.
         env: The environment, for the anatomy and the shapes of the robot.
         path: File to write, see `record`.
         fluoroscopy: Whether a Rerun file has X-ray images.
@@ -156,7 +155,6 @@ def xray_film(
     """X-ray images of all states of an episode, with the contrast of a screen.
 
     Args:
-        episode: What is seen.
         surface: Lumen surface with `vertices` and `faces`.
         options: Set-up of the angiography machine.
 

@@ -119,7 +119,6 @@ def glass(
     Args:
         vertices: (V, 3), metres, world frame.
         faces: (F, 3), counter-clockwise seen from outside.
-        projection: The view.
         colour: RGB in [0, 1].
     """
     fine = replace(projection, pixels=projection.pixels * _SAMPLES)

@@ -32,7 +32,6 @@ def write_mp4(
     """Write pictures of one size as H.264, which every slide program plays.
 
     Args:
-        path: File to write.
         pictures: RGB pictures, at least one.
         tick: Time that each is shown, ms.
         hold: Time that the last one is shown, ms.

@@ -91,11 +91,7 @@ class CoaxialControls(_Keys):
     _meaning = _COAXIAL
 
     def __init__(self, devices: int):
-        """Starts with nothing held.
-
-        Args:
-            devices: number of coaxial devices.
-        """
+        """Starts with nothing held."""
         super().__init__()
         self._devices = devices
 

@@ -126,12 +126,10 @@ def play(
     """Plays a task by keyboard and records demonstrations.
 
     Args:
-        task: of `suite.SUITE`.
         out: directory for the episodes (npz), made if it is not there; None for none.
         seed: of the first episode; the others count up.
         episodes: to play, None until the operator quits.
         speed: of the simulation against the clock.
-        task_kwargs: options of the task.
         policy: that plays while the operator watches; None for the operator.
 
     Returns:

@@ -1,12 +1,12 @@
 """Fluoroscopy in a plain window, without OpenGL."""
 
+import dataclasses
 import time
 from typing import Any
 
 import numpy as np
 
 from cathsim_dmc.imaging import angiograph
-from cathsim_dmc.imaging.options import FluoroscopyOptions
 from cathsim_dmc.play import readout
 from cathsim_dmc.play.controls import CoaxialControls, Controls
 
@@ -175,12 +175,9 @@ def _machine(task) -> angiograph.Planes:
     options = task.config.fluoroscopy
     rows, columns = options.resolution
     factor = max(1, round(SIZE / max(rows, columns)))
-    fields = {name: getattr(options, name) for name in options.__dataclass_fields__}
-    fields["size"] = (rows * factor, columns * factor)
+    options = dataclasses.replace(options, size=(rows * factor, columns * factor))
     surface = task.scene.anatomy.surface
-    machine = angiograph.Angiograph(
-        surface.vertices, surface.faces, FluoroscopyOptions(**fields)
-    )
+    machine = angiograph.Angiograph(surface.vertices, surface.faces, options)
     return machine.planes()
 
 

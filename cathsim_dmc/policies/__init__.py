@@ -23,7 +23,6 @@ def make_policy(name: str, seed: int = 0) -> Policy:
     """The policy of a name.
 
     Args:
-        name: Name in `POLICIES`.
         seed: Seed of the policy's own randomness, for the first simulation; those of
             the others count up.
 

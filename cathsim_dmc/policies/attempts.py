@@ -102,7 +102,6 @@ def advance(
 
     Args:
         settings: when to give up.
-        state: after the last step.
         place: of the head now.
         insertion: (...), of the head's device, m.
     """

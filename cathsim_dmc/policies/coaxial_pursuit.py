@@ -130,11 +130,9 @@ def decide(
     """One control step of the expert: a pure function.
 
     Args:
-        plan: of the task.
         settings: how to drive.
         state: after the last step, arrays (N,).
         readings: of the chain, arrays (N, ...).
-        devices: likewise of the devices.
         wall_force: arrays (N,); its `max` slows the devices down.
 
     Returns:

@@ -52,7 +52,6 @@ class Expert:
         """The expert for a task, or for one of the anatomies that episodes draw from.
 
         Args:
-            task: Task or anatomy.
             settings: Settings of its driving; those of coaxial devices are
                 `coaxial_pursuit.CoaxialSettings`.
 
@@ -138,7 +137,6 @@ class ExpertPolicy(Policy):
 
         Args:
             seed: Not used: the expert draws no random numbers.
-            settings: Settings of its driving.
         """
         self._settings = settings
         self._view: View | None = None

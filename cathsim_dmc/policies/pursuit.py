@@ -177,7 +177,6 @@ def tip_frames(plan: Plan, joints: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Hinge axes of the tip and direction of the head, world frame.
 
     Args:
-        plan: of the task.
         joints: (..., J), `Readings.joint_positions`.
 
     Returns:
@@ -202,7 +201,6 @@ def decide(
     """One control step of the expert: a pure function.
 
     Args:
-        plan: of the task.
         settings: how to drive.
         state: after the last step, arrays (...).
         readings: of the devices, arrays (...).

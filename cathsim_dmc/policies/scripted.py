@@ -10,8 +10,8 @@ from cathsim_dmc.policies.policy import Policy
 from cathsim_dmc.policies.view import View
 
 
-class _Drawn(Policy):
-    """Draws simulation i's actions from seed + i, on from episode to episode."""
+class _Scripted(Policy):
+    """Repeats an action; what simulation i draws is from a generator of seed + i."""
 
     def __init__(self, seed: int = 0):
         self._seed = seed
@@ -19,15 +19,19 @@ class _Drawn(Policy):
         self._action = np.zeros((0, 0))
 
     def reset(self, view: View, which: np.ndarray) -> None:
-        """Make the generators with the first episodes."""
-        count = view.num_simulations
-        if len(self._generators) != count:
-            seeds = range(self._seed, self._seed + count)
+        """Make the generators, and the actions (N, A), with the first episodes."""
+        shape = view.num_simulations, view.num_actions
+        if self._action.shape != shape:
+            seeds = range(self._seed, self._seed + shape[0])
             self._generators = [np.random.default_rng(seed) for seed in seeds]
-            self._action = np.zeros((count, view.num_actions))
+            self._action = np.zeros(shape)
+
+    def act(self, observation: Any) -> np.ndarray:
+        """Actions (N, A), whatever is observed."""
+        return self._action
 
 
-class Random(_Drawn):
+class Random(_Scripted):
     """Uniform actions in [-1, 1], from a generator for each simulation."""
 
     name = "random"
@@ -38,7 +42,7 @@ class Random(_Drawn):
         return np.stack([g.uniform(-1, 1, size) for g in self._generators])
 
 
-class RandomCurl(_Drawn):
+class RandomCurl(_Scripted):
     """Full push, the tip bent all the way in one direction drawn for each episode.
 
     Every x hinge of the tip gets the same command and every y hinge the same: a point
@@ -60,52 +64,30 @@ class RandomCurl(_Drawn):
             self._action[index, 1:motors:2] = size * np.sin(angle)
             self._action[index, catheter.translations] = 1.0
 
-    def act(self, observation: Any) -> np.ndarray:
-        """Actions (N, A), whatever is observed."""
-        return self._action
 
-
-class _Constant(Policy):
-    """The same action in every step."""
-
-    def __init__(self, seed: int = 0):
-        """Starts; `seed` is not used."""
-        self._action = np.zeros((0, 0))
-
-    def reset(self, view: View, which: np.ndarray) -> None:
-        """Look up what the entries of an action are."""
-        self._action = np.zeros((view.num_simulations, view.num_actions))
-        self._fill(self._action, view)
-
-    def _fill(self, action: np.ndarray, view: View) -> None:
-        """Write the action (N, A), which is zero."""
-
-    def act(self, observation: Any) -> np.ndarray:
-        """Actions (N, A), whatever is observed."""
-        return self._action
-
-
-class Idle(_Constant):
+class Idle(_Scripted):
     """No push, tip motors at rest."""
 
     name = "idle"
 
 
-class Push(_Constant):
+class Push(_Scripted):
     """Full push, tip motors at rest."""
 
     name = "push"
 
-    def _fill(self, action: np.ndarray, view: View) -> None:
-        action[:, view.task.scene.catheter.translations] = 1.0
+    def reset(self, view: View, which: np.ndarray) -> None:
+        """Look up which entries of an action push."""
+        super().reset(view, which)
+        self._action[:, view.task.scene.catheter.translations] = 1.0
 
 
-class Curl(_Constant):
+class Curl(Push):
     """Full push, the tip bent as far as it goes: the device jams."""
 
     name = "curl"
 
-    def _fill(self, action: np.ndarray, view: View) -> None:
-        catheter = view.task.scene.catheter
-        action[:, 0 : len(catheter.tip_motors) : 2] = 1.0
-        action[:, catheter.translations] = 1.0
+    def reset(self, view: View, which: np.ndarray) -> None:
+        """Look up which entries of an action bend the tip about x."""
+        super().reset(view, which)
+        self._action[:, 0 : len(view.task.scene.catheter.tip_motors) : 2] = 1.0

@@ -26,7 +26,6 @@ class Teacher:
         """Looks at simulations; `reset` comes before the first question.
 
         Args:
-            view: The simulations.
             settings: Settings of the expert's driving.
         """
         self._view = view

@@ -40,7 +40,6 @@ def episode_blueprint(
     Args:
         centre: (3,) point the eye looks at, world frame (LPS), metres.
         extent: Largest side of the scene in metres.
-        planes: Number of X-ray planes that the recording has.
         distance: Whether the recording has ``series/distance_mm``.
         head: (3,) where the head is at first, metres.
         robot: (3,) where the robot is, or None if the recording has none.

@@ -110,7 +110,6 @@ def device_meta(task: Any, rows: dict[str, np.ndarray]) -> list[dict[str, Any]]:
     """What ``meta['devices']`` holds.
 
     Args:
-        task: Task with coaxial devices.
         rows: ``SERIES`` by name, (T+1, K).
     """
     chain = task.scene.catheter

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -18,15 +19,10 @@ from cathsim_dmc.recording.rerun_log import write_recording
 from cathsim_dmc.recording.rerun_scene import log_static
 from cathsim_dmc.recording.rerun_stream import Log
 
-# Told apart with the common colour deficiencies (Okabe and Ito).
 COLOURS = (
-    (86, 180, 233),
-    (230, 159, 0),
-    (0, 158, 115),
-    (204, 121, 167),
-    (240, 228, 66),
-    (213, 94, 0),
-)
+    (86, 180, 233), (230, 159, 0), (0, 158, 115),
+    (204, 121, 167), (240, 228, 66), (213, 94, 0),
+)  # fmt: skip
 
 
 def write_comparison(
@@ -81,15 +77,14 @@ def _check(episodes: Mapping[str, Episode]) -> None:
         raise ValueError(
             f"{len(episodes)} episodes are to be compared; give 2 to {len(COLOURS)}"
         )
-    for name in episodes:
-        if not name.replace("_", "").replace("-", "").isalnum():
-            raise ValueError(
-                f"an episode is called {name!r}; use letters, digits, - and _ only"
-            )
-        if name in ("vessel", "goal", "contacts", "heat"):
-            raise ValueError(f"the name {name!r} is taken; choose another")
-    goals = {tuple(e.meta.get("goal_position") or ()) for e in episodes.values()}
-    if len(goals) > 1:
+    taken = ("vessel", "goal", "contacts", "heat")
+    bad = [n for n in episodes if n in taken or not re.fullmatch(r"[\w-]+", n)]
+    if bad:
+        raise ValueError(
+            f"episodes are called {bad}; use letters, digits, - and _ only, and not "
+            f"{', '.join(taken)}"
+        )
+    if len({tuple(e.meta.get("goal_position") or ()) for e in episodes.values()}) > 1:
         raise ValueError(
             "the episodes have different goals; compare those of one task and anatomy"
         )

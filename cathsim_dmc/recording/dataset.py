@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import json
 import os
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -93,10 +94,7 @@ def write(
         buffers: `minari.data_collector.EpisodeBuffer` of each episode.
         env_spec: Spec of the Gymnasium environment, see
             `simulation.gymnasium.env_spec`.
-        observation_space: Its space of observations.
-        action_space: Its space of actions.
         algorithm: What acted, for the metadata.
-        description: For the metadata.
 
     Returns:
         The directory.
@@ -136,6 +134,58 @@ def write(
         )
         storage.update_episodes(buffers)
     return path
+
+
+class DatasetError(ValueError):
+    """A dataset is missing, damaged or of another kind."""
+
+
+def read_episodes(path: str | os.PathLike[str]) -> Iterator[Any]:
+    """Episodes of a dataset, one after the other, as `minari.EpisodeData`.
+
+    Args:
+        path: Directory of the dataset, or the directory `data` in it.
+
+    Raises:
+        DatasetError: there is none, or it is damaged.
+        ModuleNotFoundError: minari is not installed.
+    """
+    try:
+        import minari
+    except ModuleNotFoundError as error:
+        raise ModuleNotFoundError(_NO_MINARI) from error
+    data = next(Path(path).glob("data"), Path(path)) / "metadata.json"
+    if not data.is_file():
+        raise DatasetError(
+            f"no dataset in {path}: give a directory that `cathsim demos` has written"
+        )
+    try:
+        # Without its spaces Minari would make the environment that the file names.
+        if not {"observation_space", "action_space"} <= set(
+            json.loads(data.read_text())
+        ):
+            raise ValueError("metadata.json lacks the spaces")
+        for number, episode in enumerate(minari.MinariDataset(data.parent)):
+            _check_episode(episode, number)
+            yield episode
+    # What a damaged file leads to.
+    except (AssertionError, AttributeError, LookupError, OSError, RuntimeError,
+            TypeError, ValueError) as error:  # fmt: skip
+        line = " ".join(str(error).split()) or type(error).__name__
+        raise DatasetError(f"{data.parent} cannot be read: {line}") from error
+
+
+def _check_episode(episode: Any, number: int) -> None:
+    """Raises ValueError unless all columns are as long as they must be, and finite."""
+    steps = len(episode.actions)
+    columns = {
+        name: (episode.observations[name], steps + 1) for name in episode.observations
+    }
+    for name in ("actions", "rewards", "terminations", "truncations"):
+        columns[name] = getattr(episode, name), steps
+    for name, (values, length) in columns.items():
+        if not steps or len(values) != length or not np.isfinite(values).all():
+            raise ValueError(f"episode {number}: {name} are not {length} finite rows")
 
 
 def check_free(path: Path) -> None:

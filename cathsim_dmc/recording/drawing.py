@@ -48,20 +48,25 @@ class Drawing:
         robot_geoms: Iterable[BodyGeom] = (),
         fluoroscopy: np.ndarray | None = None,
     ) -> Drawing:
-        """Check the arguments of ``write_rrd``; radii and goal come from ``meta``.
-
-        Raises:
-            ValueError: on anything that does not fit the episode.
-        """
+        """Check the arguments of ``write_rrd``; ValueError on what does not fit."""
+        geoms, bodies = tuple(robot_geoms), episode.body_pos.shape[1]
+        for geom in geoms:
+            if not 0 <= geom.body < bodies:
+                raise ValueError(
+                    f"geom of {geom.body_name!r} names body {geom.body}, the episode "
+                    f"has {bodies}; take the geoms from the model that was recorded"
+                )
+        if fluoroscopy is not None:
+            shape = np.shape(fluoroscopy)
+            fits = len(shape) == 4 and shape[0] == episode.steps + 1
+            if not fits or shape[-1] not in (1, 2) or fluoroscopy.dtype != np.uint8:
+                raise ValueError(
+                    f"fluoroscopy must be uint8 of shape ({episode.steps + 1}, H, W, "
+                    f"1), or 2 for two planes; got {fluoroscopy.dtype} of {shape}"
+                )
         vertices, faces = surface_arrays(surface)
-        return cls(
-            vertices,
-            faces,
-            _checked_geoms(episode, robot_geoms),
-            link_radii(episode),
-            _goal(episode),
-            _checked_frames(episode, fluoroscopy),
-        )
+        goal, radii = _goal(episode), link_radii(episode)
+        return cls(vertices, faces, geoms, radii, goal, fluoroscopy)
 
 
 def action_layout(episode: Episode) -> tuple[list[str], np.ndarray]:
@@ -101,18 +106,6 @@ def goal_distance(episode: Episode) -> np.ndarray | None:
     return distance
 
 
-def _checked_geoms(episode: Episode, geoms: Iterable[BodyGeom]) -> tuple[BodyGeom, ...]:
-    geoms = tuple(geoms)
-    bodies = episode.body_pos.shape[1]
-    for geom in geoms:
-        if not 0 <= geom.body < bodies:
-            raise ValueError(
-                f"geom of {geom.body_name!r} names body {geom.body}, the episode has "
-                f"{bodies}; take the geoms from the model that was recorded"
-            )
-    return geoms
-
-
 def link_radii(episode: Episode) -> np.ndarray:
     """Radii (L,) of the links in metres, from ``meta['catheter_radius']`` if there.
 
@@ -141,19 +134,3 @@ def _goal(episode: Episode) -> tuple[np.ndarray, float] | None:
             f"{position} and {radius}"
         )
     return place, float(radius)
-
-
-def _checked_frames(episode: Episode, frames: np.ndarray | None) -> np.ndarray | None:
-    if frames is None:
-        return None
-    frames = np.asarray(frames)
-    states = episode.steps + 1
-    wrong = frames.ndim != 4 or frames.shape[0] != states
-    if wrong or frames.shape[-1] not in (1, 2):
-        raise ValueError(
-            f"fluoroscopy must have shape ({states}, H, W, 1), or 2 for two planes; "
-            f"got {frames.shape}"
-        )
-    if frames.dtype != np.uint8:
-        raise ValueError(f"fluoroscopy must be uint8, got {frames.dtype}")
-    return frames

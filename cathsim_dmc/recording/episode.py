@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from cathsim_dmc import bounds
 from cathsim_dmc.files import atomic_path, read_arrays
 
 FORMAT = "cathsim-episode"
@@ -44,7 +45,6 @@ _AXES: dict[str, tuple[str, tuple[int | str, ...]]] = {
     "contact_position": ("contact", (3,)),
     "contact_force": ("contact", (3,)),
 }
-_NON_NEGATIVE = ("wall_force_sum", "wall_force_max")
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,13 +103,14 @@ class Episode:
         if not isinstance(self.task, str) or not self.task:
             raise ValueError(f"task must be a non-empty string, got {self.task!r}")
         if self.seed is not None:
-            if not _is_whole(self.seed):
-                raise ValueError(f"seed must be an integer or None, got {self.seed!r}")
-            object.__setattr__(self, "seed", int(self.seed))
+            object.__setattr__(self, "seed", bounds.whole("seed", self.seed))
         object.__setattr__(self, "meta", _checked_meta(self.meta))
         for name in _AXES:
-            dtype = np.int64 if name == "contact_step" else np.float64
-            object.__setattr__(self, name, _frozen(name, getattr(self, name), dtype))
+            steps = name == "contact_step"
+            given = bounds.array(name, getattr(self, name), "iu" if steps else "biuf")
+            array = np.array(given, dtype=np.int64 if steps else np.float64)
+            array.setflags(write=False)
+            object.__setattr__(self, name, array)
         self._check_shapes()
         self._check_values()
 
@@ -118,32 +119,21 @@ class Episode:
             raise ValueError(
                 f"time must have shape (T+1,) with T >= 0, got {self.time.shape}"
             )
-        rows = {
-            "state": self.time.size,
-            "step": self.time.size - 1,
-            "contact": np.atleast_1d(self.contact_step).shape[0],
-        }
-        sizes: dict[str, int] = {}
+        contacts = np.atleast_1d(self.contact_step).shape[0]
+        sizes: dict[int | str, int] = {
+            "state": self.time.size, "step": self.time.size - 1, "contact": contacts,
+        }  # fmt: skip
         for name, (axis, tail) in _AXES.items():
             shape = getattr(self, name).shape
-            wanted = (
-                rows[axis],
-                *(sizes.get(n, n) if isinstance(n, str) else n for n in tail),
-            )
-            fits = len(shape) == len(wanted) and all(
-                isinstance(want, str) or have == want
-                for have, want in zip(shape, wanted, strict=True)
-            )
-            if not fits:
-                spelled = ", ".join(str(w) for w in wanted)
+            for size, have in zip(tail, shape[1:], strict=False):
+                if isinstance(size, str):
+                    sizes.setdefault(size, have)
+            wanted = tuple(sizes.get(size, size) for size in (axis, *tail))
+            if shape != wanted:
                 raise ValueError(
-                    f"{name} must have shape ({spelled}) because time has "
-                    f"{rows['state']} entries and contact_step {rows['contact']}; "
-                    f"got {shape}"
+                    f"{name} must have shape {wanted} because time has "
+                    f"{self.time.size} entries and contact_step {contacts}; got {shape}"
                 )
-            for have, want in zip(shape[1:], tail, strict=True):
-                if isinstance(want, str):
-                    sizes[want] = have
         if sizes["L+1"] < 2:
             raise ValueError(
                 "catheter needs at least one joint and the head, so shape "
@@ -151,17 +141,12 @@ class Episode:
             )
 
     def _check_values(self) -> None:
-        for name in _AXES:
-            array = getattr(self, name)
-            if not np.isfinite(array).all():
-                row = int(np.argwhere(~np.isfinite(array))[0, 0])
-                raise ValueError(
-                    f"{name} is not finite in row {row}; leave a diverged step out of "
-                    "the record and set meta['termination'] to 'physics_error'"
-                )
-        for name in _NON_NEGATIVE:
-            if (getattr(self, name) < 0).any():
-                raise ValueError(f"{name} is a magnitude and must not be negative")
+
+        if (
+            min(self.wall_force_sum.min(initial=0), self.wall_force_max.min(initial=0))
+            < 0
+        ):
+            raise ValueError("a wall force is a magnitude and must not be negative")
         if (np.diff(self.time) <= 0).any():
             row = int(np.argmax(np.diff(self.time) <= 0)) + 1
             raise ValueError(f"time must increase strictly; it does not at row {row}")
@@ -273,26 +258,6 @@ class Episode:
         )
 
 
-def _frozen(name: str, value: Any, dtype: type) -> np.ndarray:
-    try:
-        given = np.asarray(value)
-    except ValueError as error:
-        raise ValueError(f"{name} must be an array, not ragged lists") from error
-    if given.dtype.kind not in "biuf":
-        raise ValueError(f"{name} must be numeric, got dtype {given.dtype}")
-    if dtype is np.int64 and given.dtype.kind == "f" and given.size:
-        raise ValueError(f"{name} must hold integers, got dtype {given.dtype}")
-    array = np.array(given, dtype=dtype)
-    array.setflags(write=False)
-    return array
-
-
-def _is_whole(value: Any) -> bool:
-    if isinstance(value, bool) or not isinstance(value, int | float | np.number):
-        return False
-    return bool(np.isfinite(value)) and int(value) == value
-
-
 def _plain(value: Any) -> Any:
     """Numpy values as JSON values; TypeError for all others."""
     if isinstance(value, np.generic | np.ndarray):
@@ -301,26 +266,18 @@ def _plain(value: Any) -> Any:
 
 
 def _checked_meta(meta: Any) -> dict[str, Any]:
-    if not isinstance(meta, dict):
-        raise ValueError(f"meta must be a dict, got {type(meta).__name__}")
     try:
         plain = json.loads(json.dumps(meta, default=_plain, allow_nan=False))
-    except (TypeError, ValueError) as error:
+        success, termination = plain["success"], plain["termination"]
+    except (KeyError, TypeError, ValueError) as error:
         raise ValueError(
-            f"meta must be plain JSON (finite numbers, text, lists, dicts): {error}"
+            "meta must be a dict of plain JSON (finite numbers, text, lists, dicts) "
+            f"with success and termination: {error!r}"
         ) from error
-    if not isinstance(plain.get("success"), bool):
+    if termination not in TERMINATIONS or success is not (termination == "success"):
         raise ValueError(
-            f"meta['success'] must be true or false, got {plain.get('success')!r}"
-        )
-    if plain.get("termination") not in TERMINATIONS:
-        raise ValueError(
-            f"meta['termination'] must be one of {', '.join(TERMINATIONS)}; got "
-            f"{plain.get('termination')!r}"
-        )
-    if plain["success"] != (plain["termination"] == "success"):
-        raise ValueError(
-            f"meta['success'] is {plain['success']} but meta['termination'] is "
-            f"{plain['termination']!r}"
+            f"meta['termination'] is {termination!r} and must be one of "
+            f"{', '.join(TERMINATIONS)}; meta['success'] is {success!r}, true for "
+            "'success' but false for the others"
         )
     return plain

@@ -49,18 +49,15 @@ def read_termination(task: Any, timestep: Any) -> str | None:
     return "truncated" if timestep.discount else "physics_error"
 
 
-class _EpisodeRows:
+class _EpisodeRows(dict[str, list]):
     """Growing lists, one per array of an episode."""
-
-    def __init__(self) -> None:
-        self.columns: dict[str, list] = {}
 
     def add(self, **values: Any) -> None:
         for name, value in values.items():
-            self.columns.setdefault(name, []).append(value)
+            self.setdefault(name, []).append(value)
 
-    def get(self, name: str, row_shape: tuple[int, ...] = ()) -> np.ndarray:
-        values = self.columns.get(name)
+    def array(self, name: str, row_shape: tuple[int, ...] = ()) -> np.ndarray:
+        values = self.get(name)
         return np.array(values) if values else np.zeros((0, *row_shape))
 
 
@@ -73,13 +70,10 @@ class EpisodeRecorder:
     and ``time`` belong to its end.
 
     Args:
-        env: What ``cathsim_dmc.suite.load`` returns.
+        env: What ``cathsim_dmc.suite.load`` returns; TypeError for any other.
         task_name: Registered name to write into episodes; the class name of the task
             otherwise.
         task_kwargs: Keyword arguments the environment was made with, for ``meta``.
-
-    Raises:
-        TypeError: if it is no environment of this package.
     """
 
     def __init__(
@@ -132,7 +126,13 @@ class EpisodeRecorder:
                     break
                 rows.add(**self._state())
                 rows.add(action=action, reward=float(timestep.reward))
-                rows.add(**self._forces(steps))
+                forces, contacts = self._forces()
+                rows.add(**forces)
+                for name, values in contacts.items():
+                    rows.setdefault(name, []).extend(values)
+                rows.setdefault("contact_step", []).extend(
+                    [steps] * len(contacts["contact_force"])
+                )
                 steps += 1
         except control.PhysicsError as caught:
             error, termination = str(caught), "physics_error"
@@ -165,15 +165,12 @@ class EpisodeRecorder:
             "base_insertion": float(task.readings.insertion),
         }
 
-    def _forces(self, step: int) -> dict[str, Any]:
-        """Forces and reward terms of the control step that has just ended."""
+    def _forces(self) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+        """Forces and reward terms of the step that has just ended, and contacts."""
         task, wall = self._env.task, self._env.task.wall_force
         contacts = task.contacts(self._env.physics)
         prefix = "reward_"
-        return {
-            "contact_step": np.full(contacts.present.sum(), step),
-            "contact_position": np.array(contacts.position[contacts.present]),
-            "contact_force": np.array(contacts.force[contacts.present]),
+        forces = {
             "wall_force_sum": float(wall.sum),
             "wall_force_max": float(wall.max),
             "wall_force_peak_sum": float(wall.peak_sum),
@@ -184,6 +181,10 @@ class EpisodeRecorder:
                 for name, value in task.info().items()
                 if name.startswith(prefix)
             },
+        }
+        return forces, {
+            "contact_position": contacts.position[contacts.present],
+            "contact_force": contacts.force[contacts.present],
         }
 
     def _action(self, policy: Policy, timestep: Any) -> np.ndarray:
@@ -218,40 +219,30 @@ class EpisodeRecorder:
             "body_names": [model.id2name(i, "body") for i in range(model.nbody)],
             "catheter_radius": [float(task.scene.device.outer_radius)]
             * len(task.scene.catheter.links),
-            "wall_force_peak_sum": rows.get("wall_force_peak_sum").tolist(),
-            "wall_force_peak_max": rows.get("wall_force_peak_max").tolist(),
-            "reward_terms": _columns(rows.columns.get("reward_terms", [])),
+            "wall_force_peak_sum": rows.array("wall_force_peak_sum").tolist(),
+            "wall_force_peak_max": rows.array("wall_force_peak_max").tolist(),
+            "reward_terms": _columns(rows.get("reward_terms", [])),
         }
-        if SERIES[0] in rows.columns:
-            series = {name: rows.get(name) for name in SERIES}
+        if SERIES[0] in rows:
+            series = {name: rows.array(name) for name in SERIES}
             meta["devices"] = device_meta(task, series)
         position = np.array(task.goal_position)
-        head = rows.get("catheter")[:, -1]
+        head = rows.array("catheter")[:, -1]
         meta["goal_position"] = position.tolist()
         meta["goal_radius"] = float(task.objective.goal_radius)
         meta["distance"] = np.linalg.norm(head - position, axis=-1).tolist()
         return meta
 
     def _episode(self, rows: _EpisodeRows, seed: int | None, meta: dict) -> Episode:
-        state = ("time", "qpos", "catheter", "body_pos", "body_quat")
-        step = ("reward", "wall_force_sum", "wall_force_max", "push_force")
-        ragged = {"contact_position": (3,), "contact_force": (3,)}
+        shapes = {"action": self._env.action_spec().shape}
+        shapes |= dict.fromkeys(("contact_position", "contact_force"), (3,))
+        names = set(Episode.__annotations__) - {"task", "seed", "meta", "insertion"}
         return Episode(
             task=self._task_name,
             seed=seed,
             meta=meta,
-            insertion=rows.get("base_insertion"),
-            action=rows.get("action", self._env.action_spec().shape),
-            contact_step=np.concatenate(
-                [np.zeros(0, np.int64), *rows.columns.get("contact_step", [])]
-            ),
-            **{name: rows.get(name) for name in (*state, *step)},
-            **{
-                name: np.concatenate(
-                    [np.zeros((0, *shape)), *rows.columns.get(name, [])]
-                )
-                for name, shape in ragged.items()
-            },
+            insertion=rows.array("base_insertion"),
+            **{name: rows.array(name, shapes.get(name, ())) for name in names},
         )
 
 

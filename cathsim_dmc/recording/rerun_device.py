@@ -43,11 +43,9 @@ def log_catheter(
     """Log the device as capsules coloured by what they press, its head and its path.
 
     Args:
-        log: Where to.
         radii: (L,) radii of the links, metres.
         colour: Colour of links that press nothing; where it is the default, coaxial
             devices have their own.
-        entity: Path of the device.
     """
     joints = log.episode.catheter
     states, links = joints.shape[0], joints.shape[1] - 1
@@ -110,7 +108,6 @@ def link_colours(episode: Episode, colours: np.ndarray) -> np.ndarray:
     """Colours (T+1, L, 3) uint8 of the links: that of the largest force, or their own.
 
     Args:
-        episode: What was recorded.
         colours: (T+1, L, 3) uint8, of links that press nothing.
     """
     states, links = episode.catheter.shape[0], episode.catheter.shape[1] - 1

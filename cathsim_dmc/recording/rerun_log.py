@@ -41,7 +41,6 @@ def write_rrd(
     *,
     robot_geoms: Iterable[BodyGeom] = (),
     fluoroscopy: np.ndarray | None = None,
-    lossless: bool = False,
 ) -> Path:
     """Write one episode as a Rerun recording, whole or not at all.
 
@@ -51,7 +50,6 @@ def write_rrd(
         path: Target, ``*.rrd``; an existing file is replaced.
         robot_geoms: Primitives that the body poses of the episode move.
         fluoroscopy: (T+1, H, W, P) uint8 frames, one per state, of one plane or two.
-        lossless: Store the frames as PNG instead of JPEG.
 
     Returns:
         The path.
@@ -68,7 +66,7 @@ def write_rrd(
         log = Log(stream, episode)
         log_static(log, drawing)
         if drawing.frames is not None:
-            log_frames(log, drawing.frames, lossless)
+            log_frames(log, drawing.frames)
         log_catheter(log, drawing.radii)
         log_bodies(log, drawing.geoms)
         log_contacts(log)
@@ -90,7 +88,6 @@ def write_recording(
     Args:
         path: Target, ``*.rrd``.
         layout: How the viewer opens it.
-        title: Name of the recording.
         fill: Function that logs everything into the stream.
 
     Raises:

@@ -22,46 +22,32 @@ def log_series(log: Log) -> None:
     """Log reward with its terms, forces, distance, insertion and actions."""
     episode = log.episode
     every, measured, commanded = slice(None), slice(1, None), slice(0, episode.steps)
-    log.series(
-        "series/reward", episode.reward, measured, "reward", colors=[90, 160, 90]
-    )
+    distance = goal_distance(episode)
+    away = None if distance is None else 1e3 * distance
+    lines = [
+        ("reward", episode.reward, measured, "reward", [90, 160, 90]),
+        ("distance_mm", away, every, "distance to goal, mm", [60, 190, 90]),
+        ("force/wall_sum", 1e3 * episode.wall_force_sum, measured, "wall, sum",
+         [230, 110, 40]),
+        ("force/wall_max", 1e3 * episode.wall_force_max, measured,
+         "wall, largest contact", [180, 20, 50]),
+        ("force/push", 1e3 * episode.push_force, measured, "push", [80, 120, 210]),
+        ("insertion_mm", 1e3 * episode.insertion, every, "insertion, mm",
+         [150, 90, 200]),
+    ]  # fmt: skip
+    for entity, values, rows, label, colour in lines:
+        if values is not None:
+            log.series(f"series/{entity}", values, rows, label, colors=colour)
     for name, values in episode.meta.get("reward_terms", {}).items():
         log.series(f"series/reward/{name}", np.array(values), measured, name)
-    distance = goal_distance(episode)
-    if distance is not None:
-        log.series(
-            "series/distance_mm",
-            1e3 * distance,
-            every,
-            "distance to goal, mm",
-            colors=[60, 190, 90],
-        )
-    forces = {
-        "wall_sum": (episode.wall_force_sum, "wall, sum", [230, 110, 40]),
-        "wall_max": (episode.wall_force_max, "wall, largest contact", [180, 20, 50]),
-        "push": (episode.push_force, "push", [80, 120, 210]),
-    }
-    for name, (values, label, colour) in forces.items():
-        log.series(f"series/force/{name}", 1e3 * values, measured, label, colors=colour)
-    log.series(
-        "series/insertion_mm",
-        1e3 * episode.insertion,
-        every,
-        "insertion, mm",
-        colors=[150, 90, 200],
-    )
     _log_devices(log)
     names, tip = action_layout(episode)
-    for index in np.flatnonzero(~tip):
-        log.series(
-            f"series/action/{names[index]}",
-            episode.action[:, index],
-            commanded,
-            names[index],
-        )
+    shown = {names[i]: episode.action[:, i] for i in np.flatnonzero(~tip)}
     if tip.any():
-        bend = np.sqrt(np.mean(episode.action[:, tip] ** 2, axis=1))
-        log.series("series/action/tip_bend", bend, commanded, "tip bend, rms")
+        shown["tip_bend"] = np.sqrt(np.mean(episode.action[:, tip] ** 2, axis=1))
+    for name, values in shown.items():
+        label = "tip bend, rms" if name == "tip_bend" else name
+        log.series(f"series/action/{name}", values, commanded, label)
     log.series("series/action_all", episode.action, commanded, names)
 
 
@@ -86,23 +72,18 @@ def _log_devices(log: Log) -> None:
             )
 
 
-def log_frames(log: Log, frames: np.ndarray, lossless: bool) -> None:
-    """Log X-ray images (T+1, H, W, P), one entity for each of P planes."""
-    for plane, entity in enumerate(FLUOROSCOPY[: frames.shape[-1]]):
-        _log_plane(log, entity, frames[..., plane], lossless)
-
-
-def _log_plane(log: Log, entity: str, frames: np.ndarray, lossless: bool) -> None:
+def log_frames(log: Log, frames: np.ndarray) -> None:
+    """Log X-ray images (T+1, H, W, P) as JPEG, one entity for each of P planes."""
     from PIL import Image
 
-    kind, options = ("PNG", {}) if lossless else ("JPEG", {"quality": JPEG_QUALITY})
-    blobs = []
-    for frame in frames:
-        buffer = io.BytesIO()
-        Image.fromarray(frame).save(buffer, kind, **options)
-        blobs.append(buffer.getvalue())
-    log.static(entity, rr.EncodedImage.from_fields(media_type=f"image/{kind.lower()}"))
-    log.columns(entity, rr.EncodedImage.columns(blob=blobs))
+    for plane, entity in enumerate(FLUOROSCOPY[: frames.shape[-1]]):
+        blobs = []
+        for frame in frames[..., plane]:
+            buffer = io.BytesIO()
+            Image.fromarray(frame).save(buffer, "JPEG", quality=JPEG_QUALITY)
+            blobs.append(buffer.getvalue())
+        log.static(entity, rr.EncodedImage.from_fields(media_type="image/jpeg"))
+        log.columns(entity, rr.EncodedImage.columns(blob=blobs))
 
 
 def log_events(log: Log) -> None:

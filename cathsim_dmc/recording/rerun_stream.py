@@ -28,7 +28,6 @@ class Log:
         """Takes the times of the episode.
 
         Args:
-            stream: Where to.
             episode: Whose states the rows are.
             from_zero: Whether time begins at 0, so that episodes can be compared.
         """

@@ -9,17 +9,16 @@ import socket
 import subprocess
 import sys
 import threading
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from pathlib import Path
 from urllib.parse import quote
 
 # First bytes of every recording of the current format.
 _MAGIC = b"RRF2"
 # Near the end of every whole one, before four bytes of a checksum.
-_FOOTER, _FOOTER_AT = b"RRF2FOOT", -12
+_FOOTER, _END = b"RRF2FOOT", -4
 _SUFFIX = ".rrd"
-LOOPBACK = "127.0.0.1"
-WEB_PORT = 9090
+LOOPBACK, WEB_PORT = "127.0.0.1", 9090
 
 
 class ViewerError(RuntimeError):
@@ -36,17 +35,13 @@ def check_recording(path: str | os.PathLike[str]) -> Path:
     path = Path(path)
     if not path.is_file():
         raise FileNotFoundError(f"no recording at {path}")
-    with open(path, "rb") as stream:
-        start = stream.read(len(_MAGIC))
-        stream.seek(0, os.SEEK_END)
-        stream.seek(max(0, stream.tell() + _FOOTER_AT))
-        end = stream.read(len(_FOOTER))
-    if path.suffix != _SUFFIX or start != _MAGIC:
+    data = path.read_bytes()
+    if path.suffix != _SUFFIX or not data.startswith(_MAGIC):
         raise ValueError(
             f"{path} is not a Rerun recording (*{_SUFFIX}); write one with write_rrd, "
             "or bring an older one up to date with `rerun rrd migrate`"
         )
-    if end != _FOOTER:
+    if not data[:_END].endswith(_FOOTER):
         raise ValueError(
             f"{path} is cut off: the end of a recording is missing; record it again, "
             "or complete one that an older Rerun wrote with `rerun rrd migrate`"
@@ -54,43 +49,16 @@ def check_recording(path: str | os.PathLike[str]) -> Path:
     return path.resolve()
 
 
-def viewer_command(path: Path) -> list[str]:
-    """Return the command that opens a recording in a window of its own."""
-    return [_executable(), str(path), "--new", "--bind", LOOPBACK]
-
-
-def serve_command(path: Path, host: str, port: int, data_port: int) -> list[str]:
-    """Return the command that serves a recording to browsers.
-
-    Args:
-        path: The recording.
-        host: Address to listen on, for the web page and for the data.
-        port: Port of the web page.
-        data_port: Port of the data that the page loads.
-    """
-    ports = ["--port", str(data_port), "--web-viewer-port", str(port)]
-    return [_executable(), str(path), "--serve-web", "--bind", host, *ports]
-
-
-def web_address(host: str, port: int, data_port: int) -> str:
-    """Return the address to type into a browser while a recording is served."""
-    data = quote(f"rerun+http://{host}:{data_port}/proxy", safe="")
-    return f"http://{host}:{port}?url={data}"
-
-
-def has_display(environment: Mapping[str, str] | None = None) -> bool:
-    """Whether the environment variables name a display."""
-    if not sys.platform.startswith("linux"):
-        return True
-    environment = os.environ if environment is None else environment
-    return any(environment.get(name) for name in ("DISPLAY", "WAYLAND_DISPLAY"))
+def has_display() -> bool:
+    """Whether there is a display to open a window on."""
+    named = os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
+    return bool(named) or not sys.platform.startswith("linux")
 
 
 def open_viewer(
     path: str | os.PathLike[str],
     *,
     web: bool = False,
-    host: str = LOOPBACK,
     port: int = WEB_PORT,
     announce: Callable[[str], None] | None = None,
 ) -> int:
@@ -99,8 +67,7 @@ def open_viewer(
     Args:
         path: A ``.rrd`` file.
         web: Serve a web viewer until interrupted, for machines without a display.
-        host: Address to serve on; the default is reachable from this machine only.
-        port: Port of the web page.
+        port: Port of the web page, which is reachable from this machine only.
         announce: Called with the address to open in a browser before serving.
 
     Returns:
@@ -119,17 +86,18 @@ def open_viewer(
             "shell: --web) and open the address in a browser, or copy the file to a "
             "machine with a screen"
         )
-    command = viewer_command(recording)
-    if web:
-        data_port = _checked_ports(host, port)
-        command = serve_command(recording, host, port, data_port)
-        if announce is not None:
-            announce(web_address(host, port, data_port))
-    # `announce` has given the address already.
-    return _wait(command, {"RUST_LOG": "warn", **os.environ})
+    command = [_executable(), str(recording), "--bind", LOOPBACK]
+    if not web:
+        return _wait([*command, "--new"])
+    data_port = _checked_ports(port)
+    if announce is not None:
+        data = quote(f"rerun+http://{LOOPBACK}:{data_port}/proxy", safe="")
+        announce(f"http://{LOOPBACK}:{port}?url={data}")
+    ports = ["--port", str(data_port), "--web-viewer-port", str(port)]
+    return _wait([*command, "--serve-web", *ports])
 
 
-def _wait(command: list[str], environment: Mapping[str, str]) -> int:
+def _wait(command: list[str]) -> int:
     """Runs a command until it ends; it ends with this process at Ctrl-C and SIGTERM."""
 
     def stop(number: int, frame: object) -> None:
@@ -137,6 +105,8 @@ def _wait(command: list[str], environment: Mapping[str, str]) -> int:
 
     handled = threading.current_thread() is threading.main_thread()
     previous = signal.signal(signal.SIGTERM, stop) if handled else None
+    # `announce` has given the address already.
+    environment = {"RUST_LOG": "warn", **os.environ}
     try:
         with subprocess.Popen(command, env=environment) as process:
             try:
@@ -154,24 +124,22 @@ def _wait(command: list[str], environment: Mapping[str, str]) -> int:
 def _executable() -> str:
     """The viewer of this interpreter's package: of the version of the recordings."""
     found = importlib.util.find_spec("rerun_cli")
-    if found is None or found.origin is None:
-        raise ViewerError("the Rerun viewer is missing; pip install rerun-sdk")
-    names = ("Rerun.app/Contents/MacOS/Rerun", "rerun.exe", "rerun")
-    for path in (Path(found.origin).parent / name for name in names):
-        if path.exists():
-            return str(path)
-    raise ViewerError("the Rerun viewer is missing; install rerun-sdk again")
+    folder = Path(found.origin).parent if found and found.origin else Path()
+    for name in ("Rerun.app/Contents/MacOS/Rerun", "rerun.exe", "rerun"):
+        if found and (folder / name).exists():
+            return str(folder / name)
+    raise ViewerError("the Rerun viewer is missing; pip install rerun-sdk")
 
 
-def _checked_ports(host: str, port: int) -> int:
+def _checked_ports(port: int) -> int:
     """Return a free port for the data after making sure that ``port`` is free."""
     with socket.socket() as page, socket.socket() as data:
         page.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:
-            page.bind((host, port))
+            page.bind((LOOPBACK, port))
         except OSError as error:
             raise ViewerError(
-                f"cannot serve on {host}:{port} ({error.strerror}); choose another port"
+                f"cannot serve on port {port} ({error.strerror}); choose another port"
             ) from error
-        data.bind((host, 0))
+        data.bind((LOOPBACK, 0))
         return data.getsockname()[1]

@@ -34,8 +34,6 @@ def make_env(
     """A seeded environment of batch size [num_envs] whose observations are standard.
 
     Args:
-        task: Name of a registered task.
-        observation: Name or names of the task's observations.
         num_envs: Number of simulations; simulation i draws from seed + i.
         num_threads: Number of threads of the batched simulation, None for one per
             core.
@@ -72,7 +70,6 @@ def standard(
         entries: Entries by name, in any order: numbers (*batch, ...) are flattened,
             images (*batch, h, w, c) uint8 get their channels first. Either are joined
             in the order of their names.
-        batch_dims: Number of batch dimensions.
     """
     named = [entries[name] for name in sorted(entries)]
     images = [one.movedim(-1, -3) for one in named if one.dtype == torch.uint8]

@@ -104,7 +104,6 @@ def play(
     all have ended.
 
     Args:
-        simulations: What is stepped.
         choose: Function from what is seen to the actions. It may raise StopIteration
             to end all episodes.
         begin: Function that is called with a mask (N,) of simulations that have begun

@@ -99,7 +99,6 @@ class CathSimEnv(gymnasium.Env):
         """Loads the task.
 
         Args:
-            task: of `suite.SUITE`.
             render_mode: "rgb_array" renders fluoroscopy, which needs no OpenGL.
             dtype: of the numbers observed and of the action, float32 or float64.
             **task_kwargs: options of the task, such as `observation`.
@@ -201,7 +200,6 @@ def make(task: str, **options: Any) -> gymnasium.Env:
     """An environment without wrappers, with the spec that makes it again.
 
     Args:
-        task: of `suite.SUITE`.
         **options: of `CathSimEnv`, JSON-able if the spec is to be written.
     """
     return gymnasium.make(env_spec(task, **options))
@@ -242,11 +240,9 @@ class CathSimVectorEnv(gymnasium.vector.VectorEnv):
 
         Args:
             num_envs: N.
-            task: of `suite.SUITE`.
             num_threads: worker threads, 0 for one per core.
             dtype: of the numbers observed and of the action.
             render_mode: None; one simulation renders (`CathSimEnv`).
-            **task_kwargs: options of the task.
         """
         if render_mode is not None:
             raise ValueError(

@@ -47,10 +47,7 @@ def write_mjcf(
     same actions it moves nearly as the task does. `task.json` says how, see `describe`.
 
     Args:
-        task: Name of a task of `suite.SUITE`.
         directory: Directory to write, which must not exist.
-        seed: Seed of the episode that `task.json` starts.
-        task_kwargs: Options of the task.
 
     Returns:
         The directory.

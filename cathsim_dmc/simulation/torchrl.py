@@ -38,7 +38,6 @@ class BatchedEnv(EnvBase):
         """Builds the simulations.
 
         Args:
-            task_name: Name of a task in `suite.SUITE`.
             num_envs: N.
             num_threads: Number of threads of the simulation, None for one per core.
             seed: Seed of each simulation, or of the first, the others counting up.

@@ -13,7 +13,6 @@ def load_anatomy(anatomy: str | Path | Anatomy, access: str = "ascending") -> An
     """Returns an anatomy: itself, a phantom by name, or one saved in a directory.
 
     Args:
-        anatomy: Anatomy, name in `anatomy.phantoms.PHANTOMS`, or directory.
         access: Where the device enters a phantom, "ascending" or "descending"; an
             anatomy or a directory has its own inlet.
 
@@ -49,7 +48,6 @@ def load_arches(
     Args:
         arches: Name of the set: "train", "test" or "test_variants".
         pool: Number of arches; building one takes about a second and a half.
-        first: Number in the set of the first one.
         access: Where the device enters, "ascending" or "descending".
 
     Raises:

@@ -86,8 +86,6 @@ class Cameras:
         """Opens the context.
 
         Args:
-            model: the compiled model.
-            options: cameras and size.
             catheter: MJCF scope of the catheter, which carries the endoscope.
 
         Raises:
@@ -124,7 +122,6 @@ class Cameras:
         """Pictures of N configurations.
 
         Args:
-            kinds: of `KINDS`.
             qpos: (N, nq).
 
         Returns:

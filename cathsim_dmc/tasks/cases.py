@@ -47,7 +47,6 @@ class Case:
         Args:
             scene: Entities and where they stand.
             objective: Success and reward.
-            model: The compiled scene.
             fluoroscopy: Set-up of the angiography machine, None for no machine.
             fields: What `write` writes beside the statistics, by its name in MuJoCo's
                 model.

@@ -28,7 +28,6 @@ class ImageSensors:
         """Prepares the sensors.
 
         Args:
-            names: Names of the observations.
             angiograph: Angiography machine; None without fluoroscopic observations.
             num_simulations: N.
             chain: The device as observations show it.
@@ -76,7 +75,6 @@ class ImageSensors:
 
         Args:
             lines: (N, n, 3), centrelines of the chains, m.
-            shadows: Shadow of each device.
             goal: (3,) or (N, 3), m.
             qpos: (N, nq).
             random_states: N sources of quantum noise, None for images without.
@@ -151,7 +149,6 @@ class ImageSensors:
         Args:
             indices: (K,) numbers of the simulations.
             machines: Of their anatomies.
-            kept: Arrays.
         """
         for row, (index, machine) in enumerate(zip(indices, machines, strict=True)):
             if "deviation" in kept:

@@ -19,7 +19,6 @@ def together(objectives: Sequence[Objective], chosen: np.ndarray) -> Objective:
     """One objective for N simulations.
 
     Args:
-        objectives: Objectives to choose from.
         chosen: (N,), number of the objective of each simulation.
     """
     numbers = np.unique(chosen)

@@ -272,7 +272,6 @@ class Cannulation(Shiftable, Routed):
         """The objective of reaching a goal of an anatomy.
 
         Args:
-            anatomy: Anatomy to navigate.
             goal: Goal in the lumen of one of its vessels.
             reward: Weights of the reward terms.
             goal_radius: Distance from the goal that counts as reached, m.

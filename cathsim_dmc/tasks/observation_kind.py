@@ -126,7 +126,6 @@ class ObservationTable(dict[str, ObservationKind]):
         """Names of the rows of an observation.
 
         Args:
-            names: Name or names of observations.
             coaxial: Whether the devices are coaxial, so that the rows that they add
                 follow; None where that is not known, and none follow.
             living: Whether the vessel lives; None where that is not known.

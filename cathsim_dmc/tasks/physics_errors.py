@@ -46,7 +46,6 @@ def escaped(
     """Whether devices have left the lumen.
 
     Args:
-        anatomy: whose lumen, and whose inlet.
         centreline: (..., n, 3), nodes of the devices, m, world frame.
         along: (3,) unit vector of the sheath, which need not stand as the vessel does;
             None for the inlet's direction.
@@ -198,7 +197,6 @@ def dump(
 
     Args:
         reason: what went wrong.
-        start: Snapshot of one simulation at the start of the episode.
         actions: (T, A) up to and with the one that failed.
         directory: folder for the last `KEPT_DUMPS` dumps; None for that which the
             environment variable `CATHSIM_DUMP_DIR` names, or `cathsim-errors` in the

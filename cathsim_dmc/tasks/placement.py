@@ -99,7 +99,6 @@ def place_device(
     """Puts a device to the inlet of an anatomy.
 
     Args:
-        anatomy: Anatomy to navigate.
         goal: Goal that the device must be able to reach.
         device: Device; the length of its tip decides how far it starts inside.
         working_length: Simulated length, m; None for what the goal needs.
@@ -166,9 +165,6 @@ def sheath_direction(anatomy: Anatomy) -> np.ndarray | None:
     aorta bends back on itself, that line may cross another part of it, and the device
     would stand in a wall before it begins: the sheath is then tilted about its mouth,
     by as little as it takes.
-
-    Args:
-        anatomy: Anatomy that the sheath stands before.
 
     Returns:
         Unit vector, or None if the sheath crosses a vessel at any tilt that a device

@@ -110,7 +110,6 @@ def locate(route: RouteLike, head: np.ndarray, last: np.ndarray | None = None) -
     one of them stays on it as long as it can: points near the last place come first.
 
     Args:
-        route: The route.
         head: (..., 3), m.
         last: (...), arc length of its place a control step ago, m; NaN or None where
             that is not known.

@@ -70,7 +70,6 @@ class Scene:
         """Builds the entities that are not given, and attaches all to the arena.
 
         Args:
-            anatomy: Anatomy to navigate.
             goal: Name in `anatomy.goals`, or a goal inside the lumen.
             config: Options of the task.
             goal_radius: Radius of the goal markers, m; for looks only.

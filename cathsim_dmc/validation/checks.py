@@ -118,10 +118,9 @@ class Report:
         """A `rich.table.Table` of the checks."""
         from rich.table import Table
 
-        table = Table(title=self.title)
-        table.add_column("check")
-        table.add_column("measured", justify="right")
-        table.add_column("bound", justify="right")
+        table = Table("check", title=self.title)
+        for name in ("measured", "bound"):
+            table.add_column(name, justify="right")
         table.add_column("")
         table.add_column("behind it", style="dim")
         for check in self.checks:

@@ -31,9 +31,7 @@ def study(
     """Runs a script at several resolutions, other settings at their defaults.
 
     Args:
-        script: which insertion.
         parameter: "physics_timestep" (s) or "shaft_link" (m).
-        values: of the parameter.
 
     Returns:
         "script" (name), "parameter", and lists with an entry for each value: "value",

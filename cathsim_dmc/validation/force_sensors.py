@@ -135,7 +135,6 @@ def dead_end(
         command: of the translation, in (0, 1].
         tube: length and radius, m.
         settling: s after the tip could have arrived.
-        timestep: s.
     """
     environment = suite.load(
         "cathsim",

@@ -200,7 +200,6 @@ def capstan(
         friction: Coulomb coefficient.
         wrap: angle by which the drum turns the rod at the start, rad; above half a
             turn the rod passes beside itself, for it does not touch itself.
-        device: whose rod.
 
     Raises:
         RuntimeError: if the rod sticks to the drum.

@@ -78,9 +78,7 @@ def run(
     """Runs a script until its end or that of the episode.
 
     Args:
-        script: what to do.
         seed: of the displaced start.
-        anatomy: name of an arch, or an anatomy.
         goal: it sets the stroke of the base.
         **options: further fields of `tasks.navigation.NavigationConfig`.
 
@@ -133,8 +131,6 @@ def straight_push(
     """Pushes the device at full speed without steering it.
 
     Args:
-        anatomy: where.
-        goal: of the anatomy.
         seed: of the start of the episode.
         **options: of the task, fields of `tasks.navigation.NavigationConfig`.
 

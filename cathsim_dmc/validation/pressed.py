@@ -47,7 +47,6 @@ def pressed(
     Args:
         load: N.
         solref: of the contact, MuJoCo's.
-        solimp: likewise.
     """
     spec = mujoco.MjSpec()
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_DISCRETE

@@ -30,11 +30,7 @@ class Push(NamedTuple):
 
 
 def push(task: str) -> Push:
-    """Pushes the device of a task, its tip straight, then curled.
-
-    Args:
-        task: name of a published task.
-    """
+    """Pushes the device of a task, its tip straight, then curled."""
     environment = suite.load(suite.DOMAIN, task, {"random": 0, "goal_radius": 1e-6})
     play = environment.task
     data = environment.physics.data.ptr

@@ -132,7 +132,6 @@ class Rig:
             force: (3,) dead load on the distal end, N; None leaves what is applied.
             torque: (3,) N·m.
             rest_change: of every joint over one relaxation time, rad and m.
-            longest: s.
 
         Raises:
             RuntimeError: if it is not at rest by then, or the simulation diverges.

@@ -1,4 +1,4 @@
-"""Closed forms for slender rods: elastica, column, twist and belt friction.
+"""Closed forms for slender rods: elastica, column and twist.
 
 A rod is a sequence of uniform sections, from the clamp to the free end, given by
 their lengths (m) and bending stiffnesses EI (N·m²). SI units throughout.
@@ -103,8 +103,3 @@ def twist(torque: float, lengths, torsional_stiffnesses) -> float:
     return float(
         torque * np.sum(np.asarray(lengths) / np.asarray(torsional_stiffnesses))
     )
-
-
-def capstan_ratio(friction: float, angle: float) -> float:
-    """Tension ratio exp(μθ) of a belt that slides round a drum (Euler-Eytelwein)."""
-    return float(np.exp(friction * angle))

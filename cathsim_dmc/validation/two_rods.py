@@ -164,11 +164,9 @@ def simulate(
     """Lets a chain come to rest, free or held along half a circle; see `reference`.
 
     Args:
-        names: of the devices.
         gaps: (K,), m.
         rotation: (K,), of their bases, rad.
         beyond: free length of the chain after the half circle, m; None where all is.
-        duration: s.
     """
     entity = DeviceStack(names)
     rig = Rig(catheter=entity)
