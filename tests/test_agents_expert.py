@@ -61,11 +61,12 @@ def jiggled(task, count, steps, seed=0):
     return simulation
 
 
-@pytest.mark.parametrize("rotation", [False, True])
-def test_tip_frames_are_mujocos(rotation):
-    env = suite.load(
-        suite.DOMAIN, "simple1_lcca", task_kwargs={"rotation": rotation, "random": 0}
-    )
+@pytest.mark.parametrize("rotation, roll", [(False, 0.0), (True, 0.0), (False, 2.0)])
+def test_tip_frames_are_mujocos(rotation, roll):
+    """Of a device that is rolled before it enters, too."""
+    options = {"rotation": rotation, "random": 0}
+    options["randomisation"] = {"roll": (roll, roll)} if roll else False
+    env = suite.load(suite.DOMAIN, "simple1_lcca", task_kwargs=options)
     task, random = env.task, np.random.default_rng(0)
     env.reset()
     for _ in range(10):
@@ -77,7 +78,7 @@ def test_tip_frames_are_mujocos(rotation):
     head = physics.bind(task.scene.catheter.head).xmat.reshape(3, 3)[:, 2]
     state = task.rollout.index.read(physics.data.ptr)
     axes, direction = pursuit.tip_frames(
-        pursuit.Plan.for_task(task), state.joint_positions
+        pursuit.Plan.for_task(task), state.joint_positions, state.head_frame
     )
     # The y hinge sits on the frame that the x hinge has turned.
     np.testing.assert_allclose(axes, expected, atol=1e-9)

@@ -80,7 +80,6 @@ class Plan:
         points: (P, 3), route from the inlet to the goal.
         radii: (P,), of the lumen.
         arc_length: (P,), along the route.
-        base: (3, 3), orientation of the device where it enters.
         hinges: column in `Readings.joint_positions` and axis (0, 1, 2 for x, y, z) of
             every hinge of the chain, from proximal to distal.
         tip: (M, 2) int, numbers among `hinges` of the x and y hinges of the tip motors.
@@ -92,7 +91,6 @@ class Plan:
     points: np.ndarray
     radii: np.ndarray
     arc_length: np.ndarray
-    base: np.ndarray
     hinges: tuple[tuple[int, int], ...]
     tip: np.ndarray
     steering_angle: float
@@ -133,7 +131,6 @@ class Plan:
             points=route.points,
             radii=route.radii,
             arc_length=route.arc_length,
-            base=_matrix(task.scene.placement.quaternion),
             hinges=tuple(hinges),
             tip=np.array(motors).reshape(-1, 2),
             steering_angle=catheter.device.steering_angle,
@@ -173,22 +170,27 @@ class State(attempts.Attempts):
         )
 
 
-def tip_frames(plan: Plan, joints: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def tip_frames(
+    plan: Plan, joints: np.ndarray, head: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     """Hinge axes of the tip and direction of the head, world frame.
+
+    They are found from the head backwards, so they hold for any roll of the device.
 
     Args:
         joints: (..., J), `Readings.joint_positions`.
+        head: (..., 3, 3), `Readings.head_frame`.
 
     Returns:
         Axes (..., M, 2, 3) of the x and y hinges of the tip and direction (..., 3).
     """
-    frame = np.broadcast_to(plan.base, (*joints.shape[:-1], 3, 3))
+    first, frame = plan.tip.min(), head
     axes = []
-    for column, axis in plan.hinges:
+    for column, axis in reversed(plan.hinges[first:]):
         axes.append(frame[..., axis])
-        frame = turned(frame, axis, joints[..., column])
-    stacked = np.stack(axes, axis=-2)
-    return stacked[..., plan.tip, :], frame[..., 2]
+        frame = turned(frame, axis, -joints[..., column])
+    stacked = np.stack(axes[::-1], axis=-2)
+    return stacked[..., plan.tip - first, :], head[..., 2]
 
 
 def decide(
@@ -212,7 +214,7 @@ def decide(
     # Every other attempt stays near the last place: both ways fail in some branchings.
     steady = np.where(state.attempts % 2 == 1, state.arc_length, np.nan)
     place = locate(plan, readings.head, steady)
-    axes, direction = tip_frames(plan, readings.joint_positions)
+    axes, direction = tip_frames(plan, readings.joint_positions, readings.head_frame)
     target = plan.at(
         place.arc_length + lookahead(plan, settings, state.attempts, place)
     )
@@ -275,18 +277,6 @@ def _correction(settings: Settings, axes: np.ndarray, turn: np.ndarray) -> np.nd
     needed = np.einsum("...jai,...i->...ja", axes, turn)
     limit = settings.max_bend_rate
     return np.clip(weight[:, None] * needed, -limit, limit)
-
-
-def _matrix(quaternion: np.ndarray) -> np.ndarray:
-    """Rotation matrix (3, 3) of a unit quaternion wxyz."""
-    w, x, y, z = quaternion
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    )
 
 
 def turned(frame: np.ndarray, axis: int, angle: np.ndarray) -> np.ndarray:
