@@ -9,11 +9,15 @@ from conftest import twin
 from cathsim_dmc import suite
 from cathsim_dmc.anatomy import phantoms
 from cathsim_dmc.physics.vessel import VesselOptions
+from cathsim_dmc.physics.wall import stiffness
 from cathsim_dmc.simulation.batch import BatchSimulation
 from cathsim_dmc.validation import vessel
 
 STEPS = 8
-DRAWN = {"flow": {"rate": (60, 90), "peak": (0.4, 1.0), "phase": (0, 1)}}
+DRAWN = {
+    "flow": {"rate": (60, 90), "peak": (0.4, 1.0), "phase": (0, 1)},
+    "wall": {"modulus": (0.3e6, 0.6e6), "support": (0.5, 1.0)},
+}
 
 
 @pytest.fixture(scope="module")
@@ -45,6 +49,7 @@ def test_flow_is_alike_in_both_paths_and_on_any_threads(living):
         np.testing.assert_array_equal(environment.physics.data.qpos, one[k, 2])
         np.testing.assert_array_equal(observed["blood_velocity"], velocity[k, 2])
     assert np.ptp(np.linalg.norm(velocity, axis=-1)) > 0.1
+    assert environment.task.info()["indentation"] >= 0.0
 
 
 def test_an_episode_in_a_flow_goes_on_from_a_snapshot(living):
@@ -109,11 +114,58 @@ def test_what_is_drawn_and_shown_of_the_heart(living):
     assert set(step.info()) == set(living.info_types)
 
 
+@pytest.mark.parametrize("kind", ["sphere", "capsule"])
+def test_force_rises_with_the_depth_as_the_formula_says(kind):
+    places = 2 if kind == "capsule" else 1
+    for radius, modulus in zip(vessel.RADII, vessel.MODULI, strict=True):
+        expected = places * stiffness(np.array([radius]), modulus, 1.5e-3, 1.0)[0]
+        loads = expected * np.array([2e-4, 6e-4])
+        slope = np.ptp(loads) / np.ptp(vessel.indentation(kind, radius, modulus, loads))
+        assert slope == pytest.approx(expected, rel=vessel.SLOPE_BOUND / 100)
+
+
+def test_stiffness_lies_between_the_limits_of_a_silicone_tube():
+    # Derived: an ovalising line load of 1.5e-2 N/mm per mm at 4.4 mm, over R √(R/t).
+    radius = np.array([4.4e-3])
+    free, held = (stiffness(radius, 0.52e6, 1.5e-3, s)[0] for s in (0.0, 1.0))
+    assert free == pytest.approx(1.5e4 * 4.4e-3 * np.sqrt(4.4 / 1.5), rel=0.05)
+    assert held > free
+    # An aorta yields by about 0.6 mm under 0.1 N.
+    aorta = stiffness(np.array([0.014]), 0.45e6, 1.4e-3, 1.0)[0]
+    assert 0.1 / aorta == pytest.approx(0.6e-3, rel=0.05)
+
+
+def pushed(wall):
+    """Joint positions and indentations over a push against the wall of the arch."""
+    task = suite.make_task("simple1_bca", vessel={"wall": wall} if wall else "rigid")
+    batch = BatchSimulation(task, 1, seeds=0)
+    batch.reset()
+    action = np.zeros((1, 21))
+    action[:, -1] = action[:, 0] = 1.0
+    qpos, found = [], []
+    for _ in range(50):
+        batch.step(action)
+        qpos.append(batch.batch.qpos.copy())
+        found.append(float(batch.contacts().penetration.max()))
+    return np.array(qpos), np.array(found)
+
+
+def test_a_wall_of_a_thousand_times_the_modulus_is_the_rigid_one():
+    rigid, depth = pushed(None)
+    np.testing.assert_array_equal(rigid, pushed({"modulus": 0.45e9})[0])
+    soft, indented = pushed(True)
+    assert indented.max() > 1.5 * depth.max()
+    assert not np.array_equal(rigid, soft)
+
+
 @pytest.mark.parametrize(
     ("given", "words"),
     [
-        ("liquid", "rigid, living"),
-        (3, "mapping of flow"),
+        ("liquid", "rigid, silicone, living"),
+        (3, "mapping of flow, wall"),
+        ({"wall": {"modulus": 1.0}}, "vessel wall: modulus is 1.0.*10000 to 1e.09 Pa"),
+        ({"wall": {"thickness": (0.0, 1.0)}}, "vessel wall: thickness.*0.005 m"),
+        ({"wall": {"support": None}}, "vessel wall: support is None"),
         ({"flow": {"rate": 500}}, "vessel flow: rate is 500.*30 to 200 1/min"),
         ({"flow": {"peak": (0.5, 9)}}, "vessel flow: peak.*0 to 2 m/s"),
         ({"flow": {"wave_speed": float("nan")}}, "wave_speed.*2 to 20 m/s"),

@@ -122,11 +122,7 @@ class Anatomy:
 
     @cached_property
     def circulation(self) -> Circulation:
-        """How the inflow of blood is shared among the vessels.
-
-        Raises:
-            ValueError: if there is no free end for the inflow, or no outlet.
-        """
+        """How the inflow of blood is shared among the vessels."""
         return Circulation.of(self)
 
     def depth(self, points: ArrayLike) -> Array:

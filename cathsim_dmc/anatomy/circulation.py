@@ -69,25 +69,11 @@ class Circulation:
 
     @classmethod
     def of(cls, anatomy: Anatomy) -> Circulation:
-        """The circulation of an anatomy.
-
-        Raises:
-            ValueError: if the heart's end is no free end, or there is no outlet.
-        """
+        """The circulation of an anatomy."""
         tree = anatomy.tree
         root = tree.root.centreline
         reverse = bool(root.radii[-1] > root.radii[0])
         heart = -1 if reverse else 0
-        distances = [
-            np.linalg.norm(e.position - root.points[heart]) for e in anatomy.ends
-        ]
-        if min(distances, default=np.inf) > _AT_END or len(distances) < 2:
-            raise ValueError(
-                f"anatomy {anatomy.name!r} has no flow: it has {len(distances)} free "
-                f"ends, and needs one at the wider end of {tree.root.name!r}, for the "
-                "inflow, and an outlet; import it with its ends cut open, or leave "
-                "flow out"
-            )
         courses = _courses(tree, reverse, anatomy.scanned)
         columns = [
             _along(vessel.centreline, courses[name], number)
@@ -95,6 +81,23 @@ class Circulation:
         ]
         joined = [np.concatenate(column) for column in zip(*columns, strict=True)]
         return cls(courses, float(root.radii[heart]), *joined)
+
+    def check(self, anatomy: Anatomy) -> None:
+        """Refuses an anatomy that no blood can go through.
+
+        Raises:
+            ValueError: if the heart's end is no free end, or there is no outlet.
+        """
+        root = anatomy.tree.root
+        heart = root.centreline.points[-1 if self.courses[root.name].reverse else 0]
+        ends = anatomy.ends
+        distances = [np.linalg.norm(end.position - heart) for end in ends]
+        if min(distances, default=np.inf) > _AT_END or len(ends) < 2:
+            raise ValueError(
+                f"anatomy {anatomy.name!r} has no flow: it has {len(ends)} free ends, "
+                f"and needs one at the wider end of {root.name!r}, for the inflow, and "
+                "an outlet; import it with its ends cut open, or leave flow out"
+            )
 
     @property
     def arrays(self) -> tuple[np.ndarray, ...]:

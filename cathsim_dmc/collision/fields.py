@@ -81,6 +81,8 @@ class _Table:
         self._words[:5] = native.offsets("mjModel", model)
         data = ("geom_xpos", "geom_xmat", "xpos")
         self._words[5:8] = native.offsets("mjData", data)
+        solimp = native.offsets("mjModel", ("geom_solimp",))
+        self._words[loops.GEOM_SOLIMP // 8] = solimp[0]
         self._library = _mujoco_library()
         table = (ctypes.c_void_p * (_TYPES * _TYPES)).in_dll(
             self._library, "mjCOLLISIONFUNC"

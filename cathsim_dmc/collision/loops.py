@@ -35,7 +35,8 @@ from cathsim_dmc.compiled import compiled
     OF_SPHERE,
     ERROR,
     MESSAGE,
-) = range(0, 96, 8)
+    GEOM_SOLIMP,
+) = range(0, 104, 8)
 HEAD = 16  # words
 # An entry: key, kind, addresses of the place of the carrier's middle in the field's
 # frame, and of head, coarse lattice, index and samples.
@@ -65,6 +66,9 @@ _FAR = 1e-3  # m, by which the coarse lattice may be wrong far from the wall
 _COUNT = 1 << 40  # more than any array has; nothing checks it
 _JOINED = 1e-6  # m
 NONE = (0, 0.0, FREE, 0.0, FREE)  # of `touches`
+# First impedance of a link whose wall gives: two planes share the spring of a place,
+# wherever the wall is not hollow the same one twice.
+SOFT = 0.7
 # A link this close, m, is held: between contacts under load, one physics step without
 # any lets the light tip jump by most of a millimetre.
 _TOUCH = 2e-5
@@ -484,6 +488,8 @@ def collide(model, data, contacts, geom1, geom2, margin, before):
     # A straight sheath holds the shaft without any load.
     near = 0.0 if margin > 0.0 or straight(entry) else _TOUCH
     limit = radius + margin + near
+    impedance = numbers(word(model + word(table + GEOM_SOLIMP)) + 40 * geom1, 1)[0]
+    soft = impedance == SOFT and half > 0.0 and word(entry + 8) == LUMEN
     seen = touches(entry, local, axis, half, closed, limit)
     if seen[0] == 0:
         return np.int32(0)
@@ -497,6 +503,10 @@ def collide(model, data, contacts, geom1, geom2, margin, before):
         # A sphere may have one contact, so one plane.
         around = 0 if half == 0.0 else 1 + int(abs(t) >= half)
         planes = tangents(entry, place, axis, normal, depth, limit, around, rows)
+        if soft and planes == 1:
+            for k in range(4):
+                rows[1, k] = rows[0, k]
+            planes = 2
         for plane in range(min(planes, _MOST - written)):
             contact = numbers(contacts + 80 * written, 10)
             distance = rows[plane, 3] - radius

@@ -17,7 +17,8 @@ radius a and the wall, 2πµu / ln(R/a) per length.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 
@@ -55,13 +56,7 @@ class FlowOptions:
     wave_speed: Range = 4.6
 
     def __post_init__(self):
-        for name, (low, high, unit) in _LIMITS.items():
-            value = getattr(self, name)
-            if bounds.is_number(value):
-                bounds.number(name, value, low, high, unit)
-            else:
-                ends = bounds.interval(name, value, low, high, unit)
-                object.__setattr__(self, name, ends)
+        drawable(self, _LIMITS)
 
 
 _LIMITS = {
@@ -70,6 +65,21 @@ _LIMITS = {
     "phase": (0.0, 1.0, ""),
     "wave_speed": (2.0, 20.0, "m/s"),
 }
+
+
+def drawable(options: Any, limits: Mapping[str, tuple[float, float, str]]) -> None:
+    """Checks fields that are numbers or ranges between limits, or None by default.
+
+    Raises:
+        ValueError: if one of them is neither; names it.
+    """
+    for name, (low, high, unit) in limits.items():
+        value = getattr(options, name)
+        if bounds.is_number(value):
+            bounds.number(name, value, low, high, unit)
+        elif value is not None or getattr(type(options), name) is not None:
+            ends = bounds.interval(name, value, low, high, unit)
+            object.__setattr__(options, name, ends)
 
 
 def drawn(value: Range, random_state: np.random.RandomState) -> float:

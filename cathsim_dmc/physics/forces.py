@@ -83,19 +83,28 @@ def magnitudes(row: np.ndarray) -> np.ndarray:
     return np.sqrt(np.vecdot(force, force))
 
 
-def too_coarse(magnitude: np.ndarray, rows: np.ndarray) -> np.ndarray:
+def distances(rows: np.ndarray) -> np.ndarray:
+    """Distances (..., K) m of the contacts in rows (..., K * 14), 0 where empty."""
+    # Without `_slots`, which copies long rows that are not contiguous.
+    return rows[..., 4::CONTACT_SIZE]
+
+
+def too_coarse(
+    magnitude: np.ndarray, rows: np.ndarray, deepest: float | None = None
+) -> np.ndarray:
     """Whether control steps need shorter physics steps.
 
     Args:
         magnitude: (..., S, M), N, of the contacts in S physics steps.
         rows: (..., S, K * 14) of the sensor, with K >= M.
+        deepest: m; None for `DEEPEST`.
 
     Returns:
-        (...) bool: some contact is harder than `HARDEST` or deeper than `DEEPEST`.
+        (...) bool: some contact is harder than `HARDEST` or deeper than `deepest`.
     """
-    # Without `_slots`, which copies long rows that are not contiguous.
-    distance = rows[..., 4 : magnitude.shape[-1] * CONTACT_SIZE : CONTACT_SIZE]
-    wrong = (magnitude > HARDEST) | (distance < -DEEPEST)
+    distance = distances(rows)[..., : magnitude.shape[-1]]
+    wrong = magnitude > HARDEST
+    wrong |= distance < -(DEEPEST if deepest is None else deepest)
     return np.logical_or.reduce(wrong, axis=(-2, -1))
 
 

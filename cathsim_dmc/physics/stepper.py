@@ -41,6 +41,8 @@ class Stepper(abc.ABC):
             `userdata` are written.
         warnings: (N, ...) int, how often MuJoCo has warned, a view.
         repeated: (N,) int, control steps done again in shorter physics steps.
+        deepest: Depth of a contact, m, from which a control step is done again; None
+            for `forces.DEEPEST`.
         num_simulations: N.
         substeps: S, physics steps in a control step.
     """
@@ -52,6 +54,7 @@ class Stepper(abc.ABC):
         """Finds the sensor of the wall in the compiled scene."""
         self.num_simulations, self.substeps = num_simulations, substeps
         self.repeated = np.zeros(num_simulations, np.int64)
+        self.deepest: float | None = None
         self._contacts = readings.wall_contacts(model)
         self._before = self._warnings_before = np.empty(0)
 
@@ -113,7 +116,8 @@ class Stepper(abc.ABC):
         """
         warned, magnitudes = self._warned(), self._magnitudes()
         if magnitudes.size:
-            coarse = forces.too_coarse(magnitudes, self.contact_rows) & ~warned
+            rows = self.contact_rows
+            coarse = forces.too_coarse(magnitudes, rows, self.deepest) & ~warned
             if coarse.any():
                 self._refine(np.flatnonzero(coarse))
                 warned, magnitudes = self._warned(), self._magnitudes()

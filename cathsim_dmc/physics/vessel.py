@@ -10,15 +10,21 @@ import numpy as np
 
 from cathsim_dmc import bounds
 from cathsim_dmc.anatomy import Anatomy
+from cathsim_dmc.physics import forces
 from cathsim_dmc.physics.blood import StillBlood
 from cathsim_dmc.physics.effects import Effect
 from cathsim_dmc.physics.flow import Flow, FlowOptions
 from cathsim_dmc.physics.readings import Readings
+from cathsim_dmc.physics.wall import STIFFENING, Wall, WallOptions
 
-PRESETS: dict[str, dict[str, Any]] = {"rigid": {}, "living": {"flow": True}}
+PRESETS: dict[str, dict[str, Any]] = {
+    "rigid": {},
+    "silicone": {"wall": {"modulus": 0.52e6, "thickness": 1.5e-3}},
+    "living": {"flow": True, "wall": True},
+}
 
 
-INFO = ("heart_phase", "blood_speed")  # of a vessel that lives
+INFO = ("heart_phase", "blood_speed", "indentation")  # of a vessel that lives
 
 
 class VesselReadings(NamedTuple):
@@ -27,26 +33,40 @@ class VesselReadings(NamedTuple):
     Attributes:
         heart_phase: (N,), 0 to 1, at the heart.
         blood_velocity: (N, 3), at the head, m/s, world frame.
+        indentation: (N,), of the wall under the deepest contact, m.
     """
 
     heart_phase: np.ndarray
     blood_velocity: np.ndarray
+    indentation: np.ndarray
 
     def info(self) -> dict[str, np.ndarray]:
         """Figures (N,) for `tasks.step.Step.info`, of `INFO`."""
         speed = np.sqrt((self.blood_velocity**2).sum(axis=-1))
-        return {"heart_phase": self.heart_phase, "blood_speed": speed}
+        values = self.heart_phase, speed, self.indentation
+        return dict(zip(INFO, values, strict=True))
 
 
 def read(
-    effects: Sequence[Effect], time: np.ndarray, state: Readings
+    effects: Sequence[Effect], time: np.ndarray, state: Readings, rows: np.ndarray
 ) -> VesselReadings | None:
-    """State of the vessels at times (N,) s; None where none of them lives."""
-    found: dict[str, np.ndarray] = {}
+    """State of the vessels; None where none of them lives.
+
+    Args:
+        effects: Of the task.
+        time: (N,), s, of the episodes.
+        state: At that time.
+        rows: (N, M * 14), of the wall's sensor.
+    """
+    if not any(isinstance(effect, Flow | Wall) for effect in effects):
+        return None
+    deepest = -forces.distances(rows).min(axis=-1, initial=0.0)
+    still = np.zeros(len(time))
+    found = VesselReadings(still, np.zeros((len(time), 3)), deepest)
     for effect in effects:
         if isinstance(effect, Flow):
-            found |= effect.read(time, state)
-    return VesselReadings(**found) if found else None
+            found = found._replace(**effect.read(time, state))
+    return found
 
 
 @dataclasses.dataclass(frozen=True)
@@ -55,9 +75,11 @@ class VesselOptions:
 
     Attributes:
         flow: Options of the flow of blood.
+        wall: Options of a wall that gives.
     """
 
     flow: FlowOptions | None = None
+    wall: WallOptions | None = None
 
     @classmethod
     def make(cls, value: Any) -> VesselOptions:
@@ -81,20 +103,30 @@ class VesselOptions:
     @property
     def living(self) -> bool:
         """Whether there is anything to observe of it."""
-        return self.flow is not None
+        return self.flow is not None or self.wall is not None
 
     @property
     def blood(self) -> StillBlood:
         """The effect of the blood."""
         return StillBlood() if self.flow is None else Flow(self.flow)
 
+    @property
+    def walls(self) -> list[Effect]:
+        """The effects of the wall."""
+        return [] if self.wall is None else [Wall(self.wall)]
+
+    @property
+    def deepest(self) -> float | None:
+        """Depth of a contact that asks for shorter steps, m; None for the usual one."""
+        return None if self.wall is None else STIFFENING
+
     def check(self, anatomy: Anatomy) -> None:
         """Raises ValueError if an anatomy cannot do what the options ask for."""
         if self.flow is not None:
-            anatomy.circulation  # noqa: B018
+            anatomy.circulation.check(anatomy)
 
 
-_KINDS = {"flow": FlowOptions}
+_KINDS = {"flow": FlowOptions, "wall": WallOptions}
 
 
 def _part(name: str, value: Any) -> Any:

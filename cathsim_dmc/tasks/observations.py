@@ -314,16 +314,18 @@ def depth(frame: Frame) -> Observation:
 @OBSERVATIONS.row(
     Entry("heart_phase", 2, "1", "sine and cosine of the phase of the heart", -1, 1),
     Entry("blood_velocity", 3, "m/s", "of the blood at the head, world frame"),
+    Entry("indentation", 1, "m", "of the wall under the deepest contact", 0),
     living=True,
 )
 def vessel(frame: Frame) -> Observation:
-    """Heart and blood, of a vessel that lives."""
+    """Heart, blood and wall of a vessel that lives."""
     state = frame.vessel
     assert state is not None
     angle = 2 * np.pi * state.heart_phase
     return {
         "heart_phase": np.stack([np.sin(angle), np.cos(angle)], axis=-1),
         "blood_velocity": state.blood_velocity,
+        "indentation": state.indentation[..., None],
     }
 
 

@@ -89,7 +89,7 @@ class Rollout:
         self._views = self._index.views(state)
         num_actions = len(scene.catheter.action_names)
         listed = config.effects_on(scene.catheter)
-        self._listed = listed
+        self._listed, stepper.deepest = listed, config.vessel_options.deepest
         self._devices = cast(SingleDevice, listed[-1])
         self._effects = Effects(
             listed,
@@ -229,7 +229,8 @@ class Rollout:
     def _measure(self, magnitudes: np.ndarray, rows: np.ndarray | None = None) -> None:
         """Measures all simulations, or some, when the others have not moved."""
         now = self._views.read()
-        vessel_now = vessel.read(self._listed, CONTROL_TIMESTEP * self._steps, now)
+        time, last = CONTROL_TIMESTEP * self._steps, self._stepper.contact_rows[:, -1]
+        vessel_now = vessel.read(self._listed, time, now, last)
         force, devices = forces.wall_force(magnitudes), self._devices.read(now)
         new = Measured(now, force, devices, vessel_now)
         if rows is not None and hasattr(self, "_measured"):

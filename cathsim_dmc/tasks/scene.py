@@ -15,6 +15,7 @@ from cathsim_dmc.entities.phantom import Phantom
 from cathsim_dmc.entities.robot import Robot
 from cathsim_dmc.entities.sheath import Sheath, straight
 from cathsim_dmc.physics import effects
+from cathsim_dmc.physics.wall import soften
 from cathsim_dmc.tasks import placement
 from cathsim_dmc.tasks.config import NavigationConfig
 from cathsim_dmc.tasks.objectives import GOAL_RADIUS
@@ -90,6 +91,8 @@ class Scene:
             anatomy, goal, longest_tip(chosen), length, config.ranges.farthest_shift
         )
         catheter = catheter or _chain(chosen, place, config)
+        if config.vessel_options.wall is not None:
+            soften(catheter)
         radius = catheter.device.outer_radius
         scene = cls(
             anatomy=anatomy,

@@ -1,6 +1,9 @@
-"""The vessel against closed forms: blood that flows."""
+"""The vessel against closed forms: blood that flows, a wall that gives."""
 
 from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
 
 import mujoco
 import numpy as np
@@ -9,10 +12,14 @@ from scipy.optimize import brentq
 
 from cathsim_dmc.anatomy import phantoms
 from cathsim_dmc.anatomy.anatomy import Anatomy
+from cathsim_dmc.anatomy.centreline import Centreline, Vessel, VesselTree
+from cathsim_dmc.collision import fields
 from cathsim_dmc.entities import devices
 from cathsim_dmc.entities.arena import BLOOD_DENSITY
 from cathsim_dmc.physics.blood import BLOOD_VISCOSITY, StillBlood
 from cathsim_dmc.physics.effects import userdata_size
+from cathsim_dmc.physics.stepper import PHYSICS_TIMESTEP
+from cathsim_dmc.physics.wall import law, stiffness
 from cathsim_dmc.validation.checks import Check, Report
 from cathsim_dmc.validation.damping import LINK, _uniform, drag, fill
 from cathsim_dmc.validation.rig import Rig
@@ -23,6 +30,8 @@ VOLUME_BOUND = 1e-9  # of the inflow
 PROFILE_BOUND = 1e-6  # of the mean velocity
 CROSS_FLOWS = (0.1, 0.4)  # m/s
 FORCES = (1e-4, 5e-3)  # N
+RADII, MODULI = (4.4e-3, 0.014), (0.45e6, 2e6)  # m, Pa
+SLOPE_BOUND = 5.0  # %
 _FREE = 0.2  # m
 
 
@@ -124,12 +133,10 @@ def volume_defect(anatomy: Anatomy) -> float:
 
 def profile() -> tuple[float, float]:
     """Profile in a straight tube: deviation over the mean, and flow over prescribed."""
-    from cathsim_dmc.anatomy.centreline import Centreline, Vessel, VesselTree
     from cathsim_dmc.physics.flow_loops import EXPONENT, velocities
 
-    radius, z = 0.01, np.linspace(0.0, 0.2, 21)
-    line = Centreline(np.outer(z, [0, 0, 1.0]), np.full(len(z), radius))
-    tube = Anatomy.from_tree(VesselTree({"aorta": Vessel("aorta", line)}), "tube")
+    radius = 0.01
+    tube = straight_tube(radius)
     places, weights = np.polynomial.legendre.leggauss(64)
     r = radius * (places + 1) / 2
     points = np.stack([r, 0 * r, 0.1 + 0 * r], axis=-1)
@@ -139,6 +146,81 @@ def profile() -> tuple[float, float]:
     expected = mean * (n + 2) / n * (1 - (r / radius) ** n)
     flow = (out[:, 2] * 2 * np.pi * r * weights).sum() * radius / 2
     return float(np.abs(out[:, 2] - expected).max() / mean), float(flow)
+
+
+def straight_tube(radius: float) -> Anatomy:
+    """A tube along z, 0.2 m long."""
+    z = np.linspace(0.0, 0.2, 21)
+    line = Centreline(np.outer(z, [0, 0, 1.0]), np.full(len(z), radius))
+    return Anatomy.from_tree(VesselTree({"aorta": Vessel("aorta", line)}), "tube")
+
+
+def indentation(
+    kind: str, radius: float, modulus: float, loads: Sequence[float] | np.ndarray
+) -> np.ndarray:
+    """Depths (n,) m to which a sphere or a capsule is pressed into the wall of a tube.
+
+    Args:
+        kind: "sphere", or "capsule", which lies along the tube.
+        radius: of the tube, m.
+        modulus: Pa; the wall is 1.5 mm thick.
+        loads: (n,), N.
+    """
+    lumen, size = straight_tube(radius).lumen, 1e-3
+    spec = mujoco.MjSpec()
+    spec.nuser_geom = 4
+    spec.option.integrator = mujoco.mjtIntegrator.mjINT_DISCRETE
+    spec.option.timestep = PHYSICS_TIMESTEP
+    spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
+    box = {"capsule": (size, LINK / 2, 0), "sphere": (size, 0, 0)}[kind]
+    wall = fields.carrier(lumen)
+    spec.worldbody.add_geom(
+        type=mujoco.mjtGeom.mjGEOM_BOX,
+        pos=wall["pos"],
+        size=wall["size"],
+        userdata=wall["user"],
+    )
+    body = spec.worldbody.add_body(pos=(radius - size - 1e-4, 0, 0.1))
+    body.add_joint(type=mujoco.mjtJoint.mjJNT_SLIDE, axis=(1, 0, 0))
+    type_ = getattr(mujoco.mjtGeom, f"mjGEOM_{kind.upper()}")
+    geom = body.add_geom(type=type_, size=box, mass=1e-3, priority=1)
+    model = spec.compile()
+    planes = 2 if kind == "capsule" else 1
+    spring = stiffness(np.array([radius]), modulus, 1.5e-3, 1.0) / planes
+    number = geom.id
+    model.geom_solref[number], model.geom_solimp[number] = (
+        value[0] if isinstance(value, np.ndarray) else value
+        for value in law(spring, model.body_invweight0[1, :1])
+    )
+    depths = []
+    for load in loads:
+        data = mujoco.MjData(model)
+        data.xfrc_applied[1, 0] = load
+        mujoco.mj_step(model, data, 1500)
+        depths.append(data.qpos[0] - 1e-4)
+    return np.array(depths)
+
+
+def wall_checks() -> list[Check]:
+    """A wall that gives: slope of force over depth, and a wall that hardly does."""
+    made = []
+    for kind in ("sphere", "capsule"):
+        for radius, modulus in itertools.product(RADII, MODULI):
+            expected = float(stiffness(np.array([radius]), modulus, 1.5e-3, 1.0)[0])
+            # A capsule that lies along the tube touches with both ends.
+            expected *= 2 if kind == "capsule" else 1
+            loads = expected * np.array([2e-4, 6e-4])
+            slope = np.ptp(loads) / np.ptp(indentation(kind, radius, modulus, loads))
+            made.append(
+                Check.deviation(
+                    f"{kind} in a tube of {1e3 * radius:g} mm, {1e-6 * modulus:g} MPa",
+                    slope,
+                    expected,
+                    SLOPE_BOUND,
+                    f"{slope:.0f} N/m, formula {expected:.0f} N/m",
+                )
+            )
+    return made
 
 
 def flow_checks() -> list[Check]:
@@ -184,5 +266,5 @@ def flow_checks() -> list[Check]:
 
 
 def validate_vessel() -> Report:
-    """Checks what `vessel` does to blood."""
-    return Report("vessel", flow_checks())
+    """Checks what `vessel` does to blood and wall."""
+    return Report("vessel", [*flow_checks(), *wall_checks()])

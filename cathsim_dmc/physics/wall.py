@@ -1,0 +1,195 @@
+"""A wall that gives: contacts as springs of the stiffness of the vessel where they are.
+
+A tube of radius R, thickness t, Young's modulus E and Poisson's ratio ν = ½ gives under
+a point load f by f / k, between two limits:
+
+- held by what surrounds it, like a shallow shell (Reissner 1946),
+  k = 4 E t² / (R √(3 (1 - ν²)));
+- free to become oval over a length of R √(R/t), k = E' t³ / (12 · 0.149 R³) · R √(R/t)
+  with E' = E / (1 - ν²), the ring between two loads.
+
+`support` s goes from one to the other, k = k_free^(1-s) k_held^s. In MuJoCo, a contact
+at rest obeys f = K d(r)² r / ((1 - d(r)) Â), with K the stiffness of `solref`, d the
+impedance at a depth r, and Â the inverse weight of the link. Both are set for each link
+once a control step. The spring is linear to a quarter of `STIFFENING` and up to eleven
+times as stiff beyond; it obeys the rule of `entities.contact`, α(1 + m) < 2. A capsule
+touches a hollow wall with two planes, which share the spring. What is stiffer than the
+contact with the rigid wall has that contact's law.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+
+from cathsim_dmc.anatomy import Anatomy
+from cathsim_dmc.anatomy.circulation import Circulation
+from cathsim_dmc.entities.chain import Chain
+from cathsim_dmc.entities.contact import CONTACT_SOLIMP, CONTACT_SOLREF
+from cathsim_dmc.physics.effects import Effect, World
+from cathsim_dmc.physics.flow import Range, drawable, drawn
+from cathsim_dmc.physics.randomisation import Episode
+from cathsim_dmc.physics.readings import Readings
+
+STIFFENING = 3e-3  # m, indentation from which the wall is as stiff as it gets
+_SOLIMP = (0.7, 0.95, STIFFENING, 0.5, 4)
+_RELAXATION = 8e-3  # s, as that of the rigid wall
+_PLANES = 2  # of a capsule at a hollow wall
+_POISSON = 0.5
+# The secant of the rigid wall's law under this load, N, is its stiffness.
+_LOAD = 0.1
+# Thickness of an artery over its radius, and the least: 1.4 and 1.0 mm at the ascending
+# and descending aorta (PMC3154923), 0.6 mm at a carotid.
+_RELATIVE, _THINNEST = 0.1, 0.6e-3
+
+_LIMITS = {
+    "modulus": (1e4, 1e9, "Pa"),
+    "thickness": (1e-4, 5e-3, "m"),
+    "support": (0.0, 1.0, ""),
+}
+
+
+@dataclasses.dataclass(frozen=True)
+class WallOptions:
+    """What the wall is made of; a range (low, high) is drawn from in each episode.
+
+    Attributes:
+        modulus: Young's modulus, Pa, 1e4 to 1e9: 0.45e6 of an aorta, 0.52e6 of
+            silicone.
+        thickness: m, 1e-4 to 5e-3; None for a tenth of the radius of the lumen and
+            0.6 mm at least, an artery's.
+        support: 1 for a vessel held by what surrounds it, 0 for one free to become
+            oval, or between.
+    """
+
+    modulus: Range = 0.45e6
+    thickness: Range | None = None
+    support: Range = 1.0
+
+    def __post_init__(self):
+        drawable(self, _LIMITS)
+
+
+def stiffness(
+    radius: np.ndarray, modulus: float, thickness: np.ndarray | float, support: float
+) -> np.ndarray:
+    """Stiffness (n,) of a tube under a point load, N/m.
+
+    Args:
+        radius: (n,), m.
+        modulus: Pa.
+        thickness: m.
+        support: 0 to 1.
+    """
+    plane = 1 - _POISSON**2
+    held = 4 * modulus * thickness**2 / (np.sqrt(3 * plane) * radius)
+    free = modulus / plane * thickness**3 / (12 * 0.149 * radius**3)
+    free = free * radius * np.sqrt(radius / thickness)
+    return free ** (1 - support) * held**support
+
+
+def law(
+    stiffness: np.ndarray, weight: np.ndarray
+) -> tuple[np.ndarray, tuple[float, ...]]:
+    """`geom_solref` (n, 2) of springs (n,) N/m on links of inverse weights (n,) 1/kg.
+
+    Returns:
+        And `geom_solimp`, the same for all.
+    """
+    first, last = _SOLIMP[:2]
+    damping = _RELAXATION * stiffness * last * (1 - first) * weight / first
+    spring = stiffness * last**2 * (1 - first) * weight / first**2
+    return -np.stack([spring, damping], axis=-1), _SOLIMP
+
+
+def rigid_stiffness(weight: np.ndarray) -> np.ndarray:
+    """Secant stiffness (n,) N/m of the rigid wall's contact with such links."""
+    depth = np.geomspace(1e-7, 2e-4, 400)
+    first, last, width, middle, power = CONTACT_SOLIMP
+    share = depth / width
+    below = share**power / middle ** (power - 1)
+    above = 1 - (1 - share) ** power / (1 - middle) ** (power - 1)
+    impedance = first + (last - first) * np.where(share <= middle, below, above)
+    force = -CONTACT_SOLREF[0] / last**2 * impedance**2 * depth / (1 - impedance)
+    return np.array([_LOAD / np.interp(_LOAD * each, force, depth) for each in weight])
+
+
+class Wall(Effect):
+    """Sets the contact of each link by the vessel where it is."""
+
+    model_fields = ("geom_solref", "geom_solimp")
+
+    def __init__(self, options: WallOptions):
+        """Takes the options of the task."""
+        self._options = options
+
+    def bind(self, world: World) -> None:
+        """Finds the links in the model."""
+        from cathsim_dmc.physics import flow_loops  # late, as numba takes long
+
+        super().bind(world)
+        self._look = flow_loops.velocities
+        model, links = world.model, world.index.geoms
+        self._geoms = links
+        self._weight = model.body_invweight0[model.geom_bodyid[links], 0]
+        self._rigid = rigid_stiffness(self._weight)
+        self._circulations: dict[int, Circulation] = {}
+        count = world.num_simulations
+        # Of the lumen around each link, 0 where it has never been in one.
+        self._radius = np.zeros((count, len(links)))
+        self._material = np.ones((count, len(_LIMITS)))
+
+    def enter(self, index: int, anatomy: Anatomy) -> None:
+        """Takes the radii of an anatomy."""
+        self._circulations[index] = anatomy.circulation
+
+    def restart(
+        self, index: int, episode: Episode, random_state: np.random.RandomState
+    ) -> None:
+        """Draws what the wall is made of."""
+        self._radius[index] = 0.0
+        for number, name in enumerate(_LIMITS):
+            value = getattr(self._options, name)
+            self._material[index, number] = (
+                np.nan if value is None else drawn(value, random_state)
+            )
+        self.refresh(index)
+
+    @property
+    def state(self) -> dict[str, np.ndarray]:
+        """Radii around the links, and what the walls are made of."""
+        return {"radius": self._radius, "material": self._material}
+
+    def refresh(self, index: int) -> None:
+        """Writes the contacts of one simulation."""
+        solref = self.world.field(index, "geom_solref")
+        solimp = self.world.field(index, "geom_solimp")
+        radius = self._radius[index]
+        modulus, thickness, support = self._material[index].tolist()
+        inside = radius > 0.0
+        around = np.where(inside, radius, 1.0)
+        walls: np.ndarray | float = thickness
+        if np.isnan(thickness):
+            walls = np.maximum(_RELATIVE * around, _THINNEST)
+        found = stiffness(around, modulus, walls, support)
+        soft = inside & (found < self._rigid)
+        springs, impedance = law(found / _PLANES, self._weight)
+        solref[self._geoms] = np.where(soft[:, None], springs, CONTACT_SOLREF)
+        solimp[self._geoms] = np.where(soft[:, None], impedance, CONTACT_SOLIMP)
+
+    def act(self, action: np.ndarray, state: Readings) -> np.ndarray:
+        """Looks up the vessel around the middle of each link."""
+        middles = 0.5 * (state.centreline[:, :-1] + state.centreline[:, 1:])
+        out = np.empty((middles.shape[1], 5))
+        for index, points in enumerate(np.ascontiguousarray(middles)):
+            self._look(points, *self._circulations[index].arrays, out)
+            np.copyto(self._radius[index], out[:, 4], where=out[:, 4] > 0.0)
+            self.refresh(index)
+        return action
+
+
+def soften(chain: Chain) -> None:
+    """Lets the contacts of a chain's links decide over those of the wall."""
+    for geom in chain.link_geoms:
+        geom.priority = 1
