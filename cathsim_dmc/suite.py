@@ -24,7 +24,7 @@ from dm_control.utils import containers
 from cathsim_dmc import bounds
 from cathsim_dmc.anatomy import Anatomy, Goal
 from cathsim_dmc.tasks import observations, placement
-from cathsim_dmc.tasks.anatomies import load_anatomy, load_arches
+from cathsim_dmc.tasks.anatomies import BRANCHES, goal_of, load_anatomy, load_arches
 from cathsim_dmc.tasks.config import NavigationConfig
 from cathsim_dmc.tasks.environment import Environment
 from cathsim_dmc.tasks.navigation import Navigation
@@ -77,7 +77,8 @@ class TaskDefinition:
     def own_options(self) -> tuple[str, ...]:
         """Names of the options that choose the anatomy and the goal."""
         if self.random_arch:
-            return ("arches", "pool", "first")
+            own = ("goal", "access") if self.goal == "any" else ()
+            return ("arches", "pool", "first", *own)
         own = () if self.anatomy is not None else ("anatomy", "access")
         return own if self.goal is not None else (*own, "goal")
 
@@ -146,17 +147,22 @@ def make_task(
     coaxial, living = config.devices is not None, config.vessel_options.living
     observations.resolve(config.observation, coaxial, living)
     random = bounds.random_state("random", random)
-    goal = own.get("goal", definition.goal or "bca")
-    access = own.get("access", definition.access)
+    goal = own.pop("goal", definition.goal or "bca")
+    access = own.pop("access", definition.access)
     if definition.random_arch:
+        bounds.choice("goal", goal, ("any", *BRANCHES))
         anatomies = load_arches(access=access, **own)
+        named = [
+            goal_of(anatomy, goal, number)
+            for number, anatomy in enumerate(anatomies, own.get("first", 0))
+        ]
     else:
         chosen = own.get("anatomy", definition.anatomy or "type1")
-        anatomies = [load_anatomy(chosen, access)]
+        anatomies, named = [load_anatomy(chosen, access)], [goal]
     chosen = {k: v for k, v in options.items() if k not in _CONFIG_FIELDS}
     if "farthest_shift" in definition.objective_options:
         chosen["farthest_shift"] = config.ranges.farthest_shift
-    goals = [placement.resolve_goal(anatomy, goal) for anatomy in anatomies]
+    goals = list(map(placement.resolve_goal, anatomies, named))
     config = _one_length(config, anatomies, goals)
 
     def room(number: int) -> tuple[Scene, Objective]:
@@ -376,6 +382,18 @@ _COAXIAL = {
 }
 
 _register_plain()
+register(
+    "arch_any",
+    TaskDefinition(
+        "A random arch, access and branch in each episode.",
+        None,
+        "any",
+        "any",
+        options={"working_length": placement.COMMON_LENGTH},
+        random_arch=True,
+    ),
+    "hard",
+)
 _register_coaxial()
 register(
     "navigate",

@@ -14,7 +14,7 @@ import cathsim_dmc
 PACKAGE = Path(cathsim_dmc.__file__).parent
 NAME = "cathsim_dmc"
 
-BELOW = {"files", "bounds", "style", "compiled"}
+BELOW = {"files", "file_maps", "bounds", "style", "compiled"}
 _TASK = {"anatomy", "collision", "imaging", "entities", "physics", "tasks"}
 _FACE = _TASK | {"suite", "simulation"}
 # Part of the package -> parts that it may import. Arrows point one way: what stands
@@ -24,6 +24,7 @@ ALLOWED = {
     # Below everything: how files are written, what values may be, how figures look,
     # how loops are compiled.
     "files": set(),
+    "file_maps": set(),
     "bounds": set(),
     "style": set(),
     "compiled": set(),

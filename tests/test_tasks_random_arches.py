@@ -221,6 +221,29 @@ def test_tasks_are_registered_and_have_the_common_shape(task, shared_environment
         assert spec.shape == shapes[key].shape
 
 
+def test_any_arch_takes_accesses_and_branches_in_turn():
+    def own(**options):
+        scenes = [case.scene for case in suite.make_task("arch_any", **options)._cases]
+        entered = [accesses[s.anatomy.inlet.position.tobytes()] for s in scenes]
+        return list(zip(entered, [scene.goal.name for scene in scenes], strict=True))
+
+    accesses = {
+        arch.build_seed(seed, access=access).inlet.position.tobytes(): access
+        for seed in arch.arch_set("train")[:4]
+        for access in ("ascending", "descending")
+    }
+    ways = ["ascending", "descending"] * 2
+    assert own(pool=4) == list(zip(ways, ["bca", "bca", "lcca", "lcca"], strict=True))
+    assert own(pool=1, goal="lsa", access="descending") == [("descending", "lsa")]
+
+
+@pytest.mark.parametrize("wrong", [{"goal": "left"}, {"access": "radial"}])
+def test_any_arch_names_the_branches_and_accesses(wrong):
+    (name,) = wrong
+    with pytest.raises(ValueError, match=f"{name}.*any"):
+        suite.make_task("arch_any", **wrong)
+
+
 @pytest.mark.parametrize(
     "options",
     [

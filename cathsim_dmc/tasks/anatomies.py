@@ -6,6 +6,8 @@ from cathsim_dmc import bounds
 from cathsim_dmc.anatomy import Anatomy
 from cathsim_dmc.tasks import placement
 
+# Goals in the branches of an arch.
+BRANCHES = ("bca", "rcca", "lcca", "lsa", "rsa")
 POOL = 16  # arches that an episode draws from, unless one says otherwise
 
 
@@ -48,18 +50,28 @@ def load_arches(
     Args:
         arches: Name of the set: "train", "test" or "test_variants".
         pool: Number of arches; building one takes about a second and a half.
-        access: Where the device enters, "ascending" or "descending".
+        access: Where the device enters, "ascending" or "descending"; "any" for one and
+            the other in turn, by the number in the set.
 
     Raises:
         ValueError: if there is no such set, it has no such arches, or one of them
             cannot be entered.
     """
     from cathsim_dmc.anatomy.arch import arch
+    from cathsim_dmc.anatomy.builder import ACCESSES
 
+    bounds.choice("access", access, ("any", *ACCESSES))
     seeds = arch.arch_set(bounds.choice("arches", arches, arch.SETS))
     bounds.whole(f"pool of arches {arches!r}", pool, 1, len(seeds))
     bounds.whole(f"first of arches {arches!r}", first, 0, len(seeds) - pool)
-    found = [arch.build_seed(seed, access=access) for seed in seeds[first:][:pool]]
+    found = []
+    for number in range(first, first + pool):
+        way = ACCESSES[number % 2] if access == "any" else access
+        anatomy = arch.build_seed(seeds[number], access=way)
+        if access == "any" and placement.sheath_direction(anatomy) is None:
+            way = ACCESSES[1 - number % 2]
+            anatomy = arch.build_seed(seeds[number], access=way)
+        found.append(anatomy)
     closed = [a.name for a in found if placement.sheath_direction(a) is None]
     if closed:
         raise ValueError(
@@ -67,3 +79,16 @@ def load_arches(
             "bends back across it; give another first, or a smaller pool"
         )
     return found
+
+
+def goal_of(anatomy: Anatomy, goal: str, number: int) -> str:
+    """Name of a goal; for "any", one branch of the arch after the other.
+
+    Args:
+        goal: Name, or "any".
+        number: Number of the arch in its set.
+    """
+    if goal != "any":
+        return goal
+    branches = [name for name in BRANCHES if name in anatomy.goals]
+    return branches[number // 2 % len(branches)]
