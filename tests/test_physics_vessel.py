@@ -8,6 +8,7 @@ from conftest import twin
 
 from cathsim_dmc import suite
 from cathsim_dmc.anatomy import phantoms
+from cathsim_dmc.anatomy.circulation import Circulation
 from cathsim_dmc.physics.vessel import VesselOptions
 from cathsim_dmc.physics.wall import stiffness
 from cathsim_dmc.simulation.batch import BatchSimulation
@@ -92,6 +93,16 @@ def test_volume_and_profile_are_those_prescribed():
     assert flow == pytest.approx(1.0, abs=1e-8)
 
 
+def test_outlets_share_by_murray_where_that_is_asked_for():
+    anatomy = phantoms.load("type1")
+    courses = Circulation.of(anatomy, murray=True).courses
+    radii = {end.vessel: end.radius for end in anatomy.ends if not end.open}
+    cubes = {name: radius**3 for name, radius in radii.items()}
+    for name, cube in cubes.items():
+        share = cube / sum(cubes.values())
+        assert courses[name].outlet == pytest.approx(share, rel=1e-6)
+
+
 @pytest.mark.parametrize("force", vessel.FORCES)
 def test_a_free_link_reaches_the_terminal_velocity_of_its_drag(force):
     mine, expected = vessel.terminal_velocity(force)
@@ -169,7 +180,8 @@ def test_a_wall_of_a_thousand_times_the_modulus_is_the_rigid_one():
         ({"flow": {"rate": 500}}, "vessel flow: rate is 500.*30 to 200 1/min"),
         ({"flow": {"peak": (0.5, 9)}}, "vessel flow: peak.*0 to 2 m/s"),
         ({"flow": {"wave_speed": float("nan")}}, "wave_speed.*2 to 20 m/s"),
-        ({"flow": {"pulse": 1}}, "rate, peak, phase, wave_speed"),
+        ({"flow": {"pulse": 1}}, "rate, peak, phase, wave_speed, split"),
+        ({"flow": {"split": "even"}}, "split is 'even'.*measured, murray"),
         ({"flow": "fast"}, "True, False, or some of rate"),
         ({"flows": True}, "some of flow"),
     ],

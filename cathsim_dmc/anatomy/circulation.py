@@ -68,13 +68,13 @@ class Circulation:
     vessel: np.ndarray
 
     @classmethod
-    def of(cls, anatomy: Anatomy) -> Circulation:
-        """The circulation of an anatomy."""
+    def of(cls, anatomy: Anatomy, murray: bool = False) -> Circulation:
+        """The circulation of an anatomy, perhaps with all outlets by Murray's law."""
         tree = anatomy.tree
         root = tree.root.centreline
         reverse = bool(root.radii[-1] > root.radii[0])
         heart = -1 if reverse else 0
-        courses = _courses(tree, reverse, anatomy.scanned)
+        courses = _courses(tree, reverse, murray or anatomy.scanned)
         columns = [
             _along(vessel.centreline, courses[name], number)
             for number, (name, vessel) in enumerate(tree.vessels.items())
@@ -120,8 +120,8 @@ def _along(line, course: Course, number: int) -> tuple[np.ndarray, ...]:
     return (*pairs, np.full(count - 1, number))
 
 
-def _courses(tree: VesselTree, reverse: bool, scanned: bool) -> dict[str, Course]:
-    outlets = _outlets(tree, reverse, scanned)
+def _courses(tree: VesselTree, reverse: bool, murray: bool) -> dict[str, Course]:
+    outlets = _outlets(tree, reverse, murray)
     taken = dict(outlets)
     for name in reversed(tuple(tree.vessels)):  # branches before their parents
         parent = tree.vessels[name].parent
@@ -146,10 +146,10 @@ def _courses(tree: VesselTree, reverse: bool, scanned: bool) -> dict[str, Course
     return courses
 
 
-def _outlets(tree: VesselTree, reverse: bool, scanned: bool) -> dict[str, float]:
+def _outlets(tree: VesselTree, reverse: bool, murray: bool) -> dict[str, float]:
     """Share of the inflow that leaves through the free end of each vessel."""
     cubes, artery = {}, {}
-    measured = not scanned and set(SHARES) <= set(tree.vessels)
+    measured = not murray and set(SHARES) <= set(tree.vessels)
     for name, vessel in tree.vessels.items():
         first = reverse and vessel.parent is None
         cubes[name] = float(vessel.centreline.radii[0 if first else -1]) ** 3

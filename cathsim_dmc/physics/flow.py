@@ -48,14 +48,18 @@ class FlowOptions:
         phase: Phase of the heart at the start of an episode, 0 to 1; 0 is the beginning
             of the ejection.
         wave_speed: Pulse wave velocity, m/s, 2 to 20.
+        split: "measured" for the shares of BCA, LCCA and LSA in adults, "murray" for
+            shares of all outlets by their radii cubed, as in a scan.
     """
 
     rate: Range = 60.0
     peak: Range = 0.72
     phase: Range = 0.0
     wave_speed: Range = 4.6
+    split: str = "measured"
 
     def __post_init__(self):
+        bounds.choice("split", self.split, ("measured", "murray"))
         drawable(self, _LIMITS)
 
 
@@ -115,6 +119,8 @@ class Flow(StillBlood):
     def enter(self, index: int, anatomy: Anatomy) -> None:
         """Fills the vessels of an anatomy."""
         self._circulations[index] = anatomy.circulation
+        if self._options.split == "murray":
+            self._circulations[index] = Circulation.of(anatomy, murray=True)
 
     def restart(
         self, index: int, episode: Episode, random_state: np.random.RandomState
