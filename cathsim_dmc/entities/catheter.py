@@ -3,7 +3,9 @@
 import numpy as np
 
 from cathsim_dmc.entities import devices
+from cathsim_dmc.entities.arena import BLOOD_DENSITY
 from cathsim_dmc.entities.chain import TIMESTEP, TORSION_ARMATURE, Chain
+from cathsim_dmc.entities.coaxial import carried_mass
 
 # Lag of the drives of the tip, s.
 STEERING_LAG = 0.05
@@ -104,7 +106,12 @@ class Catheter(Chain):
         return 0.0, self._device.rest_angle(start, stop)
 
     def _link_mass(self, index: int) -> float:
-        return self._device.linear_density * self._lengths[index]
+        return self._moved_mass * self._lengths[index]
+
+    @property
+    def _moved_mass(self) -> float:
+        """Mass per length that moves with the device across its axis, kg/m."""
+        return self._device.linear_density + carried_mass(self.devices)
 
     def _add_twist(self, link, index: int) -> None:
         compliance = self._twist_compliances.get(index)
@@ -159,9 +166,10 @@ class Catheter(Chain):
 
     @property
     def density(self) -> float:
-        """Mean density of the device, kg/m³."""
-        radius = self._device.outer_radius
-        return self._device.linear_density / (np.pi * radius**2)
+        """Effective density, kg/m³: with the mass moved, its buoyancy in blood."""
+        displaced = BLOOD_DENSITY * np.pi * self._device.outer_radius**2
+        weight = max(0.0, self._device.linear_density - displaced)
+        return BLOOD_DENSITY / (1 - weight / self._moved_mass)
 
     @property
     def hinges(self) -> tuple:

@@ -9,10 +9,10 @@ from cathsim_dmc.entities.contact import device_contact
 from cathsim_dmc.entities.device import Device
 from cathsim_dmc.entities.posture import x_first
 
-# Damping over stiffness of the hinges beyond that of the material, s. It has no source:
-# with half of it, a buckled shaft snaps through too fast for steps of 4 ms
-# (docs/soak.md), and the shipped policies were trained with it.
-BENDING_RELAXATION_TIME = 0.4
+# Damping over stiffness of the hinges beyond that of the material, s.
+BENDING_RELAXATION_TIME = 0.0
+# Time in which a device comes to rest, s.
+RESTING_TIME = 0.4
 # Physics step of the tasks, s. An implicit step of length h damps a spring like a
 # relaxation time of h, so the hinges have that much less.
 TIMESTEP = 4e-3

@@ -129,6 +129,11 @@ class Stack:
             [
                 [device.linear_density for device in devices],
                 [weight_density(device) for device in devices],
+                [2 * _disc(device.outer_radius) for device in devices],
+                [
+                    _disc(device.inner_radius) - _disc(device.outer_radius)
+                    for device in devices
+                ],
             ]
         )
         self._arms = self._ratio * self._radius
@@ -353,6 +358,22 @@ class Stack:
             ways,
             coefficient,
         )
+
+
+def _disc(radius: float) -> float:
+    """Mass per length of a cylinder of blood, kg/m."""
+    return BLOOD_DENSITY * np.pi * radius**2
+
+
+def carried_mass(devices: Sequence[Device]) -> float:
+    """Mass per length of the blood that devices in each other carry, kg/m.
+
+    Across its axis, a cylinder moves as much blood around it as it displaces (potential
+    flow), and all blood in its lumen.
+    """
+    lumens = [_disc(device.inner_radius) for device in devices]
+    filled = [_disc(device.outer_radius) for device in devices[:-1]]
+    return _disc(devices[-1].outer_radius) + sum(lumens) - sum(filled)
 
 
 def weight_density(device: Device) -> float:

@@ -432,11 +432,13 @@ def links(outermost, present, lengths, friction, radii, ratios, densities):
         lengths: (L,), m.
         friction: (N,), Coulomb coefficient of an uncoated device.
         radii, ratios: (K,), radii (m) and friction ratios of the devices.
-        densities: (2, K), mass and weight in blood, kg/m.
+        densities: (4, K), mass, weight in blood, blood carried by a device that is the
+            outermost and by one that is present, kg/m.
     """
     count, devices, number = outermost.shape
     made, moments = np.zeros((4, count, number)), np.empty((count, number, 2))
-    share = densities[1].sum() / densities[0].sum()
+    carried = densities[2, devices - 1] + densities[3].sum()
+    share = densities[1].sum() / (densities[0].sum() + carried)
     for i in range(count):
         for link in range(number):
             radius = mass = weight = 0.0
@@ -445,7 +447,8 @@ def links(outermost, present, lengths, friction, radii, ratios, densities):
                 outside, there = outermost[i, k, link], present[i, k, link]
                 radius += outside * radii[k]
                 made[1, i, link] += outside * ratios[k] * friction[i]
-                mass += there * densities[0, k] * lengths[link]
+                carried = outside * densities[2, k] + there * densities[3, k]
+                mass += (there * densities[0, k] + carried) * lengths[link]
                 weight += there * densities[1, k] * lengths[link]
                 whole = whole and there == 1.0
             made[0, i, link], made[2, i, link] = radius, mass

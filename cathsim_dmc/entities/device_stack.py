@@ -8,7 +8,7 @@ import numpy as np
 from cathsim_dmc.entities import devices as library
 from cathsim_dmc.entities.arena import BLOOD_DENSITY
 from cathsim_dmc.entities.chain import BENDING_RELAXATION_TIME, TIMESTEP, Chain
-from cathsim_dmc.entities.coaxial import Stack, weight_density
+from cathsim_dmc.entities.coaxial import Stack, carried_mass, weight_density
 from cathsim_dmc.entities.contact import FRICTION, coaxial_contact
 from cathsim_dmc.entities.device import Device
 from cathsim_dmc.entities.torsion import Rods
@@ -183,4 +183,5 @@ class DeviceStack(Chain):
         """Effective density, kg/m³: its buoyancy in blood is that of all devices."""
         weight = sum(weight_density(device) for device in self._devices)
         mass = sum(device.linear_density for device in self._devices)
+        mass += carried_mass(self._devices)
         return BLOOD_DENSITY / (1 - weight / mass)

@@ -9,31 +9,20 @@ velocity u, Re = ρ|u|d/µ,
 (Sucker and Brauer 1975, Wärme- und Stoffübertragung 8, 149; Re from 1e-4 to 2e5):
 viscous like that of a slender body at a small Re, quadratic at a large one. Drag along
 the axis and by rotation about it are left out, and so is the history of the motion. The
-blood that the device carries with it is no part of the links' mass
-(`carried_mass`).
+blood that the device carries is part of the mass of its links
+(`entities.coaxial.carried_mass`).
 """
 
 from __future__ import annotations
-
-import math
 
 import numpy as np
 
 from cathsim_dmc.entities.arena import BLOOD_DENSITY
 from cathsim_dmc.entities.chain import Chain
-from cathsim_dmc.entities.device import Device
 from cathsim_dmc.physics.effects import Effect, World
 from cathsim_dmc.physics.randomisation import Episode
 
 BLOOD_VISCOSITY = 3.5e-3  # Pa·s, of whole blood at high shear rates
-
-
-def carried_mass(device: Device) -> float:
-    """Mass per length of the blood that a device carries across its axis, kg/m.
-
-    As much as it displaces (potential flow), and all blood in its lumen.
-    """
-    return BLOOD_DENSITY * math.pi * (device.outer_radius**2 + device.inner_radius**2)
 
 
 class StillBlood(Effect):

@@ -21,9 +21,10 @@ from cathsim_dmc.entities.chain import (
     HINGE_ARMATURE,
     MAX_ROTATION_SPEED,
 )
+from cathsim_dmc.entities.coaxial import carried_mass
 from cathsim_dmc.entities.posture import joints_along
 from cathsim_dmc.entities.sheath import Sheath
-from cathsim_dmc.physics.blood import BLOOD_VISCOSITY, StillBlood, carried_mass
+from cathsim_dmc.physics.blood import BLOOD_VISCOSITY, StillBlood
 from cathsim_dmc.physics.drives import Drives
 from cathsim_dmc.physics.effects import Effects, World, userdata_size
 from cathsim_dmc.physics.randomisation import Episode
@@ -126,14 +127,14 @@ def release(
 
 
 def _as_stated(rig: Rig, hinges: np.ndarray, blood: bool) -> None:
-    """Leaves the damping of the material, and adds the mass of the blood carried."""
+    """Leaves the damping of the material, and without blood the device's own mass."""
     model, device = rig.model, rig.device
     dofs = model.jnt_dofadr[hinges]
     # The damping of an implicit step is part of that of the material.
     left = max(device.relaxation_time - model.opt.timestep, 0.0)
     model.dof_damping[dofs] = left * model.jnt_stiffness[hinges]
-    if blood:
-        factor = 1 + carried_mass(device) / device.linear_density
+    if not blood:
+        factor = 1 / (1 + carried_mass([device]) / device.linear_density)
         links = ids(model, rig.catheter.links)
         model.body_mass[links] *= factor
         model.body_inertia[links] *= factor
@@ -167,7 +168,7 @@ def _beam(
     device: devices.Device, length: float, start: float, time: np.ndarray, blood: bool
 ) -> np.ndarray:
     """Deflection (n,) of the end of a beam released from its first mode, m."""
-    mass = device.linear_density + (carried_mass(device) if blood else 0.0)
+    mass = device.linear_density + (carried_mass([device]) if blood else 0.0)
     squares = (_ROOTS / length) ** 4
     # The rotors of the hinges stand for no mass of the device; in blood they are left
     # out, as they matter less there.

@@ -9,7 +9,7 @@ from dm_control import mjcf
 from cathsim_dmc.entities import devices
 from cathsim_dmc.entities.arena import AngiographyArena
 from cathsim_dmc.entities.catheter import Catheter
-from cathsim_dmc.entities.chain import BENDING_RELAXATION_TIME, Chain
+from cathsim_dmc.entities.chain import RESTING_TIME, Chain
 from cathsim_dmc.entities.contact import FRICTION
 from cathsim_dmc.tasks.config import PHYSICS_TIMESTEP
 
@@ -136,7 +136,7 @@ class Rig:
         Raises:
             RuntimeError: if it is not at rest by then, or the simulation diverges.
         """
-        count = round(BENDING_RELAXATION_TIME / self.model.opt.timestep)
+        count = round(RESTING_TIME / self.model.opt.timestep)
         start, change = self.data.time, np.inf
         while change > rest_change:
             before = self.data.qpos.copy()
@@ -146,7 +146,7 @@ class Rig:
             if self.data.time - start > longest:
                 raise RuntimeError(
                     f"after {longest} s a joint still moves by {change:.2g} in "
-                    f"{BENDING_RELAXATION_TIME} s, more than {rest_change:g}; the load "
+                    f"{RESTING_TIME} s, more than {rest_change:g}; the load "
                     "is too large or the time too short"
                 )
         warnings = [

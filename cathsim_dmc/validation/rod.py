@@ -10,7 +10,11 @@ import mujoco
 import numpy as np
 
 from cathsim_dmc.entities import devices
-from cathsim_dmc.entities.chain import BENDING_RELAXATION_TIME, MAX_ROTATION_SPEED
+from cathsim_dmc.entities.chain import (
+    BENDING_RELAXATION_TIME,
+    MAX_ROTATION_SPEED,
+    RESTING_TIME,
+)
 from cathsim_dmc.validation import damping, drive, theory
 from cathsim_dmc.validation.checks import Check, Report
 from cathsim_dmc.validation.rig import REST_CHANGE, Rig
@@ -242,7 +246,7 @@ def twist_under_torque(
     lengths, _, torsional = rig.sections
     torque = TWIST / theory.twist(1.0, lengths, torsional)
     # The motor of the base is a speed servo: the base creeps, so wait for a time.
-    for _ in range(round(12 * BENDING_RELAXATION_TIME / rig.model.opt.timestep)):
+    for _ in range(round(12 * RESTING_TIME / rig.model.opt.timestep)):
         rig.step((0, 0, 0), (0, 0, torque))
     return torque, _twist(rig)
 
