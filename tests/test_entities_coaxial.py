@@ -8,6 +8,7 @@ import pytest
 from scipy.integrate import quad
 
 from cathsim_dmc.entities import devices
+from cathsim_dmc.entities.arena import BLOOD_DENSITY
 from cathsim_dmc.entities.catheter import Catheter
 from cathsim_dmc.entities.coaxial import Stack
 from cathsim_dmc.entities.torsion import STICKING, Rods
@@ -192,6 +193,10 @@ def test_links_have_the_outermost_devices_outside(pair):
     np.testing.assert_allclose(links.radius[1], catheter.outer_radius)
     total = wire.linear_density * (LENGTHS.sum() - 0.0245)
     total += catheter.linear_density * LENGTHS.sum()
+    # The blood that the catheter displaces, and that in its lumen beside the wire.
+    section = catheter.outer_radius**2 + catheter.inner_radius**2
+    blood = section * LENGTHS.sum() - wire.outer_radius**2 * (LENGTHS.sum() - 0.0245)
+    total += BLOOD_DENSITY * np.pi * blood
     assert links.mass[1].sum() == pytest.approx(total)
 
 

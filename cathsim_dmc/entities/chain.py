@@ -9,10 +9,6 @@ from cathsim_dmc.entities.contact import device_contact
 from cathsim_dmc.entities.device import Device
 from cathsim_dmc.entities.posture import x_first
 
-# Damping over stiffness of the hinges beyond that of the material, s.
-BENDING_RELAXATION_TIME = 0.0
-# Time in which a device comes to rest, s.
-RESTING_TIME = 0.4
 # Physics step of the tasks, s. An implicit step of length h damps a spring like a
 # relaxation time of h, so the hinges have that much less.
 TIMESTEP = 4e-3
@@ -49,13 +45,13 @@ TIP_COLOUR = (0.95, 0.75, 0.1, 1.0)
 
 
 def hinge_time(material: Any, timestep: float) -> Any:
-    """Damping over stiffness of a hinge, s.
+    """Damping over stiffness of a hinge whose material has a relaxation time, s.
 
     Args:
         material: relaxation time of the material, s; a number or an array.
         timestep: physics step, s.
     """
-    return np.maximum(BENDING_RELAXATION_TIME + material - timestep, 0.0)
+    return np.maximum(material - timestep, 0.0)
 
 
 class Chain(composer.Entity):

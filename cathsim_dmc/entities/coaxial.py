@@ -194,8 +194,6 @@ class Stack:
         self,
         overlap: Overlap,
         turns: np.ndarray,
-        spin: np.ndarray,
-        relaxation_time: float,
         angles: np.ndarray,
     ) -> np.ndarray:
         """Rest angles of the hinges of the chain as it is bent.
@@ -208,18 +206,15 @@ class Stack:
         Args:
             overlap: overlap of the devices.
             turns: (N, K, J), rotation of each device at each joint, rad.
-            spin: (N, K, J), rate of that rotation, rad/s.
-            relaxation_time: time by which the angles lead, that of the joints' damping,
-                s.
             angles: (N, 2 J), positions of the hinges in the order of the chain, rad.
 
         Returns:
             (N, J, 2), about x and about y, rad.
         """
-        own = overlap.rest * np.exp(1j * turns)
-        lead = 1j * relaxation_time * (own * spin).sum(axis=1)
         return self._hinges.free_hinges(
-            own.sum(axis=1), lead, overlap.compliance, np.ascontiguousarray(angles)
+            self.rest_angles(overlap, turns),
+            overlap.compliance,
+            np.ascontiguousarray(angles),
         )
 
     def links(self, overlap: Overlap, friction: np.ndarray) -> Links:

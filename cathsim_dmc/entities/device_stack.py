@@ -7,7 +7,7 @@ import numpy as np
 
 from cathsim_dmc.entities import devices as library
 from cathsim_dmc.entities.arena import BLOOD_DENSITY
-from cathsim_dmc.entities.chain import BENDING_RELAXATION_TIME, TIMESTEP, Chain
+from cathsim_dmc.entities.chain import TIMESTEP, Chain
 from cathsim_dmc.entities.coaxial import Stack, carried_mass, weight_density
 from cathsim_dmc.entities.contact import FRICTION, coaxial_contact
 from cathsim_dmc.entities.device import Device
@@ -78,11 +78,7 @@ class DeviceStack(Chain):
         self.material_times = np.array(
             [device.relaxation_time for device in self._devices]
         )
-        self._rods = Rods(
-            self._devices,
-            self._stack.nodes,
-            BENDING_RELAXATION_TIME + self.material_times,
-        )
+        self._rods = Rods(self._devices, self._stack.nodes, self.material_times)
         self._gaps = lead * np.arange(len(self._devices), dtype=np.float64)
         overlap = self._stack.overlap(self._gaps[None])
         turns = np.zeros((1, len(self._devices), len(self._stack.spans)))

@@ -119,12 +119,11 @@ def unloaded_hinges(shape):
 
 
 @compiled
-def free_hinges(shape, lead, compliance, angles):
+def free_hinges(shape, compliance, angles):
     """Rest angles (N, J, 2) of the hinges, see `Stack.free_hinges`.
 
     Args:
         shape: (N, J) complex, rest angles of the joints, rad.
-        lead: (N, J) complex, by which the shape turns in the time of the damping, rad.
         compliance: (N, J), rad/(N·m).
         angles: (N, 2 J), positions of the hinges, rad.
     """
@@ -133,29 +132,14 @@ def free_hinges(shape, lead, compliance, angles):
     free = np.empty((count, joints, 2))
     over = np.empty(2, np.complex128)
     for i in range(count):
-        # What is proximal of the joint twists by this as the shapes turn.
-        twisting = 0.0
         for j in range(joints):
             first = j % 2
             x, y = angles[i, 2 * j + first], angles[i, 2 * j + 1 - first]
-            back = unit(-twists[i, j])
-            turn = _twist_rates(x, y, first)
             over[0] = _difference(x, y, first, _STEP, 0.0)
             over[1] = _difference(x, y, first, 0.0, _STEP)
-            size = abs(shape[i, j])
-            # As far as the joint is bent along its shape.
-            ahead = -1j * twisting * bends[i, j]
-            if size > 0.0:
-                share = _dot(shape[i, j], bends[i, j]) / size**2
-                ahead += min(max(share, 0.0), 1.0) * lead[i, j]
-            ahead *= back
-            pull = (shape[i, j] - bends[i, j]) * back
-            area = (over[0].conjugate() * over[1]).imag
-            lead_x = (ahead.conjugate() * over[1]).imag / area
-            lead_y = (over[0].conjugate() * ahead).imag / area
-            twisting += turn[0] * lead_x + turn[1] * lead_y
-            free[i, j, 0] = x + _dot(over[0], pull) + lead_x
-            free[i, j, 1] = y + _dot(over[1], pull) + lead_y
+            pull = (shape[i, j] - bends[i, j]) * unit(-twists[i, j])
+            free[i, j, 0] = x + _dot(over[0], pull)
+            free[i, j, 1] = y + _dot(over[1], pull)
         # Torsional moment of all beyond the joint: derivative of the energy by a twist.
         moment = 0.0
         for j in range(joints - 1, -1, -1):

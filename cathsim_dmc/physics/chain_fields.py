@@ -8,7 +8,7 @@ from typing import NamedTuple
 import mujoco
 import numpy as np
 
-from cathsim_dmc.entities.chain import BENDING_RELAXATION_TIME, hinge_time
+from cathsim_dmc.entities.chain import hinge_time
 from cathsim_dmc.entities.coaxial import Links, Overlap
 from cathsim_dmc.entities.device_stack import DeviceStack
 from cathsim_dmc.physics.readings import ids
@@ -106,14 +106,9 @@ def chain_properties(
     friction: np.ndarray,
     factor: np.ndarray,
     loss: np.ndarray,
-    spin: np.ndarray | None = None,
     angles: np.ndarray | None = None,
 ) -> ChainProperties:
     """Properties of chains at an overlap of their devices.
-
-    The damping of a hinge beyond that of the material resists how it moves against the
-    turning shape, not against the vessel: else a shaped device would be held back by it
-    when it is turned. So the spring leads by what the damper takes.
 
     Args:
         entity: of the devices.
@@ -122,15 +117,14 @@ def chain_properties(
         friction: (N,), Coulomb coefficient of an uncoated device on the wall.
         factor: (N,), of all stiffnesses.
         loss: (N,), factor of all loss factors.
-        spin: (N, K, J), rate of that rotation, rad/s.
         angles: (N, 2 J), of the hinges as they stand, in the order of the chain, rad;
             None for the unloaded chain at rest.
     """
     stack = entity.stack
-    if angles is None or spin is None:
+    if angles is None:
         rest = stack.unloaded_hinges(overlap, turns)
     else:
-        rest = stack.free_hinges(overlap, turns, spin, BENDING_RELAXATION_TIME, angles)
+        rest = stack.free_hinges(overlap, turns, angles)
     stiffness = factor[:, None] / overlap.compliance
     shares = overlap.stiffness / overlap.stiffness.sum(axis=1, keepdims=True)
     material = loss[:, None] * (entity.material_times[:, None] * shares).sum(axis=1)

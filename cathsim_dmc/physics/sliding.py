@@ -130,8 +130,6 @@ class SlidingDevices(SingleDevice):
         self._ways = np.zeros((total, count - 1))
         self._drag = np.zeros((total, count - 1))
         self._axial = np.zeros((total, count))
-        # Rates at which they turn at the joints, rad/s.
-        self._spin = np.zeros((total, count, nodes - 2))
 
     # The course of an episode.
 
@@ -145,13 +143,13 @@ class SlidingDevices(SingleDevice):
         gaps = self._entity.start_gaps
         self._insertion[index] = self._qpos[index, self._index.insertion_qpos] - gaps
         self._angles[index] = 0.0
-        for each in (self._ways, self._drag, self._axial, self._others, self._spin):
+        for each in (self._ways, self._drag, self._axial, self._others):
             each[index] = 0.0
         self._friction[index] = self._entity.friction if friction is None else friction
         self._factor[index] = 1.0 if stiffness is None else stiffness
         self._loss[index] = 1.0 if episode.loss is None else episode.loss
         row = self._live(index)
-        turns = np.zeros((1, *self._spin.shape[1:]))
+        turns = np.zeros((1, len(gaps), len(self._stack.spans)))
         self._write(row, self._stack.overlap(gaps[None]), turns)
 
     def _live(self, index: int) -> np.ndarray:
@@ -169,7 +167,6 @@ class SlidingDevices(SingleDevice):
             "ways": self._ways,
             "drag": self._drag,
             "axial": self._axial,
-            "spin": self._spin,
             "slipped": self._slipped,
             "told": self._drives.told,
         }
@@ -278,9 +275,7 @@ class SlidingDevices(SingleDevice):
         )
         slip, self._angles[..., 0] = rods.slip(self._angles, MAX_TORQUE)
         self._slipped[:, 1::2] += slip
-        after = rods.at_joints(self._angles, gaps)
-        self._spin[:] = (after - turns) / CONTROL_TIMESTEP
-        return overlap, after
+        return overlap, rods.at_joints(self._angles, gaps)
 
     def _push(
         self,
@@ -324,16 +319,9 @@ class SlidingDevices(SingleDevice):
     def _write(self, rows: np.ndarray, overlap: Overlap, turns: np.ndarray) -> None:
         """Writes the properties of the chains of some simulations."""
         friction, factor = self._friction[rows], self._factor[rows]
-        angles, spin = self._qpos[rows, self._places.qpos], self._spin[rows]
+        angles, loss = self._qpos[rows, self._places.qpos], self._loss[rows]
         made = chain_properties(
-            self._entity,
-            overlap,
-            turns,
-            friction,
-            factor,
-            self._loss[rows],
-            spin,
-            angles,
+            self._entity, overlap, turns, friction, factor, loss, angles
         )
         for row, number in enumerate(rows.tolist()):
             self._places.write(self._arrays[number], made, row)

@@ -9,13 +9,14 @@ from dm_control import mjcf
 from cathsim_dmc.entities import devices
 from cathsim_dmc.entities.arena import AngiographyArena
 from cathsim_dmc.entities.catheter import Catheter
-from cathsim_dmc.entities.chain import RESTING_TIME, Chain
+from cathsim_dmc.entities.chain import Chain
 from cathsim_dmc.entities.contact import FRICTION
 from cathsim_dmc.tasks.config import PHYSICS_TIMESTEP
 
 # A rig has come to rest when no joint has moved by more than this, rad and m, over
-# one relaxation time of the rod. The constraint solver's tolerance leaves less.
-REST_CHANGE = 1e-6
+# that time, s. The constraint solver's tolerance leaves less. Until then the time is
+# the relaxation time of the hinges: a device damped by its material swings for minutes.
+REST_CHANGE, RESTING_TIME = 1e-6, 0.4
 
 
 class Rig:
@@ -126,18 +127,27 @@ class Rig:
         rest_change: float = REST_CHANGE,
         longest: float = 20.0,
     ) -> float:
-        """Steps until the device is at rest and returns the time that took, s.
+        """Steps, strongly damped, until the device is at rest.
 
         Args:
             force: (3,) dead load on the distal end, N; None leaves what is applied.
             torque: (3,) N·m.
             rest_change: of every joint over one relaxation time, rad and m.
 
+        Returns:
+            The time that took, s.
+
         Raises:
             RuntimeError: if it is not at rest by then, or the simulation diverges.
         """
         count = round(RESTING_TIME / self.model.opt.timestep)
         start, change = self.data.time, np.inf
+        model, damping = self.model, self.model.dof_damping.copy()
+        model.dof_damping[model.jnt_dofadr] = np.where(
+            model.jnt_type == mujoco.mjtJoint.mjJNT_HINGE,
+            np.maximum(damping[model.jnt_dofadr], RESTING_TIME * model.jnt_stiffness),
+            damping[model.jnt_dofadr],
+        )
         while change > rest_change:
             before = self.data.qpos.copy()
             for _ in range(count):
@@ -149,6 +159,7 @@ class Rig:
                     f"{RESTING_TIME} s, more than {rest_change:g}; the load "
                     "is too large or the time too short"
                 )
+        model.dof_damping[:] = damping
         warnings = [
             mujoco.mjtWarning(kind).name
             for kind, warning in enumerate(self.data.warning)

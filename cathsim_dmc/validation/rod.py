@@ -10,14 +10,10 @@ import mujoco
 import numpy as np
 
 from cathsim_dmc.entities import devices
-from cathsim_dmc.entities.chain import (
-    BENDING_RELAXATION_TIME,
-    MAX_ROTATION_SPEED,
-    RESTING_TIME,
-)
+from cathsim_dmc.entities.chain import MAX_ROTATION_SPEED
 from cathsim_dmc.validation import damping, drive, theory
 from cathsim_dmc.validation.checks import Check, Report
-from cathsim_dmc.validation.rig import REST_CHANGE, Rig
+from cathsim_dmc.validation.rig import REST_CHANGE, RESTING_TIME, Rig
 
 CANTILEVER_BOUND = 2.0  # % of the deflection
 BUCKLING_BOUND = 5.0  # % of the load
@@ -293,8 +289,7 @@ def twist_lag(
         tip.append(base[-1] - _twist(rig, wrapped=True))
     base, tip = np.array(base), np.array(tip)
     time = timestep * np.arange(len(base))
-    constant = brake / stiffness + BENDING_RELAXATION_TIME
-    constant += rig.device.relaxation_time
+    constant = brake / stiffness + rig.device.relaxation_time
     # The motor takes some 20 ms to its speed; the lag is driven by what it does.
     lag, speed = np.zeros(len(base)), np.diff(base) / timestep
     for index, omega in enumerate(speed):

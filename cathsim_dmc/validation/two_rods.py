@@ -195,9 +195,8 @@ def simulate(
             turns, np.zeros(gap.shape), CONTROL_TIMESTEP, *rods.at_nodes(loads, gap)
         )
         after = rods.at_joints(turns, gap)
-        spin = (after - at) / CONTROL_TIMESTEP
         made = chain_fields.chain_properties(
-            entity, overlap, after, ones * 0, ones, ones, spin, qpos
+            entity, overlap, after, ones * 0, ones, ones, qpos
         )
         fields.write(arrays, made, 0)
         for _ in range(round(CONTROL_TIMESTEP / rig.model.opt.timestep)):
