@@ -104,19 +104,14 @@ def test_joint_stiffness_is_that_of_the_rod(name):
     assert stiffness.shape == (len(lengths) - 1, 2)
     np.testing.assert_array_equal(stiffness[:, 0], stiffness[:, 1])
     first_tip = len(lengths) - device.tip_links
-    within_shaft, within_tip = stiffness[: first_tip - 1], stiffness[first_tip:]
-    np.testing.assert_allclose(
-        within_shaft, device.shaft.bending_stiffness / lengths[0], rtol=1e-9
+    in_tip = np.arange(len(lengths)) >= first_tip
+    assert lengths[in_tip].sum() == pytest.approx(device.tip_length)
+    # A joint bends half a link on each side.
+    bending = np.where(
+        in_tip, device.tip.bending_stiffness, device.shaft.bending_stiffness
     )
-    np.testing.assert_allclose(
-        within_tip, device.tip.bending_stiffness / lengths[-1], rtol=1e-9
-    )
-    # Where the sections meet, half a link of each bends.
-    border = (
-        lengths[0] / 2 / device.shaft.bending_stiffness
-        + lengths[-1] / 2 / device.tip.bending_stiffness
-    )
-    np.testing.assert_allclose(stiffness[first_tip - 1], 1 / border, rtol=1e-9)
+    half = lengths / 2 / bending
+    np.testing.assert_allclose(stiffness[:, 0], 1 / (half[1:] + half[:-1]), rtol=1e-9)
     np.testing.assert_allclose(
         np.asarray(bends.damping).reshape(-1, 2),
         max(device.relaxation_time - TIMESTEP, 0) * stiffness,

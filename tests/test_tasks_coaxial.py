@@ -157,14 +157,14 @@ def test_a_clamp_slips_that_pushes_a_wire_into_a_bend(monkeypatch):
     environment.reset()
     run(environment, [0.0, 0.0, 1.0, 0.0], 60)  # the wire's end is behind the bend
     before = environment.task.rollout.devices.insertion[0, 0]
-    monkeypatch.setattr(sliding, "MAX_PUSH_FORCE", 0.04)
-    run(environment, [0.1, 0.0, 0.0, 0.0], 165)
+    monkeypatch.setattr(sliding, "MAX_PUSH_FORCE", 0.02)
+    run(environment, [0.1, 0.0, 0.0, 0.0], 160)
     seen = environment.task.rollout.devices
     (slipped,) = environment.task.rollout.slipped[:, 0]
     moved = seen.insertion[0, 0] - before
     assert slipped > 1e-3
-    assert moved == pytest.approx(165 * 0.1 * STEP - slipped, abs=1e-4)
-    assert 0.02 < seen.push[0, 0] < 0.05
+    assert moved == pytest.approx(160 * 0.1 * STEP - slipped, abs=1e-4)
+    assert seen.push[0, 0] == pytest.approx(0.02, rel=0.02)
     applied = environment.physics.data.ptr.qfrc_applied
     assert applied.max() == pytest.approx(seen.push[0, 0])
     # The friction in the lumen stays when the devices stop.

@@ -1,6 +1,7 @@
 """The library of endovascular devices, and their division into links."""
 
 import dataclasses
+import itertools
 import math
 import warnings
 
@@ -223,14 +224,14 @@ WIRE_035_GLIDE = _hydrophilic_wire(
     0.035 * INCH,
     (0.50e-3, 0.28e-3),
     Arc(8e-3, math.radians(45)),
-    tip_links=4,
+    tip_links=5,
 )
 WIRE_014_MICRO = _hydrophilic_wire(
     "wire_014_micro",
     0.014 * INCH,
     (0.20e-3, 0.12e-3),
     Arc(4e-3, math.radians(45)),
-    tip_links=6,
+    tip_links=7,
 )
 
 DEVICES: dict[str, Device] = {
@@ -305,9 +306,9 @@ class Discretisation:
     def link_lengths(self, *devices: Device) -> np.ndarray:
         """Lengths (n,) of the links of a chain from proximal to distal, m.
 
-        The distal part of a chain of coaxial devices has links as short as those of
-        their tips. A shape proximal of it, under a wire that leads by more, has longer
-        links.
+        The longest tip has as many links as the device with most of them. Where it is
+        bent the most, links are half as long as where it is straight. A shape proximal
+        of it, under a wire that leads by more, has longer links.
 
         Args:
             *devices: one, or coaxial ones.
@@ -316,7 +317,6 @@ class Discretisation:
             ValueError: if the longest tip is as long as the chain.
         """
         tip_length = max(device.tip_length for device in devices)
-        shortest = min(device.tip_length / device.tip_links for device in devices)
         shaft_length = self.working_length - tip_length
         if shaft_length <= 0:
             names = " in ".join(repr(device.name) for device in devices)
@@ -325,7 +325,19 @@ class Discretisation:
                 f"{names} alone takes {tip_length} m"
             )
         shaft = math.ceil(round(shaft_length / self.shaft_link, 6))
-        tip = round(tip_length / shortest)
-        return np.concatenate(
-            [np.full(shaft, shaft_length / shaft), np.full(tip, tip_length / tip)]
+        tip = max(device.tip_links for device in devices)
+        lengths = np.full(tip, tip_length / tip)
+        arcs = [np.cumsum([a.length for a in d.tip_shape[::-1]]) for d in devices]
+        edges = np.unique(np.concatenate([[0.0, tip_length], *arcs]))
+        edges = edges[edges <= tip_length]
+        bent = np.array(
+            [
+                max(abs(each.rest_angle(far, near)) for each in devices) / (far - near)
+                for near, far in itertools.pairwise(edges.tolist())
+            ]
         )
+        if bent.any():
+            links = np.append(0.0, np.cumsum((bent + bent.max()) * np.diff(edges)))
+            places = np.linspace(0.0, links[-1], tip + 1)
+            lengths = np.diff(np.interp(places, links, edges))[::-1]
+        return np.concatenate([np.full(shaft, shaft_length / shaft), lengths])
