@@ -7,8 +7,8 @@ from cathsim_dmc.entities.arena import BLOOD_DENSITY
 from cathsim_dmc.entities.chain import TIMESTEP, TORSION_ARMATURE, Chain
 from cathsim_dmc.entities.coaxial import carried_mass
 
-# Lag of the drives of the tip, s. It has no source; with 0.05 s, noise on the motors whips
-# the tip into the wall (docs/soak.md).
+# Lag of the drives of the tip, s. It has no source; with 0.05 s, noise on the motors
+# whips the tip into the wall (docs/soak.md).
 STEERING_LAG = 0.2
 
 
