@@ -51,7 +51,8 @@ def export(
     if str(run).startswith(pretrained.PREFIX):
         path = pretrained.pretrained_path(str(run))
         policy: Any = str(run)
-        old, state, shapes, config = pretrained.read_pretrained(path)
+        old, network, shapes, config = pretrained.read_pretrained(path)
+        state = network.state_dict()
         training = old["training"]
     else:
         policy = Checkpoint.open(run)

@@ -14,8 +14,7 @@ from cathsim_dmc.physics.randomisation import START_JITTER, Episode
 from cathsim_dmc.physics.readings import ModelIndex
 from cathsim_dmc.tasks.scene import Scene
 
-# How long the device settles; its hinges relax in 0.4 s.
-_SETTLING_TIME = 2.0  # s
+_SETTLING_TIME = 2.0  # s, after which the device rests
 _STARTS_ALONG_ROUTE = 16
 # How much deeper a displacement may put the links behind the head into the wall, m.
 _PRESSED = 2e-4
