@@ -1,4 +1,4 @@
-"""Vessels that live: blood that flows, in both paths, on any threads."""
+"""Vessels that live: flow, wall and motion, in both paths, on any threads."""
 
 import dataclasses
 
@@ -18,6 +18,7 @@ STEPS = 8
 DRAWN = {
     "flow": {"rate": (60, 90), "peak": (0.4, 1.0), "phase": (0, 1)},
     "wall": {"modulus": (0.3e6, 0.6e6), "support": (0.5, 1.0)},
+    "motion": {"breathing": (0.5, 1.0), "breath_phase": (0, 1)},
 }
 
 
@@ -173,7 +174,7 @@ def test_a_wall_of_a_thousand_times_the_modulus_is_the_rigid_one():
     ("given", "words"),
     [
         ("liquid", "rigid, silicone, living"),
-        (3, "mapping of flow, wall"),
+        (3, "mapping of flow, wall, motion"),
         ({"wall": {"modulus": 1.0}}, "vessel wall: modulus is 1.0.*10000 to 1e.09 Pa"),
         ({"wall": {"thickness": (0.0, 1.0)}}, "vessel wall: thickness.*0.005 m"),
         ({"wall": {"support": None}}, "vessel wall: support is None"),
@@ -184,6 +185,12 @@ def test_a_wall_of_a_thousand_times_the_modulus_is_the_rigid_one():
         ({"flow": {"split": "even"}}, "split is 'even'.*measured, murray"),
         ({"flow": "fast"}, "True, False, or some of rate"),
         ({"flows": True}, "some of flow"),
+        ({"motion": {"heart": 0.1}}, "vessel motion: heart is 0.1.*0 to 0.012 m"),
+        ({"motion": {"breath_rate": 0}}, "vessel motion: breath_rate.*4 to 60 1/min"),
+        (
+            {"flow": True, "motion": {"rate": 70}},
+            "rate is 70, and the flow has a heart.*give rate of the flow alone",
+        ),
     ],
 )
 def test_what_no_vessel_does_is_refused(given, words):

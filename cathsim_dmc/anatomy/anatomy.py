@@ -29,6 +29,7 @@ from cathsim_dmc.anatomy.circulation import Circulation
 from cathsim_dmc.anatomy.curves import Curve, smooth_tree
 from cathsim_dmc.anatomy.field import Field
 from cathsim_dmc.anatomy.loading import check_places
+from cathsim_dmc.anatomy.motion import Motion
 from cathsim_dmc.anatomy.parts import End, Goal, Inlet, Surface
 
 _FORMAT = {"format": "cathsim-anatomy", "version": 3, "units": "m", "frame": "LPS"}
@@ -124,6 +125,11 @@ class Anatomy:
     def circulation(self) -> Circulation:
         """How the inflow of blood is shared among the vessels."""
         return Circulation.of(self)
+
+    @cached_property
+    def motion(self) -> Motion:
+        """How heart and breathing move it."""
+        return Motion.of(self)
 
     def depth(self, points: ArrayLike) -> Array:
         """Signed depth (...) of `points` (..., 3) in the lumen, metres, > 0 inside.

@@ -35,6 +35,7 @@ _TYPES = int(mujoco.mjtGeom.mjNGEOMTYPES)
 # Impedance of all contacts with a field. It does not change with the depth, so the
 # contact is a spring of one stiffness, and its rattle (docs/pair.md) has m = 0.
 IMPEDANCE = 0.95
+_EXCURSION = 40e-3  # m, by which a moving wall may leave the box of its field
 
 
 class Bore:
@@ -83,6 +84,10 @@ class _Table:
         self._words[5:8] = native.offsets("mjData", data)
         solimp = native.offsets("mjModel", ("geom_solimp",))
         self._words[loops.GEOM_SOLIMP // 8] = solimp[0]
+        nuserdata = native.offsets("mjModel", ("nuserdata",))
+        self._words[loops.NUSERDATA // 8] = nuserdata[0]
+        user = native.offsets("mjData", ("userdata", "time"))
+        self._words[loops.USERDATA // 8 : loops.TIME // 8 + 1] = user
         self._library = _mujoco_library()
         table = (ctypes.c_void_p * (_TYPES * _TYPES)).in_dll(
             self._library, "mjCOLLISIONFUNC"
@@ -119,6 +124,15 @@ class _Table:
         row[2 : 2 + len(kept)] = [array.ctypes.data for array in kept]
         row[0] = key  # last: threads may look for other entries meanwhile
 
+    def move(self, key: int, lattice: np.ndarray) -> None:
+        """Gives the field of an entry a motion, for simulations that have one."""
+        from cathsim_dmc.collision.loops import ENTRY, HEAD, MOTION_ENTRY
+
+        rows = self._words[HEAD:].reshape(-1, ENTRY)
+        row = rows[np.flatnonzero(rows[:, 0] == key)[0]]
+        self._kept[key].append(lattice)
+        row[MOTION_ENTRY // 8] = lattice.ctypes.data
+
     def knows(self, key: int) -> bool:
         """Whether there is an entry."""
         return key in self._kept
@@ -154,14 +168,24 @@ def register(field: Field | Bore) -> tuple[float, ...]:
     return (MARK, *map(float, parts))
 
 
-def carrier(field: Field | Bore) -> dict[str, Any]:
-    """Attributes of the geom that carries a field, on a body that has its frame."""
+def carrier(field: Field | Bore, motion: np.ndarray | None = None) -> dict[str, Any]:
+    """Attributes of the geom that carries a field, on a body that has its frame.
+
+    Args:
+        field: wall that touches from its inside.
+        motion: lattice of `anatomy.motion.Motion`, by which it moves in simulations
+            with `physics.motion.Moving`; None for a wall at rest.
+    """
     low, high = field.box
+    user, around = register(field), 0.0
+    if motion is not None:
+        around = _EXCURSION
+        _get_table().move(_key([int(part) for part in user[1:]]), motion)
     return {
         "type": "box",
         "pos": (low + high) / 2,
-        "size": (high - low) / 2,
-        "user": register(field),
+        "size": (high - low) / 2 + around,
+        "user": user,
     }
 
 

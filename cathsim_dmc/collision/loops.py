@@ -7,6 +7,8 @@ import math
 import numpy as np
 
 from cathsim_dmc.anatomy.field_loops import FREE, clearance_at, gradient_at
+from cathsim_dmc.anatomy.motion_loops import MARK as MOTION
+from cathsim_dmc.anatomy.motion_loops import VALUES, WARP, in_space, warp
 from cathsim_dmc.collision.native import (
     address_of,
     call_collision,
@@ -36,10 +38,13 @@ from cathsim_dmc.compiled import compiled
     ERROR,
     MESSAGE,
     GEOM_SOLIMP,
-) = range(0, 104, 8)
+    NUSERDATA,
+    USERDATA,
+    TIME,
+) = range(0, 128, 8)
 HEAD = 16  # words
 # An entry: key, kind, addresses of the place of the carrier's middle in the field's
-# frame, and of head, coarse lattice, index and samples.
+# frame, of head, coarse lattice, index and samples, and of the lattice of its motion.
 ENTRY, CAPACITY = 8, 1 << 14
 LUMEN, BORE = 0, 1
 # Numbers of a carrier geom: the mark, then the key of its field in three parts, which
@@ -73,6 +78,10 @@ SOFT = 0.7
 # any lets the light tip jump by most of a millimetre.
 _TOUCH = 2e-5
 _AT_WALL = -1e-9  # m, the depth of a link so close
+# In a moving vessel a capsule is looked for by its straight image at rest, which is off
+# by so much, m, and by the strain of space; its contacts are looked up exactly.
+_IMAGE, _STRAIN = 0.2e-3, 1.7
+MOTION_ENTRY = 56  # bytes from an entry to the address of the lattice of its motion
 
 
 @compiled
@@ -451,6 +460,32 @@ def into(frame, way):
 
 
 @compiled
+def key_of(table, model, geom):
+    """Key of the field that a geom carries; 0 for none."""
+    stride = word(model + word(table + NUSER_GEOM))
+    if stride < USER:
+        return np.int64(0)
+    user = numbers(word(model + word(table + GEOM_USER)) + 8 * stride * geom, USER)
+    if user[0] != MARK:
+        return np.int64(0)
+    key = (np.int64(user[1]) * PART + np.int64(user[2])) * PART
+    return key + np.int64(user[3])
+
+
+@compiled
+def motion_of(table, model, data):
+    """Address of the parameters of a simulation's motion; 0 for none."""
+    count = word(model + word(table + NUSERDATA))
+    place = word(data + word(table + USERDATA))
+    user, start = numbers(place, count), 0
+    while start + 2 < count:
+        if user[start + 2] == MOTION:
+            return place + 8 * (start + 2)
+        start += 2 + int(user[start + 1])
+    return np.int64(0)
+
+
+@compiled
 def collide(model, data, contacts, geom1, geom2, margin, before):
     """Contacts of a capsule or a sphere with a box, which may carry a field.
 
@@ -458,13 +493,7 @@ def collide(model, data, contacts, geom1, geom2, margin, before):
     would be compiled once for each.
     """
     table = address_of(SYMBOL)
-    stride = word(model + word(table + NUSER_GEOM))
-    key = np.int64(0)
-    if stride >= USER:
-        user = numbers(word(model + word(table + GEOM_USER)) + 8 * stride * geom2, USER)
-        if user[0] == MARK:
-            key = (np.int64(user[1]) * PART + np.int64(user[2])) * PART
-            key += np.int64(user[3])
+    key = key_of(table, model, geom2)
     if key == 0:
         old = word(table + before)
         return call_collision(old, model, data, contacts, geom1, geom2, margin)
@@ -490,33 +519,67 @@ def collide(model, data, contacts, geom1, geom2, margin, before):
     limit = radius + margin + near
     impedance = numbers(word(model + word(table + GEOM_SOLIMP)) + 40 * geom1, 1)[0]
     soft = impedance == SOFT and half > 0.0 and word(entry + 8) == LUMEN
-    seen = touches(entry, local, axis, half, closed, limit)
+    motion, space = word(entry + MOTION_ENTRY), np.int64(0)
+    if motion != 0:
+        space = motion_of(table, model, data)
+    if space != 0:
+        time = numbers(data + word(table + TIME), 1)[0]
+        lattice, course = numbers(motion, _COUNT), numbers(space, _COUNT)
+        values, there = np.empty((VALUES, 4)), np.empty(WARP)
+        warp(lattice, course, time, local[0], local[1], local[2], values, there)
+        at_rest = (there[0], there[1], there[2])
+        x, y, z = (
+            there[3] * axis[0] + there[4] * axis[1] + there[5] * axis[2],
+            there[6] * axis[0] + there[7] * axis[1] + there[8] * axis[2],
+            there[9] * axis[0] + there[10] * axis[1] + there[11] * axis[2],
+        )
+        stretch = math.sqrt(x * x + y * y + z * z)
+        way = (x / stretch, y / stretch, z / stretch)
+        reach = _STRAIN * (limit - there[12]) + _IMAGE
+        seen = touches(entry, at_rest, way, half * stretch, closed, reach)
+    else:
+        time, stretch, reach, way = 0.0, 1.0, limit, axis
+        lattice = course = there = np.empty(0)
+        values = np.empty((0, 4))
+        seen = touches(entry, local, axis, half, closed, limit)
     if seen[0] == 0:
         return np.int32(0)
     rows, written = np.empty((6, 4)), 0
     for n in range(seen[0]):
         t, depth = (seen[3], seen[4]) if n else (seen[1], seen[2])
+        at_end = abs(t) >= half * stretch
+        t /= stretch
         place = along(local, axis, t)
+        if space != 0:
+            warp(lattice, course, time, place[0], place[1], place[2], values, there)
+            place = (there[0], there[1], there[2])
+            depth = clearance(entry, place[0], place[1], place[2])
+            if depth >= FREE:
+                continue
         normal = away(entry, place[0], place[1], place[2])
         if normal == (0.0, 0.0, 0.0):
             continue
         # A sphere may have one contact, so one plane.
-        around = 0 if half == 0.0 else 1 + int(abs(t) >= half)
-        planes = tangents(entry, place, axis, normal, depth, limit, around, rows)
+        around = 0 if half == 0.0 else 1 + int(at_end)
+        planes = tangents(entry, place, way, normal, depth, reach, around, rows)
+        if space != 0:
+            in_space(there, rows, planes)
         if soft and planes == 1:
             for k in range(4):
                 rows[1, k] = rows[0, k]
             planes = 2
-        for plane in range(min(planes, _MOST - written)):
+        for plane in range(planes):
+            if written == _MOST or rows[plane, 3] > limit:
+                continue
             contact = numbers(contacts + 80 * written, 10)
             distance = rows[plane, 3] - radius
-            reach = radius + 0.5 * distance
+            reached = radius + 0.5 * distance
             contact[0] = min(distance, _AT_WALL) if near > 0.0 else distance
             for k in range(3):
                 towards = 0.0
                 for i in range(3):
                     towards -= frame[3 * k + i] * rows[plane, i]
-                contact[1 + k] = centre[k] + t * turned[3 * k + 2] + reach * towards
+                contact[1 + k] = centre[k] + t * turned[3 * k + 2] + reached * towards
                 contact[4 + k] = towards
                 contact[7 + k] = 0.0
             written += 1

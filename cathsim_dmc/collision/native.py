@@ -77,6 +77,77 @@ def offsets(struct: str, names: Sequence[str]) -> np.ndarray:
     return np.array(found, dtype=np.int64)
 
 
+_CONTACT = """
+<mujoco>
+  <worldbody>
+    <geom type="plane" size="1 1 1"/>
+    <body pos="0 0 0.9"><freejoint/><geom size="1"/></body>
+  </worldbody>
+</mujoco>
+"""
+
+
+def contact_places() -> np.ndarray:
+    """Where contacts and their constraints lie in memory, proved.
+
+    Returns:
+        (10,) int64, bytes: in mjData of the number of contacts (int32), of their
+        address and that of the Jacobian; size of a contact, and in it its position,
+        frame, dimension, second geom and first constraint (int32 the last three), and
+        in mjData of the number of constraints.
+
+    Raises:
+        RuntimeError: if they do not lie where MuJoCo's own description says.
+    """
+    model = mujoco.MjModel.from_xml_string(_CONTACT)
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    places = _places("mjData")
+    inner, size, _ = _lay(structs.STRUCTS["mjContact"].fields)
+    names = ("ncon", "contact", "efc_J")
+    own = ("pos", "frame", "dim", "geom2", "efc_address")
+    found = [places[name] for name in names]
+    found += [size, *(inner[name] for name in own), places["nefc"]]
+    count = ctypes.c_int32.from_address(data._address + places["ncon"]).value
+    first = ctypes.c_int64.from_address(data._address + places["contact"]).value
+    jacobian = ctypes.c_int64.from_address(data._address + places["efc_J"]).value
+    contact = data.contact[0]
+    read = [
+        *(ctypes.c_double * 3).from_address(first + inner["pos"]),
+        *(ctypes.c_double * 9).from_address(first + inner["frame"]),
+        *(ctypes.c_int32.from_address(first + inner[n]).value for n in own[2:]),
+        ctypes.c_int32.from_address(data._address + places["nefc"]).value,
+    ]
+    known = [*contact.pos, *contact.frame, contact.dim, contact.geom2]
+    known += [contact.efc_address, data.nefc]
+    proved = read == known and jacobian == data.efc_J.ctypes.data and count == 1
+    if not proved:
+        raise RuntimeError(
+            f"mjContact of MuJoCo {mujoco.__version__} is not laid out as it is said "
+            "to be; install a version that pyproject.toml allows"
+        )
+    return np.array(found, dtype=np.int64)
+
+
+def follow(function: Any) -> int:
+    """Has MuJoCo call a compiled function in `mjcb_passive`.
+
+    Returns:
+        Address of the function that stood there before, which it must call; 0 for none.
+
+    Raises:
+        RuntimeError: if a Python function stands there.
+    """
+    before = mujoco.get_mjcb_passive()
+    if before is not None and not hasattr(before, "argtypes"):
+        raise RuntimeError(
+            f"mjcb_passive is the Python function {before!r}, which compiled functions "
+            "cannot call; remove it with mujoco.set_mjcb_passive(None)"
+        )
+    mujoco.set_mjcb_passive(function.ctypes)
+    return 0 if before is None else ctypes.cast(before, ctypes.c_void_p).value or 0
+
+
 def _proved(owner: mujoco.MjModel | mujoco.MjData, name: str, place: int) -> bool:
     """Whether memory holds what MuJoCo's own Python types know of a field."""
     try:

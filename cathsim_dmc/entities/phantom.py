@@ -78,19 +78,21 @@ class Phantom(composer.Entity):
             rgba=_LUMEN_COLOUR if drawn else (0, 0, 0, 0),
         )
 
-    def add_wall(self, device_body, hole: float = np.inf) -> None:
+    def add_wall(self, device_body, hole: float = np.inf, moving: bool = False) -> None:
         """Adds the carrier of the wall and the sensors of its contacts with a device.
 
         Args:
             device_body: root body of the device, an element of the same model tree.
             hole: radius of the hole in the cap over the inlet, m; open if larger.
+            moving: whether heart and breathing may move it.
         """
         root = self._mjcf_root.root_model
         lumen = self._anatomy.lumen.with_hole(hole)
+        motion = self._anatomy.motion.lattice if moving else None
         root.worldbody.add(
             "geom",
             name="wall",
-            **fields.carrier(lumen),
+            **fields.carrier(lumen, motion),
             **wall_contact(self._friction),
             mass=0,
             group=5,

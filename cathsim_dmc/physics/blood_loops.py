@@ -1,11 +1,10 @@
 """Drag of blood, compiled; MuJoCo calls it in every physics step. See `blood`."""
 
-import ctypes
 import math
 
-import mujoco
 import numpy as np
 
+from cathsim_dmc.anatomy.circulation import BEAT
 from cathsim_dmc.collision import native
 from cathsim_dmc.collision.native import (
     address_of,
@@ -28,10 +27,6 @@ _FIRST = 2
 _MODEL = ("nuserdata", "body_geomadr", "geom_size", "body_dofadr", "body_dofnum", "nv")
 _DATA = ("userdata", "xipos", "xmat", "cvel", "subtree_com", "cdof", "qfrc_passive")
 _DATA += ("time",)
-# Inflow over a beat of 1 s: ms and mL/s (ADAN56, Boileau 2015, as in openBF).
-_TIMES = (0, 22, 41, 61, 80, 99, 128, 158, 177, 196, 245, 322, 351, 390, 415, 438, 1000)
-_FLOWS = (0, 0, 105, 273, 405, 536, 573, 536, 489, 452, 315, 179, 137, 0, -163, 0, 0)
-_BEAT = np.interp(np.arange(1001), _TIMES, _FLOWS) / max(_FLOWS)
 _BEFORE = 8 * (len(_MODEL) + len(_DATA))
 _SYMBOL = "cathsim_blood"
 # Offsets of these fields, and the function that stood in `mjcb_passive`.
@@ -42,10 +37,10 @@ native.symbol(_SYMBOL, _TABLE)
 @compiled
 def beat(phase):
     """Inflow of the aorta over that at its peak, at a phase in beats."""
-    place = (phase - math.floor(phase)) * (len(_BEAT) - 1)
-    first = min(int(place), len(_BEAT) - 2)
+    place = (phase - math.floor(phase)) * (len(BEAT) - 1)
+    first = min(int(place), len(BEAT) - 2)
     share = place - first
-    return (1.0 - share) * _BEAT[first] + share * _BEAT[first + 1]
+    return (1.0 - share) * BEAT[first] + share * BEAT[first + 1]
 
 
 @native.callback("void(int64, int64)")
@@ -117,14 +112,6 @@ def install() -> None:
     """
     if _TABLE[0]:
         return
-    before = mujoco.get_mjcb_passive()
-    if before is not None:
-        if not hasattr(before, "argtypes"):
-            raise RuntimeError(
-                f"mjcb_passive is the Python function {before!r}, which compiled blood "
-                "cannot call; remove it with mujoco.set_mjcb_passive(None)"
-            )
-        _TABLE[-1] = ctypes.cast(before, ctypes.c_void_p).value or 0
     _TABLE[len(_MODEL) : -1] = native.offsets("mjData", _DATA)
     _TABLE[: len(_MODEL)] = native.offsets("mjModel", _MODEL)
-    mujoco.set_mjcb_passive(_drag.ctypes)
+    _TABLE[-1] = native.follow(_drag)

@@ -17,8 +17,6 @@ radius a and the wall, 2πµu / ln(R/a) per length.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping, Sequence
-from typing import Any
 
 import numpy as np
 
@@ -27,11 +25,11 @@ from cathsim_dmc.anatomy import Anatomy
 from cathsim_dmc.anatomy.circulation import Circulation
 from cathsim_dmc.entities.chain import Chain
 from cathsim_dmc.physics.blood import StillBlood
+from cathsim_dmc.physics.drawn import Range, drawable, drawn
 from cathsim_dmc.physics.effects import World
+from cathsim_dmc.physics.motion import Moving
 from cathsim_dmc.physics.randomisation import Episode
 from cathsim_dmc.physics.readings import Readings
-
-Range = float | Sequence[float]
 
 # Least ratio of the radii of lumen and link, for the friction along the link.
 _LEAST_GAP = 1.2
@@ -71,35 +69,12 @@ _LIMITS = {
 }
 
 
-def drawable(options: Any, limits: Mapping[str, tuple[float, float, str]]) -> None:
-    """Checks fields that are numbers or ranges between limits, or None by default.
-
-    Raises:
-        ValueError: if one of them is neither; names it.
-    """
-    for name, (low, high, unit) in limits.items():
-        value = getattr(options, name)
-        if bounds.is_number(value):
-            bounds.number(name, value, low, high, unit)
-        elif value is not None or getattr(type(options), name) is not None:
-            ends = bounds.interval(name, value, low, high, unit)
-            object.__setattr__(options, name, ends)
-
-
-def drawn(value: Range, random_state: np.random.RandomState) -> float:
-    """A number as it is, or one drawn from a range (low, high)."""
-    if isinstance(value, Sequence):
-        low, high = value
-        return float(random_state.uniform(low, high))
-    return float(value)
-
-
 class Flow(StillBlood):
     """Pulsatile flow in each simulation's anatomy."""
 
-    def __init__(self, options: FlowOptions):
-        """Takes the options of the task."""
-        self._options = options
+    def __init__(self, options: FlowOptions, moving: Moving | None = None):
+        """Takes the options of the task, and what moves the vessels."""
+        self._options, self._moving = options, moving
 
     def num_parameters(self, chain: Chain) -> int:
         """Those of blood."""
@@ -142,6 +117,8 @@ class Flow(StillBlood):
     def act(self, action: np.ndarray, state: Readings) -> np.ndarray:
         """Finds the velocity at the middle of each link, and its delay."""
         middles = 0.5 * (state.centreline[:, :-1] + state.centreline[:, 1:])
+        if self._moving is not None:
+            middles = self._moving.to_rest(middles)
         found = self._at(middles)
         self.velocity[:] = found[..., :3]
         self._delay[:] = found[..., 3] / self._wave_speed[:, None]
@@ -150,6 +127,12 @@ class Flow(StillBlood):
         friction = 2 * np.pi * self._header[:, 2:3] / np.log(gap)
         self._friction[:] = np.where(inside, friction, 0.0)
         return action
+
+    def heart(self, index: int) -> dict[str, float]:
+        """Rate (1/s) and phase of the heart and pulse wave velocity (m/s)."""
+        rate, phase = self._header[index, 5:].tolist()
+        speed = float(self._wave_speed[index])
+        return {"rate": rate, "phase": phase, "wave_speed": speed}
 
     def _at(self, points: np.ndarray) -> np.ndarray:
         """What `flow_loops.velocities` finds at points (N, P, 3): (N, P, 5)."""
@@ -163,7 +146,7 @@ class Flow(StillBlood):
 
         Args:
             time: (N,) of the episodes, s.
-            state: At that time.
+            state: At that time, places at rest.
         """
         inflow, rate, phase = self._header[:, 4:].T
         phases = rate * time + phase

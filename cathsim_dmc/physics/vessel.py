@@ -14,17 +14,19 @@ from cathsim_dmc.physics import forces
 from cathsim_dmc.physics.blood import StillBlood
 from cathsim_dmc.physics.effects import Effect
 from cathsim_dmc.physics.flow import Flow, FlowOptions
+from cathsim_dmc.physics.motion import OF_HEART, MotionOptions, Moving
 from cathsim_dmc.physics.readings import Readings
 from cathsim_dmc.physics.wall import STIFFENING, Wall, WallOptions
 
 PRESETS: dict[str, dict[str, Any]] = {
     "rigid": {},
     "silicone": {"wall": {"modulus": 0.52e6, "thickness": 1.5e-3}},
-    "living": {"flow": True, "wall": True},
+    "living": {"flow": True, "wall": True, "motion": True},
 }
 
 
-INFO = ("heart_phase", "blood_speed", "indentation")  # of a vessel that lives
+# Figures of a vessel that lives.
+INFO = ("heart_phase", "breath_phase", "blood_speed", "indentation")
 
 
 class VesselReadings(NamedTuple):
@@ -32,18 +34,20 @@ class VesselReadings(NamedTuple):
 
     Attributes:
         heart_phase: (N,), 0 to 1, at the heart.
+        breath_phase: (N,), 0 to 1; 0 is the end of expiration.
         blood_velocity: (N, 3), at the head, m/s, world frame.
         indentation: (N,), of the wall under the deepest contact, m.
     """
 
     heart_phase: np.ndarray
+    breath_phase: np.ndarray
     blood_velocity: np.ndarray
     indentation: np.ndarray
 
     def info(self) -> dict[str, np.ndarray]:
         """Figures (N,) for `tasks.step.Step.info`, of `INFO`."""
         speed = np.sqrt((self.blood_velocity**2).sum(axis=-1))
-        values = self.heart_phase, speed, self.indentation
+        values = self.heart_phase, self.breath_phase, speed, self.indentation
         return dict(zip(INFO, values, strict=True))
 
 
@@ -55,15 +59,18 @@ def read(
     Args:
         effects: Of the task.
         time: (N,), s, of the episodes.
-        state: At that time.
+        state: At that time, places at rest.
         rows: (N, M * 14), of the wall's sensor.
     """
-    if not any(isinstance(effect, Flow | Wall) for effect in effects):
+    if not any(isinstance(effect, Flow | Wall | Moving) for effect in effects):
         return None
     deepest = -forces.distances(rows).min(axis=-1, initial=0.0)
     still = np.zeros(len(time))
-    found = VesselReadings(still, np.zeros((len(time), 3)), deepest)
+    found = VesselReadings(still, still, np.zeros((len(time), 3)), deepest)
     for effect in effects:
+        if isinstance(effect, Moving):
+            heart, breath = effect.phases()
+            found = found._replace(heart_phase=heart, breath_phase=breath)
         if isinstance(effect, Flow):
             found = found._replace(**effect.read(time, state))
     return found
@@ -76,10 +83,21 @@ class VesselOptions:
     Attributes:
         flow: Options of the flow of blood.
         wall: Options of a wall that gives.
+        motion: Options of a vessel that moves.
     """
 
     flow: FlowOptions | None = None
     wall: WallOptions | None = None
+    motion: MotionOptions | None = None
+
+    def __post_init__(self):
+        for name in OF_HEART if self.flow and self.motion else ():
+            value = getattr(self.motion, name)
+            if value is not None:
+                raise ValueError(
+                    f"vessel motion: {name} is {value}, and the flow has a heart of "
+                    f"its own; give {name} of the flow alone"
+                )
 
     @classmethod
     def make(cls, value: Any) -> VesselOptions:
@@ -103,17 +121,19 @@ class VesselOptions:
     @property
     def living(self) -> bool:
         """Whether there is anything to observe of it."""
-        return self.flow is not None or self.wall is not None
+        return not self.flow == self.wall == self.motion
 
-    @property
-    def blood(self) -> StillBlood:
-        """The effect of the blood."""
-        return StillBlood() if self.flow is None else Flow(self.flow)
-
-    @property
-    def walls(self) -> list[Effect]:
-        """The effects of the wall."""
-        return [] if self.wall is None else [Wall(self.wall)]
+    def effects(self) -> tuple[StillBlood, list[Effect]]:
+        """The effect of the blood, and those of the wall."""
+        moving = None if self.motion is None else Moving(self.motion)
+        blood = StillBlood() if self.flow is None else Flow(self.flow, moving)
+        walls: list[Effect] = []
+        if self.wall is not None:
+            walls.append(Wall(self.wall, moving))
+        if moving is not None:
+            moving.flow = blood if isinstance(blood, Flow) else None
+            walls.append(moving)
+        return blood, walls
 
     @property
     def deepest(self) -> float | None:
@@ -124,9 +144,11 @@ class VesselOptions:
         """Raises ValueError if an anatomy cannot do what the options ask for."""
         if self.flow is not None:
             anatomy.circulation.check(anatomy)
+        if self.motion is not None:
+            self.motion.check(anatomy)
 
 
-_KINDS = {"flow": FlowOptions, "wall": WallOptions}
+_KINDS = {"flow": FlowOptions, "wall": WallOptions, "motion": MotionOptions}
 
 
 def _part(name: str, value: Any) -> Any:

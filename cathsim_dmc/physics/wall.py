@@ -27,8 +27,9 @@ from cathsim_dmc.anatomy import Anatomy
 from cathsim_dmc.anatomy.circulation import Circulation
 from cathsim_dmc.entities.chain import Chain
 from cathsim_dmc.entities.contact import CONTACT_SOLIMP, CONTACT_SOLREF
+from cathsim_dmc.physics.drawn import Range, drawable, drawn
 from cathsim_dmc.physics.effects import Effect, World
-from cathsim_dmc.physics.flow import Range, drawable, drawn
+from cathsim_dmc.physics.motion import Moving
 from cathsim_dmc.physics.randomisation import Episode
 from cathsim_dmc.physics.readings import Readings
 
@@ -120,9 +121,9 @@ class Wall(Effect):
 
     model_fields = ("geom_solref", "geom_solimp")
 
-    def __init__(self, options: WallOptions):
-        """Takes the options of the task."""
-        self._options = options
+    def __init__(self, options: WallOptions, moving: Moving | None = None):
+        """Takes the options of the task, and what moves the vessels."""
+        self._options, self._moving = options, moving
 
     def bind(self, world: World) -> None:
         """Finds the links in the model."""
@@ -181,6 +182,8 @@ class Wall(Effect):
     def act(self, action: np.ndarray, state: Readings) -> np.ndarray:
         """Looks up the vessel around the middle of each link."""
         middles = 0.5 * (state.centreline[:, :-1] + state.centreline[:, 1:])
+        if self._moving is not None:
+            middles = self._moving.to_rest(middles)
         out = np.empty((middles.shape[1], 5))
         for index, points in enumerate(np.ascontiguousarray(middles)):
             self._look(points, *self._circulations[index].arrays, out)

@@ -171,7 +171,7 @@ class ExpertPolicy(Policy):
         view = self._view
         if view is None:
             raise RuntimeError("the expert must be reset before it acts")
-        readings, wall_force, devices = view.readings, view.wall_force, view.devices
+        readings, wall_force, devices = view.resting, view.wall_force, view.devices
         if not self._several:
             return self._experts[0].act(readings, wall_force, devices)
         actions = []

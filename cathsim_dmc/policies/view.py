@@ -45,6 +45,11 @@ class View:
         return self._rollout.readings
 
     @property
+    def resting(self) -> Readings:
+        """The same, with all places where they are in the vessel at rest."""
+        return self._rollout.resting
+
+    @property
     def wall_force(self) -> WallForce:
         """Force on the wall over the last control step; arrays (N,), N."""
         return self._rollout.wall_force

@@ -145,8 +145,8 @@ class NavigationConfig:
         own = [copy.copy(effect) for effect in self.effects]
         delay = ActionDelay(self.ranges.longest_delay)
         model = RandomisedModel(self.ranges)
-        vessel = self.vessel_options
-        return [vessel.blood, model, delay, *vessel.walls, *own, devices_of(chain)]
+        blood, walls = self.vessel_options.effects()
+        return [blood, model, delay, *walls, *own, devices_of(chain)]
 
     def _check_devices(self):
         if self.devices is None:

@@ -313,6 +313,7 @@ def depth(frame: Frame) -> Observation:
 
 @OBSERVATIONS.row(
     Entry("heart_phase", 2, "1", "sine and cosine of the phase of the heart", -1, 1),
+    Entry("breath_phase", 2, "1", "sine and cosine of that of breathing", -1, 1),
     Entry("blood_velocity", 3, "m/s", "of the blood at the head, world frame"),
     Entry("indentation", 1, "m", "of the wall under the deepest contact", 0),
     living=True,
@@ -321,9 +322,11 @@ def vessel(frame: Frame) -> Observation:
     """Heart, blood and wall of a vessel that lives."""
     state = frame.vessel
     assert state is not None
-    angle = 2 * np.pi * state.heart_phase
+    phases = 2 * np.pi * np.stack([state.heart_phase, state.breath_phase])
+    heart, breath = np.stack([np.sin(phases), np.cos(phases)], axis=-1)
     return {
-        "heart_phase": np.stack([np.sin(angle), np.cos(angle)], axis=-1),
+        "heart_phase": heart,
+        "breath_phase": breath,
         "blood_velocity": state.blood_velocity,
         "indentation": state.indentation[..., None],
     }

@@ -16,6 +16,7 @@ from cathsim_dmc.imaging.device import Shadow
 from cathsim_dmc.imaging.fluoroscopy import Fluoroscope
 from cathsim_dmc.physics import forces, readings, vessel
 from cathsim_dmc.physics.effects import Effects, World
+from cathsim_dmc.physics.motion import Moving
 from cathsim_dmc.physics.single_device import SingleDevice
 from cathsim_dmc.physics.sliding import CoaxialReadings
 from cathsim_dmc.physics.stepper import CONTROL_TIMESTEP, Stepper
@@ -90,6 +91,8 @@ class Rollout:
         num_actions = len(scene.catheter.action_names)
         listed = config.effects_on(scene.catheter)
         self._listed, stepper.deepest = listed, config.vessel_options.deepest
+        moving = [effect for effect in listed if isinstance(effect, Moving)]
+        self._moving = moving[0] if moving else None
         self._devices = cast(SingleDevice, listed[-1])
         self._effects = Effects(
             listed,
@@ -207,7 +210,7 @@ class Rollout:
             All simulations as they stand; no episode ends at its start.
         """
         self._measure(self._stepper.still(indices), indices)
-        head = self.readings.head
+        head = self.resting.head
         shortest = self._objective.path_distance(head)
         begun = Path(head, np.zeros(len(head)), shortest)
         self._path = merged(self._path, part(begun, indices), indices)
@@ -219,9 +222,10 @@ class Rollout:
         magnitudes, warned = self._stepper.end()
         self._steps += 1
         self._measure(magnitudes)
-        self._path = self._path.to(self.readings.head)
+        resting = self.resting
+        self._path = self._path.to(resting.head)
         errors = self._monitor.errors(
-            warned, self._steps, self.readings.centreline, self.wall_force.peak_max
+            warned, self._steps, resting.centreline, self.wall_force.peak_max
         )
         self._errors = np.array([error or "" for error in errors], dtype=_REASON)
         return self._step()
@@ -230,7 +234,7 @@ class Rollout:
         """Measures all simulations, or some, when the others have not moved."""
         now = self._views.read()
         time, last = CONTROL_TIMESTEP * self._steps, self._stepper.contact_rows[:, -1]
-        vessel_now = vessel.read(self._listed, time, now, last)
+        vessel_now = vessel.read(self._listed, time, self._rest(now), last)
         force, devices = forces.wall_force(magnitudes), self._devices.read(now)
         new = Measured(now, force, devices, vessel_now)
         if rows is not None and hasattr(self, "_measured"):
@@ -248,15 +252,15 @@ class Rollout:
             ended: (N,) bool, None for what the objective and the physics say.
         """
         errors = tuple(error or None for error in self._errors.tolist())
-        goal = self._objective.goal
-        distance = straight(self.readings.head, goal)
+        goal, resting = self._objective.goal, self.resting
+        distance = straight(resting.head, goal)
         failed = None
         if errors.count(None) < len(errors):
             failed = np.array([error is not None for error in errors])
         outcome = judge(
             self._objective,
             Measurement(
-                self.readings,
+                resting,
                 self.wall_force,
                 self._action,
                 self._previous_action,
@@ -269,7 +273,7 @@ class Rollout:
         if failed is not None:
             terminated = terminated | failed
         return Step(
-            observation=self._observe(goal, fresh),
+            observation=self._observe(self.goal, fresh),
             outcome=outcome,
             terminated=terminated,
             truncated=~terminated & (self._steps >= self._config.max_steps),
@@ -298,11 +302,18 @@ class Rollout:
                 None if devices is None else devices.points,
             )
         if self._routes is not None:
-            ahead = self._routes.ahead(self._case_of, state.head, state.head_frame)
+            head = self._rest(state).head
+            ahead = self._routes.ahead(self._case_of, head, state.head_frame)
         force, chain = self.wall_force, self._chain
         frame = Frame(state, force, self._action, goal, chain, images, ahead, devices)
         frame = frame._replace(vessel=self._measured.vessel)
         return observations.observe(self._names, frame)
+
+    def _rest(self, state: readings.Readings) -> readings.Readings:
+        if self._moving is None:
+            return state
+        places = self._moving.to_rest(state.centreline)
+        return state._replace(centreline=places, head=places[:, -1])
 
     # Snapshots.
 
@@ -407,9 +418,23 @@ class Rollout:
         return self._index
 
     @property
+    def resting(self) -> readings.Readings:
+        """Readings, with places where they are in the vessel at rest: judged there."""
+        return self._rest(self.readings)
+
+    @property
     def readings(self) -> readings.Readings:
         """State of the devices after the last step or reset."""
         return self._measured.readings
+
+    @property
+    def goal(self) -> np.ndarray:
+        """(3,) or (N, 3) m, the goal in space, which moves with its vessel."""
+        goal = self._objective.goal
+        if self._moving is None:
+            return goal
+        every = np.broadcast_to(goal, self.readings.head.shape)
+        return self._moving.to_space(every.copy())
 
     @property
     def shadows(self) -> Sequence[Shadow]:

@@ -15,6 +15,7 @@ from cathsim_dmc.entities.phantom import Phantom
 from cathsim_dmc.entities.robot import Robot
 from cathsim_dmc.entities.sheath import Sheath, straight
 from cathsim_dmc.physics import effects
+from cathsim_dmc.physics.motion import add_clock
 from cathsim_dmc.physics.wall import soften
 from cathsim_dmc.tasks import placement
 from cathsim_dmc.tasks.config import NavigationConfig
@@ -109,7 +110,9 @@ class Scene:
             ),
             robot=robot or Robot(device_radius=radius),
         )
-        scene._attach(effects.userdata_size(config.effects_on(catheter), catheter))
+        moving = config.vessel_options.motion is not None
+        user_data = effects.userdata_size(config.effects_on(catheter), catheter)
+        scene._attach(user_data, moving)
         box = anatomy.lumen.box
         if drawn:
             vertices = anatomy.surface.vertices
@@ -123,10 +126,10 @@ class Scene:
             self, anatomy=other.anatomy, goal=other.goal, placement=other.placement
         )
 
-    def _attach(self, user_data: int):
+    def _attach(self, user_data: int, moving: bool):
         if user_data:
             self.arena.mjcf_model.size.nuserdata = user_data
-        if len(self.catheter.links) <= _DENSE_LINKS:
+        if len(self.catheter.links) <= _DENSE_LINKS or moving:
             self.arena.mjcf_model.option.jacobian = "dense"
         self.arena.attach(self.phantom)
         place = self.placement
@@ -144,8 +147,10 @@ class Scene:
             )
             self.arena.attach(entity, site)
         self.phantom.add_wall(
-            self.catheter.links[0], self.sheath.bore_radius + _AROUND_SHEATH
+            self.catheter.links[0], self.sheath.bore_radius + _AROUND_SHEATH, moving
         )
+        if moving:
+            add_clock(self.arena.mjcf_model)
 
     @property
     def coaxial(self) -> bool:

@@ -1,4 +1,4 @@
-"""The vessel against closed forms: blood that flows, a wall that gives."""
+"""The vessel against closed forms: blood that flows, a wall that gives and moves."""
 
 from __future__ import annotations
 
@@ -20,6 +20,7 @@ from cathsim_dmc.physics.blood import BLOOD_VISCOSITY, StillBlood
 from cathsim_dmc.physics.effects import userdata_size
 from cathsim_dmc.physics.stepper import PHYSICS_TIMESTEP
 from cathsim_dmc.physics.wall import law, stiffness
+from cathsim_dmc.validation import motion
 from cathsim_dmc.validation.checks import Check, Report
 from cathsim_dmc.validation.damping import LINK, _uniform, drag, fill
 from cathsim_dmc.validation.rig import Rig
@@ -267,4 +268,6 @@ def flow_checks() -> list[Check]:
 
 def validate_vessel() -> Report:
     """Checks what `vessel` does to blood and wall."""
-    return Report("vessel", [*flow_checks(), *wall_checks()])
+    tube, phantom = straight_tube(motion.RADIUS), phantoms.load("type1")
+    moving = motion.checks(tube, phantom)
+    return Report("vessel", [*flow_checks(), *wall_checks(), *moving])

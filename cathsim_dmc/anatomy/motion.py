@@ -1,0 +1,176 @@
+"""How heart and breathing move an anatomy, as displacements of space.
+
+A place x in space holds what lies at X = x - u(x, t) in the anatomy at rest, with
+u = a(t) H(x) + b(t) B(x): H of the heart and B of breathing at amplitude 1. The radius
+grows by g(X) p(t - s/c), s the way from the heart. Rest is the end of diastole and of
+expiration. H, B, g and s lie on one lattice, between whose points they are linear.
+
+The heart moves the root of the aorta caudal, anterior and to the left, by amounts that
+fade along the aorta. Breathing moves all by what Sailer 2015 measured, in inspiration
+anterior, medial and caudal; a branch moves like its ostium. The sheath rests: near an
+open end all displacements pass into none.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from cathsim_dmc.anatomy.centreline import Array
+
+if TYPE_CHECKING:
+    from cathsim_dmc.anatomy.anatomy import Anatomy
+
+_STEP = 6e-3  # m, of the lattice
+_SMOOTH = 25e-3  # m, over which a displacement is that of the aorta around
+_ACROSS = 2e-3  # m, over which a radius passes into that of the branch
+_FADE = 60e-3  # m, from an open end, over which displacements begin
+_HEART_REACH = 50e-3  # m along the aorta, over which the heart's motion fades
+_HEART_WAY = np.array([0.3, -0.3, -0.9]) / np.sqrt(0.99)  # LPS
+# Breathing: ascending aorta, BCA, LSA, descending aorta, m (Sailer 2015), and to the
+# left where medial is.
+_BREATHING = np.array([8.9e-3, 12.0e-3, 11.1e-3, 4.9e-3])
+_MEDIAL = np.array([1.0, 1.0, -1.0, -1.0])
+_INSPIRATION = (0.33, -0.47, -0.82)  # medial, posterior, superior
+PULSE_PRESSURE = 5.33  # kPa, 40 mmHg
+# Largest norm of the gradient of a displacement; at 1 space folds.
+STEEPEST = 0.6
+
+
+@dataclass(frozen=True, eq=False)
+class Motion:
+    """Displacements of space around an anatomy.
+
+    Attributes:
+        lattice: (7 + 8 a b c,) origin (3) and step, m, shape (a, b, c), and at each
+            point what `motion_loops.VALUES` says.
+    """
+
+    lattice: Array
+
+    @classmethod
+    def of(cls, anatomy: Anatomy) -> Motion:
+        """The motion of an anatomy, with its open ends at rest."""
+        low, high = anatomy.lumen.box
+        shape = np.ceil((high - low) / _STEP).astype(int) + 1
+        lattice = np.stack(np.meshgrid(*map(np.arange, shape), indexing="ij"), -1)
+        points = (low + _STEP * lattice).reshape(-1, 3)
+        values = np.concatenate(
+            [_values(anatomy, part) for part in np.array_split(points, 32)]
+        )
+        return cls(np.concatenate([low, [_STEP], shape, values.ravel()]))
+
+    def check(self, name: str, heart: float, breathing: float) -> None:
+        """Refuses amplitudes that fold space.
+
+        Args:
+            name: Of the anatomy.
+            heart: Largest amplitude of the heart, m.
+            breathing: Largest amplitude of breathing.
+
+        Raises:
+            ValueError: if the displacement changes too steeply.
+        """
+        shape = self.lattice[4:7].astype(int)
+        values = self.lattice[7:].reshape(*shape, 8)
+        steepest = 0.0
+        for share in (0.0, 1.0):
+            u = share * heart * values[..., :3] + breathing * values[..., 3:6]
+            slopes = np.stack([np.gradient(u, _STEP, axis=k) for k in range(3)], -1)
+            steepest = max(steepest, np.linalg.norm(slopes, 2, axis=(-2, -1)).max())
+        if steepest > STEEPEST:
+            raise ValueError(
+                f"vessel motion: heart {1e3 * heart:g} mm and breathing {breathing:g} "
+                f"fold {name!r}: displacements change by {steepest:.2f} m a metre, "
+                f"{STEEPEST:g} are allowed; give smaller amplitudes"
+            )
+
+    def to_rest(self, parameters: Array, time: float, points: Array) -> Array:
+        """Places at rest (..., 3) of places in space (..., 3), m."""
+        from cathsim_dmc.anatomy import motion_loops  # late, as numba takes long
+
+        flat = np.require(points.reshape(-1, 3), np.float64, ["C", "W"])
+        out = np.empty_like(flat)
+        motion_loops.rest(self.lattice, parameters, time, flat, out)
+        return out.reshape(points.shape)
+
+    def to_space(
+        self, parameters: Array, time: float, points: Array
+    ) -> tuple[Array, Array]:
+        """Places in space (..., 3) of places at rest (..., 3), within 1e-6 m.
+
+        Returns:
+            And by how much the radius has grown there (...), m.
+        """
+        from cathsim_dmc.anatomy import motion_loops
+
+        flat = np.require(points.reshape(-1, 3), np.float64, ["C", "W"])
+        out, growth = np.empty_like(flat), np.empty(len(flat))
+        motion_loops.moved(self.lattice, parameters, time, flat, out, growth)
+        return out.reshape(points.shape), growth.reshape(points.shape[:-1])
+
+
+def distensibility(radius: Array) -> Array:
+    """Area distensibility over that of a wide artery (n,), radii (n,) m.
+
+    From Eh/r = 3e6 exp(-13.5 r) + 3.37e5 g/s²/cm, r in cm (Mynard, in pwdb).
+    """
+    return 3.37e5 / (3e6 * np.exp(-1350.0 * radius) + 3.37e5)
+
+
+def _values(anatomy: Anatomy, points: Array) -> Array:
+    """What the lattice holds (n, 8) at points (n, 3) m."""
+    blood = anatomy.circulation
+    middles, radii = blood.ends.mean(axis=1), blood.radii.mean(axis=1)
+    ways = blood.ways.mean(axis=1)
+    distance = np.linalg.norm(points[:, None] - middles, axis=-1)
+    weight = _shares(-0.5 * (distance / _SMOOTH) ** 2)
+    heart, breath = _along_aorta(anatomy, ways)
+    across = _shares((radii - distance) / _ACROSS)
+    radius = across @ radii
+    growth = 0.5 * PULSE_PRESSURE * distensibility(radius) * radius
+    begun = np.ones(len(points))
+    for end in anatomy.ends:
+        if end.open:
+            away = np.linalg.norm(points - end.position, axis=-1) - end.radius
+            share = np.clip(away / _FADE, 0.0, 1.0)
+            begun *= share**2 * (3.0 - 2.0 * share)
+    columns = [weight @ heart, weight @ breath, growth[:, None]]
+    moving = [begun[:, None] * each for each in columns]
+    return np.hstack([*moving, across @ ways[:, None]])
+
+
+def _shares(exponent: Array) -> Array:
+    """Weights (n, S) that sum to 1."""
+    weight = np.exp(exponent - exponent.max(axis=1, keepdims=True))
+    return weight / weight.sum(axis=1, keepdims=True)
+
+
+def _along_aorta(anatomy: Anatomy, ways: Array) -> tuple[Array, Array]:
+    """Displacements (S, 3), (S, 3) of the segments by heart and breathing."""
+    blood, tree = anatomy.circulation, anatomy.tree
+    root, names = tree.root, list(tree.vessels)
+    length = root.centreline.length
+    begins = {}
+    for name, vessel in tree.vessels.items():
+        top = vessel.parent == root.name
+        begins[name] = blood.courses[name].begin if top else begins.get(vessel.parent)
+    ostia = [begin for begin in begins.values() if begin is not None]
+    first, last = min(ostia, default=length / 2), max(ostia, default=length / 2)
+    place = np.array(
+        [
+            way if begins[names[number]] is None else begins[names[number]]
+            for way, number in zip(ways, blood.vessel, strict=True)
+        ]
+    )
+    fading = np.exp(-0.5 * (place / _HEART_REACH) ** 2)
+    sites = [first / 2, first, last, max(length, last + 1e-3)]
+    medial, posterior, superior = _INSPIRATION
+    unit = np.stack(
+        [medial * _MEDIAL, np.full(4, posterior), np.full(4, superior)], axis=-1
+    )
+    unit *= (_BREATHING / np.linalg.norm(unit, axis=1))[:, None]
+    breath = np.stack([np.interp(place, sites, unit[:, k]) for k in range(3)], -1)
+    return fading[:, None] * _HEART_WAY, breath

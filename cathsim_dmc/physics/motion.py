@@ -1,0 +1,179 @@
+"""A vessel that moves: pulsation, heartbeat and breathing (`anatomy.motion`).
+
+The wall of a moving vessel is the field at rest, looked up at x - u(x, t) in every
+physics step, from the time and the parameters of the simulation. Its contacts see the
+velocity of the wall (`collision.carrying`): friction carries a device along. An episode
+begins at rest, at the end of diastole and of expiration, and moves in full after
+`motion_loops.RAMP`.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Protocol
+
+import mujoco
+import numpy as np
+
+from cathsim_dmc.anatomy import Anatomy
+from cathsim_dmc.anatomy.motion import Motion
+from cathsim_dmc.entities.chain import Chain
+from cathsim_dmc.physics.drawn import Range, drawable, drawn
+from cathsim_dmc.physics.effects import Effect, World
+from cathsim_dmc.physics.randomisation import Episode
+from cathsim_dmc.physics.readings import Readings
+
+_LIMITS = {
+    "heart": (0.0, 12e-3, "m"),
+    "breathing": (0.0, 2.0, ""),
+    "distensibility": (0.0, 0.08, "1/kPa"),
+    "rate": (30.0, 200.0, "1/min"),
+    "phase": (0.0, 1.0, ""),
+    "wave_speed": (2.0, 20.0, "m/s"),
+    "breath_rate": (4.0, 60.0, "1/min"),
+    "breath_phase": (0.0, 1.0, ""),
+}
+OF_HEART = {"rate": 60.0, "phase": 0.0, "wave_speed": 4.6}
+_CLOCK_MASS = 0.1  # kg; a contact that moves at 0.05 m/s feels 0.25 kg⁻¹ of it
+
+
+@dataclasses.dataclass(frozen=True)
+class MotionOptions:
+    """How a vessel moves; a range (low, high) is drawn from in each episode.
+
+    Attributes:
+        heart: Way of the aortic root in a beat, m, 0 to 0.012.
+        breathing: Amplitude over that of Sailer 2015, 0 to 2.
+        distensibility: Area distensibility of a wide artery, 1/kPa, 0 to 0.08; 0.044
+            when young, 0.02 at about 50 years.
+        rate: Heart rate, 1/min, 30 to 200; None for that of the flow, or 60.
+        phase: Phase of the heart at the start of an episode, 0 to 1; None for that of
+            the flow, or 0.
+        wave_speed: Pulse wave velocity, m/s, 2 to 20; None for that of the flow, or
+            4.6.
+        breath_rate: Of breathing, 1/min, 4 to 60.
+        breath_phase: Phase of breathing at the start, 0 to 1; 0 is the end of
+            expiration.
+    """
+
+    heart: Range = 5.5e-3
+    breathing: Range = 1.0
+    distensibility: Range = 0.02
+    rate: Range | None = None
+    phase: Range | None = None
+    wave_speed: Range | None = None
+    breath_rate: Range = 15.0
+    breath_phase: Range = 0.0
+
+    def __post_init__(self):
+        drawable(self, _LIMITS)
+
+    def check(self, anatomy: Anatomy) -> None:
+        """Raises ValueError if the largest amplitudes fold an anatomy."""
+        largest = (np.max(each) for each in (self.heart, self.breathing))
+        anatomy.motion.check(anatomy.name, *map(float, largest))
+
+
+class Hearted(Protocol):
+    """A flow with a heart."""
+
+    def heart(self, index: int) -> dict[str, float]:
+        """Rate, 1/s, phase and wave speed, m/s, of one simulation."""
+        ...
+
+
+class Moving(Effect):
+    """Moves the wall of each simulation."""
+
+    def __init__(self, options: MotionOptions):
+        """Takes the options of the task; `flow` may become one with the same heart."""
+        self._options = options
+        self.flow: Hearted | None = None
+
+    def num_parameters(self, chain: Chain) -> int:
+        """Those of `motion_loops`."""
+        from cathsim_dmc.anatomy import motion_loops  # late, as numba takes long
+
+        del chain
+        self._loops = motion_loops
+        return motion_loops.PARAMETERS
+
+    def bind(self, world: World) -> None:
+        """Has contacts see the velocity of the wall."""
+        from cathsim_dmc.collision import carrying
+
+        super().bind(world)
+        carrying.install()
+        self._wall = mujoco.mj_name2id(world.model, mujoco.mjtObj.mjOBJ_GEOM, "wall")
+        self._motions: dict[int, Motion] = {}
+        self._clock = np.zeros(world.num_simulations)
+
+    def enter(self, index: int, anatomy: Anatomy) -> None:
+        """Takes the motion of an anatomy."""
+        self._motions[index] = anatomy.motion
+
+    def restart(
+        self, index: int, episode: Episode, random_state: np.random.RandomState
+    ) -> None:
+        """Draws amplitudes, rates and phases."""
+        values = {}
+        for name in _LIMITS:
+            value = getattr(self._options, name)
+            default = OF_HEART.get(name, 0.0)
+            values[name] = drawn(default if value is None else value, random_state)
+        values["rate"] /= 60.0
+        values["breath_rate"] /= 60.0
+        if self.flow is not None:
+            values |= self.flow.heart(index)
+        self.world.parameters[index] = (self._loops.MARK, *values.values(), self._wall)
+        self._clock[index] = 0.0
+
+    @property
+    def state(self) -> dict[str, np.ndarray]:
+        """Time of each episode; the rest are parameters."""
+        return {"clock": self._clock}
+
+    def act(self, action: np.ndarray, state: Readings) -> np.ndarray:
+        """Counts the control steps; the last effect of the vessel."""
+        from cathsim_dmc.physics.stepper import CONTROL_TIMESTEP
+
+        self._clock += CONTROL_TIMESTEP
+        return action
+
+    def phases(self) -> tuple[np.ndarray, np.ndarray]:
+        """Phases (N,), (N,) of heart and breathing, 0 to 1."""
+        _, _, _, _, rate, phase, _, breath, begin, _ = self.world.parameters.T
+        return (rate * self._clock + phase) % 1.0, (breath * self._clock + begin) % 1.0
+
+    def to_rest(self, points: np.ndarray) -> np.ndarray:
+        """Places at rest (N, ..., 3) of places in space (N, ..., 3), m."""
+        found = [
+            self._motions[index].to_rest(self.world.parameters[index], time, row)
+            for index, (row, time) in enumerate(zip(points, self._time(), strict=True))
+        ]
+        return np.array(found)
+
+    def to_space(self, points: np.ndarray) -> np.ndarray:
+        """Places in space (N, ..., 3) of places at rest (N, ..., 3), m."""
+        found = [
+            self._motions[index].to_space(self.world.parameters[index], time, row)[0]
+            for index, (row, time) in enumerate(zip(points, self._time(), strict=True))
+        ]
+        return np.array(found)
+
+    def _time(self) -> list[float]:
+        """Time of what MuJoCo has derived: one physics step before the end."""
+        step = self.world.model.opt.timestep
+        return np.maximum(self._clock - step, 0.0).tolist()
+
+
+def add_clock(root) -> None:
+    """Adds the body of the last degree of freedom, see `collision.carrying`.
+
+    Args:
+        root: MJCF of the whole scene, to which nothing is attached any more.
+    """
+    clock = root.worldbody.add("body", name="vessel_clock", gravcomp=1)
+    inertia = [_CLOCK_MASS * 1e-4] * 3
+    clock.add("inertial", pos=[0, 0, 0], mass=_CLOCK_MASS, diaginertia=inertia)
+    clock.add("joint", name="vessel_clock", type="slide", axis=[1, 0, 0])

@@ -1,0 +1,73 @@
+"""A moving vessel: where its wall is, what it carries, what is judged in it."""
+
+import numpy as np
+import pytest
+
+from cathsim_dmc import suite
+from cathsim_dmc.anatomy import phantoms
+from cathsim_dmc.physics.vessel import VesselOptions
+from cathsim_dmc.simulation.batch import BatchSimulation
+from cathsim_dmc.validation import motion, vessel
+
+
+@pytest.fixture(scope="module")
+def tube():
+    """A straight tube along z."""
+    return vessel.straight_tube(motion.RADIUS)
+
+
+@pytest.fixture(scope="module")
+def arch():
+    """The smallest phantom."""
+    return phantoms.load("simple1")
+
+
+def test_the_radius_follows_the_pulse_which_travels(tube):
+    beat = motion.diameters(tube)
+    assert 1e3 * beat.deviation < motion.WALL_BOUND
+    np.testing.assert_allclose(beat.delays, beat.expected, atol=1e-4)
+
+
+def test_the_wall_is_where_heart_and_breathing_put_it(arch):
+    assert 1e3 * motion.wall_place(arch) < motion.WALL_BOUND
+
+
+def test_a_wall_carries_what_rests_on_it(tube):
+    assert motion.slip(tube) < motion.SLIP_BOUND
+
+
+def test_motion_in_the_walls_frame_is_that_under_its_inertia(tube):
+    assert motion.frame(tube) < motion.FRAME_BOUND
+
+
+def test_places_in_space_are_found_and_the_sheath_rests(arch):
+    course = motion.parameters(5.5e-3, 1.0, 0.02)
+    points = np.concatenate([v.centreline.points for v in arch.tree.vessels.values()])
+    there, growth = arch.motion.to_space(course, 2.2, points)
+    np.testing.assert_allclose(
+        arch.motion.to_rest(course, 2.2, there), points, atol=1e-6
+    )
+    moved = np.linalg.norm(there - points, axis=1)
+    assert moved.max() > 8e-3 and growth.max() > 1e-4
+    inlet = np.linalg.norm(points - arch.inlet.position, axis=1).argmin()
+    assert moved[inlet] == 0.0 == growth[inlet]
+
+
+def test_motions_that_fold_space_are_refused(arch):
+    options = VesselOptions.make({"motion": {"breathing": (0.5, 2.0), "heart": 0.012}})
+    with pytest.raises(ValueError, match="breathing 2 fold 'simple1'.*smaller"):
+        options.check(arch)
+
+
+def test_goal_and_head_are_judged_in_the_vessel_at_rest():
+    task = suite.make_task("simple1_bca", vessel={"motion": True})
+    batch = BatchSimulation(task, 1, seeds=0)
+    batch.reset()
+    np.testing.assert_allclose(batch.rollout.goal[0], batch.rollout.objective.goal)
+    for _ in range(50):  # to the end of inspiration
+        step = batch.step(np.zeros((1, 21)))
+    rollout = batch.rollout
+    assert np.linalg.norm(rollout.goal[0] - rollout.objective.goal) > 5e-3
+    resting = np.linalg.norm(rollout.resting.head - rollout.objective.goal, axis=-1)
+    np.testing.assert_allclose(step.distance, resting)
+    np.testing.assert_allclose(step.info()["breath_phase"], 0.5, atol=1e-9)
