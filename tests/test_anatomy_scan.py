@@ -108,6 +108,17 @@ def test_saved_anatomy_keeps_its_depth(y_anatomy, tmp_path):
     assert again.scanned and again.lumen.digest == y_anatomy.lumen.digest
 
 
+def test_the_command_draws_what_it_imports(y_anatomy, tmp_path, monkeypatch, capsys):
+    from cathsim_dmc.anatomy.scan import importer
+    from cathsim_dmc.cli.phantoms import import_phantom
+
+    monkeypatch.setattr(importer, "import_scan", lambda *_, **options: y_anatomy)
+    import_phantom(Path("lumen.obj"), out=tmp_path / "one")
+    said = json.loads(capsys.readouterr().out)
+    assert Path(said["picture"]).parent == tmp_path / "one"
+    assert Path(said["picture"]).stat().st_size > 20_000
+
+
 @pytest.mark.slow
 def test_inlet_in_the_middle_cuts_the_lumen(y_scan):
     mesh, curves, _ = y_scan
@@ -212,6 +223,12 @@ def test_right_branches_share_the_brachiocephalic():
 def test_other_trunks_keep_their_names(names):
     tree = fork(*names)
     assert name_trunk(tree) is tree
+
+
+def test_branches_that_are_right_ones_need_no_name():
+    tree = name_trunk(fork("branch_2", "branch_1"), right={"branch_1", "branch_2"})
+    assert [v.parent for v in tree.vessels.values()] == [None, "aorta", "bca", "bca"]
+    assert list(tree.vessels) == ["aorta", "bca", "branch_2", "branch_1"]
 
 
 def test_ras_markup_and_table_are_the_same_curve(y_scan, tmp_path):

@@ -294,3 +294,79 @@ def test_a_small_tangle_between_large_triangles_is_mended():
     assert len(surface.faces) == len(tube.faces)
     assert surface.volume == pytest.approx(tube.volume)
     assert any("self-intersecting" in note for note in notes)
+
+
+def label_map(folder, kind, *, second=False):
+    """A label map of the Y tree in oblique voxels of 0.8 x 0.9 x 1.0 mm, RAS or LPS."""
+    turn = np.linalg.qr(np.random.default_rng(3).normal(size=(3, 3)))[0]
+    matrix = turn * (0.8, 0.9, 1.0)  # mm, LPS
+    points = marched(y_tree())[0]
+    inside = points @ np.linalg.inv(matrix).T
+    low = inside.min(axis=0) - 4
+    size = np.ceil(np.ptp(inside, axis=0) + 8).astype(int)
+    origin = matrix @ low
+    ijk = np.stack(np.meshgrid(*map(np.arange, size), indexing="ij"), -1)
+    places = (ijk @ matrix.T + origin) * 1e-3
+    depth = np.max(list(y_tree().depths(places).values()), axis=0)
+    voxels = np.where(depth > 0.0, 7, 0).astype(np.uint8)
+    if second:
+        voxels[0, 0, 0] = 3
+    path = folder / f"map{kind}"
+    if kind == ".nrrd":
+        nrrd = pytest.importorskip("nrrd")
+        header = {
+            "space": "left-posterior-superior",
+            "space directions": matrix.T,
+            "space origin": origin,
+            "Segment0_LabelValue": "7",
+            "Segment0_Name": "aorta",
+        }
+        nrrd.write(str(path), voxels, header)
+    else:
+        nibabel = pytest.importorskip("nibabel")
+        affine = np.eye(4)
+        affine[:3, :3], affine[:3, 3] = matrix, origin
+        affine[:2] *= -1.0  # RAS
+        nibabel.save(nibabel.Nifti1Image(voxels, affine), path)
+    return path
+
+
+@pytest.mark.parametrize("kind", [".nii.gz", ".nrrd"])
+def test_a_label_map_gives_the_surface_where_it_is(y_mesh, tmp_path, kind):
+    path = label_map(tmp_path, kind, second=True)
+    with pytest.raises(ValueError, match=r"2 labels: 3 \(1 voxels\), 7.*--label"):
+        read_lumen(path)
+    with pytest.raises(ValueError, match="has no label 4; it has 3"):
+        read_lumen(path, labels=(4,))
+    lumen = read_lumen(path, labels=(7,))
+    assert_closed(lumen)
+    assert lumen.units == "mm" and said(lumen, "label 7")
+    vertices, faces = y_mesh
+    for corner in (np.min, np.max):
+        both = [corner(x, axis=0) for x in (lumen.surface.vertices, vertices * 1e-3)]
+        np.testing.assert_allclose(*both, atol=0.8e-3)
+    truth = volume(vertices * 1e-3, faces)
+    assert lumen.surface.volume == pytest.approx(truth, rel=0.03)
+
+
+def test_what_is_no_label_map_is_refused(y_mesh, tmp_path, monkeypatch):
+    nibabel = pytest.importorskip("nibabel")
+    image = np.random.default_rng(0).normal(size=(5, 5, 5)).astype(np.float32)
+    nibabel.save(nibabel.Nifti1Image(image, np.eye(4)), tmp_path / "image.nii")
+    with pytest.raises(ValueError, match="not whole"):
+        read_lumen(tmp_path / "image.nii")
+    nibabel.save(
+        nibabel.Nifti1Image(np.zeros((4, 4, 4, 2), np.uint8), np.eye(4)),
+        tmp_path / "four.nii",
+    )
+    with pytest.raises(ValueError, match="three dimensions"):
+        read_lumen(tmp_path / "four.nii")
+    (tmp_path / "broken.nii.gz").write_bytes(b"x" * 400)
+    with pytest.raises(ValueError, match="cannot be read as nii"):
+        read_lumen(tmp_path / "broken.nii.gz")
+    mesh = write_obj(tmp_path / "a.obj", *y_mesh)
+    with pytest.raises(ValueError, match="label is for label maps"):
+        read_lumen(mesh, labels=(1,))
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
+    with pytest.raises(ValueError, match=r"cathsim-dmc\[segmentation\]"):
+        read_lumen(tmp_path / "image.nii")

@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from cathsim_dmc.anatomy import Anatomy
 
 phantoms = SubcommandApp()
+_PICTURE = "check.png"  # three views of an anatomy, in its directory
 
 
 @phantoms.command(name="import")
@@ -25,13 +26,16 @@ def import_phantom(
     units: Literal["mm", "cm", "m"] | None = None,
     frame: Literal["LPS", "RAS"] = "LPS",
     axes: str | None = None,
+    label: tuple[int, ...] = (),
     inlet: tuple[float, float, float] | None = None,
+    heart: tuple[float, float, float] | None = None,
     rename: tuple[str, ...] = (),
 ) -> int:
     """Turn the surface of a lumen into an anatomy.
 
     Args:
-        mesh: Surface of the lumen: OBJ, STL, PLY or VTP; ends open or capped.
+        mesh: Surface of the lumen: OBJ, STL, PLY or VTP; ends open or capped. Or a
+            label map: NIfTI or NRRD, whose unit and frame are its own.
         out: Directory of the anatomy.
         centreline: 3D Slicer curves (.mrk.json) or CSV files, one per branch; without
             any they are computed from the surface.
@@ -41,11 +45,14 @@ def import_phantom(
         axes: Of a scan that does not stand upright: where +x, +y and +z of that frame
             point in the patient, three of L, R, A, P, S, I, such as ILA; or nine
             numbers, the patient's left, back and head as directions in that frame.
+        label: Values of a label map that are the lumen.
         inlet: Where the device enters: a free end, or a place to cut the lumen at.
+        heart: Near the end of the aorta that is at the heart; found if not given.
         rename: Names of computed branches, each as computed=wanted.
     """
     from cathsim_dmc.anatomy.scan import report
     from cathsim_dmc.anatomy.scan.importer import import_scan
+    from cathsim_dmc.validation import views
 
     changes = dict(_change(text) for text in rename)
     notes: list[str] = []
@@ -59,15 +66,25 @@ def import_phantom(
         units=units,
         mesh_frame=frame,
         axes=axes,
+        labels=label,
         name=name or out.name,
         inlet=inlet,
+        heart=heart,
         rename=changes,
         progress=progress,
         notes=notes,
     )
     anatomy.save(out)
+    views.draw(anatomy, out / _PICTURE)
     figures = report.describe(anatomy)
-    print_json({"directory": str(out), "notes": notes, **figures})
+    print_json(
+        {
+            "directory": str(out),
+            "picture": str(out / _PICTURE),
+            "notes": notes,
+            **figures,
+        }
+    )
     return 0
 
 
@@ -188,7 +205,7 @@ def check(
 
     anatomy = _loaded(phantom, access)
     if figure is None and Path(phantom).is_dir():
-        figure = Path(phantom) / "check.png"
+        figure = Path(phantom) / _PICTURE
     report = validation.validate_anatomy(
         {anatomy.name: anatomy}, figure_path=figure, push=push
     )

@@ -67,11 +67,10 @@ def draw_view(ax: Axes, anatomy: Anatomy, view: tuple = VIEWS[0]) -> None:
     )
     for index, (vessel, branch) in enumerate(anatomy.tree.vessels.items()):
         line = flat(branch.centreline.points)
-        ax.plot(
-            *line.T,
-            color=style.COLOURS[index % len(style.COLOURS)],
-            lw=1.4,
-            label=vessel,
+        colour = style.COLOURS[index % len(style.COLOURS)]
+        ax.plot(*line.T, color=colour, lw=1.4, label=vessel)
+        ax.annotate(
+            vessel, tuple(line[-1]), (2, 2), textcoords="offset points", fontsize=6
         )
     for goal in anatomy.goals.values():
         place = flat(goal.position)

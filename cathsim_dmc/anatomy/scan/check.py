@@ -13,6 +13,7 @@ from cathsim_dmc.anatomy import lattice
 from cathsim_dmc.anatomy.anatomy import Anatomy
 from cathsim_dmc.anatomy.centreline import Vessel
 from cathsim_dmc.anatomy.parts import INLET_HOLE_RADIUS
+from cathsim_dmc.anatomy.scan.aorta import TURN, Bend, mirrored
 from cathsim_dmc.anatomy.scan.naming import ARCH_BRANCHES
 from cathsim_dmc.anatomy.scan.tree import END_TRIM, TAIL, TAIL_RADIUS
 from cathsim_dmc.anatomy.surface_depth import SurfaceDepth
@@ -157,8 +158,7 @@ def _parents(anatomy: Anatomy) -> TreeCheck:
 def _sides(anatomy: Anatomy) -> TreeCheck:
     """Whether the arch leads from right and front to left and back, as named.
 
-    A scan whose heart was taken for the end of the descending aorta, or whose frame is
-    not what it was said to be, has its LSA where the BCA is looked for.
+    It tells a scan that is mirrored, or whose frame is not what it was said to be.
     """
     tree, wrong = anatomy.tree, []
     root = tree.root
@@ -169,17 +169,13 @@ def _sides(anatomy: Anatomy) -> TreeCheck:
     along = np.diff([root.centreline.project(ostium).arc_length for ostium in ostia])
     if (along > 0).any() and (along < 0).any():
         wrong.append(f"{', '.join(names)} do not leave {root.name} in this order")
-    if len(vessels) > 1:
-        left, back, _ = ostia[-1] - ostia[0]
-        if left + back < 0.0:
-            wrong.append(
-                f"{names[-1]} leaves {root.name} {1e3 * abs(left):.0f} mm to the "
-                f"{'left' if left > 0 else 'right'} and {1e3 * abs(back):.0f} mm to "
-                f"the {'back' if back > 0 else 'front'} of {names[0]}: the scan does "
-                "not lie in the frame that was given, or its inlet is at the other "
-                "end of the aorta"
-            )
     fine = f"{len(vessels)} in order" if len(vessels) > 1 else "no arch"
+    bend = Bend.of(root.centreline.points)
+    if len(vessels) > 1 and bend.turn > TURN:
+        if (text := mirrored(bend.azimuth(bool(along[0] < 0)))) is not None:
+            wrong.append(text)
+        elif not bend.upright:
+            fine += ", in a scan that does not stand upright"
     return _finding("branches of the arch on their sides", wrong, fine)
 
 
@@ -197,7 +193,9 @@ def _free_ends(anatomy: Anatomy, measure: SurfaceDepth) -> TreeCheck:
         end = line.at(line.length)
         tail = line.radii[line.arc_length > line.length - 30e-3]
         wide = float(max(tail.max(), end.radius))
-        ahead = _lumen_beyond(measure, end.position, end.tangent, wide)
+        ahead = _lumen_beyond(
+            measure, end.position, end.tangent, wide, float(end.radius)
+        )
         beyond = float(np.linalg.norm(ahead - end.position, axis=1).max(initial=0.0))
         # What no device can follow was cut off, and is not missing.
         cut = TAIL + END_TRIM if end.radius < NARROW_END * TAIL_RADIUS else 0.0
@@ -226,6 +224,7 @@ def _lumen_beyond(
     position: np.ndarray,
     tangent: np.ndarray,
     radius: float,
+    narrow: float,
 ) -> np.ndarray:
     """Lattice points (n, 3) of the passable lumen ahead of a place, within 60 mm.
 
@@ -234,12 +233,16 @@ def _lumen_beyond(
         position: (3,) m, in the lumen.
         tangent: (3,), unit, ahead.
         radius: m, of the lumen up to here: what lies behind is cut off there.
+        narrow: m, radius at the place itself.
     """
-    spacing = float(np.clip(radius / 3.0, 0.5e-3, 2.0e-3))
-    reach = max(24 * spacing, (FREE_RADII + 1.5) * radius)
+    reach = (FREE_RADII + 1.5) * radius
+    spacing = float(np.clip(max(narrow / 3.0, reach / 40.0), 0.5e-3, 2.0e-3))
+    reach = max(24 * spacing, reach)
     shape = np.full(3, 2 * round(reach / spacing) + 1)
     low = position - 0.5 * (shape - 1) * spacing
-    ijk, _ = lattice.inside(depth, low, shape, spacing, PASSABLE)
+    # Lattice points lie beside the middle. Tails are cut off at `TAIL_RADIUS`.
+    deep = max(PASSABLE, TAIL_RADIUS - 0.5 * spacing)
+    ijk, _ = lattice.inside(depth, low, shape, spacing, deep)
     local = low + spacing * ijk - position
     along = local @ tangent
     aside = np.linalg.norm(local - along[:, None] * tangent, axis=1)

@@ -16,8 +16,6 @@ COVER = 1.5  # radii; what lies nearer to a way is no vessel of its own
 STUB = 3e-3  # m, shortest own vessel beyond that
 WIDE = 0.4  # of the widest free end: narrower ends are no inlet by default
 ROOT_WIDTH = 0.5  # of the inlet: narrower free ends do not continue the root
-LEG = 30e-3  # m, least distance of the top of an arch from both ends of an aorta
-BEHIND = 10e-3  # m by which the descending aorta lies behind the ascending one
 STARTS = 30e-3  # m along the lumen; curves that start nearer to an end start there
 
 
@@ -162,8 +160,7 @@ def plan_inlet(
         inlet: (3,) m near the end to use or in the middle of a vessel that is to be
             cut there, or None to choose: the end at which the curves start, else the
             wide end farthest along the lumen from their starts. Without curves it is
-            the end of an aorta that is not at the heart, else the widest. The heart
-            is at the widest end, but for an aorta whose other leg lies in front.
+            the widest.
 
     Raises:
         ValueError: if no end can be chosen; lists them.
@@ -184,40 +181,9 @@ def plan_inlet(
     elif curves:
         chosen = _chosen_by_curves(ways, ends, nodes, at_goal, curves)
     else:
-        wide = np.flatnonzero(width >= WIDE * width.max()).tolist()
-        root = int(width.argmax())
-        before = ways.deepest_from(nodes[root])
-        to = {k: ways.points[ways.trace(before, nodes[k])] for k in wide if k != root}
-        others = [k for k, way in to.items() if _arched(way)]
-        # From the heart an aorta turns back; other trees are entered by their trunk.
-        reach = ways.lengths_from(nodes[root])[nodes]
-        chosen = max(others, key=lambda k: reach[k]) if others else root
-        # A heart that was cut off above its root may be the narrower end.
-        if others and _behind(to[chosen]) < -BEHIND:
-            chosen = root
+        chosen = int(width.argmax())
     far = _far_end(ways, ends, at_goal, nodes[chosen], curves, chosen)
     return LumenEntry(position[chosen], True, far)
-
-
-def _arched(way: np.ndarray) -> bool:
-    """Whether a way (n, 3) between two ends turns back, as an aortic arch does."""
-    # From its top both ends lie on one side.
-    to_heart, to_end = way[0] - way, way[-1] - way
-    one, other = (np.linalg.norm(each, axis=1) for each in (to_heart, to_end))
-    cosine = np.einsum("nd,nd->n", to_heart, to_end) / np.maximum(one * other, 1e-12)
-    return bool((cosine[(one > LEG) & (other > LEG)] > 0.5).any())
-
-
-def _behind(way: np.ndarray) -> float:
-    """How far (m) the last leg of an arch (n, 3) lies behind its first.
-
-    Both are taken at the height of the higher end; +y is the patient's back.
-    """
-    height = max(way[0, 2], way[-1, 2])
-    top = int(way[:, 2].argmax())
-    legs = way[: top + 1], way[top:]
-    first, last = (leg[np.abs(leg[:, 2] - height).argmin()] for leg in legs)
-    return float(last[1] - first[1])
 
 
 def _ends_of_curves(ways, ends, lasts) -> np.ndarray:

@@ -15,6 +15,7 @@ from cathsim_dmc import bounds
 from cathsim_dmc.anatomy.anatomy import Anatomy
 from cathsim_dmc.anatomy.centreline import VesselTree
 from cathsim_dmc.anatomy.parts import Inlet, Surface
+from cathsim_dmc.anatomy.scan.arches import Arch
 from cathsim_dmc.anatomy.scan.check import check_tree
 from cathsim_dmc.anatomy.scan.curves import ScanCentreline, check_inside, read_curve
 from cathsim_dmc.anatomy.scan.ends import (
@@ -27,7 +28,7 @@ from cathsim_dmc.anatomy.scan.ends import (
 from cathsim_dmc.anatomy.scan.extract import DEVICE_RADIUS, centrelines, continued
 from cathsim_dmc.anatomy.scan.inlet import cut_open
 from cathsim_dmc.anatomy.scan.lumen import Lumen, read_lumen
-from cathsim_dmc.anatomy.scan.naming import name_branches, renamed
+from cathsim_dmc.anatomy.scan.naming import neutral_names, renamed
 from cathsim_dmc.anatomy.scan.places import flat_ends, place_goals, place_inlet
 from cathsim_dmc.anatomy.scan.tree import grow_tree
 from cathsim_dmc.anatomy.scan.trunk import name_trunk
@@ -60,8 +61,10 @@ def import_scan(
     units: str | None = None,
     mesh_frame: str = "LPS",
     axes: str | ArrayLike | None = None,
+    labels: Sequence[int] = (),
     name: str | None = None,
     inlet: Sequence[float] | None = None,
+    heart: Sequence[float] | None = None,
     root: str = ROOT,
     rename: Mapping[str, str] | None = None,
     progress: Callable[[str], None] | None = None,
@@ -71,6 +74,7 @@ def import_scan(
 
     Args:
         mesh_path: lumen surface (OBJ, STL, PLY or VTP); vessel ends open or capped.
+            Or a label map (NIfTI, NRRD), whose unit and frame are its own.
         centreline_paths: 3D Slicer markups or tables x,y,z[,radius], one per branch;
             the branch is called after the file (centreline-LCCA.mrk.json: "lcca").
             Without any they are computed, and named where the arch tells how.
@@ -79,10 +83,13 @@ def import_scan(
         mesh_frame: "LPS" or "RAS", of the mesh, of tables and of ``inlet``.
         axes: how that frame is turned in the patient, if the scan does not stand
             upright, such as "ILA", or nine numbers; see ``units.upright``.
+        labels: of a label map, the values that are the lumen.
         name: of the anatomy, by default the mesh file's.
         inlet: (x, y, z) where the device enters: a free end if one is near, else the
             lumen is cut there. By default the end at which the centrelines start,
             else the wide end farthest from their starts or from the widest end.
+        heart: (x, y, z) near the end of the aorta that is at the heart; None finds it
+            by width and length of both legs, their sides and their branches.
         root: name of the vessel that starts at the inlet.
         rename: new names of computed vessels by their computed names.
         progress: called with a line of text for every step, which begins with the
@@ -116,28 +123,32 @@ def import_scan(
     upright(axes)
     if units is not None:
         metres_per(units)
-    place = None
-    if inlet is not None:
-        place = np.array(bounds.vector("inlet", inlet, 3, unit="the mesh's unit"))
+    places: dict[str, np.ndarray | None] = {"inlet": None, "heart": None}
+    for key, given in (("inlet", inlet), ("heart", heart)):
+        if given is not None:
+            given = bounds.vector(key, given, 3, unit="the mesh's unit")
+            places[key] = np.array(given)
     _check_paths(centreline_paths)
     for path in centreline_paths:
         read_curve(path, units or "mm", mesh_frame)  # before the long steps
-    lumen = read_lumen(mesh_path, units, mesh_frame, axes, say)
+    lumen = read_lumen(mesh_path, units, mesh_frame, axes, labels, say)
     for text in lumen.notes:
         note(text)
-    if place is not None:
-        turn = upright(axes)
-        place = turn @ (place * frame_sign(mesh_frame) * metres_per(lumen.units))
     surface = lumen.surface
     measure = SurfaceDepth(surface)
-    _check_near(place, measure)
+    factor = frame_sign(mesh_frame) * metres_per(lumen.units)
+    for key, place in places.items():
+        if place is not None:
+            place = upright(axes) @ (place * factor)
+            _check_near(key, place, measure)
+            places[key] = place
     curves = _read_curves(centreline_paths, lumen, mesh_frame, axes, root)
     lines = {curve.name: _inside_part(curve, measure, lumen.units) for curve in curves}
     say(f"tree: looking for vessels in {len(surface.faces):,} triangles")
     ways = Ways(measure)
     for pinch in ways.pinches:
         note(f"the lumen is pinched to a slit at {_mm(pinch)}; vessels go on beyond")
-    tree, opening = _tree(measure, ways, lines, place, root, rename or {}, note)
+    tree, opening = _tree(measure, ways, lines, places, root, rename or {}, note)
     say(f"tree: {', '.join(_summary(tree))}")
     anatomy = Anatomy(
         name=name or Path(mesh_path).stem,
@@ -156,15 +167,18 @@ def import_scan(
     return anatomy
 
 
-def _tree(field, ways, lines, place, root, rename, note) -> tuple[VesselTree, Inlet]:
+def _tree(field, ways, lines, places, root, rename, note) -> tuple[VesselTree, Inlet]:
     """The tree of given lines, or of computed ones, and its inlet."""
     ends = free_ends(ways)
     lines = {key: _proximal_first(line, field) for key, line in lines.items()}
-    entry = plan_inlet(ways, ends, list(lines.values()), place)
-    drawn = bool(lines)
+    entry = plan_inlet(ways, ends, list(lines.values()), places["inlet"])
+    drawn, right = bool(lines), frozenset()
     if drawn:
-        if rename:
-            raise ValueError("rename is for computed centrelines; rename the files.")
+        if rename or places["heart"] is not None:
+            raise ValueError(
+                "rename and heart are for computed centrelines; with drawn ones rename "
+                "the files, and give the inlet."
+            )
         lines, added = continued(ways, ends, lines, entry)
         for key, length in added.items():
             note(
@@ -172,19 +186,26 @@ def _tree(field, ways, lines, place, root, rename, note) -> tuple[VesselTree, In
                 "ends; continued to the end"
             )
     else:
-        lines = _computed(ways, ends, entry, root, rename, note)
+        arch = Arch.of(ways, ends, places["heart"])
+        if arch is not None:
+            entry = arch.entry(places["inlet"], entry)
+            if (wrong := arch.wrong_side()) is not None:
+                raise ValueError(wrong)
+        lines, right = _computed(ways, ends, entry, arch, root, rename, note)
     tree = grow_tree(field, ways, lines, entry.position, entry.far, root, drawn)
-    return place_inlet(name_trunk(tree), entry.at_end)
+    return place_inlet(name_trunk(tree, right), entry.at_end)
 
 
 def _computed(
     ways: Ways,
     ends: Sequence[FreeEnd],
     entry: LumenEntry,
+    arch: Arch | None,
     root: str,
     rename: Mapping[str, str],
     note: Callable[[str], None],
-) -> dict[str, np.ndarray]:
+) -> tuple[dict[str, np.ndarray], frozenset[str]]:
+    """Computed curves by name, and those of the brachiocephalic artery."""
     found, thin = centrelines(ways, ends, entry)
     if not found:
         raise ValueError(
@@ -192,12 +213,13 @@ def _computed(
             f"({DEVICE_RADIUS * 2e3:.2f} mm) in for 15 mm, so there is no goal; its "
             f"ends are {listed(ends)}."
         )
-    start = ways.node(entry.position)
-    if entry.far is None:
-        line = found[0].points
-    else:
-        line = ways.points[ways.trace(ways.deepest_from(start), ways.node(entry.far))]
-    names = name_branches(line, [f.points for f in found], entry.far is not None)
+    curves = [f.points for f in found]
+    names, right = neutral_names(curves), ()
+    if arch is not None:
+        named = arch.named(curves)
+        names, right = named.names, named.right
+        for text in named.notes:
+            note(text)
     names = renamed(names, rename, root)
     open_names = [key for key in names if key.startswith("branch_")]
     if open_names:
@@ -210,7 +232,8 @@ def _computed(
     if thin:
         note(f"{thin} branches too thin or short for a 5 Fr catheter left out")
     note(f"inlet chosen at {_mm(entry.position)}")
-    return {key: f.points for key, f in zip(names, found, strict=True)}
+    lines = {key: f.points for key, f in zip(names, found, strict=True)}
+    return lines, frozenset(names[row] for row in right)
 
 
 def _prove(anatomy: Anatomy, mend: str, note: Callable[[str], None]) -> None:
@@ -234,12 +257,12 @@ def _cut(surface: Surface, opening: Inlet) -> Surface:
     return Surface(vertices[used], numbers.reshape(-1, 3))
 
 
-def _check_near(place: np.ndarray | None, measure: SurfaceDepth) -> None:
-    if place is not None and measure(place[None])[0] < -NEAR_INLET:
+def _check_near(key: str, place: np.ndarray, measure: SurfaceDepth) -> None:
+    if measure(place[None])[0] < -NEAR_INLET:
         raise ValueError(
-            f"inlet is {-measure(place[None])[0] * 1e3:.1f} mm away from the lumen; "
+            f"{key} is {-measure(place[None])[0] * 1e3:.1f} mm away from the lumen; "
             f"give a point in the lumen, or at most {NEAR_INLET * 1e3:g} mm from the "
-            "end by which the device enters."
+            f"end {'at the heart' if key == 'heart' else 'by which the device enters'}."
         )
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from cathsim_dmc.anatomy.parts import Surface
+from cathsim_dmc.anatomy.scan.labels import is_label_map, label_surface
 from cathsim_dmc.anatomy.scan.mesh import guess_units, read_triangles
 from cathsim_dmc.anatomy.scan.repair import mend
 from cathsim_dmc.anatomy.scan.units import UNITS, frame_sign, metres_per, upright
@@ -39,18 +40,21 @@ def read_lumen(
     units: str | None = None,
     frame: str = "LPS",
     axes: str | ArrayLike | None = None,
+    labels: Sequence[int] = (),
     say: Callable[[str], None] = lambda text: None,
 ) -> Lumen:
     """Read the surface of a lumen and mend it.
 
     Args:
         path: OBJ, STL, PLY or VTP; ends open or capped, any orientation, thin or
-            with the wall's thickness.
+            with the wall's thickness. Or a label map (NIfTI, NRRD), whose unit and
+            frame are its own.
         units: of its coordinates, a key of ``units.UNITS``, or None to guess by the
             lumen's width.
         frame: "LPS" or "RAS".
         axes: how the scan is turned if it does not stand upright; see
             ``units.upright``.
+        labels: of a label map, those that are the lumen; see `labels.label_surface`.
         say: called with a line of text for every step.
 
     Raises:
@@ -60,13 +64,21 @@ def read_lumen(
     if units is not None:
         metres_per(units)
     sign, turn = frame_sign(frame), upright(axes)
-    vertices, faces = read_triangles(path)
-    say(f"mesh: {len(faces):,} triangles read")
-    try:
-        units, why = guess_units(vertices, faces, units)
-    except ValueError as error:
-        raise ValueError(f"{path}: {error}") from error
-    vertices = (vertices * sign * UNITS[units]) @ turn.T
+    if is_label_map(path):
+        vertices, faces, why = label_surface(path, labels)
+        units, vertices = "mm", vertices @ turn.T
+    else:
+        if len(labels):
+            raise ValueError(
+                f"label is for label maps (NIfTI, NRRD); {path} is a surface."
+            )
+        vertices, faces = read_triangles(path)
+        say(f"mesh: {len(faces):,} triangles read")
+        try:
+            units, why = guess_units(vertices, faces, units)
+        except ValueError as error:
+            raise ValueError(f"{path}: {error}") from error
+        vertices = (vertices * sign * UNITS[units]) @ turn.T
     size = float(np.linalg.norm(np.ptp(vertices, axis=0)))
     if not SIZE[0] <= size <= SIZE[1]:
         raise ValueError(

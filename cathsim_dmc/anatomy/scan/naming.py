@@ -1,53 +1,177 @@
-"""Names of computed centrelines, by where they leave the aorta and where they go."""
+"""Names of computed centrelines, by hypotheses about the arch that they leave.
+
+A hypothesis says which end of the aorta is at the heart and which branch each offshoot
+of the arch is. Its probability is that of the pattern of branches times those of the
+calibres, spacings and forks that are seen. A branch gets its name if the hypotheses
+that give it sum up to `SURE`; otherwise it gets a neutral one, and the notes ask.
+"""
 
 from __future__ import annotations
 
 import re
+from collections import defaultdict
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from itertools import combinations
 
 import numpy as np
 
-from cathsim_dmc.anatomy.scan.centring import resample
+from cathsim_dmc.anatomy.scan.aorta import Bend
+from cathsim_dmc.anatomy.scan.forks import (
+    EXTRA,
+    SPREAD,
+    SURE,
+    leads,
+    normal,
+    without_twins,
+)
+from cathsim_dmc.anatomy.scan.offshoots import Offshoot, common
+from cathsim_dmc.anatomy.scan.ways import Ways
 
 ARCH_BRANCHES = ("bca", "lcca", "lsa")  # in their order from the heart
-ARCH = 220e-3  # m from the root's far end, in which the arch's branches leave
-CORONARY = 15e-3  # m from there, within which no branch of the arch leaves
-SHARED = 8e-3  # m beyond the root; curves that share more are one branch of the arch
-TALL = 0.6  # of the tallest: shorter upward branches are side branches
-_STEP = 1e-3  # m
+ANATOMICAL = frozenset((*ARCH_BRANCHES, "rcca", "rsa", "rva", "lva"))
+# Patterns of branches in their order from the heart, with their frequency and what they
+# are called. "bovine" is the common trunk of BCA and LCCA.
+PATTERNS = {
+    ("bca", "lcca", "lsa"): (0.74, "a usual arch"),
+    ("bovine", "lsa"): (0.18, "a bovine arch"),
+    ("bca", "lcca", "lva", "lsa"): (0.04, "an arch with its own left vertebral artery"),
+    ("rcca", "lcca", "lsa", "rsa"): (0.02, "an aberrant right subclavian artery"),
+    ("bovine", "lva", "lsa"): (
+        0.01,
+        "a bovine arch with its own left vertebral artery",
+    ),
+}
+CUT = 0.03  # probability that the scan shows nothing of a branch
+SHORT = 0.04  # that it is cut short
+BUMP = 0.02  # that one that looks cut short is none
+# Radii beyond the ostium, m (`arch.sampler`, vertebral: 1.9), for an aorta as wide as
+# `AORTA`; `SPREAD` is the standard deviation of their logarithm.
+RADII = {
+    "bca": 6.2e-3,
+    "bovine": 6.4e-3,
+    "lcca": 4.0e-3,
+    "lsa": 5.0e-3,
+    "lva": 1.9e-3,
+    "rcca": 3.9e-3,
+    "rsa": 4.8e-3,
+}
+AORTA = 13.3e-3
+# Distance along the aorta between neighbours, m, and the deviation of its logarithm.
+SPACING = {"bca": 11e-3, "lcca": 9e-3, "lsa": 8e-3, "bovine": 26e-3, "lva": 4e-3}
+APART = 0.5
+# Length up to the first fork, m: mean, deviation, and how often none is in the scan.
+FORKS = {
+    "bca": (42e-3, 10e-3, 0.5),
+    "bovine": (12e-3, 8e-3, 0.02),
+    "lsa": (38e-3, 10e-3, 0.5),
+    "lcca": (120e-3, 30e-3, 0.95),
+    "rcca": (120e-3, 30e-3, 0.95),
+    "rsa": (38e-3, 10e-3, 0.5),
+    "lva": (150e-3, 30e-3, 0.99),
+}
+_FORK_DENSITY = 1.0 / 60e-3  # 1/m, to which densities of forks are compared
 _NAME = re.compile(r"[a-z][a-z0-9_]*")
 
 
-def name_branches(
-    root: np.ndarray, curves: Sequence[np.ndarray], arch: bool
-) -> list[str]:
-    """Names for curves that start together with the root.
+@dataclass(frozen=True)
+class Naming:
+    """What a lumen's branches are.
 
-    Seen from the heart the arch gives off the brachiocephalic artery, the left common
-    carotid and the left subclavian, whatever the frame of the scan. What leaves
-    elsewhere, or fits none of the known patterns, is called branch_1, branch_2, ...
-    from the inlet on.
+    Attributes:
+        names: of the curves.
+        heart_last: whether the last point of the aorta is at the heart.
+        heart: probability of that.
+        notes: names with their probability, and questions.
+        right: rows of the curves that share a brachiocephalic artery, named or not.
+    """
+
+    names: list[str]
+    heart_last: bool
+    heart: float
+    notes: list[str]
+    right: tuple[int, ...] = ()
+
+
+def name_branches(
+    ways: Ways,
+    bend: Bend,
+    width: float,
+    found: Sequence[Offshoot],
+    curves: Sequence[np.ndarray],
+    odds: float,
+) -> Naming:
+    """Names for the curves that leave an aortic arch.
 
     Args:
-        root: (n, 3) m, centreline from the inlet to the heart.
-        curves: (m_i, 3) m, from the inlet on; the first points equal the root's as
-            long as they run together.
-        arch: whether the root has a far end of its own, as an aorta has.
+        ways: of the lumen.
+        bend: of its aorta.
+        width: m, median radius of the aorta.
+        found: offshoots of the arch, in the order of the bend's line.
+        curves: (m_i, 3) m, computed centrelines.
+        odds: log odds that the heart is at the last point of the line; infinite where
+            that is given.
     """
-    leave = [_common(root, curve) for curve in curves]
+    scale = float(np.clip(width / AORTA, 0.5, 1.5))
+    share = _probabilities(found, odds, scale)
+    heart = sum(value for (last, _, _), value in share.items() if last)
+    heart_last = bool(heart >= 0.5)
+    heart = max(heart, 1.0 - heart)
+    seen = list(found)[::-1] if heart_last else list(found)
+    marginal: list[dict[str, float]] = [defaultdict(float) for _ in seen]
+    for (last, _, labels), value in share.items():
+        for place, label in enumerate(labels):
+            if last == heart_last:
+                marginal[place][label] += value
     names: dict[int, str] = {}
-    if arch:
-        s = _arc(root)
-        from_heart = s[-1] - s[np.minimum(leave, len(root) - 1)]
-        near = [i for i, d in enumerate(from_heart) if CORONARY < d < ARCH]
-        if near:
-            names = _arch_names(root, curves, leave, near)
-    others = sorted(
-        (i for i in range(len(curves)) if i not in names), key=leave.__getitem__
-    )
-    for number, i in enumerate(others):
-        names[i] = f"branch_{number + 1}"
-    return [names[i] for i in range(len(curves))]
+    said, right = [], []
+    open_: list[Offshoot] = []
+    forked: list[tuple[str, Offshoot]] = []
+    for one, odds_of in zip(seen, marginal, strict=True):
+        label = max(odds_of, key=lambda key: odds_of[key])
+        sure = odds_of[label]
+        if sure < SURE or label == "extra":
+            if one.curves:
+                open_.append(one)
+            continue
+        if label == "bca" and len(one.curves) > 1:
+            right += one.curves
+            said.append(f"bca {sure:.2f}")
+        parts, doubt = leads(ways, bend, one, label, scale, heart_last)
+        for number, name in parts.items():
+            names[number] = name
+            said.append(f"{name} {sure * doubt[number]:.2f}")
+        if len(parts) < len(without_twins(one.rows)):
+            forked.append((label, one))
+    _neutral(names, curves, bend)
+    notes = []
+    if said:
+        notes.append("names with their probability: " + ", ".join(said))
+    if open_:
+        notes.append(_question(share, seen, heart_last, names))
+    for label, one in forked:
+        own = " and ".join(sorted(names[i] for i in one.curves))
+        notes.append(
+            f"question: the {label} that leaves the arch at {_mm(one.place)} leads to "
+            f"{own}: which is which? Name them (--rename)"
+        )
+    if heart < SURE:
+        notes.append(
+            f"question: which end of the aorta is at the heart? ({heart:.2f} for the "
+            "one taken); give a point near it (--heart)"
+        )
+    every = [names[i] for i in range(len(curves))]
+    return Naming(every, heart_last, heart, notes, tuple(right))
+
+
+def neutral_names(curves: Sequence[np.ndarray]) -> list[str]:
+    """Names of curves that leave no arch, in the order in which they part."""
+    leave = [
+        max((common(one, other) for other in curves if other is not one), default=0)
+        for one in curves
+    ]
+    order = sorted(range(len(curves)), key=leave.__getitem__)
+    return [f"branch_{order.index(i) + 1}" for i in range(len(curves))]
 
 
 def renamed(names: Sequence[str], changes: Mapping[str, str], root: str) -> list[str]:
@@ -73,126 +197,114 @@ def renamed(names: Sequence[str], changes: Mapping[str, str], root: str) -> list
     return out
 
 
-def _arch_names(root, curves, leave, near) -> dict[int, str]:
-    s = _arc(root)
-    groups = _groups(curves, leave, near)
-    first = min(leave[i] for i in near)
-    back, ahead = np.searchsorted(s, [s[first] - 120e-3, s[first] - 20e-3])
-    end = np.searchsorted(s, s[-1] - 30e-3)
-    up = _unit(root[max(ahead, back + 2)] - root[back])
-    if up @ _unit(root[-1] - root[end]) > 0.3:
-        return {}  # the root does not turn back: no arch
-    heart, descending = root[-1], root[:first]
-    level = np.abs((descending - heart) @ up).argmin()
-    behind = descending[level] - heart
-    behind = _unit(behind - (behind @ up) * up)
-    left = np.cross(behind, up)
-    # Branches that go to the head or the arms, in order from the heart.
-    rising = [
-        group
-        for group in groups
-        if max((curves[i][-1] - root[leave[i]]) @ up for i in group) > 0.0
-    ]
-    rising.sort(key=lambda group: -leave[group[0]])
-    sides = _order(curves, leave, rising, up)
-    names: dict[int, str] = {}
-    for group, side in zip(rising, sides, strict=False):
-        rows = [curves[i][leave[i] :] for i in group]
-        for i, name in zip(
-            group, _group_names(rows, side, up, behind, left), strict=True
-        ):
-            names[i] = name
-    return names
+def _probabilities(
+    found: Sequence[Offshoot], odds: float, scale: float
+) -> dict[tuple[bool, tuple[str, ...], tuple[str, ...]], float]:
+    """Of every (heart at the last point, pattern, labels from the heart on)."""
+    weights = {}
+    for heart_last in (False, True):
+        side = odds if heart_last else 0.0
+        if np.isinf(odds):
+            if heart_last != (odds > 0.0):
+                continue
+            side = 0.0
+        seen = list(found)[::-1] if heart_last else list(found)
+        for pattern, labels, weight in _hypotheses(seen, scale):
+            weights[heart_last, pattern, labels] = weight + side
+    most = max(weights.values())
+    share = {key: float(np.exp(weight - most)) for key, weight in weights.items()}
+    total = sum(share.values())
+    return {key: value / total for key, value in share.items()}
 
 
-def _order(curves, leave, groups, up) -> list[str]:
-    """Which branch of the arch each group is, or nothing where it is not clear."""
-    if len(groups) == 3:
-        return list(ARCH_BRANCHES)
-    if len(groups) == 2:
-        return ["bovine", "lsa"]
-    if len(groups) == 4 and len(groups[2]) == 1:
-        # A vertebral artery of its own goes up; the last of four that does is none.
-        third = curves[groups[2][0]][leave[groups[2][0]] :]
-        rise = third[-1] - third[0]
-        if rise @ up > TALL * np.linalg.norm(rise):
-            return ["bca", "lcca", "lva", "lsa"]
-    return []
+def _hypotheses(seen: Sequence[Offshoot], scale: float):
+    """Every (pattern, labels, log weight) of offshoots in order from the heart."""
+    count = len(seen)
+    for pattern, (frequency, _) in PATTERNS.items():
+        for kept in range(min(count, len(pattern)) + 1):
+            for shown in combinations(range(len(pattern)), kept):
+                for at in combinations(range(count), kept):
+                    labels = ["extra"] * count
+                    for place, which in zip(at, shown, strict=True):
+                        labels[place] = pattern[which]
+                    weight = np.log(frequency)
+                    weight += np.log(CUT) * (len(pattern) - kept)
+                    weight += sum(
+                        _fit(one, label, scale)
+                        for one, label in zip(seen, labels, strict=True)
+                    )
+                    weight += _spacings(seen, pattern, shown, at, scale)
+                    yield pattern, tuple(labels), float(weight)
 
 
-def _group_names(rows, side, up, behind, left) -> list[str]:
-    """Names of the curves (n, 3) of one branch of the arch."""
-    rel = [row[-1] - row[0] for row in rows]
-    height = np.array([r @ up for r in rel])
-    aside = np.array([np.linalg.norm(r - (r @ up) * up) for r in rel])
-    if len(rows) == 1:
-        return ["bca" if side == "bovine" else side]
-    tall = np.flatnonzero((height > aside) & (height > TALL * height.max()))
-    wide = np.flatnonzero((height <= aside) & (aside > 20e-3))
-    right = side in ("bca", "bovine")
-    names: dict[int, str] = {}
-    if len(wide) and side != "lcca":
-        names[int(wide[aside[wide].argmax()])] = "rsa" if right else "lsa"
-    if len(tall):
-        middle = 0.5 * height[tall].min()
-        places = np.stack([_at_height(rows[i], up, middle) for i in tall])
-        order = list(tall)
-        if side == "bovine" and len(tall) > 1:
-            leftmost = int(tall[(places @ left).argmax()])
-            names[leftmost] = "lcca"
-            keep = tall != leftmost
-            order, places = list(tall[keep]), places[keep]
-        front = [int(order[k]) for k in np.argsort(places @ behind)]
-        main = {"lcca": ["lcca"], "lsa": ["lva"], "lva": ["lva"]}.get(
-            side, ["rcca", "rva"]
-        )
-        for i, name in zip(front, main, strict=False):
-            names.setdefault(i, name)
-    # What is left takes the name of the one it runs with the longest.
-    known = dict(names)
-    for i in range(len(rows)):
-        if i not in names:
-            shared = {j: _common(rows[i], rows[j]) for j in known}
-            base = known[max(shared, key=shared.__getitem__)] if shared else side
-            number = 2
-            while f"{base}_{number}" in names.values():
-                number += 1
-            names[i] = f"{base}_{number}" if shared or i else base
-    return [names[i] for i in range(len(rows))]
+def _fit(one: Offshoot, label: str, scale: float) -> float:
+    """Log probability of the calibre and the fork of an offshoot."""
+    if label == "extra":
+        return float(np.log(EXTRA if one.curves else BUMP))
+    # What was cut short shows little more than the mouth of a branch.
+    spread = SPREAD if one.curves else 2.0 * SPREAD
+    weight = normal(np.log(one.radius / (scale * RADII[label])), spread)
+    mean, deviation, none = FORKS[label]
+    if one.fork is None:
+        return weight + np.log(none if one.curves else SHORT)
+    density = np.exp(-0.5 * ((one.fork - mean) / deviation) ** 2)
+    density = 0.02 + density / (deviation * np.sqrt(2.0 * np.pi) * _FORK_DENSITY)
+    return weight + np.log((1.0 - none) * density)
 
 
-def _groups(curves, leave, near) -> list[list[int]]:
-    groups: list[list[int]] = []
-    for i in near:
-        for group in groups:
-            j = group[0]
-            together = _common(curves[i], curves[j])
-            line = curves[i][leave[i] : together]
-            if len(line) > 1 and _arc(line)[-1] > SHARED:
-                group.append(i)
-                break
-        else:
-            groups.append([i])
-    return groups
+def _spacings(seen, pattern, shown, at, scale: float) -> float:
+    """Log probability of the distances between neighbours of a pattern."""
+    weight = 0.0
+    for k in range(len(at) - 1):
+        between = pattern[shown[k] : shown[k + 1] + 1]
+        wanted = sum(SPACING.get(name, 8e-3) for name in between[:-1])
+        wanted += sum(SPACING.get(name, 8e-3) for name in between[1:])
+        there = max(abs(seen[at[k + 1]].s - seen[at[k]].s), 2e-3)
+        weight += normal(np.log(there / (scale * wanted)), APART)
+    return weight
 
 
-def _common(one: np.ndarray, other: np.ndarray) -> int:
-    """How many first points two curves share."""
-    count = min(len(one), len(other))
-    same = (one[:count] == other[:count]).all(axis=1)
-    return count if same.all() else int(same.argmin())
+def _neutral(names: dict[int, str], curves, bend: Bend) -> None:
+    """Gives what has no name a neutral one, in the order from the bend's start."""
+    rest = [i for i in range(len(curves)) if i not in names]
+    tips = {
+        i: int(np.linalg.norm(bend.line - _leaves(curves[i], bend), axis=1).argmin())
+        for i in rest
+    }
+    for number, i in enumerate(sorted(rest, key=lambda k: tips[k])):
+        names[i] = f"branch_{number + 1}"
 
 
-def _at_height(row: np.ndarray, up: np.ndarray, height: float) -> np.ndarray:
-    line = resample(row, _STEP)
-    above = (line - row[0]) @ up >= height
-    return line[int(above.argmax())]
+def _leaves(curve: np.ndarray, bend: Bend) -> np.ndarray:
+    gap = np.linalg.norm(curve[:, None] - bend.line[None, ::8], axis=2).min(axis=1)
+    away = np.flatnonzero(gap < 6e-3)
+    return curve[int(away[-1]) if len(away) else 0]
 
 
-def _arc(line: np.ndarray) -> np.ndarray:
-    steps = np.linalg.norm(np.diff(line, axis=0), axis=1)
-    return np.concatenate([[0.0], np.cumsum(steps)])
+def _question(share, seen, heart_last, names) -> str:
+    """What the notes ask where not every branch has a name."""
+    by: dict[str, float] = defaultdict(float)
+    for (last, pattern, labels), value in share.items():
+        if last == heart_last:
+            missing = [name for name in pattern if name not in labels]
+            text = PATTERNS[pattern][1]
+            if missing:
+                text += f" without its {' and '.join(missing)}"
+            by[text] += value
+    best = sorted(by.items(), key=lambda item: -item[1])
+    texts = [f"{text} ({value:.2f})" for text, value in best[:3] if value > 0.02]
+    places = []
+    for one in seen:
+        own = ", ".join(names[i] for i in one.curves) or "a branch that is cut short"
+        places.append(f"{own} at {_mm(one.place)}")
+    count = {1: "one branch leaves", 2: "two branches leave"}.get(
+        len(seen), f"{len(seen)} branches leave"
+    )
+    return (
+        f"question: {count} the arch, from the heart on {'; '.join(places)}: "
+        f"{', or '.join(texts)}? Name them (--rename)"
+    )
 
 
-def _unit(vector: np.ndarray) -> np.ndarray:
-    return vector / max(float(np.linalg.norm(vector)), 1e-12)
+def _mm(point: np.ndarray) -> str:
+    return "(" + ", ".join(f"{x * 1e3:.0f}" for x in point) + ") mm"

@@ -94,9 +94,10 @@ def _separation(curve: np.ndarray, other: np.ndarray, field: SurfaceDepth) -> in
     # They part for good where a wall stands between them: at a wide flat end, or where
     # two drawn curves begin, they may part and meet again in one lumen. After that
     # they may meet once more, in a ring of vessels.
-    share = np.linspace(0.0, 1.0, 9)[:, None, None]
-    between = curve + share * (other[nearest] - curve)
-    walled = apart & (field(between).min(axis=0) < 0.0)
+    share = np.linspace(0.0, 1.0, 9)[1:-1, None, None]
+    between = curve[apart] + share * (other[nearest] - curve)[apart]
+    walled = apart.copy()
+    walled[apart] = field(between).min(axis=0) < 0.0
     if walled.any():
         # Not at a corner of the lumen that the two cut before they ever met.
         met = int((~apart).argmax())

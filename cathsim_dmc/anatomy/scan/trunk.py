@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Collection
 
 from cathsim_dmc.anatomy.centreline import Vessel, VesselTree
 from cathsim_dmc.anatomy.scan.centring import STEP
@@ -15,13 +16,18 @@ _RIGHT = re.compile(
 )
 
 
-def name_trunk(tree: VesselTree) -> VesselTree:
+def name_trunk(tree: VesselTree, right: Collection[str] = ()) -> VesselTree:
     """Give the common trunk of right branches its name, the brachiocephalic artery.
 
     Where curves share a trunk, the trunk is part of one of them: the right carotid
-    then leaves the right vertebral. If both are right branches by name, the part up
-    to the first of them becomes a vessel of its own and the parent of both. Nothing
-    changes if the trunk's name is taken or no two right branches share one.
+    then leaves the right vertebral. If both are right branches, the part up to the
+    first of them becomes a vessel of its own and the parent of both. Nothing changes
+    if the trunk's name is taken or no two right branches share one.
+
+    Args:
+        tree: as it was grown.
+        right: names of branches that are right ones, whatever they are called; others
+            are known by their names.
     """
     root = tree.root.name
     if TRUNK in tree.vessels:
@@ -31,7 +37,7 @@ def name_trunk(tree: VesselTree) -> VesselTree:
         names = [name, *(branch.name for branch in branches)]
         if vessel.parent != root or len(names) < 2:
             continue
-        if not all(_RIGHT.fullmatch(key) for key in names):
+        if not all(key in right or _RIGHT.fullmatch(key) for key in names):
             continue
         line = vessel.centreline
         split = min(tree.origin(branch.name) for branch in branches)

@@ -1,0 +1,199 @@
+"""The aorta of a lumen: its two ends, its bend, and which end is at the heart."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.ndimage import gaussian_filter1d
+from scipy.spatial.distance import cdist
+
+from cathsim_dmc.anatomy.scan.centring import resample
+from cathsim_dmc.anatomy.scan.ends import FreeEnd
+from cathsim_dmc.anatomy.scan.ways import Ways
+
+RADIUS = 4.5e-3  # m, least median radius of an aorta
+THIN = 0.25  # of the widest end: ends that are no wider are no end of the aorta
+WIDEST = 4  # ends from which the aorta may start
+SMOOTH = 6e-3  # m, standard deviation along the way, which steps from node to node
+ARM = 60e-3  # m to both sides of a place, over which the bend there is taken
+TURN = np.radians(75.0)  # least bend of an arch
+LEG = 80e-3  # m of each leg that are compared, from 10 mm past the branches on
+UPRIGHT = 0.75  # cosine between the top of the arch and +z of a scan that stands
+# Azimuth of the way from ascending to descending leg, from back to left, in a body
+# that stands upright: 50 degrees, standard deviation 14 (`arch.sampler`), here 25 for
+# what was cut; the range that is accepted; and how often a scan is not as it seems.
+FACING, FACING_SPREAD, TURNED = np.radians(50.0), np.radians(25.0), 0.02
+AZIMUTH = (np.radians(-5.0), np.radians(97.0))
+
+
+def find_aorta(ways: Ways, ends: Sequence[FreeEnd]) -> tuple[int, int] | None:
+    """The two ends (rows) between which an aorta runs in an arch, or None.
+
+    It is the way between two free ends with the largest sum of fourth powers of the
+    depth: a wide stump counts more than a long branch.
+    """
+    width = np.array([end.radius for end in ends])
+    order = [int(k) for k in np.argsort(-width) if width[k] > THIN * width.max()]
+    nodes = [ways.node(end.position) for end in ends]
+    best = (0.0, None, np.empty(0, dtype=int))
+    for row, one in enumerate(order[:WIDEST]):
+        before = ways.deepest_from(nodes[one])
+        for other in order[row + 1 :]:
+            way = ways.trace(before, nodes[other])
+            if len(way) > 3:
+                bulk = float((ways.depth[way] ** 4).sum())
+                best = max(best, (bulk, (one, other), way), key=lambda b: b[0])
+    pair, way = best[1:]
+    if pair is None or np.median(ways.depth[way]) < RADIUS:
+        return None
+    return pair if Bend.of(ways.points[way]).turn > TURN else None
+
+
+@dataclass(frozen=True)
+class Bend:
+    """The bend of an aorta.
+
+    Attributes:
+        line: (n, 3) m, smoothed, 1 mm apart.
+        apex: row of the line at which it bends most.
+        turn: rad, bend between 60 mm before and after the apex.
+        up: (3,), unit, towards the outside of the bend there.
+        along: (3,), unit, from the leg before the apex to the one after it.
+    """
+
+    line: np.ndarray
+    apex: int
+    turn: float
+    up: np.ndarray
+    along: np.ndarray
+
+    @classmethod
+    def of(cls, way: np.ndarray) -> Bend:
+        """The bend of a way (n, 3) m."""
+        line = resample(way)
+        width = min(SMOOTH / 1e-3, len(line) / 6)
+        line = gaussian_filter1d(line, width, axis=0, mode="nearest")
+        reach = max(2, min(round(ARM / 1e-3), len(line) // 3))
+        tangent = np.gradient(line, axis=0)
+        tangent /= np.maximum(np.linalg.norm(tangent, axis=1, keepdims=True), 1e-12)
+        rows = np.arange(len(line))
+        first = np.maximum(rows - reach, 0)
+        last = np.minimum(rows + reach, len(line) - 1)
+        cosine = np.vecdot(tangent[first], tangent[last])
+        # Of the places that see both arms, the one farthest above them.
+        rise = line - 0.5 * (line[first] + line[last])
+        height = np.linalg.norm(rise, axis=1) - 1e-3 * cosine
+        height[: reach // 2] = height[len(line) - reach // 2 :] = -np.inf
+        apex = int(height.argmax())
+        up = _unit(rise[apex])
+        along = line[last[apex]] - line[first[apex]]
+        along = _unit(along - (along @ up) * up)
+        turn = float(np.arccos(np.clip(cosine.min(), -1.0, 1.0)))
+        return cls(line, apex, turn, up, along)
+
+    @property
+    def upright(self) -> bool:
+        """Whether the arch stands upright in the frame of the scan."""
+        return bool(self.up[2] > UPRIGHT)
+
+    @property
+    def head(self) -> np.ndarray:
+        """Direction (3,) to the head: +z of an upright scan, else the bend's own."""
+        return np.array([0.0, 0.0, 1.0]) if self.upright else self.up
+
+    def across(self) -> np.ndarray:
+        """Horizontal way (3,) m from the leg before the apex to the one after it.
+
+        Both are taken at the height of the higher end, at most 60 mm below the top.
+        """
+        head = self.head
+        height = self.line @ head
+        level = max(height[0], height[-1], height[self.apex] - ARM)
+        first = self.line[: self.apex + 1][
+            np.abs(height[: self.apex + 1] - level).argmin()
+        ]
+        last = self.line[self.apex :][np.abs(height[self.apex :] - level).argmin()]
+        way = last - first
+        return way - (way @ head) * head
+
+    def azimuth(self, heart_last: bool) -> float | None:
+        """Angle from back to left of the way from heart to descending aorta, rad.
+
+        None if the scan does not stand upright or the legs are not told apart.
+        """
+        way = self.across() * (-1.0 if heart_last else 1.0)
+        if not self.upright or np.linalg.norm(way) < 10e-3:
+            return None
+        return float(np.arctan2(way[0], way[1]))
+
+
+def mirrored(azimuth: float | None) -> str | None:
+    """What is wrong with the side to which an arch leads, or None."""
+    if azimuth is None or AZIMUTH[0] <= azimuth <= AZIMUTH[1]:
+        return None
+    side = "left" if azimuth > 0 else "right"
+    face = "back" if abs(azimuth) < np.pi / 2 else "front"
+    return (
+        f"the arch leads from the heart to the {side} and {face} "
+        f"({np.degrees(azimuth):.0f} degrees from back to left; 50 are usual): the "
+        "scan is mirrored, turned, or in another frame (--frame, --axes), or its heart "
+        "is at the other end (--heart)"
+    )
+
+
+def heart_evidence(
+    bend: Bend, depth: np.ndarray, first: float, last: float
+) -> tuple[float, list[str]]:
+    """Log odds that the heart is at the last point of the aorta, and what says so.
+
+    Args:
+        bend: of the aorta.
+        depth: (n,) m, of the points of its line.
+        first: m, arc length at which its first branch leaves, of those of the arch.
+        last: m, the same of its last branch.
+    """
+    s = 1e-3 * np.arange(len(bend.line))
+    total, why = 0.0, []
+
+    def add(value: float, most: float, text: str) -> None:
+        nonlocal total
+        value = float(np.clip(value, -most, most))
+        total += value
+        if abs(value) > 0.2:
+            why.append(f"{text} ({value:+.1f})")
+
+    legs = [
+        (s > max(first - 10e-3 - LEG, 5e-3)) & (s < first - 10e-3),
+        (s > last + 10e-3) & (s < min(last + 10e-3 + LEG, s[-1] - 5e-3)),
+    ]
+    if all(leg.sum() >= 10 for leg in legs):
+        before, after = (float(np.median(depth[leg])) for leg in legs)
+        # Diameters 29.5 and 23.9 mm; their ratio has a standard deviation of 15 %.
+        add(18.0 * np.log(after / before), 4.0, "width of the legs")
+    length = first - (s[-1] - last)
+    far = abs(length) > 0.15
+    add(length * (40.0 if far else 10.0), 5.0 if far else 1.0, "length of the legs")
+    azimuth = bend.azimuth(heart_last=True)
+    if azimuth is not None:
+        right, wrong = _facing(azimuth), _facing(azimuth + np.pi)
+        add(float(np.log(right / wrong)), np.inf, "descending leg behind and left")
+    return total, why
+
+
+def _facing(azimuth: float) -> float:
+    """Probability density (1/rad) of an azimuth from heart to descending aorta."""
+    off = (azimuth - FACING + np.pi) % (2.0 * np.pi) - np.pi
+    peak = np.exp(-0.5 * (off / FACING_SPREAD) ** 2)
+    peak /= FACING_SPREAD * np.sqrt(2.0 * np.pi)
+    return float((1.0 - TURNED) * peak + TURNED / (2.0 * np.pi))
+
+
+def depth_along(ways: Ways, way: np.ndarray, line: np.ndarray) -> np.ndarray:
+    """Depth (m,) of the lumen on a smoothed line (m, 3) of a way (n,) of nodes."""
+    return ways.depth[way][cdist(line, ways.points[way]).argmin(axis=1)]
+
+
+def _unit(vector: np.ndarray) -> np.ndarray:
+    return vector / max(float(np.linalg.norm(vector)), 1e-12)

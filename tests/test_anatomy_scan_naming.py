@@ -1,0 +1,215 @@
+"""Names of an arch's branches: hypotheses, confidence and questions, without a mesh."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.spatial import cKDTree
+
+from cathsim_dmc.anatomy.arch.arch import ArchSeed
+from cathsim_dmc.anatomy.arch.tree import arch_tree
+from cathsim_dmc.anatomy.scan.aorta import Bend, heart_evidence, mirrored
+from cathsim_dmc.anatomy.scan.naming import name_branches
+from cathsim_dmc.anatomy.scan.offshoots import Offshoot
+
+SPACE = 20e-3  # m of aorta between ostia
+
+
+class Tubes:
+    """What naming asks of a lattice: the depth at points of some lines."""
+
+    def __init__(self, lines, radii):
+        self.points = np.concatenate(lines)
+        self.depth = np.concatenate(
+            [np.full(len(x), r) for x, r in zip(lines, radii, strict=True)]
+        )
+        self._tree = cKDTree(self.points)
+
+    def node(self, point):
+        return int(self._tree.query(point)[1])
+
+
+def line(*corners, step=1e-3):
+    """Points of a polyline through corners in mm, m."""
+    corners = 1e-3 * np.array(corners, dtype=float)
+    parts = [
+        a + np.arange(0.0, 1.0, step / np.linalg.norm(b - a))[:, None] * (b - a)
+        for a, b in zip(corners[:-1], corners[1:], strict=True)
+    ]
+    return np.concatenate(parts)
+
+
+@pytest.fixture(scope="module")
+def bend():
+    """From the heart, on the right, over the top to the left."""
+    angle = np.linspace(0.0, np.pi, 60)
+    arch = np.stack([-35 * np.cos(angle), 0 * angle, 35 * np.sin(angle)], axis=1)
+    return Bend.of(line((-35, 0, -60), *arch, (35, 0, -160)))
+
+
+def named(bend, *branches, odds=-np.inf):
+    """Names of the curves of (radius, (radius, corners)...) in mm, and the notes."""
+    lines, radii, found, curves = [], [], [], []
+    for place, branch in enumerate(branches):
+        x = 20 * place - 20
+        own = [line((x, 0, 45), *corners) for _, corners in branch[1:]]
+        # Curves share the points up to their fork.
+        for k, row in enumerate(own[1:], 1):
+            shared = int(
+                np.isclose(row[: len(own[0])], own[0][: len(row)]).all(1).sum()
+            )
+            own[k] = np.concatenate([own[0][:shared], row[shared:]])
+        fork = None
+        if len(own) > 1:
+            fork = 1e-3 * min(
+                int((a[: len(b)] == b[: len(a)]).all(1).argmin())
+                for k, a in enumerate(own)
+                for b in own[k + 1 :]
+            )
+        rows = tuple(range(len(curves), len(curves) + len(own)))
+        found.append(
+            Offshoot(
+                np.array([1e-3 * x, 0, 45e-3]),
+                SPACE * place,
+                1e-3 * branch[0],
+                rows,
+                fork,
+                tuple(own),
+            )
+        )
+        curves += own
+        lines += own
+        radii += [1e-3 * r for r, _ in branch[1:]]
+    ways = Tubes(lines, radii) if lines else None
+    out = name_branches(ways, bend, 13.3e-3, found, curves, odds)
+    return out.names, " ".join(out.notes)
+
+
+BCA = (6.2, (6.0, [(-30, 0, 85)]))
+LCCA = (4.0, (3.5, [(5, 0, 95)]))
+LSA = (5.0, (4.5, [(40, 0, 85)]))
+STUB = (3.6,)
+NECK = (
+    6.2,
+    (3.2, [(-22, 0, 87), (-24, 0, 180)]),
+    (3.5, [(-22, 0, 87), (-90, 0, 95)]),
+)
+BOVINE = (6.4, (5.8, [(-20, 0, 57), (-40, 0, 95)]), (3.6, [(-20, 0, 57), (0, 0, 95)]))
+THIN = (1.9, (1.8, [(20, 0, 95)]))
+
+
+def test_three_branches_are_a_usual_arch(bend):
+    names, notes = named(bend, BCA, LCCA, LSA)
+    assert names == ["bca", "lcca", "lsa"] and "question" not in notes
+    assert "lcca 1.00" in notes
+
+
+@pytest.mark.parametrize("missing", range(3))
+def test_two_branches_without_a_fork_are_asked_for(bend, missing):
+    """A branch that is cut off leaves no trace: any two may be what is left."""
+    branches = [BCA, LCCA, LSA]
+    del branches[missing]
+    names, notes = named(bend, *branches)
+    wrong = [("bca", "lcca", "lsa")[k] for k in range(3) if k != missing]
+    for name, truth in zip(names, wrong, strict=True):
+        assert name == truth or name.startswith("branch_")
+    assert any(name.startswith("branch_") for name in names)
+    assert "question: two branches leave the arch" in notes and "without its" in notes
+    assert "at (" in notes  # the place of each
+
+
+@pytest.mark.parametrize("cut", range(3))
+def test_a_branch_that_is_cut_short_keeps_its_place(bend, cut):
+    branches = [BCA, LCCA, LSA]
+    branches[cut] = STUB
+    kept = [name for k, name in enumerate(("bca", "lcca", "lsa")) if k != cut]
+    assert named(bend, *branches)[0] == kept
+
+
+def test_a_bovine_arch_has_its_fork(bend):
+    assert named(bend, BOVINE, LSA)[0] == ["bca", "lcca", "lsa"]
+
+
+def test_a_fork_far_up_is_no_bovine_arch(bend):
+    names, notes = named(bend, NECK, LSA)
+    assert "lcca" not in names
+    assert "question" in notes
+
+
+def test_a_trunk_is_known_where_its_branches_are_not(bend):
+    up = [(-22, 0, 87)]
+    twins = (6.2, (3.2, [*up, (-34, 0, 180)]), (3.2, [*up, (-12, 0, 180)]))
+    names, notes = named(bend, twins, LCCA, LSA)
+    assert names == ["branch_1", "branch_2", "lcca", "lsa"]
+    assert "bca 0.9" in notes or "bca 1.0" in notes
+    assert "leads to branch_1 and branch_2: which is which?" in notes
+
+
+def test_subclavian_and_vertebral_arteries(bend):
+    """A subclavian artery that goes up first and is narrowed is no vertebral."""
+    up = [(-22, 0, 87)]
+    arm = (2.2, [*up, (-40, 0, 95), (-110, 0, 100)])
+    carotid = (3.2, [*up, (-24, 0, 180)])
+    vertebral = (1.8, [*up, (-40, 0, 95), (-42, 8, 180)])
+    names, _ = named(bend, (6.2, carotid, arm, vertebral), LCCA, LSA)
+    assert names == ["rcca", "rsa", "rva", "lcca", "lsa"]
+
+
+def test_a_vertebral_artery_of_its_own_and_an_aberrant_subclavian(bend):
+    assert named(bend, BCA, LCCA, THIN, LSA)[0] == ["bca", "lcca", "lva", "lsa"]
+    carotid = (3.9, (3.6, [(-30, 0, 95)]))
+    last = (4.8, (4.4, [(20, 20, 85)]))
+    found = named(bend, carotid, LCCA, LSA, last)[0]
+    assert found == ["rcca", "lcca", "lsa", "rsa"]
+
+
+def test_without_knowing_the_heart_no_name_is_sure(bend):
+    branches = [(4.4, (4.2, [(20 * k - 20, 0, 95)])) for k in range(3)]
+    names, notes = named(bend, *branches, odds=0.0)
+    assert "question: which end of the aorta is at the heart?" in notes
+    assert "--heart" in notes
+
+
+def arches():
+    for seed, kind in enumerate(("I", "II", "III"), start=9_300_000):
+        yield arch_tree(ArchSeed(seed, kind).parameters())
+
+
+def evidence(tree, matrix=None):
+    """Log odds that the heart is at the last point, seen from either end."""
+    line_ = tree.root.centreline
+    points = line_.points if matrix is None else line_.points @ matrix.T
+    out = []
+    for turn in (1, -1):
+        bend = Bend.of(points[::turn])
+        s = np.linspace(0.0, line_.length, len(bend.line))[::turn]
+        places = [
+            1e-3 * abs(s - tree.origin(k)).argmin()
+            for k in tree.vessels
+            if k != "aorta"
+        ]
+        out.append(
+            heart_evidence(bend, line_.at(s).radius, min(places), max(places))[0]
+        )
+    return out
+
+
+def test_the_heart_is_found_from_either_end_and_in_a_turned_scan():
+    turn = np.linalg.qr(np.random.default_rng(1).normal(size=(3, 3)))[0]
+    turn *= np.sign(np.linalg.det(turn))
+    for tree in arches():
+        for matrix in (None, turn):
+            from_heart, to_heart = evidence(tree, matrix)
+            assert from_heart < -1.0 and to_heart > 1.0
+
+
+@pytest.mark.parametrize("axis", [0, 1])
+def test_a_mirrored_arch_leads_to_the_wrong_side(axis):
+    flip = np.ones(3)
+    flip[axis] = -1.0
+    for tree in arches():
+        points = tree.root.centreline.points
+        assert mirrored(Bend.of(points).azimuth(heart_last=False)) is None
+        assert mirrored(Bend.of(points[::-1]).azimuth(heart_last=True)) is None
+        wrong = mirrored(Bend.of(points * flip).azimuth(heart_last=False))
+        assert wrong is not None and "mirrored" in wrong
