@@ -1,0 +1,273 @@
+"""Scans with known truth for the import: arches of tubes, remeshed, cut and turned."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from itertools import product
+
+import numpy as np
+
+from cathsim_dmc.anatomy import phantoms
+from cathsim_dmc.anatomy.arch.arch import ArchSeed
+from cathsim_dmc.anatomy.arch.tree import arch_tree
+from cathsim_dmc.anatomy.centreline import Centreline, Vessel, VesselTree
+from cathsim_dmc.anatomy.parts import Surface
+from cathsim_dmc.anatomy.scan.topology import decimated
+from cathsim_dmc.anatomy.surface import lumen_surface
+
+TRIANGLES = (2_000, 4_000, 12_000, 30_000, 100_000)
+TYPES = ("I", "II", "III")
+VARIANTS = ("normal", "bovine_trunk", "bovine_branch", "aberrant")
+ASK = "ask"  # what an import should do where the truth cannot be seen
+NAME = "name"
+_MARCHED = 1.3e-3  # m, coarsest step at which surfaces are marched before decimation
+_PER_AREA = 2.4  # triangles per squared step
+
+
+@dataclass(frozen=True)
+class Case:
+    """One scan.
+
+    Attributes:
+        kind: what was done to the arch, a group of the report.
+        source: arch type of a random arch, or the name of a phantom.
+        seed: of the arch and of what is random in the change.
+        variant: of a random arch.
+        triangles: of the surface.
+        answer: "name" or "ask".
+        change: vessel and length (m) that is left of it past its ostium, 0 for none.
+        noise: m, standard deviation of the surface.
+        turn: None, "any" rotation or "x" or "y", the axis that is mirrored.
+    """
+
+    kind: str
+    source: str
+    seed: int
+    variant: str = "normal"
+    triangles: int = 12_000
+    answer: str = NAME
+    change: tuple[tuple[str, float], ...] = field(default=())
+    noise: float = 0.0
+    turn: str | None = None
+
+    @property
+    def name(self) -> str:
+        """Unique, for a line of the results."""
+        words = [self.kind, self.source, self.variant, self.seed, self.triangles]
+        words += [f"{name}{1e3 * length:g}" for name, length in self.change]
+        words += [self.turn] if self.turn else []
+        words += [f"{1e3 * self.noise:g}mm"] if self.noise else []
+        return "-".join(map(str, words))
+
+
+def cases() -> list[Case]:
+    """All cases, in an order in which the first ones are of every kind."""
+    groups: list[list[Case]] = []
+    seeds = iter(range(9_100_000, 9_200_000))
+
+    def add(kind, sources, variants=("normal",), **options) -> None:
+        groups.append(
+            [
+                Case(kind, source, next(seeds), variant, **options)
+                for source, variant in product(sources, variants)
+            ]
+        )
+
+    for count in TRIANGLES:
+        add("remeshed", TYPES, VARIANTS, triangles=count)
+        add("head and neck", ("I", "II"), VARIANTS[:3], triangles=count)
+    for count in (4_000, 30_000):
+        add("turned", TYPES, VARIANTS, triangles=count, turn="any")
+        add("head and neck, turned", ("I", "II"), triangles=count, turn="any")
+        add("vertebral off the arch", ("I", "II"), triangles=count)
+    for noise in (0.15e-3, 0.3e-3):
+        add("noise", TYPES, VARIANTS[:2], noise=noise)
+    for name in ("bca", "lcca", "lsa"):
+        for length in (8e-3, 12e-3, 20e-3):
+            add("branch cut short", ("I", "II"), change=((name, length),))
+        add("branch left out", ("I", "II"), change=((name, 0.0),), answer=ASK)
+    for name in ("lcca", "lsa"):
+        add(
+            "branch left out, head and neck",
+            ("I", "II"),
+            change=((name, 0.0),),
+            answer=ASK,
+        )
+    add("branch left out", ("I",), VARIANTS[1:3], change=(("lsa", 0.0),), answer=ASK)
+    for limb, length in product(("ascending", "descending"), (25e-3, 60e-3)):
+        add("limb cut short", TYPES, VARIANTS[:2], change=((limb, length),))
+    add("narrowed subclavian", TYPES, change=(("narrow", 1.1e-3),))
+    add("narrowed subclavian", ("I", "II"), change=(("narrow", 1.1e-3),), turn="any")
+    for axis in "xy":
+        add("mirrored", TYPES, turn=axis, answer=ASK)
+    for name in phantoms.PHANTOMS:
+        for count in (4_000, 100_000):
+            groups.append([Case("phantom", name, 0, triangles=count)])
+        groups.append([Case("phantom, turned", name, 1, turn="any")])
+    # In turns, so that a run that is cut off has seen every kind.
+    longest = max(map(len, groups))
+    return [g[k] for k in range(longest) for g in groups if k < len(g)]
+
+
+def truth(case: Case) -> VesselTree:
+    """The tree of a case, as its surface shows it, upright; m, LPS."""
+    if case.kind.startswith("phantom"):
+        return phantoms.load(case.source).tree
+    seed = ArchSeed(case.seed, case.source, case.variant)
+    tree = arch_tree(seed.parameters())
+    rng = np.random.default_rng(case.seed)
+    neck = "head and neck" in case.kind or case.kind == "narrowed subclavian"
+    narrow = dict(case.change).get("narrow")
+    if neck:
+        tree = with_neck(tree, rng, narrow)
+    if case.kind == "vertebral off the arch":
+        tree = with_vertebral(tree, rng)
+    for name, length in case.change:
+        if name in ("ascending", "descending"):
+            tree = limb_cut(tree, name, length)
+        elif name != "narrow":
+            tree = shortened(tree, name, length)
+    return tree
+
+
+def surface(case: Case, tree: VesselTree) -> Surface:
+    """The surface of a case, turned and with noise."""
+    area = sum(
+        2.0 * np.pi * float(np.median(v.centreline.radii)) * v.centreline.length
+        for v in tree.vessels.values()
+    )
+    step = min(_MARCHED, np.sqrt(_PER_AREA * area / case.triangles))
+    found = lumen_surface(tree, float(max(step, 0.5e-3)))
+    vertices, faces = decimated(
+        np.asarray(found.vertices), np.asarray(found.faces), case.triangles
+    )
+    rng = np.random.default_rng(case.seed)
+    if case.noise:
+        normals = Surface(vertices, faces).normals
+        vertices = vertices + normals * rng.normal(0.0, case.noise, (len(vertices), 1))
+    matrix = turn(case)
+    vertices = vertices @ matrix.T
+    if np.linalg.det(matrix) < 0.0:
+        faces = faces[:, ::-1]
+    return Surface(vertices, faces)
+
+
+def turn(case: Case) -> np.ndarray:
+    """Matrix (3, 3) by which the points of a case are turned or mirrored."""
+    if case.turn == "any":
+        rng = np.random.default_rng(case.seed + 1)
+        matrix = np.linalg.qr(rng.normal(size=(3, 3)))[0]
+        return matrix * np.sign(np.linalg.det(matrix))
+    return np.diag([-1.0 if case.turn == axis else 1.0 for axis in "xyz"])
+
+
+def shortened(tree: VesselTree, name: str, length: float) -> VesselTree:
+    """The tree with so much of a vessel past its ostium, without its branches."""
+    vessels = {}
+    for key, vessel in tree.vessels.items():
+        if key == name:
+            if length > 0.0:
+                line = vessel.centreline.slice(0.0, vessel.ostium + length)
+                vessels[key] = replace(vessel, centreline=line)
+        elif vessel.parent is None or vessel.parent in vessels:
+            kept = vessels.get(vessel.parent)
+            if kept is not None and kept.name == name and length > 0.0:
+                whole = tree.vessel(name).centreline
+                if kept.centreline.length < whole.length:
+                    continue
+            vessels[key] = vessel
+    return VesselTree(vessels)
+
+
+def limb_cut(tree: VesselTree, limb: str, length: float) -> VesselTree:
+    """The tree with so much of the aorta before its first or after its last branch."""
+    root = tree.root
+    places = [tree.origin(k) for k, v in tree.vessels.items() if v.parent == root.name]
+    line = root.centreline
+    if limb == "ascending":
+        line = line.slice(min(places) - length, line.length)
+    else:
+        line = line.slice(0.0, max(places) + length)
+    return VesselTree({**tree.vessels, root.name: Vessel(root.name, line)})
+
+
+def with_neck(tree: VesselTree, rng, narrow: float | None = None) -> VesselTree:
+    """The tree with its branches up to the neck and the arms.
+
+    Args:
+        tree: with a brachiocephalic artery, upright.
+        rng: source of randomness.
+        narrow: m, radius of a stenosis of the right subclavian artery, or None.
+    """
+    vessels = dict(tree.vessels)
+    right = np.array([-1.0, 0.0, 0.0])
+    up = np.array([0.0, 0.0, 1.0])
+
+    def grow(start, first, bends, radii):
+        """A line from a place on, which turns into each of some directions."""
+        points, heading = [start], first
+        for target, length in bends:
+            target = target + rng.normal(0.0, 0.12, 3)
+            target /= np.linalg.norm(target)
+            for share in np.linspace(0.0, 1.0, 12)[1:]:
+                mixed = (1.0 - share) * heading + share * target
+                points.append(points[-1] + length / 11 * mixed / np.linalg.norm(mixed))
+            heading = target
+        line = Centreline(np.array(points), np.ones(len(points))).resampled(2e-3)
+        share = line.arc_length / line.length
+        given = np.interp(share, np.linspace(0.0, 1.0, len(radii)), radii)
+        return Centreline(line.points, given)
+
+    def go_on(name, bends, end):
+        line = vessels[name].centreline
+        last = line.at(line.length)
+        more = grow(last.position, last.tangent, bends, [float(last.radius), end])
+        points = np.concatenate([line.points, more.points[1:]])
+        radii = np.concatenate([line.radii, more.radii[1:]])
+        vessels[name] = replace(vessels[name], centreline=Centreline(points, radii))
+
+    def leave(name, parent, at, bends, radii):
+        place = vessels[parent].centreline.at(at)
+        line = grow(place.position, bends[0][0], bends, radii)
+        depth = vessels[parent].centreline.project(line.points)
+        out = depth.distance > depth.radius
+        vessels[name] = Vessel(name, line, parent, float(line.arc_length[out.argmax()]))
+
+    bca = vessels["bca"].centreline
+    wide = float(bca.radii[-1])
+    back = np.array([0.0, 1.0, 0.0])
+    arm = [0.75 * wide, 3.6e-3, 3.4e-3, 3.2e-3]
+    if narrow is not None:
+        arm = [0.75 * wide, 3.4e-3, narrow, 3.2e-3, 3.2e-3, 3.2e-3, 3.0e-3]
+    steep = right + (1.6 if narrow is not None else 0.5) * up
+    leave("rsa", "bca", bca.length - 2e-3, [(steep, 25e-3), (right, 60e-3)], arm)
+    carotid = up + 0.15 * right
+    end = [0.8 * wide, 3.2e-3, 3.0e-3]
+    leave("rcca", "bca", bca.length - 2e-3, [(carotid, 30e-3), (up, 60e-3)], end)
+    at = 30e-3 if narrow is None else 52e-3
+    thin = [1.9e-3, 1.8e-3, 1.7e-3]
+    climb = up + 0.5 * back + 0.2 * right
+    leave("rva", "rsa", at, [(climb, 25e-3), (up + 0.1 * back, 45e-3)], thin)
+    go_on("lcca", [(up, 60e-3)], 3.0e-3)
+    lsa = vessels["lsa"].centreline.length
+    go_on("lsa", [(-right + 0.3 * up, 30e-3), (-right, 40e-3)], 3.2e-3)
+    climb = up + 0.3 * back - 0.1 * right
+    leave("lva", "lsa", lsa - 5e-3, [(climb, 25e-3), (up, 45e-3)], thin)
+    return VesselTree(vessels)
+
+
+def with_vertebral(tree: VesselTree, rng) -> VesselTree:
+    """The tree with a left vertebral artery between LCCA and LSA."""
+    root = tree.root.centreline
+    places = [tree.origin(name) for name in ("lcca", "lsa")]
+    place = root.at(float(np.mean(places)))
+    chord = tree.vessel("lcca").centreline
+    way = chord.points[-1] - chord.points[0] + rng.normal(0.0, 2e-3, 3)
+    other = tree.vessel("lsa").centreline
+    way = 0.5 * (way + other.points[-1] - other.points[0])
+    way /= np.linalg.norm(way)
+    length = float(place.radius) + 50e-3
+    points = place.position + np.linspace(0.0, length, 30)[:, None] * way
+    line = Centreline(points, np.full(30, 1.9e-3))
+    vessel = Vessel("lva", line, tree.root.name, float(place.radius))
+    return VesselTree({**tree.vessels, "lva": vessel})

@@ -1,0 +1,155 @@
+"""Imports of scans with known truth: names right, asked or wrong, entry, radii."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import tempfile
+import time
+from collections import defaultdict
+from pathlib import Path
+
+import import_cases
+import numpy as np
+import trimesh
+from import_cases import ASK, Case
+
+from cathsim_dmc.anatomy.anatomy import Anatomy
+from cathsim_dmc.anatomy.centreline import VesselTree
+from cathsim_dmc.anatomy.scan.importer import import_scan
+from cathsim_dmc.anatomy.scan.naming import ANATOMICAL
+
+ENTRY = 20e-3  # m, distance of the inlet from the end of the descending aorta
+LONG = 22e-3  # m past its ostium: shorter branches need no name
+CLEAR = 6e-3  # m past an ostium, from which on a vessel is told from its parent
+MARGIN = 15e-3  # m at the ends of the aorta at which its radius is not compared
+
+
+def run(case: Case) -> dict:
+    """Import one case and compare it with its truth."""
+    tree = import_cases.truth(case)
+    lumen = import_cases.surface(case, tree)
+    out: dict = {"case": case.name, "kind": case.kind, "answer": case.answer}
+    out["triangles"] = len(lumen.faces)
+    notes: list[str] = []
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "lumen.ply"
+        mesh = trimesh.Trimesh(1e3 * lumen.vertices, lumen.faces, process=False)
+        mesh.export(path)
+        start = time.process_time()
+        try:
+            anatomy = import_scan(path, notes=notes)
+        except ValueError as error:
+            asks = " mirror" in str(error) or "--heart" in str(error)
+            out |= {"names": "asked" if asks else "refused", "said": str(error)}
+            return out
+        finally:
+            out["cpu_s"] = round(time.process_time() - start, 2)
+    back = np.linalg.inv(import_cases.turn(case))
+    return out | compared(anatomy, tree, back) | {"notes": notes}
+
+
+def compared(anatomy: Anatomy, tree: VesselTree, back: np.ndarray) -> dict:
+    """Names, entry and radii of an import against its truth."""
+    wrong, missing = [], []
+    found = {}
+    for name, vessel in anatomy.tree.vessels.items():
+        if name != anatomy.tree.root.name:
+            line = vessel.centreline
+            s = np.arange(min(vessel.ostium + CLEAR, line.length), line.length, 1e-3)
+            found[name] = whose(tree, line.at(s).position @ back.T)
+    for name, (first, last) in found.items():
+        if name in ANATOMICAL and name not in (first, last):
+            wrong.append(f"{name} is {first}")
+    for name, vessel in tree.vessels.items():
+        if "_" in name:  # a second branch of a phantom's vessel, without a name
+            continue
+        visible = vessel.centreline.length - vessel.ostium > LONG
+        if vessel.parent is not None and visible and name not in found:
+            missing.append(name)
+    root = tree.root.centreline
+    heart, end = root.points[0], root.points[-1]
+    entry = anatomy.inlet.position @ back.T
+    far = float(np.linalg.norm(entry - end))
+    line = anatomy.tree.root.centreline
+    near = root.project(line.points @ back.T)
+    inner = (near.arc_length > MARGIN) & (near.arc_length < root.length - MARGIN)
+    error = line.radii[inner] - near.radius[inner]
+    names = "wrong" if wrong else "asked" if missing else "right"
+    return {
+        "names": names,
+        "wrong": wrong,
+        "missing": missing,
+        "found": sorted(found),
+        "entry": bool(far < ENTRY and far < np.linalg.norm(entry - heart)),
+        "radius_mm": round(1e3 * float(np.median(error)), 3) if len(error) else None,
+        "radius_error_mm": round(1e3 * float(np.median(abs(error))), 3)
+        if len(error)
+        else None,
+    }
+
+
+def whose(tree: VesselTree, points: np.ndarray) -> tuple[str, str]:
+    """Vessels in which the first and the last third of some points lie."""
+    names = [name.split("_")[0] for name in tree.vessels]
+    depth = np.stack(list(tree.depths(points).values()))
+    owner = depth.argmax(axis=0)
+    third = max(1, len(points) // 3)
+    first, last = (
+        np.bincount(part).argmax() for part in (owner[:third], owner[-third:])
+    )
+    return names[int(first)], names[int(last)]
+
+
+def table(rows: list[dict]) -> str:
+    """Markdown: a line for each kind of case, and one for all."""
+    groups = defaultdict(list)
+    for row in rows:
+        groups[row["kind"]].append(row)
+    head = (
+        "| cases | number | names right | asked | wrong | refused | entry right | "
+        "radius of the aorta, error (median, mm) |\n|---|---|---|---|---|---|---|---|"
+    )
+    asks = [row for row in rows if row["answer"] == ASK]
+    rest = [row for row in rows if row["answer"] != ASK]
+    lines = [_line(kind, group) for kind, group in groups.items()]
+    lines += [_line("**all that show their names**", rest)]
+    lines += [_line("**all that must be asked for**", asks)]
+    return "\n".join([head, *lines])
+
+
+def _line(kind: str, rows: list[dict]) -> str:
+    count = {word: 0 for word in ("right", "asked", "wrong", "refused")}
+    for row in rows:
+        count[row["names"]] += 1
+    entered = [row["entry"] for row in rows if "entry" in row]
+    errors = [row["radius_error_mm"] for row in rows if row.get("radius_error_mm")]
+    radius = f"{np.median(errors):.2f}" if errors else ""
+    cells = [kind, len(rows), *count.values(), f"{sum(entered)} of {len(entered)}"]
+    return "| " + " | ".join(map(str, [*cells, radius])) + " |"
+
+
+def main() -> None:
+    """Run what is not in the file yet, and print the table."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("out", type=Path, help="JSON lines, one per case; resumed")
+    parser.add_argument("--only", default="", help="part of a case's name")
+    parser.add_argument("--part", default="0/1", help="k/n: every n-th case from k on")
+    options = parser.parse_args()
+    rows = []
+    if options.out.exists():
+        rows = [json.loads(line) for line in options.out.read_text().splitlines()]
+    done = {row["case"] for row in rows}
+    first, step = map(int, options.part.split("/"))
+    chosen = [c for c in import_cases.cases() if options.only in c.name]
+    for case in chosen[first::step]:
+        if case.name in done:
+            continue
+        rows.append(run(case))
+        with options.out.open("a") as stream:
+            stream.write(json.dumps(rows[-1]) + "\n")
+    print(table(rows))
+
+
+if __name__ == "__main__":
+    main()
