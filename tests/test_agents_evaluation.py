@@ -6,7 +6,7 @@ import synthetic_env
 import torch
 
 from cathsim_dmc import suite
-from cathsim_dmc.agents import compare, evaluate, protocols
+from cathsim_dmc.agents import compare, evaluate, policies, protocols
 from cathsim_dmc.agents.episodes import EpisodeOutcome
 from cathsim_dmc.agents.evaluation import EvaluationResult, paired_bootstrap
 from cathsim_dmc.agents.report import EvaluationReport
@@ -115,6 +115,20 @@ def test_the_varied_protocol_has_distinct_conditions():
     assert "device" not in pair.task_kwargs
     with pytest.raises(ValueError, match="no protocol 'hard'; there are published, v"):
         play(policy="random", protocol="hard")
+
+
+def test_a_policy_of_any_arch_goes_to_a_named_anatomy():
+    """Options that chose the training's anatomy do not follow it to another task."""
+    policy = policies.FunctionPolicy(expert)
+    policy.task = "arch_any"
+    policy.task_kwargs = {"pool": 4, "arches": "test", "goal": "lsa", "delay": 2}
+    here = policies.task_and_options(policy, None, {"pool": 8})
+    assert here == ("arch_any", {**policy.task_kwargs, "pool": 8})
+    scan = {"anatomy": "my_scan"}
+    there = policies.task_and_options(policy, None, scan)
+    assert there == ("navigate", {"delay": 2, **scan})
+    there = policies.task_and_options(policy, "type1_lcca", None)
+    assert there == ("type1_lcca", {"delay": 2})
 
 
 def test_one_condition_has_no_interval_over_its_episodes():

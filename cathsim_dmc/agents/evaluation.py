@@ -17,7 +17,7 @@ from torchrl.envs.utils import step_mdp
 from cathsim_dmc import bounds, files
 from cathsim_dmc.agents import protocols
 from cathsim_dmc.agents.episodes import EpisodeOutcome, EpisodeTracker
-from cathsim_dmc.agents.policies import PolicyLike, load_policy
+from cathsim_dmc.agents.policies import PolicyLike, load_policy, require_task
 from cathsim_dmc.agents.views import view_of
 from cathsim_dmc.analysis.force_statistics import QUANTITIES, Statistics
 from cathsim_dmc.analysis.intervals import success_interval
@@ -344,23 +344,6 @@ def _settings(
         "task_kwargs": dict(options or {}),
         "frames": checkpoint.frames if checkpoint else None,
     }
-
-
-def require_task(policy: Policy, task: str | None) -> str:
-    """The task asked for, or the one that the policy was made for.
-
-    Raises:
-        ValueError: there is neither.
-    """
-    chosen = task or policy.task
-    if chosen is None:
-        from cathsim_dmc import suite
-
-        raise ValueError(
-            f"the policy {policy.name!r} was not trained on a task, so it needs a "
-            f"task to play: one of {', '.join(suite.SUITE)}"
-        )
-    return chosen
 
 
 class _Environments:

@@ -9,6 +9,7 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
+from cathsim_dmc import suite
 from cathsim_dmc.agents import pretrained
 from cathsim_dmc.agents.checkpoint import Checkpoint
 from cathsim_dmc.policies import POLICIES, Policy, View, make_policy
@@ -138,3 +139,46 @@ def _tensors(observation: Mapping[str, np.ndarray]) -> TensorDict:
     """One observation as `environments.standard_observations` arranges it."""
     entries = {name: torch.as_tensor(one)[None] for name, one in observation.items()}
     return TensorDict(environments.standard(entries, 1), batch_size=[1])
+
+
+def require_task(policy: Policy, task: str | None) -> str:
+    """The task asked for, or the one that the policy was made for.
+
+    Raises:
+        ValueError: there is neither.
+    """
+    chosen = task or policy.task
+    if chosen is None:
+        raise ValueError(
+            f"the policy {policy.name!r} was not trained on a task, so it needs a "
+            f"task to play: one of {', '.join(suite.SUITE)}"
+        )
+    return chosen
+
+
+def task_and_options(
+    policy: Policy, task: str | None, options: Mapping[str, Any] | None
+) -> tuple[str, dict[str, Any]]:
+    """What a policy plays: a task, and its options over those of the training.
+
+    Args:
+        policy: Policy.
+        task: Name of the task; None takes the one that the policy was trained on, or
+            `navigate` where that has an anatomy of its own and `options` name another.
+        options: Options of the task.
+
+    Returns:
+        Name of the task, and its options. What chose the anatomy of the training stays
+        behind where the task is another one.
+
+    Raises:
+        ValueError: no task is known.
+    """
+    options, trained = dict(options or {}), dict(policy.task_kwargs or {})
+    own = suite.TASKS[policy.task].own_options if policy.task in suite.TASKS else ()
+    if task is None and policy.task and "anatomy" in {*options} - {*own}:
+        task = "navigate"
+    chosen = require_task(policy, task)
+    if chosen != policy.task:
+        trained = {name: value for name, value in trained.items() if name not in own}
+    return chosen, {**trained, **options}

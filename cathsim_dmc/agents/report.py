@@ -171,7 +171,7 @@ def evaluate(
 
     Args:
         policy: Policy, or what names one, see `policies.load_policy`.
-        task: Name of the task; None takes the one that the policy was trained on.
+        task: Name of the task, see `policies.task_and_options`.
         episodes: Number of episodes; None for that of the protocol.
         seed: Seed of the first episode; the others lie above it.
         protocol: Name of the conditions in `protocols.PROTOCOLS`.
@@ -190,7 +190,8 @@ def evaluate(
         episodes = protocols.get(protocol).episodes
     evaluation.check_numbers(episodes, seed, num_threads)
     player = policies.load_policy(policy, seed)
-    require_registered(evaluation.require_task(player, task))
+    task, options = policies.task_and_options(player, task, task_kwargs)
+    require_registered(task)
     if out_dir is not None:
         # Now: an evaluation that cannot be written would be lost.
         Path(out_dir).mkdir(parents=True, exist_ok=True)
@@ -208,7 +209,6 @@ def evaluate(
         num_threads=num_threads,
         start=snapshot,
     )
-    options = {**(player.task_kwargs or {}), **(task_kwargs or {})}
     result = play(player, task, task_kwargs=options, observer=observe)
     other = comparison = None
     if baseline and str(policy) != "random":
@@ -248,7 +248,7 @@ def record(
     Args:
         policy: Policy, or what names one, see `policies.load_policy`.
         out: Path of the .rrd file; None writes none.
-        task: Name of the task; None takes the one that the policy was trained on.
+        task: Name of the task, see `policies.task_and_options`.
         max_steps: Number of control steps after which the episode is cut off; None
             leaves it to the task.
         task_kwargs: Options of the task, over those that the policy was trained with.
@@ -269,12 +269,11 @@ def record(
     if max_steps is not None:
         bounds.whole("max_steps", max_steps, 1)
     player = policies.load_policy(policy, seed)
-    task = evaluation.require_task(player, task)
+    task, kwargs = policies.task_and_options(player, task, task_kwargs)
     require_registered(task)
     # Now: an episode that cannot be written would be lost.
     for target in targets.values():
         target.parent.mkdir(parents=True, exist_ok=True)
-    kwargs = {**(player.task_kwargs or {}), **(task_kwargs or {})}
     if player.observation is not None:
         kwargs["observation"] = player.observation
     environment = suite.load(suite.DOMAIN, task, task_kwargs={**kwargs, "random": seed})

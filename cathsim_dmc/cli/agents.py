@@ -69,7 +69,8 @@ def evaluate(
     """Play episodes with a policy and report reward, forces and success.
 
     Args:
-        task: Task of `cathsim list`; by default the one that the policy was trained on.
+        task: Task of `cathsim list`; by default the one that the policy was trained on,
+            or navigate where `--anatomy` names another anatomy.
         episodes: Number of episodes, each with a seed of its own; by default 30, and
             100 of the varied protocol.
         seed: Seed of the first episode; the others lie above it.
@@ -122,7 +123,8 @@ def record(
         out: Path of the .rrd file.
         gif: Path of a film for slides, .gif, .webp or, with the extra `mp4`, .mp4;
             needs no OpenGL.
-        task: Task of `cathsim list`; by default the one that the policy was trained on.
+        task: Task of `cathsim list`; by default the one that the policy was trained on,
+            or navigate where `--anatomy` names another anatomy.
         seed: Seed of the episode.
         anatomy: Where the task takes place.
         fluoroscopy: Whether to include X-ray images.
