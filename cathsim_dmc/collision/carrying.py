@@ -55,7 +55,8 @@ def _carry(model, data):
     wall = int(course[9])
     key = key_of(fields, model, wall)
     lattice = numbers(word(entry_of(fields, key) + MOTION_ENTRY), _COUNT)
-    values, there = np.empty((VALUES, 4)), np.empty(WARP)
+    scratch = np.empty(WARP + 4 * VALUES)
+    there, values = scratch[:WARP], scratch[WARP:].reshape(VALUES, 4)
     for n in range(count):
         contact = word(data + word(table + 8)) + n * word(table + 24)
         first = wholes(contact + word(table + 64), 1)[0]

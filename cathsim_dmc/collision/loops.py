@@ -525,7 +525,8 @@ def collide(model, data, contacts, geom1, geom2, margin, before):
     if space != 0:
         time = numbers(data + word(table + TIME), 1)[0]
         lattice, course = numbers(motion, _COUNT), numbers(space, _COUNT)
-        values, there = np.empty((VALUES, 4)), np.empty(WARP)
+        scratch = np.empty(WARP + 4 * VALUES)
+        there, values = scratch[:WARP], scratch[WARP:].reshape(VALUES, 4)
         warp(lattice, course, time, local[0], local[1], local[2], values, there)
         at_rest = (there[0], there[1], there[2])
         x, y, z = (

@@ -116,9 +116,8 @@ class Flow(StillBlood):
 
     def act(self, action: np.ndarray, state: Readings) -> np.ndarray:
         """Finds the velocity at the middle of each link, and its delay."""
-        middles = 0.5 * (state.centreline[:, :-1] + state.centreline[:, 1:])
-        if self._moving is not None:
-            middles = self._moving.to_rest(middles)
+        places = state.centreline if self._moving is None else self._moving.centreline
+        middles = 0.5 * (places[:, :-1] + places[:, 1:])
         found = self._at(middles)
         self.velocity[:] = found[..., :3]
         self._delay[:] = found[..., 3] / self._wave_speed[:, None]

@@ -83,7 +83,14 @@ class Hearted(Protocol):
 
 
 class Moving(Effect):
-    """Moves the wall of each simulation."""
+    """Moves the wall of each simulation.
+
+    Attributes:
+        flow: Flow with the same heart; None for none.
+        centreline: (N, L + 1, 3), of the device, at rest; there from `see` on.
+    """
+
+    centreline: np.ndarray
 
     def __init__(self, options: MotionOptions):
         """Takes the options of the task; `flow` may become one with the same heart."""
@@ -107,6 +114,7 @@ class Moving(Effect):
         self._wall = mujoco.mj_name2id(world.model, mujoco.mjtObj.mjOBJ_GEOM, "wall")
         self._motions: dict[int, Motion] = {}
         self._clock = np.zeros(world.num_simulations)
+        self._step = world.model.opt.timestep
 
     def enter(self, index: int, anatomy: Anatomy) -> None:
         """Takes the motion of an anatomy."""
@@ -145,8 +153,18 @@ class Moving(Effect):
         _, _, _, _, rate, phase, _, breath, begin, _ = self.world.parameters.T
         return (rate * self._clock + phase) % 1.0, (breath * self._clock + begin) % 1.0
 
-    def to_rest(self, points: np.ndarray) -> np.ndarray:
-        """Places at rest (N, ..., 3) of places in space (N, ..., 3), m."""
+    def at_rest(self, state: Readings) -> Readings:
+        """Readings with the places at rest of those in space."""
+        places = self._to_rest(state.centreline)
+        return state._replace(centreline=places, head=places[:, -1])
+
+    def see(self, state: Readings) -> Readings:
+        """`at_rest` of what was measured last, whose places other effects use."""
+        resting = self.at_rest(state)
+        self.centreline = resting.centreline
+        return resting
+
+    def _to_rest(self, points: np.ndarray) -> np.ndarray:
         found = [
             self._motions[index].to_rest(self.world.parameters[index], time, row)
             for index, (row, time) in enumerate(zip(points, self._time(), strict=True))
@@ -163,8 +181,7 @@ class Moving(Effect):
 
     def _time(self) -> list[float]:
         """Time of what MuJoCo has derived: one physics step before the end."""
-        step = self.world.model.opt.timestep
-        return np.maximum(self._clock - step, 0.0).tolist()
+        return np.maximum(self._clock - self._step, 0.0).tolist()
 
 
 def add_clock(root) -> None:

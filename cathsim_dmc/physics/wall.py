@@ -36,13 +36,9 @@ from cathsim_dmc.physics.readings import Readings
 STIFFENING = 3e-3  # m, indentation from which the wall is as stiff as it gets
 _SOLIMP = (0.7, 0.95, STIFFENING, 0.5, 4)
 _RELAXATION = 8e-3  # s, as that of the rigid wall
-_PLANES = 2  # of a capsule at a hollow wall
-_POISSON = 0.5
+_LAWS = np.array([(*CONTACT_SOLIMP, *CONTACT_SOLREF), (*_SOLIMP, 0.0, 0.0)])
 # The secant of the rigid wall's law under this load, N, is its stiffness.
 _LOAD = 0.1
-# Thickness of an artery over its radius, and the least: 1.4 and 1.0 mm at the ascending
-# and descending aorta (PMC3154923), 0.6 mm at a carotid.
-_RELATIVE, _THINNEST = 0.1, 0.6e-3
 
 _LIMITS = {
     "modulus": (1e4, 1e9, "Pa"),
@@ -73,7 +69,7 @@ class WallOptions:
 
 
 def stiffness(
-    radius: np.ndarray, modulus: float, thickness: np.ndarray | float, support: float
+    radius: np.ndarray, modulus: float, thickness: float, support: float
 ) -> np.ndarray:
     """Stiffness (n,) of a tube under a point load, N/m.
 
@@ -83,11 +79,10 @@ def stiffness(
         thickness: m.
         support: 0 to 1.
     """
-    plane = 1 - _POISSON**2
-    held = 4 * modulus * thickness**2 / (np.sqrt(3 * plane) * radius)
-    free = modulus / plane * thickness**3 / (12 * 0.149 * radius**3)
-    free = free * radius * np.sqrt(radius / thickness)
-    return free ** (1 - support) * held**support
+    from cathsim_dmc.physics import wall_loops  # late, as numba takes long
+
+    each = [wall_loops.stiffness(r, modulus, thickness, support) for r in radius]
+    return np.array(each)
 
 
 def law(
@@ -98,10 +93,11 @@ def law(
     Returns:
         And `geom_solimp`, the same for all.
     """
-    first, last = _SOLIMP[:2]
-    damping = _RELAXATION * stiffness * last * (1 - first) * weight / first
-    spring = stiffness * last**2 * (1 - first) * weight / first**2
-    return -np.stack([spring, damping], axis=-1), _SOLIMP
+    from cathsim_dmc.physics import wall_loops
+
+    ends = *_SOLIMP[:2], _RELAXATION
+    pairs = zip(stiffness, weight, strict=True)
+    return np.array([wall_loops.reference(*pair, *ends) for pair in pairs]), _SOLIMP
 
 
 def rigid_stiffness(weight: np.ndarray) -> np.ndarray:
@@ -127,10 +123,10 @@ class Wall(Effect):
 
     def bind(self, world: World) -> None:
         """Finds the links in the model."""
-        from cathsim_dmc.physics import flow_loops  # late, as numba takes long
+        from cathsim_dmc.physics import flow_loops, wall_loops  # late, as above
 
         super().bind(world)
-        self._look = flow_loops.velocities
+        self._look, self._contacts = flow_loops.velocities, wall_loops.contacts
         model, links = world.model, world.index.geoms
         self._geoms = links
         self._weight = model.body_invweight0[model.geom_bodyid[links], 0]
@@ -164,26 +160,22 @@ class Wall(Effect):
 
     def refresh(self, index: int) -> None:
         """Writes the contacts of one simulation."""
-        solref = self.world.field(index, "geom_solref")
-        solimp = self.world.field(index, "geom_solimp")
-        radius = self._radius[index]
-        modulus, thickness, support = self._material[index].tolist()
-        inside = radius > 0.0
-        around = np.where(inside, radius, 1.0)
-        walls: np.ndarray | float = thickness
-        if np.isnan(thickness):
-            walls = np.maximum(_RELATIVE * around, _THINNEST)
-        found = stiffness(around, modulus, walls, support)
-        soft = inside & (found < self._rigid)
-        springs, impedance = law(found / _PLANES, self._weight)
-        solref[self._geoms] = np.where(soft[:, None], springs, CONTACT_SOLREF)
-        solimp[self._geoms] = np.where(soft[:, None], impedance, CONTACT_SOLIMP)
+        self._contacts(
+            self._geoms,
+            self._radius[index],
+            self._material[index],
+            self._weight,
+            self._rigid,
+            _LAWS,
+            _RELAXATION,
+            self.world.field(index, "geom_solref"),
+            self.world.field(index, "geom_solimp"),
+        )
 
     def act(self, action: np.ndarray, state: Readings) -> np.ndarray:
         """Looks up the vessel around the middle of each link."""
-        middles = 0.5 * (state.centreline[:, :-1] + state.centreline[:, 1:])
-        if self._moving is not None:
-            middles = self._moving.to_rest(middles)
+        places = state.centreline if self._moving is None else self._moving.centreline
+        middles = 0.5 * (places[:, :-1] + places[:, 1:])
         out = np.empty((middles.shape[1], 5))
         for index, points in enumerate(np.ascontiguousarray(middles)):
             self._look(points, *self._circulations[index].arrays, out)

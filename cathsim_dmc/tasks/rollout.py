@@ -234,7 +234,8 @@ class Rollout:
         """Measures all simulations, or some, when the others have not moved."""
         now = self._views.read()
         time, last = CONTROL_TIMESTEP * self._steps, self._stepper.contact_rows[:, -1]
-        vessel_now = vessel.read(self._listed, time, self._rest(now), last)
+        self._resting = now if self._moving is None else self._moving.see(now)
+        vessel_now = vessel.read(self._listed, time, self._resting, last)
         force, devices = forces.wall_force(magnitudes), self._devices.read(now)
         new = Measured(now, force, devices, vessel_now)
         if rows is not None and hasattr(self, "_measured"):
@@ -302,18 +303,13 @@ class Rollout:
                 None if devices is None else devices.points,
             )
         if self._routes is not None:
-            head = self._rest(state).head
+            seen = state if self._moving is None else self._moving.at_rest(state)
+            head = seen.head
             ahead = self._routes.ahead(self._case_of, head, state.head_frame)
         force, chain = self.wall_force, self._chain
         frame = Frame(state, force, self._action, goal, chain, images, ahead, devices)
         frame = frame._replace(vessel=self._measured.vessel)
         return observations.observe(self._names, frame)
-
-    def _rest(self, state: readings.Readings) -> readings.Readings:
-        if self._moving is None:
-            return state
-        places = self._moving.to_rest(state.centreline)
-        return state._replace(centreline=places, head=places[:, -1])
 
     # Snapshots.
 
@@ -386,6 +382,8 @@ class Rollout:
         self._choose_objective()
         self._path = merged(self._path, Path(**snapshot.part("path")), indices)
         self._measured = self._measured.restored(snapshot, indices)
+        now = self.readings
+        self._resting = now if self._moving is None else self._moving.see(now)
         machines = [self.case(index).angiograph for index in indices]
         self._sensors.restore(indices, machines, snapshot.part("images"))
         self._tracking.restore(indices, snapshot.part("tracking"))
@@ -420,7 +418,7 @@ class Rollout:
     @property
     def resting(self) -> readings.Readings:
         """Readings, with places where they are in the vessel at rest: judged there."""
-        return self._rest(self.readings)
+        return self._resting
 
     @property
     def readings(self) -> readings.Readings:

@@ -19,8 +19,8 @@ PAGE = Path(__file__).parents[1] / "vessel.md"
 CASES = {
     "rigid": "rigid",
     "flow": {"flow": True},
-    "flow, `murray`": {"flow": {"split": "murray"}},
     "wall": {"wall": True},
+    "motion": {"motion": True},
     "living": "living",
 }
 POLICIES = (
