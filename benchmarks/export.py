@@ -3,12 +3,16 @@
 python benchmarks/export.py RUN NAME [--out DIRECTORY]
 """
 
+import hashlib
+import json
+import re
 import sys
 from pathlib import Path
 from typing import Annotated, Any
 
 import judgement
 import tyro
+from safetensors.torch import save
 
 from cathsim_dmc import files
 from cathsim_dmc.agents import pretrained
@@ -47,13 +51,16 @@ def export(
     Returns:
         Path of the weights.
     """
-    pretrained.require_name(name)
+    if not re.fullmatch(r"[a-z0-9][a-z0-9_]*", name):
+        raise ValueError(
+            f"a policy cannot be called {name!r}; use lower-case letters, digits and "
+            "underscores"
+        )
     if str(run).startswith(pretrained.PREFIX):
         path = pretrained.pretrained_path(str(run))
         policy: Any = str(run)
         old, network, shapes, config = pretrained.read_pretrained(path)
-        state = network.state_dict()
-        training = old["training"]
+        state, training = network.state_dict(), old["training"]
     else:
         policy = Checkpoint.open(run)
         state, shapes, config = policy.policy_state(), policy.shapes, policy.config
@@ -79,8 +86,20 @@ def export(
         },
         "versions": judgement.versions(),
     }
-    weights = pretrained.write_pretrained(out, name, state, card)
+    weights = write(Path(out), name, state, card)
     write_list(weights.parent)
+    return weights
+
+
+def write(directory: Path, name: str, state, card) -> Path:
+    """Write weights and card; the card last, which makes them a policy."""
+    directory.mkdir(parents=True, exist_ok=True)
+    data = save({key: value.cpu().contiguous() for key, value in state.items()})
+    weights = files.write_bytes(directory / f"{name}{pretrained.SUFFIX}", data)
+    sum_ = hashlib.sha256(data).hexdigest()
+    values = {"format": pretrained.FORMAT, "name": name, **card, "sha256": sum_}
+    text = json.dumps(values, indent=1, allow_nan=False) + "\n"
+    files.write_text(weights.with_suffix(".json"), text)
     return weights
 
 

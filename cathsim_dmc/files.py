@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import json
 import os
 import re
 import shutil
@@ -11,7 +10,7 @@ import uuid
 import zipfile
 from collections.abc import Iterable, Iterator
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import BinaryIO
 
 import numpy as np
 
@@ -195,39 +194,3 @@ def read_arrays(
     except Exception as error:  # zipfile and numpy fail in many ways
         text = " ".join(str(error).split())
         raise ValueError(text or type(error).__name__) from error
-
-
-def read_text(path: Path, largest: int, what: str) -> str:
-    """The UTF-8 text of a file from outside, which may have no end.
-
-    Args:
-        path: Path of the file.
-        largest: Size of the longest file that is read, bytes.
-        what: What the file should be, for the message of one that is longer.
-
-    Raises:
-        OSError: it cannot be read.
-        ValueError: it is too long or no text. The message does not name the file.
-    """
-    with open(path, "rb") as stream:
-        data = stream.read(largest + 1)
-    if len(data) > largest:
-        raise ValueError(f"it is too long for {what}")
-    return data.decode()
-
-
-def read_json(path: Path, largest: int, what: str) -> Any:
-    """The content of a JSON file from outside, which may be anything.
-
-    Args:
-        path: Path of the file.
-        largest: Size of the longest file that is read, bytes.
-        what: What the file should be, for the message of one that is longer.
-
-    Raises:
-        ValueError: it is missing, too long or no JSON; the message names it.
-    """
-    try:
-        return json.loads(read_text(path, largest, what))
-    except (OSError, ValueError, RecursionError) as error:
-        raise ValueError(f"{path} cannot be read: {error}") from error

@@ -66,12 +66,6 @@ def test_points_behind_the_source_have_no_pixel():
     assert np.isfinite(pixels[1]).all()
 
 
-def test_centred_on_puts_the_box_in_the_middle():
-    carm = CArm.view("RAO30").centred_on([[0.0, 0.0, 0.0], [0.1, 0.2, 0.4]])
-    assert carm.isocentre == pytest.approx((0.05, 0.1, 0.2))
-    assert carm.primary == CArm.view("RAO30").primary
-
-
 @pytest.mark.parametrize(
     ("fields", "message"),
     [

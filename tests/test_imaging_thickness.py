@@ -37,30 +37,6 @@ def sphere_interval(origin, direction, centre, radius):
     return along - half, along + half
 
 
-def cylinder_interval(origin, direction, start, stop, radius):
-    """Where rays are inside a cylinder with flat ends; empty if enter > leave."""
-    axis = (stop - start) / np.linalg.norm(stop - start)
-    across = direction - (direction @ axis)[..., None] * axis
-    offset = origin - start
-    offset_across = offset - offset @ axis * axis
-    a = (across**2).sum(axis=-1)
-    b = across @ offset_across
-    c = offset_across @ offset_across - radius**2
-    root = b * b - a * c
-    with np.errstate(divide="ignore", invalid="ignore"):
-        half = np.sqrt(np.maximum(root, 0.0)) / a
-        middle = -b / a
-        ends = np.stack(
-            [
-                ((start - origin) @ axis) / (direction @ axis),
-                ((stop - origin) @ axis) / (direction @ axis),
-            ]
-        )
-    enter = np.maximum(middle - half, ends.min(axis=0))
-    leave = np.minimum(middle + half, ends.max(axis=0))
-    return np.where(root > 0.0, enter, 0.0), np.where(root > 0.0, leave, -1.0)
-
-
 def tube(line, radius, sides=48):
     """Triangle tube round a polyline, closed by fans."""
     line = np.asarray(line, dtype=float)
@@ -104,32 +80,6 @@ def ball(centre, radius, count=90):
     return vertices, faces
 
 
-def capsule(start, stop, radius, count=40):
-    axis = (stop - start) / np.linalg.norm(stop - start)
-    t = np.linspace(0, np.pi / 2, count + 1)[1:]
-    first = start - radius * np.cos(t)[:, None] * axis
-    second = stop + radius * np.cos(t[::-1])[:, None] * axis
-    line = np.concatenate([first, second])
-    size = radius * np.concatenate([np.sin(t), np.sin(t[::-1])])
-    vertices, faces = tube(line, size, sides=160)
-    vertices[-2:] = start - radius * axis, stop + radius * axis
-    return vertices, faces
-
-
-def true_capsule(carm, start, stop, radius, supersample):
-    """Mean chord in each pixel: that of the hull of its parts, as it is convex."""
-    direction = rays(carm, supersample)
-    spans = [
-        cylinder_interval(carm.source, direction, start, stop, radius),
-        sphere_interval(carm.source, direction, start, radius),
-        sphere_interval(carm.source, direction, stop, radius),
-    ]
-    enter = np.min([np.where(b > a, a, np.inf) for a, b in spans], axis=0)
-    leave = np.max([np.where(b > a, b, -np.inf) for a, b in spans], axis=0)
-    chord = np.where(leave > enter, leave - enter, 0.0)
-    return pixel_mean(chord, supersample)
-
-
 def relative_error(image, truth):
     return np.abs(image - truth).sum() / truth.sum()
 
@@ -144,20 +94,6 @@ def test_sphere(view):
     image = surface_thickness(carm, vertices, faces, 3)
     assert relative_error(image, truth) < 0.01
     assert image.max() == pytest.approx(2 * radius, rel=2e-3)
-
-
-@pytest.mark.parametrize("view", ["AP", "RAO30"])
-def test_tilted_capsule(view):
-    carm = CArm.view(view, magnification=1.5)
-    start, stop, radius = (
-        np.array([-0.03, 0.02, -0.03]),
-        np.array([0.02, -0.02, 0.03]),
-        0.01,
-    )
-    vertices, faces = capsule(start, stop, radius)
-    truth = true_capsule(carm, start, stop, radius, 3)
-    image = surface_thickness(carm, vertices, faces, 3)
-    assert relative_error(image, truth) < 0.01
 
 
 @settings(max_examples=40)

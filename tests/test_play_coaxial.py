@@ -9,11 +9,9 @@ import types
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from cathsim_dmc.play import controls, play, window
-from cathsim_dmc.play.controls import COMMANDS, CoaxialControls
+from cathsim_dmc.play.controls import CoaxialControls
 from cathsim_dmc.recording import Episode
 from cathsim_dmc.recording.coaxial import CoaxialRecord
 
@@ -45,21 +43,6 @@ def test_each_hand_holds_a_device(command):
     hands.press(command)
     hands.restart()
     assert not hands.action(STEP).any()
-
-
-@given(
-    st.integers(1, 3),
-    st.lists(st.tuples(st.sampled_from(COMMANDS), st.booleans()), max_size=40),
-)
-def test_whatever_is_pressed_the_action_is_one(devices, keys):
-    hands = CoaxialControls(devices)
-    for command, down in keys:
-        (hands.press if down else hands.release)(command)
-        action = hands.action(STEP)
-        assert action.shape == (2 * devices,) and np.abs(action).max() <= 1.0
-    assert hands.requested in (None, "restart", "quit")
-    with pytest.raises(ValueError, match="push, pull"):
-        hands.press("jump")
 
 
 class Screen(types.ModuleType):

@@ -76,16 +76,6 @@ def test_batched_env(batched):
         assert info[name].dtype == torch.bool
 
 
-def test_batched_env_with_images():
-    shown = ["image", "sequential"]
-    env = BatchedEnv("simple1_lcca", 2, num_threads=1, observation=shown)
-    check_env_specs(env)
-    for name, channels in zip(shown, (1, 3), strict=True):
-        image = env.reset()[name]
-        assert image.dtype == torch.uint8
-        assert image.shape == (2, 128, 128, channels)
-
-
 def test_batched_seeds(batched):
     def start(seed):
         batched.set_seed(seed)
@@ -112,17 +102,6 @@ def test_only_what_is_done_is_reset(batched):
     assert not torch.equal(after[0], before[0])
     assert not torch.equal(after[2], before[2])
     assert batched.simulation.rollout.steps.tolist() == [0, 3, 0]
-
-
-def test_tensors_of_steps_share_no_memory(short_batched):
-    tensordict = short_batched.reset()
-    kept = {key: tensordict[key].clone() for key in ("tracking_points", "wall_force")}
-    first = dict(tensordict.items())
-    for _ in range(2):
-        tensordict["action"] = short_batched.action_spec.rand()
-        tensordict = short_batched.step(tensordict)["next"].clone(False)
-    for key, value in kept.items():
-        assert torch.equal(first[key], value)
 
 
 def test_the_first_episode_is_that_of_the_seed():

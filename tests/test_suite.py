@@ -287,20 +287,6 @@ def test_time_out_comes_at_max_steps_with_discount_one(shared_environment, task_
     assert environment.step(np.zeros(21)).mid()
 
 
-@pytest.mark.parametrize("task_name", EACH_TASK)
-def test_reward_is_minus_the_distance_in_metres(shared_environment, task_name):
-    environment = shared_environment(task_name)
-    environment.reset()
-    for action in random_actions(environment, 5):
-        timestep = environment.step(action)
-        distance = np.linalg.norm(
-            environment.task.readings.head - environment.task.goal_position
-        )
-        assert timestep.reward == pytest.approx(-distance, rel=1e-12)
-        assert timestep.discount == 1.0
-        assert 0.03 < distance < 0.3
-
-
 @pytest.fixture(scope="module")
 def near_goal():
     """An environment whose goal lies 3 cm ahead of the tip."""

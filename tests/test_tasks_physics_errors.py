@@ -194,3 +194,16 @@ def test_trainings_keep_dumps_in_their_folder(tmp_path, monkeypatch):
         path = physics_errors.dump("tried", start, np.zeros((2, 3)))
     assert path.parent == tmp_path / "errors"
     assert "CATHSIM_DUMP_DIR" not in os.environ
+
+
+def test_a_full_disk_does_not_end_the_other_simulations(
+    dumps, task, small_disk, caplog
+):
+    simulation = batch.BatchSimulation(task, 2, num_threads=1, seeds=3)
+    simulation.reset()
+    simulation.batch.qvel[1] = 1e12
+    with small_disk(100):
+        step = simulation.step(np.zeros((2, simulation.num_actions)))
+    assert step.physics_error.tolist() == [False, True]
+    assert "lost" in caplog.text and "File too large" in caplog.text
+    assert not list(dumps.iterdir())

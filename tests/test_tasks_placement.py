@@ -15,9 +15,6 @@ from cathsim_dmc.anatomy import phantoms
 from cathsim_dmc.anatomy.arch import arch
 from cathsim_dmc.anatomy.parts import Inlet
 from cathsim_dmc.entities import devices
-from cathsim_dmc.entities.catheter import Catheter
-from cathsim_dmc.entities.robot import Robot
-from cathsim_dmc.physics import readings
 from cathsim_dmc.physics.randomisation import Episode
 from cathsim_dmc.simulation.batch import BatchSimulation
 from cathsim_dmc.tasks import placement
@@ -207,16 +204,6 @@ def test_insertion_is_what_the_base_has_moved(shared_environment):
     assert 0.01 < moved <= 0.0164
     axis = environment.task.scene.placement.direction
     assert (now.head - start.head) @ axis == pytest.approx(moved, abs=3e-4)
-
-
-def test_a_model_without_the_elements(shared_environment):
-    environment = shared_environment("type1_bca")
-    model, scene = environment.physics.model.ptr, environment.task.scene
-    strangers = Catheter(), Robot()
-    with pytest.raises(ValueError, match="joint named 'insertion'"):
-        readings.ModelIndex(model, strangers[0], scene.robot)
-    with pytest.raises(ValueError, match="joint named 'front"):
-        readings.ModelIndex(model, scene.catheter, strangers[1])
 
 
 @pytest.mark.slow

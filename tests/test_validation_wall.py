@@ -76,14 +76,6 @@ def test_insertion_is_reproducible_and_the_default_step_converged():
     assert 0 < study["path_mean_mm"][1] < 1.0
 
 
-def test_distance_from_a_polyline_with_a_halt():
-    line = np.array([[0.0, 0, 0], [1, 0, 0], [1, 0, 0], [1, 1, 0]])
-    points = np.array([[0.5, 0.2, 0], [1.3, 0.5, 0], [-3, 0, 4], [1, 0.5, 0]])
-    np.testing.assert_allclose(
-        convergence.polyline_distance(points, line), [0.2, 0.3, 5, 0], atol=1e-12
-    )
-
-
 @pytest.mark.slow
 def test_wall_report_passes():
     report = wall.validate_wall()

@@ -2,15 +2,12 @@
 
 import hashlib
 import json
-import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import torch
 from tensordict.nn import TensorDictSequential
 
-from cathsim_dmc import files
 from cathsim_dmc.agents.checkpoint import CheckpointError, line_of, policy_of
 from cathsim_dmc.agents.config import TrainingConfig
 from cathsim_dmc.agents.learners import config_from_dict
@@ -20,7 +17,6 @@ FORMAT = 1
 PREFIX = "pretrained:"
 SUFFIX = ".safetensors"
 DIRECTORY = Path(__file__).parents[1] / "pretrained"
-_NAME = re.compile(r"[a-z0-9][a-z0-9_]*")
 _PARTS: Mapping[str, type] = {
     "name": str,
     "task": str,
@@ -102,48 +98,3 @@ def read_card(path: str | Path) -> dict[str, Any]:
     if wrong or card.get("format") != FORMAT:
         raise CheckpointError(f"{path}: no card of format {FORMAT}; wrong is {wrong}.")
     return card
-
-
-def write_pretrained(
-    directory: str | Path,
-    name: str,
-    state: Mapping[str, torch.Tensor],
-    card: Mapping[str, Any],
-) -> Path:
-    """Write weights and card; the card last, which makes them a policy.
-
-    Args:
-        name: Name of the policy: lower-case letters, digits and underscores.
-        card: Card without "format", "name" and "sha256".
-
-    Returns:
-        Path of the weights.
-
-    Raises:
-        ValueError: the name is not allowed.
-    """
-    from safetensors.torch import save
-
-    require_name(name)
-    directory = Path(directory)
-    directory.mkdir(parents=True, exist_ok=True)
-    data = save({key: value.cpu().contiguous() for key, value in state.items()})
-    weights = files.write_bytes(directory / f"{name}{SUFFIX}", data)
-    values = {
-        "format": FORMAT,
-        "name": name,
-        **card,
-        "sha256": hashlib.sha256(data).hexdigest(),
-    }
-    text = json.dumps(values, indent=1, allow_nan=False) + "\n"
-    files.write_text(weights.with_suffix(".json"), text)
-    return weights
-
-
-def require_name(name: str) -> None:
-    """Raise ValueError unless a policy may have this name."""
-    if not _NAME.fullmatch(name):
-        raise ValueError(
-            f"a policy cannot be called {name!r}; use lower-case letters, digits and "
-            "underscores"
-        )

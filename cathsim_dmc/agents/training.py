@@ -24,12 +24,11 @@ from cathsim_dmc.agents.checkpoint import (
     line_of,
     save_checkpoint,
 )
-from cathsim_dmc.agents.collection import make_collector
 from cathsim_dmc.agents.config import ConfigError, TrainingConfig
 from cathsim_dmc.agents.episodes import INFO, EpisodeTracker
 from cathsim_dmc.agents.evaluation import EnvFactory
 from cathsim_dmc.agents.interruption import Interruption
-from cathsim_dmc.agents.learner import Learner
+from cathsim_dmc.agents.learner import Learner, make_collector
 from cathsim_dmc.agents.learners import make_learner
 from cathsim_dmc.agents.networks import NetworkShapes
 from cathsim_dmc.agents.training_log import TrainingLog, crossed

@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike
 
 from cathsim_dmc import file_maps
 from cathsim_dmc.anatomy.centreline import Array, VesselTree
+from cathsim_dmc.anatomy.lattice import MARGIN
 from cathsim_dmc.anatomy.parts import End, Surface
 from cathsim_dmc.anatomy.segments import as_points
 
@@ -25,7 +26,6 @@ TOLERANCE = 8e-6
 _COARSE = 3e-5
 LARGEST = 5_000_000  # bytes; where tolerance asks for more, it grows
 MOST_CELLS = 12  # along the edge of a brick
-MARGIN = 4e-3  # m, by which the box of the field exceeds the lumen
 QUANTUM = 1e-6  # m, of the depths kept in 16 bits, which reach to 32.767 mm
 _LARGEST = 32767
 _STEP = 0.25e-3  # m, to both sides, over which a gradient is taken

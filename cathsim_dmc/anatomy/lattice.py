@@ -6,6 +6,7 @@ from collections.abc import Callable
 
 import numpy as np
 
+MARGIN = 4e-3  # m, by which the box of a field exceeds the lumen
 # Points along the edges of the blocks that are looked at first, and of their parts.
 _BLOCKS = ((8, 2), (2, 1))
 # An interpolated depth may change by a little more than 1 m per m.

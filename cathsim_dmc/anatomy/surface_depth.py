@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.sparse import coo_array
 
-from cathsim_dmc.anatomy.field import MARGIN
+from cathsim_dmc.anatomy.lattice import MARGIN
 from cathsim_dmc.anatomy.parts import End, Surface
 from cathsim_dmc.anatomy.segments import Array
 

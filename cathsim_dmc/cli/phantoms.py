@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 from tyro import conf
 from tyro.extras import SubcommandApp
 
+from cathsim_dmc import bounds
 from cathsim_dmc.cli.options import Access, Json, print_json, show
 
 if TYPE_CHECKING:
@@ -143,42 +144,25 @@ def generate(
     from cathsim_dmc.anatomy import phantoms as shipped
     from cathsim_dmc.anatomy.arch import arch
 
-    given = {"seed": seed is not None, "index": index is not None}
-    if kind in arch.DROP_RANGES:
-        _check_given(kind, given, "seed")
-        anatomy = arch.build_seed(
-            arch.ArchSeed(int(seed or 0), kind, variant), access=access
-        )
-    elif kind in arch.SETS:
-        _check_given(kind, given, "index")
-        index = int(index or 0)
+    needs = dict.fromkeys(shipped.PHANTOMS) | dict.fromkeys(arch.SETS, "index")
+    needs |= dict.fromkeys(arch.DROP_RANGES, "seed")
+    if kind not in needs:
+        raise ValueError(f"no phantom, type or set {kind!r}; there are {[*needs]}")
+    for option, value in {"seed": seed, "index": index}.items():
+        if (value is not None) != (option == needs[kind]):
+            wanted = f"--{needs[kind]}" if needs[kind] else "neither --seed nor --index"
+            raise ValueError(f"{kind!r} takes {wanted}; --{option} is {value}")
+    if seed is not None:
+        anatomy = arch.build_seed(arch.ArchSeed(seed, kind, variant), access=access)
+    elif index is not None:
         arches = arch.arch_set(kind)
-        if not 0 <= index < len(arches):
-            raise ValueError(
-                f"index is {index}; {kind!r} has arches 0 to {len(arches) - 1}"
-            )
+        bounds.whole("index", index, 0, len(arches) - 1)
         anatomy = arch.build_seed(arches[index], access=access)
-    elif kind in shipped.PHANTOMS:
-        _check_given(kind, given, None)
-        anatomy = shipped.load(kind, access=access)
     else:
-        raise ValueError(
-            f"no phantom, type or set {kind!r}; there are "
-            f"{', '.join((*shipped.PHANTOMS, *arch.DROP_RANGES, *arch.SETS))}"
-        )
+        anatomy = shipped.load(kind, access=access)
     anatomy.save(out)
     print(f"{anatomy.name}: goals {', '.join(anatomy.goals)}: {out}")
     return 0
-
-
-def _check_given(kind: str, given: dict[str, bool], needed: str | None) -> None:
-    """Check that of seed and index the one that `kind` needs is given, and no other."""
-    for option, is_given in given.items():
-        if is_given and option != needed:
-            use = f"give --{needed} with it" if needed else "it is no random arch"
-            raise ValueError(f"--{option} does not go with {kind!r}; {use}")
-    if needed and not given[needed]:
-        raise ValueError(f"{kind!r} needs --{needed}")
 
 
 @phantoms.command

@@ -7,7 +7,6 @@ from typing import Any
 import numpy as np
 
 from cathsim_dmc.imaging import angiograph
-from cathsim_dmc.play import readout
 from cathsim_dmc.play.controls import CoaxialControls, Controls
 
 TITLE = "cathsim"
@@ -29,7 +28,10 @@ KEYS = {
 }
 # X repeats a held key as release and press; a release counts if none follows in, s:
 _REPEAT = 0.06
-_BAR_FORCE = readout.FORCE_LEVELS[-1][0]  # N at the end of the bar
+# Colours of the force bar: mean tip force of trained navigation, the budget of safe
+# learning and the proposed rupture threshold, N.
+FORCE_LEVELS = ((0.15, "green"), (0.85, "orange"), (1.5, "red"))
+_BAR_FORCE = FORCE_LEVELS[-1][0]  # N at the end of the bar
 _PANEL = 230  # px
 
 
@@ -147,7 +149,7 @@ class FluoroscopyWindow:
     def _draw_panel(self, task, message):
         panel, left, y = self._panel, 14, 24
         panel.delete("all")
-        lines = readout.lines(task)
+        lines = lines_of(task)
         if isinstance(self._controls, Controls):
             bend = " ".join(f"{100 * share:4.0f} %" for share in self._controls.bend)
             lines.append(("bend about x, y", bend))
@@ -159,7 +161,7 @@ class FluoroscopyWindow:
         width = (_PANEL - 2 * left) * min(force / _BAR_FORCE, 1.0)
         panel.create_rectangle(left, y, _PANEL - left, y + 16, outline="grey40")
         panel.create_rectangle(
-            left, y, left + width, y + 16, fill=readout.colour(force), width=0
+            left, y, left + width, y + 16, fill=colour_of(force), width=0
         )
         y += 40
         panel.create_text(
@@ -183,3 +185,50 @@ def _machine(task) -> angiograph.Planes:
 
 def _name(keysym: str) -> str:
     return keysym.lower() if len(keysym) == 1 else keysym
+
+
+def lines_of(task: Any) -> list[tuple[str, str]]:
+    """Name and value of every quantity after a control step or a reset."""
+    state, wall = task.readings, task.wall_force
+    distance = float(np.linalg.norm(state.head - task.goal_position))
+    return [
+        ("goal", task.scene.goal.name),
+        ("distance", _millimetres(distance)),
+        *_inserted(task),
+        ("push force", _newton(state.push_force)),
+        ("wall force, sum", _newton(wall.sum)),
+        ("largest contact", _newton(wall.max)),
+        ("peak in the step", _newton(wall.peak_max)),
+    ]
+
+
+def _inserted(task: Any) -> list[tuple[str, str]]:
+    """How far each device is in and, where it is turned at its base, by how much."""
+    devices = task.devices
+    if devices is None:
+        return [("inserted", _millimetres(task.readings.insertion))]
+    rows = []
+    for name, way, angle in zip(
+        task.scene.catheter.device_names,
+        devices.insertion,
+        np.degrees(devices.rotation),
+        strict=True,
+    ):
+        rows += [(name, _millimetres(way)), ("turned", f"{angle:5.0f}°")]
+    return rows
+
+
+def _millimetres(way: float) -> str:
+    return f"{float(way) * 1e3:5.1f} mm"
+
+
+def _newton(force: float) -> str:
+    return f"{round(float(force), 3) + 0.0:6.3f} N"  # no minus before zero
+
+
+def colour_of(force: float) -> str:
+    """Colour of a contact force in N."""
+    for level, name in FORCE_LEVELS:
+        if force <= level:
+            return name
+    return FORCE_LEVELS[-1][1]

@@ -35,7 +35,6 @@ SHAPES = (
 # Largest step of the free end as one device slides in the other, in that of the curve:
 # a chain whose hinges jumped one after the other would make several at once.
 STEP_BOUND = 1.1
-_FINE = 0.05e-3  # m, of the curve that is integrated
 
 
 def straightened(names: Sequence[str]) -> tuple[Device, ...]:
@@ -142,7 +141,7 @@ def weighted_curve(
 
     Integrated from the base, with a frame that does not twist.
     """
-    arc, steps, curvature = weighted_curvature(chosen, gaps, rotation, length)
+    arc, steps, curvature = shapes.weighted_curvature(chosen, gaps, rotation, length)
     frame, points = np.eye(3), [np.zeros(3)]
     for bend, step in zip(curvature, steps, strict=True):
         # The curvature x + iy leads towards x and y: a turn about -y, x of the frame.
@@ -151,40 +150,6 @@ def weighted_curve(
         points.append(points[-1] + half[:, 2] * step)
         frame = Rotation.from_rotvec(axis).as_matrix() @ frame
     return np.append(arc, length), np.array(points)
-
-
-def weighted_curvature(
-    chosen: Sequence[Device],
-    gaps: np.ndarray,
-    rotation: np.ndarray,
-    length: float,
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Pieces (n,) of 0.05 mm: arc length of their beginning, length, curvature x + iy.
-
-    The curvature leads towards x and y; where no device is, there is none.
-    """
-    arc = np.arange(0.0, length, _FINE)
-    steps = np.diff(np.append(arc, length))
-    middle = length - (arc + steps / 2)  # from the end
-    stiffness, moment = np.zeros(len(arc)), np.zeros(len(arc), dtype=complex)
-    for device, gap, turn in zip(chosen, gaps, rotation, strict=True):
-        own = middle - gap
-        bending = np.where(
-            own < device.tip_length,
-            device.tip.bending_stiffness,
-            device.shaft.bending_stiffness,
-        ) * (own >= 0)
-        start = 0.0
-        for bow in reversed(device.tip_shape):
-            inside = (own >= start) & (own < start + bow.length)
-            sign = np.copysign(1 / bow.radius, bow.angle)
-            moment += np.where(inside, bending * sign * np.exp(1j * turn), 0.0)
-            start += bow.length
-        stiffness += bending
-    curvature = np.divide(
-        moment, stiffness, out=np.zeros_like(moment), where=stiffness > 0
-    )
-    return arc, steps, curvature
 
 
 def free_ends(names: Sequence[str], leads: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -207,7 +172,7 @@ def free_ends(names: Sequence[str], leads: np.ndarray) -> tuple[np.ndarray, np.n
     chain = np.stack([x, 0 * x, z], axis=-1)
     curve = []
     for gap in gaps:
-        _, steps, curvature = weighted_curvature(
+        _, steps, curvature = shapes.weighted_curvature(
             entity.devices, gap, np.zeros(2), length
         )
         turning = np.real(curvature) * steps

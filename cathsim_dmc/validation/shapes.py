@@ -10,11 +10,13 @@ from scipy.spatial.transform import Rotation
 
 from cathsim_dmc.entities import devices, posture
 from cathsim_dmc.entities.coaxial import Stack
+from cathsim_dmc.entities.device import Device
 from cathsim_dmc.entities.device_stack import DeviceStack
 from cathsim_dmc.physics import chain_fields
 from cathsim_dmc.validation.checks import Check
 from cathsim_dmc.validation.rig import Rig
 
+_FINE = 0.05e-3  # m, of the curve that is integrated
 TURNS = np.radians(np.arange(0, 360, 15))
 # Distances (m) of the ends of wire and catheter from the end of the chain.
 GAPS = ((0.0, 0.02), (0.012, 0.0), (0.0, 0.005))
@@ -54,6 +56,40 @@ def free_ends(
     return np.array([end for end, _ in ends]), np.array([axis for _, axis in ends])
 
 
+def weighted_curvature(
+    chosen: Sequence[Device],
+    gaps: np.ndarray,
+    rotation: np.ndarray,
+    length: float,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Pieces (n,) of 0.05 mm: arc length of their beginning, length, curvature x + iy.
+
+    The curvature leads towards x and y; where no device is, there is none.
+    """
+    arc = np.arange(0.0, length, _FINE)
+    steps = np.diff(np.append(arc, length))
+    middle = length - (arc + steps / 2)  # from the end
+    stiffness, moment = np.zeros(len(arc)), np.zeros(len(arc), dtype=complex)
+    for device, gap, turn in zip(chosen, gaps, rotation, strict=True):
+        own = middle - gap
+        bending = np.where(
+            own < device.tip_length,
+            device.tip.bending_stiffness,
+            device.shaft.bending_stiffness,
+        ) * (own >= 0)
+        start = 0.0
+        for bow in reversed(device.tip_shape):
+            inside = (own >= start) & (own < start + bow.length)
+            sign = np.copysign(1 / bow.radius, bow.angle)
+            moment += np.where(inside, bending * sign * np.exp(1j * turn), 0.0)
+            start += bow.length
+        stiffness += bending
+    curvature = np.divide(
+        moment, stiffness, out=np.zeros_like(moment), where=stiffness > 0
+    )
+    return arc, steps, curvature
+
+
 def turned(names: Sequence[str], gaps: Sequence[float]) -> tuple[float, float, float]:
     """Largest deviations of the unloaded end, turned by `TURNS`.
 
@@ -62,8 +98,6 @@ def turned(names: Sequence[str], gaps: Sequence[float]) -> tuple[float, float, f
         EI-weighted curvature, as fractions of the displacement of the end; deviation of
         the last link's direction from that of 0°, rad.
     """
-    from cathsim_dmc.validation.pair import weighted_curvature
-
     rig = Rig(catheter=DeviceStack(names))
     rig.compile()
     ends, axes = free_ends(rig, gaps, TURNS)
