@@ -15,7 +15,7 @@ from cathsim_dmc.anatomy import phantoms
 from cathsim_dmc.anatomy.arch import arch
 from cathsim_dmc.anatomy.parts import Inlet
 from cathsim_dmc.entities import devices
-from cathsim_dmc.physics.randomisation import Episode
+from cathsim_dmc.physics.effects import Episode
 from cathsim_dmc.simulation.batch import BatchSimulation
 from cathsim_dmc.tasks import placement
 from cathsim_dmc.tasks.config import NavigationConfig

@@ -13,7 +13,7 @@ import mujoco
 
 from cathsim_dmc.collision import native
 from cathsim_dmc.compiled import compiled
-from cathsim_dmc.physics.effects import MARK, Bodies
+from cathsim_dmc.physics.readings import MARK, Bodies
 
 # Links refer to each other: none is kept on disk.
 _compiled = functools.partial(compiled, cache=False)

@@ -2,8 +2,7 @@
 
 import numpy as np
 
-from cathsim_dmc.physics.effects import Effect, World
-from cathsim_dmc.physics.randomisation import Episode
+from cathsim_dmc.physics.effects import Effect, Episode, World
 from cathsim_dmc.physics.readings import Readings
 
 

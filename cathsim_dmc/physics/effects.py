@@ -10,22 +10,49 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import mujoco
 import numpy as np
 
 from cathsim_dmc.entities.chain import Chain
-from cathsim_dmc.physics.readings import ModelIndex, Readings
+from cathsim_dmc.imaging.angiograph import Deviation
+from cathsim_dmc.physics.readings import MARK, Bodies, ModelIndex, Readings
 
 if TYPE_CHECKING:
     from cathsim_dmc.anatomy import Anatomy
-    from cathsim_dmc.physics.randomisation import Episode
 
 # Numbers of `userdata` before the parameters of an effect: its mark and their number.
 _HEADER = 2
-# The last number of `userdata` where a compiled function may act.
-MARK = 0.7389056098930650
+
+
+@dataclasses.dataclass(frozen=True)
+class Episode:
+    """What was drawn for an episode; None where the model's own value stands.
+
+    Attributes:
+        displacement: (3,) of the tip at the start, frame of the inlet, m.
+        friction: Coulomb coefficient.
+        stiffness: factor.
+        loss: factor.
+        viscosity: factor.
+        deviation: of the angiography machine.
+        goal_shift: m along the branch.
+        roll: rad.
+        delay: control steps.
+        insertion: m, beyond the task's own start.
+    """
+
+    displacement: np.ndarray
+    friction: float | None = None
+    stiffness: float | None = None
+    loss: float | None = None
+    viscosity: float | None = None
+    deviation: Deviation = Deviation()
+    goal_shift: float | None = None
+    roll: float | None = None
+    delay: int = 0
+    insertion: float | None = None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -58,28 +85,6 @@ class World:
     def num_simulations(self) -> int:
         """N."""
         return len(self.arrays.qpos)
-
-
-class Bodies(NamedTuple):
-    """The bodies in a physics step, arrays of MuJoCo's, world frame, SI units.
-
-    Attributes:
-        xipos: (nbody, 3), centres of mass.
-        ximat: (nbody, 9), orientations of the principal axes, row by row.
-        xmat: (nbody, 9), orientations of the bodies, row by row.
-        cvel: (nbody, 6), rotational and translational velocity about the centre of mass
-            of the kinematic tree.
-        subtree_com: (nbody, 3), that centre is the row of the tree's first body.
-        xfrc_applied: (nbody, 6), force and torque on the centres of mass, N and N·m,
-            zeroed before the effects of a physics step, to be added to.
-    """
-
-    xipos: np.ndarray
-    ximat: np.ndarray
-    xmat: np.ndarray
-    cvel: np.ndarray
-    subtree_com: np.ndarray
-    xfrc_applied: np.ndarray
 
 
 class Effect:

@@ -17,7 +17,7 @@ from dm_control.composer.variation import distributions
 from cathsim_dmc import bounds
 from cathsim_dmc.entities.chain import hinge_time
 from cathsim_dmc.imaging.angiograph import Deviation
-from cathsim_dmc.physics.effects import Effect, World
+from cathsim_dmc.physics.effects import Effect, Episode, World
 from cathsim_dmc.physics.readings import ids
 
 # Published: radius of the ball of the random displacement of the tip.
@@ -145,7 +145,7 @@ class Randomisation:
         """How much farther in an episode may begin, m."""
         return 0.0 if self.start_insertion is None else self.start_insertion[1]
 
-    def draw(self, random_state: np.random.RandomState) -> "Episode":
+    def draw(self, random_state: np.random.RandomState) -> Episode:
         """Draws an episode; what is None takes nothing from the source."""
 
         def value(name: str) -> float | None:
@@ -204,35 +204,6 @@ DEFAULT_RANGES = Randomisation(
     roll=(-np.pi, np.pi),
     delay=(0, 2),
 )
-
-
-@dataclasses.dataclass(frozen=True)
-class Episode:
-    """What was drawn for an episode; None where the model's own value stands.
-
-    Attributes:
-        displacement: (3,) of the tip at the start, frame of the inlet, m.
-        friction: Coulomb coefficient.
-        stiffness: factor.
-        loss: factor.
-        viscosity: factor.
-        deviation: of the angiography machine.
-        goal_shift: m along the branch.
-        roll: rad.
-        delay: control steps.
-        insertion: m, beyond the task's own start.
-    """
-
-    displacement: np.ndarray
-    friction: float | None = None
-    stiffness: float | None = None
-    loss: float | None = None
-    viscosity: float | None = None
-    deviation: Deviation = Deviation()
-    goal_shift: float | None = None
-    roll: float | None = None
-    delay: int = 0
-    insertion: float | None = None
 
 
 class RandomisedModel(Effect):

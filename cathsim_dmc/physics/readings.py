@@ -17,6 +17,9 @@ from cathsim_dmc.entities.chain import Chain
 from cathsim_dmc.entities.robot import Robot
 from cathsim_dmc.physics import forces
 
+# The last number of `userdata` where a compiled function may act.
+MARK = 0.7389056098930650
+
 
 class Readings(NamedTuple):
     """State of the device after a control step.
@@ -105,6 +108,58 @@ class Views(NamedTuple):
             push_torque=self.push_torque.copy(),
             load_cell=-self.load_cell,
         )
+
+
+class CoaxialReadings(NamedTuple):
+    """State of K devices after a control step, arrays with the leading axis N.
+
+    Attributes:
+        insertion: (N, K), way of the end of each device from where the chain's end is
+            at zero insertion, m; negative for one that has been withdrawn farther.
+        rotation: (N, K), of the rotary units, rad.
+        tip_rotation: (N, K), of the ends of the devices, rad.
+        twist: (N, K), torque of the rotary units on the devices at rest, N·m.
+        points: (N, K, P, 3), points of each device `DEVICE_PLACES` from its end,
+            m, world frame, see `sliding`; the last one is its end.
+        leading_load: (N,), N, axial force in the device that reaches farthest where it
+            leaves the others, positive when it is pushed forward; for one device alone,
+            the push force.
+        lumen_friction: (N,), N, sum of the friction forces between the devices, which
+            stay when the devices stop.
+        push: (N, K), N, force of each drive on its device, positive when it pushes it
+            forward; their sum is the push force.
+    """
+
+    insertion: np.ndarray
+    rotation: np.ndarray
+    tip_rotation: np.ndarray
+    twist: np.ndarray
+    points: np.ndarray
+    leading_load: np.ndarray
+    lumen_friction: np.ndarray
+    push: np.ndarray
+
+
+class Bodies(NamedTuple):
+    """The bodies in a physics step, arrays of MuJoCo's, world frame, SI units.
+
+    Attributes:
+        xipos: (nbody, 3), centres of mass.
+        ximat: (nbody, 9), orientations of the principal axes, row by row.
+        xmat: (nbody, 9), orientations of the bodies, row by row.
+        cvel: (nbody, 6), rotational and translational velocity about the centre of mass
+            of the kinematic tree.
+        subtree_com: (nbody, 3), that centre is the row of the tree's first body.
+        xfrc_applied: (nbody, 6), force and torque on the centres of mass, N and N·m,
+            zeroed before the effects of a physics step, to be added to.
+    """
+
+    xipos: np.ndarray
+    ximat: np.ndarray
+    xmat: np.ndarray
+    cvel: np.ndarray
+    subtree_com: np.ndarray
+    xfrc_applied: np.ndarray
 
 
 class ModelIndex:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import mujoco
 import numpy as np
 
@@ -11,12 +9,8 @@ from cathsim_dmc.entities.chain import Chain
 from cathsim_dmc.entities.robot import follower_posture
 from cathsim_dmc.imaging.device import Shadow
 from cathsim_dmc.physics.drives import Drives
-from cathsim_dmc.physics.effects import Effect, World
-from cathsim_dmc.physics.randomisation import Episode
-from cathsim_dmc.physics.readings import Readings
-
-if TYPE_CHECKING:
-    from cathsim_dmc.physics.sliding import CoaxialReadings
+from cathsim_dmc.physics.effects import Effect, Episode, World
+from cathsim_dmc.physics.readings import CoaxialReadings, Readings
 
 # Length of the straight device behind its base that X-rays meet, m.
 BEHIND = 0.3

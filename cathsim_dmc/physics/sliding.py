@@ -8,8 +8,6 @@ saved, dumped and replayed.
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import mujoco
 import numpy as np
 
@@ -30,9 +28,8 @@ from cathsim_dmc.physics.chain_fields import (
     chain_properties,
     write_still,
 )
-from cathsim_dmc.physics.effects import World
-from cathsim_dmc.physics.randomisation import Episode
-from cathsim_dmc.physics.readings import Readings
+from cathsim_dmc.physics.effects import Episode, World
+from cathsim_dmc.physics.readings import CoaxialReadings, Readings
 from cathsim_dmc.physics.single_device import BEHIND, SingleDevice
 from cathsim_dmc.physics.stepper import CONTROL_TIMESTEP
 
@@ -44,36 +41,6 @@ _GAP_STEP = 1e-8  # m, for a derivative
 # Way of a slipping clamp in a control step by the force beyond its largest, m/N. The
 # axial force of a stiff wire in a tight bend changes by 0.8 N/mm at most.
 _GIVE = 1e-3
-
-
-class CoaxialReadings(NamedTuple):
-    """State of K devices after a control step, arrays with the leading axis N.
-
-    Attributes:
-        insertion: (N, K), way of the end of each device from where the chain's end is
-            at zero insertion, m; negative for one that has been withdrawn farther.
-        rotation: (N, K), of the rotary units, rad.
-        tip_rotation: (N, K), of the ends of the devices, rad.
-        twist: (N, K), torque of the rotary units on the devices at rest, N·m.
-        points: (N, K, P, 3), points of each device `DEVICE_PLACES` from its end, m,
-            world frame; the last one is its end.
-        leading_load: (N,), N, axial force in the device that reaches farthest where it
-            leaves the others, positive when it is pushed forward; for one device alone,
-            the push force.
-        lumen_friction: (N,), N, sum of the friction forces between the devices, which
-            stay when the devices stop.
-        push: (N, K), N, force of each drive on its device, positive when it pushes it
-            forward; their sum is the push force.
-    """
-
-    insertion: np.ndarray
-    rotation: np.ndarray
-    tip_rotation: np.ndarray
-    twist: np.ndarray
-    points: np.ndarray
-    leading_load: np.ndarray
-    lumen_friction: np.ndarray
-    push: np.ndarray
 
 
 def devices_of(chain: Chain) -> SingleDevice:

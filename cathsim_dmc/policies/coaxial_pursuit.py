@@ -31,8 +31,7 @@ from cathsim_dmc.entities import posture
 from cathsim_dmc.entities.chain import MAX_PUSH_SPEED, MAX_ROTATION_SPEED
 from cathsim_dmc.entities.device_stack import DeviceStack
 from cathsim_dmc.physics import forces
-from cathsim_dmc.physics.readings import Readings
-from cathsim_dmc.physics.sliding import CoaxialReadings
+from cathsim_dmc.physics.readings import CoaxialReadings, Readings
 from cathsim_dmc.policies import pursuit
 from cathsim_dmc.policies.attempts import Attempts, advance
 from cathsim_dmc.tasks import navigation

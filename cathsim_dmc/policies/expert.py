@@ -12,8 +12,7 @@ from typing import Any
 import numpy as np
 
 from cathsim_dmc.physics import forces
-from cathsim_dmc.physics.readings import Readings
-from cathsim_dmc.physics.sliding import CoaxialReadings
+from cathsim_dmc.physics.readings import CoaxialReadings, Readings
 from cathsim_dmc.policies import coaxial_pursuit
 from cathsim_dmc.policies.attempts import Attempts
 from cathsim_dmc.policies.coaxial_pursuit import CoaxialPlan, CoaxialSettings

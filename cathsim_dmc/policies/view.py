@@ -5,8 +5,7 @@ from __future__ import annotations
 from dm_control import composer
 
 from cathsim_dmc.physics.forces import WallForce
-from cathsim_dmc.physics.readings import Readings
-from cathsim_dmc.physics.sliding import CoaxialReadings
+from cathsim_dmc.physics.readings import CoaxialReadings, Readings
 from cathsim_dmc.simulation.batch import BatchSimulation
 from cathsim_dmc.tasks.cases import Case
 from cathsim_dmc.tasks.rollout import Rollout

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from cathsim_dmc.physics import forces, readings
-from cathsim_dmc.physics.sliding import CoaxialReadings
+from cathsim_dmc.physics.readings import CoaxialReadings
 from cathsim_dmc.physics.vessel import VesselReadings
 from cathsim_dmc.tasks.common_chain import CommonChain
 from cathsim_dmc.tasks.route import Ahead

@@ -8,8 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from cathsim_dmc.physics.forces import WallForce
-from cathsim_dmc.physics.readings import Readings
-from cathsim_dmc.physics.sliding import CoaxialReadings
+from cathsim_dmc.physics.readings import CoaxialReadings, Readings
 from cathsim_dmc.physics.vessel import VesselReadings
 from cathsim_dmc.tasks.objective_pool import part
 from cathsim_dmc.tasks.snapshot import Snapshot, merged, named

@@ -12,7 +12,7 @@ from dm_control import composer
 from cathsim_dmc import bounds
 from cathsim_dmc.physics import forces, readings
 from cathsim_dmc.physics.effects import Effect
-from cathsim_dmc.physics.sliding import CoaxialReadings
+from cathsim_dmc.physics.readings import CoaxialReadings
 from cathsim_dmc.physics.stepper import SingleStepper, Stepper
 from cathsim_dmc.tasks import cameras, cases, observations
 from cathsim_dmc.tasks.actions import check_action

@@ -10,7 +10,8 @@ import numpy as np
 
 from cathsim_dmc.entities.posture import bends_of, joints_along
 from cathsim_dmc.physics.drives import hold
-from cathsim_dmc.physics.randomisation import START_JITTER, Episode
+from cathsim_dmc.physics.effects import Episode
+from cathsim_dmc.physics.randomisation import START_JITTER
 from cathsim_dmc.physics.readings import ModelIndex
 from cathsim_dmc.tasks.scene import Scene
 

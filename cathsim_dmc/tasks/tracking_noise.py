@@ -4,8 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from cathsim_dmc.physics.readings import Readings
-from cathsim_dmc.physics.sliding import CoaxialReadings
+from cathsim_dmc.physics.readings import CoaxialReadings, Readings
 
 
 class TrackingNoise:

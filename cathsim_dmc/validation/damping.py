@@ -22,8 +22,7 @@ from cathsim_dmc.entities.posture import joints_along
 from cathsim_dmc.entities.sheath import Sheath
 from cathsim_dmc.physics.blood import BLOOD_VISCOSITY, StillBlood
 from cathsim_dmc.physics.drives import Drives
-from cathsim_dmc.physics.effects import Effects, World, userdata_size
-from cathsim_dmc.physics.randomisation import Episode
+from cathsim_dmc.physics.effects import Effects, Episode, World, userdata_size
 from cathsim_dmc.physics.readings import ids
 from cathsim_dmc.physics.stepper import CONTROL_TIMESTEP
 from cathsim_dmc.validation.checks import Check
