@@ -56,10 +56,7 @@ def number(
     """A finite number in a closed range.
 
     Args:
-        name: Name of the field.
         value: What was given.
-        low: Least value.
-        high: Largest value.
         unit: Unit of the bounds, for the message.
         positive: Whether it must also be greater than zero.
     """
@@ -88,10 +85,8 @@ def seeds(name: str, value: Any, count: int) -> list[int | list[int]]:
     """One seed for each of `count` simulations.
 
     Args:
-        name: Name of the field.
         value: Seed of the first simulation, from which the others count up, or one
             seed for each. A seed is an integer, or a row of integers.
-        count: Number of simulations.
     """
     if _is_whole(value):
         last = whole(name, value, 0, MOST_SEED - count + 1) + count
@@ -117,9 +112,7 @@ def indices(name: str, value: Any, count: int) -> np.ndarray:
     """Numbers (K,) of some of `count` simulations, sorted, each once.
 
     Args:
-        name: Name of the field.
         value: Integers in one row, at least one; None chooses all.
-        count: Number of simulations.
     """
     if value is None:
         return np.arange(count)
@@ -215,7 +208,6 @@ def array(
     """An array of finite numbers.
 
     Args:
-        name: Name of the field.
         value: What was given.
         kinds: Kinds of numpy's dtypes that are allowed.
         shape: Shape that it must have, -1 for any size; None for any shape.

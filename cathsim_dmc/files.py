@@ -35,7 +35,6 @@ def atomic_path(
     writer has left is removed by the next writer of the same path.
 
     Args:
-        path: Path of the file that is to appear.
         suffix: Ending that `path` must have, such as ".npz"; None allows any.
 
     Raises:
@@ -138,7 +137,6 @@ def remove_abandoned(folder: Path, name: str | None = None) -> None:
     """Remove unfinished files and directories that no living process holds open.
 
     Args:
-        folder: Where they lie.
         name: Of what they were to become; None takes all of them.
     """
     if fcntl is None or not folder.is_dir():

@@ -73,7 +73,6 @@ def record_demonstrations(
             expert's action, which is clipped to [-1, 1] afterwards.
         task_kwargs: Further options of the task; must be JSON-able.
         num_threads: Number of threads of the simulation; None takes one per core.
-        say: Function that is told of progress.
 
     Raises:
         ValueError: a number is out of range, the task or an option is unknown, or the
@@ -199,10 +198,8 @@ def load_transitions(
     """Transitions of a dataset's successful episodes, as a collector gives them.
 
     Args:
-        path: Directory of a Minari dataset.
         observation: Name or names of the observations that the networks read; the
             dataset may hold others beside them.
-        shapes: Sizes that the networks have.
 
     Returns:
         A TensorDict (n,) on the CPU with VECTOR and/or PIXELS, "action",

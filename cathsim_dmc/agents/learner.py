@@ -46,7 +46,6 @@ class Learner(abc.ABC):
         """Makes the policy with fresh weights, drawn from torch's generator.
 
         Args:
-            config: Settings of the algorithm.
             shapes: Sizes of what the policy reads, and of the action.
             directory: Directory of the run, for what the algorithm keeps on disk.
             critic_shapes: Sizes of what the critic reads; None for the policy's.
@@ -111,7 +110,6 @@ def make_collector(
     """A collector of batches (num_envs, steps) with the learner's policy as it is.
 
     Args:
-        config: Settings of the run.
         env: Environment, which the collector closes.
         frames: Number of frames that earlier processes of the run have seen.
     """

@@ -175,8 +175,6 @@ class GaussianActor(nn.Module):
     """Mean and deviation of the actions before the tanh, each (..., actions).
 
     Args:
-        shapes: sizes of observation and action.
-        config: widths and activation.
         state_dependent_std: whether the deviation is an output of the network (SAC)
             or one parameter per action (PPO).
     """

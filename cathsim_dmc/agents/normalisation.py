@@ -23,7 +23,6 @@ class ObservationNormaliser(nn.Module):
     buffers, so they travel with the weights.
 
     Args:
-        size: number of entries of the observation.
         clip: largest magnitude of a normalised entry.
     """
 

@@ -30,8 +30,6 @@ class ReplayMemory:
 
     Args:
         directory: Folder of the files; made on the first `extend`.
-        keys: Keys of the entries of a transition.
-        capacity: Largest number of transitions kept.
         max_bytes: Largest size of all files together; lowers the capacity if need be.
     """
 

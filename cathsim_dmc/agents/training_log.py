@@ -61,9 +61,6 @@ class TrainingLog:
         Args:
             metrics: Names of the learner's own figures.
             frames: Number of frames that earlier processes of the run have seen.
-            seconds: Wall time that they have taken.
-            episodes: Number of episodes that they have finished.
-            window: Figures of the last of these.
             progress: Whether to show progress on standard error.
         """
         self.frames, self.episodes = frames, episodes
@@ -108,8 +105,6 @@ class TrainingLog:
         """Logs a batch.
 
         Args:
-            frames: Number of frames of the batch.
-            finished: Episodes that ended in it.
             losses: Figures of the learner's update.
             last: Whether no other batch follows, so that a row is due anyway.
         """

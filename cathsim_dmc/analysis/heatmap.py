@@ -140,7 +140,6 @@ def contact_heatmap(
         cell: Side of a cell of the map, metres.
         force_limit: Top of the colour scale in newtons, to compare pictures; by
             default the largest mean of the map.
-        title: Text above the picture.
     """
     if force_limit is not None and not force_limit > 0:
         raise ValueError(f"force_limit must be positive, got {force_limit}")

@@ -57,11 +57,7 @@ class Pace:
 
 
 def speed(say: Callable[[str], None] = lambda text: None) -> Report:
-    """Calibrated speeds and the overhead of a suite step, as checks.
-
-    Args:
-        say: Function that is told of progress.
-    """
+    """Calibrated speeds and the overhead of a suite step, as checks."""
     say("real-time factors")
     checks, calibration = calibrated_speeds()
     say("overhead")

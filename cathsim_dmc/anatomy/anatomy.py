@@ -96,7 +96,6 @@ class Anatomy:
         Args:
             tree: measured centrelines (`anatomy.curves.Curve`) by name, parents
                 before their children; or a finished vessel tree, taken as it is.
-            name: what to call the anatomy.
             inlet: where the device enters; what lies behind is cut off. The first
                 point of the root if None.
             goals: places to reach; if None one in each branch, see

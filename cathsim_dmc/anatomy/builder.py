@@ -72,7 +72,6 @@ def placed(
     """The tree from its inlet on, its flat ends, inlet and goals.
 
     Args:
-        tree: vessels.
         inlet: where the device enters; the first point of the root if None.
         goals: by name; see `default_goals` if None.
 
@@ -106,7 +105,6 @@ def flat_ends(tree: VesselTree, entered: str, at_first: bool) -> tuple[End, ...]
     """Every flat end of a tree, the one where the device enters open.
 
     Args:
-        tree: vessels.
         entered: vessel that the device enters.
         at_first: whether it enters at the first point of the root's centreline.
     """

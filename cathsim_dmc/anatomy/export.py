@@ -112,7 +112,6 @@ def write_mjcf(
     """Write an anatomy as a model of convex geoms, with a site at the inlet and goals.
 
     Args:
-        anatomy: what to write.
         path: of the file, which must end in .xml; lengths in it are metres.
         pieces: how the wall is divided, of `PIECES`.
 

@@ -157,7 +157,6 @@ class Field:
         """Field of the union of a tree's tubes.
 
         Args:
-            tree: vessels.
             ends: flat ends; those that are open let a device pass.
         """
         from cathsim_dmc.anatomy.tree_depth import TreeDepth

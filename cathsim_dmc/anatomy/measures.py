@@ -103,7 +103,6 @@ def measure(
     """Measure a tree whose root is an aorta with its ascending end first.
 
     Args:
-        tree: vessels.
         start: (3,) m, where a device enters; the root's first point if None.
         axis: (3,) unit vector of its first direction; that of the root's first 30 mm
             if None.

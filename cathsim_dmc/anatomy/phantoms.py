@@ -28,7 +28,6 @@ def load(name: str, *, access: str = "ascending") -> Anatomy:
     """Anatomy called `name` in `PHANTOMS`; equal calls give the same object.
 
     Args:
-        name: of the phantom.
         access: "ascending" enters at the aortic root, "descending" (as from the
             femoral artery) at the end of the descending aorta.
 

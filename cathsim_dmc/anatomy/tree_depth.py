@@ -37,7 +37,6 @@ class TreeDepth:
         """Finds the creases.
 
         Args:
-            tree: vessels.
             ends: flat ends of the tree; those that are not named are closed.
         """
         lines = [vessel.centreline for vessel in tree.vessels.values()]

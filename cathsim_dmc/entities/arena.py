@@ -20,7 +20,6 @@ class AngiographyArena(composer.Arena):
         Args:
             device_density: mean density of the device, kg/m³; gravity is reduced by
                 its buoyancy in blood.
-            name: name of the arena.
         """
         super()._build(name=name)
         root = self._mjcf_root
@@ -70,7 +69,6 @@ class AngiographyArena(composer.Arena):
         """Adds a camera that looks at a point.
 
         Args:
-            name: name of the camera.
             target: point (3,) on the optical axis, m.
             distance: distance from the point, m.
             xyaxes: right and up directions (6,) of the image.

@@ -86,7 +86,6 @@ class Chain(composer.Entity):
             rotation: whether the base has a rotation joint.
             friction: Coulomb coefficient; MuJoCo takes the larger of the two geoms'.
             timestep: physics step with which the chain will be simulated, s.
-            name: name of the entity.
         """
         if not stroke > 0:
             raise ValueError(f"stroke is {stroke} m; it must be positive")

@@ -162,7 +162,6 @@ class Stack:
         """Rest angles (N, J) of the joints, complex, rad.
 
         Args:
-            overlap: overlap of the devices.
             turns: (N, K, J), rotation of each device at each joint, rad.
         """
         return (overlap.rest * np.exp(1j * turns)).sum(axis=1)
@@ -185,7 +184,6 @@ class Stack:
         """Angles (N, J, 2) of the hinges about x and y of the unloaded chain, rad.
 
         Args:
-            overlap: overlap of the devices.
             turns: (N, K, J), rotation of each device at each joint, rad.
         """
         return self._hinges.unloaded_hinges(self.rest_angles(overlap, turns))
@@ -204,7 +202,6 @@ class Stack:
         angles θ, the rest angles are θ - C ∂E/∂θ.
 
         Args:
-            overlap: overlap of the devices.
             turns: (N, K, J), rotation of each device at each joint, rad.
             angles: (N, 2 J), positions of the hinges in the order of the chain, rad.
 
@@ -221,7 +218,6 @@ class Stack:
         """Properties of the links.
 
         Args:
-            overlap: overlap of the devices.
             friction: (N,), Coulomb coefficient of an uncoated device on the wall.
         """
         made = self._loops.links(
@@ -241,7 +237,6 @@ class Stack:
         """Limits of the friction torque of the wall on the devices.
 
         Args:
-            overlap: overlap of the devices.
             force: (N, L), force of the wall on the links, N.
             friction: (N,), Coulomb coefficient of an uncoated device on the wall.
 
@@ -261,7 +256,6 @@ class Stack:
         whip.
 
         Args:
-            overlap: overlap of the devices.
             bends: (N, J) complex, bending angles of the joints, rad.
             turns: (N, K, J), rotation of each device at each joint, rad.
 
@@ -287,7 +281,6 @@ class Stack:
         rotations of its rod; that of the leading device is minus the others' sum.
 
         Args:
-            overlap: overlap of the devices.
             gaps: (N, K), see `overlap`.
             bends: (N, J) complex, bending angles of the joints, rad.
             turns: (N, K, J), rotation of each device at each joint, rad.
@@ -328,7 +321,6 @@ class Stack:
         place, and their friction.
 
         Args:
-            overlap: overlap of the devices.
             bends: (N, J) complex, bending angles of the joints, rad.
             turns: (N, K, J), rotation of each device at each joint, rad.
             axial: (N, K, J), see `axial`, N.

@@ -52,14 +52,12 @@ class DeviceStack(Chain):
         Args:
             devices: devices from the innermost outwards, or their names in
                 `devices.DEVICES`.
-            discretisation: division into links.
             stroke: longest insertion, m.
             lead: distance by which each device starts ahead of the one around it, m.
             friction: Coulomb coefficient of an uncoated device on the wall.
             lumen_friction: Coulomb coefficient between a device and the lumen around
                 it.
             timestep: physics step with which the chain will be simulated, s.
-            name: name of the entity.
 
         Raises:
             ValueError: if a device does not fit into the next one, or is steerable.

@@ -189,11 +189,9 @@ def _hydrophilic_wire(
     """A jacketed wire with a nitinol core.
 
     Args:
-        name: name of the device.
         outer: outer diameter, m.
         cores: diameters of the core in shaft and tip, m.
         bend: bend of the tip, before 4 mm straight.
-        tip_links: number of links of the tip.
     """
     shaft, tip = cores
     jacket = _tube_density(outer / 2, shaft / 2, POLYURETHANE_DENSITY)

@@ -30,12 +30,9 @@ class Phantom(composer.Entity):
         """Builds the wall.
 
         Args:
-            anatomy: lumen and goals.
-            friction: Coulomb coefficient of the device on the wall.
             goal_radius: radius of the goal sites, m.
             drawn: whether its surface is there to be seen; a point stands for it if
                 not, so that the models have as many geoms.
-            name: name of the entity.
         """
         if not 0 <= friction <= 2:
             raise ValueError(f"friction is {friction}; it must be between 0 and 2")

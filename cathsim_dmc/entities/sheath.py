@@ -48,7 +48,6 @@ class Sheath(composer.Entity):
             link_length: longest link of the device, m. Links are straight, so in a bend
                 their middles lie inside the line; the inner side of the bend is wider
                 by that distance. No effect where the line is straight.
-            name: name of the entity.
 
         Raises:
             ValueError: if the line has fewer than two points, repeats a point or bends

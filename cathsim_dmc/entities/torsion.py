@@ -35,7 +35,6 @@ class Rods:
         """Computes the stiffness of the segments.
 
         Args:
-            devices: K devices.
             nodes: (M + 1,), distances of the nodes from a device's end, from proximal
                 to distal, m; the last one is 0.
             relaxation_times: (K,), relaxation times τ, s.

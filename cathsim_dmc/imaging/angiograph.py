@@ -48,7 +48,6 @@ class Angiograph:
         Args:
             vertices: (V, 3) of the lumen surface, world frame, m.
             faces: (F, 3), counter-clockwise seen from outside.
-            options: set-up of the machine.
         """
         self._vertices, self._faces = vertices, faces
         self._options = options or FluoroscopyOptions()

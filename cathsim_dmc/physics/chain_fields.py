@@ -111,8 +111,6 @@ def chain_properties(
     """Properties of chains at an overlap of their devices.
 
     Args:
-        entity: of the devices.
-        overlap: of the devices.
         turns: (N, K, J), rotation of each device at each joint, rad.
         friction: (N,), Coulomb coefficient of an uncoated device on the wall.
         factor: (N,), of all stiffnesses.
@@ -145,8 +143,6 @@ def write_still(
     """Writes into a model the properties of the chain while the devices stand still.
 
     Args:
-        entity: of the devices.
-        model: the compiled model.
         gaps: (K,), way from the end of each device to that of the chain, m; those at
             the start of an episode if None.
         rotation: (K,), of each device, not twisted, rad; 0 if None.

@@ -30,7 +30,6 @@ class Drives:
         """Finds the servos.
 
         Args:
-            model: the compiled scene.
             arrays: `qpos`, `qvel` and `act` (N, ...), views.
         """
         found = np.flatnonzero(

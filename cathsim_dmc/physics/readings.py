@@ -182,11 +182,6 @@ class ModelIndex:
     def __init__(self, model: mujoco.MjModel, chain: Chain, robot: Robot):
         """Finds the elements of the entities.
 
-        Args:
-            model: the compiled model.
-            chain: entity of the devices.
-            robot: entity of the follower robot.
-
         Raises:
             ValueError: if the model lacks one of the elements.
         """

@@ -118,7 +118,6 @@ def scene_figure(
 
     Args:
         fluoroscopy: Whether to put the X-ray image beside them.
-        pixels: Number of rows of the drawn vessel.
 
     Raises:
         ValueError: if a view does not exist, or there is nothing to draw.

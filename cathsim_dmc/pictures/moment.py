@@ -140,8 +140,6 @@ def xray(moment: Moment, options: FluoroscopyOptions, seed: int = 0) -> np.ndarr
     """The X-ray image (rows, columns) uint8 of a moment.
 
     Args:
-        moment: State of the device.
-        options: Set-up of the angiography machine.
         seed: Seed of the quantum noise, if the options ask for noise.
     """
     state = np.random.RandomState(seed) if options.noise else None

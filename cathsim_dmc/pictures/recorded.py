@@ -156,7 +156,6 @@ def xray_film(
 
     Args:
         surface: Lumen surface with `vertices` and `faces`.
-        options: Set-up of the angiography machine.
 
     Returns:
         (T + 1, rows, columns, planes) uint8, the frontal plane first. The darkest and

@@ -101,8 +101,6 @@ def advance(
     """Counts progress over a control step; begins and ends retries.
 
     Args:
-        settings: when to give up.
-        place: of the head now.
         insertion: (...), of the head's device, m.
     """
     outside = place.excess > settings.tolerance

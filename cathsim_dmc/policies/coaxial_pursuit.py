@@ -129,7 +129,6 @@ def decide(
     """One control step of the expert: a pure function.
 
     Args:
-        settings: how to drive.
         state: after the last step, arrays (N,).
         readings: of the chain, arrays (N, ...).
         wall_force: arrays (N,); its `max` slows the devices down.

@@ -203,7 +203,6 @@ def decide(
     """One control step of the expert: a pure function.
 
     Args:
-        settings: how to drive.
         state: after the last step, arrays (...).
         readings: of the devices, arrays (...).
         wall_force: arrays (...); its `max` slows the device down.

@@ -38,7 +38,6 @@ def make_env(
         num_threads: Number of threads of the batched simulation, None for one per
             core.
         seed: Seed of each simulation, or of the first.
-        task_kwargs: Further options of the task.
 
     Returns:
         An environment with "observation_vector" (num_envs, n) float32 and/or

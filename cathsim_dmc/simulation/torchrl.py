@@ -42,7 +42,6 @@ class BatchedEnv(EnvBase):
             num_threads: Number of threads of the simulation, None for one per core.
             seed: Seed of each simulation, or of the first, the others counting up.
             observation: Name or names of observations.
-            task_kwargs: Further options of the task.
         """
         options = bounds.options("task_kwargs", task_kwargs)
         self._simulation = BatchSimulation(

@@ -45,8 +45,6 @@ class Case:
         """Lets the device settle in the anatomy.
 
         Args:
-            scene: Entities and where they stand.
-            objective: Success and reward.
             fluoroscopy: Set-up of the angiography machine, None for no machine.
             fields: What `write` writes beside the statistics, by its name in MuJoCo's
                 model.

@@ -31,7 +31,6 @@ class CommonChain:
         """Finds the places of the simulated joints and links.
 
         Args:
-            chain: entity of the devices.
             shaft_link: longest link of the shaft, m.
         """
         tip = max(device.tip_length for device in chain.devices)

@@ -148,7 +148,6 @@ class ImageSensors:
 
         Args:
             indices: (K,) numbers of the simulations.
-            machines: Of their anatomies.
         """
         for row, (index, machine) in enumerate(zip(indices, machines, strict=True)):
             if "deviation" in kept:

@@ -53,7 +53,6 @@ class Navigation(composer.Task):
 
         Args:
             scene: Entities, attached to the arena, and where they stand.
-            objective: Success and reward.
             config: Options; those that shape the scene must be the scene's.
             random: Seed or source of randomness of the environment.
             others: Scenes that are not drawn, and objectives, beside the first, if each

@@ -98,7 +98,6 @@ def judge(
     """Asks an objective about a control step of N simulations and checks its answer.
 
     Args:
-        objective: Success and reward.
         measurement: What there is to judge, arrays (N, ...).
         failed: (N,) bool, where the physics failed: there the reward and its terms are
             0 and there is no success. None for nowhere.
@@ -273,7 +272,6 @@ class Cannulation(Shiftable, Routed):
 
         Args:
             goal: Goal in the lumen of one of its vessels.
-            reward: Weights of the reward terms.
             goal_radius: Distance from the goal that counts as reached, m.
             farthest_shift: How far past the goal its place may be shifted, m.
         """

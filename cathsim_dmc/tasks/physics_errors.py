@@ -196,7 +196,6 @@ def dump(
     """Writes what replays an episode that ended in an error, and logs where.
 
     Args:
-        reason: what went wrong.
         actions: (T, A) up to and with the one that failed.
         directory: folder for the last `KEPT_DUMPS` dumps; None for that which the
             environment variable `CATHSIM_DUMP_DIR` names, or `cathsim-errors` in the

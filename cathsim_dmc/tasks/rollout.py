@@ -71,8 +71,6 @@ class Rollout:
         Args:
             cases: Anatomies with their objectives; an episode draws one of them, if
                 there are several.
-            config: Options of the task.
-            model: The compiled scene of the first case.
             stepper: Steps the N simulations.
         """
         self._cases = tuple(cases)

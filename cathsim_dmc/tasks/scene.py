@@ -73,7 +73,6 @@ class Scene:
 
         Args:
             goal: Name in `anatomy.goals`, or a goal inside the lumen.
-            config: Options of the task.
             goal_radius: Radius of the goal markers, m; for looks only.
             arena: Arena of one's own.
             phantom: Phantom of one's own, of the same anatomy.

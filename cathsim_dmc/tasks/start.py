@@ -51,7 +51,6 @@ class StartPosture:
         """Lets the device settle.
 
         Args:
-            scene: Entities and where they stand.
             index: Places of the task's quantities in the model.
             along_route: Least and largest share of the way to the goal that the head
                 has made, for episodes that do not begin at the inlet; None for those

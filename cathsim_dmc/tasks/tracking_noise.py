@@ -39,7 +39,6 @@ class TrackingNoise:
 
         Args:
             readings: Of N simulations.
-            devices: Of coaxial devices.
             random_states: N sources.
             fresh: (K,) numbers of the simulations that have begun an episode; the
                 others keep their errors. None for all.

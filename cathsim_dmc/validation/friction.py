@@ -197,7 +197,6 @@ def capstan(
     stiffness leaves the drum earlier than a string.
 
     Args:
-        friction: Coulomb coefficient.
         wrap: angle by which the drum turns the rod at the start, rad; above half a
             turn the rod passes beside itself, for it does not touch itself.
 
@@ -298,9 +297,6 @@ def _pulled(
 
 def arch_ripple(friction: float = FRICTION) -> float:
     """Ripple of the force that draws a device round an arch under a constant load.
-
-    Args:
-        friction: Coulomb coefficient.
 
     Returns:
         Standard deviation over the mean.

@@ -78,7 +78,6 @@ def run(
     """Runs a script until its end or that of the episode.
 
     Args:
-        seed: of the displaced start.
         goal: it sets the stroke of the base.
         **options: further fields of `tasks.navigation.NavigationConfig`.
 
@@ -131,7 +130,6 @@ def straight_push(
     """Pushes the device at full speed without steering it.
 
     Args:
-        seed: of the start of the episode.
         **options: of the task, fields of `tasks.navigation.NavigationConfig`.
 
     Returns:

@@ -27,7 +27,6 @@ def draw(anatomy: Anatomy, path: str | Path, title: str | None = None) -> None:
     """Draws lumen, centrelines, goals and inlet from three sides.
 
     Args:
-        path: PNG to write.
         title: over the picture; the anatomy's name if None.
     """
     figure = Figure(figsize=(13.5, 5.6), layout="constrained")

@@ -75,8 +75,6 @@ def build_arch(
     parameters give the same object.
 
     Args:
-        params: figures of the arch.
-        name: what to call the anatomy.
         access: end of the aorta that is open for the device, "ascending" or
             "descending"; the other one is capped.
 
@@ -93,7 +91,6 @@ def build_seed(seed: ArchSeed, *, access: str = "ascending") -> Anatomy:
     """Anatomy of one arch of a set, see `sampler.arch_set`; the same at every call.
 
     Args:
-        seed: of the set.
         access: as of `build_arch`.
     """
     return build_arch(seed.parameters(), seed.name, access=access)

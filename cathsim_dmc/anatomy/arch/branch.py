@@ -58,12 +58,10 @@ def branch_vessel(
     """Branch of an arch.
 
     Args:
-        name: of the branch.
         p: its figures.
         parent: vessel that it leaves.
         ostium: (3,) m, on the parent's surface.
         direction: (3,) unit vector of its first part.
-        plane: of the arch.
         fillet: growth (m) of its radius at the ostium.
 
     Raises:
