@@ -9,7 +9,6 @@ from PIL import Image
 from recording_samples import make_episode, make_tube
 from scipy.spatial.transform import Rotation
 
-from cathsim_dmc.recording.comparison import write_comparison
 from cathsim_dmc.recording.geometry import force_text
 from cathsim_dmc.recording.rerun_device import arrow_scale
 from cathsim_dmc.recording.rerun_log import write_rrd
@@ -328,38 +327,6 @@ def test_two_planes_are_two_images(tmp_path):
         blob = recording.values(entity, "EncodedImage:blob")[3][0]
         image = np.asarray(Image.open(io.BytesIO(bytes(blob))))
         np.testing.assert_allclose(image, frames[3, ..., plane], atol=2)
-
-
-def test_several_episodes_are_compared_in_one_recording(tmp_path):
-    longer = make_recorded()
-    shorter = make_episode(3, seed=1, meta=longer.meta | {"distance": [0.1] * 4})
-    shorter = dataclasses.replace(shorter, time=shorter.time + 5.0)
-    path = write_comparison(
-        {"first": longer, "second": shorter}, make_tube(), tmp_path / "c.rrd"
-    )
-    recording = Recording(path)
-    assert len(recording.recordings) == 1
-    for name, episode in (("first", longer), ("second", shorter)):
-        head = recording.values(f"/world/{name}/head", "Points3D:positions")
-        np.testing.assert_allclose(np.array(head)[:, 0], episode.head, atol=1e-6)
-        # Both begin at 0, wherever their clocks stood.
-        assert recording.nanoseconds(f"/world/{name}/head")[0] == 0
-        scalars = recording.values(f"/series/force/{name}", "Scalars:scalars")
-        np.testing.assert_allclose(
-            np.array(scalars)[:, 0], 1e3 * episode.wall_force_max
-        )
-    assert "| second |" in recording.fixed("/info", "TextDocument:text")[0]
-
-
-@pytest.mark.parametrize(
-    ("names", "message"),
-    [(["one"], "give 2 to 6"), (["a", "b c"], "'b c'"), (["a", "goal"], "'goal'")],
-)
-def test_what_cannot_be_compared_is_refused(tmp_path, names, message):
-    episodes = {name: make_recorded() for name in names}
-    with pytest.raises(ValueError, match=message):
-        write_comparison(episodes, make_tube(), tmp_path / "c.rrd")
-    assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.parametrize(

@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING
 from cathsim_dmc.recording.episode import Episode
 
 if TYPE_CHECKING:
-    from cathsim_dmc.recording.comparison import write_comparison
     from cathsim_dmc.recording.recorder import EpisodeRecorder
     from cathsim_dmc.recording.rerun_log import write_rrd
     from cathsim_dmc.recording.scene import BodyGeom, body_geoms
@@ -20,7 +19,6 @@ _LAZY = {
     "EpisodeRecorder": "recorder",
     "BodyGeom": "scene",
     "body_geoms": "scene",
-    "write_comparison": "comparison",
     "write_rrd": "rerun_log",
     "open_viewer": "viewer",
     "ViewerError": "viewer",
@@ -33,7 +31,6 @@ __all__ = [
     "ViewerError",
     "body_geoms",
     "open_viewer",
-    "write_comparison",
     "write_rrd",
 ]
 

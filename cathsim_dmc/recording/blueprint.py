@@ -77,38 +77,8 @@ def episode_blueprint(
         way = _plot("Distance to goal, mm", "series/distance_mm", heights["distance"])
         plots.insert(1, way)
     columns = [scene, rrb.Vertical(*images, texts), rrb.Vertical(*plots)]
-    return _page(rrb.Horizontal(*columns, column_shares=[5, 3.4, 3]))
-
-
-def comparison_blueprint(
-    centre: Sequence[float], extent: float, devices: Sequence[str], *, distance: bool
-) -> rrb.Blueprint:
-    """Return the layout of several episodes in one scene.
-
-    Args:
-        centre: (3,) point the eye looks at, world frame (LPS), metres.
-        extent: Largest side of the scene in metres.
-        devices: Entity paths of the devices, whose paths so far are drawn.
-        distance: Whether the recording has ``series/distance_mm``.
-    """
-    plots = [
-        _plot("Largest contact, mN", "series/force", None, legend=True),
-        _plot("Reward", "series/reward", None, legend=True),
-        _plot("Insertion, mm", "series/insertion_mm", None, legend=True),
-    ]
-    if distance:
-        plots.insert(
-            0, _plot("Distance to goal, mm", "series/distance_mm", None, legend=True)
-        )
-    scene = _scene(np.asarray(centre, dtype=np.float64), extent, devices)
-    text = rrb.TextDocumentView(origin="info", name="Episodes")
-    left = rrb.Vertical(scene, text, row_shares=[3, 1])
-    return _page(rrb.Horizontal(left, rrb.Vertical(*plots), column_shares=[3, 2]))
-
-
-def _page(content: rrb.Container) -> rrb.Blueprint:
     return rrb.Blueprint(
-        content,
+        rrb.Horizontal(*columns, column_shares=[5, 3.4, 3]),
         rrb.BlueprintPanel(state="collapsed"),
         rrb.SelectionPanel(state="collapsed"),
         rrb.TimePanel(
@@ -136,15 +106,11 @@ def _so_far() -> rrb.VisibleTimeRanges:
     )
 
 
-def _scene(
-    centre: np.ndarray,
-    extent: float,
-    devices: Sequence[str] = ("world/catheter",),
-) -> rrb.Spatial3DView:
-    entities = [*(f"{device}/trail" for device in devices), "world/heat"]
+def _scene(centre: np.ndarray, extent: float) -> rrb.Spatial3DView:
     # From the front, as in an antero-posterior projection; y points backwards.
     eye = centre + [0.0, -EYE_DISTANCE * extent, 0.0]
-    return _world("Scene", eye, centre, so_far=entities)
+    trail = ["world/catheter/trail", "world/heat"]
+    return _world("Scene", eye, centre, so_far=trail)
 
 
 def _tip(head: np.ndarray) -> rrb.Spatial3DView:

@@ -34,30 +34,23 @@ TRAIL_COLOUR = (255, 200, 0, 160)
 DEVICE_COLOURS = ((90, 220, 190), SHAFT_COLOUR, (200, 170, 255))
 
 
-def log_catheter(
-    log: Log,
-    radii: np.ndarray,
-    colour: tuple[int, int, int] = SHAFT_COLOUR,
-    entity: str = "world/catheter",
-) -> None:
+def log_catheter(log: Log, radii: np.ndarray) -> None:
     """Log the device as capsules coloured by what they press, its head and its path.
 
     Args:
         radii: (L,) radii of the links, metres.
-        colour: Colour of links that press nothing; where it is the default, coaxial
-            devices have their own.
     """
+    entity = "world/catheter"
     joints = log.episode.catheter
     states, links = joints.shape[0], joints.shape[1] - 1
     along = np.diff(joints, axis=1)
-    colours = np.broadcast_to(np.array(colour, dtype=np.uint8), (states, links, 3))
+    colours = np.broadcast_to(np.array(SHAFT_COLOUR, np.uint8), (states, links, 3))
     thickness = np.broadcast_to(radii, (states, links))
     coaxial = CoaxialRecord.of(log.episode)
     if coaxial is not None:
         outermost = coaxial.outermost(joints)
         thickness = coaxial.radii[outermost]
-        if colour == SHAFT_COLOUR:  # another colour marks the episode, not the device
-            colours = device_colours(len(coaxial.names))[outermost]
+        colours = device_colours(len(coaxial.names))[outermost]
         _log_ends(log, coaxial, entity)
     log.static(entity, rr.Capsules3D.from_fields(fill_mode="solid"))
     capsules = rr.Capsules3D.columns(

@@ -1,15 +1,14 @@
 """Episodes as Rerun recordings.
 
-One file holds one episode, or several to compare: the scene in 3D, the fluoroscopy if
-there is any, every series over simulated time, events and metadata as text, and the
-layout that opens them. Whole series are sent as columns, so the cost does not grow with
-calls per step.
+One file holds one episode: the scene in 3D, the fluoroscopy if there is any, every
+series over simulated time, events and metadata as text, and the layout that opens them.
+Whole series are sent as columns, so the cost does not grow with calls per step.
 """
 
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -62,37 +61,6 @@ def write_rrd(
         episode, surface, robot_geoms=robot_geoms, fluoroscopy=fluoroscopy
     )
 
-    def fill(stream: rr.RecordingStream) -> None:
-        log = Log(stream, episode)
-        log_static(log, drawing)
-        if drawing.frames is not None:
-            log_frames(log, drawing.frames)
-        log_catheter(log, drawing.radii)
-        log_bodies(log, drawing.geoms)
-        log_contacts(log)
-        log_series(log)
-        log_events(log)
-
-    write_recording(path, _layout(episode, drawing), _title(episode), fill)
-    return Path(path)
-
-
-def write_recording(
-    path: str | os.PathLike[str],
-    layout: Blueprint,
-    title: str,
-    fill: Callable[[rr.RecordingStream], None],
-) -> None:
-    """Write a recording, whole or not at all.
-
-    Args:
-        path: Target, ``*.rrd``.
-        layout: How the viewer opens it.
-        fill: Function that logs everything into the stream.
-
-    Raises:
-        RuntimeError: if Rerun is switched off by the ``RERUN`` environment variable.
-    """
     with atomic_path(path, SUFFIX) as temporary:
         stream = rr.RecordingStream(APPLICATION_ID)
         if not stream.is_enabled():
@@ -107,12 +75,25 @@ def write_recording(
             encoded = stream.binary_stream()
             # Active at once: a viewer that reads over a network has made itself a
             # layout by the time that this one arrives.
+            layout = _layout(episode, drawing)
             stream.send_blueprint(layout, make_active=True, make_default=True)
-            stream.send_recording_name(title)
-            fill(stream)
+            stream.send_recording_name(_title(episode))
+            _fill(Log(stream, episode), drawing)
             data = encoded.read()
             stream.disconnect()
         temporary.write_bytes(data or b"")
+    return Path(path)
+
+
+def _fill(log: Log, drawing: Drawing) -> None:
+    log_static(log, drawing)
+    if drawing.frames is not None:
+        log_frames(log, drawing.frames)
+    log_catheter(log, drawing.radii)
+    log_bodies(log, drawing.geoms)
+    log_contacts(log)
+    log_series(log)
+    log_events(log)
 
 
 def _layout(episode: Episode, drawing: Drawing) -> Blueprint:

@@ -19,24 +19,13 @@ class Log:
         episode: Whose states the rows are.
     """
 
-    def __init__(
-        self,
-        stream: rr.RecordingStream,
-        episode: Episode,
-        from_zero: bool = False,
-    ) -> None:
-        """Takes the times of the episode.
-
-        Args:
-            episode: Whose states the rows are.
-            from_zero: Whether time begins at 0, so that episodes can be compared.
-        """
+    def __init__(self, stream: rr.RecordingStream, episode: Episode) -> None:
+        """Takes the times of the episode."""
         self.stream = stream
         self.episode = episode
         steps = np.arange(episode.steps + 1)
-        time = episode.time - episode.time[0] if from_zero else episode.time
         # Rounded here, since Rerun truncates 0.12 s to 119,999,999 ns.
-        times = np.round(time * 1e9).astype("timedelta64[ns]")
+        times = np.round(episode.time * 1e9).astype("timedelta64[ns]")
         self._indexes = {TIMELINE_TIME: times, TIMELINE_STEP: steps}
 
     def static(self, entity: str, *archetypes: Any) -> None:
