@@ -6,6 +6,7 @@ import contextlib
 import os
 import re
 import shutil
+import time
 import uuid
 import zipfile
 from collections.abc import Iterable, Iterator
@@ -14,13 +15,8 @@ from typing import BinaryIO
 
 import numpy as np
 
-try:
-    import fcntl
-except ImportError:  # Windows has no advisory locks: leftovers stay there.
-    fcntl = None
-
 _PARTIAL = ".partial"
-_DIRECTORY = ".d"  # of an unfinished directory, beside its lock
+_ABANDONED = 86_400.0  # s, after which what is unfinished is that of a killed writer
 
 
 @contextlib.contextmanager
@@ -32,7 +28,7 @@ def atomic_path(
     The temporary file lies in the same directory, is flushed to disk and renamed. When
     the block raises, it is removed and an older `path` stays as it was. Of several
     writers of one path all succeed, and the last one's content stays. What a killed
-    writer has left is removed by the next writer of the same path.
+    writer has left is removed a day later by a writer of the same path.
 
     Args:
         suffix: Ending that `path` must have, such as ".npz"; None allows any.
@@ -48,15 +44,15 @@ def atomic_path(
     if not path.parent.is_dir():
         raise FileNotFoundError(f"no directory {path.parent}; create it first")
     remove_abandoned(path.parent, path.name)
-    temporary, stream = _create(path)
+    temporary = _temporary(path)
+    # Before the work. Not tempfile, whose files only their owner may read.
+    open(temporary, "xb").close()
     try:
-        with stream, naming(path):
+        with naming(path):
             yield temporary
             if not temporary.is_file() or not temporary.stat().st_size:
                 raise RuntimeError(f"nothing was written for {path}")
-            # Opened anew: the block may have put another file in its place.
-            with open(temporary, "rb+") as written:
-                os.fsync(written.fileno())
+            _flush(temporary)
             os.replace(temporary, path)
     finally:
         temporary.unlink(missing_ok=True)
@@ -66,32 +62,23 @@ def atomic_path(
 def atomic_directory(path: str | os.PathLike[str]) -> Iterator[Path]:
     """Yield a temporary directory that becomes `path` when the block ends well.
 
-    When the block raises, it is removed. What a killed writer has left is removed by
-    the next writer of the same path, or by `remove_abandoned`.
-
-    Args:
-        path: Path of the directory that is to appear; it must not exist.
+    When the block raises, it is removed; see `atomic_path` for a killed writer.
 
     Raises:
-        OSError: if it exists with something in it, or cannot be written.
+        OSError: if `path` exists with something in it, or cannot be written.
     """
     path = Path(path)
     remove_abandoned(path.parent, path.name)
-    # The lock lies beside the directory, whose own one its users may take.
-    lock, stream = _create(path)
-    temporary = Path(f"{lock}{_DIRECTORY}")
+    temporary = _temporary(path)
+    temporary.mkdir()
     try:
-        temporary.mkdir()
         yield temporary
         for file in temporary.rglob("*"):
             if file.is_file():
-                with open(file, "rb+") as stream:
-                    os.fsync(stream.fileno())
+                _flush(file)
         os.rename(temporary, path)
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
-        lock.unlink(missing_ok=True)
-        stream.close()
 
 
 @contextlib.contextmanager
@@ -117,42 +104,34 @@ def write_text(path: str | os.PathLike[str], text: str) -> Path:
     return write_bytes(path, text.encode())
 
 
-def _create(path: Path) -> tuple[Path, BinaryIO]:
-    """An empty temporary file beside `path`, locked for as long as it is open."""
-    while True:
-        name = f".{path.name}.{uuid.uuid4().hex[:12]}{_PARTIAL}"
-        temporary = path.with_name(name)
-        # Not tempfile, whose files only their owner may read, whatever the umask.
-        stream = open(temporary, "xb")
-        if fcntl is None:
-            return temporary, stream
-        fcntl.flock(stream, fcntl.LOCK_EX)
-        # Before the lock was ours, another writer may have taken it for a leftover.
-        if temporary.exists():
-            return temporary, stream
-        stream.close()
+def _temporary(path: Path) -> Path:
+    return path.with_name(f".{path.name}.{uuid.uuid4().hex[:12]}{_PARTIAL}")
+
+
+def _flush(path: Path) -> None:
+    """Flush a file to disk; opened anew, as a block may have replaced it."""
+    with open(path, "rb+") as written:
+        os.fsync(written.fileno())
 
 
 def remove_abandoned(folder: Path, name: str | None = None) -> None:
-    """Remove unfinished files and directories that no living process holds open.
+    """Remove what killed writers have left unfinished, a day later.
 
     Args:
-        name: Of what they were to become; None takes all of them.
+        name: Of what it was to become; None takes all of it.
     """
-    if fcntl is None or not folder.is_dir():
-        return
-    pattern = re.compile(
-        rf"\.{'.+' if name is None else re.escape(name)}\.[0-9a-f]{{12}}"
-        + re.escape(_PARTIAL)
-    )
-    for leftover in folder.iterdir():
+    wanted = ".+" if name is None else re.escape(name)
+    pattern = re.compile(rf"\.{wanted}\.[0-9a-f]{{12}}{re.escape(_PARTIAL)}")
+    for leftover in folder.iterdir() if folder.is_dir() else ():
         if not pattern.fullmatch(leftover.name) or leftover.is_symlink():
             continue
-        # Another writer may remove it, or have just renamed it.
-        with contextlib.suppress(OSError), open(leftover, "rb") as stream:
-            fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            shutil.rmtree(f"{leftover}{_DIRECTORY}", ignore_errors=True)
-            leftover.unlink()
+        with contextlib.suppress(OSError):  # another writer may remove it too
+            if time.time() - leftover.stat().st_mtime < _ABANDONED:
+                continue
+            if leftover.is_dir():
+                shutil.rmtree(leftover)
+            else:
+                leftover.unlink()
 
 
 def read_arrays(

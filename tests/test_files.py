@@ -2,11 +2,9 @@
 
 import io
 import os
-import signal
 import stat
-import subprocess
-import sys
 import zipfile
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -39,81 +37,41 @@ def test_wrong_paths_are_refused_before_the_work(tmp_path):
             raise AssertionError
 
 
-KILLED = """
-import os, signal, sys
-from cathsim_dmc import files
-with files.atomic_path(sys.argv[1]) as path:
-    path.write_text("half")
-    print("writing", flush=True)
-    sys.stdin.read()
-"""
-
-
-def writer(target, script=KILLED):
-    process = subprocess.Popen(
-        [sys.executable, "-c", script, str(target)],
-        stdin=subprocess.PIPE,
-        stdout=subprocess.PIPE,
-        text=True,
-    )
-    assert process.stdout.readline() == "writing\n"
-    return process
-
-
-def test_what_the_dead_left_goes_and_what_the_living_write_stays(tmp_path):
-    target = files.write_text(tmp_path / "a.txt", "old")
-    dead, alive = writer(target), writer(target)
-    dead.send_signal(signal.SIGKILL)
-    dead.communicate()
-    assert len(names(tmp_path)) == 3
-    # A file of another target, and one that only looks alike, are none of its business.
-    (tmp_path / ".b.txt.0123456789ab.partial").write_text("another")
-    (tmp_path / ".a.txt.mine.partial").write_text("mine")
+@pytest.mark.parametrize("write", [Path.write_bytes, lambda path, _: path.mkdir()])
+def test_what_is_left_for_a_day_goes(tmp_path, write):
+    target, own, other = tmp_path / "a.txt", "0123456789ab.partial", "mine.partial"
+    # Of a killed writer, of another target, not of ours, and of one that lives.
+    made = [tmp_path / f".{name}" for name in (f"a.txt.{own}", f"b.txt.{own}")]
+    made += [tmp_path / f".a.txt.{other}", tmp_path / ".a.txt.ba9876543210.partial"]
+    for path in made:
+        write(path, b"half")
+    for path in made[:3]:
+        os.utime(path, (1e9, 1e9))
     files.write_text(target, "new")
-    left = [name for name in names(tmp_path) if name.endswith(".partial")]
-    assert len(left) == 3
-    assert target.read_text() == "new"
-    # The living one still succeeds.
-    alive.communicate("")
-    assert alive.returncode == 0
-    assert target.read_text() == "half"
-    assert names(tmp_path) == [
-        ".a.txt.mine.partial",
-        ".b.txt.0123456789ab.partial",
-        "a.txt",
-    ]
-
-
-DIRECTORY = """
-import sys
-from cathsim_dmc import files
-with files.atomic_directory(sys.argv[1]) as path:
-    (path / "half").write_text("half")
-    print("writing", flush=True)
-    sys.stdin.read()
-"""
-
-
-def test_directories_of_the_dead_go_and_those_of_the_living_stay(tmp_path):
-    target = tmp_path / "data"
-    dead, alive = writer(target, DIRECTORY), writer(target, DIRECTORY)
-    dead.send_signal(signal.SIGKILL)
-    dead.communicate()
-    assert len(list(tmp_path.rglob("half"))) == 2
-    files.remove_abandoned(tmp_path, "another")
-    assert len(list(tmp_path.rglob("half"))) == 2
+    assert [path.exists() for path in made] == [False, True, True, True]
     files.remove_abandoned(tmp_path)
-    assert len(list(tmp_path.rglob("half"))) == 1
-    alive.communicate("")
-    assert alive.returncode == 0
-    assert names(tmp_path) == ["data"] and names(target) == ["half"]
-    # The next writer of the same path does it too.
-    dead = writer(tmp_path / "more", DIRECTORY)
-    dead.send_signal(signal.SIGKILL)
-    dead.communicate()
-    with files.atomic_directory(tmp_path / "more") as path:
-        (path / "whole").write_text("")
-    assert names(tmp_path) == ["data", "more"]
+    assert [path.exists() for path in made] == [False, False, True, True]
+    assert target.read_text() == "new"
+
+
+def test_writers_of_one_path_all_succeed(tmp_path):
+    target = tmp_path / "a.txt"
+    with files.atomic_path(target) as first, files.atomic_path(target) as second:
+        first.write_text("first")
+        second.write_text("second")
+    assert target.read_text() == "first"
+    assert names(tmp_path) == ["a.txt"]
+
+
+def test_a_directory_appears_whole_or_not_at_all(tmp_path):
+    with pytest.raises(ZeroDivisionError):
+        with files.atomic_directory(tmp_path / "data") as path:
+            (path / "half").write_text("half")
+            1 / 0  # noqa: B018
+    assert names(tmp_path) == []
+    with files.atomic_directory(tmp_path / "data") as path:
+        (path / "whole").write_text("whole")
+    assert names(tmp_path) == ["data"] and names(tmp_path / "data") == ["whole"]
 
 
 def archive(path, **texts):
