@@ -10,9 +10,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from cathsim_dmc import suite
-from cathsim_dmc.physics.delay import ActionDelay
 from cathsim_dmc.physics.randomisation import (
     DEFAULT_RANGES,
+    ActionDelay,
     Episode,
     Randomisation,
     start_displacement,

@@ -4,6 +4,8 @@ import contextlib
 import json
 import math
 import os
+import signal
+import threading
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -27,7 +29,6 @@ from cathsim_dmc.agents.checkpoint import (
 from cathsim_dmc.agents.config import ConfigError, TrainingConfig
 from cathsim_dmc.agents.episodes import INFO, EpisodeTracker
 from cathsim_dmc.agents.evaluation import EnvFactory
-from cathsim_dmc.agents.interruption import Interruption
 from cathsim_dmc.agents.learner import Learner, make_collector
 from cathsim_dmc.agents.learners import make_learner
 from cathsim_dmc.agents.networks import NetworkShapes
@@ -126,11 +127,11 @@ def train(
             progress=progress,
         )
         stack.callback(log.close)
-        interruption = stack.enter_context(Interruption())
+        interruption = stack.enter_context(_interruption())
         newest = checkpoint.path if checkpoint else None
         batches = iter(collector)
         loop = _Loop(run, config, batches, learner, log, newest)
-        while log.frames < config.total_frames and not interruption.requested:
+        while log.frames < config.total_frames and not interruption.is_set():
             loop.step(interruption)
         # However it ended; writes nothing if the last batch has just been saved.
         newest = loop.save()
@@ -276,7 +277,7 @@ class _Loop:
         self._tracker = EpisodeTracker(self.config.num_envs)
         self._frames, self._time = self.log.frames, time.monotonic()
 
-    def step(self, interruption: Interruption) -> None:
+    def step(self, interruption: threading.Event) -> None:
         """Collect a batch and learn from it."""
         config, log = self.config, self.log
         batch = next(self.batches)
@@ -291,7 +292,7 @@ class _Loop:
             finished,
             step_reward=float(batch["next", "reward"].mean()),
             losses=losses,
-            last=frames >= config.total_frames or interruption.requested,
+            last=frames >= config.total_frames or interruption.is_set(),
         )
         if (
             crossed(self._frames, log.frames, config.checkpoint_frames)
@@ -328,6 +329,32 @@ def _truncate_diverged(batch: TensorDictBase) -> None:
     error = batch.get(("next", INFO, "physics_error"), None)
     if error is not None:
         batch["next", "terminated"] &= ~error
+
+
+@contextlib.contextmanager
+def _interruption() -> Iterator[threading.Event]:
+    """Yield an event that the first SIGINT or SIGTERM sets; a second one acts as usual.
+
+    Outside the main thread signals cannot be caught, and nothing sets it.
+    """
+    requested, before = threading.Event(), {}
+
+    def restore() -> None:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+        before.clear()
+
+    def note(number: int, frame: object) -> None:
+        requested.set()
+        restore()
+
+    if threading.current_thread() is threading.main_thread():
+        for number in (signal.SIGINT, signal.SIGTERM):
+            before[number] = signal.signal(number, note)
+    try:
+        yield requested
+    finally:
+        restore()
 
 
 @contextlib.contextmanager

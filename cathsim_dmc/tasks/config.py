@@ -14,9 +14,12 @@ from cathsim_dmc.entities.contact import FRICTION
 from cathsim_dmc.entities.device import Device
 from cathsim_dmc.entities.device_stack import LEAD, LUMEN_FRICTION
 from cathsim_dmc.imaging.options import FluoroscopyOptions
-from cathsim_dmc.physics.delay import ActionDelay
 from cathsim_dmc.physics.effects import Effect
-from cathsim_dmc.physics.randomisation import Randomisation, RandomisedModel
+from cathsim_dmc.physics.randomisation import (
+    ActionDelay,
+    Randomisation,
+    RandomisedModel,
+)
 from cathsim_dmc.physics.sliding import devices_of
 from cathsim_dmc.physics.stepper import CONTROL_TIMESTEP, PHYSICS_TIMESTEP
 from cathsim_dmc.physics.vessel import VesselOptions

@@ -11,6 +11,7 @@ from cathsim_dmc.physics.forces import WallForce
 from cathsim_dmc.physics.readings import CoaxialReadings, Readings
 from cathsim_dmc.physics.vessel import VesselReadings
 from cathsim_dmc.tasks.objective_pool import part
+from cathsim_dmc.tasks.objectives import straight
 from cathsim_dmc.tasks.snapshot import Snapshot, merged, named
 
 
@@ -57,3 +58,26 @@ class Measured(NamedTuple):
             for kind, old in self._asdict().items()
         }
         return self.updated(kept, indices)
+
+
+class Path(NamedTuple):
+    """Paths of the heads of N simulations in their episodes.
+
+    Attributes:
+        head: (N, 3), m.
+        length: (N,), m, of the paths so far.
+        shortest: (N,), m, shortest ways from the starts to the goals.
+    """
+
+    head: np.ndarray
+    length: np.ndarray
+    shortest: np.ndarray
+
+    def to(self, head: np.ndarray) -> Path:
+        """The paths longer by the ways to heads (N, 3), m."""
+        return Path(head, self.length + straight(self.head, head), self.shortest)
+
+    @property
+    def ratio(self) -> np.ndarray:
+        """(N,), length of each path over the shortest way from start to goal."""
+        return self.length / self.shortest

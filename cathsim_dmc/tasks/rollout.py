@@ -26,7 +26,7 @@ from cathsim_dmc.tasks.common_chain import CommonChain
 from cathsim_dmc.tasks.config import NavigationConfig
 from cathsim_dmc.tasks.frame import NO_IMAGES, Frame
 from cathsim_dmc.tasks.image_sensors import ImageSensors, open_cameras
-from cathsim_dmc.tasks.measured import Measured
+from cathsim_dmc.tasks.measured import Measured, Path
 from cathsim_dmc.tasks.objective_pool import part, together
 from cathsim_dmc.tasks.objectives import (
     Measurement,
@@ -36,7 +36,6 @@ from cathsim_dmc.tasks.objectives import (
     straight,
 )
 from cathsim_dmc.tasks.observation_kind import Observation
-from cathsim_dmc.tasks.path_tracker import Path
 from cathsim_dmc.tasks.physics_errors import PhysicsMonitor
 from cathsim_dmc.tasks.route import Routes
 from cathsim_dmc.tasks.snapshot import (
