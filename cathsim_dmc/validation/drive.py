@@ -22,8 +22,8 @@ _MIDDLE = 0.25  # m, of the stroke
 class Driven:
     """A device on its drive, under an axial force at its base."""
 
-    def __init__(self, device: str = "steerable_5f"):
-        self.rig = rig = Rig(device, stroke=2 * _MIDDLE)
+    def __init__(self):
+        self.rig = rig = Rig(stroke=2 * _MIDDLE)
         rig.compile()
         self._base = rig.model.body(f"{rig.name}/link_0").id
         self._motor = rig.data.actuator(f"{rig.name}/insertion")

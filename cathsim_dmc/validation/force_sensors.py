@@ -26,6 +26,7 @@ from cathsim_dmc.validation.rig import Rig
 
 BALANCE_BOUND = 1.0  # %
 RESTING_LOADS = (0.01, 0.1, 1.0)  # N
+RESTING_TIME = 5.0  # s, of which the first is for raising the load
 # Shares of the full speed; a stalled carriage pushes with 4 N times that.
 PUSHES = (0.1, 0.25, 0.5, 1.0)
 # A blind tube that guides the device, and one in which it buckles: length, radius, m.
@@ -51,19 +52,14 @@ class Resting(NamedTuple):
     penetration: float  # m
 
 
-def resting_link(load: float, settling: float = 5.0) -> Resting:
-    """Presses the last link of the straight device on a plate.
-
-    Args:
-        load: N.
-        settling: s, of which the first is for raising the load.
-    """
+def resting_link(load: float) -> Resting:
+    """Presses the last link of the straight device on a plate with a load, N."""
     rig = Rig()
     wall = Phantom(plate(rig.device.outer_radius))
     rig.arena.attach(wall)
     wall.add_wall(rig.catheter.links[0])
     rig.compile()
-    steps = round(settling / rig.model.opt.timestep)
+    steps = round(RESTING_TIME / rig.model.opt.timestep)
     last = round(AVERAGING / rig.model.opt.timestep)
     rows = []
     for step in range(steps):
@@ -127,7 +123,6 @@ def dead_end(
     tube: tuple[float, float] = GUIDING_TUBE,
     *,
     settling: float = 3.0,
-    timestep: float = PHYSICS_TIMESTEP,
 ) -> DeadEnd:
     """Pushes the device of the tasks against the end of a straight tube.
 
@@ -144,7 +139,6 @@ def dead_end(
             "anatomy": straight_tube(*tube),
             "goal": "end",
             "goal_radius": 1e-6,
-            "physics_timestep": timestep,
         },
     )
     task = environment.task
@@ -156,11 +150,11 @@ def dead_end(
     model.actuator_forcerange[motor.id] = -push, push
     sheath = environment.physics.bind(task.scene.sheath.bodies).element_id
     way = tube[0] - task.scene.placement.start_depth
-    steps = round((settling + way / (command * MAX_PUSH_SPEED)) / timestep)
+    steps = round((settling + way / (command * MAX_PUSH_SPEED)) / PHYSICS_TIMESTEP)
     rows = []
     for step in range(steps):
         mujoco.mj_step(model, data)
-        if step < steps - round(AVERAGING / timestep):
+        if step < steps - round(AVERAGING / PHYSICS_TIMESTEP):
             continue
         reading = task.rollout.index.read(data)
         contacts = task.rollout.index.contacts(data.sensordata)
@@ -196,9 +190,7 @@ def _axial_force_on(model, data, sheath: np.ndarray) -> float:
     return float(total)
 
 
-def scripted_cannulations(
-    speeds: Sequence[float] = INSERTION_SPEEDS, seeds: int = INSERTION_SEEDS
-) -> dict[float, list[insertion.Insertion]]:
+def scripted_cannulations() -> dict[float, list[insertion.Insertion]]:
     """Insertions into the BCA of the type-I arch, by speed (share of 40 mm/s)."""
     return {
         speed: [
@@ -208,9 +200,9 @@ def scripted_cannulations(
                 goal="bca",
             )
             for curl in INSERTION_CURLS
-            for seed in range(seeds)
+            for seed in range(INSERTION_SEEDS)
         ]
-        for speed in speeds
+        for speed in INSERTION_SPEEDS
     }
 
 

@@ -110,18 +110,13 @@ def slid(names: tuple[str, ...], load: float, speed: float) -> Slid:
     return Slid(mean / load, float(np.std(pull)) / abs(mean))
 
 
-def creep(names: tuple[str, ...], load: float = CREEP_LOAD) -> float:
-    """Speed (m/s) of a device that sticks, pulled sideways at half the limit.
-
-    Args:
-        names: of the device, or of coaxial ones.
-        load: of its end on the plate, N.
-    """
+def creep(names: tuple[str, ...]) -> float:
+    """Speed (m/s) of devices that stick, pulled sideways at half the limit."""
     rig, bodies, shares = _on_plate(names)
-    rig.data.xfrc_applied[bodies, 1] = load * shares
+    rig.data.xfrc_applied[bodies, 1] = CREEP_LOAD * shares
     for _ in _steps(rig, _SETTLED):
         rig.step()
-    rig.data.xfrc_applied[bodies, 0] = 0.5 * FRICTION * load * shares
+    rig.data.xfrc_applied[bodies, 0] = 0.5 * FRICTION * CREEP_LOAD * shares
     for _ in _steps(rig, 0.5 * _SETTLED):
         rig.step()
     before = rig.head_position
@@ -185,11 +180,7 @@ class Capstan:
         )
 
 
-def capstan(
-    friction: float,
-    wrap: float = np.pi,
-    device: str | devices.Device = "steerable_5f",
-) -> Capstan:
+def capstan(friction: float, wrap: float = np.pi) -> Capstan:
     """Pulls the rod over a drum with and without friction.
 
     The drum is a field. The distal end carries a dead load; the base retracts. Both
@@ -203,7 +194,7 @@ def capstan(
     Raises:
         RuntimeError: if the rod sticks to the drum.
     """
-    device = dataclasses.replace(devices.get(device), tip_shape=())
+    (device,) = straightened(("steerable_5f",))
     angle, travel, ratio = _pulled(device, friction, wrap)
     _, far, free = _pulled(device, 0.0, wrap)
     axis = DRUM_RADIUS + device.outer_radius
@@ -295,14 +286,10 @@ def _pulled(
     return angle, travel, tension / TENSION
 
 
-def arch_ripple(friction: float = FRICTION) -> float:
-    """Ripple of the force that draws a device round an arch under a constant load.
-
-    Returns:
-        Standard deviation over the mean.
-    """
-    device = dataclasses.replace(devices.get("steerable_5f"), tip_shape=())
-    _, travel, ratio = _pulled(device, friction, np.pi, ARCH_RADIUS)
+def arch_ripple() -> float:
+    """Deviation over mean of the force that draws a device round an arch."""
+    (device,) = straightened(("steerable_5f",))
+    _, travel, ratio = _pulled(device, FRICTION, np.pi, ARCH_RADIUS)
     sliding = ratio[travel > _LEAD]
     return float(sliding.std() / sliding.mean())
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -51,9 +50,7 @@ class Part(NamedTuple):
     warnings: int  # of MuJoCo
 
 
-def slide(
-    names: Sequence[str] = SLIDING_PAIR, task: str = SLIDING_TASK, seed: int = 0
-) -> tuple[list[Part], list[np.ndarray]]:
+def slide() -> tuple[list[Part], list[np.ndarray]]:
     """Slides two devices through each other in a vessel.
 
     Returns:
@@ -61,8 +58,8 @@ def slide(
     """
     environment = suite.load(
         suite.DOMAIN,
-        task,
-        {"devices": tuple(names), "random": seed, "observation": "tracking"},
+        SLIDING_TASK,
+        {"devices": SLIDING_PAIR, "random": 0, "observation": "tracking"},
     )
     environment.reset()
     play, parts, lines = environment.task, [], []
