@@ -135,7 +135,7 @@ def test_damage_is_found(saved, tmp_path):
     (tmp_path / "anatomy.npz").write_bytes(data)
     with pytest.raises(ValueError, match="CRC|decompress"):
         Anatomy.load(tmp_path)
-    with pytest.raises(FileNotFoundError, match=r"no anatomy\.npz .*older version"):
+    with pytest.raises(FileNotFoundError, match=r"no anatomy\.npz .*Anatomy.save"):
         Anatomy.load(tmp_path / "nothing")
 
 

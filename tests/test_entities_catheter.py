@@ -323,11 +323,6 @@ def test_device_and_section_errors_say_what_is_allowed():
         devices.get("amplatz")
 
 
-def test_the_former_name_of_a_device_is_understood_and_said():
-    with pytest.warns(FutureWarning, match="'steerable_5f' now"):
-        assert devices.get("published") is devices.DEVICES["steerable_5f"]
-
-
 def test_isotropic_section_has_the_shear_modulus_of_its_material():
     section = devices.Section.isotropic(3.0, 0.5)
     # GJ = E / 2(1+ν) · 2I

@@ -195,8 +195,7 @@ class Anatomy:
         path = Path(directory) / _FILE
         if not path.is_file():
             raise FileNotFoundError(
-                f"no {_FILE} in {path.parent}; give a directory that Anatomy.save "
-                "wrote. One with anatomy.json is of an older version: write it again."
+                f"no {_FILE} in {path.parent}; give a directory that Anatomy.save wrote"
             )
         try:
             anatomy = _unpack(files.read_arrays(path, _LARGEST))

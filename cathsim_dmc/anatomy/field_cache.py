@@ -31,7 +31,7 @@ _NAMES = ("head", "coarse", "index", "samples")
 _DIGEST = "digest"
 _SHIPPED = Path(__file__).parent / "data"
 _DIGITS = 9  # of lengths, m, that count: processors round differently
-_SUFFIX, _SUFFIXES = ".npy", "*.np[yz]"  # older versions wrote the other
+_SUFFIX = ".npy"
 # Modules whose code decides what a field holds.
 _MODULES = ("field", "tree_depth", "tree_depth_loops")
 
@@ -157,7 +157,7 @@ def _keep(field: Field, path: Path) -> None:
     with files.atomic_path(path) as temporary, open(temporary, "wb") as stream:
         np.save(stream, _record(field), allow_pickle=False)
     sizes = []
-    for entry in path.parent.glob(_SUFFIXES):
+    for entry in path.parent.glob(f"*{_SUFFIX}"):
         with contextlib.suppress(OSError):  # another process drops it
             found = entry.stat()
             sizes.append((found.st_mtime, found.st_size, entry))

@@ -3,7 +3,6 @@
 import dataclasses
 import itertools
 import math
-import warnings
 
 import numpy as np
 
@@ -253,10 +252,6 @@ DEVICES: dict[str, Device] = {
 }
 
 
-# Deprecated names of devices.
-_DEPRECATED = {"published": "steerable_5f"}
-
-
 def get(device: "str | Device") -> Device:
     """Returns a device by name, or the given `Device` itself.
 
@@ -265,14 +260,6 @@ def get(device: "str | Device") -> Device:
     """
     if isinstance(device, Device):
         return device
-    if isinstance(device, str) and device in _DEPRECATED:
-        name = _DEPRECATED[device]
-        warnings.warn(
-            f"the device name {device!r} is deprecated; use {name!r} now",
-            FutureWarning,
-            stacklevel=2,
-        )
-        device = name
     if not isinstance(device, str) or device not in DEVICES:
         raise ValueError(
             f"no device is named {device!r}; known devices: {', '.join(DEVICES)}"
