@@ -82,23 +82,6 @@ def test_the_command_writes_a_model_that_other_engines_read(
     assert "held" in touched and "free" not in touched
 
 
-@pytest.mark.slow
-def test_coacd_divides_the_wall_too(tmp_path):
-    pytest.importorskip("coacd")
-    anatomy = straight_tube(0.02, 4e-3)
-    count, found = export.write_mjcf(anatomy, tmp_path / "tube.xml", "coacd")
-    assert found.open == 0 and found.blocked == () and found.intrusion[1] <= 0.8e-3
-    assert mujoco.MjModel.from_xml_path(str(tmp_path / "tube.xml")).ngeom == count
-
-
-def test_without_coacd_the_extra_is_named(tube, tmp_path, monkeypatch):
-    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
-    with pytest.raises(ModuleNotFoundError, match=r"cathsim-dmc\[export\]"):
-        export.write_mjcf(tube, tmp_path / "tube.xml", "coacd")
-    with pytest.raises(ValueError, match="one of prisms, coacd"):
-        export.write_mjcf(tube, tmp_path / "tube.xml", "boxes")
-
-
 def test_the_ending_is_checked_before_any_work(tube, tmp_path):
     with pytest.raises(ValueError, match=r"must end in .xml, got 'tube.obj'"):
         export.write_mjcf(dataclasses.replace(tube, name="x"), tmp_path / "tube.obj")

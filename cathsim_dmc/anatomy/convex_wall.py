@@ -15,7 +15,6 @@ import itertools
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.cluster.vq import kmeans2
 from scipy.spatial import ConvexHull, QhullError, cKDTree
 
 from cathsim_dmc.anatomy.anatomy import Anatomy
@@ -34,12 +33,6 @@ EXTENT = 40e-3  # m, largest piece; longer ones slow the broad phase
 CLEARANCE = 0.1e-3  # m, kept between a 5 Fr device on the centreline and a merged hull
 CAP_OVERLAP = 2e-3  # m, of the inlet's cap under the wall around it
 CAPS = (1.0, 0.5, 0.25, 0.1)  # shares of the thickness tried for a lone triangle
-TRIANGLES_A_PATCH = 24  # of those that CoACD divides
-# Largest concavity, mm, and the least search: patches are nearly convex.
-_COACD = {
-    "threshold": 1.0, "preprocess_mode": "off", "resolution": 500, "seed": 0,
-    "mcts_iterations": 10, "mcts_nodes": 5, "mcts_max_depth": 1,
-}  # fmt: skip
 _ORDER = 6  # subdivision of a hull's triangles where its depth is sampled
 _BEHIND = 0.05e-3  # m, of the surface that is cut off ahead of the inlet's flat cap
 
@@ -50,7 +43,12 @@ def wall_pieces(anatomy: Anatomy) -> tuple[np.ndarray, ...]:
     The pieces lie outside the lumen but for chords of some tenths of a millimetre. The
     inlet is closed but for a hole of `INLET_HOLE_RADIUS`.
     """
-    builder, cap = _builder(anatomy)
+    inlet, surface = anatomy.inlet, anatomy.surface
+    vertices, faces = decimated(surface.vertices, surface.faces, TRIANGLES)
+    at = inlet.position + _BEHIND * inlet.direction
+    points, shell, cap = cut_open(vertices, faces, replace(inlet, position=at))
+    lines = [vessel.centreline for vessel in anatomy.tree.vessels.values()]
+    builder = _Builder(points, shell, anatomy.lumen, [line.points for line in lines])
     tolerance = TOLERANCE
     pieces = builder.merge(range(len(builder.faces)), tolerance)
     for _ in range(5):
@@ -64,41 +62,7 @@ def wall_pieces(anatomy: Anatomy) -> tuple[np.ndarray, ...]:
         pieces = kept + builder.merge(
             [f for each in bad for f in each.faces], tolerance
         )
-    return (*builder.hulls(pieces), *cap)
-
-
-def coacd_pieces(anatomy: Anatomy) -> tuple[np.ndarray, ...]:
-    """As `wall_pieces`, by convex decomposition (CoACD) of patches of the wall."""
-    import coacd
-
-    coacd.set_log_level("error")
-    builder, cap = _builder(anatomy)
-    faces, n = builder.faces, len(builder.vertices)
-    shell = 1e3 * builder.corners(np.arange(n), 1.0)
-    # A patch lies on one side of its vessel.
-    middles, normals = (x[faces].mean(axis=1) for x in (shell[:n], builder.normals))
-    count = len(faces) // TRIANGLES_A_PATCH + 1
-    label = kmeans2(np.hstack([middles, 4.0 * normals]), count, minit="++", seed=0)[1]
-    pieces = []
-    for patch in (faces[label == k] for k in np.unique(label)):
-        edges = patch[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
-        paired = (edges[:, None] == edges[:, ::-1]).all(axis=-1).any(axis=1)
-        a, b = edges[~paired].T
-        band = np.stack([a, b, b + n, a, b + n, a + n], axis=-1).reshape(-1, 3)
-        solid = coacd.Mesh(shell, np.concatenate([patch[:, ::-1], patch + n, band]))
-        pieces += coacd.run_coacd(solid, real_metric=True, **_COACD)
-    return (*(1e-3 * np.asarray(vertices) for vertices, _ in pieces), *cap)
-
-
-def _builder(anatomy: Anatomy) -> tuple[_Builder, list[np.ndarray]]:
-    """The surface that carries the wall, and the pieces of the inlet's cap."""
-    inlet, surface = anatomy.inlet, anatomy.surface
-    vertices, faces = decimated(surface.vertices, surface.faces, TRIANGLES)
-    at = inlet.position + _BEHIND * inlet.direction
-    points, shell, cap = cut_open(vertices, faces, replace(inlet, position=at))
-    lines = [vessel.centreline for vessel in anatomy.tree.vessels.values()]
-    builder = _Builder(points, shell, anatomy.lumen, [line.points for line in lines])
-    return builder, _inlet_cap(points[cap[:, :2]], inlet)
+    return (*builder.hulls(pieces), *_inlet_cap(points[cap[:, :2]], inlet))
 
 
 @dataclass

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -11,12 +10,11 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial import ConvexHull, cKDTree
 
-from cathsim_dmc import bounds, files
+from cathsim_dmc import files
 from cathsim_dmc.anatomy.anatomy import Anatomy
-from cathsim_dmc.anatomy.convex_wall import coacd_pieces, wall_pieces
+from cathsim_dmc.anatomy.convex_wall import wall_pieces
 from cathsim_dmc.anatomy.scan.extract import DEVICE_RADIUS
 
-PIECES = {"prisms": wall_pieces, "coacd": coacd_pieces}
 _SPACING = 1.5e-3  # m, between places of the wall that are looked at
 # Levels (m) along the normal at which pieces are looked for, > 0 in the lumen.
 _LEVELS = np.arange(-1.5e-3, 1.5e-3, 0.05e-3)
@@ -106,34 +104,24 @@ def _summary(values: np.ndarray) -> tuple[float, float, float]:
     return float(values.mean()), float(p95), float(values.max())
 
 
-def write_mjcf(
-    anatomy: Anatomy, path: str | os.PathLike[str], pieces: str = "prisms"
-) -> tuple[int, Fidelity]:
+def write_mjcf(anatomy: Anatomy, path: str | os.PathLike[str]) -> tuple[int, Fidelity]:
     """Write an anatomy as a model of convex geoms, with a site at the inlet and goals.
 
     Args:
         path: of the file, which must end in .xml; lengths in it are metres.
-        pieces: how the wall is divided, of `PIECES`.
 
     Returns:
         How many pieces there are, and how well they stand for the lumen.
 
     Raises:
-        ValueError: if the file name has another ending, or there are no such pieces.
-        ModuleNotFoundError: if CoACD is asked for and not installed.
+        ValueError: if the file name has another ending.
     """
     import mujoco
-
-    bounds.choice("pieces", pieces, PIECES)
-    if pieces == "coacd" and importlib.util.find_spec("coacd") is None:
-        raise ModuleNotFoundError(
-            "coacd is not installed; `pip install cathsim-dmc[export]` adds it"
-        )
 
     path = Path(path)
     if path.suffix != ".xml":
         raise ValueError(f"the file name must end in .xml, got {path.name!r}.")
-    wall = PIECES[pieces](anatomy)
+    wall = wall_pieces(anatomy)
     spec = mujoco.MjSpec()
     spec.modelname = anatomy.name
     for index, piece in enumerate(wall):

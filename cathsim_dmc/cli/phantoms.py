@@ -207,20 +207,17 @@ def export(
     /,
     out: Path,
     access: Access = None,
-    pieces: Literal["prisms", "coacd"] = "prisms",
 ) -> int:
     """Write an anatomy as MJCF with convex wall pieces, for other engines.
 
     Args:
         phantom: Directory of an anatomy, or the name of a phantom.
         out: File of the model, ending in .xml.
-        pieces: Merged prisms on the surface, or CoACD's pieces (extra `export`), which
-            take minutes.
     """
     from cathsim_dmc.anatomy import export as exported
 
     anatomy = _loaded(phantom, access)
-    count, found = exported.write_mjcf(anatomy, out, pieces)
+    count, found = exported.write_mjcf(anatomy, out)
     mean, p95, largest = (round(1e3 * value, 3) for value in found.intrusion)
     print_json(
         {

@@ -272,6 +272,7 @@ class Cannulation(Shiftable, Routed):
 
         Args:
             goal: Goal in the lumen of one of its vessels.
+            reward: Weights of the reward terms.
             goal_radius: Distance from the goal that counts as reached, m.
             farthest_shift: How far past the goal its place may be shifted, m.
         """
