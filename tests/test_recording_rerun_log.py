@@ -9,7 +9,10 @@ from PIL import Image
 from recording_samples import make_episode, make_tube
 from scipy.spatial.transform import Rotation
 
+from cathsim_dmc import suite
+from cathsim_dmc.recording import Episode, EpisodeRecorder
 from cathsim_dmc.recording.geometry import force_text
+from cathsim_dmc.recording.living import VesselRecord
 from cathsim_dmc.recording.rerun_device import arrow_scale
 from cathsim_dmc.recording.rerun_log import write_rrd
 from cathsim_dmc.recording.scene import BodyGeom
@@ -376,3 +379,25 @@ def test_reading_episodes_needs_no_rerun():
         [sys.executable, "-c", code], capture_output=True, text=True, check=True
     )
     assert done.stdout.strip() == "[]"
+
+
+def test_a_living_vessel_is_kept_and_its_wall_moves_in_the_file(tmp_path):
+    env = suite.load("cathsim", "simple1_bca", {"vessel": "living", "random": 0})
+    recorder = EpisodeRecorder(env)
+    recorded = recorder.record_episode(lambda _: np.zeros(21), seed=0, max_steps=8)
+    episode = Episode.load(recorded.save(tmp_path / "episode.npz"))
+    record = VesselRecord.of(episode)
+    phase = 0.04 * np.arange(9)
+    np.testing.assert_allclose(record.series["heart_phase"], phase, atol=1e-9)
+    assert record.series["blood_speed"].max() > 0.1
+    surface = env.task.scene.anatomy.surface
+    path = write_rrd(episode, surface, tmp_path / "episode.rrd")
+    places = Recording(path).values("/world/vessel", "Mesh3D:vertex_positions")
+    moved = np.linalg.norm(np.subtract(places[2], places[0]), axis=-1)
+    np.testing.assert_allclose(places[0], surface.vertices, atol=1e-6)
+    assert len(places) == 3 and moved.max() > 1e-3
+    assert np.linalg.norm(record.goal[8] - record.goal[0]) > 1e-4
+    with pytest.raises(ValueError, match="8 values of heart_phase; give 9"):
+        spoiled = {**episode.meta["vessel"], "heart_phase": list(phase[1:])}
+        meta = {**episode.meta, "vessel": spoiled}
+        VesselRecord.of(dataclasses.replace(episode, meta=meta))

@@ -89,6 +89,12 @@ def distances(rows: np.ndarray) -> np.ndarray:
     return rows[..., 4::CONTACT_SIZE]
 
 
+def pressing_work(rows: np.ndarray) -> np.ndarray:
+    """Work (...) J that has pressed springs in, ½ Σ f r, from rows (..., K * 14)."""
+    normal, depth = rows[..., 1::CONTACT_SIZE], -distances(rows)
+    return 0.5 * (normal * np.maximum(depth, 0.0)).sum(axis=-1)
+
+
 def too_coarse(
     magnitude: np.ndarray, rows: np.ndarray, deepest: float | None = None
 ) -> np.ndarray:

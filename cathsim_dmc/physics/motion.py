@@ -148,6 +148,11 @@ class Moving(Effect):
         self._clock += CONTROL_TIMESTEP
         return action
 
+    def record(self) -> dict[str, list[float]]:
+        """Lattice, to six digits, and parameters of the first simulation."""
+        lattice = [float(f"{value:.6g}") for value in self._motions[0].lattice]
+        return {"lattice": lattice, "parameters": self.world.parameters[0].tolist()}
+
     def phases(self) -> tuple[np.ndarray, np.ndarray]:
         """Phases (N,), (N,) of heart and breathing, 0 to 1."""
         _, _, _, _, rate, phase, _, breath, begin, _ = self.world.parameters.T

@@ -26,7 +26,7 @@ PRESETS: dict[str, dict[str, Any]] = {
 
 
 # Figures of a vessel that lives.
-INFO = ("heart_phase", "breath_phase", "blood_speed", "indentation")
+INFO = ("heart_phase", "breath_phase", "blood_speed", "indentation", "wall_work")
 
 
 class VesselReadings(NamedTuple):
@@ -37,17 +37,20 @@ class VesselReadings(NamedTuple):
         breath_phase: (N,), 0 to 1; 0 is the end of expiration.
         blood_velocity: (N, 3), at the head, m/s, world frame.
         indentation: (N,), of the wall under the deepest contact, m.
+        wall_work: (N,), done on the wall by pressing it in so far, J.
     """
 
     heart_phase: np.ndarray
     breath_phase: np.ndarray
     blood_velocity: np.ndarray
     indentation: np.ndarray
+    wall_work: np.ndarray
 
     def info(self) -> dict[str, np.ndarray]:
         """Figures (N,) for `tasks.step.Step.info`, of `INFO`."""
         speed = np.sqrt((self.blood_velocity**2).sum(axis=-1))
-        values = self.heart_phase, self.breath_phase, speed, self.indentation
+        phases = self.heart_phase, self.breath_phase
+        values = *phases, speed, self.indentation, self.wall_work
         return dict(zip(INFO, values, strict=True))
 
 
@@ -65,8 +68,9 @@ def read(
     if not any(isinstance(effect, Flow | Wall | Moving) for effect in effects):
         return None
     deepest = -forces.distances(rows).min(axis=-1, initial=0.0)
+    work = forces.pressing_work(rows)
     still = np.zeros(len(time))
-    found = VesselReadings(still, still, np.zeros((len(time), 3)), deepest)
+    found = VesselReadings(still, still, np.zeros((len(time), 3)), deepest, work)
     for effect in effects:
         if isinstance(effect, Moving):
             heart, breath = effect.phases()

@@ -34,6 +34,7 @@ def episode_blueprint(
     robot: Sequence[float] | None,
     heights: Mapping[str, tuple[float, float]],
     rotation: bool = False,
+    living: bool = False,
 ) -> rrb.Blueprint:
     """Return the layout: scene on the left, X-ray in the middle, series on the right.
 
@@ -46,6 +47,7 @@ def episode_blueprint(
         heights: Lowest and highest value of the plots "reward", "force", "distance"
             (if the recording has it) and "insertion".
         rotation: Whether the recording has ``series/rotation_deg``, of coaxial devices.
+        living: Whether the recording has ``series/vessel``.
     """
     middle = np.asarray(centre, dtype=np.float64)
     insets: list[rrb.View] = [_tip(np.asarray(head, dtype=np.float64))]
@@ -73,6 +75,8 @@ def episode_blueprint(
     ]
     if rotation:
         plots.insert(3, _plot("Rotation, °", "series/rotation_deg", None, legend=True))
+    if living:
+        plots.append(_plot("Heart, breathing, wall", "series/vessel", legend=True))
     if distance:
         way = _plot("Distance to goal, mm", "series/distance_mm", heights["distance"])
         plots.insert(1, way)

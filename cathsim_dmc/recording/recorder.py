@@ -15,6 +15,7 @@ from dm_control.rl import control
 
 from cathsim_dmc.recording.coaxial import SERIES, device_meta
 from cathsim_dmc.recording.episode import TERMINATIONS, Episode
+from cathsim_dmc.recording.living import vessel_meta, vessel_state
 from cathsim_dmc.simulation.episodes import ComposerSimulation, play
 
 Policy = Callable[[Any], np.ndarray]
@@ -163,6 +164,7 @@ class EpisodeRecorder:
             "body_pos": np.array(data.xpos),
             "body_quat": np.array(data.xquat),
             "base_insertion": float(task.readings.insertion),
+            **vessel_state(task),
         }
 
     def _forces(self) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
@@ -226,10 +228,13 @@ class EpisodeRecorder:
         if SERIES[0] in rows:
             series = {name: rows.array(name) for name in SERIES}
             meta["devices"] = device_meta(task, series)
-        position = np.array(task.goal_position)
-        head = rows.array("catheter")[:, -1]
+        position = task.objective.goal.reshape(3)
         meta["goal_position"] = position.tolist()
         meta["goal_radius"] = float(task.objective.goal_radius)
+        if "vessel" in rows:
+            meta["vessel"] = vessel_meta(rows["vessel"], rows["vessel_motion"][-1])
+            position = np.array(meta["vessel"]["goal"])
+        head = rows.array("catheter")[:, -1]
         meta["distance"] = np.linalg.norm(head - position, axis=-1).tolist()
         return meta
 

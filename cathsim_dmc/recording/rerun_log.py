@@ -22,8 +22,9 @@ from cathsim_dmc.recording import blueprint
 from cathsim_dmc.recording.coaxial import CoaxialRecord
 from cathsim_dmc.recording.drawing import Drawing, goal_distance
 from cathsim_dmc.recording.episode import Episode
+from cathsim_dmc.recording.living import VesselRecord
 from cathsim_dmc.recording.rerun_device import log_catheter, log_contacts
-from cathsim_dmc.recording.rerun_scene import log_bodies, log_static
+from cathsim_dmc.recording.rerun_scene import log_bodies, log_static, log_vessel
 from cathsim_dmc.recording.rerun_series import log_events, log_frames, log_series
 from cathsim_dmc.recording.rerun_stream import Log
 from cathsim_dmc.recording.scene import BodyGeom
@@ -87,6 +88,7 @@ def write_rrd(
 
 def _fill(log: Log, drawing: Drawing) -> None:
     log_static(log, drawing)
+    log_vessel(log, drawing)
     if drawing.frames is not None:
         log_frames(log, drawing.frames)
     log_catheter(log, drawing.radii)
@@ -108,6 +110,7 @@ def _layout(episode: Episode, drawing: Drawing) -> Blueprint:
         planes=planes,
         distance=goal_distance(episode) is not None,
         rotation=CoaxialRecord.of(episode) is not None,
+        living=VesselRecord.of(episode) is not None,
         head=episode.head[0],
         robot=robot,
         heights=_heights(episode),

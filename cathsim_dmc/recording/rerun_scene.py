@@ -13,11 +13,15 @@ from cathsim_dmc.anatomy.parts import Surface
 from cathsim_dmc.recording.drawing import Drawing
 from cathsim_dmc.recording.episode import Episode
 from cathsim_dmc.recording.geometry import xyzw
+from cathsim_dmc.recording.living import SERIES, VesselRecord
 from cathsim_dmc.recording.rerun_stream import Log
 from cathsim_dmc.recording.scene import BodyGeom
 
 VESSEL_COLOUR = (225, 140, 130, 60)
 GOAL_COLOUR = (60, 190, 90, 110)
+BLOOD_COLOUR = (200, 30, 40)
+BLOOD_SCALE = 0.02  # s; an arrow of 20 mm is 1 m/s
+MESH_EVERY = 4  # states, of which the moved surface is kept
 # Entities that would hide the device inside them, and how opaque they are drawn.
 SEE_THROUGH = {"sheath": 0.3}
 
@@ -29,10 +33,13 @@ def log_static(log: Log, drawing: Drawing) -> None:
     vertices, faces = drawing.vertices, drawing.faces
     # Patient frame LPS: x to the patient's left, y to the back, z up.
     log.static("world", rr.ViewCoordinates.LBU)
+    record = VesselRecord.of(log.episode)
+    moves = record is not None and record.motion is not None
     log.static(
         "world/vessel",
-        rr.Mesh3D(
-            vertex_positions=vertices.astype(np.float32),
+        rr.Mesh3D.from_fields(
+            # What is static hides what moves.
+            vertex_positions=None if moves else vertices.astype(np.float32),
             vertex_normals=Surface(vertices, faces).normals.astype(np.float32),
             triangle_indices=faces.astype(np.uint32),
             albedo_factor=VESSEL_COLOUR,
@@ -49,6 +56,38 @@ def log_static(log: Log, drawing: Drawing) -> None:
                 fill_mode="solid",
             ),
         )
+
+
+def log_vessel(log: Log, drawing: Drawing) -> None:
+    """Log heart, breathing, blood and wall of a vessel that lives, and its motion."""
+    record = VesselRecord.of(log.episode)
+    if record is None:
+        return
+    for name, values in record.series.items():
+        factor, label = SERIES[name]
+        log.series(f"series/vessel/{name}", factor * values, slice(None), label)
+    log.static("world/blood", rr.Arrows3D.from_fields(colors=[BLOOD_COLOUR]))
+    arrows = rr.Arrows3D.columns(
+        origins=log.episode.head, vectors=BLOOD_SCALE * record.blood_velocity
+    )
+    log.columns("world/blood", arrows)
+    if drawing.goal is not None:
+        log.columns(
+            "world/goal",
+            rr.Transform3D.columns(translation=record.goal - drawing.goal[0]),
+        )
+    if record.motion is None:
+        return
+    rest = drawing.vertices
+    outwards = Surface(rest, drawing.faces).normals
+    rows = np.arange(0, log.episode.steps + 1, MESH_EVERY)
+    moved = [
+        record.vertices(rest, outwards, time).astype(np.float32)
+        for time in log.episode.time[rows]
+    ]
+    columns = rr.Mesh3D.columns(vertex_positions=np.concatenate(moved))
+    columns = columns.partition(np.full(len(rows), len(rest)))
+    log.columns("world/vessel", columns, rows)
 
 
 def log_bodies(log: Log, geoms: tuple[BodyGeom, ...]) -> None:

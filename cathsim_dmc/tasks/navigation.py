@@ -319,8 +319,9 @@ class Navigation(composer.Task):
 
     @property
     def goal_position(self) -> np.ndarray:
-        """Position (3,) of the goal in this episode, m, world frame."""
-        return self.objective.goal.reshape(3)
+        """Position (3,) of the goal now, m, world frame; it moves with its vessel."""
+        goal = self.objective.goal if self.rollout is None else self.rollout.goal
+        return goal.reshape(3)
 
     @property
     def rollout(self) -> Rollout | None:

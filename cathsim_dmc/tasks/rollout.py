@@ -432,6 +432,16 @@ class Rollout:
         return self._moving.to_space(every.copy())
 
     @property
+    def vessel(self) -> vessel.VesselReadings | None:
+        """State of the vessels; None for rigid ones with blood at rest."""
+        return self._measured.vessel
+
+    @property
+    def moving(self) -> Moving | None:
+        """What moves the vessels; None where they rest."""
+        return self._moving
+
+    @property
     def shadows(self) -> Sequence[Shadow]:
         """The devices as X-rays meet them, with points (N, n, 3)."""
         return self._devices.shadows(self.readings.centreline)

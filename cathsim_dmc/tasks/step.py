@@ -70,9 +70,9 @@ class Step(NamedTuple):
         "distance" and "insertion" in m; "push_force" in N; "wall_force_sum",
         "wall_force_max" and their peaks within the control step in N (see
         `forces.WallForce`); "path_ratio"; of a vessel that lives "heart_phase",
-        "breath_phase", "blood_speed" (at the head, m/s) and "indentation" (m);
-        "success" and "physics_error" (bool); and "reward_<term>" for each weighted
-        term.
+        "breath_phase", "blood_speed" (at the head, m/s), "indentation" (m) and
+        "wall_work" (J); "success" and "physics_error" (bool); and "reward_<term>" for
+        each weighted term.
         """
         wall = self.wall_force
         return {
