@@ -96,8 +96,9 @@ def cases() -> list[Case]:
     add("branch left out", ("I",), VARIANTS[1:3], change=(("lsa", 0.0),), answer=ASK)
     for limb, length in product(("ascending", "descending"), (25e-3, 60e-3)):
         add("limb cut short", TYPES, VARIANTS[:2], change=((limb, length),))
-    add("narrowed subclavian", TYPES, change=(("narrow", 1.1e-3),))
-    add("narrowed subclavian", ("I", "II"), change=(("narrow", 1.1e-3),), turn="any")
+    narrow = {"change": (("narrow", 1.3e-3),), "triangles": 30_000}
+    add("narrowed subclavian", TYPES, **narrow)
+    add("narrowed subclavian", ("I", "II"), turn="any", **narrow)
     for axis in "xy":
         add("mirrored", TYPES, turn=axis, answer=ASK)
     for name in phantoms.PHANTOMS:
@@ -261,13 +262,26 @@ def with_vertebral(tree: VesselTree, rng) -> VesselTree:
     root = tree.root.centreline
     places = [tree.origin(name) for name in ("lcca", "lsa")]
     place = root.at(float(np.mean(places)))
-    chord = tree.vessel("lcca").centreline
-    way = chord.points[-1] - chord.points[0] + rng.normal(0.0, 2e-3, 3)
-    other = tree.vessel("lsa").centreline
-    way = 0.5 * (way + other.points[-1] - other.points[0])
-    way /= np.linalg.norm(way)
+    ways = [tree.vessel(name).centreline.points[[0, -1]] for name in ("lcca", "lsa")]
+    middle = np.mean(
+        [(end - start) / np.linalg.norm(end - start) for start, end in ways], axis=0
+    )
     length = float(place.radius) + 50e-3
-    points = place.position + np.linspace(0.0, length, 30)[:, None] * way
+    beyond = float(place.radius) + 12e-3
+    first, last = (
+        root.project(tree.vessel(name).centreline.points[-1]).arc_length
+        for name in ("lcca", "lsa")
+    )
+    for _ in range(400):
+        way = middle + rng.normal(0.0, 0.4, 3)
+        way *= length / np.linalg.norm(way)
+        points = place.position + np.linspace(0.0, 1.0, 30)[:, None] * way
+        far = points[np.linalg.norm(points - place.position, axis=1) > beyond]
+        clear = max(depth.max() for depth in tree.depths(far).values()) < -2.8e-3
+        if clear and first < root.project(points[-1]).arc_length < last:
+            break
+    else:
+        raise ValueError("no room for a vertebral artery between LCCA and LSA")
     line = Centreline(points, np.full(30, 1.9e-3))
     vessel = Vessel("lva", line, tree.root.name, float(place.radius))
     return VesselTree({**tree.vessels, "lva": vessel})

@@ -225,6 +225,16 @@ def test_other_trunks_keep_their_names(names):
     assert name_trunk(tree) is tree
 
 
+def test_a_bovine_trunk_is_the_brachiocephalic():
+    """The left carotid leaves it before the right branches part."""
+    tree = name_trunk(fork("rcca", "lcca", "rsa"))
+    parents = {key: vessel.parent for key, vessel in tree.vessels.items()}
+    assert parents.pop("bca") == "aorta"
+    assert parents == {"aorta": None, "rcca": "bca", "lcca": "bca", "rsa": "bca"}
+    after = fork("rcca", "rsa", "lcca")
+    assert name_trunk(after) is after
+
+
 def test_branches_that_are_right_ones_need_no_name():
     tree = name_trunk(fork("branch_2", "branch_1"), right={"branch_1", "branch_2"})
     assert [v.parent for v in tree.vessels.values()] == [None, "aorta", "bca", "bca"]

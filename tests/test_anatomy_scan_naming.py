@@ -9,14 +9,18 @@ from scipy.spatial import cKDTree
 from cathsim_dmc.anatomy.arch.arch import ArchSeed
 from cathsim_dmc.anatomy.arch.tree import arch_tree
 from cathsim_dmc.anatomy.scan.aorta import Bend, heart_evidence, mirrored
+from cathsim_dmc.anatomy.scan.forks import leads
 from cathsim_dmc.anatomy.scan.naming import name_branches
-from cathsim_dmc.anatomy.scan.offshoots import Offshoot
+from cathsim_dmc.anatomy.scan.offshoots import Offshoot, offshoots
 
 SPACE = 20e-3  # m of aorta between ostia
 
 
 class Tubes:
     """What naming asks of a lattice: the depth at points of some lines."""
+
+    nodes = np.empty(0, dtype=int)
+    links = np.empty((2, 0), dtype=int)
 
     def __init__(self, lines, radii):
         self.points = np.concatenate(lines)
@@ -47,8 +51,8 @@ def bend():
     return Bend.of(line((-35, 0, -60), *arch, (35, 0, -160)))
 
 
-def named(bend, *branches, odds=-np.inf):
-    """Names of the curves of (radius, (radius, corners)...) in mm, and the notes."""
+def built(*branches):
+    """Lattice, offshoots and curves of (radius, (radius, corners)...) in mm."""
     lines, radii, found, curves = [], [], [], []
     for place, branch in enumerate(branches):
         x = 20 * place - 20
@@ -80,7 +84,12 @@ def named(bend, *branches, odds=-np.inf):
         curves += own
         lines += own
         radii += [1e-3 * r for r, _ in branch[1:]]
-    ways = Tubes(lines, radii) if lines else None
+    return Tubes(lines, radii) if lines else None, found, curves
+
+
+def named(bend, *branches, odds=-np.inf):
+    """Names of the curves of such branches, and the notes."""
+    ways, found, curves = built(*branches)
     out = name_branches(ways, bend, 13.3e-3, found, curves, odds)
     return out.names, " ".join(out.notes)
 
@@ -153,6 +162,29 @@ def test_subclavian_and_vertebral_arteries(bend):
     vertebral = (1.8, [*up, (-40, 0, 95), (-42, 8, 180)])
     names, _ = named(bend, (6.2, carotid, arm, vertebral), LCCA, LSA)
     assert names == ["rcca", "rsa", "rva", "lcca", "lsa"]
+
+
+def test_a_name_is_no_surer_than_its_branch(bend):
+    ways, found, _ = built(NECK, LCCA, LSA)
+    sure = leads(ways, bend, found[0], ("bca", 1.0), 1.0, False)
+    assert sure[0] == {0: "rcca", 1: "rsa"} and min(sure[1].values()) > 0.95
+    assert leads(ways, bend, found[0], ("bca", 0.94), 1.0, False) == ({}, {})
+
+
+def test_a_vertebral_artery_far_along_the_subclavian_is_no_twin_of_it(bend):
+    way = [(45, 0, 55), (95, 0, 60)]
+    long = (5.0, (4.0, [*way, (170, 0, 62)]), (1.9, [*way, (96, 0, 140)]))
+    assert named(bend, BCA, LCCA, long)[0] == ["bca", "lcca", "lsa", "lva"]
+
+
+def test_branches_that_leave_in_one_lumen_are_one(bend):
+    """They part where they leave, as in a bovine arch with a common ostium."""
+    root = bend.line[: bend.apex]
+    rows = [line(1e3 * root[-1], (0, 0, 50), (side, 0, 95)) for side in (-20, 20)]
+    curves = [np.concatenate([root[:-1], row]) for row in rows]
+    ways = Tubes(curves, [6e-3, 4e-3])
+    found = offshoots(ways, bend, np.full(len(bend.line), 13e-3), curves)
+    assert [one.curves for one in found] == [(0, 1)]
 
 
 def test_a_vertebral_artery_of_its_own_and_an_aberrant_subclavian(bend):

@@ -15,7 +15,7 @@ from cathsim_dmc.anatomy.scan.aorta import (
     mirrored,
 )
 from cathsim_dmc.anatomy.scan.ends import FreeEnd, LumenEntry, listed
-from cathsim_dmc.anatomy.scan.extract import centrelines
+from cathsim_dmc.anatomy.scan.extract import Found, centrelines
 from cathsim_dmc.anatomy.scan.naming import SURE, Naming, name_branches, neutral_names
 from cathsim_dmc.anatomy.scan.offshoots import Offshoot, offshoots
 from cathsim_dmc.anatomy.scan.ways import Ways
@@ -32,12 +32,14 @@ class Arch:
         ends: of the aorta, that at the heart last.
         bend: of the aorta, from the first of them on.
         naming: of all branches, seen from there.
+        found: the centrelines from there, as `centrelines` gives them.
     """
 
     ways: Ways
     ends: tuple[FreeEnd, FreeEnd]
     bend: Bend
     naming: Naming
+    found: tuple[list[Found], int]
 
     @classmethod
     def of(
@@ -71,24 +73,33 @@ class Arch:
                     f"heart is {min(gaps) * 1e3:.0f} mm away from both ends of the "
                     f"aorta; give a point near one of them: {listed([first, last])}."
                 )
-        found = cls._named(ways, ends, first, last, odds)
-        if not found[1].heart_last:
+        seen = cls._named(ways, ends, first, last, odds)
+        if not seen[1].heart_last:
             first, last = last, first
-            bend, naming = cls._named(ways, ends, first, last, odds and -odds)
-        else:
-            bend, naming = found
-        return cls(ways, (first, last), bend, naming)
+            seen = cls._named(ways, ends, first, last, odds and -odds)
+        return cls(ways, (first, last), *seen)
 
     @classmethod
-    def _named(cls, ways, ends, first, last, odds) -> tuple[Bend, Naming]:
+    def _named(
+        cls, ways, ends, first, last, odds
+    ) -> tuple[Bend, Naming, tuple[list[Found], int]]:
         entry = LumenEntry(first.position, True, last.position)
-        curves = [f.points for f in centrelines(ways, ends, entry)[0]]
+        lines = centrelines(ways, ends, entry)
+        curves = [f.points for f in lines[0]]
         bend, width, found = cls._seen(ways, entry, curves)
         if odds is None:
             odds = _odds(bend, width, found)
-        return bend, name_branches(
-            ways, bend, float(np.median(width)), found, curves, odds
-        )
+        median = float(np.median(width))
+        return bend, name_branches(ways, bend, median, found, curves, odds), lines
+
+    def centrelines(
+        self, ends: Sequence[FreeEnd], entry: LumenEntry
+    ) -> tuple[list[Found], int]:
+        """The centrelines from an entry, and how many branches are too thin."""
+        own = (self.ends[0].position, self.ends[1].position)
+        if entry.at_end and entry.position is own[0] and entry.far is own[1]:
+            return self.found
+        return centrelines(self.ways, ends, entry)
 
     @staticmethod
     def _seen(ways, entry, curves) -> tuple[Bend, np.ndarray, list[Offshoot]]:

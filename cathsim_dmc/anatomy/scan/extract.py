@@ -10,7 +10,7 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
 from cathsim_dmc.anatomy.scan.ends import Cover, FreeEnd, LumenEntry, length_of
-from cathsim_dmc.anatomy.scan.ways import Ways
+from cathsim_dmc.anatomy.scan.ways import CELL, Ways
 
 DEVICE_RADIUS = 0.84e-3  # m, 5 Fr catheter (1 Fr = 1/3 mm diameter)
 BRANCH = 15e-3  # m, shortest passable length of a branch worth a name
@@ -83,7 +83,7 @@ def centrelines(
         if len(own) == len(way):
             # It begins at the inlet, at whose very end the lattice has no depth.
             own = own[int((ways.depth[own] >= DEVICE_RADIUS).argmax()) :]
-        depth = ways.depth[own]
+        depth = ways.depth[own] + CELL
         narrow = np.flatnonzero(depth < DEVICE_RADIUS)
         passable = own[: narrow[0]] if len(narrow) else own
         if len(passable) < 2 or length_of(ways, passable) < BRANCH:
@@ -171,13 +171,11 @@ def _rings(ways: Ways, before: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]
     n = len(ways.points)
     link = coo_matrix((np.ones(len(rows)), (rows, cols)), shape=(n, n))
     label = connected_components(link, directed=False)[1][rows]
+    depth = np.minimum(ways.depth[rows], ways.depth[cols])
+    order = np.lexsort((-depth, label))  # of each place the deepest link first
+    first = order[np.unique(label[order], return_index=True)[1]]
     rings = []
-    for key in np.unique(label):
-        among = np.flatnonzero(label == key)
-        depth = np.minimum(ways.depth[rows[among]], ways.depth[cols[among]])
-        at = among[depth.argmax()]
-        if depth.max() < DEVICE_RADIUS:
-            continue
+    for at in first[depth[first] >= DEVICE_RADIUS]:
         one, other = (ways.trace(before, int(k[at])) for k in (rows, cols))
         count = min(len(one), len(other))
         same = one[:count] == other[:count]

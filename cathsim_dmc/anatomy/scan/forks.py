@@ -35,20 +35,35 @@ LEADS = {
 }
 _STEM = {"bovine": "bca"}
 WAY = 60e-3  # m of a vessel over which its direction is taken
-TWINS = 70e-3  # m that two curves share after all others have left: one vessel
+TWINS = 85e-3  # m that two curves share after all others have left: one vessel
 
 
 def leads(
-    ways: Ways, bend: Bend, one: Offshoot, label: str, scale: float, heart_last: bool
+    ways: Ways,
+    bend: Bend,
+    one: Offshoot,
+    called: tuple[str, float],
+    scale: float,
+    heart_last: bool,
 ) -> tuple[dict[int, str], dict[int, float]]:
-    """Names of the curves of a branch, and their probabilities."""
+    """Names of the curves of a branch, and their probabilities.
+
+    Args:
+        ways: of the lumen.
+        bend: of its aorta.
+        one: the branch.
+        called: what the branch is, and the probability of that.
+        scale: width of the aorta by that of a usual one.
+        heart_last: whether the heart is at the last point of the aorta.
+    """
+    label, sure = called
     if not one.curves:
         return {}, {}
     kept = without_twins(one.rows) if label in LEADS else [0]
     rows = [one.rows[k] for k in kept]
     if len(rows) == 1:
         return {one.curves[kept[0]]: _STEM.get(label, label)}, {
-            one.curves[kept[0]]: 1.0
+            one.curves[kept[0]]: sure
         }
     share = _shares(rows)
     seen = [_look(ways, bend, row, max(share[i])) for i, row in enumerate(rows)]
@@ -65,16 +80,16 @@ def leads(
     most = max(weights.values())
     odds = {key: np.exp(value - most) for key, value in weights.items()}
     total = sum(odds.values())
-    names, doubt = {}, {}
+    names, surety = {}, {}
     for place, row in enumerate(kept):
         number = one.curves[row]
         by = defaultdict(float)
         for order, value in odds.items():
             by[order[place]] += value / total
         name = max(by, key=lambda key: by[key])
-        if by[name] >= SURE and name != "extra":
-            names[number], doubt[number] = name, by[name]
-    return names, doubt
+        if sure * by[name] >= SURE and name != "extra":
+            names[number], surety[number] = name, sure * by[name]
+    return names, surety
 
 
 def _shares(rows: Sequence[np.ndarray]) -> list[list[int]]:

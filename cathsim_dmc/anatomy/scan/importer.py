@@ -151,7 +151,7 @@ def import_scan(
     tree, opening = _tree(measure, ways, lines, places, root, rename or {}, note)
     say(f"tree: {', '.join(_summary(tree))}")
     anatomy = Anatomy(
-        name=name or Path(mesh_path).stem,
+        name=name or Path(mesh_path).name.split(".")[0],
         tree=tree,
         surface=_cut(surface, opening),
         inlet=opening,
@@ -206,7 +206,10 @@ def _computed(
     note: Callable[[str], None],
 ) -> tuple[dict[str, np.ndarray], frozenset[str]]:
     """Computed curves by name, and those of the brachiocephalic artery."""
-    found, thin = centrelines(ways, ends, entry)
+    if arch is None:
+        found, thin = centrelines(ways, ends, entry)
+    else:
+        found, thin = arch.centrelines(ends, entry)
     if not found:
         raise ValueError(
             "no branch of the lumen lets a 5 Fr catheter "

@@ -137,10 +137,10 @@ def name_branches(
         if label == "bca" and len(one.curves) > 1:
             right += one.curves
             said.append(f"bca {sure:.2f}")
-        parts, doubt = leads(ways, bend, one, label, scale, heart_last)
+        parts, surety = leads(ways, bend, one, (label, sure), scale, heart_last)
         for number, name in parts.items():
             names[number] = name
-            said.append(f"{name} {sure * doubt[number]:.2f}")
+            said.append(f"{name} {surety[number]:.2f}")
         if len(parts) < len(without_twins(one.rows)):
             forked.append((label, one))
     _neutral(names, curves, bend)

@@ -12,13 +12,12 @@ from scipy.spatial import cKDTree
 
 from cathsim_dmc.anatomy.scan.aorta import Bend
 from cathsim_dmc.anatomy.scan.centring import resample
-from cathsim_dmc.anatomy.scan.ways import Ways
+from cathsim_dmc.anatomy.scan.ways import CELL, Ways
 
 OUT = 1.15  # radii of the aorta beyond which a branch has left it
 SHARED = 3e-3  # m beyond that, which curves of one branch share
 NEAR = 95e-3  # m of aorta to both sides of the top of the arch that has its branches
 CALIBRE = (4e-3, 16e-3)  # m past the ostium between which a calibre is taken
-CELL = 0.2e-3  # m by which depths of lattice points are less than radii, in the mean
 STUB = 4e-3  # m, least height of a branch that was cut short
 STUB_OUT = (1.2, 1.5e-3)  # radii and m beyond which lumen is that of a stub
 STUB_RADIUS = 1.2e-3  # m
@@ -70,7 +69,11 @@ def offshoots(
         row, at = curve[start:], int(near[start])
         for members, rows, _ in out:
             shared = rows[0][: common(rows[0], row)]
-            if len(shared) > 1 and arc(shared)[-1] > SHARED:
+            apart = np.linalg.norm(rows[0][0] - row[0])
+            # They leave in one lumen, even if they part at once.
+            if apart < depth_of(ways, rows[0][:1])[0] or (
+                len(shared) > 1 and arc(shared)[-1] > SHARED
+            ):
                 members.append(number)
                 rows.append(row)
                 break

@@ -21,8 +21,9 @@ def name_trunk(tree: VesselTree, right: Collection[str] = ()) -> VesselTree:
 
     Where curves share a trunk, the trunk is part of one of them: the right carotid
     then leaves the right vertebral. If both are right branches, the part up to the
-    first of them becomes a vessel of its own and the parent of both. Nothing changes
-    if the trunk's name is taken or no two right branches share one.
+    first of them becomes a vessel of its own and the parent of both, and of the left
+    carotid of a bovine arch, which leaves it before. Nothing changes if the trunk's
+    name is taken or no two right branches share one.
 
     Args:
         tree: as it was grown.
@@ -37,10 +38,15 @@ def name_trunk(tree: VesselTree, right: Collection[str] = ()) -> VesselTree:
         names = [name, *(branch.name for branch in branches)]
         if vessel.parent != root or len(names) < 2:
             continue
-        if not all(key in right or _RIGHT.fullmatch(key) for key in names):
+        own = [key for key in names if key in right or _RIGHT.fullmatch(key)]
+        if name not in own or len(own) < 2:
             continue
         line = vessel.centreline
-        split = min(tree.origin(branch.name) for branch in branches)
+        split = min(tree.origin(key) for key in own[1:])
+        # Only the left carotid, of a bovine arch, leaves the trunk before it.
+        others = set(names) - set(own)
+        if any(key != "lcca" or tree.origin(key) > split for key in others):
+            continue
         if not vessel.ostium + 2.0 * STEP < split < line.length - 2.0 * STEP:
             continue  # they part in the root's lumen, or at the curve's end
         trunk = line.slice(0.0, split)

@@ -12,6 +12,7 @@ from cathsim_dmc.anatomy.scan.centring import resample
 from cathsim_dmc.anatomy.surface_depth import SurfaceDepth
 
 LATTICE = 1e-3  # m, spacing of the lattice on which ways are searched
+CELL = 0.2e-3  # m by which depths of its points are less than radii, in the mean
 CORRIDOR = 2e-3  # m, distance from a drawn curve at which a way costs twice
 SHALLOW = 0.2e-3  # m, lattice points nearer to the wall are no way
 # A narrow place splits that lattice. There a finer one joins the pieces again.
