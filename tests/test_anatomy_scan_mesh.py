@@ -14,7 +14,7 @@ from cathsim_dmc.anatomy.parts import Surface
 from cathsim_dmc.anatomy.scan.lumen import read_lumen
 from cathsim_dmc.anatomy.scan.mesh import read_triangles
 from cathsim_dmc.anatomy.scan.repair import mend
-from cathsim_dmc.anatomy.scan.topology import edge_counts
+from cathsim_dmc.anatomy.scan.topology import decimated, edge_counts
 from cathsim_dmc.anatomy.scan.units import upright
 
 DATA = Path(__file__).parent / "data"
@@ -294,6 +294,17 @@ def test_a_small_tangle_between_large_triangles_is_mended():
     assert len(surface.faces) == len(tube.faces)
     assert surface.volume == pytest.approx(tube.volume)
     assert any("self-intersecting" in note for note in notes)
+
+
+def test_folds_that_noise_makes_in_a_coarse_surface_are_smoothed():
+    vertices, faces = marched(y_tree(), 1e-3)
+    vertices, faces = decimated(vertices * 1e-3, faces, 3000)
+    clean = Surface(vertices, faces)
+    noise = np.random.default_rng(2).normal(0.0, 0.3e-3, (len(vertices), 1))
+    surface, notes = mend("y", vertices + noise * clean.normals, faces)
+    assert len(surface.faces) == len(faces)
+    assert surface.volume == pytest.approx(clean.volume, rel=0.01)
+    assert any("self-intersecting triangles smoothed" in note for note in notes)
 
 
 def label_map(folder, kind, *, second=False):

@@ -25,6 +25,7 @@ PART_WIDTH = 12e-3  # m, and if they are not wider
 NON_MANIFOLD = 0.01  # of the triangles: more at non-manifold edges are not mended
 HOLE = 8e-3  # m, widest hole in the side of a vessel that is filled
 SPIKE = 4e-3  # m, widest patch around a self-intersection that is cut out
+FOLD = 2.5e-3  # m, most that a vertex of a self-intersection is moved
 CUT = 16e-3  # m, widest hole that is filled where it was cut out
 END_AREA = 0.5e-6  # m^2, least area of an open end
 END = 0.55  # largest |cosine| between an end's axis and the normals around it
@@ -248,18 +249,19 @@ class _Work:
             self.notes.append("surface turned inside out: normals pointed inwards")
 
     def untangle(self) -> None:
-        """Cut out small patches that pierce the surface, refuse large ones."""
+        """Cut out small patches that pierce the surface, smooth or refuse others."""
         first = None
         for _ in range(ROUNDS):
             faces, edges = SurfaceDepth(Surface(self.vertices, self.faces)).crossings()
             if not len(faces):
                 break
-            tangled = np.isin(self.faces, np.unique(edges)).sum(axis=1) >= 2
-            tangled[faces] = True
+            tangled = self._tangled(faces, edges)
             where = self.vertices[edges[0, 0]]
             first = first or (len(np.unique(faces)), where)
-            patch = self._widest_patch(tangled)
-            if patch > SPIKE or tangled.mean() > NON_MANIFOLD:
+            few = tangled.mean() <= NON_MANIFOLD
+            if not few or self._widest_patch(tangled) > SPIKE:
+                if few and self._smooth_folds():
+                    return
                 raise ValueError(
                     f"{self.name} intersects itself: {first[0]} triangles, one at "
                     f"{_mm(where)} mm, are pierced by others. Smooth or remesh that "
@@ -281,6 +283,42 @@ class _Work:
                 f"{first[0]} self-intersecting triangles near {_mm(first[1])} mm cut "
                 "out"
             )
+
+    def _tangled(self, faces: np.ndarray, edges: np.ndarray) -> np.ndarray:
+        """Triangles (F,) that are pierced, or have an edge that pierces one."""
+        tangled = np.isin(self.faces, np.unique(edges)).sum(axis=1) >= 2
+        tangled[faces] = True
+        return tangled
+
+    def _smooth_folds(self) -> bool:
+        """Move vertices of folds to their neighbours; False if that does not help."""
+        vertices, count = self.vertices, 0
+        for _ in range(ROUNDS):
+            faces, edges = SurfaceDepth(Surface(vertices, self.faces)).crossings()
+            if not len(faces):
+                break
+            count = max(count, len(np.unique(faces)))
+            moved = np.unique(self.faces[self._tangled(faces, edges)])
+            one, other = self.faces.ravel(), np.roll(self.faces, 1, axis=1).ravel()
+            total = np.zeros_like(vertices)
+            np.add.at(total, one, vertices[other])
+            middle = (
+                total
+                / np.maximum(np.bincount(one, minlength=len(vertices)), 1)[:, None]
+            )
+            vertices = vertices.copy()
+            vertices[moved] = 0.5 * (vertices + middle)[moved]
+        else:
+            return False
+        far = float(np.linalg.norm(vertices - self.vertices, axis=1).max())
+        if far > FOLD:
+            return False
+        self.vertices = vertices
+        self.notes.append(
+            f"{count} self-intersecting triangles smoothed, by {far * 1e3:.1f} mm "
+            "at most"
+        )
+        return True
 
     def _widest_patch(self, chosen: np.ndarray) -> float:
         label = parts(self.faces[chosen])
