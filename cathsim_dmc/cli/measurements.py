@@ -1,4 +1,4 @@
-"""`cathsim validate rod`, `pair`, `wall`, `vessel`, `forces`; `benchmark speed`."""
+"""`cathsim validate` rod, pair, wall, vessel, forces, bench; `benchmark speed`."""
 
 import sys
 from pathlib import Path
@@ -82,9 +82,40 @@ def forces(
     return show(report, json)
 
 
+@validations.command
+def bench(
+    data: Path, turns: int = 12, sensitivity: bool = True, json: Json = False
+) -> int:
+    """Guidewires against those that were measured in a phantom.
+
+    Args:
+        data: Folder with phantom.stl and wires.json, see docs/bench.md.
+        turns: Number of turns of an angled wire that are tried.
+        sensitivity: Whether to repeat it with other stiffness, friction and scale.
+    """
+    from rich.console import Console
+    from rich.table import Table
+
+    from cathsim_dmc.validation import bench as benches
+
+    report = benches.validate_bench(
+        data, turns=turns, sensitivity=sensitivity, say=_progress
+    )
+    for title, (header, *rows) in benches.tables(report).items() if not json else ():
+        table = Table(*header, title=title, box=None)
+        for row in rows:
+            table.add_row(*row)
+        Console(width=max(130, Console().width)).print(table)
+    return show(report, json)
+
+
 @benchmarks.command
 def speed(json: Json = False) -> int:
     """Measure calibrated speed and overhead; run it with nothing else running."""
     from cathsim_dmc.analysis import speed as measured
 
-    return show(measured.speed(lambda text: print(text, file=sys.stderr)), json)
+    return show(measured.speed(_progress), json)
+
+
+def _progress(text: str) -> None:
+    print(text, file=sys.stderr)

@@ -1,0 +1,257 @@
+"""Guidewires measured in a phantom, read from a folder: mesh, wires and landmarks."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from cathsim_dmc import bounds
+from cathsim_dmc.anatomy.field import Field
+from cathsim_dmc.anatomy.parts import End, Inlet, Surface
+from cathsim_dmc.anatomy.scan.inlet import cut_open
+from cathsim_dmc.anatomy.scan.mesh import read_triangles
+from cathsim_dmc.anatomy.scan.topology import merged
+from cathsim_dmc.anatomy.surface_depth import SurfaceDepth
+
+MESH, WIRES = "phantom.stl", "wires.json"
+KINDS = ("straight", "angled")
+ARCH = "arch"  # tip region of a wire that is in no branch
+# Turning of a wire from the entry to the tip, rad, from which on it is folded or
+# buckled: a wire that follows an arch into a branch turns by less.
+FOLDED = np.radians(150.0)
+_CHORD = 6e-3  # m, over which directions are taken
+_STEP = 1e-3  # m
+_ASTRAY = 30e-3  # m outside of the mesh, where no wire in it can be
+_CUTS = (0.0, 0.5e-3, 1e-3, 1.5e-3, 2e-3, 3e-3)  # m into the lumen, tried in turn
+_COLUMNS = ("run", "frame", "wire", "tip_region", "recommended", "inserted_length_mm")
+_COLUMNS += ("entry_point_mm", "entry_direction", "centreline_mm")
+
+
+@dataclass(frozen=True, eq=False)
+class Wire:
+    """A measured guidewire.
+
+    Attributes:
+        name: run and frame.
+        kind: one of `KINDS`.
+        vessel: that of the tip.
+        recommended: whether it is to be compared.
+        points: (n, 3) m, from the entry to the tip.
+        direction: (3,) unit vector towards the tip, at the entry.
+    """
+
+    name: str
+    kind: str
+    vessel: str
+    recommended: bool
+    points: np.ndarray
+    direction: np.ndarray
+
+    @property
+    def length(self) -> float:
+        """Inserted length, m."""
+        return float(np.linalg.norm(np.diff(self.points, axis=0), axis=1).sum())
+
+    @property
+    def folded(self) -> bool:
+        """Whether it turns by more than `FOLDED`: folded back or buckled."""
+        line = along(self.points, np.arange(0.0, self.length, _CHORD))
+        steps = np.diff(line, axis=0)
+        steps /= np.linalg.norm(steps, axis=1)[:, None]
+        cosine = np.clip(np.vecdot(steps[1:], steps[:-1]), -1.0, 1.0)
+        return bool(np.arccos(cosine).sum() > FOLDED)
+
+
+@dataclass(frozen=True, eq=False)
+class Bench:
+    """A phantom and the wires that were measured in it.
+
+    Attributes:
+        surface: of the lumen, m, cut off and flat at the entry.
+        entry: where the wires enter; its direction points out.
+        ends: (3,) m, far end of each vessel by the name that a wire's tip region has.
+        down: directions (3,) by name, among them gravity's.
+        wires: as measured.
+    """
+
+    surface: Surface
+    entry: End
+    ends: Mapping[str, np.ndarray]
+    down: Mapping[str, np.ndarray]
+    wires: tuple[Wire, ...]
+
+    def field(self, scale: float = 1.0) -> Field:
+        """Depth in the lumen, larger by a factor about the entry."""
+        middle, vertices = self.entry.position, self.surface.vertices
+        surface = Surface(middle + scale * (vertices - middle), self.surface.faces)
+        return Field.from_surface(surface, [self.entry])
+
+
+def along(points: np.ndarray, at: np.ndarray) -> np.ndarray:
+    """Points (m, 3) of a line (n, 3) at arc lengths (m,) from its first point."""
+    steps = np.linalg.norm(np.diff(points, axis=0), axis=1)
+    arc = np.concatenate([[0.0], np.cumsum(steps)])
+    return np.stack([np.interp(at, arc, axis) for axis in points.T], axis=-1)
+
+
+def distances(one: np.ndarray, other: np.ndarray) -> np.ndarray:
+    """Distances (k,) m of two lines (n, 3), (m, 3) at equal arc lengths, every mm."""
+    lengths = [np.linalg.norm(np.diff(x, axis=0), axis=1).sum() for x in (one, other)]
+    at = np.arange(0.0, min(lengths) + 1e-9, _STEP)
+    return np.linalg.norm(along(one, at) - along(other, at), axis=1)
+
+
+def read(folder: str | Path) -> Bench:
+    """Reads a folder of measured wires.
+
+    Args:
+        folder: with `MESH` (mm) and `WIRES`, which holds "wires", a list of objects
+            with `_COLUMNS`, points from the tip on and beyond the entry, and
+            "landmarks": "entry" (point_mm, outward_normal, radius_mm), the far end
+            "ascending_aorta_root_mm", the "patient_axes", and branches (ostium_mm,
+            end_mm or fork_mm).
+
+    Raises:
+        FileNotFoundError: if a file is missing.
+        ValueError: if one is not as stated.
+    """
+    folder = Path(folder)
+    for name in (MESH, WIRES):
+        if not (folder / name).is_file():
+            raise FileNotFoundError(
+                f"no file {folder / name}; --data is a folder with {MESH} and {WIRES}"
+            )
+    path = folder / WIRES
+    try:
+        found = json.loads(path.read_text(encoding="utf-8"))
+    except ValueError as error:
+        raise ValueError(f"{path} is no JSON: {error}") from error
+    marks = _part(found, "landmarks", dict, str(path))
+    entry = _part(marks, "entry", dict, "landmarks")
+    where = _vector(entry, "point_mm", "entry") / 1e3
+    out = _unit(entry, "outward_normal", "entry")
+    vertices, faces = read_triangles(folder / MESH)
+    vertices, faces = merged(vertices / 1e3, faces)
+    radius = 1e-3 * bounds.number("entry radius_mm", entry.get("radius_mm"), 0.1, 100.0)
+    surface, where = _opened(vertices, faces, Inlet("entry", where, -out, radius))
+    measure = SurfaceDepth(surface)
+    rows, ends = _part(found, "wires", list, str(path)), _ends(marks)
+    return Bench(
+        surface=surface,
+        entry=End("entry", where, out, 2.0 * radius, True),
+        ends=ends,
+        down=_axes(_part(marks, "patient_axes", dict, "landmarks")),
+        wires=tuple(_wire(row, n, measure, ends) for n, row in enumerate(rows)),
+    )
+
+
+def _opened(
+    vertices: np.ndarray, faces: np.ndarray, inlet: Inlet
+) -> tuple[Surface, np.ndarray]:
+    """The surface cut off at the inlet, and where: farther in if its end is uneven."""
+    volume = Surface(vertices, faces).volume
+    for inwards in _CUTS:
+        place = inlet.position + inwards * inlet.direction
+        try:
+            points, shell, cap = cut_open(
+                vertices, faces, replace(inlet, position=place)
+            )
+        except ValueError:
+            continue
+        used, numbers = np.unique(np.concatenate([shell, cap]), return_inverse=True)
+        surface = Surface(points[used], numbers.reshape(-1, 3))
+        if surface.volume > 0.5 * volume:
+            return surface, place
+    raise ValueError(
+        f"{MESH} cannot be opened at the entry {np.round(1e3 * inlet.position, 1)} mm "
+        f"nor up to {1e3 * _CUTS[-1]:g} mm farther in; give a point in the lumen near "
+        "its end, and a normal out of it"
+    )
+
+
+def _ends(marks: Mapping[str, Any]) -> dict[str, np.ndarray]:
+    found = {ARCH: _vector(marks, "ascending_aorta_root_mm", "landmarks") / 1e3}
+    for name, mark in marks.items():
+        if isinstance(mark, dict) and "ostium_mm" in mark:
+            end = "end_mm" if "end_mm" in mark else "fork_mm"
+            found[name] = _vector(mark, end, name) / 1e3
+    return found
+
+
+def _axes(axes: Mapping[str, Any]) -> dict[str, np.ndarray]:
+    """Directions to the patient's six sides, and none."""
+    sides = {"superior": "inferior", "left_about": "right", "posterior_about": "front"}
+    found = {"none": np.zeros(3)}
+    for key, opposite in sides.items():
+        axis = _unit(axes, key, "patient_axes")
+        found[key.removesuffix("_about")], found[opposite] = axis, -axis
+    return found
+
+
+def _wire(
+    row: Any, number: int, measure: SurfaceDepth, ends: Mapping[str, Any]
+) -> Wire:
+    missing = [key for key in _COLUMNS if not (isinstance(row, dict) and key in row)]
+    if missing:
+        raise ValueError(
+            f"wire {number} of {WIRES} lacks {', '.join(missing)}; each has "
+            f"{', '.join(_COLUMNS)}"
+        )
+    name = f"{row['run']}, {row['frame']}"
+    kind = bounds.choice(f"wire of {name}", row["wire"], KINDS)
+    points = bounds.array(f"centreline_mm of {name}", row["centreline_mm"], "fiu")
+    if points.ndim != 2 or points.shape[1] != 3 or len(points) < 3:
+        raise ValueError(
+            f"centreline_mm of {name} has shape {points.shape}; give (n, 3), n >= 3"
+        )
+    points = np.asarray(points, dtype=np.float64) / 1e3
+    seen = float(np.linalg.norm(np.diff(points, axis=0), axis=1).sum())
+    length = 1e-3 * bounds.number(
+        f"inserted_length_mm of {name}", row["inserted_length_mm"], positive=True
+    )
+    if length > seen + 2.0 * _STEP:
+        raise ValueError(
+            f"inserted_length_mm of {name} is {1e3 * length:g}, but its centreline is "
+            f"{1e3 * seen:.1f} mm long; give points from the tip to beyond the entry"
+        )
+    inside = along(points, np.append(np.arange(0.0, length, _STEP), length))[::-1]
+    inside[0] = _vector(row, "entry_point_mm", name) / 1e3
+    out = -float(measure(inside).min())
+    if out > _ASTRAY:
+        raise ValueError(
+            f"{name} is {1e3 * out:.0f} mm outside of the mesh (at most "
+            f"{1e3 * _ASTRAY:g} mm are branches that hang elsewhere); mesh and wires "
+            "must be in one frame, in mm"
+        )
+    return Wire(
+        name,
+        kind,
+        bounds.choice(f"tip_region of {name}", row["tip_region"], ends),
+        bounds.switch(f"recommended of {name}", row["recommended"]),
+        inside,
+        _unit(row, "entry_direction", name),
+    )
+
+
+def _part(found: Any, key: str, kind: type, where: str) -> Any:
+    if not (isinstance(found, dict) and isinstance(found.get(key), kind)):
+        what = "an object" if kind is dict else "a list"
+        raise ValueError(f"{where} of {WIRES} has no {key!r}; it must be {what}")
+    return found[key]
+
+
+def _vector(found: Mapping[str, Any], key: str, where: str) -> np.ndarray:
+    return np.array(bounds.vector(f"{key} of {where}", found.get(key), 3))
+
+
+def _unit(found: Mapping[str, Any], key: str, where: str) -> np.ndarray:
+    vector = _vector(found, key, where)
+    norm = np.linalg.norm(vector)
+    if norm < 1e-9:
+        bounds.refuse(f"{key} of {where}", found[key], "a direction other than 0")
+    return vector / norm

@@ -1,0 +1,179 @@
+"""A guidewire in a measured phantom: held at the entry, pushed or let go."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import mujoco
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from cathsim_dmc.anatomy.field import Field
+from cathsim_dmc.anatomy.parts import Surface
+from cathsim_dmc.collision import fields
+from cathsim_dmc.entities.chain import MAX_PUSH_SPEED
+from cathsim_dmc.entities.contact import wall_contact
+from cathsim_dmc.entities.device import Device
+from cathsim_dmc.entities.devices import Discretisation
+from cathsim_dmc.entities.phantom import _mesh_file
+from cathsim_dmc.entities.posture import bends_of
+from cathsim_dmc.entities.sheath import Sheath, straight
+from cathsim_dmc.validation.bench_data import Wire, along
+from cathsim_dmc.validation.rig import Rig
+
+_LINK = 7e-3  # m, longest of the shaft
+# At rest no node moves by more than this, m, in a time, s; not later than another, s.
+_REST, _WHILE, _LONGEST = 0.1e-3, 0.4, 20.0
+
+
+@dataclass(frozen=True)
+class Setting:
+    """What is the same for all frames.
+
+    Attributes:
+        device: the wire.
+        friction: Coulomb coefficient.
+        gravity: (3,) m/s², frame of the mesh, buoyancy taken off.
+        overshoot: by which the wire is pushed too far and pulled back, m.
+    """
+
+    device: Device
+    friction: float
+    gravity: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    overshoot: float = 0.0
+
+
+class Held:
+    """A wire held by the middle of its first link, where and as it enters.
+
+    At full insertion the middle of link 0 is at the entry, so the chain behind it has
+    no part in its shape. The device stands upright at the origin; the wall is turned.
+    """
+
+    def __init__(
+        self,
+        setting: Setting,
+        wall: Field | Surface,
+        wire: Wire,
+        turn: float = 0.0,
+    ):
+        """Builds the scene.
+
+        Args:
+            setting: device and bench.
+            wall: lumen, frame of the mesh; of a surface its convex hull.
+            wire: whose entry and length are taken.
+            turn: of the device about its axis, rad.
+
+        Raises:
+            ValueError: if less of the wire is inserted than its tip is long.
+        """
+        # Rest does not depend on damping; so much makes it soon.
+        device = replace(setting.device, loss_factor=2.0)
+        self.length = wire.length
+        reach = wire.length + setting.overshoot
+        shaft = reach - device.tip_length
+        if shaft < _LINK:
+            raise ValueError(
+                f"{wire.name} is inserted by {1e3 * wire.length:.0f} mm; at least "
+                f"{1e3 * (device.tip_length + _LINK):.0f} mm are needed"
+            )
+        # n - 1/2 links of the shaft are in.
+        first = shaft / (np.ceil(shaft / _LINK) - 0.5)
+        self._rig = rig = Rig(
+            device,
+            Discretisation(reach + first / 2, shaft_link=first * (1 + 1e-6)),
+            stroke=reach + 1e-3,
+            friction=setting.friction,
+        )
+        self._overshoot = setting.overshoot
+        axis = wire.direction
+        side = np.eye(3)[np.abs(axis).argmin()]
+        across = np.cross(side, axis)
+        across /= np.linalg.norm(across)
+        frame = np.stack([across, np.cross(axis, across), axis], axis=1)
+        self._frame = frame @ Rotation.from_euler("z", turn).as_matrix()
+        self._entry = wire.points[0]
+        root = rig.arena.mjcf_model
+        root.option.gravity = np.asarray(setting.gravity) @ self._frame
+        rig.arena.attach(
+            Sheath(straight(float(rig.lengths.sum())), device.outer_radius)
+        )
+        body = root.worldbody.add(
+            "body",
+            pos=-self._entry @ self._frame,
+            quat=Rotation.from_matrix(self._frame.T).as_quat(scalar_first=True),
+        )
+        if isinstance(wall, Field):
+            shape = fields.carrier(wall)
+        else:
+            file = _mesh_file(wall.vertices, wall.faces)
+            root.asset.add("mesh", name="hull", file=file, inertia="shell")
+            shape = {"type": "mesh", "mesh": "hull"}
+        body.add("geom", name="wall", **shape, **wall_contact(setting.friction), mass=0)
+        rig.compile()
+        self._slide = rig.data.joint(f"{rig.name}/insertion")
+        self._servo = rig.model.actuator(f"{rig.name}/insertion").id
+
+    def push(self) -> np.ndarray:
+        """Pushes the wire in, from outside; its shape (n, 3) at rest, m."""
+        self._rig.data.qpos[:] = 0.0
+        return self._advance(0.0)
+
+    def release(self, points: np.ndarray) -> np.ndarray:
+        """Lays the wire along a line and lets it go; its shape (n, 3) at rest, m.
+
+        Args:
+            points: (n, 3) m, moved to the entry and, where too short, made longer.
+        """
+        rig = self._rig
+        end = points[-1] - points[-2]
+        longer = points[-1] + 2.0 * self.length * end / np.linalg.norm(end)
+        local = (np.vstack([points, longer]) - points[0]) @ self._frame
+        nodes, first = [np.array([0.0, 0.0, rig.lengths[0] / 2])], rig.lengths[0] / 2
+        arcs = first + np.cumsum(rig.lengths[1:])
+        steps = np.diff(np.vstack([nodes, along(local, arcs)]), axis=0)
+        steps /= np.linalg.norm(steps, axis=1)[:, None]
+        bends = bends_of(np.vstack([[0.0, 0.0, 1.0], steps]))
+        rig.data.qpos[:] = 0.0
+        self._slide.qpos = self.length
+        for number, angles in enumerate(bends, start=1):
+            for name, angle in zip("xy", angles, strict=True):
+                rig.data.joint(f"{rig.name}/bend_{name}_{number}").qpos = angle
+        return self._advance(self.length)
+
+    def _advance(self, place: float) -> np.ndarray:
+        """Moves the carriage from a place, m, to the inserted length; shape at rest."""
+        rig = self._rig
+        servo = rig.model.actuator_actadr[self._servo]
+        step = MAX_PUSH_SPEED * rig.model.opt.timestep
+        rig.data.act[servo] = place / MAX_PUSH_SPEED
+        for goal in (self.length + self._overshoot, self.length):
+            while place != goal:
+                place += np.clip(goal - place, -step, step)
+                rig.data.act[servo] = place / MAX_PUSH_SPEED
+                rig.step()
+        return self._rest()
+
+    def _rest(self) -> np.ndarray:
+        """Steps until the wire is at rest; what of it is in (n, 3), frame of the mesh.
+
+        Raises:
+            RuntimeError: if the simulation diverges.
+        """
+        rig, end = self._rig, self._rig.data.time + _LONGEST
+        mujoco.mj_forward(rig.model, rig.data)
+        before, nodes = np.inf, self._nodes()
+        while np.abs(nodes - before).max() > _REST and rig.data.time < end:
+            for _ in range(round(_WHILE / rig.model.opt.timestep)):
+                rig.step()
+            before, nodes = nodes, self._nodes()
+        if any(warning.number for warning in rig.data.warning):
+            raise RuntimeError("the wire in the phantom diverges")
+        start = float(rig.lengths.sum()) - self.length
+        total = float(rig.lengths.sum())
+        arcs = np.append(np.arange(start, total, 1e-3), total)
+        return self._entry + along(nodes, arcs) @ self._frame.T
+
+    def _nodes(self) -> np.ndarray:
+        return np.vstack([self._rig.joints, self._rig.head_position])

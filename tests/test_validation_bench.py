@@ -1,0 +1,154 @@
+"""Guidewires on a bench: a folder of measured wires, and their simulation."""
+
+import json
+
+import numpy as np
+import pytest
+import trimesh
+
+from cathsim_dmc import validation
+from cathsim_dmc.validation import bench, bench_data
+from cathsim_dmc.validation.bench_data import MESH, WIRES, Wire
+from cathsim_dmc.validation.bench_rig import Held
+
+ENTRY = np.array([3.0, 0.0, 0.0])  # mm, off the middle of the tube
+
+
+def tube():
+    """A tube of 7 mm, straight along +y for 25 mm, then bent; mm."""
+    angle = np.linspace(0.0, 0.9, 18)
+    arc = 50.0 * np.stack([1 - np.cos(angle), np.sin(angle), 0 * angle], axis=1)
+    line = np.vstack([[[0, -5.0, 0], [0, 5, 0], [0, 15, 0]], arc + (0, 25, 0)])
+    tangent = np.gradient(line, axis=0)
+    tangent /= np.linalg.norm(tangent, axis=1)[:, None]
+    up = np.array([0.0, 0.0, 1.0])
+    round_ = np.linspace(0, 2 * np.pi, 20, endpoint=False)[:, None, None]
+    side = np.cross(tangent, up)
+    rings = line + 7.0 * (np.cos(round_) * side + np.sin(round_) * up)
+    points = rings.transpose(1, 0, 2).reshape(-1, 3)
+    hull = []
+    for k in range(len(line) - 1):
+        for i in range(20):
+            a, b = 20 * k + i, 20 * k + (i + 1) % 20
+            hull += [(a, b, a + 20), (b, b + 20, a + 20)]
+    last = len(points)
+    for i in range(20):
+        j = (i + 1) % 20
+        hull += [(i, last, j), (last - 20 + i, last - 20 + j, last + 1)]
+    mesh = trimesh.Trimesh(np.vstack([points, line[[0, -1]]]), hull)
+    mesh.fix_normals()
+    return mesh, line[-1]
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """Data in the bench's format, of a wire that was simulated."""
+    path = tmp_path_factory.mktemp("bench")
+    mesh, far = tube()
+    mesh.export(path / MESH)
+    marks = {
+        "entry": {"point_mm": [0, 0, 0], "outward_normal": [0, -1, 0], "radius_mm": 7},
+        "ascending_aorta_root_mm": far.tolist(),
+        "patient_axes": {
+            "superior": [0, -1, 0],
+            "left_about": [0, 0, 1],
+            "posterior_about": [1, 0, 0],
+        },
+    }
+    row = {
+        "run": "made",
+        "frame": 1,
+        "wire": "straight",
+        "tip_region": "arch",
+        "recommended": True,
+        "inserted_length_mm": 60.0,
+        "entry_point_mm": ENTRY.tolist(),
+        "entry_direction": [0.0, 1.0, 0.0],
+        "centreline_mm": [[3.0, 60.0 - y, 0.0] for y in range(0, 70, 2)],
+    }
+    write(path, marks, row)
+    made = bench_data.read(path)
+    experiment = bench.Experiment(made)
+    (wire,) = made.wires
+    held = Held(experiment.setting(wire), experiment.field(), wire)
+    shape = 1e3 * held.push()
+    beyond = [[3.0, -1.0, 0.0], [3.0, -3.0, 0.0]]
+    measured = row | {"centreline_mm": [*shape[::-1].tolist(), *beyond]}
+    write(path, marks, measured, row | {"frame": 2, "inserted_length_mm": 50.0})
+    return path, marks, row, experiment.field()
+
+
+def write(path, marks, *rows):
+    (path / WIRES).write_text(json.dumps({"wires": rows, "landmarks": marks}))
+
+
+def test_a_simulated_wire_is_found_again_from_another(folder, monkeypatch):
+    path, _, _, lumen = folder
+    # The same for every reading of the folder; it takes seconds to make.
+    monkeypatch.setattr(bench_data.Bench, "field", lambda self, scale: lumen)
+    lines = []
+    report = validation.validate_bench(path, sensitivity=False, say=lines.append)
+    row, other = report.findings["frames"]
+    assert row["pushed"]["rms"] < 0.05
+    assert row["laid"]["rms"] < 0.3
+    assert row["led"]["rms"] < 0.3 < 1.0 < row["nearest"]["rms"]
+    assert row["centreline"]["rms"] > 2.0
+    assert row["hull"]["rms"] > 2.0
+    assert not row["folded"]
+    assert (row["half"], other["half"]) == ("fit", "test")
+    ((header, *rows),) = bench.tables(report).values()
+    assert rows[0][header.index("pushed")] == "0.0 (0)"
+    assert lines[0].startswith("made, 1 (straight, arch): pushed 0.0")
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"wire": "bent"}, "wire of made, 1 is 'bent'; it must be"),
+        ({"centreline_mm": [[1, 2], [3, 4]]}, "centreline_mm of made, 1 has shape"),
+        ({"inserted_length_mm": 190.0}, "but its centreline is 68.0 mm long"),
+        ({"entry_direction": [0, 0, 0]}, "entry_direction of made, 1"),
+        ({"frame": None, "centreline_mm": [[200, y, 0] for y in range(99)]}, "outside"),
+        ({"tip_region": "LSA"}, "tip_region of made, 1 is 'LSA'; it must be"),
+        ({"recommended": "yes"}, "recommended of made, 1"),
+    ],
+)
+def test_rows_that_are_no_wires(folder, tmp_path, change, message):
+    path, marks, row, _ = folder
+    (tmp_path / MESH).write_bytes((path / MESH).read_bytes())
+    write(tmp_path, marks, row | change)
+    with pytest.raises(ValueError, match=message) as caught:
+        bench_data.read(tmp_path)
+    assert "\n" not in str(caught.value)
+
+
+def test_folders_that_are_no_bench(folder, tmp_path):
+    path, marks, row, _ = folder
+    with pytest.raises(FileNotFoundError, match=r"no file .*phantom.stl; --data is"):
+        validation.validate_bench(tmp_path)
+    (tmp_path / MESH).write_bytes((path / MESH).read_bytes())
+    (tmp_path / WIRES).write_text("{")
+    with pytest.raises(ValueError, match=r"wires.json is no JSON: Expecting"):
+        bench_data.read(tmp_path)
+    (tmp_path / WIRES).write_text("{}")
+    with pytest.raises(ValueError, match="has no 'landmarks'"):
+        bench_data.read(tmp_path)
+    lacking = {key: value for key, value in row.items() if key != "tip_region"}
+    write(tmp_path, marks, lacking)
+    with pytest.raises(ValueError, match="wire 0 of wires.json lacks tip_region"):
+        bench_data.read(tmp_path)
+    write(tmp_path, marks, row | {"recommended": False})
+    with pytest.raises(ValueError, match="recommends none of its 1 wires"):
+        validation.validate_bench(tmp_path)
+
+
+def test_wires_that_fold_back_are_told():
+    angle = np.linspace(0.0, 1.2 * np.pi, 60)
+    bow = 0.01 * np.stack([1 - np.cos(angle), np.sin(angle), 0 * angle], axis=1)
+    straight = np.array([[0.0, y, 0.0] for y in np.linspace(-0.1, -1e-3, 50)])
+
+    def wire(points):
+        return Wire("w", "straight", "arch", True, points, np.array([0.0, 1.0, 0.0]))
+
+    assert wire(np.vstack([straight, bow])).folded
+    assert not wire(np.vstack([straight, bow[:30]])).folded
