@@ -112,6 +112,14 @@ def test_the_varied_protocol_has_distinct_conditions():
         drawn[3]["friction"] == varied.task_kwargs["randomisation"].draw(again).friction
     )
     (pair,) = protocols.parts(varied, "type1_lcca_pair", {}, 3, 0)
+    own = {"pool": 5, "first": 20, "arches": "test"}
+    for part in protocols.parts(varied, "arch_any", own, 20, 0):
+        found = [one["arch"] for one in part.conditions]
+        assert sorted(found) == sorted([*range(20, 25)] * 2)
+        first = np.random.RandomState(part.seeds[0])
+        assert first.randint(5) == found[0] - 20
+        drawn = varied.task_kwargs["randomisation"].draw(first)
+        assert drawn.friction == part.conditions[0]["friction"]
     assert "device" not in pair.task_kwargs
     with pytest.raises(ValueError, match="no protocol 'hard'; there are published, v"):
         play(policy="random", protocol="hard")

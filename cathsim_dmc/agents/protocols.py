@@ -9,6 +9,7 @@ import numpy as np
 from cathsim_dmc import suite
 from cathsim_dmc.entities import devices
 from cathsim_dmc.physics.randomisation import START_JITTER, Episode, Randomisation
+from cathsim_dmc.tasks.anatomies import POOL
 
 # Strata of each quantity, and candidates for each episode to fill them from.
 _STRATA, _CANDIDATES = 10, 20
@@ -103,21 +104,25 @@ def parts(
         task_kwargs: Options of the task, which the protocol changes.
         episodes: Number of episodes.
         seed: The seeds lie at or above it: one after the other without variation, and
-            otherwise those that fill every tenth of each range alike.
+            otherwise those that fill every tenth of each range alike and take the
+            arches of a pool in turn.
     """
     options = {**task_kwargs, **protocol.task_kwargs}
     ranges = Randomisation.make(options.get("randomisation", False))
     pools = _pools(protocol, task, options)
-    found = []
+    found, played = [], 0
     for number, own in enumerate(pools):
         count = len(range(number, episodes, len(pools)))
         if not count:
             continue
         first = seed + number * _CANDIDATES * episodes
         seeds = tuple(range(first, first + count))
+        arches = own.get("pool", POOL) if random_arch(task) else 1
         if protocol.task_kwargs:
-            seeds = stratified(ranges, count, first, random_arch(task))
-        found.append(Part(own, seeds, _conditions(ranges, seeds, task, own)))
+            wanted = [n % arches for n in range(played, played + count)]
+            seeds = stratified(ranges, wanted, first, arches)
+        played += count
+        found.append(Part(own, seeds, _conditions(ranges, seeds, arches, own)))
     return tuple(found)
 
 
@@ -137,74 +142,91 @@ def random_arch(task: str) -> bool:
     return task in suite.TASKS and suite.TASKS[task].random_arch
 
 
-def _drawn(ranges: Randomisation, seed: int, pool: bool) -> Episode:
-    """What an episode of that seed draws, after its anatomy."""
+def _drawn(ranges: Randomisation, seed: int, arches: int) -> tuple[int, Episode]:
+    """Number of the arch in its pool, and what else an episode of that seed draws."""
     source = np.random.RandomState(seed)
-    if pool:
-        source.randint(2)
-    return ranges.draw(source)
+    arch = int(source.randint(arches)) if arches > 1 else 0
+    return arch, ranges.draw(source)
 
 
 def _conditions(
-    ranges: Randomisation, seeds: Sequence[int], task: str, options: Mapping[str, Any]
+    ranges: Randomisation, seeds: Sequence[int], arches: int, options: Mapping[str, Any]
 ) -> tuple[Mapping[str, Any], ...]:
     if ranges == Randomisation():
         return ()
-    device = options.get("device")
-    drawn = [_drawn(ranges, seed, random_arch(task)) for seed in seeds]
-    return tuple(
-        {
-            "device": device,
-            **{
-                name: value.tolist() if isinstance(value, np.ndarray) else value
-                for name, value in dataclasses.asdict(one).items()
-                if value is not None
-            },
+    found = []
+    for seed in seeds:
+        arch, episode = _drawn(ranges, seed, arches)
+        where = {"arch": options.get("first", 0) + arch} if arches > 1 else {}
+        values = {
+            name: value.tolist() if isinstance(value, np.ndarray) else value
+            for name, value in dataclasses.asdict(episode).items()
+            if value is not None
         }
-        for one in drawn
-    )
+        found.append({"device": options.get("device"), **where, **values})
+    return tuple(found)
 
 
 def stratified(
-    ranges: Randomisation, count: int, seed: int, pool: bool
+    ranges: Randomisation, wanted: Sequence[int], seed: int, arches: int
 ) -> tuple[int, ...]:
     """Seeds whose draws fill every tenth of each range alike.
 
-    Of 20 candidates an episode, those are taken one after the other whose draws lie
-    where the fewest are.
+    For each episode in turn, that of 20 candidates is taken whose draws lie where the
+    fewest are.
 
     Args:
         ranges: What is drawn.
-        count: Number of seeds.
+        wanted: Number of the arch of each episode in its pool.
         seed: The candidates begin there.
-        pool: Whether an anatomy is drawn before.
+        arches: Number of arches in the pool; with more than one, a candidate is a seed
+            that draws the arch wanted.
 
     Returns:
-        Seeds (count,), ascending.
+        Seeds, in the order of `wanted`.
     """
-    candidates = np.arange(seed, seed + _CANDIDATES * count)
-    shares = np.array([_shares(ranges, int(c), pool) for c in candidates])
-    bins = np.minimum((shares * _STRATA).astype(int), _STRATA - 1)
-    columns = np.arange(bins.shape[1])
+    # Candidates of each arch, as many as its episodes may choose from.
+    left: dict[int, list[int]] = {arch: [] for arch in wanted}
+    short = {arch: _CANDIDATES * wanted.count(arch) for arch in left}
+    candidate = seed
+    while any(short.values()):
+        arch, _ = _drawn(Randomisation(), candidate, arches)
+        if short.get(arch):
+            left[arch].append(candidate)
+            short[arch] -= 1
+        candidate += 1
+    bins = {
+        candidate: _bins(ranges, candidate, arches)
+        for candidates in left.values()
+        for candidate in candidates
+    }
+    return _least_crowded(wanted, left, bins)
+
+
+def _least_crowded(
+    wanted: Sequence[int],
+    left: Mapping[int, list[int]],
+    bins: Mapping[int, np.ndarray],
+) -> tuple[int, ...]:
+    columns = np.arange(len(next(iter(bins.values()))))
     filled = np.zeros((len(columns), _STRATA), dtype=int)
-    free = np.ones(len(candidates), dtype=bool)
-    for _ in range(count):
-        crowd = (filled[columns, bins] ** 2).sum(axis=1)
-        chosen = int(np.where(free, crowd, np.iinfo(int).max).argmin())
-        free[chosen] = False
-        filled[columns, bins[chosen]] += 1
-    return tuple(candidates[~free].tolist())
+    chosen = []
+    for arch in wanted:
+        crowd = [(filled[columns, bins[c]] ** 2).sum() for c in left[arch]]
+        chosen.append(left[arch].pop(int(np.argmin(crowd))))
+        filled[columns, bins[chosen[-1]]] += 1
+    return tuple(chosen)
 
 
-def _shares(ranges: Randomisation, seed: int, pool: bool) -> list[float]:
-    """Where in their ranges the draws of a seed lie, from 0 to 1."""
-    episode, shares = _drawn(ranges, seed, pool), []
+def _bins(ranges: Randomisation, seed: int, arches: int) -> np.ndarray:
+    """Which tenths of their ranges the draws of a seed lie in."""
+    (_, episode), shares = _drawn(ranges, seed, arches), []
     for name in _STRATIFIED:
         chosen = getattr(ranges, name)
         if isinstance(chosen, Sequence) and chosen[1] > chosen[0]:
             drawn = getattr(episode, name.removeprefix("start_"))
             shares.append((drawn - chosen[0]) / (chosen[1] - chosen[0]))
-    return shares
+    return np.minimum((np.array(shares) * _STRATA).astype(int), _STRATA - 1)
 
 
 def distinct(task: str, task_kwargs: Mapping[str, Any]) -> bool:

@@ -1,0 +1,153 @@
+"""A policy under the varied protocol: held-out arches, phantoms, one change at a time.
+
+python benchmarks/robust.py pretrained:navigator --out runs/navigator.jsonl
+python benchmarks/robust.py expert --out runs/expert.jsonl --only anatomies
+
+Every cell is a line of the file as soon as it has been played; the same command goes on
+with those that are missing. docs/scripts/robust.py makes the tables of
+docs/robustness.md.
+"""
+
+import dataclasses
+import json
+import sys
+import time
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+
+from cathsim_dmc.agents import evaluation, protocols  # before dm_control  # isort: skip
+
+import judgement
+
+from cathsim_dmc.tasks.anatomies import load_anatomy
+
+GOALS = ("bca", "lcca", "lsa")
+ACCESSES = ("ascending", "descending")
+PHANTOMS = ("type1", "type2", "type3", "bovine")
+TEST_ARCHES = 98
+# What the device and the surroundings of one episode may differ in, one at a time.
+CHANGES = {
+    "none": {},
+    **{
+        name: {name: getattr(protocols.VARIED_RANGES, name)}
+        for name in (
+            *("friction", "stiffness", "loss", "viscosity", "roll", "delay"),
+            *("start_radius", "start_insertion", "tracking_noise"),
+        )
+    },
+    "goal": {"goal_shift": 5e-3},
+}
+Part = Literal["arches", "anatomies", "changes"]
+
+
+@dataclasses.dataclass(frozen=True)
+class Cell:
+    """Episodes that are counted together."""
+
+    part: str
+    labels: dict[str, str]
+    task: str
+    options: dict
+    episodes: int
+    protocol: str = "varied"
+
+
+def arches():
+    """Every held-out arch once, for each branch and access."""
+    for goal in GOALS:
+        for access in ACCESSES:
+            where = {"goal": goal, "access": access}
+            options = {**where, "arches": "test", "pool": TEST_ARCHES}
+            yield Cell("arches", where, "arch_any", options, TEST_ARCHES)
+
+
+def anatomies(names, episodes=20):
+    """Phantoms and imported anatomies, each branch from each access."""
+    for name in names:
+        goals = load_anatomy(name).goals
+        for goal in (goal for goal in GOALS if goal in goals):
+            for access in ACCESSES:
+                where = {"anatomy": name, "goal": goal, "access": access}
+                yield Cell("anatomies", where, "navigate", where, episodes)
+
+
+def changes(episodes=20):
+    """One change at a time on a phantom."""
+    where = {"anatomy": "type1", "goal": "lcca"}
+    for name, ranges in CHANGES.items():
+        options = {**where, "randomisation": ranges or False}
+        yield Cell("changes", {"change": name}, "navigate", options, episodes, "")
+    for name, options in (
+        ("device", {"device": "steerable_4f"}),
+        ("anatomy", {"anatomy": "type2"}),
+        ("time step", {"physics_timestep": 2e-3}),
+    ):
+        options = {**where, **options}
+        yield Cell("changes", {"change": name}, "navigate", options, episodes, "")
+
+
+def play(policy: str, cell: Cell) -> dict:
+    """The line of a cell."""
+    began = time.monotonic()
+    found = evaluation.evaluate(
+        policy,
+        cell.task,
+        cell.episodes,
+        protocol=cell.protocol or "published",
+        task_kwargs=cell.options,
+    )
+    summary = found.summary()
+    return {
+        "policy": policy,
+        "part": cell.part,
+        **cell.labels,
+        "episodes": cell.episodes,
+        "success": found.successes,
+        "safe": {
+            limit: round(rate * cell.episodes)
+            for limit, rate in summary["safe_success"].items()
+        },
+        "device": [drawn["device"] for drawn in found.conditions],
+        "arch": [drawn.get("arch") for drawn in found.conditions],
+        "figures": judgement.episode_figures(found),
+        "seconds": round(time.monotonic() - began, 1),
+        "date": time.strftime("%Y-%m-%d"),
+    }
+
+
+def main(
+    policy: Annotated[str, tyro.conf.Positional],
+    out: Path,
+    only: tuple[Part, ...] = ("arches", "anatomies", "changes"),
+    anatomy: tuple[str, ...] = PHANTOMS,
+) -> None:
+    """Play the cells that are missing in a file.
+
+    Args:
+        policy: Run, checkpoint, `pretrained:NAME` or a name of `cathsim eval`.
+        out: File with a line of JSON for each cell.
+        only: Parts to play.
+        anatomy: Names or directories of the anatomies of the part `anatomies`.
+    """
+    cells = {"arches": arches, "anatomies": lambda: anatomies(anatomy)}
+    cells["changes"] = changes
+    lines = out.read_text().splitlines() if out.exists() else []
+    done = [json.loads(line) for line in lines]
+    out.parent.mkdir(parents=True, exist_ok=True)
+    for cell in (cell for part in only for cell in cells[part]()):
+        key = {"policy": policy, "part": cell.part, **cell.labels}
+        if any(key.items() <= line.items() for line in done):
+            continue
+        line = play(policy, cell)
+        with out.open("a") as file:
+            file.write(json.dumps(line) + "\n")
+        print(key, line["success"], "of", cell.episodes, line["seconds"], "s")
+
+
+if __name__ == "__main__":
+    try:
+        tyro.cli(main)
+    except (ValueError, OSError) as error:
+        sys.exit(f"robust: {error}")
