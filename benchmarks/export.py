@@ -14,7 +14,7 @@ import judgement
 import tyro
 from safetensors.torch import save
 
-from cathsim_dmc import files
+from cathsim_dmc import files, suite
 from cathsim_dmc.agents import pretrained
 from cathsim_dmc.agents.checkpoint import Checkpoint
 from cathsim_dmc.analysis.force_statistics import millinewtons
@@ -70,6 +70,8 @@ def export(
             "seed": config.seed,
         }
     options = judgement.published_options(config.task_kwargs)
+    if suite.TASKS[config.task].random_arch:
+        options["arches"] = "test"
     label = f"{pretrained.PREFIX}{name}"
     found, _ = judgement.judge(policy, config.task, options, episodes, label)
     figures = judgement.episode_figures(found)

@@ -17,10 +17,8 @@ from typing import Annotated, Literal
 
 import tyro
 
-from cathsim_dmc.agents import evaluation, protocols  # before dm_control  # isort: skip
-
-import judgement
-
+from cathsim_dmc.agents import evaluation, protocols
+from cathsim_dmc.agents.evaluation import SAFE_FORCES
 from cathsim_dmc.tasks.anatomies import load_anatomy
 
 GOALS = ("bca", "lcca", "lsa")
@@ -98,23 +96,38 @@ def play(policy: str, cell: Cell) -> dict:
         protocol=cell.protocol or "published",
         task_kwargs=cell.options,
     )
-    summary = found.summary()
+    reached = found.values("success") > 0
+    sums = found.values("forces.peak_sum.maximum")
+    drawn = found.conditions or ({},) * cell.episodes
     return {
         "policy": policy,
         "part": cell.part,
         **cell.labels,
         "episodes": cell.episodes,
         "success": found.successes,
-        "safe": {
-            limit: round(rate * cell.episodes)
-            for limit, rate in summary["safe_success"].items()
-        },
-        "device": [drawn["device"] for drawn in found.conditions],
-        "arch": [drawn.get("arch") for drawn in found.conditions],
-        "figures": judgement.episode_figures(found),
+        "safe": [int((reached & (sums <= limit)).sum()) for limit in SAFE_FORCES],
+        "steps": round(float(found.values("length").mean()), 1),
+        "mean_force": round(float(found.values("forces.mean_force").mean()), 6),
+        "largest_sum": round(float(sums.max()), 4),
+        "by_device": _shares([one.get("device") for one in drawn], reached),
+        "missed_arches": [
+            one["arch"]
+            for one, good in zip(drawn, reached, strict=True)
+            if "arch" in one and not good
+        ],
         "seconds": round(time.monotonic() - began, 1),
         "date": time.strftime("%Y-%m-%d"),
     }
+
+
+def _shares(groups, reached):
+    """[successes, episodes] of each group."""
+    counts = {}
+    for group, good in zip(groups, reached, strict=True):
+        count = counts.setdefault(group or "default", [0, 0])
+        count[0] += int(good)
+        count[1] += 1
+    return counts
 
 
 def main(

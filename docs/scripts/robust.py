@@ -1,0 +1,148 @@
+"""The tables of docs/robustness.md from the lines that benchmarks/robust.py writes.
+
+    python docs/scripts/robust.py RUN.jsonl … [--keep]
+
+`--keep` puts the lines into docs/data/robust.jsonl first, in place of those that count
+the same; without files, the tables are made from what is there.
+"""
+
+import argparse
+import json
+import re
+from pathlib import Path
+
+from cathsim_dmc import files
+from cathsim_dmc.analysis.intervals import success_interval
+
+DOCS = Path(__file__).parents[1]
+DATA, PAGE = DOCS / "data" / "robust.jsonl", DOCS / "robustness.md"
+_FIGURES = "| safe, 0.5 N | steps | mean force, mN | largest sum, N |"
+_KEYS = ("policy", "part", "goal", "access", "anatomy", "change")
+
+
+def key(row):
+    return tuple(row.get(name) for name in _KEYS)
+
+
+def read(path):
+    return [json.loads(line) for line in path.read_text().splitlines()]
+
+
+def rate(successes, episodes):
+    """Success with its interval over distinct conditions, in percent."""
+    low, high = success_interval(successes, episodes)
+    share = 100 * successes / episodes
+    return f"{share:.0f} ({100 * low:.0f}–{100 * high:.0f}), {episodes}"
+
+
+def figures(rows):
+    """Cells of the columns of `_FIGURES` for rows that count together."""
+    count = sum(row["episodes"] for row in rows)
+    mean = {
+        name: sum(row[name] * row["episodes"] for row in rows) / count
+        for name in ("steps", "mean_force")
+    }
+    return (
+        f"{100 * sum(row['safe'][0] for row in rows) / count:.0f} "
+        f"| {mean['steps']:.0f} | {1e3 * mean['mean_force']:.1f} "
+        f"| {max(row['largest_sum'] for row in rows):.2f} |"
+    )
+
+
+def pooled(rows):
+    return rate(
+        sum(row["success"] for row in rows), sum(row["episodes"] for row in rows)
+    )
+
+
+def arches(rows):
+    """Held-out arches: a row for each policy, branch and access."""
+    lines = [
+        f"| policy | branch | access | success, % (95 %), arches {_FIGURES}",
+        "|---" * 8 + "|",
+    ]
+    for policy in sorted({row["policy"] for row in rows}):
+        own = [row for row in rows if row["policy"] == policy]
+        for row in own:
+            lines.append(
+                f"| `{policy}` | {row['goal'].upper()} | {row['access']} "
+                f"| {pooled([row])} | {figures([row])}"
+            )
+        lines.append(f"| `{policy}` | all | both | {pooled(own)} | {figures(own)}")
+    return lines
+
+
+def devices(rows):
+    """Success by device, over all cells of a policy."""
+    lines = ["| policy | device | success, % (95 %), episodes |", "|---|---|---|"]
+    for policy in sorted({row["policy"] for row in rows}):
+        counts = {}
+        for row in rows:
+            if row["policy"] == policy:
+                for name, (good, episodes) in row["by_device"].items():
+                    old = counts.get(name, (0, 0))
+                    counts[name] = old[0] + good, old[1] + episodes
+        lines += [f"| `{policy}` | `{n}` | {rate(*c)} |" for n, c in counts.items()]
+    return lines
+
+
+def anatomies(rows):
+    """Phantoms and scans: a row for each policy and anatomy, over branch and access."""
+    lines = [
+        f"| policy | anatomy | branches × accesses | success, % (95 %), episodes "
+        f"{_FIGURES}",
+        "|---" * 8 + "|",
+    ]
+    for policy, name in dict.fromkeys((row["policy"], row["anatomy"]) for row in rows):
+        own = [r for r in rows if (r["policy"], r["anatomy"]) == (policy, name)]
+        lines.append(
+            f"| `{policy}` | {name} | {len(own)} | {pooled(own)} | {figures(own)}"
+        )
+    return lines
+
+
+def changes(rows):
+    """One change at a time: success of each policy."""
+    names = list(dict.fromkeys(row["policy"] for row in rows))
+    lines = [
+        f"| change | {' | '.join(f'`{name}`' for name in names)} |",
+        "|---" * (1 + len(names)) + "|",
+    ]
+    for change in dict.fromkeys(row["change"] for row in rows):
+        own = {row["policy"]: row for row in rows if row["change"] == change}
+        cells = [
+            f"{own[n]['success']} of {own[n]['episodes']}" if n in own else "–"
+            for n in names
+        ]
+        lines.append(f"| {change.replace('_', ' ')} | {' | '.join(cells)} |")
+    return lines
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("runs", nargs="*", type=Path)
+    parser.add_argument("--keep", action="store_true")
+    options = parser.parse_args()
+    rows = {key(row): row for row in (read(DATA) if DATA.exists() else [])}
+    for path in options.runs:
+        rows |= {key(row): row for row in read(path)}
+    if options.keep:
+        lines = (json.dumps(row) for row in rows.values())
+        files.write_text(DATA, "\n".join(lines) + "\n")
+    page = PAGE.read_text()
+    makers = {"arches": arches, "anatomies": anatomies, "changes": changes}
+    found = {
+        name: make([row for row in rows.values() if row["part"] == name])
+        for name, make in makers.items()
+    }
+    varied = [row for row in rows.values() if row["part"] != "changes"]
+    found["devices"] = devices(varied)
+    for name, lines in found.items():
+        block = "\n".join([f"<!-- {name} -->", *lines, f"<!-- end of {name} -->"])
+        pattern = f"<!-- {name} -->.*<!-- end of {name} -->"
+        page = re.sub(pattern, lambda _, b=block: b, page, flags=re.S)
+    files.write_text(PAGE, page)
+
+
+if __name__ == "__main__":
+    main()
