@@ -14,7 +14,7 @@ from cathsim_dmc.anatomy.parts import Surface
 from cathsim_dmc.anatomy.scan.lumen import read_lumen
 from cathsim_dmc.anatomy.scan.mesh import read_triangles
 from cathsim_dmc.anatomy.scan.repair import mend
-from cathsim_dmc.anatomy.scan.topology import decimated, edge_counts
+from cathsim_dmc.anatomy.scan.topology import decimated, edge_counts, handles
 from cathsim_dmc.anatomy.scan.units import upright
 
 DATA = Path(__file__).parent / "data"
@@ -107,6 +107,13 @@ def test_a_wrong_unit_is_refused_and_the_right_one_named(y_mesh, tmp_path):
         read_lumen(path, units="m")
     with pytest.raises(ValueError, match="one of mm, cm, m"):
         read_lumen(path, units="inch")
+
+
+def test_a_given_unit_overrules_the_estimate(y_mesh, tmp_path):
+    vertices, faces = y_mesh
+    path = write_obj(tmp_path / "small.obj", vertices * 0.15, faces)
+    lumen = read_lumen(path, units="mm")
+    assert lumen.units == "mm" and said(lumen, "pass units='cm'")
 
 
 def test_far_too_many_triangles_are_refused_unread(tmp_path, monkeypatch):
@@ -294,6 +301,11 @@ def test_a_small_tangle_between_large_triangles_is_mended():
     assert len(surface.faces) == len(tube.faces)
     assert surface.volume == pytest.approx(tube.volume)
     assert any("self-intersecting" in note for note in notes)
+
+
+def test_handles_of_a_surface_are_counted():
+    assert handles(trimesh.creation.box().faces) == 0
+    assert handles(trimesh.creation.torus(3.0, 1.0).faces) == 1
 
 
 def test_folds_that_noise_makes_in_a_coarse_surface_are_smoothed():

@@ -70,7 +70,15 @@ def lumen_checks(anatomy: Anatomy) -> list[Check]:
         )
         > radius
     ]
+    handles = Check.at_most(
+        f"{name}: handles of the surface",
+        topology.handles(faces),
+        0,
+        "",
+        "tubes that touch beyond the place where they part",
+    )
     return [
+        *([] if anatomy.scanned else [handles]),  # scans have rings of vessels
         Check.at_most(
             f"{name}: edges of the surface without two triangles",
             loose,

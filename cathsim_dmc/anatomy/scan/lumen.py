@@ -84,7 +84,7 @@ def read_lumen(
         raise ValueError(
             f"{path} is {size:.3g} m across when its unit is {units!r}, which no "
             f"vessel tree is (allowed {SIZE[0]:g} to {SIZE[1]:g} m). Check the unit in "
-            "which the mesh was exported."
+            f"which the mesh was exported ({why})."
         )
     surface, changed = mend(str(path), vertices, faces)
     return Lumen(surface, units, (why, *changed))

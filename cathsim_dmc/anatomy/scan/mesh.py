@@ -115,8 +115,7 @@ def guess_units(
         units: as given by the user, or None to guess.
 
     Raises:
-        ValueError: if the lumen has no plausible width in any unit, or not in the
-            given one; says in which it would.
+        ValueError: if none is given and the lumen has no plausible width in any.
     """
     width = typical_radius(vertices, faces)
     fits = [u for u, s in UNITS.items() if WIDTH[0] <= width * s <= WIDTH[1]]
@@ -136,10 +135,10 @@ def guess_units(
         )
     if units not in fits:
         better = f"pass units={' or '.join(map(repr, fits))}" if fits else "check it"
-        raise ValueError(
-            f"the widest lumen is {width * UNITS[units] * 2e3:.3g} mm wide when the "
-            f"unit is {units!r} (allowed {WIDTH[0] * 2e3:g} to {WIDTH[1] * 2e3:g} mm); "
-            f"{better}."
+        return units, (
+            f"unit: {units}, as given, which makes the widest lumen "
+            f"{width * UNITS[units] * 2e3:.3g} mm wide ({WIDTH[0] * 2e3:g} to "
+            f"{WIDTH[1] * 2e3:g} mm are usual); if that is wrong, {better}"
         )
     return units, f"unit: {units}, as given"
 

@@ -151,6 +151,7 @@ def name_branches(
         notes.append(_question(share, seen, heart_last, names))
     for label, one in forked:
         own = " and ".join(sorted(names[i] for i in one.curves))
+        label = "trunk of bca and lcca" if label == "bovine" else label
         notes.append(
             f"question: the {label} that leaves the arch at {_mm(one.place)} leads to "
             f"{own}: which is which? Name them (--rename)"

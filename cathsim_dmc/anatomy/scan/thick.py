@@ -4,7 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 
-from cathsim_dmc.anatomy.scan.topology import adjacent, areas, edge_counts, groups
+from cathsim_dmc.anatomy.scan.topology import (
+    adjacent,
+    areas,
+    edge_counts,
+    groups,
+    handles,
+)
 
 RAYS = 64
 ENCLOSED = 0.75  # share of rays that hit: the place is inside a vessel
@@ -43,9 +49,7 @@ def lumen_of_wall(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray | None:
     """
     import igl
 
-    edges, times = edge_counts(faces)
-    handles = 1 - (len(np.unique(faces)) - len(edges) + len(faces)) // 2
-    if (times != 2).any() or handles < 1:
+    if (edge_counts(faces)[1] != 2).any() or handles(faces) < 1:
         return None  # open, or without a hole through it
     area = areas(vertices, faces)
     outward = igl.per_face_normals(vertices, faces, np.zeros(3))

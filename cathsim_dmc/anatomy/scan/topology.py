@@ -47,6 +47,12 @@ def edge_counts(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return np.unique(edges, axis=0, return_counts=True)
 
 
+def handles(faces: np.ndarray) -> int:
+    """Handles of a closed surface in one part, by its Euler characteristic."""
+    edges = len(edge_counts(faces)[0])
+    return 1 - (len(np.unique(faces)) - edges + len(faces)) // 2
+
+
 def parts(faces: np.ndarray) -> np.ndarray:
     """Number (F,) of the connected part that each triangle belongs to, from 0."""
     import igl
