@@ -7,6 +7,7 @@ import pytest
 import trimesh
 
 from cathsim_dmc import validation
+from cathsim_dmc.entities.arena import BLOOD_DENSITY, GRAVITY
 from cathsim_dmc.validation import bench, bench_data
 from cathsim_dmc.validation.bench_data import MESH, WIRES, Wire
 from cathsim_dmc.validation.bench_rig import Held
@@ -152,3 +153,17 @@ def test_wires_that_fold_back_are_told():
 
     assert wire(np.vstack([straight, bow])).folded
     assert not wire(np.vstack([straight, bow[:30]])).folded
+
+
+def test_a_wire_has_its_weight_in_blood(folder):
+    path, _, _, lumen = folder
+    experiment = bench.Experiment(bench_data.read(path))
+    wire = experiment.bench.wires[0]
+    rig = Held(experiment.setting(wire, down="left"), lumen, wire)._rig
+    weight = rig.model.body_mass.sum() * rig.model.opt.gravity / rig.lengths.sum()
+    device = bench.DEVICES["straight"]
+    displaced = BLOOD_DENSITY * np.pi * device.outer_radius**2
+    expected = GRAVITY * (device.linear_density - displaced)
+    # The device lies along +z of its frame, across gravity.
+    np.testing.assert_allclose(np.linalg.norm(weight), expected, rtol=0.01)
+    assert abs(weight[2]) < 1e-9

@@ -13,7 +13,6 @@ import numpy as np
 from cathsim_dmc.anatomy.field import Field
 from cathsim_dmc.anatomy.scan.ways import Ways
 from cathsim_dmc.anatomy.surface_depth import SurfaceDepth
-from cathsim_dmc.entities.arena import GRAVITY
 from cathsim_dmc.entities.contact import FRICTION
 from cathsim_dmc.entities.device import Arc, Device, Section
 from cathsim_dmc.entities.devices import METAL_LOSS, METAL_POISSON_RATIO, WIRE_035_GLIDE
@@ -79,14 +78,10 @@ class Experiment:
         return self._fields[scale]
 
     def setting(self, wire: Wire, down: str = DOWN, **changes: Any) -> Setting:
-        """The device of a wire on the bench; gravity as in water."""
+        """The device of a wire on the bench, with changes of the setting."""
         device = changes.pop("device", DEVICES)[wire.kind]
-        buoyant = 1.0 - 1000.0 * math.pi * device.outer_radius**2 / max(
-            device.linear_density, 1e-9
-        )
-        gravity = GRAVITY * max(buoyant, 0.0) * self.bench.down[down]
-        x, y, z = gravity.tolist()
-        return Setting(device, changes.pop("friction", FRICTION), (x, y, z), **changes)
+        friction = changes.pop("friction", FRICTION)
+        return Setting(device, friction, self.bench.down[down], **changes)
 
     def compare(
         self,

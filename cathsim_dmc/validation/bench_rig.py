@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 from cathsim_dmc.anatomy.field import Field
 from cathsim_dmc.anatomy.parts import Surface
 from cathsim_dmc.collision import fields
+from cathsim_dmc.entities.arena import BLOOD_DENSITY, GRAVITY
 from cathsim_dmc.entities.chain import MAX_PUSH_SPEED
 from cathsim_dmc.entities.contact import wall_contact
 from cathsim_dmc.entities.device import Device
@@ -33,13 +34,13 @@ class Setting:
     Attributes:
         device: the wire.
         friction: Coulomb coefficient.
-        gravity: (3,) m/s², frame of the mesh, buoyancy taken off.
+        down: (3,) direction of gravity, frame of the mesh; 0 for none.
         overshoot: by which the wire is pushed too far and pulled back, m.
     """
 
     device: Device
     friction: float
-    gravity: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    down: np.ndarray
     overshoot: float = 0.0
 
 
@@ -95,7 +96,8 @@ class Held:
         self._frame = frame @ Rotation.from_euler("z", turn).as_matrix()
         self._entry = wire.points[0]
         root = rig.arena.mjcf_model
-        root.option.gravity = np.asarray(setting.gravity) @ self._frame
+        buoyancy = BLOOD_DENSITY / rig.catheter.density
+        root.option.gravity = GRAVITY * (1.0 - buoyancy) * setting.down @ self._frame
         rig.arena.attach(
             Sheath(straight(float(rig.lengths.sum())), device.outer_radius)
         )
