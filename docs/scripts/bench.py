@@ -1,0 +1,86 @@
+"""Compares simulated guidewires with measured ones and rewrites docs/bench.md.
+
+``python docs/scripts/bench.py DIRECTORY [REPORT]``
+
+REPORT is the object that ``cathsim validate bench --data DIRECTORY --json`` prints;
+without it the comparison is run, which takes minutes. Only statistics are written: the
+measured data may not be redistributed.
+"""
+
+import datetime
+import json
+import sys
+from pathlib import Path
+
+import numpy as np
+import validation as pages
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+from cathsim_dmc import files, style
+from cathsim_dmc.validation import Check, Report, bench
+
+PAGE = pages.DOCS / "bench.md"
+FIGURE = pages.IMAGES / "validation_bench.png"
+SHOWN = (*bench.WAYS, "centreline", "nearest")
+
+
+def main(folder, report=None):
+    if report:
+        found = json.loads(Path(report).read_text(encoding="utf-8"))
+        checks = [Check(**check) for check in found["checks"]]
+        measured = Report(found["title"], checks, found["findings"])
+    else:
+        measured = bench.validate_bench(folder, say=print)
+    text = PAGE.read_text(encoding="utf-8")
+    tables = list(bench.tables(measured).items())
+    for name, (title, rows) in zip(("frames", "sensitivity"), tables, strict=True):
+        text = pages.between(text, name, f"{title}:\n\n{markdown(rows)}")
+    text = pages.between(text, "checks", pages.checks(measured))
+    day = datetime.date.today().isoformat()
+    text = pages.between(text, "when", f"Measured on {day}.\n")
+    files.write_text(PAGE, text)
+    style.save(figure(measured.findings["frames"]), FIGURE)
+
+
+def markdown(rows):
+    header, *rest = rows
+    lines = [header, ["---"] * len(header), *rest]
+    return "".join(f"| {' | '.join(line)} |\n" for line in lines)
+
+
+def figure(rows):
+    """RMS distance of every frame, by way and baseline."""
+    figure = Figure(figsize=(9.2, 4.2), layout="constrained")
+    FigureCanvasAgg(figure)
+    rows = sorted(rows, key=lambda row: (row["folded"], row["wire"], row["frame"]))
+    ax = figure.subplots()
+    style.tidy(ax)
+    places = np.arange(len(rows))
+    for index, name in enumerate(SHOWN):
+        values = [row[name]["rms"] for row in rows]
+        marker = "o" if name in bench.WAYS else "_"
+        ax.plot(
+            places + 0.1 * (index - 2),
+            values,
+            marker,
+            markersize=6 if marker == "o" else 12,
+            markeredgewidth=1 if marker == "o" else 2,
+            color=style.COLOURS[index],
+            label=name,
+        )
+    ax.set_yscale("log")
+    ax.set_yticks([0.5, 1, 2, 5, 10, 20], ["0.5", "1", "2", "5", "10", "20"])
+    ax.minorticks_off()
+    labels = [
+        f"{row['frame']}\n{row['vessel']}{', folded' if row['folded'] else ''}"
+        for row in rows
+    ]
+    ax.set_xticks(places, labels, rotation=60, ha="right", fontsize=7)
+    ax.set_ylabel("RMS distance from the measured wire, mm")
+    ax.legend(ncols=len(SHOWN), loc="lower center", bbox_to_anchor=(0.5, 1.0))
+    return figure
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])
