@@ -16,12 +16,13 @@ from cathsim_dmc.agents.evaluation import evaluate
 from cathsim_dmc.simulation.batch import BatchSimulation
 
 PAGE = Path(__file__).parents[1] / "vessel.md"
+HEART, BREATH = {"phase": (0, 1)}, {"breath_phase": (0, 1)}
 CASES = {
     "rigid": "rigid",
-    "flow": {"flow": True},
+    "flow": {"flow": HEART},
     "wall": {"wall": True},
-    "motion": {"motion": True},
-    "living": "living",
+    "motion": {"motion": HEART | BREATH},
+    "living": {"flow": HEART, "wall": True, "motion": BREATH},
 }
 POLICIES = (
     ("expert", "type1_lcca"),
