@@ -1,10 +1,12 @@
 """A moving vessel: where its wall is, what it carries, what is judged in it."""
 
+import mujoco
 import numpy as np
 import pytest
 
 from cathsim_dmc import suite
 from cathsim_dmc.anatomy import phantoms
+from cathsim_dmc.collision import fields
 from cathsim_dmc.physics.vessel import VesselOptions
 from cathsim_dmc.simulation.batch import BatchSimulation
 from cathsim_dmc.validation import motion, vessel
@@ -71,3 +73,27 @@ def test_goal_and_head_are_judged_in_the_vessel_at_rest():
     resting = np.linalg.norm(rollout.resting.head - rollout.objective.goal, axis=-1)
     np.testing.assert_allclose(step.distance, resting)
     np.testing.assert_allclose(step.info()["breath_phase"], 0.5, atol=1e-9)
+
+
+def test_a_wall_that_moves_past_the_sheath_does_not_touch_what_is_in_it(tube):
+    moving = motion.rigid_motion(tube, np.array([1.0, 0.0, 0.0]))
+    spec = motion.stirred(tube.lumen, moving.lattice)
+    beside = motion.RADIUS + 6e-3  # of which the wall moves 5.5 mm
+    line = np.array([[beside, 0.0, -0.05], [beside, 0.0, 0.0]])
+    bore = fields.carrier(fields.Bore(line, 2e-3))
+    box, ball = mujoco.mjtGeom.mjGEOM_BOX, mujoco.mjtGeom.mjGEOM_SPHERE
+    spec.worldbody.add_geom(
+        type=box, pos=bore["pos"], size=bore["size"], userdata=bore["user"]
+    )
+    body = spec.worldbody.add_body(pos=(beside, 0.0, -1e-3))
+    body.add_freejoint()
+    body.add_geom(type=ball, size=(5e-4, 0, 0))
+    model, found = spec.compile(), []
+    for sheath in (-1, 1):
+        course = motion.parameters(5.5e-3, 0.0, 0.0)
+        course[10] = sheath
+        data = motion.begin(model, course)
+        data.time = 1.35
+        mujoco.mj_fwdPosition(model, data)
+        found.append(data.ncon)
+    assert found == [1, 0]

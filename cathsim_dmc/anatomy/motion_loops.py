@@ -2,7 +2,8 @@
 
 Parameters of a motion are numbers, one simulation's: `MARK`, the amplitudes of heart
 and breathing and the distensibility; rate (1/s) and phase of the heart, pulse wave
-velocity (m/s), rate (1/s) and phase of breathing; and the number of the wall's geom.
+velocity (m/s), rate (1/s) and phase of breathing; and the numbers of the geoms that
+carry the wall and the bore of the sheath, -1 for none.
 """
 
 import math
@@ -12,7 +13,7 @@ import numpy as np
 from cathsim_dmc.anatomy.circulation import BEAT
 from cathsim_dmc.compiled import compiled
 
-PARAMETERS, MARK = 10, 2947.0
+PARAMETERS, MARK = 11, 2947.0
 # Of the head of a lattice: origin (3) m, step m, shape (3); then its values.
 HEAD = 7
 # Values at a point: displacement by the heart (3) and by breathing (3) at amplitude 1,

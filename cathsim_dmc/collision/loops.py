@@ -486,6 +486,19 @@ def motion_of(table, model, data):
 
 
 @compiled
+def sheathed(table, model, data, geom, place):
+    """Whether a place (3) is in the box of a geom, that of the sheath's bore."""
+    if geom < 0:
+        return False
+    centre = numbers(word(data + word(table + GEOM_XPOS)) + 24 * geom, 3)
+    frame = numbers(word(data + word(table + GEOM_XMAT)) + 72 * geom, 9)
+    size = numbers(word(model + word(table + GEOM_SIZE)) + 24 * geom, 3)
+    apart = (place[0] - centre[0], place[1] - centre[1], place[2] - centre[2])
+    x, y, z = into(frame, apart)
+    return abs(x) < size[0] and abs(y) < size[1] and abs(z) < size[2]
+
+
+@compiled
 def collide(model, data, contacts, geom1, geom2, margin, before):
     """Contacts of a capsule or a sphere with a box, which may carry a field.
 
@@ -525,6 +538,10 @@ def collide(model, data, contacts, geom1, geom2, margin, before):
     if space != 0:
         time = numbers(data + word(table + TIME), 1)[0]
         lattice, course = numbers(motion, _COUNT), numbers(space, _COUNT)
+        # The sheath lies where it does, whatever moves past it.
+        if sheathed(table, model, data, int(course[10]), centre):
+            if clearance(entry, local[0], local[1], local[2]) >= FREE:
+                return np.int32(0)
         scratch = np.empty(WARP + 4 * VALUES)
         there, values = scratch[:WARP], scratch[WARP:].reshape(VALUES, 4)
         warp(lattice, course, time, local[0], local[1], local[2], values, there)

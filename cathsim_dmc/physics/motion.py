@@ -111,7 +111,9 @@ class Moving(Effect):
 
         super().bind(world)
         carrying.install()
-        self._wall = mujoco.mj_name2id(world.model, mujoco.mjtObj.mjOBJ_GEOM, "wall")
+        kind = mujoco.mjtObj.mjOBJ_GEOM
+        names = "wall", "sheath/bore"
+        self._geoms = [mujoco.mj_name2id(world.model, kind, name) for name in names]
         self._motions: dict[int, Motion] = {}
         self._clock = np.zeros(world.num_simulations)
         self._step = world.model.opt.timestep
@@ -133,7 +135,11 @@ class Moving(Effect):
         values["breath_rate"] /= 60.0
         if self.flow is not None:
             values |= self.flow.heart(index)
-        self.world.parameters[index] = (self._loops.MARK, *values.values(), self._wall)
+        self.world.parameters[index] = (
+            self._loops.MARK,
+            *values.values(),
+            *self._geoms,
+        )
         self._clock[index] = 0.0
 
     @property
@@ -155,7 +161,7 @@ class Moving(Effect):
 
     def phases(self) -> tuple[np.ndarray, np.ndarray]:
         """Phases (N,), (N,) of heart and breathing, 0 to 1."""
-        _, _, _, _, rate, phase, _, breath, begin, _ = self.world.parameters.T
+        _, _, _, _, rate, phase, _, breath, begin, *_ = self.world.parameters.T
         return (rate * self._clock + phase) % 1.0, (breath * self._clock + begin) % 1.0
 
     def at_rest(self, state: Readings) -> Readings:

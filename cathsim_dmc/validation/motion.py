@@ -32,7 +32,8 @@ def parameters(heart: float, breathing: float, soft: float) -> np.ndarray:
     """Parameters of a motion at 60 beats and 15 breaths a minute, of geom 0."""
     from cathsim_dmc.anatomy.motion_loops import MARK
 
-    return np.array([MARK, heart, breathing, soft, 1.0, 0.0, 4.6, 0.25, 0.0, 0.0])
+    course = [heart, breathing, soft, 1.0, 0.0, 4.6, 0.25, 0.0]
+    return np.array([MARK, *course, 0.0, -1.0])
 
 
 def stirred(lumen, lattice: np.ndarray, friction: float = 0.0) -> mujoco.MjSpec:
