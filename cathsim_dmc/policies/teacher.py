@@ -60,7 +60,7 @@ class Teacher:
         Returns:
             (N, A) in [-1, 1].
         """
-        readings, wall_force = self._view.readings, self._view.wall_force
+        readings, wall_force = self._view.resting, self._view.wall_force
         action = np.empty((self._view.num_simulations, self._view.num_actions))
         for case, plan in self._plans.items():
             rows = np.array([i for i, one in enumerate(self._cases) if one is case])
