@@ -63,7 +63,8 @@ class Arch:
                     f"give the inlet instead of the heart. Its ends are {listed(ends)}."
                 )
             return None
-        first, last = (ends[k] for k in pair)
+        # The wider end is more often at the heart; then all is computed once.
+        first, last = sorted((ends[k] for k in pair), key=lambda end: end.radius)
         odds: float | None = None
         if heart is not None:
             gaps = [np.linalg.norm(end.position - heart) for end in (first, last)]
