@@ -139,6 +139,13 @@ def test_a_bovine_arch_has_its_fork(bend):
     assert named(bend, BOVINE, LSA)[0] == ["bca", "lcca", "lsa"]
 
 
+def test_what_parts_from_the_left_carotid_of_a_bovine_arch_is_the_bca(bend):
+    """Too steep and narrow for a sure BCA, too short for a right carotid."""
+    stem = [(-20, 0, 57)]
+    steep = (6.4, (3.9, [*stem, (-24, 0, 95)]), (3.6, [*stem, (2, 0, 95)]))
+    assert named(bend, steep, LSA)[0] == ["bca", "lcca", "lsa"]
+
+
 def test_a_fork_far_up_is_no_bovine_arch(bend):
     names, notes = named(bend, NECK, LSA)
     assert "lcca" not in names

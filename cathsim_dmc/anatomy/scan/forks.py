@@ -89,6 +89,11 @@ def leads(
         name = max(by, key=lambda key: by[key])
         if sure * by[name] >= SURE and name != "extra":
             names[number], surety[number] = name, sure * by[name]
+    numbers = [one.curves[row] for row in kept]
+    if label == "bovine" and len(rows) == 2 and list(names.values()) == ["lcca"]:
+        # What parts from the left carotid begins as the brachiocephalic artery.
+        (other,) = set(numbers) - set(names)
+        names[other], surety[other] = "bca", surety[numbers[1 - numbers.index(other)]]
     return names, surety
 
 
