@@ -224,6 +224,49 @@ def test_a_light_link_pressed_into_a_hollow_comes_to_rest(tube):
     assert max(speeds[-50:]) < 1e-3
 
 
+def test_a_link_that_hangs_over_a_ledge_touches_its_edge():
+    """It lies flat on the wall from its joint on, a few micrometres deeper there."""
+
+    def ledge(blocks, points):
+        apart = (blocks[:, None, :] + points)[..., [0, 2]]
+        outside = np.linalg.norm(np.maximum(apart, 0.0), axis=-1)
+        return outside + np.minimum(apart.max(axis=-1), 0.0)
+
+    field = Field.sampled(ledge, np.full(3, -0.02), np.full(3, 0.02))
+    lying = chain((-11e-3, 0, DEVICE - 0.04e-3 + 10e-6))
+    lying = lying.replace("<body", '<body euler="0 90.05 0"', 1)
+    found = contacts_of(carrier(field) + lying)
+    assert found.pos[:, 0].max() == pytest.approx(0.0, abs=1e-3)
+
+
+def test_an_end_in_a_dead_end_is_held_by_its_bottom_and_by_its_sides():
+    width = DEVICE + 0.01e-3
+
+    def pocket(blocks, points):
+        places = blocks[:, None, :] + points
+        apart = np.stack([np.abs(places[..., 0]) - width, -places[..., 2]], axis=-1)
+        outside = np.linalg.norm(np.maximum(apart, 0.0), axis=-1)
+        return -(outside + np.minimum(apart.max(axis=-1), 0.0))
+
+    field = Field.sampled(pocket, np.full(3, -0.02), np.full(3, 0.02))
+    end = (0, 0, HALF + DEVICE - 0.07e-3)
+    found = contacts_of(carrier(field) + capsule(end))
+    assert -0.12e-3 < found.dist.min() < -0.05e-3
+    assert found.frame[:, 2].min() < -0.9
+    assert found.frame[:, 0].min() < -0.5 and found.frame[:, 0].max() > 0.5
+
+
+def test_an_impact_is_met_a_physics_step_ahead(tube):
+    """At 0.4 m/s, 1.6 mm in a step of 4 ms, it came to lie 0.6 mm deep."""
+    model, data = compiled(carrier(tube) + capsule((0, 0, 30e-3)))
+    data.qpos[0], data.qvel[0] = RADIUS - DEVICE - 1e-3, 0.4
+    depth = []
+    for _ in range(10):
+        mujoco.mj_step(model, data)
+        depth.append(-data.contact.dist.min(initial=0.0))
+    assert max(depth) < 0.2e-3
+
+
 def rolling(field):
     """A small scene that moves: capsules that fall in the tube."""
     bodies = "".join(

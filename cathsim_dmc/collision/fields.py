@@ -82,6 +82,11 @@ class _Table:
         self._words[:5] = native.offsets("mjModel", model)
         data = ("geom_xpos", "geom_xmat", "xpos")
         self._words[5:8] = native.offsets("mjData", data)
+        moving = ("body_dofadr", "body_dofnum", "body_rootid", "dof_parentid")
+        moving += ("opt.timestep",)
+        self._words[16:21] = native.offsets("mjModel", moving)
+        velocity = ("qvel", "cdof", "subtree_com")
+        self._words[21:24] = native.offsets("mjData", velocity)
         solimp = native.offsets("mjModel", ("geom_solimp",))
         self._words[loops.GEOM_SOLIMP // 8] = solimp[0]
         nuserdata = native.offsets("mjModel", ("nuserdata",))

@@ -41,8 +41,16 @@ from cathsim_dmc.compiled import compiled
     NUSERDATA,
     USERDATA,
     TIME,
-) = range(0, 128, 8)
-HEAD = 16  # words
+    BODY_DOFADR,
+    BODY_DOFNUM,
+    BODY_ROOTID,
+    DOF_PARENTID,
+    TIMESTEP,
+    QVEL,
+    CDOF,
+    SUBTREE_COM,
+) = range(0, 192, 8)
+HEAD = 24  # words
 # An entry: key, kind, addresses of the place of the carrier's middle in the field's
 # frame, of head, coarse lattice, index and samples, and of the lattice of its motion.
 ENTRY, CAPACITY = 8, 1 << 14
@@ -64,8 +72,11 @@ _FLAT = 2e-6
 _BISECTIONS = 6
 _ASIDE = 0.4e-3  # m, to both sides, from where the planes of a hollow wall are taken
 _MOST = 4  # contacts of a capsule and a box; more are fatal
+_HEAD_ON = 0.1  # sine between a capsule and the normal
 _HOLLOW = 5e-6  # m, least distance of their edge from the wall
 _CORNER = -0.3  # slope of the clearance beside a place in a corner
+_STEEP = 0.5  # cosine between a wall of a corner and the normal, least to share a load
+_ROOM = 1e-4  # m, a link that touches one wall of a corner is held by others so close
 _STEP = 0.25e-3  # m, to both sides, over which the wall's normal is taken
 _FAR = 1e-3  # m, by which the coarse lattice may be wrong far from the wall
 _COUNT = 1 << 40  # more than any array has; nothing checks it
@@ -78,6 +89,8 @@ SOFT = 0.7
 # any lets the light tip jump by most of a millimetre.
 _TOUCH = 2e-5
 _AT_WALL = -1e-9  # m, the depth of a link so close
+# So is a link that would be so deep, m, at the end of the physics step: it hits.
+_IMPACT = 1e-4
 # In a moving vessel a capsule is looked for by its straight image at rest, which is off
 # by so much, m, and by the strain of space; its contacts are looked up exactly.
 _IMAGE, _STRAIN = 0.2e-3, 1.7
@@ -144,6 +157,22 @@ def clearance(entry, x, y, z):
 
 
 @compiled
+def length(way):
+    """Length of a vector (3)."""
+    return math.sqrt(way[0] ** 2 + way[1] ** 2 + way[2] ** 2)
+
+
+@compiled
+def across(one, other):
+    """Cross product (3) of two vectors."""
+    return (
+        one[1] * other[2] - one[2] * other[1],
+        one[2] * other[0] - one[0] * other[2],
+        one[0] * other[1] - one[1] * other[0],
+    )
+
+
+@compiled
 def away(entry, x, y, z):
     """Unit vector (3) away from the wall; zeros where there is none."""
     head = numbers(word(entry + 24), _COUNT)
@@ -154,10 +183,10 @@ def away(entry, x, y, z):
         index = wholes(word(entry + 40), _COUNT)
         samples = shorts(word(entry + 48), _COUNT)
         way = gradient_at(head, coarse, index, samples, x, y, z, _STEP)
-    length = math.sqrt(way[0] ** 2 + way[1] ** 2 + way[2] ** 2)
-    if length < 1e-12:
+    norm = length(way)
+    if norm < 1e-12:
         return (0.0, 0.0, 0.0)
-    return (way[0] / length, way[1] / length, way[2] / length)
+    return (way[0] / norm, way[1] / norm, way[2] / norm)
 
 
 @compiled
@@ -327,6 +356,7 @@ def touches(entry, centre, axis, half, closed, limit):
     if least > limit + step:
         return NONE
     found, first, low, second, lower = NONE
+    deepest = np.argmin(values)
     for i in range(count):
         value, t = values[i], -half + i * step
         at_end, open_end = i == 0 or i == count - 1, False
@@ -337,7 +367,7 @@ def touches(entry, centre, axis, half, closed, limit):
             open_end = not closed[0 if i == 0 else 1]
         elif not (value <= values[i - 1] and value < values[i + 1]):
             continue
-        elif not dented(values, count, i, closed):
+        elif i != deepest and not dented(values, count, i, closed):
             continue
         if value > limit + step:
             continue
@@ -372,21 +402,18 @@ def tangents(entry, place, axis, normal, depth, limit, turns, rows):
     is then two planes that touch it to both sides: the field made linear there. The
     last two of 6 rows are scratch.
     """
-    found = 0
+    found, least = 0, np.inf
     for turn in range(turns):
-        bx = axis[1] * normal[2] - axis[2] * normal[1]
-        by = axis[2] * normal[0] - axis[0] * normal[2]
-        bz = axis[0] * normal[1] - axis[1] * normal[0]
+        bx, by, bz = across(axis, normal)
+        if length((bx, by, bz)) < _HEAD_ON:
+            # An end that stands on the wall: any direction along the wall will do.
+            bx, by, bz = across((1.0, 0.0, 0.0), normal)
+            if abs(normal[0]) > 0.7:
+                bx, by, bz = across((0.0, 1.0, 0.0), normal)
         if turn:
-            bx, by, bz = (
-                normal[1] * bz - normal[2] * by,
-                normal[2] * bx - normal[0] * bz,
-                normal[0] * by - normal[1] * bx,
-            )
-        length = math.sqrt(bx * bx + by * by + bz * bz)
-        if length < 0.1:
-            continue
-        bx, by, bz = bx / length, by / length, bz / length
+            bx, by, bz = across(normal, (bx, by, bz))
+        norm = length((bx, by, bz))
+        bx, by, bz = bx / norm, by / norm, bz / norm
         dx, dy, dz = _ASIDE * bx, _ASIDE * by, _ASIDE * bz
         low = clearance(entry, place[0] - dx, place[1] - dy, place[2] - dz)
         high = clearance(entry, place[0] + dx, place[1] + dy, place[2] + dz)
@@ -415,20 +442,27 @@ def tangents(entry, place, axis, normal, depth, limit, turns, rows):
                 there -= slope / size * _ASIDE
             side = rows[4 + row]
             side[0], side[1], side[2], side[3] = nx, ny, nz, there
-        # Planes of a smooth wall are moved so that their edge lies at the true depth.
-        excess = 0.0
-        if not corner:
-            excess = 0.5 * (rows[4, 3] + rows[5, 3]) - depth
+        # Planes are moved so that their edge lies at the true depth: a corner is round.
+        excess = 0.5 * (rows[4, 3] + rows[5, 3]) - depth
+        if corner:
+            excess = max(min(rows[4, 3], rows[5, 3]) - depth, 0.0)
         for row in range(4, 6):
-            if rows[row, 3] - excess <= limit:
+            steep = 0.0
+            for k in range(3):
+                steep += rows[row, k] * normal[k]
+            least = min(least, rows[row, 3] - (0.0 if corner else excess))
+            moved = excess if steep > _STEEP else 0.0
+            if rows[row, 3] - moved <= limit + (_ROOM if corner else 0.0):
                 for k in range(4):  # copying a slice takes seconds to compile
                     rows[found, k] = rows[row, k]
-                rows[found, 3] -= excess
+                rows[found, 3] -= moved
                 found += 1
-    if found == 0:
-        rows[0, 0], rows[0, 1], rows[0, 2] = normal
-        rows[0, 3] = depth
-        found = 1
+    # Planes of a corner may all be farther away than the wall is.
+    if least > depth + _HOLLOW:
+        found = min(found, _MOST - 1)
+        rows[found, 0], rows[found, 1], rows[found, 2] = normal
+        rows[found, 3] = depth
+        found += 1
     return found
 
 
@@ -447,6 +481,44 @@ def ends(table, model, data, geom, half):
         low += (centre[k] - half * turned[3 * k + 2] - joint[k]) ** 2
         high += (centre[k] + half * turned[3 * k + 2] - joint[k]) ** 2
     return (low > _JOINED * _JOINED, high > _JOINED * _JOINED)
+
+
+@compiled
+def swept(table, model, data, geom):
+    """Ways of a geom's middle (3) and turn (3) in a physics step at its velocity, m."""
+    body = wholes(word(model + word(table + GEOM_BODYID)) + 4 * geom, 1)[0]
+    parents = wholes(word(model + word(table + BODY_PARENTID)), _COUNT)
+    counts = wholes(word(model + word(table + BODY_DOFNUM)), _COUNT)
+    while body > 0 and counts[body] == 0:
+        body = parents[body]
+    a, b, c, x, y, z = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    if body == 0:
+        return (x, y, z), (a, b, c)
+    ancestors = wholes(word(model + word(table + DOF_PARENTID)), _COUNT)
+    velocities = numbers(word(data + word(table + QVEL)), _COUNT)
+    motions = word(data + word(table + CDOF))
+    first = wholes(word(model + word(table + BODY_DOFADR)) + 4 * body, 1)[0]
+    dof = first + counts[body] - 1
+    while dof >= 0:
+        motion, velocity = numbers(motions + 48 * dof, 6), velocities[dof]
+        a, b, c = (
+            a + motion[0] * velocity,
+            b + motion[1] * velocity,
+            c + motion[2] * velocity,
+        )
+        x, y, z = (
+            x + motion[3] * velocity,
+            y + motion[4] * velocity,
+            z + motion[5] * velocity,
+        )
+        dof = ancestors[dof]
+    root = wholes(word(model + word(table + BODY_ROOTID)) + 4 * body, 1)[0]
+    about = numbers(word(data + word(table + SUBTREE_COM)) + 24 * root, 3)
+    centre = numbers(word(data + word(table + GEOM_XPOS)) + 24 * geom, 3)
+    step = numbers(model + word(table + TIMESTEP), 1)[0]
+    u, v, w = centre[0] - about[0], centre[1] - about[1], centre[2] - about[2]
+    x, y, z = x + b * w - c * v, y + c * u - a * w, z + a * v - b * u
+    return (step * x, step * y, step * z), (step * a, step * b, step * c)
 
 
 @compiled
@@ -529,9 +601,10 @@ def collide(model, data, contacts, geom1, geom2, margin, before):
     axis = into(frame, (turned[2], turned[5], turned[8]))
     # A straight sheath holds the shaft without any load.
     near = 0.0 if margin > 0.0 or straight(entry) else _TOUCH
-    limit = radius + margin + near
+    limit = far = radius + margin + near
     impedance = numbers(word(model + word(table + GEOM_SOLIMP)) + 40 * geom1, 1)[0]
     soft = impedance == SOFT and half > 0.0 and word(entry + 8) == LUMEN
+    travel, aside = (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
     motion, space = word(entry + MOTION_ENTRY), np.int64(0)
     if motion != 0:
         space = motion_of(table, model, data)
@@ -556,10 +629,16 @@ def collide(model, data, contacts, geom1, geom2, margin, before):
         reach = _STRAIN * (limit - there[12]) + _IMAGE
         seen = touches(entry, at_rest, way, half * stretch, closed, reach)
     else:
+        if near > 0.0 and not soft:
+            travel, turn = swept(table, model, data, geom1)
+            travel, turn = into(frame, travel), into(frame, turn)
+            aside = across(turn, axis)
+            ahead = length(travel) + half * length(aside)
+            far = max(limit, radius + ahead - _IMPACT)
         time, stretch, reach, way = 0.0, 1.0, limit, axis
         lattice = course = there = np.empty(0)
         values = np.empty((0, 4))
-        seen = touches(entry, local, axis, half, closed, limit)
+        seen = touches(entry, local, axis, half, closed, far)
     if seen[0] == 0:
         return np.int32(0)
     rows, written = np.empty((6, 4)), 0
@@ -577,9 +656,17 @@ def collide(model, data, contacts, geom1, geom2, margin, before):
         normal = away(entry, place[0], place[1], place[2])
         if normal == (0.0, 0.0, 0.0):
             continue
-        # A sphere may have one contact, so one plane.
-        around = 0 if half == 0.0 else 1 + int(at_end)
-        planes = tangents(entry, place, way, normal, depth, reach, around, rows)
+        if space != 0 or depth <= limit:
+            # A sphere may have one contact, so one plane.
+            around = 0 if half == 0.0 else 1 + int(at_end)
+            planes = tangents(entry, place, way, normal, depth, reach, around, rows)
+        else:
+            hits = along(travel, aside, t)
+            ahead = normal[0] * hits[0] + normal[1] * hits[1] + normal[2] * hits[2]
+            if depth + ahead > radius - _IMPACT:
+                continue
+            rows[0, 0], rows[0, 1], rows[0, 2] = normal
+            rows[0, 3], planes = depth, 1
         if space != 0:
             in_space(there, rows, planes)
         if soft and planes == 1:
@@ -587,7 +674,7 @@ def collide(model, data, contacts, geom1, geom2, margin, before):
                 rows[1, k] = rows[0, k]
             planes = 2
         for plane in range(planes):
-            if written == _MOST or rows[plane, 3] > limit:
+            if written == _MOST or (space != 0 and rows[plane, 3] > limit):
                 continue
             contact = numbers(contacts + 80 * written, 10)
             distance = rows[plane, 3] - radius
