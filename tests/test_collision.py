@@ -124,6 +124,17 @@ def test_behind_the_open_end_nothing_touches(tube):
     assert len(half_in.dist) and (half_in.pos[:, 2] > 0).all()
 
 
+@pytest.mark.parametrize("value", [np.nan, np.inf, 1e300])
+def test_a_place_that_is_no_number_touches_nothing(tube, value):
+    model, data = compiled(carrier(tube) + capsule((0, 0, 30e-3)))
+    for index in range(model.nq):
+        mujoco.mj_resetData(model, data)
+        data.qpos[index] = value
+        mujoco.mj_kinematics(model, data)
+        mujoco.mj_collision(model, data)
+        assert data.ncon == 0
+
+
 def chain(place):
     """Two links whose joint is at the origin of the second."""
     second = (

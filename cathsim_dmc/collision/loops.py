@@ -599,6 +599,9 @@ def collide(model, data, contacts, geom1, geom2, margin, before):
     apart = into(frame, apart)
     local = (middle[0] + apart[0], middle[1] + apart[1], middle[2] + apart[2])
     axis = into(frame, (turned[2], turned[5], turned[8]))
+    # What is no number has no place in a lattice; MuJoCo's checks of the state tell.
+    if not math.isfinite(local[0] + local[1] + local[2] + axis[0] + axis[1] + axis[2]):
+        return np.int32(0)
     # A straight sheath holds the shaft without any load.
     near = 0.0 if margin > 0.0 or straight(entry) else _TOUCH
     limit = far = radius + margin + near
