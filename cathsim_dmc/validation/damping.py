@@ -31,6 +31,7 @@ from cathsim_dmc.validation.rig import Rig
 RELEASE_BOUND = 5.0  # % of frequency and decay
 RELEASE = 0.01  # m, deflection of the end before the release
 _FREE = 0.2  # m
+_SWINGING = 3.0  # s
 LINK = 0.0175  # m, default of the tasks
 # Roots β L of a clamped beam with a free end.
 _ROOTS = np.array([1.875104069, 4.694091133, 7.854757438, 10.99554073])
@@ -42,9 +43,9 @@ SPAN_BOUND = 3.0  # % of the deflection
 SPAN_LINK = 7e-3  # m, that of the tip
 
 
-def _uniform(device: str) -> devices.Device:
+def _uniform() -> devices.Device:
     """A straight device that is all shaft."""
-    one = devices.get(device)
+    one = devices.STEERABLE_5F
     return dataclasses.replace(
         one, tip=one.shaft, tip_shape=(), tip_length=LINK, tip_links=1
     )
@@ -80,17 +81,13 @@ def _swing(time: np.ndarray, curve: np.ndarray) -> tuple[float, float]:
     return 0.5 / half, float(decay)
 
 
-def release(
-    device: str = "steerable_5f", *, blood: bool = True, duration: float = 3.0
-) -> Release:
+def release(*, blood: bool = True) -> Release:
     """Releases a bent cantilever of 0.2 m from the shape of its first mode.
 
     Args:
-        device: taken as uniform and straight.
         blood: whether it is in blood, or without any fluid.
-        duration: s.
     """
-    one = _uniform(device)
+    one = _uniform()
     rig = Rig(one, devices.Discretisation(working_length=_FREE + LINK / 2))
     effect = StillBlood()
     if blood:
@@ -116,7 +113,7 @@ def release(
     mujoco.mj_forward(rig.model, rig.data)
     start = rig.head_position[0]
     curve = [start]
-    for _ in range(round(duration / rig.model.opt.timestep)):
+    for _ in range(round(_SWINGING / rig.model.opt.timestep)):
         rig.step()
         mujoco.mj_kinematics(rig.model, rig.data)
         curve.append(rig.head_position[0])
@@ -194,7 +191,7 @@ class Spin(NamedTuple):
     expected: float  # Σ of τ ω θ² / C over the joints, through the twist, rad
 
 
-def spin(speed: float, device: str = "steerable_5f") -> Spin:
+def spin(speed: float) -> Spin:
     """Turns a device in a half circle of 40 mm, for one turn after the first quarter.
 
     A joint of compliance C that is bent by θ brakes the turning with τ ω θ²/C, where τ
@@ -202,7 +199,7 @@ def spin(speed: float, device: str = "steerable_5f") -> Spin:
     joints beyond them.
     """
     length = devices.Discretisation(working_length=0.3, torsion_joints=4)
-    rig = Rig(device, length, rotation=True, friction=0.0)
+    rig = Rig("steerable_5f", length, rotation=True, friction=0.0)
     turn = np.linspace(0.0, np.pi, 120)
     arc = _BEND * np.stack([1 - np.cos(turn), 0 * turn, np.sin(turn)], axis=-1)
     line = np.vstack([[[0, 0, -0.1]], arc, [[2 * _BEND, 0, -0.2]]])
@@ -252,18 +249,15 @@ def _turned(rig: Rig, speed: float) -> np.ndarray:
     return np.array(twists[settling:])
 
 
-def three_point(
-    span: float, link: float, on_joint: bool, device: str = "steerable_5f"
-) -> float:
+def three_point(span: float, link: float, on_joint: bool) -> float:
     """Deflection of a device in three-point bending over that of a beam, FS³/48EI.
 
     Args:
         span: distance of the supports, m.
         link: length of the links, m.
         on_joint: whether the load is on a joint, or in the middle of a link.
-        device: taken as uniform and straight.
     """
-    rig = Rig(_uniform(device), devices.Discretisation(shaft_link=link))
+    rig = Rig(_uniform(), devices.Discretisation(shaft_link=link))
     rig.compile()
     joints = np.append(rig.joints[:, 2], rig.head_position[2])
     near = int(np.argmin(np.abs(joints - joints.mean())))

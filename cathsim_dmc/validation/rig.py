@@ -122,7 +122,6 @@ class Rig:
     def settle(
         self,
         force=None,
-        torque=(0.0, 0.0, 0.0),
         *,
         rest_change: float = REST_CHANGE,
         longest: float = 20.0,
@@ -131,7 +130,6 @@ class Rig:
 
         Args:
             force: (3,) dead load on the distal end, N; None leaves what is applied.
-            torque: (3,) N·m.
             rest_change: of every joint over one relaxation time, rad and m.
 
         Returns:
@@ -151,7 +149,7 @@ class Rig:
         while change > rest_change:
             before = self.data.qpos.copy()
             for _ in range(count):
-                self.step(force, torque)
+                self.step(force)
             change = np.abs(self.data.qpos - before).max()
             if self.data.time - start > longest:
                 raise RuntimeError(

@@ -29,6 +29,7 @@ SHORT_COLUMNS = (
     *(("sliding", count) for count in (4, 6, 9)),
     *(("fixed", count) for count in (8, 10, 12)),
 )
+_TURNING = 4.0  # s, until the lag is steady
 TORSION_JOINTS = 4  # default of the tasks with rotation
 TWIST = 0.35  # rad, of the whole device under the end torque; lag of the braked tip
 
@@ -128,12 +129,7 @@ class Buckling(NamedTuple):
     expected: float  # load of Euler, N
 
 
-def buckling(
-    end: str,
-    joints: int | None = None,
-    device: str | devices.Device = "steerable_5f",
-    discretisation: devices.Discretisation | None = None,
-) -> Buckling:
+def buckling(end: str, joints: int | None = None) -> Buckling:
     """Measures the critical load of a clamped-guided length by a Southwell plot.
 
     The carriage clamps link 0; a guide that cannot turn holds another link by its
@@ -144,10 +140,8 @@ def buckling(
     Args:
         end: "sliding" lets the guide move sideways, "fixed" holds it on the axis.
         joints: links from clamp to guide; None for the whole shaft.
-        device: its shape at rest is taken as straight.
-        discretisation: default of the tasks if None.
     """
-    rig = Rig(straight(device), discretisation)
+    rig = Rig(straight("steerable_5f"))
     shaft = len(rig.lengths) - rig.device.tip_links
     last = shaft - 1 if joints is None else joints
     if not 2 <= last < shaft:
@@ -260,17 +254,13 @@ class TwistLag(NamedTuple):
     expected_rise_time: float  # s, for the measured motion of the base
 
 
-def twist_lag(
-    device: str | devices.Device = "steerable_5f",
-    torsion_joints: int = TORSION_JOINTS,
-    duration: float = 4.0,
-) -> TwistLag:
+def twist_lag() -> TwistLag:
     """Turns the base at full speed against a viscous brake b on the tip.
 
     With K = 1/Σ(l/GJ), base speed ω and the rod's own relaxation time τ, the lag δ
     obeys (b + Kτ) δ' + K δ = b ω: it rises to bω/K with the time constant b/K + τ.
     """
-    rig = _torsion_rig(device, torsion_joints)
+    rig = _torsion_rig("steerable_5f", TORSION_JOINTS)
     lengths, _, torsional = rig.sections
     stiffness = 1 / theory.twist(1.0, lengths, torsional)
     brake = TWIST * stiffness / MAX_ROTATION_SPEED
@@ -283,7 +273,7 @@ def twist_lag(
         if joint.name == "rotation" or joint.name.startswith("twist_")
     ]
     base, tip = [0.0], [0.0]
-    for _ in range(round(duration / timestep)):
+    for _ in range(round(_TURNING / timestep)):
         rig.step((0, 0, 0), (0, 0, -brake * rig.data.qvel[axial].sum()))
         base.append(rig.qpos("rotation"))
         tip.append(base[-1] - _twist(rig, wrapped=True))

@@ -36,18 +36,14 @@ SLOPE_BOUND = 5.0  # %
 _FREE = 0.2  # m
 
 
-def cantilever(
-    speed: float, device: str = "steerable_5f", link: float = LINK
-) -> tuple[float, float]:
+def cantilever(speed: float) -> tuple[float, float]:
     """Deflection of the end of a cantilever in a uniform cross-flow, m, and expected.
 
     The elastica bears ½ρ d C_d(Re) u² per length across its axis, u the velocity of the
     blood across it.
     """
-    one = _uniform(device)
-    rig = Rig(
-        one, devices.Discretisation(working_length=_FREE + link / 2, shaft_link=link)
-    )
+    one = _uniform()
+    rig = Rig(one, devices.Discretisation(working_length=_FREE + LINK / 2))
     blood = StillBlood()
     rig.arena.mjcf_model.size.nuserdata = userdata_size([blood], rig.catheter)
     rig.compile()
