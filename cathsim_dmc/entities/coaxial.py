@@ -79,6 +79,12 @@ class Links(NamedTuple):
 class Stack:
     """Coaxial devices on one chain of links.
 
+    Arguments of its methods: `gaps` (N, K), distance from the end of each device to the
+    end of the chain, m, 0 for the one that leads; `turns` (N, K, J), rotation of each
+    device at each joint, rad; `bends` (N, J) complex, bending angles of the
+    joints, rad; `angles` (N, 2 J), positions of the hinges in the order of the chain,
+    rad; `friction` (N,), Coulomb coefficient of an uncoated device on the wall.
+
     Attributes:
         devices: devices from the innermost outwards.
         link_lengths: (L,), from proximal to distal, m.
@@ -139,12 +145,7 @@ class Stack:
         self._arms = self._ratio * self._radius
 
     def overlap(self, gaps: np.ndarray) -> Overlap:
-        """Integrals around the joints and over the links.
-
-        Args:
-            gaps: (N, K), distance from the end of each device to the end of the chain,
-                m; 0 for the device that reaches farthest.
-        """
+        """Integrals around the joints and over the links."""
         gaps = np.ascontiguousarray(gaps, np.float64)
         integrals = self._loops.overlaps(
             gaps,
@@ -159,11 +160,7 @@ class Stack:
         )
 
     def rest_angles(self, overlap: Overlap, turns: np.ndarray) -> np.ndarray:
-        """Rest angles (N, J) of the joints, complex, rad.
-
-        Args:
-            turns: (N, K, J), rotation of each device at each joint, rad.
-        """
+        """Rest angles (N, J) of the joints, complex, rad."""
         return (overlap.rest * np.exp(1j * turns)).sum(axis=1)
 
     def bent(self, angles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -172,20 +169,13 @@ class Stack:
         The twist is that of the chain's frames against frames that do not twist along
         the chain, in which bends and rotations of the devices are measured.
 
-        Args:
-            angles: (N, 2 J), positions of the hinges in the order of the chain, rad.
-
         Returns:
             Bends (N, J) complex, and twists (N, J), rad.
         """
         return self._hinges.bent(np.ascontiguousarray(angles))
 
     def unloaded_hinges(self, overlap: Overlap, turns: np.ndarray) -> np.ndarray:
-        """Angles (N, J, 2) of the hinges about x and y of the unloaded chain, rad.
-
-        Args:
-            turns: (N, K, J), rotation of each device at each joint, rad.
-        """
+        """Angles (N, J, 2) of the hinges about x and y of the unloaded chain, rad."""
         return self._hinges.unloaded_hinges(self.rest_angles(overlap, turns))
 
     def free_hinges(
@@ -201,10 +191,6 @@ class Stack:
         depends on the hinges of the joint and on the twist of those before it: at
         angles θ, the rest angles are θ - C ∂E/∂θ.
 
-        Args:
-            turns: (N, K, J), rotation of each device at each joint, rad.
-            angles: (N, 2 J), positions of the hinges in the order of the chain, rad.
-
         Returns:
             (N, J, 2), about x and about y, rad.
         """
@@ -215,11 +201,7 @@ class Stack:
         )
 
     def links(self, overlap: Overlap, friction: np.ndarray) -> Links:
-        """Properties of the links.
-
-        Args:
-            friction: (N,), Coulomb coefficient of an uncoated device on the wall.
-        """
+        """Properties of the links."""
         made = self._loops.links(
             overlap.outermost,
             overlap.present,
@@ -238,7 +220,6 @@ class Stack:
 
         Args:
             force: (N, L), force of the wall on the links, N.
-            friction: (N,), Coulomb coefficient of an uncoated device on the wall.
 
         Returns:
             (N, K, J), N·m; each joint has half of its two links.
@@ -254,10 +235,6 @@ class Stack:
         that of two devices against each other -S cos(φ_k - φ_l). The derivative by a
         rotation turns a shaped device into the plane of a curved vessel and makes it
         whip.
-
-        Args:
-            bends: (N, J) complex, bending angles of the joints, rad.
-            turns: (N, K, J), rotation of each device at each joint, rad.
 
         Returns:
             Torque (N, K, J) on each device about its axis, N·m, and minus its
@@ -281,9 +258,6 @@ class Stack:
         rotations of its rod; that of the leading device is minus the others' sum.
 
         Args:
-            gaps: (N, K), see `overlap`.
-            bends: (N, J) complex, bending angles of the joints, rad.
-            turns: (N, K, J), rotation of each device at each joint, rad.
             slopes: (N, K, J), torque of `restoring` times the derivative of `turns` by
                 the gap, N.
 
@@ -321,8 +295,6 @@ class Stack:
         place, and their friction.
 
         Args:
-            bends: (N, J) complex, bending angles of the joints, rad.
-            turns: (N, K, J), rotation of each device at each joint, rad.
             axial: (N, K, J), see `axial`, N.
             start: (N, K), compression where each device leaves the others, N.
             ways: (N, K - 1) in [-1, 1], fraction of the friction that acts on device k,
