@@ -8,11 +8,11 @@ import torch
 from cathsim_dmc import suite
 from cathsim_dmc.agents import compare, evaluate, policies, protocols
 from cathsim_dmc.agents.episodes import EpisodeOutcome
-from cathsim_dmc.agents.evaluation import EvaluationResult, paired_bootstrap
+from cathsim_dmc.agents.evaluation import EvaluationResult
 from cathsim_dmc.agents.report import EvaluationReport
 from cathsim_dmc.agents.report import evaluate as evaluated
 from cathsim_dmc.analysis.force_statistics import FIGURES, EpisodeForces, Statistics
-from cathsim_dmc.analysis.intervals import success_interval
+from cathsim_dmc.analysis.intervals import paired_bootstrap, success_interval
 from cathsim_dmc.simulation.batch import BatchSimulation
 
 SORTED = sorted(synthetic_env.SIZES)

@@ -20,7 +20,7 @@ from cathsim_dmc.agents.episodes import EpisodeOutcome, EpisodeTracker
 from cathsim_dmc.agents.policies import PolicyLike, load_policy, require_task
 from cathsim_dmc.agents.views import view_of
 from cathsim_dmc.analysis.force_statistics import QUANTITIES, Statistics
-from cathsim_dmc.analysis.intervals import success_interval
+from cathsim_dmc.analysis.intervals import paired_bootstrap, success_interval
 from cathsim_dmc.policies import Policy
 from cathsim_dmc.simulation import environments
 from cathsim_dmc.simulation.episodes import play
@@ -31,7 +31,6 @@ EnvFactory = Callable[..., EnvBase]
 Observer = Callable[[EnvBase, np.ndarray], None]
 
 EVALUATION_SEED = 1_000_000  # apart from the seeds of training
-BOOTSTRAP_SAMPLES = 10_000
 
 # Largest sums of the force on the wall up to which success is called safe, N.
 SAFE_FORCES = (0.5, 1.0, 2.0)
@@ -189,25 +188,6 @@ class Comparison:
     def to_dict(self) -> dict[str, Any]:
         """JSON-able values."""
         return asdict(self)
-
-
-def paired_bootstrap(
-    first: np.ndarray, second: np.ndarray
-) -> tuple[float, tuple[float, float] | None]:
-    """Mean of first - second over pairs (n,), with its 95 % percentile interval.
-
-    The interval is None for a single pair, which tells nothing about the spread.
-    """
-    from scipy import stats
-
-    difference = np.asarray(first, np.float64) - np.asarray(second, np.float64)
-    if len(difference) < 2:
-        return float(difference.mean()), None
-    interval = stats.bootstrap(
-        (difference,), np.mean, n_resamples=BOOTSTRAP_SAMPLES, method="percentile",
-        random_state=np.random.default_rng(0),
-    ).confidence_interval  # fmt: skip
-    return float(difference.mean()), (float(interval.low), float(interval.high))
 
 
 def compare(policy: EvaluationResult, baseline: EvaluationResult) -> Comparison:
