@@ -167,16 +167,12 @@ def evaluate(
 ) -> EvaluationReport:
     """Evaluates a policy; writes its files into a directory.
 
-    What takes long says so on standard error now and then.
+    What takes long says so on standard error now and then. Arguments without a line
+    here are those of `evaluation.evaluate`.
 
     Args:
-        policy: Policy, or what names one, see `policies.load_policy`.
         task: Name of the task, see `policies.task_and_options`.
-        episodes: Number of episodes; None for that of the protocol.
-        seed: Seed of the first episode; the others lie above it.
-        protocol: Name of the conditions in `protocols.PROTOCOLS`.
         task_kwargs: Options of the task, over those that the policy was trained with.
-        num_threads: Number of threads of the simulation; None takes one per core.
         baseline: Whether to play the same seeds with the random policy too.
         out_dir: Directory for evaluation.json and heatmap.png; None writes none.
         start: File of a `Snapshot`, one episode for each of its simulations, from there

@@ -22,7 +22,6 @@ def take_over(policy: nn.Module, config: TrainingConfig, shapes: NetworkShapes) 
     Raises:
         ConfigError: the other policy has another network, sizes or observation.
         CheckpointError: there is none, or it is damaged.
-        CheckpointError: there is none, or it is damaged.
     """
     source = load_policy(str(config.initial_policy))
     if not isinstance(source, TrainedPolicy):
