@@ -96,7 +96,7 @@ def test_volume_and_profile_are_those_prescribed():
 
 def test_outlets_share_by_murray_where_that_is_asked_for():
     anatomy = phantoms.load("type1")
-    courses = Circulation.of(anatomy, murray=True).courses
+    courses = Circulation.of(anatomy.tree, murray=True).courses
     radii = {end.vessel: end.radius for end in anatomy.ends if not end.open}
     cubes = {name: radius**3 for name, radius in radii.items()}
     for name, cube in cubes.items():

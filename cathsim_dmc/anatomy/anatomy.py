@@ -126,12 +126,12 @@ class Anatomy:
     @cached_property
     def circulation(self) -> Circulation:
         """How the inflow of blood is shared among the vessels."""
-        return Circulation.of(self)
+        return Circulation.of(self.tree, murray=self.scanned)
 
     @cached_property
     def motion(self) -> Motion:
         """How heart and breathing move it."""
-        return Motion.of(self)
+        return Motion.of(self.lumen.box, self.tree, self.ends, self.circulation)
 
     def depth(self, points: ArrayLike) -> Array:
         """Signed depth (...) of `points` (..., 3) in the lumen, metres, > 0 inside.

@@ -8,15 +8,14 @@ cubed. A vessel loses at each ostium what the branch takes, so volume is conserv
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from cathsim_dmc.anatomy.centreline import Array, VesselTree
-
-if TYPE_CHECKING:
-    from cathsim_dmc.anatomy.anatomy import Anatomy
+from cathsim_dmc.anatomy.parts import End
 
 # Mean shares of the inflow, from the resistances of ADAN56 (Boileau 2015).
 SHARES = {"bca": 0.120, "lcca": 0.069, "lsa": 0.050}
@@ -72,13 +71,12 @@ class Circulation:
     vessel: np.ndarray
 
     @classmethod
-    def of(cls, anatomy: Anatomy, murray: bool = False) -> Circulation:
-        """The circulation of an anatomy, perhaps with all outlets by Murray's law."""
-        tree = anatomy.tree
+    def of(cls, tree: VesselTree, murray: bool = False) -> Circulation:
+        """The circulation of a tree, perhaps with all outlets by Murray's law."""
         root = tree.root.centreline
         reverse = bool(root.radii[-1] > root.radii[0])
         heart = -1 if reverse else 0
-        courses = _courses(tree, reverse, murray or anatomy.scanned)
+        courses = _courses(tree, reverse, murray)
         columns = [
             _along(vessel.centreline, courses[name], number)
             for number, (name, vessel) in enumerate(tree.vessels.items())
@@ -86,19 +84,18 @@ class Circulation:
         joined = [np.concatenate(column) for column in zip(*columns, strict=True)]
         return cls(courses, float(root.radii[heart]), *joined)
 
-    def check(self, anatomy: Anatomy) -> None:
-        """Refuses an anatomy that no blood can go through.
+    def check(self, name: str, tree: VesselTree, ends: Sequence[End]) -> None:
+        """Refuses an anatomy that no blood can go through, by its name and free ends.
 
         Raises:
             ValueError: if the heart's end is no free end, or there is no outlet.
         """
-        root = anatomy.tree.root
+        root = tree.root
         heart = root.centreline.points[-1 if self.courses[root.name].reverse else 0]
-        ends = anatomy.ends
         distances = [np.linalg.norm(end.position - heart) for end in ends]
         if min(distances, default=np.inf) > _AT_END or len(ends) < 2:
             raise ValueError(
-                f"anatomy {anatomy.name!r} has no flow: it has {len(ends)} free ends, "
+                f"anatomy {name!r} has no flow: it has {len(ends)} free ends, "
                 f"and needs one at the wider end of {root.name!r}, for the inflow, and "
                 "an outlet; import it with its ends cut open, or leave flow out"
             )

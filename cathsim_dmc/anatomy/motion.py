@@ -13,15 +13,14 @@ open end all displacements pass into none.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
-from cathsim_dmc.anatomy.centreline import Array
-
-if TYPE_CHECKING:
-    from cathsim_dmc.anatomy.anatomy import Anatomy
+from cathsim_dmc.anatomy.centreline import Array, VesselTree
+from cathsim_dmc.anatomy.circulation import Circulation
+from cathsim_dmc.anatomy.parts import End
 
 _STEP = 6e-3  # m, of the lattice
 _SMOOTH = 25e-3  # m, over which a displacement is that of the aorta around
@@ -51,14 +50,25 @@ class Motion:
     lattice: Array
 
     @classmethod
-    def of(cls, anatomy: Anatomy) -> Motion:
-        """The motion of an anatomy, with its open ends at rest."""
-        low, high = anatomy.lumen.box
+    def of(
+        cls,
+        box: tuple[Array, Array],
+        tree: VesselTree,
+        ends: Sequence[End],
+        blood: Circulation,
+    ) -> Motion:
+        """The motion of an anatomy, with its open ends at rest.
+
+        Args:
+            box: Corners (3,), (3,) m, of its lumen's field.
+        """
+        low, high = box
+        aorta = _along_aorta(blood, tree)
         shape = np.ceil((high - low) / _STEP).astype(int) + 1
         lattice = np.stack(np.meshgrid(*map(np.arange, shape), indexing="ij"), -1)
         points = (low + _STEP * lattice).reshape(-1, 3)
         values = np.concatenate(
-            [_values(anatomy, part) for part in np.array_split(points, 32)]
+            [_values(part, ends, blood, *aorta) for part in np.array_split(points, 32)]
         )
         return cls(np.concatenate([low, [_STEP], shape, values.ravel()]))
 
@@ -120,19 +130,19 @@ def distensibility(radius: Array) -> Array:
     return 3.37e5 / (3e6 * np.exp(-1350.0 * radius) + 3.37e5)
 
 
-def _values(anatomy: Anatomy, points: Array) -> Array:
+def _values(
+    points: Array, ends: Sequence[End], blood: Circulation, heart: Array, breath: Array
+) -> Array:
     """What the lattice holds (n, 8) at points (n, 3) m."""
-    blood = anatomy.circulation
     middles, radii = blood.ends.mean(axis=1), blood.radii.mean(axis=1)
     ways = blood.ways.mean(axis=1)
     distance = np.linalg.norm(points[:, None] - middles, axis=-1)
     weight = _shares(-0.5 * (distance / _SMOOTH) ** 2)
-    heart, breath = _along_aorta(anatomy, ways)
     across = _shares((radii - distance) / _ACROSS)
     radius = across @ radii
     growth = 0.5 * PULSE_PRESSURE * distensibility(radius) * radius
     begun = np.ones(len(points))
-    for end in anatomy.ends:
+    for end in ends:
         if end.open:
             away = np.linalg.norm(points - end.position, axis=-1) - end.radius
             share = np.clip(away / _FADE, 0.0, 1.0)
@@ -148,9 +158,9 @@ def _shares(exponent: Array) -> Array:
     return weight / weight.sum(axis=1, keepdims=True)
 
 
-def _along_aorta(anatomy: Anatomy, ways: Array) -> tuple[Array, Array]:
+def _along_aorta(blood: Circulation, tree: VesselTree) -> tuple[Array, Array]:
     """Displacements (S, 3), (S, 3) of the segments by heart and breathing."""
-    blood, tree = anatomy.circulation, anatomy.tree
+    ways = blood.ways.mean(axis=1)
     root, names = tree.root, list(tree.vessels)
     length = root.centreline.length
     begins = {}

@@ -95,7 +95,7 @@ class Flow(StillBlood):
         """Fills the vessels of an anatomy."""
         self._circulations[index] = anatomy.circulation
         if self._options.split == "murray":
-            self._circulations[index] = Circulation.of(anatomy, murray=True)
+            self._circulations[index] = Circulation.of(anatomy.tree, murray=True)
 
     def restart(
         self, index: int, episode: Episode, random_state: np.random.RandomState

@@ -147,7 +147,7 @@ class VesselOptions:
     def check(self, anatomy: Anatomy) -> None:
         """Raises ValueError if an anatomy cannot do what the options ask for."""
         if self.flow is not None:
-            anatomy.circulation.check(anatomy)
+            anatomy.circulation.check(anatomy.name, anatomy.tree, anatomy.ends)
         if self.motion is not None:
             self.motion.check(anatomy)
 
