@@ -2,6 +2,7 @@
 
 import ast
 import functools
+import graphlib
 import os
 import subprocess
 import sys
@@ -122,6 +123,19 @@ def test_the_contract_has_no_circles():
         assert free, f"circle among {sorted(left)}"
         order += free
         left = {part: allowed for part, allowed in left.items() if part not in free}
+
+
+def test_no_modules_import_each_other():
+    paths = {}
+    for path in modules():
+        parts = path.relative_to(PACKAGE).with_suffix("").parts
+        paths[".".join((NAME, *parts)).removesuffix(".__init__")] = path
+    graph = {}
+    for name, path in paths.items():
+        found = {n if n in paths else n.rpartition(".")[0] for n in imported(path)}
+        above = {n for n in found if f"{name}.".startswith(f"{n}.")}
+        graph[name] = found & set(paths) - above
+    graphlib.TopologicalSorter(graph).prepare()
 
 
 @pytest.mark.parametrize("part", ALLOWED)
