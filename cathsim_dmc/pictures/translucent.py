@@ -109,24 +109,20 @@ class Glass:
 
 
 def glass(
-    vertices: np.ndarray,
-    faces: np.ndarray,
-    projection: ParallelProjection,
-    colour: tuple[float, float, float] = WALL_COLOUR,
+    vertices: np.ndarray, faces: np.ndarray, projection: ParallelProjection
 ) -> Glass:
     """Draw a closed surface as translucent glass.
 
     Args:
         vertices: (V, 3), metres, world frame.
         faces: (F, 3), counter-clockwise seen from outside.
-        colour: RGB in [0, 1].
     """
     fine = replace(projection, pixels=projection.pixels * _SAMPLES)
     rows, columns = (_SAMPLES * n for n in projection.shape)
     pixel, depth, normal = _hits(vertices, faces, fine, (rows, columns))
     order = np.lexsort((depth, pixel))  # within a pixel, the farthest first
     pixel, normal = pixel[order], normal[order]
-    shade = _lit(normal, np.asarray(colour))
+    shade = _lit(normal, np.array(WALL_COLOUR))
     slant = 1.0 - np.abs(normal[:, 2])
     opacity = FACING + (GRAZING - FACING) * slant**2.5
     first = np.flatnonzero(np.diff(pixel, prepend=-1))

@@ -131,13 +131,12 @@ class ExpertPolicy(Policy):
     # Cheapest to observe.
     observation = "tracking"
 
-    def __init__(self, seed: int = 0, settings: Settings | None = None):
+    def __init__(self, seed: int = 0):
         """Starts before the first episode.
 
         Args:
             seed: Not used: the expert draws no random numbers.
         """
-        self._settings = settings
         self._view: View | None = None
         # One for all simulations; where their anatomies differ, one for each.
         self._experts: dict[int, Expert] = {}
@@ -155,14 +154,14 @@ class ExpertPolicy(Policy):
             self._several = view.task.num_anatomies > 1
         if not self._several:
             if not self._experts:
-                self._experts[0] = Expert.for_task(view.task, self._settings)
+                self._experts[0] = Expert.for_task(view.task)
             self._experts[0].reset(which)
             return
         for index in np.flatnonzero(which).tolist():
             case = view.case(index)
             if self._cases.get(index) is not case:
                 self._cases[index] = case
-                self._experts[index] = Expert.for_task(case, self._settings)
+                self._experts[index] = Expert.for_task(case)
             self._experts[index].reset()
 
     def act(self, observation: Any) -> np.ndarray:

@@ -22,14 +22,10 @@ from cathsim_dmc.tasks.objective_pool import part
 class Teacher:
     """Tells the expert's action in the states of N simulations."""
 
-    def __init__(self, view: View, settings: Settings | None = None):
-        """Looks at simulations; `reset` comes before the first question.
-
-        Args:
-            settings: Settings of the expert's driving.
-        """
+    def __init__(self, view: View):
+        """Looks at simulations; `reset` comes before the first question."""
         self._view = view
-        self._settings = settings or Settings()
+        self._settings = Settings()
         self._plans: dict[Case, Plan] = {}
         self._cases: list[Case | None] = [None] * view.num_simulations
         self._insertion = np.full(view.num_simulations, np.nan)
