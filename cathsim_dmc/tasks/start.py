@@ -19,6 +19,12 @@ _SETTLING_TIME = 2.0  # s, after which the device rests
 _STARTS_ALONG_ROUTE = 16
 # How much deeper a displacement may put the links behind the head into the wall, m.
 _PRESSED = 2e-4
+# MuJoCo starts anew where a state is no number, and only these tell.
+_DIVERGED = [
+    int(mujoco.mjtWarning.mjWARN_BADQPOS),
+    int(mujoco.mjtWarning.mjWARN_BADQVEL),
+    int(mujoco.mjtWarning.mjWARN_BADQACC),
+]
 _LARGEST_START = 0.5  # share of the way to the goal
 _START_SPACING = 5e-3  # m, between the postures that a start farther in chooses from
 # Displacements that are tried where the whole one presses on the wall.
@@ -242,15 +248,21 @@ def _refuse_outside(
     out = -float(anatomy.depth(nodes[entered]).min(initial=0.0))
     touching = np.isin(data.contact.geom, index.walls).any(axis=-1)
     deepest = -float(data.contact.dist[touching].min(initial=0.0))
-    if out > _OUTSIDE or deepest > _DEEPEST:
-        raise ValueError(
-            f"{scene.device.name!r} comes to rest {1e3 * max(out, 0.0):.1f} mm outside "
-            f"the lumen of {anatomy.name!r} and {1e3 * deepest:.1f} mm deep in its "
-            f"wall before an episode begins (allowed are {1e3 * _OUTSIDE:g} and "
-            f"{1e3 * _DEEPEST:g} mm): the sheath before its inlet or the first "
-            f"{1e3 * place.start_depth:.0f} mm do not fit; enter it elsewhere, or take "
-            "a device with a shorter or softer tip"
+    if data.warning.number[_DIVERGED].any():
+        found = f"does not come to rest in {anatomy.name!r}"
+    elif out > _OUTSIDE or deepest > _DEEPEST:
+        found = (
+            f"comes to rest {1e3 * max(out, 0.0):.1f} mm outside the lumen of "
+            f"{anatomy.name!r} and {1e3 * deepest:.1f} mm deep in its wall (allowed "
+            f"are {1e3 * _OUTSIDE:g} and {1e3 * _DEEPEST:g} mm)"
         )
+    else:
+        return
+    raise ValueError(
+        f"{scene.device.name!r} {found} before an episode begins: the sheath before "
+        f"its inlet or the first {1e3 * place.start_depth:.0f} mm do not fit; enter it "
+        "elsewhere, or take a device with a shorter or softer tip"
+    )
 
 
 def _dof_of(model: mujoco.MjModel, place: int) -> int:
