@@ -8,7 +8,7 @@ import soak
 
 
 def run(monkeypatch, capsys, out, episodes):
-    arguments = ["--out", out, "--episodes", episodes, "--steps", 3, "--threads", 1]
+    arguments = ["--out", out, "--episodes", episodes, "--steps", 20, "--threads", 1]
     monkeypatch.setattr(sys, "argv", ["soak", *map(str, arguments), "--json"])
     code = soak.main()
     printed = capsys.readouterr()

@@ -13,7 +13,7 @@ CONTACT_SIZE = 1 + 3 + 1 + 3 + 3 + 3
 # this: something crossed the lumen in it and hit the wall. Deeper than its radius, the
 # device is pushed out of the pieces of the wall on whatever side is nearest.
 HARDEST = 5.0
-DEEPEST = 0.5e-3
+DEEPEST = 0.6e-3
 # The control step is then done again with steps so many times shorter; a power of two,
 # which divides exactly.
 REFINEMENT = 4
