@@ -35,7 +35,7 @@ CHANGES = {
             *("start_radius", "start_insertion", "tracking_noise"),
         )
     },
-    "goal": {"goal_shift": 5e-3},
+    "goal": {"goal_shift": (-5e-3, 5e-3)},
 }
 Part = Literal["arches", "anatomies", "changes"]
 
