@@ -113,12 +113,13 @@ def test_an_evaluation_takes_options_of_the_task(cathsim):
         *("eval", "push", "--task", "simple1_bca", "--episodes", 1, "--threads", 1),
         *("--randomisation", json.dumps(ranges), "--device", "steerable_4f"),
         *("--reward", '{"path": -1}', "--max-steps", 3, "--no-baseline", "--json"),
+        *("--vessel", "silicone"),
     )
     assert code == 0, err
     found = only_json(out)["policy"]
     assert found["settings"]["task_kwargs"] == {
         "randomisation": ranges, "device": "steerable_4f", "reward": {"path": -1},
-        "max_steps": 3,
+        "max_steps": 3, "vessel": "silicone",
     }  # fmt: skip
     assert found["episodes"][0]["length"] == 3
 

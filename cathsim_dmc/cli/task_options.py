@@ -14,6 +14,7 @@ from tyro import conf
 
 _SINGLE = (str, int, float, bool)
 _JSON = " As JSON; by default the task's own."
+_CONSTANTS = {"true", "false", "null", "True", "False"}  # of JSON, or meant so
 _OWN = " By default the task's own."
 _OBJECTS = frozenset({"effects"})  # Python objects: no text stands for them
 
@@ -62,11 +63,13 @@ def given(options: Any) -> dict[str, Any]:
     values = {name: value for name, value in vars(options).items() if value is not None}
     for name, value in values.items():
         if _has_parts(kinds.get(name, float)):
-            values[name] = _parsed(name, value)
+            values[name] = _parsed(name, value, str in _alternatives(kinds.get(name)))
     return values
 
 
-def _parsed(name: str, text: str) -> Any:
+def _parsed(name: str, text: str, may_be_text: bool) -> Any:
+    if may_be_text and text.isidentifier() and text not in _CONSTANTS:
+        return text
     try:
         return json.loads({"True": "true", "False": "false"}.get(text, text))
     except ValueError as error:
