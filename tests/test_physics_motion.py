@@ -73,6 +73,12 @@ def test_goal_and_head_are_judged_in_the_vessel_at_rest():
     resting = np.linalg.norm(rollout.resting.head - rollout.objective.goal, axis=-1)
     np.testing.assert_allclose(step.distance, resting)
     np.testing.assert_allclose(step.info()["breath_phase"], 0.5, atol=1e-9)
+    # What is in the sheath has not moved, so it has not left the vessel either.
+    moved = rollout.readings.centreline[0] - rollout.resting.centreline[0]
+    inlet = task.scene.anatomy.inlet
+    nodes = rollout.readings.centreline[0] - inlet.position
+    sheathed = nodes @ inlet.direction < 0.0
+    assert sheathed[0] and not moved[sheathed].any()
 
 
 def test_a_wall_that_moves_past_the_sheath_does_not_touch_what_is_in_it(tube):

@@ -115,12 +115,15 @@ class Moving(Effect):
         names = "wall", "sheath/bore"
         self._geoms = [mujoco.mj_name2id(world.model, kind, name) for name in names]
         self._motions: dict[int, Motion] = {}
+        self._inlets = np.zeros((world.num_simulations, 2, 3))
         self._clock = np.zeros(world.num_simulations)
         self._step = world.model.opt.timestep
 
     def enter(self, index: int, anatomy: Anatomy) -> None:
         """Takes the motion of an anatomy."""
         self._motions[index] = anatomy.motion
+        inlet = anatomy.inlet
+        self._inlets[index] = np.array([inlet.position, inlet.direction])
 
     def restart(
         self, index: int, episode: Episode, random_state: np.random.RandomState
@@ -165,8 +168,12 @@ class Moving(Effect):
         return (rate * self._clock + phase) % 1.0, (breath * self._clock + begin) % 1.0
 
     def at_rest(self, state: Readings) -> Readings:
-        """Readings with the places at rest of those in space."""
-        places = self._to_rest(state.centreline)
+        """Readings with the places at rest of those in space; the sheath rests."""
+        nodes = state.centreline
+        inlet, direction = self._inlets[:, :1], self._inlets[:, 1]
+        beyond = np.einsum("nij,nj->ni", nodes - inlet, direction) > 0.0
+        entered = np.maximum.accumulate(beyond, axis=1)
+        places = np.where(entered[..., None], self._to_rest(nodes), nodes)
         return state._replace(centreline=places, head=places[:, -1])
 
     def see(self, state: Readings) -> Readings:
