@@ -166,17 +166,22 @@ class Rollout:
             shiftable = cast(Shiftable, self._objective)
             self._objective = shiftable.shifted(self._goal_shift)
 
+    def _load(self, index: int) -> None:
+        """Puts the anatomy of one simulation's episode into model and effects."""
+        case = self.case(index)
+        self._stepper.load(index, case)
+        self._effects.enter(index, case.scene.anatomy)
+
     def _draw(self, index: int, random_state: np.random.RandomState) -> None:
         """Draws the episode of one simulation and puts its device to the start."""
         if len(self._cases) > 1:
             self.case(index).scene.anatomy.lumen.release()
             self._case_of[index] = random_state.randint(len(self._cases))
-            self._stepper.load(index, self.case(index))
+            self._load(index)
         case = self.case(index)
         episode = self._config.ranges.draw(random_state)
         number = case.start.draw(random_state)
         case.start.write(self._state.qpos[index], episode, number)
-        self._effects.enter(index, case.scene.anatomy)
         self._effects.restart(index, episode, random_state)
         self._monitor.restart(index, case.scene)
         self._sensors.restart(index, case.angiograph, episode.deviation)
@@ -365,8 +370,7 @@ class Rollout:
             setattr(self, f"_{name}", array)
         for index in indices:
             if len(self._cases) > 1:
-                self._stepper.load(index, self.case(index))
-            self._effects.enter(index, self.case(index).scene.anatomy)
+                self._load(index)
             self._monitor.restart(index, self.case(index).scene)
         self._stepper.set_states(indices, kept["state"])
         for name, array in snapshot.part("effects").items():
