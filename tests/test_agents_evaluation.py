@@ -139,6 +139,13 @@ def test_a_policy_of_any_arch_goes_to_a_named_anatomy():
     assert there == ("type1_lcca", {"delay": 2})
 
 
+def test_options_of_random_arches_stay_behind_on_another_task():
+    policy = policies.FunctionPolicy(lambda seen: torch.zeros(len(seen), 21))
+    policy.task, policy.task_kwargs = "arch_any", {"arches": "test", "max_steps": 2}
+    found = evaluate(policy, "simple1_bca", 1, num_threads=1)
+    assert found.settings["task_kwargs"] == {"max_steps": 2}
+
+
 def test_one_condition_has_no_interval_over_its_episodes():
     options = {"task": "type1_bca", "task_kwargs": {"max_steps": 2}, "episodes": 3}
     one = evaluate("push", **options)

@@ -17,7 +17,7 @@ from torchrl.envs.utils import step_mdp
 from cathsim_dmc import bounds, files
 from cathsim_dmc.agents import protocols
 from cathsim_dmc.agents.episodes import EpisodeOutcome, EpisodeTracker
-from cathsim_dmc.agents.policies import PolicyLike, load_policy, require_task
+from cathsim_dmc.agents.policies import PolicyLike, load_policy, task_and_options
 from cathsim_dmc.agents.views import view_of
 from cathsim_dmc.analysis.force_statistics import QUANTITIES, Statistics
 from cathsim_dmc.analysis.intervals import paired_bootstrap, success_interval
@@ -271,9 +271,9 @@ def evaluate(
     episodes = conditions.episodes if episodes is None else episodes
     check_numbers(episodes, seed, num_threads)
     player = load_policy(policy, seed)
-    task = require_task(player, task)
-    settings = _settings(player, observation, task_kwargs)
-    options = settings["task_kwargs"]
+    task, options = task_and_options(player, task, task_kwargs)
+    options = options if task_kwargs is None else dict(task_kwargs)
+    settings = _settings(player, observation, options)
     outcomes: list[EpisodeOutcome] = []
     parts = protocols.parts(conditions, task, options, episodes, seed)
     for part in parts:
@@ -312,16 +312,12 @@ def check_numbers(episodes: int, seed: int, num_threads: int | None) -> None:
 
 
 def _settings(
-    policy: Policy,
-    observation: str | Sequence[str] | None,
-    task_kwargs: Mapping[str, Any] | None,
+    policy: Policy, observation: str | Sequence[str] | None, options: dict[str, Any]
 ) -> dict[str, Any]:
-    """Options of the evaluation; by default those that the policy was trained with."""
     checkpoint = getattr(policy, "checkpoint", None)
-    options = policy.task_kwargs if task_kwargs is None else task_kwargs
     return {
         "observation": observation or policy.observation or "internal",
-        "task_kwargs": dict(options or {}),
+        "task_kwargs": options,
         "frames": checkpoint.frames if checkpoint else None,
     }
 
