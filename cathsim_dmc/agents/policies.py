@@ -141,21 +141,6 @@ def _tensors(observation: Mapping[str, np.ndarray]) -> TensorDict:
     return TensorDict(environments.standard(entries, 1), batch_size=[1])
 
 
-def require_task(policy: Policy, task: str | None) -> str:
-    """The task asked for, or the one that the policy was made for.
-
-    Raises:
-        ValueError: there is neither.
-    """
-    chosen = task or policy.task
-    if chosen is None:
-        raise ValueError(
-            f"the policy {policy.name!r} was not trained on a task, so it needs a "
-            f"task to play: one of {', '.join(suite.SUITE)}"
-        )
-    return chosen
-
-
 def task_and_options(
     policy: Policy, task: str | None, options: Mapping[str, Any] | None
 ) -> tuple[str, dict[str, Any]]:
@@ -172,13 +157,18 @@ def task_and_options(
         behind where the task is another one.
 
     Raises:
-        ValueError: no task is known.
+        ValueError: `task` is None, and the policy was trained on none.
     """
     options, trained = dict(options or {}), dict(policy.task_kwargs or {})
     own = suite.TASKS[policy.task].own_options if policy.task in suite.TASKS else ()
     if task is None and policy.task and "anatomy" in {*options} - {*own}:
         task = "navigate"
-    chosen = require_task(policy, task)
-    if chosen != policy.task:
+    task = task or policy.task
+    if task is None:
+        raise ValueError(
+            f"the policy {policy.name!r} was not trained on a task, so it needs a "
+            f"task to play: one of {', '.join(suite.SUITE)}"
+        )
+    if task != policy.task:
         trained = {name: value for name, value in trained.items() if name not in own}
-    return chosen, {**trained, **options}
+    return task, {**trained, **options}
