@@ -144,9 +144,7 @@ def random_arch(task: str) -> bool:
 
 def _drawn(ranges: Randomisation, seed: int, arches: int) -> tuple[int, Episode]:
     """Number of the arch in its pool, and what else an episode of that seed draws."""
-    source = np.random.RandomState(seed)
-    arch = int(source.randint(arches)) if arches > 1 else 0
-    return arch, ranges.draw(source)
+    return ranges.draw_in(np.random.RandomState(seed), arches)
 
 
 def _conditions(

@@ -145,6 +145,13 @@ class Randomisation:
         """How much farther in an episode may begin, m."""
         return 0.0 if self.start_insertion is None else self.start_insertion[1]
 
+    def draw_in(
+        self, random_state: np.random.RandomState, anatomies: int
+    ) -> tuple[int, Episode]:
+        """Draws the number of one of so many anatomies, then an episode in it."""
+        number = int(random_state.randint(anatomies)) if anatomies > 1 else 0
+        return number, self.draw(random_state)
+
     def draw(self, random_state: np.random.RandomState) -> Episode:
         """Draws an episode; what is None takes nothing from the source."""
 

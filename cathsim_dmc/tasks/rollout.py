@@ -174,14 +174,15 @@ class Rollout:
 
     def _draw(self, index: int, random_state: np.random.RandomState) -> None:
         """Draws the episode of one simulation and puts its device to the start."""
+        ranges = self._config.ranges
+        number, episode = ranges.draw_in(random_state, len(self._cases))
         if len(self._cases) > 1:
             self.case(index).scene.anatomy.lumen.release()
-            self._case_of[index] = random_state.randint(len(self._cases))
+            self._case_of[index] = number
             self._load(index)
         case = self.case(index)
-        episode = self._config.ranges.draw(random_state)
-        number = case.start.draw(random_state)
-        case.start.write(self._state.qpos[index], episode, number)
+        posture = case.start.draw(random_state)
+        case.start.write(self._state.qpos[index], episode, posture)
         self._effects.restart(index, episode, random_state)
         self._monitor.restart(index, case.scene)
         self._sensors.restart(index, case.angiograph, episode.deviation)
