@@ -7,6 +7,7 @@ import json
 import sys
 from pathlib import Path
 
+import figures
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
@@ -174,9 +175,9 @@ def distributions():
     for name, (mean, deviation) in sampler.BRANCH_DIAMETERS.items():
         values = [2e3 * getattr(one, name).radius for one in drawn]
         row(f"Ø {name} at its origin, mm", values, (1e3 * mean, 1e3 * deviation))
-    for name, figures in sampler.TAKE_OFFS.items():
+    for name, angles in sampler.TAKE_OFFS.items():
         values = [np.degrees(getattr(one, name).take_off) for one in drawn]
-        row(f"take-off {name}, °", values, figures)
+        row(f"take-off {name}, °", values, angles)
     row(
         "root to BCA, mm",
         [1e3 * one.bend_radius * one.ascending_turn for one in found],
@@ -210,16 +211,6 @@ def gallery():
     style.save(figure, IMAGES / "random_arches.png")
 
 
-def write(blocks):
-    page = PAGE.read_text()
-    for name, lines in blocks.items():
-        begin, end = f"<!-- {name} -->", f"<!-- end of {name} -->"
-        head, rest = page.split(begin)
-        _, tail = rest.split(end)
-        page = head + begin + "\n" + "\n".join(lines) + "\n" + end + tail
-    PAGE.write_text(page)
-
-
 def main():
     anatomies = {name: phantoms.load(name) for name in phantoms.PHANTOMS}
     for name in phantoms.MEASURED:
@@ -233,7 +224,7 @@ def main():
     }
     if "--no-push" not in sys.argv:
         blocks["pushes"] = pushes(phantoms.PHANTOMS)
-    write(blocks)
+    figures.put(PAGE, **blocks)
 
 
 if __name__ == "__main__":

@@ -7,39 +7,39 @@ without it the comparison is run, which takes minutes. Only statistics are writt
 measured data may not be redistributed.
 """
 
-import datetime
 import json
 import sys
 from pathlib import Path
 
+import figures
 import numpy as np
-import validation as pages
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from cathsim_dmc import files, style
+from cathsim_dmc import style
 from cathsim_dmc.validation import Check, Report, bench
 
-PAGE = pages.DOCS / "bench.md"
-FIGURE = pages.IMAGES / "validation_bench.png"
+PAGE = figures.ROOT / "docs" / "bench.md"
+FIGURE = PAGE.parent / "images" / "validation_bench.png"
 SHOWN = (*bench.WAYS, "centreline", "nearest")
 
 
 def main(folder, report=None):
     if report:
         found = json.loads(Path(report).read_text(encoding="utf-8"))
-        checks = [Check(**check) for check in found["checks"]]
-        measured = Report(found["title"], checks, found["findings"])
+        measured = Report(
+            found["title"],
+            [Check(**check) for check in found["checks"]],
+            found["findings"],
+        )
     else:
         measured = bench.validate_bench(folder, say=print)
-    text = PAGE.read_text(encoding="utf-8")
+    command = "cathsim validate bench"
+    figures.keep("validation_bench", measured.as_dict(), command)
     tables = list(bench.tables(measured).items())
     for name, (title, rows) in zip(("frames", "sensitivity"), tables, strict=True):
-        text = pages.between(text, name, f"{title}:\n\n{markdown(rows)}")
-    text = pages.between(text, "checks", pages.checks(measured))
-    day = datetime.date.today().isoformat()
-    text = pages.between(text, "when", f"Measured on {day}.\n")
-    files.write_text(PAGE, text)
+        figures.put(PAGE, **{name: f"{title}:\n\n{markdown(rows)}"})
+    figures.main([])
     style.save(figure(measured.findings["frames"]), FIGURE)
 
 

@@ -24,6 +24,7 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).parent))
 
 import browser  # also torchrl before dm_control
+import figures
 import mujoco
 
 from cathsim_dmc import suite
@@ -42,7 +43,6 @@ EPISODES = (
     ("learnt policy", "pretrained:type1_lcca", 300),
     ("straight push into a jam", "push", 150),
 )
-_BEGIN, _END = "<!-- measured -->", "<!-- end -->"
 
 
 def main() -> None:
@@ -207,10 +207,7 @@ def write_table(values: dict, page: Path) -> None:
             f"| {each['name']} | {each['steps']} | {apart} | {task} | {success} | "
             f"{force} | {spent} | {each['python_milliseconds']:.1f} |"
         )
-    text = page.read_text()
-    before, rest = text.split(_BEGIN)
-    after = rest.split(_END)[1]
-    page.write_text("\n".join([before + _BEGIN, *lines, _END + after]))
+    figures.put(page, measured=lines)
 
 
 if __name__ == "__main__":

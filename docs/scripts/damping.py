@@ -6,15 +6,14 @@ The expert's actions with the damping as stated are played again with other damp
 (open loop), and the expert plays with that damping (closed loop).
 """
 
-import re
 from pathlib import Path
 
+import figures
 import numpy as np
 
 from cathsim_dmc import policies, suite
 
 PAGE = Path(__file__).parents[1] / "physics.md"
-BEGIN, END = "<!-- damping -->", "<!-- /damping -->"
 TASK, SEEDS = "type1_lcca", range(4)
 # Factors of the loss factor and of the viscosity.
 CASES = {"as stated": 1.0, "half": 0.5, "twice": 2.0}
@@ -54,9 +53,7 @@ def main():
             f"{steps:.0f}, {reached} of {len(own)} at the goal |"
         )
         print(rows[-1], flush=True)
-    block = "\n".join([BEGIN, *rows, END])
-    page = PAGE.read_text()
-    PAGE.write_text(re.sub(f"{BEGIN}.*{END}", lambda _: block, page, flags=re.S))
+    figures.put(PAGE, damping=rows)
 
 
 if __name__ == "__main__":

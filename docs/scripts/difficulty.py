@@ -9,13 +9,14 @@ policy on one task, that with more episodes stays, or else the later.
 """
 
 import json
-import re
 import sys
 from pathlib import Path
 
+import figures
+
 PAGE = Path(__file__).parents[1] / "difficulty.md"
 DATA = PAGE.parent / "data" / "difficulty.json"
-BEGIN, END = "<!-- measured -->", "<!-- end -->"
+COMMAND = "python benchmarks/difficulty.py"
 POLICIES = {
     "push": "straight push",
     "random": "random actions",
@@ -30,10 +31,8 @@ def main(paths):
     if missing or not reports:
         sys.exit(f"no report at {', '.join(missing) or DATA}; see the usage above")
     report = merged(reports)
-    DATA.write_text(json.dumps(report, indent=1) + "\n")
-    block = "\n".join([BEGIN, *tables(report), END])
-    page = PAGE.read_text()
-    PAGE.write_text(re.sub(f"{BEGIN}.*{END}", lambda _: block, page, flags=re.S))
+    figures.keep(DATA.stem, report, COMMAND)
+    figures.put(PAGE, measured=tables(report))
 
 
 def merged(reports):

@@ -10,9 +10,9 @@ A sample is one contact in the last physics step of a control step, as published
 import argparse
 import itertools
 import json
-import re
 from pathlib import Path
 
+import figures
 import numpy as np
 
 from cathsim_dmc import files, policies, suite
@@ -27,7 +27,6 @@ STEPS = 250
 RESTING = 40  # control steps without progress after which an episode is at its end
 NARROW, WIDE = 0.2, 0.4  # N: most lie below the first, outliers above the second
 PAGE = Path(__file__).parents[1] / "forces.md"
-BEGIN, END = "<!-- protocol -->", "<!-- end of protocol -->"
 
 
 def main():
@@ -39,9 +38,7 @@ def main():
     for policy in POLICIES:
         rows += play(policy, options.threads)
     files.write_text(options.out, json.dumps(rows, indent=1) + "\n")
-    block = "\n".join([BEGIN, *table(rows), END])
-    page = PAGE.read_text()
-    PAGE.write_text(re.sub(f"{BEGIN}.*{END}", lambda _: block, page, flags=re.S))
+    figures.put(PAGE, protocol=table(rows))
 
 
 def play(name, threads):
@@ -89,7 +86,7 @@ def play(name, threads):
             "friction": friction,
             "end": ends[i] or "out of time",
             "steps": int(lengths[i]),
-            **figures(np.array(samples[i]), np.array(cell[i]), int(lengths[i])),
+            **statistics(np.array(samples[i]), np.array(cell[i]), int(lengths[i])),
         }
         for i, (stiffness, friction) in enumerate(settings)
     ]
@@ -110,7 +107,7 @@ class Settings(RandomisedModel):
         super().restart(index, own, random_state)
 
 
-def figures(samples, cell, steps):
+def statistics(samples, cell, steps):
     """Of the contact forces (n,) and the load cell's readings (m,), N."""
     if not len(samples):
         return {"samples": 0}

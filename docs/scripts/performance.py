@@ -1,45 +1,69 @@
-"""Writes docs/performance.md's tables from `benchmarks/speed.py --json`.
+"""Measures the speed for docs/performance.md and writes its tables.
 
-python docs/scripts/performance.py  (with nothing else running)
+python docs/scripts/performance.py          (with nothing else running)
+python docs/scripts/performance.py --write  (the tables alone, from docs/data)
 """
 
-import datetime
 import json
 import re
 import subprocess
 import sys
-from pathlib import Path
 
-PAGE = Path(__file__).parents[1] / "performance.md"
-BEGIN, END = "<!-- measured -->", "<!-- end -->"
+import figures
+
+PAGE = figures.ROOT / "docs" / "performance.md"
+DATA = figures.DATA / "speed.json"
+# Rows of the page by the name of the figure; the file has all.
+BATCHED = {
+    "random, 1 thread": "1 thread",
+    "random, 2 threads": "2 threads",
+    "random, 1 thread, through TorchRL": "TorchRL, 1 thread",
+}
 
 
-def main():
-    result = subprocess.run(
-        [sys.executable, str(PAGE.parents[1] / "benchmarks/speed.py"), "--json"],
-        stdout=subprocess.PIPE,
-        text=True,
-        check=False,
-    )
-    report = json.loads(result.stdout)
-    lines = [
-        f"Measured on {datetime.date.today()}, 2 shared cores of an Intel Xeon server:",
-        "",
-        "| figure | measured | bar | |",
-        "|---|---|---|---|",
-    ]
+def measure():
+    script = figures.ROOT / "benchmarks" / "speed.py"
+    command = [sys.executable, str(script), "--json"]
+    done = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=False)
+    figures.keep("speed", json.loads(done.stdout), "python benchmarks/speed.py --json")
+
+
+def factors(report):
+    """Real-time factors by anatomy and policy."""
+    lines = ["| task | policy | real-time factor | calibrated, µs | at least |"]
+    lines.append("|---|---|---|---|---|")
+    bars = {check["name"]: check for check in report["checks"]}
+    for scene, row in report["findings"]["calibration"].items():
+        for policy, one in row.items():
+            check = bars[f"calibrated speed, {scene}, {policy}"]
+            lines.append(
+                f"| `{scene}` | {policy} | {one['real_time_factor']:.0f} "
+                f"| {check['value']:.0f} | {check['bound'].split()[1]} |"
+            )
+    return lines
+
+
+def others(report):
+    """What is not a calibrated speed."""
+    lines = ["| figure | measured | bound | |", "|---|---|---|---|"]
     for check in report["checks"]:
-        verdict = "" if check["passed"] else "**missed**"
-        note = f" ({check['note']})" if check["note"] else ""
-        lines.append(
-            f"| {check['name']}{note} | {check['value']:.3g} {check['unit']} "
-            f"| {check['bound']} | {verdict} |"
-        )
-    lines += ["", "By insertion depth (real-time factor; contacts with the wall):", ""]
-    depths = report["findings"]["by_insertion_depth"]
-    bins = sorted({key for row in depths.values() for key in row}, key=_low)
-    lines += [f"| policy | {' | '.join(bins)} |", "|---" * (len(bins) + 1) + "|"]
-    for policy, row in depths.items():
+        if not check["name"].startswith("calibrated"):
+            verdict = "" if check["passed"] else "**missed**"
+            lines.append(
+                f"| {check['name']} | {check['value']:.3g} {check['unit']} "
+                f"| {check['bound']} | {verdict} |"
+            )
+    return lines
+
+
+def depths(report):
+    table = report["findings"]["by_insertion_depth"]
+    bins = sorted(
+        {key for row in table.values() for key in row},
+        key=lambda name: float(re.match(r"\d+", name)[0]),
+    )
+    lines = [f"| policy | {' | '.join(bins)} |", "|---" * (len(bins) + 1) + "|"]
+    for policy, row in table.items():
         cells = [
             f"{row[key]['real_time_factor']:.0f} ({row[key]['contacts']:.0f})"
             if key in row
@@ -47,22 +71,31 @@ def main():
             for key in bins
         ]
         lines.append(f"| {policy} | {' | '.join(cells)} |")
-    rates = report["findings"]["batched_steps_per_second"]
-    lines += ["", "Batched control steps per second, 16 simulations, random:", ""]
-    lines += [f"- {name}: {rate:.0f}" for name, rate in rates.items()]
-    lines += ["", "Where a control step of 40 ms goes, µs on one core:", ""]
-    stages = report["findings"]["microseconds_in_a_control_step"]
-    lines += [f"| | {' | '.join(stages)} |", "|---" * (len(stages) + 1) + "|"]
-    for stage in next(iter(stages.values())):
-        cells = [f"{table[stage]:.0f}" for table in stages.values()]
+    return lines
+
+
+def stages(report):
+    table = report["findings"]["microseconds_in_a_control_step"]
+    lines = [f"| | {' | '.join(table)} |", "|---" * (len(table) + 1) + "|"]
+    for stage in next(iter(table.values())):
+        cells = [f"{column[stage]:.0f}" for column in table.values()]
         lines.append(f"| {stage} | {' | '.join(cells)} |")
-    page = PAGE.read_text()
-    block = BEGIN + "\n" + "\n".join(lines) + "\n" + END
-    PAGE.write_text(re.sub(f"{BEGIN}.*{END}", lambda _: block, page, flags=re.S))
+    return lines
 
 
-def _low(name: str) -> float:
-    return float(re.match(r"\d+", name).group())
+def batches(report):
+    rates = report["findings"]["batched_steps_per_second"]
+    lines = ["| 16 simulations | control steps per second |", "|---|---|"]
+    return lines + [f"| {row} | {rates[key]:.0f} |" for row, key in BATCHED.items()]
+
+
+def main():
+    if "--write" not in sys.argv:
+        measure()
+    report = json.loads(DATA.read_text())
+    makers = (factors, others, depths, stages, batches)
+    blocks = {make.__name__: make(report) for make in makers}
+    figures.put(PAGE, measured=figures.since(report), **blocks)
 
 
 if __name__ == "__main__":

@@ -10,10 +10,10 @@ with those that are missing. `--write` puts the table into docs/difficulty.md.
 import argparse
 import dataclasses
 import json
-import re
 import sys
 from pathlib import Path
 
+import figures
 import numpy as np
 
 from cathsim_dmc import policies, suite
@@ -26,7 +26,6 @@ import difficulty
 
 TASKS = ("arch_bca", "arch_lcca", "femoral_arch_bca", "femoral_arch_lcca")
 PAGE = Path(__file__).parents[1] / "difficulty.md"
-BEGIN, END = "<!-- arches -->", "<!-- end of arches -->"
 
 
 def main():
@@ -38,9 +37,7 @@ def main():
     parser.add_argument("--write", action="store_true")
     options = parser.parse_args()
     if options.write:
-        block = "\n".join([BEGIN, *table(read(options.out)), END])
-        page = PAGE.read_text()
-        PAGE.write_text(re.sub(f"{BEGIN}.*{END}", lambda _: block, page, flags=re.S))
+        figures.put(PAGE, arches=table(read(options.out)))
         return
     done = {(row["task"], row["arch"]) for row in read(options.out)}
     # Both goals of an arch in turn: it is built once.

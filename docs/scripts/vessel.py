@@ -4,11 +4,11 @@ python docs/scripts/vessel.py [--episodes 10]
 """
 
 import argparse
-import re
 import sys
 import time
 from pathlib import Path
 
+import figures
 import numpy as np
 
 from cathsim_dmc import suite
@@ -93,12 +93,7 @@ def main():
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--episodes", type=int, default=10)
     episodes = parser.parse_args().episodes
-    text = PAGE.read_text(encoding="utf-8")
-    for name, table in (("cost", costs()), ("policies", judged(episodes))):
-        begin, end = f"<!-- {name} -->", f"<!-- /{name} -->"
-        pattern = re.escape(begin) + ".*?" + re.escape(end)
-        text = re.sub(pattern, f"{begin}\n{table}\n{end}", text, flags=re.DOTALL)
-    PAGE.write_text(text, encoding="utf-8")
+    figures.put(PAGE, cost=costs(), policies=judged(episodes))
 
 
 if __name__ == "__main__":

@@ -1,0 +1,188 @@
+"""Figures of README and the pages: kept in docs/data, written between markers.
+
+    python docs/scripts/figures.py                          # writes all pages
+    python docs/scripts/figures.py NAME COMMAND             # keeps a report, from stdin
+
+A page quotes a figure as `<!-- = NAME -->` VALUE `<!-- -->`; what is between is written
+here. `docs/data/figures.json` holds single figures: value, unit, command, date, machine
+and commit by name. A report of a command (`--json`) is a file of its own there, with
+the last four beside its checks and findings; its figures are called `FILE: CHECK` and
+`FILE: FINDING: …`. `{.1f}` behind a name is the format of its value.
+
+Where a page has the marker `report FILE`, the checks stand as a table: a row for all
+checks whose names differ in numbers or devices alone, with the worst.
+"""
+
+import datetime
+import json
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+ROOT = Path(__file__).parents[2]
+DATA = ROOT / "docs" / "data"
+ORIGIN = ("command", "date", "machine", "commit")
+QUOTED = re.compile(r"<!-- = (.+?)(?: \{(\S+)\})? -->(.*?)<!-- -->", re.DOTALL)
+REPORT = re.compile(r"<!-- report (\w+) -->")
+_VARIED = re.compile(r"\b(?:\w+_\w+|type\d|patient)\b(?: in \w+_\w+)?|\d+(?:\.\d+)?")
+
+
+def pages() -> list[Path]:
+    """README and all pages."""
+    return [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
+
+
+def between(text: str, name: str, content: str) -> str:
+    """The text with the part between `<!-- name -->` and `<!-- /name -->` replaced."""
+    head, rest = text.split(f"<!-- {name} -->\n")
+    _, tail = rest.split(f"<!-- /{name} -->")
+    return f"{head}<!-- {name} -->\n{content.rstrip()}\n<!-- /{name} -->{tail}"
+
+
+def put(page: Path, **blocks: str | list[str]) -> None:
+    """Replaces blocks of a page; `_` in a name stands for a blank."""
+    text = page.read_text(encoding="utf-8")
+    for name, content in blocks.items():
+        lines = content if isinstance(content, str) else "\n".join(content)
+        text = between(text, name.replace("_", " "), lines)
+    page.write_text(text, encoding="utf-8")
+
+
+def origin(command: str) -> dict[str, str]:
+    """Where a figure comes from: the command, today, this machine, this commit."""
+    model = next(
+        line.split(":")[1].strip()
+        for line in Path("/proc/cpuinfo").read_text().splitlines()
+        if line.startswith("model name")
+    )
+    commit = subprocess.check_output(
+        ["git", "describe", "--always", "--dirty=+"], text=True, cwd=ROOT
+    ).strip()
+    values = command, str(datetime.date.today()), f"{os.cpu_count()} × {model}", commit
+    return dict(zip(ORIGIN, values, strict=True))
+
+
+def keep(name: str, report: dict, command: str) -> None:
+    """Writes a report with its origin to docs/data."""
+    values = {**origin(command), **report}
+    (DATA / f"{name}.json").write_text(json.dumps(values, indent=1) + "\n")
+
+
+def since(report: dict) -> str:
+    """A sentence: when, where and by which command a report was measured."""
+    return (
+        f"Measured on {report['date']} by `{report['command']}` on {report['machine']} "
+        f"(shared), commit {report['commit']}."
+    )
+
+
+def families(checks: list[dict]) -> dict[str, list[dict]]:
+    """Checks of one unit and bound whose names differ in numbers or devices alone."""
+    found = {}
+    for check in checks:
+        name = _VARIED.sub("…", check["name"]).removeprefix("…: ")
+        found.setdefault((name, check["unit"], check["bound"]), []).append(check)
+    return {
+        (key[0] if len(group) > 1 else group[0]["name"], *key[1:]): group
+        for key, group in found.items()
+    }
+
+
+def table(checks: list[dict]) -> list[str]:
+    """Rows with the worst figure of each family."""
+    rows = ["| check | worst | bound | figures |", "|---|---|---|---|"]
+    for (name, unit, bound), group in families(checks).items():
+        worst = max if bound.startswith("<=") else min
+        value = f"{worst(check['value'] for check in group):.3g} {unit}".strip()
+        if not all(check["passed"] for check in group):
+            value = f"**{value}**, missed"
+        rows.append(f"| {name} | {value} | {bound} {unit} | {len(group)} |")
+    return rows
+
+
+def figures() -> dict[str, dict]:
+    """All figures by name."""
+    found = json.loads((DATA / "figures.json").read_text())
+    for path in sorted(DATA.glob("*.json")):
+        report = json.loads(path.read_text())
+        if not isinstance(report, dict) or "checks" not in report:
+            continue
+        source = {key: report[key] for key in ORIGIN}
+        for check in report["checks"]:
+            name = f"{path.stem}: {check['name']}"
+            found[name] = {"value": check["value"], "unit": check["unit"], **source}
+        for name, value in _leaves(path.stem, report.get("findings", {})):
+            found[name] = {"value": value, "unit": "", **source}
+    return found
+
+
+def _leaves(name, value):
+    if isinstance(value, dict):
+        for key, each in value.items():
+            yield from _leaves(f"{name}: {key}", each)
+    elif isinstance(value, (int, float)):
+        yield name, value
+
+
+def filled(text: str, known: dict[str, dict]) -> str:
+    """The text with every quoted figure as it is known.
+
+    Raises:
+        KeyError: the text quotes a figure that is not known.
+    """
+
+    def write(match: re.Match) -> str:
+        name, form, _ = match.groups()
+        if name not in known:
+            raise KeyError(f"no figure {name!r} in docs/data")
+        value, unit = known[name]["value"], known[name]["unit"]
+        shown = value if isinstance(value, str) else format(value, form or ".3g")
+        shown = shown.replace("%", " %")
+        head = match.group(0).split("-->")[0]
+        return f"{head}-->{shown} {unit}".rstrip() + "<!-- -->"
+
+    return QUOTED.sub(write, text)
+
+
+def written() -> dict[Path, str]:
+    """Every page as it is to be."""
+    known, texts = figures(), {}
+    for page in pages():
+        text = filled(page.read_text(encoding="utf-8"), known)
+        for name in REPORT.findall(text):
+            report = json.loads((DATA / f"{name}.json").read_text())
+            lines = [since(report), "", *table(report["checks"])]
+            text = between(text, f"report {name}", "\n".join(lines))
+        texts[page] = text
+    page = ROOT / "docs" / "figures.md"
+    texts[page] = between(texts[page], "figures", sources(known))
+    return texts
+
+
+def sources(known: dict[str, dict]) -> str:
+    """The table of the figures that some page quotes, with their origin."""
+    rows = ["| figure | value | command | date | commit |", "|---|---|---|---|---|"]
+    quoted = {m[1] for page in pages() for m in QUOTED.finditer(page.read_text())}
+    for name in sorted(quoted):
+        one = known[name]
+        value = one["value"]
+        shown = value if isinstance(value, str) else f"{value:.3g}"
+        rows.append(
+            f"| {name} | {shown} {one['unit']} | `{one['command']}` | {one['date']} "
+            f"| {one['commit']} |"
+        )
+    return "\n".join(rows)
+
+
+def main(arguments: list[str]) -> None:
+    if arguments:
+        name, command = arguments
+        keep(name, json.load(sys.stdin), command)
+    for page, text in written().items():
+        page.write_text(text, encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])

@@ -1,0 +1,130 @@
+"""Every figure of the pages comes from docs/data, and prose states no other."""
+
+import importlib.util
+import json
+import re
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+STATED = json.loads((ROOT / "docs" / "data" / "stated.json").read_text())
+
+_UNIT = (
+    r"(?:%|°|(?:[mµkMG]?(?:N|m|s|g|Hz|B|Pa)|min|m[Ll]|rad|nats|times"
+    r"|(?:control )?steps|episodes|frames|images)(?:[·/][\w²³]+)*(?!\w))"
+)
+_AMOUNT = r"[-+−±]?\d[\d,]*(?:\.\d+)?(?:[eE]-?\d+)?"
+# A number or a range with its unit, or a rate such as "7 of 10".
+_FIGURE = re.compile(
+    rf"(?<![\w.,/^-]){_AMOUNT}(?:(?: (?:to|and|or|/|±) |[–±]){_AMOUNT})*\s?{_UNIT}"
+    rf"|(?<!\w)\d+ of \d+(?!\w)"
+)
+# What holds no prose, or a figure with its source.
+_ELSEWHERE = re.compile(
+    r"```.*?```"
+    r"|<!-- = .+? -->.*?<!-- -->"
+    r"|<!-- ([\w ]+) -->\n.*?<!-- /\1 -->"
+    r"|<!-- (\w+) -->\n.*?<!-- end of \2 -->"
+    r"|(?m:^    [^\n]*$)"
+    r"|`[^`\n]+`|\]\([^)]*\)",
+    re.DOTALL,
+)
+
+
+def figures_of(text, stated=()):
+    """Figures in the prose of a page that are neither generated nor stated.
+
+    A row of a table whose last column is called `source` names its source itself.
+    """
+    lines, sourced = [], False
+    for line in _ELSEWHERE.sub(" ", text).splitlines():
+        cells = [cell.strip() for cell in line.strip().strip("|").split("|")]
+        if not line.startswith("|"):
+            sourced = False
+        elif cells[-1] == "source":
+            sourced = True
+        if not sourced or not cells[-1]:
+            lines.append(line)
+    prose = re.sub(r"\s+", " ", "\n".join(lines))
+    return [one for one in _FIGURE.findall(prose) if one not in stated]
+
+
+def stated_in(page):
+    """What a page may state: definitions, its own, by the reason they are there."""
+    own = STATED.get(page, {})
+    return {one for group in (STATED["everywhere"], own) for row in group.values()
+            for one in row}  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def script():
+    """The module docs/scripts/figures.py."""
+    path = ROOT / "docs" / "scripts" / "figures.py"
+    spec = importlib.util.spec_from_file_location("figures", path)
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_the_pages_hold_the_figures_of_their_data(script):
+    for page, text in script.written().items():
+        assert page.read_text() == text, (
+            f"{page.name} is out of date; run docs/scripts/figures.py"
+        )
+
+
+def test_every_figure_has_its_origin(script):
+    for name, figure in script.figures().items():
+        assert set(figure) == {"value", "unit", *script.ORIGIN}, name
+        assert all(figure[key] for key in script.ORIGIN), name
+
+
+def test_a_quoted_figure_follows_its_data(script):
+    known = {"reset": {"value": 0.71234, "unit": "ms"}}
+    text = "a reset takes <!-- = reset -->1.8 ms<!-- -->"
+    assert script.filled(text, known).endswith("-->0.712 ms<!-- -->")
+    with pytest.raises(KeyError, match="no figure 'memory'"):
+        script.filled("<!-- = memory -->166 MB<!-- -->", known)
+
+
+def test_a_quoted_figure_does_not_begin_a_line(script):
+    """It would be a block of HTML there, and end the paragraph."""
+    for page in script.pages():
+        assert "\n<!-- = " not in page.read_text(), page.name
+
+
+@pytest.mark.parametrize(
+    "text, found",
+    [
+        ("A reset takes 0.7 ms.", ["0.7 ms"]),
+        ("intrusion of 0.42 mm and 30 of\n30 episodes", ["0.42 mm", "30 of 30"]),
+        ("| memory | 233 MB |", ["233 MB"]),
+        ("| a | source |\n|---|---|\n| 0.18 times | Jianu |\n\n9 N", ["9 N"]),
+        ("| a | source |\n|---|---|\n| 0.18 times | |", ["0.18 times"]),
+        ("a reset takes <!-- = reset -->0.7 ms<!-- -->; `0.7 ms`", []),
+        ("<!-- cost -->\n| 5 ms |\n<!-- /cost -->", []),
+        ("a control step of 40 ms", []),
+    ],
+)
+def test_a_typed_figure_is_found(text, found):
+    assert figures_of(text, stated={"40 ms"}) == found
+
+
+@pytest.mark.parametrize("page", STATED["reviewed"])
+def test_prose_states_no_figure_that_was_measured(page):
+    left = figures_of((ROOT / page).read_text(), stated_in(page))
+    assert not left, (
+        f"{page} states {left}; quote them from docs/data (docs/scripts/figures.py), "
+        "or give the reason in docs/data/stated.json"
+    )
+
+
+def test_what_may_be_stated_is_stated():
+    """No entry outlives its sentence."""
+    for page, groups in STATED.items():
+        if page in ("reviewed", "everywhere"):
+            continue
+        found = set(figures_of((ROOT / page).read_text()))
+        left = {one for row in groups.values() for one in row} - found
+        assert not left, f"{page} no longer states {sorted(left)}"
