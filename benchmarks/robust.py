@@ -19,12 +19,14 @@ import tyro
 
 from cathsim_dmc.agents import evaluation, protocols
 from cathsim_dmc.agents.evaluation import SAFE_FORCES
+from cathsim_dmc.anatomy.arch import arch
 from cathsim_dmc.tasks.anatomies import load_anatomy
 
 GOALS = ("bca", "lcca", "lsa")
 ACCESSES = ("ascending", "descending")
 PHANTOMS = ("type1", "type2", "type3", "bovine")
-TEST_ARCHES = 98
+# Held-out sets of arches with their sizes.
+TEST_ARCHES, VARIANTS = ("test", arch.TEST_SIZE), ("test_variants", 48)
 # What the device and the surroundings of one episode may differ in, one at a time.
 CHANGES = {
     "none": {},
@@ -37,7 +39,7 @@ CHANGES = {
     },
     "goal": {"goal_shift": (-5e-3, 5e-3)},
 }
-Part = Literal["arches", "anatomies", "changes"]
+Part = Literal["arches", "variants", "anatomies", "changes"]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -57,8 +59,22 @@ def arches():
     for goal in GOALS:
         for access in ACCESSES:
             where = {"goal": goal, "access": access}
-            options = {**where, "arches": "test", "pool": TEST_ARCHES}
-            yield Cell("arches", where, "arch_any", options, TEST_ARCHES)
+            yield arch_cell("arches", where, *TEST_ARCHES)
+
+
+def variants():
+    """Held-out arches of type III, bovine ones and aberrant ones, twice each.
+
+    The branch and the access of an arch follow from its number.
+    """
+    where = {"goal": "any", "access": "any"}
+    yield arch_cell("variants", where, *VARIANTS, rounds=2)
+
+
+def arch_cell(part, where, arches, pool, rounds=1):
+    """Every arch of a set, so many times."""
+    options = {**where, "arches": arches, "pool": pool}
+    return Cell(part, where, "arch_any", options, rounds * pool)
 
 
 def anatomies(names, episodes=20):
@@ -110,6 +126,7 @@ def play(policy: str, cell: Cell) -> dict:
         "mean_force": round(float(found.values("forces.mean_force").mean()), 6),
         "largest_sum": round(float(sums.max()), 4),
         "by_device": _shares([one.get("device") for one in drawn], reached),
+        "by_kind": _shares([_kind(cell, one) for one in drawn], reached),
         "missed_arches": [
             one["arch"]
             for one, good in zip(drawn, reached, strict=True)
@@ -118,6 +135,14 @@ def play(policy: str, cell: Cell) -> dict:
         "seconds": round(time.monotonic() - began, 1),
         "date": time.strftime("%Y-%m-%d"),
     }
+
+
+def _kind(cell, drawn):
+    """Kind of the arch that an episode has drawn, such as "II bovine_trunk"."""
+    if "arch" not in drawn:
+        return None
+    seed = arch.arch_set(cell.options["arches"])[drawn["arch"]]
+    return f"{seed.arch_type} {seed.variant}"
 
 
 def _shares(groups, reached):
@@ -133,7 +158,7 @@ def _shares(groups, reached):
 def main(
     policy: Annotated[str, tyro.conf.Positional],
     out: Path,
-    only: tuple[Part, ...] = ("arches", "anatomies", "changes"),
+    only: tuple[Part, ...] = ("arches", "variants", "anatomies", "changes"),
     anatomy: tuple[str, ...] = PHANTOMS,
 ) -> None:
     """Play the cells that are missing in a file.
@@ -144,7 +169,11 @@ def main(
         only: Parts to play.
         anatomy: Names or directories of the anatomies of the part `anatomies`.
     """
-    cells = {"arches": arches, "anatomies": lambda: anatomies(anatomy)}
+    cells = {
+        "arches": arches,
+        "variants": variants,
+        "anatomies": lambda: anatomies(anatomy),
+    }
     cells["changes"] = changes
     lines = out.read_text().splitlines() if out.exists() else []
     done = [json.loads(line) for line in lines]

@@ -77,13 +77,29 @@ def devices(rows):
     lines = ["| policy | device | success, % (95 %), episodes |", "|---|---|---|"]
     for policy in sorted({row["policy"] for row in rows}):
         counts = {}
-        for row in rows:
-            if row["policy"] == policy:
-                for name, (good, episodes) in row["by_device"].items():
-                    old = counts.get(name, (0, 0))
-                    counts[name] = old[0] + good, old[1] + episodes
+        for row in (row for row in rows if row["policy"] == policy):
+            _count(row["by_device"], counts)
         lines += [f"| `{policy}` | `{n}` | {rate(*c)} |" for n, c in counts.items()]
     return lines
+
+
+def kinds(rows):
+    """Success by kind of arch, over the held-out arches of a policy."""
+    lines = ["| policy | kind | success, % (95 %), episodes |", "|---|---|---|"]
+    for policy in sorted({row["policy"] for row in rows}):
+        counts = {}
+        for row in (row for row in rows if row["policy"] == policy):
+            _count(row.get("by_kind", {}), counts)
+        for name, count in sorted(counts.items()):
+            shown = name.replace("_", " ").removesuffix(" normal")
+            lines.append(f"| `{policy}` | {shown} | {rate(*count)} |")
+    return lines
+
+
+def _count(shares, counts):
+    for name, (good, episodes) in shares.items():
+        old = counts.get(name, (0, 0))
+        counts[name] = old[0] + good, old[1] + episodes
 
 
 def anatomies(rows):
@@ -137,6 +153,7 @@ def main():
     }
     varied = [row for row in rows.values() if row["part"] != "changes"]
     found["devices"] = devices(varied)
+    found["kinds"] = kinds([r for r in varied if r["part"] != "anatomies"])
     for name, lines in found.items():
         block = "\n".join([f"<!-- {name} -->", *lines, f"<!-- end of {name} -->"])
         pattern = f"<!-- {name} -->.*<!-- end of {name} -->"
