@@ -49,27 +49,26 @@ reward and length of episodes it was trained with. Published figures are those o
 et al., whose simulator, phantoms' walls and force readings differ (see
 [physics.md](physics.md), [forces.md](forces.md)): rates can be compared, forces only in
 their order of magnitude. Agents have the preset `tuned` unless their row says
-otherwise, those that read images `tuned_image`; [training.md](training.md) tells how
-these were found.
+otherwise, those that read images `tuned_image` ([training.md](training.md)).
 """
 
 COLUMNS = """\
-Success counts the episodes of all seeds together. The episodes of one anatomy differ by
-1 mm of the start, so they are nearly one and have no interval; where each has an arch
-of its own, Wilson's 95 % interval stands beside it. `cathsim eval --protocol varied`
-plays distinct conditions ([how-to.md](how-to.md#evaluate-under-varied-conditions)).
-*worst*
-is that of the worst seed. Forces are those of [forces.md](forces.md), ± deviation over
-episodes, in mN: mean force is the sum over all contacts, mean over all steps; mean
-contact force is the largest contact, mean over the steps with contact, which is nearest
-to the published f_mean; max force is the largest contact of an episode, which is the
-published f_max. `–` is not there.
+Cells show ours / published. Success counts the episodes of all seeds together, *worst*
+those of the worst seed. The episodes of one anatomy differ by 1 mm of the start, so
+they are nearly one and have no interval; where each has an arch of its own, Wilson's
+95 % interval stands beside it. `cathsim eval --protocol varied` plays distinct
+conditions ([robustness.md](robustness.md)).
+
+Forces are those of [forces.md](forces.md) in mN, ± deviation over episodes: *mean
+force* is the sum over all contacts, mean over all steps; *contact force* is the largest
+contact, mean over the steps with contact, nearest to the published f_mean; *max force*
+is the largest contact of an episode, the published f_max.
 """
 
 HEADER = (
-    "| agent | seeds | success | worst | reward | mean force "
-    "| mean contact force | max force | published: success | reward | f_mean | f_max |",
-    "|---|---|---|---|---|---|---|---|---|---|---|---|",
+    "| agent | seeds | success | worst | reward | mean force | contact force "
+    "| max force |",
+    "|---|---|---|---|---|---|---|---|",
 )
 
 
@@ -103,15 +102,16 @@ def read_all(directory):
 def page(results, broken, cells, out):
     """The text of the page; draws its figures beside it."""
     table = arranged(results, cells)
-    parts = [INTRODUCTION, standing(results, broken, cells)]
+    parts = [INTRODUCTION]
     if results:
         parts += [
+            aggregates(table),
             beside_published(table),
             other_tasks(table),
-            aggregates(table),
-            cost(results, cells),
+            cost(table),
             *drawn(table, out),
         ]
+    parts.append(standing(results, broken, cells))
     return "\n".join(part for part in parts if part)
 
 
@@ -130,30 +130,22 @@ def arranged(results, cells):
 
 
 def standing(results, broken, cells):
-    """What is there and what is missing."""
+    """What is missing."""
     missing = [cell for cell in cells if cell.name not in results]
     lines = [
-        "## What is there",
+        "## What is missing",
         "",
         f"{len(cells) - len(missing)} of the {len(cells)} cells of the grid "
         f"(`benchmarks/grid.toml`) are finished.",
+        "",
     ]
-    others = sorted(set(results) - {cell.name for cell in cells})
-    if others:
-        lines += ["", f"Beside the grid there are: {', '.join(others)}."]
-    if missing:
-        lines += ["", "Missing:", ""]
-        rows = {}
-        for cell in missing:
-            rows.setdefault((cell.label, cell.task), []).append(str(cell.seed))
-        labels = dict.fromkeys(label for label, _ in rows)
-        for label in labels:
-            of = [
-                f"{task} (seed {', '.join(seeds)})"
-                for (one, task), seeds in rows.items()
-                if one == label
-            ]
-            lines.append(f"- {label}: {'; '.join(of)}")
+    rows = {}
+    for cell in missing:
+        seeds = rows.setdefault(cell.label, {}).setdefault(cell.task, [])
+        seeds.append(str(cell.seed))
+    for label, tasks in rows.items():
+        of = (f"{task} (seed {', '.join(seeds)})" for task, seeds in tasks.items())
+        lines.append(f"- {label}: {'; '.join(of)}")
     if broken:
         lines += ["", "Cannot be read, and are left out:", ""]
         lines += [f"- {line}" for line in broken]
@@ -202,7 +194,7 @@ def other_tasks(table):
         if task in PUBLISHED_TASKS:
             continue
         for label, found in agents_.items():
-            cells = [task, label, *figures_of(found), by_group(found)]
+            cells = [task, label, *figures_of(found)]
             cells.append(percent(experts[task]) if task in experts else "–")
             lines.append(f"| {' | '.join(cells)} |")
     if not lines:
@@ -212,8 +204,8 @@ def other_tasks(table):
             "## Further tasks",
             "",
             "| task | agent | seeds | success (95 %) | worst | reward | mean force "
-            "| mean contact force | max force | success by kind of arch | expert |",
-            "|---|---|---|---|---|---|---|---|---|---|---|",
+            "| contact force | max force | expert |",
+            "|---|---|---|---|---|---|---|---|---|---|",
             *lines,
             "",
         ]
@@ -239,8 +231,11 @@ def expert_rates():
 
 def row(label, found, theirs):
     """A line of a table: ours, and the published figures of the same agent."""
-    ours = figures_of(found) if found else ["–"] * 7
-    return f"| {' | '.join([label, *ours, *published_figures(theirs)])} |"
+    cells = [label, *(figures_of(found) if found else ["–"] * 7)]
+    if theirs is not None:
+        for place, text in published_figures(theirs).items():
+            cells[place] += f" / {text}"
+    return f"| {' | '.join(cells)} |"
 
 
 def figures_of(found):
@@ -263,28 +258,14 @@ def figures_of(found):
     ]
 
 
-def by_group(found):
-    """Success in each kind of arch, where episodes have one each."""
-    reached = {}
-    for result in found:
-        groups = result.evaluation.get("groups") or ()
-        for group, success in zip(
-            groups, result.evaluation["episodes"]["success"], strict=False
-        ):
-            reached.setdefault(group, []).append(success)
-    parts = (f"{name}: {sum(one)} of {len(one)}" for name, one in reached.items())
-    return ", ".join(sorted(parts)) or "–"
-
-
 def published_figures(theirs):
-    if theirs is None:
-        return ["–"] * 4
-    return [
-        percent(theirs["success"]),
-        "{:.0f} ± {:.0f}".format(*theirs["reward"]),
-        "{:.0f} ± {:.0f}".format(*(1e3 * value for value in theirs["mean_force"])),
-        "{:.0f} ± {:.0f}".format(*(1e3 * value for value in theirs["max_force"])),
-    ]
+    """Published figures by the column of ours."""
+    return {
+        2: percent(theirs["success"]),
+        4: "{:.0f} ± {:.0f}".format(*theirs["reward"]),
+        6: "{:.0f} ± {:.0f}".format(*(1e3 * value for value in theirs["mean_force"])),
+        7: "{:.0f} ± {:.0f}".format(*(1e3 * value for value in theirs["max_force"])),
+    }
 
 
 def spread(found, name, scale, digits):
@@ -372,45 +353,33 @@ def interquartile_mean(scores, resamples=10_000, seed=0):
     return mean, (float(low), float(high))
 
 
-def cost(results, cells):
-    """Frames and time of every training."""
+def cost(table):
+    """Frames and time of the trainings of each agent."""
     lines = [
         "## Frames and time",
         "",
-        "*To 90 %*: when the last 100 training episodes, which explore and may be "
-        "shorter than 2,000 steps, first had 90 % success; at least 100 must have "
-        "ended. Times are wall times on the machine named, beside whatever else ran "
-        "there (*load* is the number of running processes over the last 15 minutes).",
+        "Means over seeds. *To 90 %*: frames at which the last 100 training episodes "
+        "first had 90 % success. Times are wall times of shared machines; the files in "
+        "`results/` have those of each seed with machine, load and commit.",
         "",
-        "| cell | frames | time | frames/s | frames to 90 % | time to 90 % | load "
-        "| machine | commit |",
-        "|---|---|---|---|---|---|---|---|---|",
+        "| task | agent | seeds | frames | time | frames/s | frames to 90 % |",
+        "|---|---|---|---|---|---|---|",
     ]
-    order = {cell.name: index for index, cell in enumerate(cells)}
-    for name in sorted(results, key=lambda n: (order.get(n, len(order)), n)):
-        values = results[name].values
-        training, machine = values["training"], values["machine"]
-        solved = training["solved"]
-        columns = [
-            name,
-            f"{training['frames']:,}",
-            clock(training["seconds"]),
-            f"{results[name].frames_per_second:.0f}",
-            f"{solved['frames']:,.0f}" if solved else "–",
-            clock(solved["seconds"]) if solved else "–",
-            f"{training['load']}" if training.get("load") is not None else "–",
-            f"{machine['cores']} × {machine['processor']}",
-            commit_of(values),
-        ]
-        lines.append(f"| {' | '.join(columns)} |")
+    for task, agents_ in table.items():
+        for label, found in agents_.items():
+            trainings = [result.values["training"] for result in found]
+            solved = [one["solved"]["frames"] for one in trainings if one["solved"]]
+            columns = [
+                task,
+                label,
+                str(len(found)),
+                f"{np.mean([one['frames'] for one in trainings]):,.0f}",
+                clock(np.mean([one["seconds"] for one in trainings])),
+                f"{np.mean([result.frames_per_second for result in found]):.0f}",
+                f"{np.mean(solved):,.0f}" if len(solved) == len(found) else "–",
+            ]
+            lines.append(f"| {' | '.join(columns)} |")
     return "\n".join(lines) + "\n"
-
-
-def commit_of(values):
-    """The commit of a result, with "+" where files differed from it."""
-    commit = values.get("commit") or "–"
-    differed = values.get("modified") or commit.endswith("+")
-    return commit[:7] + "+" * bool(differed)
 
 
 def drawn(table, out):
