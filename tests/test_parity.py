@@ -13,7 +13,8 @@ SIMULATIONS = 2
 STEPS = 60
 SEED = 10
 NUMBERS = ("internal", "tracking", "route", "goal", "force")
-PICTURES = ("image", "sequential", "segmentation", "tracking_2d")
+PICTURES = ("image", "sequential", "segmentation", "tracking_2d", "endoluminal")
+SMALL = {"size": 16}
 NOISY_BIPLANE = {"biplane": "LATERAL", "noise": True, "size": (48, 64), "roadmap": 0.4}
 
 
@@ -113,6 +114,7 @@ def test_randomised_episodes_are_equal():
         "type1",
         observation=[*NUMBERS, *PICTURES],
         fluoroscopy=NOISY_BIPLANE,
+        cameras=SMALL,
         randomisation=True,
         reward={"path": -1.0, "success": 10.0, "force": -0.1, "smoothness": -0.01},
     )

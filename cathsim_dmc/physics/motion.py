@@ -197,6 +197,11 @@ class Moving(Effect):
         ]
         return np.array(found)
 
+    def warp(self, index: int) -> tuple[np.ndarray, np.ndarray, float]:
+        """Lattice, parameters and time (s) of one simulation, for `motion_loops`."""
+        parameters = self.world.parameters[index]
+        return self._motions[index].lattice, parameters, self._time()[index]
+
     def _time(self) -> list[float]:
         """Time of what MuJoCo has derived: one physics step before the end."""
         return np.maximum(self._clock - self._step, 0.0).tolist()

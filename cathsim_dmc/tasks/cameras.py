@@ -10,13 +10,13 @@ import mujoco
 import numpy as np
 
 from cathsim_dmc import bounds
+from cathsim_dmc.imaging.options import VIEW_ANGLE
 
 CAMERAS = ("top", "side", "tip")
 KINDS = ("rgb", "depth")
 
 # A chip-on-tip endoscope: wide angle, in the middle of the rounded end of the device,
 # so that a wall which the tip touches is still in front of it.
-_TIP_FIELD_OF_VIEW = 90.0  # degrees, vertical
 # That wall is a device radius away; MuJoCo's default clips it at centimetres.
 NEAREST = 0.3e-3  # m
 FARTHEST = 10.0  # m, the top view stands 0.7 m away
@@ -29,7 +29,7 @@ _SITE_GROUPS = (4, 5)
 
 @dataclasses.dataclass(frozen=True)
 class CameraOptions:
-    """Which cameras `rgb` and `depth` show.
+    """Which cameras `rgb` and `depth` show, and the size of endoluminal views.
 
     Attributes:
         names: of `CAMERAS`: "top" as published, "side", and "tip", an endoscope.
@@ -71,7 +71,7 @@ def add_tip_camera(arena, catheter) -> None:
         name="tip",
         pos=(0, 0, catheter.link_lengths[-1]),
         xyaxes=(1, 0, 0, 0, -1, 0),  # a camera looks along its -z
-        fovy=_TIP_FIELD_OF_VIEW,
+        fovy=VIEW_ANGLE,
     )
 
 

@@ -1,6 +1,6 @@
 """Image sensors of N simulations, with the last few images of each."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import astuple
 
 import mujoco
@@ -13,6 +13,8 @@ from cathsim_dmc.tasks import cameras, observations
 from cathsim_dmc.tasks.common_chain import CommonChain
 from cathsim_dmc.tasks.frame import NO_IMAGES, Images
 
+ENDOLUMINAL = ("endoluminal", "endoluminal_distance")
+
 
 class ImageSensors:
     """Captures the images that the observations ask for, of N simulations."""
@@ -24,6 +26,7 @@ class ImageSensors:
         num_simulations: int,
         chain: CommonChain,
         gl_cameras: cameras.Cameras | None = None,
+        endoscope: Callable[[np.ndarray], Mapping[str, np.ndarray]] | None = None,
     ):
         """Prepares the sensors.
 
@@ -32,9 +35,14 @@ class ImageSensors:
             num_simulations: N.
             chain: The device as observations show it.
             gl_cameras: MuJoCo's cameras; None without `rgb` and `depth`.
+            endoscope: Function from numbers (K,) of simulations to the endoluminal
+                views (K, ...) from their heads, by name.
         """
         self._names, self._chain = names, chain
-        self._on = angiograph is not None or gl_cameras is not None
+        self._endoscope = endoscope if self._wants(*ENDOLUMINAL) else None
+        self._on = any(
+            each is not None for each in (angiograph, gl_cameras, self._endoscope)
+        )
         self._cameras = gl_cameras
         self._planes: list[angiographs.Planes] = []
         self._deviations = [angiographs.Deviation()] * num_simulations
@@ -107,6 +115,9 @@ class ImageSensors:
         kinds = [kind for kind in cameras.KINDS if kind in self._names]
         if kinds and self._cameras is not None:
             for key, view in self._cameras.see(kinds, qpos[chosen]).items():
+                self._hold(f"view_{key}", view, count, fresh)
+        if self._endoscope is not None:
+            for key, view in self._endoscope(chosen).items():
                 self._hold(f"view_{key}", view, count, fresh)
         return self._latest()
 

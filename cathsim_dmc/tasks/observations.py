@@ -8,6 +8,7 @@ from operator import attrgetter
 
 import numpy as np
 
+from cathsim_dmc.imaging.options import FARTHEST_WALL, VIEW_ANGLE
 from cathsim_dmc.physics.sliding import DEVICE_PLACES
 from cathsim_dmc.tasks.common_chain import TRACKED_PLACES
 from cathsim_dmc.tasks.frame import Frame
@@ -332,9 +333,45 @@ def vessel(frame: Frame) -> Observation:
     }
 
 
+def _endoluminal(
+    key: str, unit: str, meaning: str, high: float, dtype: type[np.number]
+) -> Entry:
+    def shape(sizes: Sizes) -> tuple[int, ...]:
+        return (*sizes.cameras.resolution, 1)
+
+    meaning += f", over {VIEW_ANGLE:g}° from the head along its axis; right and down: "
+    meaning += "x and y of the tip frame"
+    return Entry(key, shape, unit, meaning, 0, high, dtype)
+
+
+@OBSERVATIONS.row(
+    _endoluminal(
+        "endoluminal", "grey level", "wall lit by a lamp at the head", 255, np.uint8
+    )
+)
+def endoluminal(frame: Frame) -> Observation:
+    """View of the lumen from the head, without OpenGL."""
+    return {"endoluminal": _captured(frame.images.views["endoluminal"])}
+
+
+@OBSERVATIONS.row(
+    _endoluminal(
+        "endoluminal_distance",
+        "m",
+        "way to the wall along the ray of each pixel",
+        FARTHEST_WALL,
+        np.float32,
+    )
+)
+def endoluminal_distance(frame: Frame) -> Observation:
+    """Distances to the wall from the head, without OpenGL."""
+    views = frame.images.views
+    return {"endoluminal_distance": _captured(views["endoluminal_distance"])}
+
+
 def _views(frame: Frame, kind: str) -> Observation:
     views = frame.images.views
-    return {key: view for key, view in views.items() if key.startswith(kind)}
+    return {key: view for key, view in views.items() if key.startswith(f"{kind}_")}
 
 
 # Coaxial devices.

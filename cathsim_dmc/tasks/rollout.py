@@ -115,6 +115,7 @@ class Rollout:
             num_simulations,
             self._chain,
             open_cameras(self._names, model, config.camera_options, catheter),
+            self._endoscope,
         )
         self._tracking = TrackingNoise(config.ranges.tracking_noise, num_simulations)
         self._monitor = PhysicsMonitor(scene, num_simulations)
@@ -313,6 +314,23 @@ class Rollout:
         frame = Frame(state, force, self._action, goal, chain, images, ahead, devices)
         frame = frame._replace(vessel=self._measured.vessel)
         return observations.observe(self._names, frame)
+
+    def _endoscope(self, indices: np.ndarray) -> dict[str, np.ndarray]:
+        """What the heads of some simulations (K,) see of the wall, by name."""
+        from cathsim_dmc.imaging import endoluminal  # late: it brings the compiler
+
+        moving, state = self._moving, self.readings
+        warps = [
+            endoluminal.AT_REST if moving is None else moving.warp(i) for i in indices
+        ]
+        grey, distance = endoluminal.views(
+            [self.case(index).scene.anatomy.lumen for index in indices],
+            warps,
+            state.head[indices],
+            state.head_frame[indices],
+            self._config.camera_options.resolution,
+        )
+        return {"endoluminal": grey, "endoluminal_distance": distance}
 
     # Snapshots.
 

@@ -1,7 +1,7 @@
 """What the image observations of a task show, option by option.
 
-Writes docs/images/observation_views.png (needs no OpenGL) and, where there is OpenGL
-(MUJOCO_GL=osmesa or egl), docs/images/camera_views.png.
+Writes docs/images/observation_views.png and endoluminal.png (without OpenGL) and, where
+there is OpenGL (MUJOCO_GL=osmesa or egl), docs/images/camera_views.png.
 """
 
 from __future__ import annotations
@@ -16,6 +16,8 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 from cathsim_dmc import suite
+from cathsim_dmc.anatomy.arch import arch
+from cathsim_dmc.imaging import endoluminal as views
 from cathsim_dmc.tasks.cameras import CAMERAS
 
 IMAGES = Path(__file__).parents[1] / "images"
@@ -99,9 +101,34 @@ def cameras() -> Path:
     return path
 
 
+def endoluminal() -> Path:
+    """From places along the way to the LCCA of `type3`, looking ahead."""
+    anatomy = arch.load("type3")
+    way = anatomy.route("lcca")
+    figure, axes = plt.subplots(2, 4, figsize=(10, 5.2), layout="constrained")
+    for column, share in zip(axes.T, (0.1, 0.3, 0.5, 0.65), strict=True):
+        place = way.at(share * way.length)
+        forward = place.tangent
+        across = np.cross([0.0, 1.0, 0.0], forward)
+        across /= np.linalg.norm(across)
+        frame = np.stack([across, np.cross(forward, across), forward], axis=1)
+        heads, still = place.position[None], [views.AT_REST]
+        seen = views.views([anatomy.lumen], still, heads, frame[None], (256, 256))
+        grey, distance = (each[0, ..., 0] for each in seen)
+        column[0].imshow(grey, cmap="gray", vmin=0, vmax=255)
+        far = column[1].imshow(1e3 * distance, cmap="viridis_r", vmin=0, vmax=130)
+        column[0].set_title(f"{1e3 * share * way.length:.0f} mm from the inlet")
+        column[0].set_axis_off(), column[1].set_axis_off()
+    figure.colorbar(far, ax=axes[1], label="distance (mm)", shrink=0.8)
+    path = IMAGES / "endoluminal.png"
+    figure.savefig(path, dpi=70, pil_kwargs={"optimize": True})
+    return path
+
+
 def main() -> None:
     """Draws the figures."""
     print(fluoroscopy())
+    print(endoluminal())
     if os.environ.get("MUJOCO_GL", "disable") != "disable":
         print(cameras())
 

@@ -83,6 +83,13 @@ endoscope at the distal end.
 `task_kwargs={{"cameras": {{"names": [...], "size": 128}}}}`
 selects them.
 
+`endoluminal` and `endoluminal_distance` see from the same place and at the same angle
+as `tip`, without OpenGL: rays are traced through the lumen, at rest or moving. The
+option `cameras` sets their size too. The device itself is not seen, and an open end of
+the lumen is closed.
+
+![From the aorta to a branch: grey levels and distances](images/endoluminal.png)
+
 ![Cameras](images/camera_views.png)
 """
 
