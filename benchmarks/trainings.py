@@ -36,6 +36,9 @@ HERE = Path(__file__).parent
 FORMAT = 2
 POINTS = 200  # of the learning curve
 SOLVED = 0.9  # success rate that "solved" stands for
+GUIDED = (
+    0.05  # share of an expert's control steps above which an episode is not counted
+)
 # Columns of metrics.csv that make the learning curve, as far as they are there.
 _CURVE = ("frames", "seconds", "episodes", "episode_reward", "episode_length")
 _CURVE += ("success", "distance", "mean_force", "max_force")
@@ -267,10 +270,16 @@ def solved(rows):
     """Frames and seconds at which the success of training episodes reached `SOLVED`.
 
     It is the mean over the last 100 finished episodes, so the first 100 are passed
-    over: those that end early are the successful ones. None if it never did.
+    over: those that end early are the successful ones. Where an expert acts in more
+    than `GUIDED` of the control steps (DAgger), episodes count afterwards only. None if
+    it never did.
     """
+    guided = 0.0
     for row in rows:
-        enough = (row.get("episodes") or 0) >= EPISODE_WINDOW
+        episodes = row.get("episodes") or 0.0
+        if (row.get("expert_share") or 0.0) > GUIDED:
+            guided = episodes
+        enough = episodes - guided >= EPISODE_WINDOW
         if enough and (row.get("success") or 0.0) >= SOLVED:
             return {"frames": row["frames"], "seconds": row["seconds"]}
     return None

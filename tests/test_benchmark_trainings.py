@@ -187,3 +187,15 @@ def test_a_bad_grid_is_refused_before_any_work(grid, change, word):
     with pytest.raises(ValueError, match=word) as error:
         grid(ROW.replace(*change))
     assert "grid.toml" in str(error.value)
+
+
+@pytest.mark.parametrize("shares, frames", [([0.0] * 4, 200), ([1, 0.5, 0.02, 0], 400)])
+def test_episodes_that_an_expert_drives_do_not_count_as_solved(shares, frames):
+    rows = [
+        {"frames": 100 * n, "seconds": n, "episodes": 60.0 * n, "success": 1.0}
+        for n in range(1, 5)
+    ]
+    for row, share in zip(rows, shares, strict=True):
+        row["expert_share"] = share
+
+    assert trainings.solved(rows) == {"frames": frames, "seconds": frames / 100}
