@@ -14,7 +14,7 @@ from cathsim_dmc import cli
 from cathsim_dmc.anatomy import export, phantoms
 from cathsim_dmc.anatomy.centreline import Centreline, Vessel, VesselTree
 from cathsim_dmc.anatomy.convex_wall import wall_pieces
-from cathsim_dmc.validation.force_sensors import straight_tube
+from cathsim_dmc.validation.rig import tube as straight_tube
 
 
 @pytest.fixture(scope="module")

@@ -19,7 +19,7 @@ from cathsim_dmc.recording.episode import Episode
 from cathsim_dmc.recording.rerun_log import write_rrd
 from cathsim_dmc.tasks import physics_errors
 from cathsim_dmc.tasks.snapshot import Snapshot
-from cathsim_dmc.validation import force_sensors
+from cathsim_dmc.validation import rig
 
 ERRORS = (ValueError, OSError, RuntimeError)  # of readers of files
 TREE = {
@@ -82,7 +82,7 @@ def write_demonstrations(path):
 def store(tmp_path_factory):
     """One good file or folder of every kind."""
     folder = tmp_path_factory.mktemp("store")
-    force_sensors.straight_tube(0.06, 4e-3).save(folder / "anatomy")
+    rig.tube(0.06, 4e-3).save(folder / "anatomy")
     make_episode().save(folder / "episode.npz")
     write_rrd(make_episode(), make_tube(), folder / "episode.rrd")
     write_demonstrations(folder / "demos-v0")

@@ -116,3 +116,12 @@ def lumen_surface(tree: VesselTree, spacing: float | None = None) -> Surface:
     if surface.volume < 0.0:
         surface = Surface(surface.vertices, surface.faces[:, ::-1])
     return surface
+
+
+def sampled(surface: Surface, count: int) -> tuple[Array, Array]:
+    """Random places (n, 3) m all over a surface, and unit normals (n, 3) out of it."""
+    import trimesh
+
+    mesh = trimesh.Trimesh(surface.vertices, surface.faces, process=False)
+    points, face = trimesh.sample.sample_surface(mesh, count, seed=0)
+    return np.asarray(points), np.asarray(mesh.face_normals[face])

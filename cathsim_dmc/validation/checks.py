@@ -35,7 +35,7 @@ class Check:
 
     @classmethod
     def at_most(
-        cls, name: str, value: float, bound: float, unit: str, note: str = ""
+        cls, name: str, value: float, bound: float, unit: str = "", note: str = ""
     ) -> Check:
         """A check of value <= bound; a value that is no number fails."""
         value = float(value)
@@ -43,7 +43,7 @@ class Check:
 
     @classmethod
     def at_least(
-        cls, name: str, value: float, bound: float, unit: str, note: str = ""
+        cls, name: str, value: float, bound: float, unit: str = "", note: str = ""
     ) -> Check:
         """A check of value >= bound; a value that is no number fails."""
         value = float(value)
@@ -56,9 +56,13 @@ class Check:
         measured: float,
         expected: float,
         percent: float,
+        unit: str = "",
         note: str = "",
     ) -> Check:
         """A check that |measured / expected - 1| is at most `percent` %.
+
+        Args:
+            unit: of both quantities, which the note states if none is given.
 
         Raises:
             ValueError: if the expected quantity is zero or no number.
@@ -68,7 +72,21 @@ class Check:
                 f"check {name!r} expects {expected!r}; a relative deviation needs a "
                 "finite quantity other than 0"
             )
+        note = note or f"{measured:.5g} {unit}, expected {expected:.5g} {unit}".rstrip()
         return cls.at_most(name, 100 * abs(measured / expected - 1), percent, "%", note)
+
+
+class Checks(list[Check]):
+    """Checks in the order in which they are made; methods as those of `Check`."""
+
+    def at_most(self, *row: Any) -> None:  # noqa: D102
+        self.append(Check.at_most(*row))
+
+    def at_least(self, *row: Any) -> None:  # noqa: D102
+        self.append(Check.at_least(*row))
+
+    def deviation(self, *row: Any) -> None:  # noqa: D102
+        self.append(Check.deviation(*row))
 
 
 @dataclasses.dataclass(frozen=True)

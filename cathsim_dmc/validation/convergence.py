@@ -7,9 +7,10 @@ from typing import Any
 
 import numpy as np
 
+from cathsim_dmc.anatomy import Centreline
 from cathsim_dmc.tasks.config import PHYSICS_TIMESTEP, NavigationConfig
 from cathsim_dmc.validation import insertion
-from cathsim_dmc.validation.checks import Check
+from cathsim_dmc.validation.checks import Check, Checks
 
 TIMESTEPS = (0.001, 0.002, 0.004, 0.008)  # s
 SHAFT_LINKS = (0.005, 0.007, 0.010, 0.014, 0.0175, 0.025)  # m
@@ -46,7 +47,7 @@ def study(
     options = [{**fixed, parameter: value} for value in ascending]
     runs = [insertion.run(script, **each) for each in options]  # type: ignore
     away = [1e3 * np.linalg.norm(run.head - runs[0].head, axis=1) for run in runs]
-    track = [1e3 * polyline_distance(run.head, runs[0].head) for run in runs]
+    track = [1e3 * _off(run.head, runs[0].head) for run in runs]
     return {
         "script": script.name,
         "parameter": parameter,
@@ -61,14 +62,11 @@ def study(
     }
 
 
-def polyline_distance(points: np.ndarray, line: np.ndarray) -> np.ndarray:
-    """Distance (n,) of points (n, 3) from a polyline (m, 3), in their unit."""
-    start, along = line[:-1], np.diff(line, axis=0)
-    square = np.maximum((along**2).sum(-1), np.finfo(float).tiny)
-    offset = points[:, None] - start
-    share = np.clip((offset * along).sum(-1) / square, 0.0, 1.0)
-    nearest = offset - share[..., None] * along
-    return np.sqrt((nearest**2).sum(-1).min(axis=1))
+def _off(points: np.ndarray, line: np.ndarray) -> np.ndarray:
+    """Distances (n,) of points (n, 3) from a polyline (m, 3), m."""
+    moves = np.append(True, np.any(np.diff(line, axis=0) != 0.0, axis=1))
+    track = Centreline(line[moves], np.ones(moves.sum()))
+    return track.project(points).distance
 
 
 def studies() -> list[dict[str, Any]]:
@@ -83,32 +81,23 @@ def studies() -> list[dict[str, Any]]:
 
 def checks(results: Sequence[dict[str, Any]]) -> list[Check]:
     """Whether the defaults, which are among the values, are converged."""
-    found = []
+    found = Checks()
     for one in results:
         default, finest = DEFAULTS[one["parameter"]], one["value"][0]
         of_step = one["parameter"] == "physics_timestep"
         kind, unit = ("step", "ms") if of_step else ("links", "mm")
-        label = f"{kind} of {1e3 * default:g} {unit} against {1e3 * finest:g} {unit}"
+        label = f"{kind} of {1e3 * default:g} {unit} against {1e3 * finest:g} {unit}, "
+        label += one["script"]
         index = int(np.flatnonzero(np.isclose(one["value"], default))[0])
-        found.append(
-            Check.at_most(
-                f"{label}, {one['script']}: mean distance of the tip paths",
-                one["path_mean_mm"][index],
-                PATH_BOUND,
-                "mm",
-                f"largest {one['path_max_mm'][index]:.2f} mm, off the track by at "
-                f"most {one['track_max_mm'][index]:.2f} mm",
-            )
+        note = f"largest {one['path_max_mm'][index]:.2f} mm, off the track by at most "
+        note += f"{one['track_max_mm'][index]:.2f} mm"
+        path, name = (
+            one["path_mean_mm"][index],
+            f"{label}: mean distance of the tip paths",
         )
-        force, reference = one["force_mean"][index], one["force_mean"][0]
-        if reference > LEAST_FORCE:
-            found.append(
-                Check.deviation(
-                    f"{label}, {one['script']}: mean wall force",
-                    force,
-                    reference,
-                    FORCE_BOUND,
-                    f"{1e3 * force:.1f} mN against {1e3 * reference:.1f} mN",
-                )
-            )
+        found.at_most(name, path, PATH_BOUND, "mm", note)
+        force, reference = (1e3 * one["force_mean"][k] for k in (index, 0))
+        if reference > 1e3 * LEAST_FORCE:
+            name = f"{label}: mean wall force"
+            found.deviation(name, force, reference, FORCE_BOUND, "mN")
     return found

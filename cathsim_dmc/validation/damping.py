@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import dataclasses
 import types
-from typing import NamedTuple
 
 import mujoco
 import numpy as np
@@ -25,7 +24,7 @@ from cathsim_dmc.physics.drives import Drives
 from cathsim_dmc.physics.effects import Effects, Episode, World, userdata_size
 from cathsim_dmc.physics.readings import ids
 from cathsim_dmc.physics.stepper import CONTROL_TIMESTEP
-from cathsim_dmc.validation.checks import Check
+from cathsim_dmc.validation.checks import Check, Checks
 from cathsim_dmc.validation.rig import Rig
 
 RELEASE_BOUND = 5.0  # % of frequency and decay
@@ -51,22 +50,6 @@ def _uniform() -> devices.Device:
     )
 
 
-class Release(NamedTuple):
-    """End of a device after its release, and that of the beam."""
-
-    time: np.ndarray  # (n,), s
-    simulated: np.ndarray  # (n,), m
-    expected: np.ndarray  # (n,), m
-
-    @property
-    def figures(self) -> tuple[float, float, float, float]:
-        """Frequencies (Hz) and decay rates (1/s), simulated and expected."""
-        mine, theirs = (
-            _swing(self.time, curve) for curve in (self.simulated, self.expected)
-        )
-        return mine[0], theirs[0], mine[1], theirs[1]
-
-
 def _swing(time: np.ndarray, curve: np.ndarray) -> tuple[float, float]:
     """Frequency (Hz) and decay rate (1/s) of the first swings of a curve."""
     crossings = np.flatnonzero(curve[:-1] * curve[1:] < 0)[:5]
@@ -81,11 +64,14 @@ def _swing(time: np.ndarray, curve: np.ndarray) -> tuple[float, float]:
     return 0.5 / half, float(decay)
 
 
-def release(*, blood: bool = True) -> Release:
+def release(*, blood: bool = True) -> tuple[float, float, float, float]:
     """Releases a bent cantilever of 0.2 m from the shape of its first mode.
 
     Args:
         blood: whether it is in blood, or without any fluid.
+
+    Returns:
+        Frequencies, simulated and of the beam, Hz; decay rates likewise, 1/s.
     """
     one = _uniform()
     rig = Rig(one, devices.Discretisation(working_length=_FREE + LINK / 2))
@@ -118,7 +104,9 @@ def release(*, blood: bool = True) -> Release:
         mujoco.mj_kinematics(rig.model, rig.data)
         curve.append(rig.head_position[0])
     time = rig.model.opt.timestep * np.arange(len(curve))
-    return Release(time, np.array(curve), _beam(one, length, start, time, blood))
+    mine = _swing(time, np.array(curve))
+    theirs = _swing(time, _beam(one, length, start, time, blood))
+    return mine[0], theirs[0], mine[1], theirs[1]
 
 
 def fill(rig: Rig, blood: StillBlood) -> None:
@@ -183,18 +171,11 @@ def drag(velocity: np.ndarray, diameter: float) -> np.ndarray:
     return 0.5 * BLOOD_DENSITY * diameter * coefficient * speed * velocity
 
 
-class Spin(NamedTuple):
-    """Lag of the end of a device that turns in a frictionless half circle."""
+def spin(speed: float) -> tuple[float, float]:
+    """Mean lag of the end and Σ τ ω θ²/C of the joints through the twist, rad.
 
-    speed: float  # rad/s
-    lag: float  # mean over a turn, rad
-    expected: float  # Σ of τ ω θ² / C over the joints, through the twist, rad
-
-
-def spin(speed: float) -> Spin:
-    """Turns a device in a half circle of 40 mm, for one turn after the first quarter.
-
-    A joint of compliance C that is bent by θ brakes the turning with τ ω θ²/C, where τ
+    A device turns in a half circle of 40 mm, for one turn after the first quarter. A
+    joint of compliance C that is bent by θ brakes the turning with τ ω θ²/C, where τ
     is the relaxation time of the material; the torsion hinges bear the sum of all
     joints beyond them.
     """
@@ -220,7 +201,7 @@ def spin(speed: float) -> Spin:
         brakes[hinges > twist].sum() / rig.model.jnt_stiffness[twist]
         for twist in _twist_hinges(rig)
     )
-    return Spin(speed, float(-twists.sum(axis=1).mean()), float(expected))
+    return float(-twists.sum(axis=1).mean()), float(expected)
 
 
 def _twist_hinges(rig: Rig) -> np.ndarray:
@@ -286,48 +267,22 @@ def three_point(span: float, link: float, on_joint: bool) -> float:
 
 def checks() -> list[Check]:
     """Release, turning and three-point bending."""
-    made = []
+    made = Checks()
     for medium, blood in (("still blood", True), ("air", False)):
-        mine, theirs, decay, expected = release(blood=blood).figures
-        label = f"release of a cantilever in {medium}"
-        made += [
-            Check.deviation(
-                f"{label}, frequency",
-                mine,
-                theirs,
-                RELEASE_BOUND,
-                f"{mine:.3f} Hz, beam {theirs:.3f} Hz",
-            ),
-            Check.deviation(
-                f"{label}, decay",
-                decay,
-                expected,
-                RELEASE_BOUND,
-                f"{decay:.3f} 1/s, beam {expected:.3f} 1/s",
-            ),
-        ]
-    for one in map(spin, SPEEDS):
-        lag, expected = np.degrees([one.lag, one.expected])
-        made.append(
-            Check.at_most(
-                f"lag in a frictionless half circle at {one.speed:g} rad/s, "
-                "deviation from that of the material",
-                abs(lag - expected),
-                SPIN_BOUND,
-                "°",
-                f"{lag:.1f}°, Σ τωθ²/C {expected:.1f}°",
-            )
-        )
+        mine, theirs, decay, expected = release(blood=blood)
+        name = f"release of a cantilever in {medium}"
+        made.deviation(f"{name}, frequency", mine, theirs, RELEASE_BOUND, "Hz")
+        made.deviation(f"{name}, decay", decay, expected, RELEASE_BOUND, "1/s")
+    for speed in SPEEDS:
+        lag, expected = np.degrees(spin(speed))
+        name = f"lag in a frictionless half circle at {speed:g} rad/s, deviation from "
+        name += "that of the material"
+        note = f"{lag:.1f}°, Σ τωθ²/C {expected:.1f}°"
+        made.at_most(name, abs(lag - expected), SPIN_BOUND, "°", note)
     for span in SPANS:
         ratios = [three_point(span, SPAN_LINK, on_joint) for on_joint in (True, False)]
         worst = max(ratios, key=lambda ratio: abs(ratio - 1))
-        made.append(
-            Check.deviation(
-                f"three-point bending, span {1e3 * span:.0f} mm, links of 7 mm",
-                worst,
-                1.0,
-                SPAN_BOUND,
-                f"load on a joint {ratios[0]:.4f}, on a link {ratios[1]:.4f} FS³/48EI",
-            )
-        )
+        name = f"three-point bending, span {1e3 * span:.0f} mm, links of 7 mm"
+        note = "load on a joint {:.4f}, on a link {:.4f} FS³/48EI".format(*ratios)
+        made.deviation(name, worst, 1.0, SPAN_BOUND, "", note)
     return made

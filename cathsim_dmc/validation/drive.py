@@ -9,7 +9,7 @@ import numpy as np
 from cathsim_dmc.entities.chain import MAX_PUSH_FORCE, MAX_PUSH_SPEED
 from cathsim_dmc.physics.drives import Drives
 from cathsim_dmc.physics.stepper import CONTROL_TIMESTEP
-from cathsim_dmc.validation.checks import Check
+from cathsim_dmc.validation.checks import Check, Checks
 from cathsim_dmc.validation.rig import Rig
 
 JAM = 3.0  # N
@@ -58,29 +58,13 @@ def slip_force() -> float:
 
 def checks() -> list[Check]:
     """Holds, moves and slips under load."""
-    driven = Driven()
+    made, driven = Checks(), Driven()
     driven.move(0.4, 0.0, 0.0)
-    held = driven.move(10.0, 0.0, JAM)
+    held = 1e3 * abs(driven.move(10.0, 0.0, JAM))
+    made.at_most(f"drive, command 0, {JAM:g} N for 10 s: way", held, HOLD_BOUND, "mm")
     driven.move(0.4, 1.0, JAM)
-    moved = driven.move(1.0, 1.0, JAM)
-    return [
-        Check.at_most(
-            f"drive, command 0, {JAM:g} N for 10 s: way",
-            1e3 * abs(held),
-            HOLD_BOUND,
-            "mm",
-        ),
-        Check.deviation(
-            f"drive, full speed against {JAM:g} N",
-            moved,
-            MAX_PUSH_SPEED,
-            SPEED_BOUND,
-            f"{1e3 * moved:.3f} mm/s",
-        ),
-        Check.deviation(
-            "drive, force at which the clamp slips",
-            slip_force(),
-            MAX_PUSH_FORCE,
-            SLIP_BOUND,
-        ),
-    ]
+    moved, name = driven.move(1.0, 1.0, JAM), f"drive, full speed against {JAM:g} N"
+    made.deviation(name, moved, MAX_PUSH_SPEED, SPEED_BOUND, "m/s")
+    name = "drive, force at which the clamp slips"
+    made.deviation(name, slip_force(), MAX_PUSH_FORCE, SLIP_BOUND, "N")
+    return made

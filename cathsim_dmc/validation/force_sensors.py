@@ -12,8 +12,6 @@ import numpy as np
 
 from cathsim_dmc import suite
 from cathsim_dmc.anatomy.anatomy import Anatomy
-from cathsim_dmc.anatomy.builder import VesselPlace
-from cathsim_dmc.anatomy.centreline import Centreline, Vessel, VesselTree
 from cathsim_dmc.anatomy.field import Field
 from cathsim_dmc.entities.chain import MAX_PUSH_SPEED
 from cathsim_dmc.entities.phantom import Phantom
@@ -21,8 +19,8 @@ from cathsim_dmc.physics import forces
 from cathsim_dmc.recording.episode import Episode
 from cathsim_dmc.tasks.config import PHYSICS_TIMESTEP
 from cathsim_dmc.validation import insertion, protocol
-from cathsim_dmc.validation.checks import Check, Report
-from cathsim_dmc.validation.rig import Rig
+from cathsim_dmc.validation.checks import Checks, Report
+from cathsim_dmc.validation.rig import Rig, tube
 
 BALANCE_BOUND = 1.0  # %
 RESTING_LOADS = (0.01, 0.1, 1.0)  # N
@@ -34,6 +32,7 @@ GUIDING_TUBE = (0.04, 1.5e-3)
 WIDE_TUBE = (0.1, 2e-3)
 AVERAGING = 1.0  # s
 LARGEST_PUSH = 4.0  # N, in a dead end
+SETTLING = 3.0  # s, after the tip could have arrived there
 INSERTION_SPEEDS = (0.25, 0.5, 1.0)  # of 40 mm/s
 INSERTION_SEEDS = 5
 # The tip straight, and bent towards the wall of the branch.
@@ -42,32 +41,24 @@ USUAL_FORCE = 0.2  # N, most forces on phantoms lie below
 USUAL_SHARE = 90.0  # %, "most"
 
 
-class Resting(NamedTuple):
-    """The last link resting on a plate under a load, N."""
+def resting_link(load: float) -> np.ndarray:
+    """Presses the last link of the straight device on a plate with a load, N.
 
-    load: float  # on the middle of the link
-    contacts: float  # sum of the contact sensor, force of the device on the plate
-    load_cell: float  # of the plate on its support
-    base: float  # part of the load on the base, by its sensor
-    penetration: float  # m
-
-
-def resting_link(load: float) -> Resting:
-    """Presses the last link of the straight device on a plate with a load, N."""
+    Returns:
+        Force of the device on the plate by the contact sensor, by the load cell under
+        the plate, and by the sensor of the base, N; penetration, m.
+    """
     rig = Rig()
     wall = Phantom(plate(rig.device.outer_radius))
     rig.arena.attach(wall)
     wall.add_wall(rig.catheter.links[0])
     rig.compile()
     steps = round(RESTING_TIME / rig.model.opt.timestep)
-    last = round(AVERAGING / rig.model.opt.timestep)
     rows = []
     for step in range(steps):
         share = min(1.0, step * rig.model.opt.timestep)
         rig.data.xfrc_applied[rig.tip_body, 1] = share * load
         rig.step()
-        if step < steps - last:
-            continue
         contacts = forces.Contacts.from_sensor(rig.sensor("wall_contacts"))
         rows.append(
             (
@@ -78,12 +69,12 @@ def resting_link(load: float) -> Resting:
                 contacts.penetration.max(),
             )
         )
-    return Resting(load, *np.mean(rows, axis=0).tolist())
+    return np.mean(rows[-round(AVERAGING / rig.model.opt.timestep) :], axis=0)
 
 
 def walled(field: Field, name: str) -> Anatomy:
     """An anatomy whose wall is any field; its tree stands for nothing."""
-    anatomy = dataclasses.replace(straight_tube(*GUIDING_TUBE), name=name)
+    anatomy = dataclasses.replace(tube(*GUIDING_TUBE), name=name)
     vars(anatomy)["lumen"] = field
     return anatomy
 
@@ -98,15 +89,6 @@ def plate(height: float) -> Anatomy:
     return walled(field, "plate")
 
 
-def straight_tube(length: float, radius: float) -> Anatomy:
-    """A straight vessel along +z, closed at its far end; m."""
-    z = np.linspace(0.0, length, 13)
-    line = Centreline(np.stack([0 * z, 0 * z, z], axis=-1), np.full(len(z), radius))
-    tree = VesselTree({"tube": Vessel("tube", line, None, 0.0)})
-    end = VesselPlace("tube", arc_length=length - 1e-3)
-    return Anatomy.from_tree(tree, "tube", goals={"end": end})
-
-
 class DeadEnd(NamedTuple):
     """The device pushed against the blind end of a tube; averages over a second, N."""
 
@@ -118,29 +100,15 @@ class DeadEnd(NamedTuple):
     ripple: float  # standard deviation of the push force
 
 
-def dead_end(
-    command: float,
-    tube: tuple[float, float] = GUIDING_TUBE,
-    *,
-    settling: float = 3.0,
-) -> DeadEnd:
+def dead_end(command: float, size: tuple[float, float] = GUIDING_TUBE) -> DeadEnd:
     """Pushes the device of the tasks against the end of a straight tube.
 
     Args:
         command: of the translation, in (0, 1].
-        tube: length and radius, m.
-        settling: s after the tip could have arrived.
+        size: length and radius of the tube, m.
     """
-    environment = suite.load(
-        "cathsim",
-        "navigate",
-        task_kwargs={
-            "random": 0,
-            "anatomy": straight_tube(*tube),
-            "goal": "end",
-            "goal_radius": 1e-6,
-        },
-    )
+    place = {"anatomy": tube(*size), "goal": "end", "goal_radius": 1e-6}
+    environment = suite.load("cathsim", "navigate", {"random": 0, **place})
     task = environment.task
     environment.reset()
     model, data = environment.physics.model.ptr, environment.physics.data.ptr
@@ -149,8 +117,8 @@ def dead_end(
     push = command * LARGEST_PUSH
     model.actuator_forcerange[motor.id] = -push, push
     sheath = environment.physics.bind(task.scene.sheath.bodies).element_id
-    way = tube[0] - task.scene.placement.start_depth
-    steps = round((settling + way / (command * MAX_PUSH_SPEED)) / PHYSICS_TIMESTEP)
+    way = size[0] - task.scene.placement.start_depth
+    steps = round((SETTLING + way / (command * MAX_PUSH_SPEED)) / PHYSICS_TIMESTEP)
     rows = []
     for step in range(steps):
         mujoco.mj_step(model, data)
@@ -167,11 +135,8 @@ def dead_end(
             )
         )
     rows = np.array(rows)
-    return DeadEnd(
-        push,
-        *rows.mean(axis=0).tolist(),
-        ripple=float(rows[:, 0].std()),
-    )
+    means = rows.mean(axis=0).tolist()
+    return DeadEnd(push, *means, ripple=float(rows[:, 0].std()))
 
 
 def _axial_force_on(model, data, sheath: np.ndarray) -> float:
@@ -224,80 +189,58 @@ def validate_forces(
     Raises:
         ValueError: if the episode has too few contacts for statistics.
     """
-    checks = []
-    rested = [resting_link(load) for load in RESTING_LOADS]
-    for one in rested:
-        checks.append(
-            Check.deviation(
-                f"last link resting under {one.load:g} N, contact sensor",
-                one.contacts,
-                one.load,
-                BALANCE_BOUND,
-                f"{one.contacts:.5f} N, load cell {one.load_cell:.5f} N, "
-                f"{1e3 * one.penetration:.2f} mm deep",
-            )
+    checks, pushed = Checks(), {"guiding": [], "wide": []}
+    for load in RESTING_LOADS:
+        contacts, load_cell, _, depth = resting_link(load)
+        name = f"last link resting under {load:g} N, contact sensor"
+        note = (
+            f"{contacts:.5f} N, load cell {load_cell:.5f} N, {1e3 * depth:.2f} mm deep"
         )
-    pushed = {"guiding": [dead_end(command) for command in PUSHES]}
-    pushed["wide"] = [dead_end(command, WIDE_TUBE) for command in PUSHES]
-    for one in pushed["guiding"]:
-        for name, value in (("load cell", one.load_cell), ("contacts", one.contacts)):
-            checks.append(
-                Check.deviation(
-                    f"dead end, motor {one.motor:g} N: push force = {name}",
-                    value,
-                    one.push,
-                    BALANCE_BOUND,
-                    f"{one.push:.4f} N, {value:.4f} N",
-                )
-            )
-    for one in pushed["wide"]:
-        checks.append(
-            Check.deviation(
-                f"wide dead end, motor {one.motor:g} N: push force = load cell + rim "
-                "of the sheath",
-                one.load_cell + one.sheath,
-                one.push,
-                BALANCE_BOUND,
-                f"{one.push:.4f} N, {one.load_cell:.4f} N, {one.sheath:.4f} N",
-            )
-        )
+        checks.deviation(name, contacts, load, BALANCE_BOUND, "N", note)
+    for command in PUSHES:
+        one = dead_end(command)
+        pushed["guiding"].append(one)
+        for what, value in (("load cell", one.load_cell), ("contacts", one.contacts)):
+            name = f"dead end, motor {one.motor:g} N: push force = {what}"
+            checks.deviation(name, value, one.push, BALANCE_BOUND, "N")
+    for command in PUSHES:
+        one = dead_end(command, WIDE_TUBE)
+        pushed["wide"].append(one)
+        name = f"wide dead end, motor {one.motor:g} N: push force = load cell + rim "
+        name += "of the sheath"
+        value = one.load_cell + one.sheath
+        checks.deviation(name, value, one.push, BALANCE_BOUND, "N")
     cannulations = scripted_cannulations()
     for speed, runs in cannulations.items():
         single = np.concatenate([run.contact_forces for run in runs])
-        peak = max(run.peak.max() for run in runs)
-        checks.append(
-            Check.at_least(
-                f"insertion into the BCA at {40 * speed:g} mm/s: contact forces up to "
-                f"{USUAL_FORCE:g} N",
-                100 * float((single <= USUAL_FORCE).mean()),
-                USUAL_SHARE,
-                "%",
-                f"{len(single)} samples of {len(runs)} insertions "
-                f"({sum(run.success for run in runs)} arrive), mean "
-                f"{1e3 * single.mean():.2f} mN, largest {peak:.3f} N",
-            )
+        checks.at_least(
+            f"insertion into the BCA at {40 * speed:g} mm/s: contact forces up to "
+            f"{USUAL_FORCE:g} N",
+            100 * float((single <= USUAL_FORCE).mean()),
+            USUAL_SHARE,
+            "%",
+            f"{len(single)} samples of {len(runs)} insertions "
+            f"({sum(run.success for run in runs)} arrive), mean "
+            f"{1e3 * single.mean():.2f} mN, largest "
+            f"{max(run.peak.max() for run in runs):.3f} N",
         )
     samples = _samples(episode, cannulations)
     comparison = protocol.compare(samples, reference_mean, reference_sd, margin)
-    findings = {
-        "protocol": comparison,
-        "ripple of the push force against a dead end, N": {
-            tube: {f"{one.motor:g} N": one.ripple for one in runs}
-            for tube, runs in pushed.items()
-        },
+    ripples = {
+        name: {f"{one.motor:g} N": one.ripple for one in runs}
+        for name, runs in pushed.items()
     }
+    ripple = "ripple of the push force against a dead end, N"
+    findings = {"protocol": comparison, ripple: ripples}
     data = {"pushed": pushed, "samples": samples, "comparison": comparison}
     return Report("forces", checks, findings, data)
 
 
 def _samples(episode, cannulations) -> np.ndarray:
     if episode is None:
-        resultants = [
-            run.resultant[run.resultant > 0]
-            for runs in cannulations.values()
-            for run in runs
-        ]
-        return np.concatenate(resultants)
+        runs = [run.resultant for each in cannulations.values() for run in each]
+        resultants = np.concatenate(runs)
+        return resultants[resultants > 0]
     if isinstance(episode, (str, Path)):
         episode = Episode.load(episode)
     if isinstance(episode, Episode):

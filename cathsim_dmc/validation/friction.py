@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable
-from typing import NamedTuple
 
 import mujoco
 import numpy as np
@@ -17,7 +16,7 @@ from cathsim_dmc.entities.device_stack import DeviceStack
 from cathsim_dmc.entities.phantom import Phantom
 from cathsim_dmc.physics import chain_fields
 from cathsim_dmc.physics.drives import hold
-from cathsim_dmc.validation.checks import Check
+from cathsim_dmc.validation.checks import Check, Checks
 from cathsim_dmc.validation.force_sensors import plate, walled
 from cathsim_dmc.validation.pair import PAIR, straightened
 from cathsim_dmc.validation.rig import Rig
@@ -80,20 +79,17 @@ def _steps(rig: Rig, duration: float) -> range:
     return range(round(duration / rig.model.opt.timestep))
 
 
-class Slid(NamedTuple):
-    """A device pulled over a plate."""
-
-    acting: float  # coefficient of friction, pull over load
-    ripple: float  # standard deviation of the pull over its mean
-
-
-def slid(names: tuple[str, ...], load: float, speed: float) -> Slid:
+def slid(names: tuple[str, ...], load: float, speed: float) -> tuple[float, float]:
     """Pulls a device over a plate.
 
     Args:
         names: of the device, or of coaxial ones.
         load: of its end on the plate, N.
         speed: m/s.
+
+    Returns:
+        Coefficient of friction that acts, pull over load; standard deviation of the
+        pull over its mean.
     """
     rig, bodies, shares = _on_plate(names)
     rig.data.xfrc_applied[bodies, 1] = load * shares
@@ -107,7 +103,7 @@ def slid(names: tuple[str, ...], load: float, speed: float) -> Slid:
         rig.step()
         pull.append(-rig.sensor(f"{rig.name}/push_force")[2])
     mean = float(np.mean(pull))
-    return Slid(mean / load, float(np.std(pull)) / abs(mean))
+    return mean / load, float(np.std(pull)) / abs(mean)
 
 
 def creep(names: tuple[str, ...]) -> float:
@@ -175,6 +171,7 @@ class Capstan:
             self.acting,
             self.friction,
             CAPSTAN_BOUND,
+            "",
             f"friction {self.acting:.4f} acts, ratio {self.mean:.4f}, "
             f"{self.free:.4f} without friction, expected {self.expected:.4f}",
         )
@@ -296,47 +293,25 @@ def arch_ripple() -> float:
 
 def checks() -> tuple[list[Check], list[Capstan]]:
     """Friction that acts on devices, sliding and sticking, and the capstans."""
-    found = []
+    found = Checks()
     for name, names in (("steerable_5f", ("steerable_5f",)), ("pair", PAIR)):
         for load in LOADS:
-            runs = [slid(names, load, speed) for speed in SPEEDS]
-            worst = max(runs, key=lambda one: abs(one.acting - FRICTION))
-            found += [
-                Check.deviation(
-                    f"{name} sliding under {load:g} N: friction that acts",
-                    worst.acting,
-                    FRICTION,
-                    ACTING_BOUND,
-                    ", ".join(
-                        f"{one.acting:.4f} at {1e3 * speed:g} mm/s"
-                        for speed, one in zip(SPEEDS, runs, strict=True)
-                    ),
-                ),
-                Check.at_most(
-                    f"{name} sliding under {load:g} N: ripple of the pull",
-                    100 * max(one.ripple for one in runs),
-                    RIPPLE_BOUND,
-                    "%",
-                ),
-            ]
-        found.append(
-            Check.at_most(
-                f"{name} under {CREEP_LOAD:g} N, pulled sideways at half the limit: "
-                "creep",
-                1e3 * creep(names),
-                CREEP_BOUND,
-                "mm/s",
+            acting, ripples = zip(
+                *(slid(names, load, speed) for speed in SPEEDS), strict=True
             )
-        )
-    found.append(
-        Check.at_most(
-            f"drawn round an arch under {TENSION:g} N: ripple of the force",
-            100 * arch_ripple(),
-            ARCH_RIPPLE,
-            "%",
-            f"tube of {1e3 * ARCH_RADIUS:g} mm about a drum of "
-            f"{1e3 * DRUM_RADIUS:g} mm",
-        )
-    )
+            worst = max(acting, key=lambda one: abs(one - FRICTION))
+            label = f"{name} sliding under {load:g} N"
+            note = ", ".join(
+                f"{one:.4f} at {1e3 * speed:g} mm/s"
+                for speed, one in zip(SPEEDS, acting, strict=True)
+            )
+            acts = f"{label}: friction that acts"
+            found.deviation(acts, worst, FRICTION, ACTING_BOUND, "", note)
+            ripple = 100 * max(ripples)
+            found.at_most(f"{label}: ripple of the pull", ripple, RIPPLE_BOUND, "%")
+        label = f"{name} under {CREEP_LOAD:g} N, pulled sideways at half the limit: "
+        found.at_most(label + "creep", 1e3 * creep(names), CREEP_BOUND, "mm/s")
+    label = f"drawn round an arch under {TENSION:g} N: ripple of the force"
+    found.at_most(label, 100 * arch_ripple(), ARCH_RIPPLE, "%")
     pulled = [capstan(friction, wrap) for friction, wrap in CAPSTANS]
     return found + [one.check() for one in pulled], pulled

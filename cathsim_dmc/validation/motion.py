@@ -2,21 +2,19 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import mujoco
 import numpy as np
 
 from cathsim_dmc.anatomy import Anatomy
 from cathsim_dmc.anatomy.motion import PULSE_PRESSURE, Motion, distensibility
-from cathsim_dmc.collision import fields
 from cathsim_dmc.entities.contact import (
     CONTACT_SOLIMP,
     CONTACT_SOLREF,
     FRICTION_STIFFNESS,
 )
 from cathsim_dmc.physics.stepper import PHYSICS_TIMESTEP
-from cathsim_dmc.validation.checks import Check
+from cathsim_dmc.validation.checks import Check, Checks
+from cathsim_dmc.validation.rig import bare, slider
 
 WALL_BOUND = 0.02  # mm
 DELAY_BOUND = 1.0  # ms
@@ -25,7 +23,7 @@ FRAME_BOUND = 1.0  # %
 PLACES = (0.09, 0.13, 0.17)  # m along the tube
 RADIUS, _PROBE = 0.01, 5e-4  # m
 _HEART, _BREATHING, _SOFT = 5.5e-3, 1.0, 0.02
-_GRAVITY = 9.81
+_GRAVITY, _RIDE = 9.81, 2.0  # m/s², s
 
 
 def parameters(heart: float, breathing: float, soft: float) -> np.ndarray:
@@ -42,24 +40,11 @@ def stirred(lumen, lattice: np.ndarray, friction: float = 0.0) -> mujoco.MjSpec:
     from cathsim_dmc.collision import carrying
 
     carrying.install()
-    wall = fields.carrier(lumen, lattice)
-    spec = mujoco.MjSpec()
-    spec.nuser_geom, spec.nuserdata = 4, 3 + PARAMETERS
-    option = spec.option
-    option.integrator = mujoco.mjtIntegrator.mjINT_DISCRETE
-    option.timestep, option.gravity = PHYSICS_TIMESTEP, (0, 0, 0)
-    option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
-    option.impratio = FRICTION_STIFFNESS
-    option.jacobian = mujoco.mjtJacobian.mjJAC_DENSE
-    spec.worldbody.add_geom(
-        type=mujoco.mjtGeom.mjGEOM_BOX,
-        pos=wall["pos"],
-        size=wall["size"],
-        userdata=wall["user"],
-        friction=(friction, 0, 0),
-        solref=CONTACT_SOLREF,
-        solimp=CONTACT_SOLIMP,
-    )
+    fixed = {"solref": CONTACT_SOLREF, "solimp": CONTACT_SOLIMP}
+    spec = bare(lumen, lattice, friction=(friction, 0, 0), **fixed)
+    spec.nuserdata = 3 + PARAMETERS
+    spec.option.impratio = FRICTION_STIFFNESS
+    spec.option.jacobian = mujoco.mjtJacobian.mjJAC_DENSE
     return spec
 
 
@@ -77,12 +62,9 @@ class Probes:
     def __init__(self, anatomy: Anatomy, course: np.ndarray, count: int):
         """Takes the anatomy, its motion's parameters, and how many places to look."""
         spec = stirred(anatomy.lumen, anatomy.motion.lattice)
+        ball = {"size": (_PROBE, 0, 0), "margin": 2e-3, "conaffinity": 0}
         for _ in range(count):
-            body = spec.worldbody.add_body()
-            for axis in np.eye(3):
-                body.add_joint(type=mujoco.mjtJoint.mjJNT_SLIDE, axis=axis)
-            ball = mujoco.mjtGeom.mjGEOM_SPHERE
-            body.add_geom(type=ball, size=(_PROBE, 0, 0), margin=2e-3, conaffinity=0)
+            slider(spec, np.eye(3), **ball)
         self._model = spec.compile()
         self._data = begin(self._model, course)
 
@@ -99,22 +81,13 @@ class Probes:
         return found
 
 
-class Beat(NamedTuple):
-    """Diameters of a tube over a beat.
+def diameters(anatomy: Anatomy) -> tuple[float, np.ndarray, np.ndarray]:
+    """Diameters at `PLACES` of a straight tube along z over a beat.
 
-    Attributes:
-        deviation: largest difference from what is prescribed, m.
-        delays: (2,) of the pulse between the places, s.
-        expected: (2,) distance over pulse wave velocity, s.
+    Returns:
+        Largest difference from what is prescribed, m; delays (2,) of the pulse between
+        the places, and distance over pulse wave velocity (2,), s.
     """
-
-    deviation: float
-    delays: np.ndarray
-    expected: np.ndarray
-
-
-def diameters(anatomy: Anatomy) -> Beat:
-    """Diameters at `PLACES` of a straight tube along z over a beat."""
     from cathsim_dmc.anatomy.motion_loops import pulse
 
     course = parameters(0.0, 0.0, _SOFT)
@@ -136,7 +109,7 @@ def diameters(anatomy: Anatomy) -> Beat:
     rises = [np.interp(middle, found[rising, n], times[rising]) for n in range(3)]
     way = np.diff(PLACES) / course[6]
     deviation = np.abs(found - np.array(expected)).max()
-    return Beat(float(deviation), np.diff(rises), way)
+    return float(deviation), np.diff(rises), way
 
 
 def wall_place(anatomy: Anatomy, number: int = 40) -> float:
@@ -179,43 +152,29 @@ def rigid_motion(anatomy: Anatomy, way: np.ndarray) -> Motion:
     return Motion(np.concatenate([low, [np.max(high - low)], [2, 2, 2], values]))
 
 
-class Ride(NamedTuple):
-    """A free link in a tube, over time.
-
-    Attributes:
-        link: (T, 3), its ways, m.
-        wall: (T, 3), those of the wall, m.
-    """
-
-    link: np.ndarray
-    wall: np.ndarray
-
-
 def ride(
     anatomy: Anatomy,
     way: tuple[float, float, float],
     friction: float,
     inertial: bool = False,
-    seconds: float = 2.0,
-) -> Ride:
-    """Lets a link lie in a tube whose wall moves rigidly.
+) -> tuple[np.ndarray, np.ndarray]:
+    """Ways (T, 3) m of a link in a tube whose wall moves rigidly, and of the wall.
 
     Args:
         anatomy: A straight tube along z.
         way: Direction of the motion, of `_HEART` in a beat.
         friction: Coulomb coefficient.
         inertial: Whether the wall rests instead, and all feel its acceleration.
-        seconds: Time.
     """
     from cathsim_dmc.anatomy.motion_loops import courses
 
     course = parameters(_HEART, 0.0, 0.0)
     motion = rigid_motion(anatomy, np.array(way))
     spec = stirred(anatomy.lumen, motion.lattice, friction)
-    body = spec.worldbody.add_body(pos=(RADIUS - 1e-3 - 1e-6, 0, 0.1))
-    for axis in np.eye(3):
-        body.add_joint(type=mujoco.mjtJoint.mjJNT_SLIDE, axis=axis)
-    body.add_geom(
+    slider(
+        spec,
+        np.eye(3),
+        (RADIUS - 1e-3 - 1e-6, 0, 0.1),
         type=mujoco.mjtGeom.mjGEOM_CAPSULE,
         size=(1e-3, 2e-3, 0),
         mass=1e-3,
@@ -228,7 +187,7 @@ def ride(
     data = begin(model, course)
     if inertial:
         data.userdata[2:] = 0.0
-    count = round(seconds / PHYSICS_TIMESTEP)
+    count = round(_RIDE / PHYSICS_TIMESTEP)
     link, wall = np.empty((2, count, 3))
     for step in range(count):
         time = step * PHYSICS_TIMESTEP
@@ -242,52 +201,36 @@ def ride(
         mujoco.mj_step(model, data)
         link[step] = data.qpos[:3]
         wall[step] = courses(course, time + PHYSICS_TIMESTEP)[0] * np.array(way)
-    return Ride(link, wall)
+    return link, wall
 
 
 def slip(anatomy: Anatomy) -> float:
     """Way of a link along a wall that carries it, over the wall's, %."""
-    found = ride(anatomy, (0, 0, 1), friction=0.5)
-    away = np.abs(found.link[:, 2] - found.wall[:, 2]).max()
-    return float(100 * away / np.abs(found.wall[:, 2]).max())
+    link, wall = ride(anatomy, (0, 0, 1), friction=0.5)
+    away = np.abs(link[:, 2] - wall[:, 2]).max()
+    return float(100 * away / np.abs(wall[:, 2]).max())
 
 
 def frame(anatomy: Anatomy) -> float:
     """Motion seen from a moving wall against that under its inertia at rest, %."""
     way = (0.0, 0.8, 0.6)
-    moving = ride(anatomy, way, friction=0.005)
-    resting = ride(anatomy, way, friction=0.005, inertial=True)
-    relative = (moving.link - moving.wall)[:, 1:]
-    expected = resting.link[:, 1:]
-    away = np.abs(relative - expected).max()
+    link, wall = ride(anatomy, way, friction=0.005)
+    expected = ride(anatomy, way, friction=0.005, inertial=True)[0][:, 1:]
+    away = np.abs((link - wall)[:, 1:] - expected).max()
     return float(100 * away / np.ptp(expected, axis=0).max())
 
 
 def checks(tube: Anatomy, phantom: Anatomy) -> list[Check]:
     """Checks of a straight tube along z, and of a phantom."""
-    beat = diameters(tube)
-    late = np.abs(beat.delays - beat.expected).max()
-    return [
-        Check.at_most(
-            "lumen's diameter over the beat at three places",
-            1e3 * beat.deviation,
-            WALL_BOUND,
-            "mm",
-        ),
-        Check.at_most("delay of the pulse", 1e3 * late, DELAY_BOUND, "ms"),
-        Check.at_most(
-            f"wall of {phantom.name} with all motions",
-            1e3 * wall_place(phantom),
-            WALL_BOUND,
-            "mm",
-        ),
-        Check.at_most(
-            "slip of a link that the wall carries", slip(tube), SLIP_BOUND, "%"
-        ),
-        Check.at_most(
-            "sliding in a moving wall's frame, and at rest under its inertia",
-            frame(tube),
-            FRAME_BOUND,
-            "%",
-        ),
-    ]
+    made = Checks()
+    deviation, delays, expected = diameters(tube)
+    name = "lumen's diameter over the beat at three places"
+    made.at_most(name, 1e3 * deviation, WALL_BOUND, "mm")
+    late = 1e3 * np.abs(delays - expected).max()
+    made.at_most("delay of the pulse", late, DELAY_BOUND, "ms")
+    name = f"wall of {phantom.name} with all motions"
+    made.at_most(name, 1e3 * wall_place(phantom), WALL_BOUND, "mm")
+    made.at_most("slip of a link that the wall carries", slip(tube), SLIP_BOUND, "%")
+    name = "sliding in a moving wall's frame, and at rest under its inertia"
+    made.at_most(name, frame(tube), FRAME_BOUND, "%")
+    return made

@@ -4,11 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
-from typing import NamedTuple
 
-import mujoco
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from cathsim_dmc.entities import devices
 from cathsim_dmc.entities.device import Device
@@ -16,22 +13,12 @@ from cathsim_dmc.entities.device_stack import DeviceStack
 from cathsim_dmc.physics import chain_fields
 from cathsim_dmc.tasks.config import CONTROL_TIMESTEP
 from cathsim_dmc.validation import pressed, rod, shapes, sliding, two_rods
-from cathsim_dmc.validation.checks import Check, Report
+from cathsim_dmc.validation.checks import Check, Checks, Report
 from cathsim_dmc.validation.rig import Rig
 
 PAIR = ("wire_035_glide", "berenstein_5f")
 PROTRUSIONS = (0.0, 0.02, 0.05, 0.10)  # m, of the wire out of the catheter
 END_ANGLES = (15.0, 45.0)  # degrees
-CANTILEVER_BOUND = 2.0  # % of the deflection
-SHAPE_BOUND = 2.0  # % of the displacement of the end from the straight line
-# Overlaps whose unloaded shape is compared: devices, gaps (m) and rotations (rad). A
-# wire just out of the catheter, one withdrawn into its bend, one turned against it.
-SHAPES = (
-    (PAIR, (0.0, 0.02), (0.0, 0.0)),
-    (PAIR, (0.012, 0.0), (0.0, 0.0)),
-    (PAIR, (0.0, 0.005), (0.0, np.pi / 2)),
-    (("wire_035_amplatz", "diagnostic_5f_simmons"), (0.035, 0.0), (0.0, 0.0)),
-)
 # Largest step of the free end as one device slides in the other, in that of the curve:
 # a chain whose hinges jumped one after the other would make several at once.
 STEP_BOUND = 1.1
@@ -88,68 +75,6 @@ def cantilevers(protrusion: float) -> list[rod.Cantilever]:
     entity = rig.catheter
     assert isinstance(entity, DeviceStack)
     return rod.bent(rig, *sections(entity, gaps), END_ANGLES)
-
-
-class UnloadedShape(NamedTuple):
-    """Coaxial devices at rest."""
-
-    devices: tuple[str, ...]  # from the innermost outwards
-    gaps: np.ndarray  # (K,) from the end of each device to that of the chain, m
-    rotation: np.ndarray  # (K,) of each device, rad
-    simulated: np.ndarray  # (L + 1, 3), joints and head, m, from the base of the chain
-    expected: np.ndarray  # (n, 3), the curve of the EI-weighted curvature
-    # Largest of head and joints from the curve at the same arc lengths, over the
-    # displacement of the end from the straight line.
-    deviation: float
-
-
-def unloaded(
-    names: Sequence[str], end_gaps: Sequence[float], turned: Sequence[float]
-) -> UnloadedShape:
-    """Lets coaxial devices settle and compares them with Σ EI κ / Σ EI."""
-    gaps, rotation = np.asarray(end_gaps), np.asarray(turned)
-    rig = rig_of(names, gaps, rotation)
-    entity = rig.catheter
-    assert isinstance(entity, DeviceStack)
-    rig.settle(longest=60.0)
-    mujoco.mj_kinematics(rig.model, rig.data)
-    points = np.vstack([rig.joints, rig.head_position]) - rig.joints[0]
-    length = float(entity.link_lengths.sum())
-    arc, curve = weighted_curve(entity.devices, gaps, rotation, length)
-    there = np.stack(
-        [np.interp(length - entity.stack.nodes, arc, axis) for axis in curve.T], axis=-1
-    )
-    moved = np.linalg.norm(curve[-1] - (0.0, 0.0, length))
-    error = np.linalg.norm(points - there, axis=-1).max()
-    return UnloadedShape(
-        tuple(names),
-        np.array(gaps),
-        np.array(rotation),
-        points,
-        curve,
-        float(error / moved),
-    )
-
-
-def weighted_curve(
-    chosen: Sequence[Device],
-    gaps: np.ndarray,
-    rotation: np.ndarray,
-    length: float,
-) -> tuple[np.ndarray, np.ndarray]:
-    """Arc lengths (n,) and points (n, 3) of the curve of the EI-weighted curvature.
-
-    Integrated from the base, with a frame that does not twist.
-    """
-    arc, steps, curvature = shapes.weighted_curvature(chosen, gaps, rotation, length)
-    frame, points = np.eye(3), [np.zeros(3)]
-    for bend, step in zip(curvature, steps, strict=True):
-        # The curvature x + iy leads towards x and y: a turn about -y, x of the frame.
-        axis = frame @ np.array([-bend.imag, bend.real, 0.0]) * step
-        half = Rotation.from_rotvec(axis / 2).as_matrix() @ frame
-        points.append(points[-1] + half[:, 2] * step)
-        frame = Rotation.from_rotvec(axis).as_matrix() @ frame
-    return np.append(arc, length), np.array(points)
 
 
 def free_ends(names: Sequence[str], leads: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -217,39 +142,15 @@ def buckling(end: str) -> rod.Buckling:
 
 def validate_pair() -> Report:
     """Runs every check of coaxial devices."""
-    checks: list[Check] = []
+    checks = Checks()
     for protrusion in PROTRUSIONS:
+        what = f"wire out by {1e3 * protrusion:.0f} mm" if protrusion else "pair"
         for one in cantilevers(protrusion):
-            what = f"wire out by {1e3 * protrusion:.0f} mm" if protrusion else "pair"
-            checks.append(
-                Check.at_most(
-                    f"cantilever, {what}, end at {np.degrees(one.end_angle):.0f}°",
-                    100 * one.deviation,
-                    CANTILEVER_BOUND,
-                    "%",
-                    f"{1e3 * one.force:.3g} mN, deflection "
-                    f"{1e3 * one.expected.position[-1, 1]:.1f} mm",
-                )
-            )
-    resting = [unloaded(*each) for each in SHAPES]
-    for shape in resting:
-        gaps = " and ".join(f"{1e3 * gap:.0f}" for gap in shape.gaps)
-        turned = np.degrees(shape.rotation[-1] - shape.rotation[0])
-        checks.append(
-            Check.at_most(
-                f"unloaded shape, {' in '.join(shape.devices)}, ends {gaps} mm back"
-                + (f", turned by {turned:.0f}°" if turned else ""),
-                100 * shape.deviation,
-                SHAPE_BOUND,
-                "%",
-                f"end {1e3 * np.hypot(*shape.expected[-1, :2]):.1f} mm off the axis",
-            )
-        )
+            checks.append(rod.cantilever_check(what, one))
     checks += shapes.checks() + two_rods.checks()
     for end in ("sliding", "fixed"):
         checks.append(rod.buckling_check("buckling load of the pair", buckling(end)))
     checks.append(_smoothness())
     checks += pressed.checks(PAIR)
     moving, findings, turned = sliding.checks()
-    data = {"shapes": resting, "turned": turned}
-    return Report("pair", [*checks, *moving], findings, data)
+    return Report("pair", [*checks, *moving], findings, {"turned": turned})

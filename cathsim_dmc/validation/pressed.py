@@ -11,9 +11,9 @@ from cathsim_dmc import suite
 from cathsim_dmc.entities import contact
 from cathsim_dmc.entities.chain import MAX_PUSH_FORCE, MAX_PUSH_SPEED
 from cathsim_dmc.physics import forces
-from cathsim_dmc.tasks.config import CONTROL_TIMESTEP, PHYSICS_TIMESTEP
-from cathsim_dmc.validation.checks import Check
-from cathsim_dmc.validation.sliding import tube
+from cathsim_dmc.tasks.config import CONTROL_TIMESTEP
+from cathsim_dmc.validation.checks import Check, Checks
+from cathsim_dmc.validation.rig import bare, slider, tube
 
 # N, on a gram: about what a link of the pair weighs as a contact feels it.
 LOADS = (0.01, 0.03, 0.1, 0.3, 1.0, 3.0, MAX_PUSH_FORCE)
@@ -22,51 +22,42 @@ _SETTLING, _WATCHED = 1200, 300  # physics steps
 RIPPLE = 1e-3  # mm, of the depth under a dead load
 DEPTH = 0.3  # mm, 99th percentile; as in the soak
 
-# Radius of the tube, m. In one of 4 mm, a link of 7 mm wedges across the lumen as the
+# Tube, m. In one of 4 mm radius, a link of 7 mm wedges across the lumen as the
 # tip folds, and bears up to four times the push, because links do not bend.
-JAM_RADIUS = 5e-3
+JAM_TUBE = 0.275, 5e-3  # length and radius
 _JAMMED = 2.0  # s, of pushing with the stroke used up
 _END = 1.0  # s, of it that counts
-
-
-class Pressed(NamedTuple):
-    """A mass under a dead load on a plane."""
-
-    load: float  # N
-    depth: float  # mean, m
-    ripple: float  # largest depth less the smallest, m
 
 
 def pressed(
     load: float,
     solref: tuple[float, ...] = contact.CONTACT_SOLREF,
     solimp: tuple[float, ...] = contact.CONTACT_SOLIMP,
-) -> Pressed:
+) -> tuple[float, float]:
     """Presses a mass on a plane, by the integrator and time step of the tasks.
 
     Args:
         load: N.
         solref: of the contact, MuJoCo's.
+        solimp: likewise.
+
+    Returns:
+        Mean depth, and the largest less the smallest, m.
     """
-    spec = mujoco.MjSpec()
-    spec.option.integrator = mujoco.mjtIntegrator.mjINT_DISCRETE
-    spec.option.timestep = PHYSICS_TIMESTEP
+    spec = bare()
+    spec.option.cone = mujoco.mjtCone.mjCONE_PYRAMIDAL
     spec.option.gravity = (0.0, 0.0, -load / _MASS)
     spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_PLANE, size=(1, 1, 1))
-    body = spec.worldbody.add_body(pos=(0, 0, 1e-3))
-    body.add_joint(type=mujoco.mjtJoint.mjJNT_SLIDE, axis=(0, 0, 1))
-    body.add_geom(
-        size=(1e-3, 0, 0), mass=_MASS, priority=1, solref=solref, solimp=solimp
-    )
+    ball = {"size": (1e-3, 0, 0), "mass": _MASS, "priority": 1}
+    slider(spec, (0, 0, 1), (0, 0, 1e-3), **ball, solref=solref, solimp=solimp)
     model = spec.compile()
     data = mujoco.MjData(model)
+    mujoco.mj_step(model, data, _SETTLING)
     depth = np.empty(_WATCHED)
-    for _ in range(_SETTLING):
-        mujoco.mj_step(model, data)
     for step in range(_WATCHED):
         mujoco.mj_step(model, data)
         depth[step] = -data.qpos[0]
-    return Pressed(load, float(depth.mean()), float(np.ptp(depth)))
+    return float(depth.mean()), float(np.ptp(depth))
 
 
 class Jam(NamedTuple):
@@ -87,7 +78,7 @@ def jam(pair: tuple[str, str]) -> Jam:
         suite.DOMAIN,
         "navigate",
         {
-            "anatomy": tube(bent=False, radius=JAM_RADIUS),
+            "anatomy": tube(*JAM_TUBE),
             "goal": "end",
             "goal_radius": 1e-6,
             "devices": pair,
@@ -122,24 +113,22 @@ def checks(pair: tuple[str, str]) -> list[Check]:
     Args:
         pair: Names of guidewire and catheter.
     """
-    masses = [pressed(load) for load in LOADS]
-    worst = max(masses, key=lambda one: one.ripple)
+    made = Checks()
+    depths, ripples = zip(*map(pressed, LOADS), strict=True)
+    made.at_most(
+        f"pressed by {LOADS[0]:g} to {LOADS[-1]:g} N: ripple of the depth",
+        1e3 * max(ripples),
+        RIPPLE,
+        "mm",
+        f"depth {1e3 * depths[0]:.2f} to {1e3 * depths[-1]:.2f} mm",
+    )
     jammed = jam(pair)
-    least, largest = jammed.forces
-    return [
-        Check.at_most(
-            f"pressed by {LOADS[0]:g} to {LOADS[-1]:g} N: ripple of the depth",
-            1e3 * worst.ripple,
-            RIPPLE,
-            "mm",
-            f"depth {1e3 * masses[0].depth:.2f} to {1e3 * masses[-1].depth:.2f} mm",
-        ),
-        Check.at_most(
-            "pair jammed in a dead end: 99th percentile of the penetration",
-            1e3 * jammed.penetration,
-            DEPTH,
-            "mm",
-            f"pushed with {jammed.push_force:.1f} N, largest contact "
-            f"{least:.2f} to {largest:.2f} N",
-        ),
-    ]
+    made.at_most(
+        "pair jammed in a dead end: 99th percentile of the penetration",
+        1e3 * jammed.penetration,
+        DEPTH,
+        "mm",
+        f"pushed with {jammed.push_force:.1f} N, largest contact "
+        "{:.2f} to {:.2f} N".format(*jammed.forces),
+    )
+    return made

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import numpy as np
 
 from cathsim_dmc import suite
 from cathsim_dmc.physics import forces
-from cathsim_dmc.validation.checks import Check
+from cathsim_dmc.validation.checks import Check, Checks
 
 TASKS = ("type1_lcca", "femoral_type1_lcca_pair")
 REPEATED = 0.5  # %, of the control steps
@@ -18,19 +16,15 @@ _STEPS = 200  # control steps of an episode, straight or with the tip curled
 _CURLS = ((0.0, 0.0), (-0.17, 0.44))
 
 
-class Push(NamedTuple):
-    """A device pushed at full speed until it jams."""
+def push(task: str) -> dict[str, float]:
+    """Pushes the device of a task, its tip straight, then curled.
 
-    task: str
-    contacts: float  # with the wall, for each link that has one
-    repeated: float  # share of the control steps that were done again
-    deep: float  # 99th percentile of the deepest contact of a physics step, m
-    deepest: float  # m
-    force: float  # largest single contact, N
-
-
-def push(task: str) -> Push:
-    """Pushes the device of a task, its tip straight, then curled."""
+    Returns:
+        "contacts" with the wall for each link that has one; share of the control steps
+        that were done again ("repeated"); 99th percentile ("deep") and largest
+        ("deepest") of the deepest contact of a physics step, m; largest "force" of a
+        contact, N.
+    """
     environment = suite.load(suite.DOMAIN, task, {"random": 0, "goal_radius": 1e-6})
     play = environment.task
     data = environment.physics.data.ptr
@@ -56,37 +50,25 @@ def push(task: str) -> Push:
     environment.close()
     deep = np.concatenate(depth)
     deep = deep[deep > 0.0]
-    return Push(
-        task,
-        contacts / max(links, 1),
-        float(repeated),
-        float(np.percentile(deep, 99)),
-        float(deep.max()),
-        force,
-    )
+    return {
+        "contacts": contacts / max(links, 1),
+        "repeated": float(repeated),
+        "deep": float(np.percentile(deep, 99)),
+        "deepest": float(deep.max()),
+        "force": force,
+    }
 
 
-def checks() -> tuple[list[Check], list[Push]]:
+def checks() -> tuple[list[Check], list[dict]]:
     """Pushes the devices of `TASKS` and judges them."""
-    pushed = [push(task) for task in TASKS]
-    found = []
-    for one in pushed:
-        name = f"{one.task}, full push"
-        found += [
-            Check.at_most(
-                f"{name}: control steps done again",
-                100 * one.repeated,
-                REPEATED,
-                "%",
-                f"{one.contacts:.2f} contacts for each link that has one",
-            ),
-            Check.at_most(
-                f"{name}: deepest penetration",
-                1e3 * one.deepest,
-                DEEPEST,
-                "mm",
-                f"99th percentile {1e3 * one.deep:.3f} mm",
-            ),
-            Check.at_most(f"{name}: largest contact", one.force, HARDEST, "N"),
-        ]
-    return found, pushed
+    made, pushed = Checks(), []
+    for task in TASKS:
+        one, name = push(task), f"{task}, full push"
+        pushed.append({"task": task, **one})
+        note = f"{one['contacts']:.2f} contacts for each link that has one"
+        again = f"{name}: control steps done again"
+        made.at_most(again, 100 * one["repeated"], REPEATED, "%", note)
+        deep, note = 1e3 * one["deepest"], f"99th percentile {1e3 * one['deep']:.3f} mm"
+        made.at_most(f"{name}: deepest penetration", deep, DEEPEST, "mm", note)
+        made.at_most(f"{name}: largest contact", one["force"], HARDEST, "N")
+    return made, pushed

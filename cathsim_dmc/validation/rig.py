@@ -2,10 +2,16 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import mujoco
 import numpy as np
 from dm_control import mjcf
 
+from cathsim_dmc.anatomy.anatomy import Anatomy
+from cathsim_dmc.anatomy.builder import VesselPlace
+from cathsim_dmc.anatomy.centreline import Centreline, Vessel, VesselTree
+from cathsim_dmc.collision import fields
 from cathsim_dmc.entities import devices
 from cathsim_dmc.entities.arena import AngiographyArena
 from cathsim_dmc.entities.catheter import Catheter
@@ -17,6 +23,61 @@ from cathsim_dmc.tasks.config import PHYSICS_TIMESTEP
 # that time, s. The constraint solver's tolerance leaves less. Until then the time is
 # the relaxation time of the hinges: a device damped by its material swings for minutes.
 REST_CHANGE, RESTING_TIME = 1e-6, 0.4
+
+
+def tube(length: float, radius: float, bend: float = 0.0) -> Anatomy:
+    """A vessel "tube" from the origin along +z, closed at its end, with a goal "end".
+
+    Args:
+        length: of a straight tube, or of the pieces before and after a bend, m.
+        radius: m.
+        bend: radius of half a circle towards +x, m; 0 for none.
+    """
+    z = np.linspace(0.0, length, max(3, round(length / 5e-3) + 1))
+    points = np.stack([0 * z, 0 * z, z], axis=-1)
+    if bend:
+        angle = np.linspace(0.0, np.pi, 61)[1:]
+        arc = np.stack([1 - np.cos(angle), 0 * angle, np.sin(angle)], axis=-1)
+        arc = points[-1] + bend * arc
+        points = np.vstack([points, arc, arc[-1] - points[1:]])
+    line = Centreline(points, np.full(len(points), radius))
+    end = VesselPlace("tube", arc_length=line.length - 1e-3)
+    tree = VesselTree({"tube": Vessel("tube", line)})
+    return Anatomy.from_tree(tree, "tube", goals={"end": end})
+
+
+def bare(lumen: Any = None, lattice: np.ndarray | None = None, **wall: Any):
+    """MuJoCo's spec without a device, with the options of the tasks but no gravity.
+
+    Args:
+        lumen: field of the wall, geom 0, or None for no wall.
+        lattice: by which the wall moves, or None.
+        **wall: fields of the wall's geom.
+    """
+    spec = mujoco.MjSpec()
+    spec.nuser_geom = 4
+    option = spec.option
+    option.integrator = mujoco.mjtIntegrator.mjINT_DISCRETE
+    option.timestep, option.gravity = PHYSICS_TIMESTEP, (0, 0, 0)
+    option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
+    if lumen is not None:
+        made = fields.carrier(lumen, lattice)
+        spec.worldbody.add_geom(
+            type=mujoco.mjtGeom.mjGEOM_BOX,
+            pos=made["pos"],
+            size=made["size"],
+            userdata=made["user"],
+            **wall,
+        )
+    return spec
+
+
+def slider(spec: mujoco.MjSpec, axes: Any, pos: Any = (0, 0, 0), **geom: Any):
+    """Adds a body that slides along axes (n, 3), with one geom, which is returned."""
+    body = spec.worldbody.add_body(pos=pos)
+    for axis in np.atleast_2d(axes):
+        body.add_joint(type=mujoco.mjtJoint.mjJNT_SLIDE, axis=axis)
+    return body.add_geom(**geom)
 
 
 class Rig:

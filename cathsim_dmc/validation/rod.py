@@ -12,7 +12,7 @@ import numpy as np
 from cathsim_dmc.entities import devices
 from cathsim_dmc.entities.chain import MAX_ROTATION_SPEED
 from cathsim_dmc.validation import damping, drive, theory
-from cathsim_dmc.validation.checks import Check, Report
+from cathsim_dmc.validation.checks import Check, Checks, Report
 from cathsim_dmc.validation.rig import REST_CHANGE, RESTING_TIME, Rig
 
 CANTILEVER_BOUND = 2.0  # % of the deflection
@@ -192,6 +192,14 @@ def column(
     return Buckling(end, length, loads, additional, 1 / slope, expected)
 
 
+def cantilever_check(what: str, one: Cantilever) -> Check:
+    """Its deviation from the elastica."""
+    angle, end = np.degrees(one.end_angle), 1e3 * one.expected.position[-1, 1]
+    name = f"cantilever, {what + ', ' if what else ''}end at {angle:.0f}°"
+    note = f"{1e3 * one.force:.3g} mN, deflection {end:.1f} mm"
+    return Check.at_most(name, 100 * one.deviation, CANTILEVER_BOUND, "%", note)
+
+
 def buckling_check(name: str, column: Buckling) -> Check:
     """Its critical load against Euler's."""
     return Check.deviation(
@@ -199,6 +207,7 @@ def buckling_check(name: str, column: Buckling) -> Check:
         column.critical,
         column.expected,
         BUCKLING_BOUND,
+        "N",
         f"{1e3 * column.critical:.2f} mN, Euler {1e3 * column.expected:.2f} mN "
         f"over {1e3 * column.length:.0f} mm",
     )
@@ -328,25 +337,14 @@ def _twist(rig: Rig, wrapped: bool = False) -> float:
 
 def validate_rod() -> Report:
     """Runs every check of the rod."""
-    checks: list[Check] = []
-    loaded = cantilevers()
-    for one in loaded:
-        checks.append(
-            Check.at_most(
-                f"cantilever, end at {np.degrees(one.end_angle):.0f}°",
-                100 * one.deviation,
-                CANTILEVER_BOUND,
-                "%",
-                f"{1e3 * one.force:.3g} mN, deflection "
-                f"{1e3 * one.expected.position[-1, 1]:.1f} mm",
-            )
-        )
+    loaded, checks = cantilevers(), Checks()
+    checks += [cantilever_check("", one) for one in loaded]
     worst, name = max(
         (cantilevers(name, (45.0,), rest_change=LIBRARY_REST)[0].deviation, name)
         for name in devices.DEVICES
     )
     label = "cantilever, worst device of the library, end at 45°"
-    checks.append(Check.at_most(label, 100 * worst, CANTILEVER_BOUND, "%", name))
+    checks.at_most(label, 100 * worst, CANTILEVER_BOUND, "%", name)
     columns = [buckling("sliding"), buckling("fixed")]
     for column in columns:
         checks.append(buckling_check("buckling load", column))
@@ -354,24 +352,12 @@ def validate_rod() -> Report:
         torque, angle = twist_under_torque(name)
         note = f"{angle:.4f} rad under {1e6 * torque:.3g} µN·m"
         label = f"twist under end torque, {name}"
-        checks.append(Check.deviation(label, angle, TWIST, TWIST_BOUND, note))
+        checks.deviation(label, angle, TWIST, TWIST_BOUND, "rad", note)
     lag = twist_lag()
-    checks += [
-        Check.deviation(
-            "lag of the tip behind the turning base",
-            lag.lag,
-            lag.expected_lag,
-            TWIST_BOUND,
-            f"{lag.lag:.4f} rad, bω/K = {lag.expected_lag:.4f} rad",
-        ),
-        Check.deviation(
-            "rise time of that lag",
-            lag.rise_time,
-            lag.expected_rise_time,
-            TWIST_BOUND,
-            f"{lag.rise_time:.4f} s, theory {lag.expected_rise_time:.4f} s",
-        ),
-    ]
+    label = "lag of the tip behind the turning base"
+    checks.deviation(label, lag.lag, lag.expected_lag, TWIST_BOUND, "rad")
+    found = lag.rise_time, lag.expected_rise_time
+    checks.deviation("rise time of that lag", *found, TWIST_BOUND, "s")
     checks += drive.checks() + damping.checks()
     short = [buckling(end, count) for end, count in SHORT_COLUMNS]
     coarse = {

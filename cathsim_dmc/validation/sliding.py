@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from cathsim_dmc import suite
-from cathsim_dmc.anatomy import Anatomy, Centreline, Vessel, VesselTree
-from cathsim_dmc.anatomy.builder import VesselPlace
 from cathsim_dmc.entities.chain import MAX_PUSH_SPEED, MAX_ROTATION_SPEED
 from cathsim_dmc.entities.devices import get
 from cathsim_dmc.tasks.config import CONTROL_TIMESTEP
-from cathsim_dmc.validation.checks import Check
+from cathsim_dmc.validation.checks import Check, Checks
+from cathsim_dmc.validation.rig import tube
 
 SLIDING_PAIR = ("wire_035_amplatz", "diagnostic_5f_simmons")
 SLIDING_TASK = "femoral_type1_lcca"
@@ -34,77 +33,47 @@ SCRIPT = (
 TURNED = "berenstein_5f"  # alone in a tube
 TUBE_RADIUS = 4e-3  # m
 BEND_RADIUS = 0.04  # m, of half a circle
+# m: length of a straight tube, and that before and after a bend.
+STRAIGHT_TUBE, BENT_TUBE = 0.275, 0.1
 TURN_RATE = 0.5  # rad/s, of the base
 TURNS = 2.0
 STRAIGHT_LAG = 45.0  # °, of the end in a straight tube
 WHIP = 3.0  # least rate of turning of the end in a bend, in that of the base
 
 
-class Part(NamedTuple):
-    """What happened in a part of the script."""
-
-    name: str
-    largest_step: float  # of the end of the chain in a control step, m
-    moved: float  # of the end of the chain from where it was before the part, m
-    peak_force: float  # largest single contact, N
-    warnings: int  # of MuJoCo
-
-
-def slide() -> tuple[list[Part], list[np.ndarray]]:
+def slide() -> list[dict[str, Any]]:
     """Slides two devices through each other in a vessel.
 
     Returns:
-        The parts of the script, and the centrelines (L + 1, 3) at their ends, m.
+        Of each part of the script its "name"; "largest_step" of the end of the chain in
+        a control step and "moved", by which it moved in the part, m; "peak_force" of a
+        contact, N; "warnings" of MuJoCo.
     """
-    environment = suite.load(
-        suite.DOMAIN,
-        SLIDING_TASK,
-        {"devices": SLIDING_PAIR, "random": 0, "observation": "tracking"},
-    )
+    options = {"devices": SLIDING_PAIR, "random": 0, "observation": "tracking"}
+    environment = suite.load(suite.DOMAIN, SLIDING_TASK, options)
     environment.reset()
-    play, parts, lines = environment.task, [], []
+    play, parts = environment.task, []
     for name, wire, catheter, turn, duration in SCRIPT:
         action = np.array([wire, 0.0, catheter, 0.0]) / MAX_PUSH_SPEED
         action[3] = turn / MAX_ROTATION_SPEED
-        start = last = play.readings.head
-        largest = peak = 0.0
+        heads, peak = [play.readings.head], 0.0
         for _ in range(round(duration / CONTROL_TIMESTEP)):
             if environment.step(action).last():
                 break
-            head = play.readings.head
-            largest = max(largest, float(np.linalg.norm(head - last)))
-            peak, last = max(peak, float(play.wall_force.peak_max)), head
-        warnings = int(environment.physics.data.ptr.warning.number.sum())
-        moved = float(np.linalg.norm(last - start))
-        parts.append(Part(name, largest, moved, peak, warnings))
-        lines.append(play.readings.centreline)
+            heads.append(play.readings.head)
+            peak = max(peak, float(play.wall_force.peak_max))
+        steps = np.linalg.norm(np.diff(heads, axis=0), axis=-1)
+        parts.append(
+            {
+                "name": name,
+                "largest_step": float(steps.max(initial=0.0)),
+                "moved": float(np.linalg.norm(heads[-1] - heads[0])),
+                "peak_force": peak,
+                "warnings": int(environment.physics.data.ptr.warning.number.sum()),
+            }
+        )
     environment.close()
-    return parts, lines
-
-
-def tube(bent: bool, radius: float = TUBE_RADIUS) -> Anatomy:
-    """A tube with a radius (m), straight or with half a circle of 40 mm in it."""
-    s = np.linspace(0.0, 0.05, 11)
-    points = [np.stack([0 * s, 0 * s, s], axis=-1)]
-    if bent:
-        angle = np.linspace(0.0, np.pi, 61)[1:]
-        arc = np.stack([1 - np.cos(angle), 0 * angle, np.sin(angle)], axis=-1)
-        points.append((0.0, 0.0, 0.05) + BEND_RADIUS * arc)
-        s = np.linspace(0.0, 0.1, 21)[1:]
-        points.append(np.stack([0 * s, 0 * s, -s], axis=-1) + points[-1][-1])
-    else:
-        s = np.linspace(0.05, 0.05 + np.pi * BEND_RADIUS + 0.1, 31)[1:]
-        points.append(np.stack([0 * s, 0 * s, s], axis=-1))
-    line = np.concatenate(points)
-    tree = VesselTree(
-        {"tube": Vessel("tube", Centreline(line, np.full(len(line), radius)))}
-    )
-    length = tree.root.centreline.length
-    return Anatomy.from_tree(
-        tree,
-        "half circle" if bent else "straight tube",
-        goals={"end": VesselPlace("tube", arc_length=length - 2e-3)},
-    )
+    return parts
 
 
 @dataclasses.dataclass(frozen=True)
@@ -153,19 +122,10 @@ class Torque:
 
 def turn(bent: bool, **options: Any) -> Torque:
     """Advances a pre-shaped catheter through a tube and turns its base slowly."""
-    environment = suite.load(
-        suite.DOMAIN,
-        "navigate",
-        {
-            "anatomy": tube(bent),
-            "goal": "end",
-            "devices": (TURNED,),
-            "goal_radius": 1e-4,
-            "observation": "tracking",
-            "random": 0,
-            **options,
-        },
-    )
+    size = (STRAIGHT_TUBE, TUBE_RADIUS), (BENT_TUBE / 2, TUBE_RADIUS, BEND_RADIUS)
+    options = {"devices": (TURNED,), "observation": "tracking", "random": 0, **options}
+    options |= {"anatomy": tube(*size[bent]), "goal": "end", "goal_radius": 1e-4}
+    environment = suite.load(suite.DOMAIN, "navigate", options)
     environment.reset()
     play, device = environment.task, get(TURNED)
     # Until its bend lies at the far end of the half circle.
@@ -189,51 +149,34 @@ def turn(bent: bool, **options: Any) -> Torque:
 
 def checks() -> tuple[list[Check], dict[str, Any], list[Torque]]:
     """Runs the devices; returns checks, findings and the turned devices."""
-    parts, _ = slide()
-    found = [
-        Check.at_most(
-            f"sliding, {part.name}: largest step of the end in 40 ms",
-            1e3 * part.largest_step,
+    parts, made = slide(), Checks()
+    for part in parts[1:]:
+        made.at_most(
+            f"sliding, {part['name']}: largest step of the end in 40 ms",
+            1e3 * part["largest_step"],
             LARGEST_STEP,
             "mm",
-            f"moves by {1e3 * part.moved:.1f} mm, largest contact "
-            f"{part.peak_force:.3f} N, {part.warnings} warnings",
+            f"moves by {1e3 * part['moved']:.1f} mm, largest contact "
+            f"{part['peak_force']:.3f} N, {part['warnings']} warnings",
         )
-        for part in parts[1:]
-    ]
-    found.append(
-        Check.at_most("sliding, warnings", parts[-1].warnings, 0, "", "of MuJoCo")
-    )
+    made.at_most("sliding, warnings", parts[-1]["warnings"], 0, "", "of MuJoCo")
     turned = [turn(False), turn(True)]
     straight, bent = turned
-    found += [
-        Check.at_most(
-            "torque in a straight tube, lag of the end",
-            float(np.degrees(np.abs(straight.lag).max())),
-            STRAIGHT_LAG,
-            "°",
-            "friction alone holds it back",
-        ),
-        Check.at_least(
-            "torque in a half circle, fastest turning of the end over the base's",
-            bent.whips,
-            WHIP,
-            "",
-            f"A/K = {bent.shape / bent.stiffness:.1f}: above 1 it whips",
-        ),
-    ]
-    findings = {
-        "sliding": [part._asdict() for part in parts],
-        "torque": {
-            one.name: {
-                "largest lag, °": float(np.degrees(one.lag.max())),
-                "largest lag without friction and clearance, °": float(
-                    np.degrees(one.expected_lag)
-                ),
-                "fastest turning of the end over the base's": one.whips,
-                "shape over torsional stiffness, rad": one.shape / one.stiffness,
-            }
-            for one in turned
-        },
+    lag = float(np.degrees(np.abs(straight.lag).max()))
+    name = "torque in a straight tube, lag of the end"
+    made.at_most(name, lag, STRAIGHT_LAG, "°", "friction alone holds it back")
+    name = "torque in a half circle, fastest turning of the end over the base's"
+    note = f"A/K = {bent.shape / bent.stiffness:.1f}: above 1 it whips"
+    made.at_least(name, bent.whips, WHIP, "", note)
+    torque = {
+        one.name: {
+            "largest lag, °": float(np.degrees(one.lag.max())),
+            "largest lag without friction and clearance, °": float(
+                np.degrees(one.expected_lag)
+            ),
+            "fastest turning of the end over the base's": one.whips,
+            "shape over torsional stiffness, rad": one.shape / one.stiffness,
+        }
+        for one in turned
     }
-    return found, findings, turned
+    return made, {"sliding": parts, "torque": torque}, turned

@@ -12,18 +12,15 @@ from scipy.optimize import brentq
 
 from cathsim_dmc.anatomy import phantoms
 from cathsim_dmc.anatomy.anatomy import Anatomy
-from cathsim_dmc.anatomy.centreline import Centreline, Vessel, VesselTree
-from cathsim_dmc.collision import fields
 from cathsim_dmc.entities import devices
 from cathsim_dmc.entities.arena import BLOOD_DENSITY
 from cathsim_dmc.physics.blood import BLOOD_VISCOSITY, StillBlood
 from cathsim_dmc.physics.effects import userdata_size
-from cathsim_dmc.physics.stepper import PHYSICS_TIMESTEP
 from cathsim_dmc.physics.wall import law, stiffness
 from cathsim_dmc.validation import motion
-from cathsim_dmc.validation.checks import Check, Report
+from cathsim_dmc.validation.checks import Checks, Report
 from cathsim_dmc.validation.damping import LINK, _uniform, drag, fill
-from cathsim_dmc.validation.rig import Rig
+from cathsim_dmc.validation.rig import Rig, bare, slider, tube
 
 ANATOMIES = ("type1", "type2", "bovine")
 FLOW_BOUND = 2.0  # %
@@ -133,23 +130,16 @@ def profile() -> tuple[float, float]:
     from cathsim_dmc.physics.flow_loops import EXPONENT, velocities
 
     radius = 0.01
-    tube = straight_tube(radius)
+    circulation = tube(0.2, radius).circulation
     places, weights = np.polynomial.legendre.leggauss(64)
     r = radius * (places + 1) / 2
     points = np.stack([r, 0 * r, 0.1 + 0 * r], axis=-1)
     out = np.empty((len(r), 5))
-    velocities(points, *tube.circulation.arrays, out)
+    velocities(points, *circulation.arrays, out)
     mean, n = 1 / (np.pi * radius**2), EXPONENT
     expected = mean * (n + 2) / n * (1 - (r / radius) ** n)
     flow = (out[:, 2] * 2 * np.pi * r * weights).sum() * radius / 2
     return float(np.abs(out[:, 2] - expected).max() / mean), float(flow)
-
-
-def straight_tube(radius: float) -> Anatomy:
-    """A tube along z, 0.2 m long."""
-    z = np.linspace(0.0, 0.2, 21)
-    line = Centreline(np.outer(z, [0, 0, 1.0]), np.full(len(z), radius))
-    return Anatomy.from_tree(VesselTree({"aorta": Vessel("aorta", line)}), "tube")
 
 
 def indentation(
@@ -163,28 +153,19 @@ def indentation(
         modulus: Pa; the wall is 1.5 mm thick.
         loads: (n,), N.
     """
-    lumen, size = straight_tube(radius).lumen, 1e-3
-    spec = mujoco.MjSpec()
-    spec.nuser_geom = 4
-    spec.option.integrator = mujoco.mjtIntegrator.mjINT_DISCRETE
-    spec.option.timestep = PHYSICS_TIMESTEP
-    spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
-    box = {"capsule": (size, LINK / 2, 0), "sphere": (size, 0, 0)}[kind]
-    wall = fields.carrier(lumen)
-    spec.worldbody.add_geom(
-        type=mujoco.mjtGeom.mjGEOM_BOX,
-        pos=wall["pos"],
-        size=wall["size"],
-        userdata=wall["user"],
+    size, ball = 1e-3, kind == "sphere"
+    spec = bare(tube(0.2, radius).lumen)
+    geom = slider(
+        spec,
+        (1, 0, 0),
+        (radius - size - 1e-4, 0, 0.1),
+        type=getattr(mujoco.mjtGeom, f"mjGEOM_{kind.upper()}"),
+        size=(size, 0.0 if ball else LINK / 2, 0),
+        mass=1e-3,
+        priority=1,
     )
-    body = spec.worldbody.add_body(pos=(radius - size - 1e-4, 0, 0.1))
-    body.add_joint(type=mujoco.mjtJoint.mjJNT_SLIDE, axis=(1, 0, 0))
-    type_ = getattr(mujoco.mjtGeom, f"mjGEOM_{kind.upper()}")
-    geom = body.add_geom(type=type_, size=box, mass=1e-3, priority=1)
-    model = spec.compile()
-    planes = 2 if kind == "capsule" else 1
-    spring = stiffness(np.array([radius]), modulus, 1.5e-3, 1.0) / planes
-    number = geom.id
+    model, number = spec.compile(), geom.id
+    spring = stiffness(np.array([radius]), modulus, 1.5e-3, 1.0) / (1 if ball else 2)
     model.geom_solref[number], model.geom_solimp[number] = (
         value[0] if isinstance(value, np.ndarray) else value
         for value in law(spring, model.body_invweight0[1, :1])
@@ -198,72 +179,32 @@ def indentation(
     return np.array(depths)
 
 
-def wall_checks() -> list[Check]:
-    """A wall that gives: slope of force over depth, and a wall that hardly does."""
-    made = []
-    for kind in ("sphere", "capsule"):
-        for radius, modulus in itertools.product(RADII, MODULI):
-            expected = float(stiffness(np.array([radius]), modulus, 1.5e-3, 1.0)[0])
-            # A capsule that lies along the tube touches with both ends.
-            expected *= 2 if kind == "capsule" else 1
-            loads = expected * np.array([2e-4, 6e-4])
-            slope = np.ptp(loads) / np.ptp(indentation(kind, radius, modulus, loads))
-            made.append(
-                Check.deviation(
-                    f"{kind} in a tube of {1e3 * radius:g} mm, {1e-6 * modulus:g} MPa",
-                    slope,
-                    expected,
-                    SLOPE_BOUND,
-                    f"{slope:.0f} N/m, formula {expected:.0f} N/m",
-                )
-            )
-    return made
-
-
-def flow_checks() -> list[Check]:
-    """Flow of blood."""
-    made = []
-    for speed in CROSS_FLOWS:
-        mine, theirs = cantilever(speed)
-        made.append(
-            Check.deviation(
-                f"cantilever of 0.2 m in a cross-flow of {speed:g} m/s",
-                mine,
-                theirs,
-                FLOW_BOUND,
-                f"{1e3 * mine:.2f} mm, elastica {1e3 * theirs:.2f} mm",
-            )
-        )
-    for force in FORCES:
-        mine, theirs = terminal_velocity(force)
-        made.append(
-            Check.deviation(
-                f"terminal velocity of a free link under {1e3 * force:g} mN",
-                mine,
-                theirs,
-                FLOW_BOUND,
-                f"{mine:.4f} m/s, drag {theirs:.4f} m/s",
-            )
-        )
-    for name in ANATOMIES:
-        defect = volume_defect(phantoms.load(name))
-        made.append(
-            Check.at_most(
-                f"volume lost at the junctions of {name}", defect, VOLUME_BOUND, ""
-            )
-        )
-    deviation, flow = profile()
-    made.append(
-        Check.at_most(
-            "profile in a tube, deviation over the mean", deviation, PROFILE_BOUND, ""
-        )
-    )
-    made.append(Check.deviation("flow through the profile", flow, 1.0, 1e-6))
-    return made
-
-
 def validate_vessel() -> Report:
     """Checks what `vessel` does to blood and wall."""
-    tube, phantom = straight_tube(motion.RADIUS), phantoms.load("type1")
-    moving = motion.checks(tube, phantom)
-    return Report("vessel", [*flow_checks(), *wall_checks(), *moving])
+    checks = Checks()
+    for speed in CROSS_FLOWS:
+        name = f"cantilever of 0.2 m in a cross-flow of {speed:g} m/s"
+        bent, elastica = cantilever(speed)
+        checks.deviation(name, 1e3 * bent, 1e3 * elastica, FLOW_BOUND, "mm")
+    for force in FORCES:
+        name = f"terminal velocity of a free link under {1e3 * force:g} mN"
+        checks.deviation(name, *terminal_velocity(force), FLOW_BOUND, "m/s")
+    for name in ANATOMIES:
+        lost = volume_defect(phantoms.load(name))
+        checks.at_most(f"volume lost at the junctions of {name}", lost, VOLUME_BOUND)
+    deviation, flow = profile()
+    name = "profile in a tube, deviation over the mean"
+    checks.at_most(name, deviation, PROFILE_BOUND)
+    checks.deviation("flow through the profile", flow, 1.0, 1e-6)
+    for kind, radius, modulus in itertools.product(
+        ("sphere", "capsule"), RADII, MODULI
+    ):
+        expected = float(stiffness(np.array([radius]), modulus, 1.5e-3, 1.0)[0])
+        # A capsule that lies along the tube touches with both ends.
+        expected *= 2 if kind == "capsule" else 1
+        loads = expected * np.array([2e-4, 6e-4])
+        slope = np.ptp(loads) / np.ptp(indentation(kind, radius, modulus, loads))
+        name = f"{kind} in a tube of {1e3 * radius:g} mm, {1e-6 * modulus:g} MPa"
+        checks.deviation(name, slope, expected, SLOPE_BOUND, "N/m")
+    moving = motion.checks(tube(0.2, motion.RADIUS), phantoms.load("type1"))
+    return Report("vessel", [*checks, *moving])

@@ -13,11 +13,12 @@ from cathsim_dmc.anatomy import measures
 from cathsim_dmc.anatomy.anatomy import Anatomy
 from cathsim_dmc.anatomy.scan import topology
 from cathsim_dmc.anatomy.scan.check import check_tree
+from cathsim_dmc.anatomy.surface import sampled
 from cathsim_dmc.anatomy.surface_depth import SurfaceDepth
 from cathsim_dmc.anatomy.tree_depth import TreeDepth
 from cathsim_dmc.entities import devices
 from cathsim_dmc.validation import convergence, friction, pushing
-from cathsim_dmc.validation.checks import Check, Report
+from cathsim_dmc.validation.checks import Check, Checks, Report
 
 # Bounds (mm) on the difference between the field and the distance that it stands for,
 # at the 99th percentile of places within 1 mm of the wall: of a union of tubes, and of
@@ -33,17 +34,9 @@ def field_error(anatomy: Anatomy) -> np.ndarray:
     """Difference (n,) between field and exact depth within 1 mm of the wall, m."""
     from cathsim_dmc.anatomy.field_loops import FREE
 
-    rng = np.random.default_rng(0)
-    triangles = anatomy.surface.vertices[anatomy.surface.faces]
-    cross = np.cross(
-        triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]
-    )
-    area = np.linalg.norm(cross, axis=1)
-    face = rng.choice(len(area), _PLACES, p=area / area.sum())
-    points = np.einsum(
-        "nk,nkd->nd", rng.dirichlet(np.ones(3), _PLACES), triangles[face]
-    )
-    points += rng.uniform(-1.2e-3, 1.2e-3, (_PLACES, 1)) * (cross / area[:, None])[face]
+    points, normals = sampled(anatomy.surface, _PLACES)
+    away = np.random.default_rng(0).uniform(-1.2e-3, 1.2e-3, (_PLACES, 1))
+    points = points + away * normals
     if anatomy.scanned:
         exact = SurfaceDepth(anatomy.surface, anatomy.ends)(points)
     else:
@@ -70,60 +63,43 @@ def lumen_checks(anatomy: Anatomy) -> list[Check]:
         )
         > radius
     ]
-    handles = Check.at_most(
-        f"{name}: handles of the surface",
-        topology.handles(faces),
+    made = Checks()
+    if not anatomy.scanned:  # scans have rings of vessels
+        note = "tubes that touch beyond the place where they part"
+        handles = topology.handles(faces)
+        made.at_most(f"{name}: handles of the surface", handles, 0, "", note)
+    note = f"{len(faces)} triangles, {1e6 * anatomy.surface.volume:.0f} ml"
+    edges = f"{name}: edges of the surface without two triangles"
+    made.at_most(edges, loose, 0, "", note)
+    parts = int(topology.parts(faces).max()) + 1
+    made.at_most(f"{name}: separate parts of the surface", parts, 1)
+    made.at_most(
+        f"{name}: error of the field, 99th percentile",
+        float(np.percentile(error, 99)),
+        ERROR_SURFACE if anatomy.scanned else ERROR_TREE,
+        "mm",
+        f"mean {error.mean():.4f} mm, at most {error.max():.3f} mm, at "
+        f"{len(error)} places within {1e3 * _NEAR_WALL:g} mm of the wall",
+    )
+    size = anatomy.lumen.nbytes / 1e6
+    made.at_most(f"{name}: memory of the field", size, LARGEST_FIELD, "MB")
+    made.at_most(
+        f"{name}: places of the centrelines that the device does not pass",
+        sum(narrow.values()),
         0,
         "",
-        "tubes that touch beyond the place where they part",
+        f"radius {1e3 * radius:.2f} mm"
+        + (f", blocked: {', '.join(narrow)}" if narrow else ""),
     )
-    return [
-        *([] if anatomy.scanned else [handles]),  # scans have rings of vessels
-        Check.at_most(
-            f"{name}: edges of the surface without two triangles",
-            loose,
-            0,
-            "",
-            f"{len(anatomy.surface.faces)} triangles, "
-            f"{1e6 * anatomy.surface.volume:.0f} ml",
-        ),
-        Check.at_most(
-            f"{name}: separate parts of the surface",
-            int(topology.parts(faces).max()) + 1,
-            1,
-            "",
-        ),
-        Check.at_most(
-            f"{name}: error of the field, 99th percentile",
-            float(np.percentile(error, 99)),
-            ERROR_SURFACE if anatomy.scanned else ERROR_TREE,
-            "mm",
-            f"mean {error.mean():.4f} mm, at most {error.max():.3f} mm, at "
-            f"{len(error)} places within {1e3 * _NEAR_WALL:g} mm of the wall",
-        ),
-        Check.at_most(
-            f"{name}: memory of the field",
-            anatomy.lumen.nbytes / 1e6,
-            LARGEST_FIELD,
-            "MB",
-        ),
-        Check.at_most(
-            f"{name}: places of the centrelines that the device does not pass",
-            sum(narrow.values()),
-            0,
-            "",
-            f"radius {1e3 * radius:.2f} mm"
-            + (f", blocked: {', '.join(narrow)}" if narrow else ""),
-        ),
-        Check.at_most(
-            f"{name}: goals that the device cannot reach in their vessel",
-            len(astray),
-            0,
-            "",
-            f"of {', '.join(anatomy.goals) or 'none'}"
-            + (f", astray: {', '.join(astray)}" if astray else ""),
-        ),
-    ]
+    made.at_most(
+        f"{name}: goals that the device cannot reach in their vessel",
+        len(astray),
+        0,
+        "",
+        f"of {', '.join(anatomy.goals) or 'none'}"
+        + (f", astray: {', '.join(astray)}" if astray else ""),
+    )
+    return made
 
 
 def _narrow(anatomy: Anatomy, radius: float) -> dict[str, int]:
@@ -150,11 +126,13 @@ def validate_anatomy(
         figure_path: PNG of three views of the first one, or None.
         push: whether to try a straight push to each goal, which takes seconds.
     """
-    checks: list[Check] = []
-    findings: dict[str, Any] = {}
+    checks, findings = Checks(), {}
     for name, anatomy in anatomies.items():
         checks += lumen_checks(dataclasses.replace(anatomy, name=name))
-        checks += tree_checks(dataclasses.replace(anatomy, name=name))
+        for found in check_tree(anatomy):
+            violations = int(not found.passed)
+            label = f"{name}: {found.name}, violations"
+            checks.at_most(label, violations, 0, "", found.detail)
         findings[name] = {"measures": shape(anatomy)}
         if push:
             from cathsim_dmc.validation.insertion import straight_push
@@ -169,39 +147,14 @@ def validate_anatomy(
     return Report("anatomy of " + ", ".join(anatomies), checks, findings)
 
 
-def tree_checks(anatomy: Anatomy) -> list[Check]:
-    """Tree against surface; see `anatomy.scan.check.check_tree`."""
-    return [
-        Check.at_most(
-            f"{anatomy.name}: {found.name}, violations",
-            0 if found.passed else 1,
-            0,
-            "",
-            found.detail,
-        )
-        for found in check_tree(anatomy)
-    ]
+_ANGLES = "plane ascending_tilt ascending_turn take_off lean axis_angle".split()
+_PLAIN = ("drop", "tortuosity")
 
 
 def shape(anatomy: Anatomy) -> dict[str, Any]:
     """What an anatomy is like, for people: millimetres and degrees in the names."""
-    found = dataclasses.asdict(
-        measures.measure(
-            anatomy.tree, anatomy.inlet.position, measures.inlet_axis(anatomy)
-        )
-    )
-    return _for_people(found)
-
-
-_ANGLES = {
-    "plane",
-    "ascending_tilt",
-    "ascending_turn",
-    "take_off",
-    "lean",
-    "axis_angle",
-}
-_PLAIN = {"drop", "tortuosity"}
+    start, axis = anatomy.inlet.position, measures.inlet_axis(anatomy)
+    return _for_people(dataclasses.asdict(measures.measure(anatomy.tree, start, axis)))
 
 
 def _for_people(values: Mapping[str, Any], inside: str = "") -> dict[str, Any]:
@@ -213,10 +166,9 @@ def _for_people(values: Mapping[str, Any], inside: str = "") -> dict[str, Any]:
             out[key] = value
         elif key in _ANGLES:
             out[f"{key}_deg"] = round(float(np.degrees(value)), 1)
-        elif inside == "diameters":
-            out[key] = round(1e3 * value, 2)
         else:
-            out[f"{key}_mm"] = round(1e3 * value, 2)
+            end = "" if inside == "diameters" else "_mm"
+            out[f"{key}{end}"] = round(1e3 * value, 2)
     return out
 
 
@@ -247,16 +199,12 @@ def validate_wall(
                 )
             phantom = Anatomy.load(phantom)
         anatomies.append(phantom)
-    checks: list[Check] = []
-    for anatomy in anatomies:
-        checks += lumen_checks(anatomy)
+    checks = [check for anatomy in anatomies for check in lumen_checks(anatomy)]
     rubbed, pulled = friction.checks()
-    checks += rubbed
     pushes, pushed = pushing.checks()
-    checks += pushes
     studies = convergence.studies() if with_convergence else []
-    checks += convergence.checks(studies)
-    findings: dict[str, Any] = {"pushed": [one._asdict() for one in pushed]}
+    checks += rubbed + pushes + convergence.checks(studies)
+    findings: dict[str, Any] = {"pushed": pushed}
     if studies:
         findings["convergence"] = studies
     data = {"anatomies": anatomies, "capstans": pulled, "studies": studies}

@@ -129,25 +129,8 @@ def _lag(ax, lag):
     ax.legend(frameon=False, fontsize=8, loc="lower right")
 
 
-def pair(shapes, turned):
-    figure, axes = canvas(1, 2)
-    left, right = axes[0]
-    for index, shape in enumerate(shapes):
-        end = shape.expected[-1, :2]
-        across = end / np.linalg.norm(end)
-        colour = COLOURS[index % len(COLOURS)]
-        for points, mark in ((shape.expected, "-"), (shape.simulated, ".")):
-            left.plot(
-                1e3 * points[:, 2], 1e3 * points[:, :2] @ across, mark, color=colour
-            )
-    length = 1e3 * shapes[0].expected[-1, 2]
-    left.set_xlim(length - 100, length + 10)
-    left.set(
-        title="unloaded shapes: EI-weighted curvature, joints",
-        xlabel="along the sheath, mm",
-        ylabel="across, mm",
-        aspect="equal",
-    )
+def pair(turned):
+    figure, ((right,),) = canvas(1, 1)
     for index, one in enumerate(turned):
         right.plot(
             np.degrees(one.base),
