@@ -26,6 +26,7 @@ and `goals` may be left out.
 from __future__ import annotations
 
 import json
+import math
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -50,23 +51,6 @@ _RADII = (0.3, 60.0)
 _MOST_POINTS = 20_000
 
 
-@dataclass(frozen=True)
-class InletPlace:
-    """Where a device enters: a free end of a vessel, or a place to cut it at."""
-
-    vessel: str
-    end: str | None = None
-    arc_length: float | None = None
-
-    def place(self, tree: VesselTree) -> VesselPlace:
-        """The same as an arc length on the built centreline."""
-        arc = self.arc_length
-        if arc is None:
-            length = tree.vessel(self.vessel).centreline.length
-            arc = 0.0 if self.end == "first" else length
-        return VesselPlace(self.vessel, arc_length=arc)
-
-
 @dataclass(frozen=True, eq=False)
 class TreeFile:
     """Content of a tree file; lengths in metres, frame LPS.
@@ -74,14 +58,15 @@ class TreeFile:
     Attributes:
         name: of the anatomy.
         curves: centrelines by name, the root first.
-        inlets: by name of the access; the first is the usual one.
+        inlets: vessel and arc length along it, infinite for its last point, by name of
+            the access; the first is the usual one.
         goals: by name; None for one in each branch.
         note: where the figures come from.
     """
 
     name: str
     curves: Mapping[str, Curve]
-    inlets: Mapping[str, InletPlace]
+    inlets: Mapping[str, tuple[str, float]]
     goals: Mapping[str, VesselPlace] | None = None
     note: str = field(default="", repr=False)
 
@@ -97,12 +82,11 @@ class TreeFile:
         """
         if access is None:
             access = next(iter(self.inlets))
-        if access not in self.inlets:
-            raise ValueError(
-                f"access is {access!r}; choose one of {', '.join(self.inlets)}."
-            )
+        vessel, arc = self.inlets[bounds.choice("access", access, self.inlets)]
         tree = self.tree()
-        inlet = self.inlets[access].place(tree)
+        if arc == math.inf:
+            arc = tree.vessel(vessel).centreline.length
+        inlet = VesselPlace(vessel, arc_length=arc)
         return Anatomy.from_tree(tree, self.name, inlet=inlet, goals=self.goals)
 
 
@@ -118,11 +102,9 @@ def read_tree(path: str | os.PathLike[str]) -> TreeFile:
     if not path.is_file():
         raise FileNotFoundError(f"no file {path}; give a vessel tree in JSON.")
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
+        return parse_tree(json.loads(path.read_text(encoding="utf-8")))
     except (json.JSONDecodeError, UnicodeDecodeError, RecursionError) as error:
         raise ValueError(f"{path} is no JSON: {error}") from error
-    try:
-        return parse_tree(content)
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from error
 
@@ -133,174 +115,109 @@ def parse_tree(content: Any) -> TreeFile:
     Raises:
         ValueError: names the entry that is wrong and what is allowed.
     """
-    _entries(
-        content,
-        "the file",
-        {"format", "version", "name", "units", "frame", "vessels"},
-        {"note", "inlets", "goals"},
-    )
-    if content["format"] != FORMAT or content["version"] != FORMAT_VERSION:
-        raise ValueError(
-            f"format {content['format']!r}, version {content['version']!r}; this "
-            f"reads {FORMAT!r}, version {FORMAT_VERSION}."
-        )
-    if content["units"] != "mm":
-        raise ValueError(f"units is {content['units']!r}; give lengths in 'mm'.")
-    name = content["name"]
-    if not isinstance(name, str) or not name:
-        raise ValueError(f"name is {name!r}; give a word.")
-    frame = content["frame"]
-    if not isinstance(frame, str) or frame not in _FRAMES:
-        raise ValueError(f"frame is {frame!r}; choose one of {', '.join(_FRAMES)}.")
-    flip = np.array(_FRAMES[frame])
-    vessels = content["vessels"]
-    if not isinstance(vessels, dict) or not vessels:
-        raise ValueError("vessels is empty or no object; give name: centreline.")
-    curves = {key: _curve(key, entry, flip) for key, entry in vessels.items()}
-    _check_parents(curves)
-    root = next(iter(curves))
+    needed = ("format", "version", "name", "units", "frame", "vessels")
+    _entries("the file", content, needed, ("note", "inlets", "goals"))
+    fixed = {"format": FORMAT, "version": FORMAT_VERSION, "units": "mm"}
+    for key, value in fixed.items():
+        if content[key] != value:
+            bounds.refuse(key, content[key], repr(value))
+    flip = np.array(_FRAMES[bounds.choice("frame", content["frame"], _FRAMES)])
+    curves: dict[str, Curve] = {}
+    for key, entry in _parts(content, "vessels"):
+        curves[key] = _curve(f"vessel {key!r}", entry, flip, list(curves))
+    root = next(iter(curves), "")
+    bounds.choice("the first of vessels", root, curves)
     inlets = {
-        key: _inlet(key, entry, curves, root)
-        for key, entry in _object(content.get("inlets", {}), "inlets").items()
-    } or {"first": InletPlace(root, end="first")}
-    goals = content.get("goals")
-    if goals is not None:
-        goals = {
-            key: _goal(key, entry, curves, flip)
-            for key, entry in _object(goals, "goals").items()
-        }
-    note = content.get("note", "")
-    if not isinstance(note, str):
-        raise ValueError("note is no text.")
-    return TreeFile(name, curves, inlets, goals, note)
+        key: _inlet(f"inlet {key!r}", entry, curves)
+        for key, entry in _parts(content, "inlets")
+    }
+    goals = {
+        key: _goal(f"goal {key!r}", entry, curves, flip)
+        for key, entry in _parts(content, "goals")
+    }
+    return TreeFile(
+        bounds.text("name", content["name"]),
+        curves,
+        inlets or {"first": (root, 0.0)},
+        goals if "goals" in content else None,
+        bounds.instance("note", content.get("note", ""), str),
+    )
 
 
-def _object(value: Any, name: str) -> dict[str, Any]:
-    if not isinstance(value, dict):
-        raise ValueError(f"{name} is {type(value).__name__}; give an object.")
-    return value
+def _parts(content: Mapping[str, Any], name: str):
+    return bounds.instance(name, content.get(name, {}), dict).items()
 
 
-def _entries(value: Any, name: str, needed: set[str], allowed: set[str]) -> None:
+def _entries(name: str, value: Any, needed: tuple, more: tuple = ()) -> None:
     """Check that an object has the entries it needs and no others."""
-    keys = set(_object(value, name))
-    if missing := needed - keys:
+    bounds.mapping(name, value, (*needed, *more))
+    if missing := set(needed) - set(value):
         raise ValueError(f"{name} lacks {', '.join(sorted(missing))}.")
-    if unknown := keys - needed - allowed:
-        raise ValueError(
-            f"{name} has unknown entries {', '.join(sorted(unknown))}; there are "
-            f"{', '.join(sorted(needed | allowed))}."
-        )
 
 
-def _numbers(value: Any, name: str, columns: int | None) -> np.ndarray:
-    """Finite numbers (n,) or (n, columns)."""
-    shape = "numbers" if columns is None else f"rows of {columns} numbers"
-    if not isinstance(value, list) or not value or len(value) > _MOST_POINTS:
-        raise ValueError(f"{name}: give 1 to {_MOST_POINTS} {shape}.")
-    for index, row in enumerate(value):
-        cells = [row] if columns is None else row
-        if (
-            not isinstance(cells, list)
-            or (columns is not None and len(cells) != columns)
-            or not all(bounds.is_number(cell) for cell in cells)
-        ):
-            raise ValueError(f"{name}[{index}] is {row!r}; give {shape}.")
-    return np.array(value, dtype=np.float64)
-
-
-def _length(value: Any, name: str) -> float:
-    return bounds.number(name, value, 0.0, _FARTHEST, "mm") * _MM
-
-
-def _curve(name: str, entry: Any, flip: np.ndarray) -> Curve:
-    where = f"vessel {name!r}"
-    _entries(entry, where, {"parent", "points_mm", "radii_mm"}, set())
+def _curve(where: str, entry: Any, flip: np.ndarray, before: list[str]) -> Curve:
+    _entries(where, entry, ("parent", "points_mm", "radii_mm"))
     parent = entry["parent"]
-    if parent is not None and not isinstance(parent, str):
-        raise ValueError(f"{where}: parent is {parent!r}; give a name or null.")
-    points = _numbers(entry["points_mm"], f"{where}: points_mm", 3)
-    radii = _numbers(entry["radii_mm"], f"{where}: radii_mm", None)
-    if len(points) != len(radii) or len(points) < 2:
+    if parent not in (before or [None]):
+        wanted = f"one of those before it: {', '.join(before)}" if before else "null"
+        bounds.refuse(f"parent of {where}", parent, wanted)
+    points = _numbers(f"{where}: points_mm", entry["points_mm"], 3)
+    radii = _numbers(f"{where}: radii_mm", entry["radii_mm"], 1)[:, 0]
+    far, (low, high) = np.abs(points).max(), _RADII
+    if far > _FARTHEST or radii.min() < low or radii.max() > high:
         raise ValueError(
-            f"{where} has {len(points)} points and {len(radii)} radii; give at least "
-            "two points and one radius for each."
+            f"{where} has coordinates up to {far:g} mm and radii from {radii.min():g} "
+            f"to {radii.max():g} mm; allowed are {_FARTHEST:g} mm, and {low:g} to "
+            f"{high:g} mm. Are these millimetres, and no diameters?"
         )
-    if np.abs(points).max() > _FARTHEST:
-        raise ValueError(
-            f"{where} has a coordinate of {np.abs(points).max():g} mm; allowed is "
-            f"{_FARTHEST:g}. Are these millimetres?"
-        )
-    low, high = _RADII
-    if radii.min() < low or radii.max() > high:
-        raise ValueError(
-            f"{where} has radii from {radii.min():g} to {radii.max():g} mm; allowed is "
-            f"{low:g} to {high:g} mm. Are these millimetres, and no diameters?"
-        )
-    steps = np.linalg.norm(np.diff(points, axis=0), axis=1)
-    if steps.min() < 1e-3:
-        index = int(steps.argmin())
-        raise ValueError(f"{where}: points {index} and {index + 1} coincide; drop one.")
-    return Curve(points * flip * _MM, radii * _MM, parent)
+    try:
+        return Curve(points * flip * _MM, radii * _MM, parent)
+    except ValueError as error:
+        raise ValueError(f"{where}: {error}") from error
 
 
-def _check_parents(curves: Mapping[str, Curve]) -> None:
-    seen: list[str] = []
-    for name, curve in curves.items():
-        if (curve.parent is None) != (not seen):
-            raise ValueError(
-                f"vessel {name!r} has parent {curve.parent!r}; the first vessel, and "
-                "only the first, has null."
-            )
-        if curve.parent is not None and curve.parent not in seen:
-            raise ValueError(
-                f"parent {curve.parent!r} of vessel {name!r} is not among those before "
-                f"it: {', '.join(seen)}."
-            )
-        seen.append(name)
+def _numbers(name: str, value: Any, columns: int) -> np.ndarray:
+    """Finite numbers (n, columns)."""
+    if not isinstance(value, list) or not 0 < len(value) <= _MOST_POINTS:
+        bounds.refuse(name, value, f"a list of 1 to {_MOST_POINTS} entries")
+    rows = [[row] if columns == 1 else row for row in value]
+    return np.array(
+        [bounds.vector(f"{name}[{k}]", row, columns) for k, row in enumerate(rows)]
+    )
 
 
-def _vessel(entry: dict[str, Any], where: str, curves: Mapping[str, Curve]) -> str:
-    vessel = entry["vessel"]
-    if not isinstance(vessel, str) or vessel not in curves:
-        raise ValueError(
-            f"{where}: no vessel {vessel!r}; there are {', '.join(curves)}."
-        )
-    return vessel
+def _place(
+    where: str, entry: Any, curves: Mapping[str, Curve], ways: tuple
+) -> tuple[str, str]:
+    """Vessel of an entry, and the one of the ways to say a place that it has."""
+    _entries(where, entry, ("vessel",), ways)
+    given = [way for way in ways if way in entry]
+    if len(given) != 1:
+        raise ValueError(f"{where}: give one of {', '.join(ways)}.")
+    return bounds.choice(f"vessel of {where}", entry["vessel"], curves), given[0]
 
 
-def _inlet(name: str, entry: Any, curves: Mapping[str, Curve], root: str) -> InletPlace:
-    where = f"inlet {name!r}"
-    _entries(entry, where, {"vessel"}, {"end", "arc_length_mm"})
-    vessel = _vessel(entry, where, curves)
-    if ("end" in entry) == ("arc_length_mm" in entry):
-        raise ValueError(f"{where}: give one of end and arc_length_mm.")
-    if "arc_length_mm" in entry:
-        arc = _length(entry["arc_length_mm"], f"{where}: arc_length_mm")
-        return InletPlace(vessel, arc_length=arc)
-    ends = ("first", "last") if vessel == root else ("last",)
-    if entry["end"] not in ends:
-        raise ValueError(
-            f"{where}: end is {entry['end']!r}; {vessel!r} has {', '.join(ends)}."
-        )
-    return InletPlace(vessel, end=entry["end"])
+def _length(where: str, entry: Mapping[str, Any], way: str) -> float:
+    return bounds.number(f"{where}: {way}", entry[way], 0.0, _FARTHEST, "mm") * _MM
+
+
+def _inlet(where: str, entry: Any, curves: Mapping[str, Curve]) -> tuple[str, float]:
+    vessel, way = _place(where, entry, curves, ("end", "arc_length_mm"))
+    if way == "arc_length_mm":
+        return vessel, _length(where, entry, way)
+    ends = {"first": 0.0, "last": math.inf}
+    if curves[vessel].parent is not None:
+        del ends["first"]
+    return vessel, ends[bounds.choice(f"{where}: end", entry["end"], ends)]
 
 
 def _goal(
-    name: str, entry: Any, curves: Mapping[str, Curve], flip: np.ndarray
+    where: str, entry: Any, curves: Mapping[str, Curve], flip: np.ndarray
 ) -> VesselPlace:
-    where = f"goal {name!r}"
-    ways = {"arc_length_mm", "past_ostium_mm", "position_mm"}
-    _entries(entry, where, {"vessel"}, ways)
-    vessel = _vessel(entry, where, curves)
-    given = ways & set(entry)
-    if len(given) != 1:
-        raise ValueError(f"{where}: give one of {', '.join(sorted(ways))}.")
-    (way,) = given
+    ways = ("arc_length_mm", "past_ostium_mm", "position_mm")
+    vessel, way = _place(where, entry, curves, ways)
     if way == "position_mm":
-        (position,) = _numbers([entry[way]], f"{where}: {way}", 3)
+        position = np.array(bounds.vector(f"{where}: {way}", entry[way], 3))
         return VesselPlace(vessel, position=position * flip * _MM)
-    length = _length(entry[way], f"{where}: {way}")
-    if way == "past_ostium_mm":
-        return VesselPlace(vessel, past_ostium=length)
-    return VesselPlace(vessel, arc_length=length)
+    length = {way.removesuffix("_mm"): _length(where, entry, way)}
+    return VesselPlace(vessel, **length)
