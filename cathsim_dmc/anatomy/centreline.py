@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from cathsim_dmc import bounds
-from cathsim_dmc.anatomy.segments import Array, Segments, as_points
+from cathsim_dmc.anatomy.segments import Array, Segments, arc_lengths, as_points
 
 # Points x segments handled at once while projecting: stays within the L2 cache.
 _CHUNK_ELEMENTS = 64_000
@@ -93,8 +93,7 @@ class Centreline:
     @cached_property
     def arc_length(self) -> Array:
         """Arc length (n,) of each point from the first, metres."""
-        steps = np.linalg.norm(np.diff(self.points, axis=0), axis=1)
-        return _readonly(np.concatenate([[0.0], np.cumsum(steps)]))
+        return _readonly(arc_lengths(self.points))
 
     @property
     def length(self) -> float:

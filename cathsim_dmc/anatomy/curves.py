@@ -14,6 +14,7 @@ from scipy import interpolate
 
 from cathsim_dmc import bounds
 from cathsim_dmc.anatomy.centreline import Array, Centreline, Vessel, VesselTree
+from cathsim_dmc.anatomy.segments import arc_lengths
 from cathsim_dmc.anatomy.septa import check_septa
 
 # Standard deviations of measured positions and radii, m: how far the spline may
@@ -106,9 +107,7 @@ def _fit(
     points: Array, smoothing: float, weights: Array | None = None
 ) -> tuple[interpolate.BSpline, float]:
     """Cubic spline (3 coordinates) over chord length, and the whole chord length."""
-    chord = np.concatenate(
-        [[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))]
-    )
+    chord = arc_lengths(points)
     order = min(3, len(points) - 1)
     weights = np.ones(len(points)) if weights is None else weights
     # In millimetres, which fitpack's tolerances suit.
@@ -127,9 +126,7 @@ def _sampled(spline: interpolate.BSpline, end: float, step: float) -> Array:
     """Points (n, 3) of a spline at equal arcs of about `step` (m), ends included."""
     parameter = np.linspace(0.0, end, max(20, 10 * math.ceil(end / step)))
     points = spline(parameter)
-    arc = np.concatenate(
-        [[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))]
-    )
+    arc = arc_lengths(points)
     count = max(2, math.ceil(arc[-1] / step) + 1)
     # Chords between the points interpolated would show as wrinkles in its curvature.
     return spline(np.interp(np.linspace(0.0, arc[-1], count), arc, parameter))

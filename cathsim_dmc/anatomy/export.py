@@ -14,8 +14,10 @@ from cathsim_dmc import files
 from cathsim_dmc.anatomy.anatomy import Anatomy
 from cathsim_dmc.anatomy.convex_wall import wall_pieces
 from cathsim_dmc.anatomy.scan.extract import DEVICE_RADIUS
+from cathsim_dmc.anatomy.surface import sampled
 
-_SPACING = 1.5e-3  # m, between places of the wall that are looked at
+_PLACES = 10_000  # of the wall that are looked at
+_NEAR = 1.5e-3  # m from an open end, where there is no wall
 # Levels (m) along the normal at which pieces are looked for, > 0 in the lumen.
 _LEVELS = np.arange(-1.5e-3, 1.5e-3, 0.05e-3)
 _GRAZE = 0.05e-3  # m, by which a piece may touch a 5 Fr catheter on a centreline
@@ -44,31 +46,21 @@ class Fidelity:
 
 def fidelity(anatomy: Anatomy, pieces: Sequence[np.ndarray]) -> Fidelity:
     """Measures convex pieces (n_i, 3) m against the lumen of an anatomy."""
-    planes = [ConvexHull(1e3 * piece).equations * (1, 1, 1, 1e-3) for piece in pieces]
     points, inward = _wall_places(anatomy)
-    lines = points[:, None] + _LEVELS[:, None] * inward[:, None]
-    met = np.zeros(lines.shape[:2], dtype=bool)
-    near = cKDTree(points)
-    for piece, plane in zip(pieces, planes, strict=True):
-        middle = piece.mean(axis=0)
-        reach = np.linalg.norm(piece - middle, axis=1).max() - _LEVELS[0]
-        rows = near.query_ball_point(middle, reach)
-        height = lines[rows] @ plane[:, :3].T + plane[:, 3]
-        met[rows] |= (height < 1e-6).all(axis=-1)
+    met = _within(points[:, None] + _LEVELS[:, None] * inward[:, None], pieces)
     inside = np.where(met, _LEVELS, 0.0).max(axis=1).clip(0.0)
     behind = np.where(met, -_LEVELS, np.inf).min(axis=1).clip(0.0)
     closed = np.isfinite(behind)
     blocked = []
+    directions = np.random.default_rng(0).normal(size=(100, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     for name, vessel in anatomy.tree.vessels.items():
-        line = vessel.centreline
-        margin = 1.5 * DEVICE_RADIUS
+        line, margin = vessel.centreline, 1.5 * DEVICE_RADIUS
         s = np.arange(margin, max(line.length - margin, 1.1 * margin), 1e-3)
         place = line.at(s).position
         free = np.minimum(DEVICE_RADIUS, 0.8 * anatomy.depth(place)) - _GRAZE
-        if any(
-            ((place @ plane[:, :3].T + plane[:, 3]).max(axis=1) < free).any()
-            for plane in planes
-        ):
+        around = place[:, None] + free[:, None, None] * directions
+        if _within(np.concatenate([around, place[:, None]], axis=1), pieces).any():
             blocked.append(name)
     return Fidelity(
         _summary(inside),
@@ -79,21 +71,28 @@ def fidelity(anatomy: Anatomy, pieces: Sequence[np.ndarray]) -> Fidelity:
     )
 
 
+def _within(points: np.ndarray, pieces: Sequence[np.ndarray]) -> np.ndarray:
+    """Whether points (..., 3) lie in any of the pieces."""
+    flat = points.reshape(-1, 3)
+    found, near = np.zeros(len(flat), dtype=bool), cKDTree(flat)
+    for piece in pieces:
+        middle = piece.mean(axis=0)
+        reach = np.linalg.norm(piece - middle, axis=1).max()
+        if rows := near.query_ball_point(middle, reach):
+            planes = ConvexHull(1e3 * piece).equations * (1, 1, 1, 1e-3)
+            height = flat[rows] @ planes[:, :3].T + planes[:, 3]
+            found[rows] |= (height < 1e-6).all(axis=-1)
+    return found.reshape(points.shape[:-1])
+
+
 def _wall_places(anatomy: Anatomy) -> tuple[np.ndarray, np.ndarray]:
     """Places (n, 3) m all over the wall, and unit normals (n, 3) into the lumen."""
-    rng = np.random.default_rng(0)
-    corners = anatomy.surface.vertices[anatomy.surface.faces]
-    cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    area = 0.5 * np.linalg.norm(cross, axis=1)
-    count = round(area.sum() / _SPACING**2)
-    face = rng.choice(len(area), count, p=area / area.sum())
-    share = rng.dirichlet(np.ones(3), count)
-    points = np.einsum("nk,nkd->nd", share, corners[face])
+    points, _ = sampled(anatomy.surface, _PLACES)
     depth, inward = anatomy.depth(points), anatomy.lumen.gradient(points)
     inward /= np.maximum(np.linalg.norm(inward, axis=1, keepdims=True), 1e-9)
     wall = np.abs(depth) < _OFF
     for end in anatomy.ends:
-        beyond = (points - end.position) @ end.direction > -_SPACING
+        beyond = (points - end.position) @ end.direction > -_NEAR
         near = np.linalg.norm(points - end.position, axis=1) < 3.0 * end.radius
         wall &= ~(end.open & beyond & near)
     return (points - depth[:, None] * inward)[wall], inward[wall]

@@ -23,6 +23,12 @@ def as_points(points: ArrayLike, name: str = "points") -> Array:
     return array
 
 
+def arc_lengths(points: Array) -> Array:
+    """Arc length (n,) of each point (n, k) of a polyline from the first."""
+    steps = np.linalg.norm(np.diff(points, axis=0), axis=1)
+    return np.concatenate([[0.0], np.cumsum(steps)])
+
+
 class Segments:
     """Straight segments prepared for the projection of many points at once.
 

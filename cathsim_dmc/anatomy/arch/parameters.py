@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 from cathsim_dmc import bounds
 
@@ -15,8 +15,35 @@ MINIMUM_SEPTUM = 1e-3
 INLET_TUBE = 70e-3
 
 
-def _check(name: str, value: object, low: float, high: float, unit: str) -> None:
-    bounds.number(name, value, low, high, unit)
+LEVELS = ("ascending", "bca_level", "lcca_level", "lsa_level", "descending")
+# Least and largest value of each figure, and its unit.
+_TURN = 2.0 * math.pi
+_OF_BRANCH = {
+    "radius": (1.5e-3, 12e-3, "m"),
+    "end_radius": (1.0e-3, 12e-3, "m"),
+    "take_off": (-1.3, 1.3, "rad"),
+    "length": (40e-3, 150e-3, "m"),
+    "lean": (-1.3, 1.3, "rad"),
+    "bend_azimuth": (-_TURN, _TURN, "rad"),
+    "second_bend_azimuth": (-_TURN, _TURN, "rad"),
+}
+_OF_ARCH = {
+    **{f"{level}_radius": (7e-3, 25e-3, "m") for level in LEVELS},
+    "descending_radius": (6e-3, 22e-3, "m"),
+    "ascending_length": (5e-3, 300e-3, "m"),
+    "descending_length": (40e-3, 400e-3, "m"),
+    "arch_radius": (20e-3, 70e-3, "m"),
+    "arch_height": (15e-3, 90e-3, "m"),
+    "plane_rotation": (-math.pi, math.pi, "rad"),
+    "bca_drop": (0.0, 4.0, "LCCA diameters"),
+    "fillet": (0.0, 5e-3, "m"),
+    "lsa_aberrant_spacing": (0.0, 80e-3, "m"),
+    "ascending_bend": (0.0, 1.0, "rad"),
+    "descending_bend": (-0.5, 0.5, "rad"),
+    "plane_tilt": (-0.6, 0.6, "rad"),
+    "bow": (-15e-3, 15e-3, "m"),
+    "sway": (-15e-3, 15e-3, "m"),
+}
 
 
 @dataclass(frozen=True)
@@ -52,19 +79,14 @@ class BranchParameters:
     second_bend_azimuth: float = 0.0
 
     def __post_init__(self) -> None:
-        _check("branch radius", self.radius, 1.5e-3, 12e-3, "m")
-        _check("branch end_radius", self.end_radius, 1.0e-3, 12e-3, "m")
-        _check("branch take_off", self.take_off, -1.3, 1.3, "rad")
-        _check("branch length", self.length, 40e-3, 150e-3, "m")
-        _check("branch lean", self.lean, -1.3, 1.3, "rad")
+        for name, limits in _OF_BRANCH.items():
+            bounds.number(f"branch {name}", getattr(self, name), *limits)
         for name in ("bend_radius", "second_bend_radius"):
             bend = getattr(self, name)
             if bend is not None or name == "bend_radius":
-                _check(f"branch {name}", bend, 3.0 * self.radius, 10.0, "m")
-        for name in ("bend_azimuth", "second_bend_azimuth"):
-            azimuth = getattr(self, name)
-            _check(f"branch {name}", azimuth, -2 * math.pi, 2 * math.pi, "rad")
-        _check("branch goal_depth", self.goal_depth, 5e-3, self.length - 5e-3, "m")
+                bounds.number(f"branch {name}", bend, 3.0 * self.radius, 10.0, "m")
+        deepest = self.length - 5e-3
+        bounds.number("branch goal_depth", self.goal_depth, 5e-3, deepest, "m")
 
 
 @dataclass(frozen=True)
@@ -139,55 +161,38 @@ class ArchParameters:
             ):
                 bounds.refuse(name, branch, "BranchParameters")
         bounds.switch("bovine", self.bovine)
-        for level in ("ascending", "bca_level", "lcca_level", "lsa_level"):
-            name = f"{level}_radius"
-            _check(name, getattr(self, name), 7e-3, 25e-3, "m")
-        _check("descending_radius", self.descending_radius, 6e-3, 22e-3, "m")
-        _check("ascending_length", self.ascending_length, 5e-3, 300e-3, "m")
-        _check("descending_length", self.descending_length, 40e-3, 400e-3, "m")
-        _check("arch_radius", self.arch_radius, 20e-3, 70e-3, "m")
-        _check("arch_height", self.arch_height, 15e-3, 90e-3, "m")
-        _check("plane_rotation", self.plane_rotation, -math.pi, math.pi, "rad")
-        _check("bca_drop", self.bca_drop, 0.0, 4.0, "LCCA diameters")
-        _check("fillet", self.fillet, 0.0, 5e-3, "m")
-        _check("lsa_aberrant_spacing", self.lsa_aberrant_spacing, 0.0, 80e-3, "m")
-        _check("ascending_bend", self.ascending_bend, 0.0, 1.0, "rad")
-        _check("descending_bend", self.descending_bend, -0.5, 0.5, "rad")
-        _check("plane_tilt", self.plane_tilt, -0.6, 0.6, "rad")
-        for name in ("bow", "sway"):
-            _check(name, getattr(self, name), -15e-3, 15e-3, "m")
-        _check(
-            "descending_goal_depth",
-            self.descending_goal_depth,
-            5e-3,
-            self.descending_length,
-            "m",
-        )
-        widest = max(
-            getattr(self, field.name)
-            for field in fields(self)
-            if field.name.endswith("_radius") and field.name != "arch_radius"
-        )
-        tightest = min(
-            self.arch_radius**2 / self.arch_height,
-            self.arch_height**2 / self.arch_radius,
-        )
+        for name, limits in _OF_ARCH.items():
+            bounds.number(name, getattr(self, name), *limits)
+        deepest = self.descending_length
+        name = "descending_goal_depth"
+        bounds.number(name, self.descending_goal_depth, 5e-3, deepest, "m")
+        self._check_bends()
+        self._check_spacings()
+
+    def _check_bends(self) -> None:
+        """Refuses bends that are too tight for the lumen."""
+        widest = max(getattr(self, f"{level}_radius") for level in LEVELS)
+        radius, height = self.arch_radius, self.arch_height
+        tightest = min(radius**2 / height, height**2 / radius)
         if tightest < 1.25 * widest:
             raise ValueError(
-                f"the arch (arch_radius {self.arch_radius:g} m, arch_height "
-                f"{self.arch_height:g} m) bends with a radius of {tightest:g} m; it "
-                f"must be at least 1.25 times the widest lumen radius ({widest:g} m). "
-                "Enlarge arch_radius and arch_height or bring them closer together."
+                f"the arch (arch_radius {radius:g} m, arch_height {height:g} m) bends "
+                f"with a radius of {tightest:g} m; it must be at least 1.25 times the "
+                f"widest lumen radius ({widest:g} m). Enlarge arch_radius and "
+                "arch_height or bring them closer together."
             )
-        bends = (self.ascending_bend, abs(self.descending_bend))
-        for limb, bend in zip(("ascending", "descending"), bends, strict=True):
+        for limb in ("ascending", "descending"):
             length = getattr(self, f"{limb}_length")
+            bend = abs(getattr(self, f"{limb}_bend"))
             if length < 1.25 * widest * bend:
                 raise ValueError(
                     f"the {limb} limb ({length:g} m long) turns by {bend:g} rad, with "
                     f"a radius of {length / bend:g} m; it must be at least 1.25 times "
                     f"the widest lumen radius ({widest:g} m). Reduce {limb}_bend."
                 )
+
+    def _check_spacings(self) -> None:
+        """Refuses branches without a wall between them."""
         before_lsa = self.bca if self.bovine else self.lcca
         pairs = [("lcca_lsa_spacing", before_lsa, self.lsa)]
         if not self.bovine:
@@ -198,11 +203,11 @@ class ArchParameters:
             pairs.append(("lsa_aberrant_spacing", self.lsa, self.aberrant))
         for name, first, second in pairs:
             need = first.radius + second.radius + MINIMUM_SEPTUM
-            _check(name, getattr(self, name), need, 80e-3, "m")
+            bounds.number(name, getattr(self, name), need, 80e-3, "m")
         if self.bovine:
             # Leave the ostium before branching, and keep the branch on the trunk.
             low = self.lcca.radius + 2e-3
-            _check("bca_lcca_spacing", self.bca_lcca_spacing, low, 25e-3, "m")
+            bounds.number("bca_lcca_spacing", self.bca_lcca_spacing, low, 25e-3, "m")
             if self.lcca.radius > 0.8 * self.bca.radius:
                 raise ValueError(
                     f"a bovine LCCA of radius {self.lcca.radius:g} m needs a BCA of "

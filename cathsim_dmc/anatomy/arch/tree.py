@@ -8,11 +8,13 @@ import numpy as np
 
 from cathsim_dmc.anatomy.arch.branch import Plane, branch_vessel
 from cathsim_dmc.anatomy.arch.parameters import (
+    LEVELS,
     MINIMUM_SEPTUM,
     ArchParameters,
     BranchParameters,
 )
 from cathsim_dmc.anatomy.centreline import Array, Centreline, Vessel, VesselTree
+from cathsim_dmc.anatomy.segments import arc_lengths
 from cathsim_dmc.anatomy.septa import check_septa
 
 # Polyline steps, m: the chord of 2 mm on a 34 mm arch departs 0.015 mm from it.
@@ -58,9 +60,7 @@ def _aorta_points(p: ArchParameters) -> Array:
         [p.arch_radius * (1.0 - np.cos(angle)), p.arch_height * np.sin(angle)], axis=1
     )
     # Equal steps along the ellipse.
-    arc = np.concatenate(
-        [[0.0], np.cumsum(np.linalg.norm(np.diff(ellipse, axis=0), axis=1))]
-    )
+    arc = arc_lengths(ellipse)
     even = np.linspace(0.0, arc[-1], round(arc[-1] / _CURVED_STEP) + 1)
     ellipse = np.stack([np.interp(even, arc, ellipse[:, i]) for i in (0, 1)], axis=1)
     fall = ellipse[-1] + _limb(p.descending_length, p.descending_bend, math.pi)
@@ -74,8 +74,7 @@ def _outer_curve(p: ArchParameters) -> tuple[Array, Array, Array, dict[str, floa
     which depends on the radii, which depend on the levels: iterate.
     """
     points = _aorta_points(p)
-    steps = np.linalg.norm(np.diff(points, axis=0), axis=1)
-    s = np.concatenate([[0.0], np.cumsum(steps)])
+    s = arc_lengths(points)
     tangent = np.gradient(points, s, axis=0)
     tangent /= np.linalg.norm(tangent, axis=1)[:, None]
     outward = np.stack([-tangent[:, 1], tangent[:, 0]], axis=1)
@@ -93,23 +92,10 @@ def _outer_curve(p: ArchParameters) -> tuple[Array, Array, Array, dict[str, floa
                 f"({arch_end * 1e3:.1f} mm); reduce bca_drop or the spacings, or "
                 "enlarge the arch."
             )
-        radii = _smooth_interpolation(
-            s,
-            stations,
-            np.array(
-                [
-                    p.ascending_radius,
-                    p.bca_level_radius,
-                    p.lcca_level_radius,
-                    p.lsa_level_radius,
-                    p.descending_radius,
-                ]
-            ),
-        )
+        levels_of = [getattr(p, f"{level}_radius") for level in LEVELS]
+        radii = _smooth_interpolation(s, stations, np.array(levels_of))
         outer = points + radii[:, None] * outward
-        arc = np.concatenate(
-            [[0.0], np.cumsum(np.linalg.norm(np.diff(outer, axis=0), axis=1))]
-        )
+        arc = arc_lengths(outer)
         summit = outer[:, 1].argmax()
         height = outer[summit, 1] - p.bca_drop * 2.0 * p.lcca.radius
         bca = np.interp(height, outer[: summit + 1, 1], arc[: summit + 1])
@@ -131,9 +117,7 @@ def _outer_curve(p: ArchParameters) -> tuple[Array, Array, Array, dict[str, floa
 
 def _in_space(p: ArchParameters, plane: Plane, flat: Array) -> Array:
     """World points (n, 3) of the aorta's in-plane ones: with bow and sway."""
-    s = np.concatenate(
-        [[0.0], np.cumsum(np.linalg.norm(np.diff(flat, axis=0), axis=1))]
-    )
+    s = arc_lengths(flat)
     phase = math.pi * s / s[-1]
     aside = p.bow * np.sin(phase) + p.sway * np.sin(2.0 * phase)
     return plane.to_world(flat) + aside[:, None] * plane.normal
@@ -199,9 +183,7 @@ def _ostium(
     lean: float,
 ) -> Array:
     """Point (3,) on the aorta's surface, `lean` round it from its outer curve."""
-    flat = np.concatenate(
-        [[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))]
-    )
+    flat = arc_lengths(points)
     index = float(np.interp(level, flat, np.arange(len(flat))))
     # The curve in space is a little longer than the one in the plane.
     s = float(np.interp(index, np.arange(len(flat)), aorta.centreline.arc_length))

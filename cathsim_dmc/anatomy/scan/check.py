@@ -5,8 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from cathsim_dmc.anatomy import lattice
@@ -15,7 +13,9 @@ from cathsim_dmc.anatomy.centreline import Vessel
 from cathsim_dmc.anatomy.parts import INLET_HOLE_RADIUS
 from cathsim_dmc.anatomy.scan.aorta import TURN, Bend, mirrored
 from cathsim_dmc.anatomy.scan.naming import ARCH_BRANCHES
+from cathsim_dmc.anatomy.scan.topology import groups
 from cathsim_dmc.anatomy.scan.tree import END_TRIM, TAIL, TAIL_RADIUS
+from cathsim_dmc.anatomy.scan.units import in_mm
 from cathsim_dmc.anatomy.surface_depth import SurfaceDepth
 
 SLACK = 0.3e-3  # m, by which a triangulated surface may cut into a tube
@@ -78,10 +78,6 @@ def _finding(name: str, wrong: list[str], fine: str) -> TreeCheck:
     return TreeCheck(name, not wrong, "; ".join(wrong) if wrong else fine)
 
 
-def _mm(point: np.ndarray) -> str:
-    return "(" + ", ".join(f"{x * 1e3:.0f}" for x in point) + ") mm"
-
-
 def _inside(anatomy: Anatomy, measure: SurfaceDepth) -> TreeCheck:
     wrong, least = [], np.inf
     for key, vessel in anatomy.tree.vessels.items():
@@ -99,7 +95,7 @@ def _inside(anatomy: Anatomy, measure: SurfaceDepth) -> TreeCheck:
         if depth[worst] < min(floor[worst], 0.1e-3) - SLACK * 0.5:
             wrong.append(
                 f"{key} leaves the lumen {s[worst] * 1e3:.0f} mm from its start, at "
-                f"{_mm(place.position[worst])}, by {-depth[worst] * 1e3:.1f} mm"
+                f"{in_mm(place.position[worst])}, by {-depth[worst] * 1e3:.1f} mm"
             )
     return _finding(
         "centrelines in the lumen", wrong, f"at least {least * 1e3:.2f} mm deep"
@@ -123,7 +119,7 @@ def _own_lumen(anatomy: Anatomy) -> TreeCheck:
             if length > BESIDE:
                 wrong.append(
                     f"{vessel.name} runs {length * 1e3:.0f} mm in the lumen of "
-                    f"{other.name}, around {_mm(own.position[beside.argmax()])}"
+                    f"{other.name}, around {in_mm(own.position[beside.argmax()])}"
                 )
     return _finding("every vessel in a lumen of its own", wrong, f"{len(vessels)}")
 
@@ -209,7 +205,7 @@ def _free_ends(anatomy: Anatomy, measure: SurfaceDepth) -> TreeCheck:
         if any((place.distance < 0.7 * place.radius).any() for place in places):
             continue
         wrong.append(
-            f"{key} ends at {_mm(end.position)}, but its lumen goes on for "
+            f"{key} ends at {in_mm(end.position)}, but its lumen goes on for "
             f"{beyond * 1e3:.0f} mm or more"
         )
     return _finding(
@@ -251,9 +247,7 @@ def _lumen_beyond(
     if not len(points):
         return points
     pairs = cKDTree(points).query_pairs(1.8 * spacing, output_type="ndarray")
-    n = len(points)
-    link = coo_matrix((np.ones(len(pairs)), pairs.T), shape=(n, n))
-    label = connected_components(link, directed=False)[1]
+    label = groups(len(points), pairs)
     gap = np.linalg.norm(points - position, axis=1)
     gap[(points - position) @ tangent < -1e-9] = np.inf
     nearest = int(gap.argmin())

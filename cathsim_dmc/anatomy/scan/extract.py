@@ -6,10 +6,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
 
 from cathsim_dmc.anatomy.scan.ends import Cover, FreeEnd, LumenEntry, length_of
+from cathsim_dmc.anatomy.scan.topology import groups
 from cathsim_dmc.anatomy.scan.ways import CELL, Ways
 
 DEVICE_RADIUS = 0.84e-3  # m, 5 Fr catheter (1 Fr = 1/3 mm diameter)
@@ -168,9 +167,7 @@ def _rings(ways: Ways, before: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]
     rows, cols = rows[meet], cols[meet]
     if not len(rows):
         return []
-    n = len(ways.points)
-    link = coo_matrix((np.ones(len(rows)), (rows, cols)), shape=(n, n))
-    label = connected_components(link, directed=False)[1][rows]
+    label = groups(len(ways.points), np.stack([rows, cols], axis=1))[rows]
     depth = np.minimum(ways.depth[rows], ways.depth[cols])
     order = np.lexsort((-depth, label))  # of each place the deepest link first
     first = order[np.unique(label[order], return_index=True)[1]]

@@ -9,8 +9,9 @@ from itertools import product
 import numpy as np
 
 from cathsim_dmc.anatomy.scan.aorta import Bend
-from cathsim_dmc.anatomy.scan.offshoots import Offshoot, arc, common, depth_of
+from cathsim_dmc.anatomy.scan.offshoots import Offshoot, common, depth_of
 from cathsim_dmc.anatomy.scan.ways import Ways
+from cathsim_dmc.anatomy.segments import arc_lengths
 
 SURE = 0.95  # least probability of a name, and of the end at the heart
 EXTRA = 0.002  # probability that a branch is none of those that are looked for
@@ -105,7 +106,7 @@ def _shares(rows: Sequence[np.ndarray]) -> list[list[int]]:
 def without_twins(rows: Sequence[np.ndarray]) -> list[int]:
     """Rows of the curves but for those that run in the vessel of a longer one."""
     share = _shares(rows)
-    along = [arc(row) for row in rows]
+    along = [arc_lengths(row) for row in rows]
     out: list[int] = []
     for i in sorted(range(len(rows)), key=lambda k: -along[k][-1]):
         for j in out:
@@ -121,7 +122,7 @@ def without_twins(rows: Sequence[np.ndarray]) -> list[int]:
 def _look(ways: Ways, bend: Bend, row: np.ndarray, shared: int) -> tuple[float, float]:
     """Radius (m) and angle (degrees) from the head of what a curve has for its own."""
     own = row[min(shared, len(row) - 3) :]
-    s = arc(own)
+    s = arc_lengths(own)
     part = own[(s >= min(8e-3, 0.4 * s[-1])) & (s <= WAY)]
     chord = part[-1] - part[0] if len(part) > 1 else own[-1] - own[0]
     cosine = chord @ bend.head / max(float(np.linalg.norm(chord)), 1e-9)

@@ -32,7 +32,7 @@ from cathsim_dmc.anatomy.scan.naming import neutral_names, renamed
 from cathsim_dmc.anatomy.scan.places import flat_ends, place_goals, place_inlet
 from cathsim_dmc.anatomy.scan.tree import grow_tree
 from cathsim_dmc.anatomy.scan.trunk import name_trunk
-from cathsim_dmc.anatomy.scan.units import frame_sign, metres_per, upright
+from cathsim_dmc.anatomy.scan.units import frame_sign, in_mm, metres_per, upright
 from cathsim_dmc.anatomy.scan.ways import Ways
 from cathsim_dmc.anatomy.surface_depth import SurfaceDepth
 
@@ -147,7 +147,7 @@ def import_scan(
     say(f"tree: looking for vessels in {len(surface.faces):,} triangles")
     ways = Ways(measure)
     for pinch in ways.pinches:
-        note(f"the lumen is pinched to a slit at {_mm(pinch)}; vessels go on beyond")
+        note(f"the lumen is pinched to a slit at {in_mm(pinch)}; vessels go on beyond")
     tree, opening = _tree(measure, ways, lines, places, root, rename or {}, note)
     say(f"tree: {', '.join(_summary(tree))}")
     anatomy = Anatomy(
@@ -227,14 +227,14 @@ def _computed(
     open_names = [key for key in names if key.startswith("branch_")]
     if open_names:
         places = ", ".join(
-            f"{key} (ends at {_mm(f.tip)})"
+            f"{key} (ends at {in_mm(f.tip)})"
             for key, f in zip(names, found, strict=True)
             if key in open_names
         )
         note(f"geometry gives no anatomical name to {places}; rename (--rename) does")
     if thin:
         note(f"{thin} branches too thin or short for a 5 Fr catheter left out")
-    note(f"inlet chosen at {_mm(entry.position)}")
+    note(f"inlet chosen at {in_mm(entry.position)}")
     lines = {key: f.points for key, f in zip(names, found, strict=True)}
     return lines, frozenset(names[row] for row in right)
 
@@ -330,7 +330,3 @@ def _summary(tree: VesselTree) -> list[str]:
         + (f" from {vessel.parent}" if vessel.parent else "")
         for key, vessel in tree.vessels.items()
     ]
-
-
-def _mm(point: np.ndarray) -> str:
-    return "(" + ", ".join(f"{x * 1e3:.0f}" for x in point) + ") mm"

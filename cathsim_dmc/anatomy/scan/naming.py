@@ -26,6 +26,7 @@ from cathsim_dmc.anatomy.scan.forks import (
     without_twins,
 )
 from cathsim_dmc.anatomy.scan.offshoots import Offshoot, common
+from cathsim_dmc.anatomy.scan.units import in_mm
 from cathsim_dmc.anatomy.scan.ways import Ways
 
 ARCH_BRANCHES = ("bca", "lcca", "lsa")  # in their order from the heart
@@ -153,8 +154,8 @@ def name_branches(
         own = " and ".join(sorted(names[i] for i in one.curves))
         label = "trunk of bca and lcca" if label == "bovine" else label
         notes.append(
-            f"question: the {label} that leaves the arch at {_mm(one.place)} leads to "
-            f"{own}: which is which? Name them (--rename)"
+            f"question: the {label} that leaves the arch at {in_mm(one.place)} leads "
+            f"to {own}: which is which? Name them (--rename)"
         )
     if heart < SURE:
         notes.append(
@@ -297,7 +298,7 @@ def _question(share, seen, heart_last, names) -> str:
     places = []
     for one in seen:
         own = ", ".join(names[i] for i in one.curves) or "a branch that is cut short"
-        places.append(f"{own} at {_mm(one.place)}")
+        places.append(f"{own} at {in_mm(one.place)}")
     count = {1: "one branch leaves", 2: "two branches leave"}.get(
         len(seen), f"{len(seen)} branches leave"
     )
@@ -305,7 +306,3 @@ def _question(share, seen, heart_last, names) -> str:
         f"question: {count} the arch, from the heart on {'; '.join(places)}: "
         f"{', or '.join(texts)}? Name them (--rename)"
     )
-
-
-def _mm(point: np.ndarray) -> str:
-    return "(" + ", ".join(f"{x * 1e3:.0f}" for x in point) + ") mm"

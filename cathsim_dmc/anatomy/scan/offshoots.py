@@ -6,13 +6,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from cathsim_dmc.anatomy.scan.aorta import Bend
 from cathsim_dmc.anatomy.scan.centring import resample
+from cathsim_dmc.anatomy.scan.topology import groups
 from cathsim_dmc.anatomy.scan.ways import CELL, Ways
+from cathsim_dmc.anatomy.segments import arc_lengths
 
 OUT = 1.15  # radii of the aorta beyond which a branch has left it
 SHARED = 3e-3  # m beyond that, which curves of one branch share
@@ -72,7 +72,7 @@ def offshoots(
             apart = np.linalg.norm(rows[0][0] - row[0])
             # They leave in one lumen, even if they part at once.
             if apart < depth_of(ways, rows[0][:1])[0] or (
-                len(shared) > 1 and arc(shared)[-1] > SHARED
+                len(shared) > 1 and arc_lengths(shared)[-1] > SHARED
             ):
                 members.append(number)
                 rows.append(row)
@@ -108,12 +108,6 @@ def common(one: np.ndarray, other: np.ndarray) -> int:
     return count if same.all() else int(same.argmin())
 
 
-def arc(line: np.ndarray) -> np.ndarray:
-    """Arc length (n,) m of the points of a line (n, 3)."""
-    steps = np.linalg.norm(np.diff(line, axis=0), axis=1)
-    return np.concatenate([[0.0], np.cumsum(steps)])
-
-
 def depth_of(ways: Ways, line: np.ndarray) -> np.ndarray:
     """Radius (n,) m of the lumen at nodes (n, 3) of the lattice."""
     return ways.depth[[ways.node(point) for point in line]] + CELL
@@ -121,7 +115,7 @@ def depth_of(ways: Ways, line: np.ndarray) -> np.ndarray:
 
 def _fork(rows: Sequence[np.ndarray]) -> float | None:
     shares = [
-        arc(one)[min(common(one, other), len(one) - 1)]
+        arc_lengths(one)[min(common(one, other), len(one) - 1)]
         for k, one in enumerate(rows)
         for other in rows[k + 1 :]
     ]
@@ -129,7 +123,7 @@ def _fork(rows: Sequence[np.ndarray]) -> float | None:
 
 
 def _calibre(ways: Ways, row: np.ndarray, fork: float | None) -> float:
-    s = arc(row)
+    s = arc_lengths(row)
     first = min(CALIBRE[0], 0.3 * s[-1])
     last = min(CALIBRE[1], max(first + 2e-3, fork or np.inf))
     part = row[(s >= first) & (s <= last)]
@@ -155,11 +149,8 @@ def _stubs(ways, bend, depth, curves, aorta) -> list[Offshoot]:
         return []
     one, other = ways.links
     linked = (row[one] >= 0) & (row[other] >= 0)
-    link = coo_matrix(
-        (np.ones(int(linked.sum())), (row[one[linked]], row[other[linked]])),
-        shape=(len(points), len(points)),
-    )
-    label = connected_components(link, directed=False)[1]
+    pairs = np.stack([row[one[linked]], row[other[linked]]], axis=1)
+    label = groups(len(points), pairs)
     known = cKDTree(np.concatenate([resample(curve) for curve in curves]))
     taken = np.unique(label[known.query(points)[0] < 1.2e-3])
     found = []

@@ -18,6 +18,7 @@ from cathsim_dmc.anatomy.scan.topology import (
     widths,
     without_slivers,
 )
+from cathsim_dmc.anatomy.scan.units import in_mm
 from cathsim_dmc.anatomy.surface_depth import SurfaceDepth
 
 PART_AREA = 0.03  # of the surface's area: smaller separate parts are dropped
@@ -147,7 +148,7 @@ class _Work:
             if bad.sum() > max(NON_MANIFOLD * len(self.faces), 40):
                 raise ValueError(
                     f"{self.name} has {first[0]} edges shared by more than two "
-                    f"triangles, one at {_mm(first[1])} mm, too many to mend: parts "
+                    f"triangles, one at {in_mm(first[1])}, too many to mend: parts "
                     "of the surface are glued together. Export it from the "
                     "segmentation again, or remesh it."
                 )
@@ -155,7 +156,7 @@ class _Work:
         if first:
             self.notes.append(
                 f"{first[0]} edges shared by more than two triangles, near "
-                f"{_mm(first[1])} mm: the triangles around them cut out"
+                f"{in_mm(first[1])}: the triangles around them cut out"
             )
             self._drop_small_parts()
 
@@ -199,7 +200,7 @@ class _Work:
             elif wide > widest:
                 raise ValueError(
                     f"{self.name} is not closed: a hole {wide * 1e3:.1f} mm wide in "
-                    f"the side of a vessel at {_mm(middle)} mm (at most "
+                    f"the side of a vessel at {in_mm(middle)} (at most "
                     f"{widest * 1e3:g} mm are filled). Fill holes (3D Slicer: Surface "
                     "Toolbox, Fill holes), then export again."
                 )
@@ -210,7 +211,7 @@ class _Work:
             wide, middle = max(filled, key=lambda hole: hole[0])
             self.notes.append(
                 f"{len(filled)} holes filled, the widest {wide * 1e3:.1f} mm at "
-                f"{_mm(middle)} mm"
+                f"{in_mm(middle)}"
             )
         if self._ends:
             self.notes.append(f"{self._ends} open vessel ends capped")
@@ -220,7 +221,7 @@ class _Work:
             raise ValueError(
                 f"{self.name} is not closed: {int((times == 1).sum())} boundary edges "
                 f"and {int((times > 2).sum())} edges shared by more than two triangles "
-                f"are left after mending, one at {_mm(where)} mm. Export it from the "
+                f"are left after mending, one at {in_mm(where)}. Export it from the "
                 "segmentation again, or remesh it."
             )
 
@@ -264,7 +265,7 @@ class _Work:
                     return
                 raise ValueError(
                     f"{self.name} intersects itself: {first[0]} triangles, one at "
-                    f"{_mm(where)} mm, are pierced by others. Smooth or remesh that "
+                    f"{in_mm(where)}, are pierced by others. Smooth or remesh that "
                     "place, or export the segmentation again."
                 )
             touched = np.isin(self.faces, self.faces[tangled]).any(axis=1)
@@ -275,13 +276,12 @@ class _Work:
         else:
             assert first is not None  # every round has found some
             raise ValueError(
-                f"{self.name} intersects itself near {_mm(first[1])} mm, and cutting "
+                f"{self.name} intersects itself near {in_mm(first[1])}, and cutting "
                 "the place out did not help. Smooth or remesh it."
             )
         if first:
             self.notes.append(
-                f"{first[0]} self-intersecting triangles near {_mm(first[1])} mm cut "
-                "out"
+                f"{first[0]} self-intersecting triangles near {in_mm(first[1])} cut out"
             )
 
     def _tangled(self, faces: np.ndarray, edges: np.ndarray) -> np.ndarray:
@@ -327,7 +327,3 @@ class _Work:
     def _keep(self, chosen: np.ndarray) -> None:
         used, numbers = np.unique(self.faces[chosen], return_inverse=True)
         self.vertices, self.faces = self.vertices[used], numbers.reshape(-1, 3)
-
-
-def _mm(point: np.ndarray) -> str:
-    return "(" + ", ".join(f"{x * 1e3:.1f}" for x in point) + ")"

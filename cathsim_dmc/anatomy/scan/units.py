@@ -37,6 +37,11 @@ def metres_per(units: str) -> float:
         ) from None
 
 
+def in_mm(point: np.ndarray) -> str:
+    """A place (3,) m as text, in whole millimetres."""
+    return "(" + ", ".join(f"{x * 1e3:.0f}" for x in point) + ") mm"
+
+
 def frame_sign(frame: str) -> np.ndarray:
     """Factors (3,) that take a point of ``frame`` ("LPS" or "RAS") to LPS."""
     try:
