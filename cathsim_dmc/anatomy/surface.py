@@ -123,5 +123,5 @@ def sampled(surface: Surface, count: int) -> tuple[Array, Array]:
     import trimesh
 
     mesh = trimesh.Trimesh(surface.vertices, surface.faces, process=False)
-    points, face = trimesh.sample.sample_surface(mesh, count, seed=0)
+    points, face = trimesh.sample.sample_surface(mesh, count, seed=0)[:2]
     return np.asarray(points), np.asarray(mesh.face_normals[face])

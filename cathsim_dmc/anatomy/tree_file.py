@@ -219,5 +219,7 @@ def _goal(
     if way == "position_mm":
         position = np.array(bounds.vector(f"{where}: {way}", entry[way], 3))
         return VesselPlace(vessel, position=position * flip * _MM)
-    length = {way.removesuffix("_mm"): _length(where, entry, way)}
-    return VesselPlace(vessel, **length)
+    length = _length(where, entry, way)
+    if way == "past_ostium_mm":
+        return VesselPlace(vessel, past_ostium=length)
+    return VesselPlace(vessel, arc_length=length)
