@@ -13,6 +13,7 @@ from cathsim_dmc.anatomy.centreline import Centreline, Vessel, VesselTree
 from cathsim_dmc.anatomy.field import Field
 from cathsim_dmc.anatomy.parts import End
 from cathsim_dmc.collision import fields
+from cathsim_dmc.entities.contact import CONTACT_SOLIMP
 
 RADIUS, DEVICE, HALF = 5e-3, 0.8e-3, 3.5e-3
 
@@ -86,21 +87,26 @@ def test_a_capsule_in_a_straight_tube_overlaps_by_what_it_does(tube):
     )
 
 
-def test_a_capsule_in_a_bend_touches_once_inside_and_twice_outside():
+@pytest.mark.parametrize(("overlap", "planes"), [(0.05e-3, 1), (0.2e-3, 2)])
+def test_a_capsule_in_a_bend_touches_once_inside_and_twice_outside(overlap, planes):
     angle = np.linspace(0, np.pi / 2, 61)
     circle = np.stack([np.cos(angle), np.sin(angle), 0 * angle], axis=-1)
     field = Field.from_tree(tree_along(30e-3 * circle))
     middle = np.array([np.cos(np.pi / 4), np.sin(np.pi / 4), 0])
     along = "90 45 0"  # the capsule lies along the bend there
-    for reach, count in ((25e-3 + DEVICE - 0.1e-3, 1), (35e-3 - DEVICE + 0.1e-3, 2)):
-        found = contacts_of(carrier(field) + capsule(reach * middle, euler=along))
-        assert len(found.dist) == 2 * count
+    inside, outside = 25e-3 + DEVICE - overlap, 35e-3 - DEVICE + overlap
+    for reach, count in ((inside, 1), (outside, 2)):
+        law = f'solimp="{numbers(CONTACT_SOLIMP)}"'
+        link = capsule(reach * middle, euler=along, more=law)
+        found = contacts_of(carrier(field) + link)
+        # Outside the ends are deep in both cases.
+        assert len(found.dist) == (planes if count == 1 else 2 * count)
         if count == 1:
-            np.testing.assert_allclose(found.dist, -0.1e-3, atol=0.01e-3)
+            np.testing.assert_allclose(found.dist, -overlap, atol=0.01e-3)
         else:
             # Its ends stand further out than its middle.
             more = np.hypot(reach, HALF) - reach
-            np.testing.assert_allclose(found.dist, -0.1e-3 - more, atol=0.015e-3)
+            np.testing.assert_allclose(found.dist, -overlap - more, atol=0.015e-3)
 
 
 def test_a_capsule_across_an_ostium_touches_its_edge():

@@ -74,6 +74,12 @@ _ASIDE = 0.4e-3  # m, to both sides, from where the planes of a hollow wall are 
 _MOST = 4  # contacts of a capsule and a box; more are fatal
 _HEAD_ON = 0.1  # sine between a capsule and the normal
 _HOLLOW = 5e-6  # m, least distance of their edge from the wall
+# One plane does as long as its load, which grows with the cube of the depth, times the
+# slope of the wall beside it is a stiffness that the time step stands: to this depth,
+# m, at this slope. Two planes bear what one does at a depth less by a share; from there
+# to twice the depth they come up to the wall.
+_DEEP, _SLOPED, _SHARED = 1e-4, 0.06, 0.18
+_SLACK = 0.1  # first impedance of a law that starts soft enough for that
 _CORNER = -0.3  # slope of the clearance beside a place in a corner
 _STEEP = 0.5  # cosine between a wall of a corner and the normal, least to share a load
 _ROOM = 1e-4  # m, a link that touches one wall of a corner is held by others so close
@@ -393,16 +399,17 @@ def touches(entry, centre, axis, half, closed, limit):
 
 
 @compiled
-def tangents(entry, place, axis, normal, depth, limit, turns, rows):
+def tangents(entry, place, axis, normal, depth, limit, held, turns, rows):
     """Planes (1 or 2 rows of unit normal and clearance) that stand for the wall.
 
     Where the wall is hollow across the device, one plane turns with the device as it
     rolls there, from step to step: a force f at a radius r of its way is a stiffness
     f / r that no implicit step knows of, and throws light links to and fro. The wall
-    is then two planes that touch it to both sides: the field made linear there. The
-    last two of 6 rows are scratch.
+    is then two planes that touch it to both sides: the field made linear there. Under
+    a light load one plane does; it stands there where `held`, m, is the radius, and not
+    where `held` is 0. The last two of 6 rows are scratch.
     """
-    found, least = 0, np.inf
+    found, least, shift = 0, np.inf, 0.0
     for turn in range(turns):
         bx, by, bz = across(axis, normal)
         if length((bx, by, bz)) < _HEAD_ON:
@@ -425,6 +432,11 @@ def tangents(entry, place, axis, normal, depth, limit, turns, rows):
         if rise >= -_HOLLOW:
             continue
         corner = slope < _CORNER
+        if held > 0.0:
+            one = _DEEP * (_SLOPED / -slope) ** (1.0 / 3.0)
+            if held - depth < one:
+                continue
+            shift = _SHARED * max(2.0 * one - (held - depth), 0.0)
         for row in range(2):
             way = 2.0 * row - 1.0
             there = high if row else low
@@ -446,6 +458,7 @@ def tangents(entry, place, axis, normal, depth, limit, turns, rows):
         excess = 0.5 * (rows[4, 3] + rows[5, 3]) - depth
         if corner:
             excess = max(min(rows[4, 3], rows[5, 3]) - depth, 0.0)
+        excess -= shift
         for row in range(4, 6):
             steep = 0.0
             for k in range(3):
@@ -458,7 +471,7 @@ def tangents(entry, place, axis, normal, depth, limit, turns, rows):
                 rows[found, 3] -= moved
                 found += 1
     # Planes of a corner may all be farther away than the wall is.
-    if least > depth + _HOLLOW:
+    if least > depth + _HOLLOW + shift:
         found = min(found, _MOST - 1)
         rows[found, 0], rows[found, 1], rows[found, 2] = normal
         rows[found, 3] = depth
@@ -645,8 +658,13 @@ def collide(model, data, contacts, geom1, geom2, margin, before):
     if seen[0] == 0:
         return np.int32(0)
     rows, written = np.empty((6, 4)), 0
+    held = radius if impedance < _SLACK else 0.0
     for n in range(seen[0]):
         t, depth = (seen[3], seen[4]) if n else (seen[1], seen[2])
+        # Two places so close are one. What is held at one is not at another by `near`.
+        lowest = depth <= (seen[2] if n else seen[4])
+        if not lowest and seen[3] - seen[1] < _EVERY and not soft:
+            continue
         at_end = abs(t) >= half * stretch
         t /= stretch
         place = along(local, axis, t)
@@ -659,10 +677,12 @@ def collide(model, data, contacts, geom1, geom2, margin, before):
         normal = away(entry, place[0], place[1], place[2])
         if normal == (0.0, 0.0, 0.0):
             continue
-        if space != 0 or depth <= limit:
+        if space != 0 or depth <= (limit if lowest else radius + margin):
             # A sphere may have one contact, so one plane.
             around = 0 if half == 0.0 else 1 + int(at_end)
-            planes = tangents(entry, place, way, normal, depth, reach, around, rows)
+            planes = tangents(
+                entry, place, way, normal, depth, reach, held, around, rows
+            )
         else:
             hits = along(travel, aside, t)
             ahead = normal[0] * hits[0] + normal[1] * hits[1] + normal[2] * hits[2]
