@@ -119,6 +119,40 @@ def signed(nodes, first, last, flats, chosen, count, x, y, z, out):
 
 
 @compiled
+def _square(place, x, y, z):
+    return (place[0] - x) ** 2 + (place[1] - y) ** 2 + (place[2] - z) ** 2
+
+
+@compiled
+def _rings_near(nodes, first, last, x, y, z, margin, chosen):
+    """Rings of one vessel that matter around a place, their number, and its depth."""
+    best, deepest, count = np.inf, -np.inf, 0
+    for k in range(first, last + 1):
+        best = min(best, at_node(nodes, k, x, y, z))
+        deepest = max(deepest, nodes[k, 6] - math.sqrt(_square(nodes[k], x, y, z)))
+    limit = (math.sqrt(best) + margin) ** 2
+    for k in range(first, last + 1):
+        if at_node(nodes, k, x, y, z) <= limit:
+            chosen[count] = k
+            count += 1
+    return count, deepest
+
+
+@compiled
+def _creases_near(creases, x, y, z, margin, near):
+    """Number of the creases that matter around a place, which are put into `near`."""
+    closest, found = np.inf, 0
+    for c in range(len(creases)):
+        closest = min(closest, _square(creases[c], x, y, z))
+    limit = (math.sqrt(closest) + margin) ** 2
+    for c in range(len(creases)):
+        if _square(creases[c], x, y, z) <= limit:
+            near[found] = c
+            found += 1
+    return found
+
+
+@compiled
 def tree_depths(nodes, spans, flats, creases, blocks, points, reach, slack, out):
     """Signed distance to the wall at every point of every block.
 
@@ -143,30 +177,11 @@ def tree_depths(nodes, spans, flats, creases, blocks, points, reach, slack, out)
         x, y, z = blocks[n]
         for v in range(vessels):
             first, last = spans[v]
-            best, deepest = np.inf, -np.inf
-            for k in range(first, last + 1):
-                best = min(best, at_node(nodes, k, x, y, z))
-                far = (nodes[k, 0] - x) ** 2 + (nodes[k, 1] - y) ** 2
-                far += (nodes[k, 2] - z) ** 2
-                deepest = max(deepest, nodes[k, 6] - math.sqrt(far))
-            limit = (math.sqrt(best) + 2.0 * reach + slack) ** 2
-            count = 0
-            for k in range(first, last + 1):
-                if at_node(nodes, k, x, y, z) <= limit:
-                    chosen[v, count] = k
-                    count += 1
-            counts[v], level[v] = count, deepest
+            counts[v], level[v] = _rings_near(
+                nodes, first, last, x, y, z, 2.0 * reach + slack, chosen[v]
+            )
         bar = level.max() - 2.0 * reach - slack
-        found, closest = 0, np.inf
-        for c in range(len(creases)):
-            d = (creases[c, 0] - x) ** 2 + (creases[c, 1] - y) ** 2
-            closest = min(closest, d + (creases[c, 2] - z) ** 2)
-        limit = (math.sqrt(closest) + 2.0 * reach + 1e-6) ** 2
-        for c in range(len(creases)):
-            d = (creases[c, 0] - x) ** 2 + (creases[c, 1] - y) ** 2
-            if d + (creases[c, 2] - z) ** 2 <= limit:
-                near[found] = c
-                found += 1
+        found = _creases_near(creases, x, y, z, 2.0 * reach + 1e-6, near)
         for q in range(len(points)):
             px, py, pz = x + points[q, 0], y + points[q, 1], z + points[q, 2]
             inside, distance = False, np.inf
@@ -194,14 +209,9 @@ def tree_depths(nodes, spans, flats, creases, blocks, points, reach, slack, out)
                         break
                 if valid:
                     distance = abs(depth)
-            if found:
-                best = np.inf
-                for c in range(found):
-                    d = (creases[near[c], 0] - px) ** 2 + (
-                        creases[near[c], 1] - py
-                    ) ** 2
-                    best = min(best, d + (creases[near[c], 2] - pz) ** 2)
-                distance = min(distance, math.sqrt(best))
+            for c in range(found):
+                square = _square(creases[near[c]], px, py, pz)
+                distance = min(distance, math.sqrt(square))
             out[n, q] = distance if inside else -distance
 
 

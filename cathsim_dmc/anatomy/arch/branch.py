@@ -67,19 +67,52 @@ def branch_vessel(
     Raises:
         ValueError: if it is too oblique or too wide for its parent.
     """
-    line = parent.centreline
     # Start where the axis, followed back into the parent, is nearest to the
     # parent's centreline; then aim from there at the ostium.
+    line = parent.centreline
     back = np.linspace(0.0, 4.0, 400)[:, None] * float(line.project(ostium).radius)
     crossing = line.project(ostium - back * direction)
     place = line.at(crossing.arc_length[crossing.distance.argmin()])
-    origin = place.position
-    direction = ostium - origin
+    direction = ostium - place.position
     exit_length = float(np.linalg.norm(direction))
     direction = direction / exit_length
     outward = ostium - line.at(line.project(ostium).arc_length).position
     tilt = math.acos(np.clip(direction @ outward / np.linalg.norm(outward), -1.0, 1.0))
-    parent_radius = float(place.radius)
+    inwards = _inwards(name, p.radius + fillet, exit_length, tilt, float(place.radius))
+    flare_start = max(exit_length - inwards, 0.1 * exit_length)
+    flare_end = exit_length + 2.0 * fillet + p.radius * math.tan(tilt)
+    length = exit_length + p.length
+    flare = 2 + int((flare_end - flare_start) / _FLARE_STEP)
+    beyond = 2 + int((length - flare_end) / _CURVED_STEP)
+    parts = (
+        np.linspace(0.0, flare_start, 4),
+        np.linspace(flare_start, flare_end, flare),
+        np.linspace(flare_end, length, beyond),
+    )
+    s = np.unique(np.concatenate(parts))
+    points = place.position + _path(p, s, direction, plane, flare_end + 6e-3, length)
+    progress = np.clip((s - exit_length) / p.length, 0.0, 1.0)
+    # Quadratic from the full fillet where the ring is inside the parent to none.
+    u = np.clip((s - flare_start) / (flare_end - flare_start), 0.0, 1.0)
+    radii = p.radius + (p.end_radius - p.radius) * progress + fillet * (1.0 - u) ** 2
+    return Vessel(name, Centreline(points, radii), parent.name, exit_length)
+
+
+def _inwards(
+    name: str, wide: float, exit_length: float, tilt: float, parent_radius: float
+) -> float:
+    """How far (m) the flare reaches into the parent, until its ring is inside.
+
+    The wall is then convex along the branch wherever it exists.
+
+    Args:
+        wide: radius of the branch with its fillet, m.
+        exit_length: from the parent's centreline to the ostium, m.
+        tilt: of the branch from the normal of its parent's wall, rad.
+
+    Raises:
+        ValueError: if the branch is too oblique or too wide for its parent.
+    """
     if tilt > _MOST_OBLIQUE or exit_length > _LONGEST_EXIT * parent_radius:
         raise ValueError(
             f"branch {name!r} leaves at {math.degrees(tilt):.0f} degrees from the "
@@ -88,43 +121,14 @@ def branch_vessel(
             f"{_LONGEST_EXIT * parent_radius * 1e3:.0f} mm are allowed. Change its "
             "take_off."
         )
-    # The flare reaches inwards until the whole ring is inside the parent, so that
-    # the wall is convex along the branch wherever it exists.
-    wide = p.radius + fillet
     if wide > 0.95 * parent_radius:
         raise ValueError(
             f"branch {name!r} with its fillet has radius {wide:g} m at the ostium; its "
             f"parent's lumen radius is {parent_radius:g} m. Make the branch smaller."
         )
     sag = parent_radius - math.sqrt(parent_radius**2 - wide**2)
-    reach = wide * math.tan(tilt)
     # A bent parent needs more than this estimate for a straight one.
-    inwards = 1.25 * (sag + reach) + 1e-3
-    flare_start = max(exit_length - inwards, 0.1 * exit_length)
-    flare_end = exit_length + 2.0 * fillet + p.radius * math.tan(tilt)
-    bend_start = flare_end + 6e-3
-    length = exit_length + p.length
-    s = np.unique(
-        np.concatenate(
-            [
-                np.linspace(0.0, flare_start, 4),
-                np.linspace(
-                    flare_start,
-                    flare_end,
-                    2 + int((flare_end - flare_start) / _FLARE_STEP),
-                ),
-                np.linspace(
-                    flare_end, length, 2 + int((length - flare_end) / _CURVED_STEP)
-                ),
-            ]
-        )
-    )
-    points = origin + _path(p, s, direction, plane, bend_start, length)
-    progress = np.clip((s - exit_length) / p.length, 0.0, 1.0)
-    # Quadratic from the full fillet where the ring is inside the parent to none.
-    u = np.clip((s - flare_start) / (flare_end - flare_start), 0.0, 1.0)
-    radii = p.radius + (p.end_radius - p.radius) * progress + fillet * (1.0 - u) ** 2
-    return Vessel(name, Centreline(points, radii), parent.name, exit_length)
+    return 1.25 * (sag + wide * math.tan(tilt)) + 1e-3
 
 
 def _path(
