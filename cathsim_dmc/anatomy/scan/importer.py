@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -27,7 +27,7 @@ from cathsim_dmc.anatomy.scan.ends import (
 )
 from cathsim_dmc.anatomy.scan.extract import DEVICE_RADIUS, centrelines, continued
 from cathsim_dmc.anatomy.scan.inlet import cut_open
-from cathsim_dmc.anatomy.scan.lumen import Lumen, read_lumen
+from cathsim_dmc.anatomy.scan.lumen import read_lumen
 from cathsim_dmc.anatomy.scan.naming import neutral_names, renamed
 from cathsim_dmc.anatomy.scan.places import flat_ends, place_goals, place_inlet
 from cathsim_dmc.anatomy.scan.tree import grow_tree
@@ -36,7 +36,7 @@ from cathsim_dmc.anatomy.scan.units import frame_sign, in_mm, metres_per, uprigh
 from cathsim_dmc.anatomy.scan.ways import Ways
 from cathsim_dmc.anatomy.surface_depth import SurfaceDepth
 
-log = logging.getLogger(__name__)
+_log = logging.getLogger(__name__)
 
 ROOT = "aorta"
 FRAMES = ("LPS", "RAS")
@@ -105,70 +105,83 @@ def import_scan(
         ValueError: if a file or an option is not as stated, or the tree that results
             does not agree with the surface; says how to mend it.
     """
-    bounds.choice("mesh_frame", mesh_frame, FRAMES)
+    log = _Log(progress, notes)
+    frame = _Frame(units, mesh_frame, axes)
+    points = {"inlet": _point("inlet", inlet), "heart": _point("heart", heart)}
     _check_rename(rename)
-    started = time.monotonic()
-
-    def say(text: str) -> None:
-        log.info(text)
-        if progress is not None:
-            progress(text)
-
-    def note(text: str) -> None:
-        if notes is not None:
-            notes.append(text)
-        say(f"note: {text}")
-
-    frame_sign(mesh_frame)
-    upright(axes)
-    if units is not None:
-        metres_per(units)
-    places: dict[str, np.ndarray | None] = {"inlet": None, "heart": None}
-    for key, given in (("inlet", inlet), ("heart", heart)):
-        if given is not None:
-            given = bounds.vector(key, given, 3, unit="the mesh's unit")
-            places[key] = np.array(given)
-    _check_paths(centreline_paths)
-    for path in centreline_paths:
-        read_curve(path, units or "mm", mesh_frame)  # before the long steps
-    lumen = read_lumen(mesh_path, units, mesh_frame, axes, labels, say)
-    for text in lumen.notes:
-        note(text)
-    surface = lumen.surface
-    measure = SurfaceDepth(surface)
-    factor = frame_sign(mesh_frame) * metres_per(lumen.units)
-    for key, place in places.items():
-        if place is not None:
-            place = upright(axes) @ (place * factor)
-            _check_near(key, place, measure)
-            places[key] = place
-    curves = _read_curves(centreline_paths, lumen, mesh_frame, axes, root)
-    lines = {curve.name: _inside_part(curve, measure, lumen.units) for curve in curves}
-    say(f"tree: looking for vessels in {len(surface.faces):,} triangles")
-    ways = Ways(measure)
-    for pinch in ways.pinches:
-        note(f"the lumen is pinched to a slit at {in_mm(pinch)}; vessels go on beyond")
-    tree, opening = _tree(measure, ways, lines, places, root, rename or {}, note)
-    say(f"tree: {', '.join(_summary(tree))}")
-    anatomy = Anatomy(
-        name=name or Path(mesh_path).name.split(".")[0],
-        tree=tree,
-        surface=_cut(surface, opening),
-        inlet=opening,
-        goals=place_goals(tree, root),
-        ends=flat_ends(tree, opening),
-        scanned=True,
-    )
-    _prove(anatomy, _MEND_DRAWN if lines else _MEND_COMPUTED, note)
-    say(
-        f"done in {time.monotonic() - started:.0f} s, goals "
-        f"{', '.join(anatomy.goals) or 'none'}"
-    )
+    _check_paths(centreline_paths, frame)
+    lumen = read_lumen(mesh_path, units, mesh_frame, axes, labels, log.say)
+    log.note(*lumen.notes)
+    frame = replace(frame, units=lumen.units)
+    measure = SurfaceDepth(lumen.surface)
+    places = {k: _placed(k, point, frame, measure) for k, point in points.items()}
+    lines = _read_curves(centreline_paths, frame, root, measure)
+    log.say(f"tree: looking for vessels in {len(lumen.surface.faces):,} triangles")
+    tree, opening = _tree(measure, lines, places, root, rename or {}, log.note)
+    log.say(f"tree: {', '.join(_summary(tree))}")
+    name, goals = name or Path(mesh_path).name.split(".")[0], place_goals(tree, root)
+    surface, ends = _cut(lumen.surface, opening), flat_ends(tree, opening)
+    anatomy = Anatomy(name, tree, surface, opening, goals, ends, scanned=True)
+    _prove(anatomy, _MEND_DRAWN if lines else _MEND_COMPUTED, log.note)
+    log.say(f"done in {log.seconds:.0f} s, goals {', '.join(goals) or 'none'}")
     return anatomy
 
 
-def _tree(field, ways, lines, places, root, rename, note) -> tuple[VesselTree, Inlet]:
+class _Log:
+    """Lines of text about the steps, and what was guessed, mended and left out."""
+
+    def __init__(self, progress: Callable[[str], None] | None, notes: list[str] | None):
+        self._progress, self._notes = progress, notes
+        self._started = time.monotonic()
+
+    def say(self, text: str) -> None:
+        _log.info(text)
+        if self._progress is not None:
+            self._progress(text)
+
+    def note(self, *texts: str) -> None:
+        for text in texts:
+            if self._notes is not None:
+                self._notes.append(text)
+            self.say(f"note: {text}")
+
+    @property
+    def seconds(self) -> float:
+        return time.monotonic() - self._started
+
+
+@dataclass(frozen=True)
+class _Frame:
+    """Unit, frame and axes of a scan, checked."""
+
+    units: str | None
+    frame: str
+    axes: str | ArrayLike | None
+
+    def __post_init__(self):
+        bounds.choice("mesh_frame", self.frame, FRAMES)
+        upright(self.axes)
+        if self.units is not None:
+            metres_per(self.units)
+
+    def to_lps(self, point: np.ndarray) -> np.ndarray:
+        """A point (3,) of the scan in m, LPS."""
+        assert self.units is not None
+        factor = frame_sign(self.frame) * metres_per(self.units)
+        return upright(self.axes) @ (point * factor)
+
+
+def _point(key: str, given: Sequence[float] | None) -> np.ndarray | None:
+    if given is None:
+        return None
+    return np.array(bounds.vector(key, given, 3, unit="the mesh's unit"))
+
+
+def _tree(field, lines, places, root, rename, note) -> tuple[VesselTree, Inlet]:
     """The tree of given lines, or of computed ones, and its inlet."""
+    ways = Ways(field)
+    for pinch in ways.pinches:
+        note(f"the lumen is pinched to a slit at {in_mm(pinch)}; vessels go on beyond")
     ends = free_ends(ways)
     lines = {key: _proximal_first(line, field) for key, line in lines.items()}
     entry = plan_inlet(ways, ends, list(lines.values()), places["inlet"])
@@ -260,13 +273,21 @@ def _cut(surface: Surface, opening: Inlet) -> Surface:
     return Surface(vertices[used], numbers.reshape(-1, 3))
 
 
-def _check_near(key: str, place: np.ndarray, measure: SurfaceDepth) -> None:
-    if measure(place[None])[0] < -NEAR_INLET:
+def _placed(
+    key: str, point: np.ndarray | None, frame: _Frame, measure: SurfaceDepth
+) -> np.ndarray | None:
+    """A given point (3,) in m, LPS, which must be near the lumen."""
+    if point is None:
+        return None
+    place = frame.to_lps(point)
+    away = -float(measure(place[None])[0])
+    if away > NEAR_INLET:
         raise ValueError(
-            f"{key} is {-measure(place[None])[0] * 1e3:.1f} mm away from the lumen; "
-            f"give a point in the lumen, or at most {NEAR_INLET * 1e3:g} mm from the "
-            f"end {'at the heart' if key == 'heart' else 'by which the device enters'}."
+            f"{key} is {away * 1e3:.1f} mm away from the lumen; give a point in the "
+            f"lumen, or at most {NEAR_INLET * 1e3:g} mm from the end "
+            f"{'at the heart' if key == 'heart' else 'by which the device enters'}."
         )
+    return place
 
 
 def _check_rename(rename: Mapping[str, str] | None) -> None:
@@ -278,18 +299,21 @@ def _check_rename(rename: Mapping[str, str] | None) -> None:
         bounds.refuse("rename", rename, "a mapping of computed names to wanted ones")
 
 
-def _check_paths(paths: Sequence[str | Path]) -> None:
+def _check_paths(paths: Sequence[str | Path], frame: _Frame) -> None:
     listed = isinstance(paths, Sequence) and not isinstance(paths, str | bytes)
     if not listed or not all(isinstance(path, str | Path) for path in paths):
         raise ValueError(
             f"centreline_paths is {paths!r}; give a list of files, one per branch (3D "
             "Slicer .mrk.json or .csv), or none to have them computed."
         )
+    for path in paths:
+        read_curve(path, frame.units or "mm", frame.frame)  # before the long steps
 
 
-def _read_curves(paths, lumen: Lumen, frame, axes, root) -> list[ScanCentreline]:
-    curves = [read_curve(path, lumen.units, frame) for path in paths]
-    turn = upright(axes)
+def _read_curves(paths, frame: _Frame, root: str, measure) -> dict[str, np.ndarray]:
+    """The part (n, 3) m, LPS, of each drawn curve that lies in the lumen, by name."""
+    curves = [read_curve(path, frame.units or "mm", frame.frame) for path in paths]
+    turn = upright(frame.axes)
     curves = [replace(curve, points=curve.points @ turn.T) for curve in curves]
     names = [curve.name for curve in curves]
     for curve in curves:
@@ -298,7 +322,8 @@ def _read_curves(paths, lumen: Lumen, frame, axes, root) -> list[ScanCentreline]
                 f"{curve.path} gives the vessel name {curve.name!r}, which is taken "
                 f"(names: {root}, {', '.join(names)}); rename the file."
             )
-    return curves
+    units = str(frame.units)
+    return {curve.name: _inside_part(curve, measure, units) for curve in curves}
 
 
 def _inside_part(

@@ -35,7 +35,6 @@ def cut_open(
     ring_pairs = pairs[crossing[pairs].all(1)]
     ring = _component(len(faces), ring_pairs, crossing, vertices, faces, inlet.position)
     others = pairs[~ring[pairs].any(1)]
-    behind = ring.copy()
     touching = pairs[ring[pairs].sum(1) == 1]
     outer = np.where(ring[touching[:, 0]], touching[:, 1], touching[:, 0])
     label = groups(len(faces), others)
