@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 
-from cathsim_dmc.anatomy import phantoms
 from cathsim_dmc.anatomy.centreline import Centreline, Vessel, VesselTree
 from cathsim_dmc.anatomy.field import Field
 from cathsim_dmc.anatomy.field_loops import FREE
@@ -143,21 +142,6 @@ def test_the_gradient_points_away_from_the_wall(tube):
     # An impact is pushed back whatever its depth.
     deep = field.gradient(12e-3 * spokes[::10] + (0, 0, 21e-3))
     assert (np.vecdot(deep, -spokes[::10]) > 0.7).all()
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", ["type1", "type2"])
-def test_a_phantom_is_small_and_as_exact_as_contact_needs(name):
-    anatomy = phantoms.load(name)
-    field = Field.from_tree(anatomy.tree, anatomy.ends)
-    assert field.nbytes < 5e6
-    random = np.random.default_rng(1)
-    points = anatomy.surface.vertices[::7] + random.normal(0, 0.6e-3, (1, 3))
-    exact = TreeDepth(anatomy.tree, anatomy.ends)(points)
-    looked_up = field(points, free=True)
-    close = (np.abs(exact) < 1e-3) & (looked_up < FREE)
-    assert close.sum() > 500
-    assert np.quantile(np.abs(looked_up - exact)[close], 0.99) < 0.02e-3
 
 
 def box(side):

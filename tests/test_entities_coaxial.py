@@ -308,13 +308,6 @@ def test_lag_behind_a_brake_is_b_omega_over_k():
     assert reached == pytest.approx(constant, abs=2 * step)
 
 
-def test_a_free_device_follows_its_base():
-    one = rods()
-    angles = np.zeros((1, 1, len(LENGTHS) + 1))
-    turned = one.turn(angles, np.full((1, 1), 0.1), 0.04)
-    np.testing.assert_allclose(turned, 0.1, rtol=1e-12)
-
-
 def test_friction_winds_the_device_up_until_it_gives():
     """The end stays, but for a creep, until its twist bears the friction."""
     one = rods()

@@ -19,14 +19,6 @@ def test_a_released_device_swings_as_the_beam_with_stated_losses(blood):
     assert decay == pytest.approx(expected, rel=damping.RELEASE_BOUND / 100)
 
 
-def test_blood_slows_the_swing_and_damps_it():
-    (blood, _, damped, _), (air, _, free, _) = (
-        damping.release(blood=blood) for blood in (True, False)
-    )
-    assert blood < 0.7 * air
-    assert damped > 1.1 * free
-
-
 @pytest.mark.parametrize("speed", [1.0, 3.14])
 def test_a_device_turned_in_a_bend_lags_by_the_losses_of_its_material(speed):
     lag, expected = damping.spin(speed)

@@ -39,9 +39,9 @@ class Rods:
                 to distal, m; the last one is 0.
             relaxation_times: (K,), relaxation times τ, s.
         """
-        from cathsim_dmc.entities import coaxial_loops  # imports numba, which is slow
+        from cathsim_dmc.entities import torsion_loops  # imports numba, which is slow
 
-        self._loops = coaxial_loops
+        self._loops = torsion_loops
         self._nodes = nodes
         self._relaxation_times = relaxation_times
         self.stiffness = np.stack([1 / _twist(device, nodes) for device in devices])

@@ -11,7 +11,10 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial import cKDTree
 
+from cathsim_dmc.anatomy.parts import Surface
+from cathsim_dmc.anatomy.scan.topology import areas
 from cathsim_dmc.anatomy.scan.units import UNITS
+from cathsim_dmc.anatomy.surface import sampled
 
 # Endings, and the least bytes a triangle takes where no header counts them: a face
 # "f 1 2 3" and half a vertex in OBJ, seven lines of text in STL.
@@ -150,17 +153,9 @@ def typical_radius(vertices: np.ndarray, faces: np.ndarray) -> float:
     surface at a place and holds no other part of it: neither holes nor turned faces
     disturb it (Ma et al., 3D medial axis point approximation, 2012).
     """
-    corners = vertices[faces]
-    cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    area = np.linalg.norm(cross, axis=1)
-    if not area.sum() > 0.0:
+    if not areas(vertices, faces).sum() > 0.0:
         raise ValueError("all triangles have no area; give the surface of a lumen.")
-    rng = np.random.default_rng(0)
-    some = rng.choice(len(faces), _SAMPLES, p=area / area.sum())
-    cut = np.sort(rng.uniform(size=(_SAMPLES, 2)), axis=1)
-    weights = np.stack([cut[:, 0], cut[:, 1] - cut[:, 0], 1.0 - cut[:, 1]], axis=1)
-    points = np.einsum("nk,nkd->nd", weights, corners[some])
-    normals = cross[some] / area[some, None]
+    points, normals = sampled(Surface(vertices, faces), _SAMPLES)
     tree = cKDTree(np.concatenate([points, vertices[np.unique(faces)]]))
     size = float(np.linalg.norm(np.ptp(vertices, axis=0)))
     radii = np.minimum(*(_ball(tree, points, s * normals, size) for s in (1.0, -1.0)))
