@@ -14,11 +14,13 @@ from cathsim_dmc.anatomy.anatomy import Anatomy
 from cathsim_dmc.anatomy.centreline import Centreline, Vessel, VesselTree
 from cathsim_dmc.anatomy.field import Field
 from cathsim_dmc.anatomy.parts import End, Inlet, Surface
+from cathsim_dmc.anatomy.scan import importer
 from cathsim_dmc.anatomy.scan.curves import read_curve, vessel_name
 from cathsim_dmc.anatomy.scan.importer import import_scan
 from cathsim_dmc.anatomy.scan.inlet import cut_open
 from cathsim_dmc.anatomy.scan.report import describe
 from cathsim_dmc.anatomy.scan.trunk import name_trunk
+from cathsim_dmc.anatomy.surface import lumen_surface
 from cathsim_dmc.anatomy.surface_depth import SurfaceDepth
 from cathsim_dmc.anatomy.tree_depth import TreeDepth
 
@@ -101,7 +103,6 @@ def test_saved_anatomy_keeps_its_depth(y_anatomy, tmp_path):
 
 
 def test_the_command_draws_what_it_imports(y_anatomy, tmp_path, monkeypatch, capsys):
-    from cathsim_dmc.anatomy.scan import importer
     from cathsim_dmc.cli.phantoms import import_phantom
 
     monkeypatch.setattr(importer, "import_scan", lambda *_, **options: y_anatomy)
@@ -164,14 +165,16 @@ def test_the_lumen_ends_at_the_inlet(cut_tube):
     np.testing.assert_allclose(depth(line[s < 0.0]), s[s < 0.0], atol=1e-9)
 
 
+def tube_line(start, end, radius) -> Centreline:
+    """A straight centreline, mm."""
+    ends = Centreline(np.array([start, end]) * 1e-3, np.full(2, radius * 1e-3))
+    return ends.resampled(1e-3)
+
+
 def fork(*names, trunk=(0.0, 60.0)) -> VesselTree:
     """A root of 8 mm radius, a branch, and further branches off that branch, mm."""
 
-    def line(start, end, radius):
-        ends = Centreline(np.array([start, end]) * 1e-3, np.full(2, radius * 1e-3))
-        return ends.resampled(1e-3)
-
-    low, high = trunk
+    low, high, line = *trunk, tube_line
     vessels = {
         "aorta": Vessel("aorta", line((0, 0, -40), (0, 0, 40), 8.0)),
         names[0]: Vessel(names[0], line((low, 0, 0), (high, 0, 0), 3.0), "aorta", 8e-3),
@@ -181,6 +184,17 @@ def fork(*names, trunk=(0.0, 60.0)) -> VesselTree:
         end = (30 + 10 * number, 40, 0)
         vessels[name] = Vessel(name, line(start, end, 2.0), names[0], 3e-3)
     return VesselTree(vessels)
+
+
+def test_less_is_cut_off_where_the_inlet_would_meet_a_branch():
+    """A branch 8 mm from the end, of which 6.4 mm are cut off otherwise."""
+    root = Vessel("aorta", tube_line((0, 0, 0), (0, 0, 60), 8.0))
+    branch = Vessel("lsa", tube_line((0, 0, 8), (40, 0, 2), 3.0), "aorta", 8e-3)
+    tree = VesselTree({"aorta": root, "lsa": branch})
+    opened, inlet, surface = importer._opened(tree, True, lumen_surface(tree, 1e-3))
+    assert 1e-3 < inlet.position[2] < 5e-3
+    assert SurfaceDepth(surface)(branch.centreline.points[-2:-1]) > 1e-3
+    assert list(opened.vessels) == ["aorta", "lsa"]
 
 
 def test_right_branches_share_the_brachiocephalic():

@@ -1,7 +1,7 @@
 """Twist of coaxial devices: compiled loops over simulations, devices and nodes.
 
-`torsion` calls them. Arrays are as in `coaxial_loops`; a rod has M + 1 = J + 2 nodes, of
-which 0 is its base.
+`torsion` calls them. Arrays are as in `coaxial_loops`; a rod has M + 1 = J + 2 nodes,
+of which 0 is its base.
 """
 
 import numpy as np

@@ -41,6 +41,7 @@ _log = logging.getLogger(__name__)
 ROOT = "aorta"
 FRAMES = ("LPS", "RAS")
 NEAR_INLET = 15e-3  # m, distance from the lumen of an inlet that is pointed at
+SHARES = (1.0, 0.6, 0.3)  # of a blind end that are tried to be cut off at the inlet
 RADII = (0.3e-3, 30e-3)  # m, allowed median radius of a vessel: arteriole, aneurysm
 
 # What to do about a tree that does not agree with the surface.
@@ -117,10 +118,11 @@ def import_scan(
     places = {k: _placed(k, point, frame, measure) for k, point in points.items()}
     lines = _read_curves(centreline_paths, frame, root, measure)
     log.say(f"tree: looking for vessels in {len(lumen.surface.faces):,} triangles")
-    tree, opening = _tree(measure, lines, places, root, rename or {}, log.note)
+    grown, at_end = _tree(measure, lines, places, root, rename or {}, log.note)
+    tree, opening, surface = _opened(grown, at_end, lumen.surface)
     log.say(f"tree: {', '.join(_summary(tree))}")
     name, goals = name or Path(mesh_path).name.split(".")[0], place_goals(tree, root)
-    surface, ends = _cut(lumen.surface, opening), flat_ends(tree, opening)
+    ends = flat_ends(tree, opening)
     anatomy = Anatomy(name, tree, surface, opening, goals, ends, scanned=True)
     _prove(anatomy, _MEND_DRAWN if lines else _MEND_COMPUTED, log.note)
     log.say(f"done in {log.seconds:.0f} s, goals {', '.join(goals) or 'none'}")
@@ -177,8 +179,8 @@ def _point(key: str, given: Sequence[float] | None) -> np.ndarray | None:
     return np.array(bounds.vector(key, given, 3, unit="the mesh's unit"))
 
 
-def _tree(field, lines, places, root, rename, note) -> tuple[VesselTree, Inlet]:
-    """The tree of given lines, or of computed ones, and its inlet."""
+def _tree(field, lines, places, root, rename, note) -> tuple[VesselTree, bool]:
+    """The tree of given lines, or of computed ones; whether it starts at an end."""
     ways = Ways(field)
     for pinch in ways.pinches:
         note(f"the lumen is pinched to a slit at {in_mm(pinch)}; vessels go on beyond")
@@ -206,7 +208,7 @@ def _tree(field, lines, places, root, rename, note) -> tuple[VesselTree, Inlet]:
                 raise ValueError(wrong)
         lines, right = _computed(ways, ends, entry, arch, root, rename, note)
     tree = grow_tree(field, ways, lines, entry.position, entry.far, root, drawn)
-    return place_inlet(name_trunk(tree, right), entry.at_end)
+    return name_trunk(tree, right), entry.at_end
 
 
 def _computed(
@@ -264,6 +266,27 @@ def _prove(anatomy: Anatomy, mend: str, note: Callable[[str], None]) -> None:
             f"the tree does not agree with the surface ({check.name}): {check.detail}. "
             + mend
         )
+
+
+def _opened(
+    tree: VesselTree, at_end: bool, surface: Surface
+) -> tuple[VesselTree, Inlet, Surface]:
+    """The tree from its inlet on, the inlet, and the surface cut off there.
+
+    Less is cut off where the plane of the inlet would meet a branch.
+    """
+    for share in SHARES:
+        opened, inlet = place_inlet(tree, at_end, share)
+        try:
+            cut = _cut(surface, inlet)
+        except ValueError:
+            if share == SHARES[-1] or not at_end:
+                raise
+            continue
+        tips = [vessel.centreline.points[-1] for vessel in opened.vessels.values()]
+        if not at_end or (SurfaceDepth(cut)(np.array(tips)) > 0.0).all():
+            break
+    return opened, inlet, cut
 
 
 def _cut(surface: Surface, opening: Inlet) -> Surface:

@@ -21,8 +21,16 @@ def passable_length(vessel: Vessel, radius: float = DEVICE_RADIUS) -> float:
     return float(line.arc_length[narrow.argmax()] if narrow.any() else line.length)
 
 
-def place_inlet(tree: VesselTree, at_end: bool) -> tuple[VesselTree, Inlet]:
-    """Start the root where the lumen has its width, and look along it there."""
+def place_inlet(
+    tree: VesselTree, at_end: bool, share: float = 1.0
+) -> tuple[VesselTree, Inlet]:
+    """Start the root where the lumen has its width, and look along it there.
+
+    Args:
+        tree: as it was grown.
+        at_end: whether it starts at a blind end, of which a piece is cut off.
+        share: of that piece which is cut off.
+    """
     root = tree.root
     line = root.centreline
     start = 0.0
@@ -32,6 +40,7 @@ def place_inlet(tree: VesselTree, at_end: bool) -> tuple[VesselTree, Inlet]:
         first = int((line.radii >= wide).argmax())
         # Further by that width, because a vessel's end may be cut off at a slant.
         start = float(line.arc_length[first] + INLET_WIDTH * line.radii[first])
+        start *= share
     if start > 0.0:
         line = line.slice(start, line.length)
     place = line.at(0.0)
