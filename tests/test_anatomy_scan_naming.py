@@ -202,6 +202,16 @@ def test_a_vertebral_artery_of_its_own_and_an_aberrant_subclavian(bend):
     assert found == ["rcca", "lcca", "lsa", "rsa"]
 
 
+@pytest.mark.parametrize("first", [5.4, 6.0])
+def test_a_wide_fourth_branch_is_hardly_one_without_a_name(bend, first):
+    """But the first one is asked for if it is as wide as a brachiocephalic artery."""
+    radii = (first, 4.0, 5.0, 3.8)
+    straight = [(r, (r, [(20 * k - 20, 0, 110)])) for k, r in enumerate(radii)]
+    names = named(bend, *straight)[0]
+    sure = ["rcca", "lcca", "lsa", "rsa"]
+    assert names == (["branch_1", "lcca", "lsa", "branch_2"] if first == 6.0 else sure)
+
+
 def test_without_knowing_the_heart_no_name_is_sure(bend):
     branches = [(4.4, (4.2, [(20 * k - 20, 0, 95)])) for k in range(3)]
     names, notes = named(bend, *branches, odds=0.0)

@@ -45,6 +45,9 @@ PATTERNS = {
 }
 CUT = 0.03  # probability that the scan shows nothing of a branch
 SHORT = 0.04  # that it is cut short
+# Arteries of the arch that have no name here, such as a thyroid or a bronchial one, are
+# thin: radius in m, and the standard deviation of the logarithm of a wider one.
+EXTRA_RADIUS, EXTRA_SPREAD = 2.0e-3, 0.8
 BUMP = 0.02  # that one that looks cut short is none
 # Radii beyond the ostium, m (`arch.sampler`, vertebral: 1.9), for an aorta as wide as
 # `AORTA`; `SPREAD` is the standard deviation of their logarithm.
@@ -242,7 +245,10 @@ def _hypotheses(seen: Sequence[Offshoot], scale: float):
 def _fit(one: Offshoot, label: str, scale: float) -> float:
     """Log probability of the calibre and the fork of an offshoot."""
     if label == "extra":
-        return float(np.log(EXTRA if one.curves else BUMP))
+        if not one.curves:
+            return float(np.log(BUMP))
+        wider = max(np.log(one.radius / (scale * EXTRA_RADIUS)), 0.0) / EXTRA_SPREAD
+        return float(np.log(EXTRA) - 0.5 * wider**2)
     # What was cut short shows little more than the mouth of a branch.
     spread = SPREAD if one.curves else 2.0 * SPREAD
     weight = normal(np.log(one.radius / (scale * RADII[label])), spread)
