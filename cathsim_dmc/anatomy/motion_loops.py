@@ -174,21 +174,30 @@ def moved(lattice, parameters, time, points, out, growth):
 
 
 @compiled
+def carried(there, p, q, r):
+    """What a flow (p, q, r) at rest becomes where `warp` has looked, and det A.
+
+    det A A⁻¹ (p, q, r), with A the gradient of the place at rest, conserves volume.
+    """
+    a, b, c = there[3], there[4], there[5]
+    d, e, f = there[6], there[7], there[8]
+    g, h, i = there[9], there[10], there[11]
+    x, y, z = e * i - f * h, c * h - b * i, b * f - c * e
+    u = x * p + y * q + z * r
+    v = (f * g - d * i) * p + (a * i - c * g) * q + (c * d - a * f) * r
+    w = (d * h - e * g) * p + (b * g - a * h) * q + (a * e - b * d) * r
+    return u, v, w, a * x + d * y + g * z
+
+
+@compiled
 def wall_velocity(there, normal):
     """Velocity (3) m/s of the wall's material where `warp` has looked.
 
     Space goes with A⁻¹ ∂u/∂t, and a wall that widens away from its normal (3).
     """
-    a, b, c = there[3], there[4], there[5]
-    d, e, f = there[6], there[7], there[8]
-    g, h, i = there[9], there[10], there[11]
-    p, q, r = there[16], there[17], there[18]
-    x, y, z = e * i - f * h, c * h - b * i, b * f - c * e
-    scale = 1.0 / (a * x + d * y + g * z)
-    u = (x * p + y * q + z * r) * scale
-    v = ((f * g - d * i) * p + (a * i - c * g) * q + (c * d - a * f) * r) * scale
-    w = ((d * h - e * g) * p + (b * g - a * h) * q + (a * e - b * d) * r) * scale
+    u, v, w, scale = carried(there, there[16], there[17], there[18])
     grow = there[19]
+    u, v, w = u / scale, v / scale, w / scale
     return (u - grow * normal[0], v - grow * normal[1], w - grow * normal[2])
 
 

@@ -46,7 +46,7 @@ class StillBlood(Effect):
         # Of the blood at the links, world frame: (N, L, 3) m/s, (N, L) s; and (N, L)
         # N·s/m², see `blood_loops.OF_LINK`.
         self.velocity, self._delay = links[..., :3], links[..., 3]
-        self._friction = links[..., 4]
+        self._friction, self._drift, self._links = links[..., 4], links[..., 5:], links
 
     def restart(
         self, index: int, episode: Episode, random_state: np.random.RandomState
@@ -56,4 +56,4 @@ class StillBlood(Effect):
         viscosity, first = factor * BLOOD_VISCOSITY, self.world.index.links.start
         self._header[index] = 0.0
         self._header[index, :4] = self._loops.MARK, BLOOD_DENSITY, viscosity, first
-        self.velocity[index] = self._delay[index] = self._friction[index] = 0.0
+        self._links[index] = 0.0

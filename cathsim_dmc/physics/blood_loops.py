@@ -20,8 +20,9 @@ from cathsim_dmc.compiled import compiled
 # velocities the peak b, 0 for a steady flow, the rate r in 1/s and the phase p.
 HEADER, MARK = 7, 1843.0
 # Parameters of a link: velocity of the blood there, m/s at a factor of 1, its delay, s,
-# and the friction along the link's axis per length and velocity, N·s/m².
-OF_LINK = 5
+# the friction along the link's axis per length and velocity, N·s/m², and the velocity
+# of the vessel's space, m/s.
+OF_LINK = 8
 # Numbers of `userdata` before the parameters of the first effect.
 _FIRST = 2
 _MODEL = ("nuserdata", "body_geomadr", "geom_size", "body_dofadr", "body_dofnum", "nv")
@@ -82,9 +83,9 @@ def _drag(model, data):
         x, y, z = place[0] - pole[0], place[1] - pole[1], place[2] - pole[2]
         if peak != 0.0:
             factor = peak * beat(phase - rate * flow[3])
-        u = factor * flow[0] - spin[3] - spin[1] * z + spin[2] * y
-        v = factor * flow[1] - spin[4] - spin[2] * x + spin[0] * z
-        w = factor * flow[2] - spin[5] - spin[0] * y + spin[1] * x
+        u = factor * flow[0] + flow[5] - spin[3] - spin[1] * z + spin[2] * y
+        v = factor * flow[1] + flow[6] - spin[4] - spin[2] * x + spin[0] * z
+        w = factor * flow[2] + flow[7] - spin[5] - spin[0] * y + spin[1] * x
         along = u * axes[2] + v * axes[5] + w * axes[8]
         u, v, w = u - along * axes[2], v - along * axes[5], w - along * axes[8]
         speed = math.sqrt(u * u + v * v + w * w)

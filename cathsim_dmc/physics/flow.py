@@ -8,6 +8,11 @@ of the aorta have it (Smith, Pullan and Hunter 2002; openBF). Womersley's profil
 that of a developed flow; the aorta is shorter than its entrance length, and measured
 profiles are flat (the Stokes layer at 1 Hz is 1 mm thick).
 
+In a moving vessel (`anatomy.motion`), with the gradient A = ∂X/∂x of the place at rest,
+the velocity v(X) at rest, over the radius that the lumen has grown to, becomes
+det A A⁻¹ v(X), which conserves the volume through every section (Piola), and the
+velocity A⁻¹ ∂u/∂t of the vessel's space is added.
+
 The velocity at each link is taken once a control step where the link is, its course in
 time in every physics step. Across the link the drag is that of `blood`, from the
 velocity relative to the link; along it, the blood rubs like a flow between the link of
@@ -70,38 +75,46 @@ _LIMITS = {
 
 
 class Flow(StillBlood):
-    """Pulsatile flow in each simulation's anatomy."""
+    """Blood in vessels that live: it may flow, and moves with what moves them.
 
-    def __init__(self, options: FlowOptions, moving: Moving | None = None):
-        """Takes the options of the task, and what moves the vessels."""
+    Attributes:
+        radius: (N, L), of the lumen around each link, m, 0 where it is in none.
+    """
+
+    radius: np.ndarray
+
+    def __init__(self, options: FlowOptions | None, moving: Moving | None = None):
+        """Takes the options of the task, None for no flow, and what moves vessels."""
         self._options, self._moving = options, moving
 
     def num_parameters(self, chain: Chain) -> int:
         """Those of blood."""
         from cathsim_dmc.physics import flow_loops  # late, as numba takes long
 
-        self._velocities = flow_loops.velocities
+        self._places = flow_loops
         return super().num_parameters(chain)
 
     def bind(self, world: World) -> None:
         """Finds the parameters of blood and the radii of the links."""
         super().bind(world)
-        links = world.index.geoms
-        self._link_radii = world.model.geom_size[links, 0]
+        self._link_radii = world.model.geom_size[world.index.geoms, 0]
         self._circulations: dict[int, Circulation] = {}
         self._wave_speed = np.ones(world.num_simulations)
 
     def enter(self, index: int, anatomy: Anatomy) -> None:
         """Fills the vessels of an anatomy."""
-        self._circulations[index] = anatomy.circulation
-        if self._options.split == "murray":
-            self._circulations[index] = Circulation.of(anatomy.tree, murray=True)
+        murray = self._options is not None and self._options.split == "murray"
+        self._circulations[index] = (
+            Circulation.of(anatomy.tree, murray) if murray else anatomy.circulation
+        )
 
     def restart(
         self, index: int, episode: Episode, random_state: np.random.RandomState
     ) -> None:
         """Draws rate, peak and phase of the heart, and pulse wave velocity."""
         super().restart(index, episode, random_state)
+        if self._options is None:
+            return
         rate, peak, phase, speed = (
             drawn(getattr(self._options, name), random_state) for name in _LIMITS
         )
@@ -115,16 +128,16 @@ class Flow(StillBlood):
         return {"wave_speed": self._wave_speed}
 
     def act(self, action: np.ndarray, state: Readings) -> np.ndarray:
-        """Finds the velocity at the middle of each link, and its delay."""
-        places = state.centreline if self._moving is None else self._moving.centreline
-        middles = 0.5 * (places[:, :-1] + places[:, 1:])
-        found = self._at(middles)
-        self.velocity[:] = found[..., :3]
-        self._delay[:] = found[..., 3] / self._wave_speed[:, None]
-        inside = found[..., 4] > 0.0
-        gap = np.maximum(found[..., 4] / self._link_radii, _LEAST_GAP)
-        friction = 2 * np.pi * self._header[:, 2:3] / np.log(gap)
-        self._friction[:] = np.where(inside, friction, 0.0)
+        """Finds the blood at the middle of each link."""
+        nodes = state.centreline
+        found = self._at(0.5 * (nodes[:, :-1] + nodes[:, 1:]))
+        self.radius, self._drift[:] = found[..., 4], found[..., 5:]
+        if self._options is not None:
+            self.velocity[:] = found[..., :3]
+            self._delay[:] = found[..., 3] / self._wave_speed[:, None]
+            gap = np.maximum(self.radius / self._link_radii, _LEAST_GAP)
+            friction = 2 * np.pi * self._header[:, 2:3] / np.log(gap)
+            self._friction[:] = np.where(self.radius > 0.0, friction, 0.0)
         return action
 
     def heart(self, index: int) -> dict[str, float]:
@@ -134,10 +147,17 @@ class Flow(StillBlood):
         return {"rate": rate, "phase": phase, "wave_speed": speed}
 
     def _at(self, points: np.ndarray) -> np.ndarray:
-        """What `flow_loops.velocities` finds at points (N, P, 3): (N, P, 5)."""
-        out = np.empty((*points.shape[:2], 5))
+        """What `flow_loops` finds at points (N, P, 3) in space: (N, P, 8)."""
+        out = np.zeros((*points.shape[:2], 8))
         for index, row in enumerate(np.ascontiguousarray(points)):
-            self._velocities(row, *self._circulations[index].arrays, out[index])
+            vessels = self._circulations[index].arrays
+            if self._moving is None:
+                self._places.velocities(row, np.zeros(len(row)), *vessels, out[index])
+            else:
+                course = self._moving.course(index)
+                self._places.moving_velocities(*course, row, *vessels, out[index])
+        if self._moving is not None:
+            out[~self._moving.entered(points)] = 0.0
         return out
 
     def read(self, time: np.ndarray, state: Readings) -> dict[str, np.ndarray]:
@@ -145,12 +165,14 @@ class Flow(StillBlood):
 
         Args:
             time: (N,) of the episodes, s.
-            state: At that time, places at rest.
+            state: At that time.
         """
+        found = self._at(state.head[:, None])[:, 0]
+        if self._options is None:
+            return {"blood_velocity": found[:, 5:]}
         inflow, rate, phase = self._header[:, 4:].T
         phases = rate * time + phase
-        found = self._at(state.head[:, None])[:, 0]
         delays = found[:, 3] / self._wave_speed
         beats = [self._loops.beat(phase) for phase in (phases - rate * delays).tolist()]
-        velocity = (inflow * np.array(beats))[:, None] * found[:, :3]
+        velocity = (inflow * np.array(beats))[:, None] * found[:, :3] + found[:, 5:]
         return {"heart_phase": phases % 1.0, "blood_velocity": velocity}

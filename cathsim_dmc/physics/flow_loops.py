@@ -4,6 +4,7 @@ import math
 
 import numpy as np
 
+from cathsim_dmc.anatomy.motion_loops import VALUES, WARP, carried, warp
 from cathsim_dmc.compiled import compiled
 
 # Exponent of the profile across the lumen.
@@ -19,17 +20,44 @@ def profile(share):
 
 
 @compiled
-def velocities(points, ends, radii, shares, ways, vessel, out):
+def moving_velocities(
+    lattice, parameters, time, points, ends, radii, shares, ways, vessel, out
+):
+    """As `velocities`, where the vessel is at a time, s.
+
+    Args:
+        lattice: of `anatomy.motion.Motion`.
+        parameters: of the motion.
+        out: (P, 8): as there, and the velocity of the vessel's space, m/s.
+    """
+    values, there = np.empty((VALUES, 4)), np.empty((len(points), WARP))
+    for p in range(len(points)):
+        x, y, z = points[p]
+        warp(lattice, parameters, time, x, y, z, values, there[p])
+    rest, growth = there[:, :3].copy(), there[:, 12].copy()
+    velocities(rest, growth, ends, radii, shares, ways, vessel, out)
+    for p in range(len(points)):
+        row, at = out[p], there[p]
+        if row[4] > 0.0:
+            row[0], row[1], row[2], scale = carried(at, row[0], row[1], row[2])
+            row[5], row[6], row[7], scale = carried(at, at[16], at[17], at[18])
+            row[5:] /= scale
+
+
+@compiled
+def velocities(points, growth, ends, radii, shares, ways, vessel, out):
     """Writes velocity, way from the heart and radius of the lumen at some places.
 
     Args:
-        points: (P, 3), m.
+        points: (P, 3), m, in the vessel at rest.
+        growth: (P,), of the radius of the lumen, m.
         ends: as the others, of `anatomy.circulation.Circulation`.
         radii: (S, 2), m.
         shares: (S, 2).
         ways: (S, 2), m.
         vessel: (S,).
-        out: (P, 5): velocity for an inflow of 1 m³/s, 1/m²; way, m; radius, m.
+        out: (P, 5 or more): velocity for an inflow of 1 m³/s, 1/m²; way, m; radius,
+            m; 0 outside the lumen.
     """
     count = len(vessel)
     nearest = np.empty(vessel[-1] + 1)
@@ -52,7 +80,7 @@ def velocities(points, ends, radii, shares, ways, vessel, out):
             before = t < 0.0 and (k == 0 or vessel[k - 1] != v)
             after = t > 1.0 and (k == count - 1 or vessel[k + 1] != v)
             t = min(max(t, 0.0), 1.0)
-            radius = (1.0 - t) * radii[k, 0] + t * radii[k, 1]
+            radius = growth[p] + (1.0 - t) * radii[k, 0] + t * radii[k, 1]
             # Depth in the tube of the vessel, none past its ends.
             nearest[v] = radius - math.sqrt(nearest[v])
             if before or after:
@@ -67,7 +95,7 @@ def velocities(points, ends, radii, shares, ways, vessel, out):
                 continue
             k = segment[v]
             t = min(max(_place(points[p], ends[k]), 0.0), 1.0)
-            radius = (1.0 - t) * radii[k, 0] + t * radii[k, 1]
+            radius = growth[p] + (1.0 - t) * radii[k, 0] + t * radii[k, 1]
             length = 0.0
             for i in range(3):
                 length += (ends[k, 1, i] - ends[k, 0, i]) ** 2

@@ -10,7 +10,8 @@ begins at rest, at the end of diastole and of expiration, and moves in full afte
 from __future__ import annotations
 
 import dataclasses
-from typing import Protocol
+from collections.abc import Callable
+from typing import Any, Protocol
 
 import mujoco
 import numpy as np
@@ -87,10 +88,7 @@ class Moving(Effect):
 
     Attributes:
         flow: Flow with the same heart; None for none.
-        centreline: (N, L + 1, 3), of the device, at rest; there from `see` on.
     """
-
-    centreline: np.ndarray
 
     def __init__(self, options: MotionOptions):
         """Takes the options of the task; `flow` may become one with the same heart."""
@@ -167,44 +165,38 @@ class Moving(Effect):
         _, _, _, _, rate, phase, _, breath, begin, *_ = self.world.parameters.T
         return (rate * self._clock + phase) % 1.0, (breath * self._clock + begin) % 1.0
 
+    def entered(self, nodes: np.ndarray) -> np.ndarray:
+        """Which nodes (N, P, 3) of devices, m, are past the inlet: (N, P) bool."""
+        inlet, direction = self._inlets[:, :1], self._inlets[:, 1]
+        beyond = np.einsum("nij,nj->ni", nodes - inlet, direction) > 0.0
+        return np.maximum.accumulate(beyond, axis=1)
+
     def at_rest(self, state: Readings) -> Readings:
         """Readings with the places at rest of those in space; the sheath rests."""
         nodes = state.centreline
-        inlet, direction = self._inlets[:, :1], self._inlets[:, 1]
-        beyond = np.einsum("nij,nj->ni", nodes - inlet, direction) > 0.0
-        entered = np.maximum.accumulate(beyond, axis=1)
-        places = np.where(entered[..., None], self._to_rest(nodes), nodes)
+        there = self._each(Motion.to_rest, nodes)
+        places = np.where(self.entered(nodes)[..., None], there, nodes)
         return state._replace(centreline=places, head=places[:, -1])
-
-    def see(self, state: Readings) -> Readings:
-        """`at_rest` of what was measured last, whose places other effects use."""
-        resting = self.at_rest(state)
-        self.centreline = resting.centreline
-        return resting
-
-    def _to_rest(self, points: np.ndarray) -> np.ndarray:
-        found = [
-            self._motions[index].to_rest(self.world.parameters[index], time, row)
-            for index, (row, time) in enumerate(zip(points, self._time(), strict=True))
-        ]
-        return np.array(found)
 
     def to_space(self, points: np.ndarray) -> np.ndarray:
         """Places in space (N, ..., 3) of places at rest (N, ..., 3), m."""
+        return self._each(lambda *given: Motion.to_space(*given)[0], points)
+
+    def course(self, index: int) -> tuple[np.ndarray, np.ndarray, float]:
+        """Lattice and parameters of one simulation's motion, and its time, s.
+
+        The time is that of what MuJoCo has derived, one physics step before the end.
+        """
+        time = max(float(self._clock[index]) - self._step, 0.0)
+        return self._motions[index].lattice, self.world.parameters[index], time
+
+    def _each(self, function: Callable[..., Any], points: np.ndarray) -> np.ndarray:
+        """A method of the motions with parameters, time, and points (N, ..., 3)."""
         found = [
-            self._motions[index].to_space(self.world.parameters[index], time, row)[0]
-            for index, (row, time) in enumerate(zip(points, self._time(), strict=True))
+            function(self._motions[index], *self.course(index)[1:], row)
+            for index, row in enumerate(points)
         ]
         return np.array(found)
-
-    def warp(self, index: int) -> tuple[np.ndarray, np.ndarray, float]:
-        """Lattice, parameters and time (s) of one simulation, for `motion_loops`."""
-        parameters = self.world.parameters[index]
-        return self._motions[index].lattice, parameters, self._time()[index]
-
-    def _time(self) -> list[float]:
-        """Time of what MuJoCo has derived: one physics step before the end."""
-        return np.maximum(self._clock - self._step, 0.0).tolist()
 
 
 def add_clock(root) -> None:

@@ -62,10 +62,10 @@ def read(
     Args:
         effects: Of the task.
         time: (N,), s, of the episodes.
-        state: At that time, places at rest.
+        state: At that time.
         rows: (N, M * 14), of the wall's sensor.
     """
-    if not any(isinstance(effect, Flow | Wall | Moving) for effect in effects):
+    if not any(isinstance(effect, Flow) for effect in effects):
         return None
     deepest = -forces.distances(rows).min(axis=-1, initial=0.0)
     work = forces.pressing_work(rows)
@@ -129,13 +129,14 @@ class VesselOptions:
 
     def effects(self) -> tuple[StillBlood, list[Effect]]:
         """The effect of the blood, and those of the wall."""
+        if not self.living:
+            return StillBlood(), []
         moving = None if self.motion is None else Moving(self.motion)
-        blood = StillBlood() if self.flow is None else Flow(self.flow, moving)
-        walls: list[Effect] = []
+        blood, walls = Flow(self.flow, moving), list[Effect]()
         if self.wall is not None:
-            walls.append(Wall(self.wall, moving))
+            walls.append(Wall(self.wall, blood))
         if moving is not None:
-            moving.flow = blood if isinstance(blood, Flow) else None
+            moving.flow = None if self.flow is None else blood
             walls.append(moving)
         return blood, walls
 

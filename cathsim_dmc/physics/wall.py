@@ -23,13 +23,11 @@ import dataclasses
 
 import numpy as np
 
-from cathsim_dmc.anatomy import Anatomy
-from cathsim_dmc.anatomy.circulation import Circulation
 from cathsim_dmc.entities.chain import Chain
 from cathsim_dmc.entities.contact import CONTACT_SOLIMP, CONTACT_SOLREF
 from cathsim_dmc.physics.drawn import Range, drawable, drawn
 from cathsim_dmc.physics.effects import Effect, World
-from cathsim_dmc.physics.motion import Moving
+from cathsim_dmc.physics.flow import Flow
 from cathsim_dmc.physics.randomisation import Episode
 from cathsim_dmc.physics.readings import Readings
 
@@ -117,29 +115,24 @@ class Wall(Effect):
 
     model_fields = ("geom_solref", "geom_solimp")
 
-    def __init__(self, options: WallOptions, moving: Moving | None = None):
-        """Takes the options of the task, and what moves the vessels."""
-        self._options, self._moving = options, moving
+    def __init__(self, options: WallOptions, blood: Flow):
+        """Takes the options of the task, and the blood, which knows the vessels."""
+        self._options, self._blood = options, blood
 
     def bind(self, world: World) -> None:
         """Finds the links in the model."""
-        from cathsim_dmc.physics import flow_loops, wall_loops  # late, as above
+        from cathsim_dmc.physics import wall_loops  # late, as above
 
         super().bind(world)
-        self._look, self._contacts = flow_loops.velocities, wall_loops.contacts
+        self._contacts = wall_loops.contacts
         model, links = world.model, world.index.geoms
         self._geoms = links
         self._weight = model.body_invweight0[model.geom_bodyid[links], 0]
         self._rigid = rigid_stiffness(self._weight)
-        self._circulations: dict[int, Circulation] = {}
         count = world.num_simulations
         # Of the lumen around each link, 0 where it has never been in one.
         self._radius = np.zeros((count, len(links)))
         self._material = np.ones((count, len(_LIMITS)))
-
-    def enter(self, index: int, anatomy: Anatomy) -> None:
-        """Takes the radii of an anatomy."""
-        self._circulations[index] = anatomy.circulation
 
     def restart(
         self, index: int, episode: Episode, random_state: np.random.RandomState
@@ -173,13 +166,10 @@ class Wall(Effect):
         )
 
     def act(self, action: np.ndarray, state: Readings) -> np.ndarray:
-        """Looks up the vessel around the middle of each link."""
-        places = state.centreline if self._moving is None else self._moving.centreline
-        middles = 0.5 * (places[:, :-1] + places[:, 1:])
-        out = np.empty((middles.shape[1], 5))
-        for index, points in enumerate(np.ascontiguousarray(middles)):
-            self._look(points, *self._circulations[index].arrays, out)
-            np.copyto(self._radius[index], out[:, 4], where=out[:, 4] > 0.0)
+        """Takes the radius of the vessel around each link."""
+        radius = self._blood.radius
+        np.copyto(self._radius, radius, where=radius > 0.0)
+        for index in range(len(radius)):
             self.refresh(index)
         return action
 

@@ -238,13 +238,17 @@ class Rollout:
         """Measures all simulations, or some, when the others have not moved."""
         now = self._views.read()
         time, last = CONTROL_TIMESTEP * self._steps, self._stepper.contact_rows[:, -1]
-        self._resting = now if self._moving is None else self._moving.see(now)
-        vessel_now = vessel.read(self._listed, time, self._resting, last)
+        vessel_now = vessel.read(self._listed, time, now, last)
         force, devices = forces.wall_force(magnitudes), self._devices.read(now)
         new = Measured(now, force, devices, vessel_now)
         if rows is not None and hasattr(self, "_measured"):
             new = self._measured.updated(new.rows(rows), rows)
         self._measured = new
+        self._resting = self._at_rest(self.readings)
+
+    def _at_rest(self, state: readings.Readings) -> readings.Readings:
+        """Readings with places where they are in the vessel at rest."""
+        return state if self._moving is None else self._moving.at_rest(state)
 
     def _step(
         self, fresh: np.ndarray | None = None, ended: np.ndarray | None = None
@@ -307,9 +311,8 @@ class Rollout:
                 None if devices is None else devices.points,
             )
         if self._routes is not None:
-            seen = state if self._moving is None else self._moving.at_rest(state)
-            head = seen.head
-            ahead = self._routes.ahead(self._case_of, head, state.head_frame)
+            seen = self._at_rest(state) if self._tracking.on else self.resting
+            ahead = self._routes.ahead(self._case_of, seen.head, state.head_frame)
         force, chain = self.wall_force, self._chain
         frame = Frame(state, force, self._action, goal, chain, images, ahead, devices)
         frame = frame._replace(vessel=self._measured.vessel)
@@ -402,8 +405,7 @@ class Rollout:
         self._choose_objective()
         self._path = merged(self._path, Path(**snapshot.part("path")), indices)
         self._measured = self._measured.restored(snapshot, indices)
-        now = self.readings
-        self._resting = now if self._moving is None else self._moving.see(now)
+        self._resting = self._at_rest(self.readings)
         machines = [self.case(index).angiograph for index in indices]
         self._sensors.restore(indices, machines, snapshot.part("images"))
         self._tracking.restore(indices, snapshot.part("tracking"))

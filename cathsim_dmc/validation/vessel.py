@@ -135,7 +135,7 @@ def profile() -> tuple[float, float]:
     r = radius * (places + 1) / 2
     points = np.stack([r, 0 * r, 0.1 + 0 * r], axis=-1)
     out = np.empty((len(r), 5))
-    velocities(points, *circulation.arrays, out)
+    velocities(points, np.zeros(len(r)), *circulation.arrays, out)
     mean, n = 1 / (np.pi * radius**2), EXPONENT
     expected = mean * (n + 2) / n * (1 - (r / radius) ** n)
     flow = (out[:, 2] * 2 * np.pi * r * weights).sum() * radius / 2
