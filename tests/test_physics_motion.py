@@ -42,6 +42,21 @@ def test_motion_in_the_walls_frame_is_that_under_its_inertia(tube):
     assert motion.frame(tube) < motion.FRAME_BOUND
 
 
+def test_blood_in_a_moving_vessel_keeps_its_volume_and_moves_along(tube):
+    for time in motion.FLOW_TIMES:
+        flow = motion.section_flow(tube, time)
+        assert flow == pytest.approx(1.0, rel=motion.FLOW_BOUND / 100)
+
+
+def test_blood_at_rest_is_carried_by_the_vessel():
+    task = suite.make_task("simple1_bca", vessel={"motion": True})
+    batch = BatchSimulation(task, 1, seeds=0)
+    batch.reset()
+    steps = [batch.step(np.zeros((1, 21))) for _ in range(40)]
+    speeds = np.concatenate([step.info()["blood_speed"] for step in steps])
+    assert speeds[0] < 1e-3 and 3e-3 < speeds.max() < 0.1
+
+
 def test_places_in_space_are_found_and_the_sheath_rests(arch):
     course = motion.parameters(5.5e-3, 1.0, 0.02)
     points = np.concatenate([v.centreline.points for v in arch.tree.vessels.values()])
@@ -103,3 +118,19 @@ def test_a_wall_that_moves_past_the_sheath_does_not_touch_what_is_in_it(tube):
         mujoco.mj_fwdPosition(model, data)
         found.append(data.ncon)
     assert found == [1, 0]
+
+
+def test_fluoroscopy_shows_the_vessel_where_it_is():
+    task = suite.make_task(
+        "simple1_bca", vessel={"motion": True}, observation="segmentation"
+    )
+    batch = BatchSimulation(task, 1, seeds=0)
+    batch.reset()
+    for _ in range(50):  # to the end of inspiration
+        step = batch.step(np.zeros((1, 21)))
+    vessel_now = step.observation["segmentation"][0, ..., 1] > 0
+    machine = batch.rollout.case().angiograph
+    plane = machine.planes()[0]
+    there = plane.around(batch.rollout.moving.surface(0))
+    np.testing.assert_array_equal(vessel_now, there.vessel_mask)
+    assert (vessel_now != plane.vessel_mask).mean() > 0.02

@@ -10,9 +10,13 @@ from recording_samples import make_episode, make_tube
 from scipy.spatial.transform import Rotation
 
 from cathsim_dmc import suite
+from cathsim_dmc.anatomy import Surface
+from cathsim_dmc.imaging import FluoroscopyOptions
+from cathsim_dmc.pictures.moment import Moment
+from cathsim_dmc.pictures.recorded import xray_film
 from cathsim_dmc.recording import Episode, EpisodeRecorder
 from cathsim_dmc.recording.geometry import force_text
-from cathsim_dmc.recording.living import VesselRecord
+from cathsim_dmc.recording.living import DENT, VesselRecord, dented
 from cathsim_dmc.recording.rerun_device import arrow_scale
 from cathsim_dmc.recording.rerun_log import write_rrd
 from cathsim_dmc.recording.scene import BodyGeom
@@ -381,6 +385,16 @@ def test_reading_episodes_needs_no_rerun():
     assert done.stdout.strip() == "[]"
 
 
+def test_a_wall_that_gives_is_drawn_pressed_in_by_the_contacts():
+    surface = Surface(*make_tube())
+    place = surface.vertices[:1]
+    touched = dented(surface, place, np.array([1e-3])).vertices - surface.vertices
+    np.testing.assert_allclose(touched[0], 1e-3 * surface.normals[0])
+    away = np.linalg.norm(surface.vertices - place, axis=1) > DENT
+    assert away.any() and not touched[away].any()
+    np.testing.assert_allclose((touched * surface.normals).sum(1).max(), 1e-3)
+
+
 def test_a_living_vessel_is_kept_and_its_wall_moves_in_the_file(tmp_path):
     env = suite.load("cathsim", "simple1_bca", {"vessel": "living", "random": 0})
     recorder = EpisodeRecorder(env)
@@ -397,6 +411,12 @@ def test_a_living_vessel_is_kept_and_its_wall_moves_in_the_file(tmp_path):
     np.testing.assert_allclose(places[0], surface.vertices, atol=1e-6)
     assert len(places) == 3 and moved.max() > 1e-3
     assert np.linalg.norm(record.goal[8] - record.goal[0]) > 1e-4
+    drawn, present = Moment.of_episode(episode, surface, 8), Moment.of(env)
+    np.testing.assert_allclose(drawn.surface.vertices, present.surface.vertices)
+    np.testing.assert_allclose(drawn.surface.vertices, places[2], atol=1e-6)
+    np.testing.assert_array_equal(drawn.goal, record.goal[8])
+    film = xray_film(episode, surface, FluoroscopyOptions(size=64))
+    assert (film[0] != film[4]).mean() > 0.01
     with pytest.raises(ValueError, match="8 values of heart_phase; give 9"):
         spoiled = {**episode.meta["vessel"], "heart_phase": list(phase[1:])}
         meta = {**episode.meta, "vessel": spoiled}

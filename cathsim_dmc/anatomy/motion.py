@@ -20,7 +20,7 @@ import numpy as np
 
 from cathsim_dmc.anatomy.centreline import Array, VesselTree
 from cathsim_dmc.anatomy.circulation import Circulation
-from cathsim_dmc.anatomy.parts import End
+from cathsim_dmc.anatomy.parts import End, Surface
 
 _STEP = 6e-3  # m, of the lattice
 _SMOOTH = 25e-3  # m, over which a displacement is that of the aorta around
@@ -120,6 +120,11 @@ class Motion:
         out, growth = np.empty_like(flat), np.empty(len(flat))
         motion_loops.moved(self.lattice, parameters, time, flat, out, growth)
         return out.reshape(points.shape), growth.reshape(points.shape[:-1])
+
+    def surface(self, parameters: Array, time: float, rest: Surface) -> Surface:
+        """The lumen's surface at a time, s, of that at rest."""
+        places, growth = self.to_space(parameters, time, rest.vertices)
+        return Surface(places + growth[:, None] * rest.normals, rest.faces)
 
 
 def distensibility(radius: Array) -> Array:

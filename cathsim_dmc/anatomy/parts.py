@@ -6,6 +6,7 @@ Lengths are metres, positions are in the patient frame LPS.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -117,7 +118,7 @@ class Surface:
         a, b, c = (self.vertices[self.faces[:, i]] for i in range(3))
         return float(np.einsum("fj,fj->", a, np.cross(b, c)) / 6.0)
 
-    @property
+    @cached_property
     def normals(self) -> Array:
         """Unit normals (V, 3) of the vertices, by area; +z where there is no area."""
         import igl

@@ -7,13 +7,14 @@ The path length through vessel and patient is computed once per anatomy and view
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from cathsim_dmc.anatomy.parts import Surface
 from cathsim_dmc.imaging import detector, materials
 from cathsim_dmc.imaging.carm import CArm
 from cathsim_dmc.imaging.device import Shadow, device_attenuation, device_thickness
@@ -109,9 +110,13 @@ class Fluoroscope:
         """
         if carm is None:
             carm = CArm.view("AP").centred_on(vertices)
-        thickness = surface_thickness(carm, vertices, faces, supersample)
-        central = surface_thickness(carm, vertices, faces, 1)
-        return cls(carm=carm, vessel=thickness, vessel_mask=central > 0.0, **fields)
+        paths = _paths(carm, vertices, faces, supersample)
+        return cls(carm, *paths, **fields)
+
+    def around(self, surface: Surface, supersample: int = 3) -> Fluoroscope:
+        """The same view of a lumen whose surface has moved."""
+        paths = _paths(self.carm, surface.vertices, surface.faces, supersample)
+        return replace(self, vessel=paths[0], vessel_mask=paths[1])
 
     @cached_property
     def signal(self) -> np.ndarray:
@@ -225,6 +230,14 @@ class Fluoroscope:
             # A chain of unlike links is seen where its thinnest link would be.
             radii = np.asarray(radii.min(axis=-1))
         return thickness >= MASK_SHARE * 2.0 * radii[..., None, None]
+
+
+def _paths(
+    carm: CArm, vertices: ArrayLike, faces: ArrayLike, supersample: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Path length through the lumen, and pixels whose central ray meets it."""
+    central = surface_thickness(carm, vertices, faces, 1)
+    return surface_thickness(carm, vertices, faces, supersample), central > 0.0
 
 
 def rgb(image: ArrayLike) -> np.ndarray:

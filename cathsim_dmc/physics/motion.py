@@ -16,7 +16,7 @@ from typing import Any, Protocol
 import mujoco
 import numpy as np
 
-from cathsim_dmc.anatomy import Anatomy
+from cathsim_dmc.anatomy import Anatomy, Surface
 from cathsim_dmc.anatomy.motion import Motion
 from cathsim_dmc.entities.chain import Chain
 from cathsim_dmc.physics.drawn import Range, drawable, drawn
@@ -113,6 +113,7 @@ class Moving(Effect):
         names = "wall", "sheath/bore"
         self._geoms = [mujoco.mj_name2id(world.model, kind, name) for name in names]
         self._motions: dict[int, Motion] = {}
+        self._surfaces: dict[int, Surface] = {}
         self._inlets = np.zeros((world.num_simulations, 2, 3))
         self._clock = np.zeros(world.num_simulations)
         self._step = world.model.opt.timestep
@@ -120,6 +121,7 @@ class Moving(Effect):
     def enter(self, index: int, anatomy: Anatomy) -> None:
         """Takes the motion of an anatomy."""
         self._motions[index] = anatomy.motion
+        self._surfaces[index] = anatomy.surface
         inlet = anatomy.inlet
         self._inlets[index] = np.array([inlet.position, inlet.direction])
 
@@ -189,6 +191,11 @@ class Moving(Effect):
         """
         time = max(float(self._clock[index]) - self._step, 0.0)
         return self._motions[index].lattice, self.world.parameters[index], time
+
+    def surface(self, index: int) -> Surface:
+        """The lumen's surface of one simulation where it is now."""
+        parameters, time = self.course(index)[1:]
+        return self._motions[index].surface(parameters, time, self._surfaces[index])
 
     def _each(self, function: Callable[..., Any], points: np.ndarray) -> np.ndarray:
         """A method of the motions with parameters, time, and points (N, ..., 3)."""

@@ -177,7 +177,10 @@ class _Film:
             moment = Moment.of_episode(self._episode, self._surface, int(step))
             self._scene.clear()
             self._scene.axis("off")
-            drawing.draw_scene(self._scene, moment, self._projection, self._glass)
+            pane, now = self._glass, moment.surface
+            if now is not self._surface:
+                pane = glass(now.vertices, now.faces, self._projection)
+            drawing.draw_scene(self._scene, moment, self._projection, pane)
             self._label(moment, int(step))
             if image is None:
                 image = drawing.draw_fluoroscopy(

@@ -100,10 +100,14 @@ def force_map() -> LinearSegmentedColormap:
 
 @functools.lru_cache(maxsize=16)
 def background(
-    surface: Any, azimuth: float, height: int
+    surface: Any, azimuth: float, height: int, rest: Any = None
 ) -> tuple[ParallelProjection, Glass]:
-    """A vessel as glass, seen from an azimuth, degrees, in so many rows of pixels."""
-    projection = ParallelProjection.of(surface.vertices, azimuth=azimuth, height=height)
+    """A vessel as glass, seen from an azimuth, degrees, in so many rows of pixels.
+
+    `rest` is the surface on which the view is centred, where that is another.
+    """
+    middle = (rest or surface).vertices
+    projection = ParallelProjection.of(middle, azimuth=azimuth, height=height)
     return projection, glass(surface.vertices, surface.faces, projection)
 
 
@@ -125,7 +129,10 @@ def scene_figure(
     unknown = [view for view in views if view not in VIEWS]
     if unknown or not (views or fluoroscopy):
         raise ValueError(f"views are {views!r}; give some of {', '.join(VIEWS)}")
-    drawn = [background(moment.surface, VIEWS[v][0], pixels) for v in views]
+    moved = moment.surface is not moment.rest
+    draw = background.__wrapped__ if moved else background  # which keeps what it drew
+    given = pixels, moment.rest
+    drawn = [draw(moment.surface, VIEWS[v][0], *given) for v in views]
     ratios = [p.shape[1] / p.shape[0] for p, _ in drawn] + [1.0] * fluoroscopy
     size = _HEIGHT_IN * 0.84 * sum(ratios) + 1.6, _HEIGHT_IN
     if size[0] > _WIDEST_IN:
@@ -270,7 +277,7 @@ def draw_fluoroscopy(
         matplotlib's image, whose data another moment may replace.
     """
     options = options or FLUOROSCOPY
-    fluoroscope = fluoroscope_of(moment.surface, options)
+    fluoroscope = fluoroscope_of(moment.rest, options)
     frame = xray(moment, options, seed)
     black, white = np.percentile(frame, WINDOW)
     image = axes.imshow(

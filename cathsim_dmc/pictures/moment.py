@@ -13,6 +13,7 @@ from cathsim_dmc.recording.coaxial import CoaxialRecord
 from cathsim_dmc.recording.drawing import link_radii
 from cathsim_dmc.recording.episode import Episode
 from cathsim_dmc.recording.geometry import force_scale
+from cathsim_dmc.recording.living import VesselRecord, dented, dents
 from cathsim_dmc.recording.recorder import EpisodeRecorder, navigation_of
 
 # Prepared views of anatomies that are kept: each holds some megabytes.
@@ -24,7 +25,8 @@ class Moment:
     """State of one simulation; lengths in metres, forces in newtons, world frame.
 
     Attributes:
-        surface: Lumen surface with `vertices` (V, 3) and `faces` (F, 3).
+        surface: Lumen surface with `vertices` (V, 3) and `faces` (F, 3), as it is.
+        rest: The same where nothing moves it, which views are centred on.
         device: (L + 1, 3) joints of the device from base to head.
         radius: (L,) radii of its links.
         outermost: (L,) number of the outermost of coaxial devices on each link, 0 for
@@ -40,6 +42,7 @@ class Moment:
     """
 
     surface: Any
+    rest: Any
     device: np.ndarray
     radius: np.ndarray
     goal: np.ndarray
@@ -68,8 +71,12 @@ class Moment:
         contacts, scene = task.contacts(env.physics), task.scene
         episode = EpisodeRecorder(env, task.name).present()
         distance = 1e3 * episode.meta["distance"][0]
+        moment = cls.of_episode(episode, scene.anatomy.surface)
+        depth, touched = dents(task, contacts), contacts.position[contacts.present]
+        surface = dented(moment.surface, touched, depth) if depth.size else None
         return dataclasses.replace(
-            cls.of_episode(episode, scene.anatomy.surface),
+            moment,
+            surface=surface or moment.surface,
             position=contacts.position[contacts.present],
             force=contacts.force[contacts.present],
             force_scale=force_scale(contacts.magnitude[contacts.present]),
@@ -98,10 +105,13 @@ class Moment:
             raise ValueError("the episode was recorded without a goal")
         # Contacts of state t + 1 belong to step t.
         there = episode.contact_step == step - 1
+        record = VesselRecord.of(episode)
+        now = surface if record is None else record.surface(surface, episode, step)
         return cls(
-            surface=surface,
+            surface=now,
+            rest=surface,
             device=episode.catheter[step],
-            goal=np.asarray(goal, dtype=np.float64),
+            goal=np.asarray(goal if record is None else record.goal[step], np.float64),
             goal_radius=float(episode.meta["goal_radius"]),
             position=episode.contact_position[there],
             force=episode.contact_force[there],
@@ -143,5 +153,7 @@ def xray(moment: Moment, options: FluoroscopyOptions, seed: int = 0) -> np.ndarr
         seed: Seed of the quantum noise, if the options ask for noise.
     """
     state = np.random.RandomState(seed) if options.noise else None
-    fluoroscope = fluoroscope_of(moment.surface, options)
+    fluoroscope = fluoroscope_of(moment.rest, options)
+    if moment.surface is not moment.rest:
+        fluoroscope = fluoroscope.around(moment.surface)
     return fluoroscope.render(moment.device, moment.radius, state)[..., 0]

@@ -15,6 +15,7 @@ from cathsim_dmc.imaging import Angiograph, FluoroscopyOptions
 from cathsim_dmc.pictures import video
 from cathsim_dmc.recording.drawing import link_radii
 from cathsim_dmc.recording.episode import Episode
+from cathsim_dmc.recording.living import MESH_EVERY, VesselRecord
 from cathsim_dmc.recording.recorder import EpisodeRecorder, navigation_of
 from cathsim_dmc.recording.scene import body_geoms
 
@@ -159,12 +160,22 @@ def xray_film(
 
     Returns:
         (T + 1, rows, columns, planes) uint8, the frontal plane first. The darkest and
-        the brightest of each plane's grey levels are black and white.
+        the brightest of each plane's grey levels are black and white. A vessel that
+        moves is drawn anew in every fourth state.
     """
-    machine = Angiograph(surface.vertices, surface.faces, options)
+    planes = Angiograph(surface.vertices, surface.faces, options).planes()
+    record, states = VesselRecord.of(episode), episode.steps + 1
+    moved = None if record is None or record.still else record
+    span = MESH_EVERY if moved else states
+    films = [np.empty((states, *p.carm.resolution, 1), np.uint8) for p in planes]
     radii = link_radii(episode)
-    radius = np.broadcast_to(radii, (episode.steps + 1, len(radii)))
-    films = [plane.render(episode.catheter, radius) for plane in machine.planes()]
+    for first in range(0, states, span):
+        line = episode.catheter[first : first + span]
+        radius = np.broadcast_to(radii, (len(line), len(radii)))
+        now = moved and moved.surface(surface, episode, first)
+        for film, plane in zip(films, planes, strict=True):
+            seen = plane.around(now) if now else plane
+            film[first : first + span] = seen.render(line, radius)
     return np.concatenate([_windowed(film) for film in films], axis=-1)
 
 

@@ -122,7 +122,9 @@ class FluoroscopyWindow:
     def show(self, task: Any, message: str = "") -> None:
         """Draws the state of a task."""
         planes = angiograph.images(
-            [self._machine], task.rollout.shadows, [self._random]
+            [task.rollout.around(self._machine)],
+            task.rollout.shadows,
+            [self._random],
         )[0]
         image = np.concatenate(list(np.moveaxis(planes, -1, 0)), axis=1)
         rows, columns = image.shape

@@ -6,8 +6,10 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from scipy.spatial import KDTree
 
 from cathsim_dmc.anatomy.motion import Motion
+from cathsim_dmc.anatomy.parts import Surface
 from cathsim_dmc.recording.episode import Episode
 
 # Figures over the states in ``meta['vessel']``: name, factor and label of a plot.
@@ -20,6 +22,10 @@ SERIES = {
 }
 
 
+MESH_EVERY = 4  # states, of which a recording keeps the moved surface
+DENT = 6e-3  # m around a contact, in which a wall that gives is drawn pressed in
+
+
 @dataclass(frozen=True, eq=False)
 class VesselRecord:
     """A vessel over T+1 states.
@@ -30,6 +36,7 @@ class VesselRecord:
         goal: (T+1, 3), m, world frame.
         motion: How it moves; None where it rests.
         parameters: Of the motion, see `anatomy.motion_loops`.
+        depth: (K,), of the contacts in a wall that gives, m, or (0,).
     """
 
     series: dict[str, np.ndarray]
@@ -37,6 +44,7 @@ class VesselRecord:
     goal: np.ndarray
     motion: Motion | None
     parameters: np.ndarray
+    depth: np.ndarray
 
     @classmethod
     def of(cls, episode: Episode) -> VesselRecord | None:
@@ -54,6 +62,7 @@ class VesselRecord:
             goal = np.array(given["goal"], np.float64)
             lattice = np.array(given["lattice"], dtype=np.float64)
             parameters = np.array(given["parameters"], dtype=np.float64)
+            depth = np.array(given.get("depth", []), dtype=np.float64)
         except (KeyError, TypeError, ValueError) as error:
             raise ValueError(f"meta['vessel'] lacks or spoils {error!r}") from error
         for name, values in (*series.items(), ("goal", goal)):
@@ -62,14 +71,36 @@ class VesselRecord:
                     f"meta['vessel'] has {len(values)} values of {name}; give "
                     f"{episode.steps + 1}, one for each state"
                 )
+        if len(depth) not in (0, len(episode.contact_step)):
+            raise ValueError("meta['vessel'] has not one depth for each contact")
         motion = Motion(lattice) if lattice.size else None
-        return cls(series, velocity, goal, motion, parameters)
+        return cls(series, velocity, goal, motion, parameters, depth)
 
-    def vertices(self, rest: np.ndarray, outwards: np.ndarray, time: float):
-        """Vertices (V, 3) m at a time, s, of those at rest with normals outwards."""
-        assert self.motion is not None
-        places, growth = self.motion.to_space(self.parameters, time, rest)
-        return places + growth[:, None] * outwards
+    @property
+    def still(self) -> bool:
+        """Whether its surface is always that at rest."""
+        return self.motion is None and not self.depth.any()
+
+    def surface(self, rest: Surface, episode: Episode, state: int) -> Surface:
+        """The surface of the lumen in a state, with the dents of the contacts."""
+        if self.motion is not None:
+            time = float(episode.time[state])
+            rest = self.motion.surface(self.parameters, time, rest)
+        there = episode.contact_step == state - 1  # contacts of state t + 1: step t
+        if not self.depth.size or not there.any():
+            return rest
+        return dented(rest, episode.contact_position[there], self.depth[there])
+
+
+def dented(surface: Surface, place: np.ndarray, depth: np.ndarray) -> Surface:
+    """A surface pressed outwards by contacts (K, 3) m of depths (K,) m.
+
+    A vertex goes outwards by the depth of the nearest contact, less towards `DENT`.
+    """
+    distance, nearest = KDTree(place).query(surface.vertices)
+    share = np.clip(1.0 - (distance / DENT) ** 2, 0.0, None) ** 2
+    way = (share * np.maximum(depth[nearest], 0.0))[:, None]
+    return Surface(surface.vertices + way * surface.normals, surface.faces)
 
 
 def vessel_state(task: Any) -> dict[str, Any]:
@@ -90,7 +121,16 @@ def vessel_state(task: Any) -> dict[str, Any]:
     }
 
 
-def vessel_meta(states: list[dict[str, Any]], motion: dict[str, Any]) -> dict[str, Any]:
-    """Entry ``meta['vessel']`` of the states of an episode."""
+def dents(task: Any, contacts: Any) -> np.ndarray:
+    """Depths (K,) m of the contacts; (0,) in a wall that does not give."""
+    gives = task.config.vessel_options.wall is not None
+    return contacts.penetration[contacts.present] if gives else np.zeros(0)
+
+
+def vessel_meta(
+    states: list[dict[str, Any]], motion: dict[str, Any], depth: np.ndarray
+) -> dict[str, Any]:
+    """Entry ``meta['vessel']`` of an episode: its states, and depths of contacts."""
     columns = {name: [state[name] for state in states] for name in states[0]}
-    return {**columns, "lattice": [], "parameters": [], **motion}
+    meta = {**columns, "lattice": [], "parameters": [], **motion}
+    return {**meta, "depth": depth.tolist()}

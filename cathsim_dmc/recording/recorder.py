@@ -15,7 +15,7 @@ from dm_control.rl import control
 
 from cathsim_dmc.recording.coaxial import SERIES, device_meta
 from cathsim_dmc.recording.episode import TERMINATIONS, Episode
-from cathsim_dmc.recording.living import vessel_meta, vessel_state
+from cathsim_dmc.recording.living import dents, vessel_meta, vessel_state
 from cathsim_dmc.simulation.episodes import ComposerSimulation, play
 
 Policy = Callable[[Any], np.ndarray]
@@ -187,6 +187,7 @@ class EpisodeRecorder:
         return forces, {
             "contact_position": contacts.position[contacts.present],
             "contact_force": contacts.force[contacts.present],
+            "contact_depth": dents(task, contacts),
         }
 
     def _action(self, policy: Policy, timestep: Any) -> np.ndarray:
@@ -232,7 +233,8 @@ class EpisodeRecorder:
         meta["goal_position"] = position.tolist()
         meta["goal_radius"] = float(task.objective.goal_radius)
         if "vessel" in rows:
-            meta["vessel"] = vessel_meta(rows["vessel"], rows["vessel_motion"][-1])
+            moves, depth = rows["vessel_motion"][-1], rows.array("contact_depth")
+            meta["vessel"] = vessel_meta(rows["vessel"], moves, depth)
             position = np.array(meta["vessel"]["goal"])
         head = rows.array("catheter")[:, -1]
         meta["distance"] = np.linalg.norm(head - position, axis=-1).tolist()

@@ -13,7 +13,7 @@ from cathsim_dmc.anatomy.parts import Surface
 from cathsim_dmc.recording.drawing import Drawing
 from cathsim_dmc.recording.episode import Episode
 from cathsim_dmc.recording.geometry import xyzw
-from cathsim_dmc.recording.living import SERIES, VesselRecord
+from cathsim_dmc.recording.living import MESH_EVERY, SERIES, VesselRecord
 from cathsim_dmc.recording.rerun_stream import Log
 from cathsim_dmc.recording.scene import BodyGeom
 
@@ -21,7 +21,6 @@ VESSEL_COLOUR = (225, 140, 130, 60)
 GOAL_COLOUR = (60, 190, 90, 110)
 BLOOD_COLOUR = (200, 30, 40)
 BLOOD_SCALE = 0.02  # s; an arrow of 20 mm is 1 m/s
-MESH_EVERY = 4  # states, of which the moved surface is kept
 # Entities that would hide the device inside them, and how opaque they are drawn.
 SEE_THROUGH = {"sheath": 0.3}
 
@@ -34,7 +33,7 @@ def log_static(log: Log, drawing: Drawing) -> None:
     # Patient frame LPS: x to the patient's left, y to the back, z up.
     log.static("world", rr.ViewCoordinates.LBU)
     record = VesselRecord.of(log.episode)
-    moves = record is not None and record.motion is not None
+    moves = record is not None and not record.still
     log.static(
         "world/vessel",
         rr.Mesh3D.from_fields(
@@ -76,17 +75,16 @@ def log_vessel(log: Log, drawing: Drawing) -> None:
             "world/goal",
             rr.Transform3D.columns(translation=record.goal - drawing.goal[0]),
         )
-    if record.motion is None:
+    if record.still:
         return
-    rest = drawing.vertices
-    outwards = Surface(rest, drawing.faces).normals
+    rest = Surface(drawing.vertices, drawing.faces)
     rows = np.arange(0, log.episode.steps + 1, MESH_EVERY)
     moved = [
-        record.vertices(rest, outwards, time).astype(np.float32)
-        for time in log.episode.time[rows]
+        record.surface(rest, log.episode, state).vertices.astype(np.float32)
+        for state in rows.tolist()
     ]
     columns = rr.Mesh3D.columns(vertex_positions=np.concatenate(moved))
-    columns = columns.partition(np.full(len(rows), len(rest)))
+    columns = columns.partition(np.full(len(rows), len(rest.vertices)))
     log.columns("world/vessel", columns, rows)
 
 

@@ -191,7 +191,8 @@ class CathSimEnv(gymnasium.Env):
 
 def fluoroscopy_frame(task, machine: angiograph.Angiograph) -> np.ndarray:
     """The device of a task before a machine, (rows, columns, 3) uint8, no noise."""
-    image = angiograph.images([machine.planes()], task.rollout.shadows)[0]
+    rollout = task.rollout
+    image = angiograph.images([rollout.around(machine.planes())], rollout.shadows)[0]
     row = np.concatenate(list(np.moveaxis(image, -1, 0)), axis=1)
     return np.repeat(row[..., None], 3, axis=-1)
 

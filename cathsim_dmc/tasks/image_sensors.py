@@ -78,6 +78,7 @@ class ImageSensors:
         random_states: Sequence[np.random.RandomState] | None,
         fresh: np.ndarray | None = None,
         device_points: np.ndarray | None = None,
+        around: Callable[[angiographs.Planes, int], angiographs.Planes] | None = None,
     ) -> Images:
         """Captures the next images.
 
@@ -89,6 +90,7 @@ class ImageSensors:
             fresh: indices of simulations that begin an episode: only their images are
                 captured, and fill their history. None for a control step of all.
             device_points: (N, K, P, 3), tracked points of coaxial devices, m.
+            around: moves the vessel before the machine of a simulation.
         """
         if not self._on or (fresh is not None and not len(fresh)):
             return self._latest() if self._on else NO_IMAGES
@@ -96,6 +98,8 @@ class ImageSensors:
         chosen = np.arange(count) if fresh is None else fresh
         line = lines[chosen]
         planes = [self._planes[index] for index in chosen] if self._planes else []
+        if around and self._wants("image", "sequential", "segmentation"):
+            planes = list(map(around, planes, chosen.tolist()))
         if self._wants("image", "sequential"):
             states = None
             if random_states is not None and self._noise:

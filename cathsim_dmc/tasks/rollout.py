@@ -12,6 +12,7 @@ from typing import cast
 import mujoco
 import numpy as np
 
+from cathsim_dmc.imaging.angiograph import Planes
 from cathsim_dmc.imaging.device import Shadow
 from cathsim_dmc.imaging.fluoroscopy import Fluoroscope
 from cathsim_dmc.physics import forces, readings, vessel
@@ -309,6 +310,7 @@ class Rollout:
                 self._random_states,
                 fresh,
                 None if devices is None else devices.points,
+                None if self._moving is None else self.around,
             )
         if self._routes is not None:
             seen = self._at_rest(state) if self._tracking.on else self.resting
@@ -465,6 +467,13 @@ class Rollout:
     def moving(self) -> Moving | None:
         """What moves the vessels; None where they rest."""
         return self._moving
+
+    def around(self, planes: Planes, index: int = 0) -> Planes:
+        """A machine's planes with one simulation's vessel where it is now."""
+        if self._moving is None:
+            return planes
+        surface = self._moving.surface(index)
+        return tuple(plane.around(surface) for plane in planes)
 
     @property
     def shadows(self) -> Sequence[Shadow]:
