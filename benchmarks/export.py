@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import judgement
+import torch
 import tyro
 from safetensors.torch import save
 
@@ -38,6 +39,7 @@ def export(
     name: Annotated[str, tyro.conf.Positional],
     out: Path = pretrained.DIRECTORY,
     episodes: int = judgement.EPISODES,
+    half: bool = False,
 ) -> Path:
     """Write the policy of a run with its card, after judging it.
 
@@ -47,6 +49,7 @@ def export(
         name: Name of the policy, "type1_bca" for `pretrained:type1_bca`.
         out: Directory to write to; by default that of the package.
         episodes: Number of episodes of the evaluation.
+        half: Whether weights are kept, and judged, in half precision.
 
     Returns:
         Path of the weights.
@@ -73,20 +76,26 @@ def export(
     if suite.TASKS[config.task].random_arch:
         options["arches"] = "test"
     label = f"{pretrained.PREFIX}{name}"
-    found, _ = judgement.judge(policy, config.task, options, episodes, label)
-    figures = judgement.episode_figures(found)
     card = {
         "task": config.task,
         "task_kwargs": options,
         "config": config.to_dict(),
         "shapes": shapes.to_dict(),
         "training": training,
-        "evaluation": {
-            "seed": found.seeds[0],
-            "summary": found.summary(),
-            "episodes": {name: figures[name] for name in _FIGURES},
-        },
+        "evaluation": {},
         "versions": judgement.versions(),
+    }
+    if half:
+        state = {
+            k: v.half() if v.dtype == torch.float32 else v for k, v in state.items()
+        }
+        policy = write(Path(out), name, state, card)
+    found, _ = judgement.judge(policy, config.task, options, episodes, label)
+    figures = judgement.episode_figures(found)
+    card["evaluation"] = {
+        "seed": found.seeds[0],
+        "summary": found.summary(),
+        "episodes": {name: figures[name] for name in _FIGURES},
     }
     weights = write(Path(out), name, state, card)
     write_list(weights.parent)
@@ -101,6 +110,10 @@ def write(directory: Path, name: str, state, card) -> Path:
     sum_ = hashlib.sha256(data).hexdigest()
     values = {"format": pretrained.FORMAT, "name": name, **card, "sha256": sum_}
     text = json.dumps(values, indent=1, allow_nan=False) + "\n"
+    # Lists of numbers on one line.
+    text = re.sub(
+        r"\[[^\[\]{}\"]*\]", lambda found: re.sub(r"\s+", " ", found[0]), text
+    )
     files.write_text(weights.with_suffix(".json"), text)
     return weights
 

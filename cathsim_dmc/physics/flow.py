@@ -154,7 +154,7 @@ class Flow(StillBlood):
             if self._moving is None:
                 self._places.velocities(row, np.zeros(len(row)), *vessels, out[index])
             else:
-                course = self._moving.course(index)
+                course = self._moving.warp(index)
                 self._places.moving_velocities(*course, row, *vessels, out[index])
         if self._moving is not None:
             out[~self._moving.entered(points)] = 0.0

@@ -184,7 +184,7 @@ class Moving(Effect):
         """Places in space (N, ..., 3) of places at rest (N, ..., 3), m."""
         return self._each(lambda *given: Motion.to_space(*given)[0], points)
 
-    def course(self, index: int) -> tuple[np.ndarray, np.ndarray, float]:
+    def warp(self, index: int) -> tuple[np.ndarray, np.ndarray, float]:
         """Lattice and parameters of one simulation's motion, and its time, s.
 
         The time is that of what MuJoCo has derived, one physics step before the end.
@@ -194,13 +194,13 @@ class Moving(Effect):
 
     def surface(self, index: int) -> Surface:
         """The lumen's surface of one simulation where it is now."""
-        parameters, time = self.course(index)[1:]
+        parameters, time = self.warp(index)[1:]
         return self._motions[index].surface(parameters, time, self._surfaces[index])
 
     def _each(self, function: Callable[..., Any], points: np.ndarray) -> np.ndarray:
         """A method of the motions with parameters, time, and points (N, ..., 3)."""
         found = [
-            function(self._motions[index], *self.course(index)[1:], row)
+            function(self._motions[index], *self.warp(index)[1:], row)
             for index, row in enumerate(points)
         ]
         return np.array(found)

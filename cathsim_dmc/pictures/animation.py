@@ -189,6 +189,8 @@ class _Film:
                 self._xray.set_title("")
             else:
                 image.set_data(xray(moment, FLUOROSCOPY, int(step)))
+                ring = self._xray.patches[0]
+                ring.center = drawing.goal_ring(moment, FLUOROSCOPY)[0]
             now = float(self._episode.time[step] - self._episode.time[0])
             self._now.set_xdata([now, now])
             self._figure.agg.draw()

@@ -277,20 +277,26 @@ def draw_fluoroscopy(
         matplotlib's image, whose data another moment may replace.
     """
     options = options or FLUOROSCOPY
-    fluoroscope = fluoroscope_of(moment.rest, options)
     frame = xray(moment, options, seed)
     black, white = np.percentile(frame, WINDOW)
     image = axes.imshow(
         frame, cmap="gray", vmin=black, vmax=white, interpolation="bilinear"
     )
-    (column, row), depth = fluoroscope.carm.project(moment.goal)
-    radius = moment.goal_radius * fluoroscope.carm.focal_length / float(depth)
-    axes.add_patch(Circle((column, row), radius, fill=False, ec=GOAL_LIGHT, lw=1.4))
+    axes.add_patch(
+        Circle(*goal_ring(moment, options), fill=False, ec=GOAL_LIGHT, lw=1.4)
+    )
     axes.set_title("fluoroscopy", fontsize=10)
     axes.set_xticks([])
     axes.set_yticks([])
     axes.spines[:].set_visible(True)
     return image
+
+
+def goal_ring(moment: Moment, options: FluoroscopyOptions) -> tuple[np.ndarray, float]:
+    """Middle (column, row) and radius of the goal in the X-ray image, pixels."""
+    carm = fluoroscope_of(moment.rest, options).carm
+    middle, depth = carm.project(moment.goal)
+    return middle, moment.goal_radius * carm.focal_length / float(depth)
 
 
 def _caption(moment: Moment) -> str:

@@ -39,11 +39,13 @@ class Clip:
     seed: int
     steps: int | None = None
     own_task: bool = False  # the policy's own, which the command need not name
+    vessel: str = "rigid"
 
     @property
     def command(self) -> str:
         parts = ["cathsim record", self.policy]
         parts += [] if self.own_task else [f"--task {self.task}"]
+        parts += [f"--vessel {self.vessel}"] if self.vessel != "rigid" else []
         parts += [f"--seed {self.seed}"] if self.seed != EVALUATION else []
         parts += [f"--max-steps {self.steps}"] if self.steps else []
         return " ".join([*parts, f"--gif {self.name}.webp"])
@@ -62,6 +64,14 @@ CLIPS = (
     ),
     Clip("bovine", "Expert, bovine arch", "expert", "femoral_bovine_lcca", 1),
     Clip("jam", "A straight push passes and jams", "push", "type1_lcca", 0, 120),
+    Clip(
+        "living",
+        "Expert, living vessel",
+        "expert",
+        "femoral_type1_lcca",
+        1,
+        vessel="living",
+    ),
 )
 
 
@@ -75,6 +85,7 @@ def main() -> None:
             continue
         policy = load_policy(clip.policy, clip.seed)
         kwargs = {"observation": policy.observation or "tracking"}
+        kwargs["vessel"] = clip.vessel
         env = suite.load("cathsim", clip.task, kwargs)
         episode = cathsim_dmc.record(
             env, policy, seed=clip.seed, max_steps=clip.steps, task_name=clip.task

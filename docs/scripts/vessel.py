@@ -1,21 +1,30 @@
-"""Writes what a living vessel costs, and what it does to policies, into docs/vessel.md.
+"""Measures what a living vessel costs, breaks and does to policies, for docs/vessel.md.
 
-python docs/scripts/vessel.py [--episodes 10]
+    python docs/scripts/vessel.py cost soak policies [--policy NAME ...] [--episodes 10]
+
+Each part leaves its figures in docs/data/vessel.json, a policy in its own rows; without
+a part, page and picture are drawn from there.
 """
 
 import argparse
+import json
 import sys
 import time
 from pathlib import Path
+
+# torchrl goes before dm_control.
+from cathsim_dmc.agents.evaluation import evaluate  # isort: skip
 
 import figures
 import numpy as np
 
 from cathsim_dmc import suite
-from cathsim_dmc.agents.evaluation import evaluate
+from cathsim_dmc.pictures.figure import Picture
 from cathsim_dmc.simulation.batch import BatchSimulation
 
 PAGE = Path(__file__).parents[1] / "vessel.md"
+PICTURE = PAGE.parent / "images" / "vessel_policies.png"
+DATA = figures.DATA / "vessel.json"
 HEART, BREATH = {"phase": (0, 1)}, {"breath_phase": (0, 1)}
 CASES = {
     "rigid": "rigid",
@@ -24,23 +33,28 @@ CASES = {
     "motion": {"motion": HEART | BREATH},
     "living": {"flow": HEART, "wall": True, "motion": BREATH},
 }
-POLICIES = (
-    ("expert", "type1_lcca"),
-    ("expert", "femoral_type1_lcca"),
-    *((f"pretrained:{name}", name) for name in ("type1_bca", "type1_lcca")),
-    *((f"pretrained:{name}", name) for name in ("type2_bca", "type2_lcca")),
-    *(
-        (f"pretrained:femoral_{name}_lcca", f"femoral_{name}_lcca")
-        for name in ("type1", "type2")
-    ),
-)
+BOTH = ("type1_lcca", "femoral_type1_lcca")
+TASKS = {
+    "expert": BOTH,
+    **{f"pretrained:{name}": (name,) for name in ("type1_bca", "type2_bca")},
+    **{f"pretrained:{name}": (name,) for name in ("type1_lcca", "type2_lcca")},
+    "pretrained:femoral_type1_lcca": ("femoral_type1_lcca",),
+    "pretrained:femoral_type2_lcca": ("femoral_type2_lcca",),
+    "pretrained:navigator": BOTH,
+    "pretrained:femoral_type1_lcca_living": BOTH,
+}
+DRAWN = {
+    "flow": {"rate": (50, 100), "peak": (0.3, 1.0), "phase": (0, 1)},
+    "wall": {"modulus": (0.3e6, 0.6e6), "support": (0.5, 1.0)},
+    "motion": {"breathing": (0.5, 1.2), "breath_rate": (10, 25), **BREATH},
+}
+SOAKED = ("type1_lcca", "type2_bca", "femoral_type1_lcca", "femoral_type2_lcca")
 LONGEST = 400  # control steps
 SAFE = 1.0  # N
 
 
-def costs(rounds: int = 5) -> str:
+def costs(rounds: int = 5) -> dict:
     """Times of a control step over the rigid vessel's, measured in alternation."""
-    rows = ["| | random | push |", "|---|---|---|"]
     batches = {
         case: BatchSimulation(
             suite.make_task("type1_lcca", vessel=vessel, observation="tracking"),
@@ -61,39 +75,156 @@ def costs(rounds: int = 5) -> str:
                 for action in np.repeat(held, 10, axis=0):
                     batch.step(action[None])
                 seconds[case, kind].append(time.process_time() - start)
-    for case in CASES:
-        ratios = [
-            np.median(np.divide(seconds["rigid", kind], seconds[case, kind]))
+    return {
+        case: {
+            kind: float(
+                np.median(np.divide(seconds["rigid", kind], seconds[case, kind]))
+            )
             for kind in ("random", "push")
-        ]
-        rows.append(f"| {case} | {ratios[0]:.2f} | {ratios[1]:.2f} |")
-    return "\n".join(rows)
+        }
+        for case in CASES
+    }
 
 
-def judged(episodes: int) -> str:
-    """Success, safe success, largest force and steps of each policy in each vessel."""
+def soak(episodes: int = 52, steps: int = 150, together: int = 13) -> dict:
+    """Random and pushing actions in living vessels with drawn options."""
+    found = {"episodes": 0, "steps": steps, "warnings": 0, "errors": 0, "force": 0.0}
+    for number in range(episodes // together):
+        task = SOAKED[number % len(SOAKED)]
+        batch = BatchSimulation(
+            suite.make_task(task, vessel=DRAWN, observation="tracking"),
+            together,
+            num_threads=1,
+            seeds=100 * number,
+        )
+        batch.reset()
+        random = np.random.RandomState(number)
+        ended = np.zeros(together, dtype=bool)
+        for step in range(steps):
+            if step % 10 == 0:
+                action = random.uniform(-1, 1, (together, batch.num_actions))
+                action[::2, :-1], action[::2, -1] = 0.0, 1.0  # every other pushes
+            now = batch.step(action)
+            failed = np.array([error is not None for error in now.errors]) & ~ended
+            found["errors"] += int(failed.sum())
+            force = now.wall_force.peak_max[~ended].max(initial=0.0)
+            found["force"] = max(found["force"], float(force))
+            ended |= now.terminated
+        found["warnings"] += int(batch.batch.warning_number.sum())
+        found["episodes"] += together
+    return found
+
+
+def judged(policy: str, task: str, case: str, episodes: int) -> dict:
+    """Success, safe success, largest force and steps of a policy in a vessel."""
+    options = {"vessel": CASES[case], "max_steps": LONGEST}
+    result = evaluate(policy, task, episodes, task_kwargs=options)
+    return {
+        "policy": policy,
+        "task": task,
+        "case": case,
+        "episodes": episodes,
+        "successes": result.successes,
+        "safe": round((result.safe_success(SAFE) or 0.0) * episodes),
+        "force": result.mean_sd("forces.peak_sum.maximum")[0],
+        "steps": result.mean_sd("length")[0],
+        "commit": figures.origin("")["commit"],
+    }
+
+
+def table(data: dict) -> str:
+    """All policies in all vessels."""
+    known = {(row["policy"], row["task"], row["case"]): row for row in data["policies"]}
     rows = ["| policy | task | " + " | ".join(CASES) + " |"]
     rows.append("|---" * (2 + len(CASES)) + "|")
-    for policy, task in POLICIES:
-        cells = []
-        for case, vessel in CASES.items():
-            options = {"vessel": vessel, "max_steps": LONGEST}
-            result = evaluate(policy, task, episodes, task_kwargs=options)
-            force = result.mean_sd("forces.peak_sum.maximum")[0]
-            steps = result.mean_sd("length")[0]
-            safe = round((result.safe_success(SAFE) or 0.0) * episodes)
-            cells.append(f"{result.successes} ({safe}), {force:.2f} N, {steps:.0f}")
-            print(policy, task, case, cells[-1], file=sys.stderr, flush=True)
-        rows.append(f"| `{policy}` | `{task}` | " + " | ".join(cells) + " |")
+    for policy, tasks in TASKS.items():
+        for task in tasks:
+            found = [known.get((policy, task, case)) for case in CASES]
+            if any(found):
+                cells = " | ".join(map(_cell, found))
+                rows.append(f"| `{policy}` | `{task}` | {cells} |")
     return "\n".join(rows)
+
+
+def _cell(row: dict | None) -> str:
+    if row is None:
+        return "–"
+    return (
+        f"{row['successes']} of {row['episodes']} ({row['safe']}), "
+        f"{row['force']:.2f} N, {row['steps']:.0f}"
+    )
+
+
+def draw(data: dict) -> None:
+    """Success of each policy in each vessel, as a picture."""
+    rows = {(row["policy"], row["task"]): {} for row in data["policies"]}
+    for row in data["policies"]:
+        share = 100 * row["successes"] / row["episodes"]
+        rows[row["policy"], row["task"]][row["case"]] = share
+    figure = Picture(figsize=(8, 0.36 * len(rows) + 0.9), layout="constrained")
+    axes = figure.subplots()
+    values = [[row.get(case, np.nan) for case in CASES] for row in rows.values()]
+    axes.imshow(values, cmap="RdYlGn", vmin=0, vmax=100, aspect="auto", alpha=0.7)
+    for place in np.ndindex(len(rows), len(CASES)):
+        share = values[place[0]][place[1]]
+        if np.isfinite(share):
+            axes.text(*place[::-1], f"{share:.0f} %", ha="center", va="center")
+    names = [f"{p.removeprefix('pretrained:')} on {task}" for p, task in rows]
+    axes.set_xticks(range(len(CASES)), list(CASES))
+    axes.set_yticks(range(len(rows)), names)
+    axes.grid(False)
+    figure.savefig(PICTURE, dpi=110)
 
 
 def main():
-    """Measures and writes both tables."""
+    """Measures the parts that are named, then writes page and picture."""
     parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("parts", nargs="*", help="cost, soak, policies")
     parser.add_argument("--episodes", type=int, default=10)
-    episodes = parser.parse_args().episodes
-    figures.put(PAGE, cost=costs(), policies=judged(episodes))
+    parser.add_argument("--policy", action="append", choices=TASKS)
+    parser.add_argument("--case", action="append", choices=CASES)
+    given = parser.parse_args()
+    if "cost" in given.parts:
+        _keep(cost=costs())
+    if "soak" in given.parts:
+        _keep(soak=soak())
+    if "policies" in given.parts:
+        for policy in given.policy or TASKS:
+            for task in TASKS[policy]:
+                for case in given.case or CASES:
+                    row = judged(policy, task, case, given.episodes)
+                    print(policy, task, case, _cell(row), file=sys.stderr, flush=True)
+                    _keep(row)
+    data = json.loads(DATA.read_text())
+    draw(data)
+    blocks: dict[str, str | list[str]] = {"policies": table(data)}
+    if "cost" in data:
+        lines = ["| | random | push |", "|---|---|---|"]
+        for case, row in data["cost"].items():
+            cells = f"{row['random']:.2f} | {row['push']:.2f}"
+            lines.append(f"| {case} | {cells} |")
+        blocks["cost"] = lines
+    if "soak" in data:
+        blocks["soak"] = (
+            "{episodes} episodes of {steps} steps: {warnings} warnings of MuJoCo, "
+            "{errors} physics errors (escapes among them), largest force {force:.2f} N."
+        ).format(**data["soak"])
+    figures.put(PAGE, **blocks)
+
+
+def _keep(row: dict | None = None, **parts: dict) -> None:
+    """Puts a row in the place of that of the same policy, task and vessel, or parts."""
+    data: dict = json.loads(DATA.read_text())
+    for name, part in parts.items():
+        data[name] = {**part}
+    if row is not None:
+        same = [
+            one
+            for one in data["policies"]
+            if any(one[key] != row[key] for key in ("policy", "task", "case"))
+        ]
+        data["policies"] = [*same, row]
+    DATA.write_text(json.dumps(data, indent=1) + "\n")
 
 
 if __name__ == "__main__":
