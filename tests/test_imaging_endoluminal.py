@@ -5,7 +5,7 @@ import pytest
 
 from cathsim_dmc.anatomy import phantoms
 from cathsim_dmc.imaging import endoluminal
-from cathsim_dmc.validation import motion, vessel
+from cathsim_dmc.validation import motion, rig
 
 SIZE = 32
 RADIUS = 8e-3
@@ -29,7 +29,7 @@ def seen(anatomy, head, frame, warp=endoluminal.AT_REST):
 @pytest.mark.parametrize("tilt", [0.0, 0.6])
 def test_a_straight_tube_is_seen_as_the_closed_form_says(tilt):
     """Distance r / sin(angle to the axis), cosine of the incidence sin(angle)."""
-    tube = vessel.straight_tube(RADIUS)
+    tube = rig.tube(0.2, RADIUS)
     line = tube.tree.root.centreline.points
     axis = (line[-1] - line[0]) / np.linalg.norm(line[-1] - line[0])
     across = np.cross(axis, [0.3, 0.5, 0.8])

@@ -36,10 +36,8 @@ def parameters(heart: float, breathing: float, soft: float) -> np.ndarray:
     return np.array([MARK, *course, 0.0, -1.0])
 
 
-def walled(
-    lumen, lattice: np.ndarray | None = None, friction: float = 0.0
-) -> mujoco.MjSpec:
-    """A model of a wall alone, geom 0, which a lattice moves."""
+def stirred(lumen, lattice: np.ndarray, friction: float = 0.0) -> mujoco.MjSpec:
+    """A model of a moving wall alone, geom 0."""
     from cathsim_dmc.anatomy.motion_loops import PARAMETERS
     from cathsim_dmc.collision import carrying
 
