@@ -3,7 +3,7 @@
 import importlib
 import warnings
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"
 
 # MuJoCo's window library warns at import on a machine without a screen. Nothing here
 # needs one before a viewer is asked for, which then says so itself.

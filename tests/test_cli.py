@@ -11,13 +11,13 @@ import time
 import pytest
 from conftest import TASKS
 
-from cathsim_dmc import cli, suite
+from cathsim_dmc import __version__, cli, suite
 from cathsim_dmc.agents import LEARNERS, Checkpoint, report
 from cathsim_dmc.agents.checkpoint import checkpoints_in
 from cathsim_dmc.agents.policies import FunctionPolicy
 from cathsim_dmc.anatomy.arch import arch
 from cathsim_dmc.anatomy.parts import Surface
-from cathsim_dmc.cli import task_options
+from cathsim_dmc.cli import installation, task_options
 
 
 @pytest.fixture
@@ -122,6 +122,44 @@ def test_an_evaluation_takes_options_of_the_task(cathsim):
         "max_steps": 3, "vessel": "silicone",
     }  # fmt: skip
     assert found["episodes"][0]["length"] == 3
+
+
+def test_the_doctor_names_what_is_missing_and_what_to_do(cathsim, monkeypatch):
+    real = installation.metadata.version
+    versions = {"mujoco": "4.0.0"}
+
+    def version(name):
+        if name == "trimesh":
+            raise installation.metadata.PackageNotFoundError(name)
+        return versions.get(name) or real(name)
+
+    code, out, _ = cathsim("doctor", "--json")
+    found = {check["name"]: check for check in only_json(out)["checks"]}
+    assert code == 0 and all(check["passed"] for check in found.values())
+    assert {"Python", "numpy", "OMP_NUM_THREADS", "compiled kernels", "OpenGL"} < {
+        *found
+    }
+    monkeypatch.setattr(installation.metadata, "version", version)
+    code, out, _ = cathsim("doctor")
+    assert code == 1
+    failed = [line for line in out.splitlines() if line.startswith("FAIL")]
+    assert len(failed) == 2 and "pip install 'mujoco<4,>=3.17'" in failed[0]
+    assert "trimesh: not installed" in failed[1]
+
+
+def test_an_evaluation_reports_each_episode(cathsim, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "200")
+    code, out, err = cathsim(
+        *("eval", "push", "--task", "simple1_bca", "--episodes", 2, "--threads", 1),
+        *("--max-steps", 5, "--no-baseline", "--report", "--protocol", "varied"),
+    )
+    assert code == 0, err
+    title, *rows = out[out.index("task simple1_bca, protocol varied") :].splitlines()
+    assert __version__ in title and "max_steps=5" in out
+    episodes = [row for row in rows if "out of time" in row]
+    assert len(episodes) == 2
+    for row, device in zip(episodes, ("steerable_5f", "steerable_4f"), strict=True):
+        assert device in row and " 0.2 " in row, row  # s, five control steps
 
 
 def test_an_evaluation_keeps_the_options_that_a_policy_was_trained_with(monkeypatch):

@@ -10,8 +10,9 @@ from typing import Any
 import numpy as np
 from torchrl.envs import EnvBase
 
-from cathsim_dmc import bounds, files, suite
+from cathsim_dmc import __version__, bounds, files, suite
 from cathsim_dmc.agents import evaluation, policies, protocols
+from cathsim_dmc.agents.episodes import EpisodeOutcome
 from cathsim_dmc.agents.progress import EvaluationProgress
 from cathsim_dmc.analysis import heatmap
 from cathsim_dmc.analysis.force_statistics import FIGURES, millinewtons
@@ -20,6 +21,7 @@ from cathsim_dmc.pictures.animation import SUFFIXES, check_film
 from cathsim_dmc.policies import in_environment
 from cathsim_dmc.recording import recorder
 from cathsim_dmc.recording.episode import Episode
+from cathsim_dmc.tasks.config import CONTROL_TIMESTEP
 from cathsim_dmc.tasks.snapshot import Snapshot
 
 
@@ -71,6 +73,46 @@ class EvaluationReport:
                 f"reward over {self.comparison.baseline}: "
                 f"{self.comparison.reward_difference:+.1f} ({interval})"
             )
+
+    def print_episodes(self) -> None:
+        """Prints what was played and how each episode ended: task, model, outcome."""
+        from rich.console import Console
+        from rich.table import Table
+
+        settings = self.policy.settings
+        chosen = ", ".join(f"{k}={v}" for k, v in settings["task_kwargs"].items())
+        title = (
+            f"task {self.policy.task}, protocol {settings['protocol']}; model: "
+            f"cathsim_dmc {__version__}, {chosen or 'options of the task'}"
+        )
+        table = Table(*_OUTCOME, title=title)
+        drawn = self.policy.conditions or ({},) * len(self.policy.episodes)
+        played = zip(self.policy.seeds, drawn, self.policy.episodes, strict=True)
+        for seed, conditions, episode in played:
+            table.add_row(str(seed), *_outcome(conditions, episode))
+        Console().print(table)
+
+
+_OUTCOME = (
+    "seed", "arch", "device", "end", "time, s", "path ratio", "mean force, mN",
+    "peak force, mN", "largest sum, N",
+)  # fmt: skip
+
+
+def _outcome(conditions: Mapping[str, Any], episode: EpisodeOutcome) -> list[str]:
+    def shown(value: float | None, digits: int) -> str:
+        return "–" if value is None else f"{value:.{digits}f}"
+
+    end = "goal reached" if episode.success else "out of time"
+    return [
+        *(str(conditions.get(name, "–")) for name in ("arch", "device")),
+        "physics error" if episode.physics_error else end,
+        shown(episode.length * CONTROL_TIMESTEP, 1),
+        shown(episode.path_ratio, 2),
+        millinewtons(episode.forces.mean_force),
+        millinewtons(episode.forces.peak_force),
+        shown(episode.forces.peak_sum and episode.forces.peak_sum.maximum, 2),
+    ]
 
 
 _ROWS = (

@@ -62,6 +62,7 @@ def evaluate(
     anatomy: OwnAnatomy = NO_ANATOMY,
     threads: Threads = None,
     start: Path | None = None,
+    report: bool = False,
     json: Json = False,
     *,
     options: NoOptions,
@@ -82,11 +83,13 @@ def evaluate(
         anatomy: Where the task takes place.
         start: File of a snapshot (`snapshot().save`): one episode for each of its
             simulations, from there on.
+        report: Whether to print each episode too: seed, anatomy, device, end, time,
+            path and forces (docs/start.md).
         options: Options of the task, over those that the policy was trained with.
     """
-    from cathsim_dmc.agents import report
+    from cathsim_dmc.agents import report as reports
 
-    result = report.evaluate(
+    result = reports.evaluate(
         policy,
         task=task,
         episodes=episodes,
@@ -103,6 +106,8 @@ def evaluate(
         print_json({"checks": [], **result.to_dict()})
     else:
         result.print()
+        if report:
+            result.print_episodes()
     return 0
 
 
