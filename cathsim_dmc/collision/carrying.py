@@ -9,13 +9,6 @@ import numpy as np
 
 from cathsim_dmc.anatomy.motion_loops import VALUES, WARP, wall_velocity, warp
 from cathsim_dmc.collision import native
-from cathsim_dmc.collision.loops import (
-    MOTION_ENTRY,
-    SYMBOL,
-    entry_of,
-    key_of,
-    motion_of,
-)
 from cathsim_dmc.collision.native import (
     address_of,
     call_callback,
@@ -23,9 +16,16 @@ from cathsim_dmc.collision.native import (
     wholes,
     word,
 )
+from cathsim_dmc.collision.table import (
+    COUNT,
+    MOTION_ENTRY,
+    SYMBOL,
+    entry_of,
+    key_of,
+    motion_of,
+)
 
 _SYMBOL = "cathsim_carrying"
-_COUNT = 1 << 40  # more than any array has; nothing checks it
 # `native.contact_places`; offsets of nv, qvel and time; the function before;
 # offset of the time step.
 _TABLE = np.zeros(15, np.int64)
@@ -47,14 +47,14 @@ def _carry(model, data):
     count = wholes(data + word(table), 1)[0]
     if count == 0:
         return
-    jacobian = numbers(word(data + word(table + 16)), _COUNT)
+    jacobian = numbers(word(data + word(table + 16)), COUNT)
     # In the middle of the step, so that a device that sticks goes the wall's way.
     time = numbers(data + word(table + 96), 1)[0]
     time += 0.5 * numbers(model + word(table + 112), 1)[0]
-    course = numbers(space, _COUNT)
+    course = numbers(space, COUNT)
     wall = int(course[9])
     key = key_of(fields, model, wall)
-    lattice = numbers(word(entry_of(fields, key) + MOTION_ENTRY), _COUNT)
+    lattice = numbers(word(entry_of(fields, key) + MOTION_ENTRY), COUNT)
     scratch = np.empty(WARP + 4 * VALUES)
     there, values = scratch[:WARP], scratch[WARP:].reshape(VALUES, 4)
     for n in range(count):

@@ -73,8 +73,9 @@ class _Table:
 
     def __init__(self):
         from cathsim_dmc.collision import loops, native
+        from cathsim_dmc.collision import table as words
 
-        self._words = loops.TABLE
+        self._words = words.TABLE
         # The arrays whose addresses are in the table, for as long as the process.
         self._kept: dict[int, Any] = {}
         model = ("nuser_geom", "geom_user", "geom_size", "geom_bodyid")
@@ -88,22 +89,22 @@ class _Table:
         velocity = ("qvel", "cdof", "subtree_com")
         self._words[21:24] = native.offsets("mjData", velocity)
         solimp = native.offsets("mjModel", ("geom_solimp",))
-        self._words[loops.GEOM_SOLIMP // 8] = solimp[0]
+        self._words[words.GEOM_SOLIMP // 8] = solimp[0]
         nuserdata = native.offsets("mjModel", ("nuserdata",))
-        self._words[loops.NUSERDATA // 8] = nuserdata[0]
+        self._words[words.NUSERDATA // 8] = nuserdata[0]
         user = native.offsets("mjData", ("userdata", "time"))
-        self._words[loops.USERDATA // 8 : loops.TIME // 8 + 1] = user
+        self._words[words.USERDATA // 8 : words.TIME // 8 + 1] = user
         self._library = _mujoco_library()
         table = (ctypes.c_void_p * (_TYPES * _TYPES)).in_dll(
             self._library, "mjCOLLISIONFUNC"
         )
         error = ctypes.cast(self._library.mju_error, ctypes.c_void_p)
         self._message = ctypes.create_string_buffer(_MESSAGE)
-        places = {_CAPSULE: loops.OF_CAPSULE, _SPHERE: loops.OF_SPHERE}
+        places = {_CAPSULE: words.OF_CAPSULE, _SPHERE: words.OF_SPHERE}
         for kind, place in places.items():
             self._words[place // 8] = table[kind * _TYPES + _BOX] or 0
-        self._words[loops.ERROR // 8] = error.value or 0
-        self._words[loops.MESSAGE // 8] = ctypes.addressof(self._message)
+        self._words[words.ERROR // 8] = error.value or 0
+        self._words[words.MESSAGE // 8] = ctypes.addressof(self._message)
         table[_CAPSULE * _TYPES + _BOX] = loops.of_capsule.address
         table[_SPHERE * _TYPES + _BOX] = loops.of_sphere.address
 
@@ -111,7 +112,7 @@ class _Table:
         self, key: int, kind: int, middle: np.ndarray, arrays: Sequence[np.ndarray]
     ) -> None:
         """Adds an entry, unless there is one."""
-        from cathsim_dmc.collision.loops import CAPACITY, ENTRY, HEAD
+        from cathsim_dmc.collision.table import CAPACITY, ENTRY, HEAD
 
         if key in self._kept:
             return
@@ -131,7 +132,7 @@ class _Table:
 
     def move(self, key: int, lattice: np.ndarray) -> None:
         """Gives the field of an entry a motion, for simulations that have one."""
-        from cathsim_dmc.collision.loops import ENTRY, HEAD, MOTION_ENTRY
+        from cathsim_dmc.collision.table import ENTRY, HEAD, MOTION_ENTRY
 
         rows = self._words[HEAD:].reshape(-1, ENTRY)
         row = rows[np.flatnonzero(rows[:, 0] == key)[0]]
@@ -162,7 +163,7 @@ def register(field: Field | Bore) -> tuple[float, ...]:
     Returns:
         What the `geom_user` of its carrier is to hold.
     """
-    from cathsim_dmc.collision.loops import BORE, LUMEN, MARK, PART
+    from cathsim_dmc.collision.table import BORE, LUMEN, MARK, PART
 
     digest = _digest(field)
     parts = [int.from_bytes(digest[3 * k : 3 * k + 3], "big") % PART for k in range(3)]
@@ -201,7 +202,7 @@ def check(model: mujoco.MjModel) -> None:
         ValueError: if a carrier's field is unknown, or something other than capsules
             and spheres can touch it; names the geoms.
     """
-    from cathsim_dmc.collision.loops import MARK, USER
+    from cathsim_dmc.collision.table import MARK, USER
 
     if model.nuser_geom < USER:
         return
@@ -258,7 +259,7 @@ def solimp() -> tuple[float, ...]:
 
 
 def _key(parts: Sequence[int]) -> int:
-    from cathsim_dmc.collision.loops import PART
+    from cathsim_dmc.collision.table import PART
 
     return (parts[0] * PART + parts[1]) * PART + parts[2]
 
