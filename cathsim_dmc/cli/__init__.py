@@ -3,6 +3,7 @@
 import os
 import sys
 from pathlib import Path
+from typing import Annotated
 
 from tyro import conf
 from tyro.extras import SubcommandApp
@@ -72,6 +73,57 @@ def mjcf(task: Task, /, out: Path, seed: int = 0, anatomy: OwnAnatomy = NO_ANATO
     from cathsim_dmc.simulation.mjcf import write_mjcf
 
     print(write_mjcf(task, out, seed=seed, task_kwargs=anatomy.task_kwargs))
+    return 0
+
+
+@app.command
+def dataset(
+    out: Annotated[Path, conf.Positional],
+    /,
+    anatomies: tuple[int, int, int] = (8, 2, 2),
+    sequences: int = 32,
+    frames: int = 24,
+    views: int = 2,
+    stride: int = 1,
+    size: int = 256,
+    vessel: str = "rigid",
+    pictures: bool = False,
+    seed: int = 0,
+    processes: int | None = None,
+    json: Json = False,
+) -> int:
+    """Write labelled fluoroscopy of random arches: images, masks, keypoints, forces.
+
+    Args:
+        out: Folder of the data set; an interrupted run goes on in it.
+        anatomies: Number of arches in train, val and test.
+        sequences: Number of motions in each anatomy.
+        frames: Number of frames of a sequence.
+        views: Number of C-arms that see each motion.
+        stride: Control steps of 40 ms from frame to frame.
+        size: Pixels along a side of an image.
+        vessel: State of the vessel: rigid, silicone or living.
+        pictures: Whether to write the images as PNG too, for tools of COCO.
+        seed: Seed of all that is drawn.
+        processes: Number of processes; one per core by default.
+    """
+    from cathsim_dmc.recording.image_set import ImageSetOptions, write
+
+    done = write(
+        out,
+        ImageSetOptions(
+            sequences, frames, views, stride, size, vessel, anatomies, pictures, seed
+        ),
+        processes=processes,
+        say=lambda text: print(text, file=sys.stderr, flush=True),
+    )
+    rates = done.new / done.seconds, done.new / done.processor
+    if json:
+        found = {**vars(done), "path": str(out), "frames_per_second": rates[0]}
+        print_json({**found, "frames_per_processor_second": rates[1]})
+        return 0
+    held = ", ".join(f"{count} {name}" for name, count in done.frames.items())
+    print(f"{held} images, {rates[0]:.0f} new ones a second: {out}")
     return 0
 
 

@@ -157,6 +157,14 @@ class CArm:
         terms = relative[..., None, :] * self.axes
         return terms[..., 0] + terms[..., 1] + terms[..., 2]
 
+    @property
+    def matrix(self) -> np.ndarray:
+        """(3, 4) float64: (x, y, z, 1) in m to (column w, row w, w), w the depth, m."""
+        rows, columns = self.resolution
+        inner = np.diag([self.focal_length, self.focal_length, 1.0])
+        inner[:2, 2] = 0.5 * (columns - 1), 0.5 * (rows - 1)
+        return inner @ np.column_stack([self.axes, -self.axes @ self.source])
+
     def project(self, points: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
         """Pixel coordinates of world points.
 

@@ -21,7 +21,8 @@ from cathsim_dmc.imaging.device import Shadow, device_attenuation, device_thickn
 from cathsim_dmc.imaging.thickness import surface_thickness
 
 # A pixel shows the device if the path through it is at least this share of its
-# diameter: half the pixel covered to half the depth.
+# diameter: half the pixel covered to half the depth. Of a device thinner than a pixel,
+# whose path is averaged over the pixel, it is that share of its width in pixels.
 MASK_SHARE = 0.25
 
 # Frames rendered at once.
@@ -229,7 +230,9 @@ class Fluoroscope:
         if radii.ndim == np.ndim(shadow.points) - 1:
             # A chain of unlike links is seen where its thinnest link would be.
             radii = np.asarray(radii.min(axis=-1))
-        return thickness >= MASK_SHARE * 2.0 * radii[..., None, None]
+        arm, diameter = self.carm, 2.0 * radii[..., None, None]
+        width = diameter * arm.focal_length / arm.source_isocentre
+        return thickness >= MASK_SHARE * diameter * np.minimum(width, 1.0)
 
 
 def _paths(

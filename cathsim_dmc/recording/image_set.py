@@ -1,0 +1,290 @@
+"""A data set of labelled fluoroscopy: a folder with a split by anatomy.
+
+    OUT/README.md                      data card
+    OUT/dataset.json                   options, and the anatomies of each split
+    OUT/{train,val,test}/NAME.h5       sequences in one anatomy, see `sequences`
+    OUT/annotations/{…}.json           labels in the format of COCO
+
+An anatomy is there whole or not at all; a run that was interrupted goes on with those
+that are missing. The same options give the same files, byte by byte.
+"""
+
+from __future__ import annotations
+
+import concurrent.futures
+import dataclasses
+import json
+import multiprocessing
+import os
+import time
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from cathsim_dmc import __version__, bounds, files
+from cathsim_dmc.recording import sequences
+from cathsim_dmc.recording.sequences import KEYPOINTS, KITS, SequenceOptions
+
+SPLITS = {"train": "train", "val": "train", "test": "test"}  # and their sets of arches
+_TRIES = 8  # arches that are tried in place of those that no device enters
+_FORMAT = "cathsim-image-set"
+_NO_H5PY = "h5py is not installed; `pip install cathsim-dmc[gym]` adds it"
+
+
+@dataclasses.dataclass(frozen=True)
+class ImageSetOptions(SequenceOptions):
+    """What a data set holds.
+
+    Attributes:
+        anatomies: number of random arches in train, val and test.
+        pictures: whether the images are also written as PNG, for tools of COCO.
+        seed: of all that is drawn.
+    """
+
+    anatomies: tuple[int, int, int] = (8, 2, 2)
+    pictures: bool = False
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        counts = bounds.vector("anatomies", self.anatomies, 3, 0, 50)
+        if any(count % 1 for count in counts) or not sum(counts):
+            bounds.refuse("anatomies", self.anatomies, "whole numbers, not all 0")
+        object.__setattr__(self, "anatomies", tuple(map(int, counts)))
+        bounds.switch("pictures", self.pictures)
+        bounds.seed("seed", self.seed)
+
+
+@dataclasses.dataclass(frozen=True)
+class _Shard:
+    """One anatomy of a data set."""
+
+    folder: Path
+    split: str
+    number: int
+    candidates: tuple[int, ...]
+    options: ImageSetOptions
+
+    @property
+    def path(self) -> Path:
+        return self.folder / self.split / f"{self.split}_{self.number:03d}.h5"
+
+    @property
+    def seed(self) -> list[int]:
+        return [self.options.seed, list(SPLITS).index(self.split), self.number]
+
+
+@dataclasses.dataclass(frozen=True)
+class Written:
+    """What a run has written.
+
+    Attributes:
+        path: of the data set.
+        frames: images of each split, with those of earlier runs.
+        new: images of this run.
+        seconds: wall time of this run.
+        processor: processor time of this run, all processes, s.
+    """
+
+    path: Path
+    frames: dict[str, int]
+    new: int
+    seconds: float
+    processor: float
+
+
+def write(
+    out: str | os.PathLike[str],
+    options: ImageSetOptions | None = None,
+    *,
+    processes: int | None = None,
+    say: Callable[[str], None] = lambda text: None,
+) -> Written:
+    """Writes a data set, or what an interrupted run has left out of it.
+
+    Args:
+        out: folder, which must not exist unless a run with these options has begun it.
+        processes: number of processes, None for one per core; with more than one, a
+            script must guard its main part (`if __name__ == "__main__"`).
+        say: receives a line for each anatomy.
+
+    Raises:
+        ValueError: if an option is wrong, or the folder is that of other options.
+        FileNotFoundError: if the directory around `out` does not exist.
+        ModuleNotFoundError: if h5py is not installed.
+    """
+    try:
+        import h5py  # noqa: F401
+    except ModuleNotFoundError as error:
+        raise ModuleNotFoundError(_NO_H5PY) from error
+    out, options = Path(out), options or ImageSetOptions()
+    count = os.cpu_count() or 1
+    if processes is not None:
+        count = bounds.whole("processes", processes, 1, bounds.MOST_THREADS)
+    _begin(out, options)
+    start, used = time.monotonic(), _processor()
+    shards = _shards(out, options)
+    missing = [shard for shard in shards if not shard.path.exists()]
+    new = 0
+    for rows, line in _over(_write_shard, missing, count):
+        new += rows
+        say(line)
+    frames = _label(out, shards, count)
+    files.write_text(out / "README.md", _card(options, frames))
+    took = time.monotonic() - start
+    return Written(out, frames, new, took, _processor() - used)
+
+
+def _begin(out: Path, options: ImageSetOptions) -> None:
+    """Makes the folders; refuses one with anything else in it."""
+    about = {
+        "format": _FORMAT,
+        "version": __version__,
+        "options": dataclasses.asdict(options),
+    }
+    text = json.dumps(about, indent=2) + "\n"
+    if not out.parent.is_dir():
+        raise FileNotFoundError(f"no directory {out.parent}; create it first")
+    described = out / "dataset.json"
+    if out.exists() and not described.is_file() and any(out.iterdir()):
+        raise ValueError(f"{out} is not empty and no data set; choose another folder")
+    if described.is_file() and described.read_text() != text:
+        raise ValueError(
+            f"{described} says that {out} was begun with other options or another "
+            "version; give those, or another folder"
+        )
+    for name in ("annotations", *SPLITS):
+        (out / name).mkdir(parents=True, exist_ok=True)
+    files.write_text(described, text)
+
+
+def _shards(out: Path, options: ImageSetOptions) -> list[_Shard]:
+    """The anatomies of all splits, none in two of them."""
+    from cathsim_dmc.anatomy.arch import arch
+
+    shards, taken = [], dict.fromkeys(SPLITS.values(), 0)
+    for (split, name), count in zip(SPLITS.items(), options.anatomies, strict=True):
+        order = np.random.RandomState(options.seed)
+        order = order.permutation(len(arch.arch_set(name)))
+        for number in range(count):
+            # A place of its own for each of its candidates, whatever becomes of others.
+            first = taken[name]
+            places = [(first + 100 * k) % len(order) for k in range(_TRIES)]
+            if len(order) < 100 * _TRIES:
+                places = [first]
+            chosen = tuple(order[places].tolist())
+            shards.append(_Shard(out, split, number, chosen, options))
+            taken[name] += 1
+    return shards
+
+
+def _write_shard(shard: _Shard) -> tuple[int, str]:
+    """Writes one anatomy; the number of its frames, and a line about it."""
+    from cathsim_dmc.anatomy.arch import arch
+    from cathsim_dmc.anatomy.builder import ACCESSES
+
+    random, faults = np.random.RandomState(shard.seed), []
+    seeds = arch.arch_set(SPLITS[shard.split])
+    for place in np.resize(shard.candidates, _TRIES).tolist():
+        kit = list(KITS)[random.randint(len(KITS))]
+        access = ACCESSES[random.randint(len(ACCESSES))]
+        anatomy = arch.build_seed(seeds[place], access=access)
+        branches = [goal for goal in anatomy.goals if goal != "descending"]
+        goal = branches[random.randint(len(branches))]
+        drawn = [*shard.seed, random.randint(2**31)]
+        try:
+            states = sequences.simulate(anatomy, goal, kit, shard.options, drawn)
+        except ValueError as error:  # the device does not fit
+            faults.append(str(error))
+            continue
+        rows = sequences.write(
+            shard.path, anatomy, states, shard.options, [*drawn, 1], name=anatomy.name,
+            split=shard.split, access=access, goal=goal, devices=kit,
+        )  # fmt: skip
+        about = f"{anatomy.name}, {access}, {kit}, {rows} frames"
+        return rows, f"{shard.path.name}: {about}"
+    raise RuntimeError(f"{shard.path.name}: no device fits; the last: {faults[-1]}")
+
+
+def _over(work: Callable[[Any], Any], jobs: list[Any], processes: int) -> Iterable[Any]:
+    """Results of the jobs in their order, from several processes."""
+    if processes == 1 or len(jobs) < 2:
+        yield from map(work, jobs)
+        return
+    context = multiprocessing.get_context("spawn")
+    workers = min(processes, len(jobs))
+    with concurrent.futures.ProcessPoolExecutor(workers, context) as pool:
+        yield from pool.map(work, jobs)
+
+
+def _label_shard(shard: _Shard) -> dict[str, list[Any]]:
+    from cathsim_dmc.recording import coco
+
+    return coco.labels(shard.path, shard.number, shard.options.pictures)
+
+
+def _label(out: Path, shards: list[_Shard], processes: int) -> dict[str, int]:
+    """Writes the labels of each split; the number of its images."""
+    from cathsim_dmc.recording import coco
+
+    frames = {}
+    for split in SPLITS:
+        own = [shard for shard in shards if shard.split == split]
+        joined: dict[str, Any] = {
+            "info": {"description": f"cathsim_dmc {__version__}, {split}"},
+            "categories": coco.CATEGORIES, "images": [], "annotations": [],
+        }  # fmt: skip
+        for part in _over(_label_shard, own, processes):
+            for name, rows in part.items():
+                joined[name] += rows
+        files.write_text(out / "annotations" / f"{split}.json", json.dumps(joined))
+        frames[split] = len(joined["images"])
+    return frames
+
+
+def _processor() -> float:
+    """Processor time of this process and those that it has waited for, s."""
+    spent = os.times()
+    return spent.user + spent.system + spent.children_user + spent.children_system
+
+
+def _card(options: ImageSetOptions, frames: dict[str, int]) -> str:
+    """The data card."""
+    counts = zip(frames.items(), options.anatomies, strict=True)
+    rows = [f"| {name} | {some} | {n} |" for (name, n), some in counts]
+
+    def span(pair: tuple[float, float], factor: float = 1.0) -> str:
+        return f"{factor * pair[0]:g} to {factor * pair[1]:g}"
+
+    return f"""# Simulated fluoroscopy of endovascular devices
+
+Written by `cathsim dataset` of cathsim_dmc {__version__}; the options are in
+`dataset.json`. Licence: that of cathsim_dmc, Apache-2.0.
+
+| split | anatomies | images |
+|---|---|---|
+{chr(10).join(rows)}
+
+No anatomy is in two splits. Train and val hold random aortic arches of all types, test
+normal arches of the types I and II of a set that nothing is trained on.
+
+- Images: {options.size} x {options.size}, 8 bits, dark is opaque, quantum noise. Kerma
+  {span(sequences.KERMA, 1e9)} nGy, gain {span(sequences.GAIN)}; every other sequence
+  has contrast, {span(sequences.IODINE)} kg/m³ of iodine. C-arm: primary
+  {span(sequences.PRIMARY)}, secondary {span(sequences.SECONDARY)} degrees, zoom
+  {span(sequences.ZOOM)}.
+- Motion: {options.frames} frames, {40 * options.stride} ms apart, of a device that is
+  pushed and turned at random from anywhere along the way to a branch. Each motion is
+  seen by {options.views} C-arms. Vessel: {options.vessel}. Devices: {", ".join(KITS)}.
+- Keypoints: {", ".join(KEYPOINTS)}. Those outside the image are absent (0), ostia
+  without contrast labelled but not visible (1).
+- Frame: patient, LPS, m. `camera_matrix` takes (x, y, z, 1) to (column w, row w, w);
+  whole numbers are the centres of pixels.
+
+For: detection, segmentation, tracking and reconstruction of devices, before real
+images. Not for: clinical use, or claims of performance without real images. There are
+no bones, no other organs, no scatter and no motion of the table; vessels are smooth
+tubes.
+"""

@@ -1,0 +1,338 @@
+"""Sequences of fluoroscopy in one anatomy, with all that is known of each frame.
+
+A device drawn from `KITS` starts anywhere along the way to a branch and is pushed and
+turned at random. C-arms drawn for each sequence see every state. One HDF5 file holds
+the frames of an anatomy: a row of every array belongs to one frame, and the frames of a
+sequence follow each other.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from cathsim_dmc import bounds, files
+from cathsim_dmc.anatomy import Anatomy
+from cathsim_dmc.imaging import CArm, Fluoroscope, surface_thickness
+from cathsim_dmc.imaging.device import Shadow
+from cathsim_dmc.imaging.materials import MARKER_LENGTH
+from cathsim_dmc.imaging.options import DETECTOR_SIZE
+from cathsim_dmc.physics.stepper import CONTROL_TIMESTEP
+from cathsim_dmc.physics.vessel import PRESETS
+from cathsim_dmc.tasks.anatomies import BRANCHES
+
+# Bits of a mask.
+DEVICE, VESSEL = 1, 2
+# The innermost device, or the only one, and the one around it: its distal end and where
+# its radiopaque marker begins. Then the ostia, where a branch leaves its parent.
+DEVICE_KEYPOINTS = ("tip", "marker", "outer_tip", "outer_marker")
+OSTIA = tuple(f"ostium_{name}" for name in BRANCHES)
+KEYPOINTS = DEVICE_KEYPOINTS + OSTIA
+# Of a keypoint, as in COCO.
+ABSENT, UNSEEN, SEEN = 0, 1, 2
+
+# Options of the task, by name: what is pushed and turned.
+KITS: dict[str, dict[str, Any]] = {
+    "steerable_5f": {"device": "steerable_5f", "rotation": True},
+    "steerable_4f": {"device": "steerable_4f", "rotation": True},
+    "glide": {"devices": ["wire_035_glide"]},
+    "glide_in_berenstein": {"devices": ["wire_035_glide", "berenstein_5f"]},
+    "glide_in_vertebral": {"devices": ["wire_035_glide", "vertebral_5f"]},
+    "micro": {"devices": ["wire_014_micro", "microcatheter_021"]},
+}
+# What is drawn for each sequence: angles, degrees, within those used for the arch;
+# electronic zoom; air kerma, Gy; gain; iodine in the lumen, kg/m³, in every other one.
+PRIMARY, SECONDARY = (-45.0, 75.0), (-25.0, 25.0)
+ZOOM, KERMA, GAIN, IODINE = (1.0, 1.8), (8e-9, 60e-9), (0.6, 0.85), (3.0, 20.0)
+_STARTS = (0.0, 0.9)  # shares of the way to the branch
+_RANDOMISED = {"friction": (0.02, 0.15), "stiffness": (0.8, 1.25), "roll": (-3.1, 3.1)}
+# Mean push of a sequence; deviation and memory, a control step, of what is added.
+_PUSH, _JITTER, _MEMORY = (-0.3, 1.0), 0.3, 0.8
+
+
+# Parameters and time (s) of a vessel that moves, as `Motion.to_space` takes them.
+Warp = tuple[np.ndarray, float]
+
+
+@dataclasses.dataclass(frozen=True)
+class SequenceOptions:
+    """What is recorded in each anatomy.
+
+    Attributes:
+        sequences: number of motions.
+        frames: of each sequence.
+        views: C-arms that see each motion, a sequence each.
+        stride: control steps of 40 ms from frame to frame.
+        size: pixels along a side of an image.
+        vessel: "rigid", or another of `physics.vessel.PRESETS`.
+    """
+
+    sequences: int = 32
+    frames: int = 24
+    views: int = 2
+    stride: int = 1
+    size: int = 256
+    vessel: str = "rigid"
+
+    def __post_init__(self) -> None:
+        for name, most in (
+            ("sequences", 1000), ("frames", 1000), ("views", 100), ("stride", 100),
+        ):  # fmt: skip
+            bounds.whole(name, getattr(self, name), 1, most)
+        bounds.whole("size", self.size, 16, bounds.MOST_PIXELS)
+        bounds.choice("vessel", self.vessel, PRESETS)
+
+
+@dataclasses.dataclass(frozen=True)
+class States:
+    """The motions in one anatomy, arrays with leading axes (T frames, N motions).
+
+    Attributes:
+        shadows: devices as X-rays meet them, points (T, N, n, 3).
+        columns: what is written of each state, by name.
+        warps: T times N motions of the vessel (`Motion.to_space`); None at rest.
+        kept: numbers of the motions that are sound.
+    """
+
+    shadows: Sequence[Shadow]
+    columns: dict[str, np.ndarray]
+    warps: list[list[Warp]] | None
+    kept: np.ndarray
+
+
+def simulate(
+    anatomy: Anatomy, goal: str, kit: str, options: SequenceOptions, seed: Sequence[int]
+) -> States:
+    """Pushes and turns devices at random, side by side.
+
+    Raises:
+        ValueError: if the device does not fit into the anatomy.
+    """
+    from cathsim_dmc import suite
+    from cathsim_dmc.simulation.batch import BatchSimulation
+
+    task = suite.make_task(
+        "navigate", anatomy=anatomy, goal=goal, vessel=options.vessel, **KITS[kit],
+        observation="goal", start_along_route=_STARTS, randomisation=_RANDOMISED,
+    )  # fmt: skip
+    random, count = np.random.RandomState(seed), options.sequences
+    seeds = random.randint(2**31, size=count).tolist()
+    simulation = BatchSimulation(task, count, num_threads=1, seeds=seeds)
+    simulation.reset()
+    rollout, chain = simulation.rollout, task.scene.catheter
+    groups = np.array(chain.action_groups)
+    mean = random.uniform(-1.0, 1.0, (count, groups.max() + 1))[:, groups]
+    ways = list(chain.translations)
+    mean[:, ways] = random.uniform(*_PUSH, (count, len(ways)))
+    added, failed = np.zeros_like(mean), np.zeros(count, bool)
+    shadows, turns, warps = [], [], []
+    for _ in range(options.frames):
+        for _ in range(options.stride):
+            drawn = random.normal(0.0, _JITTER, mean.shape)
+            added = _MEMORY * added + np.sqrt(1.0 - _MEMORY**2) * drawn
+            step = simulation.step(np.clip(mean + added, -1.0, 1.0))
+            failed |= step.physics_error
+        shadows.append(rollout.shadows)
+        state, force = step.readings, step.wall_force
+        turns.append({
+            "centreline": state.centreline,
+            "wall_force": np.stack(force, axis=-1),
+            "push_force": np.stack([state.push_force, state.push_torque], axis=-1),
+            "load_cell": state.load_cell,
+        })  # fmt: skip
+        if step.vessel is not None:
+            for name in ("heart_phase", "breath_phase"):
+                turns[-1][name] = getattr(step.vessel, name)
+        if (moving := rollout.moving) is not None:
+            every = (moving.warp(number) for number in range(count))
+            warps.append([(course.copy(), time) for _, course, time in every])
+    columns = {name: np.stack([turn[name] for turn in turns]) for name in turns[0]}
+    joined = [
+        dataclasses.replace(same[0], points=np.stack([each.points for each in same]))
+        for same in zip(*shadows, strict=True)
+    ]
+    return States(joined, columns, warps or None, np.flatnonzero(~failed))
+
+
+def ostia(anatomy: Anatomy) -> np.ndarray:
+    """Places (len(OSTIA), 3) where branches leave their parents, m; NaN for none."""
+    found = np.full((len(BRANCHES), 3), np.nan)
+    for row, name in enumerate(BRANCHES):
+        if name in anatomy.tree.vessels:
+            vessel = anatomy.tree.vessels[name]
+            found[row] = vessel.centreline.at(vessel.ostium).position
+    return found
+
+
+def ends(shadow: Shadow) -> np.ndarray:
+    """Distal end of a device and where its marker begins (..., 2, 3), m."""
+    length = MARKER_LENGTH if shadow.mu is None else shadow.marker_length
+    last = shadow.points[..., -1, :]
+    found = np.empty((*last.shape[:-1], 2, 3))
+    found[..., 0, :], left = last, np.full(last.shape[:-1], length)
+    place = last.copy()
+    for number in range(shadow.points.shape[-2] - 2, -1, -1):
+        back = shadow.points[..., number, :] - shadow.points[..., number + 1, :]
+        size = np.linalg.norm(back, axis=-1)
+        share = np.clip(left / np.maximum(size, 1e-12), 0.0, 1.0)
+        place += share[..., None] * back
+        left = np.maximum(left - size, 0.0)
+        if not left.any():
+            break
+    found[..., 1, :] = place
+    return found
+
+
+class Camera:
+    """C-arm, contrast and dose of one sequence, as drawn."""
+
+    def __init__(
+        self,
+        anatomy: Anatomy,
+        size: int,
+        aim: np.ndarray,
+        random: np.random.RandomState,
+    ):
+        """Draws them.
+
+        Args:
+            aim: (3,) m, towards which the isocentre lies from the middle of the lumen.
+        """
+        self.angles = random.uniform(*PRIMARY), random.uniform(*SECONDARY)
+        middle = np.mean(anatomy.lumen.box, axis=0)
+        share, zoom = random.uniform(), random.uniform(*ZOOM)
+        isocentre = middle + share * (aim - middle)
+        primary, secondary = np.radians(self.angles)
+        self.arm = CArm(
+            primary=primary, secondary=secondary, magnification=zoom,
+            detector_size=DETECTOR_SIZE, resolution=(size, size),
+            isocentre=tuple(isocentre),
+        )  # fmt: skip
+        iodine = random.uniform(*IODINE)
+        self.iodine = iodine if random.uniform() < 0.5 else 0.0
+        self.kerma = float(np.exp(random.uniform(*np.log(KERMA))))
+        self.gain = random.uniform(*GAIN)
+        self._surface = anatomy.surface
+        self._normals = anatomy.surface.normals
+
+    def before(self, anatomy: Anatomy, warp: Warp | None = None) -> Fluoroscope:
+        """The fluoroscope before the vessel, as it has moved at one time."""
+        vertices = self._surface.vertices
+        if warp is not None:
+            there, growth = anatomy.motion.to_space(*warp, vertices)
+            vertices = there + growth[:, None] * self._normals
+        depth = surface_thickness(self.arm, vertices, self._surface.faces, 1)
+        return Fluoroscope(
+            self.arm, depth, depth > 0.0, self.iodine, kerma=self.kerma, gain=self.gain
+        )
+
+
+def frames_of(
+    anatomy: Anatomy, states: States, options: SequenceOptions, seed: Sequence[int]
+) -> Iterator[dict[str, np.ndarray]]:
+    """Sequences (T rows of every array) before C-arms drawn for each."""
+    random = np.random.RandomState(seed)
+    rest, found = ostia(anatomy), 0
+    device = np.concatenate([ends(shadow) for shadow in states.shadows], axis=-2)
+    count = options.frames
+    for motion in states.kept:
+        for _ in range(options.views):
+            aim = device[count // 2, motion, 0]
+            camera = Camera(anatomy, options.size, aim, random)
+            own = [
+                dataclasses.replace(each, points=each.points[:, motion])
+                for each in states.shadows
+            ]
+            places = np.full((count, len(KEYPOINTS), 3), np.nan)
+            places[:, : device.shape[-2]] = device[:, motion]
+            if states.warps is None:
+                places[:, -len(OSTIA) :] = rest
+                view = camera.before(anatomy)
+                image, seen = view.image(own, random), view.masks_of(own).device
+                mask = DEVICE * seen + VESSEL * view.vessel_mask
+            else:
+                image = np.empty((count, options.size, options.size, 1), np.uint8)
+                mask = np.empty(image.shape[:-1], np.uint8)
+                here = np.isfinite(rest[:, 0])
+                for row, warp in enumerate(every[motion] for every in states.warps):
+                    moved, _ = anatomy.motion.to_space(*warp, rest[here])
+                    places[row, len(DEVICE_KEYPOINTS) :][here] = moved
+                    view = camera.before(anatomy, warp)
+                    one = [each.of(np.array([row])) for each in own]
+                    image[row] = view.image(one, random)[0]
+                    mask[row] = DEVICE * view.masks_of(one).device[0]
+                    mask[row] += VESSEL * view.vessel_mask.astype(np.uint8)
+            yield {
+                "image": image[..., 0],
+                "mask": mask.astype(np.uint8),
+                "keypoints": _seen(camera, places),
+                "keypoints_3d": places,
+                "camera_matrix": np.tile(camera.arm.matrix, (count, 1, 1)),
+                "angles": np.tile(camera.angles, (count, 1)),
+                "iodine": np.full(count, camera.iodine),
+                "sequence": np.full(count, found),
+                "motion": np.full(count, motion),
+                "time": CONTROL_TIMESTEP * options.stride * (1.0 + np.arange(count)),
+                **{name: each[:, motion] for name, each in states.columns.items()},
+            }
+            found += 1
+
+
+def _seen(camera: Camera, places: np.ndarray) -> np.ndarray:
+    """Keypoints (T, K, 3): column, row, and `ABSENT`, `UNSEEN` or `SEEN`.
+
+    Those outside the image are absent; ostia without contrast are not seen.
+    """
+    pixels, _ = camera.arm.project(np.nan_to_num(places, nan=1e3))
+    size = camera.arm.resolution[0]
+    inside = ((pixels >= -0.5) & (pixels < size - 0.5)).all(axis=-1)
+    inside &= np.isfinite(places[..., 0])
+    state = np.where(inside, SEEN, ABSENT)
+    if not camera.iodine:
+        state[:, -len(OSTIA) :] = np.where(inside[:, -len(OSTIA) :], UNSEEN, ABSENT)
+    pixels = np.where(inside[..., None], pixels, 0.0)
+    return np.concatenate([pixels, state[..., None]], axis=-1)
+
+
+_TYPES = {"camera_matrix": "f8", "sequence": "i4", "motion": "i4"}
+
+
+def write(
+    path: Path, anatomy: Anatomy, states: States, options: SequenceOptions,
+    seed: Sequence[int], **about: Any,
+) -> int:  # fmt: skip
+    """Writes the file of an anatomy, whole or not at all; returns its frames.
+
+    Args:
+        about: attributes of the file.
+    """
+    import h5py
+
+    rows, count = len(states.kept) * options.views * options.frames, options.frames
+    with files.atomic_path(path, ".h5") as temporary, h5py.File(temporary, "w") as file:
+        file.attrs.update(
+            **about,
+            keypoints=list(KEYPOINTS),
+            mask_bits=json.dumps({"device": DEVICE, "vessel": VESSEL}),
+            units="m, N, N m, s, kg/m3, degrees, pixels; frame LPS",
+        )
+        every = frames_of(anatomy, states, options, seed)
+        for start, clip in zip(range(0, rows, count), every, strict=True):
+            for name, values in clip.items():
+                if name not in file:
+                    kind = _TYPES.get(name, "u1" if values.dtype == np.uint8 else "f4")
+                    chunk, packed = True, None
+                    if kind == "u1":
+                        chunk, packed = (1, *values.shape[1:]), 1
+                    file.create_dataset(
+                        name, (rows, *values.shape[1:]), kind, chunks=chunk,
+                        compression="gzip" if packed and name == "mask" else None,
+                        compression_opts=packed if name == "mask" else None,
+                    )  # fmt: skip
+                file[name][start : start + count] = values
+    return rows

@@ -1,0 +1,206 @@
+"""Labelled fluoroscopy: labels fit the images, splits are disjoint, seeds repeat."""
+
+import dataclasses
+import json
+
+import h5py
+import numpy as np
+import pytest
+
+from cathsim_dmc.anatomy import phantoms
+from cathsim_dmc.imaging import Fluoroscope, surface_thickness
+from cathsim_dmc.recording import coco, image_set, sequences
+from cathsim_dmc.recording.image_set import ImageSetOptions
+
+OPTIONS = ImageSetOptions(
+    sequences=2, frames=2, views=2, stride=4, size=128, anatomies=(1, 0, 0)
+)
+
+
+@pytest.fixture(scope="module")
+def arch():
+    return phantoms.load("simple1")
+
+
+@pytest.fixture(scope="module")
+def states(arch):
+    return sequences.simulate(arch, "bca", "glide_in_berenstein", OPTIONS, [1])
+
+
+@pytest.fixture(scope="module")
+def path(arch, states, tmp_path_factory):
+    path = tmp_path_factory.mktemp("set") / "one.h5"
+    rows = sequences.write(path, arch, states, OPTIONS, [2], name="one")
+    assert rows == 8
+    return path
+
+
+@pytest.fixture(scope="module")
+def rows(path):
+    with h5py.File(path) as file:
+        return {name: file[name][:] for name in file}
+
+
+def projected(matrix, points):
+    """Pixels (n, K, 2) of points (n, K, 3) by matrices (n, 3, 4)."""
+    ones = np.ones((*points.shape[:-1], 1))
+    image = np.concatenate([points, ones], -1) @ np.swapaxes(matrix, 1, 2)
+    return image[..., :2] / image[..., 2:]
+
+
+def flag(mask, bit, pixels):
+    """Whether masks (n, H, W) have a bit within a pixel of places (n, 2)."""
+    found = []
+    for one, (column, row) in zip(mask, np.rint(pixels).astype(int), strict=True):
+        part = one[max(row - 1, 0) : row + 2, max(column - 1, 0) : column + 2]
+        found.append(bool((part & bit).any()))
+    return np.array(found)
+
+
+def test_keypoints_are_where_the_camera_matrix_puts_them_and_on_their_masks(rows):
+    pixels = projected(rows["camera_matrix"], rows["keypoints_3d"])
+    seen = rows["keypoints"][..., 2] > 0
+    error = (pixels - rows["keypoints"][..., :2])[seen]
+    assert np.abs(error).max() < 0.01
+    for number, name in enumerate(sequences.KEYPOINTS):
+        bit = sequences.VESSEL if "ostium" in name else sequences.DEVICE
+        inside = seen[:, number]
+        assert flag(rows["mask"][inside], bit, pixels[inside, number]).all(), name
+    assert seen[:, :4].any(axis=0).all() and seen[:, 4:].any(), "all are tested"
+    # The head of the chain is the tip of the device that leads.
+    heads = rows["centreline"][:, -1]
+    tips = np.linalg.norm(rows["keypoints_3d"][:, [0, 2]] - heads[:, None], axis=-1)
+    assert tips.min(axis=1).max() < 1e-6
+
+
+def test_the_mask_is_where_the_device_changes_the_image(arch, states):
+    random = np.random.RandomState(0)
+    camera = sequences.Camera(arch, 128, states.shadows[0].points[0, 0, -1], random)
+    vessel = surface_thickness(camera.arm, arch.surface.vertices, arch.surface.faces, 1)
+    view = Fluoroscope(camera.arm, vessel, vessel > 0, contrast=0.0)
+    for shadow in states.shadows:
+        own = [dataclasses.replace(shadow, points=shadow.points[:1, 0])]
+        changed = (
+            view.image(own)[0, ..., 0]
+            != view.image([dataclasses.replace(own[0], points=own[0].points + 5.0)])[
+                0, ..., 0
+            ]
+        )
+        mask = view.masks_of(own).device[0]
+        assert mask.sum() > 40 and changed[mask].all()
+        # What is changed beside the mask are its neighbours, which are covered less.
+        wide = np.pad(mask, 1)
+        near = sum(
+            np.roll(wide, (i, j), (0, 1)) for i in (-1, 0, 1) for j in (-1, 0, 1)
+        )
+        assert not (changed & (near[1:-1, 1:-1] == 0)).any()
+
+
+def test_the_same_seed_gives_the_same_bytes(arch, states, path, tmp_path):
+    sequences.write(tmp_path / "again.h5", arch, states, OPTIONS, [2], name="one")
+    assert (tmp_path / "again.h5").read_bytes() == path.read_bytes()
+    again = sequences.simulate(arch, "bca", "glide_in_berenstein", OPTIONS, [1])
+    for name, values in states.columns.items():
+        np.testing.assert_array_equal(values, again.columns[name])
+
+
+def test_a_vessel_that_moves_takes_its_mask_and_its_ostia_along(arch):
+    options = dataclasses.replace(OPTIONS, vessel="living", views=1, frames=3, stride=6)
+    states = sequences.simulate(arch, "bca", "steerable_5f", options, [3])
+    clip = next(sequences.frames_of(arch, states, options, [4]))
+    ostia = clip["keypoints_3d"][:, 4:]
+    there = np.isfinite(ostia[0, :, 0])
+    moved = np.linalg.norm(np.diff(ostia[:, there], axis=0), axis=-1)
+    assert there.sum() == 3 and moved.max() > 0.5e-3
+    pixels = projected(clip["camera_matrix"], ostia[:, there])
+    seen = clip["keypoints"][:, 4:][:, there, 2] > 0
+    for number in range(3):
+        inside = seen[:, number]
+        at = pixels[inside, number]
+        assert flag(clip["mask"][inside], sequences.VESSEL, at).all()
+    assert len(np.unique(clip["heart_phase"])) == 3
+
+
+def decoded(size, text):
+    """Reads COCO's compressed run lengths, by its description."""
+    runs, at = [], 0
+    while at < len(text):
+        value, shift, more = 0, 0, True
+        while more:
+            code = ord(text[at]) - 48
+            value |= (code & 31) << shift
+            more, shift, at = bool(code & 32), shift + 5, at + 1
+        if code & 16:
+            value -= 1 << shift
+        runs.append(value + (runs[-2] if len(runs) > 2 else 0))
+    values = np.repeat(np.arange(len(runs)) % 2, runs)
+    return values.reshape(size[::-1]).T.astype(bool)
+
+
+def test_labels_are_those_of_coco(path, rows, tmp_path):
+    labels = coco.labels(path, 3)
+    by_image = {image["id"]: image for image in labels["images"]}
+    assert len(by_image) == len(rows["image"])
+    for one in labels["annotations"]:
+        image = by_image[one["image_id"]]
+        bit = {1: sequences.DEVICE, 2: sequences.VESSEL}[one["category_id"]]
+        mask = (rows["mask"][image["row"]] & bit) > 0
+        text = one["segmentation"]["counts"]
+        np.testing.assert_array_equal(decoded(mask.shape, text), mask)
+        left, top, width, height = one["bbox"]
+        assert mask[top : top + height, left : left + width].sum() == one["area"]
+        names = coco.CATEGORIES[one["category_id"] - 1]["keypoints"]
+        assert len(one["keypoints"]) == 3 * len(names)
+    pytest.importorskip("pycocotools")
+    from pycocotools.coco import COCO
+
+    file = tmp_path / "labels.json"
+    file.write_text(json.dumps({**labels, "categories": coco.CATEGORIES}))
+    read = COCO(str(file))
+    for one in labels["annotations"]:
+        assert read.annToMask(one).sum() == one["area"]
+
+
+def test_no_anatomy_is_in_two_splits(tmp_path):
+    options = dataclasses.replace(OPTIONS, anatomies=(50, 50, 50), seed=7)
+    shards = image_set._shards(tmp_path, options)
+    sets = [(image_set.SPLITS[s.split], set(s.candidates)) for s in shards]
+    for number, (kind, chosen) in enumerate(sets):
+        for other, those in sets[:number]:
+            assert kind != other or not chosen & those
+    assert len(shards) == 150
+
+
+def test_a_set_is_resumed_and_refused_where_it_must_be(tmp_path, monkeypatch, path):
+    def write_shard(shard):
+        shard.path.write_bytes(path.read_bytes())
+        return 8, shard.path.name
+
+    monkeypatch.setattr(image_set, "_write_shard", write_shard)
+    out = tmp_path / "set"
+    options = dataclasses.replace(OPTIONS, anatomies=(2, 1, 1))
+    done = image_set.write(out, options, processes=1)
+    assert done.frames == {"train": 16, "val": 8, "test": 8} and done.new == 32
+    assert "| train | 2 | 16 |" in (out / "README.md").read_text()
+    (out / "train" / "train_001.h5").unlink()
+    assert image_set.write(out, options, processes=1).new == 8
+    ids = [
+        i["id"]
+        for i in json.loads((out / "annotations/train.json").read_text())["images"]
+    ]
+    assert len(set(ids)) == 16
+    with pytest.raises(ValueError, match="other options"):
+        image_set.write(out, OPTIONS, processes=1)
+    with pytest.raises(ValueError, match="not empty"):
+        image_set.write(path.parent, OPTIONS, processes=1)
+    with pytest.raises(FileNotFoundError, match="create it"):
+        image_set.write(tmp_path / "a" / "b", OPTIONS, processes=1)
+
+
+@pytest.mark.parametrize(
+    ("option", "value"),
+    [("size", 4), ("frames", 0), ("vessel", "alive"), ("anatomies", (0, 0, 0))],
+)
+def test_a_wrong_option_is_named(option, value):
+    with pytest.raises(ValueError, match=option):
+        dataclasses.replace(OPTIONS, **{option: value})
