@@ -260,7 +260,8 @@ def frames_of(
                 mask = np.empty(image.shape[:-1], np.uint8)
                 here = np.isfinite(rest[:, 0])
                 for row, warp in enumerate(every[motion] for every in states.warps):
-                    moved, _ = anatomy.motion.to_space(*warp, rest[here])
+                    course, time = warp
+                    moved, _ = anatomy.motion.to_space(course, time, rest[here])
                     places[row, len(DEVICE_KEYPOINTS) :][here] = moved
                     view = camera.before(anatomy, warp)
                     one = [each.of(np.array([row])) for each in own]

@@ -8,7 +8,7 @@ from operator import attrgetter
 
 import numpy as np
 
-from cathsim_dmc.imaging.options import FARTHEST_WALL, VIEW_ANGLE
+from cathsim_dmc.imaging.options import FARTHEST_WALL
 from cathsim_dmc.physics.sliding import DEVICE_PLACES
 from cathsim_dmc.tasks.common_chain import TRACKED_PLACES
 from cathsim_dmc.tasks.frame import Frame
@@ -339,8 +339,8 @@ def _endoluminal(
     def shape(sizes: Sizes) -> tuple[int, ...]:
         return (*sizes.cameras.resolution, 1)
 
-    meaning += f", over {VIEW_ANGLE:g}° from the head along its axis; right and down: "
-    meaning += "x and y of the tip frame"
+    meaning += ", over a right angle from the head along its axis; right and down: x "
+    meaning += "and y of the tip frame"
     return Entry(key, shape, unit, meaning, 0, high, dtype)
 
 
