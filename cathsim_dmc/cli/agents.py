@@ -27,7 +27,7 @@ from cathsim_dmc.cli.task_options import given, task_kind
 def add_to(app: SubcommandApp) -> None:
     """Adds the commands."""
     app.command(name="eval")(evaluation([]))
-    for command in (record, demos, replay, play):
+    for command in (submit, record, demos, replay, play):
         app.command(command)
 
 
@@ -108,6 +108,30 @@ def evaluate(
         result.print()
         if report:
             result.print_episodes()
+    return 0
+
+
+def submit(
+    policy: PolicyName,
+    /,
+    out: Path,
+    task: str | None = None,
+    episodes: int | None = None,
+    threads: Threads = None,
+) -> int:
+    """Play a policy under the varied protocol and write a file for the leaderboard.
+
+    Args:
+        out: File to write, ending in .json.
+        task: Task of `cathsim list`; by default the one that the policy was trained on.
+        episodes: Number of episodes; fewer than the 100 of the protocol are not listed.
+    """
+    from cathsim_dmc.agents import submission
+
+    given = {"episodes": episodes, "num_threads": threads}
+    done = submission.submit(policy, out, task, **given)
+    rates = done["summary"]["success"], done["summary"]["safe_success"]
+    print(f"{out}: success {rates[0]}, safe success {rates[1]}, {done['sha256']}")
     return 0
 
 

@@ -1,0 +1,94 @@
+"""Submissions to the leaderboard: a policy under the varied protocol, with hashes."""
+
+import hashlib
+import json
+import subprocess
+from pathlib import Path
+from typing import Any
+
+from cathsim_dmc import __version__, files
+from cathsim_dmc.agents import evaluation, pretrained
+from cathsim_dmc.agents.checkpoint import Checkpoint
+from cathsim_dmc.agents.report import require_registered
+from cathsim_dmc.policies import POLICIES
+
+PROTOCOL = "varied"
+
+
+def submit(
+    policy: str,
+    out: str | Path,
+    task: str | None = None,
+    *,
+    episodes: int | None = None,
+    num_threads: int | None = None,
+) -> dict[str, Any]:
+    """Plays a policy under the varied protocol and writes its submission.
+
+    The protocol and its seeds are fixed, so whoever has the policy, the package and
+    the commit gets the same episodes.
+
+    Args:
+        policy: Name of a policy, "pretrained:NAME", or directory of a run.
+        out: File to write, ending in .json.
+        task: Name of the task; None takes the one that the policy was trained on.
+        episodes: Number of episodes, fewer than those of the protocol to try it out.
+        num_threads: Number of threads of the simulation; None takes one per core.
+
+    Returns:
+        The submission; "sha256" is the digest of all other entries.
+
+    Raises:
+        ValueError: `out` is no .json file, or no such task.
+        CheckpointError: there is no such policy, or it is damaged.
+    """
+    out = Path(out)
+    if out.suffix != ".json":
+        raise ValueError(f"the submission is to be written to {out}; give a .json file")
+    if task is not None:
+        require_registered(task)
+    weights = digest_of(policy)
+    out.parent.mkdir(parents=True, exist_ok=True)
+    result = evaluation.evaluate(
+        policy, task, episodes, protocol=PROTOCOL, num_threads=num_threads
+    )
+    submission = {
+        "policy_sha256": weights,
+        "package": __version__,
+        "commit": _commit(),
+        **result.to_dict(),
+    }
+    submission = json.loads(json.dumps(submission, default=str))
+    submission["sha256"] = seal(submission)
+    files.write_text(out, json.dumps(submission, indent=1) + "\n")
+    return submission
+
+
+def seal(submission: dict[str, Any]) -> str:
+    """SHA-256 of all entries of a submission but "sha256"."""
+    rest = {key: value for key, value in submission.items() if key != "sha256"}
+    return hashlib.sha256(json.dumps(rest, sort_keys=True).encode()).hexdigest()
+
+
+def digest_of(policy: str) -> str | None:
+    """SHA-256 of the weights of a policy; None for one without a file."""
+    if policy in POLICIES:
+        return None
+    if policy.startswith(pretrained.PREFIX):
+        policy = str(pretrained.pretrained_path(policy))
+    if policy.endswith(pretrained.SUFFIX):
+        return hashlib.sha256(Path(policy).read_bytes()).hexdigest()
+    sums = json.dumps(dict(Checkpoint.open(policy).sha256), sort_keys=True)
+    return hashlib.sha256(sums.encode()).hexdigest()
+
+
+def _commit() -> str | None:
+    """Commit of the checkout that the package lies in, "+" if files differ."""
+    command = ["git", "describe", "--always", "--dirty=+", "--abbrev=12"]
+    home = Path(__file__).parents[2]
+    if not (home / ".git").exists():
+        return None
+    done = subprocess.run(
+        command, cwd=home, capture_output=True, text=True, check=False
+    )
+    return done.stdout.strip() or None
