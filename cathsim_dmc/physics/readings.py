@@ -1,13 +1,12 @@
 """What a task reads from the simulator, for one simulation or for many at once.
 
-A `ModelIndex` finds the quantities of a compiled model by name once. `ModelIndex.views`
-finds them in any object with MuJoCo's array names: an `mujoco.MjData`, with arrays such
-as qpos (nq,), or a `mujoco.batch.Batch`, with arrays such as qpos (N, nq). `Views.read`
-then takes them, step after step. Every array of the result has the leading axes of the
-source, written `...` below.
+A `ModelIndex` finds the quantities of a compiled model by name once. Its `reader` finds
+them in any object with MuJoCo's array names: an `mujoco.MjData`, with arrays such as
+qpos (nq,), or a `mujoco.batch.Batch`, with arrays such as qpos (N, nq), and takes them
+step after step. Every array has the leading axes of the source, written `...` below.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import mujoco
@@ -60,54 +59,6 @@ class Readings(NamedTuple):
     push_force: np.ndarray
     push_torque: np.ndarray
     load_cell: np.ndarray
-
-
-class Views(NamedTuple):
-    """Views of a simulator's arrays: they change with the simulation.
-
-    Attributes:
-        links: (..., L, 3), proximal ends of the links.
-        tip: (..., 1, 3), the head, in line with the links.
-        rotation: (..., 9), orientation of the last link, row by row.
-        load_cell: (..., 3), force of the support on the phantom.
-        order: (J,), places of the joints among those of the chain in MuJoCo's order.
-
-    The others are those of `Readings`.
-    """
-
-    insertion: np.ndarray
-    joint_positions: np.ndarray
-    joint_velocities: np.ndarray
-    com_inertia: np.ndarray
-    com_velocity: np.ndarray
-    actuator_force: np.ndarray
-    external_force: np.ndarray
-    links: np.ndarray
-    tip: np.ndarray
-    head: np.ndarray
-    rotation: np.ndarray
-    push_force: np.ndarray
-    push_torque: np.ndarray
-    load_cell: np.ndarray
-    order: np.ndarray
-
-    def read(self) -> Readings:
-        """Takes the readings as they stand, as copies."""
-        return Readings(
-            insertion=self.insertion.copy(),
-            joint_positions=self.joint_positions.take(self.order, axis=-1),
-            joint_velocities=self.joint_velocities.take(self.order, axis=-1),
-            com_inertia=self.com_inertia.copy(),
-            com_velocity=self.com_velocity.copy(),
-            actuator_force=self.actuator_force.take(self.order, axis=-1),
-            external_force=self.external_force.copy(),
-            centreline=np.concatenate([self.links, self.tip], axis=-2),
-            head=self.head.copy(),
-            head_frame=self.rotation.reshape(*self.rotation.shape[:-1], 3, 3).copy(),
-            push_force=self.push_force.copy(),
-            push_torque=self.push_torque.copy(),
-            load_cell=-self.load_cell,
-        )
 
 
 class CoaxialReadings(NamedTuple):
@@ -165,7 +116,7 @@ class Bodies(NamedTuple):
 class ModelIndex:
     """Places of a task's quantities in the arrays of a compiled model."""
 
-    # Fields of `mujoco.MjData` that `views` uses, for a batch to bind beforehand.
+    # Fields of `mujoco.MjData` that `reader` uses, for a batch to bind beforehand.
     FIELDS = (
         "qpos",
         "qvel",
@@ -211,39 +162,55 @@ class ModelIndex:
         self.load_cell = _sensor(model, "load_cell")
         self.wall_contacts = wall_contacts(model)
 
-    def views(self, data) -> Views:
+    def reader(self, data) -> Callable[[], Readings]:
         """Finds the readings in a simulator's arrays.
 
         Args:
             data: an `mujoco.MjData` or a `mujoco.batch.Batch` with `FIELDS` bound.
 
         Returns:
-            Views, not copied; they stay valid as long as `data` lives.
+            A function that takes the readings as they stand, as copies, as long as
+            `data` lives.
         """
         qpos, sensors = data.qpos, data.sensordata
+        positions, velocities = qpos[..., self.qpos], data.qvel[..., self.dofs]
+        motors = data.qfrc_actuator[..., self.dofs]
         head = data.site_xpos[..., self.head_site, :]
-        return Views(
-            insertion=qpos[..., self.insertion_qpos],
-            joint_positions=qpos[..., self.qpos],
-            joint_velocities=data.qvel[..., self.dofs],
-            com_inertia=data.cinert[..., self.links, :],
-            com_velocity=data.cvel[..., self.links, :],
-            actuator_force=data.qfrc_actuator[..., self.dofs],
-            external_force=data.cfrc_ext[..., self.links, :],
-            links=data.xpos[..., self.links, :],
-            tip=head[..., None, :],
-            head=head,
-            rotation=data.site_xmat[..., self.head_site, :],
-            # MuJoCo reports the force of the parent on the site's body.
-            push_force=sensors[..., self.push_force.start + 2],
-            push_torque=sensors[..., self.push_torque.start + 2],
-            load_cell=sensors[..., self.load_cell],
-            order=self._order,
+        nodes = (data.xpos[..., self.links, :], head[..., None, :])
+        frame = data.site_xmat[..., self.head_site, :]
+        insertion = qpos[..., self.insertion_qpos]
+        inertia, velocity = (
+            data.cinert[..., self.links, :],
+            data.cvel[..., self.links, :],
         )
+        external = data.cfrc_ext[..., self.links, :]
+        # MuJoCo reports the force of the parent on the site's body.
+        force = sensors[..., self.push_force.start + 2]
+        torque = sensors[..., self.push_torque.start + 2]
+        cell, order = sensors[..., self.load_cell], self._order
+
+        def read() -> Readings:
+            return Readings(
+                insertion=insertion.copy(),
+                joint_positions=positions.take(order, axis=-1),
+                joint_velocities=velocities.take(order, axis=-1),
+                com_inertia=inertia.copy(),
+                com_velocity=velocity.copy(),
+                actuator_force=motors.take(order, axis=-1),
+                external_force=external.copy(),
+                centreline=np.concatenate(nodes, axis=-2),
+                head=head.copy(),
+                head_frame=frame.reshape(*frame.shape[:-1], 3, 3).copy(),
+                push_force=force.copy(),
+                push_torque=torque.copy(),
+                load_cell=-cell,
+            )
+
+        return read
 
     def read(self, data) -> Readings:
-        """Takes the readings once, as copies; see `views`."""
-        return self.views(data).read()
+        """Takes the readings once, as copies; see `reader`."""
+        return self.reader(data)()
 
     def contacts(self, sensordata: np.ndarray) -> forces.Contacts:
         """Contacts with the wall from sensor rows (..., nsensordata)."""

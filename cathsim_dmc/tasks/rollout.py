@@ -85,7 +85,7 @@ class Rollout:
         self._names = observations.resolve(config.observation, scene.coaxial, living)
         catheter = scene.catheter.mjcf_model.model
         self._index = model_index(scene, model)
-        self._views = self._index.views(state)
+        self._read = self._index.reader(state)
         num_actions = len(scene.catheter.action_names)
         listed = config.effects_on(scene.catheter)
         self._listed, stepper.deepest = listed, config.vessel_options.deepest
@@ -237,7 +237,7 @@ class Rollout:
 
     def _measure(self, magnitudes: np.ndarray, rows: np.ndarray | None = None) -> None:
         """Measures all simulations, or some, when the others have not moved."""
-        now = self._views.read()
+        now = self._read()
         time, last = CONTROL_TIMESTEP * self._steps, self._stepper.contact_rows[:, -1]
         vessel_now = vessel.read(self._listed, time, now, last)
         force, devices = forces.wall_force(magnitudes), self._devices.read(now)
