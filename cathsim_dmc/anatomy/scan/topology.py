@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+
 import numpy as np
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
@@ -28,8 +30,9 @@ def merged(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndar
 
 def areas(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     """Area (F,) of each triangle, m^2."""
-    a, b, c = (vertices[faces[:, k]] for k in range(3))
-    return 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1)
+    import trimesh
+
+    return trimesh.triangles.area(vertices[faces])
 
 
 def widths(vertices: np.ndarray, faces: np.ndarray, label: np.ndarray) -> np.ndarray:
@@ -63,12 +66,9 @@ def parts(faces: np.ndarray) -> np.ndarray:
 
 def adjacent(faces: np.ndarray) -> np.ndarray:
     """Pairs (n, 2) of triangles that share an edge."""
-    edges = np.sort(faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
-    owner = np.repeat(np.arange(len(faces)), 3)
-    order = np.lexsort((edges[:, 1], edges[:, 0]))
-    edges, owner = edges[order], owner[order]
-    same = (edges[1:] == edges[:-1]).all(axis=1)
-    return np.stack([owner[:-1][same], owner[1:][same]], axis=1)
+    import trimesh
+
+    return trimesh.graph.face_adjacency(faces)
 
 
 def groups(count: int, pairs: np.ndarray) -> np.ndarray:
@@ -118,34 +118,19 @@ def border_loops(faces: np.ndarray) -> list[np.ndarray]:
     Where two holes meet in a vertex, they become one loop each as far as that can
     be told.
     """
+    import networkx
+
     pairs = faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
-    there = {(int(a), int(b)) for a, b in pairs}
-    following: dict[int, list[int]] = {}
-    for a, b in sorted(there):
-        if (b, a) not in there:
-            following.setdefault(a, []).append(b)
+    graph = networkx.DiGraph(map(tuple, pairs.tolist()))
+    graph.remove_edges_from([(a, b) for a, b in graph.edges if graph.has_edge(b, a)])
+    graph.remove_nodes_from(list(networkx.isolates(graph)))
     loops = []
-    while following:
-        start = next(iter(following))
-        way, seen = [start], {start: 0}
+    with contextlib.suppress(networkx.NetworkXNoCycle):
         while True:
-            after = following[way[-1]]
-            step = after.pop()
-            if not after:
-                del following[way[-1]]
-            if step in seen:
-                loops.append(np.array(way[seen[step] :]))
-                rest = way[: seen[step] + 1]
-                if len(rest) == 1 and step not in following:
-                    break
-                way, seen = rest, {v: k for k, v in enumerate(rest)}
-                if way[-1] not in following:
-                    break
-                continue
-            if step not in following:
-                break
-            seen[step] = len(way)
-            way.append(step)
+            loop = networkx.find_cycle(graph)
+            graph.remove_edges_from(loop)
+            graph.remove_nodes_from([a for a, _ in loop if not graph.degree(a)])
+            loops.append(np.array([a for a, _ in loop]))
     return [loop for loop in loops if len(loop) >= 3]
 
 
