@@ -3,12 +3,13 @@
 import contextlib
 import dataclasses
 import gc
+import sys
 
 import hypothesis
 import numpy as np
 import pytest
 
-from cathsim_dmc import suite
+from cathsim_dmc import cli, suite
 from cathsim_dmc.tasks import observations
 from cathsim_dmc.tasks.navigation import Navigation
 
@@ -60,6 +61,20 @@ def pytest_collection_finish():
     gc.collect()
     gc.freeze()
     gc.set_threshold(5_000, 10, 10)
+
+
+@pytest.fixture
+def cathsim(monkeypatch, capsys):
+    """Returns a function that runs `cathsim ARGUMENTS`: (code, stdout, stderr)."""
+
+    def run(*arguments):
+        monkeypatch.setattr(sys, "argv", ["cathsim", *map(str, arguments)])
+        with pytest.raises(SystemExit) as end:
+            cli.main()
+        captured = capsys.readouterr()
+        return end.value.code or 0, captured.out, captured.err
+
+    return run
 
 
 @pytest.fixture(autouse=True, scope="session")

@@ -2,7 +2,6 @@
 
 import dataclasses
 import json
-import sys
 from itertools import pairwise
 
 import mujoco
@@ -10,7 +9,6 @@ import numpy as np
 import pytest
 from scipy.spatial import ConvexHull
 
-from cathsim_dmc import cli
 from cathsim_dmc.anatomy import export, phantoms
 from cathsim_dmc.anatomy.centreline import Centreline, Vessel, VesselTree
 from cathsim_dmc.anatomy.convex_wall import wall_pieces
@@ -46,17 +44,12 @@ def test_a_missing_piece_and_a_plug_are_found(tube, pieces):
     )
 
 
-def test_the_command_writes_a_model_that_other_engines_read(
-    tube, tmp_path, monkeypatch, capsys
-):
+def test_the_command_writes_a_model_that_other_engines_read(tube, tmp_path, cathsim):
     tube.save(tmp_path / "tube")
     path = tmp_path / "tube.xml"
-    command = ["cathsim", "phantom", "export", tmp_path / "tube", "--out", path]
-    monkeypatch.setattr(sys, "argv", [*map(str, command)])
-    with pytest.raises(SystemExit) as end:
-        cli.main()
-    assert not end.value.code
-    told = json.loads(capsys.readouterr().out)
+    code, told, _ = cathsim("phantom", "export", tmp_path / "tube", "--out", path)
+    assert not code
+    told = json.loads(told)
     model = mujoco.MjModel.from_xml_path(str(path))
     assert model.ngeom == told["pieces"] and told["open_places"] == 0
     np.testing.assert_allclose(model.site("end").pos, tube.goals["end"].position)

@@ -2,13 +2,11 @@
 
 import json
 import math
-import sys
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from cathsim_dmc import cli
 from cathsim_dmc.anatomy import measures, phantoms
 from cathsim_dmc.anatomy.arch import arch
 from cathsim_dmc.anatomy.arch.tree import arch_tree
@@ -135,24 +133,11 @@ def test_measured_phantoms_are_as_was_measured():
     np.testing.assert_allclose(radii, [4.2, 2.9, 4.7], atol=0.5)
 
 
-@pytest.fixture
-def cathsim(monkeypatch, capsys):
-    def run(*arguments):
-        monkeypatch.setattr(sys, "argv", ["cathsim", "phantom", *map(str, arguments)])
-        with pytest.raises(SystemExit) as end:
-            cli.main()
-        captured = capsys.readouterr()
-        return end.value.code or 0, captured.out, captured.err
-
-    return run
-
-
 @pytest.mark.slow
 def test_check_measures_and_draws(cathsim, tmp_path):
     picture = tmp_path / "views.png"
-    code, out, _ = cathsim(
-        "check", "simple1", "--no-push", "--figure", picture, "--json"
-    )
+    options = ("--no-push", "--figure", picture, "--json")
+    code, out, _ = cathsim("phantom", "check", "simple1", *options)
     assert code == 0
     report = json.loads(out)
     assert report["passed"]
@@ -165,12 +150,13 @@ def test_check_measures_and_draws(cathsim, tmp_path):
 @pytest.mark.slow
 def test_check_of_a_directory_draws_into_it(cathsim, tmp_path):
     phantoms.load("simple2").save(tmp_path / "two")
-    code, out, err = cathsim("check", tmp_path / "two", "--no-push")
+    code, out, err = cathsim("phantom", "check", tmp_path / "two", "--no-push")
     assert code == 0
     assert "arch_type II" in out
     assert (tmp_path / "two/check.png").is_file()
     assert "check.png" in err
-    code, _, err = cathsim("check", tmp_path / "two", "--access", "ascending")
+    wrong = ("check", tmp_path / "two", "--access", "ascending")
+    code, _, err = cathsim("phantom", *wrong)
     assert code == 2
     assert "no named phantom" in err
 

@@ -1,13 +1,10 @@
 """Scans that cannot be used: each refused in its own words, with nothing written."""
 
 import json
-import sys
 
 import numpy as np
 import pytest
 from synthetic_scans import marched, write_obj, y_tree
-
-from cathsim_dmc import cli
 
 
 @pytest.fixture(scope="module")
@@ -95,7 +92,7 @@ SCANS = (
 
 
 def test_bad_scans_are_told_apart_and_leave_nothing(
-    y_mesh, tmp_path, monkeypatch, capsys
+    y_mesh, tmp_path, monkeypatch, cathsim
 ):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     said = {}
@@ -105,12 +102,8 @@ def test_bad_scans_are_told_apart_and_leave_nothing(
         monkeypatch.chdir(folder)
         arguments, words = scan(y_mesh, folder)
         before = sorted(folder.iterdir())
-        command = ["cathsim", "phantom", "import", *arguments, "--out", "OUT"]
-        monkeypatch.setattr(sys, "argv", command)
-        with pytest.raises(SystemExit) as end:
-            cli.main()
-        out, err = capsys.readouterr()
-        assert end.value.code == 2 and not out, scan.__name__
+        code, out, err = cathsim("phantom", "import", *arguments, "--out", "OUT")
+        assert code == 2 and not out, scan.__name__
         assert "Traceback" not in err
         message = " ".join(err.split())
         assert words in message, f"{scan.__name__}: {message}"
@@ -118,4 +111,4 @@ def test_bad_scans_are_told_apart_and_leave_nothing(
         said[scan.__name__] = err.strip().splitlines()[-1]
         assert sorted(folder.iterdir()) == before, "something was written"
     assert len(set(said.values())) == len(SCANS), said
-    assert not list((tmp_path / "cache").glob("**/*.json"))
+    assert not list((tmp_path / "cache" / "cathsim_dmc").glob("**/*"))

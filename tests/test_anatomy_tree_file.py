@@ -2,12 +2,10 @@
 
 import copy
 import json
-import sys
 
 import numpy as np
 import pytest
 
-from cathsim_dmc import cli
 from cathsim_dmc.anatomy import Anatomy
 from cathsim_dmc.anatomy.builder import VesselPlace
 from cathsim_dmc.anatomy.curves import Curve, smooth_tree
@@ -259,28 +257,20 @@ def test_branches_that_meet_are_refused():
         parse_tree(tree).build("low")
 
 
-def run(monkeypatch, capsys, *arguments):
-    monkeypatch.setattr(sys, "argv", ["cathsim", "phantom", *map(str, arguments)])
-    with pytest.raises(SystemExit) as end:
-        cli.main()
-    captured = capsys.readouterr()
-    return end.value.code or 0, captured.out, captured.err
-
-
-def test_command_builds_and_refuses(tmp_path, monkeypatch, capsys):
+def test_command_builds_and_refuses(tmp_path, cathsim):
     path = tmp_path / "tree.json"
     path.write_text(json.dumps(content()))
     out, other = tmp_path / "helix", tmp_path / "other"
-    code, text, _ = run(monkeypatch, capsys, "build", path, "--out", out)
+    code, text, _ = cathsim("phantom", "build", path, "--out", out)
     assert code == 0
     assert "goals side, far, free" in text
     assert Anatomy.load(out).goals.keys() == {"side", "far", "free"}
     wrong = ("build", path, "--out", other, "--access", "x")
-    code, _, error = run(monkeypatch, capsys, *wrong)
+    code, _, error = cathsim("phantom", *wrong)
     assert code == 2
     assert "low, high, cut, side" in error
     path.write_text("{")
-    code, _, error = run(monkeypatch, capsys, "build", path, "--out", other)
+    code, _, error = cathsim("phantom", "build", path, "--out", other)
     assert code == 2
     assert "tree.json" in error
     assert not other.exists()

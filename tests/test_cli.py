@@ -11,27 +11,13 @@ import time
 import pytest
 from conftest import TASKS
 
-from cathsim_dmc import __version__, cli, suite
+from cathsim_dmc import __version__, suite
 from cathsim_dmc.agents import LEARNERS, Checkpoint, report
 from cathsim_dmc.agents.checkpoint import checkpoints_in
 from cathsim_dmc.agents.policies import FunctionPolicy
 from cathsim_dmc.anatomy.arch import arch
 from cathsim_dmc.anatomy.parts import Surface
 from cathsim_dmc.cli import installation, task_options
-
-
-@pytest.fixture
-def cathsim(monkeypatch, capsys):
-    """Returns a function that runs `cathsim ARGUMENTS`: (code, stdout, stderr)."""
-
-    def run(*arguments):
-        monkeypatch.setattr(sys, "argv", ["cathsim", *map(str, arguments)])
-        with pytest.raises(SystemExit) as end:
-            cli.main()
-        captured = capsys.readouterr()
-        return end.value.code or 0, captured.out, captured.err
-
-    return run
 
 
 def only_json(text):
