@@ -18,15 +18,17 @@ import torch
 import tyro
 from torch import nn
 
+CELL = 4  # pixels along a side of a cell of the map
+
 
 @dataclasses.dataclass(frozen=True)
 class Settings:
     """Settings of a run; every one is an option of the command line."""
 
     data: tyro.conf.Positional[Path]  # a folder of `cathsim dataset`
-    epochs: int = 12
+    epochs: int = 8
     batch: int = 32
-    width: int = 16  # channels of the first layer
+    width: int = 12  # channels of the first layer
     learning_rate: float = 2e-3
     seed: int = 0
     out: Path | None = None  # a picture of detections on the test set
@@ -65,7 +67,7 @@ class Detector(nn.Module):
             self.down.append(self.block(before, size))
             before = size
         self.middle = nn.Sequential(*(self.block(before, before) for _ in range(2)))
-        for size in reversed(sizes):
+        for size in reversed(sizes[1:]):
             self.up.append(self.block(before + size, size))
             before = size
         self.last = nn.Conv2d(before, 1, 1)
@@ -79,7 +81,7 @@ class Detector(nn.Module):
         )
 
     def forward(self, images):
-        """Logarithms (n, H / 2, W / 2) of the probability of each cell."""
+        """Logarithms (n, H / CELL, W / CELL) of the probability of each cell."""
         signal = images.float() / 127.5 - 1.0
         signal = signal - signal.mean(dim=(2, 3), keepdim=True)
         signal = 4.0 * nn.functional.avg_pool2d(signal, 2)
@@ -89,7 +91,7 @@ class Detector(nn.Module):
             kept.append(signal)
             signal = nn.functional.max_pool2d(signal, 2)
         signal = self.middle(signal)
-        for block, beside in zip(self.up, reversed(kept), strict=True):
+        for block, beside in zip(self.up, reversed(kept[1:]), strict=True):
             signal = nn.functional.interpolate(signal, scale_factor=2)
             signal = block(torch.cat([signal, beside], dim=1))
         return (
@@ -98,11 +100,11 @@ class Detector(nn.Module):
 
 
 def targets(tips, shape):
-    """Maps (n, h, w) that are a Gaussian of one cell about the tip; they sum to 1."""
+    """Maps (n, h, w) that are a Gaussian about the tip and sum to 1."""
     rows, columns = (torch.arange(size, dtype=torch.float32) for size in shape)
-    x, y = ((tips - 0.5) / 2).T  # the centre of cell 0 is between pixels 0 and 1
+    x, y = ((tips - (CELL - 1) / 2) / CELL).T  # whole numbers are centres of cells
     square = (columns - x[:, None, None]) ** 2 + (rows[:, None] - y[:, None, None]) ** 2
-    return (-0.5 * square).flatten(1).softmax(1).view(len(tips), *shape)
+    return (-square).flatten(1).softmax(1).view(len(tips), *shape)
 
 
 @torch.no_grad()
@@ -122,7 +124,7 @@ def detect(model, images, batch: int):
         weight = logits.exp() * (far <= 2)
         weight /= weight.sum(dim=(1, 2), keepdim=True)
         cell = torch.stack([(weight * each).sum((1, 2)) for each in (columns, rows)], 1)
-        found.append(2 * cell + 0.5)
+        found.append(CELL * cell + (CELL - 1) / 2)
     return torch.cat(found)
 
 

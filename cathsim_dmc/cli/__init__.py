@@ -82,7 +82,7 @@ def dataset(
     /,
     anatomies: tuple[int, int, int] = (8, 2, 2),
     sequences: int = 32,
-    frames: int = 24,
+    frames: int = 32,
     views: int = 2,
     stride: int = 1,
     size: int = 256,

@@ -73,7 +73,7 @@ class SequenceOptions:
     """
 
     sequences: int = 32
-    frames: int = 24
+    frames: int = 32
     views: int = 2
     stride: int = 1
     size: int = 256
@@ -217,16 +217,14 @@ class Camera:
         self.iodine = iodine if random.uniform() < 0.5 else 0.0
         self.kerma = float(np.exp(random.uniform(*np.log(KERMA))))
         self.gain = random.uniform(*GAIN)
-        self._surface = anatomy.surface
-        self._normals = anatomy.surface.normals
 
     def before(self, anatomy: Anatomy, warp: Warp | None = None) -> Fluoroscope:
         """The fluoroscope before the vessel, as it has moved at one time."""
-        vertices = self._surface.vertices
+        surface = anatomy.surface
         if warp is not None:
-            there, growth = anatomy.motion.to_space(*warp, vertices)
-            vertices = there + growth[:, None] * self._normals
-        depth = surface_thickness(self.arm, vertices, self._surface.faces, 1)
+            course, time = warp
+            surface = anatomy.motion.surface(course, time, surface)
+        depth = surface_thickness(self.arm, surface.vertices, surface.faces, 1)
         return Fluoroscope(
             self.arm, depth, depth > 0.0, self.iodine, kerma=self.kerma, gain=self.gain
         )
