@@ -32,9 +32,9 @@ from cathsim_dmc.physics.randomisation import Episode
 from cathsim_dmc.physics.readings import Readings
 
 STIFFENING = 3e-3  # m, indentation from which the wall is as stiff as it gets
-_SOLIMP = (0.7, 0.95, STIFFENING, 0.5, 4)
-_RELAXATION = 8e-3  # s, as that of the rigid wall
-_LAWS = np.array([(*CONTACT_SOLIMP, *CONTACT_SOLREF), (*_SOLIMP, 0.0, 0.0)])
+SOLIMP = (0.7, 0.95, STIFFENING, 0.5, 4)
+RELAXATION = 8e-3  # s, as that of the rigid wall
+_LAWS = np.array([(*CONTACT_SOLIMP, *CONTACT_SOLREF), (*SOLIMP, 0.0, 0.0)])
 # The secant of the rigid wall's law under this load, N, is its stiffness.
 _LOAD = 0.1
 
@@ -66,38 +66,6 @@ class WallOptions:
         drawable(self, _LIMITS)
 
 
-def stiffness(
-    radius: np.ndarray, modulus: float, thickness: float, support: float
-) -> np.ndarray:
-    """Stiffness (n,) of a tube under a point load, N/m.
-
-    Args:
-        radius: (n,), m.
-        modulus: Pa.
-        thickness: m.
-        support: 0 to 1.
-    """
-    from cathsim_dmc.physics import wall_loops  # late, as numba takes long
-
-    each = [wall_loops.stiffness(r, modulus, thickness, support) for r in radius]
-    return np.array(each)
-
-
-def law(
-    stiffness: np.ndarray, weight: np.ndarray
-) -> tuple[np.ndarray, tuple[float, ...]]:
-    """`geom_solref` (n, 2) of springs (n,) N/m on links of inverse weights (n,) 1/kg.
-
-    Returns:
-        And `geom_solimp`, the same for all.
-    """
-    from cathsim_dmc.physics import wall_loops
-
-    ends = *_SOLIMP[:2], _RELAXATION
-    pairs = zip(stiffness, weight, strict=True)
-    return np.array([wall_loops.reference(*pair, *ends) for pair in pairs]), _SOLIMP
-
-
 def rigid_stiffness(weight: np.ndarray) -> np.ndarray:
     """Secant stiffness (n,) N/m of the rigid wall's contact with such links."""
     depth = np.geomspace(1e-7, 2e-4, 400)
@@ -121,7 +89,7 @@ class Wall(Effect):
 
     def bind(self, world: World) -> None:
         """Finds the links in the model."""
-        from cathsim_dmc.physics import wall_loops  # late, as above
+        from cathsim_dmc.physics import wall_loops  # late, as numba takes long
 
         super().bind(world)
         self._contacts = wall_loops.contacts
@@ -160,7 +128,7 @@ class Wall(Effect):
             self._weight,
             self._rigid,
             _LAWS,
-            _RELAXATION,
+            RELAXATION,
             self.world.field(index, "geom_solref"),
             self.world.field(index, "geom_solimp"),
         )

@@ -16,7 +16,7 @@ from cathsim_dmc.entities import devices
 from cathsim_dmc.entities.arena import BLOOD_DENSITY
 from cathsim_dmc.physics.blood import BLOOD_VISCOSITY, StillBlood
 from cathsim_dmc.physics.effects import userdata_size
-from cathsim_dmc.physics.wall import law, stiffness
+from cathsim_dmc.physics.wall import RELAXATION, SOLIMP
 from cathsim_dmc.validation import motion
 from cathsim_dmc.validation.checks import Checks, Report
 from cathsim_dmc.validation.damping import LINK, _uniform, drag, fill
@@ -153,6 +153,8 @@ def indentation(
         modulus: Pa; the wall is 1.5 mm thick.
         loads: (n,), N.
     """
+    from cathsim_dmc.physics.wall_loops import reference, stiffness
+
     size, ball = 1e-3, kind == "sphere"
     spec = bare(tube(0.2, radius).lumen)
     geom = slider(
@@ -165,11 +167,10 @@ def indentation(
         priority=1,
     )
     model, number = spec.compile(), geom.id
-    spring = stiffness(np.array([radius]), modulus, 1.5e-3, 1.0) / (1 if ball else 2)
-    model.geom_solref[number], model.geom_solimp[number] = (
-        value[0] if isinstance(value, np.ndarray) else value
-        for value in law(spring, model.body_invweight0[1, :1])
-    )
+    spring = stiffness(radius, modulus, 1.5e-3, 1.0) / (1 if ball else 2)
+    weight = model.body_invweight0[1, 0]
+    law = reference(spring, weight, *SOLIMP[:2], RELAXATION)
+    model.geom_solref[number], model.geom_solimp[number] = law, SOLIMP
     depths = []
     for load in loads:
         data = mujoco.MjData(model)
@@ -181,6 +182,8 @@ def indentation(
 
 def validate_vessel() -> Report:
     """Checks what `vessel` does to blood and wall."""
+    from cathsim_dmc.physics.wall_loops import stiffness
+
     checks = Checks()
     for speed in CROSS_FLOWS:
         name = f"cantilever of 0.2 m in a cross-flow of {speed:g} m/s"
@@ -199,7 +202,7 @@ def validate_vessel() -> Report:
     for kind, radius, modulus in itertools.product(
         ("sphere", "capsule"), RADII, MODULI
     ):
-        expected = float(stiffness(np.array([radius]), modulus, 1.5e-3, 1.0)[0])
+        expected = stiffness(radius, modulus, 1.5e-3, 1.0)
         # A capsule that lies along the tube touches with both ends.
         expected *= 2 if kind == "capsule" else 1
         loads = expected * np.array([2e-4, 6e-4])
