@@ -110,7 +110,7 @@ def soak(episodes: int = 52, steps: int = 150, together: int = 13) -> dict:
             force = now.wall_force.peak_max[~ended].max(initial=0.0)
             found["force"] = max(found["force"], float(force))
             ended |= now.terminated
-        found["warnings"] += int(batch.batch.warning_number.sum())
+        found["warnings"] += int(np.asarray(batch.batch.warning).sum())
         found["episodes"] += together
     return found
 
