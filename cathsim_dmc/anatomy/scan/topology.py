@@ -68,7 +68,7 @@ def adjacent(faces: np.ndarray) -> np.ndarray:
     """Pairs (n, 2) of triangles that share an edge."""
     import trimesh
 
-    return trimesh.graph.face_adjacency(faces)
+    return np.asarray(trimesh.graph.face_adjacency(faces))
 
 
 def groups(count: int, pairs: np.ndarray) -> np.ndarray:
