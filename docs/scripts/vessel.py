@@ -86,7 +86,7 @@ def costs(rounds: int = 5) -> dict:
     }
 
 
-def soak(episodes: int = 52, steps: int = 150, together: int = 13) -> dict:
+def soak(episodes: int = 52, steps: int = 75, together: int = 13) -> dict:
     """Random and pushing actions in living vessels with drawn options."""
     found = {"episodes": 0, "steps": steps, "warnings": 0, "errors": 0, "force": 0.0}
     for number in range(episodes // together):
