@@ -25,7 +25,7 @@ _KEPT = frozenset(
     {
         *("anatomy", "access", "goal", "device", "rotation", "friction"),
         *("shaft_link", "torsion_joints", "working_length", "physics_timestep"),
-        *("fluoroscopy", "cameras", "vessel"),
+        *("fluoroscopy", "vessel"),
     }
 )
 _EPISODE = ("reward", "length", "success", "physics_error", "path_ratio")

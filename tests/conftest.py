@@ -23,11 +23,11 @@ EACH_TASK = [
     pytest.param(name, marks=() if quick else pytest.mark.slow)
     for name, quick in zip(TASKS, (False, True, True, False), strict=True)
 ]
-# Of one device; those of cameras need OpenGL.
+# Of one device.
 OBSERVATIONS = [
     name
     for name, row in observations.OBSERVATIONS.items()
-    if not (row.coaxial or row.living) and name not in ("rgb", "depth")
+    if not (row.coaxial or row.living)
 ]
 SHORT_EPISODE = 12  # control steps
 
@@ -75,14 +75,6 @@ def cathsim(monkeypatch, capsys):
         return end.value.code or 0, captured.out, captured.err
 
     return run
-
-
-@pytest.fixture(autouse=True, scope="session")
-def dumps_of_physics_errors(tmp_path_factory):
-    """Dumps go where pytest tidies up; a test may say otherwise."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("CATHSIM_DUMP_DIR", str(tmp_path_factory.mktemp("dumps")))
-        yield
 
 
 @pytest.fixture

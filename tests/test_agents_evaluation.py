@@ -5,15 +5,12 @@ import pytest
 import synthetic_env
 import torch
 
-from cathsim_dmc import suite
 from cathsim_dmc.agents import compare, evaluate, policies, protocols
 from cathsim_dmc.agents.episodes import EpisodeOutcome
 from cathsim_dmc.agents.evaluation import EvaluationResult
 from cathsim_dmc.agents.report import EvaluationReport
-from cathsim_dmc.agents.report import evaluate as evaluated
 from cathsim_dmc.analysis.force_statistics import FIGURES, EpisodeForces, Statistics
 from cathsim_dmc.analysis.intervals import paired_bootstrap, success_interval
-from cathsim_dmc.simulation.batch import BatchSimulation
 
 SORTED = sorted(synthetic_env.SIZES)
 # Where "position" begins in the concatenated observation.
@@ -211,20 +208,3 @@ def test_the_table_says_which_force_is_which(capsys, monkeypatch):
     mean, deviation = result.mean_sd("forces.sum.mean")
     assert mean > 0.1
     assert f"│ {1e3 * mean:.0f} ± {1e3 * deviation:.0f}" in text
-
-
-def test_an_evaluation_goes_on_from_a_snapshot(tmp_path):
-    task = suite.make_task("simple1_bca", max_steps=12)
-    simulation = BatchSimulation(task, 2, num_threads=1, seeds=5)
-    simulation.reset()
-    push = np.zeros((2, simulation.num_actions))
-    push[:, 20] = 1.0
-    for _ in range(4):
-        simulation.step(push)
-    path = simulation.snapshot().save(tmp_path / "state.npz")
-    report = evaluated("push", task="simple1_bca", task_kwargs={"max_steps": 12},
-                       num_threads=1, baseline=False, start=path)  # fmt: skip
-    step = [simulation.step(push) for _ in range(8)]
-    assert [one.length for one in report.policy.episodes] == [8, 8]
-    reward = sum(one.outcome.reward for one in step)
-    np.testing.assert_allclose(report.policy.values("reward"), reward, rtol=1e-6)

@@ -17,8 +17,6 @@ from cathsim_dmc.recording import dataset, viewer
 from cathsim_dmc.recording.dataset import read_episodes
 from cathsim_dmc.recording.episode import Episode
 from cathsim_dmc.recording.rerun_log import write_rrd
-from cathsim_dmc.tasks import physics_errors
-from cathsim_dmc.tasks.snapshot import Snapshot
 from cathsim_dmc.validation import rig
 
 ERRORS = (ValueError, OSError, RuntimeError)  # of readers of files
@@ -86,9 +84,6 @@ def store(tmp_path_factory):
     make_episode().save(folder / "episode.npz")
     write_rrd(make_episode(), make_tube(), folder / "episode.rrd")
     write_demonstrations(folder / "demos-v0")
-    start = Snapshot({"goal": "bca"}, {"state": np.ones((1, 9))})
-    dump = physics_errors.dump("tried", start, np.ones((3, 2)), folder)
-    dump.rename(folder / "dump.npz")
     points = [[0, 0, z] for z in range(0, 50, 5)]
     write_markup(folder / "lcca.mrk.json", points, radii=[4.0] * 10)
     (folder / "lcca.csv").write_text("0,0,0\n0,0,1\n0,0,2\n")
@@ -100,7 +95,6 @@ def store(tmp_path_factory):
 LOADERS = {
     "anatomy/anatomy.npz": (lambda path: Anatomy.load(path.parent), ()),
     "episode.npz": (Episode.load, ()),
-    "dump.npz": (physics_errors.load, ("task",)),
     "episode.rrd": (viewer.check_recording, ()),
     "demos-v0/data/metadata.json": (
         lambda path: list(read_episodes(path.parent)),

@@ -18,7 +18,6 @@ from cathsim_dmc.anatomy.scan.importer import import_scan
 from cathsim_dmc.entities import devices
 from cathsim_dmc.imaging.options import FluoroscopyOptions
 from cathsim_dmc.physics.randomisation import Randomisation
-from cathsim_dmc.tasks.cameras import CameraOptions
 from cathsim_dmc.tasks.config import NavigationConfig
 
 ARCH = arch.ARCHES["simple1"]
@@ -36,7 +35,7 @@ TASK = {
     "physics_timestep": number(4e-5, 0.005),
     "outside_range": flag(),
     "fluoroscopy": options() | NONE,
-    "cameras": options() | NONE,
+    "endoluminal_size": pixels(),
     "randomisation": options() | NONE,
     "vessel": options() | NONE,
     "goal_radius": POSITIVE,
@@ -257,7 +256,6 @@ def entries(folder):
         ("task arch_bca", lambda **o: suite.make_task("arch_bca", **o), ARCHES),
         ("NavigationConfig", NavigationConfig, {k: TASK[k] for k in CONFIG}),
         ("FluoroscopyOptions", FluoroscopyOptions, FLUOROSCOPY),
-        ("CameraOptions", CameraOptions, {"names": word(), "size": pixels()}),
         ("Randomisation", Randomisation, RANDOMISATION),
         ("ArchParameters", _replaced(ARCH), ARCH_FIGURES),
         ("BranchParameters", _replaced(ARCH.bca), BRANCH),

@@ -9,7 +9,6 @@ from conftest import OBSERVATIONS
 
 from cathsim_dmc import suite
 from cathsim_dmc.tasks import observations
-from cathsim_dmc.tasks.cameras import CAMERAS, CameraOptions
 from cathsim_dmc.tasks.observation_kind import Sizes
 
 SCRIPT = Path(__file__).parents[1] / "docs" / "scripts" / "observations.py"
@@ -45,15 +44,6 @@ def test_the_table_names_what_the_functions_return(environment, monkeypatch):
         returned = observations.OBSERVATIONS[name].observe(frame)
         listed = observations.entry_specs([name], Sizes())
         assert list(returned) == list(listed)
-
-
-def test_cameras_have_an_entry_each():
-    sizes = Sizes(cameras=CameraOptions(names=CAMERAS))
-    for kind in ("rgb", "depth"):
-        keys = observations.entry_specs([kind], sizes)
-        assert list(keys) == [f"{kind}_{name}" for name in CAMERAS]
-        channels = 3 if kind == "rgb" else 1
-        assert {spec.shape for spec in keys.values()} == {(128, 128, channels)}
 
 
 def test_the_page_is_what_the_specs_say(script):

@@ -114,7 +114,7 @@ def test_randomised_episodes_are_equal():
         "type1",
         observation=[*NUMBERS, *PICTURES],
         fluoroscopy=NOISY_BIPLANE,
-        cameras=SMALL,
+        endoluminal_size=SMALL["size"],
         randomisation=True,
         reward={"path": -1.0, "success": 10.0, "force": -0.1, "smoothness": -0.01},
     )

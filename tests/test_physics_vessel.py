@@ -54,22 +54,6 @@ def test_flow_is_alike_in_both_paths_and_on_any_threads(living):
     assert environment.task.info()["indentation"] >= 0.0
 
 
-def test_an_episode_in_a_flow_goes_on_from_a_snapshot(living):
-    environment = suite.environment(twin(living))
-    environment.reset()
-    environment.step(np.zeros(21))
-    snapshot = environment.snapshot()
-    ends = []
-    for _ in range(2):
-        for _ in range(3):
-            step = environment.step(np.full(21, 0.5))
-        ends.append((environment.physics.data.qpos.copy(), step.observation))
-        environment.restore(snapshot)
-    np.testing.assert_array_equal(ends[0][0], ends[1][0])
-    for key, value in ends[0][1].items():
-        np.testing.assert_array_equal(value, ends[1][1][key])
-
-
 @pytest.mark.parametrize("access", ["ascending", "descending"])
 def test_blood_comes_from_the_heart_delayed_by_the_way(access):
     anatomy = phantoms.load("type1", access=access)

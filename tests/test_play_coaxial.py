@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from cathsim_dmc.play import controls, play, window
-from cathsim_dmc.play.controls import CoaxialControls
+from cathsim_dmc.play.controls import Controls
 from cathsim_dmc.recording import Episode
 from cathsim_dmc.recording.coaxial import CoaxialRecord
 
@@ -32,7 +32,7 @@ MEANING = {
 
 @pytest.mark.parametrize("command", MEANING)
 def test_each_hand_holds_a_device(command):
-    hands = CoaxialControls(2)
+    hands = Controls(devices=2)
     assert not hands.action(STEP).any()
     hands.press(command)
     place, value = MEANING[command]

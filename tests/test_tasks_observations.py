@@ -211,9 +211,7 @@ def test_options_are_json_and_wrong_ones_are_refused():
         ({"fluoroscopy": {"zoom": 2}}, "magnification"),
         ({"fluoroscopy": {"size": 0}}, "size is 0"),
         ({"fluoroscopy": {"view": (0, 90)}}, "secondary"),
-        ({"cameras": {"names": "front"}}, "top, side, tip"),
-        ({"cameras": {"size": (0, 1)}}, "size"),
-        ({"cameras": 3}, "mapping"),
+        ({"fluoroscopy": 3}, "mapping"),
     ):
         with pytest.raises(ValueError, match=message):
             NavigationConfig(**options)

@@ -9,8 +9,6 @@ from cathsim_dmc import policies, suite
 from cathsim_dmc.anatomy.arch import arch
 from cathsim_dmc.policies.expert import Expert
 from cathsim_dmc.tasks import cases, placement
-from cathsim_dmc.tasks.config import NavigationConfig
-from cathsim_dmc.tasks.navigation import Navigation
 from cathsim_dmc.tasks.objective_pool import part
 from cathsim_dmc.tasks.physics_errors import ESCAPE_INTERVAL
 
@@ -265,13 +263,6 @@ def test_all_cases_share_the_entities(plain_pair):
     assert [scene.anatomy.name for scene in scenes] == names()
     for scene in scenes[1:]:
         assert scene.arena is scenes[0].arena and scene.sheath is scenes[0].sheath
-
-
-def test_cameras_of_one_model_are_refused(plain_pair):
-    task = plain_pair.batch.task
-    room, config = (task.scene, task.objective), NavigationConfig(observation="rgb")
-    with pytest.raises(ValueError, match="pool=1"):
-        Navigation(*room, config, others=[room])
 
 
 def test_anatomies_with_other_goals_are_refused():

@@ -24,7 +24,6 @@ from cathsim_dmc.analysis.intervals import paired_bootstrap, success_interval
 from cathsim_dmc.policies import Policy
 from cathsim_dmc.simulation import environments
 from cathsim_dmc.simulation.episodes import play
-from cathsim_dmc.tasks.snapshot import Snapshot
 
 EnvFactory = Callable[..., EnvBase]
 # Called after every step with the environment and which episodes (n,) bool still run.
@@ -236,7 +235,6 @@ def evaluate(
     num_threads: int | None = None,
     out_dir: str | Path | None = None,
     observer: Observer | None = None,
-    start: Snapshot | None = None,
     make_env: EnvFactory = environments.make_env,
 ) -> EvaluationResult:
     """Play episodes with a policy, each with a seed of its own, all side by side.
@@ -260,11 +258,9 @@ def evaluate(
         num_threads: Number of threads of the simulation; None takes one per core.
         out_dir: Directory for evaluation.json; None writes none.
         observer: Function that is called after every step, before any reset.
-        start: State in the middle of as many episodes, which are played on, and
-            counted, from there; None for the starts of the task.
 
     Raises:
-        ValueError: no task is known, episodes < 1, or `start` does not fit.
+        ValueError: no task is known, or episodes < 1.
         CheckpointError: there is no such checkpoint, or it is damaged.
     """
     conditions = protocols.get(protocol)
@@ -286,7 +282,7 @@ def evaluate(
             task_kwargs=part.task_kwargs,
         )
         try:
-            outcomes += _first_episodes(env, player, observer, start)
+            outcomes += _first_episodes(env, player, observer)
         finally:
             env.close()
     result = EvaluationResult(
@@ -295,7 +291,7 @@ def evaluate(
         tuple(seed for part in parts for seed in part.seeds),
         tuple(outcomes),
         {"protocol": protocol, **settings},
-        start is not None or protocols.distinct(task, parts[0].task_kwargs),
+        protocols.distinct(task, parts[0].task_kwargs),
         tuple(drawn for part in parts for drawn in part.conditions),
     )
     if out_dir is not None:
@@ -330,18 +326,13 @@ class _Environments:
 
     seen: TensorDictBase
 
-    def __init__(self, env: EnvBase, start: Snapshot | None):
-        self._env, self._start, self.view = env, start, view_of(env)
+    def __init__(self, env: EnvBase):
+        self._env, self.view = env, view_of(env)
 
     def reset(self, which: np.ndarray | None) -> TensorDictBase:
         """Begin episodes, in all environments or where one has ended."""
-        if which is not None:
-            self.seen = self._env.maybe_reset(self.seen)
-            return self.seen
-        self.seen = self._env.reset()
-        if self._start is not None:
-            restored = self._env.base_env.restore(self._start)
-            self.seen.update(self._env.transform._reset(self.seen, restored))
+        fresh = which is None
+        self.seen = self._env.reset() if fresh else self._env.maybe_reset(self.seen)
         return self.seen
 
     def step(self, action: np.ndarray) -> tuple[TensorDictBase, np.ndarray]:
@@ -354,13 +345,10 @@ class _Environments:
 
 @torch.no_grad()
 def _first_episodes(
-    env: EnvBase,
-    policy: Policy,
-    observer: Observer | None,
-    start: Snapshot | None = None,
+    env: EnvBase, policy: Policy, observer: Observer | None
 ) -> tuple[EpisodeOutcome, ...]:
     (count,) = env.batch_size
-    tracker, environments_ = EpisodeTracker(count), _Environments(env, start)
+    tracker, environments_ = EpisodeTracker(count), _Environments(env)
     outcomes: dict[int, EpisodeOutcome] = {}
 
     def begin(which: np.ndarray) -> None:

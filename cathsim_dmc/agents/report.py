@@ -22,7 +22,6 @@ from cathsim_dmc.policies import in_environment
 from cathsim_dmc.recording import recorder
 from cathsim_dmc.recording.episode import Episode
 from cathsim_dmc.tasks.config import CONTROL_TIMESTEP
-from cathsim_dmc.tasks.snapshot import Snapshot
 
 
 @dataclasses.dataclass(frozen=True)
@@ -205,7 +204,6 @@ def evaluate(
     num_threads: int | None = None,
     baseline: bool = True,
     out_dir: str | Path | None = None,
-    start: str | Path | None = None,
 ) -> EvaluationReport:
     """Evaluates a policy; writes its files into a directory.
 
@@ -217,14 +215,9 @@ def evaluate(
         task_kwargs: Options of the task, over those that the policy was trained with.
         baseline: Whether to play the same seeds with the random policy too.
         out_dir: Directory for evaluation.json and heatmap.png; None writes none.
-        start: File of a `Snapshot`, one episode for each of its simulations, from there
-            on; None plays `episodes` from their starts.
     """
     began = time.monotonic()
-    snapshot = None if start is None else Snapshot.load(start)
-    if snapshot is not None:
-        episodes = len(snapshot)
-    elif episodes is None:
+    if episodes is None:
         episodes = protocols.get(protocol).episodes
     evaluation.check_numbers(episodes, seed, num_threads)
     player = policies.load_policy(policy, seed)
@@ -245,7 +238,6 @@ def evaluate(
         seed=seed,
         protocol=protocol,
         num_threads=num_threads,
-        start=snapshot,
     )
     result = play(player, task, task_kwargs=options, observer=observe)
     other = comparison = None

@@ -72,7 +72,7 @@ def train(
     """Train an agent, or continue a run from its newest checkpoint.
 
     The directory receives config.json, metrics.csv and checkpoints/<frames>/ (SAC:
-    also replay/); errors/ holds dumps of the last physics errors. SIGINT or SIGTERM
+    also replay/). SIGINT or SIGTERM
     end the run after the current batch with a checkpoint. After kill -9, `resume=True`
     continues from the newest complete checkpoint: frames are counted from there, rows
     of metrics.csv beyond it are dropped, episodes that were running start anew. One
@@ -95,15 +95,12 @@ def train(
         FloatingPointError: a loss is not finite; the last checkpoint stays.
         OSError: the disk is full, or the directory cannot be written to.
     """
-    from cathsim_dmc.tasks import physics_errors  # loads MuJoCo
-
     run = Path(out_dir)
     _require_device(config.torch_device)
     with contextlib.ExitStack() as stack:
         stack.enter_context(_only_process(run))
         checkpoint = _prepare(run, config, resume)
         stack.enter_context(_torch_threads(config.torch_threads))
-        stack.enter_context(physics_errors.dumps_in(run / "errors"))
         env = _make_environment(config, checkpoint, make_env)
         torch.manual_seed(config.seed)
         learner = make_learner(config, NetworkShapes.of(env), run)

@@ -61,7 +61,6 @@ def evaluate(
     baseline: bool = True,
     anatomy: OwnAnatomy = NO_ANATOMY,
     threads: Threads = None,
-    start: Path | None = None,
     report: bool = False,
     json: Json = False,
     *,
@@ -81,8 +80,6 @@ def evaluate(
         out: Directory for evaluation.json and heatmap.png.
         baseline: Whether to compare with the random policy on the same seeds.
         anatomy: Where the task takes place.
-        start: File of a snapshot (`snapshot().save`): one episode for each of its
-            simulations, from there on.
         report: Whether to print each episode too: seed, anatomy, device, end, time,
             path and forces (docs/start.md).
         options: Options of the task, over those that the policy was trained with.
@@ -99,7 +96,6 @@ def evaluate(
         num_threads=threads,
         baseline=baseline,
         out_dir=out,
-        start=start,
     )
     if json:
         # No figure of a policy has a bar to keep.

@@ -141,17 +141,6 @@ class Effect:
         del state
         return action
 
-    @property
-    def state(self) -> dict[str, np.ndarray]:
-        """Arrays (N, ...) by name that a snapshot keeps; not copied.
-
-        Parameters need not be among them.
-        """
-        return {}
-
-    def refresh(self, index: int) -> None:
-        """Writes the model of one simulation, whose state has been restored."""
-
 
 def userdata_size(effects: Sequence[Effect], chain: Chain) -> int:
     """Numbers of MuJoCo's `userdata` that some effects take."""
@@ -222,20 +211,3 @@ class Effects:
         for effect in self._effects:
             action = effect.act(action, state)
         return action
-
-    @property
-    def state(self) -> dict[str, np.ndarray]:
-        """Arrays (N, ...) of all effects, not copied."""
-        return {
-            f"{type(effect).__name__}_{number}.{name}": array
-            for number, effect in enumerate(self._effects)
-            for name, array in effect.state.items()
-        }
-
-    def refresh(self, indices: np.ndarray) -> None:
-        """Writes the models of some simulations, whose state has been restored."""
-        for index in indices:
-            # Marks are those of this process.
-            self._user[index, self._labelled] = self._labels[self._labelled]
-            for effect in self._effects:
-                effect.refresh(index)

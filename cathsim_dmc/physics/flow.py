@@ -122,11 +122,6 @@ class Flow(StillBlood):
         self._header[index, 4:] = inflow, rate / 60.0, phase
         self._wave_speed[index] = speed
 
-    @property
-    def state(self) -> dict[str, np.ndarray]:
-        """The pulse wave velocity; the rest are parameters."""
-        return {"wave_speed": self._wave_speed}
-
     def act(self, action: np.ndarray, state: Readings) -> np.ndarray:
         """Finds the blood at the middle of each link."""
         nodes = state.centreline

@@ -145,11 +145,6 @@ class Moving(Effect):
         )
         self._clock[index] = 0.0
 
-    @property
-    def state(self) -> dict[str, np.ndarray]:
-        """Time of each episode; the rest are parameters."""
-        return {"clock": self._clock}
-
     def act(self, action: np.ndarray, state: Readings) -> np.ndarray:
         """Counts the control steps; the last effect of the vessel."""
         from cathsim_dmc.physics.stepper import CONTROL_TIMESTEP

@@ -247,32 +247,20 @@ class RandomisedModel(Effect):
         self._motors = ids(model, chain.tip_motors)
         self._base = world.index.links.start
         self._stiffness = model.jnt_stiffness[self._hinges].copy()
-        self._state = {name: np.zeros(world.num_simulations) for name in self._drawn}
 
     def restart(
         self, index: int, episode: Episode, random_state: np.random.RandomState
     ) -> None:
         """Writes what was drawn into the model of one simulation."""
-        for name, values in self._state.items():
-            values[index] = getattr(episode, name)
-        self.refresh(index)
-
-    @property
-    def state(self) -> dict[str, np.ndarray]:
-        """What was drawn."""
-        return self._state
-
-    def refresh(self, index: int) -> None:
-        """Writes the model of one simulation."""
         field = self.world.field
-        if (friction := self._state.get("friction")) is not None:
-            field(index, "geom_friction")[self._geoms, 0] = friction[index]
-        stiffness = self._state.get("stiffness")
-        loss = self._state.get("loss")
+        drawn = {name: getattr(episode, name) for name in self._drawn}
+        if (friction := drawn.get("friction")) is not None:
+            field(index, "geom_friction")[self._geoms, 0] = friction
+        stiffness, loss = drawn.get("stiffness"), drawn.get("loss")
         if loss is not None or stiffness is not None:
             device, timestep = self.world.chain.device, self.world.chain.timestep
-            factor = 1.0 if stiffness is None else stiffness[index]
-            material = device.relaxation_time * (1.0 if loss is None else loss[index])
+            factor = 1.0 if stiffness is None else stiffness
+            material = device.relaxation_time * (1.0 if loss is None else loss)
             field(index, "dof_damping")[self._dofs] = (
                 hinge_time(material, timestep) * factor * self._stiffness
             )
@@ -281,11 +269,9 @@ class RandomisedModel(Effect):
                 ("jnt_stiffness", self._hinges),
                 ("actuator_gainprm", (self._motors, 0)),
             ):
-                field(index, name)[where] = (
-                    self._nominal[name][where] * stiffness[index]
-                )
-        if (roll := self._state.get("roll")) is not None:
-            half = roll[index] / 2
+                field(index, name)[where] = self._nominal[name][where] * stiffness
+        if (roll := drawn.get("roll")) is not None:
+            half = roll / 2
             turn = np.array([np.cos(half), 0.0, 0.0, np.sin(half)])
             quaternion = np.empty(4)
             mujoco.mju_mulQuat(quaternion, self._nominal["body_quat"][self._base], turn)
@@ -319,8 +305,3 @@ class ActionDelay(Effect):
         self._past[:, 1:] = self._past[:, :-1]
         self._past[:, 0] = action
         return self._past[np.arange(len(self._delay)), self._delay]
-
-    @property
-    def state(self) -> dict[str, np.ndarray]:
-        """Actions on their way, the last one first, and delays."""
-        return {"past": self._past, "delay": self._delay} if self._longest else {}

@@ -42,11 +42,6 @@ class SingleDevice(Effect):
         self._drives.hold(index)
 
     @property
-    def state(self) -> dict[str, np.ndarray]:
-        """What is not in MuJoCo's state."""
-        return {"slipped": self._drives.slipped, "told": self._drives.told}
-
-    @property
     def slipped(self) -> np.ndarray:
         """Way by which the clamps have slipped in the episode, m and rad.
 

@@ -115,40 +115,15 @@ class SlidingDevices(SingleDevice):
         self._friction[index] = self._entity.friction if friction is None else friction
         self._factor[index] = 1.0 if stiffness is None else stiffness
         self._loss[index] = 1.0 if episode.loss is None else episode.loss
-        row = self._live(index)
+        self._arrays[index] = [self.world.field(index, name) for name in FIELDS]
+        row = np.array([index])
         turns = np.zeros((1, len(gaps), len(self._stack.spans)))
         self._write(row, self._stack.overlap(gaps[None]), turns)
-
-    def _live(self, index: int) -> np.ndarray:
-        """Takes the fields of a simulation's model as they are now; (1,) its number."""
-        self._arrays[index] = [self.world.field(index, name) for name in FIELDS]
-        return np.array([index])
-
-    @property
-    def state(self) -> dict[str, np.ndarray]:
-        """What is not in MuJoCo's state."""
-        return {
-            "friction": self._friction,
-            "factor": self._factor,
-            "loss": self._loss,
-            "ways": self._ways,
-            "drag": self._drag,
-            "axial": self._axial,
-            "slipped": self._slipped,
-            "told": self._drives.told,
-        }
 
     @property
     def slipped(self) -> np.ndarray:
         """Way (N, 2 K) by which the clamps have slipped, see `SingleDevice.slipped`."""
         return self._slipped
-
-    def refresh(self, index: int) -> None:
-        """Writes the properties of the chain of one simulation."""
-        row = self._live(index)
-        gaps = self._loops.gaps(np.ascontiguousarray(self._insertion[row]))
-        turns = self._rods.at_joints(self._angles[row], gaps)
-        self._write(row, self._stack.overlap(gaps), turns)
 
     def act(self, action: np.ndarray, state: Readings) -> np.ndarray:
         """Moves the devices and writes the properties of the chains.

@@ -112,14 +112,9 @@ class Wall(Effect):
             self._material[index, number] = (
                 np.nan if value is None else drawn(value, random_state)
             )
-        self.refresh(index)
+        self._write(index)
 
-    @property
-    def state(self) -> dict[str, np.ndarray]:
-        """Radii around the links, and what the walls are made of."""
-        return {"radius": self._radius, "material": self._material}
-
-    def refresh(self, index: int) -> None:
+    def _write(self, index: int) -> None:
         """Writes the contacts of one simulation."""
         self._contacts(
             self._geoms,
@@ -138,7 +133,7 @@ class Wall(Effect):
         radius = self._blood.radius
         np.copyto(self._radius, radius, where=radius > 0.0)
         for index in range(len(radius)):
-            self.refresh(index)
+            self._write(index)
         return action
 
 

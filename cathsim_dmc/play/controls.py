@@ -2,6 +2,8 @@
 
 import numpy as np
 
+from cathsim_dmc.tasks.scene import Scene
+
 # Commands that act while they are held: what they move, and sign.
 _STEERABLE = {
     "push": ("translation", 1.0),
@@ -40,27 +42,50 @@ COAXIAL_HELP = (
 )
 
 
-class _Keys:
-    """Commands that are held, and single requests.
+class Controls:
+    """Keys of a task: speeds while a key is held; the bend of a steerable tip stays.
+
+    In the AP view, "right" bends the tip to the right of the image and "up" towards
+    the observer, as long as the base is not rotated. Of coaxial devices the keys move
+    the innermost and the outermost; one device alone is both.
 
     Attributes:
+        help: What the keys do.
         requested: "restart" or "quit" since the last `restart`, or None.
+        bend: Deflection (2,) of the tip about x and y, shares of the full one.
     """
 
-    help = ""
-    _meaning: dict[str, tuple[str, float]] = {}
+    def __init__(self, tip_joints: int = 0, rotation: bool = False, devices: int = 0):
+        """Starts with nothing held and a straight tip.
 
-    def __init__(self):
+        Args:
+            tip_joints: Number of steerable joints of the device, two motors each.
+            rotation: Whether the action has a rotation.
+            devices: Number K of coaxial devices; 0 for a steerable device.
+        """
+        self._tip_joints, self._rotation, self._devices = tip_joints, rotation, devices
+        self._meaning = _COAXIAL if devices else _STEERABLE
+        self.help = COAXIAL_HELP if devices else HELP
         self._held: set[str] = set()
-        self.requested: str | None = None
+        self.restart()
+
+    @classmethod
+    def of(cls, scene: Scene) -> "Controls":
+        """The controls of the devices in a scene."""
+        chain = scene.catheter
+        if scene.coaxial:
+            return cls(devices=len(chain.devices))
+        return cls(len(chain.tip_motors) // 2, chain.rotation is not None)
 
     def press(self, command: str) -> None:
         """Begins to hold a command until `release`."""
         if command not in COMMANDS:
             raise ValueError(f"no command {command!r}; there are {', '.join(COMMANDS)}")
-        if command in self._meaning:
+        if command == "straight":
+            self.bend = np.zeros(2)
+        elif command in self._meaning:
             self._held.add(command)
-        elif command in ("restart", "quit"):
+        else:
             self.requested = command
 
     def release(self, command: str) -> None:
@@ -68,94 +93,30 @@ class _Keys:
         self._held.discard(command)
 
     def restart(self) -> None:
-        """Ends all commands."""
-        self._held.clear()
-        self.requested = None
-
-    def _axes(self) -> dict[str, float]:
-        """Sum of the held commands of each axis."""
-        axes = dict.fromkeys((axis for axis, _ in self._meaning.values()), 0.0)
-        for command in self._held:
-            axis, sign = self._meaning[command]
-            axes[axis] += sign
-        return axes
-
-
-class CoaxialControls(_Keys):
-    """Keys of the innermost and of the outermost of coaxial devices.
-
-    One device alone is both.
-    """
-
-    help = COAXIAL_HELP
-    _meaning = _COAXIAL
-
-    def __init__(self, devices: int):
-        """Starts with nothing held."""
-        super().__init__()
-        self._devices = devices
-
-    def action(self, duration: float) -> np.ndarray:
-        """Action (2 K,) float64 of the next control step of a duration in seconds.
-
-        float32 holds it exactly, as that of `Controls`.
-        """
-        axes = self._axes()
-        action = np.zeros(2 * self._devices)
-        action[:2] = axes["guidewire"], axes["guidewire_rotation"]
-        action[-2:] += axes["catheter"], axes["catheter_rotation"]
-        return np.clip(action, -1.0, 1.0)
-
-
-class Controls(_Keys):
-    """Keys of a steerable device: speeds while a key is held, a bend that stays.
-
-    In the AP view, "right" bends the tip to the right of the image and "up" towards
-    the observer, as long as the base is not rotated.
-    """
-
-    help = HELP
-    _meaning = _STEERABLE
-
-    def __init__(self, tip_joints: int, rotation: bool):
-        """Starts with nothing held and a straight tip.
-
-        Args:
-            tip_joints: number of steerable joints of the device, two motors each.
-            rotation: whether the action has a rotation.
-        """
-        super().__init__()
-        self._tip_joints = tip_joints
-        self._has_rotation = rotation
-        self._bend = np.zeros(2)
-
-    def press(self, command: str) -> None:
-        """Begins to hold a command until `release`."""
-        super().press(command)
-        if command == "straight":
-            self._bend[:] = 0.0
-
-    def restart(self) -> None:
         """Ends all commands and straightens the tip."""
-        super().restart()
-        self._bend[:] = 0.0
+        self._held.clear()
+        self.requested: str | None = None
+        self.bend = np.zeros(2)
 
     def action(self, duration: float) -> np.ndarray:
         """Action of the next control step of a duration in seconds.
 
         Returns:
             (A,) float64 that float32 holds exactly, so that a demonstration can be
-            repeated through interfaces of single precision.
+            repeated through interfaces of single precision. A is 2 K with coaxial
+            devices.
         """
-        axes = self._axes()
-        self._bend += BEND_RATE * duration * np.array([axes["bend_x"], axes["bend_y"]])
-        np.clip(self._bend, -1.0, 1.0, out=self._bend)
-        action = [*np.tile(self._bend, self._tip_joints), axes["translation"]]
-        if self._has_rotation:
-            action.append(axes["rotation"])
-        return np.array(action, dtype=np.float32).astype(np.float64)
-
-    @property
-    def bend(self) -> np.ndarray:
-        """Deflection (2,) about x and y, shares of the full one."""
-        return self._bend.copy()
+        axes = dict.fromkeys((axis for axis, _ in self._meaning.values()), 0.0)
+        for command in self._held:
+            axis, sign = self._meaning[command]
+            axes[axis] += sign
+        if self._devices:
+            action = np.zeros(2 * self._devices)
+            action[:2] = axes["guidewire"], axes["guidewire_rotation"]
+            action[-2:] += axes["catheter"], axes["catheter_rotation"]
+            return np.clip(action, -1.0, 1.0)
+        change = BEND_RATE * duration * np.array([axes["bend_x"], axes["bend_y"]])
+        self.bend = np.clip(self.bend + change, -1.0, 1.0)
+        moved = [axes["translation"], axes["rotation"]][: 1 + self._rotation]
+        action = np.array([*np.tile(self.bend, self._tip_joints), *moved])
+        return action.astype(np.float32).astype(np.float64)

@@ -16,7 +16,7 @@ from cathsim_dmc.recording.episode import Episode
 
 # Options that say what is observed. An episode does not hold observations: they come
 # from repeating it, and may be others than those it was recorded with.
-_OBSERVED = ("observation", "fluoroscopy", "cameras")
+_OBSERVED = ("observation", "fluoroscopy", "endoluminal_size")
 # Rewards of a repeated episode may differ by rounding on another machine.
 TOLERANCE = 1e-9
 

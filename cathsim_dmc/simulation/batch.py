@@ -22,7 +22,6 @@ from cathsim_dmc.physics.stepper import Anatomic, Stepper
 from cathsim_dmc.tasks.actions import check_action
 from cathsim_dmc.tasks.navigation import Navigation
 from cathsim_dmc.tasks.rollout import Rollout
-from cathsim_dmc.tasks.snapshot import Snapshot
 from cathsim_dmc.tasks.step import Step
 
 # What composer calls on a task; the batch steps the rollout instead, so a task that
@@ -152,37 +151,6 @@ class BatchSimulation:
         self._rollout.command(action)
         self._stepper.run()
         return _own(self._rollout.finish())
-
-    def snapshot(self, indices: np.ndarray | None = None) -> Snapshot:
-        """The state between two steps, from which episodes go on bit for bit.
-
-        Args:
-            indices: Numbers of the simulations, all if None, in ascending order.
-
-        Raises:
-            RuntimeError: if one of them has not been reset.
-        """
-        indices = bounds.indices("indices", indices, self.num_simulations)
-        self._refuse_waiting(indices)
-        return self._rollout.snapshot(indices)
-
-    def restore(self, snapshot: Snapshot, indices: np.ndarray | None = None) -> Step:
-        """Puts simulations to a snapshot, in place of a reset.
-
-        Args:
-            snapshot: Of as many simulations of the same task, batched or composer.
-            indices: Numbers of the simulations, all if None, in ascending order.
-
-        Returns:
-            All simulations as they stand.
-
-        Raises:
-            ValueError: if the snapshot is of another task, or of fewer simulations.
-        """
-        indices = bounds.indices("indices", indices, self.num_simulations)
-        if not self._begun[indices].all():
-            self.reset(indices[~self._begun[indices]])
-        return _own(self._rollout.restore(indices, snapshot, self._random_states))
 
     def _refuse_waiting(self, indices: np.ndarray):
         waiting = indices[~self._begun[indices]].tolist()

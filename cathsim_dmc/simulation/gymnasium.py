@@ -13,7 +13,6 @@ from cathsim_dmc.anatomy.parts import Surface
 from cathsim_dmc.imaging import angiograph
 from cathsim_dmc.simulation import batch
 from cathsim_dmc.tasks.config import CONTROL_TIMESTEP
-from cathsim_dmc.tasks.snapshot import Snapshot
 
 RENDER_MODES = ("rgb_array",)
 VERSION = 0  # of the ids
@@ -145,17 +144,6 @@ class CathSimEnv(gymnasium.Env):
             self._ended and not terminated,
             self._environment.task.info(),
         )
-
-    def snapshot(self) -> Snapshot:
-        """The state between two steps; see `tasks.environment.Environment`."""
-        return self._environment.snapshot()
-
-    def restore(self, snapshot: Snapshot):
-        """Puts the environment to a snapshot; returns what `reset` does."""
-        timestep = self._environment.restore(snapshot)
-        self._begun, self._ended = True, timestep.last()
-        info = self._environment.task.info()
-        return _converted(timestep.observation, self._dtype), info
 
     def render(self) -> np.ndarray | None:
         """Fluoroscopy (rows, columns, 3) uint8, two planes side by side."""

@@ -13,7 +13,6 @@ from torchrl.envs import EnvBase
 from cathsim_dmc import bounds, suite
 from cathsim_dmc.simulation.batch import BatchSimulation
 from cathsim_dmc.tasks.navigation import Navigation
-from cathsim_dmc.tasks.snapshot import Snapshot
 from cathsim_dmc.tasks.step import Step
 
 
@@ -73,10 +72,6 @@ class BatchedEnv(EnvBase):
             mask = tensordict["_reset"].reshape(self.batch_size).numpy()
             chosen = np.flatnonzero(mask)
         return self._tensors(self._simulation.reset(chosen))
-
-    def restore(self, snapshot: Snapshot) -> TensorDict:
-        """Puts all simulations to a snapshot; returns what `reset` does."""
-        return self._tensors(self._simulation.restore(snapshot))
 
     def _step(self, tensordict: TensorDict) -> TensorDict:
         step = self._simulation.step(tensordict["action"].numpy())

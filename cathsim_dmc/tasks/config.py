@@ -23,7 +23,6 @@ from cathsim_dmc.physics.randomisation import (
 from cathsim_dmc.physics.sliding import devices_of
 from cathsim_dmc.physics.stepper import CONTROL_TIMESTEP, PHYSICS_TIMESTEP
 from cathsim_dmc.physics.vessel import VesselOptions
-from cathsim_dmc.tasks.cameras import CameraOptions
 
 MAX_STEPS = 2000  # published
 _MOST_JOINTS = 1000
@@ -67,8 +66,7 @@ class NavigationConfig:
             refused.
         fluoroscopy: `imaging.FluoroscopyOptions` of the images, or a mapping of its
             fields.
-        cameras: `cameras.CameraOptions` of `rgb` and `depth`, or a mapping of its
-            fields.
+        endoluminal_size: Pixels along a side of endoluminal views, or (rows, columns).
         randomisation: Ranges that each episode draws from: True for
             `randomisation.DEFAULT_RANGES`, False for none, a
             `randomisation.Randomisation` or a mapping of its fields.
@@ -92,7 +90,7 @@ class NavigationConfig:
     physics_timestep: float = PHYSICS_TIMESTEP
     outside_range: bool = False
     fluoroscopy: FluoroscopyOptions | Mapping[str, Any] = FluoroscopyOptions()
-    cameras: CameraOptions | Mapping[str, Any] = CameraOptions()
+    endoluminal_size: int | Sequence[int] = 128
     randomisation: Randomisation | Mapping[str, Any] | bool = False
     effects: Sequence[Effect] = ()
     vessel: str | Mapping[str, Any] | VesselOptions = "rigid"
@@ -101,11 +99,10 @@ class NavigationConfig:
         self._check_devices()
         self._check_numbers()
         self._check_range()
-        kinds = {"fluoroscopy": FluoroscopyOptions, "cameras": CameraOptions}
-        for name, kind in kinds.items():
-            value = getattr(self, name)
-            if not isinstance(value, kind):
-                object.__setattr__(self, name, _options(name, kind, value))
+        bounds.pixels("endoluminal_size", self.endoluminal_size)
+        if not isinstance(self.fluoroscopy, FluoroscopyOptions):
+            given = _options("fluoroscopy", FluoroscopyOptions, self.fluoroscopy)
+            object.__setattr__(self, "fluoroscopy", given)
         object.__setattr__(
             self, "randomisation", Randomisation.make(self.randomisation)
         )
@@ -134,9 +131,9 @@ class NavigationConfig:
         return cast(FluoroscopyOptions, self.fluoroscopy)
 
     @property
-    def camera_options(self) -> CameraOptions:
-        """`cameras` as an object."""
-        return cast(CameraOptions, self.cameras)
+    def endoluminal_resolution(self) -> tuple[int, int]:
+        """(rows, columns) of endoluminal views."""
+        return bounds.pixels("endoluminal_size", self.endoluminal_size)
 
     @property
     def vessel_options(self) -> VesselOptions:

@@ -7,7 +7,6 @@ import numpy as np
 from dm_control import composer, mjcf
 
 from cathsim_dmc.tasks.observation_kind import FrameObservable
-from cathsim_dmc.tasks.snapshot import Snapshot
 
 # What composer does with an observable between physics steps, or to its values.
 _SETTINGS = ("buffer_size", "delay", "aggregator", "corruptor")
@@ -55,39 +54,6 @@ class Environment(composer.Environment):
         observation = {name: np.array(seen[name][0]) for name in self._enabled}
         ends = self.task.should_terminate_episode(self._physics_proxy)
         self._reset_next_step = ends or self._physics.time() >= self._time_limit
-        return self._timestep(observation)
-
-    def snapshot(self) -> Snapshot:
-        """The state between two steps, from which an episode goes on bit for bit.
-
-        Raises:
-            RuntimeError: if no episode has begun.
-        """
-        return self.task.snapshot()
-
-    def restore(self, snapshot: Snapshot) -> dm_env.TimeStep:
-        """Puts the environment to a snapshot, in place of a reset.
-
-        Args:
-            snapshot: Of one simulation of the same task, perhaps of another process.
-
-        Returns:
-            The time step that was the last one when the snapshot was taken.
-
-        Raises:
-            ValueError: if the snapshot is of another task.
-        """
-        task, physics = self.task, self._physics_proxy
-        task.restore(physics, snapshot, self._random_state)
-        self._observation_updater.reset(physics, self._random_state)
-        observation = self._observation_updater.get_observation()
-        self._plain = self._is_plain()
-        self._reset_next_step = task.termination is not None
-        if not task.rollout.steps[0]:
-            return dm_env.restart(observation)
-        return self._timestep(observation)
-
-    def _timestep(self, observation) -> dm_env.TimeStep:
         kind = dm_env.StepType.LAST if self._reset_next_step else dm_env.StepType.MID
         task, physics = self.task, self._physics_proxy
         reward, discount = task.get_reward(physics), task.get_discount(physics)

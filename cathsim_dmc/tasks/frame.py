@@ -21,7 +21,7 @@ class Images(NamedTuple):
         past_images: the same, one and two control steps before, newest first.
         masks: (..., H, W, 2 P) uint8, see `imaging.angiograph.masks`.
         pixels: (..., P, K + 1, 2), tracked points and goal, (column, row).
-        views: images of MuJoCo's cameras and endoluminal views, by key.
+        views: endoluminal views by name.
     """
 
     image: np.ndarray | None = None

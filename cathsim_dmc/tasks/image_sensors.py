@@ -1,17 +1,17 @@
 """Image sensors of N simulations, with the last few images of each."""
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import astuple
 
-import mujoco
 import numpy as np
 
 from cathsim_dmc.imaging import angiograph as angiographs
 from cathsim_dmc.imaging.device import Shadow
 from cathsim_dmc.imaging.fluoroscopy import Fluoroscope
-from cathsim_dmc.tasks import cameras, observations
+from cathsim_dmc.tasks import observations
 from cathsim_dmc.tasks.common_chain import CommonChain
-from cathsim_dmc.tasks.frame import NO_IMAGES, Images
+from cathsim_dmc.tasks.frame import Images
+
+_AGES = tuple(f"past_{age}" for age in range(observations.SEQUENCE_LENGTH))
 
 ENDOLUMINAL = ("endoluminal", "endoluminal_distance")
 
@@ -25,7 +25,6 @@ class ImageSensors:
         angiograph: angiographs.Angiograph | None,
         num_simulations: int,
         chain: CommonChain,
-        gl_cameras: cameras.Cameras | None = None,
         endoscope: Callable[[np.ndarray], Mapping[str, np.ndarray]] | None = None,
     ):
         """Prepares the sensors.
@@ -34,18 +33,13 @@ class ImageSensors:
             angiograph: Angiography machine; None without fluoroscopic observations.
             num_simulations: N.
             chain: The device as observations show it.
-            gl_cameras: MuJoCo's cameras; None without `rgb` and `depth`.
             endoscope: Function from numbers (K,) of simulations to the endoluminal
                 views (K, ...) from their heads, by name.
         """
         self._names, self._chain = names, chain
         self._endoscope = endoscope if self._wants(*ENDOLUMINAL) else None
-        self._on = any(
-            each is not None for each in (angiograph, gl_cameras, self._endoscope)
-        )
-        self._cameras = gl_cameras
+        self._on = angiograph is not None or self._endoscope is not None
         self._planes: list[angiographs.Planes] = []
-        self._deviations = [angiographs.Deviation()] * num_simulations
         self._noise = False
         if angiograph is not None:
             self._planes = [angiograph.planes()] * num_simulations
@@ -67,14 +61,12 @@ class ImageSensors:
         """Begins an episode of one simulation with its machine and its deviation."""
         if angiograph is not None:
             self._planes[index] = angiograph.planes(deviation)
-            self._deviations[index] = deviation
 
     def capture(
         self,
         lines: np.ndarray,
         shadows: Sequence[Shadow],
         goal: np.ndarray,
-        qpos: np.ndarray,
         random_states: Sequence[np.random.RandomState] | None,
         fresh: np.ndarray | None = None,
         device_points: np.ndarray | None = None,
@@ -85,16 +77,13 @@ class ImageSensors:
         Args:
             lines: (N, n, 3), centrelines of the chains, m.
             goal: (3,) or (N, 3), m.
-            qpos: (N, nq).
             random_states: N sources of quantum noise, None for images without.
             fresh: indices of simulations that begin an episode: only their images are
                 captured, and fill their history. None for a control step of all.
             device_points: (N, K, P, 3), tracked points of coaxial devices, m.
             around: moves the vessel before the machine of a simulation.
         """
-        if not self._on or (fresh is not None and not len(fresh)):
-            return self._latest() if self._on else NO_IMAGES
-        count = len(qpos)
+        count = len(lines)
         chosen = np.arange(count) if fresh is None else fresh
         line = lines[chosen]
         planes = [self._planes[index] for index in chosen] if self._planes else []
@@ -116,75 +105,35 @@ class ImageSensors:
                 points.append(device_points[chosen].reshape(len(line), -1, 3))
             points = np.concatenate([*points, ends], axis=-2)
             self._hold("pixels", angiographs.pixels(planes, points), count, fresh)
-        kinds = [kind for kind in cameras.KINDS if kind in self._names]
-        if kinds and self._cameras is not None:
-            for key, view in self._cameras.see(kinds, qpos[chosen]).items():
-                self._hold(f"view_{key}", view, count, fresh)
         if self._endoscope is not None:
             for key, view in self._endoscope(chosen).items():
-                self._hold(f"view_{key}", view, count, fresh)
+                self._hold(key, view, count, fresh)
         return self._latest()
 
     def _latest(self) -> Images:
-        past = tuple(self._named("past_").values())
+        past = [self._held[age] for age in _AGES if age in self._held]
         return Images(
             image=past[0] if past else None,
-            past_images=past[1:],
+            past_images=tuple(past[1:]),
             masks=self._held.get("masks"),
             pixels=self._held.get("pixels"),
-            views=self._named("view_"),
+            views={
+                name: self._held[name] for name in ENDOLUMINAL if name in self._held
+            },
         )
-
-    def _named(self, prefix: str) -> dict[str, np.ndarray]:
-        return {
-            name.removeprefix(prefix): image
-            for name, image in self._held.items()
-            if name.startswith(prefix)
-        }
 
     def _hold(self, name, image, count, fresh):
         self._held[name] = _merged(self._held.get(name), image, count, fresh)
-
-    @property
-    def state(self) -> dict[str, np.ndarray]:
-        """Arrays (N, ...) that a snapshot keeps."""
-        kept = dict(self._held)
-        if self._planes:
-            kept["deviation"] = np.array([astuple(one) for one in self._deviations])
-        return kept
-
-    def restore(
-        self,
-        indices: np.ndarray,
-        machines: Sequence[angiographs.Angiograph | None],
-        kept: Mapping[str, np.ndarray],
-    ) -> None:
-        """Puts some simulations to arrays (K, ...) of `state`.
-
-        Args:
-            indices: (K,) numbers of the simulations.
-        """
-        for row, (index, machine) in enumerate(zip(indices, machines, strict=True)):
-            if "deviation" in kept:
-                primary, secondary, *factors = kept["deviation"][row].tolist()
-                deviation = angiographs.Deviation(
-                    round(primary), round(secondary), *factors
-                )
-                self.restart(index, machine, deviation)
-
-        for name, image in self._held.items():
-            self._held[name] = _merged(image, kept[name], len(image), indices)
 
     def _wants(self, *names: str) -> bool:
         return any(name in self._names for name in names)
 
     def _remember(self, image, count, fresh):
-        ages = [f"past_{age}" for age in range(observations.SEQUENCE_LENGTH)]
-        if fresh is None and ages[0] in self._held:
-            past = [image, *(self._held[age] for age in ages[:-1])]
-            self._held.update(zip(ages, past, strict=True))
+        if fresh is None and _AGES[0] in self._held:
+            past = [image, *(self._held[age] for age in _AGES[:-1])]
+            self._held.update(zip(_AGES, past, strict=True))
             return
-        for age in ages:
+        for age in _AGES:
             self._hold(age, image, count, fresh)
 
     @property
@@ -202,15 +151,3 @@ def _merged(old, new, count, fresh):
     old = old.copy()
     old[fresh] = new
     return old
-
-
-def open_cameras(
-    names: Sequence[str],
-    model: mujoco.MjModel,
-    options: cameras.CameraOptions,
-    catheter: str,
-) -> cameras.Cameras | None:
-    """The cameras that the observations need, or None if they need none."""
-    if not any(kind in names for kind in cameras.KINDS):
-        return None
-    return cameras.Cameras(model, options, catheter)

@@ -1,8 +1,7 @@
-"""What was measured after a control step, kept for observations and snapshots."""
+"""What was measured after a control step."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -12,7 +11,6 @@ from cathsim_dmc.physics.readings import CoaxialReadings, Readings
 from cathsim_dmc.physics.vessel import VesselReadings
 from cathsim_dmc.tasks.objective_pool import part
 from cathsim_dmc.tasks.objectives import straight
-from cathsim_dmc.tasks.snapshot import Snapshot, merged, named
 
 
 class Measured(NamedTuple):
@@ -30,34 +28,10 @@ class Measured(NamedTuple):
     devices: CoaxialReadings | None
     vessel: VesselReadings | None
 
-    def rows(self, indices: np.ndarray) -> dict[str, Any]:
-        """What is of some simulations, by the names of the fields."""
-        return part(self, indices)._asdict()
-
-    def updated(self, kept: Mapping[str, Any], indices: np.ndarray) -> Measured:
-        """The same with `kept`, as from `rows`, of some simulations."""
-        values: dict[str, Any] = {
-            name: None if old is None else merged(old, kept[name], indices)
-            for name, old in self._asdict().items()
-        }
-        return Measured(**values)
-
-    def arrays(self) -> dict[str, np.ndarray]:
-        """Arrays by name, for a snapshot."""
-        return {
-            name: array
-            for kind, values in self._asdict().items()
-            if values is not None
-            for name, array in named(kind, values._asdict()).items()
-        }
-
-    def restored(self, snapshot: Snapshot, indices: np.ndarray) -> Measured:
-        """The same with some simulations as in a snapshot of them."""
-        kept = {
-            kind: None if old is None else type(old)(**snapshot.part(kind))
-            for kind, old in self._asdict().items()
-        }
-        return self.updated(kept, indices)
+    def updated(self, new: Measured, rows: np.ndarray) -> Measured:
+        """The same with some simulations as in `new`."""
+        pairs = zip(self, part(new, rows), strict=True)
+        return Measured._make(old and merged(old, kept, rows) for old, kept in pairs)
 
 
 class Path(NamedTuple):
@@ -81,3 +55,13 @@ class Path(NamedTuple):
     def ratio(self) -> np.ndarray:
         """(N,), length of each path over the shortest way from start to goal."""
         return self.length / self.shortest
+
+
+def merged(old: Any, new: Any, rows: np.ndarray) -> Any:
+    """A named tuple of arrays (N, ...) with `new` in some rows; `old` stays."""
+    values = []
+    for before, now in zip(old, new, strict=True):
+        array = before.copy()
+        array[rows] = now
+        values.append(array)
+    return type(old)._make(values)

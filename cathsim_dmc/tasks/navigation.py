@@ -14,7 +14,7 @@ from cathsim_dmc.physics import forces, readings
 from cathsim_dmc.physics.effects import Effect
 from cathsim_dmc.physics.readings import CoaxialReadings
 from cathsim_dmc.physics.stepper import SingleStepper, Stepper
-from cathsim_dmc.tasks import cameras, cases, observations
+from cathsim_dmc.tasks import cases, observations
 from cathsim_dmc.tasks.actions import check_action
 from cathsim_dmc.tasks.common_chain import CommonChain
 from cathsim_dmc.tasks.config import CONTROL_TIMESTEP, NavigationConfig
@@ -22,7 +22,6 @@ from cathsim_dmc.tasks.objectives import Objective, Shiftable
 from cathsim_dmc.tasks.observation_kind import FrameObservable, Sizes
 from cathsim_dmc.tasks.rollout import Rollout
 from cathsim_dmc.tasks.scene import Scene
-from cathsim_dmc.tasks.snapshot import Snapshot
 from cathsim_dmc.tasks.step import Step, info_types
 
 _ONLY = np.zeros(1, dtype=int)  # number of the one simulation
@@ -83,15 +82,6 @@ class Navigation(composer.Task):
             self._fluoroscopy = config.fluoroscopy_options
         rooms = iter(others)
         second = next(rooms, None)
-        if set(cameras.KINDS) & set(self._names):
-            if second is not None:
-                raise ValueError(
-                    f"the observation {config.observation!r} needs MuJoCo's cameras, "
-                    "which show one anatomy only, and this task draws from several; "
-                    "observe image, sequential or segmentation, or make the task with "
-                    "pool=1"
-                )
-            cameras.add_tip_camera(scene.arena, scene.catheter)
         self.set_timesteps(CONTROL_TIMESTEP, config.physics_timestep)
         self._cases: tuple[cases.Case, ...] = ()
         if second is not None:
@@ -186,7 +176,7 @@ class Navigation(composer.Task):
             links=common.num_links,
             devices=len(chain.devices) if self._scene.coaxial else 0,
             fluoroscopy=config.fluoroscopy_options,
-            cameras=config.camera_options,
+            endoluminal=config.endoluminal_resolution,
         )
         return observations.entry_specs(self._names, sizes)
 
@@ -228,17 +218,6 @@ class Navigation(composer.Task):
         goal = self._scene.phantom.goals.get(self._scene.goal.name)
         if goal is not None and self._config.ranges.goal_shift:
             physics.bind(goal).pos = self.goal_position
-
-    def snapshot(self) -> Snapshot:
-        """The state of the simulation; see `environment.Environment.snapshot`."""
-        self._current()
-        return self._rollout.snapshot(_ONLY)
-
-    def restore(self, physics, snapshot: Snapshot, random_state):
-        """Puts the simulation to a snapshot; see `environment.Environment.restore`."""
-        self._current()
-        self._step = self._rollout.restore(_ONLY, snapshot, [random_state])
-        self._show_goal(physics)
 
     def before_step(self, physics, action, random_state):
         """Applies the action and moves the robot along."""

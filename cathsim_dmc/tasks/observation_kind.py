@@ -10,7 +10,6 @@ from dm_control.composer.observation import observable
 from dm_env import specs
 
 from cathsim_dmc.imaging.options import FluoroscopyOptions
-from cathsim_dmc.tasks.cameras import CameraOptions
 from cathsim_dmc.tasks.frame import Frame
 
 Observation = dict[str, np.ndarray]
@@ -27,7 +26,7 @@ class Sizes:
         links: links that are shown.
         devices: coaxial devices; 0 for a single device.
         fluoroscopy: set-up of the angiography machine.
-        cameras: MuJoCo's cameras and the size of their images.
+        endoluminal: (rows, columns) of endoluminal views.
     """
 
     actions: int = 0
@@ -35,7 +34,7 @@ class Sizes:
     links: int = 0
     devices: int = 0
     fluoroscopy: FluoroscopyOptions = FluoroscopyOptions()
-    cameras: CameraOptions = CameraOptions()
+    endoluminal: tuple[int, int] = (128, 128)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -43,7 +42,7 @@ class Entry:
     """One array of an observation.
 
     Attributes:
-        key: name in the observation; `<camera>` stands for the name of each camera.
+        key: name in the observation.
         shape: shape for one simulation or length of a vector, or a function of the
             sizes that returns it.
         unit: of its numbers, by part where parts differ.
@@ -66,20 +65,14 @@ class Entry:
         """Whether it is an image."""
         return self.dtype is not np.float64
 
-    def named_specs(self, sizes: Sizes) -> dict[str, specs.Array]:
-        """Names in the observation, with the spec of each for one simulation."""
+    def spec(self, sizes: Sizes) -> specs.Array:
+        """Its spec for one simulation."""
         shape = self.shape(sizes) if callable(self.shape) else self.shape
         shape = (shape,) if isinstance(shape, int) else shape
-        names = [self.key]
-        if "<camera>" in self.key:
-            names = [self.key.replace("<camera>", n) for n in sizes.cameras.names]
-        return {name: self._spec(name, shape) for name in names}
-
-    def _spec(self, name: str, shape: tuple[int, ...]) -> specs.Array:
         if math.isinf(self.low) and math.isinf(self.high):
-            return specs.Array(shape, self.dtype, name)
+            return specs.Array(shape, self.dtype, self.key)
         low, high = (np.asarray(end, self.dtype) for end in (self.low, self.high))
-        return specs.BoundedArray(shape, self.dtype, low, high, name)
+        return specs.BoundedArray(shape, self.dtype, low, high, self.key)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -168,11 +161,7 @@ class ObservationTable(dict[str, ObservationKind]):
 
     def entry_specs(self, names: Sequence[str], sizes: Sizes) -> dict[str, specs.Array]:
         """Specs of the entries of the named rows, for one simulation."""
-        return {
-            key: spec
-            for entry in self.entries(names)
-            for key, spec in entry.named_specs(sizes).items()
-        }
+        return {entry.key: entry.spec(sizes) for entry in self.entries(names)}
 
 
 class FrameObservable(observable.Generic):

@@ -3,7 +3,6 @@
 To add an observation, write it here as a row.
 """
 
-import math
 from operator import attrgetter
 
 import numpy as np
@@ -281,38 +280,6 @@ def force(frame: Frame) -> Observation:
 
 
 @OBSERVATIONS.row(
-    Entry(
-        "rgb_<camera>",
-        lambda sizes: (*sizes.cameras.resolution, 3),
-        "colour level",
-        "red, green, blue",
-        0,
-        255,
-        np.uint8,
-    )
-)
-def rgb(frame: Frame) -> Observation:
-    """Colour images of MuJoCo's cameras."""
-    return _views(frame, "rgb")
-
-
-@OBSERVATIONS.row(
-    Entry(
-        "depth_<camera>",
-        lambda sizes: (*sizes.cameras.resolution, 1),
-        "m",
-        "distance along the optical axis",
-        0,
-        math.inf,
-        np.float32,
-    )
-)
-def depth(frame: Frame) -> Observation:
-    """Distance images of MuJoCo's cameras."""
-    return _views(frame, "depth")
-
-
-@OBSERVATIONS.row(
     Entry("heart_phase", 2, "1", "sine and cosine of the phase of the heart", -1, 1),
     Entry("breath_phase", 2, "1", "sine and cosine of that of breathing", -1, 1),
     Entry("blood_velocity", 3, "m/s", "of the blood at the head, world frame"),
@@ -337,7 +304,7 @@ def _endoluminal(
     key: str, unit: str, meaning: str, high: float, dtype: type[np.number]
 ) -> Entry:
     def shape(sizes: Sizes) -> tuple[int, ...]:
-        return (*sizes.cameras.resolution, 1)
+        return (*sizes.endoluminal, 1)
 
     meaning += ", over a right angle from the head along its axis; right and down: x "
     meaning += "and y of the tip frame"
@@ -367,11 +334,6 @@ def endoluminal_distance(frame: Frame) -> Observation:
     """Distances to the wall from the head, without OpenGL."""
     views = frame.images.views
     return {"endoluminal_distance": _captured(views["endoluminal_distance"])}
-
-
-def _views(frame: Frame, kind: str) -> Observation:
-    views = frame.images.views
-    return {key: view for key, view in views.items() if key.startswith(f"{kind}_")}
 
 
 # Coaxial devices.

@@ -26,8 +26,8 @@ from cathsim_dmc.tasks.cases import Case, model_index
 from cathsim_dmc.tasks.common_chain import CommonChain
 from cathsim_dmc.tasks.config import NavigationConfig
 from cathsim_dmc.tasks.frame import NO_IMAGES, Frame
-from cathsim_dmc.tasks.image_sensors import ImageSensors, open_cameras
-from cathsim_dmc.tasks.measured import Measured, Path
+from cathsim_dmc.tasks.image_sensors import ImageSensors
+from cathsim_dmc.tasks.measured import Measured, Path, merged
 from cathsim_dmc.tasks.objective_pool import part, together
 from cathsim_dmc.tasks.objectives import (
     Measurement,
@@ -39,21 +39,11 @@ from cathsim_dmc.tasks.objectives import (
 from cathsim_dmc.tasks.observation_kind import Observation
 from cathsim_dmc.tasks.physics_errors import PhysicsMonitor
 from cathsim_dmc.tasks.route import Routes
-from cathsim_dmc.tasks.snapshot import (
-    Snapshot,
-    describe,
-    merged,
-    named,
-    random_arrays,
-    set_random,
-)
 from cathsim_dmc.tasks.step import Step
 from cathsim_dmc.tasks.tracking_noise import TrackingNoise
 
 # Reasons of errors, empty for none.
 _REASON = "U64"
-# Arrays (N, ...) of a rollout that a snapshot keeps as they are.
-_KEPT = ("case_of", "goal_shift", "steps", "action", "previous_action", "errors")
 
 
 class Rollout:
@@ -83,7 +73,6 @@ class Rollout:
         self._state = state = stepper.arrays
         living = config.vessel_options.living
         self._names = observations.resolve(config.observation, scene.coaxial, living)
-        catheter = scene.catheter.mjcf_model.model
         self._index = model_index(scene, model)
         self._read = self._index.reader(state)
         num_actions = len(scene.catheter.action_names)
@@ -115,12 +104,10 @@ class Rollout:
             cases[0].angiograph,
             num_simulations,
             self._chain,
-            open_cameras(self._names, model, config.camera_options, catheter),
             self._endoscope,
         )
         self._tracking = TrackingNoise(config.ranges.tracking_noise, num_simulations)
         self._monitor = PhysicsMonitor(scene, num_simulations)
-        self._description = describe([case.scene for case in cases], listed)
         still = np.zeros((num_simulations, 3))
         self._path = Path(still, still[:, 0], np.ones(num_simulations))
         # None before the first episode.
@@ -168,12 +155,6 @@ class Rollout:
             shiftable = cast(Shiftable, self._objective)
             self._objective = shiftable.shifted(self._goal_shift)
 
-    def _load(self, index: int) -> None:
-        """Puts the anatomy of one simulation's episode into model and effects."""
-        case = self.case(index)
-        self._stepper.load(index, case)
-        self._effects.enter(index, case.scene.anatomy)
-
     def _draw(self, index: int, random_state: np.random.RandomState) -> None:
         """Draws the episode of one simulation and puts its device to the start."""
         ranges = self._config.ranges
@@ -181,7 +162,8 @@ class Rollout:
         if len(self._cases) > 1:
             self.case(index).scene.anatomy.lumen.release()
             self._case_of[index] = number
-            self._load(index)
+            self._stepper.load(index, self.case(index))
+            self._effects.enter(index, self.case(index).scene.anatomy)
         case = self.case(index)
         posture = case.start.draw(random_state)
         case.start.write(self._state.qpos[index], episode, posture)
@@ -200,7 +182,6 @@ class Rollout:
         Args:
             action: (N, A) float64 as `actions.check_action` returns it.
         """
-        self._monitor.before_step(self.snapshot, action)
         self._previous_action, self._action = self._action, action
         self._pose_robot()
         self._stepper.begin(self._effects.act(action, self.readings))
@@ -243,7 +224,7 @@ class Rollout:
         force, devices = forces.wall_force(magnitudes), self._devices.read(now)
         new = Measured(now, force, devices, vessel_now)
         if rows is not None and hasattr(self, "_measured"):
-            new = self._measured.updated(new.rows(rows), rows)
+            new = self._measured.updated(new, rows)
         self._measured = new
         self._resting = self._at_rest(self.readings)
 
@@ -278,8 +259,7 @@ class Rollout:
             ),
             failed,
         )
-        # A restored start is no end.
-        terminated = outcome.success & (self._steps > 0) if ended is None else ended
+        terminated = outcome.success if ended is None else ended
         if failed is not None:
             terminated = terminated | failed
         return Step(
@@ -306,7 +286,6 @@ class Rollout:
                 state.centreline,
                 self.shadows,
                 goal,
-                self._state.qpos,
                 self._random_states,
                 fresh,
                 None if devices is None else devices.points,
@@ -333,85 +312,9 @@ class Rollout:
             warps,
             state.head[indices],
             state.head_frame[indices],
-            self._config.camera_options.resolution,
+            self._config.endoluminal_resolution,
         )
         return {"endoluminal": grey, "endoluminal_distance": distance}
-
-    # Snapshots.
-
-    def snapshot(self, indices: np.ndarray) -> Snapshot:
-        """The state of some simulations (K,), between two control steps.
-
-        Raises:
-            RuntimeError: if no episode has begun.
-        """
-        if self._random_states is None:
-            raise RuntimeError(
-                "there is no episode to take a snapshot of; call reset()"
-            )
-        arrays = {
-            "state": self._stepper.states(),
-            **{name: getattr(self, f"_{name}") for name in _KEPT},
-            **named("path", self._path._asdict()),
-            **self._measured.arrays(),
-            **named("effects", self._effects.state),
-            **named("images", self._sensors.state),
-            **named("tracking", self._tracking.state),
-        }
-        arrays = {name: array[indices] for name, array in arrays.items()}
-        sources = random_arrays([self._random_states[index] for index in indices])
-        return Snapshot(self._description, {**arrays, **named("random", sources)})
-
-    def restore(
-        self,
-        indices: np.ndarray,
-        snapshot: Snapshot,
-        random_states: Sequence[np.random.RandomState],
-    ) -> Step:
-        """Puts some simulations (K,) to a snapshot of as many.
-
-        Args:
-            indices: Numbers of the simulations; an episode has begun in each.
-            snapshot: Of this task, perhaps of another process.
-            random_states: N sources of randomness, of which some are put back.
-
-        Returns:
-            All simulations as they stand.
-
-        Raises:
-            ValueError: if the snapshot is of another task.
-        """
-        self._random_states = list(random_states)
-        snapshot.require(self.snapshot(indices))
-        kept = snapshot.arrays
-        cases = kept["case_of"]
-        if cases.min() < 0 or cases.max() >= len(self._cases):
-            raise ValueError(f"the snapshot is of anatomies {cases.tolist()}")
-        set_random([random_states[i] for i in indices], snapshot.part("random"))
-        for name in _KEPT:
-            array = getattr(self, f"_{name}").copy()
-            array[indices] = kept[name]
-            setattr(self, f"_{name}", array)
-        for index in indices:
-            if len(self._cases) > 1:
-                self._load(index)
-            self._monitor.restart(index, self.case(index).scene)
-        self._stepper.set_states(indices, kept["state"])
-        for name, array in snapshot.part("effects").items():
-            self._effects.state[name][indices] = array
-        self._effects.refresh(indices)
-        # What MuJoCo derives is for pictures; the pass changes the state.
-        state = self._stepper.states()[indices]
-        self._stepper.forward_unactuated(indices)
-        self._stepper.set_states(indices, state)
-        self._choose_objective()
-        self._path = merged(self._path, Path(**snapshot.part("path")), indices)
-        self._measured = self._measured.restored(snapshot, indices)
-        self._resting = self._at_rest(self.readings)
-        machines = [self.case(index).angiograph for index in indices]
-        self._sensors.restore(indices, machines, snapshot.part("images"))
-        self._tracking.restore(indices, snapshot.part("tracking"))
-        return self._step(np.empty(0, dtype=int))
 
     # What others may read.
 

@@ -71,15 +71,3 @@ class TrackingNoise:
             errors = self._devices.reshape(devices.points.shape)
             devices = devices._replace(points=devices.points + errors)
         return readings, devices
-
-    @property
-    def state(self) -> dict[str, np.ndarray]:
-        """Arrays (N, ...) that a snapshot keeps."""
-        return {"line": self._line, "devices": self._devices} if self.on else {}
-
-    def restore(self, indices: np.ndarray, kept: dict[str, np.ndarray]) -> None:
-        """Puts some simulations (K,) to arrays (K, ...) of `state`."""
-        for name, array in kept.items():
-            own = getattr(self, f"_{name}").copy()
-            own[indices] = array
-            setattr(self, f"_{name}", own)

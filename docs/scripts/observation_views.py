@@ -1,12 +1,10 @@
 """What the image observations of a task show, option by option.
 
-Writes docs/images/observation_views.png and endoluminal.png (without OpenGL) and, where
-there is OpenGL (MUJOCO_GL=osmesa or egl), docs/images/camera_views.png.
+Writes docs/images/observation_views.png and endoluminal.png.
 """
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 
 import matplotlib
@@ -18,7 +16,6 @@ import numpy as np
 from cathsim_dmc import suite
 from cathsim_dmc.anatomy.arch import arch
 from cathsim_dmc.imaging import endoluminal as views
-from cathsim_dmc.tasks.cameras import CAMERAS
 
 IMAGES = Path(__file__).parents[1] / "images"
 TASK, SEED, STEPS = "type1_bca", 1, 60
@@ -82,25 +79,6 @@ def fluoroscopy() -> Path:
     return path
 
 
-def cameras() -> Path:
-    options = {"names": CAMERAS, "size": 256}
-    seen = drive(load(observation=["rgb", "depth"], cameras=options))
-    figure, axes = plt.subplots(2, 3, figsize=(9, 6), layout="constrained")
-    for column, name in enumerate(CAMERAS):
-        depth = seen[f"depth_{name}"][..., 0]
-        near = depth[depth < 1]
-        axes[0, column].imshow(seen[f"rgb_{name}"])
-        axes[1, column].imshow(depth, vmin=near.min(), vmax=near.max())
-        axes[0, column].set_title(f"rgb_{name}", fontsize=9)
-        low, high = near.min() * 1e3, near.max() * 1e3
-        axes[1, column].set_title(f"depth_{name}: {low:.0f}-{high:.0f} mm", fontsize=9)
-    for axis in axes.flat:
-        axis.set_axis_off()
-    path = IMAGES / "camera_views.png"
-    figure.savefig(path, dpi=100, pil_kwargs={"optimize": True})
-    return path
-
-
 def endoluminal() -> Path:
     """From places along the way to the LCCA of `type3`, looking ahead."""
     anatomy = arch.load("type3")
@@ -129,8 +107,6 @@ def main() -> None:
     """Draws the figures."""
     print(fluoroscopy())
     print(endoluminal())
-    if os.environ.get("MUJOCO_GL", "disable") != "disable":
-        print(cameras())
 
 
 if __name__ == "__main__":

@@ -12,9 +12,9 @@ import numpy as np
 
 from cathsim_dmc import suite
 from cathsim_dmc.imaging import VIEWS, FluoroscopyOptions
+from cathsim_dmc.imaging.options import VIEW_ANGLE
 from cathsim_dmc.physics.randomisation import DEFAULT_RANGES, Randomisation
 from cathsim_dmc.tasks import observations
-from cathsim_dmc.tasks.cameras import CAMERAS, CameraOptions
 from cathsim_dmc.tasks.observation_kind import Entry
 from cathsim_dmc.tasks.placement import COMMON_LENGTH
 
@@ -74,23 +74,15 @@ A cannulation of the left common carotid artery by the scripted expert:
 ![Cannulation](images/cannulation_strip.png)
 """
 
-CAMERA_TEXT = f"""
-## Cameras
+ENDOLUMINAL = f"""
+## Endoluminal views
 
-`rgb` and `depth` need OpenGL: set `MUJOCO_GL` to `egl`, `osmesa` or `glfw` before
-Python starts. Cameras are {", ".join(f"`{name}`" for name in CAMERAS)}; the last is an
-endoscope at the distal end.
-`task_kwargs={{"cameras": {{"names": [...], "size": 128}}}}`
-selects them.
-
-`endoluminal` and `endoluminal_distance` see from the same place and at the same angle
-as `tip`, without OpenGL: rays are traced through the lumen, at rest or moving. The
-option `cameras` sets their size too. The device itself is not seen, and an open end of
-the lumen is closed.
+`endoluminal` and `endoluminal_distance` see {VIEW_ANGLE:g}° from the head of the device,
+without OpenGL: rays are traced through the lumen, at rest or moving. The option
+`endoluminal_size` sets their size. The device itself is not seen, and an open end of the
+lumen is closed.
 
 ![From the aorta to a branch: grey levels and distances](images/endoluminal.png)
-
-![Cameras](images/camera_views.png)
 """
 
 RANDOMISATION = """
@@ -147,7 +139,7 @@ def entries_table() -> str:
     ]
     for name, kind in kinds.items():
         for entry in kind.entries:
-            spec = specs[entry.key.replace("<camera>", CameraOptions().names[0])]
+            spec = specs[entry.key]
             rows.append(
                 _row(
                     f"`{name}`",
@@ -195,7 +187,7 @@ def page() -> str:
     parts.append(COAXIAL.replace("{table}", coaxial_table()))
     table = options_table(FluoroscopyOptions, FluoroscopyOptions(), "default")
     parts.append(FLUOROSCOPY.replace("{table}", table))
-    parts.append(CAMERA_TEXT)
+    parts.append(ENDOLUMINAL)
     table = options_table(Randomisation, DEFAULT_RANGES, "default range")
     parts.append(RANDOMISATION.replace("{table}", table))
     assert len(_attributes(Randomisation)) == len(dataclasses.fields(Randomisation))
