@@ -181,7 +181,6 @@ TRAINING = {
     "checkpoint_seconds": POSITIVE,
     "keep_checkpoints": whole(1),
     "metrics_frames": whole(1),
-    "tensorboard": flag(),
     "torch_threads": whole(1),
 }
 CRITIC = {"critic_observation": st.sampled_from(["", 1, [], [1], {}, 1.5, (), True])}

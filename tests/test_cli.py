@@ -172,7 +172,7 @@ TINY = (
 def test_every_setting_is_a_typed_option(cathsim, tmp_path):
     code, out, err = cathsim(
         "train", "navigate", "--out", tmp_path, *TINY, "--frames", 64,
-        "--phantom", "simple2", "--goal", "lcca", "--hidden", 8, 8, "--no-tensorboard",
+        "--phantom", "simple2", "--goal", "lcca", "--hidden", 8, 8,
         "--target-kl", 0.5, "--friction", 0.1, "--observation", "tracking", "force",
     )  # fmt: skip
     assert code == 0, err

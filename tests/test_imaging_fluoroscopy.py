@@ -13,7 +13,6 @@ from cathsim_dmc.imaging import (
     angiograph,
     detector,
     materials,
-    rgb,
 )
 from cathsim_dmc.imaging.device import Shadow
 
@@ -120,9 +119,9 @@ def test_roadmap_lightens_the_vessel(fluoroscope, frames):
 
 
 def test_device_mask_covers_the_catheter(fluoroscope, frames):
-    masks = fluoroscope.masks(frames, RADIUS)
-    assert masks.device.shape == (20, 128, 128) and masks.device.dtype == bool
-    for mask, points in zip(masks.device, frames, strict=True):
+    masks = fluoroscope.device_mask(Shadow(frames, RADIUS))
+    assert masks.shape == (20, 128, 128) and masks.dtype == bool
+    for mask, points in zip(masks, frames, strict=True):
         pixels, _ = fluoroscope.carm.project(points)
         t = np.linspace(0, 36, 800)
         line = np.stack([np.interp(t, np.arange(37), p) for p in pixels.T], -1)
@@ -192,7 +191,7 @@ def test_seeds_decide_the_noise(fluoroscope, frames):
     assert residual[tissue].std() == pytest.approx(expected, rel=0.15)
 
 
-# ------------------------------------------------------------- biplane, rgb
+# ------------------------------------------------------------------ biplane
 
 
 def test_biplane_stacks_two_views(vessel, frames):
@@ -211,12 +210,3 @@ def test_biplane_stacks_two_views(vessel, frames):
     one = [Shadow(frames[4:5], RADIUS)]
     single = angiograph.images(machines[:1], one, [state])
     assert (noisy[4] == single[0]).all()
-
-
-def test_rgb_repeats_the_grey_channel(fluoroscope, frames):
-    image = fluoroscope.render(frames[0], RADIUS)
-    colour = rgb(image)
-    assert colour.shape == (128, 128, 3) and colour.dtype == np.uint8
-    assert (colour == image).all()
-    with pytest.raises(ValueError, match="biplane"):
-        rgb(np.zeros((128, 128, 2), dtype=np.uint8))

@@ -9,7 +9,6 @@ from recording_samples import make_tube
 
 import cathsim_dmc
 from cathsim_dmc import suite
-from cathsim_dmc.pictures import video
 from cathsim_dmc.pictures.animation import animate
 from cathsim_dmc.pictures.figure import scene_figure
 from cathsim_dmc.pictures.moment import Moment
@@ -45,39 +44,6 @@ def test_forces_are_those_of_the_task(pushed):
     text = repr(readout)
     assert f"{1e3 * readout.wall_max:.2f} mN" in text
     assert len(text.splitlines()) == 3 + len(readout)
-
-
-def test_a_film_for_slides_plays_the_episode(pushed, tmp_path):
-    av = pytest.importorskip("av", reason="needs the extra mp4")
-    env, episode = pushed
-    surface = env.task.scene.anatomy.surface
-    path = animate(
-        episode, surface, tmp_path / "film.mp4", frames=4, width=321, seconds=2.0
-    )
-    with av.open(str(path)) as file:
-        assert file.streams.video[0].codec_context.name == "h264"
-        seconds = file.duration / av.time_base
-        frames = [one.to_ndarray(format="rgb24") for one in file.decode(video=0)]
-    assert len({frame.shape for frame in frames}) == 1
-    rows, columns, _ = frames[0].shape
-    assert rows % 2 == columns % 2 == 0 and abs(columns - 321) < 4
-    # Four pictures, and the last one for a while.
-    assert 3.0 < seconds < 4.0 and len(frames) == 4 + 3
-    moved = np.abs(frames[0].astype(int) - frames[3]).mean()
-    still = np.abs(frames[3].astype(int) - frames[-1]).mean()
-    assert moved > 1 > 3 * still
-
-
-def test_without_an_encoder_no_work_is_lost(pushed, tmp_path, monkeypatch):
-    env, _ = pushed
-    monkeypatch.setattr(video.importlib.util, "find_spec", lambda name: None)
-
-    def never(observation):
-        raise AssertionError("it was played")
-
-    with pytest.raises(ImportError, match=r"cathsim-dmc\[mp4\]"):
-        cathsim_dmc.record(env, never, tmp_path / "film.mp4")
-    assert not list(tmp_path.iterdir())
 
 
 def test_the_fluoroscopy_of_a_state_shows_where_the_head_is(pushed):
@@ -196,7 +162,7 @@ def test_the_frames_of_a_film_differ_where_the_device_moves(pushed, tmp_path):
         (
             lambda env: cathsim_dmc.record(env, "push", "e.avi"),
             ValueError,
-            ".rrd, .npz, .gif, .webp, .mp4",
+            ".rrd, .npz, .gif, .webp",
         ),
         (
             lambda env: cathsim_dmc.record(env, "push", "none/e.gif"),

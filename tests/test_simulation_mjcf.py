@@ -1,7 +1,9 @@
 """A task as files: another program that steps the scene gets what the task gets."""
 
 import json
+import sys
 import types
+from pathlib import Path
 
 import mujoco
 import numpy as np
@@ -10,7 +12,11 @@ import pytest
 from cathsim_dmc import suite
 from cathsim_dmc.physics import forces
 from cathsim_dmc.physics.drives import Drives
-from cathsim_dmc.simulation.mjcf import write_mjcf
+
+SCRIPTS = Path(__file__).parents[1] / "docs" / "scripts"
+sys.path.insert(0, str(SCRIPTS))
+
+from mjcf_scene import write_mjcf  # noqa: E402
 
 TASK, SEED, STEPS = "type1_lcca", 3, 30
 

@@ -68,8 +68,6 @@ class TrainingConfig:
             time, so that a killed run loses no more.
         keep_checkpoints: Number of the newest checkpoints that stay on disk.
         metrics_frames: Number of frames between two rows of metrics.csv.
-        tensorboard: Whether to write TensorBoard event files too (needs the
-            `tensorboard` extra).
         torch_device: Torch device of the networks, such as "cpu" or "cuda"; the
             simulation is always on the CPU.
         torch_threads: Number of threads of one torch operation. One is fastest for
@@ -88,7 +86,6 @@ class TrainingConfig:
             "checkpoint_seconds",
             "keep_checkpoints",
             "metrics_frames",
-            "tensorboard",
             "num_threads",
             "torch_threads",
             "torch_device",
@@ -120,7 +117,6 @@ class TrainingConfig:
     checkpoint_seconds: float = positive(120.0)
     keep_checkpoints: int = positive(3)
     metrics_frames: int = positive(2_048)
-    tensorboard: bool = False
     torch_device: str = "cpu"
     torch_threads: int = positive(1)
 

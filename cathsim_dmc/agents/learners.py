@@ -16,7 +16,7 @@ from cathsim_dmc.agents.sac import SAC, SACConfig
 
 # Fields of configs in older files that mean nothing any more.
 _RETIRED = frozenset(
-    {"backend", "collector", "collectors"}
+    {"backend", "collector", "collectors", "tensorboard"}
     | {"rerun", "rerun_every", "rerun_steps", "rerun_viewer"}
 )
 

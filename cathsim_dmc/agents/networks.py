@@ -23,8 +23,8 @@ from cathsim_dmc.tasks import observations
 NORMAL = "observation_normal"
 NORMAL_PIXELS = "pixels_normal"
 
-# A deviation below exp(-5) before the tanh no longer explores; above exp(2) all
-# actions sit at their bounds.
+# A deviation below exp(-5) before the tanh explores nothing; above exp(2) all
+# actions are at their bounds.
 LOG_STD_RANGE = (-5.0, 2.0)
 
 

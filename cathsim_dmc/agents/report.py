@@ -283,7 +283,7 @@ def record(
             leaves it to the task.
         task_kwargs: Options of the task, over those that the policy was trained with.
         fluoroscopy: Whether to include X-ray images.
-        gif: Path of the film, .gif, .webp or .mp4; None makes none.
+        gif: Path of the film, .gif or .webp; None makes none.
 
     Returns:
         The episode.
@@ -291,7 +291,6 @@ def record(
     Raises:
         ValueError: `out` is no .rrd file, `gif` no film, there is neither, or no task
             is known.
-        ImportError: an MP4 is asked for without the extra `mp4`.
         CheckpointError: there is no such checkpoint, or it is damaged.
     """
     targets = _targets(out, gif)

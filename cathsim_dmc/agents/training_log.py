@@ -1,4 +1,4 @@
-"""Figures of a training run: metrics.csv, TensorBoard, progress."""
+"""Figures of a training run: metrics.csv and progress."""
 
 import csv
 import io
@@ -7,12 +7,11 @@ from collections import deque
 from collections.abc import Iterable, Mapping, Sequence
 from operator import attrgetter
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from cathsim_dmc import files
-from cathsim_dmc.agents.config import ConfigError, TrainingConfig
+from cathsim_dmc.agents.config import TrainingConfig
 from cathsim_dmc.agents.episodes import EpisodeOutcome
 from cathsim_dmc.agents.progress import progress_bar
 
@@ -72,7 +71,6 @@ class TrainingLog:
         rows = _texts(self._path) if resumed and self._path.exists() else []
         self._rows: list[dict] = [r for r in rows if int(r["frames"]) <= frames]
         self._write()
-        self._board = _tensorboard(run) if config.tensorboard else None
         self._bar = progress_bar(
             f"{config.algorithm} {config.task}",
             " frames",
@@ -84,10 +82,8 @@ class TrainingLog:
         self._began = time.monotonic()
 
     def close(self) -> None:
-        """Closes what is open."""
+        """Closes the progress bar."""
         self._bar.close()
-        if self._board is not None:
-            self._board.close()
 
     @property
     def seconds(self) -> float:
@@ -133,9 +129,6 @@ class TrainingLog:
             }
             self._rows.append(texts)
             self._write()
-            for name, value in self.row.items():
-                if self._board is not None and name != "frames" and value is not None:
-                    self._board.add_scalar(name, value, self.frames)
         shown = {"step_reward": step_reward, **means}
         self._bar.set_postfix(
             {name: value for name, value in shown.items() if value is not None},
@@ -181,13 +174,3 @@ def _episode_means(window: Iterable[Sequence[float | None]]) -> dict[str, float 
         known = [value for value in values if value is not None]
         means[name] = float(np.mean(known)) if known else None
     return means
-
-
-def _tensorboard(run: Path) -> Any:
-    try:
-        from torch.utils.tensorboard import SummaryWriter
-    except ImportError as error:
-        raise ConfigError(
-            "tensorboard=True needs the extra: pip install 'cathsim-dmc[tensorboard]'."
-        ) from error
-    return SummaryWriter(run / "tensorboard")

@@ -15,10 +15,7 @@ from cathsim_dmc.cli.measurements import benchmarks, validations
 from cathsim_dmc.cli.options import (
     BAD_INPUT,
     INTERRUPTED,
-    NO_ANATOMY,
     Json,
-    OwnAnatomy,
-    Task,
     print_json,
 )  # fmt: skip
 from cathsim_dmc.cli.phantoms import phantoms
@@ -57,22 +54,6 @@ def list_tasks(devices: bool = False, json: Json = False) -> int:
     for name, line in lines.items():
         table.add_row(name, line)
     Console().print(table)
-    return 0
-
-
-@app.command
-def mjcf(task: Task, /, out: Path, seed: int = 0, anatomy: OwnAnatomy = NO_ANATOMY):
-    """Write the scene of a task as MJCF, with the start of an episode as JSON.
-
-    Args:
-        out: Directory to write, which must not exist: scene.xml, which MuJoCo's
-            viewer opens, and task.json.
-        seed: Seed of the episode.
-        anatomy: Where the task takes place.
-    """
-    from cathsim_dmc.simulation.mjcf import write_mjcf
-
-    print(write_mjcf(task, out, seed=seed, task_kwargs=anatomy.task_kwargs))
     return 0
 
 

@@ -135,7 +135,7 @@ def record(
     policy: PolicyName,
     /,
     out: Path | None = None,
-    gif: Annotated[Path | None, conf.arg(aliases=("--mp4",))] = None,
+    gif: Path | None = None,
     task: str | None = None,
     seed: int = EVALUATION_SEED,
     max_steps: MaxSteps = None,
@@ -146,8 +146,7 @@ def record(
 
     Args:
         out: Path of the .rrd file.
-        gif: Path of a film for slides, .gif, .webp or, with the extra `mp4`, .mp4;
-            needs no OpenGL.
+        gif: Path of a film for slides, .gif or .webp; needs no OpenGL.
         task: Task of `cathsim list`; by default the one that the policy was trained on,
             or navigate where `--anatomy` names another anatomy.
         seed: Seed of the episode.

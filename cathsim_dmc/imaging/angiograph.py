@@ -137,9 +137,10 @@ def masks(machines: Sequence[Planes], shadows: Sequence[Shadow]) -> np.ndarray:
         both = np.empty((len(machines), *shape, 2), dtype=np.uint8)
         for chosen in _alike(machines):
             own = [shadow.of(chosen) for shadow in shadows]
-            mask = machines[chosen[0]][plane].masks_of(own)
-            both[chosen, ..., 0] = mask.device * np.uint8(255)
-            both[chosen, ..., 1] = mask.vessel * np.uint8(255)
+            fluoroscope = machines[chosen[0]][plane]
+            seen = np.any([fluoroscope.device_mask(one) for one in own], axis=0)
+            both[chosen, ..., 0] = seen * np.uint8(255)
+            both[chosen, ..., 1] = fluoroscope.vessel_mask * np.uint8(255)
         channels.append(both)
     return np.concatenate(channels, axis=-1)
 

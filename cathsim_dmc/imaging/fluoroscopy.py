@@ -9,7 +9,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -29,13 +28,6 @@ MASK_SHARE = 0.25
 _CHUNK = 16
 
 RandomStates = np.random.RandomState | Sequence[np.random.RandomState]
-
-
-class Masks(NamedTuple):
-    """Segmentation: `device` (..., rows, columns) and `vessel` (rows, columns) bool."""
-
-    device: np.ndarray
-    vessel: np.ndarray
 
 
 @dataclass(frozen=True, eq=False)
@@ -212,18 +204,7 @@ class Fluoroscope:
     def _roadmap_gain(self) -> np.ndarray:
         return detector.roadmap_gain(self.vessel_mask, self.roadmap, self.gain)
 
-    def masks(self, points: ArrayLike, radius: ArrayLike) -> Masks:
-        """Which pixels show the device, and which the vessel; arguments of `render`."""
-        return self.masks_of([Shadow(np.asarray(points), radius)])
-
-    def masks_of(self, shadows: Sequence[Shadow]) -> Masks:
-        """Which pixels show one of several devices, and which the vessel."""
-        seen = self._shows(shadows[0])
-        for shadow in shadows[1:]:
-            seen |= self._shows(shadow)
-        return Masks(device=seen, vessel=self.vessel_mask)
-
-    def _shows(self, shadow: Shadow) -> np.ndarray:
+    def device_mask(self, shadow: Shadow) -> np.ndarray:
         """Pixels (..., rows, columns) bool that show a device."""
         thickness = device_thickness(self.carm, shadow.points, shadow.radius)
         radii = np.asarray(shadow.radius, dtype=np.float64)
@@ -241,14 +222,3 @@ def _paths(
     """Path length through the lumen, and pixels whose central ray meets it."""
     central = surface_thickness(carm, vertices, faces, 1)
     return surface_thickness(carm, vertices, faces, supersample), central > 0.0
-
-
-def rgb(image: ArrayLike) -> np.ndarray:
-    """Grey images (..., rows, columns, 1) as (..., rows, columns, 3), for viewers."""
-    image = np.asarray(image)
-    if image.ndim < 3 or image.shape[-1] != 1:
-        raise ValueError(
-            f"image has shape {image.shape}; give (..., rows, columns, 1), of a "
-            "biplane image one channel at a time (image[..., :1])."
-        )
-    return np.repeat(image, 3, axis=-1)

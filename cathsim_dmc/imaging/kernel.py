@@ -234,56 +234,58 @@ def _add_link(
     nearest = min(z0, z0 + dz)
     if not nearest > NEAREST:
         return length, 0.0
-
     # Ends in pixels from the middle of the image.
     wide = radius * focal / nearest
     u0, v0 = x0 * focal / z0, y0 * focal / z0
     u1, v1 = (x0 + dx) * focal / (z0 + dz), (y0 + dy) * focal / (z0 + dz)
     broad, high = 0.5 * columns + wide, 0.5 * rows + wide
-    if (
-        min(u0, u1) >= broad
-        or max(u0, u1) <= -broad
-        or min(v0, v1) >= high
-        or max(v0, v1) <= -high
-    ):
+    beside = min(u0, u1) >= broad or max(u0, u1) <= -broad
+    if beside or min(v0, v1) >= high or max(v0, v1) <= -high:
         return length, 0.0
     if wide > WIDEST:
         return length, wide
-
     spacing = max(SPACING, RELATIVE_SPACING * wide)
     # A link that runs far out of the image must not take for ever.
     most = 4.0 * (rows + columns) / SPACING
     count = int(min(max(math.ceil(math.hypot(u1 - u0, v1 - v0) / spacing), 1.0), most))
     piece = length / count
-    a, b, _, d, e, _ = bends(camera, link)
+    turns = bends(camera, link)
     for step in range(count):
         fraction = (step + 0.5) / count
         # Of the link without its round ends, which are straight.
         t = min(max(fraction * stretch - back, 0.0), 1.0)
-        sag = t * (1.0 - t)
-        behind, before = sag * (1.0 - t), sag * t
-        x = x0 + fraction * dx + behind * a - before * d
-        y = y0 + fraction * dy + behind * b - before * e
-        z = z0 + fraction * dz  # a bend hardly changes the magnification
         weight = mu
         if marker_length > 0.0:
             distal = to_tip + (1.0 - fraction) * length
             inside = min(max((marker_length - distal) / piece + 0.5, 0.0), 1.0)
             weight += (marker_mu - mu) * inside
-        # A pixel sees, at this depth, an area (depth / focal)² across the beam axis
-        # and 1 / slant of that across its ray; volume over area is the mean path.
-        scale = focal / z
-        slant = math.sqrt(x * x + y * y + z * z) / z
-        weight *= math.pi * radius**2 * piece * slant * scale**2
-        add_disc(
-            image,
-            y * scale + 0.5 * (rows - 1),
-            x * scale + 0.5 * (columns - 1),
-            radius * scale,
-            weight,
-            scratch,
-        )
+        start = x0 + fraction * dx, y0 + fraction * dy, z0 + fraction * dz
+        _add_piece(image, start, turns, t, radius, weight, piece, focal, scratch)
     return length, wide
+
+
+@compiled
+def _add_piece(image, chord, turns, t, radius, weight, length, focal, scratch) -> None:
+    """Adds a piece of a link, at a place of its chord, as a disc.
+
+    Args:
+        turns: of the link's curve, see `bends`; the piece is at `t` of it.
+        weight: its attenuation, 1/m.
+    """
+    rows, columns = image.shape
+    x, y, z = chord
+    a, b, _, d, e, _ = turns
+    sag = t * (1.0 - t)
+    behind, before = sag * (1.0 - t), sag * t
+    x = x + behind * a - before * d
+    y = y + behind * b - before * e  # a bend hardly changes the magnification
+    # A pixel sees, at this depth, an area (depth / focal)² across the beam axis
+    # and 1 / slant of that across its ray; volume over area is the mean path.
+    scale = focal / z
+    slant = math.sqrt(x * x + y * y + z * z) / z
+    weight *= math.pi * radius**2 * length * slant * scale**2
+    row, column = y * scale + 0.5 * (rows - 1), x * scale + 0.5 * (columns - 1)
+    add_disc(image, row, column, radius * scale, weight, scratch)
 
 
 @compiled

@@ -13,12 +13,11 @@ from PIL import Image
 
 from cathsim_dmc.files import atomic_path
 from cathsim_dmc.pictures import figure as drawing
-from cathsim_dmc.pictures import video
 from cathsim_dmc.pictures.moment import Moment, xray
 from cathsim_dmc.pictures.translucent import Glass, ParallelProjection, glass
 from cathsim_dmc.recording.episode import Episode
 
-SUFFIXES = (".gif", ".webp", video.SUFFIX)
+SUFFIXES = (".gif", ".webp")
 FRAMES = 90
 # The last frame stays for so long before it begins again, ms.
 _HOLD_MS = 1500
@@ -41,14 +40,14 @@ def animate(
     width: int = 860,
     quality: int = 80,
 ) -> Path:
-    """Write an episode as an animated GIF or WebP or an MP4, whole or not at all.
+    """Write an episode as an animated GIF or WebP, whole or not at all.
 
     On the left the vessel as glass with device, goal and contact forces, on the right
     the X-ray image over the force on the wall.
 
     Args:
         surface: Lumen surface with `vertices` and `faces`.
-        path: File to write, `.gif`, `.webp` or, with the extra `mp4`, `.mp4`.
+        path: File to write, `.gif` or `.webp`.
         view: Direction of view, of `figure.VIEWS`.
         seconds: Length of the film without its last pause; None takes the episode's,
             at least 2 and at most 12.
@@ -63,7 +62,6 @@ def animate(
         ValueError: on another suffix, an unknown view, fewer than two frames, or an
             episode without a goal.
         FileNotFoundError: if the folder does not exist.
-        ImportError: if an MP4 is asked for and cannot be encoded.
     """
     path = Path(path)
     check_film(path)
@@ -80,10 +78,6 @@ def animate(
         for picture in _Film(episode, surface, view, width).pictures(chosen)
     ]
     tick = max(round(1000 * seconds / len(pictures)), _TICK_MS)
-    if path.suffix == video.SUFFIX:
-        with atomic_path(path, path.suffix) as temporary:
-            video.write_mp4(temporary, pictures, tick, _HOLD_MS)
-        return path
     times = [tick] * (len(pictures) - 1) + [_HOLD_MS]
     options: dict[str, Any] = {"quality": quality, "method": 4}
     if path.suffix == ".gif":
@@ -102,16 +96,9 @@ def animate(
 
 
 def check_film(path: Path) -> None:
-    """Raise unless a film of this name can be written.
-
-    Raises:
-        ValueError: on another suffix.
-        ImportError: if an MP4 is asked for and cannot be encoded.
-    """
+    """Raise ValueError unless a film of this name can be written."""
     if path.suffix not in SUFFIXES:
         raise ValueError(f"a film is a {' or '.join(SUFFIXES)} file, not {path.name}")
-    if path.suffix == video.SUFFIX:
-        video.require_encoder()
 
 
 def _one_palette(pictures: list[Image.Image]) -> list[Image.Image]:

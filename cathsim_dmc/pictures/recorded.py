@@ -12,7 +12,6 @@ import numpy as np
 
 from cathsim_dmc import policies
 from cathsim_dmc.imaging import Angiograph, FluoroscopyOptions
-from cathsim_dmc.pictures import video
 from cathsim_dmc.recording.drawing import link_radii
 from cathsim_dmc.recording.episode import Episode
 from cathsim_dmc.recording.living import MESH_EVERY, VesselRecord
@@ -22,7 +21,7 @@ from cathsim_dmc.recording.scene import body_geoms
 # A name of `policies.POLICIES`, a policy, or a function from the observation (a
 # dictionary of arrays) to the action (A,).
 AnyPolicy = str | policies.Policy | Callable[[Any], np.ndarray]
-FORMATS = (".rrd", ".npz", ".gif", ".webp", ".mp4")
+FORMATS = (".rrd", ".npz", ".gif", ".webp")
 # X-ray images of a recording: pixels along a side, and how far the view is zoomed in.
 _FILM_SIZE, _FILM_MAGNIFICATION = 512, 1.3
 
@@ -42,8 +41,8 @@ def record(
         env: What `cathsim_dmc.suite.load` returns; it stays usable.
         policy: Name in `policies.POLICIES`, a `Policy`, or a function from the
             observation to the action.
-        path: File to write: `.rrd` (Rerun), `.npz` (arrays), `.gif`, `.webp` or
-            `.mp4` (moving picture); None writes none.
+        path: File to write: `.rrd` (Rerun), `.npz` (arrays), `.gif` or `.webp`
+            (moving picture); None writes none.
         seed: Seed of the episode; None goes on from the environment's random state.
         max_steps: Number of control steps after which the episode is cut off.
         task_name: Name of the task in the record; that of the environment otherwise.
@@ -56,7 +55,6 @@ def record(
         ValueError: the policy's name or the file's kind does not exist, or the policy
             returns no action of the environment.
         FileNotFoundError: the file's folder does not exist.
-        ImportError: an MP4 is asked for without the extra `mp4`.
     """
     task = navigation_of(env)
     target = None if path is None else _checked(path)
@@ -76,8 +74,6 @@ def _checked(path: str | os.PathLike[str]) -> Path:
             f"the recording is to be written to {target}; give a file that ends in "
             f"{', '.join(FORMATS)}"
         )
-    if target.suffix == video.SUFFIX:
-        video.require_encoder()
     if not target.parent.is_dir():
         raise FileNotFoundError(f"no folder {target.parent}; make it first")
     return target

@@ -49,7 +49,7 @@ def effective_count(samples: np.ndarray) -> float:
     """Number of independent samples in a time series (n,).
 
     n over the integrated autocorrelation time, summed up to the first lag at which
-    the autocorrelation is no longer positive.
+    the autocorrelation is not positive.
     """
     n = len(samples)
     centred = samples - samples.mean()

@@ -136,7 +136,7 @@ class Rig:
         )
 
     def compile(self) -> None:
-        """Compiles the model; fixtures can no longer be added."""
+        """Compiles the model; fixtures are added before."""
         physics = mjcf.Physics.from_mjcf_model(self.arena.mjcf_model)
         self._physics = physics  # owns model and data
         self.model = physics.model.ptr

@@ -18,7 +18,8 @@ from scipy.ndimage import gaussian_filter1d
 
 from cathsim_dmc.anatomy.arch.arch import ARCHES, arch_tree
 from cathsim_dmc.anatomy.surface import lumen_surface
-from cathsim_dmc.imaging import VIEWS, CArm, Fluoroscope, rgb
+from cathsim_dmc.imaging import VIEWS, CArm, Fluoroscope
+from cathsim_dmc.imaging.device import Shadow
 from cathsim_dmc.imaging.options import DETECTOR_SIZE
 
 OUTPUT = Path(__file__).parents[1] / "images" / "fluoroscopy_views.png"
@@ -59,10 +60,9 @@ def views(tree, surface) -> dict[str, np.ndarray]:
     images["LAO45, roadmap"] = road.render(
         points, CATHETER_RADIUS, np.random.RandomState(2)
     )
-    masks = scope.masks(points, CATHETER_RADIUS)
-    coloured = rgb(live.render(points, CATHETER_RADIUS)) // 2 + 100
-    coloured[masks.vessel] = (140, 170, 220)
-    coloured[masks.device] = (200, 30, 30)
+    coloured = live.render(points, CATHETER_RADIUS).repeat(3, axis=-1) // 2 + 100
+    coloured[scope.vessel_mask] = (140, 170, 220)
+    coloured[scope.device_mask(Shadow(points, CATHETER_RADIUS))] = (200, 30, 30)
     images["LAO45, masks"] = coloured
 
     close = CArm.view("LAO45", magnification=2.5, resolution=(512, 512))

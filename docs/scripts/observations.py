@@ -12,7 +12,6 @@ import numpy as np
 
 from cathsim_dmc import suite
 from cathsim_dmc.imaging import VIEWS, FluoroscopyOptions
-from cathsim_dmc.imaging.options import VIEW_ANGLE
 from cathsim_dmc.physics.randomisation import DEFAULT_RANGES, Randomisation
 from cathsim_dmc.tasks import observations
 from cathsim_dmc.tasks.observation_kind import Entry
@@ -74,13 +73,13 @@ A cannulation of the left common carotid artery by the scripted expert:
 ![Cannulation](images/cannulation_strip.png)
 """
 
-ENDOLUMINAL = f"""
+ENDOLUMINAL = """
 ## Endoluminal views
 
-`endoluminal` and `endoluminal_distance` see {VIEW_ANGLE:g}° from the head of the device,
-without OpenGL: rays are traced through the lumen, at rest or moving. The option
-`endoluminal_size` sets their size. The device itself is not seen, and an open end of the
-lumen is closed.
+`endoluminal` and `endoluminal_distance` see a right angle ahead of the device, without
+OpenGL: rays are traced through the lumen, at rest or moving. The option
+`endoluminal_size` sets their size. The device itself is not seen, and an open end of
+the lumen is closed.
 
 ![From the aorta to a branch: grey levels and distances](images/endoluminal.png)
 """

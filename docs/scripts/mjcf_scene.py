@@ -1,5 +1,7 @@
 """A task as files: the scene as MJCF, and what another program needs to run it.
 
+    python docs/scripts/mjcf_scene.py type1_lcca DIR
+
 MuJoCo's viewer, its WebAssembly build and other engines read the scene; the page in
 the browser is one of them.
 """
@@ -9,6 +11,7 @@ from __future__ import annotations
 import itertools
 import json
 import os
+import sys
 from collections.abc import Iterator
 from importlib import metadata
 from pathlib import Path
@@ -213,3 +216,7 @@ def _branch(objective: Any) -> dict[str, Any] | None:
         "radii": line.radii.tolist(),
         "ostium": float(objective.ostium),
     }
+
+
+if __name__ == "__main__":
+    print(write_mjcf(*sys.argv[1:3]))
