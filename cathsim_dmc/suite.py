@@ -138,8 +138,12 @@ def make_task(
         )
     definition = TASKS[name]
     options = {**definition.options, **options}
+    if unknown := sorted(set(options) - {*task_options(name)}):
+        raise ValueError(
+            f"no task option {', '.join(map(repr, unknown))}; there are random, "
+            f"{', '.join(task_options(name))}"
+        )
     own = {key: options.pop(key) for key in definition.own_options if key in options}
-    _refuse_unknown(definition, options)
     config = NavigationConfig(
         **{key: value for key, value in options.items() if key in _CONFIG_FIELDS}
     )
@@ -197,21 +201,6 @@ def task_options(name: str) -> tuple[str, ...]:
     definition = TASKS[name]
     of_objective = (o for o in definition.objective_options if o != "farthest_shift")
     return (*definition.own_options, *of_objective, *_CONFIG_FIELDS)
-
-
-def _refuse_unknown(definition: TaskDefinition, options: Mapping[str, Any]) -> None:
-    known = (
-        *_CONFIG_FIELDS,
-        *definition.objective_options,
-        *(definition.own_options if definition.random_arch else ()),
-    )
-    known = [name for name in known if name != "farthest_shift"]
-    unknown = sorted(set(options) - set(known))
-    if unknown:
-        raise ValueError(
-            f"no task option {', '.join(map(repr, unknown))}; there are random, "
-            f"{', '.join(known)}"
-        )
 
 
 def load(

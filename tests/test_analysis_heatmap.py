@@ -35,16 +35,6 @@ def test_a_contact_lies_in_the_cell_that_its_edges_say():
     assert field.mean[3, 0] == 5.0
 
 
-def test_wrong_maps_are_refused():
-    low, high = np.zeros(2), np.ones(2)
-    with pytest.raises(ValueError, match="as many"):
-        force_map(np.zeros((2, 3)), np.zeros(3), low, high)
-    with pytest.raises(ValueError, match="positive"):
-        force_map(np.zeros((2, 3)), np.zeros(2), high, low)
-    with pytest.raises(ValueError, match="positive"):
-        force_map(np.zeros((2, 3)), np.zeros(2), low, high, 0.0)
-
-
 def picture_of(tmp_path, episodes, **options):
     from matplotlib.image import imread
 

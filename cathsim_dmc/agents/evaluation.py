@@ -1,5 +1,6 @@
 """Evaluation: fixed seeds, each episode counted once, intervals beside every mean."""
 
+import contextlib
 import dataclasses
 import itertools
 import json
@@ -269,31 +270,28 @@ def evaluate(
     player = load_policy(policy, seed)
     task, options = task_and_options(player, task, task_kwargs)
     options = options if task_kwargs is None else dict(task_kwargs)
-    settings = _settings(player, observation, options)
-    outcomes: list[EpisodeOutcome] = []
+    observed = observation or player.observation or "internal"
     parts = protocols.parts(conditions, task, options, episodes, seed)
+    outcomes: list[EpisodeOutcome] = []
     for part in parts:
         env = make_env(
-            task,
-            observation=settings["observation"],
-            num_envs=len(part.seeds),
-            num_threads=num_threads,
+            task, observation=observed, num_envs=len(part.seeds),
+            num_threads=num_threads, task_kwargs=part.task_kwargs,
             seed=part.seeds if conditions.task_kwargs else part.seeds[0],
-            task_kwargs=part.task_kwargs,
-        )
-        try:
+        )  # fmt: skip
+        with contextlib.closing(env):
             outcomes += _first_episodes(env, player, observer)
-        finally:
-            env.close()
+    trained = getattr(player, "checkpoint", None)
     result = EvaluationResult(
         task,
         name or player.name,
         tuple(seed for part in parts for seed in part.seeds),
         tuple(outcomes),
-        {"protocol": protocol, **settings},
+        {"protocol": protocol, "observation": observed, "task_kwargs": options,
+         "frames": trained and trained.frames},
         protocols.distinct(task, parts[0].task_kwargs),
         tuple(drawn for part in parts for drawn in part.conditions),
-    )
+    )  # fmt: skip
     if out_dir is not None:
         write_evaluation(out_dir, result.to_dict())
     return result
@@ -305,17 +303,6 @@ def check_numbers(episodes: int, seed: int, num_threads: int | None) -> None:
     bounds.seed("seed", seed)
     if num_threads is not None:
         bounds.whole("num_threads (--threads)", num_threads, 1, bounds.MOST_THREADS)
-
-
-def _settings(
-    policy: Policy, observation: str | Sequence[str] | None, options: dict[str, Any]
-) -> dict[str, Any]:
-    checkpoint = getattr(policy, "checkpoint", None)
-    return {
-        "observation": observation or policy.observation or "internal",
-        "task_kwargs": options,
-        "frames": checkpoint.frames if checkpoint else None,
-    }
 
 
 class _Environments:

@@ -72,11 +72,10 @@ def train(
     """Train an agent, or continue a run from its newest checkpoint.
 
     The directory receives config.json, metrics.csv and checkpoints/<frames>/ (SAC:
-    also replay/). SIGINT or SIGTERM
-    end the run after the current batch with a checkpoint. After kill -9, `resume=True`
-    continues from the newest complete checkpoint: frames are counted from there, rows
-    of metrics.csv beyond it are dropped, episodes that were running start anew. One
-    process at a time trains in a directory.
+    also replay/). SIGINT or SIGTERM end the run after the current batch with a
+    checkpoint. After kill -9, `resume=True` continues from the newest complete
+    checkpoint: frames are counted from there, rows of metrics.csv beyond it are
+    dropped, episodes that were running start anew. One process at a time trains there.
 
     Args:
         config: Settings: what to train, and how.
@@ -116,24 +115,13 @@ def train(
         else:
             torch.manual_seed(config.seed + 1)
         log = TrainingLog(
-            run,
-            config,
-            learner.metrics,
-            **state,
-            resumed=checkpoint is not None,
+            run, config, learner.metrics, **state, resumed=checkpoint is not None,
             progress=progress,
-        )
+        )  # fmt: skip
         stack.callback(log.close)
-        interruption = stack.enter_context(_interruption())
         newest = checkpoint.path if checkpoint else None
-        batches = iter(collector)
-        loop = _Loop(run, config, batches, learner, log, newest)
-        while log.frames < config.total_frames and not interruption.is_set():
-            loop.step(interruption)
-        # However it ended; writes nothing if the last batch has just been saved.
-        newest = loop.save()
-        short = log.frames < config.total_frames
-        return TrainingResult(run, newest, log.frames, log.seconds, short, log.row)
+        loop = _Loop(run, config, iter(collector), learner, log, newest)
+        return loop.run_until(stack.enter_context(_interruption()))
 
 
 def _require_device(name: str) -> None:
@@ -273,6 +261,15 @@ class _Loop:
     def __post_init__(self):
         self._tracker = EpisodeTracker(self.config.num_envs)
         self._frames, self._time = self.log.frames, time.monotonic()
+
+    def run_until(self, interruption: threading.Event) -> TrainingResult:
+        """Train to the last frame, or until an event is set."""
+        log, total = self.log, self.config.total_frames
+        while log.frames < total and not interruption.is_set():
+            self.step(interruption)
+        # However it ended; writes nothing if the last batch has just been saved.
+        newest, short = self.save(), log.frames < total
+        return TrainingResult(self.run, newest, log.frames, log.seconds, short, log.row)
 
     def step(self, interruption: threading.Event) -> None:
         """Collect a batch and learn from it."""

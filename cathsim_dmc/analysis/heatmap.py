@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from cathsim_dmc import bounds
 from cathsim_dmc.files import atomic_path
 from cathsim_dmc.recording.episode import Episode
 from cathsim_dmc.recording.geometry import surface_arrays
@@ -64,24 +65,12 @@ def force_map(
         low: (2,) lower corner (x, z) of the map, metres.
         high: (2,) upper corner; the map grows to whole cells.
         cell: Side of a cell, metres.
-
-    Raises:
-        ValueError: if the cell or the extent is not positive, or shapes differ.
     """
     position = np.asarray(position, dtype=np.float64).reshape(-1, 3)
     force = np.asarray(force, dtype=np.float64)
     low, high = np.asarray(low, np.float64), np.asarray(high, np.float64)
-    if force.shape != position.shape[:1]:
-        raise ValueError(
-            f"{len(position)} positions need as many force magnitudes, got shape "
-            f"{force.shape}"
-        )
-    if not cell > 0 or not (high > low).all():
-        raise ValueError(
-            f"cell and extent must be positive, got cell {cell}, {low} to {high}"
-        )
     shape = np.maximum(np.ceil((high - low) / cell - 1e-9).astype(int), 1)
-    # Half a cell more on either side keeps what lies on the far edges out of the map.
+    # Half a cell more keeps what lies on the far edges out of the map.
     edges = [
         low[k] + cell * np.append(np.arange(n + 1), n + 0.5)
         for k, n in enumerate(shape)
@@ -141,8 +130,9 @@ def contact_heatmap(
         force_limit: Top of the colour scale in newtons, to compare pictures; by
             default the largest mean of the map.
     """
-    if force_limit is not None and not force_limit > 0:
-        raise ValueError(f"force_limit must be positive, got {force_limit}")
+    bounds.number("cell", cell, positive=True)
+    if force_limit is not None:
+        bounds.number("force_limit", force_limit, positive=True)
     vertices, faces = surface_arrays(surface)
     outline = vertices[:, AP_AXES]
     field = force_map(
@@ -162,7 +152,6 @@ def _figure(
     title: str,
 ) -> Any:
     """Build the picture with matplotlib's objects, which leave pyplot alone."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.collections import PolyCollection
     from matplotlib.figure import Figure
 
@@ -170,7 +159,6 @@ def _figure(
     width = _PICTURE_HEIGHT_IN * np.ptp(x_mm) / np.ptp(z_mm) + _COLOUR_BAR_IN
     size = np.clip(width, *_PICTURE_WIDTH_RANGE_IN), _PICTURE_HEIGHT_IN
     figure = Figure(figsize=size, layout="constrained")
-    FigureCanvasAgg(figure)
     axes = figure.add_subplot()
     triangles = list(1e3 * outline[faces])
     # All triangles twice: dark and wide, then light on top, which leaves a dark rim
@@ -178,22 +166,15 @@ def _figure(
     for colour, rim in (("0.45", 2.2), ("0.9", 0.6)):
         look = {"facecolors": colour, "edgecolors": colour, "lw": rim}
         axes.add_collection(PolyCollection(triangles, **look))
-    if force_limit is None:
-        force_limit = float(np.nanmax(field.mean)) if field.count.any() else 0.0
+    largest = float(np.nanmax(field.mean)) if field.count.any() else 0.0
+    top = largest if force_limit is None else force_limit
     image = axes.pcolormesh(
-        x_mm,
-        z_mm,
-        1e3 * np.ma.masked_invalid(field.mean),
-        cmap="inferno_r",
-        vmin=0.0,
+        x_mm, z_mm, 1e3 * np.ma.masked_invalid(field.mean), cmap="inferno_r", zorder=3,
         # A map without force still needs a scale.
-        vmax=1e3 * force_limit if force_limit > 0 else 1.0,
-        zorder=3,
-    )
-    over = bool(field.count.any() and np.nanmax(field.mean) > force_limit)
-    bar = figure.colorbar(
-        image, ax=axes, extend="max" if over else "neither", shrink=0.8
-    )
+        vmin=0.0, vmax=1e3 * top if top > 0 else 1.0,
+    )  # fmt: skip
+    extend = "max" if largest > top else "neither"
+    bar = figure.colorbar(image, ax=axes, extend=extend, shrink=0.8)
     bar.set_label("mean contact force, mN")
     axes.set(xlim=x_mm[[0, -1]], ylim=z_mm[[0, -1]], aspect="equal")
     axes.set(xlabel="x, mm (patient left →)", ylabel="z, mm (head ↑)")
