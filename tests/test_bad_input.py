@@ -290,7 +290,6 @@ def entries(folder):
 
 # What a message says in place of the field's name.
 SAYS = {
-    "names": "camera",
     "size": "size",
     "centreline_paths": "centreline",
     "points": "centreline",

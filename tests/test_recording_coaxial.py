@@ -1,7 +1,5 @@
 """Coaxial devices in a record and in its Rerun file."""
 
-import dataclasses
-
 import numpy as np
 import pytest
 
@@ -84,14 +82,3 @@ def test_the_rerun_file_has_both(recorded, tmp_path):
 def test_actions_of_two_devices_do_not_share_a_name(recorded):
     names, tip = action_layout(recorded[0])
     assert len(set(names)) == 4 and not tip.any()
-
-
-def test_a_record_with_damaged_devices_is_refused(recorded):
-    episode, _ = recorded
-    device = dict(episode.meta["devices"][0])
-    short = {**device, "insertion": device["insertion"][:-1]}
-    del device["radius"]
-    for wrong, message in ((device, "radius"), (short, "one entry per state")):
-        meta = {**episode.meta, "devices": [wrong]}
-        with pytest.raises(ValueError, match=message):
-            CoaxialRecord.of(dataclasses.replace(episode, meta=meta))

@@ -208,8 +208,6 @@ def test_options_are_json_and_wrong_ones_are_refused():
     assert config.fluoroscopy.planes == 2
     for options, message in (
         ({"fluoroscopy": {"view": "PA"}}, "LAO45"),
-        ({"fluoroscopy": {"zoom": 2}}, "magnification"),
-        ({"fluoroscopy": {"size": 0}}, "size is 0"),
         ({"fluoroscopy": {"view": (0, 90)}}, "secondary"),
         ({"fluoroscopy": 3}, "mapping"),
     ):

@@ -248,12 +248,10 @@ def evaluate(
         policy: Policy, or what names one, see `policies.load_policy`.
         task: Name of the task; None takes the one that the policy was trained on.
         episodes: Number of episodes; None for that of the protocol.
-        seed: Seed of the first episode; the others lie above it. The default lies
-            apart from training seeds.
+        seed: Seed of the first episode; the others lie above it.
         protocol: Name of the conditions in `protocols.PROTOCOLS`.
         name: Name of the policy for the reports.
-        observation: Name or names of the observations; None takes those that the
-            policy reads.
+        observation: Name or names of observations; None takes the policy's own.
         task_kwargs: Further options of the task; None takes those that the policy was
             trained with.
         num_threads: Number of threads of the simulation; None takes one per core.

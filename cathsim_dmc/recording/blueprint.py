@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 import rerun.blueprint as rrb
@@ -19,8 +19,6 @@ EYE_DISTANCE = 1.35
 # Of the eye from the tip that it follows, and from the robot, m.
 TIP_DISTANCE = 0.075
 ROBOT_OFFSET = np.array([-0.16, -0.42, 0.2])
-# Room above the curves of a plot for its legend, as a share of their height.
-_HEADROOM = 0.55
 _BACKGROUND = (30, 32, 38)
 
 
@@ -32,7 +30,6 @@ def episode_blueprint(
     distance: bool,
     head: Sequence[float],
     robot: Sequence[float] | None,
-    heights: Mapping[str, tuple[float, float]],
     rotation: bool = False,
     living: bool = False,
 ) -> rrb.Blueprint:
@@ -44,8 +41,6 @@ def episode_blueprint(
         distance: Whether the recording has ``series/distance_mm``.
         head: (3,) where the head is at first, metres.
         robot: (3,) where the robot is, or None if the recording has none.
-        heights: Lowest and highest value of the plots "reward", "force", "distance"
-            (if the recording has it) and "insertion".
         rotation: Whether the recording has ``series/rotation_deg``, of coaxial devices.
         living: Whether the recording has ``series/vessel``.
     """
@@ -65,21 +60,20 @@ def episode_blueprint(
         for origin, name in zip(FLUOROSCOPY[:planes], _PLANE_NAMES, strict=False)
     ]
     plots = [
-        _plot("Reward and its terms", "series/reward", heights["reward"], legend=True),
-        _plot("Force, mN", "series/force", heights["force"], legend=True),
-        _plot("Insertion, mm", "series/insertion_mm", heights["insertion"]),
+        _plot("Reward and its terms", "series/reward", legend=True),
+        _plot("Force, mN", "series/force", legend=True),
+        _plot("Insertion, mm", "series/insertion_mm"),
         rrb.Tabs(
-            _plot("Action", "series/action", (-1.0, 1.0), legend=True),
+            _plot("Action", "series/action", legend=True),
             _plot("All actions", "series/action_all"),
         ),
     ]
     if rotation:
-        plots.insert(3, _plot("Rotation, °", "series/rotation_deg", None, legend=True))
+        plots.insert(3, _plot("Rotation, °", "series/rotation_deg", legend=True))
     if living:
         plots.append(_plot("Heart, breathing, wall", "series/vessel", legend=True))
     if distance:
-        way = _plot("Distance to goal, mm", "series/distance_mm", heights["distance"])
-        plots.insert(1, way)
+        plots.insert(1, _plot("Distance to goal, mm", "series/distance_mm"))
     columns = [scene, rrb.Vertical(*images, texts), rrb.Vertical(*plots)]
     return rrb.Blueprint(
         rrb.Horizontal(*columns, column_shares=[5, 3.4, 3]),
@@ -160,22 +154,9 @@ def _world(
     )
 
 
-def _plot(
-    name: str,
-    origin: str,
-    height: tuple[float, float] | None = None,
-    legend: bool = False,
-) -> rrb.TimeSeriesView:
-    """A plot; where its height is known, a legend has room above the curves."""
-    axis = None
-    if height is not None:
-        low, high = height
-        rise = max(high - low, 1e-6)
-        above = _HEADROOM if legend else 0.1
-        axis = rrb.ScalarAxis(range=(low - 0.05 * rise, high + above * rise))
+def _plot(name: str, origin: str, legend: bool = False) -> rrb.TimeSeriesView:
     return rrb.TimeSeriesView(
         origin=origin,
         name=name,
-        axis_y=axis,
         plot_legend=rrb.PlotLegend(corner="LeftTop", visible=legend),
     )

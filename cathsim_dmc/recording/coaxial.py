@@ -36,34 +36,15 @@ class CoaxialRecord:
 
     @classmethod
     def of(cls, episode: Episode) -> CoaxialRecord | None:
-        """Reads the devices of an episode; None if it has a single device.
-
-        Raises:
-            ValueError: a device lacks an entry, or has not one value for each state.
-        """
+        """Reads the devices of an episode; None if it has a single device."""
         devices = episode.meta.get("devices")
         if not devices:
             return None
-        try:
-            series = [
-                np.array([one[name] for one in devices], dtype=np.float64).T
-                for name in SERIES
-            ]
-            names = tuple(str(one["name"]) for one in devices)
-            radii = np.array([one["radius"] for one in devices], dtype=np.float64)
-        except (KeyError, TypeError, ValueError) as error:
-            raise ValueError(
-                "meta['devices'] must list devices with name, radius, "
-                f"{', '.join(SERIES)}, all as long: {error!r}"
-            ) from error
-        states = episode.steps + 1
-        for name, values in zip(SERIES, series, strict=True):
-            if values.shape != (states, len(names)):
-                raise ValueError(
-                    f"{name} in meta['devices'] must have one entry per state, "
-                    f"{states}; got {values.shape[:1]}"
-                )
-        return cls(names, radii, *series)
+        series = (
+            np.array([one[name] for one in devices], np.float64).T for name in SERIES
+        )
+        radii = np.array([one["radius"] for one in devices], np.float64)
+        return cls(tuple(one["name"] for one in devices), radii, *series)
 
     @property
     def gaps(self) -> np.ndarray:

@@ -198,21 +198,14 @@ def check_free(path: Path) -> None:
 
 def _common(episodes: Sequence[Episode]) -> tuple[str, dict[str, Any]]:
     """Task and options that all episodes share."""
-    if not episodes:
-        raise ValueError("there are no episodes to export")
-    tasks = {episode.task for episode in episodes}
-    kinds = [
-        {
-            key: value
-            for key, value in episode.meta.get("task_kwargs", {}).items()
-            if key not in ("random", *_OBSERVED)
-        }
-        for episode in episodes
-    ]
-    if len(tasks) > 1 or any(kind != kinds[0] for kind in kinds):
+    given = [episode.meta.get("task_kwargs", {}) for episode in episodes]
+    unseen = {"random", *_OBSERVED}
+    kinds = [{k: v for k, v in one.items() if k not in unseen} for one in given]
+    tasks = sorted({episode.task for episode in episodes})
+    if len(tasks) != 1 or any(kind != kinds[0] for kind in kinds):
         raise ValueError(
-            f"the episodes are of the tasks {', '.join(sorted(tasks))}, or with "
-            "different options; export each kind as a dataset of its own"
+            f"{len(episodes)} episodes of the tasks {tasks}, or with different "
+            "options, make no dataset; export each kind as one of its own"
         )
     for index, episode in enumerate(episodes):
         if episode.seed is None or not episode.steps:
@@ -220,9 +213,8 @@ def _common(episodes: Sequence[Episode]) -> tuple[str, dict[str, Any]]:
                 f"episode {index} has {episode.steps} steps and the seed "
                 f"{episode.seed}; only seeded episodes with steps can be repeated"
             )
-    first = episodes[0].meta.get("task_kwargs", {})
-    observed = {key: first[key] for key in _OBSERVED if key in first}
-    return episodes[0].task, {**kinds[0], **observed}
+    observed = {key: given[0][key] for key in _OBSERVED if key in given[0]}
+    return tasks[0], {**kinds[0], **observed}
 
 
 def _repeat(environment, episode: Episode):

@@ -49,13 +49,6 @@ class Drawing:
         fluoroscopy: np.ndarray | None = None,
     ) -> Drawing:
         """Check the arguments of ``write_rrd``; ValueError on what does not fit."""
-        geoms, bodies = tuple(robot_geoms), episode.body_pos.shape[1]
-        for geom in geoms:
-            if not 0 <= geom.body < bodies:
-                raise ValueError(
-                    f"geom of {geom.body_name!r} names body {geom.body}, the episode "
-                    f"has {bodies}; take the geoms from the model that was recorded"
-                )
         if fluoroscopy is not None:
             shape = np.shape(fluoroscopy)
             fits = len(shape) == 4 and shape[0] == episode.steps + 1
@@ -65,8 +58,11 @@ class Drawing:
                     f"1), or 2 for two planes; got {fluoroscopy.dtype} of {shape}"
                 )
         vertices, faces = surface_arrays(surface)
-        goal, radii = _goal(episode), link_radii(episode)
-        return cls(vertices, faces, geoms, radii, goal, fluoroscopy)
+        geoms, goal = tuple(robot_geoms), None
+        if "goal_position" in episode.meta:
+            place = np.array(episode.meta["goal_position"], np.float64)
+            goal = place, float(episode.meta["goal_radius"])
+        return cls(vertices, faces, geoms, link_radii(episode), goal, fluoroscopy)
 
 
 def action_layout(episode: Episode) -> tuple[list[str], np.ndarray]:
@@ -89,48 +85,12 @@ def action_layout(episode: Episode) -> tuple[list[str], np.ndarray]:
 
 
 def goal_distance(episode: Episode) -> np.ndarray | None:
-    """Return the distance to the goal (T+1,) in metres, or None if not recorded.
-
-    Raises:
-        ValueError: if ``meta['distance']`` does not have one entry per state.
-    """
+    """Return the distance to the goal (T+1,) in metres, or None if not recorded."""
     distance = episode.meta.get("distance")
-    if distance is None:
-        return None
-    distance = np.asarray(distance, dtype=np.float64)
-    if distance.shape != episode.time.shape:
-        raise ValueError(
-            f"meta['distance'] must have one entry per state, {episode.time.size}; "
-            f"got shape {distance.shape}"
-        )
-    return distance
+    return None if distance is None else np.array(distance, np.float64)
 
 
 def link_radii(episode: Episode) -> np.ndarray:
-    """Radii (L,) of the links in metres, from ``meta['catheter_radius']`` if there.
-
-    Raises:
-        ValueError: if it is neither one positive radius nor one for each link.
-    """
+    """Radii (L,) of the links in metres, from ``meta['catheter_radius']`` if there."""
     given = episode.meta.get("catheter_radius", CATHETER_RADIUS)
-    links = episode.catheter.shape[1] - 1
-    radii = np.asarray(given, dtype=np.float64)
-    if radii.shape not in ((), (links,)) or not (radii > 0).all():
-        raise ValueError(
-            f"meta['catheter_radius'] must be one positive radius or {links} of them, "
-            f"in metres; got {given}"
-        )
-    return np.broadcast_to(radii, (links,))
-
-
-def _goal(episode: Episode) -> tuple[np.ndarray, float] | None:
-    position, radius = (episode.meta.get(f"goal_{k}") for k in ("position", "radius"))
-    if position is None and radius is None:
-        return None
-    place = np.asarray(position, dtype=np.float64)
-    if place.shape != (3,) or radius is None or not radius > 0:
-        raise ValueError(
-            "a goal is a position (3,) and a positive radius in metres, got "
-            f"{position} and {radius}"
-        )
-    return place, float(radius)
+    return np.broadcast_to(np.float64(given), (episode.catheter.shape[1] - 1,))

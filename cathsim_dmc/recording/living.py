@@ -48,32 +48,17 @@ class VesselRecord:
 
     @classmethod
     def of(cls, episode: Episode) -> VesselRecord | None:
-        """Reads the vessel of an episode; None if it is rigid and its blood rests.
-
-        Raises:
-            ValueError: an entry is missing, or has not one row for each state.
-        """
+        """Reads the vessel of an episode; None if it is rigid and its blood rests."""
         given = episode.meta.get("vessel")
         if not given:
             return None
-        try:
-            series = {name: np.array(given[name], np.float64) for name in SERIES}
-            velocity = np.array(given["blood_velocity"], np.float64)
-            goal = np.array(given["goal"], np.float64)
-            lattice = np.array(given["lattice"], dtype=np.float64)
-            parameters = np.array(given["parameters"], dtype=np.float64)
-            depth = np.array(given.get("depth", []), dtype=np.float64)
-        except (KeyError, TypeError, ValueError) as error:
-            raise ValueError(f"meta['vessel'] lacks or spoils {error!r}") from error
-        for name, values in (*series.items(), ("goal", goal)):
-            if len(values) != episode.steps + 1:
-                raise ValueError(
-                    f"meta['vessel'] has {len(values)} values of {name}; give "
-                    f"{episode.steps + 1}, one for each state"
-                )
-        if len(depth) not in (0, len(episode.contact_step)):
-            raise ValueError("meta['vessel'] has not one depth for each contact")
+        names = ("blood_velocity", "goal", "lattice", "parameters")
+        velocity, goal, lattice, parameters = (
+            np.array(given[name], np.float64) for name in names
+        )
+        depth = np.array(given.get("depth", []), np.float64)
         motion = Motion(lattice) if lattice.size else None
+        series = {name: np.array(given[name], np.float64) for name in SERIES}
         return cls(series, velocity, goal, motion, parameters, depth)
 
     @property

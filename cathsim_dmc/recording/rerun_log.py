@@ -31,7 +31,6 @@ from cathsim_dmc.recording.scene import BodyGeom
 
 APPLICATION_ID = "cathsim"
 SUFFIX = ".rrd"
-_LEAST_HEIGHT_MM = 100.0
 
 
 def write_rrd(
@@ -113,35 +112,7 @@ def _layout(episode: Episode, drawing: Drawing) -> Blueprint:
         living=VesselRecord.of(episode) is not None,
         head=episode.head[0],
         robot=robot,
-        heights=_heights(episode),
     )
-
-
-def _heights(episode: Episode) -> dict[str, tuple[float, float]]:
-    """Lowest and highest value of the plots."""
-    terms = episode.meta.get("reward_terms", {}).values()
-    groups = {
-        "reward": [episode.reward, *terms],
-        "force": [
-            1e3 * values
-            for values in (
-                episode.wall_force_sum,
-                episode.wall_force_max,
-                episode.push_force,
-            )
-        ],
-    }
-    found = {}
-    for name, rows in groups.items():
-        values = np.concatenate([np.zeros(1), *(np.asarray(row) for row in rows)])
-        found[name] = (float(values.min()), float(values.max()))
-    # From 0 to 100 mm at least: the viewer writes hundreds at its scale, not tens.
-    lengths = {"insertion": episode.insertion, "distance": goal_distance(episode)}
-    for name, values in lengths.items():
-        if values is not None:
-            low, high = 1e3 * np.min(values), 1e3 * np.max(values)
-            found[name] = (min(0.0, float(low)), max(_LEAST_HEIGHT_MM, float(high)))
-    return found
 
 
 def _title(episode: Episode) -> str:
