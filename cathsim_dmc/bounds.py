@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 import numbers
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, NoReturn
 
 import numpy as np
@@ -164,12 +164,8 @@ def vector(
     unit: str = "",
 ) -> tuple[float, ...]:
     """`count` finite numbers in a closed range."""
-    values = _row(value)
-    if (
-        values is None
-        or len(values) != count
-        or not all(is_number(one) and low <= one <= high for one in values)
-    ):
+    values = _entries(value, count, is_number, low, high)
+    if values is None:
         allowed = _allowed("a finite number", low, high, unit)
         refuse(name, value, f"{count} numbers, each {allowed}")
     return tuple(float(one) for one in values)
@@ -185,20 +181,11 @@ def interval(
     integers: bool = False,
 ) -> tuple[float, float]:
     """The ends (low, high) of a range within another."""
-    values = _row(value)
-    fits = _is_whole if integers else is_number
-    if (
-        values is None
-        or len(values) != 2
-        or not all(fits(one) and low <= one <= high for one in values)
-        or not values[0] <= values[1]
-    ):
+    values = _entries(value, 2, _is_whole if integers else is_number, low, high)
+    if values is None or not values[0] <= values[1]:
         kind = "an integer" if integers else "a finite number"
-        refuse(
-            name,
-            value,
-            f"(low, high) with low <= high, each {_allowed(kind, low, high, unit)}",
-        )
+        allowed = _allowed(kind, low, high, unit)
+        refuse(name, value, f"(low, high) with low <= high, each {allowed}")
     return values[0], values[1]
 
 
@@ -241,12 +228,9 @@ def instance(name: str, value: Any, kind: type) -> Any:
 
 def pixels(name: str, value: Any) -> tuple[int, int]:
     """Rows and columns of an image, from (rows, columns) or one number for both."""
-    values = [value, value] if _is_whole(value) else _row(value)
-    if (
-        values is None
-        or len(values) != 2
-        or not all(_is_whole(one) and 1 <= one <= MOST_PIXELS for one in values)
-    ):
+    given = [value, value] if _is_whole(value) else value
+    values = _entries(given, 2, _is_whole, 1, MOST_PIXELS)
+    if values is None:
         allowed = f"an integer from 1 to {MOST_PIXELS}"
         refuse(name, value, f"{allowed}, or (rows, columns), each {allowed}")
     return int(values[0]), int(values[1])
@@ -266,6 +250,16 @@ def options(name: str, value: Any) -> dict[str, Any]:
     if not isinstance(value, Mapping) or not all(isinstance(key, str) for key in value):
         refuse(name, value, "None, or a mapping of names to values")
     return dict(value)
+
+
+def _entries(
+    value: Any, count: int, fits: Callable[[Any], bool], low: float, high: float
+) -> list[Any] | None:
+    """The entries of a row of `count` that fit in a closed range; None for another."""
+    row = _row(value)
+    if row is None or len(row) != count:
+        return None
+    return row if all(fits(one) and low <= one <= high for one in row) else None
 
 
 def _row(value: Any) -> list[Any] | None:

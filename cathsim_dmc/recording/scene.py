@@ -28,9 +28,6 @@ class BodyGeom:
         position: (3,) centre in the frame of the body, metres.
         quaternion: (4,) wxyz, orientation in the frame of the body.
         rgba: (4,) colour in [0, 1].
-
-    Raises:
-        ValueError: on an unknown kind or a wrong number of sizes.
     """
 
     body: int
@@ -40,13 +37,6 @@ class BodyGeom:
     position: np.ndarray
     quaternion: np.ndarray
     rgba: np.ndarray
-
-    def __post_init__(self) -> None:
-        if self.kind not in SIZES or len(self.size) != SIZES[self.kind]:
-            raise ValueError(
-                f"a {self.kind} with {len(self.size)} sizes; kinds and their numbers "
-                f"of sizes are {SIZES}"
-            )
 
 
 def body_geoms(
