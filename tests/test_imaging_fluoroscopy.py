@@ -119,7 +119,7 @@ def test_roadmap_lightens_the_vessel(fluoroscope, frames):
 
 
 def test_device_mask_covers_the_catheter(fluoroscope, frames):
-    masks = fluoroscope.device_mask(Shadow(frames, RADIUS))
+    masks = fluoroscope.device_mask([Shadow(frames, RADIUS)])
     assert masks.shape == (20, 128, 128) and masks.dtype == bool
     for mask, points in zip(masks, frames, strict=True):
         pixels, _ = fluoroscope.carm.project(points)

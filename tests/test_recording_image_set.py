@@ -86,7 +86,7 @@ def test_the_mask_is_where_the_device_changes_the_image(arch, states):
                 0, ..., 0
             ]
         )
-        mask = view.masks_of(own).device[0]
+        mask = view.device_mask(own)[0]
         assert mask.sum() > 40 and changed[mask].all()
         # What is changed beside the mask are its neighbours, which are covered less.
         wide = np.pad(mask, 1)

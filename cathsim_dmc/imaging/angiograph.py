@@ -138,8 +138,7 @@ def masks(machines: Sequence[Planes], shadows: Sequence[Shadow]) -> np.ndarray:
         for chosen in _alike(machines):
             own = [shadow.of(chosen) for shadow in shadows]
             fluoroscope = machines[chosen[0]][plane]
-            seen = np.any([fluoroscope.device_mask(one) for one in own], axis=0)
-            both[chosen, ..., 0] = seen * np.uint8(255)
+            both[chosen, ..., 0] = fluoroscope.device_mask(own) * np.uint8(255)
             both[chosen, ..., 1] = fluoroscope.vessel_mask * np.uint8(255)
         channels.append(both)
     return np.concatenate(channels, axis=-1)

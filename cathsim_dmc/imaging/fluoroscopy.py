@@ -204,7 +204,11 @@ class Fluoroscope:
     def _roadmap_gain(self) -> np.ndarray:
         return detector.roadmap_gain(self.vessel_mask, self.roadmap, self.gain)
 
-    def device_mask(self, shadow: Shadow) -> np.ndarray:
+    def device_mask(self, shadows: Sequence[Shadow]) -> np.ndarray:
+        """Pixels (..., rows, columns) bool that show one of several devices."""
+        return np.any([self._shows(shadow) for shadow in shadows], axis=0)
+
+    def _shows(self, shadow: Shadow) -> np.ndarray:
         """Pixels (..., rows, columns) bool that show a device."""
         thickness = device_thickness(self.carm, shadow.points, shadow.radius)
         radii = np.asarray(shadow.radius, dtype=np.float64)

@@ -251,7 +251,7 @@ def frames_of(
             if states.warps is None:
                 places[:, -len(OSTIA) :] = rest
                 view = camera.before(anatomy)
-                image, seen = view.image(own, random), view.masks_of(own).device
+                image, seen = view.image(own, random), view.device_mask(own)
                 mask = DEVICE * seen + VESSEL * view.vessel_mask
             else:
                 image = np.empty((count, options.size, options.size, 1), np.uint8)
@@ -264,7 +264,7 @@ def frames_of(
                     view = camera.before(anatomy, warp)
                     one = [each.of(np.array([row])) for each in own]
                     image[row] = view.image(one, random)[0]
-                    mask[row] = DEVICE * view.masks_of(one).device[0]
+                    mask[row] = DEVICE * view.device_mask(one)[0]
                     mask[row] += VESSEL * view.vessel_mask.astype(np.uint8)
             yield {
                 "image": image[..., 0],

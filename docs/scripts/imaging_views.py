@@ -62,7 +62,7 @@ def views(tree, surface) -> dict[str, np.ndarray]:
     )
     coloured = live.render(points, CATHETER_RADIUS).repeat(3, axis=-1) // 2 + 100
     coloured[scope.vessel_mask] = (140, 170, 220)
-    coloured[scope.device_mask(Shadow(points, CATHETER_RADIUS))] = (200, 30, 30)
+    coloured[scope.device_mask([Shadow(points, CATHETER_RADIUS)])] = (200, 30, 30)
     images["LAO45, masks"] = coloured
 
     close = CArm.view("LAO45", magnification=2.5, resolution=(512, 512))
