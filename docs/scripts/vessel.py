@@ -53,7 +53,7 @@ LONGEST = 400  # control steps
 SAFE = 1.0  # N
 
 
-def costs(rounds: int = 5) -> dict:
+def costs(rounds: int = 2) -> dict:
     """Times of a control step over the rigid vessel's, measured in alternation."""
     batches = {
         case: BatchSimulation(
