@@ -26,10 +26,10 @@ class Settings:
     """Settings of a run; every one is an option of the command line."""
 
     data: tyro.conf.Positional[Path]  # a folder of `cathsim dataset`
-    epochs: int = 8
+    epochs: int = 6
     batch: int = 32
-    width: int = 12  # channels of the first layer
-    learning_rate: float = 2e-3
+    width: int = 8  # channels of the first layer
+    learning_rate: float = 4e-3
     seed: int = 0
     out: Path | None = None  # a picture of detections on the test set
 

@@ -66,7 +66,7 @@ def dataset(
     frames: int = 32,
     views: int = 2,
     stride: int = 1,
-    size: int = 256,
+    size: int = 128,
     vessel: str = "rigid",
     pictures: bool = False,
     seed: int = 0,

@@ -76,7 +76,7 @@ class SequenceOptions:
     frames: int = 32
     views: int = 2
     stride: int = 1
-    size: int = 256
+    size: int = 128
     vessel: str = "rigid"
 
     def __post_init__(self) -> None:
