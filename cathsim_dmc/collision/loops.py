@@ -69,7 +69,7 @@ _ROOM = 1e-4  # m, a link that touches one wall of a corner is held by others so
 SOFT = 0.7
 # A link this close, m, is held: between contacts under load, one physics step without
 # any lets the light tip jump by most of a millimetre.
-_TOUCH = 2e-5
+_TOUCH = 1e-4
 _AT_WALL = -1e-9  # m, the depth of a link so close
 # So is a link that would be so deep, m, at the end of the physics step: it hits.
 _IMPACT = 1e-4
@@ -166,7 +166,7 @@ def tangents(entry, place, axis, normal, depth, limit, held, turns, rows):
 
 
 @compiled
-def put(table, data, contacts, geoms, written, rows, planes, t, limit, law):
+def put(table, data, contacts, geoms, written, most, rows, planes, t, limit, law):
     """Writes planes as contacts after those written, and returns how many there are."""
     radius, near, soft, _ = law
     turns = word(data + word(table + GEOM_XMAT))
@@ -177,7 +177,7 @@ def put(table, data, contacts, geoms, written, rows, planes, t, limit, law):
             rows[1, k] = rows[0, k]
         planes = 2
     for plane in range(planes):
-        if written == _MOST or rows[plane, 3] > limit:
+        if written == most or rows[plane, 3] > limit:
             continue
         contact = numbers(contacts + 80 * written, 10)
         distance = rows[plane, 3] - radius
@@ -222,7 +222,7 @@ def at_rest(table, model, data, contacts, geoms, entry, half, closed, margin, la
             continue
         if depth <= (limit if lowest else radius + margin):
             # A sphere may have one contact, so one plane.
-            turns = 0 if half == 0.0 else 1 + int(abs(t) >= half)
+            turns = 0 if half == 0.0 else 1 + int(lowest and abs(t) >= half)
             planes = tangents(
                 entry, place, axis, normal, depth, limit, held, turns, rows
             )
@@ -233,8 +233,10 @@ def at_rest(table, model, data, contacts, geoms, entry, half, closed, margin, la
                 continue
             rows[0, 0], rows[0, 1], rows[0, 2] = normal
             rows[0, 3], planes = depth, 1
+        # A second place has room for a plane at least.
+        most = _MOST - (1 + int(not lowest) if seen[0] - n == 2 else 0)
         written = put(
-            table, data, contacts, geoms, written, rows, planes, t, np.inf, law
+            table, data, contacts, geoms, written, most, rows, planes, t, np.inf, law
         )
     return written
 
@@ -271,7 +273,7 @@ def in_motion(table, model, data, contacts, geoms, entry, half, closed, margin, 
         lowest = depth <= (seen[2] if n else seen[4])
         if not lowest and seen[3] - seen[1] < EVERY and not soft:
             continue
-        turns = 0 if half == 0.0 else 1 + int(abs(t) >= half * stretch)
+        turns = 0 if half == 0.0 else 1 + int(lowest and abs(t) >= half * stretch)
         t /= stretch
         x, y, z = along(local, axis, t)
         warp(lattice, course, time, x, y, z, values, there)
@@ -284,8 +286,10 @@ def in_motion(table, model, data, contacts, geoms, entry, half, closed, margin, 
             continue
         planes = tangents(entry, place, way, normal, depth, reach, held, turns, rows)
         in_space(there, rows, planes)
+        # A second place has room for a plane at least.
+        most = _MOST - (1 + int(not lowest) if seen[0] - n == 2 else 0)
         written = put(
-            table, data, contacts, geoms, written, rows, planes, t, limit, law
+            table, data, contacts, geoms, written, most, rows, planes, t, limit, law
         )
     return written
 
