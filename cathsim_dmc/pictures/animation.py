@@ -6,9 +6,10 @@ import dataclasses
 import os
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
+from matplotlib.patches import Circle
 from PIL import Image
 
 from cathsim_dmc.files import atomic_path
@@ -176,8 +177,9 @@ class _Film:
                 self._xray.set_title("")
             else:
                 image.set_data(xray(moment, FLUOROSCOPY, int(step)))
-                ring = self._xray.patches[0]
-                ring.center = drawing.goal_ring(moment, FLUOROSCOPY)[0]
+                ring = cast(Circle, self._xray.patches[0])
+                column, row = drawing.goal_ring(moment, FLUOROSCOPY)[0]
+                ring.center = column, row
             now = float(self._episode.time[step] - self._episode.time[0])
             self._now.set_xdata([now, now])
             self._figure.agg.draw()

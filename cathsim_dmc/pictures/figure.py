@@ -282,9 +282,9 @@ def draw_fluoroscopy(
     image = axes.imshow(
         frame, cmap="gray", vmin=black, vmax=white, interpolation="bilinear"
     )
-    axes.add_patch(
-        Circle(*goal_ring(moment, options), fill=False, ec=GOAL_LIGHT, lw=1.4)
-    )
+    (column, row), radius = goal_ring(moment, options)
+    ring = Circle((column, row), radius, fill=False, ec=GOAL_LIGHT, lw=1.4)
+    axes.add_patch(ring)
     axes.set_title("fluoroscopy", fontsize=10)
     axes.set_xticks([])
     axes.set_yticks([])
