@@ -25,8 +25,6 @@ from cathsim_dmc.tasks.anatomies import load_anatomy
 GOALS = ("bca", "lcca", "lsa")
 ACCESSES = ("ascending", "descending")
 PHANTOMS = ("type1", "type2", "type3", "bovine")
-# Held-out sets of arches with their sizes.
-TEST_ARCHES, VARIANTS = ("test", arch.TEST_SIZE), ("test_variants", 48)
 # What the device and the surroundings of one episode may differ in, one at a time.
 CHANGES = {
     "none": {},
@@ -59,7 +57,7 @@ def arches():
     for goal in GOALS:
         for access in ACCESSES:
             where = {"goal": goal, "access": access}
-            yield arch_cell("arches", where, *TEST_ARCHES)
+            yield arch_cell("arches", where, "test")
 
 
 def variants():
@@ -68,11 +66,12 @@ def variants():
     The branch and the access of an arch follow from its number.
     """
     where = {"goal": "any", "access": "any"}
-    yield arch_cell("variants", where, *VARIANTS, rounds=2)
+    yield arch_cell("variants", where, "test_variants", rounds=2)
 
 
-def arch_cell(part, where, arches, pool, rounds=1):
+def arch_cell(part, where, arches, rounds=1):
     """Every arch of a set, so many times."""
+    pool = len(arch.arch_set(arches))
     options = {**where, "arches": arches, "pool": pool}
     return Cell(part, where, "arch_any", options, rounds * pool)
 
