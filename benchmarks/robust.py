@@ -54,26 +54,24 @@ class Cell:
 
 def arches():
     """Every held-out arch once, for each branch and access."""
+    pool = len(arch.arch_set("test"))
     for goal in GOALS:
         for access in ACCESSES:
             where = {"goal": goal, "access": access}
-            yield arch_cell("arches", where, "test")
+            options = {**where, "arches": "test", "pool": pool}
+            yield Cell("arches", where, "arch_any", options, pool)
 
 
-def variants():
-    """Held-out arches of type III, bovine ones and aberrant ones, twice each.
+def variants(episodes=4):
+    """Held-out arches of type III, bovine ones and aberrant ones, each by itself.
 
-    The branch and the access of an arch follow from its number.
+    The branch and the access of an arch follow from its number. Arches with another
+    number of goals have no place in one pool.
     """
-    where = {"goal": "any", "access": "any"}
-    yield arch_cell("variants", where, "test_variants", rounds=2)
-
-
-def arch_cell(part, where, arches, rounds=1):
-    """Every arch of a set, so many times."""
-    pool = len(arch.arch_set(arches))
-    options = {**where, "arches": arches, "pool": pool}
-    return Cell(part, where, "arch_any", options, rounds * pool)
+    where = {"goal": "any", "access": "any", "arches": "test_variants", "pool": 1}
+    for number, seed in enumerate(arch.arch_set("test_variants")):
+        options = {**where, "first": number}
+        yield Cell("variants", {"arch": seed.name}, "arch_any", options, episodes)
 
 
 def anatomies(names, episodes=20):
@@ -137,10 +135,11 @@ def play(policy: str, cell: Cell) -> dict:
 
 
 def _kind(cell, drawn):
-    """Kind of the arch that an episode has drawn, such as "II bovine_trunk"."""
-    if "arch" not in drawn:
+    """Kind of the arch that an episode plays, such as "II bovine_trunk"."""
+    if "arches" not in cell.options:
         return None
-    seed = arch.arch_set(cell.options["arches"])[drawn["arch"]]
+    number = drawn.get("arch", cell.options.get("first"))
+    seed = arch.arch_set(cell.options["arches"])[number]
     return f"{seed.arch_type} {seed.variant}"
 
 
