@@ -11,7 +11,7 @@ export MUJOCO_GL ?= disable
 .PHONY: demo test test-slow nightly lint audit compatibility dist docs site clean
 
 demo: $(VENV)/.installed
-	$(BIN)/cathsim train type1_lcca --algo dagger --preset demo --frames 8192 --out runs/demo $$(test ! -e runs/demo/config.json || echo --resume)
+	$(BIN)/cathsim train type1_lcca --algo dagger --preset demo --frames 12288 --out runs/demo $$(test ! -e runs/demo/config.json || echo --resume)
 	$(BIN)/cathsim eval runs/demo --out runs/demo
 	$(BIN)/cathsim record runs/demo --out runs/demo/episode.rrd
 	@echo "runs/demo: checkpoints/ (policy), metrics.csv, evaluation.json, heatmap.png, episode.rrd (open it: $(BIN)/cathsim replay runs/demo/episode.rrd)"
