@@ -79,5 +79,5 @@ def _opengl() -> Finding:
     name = os.environ.get("MUJOCO_GL", "not set")
     command = [sys.executable, "-c", _OPENGL]
     works = not subprocess.run(command, capture_output=True, check=False).returncode
-    advice = "" if works else "rgb and depth alone need it: try MUJOCO_GL=egl"
+    advice = "" if works else "physics.render and viewers need it: try MUJOCO_GL=egl"
     return Finding("OpenGL", f"{'works' if works else 'none'}, {name}", note=advice)
