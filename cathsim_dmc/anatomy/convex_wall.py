@@ -75,7 +75,7 @@ def _outward_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     """Unit normals (V, 3) that lean outwards from all triangles around a vertex.
 
     The angle-weighted mean can point into one of the triangles where the surface
-    folds sharply; the worst triangle is then added until it no longer does.
+    folds sharply; while it does, the worst triangle is added.
     """
     import igl
 

@@ -195,6 +195,22 @@ def put(table, data, contacts, geoms, written, most, rows, planes, t, limit, law
 
 
 @compiled
+def nth(seen, n, soft):
+    """Place n of a link: where, its clearance, whether it is the lowest, and its room.
+
+    The room is how many contacts the link may have with it: 0 where it lies so close
+    to a lower place that both are one, and fewer than all where another place follows.
+    What is held at the lowest place is not at the other.
+    """
+    t, depth = (seen[3], seen[4]) if n else (seen[1], seen[2])
+    lowest = depth <= (seen[2] if n else seen[4])
+    if not lowest and seen[3] - seen[1] < EVERY and not soft:
+        return t, depth, lowest, 0
+    left = 1 + int(not lowest) if seen[0] - n == 2 else 0
+    return t, depth, lowest, _MOST - left
+
+
+@compiled
 def at_rest(table, model, data, contacts, geoms, entry, half, closed, margin, law):
     """Number of contacts, written, with a field that does not move."""
     radius, near, soft, held = law
@@ -211,10 +227,8 @@ def at_rest(table, model, data, contacts, geoms, entry, half, closed, margin, la
     seen = touches(entry, local, axis, half, closed, far)
     rows, written = np.empty((6, 4)), 0
     for n in range(seen[0]):
-        t, depth = (seen[3], seen[4]) if n else (seen[1], seen[2])
-        # Two places so close are one. What is held at one is not at another by `near`.
-        lowest = depth <= (seen[2] if n else seen[4])
-        if not lowest and seen[3] - seen[1] < EVERY and not soft:
+        t, depth, lowest, most = nth(seen, n, soft)
+        if not most:
             continue
         place = along(local, axis, t)
         normal = away(entry, place[0], place[1], place[2])
@@ -233,8 +247,6 @@ def at_rest(table, model, data, contacts, geoms, entry, half, closed, margin, la
                 continue
             rows[0, 0], rows[0, 1], rows[0, 2] = normal
             rows[0, 3], planes = depth, 1
-        # A second place has room for a plane at least.
-        most = _MOST - (1 + int(not lowest) if seen[0] - n == 2 else 0)
         written = put(
             table, data, contacts, geoms, written, most, rows, planes, t, np.inf, law
         )
@@ -269,9 +281,8 @@ def in_motion(table, model, data, contacts, geoms, entry, half, closed, margin, 
     seen = touches(entry, image, way, half * stretch, closed, reach)
     rows, written = np.empty((6, 4)), 0
     for n in range(seen[0]):
-        t, depth = (seen[3], seen[4]) if n else (seen[1], seen[2])
-        lowest = depth <= (seen[2] if n else seen[4])
-        if not lowest and seen[3] - seen[1] < EVERY and not soft:
+        t, depth, lowest, most = nth(seen, n, soft)
+        if not most:
             continue
         turns = 0 if half == 0.0 else 1 + int(lowest and abs(t) >= half * stretch)
         t /= stretch
@@ -286,8 +297,6 @@ def in_motion(table, model, data, contacts, geoms, entry, half, closed, margin, 
             continue
         planes = tangents(entry, place, way, normal, depth, reach, held, turns, rows)
         in_space(there, rows, planes)
-        # A second place has room for a plane at least.
-        most = _MOST - (1 + int(not lowest) if seen[0] - n == 2 else 0)
         written = put(
             table, data, contacts, geoms, written, most, rows, planes, t, limit, law
         )

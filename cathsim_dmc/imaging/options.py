@@ -15,8 +15,8 @@ from cathsim_dmc.imaging import detector, materials
 # the inlet to the ends of the branches.
 DETECTOR_SIZE = 0.38
 
-# Of the endoluminal camera: vertical field of view, degrees, that of the OpenGL camera
-# in the tip; and the distance, m, at which a ray ends that meets no wall.
+# Of the endoluminal camera: vertical field of view, degrees, that of a chip-on-tip
+# endoscope; and the distance, m, at which a ray ends that meets no wall.
 VIEW_ANGLE, FARTHEST_WALL = 90.0, 0.3
 
 # Bounds of the options: wider than real systems, within the computable.

@@ -72,34 +72,31 @@ def arches(rows):
     return lines
 
 
-def devices(rows):
-    """Success by device, over all cells of a policy."""
-    lines = ["| policy | device | success, % (95 %), episodes |", "|---|---|---|"]
+def shares(rows, column, field, shown):
+    """Success by what `field` of the rows counts apart, for each policy."""
+    lines = [f"| policy | {column} | success, % (95 %), episodes |", "|---|---|---|"]
     for policy in sorted({row["policy"] for row in rows}):
         counts = {}
         for row in (row for row in rows if row["policy"] == policy):
-            _count(row["by_device"], counts)
-        lines += [f"| `{policy}` | `{n}` | {rate(*c)} |" for n, c in counts.items()]
+            for name, (good, episodes) in row.get(field, {}).items():
+                old = counts.get(name, (0, 0))
+                counts[name] = old[0] + good, old[1] + episodes
+        lines += [
+            f"| `{policy}` | {shown(n)} | {rate(*c)} |" for n, c in counts.items()
+        ]
     return lines
+
+
+def devices(rows):
+    """Success by device, over all cells of a policy."""
+    return shares(rows, "device", "by_device", "`{}`".format)
 
 
 def kinds(rows):
     """Success by kind of arch, over the held-out arches of a policy."""
-    lines = ["| policy | kind | success, % (95 %), episodes |", "|---|---|---|"]
-    for policy in sorted({row["policy"] for row in rows}):
-        counts = {}
-        for row in (row for row in rows if row["policy"] == policy):
-            _count(row.get("by_kind", {}), counts)
-        for name, count in sorted(counts.items()):
-            shown = name.replace("_", " ").removesuffix(" normal")
-            lines.append(f"| `{policy}` | {shown} | {rate(*count)} |")
-    return lines
-
-
-def _count(shares, counts):
-    for name, (good, episodes) in shares.items():
-        old = counts.get(name, (0, 0))
-        counts[name] = old[0] + good, old[1] + episodes
+    return shares(
+        rows, "kind", "by_kind", lambda n: n.replace("_", " ").removesuffix(" normal")
+    )
 
 
 def anatomies(rows):

@@ -93,8 +93,7 @@ def import_scan(
             by width and length of both legs, their sides and their branches.
         root: name of the vessel that starts at the inlet.
         rename: new names of computed vessels by their computed names.
-        progress: called with a line of text for every step, which begins with the
-            step's name or with "note".
+        progress: called with a line for every step: its name or "note", then text.
         notes: list to which what was guessed, mended and left out is added.
 
     Returns:
