@@ -192,8 +192,15 @@ class Field:
         origin = np.asarray(low) - MARGIN
         shape = np.ceil((np.asarray(high) + MARGIN - origin) / EDGE).astype(int)
         coarse = _corners(measure, origin, shape + 1)
-        rows = np.argwhere(_near_wall(coarse))
+        corners = np.lib.stride_tricks.sliding_window_view(coarse, (2, 2, 2))
+        low, high = corners.min(axis=(3, 4, 5)), corners.max(axis=(3, 4, 5))
+        rows = np.argwhere(_near_wall(low, high))
         middles = origin + EDGE * (rows + 0.5)
+        depth = measure(middles, np.zeros((1, 3)))[:, 0]
+        # Behind an open end the depth jumps from one corner to the other.
+        across = (low < SHELL[1]) & (high > SHELL[0])
+        near = _near_wall(depth, depth) | across[tuple(rows.T)]
+        rows, middles = rows[near], middles[near]
         exact = _measured(measure, middles, 4)
         eight = np.stack([coarse[tuple((rows + c).T)] for c in np.ndindex(2, 2, 2)], 1)
         cells = _cells(exact, eight.reshape(-1, 2, 2, 2), LARGEST - 6 * coarse.size)
@@ -237,11 +244,9 @@ def _corners(measure: Measure, origin: Array, shape: np.ndarray) -> Array:
     return depth[: shape[0], : shape[1], : shape[2]]
 
 
-def _near_wall(coarse: Array) -> np.ndarray:
-    """Which bricks (a, b, c) may come into the shell, from the depths at corners."""
+def _near_wall(low: Array, high: Array) -> np.ndarray:
+    """Which bricks may come into the shell, from depths at their corners or middles."""
     reach = EDGE * np.sqrt(3.0) / 2.0
-    cells = np.lib.stride_tricks.sliding_window_view(coarse, (2, 2, 2))
-    low, high = cells.min(axis=(3, 4, 5)), cells.max(axis=(3, 4, 5))
     # The depth changes by at most the distance moved.
     return (high + reach > SHELL[0]) & (low - reach < SHELL[1])
 

@@ -15,7 +15,7 @@ _SLACK = 3e-3
 _AROUND = 120
 _SEED = 1.5e-3
 _APART = 0.1e-3
-_MANY = 300  # points of a block that is divided
+_GROUP = 2.5  # points along each axis of a group, about
 # Projections on the one wall and the other; walls that meet at 30° take the most.
 _ROUNDS = 30
 _ON_BOTH = 5e-6  # m
@@ -66,16 +66,8 @@ class TreeDepth:
         from cathsim_dmc.anatomy.tree_depth_loops import tree_depths
 
         blocks, points = np.asarray(blocks), np.asarray(points)
+        groups, middles, reaches = _grouped(points)
         out = np.empty((len(blocks), len(points)))
-        if len(points) > _MANY:
-            # The smaller a block, the fewer rings its points have to be held against.
-            octants = (points > points.mean(axis=0)) @ (1, 2, 4)
-            for octant in np.unique(octants):
-                part = octants == octant
-                middle = points[part].mean(axis=0)
-                out[:, part] = self.around(blocks + middle, points[part] - middle)
-            return out
-        reach = float(np.linalg.norm(points, axis=1).max())
         tree_depths(
             self._nodes,
             self._spans,
@@ -83,7 +75,10 @@ class TreeDepth:
             self._creases,
             np.ascontiguousarray(blocks, dtype=np.float64),
             np.ascontiguousarray(points, dtype=np.float64),
-            reach,
+            float(np.linalg.norm(points, axis=1).max()),
+            groups,
+            middles,
+            reaches,
             _SLACK,
             out,
         )
@@ -144,6 +139,23 @@ def _rings(line: Centreline) -> Array:
     tangents = np.concatenate([steps[:1], steps[:-1] + steps[1:], steps[-1:]])
     tangents /= np.linalg.norm(tangents, axis=1, keepdims=True)
     return np.concatenate([line.points, tangents, line.radii[:, None]], axis=1)
+
+
+def _grouped(points: Array) -> tuple[np.ndarray, Array, Array]:
+    """Divides points (q, 3): group of each (q,), middles (g, 3) and reaches (g,), m.
+
+    The closer points are, the fewer rings they have to be held against.
+    """
+    along = max(1, round(len(points) ** (1 / 3) / _GROUP))
+    size = max(float(np.ptp(points, axis=0).max()), 1e-9) / along
+    cells = ((points - points.min(axis=0)) / size).astype(int).clip(0, along - 1)
+    _, groups = np.unique(cells @ (1, along, along**2), return_inverse=True)
+    middles, reaches = [], []
+    for group in range(groups.max() + 1):
+        own = points[groups == group]
+        middles.append(own.mean(axis=0))
+        reaches.append(np.linalg.norm(own - middles[-1], axis=1).max())
+    return groups, np.array(middles), np.array(reaches)
 
 
 def _box(nodes: Array) -> tuple[Array, Array]:

@@ -102,7 +102,7 @@ def signed(nodes, first, last, flats, chosen, count, x, y, z, out):
         k, u, way = (first, 0.0, -1.0) if end == 0 else (last - 1, 1.0, 1.0)
         axial, radial, radius = ring(nodes, k, u, x, y, z)
         level = way * axial
-        if radial > radius:
+        if radial > radius or (level <= 0.0 and flats[end] != 1):
             continue
         if level > 0.0:
             if abs(place - k - u) > 0.01:
@@ -124,14 +124,17 @@ def _square(place, x, y, z):
 
 
 @compiled
-def _rings_near(nodes, first, last, x, y, z, margin, chosen):
-    """Rings of one vessel that matter around a place, their number, and its depth."""
+def _rings_near(nodes, among, x, y, z, margin, chosen):
+    """Those of the rings of one vessel that matter around a place, and its depth.
+
+    They are put into `chosen`; the first is their number.
+    """
     best, deepest, count = np.inf, -np.inf, 0
-    for k in range(first, last + 1):
+    for k in among:
         best = min(best, at_node(nodes, k, x, y, z))
         deepest = max(deepest, nodes[k, 6] - math.sqrt(_square(nodes[k], x, y, z)))
     limit = (math.sqrt(best) + margin) ** 2
-    for k in range(first, last + 1):
+    for k in among:
         if at_node(nodes, k, x, y, z) <= limit:
             chosen[count] = k
             count += 1
@@ -139,13 +142,13 @@ def _rings_near(nodes, first, last, x, y, z, margin, chosen):
 
 
 @compiled
-def _creases_near(creases, x, y, z, margin, near):
+def _creases_near(creases, among, x, y, z, margin, near):
     """Number of the creases that matter around a place, which are put into `near`."""
     closest, found = np.inf, 0
-    for c in range(len(creases)):
+    for c in among:
         closest = min(closest, _square(creases[c], x, y, z))
     limit = (math.sqrt(closest) + margin) ** 2
-    for c in range(len(creases)):
+    for c in among:
         if _square(creases[c], x, y, z) <= limit:
             near[found] = c
             found += 1
@@ -153,7 +156,10 @@ def _creases_near(creases, x, y, z, margin, near):
 
 
 @compiled
-def tree_depths(nodes, spans, flats, creases, blocks, points, reach, slack, out):
+def tree_depths(
+    nodes, spans, flats, creases, blocks, points, reach, groups, middles, reaches,
+    slack, out,
+):  # fmt: skip
     """Signed distance to the wall at every point of every block.
 
     Args:
@@ -164,55 +170,86 @@ def tree_depths(nodes, spans, flats, creases, blocks, points, reach, slack, out)
         blocks: (n, 3) middles of the blocks, m.
         points: (q, 3) relative to the middle of a block, m, within `reach`.
         reach: m.
+        groups: (q,) number of the group of each point.
+        middles: (g, 3) of the groups, relative to the middle of a block, m.
+        reaches: (g,) of the groups, m.
         slack: m; farther vessels do not matter.
         out: (n, q) m, > 0 inside.
     """
     vessels = len(spans)
-    chosen = np.empty((vessels, len(nodes)), np.int64)
-    counts = np.empty(vessels, np.int64)
-    level = np.empty(vessels)
-    near = np.empty(len(creases), np.int64)
+    rings, edges = np.arange(len(nodes)), np.arange(len(creases))
+    wide = np.empty((vessels, len(nodes)), np.int64)
+    close = np.empty((vessels, len(nodes)), np.int64)
+    many, few = np.empty(vessels, np.int64), np.empty(vessels, np.int64)
+    level, depths = np.empty(vessels), np.empty(vessels)
+    around, near = np.empty(len(creases), np.int64), np.empty(len(creases), np.int64)
     wall, there = np.empty(3), np.empty(3)
     for n in range(len(blocks)):
         x, y, z = blocks[n]
         for v in range(vessels):
             first, last = spans[v]
-            counts[v], level[v] = _rings_near(
-                nodes, first, last, x, y, z, 2.0 * reach + slack, chosen[v]
+            many[v], level[v] = _rings_near(
+                nodes, rings[first : last + 1], x, y, z, 2.0 * reach + slack, wide[v]
             )
         bar = level.max() - 2.0 * reach - slack
-        found = _creases_near(creases, x, y, z, 2.0 * reach + 1e-6, near)
-        for q in range(len(points)):
-            px, py, pz = x + points[q, 0], y + points[q, 1], z + points[q, 2]
-            inside, distance = False, np.inf
+        margin = 2.0 * reach + 1e-6
+        found = _creases_near(creases, edges, x, y, z, margin, around)
+        for g in range(len(middles)):
+            gx, gy, gz = x + middles[g, 0], y + middles[g, 1], z + middles[g, 2]
+            margin = 2.0 * reaches[g] + 1e-6
             for v in range(vessels):
-                if level[v] < bar:
-                    continue
-                first, last = spans[v]
-                depth = signed(
-                    nodes, first, last, flats[v], chosen[v], counts[v], px, py, pz, wall
-                )
-                inside = inside or depth > 0.0
-                if abs(depth) >= distance:
-                    continue
-                valid = True
-                for w in range(vessels):
-                    if w == v or level[w] < bar - slack:
-                        continue
-                    first, last = spans[w]
-                    other = signed(
-                        nodes, first, last, flats[w], chosen[w], counts[w],
-                        wall[0], wall[1], wall[2], there,
+                if level[v] >= bar:
+                    few[v], depths[v] = _rings_near(
+                        nodes, wide[v, : many[v]], gx, gy, gz, margin, close[v]
+                    )
+                else:
+                    depths[v] = -np.inf
+            lowest = depths.max() - 2.0 * reaches[g] - slack
+            left = _creases_near(creases, around[:found], gx, gy, gz, margin, near)
+            for q in range(len(points)):
+                if groups[q] == g:
+                    out[n, q] = _tree_depth(
+                        nodes, spans, flats, wide, many, close, few, depths, lowest,
+                        level, bar - slack, creases, near[:left],
+                        x + points[q, 0], y + points[q, 1], z + points[q, 2],
+                        wall, there,
                     )  # fmt: skip
-                    if other > _TOUCHING:
-                        valid = False
-                        break
-                if valid:
-                    distance = abs(depth)
-            for c in range(found):
-                square = _square(creases[near[c]], px, py, pz)
-                distance = min(distance, math.sqrt(square))
-            out[n, q] = distance if inside else -distance
+
+
+@compiled
+def _tree_depth(
+    nodes, spans, flats, wide, many, close, few, depths, lowest, level, bar, creases,
+    near, x, y, z, wall, there,
+):  # fmt: skip
+    """Signed distance of one point, m; rings and creases that matter are given."""
+    inside, distance = False, np.inf
+    for v in range(len(spans)):
+        if depths[v] < lowest:
+            continue
+        first, last = spans[v]
+        depth = signed(nodes, first, last, flats[v], close[v], few[v], x, y, z, wall)
+        inside = inside or depth > 0.0
+        if abs(depth) >= distance:
+            continue
+        valid = True
+        for w in range(len(spans)):
+            if w == v or level[w] < bar:
+                continue
+            first, last = spans[w]
+            other = signed(
+                nodes, first, last, flats[w], wide[w], many[w],
+                wall[0], wall[1], wall[2], there,
+            )  # fmt: skip
+            if other > _TOUCHING:
+                valid = False
+                break
+        if valid:
+            distance = abs(depth)
+    closest = np.inf
+    for c in near:
+        closest = min(closest, _square(creases[c], x, y, z))
+    distance = min(distance, math.sqrt(closest))
+    return distance if inside else -distance
 
 
 @compiled
