@@ -183,7 +183,7 @@ def test_pressing_on_the_wall_slows_the_device_down():
     plan = pursuit.Plan.for_task(task)
     simulation = jiggled(task, 2, 1)
     options = pursuit.Settings()
-    pressing = forces.wall_force(np.array([0.0, 1.0]).reshape(2, 1, 1))
+    pressing = forces.WallForce(*[np.array([0.0, 1.0])] * 4)
     action = expert.Expert(plan, options).act(simulation.readings, pressing)
     assert action[0, 20] > 0.5 * options.speed
     assert action[1, 20] == pytest.approx(options.speed * options.creep)

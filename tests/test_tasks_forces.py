@@ -58,13 +58,25 @@ def test_magnitude_is_the_norm_of_the_force(local):
     )
 
 
-@given(arrays.arrays(float, (3, 5, 4), elements=st.floats(0, 5, allow_subnormal=False)))
+@given(arrays.arrays(float, (3, 5, 4), elements=st.floats(1e-9, 5)))
 def test_sum_and_peaks(magnitude):
-    wall = forces.wall_force(magnitude)
-    assert wall.sum.shape == (3,)
+    rows = np.zeros((*magnitude.shape, forces.CONTACT_SIZE))
+    rows[..., 0], rows[..., 1], rows[1, 2, 3, 4] = 4, magnitude, -2e-4
+    wall, depth = forces.wall_force(rows.reshape(3, 5, -1))
+    assert wall.sum.shape == (3,) and depth.tolist() == [0.0, 2e-4, 0.0]
     np.testing.assert_allclose(wall.sum, magnitude[:, -1].sum(-1))
     np.testing.assert_array_equal(wall.max, magnitude[:, -1].max(-1))
     np.testing.assert_allclose(wall.peak_sum, magnitude.sum(-1).max(-1))
     np.testing.assert_array_equal(wall.peak_max, magnitude.max((-1, -2)))
     assert (wall.peak_sum >= wall.sum).all()
     assert (wall.peak_max >= wall.max).all() and (wall.sum >= wall.max - 1e-12).all()
+
+
+@pytest.mark.parametrize("step", [0, 4])
+def test_a_force_that_is_no_number_is_not_lost(step):
+    rows = np.zeros((1, 5, 3 * forces.CONTACT_SIZE))
+    rows.reshape(1, 5, 3, -1)[..., :2] = 3, 1.0
+    rows[0, step, 1] = np.nan
+    wall, _ = forces.wall_force(rows)
+    assert np.isnan(wall.peak_max) and np.isnan(wall.peak_sum)
+    assert np.isnan([wall.max, wall.sum]).all() == (step == 4)

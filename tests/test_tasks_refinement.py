@@ -45,7 +45,7 @@ def test_hard_and_deep_contacts_need_shorter_steps(contact, coarse):
     force, depth = contact
     rows = np.zeros((2, 3, 4 * forces.CONTACT_SIZE))
     rows[1, 2, [0, 1, 4]] = 1, force, -depth
-    assert forces.too_coarse(forces.magnitudes(rows), rows).tolist() == [False, coarse]
+    assert forces.too_coarse(*forces.wall_force(rows)).tolist() == [False, coarse]
 
 
 @pytest.mark.parametrize(

@@ -243,6 +243,16 @@ def word(_, address):
 
 
 @_intrinsic
+def fused(_, one, other, more):
+    """The number one * other + more, rounded once; so numpy sums squares."""
+
+    def generate(context, builder, signature, arguments):
+        return builder.fma(*arguments)
+
+    return types.float64(types.float64, types.float64, types.float64), generate
+
+
+@_intrinsic
 def pointer(_, address):
     """An address as the untyped pointer that `numba.carray` takes."""
 

@@ -112,38 +112,8 @@ JOINTS: tuple[RobotJoint, ...] = (
 
 
 # Insertion 0 lies in the middle of an overlap: both pairs are closed at the start.
-_FRONT_PHASE, _REAR_PHASE = OVERLAP / 2, OVERLAP / 2 + CYCLE / 2
-
-# One number, or an array of them.
-Scalars = float | NDArray[np.float64]
-
-
-def _clamp(insertion: Scalars, offset: float) -> tuple[Scalars, Scalars]:
-    """Travel of a pair's platform from home, and opening of each of its jaws, m.
-
-    A platform moves with the device while its jaws are closed, opening or closing, and
-    returns in between:
-    ``travel = phase - STROKE / 2 - CYCLE * smoothstep(return progress)``. Position and
-    speed are continuous. Both depend on the insertion alone, so a withdrawal reverses
-    the motion.
-    """
-    # The jaws are closed over phases [0, STROKE].
-    phase = (insertion + offset) % CYCLE
-    swung = _smoothstep((phase - (STROKE + JAW_TRAVEL)) / RETURN)
-    opened = _smoothstep((phase - STROKE) / JAW_TRAVEL)
-    closed = _smoothstep((phase - (CYCLE - JAW_TRAVEL)) / JAW_TRAVEL)
-    return phase - STROKE / 2 - CYCLE * swung, JAW_OPENING * (opened - closed)
-
-
-def _smoothstep(u: Scalars) -> Scalars:
-    # Plain floats are faster than numpy for one robot, posed in every control step.
-    if not isinstance(u, float):
-        u = np.clip(u, 0.0, 1.0)
-    elif u <= 0.0:
-        return 0.0
-    elif u >= 1.0:
-        return 1.0
-    return u * u * (3.0 - 2.0 * u)
+_PHASES = (OVERLAP / 2, OVERLAP / 2 + CYCLE / 2)
+_CYCLE = (CYCLE, STROKE, JAW_TRAVEL, RETURN, JAW_OPENING)
 
 
 def follower_posture(
@@ -176,44 +146,31 @@ def follower_posture(
         insertion if guidewire_insertion is None else guidewire_insertion,
         rotation if guidewire_rotation is None else guidewire_rotation,
     )
-    arrays = [np.asarray(each, np.float64) for each in given]
-    if all(each.size == 1 for each in arrays):  # plain floats take a third of the time
-        plain = [each.item() for each in arrays]
-        shape = max((each.shape for each in arrays), key=len)
-        posture = np.array(_posture(*plain)).reshape(*shape, len(JOINTS))
-        finite = math.isfinite(sum(plain))
-    else:
-        posture = np.stack(_posture(*np.broadcast_arrays(*arrays)), axis=-1)
-        finite = bool(np.isfinite(posture).all())
-    if not finite:
+    table = np.empty((len(given), *np.broadcast(*given).shape))
+    for row, each in enumerate(given):
+        table[row] = each
+    posture = postures(table.reshape(len(given), -1))
+    return posture.reshape(*table.shape[1:], len(JOINTS))
+
+
+def postures(given: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Joint positions (N, len(JOINTS)) of N followers; see `follower_posture`.
+
+    Args:
+        given: (4, N), insertion and rotation of the catheter and of the guidewire.
+
+    Raises:
+        ValueError: a number is not finite.
+    """
+    from cathsim_dmc.entities import robot_loops  # late, as numba takes long
+
+    if not math.isfinite(given.sum()):
         raise ValueError(
             "insertion, rotation, guidewire insertion and guidewire rotation must be "
             f"finite, got {given}: check for a diverged simulation"
         )
-    return posture
-
-
-def _posture(
-    pushed: Scalars, turned: Scalars, wire_pushed: Scalars, wire_turned: Scalars
-) -> tuple[Scalars, ...]:
-    """The joints in the order of ``JOINTS``."""
-    front, front_opening = _clamp(pushed, _FRONT_PHASE)
-    rear, rear_opening = _clamp(wire_pushed, _REAR_PHASE)
-    # The catheter unit stays half-way between the clamps, so the free lengths of shaft
-    # on both sides are equal; the guidewire unit moves with the rear clamps.
-    middle = (front + rear) / 2
-    return (
-        *(front, middle, rear, rear),
-        *(front_opening, front_opening, rear_opening, rear_opening),
-        *_wheels(pushed - middle, turned),
-        *_wheels(wire_pushed - rear, wire_turned),
-    )
-
-
-def _wheels(slip: Scalars, turned: Scalars) -> tuple[Scalars, ...]:
-    """Ring, pinion and rollers; ``slip`` is the device relative to the platform, m."""
-    rolled = slip / ROLLER_RADIUS
-    return turned, -turned * (RING_TEETH / PINION_TEETH), rolled, -rolled
+    teeth = RING_TEETH / PINION_TEETH
+    return robot_loops.postures(given, _PHASES, _CYCLE, ROLLER_RADIUS, teeth)
 
 
 class Robot(composer.Entity):

@@ -32,27 +32,30 @@ class Drives:
         Args:
             arrays: `qpos`, `qvel` and `act` (N, ...), views.
         """
+        from cathsim_dmc.physics import drives_loops  # late, as numba takes long
+
+        self._loops = drives_loops
         found = np.flatnonzero(
             model.actuator_dyntype == mujoco.mjtDyn.mjDYN_INTEGRATOR.value
         )
         joints = model.actuator_trnid[found, 0]
         self._arrays = arrays
-        # Whole numbers of the size that numpy indexes with: others are cast each time.
-        self._places = model.actuator_actadr[found].astype(np.intp)
-        self._qpos = model.jnt_qposadr[joints].astype(np.intp)
-        self._dofs = model.jnt_dofadr[joints].astype(np.intp)
-        self._gain = model.actuator_gainprm[found, 0]
-        self._stiffness = -model.actuator_biasprm[found, 1]
-        self._damping = -model.actuator_biasprm[found, 2]
-        self._limit = model.actuator_forcerange[found, 1]
+        addresses = model.jnt_qposadr[joints], model.jnt_dofadr[joints]
+        self._places = np.stack([*addresses, model.actuator_actadr[found]])
+        gain, spring = model.actuator_gainprm[found, 0], model.actuator_biasprm[found]
+        stiffness, limit = -spring[:, 1], model.actuator_forcerange[found, 1]
+        reach = gain / stiffness * CONTROL_TIMESTEP
+        self._constants = np.stack([gain, stiffness, -spring[:, 2], limit, reach])
         count = len(arrays.qpos)
         self.slipped = np.zeros((count, len(found)))
         self.told = np.zeros((count, len(found)))
 
     def hold(self, index: int) -> None:
         """Sets the command of one simulation to where its base stands."""
-        place = self._arrays.qpos[index, self._qpos]
-        self._arrays.act[index, self._places] = place * self._stiffness / self._gain
+        qpos, _, act = self._places
+        gain, stiffness = self._constants[:2]
+        place = self._arrays.qpos[index, qpos]
+        self._arrays.act[index, act] = place * stiffness / gain
         self.told[index] = place
         self.slipped[index] = 0.0
 
@@ -65,20 +68,13 @@ class Drives:
         Returns:
             Way (N, D) by which the clamps have slipped in the last one, m and rad.
         """
-        place = self._arrays.qpos[:, self._qpos]
-        brake = self._damping * self._arrays.qvel[:, self._dofs]
-        effort = self._gain * self._arrays.act[:, self._places]
-        effort -= self._stiffness * place + brake
-        slips = np.abs(effort) >= self._limit
-        slip = np.zeros_like(place)
-        if np.count_nonzero(slips):  # which is rare, and takes long to work out
-            slip[slips] = (self.told - place)[slips]
-            self.told -= slip
-            self.slipped += np.abs(slip)
-            effort = np.clip(effort, -self._limit, self._limit)
-        pulled = self._stiffness * self.told + effort + brake
-        self._arrays.act[:, self._places] = pulled / self._gain
-        self.told += command * (self._gain / self._stiffness * CONTROL_TIMESTEP)
+        arrays, slip = self._arrays, np.zeros_like(self.told)
+        self._loops.follow(
+            *(arrays.qpos, arrays.qvel, arrays.act),
+            *(self._places, self._constants),
+            *(self.told, self.slipped),
+            *(np.ascontiguousarray(command), slip),
+        )
         return slip
 
 

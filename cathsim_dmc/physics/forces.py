@@ -19,12 +19,6 @@ DEEPEST = 0.6e-3
 REFINEMENT = 4
 
 
-def _slots(row: np.ndarray) -> np.ndarray:
-    """The sensor's row (..., K * 14) contact by contact (..., K, 14)."""
-    places = row.shape[-1] // CONTACT_SIZE
-    return row.reshape(*row.shape[:-1], places, CONTACT_SIZE)
-
-
 @dataclasses.dataclass(frozen=True)
 class Contacts:
     """Contacts of the device with the wall; K places, of which some are empty.
@@ -50,7 +44,7 @@ class Contacts:
     @classmethod
     def from_sensor(cls, row: np.ndarray) -> "Contacts":
         """Reads the sensor's row (..., K * 14) as `entities.phantom` declares it."""
-        slots = _slots(row)
+        slots = row.reshape(*row.shape[:-1], -1, CONTACT_SIZE)
         found = slots[..., 0]
         present = found > 0
         normal, tangent = slots[..., 8:11], slots[..., 11:14]
@@ -70,22 +64,9 @@ class Contacts:
         )
 
 
-def magnitudes(row: np.ndarray) -> np.ndarray:
-    """Contact force magnitudes in N from the sensor's row (..., K * 14).
-
-    Returns:
-        (..., M) with M <= K, the most contacts of any row: the sensor fills its places
-        from the first, and most are empty.
-    """
-    slots = _slots(row)
-    occupied = min(int(slots[..., 0, 0].max()), slots.shape[-2])
-    force = slots[..., :occupied, 1:4]
-    return np.sqrt(np.vecdot(force, force))
-
-
 def distances(rows: np.ndarray) -> np.ndarray:
     """Distances (..., K) m of the contacts in rows (..., K * 14), 0 where empty."""
-    # Without `_slots`, which copies long rows that are not contiguous.
+    # Without reshaping, which copies long rows that are not contiguous.
     return rows[..., 4::CONTACT_SIZE]
 
 
@@ -93,57 +74,6 @@ def pressing_work(rows: np.ndarray) -> np.ndarray:
     """Work (...) J that has pressed springs in, ½ Σ f r, from rows (..., K * 14)."""
     normal, depth = rows[..., 1::CONTACT_SIZE], -distances(rows)
     return 0.5 * (normal * np.maximum(depth, 0.0)).sum(axis=-1)
-
-
-def too_coarse(
-    magnitude: np.ndarray, rows: np.ndarray, deepest: float | None = None
-) -> np.ndarray:
-    """Whether control steps need shorter physics steps.
-
-    Args:
-        magnitude: (..., S, M), N, of the contacts in S physics steps.
-        rows: (..., S, K * 14) of the sensor, with K >= M.
-        deepest: m; None for `DEEPEST`.
-
-    Returns:
-        (...) bool: some contact is harder than `HARDEST` or deeper than `deepest`.
-    """
-    distance = distances(rows)[..., : magnitude.shape[-1]]
-    wrong = magnitude > HARDEST
-    wrong |= distance < -(DEEPEST if deepest is None else deepest)
-    return np.logical_or.reduce(wrong, axis=(-2, -1))
-
-
-class ContactHistory:
-    """Contacts in each physics step of a control step, without the empty places.
-
-    A row of the sensor is long and mostly empty; copying it after every physics step
-    would take as long as a tenth of a free one.
-    """
-
-    def __init__(self, steps: int, places: int):
-        """Starts empty, for `steps` physics steps and a row of `places` numbers."""
-        self._rows = np.zeros((steps, places))
-        self._width = 0
-
-    def clear(self) -> None:
-        """Begins a control step, without contacts."""
-        if self._width:
-            self._rows[:, : self._width] = 0.0
-            self._width = 0
-
-    def keep(self, step: int, row: np.ndarray) -> None:
-        """Keeps the sensor's row (K * 14,) of the physics step just done."""
-        found = row[0]
-        if found:
-            width = min(int(found) * CONTACT_SIZE, len(row))
-            self._rows[step, :width] = row[:width]
-            self._width = max(self._width, width)
-
-    @property
-    def rows(self) -> np.ndarray:
-        """Rows (S, M * 14) of the S physics steps, of the M places used."""
-        return self._rows[:, : self._width]
 
 
 class WallForce(NamedTuple):
@@ -165,20 +95,30 @@ class WallForce(NamedTuple):
 NO_FORCE = WallForce(*(np.zeros(()) for _ in WallForce._fields))
 
 
-def wall_force(magnitude: np.ndarray) -> WallForce:
-    """Summarises the contact magnitudes (..., S, M) of S substeps, in N."""
-    if not magnitude.shape[-1]:
-        shape = magnitude.shape[:-2]
-        return WallForce(
-            np.zeros(shape), np.zeros(shape), np.zeros(shape), np.zeros(shape)
-        )
-    # One contact after the other: numpy's pairwise sum along the last axis would depend
-    # on the number of empty places, and so on what other simulations touch.
-    total = magnitude.cumsum(-1)[..., -1]
-    largest = magnitude.max(-1)
-    return WallForce(
-        sum=total[..., -1],
-        max=largest[..., -1],
-        peak_sum=total.max(-1),
-        peak_max=largest.max(-1),
-    )
+def wall_force(rows: np.ndarray) -> tuple[WallForce, np.ndarray]:
+    """Summarises the sensor's rows (N, S, K * 14) of the S steps of a control step.
+
+    Returns:
+        Forces, and the depth (N,) of the deepest contact in them, m.
+    """
+    from cathsim_dmc.physics import forces_loops  # late, as numba takes long
+
+    *force, deepest = forces_loops.summed(rows, CONTACT_SIZE)
+    return WallForce(*force), deepest
+
+
+def too_coarse(
+    force: WallForce, depth: np.ndarray, deepest: float | None = None
+) -> np.ndarray:
+    """Whether control steps need shorter physics steps.
+
+    Args:
+        force: Of N control steps.
+        depth: (N,), m, of the deepest contact in them.
+        deepest: m; None for `DEEPEST`.
+
+    Returns:
+        (N,) bool: some contact is harder than `HARDEST` or deeper than `deepest`.
+    """
+    limit = DEEPEST if deepest is None else deepest
+    return (force.peak_max > HARDEST) | (depth > limit)

@@ -6,7 +6,7 @@ import mujoco
 import numpy as np
 
 from cathsim_dmc.entities.chain import Chain
-from cathsim_dmc.entities.robot import follower_posture
+from cathsim_dmc.entities.robot import postures
 from cathsim_dmc.imaging.device import Shadow
 from cathsim_dmc.physics.drives import Drives
 from cathsim_dmc.physics.effects import Effect, Episode, World
@@ -58,8 +58,11 @@ class SingleDevice(Effect):
     def follower_posture(self) -> np.ndarray:
         """Joints (N, len(JOINTS)) of the robot that holds the devices."""
         index, qpos = self.world.index, self.world.arrays.qpos
-        turned = 0.0 if index.rotation_qpos is None else qpos[:, index.rotation_qpos]
-        return follower_posture(qpos[:, index.insertion_qpos], turned)
+        held = np.zeros((4, len(qpos)))
+        held[::2] = qpos[:, index.insertion_qpos]
+        if index.rotation_qpos is not None:
+            held[1::2] = qpos[:, index.rotation_qpos]
+        return postures(held)
 
     def shadows(self, line: np.ndarray) -> list[Shadow]:
         """The devices as X-rays meet them, from the innermost outwards.

@@ -20,7 +20,7 @@ from cathsim_dmc.entities.chain import (
 )
 from cathsim_dmc.entities.coaxial import Overlap
 from cathsim_dmc.entities.device_stack import DeviceStack
-from cathsim_dmc.entities.robot import follower_posture
+from cathsim_dmc.entities.robot import postures
 from cathsim_dmc.imaging.device import Shadow
 from cathsim_dmc.physics.chain_fields import (
     FIELDS,
@@ -281,12 +281,8 @@ class SlidingDevices(SingleDevice):
         units work on the same.
         """
         pushed, turned = self.pushed(), self._angles[..., 0]
-        return follower_posture(
-            pushed[:, -1],
-            turned[:, -1],
-            guidewire_insertion=pushed[:, 0],
-            guidewire_rotation=turned[:, 0],
-        )
+        ends = (pushed[:, -1], turned[:, -1], pushed[:, 0], turned[:, 0])
+        return postures(np.array(ends))
 
     def turned(self) -> np.ndarray:
         """Rotation (N, K) of the rotary unit of each device, rad."""

@@ -107,26 +107,23 @@ class Stepper(abc.ABC):
         self._before = self.states()
         self._warnings_before = self.warnings.copy()
 
-    def end(self) -> tuple[np.ndarray, np.ndarray]:
+    def end(self) -> tuple[forces.WallForce, np.ndarray]:
         """Ends a control step, done again in shorter steps where it was too coarse.
 
         Returns:
-            Contact forces on the wall (N, S, M) in its physics steps, N, and whether
-            MuJoCo has warned in it, (N,) bool.
+            Force on the wall over it, and whether MuJoCo has warned in it, (N,) bool.
         """
-        warned, magnitudes = self._warned(), self._magnitudes()
-        if magnitudes.size:
-            rows = self.contact_rows
-            coarse = forces.too_coarse(magnitudes, rows, self.deepest) & ~warned
-            if coarse.any():
-                self._refine(np.flatnonzero(coarse))
-                warned, magnitudes = self._warned(), self._magnitudes()
-        return magnitudes, warned
+        warned, (force, depth) = self._warned(), forces.wall_force(self.contact_rows)
+        coarse = forces.too_coarse(force, depth, self.deepest) & ~warned
+        if np.count_nonzero(coarse):
+            self._refine(np.flatnonzero(coarse))
+            warned, (force, _) = self._warned(), forces.wall_force(self.contact_rows)
+        return force, warned
 
-    def still(self, indices: np.ndarray) -> np.ndarray:
-        """Contact forces on the wall (N, S, M), N, where some have not moved yet."""
+    def still(self, indices: np.ndarray) -> forces.WallForce:
+        """Force on the wall where some simulations have not moved yet."""
         self._keep_still(indices)
-        return self._magnitudes()
+        return forces.wall_force(self.contact_rows)[0]
 
     def forward_unactuated(self, indices: np.ndarray) -> None:
         """What dm_control does at a reset, when there is no control yet."""
@@ -165,12 +162,6 @@ class Stepper(abc.ABC):
         changed = self.warnings != self._warnings_before
         return changed.reshape(self.num_simulations, -1).any(-1)
 
-    def _magnitudes(self) -> np.ndarray:
-        """Contact forces on the wall (N, S, M) in the S physics steps, N."""
-        rows = self.contact_rows
-        # Without a contact there is nothing to work out, which is the usual case.
-        return forces.magnitudes(rows) if rows.size else rows
-
 
 class SingleStepper(Stepper):
     """One simulation, stepped by somebody else who calls `keep` after each step."""
@@ -189,24 +180,24 @@ class SingleStepper(Stepper):
         self.warnings = data.warning.number[None]
         self._case: Anatomic | None = None
         self._sensor = data.sensordata[self._contacts]
-        self._history = forces.ContactHistory(substeps, len(self._sensor))
-        self._substep = 0
+        # Of each physics step; 0 where there is no contact.
+        self._rows = np.zeros((substeps, len(self._sensor)))
+        self._substep, self._size = 0, mujoco.mj_stateSize(model, _STATE)
 
     def begin(self, control: np.ndarray) -> None:
         """Begins a control step with the control (1, U) of all its physics steps."""
         super().begin(control)
-        self._history.clear()
         self._substep = 0
 
     def keep(self) -> None:
         """Keeps the contacts of the physics step that has just been done."""
-        self._history.keep(self._substep, self._sensor)
+        self._rows[self._substep] = self._sensor
         self._substep += 1
 
     @property
     def contact_rows(self) -> np.ndarray:
         """Rows (1, S, M * 14) of the wall's sensor in the last control step."""
-        return self._history.rows[None]
+        return self._rows[None]
 
     def field(self, index: int, name: str) -> np.ndarray:
         """A field of the model, to be written."""
@@ -224,7 +215,7 @@ class SingleStepper(Stepper):
 
     def states(self) -> np.ndarray:
         """State (1, nstate), mjSTATE_INTEGRATION, a copy."""
-        state = np.empty((1, mujoco.mj_stateSize(self._model, _STATE)))
+        state = np.empty((1, self._size))
         mujoco.mj_getState(self._model, self._data, state[0], _STATE)
         return state
 
@@ -235,21 +226,20 @@ class SingleStepper(Stepper):
 
     def run(self, parts: int = 1) -> None:
         """Does the physics steps of a control step, each in so many parts."""
-        self._history.clear()
         before = self._warnings_before.tobytes()
-        for substep in range(self.substeps):
+        for substep, row in enumerate(self._rows):
             for _ in range(parts):
                 mujoco.mj_step(self._model, self._data)
                 if self.warnings.tobytes() != before:  # where a batch stops, too
+                    self._rows[substep:] = 0.0
                     return
-            self._history.keep(substep, self._sensor)
+            row[:] = self._sensor
 
     def _run(self, indices: np.ndarray, parts: int) -> None:
         self.run(parts)
 
     def _keep_still(self, indices: np.ndarray) -> None:
-        self._history.clear()
-        self._history.keep(-1, self._sensor)
+        self._rows[:-1], self._rows[-1] = 0.0, self._sensor
 
     def _forward(self, indices: np.ndarray) -> None:
         mujoco.mj_forward(self._model, self._data)

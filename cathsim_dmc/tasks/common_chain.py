@@ -43,9 +43,10 @@ class CommonChain:
         bends = [names.index(joint.full_identifier) for joint in chain.bends]
         others = [place for place in range(len(names)) if place not in bends]
         shown = 2 * (self.num_links - 1)
-        missing = [len(names)] * (shown - len(bends))
-        # Places in the simulated joints; the place past the last one stands for zero.
-        self._joints = np.array([*others, *missing, *bends[-shown:]])
+        missing = max(shown - len(bends), 0)
+        # Places in the simulated joints, any for those that are missing.
+        self._joints = np.array([*others, *[0] * missing, *bends[-shown:]])
+        self._missing = slice(len(others), len(others) + missing)
         self.num_joints = len(self._joints)
 
         nodes = np.append(np.cumsum(lengths[::-1])[::-1], 0.0)
@@ -61,8 +62,9 @@ class CommonChain:
         Base and torsion come first, then the bending hinges, of which those behind the
         simulated links are 0.
         """
-        zero = np.zeros((*values.shape[:-1], 1))
-        return np.concatenate([values, zero], axis=-1)[..., self._joints]
+        taken = values.take(self._joints, axis=-1)
+        taken[..., self._missing] = 0.0
+        return taken
 
     def links(self, state: Readings) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Inertia (N, L, 10), velocity and force (N, L, 6) of the links shown.

@@ -50,20 +50,21 @@ class Environment(composer.Environment):
         self._hooks.before_step(self._physics_proxy, action, self._random_state)
         self.task.run_substeps()
         self._hooks.after_step(self._physics_proxy, self._random_state)
-        seen = self.task.observation
+        task, physics = self.task, self._physics_proxy
+        seen = task.observation
         observation = {name: np.array(seen[name][0]) for name in self._enabled}
-        ends = self.task.should_terminate_episode(self._physics_proxy)
+        ends = task.should_terminate_episode(physics)
         self._reset_next_step = ends or self._physics.time() >= self._time_limit
         kind = dm_env.StepType.LAST if self._reset_next_step else dm_env.StepType.MID
-        task, physics = self.task, self._physics_proxy
         reward, discount = task.get_reward(physics), task.get_discount(physics)
         return dm_env.TimeStep(kind, reward, discount, observation)
 
     def _is_watched(self) -> bool:
         """Whether somebody is called between physics steps."""
         hooks = self._hooks
-        between = hooks._before_substep, hooks._after_substep  # noqa: SLF001
-        return any(hook.entity_hooks or hook.extra_hooks for hook in between)
+        before, after = hooks._before_substep, hooks._after_substep  # noqa: SLF001
+        called = before.entity_hooks or before.extra_hooks
+        return bool(called or after.entity_hooks or after.extra_hooks)
 
     def _is_plain(self) -> bool:
         """Whether composer's own step would do no more for an episode."""

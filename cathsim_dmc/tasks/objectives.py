@@ -138,8 +138,7 @@ def ask(objective: Objective, measurement: Measurement) -> Outcome:
 
 
 def _copied(objective, name, value, kinds, shape) -> np.ndarray:
-    masked = isinstance(value, np.ma.MaskedArray)
-    if masked or not isinstance(value, np.ndarray) or value.dtype.kind not in kinds:
+    if type(value) is not np.ndarray or value.dtype.kind not in kinds:
         _refuse(objective, f"{name} {bounds.shown(value)}")
     if value.shape != shape:
         _refuse(objective, f"{name} of shape {value.shape}; it must be {shape}")

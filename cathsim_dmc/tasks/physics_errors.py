@@ -1,7 +1,6 @@
 """Physics errors: detection and names."""
 
 import logging
-from collections.abc import Sequence
 
 import numpy as np
 
@@ -65,7 +64,7 @@ class PhysicsMonitor:
 
     def errors(
         self,
-        diverged: Sequence[bool] | np.ndarray,
+        diverged: np.ndarray,
         steps: np.ndarray,
         centreline: np.ndarray,
         peak_force: np.ndarray,
@@ -75,7 +74,7 @@ class PhysicsMonitor:
         The first error of an episode is logged.
 
         Args:
-            diverged: (N,), MuJoCo warned.
+            diverged: (N,) bool, MuJoCo warned.
             steps: (N,), control steps of the episodes.
             centreline: (N, n, 3), nodes of the devices, m.
             peak_force: (N,), largest single contact force within the step, N.
@@ -86,12 +85,9 @@ class PhysicsMonitor:
         looked = [
             i for i, taken in enumerate(steps.tolist()) if not taken % ESCAPE_INTERVAL
         ]
-        wrong = [
-            warned or not force <= MAX_FORCE
-            for warned, force in zip(diverged, peak_force.tolist(), strict=True)
-        ]
+        wrong = diverged | ~(peak_force <= MAX_FORCE)
         reasons: list[str | None] = [None] * len(self._scenes)
-        if not looked and not any(wrong):
+        if not looked and not np.count_nonzero(wrong):
             return tuple(reasons)
         out = np.zeros(len(reasons), dtype=bool)
         if looked:

@@ -42,9 +42,6 @@ from cathsim_dmc.tasks.route import Routes
 from cathsim_dmc.tasks.step import Step
 from cathsim_dmc.tasks.tracking_noise import TrackingNoise
 
-# Reasons of errors, empty for none.
-_REASON = "U64"
-
 
 class Rollout:
     """Episodes of N simulations of one task."""
@@ -116,9 +113,9 @@ class Rollout:
         self._steps = np.zeros(num_simulations, dtype=int)
         self._action = np.zeros((num_simulations, num_actions))
         self._previous_action = self._action
-        self._errors = np.zeros(num_simulations, dtype=_REASON)
         # There from the first measurement on.
         self._measured: Measured
+        self._errors: tuple[str | None, ...]
 
     # The course of an episode.
 
@@ -200,29 +197,27 @@ class Rollout:
         shortest = self._objective.path_distance(head)
         begun = Path(head, np.zeros(len(head)), shortest)
         self._path = merged(self._path, part(begun, indices), indices)
-        self._errors = np.zeros(len(head), dtype=_REASON)
+        self._errors = (None,) * len(head)
         return self._step(indices, np.zeros(len(head), dtype=bool))
 
     def finish(self) -> Step:
         """Measures, judges and observes after the physics steps of a control step."""
-        magnitudes, warned = self._stepper.end()
+        force, warned = self._stepper.end()
         self._steps += 1
-        self._measure(magnitudes)
+        self._measure(force)
         resting = self.resting
         self._path = self._path.to(resting.head)
-        errors = self._monitor.errors(
-            warned, self._steps, resting.centreline, self.wall_force.peak_max
+        self._errors = self._monitor.errors(
+            warned, self._steps, resting.centreline, force.peak_max
         )
-        self._errors = np.array([error or "" for error in errors], dtype=_REASON)
         return self._step()
 
-    def _measure(self, magnitudes: np.ndarray, rows: np.ndarray | None = None) -> None:
+    def _measure(self, force: forces.WallForce, rows: np.ndarray | None = None) -> None:
         """Measures all simulations, or some, when the others have not moved."""
         now = self._read()
         time, last = CONTROL_TIMESTEP * self._steps, self._stepper.contact_rows[:, -1]
         vessel_now = vessel.read(self._listed, time, now, last)
-        force, devices = forces.wall_force(magnitudes), self._devices.read(now)
-        new = Measured(now, force, devices, vessel_now)
+        new = Measured(now, force, self._devices.read(now), vessel_now)
         if rows is not None and hasattr(self, "_measured"):
             new = self._measured.updated(new, rows)
         self._measured = new
@@ -242,8 +237,7 @@ class Rollout:
                 their images are captured. None for all, one control step on.
             ended: (N,) bool, None for what the objective and the physics say.
         """
-        errors = tuple(error or None for error in self._errors.tolist())
-        goal, resting = self._objective.goal, self.resting
+        errors, goal, resting = self._errors, self._objective.goal, self.resting
         distance = straight(resting.head, goal)
         failed = None
         if errors.count(None) < len(errors):
@@ -294,9 +288,10 @@ class Rollout:
         if self._routes is not None:
             seen = self._at_rest(state) if self._tracking.on else self.resting
             ahead = self._routes.ahead(self._case_of, seen.head, state.head_frame)
-        force, chain = self.wall_force, self._chain
-        frame = Frame(state, force, self._action, goal, chain, images, ahead, devices)
-        frame = frame._replace(vessel=self._measured.vessel)
+        frame = Frame(
+            *(state, self.wall_force, self._action, goal, self._chain),
+            *(images, ahead, devices, self._measured.vessel),
+        )
         return observations.observe(self._names, frame)
 
     def _endoscope(self, indices: np.ndarray) -> dict[str, np.ndarray]:

@@ -114,7 +114,8 @@ class ExportedScene:
         for _ in range(self._task["substeps"]):
             mujoco.mj_step(self.model, self.data)
             rows.append(self.data.sensordata[self._row].copy())
-        self.wall_force = forces.wall_force(forces.magnitudes(np.array(rows)))
+        found, _ = forces.wall_force(np.array([rows]))
+        self.wall_force = forces.WallForce(*(value[0] for value in found))
 
     @property
     def head(self) -> np.ndarray:

@@ -1,0 +1,44 @@
+"""Compiled loop over the contacts of control steps; see `forces`."""
+
+import math
+
+import numpy as np
+
+from cathsim_dmc.collision.native import fused
+from cathsim_dmc.compiled import compiled
+
+
+@compiled
+def summed(rows, size):
+    """The arrays (N,) of `forces.WallForce`, and the depth of the deepest contact.
+
+    Args:
+        rows: (N, S, K * size), of the sensor, which fills its places from the first.
+        size: numbers of a contact.
+
+    Returns:
+        (5, N).
+    """
+    found = np.zeros((5, len(rows)))
+    for i in range(len(rows)):
+        for step in range(rows.shape[1]):
+            total, largest = 0.0, 0.0
+            for place in range(0, rows.shape[2], size):
+                contact = rows[i, step, place : place + size]
+                if contact[0] == 0.0:
+                    break
+                x, y, z = contact[1], contact[2], contact[3]
+                force = math.sqrt(fused(z, z, fused(y, y, x * x)))
+                total += force
+                largest = higher(force, largest)
+                found[4, i] = max(found[4, i], -contact[4])
+            found[0, i], found[1, i] = total, largest
+            found[2, i] = higher(total, found[2, i])
+            found[3, i] = higher(largest, found[3, i])
+    return found
+
+
+@compiled
+def higher(one, other):
+    """The larger of two numbers, or one that is none."""
+    return one if one > other or math.isnan(one) else other
