@@ -41,7 +41,6 @@ def register() -> None:
             gymnasium.register(
                 env_id,
                 entry_point=f"{_MODULE}:CathSimEnv",
-                vector_entry_point=f"{_MODULE}:CathSimVectorEnv",
                 kwargs={"task": task_of(env_id)},
             )
 

@@ -164,7 +164,7 @@ def test_every_entity_lives_on_both_timelines_at_the_right_rows(written):
         "/series/action/tip_bend": states[:-1],
         "/series/action_all": states[:-1],
     }
-    assert set(recording.temporal) == {*expected, "/events"}
+    assert set(recording.temporal) == set(expected)
     for entity, rows in expected.items():
         assert recording.values(entity, "step") == rows, entity
         wanted = [round(episode.time[row] * 1e9) for row in rows]
@@ -240,19 +240,6 @@ def test_series_hold_the_values_of_the_episode(written):
     )
     names = recording.fixed("/series/action_all", "SeriesLines:names")
     assert names[:3] == ["tip_x_0", "tip_y_0", "tip_x_1"] and names[-1] == "translation"
-
-
-def test_events_stand_at_the_states_where_they_happen(written):
-    episode, _, _, recording = written
-    texts = [text[0] for text in recording.values("/events", "TextLog:text")]
-    rows = dict(zip(texts, recording.values("/events", "step"), strict=True))
-    assert rows["start of type1_bca"] == 0 and rows["end: success"] == STEPS
-    row = int(episode.wall_force_max.argmax())
-    largest = f"largest force, {force_text(episode.wall_force_max[row])}"
-    assert rows[largest] == row + 1
-    nearest = int(np.argmin(episode.meta["distance"]))
-    named = [text for text in texts if text.startswith("nearest to the goal")]
-    assert [rows[text] for text in named] == [nearest]
 
 
 def test_links_take_the_colour_of_what_they_press(written):

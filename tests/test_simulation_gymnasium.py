@@ -120,31 +120,6 @@ def test_render_shows_the_device_as_it_goes():
     assert biplane.render().shape == (32, 64, 3)
 
 
-def test_vector_environment_is_the_single_ones_and_resets_by_itself():
-    steps, count = 4, 3
-    many = gymnasium.make_vec(
-        TASK, num_envs=count, vectorization_mode="vector_entry_point", max_steps=steps
-    )
-    single = gymnasium.make(TASK, max_steps=steps)
-    observation, _ = many.reset(seed=5)
-    first, _ = single.reset(seed=6)
-    np.testing.assert_array_equal(observation["position"][1], first["position"])
-    many.action_space.seed(0)
-    for index in range(steps):
-        action = many.action_space.sample()
-        observation, reward, terminated, truncated, info = many.step(action)
-        row = single.step(action[1])
-        assert reward[1] == row[1]
-        assert truncated.all() == (index == steps - 1) and not terminated.any()
-    np.testing.assert_array_equal(info["final_obs"]["position"][1], row[0]["position"])
-    np.testing.assert_allclose(info["final_info"]["distance"][1], row[4]["distance"])
-    # The next episode has begun, in each from its own source.
-    following, _ = single.reset()
-    np.testing.assert_array_equal(observation["position"][1], following["position"])
-    assert many.observation_space.contains(observation)
-    many.step(many.action_space.sample())
-
-
 def test_torchrl_takes_the_id():
     torchrl_envs = pytest.importorskip("torchrl.envs")
     from torchrl.envs.utils import check_env_specs

@@ -8,14 +8,17 @@ from typing import Any
 
 import numpy as np
 import torch
+from dm_env import specs
 from tensordict import TensorDict, TensorDictBase
 
+from cathsim_dmc import suite
 from cathsim_dmc.agents.networks import NetworkShapes
 from cathsim_dmc.policies import View
 from cathsim_dmc.policies.expert import ExpertPolicy
 from cathsim_dmc.recording import dataset
 from cathsim_dmc.recording.dataset import DatasetError, read_episodes
 from cathsim_dmc.simulation import environments
+from cathsim_dmc.simulation.batch import BatchSimulation
 from cathsim_dmc.simulation.environments import PIXELS, VECTOR
 from cathsim_dmc.simulation.episodes import BatchedSimulations, play
 from cathsim_dmc.tasks import observations
@@ -87,25 +90,32 @@ def record_demonstrations(
     if not 0 <= noise <= 1:
         raise ValueError(f"noise={noise} must be a deviation in [0, 1]")
     dataset.check_free(out)
-    from cathsim_dmc.simulation.gymnasium import CathSimVectorEnv, env_spec
+    from cathsim_dmc.simulation import gymnasium
 
     names = observation if isinstance(observation, str) else list(observation)
     options = {**(task_kwargs or {}), "observation": names}
     count = min(episodes, _SIMULATIONS)
-    environment = CathSimVectorEnv(count, task, num_threads or 0, **options)
+    simulation = BatchSimulation(
+        suite.make_task(task, **options), count, num_threads=num_threads or 0
+    )
     buffers: list[Any] = []
     while len(buffers) < episodes:
         seeds = np.arange(count) + seed + len(buffers)
-        played = _play(environment.simulation, seeds, noise)
+        played = _play(simulation, seeds, noise)
         buffers += played[: episodes - len(buffers)]
         if say is not None:
             say(f"{len(buffers)} of {episodes} episodes")
     dataset.write(
         out,
         buffers,
-        env_spec=env_spec(task, **options),
-        observation_space=environment.single_observation_space,
-        action_space=environment.single_action_space,
+        env_spec=gymnasium.env_spec(task, **options),
+        observation_space=gymnasium.space_of(
+            simulation.task.observation_specs, np.dtype("float32")
+        ),
+        action_space=gymnasium.space(
+            specs.BoundedArray((simulation.num_actions,), np.float32, -1.0, 1.0),
+            np.dtype("float32"),
+        ),
         algorithm=f"scripted expert, noise {noise:g}",
         description=f"{episodes} demonstrations of the task {task} of cathsim_dmc, "
         f"seeds from {seed}",

@@ -243,10 +243,8 @@ def replay(
     """
     from cathsim_dmc.recording import viewer
 
-    def announce(address: str) -> None:
-        print(f"Open {address} in a browser; Ctrl-C ends it.", flush=True)
-
-    return viewer.open_viewer(recording, web=web, port=port, announce=announce)
+    viewer.open_viewer(recording, web=web, port=port)
+    return 0
 
 
 def play(

@@ -60,26 +60,11 @@ def vessel(json: bool = False) -> int:
 
 
 @validations.command
-def forces(
-    episode: Path | None = None,
-    mean: float = 0.4,
-    sd: float = 0.02,
-    margin: float = 0.1,
-    json: Json = False,
-) -> int:
-    """Force balance, known loads, and the published protocol.
-
-    Args:
-        episode: Recorded cannulation (.npz of `cathsim record`) for the protocol;
-            scripted insertions by default.
-        mean: Mean of the normal reference, N; the published one is unverified.
-        sd: Standard deviation of the reference, N.
-        margin: Margin of the equivalence test, N.
-    """
+def forces(json: Json = False) -> int:
+    """Force balance and known loads."""
     from cathsim_dmc import validation
 
-    report = validation.validate_forces(episode, mean, sd, margin)
-    return show(report, json)
+    return show(validation.validate_forces(), json)
 
 
 @validations.command

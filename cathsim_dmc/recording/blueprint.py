@@ -51,10 +51,7 @@ def episode_blueprint(
     scene = rrb.Vertical(
         _scene(middle, extent), rrb.Horizontal(*insets), row_shares=[3, 2]
     )
-    texts = rrb.Tabs(
-        rrb.TextLogView(origin="events", name="Events"),
-        rrb.TextDocumentView(origin="info", name="Episode"),
-    )
+    texts = rrb.TextDocumentView(origin="info", name="Episode")
     images = [
         rrb.Spatial2DView(origin=origin, name=name)
         for origin, name in zip(FLUOROSCOPY[:planes], _PLANE_NAMES, strict=False)

@@ -5,72 +5,16 @@ from __future__ import annotations
 import json
 import os
 import re
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from cathsim_dmc.files import atomic_directory
-from cathsim_dmc.recording.episode import Episode
-
-# Options that say what is observed. An episode does not hold observations: they come
-# from repeating it, and may be others than those it was recorded with.
-_OBSERVED = ("observation", "fluoroscopy", "endoluminal_size")
-# Rewards of a repeated episode may differ by rounding on another machine.
-TOLERANCE = 1e-9
 
 _NO_MINARI = "minari is not installed; `pip install cathsim-dmc[gym]` adds it"
 _VERSION = re.compile(r"-v\d+$")
-
-
-def export(
-    episodes: Iterable[Episode],
-    path: str | os.PathLike[str],
-    *,
-    observation: str | Sequence[str] | None = None,
-    task_kwargs: Mapping[str, Any] | None = None,
-) -> Path:
-    """Repeats recorded episodes and writes them as a dataset, see `write`.
-
-    Every step is taken again from the episode's seed and compared with the record.
-
-    Args:
-        episodes: of one task, with the same options, seeded and not empty.
-        path: directory of the dataset, which must not exist.
-        observation: names of observations; None for those of the record, or "internal".
-        task_kwargs: further options of what is observed, such as `fluoroscopy`.
-
-    Raises:
-        ValueError: if the episodes do not belong together or do not repeat.
-        FileExistsError: the directory exists.
-        ModuleNotFoundError: if minari is not installed.
-    """
-    try:
-        from cathsim_dmc.simulation.gymnasium import make
-    except ModuleNotFoundError as error:
-        raise ModuleNotFoundError(_NO_MINARI) from error
-    check_free(Path(path))
-    episodes = list(episodes)
-    task, options = _common(episodes)
-    options.update(task_kwargs or {})
-    if observation is not None:
-        options["observation"] = observation
-    single = all((e.action == e.action.astype(np.float32)).all() for e in episodes)
-    environment = make(task, dtype="float32" if single else "float64", **options)
-    try:
-        return write(
-            path,
-            [_repeat(environment, episode) for episode in episodes],
-            env_spec=environment.spec,
-            observation_space=environment.observation_space,
-            action_space=environment.action_space,
-            algorithm="recorded episodes",
-            description=f"{len(episodes)} recorded episodes of the task {task} of "
-            "cathsim_dmc",
-        )
-    finally:
-        environment.close()
 
 
 def write(
@@ -194,69 +138,3 @@ def check_free(path: Path) -> None:
         raise FileExistsError(f"{path} exists: choose another directory, or remove it")
     if not path.parent.is_dir():
         raise FileNotFoundError(f"no directory {path.parent}; create it first")
-
-
-def _common(episodes: Sequence[Episode]) -> tuple[str, dict[str, Any]]:
-    """Task and options that all episodes share."""
-    given = [episode.meta.get("task_kwargs", {}) for episode in episodes]
-    unseen = {"random", *_OBSERVED}
-    kinds = [{k: v for k, v in one.items() if k not in unseen} for one in given]
-    tasks = sorted({episode.task for episode in episodes})
-    if len(tasks) != 1 or any(kind != kinds[0] for kind in kinds):
-        raise ValueError(
-            f"{len(episodes)} episodes of the tasks {tasks}, or with different "
-            "options, make no dataset; export each kind as one of its own"
-        )
-    for index, episode in enumerate(episodes):
-        if episode.seed is None or not episode.steps:
-            raise ValueError(
-                f"episode {index} has {episode.steps} steps and the seed "
-                f"{episode.seed}; only seeded episodes with steps can be repeated"
-            )
-    observed = {key: given[0][key] for key in _OBSERVED if key in given[0]}
-    return tasks[0], {**kinds[0], **observed}
-
-
-def _repeat(environment, episode: Episode):
-    """Takes every step of an episode again; returns it as Minari's buffer.
-
-    Raises:
-        ValueError: if it goes another way.
-    """
-    from minari.data_collector import EpisodeBuffer
-
-    dtype = environment.action_space.dtype
-    first = environment.reset(seed=episode.seed)
-    seen, infos, ends = [first[0]], [first[1]], []
-    for step, action in enumerate(episode.action.astype(dtype)):
-        observation, reward, *end, info = environment.step(action)
-        seen.append(observation)
-        infos.append(info)
-        ends.append(end)
-        if abs(reward - episode.reward[step]) > TOLERANCE:
-            raise ValueError(
-                f"episode with seed {episode.seed} does not repeat: reward {reward} "
-                f"instead of {episode.reward[step]} at step {step}; it was recorded "
-                f"with {episode.meta.get('versions')}"
-            )
-        if any(end) and step + 1 < episode.steps:
-            raise ValueError(
-                f"episode with seed {episode.seed} ends at step {step} instead of "
-                f"{episode.steps - 1}; export it with the options it was recorded with"
-            )
-    # The operator may have stopped the recording, which no step shows.
-    terminated, truncated = np.array(ends).T
-    truncated[-1] |= not terminated[-1]
-    return EpisodeBuffer(
-        seed=episode.seed,
-        observations=_columns(seen),
-        actions=episode.action.astype(dtype),
-        rewards=episode.reward.tolist(),
-        terminations=terminated.tolist(),
-        truncations=truncated.tolist(),
-        infos=_columns(infos),
-    )
-
-
-def _columns(rows: Sequence[Mapping[str, Any]]) -> dict[str, np.ndarray]:
-    return {key: np.array([row[key] for row in rows]) for key in rows[0]}

@@ -1,7 +1,7 @@
 """Episodes as Rerun recordings.
 
 One file holds one episode: the scene in 3D, the fluoroscopy if there is any, every
-series over simulated time, events and metadata as text, and the layout that opens them.
+series over simulated time, metadata as text, and the layout that opens them.
 Whole series are sent as columns, so the cost does not grow with calls per step.
 """
 
@@ -25,7 +25,7 @@ from cathsim_dmc.recording.episode import Episode
 from cathsim_dmc.recording.living import VesselRecord
 from cathsim_dmc.recording.rerun_device import log_catheter, log_contacts
 from cathsim_dmc.recording.rerun_scene import log_bodies, log_static, log_vessel
-from cathsim_dmc.recording.rerun_series import log_events, log_frames, log_series
+from cathsim_dmc.recording.rerun_series import log_frames, log_series
 from cathsim_dmc.recording.rerun_stream import Log
 from cathsim_dmc.recording.scene import BodyGeom
 
@@ -94,7 +94,6 @@ def _fill(log: Log, drawing: Drawing) -> None:
     log_bodies(log, drawing.geoms)
     log_contacts(log)
     log_series(log)
-    log_events(log)
 
 
 def _layout(episode: Episode, drawing: Drawing) -> Blueprint:

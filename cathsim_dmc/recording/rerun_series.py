@@ -1,4 +1,4 @@
-"""Series over time, X-ray images and events as Rerun entities."""
+"""Series over time and X-ray images as Rerun entities."""
 
 from __future__ import annotations
 
@@ -10,8 +10,6 @@ import rerun as rr
 from cathsim_dmc.recording.blueprint import FLUOROSCOPY
 from cathsim_dmc.recording.coaxial import CoaxialRecord
 from cathsim_dmc.recording.drawing import action_layout, goal_distance
-from cathsim_dmc.recording.episode import Episode
-from cathsim_dmc.recording.geometry import force_text
 from cathsim_dmc.recording.rerun_device import device_colours
 from cathsim_dmc.recording.rerun_stream import Log
 
@@ -85,63 +83,3 @@ def log_frames(log: Log, frames: np.ndarray) -> None:
             blobs.append(buffer.getvalue())
         log.static(entity, rr.EncodedImage.from_fields(media_type="image/jpeg"))
         log.columns(entity, rr.EncodedImage.columns(blob=blobs))
-
-
-def log_events(log: Log) -> None:
-    """Log what happens in the episode as lines of text."""
-    lines = events(log.episode)
-    rows = np.array([state for state, _, _ in lines], dtype=np.int64)
-    log.columns(
-        "events",
-        rr.TextLog.columns(
-            text=[text for _, text, _ in lines], level=[level for *_, level in lines]
-        ),
-        rows,
-    )
-
-
-# Steps without contact after which the next contact is an event again.
-_QUIET = 10
-INFO, WARN, ERROR = "INFO", "WARN", "ERROR"
-_END = {"success": INFO, "truncated": WARN, "physics_error": ERROR}
-
-
-def events(episode: Episode) -> list[tuple[int, str, str]]:
-    """State (its number), text and level of every event, in the order of time.
-
-    The start, contacts that begin, the largest force, the head half way and nearest to
-    the goal, the end.
-    """
-    found = [(0, f"start of {episode.task}", INFO), *_contacts(episode)]
-    force = episode.wall_force_max
-    if force.max(initial=0.0) > 0:
-        row = int(force.argmax())
-        found.append((row + 1, f"largest force, {force_text(force[row])}", WARN))
-    distance = episode.meta.get("distance")
-    if distance:
-        found += _approach(np.asarray(distance, dtype=np.float64))
-    text = f"end: {episode.termination.replace('_', ' ')}"
-    found.append((episode.steps, text, _END[episode.termination]))
-    return sorted(found, key=lambda event: event[0])
-
-
-def _contacts(episode: Episode) -> list[tuple[int, str, str]]:
-    touched = np.unique(episode.contact_step)
-    quiet = np.diff(touched, prepend=-_QUIET - 1) > _QUIET
-    found = []
-    for row in touched[quiet]:
-        force = episode.contact_force[episode.contact_step == row]
-        largest = np.linalg.norm(force, axis=-1).max()
-        found.append(
-            (int(row) + 1, f"contact with the wall, {force_text(largest)}", INFO)
-        )
-    return found
-
-
-def _approach(distance: np.ndarray) -> list[tuple[int, str, str]]:
-    half = np.flatnonzero(distance <= distance[0] / 2)
-    nearest = int(distance.argmin())
-    found = [(nearest, f"nearest to the goal, {1e3 * distance[nearest]:.1f} mm", INFO)]
-    if len(half):
-        found.append((int(half[0]), "half of the distance to the goal", INFO))
-    return found

@@ -1,4 +1,4 @@
-"""The tasks as Gymnasium environments: one simulation, or many on the batched path."""
+"""The tasks as Gymnasium environments."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -11,7 +11,6 @@ from gymnasium.envs.registration import EnvSpec
 from cathsim_dmc import suite
 from cathsim_dmc.anatomy.parts import Surface
 from cathsim_dmc.imaging import angiograph
-from cathsim_dmc.simulation import batch
 from cathsim_dmc.tasks.config import CONTROL_TIMESTEP
 
 RENDER_MODES = ("rgb_array",)
@@ -34,9 +33,10 @@ def space(spec: specs.Array, dtype: np.dtype) -> gymnasium.spaces.Box:
     return gymnasium.spaces.Box(-np.inf, np.inf, spec.shape, dtype)
 
 
-def _space_of(
+def space_of(
     entries: Mapping[str, specs.Array], dtype: np.dtype
 ) -> gymnasium.spaces.Dict:
+    """Spaces of named arrays, see `space`."""
     return gymnasium.spaces.Dict({k: space(spec, dtype) for k, spec in entries.items()})
 
 
@@ -112,7 +112,7 @@ class CathSimEnv(gymnasium.Env):
         self._dtype = _float_type(dtype)
         self._environment = suite.load(suite.DOMAIN, task, task_kwargs)
         entries = self._environment.task.observation_specs
-        self.observation_space = _space_of(entries, self._dtype)
+        self.observation_space = space_of(entries, self._dtype)
         self.action_space = space(self._environment.action_spec(), self._dtype)
         self._machines: dict[Surface, angiograph.Angiograph] = {}
         self._begun, self._ended = False, True
@@ -202,97 +202,3 @@ def env_spec(task: str, **options: Any) -> EnvSpec:
         kwargs={"task": task, **options},
         disable_env_checker=True,
     )
-
-
-class CathSimVectorEnv(gymnasium.vector.VectorEnv):
-    """N simulations of a task on the batched path.
-
-    An episode that ends is followed by the next one in the same step; its last
-    observation and information are in `infos["final_obs"]` and `infos["final_info"]`.
-    """
-
-    metadata = {
-        **CathSimEnv.metadata,
-        "autoreset_mode": gymnasium.vector.AutoresetMode.SAME_STEP,
-    }
-
-    def __init__(
-        self,
-        num_envs: int = 1,
-        task: str = "type1_bca",
-        num_threads: int = 0,
-        dtype: str = "float32",
-        render_mode: str | None = None,
-        **task_kwargs: Any,
-    ):
-        """Starts the simulations.
-
-        Args:
-            num_envs: N.
-            num_threads: worker threads, 0 for one per core.
-            dtype: of the numbers observed and of the action.
-            render_mode: None; one simulation renders (`CathSimEnv`).
-        """
-        if render_mode is not None:
-            raise ValueError(
-                f"render_mode is {render_mode!r}; many simulations do not render, "
-                'make one with gymnasium.make(..., render_mode="rgb_array")'
-            )
-        self.render_mode = None
-        self._dtype = _float_type(dtype)
-        self.num_envs = num_envs
-        self._simulation = batch.BatchSimulation(
-            suite.make_task(task, **task_kwargs),
-            num_envs,
-            num_threads=num_threads,
-            seeds=np.random.SeedSequence().generate_state(num_envs).tolist(),
-        )
-        action = specs.BoundedArray(
-            (self._simulation.num_actions,), self._dtype, -1.0, 1.0
-        )
-        self.single_observation_space = _space_of(
-            self._simulation.task.observation_specs, self._dtype
-        )
-        self.single_action_space = space(action, self._dtype)
-        many = gymnasium.vector.utils.batch_space
-        self.observation_space = many(self.single_observation_space, self.num_envs)
-        self.action_space = many(self.single_action_space, self.num_envs)
-
-    def reset(self, *, seed: int | list[int] | None = None, options=None):
-        """Starts all episodes; a seed is that of the first, the others count up."""
-        seeds = seed
-        if isinstance(seeds, int | np.integer):
-            seeds = [int(seeds) + i for i in range(self.num_envs)]
-        super().reset(seed=None if seeds is None else seeds[0])
-        if seeds is not None:
-            self._simulation.seed([_words(each) for each in seeds])
-        step = self._simulation.reset()
-        return _converted(step.observation, self._dtype), step.info()
-
-    def step(self, actions: np.ndarray):
-        """Advances all; see `gymnasium.vector.VectorEnv.step`."""
-        step = self._simulation.step(actions)
-        observation, info = step.observation, step.info()
-        ended = step.terminated | step.truncated
-        if ended.any():
-            begun = self._simulation.reset(np.flatnonzero(ended))
-            info = {
-                **begun.info(),
-                "final_obs": _converted(observation, self._dtype),
-                "_final_obs": ended,
-                "final_info": info,
-                "_final_info": ended,
-            }
-            observation = begun.observation
-        return (
-            _converted(observation, self._dtype),
-            step.outcome.reward.copy(),
-            step.terminated.copy(),
-            step.truncated.copy(),
-            info,
-        )
-
-    @property
-    def simulation(self) -> batch.BatchSimulation:
-        """The simulations underneath."""
-        return self._simulation

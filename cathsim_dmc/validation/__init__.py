@@ -1,4 +1,4 @@
-"""Validation of the physics against closed forms and the published protocol.
+"""Validation of the physics against closed forms.
 
 Each `validate_…` returns a `Report`. Its module is imported when it is first used.
 """

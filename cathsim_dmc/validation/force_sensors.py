@@ -1,10 +1,8 @@
-"""`cathsim validate forces`: sensors against known loads, the published protocol."""
+"""`cathsim validate forces`: sensors against known loads."""
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
-from pathlib import Path
 from typing import NamedTuple
 
 import mujoco
@@ -16,9 +14,8 @@ from cathsim_dmc.anatomy.field import Field
 from cathsim_dmc.entities.chain import MAX_PUSH_SPEED
 from cathsim_dmc.entities.phantom import Phantom
 from cathsim_dmc.physics import forces
-from cathsim_dmc.recording.episode import Episode
 from cathsim_dmc.tasks.config import PHYSICS_TIMESTEP
-from cathsim_dmc.validation import insertion, protocol
+from cathsim_dmc.validation import insertion
 from cathsim_dmc.validation.checks import Checks, Report
 from cathsim_dmc.validation.rig import Rig, tube
 
@@ -171,24 +168,8 @@ def scripted_cannulations() -> dict[float, list[insertion.Insertion]]:
     }
 
 
-def validate_forces(
-    episode: str | Path | Episode | Sequence[float] | None = None,
-    reference_mean: float = protocol.REFERENCE_MEAN,
-    reference_sd: float = protocol.REFERENCE_SD,
-    margin: float = protocol.EQUIVALENCE_MARGIN,
-) -> Report:
-    """Runs every check of the forces, and the published protocol.
-
-    Args:
-        episode: cannulation of the BCA for the protocol: a recorded episode, its
-            file, or force samples in N. None for scripted insertions.
-        reference_mean: of the normal reference, N.
-        reference_sd: N.
-        margin: of the equivalence test, N.
-
-    Raises:
-        ValueError: if the episode has too few contacts for statistics.
-    """
+def validate_forces() -> Report:
+    """Runs every check of the forces."""
     checks, pushed = Checks(), {"guiding": [], "wide": []}
     for load in RESTING_LOADS:
         contacts, load_cell, _, depth = resting_link(load)
@@ -224,25 +205,9 @@ def validate_forces(
             f"{1e3 * single.mean():.2f} mN, largest "
             f"{max(run.peak.max() for run in runs):.3f} N",
         )
-    samples = _samples(episode, cannulations)
-    comparison = protocol.compare(samples, reference_mean, reference_sd, margin)
     ripples = {
         name: {f"{one.motor:g} N": one.ripple for one in runs}
         for name, runs in pushed.items()
     }
     ripple = "ripple of the push force against a dead end, N"
-    findings = {"protocol": comparison, ripple: ripples}
-    data = {"pushed": pushed, "samples": samples, "comparison": comparison}
-    return Report("forces", checks, findings, data)
-
-
-def _samples(episode, cannulations) -> np.ndarray:
-    if episode is None:
-        runs = [run.resultant for each in cannulations.values() for run in each]
-        resultants = np.concatenate(runs)
-        return resultants[resultants > 0]
-    if isinstance(episode, (str, Path)):
-        episode = Episode.load(episode)
-    if isinstance(episode, Episode):
-        return protocol.load_cell_samples(episode)
-    return np.asarray(episode, dtype=np.float64)
+    return Report("forces", checks, {ripple: ripples}, {"pushed": pushed})

@@ -60,7 +60,6 @@ class Insertion(NamedTuple):
     head: np.ndarray  # (T, 3), m
     wall_force: np.ndarray  # (T,), sum of the magnitudes of all contacts, N
     peak: np.ndarray  # (T,), largest single contact of any physics step, N
-    resultant: np.ndarray  # (T,), force on the phantom's load cell, N
     contact_forces: np.ndarray  # (K,), single contacts of all steps, N
     penetration: np.ndarray  # (T,), largest, m
     links: int  # of the device
@@ -104,19 +103,15 @@ def run(
                 task.readings.head,
                 task.wall_force.sum,
                 task.wall_force.peak_max,
-                np.linalg.norm(task.readings.load_cell),
                 contacts.penetration.max(initial=0.0),
             )
         )
-    head, wall_force, peak, resultant, penetration = map(
-        np.array, zip(*rows, strict=True)
-    )
+    head, wall_force, peak, penetration = map(np.array, zip(*rows, strict=True))
     environment.close()
     return Insertion(
         head,
         wall_force,
         peak,
-        resultant,
         np.concatenate(single),
         penetration,
         len(task.scene.catheter.links),

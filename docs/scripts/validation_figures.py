@@ -3,7 +3,6 @@
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
-from scipy import stats
 
 from cathsim_dmc import style
 from cathsim_dmc.validation.convergence import DEFAULTS, LEAST_FORCE
@@ -212,9 +211,8 @@ def wall(anatomies, capstans, studies):
     return figure
 
 
-def forces(pushed, samples, comparison):
-    figure, (axes,) = canvas(1, 3)
-    ax = axes[0]
+def forces(pushed):
+    figure, ((ax,),) = canvas(1, 1)
     for colour, (name, runs) in zip(COLOURS, pushed.items(), strict=False):
         push = [one.push for one in runs]
         closed = [
@@ -239,35 +237,6 @@ def forces(pushed, samples, comparison):
         ylabel="load cell, N",
     )
     ax.legend(frameon=False, fontsize=8)
-    reference = stats.norm(comparison["reference_mean"], comparison["reference_sd"])
-    grid = np.linspace(0, max(samples.max(), reference.ppf(0.9999)) * 1.05, 800)
-    ax = axes[1]
-    ax.hist(samples, bins=40, density=True, color=SIMULATED, alpha=0.6)
-    ax.plot(grid, reference.pdf(grid), color=THEORY)
-    ax.set(
-        title="Density",
-        xlabel="force on the phantom, N",
-        ylabel="1/N",
-        yscale="log",
-        ylim=(1e-2, 1e4),
-    )
-    ax = axes[2]
-    ordered = np.sort(samples)
-    ax.step(
-        ordered,
-        np.arange(1, len(ordered) + 1) / len(ordered),
-        where="post",
-        color=SIMULATED,
-        label=f"simulated, n = {comparison['count']}",
-    )
-    ax.plot(
-        grid,
-        reference.cdf(grid),
-        color=THEORY,
-        label="normal, {reference_mean:g} ± {reference_sd:g} N".format(**comparison),
-    )
-    ax.set(title="Cumulative", xlabel="force on the phantom, N", ylabel="share")
-    ax.legend(frameon=False, fontsize=8, loc="center", bbox_to_anchor=(0.42, 0.5))
     return figure
 
 
