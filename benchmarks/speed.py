@@ -1,6 +1,7 @@
 """All figures of docs/performance.md: speed, and where the time goes.
 
-    python benchmarks/speed.py --json  (with nothing else running)
+    python benchmarks/speed.py --json   (with nothing else running)
+    python benchmarks/speed.py --short  (real-time factors and overhead alone)
 
 The two sides of a ratio take turns, so that a machine whose speed drifts bends neither.
 """
@@ -20,8 +21,7 @@ from cathsim_dmc.simulation.torchrl import BatchedEnv
 # isort: on
 import mujoco
 import numpy as np
-
-from cathsim_dmc.analysis.speed import (
+from pace import (
     NEVER,
     RUNS,
     STEPS,
@@ -31,6 +31,7 @@ from cathsim_dmc.analysis.speed import (
     pace,
     speed,
 )
+
 from cathsim_dmc.anatomy.arch import arch
 from cathsim_dmc.cli.options import show
 from cathsim_dmc.simulation.batch import BatchSimulation
@@ -45,7 +46,7 @@ _RUNS = 12
 
 
 def everything(say: Callable[[str], None]) -> Report:
-    """The checks of `cathsim benchmark speed`, further ones, and tables."""
+    """The checks of `speed`, further ones, and tables."""
     base = speed(say)
     say("by insertion depth")
     long = load(working_length=_LONG)
@@ -395,5 +396,6 @@ def peak_memory() -> float:
 
 
 if __name__ == "__main__":
-    report = everything(lambda text: print(text, file=sys.stderr, flush=True))
+    measure = speed if "--short" in sys.argv[1:] else everything
+    report = measure(lambda text: print(text, file=sys.stderr, flush=True))
     sys.exit(show(report, "--json" in sys.argv[1:]))

@@ -247,7 +247,7 @@ def test_an_interrupted_training_says_how_to_go_on(cathsim, tmp_path):
     "arguments",
     [
         ("eval", "random", "--task", "type1_bca", "--episodes", 30),
-        ("benchmark", "speed"),
+        ("validate", "rod"),
     ],
 )
 @pytest.mark.slow

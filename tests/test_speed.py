@@ -2,10 +2,9 @@
 
 import mujoco
 import numpy as np
+import pace as speed
 import pytest
 import speed as script
-
-from cathsim_dmc.analysis import speed
 
 
 @pytest.fixture(scope="module")

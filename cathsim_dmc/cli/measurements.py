@@ -1,7 +1,5 @@
-"""`cathsim validate` rod, pair, wall, vessel, forces, bench; `benchmark speed`."""
+"""`cathsim validate` rod, pair, wall, vessel, forces."""
 
-import sys
-from pathlib import Path
 from typing import Annotated
 
 from tyro import conf
@@ -10,7 +8,6 @@ from tyro.extras import SubcommandApp
 from cathsim_dmc.cli.options import Json, show
 
 validations = SubcommandApp()
-benchmarks = SubcommandApp()
 
 
 @validations.command
@@ -65,42 +62,3 @@ def forces(json: Json = False) -> int:
     from cathsim_dmc import validation
 
     return show(validation.validate_forces(), json)
-
-
-@validations.command
-def bench(
-    data: Path, turns: int = 12, sensitivity: bool = True, json: Json = False
-) -> int:
-    """Guidewires against those that were measured in a phantom.
-
-    Args:
-        data: Folder with phantom.stl and wires.json, see docs/bench.md.
-        turns: Number of turns of an angled wire that are tried.
-        sensitivity: Whether to repeat it with other stiffness, friction and scale.
-    """
-    from rich.console import Console
-    from rich.table import Table
-
-    from cathsim_dmc.validation import bench as benches
-
-    report = benches.validate_bench(
-        data, turns=turns, sensitivity=sensitivity, say=_progress
-    )
-    for title, (header, *rows) in benches.tables(report).items() if not json else ():
-        table = Table(*header, title=title, box=None)
-        for row in rows:
-            table.add_row(*row)
-        Console(width=max(130, Console().width)).print(table)
-    return show(report, json)
-
-
-@benchmarks.command
-def speed(json: Json = False) -> int:
-    """Measure calibrated speed and overhead; run it with nothing else running."""
-    from cathsim_dmc.analysis import speed as measured
-
-    return show(measured.speed(_progress), json)
-
-
-def _progress(text: str) -> None:
-    print(text, file=sys.stderr)

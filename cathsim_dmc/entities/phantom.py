@@ -60,7 +60,7 @@ class Phantom(composer.Entity):
             self._mjcf_root.asset.add(
                 "mesh",
                 name="lumen",
-                file=_mesh_file(surface.vertices, surface.faces),
+                file=mesh_file(surface.vertices, surface.faces),
                 inertia="shell",
             )
             shape = {"type": "mesh", "mesh": "lumen"}
@@ -140,7 +140,7 @@ class Phantom(composer.Entity):
         return self._goals
 
 
-def _mesh_file(vertices: np.ndarray, faces: np.ndarray | None = None) -> mjcf.Asset:
+def mesh_file(vertices: np.ndarray, faces: np.ndarray | None = None) -> mjcf.Asset:
     """A mesh in MuJoCo's own binary format (MSH).
 
     Args:
@@ -153,7 +153,7 @@ def _mesh_file(vertices: np.ndarray, faces: np.ndarray | None = None) -> mjcf.As
     return mjcf.Asset(b"".join(part.tobytes() for part in parts), ".msh")
 
 
-def read_mesh_file(data: bytes) -> tuple[np.ndarray, np.ndarray]:
+def readmesh_file(data: bytes) -> tuple[np.ndarray, np.ndarray]:
     """Vertices (n, 3) float32, m, and faces (m, 3) of a mesh of a `Phantom`."""
     vertices, _, _, faces = np.frombuffer(data, "<i4", 4)
     points = np.frombuffer(data, "<f4", 3 * vertices, 16)

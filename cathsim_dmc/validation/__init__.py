@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING
 from cathsim_dmc.validation.checks import Check, Report
 
 if TYPE_CHECKING:
-    from cathsim_dmc.validation.bench import validate_bench
     from cathsim_dmc.validation.force_sensors import validate_forces
     from cathsim_dmc.validation.pair import validate_pair
     from cathsim_dmc.validation.rod import validate_rod
@@ -20,7 +19,6 @@ __all__ = [
     "Check",
     "Report",
     "validate_anatomy",
-    "validate_bench",
     "validate_forces",
     "validate_pair",
     "validate_rod",
@@ -30,7 +28,6 @@ __all__ = [
 
 _MODULES = {
     "validate_anatomy": "wall",
-    "validate_bench": "bench",
     "validate_forces": "force_sensors",
     "validate_pair": "pair",
     "validate_rod": "rod",

@@ -2,7 +2,7 @@
 
 ``python docs/scripts/bench.py DIRECTORY [REPORT]``
 
-REPORT is the object that ``cathsim validate bench --data DIRECTORY --json`` prints;
+REPORT is the object that ``python benchmarks/wires.py DIRECTORY --json`` prints;
 without it the comparison is run, which takes minutes. Only statistics are written: the
 measured data may not be redistributed.
 """
@@ -17,11 +17,14 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from cathsim_dmc import style
-from cathsim_dmc.validation import Check, Report, bench
+from cathsim_dmc.validation import Check, Report
+
+sys.path.insert(0, str(figures.ROOT / "benchmarks"))
+import wires  # noqa: E402
 
 PAGE = figures.ROOT / "docs" / "bench.md"
 FIGURE = PAGE.parent / "images" / "validation_bench.png"
-SHOWN = (*bench.WAYS, "centreline", "nearest")
+SHOWN = (*wires.WAYS, "centreline", "nearest")
 
 
 def main(folder, report=None):
@@ -33,10 +36,10 @@ def main(folder, report=None):
             found["findings"],
         )
     else:
-        measured = bench.validate_bench(folder, say=print)
-    command = "cathsim validate bench"
+        measured = wires.compare_wires(folder, say=print)
+    command = "python benchmarks/wires.py"
     figures.keep("validation_bench", measured.as_dict(), command)
-    tables = list(bench.tables(measured).items())
+    tables = list(wires.tables(measured).items())
     for name, (title, rows) in zip(("frames", "sensitivity"), tables, strict=True):
         figures.put(PAGE, **{name: f"{title}:\n\n{markdown(rows)}"})
     figures.main([])
@@ -59,7 +62,7 @@ def figure(rows):
     places = np.arange(len(rows))
     for index, name in enumerate(SHOWN):
         values = [row[name]["rms"] for row in rows]
-        marker = "o" if name in bench.WAYS else "_"
+        marker = "o" if name in wires.WAYS else "_"
         ax.plot(
             places + 0.1 * (index - 2),
             values,

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 import mujoco
 import numpy as np
 from scipy.spatial.transform import Rotation
+from wires_data import Wire, along
 
 from cathsim_dmc.anatomy.field import Field
 from cathsim_dmc.anatomy.parts import Surface
@@ -16,10 +17,9 @@ from cathsim_dmc.entities.chain import MAX_PUSH_SPEED
 from cathsim_dmc.entities.contact import wall_contact
 from cathsim_dmc.entities.device import Device
 from cathsim_dmc.entities.devices import Discretisation
-from cathsim_dmc.entities.phantom import _mesh_file
+from cathsim_dmc.entities.phantom import mesh_file
 from cathsim_dmc.entities.posture import bends_of
 from cathsim_dmc.entities.sheath import Sheath, straight
-from cathsim_dmc.validation.bench_data import Wire, along
 from cathsim_dmc.validation.rig import Rig
 
 _LINK = 7e-3  # m, longest of the shaft
@@ -109,7 +109,7 @@ class Held:
         if isinstance(wall, Field):
             shape = fields.carrier(wall)
         else:
-            file = _mesh_file(wall.vertices, wall.faces)
+            file = mesh_file(wall.vertices, wall.faces)
             root.asset.add("mesh", name="hull", file=file, inertia="shell")
             shape = {"type": "mesh", "mesh": "hull"}
         body.add("geom", name="wall", **shape, **wall_contact(setting.friction), mass=0)

@@ -5,12 +5,12 @@ import json
 import numpy as np
 import pytest
 import trimesh
+import wires as bench
+import wires_data
+from wires_data import MESH, WIRES, Wire
+from wires_rig import Held
 
-from cathsim_dmc import validation
 from cathsim_dmc.entities.arena import BLOOD_DENSITY, GRAVITY
-from cathsim_dmc.validation import bench, bench_data
-from cathsim_dmc.validation.bench_data import MESH, WIRES, Wire
-from cathsim_dmc.validation.bench_rig import Held
 
 ENTRY = np.array([3.0, 0.0, 0.0])  # mm, off the middle of the tube
 
@@ -68,7 +68,7 @@ def folder(tmp_path_factory):
         "centreline_mm": [[3.0, 60.0 - y, 0.0] for y in range(0, 70, 2)],
     }
     write(path, marks, row)
-    made = bench_data.read(path)
+    made = wires_data.read(path)
     experiment = bench.Experiment(made)
     (wire,) = made.wires
     held = Held(experiment.setting(wire), experiment.field(), wire)
@@ -86,9 +86,9 @@ def write(path, marks, *rows):
 def test_a_simulated_wire_is_found_again_from_another(folder, monkeypatch):
     path, _, _, lumen = folder
     # The same for every reading of the folder; it takes seconds to make.
-    monkeypatch.setattr(bench_data.Bench, "field", lambda self, scale: lumen)
+    monkeypatch.setattr(wires_data.Bench, "field", lambda self, scale: lumen)
     lines = []
-    report = validation.validate_bench(path, sensitivity=False, say=lines.append)
+    report = bench.compare_wires(path, sensitivity=False, say=lines.append)
     row, other = report.findings["frames"]
     assert row["pushed"]["rms"] < 0.05
     assert row["laid"]["rms"] < 0.3
@@ -119,28 +119,30 @@ def test_rows_that_are_no_wires(folder, tmp_path, change, message):
     (tmp_path / MESH).write_bytes((path / MESH).read_bytes())
     write(tmp_path, marks, row | change)
     with pytest.raises(ValueError, match=message) as caught:
-        bench_data.read(tmp_path)
+        wires_data.read(tmp_path)
     assert "\n" not in str(caught.value)
 
 
 def test_folders_that_are_no_bench(folder, tmp_path):
     path, marks, row, _ = folder
-    with pytest.raises(FileNotFoundError, match=r"no file .*phantom.stl; --data is"):
-        validation.validate_bench(tmp_path)
+    with pytest.raises(
+        FileNotFoundError, match=r"no file .*phantom.stl; the folder has"
+    ):
+        bench.compare_wires(tmp_path)
     (tmp_path / MESH).write_bytes((path / MESH).read_bytes())
     (tmp_path / WIRES).write_text("{")
     with pytest.raises(ValueError, match=r"wires.json is no JSON: Expecting"):
-        bench_data.read(tmp_path)
+        wires_data.read(tmp_path)
     (tmp_path / WIRES).write_text("{}")
     with pytest.raises(ValueError, match="has no 'landmarks'"):
-        bench_data.read(tmp_path)
+        wires_data.read(tmp_path)
     lacking = {key: value for key, value in row.items() if key != "tip_region"}
     write(tmp_path, marks, lacking)
     with pytest.raises(ValueError, match="wire 0 of wires.json lacks tip_region"):
-        bench_data.read(tmp_path)
+        wires_data.read(tmp_path)
     write(tmp_path, marks, row | {"recommended": False})
     with pytest.raises(ValueError, match="recommends none of its 1 wires"):
-        validation.validate_bench(tmp_path)
+        bench.compare_wires(tmp_path)
 
 
 def test_wires_that_fold_back_are_told():
@@ -157,7 +159,7 @@ def test_wires_that_fold_back_are_told():
 
 def test_a_wire_has_its_weight_in_blood(folder):
     path, _, _, lumen = folder
-    experiment = bench.Experiment(bench_data.read(path))
+    experiment = bench.Experiment(wires_data.read(path))
     wire = experiment.bench.wires[0]
     rig = Held(experiment.setting(wire, down="left"), lumen, wire)._rig
     weight = rig.model.body_mass.sum() * rig.model.opt.gravity / rig.lengths.sum()

@@ -1,24 +1,31 @@
-"""`cathsim validate bench`: simulated guidewires against measured ones."""
+"""Simulated guidewires against measured ones: the figures of docs/bench.md.
+
+    python benchmarks/wires.py DIRECTORY [--json]
+
+DIRECTORY has phantom.stl and wires.json; the measured data may not be redistributed.
+"""
 
 from __future__ import annotations
 
 import dataclasses
 import math
+import sys
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+import wires_data
+from wires_data import Bench, Wire
+from wires_rig import Held, Setting
 
 from cathsim_dmc.anatomy.field import Field
 from cathsim_dmc.anatomy.scan.ways import Ways
 from cathsim_dmc.anatomy.surface_depth import SurfaceDepth
+from cathsim_dmc.cli.options import show
 from cathsim_dmc.entities.contact import FRICTION
 from cathsim_dmc.entities.device import Arc, Device, Section
 from cathsim_dmc.entities.devices import METAL_LOSS, METAL_POISSON_RATIO, WIRE_035_GLIDE
-from cathsim_dmc.validation import bench_data
-from cathsim_dmc.validation.bench_data import Bench, Wire
-from cathsim_dmc.validation.bench_rig import Held, Setting
 from cathsim_dmc.validation.checks import Check, Report
 
 # Median RMS distance, mm, of straight wires, and of angled ones at their best turn.
@@ -141,7 +148,7 @@ class Experiment:
 
 
 def _result(wire: Wire, shapes: Sequence[np.ndarray]) -> Result:
-    found = [1e3 * bench_data.distances(wire.points, shape) for shape in shapes]
+    found = [1e3 * wires_data.distances(wire.points, shape) for shape in shapes]
     rms = [float(np.sqrt((each**2).mean())) for each in found] or [np.nan]
     largest = [float(each.max()) for each in found] or [np.nan]
     return Result(np.array(rms), np.array(largest))
@@ -186,14 +193,14 @@ def variants() -> dict[str, dict[str, Any]]:
 def halves(wires: Iterable[Wire]) -> dict[str, str]:
     """Which half a frame belongs to: parameters are fitted to one, tested on other."""
     found: dict[str, str] = {}
-    count: dict[str, int] = dict.fromkeys(bench_data.KINDS, 0)
+    count: dict[str, int] = dict.fromkeys(wires_data.KINDS, 0)
     for wire in wires:
         found[wire.name] = ("fit", "test")[count[wire.kind] % 2]
         count[wire.kind] += 1
     return found
 
 
-def validate_bench(
+def compare_wires(
     folder: str | Path,
     *,
     turns: int = TURNS,
@@ -203,7 +210,7 @@ def validate_bench(
     """Compares simulated guidewires with those measured in a phantom.
 
     Args:
-        folder: see `bench_data.read`.
+        folder: see `wires_data.read`.
         turns: of an angled wire about its axis, evenly spread.
         sensitivity: whether to repeat it with other parameters.
         say: called with a line of text for every frame and variant.
@@ -214,7 +221,7 @@ def validate_bench(
     """
     if turns < 1:
         raise ValueError(f"turns is {turns}; it must be 1 or more")
-    bench = bench_data.read(folder)
+    bench = wires_data.read(folder)
     wires = [wire for wire in bench.wires if wire.recommended]
     if not wires:
         raise ValueError(
@@ -278,7 +285,7 @@ def _sensitivity(experiment, wires, rows, say) -> dict[str, dict[str, float]]:
 def _checks(rows: Sequence[dict[str, Any]]) -> list[Check]:
     """Medians against the aims and the baselines; folded frames apart."""
     found = []
-    for kind, bound in zip(bench_data.KINDS, (STRAIGHT, ANGLED), strict=True):
+    for kind, bound in zip(wires_data.KINDS, (STRAIGHT, ANGLED), strict=True):
         chosen = [row for row in rows if row["wire"] == kind and not row["folded"]]
         if not chosen:
             continue
@@ -327,3 +334,10 @@ def tables(report: Report) -> dict[str, list[list[str]]]:
         ]
         found["Median RMS distance by variant, mm"] = [["variant", *names], *rows]
     return found
+
+
+if __name__ == "__main__":
+    report = compare_wires(
+        sys.argv[1], say=lambda text: print(text, file=sys.stderr, flush=True)
+    )
+    sys.exit(show(report, "--json" in sys.argv[2:]))

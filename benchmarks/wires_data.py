@@ -124,7 +124,7 @@ def read(folder: str | Path) -> Bench:
     for name in (MESH, WIRES):
         if not (folder / name).is_file():
             raise FileNotFoundError(
-                f"no file {folder / name}; --data is a folder with {MESH} and {WIRES}"
+                f"no file {folder / name}; the folder has {MESH} and {WIRES}"
             )
     path = folder / WIRES
     try:
