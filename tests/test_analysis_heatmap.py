@@ -2,9 +2,10 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from recording_samples import make_episode, make_tube
+from recording_samples import make_tube
 
 from cathsim_dmc.analysis.heatmap import force_map, heatmap
+from cathsim_dmc.anatomy import Surface
 
 
 @given(seed=st.integers(0, 2**31), count=st.integers(0, 60))
@@ -35,42 +36,24 @@ def test_a_contact_lies_in_the_cell_that_its_edges_say():
     assert field.mean[3, 0] == 5.0
 
 
-def picture_of(tmp_path, episodes, **options):
+def test_the_picture_shows_contacts_where_they_are(tmp_path):
     from matplotlib.image import imread
 
-    path = tmp_path / "map.png"
-    field = heatmap(episodes, make_tube(), path, **options)
-    return field, imread(path)[..., :3]
-
-
-def test_the_picture_shows_contacts_where_they_are(tmp_path):
+    tube, path = Surface(*make_tube()), tmp_path / "map.png"
+    empty = heatmap(np.zeros((0, 3)), np.zeros(0), tube, path)
+    assert empty.count.sum() == 0
+    without = imread(path)[..., :3]
     places = np.array([[0.01, 0.0, 0.02]] * 6)
-    force = np.tile([0.0, 0.0, 0.4], (6, 1))
-    touched = make_episode(
-        counts=np.ones(6, int), contact_position=places, contact_force=force
-    )
-    free = make_episode(counts=np.zeros(6, int))
-    # The limit keeps both colour bars the same, so only the map can differ.
-    field, with_contact = picture_of(
-        tmp_path, [touched, free], force_limit=0.5, title="t", cell=4e-3
-    )
-    empty, without = picture_of(tmp_path, [free], force_limit=0.5, title="t", cell=4e-3)
-    assert np.nanmax(field.mean) == pytest.approx(0.4) and empty.count.sum() == 0
+    field = heatmap(places, np.full(6, 0.4), tube, path)
+    assert np.nanmax(field.mean) == pytest.approx(0.4)
+    with_contact = imread(path)[..., :3]
     changed = np.argwhere(np.abs(with_contact - without).max(axis=-1) > 0.1)
-    assert len(changed) > 20
-    # All of the change is one square cell, to the right of the middle of the tube.
-    height, width = np.ptp(changed, axis=0)
-    assert abs(int(height) - int(width)) <= 2
     silhouette = np.argwhere(np.abs(without - 0.9).max(axis=-1) < 0.01)
-    assert changed[:, 1].mean() > silhouette[:, 1].mean()
-    assert changed[:, 0].mean() < silhouette[:, 0].mean()
-
-
-def test_wrong_heatmaps_are_refused(tmp_path):
-    tube = make_tube()
-    with pytest.raises(ValueError, match="at least one episode"):
-        heatmap([], tube, tmp_path / "map.png")
+    # Without the bar: one square cell, to the right of the middle of the tube.
+    cell = changed[changed[:, 1] < silhouette[:, 1].max()]
+    height, width = np.ptp(cell, axis=0)
+    assert len(cell) > 20 and abs(int(height) - int(width)) <= 2
+    assert cell[:, 1].mean() > silhouette[:, 1].mean()
+    assert cell[:, 0].mean() < silhouette[:, 0].mean()
     with pytest.raises(ValueError, match=r"\.png"):
-        heatmap([make_episode()], tube, tmp_path / "map.pdf")
-    with pytest.raises(ValueError, match="force_limit"):
-        heatmap([make_episode()], tube, tmp_path / "map.png", force_limit=0.0)
+        heatmap(places, np.ones(6), tube, tmp_path / "map.pdf")

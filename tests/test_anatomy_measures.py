@@ -136,7 +136,7 @@ def test_measured_phantoms_are_as_was_measured():
 @pytest.mark.slow
 def test_check_measures_and_draws(cathsim, tmp_path):
     picture = tmp_path / "views.png"
-    options = ("--no-push", "--figure", picture, "--json")
+    options = ("--figure", picture, "--json")
     code, out, _ = cathsim("phantom", "check", "simple1", *options)
     assert code == 0
     report = json.loads(out)
@@ -150,7 +150,7 @@ def test_check_measures_and_draws(cathsim, tmp_path):
 @pytest.mark.slow
 def test_check_of_a_directory_draws_into_it(cathsim, tmp_path):
     phantoms.load("simple2").save(tmp_path / "two")
-    code, out, err = cathsim("phantom", "check", tmp_path / "two", "--no-push")
+    code, out, err = cathsim("phantom", "check", tmp_path / "two")
     assert code == 0
     assert "arch_type II" in out
     assert (tmp_path / "two/check.png").is_file()

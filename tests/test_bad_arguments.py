@@ -59,7 +59,6 @@ COMMANDS = [
     (("phantom", "import", "none.stl", "--out", "OUT"), "--wall", NAME),
     (("replay",), "", NAME),
     (("validate",), "", NAME),
-    (("validate", "forces"), "--mean", NUMBER),
     (("benchmark",), "", NAME),
 ]
 

@@ -79,7 +79,7 @@ def test_a_failed_check_exits_with_one(cathsim, tmp_path):
     whole = arch.load("simple1")
     surface = Surface(whole.surface.vertices, whole.surface.faces[1:])
     dataclasses.replace(whole, name="torn", surface=surface).save(tmp_path)
-    code, out, _ = cathsim("phantom", "check", tmp_path, "--no-push", "--json")
+    code, out, _ = cathsim("phantom", "check", tmp_path, "--json")
     assert code == 1
     failed = [c["name"] for c in only_json(out)["checks"] if not c["passed"]]
     assert any("edges of the surface" in name for name in failed), failed

@@ -6,7 +6,6 @@ import pytest
 from cathsim_dmc import suite
 from cathsim_dmc.recording import rerun_log
 from cathsim_dmc.recording.coaxial import CoaxialRecord
-from cathsim_dmc.recording.drawing import action_layout
 from cathsim_dmc.recording.episode import Episode
 from cathsim_dmc.recording.recorder import EpisodeRecorder
 
@@ -76,9 +75,3 @@ def test_the_rerun_file_has_both(recorded, tmp_path):
         assert f"/series/insertion_mm/{name}" in entities
         assert f"/series/rotation_deg/{name}" in entities
         assert f"/series/rotation_deg/{name}_end" in entities
-        assert f"/series/action/{name}_insertion" in entities
-
-
-def test_actions_of_two_devices_do_not_share_a_name(recorded):
-    names, tip = action_layout(recorded[0])
-    assert len(set(names)) == 4 and not tip.any()

@@ -15,7 +15,6 @@ from cathsim_dmc.imaging import FluoroscopyOptions
 from cathsim_dmc.pictures.moment import Moment
 from cathsim_dmc.pictures.recorded import xray_film
 from cathsim_dmc.recording import Episode, EpisodeRecorder
-from cathsim_dmc.recording.geometry import force_text
 from cathsim_dmc.recording.living import DENT, VesselRecord, dented
 from cathsim_dmc.recording.rerun_device import arrow_scale
 from cathsim_dmc.recording.rerun_log import write_rrd
@@ -50,7 +49,6 @@ def make_recorded(**changes):
         "goal_position": GOAL,
         "goal_radius": 0.008,
         "distance": np.linalg.norm(episode.head - GOAL, axis=1),
-        "versions": {"a|b": "1.0"},
     }
     position, quaternion = episode.body_pos.copy(), episode.body_quat.copy()
     position[:, 1], quaternion[:, 1] = position[0, 1], quaternion[0, 1]
@@ -118,7 +116,6 @@ def test_the_file_holds_one_recording_and_its_layout(written):
     assert recording.recordings[0].application_id == "cathsim"
     assert recording.views["/world"] == "3D"
     assert recording.views["/fluoroscopy"] == "2D"
-    assert recording.views["/info"] == "TextDocument"
     plots = {o for o, kind in recording.views.items() if kind == "TimeSeries"}
     assert plots == {
         "/series/reward",
@@ -126,7 +123,6 @@ def test_the_file_holds_one_recording_and_its_layout(written):
         "/series/force",
         "/series/insertion_mm",
         "/series/action",
-        "/series/action_all",
     }
     assert [p.name for p in path.parent.iterdir()] == ["episode.rrd"]
 
@@ -151,7 +147,6 @@ def test_every_entity_lives_on_both_timelines_at_the_right_rows(written):
         "/world/catheter/trail": steps,
         "/world/robot/wheel": states,
         "/world/contacts": steps,
-        "/world/contacts/largest": steps,
         "/world/heat": steps,
         "/fluoroscopy": states,
         "/series/reward": steps,
@@ -160,9 +155,7 @@ def test_every_entity_lives_on_both_timelines_at_the_right_rows(written):
         "/series/force/wall_max": steps,
         "/series/force/push": steps,
         "/series/insertion_mm": states,
-        "/series/action/translation": states[:-1],
-        "/series/action/tip_bend": states[:-1],
-        "/series/action_all": states[:-1],
+        "/series/action": states[:-1],
     }
     assert set(recording.temporal) == set(expected)
     for entity, rows in expected.items():
@@ -202,23 +195,6 @@ def test_arrows_show_the_contacts_of_their_step_only(written):
     )
 
 
-def test_the_largest_force_of_a_step_is_written_at_the_end_of_its_arrow(written):
-    episode, _, _, recording = written
-    entity = "/world/contacts/largest"
-    places = recording.values(entity, "Points3D:positions")
-    labels = recording.values(entity, "Points3D:labels")
-    for step in range(STEPS):
-        rows = np.flatnonzero(episode.contact_step == step)
-        if not len(rows):
-            assert places[step] == labels[step] == []
-            continue
-        force = episode.contact_force[rows]
-        top = int(np.linalg.norm(force, axis=1).argmax())
-        assert labels[step] == [force_text(np.linalg.norm(force[top]))]
-        end = episode.contact_position[rows[top]] + arrow_scale(episode) * force[top]
-        np.testing.assert_allclose(places[step], [end], atol=1e-6)
-
-
 def test_series_hold_the_values_of_the_episode(written):
     episode, _, _, recording = written
 
@@ -226,20 +202,11 @@ def test_series_hold_the_values_of_the_episode(written):
         return np.array(recording.values(f"/series/{entity}", "Scalars:scalars"))
 
     np.testing.assert_array_equal(scalars("reward")[:, 0], episode.reward)
-    np.testing.assert_array_equal(scalars("action_all"), episode.action)
-    np.testing.assert_array_equal(
-        scalars("action/translation")[:, 0], episode.action[:, 20]
-    )
-    np.testing.assert_allclose(
-        scalars("action/tip_bend")[:, 0],
-        np.sqrt((episode.action[:, :20] ** 2).mean(axis=1)),
-    )
+    np.testing.assert_array_equal(scalars("action"), episode.action)
     np.testing.assert_array_equal(scalars("force/push")[:, 0], 1e3 * episode.push_force)
     np.testing.assert_allclose(
         scalars("distance_mm")[:, 0], 1e3 * np.array(episode.meta["distance"])
     )
-    names = recording.fixed("/series/action_all", "SeriesLines:names")
-    assert names[:3] == ["tip_x_0", "tip_y_0", "tip_x_1"] and names[-1] == "translation"
 
 
 def test_links_take_the_colour_of_what_they_press(written):
@@ -290,13 +257,6 @@ def test_the_scene_is_in_the_patient_frame_with_a_translucent_vessel(written):
     assert list(recording.fixed("/world", "ViewCoordinates:xyz")[0]) == [4, 6, 1]
     goal = recording.fixed("/world/goal", "Ellipsoids3D:centers")[0]
     np.testing.assert_allclose(goal, GOAL, atol=1e-6)
-
-
-def test_the_text_is_a_table_with_escaped_cells(written):
-    text = written[3].fixed("/info", "TextDocument:text")[0]
-    assert "| Outcome | success |" in text
-    assert '{"a\\|b": "1.0"}' in text
-    assert "distance" not in text.split("| versions")[1]
 
 
 def test_an_episode_without_extras_opens_without_them(tmp_path):

@@ -184,7 +184,7 @@ class ContactLog:
     def draw(self, result: evaluation.EvaluationResult, path: Path) -> None:
         """Writes the heatmap of an evaluation as PNG."""
         task = suite.make_task(result.task, **result.settings["task_kwargs"])
-        heatmap.contact_heatmap(
+        heatmap.heatmap(
             self.positions,
             self.magnitudes,
             task.scene.anatomy.surface,

@@ -11,7 +11,7 @@ from tyro.extras import SubcommandApp
 from cathsim_dmc import __version__
 from cathsim_dmc.cli import agents, training
 from cathsim_dmc.cli.installation import doctor
-from cathsim_dmc.cli.measurements import validations
+from cathsim_dmc.cli.measurements import validate
 from cathsim_dmc.cli.options import (
     BAD_INPUT,
     INTERRUPTED,
@@ -111,7 +111,7 @@ def dataset(
 agents.add_to(app)
 app.command(doctor)
 app.command(phantoms, name="phantom", help="Make, import and check anatomies.")
-app.command(validations, name="validate", help="Compare the physics with theory.")
+app.command(validate)
 
 
 def main() -> None:

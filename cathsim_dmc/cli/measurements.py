@@ -1,64 +1,34 @@
 """`cathsim validate` rod, pair, wall, vessel, forces."""
 
-from typing import Annotated
+from typing import Annotated, Literal
 
 from tyro import conf
-from tyro.extras import SubcommandApp
 
 from cathsim_dmc.cli.options import Json, show
 
-validations = SubcommandApp()
 
-
-@validations.command
-def rod(json: Json = False) -> int:
-    """Bending, buckling and twist of the device against theory."""
-    from cathsim_dmc import validation
-
-    return show(validation.validate_rod(), json)
-
-
-@validations.command
-def pair(json: Json = False) -> int:
-    """Devices in each other: bending, shape, buckling, sliding and torque."""
-    from cathsim_dmc import validation
-
-    return show(validation.validate_pair(), json)
-
-
-@validations.command
-def wall(
-    anatomy: Annotated[list[str], conf.arg(aliases=("--phantom",))] = [],  # noqa: B006
+def validate(
+    part: Annotated[
+        Literal["rod", "pair", "wall", "vessel", "forces"], conf.Positional
+    ],
+    /,
+    anatomy: Annotated[tuple[str, ...], conf.arg(aliases=("--phantom",))] = (),
     convergence: bool = True,
     json: Json = False,
 ) -> int:
-    """Fidelity of the wall, friction against the capstan equation, convergence.
+    """Compare the physics with theory.
 
     Args:
-        anatomy: Directories of further anatomies, such as an imported scan.
-        convergence: Whether to include the studies of time step and link length.
+        part: Rod and drives; coaxial devices; contact with the wall and its shape;
+            flow, wall and motion of the vessel; force sensors.
+        anatomy: Of `wall`: directories of further anatomies, such as an imported scan.
+        convergence: Of `wall`: whether to include the studies of time step and link
+            length.
     """
     from cathsim_dmc import validation
 
-    report = validation.validate_wall(anatomy, with_convergence=convergence)
-    return show(report, json)
-
-
-@validations.command
-def vessel(json: bool = False) -> int:
-    """Blood that flows, against closed forms.
-
-    Args:
-        json: Whether to print one JSON object and nothing else.
-    """
-    from cathsim_dmc import validation
-
-    return show(validation.validate_vessel(), json)
-
-
-@validations.command
-def forces(json: Json = False) -> int:
-    """Force balance and known loads."""
-    from cathsim_dmc import validation
-
-    return show(validation.validate_forces(), json)
+    if part == "wall":
+        return show(validation.validate_wall(anatomy, convergence), json)
+    if anatomy or not convergence:
+        raise ValueError("--anatomy and --no-convergence belong to `validate wall`")
+    return show(getattr(validation, f"validate_{part}")(), json)

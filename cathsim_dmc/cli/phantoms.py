@@ -171,28 +171,24 @@ def check(
     /,
     figure: Path | None = None,
     access: Access = None,
-    push: bool = True,
     json: Json = False,
 ) -> int:
     """Check an anatomy and measure what it is like.
 
     Its surface, the field of its lumen, passage, goals; type of the arch, diameters,
-    take-offs, curvature; whether a device that is only pushed reaches each goal.
+    take-offs, curvature.
 
     Args:
         phantom: Directory of an anatomy, or the name of a phantom.
         figure: PNG of three views; check.png in a directory of an anatomy if left
             out.
-        push: Try a straight push to each goal.
     """
     from cathsim_dmc import validation
 
     anatomy = _loaded(phantom, access)
     if figure is None and Path(phantom).is_dir():
         figure = Path(phantom) / _PICTURE
-    report = validation.validate_anatomy(
-        {anatomy.name: anatomy}, figure_path=figure, push=push
-    )
+    report = validation.validate_anatomy({anatomy.name: anatomy}, figure)
     code = show(report, json)
     if not json:
         print_measures(report.findings[anatomy.name])
@@ -255,13 +251,6 @@ def print_measures(findings: dict) -> None:
     print(_line("diameters, mm", diameters))
     for name, branch in branches.items():
         print(_line(name, branch))
-    for goal, push in findings.get("straight push", {}).items():
-        reached = "reaches" if push["success"] else "does not reach"
-        print(
-            f"a straight push {reached} {goal}: {push['steps']} steps, force on the "
-            f"wall {1e3 * push['mean_force']:.0f} mN on average, largest contact "
-            f"{1e3 * push['peak_force']:.0f} mN"
-        )
 
 
 def _line(name: str, figures: dict) -> str:

@@ -51,7 +51,6 @@ def episode_blueprint(
     scene = rrb.Vertical(
         _scene(middle, extent), rrb.Horizontal(*insets), row_shares=[3, 2]
     )
-    texts = rrb.TextDocumentView(origin="info", name="Episode")
     images = [
         rrb.Spatial2DView(origin=origin, name=name)
         for origin, name in zip(FLUOROSCOPY[:planes], _PLANE_NAMES, strict=False)
@@ -60,10 +59,7 @@ def episode_blueprint(
         _plot("Reward and its terms", "series/reward", legend=True),
         _plot("Force, mN", "series/force", legend=True),
         _plot("Insertion, mm", "series/insertion_mm"),
-        rrb.Tabs(
-            _plot("Action", "series/action", legend=True),
-            _plot("All actions", "series/action_all"),
-        ),
+        _plot("Action", "series/action"),
     ]
     if rotation:
         plots.insert(3, _plot("Rotation, °", "series/rotation_deg", legend=True))
@@ -71,9 +67,11 @@ def episode_blueprint(
         plots.append(_plot("Heart, breathing, wall", "series/vessel", legend=True))
     if distance:
         plots.insert(1, _plot("Distance to goal, mm", "series/distance_mm"))
-    columns = [scene, rrb.Vertical(*images, texts), rrb.Vertical(*plots)]
+    columns = [scene, rrb.Vertical(*images), rrb.Vertical(*plots)]
+    if not images:
+        del columns[1]
     return rrb.Blueprint(
-        rrb.Horizontal(*columns, column_shares=[5, 3.4, 3]),
+        rrb.Horizontal(*columns, column_shares=[5, 3.4, 3] if images else [5, 3]),
         rrb.BlueprintPanel(state="collapsed"),
         rrb.SelectionPanel(state="collapsed"),
         rrb.TimePanel(

@@ -14,9 +14,6 @@ from cathsim_dmc.recording.scene import BodyGeom
 
 # 5F diagnostic catheter, 1.67 mm outer diameter; used when the record has no radii.
 CATHETER_RADIUS = 0.835e-3
-TIP_PREFIX = "tip_"
-# Order of the actions without names: 20 tip motors, translation, rotation.
-DEFAULT_TIP_MOTORS = 20
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,25 +60,6 @@ class Drawing:
             place = np.array(episode.meta["goal_position"], np.float64)
             goal = place, float(episode.meta["goal_radius"])
         return cls(vertices, faces, geoms, link_radii(episode), goal, fluoroscopy)
-
-
-def action_layout(episode: Episode) -> tuple[list[str], np.ndarray]:
-    """Return short names of the A actions and a mask (A,) of those bending the tip."""
-    count = episode.action.shape[1]
-    given = episode.meta.get("action_names")
-    if given is not None and len(given) == count:
-        names = [str(name).rsplit("/", 1)[-1] for name in given]
-        if len(set(names)) < count:  # of several devices, whose names come first
-            names = [str(name).replace("/", "_") for name in given]
-    else:
-        tips = min(count, DEFAULT_TIP_MOTORS)
-        names = [f"{TIP_PREFIX}{'xy'[i % 2]}_{i // 2}" for i in range(tips)]
-        extra = ["translation", "rotation"]
-        names += [
-            extra[i] if i < len(extra) else f"action_{tips + i}"
-            for i in range(count - tips)
-        ]
-    return names, np.array([name.startswith(TIP_PREFIX) for name in names], dtype=bool)
 
 
 def goal_distance(episode: Episode) -> np.ndarray | None:

@@ -10,7 +10,6 @@ from cathsim_dmc.recording.episode import Episode
 from cathsim_dmc.recording.geometry import (
     force_colours,
     force_scale,
-    force_text,
     xyzw,
     z_to,
 )
@@ -22,10 +21,6 @@ ARROW_RADIUS = 0.7e-3
 HEAT_RADIUS = 0.9e-3
 TRAIL_RADIUS = 0.25e-3
 HEAD_SCALE = 1.8
-# Of the text at the largest force of a step: legible where the viewer is light and
-# where it is dark, as the colours of forces are not. Its point is not to be seen.
-LABEL_COLOUR, LABEL_RADIUS = (186, 58, 0), 1e-5
-
 SHAFT_COLOUR = (215, 228, 255)
 HEAD_COLOUR = (255, 200, 0)
 TRAIL_COLOUR = (255, 200, 0, 160)
@@ -136,20 +131,3 @@ def log_contacts(log: Log) -> None:
         log.static("world/heat", rr.Points3D.from_fields(radii=[HEAT_RADIUS]))
         heat = rr.Points3D.columns(positions=episode.contact_position, colors=colours)
         log.columns("world/heat", heat.partition(episode.contact_counts), rows)
-        _log_largest(log, episode.contact_position + vectors, magnitude)
-
-
-def _log_largest(log: Log, ends: np.ndarray, magnitude: np.ndarray) -> None:
-    """Log the largest force of each step as text at the end of its arrow."""
-    episode, entity = log.episode, "world/contacts/largest"
-    order = np.lexsort((magnitude, episode.contact_step))
-    top = order[np.flatnonzero(np.diff(episode.contact_step[order], append=-1))]
-    look = rr.Points3D.from_fields(
-        colors=[LABEL_COLOUR], radii=[LABEL_RADIUS], show_labels=True
-    )
-    log.static(entity, look)
-    text = rr.Points3D.columns(
-        positions=ends[top], labels=[force_text(force) for force in magnitude[top]]
-    )
-    one = np.minimum(episode.contact_counts, 1)
-    log.columns(entity, text.partition(one), slice(1, None))

@@ -1,7 +1,7 @@
 """Episodes as Rerun recordings.
 
 One file holds one episode: the scene in 3D, the fluoroscopy if there is any, every
-series over simulated time, metadata as text, and the layout that opens them.
+series over simulated time, and the layout that opens them.
 Whole series are sent as columns, so the cost does not grow with calls per step.
 """
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from typing import Any
 
 import numpy as np
@@ -11,7 +10,6 @@ from scipy.spatial.transform import Rotation
 
 from cathsim_dmc.anatomy.parts import Surface
 from cathsim_dmc.recording.drawing import Drawing
-from cathsim_dmc.recording.episode import Episode
 from cathsim_dmc.recording.geometry import xyzw
 from cathsim_dmc.recording.living import MESH_EVERY, SERIES, VesselRecord
 from cathsim_dmc.recording.rerun_stream import Log
@@ -26,9 +24,7 @@ SEE_THROUGH = {"sheath": 0.3}
 
 
 def log_static(log: Log, drawing: Drawing) -> None:
-    """Log vessel, goal, directions and the page of text."""
-    text = rr.TextDocument(episode_markdown(log.episode), media_type="text/markdown")
-    log.static("info", text)
+    """Log vessel, goal and directions."""
     vertices, faces = drawing.vertices, drawing.faces
     # Patient frame LPS: x to the patient's left, y to the back, z up.
     log.static("world", rr.ViewCoordinates.LBU)
@@ -141,43 +137,3 @@ def _shape(parts: list[BodyGeom]) -> Any:
     along = Rotation.from_quat(turn, scalar_first=True).apply([0.0, 0.0, 1.0])
     lower = centre - size[:, 1:] * along
     return rr.Capsules3D(radii=radii, lengths=lengths, translations=lower, **common)
-
-
-# Series and name lists of the metadata belong in plots, not on the page.
-_LONG = 8
-
-
-def episode_markdown(episode: Episode) -> str:
-    """Return a Markdown page: outcome, forces, versions and options."""
-    force = np.linalg.norm(episode.contact_force, axis=-1)
-    head_path = np.linalg.norm(np.diff(episode.head, axis=0), axis=-1).sum()
-    rows = {
-        "Task": episode.task,
-        "Seed": "none" if episode.seed is None else str(episode.seed),
-        "Outcome": episode.termination.replace("_", " "),
-        "Steps": str(episode.steps),
-        "Simulated time": f"{episode.time[-1] - episode.time[0]:.2f} s",
-        "Return": f"{episode.reward.sum():.3f}",
-        "Contacts": str(len(force)),
-        "Force per contact, mean": f"{force.mean():.4f} N" if len(force) else "-",
-        "Force per contact, largest": f"{force.max():.4f} N" if len(force) else "-",
-        "Wall force sum, largest": f"{np.max(episode.wall_force_sum, initial=0):.4f} N",
-        "Insertion, last": f"{1e3 * episode.insertion[-1]:.1f} mm",
-        "Path of the head": f"{1e3 * head_path:.1f} mm",
-    }
-    if episode.meta.get("distance"):
-        distance = 1e3 * np.asarray(episode.meta["distance"])
-        rows["Distance to goal, first"] = f"{distance[0]:.1f} mm"
-        rows["Distance to goal, last"] = f"{distance[-1]:.1f} mm"
-    shown = {"success", "termination"}
-    for key, value in episode.meta.items():
-        text = value if isinstance(value, str) else json.dumps(value)
-        if key not in shown and not (isinstance(value, list) and len(value) > _LONG):
-            rows[key] = text
-    lines = [f"# {_cell(episode.task)}", "", "| | |", "|---|---|"]
-    lines += [f"| {_cell(key)} | {_cell(text)} |" for key, text in rows.items()]
-    return "\n".join(lines) + "\n"
-
-
-def _cell(text: str) -> str:
-    return text.replace("\\", "\\\\").replace("|", "\\|").replace("\n", " ")

@@ -9,7 +9,7 @@ import rerun as rr
 
 from cathsim_dmc.recording.blueprint import FLUOROSCOPY
 from cathsim_dmc.recording.coaxial import CoaxialRecord
-from cathsim_dmc.recording.drawing import action_layout, goal_distance
+from cathsim_dmc.recording.drawing import goal_distance
 from cathsim_dmc.recording.rerun_device import device_colours
 from cathsim_dmc.recording.rerun_stream import Log
 
@@ -40,14 +40,11 @@ def log_series(log: Log) -> None:
     for name, values in episode.meta.get("reward_terms", {}).items():
         log.series(f"series/reward/{name}", np.array(values), measured, name)
     _log_devices(log)
-    names, tip = action_layout(episode)
-    shown = {names[i]: episode.action[:, i] for i in np.flatnonzero(~tip)}
-    if tip.any():
-        shown["tip_bend"] = np.sqrt(np.mean(episode.action[:, tip] ** 2, axis=1))
-    for name, values in shown.items():
-        label = "tip bend, rms" if name == "tip_bend" else name
-        log.series(f"series/action/{name}", values, commanded, label)
-    log.series("series/action_all", episode.action, commanded, names)
+    # Of several devices, whose names come first; otherwise of joints of the device.
+    names = [str(name) for name in episode.meta.get("action_names", ())]
+    short = [name.rsplit("/", 1)[-1] for name in names]
+    names = short if len(set(short)) == len(names) else names
+    log.series("series/action", episode.action, commanded, names or None)
 
 
 def _log_devices(log: Log) -> None:

@@ -1,4 +1,4 @@
-"""Scripted insertions, for convergence, force statistics and straight pushes."""
+"""Scripted insertions, for convergence and force statistics."""
 
 from __future__ import annotations
 
@@ -10,13 +10,10 @@ import numpy as np
 
 from cathsim_dmc import suite
 from cathsim_dmc.anatomy import Anatomy, Goal
-from cathsim_dmc.entities.chain import MAX_PUSH_SPEED
 from cathsim_dmc.simulation.episodes import ComposerSimulation, play
 from cathsim_dmc.tasks.config import CONTROL_TIMESTEP
 
 CURL_TIME = 2.0  # s
-# Way of the base (m) beside that to the goal, after which a straight push has missed.
-_SPARE = 0.08
 
 
 @dataclasses.dataclass(frozen=True)
@@ -117,26 +114,3 @@ def run(
         len(task.scene.catheter.links),
         task.termination == "success",
     )
-
-
-def straight_push(
-    anatomy: Anatomy, goal: str | Goal, seed: int = 0, **options: Any
-) -> dict[str, float]:
-    """Pushes the device at full speed without steering it.
-
-    Args:
-        **options: of the task, fields of `tasks.navigation.NavigationConfig`.
-
-    Returns:
-        Whether the goal was reached ("success"), "steps" until then or until it was
-        given up, "mean_force" of the wall and the "peak_force" of a contact, N.
-    """
-    duration = (anatomy.route(goal).length + _SPARE) / MAX_PUSH_SPEED
-    script = Script("straight push", 1.0, (0.0, 0.0), duration)
-    pushed = run(script, seed=seed, anatomy=anatomy, goal=goal, **options)
-    return {
-        "success": pushed.success,
-        "steps": len(pushed.head),
-        "mean_force": float(pushed.wall_force.mean()),
-        "peak_force": float(pushed.peak.max(initial=0.0)),
-    }

@@ -117,14 +117,12 @@ def _narrow(anatomy: Anatomy, radius: float) -> dict[str, int]:
 def validate_anatomy(
     anatomies: Mapping[str, Anatomy],
     figure_path: str | Path | None = None,
-    push: bool = False,
 ) -> Report:
     """Checks some anatomies, by name, and measures what they are like.
 
     Args:
         anatomies: generated, measured or imported.
         figure_path: PNG of three views of the first one, or None.
-        push: whether to try a straight push to each goal, which takes seconds.
     """
     checks, findings = Checks(), {}
     for name, anatomy in anatomies.items():
@@ -134,12 +132,6 @@ def validate_anatomy(
             label = f"{name}: {found.name}, violations"
             checks.at_most(label, violations, 0, "", found.detail)
         findings[name] = {"measures": shape(anatomy)}
-        if push:
-            from cathsim_dmc.validation.insertion import straight_push
-
-            findings[name]["straight push"] = {
-                goal: straight_push(anatomy, goal) for goal in anatomy.goals
-            }
     if figure_path is not None:
         from cathsim_dmc.validation import views
 
