@@ -15,9 +15,10 @@ from cathsim_dmc.entities.robot import (
     follower_posture,
 )
 
-NAMES = [joint.name for joint in JOINTS]
+NAMES = list(JOINTS)
 COLUMN = {name: i for i, name in enumerate(NAMES)}
-SLIDES = [i for i, joint in enumerate(JOINTS) if joint.kind == "slide"]
+RANGES = [joint.range for joint in Robot().joints]  # of slides; wheels have none
+SLIDES = [i for i, range_ in enumerate(RANGES) if range_ is not None]
 insertions = st.floats(-0.5, 1.5, allow_nan=False)
 rotations = st.floats(-50.0, 50.0, allow_nan=False)
 
@@ -67,7 +68,7 @@ def test_posture_is_continuous(insertion, step, rotation):
     )
     # Fastest slide: the return swing, 1 - 1.5 CYCLE / RETURN; jaws are slower.
     fastest = 1.5 * CYCLE / robot_module.RETURN
-    wheels = [i for i, joint in enumerate(JOINTS) if joint.kind == "hinge"]
+    wheels = [i for i in range(len(JOINTS)) if i not in SLIDES]
     assert change[SLIDES].max() <= fastest * step + 1e-12
     assert change[wheels].max() <= (1 + fastest) * step / ROLLER_RADIUS + 1e-9
 
@@ -91,10 +92,8 @@ def test_no_slip_while_clamped(insertion, step):
 @given(insertions, rotations)
 def test_posture_stays_in_range(insertion, rotation):
     posture = follower_posture(insertion, rotation)
-    for joint, value in zip(JOINTS, posture, strict=True):
-        if joint.range is not None:
-            low, high = joint.range
-            assert low <= value <= high, joint.name
+    for name, ends, value in zip(JOINTS, RANGES, posture, strict=True):
+        assert ends is None or ends[0] <= value <= ends[1], name
 
 
 def test_posture_broadcasts_over_batch_axes():
@@ -125,21 +124,13 @@ def test_rear_clamps_and_guidewire_unit_follow_a_guidewire_of_its_own():
 
 def test_platforms_never_meet():
     posture = follower_posture(np.linspace(0, CYCLE, 4001))
-    homes = np.array(
-        [
-            robot_module.FRONT_HOME,
-            robot_module.CATHETER_HOME,
-            robot_module.REAR_HOME,
-            robot_module.GUIDEWIRE_HOME,
-        ]
-    )
-    clamp, rotary = robot_module.CLAMP_HALF_LENGTH, robot_module.ROTARY_HALF_LENGTH
-    half = np.array([clamp, rotary, clamp, rotary])
-    centre = homes + posture[:, :4]
+    bodies = [Robot().mjcf_model.find("body", name) for name in JOINTS[:4]]
+    half = np.array([body.geom[0].size[2] for body in bodies])  # of the plates
+    centre = np.array([body.pos[2] for body in bodies]) + posture[:, :4]
     gaps = (centre - half)[:, :-1] - (centre + half)[:, 1:]
     assert gaps.min() > 0.004
     assert (centre + half).max() < -0.016  # the front end plate
-    assert (centre - half).min() > robot_module.RAIL_END + 0.012
+    assert (centre - half).min() > -0.360 + 0.012  # the rear one
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf])
@@ -167,8 +158,8 @@ def test_ranges_are_written_but_not_enforced():
     physics, robot = arena_with_robot()
     bound = physics.bind(robot.joints)
     assert not np.any(bound.limited)
-    for joint, given_range in zip(JOINTS, bound.range, strict=True):
-        np.testing.assert_allclose(given_range, joint.range or (0, 0))
+    wanted = [(0, 0) if ends is None else ends for ends in RANGES]
+    np.testing.assert_allclose(bound.range, wanted)
 
 
 @pytest.mark.parametrize("radius", [0.0, 0.835, -1e-3])
@@ -183,7 +174,7 @@ def test_all_geoms_are_for_looks_only():
     assert not np.any(geoms.contype) and not np.any(geoms.conaffinity)
     kinds = {int(mujoco.mjtGeom.mjGEOM_BOX), int(mujoco.mjtGeom.mjGEOM_CYLINDER)}
     assert set(np.asarray(geoms.type)) <= kinds | {int(mujoco.mjtGeom.mjGEOM_CAPSULE)}
-    assert set(np.asarray(geoms.group)) == {robot_module.VISUAL_GROUP}
+    assert set(np.asarray(geoms.group)) == {2}
     assert np.all(geoms.matid >= 0)
     # The model's mean inertia, which scales the solver's stopping rule, is left
     # alone: a carriage has 0.2 kg.
