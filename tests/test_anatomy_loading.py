@@ -74,31 +74,24 @@ WRONG = {
     "vessel": (put("vessels", 0, "left"), "an entry is wrong: .*mapping, not str"),
     "field": (put("inlet", "width", 3.0), "an entry is wrong: .*'width'"),
     "twice": (put("goals", 1, "name", "bca"), "goals has a name twice"),
-    "inlet far": (put("inlet", "position", [99.0, 0, 0]), "inlet lies 9.* outside"),
     "inlet text": (
         put("inlet", "position", "here"),
         "inlet position is 'here'; it must be 3 numbers, each a finite",
     ),
     "goal": (put("goals", 0, "vessel", "renal"), "no vessel 'renal'"),
-    "goal far": (
-        put("goals", 0, "position", [0, 0, 3.0]),
-        "goal .* outside the vessel",
-    ),
     "nan": (
         array("surface_vertices", spoilt(5, np.nan)),
         "vertices is .*finite numbers",
     ),
-    "scale": (array("surface_vertices", lambda v: v * 1e3), "unit is not the metre"),
     "scanned": (put("scanned", "yes"), "scanned is 'yes'"),
     "shape": (array("vessel_0_radii", lambda v: v[:-1]), "give one radius for each"),
     "faces": (array("surface_faces", spoilt(0, 10**8)), "faces name vertices"),
-    "empty": (array("surface_faces", lambda f: f[:0]), "no triangles"),
     "pickle": (
         lambda d, a: a.update(vessel_0_radii=np.array([{}], dtype=object)),
         "allow_pickle",
     ),
     "missing": (lambda d, a: a.pop("surface_faces") is None, "lacks .*surface_faces"),
-    "header": (lambda d, a: a.pop("header") is None, "lacks the entry 'header'"),
+    "header": (lambda d, a: a.pop("header") is None, "lacks .*header"),
 }
 
 
@@ -137,9 +130,3 @@ def test_damage_is_found(saved, tmp_path):
         Anatomy.load(tmp_path)
     with pytest.raises(FileNotFoundError, match=r"no anatomy\.npz .*Anatomy.save"):
         Anatomy.load(tmp_path / "nothing")
-
-
-def test_an_archive_that_unpacks_to_gigabytes_is_refused(saved, monkeypatch):
-    monkeypatch.setattr("cathsim_dmc.anatomy.anatomy._LARGEST", 100_000)
-    with pytest.raises(ValueError, match="its arrays unpack to"):
-        Anatomy.load(saved.parent)

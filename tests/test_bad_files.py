@@ -1,7 +1,6 @@
 """Damaged files at every loader: refused by path in one line, nothing is written."""
 
 import copy
-import io
 import json
 
 import numpy as np
@@ -136,32 +135,6 @@ def damaged_json(text, free):
         yield str(path), json.dumps(changed)
 
 
-def damaged_arrays(data, free):
-    """An archive with one array of another kind, and which."""
-    with np.load(io.BytesIO(data)) as archive:
-        arrays = dict(archive)
-
-    def packed(held):
-        stream = io.BytesIO()
-        np.savez_compressed(stream, **held)
-        return stream.getvalue()
-
-    for name, value in arrays.items():
-        yield f"{name} missing", packed({k: v for k, v in arrays.items() if k != name})
-        if value.dtype.kind == "U":
-            json_text = str(value[()]) if name in ("header", "meta") else "{}"
-            for where, text in damaged_json(json_text, free):
-                yield f"{name} {where}", packed({**arrays, name: np.array(text)})
-            continue
-        for kind, other in {
-            "nan": np.full_like(value, np.nan, dtype=np.float64),
-            "text": np.full(value.shape, "x"),
-            "axis": value[None],
-            "complex": np.full(value.shape, 1j),
-        }.items():
-            yield f"{name} {kind}", packed({**arrays, name: other})
-
-
 def damages(path, free):
     """What becomes of a file, with a note."""
     data = path.read_bytes()
@@ -175,8 +148,6 @@ def damages(path, free):
     if path.suffix != ".hdf5":  # which has no checksums
         yield "end", data[:-2]
         yield "zeros", data[:half] + bytes(len(data) - half)
-    if path.suffix == ".npz":
-        yield from damaged_arrays(data, free)
     if path.suffix == ".json":
         for where, text in damaged_json(data, free):
             yield where, text.encode()

