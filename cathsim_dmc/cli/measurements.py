@@ -1,5 +1,6 @@
 """`cathsim validate` rod, pair, wall, vessel, forces."""
 
+import importlib
 from typing import Annotated, Literal
 
 from tyro import conf
@@ -25,10 +26,11 @@ def validate(
         convergence: Of `wall`: whether to include the studies of time step and link
             length.
     """
-    from cathsim_dmc import validation
-
+    module = "force_sensors" if part == "forces" else part
+    found = importlib.import_module(f"cathsim_dmc.validation.{module}")
+    run = getattr(found, f"validate_{part}")
     if part == "wall":
-        return show(validation.validate_wall(anatomy, convergence), json)
+        return show(run(anatomy, convergence), json)
     if anatomy or not convergence:
         raise ValueError("--anatomy and --no-convergence belong to `validate wall`")
-    return show(getattr(validation, f"validate_{part}")(), json)
+    return show(run(), json)

@@ -183,12 +183,12 @@ def check(
         figure: PNG of three views; check.png in a directory of an anatomy if left
             out.
     """
-    from cathsim_dmc import validation
+    from cathsim_dmc.validation.wall import validate_anatomy
 
     anatomy = _loaded(phantom, access)
     if figure is None and Path(phantom).is_dir():
         figure = Path(phantom) / _PICTURE
-    report = validation.validate_anatomy({anatomy.name: anatomy}, figure)
+    report = validate_anatomy({anatomy.name: anatomy}, figure)
     code = show(report, json)
     if not json:
         print_measures(report.findings[anatomy.name])

@@ -231,24 +231,9 @@ WIRE_014_MICRO = _hydrophilic_wire(
     tip_links=7,
 )
 
+# Every device above, by name.
 DEVICES: dict[str, Device] = {
-    device.name: device
-    for device in (
-        STEERABLE_5F,
-        STEERABLE_4F,
-        DIAGNOSTIC_5F_J,
-        DIAGNOSTIC_5F_SIMMONS,
-        WIRE_035_AMPLATZ,
-        WIRE_035_HEAVY_DUTY,
-        WIRE_035_EXTRA_STIFF,
-        WIRE_035_SUPER_STIFF,
-        WIRE_035_LUNDERQUIST,
-        BERENSTEIN_5F,
-        VERTEBRAL_5F,
-        MICROCATHETER_021,
-        WIRE_035_GLIDE,
-        WIRE_014_MICRO,
-    )
+    one.name: one for one in list(globals().values()) if isinstance(one, Device)
 }
 
 

@@ -13,7 +13,6 @@ from matplotlib.collections import LineCollection
 from matplotlib.colors import LinearSegmentedColormap, Normalize
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle
-from PIL import Image
 
 from cathsim_dmc.imaging import FluoroscopyOptions
 from cathsim_dmc.pictures.moment import Moment, fluoroscope_of, xray
@@ -54,9 +53,6 @@ _HEIGHT_IN = 6.0
 _WIDEST_IN, _LETTERING_IN = 16.0, 1.2
 # Shaft of an arrow.
 _ARROW_WIDTH_IN = 0.037
-# The palette of a notebook's picture is refined until no more pixels than these
-# change their colour.
-_SETTLED_PIXELS = 1_000
 _POINTS_PER_INCH = 72.0
 
 
@@ -80,16 +76,10 @@ class Picture(Figure):
         return made
 
     def _repr_png_(self) -> bytes:
-        """PNG for notebooks, with 256 colours: a third of the size."""
-        full, small = io.BytesIO(), io.BytesIO()
-        self.savefig(full, format="png")
-        picture = Image.open(full).convert("RGB")
-        # By coverage, not by count: the rare colours of scale and goal keep theirs.
-        # Refined, because coverage alone gives tints to grey images.
-        method, dither = Image.Quantize.MAXCOVERAGE, Image.Dither.NONE
-        quantised = picture.quantize(256, method, _SETTLED_PIXELS, dither=dither)
-        quantised.save(small, "PNG", optimize=True)
-        return small.getvalue()
+        """PNG for notebooks."""
+        stream = io.BytesIO()
+        self.savefig(stream, format="png")
+        return stream.getvalue()
 
 
 def force_map() -> LinearSegmentedColormap:

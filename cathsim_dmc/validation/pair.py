@@ -12,7 +12,7 @@ from cathsim_dmc.entities.device import Device
 from cathsim_dmc.entities.device_stack import DeviceStack
 from cathsim_dmc.physics import chain_fields
 from cathsim_dmc.tasks.config import CONTROL_TIMESTEP
-from cathsim_dmc.validation import pressed, rod, shapes, sliding, two_rods
+from cathsim_dmc.validation import pressed, rod, shapes, sliding, theory, two_rods
 from cathsim_dmc.validation.checks import Check, Checks, Report
 from cathsim_dmc.validation.rig import Rig
 
@@ -41,15 +41,7 @@ def sections(entity: DeviceStack, gaps: np.ndarray) -> tuple[np.ndarray, np.ndar
     places = np.array(sorted(edges))
     middles = (places[1:] + places[:-1]) / 2
     bending = sum(
-        np.where(
-            middles < gap,
-            0.0,
-            np.where(
-                middles < gap + device.tip_length,
-                device.tip.bending_stiffness,
-                device.shaft.bending_stiffness,
-            ),
-        )
+        theory.profile(device, middles - gap)[0]
         for device, gap in zip(entity.devices, gaps, strict=True)
     )
     return np.diff(places)[::-1], np.asarray(bending)[::-1]

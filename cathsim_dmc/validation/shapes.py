@@ -13,6 +13,7 @@ from cathsim_dmc.entities.coaxial import Stack
 from cathsim_dmc.entities.device import Device
 from cathsim_dmc.entities.device_stack import DeviceStack
 from cathsim_dmc.physics import chain_fields
+from cathsim_dmc.validation import theory
 from cathsim_dmc.validation.checks import Check
 from cathsim_dmc.validation.rig import Rig
 
@@ -69,21 +70,13 @@ def weighted_curvature(
     arc = np.arange(0.0, length, _FINE)
     steps = np.diff(np.append(arc, length))
     middle = length - (arc + steps / 2)  # from the end
-    stiffness, moment = np.zeros(len(arc)), np.zeros(len(arc), dtype=complex)
-    for device, gap, turn in zip(chosen, gaps, rotation, strict=True):
-        own = middle - gap
-        bending = np.where(
-            own < device.tip_length,
-            device.tip.bending_stiffness,
-            device.shaft.bending_stiffness,
-        ) * (own >= 0)
-        start = 0.0
-        for bow in reversed(device.tip_shape):
-            inside = (own >= start) & (own < start + bow.length)
-            sign = np.copysign(1 / bow.radius, bow.angle)
-            moment += np.where(inside, bending * sign * np.exp(1j * turn), 0.0)
-            start += bow.length
-        stiffness += bending
+    rows = [
+        theory.profile(device, middle - gap)
+        for device, gap in zip(chosen, gaps, strict=True)
+    ]
+    bending, _, own = (np.array(each) for each in zip(*rows, strict=True))
+    moment = (bending * own * np.exp(1j * rotation)[:, None]).sum(axis=0)
+    stiffness = bending.sum(axis=0)
     curvature = np.divide(
         moment, stiffness, out=np.zeros_like(moment), where=stiffness > 0
     )

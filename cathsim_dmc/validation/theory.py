@@ -13,6 +13,8 @@ import numpy as np
 from scipy.integrate import solve_ivp
 from scipy.optimize import brentq
 
+from cathsim_dmc.entities.device import Device
+
 
 class Elastica(NamedTuple):
     """Shape of a clamped rod under a dead transverse force at its free end.
@@ -103,3 +105,18 @@ def twist(torque: float, lengths, torsional_stiffnesses) -> float:
     return float(
         torque * np.sum(np.asarray(lengths) / np.asarray(torsional_stiffnesses))
     )
+
+
+def profile(device: Device, places: np.ndarray) -> tuple[np.ndarray, ...]:
+    """EI, GJ and curvature at places (n,) from the device's end, 0 beyond it."""
+    there, tip = places >= 0, places < device.tip_length
+    parts = [
+        there * np.where(tip, getattr(device.tip, name), getattr(device.shaft, name))
+        for name in ("bending_stiffness", "torsional_stiffness")
+    ]
+    curvature, start = np.zeros(len(places)), 0.0
+    for arc in reversed(device.tip_shape):
+        inside = (places >= start) & (places < start + arc.length)
+        curvature[inside] = np.copysign(1 / arc.radius, arc.angle)
+        start += arc.length
+    return (*parts, curvature)

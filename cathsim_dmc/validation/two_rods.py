@@ -22,6 +22,7 @@ from cathsim_dmc.entities.device import Device
 from cathsim_dmc.entities.device_stack import DeviceStack
 from cathsim_dmc.physics import chain_fields
 from cathsim_dmc.physics.stepper import CONTROL_TIMESTEP
+from cathsim_dmc.validation import theory
 from cathsim_dmc.validation.checks import Check, Checks
 from cathsim_dmc.validation.rig import Rig, tube
 
@@ -70,21 +71,6 @@ class Rods(NamedTuple):
     force: np.ndarray | None = None
 
 
-def _profile(device: Device, places: np.ndarray) -> tuple[np.ndarray, ...]:
-    """EI, GJ and curvature at places (n,) from the device's end, 0 beyond it."""
-    there, tip = places >= 0, places < device.tip_length
-    parts = [
-        there * np.where(tip, getattr(device.tip, name), getattr(device.shaft, name))
-        for name in ("bending_stiffness", "torsional_stiffness")
-    ]
-    curvature, start = np.zeros(len(places)), 0.0
-    for arc in reversed(device.tip_shape):
-        inside = (places >= start) & (places < start + arc.length)
-        curvature[inside] = np.copysign(1 / arc.radius, arc.angle)
-        start += arc.length
-    return (*parts, curvature)
-
-
 def reference(
     devices: Sequence[Device],
     gaps: ArrayLike,
@@ -105,7 +91,7 @@ def reference(
     places = length - (np.arange(count) + 0.5) * _FINE
     given = np.zeros(0, complex) if held is None else held
     made = [
-        _profile(device, places - gap)
+        theory.profile(device, places - gap)
         for device, gap in zip(devices, np.asarray(gaps), strict=True)
     ]
     bending, torsion, own = (np.array(each) for each in zip(*made, strict=True))

@@ -17,7 +17,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from cathsim_dmc import style
-from cathsim_dmc.validation import Check, Report
+from cathsim_dmc.validation.checks import Check, Report
 
 sys.path.insert(0, str(figures.ROOT / "benchmarks"))
 import wires  # noqa: E402

@@ -12,7 +12,7 @@ import figures
 import validation_figures
 from rich.console import Console
 
-from cathsim_dmc import validation
+from cathsim_dmc.validation import force_sensors, pair, rod, wall
 
 DOCS = figures.ROOT / "docs"
 IMAGES = DOCS / "images"
@@ -24,10 +24,10 @@ def main() -> int:
     parser.add_argument("--phantom", action="append", default=[])
     arguments = parser.parse_args()
     runs = {
-        "rod": validation.validate_rod,
-        "pair": validation.validate_pair,
-        "wall": lambda: validation.validate_wall(arguments.phantom),
-        "forces": validation.validate_forces,
+        "rod": rod.validate_rod,
+        "pair": pair.validate_pair,
+        "wall": lambda: wall.validate_wall(arguments.phantom),
+        "forces": force_sensors.validate_forces,
     }
     chosen = arguments.parts or list(runs)
     if unknown := set(chosen) - set(runs):
