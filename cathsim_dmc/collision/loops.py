@@ -211,10 +211,12 @@ def nth(seen, n, soft):
 
 
 @compiled
-def at_rest(table, model, data, contacts, geoms, entry, half, closed, margin, law):
+def at_rest(
+    table, model, data, contacts, geoms, entry, pose, half, closed, margin, law
+):
     """Number of contacts, written, with a field that does not move."""
     radius, near, soft, held = law
-    local, axis = posed(table, data, entry, geoms[0], geoms[1])
+    local, axis = pose
     limit = far = radius + margin + near
     travel, aside = (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
     if near > 0.0 and not soft:
@@ -225,6 +227,8 @@ def at_rest(table, model, data, contacts, geoms, entry, half, closed, margin, la
         ahead = length(travel) + half * length(aside)
         far = max(limit, radius + ahead - _IMPACT)
     seen = touches(entry, local, axis, half, closed, far)
+    if seen[0] == 0:  # most links; rows take as long to make as all before
+        return 0
     rows, written = np.empty((6, 4)), 0
     for n in range(seen[0]):
         t, depth, lowest, most = nth(seen, n, soft)
@@ -254,10 +258,12 @@ def at_rest(table, model, data, contacts, geoms, entry, half, closed, margin, la
 
 
 @compiled
-def in_motion(table, model, data, contacts, geoms, entry, half, closed, margin, law):
+def in_motion(
+    table, model, data, contacts, geoms, entry, pose, half, closed, margin, law
+):
     """Number of contacts, written, with a field that moves."""
     radius, near, soft, held = law
-    local, axis = posed(table, data, entry, geoms[0], geoms[1])
+    local, axis = pose
     limit = radius + margin + near
     time = numbers(data + word(table + TIME), 1)[0]
     lattice = numbers(word(entry + MOTION_ENTRY), COUNT)
@@ -322,7 +328,7 @@ def collide(model, data, contacts, geom1, geom2, margin, before):
     size = numbers(word(model + word(table + GEOM_SIZE)) + 24 * geom1, 3)
     radius, half = size[0], size[1] if before == OF_CAPSULE else 0.0
     geoms, closed = (geom1, geom2), ends(table, model, data, geom1, half)
-    local, axis = posed(table, data, entry, geom1, geom2)
+    pose = local, axis = posed(table, data, entry, geom1, geom2)
     # What is no number has no place in a lattice; MuJoCo's checks of the state tell.
     if not math.isfinite(local[0] + local[1] + local[2] + axis[0] + axis[1] + axis[2]):
         return np.int32(0)
@@ -333,11 +339,11 @@ def collide(model, data, contacts, geom1, geom2, margin, before):
     law = (radius, near, soft, radius if impedance < _SLACK else 0.0)
     if word(entry + MOTION_ENTRY) != 0 and motion_of(table, model, data) != 0:
         written = in_motion(
-            table, model, data, contacts, geoms, entry, half, closed, margin, law
+            table, model, data, contacts, geoms, entry, pose, half, closed, margin, law
         )
     else:
         written = at_rest(
-            table, model, data, contacts, geoms, entry, half, closed, margin, law
+            table, model, data, contacts, geoms, entry, pose, half, closed, margin, law
         )
     return np.int32(written)
 

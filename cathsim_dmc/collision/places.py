@@ -222,6 +222,19 @@ def in_straight_bore(head, centre, axis, half, closed, limit):
 
 
 @compiled
+def apart(entry, centre, axis, half, limit):
+    """Whether a capsule is farther from the wall than the limit, m, by its middle."""
+    middle = clearance(entry, centre[0], centre[1], centre[2])
+    if middle < FREE:
+        return middle - half > limit + _FAR
+    return (
+        half > 0.0
+        and clearance_along(entry, centre, axis, -half) >= FREE
+        and clearance_along(entry, centre, axis, half) >= FREE
+    )
+
+
+@compiled
 def sampled(entry, centre, axis, half, limit):
     """Clearances (n,) m of places along a capsule, and their distance apart, m.
 
@@ -229,16 +242,6 @@ def sampled(entry, centre, axis, half, limit):
     keeps away from the wall is not looked up: it changes by at most the way, but where
     an open end begins.
     """
-    middle = clearance(entry, centre[0], centre[1], centre[2])
-    if middle < FREE and middle - half > limit + _FAR:
-        return np.empty(0), 0.0
-    if (
-        middle >= FREE
-        and half > 0.0
-        and clearance_along(entry, centre, axis, -half) >= FREE
-        and clearance_along(entry, centre, axis, half) >= FREE
-    ):
-        return np.empty(0), 0.0
     count = 1
     if half > 0.0:
         count += min(max(int(math.ceil(2.0 * half / EVERY)), 2), _PLACES - 1)
@@ -303,8 +306,10 @@ def touches(entry, centre, axis, half, closed, limit):
     if straight(entry):
         head = numbers(word(entry + 24), COUNT)
         return in_straight_bore(head, centre, axis, half, closed, limit)
+    seen = NONE
+    if apart(entry, centre, axis, half, limit):
+        return seen
     values, step = sampled(entry, centre, axis, half, limit)
-    seen = (0, 0.0, FREE, 0.0, FREE)
     if len(values) == 0:
         return seen
     deepest = np.argmin(values)
