@@ -172,11 +172,11 @@ def test_no_anatomy_is_in_two_splits(tmp_path):
 
 
 def test_a_set_is_resumed_and_refused_where_it_must_be(tmp_path, monkeypatch, path):
-    def write_shard(shard):
+    def simulate_shard(shard):
         shard.path.write_bytes(path.read_bytes())
         return 8, shard.path.name
 
-    monkeypatch.setattr(image_set, "_write_shard", write_shard)
+    monkeypatch.setattr(image_set, "_simulate_shard", simulate_shard)
     out = tmp_path / "set"
     options = dataclasses.replace(OPTIONS, anatomies=(2, 1, 1))
     done = image_set.write(out, options, processes=1)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +27,7 @@ def encoded(mask: np.ndarray) -> str:
     """
     column_major = np.ascontiguousarray(mask.T, dtype=np.uint8).reshape(-1)
     text = np.empty(7 * len(column_major) + 14, np.uint8)
-    return bytes(text[: _encode(column_major, text)]).decode()
+    return text[: _encode(column_major, text)].tobytes().decode()
 
 
 @compiled
@@ -71,22 +72,22 @@ def labels(path: Path, number: int, pictures: bool = False) -> dict[str, list[An
             name: file[name][:] for name in ("keypoints", "sequence", "camera_matrix")
         }
         rows, height, width = file["image"].shape
-        masks = file["mask"][:]
-        for row in range(rows):
-            found = number * _MOST_ROWS + row
+        masks, keypoints = file["mask"][:], columns["keypoints"].round(2)
+        cameras = columns["camera_matrix"].round(6).tolist()
+        for row, sequence in enumerate(columns["sequence"].tolist()):
             images.append({
-                "id": found, "height": height, "width": width,
+                "id": number * _MOST_ROWS + row, "height": height, "width": width,
                 "file_name": f"{path.parent.name}/{path.stem}/{row:06d}.png",
                 "hdf5": f"{path.parent.name}/{path.name}", "row": row,
-                "sequence": int(columns["sequence"][row]),
-                "camera_matrix": columns["camera_matrix"][row].round(6).tolist(),
+                "sequence": sequence, "camera_matrix": cameras[row],
             })  # fmt: skip
-            flags, points = masks[row], columns["keypoints"][row].round(2)
-            for kind, (_, bit, names) in enumerate(_CLASSES):
-                own = points[: len(names)] if not kind else points[-len(names) :]
+        for kind, (_, bit, names) in enumerate(_CLASSES):
+            own = keypoints[:, -len(names) :] if kind else keypoints[:, : len(names)]
+            for row, one in enumerate(_annotations(masks & bit > 0, own)):
+                found = number * _MOST_ROWS + row
                 annotations.append(
                     {"id": 2 * found + kind, "image_id": found, "category_id": kind + 1}
-                    | _annotation(flags & bit > 0, own)
+                    | one
                 )
         if pictures and not (folder := path.with_suffix("")).exists():
             with files.atomic_directory(folder) as temporary:
@@ -94,21 +95,27 @@ def labels(path: Path, number: int, pictures: bool = False) -> dict[str, list[An
     return {"images": images, "annotations": annotations}
 
 
-def _annotation(mask: np.ndarray, keypoints: np.ndarray) -> dict[str, Any]:
-    """What COCO says of an object with a mask (H, W) bool and keypoints (K, 3)."""
-    rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
-    box = [0, 0, 0, 0]
-    if len(rows):
-        height, width = np.ptp(rows) + 1, np.ptp(columns) + 1
-        box = [int(columns[0]), int(rows[0]), int(width), int(height)]
-    return {
-        "segmentation": {"size": list(mask.shape), "counts": encoded(mask)},
-        "area": int(mask.sum()),
-        "bbox": box,
-        "iscrowd": 0,
-        "keypoints": keypoints.reshape(-1).tolist(),
-        "num_keypoints": int((keypoints[:, 2] > 0).sum()),
-    }
+def _annotations(masks: np.ndarray, keypoints: np.ndarray) -> Iterator[dict[str, Any]]:
+    """What COCO says of objects with masks (n, H, W) bool and keypoints (n, K, 3)."""
+    size, areas = list(masks.shape[1:]), masks.sum(axis=(1, 2)).tolist()
+    ends = []
+    for axis in (1, 2):  # columns, then rows
+        covered = masks.any(axis=axis)
+        first, length = covered.argmax(axis=1), covered.shape[1]
+        last = length - 1 - covered[:, ::-1].argmax(axis=1)
+        ends.append((first.tolist(), (last - first + 1).tolist()))
+    known = (keypoints[..., 2] > 0).sum(axis=1).tolist()
+    flat = keypoints.reshape(len(keypoints), -1).tolist()
+    for row, mask in enumerate(masks):
+        box = [ends[0][0][row], ends[1][0][row], ends[0][1][row], ends[1][1][row]]
+        yield {
+            "segmentation": {"size": size, "counts": encoded(mask)},
+            "area": areas[row],
+            "bbox": box if areas[row] else [0, 0, 0, 0],
+            "iscrowd": 0,
+            "keypoints": flat[row],
+            "num_keypoints": known[row],
+        }
 
 
 def _write_pictures(images: Any, folder: Path) -> None:

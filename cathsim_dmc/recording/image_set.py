@@ -33,6 +33,9 @@ _FORMAT = "cathsim-image-set"
 _NO_H5PY = "h5py is not installed; `pip install cathsim-dmc[gym]` adds it"
 
 
+Labels = dict[str, list[Any]]  # as `coco.labels` returns them
+
+
 @dataclasses.dataclass(frozen=True)
 class ImageSetOptions(SequenceOptions):
     """What a data set holds.
@@ -125,13 +128,13 @@ def write(
         count = bounds.whole("processes", processes, 1, bounds.MOST_THREADS)
     _begin(out, options)
     start, used = time.monotonic(), _processor()
-    shards = _shards(out, options)
-    missing = [shard for shard in shards if not shard.path.exists()]
-    new = 0
-    for rows, line in _over(_write_shard, missing, count):
+    shards, labels, new = _shards(out, options), [], 0
+    for rows, line, own in _over(_write_shard, shards, count):
+        labels.append(own)
         new += rows
-        say(line)
-    frames = _label(out, shards, count)
+        if line:
+            say(line)
+    frames = _label(out, shards, labels)
     files.write_text(out / "README.md", _card(options, frames))
     took = time.monotonic() - start
     return Written(out, frames, new, took, _processor() - used)
@@ -180,7 +183,15 @@ def _shards(out: Path, options: ImageSetOptions) -> list[_Shard]:
     return shards
 
 
-def _write_shard(shard: _Shard) -> tuple[int, str]:
+def _write_shard(shard: _Shard) -> tuple[int, str, Labels]:
+    """Writes one anatomy unless it is there: new frames, a line about it, labels."""
+    from cathsim_dmc.recording import coco
+
+    written = (0, "") if shard.path.exists() else _simulate_shard(shard)
+    return *written, coco.labels(shard.path, shard.number, shard.options.pictures)
+
+
+def _simulate_shard(shard: _Shard) -> tuple[int, str]:
     """Writes one anatomy; the number of its frames, and a line about it."""
     from cathsim_dmc.anatomy.arch import arch
     from cathsim_dmc.anatomy.builder import ACCESSES
@@ -219,26 +230,20 @@ def _over(work: Callable[[Any], Any], jobs: list[Any], processes: int) -> Iterab
         yield from pool.map(work, jobs)
 
 
-def _label_shard(shard: _Shard) -> dict[str, list[Any]]:
-    from cathsim_dmc.recording import coco
-
-    return coco.labels(shard.path, shard.number, shard.options.pictures)
-
-
-def _label(out: Path, shards: list[_Shard], processes: int) -> dict[str, int]:
+def _label(out: Path, shards: list[_Shard], labels: list[Labels]) -> dict[str, int]:
     """Writes the labels of each split; the number of its images."""
     from cathsim_dmc.recording import coco
 
     frames = {}
     for split in SPLITS:
-        own = [shard for shard in shards if shard.split == split]
         joined: dict[str, Any] = {
             "info": {"description": f"cathsim_dmc {__version__}, {split}"},
             "categories": coco.CATEGORIES, "images": [], "annotations": [],
         }  # fmt: skip
-        for part in _over(_label_shard, own, processes):
-            for name, rows in part.items():
-                joined[name] += rows
+        for shard, part in zip(shards, labels, strict=True):
+            if shard.split == split:
+                for name, rows in part.items():
+                    joined[name] += rows
         files.write_text(out / "annotations" / f"{split}.json", json.dumps(joined))
         frames[split] = len(joined["images"])
     return frames

@@ -321,17 +321,18 @@ def write(
             units="m, N, N m, s, kg/m3, degrees, pixels; frame LPS",
         )
         every = frames_of(anatomy, states, options, seed)
+        columns: dict[str, h5py.Dataset] = {}
         for start, clip in zip(range(0, rows, count), every, strict=True):
             for name, values in clip.items():
-                if name not in file:
+                if name not in columns:
                     kind = _TYPES.get(name, "u1" if values.dtype == np.uint8 else "f4")
                     chunk, packed = True, None
                     if kind == "u1":
                         chunk, packed = (1, *values.shape[1:]), 1
-                    file.create_dataset(
+                    columns[name] = file.create_dataset(
                         name, (rows, *values.shape[1:]), kind, chunks=chunk,
                         compression="gzip" if packed and name == "mask" else None,
                         compression_opts=packed if name == "mask" else None,
                     )  # fmt: skip
-                file[name][start : start + count] = values
+                columns[name][start : start + count] = values
     return rows
