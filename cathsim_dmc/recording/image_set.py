@@ -187,8 +187,9 @@ def _write_shard(shard: _Shard) -> tuple[int, str, Labels]:
     """Writes one anatomy unless it is there: new frames, a line about it, labels."""
     from cathsim_dmc.recording import coco
 
-    written = (0, "") if shard.path.exists() else _simulate_shard(shard)
-    return *written, coco.labels(shard.path, shard.number, shard.options.pictures)
+    rows, line = (0, "") if shard.path.exists() else _simulate_shard(shard)
+    labels = coco.labels(shard.path, shard.number, shard.options.pictures)
+    return rows, line, labels
 
 
 def _simulate_shard(shard: _Shard) -> tuple[int, str]:
