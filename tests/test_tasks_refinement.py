@@ -36,9 +36,9 @@ def test_an_impact_in_shorter_steps_is_not_as_deep(monkeypatch):
     ("contact", "coarse"),
     [
         ((0.1, 1e-4), False),
-        ((4.9, 5e-4), False),
+        ((4.9, 2.9e-4), False),
         ((5.1, 1e-4), True),
-        ((0.1, 7e-4), True),
+        ((0.1, 3.1e-4), True),
     ],
 )
 def test_hard_and_deep_contacts_need_shorter_steps(contact, coarse):

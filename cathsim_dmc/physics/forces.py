@@ -9,11 +9,11 @@ import numpy as np
 # The order is MuJoCo's own, whatever the order in the model file.
 CONTACT_SIZE = 1 + 3 + 1 + 3 + 3 + 3
 
-# A physics step was too long if it ends with a contact harder, N, or deeper, m, than
-# this: something crossed the lumen in it and hit the wall. Deeper than its radius, the
-# device is pushed out of the pieces of the wall on whatever side is nearest.
+# A physics step was too long if one begins with a contact harder, N, or deeper, m, than
+# this: something crossed the lumen and hit the wall. It may hit again, and where the
+# last physics step of a control step ends is seen only in the next control step.
 HARDEST = 5.0
-DEEPEST = 0.6e-3
+DEEPEST = 0.3e-3
 # The control step is then done again with steps so many times shorter; a power of two,
 # which divides exactly.
 REFINEMENT = 4
