@@ -100,7 +100,7 @@ def _annotations(masks: np.ndarray, keypoints: np.ndarray) -> Iterator[dict[str,
     size, areas = list(masks.shape[1:]), masks.sum(axis=(1, 2)).tolist()
     ends = []
     for axis in (1, 2):  # columns, then rows
-        covered: np.ndarray = masks.any(axis=axis)
+        covered = np.asarray(masks.any(axis=axis))
         first, length = covered.argmax(axis=1), covered.shape[1]
         last = length - 1 - covered[:, ::-1].argmax(axis=1)
         ends.append((first.tolist(), (last - first + 1).tolist()))

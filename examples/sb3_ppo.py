@@ -1,0 +1,103 @@
+"""PPO of Stable-Baselines3, evaluated and recorded as the package's own policies are.
+
+    pip install "cathsim-dmc[gym]" stable-baselines3
+    python examples/sb3_ppo.py --task type1_lcca --frames 200000 --out runs/sb3
+
+`PPO_SETTINGS` and `TRAINING` are the settings. The motors of the tip that bend it about
+one axis get one command, so the policy has three outputs: two bends and the
+translation. The evaluation is that of the task: its reward, its start, its time limit.
+"""
+
+from pathlib import Path
+
+import gymnasium
+import numpy as np
+import torch
+import tyro
+from stable_baselines3 import PPO
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.vec_env import VecNormalize
+
+import cathsim_dmc
+import cathsim_dmc.gym
+from cathsim_dmc import agents, suite
+from cathsim_dmc.simulation.environments import VECTOR
+
+OBSERVATION = "internal"  # numbers, without images
+# Short episodes from anywhere along the way; the reward is the path that is left.
+TRAINING = {
+    "observation": OBSERVATION,
+    "max_steps": 120,
+    "start_along_route": (0.0, 0.9),
+    "reward": {"path": -1.0, "success": 10.0},
+}
+PPO_SETTINGS = {
+    "learning_rate": 3e-4,
+    "n_steps": 256,  # of each environment between two updates
+    "batch_size": 256,
+    "n_epochs": 10,
+    "gamma": 0.99,
+    "gae_lambda": 0.95,
+    "clip_range": 0.2,
+    "ent_coef": 0.0,
+    "target_kl": 0.05,
+    "policy_kwargs": {"net_arch": [128, 128], "log_std_init": -0.5},
+}
+
+
+def groups_of(env: gymnasium.Env) -> np.ndarray:
+    """Output of the policy that each entry of an action takes."""
+    return np.array(env.unwrapped.environment.task.scene.catheter.action_groups)
+
+
+def wrapped(env: gymnasium.Env) -> gymnasium.Env:
+    """The environment with one vector to observe and one action for each group."""
+    groups = groups_of(env)
+    space = gymnasium.spaces.Box(-1.0, 1.0, (groups.max() + 1,), np.float32)
+    env = gymnasium.wrappers.FlattenObservation(env)
+    return gymnasium.wrappers.TransformAction(env, lambda a: a[groups], space)
+
+
+def policy_of(model: PPO, normalise: VecNormalize, groups: np.ndarray):
+    """A function from observations (N, …) to actions (N, A), as `evaluate` takes it."""
+
+    def sb3_ppo(observation):
+        seen = normalise.normalize_obs(observation[VECTOR].numpy())
+        action, _ = model.predict(seen, deterministic=True)
+        return torch.as_tensor(action[..., groups])
+
+    return sb3_ppo
+
+
+def main(
+    task: str = "type1_lcca",
+    frames: int = 200_000,
+    envs: int = 8,
+    seed: int = 0,
+    episodes: int | None = None,
+    out: Path = Path("runs/sb3"),
+) -> None:
+    """Trains, evaluates under both protocols, records an episode, saves the policy."""
+    torch.set_num_threads(1)  # the networks are small
+    name = f"cathsim/{task}-v{cathsim_dmc.gym.VERSION}"
+    env = make_vec_env(name, envs, seed, env_kwargs=TRAINING, wrapper_class=wrapped)
+    normalise = VecNormalize(env, norm_reward=False)
+    model = PPO("MlpPolicy", normalise, seed=seed, verbose=1, **PPO_SETTINGS)
+    model.learn(frames)
+    out.mkdir(parents=True, exist_ok=True)
+    model.save(out / "model.zip")
+    normalise.save(str(out / "normalisation.pkl"))
+    policy = policy_of(model, normalise, groups_of(env.envs[0]))
+    for protocol in ("published", "varied"):
+        result = agents.evaluate(
+            policy, task, episodes, protocol=protocol, observation=OBSERVATION,
+            out_dir=out / protocol,
+        )  # fmt: skip
+        rate, safe = result.summary()["success"], result.safe_success(0.5)
+        print(f"{protocol}: success {rate:.0%}, safe at 0.5 N {safe:.0%}")
+    one = suite.load("cathsim", task, task_kwargs={"observation": OBSERVATION})
+    cathsim_dmc.record(one, agents.load_policy(policy), out / "episode.npz", seed=seed)
+
+
+if __name__ == "__main__":
+    tyro.cli(main)
