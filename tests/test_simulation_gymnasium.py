@@ -1,6 +1,8 @@
 """The tasks as Gymnasium environments."""
 
+import runpy
 import warnings
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -140,3 +142,32 @@ def test_success_terminates():
     _, reward, terminated, truncated, info = env.step(np.zeros(21, np.float32))
     assert (reward, terminated, truncated) == (10.0, True, False)
     assert info["success"] and not info["physics_error"]
+
+
+@pytest.mark.slow
+def test_the_example_of_stable_baselines_trains_and_its_policy_is_evaluated():
+    pytest.importorskip("stable_baselines3")
+    from stable_baselines3 import PPO
+    from stable_baselines3.common.env_util import make_vec_env
+    from stable_baselines3.common.vec_env import VecNormalize
+
+    from cathsim_dmc import agents
+
+    path = Path(__file__).parents[1] / "examples" / "sb3_ppo.py"
+    example = runpy.run_path(str(path))
+    env = make_vec_env(
+        TASK, 2, 0, env_kwargs=example["TRAINING"], wrapper_class=example["wrapped"]
+    )
+    settings = {**example["PPO_SETTINGS"], "n_steps": 64, "batch_size": 64}
+    normalise = VecNormalize(env, norm_reward=False)
+    model = PPO("MlpPolicy", normalise, seed=0, **settings).learn(256)
+    policy = example["policy_of"](model, normalise, example["groups_of"](env.envs[0]))
+    # What the network reads is in the order in which it was trained.
+    single = env.envs[0]
+    entries = single.unwrapped.observation_space.spaces
+    assert list(entries) == sorted(entries)
+    result = agents.evaluate(
+        policy, "simple1_bca", 2, observation=example["OBSERVATION"],
+        task_kwargs={"max_steps": 5},
+    )  # fmt: skip
+    assert result.policy == "sb3_ppo" and result.values("length").tolist() == [5, 5]
