@@ -1,4 +1,6 @@
-"""Contacts with a moving wall see its velocity; see `physics.motion`.
+"""Contacts with walls that give or move, before MuJoCo works out their references.
+
+Two contacts that share the spring of a wall that gives (`loops.SOFT`) get half each.
 
 MuJoCo knows the velocity of a contact as J qvel. The model has one more degree of
 freedom, the last, whose velocity is 1 m/s in every physics step; its column of J gets
@@ -9,6 +11,7 @@ import numpy as np
 
 from cathsim_dmc.anatomy.motion_loops import VALUES, WARP, wall_velocity, warp
 from cathsim_dmc.collision import native
+from cathsim_dmc.collision.loops import SOFT
 from cathsim_dmc.collision.native import (
     address_of,
     call_callback,
@@ -24,33 +27,46 @@ from cathsim_dmc.collision.table import (
     key_of,
     motion_of,
 )
+from cathsim_dmc.compiled import compiled
 
 _SYMBOL = "cathsim_carrying"
 # `native.contact_places`; offsets of nv, qvel and time; the function before;
 # offset of the time step.
-_TABLE = np.zeros(15, np.int64)
+_TABLE = np.zeros(16, np.int64)
 native.symbol(_SYMBOL, _TABLE)
+
+
+@compiled
+def _share(table, data):
+    """Halves stiffness and damping of contacts that share a spring."""
+    for n in range(wholes(data + word(table), 1)[0]):
+        contact = word(data + word(table + 8)) + n * word(table + 24)
+        soft = numbers(contact + word(table + 72), 1)[0] == SOFT
+        if soft and wholes(contact, 1)[0] & 1:
+            law = numbers(contact + word(table + 80), 2)
+            law[0], law[1] = 0.5 * law[0], 0.5 * law[1]
 
 
 @native.callback("void(int64, int64)")
 def _carry(model, data):
-    """Writes the velocity of the wall into the Jacobian of its contacts."""
+    """Shares springs, and writes the wall's velocity into contacts' Jacobian."""
     table, fields = address_of(_SYMBOL), address_of(SYMBOL)
-    before = word(table + 104)
+    before = word(table + 112)
     if before != 0:
         call_callback(before, model, data)
+    _share(table, data)
     space = motion_of(fields, model, data)
     if space == 0:
         return
-    nv = word(model + word(table + 80))
-    numbers(word(data + word(table + 88)), nv)[nv - 1] = 1.0
+    nv = word(model + word(table + 88))
+    numbers(word(data + word(table + 96)), nv)[nv - 1] = 1.0
     count = wholes(data + word(table), 1)[0]
     if count == 0:
         return
     jacobian = numbers(word(data + word(table + 16)), COUNT)
     # In the middle of the step, so that a device that sticks goes the wall's way.
-    time = numbers(data + word(table + 96), 1)[0]
-    time += 0.5 * numbers(model + word(table + 112), 1)[0]
+    time = numbers(data + word(table + 104), 1)[0]
+    time += 0.5 * numbers(model + word(table + 120), 1)[0]
     course = numbers(space, COUNT)
     wall = int(course[9])
     key = key_of(fields, model, wall)
@@ -73,15 +89,14 @@ def _carry(model, data):
 
 
 def install() -> None:
-    """Has MuJoCo call it in every physics step of models with a motion.
+    """Has MuJoCo call it in every physics step, for walls that give or move.
 
     Raises:
         RuntimeError: if a Python function stands in `mjcb_passive`.
     """
     if _TABLE[0]:
         return
-    _TABLE[10] = native.offsets("mjModel", ("nv",))[0]
-    _TABLE[11:13] = native.offsets("mjData", ("qvel", "time"))
-    _TABLE[14] = native.offsets("mjModel", ("opt.timestep",))[0]
-    _TABLE[:10] = native.contact_places()
-    _TABLE[13] = native.follow(_carry)
+    _TABLE[[11, 15]] = native.offsets("mjModel", ("nv", "opt.timestep"))
+    _TABLE[12:14] = native.offsets("mjData", ("qvel", "time"))
+    _TABLE[:11] = native.contact_places()
+    _TABLE[14] = native.follow(_carry)

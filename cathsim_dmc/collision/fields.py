@@ -88,10 +88,11 @@ class _Table:
         self._words[16:21] = native.offsets("mjModel", moving)
         velocity = ("qvel", "cdof", "subtree_com")
         self._words[21:24] = native.offsets("mjData", velocity)
-        solimp = native.offsets("mjModel", ("geom_solimp",))
-        self._words[words.GEOM_SOLIMP // 8] = solimp[0]
-        nuserdata = native.offsets("mjModel", ("nuserdata",))
-        self._words[words.NUSERDATA // 8] = nuserdata[0]
+        more = native.offsets("mjModel", ("geom_solimp", "nuserdata", "geom_solref"))
+        for place, offset in zip(
+            (words.GEOM_SOLIMP, words.NUSERDATA, words.GEOM_SOLREF), more, strict=True
+        ):
+            self._words[place // 8] = offset
         user = native.offsets("mjData", ("userdata", "time"))
         self._words[words.USERDATA // 8 : words.TIME // 8 + 1] = user
         self._library = _mujoco_library()

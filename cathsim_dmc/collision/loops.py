@@ -14,6 +14,7 @@ from cathsim_dmc.collision.native import (
     call_error,
     callback,
     numbers,
+    wholes,
     word,
 )
 from cathsim_dmc.collision.places import (
@@ -31,6 +32,7 @@ from cathsim_dmc.collision.table import (
     ERROR,
     GEOM_SIZE,
     GEOM_SOLIMP,
+    GEOM_SOLREF,
     GEOM_XMAT,
     GEOM_XPOS,
     LUMEN,
@@ -64,9 +66,10 @@ _SLACK = 0.1  # first impedance of a law that starts soft enough for that
 _CORNER = -0.3  # slope of the clearance beside a place in a corner
 _STEEP = 0.5  # cosine between a wall of a corner and the normal, least to share a load
 _ROOM = 1e-4  # m, a link that touches one wall of a corner is held by others so close
-# First impedance of a link whose wall gives: two planes share the spring of a place,
-# wherever the wall is not hollow the same one twice.
-SOFT = 0.7
+# First impedance of a link whose wall gives. Two planes share the spring of a place, as
+# the last bit of their depth says (`carrying`). One plane does up to a depth times
+# slope, m, of so much, m/s², over |`solref`|: less than half a rigid wall's load.
+SOFT, _LIGHT = 0.7, 15.0
 # A link this close, m, is held: between contacts under load, one physics step without
 # any lets the light tip jump by most of a millimetre.
 _TOUCH = 1e-4
@@ -94,7 +97,7 @@ def sideways(axis, normal, turn):
 
 
 @compiled
-def tangents(entry, place, axis, normal, depth, limit, held, turns, rows):
+def tangents(entry, place, axis, normal, depth, limit, held, light, turns, rows):
     """Planes (1 or 2 rows of unit normal and clearance) that stand for the wall.
 
     Where the wall is hollow across the device, one plane turns with the device as it
@@ -102,7 +105,8 @@ def tangents(entry, place, axis, normal, depth, limit, held, turns, rows):
     f / r that no implicit step knows of, and throws light links to and fro. The wall
     is then two planes that touch it to both sides: the field made linear there. Under
     a light load one plane does; it stands there where `held`, m, is the radius, and not
-    where `held` is 0. The last two of 6 rows are scratch.
+    where `held` is 0. In a wall that gives, one plane does up to a depth times slope of
+    `light`, m, which is 0 for another wall. The last two of 6 rows are scratch.
     """
     found, least, shift = 0, np.inf, 0.0
     for turn in range(turns):
@@ -120,9 +124,12 @@ def tangents(entry, place, axis, normal, depth, limit, held, turns, rows):
         corner = slope < _CORNER
         if held > 0.0:
             one = _DEEP * (_SLOPED / -slope) ** (1.0 / 3.0)
+            if light > 0.0:
+                one = light / -slope
             if held - depth < one:
                 continue
-            shift = _SHARED * max(2.0 * one - (held - depth), 0.0)
+            if light == 0.0:
+                shift = _SHARED * max(2.0 * one - (held - depth), 0.0)
         for row in range(2):
             way = 2.0 * row - 1.0
             there = high if row else low
@@ -168,14 +175,10 @@ def tangents(entry, place, axis, normal, depth, limit, held, turns, rows):
 @compiled
 def put(table, data, contacts, geoms, written, most, rows, planes, t, limit, law):
     """Writes planes as contacts after those written, and returns how many there are."""
-    radius, near, soft, _ = law
+    radius, near, soft, _, _ = law
     turns = word(data + word(table + GEOM_XMAT))
     centre = numbers(word(data + word(table + GEOM_XPOS)) + 24 * geoms[0], 3)
     turned, frame = numbers(turns + 72 * geoms[0], 9), numbers(turns + 72 * geoms[1], 9)
-    if soft and planes == 1:
-        for k in range(4):
-            rows[1, k] = rows[0, k]
-        planes = 2
     for plane in range(planes):
         if written == most or rows[plane, 3] > limit:
             continue
@@ -183,6 +186,9 @@ def put(table, data, contacts, geoms, written, most, rows, planes, t, limit, law
         distance = rows[plane, 3] - radius
         reached = radius + 0.5 * distance
         contact[0] = min(distance, _AT_WALL) if near > 0.0 else distance
+        if soft:
+            bits = wholes(contacts + 80 * written, 1)
+            bits[0] = (bits[0] & -2) | int(planes > 1)
         for k in range(3):
             towards = 0.0
             for i in range(3):
@@ -215,7 +221,7 @@ def at_rest(
     table, model, data, contacts, geoms, entry, pose, half, closed, margin, law
 ):
     """Number of contacts, written, with a field that does not move."""
-    radius, near, soft, held = law
+    radius, near, soft, held, light = law
     local, axis = pose
     limit = far = radius + margin + near
     travel, aside = (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
@@ -242,7 +248,7 @@ def at_rest(
             # A sphere may have one contact, so one plane.
             turns = 0 if half == 0.0 else 1 + int(lowest and abs(t) >= half)
             planes = tangents(
-                entry, place, axis, normal, depth, limit, held, turns, rows
+                entry, place, axis, normal, depth, limit, held, light, turns, rows
             )
         else:
             hits = along(travel, aside, t)
@@ -262,7 +268,7 @@ def in_motion(
     table, model, data, contacts, geoms, entry, pose, half, closed, margin, law
 ):
     """Number of contacts, written, with a field that moves."""
-    radius, near, soft, held = law
+    radius, near, soft, held, light = law
     local, axis = pose
     limit = radius + margin + near
     time = numbers(data + word(table + TIME), 1)[0]
@@ -301,7 +307,11 @@ def in_motion(
         normal = away(entry, place[0], place[1], place[2])
         if normal == (0.0, 0.0, 0.0):
             continue
-        planes = tangents(entry, place, way, normal, depth, reach, held, turns, rows)
+        # A lumen that has grown is held where it is, not where it was at rest.
+        grown = max(held - there[12], 1e-9) if held > 0.0 else 0.0
+        planes = tangents(
+            entry, place, way, normal, depth, reach, grown, light, turns, rows
+        )
         in_space(there, rows, planes)
         written = put(
             table, data, contacts, geoms, written, most, rows, planes, t, limit, law
@@ -335,8 +345,12 @@ def collide(model, data, contacts, geom1, geom2, margin, before):
     # A straight sheath holds the shaft without any load.
     near = 0.0 if margin > 0.0 or straight(entry) else _TOUCH
     impedance = numbers(word(model + word(table + GEOM_SOLIMP)) + 40 * geom1, 1)[0]
-    soft = impedance == SOFT and half > 0.0 and word(entry + 8) == LUMEN
-    law = (radius, near, soft, radius if impedance < _SLACK else 0.0)
+    soft = impedance == SOFT and word(entry + 8) == LUMEN
+    light = 0.0
+    if soft:
+        spring = numbers(word(model + word(table + GEOM_SOLREF)) + 16 * geom1, 1)[0]
+        light = _LIGHT / abs(spring)
+    law = (radius, near, soft, radius if impedance < _SLACK or soft else 0.0, light)
     if word(entry + MOTION_ENTRY) != 0 and motion_of(table, model, data) != 0:
         written = in_motion(
             table, model, data, contacts, geoms, entry, pose, half, closed, margin, law

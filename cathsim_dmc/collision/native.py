@@ -91,10 +91,10 @@ def contact_places() -> np.ndarray:
     """Where contacts and their constraints lie in memory, proved.
 
     Returns:
-        (10,) int64, bytes: in mjData of the number of contacts (int32), of their
-        address and that of the Jacobian; size of a contact, and in it its position,
-        frame, dimension, second geom and first constraint (int32 the last three), and
-        in mjData of the number of constraints.
+        (11,) int64, bytes: in mjData of the number of contacts (int32), of their
+        address and that of the Jacobian; size of a contact, which begins with its
+        depth, and in it its position, frame, dimension, second geom and first
+        constraint (int32 these three), `solimp` and `solref`.
 
     Raises:
         RuntimeError: if they do not lie where MuJoCo's own description says.
@@ -105,21 +105,23 @@ def contact_places() -> np.ndarray:
     places = _places("mjData")
     inner, size, _ = _lay(structs.STRUCTS["mjContact"].fields)
     names = ("ncon", "contact", "efc_J")
-    own = ("pos", "frame", "dim", "geom2", "efc_address")
+    own = ("pos", "frame", "dim", "geom2", "efc_address", "solimp", "solref")
     found = [places[name] for name in names]
-    found += [size, *(inner[name] for name in own), places["nefc"]]
+    found += [size, *(inner[name] for name in own)]
     count = ctypes.c_int32.from_address(data._address + places["ncon"]).value
     first = ctypes.c_int64.from_address(data._address + places["contact"]).value
     jacobian = ctypes.c_int64.from_address(data._address + places["efc_J"]).value
     contact = data.contact[0]
     read = [
+        ctypes.c_double.from_address(first).value,
+        *(ctypes.c_double * 5).from_address(first + inner["solimp"]),
+        *(ctypes.c_double * 2).from_address(first + inner["solref"]),
         *(ctypes.c_double * 3).from_address(first + inner["pos"]),
         *(ctypes.c_double * 9).from_address(first + inner["frame"]),
-        *(ctypes.c_int32.from_address(first + inner[n]).value for n in own[2:]),
-        ctypes.c_int32.from_address(data._address + places["nefc"]).value,
+        *(ctypes.c_int32.from_address(first + inner[n]).value for n in own[2:5]),
     ]
-    known = [*contact.pos, *contact.frame, contact.dim, contact.geom2]
-    known += [contact.efc_address, data.nefc]
+    known = [contact.dist, *contact.solimp, *contact.solref, *contact.pos]
+    known += [*contact.frame, contact.dim, contact.geom2, contact.efc_address]
     proved = read == known and jacobian == data.efc_J.ctypes.data and count == 1
     if not proved:
         raise RuntimeError(

@@ -33,8 +33,9 @@ from cathsim_dmc.compiled import compiled
     QVEL,
     CDOF,
     SUBTREE_COM,
-) = range(0, 192, 8)
-HEAD = 24  # words
+    GEOM_SOLREF,
+) = range(0, 200, 8)
+HEAD = 25  # words
 # An entry: key, kind, addresses of the place of the carrier's middle in the field's
 # frame, of head, coarse lattice, index and samples, and of the lattice of its motion.
 ENTRY, CAPACITY = 8, 1 << 14

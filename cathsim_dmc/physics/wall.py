@@ -12,9 +12,9 @@ a point load f by f / k, between two limits:
 at rest obeys f = K d(r)² r / ((1 - d(r)) Â), with K the stiffness of `solref`, d the
 impedance at a depth r, and Â the inverse weight of the link. Both are set for each link
 once a control step. The spring is linear to a quarter of `STIFFENING` and up to eleven
-times as stiff beyond; it obeys the rule of `entities.contact`, α(1 + m) < 2. A capsule
-touches a hollow wall with two planes, which share the spring. What is stiffer than the
-contact with the rigid wall has that contact's law.
+times as stiff beyond; it obeys the rule of `entities.contact`, α(1 + m) < 2. Two planes
+for one place of a hollow wall share the spring. What is stiffer than the contact with
+the rigid wall has that contact's law.
 """
 
 from __future__ import annotations
@@ -89,9 +89,11 @@ class Wall(Effect):
 
     def bind(self, world: World) -> None:
         """Finds the links in the model."""
-        from cathsim_dmc.physics import wall_loops  # late, as numba takes long
+        from cathsim_dmc.collision import carrying  # late, as numba takes long
+        from cathsim_dmc.physics import wall_loops
 
         super().bind(world)
+        carrying.install()
         self._contacts = wall_loops.contacts
         model, links = world.model, world.index.geoms
         self._geoms = links

@@ -5,7 +5,6 @@ import math
 from cathsim_dmc.compiled import compiled
 
 POISSON = 0.5
-PLANES = 2  # of a capsule at a hollow wall
 # Thickness of an artery over its radius, and the least: 1.4 and 1.0 mm at the ascending
 # and descending aorta (PMC3154923), 0.6 mm at a carotid.
 _RELATIVE, _THINNEST = 0.1, 0.6e-3
@@ -65,5 +64,5 @@ def contacts(geoms, radius, material, weight, rigid, laws, relaxation, solref, s
         solref[geom, 0], solref[geom, 1] = laws[0, 5], laws[0, 6]
         if soft:
             solref[geom, 0], solref[geom, 1] = reference(
-                found / PLANES, weight[n], first, last, relaxation
+                found, weight[n], first, last, relaxation
             )

@@ -153,8 +153,10 @@ def indentation(
         modulus: Pa; the wall is 1.5 mm thick.
         loads: (n,), N.
     """
+    from cathsim_dmc.collision import carrying
     from cathsim_dmc.physics.wall_loops import reference, stiffness
 
+    carrying.install()
     size, ball = 1e-3, kind == "sphere"
     spec = bare(tube(0.2, radius).lumen)
     geom = slider(
@@ -167,7 +169,7 @@ def indentation(
         priority=1,
     )
     model, number = spec.compile(), geom.id
-    spring = stiffness(radius, modulus, 1.5e-3, 1.0) / (1 if ball else 2)
+    spring = stiffness(radius, modulus, 1.5e-3, 1.0)
     weight = model.body_invweight0[1, 0]
     law = reference(spring, weight, *SOLIMP[:2], RELAXATION)
     model.geom_solref[number], model.geom_solimp[number] = law, SOLIMP
