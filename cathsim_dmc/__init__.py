@@ -8,6 +8,8 @@ __version__ = "0.2.0"
 # MuJoCo's window library warns at import on a machine without a screen. Nothing here
 # needs one before a viewer is asked for, which then says so itself.
 warnings.filterwarnings("ignore", message=".*DISPLAY environment variable is missing.*")
+# TorchRL 0.14 warns of classes of its own at import.
+warnings.filterwarnings("ignore", message=".*WeightUpdaterBase is deprecated.*")
 
 _SUBMODULES = (
     "agents",
