@@ -12,9 +12,7 @@ from cathsim_dmc.agents.checkpoint import Checkpoint, CheckpointError
 from cathsim_dmc.agents.config import ConfigError, TrainingConfig
 from cathsim_dmc.agents.demonstrations import record_demonstrations
 from cathsim_dmc.agents.evaluation import (
-    Comparison,
     EvaluationResult,
-    compare,
     evaluate,
 )
 from cathsim_dmc.agents.learners import LEARNERS, make_config
@@ -28,14 +26,12 @@ __all__ = [
     "LEARNERS",
     "Checkpoint",
     "CheckpointError",
-    "Comparison",
     "ConfigError",
     "EvaluationResult",
     "PPOConfig",
     "SACConfig",
     "TrainingConfig",
     "TrainingResult",
-    "compare",
     "evaluate",
     "load_policy",
     "make_config",

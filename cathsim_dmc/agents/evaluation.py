@@ -21,7 +21,7 @@ from cathsim_dmc.agents.episodes import EpisodeOutcome, EpisodeTracker
 from cathsim_dmc.agents.policies import PolicyLike, load_policy, task_and_options
 from cathsim_dmc.agents.views import view_of
 from cathsim_dmc.analysis.force_statistics import QUANTITIES, Statistics
-from cathsim_dmc.analysis.intervals import paired_bootstrap, success_interval
+from cathsim_dmc.analysis.intervals import success_interval
 from cathsim_dmc.policies import Policy
 from cathsim_dmc.simulation import environments
 from cathsim_dmc.simulation.episodes import play
@@ -161,66 +161,6 @@ class EvaluationResult:
             "summary": self.summary(),
             "episodes": episodes,
         }
-
-
-@dataclass(frozen=True)
-class Comparison:
-    """How much better one policy is than another on the same seeds.
-
-    Attributes:
-        policy: Name of the policy in question.
-        baseline: Name of the other one.
-        reward_difference: Mean over seeds of the difference of episode rewards.
-        reward_ci95: Bootstrap interval of that mean; None for a single seed.
-        success_difference: Difference of the success rates; None if unknown.
-        success_ci95: Bootstrap interval of that difference; None if unknown.
-        better: Whether the reward interval lies above zero.
-    """
-
-    policy: str
-    baseline: str
-    reward_difference: float
-    reward_ci95: tuple[float, float] | None
-    success_difference: float | None
-    success_ci95: tuple[float, float] | None
-    better: bool
-
-    def to_dict(self) -> dict[str, Any]:
-        """JSON-able values."""
-        return asdict(self)
-
-
-def compare(policy: EvaluationResult, baseline: EvaluationResult) -> Comparison:
-    """Compare two evaluations of the same task on the same seeds.
-
-    Raises:
-        ValueError: they are of different tasks or seeds.
-    """
-    here = (policy.task, policy.seeds)
-    there = (baseline.task, baseline.seeds)
-    if here != there:
-        one, other = ((task, seeds[0], len(seeds)) for task, seeds in (here, there))
-        raise ValueError(
-            f"only evaluations of the same (task, seed, episodes) can be compared: "
-            f"given are {one} and {other}."
-        )
-    reward, reward_ci = paired_bootstrap(
-        policy.values("reward"), baseline.values("reward")
-    )
-    success = success_ci = None
-    if policy.successes is not None and baseline.successes is not None:
-        success, success_ci = paired_bootstrap(
-            policy.values("success"), baseline.values("success")
-        )
-    return Comparison(
-        policy=policy.policy,
-        baseline=baseline.policy,
-        reward_difference=reward,
-        reward_ci95=reward_ci,
-        success_difference=success,
-        success_ci95=success_ci,
-        better=reward_ci is not None and reward_ci[0] > 0,
-    )
 
 
 def evaluate(

@@ -31,13 +31,11 @@ class EvaluationReport:
     Attributes:
         policy: Evaluation of the policy that was asked for.
         baseline: Evaluation of the random policy, or None.
-        comparison: Comparison of the two, or None.
         seconds: Wall time of both.
     """
 
     policy: evaluation.EvaluationResult
     baseline: evaluation.EvaluationResult | None
-    comparison: evaluation.Comparison | None
     seconds: float
 
     def to_dict(self) -> dict[str, Any]:
@@ -45,8 +43,6 @@ class EvaluationReport:
         values = {"policy": self.policy.to_dict(), "seconds": round(self.seconds, 1)}
         if self.baseline is not None:
             values["baseline"] = self.baseline.to_dict()
-        if self.comparison is not None:
-            values["comparison"] = self.comparison.to_dict()
         return values
 
     def print(self) -> None:
@@ -63,15 +59,6 @@ class EvaluationReport:
         for row in zip(_ROWS, *map(_cells, results), strict=True):
             table.add_row(*row)
         Console().print(table)
-        if self.comparison is not None:
-            interval = "one episode tells no interval"
-            if self.comparison.reward_ci95 is not None:
-                low, high = self.comparison.reward_ci95
-                interval = f"95 % interval {low:+.1f} to {high:+.1f}"
-            Console().print(
-                f"reward over {self.comparison.baseline}: "
-                f"{self.comparison.reward_difference:+.1f} ({interval})"
-            )
 
     def print_episodes(self) -> None:
         """Prints what was played and how each episode ended: task, model, outcome."""
@@ -240,7 +227,7 @@ def evaluate(
         num_threads=num_threads,
     )
     result = play(player, task, task_kwargs=options, observer=observe)
-    other = comparison = None
+    other = None
     if baseline and str(policy) != "random":
         other = play(
             "random",
@@ -248,8 +235,7 @@ def evaluate(
             task_kwargs=result.settings["task_kwargs"],
             observer=EvaluationProgress("random"),
         )
-        comparison = evaluation.compare(result, other)
-    report = EvaluationReport(result, other, comparison, time.monotonic() - began)
+    report = EvaluationReport(result, other, time.monotonic() - began)
     if out_dir is not None:
         evaluation.write_evaluation(out_dir, report.to_dict())
         contacts.draw(result, Path(out_dir) / "heatmap.png")
