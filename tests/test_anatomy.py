@@ -8,7 +8,7 @@ import pytest
 from cathsim_dmc import suite
 from cathsim_dmc.anatomy.anatomy import Anatomy
 from cathsim_dmc.anatomy.arch import arch
-from cathsim_dmc.anatomy.parts import Goal, Inlet, Surface
+from cathsim_dmc.anatomy.parts import Goal
 
 
 @pytest.fixture(scope="module")
@@ -33,10 +33,6 @@ def test_triangles_of_a_tree_are_built_when_they_are_asked_for():
 def test_names_and_shapes_are_checked(anatomy):
     with pytest.raises(ValueError, match="bca, lcca, lsa, descending"):
         anatomy.goal("renal")
-    with pytest.raises(ValueError, match="there are 3"):
-        Surface(np.zeros((3, 3)), [[0, 1, 3]])
-    with pytest.raises(ValueError, match="direction"):
-        Inlet("aorta", [0, 0, 0], [0, 0, 0], 0.01)
     with pytest.raises(ValueError, match="no vessel 'rca'"):
         Anatomy(
             "x",

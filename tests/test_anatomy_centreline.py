@@ -104,21 +104,6 @@ def test_slice_and_resample_keep_the_curve():
     assert steps.min() >= 0.95e-3
 
 
-@pytest.mark.parametrize(
-    ("points", "radii", "message"),
-    [
-        ([[0, 0, 0]], [1], "shape"),
-        ([[0, 0, 0], [0, 0, 1]], [1], "one radius"),
-        ([[0, 0, 0], [0, 0, 1]], [1, 0], "must be > 0"),
-        ([[0, 0, 0], [0, 0, 0]], [1, 1], "coincide"),
-        ([[0, 0, 0], [0, 0, np.nan]], [1, 1], "finite numbers"),
-    ],
-)
-def test_bad_centrelines_are_refused(points, radii, message):
-    with pytest.raises(ValueError, match=message):
-        Centreline(points, radii)
-
-
 def test_arrays_cannot_be_changed():
     with pytest.raises(ValueError, match="read-only"):
         straight().points[0, 0] = 1.0

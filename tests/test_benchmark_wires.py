@@ -102,49 +102,6 @@ def test_a_simulated_wire_is_found_again_from_another(folder, monkeypatch):
     assert lines[0].startswith("made, 1 (straight, arch): pushed 0.0")
 
 
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"wire": "bent"}, "wire of made, 1 is 'bent'; it must be"),
-        ({"centreline_mm": [[1, 2], [3, 4]]}, "centreline_mm of made, 1 has shape"),
-        ({"inserted_length_mm": 190.0}, "but its centreline is 68.0 mm long"),
-        ({"entry_direction": [0, 0, 0]}, "entry_direction of made, 1"),
-        ({"frame": None, "centreline_mm": [[200, y, 0] for y in range(99)]}, "outside"),
-        ({"tip_region": "LSA"}, "tip_region of made, 1 is 'LSA'; it must be"),
-        ({"recommended": "yes"}, "recommended of made, 1"),
-    ],
-)
-def test_rows_that_are_no_wires(folder, tmp_path, change, message):
-    path, marks, row, _ = folder
-    (tmp_path / MESH).write_bytes((path / MESH).read_bytes())
-    write(tmp_path, marks, row | change)
-    with pytest.raises(ValueError, match=message) as caught:
-        wires_data.read(tmp_path)
-    assert "\n" not in str(caught.value)
-
-
-def test_folders_that_are_no_bench(folder, tmp_path):
-    path, marks, row, _ = folder
-    with pytest.raises(
-        FileNotFoundError, match=r"no file .*phantom.stl; the folder has"
-    ):
-        bench.compare_wires(tmp_path)
-    (tmp_path / MESH).write_bytes((path / MESH).read_bytes())
-    (tmp_path / WIRES).write_text("{")
-    with pytest.raises(ValueError, match=r"wires.json is no JSON: Expecting"):
-        wires_data.read(tmp_path)
-    (tmp_path / WIRES).write_text("{}")
-    with pytest.raises(ValueError, match="has no 'landmarks'"):
-        wires_data.read(tmp_path)
-    lacking = {key: value for key, value in row.items() if key != "tip_region"}
-    write(tmp_path, marks, lacking)
-    with pytest.raises(ValueError, match="wire 0 of wires.json lacks tip_region"):
-        wires_data.read(tmp_path)
-    write(tmp_path, marks, row | {"recommended": False})
-    with pytest.raises(ValueError, match="recommends none of its 1 wires"):
-        bench.compare_wires(tmp_path)
-
-
 def test_wires_that_fold_back_are_told():
     angle = np.linspace(0.0, 1.2 * np.pi, 60)
     bow = 0.01 * np.stack([1 - np.cos(angle), np.sin(angle), 0 * angle], axis=1)

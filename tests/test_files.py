@@ -1,8 +1,5 @@
 """Files that appear whole or not at all, whoever writes or dies meanwhile."""
 
-import os
-import stat
-
 import numpy as np
 import pytest
 
@@ -68,17 +65,3 @@ def test_arrays_from_outside_run_nothing(tmp_path):
         path.write_bytes(data)
         with pytest.raises(ValueError):
             files.read_arrays(path)
-
-
-@pytest.mark.parametrize("umask", [0o022, 0o027, 0o077])
-def test_the_umask_decides_who_may_read(tmp_path, umask):
-    before = os.umask(umask)
-    try:
-        files.write_text(tmp_path / "a.json", "{}")
-        with files.atomic_path(tmp_path / "b.bin") as path:
-            path.write_bytes(b"1")
-    finally:
-        os.umask(before)
-    for name in ("a.json", "b.bin"):
-        mode = stat.S_IMODE((tmp_path / name).stat().st_mode)
-        assert mode == 0o666 & ~umask
