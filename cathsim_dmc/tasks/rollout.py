@@ -328,11 +328,6 @@ class Rollout:
         return self._cases[self._case_of[index]]
 
     @property
-    def case_of(self) -> np.ndarray:
-        """(N,) int, number of the case that each simulation has drawn."""
-        return self._case_of.copy()
-
-    @property
     def index(self) -> readings.ModelIndex:
         """Places of the task's quantities in the compiled model."""
         return self._index
