@@ -16,7 +16,7 @@ HARDEST = 5.0
 DEEPEST = 0.3e-3
 # The control step is then done again with steps so many times shorter; a power of two,
 # which divides exactly.
-REFINEMENT = 4
+REFINEMENT = 8
 
 
 @dataclasses.dataclass(frozen=True)
