@@ -1,4 +1,4 @@
-"""How figures look: one set of colours and of axes for all of them."""
+"""Style of all figures: one set of colours and axes."""
 
 from pathlib import Path
 from typing import Any

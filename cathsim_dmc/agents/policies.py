@@ -109,7 +109,7 @@ class TrainedPolicy(FunctionPolicy):
 
 
 def load_policy(policy: PolicyLike, seed: int = 0) -> Policy:
-    """A policy from whatever names one.
+    """A policy from its name, file, run or function.
 
     Args:
         policy: Name in `POLICIES`, "pretrained:NAME", file of a pretrained policy,
@@ -144,7 +144,7 @@ def _tensors(observation: Mapping[str, np.ndarray]) -> TensorDict:
 def task_and_options(
     policy: Policy, task: str | None, options: Mapping[str, Any] | None
 ) -> tuple[str, dict[str, Any]]:
-    """What a policy plays: a task, and its options over those of the training.
+    """Task of a policy, and its options over those of the training.
 
     Args:
         policy: Policy.

@@ -133,7 +133,7 @@ class PPOConfig(ActorCriticConfig):
         return self.steps_per_update
 
     def changed_for_resume(self, other: TrainingConfig) -> dict[str, tuple]:
-        """As in the base class; an annealed run may not change its length."""
+        """Settings that a resumed run may change; not the length of an annealed one."""
         changed = super().changed_for_resume(other)
         if self.anneal and self.total_frames != other.total_frames:
             changed["total_frames"] = (self.total_frames, other.total_frames)

@@ -120,12 +120,12 @@ class Anatomy:
 
     @cached_property
     def circulation(self) -> Circulation:
-        """How the inflow of blood is shared among the vessels."""
+        """Distribution of the inflow among the vessels."""
         return Circulation.of(self.tree, murray=self.scanned)
 
     @cached_property
     def motion(self) -> Motion:
-        """How heart and breathing move it."""
+        """Motion of the anatomy with heart and breathing."""
         return Motion.of(self.lumen.box, self.tree, self.ends, self.circulation)
 
     def depth(self, points: ArrayLike) -> Array:

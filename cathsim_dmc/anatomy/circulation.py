@@ -1,4 +1,4 @@
-"""How the inflow of an aorta is shared among its branches.
+"""Distribution of the aortic inflow among the branches.
 
 The heart is at the wider end of the root; every other free end of a vessel is an
 outlet. Arteries with a measured share have it together with all that branches off them;
@@ -28,7 +28,7 @@ _AT_END = 1e-6  # m
 
 
 class Course(NamedTuple):
-    """How blood goes through a vessel.
+    """Blood flow through a vessel.
 
     Attributes:
         begin: way from the heart to where blood enters the vessel, m.

@@ -1,4 +1,4 @@
-"""An anatomy as MJCF with convex wall pieces, and how well they stand for its lumen."""
+"""Export of an anatomy as MJCF with convex wall pieces, and its deviations."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _OFF = 0.3e-3  # m; farther from the wall a place of the surface is on an open e
 
 @dataclass(frozen=True)
 class Fidelity:
-    """How well convex pieces stand for a lumen.
+    """Deviations of convex pieces from a lumen.
 
     Attributes:
         intrusion: mean, 95th percentile and maximum of how far the pieces stand in the

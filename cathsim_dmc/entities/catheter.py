@@ -174,7 +174,7 @@ class Catheter(Chain):
 
     @property
     def hinges(self) -> tuple:
-        """Hinges that stand for the bending and torsion of the rod."""
+        """Hinges that represent the bending and torsion of the rod."""
         return (*self.bends, *self._twists)
 
     @property

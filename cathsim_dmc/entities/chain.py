@@ -333,7 +333,7 @@ class Chain(composer.Entity):
 
     @property
     def hinges(self) -> tuple:
-        """Hinges that stand for the bending and torsion of the rod."""
+        """Hinges that represent the bending and torsion of the rod."""
         return self.bends
 
     @property

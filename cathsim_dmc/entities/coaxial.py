@@ -1,4 +1,4 @@
-"""Coaxial devices: the properties of one chain that stands for all of them.
+"""Coaxial devices: the properties of the chain that represents them.
 
 Devices are numbered from the innermost outwards. The end of the chain is the farthest
 of their ends; device k ends `gap_k` before it. At a distance s from the end of the

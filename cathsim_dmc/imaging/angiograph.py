@@ -16,7 +16,7 @@ Planes = tuple[Fluoroscope, ...]
 
 @dataclass(frozen=True)
 class Deviation:
-    """How the machine of one simulation differs from the options.
+    """Deviation of one simulation's machine from the options.
 
     Attributes:
         primary: added to the primary angles, whole degrees.

@@ -1,4 +1,4 @@
-"""What a camera in the head of a device sees of the lumen, without OpenGL.
+"""View of a camera in the head of a device, without OpenGL.
 
 Each ray steps forward by the depth of the lumen's field, which no wall is nearer than,
 until it meets the wall (sphere tracing). The camera looks along +z of the head, with +x

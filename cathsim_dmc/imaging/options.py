@@ -38,7 +38,7 @@ View = str | Sequence[float]
 
 @dataclass(frozen=True)
 class FluoroscopyOptions:
-    """How the angiography suite is set up.
+    """Set-up of the angiography suite.
 
     Attributes:
         view: name of a view, or (primary, secondary) angle in degrees.

@@ -1,1 +1,1 @@
-"""What is simulated, and what acts on it in every control and physics step."""
+"""Simulated quantities, and the effects of every control and physics step."""

@@ -1,4 +1,4 @@
-"""What changes the simulation: forces, fields of the model, commands of the drives.
+"""Effects on the simulation: forces, fields of the model, commands of the drives.
 
 An effect is a small class, listed by a task: `suite.make_task(name, effects=[...])`.
 It restarts with each episode and acts once in a control step on the arrays of all

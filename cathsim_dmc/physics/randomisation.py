@@ -56,7 +56,7 @@ def start_displacement(
 
 @dataclasses.dataclass(frozen=True)
 class Randomisation:
-    """What is drawn at the start of an episode; None leaves it as it is.
+    """Quantities drawn at the start of an episode; None keeps the default.
 
     A range is `(low, high)` of a uniform distribution, or a composer Variation.
 

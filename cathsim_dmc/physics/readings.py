@@ -1,4 +1,4 @@
-"""What a task reads from the simulator, for one simulation or for many at once.
+"""Quantities that a task reads from the simulator, for one simulation or for many.
 
 A `ModelIndex` finds the quantities of a compiled model by name once. Its `reader` finds
 them in any object with MuJoCo's array names: an `mujoco.MjData`, with arrays such as

@@ -46,7 +46,7 @@ _TURN = MAX_ROTATION_SPEED * CONTROL_TIMESTEP
 
 @dataclasses.dataclass(frozen=True)
 class CoaxialSettings(pursuit.Settings):
-    """How the expert drives coaxial devices; `pursuit.Settings` has what is not here.
+    """Settings of the expert of coaxial devices, beside those of `pursuit.Settings`.
 
     Attributes:
         leads: by how much each device is ahead of the one around it in successive

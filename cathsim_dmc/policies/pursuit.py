@@ -33,7 +33,7 @@ from cathsim_dmc.tasks.route import Place, Route, RouteLike, along, locate
 
 @dataclasses.dataclass(frozen=True)
 class Settings(attempts.AttemptSettings):
-    """How the expert drives; `attempts.AttemptSettings` has when it gives up.
+    """Settings of the expert; `attempts.AttemptSettings` has when it gives up.
 
     None of the values is critical. The published tasks were solved without a retry
     with 0.5 to 1.6 times the gain or the speed, with 0.75 to 1.4 times the look-ahead,

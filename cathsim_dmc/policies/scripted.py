@@ -27,7 +27,7 @@ class _Scripted(Policy):
             self._action = np.zeros(shape)
 
     def act(self, observation: Any) -> np.ndarray:
-        """Actions (N, A), whatever is observed."""
+        """Actions (N, A), independent of the observation."""
         return self._action
 
 
@@ -37,7 +37,7 @@ class Random(_Scripted):
     name = "random"
 
     def act(self, observation: Any) -> np.ndarray:
-        """Actions (N, A), whatever is observed."""
+        """Actions (N, A), independent of the observation."""
         size = self._action.shape[1]
         return np.stack([g.uniform(-1, 1, size) for g in self._generators])
 

@@ -1,4 +1,4 @@
-"""How a recorded episode is laid out in the Rerun viewer."""
+"""Layout of a recorded episode in the Rerun viewer."""
 
 from __future__ import annotations
 

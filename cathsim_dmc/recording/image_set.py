@@ -38,7 +38,7 @@ Labels = dict[str, list[Any]]  # as `coco.labels` returns them
 
 @dataclasses.dataclass(frozen=True)
 class ImageSetOptions(SequenceOptions):
-    """What a data set holds.
+    """Content of a data set.
 
     Attributes:
         anatomies: number of random arches in train, val and test.
@@ -81,7 +81,7 @@ class _Shard:
 
 @dataclasses.dataclass(frozen=True)
 class Written:
-    """What a run has written.
+    """Result of a run.
 
     Attributes:
         path: of the data set.

@@ -61,7 +61,7 @@ Warp = tuple[np.ndarray, float]
 
 @dataclasses.dataclass(frozen=True)
 class SequenceOptions:
-    """What is recorded in each anatomy.
+    """Recordings in each anatomy.
 
     Attributes:
         sequences: number of motions.

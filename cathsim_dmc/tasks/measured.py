@@ -1,4 +1,4 @@
-"""What was measured after a control step."""
+"""Measurements after a control step."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from cathsim_dmc.tasks.objectives import straight
 
 
 class Measured(NamedTuple):
-    """What was measured of N simulations, arrays (N, ...).
+    """Measurements of N simulations, arrays (N, ...).
 
     Attributes:
         readings: State of the devices.

@@ -69,7 +69,7 @@ class PhysicsMonitor:
         centreline: np.ndarray,
         peak_force: np.ndarray,
     ) -> tuple[str | None, ...]:
-        """What went wrong in the control step that has just ended.
+        """Physics errors of the last control step.
 
         The first error of an episode is logged.
 

@@ -1,4 +1,4 @@
-"""Where device, sheath and robot stand in an anatomy, and where the goal is."""
+"""Placement of device, sheath and robot in an anatomy, and of the goal."""
 
 import dataclasses
 import math

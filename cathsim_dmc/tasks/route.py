@@ -83,7 +83,7 @@ def along(route: RouteLike, arc_length: np.ndarray) -> np.ndarray:
 
 @dataclasses.dataclass(frozen=True)
 class Place:
-    """Where a head is on a route.
+    """Place of a head on a route.
 
     Attributes:
         arc_length: (...), m.
@@ -130,7 +130,7 @@ def locate(route: RouteLike, head: np.ndarray, last: np.ndarray | None = None) -
 
 
 class Ahead(NamedTuple):
-    """What lies ahead of the tips of N simulations, in the frame of each tip.
+    """Route and lumen ahead of N tips, each in the frame of its tip.
 
     Its origin is the head, its z the direction of the head, its x and y the axes of
     the hinges of the last link.

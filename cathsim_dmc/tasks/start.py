@@ -37,7 +37,7 @@ _DEEPEST = 1.0e-3
 
 
 class StartPosture:
-    """Where the joints of the device are at the start of an episode.
+    """Joint positions of the device at the start of an episode.
 
     The device is laid along the centreline of the vessel and let go, with motors and
     base at rest: a bent elastic device comes to lie against the wall. This is done

@@ -91,7 +91,7 @@ class Checks(list[Check]):
 
 @dataclasses.dataclass(frozen=True)
 class Report:
-    """What one validation measured.
+    """Results of one validation.
 
     Attributes:
         title: of the validation.

@@ -52,7 +52,7 @@ SCRIPTS = (
 
 
 class Insertion(NamedTuple):
-    """What an insertion measured at T control steps."""
+    """Measurements of an insertion at T control steps."""
 
     head: np.ndarray  # (T, 3), m
     wall_force: np.ndarray  # (T,), sum of the magnitudes of all contacts, N
