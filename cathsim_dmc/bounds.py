@@ -81,12 +81,12 @@ def seed(name: str, value: Any) -> int:
     return whole(name, value, 0, MOST_SEED)
 
 
-def seeds(name: str, value: Any, count: int) -> list[int | list[int]]:
+def seeds(name: str, value: Any, count: int) -> list[int]:
     """One seed for each of `count` simulations.
 
     Args:
         value: Seed of the first simulation, from which the others count up, or one
-            seed for each. A seed is an integer, or a row of integers.
+            seed for each.
     """
     if _is_whole(value):
         last = whole(name, value, 0, MOST_SEED - count + 1) + count
@@ -98,14 +98,7 @@ def seeds(name: str, value: Any, count: int) -> list[int | list[int]]:
         raise ValueError(
             f"{len(each)} seeds for {count} simulations; give one each, or the first"
         )
-    taken = []
-    for one in each:
-        words = [one] if _is_whole(one) else _row(one)
-        if not words:
-            refuse(name, value, f"an integer, or {count} of them")
-        words = [seed(f"an entry of {name}", word) for word in words]
-        taken.append(words[0] if _is_whole(one) else words)
-    return taken
+    return [seed(f"an entry of {name}", one) for one in each]
 
 
 def indices(name: str, value: Any, count: int) -> np.ndarray:

@@ -191,7 +191,7 @@ def check(
     report = validate_anatomy({anatomy.name: anatomy}, figure)
     code = show(report, json)
     if not json:
-        print_measures(report.findings[anatomy.name])
+        print_json(report.findings[anatomy.name]["measures"])
     if figure is not None:
         print(f"three views: {figure}", file=sys.stderr)
     return code
@@ -240,22 +240,3 @@ def _loaded(phantom: str, access: str | None) -> "Anatomy":
         f"{phantom!r} is no named phantom, so its access is as built; named are "
         f"{', '.join(shipped.PHANTOMS)}"
     )
-
-
-def print_measures(findings: dict) -> None:
-    """Prints what an anatomy is like, a line for each of its parts."""
-    figures = dict(findings["measures"])
-    branches = figures.pop("branches")
-    diameters = figures.pop("diameters")
-    print(_line("arch", figures))
-    print(_line("diameters, mm", diameters))
-    for name, branch in branches.items():
-        print(_line(name, branch))
-
-
-def _line(name: str, figures: dict) -> str:
-    cells = (
-        f"{key} {value:.3g}" if isinstance(value, float) else f"{key} {value}"
-        for key, value in figures.items()
-    )
-    return f"{name}: {', '.join(cells)}"

@@ -101,7 +101,7 @@ class BatchSimulation:
         self._process = os.getpid()
         _ALIVE.add(self)
 
-    def seed(self, seeds: Sequence[int | Sequence[int]] | int) -> None:
+    def seed(self, seeds: Sequence[int] | int) -> None:
         """Gives each simulation its own source of randomness.
 
         Args:
