@@ -153,7 +153,7 @@ def mesh_file(vertices: np.ndarray, faces: np.ndarray | None = None) -> mjcf.Ass
     return mjcf.Asset(b"".join(part.tobytes() for part in parts), ".msh")
 
 
-def readmesh_file(data: bytes) -> tuple[np.ndarray, np.ndarray]:
+def read_mesh_file(data: bytes) -> tuple[np.ndarray, np.ndarray]:
     """Vertices (n, 3) float32, m, and faces (m, 3) of a mesh of a `Phantom`."""
     vertices, _, _, faces = np.frombuffer(data, "<i4", 4)
     points = np.frombuffer(data, "<f4", 3 * vertices, 16)

@@ -17,8 +17,9 @@ from cathsim_dmc.anatomy import measures, phantoms
 from cathsim_dmc.anatomy.arch import arch, sampler
 from cathsim_dmc.anatomy.surface import lumen_surface
 from cathsim_dmc.anatomy.surface_depth import SurfaceDepth
+from cathsim_dmc.entities.chain import MAX_PUSH_SPEED
 from cathsim_dmc.validation import views, wall
-from cathsim_dmc.validation.insertion import straight_push
+from cathsim_dmc.validation.insertion import Script, run
 
 ROOT = Path(__file__).parents[1]
 PAGE, IMAGES = ROOT / "anatomies.md", ROOT / "images"
@@ -123,6 +124,19 @@ def against_measured():
         )  # fmt: skip
     header = ["", "centreline, mean / p95 / max, mm", "inscribed radius, the same"]
     return table(header, rows)
+
+
+def straight_push(anatomy, goal):
+    """Pushes the device at full speed without steering it, 80 mm past the goal."""
+    duration = (anatomy.route(goal).length + 0.08) / MAX_PUSH_SPEED
+    script = Script("straight push", 1.0, (0.0, 0.0), duration)
+    pushed = run(script, anatomy=anatomy, goal=goal)
+    return {
+        "success": pushed.success,
+        "steps": len(pushed.head),
+        "mean_force": float(pushed.wall_force.mean()),
+        "peak_force": float(pushed.peak.max(initial=0.0)),
+    }
 
 
 def pushes(names):
