@@ -10,6 +10,7 @@ import numpy as np
 from scipy.integrate import solve_bvp
 from scipy.optimize import brentq
 
+from cathsim_dmc import suite
 from cathsim_dmc.anatomy import phantoms
 from cathsim_dmc.anatomy.anatomy import Anatomy
 from cathsim_dmc.entities import devices
@@ -17,6 +18,7 @@ from cathsim_dmc.entities.arena import BLOOD_DENSITY
 from cathsim_dmc.physics.blood import BLOOD_VISCOSITY, StillBlood
 from cathsim_dmc.physics.effects import userdata_size
 from cathsim_dmc.physics.wall import RELAXATION, SOLIMP
+from cathsim_dmc.simulation.batch import BatchSimulation
 from cathsim_dmc.validation import motion
 from cathsim_dmc.validation.checks import Checks, Report
 from cathsim_dmc.validation.damping import LINK, _uniform, drag, fill
@@ -182,6 +184,29 @@ def indentation(
     return np.array(depths)
 
 
+def stiffened(factor: float, steps: int = 50) -> float:
+    """Largest change of a joint's position in a push against a stiffer wall, rad.
+
+    Args:
+        factor: Of the modulus of an aorta.
+        steps: Control steps of the push.
+
+    Returns:
+        The difference from the rigid wall.
+    """
+    walls = "rigid", {"wall": {"modulus": factor * MODULI[0]}}
+    found = []
+    for vessel in walls:
+        batch = BatchSimulation(suite.make_task("simple1_bca", vessel=vessel), 1)
+        batch.reset()
+        action = np.zeros((1, batch.num_actions))
+        action[:, [0, -1]] = 1.0
+        for _ in range(steps):
+            batch.step(action)
+        found.append(batch.batch.qpos.copy())
+    return float(np.abs(found[0] - found[1]).max())
+
+
 def validate_vessel() -> Report:
     """Checks what `vessel` does to blood and wall."""
     from cathsim_dmc.physics.wall_loops import stiffness
@@ -211,5 +236,7 @@ def validate_vessel() -> Report:
         slope = np.ptp(loads) / np.ptp(indentation(kind, radius, modulus, loads))
         name = f"{kind} in a tube of {1e3 * radius:g} mm, {1e-6 * modulus:g} MPa"
         checks.deviation(name, slope, expected, SLOPE_BOUND, "N/m")
+    name = "joint positions after a push, wall of 1,000 times the modulus to rigid wall"
+    checks.at_most(name, stiffened(1000.0), 0.0, "rad")
     moving = motion.checks(tube(0.2, motion.RADIUS), phantoms.load("type1"))
     return Report("vessel", [*checks, *moving])

@@ -86,13 +86,15 @@ def costs(rounds: int = 2) -> dict:
     }
 
 
-def soak(episodes: int = 52, steps: int = 75, together: int = 13) -> dict:
-    """Random and pushing actions in living vessels with drawn options."""
+def soak(episodes: int = 52, steps: int = LONGEST, together: int = 13) -> dict:
+    """Random and pushing actions in living vessels with drawn options, past success."""
     found = {"episodes": 0, "steps": steps, "warnings": 0, "errors": 0, "force": 0.0}
     for number in range(episodes // together):
         task = SOAKED[number % len(SOAKED)]
         batch = BatchSimulation(
-            suite.make_task(task, vessel=DRAWN, observation="tracking"),
+            suite.make_task(
+                task, vessel=DRAWN, observation="tracking", max_steps=steps
+            ),
             together,
             num_threads=1,
             seeds=100 * number,
@@ -109,7 +111,7 @@ def soak(episodes: int = 52, steps: int = 75, together: int = 13) -> dict:
             found["errors"] += int(failed.sum())
             force = now.wall_force.peak_max[~ended].max(initial=0.0)
             found["force"] = max(found["force"], float(force))
-            ended |= now.terminated
+            ended |= failed
         found["warnings"] += int(np.asarray(batch.batch.warning).sum())
         found["episodes"] += together
     return found
