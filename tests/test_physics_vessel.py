@@ -175,6 +175,7 @@ def test_a_device_touches_a_living_wall_at_as_many_places_as_a_rigid_one(rigid, 
         ({"wall": {"modulus": 1.0}}, "vessel wall: modulus is 1.0.*10000 to 1e.09 Pa"),
         ({"wall": {"thickness": (0.0, 1.0)}}, "vessel wall: thickness.*0.005 m"),
         ({"wall": {"support": None}}, "vessel wall: support is None"),
+        ({"flow": {"rate": "fast"}}, "rate is 'fast'.*a finite number from 30"),
         ({"flow": {"rate": 500}}, "vessel flow: rate is 500.*30 to 200 1/min"),
         ({"flow": {"peak": (0.5, 9)}}, "vessel flow: peak.*0 to 2 m/s"),
         ({"flow": {"wave_speed": float("nan")}}, "wave_speed.*2 to 20 m/s"),
@@ -199,5 +200,5 @@ def test_what_cannot_flow_or_be_observed_is_refused():
     anatomy = dataclasses.replace(phantoms.load("simple1"), ends=())
     with pytest.raises(ValueError, match="leave flow out"):
         VesselOptions.make("living").check(anatomy)
-    with pytest.raises(ValueError, match="observation is 'vessel'; give one of"):
+    with pytest.raises(ValueError, match="'vessel' needs a living vessel"):
         suite.make_task("simple1_bca", observation="vessel")

@@ -20,7 +20,7 @@ def drawable(options: Any, limits: Mapping[str, tuple[float, float, str]]) -> No
     """
     for name, (low, high, unit) in limits.items():
         value = getattr(options, name)
-        if bounds.is_number(value):
+        if isinstance(value, str | float) or bounds.is_number(value):
             bounds.number(name, value, low, high, unit)
         elif value is not None or getattr(type(options), name) is not None:
             ends = bounds.interval(name, value, low, high, unit)

@@ -137,9 +137,12 @@ class ObservationTable(dict[str, ObservationKind]):
         ]
         unknown = [n for n in chosen if not isinstance(n, str) or n not in allowed]
         if unknown or not chosen or len(set(chosen)) < len(chosen):
+            needs = ("a living vessel (option vessel)", "coaxial devices")
+            known = [n for n in unknown if isinstance(n, str) and n in self]
+            hints = [f"{n!r} needs {needs[self[n].coaxial]}; " for n in known]
             raise ValueError(
-                f"observation is {names!r}; give one of {', '.join(allowed)}, "
-                "or a list of different ones"
+                f"observation is {names!r}; {''.join(hints)}give one of "
+                f"{', '.join(allowed)}, or a list of different ones"
             )
         joined = [n for name in chosen for n in self[name].joined if coaxial]
         return tuple(dict.fromkeys([*chosen, *joined]))
