@@ -18,6 +18,8 @@ ROOT = Path(__file__).parents[2]
 OF_THE_REPOSITORY = ("CONTRIBUTING.md", "CHANGELOG.md")
 # Pages that not every state of the repository has.
 OPTIONAL = ("results.md", "reliability.md", "imitation.md")
+# A table with this many columns takes the room of the page's table of contents.
+_WIDE = 5
 # A link out of docs/ and where it leads on the site.
 _LINK = re.compile(r"\]\((?:\.\./)*(docs/|examples/)?([\w./-]*)(#[\w-]*)?\)")
 
@@ -66,8 +68,11 @@ def _as_pages(entries):
 
 
 def on_page_markdown(markdown, page, config, files):
-    """Leads links out of docs/, and to notebooks, to the pages of the site."""
+    """Leads links out of docs/ to pages of the site; gives wide tables room."""
     del config, files
+    rows = re.findall(r"^\|[-|: ]+\|$", markdown, re.MULTILINE)
+    if any(row.count("|") - 1 >= _WIDE for row in rows):
+        page.meta.setdefault("hide", ["toc"])
     up = "../" * page.file.src_uri.count("/")
 
     def lead(match: re.Match) -> str:
