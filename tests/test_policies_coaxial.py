@@ -151,10 +151,22 @@ def test_what_is_for_one_device_is_refused_for_several():
     task = suite.make_task(TASK, random=0, observation="tracking")
     with pytest.raises(ValueError, match="coaxial_pursuit.CoaxialSettings"):
         Expert.for_task(task, pursuit.Settings())
+
+
+def test_the_teacher_reaches_the_goal_without_memory():
+    """It is told the last action and asked in every state as in the first."""
+    task = suite.make_task("femoral_type1_lcca_pair", random=0, observation="tracking")
     simulation = BatchSimulation(task, 1)
     simulation.reset()
-    with pytest.raises(ValueError, match=r"coaxial devices.*demonstrations"):
-        Teacher(policies.View(simulation)).reset(np.array([True]))
+    view, everyone = policies.View(simulation), np.ones(1, dtype=bool)
+    teacher, action = Teacher(view), np.zeros((1, 4))
+    teacher.reset(everyone)
+    for _ in range(200):
+        action = teacher.act(action)
+        step = simulation.step(action)
+        if step.terminated[0]:
+            break
+    assert step.info()["success"][0]
 
 
 @pytest.mark.slow

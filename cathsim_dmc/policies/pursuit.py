@@ -109,8 +109,7 @@ class Plan:
         if task.scene.coaxial:
             raise ValueError(
                 "this expert steers the tip of one device, and the task has coaxial "
-                "devices; their own expert remembers what it tries, so it answers no "
-                "questions on the way (dagger): learn from its demonstrations (bc)"
+                "devices: they have their own"
             )
         if not catheter.device.steerable:
             steerable = [d.name for d in devices.DEVICES.values() if d.steerable]

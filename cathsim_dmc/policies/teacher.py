@@ -1,22 +1,34 @@
 """The expert as a teacher: its actions in states that another policy reaches.
 
-The expert remembers its commands to the tip, to which every correction adds, and its
-retries. Neither fits the state that another policy has reached, and a learner does not
-observe retries. The teacher therefore takes the action that was carried out for its
-own and judges every state by itself: it withdraws outside the tube of the route and
-advances inside it. Both follow from the observation if that has the last action.
+The expert remembers its commands to a steerable tip, to which every correction adds,
+and its retries. Neither fits the state that another policy has reached, and a learner
+does not observe retries. The teacher therefore takes the action that was carried out
+for its own and judges every state by itself: it withdraws outside the tube of the route
+and advances inside it. Coaxial devices keep one lead and one look-ahead; without
+retries, the wire 20 mm ahead reaches the left common carotid of Type I, and does not
+reach the brachiocephalic artery of Type II. All follows from the observation if that
+has the last action.
 """
 
 from __future__ import annotations
 
 import dataclasses
+from typing import Any
 
 import numpy as np
 
-from cathsim_dmc.policies.pursuit import Plan, Settings, State, decide, locate
+from cathsim_dmc.policies import coaxial_pursuit
+from cathsim_dmc.policies.attempts import Attempts
+from cathsim_dmc.policies.coaxial_pursuit import CoaxialPlan, CoaxialSettings
+from cathsim_dmc.policies.expert import Expert
+from cathsim_dmc.policies.pursuit import Plan, Settings, State, decide
 from cathsim_dmc.policies.view import View
 from cathsim_dmc.tasks.cases import Case
 from cathsim_dmc.tasks.objective_pool import part
+from cathsim_dmc.tasks.route import locate
+
+# The lead and the look-ahead that need no retry.
+_COAXIAL = CoaxialSettings(leads=(0.02,), offsets=(0.0,), lookahead_factors=(1.4,))
 
 
 class Teacher:
@@ -25,8 +37,7 @@ class Teacher:
     def __init__(self, view: View):
         """Looks at simulations; `reset` comes before the first question."""
         self._view = view
-        self._settings = Settings()
-        self._plans: dict[Case, Plan] = {}
+        self._plans: dict[Case, Plan | CoaxialPlan] = {}
         self._cases: list[Case | None] = [None] * view.num_simulations
         self._insertion = np.full(view.num_simulations, np.nan)
 
@@ -37,12 +48,12 @@ class Teacher:
             which: (N,) bool.
 
         Raises:
-            ValueError: the task's device cannot be steered.
+            ValueError: the task's device can neither be steered nor turned.
         """
         for index in np.flatnonzero(which).tolist():
             case = self._view.case(index)
             if case not in self._plans:
-                self._plans[case] = Plan.for_task(case)
+                self._plans[case] = Expert.for_task(case).plan
             self._cases[index] = case
         self._insertion[which] = np.nan
 
@@ -56,25 +67,41 @@ class Teacher:
         Returns:
             (N, A) in [-1, 1].
         """
-        readings, wall_force = self._view.resting, self._view.wall_force
         action = np.empty((self._view.num_simulations, self._view.num_actions))
         for case, plan in self._plans.items():
             rows = np.array([i for i, one in enumerate(self._cases) if one is case])
-            if not len(rows):
-                continue
-            mine = part(readings, rows)
-            fresh = State.fresh((len(rows),), len(plan.tip))
-            told = last_action[rows, : plan.tip.size] * plan.steering_angle
-            outside = locate(plan, mine.head).excess > self._settings.tolerance
-            state = dataclasses.replace(
-                fresh,
-                bend=told.reshape(fresh.bend.shape),
-                insertion=self._insertion[rows],
-                retracting=outside,
-                turn=np.full(len(rows), np.inf),
+            if len(rows):
+                action[rows] = self._decided(plan, rows, last_action[rows])
+        self._insertion = np.array(self._view.resting.insertion)
+        return action
+
+    def _decided(
+        self, plan: Plan | CoaxialPlan, rows: np.ndarray, last_action: np.ndarray
+    ) -> np.ndarray:
+        """Actions of the simulations (rows,) that share a plan."""
+        view, shape = self._view, (len(rows),)
+        readings, force = part(view.resting, rows), part(view.wall_force, rows)
+        coaxial = isinstance(plan, CoaxialPlan)
+        settings = _COAXIAL if coaxial else Settings()
+        fresh = Attempts.none(shape) if coaxial else State.fresh(shape, len(plan.tip))
+        state: Any = dataclasses.replace(
+            fresh,
+            retracting=locate(plan, readings.head).excess > settings.tolerance,
+            turn=np.full(shape, np.inf),
+            held=np.array(readings.insertion),
+        )
+        if coaxial:
+            assert view.devices is not None
+            own = part(view.devices, rows)
+            action, _ = coaxial_pursuit.decide(
+                plan, settings, state, readings, own, force
             )
-            action[rows], _ = decide(
-                plan, self._settings, state, mine, part(wall_force, rows)
-            )
-        self._insertion = np.array(readings.insertion)
+            return action
+        told = last_action[:, : plan.tip.size] * plan.steering_angle
+        state = dataclasses.replace(
+            state,
+            bend=told.reshape(state.bend.shape),
+            insertion=self._insertion[rows],
+        )
+        action, _ = decide(plan, settings, state, readings, force)
         return action
