@@ -74,5 +74,4 @@ def test_loading_stepping_training_evaluating_and_recording_need_no_network(tmp_
     )
     done = python(code, tmp_path)
     assert done.returncode == 0, done.stderr
-    assert "is deprecated" not in done.stderr  # what libraries say of themselves
     assert (tmp_path / "a.rrd").stat().st_size > 10_000

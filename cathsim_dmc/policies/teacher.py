@@ -82,7 +82,7 @@ class Teacher:
         view, shape = self._view, (len(rows),)
         readings, force = part(view.resting, rows), part(view.wall_force, rows)
         coaxial = isinstance(plan, CoaxialPlan)
-        settings = _COAXIAL if coaxial else Settings()
+        settings: Any = _COAXIAL if coaxial else Settings()
         fresh = Attempts.none(shape) if coaxial else State.fresh(shape, len(plan.tip))
         state: Any = dataclasses.replace(
             fresh,
