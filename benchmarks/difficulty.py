@@ -196,11 +196,7 @@ def playable() -> tuple[str, ...]:
 
 
 def tasks() -> tuple[str, ...]:
-    """Those of them that are played by default, of a steerable device.
-
-    Tasks of coaxial devices are played when they are named: a straight push, by which
-    a steerable device shows that a task asks for steering, says little of them.
-    """
+    """Tasks that are played by default; those of coaxial devices only when named."""
     return tuple(
         name for name in playable() if "devices" not in suite.TASKS[name].options
     )

@@ -134,6 +134,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("out", type=Path, help="JSON lines, one per case; resumed")
     parser.add_argument("--only", default="", help="part of a case's name")
+    parser.add_argument(
+        "--seed", type=int, default=import_cases.SEED, help="of the first case"
+    )
     parser.add_argument("--part", default="0/1", help="k/n: every n-th case from k on")
     options = parser.parse_args()
     rows = []
@@ -141,7 +144,7 @@ def main() -> None:
         rows = [json.loads(line) for line in options.out.read_text().splitlines()]
     done = {row["case"] for row in rows}
     first, step = map(int, options.part.split("/"))
-    chosen = [c for c in import_cases.cases() if options.only in c.name]
+    chosen = [c for c in import_cases.cases(options.seed) if options.only in c.name]
     for case in chosen[first::step]:
         if case.name in done:
             continue

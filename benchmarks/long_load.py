@@ -3,8 +3,7 @@
     python benchmarks/long_load.py --steps 1000000 --out runs/long-load.json
 
 A control step is one of one simulation: 16 simulations make 16 of them at once. At the
-end the same steps, bit for bit, are timed here and in a fresh process in turns, so that
-neither a machine that has become slower meanwhile nor other contacts are a finding.
+end the same steps are timed here and in a fresh process, in alternation.
 Exit code 1: a bound was broken.
 
 Bounds: memory grows by less than 20 MB after the warm-up; the speed at the end is at

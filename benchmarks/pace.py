@@ -1,10 +1,10 @@
 """Speed of the simulator on one core, and its checks.
 
-Real-time factor: simulated seconds per CPU second of this process, one thread. It says
-as much about the machine as about the program, so what the checks bound is the
-calibrated speed: the real-time factor times the microseconds of one `mj_step` of
-dm_control's humanoid, both timed in turns. Every figure is the median of repeated runs
-after a warm-up. `speed.py` measures more: threads, images, stages, memory.
+Real-time factor: simulated seconds per CPU second of this process, one thread. It
+depends on the machine, so the checks bound the calibrated speed: the real-time factor
+times the microseconds of one `mj_step` of dm_control's humanoid, timed in alternation.
+Every figure is the median of repeated runs after a warm-up. `speed.py` measures more:
+threads, images, stages, memory.
 """
 
 import dataclasses

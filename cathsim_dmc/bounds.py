@@ -4,8 +4,7 @@ Every function returns the value as plain Python, or raises a ValueError that na
 field, what was given and what is allowed.
 """
 
-from __future__ import annotations
-
+import dataclasses
 import math
 import numbers
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -234,6 +233,24 @@ def mapping(name: str, value: Any, known: Iterable[str]) -> Mapping[str, Any]:
     if not isinstance(value, Mapping) or set(value) - set(known):
         refuse(name, value, f"a mapping with some of {', '.join(known)}")
     return value
+
+
+def made(name: str, value: Any, kind: type, others: str = "") -> Any:
+    """A dataclass from a mapping of its fields; an object of it is taken as it is.
+
+    Args:
+        others: What else is allowed, for the message.
+    """
+    if isinstance(value, kind):
+        return value
+    known = [field.name for field in dataclasses.fields(kind)]
+    if others and not isinstance(value, Mapping):
+        refuse(name, value, f"{others}some of {', '.join(known)}")
+    mapping(name, value, known)
+    try:
+        return kind(**value)
+    except ValueError as error:
+        raise ValueError(f"{name}: {error}") from error
 
 
 def options(name: str, value: Any) -> dict[str, Any]:

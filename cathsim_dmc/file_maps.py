@@ -4,8 +4,6 @@
 often has 1,024; these maps keep none.
 """
 
-from __future__ import annotations
-
 import ctypes
 import functools
 import mmap

@@ -349,7 +349,7 @@ def _register_plain() -> None:
 def _register_coaxial() -> None:
     """Variants of each task: a guidewire, and a guidewire in a catheter."""
     for name, definition in list(TASKS.items()):
-        for suffix, (chosen, words) in _COAXIAL.items():
+        for suffix, (chosen, words) in COAXIAL.items():
             register(
                 f"{name}_{suffix}",
                 dataclasses.replace(
@@ -362,7 +362,7 @@ def _register_coaxial() -> None:
 
 
 # Devices of the tasks with that suffix, from the innermost outwards.
-_COAXIAL = {
+COAXIAL = {
     "wire": (("wire_035_glide",), "with a guidewire that is pushed and turned"),
     "pair": (
         ("wire_035_glide", "berenstein_5f"),

@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from cathsim_dmc.anatomy.parts import Surface
 from cathsim_dmc.recording.episode import Episode
 
 
@@ -39,7 +40,7 @@ def make_episode(steps=6, links=4, actions=21, seed=0, counts=None, **changes):
 
 
 def make_tube(radius=0.02, length=0.08, sides=12, rings=5):
-    """An open tube along z about the origin: vertices (V, 3), faces (F, 3)."""
+    """Surface of an open tube along z about the origin."""
     angle = np.linspace(0, 2 * np.pi, sides, endpoint=False)
     ring = radius * np.stack([np.cos(angle), np.sin(angle)], axis=1)
     height = np.linspace(-length / 2, length / 2, rings)
@@ -51,4 +52,4 @@ def make_tube(radius=0.02, length=0.08, sides=12, rings=5):
     faces = np.concatenate(
         [np.stack([a, b, b + sides], 1), np.stack([a, b + sides, a + sides], 1)]
     )
-    return vertices, faces
+    return Surface(vertices, faces)

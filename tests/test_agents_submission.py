@@ -49,6 +49,8 @@ def test_a_submission_holds_hashes_and_every_episode(played, script, tmp_path):
     path = tmp_path / "sub" / "one.json"
     submission.submit(name, path, "type1_lcca")
     found = script.read(path)
+    lines = len(path.read_text().splitlines())
+    assert lines == 100 + len(found) + 3  # a line for each episode and entry
     card = json.loads(pretrained.pretrained_path(name).with_suffix(".json").read_text())
     assert found["policy_sha256"] == card["sha256"]
     assert found["package"] == __version__ and found["commit"]

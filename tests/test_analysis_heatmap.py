@@ -5,7 +5,6 @@ from hypothesis import strategies as st
 from recording_samples import make_tube
 
 from cathsim_dmc.analysis.heatmap import force_map, heatmap
-from cathsim_dmc.anatomy import Surface
 
 
 @given(seed=st.integers(0, 2**31), count=st.integers(0, 60))
@@ -39,7 +38,7 @@ def test_a_contact_lies_in_the_cell_that_its_edges_say():
 def test_the_picture_shows_contacts_where_they_are(tmp_path):
     from matplotlib.image import imread
 
-    tube, path = Surface(*make_tube()), tmp_path / "map.png"
+    tube, path = make_tube(), tmp_path / "map.png"
     assert heatmap(np.zeros((0, 3)), np.zeros(0), tube, path).count.sum() == 0
     pictures = []
     for place in ([0.01, 0.0, 0.02], [-0.01, 0.0, 0.01]):

@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 
 from cathsim_dmc import suite
+from cathsim_dmc.anatomy import phantoms
 from cathsim_dmc.anatomy.anatomy import Anatomy
-from cathsim_dmc.anatomy.arch import arch
 from cathsim_dmc.anatomy.parts import Goal
 
 
 @pytest.fixture(scope="module")
 def anatomy():
-    return arch.load("simple1")
+    return phantoms.load("simple1")
 
 
 def test_route_starts_at_the_inlet_and_ends_at_the_goal(anatomy):

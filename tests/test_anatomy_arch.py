@@ -6,13 +6,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from cathsim_dmc.anatomy import measures
+from cathsim_dmc.anatomy import measures, phantoms
 from cathsim_dmc.anatomy.arch import arch
 from cathsim_dmc.anatomy.arch.tree import arch_tree
 
 
 def test_type_one_has_the_published_figures():
-    anatomy = arch.load("simple1")
+    anatomy = phantoms.load("simple1")
     plane = arch.TYPE_I.plane_rotation
     along = np.array([math.sin(plane), math.cos(plane), 0.0])
     vertices = anatomy.surface.vertices
@@ -92,19 +92,8 @@ def test_branches_that_cross_are_refused():
         arch_tree(replace(arch.TYPE_II, lcca=leaning, bca=upright))
 
 
-def test_unknown_names_list_the_known():
-    with pytest.raises(ValueError, match="simple1, simple2, type3, bovine"):
-        arch.load("type9")
-    with pytest.raises(ValueError, match="ascending, descending"):
-        arch.load("simple1", access="radial")
-
-
-def test_equal_parameters_give_one_anatomy():
-    assert arch.load("simple1") is arch.load("simple1")
-
-
 def test_femoral_access_enters_the_descending_aorta():
-    anatomy = arch.load("simple2", access="descending")
+    anatomy = phantoms.load("simple2", access="descending")
     aorta = anatomy.tree.vessel("aorta").centreline
     np.testing.assert_allclose(anatomy.inlet.position, aorta.points[-1])
     np.testing.assert_allclose(anatomy.inlet.direction, [0, 0, 1], atol=1e-9)

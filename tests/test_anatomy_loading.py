@@ -7,13 +7,13 @@ import json
 import numpy as np
 import pytest
 
+from cathsim_dmc.anatomy import phantoms
 from cathsim_dmc.anatomy.anatomy import Anatomy
-from cathsim_dmc.anatomy.arch import arch
 
 
 @pytest.fixture(scope="module")
 def anatomy():
-    return arch.load("simple1")
+    return phantoms.load("simple1")
 
 
 @pytest.fixture(scope="module")
@@ -117,7 +117,7 @@ def test_round_trip(anatomy, saved):
 
 def test_saving_again_replaces_the_file(anatomy, tmp_path):
     anatomy.save(tmp_path)
-    arch.load("simple2").save(tmp_path)
+    phantoms.load("simple2").save(tmp_path)
     assert len(list(tmp_path.iterdir())) == 1
     assert Anatomy.load(tmp_path).name == "simple2"
 

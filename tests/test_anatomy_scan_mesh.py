@@ -14,7 +14,12 @@ from cathsim_dmc.anatomy.parts import Surface
 from cathsim_dmc.anatomy.scan.lumen import read_lumen
 from cathsim_dmc.anatomy.scan.mesh import read_triangles
 from cathsim_dmc.anatomy.scan.repair import mend
-from cathsim_dmc.anatomy.scan.topology import decimated, edge_counts, handles
+from cathsim_dmc.anatomy.scan.topology import (
+    decimated,
+    edge_counts,
+    handles,
+    without_slivers,
+)
 from cathsim_dmc.anatomy.scan.units import upright
 
 DATA = Path(__file__).parent / "data"
@@ -147,6 +152,14 @@ def test_holes_flips_slivers_and_small_parts_are_mended(y_mesh, tmp_path):
     assert_closed(lumen)
     for text in ("flipped", "holes filled", "small parts", "without area"):
         assert said(lumen, text), text
+
+
+def test_a_triangle_without_area_beside_a_corner_of_three_opens_no_hole():
+    """Its flip would give an edge to four triangles."""
+    vertices = 1e-3 * np.array([[0, 0, 0], [4, 0, 0], [2, 0, 0], [1, 3, 0.0]])
+    faces = np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [2, 3, 1]])
+    left, _ = without_slivers(vertices, faces)
+    assert set(edge_counts(left)[1]) == {2}
 
 
 def test_open_ends_are_capped(y_mesh, tmp_path):

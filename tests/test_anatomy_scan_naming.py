@@ -206,10 +206,24 @@ def test_a_vertebral_artery_of_its_own_and_an_aberrant_subclavian(bend):
 def test_a_wide_fourth_branch_is_hardly_one_without_a_name(bend, first):
     """But the first one is asked for if it is as wide as a brachiocephalic artery."""
     radii = (first, 4.0, 5.0, 3.8)
-    straight = [(r, (r, [(20 * k - 20, 0, 110)])) for k, r in enumerate(radii)]
-    names = named(bend, *straight)[0]
-    sure = ["rcca", "lcca", "lsa", "rsa"]
-    assert names == (["branch_1", "lcca", "lsa", "branch_2"] if first == 6.0 else sure)
+    ways = [(20 * k - 20, (25 if first < 6.0 else 0) * (k == 3), 110) for k in range(4)]
+    names = named(bend, *((r, (r, [w])) for r, w in zip(radii, ways, strict=True)))[0]
+    if first < 6.0:
+        assert names == ["rcca", "lcca", "lsa", "rsa"]
+    else:
+        assert names[0] == "branch_1" and names[3].startswith("branch_")
+
+
+def test_an_aberrant_subclavian_artery_leads_to_the_right_and_back(bend):
+    """A fourth branch in the plane of the arch, or to the left, is asked for."""
+    radii = (4.2, 3.8, 3.4, 4.2)
+
+    def led(y):
+        ends = [(20 * k - 20, y * (k == 3), 90) for k in range(4)]
+        return named(bend, *((r, (r, [x])) for r, x in zip(radii, ends, strict=True)))
+
+    assert led(40)[0] == ["rcca", "lcca", "lsa", "rsa"]
+    assert "rsa" not in led(-10)[0] and "question" in led(-10)[1]
 
 
 def test_without_knowing_the_heart_no_name_is_sure(bend):

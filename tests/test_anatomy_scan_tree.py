@@ -11,9 +11,12 @@ from synthetic_scans import marched, write_markup, write_obj, y_tree
 from cathsim_dmc.anatomy import phantoms
 from cathsim_dmc.anatomy.anatomy import Anatomy
 from cathsim_dmc.anatomy.centreline import Centreline, Vessel, VesselTree
-from cathsim_dmc.anatomy.parts import Goal
+from cathsim_dmc.anatomy.parts import Goal, Surface
 from cathsim_dmc.anatomy.scan.check import check_tree
 from cathsim_dmc.anatomy.scan.importer import import_scan
+from cathsim_dmc.anatomy.scan.tree import grow_tree
+from cathsim_dmc.anatomy.scan.ways import Ways
+from cathsim_dmc.anatomy.surface_depth import SurfaceDepth
 
 
 def tube(points, radii):
@@ -114,7 +117,12 @@ def test_a_turned_scan_gets_the_same_names(arch_scan, tmp_path):
 
 
 @pytest.mark.slow
-def test_names_can_be_changed(arch_scan):
+def test_heart_unit_and_names_can_be_given(arch_scan):
+    heart, names = (-35.0, 0.0, 75.0), {"lcca": "left"}
+    anatomy = import_scan(arch_scan[0], heart=heart, units="mm", rename=names)
+    assert "left" in anatomy.goals and anatomy.inlet.position[0] > 0.03
+    with pytest.raises(ValueError, match="its heart is at the other end"):
+        import_scan(arch_scan[0], heart=(35.0, 0.0, 0.0))
     with pytest.raises(ValueError, match="no vessel 'rva' to rename; there are"):
         import_scan(arch_scan[0], rename={"rva": "x"})
 
@@ -248,6 +256,28 @@ def changed(anatomy: Anatomy, tree=None, goals=None) -> Anatomy:
     )
 
 
+def test_a_named_carotid_keeps_what_it_shares_with_a_nameless_branch():
+    fork = (26, 0, 55)
+    vessels = {
+        "aorta": Vessel("aorta", tube([(0, 0, 0), (0, 0, 80)], [6, 6])),
+        "stem": Vessel("stem", tube([(0, 0, 40), fork], [4, 4]), "aorta", 7e-3),
+        "wide": Vessel("wide", tube([fork, (50, 0, 80)], [4, 3.5]), "stem", 5e-3),
+        "thin": Vessel("thin", tube([fork, (54, 0, 48)], [4, 2.5]), "stem", 5e-3),
+    }
+    vertices, faces = marched(VesselTree(vessels))
+    field = SurfaceDepth(Surface(vertices * 1e-3, faces))
+    ways = Ways(field)
+    ends = {k: vessels[k].centreline.points[-1] for k in ("aorta", "wide", "thin")}
+    inlet = np.zeros(3)
+    before = ways.deepest_from(ways.node(inlet))
+    way = {k: ways.points[ways.trace(before, ways.node(p))] for k, p in ends.items()}
+    for drawn, stem in ((False, "lcca"), (True, "branch_1")):
+        curves = {"branch_1": way["wide"], "lcca": way["thin"]}
+        tree = grow_tree(field, ways, curves, inlet, ends["aorta"], "aorta", drawn)
+        (other,) = set(curves) - {stem}
+        assert (tree.vessel(stem).parent, tree.vessel(other).parent) == ("aorta", stem)
+
+
 def test_the_proof_finds_each_fault(computed):
     """What `check_tree` is to find, planted in a tree that passes."""
     good, _ = computed
@@ -296,6 +326,17 @@ def test_the_proof_finds_each_fault(computed):
         order[new] = Vessel(new, vessels[old].centreline, "aorta", vessels[old].ostium)
     found = failed(changed(good, VesselTree(order), {}))
     assert "in this order" in found["branches of the arch on their sides"]
+    # Neighbours that leave together, as in a bovine arch, have no order.
+    trunk = vessels["bca"].centreline
+    wrong_way = (
+        vessels["bca"].centreline.points[0] - vessels["lcca"].centreline.points[0]
+    )
+    points = trunk.points + 1e-3 * wrong_way / np.linalg.norm(wrong_way)
+    together = Vessel(
+        "lcca", replace(trunk, points=points), "aorta", vessels["bca"].ostium
+    )
+    found = failed(changed(good, VesselTree({**vessels, "lcca": together}), {}))
+    assert "branches of the arch on their sides" not in found
     # A goal that lies in another vessel.
     goal = good.goals["lsa"]
     wrong = Goal("lcca", "lcca", goal.position, good.goals["lcca"].arc_length)
@@ -329,9 +370,9 @@ def test_the_surface_of_a_phantom_is_a_scan(tmp_path):
 
 @pytest.mark.slow
 def test_generated_arches_are_proved_too():
-    from cathsim_dmc.anatomy.arch import arch
+    from cathsim_dmc.anatomy import phantoms
 
-    found = failed(arch.load("simple1"))
+    found = failed(phantoms.load("simple1"))
     assert found.keys() <= {"start of the device"}
 
 

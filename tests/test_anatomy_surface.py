@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from cathsim_dmc.anatomy import lattice, surface
-from cathsim_dmc.anatomy.arch import arch
+from cathsim_dmc.anatomy import lattice, phantoms, surface
 from cathsim_dmc.anatomy.centreline import Centreline, Vessel, VesselTree
 from cathsim_dmc.anatomy.scan import topology
 from cathsim_dmc.anatomy.tree_depth import TreeDepth
@@ -17,7 +16,7 @@ def cylinder(radius=0.01, length=0.1):
 
 @pytest.mark.parametrize("name", ["simple1", "bovine"])
 def test_surface_is_closed_points_outwards_and_follows_the_lumen(name):
-    anatomy = arch.load(name)
+    anatomy = phantoms.load(name)
     found = anatomy.surface
     assert len(found.faces) <= 30_000
     faces = found.faces.astype(np.int64)

@@ -252,10 +252,11 @@ def test_importing_the_suite_is_all_dm_control_needs_and_is_light():
 
 
 def test_imports_leave_the_environment_as_it_is():
-    """Agents load torchrl before dm_control; what libraries set is theirs."""
+    """`cathsim eval` and agents load torchrl before dm_control."""
     done = run(
         "import os, sys\n"
-        "import cathsim_dmc.agents\n"
+        "from cathsim_dmc.cli.agents import evaluation\n"
+        "evaluation(['eval'])\n"
         "loaded = list(sys.modules)\n"
         "assert loaded.index('torchrl') < loaded.index('dm_control')\n"
         "import rerun, tyro\n"

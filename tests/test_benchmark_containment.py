@@ -6,14 +6,14 @@ from containment import Containment, points_along
 from hypothesis import given
 from hypothesis import strategies as st
 
-from cathsim_dmc.anatomy.arch import arch
+from cathsim_dmc.anatomy import phantoms
 
 RADIUS, BORE = 0.8e-3, 1.15e-3
 
 
 @pytest.fixture(scope="module")
 def containment():
-    anatomy = arch.load("simple1")
+    anatomy = phantoms.load("simple1")
     assert np.allclose(anatomy.inlet.direction, [0, 0, 1])
     return Containment(anatomy, RADIUS, BORE, np.array([0.0, 0.0, 1.0]))
 

@@ -15,7 +15,7 @@ from cathsim_dmc import __version__, suite
 from cathsim_dmc.agents import LEARNERS, Checkpoint, report
 from cathsim_dmc.agents.checkpoint import checkpoints_in
 from cathsim_dmc.agents.policies import FunctionPolicy
-from cathsim_dmc.anatomy.arch import arch
+from cathsim_dmc.anatomy import phantoms
 from cathsim_dmc.anatomy.parts import Surface
 from cathsim_dmc.cli import installation, task_options
 
@@ -28,11 +28,12 @@ def only_json(text):
 # What works.
 
 
-def test_list_shows_every_task_with_a_line(cathsim):
+def test_list_shows_every_task_with_a_line_and_variants_once(cathsim):
     code, out, err = cathsim("list")
     assert code == 0 and not err
-    for name in (*TASKS, "navigate"):
+    for name in (*(n for n in TASKS if not n.endswith(("_wire", "_pair"))), "navigate"):
         assert name in out
+    assert out.count("_pair") == out.count("_wire") == 1
     assert "brachiocephalic" in out
 
 
@@ -76,7 +77,7 @@ def test_check_prints_one_object_and_passes(cathsim):
 @pytest.mark.slow
 def test_a_failed_check_exits_with_one(cathsim, tmp_path):
     """An arch that has lost a triangle of its surface has edges without two."""
-    whole = arch.load("simple1")
+    whole = phantoms.load("simple1")
     surface = Surface(whole.surface.vertices, whole.surface.faces[1:])
     dataclasses.replace(whole, name="torn", surface=surface).save(tmp_path)
     code, out, _ = cathsim("phantom", "check", tmp_path, "--json")

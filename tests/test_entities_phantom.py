@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from dm_control import mjcf
 
-from cathsim_dmc.anatomy.arch import arch
+from cathsim_dmc.anatomy import phantoms
 from cathsim_dmc.entities import contact
 from cathsim_dmc.entities.arena import BLOOD_DENSITY, GRAVITY, AngiographyArena
 from cathsim_dmc.entities.phantom import Phantom
@@ -185,7 +185,7 @@ def test_goals_are_where_the_anatomy_puts_them(environment):
 @pytest.mark.parametrize("friction", [-0.1, 2.5, math.nan])
 def test_friction_outside_its_range(friction):
     with pytest.raises(ValueError, match="friction is .* between 0 and 2"):
-        Phantom(arch.load("simple1"), friction)
+        Phantom(phantoms.load("simple1"), friction)
 
 
 # Names.

@@ -12,7 +12,7 @@ from cathsim_dmc.entities.robot import (
     JOINTS,
     ROLLER_RADIUS,
     Robot,
-    follower_posture,
+    postures,
 )
 
 NAMES = list(JOINTS)
@@ -21,6 +21,13 @@ RANGES = [joint.range for joint in Robot().joints]  # of slides; wheels have non
 SLIDES = [i for i, range_ in enumerate(RANGES) if range_ is not None]
 insertions = st.floats(-0.5, 1.5, allow_nan=False)
 rotations = st.floats(-50.0, 50.0, allow_nan=False)
+
+
+def follower_posture(insertion, rotation=0.0, *wire):
+    """Posture (..., 16) of a robot with one device, or with a guidewire of its own."""
+    four = np.broadcast_arrays(insertion, rotation, *(wire or (insertion, rotation)))
+    joints = postures(np.array(four, float).reshape(4, -1))
+    return joints.reshape(*four[0].shape, len(JOINTS))
 
 
 def arena_with_robot(gravity=(0.0, 0.0, -9.81), falling_ball=False):
@@ -109,7 +116,7 @@ def test_posture_broadcasts_over_batch_axes():
 
 def test_rear_clamps_and_guidewire_unit_follow_a_guidewire_of_its_own():
     both = follower_posture(0.1, 1.0)
-    own = follower_posture(0.1, 1.0, guidewire_insertion=0.15, guidewire_rotation=-2.0)
+    own = follower_posture(0.1, 1.0, 0.15, -2.0)
     changed = {name for name, a, b in zip(NAMES, both, own, strict=True) if a != b}
     kept = {name for name in NAMES if name.startswith("front_")}
     # The catheter unit stays half-way between the clamps, and rolls on the catheter.

@@ -187,8 +187,8 @@ def test_a_device_goes_round_a_bend_without_jam(bent_rig):
     [
         (np.zeros((1, 3)), r"shape \(1, 3\)"),
         (np.zeros((4, 2)), r"shape \(4, 2\)"),
-        ([[0, 0, 0], [0, 0, 0]], "repeats a point"),
-        ([[0, 0, 0], [0, 0, np.nan]], "not finite"),
+        ([[0, 0, 0], [0, 0, 0]], "coincide"),
+        ([[0, 0, 0], [0, 0, np.nan]], "finite numbers"),
         (bend(0.1, radius=0.004), "turns by .*smooth the line"),
     ],
 )

@@ -11,6 +11,7 @@ from dm_control import suite as dm_suite
 from dm_control.composer.variation import distributions
 
 from cathsim_dmc import suite
+from cathsim_dmc.anatomy import phantoms
 from cathsim_dmc.anatomy.arch import arch
 from cathsim_dmc.anatomy.parts import Goal
 from cathsim_dmc.entities import devices
@@ -21,19 +22,11 @@ from cathsim_dmc.tasks.config import NavigationConfig
 STIFF = dataclasses.replace(
     devices.get("steerable_5f"), name="stiff", shaft=devices.Section(6e-3, 5e-3)
 )
-
-
-def fails(words, error=ValueError, **options):
-    """Loads a task with options; the message must hold all the words."""
-    task_name = options.pop("task_name", "type1_bca")
-    with pytest.raises(error) as caught:
-        suite.load("cathsim", task_name, task_kwargs=options)
-    missing = [word for word in words if str(word) not in str(caught.value)]
-    assert not missing, f"{missing} not in: {caught.value}"
-
-
-def test_wrong_task_name():
-    fails(["type3_bcb", "cathsim", *TASKS, "navigate"], task_name="type3_bcb")
+OPTIONS = [field.name for field in dataclasses.fields(NavigationConfig)]
+TYPE1 = {"task_name": "navigate", "anatomy": "type1"}
+BESIDE = Goal("beside", "bca", [0.1, 0.0, 0.0], 0.01)
+BESIDE_WORDS = ["beside", "outside the lumen", "mm", "point inside", "bca", "lcca"]
+ELSEWHERE = ["directory", "cathsim phantom", *arch.ARCHES]
 
 
 def test_wrong_domain_name():
@@ -43,46 +36,16 @@ def test_wrong_domain_name():
         assert word in str(caught.value)
 
 
-def test_wrong_observation_name():
-    fails(["pixels", *OBSERVATIONS], observation="pixels")
-
-
-def test_every_option_is_listed():
-    names = [field.name for field in dataclasses.fields(NavigationConfig)]
-    fails(["frictoin", *names], frictoin=0.1)
-
-
-def test_wrong_goal_name():
-    fails(
-        ["carotid", *arch.load("simple1").goals],
-        task_name="navigate",
-        anatomy="type1",
-        goal="carotid",
-    )
-
-
-def test_goal_outside_the_lumen():
-    goal = Goal("beside", "bca", [0.1, 0.0, 0.0], 0.01)
-    fails(
-        ["beside", "outside the lumen", "mm", "point inside", "bca", "lcca"],
-        task_name="navigate",
-        anatomy="type1",
-        goal=goal,
-    )
-
-
-@pytest.mark.parametrize("phantom", ["type9", "runs/no/such/phantom"])
-def test_missing_phantom(phantom):
-    fails(
-        [phantom, "directory", "cathsim phantom", *arch.ARCHES],
-        task_name="navigate",
-        anatomy=phantom,
-    )
-
-
 @pytest.mark.parametrize(
     ("options", "words"),
     [
+        ({"task_name": "type3_bcb"}, ["type3_bcb", "cathsim", *TASKS, "navigate"]),
+        ({"observation": "pixels"}, ["pixels", *OBSERVATIONS]),
+        ({"frictoin": 0.1}, ["frictoin", *OPTIONS]),
+        ({**TYPE1, "goal": "carotid"}, ["carotid", *phantoms.load("simple1").goals]),
+        ({**TYPE1, "goal": BESIDE}, BESIDE_WORDS),
+        ({**TYPE1, "anatomy": "type9"}, ["type9", *ELSEWHERE]),
+        ({**TYPE1, "anatomy": "no/such"}, ["no/such", *ELSEWHERE]),
         ({"max_steps": 10**400}, ["max_steps", "an integer from 1"]),
         ({"physics_timestep": 0.003}, ["physics_timestep", "whole part"]),
         ({"physics_timestep": 0.02}, ["physics_timestep", "0.005", "outside_range"]),
@@ -101,7 +64,11 @@ def test_missing_phantom(phantom):
     ],
 )
 def test_wrong_values(options, words):
-    fails(words, **options)
+    options = {"task_name": "type1_bca", **options}
+    with pytest.raises(ValueError) as caught:
+        suite.load("cathsim", options.pop("task_name"), task_kwargs=options)
+    missing = [word for word in words if str(word) not in str(caught.value)]
+    assert not missing, f"{missing} not in: {caught.value}"
 
 
 # Actions.

@@ -5,7 +5,7 @@ import pytest
 from conftest import twin
 
 from cathsim_dmc import suite
-from cathsim_dmc.anatomy.arch import arch
+from cathsim_dmc.anatomy import phantoms
 from cathsim_dmc.anatomy.parts import Goal
 from cathsim_dmc.simulation.batch import BatchSimulation
 
@@ -20,18 +20,17 @@ NOISY_BIPLANE = {"biplane": "LATERAL", "noise": True, "size": (48, 64), "roadmap
 
 @pytest.fixture(scope="module")
 def anatomy():
-    return arch.load("simple1")
+    return phantoms.load("simple1")
 
 
 class Pair:
     """A batch and the composer environments with the same seeds."""
 
-    def __init__(self, anatomy, **options):
-        options = {"anatomy": anatomy, "goal": "bca", **options}
-        self.simulate(suite.make_task("navigate", **options))
-
-    def simulate(self, task):
+    def __init__(self, task, **options):
         """Each environment and the batch compile a model of their own."""
+        if not isinstance(task, str):
+            task, options = "navigate", {"anatomy": task, "goal": "bca", **options}
+        task = suite.make_task(task, **options)
         self.environments = [
             suite.environment(twin(task, SEED + i)) for i in range(SIMULATIONS)
         ]
@@ -76,11 +75,11 @@ class Pair:
                 np.testing.assert_array_equal(value[i], other, err_msg=f"{key} of {i}")
 
 
-def actions(steps, seed=0):
+def actions(steps, seed=0, count=21):
     """Random steering while pushing on, which meets the wall."""
     random = np.random.default_rng(seed)
-    rows = random.uniform(-1, 1, (steps, SIMULATIONS, 21))
-    rows[..., -1] = 1.0
+    rows = random.uniform(-1, 1, (steps, SIMULATIONS, count))
+    rows[..., -1 if count > 4 else slice(0, None, 2)] = 1.0
     return rows
 
 
@@ -111,7 +110,9 @@ def test_partial_resets_are_equal(anatomy):
 def test_randomised_episodes_are_equal():
     # The wall of the phantom is met at once.
     pair = Pair(
-        "type1",
+        "navigate",
+        anatomy="type1",
+        goal="bca",
         observation=[*NUMBERS, *PICTURES],
         fluoroscopy=NOISY_BIPLANE,
         endoluminal_size=SMALL["size"],
@@ -129,6 +130,23 @@ def test_randomised_episodes_are_equal():
     assert touched
     # It is randomised indeed: no two goals of an episode and none of two are alike.
     assert len(np.unique(np.concatenate(seen), axis=0)) == 2 * SIMULATIONS
+
+
+@pytest.mark.parametrize(
+    "name, options",
+    [
+        ("simple1_bca_pair", {"randomisation": True}),
+        ("type1_lcca_wire", {"randomisation": True}),
+        pytest.param("arch_bca_pair", {"pool": 2}, marks=pytest.mark.slow),
+    ],
+)
+def test_coaxial_devices_are_equal(name, options):
+    pair = Pair(name, observation=["internal", "tracking", "force"], **options)
+    pair.reset()
+    for index, action in enumerate(actions(24, count=pair.batch.num_actions)):
+        pair.step(action)
+        if index % 12 == 6:
+            pair.reset_some([1])
 
 
 def test_success_ends_both(anatomy):

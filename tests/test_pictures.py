@@ -86,7 +86,8 @@ def test_the_moment_of_a_record_is_that_of_the_environment(pushed):
 
 
 def test_glass_covers_what_the_surface_covers_and_darkens_at_the_rim():
-    vertices, faces = make_tube(radius=0.02, length=0.08, sides=48, rings=9)
+    tube = make_tube(radius=0.02, length=0.08, sides=48, rings=9)
+    vertices, faces = tube.vertices, tube.faces
     projection = ParallelProjection.of(vertices, margin=0.01, height=200)
     picture = glass(vertices, faces, projection)
     alpha = picture.behind[..., 3]
@@ -209,6 +210,13 @@ def test_tasks_and_anatomies_say_what_they_are(pushed):
     assert len(repr(anatomy)) < 300
     for text in ("simple1", "bca, lcca", "inlet in aorta"):
         assert text in repr(anatomy)
+
+
+def test_contacts_without_force_are_drawn(pushed, recwarn):
+    moment = Moment.of(pushed[0])
+    touching = dataclasses.replace(moment, force=np.zeros_like(moment.force))
+    scene_figure(touching, views=("front",), fluoroscopy=False, pixels=200)
+    assert not recwarn.list
 
 
 def test_scene_figure_needs_something_to_draw(pushed):

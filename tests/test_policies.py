@@ -16,7 +16,7 @@ from cathsim_dmc.policies import (
     in_environment,
     make_policy,
 )
-from cathsim_dmc.recording import EpisodeRecorder
+from cathsim_dmc.recording.recorder import EpisodeRecorder
 
 TASK = "simple1_bca"
 SHORT = {"max_steps": 12}

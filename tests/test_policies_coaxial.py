@@ -153,13 +153,21 @@ def test_what_is_for_one_device_is_refused_for_several():
         Expert.for_task(task, pursuit.Settings())
 
 
-def test_the_teacher_reaches_the_goal_without_memory():
+@pytest.mark.parametrize(
+    ("task", "lead"),
+    [
+        ("femoral_type1_lcca_pair", 0.02),
+        pytest.param("femoral_type2_bca_pair", -0.02, marks=pytest.mark.slow),
+    ],
+)
+def test_the_teacher_reaches_the_goal_without_memory(task, lead):
     """It is told the last action and asked in every state as in the first."""
-    task = suite.make_task("femoral_type1_lcca_pair", random=0, observation="tracking")
-    simulation = BatchSimulation(task, 1)
+    simulation = BatchSimulation(
+        suite.make_task(task, random=0, observation="tracking"), 1
+    )
     simulation.reset()
     view, everyone = policies.View(simulation), np.ones(1, dtype=bool)
-    teacher, action = Teacher(view), np.zeros((1, 4))
+    teacher, action = Teacher(view, lead), np.zeros((1, 4))
     teacher.reset(everyone)
     for _ in range(200):
         action = teacher.act(action)

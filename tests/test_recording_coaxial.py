@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from cathsim_dmc import suite
+from cathsim_dmc.anatomy.parts import Surface
 from cathsim_dmc.recording import rerun_log
 from cathsim_dmc.recording.coaxial import CoaxialRecord
 from cathsim_dmc.recording.episode import Episode
@@ -67,7 +68,7 @@ def test_the_rerun_file_has_both(recorded, tmp_path):
 
     episode, _ = recorded
     path = tmp_path / "pair.rrd"
-    box = (np.eye(3), np.array([[0, 1, 2]]))
+    box = Surface(np.eye(3), np.array([[0, 1, 2]]))
     rerun_log.write_rrd(episode, box, path)
     entities = {str(chunk.entity_path) for chunk in RrdReader(path).stream()}
     for name in ("guidewire", "catheter"):

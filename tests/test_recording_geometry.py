@@ -5,11 +5,9 @@ from hypothesis import strategies as st
 from recording_samples import make_tube
 from scipy.spatial.transform import Rotation
 
-from cathsim_dmc.anatomy.parts import Surface
 from cathsim_dmc.recording.geometry import (
     FORCE_COLOUR_MAX,
     force_colours,
-    surface_arrays,
     xyzw,
     z_to,
 )
@@ -30,29 +28,11 @@ def test_z_to_turns_z_into_the_direction(direction):
 
 
 def test_normals_of_a_tube_point_outwards():
-    vertices, faces = make_tube(sides=24)
-    normals = Surface(vertices, faces).normals
+    tube = make_tube(sides=24)
+    vertices, normals = tube.vertices, tube.normals
     np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1)
     radial = vertices[:, :2] / np.linalg.norm(vertices[:, :2], axis=1, keepdims=True)
     assert ((normals[:, :2] * radial).sum(axis=1) > 0.99).all()
-
-
-def test_surfaces_are_pairs_or_objects():
-    pair = make_tube()
-
-    class Shape:
-        vertices, faces = pair
-
-    for given_surface in (pair, Shape()):
-        vertices, faces = surface_arrays(given_surface)
-        np.testing.assert_array_equal(vertices, pair[0])
-        np.testing.assert_array_equal(faces, pair[1])
-    with pytest.raises(ValueError, match="faces name vertices"):
-        surface_arrays((pair[0][:5], pair[1]))
-    with pytest.raises(ValueError, match=r"vertices is .*shape \(n, 3\)"):
-        surface_arrays((pair[0][:, :2], pair[1]))
-    with pytest.raises(ValueError, match="finite"):
-        surface_arrays((pair[0] * np.nan, pair[1]))
 
 
 def test_colours_darken_with_force_and_saturate():

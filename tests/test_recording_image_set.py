@@ -204,3 +204,15 @@ def test_a_set_is_resumed_and_refused_where_it_must_be(tmp_path, monkeypatch, pa
 def test_a_wrong_option_is_named(option, value):
     with pytest.raises(ValueError, match=option):
         dataclasses.replace(OPTIONS, **{option: value})
+
+
+@pytest.mark.parametrize("share", [0.0, 0.02, 0.5, 1.0])
+def test_the_description_of_a_mask_is_that_of_its_pixels(share):
+    mask = (np.random.RandomState(0).uniform(size=(31, 17)) < share).astype(np.uint8)
+    mask[:, 3:5] |= 2  # of another object
+    found = coco.described(np.ascontiguousarray(mask.T))
+    rows, columns = np.nonzero(mask & 1)
+    box = [0] * 4
+    if len(rows):
+        box = [columns.min(), rows.min(), np.ptp(columns) + 1, np.ptp(rows) + 1]
+    assert found["area"] == len(rows) and found["bbox"] == [int(one) for one in box]

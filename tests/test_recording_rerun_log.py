@@ -10,12 +10,12 @@ from recording_samples import make_episode, make_tube
 from scipy.spatial.transform import Rotation
 
 from cathsim_dmc import suite
-from cathsim_dmc.anatomy import Surface
 from cathsim_dmc.imaging import FluoroscopyOptions
 from cathsim_dmc.pictures.moment import Moment
 from cathsim_dmc.pictures.recorded import xray_film
-from cathsim_dmc.recording import Episode, EpisodeRecorder
+from cathsim_dmc.recording.episode import Episode
 from cathsim_dmc.recording.living import DENT, VesselRecord, dented
+from cathsim_dmc.recording.recorder import EpisodeRecorder
 from cathsim_dmc.recording.rerun_device import arrow_scale
 from cathsim_dmc.recording.rerun_log import write_rrd
 from cathsim_dmc.recording.scene import BodyGeom
@@ -244,7 +244,8 @@ def test_bodies_carry_their_geoms(written):
 
 def test_the_scene_is_in_the_patient_frame_with_a_translucent_vessel(written):
     _, _, _, recording = written
-    vertices, faces = make_tube()
+    tube = make_tube()
+    vertices, faces = tube.vertices, tube.faces
     assert len(recording.fixed("/world/vessel", "Mesh3D:vertex_positions")) == len(
         vertices
     )
@@ -319,7 +320,7 @@ def test_reading_episodes_needs_no_rerun():
 
 
 def test_a_wall_that_gives_is_drawn_pressed_in_by_the_contacts():
-    surface = Surface(*make_tube())
+    surface = make_tube()
     place = surface.vertices[:1]
     touched = dented(surface, place, np.array([1e-3])).vertices - surface.vertices
     np.testing.assert_allclose(touched[0], 1e-3 * surface.normals[0])
@@ -337,6 +338,7 @@ def test_a_living_vessel_is_kept_and_its_wall_moves_in_the_file(tmp_path):
     phase = 0.04 * np.arange(9)
     np.testing.assert_allclose(record.series["heart_phase"], phase, atol=1e-9)
     assert record.series["blood_speed"].max() > 0.1
+    assert record.curves()["heart_phase"][0].argmax() == 6  # the T wave of its ECG
     surface = env.task.scene.anatomy.surface
     path = write_rrd(episode, surface, tmp_path / "episode.rrd")
     places = Recording(path).values("/world/vessel", "Mesh3D:vertex_positions")

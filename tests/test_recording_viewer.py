@@ -52,7 +52,7 @@ def test_a_browser_gets_a_page_until_the_command_ends(recording):
         probe.bind(("127.0.0.1", 0))
         port = probe.getsockname()[1]
     code = (
-        "from cathsim_dmc.recording import open_viewer; "
+        "from cathsim_dmc.recording.viewer import open_viewer; "
         f"open_viewer({str(recording)!r}, web=True, port={port})"
     )
     page, text, deadline = f"http://127.0.0.1:{port}/", None, time.monotonic() + 20

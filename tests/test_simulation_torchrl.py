@@ -120,10 +120,10 @@ def test_the_first_episode_is_that_of_the_seed():
 
 
 def test_success_is_terminated_in_torchrl():
-    from cathsim_dmc.anatomy.arch import arch
+    from cathsim_dmc.anatomy import phantoms
     from cathsim_dmc.anatomy.parts import Goal
 
-    anatomy = arch.load("simple1")
+    anatomy = phantoms.load("simple1")
     place = anatomy.tree.vessel("aorta").centreline.at(0.09)
     env = DMControlEnv(
         "cathsim",

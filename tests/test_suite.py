@@ -12,7 +12,7 @@ from dm_env import specs, test_utils
 from scipy.stats import qmc
 
 from cathsim_dmc import suite
-from cathsim_dmc.anatomy.arch import arch
+from cathsim_dmc.anatomy import phantoms
 from cathsim_dmc.anatomy.parts import Goal
 from cathsim_dmc.physics import forces
 
@@ -290,7 +290,7 @@ def test_time_out_comes_at_max_steps_with_discount_one(shared_environment, task_
 @pytest.fixture(scope="module")
 def near_goal():
     """An environment whose goal lies 3 cm ahead of the tip."""
-    anatomy = arch.load("simple1")
+    anatomy = phantoms.load("simple1")
     line = anatomy.tree.vessel("aorta").centreline
     place = line.at(0.105)
     goal = Goal("near", "aorta", place.position, 0.105)

@@ -10,7 +10,7 @@ from hypothesis.extra import numpy as arrays
 from scipy import stats
 
 from cathsim_dmc import suite
-from cathsim_dmc.anatomy.arch import arch
+from cathsim_dmc.anatomy import phantoms
 from cathsim_dmc.physics import forces, readings
 from cathsim_dmc.physics.randomisation import start_displacement
 from cathsim_dmc.tasks import objectives
@@ -21,7 +21,7 @@ PATH_REWARD = {"path": -1.0, "success": 10.0}
 
 @pytest.fixture(scope="module")
 def anatomy():
-    return arch.load("simple1")
+    return phantoms.load("simple1")
 
 
 def cannulation(anatomy, goal="bca", **options):

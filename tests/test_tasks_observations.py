@@ -7,7 +7,7 @@ import pytest
 from conftest import twin
 
 from cathsim_dmc import suite
-from cathsim_dmc.anatomy.arch import arch
+from cathsim_dmc.anatomy import phantoms
 from cathsim_dmc.imaging import Fluoroscope, FluoroscopyOptions
 from cathsim_dmc.tasks import observations, route
 from cathsim_dmc.tasks.common_chain import CommonChain
@@ -18,7 +18,7 @@ SIZE = 64
 
 @pytest.fixture(scope="module")
 def anatomy():
-    return arch.load("simple1")
+    return phantoms.load("simple1")
 
 
 @pytest.fixture(scope="module")

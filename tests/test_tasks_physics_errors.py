@@ -5,7 +5,7 @@ import pytest
 from conftest import twin
 
 from cathsim_dmc import suite
-from cathsim_dmc.anatomy.arch import arch
+from cathsim_dmc.anatomy import phantoms
 from cathsim_dmc.simulation import batch
 from cathsim_dmc.tasks import physics_errors
 
@@ -29,7 +29,7 @@ def _push(environment):
 
 
 def test_a_device_in_lumen_and_sheath_has_not_escaped():
-    anatomy = arch.load("simple1")
+    anatomy = phantoms.load("simple1")
     inlet = anatomy.inlet
     way = np.linspace(-0.3, 0.1, 81)[:, None]
     straight = inlet.position + way * inlet.direction

@@ -31,7 +31,7 @@ def direction(azimuth, height):
 @given(azimuth=ANGLES, height=st.floats(-1, 1))
 def test_frame_turns_z_into_any_direction(azimuth, height):
     axis = direction(azimuth, height)
-    anatomy = arch.load("simple1")
+    anatomy = phantoms.load("simple1")
     inlet = Inlet("aorta", [0, 0, 0], axis, 0.0138)
     turned = dataclasses.replace(anatomy, inlet=inlet)
     # Whatever stands behind it.
@@ -55,7 +55,7 @@ def test_frame_turns_z_into_any_direction(azimuth, height):
 
 @pytest.mark.parametrize("name", arch.ARCHES)
 def test_the_device_starts_inside_and_reaches_every_goal(name):
-    anatomy = arch.load(name)
+    anatomy = phantoms.load(name)
     for goal in anatomy.goals.values():
         route = anatomy.route(goal)
         placed = placement.place_device(anatomy, goal, devices.STEERABLE_5F)
@@ -70,7 +70,7 @@ def test_the_device_starts_inside_and_reaches_every_goal(name):
 @pytest.mark.parametrize("length", [0.0, 0.05, 0.09, -1.0, math.nan, math.inf, 5.0])
 def test_working_length_is_checked(length):
     with pytest.raises(ValueError, match=r"working_length is .*more than.*at most"):
-        anatomy = arch.load("simple1")
+        anatomy = phantoms.load("simple1")
         placement.place_device(
             anatomy, anatomy.goal("bca"), devices.STEERABLE_5F, length
         )

@@ -48,23 +48,34 @@ def test_hard_and_deep_contacts_need_shorter_steps(contact, coarse):
     assert forces.too_coarse(*forces.wall_force(rows)).tolist() == [False, coarse]
 
 
+def test_what_goes_deep_in_the_last_physics_step_is_seen():
+    batch = BatchSimulation(suite.make_task("type1_lcca"), 1, num_threads=1)
+    batch.reset()
+    before, never = np.array([1e-4]), np.array([False])
+    batch.batch.qpos[:, batch.rollout.index.insertion_qpos] += 0.1
+    assert batch._stepper._depth_at_end(before.copy(), never) == before
+    batch.batch.qvel[:, batch.rollout.index.dofs.start] = 1.0
+    assert batch._stepper._depth_at_end(before.copy(), never) > 1e-3
+
+
 @pytest.mark.parametrize(
-    ("task", "options"),
+    ("task", "options", "limit"),
     [
-        ("type1_lcca_pair", {"randomisation": True}),
-        ("femoral_arch_lcca", {"pool": 2, "arches": "test"}),
+        ("type1_lcca_pair", {"randomisation": True}, {"HARDEST": 2e-4}),
+        ("femoral_arch_lcca", {"pool": 2, "arches": "test"}, {"HARDEST": 2e-4}),
+        ("type1_lcca_pair", {"randomisation": True}, {"DEEPEST": 1e-6}),
     ],
 )
-def test_shorter_steps_are_equal_in_both_paths(task, options, monkeypatch):
-    monkeypatch.setattr(forces, "HARDEST", 2e-4)
+def test_shorter_steps_are_equal_in_both_paths(task, options, limit, monkeypatch):
+    monkeypatch.setattr(forces, *limit.popitem())
     refined = []
     original = Stepper._refine
     monkeypatch.setattr(
         _BatchStepper,
         "_refine",
-        lambda self, indices: (
+        lambda self, indices, parts: (
             refined.extend(indices.tolist()),
-            original(self, indices),
+            original(self, indices, parts),
         ),
     )
     task = suite.make_task(task, **options)

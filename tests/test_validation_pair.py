@@ -40,7 +40,7 @@ def test_what_is_pressed_on_the_wall_lies_still():
 
 
 def test_depth_and_law_agree_with_the_iteration_in_which_they_settle():
-    """α (1 + m) < 2 at every depth, as `entities.contact` says; see docs/pair.md."""
+    """α (1 + m) < 2 at every depth, as `entities.contact` says; see docs/physics.md."""
 
     def growth(solref, solimp):
         least, most, width, middle, power = solimp

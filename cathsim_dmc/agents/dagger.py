@@ -40,6 +40,8 @@ class DAggerConfig(TrainingConfig):
             from round to round; in the first round it acts alone.
         gradient_steps: Number of gradient steps in a round.
         batch_size: Number of states per gradient step.
+        expert_lead: By how much the expert keeps a guidewire ahead of the catheter
+            around it, m; negative where the catheter's shaped end goes first.
         replay_frames: Largest number of states kept, the newest.
         replay_bytes: Largest size of their files in bytes; the smaller of the two
             limits rules.
@@ -56,6 +58,7 @@ class DAggerConfig(TrainingConfig):
     expert_share: float = within(0.5, 0, 1)
     gradient_steps: int = positive(2_000)
     batch_size: int = positive(256)
+    expert_lead: float = within(0.02, -0.1, 0.1)
     replay_frames: int = 1_000_000
     replay_bytes: int = positive(2 * 1024**3)
     total_frames: int = 20_480
@@ -84,13 +87,13 @@ class DAggerConfig(TrainingConfig):
 class _Guided(TensorDictModuleBase):
     """Acts with expert or learner at random; records the expert's action."""
 
-    def __init__(self, policy: TensorDictSequential, env: EnvBase):
+    def __init__(self, policy: TensorDictSequential, env: EnvBase, lead: float):
         super().__init__()
         self.policy, self.share = policy, 1.0
         self.in_keys = [*policy.in_keys, _BEGUN]
         self.out_keys = ["action", EXPERT_ACTION]
         self._view = view_of(env)
-        self._teacher = Teacher(self._view)
+        self._teacher = Teacher(self._view, lead)
         self._last = torch.zeros(self._view.num_simulations, self._view.num_actions)
 
     @torch.no_grad()
@@ -132,7 +135,7 @@ class DAgger(CloningLearner):
 
     @override
     def attach(self, env: EnvBase) -> None:
-        self.policy = _Guided(self.network, env)
+        self.policy = _Guided(self.network, env, self.config.expert_lead)
         self._set_share()
 
     def _set_share(self) -> float:

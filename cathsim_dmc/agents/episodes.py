@@ -6,16 +6,12 @@ import numpy as np
 from tensordict import TensorDictBase
 
 from cathsim_dmc.analysis.force_statistics import EpisodeForces, ForceTracker
+from cathsim_dmc.physics.forces import NAMES, WallForce
 
 # Information of the environment about a step, beside the observation.
 INFO = "info"
 # Force of a control step -> its name in the information.
-_FORCES = {
-    "sum": "wall_force_sum",
-    "max": "wall_force_max",
-    "peak_sum": "wall_force_peak_sum",
-    "peak_max": "wall_force_peak_max",
-}
+_FORCES = dict(zip(WallForce._fields, NAMES, strict=True))
 
 
 @dataclass(frozen=True)
@@ -69,7 +65,7 @@ class EpisodeTracker:
         forces = {name: information(batch, key) for name, key in _FORCES.items()}
         success = information(batch, "success")
         error = information(batch, "physics_error")
-        path_ratio = information(batch, "path_ratio")
+        ratio = information(batch, "path_ratio")
         finished = []
         for step in range(batch.shape[1]):
             self.reward += reward[:, step]
@@ -92,9 +88,7 @@ class EpisodeTracker:
                         success=None if success is None else bool(self.success[env]),
                         forces=self.forces.finish(env),
                         physics_error=error is not None and bool(error[env, step]),
-                        path_ratio=None
-                        if path_ratio is None
-                        else float(path_ratio[env, step]),
+                        path_ratio=None if ratio is None else float(ratio[env, step]),
                     )
                 )
                 self.reward[env] = self.length[env] = 0

@@ -48,7 +48,7 @@ class EvaluationResult:
         episodes: Episodes in the order of their seeds.
         settings: Protocol, observation, task_kwargs and, for a checkpoint, its frames.
         distinct: Whether episodes differ by more than the jitter of the start. If not,
-            they are nearly one, and no interval over them is given.
+            no interval over them is given.
         conditions: What was drawn for each episode; empty without randomisation.
     """
 

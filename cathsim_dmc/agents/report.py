@@ -115,8 +115,8 @@ _CAPTION = (
     "contacts stays at or below a limit in every physics step."
 )
 _NEARLY_ONE = (
-    "Success without interval: the episodes differ by 1 mm of the start, so they are "
-    "nearly one; `--protocol varied` plays distinct ones."
+    "Success without interval: the episodes differ only by 1 mm of the start; "
+    "`--protocol varied` plays distinct conditions."
 )
 
 

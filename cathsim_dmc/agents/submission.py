@@ -60,8 +60,17 @@ def submit(
     }
     submission = json.loads(json.dumps(submission, default=str))
     submission["sha256"] = seal(submission)
-    files.write_text(out, json.dumps(submission, indent=1) + "\n")
+    files.write_text(out, text(submission))
     return submission
+
+
+def text(submission: dict[str, Any]) -> str:
+    """A submission as JSON: a line for each entry and each episode."""
+    episodes = ",\n  ".join(map(json.dumps, submission["episodes"]))
+    lines = {key: json.dumps(value) for key, value in submission.items()}
+    lines["episodes"] = f"[\n  {episodes}\n ]"
+    body = ",\n ".join(f'"{key}": {value}' for key, value in lines.items())
+    return f"{{\n {body}\n}}\n"
 
 
 def seal(submission: dict[str, Any]) -> str:

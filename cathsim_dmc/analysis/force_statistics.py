@@ -5,8 +5,6 @@ named figures, which evaluations, results and cards report. docs/forces.md expla
 them and relates them to the published figures.
 """
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Mapping
 from dataclasses import dataclass

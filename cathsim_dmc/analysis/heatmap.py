@@ -1,7 +1,5 @@
 """Where the device presses on the wall, seen from the front."""
 
-from __future__ import annotations
-
 import os
 from dataclasses import dataclass
 

@@ -3,8 +3,6 @@
 Lengths are metres, positions are in the patient frame LPS.
 """
 
-from __future__ import annotations
-
 import json
 import os
 from collections.abc import Mapping
@@ -85,7 +83,7 @@ class Anatomy:
         inlet: VesselPlace | None = None,
         goals: Mapping[str, VesselPlace] | None = None,
         **smoothing: float,
-    ) -> Anatomy:
+    ) -> "Anatomy":
         """Build lumen surface, inlet and goals around centrelines.
 
         Args:
@@ -179,7 +177,7 @@ class Anatomy:
         return directory
 
     @classmethod
-    def load(cls, directory: str | os.PathLike[str]) -> Anatomy:
+    def load(cls, directory: str | os.PathLike[str]) -> "Anatomy":
         """Read an anatomy that `save` wrote.
 
         Raises:

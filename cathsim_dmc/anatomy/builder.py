@@ -1,7 +1,5 @@
 """Ends, inlet and goals of a vessel tree."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace

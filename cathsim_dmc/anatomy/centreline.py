@@ -4,8 +4,6 @@ All lengths are metres, all points are in the patient frame LPS (+x patient
 left, +y posterior, +z superior).
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
@@ -139,7 +137,7 @@ class Centreline:
             )
         return Projection(*(values.reshape(points.shape[:-1]) for values in out))
 
-    def resampled(self, spacing: float) -> Centreline:
+    def resampled(self, spacing: float) -> "Centreline":
         """Same curve with equal steps of about `spacing` (m), ends kept."""
         if not spacing > 0.0:
             raise ValueError(f"spacing is {spacing:g} m; it must be > 0.")
@@ -147,7 +145,7 @@ class Centreline:
         place = self.at(np.linspace(0.0, self.length, count + 1))
         return Centreline(place.position, place.radius)
 
-    def slice(self, s0: float, s1: float) -> Centreline:
+    def slice(self, s0: float, s1: float) -> "Centreline":
         """Part between arc lengths `s0` and `s1` (m), reversed when s0 > s1.
 
         Raises:

@@ -6,8 +6,6 @@ within an artery, and in an imported scan, outlets share by Murray's law, as the
 cubed. A vessel loses at each ostium what the branch takes, so volume is conserved.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -71,7 +69,7 @@ class Circulation:
     vessel: np.ndarray
 
     @classmethod
-    def of(cls, tree: VesselTree, murray: bool = False) -> Circulation:
+    def of(cls, tree: VesselTree, murray: bool = False) -> "Circulation":
         """The circulation of a tree, perhaps with all outlets by Murray's law."""
         root = tree.root.centreline
         reverse = bool(root.radii[-1] > root.radii[0])

@@ -6,8 +6,6 @@ them. The vertices are moved outwards by what the triangles around them stand in
 lumen.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

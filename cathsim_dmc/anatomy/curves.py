@@ -3,8 +3,6 @@
 Lengths are metres, points are in one frame (LPS unless said otherwise).
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field

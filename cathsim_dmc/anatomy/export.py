@@ -1,7 +1,5 @@
 """Export of an anatomy as MJCF with convex wall pieces, and its deviations."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass

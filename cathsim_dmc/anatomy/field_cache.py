@@ -5,8 +5,6 @@ field on a machine takes longer than all else that a task needs. `tools/ship_fie
 writes them.
 """
 
-from __future__ import annotations
-
 import contextlib
 import hashlib
 import io

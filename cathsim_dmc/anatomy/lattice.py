@@ -1,7 +1,5 @@
 """Points of a regular lattice inside a lumen."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np

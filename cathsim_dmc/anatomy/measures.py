@@ -4,8 +4,6 @@ Computed from centrelines and radii, so alike for generated, measured and import
 anatomies. Lengths are metres and angles radians; the vertical is +z (superior).
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field

@@ -11,8 +11,6 @@ anterior, medial and caudal; a branch moves like its ostium. The sheath rests: n
 open end all displacements pass into none.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -56,7 +54,7 @@ class Motion:
         tree: VesselTree,
         ends: Sequence[End],
         blood: Circulation,
-    ) -> Motion:
+    ) -> "Motion":
         """The motion of an anatomy, with its open ends at rest.
 
         Args:

@@ -55,7 +55,10 @@ def pulse(phase):
 
 @compiled
 def courses(parameters, time):
-    """Amplitudes of heart, breathing and radius at a time, then their rates (1/s)."""
+    """Amplitudes of heart, breathing and radius at a time, then their rates (1/s).
+
+    Then of the pulse: its phase at the heart, the lag a metre, 1/m, and its rate, 1/s.
+    """
     share = min(max(time / RAMP, 0.0), 1.0)
     ramp = share * share * (3.0 - 2.0 * share)
     growing = 6.0 * share * (1.0 - share) / RAMP
@@ -76,6 +79,9 @@ def courses(parameters, time):
         parameters[1] * (ramp * beating + growing * heart),
         parameters[2] * (ramp * breathing + growing * breath),
         parameters[3] * growing,
+        parameters[4] * time + parameters[5],
+        parameters[4] / parameters[6],
+        parameters[4],
     )
 
 
@@ -115,19 +121,18 @@ def interpolate(lattice, x, y, z, out):
 
 
 @compiled
-def warp(lattice, parameters, time, x, y, z, values, out):
+def warp(lattice, course, x, y, z, values, out):
     """Writes what the motion does to a place in space, see `WARP`.
 
     Args:
         lattice: of the anatomy.
-        parameters: of the simulation.
-        time: s.
+        course: what `courses` says of a time.
         x: with y and z, the place, m.
         values: (8, 4), scratch.
         out: (20,).
     """
     interpolate(lattice, x, y, z, values)
-    a, b, r, da, db, dr = courses(parameters, time)
+    a, b, r, da, db, dr, beats, lag, often = course
     out[0], out[1], out[2] = x, y, z
     for i in range(3):
         out[i] -= a * values[i, 0] + b * values[3 + i, 0]
@@ -135,21 +140,38 @@ def warp(lattice, parameters, time, x, y, z, values, out):
             out[3 + 3 * i + j] = -a * values[i, 1 + j] - b * values[3 + i, 1 + j]
         out[3 + 4 * i] += 1.0
         out[16 + i] = da * values[i, 0] + db * values[3 + i, 0]
-    delay = values[7, 0] / parameters[6]
-    share, rate = pulse(parameters[4] * (time - delay) + parameters[5])
+    share, rate = pulse(beats - lag * values[7, 0])
     out[12] = r * share * values[6, 0]
     for j in range(3):
         out[13 + j] = r * share * values[6, 1 + j]
-    out[19] = (dr * share + r * rate * parameters[4]) * values[6, 0]
+    out[19] = (dr * share + r * rate * often) * values[6, 0]
+
+
+@compiled
+def first_past(inlet, points):
+    """Number of the first of some places (n, 3), m, past an inlet, n for none.
+
+    Args:
+        inlet: (2, 3), its position, m, and the direction into the vessel.
+        points: of a device, from its proximal end.
+    """
+    for n in range(len(points)):
+        level = 0.0
+        for k in range(3):
+            level += (points[n, k] - inlet[0, k]) * inlet[1, k]
+        if level > 0.0:
+            return n
+    return len(points)
 
 
 @compiled
 def rest(lattice, parameters, time, points, out):
     """Writes the places at rest (n, 3) of places in space (n, 3), m."""
     values, there = np.empty((VALUES, 4)), np.empty(WARP)
+    course = courses(parameters, time)
     for n in range(len(points)):
         x, y, z = points[n]
-        warp(lattice, parameters, time, x, y, z, values, there)
+        warp(lattice, course, x, y, z, values, there)
         out[n, 0], out[n, 1], out[n, 2] = there[0], there[1], there[2]
 
 
@@ -160,10 +182,11 @@ def moved(lattice, parameters, time, points, out, growth):
     And how much the radius has grown there (n,), m.
     """
     values, there = np.empty((VALUES, 4)), np.empty(WARP)
+    course = courses(parameters, time)
     for n in range(len(points)):
         x, y, z = points[n]
         for _ in range(_TURNS):
-            warp(lattice, parameters, time, x, y, z, values, there)
+            warp(lattice, course, x, y, z, values, there)
             ax, ay, az = points[n, 0] - there[0], points[n, 1] - there[1], 0.0
             az = points[n, 2] - there[2]
             x, y, z = x + ax, y + ay, z + az

@@ -3,8 +3,6 @@
 Lengths are metres, positions are in the patient frame LPS.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -18,7 +16,7 @@ from cathsim_dmc.anatomy.centreline import Array, _readonly
 INLET_HOLE_RADIUS = 2.5e-3
 
 
-def _checked(part: Goal | Inlet | End, what: str) -> None:
+def _checked(part: "Goal | Inlet | End", what: str) -> None:
     """Checks the fields that goals, inlets and ends share, and freezes the vectors."""
     bounds.text(f"{what} vessel", part.vessel)
     for field in ("position", "direction"):

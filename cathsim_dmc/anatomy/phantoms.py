@@ -1,7 +1,5 @@
 """Anatomies that come with the package, by name."""
 
-from __future__ import annotations
-
 from functools import lru_cache
 from pathlib import Path
 
@@ -40,7 +38,7 @@ def load(name: str, *, access: str = "ascending") -> Anatomy:
         raise ValueError(f"access is {access!r}; choose one of {', '.join(ACCESSES)}.")
     if name in TREES:
         return _built(name, access)
-    return arch.load(name, access=access)
+    return arch.build_arch(arch.ARCHES[name], name, access=access)
 
 
 @lru_cache(maxsize=8)

@@ -1,7 +1,5 @@
 """Distances of many points to many straight segments at once."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 

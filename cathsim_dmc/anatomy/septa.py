@@ -1,7 +1,5 @@
 """Walls between vessels that run side by side."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from cathsim_dmc.anatomy.centreline import Vessel, VesselTree

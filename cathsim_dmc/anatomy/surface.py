@@ -1,7 +1,5 @@
 """Triangles of the lumen surface, from the depth field of the vessel tree."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

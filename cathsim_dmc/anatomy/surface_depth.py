@@ -1,7 +1,5 @@
 """Distances to a triangulated surface, by libigl."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

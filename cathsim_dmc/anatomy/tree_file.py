@@ -23,8 +23,6 @@ The first vessel is the root; parents stand before their children. `note`, `inle
 and `goals` may be left out.
 """
 
-from __future__ import annotations
-
 import json
 import math
 import os

@@ -32,7 +32,7 @@ app.command(name="train")(training.command([]))
 
 @app.command(name="list")
 def list_tasks(devices: bool = False, json: Json = False) -> int:
-    """List the tasks, with one line each, or the devices and what they are made of.
+    """List the tasks, or the devices with their properties.
 
     Args:
         devices: Whether to list the devices in place of the tasks.
@@ -52,7 +52,10 @@ def list_tasks(devices: bool = False, json: Json = False) -> int:
         return 0
     table = Table("task", "what to do", box=None)
     for name, line in lines.items():
-        table.add_row(name, line)
+        if not name.endswith(tuple(f"_{suffix}" for suffix in suite.COAXIAL)):
+            table.add_row(name, line)
+    for suffix, (_, words) in suite.COAXIAL.items():
+        table.add_row(f"…_{suffix}", f"Each task but navigate, {words}.")
     Console().print(table)
     return 0
 

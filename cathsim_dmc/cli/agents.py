@@ -45,6 +45,8 @@ def evaluation(arguments: Sequence[str]) -> Callable[..., int]:
     """
     kind: type = NoOptions
     if list(arguments[:1]) == ["eval"]:
+        from cathsim_dmc import agents  # noqa: F401  torchrl goes before dm_control
+
         kind = task_kind(frozenset({"observation"}))
     evaluate.__annotations__["options"] = Annotated[kind, conf.arg(name="")]
     return evaluate

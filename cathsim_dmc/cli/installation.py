@@ -80,4 +80,5 @@ def _opengl() -> Finding:
     command = [sys.executable, "-c", _OPENGL]
     works = not subprocess.run(command, capture_output=True, check=False).returncode
     advice = "" if works else "physics.render and viewers need it: try MUJOCO_GL=egl"
-    return Finding("OpenGL", f"{'works' if works else 'none'}, {name}", note=advice)
+    found = f"{'works' if works else 'none'} (MUJOCO_GL {name})"
+    return Finding("OpenGL", found, note=advice)

@@ -9,7 +9,7 @@ the velocity of the wall in the frame of each contact.
 
 import numpy as np
 
-from cathsim_dmc.anatomy.motion_loops import VALUES, WARP, wall_velocity, warp
+from cathsim_dmc.anatomy.motion_loops import VALUES, WARP, courses, wall_velocity, warp
 from cathsim_dmc.collision import native
 from cathsim_dmc.collision.loops import SOFT
 from cathsim_dmc.collision.native import (
@@ -67,8 +67,8 @@ def _carry(model, data):
     # In the middle of the step, so that a device that sticks goes the wall's way.
     time = numbers(data + word(table + 104), 1)[0]
     time += 0.5 * numbers(model + word(table + 120), 1)[0]
-    course = numbers(space, COUNT)
-    wall = int(course[9])
+    parameters = numbers(space, COUNT)
+    wall, course = int(parameters[9]), courses(parameters, time)
     key = key_of(fields, model, wall)
     lattice = numbers(word(entry_of(fields, key) + MOTION_ENTRY), COUNT)
     scratch = np.empty(WARP + 4 * VALUES)
@@ -80,7 +80,7 @@ def _carry(model, data):
             continue
         place = numbers(contact + word(table + 32), 3)
         frame = numbers(contact + word(table + 40), 9)
-        warp(lattice, course, time, place[0], place[1], place[2], values, there)
+        warp(lattice, course, place[0], place[1], place[2], values, there)
         # The frame's first axis points from the device into the wall.
         u, v, w = wall_velocity(there, (-frame[0], -frame[1], -frame[2]))
         for row in range(min(wholes(contact + word(table + 48), 1)[0], 3)):

@@ -33,7 +33,7 @@ _BOX = int(mujoco.mjtGeom.mjGEOM_BOX)
 _TYPES = int(mujoco.mjtGeom.mjNGEOMTYPES)
 
 # Impedance of all contacts with a field. It does not change with the depth, so the
-# contact is a spring of one stiffness, and its rattle (docs/pair.md) has m = 0.
+# contact is a spring of one stiffness, and its rattle (docs/physics.md) has m = 0.
 IMPEDANCE = 0.95
 _EXCURSION = 40e-3  # m, by which a moving wall may leave the box of its field
 

@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from cathsim_dmc.anatomy.field_loops import FREE
-from cathsim_dmc.anatomy.motion_loops import VALUES, WARP, in_space, warp
+from cathsim_dmc.anatomy.motion_loops import VALUES, WARP, courses, in_space, warp
 from cathsim_dmc.collision.native import (
     address_of,
     call_collision,
@@ -78,7 +78,7 @@ _AT_WALL = -1e-9  # m, the depth of a link so close
 _IMPACT = 1e-4
 # In a moving vessel a capsule is looked for by its straight image at rest, which is off
 # by so much, m, and by the strain of space; its contacts are looked up exactly.
-_IMAGE, _STRAIN = 0.2e-3, 1.7
+_IMAGE = 0.2e-3
 
 
 @compiled
@@ -217,21 +217,34 @@ def nth(seen, n, soft):
 
 
 @compiled
+def sweep(table, model, data, geoms, axis, half, law):
+    """How a capsule moves in a physics step, in the frame of the field.
+
+    Returns:
+        Ways (3) m of the middle and, a metre along the capsule, of its places; and the
+        clearance below which they may hit, m.
+    """
+    still = (0.0, 0.0, 0.0)
+    if law[1] == 0.0 or law[2]:
+        return still, still, -np.inf
+    travel, turn = swept(table, model, data, geoms[0])
+    frame = numbers(word(data + word(table + GEOM_XMAT)) + 72 * geoms[1], 9)
+    travel, turn = into(frame, travel), into(frame, turn)
+    aside = across(turn, axis)
+    ahead = length(travel) + half * length(aside)
+    return travel, aside, law[0] + ahead - _IMPACT
+
+
+@compiled
 def at_rest(
     table, model, data, contacts, geoms, entry, pose, half, closed, margin, law
 ):
     """Number of contacts, written, with a field that does not move."""
     radius, near, soft, held, light = law
     local, axis = pose
-    limit = far = radius + margin + near
-    travel, aside = (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
-    if near > 0.0 and not soft:
-        travel, turn = swept(table, model, data, geoms[0])
-        frame = numbers(word(data + word(table + GEOM_XMAT)) + 72 * geoms[1], 9)
-        travel, turn = into(frame, travel), into(frame, turn)
-        aside = across(turn, axis)
-        ahead = length(travel) + half * length(aside)
-        far = max(limit, radius + ahead - _IMPACT)
+    limit = radius + margin + near
+    travel, aside, far = sweep(table, model, data, geoms, axis, half, law)
+    far = max(limit, far)
     seen = touches(entry, local, axis, half, closed, far)
     if seen[0] == 0:  # most links; rows take as long to make as all before
         return 0
@@ -273,15 +286,19 @@ def in_motion(
     limit = radius + margin + near
     time = numbers(data + word(table + TIME), 1)[0]
     lattice = numbers(word(entry + MOTION_ENTRY), COUNT)
-    course = numbers(motion_of(table, model, data), COUNT)
+    parameters = numbers(motion_of(table, model, data), COUNT)
     # The sheath lies where it does, whatever moves past it.
     centre = numbers(word(data + word(table + GEOM_XPOS)) + 24 * geoms[0], 3)
-    if sheathed(table, model, data, int(course[10]), centre):
+    if sheathed(table, model, data, int(parameters[10]), centre):
         if clearance(entry, local[0], local[1], local[2]) >= FREE:
             return 0
     scratch = np.empty(WARP + 4 * VALUES)
     there, values = scratch[:WARP], scratch[WARP:].reshape(VALUES, 4)
-    warp(lattice, course, time, local[0], local[1], local[2], values, there)
+    course = courses(parameters, time)
+    warp(lattice, course, local[0], local[1], local[2], values, there)
+    strain = 0.0
+    for k in range(3, 12):
+        strain += (there[k] - (1.0 if k % 4 == 3 else 0.0)) ** 2
     x, y, z = (
         there[3] * axis[0] + there[4] * axis[1] + there[5] * axis[2],
         there[6] * axis[0] + there[7] * axis[1] + there[8] * axis[2],
@@ -289,8 +306,11 @@ def in_motion(
     )
     stretch = math.sqrt(x * x + y * y + z * z)
     way, image = (x / stretch, y / stretch, z / stretch), (there[0], there[1], there[2])
-    reach = _STRAIN * (limit - there[12]) + _IMAGE
+    travel, aside, far = sweep(table, model, data, geoms, axis, half, law)
+    reach = (1.0 + math.sqrt(strain)) * (max(limit, far) - there[12]) + _IMAGE
     seen = touches(entry, image, way, half * stretch, closed, reach)
+    if seen[0] == 0:
+        return 0
     rows, written = np.empty((6, 4)), 0
     for n in range(seen[0]):
         t, depth, lowest, most = nth(seen, n, soft)
@@ -299,7 +319,7 @@ def in_motion(
         turns = 0 if half == 0.0 else 1 + int(lowest and abs(t) >= half * stretch)
         t /= stretch
         x, y, z = along(local, axis, t)
-        warp(lattice, course, time, x, y, z, values, there)
+        warp(lattice, course, x, y, z, values, there)
         place = (there[0], there[1], there[2])
         depth = clearance(entry, place[0], place[1], place[2])
         if depth >= FREE:
@@ -307,14 +327,24 @@ def in_motion(
         normal = away(entry, place[0], place[1], place[2])
         if normal == (0.0, 0.0, 0.0):
             continue
-        # A lumen that has grown is held where it is, not where it was at rest.
-        grown = max(held - there[12], 1e-9) if held > 0.0 else 0.0
-        planes = tangents(
-            entry, place, way, normal, depth, reach, grown, light, turns, rows
-        )
+        rows[0, 0], rows[0, 1], rows[0, 2] = normal
+        rows[0, 3], planes = depth, 1
         in_space(there, rows, planes)
+        bound = limit if lowest else radius + margin
+        if rows[0, 3] <= bound:
+            # A lumen that has grown is held where it is, not where it was at rest.
+            grown = max(held - there[12], 1e-9) if held > 0.0 else 0.0
+            planes = tangents(
+                entry, place, way, normal, depth, reach, grown, light, turns, rows
+            )
+            in_space(there, rows, planes)
+        else:
+            bound, hits = np.inf, along(travel, aside, t)
+            ahead = rows[0, 0] * hits[0] + rows[0, 1] * hits[1] + rows[0, 2] * hits[2]
+            if rows[0, 3] + ahead > radius - _IMPACT:
+                continue
         written = put(
-            table, data, contacts, geoms, written, most, rows, planes, t, limit, law
+            table, data, contacts, geoms, written, most, rows, planes, t, bound, law
         )
     return written
 

@@ -4,8 +4,9 @@ import numpy as np
 
 from cathsim_dmc.entities import devices
 from cathsim_dmc.entities.arena import BLOOD_DENSITY
-from cathsim_dmc.entities.chain import TIMESTEP, TORSION_ARMATURE, Chain
+from cathsim_dmc.entities.chain import TIMESTEP, Chain, Links
 from cathsim_dmc.entities.coaxial import carried_mass
+from cathsim_dmc.entities.contact import device_contact
 
 # Lag of the drives of the tip, s. It has no source; with 0.05 s, noise on the motors
 # whips the tip into the wall (docs/soak.md).
@@ -40,23 +41,29 @@ class Catheter(Chain):
         self._device = devices.get(device)
         self._discretisation = discretisation or devices.Discretisation()
         self._lengths = self._discretisation.link_lengths(self._device)
-        self._twists = []
-        self._twist_compliances = self._torsion_hinges()
-        self._assemble(
+        self._first = len(self._lengths) - self._device.tip_links  # of the tip
+        joints = range(1, len(self._lengths))
+        links = Links(
             self._lengths,
             self._device.outer_radius,
+            masses=(self._moved_mass * self._lengths).tolist(),
+            compliances=[self._joint_compliance(index) for index in joints],
+            rest_angles=[(0.0, self._rest_angle(index)) for index in joints],
+            axial_stiffness=self._device.axial_stiffness,
+            tip=self._first,
+            twists=self._torsion_hinges(),
+        )
+        self._assemble(
+            links,
+            device_contact(friction),
             stroke=stroke,
             rotation=rotation,
-            friction=friction,
             timestep=timestep,
             name=name,
         )
 
-    def _in_tip(self, index: int) -> bool:
-        return index >= len(self._lengths) - self._device.tip_links
-
     def _section(self, index: int) -> devices.Section:
-        return self._device.tip if self._in_tip(index) else self._device.shaft
+        return self._device.tip if index >= self._first else self._device.shaft
 
     def _joint_compliance(self, index: int) -> float:
         """Bending compliance of a joint, rad/(N·m).
@@ -98,53 +105,29 @@ class Catheter(Chain):
         links = np.round((edges[:-1] + edges[1:]) / 2 + 0.5).astype(int)
         return dict(zip(links.tolist(), np.diff(total).tolist(), strict=True))
 
-    def _axial_stiffness(self) -> float:
-        return self._device.axial_stiffness
-
-    def _rest_angles(self, index: int) -> tuple[float, float]:
+    def _rest_angle(self, index: int) -> float:
         start = self._lengths[index - 1 :].sum() - self._lengths[index - 1] / 2
         stop = self._lengths[index:].sum() - self._lengths[index] / 2
-        return 0.0, self._device.rest_angle(start, stop)
-
-    def _link_mass(self, index: int) -> float:
-        return self._moved_mass * self._lengths[index]
+        return self._device.rest_angle(start, stop)
 
     @property
     def _moved_mass(self) -> float:
         """Mass per length that moves with the device across its axis, kg/m."""
         return self._device.linear_density + carried_mass(self.devices)
 
-    def _add_twist(self, link, index: int) -> None:
-        compliance = self._twist_compliances.get(index)
-        if compliance is None:
-            return
-        twist = 1 / compliance
-        self._twists.append(
-            link.add(
-                "joint",
-                name=f"twist_{index}",
-                axis=(0, 0, 1),
-                stiffness=twist,
-                damping=self._relaxation_time * twist,
-                armature=TORSION_ARMATURE,
-            )
-        )
-
     def _build_motors(self):
         self._tip_motors = []
         if self._device.steerable:
-            first = len(self._lengths) - self._device.tip_links
-            for index in range(first, len(self._lengths)):
+            for index in range(self._first, len(self._lengths)):
                 # This torque bends the free joint by the steering angle: a motor shifts
                 # the rest shape and adds no stiffness.
-                compliance = self._joint_compliance(index)
-                torque = self._device.steering_angle / compliance
+                torque = self._device.steering_angle / self._joint_compliance(index)
                 for axis in ("x", "y"):
                     joint = self._mjcf_root.find("joint", f"bend_{axis}_{index}")
                     self._tip_motors.append(
                         self._mjcf_root.actuator.add(
                             "general",
-                            name=f"tip_{axis}_{index - first}",
+                            name=f"tip_{axis}_{index - self._first}",
                             joint=joint,
                             ctrllimited=True,
                             ctrlrange=(-1, 1),
@@ -171,11 +154,6 @@ class Catheter(Chain):
         displaced = BLOOD_DENSITY * np.pi * self._device.outer_radius**2
         weight = max(0.0, self._device.linear_density - displaced)
         return BLOOD_DENSITY / (1 - weight / self._moved_mass)
-
-    @property
-    def hinges(self) -> tuple:
-        """Hinges that represent the bending and torsion of the rod."""
-        return (*self.bends, *self._twists)
 
     @property
     def tip_motors(self) -> tuple:

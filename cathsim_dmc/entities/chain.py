@@ -1,11 +1,12 @@
 """A chain of rigid links with a driven base, the model of slender devices."""
 
-from typing import Any
+from collections.abc import Mapping, Sequence
+from types import MappingProxyType
+from typing import Any, NamedTuple
 
 import numpy as np
 from dm_control import composer, mjcf
 
-from cathsim_dmc.entities.contact import device_contact
 from cathsim_dmc.entities.device import Device
 from cathsim_dmc.entities.posture import x_first
 
@@ -54,11 +55,35 @@ def hinge_time(material: Any, timestep: float) -> Any:
     return np.maximum(material - timestep, 0.0)
 
 
+class Links(NamedTuple):
+    """What a chain of n links is made of, from proximal to distal.
+
+    Attributes:
+        lengths: (n,), m.
+        radius: of all links, m.
+        masses: n, kg.
+        compliances: n - 1 of the joints in bending, rad/(N·m).
+        rest_angles: n - 1 pairs, of the hinges about x and y, rad.
+        axial_stiffness: EA of the whole device, N.
+        tip: number of the first link that is drawn as part of the tip.
+        twists: compliance of the torsion hinges, rad/(N·m), by link.
+    """
+
+    lengths: np.ndarray
+    radius: float
+    masses: Sequence[float]
+    compliances: Sequence[float]
+    rest_angles: Sequence[tuple[float, float]]
+    axial_stiffness: float
+    tip: int
+    twists: Mapping[int, float] = MappingProxyType({})
+
+
 class Chain(composer.Entity):
     """Links with hinges about x and y; +z of every link points to the distal end.
 
     The origin of the entity is the position of the distal end at zero insertion.
-    `Catheter` and `DeviceStack` define the properties of the links.
+    `Catheter` and `DeviceStack` say what the links are made of.
 
     Attributes:
         coaxial: Whether the devices are coaxial ones, each moved by itself.
@@ -68,35 +93,33 @@ class Chain(composer.Entity):
 
     def _assemble(
         self,
-        link_lengths: np.ndarray,
-        radius: float,
+        links: Links,
+        contact: dict[str, Any],
         *,
         stroke: float,
         rotation: bool,
-        friction: float,
         timestep: float,
         name: str,
     ) -> None:
         """Builds base, links, head, motors and sensors.
 
         Args:
-            link_lengths: (n,) lengths from proximal to distal, m.
-            radius: radius of all links, m.
+            links: what the chain is made of.
+            contact: attributes of the geoms.
             stroke: longest insertion, m.
             rotation: whether the base has a rotation joint.
-            friction: Coulomb coefficient; MuJoCo takes the larger of the two geoms'.
             timestep: physics step with which the chain will be simulated, s.
         """
         if not stroke > 0:
             raise ValueError(f"stroke is {stroke} m; it must be positive")
-        self._lengths, self._radius, self._stroke = link_lengths, radius, stroke
+        self._made, self._contact, self._stroke = links, contact, stroke
+        self._lengths, self._radius = links.lengths, links.radius
         self._timestep = timestep
         self._mjcf_root = mjcf.RootElement(model=name)
         self._mjcf_root.compiler.angle = "radian"
-        self._contact = self._surface(friction)
         self._links = []
         self._link_geoms = []
-        self._bends = []
+        self._bends, self._twists = [], []
         self._build_base(rotation)
         for index in range(1, len(self._lengths)):
             self._build_link(index)
@@ -110,35 +133,6 @@ class Chain(composer.Entity):
         )
         self._build_motors()
         self._build_sensors()
-
-    # Properties of the links.
-
-    def _axial_stiffness(self) -> float:
-        """EA of the whole device, N."""
-        raise NotImplementedError
-
-    def _joint_compliance(self, index: int) -> float:
-        """Bending compliance of a joint, rad/(N·m)."""
-        raise NotImplementedError
-
-    def _rest_angles(self, index: int) -> tuple[float, float]:
-        """Rest angles of the hinges of a joint about x and y, rad."""
-        raise NotImplementedError
-
-    def _link_mass(self, index: int) -> float:
-        """Mass of a link, kg."""
-        raise NotImplementedError
-
-    def _in_tip(self, index: int) -> bool:
-        """Whether a link is drawn as part of the tip."""
-        raise NotImplementedError
-
-    def _surface(self, friction: float) -> dict[str, Any]:
-        """Contact attributes of the geoms."""
-        return device_contact(friction)
-
-    def _add_twist(self, link, index: int) -> None:
-        """Adds the torsion hinge of a link, if it has one."""
 
     @property
     def device(self) -> Device:
@@ -170,7 +164,7 @@ class Chain(composer.Entity):
             limited=True,
             range=(0.0, self._stroke),
         )
-        stiffness = self._axial_stiffness() / self._lengths.sum()
+        stiffness = self._made.axial_stiffness / self._lengths.sum()
         base.add(
             "joint",
             name="compression",
@@ -210,9 +204,20 @@ class Chain(composer.Entity):
             "body", name=f"link_{index}", pos=(0, 0, self._lengths[index - 1])
         )
         self._links.append(link)
-        stiffness = 1 / self._joint_compliance(index)
-        rest = dict(zip("xy", self._rest_angles(index), strict=True))
-        self._add_twist(link, index)
+        stiffness = 1 / self._made.compliances[index - 1]
+        rest = dict(zip("xy", self._made.rest_angles[index - 1], strict=True))
+        if index in self._made.twists:
+            twist = 1 / self._made.twists[index]
+            self._twists.append(
+                link.add(
+                    "joint",
+                    name=f"twist_{index}",
+                    axis=(0, 0, 1),
+                    stiffness=twist,
+                    damping=self._relaxation_time * twist,
+                    armature=TORSION_ARMATURE,
+                )
+            )
         bends = {
             axis: link.add(
                 "joint",
@@ -237,8 +242,8 @@ class Chain(composer.Entity):
                 type="capsule",
                 fromto=(0, 0, 0, 0, 0, length),
                 size=[self._radius],
-                mass=self._link_mass(index),
-                rgba=TIP_COLOUR if self._in_tip(index) else COLOUR,
+                mass=self._made.masses[index],
+                rgba=TIP_COLOUR if index >= self._made.tip else COLOUR,
                 **self._contact,
             )
         )
@@ -334,7 +339,7 @@ class Chain(composer.Entity):
     @property
     def hinges(self) -> tuple:
         """Hinges that represent the bending and torsion of the rod."""
-        return self.bends
+        return (*self._bends, *self._twists)
 
     @property
     def push_force(self):

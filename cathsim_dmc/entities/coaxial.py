@@ -19,8 +19,6 @@ bend_y - i bend_x, and a rotation by φ about the device multiplies by exp(iφ).
 frames of the links twist, because two hinges do (`Stack.bent`).
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -122,13 +120,13 @@ class Stack:
         # of the latter two is the space beyond the device's end.
         pieces = [_pieces(device) for device in self.devices]
         most = max(len(edges) for edges, _, _ in pieces)
-        self._edges = np.full((count, most), np.inf)
-        self._bending = np.zeros((count, most + 1))
-        self._moment = np.zeros((count, most + 1))
-        for k, (edges, bending, moment) in enumerate(pieces):
-            self._edges[k, : len(edges)] = edges
-            self._bending[k, 1 : len(edges) + 1] = bending
-            self._moment[k, 1 : len(edges) + 1] = moment
+        edges = np.full((count, most), np.inf)
+        bending, moment = np.zeros((2, count, most + 1))
+        for k, (starts, stiffness, moments) in enumerate(pieces):
+            edges[k, : len(starts)] = starts
+            bending[k, 1 : len(starts) + 1] = stiffness
+            moment[k, 1 : len(starts) + 1] = moments
+        self._tables = self.nodes, self.link_lengths, edges, bending, moment
         self._radius = np.array([device.outer_radius for device in devices])
         self._ratio = np.array([device.friction_ratio for device in devices])
         self._densities = np.array(
@@ -147,17 +145,9 @@ class Stack:
     def overlap(self, gaps: np.ndarray) -> Overlap:
         """Integrals around the joints and over the links."""
         gaps = np.ascontiguousarray(gaps, np.float64)
-        integrals = self._loops.overlaps(
-            gaps,
-            self.nodes,
-            self.link_lengths,
-            self._edges,
-            self._bending,
-            self._moment,
-        )
-        return Overlap(
-            *integrals, *self._loops.shares(gaps, self.nodes, self.link_lengths)
-        )
+        integrals = self._loops.overlaps(gaps, *self._tables)
+        shares = self._loops.shares(gaps, self.nodes, self.link_lengths)
+        return Overlap(*integrals, *shares)
 
     def rest_angles(self, overlap: Overlap, turns: np.ndarray) -> np.ndarray:
         """Rest angles (N, J) of the joints, complex, rad."""
@@ -266,11 +256,7 @@ class Stack:
         """
         return self._loops.axial(
             np.ascontiguousarray(gaps),
-            self.nodes,
-            self.link_lengths,
-            self._edges,
-            self._bending,
-            self._moment,
+            *self._tables,
             overlap.compliance,
             overlap.rest,
             bends,

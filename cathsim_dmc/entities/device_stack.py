@@ -1,13 +1,12 @@
 """Coaxial devices in the simulation: guidewire, guidewire in catheter, and so on."""
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 
 from cathsim_dmc.entities import devices as library
 from cathsim_dmc.entities.arena import BLOOD_DENSITY
-from cathsim_dmc.entities.chain import TIMESTEP, Chain
+from cathsim_dmc.entities.chain import TIMESTEP, Chain, Links
 from cathsim_dmc.entities.coaxial import Stack, carried_mass, weight_density
 from cathsim_dmc.entities.contact import FRICTION, coaxial_contact
 from cathsim_dmc.entities.device import Device
@@ -80,38 +79,25 @@ class DeviceStack(Chain):
         self._gaps = lead * np.arange(len(self._devices), dtype=np.float64)
         overlap = self._stack.overlap(self._gaps[None])
         turns = np.zeros((1, len(self._devices), len(self._stack.spans)))
-        self._compliance = overlap.compliance[0]
-        self._rest = self._stack.unloaded_hinges(overlap, turns)[0]
-        self._mass = self._stack.links(overlap, np.zeros(1)).mass[0]
-        self._assemble(
+        tip = self._stack.nodes <= self._devices[0].tip_length + 1e-9
+        links = Links(
             self._stack.link_lengths,
             # The largest radius, so that the bounding volumes enclose all devices.
             max(device.outer_radius for device in self._devices),
+            masses=self._stack.links(overlap, np.zeros(1)).mass[0].tolist(),
+            compliances=overlap.compliance[0].tolist(),
+            rest_angles=self._stack.unloaded_hinges(overlap, turns)[0].tolist(),
+            axial_stiffness=sum(device.axial_stiffness for device in self._devices),
+            tip=int(tip.argmax()),
+        )
+        self._assemble(
+            links,
+            coaxial_contact(friction),
             stroke=stroke,
             rotation=False,
-            friction=friction,
             timestep=timestep,
             name=name,
         )
-
-    def _axial_stiffness(self) -> float:
-        return sum(device.axial_stiffness for device in self._devices)
-
-    def _joint_compliance(self, index: int) -> float:
-        return float(self._compliance[index - 1])
-
-    def _rest_angles(self, index: int) -> tuple[float, float]:
-        about_x, about_y = self._rest[index - 1].tolist()
-        return about_x, about_y
-
-    def _link_mass(self, index: int) -> float:
-        return float(self._mass[index])
-
-    def _surface(self, friction: float) -> dict[str, Any]:
-        return coaxial_contact(friction)
-
-    def _in_tip(self, index: int) -> bool:
-        return bool(self._stack.nodes[index] <= self._devices[0].tip_length + 1e-9)
 
     @property
     def device(self) -> Device:

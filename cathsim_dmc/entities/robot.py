@@ -12,20 +12,18 @@ without rotation lies on the table below the device. ``+x`` is then the patient'
 left.
 
 **Motion** is perfect, as in the published system: the joints of the device are driven,
-and the robot is posed accordingly. :func:`follower_posture` gives every robot joint as
-a function of insertion and rotation; the task writes the joints into the simulation.
+and the robot is posed accordingly. :func:`postures` gives every robot joint as a
+function of insertion and rotation; the task writes the joints into the simulation.
 They are slides and hinges without load (gravity compensated, no actuator, no contact,
 no limit in the solver), so they do not move between two poses.
 """
-
-from __future__ import annotations
 
 import math
 from pathlib import Path
 
 import numpy as np
 from dm_control import composer, mjcf
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 # --- The clamp-advance-release cycle, in metres of insertion. ---
 # The stroke fits a rail of 0.35 m, and the clamps change about once a second at the
@@ -59,48 +57,15 @@ _PHASES = (OVERLAP / 2, OVERLAP / 2 + CYCLE / 2)
 _CYCLE = (CYCLE, STROKE, JAW_TRAVEL, RETURN, JAW_OPENING)
 
 
-def follower_posture(
-    insertion: ArrayLike,
-    rotation: ArrayLike = 0.0,
-    *,
-    guidewire_insertion: ArrayLike | None = None,
-    guidewire_rotation: ArrayLike | None = None,
-) -> NDArray[np.float64]:
-    """Joint positions of the follower for an insertion and a rotation.
-
-    Args:
-        insertion: (...,) metres from the start, positive into the patient.
-        rotation: (...,) radians about +z from the start.
-        guidewire_insertion: (...,) metres; the catheter's if omitted, so that both
-            pairs of clamps and both rotary units hold one device. Otherwise the front
-            clamps hold the catheter and the rear clamps the guidewire.
-        guidewire_rotation: (...,) radians; the catheter's if omitted.
-
-    Returns:
-        (..., len(JOINTS)) float64 in the order of ``JOINTS``; metres for slides,
-        radians for hinges, continuous in every argument (angles do not wrap).
-
-    Raises:
-        ValueError: an argument is not finite, or the shapes do not broadcast.
-    """
-    given = (
-        insertion,
-        rotation,
-        insertion if guidewire_insertion is None else guidewire_insertion,
-        rotation if guidewire_rotation is None else guidewire_rotation,
-    )
-    table = np.empty((len(given), *np.broadcast(*given).shape))
-    for row, each in enumerate(given):
-        table[row] = each
-    posture = postures(table.reshape(len(given), -1))
-    return posture.reshape(*table.shape[1:], len(JOINTS))
-
-
 def postures(given: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Joint positions (N, len(JOINTS)) of N followers; see `follower_posture`.
+    """Joint positions (N, len(JOINTS)) of N followers, m for slides, rad for hinges.
+
+    They are continuous in every argument: angles do not wrap.
 
     Args:
-        given: (4, N), insertion and rotation of the catheter and of the guidewire.
+        given: (4, N), insertion (m) and rotation (rad) of the catheter from the start,
+            which the front clamps hold, and of the guidewire in the rear clamps; both
+            pairs hold one device where they are the same.
 
     Raises:
         ValueError: a number is not finite.

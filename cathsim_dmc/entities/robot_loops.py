@@ -33,7 +33,7 @@ def smoothstep(u):
 
 @compiled
 def postures(given, phases, cycle, radius, ratio):
-    """Joints (N, 16) in the order of `JOINTS`, see `robot.follower_posture`.
+    """Joints (N, 16) in the order of `JOINTS`, see `robot.postures`.
 
     Args:
         given: (4, N), insertion and rotation, and those of the guidewire, m and rad.

@@ -3,14 +3,12 @@
 import numpy as np
 from dm_control import composer, mjcf
 
+from cathsim_dmc.anatomy import Centreline
 from cathsim_dmc.collision import fields
 from cathsim_dmc.entities.contact import sheath_contact
 
 CLEARANCE = 0.35e-3  # m between the device and the bore all round
-# Largest distance of a straight piece of the bore from the line, m.
-_CHORD_TOLERANCE = 0.1e-3
-_SPACING = 0.5e-3  # m, of the points that sample a curved line
-_LEAST_CURVE_RADIUS = 0.01  # m
+_LEAST_CURVE_RADIUS, _SPACING = 0.01, 0.5e-3  # m
 _VISIBLE_WALL = 0.4e-3  # m, as drawn
 _COLOUR = (0.35, 0.45, 0.6, 0.35)
 
@@ -56,25 +54,28 @@ class Sheath(composer.Entity):
         if not device_radius > 0:
             raise ValueError(f"device_radius is {device_radius} m; it must be positive")
         self._bore_radius = device_radius + CLEARANCE
-        self._axis = _Axis(centreline)
+        line = Centreline(centreline, np.full(len(centreline), self._bore_radius))
+        _refuse_sharp_bends(line)
+        self._line = line
         self._mjcf_root = mjcf.RootElement(model=name)
         self._bore = self._mjcf_root.worldbody.add("body", name="bore")
-        points, widths = self._axis.bore(self._bore_radius, link_length)
+        inwards = _sagitta(line, link_length) / 2
+        widths = self._bore_radius + np.linalg.norm(inwards, axis=-1)
         self._bore_geom = self._bore.add(
             "geom",
             name="bore",
-            **fields.carrier(fields.Bore(points, widths)),
+            **fields.carrier(fields.Bore(line.points + inwards, widths)),
             **sheath_contact(),
             mass=0,
             group=5,
             rgba=(0, 0, 0, 0),
         )
-        for index in range(len(self._axis.arcs) - 1):
+        for index in range(len(line.points) - 1):
             self._bore.add(
                 "geom",
                 name=f"tube_{index}",
                 type="cylinder",
-                fromto=self._axis.vertices[index : index + 2].ravel(),
+                fromto=line.points[index : index + 2].ravel(),
                 size=[self._bore_radius + _VISIBLE_WALL],
                 contype=0,
                 conaffinity=0,
@@ -100,13 +101,13 @@ class Sheath(composer.Entity):
 
     @property
     def vertices(self) -> np.ndarray:
-        """Ends (p + 1, 3) of the straight pieces of the axis, m, entity's frame."""
-        return self._axis.vertices
+        """Points (n, 3) of the axis, m, entity's frame."""
+        return self._line.points
 
     @property
     def length(self) -> float:
         """Length of the bore along its axis, m."""
-        return float(self._axis.arcs[-1])
+        return self._line.length
 
     @property
     def bore_radius(self) -> float:
@@ -114,96 +115,25 @@ class Sheath(composer.Entity):
         return self._bore_radius
 
 
-class _Axis:
-    """The line of a sheath as straight pieces.
-
-    Attributes:
-        vertices: (p + 1, 3), ends of the pieces, m.
-        arcs: (p + 1,), arc lengths of the vertices, m.
-    """
-
-    def __init__(self, centreline: np.ndarray):
-        points = np.asarray(centreline, dtype=np.float64)
-        if points.ndim != 2 or points.shape[1] != 3 or len(points) < 2:
-            raise ValueError(
-                f"centreline has shape {points.shape}; give (n, 3) with n >= 2"
-            )
-        steps = np.linalg.norm(np.diff(points, axis=0), axis=-1)
-        if not (np.isfinite(steps).all() and (steps > 0).all()):
-            raise ValueError(
-                "centreline repeats a point or has a coordinate that is not finite"
-            )
-        arc = np.concatenate([[0.0], np.cumsum(steps)])
-        self._fine_arc = np.linspace(0, arc[-1], max(2, round(arc[-1] / _SPACING) + 1))
-        self._fine = np.stack(
-            [np.interp(self._fine_arc, arc, axis) for axis in points.T], axis=-1
+def _refuse_sharp_bends(line: Centreline) -> None:
+    # Over a window, because a line given by a few points has corners.
+    window = round(_LEAST_CURVE_RADIUS / _SPACING)
+    heading = line.at(np.arange(0.0, line.length + _SPACING, _SPACING)).tangent
+    cosine = np.vecdot(heading[window:], heading[:-window]).min(initial=1.0)
+    if cosine < np.cos(1.0):
+        raise ValueError(
+            f"centreline turns by {np.degrees(np.arccos(cosine)):.0f}° within "
+            f"{1e3 * _LEAST_CURVE_RADIUS:g} mm; a sheath bends with a radius of "
+            f"{1e3 * _LEAST_CURVE_RADIUS:g} mm at least: smooth the line"
         )
-        tangents = np.gradient(self._fine, self._fine_arc, axis=0)
-        tangents /= np.linalg.norm(tangents, axis=-1, keepdims=True)
-        self._check_bends(tangents)
-        chosen = self._pieces()
-        self.vertices = self._fine[chosen]
-        self.arcs = self._fine_arc[chosen]
 
-    def _check_bends(self, tangents: np.ndarray) -> None:
-        # Over a window, because a line given by a few points has corners.
-        window = round(_LEAST_CURVE_RADIUS / _SPACING)
-        if len(tangents) <= window:
-            return
-        cosine = np.vecdot(tangents[window:], tangents[:-window]).min()
-        if cosine < np.cos(1.0):
-            raise ValueError(
-                f"centreline turns by {np.degrees(np.arccos(cosine)):.0f}° within "
-                f"{1e3 * _LEAST_CURVE_RADIUS:g} mm; a sheath bends with a radius of "
-                f"{1e3 * _LEAST_CURVE_RADIUS:g} mm at least: smooth the line"
-            )
 
-    def _pieces(self) -> list[int]:
-        """Indices of the fine points at the ends of the straight pieces."""
-        chosen, last = [0], len(self._fine) - 1
-        while chosen[-1] < last:
-            start = chosen[-1]
-            low, high = start + 1, last
-            while low < high:  # the deviation grows with the length of the piece
-                middle = (low + high + 1) // 2
-                if self._deviation(start, middle) <= _CHORD_TOLERANCE:
-                    low = middle
-                else:
-                    high = middle - 1
-            chosen.append(low)
-        return chosen
-
-    def _deviation(self, start: int, stop: int) -> float:
-        chord = self._fine[stop] - self._fine[start]
-        offsets = self._fine[start : stop + 1] - self._fine[start]
-        across = np.cross(offsets, chord / np.linalg.norm(chord))
-        return float(np.linalg.norm(across, axis=-1).max())
-
-    def bore(self, radius: float, link_length: float) -> tuple[np.ndarray, np.ndarray]:
-        """Axis and radii of a bore that lets a chord pass.
-
-        Args:
-            radius: radius where the line is straight, m.
-            link_length: chord that the bore must let pass, m.
-
-        Returns:
-            points (p + 1, 3) and radii (p + 1,), m.
-        """
-        inwards = self._sagitta(link_length)
-        wider = np.linalg.norm(inwards, axis=-1) / 2
-        return self.vertices + inwards / 2, radius + wider
-
-    def _sagitta(self, chord: float) -> np.ndarray:
-        """Vectors (p + 1, 3) from the line to the middle of a chord of it, m."""
-        half, end = chord / 2, self._fine_arc[-1]
-        if not 0 < chord < end:
-            return np.zeros_like(self.vertices)
-        # Beyond its ends, the line is assumed to bend as at its ends.
-        arcs = np.clip(self.arcs, half, end - half)
-
-        def at(arc: np.ndarray) -> np.ndarray:
-            return np.stack(
-                [np.interp(arc, self._fine_arc, axis) for axis in self._fine.T], axis=-1
-            )
-
-        return (at(arcs - half) + at(arcs + half)) / 2 - at(arcs)
+def _sagitta(line: Centreline, chord: float) -> np.ndarray:
+    """Vectors (n, 3) m from the points of a line to the middles of chords of it."""
+    half = chord / 2
+    if not 0 < chord < line.length:
+        return np.zeros_like(line.points)
+    # Beyond its ends, the line is assumed to bend as at its ends.
+    arcs = np.clip(line.arc_length, half, line.length - half)
+    before, after = (line.at(arcs + way).position for way in (-half, half))
+    return (before + after) / 2 - line.at(arcs).position

@@ -6,8 +6,6 @@ GJ/l (Δφ + τ Δφ'), as the torsion hinges of a single catheter have. The rod
 inertia: it is in equilibrium with its loads at the end of every control step.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

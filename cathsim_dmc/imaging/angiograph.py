@@ -1,7 +1,5 @@
 """The angiography machine: one or two C-arms before one anatomy, for many devices."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -35,6 +33,9 @@ class Angiograph:
     """C-arms before an anatomy; images have the leading axis N of the devices.
 
     The path length through the vessel is cached for each pair of angles.
+
+    Attributes:
+        options: Set-up of the machine.
     """
 
     def __init__(
@@ -50,14 +51,14 @@ class Angiograph:
             faces: (F, 3), counter-clockwise seen from outside.
         """
         self._vertices, self._faces = vertices, faces
-        self._options = options or FluoroscopyOptions()
+        self.options = options or FluoroscopyOptions()
         self._views: dict[tuple[int, int], Planes] = {}
         self._usual = self._view(0, 0)
 
     def _view(self, primary: int, secondary: int) -> Planes:
         key = (primary, secondary)
         if key not in self._views:
-            options = self._options
+            options = self.options
             self._views[key] = tuple(
                 Fluoroscope.from_surface(
                     self._vertices,
@@ -88,11 +89,6 @@ class Angiograph:
             )
             for plane in view
         )
-
-    @property
-    def options(self) -> FluoroscopyOptions:
-        """Set-up of the machine."""
-        return self._options
 
 
 def images(

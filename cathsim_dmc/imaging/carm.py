@@ -8,8 +8,6 @@ looks from the detector towards the source: the patient's left is on the right o
 AP image and the head is up.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -95,7 +93,7 @@ class CArm:
             object.__setattr__(self, name, value)
 
     @classmethod
-    def view(cls, name: str = "AP", **fields) -> CArm:
+    def view(cls, name: str = "AP", **fields) -> "CArm":
         """C-arm of a named view; further fields as in the constructor.
 
         Raises:
@@ -104,7 +102,7 @@ class CArm:
         primary, secondary = np.deg2rad(VIEWS[bounds.choice("view", name, VIEWS)])
         return cls(primary=primary, secondary=secondary, **fields)
 
-    def centred_on(self, points: ArrayLike) -> CArm:
+    def centred_on(self, points: ArrayLike) -> "CArm":
         """The same arm with its isocentre in the middle of the box round `points`.
 
         Args:

@@ -5,8 +5,6 @@ signal of 1 is what the detector receives behind the patient where there is neit
 vessel nor device.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from functools import cache
@@ -120,19 +118,10 @@ def blurred(signal: ArrayLike, sigma: float) -> np.ndarray:
     out = np.asarray(signal, dtype=np.float32)
     if sigma < LEAST_BLUR:
         return out
+    from scipy.ndimage import gaussian_filter
+
     reach = math.ceil(3.0 * sigma)
-    weight = np.exp(-0.5 * (np.arange(-reach, reach + 1) / sigma) ** 2)
-    weight = (weight / weight.sum()).astype(np.float32)
-    for axis in (-2, -1):
-        count = out.shape[axis]
-        edges = [(0, 0)] * out.ndim
-        edges[axis] = (reach, reach)
-        padded = np.moveaxis(np.pad(out, edges, mode="edge"), axis, -1)
-        total = weight[0] * padded[..., :count]
-        for k in range(1, 2 * reach + 1):
-            total += weight[k] * padded[..., k : k + count]
-        out = np.moveaxis(total, -1, axis)
-    return out
+    return gaussian_filter(out, sigma, mode="nearest", radius=reach, axes=(-2, -1))
 
 
 def grey(signal: ArrayLike, gain: float = GAIN) -> np.ndarray:

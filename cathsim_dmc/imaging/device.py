@@ -6,13 +6,12 @@ over the image, thickness times pixel area is the volume of the device, wherever
 moves and however it turns.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from cathsim_dmc.imaging import materials
 from cathsim_dmc.imaging.carm import CArm
 
 
@@ -23,19 +22,18 @@ class Shadow:
     Attributes:
         points: (..., n, 3) joints from base to tip, world frame, m.
         radius: as in `device_thickness`.
-        mu: excess attenuation, homogenised over its cross-section, 1/m; None for that
-            of the fluoroscope's device, with its marker.
+        mu: excess attenuation, homogenised over its cross-section, 1/m.
         marker_mu: that of the marker at its tip, 1/m; None for no marker.
         marker_length: of the marker, m, measured back from the tip.
     """
 
     points: np.ndarray
     radius: ArrayLike
-    mu: float | None = None
-    marker_mu: float | None = None
-    marker_length: float = 0.0
+    mu: float = materials.CATHETER
+    marker_mu: float | None = materials.MARKER
+    marker_length: float = materials.MARKER_LENGTH
 
-    def of(self, rows: np.ndarray) -> Shadow:
+    def of(self, rows: np.ndarray) -> "Shadow":
         """The shadows of some frames of a batch; the radius is the same for all."""
         return replace(self, points=self.points[rows])
 

@@ -66,12 +66,12 @@ def views(
 
 
 @compiled
-def _clear(head, coarse, index, samples, lattice, parameters, time, x, y, z, values):
+def _clear(head, coarse, index, samples, lattice, course, x, y, z, values):
     """Depth (m) of a place in space; in a vessel that moves, within its stretch."""
     growth = 0.0
     if len(lattice):
         there = values[8:].reshape(-1)
-        motion_loops.warp(lattice, parameters, time, x, y, z, values, there)
+        motion_loops.warp(lattice, course, x, y, z, values, there)
         x, y, z, growth = there[0], there[1], there[2], there[12]
     level = behind(head, x, y, z)
     if level > 0.0:
@@ -80,16 +80,14 @@ def _clear(head, coarse, index, samples, lattice, parameters, time, x, y, z, val
 
 
 @compiled
-def _met(head, coarse, index, samples, lattice, parameters, time, eye, x, y, z, values):
+def _met(head, coarse, index, samples, lattice, course, eye, x, y, z, values):
     """Way (m) of a ray from an eye (3) along a unit vector to the wall."""
     # A displacement that stretches space makes distances in it shorter.
     stride = 1.0 / (1.0 + STEEPEST) if len(lattice) else 1.0
     t, step, before = 0.0, 0.0, 0.0
     for _ in range(_MOST_STEPS):
         a, b, c = eye[0] + t * x, eye[1] + t * y, eye[2] + t * z
-        depth = _clear(
-            head, coarse, index, samples, lattice, parameters, time, a, b, c, values
-        )
+        depth = _clear(head, coarse, index, samples, lattice, course, a, b, c, values)
         if abs(depth) < _CLOSE or t == FARTHEST_WALL:
             break
         ahead = stride * depth
@@ -107,6 +105,7 @@ def _trace(
 ):
     """Writes grey levels and distances (rows, columns) of the view of one camera."""
     values, slope = np.empty((8 + motion_loops.WARP // 4, 4)), np.empty(3)
+    course = motion_loops.courses(parameters, time)
     rows, columns = far.shape
     for i in range(rows):
         v = (i + 0.5 - 0.5 * rows) / focal
@@ -117,9 +116,8 @@ def _trace(
             y = (axes[1, 0] * u + axes[1, 1] * v + axes[1, 2]) / norm
             z = (axes[2, 0] * u + axes[2, 1] * v + axes[2, 2]) / norm
             t = _met(
-                head, coarse, index, samples, lattice, parameters, time,
-                eye, x, y, z, values,
-            )  # fmt: skip
+                head, coarse, index, samples, lattice, course, eye, x, y, z, values
+            )
             far[i, j] = t
             for k in range(3):
                 slope[k] = 0.0
@@ -132,9 +130,8 @@ def _trace(
                     else:
                         c += side
                     slope[k] += side * _clear(
-                        head, coarse, index, samples, lattice, parameters, time,
-                        a, b, c, values,
-                    )  # fmt: skip
+                        head, coarse, index, samples, lattice, course, a, b, c, values
+                    )
             size = math.sqrt(slope[0] ** 2 + slope[1] ** 2 + slope[2] ** 2)
             facing = -(slope[0] * x + slope[1] * y + slope[2] * z)
             cosine = facing / size if size > 0.0 else 0.0

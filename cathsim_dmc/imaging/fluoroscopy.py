@@ -4,8 +4,6 @@ The path length through vessel and patient is computed once per anatomy and view
 (`Fluoroscope.from_surface`); the device is drawn in every frame (`Fluoroscope.render`).
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -44,9 +42,6 @@ class Fluoroscope:
         vessel: (rows, columns) path length through the lumen, m.
         vessel_mask: (rows, columns) bool, pixels whose central ray meets the lumen.
         contrast: iodine in the lumen, kg/m³ (mg/ml); 0 is contrast off.
-        device_mu: excess attenuation of the device, homogenised, 1/m.
-        marker_mu: the same for the marker at its tip, 1/m; None for no marker.
-        marker_length: length of the marker, m.
         kerma: air kerma at the detector per frame behind plain tissue, Gy; more is
             less noise.
         blur: standard deviation of the detector's point spread, m.
@@ -59,9 +54,6 @@ class Fluoroscope:
     vessel: np.ndarray
     vessel_mask: np.ndarray
     contrast: float = materials.CONTRAST
-    device_mu: float = materials.CATHETER
-    marker_mu: float | None = materials.MARKER
-    marker_length: float = materials.MARKER_LENGTH
     kerma: float = detector.FRAME_KERMA
     blur: float = detector.DETECTOR_BLUR
     gain: float = detector.GAIN
@@ -87,7 +79,7 @@ class Fluoroscope:
         carm: CArm | None = None,
         supersample: int = 3,
         **fields,
-    ) -> Fluoroscope:
+    ) -> "Fluoroscope":
         """Fluoroscope of a lumen surface: the static part, once per anatomy and view.
 
         Args:
@@ -106,7 +98,7 @@ class Fluoroscope:
         paths = _paths(carm, vertices, faces, supersample)
         return cls(carm, *paths, **fields)
 
-    def around(self, surface: Surface, supersample: int = 3) -> Fluoroscope:
+    def around(self, surface: Surface, supersample: int = 3) -> "Fluoroscope":
         """The same view of a lumen whose surface has moved."""
         paths = _paths(self.carm, surface.vertices, surface.faces, supersample)
         return replace(self, vessel=paths[0], vessel_mask=paths[1])
@@ -182,10 +174,7 @@ class Fluoroscope:
     def _depth(self, shadow: Shadow) -> np.ndarray:
         """Optical depth (..., rows, columns) of a device."""
         points = np.asarray(shadow.points, dtype=np.float64)
-        if shadow.mu is None:
-            material = (self.device_mu, self.marker_mu, self.marker_length)
-        else:
-            material = (shadow.mu, shadow.marker_mu, shadow.marker_length)
+        material = shadow.mu, shadow.marker_mu, shadow.marker_length
         return device_attenuation(self.carm, points, shadow.radius, *material)
 
     def _developed(self, depth: np.ndarray, states) -> np.ndarray:

@@ -12,8 +12,6 @@ Whatever lies in the patient takes the place of as much water (tissue), so vesse
 and device count with their *excess* over water: `mu - WATER`.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import ArrayLike
 

@@ -1,7 +1,5 @@
 """Options of the fluoroscopy that a task shows, in a form that JSON can hold."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

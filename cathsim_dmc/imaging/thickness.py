@@ -7,8 +7,6 @@ exactly one of the two triangles; so entries and exits always match, and the sum
 the exact chord of the triangle mesh for every ray.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import ArrayLike
 

@@ -13,8 +13,6 @@ blood that the device carries is part of the mass of its links
 (`entities.coaxial.carried_mass`).
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from cathsim_dmc.entities.arena import BLOOD_DENSITY
@@ -43,10 +41,8 @@ class StillBlood(Effect):
         links = world.parameters[:, self._loops.HEADER :].reshape(
             world.num_simulations, -1, self._loops.OF_LINK
         )
-        # Of the blood at the links, world frame: (N, L, 3) m/s, (N, L) s; and (N, L)
-        # N·s/m², see `blood_loops.OF_LINK`.
-        self.velocity, self._delay = links[..., :3], links[..., 3]
-        self._friction, self._drift, self._links = links[..., 4], links[..., 5:], links
+        # See `blood_loops.OF_LINK`; the first are the blood's velocity, world frame.
+        self.velocity, self._links = links[..., :3], links
 
     def restart(
         self, index: int, episode: Episode, random_state: np.random.RandomState

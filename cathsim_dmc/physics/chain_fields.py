@@ -1,7 +1,5 @@
 """Local properties of the chain of coaxial devices, written into a model's fields."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -32,7 +30,11 @@ FIELDS = (
 
 
 class ChainFields:
-    """Places in a model of what changes as the devices slide."""
+    """Places in a model of what changes as the devices slide.
+
+    Attributes:
+        qpos: Places of the hinges in `qpos`, in the order of the chain.
+    """
 
     def __init__(self, model: mujoco.MjModel, chain: DeviceStack):
         """Finds the elements of the chain in a compiled model."""
@@ -45,21 +47,17 @@ class ChainFields:
         # Both kinds of elements follow each other, from proximal to distal.
         if any((np.diff(each) != 1).any() for each in [bodies, *places]):
             raise ValueError(f"the links of {chain!r} do not follow each other")
-        self._hinges = np.array([each[0] for each in places], dtype=np.intp)
-        self._body = int(bodies[0])
-        self._geoms = ids(model, chain.link_geoms).astype(np.intp)
-        self._half_lengths = model.geom_size[self._geoms, 1].copy()
+        hinges = np.array([each[0] for each in places], dtype=np.intp)
+        geoms = ids(model, chain.link_geoms).astype(np.intp)
+        half_lengths = model.geom_size[geoms, 1].copy()
         # MuJoCo orders the axes of inertia in its own way.
-        self._axes = model.body_inertia[bodies].argmin(axis=-1)
-
-    @property
-    def qpos(self) -> slice:
-        """Places of the hinges in `qpos`, in the order of the chain."""
-        start = int(self._hinges[2])
-        return slice(start, start + 2 * (len(self._geoms) - 1))
+        axes = model.body_inertia[bodies].argmin(axis=-1)
+        self._places = hinges, int(bodies[0]), geoms, axes, half_lengths
+        first = int(hinges[2])
+        self.qpos = slice(first, first + 2 * (len(geoms) - 1))
 
     def write(
-        self, arrays: Sequence[np.ndarray], made: ChainProperties, row: int
+        self, arrays: Sequence[np.ndarray], made: "ChainProperties", row: int
     ) -> None:
         """Writes the properties of the chain of one simulation.
 
@@ -68,19 +66,8 @@ class ChainFields:
             made: of some simulations.
             row: which of them.
         """
-        self._write(
-            row,
-            self._hinges,
-            self._body,
-            self._geoms,
-            self._axes,
-            self._half_lengths,
-            made.stiffness,
-            made.damping,
-            made.rest,
-            *made.links,
-            *arrays,
-        )
+        chain = made.stiffness, made.damping, made.rest, *made.links
+        self._write(row, self._places, chain, tuple(arrays))
 
 
 class ChainProperties(NamedTuple):

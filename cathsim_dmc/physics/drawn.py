@@ -1,7 +1,5 @@
 """Options that an episode may draw: numbers, or ranges (low, high)."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from typing import Any
 

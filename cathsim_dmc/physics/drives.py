@@ -7,8 +7,6 @@ base at the place that it has been told; where the clamp has slipped, that place
 where the base stands.
 """
 
-from __future__ import annotations
-
 import types
 from typing import Any
 
@@ -78,7 +76,9 @@ class Drives:
         return slip
 
 
-def hold(model: mujoco.MjModel, data: mujoco.MjData) -> None:
-    """Sets the commands of all drives to where their bases stand."""
+def hold(model: mujoco.MjModel, data: mujoco.MjData) -> Drives:
+    """The drives of one simulation, whose commands are set to where the bases stand."""
     arrays = {name: getattr(data, name)[None] for name in ("qpos", "qvel", "act")}
-    Drives(model, types.SimpleNamespace(**arrays)).hold(0)
+    drives = Drives(model, types.SimpleNamespace(**arrays))
+    drives.hold(0)
+    return drives

@@ -6,8 +6,6 @@ simulations. Where it must act in every physics step, it has a function that is
 compiled and that MuJoCo calls, so that no Python runs in the loop; see `Effect.forces`.
 """
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
@@ -114,7 +112,7 @@ class Effect:
         """Finds what it acts on; no episode has begun yet."""
         self.world = world
 
-    def enter(self, index: int, anatomy: Anatomy) -> None:
+    def enter(self, index: int, anatomy: "Anatomy") -> None:
         """Takes the anatomy of one simulation, before an episode begins in it."""
 
     def restart(
@@ -193,7 +191,7 @@ class Effects:
         self._labels[start : start + _HEADER] = mark, count
         self._labelled += [start, start + 1]
 
-    def enter(self, index: int, anatomy: Anatomy) -> None:
+    def enter(self, index: int, anatomy: "Anatomy") -> None:
         """Takes the anatomy of one simulation; see `Effect.enter`."""
         for effect in self._effects:
             effect.enter(index, anatomy)

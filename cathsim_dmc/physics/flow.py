@@ -36,9 +36,6 @@ from cathsim_dmc.physics.motion import Moving
 from cathsim_dmc.physics.randomisation import Episode
 from cathsim_dmc.physics.readings import Readings
 
-# Least ratio of the radii of lumen and link, for the friction along the link.
-_LEAST_GAP = 1.2
-
 
 @dataclasses.dataclass(frozen=True)
 class FlowOptions:
@@ -126,13 +123,15 @@ class Flow(StillBlood):
         """Finds the blood at the middle of each link."""
         nodes = state.centreline
         found = self._at(0.5 * (nodes[:, :-1] + nodes[:, 1:]))
-        self.radius, self._drift[:] = found[..., 4], found[..., 5:]
-        if self._options is not None:
-            self.velocity[:] = found[..., :3]
-            self._delay[:] = found[..., 3] / self._wave_speed[:, None]
-            gap = np.maximum(self.radius / self._link_radii, _LEAST_GAP)
-            friction = 2 * np.pi * self._header[:, 2:3] / np.log(gap)
-            self._friction[:] = np.where(self.radius > 0.0, friction, 0.0)
+        self.radius = found[..., 4]
+        self._places.fill(
+            found,
+            self._wave_speed,
+            self._header[:, 2],
+            self._link_radii,
+            self._options is not None,
+            self._links,
+        )
         return action
 
     def heart(self, index: int) -> dict[str, float]:
@@ -149,10 +148,9 @@ class Flow(StillBlood):
             if self._moving is None:
                 self._places.velocities(row, np.zeros(len(row)), *vessels, out[index])
             else:
-                course = self._moving.warp(index)
-                self._places.moving_velocities(*course, row, *vessels, out[index])
-        if self._moving is not None:
-            out[~self._moving.entered(points)] = 0.0
+                first = self._moving.entered(index, row)
+                course, there = self._moving.warp(index), out[index, first:]
+                self._places.moving_velocities(*course, row[first:], *vessels, there)
         return out
 
     def read(self, time: np.ndarray, state: Readings) -> dict[str, np.ndarray]:

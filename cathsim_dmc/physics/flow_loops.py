@@ -4,13 +4,15 @@ import math
 
 import numpy as np
 
-from cathsim_dmc.anatomy.motion_loops import VALUES, WARP, carried, warp
+from cathsim_dmc.anatomy.motion_loops import VALUES, WARP, carried, courses, warp
 from cathsim_dmc.compiled import compiled
 
 # Exponent of the profile across the lumen.
 EXPONENT = 9
 # Distance over which the flow of a vessel passes into that of its branch, m.
 _BLEND = 5e-4
+# Least ratio of the radii of lumen and link, for the friction along the link.
+_LEAST_GAP = 1.2
 
 
 @compiled
@@ -31,9 +33,10 @@ def moving_velocities(
         out: (P, 8): as there, and the velocity of the vessel's space, m/s.
     """
     values, there = np.empty((VALUES, 4)), np.empty((len(points), WARP))
+    course = courses(parameters, time)
     for p in range(len(points)):
         x, y, z = points[p]
-        warp(lattice, parameters, time, x, y, z, values, there[p])
+        warp(lattice, course, x, y, z, values, there[p])
     rest, growth = there[:, :3].copy(), there[:, 12].copy()
     velocities(rest, growth, ends, radii, shares, ways, vessel, out)
     for p in range(len(points)):
@@ -42,6 +45,30 @@ def moving_velocities(
             row[0], row[1], row[2], scale = carried(at, row[0], row[1], row[2])
             row[5], row[6], row[7], scale = carried(at, at[16], at[17], at[18])
             row[5:] /= scale
+
+
+@compiled
+def fill(found, speed, viscosity, radii, flowing, links):
+    """Writes the parameters of links (N, L, 8), see `blood_loops.OF_LINK`.
+
+    Args:
+        found: (N, L, 8), of `velocities`.
+        speed: (N,), pulse wave velocity, m/s.
+        viscosity: (N,), Pa·s.
+        radii: (L,), of the links, m.
+        flowing: whether blood flows, and not only moves with the vessel.
+        links: written.
+    """
+    for index in range(len(found)):
+        for n in range(len(radii)):
+            row, link = found[index, n], links[index, n]
+            link[5:] = row[5:]
+            if flowing:
+                link[:3] = row[:3]
+                link[3], link[4] = row[3] / speed[index], 0.0
+                if row[4] > 0.0:
+                    gap = max(row[4] / radii[n], _LEAST_GAP)
+                    link[4] = 2.0 * math.pi * viscosity[index] / math.log(gap)
 
 
 @compiled
@@ -64,15 +91,23 @@ def velocities(points, growth, ends, radii, shares, ways, vessel, out):
     segment = np.empty(vessel[-1] + 1, np.int64)
     for p in range(len(points)):
         nearest[:] = np.inf
-        for k in range(count):
+        k = 0
+        while k < count:
             square = 0.0
             t = _place(points[p], ends[k])
             clipped = min(max(t, 0.0), 1.0)
             for i in range(3):
                 there = (1.0 - clipped) * ends[k, 0, i] + clipped * ends[k, 1, i]
                 square += (points[p, i] - there) ** 2
-            if square < nearest[vessel[k]]:
-                nearest[vessel[k]], segment[vessel[k]] = square, k
+            v = vessel[k]
+            if square < nearest[v]:
+                nearest[v], segment[v] = square, k
+            # So many of the next, no longer each than this one, are farther away.
+            ahead = (math.sqrt(square) - math.sqrt(nearest[v])) * 0.999999
+            step = int(ahead / abs(ways[k, 1] - ways[k, 0]))
+            k += 1
+            while step > 1 and k < count and vessel[k] == v:
+                k, step = k + 1, step - 1
         out[p] = 0.0
         deepest = -np.inf
         for v in range(len(nearest)):

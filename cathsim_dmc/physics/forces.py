@@ -64,18 +64,6 @@ class Contacts:
         )
 
 
-def distances(rows: np.ndarray) -> np.ndarray:
-    """Distances (..., K) m of the contacts in rows (..., K * 14), 0 where empty."""
-    # Without reshaping, which copies long rows that are not contiguous.
-    return rows[..., 4::CONTACT_SIZE]
-
-
-def pressing_work(rows: np.ndarray) -> np.ndarray:
-    """Work (...) J that has pressed springs in, ½ Σ f r, from rows (..., K * 14)."""
-    normal, depth = rows[..., 1::CONTACT_SIZE], -distances(rows)
-    return 0.5 * (normal * np.maximum(depth, 0.0)).sum(axis=-1)
-
-
 class WallForce(NamedTuple):
     """Force on the wall over one control step, N.
 
@@ -91,7 +79,12 @@ class WallForce(NamedTuple):
     peak_sum: np.ndarray
     peak_max: np.ndarray
 
+    def named(self) -> dict[str, np.ndarray]:
+        """The forces as logs and records name them, see `NAMES`."""
+        return dict(zip(NAMES, self, strict=True))
 
+
+NAMES = tuple(f"wall_force_{name}" for name in WallForce._fields)
 NO_FORCE = WallForce(*(np.zeros(()) for _ in WallForce._fields))
 
 

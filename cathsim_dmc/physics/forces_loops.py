@@ -39,6 +39,23 @@ def summed(rows, size):
 
 
 @compiled
+def pressed(rows, size):
+    """Depth of the deepest contact, m, and the work ½ Σ f r of all, J: (2, N).
+
+    Args:
+        rows: (N, K * size), of the sensor.
+        size: numbers of a contact.
+    """
+    found = np.zeros((2, len(rows)))
+    for i in range(len(rows)):
+        for place in range(0, rows.shape[1], size):
+            depth = max(-rows[i, place + 4], 0.0)
+            found[0, i] = max(found[0, i], depth)
+            found[1, i] += 0.5 * rows[i, place + 1] * depth
+    return found
+
+
+@compiled
 def higher(one, other):
     """The larger of two numbers, or one that is none."""
     return one if one > other or math.isnan(one) else other

@@ -10,8 +10,7 @@ begins at rest, at the end of diastole and of expiration, and moves in full afte
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
-from typing import Any, Protocol
+from typing import Protocol
 
 import mujoco
 import numpy as np
@@ -162,22 +161,25 @@ class Moving(Effect):
         _, _, _, _, rate, phase, _, breath, begin, *_ = self.world.parameters.T
         return (rate * self._clock + phase) % 1.0, (breath * self._clock + begin) % 1.0
 
-    def entered(self, nodes: np.ndarray) -> np.ndarray:
-        """Which nodes (N, P, 3) of devices, m, are past the inlet: (N, P) bool."""
-        inlet, direction = self._inlets[:, :1], self._inlets[:, 1]
-        beyond = np.einsum("nij,nj->ni", nodes - inlet, direction) > 0.0
-        return np.maximum.accumulate(beyond, axis=1)
+    def entered(self, index: int, nodes: np.ndarray) -> int:
+        """Number of the first node (P, 3) of a device, m, that is past the inlet."""
+        return self._loops.first_past(self._inlets[index], nodes)
 
     def at_rest(self, state: Readings) -> Readings:
         """Readings with the places at rest of those in space; the sheath rests."""
-        nodes = state.centreline
-        there = self._each(Motion.to_rest, nodes)
-        places = np.where(self.entered(nodes)[..., None], there, nodes)
+        places = state.centreline.copy()
+        for index, row in enumerate(places):
+            moved = row[self.entered(index, row) :]
+            moved[:] = self._motions[index].to_rest(*self.warp(index)[1:], moved)
         return state._replace(centreline=places, head=places[:, -1])
 
     def to_space(self, points: np.ndarray) -> np.ndarray:
         """Places in space (N, ..., 3) of places at rest (N, ..., 3), m."""
-        return self._each(lambda *given: Motion.to_space(*given)[0], points)
+        found = [
+            self._motions[index].to_space(*self.warp(index)[1:], row)[0]
+            for index, row in enumerate(points)
+        ]
+        return np.array(found)
 
     def warp(self, index: int) -> tuple[np.ndarray, np.ndarray, float]:
         """Lattice and parameters of one simulation's motion, and its time, s.
@@ -191,14 +193,6 @@ class Moving(Effect):
         """The lumen's surface of one simulation where it is now."""
         parameters, time = self.warp(index)[1:]
         return self._motions[index].surface(parameters, time, self._surfaces[index])
-
-    def _each(self, function: Callable[..., Any], points: np.ndarray) -> np.ndarray:
-        """A method of the motions with parameters, time, and points (N, ..., 3)."""
-        found = [
-            function(self._motions[index], *self.warp(index)[1:], row)
-            for index, row in enumerate(points)
-        ]
-        return np.array(found)
 
 
 def add_clock(root) -> None:

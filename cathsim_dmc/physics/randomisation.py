@@ -115,20 +115,9 @@ class Randomisation:
     @classmethod
     def make(cls, value: "Randomisation | Mapping[str, Any] | bool") -> "Randomisation":
         """From a task's option: False, True for `DEFAULT_RANGES`, or fields."""
-        if isinstance(value, Randomisation):
-            return value
         if isinstance(value, bool):
             return DEFAULT_RANGES if value else cls()
-        known = [field.name for field in dataclasses.fields(cls)]
-        if not isinstance(value, Mapping):
-            bounds.refuse(
-                "randomisation", value, f"True, False, or some of {', '.join(known)}"
-            )
-        bounds.mapping("randomisation", value, known)
-        try:
-            return cls(**value)
-        except ValueError as error:
-            raise ValueError(f"randomisation: {error}") from error
+        return bounds.made("randomisation", value, cls, "True, False, or ")
 
     @property
     def longest_delay(self) -> int:
@@ -167,8 +156,8 @@ class Randomisation:
             return bounds.number(f"{name}, as drawn,", drawn, *_RANGES[name])
 
         displacement = start_displacement(random_state, self.start_radius)
-        friction, stiffness = value("friction"), value("stiffness")
-        loss, viscosity = value("loss"), value("viscosity")
+        names = "friction", "stiffness", "loss", "viscosity"
+        factors = {name: value(name) for name in names}
         primary, secondary = value("view"), value("view")
         gain, kerma = value("gain"), value("kerma")
         shift, roll = value("goal_shift"), value("roll")
@@ -179,10 +168,7 @@ class Randomisation:
         insertion = value("start_insertion")
         return Episode(
             displacement=displacement,
-            friction=friction,
-            stiffness=stiffness,
-            loss=loss,
-            viscosity=viscosity,
+            **factors,
             deviation=Deviation(
                 primary=round(primary or 0.0),
                 secondary=round(secondary or 0.0),

@@ -128,6 +128,8 @@ class ModelIndex:
         "site_xpos",
         "site_xmat",
         "sensordata",
+        "cdof",
+        "subtree_com",
     )
 
     def __init__(self, model: mujoco.MjModel, chain: Chain, robot: Robot):

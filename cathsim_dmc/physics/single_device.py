@@ -1,7 +1,5 @@
 """One device in a task, moved by its own motors; the base of coaxial devices."""
 
-from __future__ import annotations
-
 import mujoco
 import numpy as np
 

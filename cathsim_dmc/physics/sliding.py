@@ -6,8 +6,6 @@ and how it is turned lies in MuJoCo's `userdata`, so it is part of the state tha
 saved, dumped and replayed.
 """
 
-from __future__ import annotations
-
 import mujoco
 import numpy as np
 

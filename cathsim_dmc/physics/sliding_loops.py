@@ -135,46 +135,22 @@ def leading_load(force, line, ways, nodes):
 
 
 @compiled
-def write(
-    row,
-    hinges,
-    bodies,
-    geoms,
-    axes,
-    half_lengths,
-    stiffness,
-    damping,
-    rest,
-    radius,
-    friction,
-    mass,
-    buoyancy,
-    inertia,
-    jnt_stiffness,
-    dof_damping,
-    qpos_spring,
-    geom_size,
-    geom_rbound,
-    geom_aabb,
-    geom_friction,
-    body_mass,
-    body_inertia,
-    body_subtreemass,
-    body_gravcomp,
-):
+def write(row, places, chain, fields):
     """Writes what a chain is made of into the fields of a model.
 
     Args:
         row: number of the simulation.
-        hinges: (3,), of the first hinge among joints, degrees of freedom and positions.
-        bodies: number of the first link.
-        geoms: (L,), of the links.
-        axes: (L,), which of a link's axes of inertia lies along it.
-        half_lengths: (L,), of the cylinders of the links, m.
-        stiffness, damping, rest, radius, friction, mass, buoyancy, inertia: of N
-            simulations, see `chain_fields.ChainProperties`.
-        jnt_stiffness, ...: the fields, named as in MuJoCo.
+        places: (3,) first hinge among joints, degrees of freedom and positions; number
+            of the first link; (L,) geoms of the links; (L,) which of a link's axes of
+            inertia lies along it; (L,) half lengths of their cylinders, m.
+        chain: arrays of `chain_fields.ChainProperties`, with those of the links.
+        fields: live `chain_fields.FIELDS`.
     """
+    hinges, bodies, geoms, axes, half_lengths = places
+    stiffness, damping, rest, radius, friction, mass, buoyancy, inertia = chain
+    jnt_stiffness, dof_damping, qpos_spring = fields[:3]
+    geom_size, geom_rbound, geom_aabb, geom_friction = fields[3:7]
+    body_mass, body_inertia, body_subtreemass, body_gravcomp = fields[7:]
     for j in range(stiffness.shape[1]):
         for axis in range(2):
             hinge = 2 * j + (axis + j) % 2  # see `posture.x_first`

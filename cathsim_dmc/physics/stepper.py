@@ -51,18 +51,28 @@ class Stepper(abc.ABC):
     warnings: np.ndarray
 
     def __init__(self, model: mujoco.MjModel, num_simulations: int, substeps: int):
-        """Finds the sensor of the wall in the compiled scene."""
+        """Finds the wall, its sensor and what touches it in the compiled scene."""
+        from cathsim_dmc.physics import stepper_loops  # late, as numba takes long
+
         self.num_simulations, self.substeps = num_simulations, substeps
         self.repeated = np.zeros(num_simulations, np.int64)
         self.deepest: float | None = None
         self._contacts = readings.wall_contacts(model)
         self._before = self._warnings_before = np.empty(0)
+        self._timestep, self._scratch = model.opt.timestep, mujoco.MjData(model)
+        self._wall = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_GEOM, "wall")
+        self._fastest, self._links = stepper_loops.fastest, _moving(model)
+        self._views: tuple[np.ndarray, ...] = ()
 
     # What a simulator does.
 
     @abc.abstractmethod
     def field(self, index: int, name: str) -> np.ndarray:
         """A field of the model that one simulation has for itself, to be written."""
+
+    @abc.abstractmethod
+    def _model_of(self, index: int) -> mujoco.MjModel:
+        """The model that one simulation runs on."""
 
     @abc.abstractmethod
     def load(self, index: int, case: Anatomic) -> None:
@@ -114,10 +124,15 @@ class Stepper(abc.ABC):
             Force on the wall over it, and whether MuJoCo has warned in it, (N,) bool.
         """
         warned, (force, depth) = self._warned(), forces.wall_force(self.contact_rows)
-        coarse = forces.too_coarse(force, depth, self.deepest) & ~warned
-        if np.count_nonzero(coarse):
-            self._refine(np.flatnonzero(coarse))
-            warned, (force, _) = self._warned(), forces.wall_force(self.contact_rows)
+        depth = self._depth_at_end(depth, warned)
+        # A wall that gives is soft enough for half the step, as a rule.
+        for parts in (forces.REFINEMENT,) if self.deepest is None else (2, 8):
+            coarse = forces.too_coarse(force, depth, self.deepest) & ~warned
+            if not np.count_nonzero(coarse):
+                break
+            self._refine(np.flatnonzero(coarse), parts)
+            rows = self.contact_rows
+            warned, (force, depth) = self._warned(), forces.wall_force(rows)
         return force, warned
 
     def still(self, indices: np.ndarray) -> forces.WallForce:
@@ -135,17 +150,40 @@ class Stepper(abc.ABC):
         ):
             self._forward(indices)
 
-    def _refine(self, indices: np.ndarray) -> None:
-        """Does the control step of some simulations again, with shorter steps."""
+    def _depth_at_end(self, depth: np.ndarray, warned: np.ndarray) -> np.ndarray:
+        """Depth (N,) m of the deepest contact in a control step and at its end.
+
+        The last physics step's contacts are those of its beginning. Where a link may
+        have gone too deep in it, they are looked for once more.
+        """
+        if not self._views:  # a batch looks for them each time
+            names = ("qvel", "cdof", "xpos", "subtree_com")
+            self._views = tuple(getattr(self.arrays, name) for name in names)
+        way = self._timestep * self._fastest(*self._views, *self._links)
+        limit = forces.DEEPEST if self.deepest is None else self.deepest
+        suspect = (depth + way > limit) & (depth <= limit) & ~warned
+        for index in np.flatnonzero(suspect).tolist():
+            model, data = self._model_of(index), self._scratch
+            state = self.states()[index]
+            mujoco.mj_setState(model, data, state, _STATE)
+            mujoco.mj_kinematics(model, data)
+            mujoco.mj_collision(model, data)
+            at_wall = data.contact.geom2 == self._wall
+            end = -data.contact.dist.min(initial=0.0, where=at_wall)
+            depth[index] = max(depth[index], end)
+        return depth
+
+    def _refine(self, indices: np.ndarray, parts: int) -> None:
+        """Does the control step of some simulations again, in steps so much shorter."""
         self.repeated[indices] += 1
         self.set_states(indices, self._before[indices])
         with self._changed(
             indices,
             "timestep",
-            lambda timestep: timestep / forces.REFINEMENT,
-            lambda timestep: timestep * forces.REFINEMENT,
+            lambda timestep: timestep / parts,
+            lambda timestep: timestep * parts,
         ):
-            self._run(indices, forces.REFINEMENT)
+            self._run(indices, parts)
 
     @contextmanager
     def _changed(self, indices, option, change, undo) -> Iterator[None]:
@@ -204,6 +242,11 @@ class SingleStepper(Stepper):
         del index
         return getattr(self._model, name)
 
+    def _model_of(self, index: int) -> mujoco.MjModel:
+        """The only model."""
+        del index
+        return self._model
+
     def load(self, index: int, case: Anatomic) -> None:
         """Puts an anatomy into the model; the data begin anew."""
         del index
@@ -248,6 +291,19 @@ class SingleStepper(Stepper):
         self, indices: np.ndarray, option: str, change: Callable[[Any], Any]
     ) -> None:
         setattr(self._model.opt, option, change(getattr(self._model.opt, option)))
+
+
+def _moving(model: mujoco.MjModel) -> tuple[np.ndarray, ...]:
+    """What `stepper_loops.fastest` knows of the links that can touch a wall."""
+    links = np.flatnonzero((model.geom_contype == 0) & (model.geom_conaffinity != 0))
+    bodies, last = model.geom_bodyid[links], []
+    for body in bodies:
+        while model.body_dofnum[body] == 0:
+            body = model.body_parentid[body]
+        last.append(model.body_dofadr[body] + model.body_dofnum[body] - 1)
+    reach = np.linalg.norm(model.geom_pos[links], axis=1) + model.geom_size[links, 1]
+    roots = model.body_rootid[bodies]
+    return model.dof_parentid.copy(), bodies, np.array(last), roots, reach
 
 
 class _Arrays:

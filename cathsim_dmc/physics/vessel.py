@@ -1,7 +1,5 @@
 """The option `vessel` of a task: blood that flows, a wall that gives and moves."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
@@ -67,8 +65,9 @@ def read(
     """
     if not any(isinstance(effect, Flow) for effect in effects):
         return None
-    deepest = -forces.distances(rows).min(axis=-1, initial=0.0)
-    work = forces.pressing_work(rows)
+    from cathsim_dmc.physics import forces_loops  # late, as numba takes long
+
+    deepest, work = forces_loops.pressed(rows, forces.CONTACT_SIZE)
     still = np.zeros(len(time))
     found = VesselReadings(still, still, np.zeros((len(time), 3)), deepest, work)
     for effect in effects:
@@ -104,7 +103,7 @@ class VesselOptions:
                 )
 
     @classmethod
-    def make(cls, value: Any) -> VesselOptions:
+    def make(cls, value: Any) -> "VesselOptions":
         """From a task's option: the name of a preset, or a mapping of its parts.
 
         Raises:
@@ -159,17 +158,6 @@ _KINDS = {"flow": FlowOptions, "wall": WallOptions, "motion": MotionOptions}
 def _part(name: str, value: Any) -> Any:
     """Options of a part: None and False for none, True for the defaults."""
     kind = _KINDS[name]
-    if value is None or value is False or isinstance(value, kind):
-        return value or None
-    if value is True:
-        return kind()
-    known = [field.name for field in dataclasses.fields(kind)]
-    if not isinstance(value, Mapping):
-        bounds.refuse(
-            f"vessel {name}", value, f"True, False, or some of {', '.join(known)}"
-        )
-    bounds.mapping(f"vessel {name}", value, known)
-    try:
-        return kind(**value)
-    except ValueError as error:
-        raise ValueError(f"vessel {name}: {error}") from error
+    if isinstance(value, bool) or value is None:
+        return kind() if value else None
+    return bounds.made(f"vessel {name}", value, kind, "True, False, or ")

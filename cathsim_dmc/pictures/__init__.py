@@ -5,8 +5,6 @@ Everything here takes the environment that `cathsim_dmc.suite.load` returns.
 `import cathsim_dmc` is enough in a notebook.
 """
 
-from __future__ import annotations
-
 import dataclasses
 from typing import Any
 

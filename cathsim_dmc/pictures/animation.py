@@ -1,7 +1,5 @@
 """An episode as a moving picture for slides and pages, without OpenGL."""
 
-from __future__ import annotations
-
 import dataclasses
 import os
 from collections.abc import Iterator

@@ -1,7 +1,5 @@
 """A scene as a matplotlib figure: anatomy, device, goal, contact forces."""
 
-from __future__ import annotations
-
 import functools
 import io
 from typing import Any
@@ -226,12 +224,12 @@ def _draw_device(axes: Any, moment: Moment, projection: ParallelProjection) -> N
 
 def _draw_forces(axes: Any, moment: Moment, projection: ParallelProjection) -> None:
     magnitude = moment.magnitude
-    if not len(magnitude):
+    if not magnitude.any():
         return
     place = projection.flat_mm(moment.position)
     colours = force_colours(magnitude, moment.force_scale) / 255
     axes.scatter(*place.T, s=16, c=colours, edgecolors="0.15", linewidths=0.5, zorder=8)
-    largest = magnitude.max()
+    largest = max(magnitude.max(), ARROW_LEAST_N)
     strong = magnitude > ARROW_LEAST_N
     length = np.maximum(ARROW_MM * magnitude / largest, ARROW_LEAST_MM)
     unit = moment.force / np.maximum(magnitude, 1e-12)[:, None]
@@ -242,10 +240,13 @@ def _draw_forces(axes: Any, moment: Moment, projection: ParallelProjection) -> N
         edgecolor="0.15", linewidth=0.4, zorder=8,
     )  # fmt: skip
     top = int(magnitude.argmax())
+    end = place[top] + (along[top] if strong[top] else 0)
+    beyond = bool(end[0] > np.mean(axes.get_xlim()))  # what stands beside hides it
     axes.annotate(
-        force_text(largest),
-        place[top] + (along[top] if strong[top] else 0),
-        xytext=(5, 4),
+        force_text(magnitude[top]),
+        end,
+        xytext=(-5 if beyond else 5, 4),
+        ha="right" if beyond else "left",
         textcoords="offset points",
         fontsize=9,
         fontweight="bold",

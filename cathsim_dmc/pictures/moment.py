@@ -1,7 +1,5 @@
 """One state of an episode, with everything that a picture needs."""
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 from typing import Any
@@ -61,7 +59,7 @@ class Moment:
         return np.linalg.norm(self.force, axis=-1)
 
     @classmethod
-    def of(cls, env: Any) -> Moment:
+    def of(cls, env: Any) -> "Moment":
         """The present state of a composer environment.
 
         Raises:
@@ -85,7 +83,7 @@ class Moment:
         )
 
     @classmethod
-    def of_episode(cls, episode: Episode, surface: Any, step: int = -1) -> Moment:
+    def of_episode(cls, episode: Episode, surface: Any, step: int = -1) -> "Moment":
         """A state of a recorded episode.
 
         Args:

@@ -1,7 +1,5 @@
 """The forces of a state as one readable object."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any
 
@@ -77,21 +75,16 @@ def forces(env: Any) -> ForceReadout:
         TypeError: if it is no environment of this package.
     """
     task = navigation_of(env)
-    contacts, wall, readings = (
-        task.contacts(env.physics),
-        task.wall_force,
-        task.readings,
-    )
+    contacts, readings = task.contacts(env.physics), task.readings
     there = contacts.present
+    names = ("wall_sum", "wall_max", "wall_peak_sum", "wall_peak_max")
+    wall = dict(zip(names, map(float, task.wall_force), strict=True))
     return ForceReadout(
         position=contacts.position[there],
         force=contacts.force[there],
         magnitude=contacts.magnitude[there],
         penetration=contacts.penetration[there],
-        wall_sum=float(wall.sum),
-        wall_max=float(wall.max),
-        wall_peak_sum=float(wall.peak_sum),
-        wall_peak_max=float(wall.peak_max),
+        **wall,
         push_force=float(readings.push_force),
         push_torque=float(readings.push_torque),
         load_cell=np.array(readings.load_cell),

@@ -1,7 +1,5 @@
 """An episode of any policy, recorded in one call."""
 
-from __future__ import annotations
-
 import dataclasses
 import os
 from collections.abc import Callable

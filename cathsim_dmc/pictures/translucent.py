@@ -6,8 +6,6 @@ pixels with all triangles are found first, sorted by depth and laid over each ot
 pixel by pixel. Glass is denser where one looks along it, which draws the outline.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -49,7 +47,7 @@ class ParallelProjection:
         azimuth: float = 0.0,
         margin: float = 6e-3,
         height: int = 900,
-    ) -> ParallelProjection:
+    ) -> "ParallelProjection":
         """A view upright in the patient frame (LPS) that shows all vertices.
 
         Args:

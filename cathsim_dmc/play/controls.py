@@ -4,31 +4,21 @@ import numpy as np
 
 from cathsim_dmc.tasks.scene import Scene
 
-# Commands that act while they are held: what they move, and sign.
-_STEERABLE = {
-    "push": ("translation", 1.0),
-    "pull": ("translation", -1.0),
-    "right": ("bend_y", 1.0),
-    "left": ("bend_y", -1.0),
-    "up": ("bend_x", 1.0),
-    "down": ("bend_x", -1.0),
-    "turn_left": ("rotation", 1.0),
-    "turn_right": ("rotation", -1.0),
+# Key of Tk that acts while it is held: the axis that it moves, and its sign, for a
+# steerable device (bend about x and y, translation, rotation) and for coaxial ones
+# (translation and rotation of the innermost, and of the outermost).
+HELD = {
+    "w": (2, 1.0, 1.0),
+    "s": (2, -1.0, -1.0),
+    "a": (3, 1.0, 1.0),
+    "d": (3, -1.0, -1.0),
+    "Up": (0, 1.0, 1.0),
+    "Down": (0, -1.0, -1.0),
+    "Left": (1, -1.0, 1.0),
+    "Right": (1, 1.0, -1.0),
 }
-# The same with coaxial devices.
-_COAXIAL = {
-    "push": ("catheter", 1.0),
-    "pull": ("catheter", -1.0),
-    "turn_left": ("catheter_rotation", 1.0),
-    "turn_right": ("catheter_rotation", -1.0),
-    "up": ("guidewire", 1.0),
-    "down": ("guidewire", -1.0),
-    "left": ("guidewire_rotation", 1.0),
-    "right": ("guidewire_rotation", -1.0),
-}
-# Commands that act once.
-_ONCE = ("straight", "restart", "quit")
-COMMANDS = (*_STEERABLE, *_ONCE)
+# Keys that act once.
+ONCE = {"space": "straight", "r": "restart", "Escape": "quit"}
 
 BEND_RATE = 1.0  # share of the full deflection per second while a key is held
 
@@ -45,7 +35,7 @@ COAXIAL_HELP = (
 class Controls:
     """Keys of a task: speeds while a key is held; the bend of a steerable tip stays.
 
-    In the AP view, "right" bends the tip to the right of the image and "up" towards
+    In the AP view, "Right" bends the tip to the right of the image and "Up" towards
     the observer, as long as the base is not rotated. Of coaxial devices the keys move
     the innermost and the outermost; one device alone is both.
 
@@ -64,7 +54,6 @@ class Controls:
             devices: Number K of coaxial devices; 0 for a steerable device.
         """
         self._tip_joints, self._rotation, self._devices = tip_joints, rotation, devices
-        self._meaning = _COAXIAL if devices else _STEERABLE
         self.help = COAXIAL_HELP if devices else HELP
         self._held: set[str] = set()
         self.restart()
@@ -77,23 +66,21 @@ class Controls:
             return cls(devices=len(chain.devices))
         return cls(len(chain.tip_motors) // 2, chain.rotation is not None)
 
-    def press(self, command: str) -> None:
-        """Begins to hold a command until `release`."""
-        if command not in COMMANDS:
-            raise ValueError(f"no command {command!r}; there are {', '.join(COMMANDS)}")
-        if command == "straight":
+    def press(self, key: str) -> None:
+        """Begins to hold a key until `release`; others than those above do nothing."""
+        if key in HELD:
+            self._held.add(key)
+        elif ONCE.get(key) == "straight":
             self.bend = np.zeros(2)
-        elif command in self._meaning:
-            self._held.add(command)
         else:
-            self.requested = command
+            self.requested = ONCE.get(key, self.requested)
 
-    def release(self, command: str) -> None:
-        """Ends a command."""
-        self._held.discard(command)
+    def release(self, key: str) -> None:
+        """Lets a key go."""
+        self._held.discard(key)
 
     def restart(self) -> None:
-        """Ends all commands and straightens the tip."""
+        """Lets all keys go and straightens the tip."""
         self._held.clear()
         self.requested: str | None = None
         self.bend = np.zeros(2)
@@ -106,17 +93,15 @@ class Controls:
             repeated through interfaces of single precision. A is 2 K with coaxial
             devices.
         """
-        axes = dict.fromkeys((axis for axis, _ in self._meaning.values()), 0.0)
-        for command in self._held:
-            axis, sign = self._meaning[command]
-            axes[axis] += sign
+        held = np.zeros(4)
+        for axis, *signs in map(HELD.__getitem__, self._held):
+            held[axis] += signs[self._devices > 0]
         if self._devices:
             action = np.zeros(2 * self._devices)
-            action[:2] = axes["guidewire"], axes["guidewire_rotation"]
-            action[-2:] += axes["catheter"], axes["catheter_rotation"]
+            action[:2] = held[:2]
+            action[-2:] += held[2:]
             return np.clip(action, -1.0, 1.0)
-        change = BEND_RATE * duration * np.array([axes["bend_x"], axes["bend_y"]])
-        self.bend = np.clip(self.bend + change, -1.0, 1.0)
-        moved = [axes["translation"], axes["rotation"]][: 1 + self._rotation]
+        self.bend = np.clip(self.bend + BEND_RATE * duration * held[:2], -1.0, 1.0)
+        moved = held[2 : 3 + self._rotation]
         action = np.array([*np.tile(self.bend, self._tip_joints), *moved])
         return action.astype(np.float32).astype(np.float64)

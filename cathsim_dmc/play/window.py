@@ -11,27 +11,13 @@ from cathsim_dmc.play.controls import Controls
 
 SIZE = 512  # px
 
-# Keys of Tk by command.
-KEYS = {
-    "w": "push",
-    "s": "pull",
-    "Right": "right",
-    "Left": "left",
-    "Up": "up",
-    "Down": "down",
-    "a": "turn_left",
-    "d": "turn_right",
-    "space": "straight",
-    "r": "restart",
-    "Escape": "quit",
-}
 # X repeats a held key as release and press; a release counts if none follows in, s:
 _REPEAT = 0.06
 _PANEL = 230  # px
 
 
 class FluoroscopyWindow:
-    """Shows the task as an operator sees it and turns keys into commands.
+    """Shows the task as an operator sees it and turns keys into actions.
 
     Attributes:
         closed: Whether the operator has closed the window.
@@ -85,23 +71,20 @@ class FluoroscopyWindow:
         root.focus_force()
 
     def _pressed(self, event):
-        command = KEYS.get(_name(event.keysym))
-        if command is not None:
-            self._released.pop(command, None)
-            self._controls.press(command)
+        key = _name(event.keysym)
+        self._released.pop(key, None)
+        self._controls.press(key)
 
     def _let_go(self, event):
-        command = KEYS.get(_name(event.keysym))
-        if command is not None:
-            self._released[command] = time.monotonic()
+        self._released[_name(event.keysym)] = time.monotonic()
 
     def poll(self) -> None:
         """Reads the keys pressed since the last call."""
         self._root.update()
-        for command, when in list(self._released.items()):
+        for key, when in list(self._released.items()):
             if time.monotonic() - when > _REPEAT:
-                self._controls.release(command)
-                del self._released[command]
+                self._controls.release(key)
+                del self._released[key]
 
     def show(self, task: Any, message: str = "", until: float = 0.0) -> None:
         """Draws the state of a task; reads keys until a time of `time.monotonic`, s."""

@@ -9,8 +9,6 @@ withdraw only as long as the head does not come back.
 Pure functions of arrays with leading batch axes, written `...`; metres.
 """
 
-from __future__ import annotations
-
 import dataclasses
 from typing import TypeVar
 
@@ -77,7 +75,7 @@ class Attempts:
     attempts: np.ndarray
 
     @classmethod
-    def none(cls, shape: tuple[int, ...]) -> Attempts:
+    def none(cls, shape: tuple[int, ...]) -> "Attempts":
         """Before the first step of an episode."""
         return Attempts(
             arc_length=np.full(shape, np.nan),

@@ -21,9 +21,8 @@ and goes up; the wire holds the shaft in the aorta straight.
 time no jumps of the head's place on the route.
 """
 
-from __future__ import annotations
-
 import dataclasses
+from typing import ClassVar
 
 import numpy as np
 
@@ -37,7 +36,7 @@ from cathsim_dmc.policies.attempts import Attempts, advance
 from cathsim_dmc.tasks import navigation
 from cathsim_dmc.tasks.cases import Case
 from cathsim_dmc.tasks.config import CONTROL_TIMESTEP
-from cathsim_dmc.tasks.route import Place, Route, along, locate
+from cathsim_dmc.tasks.route import Place, Route, locate
 
 # What a full action moves (m) and turns (rad) a device by in a control step.
 _MOVE = MAX_PUSH_SPEED * CONTROL_TIMESTEP
@@ -78,27 +77,22 @@ class CoaxialSettings(pursuit.Settings):
 
 
 @dataclasses.dataclass(frozen=True)
-class CoaxialPlan:
+class CoaxialPlan(Route):
     """Route and devices of a task with coaxial devices; world frame, SI units.
 
     Attributes:
-        points: (P, 3), route from the inlet to the goal.
-        radii: (P,), of the lumen.
-        arc_length: (P,), along the route.
         shaped: (K,), length of the pre-shaped end of each device.
         nodes: (L + 1,), ends of the links from the end of the chain.
         ostium: arc length where the route narrows most, into its last branch.
     """
 
-    points: np.ndarray
-    radii: np.ndarray
-    arc_length: np.ndarray
     shaped: np.ndarray
     nodes: np.ndarray
     ostium: float
+    settings: ClassVar = CoaxialSettings
 
     @classmethod
-    def for_task(cls, task: navigation.Navigation | Case) -> CoaxialPlan:
+    def for_task(cls, task: navigation.Navigation | Case) -> "CoaxialPlan":
         """Reads off a task of coaxial devices, or one of its anatomies.
 
         Raises:
@@ -109,55 +103,62 @@ class CoaxialPlan:
         route = Route.of(task.objective)
         shapes = [[arc.length for arc in one.tip_shape] for one in stack.devices]
         return cls(
-            points=route.points,
-            radii=route.radii,
-            arc_length=route.arc_length,
+            **vars(route),
             shaped=np.array([sum(lengths) for lengths in shapes]),
             nodes=stack.stack.nodes,
             ostium=float(route.arc_length[np.diff(route.radii).argmin()]),
         )
 
+    def fresh(self, shape: tuple[int, ...]) -> Attempts:
+        """Memory (N,) at the start of an episode."""
+        return Attempts.none(shape)
 
-def decide(
-    plan: CoaxialPlan,
-    settings: CoaxialSettings,
-    state: Attempts,
-    readings: Readings,
-    devices: CoaxialReadings,
-    wall_force: forces.WallForce,
-) -> tuple[np.ndarray, Attempts]:
-    """One control step of the expert: a pure function.
+    def told(self, state: Attempts, action: np.ndarray) -> Attempts:
+        """The memory as it is, which no action is part of."""
+        del action
+        return state
 
-    Args:
-        state: after the last step, arrays (N,).
-        readings: of the chain, arrays (N, ...).
-        wall_force: arrays (N,); its `max` slows the devices down.
+    def decide(
+        self,
+        settings: CoaxialSettings,
+        state: Attempts,
+        readings: Readings,
+        wall_force: forces.WallForce,
+        devices: CoaxialReadings,
+    ) -> tuple[np.ndarray, Attempts]:
+        """One control step of the expert: a pure function.
 
-    Returns:
-        Action (N, 2 K) in [-1, 1] and the new state.
-    """
-    # Every other attempt stays near the last place: both ways fail in some branchings.
-    steady = np.where(state.attempts % 2 == 1, state.arc_length, np.nan)
-    place = locate(plan, readings.head, steady)
-    ahead = pursuit.lookahead(plan, settings, state.attempts, place)
-    error, away = _directions(plan, readings, devices, place, ahead)
-    offsets = np.asarray(settings.offsets)
-    error = error + offsets[state.attempts % len(offsets)][:, None]
-    state = advance(settings, state, place, readings.insertion)
-    turns = away > settings.aside
-    action = np.zeros((len(error), 2 * error.shape[1]))
-    rate = settings.turning * np.angle(np.exp(1j * error)) / _TURN
-    action[:, 1::2] = np.where(turns, rate, 0.0)
-    leader = devices.insertion.argmax(axis=1)[:, None]
-    looks = np.where(turns, np.cos(error), 1.0)
-    cosine = np.take_along_axis(looks, leader, axis=1)[:, 0]
-    clear = pursuit.ramp(cosine, settings.misaligned, settings.aligned)
-    free = pursuit.ramp(wall_force.max, settings.hard_force, settings.soft_force)
-    forward = settings.speed * np.maximum(free * clear, settings.creep)
-    speed = np.where(state.retracting, -settings.speed, forward)
-    deep = np.maximum(place.arc_length - plan.ostium, 0.0)
-    action[:, 0::2] = _led(settings, state, devices.insertion, speed, deep)
-    return np.clip(action, -1.0, 1.0), state
+        Args:
+            state: after the last step, arrays (N,).
+            readings: of the chain, arrays (N, ...).
+            wall_force: arrays (N,); its `max` slows the devices down.
+
+        Returns:
+            Action (N, 2 K) in [-1, 1] and the new state.
+        """
+        # Every other attempt stays near the last place: both ways fail in some
+        # branchings.
+        steady = np.where(state.attempts % 2 == 1, state.arc_length, np.nan)
+        place = locate(self, readings.head, steady)
+        ahead = pursuit.lookahead(self, settings, state.attempts, place)
+        error, away = _directions(self, readings, devices, place, ahead)
+        offsets = np.asarray(settings.offsets)
+        error = error + offsets[state.attempts % len(offsets)][:, None]
+        state = advance(settings, state, place, readings.insertion)
+        turns = away > settings.aside
+        action = np.zeros((len(error), 2 * error.shape[1]))
+        rate = settings.turning * np.angle(np.exp(1j * error)) / _TURN
+        action[:, 1::2] = np.where(turns, rate, 0.0)
+        leader = devices.insertion.argmax(axis=1)[:, None]
+        looks = np.where(turns, np.cos(error), 1.0)
+        cosine = np.take_along_axis(looks, leader, axis=1)[:, 0]
+        clear = pursuit.ramp(cosine, settings.misaligned, settings.aligned)
+        free = pursuit.ramp(wall_force.max, settings.hard_force, settings.soft_force)
+        forward = settings.speed * np.maximum(free * clear, settings.creep)
+        speed = np.where(state.retracting, -settings.speed, forward)
+        deep = np.maximum(place.arc_length - self.ostium, 0.0)
+        action[:, 0::2] = _led(settings, state, devices.insertion, speed, deep)
+        return np.clip(action, -1.0, 1.0), state
 
 
 def _led(
@@ -205,7 +206,7 @@ def _directions(
         while len(frames) <= last - link.min():
             frames.append(_before(frames[-1], readings.joint_positions, len(frames)))
         frame = np.stack(frames)[last - link, rows]
-        target = along(plan, place.arc_length - gaps[:, k] + ahead)
+        target = plan.at(place.arc_length - gaps[:, k] + ahead)
         way = target - readings.centreline[rows, link]
         x, y, z = np.einsum("nij,ni->jn", frame, way)
         error[:, k] = np.arctan2(y, x) - devices.tip_rotation[:, k]

@@ -4,8 +4,6 @@ Its success shows that a task can be solved, and is compared with that of traine
 agents. `pursuit` has its decisions, `coaxial_pursuit` those for coaxial devices.
 """
 
-from __future__ import annotations
-
 import dataclasses
 from typing import Any
 
@@ -13,11 +11,10 @@ import numpy as np
 
 from cathsim_dmc.physics import forces
 from cathsim_dmc.physics.readings import CoaxialReadings, Readings
-from cathsim_dmc.policies import coaxial_pursuit
 from cathsim_dmc.policies.attempts import Attempts
-from cathsim_dmc.policies.coaxial_pursuit import CoaxialPlan, CoaxialSettings
+from cathsim_dmc.policies.coaxial_pursuit import CoaxialPlan
 from cathsim_dmc.policies.policy import Policy
-from cathsim_dmc.policies.pursuit import Plan, Settings, State, decide
+from cathsim_dmc.policies.pursuit import Plan, Settings
 from cathsim_dmc.policies.view import View
 from cathsim_dmc.tasks import navigation
 from cathsim_dmc.tasks.cases import Case
@@ -39,15 +36,14 @@ class Expert:
             plan: Of a steerable device, or of coaxial devices.
             settings: Of the same kind; None for the defaults.
         """
-        coaxial = isinstance(plan, CoaxialPlan)
-        self.plan = plan
-        self._settings = settings or (CoaxialSettings() if coaxial else Settings())
+        self.plan: Any = plan
+        self._settings = settings or plan.settings()
         self.state: Attempts | None = None
 
     @classmethod
     def for_task(
         cls, task: navigation.Navigation | Case, settings: Settings | None = None
-    ) -> Expert:
+    ) -> "Expert":
         """The expert for a task, or for one of the anatomies that episodes draw from.
 
         Args:
@@ -58,14 +54,13 @@ class Expert:
             ValueError: if the device can neither be steered nor turned at its base, or
                 the settings are not for it.
         """
-        if not task.scene.coaxial:
-            return cls(Plan.for_task(task), settings)
-        if settings is not None and not isinstance(settings, CoaxialSettings):
+        kind = CoaxialPlan if task.scene.coaxial else Plan
+        if settings is not None and not isinstance(settings, kind.settings):
             raise ValueError(
                 "these settings are of a steerable device's expert; coaxial devices "
                 "need coaxial_pursuit.CoaxialSettings"
             )
-        return cls(CoaxialPlan.for_task(task), settings)
+        return cls(kind.for_task(task), settings)
 
     def reset(self, which: np.ndarray | None = None) -> None:
         """Forgets the simulations that begin a new episode.
@@ -76,14 +71,9 @@ class Expert:
         if which is None or self.state is None:
             self.state = None
             return
-        fresh = self._fresh(self.state.attempts.shape)
+        fresh = self.plan.fresh(self.state.attempts.shape)
         for field in dataclasses.fields(fresh):
             getattr(self.state, field.name)[which] = getattr(fresh, field.name)[which]
-
-    def _fresh(self, shape: tuple[int, ...]) -> Attempts:
-        if isinstance(self.plan, Plan):
-            return State.fresh(shape, len(self.plan.tip))
-        return Attempts.none(shape)
 
     def act(
         self,
@@ -97,31 +87,21 @@ class Expert:
             ValueError: if the leading axes changed since the last call without reset.
         """
         shape = readings.head.shape[:-1]
-        if self.state is None:
-            self.state = self._fresh(shape)
-        if self.state.attempts.shape != shape:
+        state = self.plan.fresh(shape) if self.state is None else self.state
+        if state.attempts.shape != shape:
             raise ValueError(
                 f"the readings have leading axes {shape}, those before had "
-                f"{self.state.attempts.shape}; call reset() in between"
+                f"{state.attempts.shape}; call reset() in between"
             )
-        plan, state = self.plan, self.state
-        settings: Any = self._settings
-        if isinstance(plan, Plan):
-            assert isinstance(state, State)
-            action, self.state = decide(plan, settings, state, readings, wall_force)
-        else:
-            assert devices is not None
-            action, self.state = coaxial_pursuit.decide(
-                plan, settings, state, readings, devices, wall_force
-            )
+        action, self.state = self.plan.decide(
+            self._settings, state, readings, wall_force, devices
+        )
         return action
 
     def follow(self, action: np.ndarray) -> None:
         """Replace the last action by the one (..., A) that was carried out."""
-        if isinstance(self.plan, Plan) and isinstance(self.state, State):
-            told = action[..., : self.plan.tip.size] * self.plan.steering_angle
-            bend = told.reshape(self.state.bend.shape)
-            self.state = dataclasses.replace(self.state, bend=bend)
+        if self.state is not None:
+            self.state = self.plan.told(self.state, action)
 
 
 class ExpertPolicy(Policy):

@@ -1,7 +1,5 @@
 """Base class of all policies."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 

@@ -16,19 +16,18 @@ leader): the tip keeps the shape of its path.
 jumps of the head's place on the route.
 """
 
-from __future__ import annotations
-
 import dataclasses
+from typing import ClassVar
 
 import numpy as np
 
 from cathsim_dmc.entities import devices
 from cathsim_dmc.physics import forces
-from cathsim_dmc.physics.readings import Readings
+from cathsim_dmc.physics.readings import CoaxialReadings, Readings
 from cathsim_dmc.policies import attempts
 from cathsim_dmc.tasks import navigation
 from cathsim_dmc.tasks.cases import Case
-from cathsim_dmc.tasks.route import Place, Route, RouteLike, along, locate
+from cathsim_dmc.tasks.route import Place, Route, locate
 
 
 @dataclasses.dataclass(frozen=True)
@@ -73,13 +72,10 @@ class Settings(attempts.AttemptSettings):
 
 
 @dataclasses.dataclass(frozen=True)
-class Plan:
+class Plan(Route):
     """Route and device of a task; world frame, SI units.
 
     Attributes:
-        points: (P, 3), route from the inlet to the goal.
-        radii: (P,), of the lumen.
-        arc_length: (P,), along the route.
         hinges: column in `Readings.joint_positions` and axis (0, 1, 2 for x, y, z) of
             every hinge of the chain, from proximal to distal.
         tip: (M, 2) int, numbers among `hinges` of the x and y hinges of the tip motors.
@@ -88,17 +84,15 @@ class Plan:
         num_actions: A.
     """
 
-    points: np.ndarray
-    radii: np.ndarray
-    arc_length: np.ndarray
     hinges: tuple[tuple[int, int], ...]
     tip: np.ndarray
     steering_angle: float
     link_length: float
     num_actions: int
+    settings: ClassVar = Settings
 
     @classmethod
-    def for_task(cls, task: navigation.Navigation | Case) -> Plan:
+    def for_task(cls, task: navigation.Navigation | Case) -> "Plan":
         """Reads off a task, or one of the anatomies that its episodes draw from.
 
         Raises:
@@ -117,7 +111,6 @@ class Plan:
                 f"device {catheter.device.name!r} has no motors in its tip, so the "
                 f"expert cannot steer it; choose one of {', '.join(steerable)}"
             )
-        route = Route.of(task.objective)
         hinges, numbers = [], {}
         columns = {joint.name: n for n, joint in enumerate(catheter.joints)}
         for joint in catheter.mjcf_model.find_all("joint"):
@@ -127,9 +120,7 @@ class Plan:
             hinges.append((columns[joint.name], int(np.argmax(joint.axis))))
         motors = [numbers[motor.joint.name] for motor in catheter.tip_motors]
         return cls(
-            points=route.points,
-            radii=route.radii,
-            arc_length=route.arc_length,
+            **vars(Route.of(task.objective)),
             hinges=tuple(hinges),
             tip=np.array(motors).reshape(-1, 2),
             steering_angle=catheter.device.steering_angle,
@@ -137,14 +128,57 @@ class Plan:
             num_actions=len(catheter.actuators),
         )
 
-    @property
-    def length(self) -> float:
-        """Length of the route, m."""
-        return float(self.arc_length[-1])
+    def fresh(self, shape: tuple[int, ...]) -> "State":
+        """Memory (...) at the start of an episode."""
+        return State.fresh(shape, len(self.tip))
 
-    def at(self, arc_length: np.ndarray) -> np.ndarray:
-        """Point (..., 3) of the route; beyond the goal, straight on."""
-        return along(self, arc_length)
+    def told(self, state: "State", action: np.ndarray) -> "State":
+        """Memory as if the last action were this one (..., A)."""
+        bend = action[..., : self.tip.size] * self.steering_angle
+        return dataclasses.replace(state, bend=bend.reshape(state.bend.shape))
+
+    def decide(
+        self,
+        settings: Settings,
+        state: "State",
+        readings: Readings,
+        wall_force: forces.WallForce,
+        devices: CoaxialReadings | None = None,
+    ) -> "tuple[np.ndarray, State]":
+        """One control step of the expert: a pure function.
+
+        Args:
+            state: after the last step, arrays (...).
+            readings: of the devices, arrays (...).
+            wall_force: arrays (...); its `max` slows the device down.
+            devices: of coaxial devices; not looked at.
+
+        Returns:
+            Action (..., A) in [-1, 1] and the new state.
+        """
+        # Every other attempt stays near the last place: both ways fail in some
+        # branchings.
+        steady = np.where(state.attempts % 2 == 1, state.arc_length, np.nan)
+        place = locate(self, readings.head, steady)
+        joints, frame = readings.joint_positions, readings.head_frame
+        axes, direction = tip_frames(self, joints, frame)
+        way = lookahead(self, settings, state.attempts, place)
+        target = self.at(place.arc_length + way)
+        turn, cosine = _rotation_to(direction, target - readings.head)
+        bend = _follow_the_leader(self, state, readings.insertion)
+        bend = bend + _correction(settings, axes, turn)
+        bend = np.clip(bend, -self.steering_angle, self.steering_angle)
+        state = attempts.advance(settings, state, place, readings.insertion)
+        free = ramp(wall_force.max, settings.hard_force, settings.soft_force)
+        clear = ramp(cosine, settings.misaligned, settings.aligned)
+        advance = settings.speed * np.maximum(free * clear, settings.creep)
+        translation = np.where(state.retracting, -settings.speed, advance)
+        action = np.zeros((*translation.shape, self.num_actions))
+        motors = self.tip.size
+        told = (bend / self.steering_angle).reshape(*translation.shape, -1)
+        action[..., :motors], action[..., motors] = told, translation
+        insertion = np.array(readings.insertion)
+        return action, dataclasses.replace(state, bend=bend, insertion=insertion)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -160,7 +194,7 @@ class State(attempts.Attempts):
     insertion: np.ndarray
 
     @classmethod
-    def fresh(cls, shape: tuple[int, ...], joints: int) -> State:
+    def fresh(cls, shape: tuple[int, ...], joints: int) -> "State":
         """State at the start of an episode."""
         return cls(
             **vars(attempts.Attempts.none(shape)),
@@ -192,49 +226,8 @@ def tip_frames(
     return stacked[..., plan.tip - first, :], head[..., 2]
 
 
-def decide(
-    plan: Plan,
-    settings: Settings,
-    state: State,
-    readings: Readings,
-    wall_force: forces.WallForce,
-) -> tuple[np.ndarray, State]:
-    """One control step of the expert: a pure function.
-
-    Args:
-        state: after the last step, arrays (...).
-        readings: of the devices, arrays (...).
-        wall_force: arrays (...); its `max` slows the device down.
-
-    Returns:
-        Action (..., A) in [-1, 1] and the new state.
-    """
-    # Every other attempt stays near the last place: both ways fail in some branchings.
-    steady = np.where(state.attempts % 2 == 1, state.arc_length, np.nan)
-    place = locate(plan, readings.head, steady)
-    axes, direction = tip_frames(plan, readings.joint_positions, readings.head_frame)
-    target = plan.at(
-        place.arc_length + lookahead(plan, settings, state.attempts, place)
-    )
-    turn, cosine = _rotation_to(direction, target - readings.head)
-    bend = _follow_the_leader(plan, state, readings.insertion)
-    bend = bend + _correction(settings, axes, turn)
-    bend = np.clip(bend, -plan.steering_angle, plan.steering_angle)
-    state = attempts.advance(settings, state, place, readings.insertion)
-    free = ramp(wall_force.max, settings.hard_force, settings.soft_force)
-    clear = ramp(cosine, settings.misaligned, settings.aligned)
-    advance = settings.speed * np.maximum(free * clear, settings.creep)
-    translation = np.where(state.retracting, -settings.speed, advance)
-    action = np.zeros((*translation.shape, plan.num_actions))
-    motors = plan.tip.size
-    action[..., :motors] = (bend / plan.steering_angle).reshape(*translation.shape, -1)
-    action[..., motors] = translation
-    insertion = np.array(readings.insertion)
-    return action, dataclasses.replace(state, bend=bend, insertion=insertion)
-
-
 def lookahead(
-    plan: RouteLike, settings: Settings, number: np.ndarray, place: Place
+    plan: Route, settings: Settings, number: np.ndarray, place: Place
 ) -> np.ndarray:
     """Way (...) from the place to the point pursued in the n-th attempt (...), m."""
     # The lumen that counts is the one to come, or a branch is entered too obliquely.

@@ -1,7 +1,5 @@
 """Policies that ignore the observation: baselines of agents, loads of the simulator."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

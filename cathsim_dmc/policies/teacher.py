@@ -4,39 +4,40 @@ The expert remembers its commands to a steerable tip, to which every correction 
 and its retries. Neither fits the state that another policy has reached, and a learner
 does not observe retries. The teacher therefore takes the action that was carried out
 for its own and judges every state by itself: it withdraws outside the tube of the route
-and advances inside it. Coaxial devices keep one lead and one look-ahead; without
-retries, the wire 20 mm ahead reaches the left common carotid of Type I, and does not
-reach the brachiocephalic artery of Type II. All follows from the observation if that
-has the last action.
+and advances inside it. Coaxial devices keep one lead and one look-ahead. All follows
+from the observation if that has the last action.
 """
-
-from __future__ import annotations
 
 import dataclasses
 from typing import Any
 
 import numpy as np
 
-from cathsim_dmc.policies import coaxial_pursuit
-from cathsim_dmc.policies.attempts import Attempts
 from cathsim_dmc.policies.coaxial_pursuit import CoaxialPlan, CoaxialSettings
 from cathsim_dmc.policies.expert import Expert
-from cathsim_dmc.policies.pursuit import Plan, Settings, State, decide
+from cathsim_dmc.policies.pursuit import Plan, Settings
 from cathsim_dmc.policies.view import View
 from cathsim_dmc.tasks.cases import Case
 from cathsim_dmc.tasks.objective_pool import part
 from cathsim_dmc.tasks.route import locate
 
-# The lead and the look-ahead that need no retry.
-_COAXIAL = CoaxialSettings(leads=(0.02,), offsets=(0.0,), lookahead_factors=(1.4,))
-
 
 class Teacher:
     """Tells the expert's action in the states of N simulations."""
 
-    def __init__(self, view: View):
-        """Looks at simulations; `reset` comes before the first question."""
+    def __init__(self, view: View, lead: float = 0.02):
+        """Looks at simulations; `reset` comes before the first question.
+
+        Args:
+            lead: of a guidewire ahead of the catheter around it, m. With 0.02 it
+                reaches the left common carotid of Type I without retries; the
+                brachiocephalic artery of Type II takes -0.02, the catheter first.
+        """
         self._view = view
+        # A longer look-ahead than the expert's needs no retry.
+        self._coaxial = CoaxialSettings(
+            leads=(lead,), offsets=(0.0,), lookahead_factors=(1.4,)
+        )
         self._plans: dict[Case, Plan | CoaxialPlan] = {}
         self._cases: list[Case | None] = [None] * view.num_simulations
         self._insertion = np.full(view.num_simulations, np.nan)
@@ -82,26 +83,15 @@ class Teacher:
         view, shape = self._view, (len(rows),)
         readings, force = part(view.resting, rows), part(view.wall_force, rows)
         coaxial = isinstance(plan, CoaxialPlan)
-        settings: Any = _COAXIAL if coaxial else Settings()
-        fresh = Attempts.none(shape) if coaxial else State.fresh(shape, len(plan.tip))
+        settings: Any = self._coaxial if coaxial else Settings()
         state: Any = dataclasses.replace(
-            fresh,
+            plan.fresh(shape),
             retracting=locate(plan, readings.head).excess > settings.tolerance,
             turn=np.full(shape, np.inf),
             held=np.array(readings.insertion),
         )
-        if coaxial:
-            assert view.devices is not None
-            own = part(view.devices, rows)
-            action, _ = coaxial_pursuit.decide(
-                plan, settings, state, readings, own, force
-            )
-            return action
-        told = last_action[:, : plan.tip.size] * plan.steering_angle
-        state = dataclasses.replace(
-            state,
-            bend=told.reshape(state.bend.shape),
-            insertion=self._insertion[rows],
-        )
-        action, _ = decide(plan, settings, state, readings, force)
-        return action
+        state = plan.told(state, last_action)
+        if isinstance(plan, Plan):
+            state = dataclasses.replace(state, insertion=self._insertion[rows])
+        devices = part(view.devices, rows)
+        return plan.decide(settings, state, readings, force, devices)[0]

@@ -1,7 +1,5 @@
 """State of the simulations, for policies that do not act on observations."""
 
-from __future__ import annotations
-
 from dm_control import composer
 
 from cathsim_dmc.physics.forces import WallForce

@@ -1,7 +1,5 @@
 """Layout of a recorded episode in the Rerun viewer."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

@@ -3,8 +3,6 @@
 A record holds one chain of links; what the devices in it did stands in ``meta``.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any
 
@@ -35,7 +33,7 @@ class CoaxialRecord:
     tip_rotation: np.ndarray
 
     @classmethod
-    def of(cls, episode: Episode) -> CoaxialRecord | None:
+    def of(cls, episode: Episode) -> "CoaxialRecord | None":
         """Reads the devices of an episode; None if it has a single device."""
         devices = episode.meta.get("devices")
         if not devices:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -20,40 +19,62 @@ CATEGORIES = [
 _MOST_ROWS = 10**6  # in one file
 
 
-def encoded(mask: np.ndarray) -> str:
-    """A mask (rows, columns) bool as COCO's compressed run lengths, column by column.
+def described(columns: np.ndarray, bit: int = 1) -> dict[str, Any]:
+    """The pixels of a mask that have a bit, as COCO describes an object.
 
-    `pycocotools.mask.decode({"size": mask.shape, "counts": ...})` reads it.
+    Args:
+        columns: (columns, rows) uint8, the transposed mask.
+
+    Returns:
+        Segmentation in compressed run lengths, which `pycocotools.mask.decode` reads;
+        area; bounding box.
     """
-    column_major = np.ascontiguousarray(mask.T, dtype=np.uint8).reshape(-1)
-    text = np.empty(7 * len(column_major) + 14, np.uint8)
-    return text[: _encode(column_major, text)].tobytes().decode()
+    text = np.empty(7 * columns.size + 14, np.uint8)
+    size, area, left, right, top, bottom = _describe(columns, bit, text)
+    counts = text[:size].tobytes().decode()
+    return {
+        "segmentation": {"size": list(columns.shape[::-1]), "counts": counts},
+        "area": area,
+        "bbox": [left, top, right - left + 1, bottom - top + 1] if area else [0] * 4,
+        "iscrowd": 0,
+    }
 
 
 @compiled
-def _encode(values: np.ndarray, text: np.ndarray) -> int:
-    """Writes run lengths as pycocotools does; returns the number of characters.
+def _describe(columns: np.ndarray, bit: int, text: np.ndarray) -> tuple:
+    """Writes run lengths as pycocotools does.
 
     Run lengths begin with that of zeros; from the fourth on they are less the one two
     before. Each is written in groups of five bits, least first, with a sign.
+
+    Returns:
+        Number of characters, area, first and last column, first and last row.
     """
-    size, now, start, count = 0, 0, 0, 0
+    high, values = columns.shape[1], columns.reshape(-1)
+    size, now, start, count, area = 0, 0, 0, 0, 0
     before, last = 0, 0  # the run lengths two before, and one before
+    left, right, top, bottom = len(columns), -1, high, -1
     for end in range(len(values) + 1):
-        if end < len(values) and values[end] == now:
+        if end < len(values) and (values[end] & bit != 0) == now:
             continue
         run = end - start
-        left = run - before if count > 2 else run
+        if now and run:
+            area += run
+            left, right = min(left, start // high), (end - 1) // high
+            inside = start // high == right  # a run over two columns covers both ends
+            top = min(top, start % high if inside else 0)
+            bottom = max(bottom, (end - 1) % high if inside else high - 1)
+        rest = run - before if count > 2 else run
         while True:
-            group = left & 31
-            left >>= 5
-            more = left != -1 if group & 16 else left != 0
+            group = rest & 31
+            rest >>= 5
+            more = rest != -1 if group & 16 else rest != 0
             text[size] = group + (32 if more else 0) + 48
             size += 1
             if not more:
                 break
         before, last, start, now, count = last, run, end, 1 - now, count + 1
-    return size
+    return size, area, left, right, top, bottom
 
 
 def labels(path: Path, number: int, pictures: bool = False) -> dict[str, list[Any]]:
@@ -72,7 +93,8 @@ def labels(path: Path, number: int, pictures: bool = False) -> dict[str, list[An
             name: file[name][:] for name in ("keypoints", "sequence", "camera_matrix")
         }
         rows, height, width = file["image"].shape
-        masks, keypoints = file["mask"][:], columns["keypoints"].round(2)
+        keypoints = columns["keypoints"].round(2)
+        masks = np.ascontiguousarray(file["mask"][:].transpose(0, 2, 1))
         cameras = columns["camera_matrix"].round(6).tolist()
         for row, sequence in enumerate(columns["sequence"].tolist()):
             images.append({
@@ -83,39 +105,19 @@ def labels(path: Path, number: int, pictures: bool = False) -> dict[str, list[An
             })  # fmt: skip
         for kind, (_, bit, names) in enumerate(_CLASSES):
             own = keypoints[:, -len(names) :] if kind else keypoints[:, : len(names)]
-            for row, one in enumerate(_annotations(masks & bit > 0, own)):
-                found = number * _MOST_ROWS + row
-                annotations.append(
-                    {"id": 2 * found + kind, "image_id": found, "category_id": kind + 1}
-                    | one
-                )
+            known = (own[..., 2] > 0).sum(axis=1).tolist()
+            flat = own.reshape(len(own), -1).tolist()
+            for row, mask in enumerate(masks):
+                image = number * _MOST_ROWS + row
+                annotations.append({
+                    "id": 2 * image + kind, "image_id": image, "category_id": kind + 1,
+                    **described(mask, bit), "keypoints": flat[row],
+                    "num_keypoints": known[row],
+                })  # fmt: skip
         if pictures and not (folder := path.with_suffix("")).exists():
             with files.atomic_directory(folder) as temporary:
                 _write_pictures(file["image"], temporary)
     return {"images": images, "annotations": annotations}
-
-
-def _annotations(masks: np.ndarray, keypoints: np.ndarray) -> Iterator[dict[str, Any]]:
-    """What COCO says of objects with masks (n, H, W) bool and keypoints (n, K, 3)."""
-    size, areas = list(masks.shape[1:]), masks.sum(axis=(1, 2)).tolist()
-    ends = []
-    for axis in (1, 2):  # columns, then rows
-        covered = np.asarray(masks.any(axis=axis))
-        first, length = covered.argmax(axis=1), covered.shape[1]
-        last = length - 1 - covered[:, ::-1].argmax(axis=1)
-        ends.append((first.tolist(), (last - first + 1).tolist()))
-    known = (keypoints[..., 2] > 0).sum(axis=1).tolist()
-    flat = keypoints.reshape(len(keypoints), -1).tolist()
-    for row, mask in enumerate(masks):
-        box = [ends[0][0][row], ends[1][0][row], ends[0][1][row], ends[1][1][row]]
-        yield {
-            "segmentation": {"size": size, "counts": encoded(mask)},
-            "area": areas[row],
-            "bbox": box if areas[row] else [0, 0, 0, 0],
-            "iscrowd": 0,
-            "keypoints": flat[row],
-            "num_keypoints": known[row],
-        }
 
 
 def _write_pictures(images: Any, folder: Path) -> None:

@@ -1,7 +1,5 @@
 """Episodes as a Minari dataset, which Gymnasium and TorchRL load."""
 
-from __future__ import annotations
-
 import json
 import os
 import re
@@ -13,7 +11,7 @@ import numpy as np
 
 from cathsim_dmc.files import atomic_directory
 
-_NO_MINARI = "minari is not installed; `pip install cathsim-dmc[gym]` adds it"
+_NO_MINARI = "minari is not installed; `pip install 'cathsim-dmc[gym]'` adds it"
 _VERSION = re.compile(r"-v\d+$")
 
 

@@ -1,15 +1,12 @@
 """Inputs of a recording beside the episode, checked against it."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
+from cathsim_dmc.anatomy.parts import Surface
 from cathsim_dmc.recording.episode import Episode
-from cathsim_dmc.recording.geometry import surface_arrays
 from cathsim_dmc.recording.scene import BodyGeom
 
 # 5F diagnostic catheter, 1.67 mm outer diameter; used when the record has no radii.
@@ -21,16 +18,14 @@ class Drawing:
     """Checked inputs of a recording; lengths in metres, world frame.
 
     Attributes:
-        vertices: (V, 3) float64 of the vessel surface.
-        faces: (F, 3) int64.
+        surface: Lumen surface of the vessel.
         geoms: Primitives that the body poses of the episode move.
         radii: (L,) radii of the links of the catheter.
         goal: Position (3,) and radius, or None.
         frames: (T+1, H, W, P) uint8 fluoroscopy of P = 1 or 2 planes, or None.
     """
 
-    vertices: np.ndarray
-    faces: np.ndarray
+    surface: Surface
     geoms: tuple[BodyGeom, ...]
     radii: np.ndarray
     goal: tuple[np.ndarray, float] | None
@@ -40,11 +35,11 @@ class Drawing:
     def of(
         cls,
         episode: Episode,
-        surface: Any,
+        surface: Surface,
         *,
         robot_geoms: Iterable[BodyGeom] = (),
         fluoroscopy: np.ndarray | None = None,
-    ) -> Drawing:
+    ) -> "Drawing":
         """Check the arguments of ``write_rrd``; ValueError on what does not fit."""
         if fluoroscopy is not None:
             shape = np.shape(fluoroscopy)
@@ -54,12 +49,13 @@ class Drawing:
                     f"fluoroscopy must be uint8 of shape ({episode.steps + 1}, H, W, "
                     f"1), or 2 for two planes; got {fluoroscopy.dtype} of {shape}"
                 )
-        vertices, faces = surface_arrays(surface)
+        if not len(surface.vertices):
+            raise ValueError("a surface needs vertices")
         geoms, goal = tuple(robot_geoms), None
         if "goal_position" in episode.meta:
             place = np.array(episode.meta["goal_position"], np.float64)
             goal = place, float(episode.meta["goal_radius"])
-        return cls(vertices, faces, geoms, link_radii(episode), goal, fluoroscopy)
+        return cls(surface, geoms, link_radii(episode), goal, fluoroscopy)
 
 
 def goal_distance(episode: Episode) -> np.ndarray | None:

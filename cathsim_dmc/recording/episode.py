@@ -5,8 +5,6 @@ dictionary, so statistics, heatmaps and Rerun files can be made from it long aft
 the environment is gone, on a machine that has neither MuJoCo nor Rerun.
 """
 
-from __future__ import annotations
-
 import json
 import os
 from dataclasses import dataclass, field, fields
@@ -192,7 +190,7 @@ class Episode:
             np.savez_compressed(stream, header=np.array(json.dumps(header)), **arrays)
 
     @classmethod
-    def load(cls, path: str | os.PathLike[str]) -> Episode:
+    def load(cls, path: str | os.PathLike[str]) -> "Episode":
         """Read an episode that ``save`` wrote; nothing in the file is executed.
 
         Raises:
@@ -225,7 +223,7 @@ class Episode:
         except ValueError as error:
             raise ValueError(f"{path}: {error}") from error
 
-    def equals(self, other: Episode) -> bool:
+    def equals(self, other: "Episode") -> bool:
         """Whether both hold the same values, bit for bit."""
         return all(
             np.array_equal(getattr(self, f.name), getattr(other, f.name))

@@ -1,12 +1,6 @@
 """Small geometry for drawing: orientations, shading normals, force colours."""
 
-from __future__ import annotations
-
-from typing import Any
-
 import numpy as np
-
-from cathsim_dmc.anatomy.parts import Surface
 
 UP = np.array([0.0, 0.0, 1.0])
 # Top of the colour scale, newtons. Published in-contact forces lie mostly within
@@ -21,24 +15,6 @@ _FORCE_SCALES = (0.02, 0.05, 0.1, 0.2, FORCE_COLOUR_MAX)
 _FORCE_COLOURS = np.array(
     [[255, 240, 150], [253, 170, 70], [225, 65, 40], [120, 0, 45]], dtype=np.float64
 )
-
-
-def surface_arrays(surface: Any) -> tuple[np.ndarray, np.ndarray]:
-    """Return vertices (V, 3) float64 and faces (F, 3) int64 of a triangle surface.
-
-    Args:
-        surface: A pair ``(vertices, faces)`` or an object with those attributes.
-
-    Raises:
-        ValueError: on a wrong shape or a face that names a missing vertex.
-    """
-    if not isinstance(surface, Surface):
-        if hasattr(surface, "vertices"):
-            surface = surface.vertices, surface.faces
-        surface = Surface(*surface)
-    if not len(surface.vertices):
-        raise ValueError("a surface needs vertices")
-    return surface.vertices, surface.faces.astype(np.int64)
 
 
 def z_to(direction: np.ndarray) -> np.ndarray:
@@ -85,10 +61,8 @@ def force_colours(
     magnitude = np.asarray(magnitude, dtype=np.float64)
     last = len(_FORCE_COLOURS) - 1
     place = np.clip(magnitude / largest, 0, 1) * last
-    lower = np.minimum(place.astype(np.int64), last - 1)
-    share = (place - lower)[..., None]
-    mixed = _FORCE_COLOURS[lower] * (1 - share) + _FORCE_COLOURS[lower + 1] * share
-    return np.round(mixed).astype(np.uint8)
+    mixed = [np.interp(place, range(last + 1), one) for one in _FORCE_COLOURS.T]
+    return np.round(np.stack(mixed, axis=-1)).astype(np.uint8)
 
 
 def force_scale(magnitude: np.ndarray) -> float:

@@ -30,7 +30,7 @@ from cathsim_dmc.recording.sequences import KEYPOINTS, KITS, SequenceOptions
 SPLITS = {"train": "train", "val": "train", "test": "test"}  # and their sets of arches
 _TRIES = 8  # arches that are tried in place of those that no device enters
 _FORMAT = "cathsim-image-set"
-_NO_H5PY = "h5py is not installed; `pip install cathsim-dmc[gym]` adds it"
+_NO_H5PY = "h5py is not installed; `pip install 'cathsim-dmc[gym]'` adds it"
 
 
 Labels = dict[str, list[Any]]  # as `coco.labels` returns them

@@ -1,7 +1,5 @@
 """The vessel of a recorded episode, where it lives: phases, blood, wall and motion."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any
 
@@ -22,6 +20,17 @@ SERIES = {
 }
 
 
+# Waves P, Q, R, S and T of the curve that stands for an ECG: middle, in beats from the
+# beginning of the ejection, width and height.
+_WAVES = np.array(
+    [
+        (-0.20, 0.030, 0.15),
+        (-0.07, 0.012, -0.12),
+        (-0.04, 0.025, 1.0),
+        (-0.01, 0.012, -0.2),
+        (0.24, 0.045, 0.3),
+    ]
+)
 MESH_EVERY = 4  # states, of which a recording keeps the moved surface
 DENT = 6e-3  # m around a contact, in which a wall that gives is drawn pressed in
 
@@ -47,7 +56,7 @@ class VesselRecord:
     depth: np.ndarray
 
     @classmethod
-    def of(cls, episode: Episode) -> VesselRecord | None:
+    def of(cls, episode: Episode) -> "VesselRecord | None":
         """Reads the vessel of an episode; None if it is rigid and its blood rests."""
         given = episode.meta.get("vessel")
         if not given:
@@ -60,6 +69,25 @@ class VesselRecord:
         motion = Motion(lattice) if lattice.size else None
         series = {name: np.array(given[name], np.float64) for name in SERIES}
         return cls(series, velocity, goal, motion, parameters, depth)
+
+    def curves(self) -> dict[str, tuple[np.ndarray, str]]:
+        """What is drawn over time (T+1,), by name, with labels.
+
+        The phases stand as an ECG, a sum of five waves of this size for any heart, and
+        as the depth of a breath.
+        """
+        found = {
+            name: (factor * self.series[name], label)
+            for name, (factor, label) in SERIES.items()
+        }
+        place, width, height = _WAVES.T
+        way = self.series["heart_phase"][:, None] - place
+        way -= np.round(way)
+        ecg = np.exp(-0.5 * (way / width) ** 2) @ height
+        breath = 0.5 - 0.5 * np.cos(2.0 * np.pi * self.series["breath_phase"])
+        found["heart_phase"] = ecg, "ECG, schematic"
+        found["breath_phase"] = breath, "depth of the breath"
+        return found
 
     @property
     def still(self) -> bool:

@@ -1,7 +1,5 @@
 """Recording of whole episodes of a composer environment."""
 
-from __future__ import annotations
-
 import functools
 import itertools
 import logging
@@ -173,10 +171,7 @@ class EpisodeRecorder:
         contacts = task.contacts(self._env.physics)
         prefix = "reward_"
         forces = {
-            "wall_force_sum": float(wall.sum),
-            "wall_force_max": float(wall.max),
-            "wall_force_peak_sum": float(wall.peak_sum),
-            "wall_force_peak_max": float(wall.peak_max),
+            **{name: float(value) for name, value in wall.named().items()},
             "push_force": float(task.readings.push_force),
             "reward_terms": {
                 name.removeprefix(prefix): value

@@ -1,7 +1,5 @@
 """The device, its path and its contacts as Rerun entities."""
 
-from __future__ import annotations
-
 import numpy as np
 import rerun as rr
 

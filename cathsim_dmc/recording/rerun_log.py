@@ -5,18 +5,16 @@ series over simulated time, and the layout that opens them.
 Whole series are sent as columns, so the cost does not grow with calls per step.
 """
 
-from __future__ import annotations
-
 import os
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import rerun as rr
 from rerun.blueprint import Blueprint
 from rerun.error_utils import catch_and_log_exceptions
 
+from cathsim_dmc.anatomy.parts import Surface
 from cathsim_dmc.files import atomic_path
 from cathsim_dmc.recording import blueprint
 from cathsim_dmc.recording.coaxial import CoaxialRecord
@@ -35,7 +33,7 @@ SUFFIX = ".rrd"
 
 def write_rrd(
     episode: Episode,
-    surface: Any,
+    surface: Surface,
     path: str | os.PathLike[str],
     *,
     robot_geoms: Iterable[BodyGeom] = (),
@@ -45,7 +43,7 @@ def write_rrd(
 
     Args:
         episode: What to draw; radii of the device and the goal are in ``meta``.
-        surface: The vessel, ``(vertices, faces)`` or an object with these, metres.
+        surface: Lumen surface of the vessel.
         path: Target, ``*.rrd``; an existing file is replaced.
         robot_geoms: Primitives that the body poses of the episode move.
         fluoroscopy: (T+1, H, W, P) uint8 frames, one per state, of one plane or two.
@@ -98,7 +96,8 @@ def _fill(log: Log, drawing: Drawing) -> None:
 
 def _layout(episode: Episode, drawing: Drawing) -> Blueprint:
     """How the viewer opens an episode."""
-    low, high = drawing.vertices.min(0), drawing.vertices.max(0)
+    vertices = drawing.surface.vertices
+    low, high = vertices.min(0), vertices.max(0)
     planes = 0 if drawing.frames is None else drawing.frames.shape[-1]
     robots = [g.body for g in drawing.geoms if g.body_name.startswith("robot/")]
     robot = episode.body_pos[0, sorted(set(robots))].mean(0) if robots else None

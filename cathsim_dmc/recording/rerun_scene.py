@@ -1,17 +1,14 @@
 """Static parts of the scene, and the moving bodies, as Rerun entities."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np
 import rerun as rr
 from scipy.spatial.transform import Rotation
 
-from cathsim_dmc.anatomy.parts import Surface
 from cathsim_dmc.recording.drawing import Drawing
 from cathsim_dmc.recording.geometry import xyzw
-from cathsim_dmc.recording.living import MESH_EVERY, SERIES, VesselRecord
+from cathsim_dmc.recording.living import MESH_EVERY, VesselRecord
 from cathsim_dmc.recording.rerun_stream import Log
 from cathsim_dmc.recording.scene import BodyGeom
 
@@ -25,7 +22,7 @@ SEE_THROUGH = {"sheath": 0.3}
 
 def log_static(log: Log, drawing: Drawing) -> None:
     """Log vessel, goal and directions."""
-    vertices, faces = drawing.vertices, drawing.faces
+    surface = drawing.surface
     # Patient frame LPS: x to the patient's left, y to the back, z up.
     log.static("world", rr.ViewCoordinates.LBU)
     record = VesselRecord.of(log.episode)
@@ -34,9 +31,9 @@ def log_static(log: Log, drawing: Drawing) -> None:
         "world/vessel",
         rr.Mesh3D.from_fields(
             # What is static hides what moves.
-            vertex_positions=None if moves else vertices.astype(np.float32),
-            vertex_normals=Surface(vertices, faces).normals.astype(np.float32),
-            triangle_indices=faces.astype(np.uint32),
+            vertex_positions=None if moves else surface.vertices.astype(np.float32),
+            vertex_normals=surface.normals.astype(np.float32),
+            triangle_indices=surface.faces.astype(np.uint32),
             albedo_factor=VESSEL_COLOUR,
         ),
     )
@@ -58,9 +55,8 @@ def log_vessel(log: Log, drawing: Drawing) -> None:
     record = VesselRecord.of(log.episode)
     if record is None:
         return
-    for name, values in record.series.items():
-        factor, label = SERIES[name]
-        log.series(f"series/vessel/{name}", factor * values, slice(None), label)
+    for name, (values, label) in record.curves().items():
+        log.series(f"series/vessel/{name}", values, slice(None), label)
     log.static("world/blood", rr.Arrows3D.from_fields(colors=[BLOOD_COLOUR]))
     arrows = rr.Arrows3D.columns(
         origins=log.episode.head, vectors=BLOOD_SCALE * record.blood_velocity
@@ -73,7 +69,7 @@ def log_vessel(log: Log, drawing: Drawing) -> None:
         )
     if record.still:
         return
-    rest = Surface(drawing.vertices, drawing.faces)
+    rest = drawing.surface
     rows = np.arange(0, log.episode.steps + 1, MESH_EVERY)
     moved = [
         record.surface(rest, log.episode, state).vertices.astype(np.float32)

@@ -1,7 +1,5 @@
 """Series over time and X-ray images as Rerun entities."""
 
-from __future__ import annotations
-
 import io
 
 import numpy as np

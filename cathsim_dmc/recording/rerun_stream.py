@@ -1,7 +1,5 @@
 """A Rerun stream together with the times of one episode's states."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

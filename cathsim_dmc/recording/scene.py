@@ -1,8 +1,6 @@
 """Primitive geoms of a compiled model, for drawing bodies that the record moves."""
 
-from __future__ import annotations
-
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -39,29 +37,21 @@ class BodyGeom:
     rgba: np.ndarray
 
 
-def body_geoms(
-    physics: Any, entities: Iterable[str] = ("robot", "sheath")
-) -> tuple[BodyGeom, ...]:
-    """Return the visible primitives of some entities, in the order of the model.
+def body_geoms(physics: Any) -> Iterator[BodyGeom]:
+    """The visible primitives of robot and sheath, in the order of the model.
 
     Args:
         physics: A dm_control ``Physics``.
-        entities: MJCF prefixes; an entity that the model lacks adds nothing, and
-            meshes are left out because their vertices belong to the model file.
     """
-    wanted = tuple(entities)
-    return tuple(_walk(physics.model, wanted))
-
-
-def _walk(model: Any, wanted: tuple[str, ...]) -> Iterator[BodyGeom]:
     import mujoco
 
+    model = physics.model
     kinds = {int(getattr(mujoco.mjtGeom, f"mjGEOM_{k.upper()}")): k for k in SIZES}
     for geom in range(model.ngeom):
         kind = kinds.get(int(model.geom_type[geom]))
         body = int(model.geom_bodyid[geom])
         name = model.id2name(body, "body")
-        if kind is None or name.split("/", 1)[0] not in wanted:
+        if kind is None or name.split("/", 1)[0] not in ("robot", "sheath"):
             continue
         material = int(model.geom_matid[geom])
         rgba = model.mat_rgba[material] if material >= 0 else model.geom_rgba[geom]

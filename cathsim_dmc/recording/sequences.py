@@ -252,7 +252,8 @@ def frames_of(
                 places[:, -len(OSTIA) :] = rest
                 view = camera.before(anatomy)
                 image, seen = view.image(own, random), view.device_mask(own)
-                mask = DEVICE * seen + VESSEL * view.vessel_mask
+                vessel = VESSEL * view.vessel_mask.astype(np.uint8)
+                mask = DEVICE * seen.astype(np.uint8) + vessel
             else:
                 image = np.empty((count, options.size, options.size, 1), np.uint8)
                 mask = np.empty(image.shape[:-1], np.uint8)
@@ -268,7 +269,7 @@ def frames_of(
                     mask[row] += VESSEL * view.vessel_mask.astype(np.uint8)
             yield {
                 "image": image[..., 0],
-                "mask": mask.astype(np.uint8),
+                "mask": mask,
                 "keypoints": _seen(camera, places),
                 "keypoints_3d": places,
                 "camera_matrix": np.tile(camera.arm.matrix, (count, 1, 1)),

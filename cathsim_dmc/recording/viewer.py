@@ -1,7 +1,5 @@
 """Opening recordings in the viewer of the installed Rerun package."""
 
-from __future__ import annotations
-
 import importlib.util
 import os
 import sys

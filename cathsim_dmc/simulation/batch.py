@@ -57,6 +57,10 @@ class BatchSimulation:
 
     A simulation that has ended must be reset before the next step; stepping it on is
     allowed and goes on with the state as it is.
+
+    Attributes:
+        task: The task that all simulations run.
+        rollout: Objective, readings and forces of all simulations.
     """
 
     def __init__(
@@ -83,7 +87,7 @@ class BatchSimulation:
         )
         num_threads = bounds.whole("num_threads", num_threads, 0, bounds.MOST_THREADS)
         _refuse_overrides(type(task))
-        self._task = task
+        self.task = task
         physics = mjcf.Physics.from_mjcf_model(task.root_entity.mjcf_model)
         self._model = physics.model.ptr
         if task.num_anatomies > 1:
@@ -95,7 +99,7 @@ class BatchSimulation:
             self._stepper = _BatchStepper(
                 task, self._model, num_simulations, num_threads
             )
-        self._rollout = task.make_rollout(self._model, self._stepper)
+        self.rollout: Rollout = task.make_rollout(self._model, self._stepper)
         self.seed(seeds)
         self._begun = np.zeros(num_simulations, dtype=bool)
         self._process = os.getpid()
@@ -130,9 +134,9 @@ class BatchSimulation:
         indices = bounds.indices("indices", indices, self.num_simulations)
         self._begun[indices] = True
         self._stepper.reset(indices)
-        self._rollout.begin(indices, self._random_states)
+        self.rollout.begin(indices, self._random_states)
         self._stepper.forward_unactuated(indices)
-        return _own(self._rollout.start(indices))
+        return _own(self.rollout.start(indices))
 
     def step(self, action: np.ndarray) -> Step:
         """Advances every simulation by one control step.
@@ -146,19 +150,16 @@ class BatchSimulation:
             RuntimeError: if a simulation has not been reset, or the process has forked.
         """
         self._refuse_fork()
-        self._refuse_waiting(np.arange(self.num_simulations))
-        action = check_action(action, (self.num_simulations, self.num_actions))
-        self._rollout.command(action)
-        self._stepper.run()
-        return _own(self._rollout.finish())
-
-    def _refuse_waiting(self, indices: np.ndarray):
-        waiting = indices[~self._begun[indices]].tolist()
-        if waiting:
+        if not self._begun.all():
+            waiting = np.flatnonzero(~self._begun).tolist()
             raise RuntimeError(
                 f"simulations {bounds.shown(waiting)} have no episode; call reset() "
                 "first"
             )
+        action = check_action(action, (self.num_simulations, self.num_actions))
+        self.rollout.command(action)
+        self._stepper.run()
+        return _own(self.rollout.finish())
 
     def _refuse_fork(self):
         if os.getpid() != self._process:
@@ -175,27 +176,17 @@ class BatchSimulation:
     @property
     def num_actions(self) -> int:
         """A, entries of an action."""
-        return self._task.num_actions
-
-    @property
-    def task(self) -> Navigation:
-        """The task that all simulations run."""
-        return self._task
-
-    @property
-    def rollout(self) -> Rollout:
-        """Objective, readings and forces of all simulations."""
-        return self._rollout
+        return self.task.num_actions
 
     @property
     def readings(self) -> readings.Readings:
         """State of the devices after the last step or reset, arrays (N, ...)."""
-        return self._rollout.readings
+        return self.rollout.readings
 
     @property
     def wall_force(self) -> forces.WallForce:
         """Force on the wall over the last step, arrays (N,)."""
-        return self._rollout.wall_force
+        return self.rollout.wall_force
 
     @property
     def batch(self) -> mujoco_batch.Batch:
@@ -209,7 +200,7 @@ class BatchSimulation:
 
     def contacts(self) -> forces.Contacts:
         """Contacts with the wall in the last physics step, arrays (N, K, ...)."""
-        return self._rollout.index.contacts(self.sensor_rows[:, -1])
+        return self.rollout.index.contacts(self.sensor_rows[:, -1])
 
 
 class _BatchStepper(Stepper):
@@ -228,6 +219,7 @@ class _BatchStepper(Stepper):
             self.batch.bind(field)
         self.arrays, self.warnings = self.batch, self.batch.warning
         self.rows = np.zeros((num_simulations, self.substeps, model.nsensordata))
+        self._copy, self._own_fields = copy.copy(model), set[str]()
 
     def reset(self, indices: np.ndarray) -> None:
         """Puts some simulations to the model's default state."""
@@ -247,7 +239,14 @@ class _BatchStepper(Stepper):
 
     def field(self, index: int, name: str) -> np.ndarray:
         """A field of the model of one simulation, to be written."""
+        self._own_fields.add(name)
         return self.batch.expand(name)[index]
+
+    def _model_of(self, index: int) -> mujoco.MjModel:
+        """A copy of the model with the fields of one simulation."""
+        for name in self._own_fields:
+            getattr(self._copy, name)[:] = self.batch.expand(name)[index]
+        return self._copy
 
     def load(self, index: int, case: Anatomic) -> None:
         """There is one anatomy."""
@@ -299,6 +298,10 @@ class _PoolStepper(_BatchStepper):
     def field(self, index: int, name: str) -> np.ndarray:
         """A field of the model of one simulation, to be written."""
         return getattr(self._models[index], name)
+
+    def _model_of(self, index: int) -> mujoco.MjModel:
+        """The model of one simulation."""
+        return self._models[index]
 
     def load(self, index: int, case: Anatomic) -> None:
         """Puts an anatomy into the model of one simulation, before a forward pass."""

@@ -81,6 +81,9 @@ class CathSimEnv(gymnasium.Env):
     `reset(seed=s)` starts the same episode as the suite's `random=s`. The observation
     is a dictionary, whatever it holds. `terminated` is success or, with
     `info["physics_error"]`, divergence; `truncated` is the end of the time.
+
+    Attributes:
+        environment: The composer environment.
     """
 
     metadata = {
@@ -110,10 +113,10 @@ class CathSimEnv(gymnasium.Env):
         _refuse_unknown(task, task_kwargs)
         self.render_mode = render_mode
         self._dtype = _float_type(dtype)
-        self._environment = suite.load(suite.DOMAIN, task, task_kwargs)
-        entries = self._environment.task.observation_specs
+        self.environment = suite.load(suite.DOMAIN, task, task_kwargs)
+        entries = self.environment.task.observation_specs
         self.observation_space = space_of(entries, self._dtype)
-        self.action_space = space(self._environment.action_spec(), self._dtype)
+        self.action_space = space(self.environment.action_spec(), self._dtype)
         self._machines: dict[Surface, angiograph.Angiograph] = {}
         self._begun, self._ended = False, True
         self._closed = False
@@ -122,10 +125,10 @@ class CathSimEnv(gymnasium.Env):
         """Starts an episode; see `gymnasium.Env.reset`. `options` has no meaning."""
         super().reset(seed=seed)
         if seed is not None:
-            self._environment.random_state.seed(_words(seed))
-        timestep = self._environment.reset()
+            self.environment.random_state.seed(_words(seed))
+        timestep = self.environment.reset()
         self._begun, self._ended = True, False
-        info = self._environment.task.info()
+        info = self.environment.task.info()
         return _converted(timestep.observation, self._dtype), info
 
     def step(self, action: np.ndarray):
@@ -134,7 +137,7 @@ class CathSimEnv(gymnasium.Env):
             raise gymnasium.error.ResetNeeded(
                 "the episode has ended, or none has begun; call reset()"
             )
-        timestep = self._environment.step(action)
+        timestep = self.environment.step(action)
         self._ended = timestep.last()
         terminated = self._ended and timestep.discount == 0
         return (
@@ -142,7 +145,7 @@ class CathSimEnv(gymnasium.Env):
             float(timestep.reward),
             terminated,
             self._ended and not terminated,
-            self._environment.task.info(),
+            self.environment.task.info(),
         )
 
     def render(self) -> np.ndarray | None:
@@ -154,10 +157,10 @@ class CathSimEnv(gymnasium.Env):
             return None
         if not self._begun:
             raise gymnasium.error.ResetNeeded("there is nothing to see before reset()")
-        return fluoroscopy_frame(self._environment.task, self._machine())
+        return fluoroscopy_frame(self.environment.task, self._machine())
 
     def _machine(self) -> angiograph.Angiograph:
-        task = self._environment.task
+        task = self.environment.task
         surface = task.scene.anatomy.surface
         if surface not in self._machines:
             self._machines[surface] = angiograph.Angiograph(
@@ -165,15 +168,10 @@ class CathSimEnv(gymnasium.Env):
             )
         return self._machines[surface]
 
-    @property
-    def environment(self):
-        """The composer environment."""
-        return self._environment
-
     def close(self) -> None:
         """Frees the simulator; closing twice does nothing."""
         if not self._closed:
-            self._environment.close()
+            self.environment.close()
         self._closed = True
 
 

@@ -22,7 +22,12 @@ class BatchedEnv(EnvBase):
     Keys: the task's observations (float32, images uint8), "action" (N, A), "reward",
     "terminated" (success or physics error), "truncated", and under "info" the
     figures of `tasks.step.Step.info` (float32 or bool), all (N, 1).
+
+    Attributes:
+        simulation: The simulations underneath.
     """
+
+    simulation: BatchSimulation
 
     def __init__(
         self,
@@ -43,14 +48,14 @@ class BatchedEnv(EnvBase):
             observation: Name or names of observations.
         """
         options = bounds.options("task_kwargs", task_kwargs)
-        self._simulation = BatchSimulation(
+        self.simulation = BatchSimulation(
             suite.make_task(task_name, **{**options, "observation": observation}),
             num_envs,
             num_threads=num_threads or 0,
             seeds=seed,
         )
         super().__init__(device="cpu", batch_size=[num_envs])
-        self._make_specs(self._simulation.task)
+        self._make_specs(self.simulation.task)
 
     def _make_specs(self, task: Navigation) -> None:
         shape = self.batch_size
@@ -58,7 +63,7 @@ class BatchedEnv(EnvBase):
         entries["info"] = info_spec(task.info_types, shape)
         self.observation_spec = Composite(entries, shape=shape)
         self.action_spec = Bounded(
-            -1.0, 1.0, (*shape, self._simulation.num_actions), dtype=torch.float32
+            -1.0, 1.0, (*shape, self.simulation.num_actions), dtype=torch.float32
         )
         self.reward_spec = Unbounded((*shape, 1), dtype=torch.float32)
         flag = Binary(1, (*shape, 1), dtype=torch.bool)
@@ -71,10 +76,10 @@ class BatchedEnv(EnvBase):
         if tensordict is not None and "_reset" in tensordict.keys():
             mask = tensordict["_reset"].reshape(self.batch_size).numpy()
             chosen = np.flatnonzero(mask)
-        return self._tensors(self._simulation.reset(chosen))
+        return self._tensors(self.simulation.reset(chosen))
 
     def _step(self, tensordict: TensorDict) -> TensorDict:
-        step = self._simulation.step(tensordict["action"].numpy())
+        step = self.simulation.step(tensordict["action"].numpy())
         result = self._tensors(step)
         result["reward"] = _column(step.outcome.reward, torch.float32)
         result["terminated"] = _column(step.terminated, torch.bool)
@@ -97,17 +102,12 @@ class BatchedEnv(EnvBase):
         return TensorDict(entries, batch_size=self.batch_size)
 
     def _set_seed(self, seed: int | None) -> None:
-        self._simulation.seed(0 if seed is None else seed)
+        self.simulation.seed(0 if seed is None else seed)
 
     @property
     def action_groups(self) -> tuple[int, ...]:
         """Number of the group of each action: motors that bend about one axis."""
-        return self._simulation.task.scene.catheter.action_groups
-
-    @property
-    def simulation(self) -> BatchSimulation:
-        """The simulations underneath."""
-        return self._simulation
+        return self.simulation.task.scene.catheter.action_groups
 
 
 def _spec(spec: specs.Array, batch: torch.Size) -> TensorSpec:

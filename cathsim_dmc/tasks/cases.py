@@ -7,7 +7,7 @@ everything that was bound to the model stays bound.
 """
 
 import functools
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 
 import mujoco
 import numpy as np
@@ -16,6 +16,7 @@ from cathsim_dmc.imaging.angiograph import Angiograph
 from cathsim_dmc.imaging.options import FluoroscopyOptions
 from cathsim_dmc.physics.readings import ModelIndex
 from cathsim_dmc.physics.sliding import devices_of
+from cathsim_dmc.tasks.config import NavigationConfig
 from cathsim_dmc.tasks.objectives import Objective
 from cathsim_dmc.tasks.scene import Scene
 from cathsim_dmc.tasks.start import StartPosture
@@ -37,10 +38,9 @@ class Case:
         scene: Scene,
         objective: Objective,
         model: mujoco.MjModel,
+        config: NavigationConfig,
         fluoroscopy: FluoroscopyOptions | None = None,
         fields: Fields | None = None,
-        start_along_route: Sequence[float] | None = None,
-        farthest_start: float = 0.0,
     ):
         """Lets the device settle in the anatomy.
 
@@ -48,15 +48,14 @@ class Case:
             fluoroscopy: Set-up of the angiography machine, None for no machine.
             fields: What `write` writes beside the statistics, by its name in MuJoCo's
                 model.
-            start_along_route: As in `NavigationConfig`.
-            farthest_start: How much farther in an episode may begin, m.
         """
         self.scene = scene
         self.objective = objective
         index = model_index(scene, model)
         devices_of(scene.catheter).settle(model)
+        farthest = config.ranges.farthest_insertion
         self.start = StartPosture(
-            scene, model, index, start_along_route, farthest_start
+            scene, model, index, config.start_along_route, farthest
         )
         self._fluoroscopy = fluoroscopy
         self.fields = fields or {}
@@ -85,10 +84,8 @@ def model_index(scene: Scene, model: mujoco.MjModel) -> ModelIndex:
 
 def compile_together(
     rooms: Iterable[tuple[Scene, Objective]],
-    physics_timestep: float,
+    config: NavigationConfig,
     fluoroscopy: FluoroscopyOptions | None = None,
-    start_along_route: Sequence[float] | None = None,
-    farthest_start: float = 0.0,
 ) -> tuple[Case, ...]:
     """Compiles scenes so that any of them can be written into a model of the first.
 
@@ -97,10 +94,8 @@ def compile_together(
     Args:
         rooms: Scenes of one device, not compiled yet, with success and reward in each;
             the first one alone is drawn.
-        physics_timestep: s.
+        config: Options of the task.
         fluoroscopy: Set-up of the angiography machines, None for none.
-        start_along_route: As in `NavigationConfig`.
-        farthest_start: How much farther in an episode may begin, m.
 
     Raises:
         ValueError: if the scenes differ in more than wall and places.
@@ -110,7 +105,7 @@ def compile_together(
     first, host = None, None
     for scene, objective in rooms:
         root = scene.arena.mjcf_model
-        root.option.timestep = physics_timestep
+        root.option.timestep = config.physics_timestep
         spec = mujoco.MjSpec.from_string(root.to_xml_string(), assets=root.get_assets())
         model, fields = spec.compile(), {}
         if first is None or host is None:
@@ -118,15 +113,7 @@ def compile_together(
         else:
             fields = _differences(host, model, scene, first)
             sizes |= {name: len(value) for name, value in fields.items()}
-        case = Case(
-            scene,
-            objective,
-            model,
-            fluoroscopy,
-            fields,
-            start_along_route,
-            farthest_start,
-        )
+        case = Case(scene, objective, model, config, fluoroscopy, fields)
         case.scene = first.in_anatomy(scene)
         scene.anatomy.lumen.release()
         found.append(case)

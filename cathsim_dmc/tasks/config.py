@@ -100,9 +100,8 @@ class NavigationConfig:
         self._check_numbers()
         self._check_range()
         bounds.pixels("endoluminal_size", self.endoluminal_size)
-        if not isinstance(self.fluoroscopy, FluoroscopyOptions):
-            given = _options("fluoroscopy", FluoroscopyOptions, self.fluoroscopy)
-            object.__setattr__(self, "fluoroscopy", given)
+        given = bounds.made("fluoroscopy", self.fluoroscopy, FluoroscopyOptions)
+        object.__setattr__(self, "fluoroscopy", given)
         object.__setattr__(
             self, "randomisation", Randomisation.make(self.randomisation)
         )
@@ -235,12 +234,3 @@ class NavigationConfig:
                     f"randomisation: view is {view!r}, but fluoroscopy has no view "
                     f"that deviates by {deviation} degrees: {error}"
                 ) from error
-
-
-def _options(name: str, kind: type, value: Mapping[str, Any]):
-    known = [field.name for field in dataclasses.fields(kind)]
-    bounds.mapping(name, value, known)
-    try:
-        return kind(**value)
-    except ValueError as error:
-        raise ValueError(f"{name}: {error}") from error

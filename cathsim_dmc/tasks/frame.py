@@ -13,27 +13,6 @@ from cathsim_dmc.tasks.common_chain import CommonChain
 from cathsim_dmc.tasks.route import Ahead
 
 
-class Images(NamedTuple):
-    """Images of the sensors; None where no observation needs them.
-
-    Attributes:
-        image: (..., H, W, P) uint8, fluoroscopy of P planes.
-        past_images: the same, one and two control steps before, newest first.
-        masks: (..., H, W, 2 P) uint8, see `imaging.angiograph.masks`.
-        pixels: (..., P, K + 1, 2), tracked points and goal, (column, row).
-        views: endoluminal views by name.
-    """
-
-    image: np.ndarray | None = None
-    past_images: tuple[np.ndarray, ...] = ()
-    masks: np.ndarray | None = None
-    pixels: np.ndarray | None = None
-    views: Mapping[str, np.ndarray] = MappingProxyType({})
-
-
-NO_IMAGES = Images()
-
-
 class Frame(NamedTuple):
     """Input of the observations after a control step.
 
@@ -43,7 +22,10 @@ class Frame(NamedTuple):
         action: (..., A), the last action, zeros after a reset.
         goal: (3,) or (..., 3), m.
         chain: the device as observations show it.
-        images: images of the sensors.
+        images: of the sensors, by name: (..., H, W, P) uint8 of P planes "past_0", the
+            last one, "past_1" and "past_2"; (..., H, W, 2 P) uint8 "masks", see
+            `imaging.angiograph.masks`; (..., P, K + 1, 2) "pixels" of tracked points
+            and goal, (column, row); endoluminal views.
         ahead: route ahead of the tip; None where no observation needs it.
         devices: state of coaxial devices; None for a device alone.
         vessel: state of the vessel; None for a rigid one with blood at rest.
@@ -54,7 +36,7 @@ class Frame(NamedTuple):
     action: np.ndarray
     goal: np.ndarray
     chain: CommonChain
-    images: Images = NO_IMAGES
+    images: Mapping[str, np.ndarray] = MappingProxyType({})
     ahead: Ahead | None = None
     devices: CoaxialReadings | None = None
     vessel: VesselReadings | None = None

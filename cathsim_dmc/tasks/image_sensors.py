@@ -9,7 +9,6 @@ from cathsim_dmc.imaging.device import Shadow
 from cathsim_dmc.imaging.fluoroscopy import Fluoroscope
 from cathsim_dmc.tasks import observations
 from cathsim_dmc.tasks.common_chain import CommonChain
-from cathsim_dmc.tasks.frame import Images
 
 _AGES = tuple(f"past_{age}" for age in range(observations.SEQUENCE_LENGTH))
 
@@ -17,7 +16,11 @@ ENDOLUMINAL = ("endoluminal", "endoluminal_distance")
 
 
 class ImageSensors:
-    """Captures the images that the observations ask for, of N simulations."""
+    """Captures the images that the observations ask for, of N simulations.
+
+    Attributes:
+        on: Whether an observation needs them.
+    """
 
     def __init__(
         self,
@@ -38,7 +41,7 @@ class ImageSensors:
         """
         self._names, self._chain = names, chain
         self._endoscope = endoscope if self._wants(*ENDOLUMINAL) else None
-        self._on = angiograph is not None or self._endoscope is not None
+        self.on = angiograph is not None or self._endoscope is not None
         self._planes: list[angiographs.Planes] = []
         self._noise = False
         if angiograph is not None:
@@ -46,11 +49,6 @@ class ImageSensors:
             self._noise = angiograph.options.noise
         # The last images (N, ...) by name, and those before: past_0 is the last one.
         self._held: dict[str, np.ndarray] = {}
-
-    @property
-    def on(self) -> bool:
-        """Whether an observation needs them."""
-        return self._on
 
     def restart(
         self,
@@ -71,7 +69,7 @@ class ImageSensors:
         fresh: np.ndarray | None = None,
         device_points: np.ndarray | None = None,
         around: Callable[[angiographs.Planes, int], angiographs.Planes] | None = None,
-    ) -> Images:
+    ) -> dict[str, np.ndarray]:
         """Captures the next images.
 
         Args:
@@ -108,19 +106,7 @@ class ImageSensors:
         if self._endoscope is not None:
             for key, view in self._endoscope(chosen).items():
                 self._hold(key, view, count, fresh)
-        return self._latest()
-
-    def _latest(self) -> Images:
-        past = [self._held[age] for age in _AGES if age in self._held]
-        return Images(
-            image=past[0] if past else None,
-            past_images=tuple(past[1:]),
-            masks=self._held.get("masks"),
-            pixels=self._held.get("pixels"),
-            views={
-                name: self._held[name] for name in ENDOLUMINAL if name in self._held
-            },
-        )
+        return dict(self._held)
 
     def _hold(self, name, image, count, fresh):
         self._held[name] = _merged(self._held.get(name), image, count, fresh)

@@ -1,7 +1,5 @@
 """Measurements after a control step."""
 
-from __future__ import annotations
-
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -28,7 +26,7 @@ class Measured(NamedTuple):
     devices: CoaxialReadings | None
     vessel: VesselReadings | None
 
-    def updated(self, new: Measured, rows: np.ndarray) -> Measured:
+    def updated(self, new: "Measured", rows: np.ndarray) -> "Measured":
         """The same with some simulations as in `new`."""
         pairs = zip(self, part(new, rows), strict=True)
         return Measured._make(old and merged(old, kept, rows) for old, kept in pairs)
@@ -47,7 +45,7 @@ class Path(NamedTuple):
     length: np.ndarray
     shortest: np.ndarray
 
-    def to(self, head: np.ndarray) -> Path:
+    def to(self, head: np.ndarray) -> "Path":
         """The paths longer by the ways to heads (N, 3), m."""
         return Path(head, self.length + straight(self.head, head), self.shortest)
 

@@ -37,6 +37,10 @@ class Navigation(composer.Task):
 
     Reward and success come from the objective alone: a subclass that overrides
     `get_reward` would be another task on the batched path, which refuses it.
+
+    Attributes:
+        config: Options.
+        num_actions: A, entries of an action.
     """
 
     def __init__(
@@ -66,7 +70,7 @@ class Navigation(composer.Task):
         self.name = name or type(self).__name__
         self._scene = scene
         self._objective = objective
-        self._config = config = config or NavigationConfig()
+        self.config = config = config or NavigationConfig()
         self._random_state = bounds.random_state("random", random)
         if config.ranges.goal_shift and not isinstance(objective, Shiftable):
             raise ValueError(
@@ -74,7 +78,7 @@ class Navigation(composer.Task):
                 "shifted(shift): derive it from tasks.objectives.Shiftable, or leave "
                 "goal_shift out"
             )
-        self._num_actions = len(scene.catheter.action_names)
+        self.num_actions = len(scene.catheter.action_names)
         living = config.vessel_options.living
         self._names = observations.resolve(config.observation, scene.coaxial, living)
         self._fluoroscopy = None
@@ -87,10 +91,8 @@ class Navigation(composer.Task):
         if second is not None:
             self._cases = cases.compile_together(
                 itertools.chain([(scene, objective), second], rooms),
-                config.physics_timestep,
+                config,
                 self._fluoroscopy,
-                config.start_along_route,
-                config.ranges.farthest_insertion,
             )
         self._rollout: Rollout  # there once the model is compiled
         self._observables = None
@@ -104,20 +106,15 @@ class Navigation(composer.Task):
         """The course of the task's episodes; see `Rollout`."""
         chosen = self._cases or [
             cases.Case(
-                self._scene,
-                self._objective,
-                model,
-                self._fluoroscopy,
-                start_along_route=self._config.start_along_route,
-                farthest_start=self._config.ranges.farthest_insertion,
+                self._scene, self._objective, model, self.config, self._fluoroscopy
             )
         ]
-        return Rollout(chosen, self._config, model, stepper)
+        return Rollout(chosen, self.config, model, stepper)
 
     @property
     def effects(self) -> list[Effect]:
         """What changes the simulation, in order; new ones for each rollout."""
-        return self._config.effects_on(self._scene.catheter)
+        return self.config.effects_on(self._scene.catheter)
 
     @property
     def data_fields(self) -> tuple[str, ...]:
@@ -137,7 +134,7 @@ class Navigation(composer.Task):
         return (
             f"<{self.name}: {anatomy}, goal {scene.goal.name!r} within "
             f"{1e3 * self.objective.goal_radius:g} mm, device {inner}, "
-            f"{self._num_actions} actions, observation {', '.join(self._names)}>"
+            f"{self.num_actions} actions, observation {', '.join(self._names)}>"
         )
 
     # Composer's hooks.
@@ -168,10 +165,10 @@ class Navigation(composer.Task):
     @property
     def observation_specs(self) -> dict[str, dm_env.specs.Array]:
         """Spec of each entry of the observation of one simulation."""
-        chain, config = self._scene.catheter, self._config
+        chain, config = self._scene.catheter, self.config
         common = CommonChain(chain, config.shaft_link)
         sizes = Sizes(
-            actions=self._num_actions,
+            actions=self.num_actions,
             joints=common.num_joints,
             links=common.num_links,
             devices=len(chain.devices) if self._scene.coaxial else 0,
@@ -183,7 +180,7 @@ class Navigation(composer.Task):
     @property
     def info_types(self) -> dict[str, type]:
         """Type of each figure of `info`: float or bool."""
-        return info_types(self._objective.terms, self._config.vessel_options.living)
+        return info_types(self._objective.terms, self.config.vessel_options.living)
 
     def action_spec(self, physics) -> dm_env.specs.BoundedArray:
         """Bounds [-1, 1] for each actuator."""
@@ -216,13 +213,13 @@ class Navigation(composer.Task):
     def _show_goal(self, physics):
         """Puts the marker to a shifted goal; it only looks."""
         goal = self._scene.phantom.goals.get(self._scene.goal.name)
-        if goal is not None and self._config.ranges.goal_shift:
+        if goal is not None and self.config.ranges.goal_shift:
             physics.bind(goal).pos = self.goal_position
 
     def before_step(self, physics, action, random_state):
         """Applies the action and moves the robot along."""
         del physics, random_state
-        self._rollout.command(check_action(action, (self._num_actions,))[None])
+        self._rollout.command(check_action(action, (self.num_actions,))[None])
 
     @property
     def substeps(self) -> int:
@@ -277,19 +274,9 @@ class Navigation(composer.Task):
         return self._scene if rollout is None else rollout.case().scene
 
     @property
-    def num_actions(self) -> int:
-        """A, entries of an action."""
-        return self._num_actions
-
-    @property
     def num_anatomies(self) -> int:
         """How many anatomies an episode draws from."""
         return len(self._cases) or 1
-
-    @property
-    def config(self) -> NavigationConfig:
-        """Options."""
-        return self._config
 
     @property
     def objective(self) -> Objective:

@@ -30,30 +30,23 @@ def together(objectives: Sequence[Objective], chosen: np.ndarray) -> Objective:
 
 
 class ObjectivePool(Shiftable):
-    """Objectives of groups of simulations."""
+    """Objectives of groups of simulations, which share radius and reward terms.
+
+    Attributes:
+        goal: (N, 3), m, world frame.
+        goal_radius: distance from the goal that counts as reached, m.
+        terms: names of the reward terms.
+    """
 
     def __init__(self, groups: Sequence[tuple[Objective, np.ndarray]]):
         """Takes each objective with the numbers of its simulations, N in all."""
         self._groups = tuple(groups)
         self._count = sum(len(rows) for _, rows in self._groups)
-        self._goal = np.empty((self._count, 3))
+        self.goal = np.empty((self._count, 3))
         for objective, rows in self._groups:
-            self._goal[rows] = objective.goal
-
-    @property
-    def goal(self) -> np.ndarray:
-        """(N, 3), m, world frame."""
-        return self._goal
-
-    @property
-    def goal_radius(self) -> float:
-        """Distance from the goal that counts as reached, m."""
-        return self._groups[0][0].goal_radius
-
-    @property
-    def terms(self) -> Sequence[str]:
-        """Names of the reward terms, which all objectives share."""
-        return self._groups[0][0].terms
+            self.goal[rows] = objective.goal
+        first = self._groups[0][0]
+        self.goal_radius, self.terms = first.goal_radius, first.terms
 
     def outcome(self, measurement: Measurement) -> Outcome:
         """Judges a control step of N simulations."""

@@ -25,12 +25,6 @@ SEQUENCE_LENGTH = 3
 OBSERVATIONS = ObservationTable()
 
 
-def _captured(array: np.ndarray | None) -> np.ndarray:
-    """An image of the sensors, which an observation has requested."""
-    assert array is not None
-    return array
-
-
 _actions, _joints, _devices = map(attrgetter, ("actions", "joints", "devices"))
 
 
@@ -119,7 +113,7 @@ def internal(frame: Frame) -> Observation:
 )
 def image(frame: Frame) -> Observation:
     """One fluoroscopic image, a channel for each plane."""
-    return {"image": _captured(frame.images.image)}
+    return {"image": frame.images["past_0"]}
 
 
 @OBSERVATIONS.row(
@@ -133,7 +127,8 @@ def image(frame: Frame) -> Observation:
 )
 def sequential(frame: Frame) -> Observation:
     """Three consecutive images, oldest first."""
-    images = (*reversed(frame.images.past_images), _captured(frame.images.image))
+    ages = reversed(range(SEQUENCE_LENGTH))
+    images = [frame.images[f"past_{age}"] for age in ages]
     return {"sequential": np.concatenate(images, axis=-1)}
 
 
@@ -143,7 +138,7 @@ def sequential(frame: Frame) -> Observation:
 )
 def segmentation(frame: Frame) -> Observation:
     """Which pixels show the device, and which the vessel."""
-    return {"segmentation": _captured(frame.images.masks)}
+    return {"segmentation": frame.images["masks"]}
 
 
 @OBSERVATIONS.row(
@@ -192,7 +187,7 @@ def _pixels(sizes: Sizes) -> int:
 )
 def tracking_2d(frame: Frame) -> Observation:
     """Tracked points and goal in pixels of fluoroscopy."""
-    pixels = _captured(frame.images.pixels)
+    pixels = frame.images["pixels"]
     return {
         "tracking_pixels": _flat(pixels[..., :-1, :], 3),
         "tracking_goal_pixels": _flat(pixels[..., -1, :], 2),
@@ -318,7 +313,7 @@ def _endoluminal(
 )
 def endoluminal(frame: Frame) -> Observation:
     """View of the lumen from the head, without OpenGL."""
-    return {"endoluminal": _captured(frame.images.views["endoluminal"])}
+    return {"endoluminal": frame.images["endoluminal"]}
 
 
 @OBSERVATIONS.row(
@@ -332,8 +327,7 @@ def endoluminal(frame: Frame) -> Observation:
 )
 def endoluminal_distance(frame: Frame) -> Observation:
     """Distances to the wall from the head, without OpenGL."""
-    views = frame.images.views
-    return {"endoluminal_distance": _captured(views["endoluminal_distance"])}
+    return {"endoluminal_distance": frame.images["endoluminal_distance"]}
 
 
 # Coaxial devices.

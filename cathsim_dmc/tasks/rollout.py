@@ -25,7 +25,7 @@ from cathsim_dmc.tasks import observations
 from cathsim_dmc.tasks.cases import Case, model_index
 from cathsim_dmc.tasks.common_chain import CommonChain
 from cathsim_dmc.tasks.config import NavigationConfig
-from cathsim_dmc.tasks.frame import NO_IMAGES, Frame
+from cathsim_dmc.tasks.frame import Frame
 from cathsim_dmc.tasks.image_sensors import ImageSensors
 from cathsim_dmc.tasks.measured import Measured, Path, merged
 from cathsim_dmc.tasks.objective_pool import part, together
@@ -44,7 +44,18 @@ from cathsim_dmc.tasks.tracking_noise import TrackingNoise
 
 
 class Rollout:
-    """Episodes of N simulations of one task."""
+    """Episodes of N simulations of one task.
+
+    Attributes:
+        index: Places of the task's quantities in the compiled model.
+        objective: Goals, which may differ between simulations, reward and success rule.
+        steps: Control steps (N,) since each episode began.
+        moving: What moves the vessels; None where they rest.
+        resting: Readings, with places where they are in the vessel at rest: judged
+            there.
+    """
+
+    resting: readings.Readings
 
     def __init__(
         self,
@@ -63,27 +74,27 @@ class Rollout:
         self._cases = tuple(cases)
         num_simulations = stepper.num_simulations
         self._case_of = np.zeros(num_simulations, dtype=int)
-        self._objective = cases[0].objective
+        self.objective: Objective = cases[0].objective
         scene = cases[0].scene
         self._config = config
         self._stepper = stepper
         self._state = state = stepper.arrays
         living = config.vessel_options.living
         self._names = observations.resolve(config.observation, scene.coaxial, living)
-        self._index = model_index(scene, model)
-        self._read = self._index.reader(state)
+        self.index = model_index(scene, model)
+        self._read = self.index.reader(state)
         num_actions = len(scene.catheter.action_names)
         listed = config.effects_on(scene.catheter)
         self._listed, stepper.deepest = listed, config.vessel_options.deepest
         moving = [effect for effect in listed if isinstance(effect, Moving)]
-        self._moving = moving[0] if moving else None
+        self.moving: Moving | None = moving[0] if moving else None
         self._devices = cast(SingleDevice, listed[-1])
         self._effects = Effects(
             listed,
             World(
                 model,
                 scene.catheter,
-                self._index,
+                self.index,
                 scene.placement.start_depth,
                 state,
                 stepper.field,
@@ -110,7 +121,7 @@ class Rollout:
         # None before the first episode.
         self._random_states: list[np.random.RandomState] | None = None
         self._goal_shift = np.zeros(num_simulations)
-        self._steps = np.zeros(num_simulations, dtype=int)
+        self.steps = np.zeros(num_simulations, dtype=int)
         self._action = np.zeros((num_simulations, num_actions))
         self._previous_action = self._action
         # There from the first measurement on.
@@ -136,7 +147,7 @@ class Rollout:
             self._draw(index, random_states[index])
         self._pose_robot()
         self._choose_objective()
-        self._steps[indices] = 0
+        self.steps[indices] = 0
         # New arrays: those handed out before stay what they were.
         self._action = self._action.copy()
         self._action[indices] = 0.0
@@ -144,13 +155,13 @@ class Rollout:
 
     def _choose_objective(self) -> None:
         """Takes the objective of each simulation's anatomy, with its goal."""
-        self._objective = together(
+        self.objective = together(
             [case.objective for case in self._cases], self._case_of
         )
         if self._config.ranges.goal_shift is not None:
             # Navigation has made sure that it can be shifted.
-            shiftable = cast(Shiftable, self._objective)
-            self._objective = shiftable.shifted(self._goal_shift)
+            shiftable = cast(Shiftable, self.objective)
+            self.objective = shiftable.shifted(self._goal_shift)
 
     def _draw(self, index: int, random_state: np.random.RandomState) -> None:
         """Draws the episode of one simulation and puts its device to the start."""
@@ -171,7 +182,7 @@ class Rollout:
 
     def _pose_robot(self) -> None:
         """Poses the follower's joints after the devices."""
-        self._state.qpos[:, self._index.robot_qpos] = self._devices.follower_posture()
+        self._state.qpos[:, self.index.robot_qpos] = self._devices.follower_posture()
 
     def command(self, action: np.ndarray) -> None:
         """Takes the actions of a control step; its physics steps must follow.
@@ -194,7 +205,7 @@ class Rollout:
         """
         self._measure(self._stepper.still(indices), indices)
         head = self.resting.head
-        shortest = self._objective.path_distance(head)
+        shortest = self.objective.path_distance(head)
         begun = Path(head, np.zeros(len(head)), shortest)
         self._path = merged(self._path, part(begun, indices), indices)
         self._errors = (None,) * len(head)
@@ -203,29 +214,29 @@ class Rollout:
     def finish(self) -> Step:
         """Measures, judges and observes after the physics steps of a control step."""
         force, warned = self._stepper.end()
-        self._steps += 1
+        self.steps += 1
         self._measure(force)
         resting = self.resting
         self._path = self._path.to(resting.head)
         self._errors = self._monitor.errors(
-            warned, self._steps, resting.centreline, force.peak_max
+            warned, self.steps, resting.centreline, force.peak_max
         )
         return self._step()
 
     def _measure(self, force: forces.WallForce, rows: np.ndarray | None = None) -> None:
         """Measures all simulations, or some, when the others have not moved."""
         now = self._read()
-        time, last = CONTROL_TIMESTEP * self._steps, self._stepper.contact_rows[:, -1]
+        time, last = CONTROL_TIMESTEP * self.steps, self._stepper.contact_rows[:, -1]
         vessel_now = vessel.read(self._listed, time, now, last)
         new = Measured(now, force, self._devices.read(now), vessel_now)
         if rows is not None and hasattr(self, "_measured"):
             new = self._measured.updated(new, rows)
         self._measured = new
-        self._resting = self._at_rest(self.readings)
+        self.resting = self._at_rest(self.readings)
 
     def _at_rest(self, state: readings.Readings) -> readings.Readings:
         """Readings with places where they are in the vessel at rest."""
-        return state if self._moving is None else self._moving.at_rest(state)
+        return state if self.moving is None else self.moving.at_rest(state)
 
     def _step(
         self, fresh: np.ndarray | None = None, ended: np.ndarray | None = None
@@ -237,13 +248,13 @@ class Rollout:
                 their images are captured. None for all, one control step on.
             ended: (N,) bool, None for what the objective and the physics say.
         """
-        errors, goal, resting = self._errors, self._objective.goal, self.resting
+        errors, goal, resting = self._errors, self.objective.goal, self.resting
         distance = straight(resting.head, goal)
         failed = None
         if errors.count(None) < len(errors):
             failed = np.array([error is not None for error in errors])
         outcome = judge(
-            self._objective,
+            self.objective,
             Measurement(
                 resting,
                 self.wall_force,
@@ -260,7 +271,7 @@ class Rollout:
             observation=self._observe(self.goal, fresh),
             outcome=outcome,
             terminated=terminated,
-            truncated=~terminated & (self._steps >= self._config.max_steps),
+            truncated=~terminated & (self.steps >= self._config.max_steps),
             errors=errors,
             readings=self.readings,
             wall_force=self.wall_force,
@@ -274,7 +285,7 @@ class Rollout:
             devices = self._measured.devices
             self._tracking.draw(self.readings, devices, self._random_states, fresh)
         state, devices = self._tracking.seen(self.readings, self.devices)
-        ahead, images = None, NO_IMAGES
+        ahead, images = None, {}
         if self._sensors.on:
             images = self._sensors.capture(
                 state.centreline,
@@ -283,7 +294,7 @@ class Rollout:
                 self._random_states,
                 fresh,
                 None if devices is None else devices.points,
-                None if self._moving is None else self.around,
+                None if self.moving is None else self.around,
             )
         if self._routes is not None:
             seen = self._at_rest(state) if self._tracking.on else self.resting
@@ -298,7 +309,7 @@ class Rollout:
         """What the heads of some simulations (K,) see of the wall, by name."""
         from cathsim_dmc.imaging import endoluminal  # late: it brings the compiler
 
-        moving, state = self._moving, self.readings
+        moving, state = self.moving, self.readings
         warps = [
             endoluminal.AT_REST if moving is None else moving.warp(i) for i in indices
         ]
@@ -318,24 +329,9 @@ class Rollout:
         """Number (N,) of control steps done again in shorter physics steps, a view."""
         return self._stepper.repeated
 
-    @property
-    def objective(self) -> Objective:
-        """Goals, which may differ between simulations, reward and success rule."""
-        return self._objective
-
     def case(self, index: int = 0) -> Case:
         """Anatomy and objective of the episode of one simulation."""
         return self._cases[self._case_of[index]]
-
-    @property
-    def index(self) -> readings.ModelIndex:
-        """Places of the task's quantities in the compiled model."""
-        return self._index
-
-    @property
-    def resting(self) -> readings.Readings:
-        """Readings, with places where they are in the vessel at rest: judged there."""
-        return self._resting
 
     @property
     def readings(self) -> readings.Readings:
@@ -345,27 +341,22 @@ class Rollout:
     @property
     def goal(self) -> np.ndarray:
         """(3,) or (N, 3) m, the goal in space, which moves with its vessel."""
-        goal = self._objective.goal
-        if self._moving is None:
+        goal = self.objective.goal
+        if self.moving is None:
             return goal
         every = np.broadcast_to(goal, self.readings.head.shape)
-        return self._moving.to_space(every.copy())
+        return self.moving.to_space(every.copy())
 
     @property
     def vessel(self) -> vessel.VesselReadings | None:
         """State of the vessels; None for rigid ones with blood at rest."""
         return self._measured.vessel
 
-    @property
-    def moving(self) -> Moving | None:
-        """What moves the vessels; None where they rest."""
-        return self._moving
-
     def around(self, planes: Planes, index: int = 0) -> Planes:
         """A machine's planes with one simulation's vessel where it is now."""
-        if self._moving is None:
+        if self.moving is None:
             return planes
-        surface = self._moving.surface(index)
+        surface = self.moving.surface(index)
         return tuple(plane.around(surface) for plane in planes)
 
     @property
@@ -387,11 +378,6 @@ class Rollout:
     def wall_force(self) -> forces.WallForce:
         """Force on the wall over the last step."""
         return self._measured.wall_force
-
-    @property
-    def steps(self) -> np.ndarray:
-        """Control steps (N,) since each episode began."""
-        return self._steps
 
     @property
     def fluoroscope(self) -> Fluoroscope | None:

@@ -3,11 +3,9 @@
 Pure functions of arrays with leading batch axes, written `...`; metres.
 """
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Sequence
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import numpy as np
 
@@ -18,19 +16,6 @@ ROUTE_SPACING = 1e-3  # m, resolution of the route
 # Way along the route from the place of the head to each of the points ahead, m.
 AHEAD = np.arange(8) * 5e-3
 _NEARBY = 10e-3  # m of the route that a head can pass between two control steps
-
-
-class RouteLike(Protocol):
-    """Points (P, 3), their arc lengths (P,) and the lumen's radii (P,) there, m."""
-
-    @property
-    def points(self) -> np.ndarray: ...  # noqa: D102
-
-    @property
-    def radii(self) -> np.ndarray: ...  # noqa: D102
-
-    @property
-    def arc_length(self) -> np.ndarray: ...  # noqa: D102
 
 
 @dataclasses.dataclass(frozen=True)
@@ -48,7 +33,7 @@ class Route:
     arc_length: np.ndarray
 
     @classmethod
-    def of(cls, objective: Objective) -> Route:
+    def of(cls, objective: Objective) -> "Route":
         """The route of an objective.
 
         Raises:
@@ -56,6 +41,14 @@ class Route:
         """
         fine = line_of(objective).resampled(ROUTE_SPACING)
         return cls(fine.points, fine.radii, fine.arc_length)
+
+    def at(self, arc_length: np.ndarray) -> np.ndarray:
+        """Point (..., 3) of the route; beyond its end, straight on."""
+        axes = [np.interp(arc_length, self.arc_length, x) for x in self.points.T]
+        last = self.points[-1] - self.points[-2]
+        last = last / np.linalg.norm(last)
+        beyond = np.maximum(arc_length - float(self.arc_length[-1]), 0.0)
+        return np.stack(axes, axis=-1) + beyond[..., None] * last
 
 
 def line_of(objective: Objective) -> Centreline:
@@ -67,18 +60,6 @@ def line_of(objective: Objective) -> Centreline:
             "derive it from tasks.objectives.Routed"
         )
     return objective.route
-
-
-def along(route: RouteLike, arc_length: np.ndarray) -> np.ndarray:
-    """Point (..., 3) of a route; beyond its end, straight on."""
-    point = np.stack(
-        [np.interp(arc_length, route.arc_length, route.points[:, i]) for i in range(3)],
-        axis=-1,
-    )
-    last = route.points[-1] - route.points[-2]
-    last = last / np.linalg.norm(last)
-    beyond = np.maximum(arc_length - float(route.arc_length[-1]), 0.0)
-    return point + beyond[..., None] * last
 
 
 @dataclasses.dataclass(frozen=True)
@@ -97,7 +78,7 @@ class Place:
     excess: np.ndarray
 
 
-def locate(route: RouteLike, head: np.ndarray, last: np.ndarray | None = None) -> Place:
+def locate(route: Route, head: np.ndarray, last: np.ndarray | None = None) -> Place:
     """Finds the place of a head (..., 3) on the route.
 
     It is the nearest point of the route whose cross-section reaches the head: beside
@@ -173,7 +154,7 @@ class Routes:
                 self._routes[number] = Route.of(self._objectives[number])
             route, rows = self._routes[number], np.flatnonzero(chosen == number)
             place = locate(route, head[rows]).arc_length[:, None] + AHEAD
-            points[rows] = along(route, place)
+            points[rows] = route.at(place)
             radii[rows] = np.interp(place, route.arc_length, route.radii)
         return Ahead(into_frame(points - head[:, None], frame), radii)
 

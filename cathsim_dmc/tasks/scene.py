@@ -3,8 +3,6 @@
 import dataclasses
 from collections.abc import Sequence
 
-import numpy as np
-
 from cathsim_dmc.anatomy import Anatomy, Goal
 from cathsim_dmc.entities import devices
 from cathsim_dmc.entities.arena import AngiographyArena
@@ -62,52 +60,35 @@ class Scene:
         config: NavigationConfig,
         *,
         goal_radius: float = GOAL_RADIUS,
-        arena: AngiographyArena | None = None,
-        phantom: Phantom | None = None,
-        catheter: Chain | None = None,
-        sheath: Sheath | None = None,
-        robot: Robot | None = None,
         drawn: bool = True,
     ) -> "Scene":
-        """Builds the entities that are not given, and attaches all to the arena.
+        """Builds the entities and attaches all to the arena.
 
         Args:
             goal: Name in `anatomy.goals`, or a goal inside the lumen.
             goal_radius: Radius of the goal markers, m; for looks only.
-            arena: Arena of one's own.
-            phantom: Phantom of one's own, of the same anatomy.
-            catheter: Device of one's own; it must reach the goal.
-            sheath: Introducer sheath of one's own.
-            robot: Follower of one's own.
             drawn: Whether the surface of the lumen is there to be seen.
         """
         goal = placement.resolve_goal(anatomy, goal)
         config.vessel_options.check(anatomy)
-        chosen = chosen_devices(config) if catheter is None else catheter.devices
-        length = config.working_length
-        if catheter is not None:
-            length = float(np.sum(catheter.link_lengths))
+        chosen, length = chosen_devices(config), config.working_length
         place = placement.place_device(
             anatomy, goal, longest_tip(chosen), length, config.ranges.farthest_shift
         )
-        catheter = catheter or _chain(chosen, place, config)
+        catheter = _chain(chosen, place, config)
         if config.vessel_options.wall is not None:
             soften(catheter)
         radius = catheter.device.outer_radius
+        bore = straight(place.working_length - place.start_depth)
         scene = cls(
             anatomy=anatomy,
             goal=goal,
             placement=place,
-            arena=arena or AngiographyArena(device_density=catheter.density),
-            phantom=phantom
-            or Phantom(anatomy, config.friction, goal_radius=goal_radius, drawn=drawn),
+            arena=AngiographyArena(device_density=catheter.density),
+            phantom=Phantom(anatomy, config.friction, goal_radius, drawn),
             catheter=catheter,
-            sheath=sheath
-            or Sheath(
-                straight(place.working_length - place.start_depth),
-                device_radius=radius,
-            ),
-            robot=robot or Robot(device_radius=radius),
+            sheath=Sheath(bore, device_radius=radius),
+            robot=Robot(device_radius=radius),
         )
         moving = config.vessel_options.motion is not None
         user_data = effects.userdata_size(config.effects_on(catheter), catheter)

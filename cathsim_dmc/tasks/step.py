@@ -10,8 +10,7 @@ from cathsim_dmc.physics.vessel import INFO, VesselReadings
 from cathsim_dmc.tasks import objectives
 from cathsim_dmc.tasks.observation_kind import Observation
 
-_INFO = ("distance", "insertion", "push_force", "wall_force_sum", "wall_force_max")
-_INFO += ("wall_force_peak_sum", "wall_force_peak_max", "path_ratio")
+_INFO = ("distance", "insertion", "push_force", *forces.NAMES, "path_ratio")
 
 
 def info_types(terms: Sequence[str], living: bool = False) -> dict[str, type]:
@@ -74,15 +73,11 @@ class Step(NamedTuple):
         "wall_work" (J); "success" and "physics_error" (bool); and "reward_<term>" for
         each weighted term.
         """
-        wall = self.wall_force
         return {
             "distance": self.distance,
             "insertion": self.readings.insertion,
             "push_force": self.readings.push_force,
-            "wall_force_sum": wall.sum,
-            "wall_force_max": wall.max,
-            "wall_force_peak_sum": wall.peak_sum,
-            "wall_force_peak_max": wall.peak_max,
+            **self.wall_force.named(),
             "path_ratio": self.path_ratio,
             **({} if self.vessel is None else self.vessel.info()),
             "success": self.outcome.success,

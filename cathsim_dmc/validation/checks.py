@@ -1,7 +1,5 @@
 """Checks: a measured figure, the bound it must keep, and reports of many of them."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from collections.abc import Mapping, Sequence
@@ -36,7 +34,7 @@ class Check:
     @classmethod
     def at_most(
         cls, name: str, value: float, bound: float, unit: str = "", note: str = ""
-    ) -> Check:
+    ) -> "Check":
         """A check of value <= bound; a value that is no number fails."""
         value = float(value)
         return cls(name, value, unit, f"<= {bound:g}", bool(value <= bound), note)
@@ -44,7 +42,7 @@ class Check:
     @classmethod
     def at_least(
         cls, name: str, value: float, bound: float, unit: str = "", note: str = ""
-    ) -> Check:
+    ) -> "Check":
         """A check of value >= bound; a value that is no number fails."""
         value = float(value)
         return cls(name, value, unit, f">= {bound:g}", bool(value >= bound), note)
@@ -58,7 +56,7 @@ class Check:
         percent: float,
         unit: str = "",
         note: str = "",
-    ) -> Check:
+    ) -> "Check":
         """A check that |measured / expected - 1| is at most `percent` %.
 
         Args:

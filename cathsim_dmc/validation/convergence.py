@@ -1,7 +1,5 @@
 """Convergence of tip path and wall force with the time step and the link length."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 

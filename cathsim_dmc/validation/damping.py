@@ -4,8 +4,6 @@ The release is compared with the equation of a beam whose material damps as it i
 (Kelvin-Voigt) and on which blood acts as it is stated, in four modes.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import types
 
@@ -20,7 +18,7 @@ from cathsim_dmc.entities.coaxial import carried_mass
 from cathsim_dmc.entities.posture import joints_along
 from cathsim_dmc.entities.sheath import Sheath
 from cathsim_dmc.physics.blood import BLOOD_VISCOSITY, StillBlood
-from cathsim_dmc.physics.drives import Drives
+from cathsim_dmc.physics.drives import hold
 from cathsim_dmc.physics.effects import Effects, Episode, World, userdata_size
 from cathsim_dmc.physics.readings import ids
 from cathsim_dmc.physics.stepper import CONTROL_TIMESTEP
@@ -64,6 +62,18 @@ def _swing(time: np.ndarray, curve: np.ndarray) -> tuple[float, float]:
     return 0.5 / half, float(decay)
 
 
+def cantilever(blood: StillBlood | None) -> Rig:
+    """A uniform device of which 0.2 m are free, in blood or without any fluid."""
+    length = devices.Discretisation(working_length=_FREE + LINK / 2)
+    rig = Rig(_uniform(), length)
+    if blood is not None:
+        rig.arena.mjcf_model.size.nuserdata = userdata_size([blood], rig.catheter)
+    rig.compile()
+    if blood is not None:
+        fill(rig, blood)
+    return rig
+
+
 def release(*, blood: bool = True) -> tuple[float, float, float, float]:
     """Releases a bent cantilever of 0.2 m from the shape of its first mode.
 
@@ -73,20 +83,14 @@ def release(*, blood: bool = True) -> tuple[float, float, float, float]:
     Returns:
         Frequencies, simulated and of the beam, Hz; decay rates likewise, 1/s.
     """
-    one = _uniform()
-    rig = Rig(one, devices.Discretisation(working_length=_FREE + LINK / 2))
-    effect = StillBlood()
-    if blood:
-        rig.arena.mjcf_model.size.nuserdata = userdata_size([effect], rig.catheter)
-    rig.compile()
+    rig = cantilever(StillBlood() if blood else None)
+    one = rig.device
     if not blood:
         factor = 1 / (1 + carried_mass([one]) / one.linear_density)
         links = ids(rig.model, rig.catheter.links)
         rig.model.body_mass[links] *= factor
         rig.model.body_inertia[links] *= factor
         mujoco.mj_setConst(rig.model, rig.data)
-    if blood:
-        fill(rig, effect)
     length = float(rig.sections[0].sum())
     nodes = np.cumsum(rig.lengths)[:-1] - rig.lengths[0] / 2
     slope = _modes(np.append(nodes, length) / length)[0]
@@ -94,9 +98,7 @@ def release(*, blood: bool = True) -> tuple[float, float, float, float]:
     # Turning angles of the links along the mode shape.
     angle = np.arctan(np.diff(RELEASE * slope / 2) / np.diff(ends))
     turning = np.diff(np.append([0.0], angle))
-    for joint, turn in enumerate(turning, start=1):
-        rig.data.joint(f"{rig.name}/bend_y_{joint}").qpos = turn
-    mujoco.mj_forward(rig.model, rig.data)
+    rig.bend(np.stack([0 * turning, turning], axis=-1))
     start = rig.head_position[0]
     curve = [start]
     for _ in range(round(_SWINGING / rig.model.opt.timestep)):
@@ -181,16 +183,13 @@ def spin(speed: float) -> tuple[float, float]:
     """
     length = devices.Discretisation(working_length=0.3, torsion_joints=4)
     rig = Rig("steerable_5f", length, rotation=True, friction=0.0)
-    turn = np.linspace(0.0, np.pi, 120)
+    turn = np.linspace(0.0, np.pi, 31)
     arc = _BEND * np.stack([1 - np.cos(turn), 0 * turn, np.sin(turn)], axis=-1)
     line = np.vstack([[[0, 0, -0.1]], arc, [[2 * _BEND, 0, -0.2]]])
     line[:, 2] += 0.1 - rig.lengths.sum()
     rig.arena.attach(Sheath(line[:-1], rig.device.outer_radius, rig.lengths.max()))
     rig.compile()
-    for joint, bends in enumerate(joints_along(rig.lengths, line), start=1):
-        for axis, angle in zip("xy", bends, strict=True):
-            rig.data.joint(f"{rig.name}/bend_{axis}_{joint}").qpos = angle
-    mujoco.mj_forward(rig.model, rig.data)
+    rig.bend(joints_along(rig.lengths, line))
     twists = _turned(rig, speed)
     hinges = np.sort(ids(rig.model, rig.catheter.bends))
     bends = rig.data.qpos[rig.model.jnt_qposadr[hinges]].reshape(-1, 2)
@@ -210,12 +209,7 @@ def _twist_hinges(rig: Rig) -> np.ndarray:
 
 def _turned(rig: Rig, speed: float) -> np.ndarray:
     """Twists (T, H) of the torsion hinges after the control steps of one turn, rad."""
-    names = ("qpos", "qvel", "act")
-    arrays = types.SimpleNamespace(
-        **{name: getattr(rig.data, name)[None] for name in names}
-    )
-    drives = Drives(rig.model, arrays)
-    drives.hold(0)
+    drives = hold(rig.model, rig.data)
     places = rig.model.jnt_qposadr[_twist_hinges(rig)]
     command = np.array([[0.0, speed / MAX_ROTATION_SPEED]])
     twists = []
@@ -224,8 +218,7 @@ def _turned(rig: Rig, speed: float) -> np.ndarray:
     for _ in range(settling + steps):
         drives.follow(command)
         rig.data.ctrl[-2:] = command[0]
-        for _ in range(round(CONTROL_TIMESTEP / rig.model.opt.timestep)):
-            rig.step()
+        rig.run(CONTROL_TIMESTEP)
         twists.append(rig.data.qpos[places].copy())
     return np.array(twists[settling:])
 

@@ -1,13 +1,9 @@
 """The drive of the base under load: it holds, slips at a stated force, and is exact."""
 
-from __future__ import annotations
-
-import types
-
 import numpy as np
 
 from cathsim_dmc.entities.chain import MAX_PUSH_FORCE, MAX_PUSH_SPEED
-from cathsim_dmc.physics.drives import Drives
+from cathsim_dmc.physics.drives import hold
 from cathsim_dmc.physics.stepper import CONTROL_TIMESTEP
 from cathsim_dmc.validation.checks import Check, Checks
 from cathsim_dmc.validation.rig import Rig
@@ -28,10 +24,7 @@ class Driven:
         self._base = rig.model.body(f"{rig.name}/link_0").id
         self._motor = rig.data.actuator(f"{rig.name}/insertion")
         rig.data.joint(f"{rig.name}/insertion").qpos = _MIDDLE
-        names = ("qpos", "qvel", "act")
-        arrays = {name: getattr(rig.data, name)[None] for name in names}
-        self.drives = Drives(rig.model, types.SimpleNamespace(**arrays))
-        self.drives.hold(0)
+        self.drives = hold(rig.model, rig.data)
 
     def move(self, duration: float, command: float, force: float) -> float:
         """Moves the base for a time (s), pushed back by a force (N); its way, m."""
@@ -40,8 +33,7 @@ class Driven:
             self.drives.follow(np.array([[command]]))
             self._motor.ctrl[0] = command
             self.rig.data.xfrc_applied[self._base, 2] = -force
-            for _ in range(round(CONTROL_TIMESTEP / self.rig.model.opt.timestep)):
-                self.rig.step()
+            self.rig.run(CONTROL_TIMESTEP)
         return self.rig.qpos("insertion") - start
 
 

@@ -1,14 +1,11 @@
 """`cathsim validate forces`: sensors against known loads."""
 
-from __future__ import annotations
-
 import dataclasses
 from typing import NamedTuple
 
 import mujoco
 import numpy as np
 
-from cathsim_dmc import suite
 from cathsim_dmc.anatomy.anatomy import Anatomy
 from cathsim_dmc.anatomy.field import Field
 from cathsim_dmc.entities.chain import MAX_PUSH_SPEED
@@ -17,7 +14,7 @@ from cathsim_dmc.physics import forces
 from cathsim_dmc.tasks.config import PHYSICS_TIMESTEP
 from cathsim_dmc.validation import insertion
 from cathsim_dmc.validation.checks import Checks, Report
-from cathsim_dmc.validation.rig import Rig, tube
+from cathsim_dmc.validation.rig import Rig, in_tube, tube
 
 BALANCE_BOUND = 1.0  # %
 RESTING_LOADS = (0.01, 0.1, 1.0)  # N
@@ -104,10 +101,8 @@ def dead_end(command: float, size: tuple[float, float] = GUIDING_TUBE) -> DeadEn
         command: of the translation, in (0, 1].
         size: length and radius of the tube, m.
     """
-    place = {"anatomy": tube(*size), "goal": "end", "goal_radius": 1e-6}
-    environment = suite.load("cathsim", "navigate", {"random": 0, **place})
+    environment = in_tube(size)
     task = environment.task
-    environment.reset()
     model, data = environment.physics.model.ptr, environment.physics.data.ptr
     motor = model.actuator(f"{task.scene.catheter.mjcf_model.model}/insertion")
     data.actuator(motor.id).ctrl[0] = command

@@ -1,11 +1,8 @@
 """Friction of devices on a wall: sliding, sticking, and pulled round a drum."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Callable
 
-import mujoco
 import numpy as np
 
 from cathsim_dmc.anatomy.field import Field
@@ -75,10 +72,6 @@ def _on_plate(names: tuple[str, ...]) -> tuple[Rig, np.ndarray, np.ndarray]:
     return rig, bodies, rig.lengths[pressed] / rig.lengths[pressed].sum()
 
 
-def _steps(rig: Rig, duration: float) -> range:
-    return range(round(duration / rig.model.opt.timestep))
-
-
 def slid(names: tuple[str, ...], load: float, speed: float) -> tuple[float, float]:
     """Pulls a device over a plate.
 
@@ -93,13 +86,11 @@ def slid(names: tuple[str, ...], load: float, speed: float) -> tuple[float, floa
     """
     rig, bodies, shares = _on_plate(names)
     rig.data.xfrc_applied[bodies, 1] = load * shares
-    for _ in _steps(rig, _SETTLED):
-        rig.step()
+    rig.run(_SETTLED)
     rig.data.actuator(f"{rig.name}/insertion").ctrl[0] = -speed / MAX_PUSH_SPEED
-    for _ in _steps(rig, _SLID / speed):
-        rig.step()
+    rig.run(_SLID / speed)
     pull = []
-    for _ in _steps(rig, _WATCHED / speed):
+    for _ in range(round(_WATCHED / speed / rig.model.opt.timestep)):
         rig.step()
         pull.append(-rig.sensor(f"{rig.name}/push_force")[2])
     mean = float(np.mean(pull))
@@ -110,14 +101,11 @@ def creep(names: tuple[str, ...]) -> float:
     """Speed (m/s) of devices that stick, pulled sideways at half the limit."""
     rig, bodies, shares = _on_plate(names)
     rig.data.xfrc_applied[bodies, 1] = CREEP_LOAD * shares
-    for _ in _steps(rig, _SETTLED):
-        rig.step()
+    rig.run(_SETTLED)
     rig.data.xfrc_applied[bodies, 0] = 0.5 * FRICTION * CREEP_LOAD * shares
-    for _ in _steps(rig, 0.5 * _SETTLED):
-        rig.step()
+    rig.run(0.5 * _SETTLED)
     before = rig.head_position
-    for _ in _steps(rig, _SETTLED):
-        rig.step()
+    rig.run(_SETTLED)
     return float(np.linalg.norm(rig.head_position - before)) / _SETTLED
 
 
@@ -255,14 +243,10 @@ def _pulled(
     heading = np.clip((middles - _LEAD) / radius, 0.0, wrap)
     rig.data.joint(f"{rig.name}/insertion").qpos = _PULL
     hold(rig.model, rig.data)
-    for index in range(1, len(middles)):
-        angle = heading[index] - heading[index - 1]
-        rig.data.joint(f"{rig.name}/bend_y_{index}").qpos = angle
-    mujoco.mj_forward(rig.model, rig.data)
+    rig.bend(np.stack([0 * heading[1:], np.diff(heading)], axis=-1))
     load = TENSION * np.array([np.sin(wrap), 0.0, np.cos(wrap)])
     motor = rig.data.actuator(f"{rig.name}/insertion")
-    for _ in _steps(rig, _SETTLING):
-        rig.step(load)
+    rig.run(_SETTLING, load)
     motor.ctrl[0] = -PULL_SPEED / MAX_PUSH_SPEED
     travel, force = [], []
     while not travel or travel[-1] < _PULL - 0.02:

@@ -1,7 +1,5 @@
 """Scripted insertions, for convergence and force statistics."""
 
-from __future__ import annotations
-
 import dataclasses
 import itertools
 from typing import Any, NamedTuple

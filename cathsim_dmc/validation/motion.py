@@ -1,7 +1,5 @@
 """A moving vessel against what is prescribed: where its wall is, what it carries."""
 
-from __future__ import annotations
-
 import mujoco
 import numpy as np
 

@@ -1,7 +1,5 @@
 """`cathsim validate pair`: coaxial devices against theory, at rest and on the move."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Sequence
 
@@ -47,25 +45,13 @@ def sections(entity: DeviceStack, gaps: np.ndarray) -> tuple[np.ndarray, np.ndar
     return np.diff(places)[::-1], np.asarray(bending)[::-1]
 
 
-def rig_of(
-    chosen: Sequence[str | Device],
-    gaps: np.ndarray,
-    rotation: np.ndarray | None = None,
-) -> Rig:
-    """A compiled rig with coaxial devices at rest."""
-    entity = DeviceStack(chosen)
-    rig = Rig(catheter=entity)
-    rig.compile()
-    chain_fields.write_still(entity, rig.model, gaps, rotation)
-    return rig
-
-
 def cantilevers(protrusion: float) -> list[rod.Cantilever]:
     """The pair, straightened, with the wire out by so much (m), loaded at its end."""
     gaps = np.array([0.0, protrusion])
-    rig = rig_of(straightened(PAIR), gaps)
-    entity = rig.catheter
-    assert isinstance(entity, DeviceStack)
+    entity = DeviceStack(straightened(PAIR))
+    rig = Rig(catheter=entity)
+    rig.compile()
+    chain_fields.write_still(entity, rig.model, gaps)
     return rod.bent(rig, *sections(entity, gaps), END_ANGLES)
 
 

@@ -1,19 +1,16 @@
 """Devices pressed on a wall: whether the contact law keeps them at rest."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import mujoco
 import numpy as np
 
-from cathsim_dmc import suite
 from cathsim_dmc.entities import contact
 from cathsim_dmc.entities.chain import MAX_PUSH_FORCE, MAX_PUSH_SPEED
 from cathsim_dmc.physics import forces
 from cathsim_dmc.tasks.config import CONTROL_TIMESTEP
 from cathsim_dmc.validation.checks import Check, Checks
-from cathsim_dmc.validation.rig import bare, slider, tube
+from cathsim_dmc.validation.rig import bare, in_tube, slider
 
 # N, on a gram: about what a link of the pair weighs as a contact feels it.
 LOADS = (0.01, 0.03, 0.1, 0.3, 1.0, 3.0, MAX_PUSH_FORCE)
@@ -74,19 +71,8 @@ def jam(pair: tuple[str, str]) -> Jam:
     Args:
         pair: Names of guidewire and catheter.
     """
-    environment = suite.load(
-        suite.DOMAIN,
-        "navigate",
-        {
-            "anatomy": tube(*JAM_TUBE),
-            "goal": "end",
-            "goal_radius": 1e-6,
-            "devices": pair,
-            "random": 1,
-            "observation": "tracking",
-        },
-    )
-    environment.reset()
+    options = {"devices": pair, "random": 1, "observation": "tracking"}
+    environment = in_tube(JAM_TUBE, **options)
     task = environment.task
     way = task.scene.catheter.stroke / (MAX_PUSH_SPEED * CONTROL_TIMESTEP)
     count = round(way + _JAMMED / CONTROL_TIMESTEP)

@@ -1,7 +1,5 @@
 """Devices pushed at full speed: contacts, and control steps that are done again."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from cathsim_dmc import suite

@@ -1,13 +1,12 @@
 """Test rigs: the catheter of the tasks, with their settings, under known loads."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import mujoco
 import numpy as np
 from dm_control import mjcf
 
+from cathsim_dmc import suite
 from cathsim_dmc.anatomy.anatomy import Anatomy
 from cathsim_dmc.anatomy.builder import VesselPlace
 from cathsim_dmc.anatomy.centreline import Centreline, Vessel, VesselTree
@@ -44,6 +43,14 @@ def tube(length: float, radius: float, bend: float = 0.0) -> Anatomy:
     end = VesselPlace("tube", arc_length=line.length - 1e-3)
     tree = VesselTree({"tube": Vessel("tube", line)})
     return Anatomy.from_tree(tree, "tube", goals={"end": end})
+
+
+def in_tube(size: tuple[float, ...], **options: Any):
+    """A composer environment in a tube of these arguments of `tube`, after a reset."""
+    place = {"anatomy": tube(*size), "goal": "end", "goal_radius": 1e-6, "random": 0}
+    environment = suite.load(suite.DOMAIN, "navigate", place | options)
+    environment.reset()
+    return environment
 
 
 def bare(lumen: Any = None, lattice: np.ndarray | None = None, **wall: Any):
@@ -101,7 +108,6 @@ class Rig:
         stroke: float = 0.1,
         rotation: bool = False,
         friction: float = FRICTION,
-        timestep: float = PHYSICS_TIMESTEP,
         catheter: Chain | None = None,
     ):
         self.catheter = catheter or Catheter(
@@ -110,11 +116,10 @@ class Rig:
             stroke=stroke,
             rotation=rotation,
             friction=friction,
-            timestep=timestep,
         )
         self.device = self.catheter.device
         self.arena = AngiographyArena(self.catheter.density)
-        self.arena.mjcf_model.option.timestep = timestep
+        self.arena.mjcf_model.option.timestep = self.catheter.timestep
         self.arena.mjcf_model.option.gravity = (0, 0, 0)
         self.lengths = self.catheter.link_lengths
         self.arena.attach(self.catheter)
@@ -180,6 +185,18 @@ class Rig:
             self.load_head(force, torque)
         mujoco.mj_step(self.model, self.data)
 
+    def run(self, duration: float, force=None) -> None:
+        """Steps for a time (s), under a dead load if one is given."""
+        for _ in range(round(duration / self.model.opt.timestep)):
+            self.step(force)
+
+    def bend(self, angles: np.ndarray) -> None:
+        """Puts the hinges of the joints to angles (n - 1, 2) about x and y, rad."""
+        for joint, bends in enumerate(angles.tolist(), start=1):
+            for axis, angle in zip("xy", bends, strict=True):
+                self.data.joint(f"{self.name}/bend_{axis}_{joint}").qpos = angle
+        mujoco.mj_forward(self.model, self.data)
+
     def settle(
         self,
         force=None,
@@ -199,7 +216,6 @@ class Rig:
         Raises:
             RuntimeError: if it is not at rest by then, or the simulation diverges.
         """
-        count = round(RESTING_TIME / self.model.opt.timestep)
         start, change = self.data.time, np.inf
         model, damping = self.model, self.model.dof_damping.copy()
         model.dof_damping[model.jnt_dofadr] = np.where(
@@ -209,8 +225,7 @@ class Rig:
         )
         while change > rest_change:
             before = self.data.qpos.copy()
-            for _ in range(count):
-                self.step(force)
+            self.run(RESTING_TIME, force)
             change = np.abs(self.data.qpos - before).max()
             if self.data.time - start > longest:
                 raise RuntimeError(

@@ -1,7 +1,5 @@
 """`cathsim validate rod`: bending, buckling and twist of the device against theory."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
@@ -245,8 +243,8 @@ def twist_under_torque(
     lengths, _, torsional = rig.sections
     torque = TWIST / theory.twist(1.0, lengths, torsional)
     # The motor of the base is a speed servo: the base creeps, so wait for a time.
-    for _ in range(round(12 * RESTING_TIME / rig.model.opt.timestep)):
-        rig.step((0, 0, 0), (0, 0, torque))
+    rig.load_head(torque=(0, 0, torque))
+    rig.run(12 * RESTING_TIME)
     return torque, _twist(rig)
 
 

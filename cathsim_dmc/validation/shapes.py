@@ -1,7 +1,5 @@
 """Unloaded shapes turned about the axis, and twist of the chain in a bend."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import mujoco

@@ -1,7 +1,5 @@
 """Coaxial devices on the move: sliding through each other, and turned in a tube."""
 
-from __future__ import annotations
-
 import dataclasses
 from typing import Any
 
@@ -12,7 +10,7 @@ from cathsim_dmc.entities.chain import MAX_PUSH_SPEED, MAX_ROTATION_SPEED
 from cathsim_dmc.entities.devices import get
 from cathsim_dmc.tasks.config import CONTROL_TIMESTEP
 from cathsim_dmc.validation.checks import Check, Checks
-from cathsim_dmc.validation.rig import tube
+from cathsim_dmc.validation.rig import in_tube
 
 SLIDING_PAIR = ("wire_035_amplatz", "diagnostic_5f_simmons")
 SLIDING_TASK = "femoral_type1_lcca"
@@ -123,10 +121,8 @@ class Torque:
 def turn(bent: bool, **options: Any) -> Torque:
     """Advances a pre-shaped catheter through a tube and turns its base slowly."""
     size = (STRAIGHT_TUBE, TUBE_RADIUS), (BENT_TUBE / 2, TUBE_RADIUS, BEND_RADIUS)
-    options = {"devices": (TURNED,), "observation": "tracking", "random": 0, **options}
-    options |= {"anatomy": tube(*size[bent]), "goal": "end", "goal_radius": 1e-4}
-    environment = suite.load(suite.DOMAIN, "navigate", options)
-    environment.reset()
+    options = {"devices": (TURNED,), "observation": "tracking", **options}
+    environment = in_tube(size[bent], **options)
     play, device = environment.task, get(TURNED)
     # Until its bend lies at the far end of the half circle.
     ahead = 0.05 + np.pi * BEND_RADIUS - play.scene.placement.start_depth

@@ -4,8 +4,6 @@ A rod is a sequence of uniform sections, from the clamp to the free end, given b
 their lengths (m) and bending stiffnesses EI (N·m²). SI units throughout.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import NamedTuple
 

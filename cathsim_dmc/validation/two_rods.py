@@ -4,8 +4,6 @@ The reference minimises the bending and twist energy over the increments of shap
 twists on a fine grid; it shares no code with the model but the devices' data.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -15,7 +13,6 @@ from numpy.typing import ArrayLike
 from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation
 
-from cathsim_dmc import suite
 from cathsim_dmc.entities import posture
 from cathsim_dmc.entities.chain import MAX_PUSH_SPEED
 from cathsim_dmc.entities.device import Device
@@ -24,7 +21,7 @@ from cathsim_dmc.physics import chain_fields
 from cathsim_dmc.physics.stepper import CONTROL_TIMESTEP
 from cathsim_dmc.validation import theory
 from cathsim_dmc.validation.checks import Check, Checks
-from cathsim_dmc.validation.rig import Rig, tube
+from cathsim_dmc.validation.rig import Rig, in_tube
 
 _FINE = 0.5e-3  # m
 BEND_RADIUS = 0.04  # m, of half a circle in which the pairs are held
@@ -186,8 +183,7 @@ def simulate(
             entity, overlap, after, ones * 0, ones, ones, qpos
         )
         fields.write(arrays, made, 0)
-        for _ in range(round(CONTROL_TIMESTEP / rig.model.opt.timestep)):
-            rig.step()
+        rig.run(CONTROL_TIMESTEP)
     mujoco.mj_kinematics(rig.model, rig.data)
     bends, _ = stack.bent(rig.data.qpos[None, fields.qpos])
     slopes = rods.at_joints(turns, gap + 1e-8) - rods.at_joints(turns, gap)
@@ -214,11 +210,8 @@ def work(speed: float) -> tuple[float, float]:
     Returns:
         Work of the drives, and change of the energy by `reference`, J.
     """
-    options = {"anatomy": tube(*_WIDE), "goal": "end", "goal_radius": 1e-4, "random": 0}
-    options |= {"devices": WORKING, "friction": 0.0, "lumen_friction": 0.0}
-    options |= {"observation": "tracking"}
-    environment = suite.load(suite.DOMAIN, "navigate", options)
-    environment.reset()
+    options = {"devices": WORKING, "friction": 0.0, "lumen_friction": 0.0}
+    environment = in_tube(_WIDE, observation="tracking", **options)
     environment.physics.model.ptr.opt.gravity[:] = 0.0
     task = environment.task
     for push in [1.0] * 40 + [0.0] * 60:

@@ -1,7 +1,5 @@
 """The vessel against closed forms: blood that flows, a wall that gives and moves."""
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Sequence
 
@@ -16,13 +14,12 @@ from cathsim_dmc.anatomy.anatomy import Anatomy
 from cathsim_dmc.entities import devices
 from cathsim_dmc.entities.arena import BLOOD_DENSITY
 from cathsim_dmc.physics.blood import BLOOD_VISCOSITY, StillBlood
-from cathsim_dmc.physics.effects import userdata_size
 from cathsim_dmc.physics.wall import RELAXATION, SOLIMP
 from cathsim_dmc.simulation.batch import BatchSimulation
-from cathsim_dmc.validation import motion
+from cathsim_dmc.validation import damping, motion
 from cathsim_dmc.validation.checks import Checks, Report
-from cathsim_dmc.validation.damping import LINK, _uniform, drag, fill
-from cathsim_dmc.validation.rig import Rig, bare, slider, tube
+from cathsim_dmc.validation.damping import LINK, drag
+from cathsim_dmc.validation.rig import bare, slider, tube
 
 ANATOMIES = ("type1", "type2", "bovine")
 FLOW_BOUND = 2.0  # %
@@ -32,7 +29,6 @@ CROSS_FLOWS = (0.1, 0.4)  # m/s
 FORCES = (1e-4, 5e-3)  # N
 RADII, MODULI = (4.4e-3, 0.014), (0.45e6, 2e6)  # m, Pa
 SLOPE_BOUND = 5.0  # %
-_FREE = 0.2  # m
 
 
 def cantilever(speed: float) -> tuple[float, float]:
@@ -41,12 +37,9 @@ def cantilever(speed: float) -> tuple[float, float]:
     The elastica bears ½ρ d C_d(Re) u² per length across its axis, u the velocity of the
     blood across it.
     """
-    one = _uniform()
-    rig = Rig(one, devices.Discretisation(working_length=_FREE + LINK / 2))
     blood = StillBlood()
-    rig.arena.mjcf_model.size.nuserdata = userdata_size([blood], rig.catheter)
-    rig.compile()
-    fill(rig, blood)
+    rig = damping.cantilever(blood)
+    one = rig.device
     blood.velocity[0] = [speed, 0.0, 0.0]
     rig.settle()
     length = float(rig.sections[0].sum())
@@ -74,13 +67,8 @@ def cantilever(speed: float) -> tuple[float, float]:
     return float(rig.head_position[0]), float(solved.y[4, -1])
 
 
-def terminal_velocity(force: float, length: float = LINK) -> tuple[float, float]:
-    """Velocity of a free link under a force across its axis, m/s, and expected.
-
-    Args:
-        force: N.
-        length: m.
-    """
+def terminal_velocity(force: float) -> tuple[float, float]:
+    """Velocity of a free link under a force (N) across its axis, m/s, and expected."""
     from cathsim_dmc.physics import blood_loops
 
     blood_loops.install()
@@ -93,7 +81,7 @@ def terminal_velocity(force: float, length: float = LINK) -> tuple[float, float]
           <worldbody>
             <body>
               <freejoint/>
-              <geom type="capsule" size="{radius} {length / 2}" density="1060"/>
+              <geom type="capsule" size="{radius} {LINK / 2}" density="1060"/>
             </body>
           </worldbody>
         </mujoco>""")
@@ -102,7 +90,7 @@ def terminal_velocity(force: float, length: float = LINK) -> tuple[float, float]
     data.userdata[2:6] = blood_loops.MARK, BLOOD_DENSITY, BLOOD_VISCOSITY, 1
     data.xfrc_applied[1, 0] = force
     mujoco.mj_step(model, data, 2000)
-    expected = brentq(lambda u: length * drag(u, 2 * radius) - force, 1e-6, 10.0)
+    expected = brentq(lambda u: LINK * drag(u, 2 * radius) - force, 1e-6, 10.0)
     return float(data.qvel[0]), float(expected)
 
 
@@ -184,16 +172,8 @@ def indentation(
     return np.array(depths)
 
 
-def stiffened(factor: float, steps: int = 50) -> float:
-    """Largest change of a joint's position in a push against a stiffer wall, rad.
-
-    Args:
-        factor: Of the modulus of an aorta.
-        steps: Control steps of the push.
-
-    Returns:
-        The difference from the rigid wall.
-    """
+def stiffened(factor: float) -> float:
+    """Change of the joints, rad, in a push against a wall of a stiffer aorta."""
     walls = "rigid", {"wall": {"modulus": factor * MODULI[0]}}
     found = []
     for vessel in walls:
@@ -201,7 +181,7 @@ def stiffened(factor: float, steps: int = 50) -> float:
         batch.reset()
         action = np.zeros((1, batch.num_actions))
         action[:, [0, -1]] = 1.0
-        for _ in range(steps):
+        for _ in range(50):
             batch.step(action)
         found.append(batch.batch.qpos.copy())
     return float(np.abs(found[0] - found[1]).max())

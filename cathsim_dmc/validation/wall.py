@@ -1,7 +1,5 @@
 """`cathsim validate wall`: wall against lumen, friction that acts, convergence."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -118,7 +116,7 @@ def validate_anatomy(
     anatomies: Mapping[str, Anatomy],
     figure_path: str | Path | None = None,
 ) -> Report:
-    """Checks some anatomies, by name, and measures what they are like.
+    """Checks and measures anatomies by name.
 
     Args:
         anatomies: generated, measured or imported.

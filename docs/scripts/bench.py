@@ -1,10 +1,9 @@
-"""Compares simulated guidewires with measured ones and rewrites docs/bench.md.
+"""Rewrites docs/bench.md: simulated guidewires against measured ones.
 
-``python docs/scripts/bench.py DIRECTORY [REPORT]``
+``python docs/scripts/bench.py REPORT``
 
-REPORT is the object that ``python benchmarks/wires.py DIRECTORY --json`` prints;
-without it the comparison is run, which takes minutes. Only statistics are written: the
-measured data may not be redistributed.
+REPORT is what ``python benchmarks/wires.py DIRECTORY`` prints. Only statistics are
+written: the measured data may not be redistributed.
 """
 
 import json
@@ -17,33 +16,48 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from cathsim_dmc import style
+from cathsim_dmc.validation.bench import BASELINES, WAYS
 from cathsim_dmc.validation.checks import Check, Report
-
-sys.path.insert(0, str(figures.ROOT / "benchmarks"))
-import wires  # noqa: E402
 
 PAGE = figures.ROOT / "docs" / "bench.md"
 FIGURE = PAGE.parent / "images" / "validation_bench.png"
-SHOWN = (*wires.WAYS, "centreline", "nearest")
+SHOWN = (*WAYS, "centreline", "nearest")
 
 
-def main(folder, report=None):
-    if report:
-        found = json.loads(Path(report).read_text(encoding="utf-8"))
-        measured = Report(
-            found["title"],
-            [Check(**check) for check in found["checks"]],
-            found["findings"],
-        )
-    else:
-        measured = wires.compare_wires(folder, say=print)
+def main(report):
+    found = json.loads(Path(report).read_text(encoding="utf-8"))
+    checks = [Check(**check) for check in found["checks"]]
+    measured = Report(found["title"], checks, found["findings"])
     command = "python benchmarks/wires.py"
     figures.keep("validation_bench", measured.as_dict(), command)
-    tables = list(wires.tables(measured).items())
-    for name, (title, rows) in zip(("frames", "sensitivity"), tables, strict=True):
+    found = tables(measured).items()
+    for name, (title, rows) in zip(("frames", "sensitivity"), found, strict=True):
         figures.put(PAGE, **{name: f"{title}:\n\n{markdown(rows)}"})
     figures.main([])
     style.save(figure(measured.findings["frames"]), FIGURE)
+
+
+def tables(report: Report) -> dict[str, list[list[str]]]:
+    """Rows of text by title, the header first: frames, and sensitivity if measured."""
+    frames = [["frame", "wire, tip in", "half", *WAYS, *BASELINES]]
+    for row in report.findings["frames"]:
+        half = "folded" if row["folded"] else row["half"]
+        cells = [row["frame"], f"{row['wire']}, {row['vessel']}", half]
+        for name in (*WAYS, *BASELINES):
+            each = row[name]
+            turned = row["wire"] == "angled" and name in WAYS
+            median = f" / {each['median_rms']:.1f}" if turned else ""
+            cells.append(f"{each['rms']:.1f}{median} ({each['largest']:.0f})")
+        frames.append(cells)
+    found = {"RMS distance: best turn / median turn (largest distance), mm": frames}
+    variants = report.findings.get("sensitivity", {})
+    if variants:
+        names = list(next(iter(variants.values())))
+        rows = [
+            [key, *(f"{row[n]:.2f}" for n in names)] for key, row in variants.items()
+        ]
+        found["Median RMS distance by variant, mm"] = [["variant", *names], *rows]
+    return found
 
 
 def markdown(rows):
@@ -62,7 +76,7 @@ def figure(rows):
     places = np.arange(len(rows))
     for index, name in enumerate(SHOWN):
         values = [row[name]["rms"] for row in rows]
-        marker = "o" if name in wires.WAYS else "_"
+        marker = "o" if name in WAYS else "_"
         ax.plot(
             places + 0.1 * (index - 2),
             values,

@@ -30,7 +30,7 @@ from PIL import Image
 
 from cathsim_dmc import agents, suite  # agents before anything of dm_control
 from cathsim_dmc.agents import report
-from cathsim_dmc.imaging import FluoroscopyOptions
+from cathsim_dmc.imaging import FluoroscopyOptions, materials
 from cathsim_dmc.imaging.angiograph import Angiograph
 from cathsim_dmc.physics import forces
 from cathsim_dmc.physics.drives import Drives
@@ -196,9 +196,9 @@ def _fluoroscopy(surface, out: Path) -> dict:
         "source": arm.source.tolist(),
         "gain": plane.gain,
         "window": _window(plane),
-        "device_mu": plane.device_mu,
-        "marker_mu": plane.marker_mu,
-        "marker_length": plane.marker_length,
+        "device_mu": materials.CATHETER,
+        "marker_mu": materials.MARKER,
+        "marker_length": materials.MARKER_LENGTH,
         "noise": plane.quanta**-0.5,
     }
 
@@ -208,7 +208,7 @@ def _window(plane) -> list[float]:
 
     Black is a device across the densest part of the vessel.
     """
-    device = np.exp(-plane.device_mu * 2 * DEVICE_RADIUS)
+    device = np.exp(-materials.CATHETER * 2 * DEVICE_RADIUS)
     return [0.97 * float(plane.signal.min() * device), 1.02 * float(plane.signal.max())]
 
 

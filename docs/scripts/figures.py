@@ -139,7 +139,8 @@ def filled(text: str, known: dict[str, dict]) -> str:
             raise KeyError(f"no figure {name!r} in docs/data")
         value, unit = known[name]["value"], known[name]["unit"]
         shown = value if isinstance(value, str) else format(value, form or ".3g")
-        shown = shown.replace("%", " %")
+        if shown.endswith("%"):
+            shown, unit = shown.replace("%", " %"), ""
         head = match.group(0).split("-->")[0]
         return f"{head}-->{shown} {unit}".rstrip() + "<!-- -->"
 

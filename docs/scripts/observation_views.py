@@ -14,7 +14,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 from cathsim_dmc import suite
-from cathsim_dmc.anatomy.arch import arch
+from cathsim_dmc.anatomy import phantoms
 from cathsim_dmc.imaging import endoluminal as views
 
 IMAGES = Path(__file__).parents[1] / "images"
@@ -81,7 +81,7 @@ def fluoroscopy() -> Path:
 
 def endoluminal() -> Path:
     """From places along the way to the LCCA of `type3`, looking ahead."""
-    anatomy = arch.load("type3")
+    anatomy = phantoms.load("type3")
     way = anatomy.route("lcca")
     figure, axes = plt.subplots(2, 4, figsize=(10, 5.2), layout="constrained")
     for column, share in zip(axes.T, (0.1, 0.3, 0.5, 0.65), strict=True):

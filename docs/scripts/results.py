@@ -42,27 +42,25 @@ INTRODUCTION = """\
 Written by `python docs/scripts/results.py` from the JSON files in `results/`, one for
 each training; `python benchmarks/trainings.py` makes those that are missing.
 
-Every policy is evaluated over 30 episodes with seeds of their own, acting
-deterministically, by the published rule: 2,000 control steps at most, success within
-8 mm of the goal and inside the target branch, the published reward. That holds whatever
-reward and length of episodes it was trained with. Published figures are those of Jianu
-et al., whose simulator, phantoms' walls and force readings differ (see
-[physics.md](physics.md), [forces.md](forces.md)): rates can be compared, forces only in
-their order of magnitude. Agents have the preset `tuned` unless their row says
-otherwise, those that read images `tuned_image` ([training.md](training.md)).
+Every policy acts deterministically in 30 episodes with their own seeds, by the
+published rule: 2,000 control steps at most, success within 8 mm of the goal and inside
+the target branch, the published reward. Reward and length of its training episodes may
+differ. Published figures are those of Jianu et al.; their simulator, walls and force
+readings differ ([physics](physics.md), [forces](forces.md)), so rates can be compared,
+forces only in their order of magnitude. Agents have the preset `tuned` unless their row
+says otherwise; those that read images have `tuned_image` ([settings](training.md)).
 """
 
 COLUMNS = """\
-Cells show ours / published. Success counts the episodes of all seeds together, *worst*
-those of the worst seed. The episodes of one anatomy differ by 1 mm of the start, so
-they are nearly one and have no interval; where each has an arch of its own, Wilson's
-95 % interval stands beside it. `cathsim eval --protocol varied` plays distinct
-conditions ([robustness.md](robustness.md)).
+Cells show ours / published. Success counts the episodes of all seeds, *worst* those of
+the worst seed. Episodes in one anatomy differ only by 1 mm of the start and have no
+interval; episodes in their own arches have Wilson's 95 % interval. Distinct conditions
+are in [robustness](robustness.md) (`cathsim eval --protocol varied`).
 
-Forces are those of [forces.md](forces.md) in mN, ± deviation over episodes: *mean
-force* is the sum over all contacts, mean over all steps; *contact force* is the largest
-contact, mean over the steps with contact, nearest to the published f_mean; *max force*
-is the largest contact of an episode, the published f_max.
+[Forces](forces.md) are in mN, ± deviation over episodes: *mean force* is the sum over
+all contacts, mean over all steps; *contact force* is the largest contact, mean over the
+steps with contact, nearest to the published f_mean; *max force* is the largest contact
+of an episode, the published f_max.
 """
 
 HEADER = (
@@ -289,7 +287,7 @@ def aggregates(table):
         "",
         "Interquartile mean of the success rate over tasks and seeds (Agarwal et al. "
         "2021), with the 95 % interval of a bootstrap that resamples seeds within "
-        "tasks; a single seed tells no interval. Published agents have one seed.",
+        "tasks; a single seed has no interval. Published agents have one seed.",
         "",
         "| agent | tasks | seeds | interquartile mean | published |",
         "|---|---|---|---|---|",

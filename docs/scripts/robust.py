@@ -114,6 +114,23 @@ def anatomies(rows):
     return lines
 
 
+def weakest(rows):
+    """Cells of the phantoms where fewer than nine of ten episodes succeed."""
+    cells = {(r["policy"], r["anatomy"], r["goal"], r["access"]): r for r in rows}
+    lines = ["| policy | anatomy | branch | access | success | `expert` |"]
+    lines.append("|---" * 6 + "|")
+    for (policy, *cell), row in cells.items():
+        if row["success"] < 0.9 * row["episodes"]:
+            beside = cells.get(("expert", *cell))
+            counts = [
+                f"{one['success']} of {one['episodes']}" if one else "–"
+                for one in (row, beside)
+            ]
+            place = cell[0], cell[1].upper(), cell[2]
+            lines.append(f"| `{policy}` | {' | '.join((*place, *counts))} |")
+    return lines
+
+
 def changes(rows):
     """One change at a time: success of each policy."""
     names = list(dict.fromkeys(row["policy"] for row in rows))
@@ -149,6 +166,7 @@ def main():
         for name, make in makers.items()
     }
     varied = [row for row in rows.values() if row["part"] != "changes"]
+    found["weakest"] = weakest([r for r in varied if r["part"] == "anatomies"])
     found["devices"] = devices(varied)
     found["kinds"] = kinds([r for r in varied if r["part"] != "anatomies"])
     for name, lines in found.items():

@@ -9,8 +9,6 @@ limbs in a vertical plane. Type III and bovine curve in space, as what `arch.sam
 draws does.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from dataclasses import replace
@@ -44,7 +42,6 @@ __all__ = [
     "arch_set",
     "build_arch",
     "build_seed",
-    "load",
     "sample",
 ]
 
@@ -96,10 +93,6 @@ def build_seed(seed: ArchSeed, *, access: str = "ascending") -> Anatomy:
     return build_arch(seed.parameters(), seed.name, access=access)
 
 
-def _degrees(value: float) -> float:
-    return math.radians(value)
-
-
 # The published Type-I phantom, as measured: outer width 91 mm, 186 mm from the end
 # of the descending aorta to the top of the branches, lumen radii 9.1 (descending),
 # 13.8 (arch), 4.4 (BCA) and 3.1 mm (LCCA), targets 15 mm apart and about 130 mm
@@ -107,15 +100,15 @@ def _degrees(value: float) -> float:
 # radii; take-offs and lengths are chosen so that the measured figures come out.
 TYPE_I = ArchParameters(
     bca=BranchParameters(
-        radius=4.4e-3, end_radius=4.2e-3, take_off=_degrees(12.0), length=43e-3
+        radius=4.4e-3, end_radius=4.2e-3, take_off=math.radians(12.0), length=43e-3
     ),
     lcca=BranchParameters(
-        radius=3.1e-3, end_radius=2.9e-3, take_off=_degrees(12.0), length=43e-3
+        radius=3.1e-3, end_radius=2.9e-3, take_off=math.radians(12.0), length=43e-3
     ),
     lsa=BranchParameters(
         radius=3.7e-3,
         end_radius=3.4e-3,
-        take_off=_degrees(-20.0),
+        take_off=math.radians(-20.0),
         length=41e-3,
         bend_azimuth=math.pi,
     ),
@@ -134,15 +127,15 @@ TYPE_I = ArchParameters(
 # the mid common carotid. Arch radius as in the measured phantom.
 TYPE_II = ArchParameters(
     bca=BranchParameters(
-        radius=6.25e-3, end_radius=5.5e-3, take_off=_degrees(44.9), length=44e-3
+        radius=6.25e-3, end_radius=5.5e-3, take_off=math.radians(44.9), length=44e-3
     ),
     lcca=BranchParameters(
-        radius=4.14e-3, end_radius=3.15e-3, take_off=_degrees(25.7), length=50e-3
+        radius=4.14e-3, end_radius=3.15e-3, take_off=math.radians(25.7), length=50e-3
     ),
     lsa=BranchParameters(
         radius=5.2e-3,
         end_radius=4.5e-3,
-        take_off=_degrees(-28.8),
+        take_off=math.radians(-28.8),
         length=45e-3,
         bend_azimuth=math.pi,
     ),
@@ -156,7 +149,7 @@ def _bent(
     """A branch that leaves the plane of the arch, bends, and bends back half way."""
     return replace(
         branch,
-        lean=_degrees(lean),
+        lean=math.radians(lean),
         length=50e-3,
         bend_radius=radius,
         bend_azimuth=azimuth,
@@ -173,12 +166,12 @@ def _bent(
 TYPE_III = replace(
     TYPE_II,
     bca=_bent(TYPE_II.bca, 8.0, 45e-3, 0.6),
-    lcca=_bent(replace(TYPE_II.lcca, take_off=_degrees(10.0)), 14.0, 40e-3, 0.6),
+    lcca=_bent(replace(TYPE_II.lcca, take_off=math.radians(10.0)), 14.0, 40e-3, 0.6),
     lsa=_bent(TYPE_II.lsa, 10.0, 43e-3, math.pi + 0.6),
     bca_drop=2.391,
     ascending_length=45.6e-3,
     descending_length=115e-3,
-    ascending_bend=_degrees(30.0),
+    ascending_bend=math.radians(30.0),
     sway=4e-3,
 )
 # The LCCA off the BCA, on an arch nearly as steep; the LSA leans back by half a
@@ -186,7 +179,7 @@ TYPE_III = replace(
 BOVINE = replace(
     TYPE_III,
     lcca=_bent(TYPE_II.lcca, 14.0, 40e-3, 0.6),
-    lsa=replace(TYPE_III.lsa, take_off=_degrees(-36.0)),
+    lsa=replace(TYPE_III.lsa, take_off=math.radians(-36.0)),
     bca_drop=2.166,
     ascending_length=43.76e-3,
     bca_lcca_spacing=10e-3,
@@ -196,14 +189,3 @@ BOVINE = replace(
 ARCHES: Mapping[str, ArchParameters] = MappingProxyType(
     {"simple1": TYPE_I, "simple2": TYPE_II, "type3": TYPE_III, "bovine": BOVINE}
 )
-
-
-def load(name: str, *, access: str = "ascending") -> Anatomy:
-    """Anatomy of the arch called `name` in `ARCHES`.
-
-    Raises:
-        ValueError: if there is none; the message lists the names.
-    """
-    if name not in ARCHES:
-        raise ValueError(f"no arch {name!r}; there are {', '.join(ARCHES)}.")
-    return build_arch(ARCHES[name], name, access=access)

@@ -1,7 +1,5 @@
 """One branch of a parametric arch: take-off, flare and bends."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 
@@ -34,7 +32,7 @@ class Plane:
     normal: Array
 
     @classmethod
-    def turned(cls, rotation: float, tilt: float = 0.0) -> Plane:
+    def turned(cls, rotation: float, tilt: float = 0.0) -> "Plane":
         """Vertical plane turned from the sagittal one, its top then tilted."""
         along = np.array([math.sin(rotation), math.cos(rotation), 0.0])
         side = np.cross([0.0, 0.0, 1.0], along)

@@ -1,7 +1,5 @@
 """Parameters of an aortic arch, with the bounds of each."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """Random aortic arches from anatomical distributions, and named sets of them."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace

@@ -1,7 +1,5 @@
 """Geometry of parametric aortic arches: from their figures to a vessel tree."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

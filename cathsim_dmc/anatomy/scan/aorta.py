@@ -20,7 +20,13 @@ SMOOTH = 6e-3  # m, standard deviation along the way, which steps from node to n
 ARM = 60e-3  # m to both sides of a place, over which the bend there is taken
 TURN = np.radians(75.0)  # least bend of an arch
 LEG = 80e-3  # m of each leg that are compared, from 10 mm past the branches on
-UPRIGHT = 0.75  # cosine between the top of the arch and +z of a scan that stands
+LIMB = 50e-3  # m from the top on, at most half of a limb, that has no direction yet
+UPRIGHT = 0.9  # cosine between the limbs of the aorta and +z of a scan that stands
+# Longest usual ascending aorta, m, and what more makes it e times less likely.
+ASCENDING, LONGER = 70e-3, 18e-3
+# Way from the middle of the arch's branches to the top, m: the more, the steeper the
+# type of the arch (`arch.sampler`: 0, 13 and 21 mm for types I to III, each +- 8).
+BEFORE, BEFORE_SPREAD = 10e-3, 11e-3
 # Azimuth of the way from ascending to descending leg, from back to left, in a body
 # that stands upright: 50 degrees, standard deviation 14 (`arch.sampler`), here 25 for
 # what was cut; the range that is accepted; and how often a scan is not as it seems.
@@ -59,7 +65,7 @@ class Bend:
         line: (n, 3) m, smoothed, 1 mm apart.
         apex: row of the line at which it bends most.
         turn: rad, bend between 60 mm before and after the apex.
-        up: (3,), unit, towards the outside of the bend there.
+        up: (3,), unit, mean direction in which both limbs lead to the bend.
         along: (3,), unit, from the leg before the apex to the one after it.
     """
 
@@ -87,7 +93,12 @@ class Bend:
         height = np.linalg.norm(rise, axis=1) - 1e-3 * cosine
         height[: reach // 2] = height[len(line) - reach // 2 :] = -np.inf
         apex = int(height.argmax())
-        up = _unit(rise[apex])
+        after = len(line) - 1 - apex
+        limbs = [
+            line[apex - min(round(LIMB / 1e-3), apex // 2)] - line[0],
+            line[apex + min(round(LIMB / 1e-3), after // 2)] - line[-1],
+        ]
+        up = _unit(_unit(limbs[0]) + _unit(limbs[1]))
         along = line[last[apex]] - line[first[apex]]
         along = _unit(along - (along @ up) * up)
         turn = float(np.arccos(np.clip(cosine.min(), -1.0, 1.0)))
@@ -172,9 +183,11 @@ def heart_evidence(
         before, after = (float(np.median(depth[leg])) for leg in legs)
         # Diameters 29.5 and 23.9 mm; their ratio has a standard deviation of 15 %.
         add(18.0 * np.log(after / before), 4.0, "width of the legs")
-    length = first - (s[-1] - last)
-    far = abs(length) > 0.15
-    add(length * (40.0 if far else 10.0), 5.0 if far else 1.0, "length of the legs")
+    # The ascending aorta is 63 (11) mm long up to its branches, or cut off.
+    longer = [max(leg - ASCENDING, 0.0) / LONGER for leg in (first, s[-1] - last)]
+    add(min(longer[0], 5.0) - min(longer[1], 5.0), 5.0, "length of the legs")
+    before = 1e-3 * bend.apex - 0.5 * (first + last)
+    add(-2.0 * BEFORE * before / BEFORE_SPREAD**2, 2.5, "branches before the top")
     azimuth = bend.azimuth(heart_last=True)
     if azimuth is not None:
         right, wrong = _facing(azimuth), _facing(azimuth + np.pi)

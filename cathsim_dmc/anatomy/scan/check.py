@@ -29,6 +29,7 @@ BESIDE = 15e-3  # m that two vessels may run in one lumen beyond their parting
 VOLUME = (0.5e-6, 2e-3)  # m^3 of a lumen
 RADIUS = (0.3e-3, 30e-3)  # m, median of a vessel
 WIDEST = 45e-3  # m
+ONE_OSTIUM = 3e-3  # m of the aorta between ostia that are one
 START = 75e-3  # m past the inlet, deepest start of a device
 START_CLEARANCE = 1e-3  # m between the device and the wall there
 START_ROOM = 10e-3  # m between the head at the start and a goal's ostium
@@ -163,12 +164,14 @@ def _sides(anatomy: Anatomy) -> TreeCheck:
     names = [vessel.name for vessel in vessels]
     ostia = [vessel.centreline.at(vessel.ostium).position for vessel in vessels]
     along = np.diff([root.centreline.project(ostium).arc_length for ostium in ostia])
-    if (along > 0).any() and (along < 0).any():
+    # What leaves in one lumen, as in a bovine arch, has no order.
+    apart = along[np.abs(along) > ONE_OSTIUM]
+    if (apart > 0).any() and (apart < 0).any():
         wrong.append(f"{', '.join(names)} do not leave {root.name} in this order")
     fine = f"{len(vessels)} in order" if len(vessels) > 1 else "no arch"
     bend = Bend.of(root.centreline.points)
     if len(vessels) > 1 and bend.turn > TURN:
-        if (text := mirrored(bend.azimuth(bool(along[0] < 0)))) is not None:
+        if (text := mirrored(bend.azimuth(bool(along.sum() < 0)))) is not None:
             wrong.append(text)
         elif not bend.upright:
             fine += ", in a scan that does not stand upright"
@@ -337,7 +340,7 @@ def _start(anatomy: Anatomy, measure: SurfaceDepth) -> TreeCheck:
         if here > there - START_ROOM:
             wrong.append(
                 f"the ostium of {lineage} is {there * 1e3:.0f} mm from the inlet and a "
-                f"device starts {here * 1e3:.0f} mm deep, so that the way to {name} "
-                "is no way; choose an inlet farther back"
+                f"device starts {here * 1e3:.0f} mm deep, past it: {name} cannot be "
+                "reached; choose an inlet farther back"
             )
     return _finding("start of the device", wrong, f"{run * 1e3:.0f} mm deep at most")

@@ -21,6 +21,7 @@ from cathsim_dmc.anatomy.scan.forks import (
     EXTRA,
     SPREAD,
     SURE,
+    WAY,
     leads,
     normal,
     without_twins,
@@ -28,6 +29,7 @@ from cathsim_dmc.anatomy.scan.forks import (
 from cathsim_dmc.anatomy.scan.offshoots import Offshoot, common
 from cathsim_dmc.anatomy.scan.units import in_mm
 from cathsim_dmc.anatomy.scan.ways import Ways
+from cathsim_dmc.anatomy.segments import arc_lengths
 
 ARCH_BRANCHES = ("bca", "lcca", "lsa")  # in their order from the heart
 ANATOMICAL = frozenset((*ARCH_BRANCHES, "rcca", "rsa", "rva", "lva"))
@@ -48,6 +50,7 @@ SHORT = 0.04  # that it is cut short
 # Arteries of the arch that have no name here, such as a thyroid or a bronchial one, are
 # thin: radius in m, and the standard deviation of the logarithm of a wider one.
 EXTRA_RADIUS, EXTRA_SPREAD = 2.0e-3, 0.8
+BETWEEN = 0.2  # of these, how many leave between LCCA and LSA, where vertebral ones do
 BUMP = 0.02  # that one that looks cut short is none
 # Radii beyond the ostium, m (`arch.sampler`, vertebral: 1.9), for an aorta as wide as
 # `AORTA`; `SPREAD` is the standard deviation of their logarithm.
@@ -74,6 +77,10 @@ FORKS = {
     "rsa": (38e-3, 10e-3, 0.5),
     "lva": (150e-3, 30e-3, 0.99),
 }
+# Cosine between the way of a branch and the right and back of the arch's plane: mean
+# and deviation. An aberrant right subclavian artery runs behind to the right.
+SIDE, SIDE_OF_RSA = (0.0, 0.35), (0.65, 0.3)
+_SIDES = np.log(2.0 / np.sqrt(2.0 * np.pi))  # against one of any side
 _FORK_DENSITY = 1.0 / 60e-3  # 1/m, to which densities of forks are compared
 _NAME = re.compile(r"[a-z][a-z0-9_]*")
 
@@ -117,7 +124,7 @@ def name_branches(
             that is given.
     """
     scale = float(np.clip(width / AORTA, 0.5, 1.5))
-    share = _probabilities(found, odds, scale)
+    share = _probabilities(found, _sides(bend, found), odds, scale)
     heart = sum(value for (last, _, _), value in share.items() if last)
     heart_last = bool(heart >= 0.5)
     heart = max(heart, 1.0 - heart)
@@ -202,8 +209,22 @@ def renamed(names: Sequence[str], changes: Mapping[str, str], root: str) -> list
     return out
 
 
+def _sides(bend: Bend, found: Sequence[Offshoot]) -> list[float]:
+    """Cosine of each branch to one side of the arch's plane, where it can be seen.
+
+    The side is the patient's right and back if the heart is at the first point.
+    """
+    out = []
+    for one in found:
+        way = max(one.rows, key=len, default=np.zeros((1, 3)))
+        chord = way[arc_lengths(way) <= WAY][-1] - way[0]
+        chord /= max(float(np.linalg.norm(chord)), 1e-9)
+        out.append(float(chord @ np.cross(bend.up, bend.along)))
+    return out
+
+
 def _probabilities(
-    found: Sequence[Offshoot], odds: float, scale: float
+    found: Sequence[Offshoot], sides: Sequence[float], odds: float, scale: float
 ) -> dict[tuple[bool, tuple[str, ...], tuple[str, ...]], float]:
     """Of every (heart at the last point, pattern, labels from the heart on)."""
     weights = {}
@@ -213,8 +234,10 @@ def _probabilities(
             if heart_last != (odds > 0.0):
                 continue
             side = 0.0
-        seen = list(found)[::-1] if heart_last else list(found)
-        for pattern, labels, weight in _hypotheses(seen, scale):
+        seen, right = list(found), list(sides)
+        if heart_last:
+            seen, right = seen[::-1], [-value for value in right[::-1]]
+        for pattern, labels, weight in _hypotheses(seen, right, scale):
             weights[heart_last, pattern, labels] = weight + side
     most = max(weights.values())
     share = {key: float(np.exp(weight - most)) for key, weight in weights.items()}
@@ -222,7 +245,7 @@ def _probabilities(
     return {key: value / total for key, value in share.items()}
 
 
-def _hypotheses(seen: Sequence[Offshoot], scale: float):
+def _hypotheses(seen: Sequence[Offshoot], right: Sequence[float], scale: float):
     """Every (pattern, labels, log weight) of offshoots in order from the heart."""
     count = len(seen)
     for pattern, (frequency, _) in PATTERNS.items():
@@ -235,15 +258,26 @@ def _hypotheses(seen: Sequence[Offshoot], scale: float):
                     weight = np.log(frequency)
                     weight += np.log(CUT) * (len(pattern) - kept)
                     weight += sum(
-                        _fit(one, label, scale)
-                        for one, label in zip(seen, labels, strict=True)
+                        _fit(one, label, scale, side)
+                        for one, label, side in zip(seen, labels, right, strict=True)
                     )
                     weight += _spacings(seen, pattern, shown, at, scale)
+                    weight += np.log(BETWEEN) * _between(seen, labels)
                     yield pattern, tuple(labels), float(weight)
 
 
-def _fit(one: Offshoot, label: str, scale: float) -> float:
-    """Log probability of the calibre and the fork of an offshoot."""
+def _between(seen: Sequence[Offshoot], labels: Sequence[str]) -> int:
+    """How many arteries without a name leave between LCCA and LSA."""
+    near = zip(labels, seen[1:], labels[1:], labels[2:], strict=False)
+    return sum(
+        first in ("lcca", "bovine") and label == "extra" and last == "lsa"
+        for first, one, label, last in near
+        if one.curves
+    )
+
+
+def _fit(one: Offshoot, label: str, scale: float, side: float) -> float:
+    """Log probability of the calibre, the fork and the side of an offshoot."""
     if label == "extra":
         if not one.curves:
             return float(np.log(BUMP))
@@ -252,6 +286,9 @@ def _fit(one: Offshoot, label: str, scale: float) -> float:
     # What was cut short shows little more than the mouth of a branch.
     spread = SPREAD if one.curves else 2.0 * SPREAD
     weight = normal(np.log(one.radius / (scale * RADII[label])), spread)
+    if one.curves:
+        mean, deviation = SIDE_OF_RSA if label == "rsa" else SIDE
+        weight += normal(side - mean, deviation) + _SIDES
     mean, deviation, none = FORKS[label]
     if one.fork is None:
         return weight + np.log(none if one.curves else SHORT)

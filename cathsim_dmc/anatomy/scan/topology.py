@@ -170,10 +170,14 @@ def without_slivers(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray
                 continue
             other = others[0]
             face = list(map(int, faces[other]))
-            for j in range(3):
-                if {face[j], face[(j + 1) % 3]} == {a, b}:
-                    p, q, top = face[j], face[(j + 1) % 3], face[(j + 2) % 3]
-                    fresh += [(p, m, top), (m, q, top)]
+            top = next(corner for corner in face if corner not in (a, b))
+            edge = (min(m, top), max(m, top))
+            if edge in owner:
+                continue  # a third and a fourth triangle would share it
+            owner[edge] = [int(row), other]
+            j = face.index(top)
+            p, q = face[(j + 1) % 3], face[(j + 2) % 3]
+            fresh += [(p, m, top), (m, q, top)]
             gone += [row, other]
             touched |= {row, other}
         if not gone:

@@ -21,6 +21,8 @@ TAIL_RADIUS = 1.1e-3  # m, of a 6 Fr device (1.0 mm) and a tenth to spare
 END_TRIM = 8e-3  # m, most that is cut off where a curve runs into its end
 # These keep what they share with others: vertebral arteries are their branches.
 TRUNKS = ("rsa", "lsa")
+# These, where they are named, keep what they share with what has no name.
+STEMS = ("bca", "lcca", "rcca")
 MIN_RADIUS = 0.1e-3  # m, floor of a centreline's radius where it scrapes the wall
 
 
@@ -63,8 +65,12 @@ def grow_tree(
     root = _deep_start(root, field)
     lines = {root_name: root}
     vessels = {root_name: Vessel(root_name, _finish(field, root, None))}
-    order = sorted(raw, key=lambda key: (key not in TRUNKS, -_bulk(field, raw[key])))
-    for name in order:
+    stems = () if drawn else STEMS
+
+    def rank(name: str) -> tuple[bool, bool, float]:
+        return name not in TRUNKS, name not in stems, -_bulk(field, raw[name])
+
+    for name in sorted(raw, key=rank):
         curve = raw[name]
         parent, at = _parent(curve, lines, vessels, field)
         trunk = vessels[parent].centreline

@@ -7,7 +7,6 @@ from dataclasses import dataclass, replace
 import mujoco
 import numpy as np
 from scipy.spatial.transform import Rotation
-from wires_data import Wire, along
 
 from cathsim_dmc.anatomy.field import Field
 from cathsim_dmc.anatomy.parts import Surface
@@ -20,6 +19,7 @@ from cathsim_dmc.entities.devices import Discretisation
 from cathsim_dmc.entities.phantom import mesh_file
 from cathsim_dmc.entities.posture import bends_of
 from cathsim_dmc.entities.sheath import Sheath, straight
+from cathsim_dmc.validation.bench_data import Wire, along
 from cathsim_dmc.validation.rig import Rig
 
 _LINK = 7e-3  # m, longest of the shaft
@@ -36,12 +36,15 @@ class Setting:
         friction: Coulomb coefficient.
         down: (3,) direction of gravity, frame of the mesh; 0 for none.
         overshoot: by which the wire is pushed too far and pulled back, m.
+        taper: m from the tip to where the core has its diameter, and by what factor
+            it is thinner at the tip; None for the two sections of the device.
     """
 
     device: Device
     friction: float
     down: np.ndarray
     overshoot: float = 0.0
+    taper: tuple[float, float] | None = None
 
 
 class Held:
@@ -114,8 +117,21 @@ class Held:
             shape = {"type": "mesh", "mesh": "hull"}
         body.add("geom", name="wall", **shape, **wall_contact(setting.friction), mass=0)
         rig.compile()
+        if setting.taper is not None:
+            self._grind(device.shaft.bending_stiffness, *setting.taper)
         self._slide = rig.data.joint(f"{rig.name}/insertion")
         self._servo = rig.model.actuator(f"{rig.name}/insertion").id
+
+    def _grind(self, stiffness: float, length: float, thinnest: float) -> None:
+        """Lets the core taper: EI goes with the fourth power of its diameter."""
+        lengths = self._rig.lengths
+        ahead = lengths[::-1].cumsum()[::-1]
+        for number in range(1, len(lengths)):
+            share = min(ahead[number] / length, 1.0)
+            here = stiffness * (thinnest + (1.0 - thinnest) * share) ** 4
+            for name in "xy":
+                joint = self._rig.model.joint(f"{self._rig.name}/bend_{name}_{number}")
+                joint.stiffness = here / lengths[number - 1 : number + 1].mean()
 
     def push(self) -> np.ndarray:
         """Pushes the wire in, from outside; its shape (n, 3) at rest, m."""

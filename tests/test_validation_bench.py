@@ -5,12 +5,13 @@ import json
 import numpy as np
 import pytest
 import trimesh
-import wires as bench
-import wires_data
-from wires_data import MESH, WIRES, Wire
-from wires_rig import Held
 
+from cathsim_dmc.cli.measurements import validate
 from cathsim_dmc.entities.arena import BLOOD_DENSITY, GRAVITY
+from cathsim_dmc.validation import bench, bench_data
+from cathsim_dmc.validation.bench_data import MESH, WIRES, Wire
+from cathsim_dmc.validation.bench_rig import Held
+from cathsim_dmc.validation.checks import Report
 
 ENTRY = np.array([3.0, 0.0, 0.0])  # mm, off the middle of the tube
 
@@ -68,7 +69,7 @@ def folder(tmp_path_factory):
         "centreline_mm": [[3.0, 60.0 - y, 0.0] for y in range(0, 70, 2)],
     }
     write(path, marks, row)
-    made = wires_data.read(path)
+    made = bench_data.read(path)
     experiment = bench.Experiment(made)
     (wire,) = made.wires
     held = Held(experiment.setting(wire), experiment.field(), wire)
@@ -86,9 +87,9 @@ def write(path, marks, *rows):
 def test_a_simulated_wire_is_found_again_from_another(folder, monkeypatch):
     path, _, _, lumen = folder
     # The same for every reading of the folder; it takes seconds to make.
-    monkeypatch.setattr(wires_data.Bench, "field", lambda self, scale: lumen)
+    monkeypatch.setattr(bench_data.Bench, "field", lambda self, scale: lumen)
     lines = []
-    report = bench.compare_wires(path, sensitivity=False, say=lines.append)
+    report = bench.validate_bench(path, lines.append)
     row, other = report.findings["frames"]
     assert row["pushed"]["rms"] < 0.05
     assert row["laid"]["rms"] < 0.3
@@ -97,9 +98,16 @@ def test_a_simulated_wire_is_found_again_from_another(folder, monkeypatch):
     assert row["hull"]["rms"] > 2.0
     assert not row["folded"]
     assert (row["half"], other["half"]) == ("fit", "test")
-    ((header, *rows),) = bench.tables(report).values()
-    assert rows[0][header.index("pushed")] == "0.0 (0)"
     assert lines[0].startswith("made, 1 (straight, arch): pushed 0.0")
+
+
+def test_the_command_gives_the_report(monkeypatch, capsys):
+    monkeypatch.setattr(bench, "validate_bench", lambda data, say: Report(data, []))
+    assert validate("bench", data="there", json=True) == 0
+    assert json.loads(capsys.readouterr().out)["title"] == "there"
+    for part, data in (("bench", None), ("rod", "there")):
+        with pytest.raises(ValueError, match="--data DIR, a folder with phantom.stl"):
+            validate(part, data=data)
 
 
 def test_wires_that_fold_back_are_told():
@@ -116,7 +124,7 @@ def test_wires_that_fold_back_are_told():
 
 def test_a_wire_has_its_weight_in_blood(folder):
     path, _, _, lumen = folder
-    experiment = bench.Experiment(wires_data.read(path))
+    experiment = bench.Experiment(bench_data.read(path))
     wire = experiment.bench.wires[0]
     rig = Held(experiment.setting(wire, down="left"), lumen, wire)._rig
     weight = rig.model.body_mass.sum() * rig.model.opt.gravity / rig.lengths.sum()

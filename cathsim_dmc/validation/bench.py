@@ -1,0 +1,242 @@
+"""Simulated guidewires against measured ones: `cathsim validate bench`."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from cathsim_dmc.anatomy.field import Field
+from cathsim_dmc.anatomy.scan.ways import Ways
+from cathsim_dmc.anatomy.surface_depth import SurfaceDepth
+from cathsim_dmc.entities.contact import FRICTION
+from cathsim_dmc.entities.device import Device, Section
+from cathsim_dmc.entities.devices import METAL_LOSS, METAL_POISSON_RATIO, WIRE_035_GLIDE
+from cathsim_dmc.validation import bench_data
+from cathsim_dmc.validation.bench_data import Bench, Wire
+from cathsim_dmc.validation.bench_rig import Held, Setting
+from cathsim_dmc.validation.checks import Check, Report
+
+# Median RMS distance, mm, of straight wires, and of angled ones at their best turn.
+STRAIGHT, ANGLED = 2.0, 3.0
+TURNS = 12  # of an angled wire about its axis, evenly spread
+# How a wire comes to its place: pushed from the entry without steering; laid along
+# another measured wire and let go, so that it is on the side of each branch to which
+# the operator has steered it; laid along the measured wire itself.
+WAYS = ("pushed", "led", "laid")
+EITHER = "pushed or led"  # the better of two histories, since the true one is unknown
+BASELINES = ("centreline", "nearest", "hull")
+
+
+def _nitrex(shaft: float, tip: float, length: float) -> Device:
+    """A straight wire of nitinol with a tip of gold-tungsten; EI in N·m², length m."""
+    return Device(
+        name="nitrex",
+        outer_radius=0.445e-3,
+        linear_density=4.0e-3,
+        shaft=Section.isotropic(shaft, METAL_POISSON_RATIO),
+        tip=Section.isotropic(tip, METAL_POISSON_RATIO),
+        tip_length=length,
+        tip_links=round(length / 4e-3),
+        loss_factor=METAL_LOSS,
+        source="fit to every second recommended frame (docs/bench.md)",
+    )
+
+
+# Nitrex with a straight tip; Radifocus M Stiff with an angled one.
+DEVICES = {
+    "straight": _nitrex(75e-6, 2.25e-6, 0.03),
+    "angled": WIRE_035_GLIDE,
+}
+DOWN = "left"  # of the patient, see docs/bench.md
+
+
+class Result(NamedTuple):
+    """Distances of a simulated wire from the measured one at T turns, mm."""
+
+    rms: np.ndarray  # (T,)
+    largest: np.ndarray  # (T,)
+
+
+class Experiment:
+    """A bench, its fields and baselines, made once."""
+
+    def __init__(self, bench: Bench):
+        """Takes a bench that was read."""
+        self.bench = bench
+        self._fields: dict[float, Field] = {}
+        self._ways: Ways | None = None
+
+    def field(self, scale: float = 1.0) -> Field:
+        """Lumen, larger by a factor."""
+        if scale not in self._fields:
+            self._fields[scale] = self.bench.field(scale)
+        return self._fields[scale]
+
+    def setting(self, wire: Wire, down: str = DOWN, **changes: Any) -> Setting:
+        """The device of a wire on the bench, with changes of the setting."""
+        device = changes.pop("device", DEVICES)[wire.kind]
+        friction = changes.pop("friction", FRICTION)
+        changes["taper"] = changes.get("taper", {}).get(wire.kind)
+        return Setting(device, friction, self.bench.down[down], **changes)
+
+    def compare(
+        self,
+        wire: Wire,
+        way: str,
+        turns: Sequence[float] = (0.0,),
+        scale: float = 1.0,
+        **changes: Any,
+    ) -> Result:
+        """Simulates a wire in one of `WAYS`.
+
+        Args:
+            wire: to compare with.
+            way: in which it comes to its place.
+            turns: of the wire about its axis, rad.
+            scale: by which the lumen is larger.
+            **changes: of the setting: `friction`, `down`, `overshoot`; by kind of the
+                wire `device` and `taper`.
+        """
+        setting, wall = self.setting(wire, **changes), self.field(scale)
+        start = {"led": self._nearest(wire), "laid": wire}.get(way)
+        shapes = []
+        for turn in turns if way == "pushed" or start is not None else ():
+            held = Held(setting, wall, wire, turn)
+            shapes.append(held.push() if start is None else held.release(start.points))
+        return _result(wire, shapes)
+
+    def centreline(self, wire: Wire) -> Result:
+        """The vessel's centreline from the entry to the vessel that the tip is in."""
+        if self._ways is None:
+            self._ways = Ways(SurfaceDepth(self.bench.surface))
+        node = self._ways.node(self.bench.ends[wire.vessel])
+        before = self._ways.deepest_from(self._ways.node(self.bench.entry.position))
+        return _result(wire, [self._ways.points[self._ways.trace(before, node)]])
+
+    def nearest(self, wire: Wire) -> Result:
+        """Another measured wire of the product: where a wire that is led starts."""
+        other = self._nearest(wire)
+        return _result(wire, [] if other is None else [other.points])
+
+    def _nearest(self, wire: Wire) -> Wire | None:
+        """The other recommended wire of the product whose tip is nearest, if any."""
+        others = [
+            other
+            for other in self.bench.wires
+            if other is not wire and other.kind == wire.kind and other.recommended
+            if not other.folded
+        ]
+        tip = wire.points[-1]
+        return min(
+            others, key=lambda o: np.linalg.norm(o.points[-1] - tip), default=None
+        )
+
+    def hull(self, wire: Wire) -> Result:
+        """The wire pushed into MuJoCo's own mesh, which is its convex hull."""
+        held = Held(self.setting(wire), self.bench.surface, wire)
+        return _result(wire, [held.push()])
+
+
+def _result(wire: Wire, shapes: Sequence[np.ndarray]) -> Result:
+    found = [1e3 * bench_data.distances(wire.points, shape) for shape in shapes]
+    rms = [float(np.sqrt((each**2).mean())) for each in found] or [np.nan]
+    largest = [float(each.max()) for each in found] or [np.nan]
+    return Result(np.array(rms), np.array(largest))
+
+
+def halves(wires: Iterable[Wire]) -> dict[str, str]:
+    """Which half a frame belongs to: parameters are fitted to one, tested on other."""
+    found: dict[str, str] = {}
+    count: dict[str, int] = dict.fromkeys(bench_data.KINDS, 0)
+    for wire in wires:
+        found[wire.name] = ("fit", "test")[count[wire.kind] % 2]
+        count[wire.kind] += 1
+    return found
+
+
+def validate_bench(
+    folder: str | Path, say: Callable[[str], None] = lambda text: None
+) -> Report:
+    """Compares simulated guidewires with those measured in a phantom.
+
+    Args:
+        folder: see `bench_data.read`.
+        say: called with a line of text for every frame.
+
+    Raises:
+        FileNotFoundError: if a file is missing.
+        ValueError: if one is not as stated, or recommends no frame.
+    """
+    bench = bench_data.read(folder)
+    wires = [wire for wire in bench.wires if wire.recommended]
+    if not wires:
+        raise ValueError(
+            f"{folder} recommends none of its {len(bench.wires)} wires; "
+            "'recommended' of at least one must be true"
+        )
+    experiment, half = Experiment(bench), halves(wires)
+    rows = []
+    for wire in wires:
+        rows.append(row := _row(experiment, wire, half[wire.name]))
+        figures = (f"{key} {row[key]['rms']:.2f} mm" for key in (*WAYS, *BASELINES))
+        say(f"{wire.name} ({wire.kind}, {wire.vessel}): {', '.join(figures)}")
+    return Report("Guidewires on a bench", _checks(rows), {"frames": rows})
+
+
+def _row(experiment: Experiment, wire: Wire, half: str) -> dict[str, Any]:
+    """Figures of one frame."""
+    angles = np.arange(TURNS if wire.kind == "angled" else 1) * (2.0 * np.pi / TURNS)
+    results = {way: experiment.compare(wire, way, angles.tolist()) for way in WAYS}
+    results |= {name: getattr(experiment, name)(wire) for name in BASELINES}
+    row: dict[str, Any] = {
+        "frame": wire.name,
+        "wire": wire.kind,
+        "vessel": wire.vessel,
+        "half": half,
+        "folded": wire.folded,
+        "inserted_mm": 1e3 * wire.length,
+    }
+    for name, result in results.items():
+        best = int(result.rms.argmin())
+        row[name] = {
+            "rms": float(result.rms[best]),
+            "largest": float(result.largest[best]),
+            "median_rms": float(np.median(result.rms)),
+            "turn": float(angles[best]),
+        }
+    row[EITHER] = min(row["pushed"], row["led"], key=lambda each: each["rms"])
+    return row
+
+
+def _checks(rows: Sequence[dict[str, Any]]) -> list[Check]:
+    """Medians against the aims and the baselines; folded frames apart."""
+    found = []
+    for kind, bound in zip(bench_data.KINDS, (STRAIGHT, ANGLED), strict=True):
+        chosen = [row for row in rows if row["wire"] == kind and not row["folded"]]
+        if not chosen:
+            continue
+        baseline = {
+            key: float(np.median([row[key]["rms"] for row in chosen]))
+            for key in BASELINES
+        }
+        note = ", ".join(f"{key} {value:.2f} mm" for key, value in baseline.items())
+        least = min(value for value in baseline.values() if np.isfinite(value))
+        for way in ("pushed", EITHER, "laid"):
+            each = [row[way]["rms"] for row in chosen]
+            tested = [row[way]["rms"] for row in chosen if row["half"] == "test"]
+            largest = max(row[way]["largest"] for row in chosen)
+            name = f"{kind} wires, {way}: median RMS"
+            behind = f"of {len(each)} frames, largest distance {largest:.1f} mm"
+            value = float(np.median(each))
+            found.append(Check.at_most(name, value, bound, "mm", behind))
+            if way != "laid":
+                label = f"{name}, against the best baseline"
+                found.append(Check.at_most(label, value, least, "mm", note))
+            if tested:
+                label, behind = f"{name}, test half", f"of {len(tested)} frames"
+                value = float(np.median(tested))
+                found.append(Check.at_most(label, value, bound, "mm", behind))
+    return found
