@@ -145,6 +145,22 @@ def test_dagger_learns_from_what_the_expert_would_do(tmp_path, monkeypatch):
     assert apart[0] == 0 and 0.2 < apart[1] < 0.8 and apart[1] < apart[2]
 
 
+@pytest.mark.parametrize("withdrawn, weight", [(0, 1), (1, 5), (20, 4), (80, 1)])
+def test_rare_withdrawals_weigh_as_much_as_the_rest(
+    withdrawn, weight, shapes, tmp_path
+):
+    env = make_env("simple1_bca", observation="tracking", num_threads=1)
+    learner = make_learner(dagger(withdrawal_weight=5.0), shapes, tmp_path)
+    learner.attach(env)
+    target = torch.full((100, shapes.actions), -0.5)
+    column = env.base_env.simulation.task.scene.catheter.translations[0]
+    target[withdrawn:, column] = 0.5
+    weights = learner._weights(target)
+    assert weights.shape == (100, 1)
+    np.testing.assert_allclose(weights[:withdrawn], weight, rtol=1e-6)
+    np.testing.assert_allclose(weights[withdrawn:], 1)
+
+
 @pytest.mark.slow
 def test_dagger_repeats_and_goes_on(tmp_path):
     for name in "ab":

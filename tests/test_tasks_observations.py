@@ -175,6 +175,8 @@ def test_the_route_ahead_is_that_of_the_centreline_seen_from_the_tip(make):
     # The head lies in the cross-section of the first of them, or is nowhere nearer.
     nearest = line.project(state.head)
     assert abs(place.arc_length[0] - nearest.arc_length) < 1e-3
+    deviation = nearest.distance / nearest.radius - 1
+    np.testing.assert_allclose(observation["route_deviation"], deviation, atol=0.03)
     goal = frame @ observation["route_goal"] + state.head
     np.testing.assert_allclose(goal, env.task.objective.goal, atol=1e-12)
     device = observation["route_device"].reshape(-1, 3) @ frame.T + state.head
@@ -192,6 +194,19 @@ def test_the_route_goes_straight_on_behind_the_goal():
     way = np.diff(points[2:], axis=0)
     np.testing.assert_allclose(np.linalg.norm(way, axis=-1), 5e-3, atol=1e-9)
     np.testing.assert_allclose(way, np.broadcast_to(way[0], way.shape), atol=1e-9)
+
+
+def test_a_head_beside_the_route_sees_how_far_it_is_out_of_the_lumen():
+    objective = suite.make_task("simple1_bca").objective
+    line = objective.route
+    middle = len(line.points) // 2
+    way = line.points[middle + 1] - line.points[middle - 1]
+    aside = np.cross(way, [0.3, 0.5, 0.8])
+    aside *= line.radii[middle] / np.linalg.norm(aside)
+    heads = line.points[middle] + np.outer([0.0, 1.0, 3.0], aside)
+    frames = np.broadcast_to(np.eye(3), (3, 3, 3))
+    ahead = route.Routes([objective]).ahead(np.zeros(3, int), heads, frames)
+    np.testing.assert_allclose(ahead.excess, [-1, 0, 2], atol=0.1)
 
 
 def test_an_objective_without_a_route_cannot_show_one():

@@ -40,6 +40,9 @@ class DAggerConfig(TrainingConfig):
             from round to round; in the first round it acts alone.
         gradient_steps: Number of gradient steps in a round.
         batch_size: Number of states per gradient step.
+        withdrawal_weight: Largest weight of the states in which the expert withdraws a
+            device, among those in which it does not; together they weigh at most as
+            much as the others.
         expert_lead: By how much the expert keeps a guidewire ahead of the catheter
             around it, m; negative where the catheter's shaped end goes first.
         replay_frames: Largest number of states kept, the newest.
@@ -58,6 +61,7 @@ class DAggerConfig(TrainingConfig):
     expert_share: float = within(0.5, 0, 1)
     gradient_steps: int = positive(2_000)
     batch_size: int = positive(256)
+    withdrawal_weight: float = within(20.0, 1, 1_000)
     expert_lead: float = within(0.02, -0.1, 0.1)
     replay_frames: int = 1_000_000
     replay_bytes: int = positive(2 * 1024**3)
@@ -136,7 +140,16 @@ class DAgger(CloningLearner):
     @override
     def attach(self, env: EnvBase) -> None:
         self.policy = _Guided(self.network, env, self.config.expert_lead)
+        self._translations = list(view_of(env).task.scene.catheter.translations)
         self._set_share()
+
+    @override
+    def _weights(self, target: torch.Tensor) -> torch.Tensor:
+        """Withdrawals weigh more: they are rare, and nothing else helps then."""
+        withdrawn = (target[:, self._translations] < 0.0).any(1, keepdim=True)
+        share = withdrawn.float().mean().clamp(1e-6, 1.0)
+        weight = ((1.0 - share) / share).clamp(1.0, self.config.withdrawal_weight)
+        return torch.where(withdrawn, weight, torch.ones_like(weight))
 
     def _set_share(self) -> float:
         """The share of the expert in the next round."""

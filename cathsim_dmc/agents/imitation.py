@@ -77,7 +77,7 @@ class CloningLearner(Learner):
             for group in self.optimiser.param_groups:
                 group["lr"] = rate
             mean, target = self._means(sample(batch_size))
-            loss = (mean.tanh() - target).square().mean()
+            loss = ((mean.tanh() - target).square() * self._weights(target)).mean()
             self.optimiser.zero_grad()
             loss.backward()
             self.optimiser.step()
@@ -87,6 +87,10 @@ class CloningLearner(Learner):
             "loss": float(total) / max(len(rates), 1),
             "deviation": self._set_deviation(sample(_SAMPLE)),
         }
+
+    def _weights(self, target: torch.Tensor) -> torch.Tensor:
+        """Weights (n, 1) of the squared errors of the actions `target` (n, A)."""
+        return torch.ones_like(target[:, :1])
 
     def _means(self, states: TensorDictBase) -> tuple[torch.Tensor, torch.Tensor]:
         """Means before the tanh and the actions that are wanted."""

@@ -212,6 +212,14 @@ def tracking_2d(frame: Frame) -> Observation:
         f"{TRACKED_POINTS - 1} points along the device, proximal to the head and "
         "without it, tip frame",
     ),
+    Entry(
+        "route_deviation",
+        1,
+        "radius",
+        "by how much the head is out of the lumen of the route, in radii there; "
+        "negative inside",
+        -1,
+    ),
     Entry("route_action", _actions, "1", "the last action, 0 after a reset", -1, 1),
     routed=True,
     joined=("drives", "devices"),
@@ -228,6 +236,7 @@ def route(frame: Frame) -> Observation:
         "route_radii": ahead.radii,
         "route_goal": into_frame(goal, axes)[..., 0, :],
         "route_device": _flat(into_frame(device, axes), 2),
+        "route_deviation": ahead.excess[..., None],
         "route_action": frame.action,
     }
 

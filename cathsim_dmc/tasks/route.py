@@ -119,10 +119,12 @@ class Ahead(NamedTuple):
     Attributes:
         points: (N, K, 3), of the route, `AHEAD` of the place of the head, m.
         radii: (N, K), of the lumen there, m.
+        excess: (N,), `Place.excess` of the head.
     """
 
     points: np.ndarray
     radii: np.ndarray
+    excess: np.ndarray
 
 
 class Routes:
@@ -149,14 +151,17 @@ class Routes:
         """
         points = np.empty((len(head), len(AHEAD), 3))
         radii = np.empty((len(head), len(AHEAD)))
+        excess = np.empty(len(head))
         for number in np.unique(chosen).tolist():
             if number not in self._routes:
                 self._routes[number] = Route.of(self._objectives[number])
             route, rows = self._routes[number], np.flatnonzero(chosen == number)
-            place = locate(route, head[rows]).arc_length[:, None] + AHEAD
-            points[rows] = route.at(place)
-            radii[rows] = np.interp(place, route.arc_length, route.radii)
-        return Ahead(into_frame(points - head[:, None], frame), radii)
+            place = locate(route, head[rows])
+            ways = place.arc_length[:, None] + AHEAD
+            points[rows] = route.at(ways)
+            radii[rows] = np.interp(ways, route.arc_length, route.radii)
+            excess[rows] = place.excess
+        return Ahead(into_frame(points - head[:, None], frame), radii, excess)
 
 
 def into_frame(vectors: np.ndarray, frame: np.ndarray) -> np.ndarray:
