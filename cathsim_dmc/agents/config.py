@@ -29,8 +29,8 @@ class TrainingConfig:
             "image", "sequential" or "tracking".
         task_kwargs: Further options of the task; must be JSON-able.
         training_reward: Weights of the reward terms to learn from, such as
-            {"path": -1, "success": 10}; None takes the task's. Evaluation and
-            recordings always take the task's.
+            {"path": -1, "success": 10}, or path -1 success 10 on the command line;
+            None takes the task's. Evaluation and recordings always take the task's.
         training_max_steps: Largest number of control steps of an episode of the
             training, at whose end the value is carried on; None takes the task's.
             Evaluation and recordings always take the task's.

@@ -16,6 +16,7 @@ from cathsim_dmc.physics import forces, readings
 
 _NOTHING = np.zeros(())
 GOAL_RADIUS = 8e-3  # m, δ of the published task
+GENTLE = 0.1  # N, sum of all contacts above which a push counts as hard
 # Weights of the published reward: minus the distance in metres, or 10 at success.
 PUBLISHED_REWARD: Mapping[str, float] = MappingProxyType(
     {"distance": -1.0, "success": 10.0}
@@ -222,6 +223,10 @@ class Cannulation(Shiftable, Routed):
             "force": lambda self, m: m.wall_force.sum,
             # Largest single contact in any physics step of the control step, N.
             "peak_force": lambda self, m: m.wall_force.peak_max,
+            # By how much the peak of that sum in the control step exceeds `GENTLE`, N.
+            "excess_force": lambda self, m: np.maximum(
+                m.wall_force.peak_sum - GENTLE, 0.0
+            ),
             # 1 for each control step.
             "time": lambda self, m: np.ones_like(m.readings.insertion),
             # Mean square of the change of the action.
