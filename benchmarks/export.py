@@ -49,7 +49,7 @@ def export(
         name: Name of the policy, "type1_bca" for `pretrained:type1_bca`.
         out: Directory to write to; by default that of the package.
         episodes: Number of episodes of the evaluation.
-        half: Whether weights are kept, and judged, in half precision.
+        half: Whether matrices of weights are kept, and judged, in half precision.
 
     Returns:
         Path of the weights.
@@ -87,7 +87,8 @@ def export(
     }
     if half:
         state = {
-            k: v.half() if v.dtype == torch.float32 else v for k, v in state.items()
+            k: v.half() if v.dtype == torch.float32 and v.ndim > 1 else v
+            for k, v in state.items()
         }
         policy = write(Path(out), name, state, card)
     found, _ = judgement.judge(policy, config.task, options, episodes, label)

@@ -128,7 +128,7 @@ def weakest(rows):
             ]
             place = cell[0], cell[1].upper(), cell[2]
             lines.append(f"| `{policy}` | {' | '.join((*place, *counts))} |")
-    return lines
+    return lines if len(lines) > 2 else ["None."]
 
 
 def changes(rows):
