@@ -50,16 +50,26 @@ def put(page: Path, **blocks: str | list[str]) -> None:
     page.write_text(text, encoding="utf-8")
 
 
+def git(*arguments: str) -> subprocess.CompletedProcess:
+    """A finished git command in the repository."""
+    return subprocess.run(["git", *arguments], capture_output=True, text=True, cwd=ROOT)
+
+
 def origin(command: str) -> dict[str, str]:
-    """Where a figure comes from: the command, today, this machine, this commit."""
+    """Where a figure comes from: the command, today, this machine, the commit.
+
+    The commit is the newest one of main that is part of what was run, with "+" if the
+    package or its benchmarks differ from it: a commit of a branch may be rebased away.
+    """
     model = next(
         line.split(":")[1].strip()
         for line in Path("/proc/cpuinfo").read_text().splitlines()
         if line.startswith("model name")
     )
-    commit = subprocess.check_output(
-        ["git", "describe", "--always", "--dirty=+"], text=True, cwd=ROOT
-    ).strip()
+    commit = git("merge-base", "HEAD", "main").stdout.strip()[:7]
+    measured = "cathsim_dmc", "benchmarks", "examples", "docs/scripts"
+    if git("diff", "--quiet", commit, "--", *measured).returncode:
+        commit += "+"
     values = command, str(datetime.date.today()), f"{os.cpu_count()} × {model}", commit
     return dict(zip(ORIGIN, values, strict=True))
 
