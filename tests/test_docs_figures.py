@@ -50,6 +50,16 @@ def figures_of(text, stated=()):
     return [one for one in _FIGURE.findall(prose) if one not in stated]
 
 
+def text_of(page):
+    """The text of a page; of a notebook, that between its cells of code."""
+    text = (ROOT / page).read_text()
+    if not page.endswith(".ipynb"):
+        return text
+    cells = json.loads(text)["cells"]
+    prose = ["".join(one["source"]) for one in cells if one["cell_type"] == "markdown"]
+    return "\n\n".join(prose)
+
+
 def stated_in(page):
     """What a page may state: definitions, its own, by the reason they are there."""
     own = STATED.get(page, {})
@@ -115,13 +125,18 @@ def test_a_typed_figure_is_found(text, found):
 
 
 WRITTEN = {"docs/results.md"}  # as a whole, by docs/scripts/results.py
-PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *(ROOT / "docs").rglob("*.md")]
+PAGES = [
+    ROOT / "README.md",
+    ROOT / "CONTRIBUTING.md",
+    *(ROOT / "docs").rglob("*.md"),
+    *(ROOT / "docs" / "tutorials").glob("*.ipynb"),
+]
 NAMES = {str(page.relative_to(ROOT)) for page in PAGES} - WRITTEN
 
 
 @pytest.mark.parametrize("page", sorted(NAMES))
 def test_prose_states_no_figure_that_was_measured(page):
-    left = figures_of((ROOT / page).read_text(), stated_in(page))
+    left = figures_of(text_of(page), stated_in(page))
     assert not left, (
         f"{page} states {left}; quote them from docs/data (docs/scripts/figures.py), "
         "or give the reason in docs/data/stated.json"
@@ -133,6 +148,6 @@ def test_what_may_be_stated_is_stated():
     for page, groups in STATED.items():
         if page == "everywhere":
             continue
-        found = set(figures_of((ROOT / page).read_text()))
+        found = set(figures_of(text_of(page)))
         left = {one for row in groups.values() for one in row} - found
         assert not left, f"{page} no longer states {sorted(left)}"
