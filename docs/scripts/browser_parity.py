@@ -10,9 +10,7 @@ docs/browser/index.md.
 
 from __future__ import annotations
 
-import datetime
 import json
-import os
 import subprocess
 import sys
 import tempfile
@@ -56,7 +54,7 @@ def main() -> None:
         ]
     draw(measured, DOCS / "images" / "browser_parity.png")
     values = {
-        "date": datetime.date.today().isoformat(),
+        **figures.origin("python docs/scripts/browser_parity.py"),
         "task": TASK,
         "seed": SEED,
         "python": mujoco.__version__,
@@ -187,7 +185,7 @@ def draw(measured: list[dict], path: Path) -> None:
 def write_table(values: dict, page: Path) -> None:
     """Put the figures into the page, between its two marks."""
     lines = [
-        f"Measured on {values['date']}, {os.cpu_count()} shared cores, `{TASK}`, seed "
+        f"{figures.since(values)} `{TASK}`, seed "
         f"{SEED}; MuJoCo {values['python']} in Python, {values['webassembly']} in "
         "WebAssembly (Node.js). A control step is 40 ms; times are of the processor.",
         "",

@@ -31,8 +31,10 @@ def main(paths):
     if missing or not reports:
         sys.exit(f"no report at {', '.join(missing) or DATA}; see the usage above")
     report = merged(reports)
-    figures.keep(DATA.stem, report, COMMAND)
-    figures.put(PAGE, measured=tables(report))
+    if paths or "commit" not in reports[0]:
+        figures.keep(DATA.stem, report, COMMAND)
+    since = figures.since(json.loads(DATA.read_text()))
+    figures.put(PAGE, measured=[since, "", *tables(report)])
 
 
 def merged(reports):
@@ -84,7 +86,8 @@ def tables(report):
         cells = [_force(trials.get(policy)) for policy in names]
         lines.append(f"| `{task}` | {' | '.join(cells)} |")
     missed = [check for check in report["checks"] if not check["passed"]]
-    lines += ["", f"{len(report['checks'])} bounds, {len(missed)} missed:", ""]
+    end = ":" if missed else "."
+    lines += ["", f"{len(report['checks'])} bounds, {len(missed)} missed{end}", ""]
     lines += [
         f"- {c['name']}: {c['value']:.0f} % where the bound is {c['bound']} % "
         f"({c['note']})"

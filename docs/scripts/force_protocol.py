@@ -38,8 +38,9 @@ def main():
     rows = []
     for policy in POLICIES:
         rows += play(policy, options.threads)
-    files.write_text(options.out, json.dumps(rows, indent=1) + "\n")
-    figures.put(PAGE, protocol=table(rows))
+    report = {**figures.origin("python docs/scripts/force_protocol.py"), "rows": rows}
+    files.write_text(options.out, json.dumps(report, indent=1) + "\n")
+    figures.put(PAGE, protocol=[figures.since(report), "", *table(rows)])
 
 
 def play(name, threads):
