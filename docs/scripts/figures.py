@@ -193,6 +193,9 @@ def main(arguments: list[str]) -> None:
         keep(name, json.load(sys.stdin), command)
     for page, text in written().items():
         page.write_text(text, encoding="utf-8")
+    for commit in sorted({one["commit"] for one in figures().values()}):
+        if git("merge-base", "--is-ancestor", commit.rstrip("+"), "HEAD").returncode:
+            print(f"commit {commit} of some figure is not in the history")
 
 
 if __name__ == "__main__":
