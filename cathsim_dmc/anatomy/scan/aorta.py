@@ -12,6 +12,7 @@ from scipy.spatial.distance import cdist
 from cathsim_dmc.anatomy.scan.centring import resample
 from cathsim_dmc.anatomy.scan.ends import FreeEnd
 from cathsim_dmc.anatomy.scan.ways import Ways
+from cathsim_dmc.anatomy.segments import arc_lengths
 
 RADIUS = 4.5e-3  # m, least median radius of an aorta
 THIN = 0.25  # of the widest end: ends that are no wider are no end of the aorta
@@ -20,7 +21,10 @@ SMOOTH = 6e-3  # m, standard deviation along the way, which steps from node to n
 ARM = 60e-3  # m to both sides of a place, over which the bend there is taken
 TURN = np.radians(75.0)  # least bend of an arch
 LEG = 80e-3  # m of each leg that are compared, from 10 mm past the branches on
-LIMB = 50e-3  # m from the top on, at most half of a limb, that has no direction yet
+# m of a limb from the bend on, at most half, that has no direction yet; its length from
+# which on its direction counts, and what more makes that as sure as the branches'.
+LIMB, COUNTS, FULL = 50e-3, 40e-3, 60e-3
+BRANCH = 60e-3  # m of a branch over which its direction is taken
 UPRIGHT = 0.9  # cosine between the limbs of the aorta and +z of a scan that stands
 # Longest usual ascending aorta, m, and what more makes it e times less likely.
 ASCENDING, LONGER = 70e-3, 18e-3
@@ -65,7 +69,7 @@ class Bend:
         line: (n, 3) m, smoothed, 1 mm apart.
         apex: row of the line at which it bends most.
         turn: rad, bend between 60 mm before and after the apex.
-        up: (3,), unit, mean direction in which both limbs lead to the bend.
+        up: (3,), unit, mean direction of both limbs to the bend and of the branches.
         along: (3,), unit, from the leg before the apex to the one after it.
     """
 
@@ -76,8 +80,8 @@ class Bend:
     along: np.ndarray
 
     @classmethod
-    def of(cls, way: np.ndarray) -> Bend:
-        """The bend of a way (n, 3) m."""
+    def of(cls, way: np.ndarray, branches: Sequence[np.ndarray] = ()) -> Bend:
+        """The bend of a way (n, 3) m, with branches (m_i, 3) m that leave it."""
         line = resample(way)
         width = min(SMOOTH / 1e-3, len(line) / 6)
         line = gaussian_filter1d(line, width, axis=0, mode="nearest")
@@ -93,12 +97,12 @@ class Bend:
         height = np.linalg.norm(rise, axis=1) - 1e-3 * cosine
         height[: reach // 2] = height[len(line) - reach // 2 :] = -np.inf
         apex = int(height.argmax())
-        after = len(line) - 1 - apex
-        limbs = [
-            line[apex - min(round(LIMB / 1e-3), apex // 2)] - line[0],
-            line[apex + min(round(LIMB / 1e-3), after // 2)] - line[-1],
-        ]
-        up = _unit(_unit(limbs[0]) + _unit(limbs[1]))
+        up = _unit(sum(map(chord, branches), np.zeros(3)))
+        for limb in (line[apex::-1], line[apex:]):
+            start = limb[min(round(LIMB / 1e-3), (len(limb) - 1) // 2)]
+            sure = np.clip((1e-3 * len(limb) - COUNTS) / FULL, 0.05, 1.0)
+            up = up + sure * _unit(start - limb[-1])
+        up = _unit(up)
         along = line[last[apex]] - line[first[apex]]
         along = _unit(along - (along @ up) * up)
         turn = float(np.arccos(np.clip(cosine.min(), -1.0, 1.0)))
@@ -114,30 +118,25 @@ class Bend:
         """Direction (3,) to the head: +z of an upright scan, else the bend's own."""
         return np.array([0.0, 0.0, 1.0]) if self.upright else self.up
 
-    def across(self) -> np.ndarray:
-        """Horizontal way (3,) m from the leg before the apex to the one after it.
-
-        Both are taken at the height of the higher end, at most 60 mm below the top.
-        """
-        head = self.head
-        height = self.line @ head
-        level = max(height[0], height[-1], height[self.apex] - ARM)
-        first = self.line[: self.apex + 1][
-            np.abs(height[: self.apex + 1] - level).argmin()
-        ]
-        last = self.line[self.apex :][np.abs(height[self.apex :] - level).argmin()]
-        way = last - first
-        return way - (way @ head) * head
+    @property
+    def top(self) -> int:
+        """Row of the line that is nearest to the head."""
+        return int((self.line @ self.head).argmax())
 
     def azimuth(self, heart_last: bool) -> float | None:
         """Angle from back to left of the way from heart to descending aorta, rad.
 
+        Both legs are taken at the height of the higher end, or 60 mm below the top.
         None if the scan does not stand upright or the legs are not told apart.
         """
-        way = self.across() * (-1.0 if heart_last else 1.0)
-        if not self.upright or np.linalg.norm(way) < 10e-3:
+        height, top = self.line @ self.head, self.top
+        off = np.abs(height - max(height[0], height[-1], height[top] - ARM))
+        x, y, _ = (
+            self.line[top + off[top:].argmin()] - self.line[off[: top + 1].argmin()]
+        )
+        if not self.upright or np.hypot(x, y) < 10e-3:
             return None
-        return float(np.arctan2(way[0], way[1]))
+        return float(np.arctan2(-x, -y) if heart_last else np.arctan2(x, y))
 
 
 def mirrored(azimuth: float | None) -> str | None:
@@ -186,7 +185,7 @@ def heart_evidence(
     # The ascending aorta is 63 (11) mm long up to its branches, or cut off.
     longer = [max(leg - ASCENDING, 0.0) / LONGER for leg in (first, s[-1] - last)]
     add(min(longer[0], 5.0) - min(longer[1], 5.0), 5.0, "length of the legs")
-    before = 1e-3 * bend.apex - 0.5 * (first + last)
+    before = 1e-3 * bend.top - 0.5 * (first + last)
     add(-2.0 * BEFORE * before / BEFORE_SPREAD**2, 2.5, "branches before the top")
     azimuth = bend.azimuth(heart_last=True)
     if azimuth is not None:
@@ -206,6 +205,11 @@ def _facing(azimuth: float) -> float:
 def depth_along(ways: Ways, way: np.ndarray, line: np.ndarray) -> np.ndarray:
     """Depth (m,) of the lumen on a smoothed line (m, 3) of a way (n,) of nodes."""
     return ways.depth[way][cdist(line, ways.points[way]).argmin(axis=1)]
+
+
+def chord(row: np.ndarray) -> np.ndarray:
+    """Direction (3,), unit, of what a row (n, 3) m of points first leads to."""
+    return _unit(row[arc_lengths(row) <= BRANCH][-1] - row[0])
 
 
 def _unit(vector: np.ndarray) -> np.ndarray:

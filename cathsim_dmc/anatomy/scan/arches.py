@@ -108,7 +108,10 @@ class Arch:
         way = ways.trace(before, ways.node(entry.far))
         bend = Bend.of(ways.points[way])
         width = depth_along(ways, way, bend.line)
-        return bend, width, offshoots(ways, bend, width, curves) if curves else []
+        found = offshoots(ways, bend, width, curves) if curves else []
+        # Where a limb is short its branches say better where the head is.
+        rows = [max(one.rows, key=len) for one in found if one.rows]
+        return Bend.of(ways.points[way], rows), width, found
 
     def entry(self, inlet: np.ndarray | None, planned: LumenEntry) -> LumenEntry:
         """Where the device enters, and where the aorta leads from there.

@@ -169,7 +169,7 @@ def _sides(anatomy: Anatomy) -> TreeCheck:
     if (apart > 0).any() and (apart < 0).any():
         wrong.append(f"{', '.join(names)} do not leave {root.name} in this order")
     fine = f"{len(vessels)} in order" if len(vessels) > 1 else "no arch"
-    bend = Bend.of(root.centreline.points)
+    bend = Bend.of(root.centreline.points, [v.centreline.points for v in vessels])
     if len(vessels) > 1 and bend.turn > TURN:
         if (text := mirrored(bend.azimuth(bool(along.sum() < 0)))) is not None:
             wrong.append(text)

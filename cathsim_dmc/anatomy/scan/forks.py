@@ -8,7 +8,7 @@ from itertools import product
 
 import numpy as np
 
-from cathsim_dmc.anatomy.scan.aorta import Bend
+from cathsim_dmc.anatomy.scan.aorta import BRANCH, Bend, chord
 from cathsim_dmc.anatomy.scan.offshoots import Offshoot, common, depth_of
 from cathsim_dmc.anatomy.scan.ways import Ways
 from cathsim_dmc.anatomy.segments import arc_lengths
@@ -35,7 +35,6 @@ LEADS = {
     "rsa": ("rsa", "rva"),
 }
 _STEM = {"bovine": "bca"}
-WAY = 60e-3  # m of a vessel over which its direction is taken
 TWINS = 85e-3  # m that two curves share after all others have left: one vessel
 
 
@@ -123,9 +122,8 @@ def _look(ways: Ways, bend: Bend, row: np.ndarray, shared: int) -> tuple[float, 
     """Radius (m) and angle (degrees) from the head of what a curve has for its own."""
     own = row[min(shared, len(row) - 3) :]
     s = arc_lengths(own)
-    part = own[(s >= min(8e-3, 0.4 * s[-1])) & (s <= WAY)]
-    chord = part[-1] - part[0] if len(part) > 1 else own[-1] - own[0]
-    cosine = chord @ bend.head / max(float(np.linalg.norm(chord)), 1e-9)
+    part = own[(s >= min(8e-3, 0.4 * s[-1])) & (s <= BRANCH)]
+    cosine = chord(part if len(part) > 1 else own) @ bend.head
     radius = float(np.median(depth_of(ways, part)))
     return radius, float(np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0))))
 

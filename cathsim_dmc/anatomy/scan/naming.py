@@ -16,12 +16,11 @@ from itertools import combinations
 
 import numpy as np
 
-from cathsim_dmc.anatomy.scan.aorta import Bend
+from cathsim_dmc.anatomy.scan.aorta import Bend, chord
 from cathsim_dmc.anatomy.scan.forks import (
     EXTRA,
     SPREAD,
     SURE,
-    WAY,
     leads,
     normal,
     without_twins,
@@ -29,7 +28,6 @@ from cathsim_dmc.anatomy.scan.forks import (
 from cathsim_dmc.anatomy.scan.offshoots import Offshoot, common
 from cathsim_dmc.anatomy.scan.units import in_mm
 from cathsim_dmc.anatomy.scan.ways import Ways
-from cathsim_dmc.anatomy.segments import arc_lengths
 
 ARCH_BRANCHES = ("bca", "lcca", "lsa")  # in their order from the heart
 ANATOMICAL = frozenset((*ARCH_BRANCHES, "rcca", "rsa", "rva", "lva"))
@@ -64,8 +62,9 @@ RADII = {
     "rsa": 4.8e-3,
 }
 AORTA = 13.3e-3
-# Distance along the aorta between neighbours, m, and the deviation of its logarithm.
-SPACING = {"bca": 11e-3, "lcca": 9e-3, "lsa": 8e-3, "bovine": 26e-3, "lva": 4e-3}
+# Share of each in the distance (m) between neighbours; the deviation of its logarithm.
+# A vertebral artery leaves between others that are no farther apart.
+SPACING = {"bca": 11e-3, "lcca": 9e-3, "lsa": 8e-3, "bovine": 26e-3, "lva": 0.0}
 APART = 0.5
 # Length up to the first fork, m: mean, deviation, and how often none is in the scan.
 FORKS = {
@@ -214,13 +213,9 @@ def _sides(bend: Bend, found: Sequence[Offshoot]) -> list[float]:
 
     The side is the patient's right and back if the heart is at the first point.
     """
-    out = []
-    for one in found:
-        way = max(one.rows, key=len, default=np.zeros((1, 3)))
-        chord = way[arc_lengths(way) <= WAY][-1] - way[0]
-        chord /= max(float(np.linalg.norm(chord)), 1e-9)
-        out.append(float(chord @ np.cross(bend.up, bend.along)))
-    return out
+    side = np.cross(bend.up, bend.along)
+    ways = [max(one.rows, key=len, default=np.zeros((1, 3))) for one in found]
+    return [float(chord(way) @ side) for way in ways]
 
 
 def _probabilities(
