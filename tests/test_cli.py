@@ -134,8 +134,7 @@ def test_the_doctor_names_what_is_missing_and_what_to_do(cathsim, monkeypatch):
     assert "trimesh: not installed" in failed[1]
 
 
-def test_an_evaluation_reports_each_episode(cathsim, monkeypatch):
-    monkeypatch.setenv("COLUMNS", "200")
+def test_an_evaluation_reports_each_episode(cathsim):
     code, out, err = cathsim(
         *("eval", "push", "--task", "simple1_bca", "--episodes", 2, "--threads", 1),
         *("--max-steps", 5, "--no-baseline", "--report", "--protocol", "varied"),

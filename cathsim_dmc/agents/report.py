@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import sys
 import time
 from collections.abc import Mapping
 from pathlib import Path
@@ -76,7 +77,8 @@ class EvaluationReport:
         played = zip(self.policy.seeds, drawn, self.policy.episodes, strict=True)
         for seed, conditions, episode in played:
             table.add_row(str(seed), *_outcome(conditions, episode))
-        Console().print(table)
+        # A pipe has no width that the columns would have to fit.
+        Console(width=None if sys.stdout.isatty() else 160).print(table)
 
 
 _OUTCOME = (
