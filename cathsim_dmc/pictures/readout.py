@@ -49,7 +49,8 @@ class ForceReadout:
         """A table of the contacts and a line of the other forces."""
         lines = [
             f"{len(self)} contact{'s' * (len(self) != 1)} with the wall: sum "
-            f"{_mn(self.wall_sum)}, largest {_mn(self.wall_max)}, peak within the step {_mn(self.wall_peak_max)}",
+            f"{_mn(self.wall_sum)}, largest {_mn(self.wall_max)}, "
+            f"peak within the step {_mn(self.wall_peak_max)}",
             f"push {_mn(self.push_force)}, load cell "
             f"({', '.join(f'{1e3 * f:.1f}' for f in self.load_cell)}) mN",
         ]
