@@ -81,12 +81,7 @@ def seed(name: str, value: Any) -> int:
 
 
 def seeds(name: str, value: Any, count: int) -> list[int]:
-    """One seed for each of `count` simulations.
-
-    Args:
-        value: Seed of the first simulation, from which the others count up, or one
-            seed for each.
-    """
+    """The seeds of `count` simulations; a single one is that of the first."""
     if _is_whole(value):
         last = whole(name, value, 0, MOST_SEED - count + 1) + count
         return list(range(last - count, last))
@@ -101,11 +96,7 @@ def seeds(name: str, value: Any, count: int) -> list[int]:
 
 
 def indices(name: str, value: Any, count: int) -> np.ndarray:
-    """Numbers (K,) of some of `count` simulations, sorted, each once.
-
-    Args:
-        value: Integers in one row, at least one; None chooses all.
-    """
+    """Numbers (K,) of some of `count` simulations, sorted; None for all."""
     if value is None:
         return np.arange(count)
     row = _row(value)
@@ -236,11 +227,7 @@ def mapping(name: str, value: Any, known: Iterable[str]) -> Mapping[str, Any]:
 
 
 def made(name: str, value: Any, kind: type, others: str = "") -> Any:
-    """A dataclass from a mapping of its fields; an object of it is taken as it is.
-
-    Args:
-        others: What else is allowed, for the message.
-    """
+    """A dataclass, as it is or from its fields; `others` is for the message."""
     if isinstance(value, kind):
         return value
     known = [field.name for field in dataclasses.fields(kind)]

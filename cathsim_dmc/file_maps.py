@@ -40,10 +40,7 @@ def mapped(stream: BinaryIO) -> np.ndarray:
 
 
 def release(pages: np.ndarray) -> None:
-    """Drops the pages of what `mapped` returned; they are read again when touched.
-
-    What has been written into them is lost.
-    """
+    """Drops the pages of what `mapped` returned, and what was written to them."""
     if os.name == "posix":
         _library().madvise(pages.ctypes.data, pages.size, mmap.MADV_DONTNEED)
 

@@ -58,12 +58,7 @@ class BC(CloningLearner):
     metrics: ClassVar[tuple[str, ...]] = ("loss", "deviation", "gradient_steps")
 
     def __init__(self, config: BCConfig, shapes: NetworkShapes, directory: Path):
-        """Makes the policy and loads the dataset.
-
-        Raises:
-            ConfigError: no dataset is given.
-            DatasetError: it cannot be used, see `demonstrations.load_transitions`.
-        """
+        """Makes the policy; ConfigError or DatasetError if there is no dataset."""
         if not config.demonstrations:
             raise ConfigError(
                 "demonstrations is not given: bc needs the directory of a dataset; "

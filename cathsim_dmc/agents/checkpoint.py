@@ -53,11 +53,7 @@ class Checkpoint:
 
     @classmethod
     def open(cls, path: str | Path) -> "Checkpoint":
-        """Open a checkpoint, or the newest one of a run.
-
-        Raises:
-            CheckpointError: there is none, or its description cannot be used.
-        """
+        """Open a checkpoint, or the newest of a run; CheckpointError if damaged."""
         path = Path(path)
         if not (path / _DESCRIPTION).exists():
             found = checkpoints_in(path)
@@ -84,11 +80,7 @@ class Checkpoint:
             raise CheckpointError(f"{description}: {line_of(error)}") from error
 
     def policy_state(self) -> dict[str, Any]:
-        """Weights and statistics of the policy, on the CPU.
-
-        Raises:
-            CheckpointError: the file is missing, or is not what was written.
-        """
+        """Weights and statistics on the CPU; CheckpointError if damaged or missing."""
         return self._load(_POLICY)
 
     def learning_state(self) -> dict[str, Any]:
@@ -96,11 +88,7 @@ class Checkpoint:
         return self._load(_LEARNING)
 
     def policy(self) -> TensorDictSequential:
-        """The policy, ready to act: raw observation in, action out.
-
-        Raises:
-            CheckpointError: the weights are damaged or of another network.
-        """
+        """The policy, raw observation in, action out; CheckpointError if damaged."""
         file = self.path / _POLICY
         return policy_of(file, self.policy_state(), self.shapes, self.config)
 
@@ -129,11 +117,7 @@ class Checkpoint:
 def policy_of(
     path: Path, state: Mapping[str, Any], shapes: NetworkShapes, config: TrainingConfig
 ) -> TensorDictSequential:
-    """A policy with weights from a file, ready to act.
-
-    Raises:
-        CheckpointError: the weights are of another network.
-    """
+    """A policy ready to act; CheckpointError if the weights are of another network."""
     try:
         policy = make_policy(shapes, config)
         policy.load_state_dict(dict(state))

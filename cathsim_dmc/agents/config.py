@@ -183,11 +183,7 @@ class TrainingConfig:
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> "TrainingConfig":
-        """A config of this class from its fields by name.
-
-        Raises:
-            ConfigError: an unknown field, or a value that is not allowed.
-        """
+        """A config from its fields by name; ConfigError if one is not allowed."""
         _require_fields(cls, values)
         return cls(**values)
 

@@ -244,10 +244,7 @@ def check_numbers(episodes: int, seed: int, num_threads: int | None) -> None:
 
 
 class _Environments:
-    """The environments of a TorchRL environment; their state is the step's TensorDict.
-
-    `seen` holds the present observations (N, ...).
-    """
+    """The environments of a TorchRL environment; their state is its TensorDict."""
 
     seen: TensorDictBase
 

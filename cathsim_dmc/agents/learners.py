@@ -39,22 +39,14 @@ LEARNERS: dict[str, Algorithm] = {
 def make_config(
     algorithm: str = "ppo", preset: str = "published", **overrides: Any
 ) -> TrainingConfig:
-    """The config of an algorithm: a preset with some fields overridden.
-
-    Raises:
-        ConfigError: unknown algorithm, preset or field, or a value not allowed.
-    """
+    """A preset of an algorithm, with fields overridden; or ConfigError."""
     kind = _choice(LEARNERS, algorithm, "algorithm").config
     settings = _choice(kind.presets, preset, f"preset of {algorithm}")
     return kind.from_dict({**settings, **overrides})
 
 
 def config_from_dict(values: Mapping[str, Any]) -> TrainingConfig:
-    """The inverse of TrainingConfig.to_dict; reads older configs, too.
-
-    Raises:
-        ConfigError: unknown algorithm or field, or a value not allowed.
-    """
+    """The inverse of TrainingConfig.to_dict; ConfigError if a value is wrong."""
     values = {name: one for name, one in values.items() if name not in _RETIRED}
     kind = _choice(LEARNERS, values.pop("algorithm", None), "algorithm").config
     return kind.from_dict(values)

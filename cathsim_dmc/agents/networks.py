@@ -56,11 +56,7 @@ class NetworkShapes:
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> "NetworkShapes":
-        """The inverse of to_dict.
-
-        Raises:
-            ConfigError: a size is missing or no integer.
-        """
+        """The inverse of to_dict; ConfigError if a size is missing or no integer."""
         fields = {name: tuples(values.get(name)) for name in cls.__annotations__}
         for name, kind in typing.get_type_hints(cls).items():
             require_type(f"shapes.{name}", fields[name], kind)
@@ -140,11 +136,7 @@ class Convolutions(nn.Module):
 
 
 class Body(nn.Module):
-    """Observation (and action, for a Q function) to hidden features.
-
-    Images alone go through the convolutions; wherever a vector is present, hidden
-    layers follow.
-    """
+    """Observation (and action, for a Q function) to hidden features."""
 
     def __init__(self, shapes: NetworkShapes, config: TrainingConfig, actions: int = 0):
         super().__init__()
@@ -172,12 +164,7 @@ class Body(nn.Module):
 
 
 class GaussianActor(nn.Module):
-    """Mean and deviation of the actions before the tanh, each (..., actions).
-
-    Args:
-        state_dependent_std: whether the deviation is an output of the network (SAC)
-            or one parameter per action (PPO).
-    """
+    """Mean and deviation of the actions before the tanh, each (..., actions)."""
 
     def __init__(
         self, shapes: NetworkShapes, config: TrainingConfig, state_dependent_std: bool

@@ -48,11 +48,7 @@ class ObservationNormaliser(nn.Module):
 
     @torch.no_grad()
     def update(self, observation: torch.Tensor) -> None:
-        """Merge a batch (..., size) into the statistics (Chan et al. 1983).
-
-        Raises:
-            ValueError: an entry is not finite.
-        """
+        """Merge a batch (..., size) (Chan et al. 1983); ValueError if not finite."""
         rows = observation.reshape(-1, self.mean.numel()).double()
         if not bool(torch.isfinite(rows).all()):
             bad = (~torch.isfinite(rows)).any(0).nonzero().flatten().tolist()

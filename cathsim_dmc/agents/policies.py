@@ -22,11 +22,7 @@ PolicyLike = str | Path | Checkpoint | Policy | PolicyFunction
 
 
 class FunctionPolicy(Policy):
-    """A function of the standard observations.
-
-    A function with randomness of its own, such as a network, acts deterministically:
-    with the middle of its distribution.
-    """
+    """A function of the standard observations, without randomness of its own."""
 
     def __init__(self, function: PolicyFunction, name: str | None = None):
         """Wraps a function; its name for reports is its own by default."""
@@ -56,11 +52,7 @@ class TrainedPolicy(FunctionPolicy):
     """
 
     def __init__(self, source: Checkpoint | Path):
-        """Loads the weights of a checkpoint, or of a `.safetensors` file with its card.
-
-        Raises:
-            CheckpointError: its weights cannot be used.
-        """
+        """Loads a checkpoint or a `.safetensors` file; CheckpointError if damaged."""
         self.checkpoint = self.card = None
         if isinstance(source, Checkpoint):
             self.checkpoint = source
@@ -88,11 +80,7 @@ class TrainedPolicy(FunctionPolicy):
             )
 
     def act(self, observation: Any) -> np.ndarray:
-        """Actions (N, A) float32.
-
-        Raises:
-            ValueError: the observation has another size than in training.
-        """
+        """Actions (N, A) float32; ValueError if the observation has another size."""
         if not isinstance(observation, TensorDictBase):
             observation = _tensors(observation)
         vector = observation.get(environments.VECTOR, None)

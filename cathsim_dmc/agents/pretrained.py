@@ -35,11 +35,7 @@ def pretrained_names(directory: str | Path = DIRECTORY) -> list[str]:
 
 
 def pretrained_path(name: str) -> Path:
-    """Weights of the policy that ships under a name.
-
-    Raises:
-        CheckpointError: there is none of that name (lists those that exist).
-    """
+    """Weights of the policy that ships under a name; CheckpointError lists names."""
     name = name.removeprefix(PREFIX)
     names = pretrained_names()
     if name not in names:
@@ -51,14 +47,7 @@ def pretrained_path(name: str) -> Path:
 def read_pretrained(
     weights: str | Path,
 ) -> tuple[dict[str, Any], TensorDictSequential, NetworkShapes, TrainingConfig]:
-    """Card, network, sizes and settings of a policy.
-
-    Args:
-        weights: Path of the `.safetensors` file; the card lies beside it.
-
-    Raises:
-        CheckpointError: there is none, or it is damaged.
-    """
+    """Card, network, sizes and settings of a policy; CheckpointError if damaged."""
     from safetensors import SafetensorError
     from safetensors.torch import load
 

@@ -79,12 +79,7 @@ class ReplayMemory:
         return {"cursor": self.cursor, "size": self.size, "capacity": self.capacity}
 
     def load(self, state: Mapping[str, Any]) -> None:
-        """Open the files of an earlier process at the state it had noted.
-
-        Raises:
-            ReplayError: the files are missing, damaged, or not the ones that were
-                noted.
-        """
+        """Open the files of an earlier process; ReplayError if missing or damaged."""
         size, cursor, capacity = state["size"], state["cursor"], state["capacity"]
         if size == 0:
             return
@@ -106,10 +101,7 @@ class ReplayMemory:
         self.cursor, self.size = cursor, size
 
     def _create(self, like: TensorDictBase) -> TensorDictBase:
-        """Files for `capacity` transitions, which take their room on the disk now.
-
-        A memory-mapped write that finds the disk full would kill the process.
-        """
+        """Files for `capacity` transitions, which take their room on the disk now."""
         needed = self.capacity * like[:1].bytes()
         shutil.rmtree(self.directory, ignore_errors=True)
         self.directory.mkdir(parents=True)

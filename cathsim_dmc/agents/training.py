@@ -136,10 +136,7 @@ def _require_device(name: str) -> None:
 
 @contextlib.contextmanager
 def _only_process(run: Path) -> Iterator[None]:
-    """Make the directory of a run and lock it against other processes.
-
-    The operating system releases the lock of a process that is killed.
-    """
+    """Make the directory of a run; lock it until this process ends, even killed."""
     run.mkdir(parents=True, exist_ok=True)
     lock = FileLock(run / _LOCK_FILE)
     try:
@@ -327,10 +324,7 @@ def _truncate_diverged(batch: TensorDictBase) -> None:
 
 @contextlib.contextmanager
 def _interruption() -> Iterator[threading.Event]:
-    """Yield an event that the first SIGINT or SIGTERM sets; a second one acts as usual.
-
-    Outside the main thread signals cannot be caught, and nothing sets it.
-    """
+    """Yield an event that the first SIGINT or SIGTERM of the main thread sets."""
     requested, before = threading.Event(), {}
 
     def restore() -> None:

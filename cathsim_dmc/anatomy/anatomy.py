@@ -108,10 +108,7 @@ class Anatomy:
 
     @cached_property
     def lumen(self) -> Field:
-        """Signed depth to the wall, which a device touches.
-
-        Built when first asked for, and kept in `field_cache.cache_folder()`.
-        """
+        """Signed depth to the wall; built once and kept in a cache."""
         if self.scanned:
             return field_cache.surface_field(self.surface, self.ends)
         return field_cache.tree_field(self.tree, self.ends)
@@ -134,11 +131,7 @@ class Anatomy:
         return self.lumen(points)
 
     def goal(self, name: str) -> Goal:
-        """Goal called `name`.
-
-        Raises:
-            ValueError: if there is none; the message lists the names.
-        """
+        """Goal called `name`; ValueError lists those that there are."""
         try:
             return self.goals[name]
         except KeyError:
@@ -163,11 +156,7 @@ class Anatomy:
         )
 
     def save(self, directory: str | os.PathLike[str]) -> Path:
-        """Write the anatomy into `directory` and return that path.
-
-        A reader finds the old anatomy or the new one. Of processes that save into one
-        directory at once, the last one's anatomy stays.
-        """
+        """Write the anatomy into `directory`, whole, and return that path."""
         directory = Path(directory)
         directory.mkdir(parents=True, exist_ok=True)
         arrays, header = _pack(self)
@@ -227,11 +216,7 @@ def _plain(part: Goal | Inlet | End) -> dict[str, Any]:
 
 
 def _unpack(arrays: dict[str, np.ndarray]) -> Anatomy:
-    """The anatomy of a file's arrays.
-
-    Raises:
-        ValueError: if an entry is missing or wrong.
-    """
+    """The anatomy of a file's arrays; ValueError names an entry that is wrong."""
     try:
         header = json.loads(str(arrays["header"]))
         kept = {key: header[key] for key in ("format", "version", "units", "frame")}

@@ -42,11 +42,7 @@ class VesselPlace:
             )
 
     def arc(self, tree: VesselTree) -> float:
-        """Arc length (m) of the place.
-
-        Raises:
-            ValueError: if the tree has no such vessel, or the place is not on it.
-        """
+        """Arc length (m) of the place; ValueError if it is not on the tree."""
         vessel = tree.vessel(self.vessel)
         line = vessel.centreline
         if self.position is not None:
@@ -67,15 +63,7 @@ class VesselPlace:
 def placed(
     tree: VesselTree, inlet: VesselPlace | None, goals: Mapping[str, VesselPlace] | None
 ) -> tuple[VesselTree, tuple[End, ...], Inlet, dict[str, Goal]]:
-    """The tree from its inlet on, its flat ends, inlet and goals.
-
-    Args:
-        inlet: where the device enters; the first point of the root if None.
-        goals: by name; see `default_goals` if None.
-
-    Raises:
-        ValueError: if a place is not on its vessel, or lies behind the inlet.
-    """
+    """The tree from its inlet on, its ends, inlet and goals; or ValueError."""
     found = (
         default_goals(tree)
         if goals is None
@@ -166,11 +154,7 @@ def _inlet(ends: tuple[End, ...]) -> Inlet:
 def _cut_at(
     tree: VesselTree, inlet: VesselPlace, goals: Mapping[str, Goal]
 ) -> tuple[VesselTree, tuple[str, bool]]:
-    """The tree cut at the inlet; vessel and end that is entered.
-
-    Raises:
-        ValueError: if a branch or a goal lies behind the inlet.
-    """
+    """The tree cut at the inlet, and the end entered; or ValueError."""
     vessel = tree.vessel(inlet.vessel)
     line = vessel.centreline
     arc = inlet.arc(tree)

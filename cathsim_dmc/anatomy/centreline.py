@@ -32,10 +32,7 @@ class CentrelinePoint(NamedTuple):
 
 
 class Projection(NamedTuple):
-    """Nearest place of a centreline: arc length, distance and lumen radius there.
-
-    All three have the leading shape of the projected points and are in metres.
-    """
+    """Nearest place of a centreline: its arc length, distance and radius (...), m."""
 
     arc_length: Array
     distance: Array
@@ -146,11 +143,7 @@ class Centreline:
         return Centreline(place.position, place.radius)
 
     def slice(self, s0: float, s1: float) -> "Centreline":
-        """Part between arc lengths `s0` and `s1` (m), reversed when s0 > s1.
-
-        Raises:
-            ValueError: if nothing is left between the clamped arc lengths.
-        """
+        """Part from `s0` to `s1` (m), maybe backwards; ValueError if it is empty."""
         low, high = sorted((float(s0), float(s1)))
         low, high = max(low, 0.0), min(high, self.length)
         # Vertices closer than a nanometre to a cut would repeat the cut point.
@@ -238,11 +231,7 @@ class VesselTree:
         return next(iter(self.vessels.values()))
 
     def vessel(self, name: str) -> Vessel:
-        """Vessel called `name`.
-
-        Raises:
-            ValueError: if there is none; the message lists the names.
-        """
+        """Vessel called `name`; ValueError lists those that there are."""
         try:
             return self.vessels[name]
         except KeyError:

@@ -83,11 +83,7 @@ class Circulation:
         return cls(courses, float(root.radii[heart]), *joined)
 
     def check(self, name: str, tree: VesselTree, ends: Sequence[End]) -> None:
-        """Refuses an anatomy that no blood can go through, by its name and free ends.
-
-        Raises:
-            ValueError: if the heart's end is no free end, or there is no outlet.
-        """
+        """Raises ValueError unless blood can enter at the heart's end and leave."""
         root = tree.root
         heart = root.centreline.points[-1 if self.courses[root.name].reverse else 0]
         distances = [np.linalg.norm(end.position - heart) for end in ends]

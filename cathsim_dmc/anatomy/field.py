@@ -154,11 +154,7 @@ class Field:
 
     @classmethod
     def from_tree(cls, tree: VesselTree, ends: Sequence[End] = ()) -> Field:
-        """Field of the union of a tree's tubes.
-
-        Args:
-            ends: flat ends; those that are open let a device pass.
-        """
+        """Field of the union of a tree's tubes; a device passes its open ends."""
         from cathsim_dmc.anatomy.tree_depth import TreeDepth
 
         measure = TreeDepth(tree, ends)
@@ -166,12 +162,7 @@ class Field:
 
     @classmethod
     def from_surface(cls, surface: Surface, ends: Sequence[End] = ()) -> Field:
-        """Field of what a closed surface encloses.
-
-        Args:
-            surface: closed, normals outwards; flat over the ends.
-            ends: flat ends; those that are open let a device pass.
-        """
+        """Field of what a closed surface encloses; a device passes its open ends."""
         from cathsim_dmc.anatomy.surface_depth import SurfaceDepth
 
         measure = SurfaceDepth(surface, ends)
@@ -225,10 +216,7 @@ class Field:
 
 
 def _corners(measure: Measure, origin: Array, shape: np.ndarray) -> Array:
-    """Depths at the corners of all bricks, m, a lattice of a shape.
-
-    Far outside of the lumen all corners of a block have the depth of its middle.
-    """
+    """Depths m at all corners of bricks; far outside, those of a block's middle."""
     blocks = -(-shape // _TOGETHER)
     rows = np.stack(np.meshgrid(*(np.arange(n) for n in blocks), indexing="ij"), -1)
     steps = EDGE * (np.arange(_TOGETHER) - (_TOGETHER - 1) / 2)

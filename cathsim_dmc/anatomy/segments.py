@@ -7,11 +7,7 @@ Array = NDArray[np.float64]
 
 
 def as_points(points: ArrayLike, name: str = "points") -> Array:
-    """Return `points` as float64 (..., 3).
-
-    Raises:
-        ValueError: if the last axis is not 3.
-    """
+    """Return `points` as float64 (..., 3); ValueError if the last axis is another."""
     array = np.asarray(points, dtype=np.float64)
     if array.ndim == 0 or array.shape[-1] != 3:
         raise ValueError(
@@ -28,12 +24,7 @@ def arc_lengths(points: Array) -> Array:
 
 
 class Segments:
-    """Straight segments prepared for the projection of many points at once.
-
-    Attributes are per segment: start (s, 3), direction (s, 3) not normalised,
-    length (s,). Distances come from the expanded square, so the work per
-    point and segment is two matrix products and a few elementwise passes.
-    """
+    """Straight segments (s, 3) m, prepared for the projection of many points."""
 
     def __init__(self, start: Array, end: Array) -> None:
         self.start = start

@@ -34,11 +34,7 @@ class TreeDepth:
     """
 
     def __init__(self, tree: VesselTree, ends: Sequence[End] = ()):
-        """Finds the creases.
-
-        Args:
-            ends: flat ends of the tree; those that are not named are closed.
-        """
+        """Finds the creases; ends that are not named are closed."""
         lines = [vessel.centreline for vessel in tree.vessels.values()]
         self._nodes = np.concatenate([_rings(line) for line in lines])
         stops = np.cumsum([len(line.points) for line in lines])
@@ -142,10 +138,7 @@ def _rings(line: Centreline) -> Array:
 
 
 def _grouped(points: Array) -> tuple[np.ndarray, Array, Array]:
-    """Divides points (q, 3): group of each (q,), middles (g, 3) and reaches (g,), m.
-
-    The closer points are, the fewer rings they have to be held against.
-    """
+    """Groups (q,) of near points (q, 3), their middles (g, 3) and reaches (g,), m."""
     along = max(1, round(len(points) ** (1 / 3) / _GROUP))
     size = max(float(np.ptp(points, axis=0).max()), 1e-9) / along
     cells = ((points - points.min(axis=0)) / size).astype(int).clip(0, along - 1)

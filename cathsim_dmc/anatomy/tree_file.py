@@ -73,11 +73,7 @@ class TreeFile:
         return smooth_tree(self.curves)
 
     def build(self, access: str | None = None) -> Anatomy:
-        """Anatomy that is entered by `access`, the first inlet if None.
-
-        Raises:
-            ValueError: if there is no such inlet, or the tree gives no valid lumen.
-        """
+        """Anatomy that is entered by `access`, by default the first inlet's."""
         if access is None:
             access = next(iter(self.inlets))
         vessel, arc = self.inlets[bounds.choice("access", access, self.inlets)]
@@ -89,13 +85,7 @@ class TreeFile:
 
 
 def read_tree(path: str | os.PathLike[str]) -> TreeFile:
-    """Read a tree file.
-
-    Raises:
-        FileNotFoundError: if there is none.
-        ValueError: if it is damaged or anything in it is not as described; the
-            message names the entry.
-    """
+    """Read a tree file; ValueError names the entry that is not as described."""
     path = Path(path)
     if not path.is_file():
         raise FileNotFoundError(f"no file {path}; give a vessel tree in JSON.")
@@ -108,11 +98,7 @@ def read_tree(path: str | os.PathLike[str]) -> TreeFile:
 
 
 def parse_tree(content: Any) -> TreeFile:
-    """Tree file from what JSON holds; see the module for the format.
-
-    Raises:
-        ValueError: names the entry that is wrong and what is allowed.
-    """
+    """Tree file from what JSON holds; ValueError names an entry that is wrong."""
     needed = ("format", "version", "name", "units", "frame", "vessels")
     _entries("the file", content, needed, ("note", "inlets", "goals"))
     fixed = {"format": FORMAT, "version": FORMAT_VERSION, "units": "mm"}

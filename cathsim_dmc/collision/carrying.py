@@ -89,11 +89,7 @@ def _carry(model, data):
 
 
 def install() -> None:
-    """Has MuJoCo call it in every physics step, for walls that give or move.
-
-    Raises:
-        RuntimeError: if a Python function stands in `mjcb_passive`.
-    """
+    """Has MuJoCo call it in every physics step; RuntimeError as `native.follow`."""
     if _TABLE[0]:
         return
     _TABLE[[11, 15]] = native.offsets("mjModel", ("nv", "opt.timestep"))

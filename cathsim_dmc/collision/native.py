@@ -324,12 +324,7 @@ def call_error(_, address, text, number):
 
 
 def callback(signature: str, cache: bool = True) -> Callable:
-    """Compiles a function that C calls, once on each machine as `compiled` does.
-
-    Args:
-        signature: numba's, such as "void(int64, int64)"; a pointer is an int64.
-        cache: Whether it is kept on disk.
-    """
+    """Compiles a function that C calls, as `compiled` does; a pointer is an int64."""
 
     def decorate(function: Callable):
         options = {"nopython": True, "error_model": "numpy"}

@@ -66,10 +66,7 @@ class Catheter(Chain):
         return self._device.tip if index >= self._first else self._device.shaft
 
     def _joint_compliance(self, index: int) -> float:
-        """Bending compliance of a joint, rad/(N·m).
-
-        A joint stands for the half links on both of its sides, l/2EI each.
-        """
+        """Bending compliance of a joint, rad/(N·m): that of two half links."""
         return sum(
             self._lengths[neighbour] / 2 / self._section(neighbour).bending_stiffness
             for neighbour in (index - 1, index)

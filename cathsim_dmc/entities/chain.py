@@ -46,12 +46,7 @@ TIP_COLOUR = (0.95, 0.75, 0.1, 1.0)
 
 
 def hinge_time(material: Any, timestep: float) -> Any:
-    """Damping over stiffness of a hinge whose material has a relaxation time, s.
-
-    Args:
-        material: relaxation time of the material, s; a number or an array.
-        timestep: physics step, s.
-    """
+    """Damping over stiffness of a hinge, s, from the material's relaxation time."""
     return np.maximum(material - timestep, 0.0)
 
 
@@ -374,10 +369,7 @@ class Chain(composer.Entity):
 
     @property
     def action_groups(self) -> tuple[int, ...]:
-        """Group index of each entry of an action.
-
-        The tip motors of one bending axis form a group; every other entry is its own.
-        """
+        """Group of each entry of an action; the tip has one for each bending axis."""
         tip = len(self.tip_motors)
         axes = [number % 2 for number in range(tip)]
         first = min(tip, 2)

@@ -238,11 +238,7 @@ DEVICES: dict[str, Device] = {
 
 
 def get(device: "str | Device") -> Device:
-    """Returns a device by name, or the given `Device` itself.
-
-    Raises:
-        ValueError: if no device has that name.
-    """
+    """Returns a device by name, or as given; ValueError if there is none."""
     if isinstance(device, Device):
         return device
     if not isinstance(device, str) or device not in DEVICES:

@@ -14,11 +14,7 @@ _ROUNDS = 5
 
 @compiled
 def _on_rod(joint, gap, nodes, first):
-    """Segment of a rod that contains a joint, and the fraction of it before the joint.
-
-    The search begins at segment `first`. A joint beyond the device's end is at the end
-    of its rod.
-    """
+    """Segment of a rod, from `first` on, with a joint; the fraction before it."""
     place = max(nodes[joint + 1] - gap, 0.0)
     while first < len(nodes) - 2 and nodes[first + 1] > place:
         first += 1

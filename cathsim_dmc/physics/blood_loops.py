@@ -106,11 +106,7 @@ def _drag(model, data):
 
 
 def install() -> None:
-    """Has MuJoCo add the drag in every physics step of models with blood.
-
-    Raises:
-        RuntimeError: if a Python function stands in `mjcb_passive`.
-    """
+    """Has MuJoCo add the drag where there is blood; RuntimeError as `follow`."""
     if _TABLE[0]:
         return
     _TABLE[len(_MODEL) : -1] = native.offsets("mjData", _DATA)

@@ -11,11 +11,7 @@ Range = float | Sequence[float]
 
 
 def drawable(options: Any, limits: Mapping[str, tuple[float, float, str]]) -> None:
-    """Checks fields that are numbers or ranges between limits, or None by default.
-
-    Raises:
-        ValueError: if one of them is neither; names it.
-    """
+    """Checks numbers and ranges against limits; ValueError names a field."""
     for name, (low, high, unit) in limits.items():
         value = getattr(options, name)
         if isinstance(value, str | float) or bounds.is_number(value):

@@ -25,11 +25,7 @@ class Drives:
     """
 
     def __init__(self, model: mujoco.MjModel, arrays: Any):
-        """Finds the servos.
-
-        Args:
-            arrays: `qpos`, `qvel` and `act` (N, ...), views.
-        """
+        """Finds the servos; `arrays` has views `qpos`, `qvel` and `act` (N, ...)."""
         from cathsim_dmc.physics import drives_loops  # late, as numba takes long
 
         self._loops = drives_loops

@@ -154,12 +154,7 @@ class Flow(StillBlood):
         return out
 
     def read(self, time: np.ndarray, state: Readings) -> dict[str, np.ndarray]:
-        """Figures of `vessel.VesselReadings`.
-
-        Args:
-            time: (N,) of the episodes, s.
-            state: At that time.
-        """
+        """Figures of `vessel.VesselReadings` at times (N,), s."""
         found = self._at(state.head[:, None])[:, 0]
         if self._options is None:
             return {"blood_velocity": found[:, 5:]}

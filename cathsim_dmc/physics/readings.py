@@ -133,11 +133,7 @@ class ModelIndex:
     )
 
     def __init__(self, model: mujoco.MjModel, chain: Chain, robot: Robot):
-        """Finds the elements of the entities.
-
-        Raises:
-            ValueError: if the model lacks one of the elements.
-        """
+        """Finds the elements; ValueError if the model lacks one of them."""
         joints = ids(model, chain.joints)
         self.links = _as_slice(ids(model, chain.links))
         self.geoms = ids(model, chain.link_geoms)
@@ -165,15 +161,7 @@ class ModelIndex:
         self.wall_contacts = wall_contacts(model)
 
     def reader(self, data) -> Callable[[], Readings]:
-        """Finds the readings in a simulator's arrays.
-
-        Args:
-            data: an `mujoco.MjData` or a `mujoco.batch.Batch` with `FIELDS` bound.
-
-        Returns:
-            A function that takes the readings as they stand, as copies, as long as
-            `data` lives.
-        """
+        """A function that copies the readings of `MjData` or a `Batch` as they are."""
         qpos, sensors = data.qpos, data.sensordata
         positions, velocities = qpos[..., self.qpos], data.qvel[..., self.dofs]
         motors = data.qfrc_actuator[..., self.dofs]
@@ -225,11 +213,7 @@ def wall_contacts(model: mujoco.MjModel) -> slice:
 
 
 def ids(model: mujoco.MjModel, elements: Sequence[Any]) -> np.ndarray:
-    """Numbers (n,) of MJCF elements in a compiled model.
-
-    Raises:
-        ValueError: if the model lacks one of them.
-    """
+    """Numbers (n,) of MJCF elements in a model; ValueError if one is missing."""
     kinds = mujoco.mjtObj.__members__
     found = [
         _id(model, kinds[f"mjOBJ_{each.spec.namespace.upper()}"], each.full_identifier)

@@ -184,13 +184,7 @@ class SlidingDevices(SingleDevice):
     def _turn(
         self, rate: np.ndarray, lead: np.ndarray, state: Readings
     ) -> tuple[Overlap, np.ndarray]:
-        """Turns the devices, against their shape in the vessel and friction.
-
-        The forces of the drives are those of the devices as they are before.
-
-        Returns:
-            Overlap, and rotations (N, K, J) at the joints.
-        """
+        """Turns the devices; their overlap, and rotations (N, K, J) at the joints."""
         stack, rods = self._stack, self._rods
         gaps = self._loops.gaps(np.ascontiguousarray(self._insertion))
         overlap, turns = stack.overlap(gaps), rods.at_joints(self._angles, gaps)
@@ -273,11 +267,7 @@ class SlidingDevices(SingleDevice):
         return self._held(self._reached())
 
     def follower_posture(self) -> np.ndarray:
-        """Joints (N, len(JOINTS)) of the robot that holds the outer and inner device.
-
-        Of more than two devices it holds the outermost and the innermost; of one, both
-        units work on the same.
-        """
+        """Joints (N, len(JOINTS)) of the robot with the outer and inner device."""
         pushed, turned = self.pushed(), self._angles[..., 0]
         ends = (pushed[:, -1], turned[:, -1], pushed[:, 0], turned[:, 0])
         return postures(np.array(ends))
@@ -287,11 +277,7 @@ class SlidingDevices(SingleDevice):
         return self._angles[..., 0].copy()
 
     def read(self, readings: Readings) -> CoaxialReadings:
-        """State of the devices.
-
-        Args:
-            readings: of the same control step.
-        """
+        """State of the devices at the readings of a control step."""
         insertion = self.pushed()
         gaps = self._loops.gaps(insertion)
         push = self._axial.copy()
@@ -317,11 +303,7 @@ class SlidingDevices(SingleDevice):
         return self._loops.points(line, places, self._stack.nodes)
 
     def shadows(self, line: np.ndarray) -> list[Shadow]:
-        """The devices as X-rays meet them, from the innermost outwards.
-
-        Args:
-            line: (N, L + 1, 3), `Readings.centreline`.
-        """
+        """The devices as X-rays meet them on a centreline, innermost first."""
         nodes = self._stack.nodes
         insertion = self.pushed()
         gaps = self._loops.gaps(insertion)

@@ -104,11 +104,7 @@ class VesselOptions:
 
     @classmethod
     def make(cls, value: Any) -> "VesselOptions":
-        """From a task's option: the name of a preset, or a mapping of its parts.
-
-        Raises:
-            ValueError: if it is neither, or a part is wrong.
-        """
+        """From the name of a preset or a mapping of parts; ValueError if wrong."""
         if isinstance(value, VesselOptions):
             return value
         if isinstance(value, str):

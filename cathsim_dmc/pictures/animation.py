@@ -101,10 +101,7 @@ def check_film(path: Path) -> None:
 
 
 def _one_palette(pictures: list[Image.Image]) -> list[Image.Image]:
-    """The pictures in the 256 colours of the middle and the last one.
-
-    One palette for all keeps what does not move from flickering, and small.
-    """
+    """The pictures in 256 colours that all of them share."""
     both = pictures[len(pictures) // 2], pictures[-1]
     sample = np.hstack([np.asarray(picture) for picture in both])
     palette = Image.fromarray(sample).quantize(256, Image.Quantize.MEDIANCUT)

@@ -60,11 +60,7 @@ class Moment:
 
     @classmethod
     def of(cls, env: Any) -> "Moment":
-        """The present state of a composer environment.
-
-        Raises:
-            TypeError: if it is no environment of this package.
-        """
+        """The present state of an environment; TypeError for any other object."""
         task = navigation_of(env)
         contacts, scene = task.contacts(env.physics), task.scene
         episode = EpisodeRecorder(env, task.name).present()
@@ -145,11 +141,7 @@ def fluoroscope_of(surface: Any, options: FluoroscopyOptions) -> Any:
 
 
 def xray(moment: Moment, options: FluoroscopyOptions, seed: int = 0) -> np.ndarray:
-    """The X-ray image (rows, columns) uint8 of a moment.
-
-    Args:
-        seed: Seed of the quantum noise, if the options ask for noise.
-    """
+    """The X-ray image (rows, columns) uint8 of a moment; `seed` of its noise."""
     state = np.random.RandomState(seed) if options.noise else None
     fluoroscope = fluoroscope_of(moment.rest, options)
     if moment.surface is not moment.rest:

@@ -80,12 +80,7 @@ def _checked(path: str | os.PathLike[str]) -> Path:
 def as_function(
     policy: AnyPolicy, env: Any, seed: int | None = None
 ) -> Callable[[Any], np.ndarray]:
-    """A policy as a function from the environment's timestep to the action.
-
-    Raises:
-        ValueError: there is no policy of that name.
-        TypeError: it is neither a name nor a policy nor a function.
-    """
+    """A policy as a function of the timestep; ValueError or TypeError for others."""
     if isinstance(policy, str):
         policy = policies.make_policy(policy, seed or 0)
     if isinstance(policy, policies.Policy):
@@ -106,13 +101,7 @@ def write(
     path: str | os.PathLike[str],
     fluoroscopy: bool = True,
 ) -> Path:
-    """Write an episode in the format that the file's name asks for.
-
-    Args:
-        env: The environment, for the anatomy and the shapes of the robot.
-        path: File to write, see `record`.
-        fluoroscopy: Whether a Rerun file has X-ray images.
-    """
+    """Write an episode in the format that the file's name asks for."""
     target = _checked(path)
     surface = navigation_of(env).scene.anatomy.surface
     if target.suffix == ".npz":

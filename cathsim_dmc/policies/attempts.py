@@ -96,11 +96,7 @@ State = TypeVar("State", bound=Attempts)
 def advance(
     settings: AttemptSettings, state: State, place: Place, insertion: np.ndarray
 ) -> State:
-    """Counts progress over a control step; begins and ends retries.
-
-    Args:
-        insertion: (...), of the head's device, m.
-    """
+    """Counts progress at an insertion (...), m; begins and ends retries."""
     outside = place.excess > settings.tolerance
     gained = place.arc_length > state.best + settings.progress
     idle = gained | state.retracting

@@ -93,11 +93,7 @@ class CoaxialPlan(Route):
 
     @classmethod
     def for_task(cls, task: navigation.Navigation | Case) -> "CoaxialPlan":
-        """Reads off a task of coaxial devices, or one of its anatomies.
-
-        Raises:
-            ValueError: if the task's objective has no route.
-        """
+        """Reads off a task or anatomy; ValueError if its objective has no route."""
         stack = task.scene.catheter
         assert isinstance(stack, DeviceStack)
         route = Route.of(task.objective)
@@ -126,16 +122,7 @@ class CoaxialPlan(Route):
         wall_force: forces.WallForce,
         devices: CoaxialReadings,
     ) -> tuple[np.ndarray, Attempts]:
-        """One control step of the expert: a pure function.
-
-        Args:
-            state: after the last step, arrays (N,).
-            readings: of the chain, arrays (N, ...).
-            wall_force: arrays (N,); its `max` slows the devices down.
-
-        Returns:
-            Action (N, 2 K) in [-1, 1] and the new state.
-        """
+        """Action (N, 2 K) in [-1, 1] and state of one control step: a pure function."""
         # Every other attempt stays near the last place: both ways fail in some
         # branchings.
         steady = np.where(state.attempts % 2 == 1, state.arc_length, np.nan)

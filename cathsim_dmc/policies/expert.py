@@ -30,12 +30,7 @@ class Expert:
     """
 
     def __init__(self, plan: Plan | CoaxialPlan, settings: Settings | None = None):
-        """Starts before the first episode; `for_task` makes the plan.
-
-        Args:
-            plan: Of a steerable device, or of coaxial devices.
-            settings: Of the same kind; None for the defaults.
-        """
+        """Takes a plan, and settings of its kind; None for the defaults."""
         self.plan: Any = plan
         self._settings = settings or plan.settings()
         self.state: Attempts | None = None
@@ -44,16 +39,7 @@ class Expert:
     def for_task(
         cls, task: navigation.Navigation | Case, settings: Settings | None = None
     ) -> "Expert":
-        """The expert for a task, or for one of the anatomies that episodes draw from.
-
-        Args:
-            settings: Settings of its driving; those of coaxial devices are
-                `coaxial_pursuit.CoaxialSettings`.
-
-        Raises:
-            ValueError: if the device can neither be steered nor turned at its base, or
-                the settings are not for it.
-        """
+        """The expert for a task or an anatomy; ValueError if it cannot steer."""
         kind = CoaxialPlan if task.scene.coaxial else Plan
         if settings is not None and not isinstance(settings, kind.settings):
             raise ValueError(
@@ -63,11 +49,7 @@ class Expert:
         return cls(kind.for_task(task), settings)
 
     def reset(self, which: np.ndarray | None = None) -> None:
-        """Forgets the simulations that begin a new episode.
-
-        Args:
-            which: Mask or indices of the simulations, None for all.
-        """
+        """Forgets simulations (mask or indices, None for all) that begin again."""
         if which is None or self.state is None:
             self.state = None
             return
@@ -81,11 +63,7 @@ class Expert:
         wall_force: forces.WallForce,
         devices: CoaxialReadings | None = None,
     ) -> np.ndarray:
-        """Action (..., A) in [-1, 1] for the state of the devices.
-
-        Raises:
-            ValueError: if the leading axes changed since the last call without reset.
-        """
+        """Action (..., A) in [-1, 1]; ValueError if the leading axes changed."""
         shape = readings.head.shape[:-1]
         state = self.plan.fresh(shape) if self.state is None else self.state
         if state.attempts.shape != shape:
@@ -112,11 +90,7 @@ class ExpertPolicy(Policy):
     observation = "tracking"
 
     def __init__(self, seed: int = 0):
-        """Starts before the first episode.
-
-        Args:
-            seed: Not used: the expert draws no random numbers.
-        """
+        """Starts before the first episode; the expert draws no random numbers."""
         self._view: View | None = None
         # One for all simulations; where their anatomies differ, one for each.
         self._experts: dict[int, Expert] = {}
@@ -124,11 +98,7 @@ class ExpertPolicy(Policy):
         self._several = False
 
     def reset(self, view: View, which: np.ndarray) -> None:
-        """Forget the simulations that begin a new episode.
-
-        Raises:
-            ValueError: the task's device cannot be steered.
-        """
+        """Forget simulations that begin an episode; ValueError if it cannot steer."""
         if self._view is not view:
             self._view, self._experts, self._cases = view, {}, {}
             self._several = view.task.num_anatomies > 1
@@ -161,10 +131,6 @@ class ExpertPolicy(Policy):
         return np.concatenate(actions)
 
     def follow(self, action: np.ndarray) -> None:
-        """Replace the last actions by those that were carried out.
-
-        Args:
-            action: (N, A) in [-1, 1].
-        """
+        """Replace the last actions by those (N, A) that were carried out."""
         for index, expert in self._experts.items():
             expert.follow(action[[index]] if self._several else action)

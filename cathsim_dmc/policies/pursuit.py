@@ -93,12 +93,7 @@ class Plan(Route):
 
     @classmethod
     def for_task(cls, task: navigation.Navigation | Case) -> "Plan":
-        """Reads off a task, or one of the anatomies that its episodes draw from.
-
-        Raises:
-            ValueError: if the task's device has no motors in its tip, or it has coaxial
-                devices.
-        """
+        """Reads off a task or anatomy; ValueError if the tip has no motors."""
         catheter = task.scene.catheter
         if task.scene.coaxial:
             raise ValueError(
@@ -145,17 +140,7 @@ class Plan(Route):
         wall_force: forces.WallForce,
         devices: CoaxialReadings | None = None,
     ) -> "tuple[np.ndarray, State]":
-        """One control step of the expert: a pure function.
-
-        Args:
-            state: after the last step, arrays (...).
-            readings: of the devices, arrays (...).
-            wall_force: arrays (...); its `max` slows the device down.
-            devices: of coaxial devices; not looked at.
-
-        Returns:
-            Action (..., A) in [-1, 1] and the new state.
-        """
+        """Action (..., A) in [-1, 1] and state of one control step: a pure function."""
         # Every other attempt stays near the last place: both ways fail in some
         # branchings.
         steady = np.where(state.attempts % 2 == 1, state.arc_length, np.nan)

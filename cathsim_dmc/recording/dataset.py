@@ -83,15 +83,7 @@ class DatasetError(ValueError):
 
 
 def read_episodes(path: str | os.PathLike[str]) -> Iterator[Any]:
-    """Episodes of a dataset, one after the other, as `minari.EpisodeData`.
-
-    Args:
-        path: Directory of the dataset, or the directory `data` in it.
-
-    Raises:
-        DatasetError: there is none, or it is damaged.
-        ModuleNotFoundError: minari is not installed.
-    """
+    """Episodes as `minari.EpisodeData`; DatasetError if there are none to read."""
     try:
         import minari
     except ModuleNotFoundError as error:

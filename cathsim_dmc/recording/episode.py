@@ -166,12 +166,7 @@ class Episode:
         return np.bincount(self.contact_step, minlength=self.steps)
 
     def save(self, path: str | os.PathLike[str]) -> Path:
-        """Write the episode to ``path`` (``.npz``), whole or not at all.
-
-        Raises:
-            ValueError: if the name does not end in ``.npz``.
-            FileNotFoundError: if the directory does not exist.
-        """
+        """Write the episode to a ``.npz``, whole or not at all."""
         with atomic_path(path, SUFFIX) as temporary:
             self.write(temporary)
         return Path(path)

@@ -22,11 +22,7 @@ _VERSIONED = ("cathsim-dmc", "mujoco", "dm-control", "numpy")
 
 
 def navigation_of(env: Any) -> Any:
-    """The task of an environment of this package.
-
-    Raises:
-        TypeError: if it is no such environment.
-    """
+    """The task of an environment of this package; TypeError for any other."""
     task = getattr(env, "task", None)
     if not hasattr(task, "scene") or not hasattr(env, "physics"):
         raise TypeError(

@@ -28,11 +28,7 @@ DEVICE_COLOURS = ((90, 220, 190), SHAFT_COLOUR, (200, 170, 255))
 
 
 def log_catheter(log: Log, radii: np.ndarray) -> None:
-    """Log the device as capsules coloured by what they press, its head and its path.
-
-    Args:
-        radii: (L,) radii of the links, metres.
-    """
+    """Log the device of link radii (L,) m, its head and its path."""
     entity = "world/catheter"
     joints = log.episode.catheter
     states, links = joints.shape[0], joints.shape[1] - 1

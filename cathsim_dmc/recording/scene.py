@@ -38,11 +38,7 @@ class BodyGeom:
 
 
 def body_geoms(physics: Any) -> Iterator[BodyGeom]:
-    """The visible primitives of robot and sheath, in the order of the model.
-
-    Args:
-        physics: A dm_control ``Physics``.
-    """
+    """The visible primitives of robot and sheath, in the order of the model."""
     import mujoco
 
     model = physics.model

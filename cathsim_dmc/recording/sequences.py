@@ -108,11 +108,7 @@ class States:
 def simulate(
     anatomy: Anatomy, goal: str, kit: str, options: SequenceOptions, seed: Sequence[int]
 ) -> States:
-    """Pushes and turns devices at random, side by side.
-
-    Raises:
-        ValueError: if the device does not fit into the anatomy.
-    """
+    """Pushes and turns devices at random; ValueError if they do not fit."""
     from cathsim_dmc import suite
     from cathsim_dmc.simulation.batch import BatchSimulation
 
@@ -284,10 +280,7 @@ def frames_of(
 
 
 def _seen(camera: Camera, places: np.ndarray) -> np.ndarray:
-    """Keypoints (T, K, 3): column, row, and `ABSENT`, `UNSEEN` or `SEEN`.
-
-    Those outside the image are absent; ostia without contrast are not seen.
-    """
+    """Keypoints (T, K, 3): column, row, and `ABSENT`, `UNSEEN` or `SEEN`."""
     pixels, _ = camera.arm.project(np.nan_to_num(places, nan=1e3))
     size = camera.arm.resolution[0]
     inside = ((pixels >= -0.5) & (pixels < size - 0.5)).all(axis=-1)
@@ -306,11 +299,7 @@ def write(
     path: Path, anatomy: Anatomy, states: States, options: SequenceOptions,
     seed: Sequence[int], **about: Any,
 ) -> int:  # fmt: skip
-    """Writes the file of an anatomy, whole or not at all; returns its frames.
-
-    Args:
-        about: attributes of the file.
-    """
+    """Writes the file of an anatomy with attributes; returns its frames."""
     import h5py
 
     rows, count = len(states.kept) * options.views * options.frames, options.frames

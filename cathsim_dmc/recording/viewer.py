@@ -17,12 +17,7 @@ class ViewerError(RuntimeError):
 
 
 def check_recording(path: str | os.PathLike[str]) -> Path:
-    """Return the absolute path of a recording after looking at both of its ends.
-
-    Raises:
-        FileNotFoundError: if there is no such file.
-        ValueError: if it is not a Rerun recording, or only the beginning of one.
-    """
+    """Absolute path of a whole recording; FileNotFoundError or ValueError if none."""
     path = Path(path)
     if not path.is_file():
         raise FileNotFoundError(f"no recording at {path}")

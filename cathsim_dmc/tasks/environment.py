@@ -28,11 +28,7 @@ class Environment(composer.Environment):
     _plain = False
 
     def reset(self):
-        """Starts an episode.
-
-        Returns:
-            The first time step.
-        """
+        """Starts an episode; returns the first time step."""
         if not self._changes_model():
             self._mjcf_never_compiled = False
         timestep = super().reset()
@@ -40,11 +36,7 @@ class Environment(composer.Environment):
         return timestep
 
     def step(self, action) -> dm_env.TimeStep:
-        """Does a control step, or starts an episode after the end of one.
-
-        Args:
-            action: As `action_spec` says.
-        """
+        """Does a control step, or starts an episode after the end of one."""
         if self._reset_next_step or not self._plain or self._is_watched():
             return super().step(action)
         self._hooks.before_step(self._physics_proxy, action, self._random_state)
@@ -106,11 +98,7 @@ class NavigationPhysics(mjcf.Physics):
     """The simulator, with pictures that need OpenGL."""
 
     def _make_rendering_contexts(self):
-        """Opens the off-screen context that pictures are drawn in.
-
-        Raises:
-            RuntimeError: there is no OpenGL; says what to do.
-        """
+        """Opens the off-screen context; RuntimeError says what to do without one."""
         try:
             super()._make_rendering_contexts()
         except Exception as error:  # every backend fails in its own way

@@ -16,11 +16,7 @@ from cathsim_dmc.tasks.objectives import (
 
 
 def together(objectives: Sequence[Objective], chosen: np.ndarray) -> Objective:
-    """One objective for N simulations.
-
-    Args:
-        chosen: (N,), number of the objective of each simulation.
-    """
+    """One objective for N simulations with objectives of numbers (N,)."""
     numbers = np.unique(chosen)
     if len(numbers) == 1:
         return objectives[int(numbers[0])]

@@ -71,11 +71,7 @@ class Placement:
 
 
 def resolve_goal(anatomy: Anatomy, goal: "str | Goal") -> Goal:
-    """Returns the goal, by name or as given.
-
-    Raises:
-        ValueError: if the anatomy has no such goal, or the goal is outside the lumen.
-    """
+    """The goal, by name or as given; ValueError if outside the lumen."""
     if isinstance(goal, str):
         goal = anatomy.goal(goal)
     bounds.instance("goal", goal, Goal)
@@ -188,11 +184,7 @@ def sheath_direction(anatomy: Anatomy) -> np.ndarray | None:
 
 
 def _clear(anatomy: Anatomy, directions: np.ndarray) -> np.ndarray:
-    """Whether sheaths of some directions (k, 3) of insertion run outside all vessels.
-
-    Returns:
-        (k,) bool.
-    """
+    """Whether (k,) sheaths in directions (k, 3) run outside all vessels."""
     behind = np.arange(_NEAR_INLET, COMMON_LENGTH, _LINE_SPACING)
     lines = anatomy.inlet.position - behind[:, None] * directions[:, None]
     depth = anatomy.depth(lines.reshape(-1, 3)).reshape(len(directions), -1)

@@ -169,14 +169,7 @@ class _Posture:
         self._least[:-1] -= _PRESSED
 
     def clear_of_wall(self, displacement: np.ndarray) -> np.ndarray:
-        """The displacement, reversed or halved where it would press on the wall.
-
-        Args:
-            displacement: (3,) of the head in the frame of the inlet, m.
-
-        Returns:
-            (3,) m.
-        """
+        """The displacement (3,), m, reversed or halved where it would press."""
         for factor in (1.0, -1.0, *_SMALLER):
             displaced = self._frame @ (factor * displacement)
             depth = self._anatomy.depth(self._nodes + self._shares * displaced)
@@ -225,11 +218,7 @@ def _settle(
 def _settled(
     settle: Callable[[float], _Posture], low: float, high: float, count: int
 ) -> list[_Posture]:
-    """Postures further and further in, m.
-
-    What springs out of a branch comes to rest elsewhere in the lumen; where a device
-    cannot lie at all, none is kept.
-    """
+    """Postures that come to rest, further and further in, from `low` to `high`, m."""
     settled = []
     for advance in np.linspace(low, high, count):
         with contextlib.suppress(ValueError):

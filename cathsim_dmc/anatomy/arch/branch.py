@@ -99,18 +99,7 @@ def branch_vessel(
 def _inwards(
     name: str, wide: float, exit_length: float, tilt: float, parent_radius: float
 ) -> float:
-    """How far (m) the flare reaches into the parent, until its ring is inside.
-
-    The wall is then convex along the branch wherever it exists.
-
-    Args:
-        wide: radius of the branch with its fillet, m.
-        exit_length: from the parent's centreline to the ostium, m.
-        tilt: of the branch from the normal of its parent's wall, rad.
-
-    Raises:
-        ValueError: if the branch is too oblique or too wide for its parent.
-    """
+    """How far (m) the flare reaches into the parent; ValueError if too far."""
     if tilt > _MOST_OBLIQUE or exit_length > _LONGEST_EXIT * parent_radius:
         raise ValueError(
             f"branch {name!r} leaves at {math.degrees(tilt):.0f} degrees from the "

@@ -30,13 +30,7 @@ def _smooth_interpolation(s: Array, stations: Array, values: Array) -> Array:
 
 
 def _limb(length: float, bend: float, heading: float) -> Array:
-    """Points (n, 2) of a limb that turns by `bend` to the right and begins at 0.
-
-    Args:
-        length: m.
-        bend: angle, evenly along it.
-        heading: of its first direction, from the vertical to the right.
-    """
+    """Points (n, 2) m of a limb from 0 on that turns to the right by `bend`, rad."""
     step = _STRAIGHT_STEP if abs(bend) < 1e-9 else _CURVED_STEP
     # Whole steps, of which the parametric arches have always had `length / step`.
     count = max(1, round(length / step))
@@ -134,11 +128,7 @@ def _direction(branch: BranchParameters, plane: Plane) -> Array:
 
 
 def arch_tree(params: ArchParameters) -> VesselTree:
-    """Vessels "aorta", "bca" (or "rcca"), "lcca", "lsa" (and "rsa") of an arch.
-
-    Raises:
-        ValueError: if branches do not fit on the arch or run into each other.
-    """
+    """Vessels of an arch; ValueError if branches do not fit or meet each other."""
     plane = Plane.turned(params.plane_rotation, params.plane_tilt)
     points, radii, outer, levels = _outer_curve(params)
     aorta = Vessel("aorta", Centreline(_in_space(params, plane, points), radii))
