@@ -1,16 +1,14 @@
 """Compiled loops: what a function of plain loops over arrays is decorated with.
 
-Importing numba takes longer than loading a task, so a module with such functions is
-imported only where it is needed, within a function.
+Importing numba takes longer than loading a task, so a function is compiled when it is
+first called, and numba is imported with it.
 """
 
 import functools
 import hashlib
 from collections.abc import Callable
 from pathlib import Path
-
-import numba
-from numba.core import caching
+from typing import Any
 
 _PACKAGE = Path(__file__).parent
 # What a source that holds compiled loops, or helps to compile, has in it.
@@ -19,7 +17,6 @@ _MARKS = (b"\n@compiled", b"\n@callback", b"import numba", b"from numba")
 
 @functools.cache
 def _stamp() -> bytes:
-    """Digest of all sources that hold compiled loops."""
     digest = hashlib.sha256()
     for path in sorted(_PACKAGE.rglob("*.py")):
         source = path.read_bytes()
@@ -28,34 +25,64 @@ def _stamp() -> bytes:
     return digest.digest()
 
 
-class _Together:
-    """A place of compiled loops that are made anew when any of them changes.
+@functools.cache
+def keep_together() -> None:
+    """Has numba compile all loops anew when the source of any of them changes.
 
     Compiled code holds what it calls in other modules, of which numba's own stamp
     knows nothing.
     """
+    from numba.core import caching
 
-    @classmethod
-    def from_function(cls, py_func, py_file):
-        """The place for a function of this package, None for any other."""
-        if not Path(py_file).is_relative_to(_PACKAGE):
-            return None
-        return super().from_function(py_func, py_file)  # type: ignore[misc]
+    class Together:
+        @classmethod
+        def from_function(cls, py_func, py_file):
+            if not Path(py_file).is_relative_to(_PACKAGE):
+                return None
+            return super().from_function(py_func, py_file)  # type: ignore[misc]
 
-    def get_source_stamp(self) -> bytes:
-        """Changes with any source of compiled loops."""
-        return _stamp()
+        def get_source_stamp(self) -> bytes:
+            return _stamp()
+
+    class BesideSource(Together, caching.InTreeCacheLocator):
+        pass
+
+    class OfUser(Together, caching.UserWideCacheLocator):
+        pass
+
+    caching.CacheImpl._locator_classes[1:1] = [BesideSource, OfUser]  # noqa: SLF001
 
 
-class _BesideSource(_Together, caching.InTreeCacheLocator):
-    pass
+class _Compiled:
+    """A function that is compiled when it is called, from Python or compiled code."""
 
+    def __init__(self, function: Callable, cache: bool):
+        functools.update_wrapper(self, function)
+        self._function, self._cache = function, cache
 
-class _OfUser(_Together, caching.UserWideCacheLocator):
-    pass
+    @functools.cached_property
+    def _compiled(self) -> Any:
+        import numba
 
+        keep_together()
+        # Nothing calls them from C, which would take a tenth more time to compile.
+        options = {"nogil": True, "error_model": "numpy", "no_cfunc_wrapper": True}
+        try:
+            return numba.njit(self._function, cache=self._cache, **options)
+        except RuntimeError:  # neither this folder nor the user's can be written to
+            return numba.njit(self._function, **options)
 
-caching.CacheImpl._locator_classes[1:1] = [_BesideSource, _OfUser]  # noqa: SLF001
+    def __call__(self, *arguments: Any) -> Any:
+        return self._compiled(*arguments)
+
+    @property
+    def _numba_type_(self) -> Any:
+        return self._compiled._numba_type_  # noqa: SLF001
+
+    @property
+    def cache_path(self) -> str | None:
+        """Folder in which what is compiled is kept; None where nothing is."""
+        return self._compiled.stats.cache_path
 
 
 def compiled(function: Callable, cache: bool = True) -> Callable:
@@ -64,9 +91,4 @@ def compiled(function: Callable, cache: bool = True) -> Callable:
     Without `fastmath`: the same numbers bit for bit, alone and in a batch. A function
     that refers to others which change from call to call must not be kept (`cache`).
     """
-    # Nothing calls them from C, which would take a tenth more time to compile.
-    options = {"nogil": True, "error_model": "numpy", "no_cfunc_wrapper": True}
-    try:
-        return numba.njit(function, cache=cache, **options)
-    except RuntimeError:  # neither this folder nor the user's can be written to
-        return numba.njit(function, **options)
+    return _Compiled(function, cache)

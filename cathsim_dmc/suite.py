@@ -266,7 +266,6 @@ def environment(task: Navigation, **environment_kwargs: Any) -> composer.Environ
 
 
 def _environment_settings(given: Mapping[str, Any] | None) -> dict[str, Any]:
-    """Arguments of `composer.Environment`, checked."""
     settings = bounds.options("environment_kwargs", given)
     bounds.mapping("environment_kwargs", settings, _SETTINGS)
     limit = settings.get("time_limit", math.inf)
@@ -328,7 +327,6 @@ _TABLE = (
 
 
 def _register_plain() -> None:
-    """Tasks with one device: phantoms and random arches, by both accesses."""
     rows = [(*row[:2], a, g) for row in _TABLE for a in row[2] for g in row[3]]
     for access, prefix, anatomy, goal in rows:
         drawn = anatomy == "arch"

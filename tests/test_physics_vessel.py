@@ -10,7 +10,7 @@ from cathsim_dmc import suite
 from cathsim_dmc.anatomy import phantoms
 from cathsim_dmc.anatomy.circulation import Circulation
 from cathsim_dmc.physics.vessel import VesselOptions
-from cathsim_dmc.physics.wall_loops import stiffness
+from cathsim_dmc.physics.wall import stiffness
 from cathsim_dmc.simulation.batch import BatchSimulation
 from cathsim_dmc.validation import vessel
 

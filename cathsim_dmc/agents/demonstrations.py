@@ -247,7 +247,6 @@ def _shapes(transitions: TensorDictBase) -> NetworkShapes:
 
 
 def _keys(names: Sequence[str], coaxial: bool) -> set[str]:
-    """Keys of the named observations."""
     rows = observations.resolve(names, coaxial or None)
     return set(observations.entry_specs(rows, Sizes()))
 

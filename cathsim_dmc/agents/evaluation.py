@@ -252,13 +252,11 @@ class _Environments:
         self._env, self.view = env, view_of(env)
 
     def reset(self, which: np.ndarray | None) -> TensorDictBase:
-        """Begin episodes, in all environments or where one has ended."""
         fresh = which is None
         self.seen = self._env.reset() if fresh else self._env.maybe_reset(self.seen)
         return self.seen
 
     def step(self, action: np.ndarray) -> tuple[TensorDictBase, np.ndarray]:
-        """Advance by a control step."""
         self.seen["action"] = torch.as_tensor(action).to(torch.float32)
         stepped = self._env.step(self.seen)
         self.seen = step_mdp(stepped)

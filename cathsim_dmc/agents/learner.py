@@ -131,7 +131,6 @@ def make_collector(
 def _on_cpu(
     policy: TensorDictModuleBase, device: device
 ) -> Callable[[TensorDictBase], TensorDictBase]:
-    """A policy that takes and gives CPU tensors wherever its weights are."""
     if device.type == "cpu":
         return policy
 

@@ -102,7 +102,6 @@ class NetworkShapes:
 
 
 def _are_images(names: str | tuple[str, ...], images: bool) -> bool:
-    """Whether all the entries of observations are images, or all are vectors."""
     chosen = observations.resolve(names)
     return all(one.is_image == images for one in observations.entries(chosen))
 

@@ -143,7 +143,6 @@ def random_arch(task: str) -> bool:
 
 
 def _drawn(ranges: Randomisation, seed: int, arches: int) -> tuple[int, Episode]:
-    """Number of the arch in its pool, and what else an episode of that seed draws."""
     return ranges.draw_in(np.random.RandomState(seed), arches)
 
 

@@ -92,7 +92,6 @@ def digest_of(policy: str) -> str | None:
 
 
 def _commit() -> str | None:
-    """Commit of the checkout that the package lies in, "+" if files differ."""
     command = ["git", "describe", "--always", "--dirty=+", "--abbrev=12"]
     home = Path(__file__).parents[2]
     if not (home / ".git").exists():

@@ -269,7 +269,6 @@ class _Loop:
         return TrainingResult(self.run, newest, log.frames, log.seconds, short, log.row)
 
     def step(self, interruption: threading.Event) -> None:
-        """Collect a batch and learn from it."""
         config, log = self.config, self.log
         batch = next(self.batches)
         finished = self._tracker.add(batch)
@@ -292,7 +291,6 @@ class _Loop:
             self.save()
 
     def save(self) -> Path:
-        """Write a checkpoint; return its directory."""
         self.newest = save_checkpoint(
             self.run,
             config=self.config,

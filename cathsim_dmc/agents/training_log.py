@@ -137,7 +137,6 @@ class TrainingLog:
         self._bar.update(frames)
 
     def _write(self) -> None:
-        """Write metrics.csv whole."""
         text = io.StringIO()
         # An older version may have had other columns.
         writer = csv.DictWriter(
@@ -149,7 +148,6 @@ class TrainingLog:
 
 
 def _texts(path: Path) -> list[dict[str, str]]:
-    """The whole rows of a metrics.csv."""
     with open(path, newline="") as file:
         return [row for row in csv.DictReader(file) if None not in row.values()]
 

@@ -8,8 +8,6 @@ from cathsim_dmc.policies import View
 
 
 class _ForeignView:
-    """Simulations of an environment that is not ours: only their numbers are known."""
-
     def __init__(self, env: EnvBase):
         (self.num_simulations,) = env.batch_size
         self.num_actions = int(env.action_spec.shape[-1])

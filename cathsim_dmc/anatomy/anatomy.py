@@ -210,7 +210,6 @@ def _pack(anatomy: Anatomy) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
 
 
 def _plain(part: Goal | Inlet | End) -> dict[str, Any]:
-    """Fields as JSON values."""
     values = {field.name: getattr(part, field.name) for field in fields(part)}
     return {name: np.asarray(value).tolist() for name, value in values.items()}
 

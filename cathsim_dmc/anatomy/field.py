@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike
 
 from cathsim_dmc import file_maps
 from cathsim_dmc.anatomy.centreline import Array, VesselTree
+from cathsim_dmc.anatomy.field_loops import END, FIRST_END, depths, gradients
 from cathsim_dmc.anatomy.lattice import MARGIN
 from cathsim_dmc.anatomy.parts import End, Surface
 from cathsim_dmc.anatomy.segments import as_points
@@ -70,8 +71,6 @@ class Field:
                 lumen, is `field_loops.FREE` deep; otherwise it is outside, by its
                 distance from the plane of the end.
         """
-        from cathsim_dmc.anatomy.field_loops import depths
-
         points = as_points(points)
         # Writable: numba would compile another function for those that are not.
         flat = np.require(points.reshape(-1, 3), None, ["C", "W"])
@@ -89,8 +88,6 @@ class Field:
         They point away from the wall and change without jumps from cell to cell; NaN
         at points that are not finite.
         """
-        from cathsim_dmc.anatomy.field_loops import gradients
-
         points = as_points(points)
         flat = np.ascontiguousarray(points.reshape(-1, 3))
         out = np.full(flat.shape, np.nan)
@@ -130,8 +127,6 @@ class Field:
 
     def with_hole(self, radius: float) -> Field:
         """The same lumen with flat caps over its open ends, but for a hole (m) each."""
-        from cathsim_dmc.anatomy.field_loops import END, FIRST_END
-
         head = self.head.copy()
         head[FIRST_END + END - 1 :: END] = radius
         field = replace(self, head=head)

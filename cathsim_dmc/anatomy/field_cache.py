@@ -63,7 +63,6 @@ def _parts(tree: VesselTree) -> list[np.ndarray]:
 
 
 def _name(parts: Sequence[np.ndarray], ends: Sequence[End]) -> str:
-    """Digest of what a field is built from."""
     flat = [(*e.position, *e.direction, e.radius, e.open) for e in ends]
     digest = hashlib.sha256()
     for part in (*parts, np.array(flat)):
@@ -111,7 +110,6 @@ def _read(path: Path) -> Field:
 
 @cache
 def _code() -> bytes:
-    """Digest of the code that builds fields."""
     digest = hashlib.sha256()
     for name in _MODULES:
         digest.update(Path(__file__).with_name(f"{name}.py").read_bytes())

@@ -16,6 +16,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from cathsim_dmc.anatomy import motion_loops
 from cathsim_dmc.anatomy.centreline import Array, VesselTree
 from cathsim_dmc.anatomy.circulation import Circulation
 from cathsim_dmc.anatomy.parts import End, Surface
@@ -84,8 +85,6 @@ class Motion:
 
     def to_rest(self, parameters: Array, time: float, points: Array) -> Array:
         """Places at rest (..., 3) of places in space (..., 3), m."""
-        from cathsim_dmc.anatomy import motion_loops  # late, as numba takes long
-
         flat = np.require(points.reshape(-1, 3), np.float64, ["C", "W"])
         out = np.empty_like(flat)
         motion_loops.rest(self.lattice, parameters, time, flat, out)
@@ -99,8 +98,6 @@ class Motion:
         Returns:
             And by how much the radius has grown there (...), m.
         """
-        from cathsim_dmc.anatomy import motion_loops
-
         flat = np.require(points.reshape(-1, 3), np.float64, ["C", "W"])
         out, growth = np.empty_like(flat), np.empty(len(flat))
         motion_loops.moved(self.lattice, parameters, time, flat, out, growth)

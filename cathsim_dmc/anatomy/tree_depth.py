@@ -8,6 +8,7 @@ import numpy as np
 
 from cathsim_dmc.anatomy.centreline import Array, Centreline, VesselTree
 from cathsim_dmc.anatomy.parts import End
+from cathsim_dmc.anatomy.tree_depth_loops import onto_creases, tree_depths
 
 # Farther from the wall than this, m, another vessel does not matter to a point.
 _SLACK = 3e-3
@@ -59,8 +60,6 @@ class TreeDepth:
 
     def around(self, blocks: Array, points: Array) -> Array:
         """Signed distances (n, m) m at blocks (n, 3) + points (m, 3) m, > 0 inside."""
-        from cathsim_dmc.anatomy.tree_depth_loops import tree_depths
-
         blocks, points = np.asarray(blocks), np.asarray(points)
         groups, middles, reaches = _grouped(points)
         out = np.empty((len(blocks), len(points)))
@@ -107,8 +106,6 @@ class TreeDepth:
 
     def _onto(self, one: int, two: int, seeds: Array, rounds: int) -> Array:
         """Moves seeds (n, 3) onto both walls; their depths (n, 2) in both, m."""
-        from cathsim_dmc.anatomy.tree_depth_loops import onto_creases
-
         left = np.empty((len(seeds), 2))
         onto_creases(
             self._nodes, self._spans, self._flats, one, two, seeds, rounds, left
@@ -138,7 +135,6 @@ def _rings(line: Centreline) -> Array:
 
 
 def _grouped(points: Array) -> tuple[np.ndarray, Array, Array]:
-    """Groups (q,) of near points (q, 3), their middles (g, 3) and reaches (g,), m."""
     along = max(1, round(len(points) ** (1 / 3) / _GROUP))
     size = max(float(np.ptp(points, axis=0).max()), 1e-9) / along
     cells = ((points - points.min(axis=0)) / size).astype(int).clip(0, along - 1)

@@ -161,7 +161,6 @@ def _curve(where: str, entry: Any, flip: np.ndarray, before: list[str]) -> Curve
 
 
 def _numbers(name: str, value: Any, columns: int) -> np.ndarray:
-    """Finite numbers (n, columns)."""
     if not isinstance(value, list) or not 0 < len(value) <= _MOST_POINTS:
         bounds.refuse(name, value, f"a list of 1 to {_MOST_POINTS} entries")
     rows = [[row] if columns == 1 else row for row in value]

@@ -66,7 +66,7 @@ def _versions(name: str) -> list[Finding]:
 def _kernels() -> Finding:
     from cathsim_dmc.collision import loops
 
-    folder = loops.straight.stats.cache_path
+    folder = loops.straight.cache_path
     if folder is None:
         advice = "every process compiles anew; set NUMBA_CACHE_DIR to a folder"
         return Finding("compiled kernels", "not kept", False, advice)

@@ -122,7 +122,6 @@ def _settings(arguments: Sequence[str]) -> tuple[Any, bool]:
 
 
 def _setting_options(settings: Any) -> type:
-    """A dataclass of the settings that are options, with these defaults."""
     helps, fields = field_helps(type(settings)), []
     for item in dataclasses.fields(settings):
         if item.name in ("task", "task_kwargs"):

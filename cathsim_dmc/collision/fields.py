@@ -112,7 +112,6 @@ class _Table:
     def put(
         self, key: int, kind: int, middle: np.ndarray, arrays: Sequence[np.ndarray]
     ) -> None:
-        """Adds an entry, unless there is one."""
         from cathsim_dmc.collision.table import CAPACITY, ENTRY, HEAD
 
         if key in self._kept:
@@ -141,7 +140,6 @@ class _Table:
         row[MOTION_ENTRY // 8] = lattice.ctypes.data
 
     def knows(self, key: int) -> bool:
-        """Whether there is an entry."""
         return key in self._kept
 
 
@@ -274,7 +272,6 @@ def _digest(field: Field | Bore) -> bytes:
 
 
 def _mujoco_library() -> ctypes.CDLL:
-    """MuJoCo's library, which the process has loaded."""
     folder = Path(mujoco.__path__[0])
     for path in sorted(folder.glob("*mujoco*")):
         if path.suffix != ".py" and any(

@@ -24,6 +24,8 @@ from numba.core import cgutils, types
 from numba.extending import intrinsic, register_jitable
 from numba.np.numpy_support import carray
 
+from cathsim_dmc.compiled import keep_together
+
 # Compiled code calls what this decorates without its first argument.
 _intrinsic: Any = intrinsic
 
@@ -180,7 +182,6 @@ def _place(struct: str, name: str) -> int | None:
 
 @functools.cache
 def _places(struct: str) -> dict[str, int]:
-    """Offsets of the fields of one of MuJoCo's structs, bytes."""
     return _lay(structs.STRUCTS[struct].fields)[0]
 
 
@@ -196,7 +197,6 @@ def _lay(fields) -> tuple[dict[str, int], int, int]:
 
 
 def _size(kind) -> tuple[int, int]:
-    """Size and alignment of a type, bytes."""
     if isinstance(kind, ast_nodes.PointerType):
         return 8, 8
     if isinstance(kind, ast_nodes.ArrayType):
@@ -325,6 +325,7 @@ def call_error(_, address, text, number):
 
 def callback(signature: str, cache: bool = True) -> Callable:
     """Compiles a function that C calls, as `compiled` does; a pointer is an int64."""
+    keep_together()
 
     def decorate(function: Callable):
         options = {"nopython": True, "error_model": "numpy"}

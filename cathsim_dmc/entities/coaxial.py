@@ -24,6 +24,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from cathsim_dmc.entities import coaxial_loops, hinge_loops
 from cathsim_dmc.entities.arena import BLOOD_DENSITY
 from cathsim_dmc.entities.device import Device
 
@@ -103,10 +104,6 @@ class Stack:
             ValueError: if `devices` is empty, or one does not fit into the next.
         """
         _check_fit(devices)
-        # Both import numba, which is slow.
-        from cathsim_dmc.entities import coaxial_loops, hinge_loops
-
-        self._loops, self._hinges = coaxial_loops, hinge_loops
         self.devices = tuple(devices)
         self.link_lengths = np.asarray(link_lengths, dtype=np.float64)
         beyond = np.cumsum(self.link_lengths[::-1])[::-1]
@@ -145,8 +142,8 @@ class Stack:
     def overlap(self, gaps: np.ndarray) -> Overlap:
         """Integrals around the joints and over the links."""
         gaps = np.ascontiguousarray(gaps, np.float64)
-        integrals = self._loops.overlaps(gaps, *self._tables)
-        shares = self._loops.shares(gaps, self.nodes, self.link_lengths)
+        integrals = coaxial_loops.overlaps(gaps, *self._tables)
+        shares = coaxial_loops.shares(gaps, self.nodes, self.link_lengths)
         return Overlap(*integrals, *shares)
 
     def rest_angles(self, overlap: Overlap, turns: np.ndarray) -> np.ndarray:
@@ -162,11 +159,11 @@ class Stack:
         Returns:
             Bends (N, J) complex, and twists (N, J), rad.
         """
-        return self._hinges.bent(np.ascontiguousarray(angles))
+        return hinge_loops.bent(np.ascontiguousarray(angles))
 
     def unloaded_hinges(self, overlap: Overlap, turns: np.ndarray) -> np.ndarray:
         """Angles (N, J, 2) of the hinges about x and y of the unloaded chain, rad."""
-        return self._hinges.unloaded_hinges(self.rest_angles(overlap, turns))
+        return hinge_loops.unloaded_hinges(self.rest_angles(overlap, turns))
 
     def free_hinges(
         self,
@@ -184,7 +181,7 @@ class Stack:
         Returns:
             (N, J, 2), about x and about y, rad.
         """
-        return self._hinges.free_hinges(
+        return hinge_loops.free_hinges(
             self.rest_angles(overlap, turns),
             overlap.compliance,
             np.ascontiguousarray(angles),
@@ -192,7 +189,7 @@ class Stack:
 
     def links(self, overlap: Overlap, friction: np.ndarray) -> Links:
         """Properties of the links."""
-        made = self._loops.links(
+        made = coaxial_loops.links(
             overlap.outermost,
             overlap.present,
             self.link_lengths,
@@ -214,7 +211,8 @@ class Stack:
         Returns:
             (N, K, J), N·m; each joint has half of its two links.
         """
-        return self._loops.wall_friction(overlap.outermost, force, friction, self._arms)
+        outermost = overlap.outermost
+        return coaxial_loops.wall_friction(outermost, force, friction, self._arms)
 
     def restoring(
         self, overlap: Overlap, bends: np.ndarray, turns: np.ndarray
@@ -230,7 +228,7 @@ class Stack:
             Torque (N, K, J) on each device about its axis, N·m, and minus its
             derivative by the rotation, N·m/rad.
         """
-        return self._loops.restoring(
+        return coaxial_loops.restoring(
             overlap.rest, overlap.compliance, overlap.coupling, bends, turns
         )
 
@@ -254,7 +252,7 @@ class Stack:
         Returns:
             (N, K, J), N, positive where a device must be pushed forward.
         """
-        return self._loops.axial(
+        return coaxial_loops.axial(
             np.ascontiguousarray(gaps),
             *self._tables,
             overlap.compliance,
@@ -291,7 +289,7 @@ class Stack:
             (N, K - 1, J), force of device k on device k + 1 at the joints, N, and
             (N, K - 1), the axial force that their friction demands of device k, N.
         """
-        return self._loops.pressure(
+        return coaxial_loops.pressure(
             overlap.stiffness,
             overlap.moment,
             overlap.present,

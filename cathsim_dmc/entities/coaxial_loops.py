@@ -35,7 +35,6 @@ def _weight(place, joint, nodes, lengths):
 
 @compiled
 def _breaks(gaps, edges):
-    """Boundaries of the uniform pieces of the chain, from its end on."""
     places = np.empty(edges.size + 1)
     for k in range(edges.shape[0]):
         for e in range(edges.shape[1]):
@@ -47,7 +46,6 @@ def _breaks(gaps, edges):
 
 @compiled
 def _piece(place, edges):
-    """Index of the piece of a device at a distance from its end, 0 beyond it."""
     piece = 0
     while piece < len(edges) and place >= edges[piece]:
         piece += 1

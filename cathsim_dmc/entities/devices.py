@@ -170,7 +170,6 @@ WIRE_035_LUNDERQUIST = _guidewire("wire_035_lunderquist", 4860e-6)
 
 
 def _core(diameter: float) -> float:
-    """EI (N·m²) of a nitinol core."""
     return NITINOL_MODULUS * math.pi * diameter**4 / 64
 
 

@@ -76,7 +76,6 @@ def _difference(x, y, first, dx, dy):
 
 @compiled
 def _twist_rates(x, y, first):
-    """Derivatives of `_twist` by x and y."""
     twist = _twist(x, y, first)
     if twist == 0.0:
         sign = 1.0 if first == 0 else -1.0

@@ -25,6 +25,8 @@ import numpy as np
 from dm_control import composer, mjcf
 from numpy.typing import NDArray
 
+from cathsim_dmc.compiled import compiled
+
 # --- The clamp-advance-release cycle, in metres of insertion. ---
 # The stroke fits a rail of 0.35 m, and the clamps change about once a second at the
 # fastest push (40 mm/s).
@@ -70,15 +72,13 @@ def postures(given: NDArray[np.float64]) -> NDArray[np.float64]:
     Raises:
         ValueError: a number is not finite.
     """
-    from cathsim_dmc.entities import robot_loops  # late, as numba takes long
-
     if not math.isfinite(given.sum()):
         raise ValueError(
             "insertion, rotation, guidewire insertion and guidewire rotation must be "
             f"finite, got {given}: check for a diverged simulation"
         )
     teeth = RING_TEETH / PINION_TEETH
-    return robot_loops.postures(given, _PHASES, _CYCLE, ROLLER_RADIUS, teeth)
+    return _postures(given, _PHASES, _CYCLE, ROLLER_RADIUS, teeth)
 
 
 class Robot(composer.Entity):
@@ -115,3 +115,52 @@ class Robot(composer.Entity):
     def joints(self) -> tuple[mjcf.Element, ...]:
         """The MJCF joints in the order of ``JOINTS``."""
         return self._joints
+
+
+@compiled
+def _clamp(insertion, offset, cycle):
+    """Travel of a pair's platform from home, and opening of each of its jaws, m.
+
+    A platform moves with the device while its jaws are closed, opening or closing, and
+    returns in between:
+    ``travel = phase - stroke / 2 - cycle * smoothstep(return progress)``. Position and
+    speed are continuous. Both depend on the insertion alone, so a withdrawal reverses
+    the motion.
+    """
+    length, stroke, jaws, back, opening = cycle
+    # The jaws are closed over phases [0, stroke].
+    phase = (insertion + offset) % length
+    swung = _smoothstep((phase - (stroke + jaws)) / back)
+    opened = _smoothstep((phase - stroke) / jaws)
+    closed = _smoothstep((phase - (length - jaws)) / jaws)
+    return phase - stroke / 2 - length * swung, opening * (opened - closed)
+
+
+@compiled
+def _smoothstep(u):
+    """0 before 0, 1 after 1, and smooth between."""
+    u = min(max(u, 0.0), 1.0)
+    return u * u * (3.0 - 2.0 * u)
+
+
+@compiled
+def _postures(given, phases, cycle, radius, ratio):
+    """Joints (N, 16) in the order of `JOINTS`, see `postures`."""
+    count = given.shape[1]
+    joints = np.empty((count, 16))
+    for i in range(count):
+        pushed, turned, wire_pushed, wire_turned = given[:, i]
+        front, front_opening = _clamp(pushed, phases[0], cycle)
+        rear, rear_opening = _clamp(wire_pushed, phases[1], cycle)
+        # The catheter unit stays half-way between the clamps, so the free lengths of
+        # shaft on both sides are equal; the guidewire unit moves with the rear clamps.
+        middle = (front + rear) / 2
+        own = joints[i]
+        own[0], own[1], own[2], own[3] = front, middle, rear, rear
+        own[4:6], own[6:8] = front_opening, rear_opening
+        # Ring, pinion and rollers of the two units.
+        own[8], own[9], own[10] = turned, -turned * ratio, (pushed - middle) / radius
+        own[12], own[13] = wire_turned, -wire_turned * ratio
+        own[14] = (wire_pushed - rear) / radius
+        own[11], own[15] = -own[10], -own[14]
+    return joints

@@ -12,6 +12,8 @@ from functools import cache
 import numpy as np
 from numpy.typing import ArrayLike
 
+from cathsim_dmc.imaging import kernel
+
 # Quanta per area and air kerma at the detector, 1/(m² Gy): 30174 per mm² and uGy for
 # the beam quality RQA5 of IEC 62220-1.
 QUANTA_PER_KERMA = 30174.0e6 * 1.0e6
@@ -95,8 +97,6 @@ def quantum_noise(
                 "one per frame."
             )
     quantiles, skew = _normal_quantiles()
-    from cathsim_dmc.imaging import kernel  # late: it brings the compiler
-
     result = np.empty_like(frames)
     for frame, out, state in zip(frames, result, states, strict=True):
         draw = np.frombuffer(state.bytes(2 * frame.size), dtype="<u2")

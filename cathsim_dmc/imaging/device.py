@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike
 
-from cathsim_dmc.imaging import materials
+from cathsim_dmc.imaging import kernel, materials
 from cathsim_dmc.imaging.carm import CArm
 
 
@@ -87,8 +87,6 @@ def device_attenuation(
     points, radius, batch = _chain(points, radius)
     if marker_mu is None:
         marker_mu, marker_length = mu, 0.0
-    from cathsim_dmc.imaging import kernel  # late: it brings the compiler
-
     image = np.zeros((len(points), *carm.resolution), dtype=np.float32)
     with np.errstate(invalid="ignore"):  # joints that are not finite
         camera = carm.camera(points)

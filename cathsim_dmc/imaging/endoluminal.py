@@ -3,8 +3,6 @@
 Each ray steps forward by the depth of the lumen's field, which no wall is nearer than,
 until it meets the wall (sphere tracing). The camera looks along +z of the head, with +x
 to the right and +y down; a lamp beside it lights the wall.
-
-Numba compiles this module, so it is imported only where images are made.
 """
 
 import math

@@ -198,7 +198,6 @@ class Fluoroscope:
         return np.any([self._shows(shadow) for shadow in shadows], axis=0)
 
     def _shows(self, shadow: Shadow) -> np.ndarray:
-        """Pixels (..., rows, columns) bool that show a device."""
         thickness = device_thickness(self.carm, shadow.points, shadow.radius)
         radii = np.asarray(shadow.radius, dtype=np.float64)
         if radii.ndim == np.ndim(shadow.points) - 1:

@@ -7,9 +7,6 @@ and what a pixel receives of a disc is the area the two share, which has a close
 form: nothing is tabulated, and nothing is lost between pixels. The axis of a device is
 a smooth curve through its joints.
 
-Numba compiles this module when it is first called and keeps the result beside it.
-Importing numba takes longer than loading a task, so `device` imports this module only
-when there is something to draw.
 """
 
 import math

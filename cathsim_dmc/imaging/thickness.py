@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from cathsim_dmc.anatomy.parts import Surface
+from cathsim_dmc.imaging import kernel
 from cathsim_dmc.imaging.carm import NEAREST, CArm
 
 
@@ -50,8 +51,6 @@ def surface_thickness(
             f"the surface comes within {NEAREST:g} m of the X-ray source; move the "
             "isocentre onto the anatomy (CArm.centred_on)."
         )
-    from cathsim_dmc.imaging import kernel  # late: it brings the compiler
-
     # From pixel to ray index: ray i sits at (i + 0.5) / supersample - 0.5.
     grid = (pixels + 0.5) * supersample - 0.5
     corners = np.rint(grid * kernel.SUBDIVISIONS).astype(np.int64)

@@ -51,7 +51,6 @@ def install(function: Callable) -> int:
 
 
 def _append(function: Callable, mark: int) -> None:
-    """Puts one more link at the end of the chain."""
     before = mujoco.get_mjcb_control()
     if before is not None and not hasattr(before, "argtypes"):
         raise RuntimeError(
@@ -66,7 +65,6 @@ def _append(function: Callable, mark: int) -> None:
 
 
 def _called(before) -> Callable:
-    """Compiled call of what stood in the chain before."""
     if before is None:
 
         @_compiled

@@ -9,6 +9,7 @@ import numpy as np
 from cathsim_dmc.entities.chain import hinge_time
 from cathsim_dmc.entities.coaxial import Links, Overlap
 from cathsim_dmc.entities.device_stack import DeviceStack
+from cathsim_dmc.physics import sliding_loops
 from cathsim_dmc.physics.readings import ids
 
 # Fields of the model that change as the devices slide. The constants that MuJoCo
@@ -38,9 +39,6 @@ class ChainFields:
 
     def __init__(self, model: mujoco.MjModel, chain: DeviceStack):
         """Finds the elements of the chain in a compiled model."""
-        from cathsim_dmc.physics import sliding_loops  # late, as it takes long
-
-        self._write = sliding_loops.write
         bodies = ids(model, chain.links)
         joints = np.sort(ids(model, chain.bends))
         places = [joints, model.jnt_dofadr[joints], model.jnt_qposadr[joints]]
@@ -67,7 +65,7 @@ class ChainFields:
             row: which of them.
         """
         chain = made.stiffness, made.damping, made.rest, *made.links
-        self._write(row, self._places, chain, tuple(arrays))
+        sliding_loops.write(row, self._places, chain, tuple(arrays))
 
 
 class ChainProperties(NamedTuple):

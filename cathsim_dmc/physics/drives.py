@@ -13,6 +13,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
+from cathsim_dmc.compiled import compiled
 from cathsim_dmc.physics.stepper import CONTROL_TIMESTEP
 
 
@@ -26,9 +27,6 @@ class Drives:
 
     def __init__(self, model: mujoco.MjModel, arrays: Any):
         """Finds the servos; `arrays` has views `qpos`, `qvel` and `act` (N, ...)."""
-        from cathsim_dmc.physics import drives_loops  # late, as numba takes long
-
-        self._loops = drives_loops
         found = np.flatnonzero(
             model.actuator_dyntype == mujoco.mjtDyn.mjDYN_INTEGRATOR.value
         )
@@ -63,7 +61,7 @@ class Drives:
             Way (N, D) by which the clamps have slipped in the last one, m and rad.
         """
         arrays, slip = self._arrays, np.zeros_like(self.told)
-        self._loops.follow(
+        _follow(
             *(arrays.qpos, arrays.qvel, arrays.act),
             *(self._places, self._constants),
             *(self.told, self.slipped),
@@ -78,3 +76,21 @@ def hold(model: mujoco.MjModel, data: mujoco.MjData) -> Drives:
     drives = Drives(model, types.SimpleNamespace(**arrays))
     drives.hold(0)
     return drives
+
+
+@compiled
+def _follow(qpos, qvel, act, places, constants, told, slipped, command, slip):
+    """Corrects servos, of a control step to come, see `Drives.follow`."""
+    for i in range(len(qpos)):
+        for k in range(places.shape[1]):
+            gain, stiffness, damping, limit, reach = constants[:, k]
+            place = qpos[i, places[0, k]]
+            brake = damping * qvel[i, places[1, k]]
+            effort = gain * act[i, places[2, k]] - (stiffness * place + brake)
+            if abs(effort) >= limit:
+                slip[i, k] = told[i, k] - place
+                told[i, k] -= slip[i, k]
+                slipped[i, k] += abs(slip[i, k])
+                effort = min(max(effort, -limit), limit)
+            act[i, places[2, k]] = (stiffness * told[i, k] + effort + brake) / gain
+            told[i, k] += command[i, k] * reach

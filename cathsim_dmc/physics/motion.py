@@ -15,7 +15,7 @@ from typing import Protocol
 import mujoco
 import numpy as np
 
-from cathsim_dmc.anatomy import Anatomy, Surface
+from cathsim_dmc.anatomy import Anatomy, Surface, motion_loops
 from cathsim_dmc.anatomy.motion import Motion
 from cathsim_dmc.entities.chain import Chain
 from cathsim_dmc.physics.drawn import Range, drawable, drawn
@@ -96,10 +96,7 @@ class Moving(Effect):
 
     def num_parameters(self, chain: Chain) -> int:
         """Those of `motion_loops`."""
-        from cathsim_dmc.anatomy import motion_loops  # late, as numba takes long
-
         del chain
-        self._loops = motion_loops
         return motion_loops.PARAMETERS
 
     def bind(self, world: World) -> None:
@@ -138,7 +135,7 @@ class Moving(Effect):
         if self.flow is not None:
             values |= self.flow.heart(index)
         self.world.parameters[index] = (
-            self._loops.MARK,
+            motion_loops.MARK,
             *values.values(),
             *self._geoms,
         )
@@ -163,7 +160,7 @@ class Moving(Effect):
 
     def entered(self, index: int, nodes: np.ndarray) -> int:
         """Number of the first node (P, 3) of a device, m, that is past the inlet."""
-        return self._loops.first_past(self._inlets[index], nodes)
+        return motion_loops.first_past(self._inlets[index], nodes)
 
     def at_rest(self, state: Readings) -> Readings:
         """Readings with the places at rest of those in space; the sheath rests."""

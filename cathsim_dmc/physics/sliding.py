@@ -20,6 +20,7 @@ from cathsim_dmc.entities.coaxial import Overlap
 from cathsim_dmc.entities.device_stack import DeviceStack
 from cathsim_dmc.entities.robot import postures
 from cathsim_dmc.imaging.device import Shadow
+from cathsim_dmc.physics import sliding_loops
 from cathsim_dmc.physics.chain_fields import (
     FIELDS,
     ChainFields,
@@ -68,11 +69,8 @@ class SlidingDevices(SingleDevice):
 
     def bind(self, world: World) -> None:
         """Finds the places in the model."""
-        from cathsim_dmc.physics import sliding_loops  # late, as it takes long
-
         super().bind(world)
         self._slipped = np.zeros((world.num_simulations, 2 * len(self._entity.devices)))
-        self._loops = sliding_loops
         self._index, self._qpos = world.index, world.arrays.qpos
         self._internal_force = world.arrays.cfrc_int[:, world.index.links]
         self._start_depth = world.start_depth
@@ -143,7 +141,7 @@ class SlidingDevices(SingleDevice):
         told = step * action[:, 0::2]
         moved = self._clamped(told, leaders)
         self._slipped[:, 0::2] += np.abs(told - moved)
-        target, lead = self._loops.advance(
+        target, lead = sliding_loops.advance(
             before,
             moved,
             # A device may be withdrawn until its end has left the patient.
@@ -174,26 +172,25 @@ class SlidingDevices(SingleDevice):
         return np.where(excess < 0.0, told, given)
 
     def _reached(self) -> np.ndarray:
-        """Insertion (N,) of the chain, m."""
         return self._qpos[:, self._index.insertion_qpos].copy()
 
     def _held(self, reached: np.ndarray) -> np.ndarray:
         """Insertions (N, K): leading devices as measured, the others as commanded."""
-        return self._loops.held(np.ascontiguousarray(self._insertion), reached)
+        return sliding_loops.held(np.ascontiguousarray(self._insertion), reached)
 
     def _turn(
         self, rate: np.ndarray, lead: np.ndarray, state: Readings
     ) -> tuple[Overlap, np.ndarray]:
         """Turns the devices; their overlap, and rotations (N, K, J) at the joints."""
         stack, rods = self._stack, self._rods
-        gaps = self._loops.gaps(np.ascontiguousarray(self._insertion))
+        gaps = sliding_loops.gaps(np.ascontiguousarray(self._insertion))
         overlap, turns = stack.overlap(gaps), rods.at_joints(self._angles, gaps)
         bends, _ = stack.bent(self._qpos[:, self._places.qpos])
         loads = np.empty((3, *turns.shape))
         loads[0], loads[1] = stack.restoring(overlap, bends, turns)
         loads[:2] *= self._factor[:, None, None]
         # Nothing rubs in the sheath.
-        force = self._loops.rubbing(
+        force = sliding_loops.rubbing(
             state.external_force, lead, self._start_depth, stack.nodes
         )
         loads[2] = stack.wall_friction(overlap, force, self._friction)
@@ -233,7 +230,7 @@ class SlidingDevices(SingleDevice):
         every, leaders = np.arange(len(gaps)), np.argmin(gaps, axis=1)
         # What the wall does to the links beyond; forces within are not MuJoCo's state.
         beyond = -np.cumsum(state.external_force[:, ::-1], axis=1)[:, ::-1]
-        start[every, leaders] = self._loops.leading_load(
+        start[every, leaders] = sliding_loops.leading_load(
             np.ascontiguousarray(beyond), state.centreline, gaps, stack.nodes
         )
         stiff = overlap._replace(
@@ -279,7 +276,7 @@ class SlidingDevices(SingleDevice):
     def read(self, readings: Readings) -> CoaxialReadings:
         """State of the devices at the readings of a control step."""
         insertion = self.pushed()
-        gaps = self._loops.gaps(insertion)
+        gaps = sliding_loops.gaps(insertion)
         push = self._axial.copy()
         push[np.arange(len(gaps)), gaps.argmin(axis=1)] += readings.push_force
         return CoaxialReadings(
@@ -300,13 +297,13 @@ class SlidingDevices(SingleDevice):
             line: (N, L + 1, 3), `Readings.centreline`.
             places: behind its base the device is straight.
         """
-        return self._loops.points(line, places, self._stack.nodes)
+        return sliding_loops.points(line, places, self._stack.nodes)
 
     def shadows(self, line: np.ndarray) -> list[Shadow]:
         """The devices as X-rays meet them on a centreline, innermost first."""
         nodes = self._stack.nodes
         insertion = self.pushed()
-        gaps = self._loops.gaps(insertion)
+        gaps = sliding_loops.gaps(insertion)
         # A device has one point more than the chain: behind, its own nodes, its end.
         beyond = (nodes < gaps[..., None]).sum(axis=-1, keepdims=True)
         own = np.arange(len(nodes)) - np.maximum(beyond - 1, 0)
@@ -329,6 +326,6 @@ class SlidingDevices(SingleDevice):
         if gaps.shape[1] == 1:
             return readings.push_force.copy()
         force = np.ascontiguousarray(self._internal_force)
-        return self._loops.leading_load(
+        return sliding_loops.leading_load(
             force, readings.centreline, gaps, self._stack.nodes
         )

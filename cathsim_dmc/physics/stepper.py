@@ -8,6 +8,7 @@ the simulation that composer steps, `simulation.batch` those of `mujoco.batch`.
 """
 
 import abc
+import math
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any, Protocol
@@ -15,6 +16,7 @@ from typing import Any, Protocol
 import mujoco
 import numpy as np
 
+from cathsim_dmc.compiled import compiled
 from cathsim_dmc.entities.chain import TIMESTEP
 from cathsim_dmc.physics import forces, readings
 
@@ -52,8 +54,6 @@ class Stepper(abc.ABC):
 
     def __init__(self, model: mujoco.MjModel, num_simulations: int, substeps: int):
         """Finds the wall, its sensor and what touches it in the compiled scene."""
-        from cathsim_dmc.physics import stepper_loops  # late, as numba takes long
-
         self.num_simulations, self.substeps = num_simulations, substeps
         self.repeated = np.zeros(num_simulations, np.int64)
         self.deepest: float | None = None
@@ -61,7 +61,7 @@ class Stepper(abc.ABC):
         self._before = self._warnings_before = np.empty(0)
         self._timestep, self._scratch = model.opt.timestep, mujoco.MjData(model)
         self._wall = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_GEOM, "wall")
-        self._fastest, self._links = stepper_loops.fastest, _moving(model)
+        self._links = _moving(model)
         self._views: tuple[np.ndarray, ...] = ()
 
     # What a simulator does.
@@ -159,7 +159,7 @@ class Stepper(abc.ABC):
         if not self._views:  # a batch looks for them each time
             names = ("qvel", "cdof", "xpos", "subtree_com")
             self._views = tuple(getattr(self.arrays, name) for name in names)
-        way = self._timestep * self._fastest(*self._views, *self._links)
+        way = self._timestep * _fastest(*self._views, *self._links)
         limit = forces.DEEPEST if self.deepest is None else self.deepest
         suspect = (depth + way > limit) & (depth <= limit) & ~warned
         for index in np.flatnonzero(suspect).tolist():
@@ -243,7 +243,6 @@ class SingleStepper(Stepper):
         return getattr(self._model, name)
 
     def _model_of(self, index: int) -> mujoco.MjModel:
-        """The only model."""
         del index
         return self._model
 
@@ -294,7 +293,7 @@ class SingleStepper(Stepper):
 
 
 def _moving(model: mujoco.MjModel) -> tuple[np.ndarray, ...]:
-    """What `stepper_loops.fastest` knows of the links that can touch a wall."""
+    """What `_fastest` knows of the links that can touch a wall."""
     links = np.flatnonzero((model.geom_contype == 0) & (model.geom_conaffinity != 0))
     bodies, last = model.geom_bodyid[links], []
     for body in bodies:
@@ -312,3 +311,31 @@ class _Arrays:
     def __init__(self, data: mujoco.MjData, fields: Sequence[str]):
         for field in (*fields, "ctrl", "userdata"):
             setattr(self, field, getattr(data, field)[None])
+
+
+@compiled
+def _fastest(velocity, motions, places, poles, parents, bodies, last, roots, reach):
+    """Largest velocity (N,) m/s of places of N devices, but along themselves."""
+    found = np.zeros(len(velocity))
+    total = np.empty((len(parents), 6))
+    for i in range(len(velocity)):
+        for dof in range(len(parents)):
+            for k in range(6):
+                total[dof, k] = motions[i, dof, k] * velocity[i, dof]
+                if parents[dof] >= 0:
+                    total[dof, k] += total[parents[dof], k]
+        for n in range(len(bodies)):
+            place, pole = places[i, bodies[n]], poles[i, roots[n]]
+            a, b, c, u, v, w = total[last[n]]
+            x, y, z = place[0] - pole[0], place[1] - pole[1], place[2] - pole[2]
+            u, v, w = u + b * z - c * y, v + c * x - a * z, w + a * y - b * x
+            along = 0.0
+            if n + 1 < len(bodies):
+                ahead = places[i, bodies[n + 1]]
+                x, y, z = ahead[0] - place[0], ahead[1] - place[1], ahead[2] - place[2]
+                along = (u * x + v * y + w * z) / (x * x + y * y + z * z)
+            u, v, w = u - along * x, v - along * y, w - along * z
+            speed = math.sqrt(u * u + v * v + w * w)
+            speed += reach[n] * math.sqrt(a * a + b * b + c * c)
+            found[i] = max(found[i], speed)
+    return found

@@ -20,9 +20,11 @@ the rigid wall has that contact's law.
 from __future__ import annotations
 
 import dataclasses
+import math
 
 import numpy as np
 
+from cathsim_dmc.compiled import compiled
 from cathsim_dmc.entities.chain import Chain
 from cathsim_dmc.entities.contact import CONTACT_SOLIMP, CONTACT_SOLREF
 from cathsim_dmc.physics.drawn import Range, drawable, drawn
@@ -38,6 +40,10 @@ _LAWS = np.array([(*CONTACT_SOLIMP, *CONTACT_SOLREF), (*SOLIMP, 0.0, 0.0)])
 # The secant of the rigid wall's law under this load, N, is its stiffness.
 _LOAD = 0.1
 
+POISSON = 0.5
+# Thickness of an artery over its radius, and the least: 1.4 and 1.0 mm at the ascending
+# and descending aorta (PMC3154923), 0.6 mm at a carotid.
+_RELATIVE, _THINNEST = 0.1, 0.6e-3
 _LIMITS = {
     "modulus": (1e4, 1e9, "Pa"),
     "thickness": (1e-4, 5e-3, "m"),
@@ -90,11 +96,9 @@ class Wall(Effect):
     def bind(self, world: World) -> None:
         """Finds the links in the model."""
         from cathsim_dmc.collision import carrying  # late, as numba takes long
-        from cathsim_dmc.physics import wall_loops
 
         super().bind(world)
         carrying.install()
-        self._contacts = wall_loops.contacts
         model, links = world.model, world.index.geoms
         self._geoms = links
         self._weight = model.body_invweight0[model.geom_bodyid[links], 0]
@@ -117,8 +121,7 @@ class Wall(Effect):
         self._write(index)
 
     def _write(self, index: int) -> None:
-        """Writes the contacts of one simulation."""
-        self._contacts(
+        contacts(
             self._geoms,
             self._radius[index],
             self._material[index],
@@ -143,3 +146,53 @@ def soften(chain: Chain) -> None:
     """Lets the contacts of a chain's links decide over those of the wall."""
     for geom in chain.link_geoms:
         geom.priority = 1
+
+
+@compiled
+def stiffness(radius, modulus, thickness, support):
+    """Stiffness of a tube under a point load, N/m; a NaN thickness is an artery's."""
+    if math.isnan(thickness):
+        thickness = max(_RELATIVE * radius, _THINNEST)
+    plane = 1.0 - POISSON**2
+    held = 4.0 * modulus * thickness**2 / (math.sqrt(3.0 * plane) * radius)
+    free = modulus / plane * thickness**3 / (12.0 * 0.149 * radius**3)
+    free *= radius * math.sqrt(radius / thickness)
+    return free ** (1.0 - support) * held**support
+
+
+@compiled
+def reference(stiffness, weight, first, last, relaxation):
+    """`solref` (2) of a spring, N/m, on a link of an inverse weight, 1/kg."""
+    scale = stiffness * last * (1.0 - first) * weight / first
+    return -scale * last / first, -scale * relaxation
+
+
+@compiled
+def contacts(geoms, radius, material, weight, rigid, laws, relaxation, solref, solimp):
+    """Writes the contacts of the links of one simulation.
+
+    Args:
+        geoms: (n,) numbers of the links' geoms.
+        radius: (n,) of the lumen around them, m, 0 for none.
+        material: (3,) modulus, thickness and support.
+        weight: (n,) inverse weights, 1/kg.
+        rigid: (n,) stiffness of the rigid wall's contact, N/m.
+        laws: (2, 7) of the rigid wall and of one that gives: `solimp`, then `solref`,
+            that of the latter not used.
+        relaxation: of a wall that gives, s.
+        solref: (ngeom, 2), written.
+        solimp: (ngeom, 5), written.
+    """
+    first, last = laws[1, 0], laws[1, 1]
+    for n in range(len(geoms)):
+        geom, found = geoms[n], rigid[n]
+        if radius[n] > 0.0:
+            found = stiffness(radius[n], material[0], material[1], material[2])
+        soft = found < rigid[n]
+        for k in range(5):
+            solimp[geom, k] = laws[1 if soft else 0, k]
+        solref[geom, 0], solref[geom, 1] = laws[0, 5], laws[0, 6]
+        if soft:
+            solref[geom, 0], solref[geom, 1] = reference(
+                found, weight[n], first, last, relaxation
+            )

@@ -13,6 +13,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Circle
 
 from cathsim_dmc.imaging import FluoroscopyOptions
+from cathsim_dmc.imaging.kernel import curve
 from cathsim_dmc.pictures.moment import Moment, fluoroscope_of, xray
 from cathsim_dmc.pictures.translucent import Glass, ParallelProjection, glass
 from cathsim_dmc.recording.geometry import force_colours, force_text
@@ -71,7 +72,6 @@ class Picture(Figure):
         return made
 
     def _repr_png_(self) -> bytes:
-        """PNG for notebooks."""
         stream = io.BytesIO()
         self.savefig(stream, format="png")
         return stream.getvalue()
@@ -179,8 +179,6 @@ def _points_per_mm(axes: Any) -> float:
 
 
 def _draw_device(axes: Any, moment: Moment, projection: ParallelProjection) -> None:
-    from cathsim_dmc.imaging.kernel import curve  # late: it brings the compiler
-
     line = projection.flat_mm(curve(np.float64(moment.device), _PIECES))
     radius = np.repeat(moment.radius, _PIECES)
     # Thicker than in truth, by half: as printed it would be two points wide.

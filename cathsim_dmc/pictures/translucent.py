@@ -182,7 +182,6 @@ def _lit(normal: np.ndarray, colour: np.ndarray) -> np.ndarray:
 
 
 def _over(image: np.ndarray, where: np.ndarray, colour, opacity) -> None:
-    """Lays colours over some pixels of an RGBA image."""
     below = image[where]
     cover = opacity[:, None]
     alpha = cover + below[:, 3:] * (1 - cover)

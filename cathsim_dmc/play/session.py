@@ -90,7 +90,6 @@ def play(
 
 
 def _save(episode: Episode, directory: Path) -> Path:
-    """Saves under the first number that is free."""
     number = 0
     while (path := directory / f"{episode.task}_{number:03d}{SUFFIX}").exists():
         number += 1

@@ -25,7 +25,6 @@ class _Scripted(Policy):
             self._action = np.zeros(shape)
 
     def act(self, observation: Any) -> np.ndarray:
-        """Actions (N, A), independent of the observation."""
         return self._action
 
 

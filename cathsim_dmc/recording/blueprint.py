@@ -116,7 +116,6 @@ def _tip(head: np.ndarray) -> rrb.Spatial3DView:
 
 
 def _robot(place: np.ndarray) -> rrb.Spatial3DView:
-    """View of the follower robot, which is far from the anatomy."""
     parts = ["+ $origin/robot/**", "+ $origin/sheath/**", "+ $origin/catheter"]
     return _world("Robot", place + ROBOT_OFFSET, place, contents=parts)
 
@@ -129,7 +128,6 @@ def _world(
     contents: Sequence[str] = ("+ $origin/**",),
     so_far: Sequence[str] = ("world/heat",),
 ) -> rrb.Spatial3DView:
-    """A view of the scene from an eye (3,) to a target (3,), m, world frame."""
     return rrb.Spatial3DView(
         origin="world",
         name=name,

@@ -229,7 +229,6 @@ class Episode:
 
 
 def _plain(value: Any) -> Any:
-    """Numpy values as JSON values; TypeError for all others."""
     if isinstance(value, np.generic | np.ndarray):
         return value.tolist()
     raise TypeError(f"{type(value).__name__} ({value!r}) has no JSON form")

@@ -164,7 +164,6 @@ def _begin(out: Path, options: ImageSetOptions) -> None:
 
 
 def _shards(out: Path, options: ImageSetOptions) -> list[_Shard]:
-    """The anatomies of all splits, none in two of them."""
     from cathsim_dmc.anatomy.arch import arch
 
     shards, taken = [], dict.fromkeys(SPLITS.values(), 0)
@@ -193,7 +192,6 @@ def _write_shard(shard: _Shard) -> tuple[int, str, Labels]:
 
 
 def _simulate_shard(shard: _Shard) -> tuple[int, str]:
-    """Writes one anatomy; the number of its frames, and a line about it."""
     from cathsim_dmc.anatomy.arch import arch
     from cathsim_dmc.anatomy.builder import ACCESSES
 
@@ -221,7 +219,6 @@ def _simulate_shard(shard: _Shard) -> tuple[int, str]:
 
 
 def _over(work: Callable[[Any], Any], jobs: list[Any], processes: int) -> Iterable[Any]:
-    """Results of the jobs in their order, from several processes."""
     if processes == 1 or len(jobs) < 2:
         yield from map(work, jobs)
         return
@@ -257,7 +254,6 @@ def _processor() -> float:
 
 
 def _card(options: ImageSetOptions, frames: dict[str, int]) -> str:
-    """The data card."""
     counts = zip(frames.items(), options.anatomies, strict=True)
     rows = [f"| {name} | {some} | {n} |" for (name, n), some in counts]
 

@@ -245,7 +245,6 @@ class EpisodeRecorder:
 
 
 def _columns(rows: list[dict[str, float]]) -> dict[str, list[float]]:
-    """Rows of named numbers as a list for each name."""
     return {name: [row[name] for row in rows] for name in (rows[0] if rows else ())}
 
 

@@ -74,7 +74,6 @@ def device_colours(count: int) -> np.ndarray:
 
 
 def _log_ends(log: Log, coaxial: CoaxialRecord, entity: str) -> None:
-    """Log the end of each coaxial device, in the device's colour."""
     ends = coaxial.ends(log.episode.catheter)
     for k, name in enumerate(coaxial.names):
         where = f"{entity}/{name}"

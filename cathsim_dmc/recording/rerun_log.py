@@ -95,7 +95,6 @@ def _fill(log: Log, drawing: Drawing) -> None:
 
 
 def _layout(episode: Episode, drawing: Drawing) -> Blueprint:
-    """How the viewer opens an episode."""
     vertices = drawing.surface.vertices
     low, high = vertices.min(0), vertices.max(0)
     planes = 0 if drawing.frames is None else drawing.frames.shape[-1]

@@ -46,7 +46,6 @@ def log_series(log: Log) -> None:
 
 
 def _log_devices(log: Log) -> None:
-    """Log how far each coaxial device has been pushed and turned."""
     coaxial = CoaxialRecord.of(log.episode)
     if coaxial is None:
         return

@@ -222,28 +222,23 @@ class _BatchStepper(Stepper):
         self._copy, self._own_fields = copy.copy(model), set[str]()
 
     def reset(self, indices: np.ndarray) -> None:
-        """Puts some simulations to the model's default state."""
         # Without a pass at the default pose, whose solution would warm-start ours.
         self.batch.reset(indices, stage=mujoco.mjtStage.mjSTAGE_NONE.value)
 
     def run(self) -> None:
-        """Does the physics steps of a control step."""
         self.batch.rollout(
             self.substeps, record=("sensordata",), out={"sensordata": self.rows}
         )
 
     @property
     def contact_rows(self) -> np.ndarray:
-        """Rows (N, S, K * 14) of the wall's sensor in the last control step."""
         return self.rows[..., self._contacts]
 
     def field(self, index: int, name: str) -> np.ndarray:
-        """A field of the model of one simulation, to be written."""
         self._own_fields.add(name)
         return self.batch.expand(name)[index]
 
     def _model_of(self, index: int) -> mujoco.MjModel:
-        """A copy of the model with the fields of one simulation."""
         for name in self._own_fields:
             getattr(self._copy, name)[:] = self.batch.expand(name)[index]
         return self._copy
@@ -252,11 +247,9 @@ class _BatchStepper(Stepper):
         """There is one anatomy."""
 
     def states(self) -> np.ndarray:
-        """States (N, nstate), mjSTATE_INTEGRATION, a copy."""
         return self.batch.state.copy()
 
     def set_states(self, indices: np.ndarray, states: np.ndarray) -> None:
-        """Writes states (K, nstate) of some simulations (K,)."""
         self.batch.state[indices] = states
 
     def _run(self, indices: np.ndarray, parts: int) -> None:
@@ -296,15 +289,12 @@ class _PoolStepper(_BatchStepper):
         self._loaded: dict[int | Anatomic, Any] = {}
 
     def field(self, index: int, name: str) -> np.ndarray:
-        """A field of the model of one simulation, to be written."""
         return getattr(self._models[index], name)
 
     def _model_of(self, index: int) -> mujoco.MjModel:
-        """The model of one simulation."""
         return self._models[index]
 
     def load(self, index: int, case: Anatomic) -> None:
-        """Puts an anatomy into the model of one simulation, before a forward pass."""
         if self._own:
             if self._loaded.get(index) is not case:
                 case.write(self._models[index])

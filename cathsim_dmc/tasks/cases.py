@@ -145,7 +145,6 @@ def _differences(
 
 
 def _array_names(model: mujoco.MjModel) -> list[str]:
-    """Names of the arrays of a model that are no text."""
     return [
         name
         for name in dir(model)

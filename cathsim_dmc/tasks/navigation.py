@@ -211,7 +211,6 @@ class Navigation(composer.Task):
         self._show_goal(physics)
 
     def _show_goal(self, physics):
-        """Puts the marker to a shifted goal; it only looks."""
         goal = self._scene.phantom.goals.get(self._scene.goal.name)
         if goal is not None and self.config.ranges.goal_shift:
             physics.bind(goal).pos = self.goal_position

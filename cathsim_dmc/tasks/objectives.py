@@ -360,7 +360,6 @@ class Cannulation(Shiftable, Routed):
 
 
 def _ways_to(anatomy: Anatomy, route: Centreline) -> LumenDistance:
-    """Shortest ways through the lumen of an anatomy to the end of a route."""
     vertices = anatomy.surface.vertices
     bounds = np.stack([vertices.min(0), vertices.max(0)])
     return LumenDistance(

@@ -12,6 +12,7 @@ from typing import cast
 import mujoco
 import numpy as np
 
+from cathsim_dmc.imaging import endoluminal
 from cathsim_dmc.imaging.angiograph import Planes
 from cathsim_dmc.imaging.device import Shadow
 from cathsim_dmc.imaging.fluoroscopy import Fluoroscope
@@ -181,7 +182,6 @@ class Rollout:
         self._goal_shift[index] = episode.goal_shift or 0.0
 
     def _pose_robot(self) -> None:
-        """Poses the follower's joints after the devices."""
         self._state.qpos[:, self.index.robot_qpos] = self._devices.follower_posture()
 
     def command(self, action: np.ndarray) -> None:
@@ -303,8 +303,6 @@ class Rollout:
 
     def _endoscope(self, indices: np.ndarray) -> dict[str, np.ndarray]:
         """What the heads of some simulations (K,) see of the wall, by name."""
-        from cathsim_dmc.imaging import endoluminal  # late: it brings the compiler
-
         moving, state = self.moving, self.readings
         warps = [
             endoluminal.AT_REST if moving is None else moving.warp(i) for i in indices

@@ -133,7 +133,6 @@ class _Posture:
         data: mujoco.MjData,
         advance: float,
     ):
-        """Takes the posture of a device that has settled."""
         self.advance = advance
         self._bends, self._insertion = index.bends_qpos, index.insertion_qpos
         data.qvel[:] = 0.0
@@ -255,7 +254,6 @@ def _refuse_outside(
 
 
 def _dof_of(model: mujoco.MjModel, place: int) -> int:
-    """Degree of freedom of the joint at a place in qpos."""
     return int(model.jnt_dofadr[np.flatnonzero(model.jnt_qposadr == place)[0]])
 
 

@@ -187,7 +187,6 @@ def validate_bench(
 
 
 def _row(experiment: Experiment, wire: Wire, half: str) -> dict[str, Any]:
-    """Figures of one frame."""
     angles = np.arange(TURNS if wire.kind == "angled" else 1) * (2.0 * np.pi / TURNS)
     results = {way: experiment.compare(wire, way, angles.tolist()) for way in WAYS}
     results |= {name: getattr(experiment, name)(wire) for name in BASELINES}

@@ -41,7 +41,6 @@ SPAN_LINK = 7e-3  # m, that of the tip
 
 
 def _uniform() -> devices.Device:
-    """A straight device that is all shaft."""
     one = devices.STEERABLE_5F
     return dataclasses.replace(
         one, tip=one.shaft, tip_shape=(), tip_length=LINK, tip_links=1

@@ -5,11 +5,14 @@ import numpy as np
 
 from cathsim_dmc.anatomy import Anatomy
 from cathsim_dmc.anatomy.motion import PULSE_PRESSURE, Motion, distensibility
+from cathsim_dmc.anatomy.motion_loops import MARK, PARAMETERS, courses, pulse
+from cathsim_dmc.collision import carrying
 from cathsim_dmc.entities.contact import (
     CONTACT_SOLIMP,
     CONTACT_SOLREF,
     FRICTION_STIFFNESS,
 )
+from cathsim_dmc.physics.flow import moving_velocities
 from cathsim_dmc.physics.stepper import PHYSICS_TIMESTEP
 from cathsim_dmc.validation.checks import Check, Checks
 from cathsim_dmc.validation.rig import bare, slider
@@ -28,17 +31,12 @@ _GRAVITY, _RIDE = 9.81, 2.0  # m/s², s
 
 def parameters(heart: float, breathing: float, soft: float) -> np.ndarray:
     """Parameters of a motion at 60 beats and 15 breaths a minute, of geom 0."""
-    from cathsim_dmc.anatomy.motion_loops import MARK
-
     course = [heart, breathing, soft, 1.0, 0.0, 4.6, 0.25, 0.0]
     return np.array([MARK, *course, 0.0, -1.0])
 
 
 def stirred(lumen, lattice: np.ndarray, friction: float = 0.0) -> mujoco.MjSpec:
     """A model of a moving wall alone, geom 0."""
-    from cathsim_dmc.anatomy.motion_loops import PARAMETERS
-    from cathsim_dmc.collision import carrying
-
     carrying.install()
     fixed = {"solref": CONTACT_SOLREF, "solimp": CONTACT_SOLIMP}
     spec = bare(lumen, lattice, friction=(friction, 0, 0), **fixed)
@@ -88,8 +86,6 @@ def diameters(anatomy: Anatomy) -> tuple[float, np.ndarray, np.ndarray]:
         Largest difference from what is prescribed, m; delays (2,) of the pulse between
         the places, and distance over pulse wave velocity (2,), s.
     """
-    from cathsim_dmc.anatomy.motion_loops import pulse
-
     course = parameters(0.0, 0.0, _SOFT)
     sides = np.array([[1, 0, 0], [-1, 0, 0]]) * (RADIUS - 1e-3)
     points = np.concatenate([sides + [0, 0, z] for z in PLACES])
@@ -151,8 +147,6 @@ def section_flow(anatomy: Anatomy, time: float) -> float:
     The velocity relative to the moving space is integrated over the section, whose
     points and normals come from where `Motion.to_space` puts it.
     """
-    from cathsim_dmc.physics.flow_loops import moving_velocities
-
     course = parameters(_HEART, _BREATHING, _SOFT)
 
     def there(radius, angle):
@@ -199,8 +193,6 @@ def ride(
         friction: Coulomb coefficient.
         inertial: Whether the wall rests instead, and all feel its acceleration.
     """
-    from cathsim_dmc.anatomy.motion_loops import courses
-
     course = parameters(_HEART, 0.0, 0.0)
     motion = rigid_motion(anatomy, np.array(way))
     spec = stirred(anatomy.lumen, motion.lattice, friction)

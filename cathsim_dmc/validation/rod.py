@@ -212,7 +212,6 @@ def buckling_check(name: str, column: Buckling) -> Check:
 
 
 def _add_guide(rig: Rig, index: int, end: str) -> None:
-    """Welds a link to a massless slider that cannot turn."""
     origin = float(np.sum(rig.lengths[:index]) - rig.lengths.sum())
     guide = rig.arena.mjcf_model.worldbody.add("body", name="guide", pos=(0, 0, origin))
     guide.add("inertial", pos=(0, 0, 0), mass=1e-3, diaginertia=(1e-9, 1e-9, 1e-9))

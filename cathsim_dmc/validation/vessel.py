@@ -14,7 +14,8 @@ from cathsim_dmc.anatomy.anatomy import Anatomy
 from cathsim_dmc.entities import devices
 from cathsim_dmc.entities.arena import BLOOD_DENSITY
 from cathsim_dmc.physics.blood import BLOOD_VISCOSITY, StillBlood
-from cathsim_dmc.physics.wall import RELAXATION, SOLIMP
+from cathsim_dmc.physics.flow import EXPONENT, velocities
+from cathsim_dmc.physics.wall import RELAXATION, SOLIMP, reference, stiffness
 from cathsim_dmc.simulation.batch import BatchSimulation
 from cathsim_dmc.validation import damping, motion
 from cathsim_dmc.validation.checks import Checks, Report
@@ -117,8 +118,6 @@ def volume_defect(anatomy: Anatomy) -> float:
 
 def profile() -> tuple[float, float]:
     """Profile in a straight tube: deviation over the mean, and flow over prescribed."""
-    from cathsim_dmc.physics.flow_loops import EXPONENT, velocities
-
     radius = 0.01
     circulation = tube(0.2, radius).circulation
     places, weights = np.polynomial.legendre.leggauss(64)
@@ -144,7 +143,6 @@ def indentation(
         loads: (n,), N.
     """
     from cathsim_dmc.collision import carrying
-    from cathsim_dmc.physics.wall_loops import reference, stiffness
 
     carrying.install()
     size, ball = 1e-3, kind == "sphere"
@@ -189,8 +187,6 @@ def stiffened(factor: float) -> float:
 
 def validate_vessel() -> Report:
     """Checks what `vessel` does to blood and wall."""
-    from cathsim_dmc.physics.wall_loops import stiffness
-
     checks = Checks()
     for speed in CROSS_FLOWS:
         name = f"cantilever of 0.2 m in a cross-flow of {speed:g} m/s"

@@ -9,6 +9,7 @@ import numpy as np
 
 from cathsim_dmc.anatomy import measures
 from cathsim_dmc.anatomy.anatomy import Anatomy
+from cathsim_dmc.anatomy.field_loops import FREE
 from cathsim_dmc.anatomy.scan import topology
 from cathsim_dmc.anatomy.scan.check import check_tree
 from cathsim_dmc.anatomy.surface import sampled
@@ -30,8 +31,6 @@ _PLACES = 20_000
 
 def field_error(anatomy: Anatomy) -> np.ndarray:
     """Difference (n,) between field and exact depth within 1 mm of the wall, m."""
-    from cathsim_dmc.anatomy.field_loops import FREE
-
     points, normals = sampled(anatomy.surface, _PLACES)
     away = np.random.default_rng(0).uniform(-1.2e-3, 1.2e-3, (_PLACES, 1))
     points = points + away * normals

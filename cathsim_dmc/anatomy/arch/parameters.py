@@ -168,7 +168,6 @@ class ArchParameters:
         self._check_spacings()
 
     def _check_bends(self) -> None:
-        """Refuses bends that are too tight for the lumen."""
         widest = max(getattr(self, f"{level}_radius") for level in LEVELS)
         radius, height = self.arch_radius, self.arch_height
         tightest = min(radius**2 / height, height**2 / radius)
@@ -190,7 +189,6 @@ class ArchParameters:
                 )
 
     def _check_spacings(self) -> None:
-        """Refuses branches without a wall between them."""
         before_lsa = self.bca if self.bovine else self.lcca
         pairs = [("lcca_lsa_spacing", before_lsa, self.lsa)]
         if not self.bovine:

@@ -116,7 +116,6 @@ def _in_space(p: ArchParameters, plane: Plane, flat: Array) -> Array:
 
 
 def _direction(branch: BranchParameters, plane: Plane) -> Array:
-    """First direction (3,) of a branch, from the vertical."""
     upright = np.array([0.0, 0.0, 1.0])
     aside = np.cross(upright, plane.along)
     direction = (
