@@ -1,7 +1,6 @@
 import dataclasses
 import re
 from pathlib import Path
-from unittest.mock import MagicMock
 
 import numpy as np
 import pytest
@@ -19,7 +18,7 @@ from cathsim_dmc.analysis.force_statistics import (
     recorded_forces,
 )
 from cathsim_dmc.entities.devices import DEVICES
-from cathsim_dmc.tasks.step import Step
+from cathsim_dmc.tasks.step import info_types
 
 
 def known_episode(**meta):
@@ -89,8 +88,14 @@ def test_episodes_that_end_at_different_steps_keep_apart(seed, steps, count):
 def test_every_name_in_the_page_of_forces_exists():
     text = Path(__file__).parents[1].joinpath("docs/forces.md").read_text()
     statistics = {field.name for field in dataclasses.fields(Statistics)}
-    infos = Step.info(MagicMock(outcome=MagicMock(terms={})))
-    known = {*infos, *QUANTITIES, *statistics, *FIGURES, *suite.TASKS, *DEVICES}
+    known = {
+        *info_types(()),
+        *QUANTITIES,
+        *statistics,
+        *FIGURES,
+        *suite.TASKS,
+        *DEVICES,
+    }
     known |= {f"{one}.{other}" for one in QUANTITIES for other in statistics}
     words = re.findall(r"`([a-z_0-9.]+)`", text)
     files = (r"[a-z_/]+\.(json|py)", r"summary\.forces", r"cathsim_dmc\.[a-z_.]+")

@@ -174,7 +174,7 @@ def force_boxes(by_task, looks, published, path):
         axes.set_ylim(-0.8, len(labels) - 0.4)
         axes.set_xlim(left=0)
         axes.set_title(task, fontsize=10)
-        axes.set_xlabel("largest contact force of an episode, mN")
+        axes.set_xlabel("largest contact, mN")
         axes.grid(axis="x", alpha=0.3)
     return _save(figure, path)
 
