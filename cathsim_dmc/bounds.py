@@ -81,7 +81,12 @@ def seed(name: str, value: Any) -> int:
 
 
 def seeds(name: str, value: Any, count: int) -> list[int]:
-    """The seeds of `count` simulations; a single one is that of the first."""
+    """One seed for each of `count` simulations.
+
+    Args:
+        value: Seed of the first simulation, from which the others count up, or one
+            seed for each.
+    """
     if _is_whole(value):
         last = whole(name, value, 0, MOST_SEED - count + 1) + count
         return list(range(last - count, last))
@@ -96,7 +101,11 @@ def seeds(name: str, value: Any, count: int) -> list[int]:
 
 
 def indices(name: str, value: Any, count: int) -> np.ndarray:
-    """Numbers (K,) of some of `count` simulations, sorted; None for all."""
+    """Numbers (K,) of some of `count` simulations, sorted, each once.
+
+    Args:
+        value: Integers in one row, at least one; None chooses all.
+    """
     if value is None:
         return np.arange(count)
     row = _row(value)
@@ -227,7 +236,11 @@ def mapping(name: str, value: Any, known: Iterable[str]) -> Mapping[str, Any]:
 
 
 def made(name: str, value: Any, kind: type, others: str = "") -> Any:
-    """A dataclass, as it is or from its fields; `others` is for the message."""
+    """A dataclass from a mapping of its fields; an object of it is taken as it is.
+
+    Args:
+        others: What else is allowed, for the message.
+    """
     if isinstance(value, kind):
         return value
     known = [field.name for field in dataclasses.fields(kind)]

@@ -35,6 +35,8 @@ def keep_together() -> None:
     from numba.core import caching
 
     class Together:
+        """A place for the cache of the package, with one stamp for all sources."""
+
         @classmethod
         def from_function(cls, py_func, py_file):
             if not Path(py_file).is_relative_to(_PACKAGE):
@@ -45,10 +47,10 @@ def keep_together() -> None:
             return _stamp()
 
     class BesideSource(Together, caching.InTreeCacheLocator):
-        pass
+        """In the folder of the source."""
 
     class OfUser(Together, caching.UserWideCacheLocator):
-        pass
+        """In the folder of the user, where that of the source is read-only."""
 
     caching.CacheImpl._locator_classes[1:1] = [BesideSource, OfUser]  # noqa: SLF001
 

@@ -40,7 +40,10 @@ def mapped(stream: BinaryIO) -> np.ndarray:
 
 
 def release(pages: np.ndarray) -> None:
-    """Drops the pages of what `mapped` returned, and what was written to them."""
+    """Drops the pages of what `mapped` returned; they are read again when touched.
+
+    What has been written into them is lost.
+    """
     if os.name == "posix":
         _library().madvise(pages.ctypes.data, pages.size, mmap.MADV_DONTNEED)
 

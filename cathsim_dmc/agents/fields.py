@@ -41,7 +41,10 @@ def _checked(default: Any, fits: Callable[[Any], bool], allowed: str) -> Any:
 
 
 def check_fields(config: Any) -> None:
-    """Raise ConfigError unless the fields have their types and bounds."""
+    """Raise ConfigError unless the fields of a dataclass have their types and bounds.
+
+    Lists become tuples. The bounds of a base class hold in its subclasses.
+    """
     for name, kind in typing.get_type_hints(type(config)).items():
         if typing.get_origin(kind) is ClassVar:
             continue

@@ -135,7 +135,11 @@ class Convolutions(nn.Module):
 
 
 class Body(nn.Module):
-    """Observation (and action, for a Q function) to hidden features."""
+    """Observation (and action, for a Q function) to hidden features.
+
+    Images alone go through the convolutions; wherever a vector is present, hidden
+    layers follow.
+    """
 
     def __init__(self, shapes: NetworkShapes, config: TrainingConfig, actions: int = 0):
         super().__init__()
@@ -163,7 +167,12 @@ class Body(nn.Module):
 
 
 class GaussianActor(nn.Module):
-    """Mean and deviation of the actions before the tanh, each (..., actions)."""
+    """Mean and deviation of the actions before the tanh, each (..., actions).
+
+    Args:
+        state_dependent_std: whether the deviation is an output of the network (SAC)
+            or one parameter per action (PPO).
+    """
 
     def __init__(
         self, shapes: NetworkShapes, config: TrainingConfig, state_dependent_std: bool

@@ -22,7 +22,11 @@ PolicyLike = str | Path | Checkpoint | Policy | PolicyFunction
 
 
 class FunctionPolicy(Policy):
-    """A function of the standard observations, without randomness of its own."""
+    """A function of the standard observations.
+
+    A function with randomness of its own, such as a network, acts deterministically:
+    with the middle of its distribution.
+    """
 
     def __init__(self, function: PolicyFunction, name: str | None = None):
         """Wraps a function; its name for reports is its own by default."""

@@ -47,7 +47,14 @@ def pretrained_path(name: str) -> Path:
 def read_pretrained(
     weights: str | Path,
 ) -> tuple[dict[str, Any], TensorDictSequential, NetworkShapes, TrainingConfig]:
-    """Card, network, sizes and settings of a policy; CheckpointError if damaged."""
+    """Card, network, sizes and settings of a policy.
+
+    Args:
+        weights: Path of the `.safetensors` file; the card lies beside it.
+
+    Raises:
+        CheckpointError: there is none, or it is damaged.
+    """
     from safetensors import SafetensorError
     from safetensors.torch import load
 

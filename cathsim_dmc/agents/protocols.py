@@ -227,7 +227,10 @@ def _bins(ranges: Randomisation, seed: int, arches: int) -> np.ndarray:
 
 
 def distinct(task: str, task_kwargs: Mapping[str, Any]) -> bool:
-    """Whether episodes differ by more than the published jitter of the start."""
+    """Whether episodes differ by more than the published jitter of the start.
+
+    Tasks outside the suite are taken to.
+    """
     if task not in suite.TASKS:
         return True
     ranges = Randomisation.make(task_kwargs.get("randomisation", False))

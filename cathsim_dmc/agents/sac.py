@@ -112,7 +112,11 @@ class SACConfig(ActorCriticConfig):
 
 
 class SAC(Learner):
-    """Updates from a replay memory of raw observations."""
+    """Updates from a replay memory.
+
+    The replay keeps raw observations; they are normalised with today's statistics
+    when sampled, so old and new transitions agree.
+    """
 
     metrics: ClassVar[tuple[str, ...]] = (
         "loss_actor",

@@ -79,7 +79,11 @@ class ForceTracker:
     """Statistics of the running episodes of N simulations, step by step."""
 
     def __init__(self, num_simulations: int):
-        """Starts N episodes."""
+        """Starts N episodes.
+
+        Args:
+            num_simulations: N.
+        """
         self._steps = np.zeros(num_simulations, dtype=np.int64)
         shape = (len(QUANTITIES), num_simulations)
         self._known = np.zeros(shape, dtype=bool)

@@ -108,7 +108,10 @@ class Anatomy:
 
     @cached_property
     def lumen(self) -> Field:
-        """Signed depth to the wall; built once and kept in a cache."""
+        """Signed depth to the wall, which a device touches.
+
+        Built when first asked for, and kept in `field_cache.cache_folder()`.
+        """
         if self.scanned:
             return field_cache.surface_field(self.surface, self.ends)
         return field_cache.tree_field(self.tree, self.ends)
@@ -156,7 +159,11 @@ class Anatomy:
         )
 
     def save(self, directory: str | os.PathLike[str]) -> Path:
-        """Write the anatomy into `directory`, whole, and return that path."""
+        """Write the anatomy into `directory` and return that path.
+
+        A reader finds the old anatomy or the new one. Of processes that save into one
+        directory at once, the last one's anatomy stays.
+        """
         directory = Path(directory)
         directory.mkdir(parents=True, exist_ok=True)
         arrays, header = _pack(self)

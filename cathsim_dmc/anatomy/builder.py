@@ -63,7 +63,15 @@ class VesselPlace:
 def placed(
     tree: VesselTree, inlet: VesselPlace | None, goals: Mapping[str, VesselPlace] | None
 ) -> tuple[VesselTree, tuple[End, ...], Inlet, dict[str, Goal]]:
-    """The tree from its inlet on, its ends, inlet and goals; or ValueError."""
+    """The tree from its inlet on, its flat ends, inlet and goals.
+
+    Args:
+        inlet: where the device enters; the first point of the root if None.
+        goals: by name; see `default_goals` if None.
+
+    Raises:
+        ValueError: if a place is not on its vessel, or lies behind the inlet.
+    """
     found = (
         default_goals(tree)
         if goals is None

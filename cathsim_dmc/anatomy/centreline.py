@@ -32,7 +32,10 @@ class CentrelinePoint(NamedTuple):
 
 
 class Projection(NamedTuple):
-    """Nearest place of a centreline: its arc length, distance and radius (...), m."""
+    """Nearest place of a centreline: arc length, distance and lumen radius there.
+
+    All three have the leading shape of the projected points and are in metres.
+    """
 
     arc_length: Array
     distance: Array

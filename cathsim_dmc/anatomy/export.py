@@ -102,7 +102,17 @@ def _summary(values: np.ndarray) -> tuple[float, float, float]:
 
 
 def write_mjcf(anatomy: Anatomy, path: str | os.PathLike[str]) -> tuple[int, Fidelity]:
-    """Write wall pieces, inlet and goals as .xml, m; their number and fidelity."""
+    """Write an anatomy as a model of convex geoms, with a site at the inlet and goals.
+
+    Args:
+        path: of the file, which must end in .xml; lengths in it are metres.
+
+    Returns:
+        How many pieces there are, and how well they stand for the lumen.
+
+    Raises:
+        ValueError: if the file name has another ending.
+    """
     import mujoco
 
     path = Path(path)

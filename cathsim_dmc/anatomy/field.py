@@ -149,7 +149,11 @@ class Field:
 
     @classmethod
     def from_tree(cls, tree: VesselTree, ends: Sequence[End] = ()) -> Field:
-        """Field of the union of a tree's tubes; a device passes its open ends."""
+        """Field of the union of a tree's tubes.
+
+        Args:
+            ends: flat ends; those that are open let a device pass.
+        """
         from cathsim_dmc.anatomy.tree_depth import TreeDepth
 
         measure = TreeDepth(tree, ends)
@@ -157,7 +161,12 @@ class Field:
 
     @classmethod
     def from_surface(cls, surface: Surface, ends: Sequence[End] = ()) -> Field:
-        """Field of what a closed surface encloses; a device passes its open ends."""
+        """Field of what a closed surface encloses.
+
+        Args:
+            surface: closed, normals outwards; flat over the ends.
+            ends: flat ends; those that are open let a device pass.
+        """
         from cathsim_dmc.anatomy.surface_depth import SurfaceDepth
 
         measure = SurfaceDepth(surface, ends)

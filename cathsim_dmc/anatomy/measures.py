@@ -98,7 +98,13 @@ def arch_type(drop: float) -> str:
 def measure(
     tree: VesselTree, start: Array | None = None, axis: Array | None = None
 ) -> ArchMeasures:
-    """Measure an arch from `start` (3,) m on, along `axis` (3,); the root's if None."""
+    """Measure a tree whose root is an aorta with its ascending end first.
+
+    Args:
+        start: (3,) m, where a device enters; the root's first point if None.
+        axis: (3,) unit vector of its first direction; that of the root's first 30 mm
+            if None.
+    """
     aorta = tree.root.centreline
     origin = aorta.points[0] if start is None else np.asarray(start, float)
     if axis is None:

@@ -56,7 +56,11 @@ class Motion:
         ends: Sequence[End],
         blood: Circulation,
     ) -> "Motion":
-        """The motion of an anatomy in a box (3,), (3,) m; open ends rest."""
+        """The motion of an anatomy, with its open ends at rest.
+
+        Args:
+            box: Corners (3,), (3,) m, of its lumen's field.
+        """
         low, high = box
         aorta = _along_aorta(blood, tree)
         shape = np.ceil((high - low) / _STEP).astype(int) + 1
@@ -68,7 +72,16 @@ class Motion:
         return cls(np.concatenate([low, [_STEP], shape, values.ravel()]))
 
     def check(self, name: str, heart: float, breathing: float) -> None:
-        """Raises ValueError if amplitudes of heart (m) and breathing fold space."""
+        """Refuses amplitudes that fold space.
+
+        Args:
+            name: Of the anatomy.
+            heart: Largest amplitude of the heart, m.
+            breathing: Largest amplitude of breathing.
+
+        Raises:
+            ValueError: if the displacement changes too steeply.
+        """
         shape = self.lattice[4:7].astype(int)
         values = self.lattice[7:].reshape(*shape, 8)
         steepest = 0.0

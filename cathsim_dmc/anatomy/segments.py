@@ -24,7 +24,12 @@ def arc_lengths(points: Array) -> Array:
 
 
 class Segments:
-    """Straight segments (s, 3) m, prepared for the projection of many points."""
+    """Straight segments prepared for the projection of many points at once.
+
+    Attributes are per segment: start (s, 3), direction (s, 3) not normalised,
+    length (s,). Distances come from the expanded square, so the work per
+    point and segment is two matrix products and a few elementwise passes.
+    """
 
     def __init__(self, start: Array, end: Array) -> None:
         self.start = start

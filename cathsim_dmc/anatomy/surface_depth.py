@@ -96,7 +96,11 @@ class SurfaceDepth:
         return self(every.reshape(-1, 3)[first])[same].reshape(every.shape[:-1])
 
     def crossings(self) -> tuple[np.ndarray, np.ndarray]:
-        """Faces (n,) that edges (n, 2) of other faces pierce."""
+        """Faces that an edge of another face pierces, and those edges' vertices.
+
+        Returns:
+            (faces (n,), edges (n, 2)), one pair for every crossing.
+        """
         import igl
 
         sides = self._wall[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)

@@ -35,7 +35,11 @@ class TreeDepth:
     """
 
     def __init__(self, tree: VesselTree, ends: Sequence[End] = ()):
-        """Finds the creases; ends that are not named are closed."""
+        """Finds the creases.
+
+        Args:
+            ends: flat ends of the tree; those that are not named are closed.
+        """
         lines = [vessel.centreline for vessel in tree.vessels.values()]
         self._nodes = np.concatenate([_rings(line) for line in lines])
         stops = np.cumsum([len(line.points) for line in lines])

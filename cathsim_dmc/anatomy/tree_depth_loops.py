@@ -16,7 +16,10 @@ _BEHIND = 20e-3
 
 @compiled
 def ring(nodes, k, u, x, y, z):
-    """A ring between nodes k and k + 1: axial and radial place of a point, radius."""
+    """A ring between nodes k and k + 1: axial and radial place of a point, radius.
+
+    Nodes are rows of centre (3), unit tangent (3) and radius.
+    """
     v = 1.0 - u
     a, b = nodes[k], nodes[k + 1]
     dx = x - (v * a[0] + u * b[0])

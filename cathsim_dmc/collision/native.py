@@ -324,7 +324,12 @@ def call_error(_, address, text, number):
 
 
 def callback(signature: str, cache: bool = True) -> Callable:
-    """Compiles a function that C calls, as `compiled` does; a pointer is an int64."""
+    """Compiles a function that C calls, once on each machine as `compiled` does.
+
+    Args:
+        signature: numba's, such as "void(int64, int64)"; a pointer is an int64.
+        cache: Whether it is kept on disk.
+    """
     keep_together()
 
     def decorate(function: Callable):

@@ -66,7 +66,14 @@ class AngiographyArena(composer.Arena):
         )
 
     def add_camera(self, name: str, target, distance: float, xyaxes, fovy=30.0):
-        """Adds a camera `distance` m from `target` (3,); axes (6,), `fovy` degrees."""
+        """Adds a camera that looks at a point.
+
+        Args:
+            target: point (3,) on the optical axis, m.
+            distance: distance from the point, m.
+            xyaxes: right and up directions (6,) of the image.
+            fovy: vertical field of view, degrees.
+        """
         right, up = xyaxes[:3], xyaxes[3:]
         backward = (
             right[1] * up[2] - right[2] * up[1],

@@ -46,7 +46,12 @@ TIP_COLOUR = (0.95, 0.75, 0.1, 1.0)
 
 
 def hinge_time(material: Any, timestep: float) -> Any:
-    """Damping over stiffness of a hinge, s, from the material's relaxation time."""
+    """Damping over stiffness of a hinge whose material has a relaxation time, s.
+
+    Args:
+        material: relaxation time of the material, s; a number or an array.
+        timestep: physics step, s.
+    """
     return np.maximum(material - timestep, 0.0)
 
 
@@ -369,7 +374,10 @@ class Chain(composer.Entity):
 
     @property
     def action_groups(self) -> tuple[int, ...]:
-        """Group of each entry of an action; the tip has one for each bending axis."""
+        """Group index of each entry of an action.
+
+        The tip motors of one bending axis form a group; every other entry is its own.
+        """
         tip = len(self.tip_motors)
         axes = [number % 2 for number in range(tip)]
         first = min(tip, 2)

@@ -179,7 +179,13 @@ def _pull(place, load, turns, gaps, edges, bending, moment, piece, device):
 def axial(
     gaps, nodes, lengths, edges, bending, moment, compliance, rest, bends, turns, slopes
 ):
-    """Axial forces (N, K, J) of the joints, N, see `Stack.axial`."""
+    """Axial forces (N, K, J) of the joints, see `Stack.axial`.
+
+    Args:
+        gaps, nodes, lengths, edges, bending, moment: see `overlaps`.
+        compliance, rest, bends, turns: see `restoring`.
+        slopes: (N, K, J), torque times the derivative of the rotation by the gap, N.
+    """
     count, devices, joints = turns.shape
     force = np.zeros(turns.shape)
     loads = np.empty(joints, np.complex128)

@@ -25,7 +25,11 @@ def wall_contact(friction: float) -> dict[str, Any]:
 
 
 def device_contact(friction: float) -> dict[str, Any]:
-    """Attributes of a geom of the device; the larger friction of two geoms acts."""
+    """Attributes of a geom of the device, which collides with walls only.
+
+    Args:
+        friction: Coulomb coefficient; MuJoCo takes the larger of the two geoms'.
+    """
     return {"contype": 0, "conaffinity": 1, **_surface(friction)}
 
 

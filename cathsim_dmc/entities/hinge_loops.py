@@ -119,7 +119,13 @@ def unloaded_hinges(shape):
 
 @compiled
 def free_hinges(shape, compliance, angles):
-    """Rest angles (N, J, 2) rad of the hinges, see `Stack.free_hinges`."""
+    """Rest angles (N, J, 2) of the hinges, see `Stack.free_hinges`.
+
+    Args:
+        shape: (N, J) complex, rest angles of the joints, rad.
+        compliance: (N, J), rad/(N·m).
+        angles: (N, 2 J), positions of the hinges, rad.
+    """
     count, joints = shape.shape
     bends, twists = bent(angles)
     free = np.empty((count, joints, 2))

@@ -123,7 +123,11 @@ def images(
 
 
 def masks(machines: Sequence[Planes], shadows: Sequence[Shadow]) -> np.ndarray:
-    """Device and vessel by plane (N, rows, columns, 2 planes) uint8, 0 or 255."""
+    """Segmentation (N, rows, columns, 2 planes) uint8, 0 or 255.
+
+    Channels: device and vessel of the frontal plane, then of the second one. Arguments
+    as in `images`.
+    """
     channels = []
     for plane, shape in enumerate(_resolutions(machines)):
         both = np.empty((len(machines), *shape, 2), dtype=np.uint8)
@@ -137,7 +141,10 @@ def masks(machines: Sequence[Planes], shadows: Sequence[Shadow]) -> np.ndarray:
 
 
 def pixels(machines: Sequence[Planes], points: np.ndarray) -> np.ndarray:
-    """Pixels (N, planes, K, 2), column and row, of points (N, K, 3) m, or -1."""
+    """Pixel coordinates (column, row) of points (N, K, 3), m: (N, planes, K, 2).
+
+    Points that no ray reaches, nearer to a source than its housing, are at -1.
+    """
     places = np.empty((len(points), len(machines[0]), points.shape[1], 2))
     for chosen in _alike(machines):
         for plane, fluoroscope in enumerate(machines[chosen[0]]):

@@ -99,7 +99,11 @@ class CArm:
         return cls(primary=primary, secondary=secondary, **fields)
 
     def centred_on(self, points: ArrayLike) -> "CArm":
-        """The same arm with its isocentre amid `points` (..., 3), world frame, m."""
+        """The same arm with its isocentre in the middle of the box round `points`.
+
+        Args:
+            points: (..., 3) world frame, m, for example the vertices of the lumen.
+        """
         points = np.asarray(points, dtype=np.float64).reshape(-1, 3)
         middle = 0.5 * (points.min(axis=0) + points.max(axis=0))
         return replace(self, isocentre=tuple(middle))
@@ -134,7 +138,14 @@ class CArm:
         return self.source_detector / self.pitch
 
     def camera(self, points: ArrayLike) -> np.ndarray:
-        """Right, down and depth (..., 3) m, from the source, of points (..., 3) m."""
+        """Coordinates of world points along the axes, seen from the source.
+
+        Args:
+            points: (..., 3) world frame, m.
+
+        Returns:
+            (..., 3) float64: right, down and depth, m.
+        """
         relative = np.asarray(points, dtype=np.float64) - self.source
         # Sums written out: a matrix product would round differently for batches.
         terms = relative[..., None, :] * self.axes

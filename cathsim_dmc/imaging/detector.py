@@ -125,7 +125,15 @@ def blurred(signal: ArrayLike, sigma: float) -> np.ndarray:
 
 
 def grey(signal: ArrayLike, gain: float = GAIN) -> np.ndarray:
-    """Grey levels uint8, round(255 gain signal) of (..., rows, columns)."""
+    """8-bit grey levels: round(255 gain signal), limited to 0..255; dark = opaque.
+
+    Args:
+        signal: (..., rows, columns), 1 behind plain tissue.
+        gain: share of full white given to signal 1.
+
+    Returns:
+        (..., rows, columns) uint8.
+    """
     level = np.asarray(signal, dtype=np.float32) * np.float32(255.0 * gain)
     level += np.float32(0.5)
     return np.clip(level, 0.0, 255.0, out=level).astype(np.uint8)

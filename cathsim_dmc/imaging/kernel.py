@@ -352,7 +352,16 @@ def count(
     skew: np.ndarray,
     out: np.ndarray,
 ) -> None:
-    """Writes a frame of quanta over `quanta`, see `detector.quantum_noise`."""
+    """Writes a frame of quanta over `quanta`, see `detector.quantum_noise`.
+
+    Args:
+        frame: (rows, columns) float32, signal.
+        quanta: float32, at signal 1.
+        draw: (rows * columns,) uint16, numbers of the quantiles.
+        quantiles: normal deviates, float32.
+        skew: their terms for skewness, float32.
+        out: (rows, columns) float32.
+    """
     zero = np.float32(0.0)
     # The skew term and rounding add 1/18 + 1/12 to the variance: taken off here.
     excess = np.float32(5.0 / 36.0)

@@ -26,7 +26,11 @@ class Drives:
     """
 
     def __init__(self, model: mujoco.MjModel, arrays: Any):
-        """Finds the servos; `arrays` has views `qpos`, `qvel` and `act` (N, ...)."""
+        """Finds the servos.
+
+        Args:
+            arrays: `qpos`, `qvel` and `act` (N, ...), views.
+        """
         found = np.flatnonzero(
             model.actuator_dyntype == mujoco.mjtDyn.mjDYN_INTEGRATOR.value
         )

@@ -151,7 +151,15 @@ class Effects:
     """The effects of a task, one after the other."""
 
     def __init__(self, effects: Sequence[Effect], world: World):
-        """Gives each effect its userdata; ValueError if the scene is for others."""
+        """Gives each effect its part of the world.
+
+        Args:
+            effects: Of one rollout only.
+            world: Simulations; its parameters are all of `userdata`.
+
+        Raises:
+            ValueError: if the scene was built for other effects.
+        """
         self._effects, self._user = tuple(effects), world.parameters
         needed = userdata_size(effects, world.chain)
         if self._user.shape[1] != needed:

@@ -156,7 +156,12 @@ class Flow(StillBlood):
         return out
 
     def read(self, time: np.ndarray, state: Readings) -> dict[str, np.ndarray]:
-        """Figures of `vessel.VesselReadings` at times (N,), s."""
+        """Figures of `vessel.VesselReadings`.
+
+        Args:
+            time: (N,) of the episodes, s.
+            state: At that time.
+        """
         found = self._at(state.head[:, None])[:, 0]
         if self._options is None:
             return {"blood_velocity": found[:, 5:]}
@@ -240,7 +245,7 @@ def velocities(points, growth, ends, radii, shares, ways, vessel, out):
             v = vessel[k]
             if square < nearest[v]:
                 nearest[v], segment[v] = square, k
-            # So many of the next, no longer each than this one, are farther away.
+            # So many of the next, none of which exceeds this one, are farther away.
             ahead = (math.sqrt(square) - math.sqrt(nearest[v])) * 0.999999
             step = int(ahead / abs(ways[k, 1] - ways[k, 0]))
             k += 1

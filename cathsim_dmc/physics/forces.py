@@ -89,7 +89,11 @@ NO_FORCE = WallForce(*(np.zeros(()) for _ in WallForce._fields))
 
 
 def wall_force(rows: np.ndarray) -> tuple[WallForce, np.ndarray]:
-    """Forces of rows (N, S, K * 14), S steps, and their deepest contacts (N,) m."""
+    """Summarises the sensor's rows (N, S, K * 14) of the S steps of a control step.
+
+    Returns:
+        Forces, and the depth (N,) of the deepest contact in them, m.
+    """
     from cathsim_dmc.physics import forces_loops  # late, as numba takes long
 
     *force, deepest = forces_loops.summed(rows, CONTACT_SIZE)
@@ -99,6 +103,15 @@ def wall_force(rows: np.ndarray) -> tuple[WallForce, np.ndarray]:
 def too_coarse(
     force: WallForce, depth: np.ndarray, deepest: float | None = None
 ) -> np.ndarray:
-    """Whether (N,) a contact is harder than `HARDEST`, or deeper than `deepest`, m."""
+    """Whether control steps need shorter physics steps.
+
+    Args:
+        force: Of N control steps.
+        depth: (N,), m, of the deepest contact in them.
+        deepest: m; None for `DEEPEST`.
+
+    Returns:
+        (N,) bool: some contact is harder than `HARDEST` or deeper than `deepest`.
+    """
     limit = DEEPEST if deepest is None else deepest
     return (force.peak_max > HARDEST) | (depth > limit)

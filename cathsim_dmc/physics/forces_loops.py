@@ -10,7 +10,15 @@ from cathsim_dmc.compiled import compiled
 
 @compiled
 def summed(rows, size):
-    """`forces.WallForce` and deepest contacts (5, N) of rows (N, S, K * size)."""
+    """The arrays (N,) of `forces.WallForce`, and the depth of the deepest contact.
+
+    Args:
+        rows: (N, S, K * size), of the sensor, which fills its places from the first.
+        size: numbers of a contact.
+
+    Returns:
+        (5, N).
+    """
     found = np.zeros((5, len(rows)))
     for i in range(len(rows)):
         for step in range(rows.shape[1]):
@@ -32,7 +40,12 @@ def summed(rows, size):
 
 @compiled
 def pressed(rows, size):
-    """Depth of the deepest contact, m, and the work ½ Σ f r of all, J: (2, N)."""
+    """Depth of the deepest contact, m, and the work ½ Σ f r of all, J: (2, N).
+
+    Args:
+        rows: (N, K * size), of the sensor.
+        size: numbers of a contact.
+    """
     found = np.zeros((2, len(rows)))
     for i in range(len(rows)):
         for place in range(0, rows.shape[1], size):

@@ -161,7 +161,15 @@ class ModelIndex:
         self.wall_contacts = wall_contacts(model)
 
     def reader(self, data) -> Callable[[], Readings]:
-        """A function that copies the readings of `MjData` or a `Batch` as they are."""
+        """Finds the readings in a simulator's arrays.
+
+        Args:
+            data: an `mujoco.MjData` or a `mujoco.batch.Batch` with `FIELDS` bound.
+
+        Returns:
+            A function that takes the readings as they stand, as copies, as long as
+            `data` lives.
+        """
         qpos, sensors = data.qpos, data.sensordata
         positions, velocities = qpos[..., self.qpos], data.qvel[..., self.dofs]
         motors = data.qfrc_actuator[..., self.dofs]

@@ -63,7 +63,11 @@ class SingleDevice(Effect):
         return postures(held)
 
     def shadows(self, line: np.ndarray) -> list[Shadow]:
-        """The devices as X-rays meet them on a centreline, innermost first."""
+        """The devices as X-rays meet them, from the innermost outwards.
+
+        Args:
+            line: (N, L + 1, 3), `Readings.centreline`.
+        """
         first = line[:, :1] + self._behind * (line[:, :1] - line[:, 1:2])
         return [Shadow(np.concatenate([first, line], axis=1), self._radius)]
 

@@ -264,7 +264,11 @@ class SlidingDevices(SingleDevice):
         return self._held(self._reached())
 
     def follower_posture(self) -> np.ndarray:
-        """Joints (N, len(JOINTS)) of the robot with the outer and inner device."""
+        """Joints (N, len(JOINTS)) of the robot that holds the outer and inner device.
+
+        Of more than two devices it holds the outermost and the innermost; of one, both
+        units work on the same.
+        """
         pushed, turned = self.pushed(), self._angles[..., 0]
         ends = (pushed[:, -1], turned[:, -1], pushed[:, 0], turned[:, 0])
         return postures(np.array(ends))
@@ -274,7 +278,11 @@ class SlidingDevices(SingleDevice):
         return self._angles[..., 0].copy()
 
     def read(self, readings: Readings) -> CoaxialReadings:
-        """State of the devices at the readings of a control step."""
+        """State of the devices.
+
+        Args:
+            readings: of the same control step.
+        """
         insertion = self.pushed()
         gaps = sliding_loops.gaps(insertion)
         push = self._axial.copy()
@@ -300,7 +308,11 @@ class SlidingDevices(SingleDevice):
         return sliding_loops.points(line, places, self._stack.nodes)
 
     def shadows(self, line: np.ndarray) -> list[Shadow]:
-        """The devices as X-rays meet them on a centreline, innermost first."""
+        """The devices as X-rays meet them, from the innermost outwards.
+
+        Args:
+            line: (N, L + 1, 3), `Readings.centreline`.
+        """
         nodes = self._stack.nodes
         insertion = self.pushed()
         gaps = sliding_loops.gaps(insertion)

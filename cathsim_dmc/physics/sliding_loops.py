@@ -62,7 +62,14 @@ def advance(before, step, least, most):
 
 @compiled
 def rubbing(force, lead, depth, nodes):
-    """Size (N, L) N of contact forces (N, L, 6) on links outside the sheath."""
+    """Size (N, L) of contact forces (N, L, 6) on the links outside the sheath, N.
+
+    Args:
+        force: torque and force, MuJoCo's `cfrc_ext`.
+        lead: (N,), insertion of the chain, m.
+        depth: of the chain's end past the mouth of the sheath at zero insertion, m.
+        nodes: (L + 1,), ends of the links from the end of the chain, m.
+    """
     count, links = force.shape[:2]
     size = np.zeros((count, links))
     for i in range(count):
@@ -75,7 +82,13 @@ def rubbing(force, lead, depth, nodes):
 
 @compiled
 def points(line, places, nodes):
-    """Points (N, K, P, 3) of a chain (N, L + 1, 3) at places (N, K, P) from its end."""
+    """Points (N, K, P, 3) of a chain (N, L + 1, 3) at places (N, K, P) from its end.
+
+    Args:
+        line: joints and head, from proximal to distal, m.
+        places: m; behind its base the device is straight.
+        nodes: (L + 1,), distance of the line's points from the end, m.
+    """
     found = np.empty((*places.shape, 3))
     last = len(nodes) - 1
     for i in range(places.shape[0]):
@@ -96,7 +109,14 @@ def points(line, places, nodes):
 
 @compiled
 def leading_load(force, line, ways, nodes):
-    """Axial force (N,) N in the leading device where it leaves the others."""
+    """Axial force (N,) in the leading device where it leaves the others, N.
+
+    Args:
+        force: (N, L, 6), on each link from the one before it, torque and force.
+        line: (N, L + 1, 3), m.
+        ways: (N, K), from the end of each device to that of the chain, m; K at least 2.
+        nodes: (L + 1,), distance of the line's points from the end, m.
+    """
     count, links = force.shape[:2]
     load = np.empty(count)
     for i in range(count):

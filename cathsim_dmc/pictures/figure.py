@@ -56,7 +56,10 @@ _POINTS_PER_INCH = 72.0
 
 
 class Picture(Figure):
-    """A figure in the shared style, which notebooks show without pyplot."""
+    """A figure that notebooks show without pyplot.
+
+    Its axes have the colours and scales of `cathsim_dmc.style`.
+    """
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         """As `matplotlib.figure.Figure`, on the canvas that needs no screen."""
@@ -103,7 +106,14 @@ def scene_figure(
     fluoroscopy: bool = True,
     pixels: int = 900,
 ) -> Picture:
-    """Draw a moment of an episode; ValueError if a view does not exist."""
+    """Draw a moment of an episode, without OpenGL.
+
+    Args:
+        fluoroscopy: Whether to put the X-ray image beside them.
+
+    Raises:
+        ValueError: if a view does not exist, or there is nothing to draw.
+    """
     unknown = [view for view in views if view not in VIEWS]
     if unknown or not (views or fluoroscopy):
         raise ValueError(f"views are {views!r}; give some of {', '.join(VIEWS)}")

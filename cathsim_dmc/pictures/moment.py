@@ -141,7 +141,11 @@ def fluoroscope_of(surface: Any, options: FluoroscopyOptions) -> Any:
 
 
 def xray(moment: Moment, options: FluoroscopyOptions, seed: int = 0) -> np.ndarray:
-    """The X-ray image (rows, columns) uint8 of a moment; `seed` of its noise."""
+    """The X-ray image (rows, columns) uint8 of a moment.
+
+    Args:
+        seed: Seed of the quantum noise, if the options ask for noise.
+    """
     state = np.random.RandomState(seed) if options.noise else None
     fluoroscope = fluoroscope_of(moment.rest, options)
     if moment.surface is not moment.rest:

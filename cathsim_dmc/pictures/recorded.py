@@ -101,7 +101,13 @@ def write(
     path: str | os.PathLike[str],
     fluoroscopy: bool = True,
 ) -> Path:
-    """Write an episode in the format that the file's name asks for."""
+    """Write an episode in the format that the file's name asks for.
+
+    Args:
+        env: The environment, for the anatomy and the shapes of the robot.
+        path: File to write, see `record`.
+        fluoroscopy: Whether a Rerun file has X-ray images.
+    """
     target = _checked(path)
     surface = navigation_of(env).scene.anatomy.surface
     if target.suffix == ".npz":

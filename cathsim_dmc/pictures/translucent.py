@@ -109,7 +109,12 @@ class Glass:
 def glass(
     vertices: np.ndarray, faces: np.ndarray, projection: ParallelProjection
 ) -> Glass:
-    """Draw a closed surface, (V, 3) m and (F, 3), as translucent glass."""
+    """Draw a closed surface as translucent glass.
+
+    Args:
+        vertices: (V, 3), metres, world frame.
+        faces: (F, 3), counter-clockwise seen from outside.
+    """
     fine = replace(projection, pixels=projection.pixels * _SAMPLES)
     rows, columns = (_SAMPLES * n for n in projection.shape)
     pixel, depth, normal = _hits(vertices, faces, fine, (rows, columns))

@@ -96,7 +96,11 @@ State = TypeVar("State", bound=Attempts)
 def advance(
     settings: AttemptSettings, state: State, place: Place, insertion: np.ndarray
 ) -> State:
-    """Counts progress at an insertion (...), m; begins and ends retries."""
+    """Counts progress over a control step; begins and ends retries.
+
+    Args:
+        insertion: (...), of the head's device, m.
+    """
     outside = place.excess > settings.tolerance
     gained = place.arc_length > state.best + settings.progress
     idle = gained | state.retracting

@@ -122,7 +122,16 @@ class CoaxialPlan(Route):
         wall_force: forces.WallForce,
         devices: CoaxialReadings,
     ) -> tuple[np.ndarray, Attempts]:
-        """Action (N, 2 K) in [-1, 1] and state of one control step: a pure function."""
+        """One control step of the expert: a pure function.
+
+        Args:
+            state: after the last step, arrays (N,).
+            readings: of the chain, arrays (N, ...).
+            wall_force: arrays (N,); its `max` slows the devices down.
+
+        Returns:
+            Action (N, 2 K) in [-1, 1] and the new state.
+        """
         # Every other attempt stays near the last place: both ways fail in some
         # branchings.
         steady = np.where(state.attempts % 2 == 1, state.arc_length, np.nan)

@@ -30,7 +30,12 @@ class Expert:
     """
 
     def __init__(self, plan: Plan | CoaxialPlan, settings: Settings | None = None):
-        """Takes a plan, and settings of its kind; None for the defaults."""
+        """Starts before the first episode; `for_task` makes the plan.
+
+        Args:
+            plan: Of a steerable device, or of coaxial devices.
+            settings: Of the same kind; None for the defaults.
+        """
         self.plan: Any = plan
         self._settings = settings or plan.settings()
         self.state: Attempts | None = None
@@ -39,7 +44,16 @@ class Expert:
     def for_task(
         cls, task: navigation.Navigation | Case, settings: Settings | None = None
     ) -> "Expert":
-        """The expert for a task or an anatomy; ValueError if it cannot steer."""
+        """The expert for a task, or for one of the anatomies that episodes draw from.
+
+        Args:
+            settings: Settings of its driving; those of coaxial devices are
+                `coaxial_pursuit.CoaxialSettings`.
+
+        Raises:
+            ValueError: if the device can neither be steered nor turned at its base, or
+                the settings are not for it.
+        """
         kind = CoaxialPlan if task.scene.coaxial else Plan
         if settings is not None and not isinstance(settings, kind.settings):
             raise ValueError(
@@ -49,7 +63,11 @@ class Expert:
         return cls(kind.for_task(task), settings)
 
     def reset(self, which: np.ndarray | None = None) -> None:
-        """Forgets simulations (mask or indices, None for all) that begin again."""
+        """Forgets the simulations that begin a new episode.
+
+        Args:
+            which: Mask or indices of the simulations, None for all.
+        """
         if which is None or self.state is None:
             self.state = None
             return
@@ -90,7 +108,11 @@ class ExpertPolicy(Policy):
     observation = "tracking"
 
     def __init__(self, seed: int = 0):
-        """Starts before the first episode; the expert draws no random numbers."""
+        """Starts before the first episode.
+
+        Args:
+            seed: Not used: the expert draws no random numbers.
+        """
         self._view: View | None = None
         # One for all simulations; where their anatomies differ, one for each.
         self._experts: dict[int, Expert] = {}
@@ -131,6 +153,10 @@ class ExpertPolicy(Policy):
         return np.concatenate(actions)
 
     def follow(self, action: np.ndarray) -> None:
-        """Replace the last actions by those (N, A) that were carried out."""
+        """Replace the last actions by those that were carried out.
+
+        Args:
+            action: (N, A) in [-1, 1].
+        """
         for index, expert in self._experts.items():
             expert.follow(action[[index]] if self._several else action)

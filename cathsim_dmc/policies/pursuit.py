@@ -140,7 +140,17 @@ class Plan(Route):
         wall_force: forces.WallForce,
         devices: CoaxialReadings | None = None,
     ) -> "tuple[np.ndarray, State]":
-        """Action (..., A) in [-1, 1] and state of one control step: a pure function."""
+        """One control step of the expert: a pure function.
+
+        Args:
+            state: after the last step, arrays (...).
+            readings: of the devices, arrays (...).
+            wall_force: arrays (...); its `max` slows the device down.
+            devices: of coaxial devices; not looked at.
+
+        Returns:
+            Action (..., A) in [-1, 1] and the new state.
+        """
         # Every other attempt stays near the last place: both ways fail in some
         # branchings.
         steady = np.where(state.attempts % 2 == 1, state.arc_length, np.nan)

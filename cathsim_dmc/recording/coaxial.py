@@ -50,7 +50,11 @@ class CoaxialRecord:
         return self.insertion.max(axis=1, keepdims=True) - self.insertion
 
     def ends(self, line: np.ndarray) -> np.ndarray:
-        """Ends (T+1, K, 3) m of devices on a line (T+1, L+1, 3) of joints and head."""
+        """Ends (T+1, K, 3) of the devices on a chain.
+
+        Args:
+            line: (T+1, L+1, 3), joints from proximal to distal, then the head.
+        """
         beyond = _beyond(line)
         found = np.empty((*self.gaps.shape, 3))
         for state, gaps in enumerate(self.gaps):
@@ -61,7 +65,11 @@ class CoaxialRecord:
         return found
 
     def outermost(self, line: np.ndarray) -> np.ndarray:
-        """Number (T+1, L) of the outermost device in the middle of each link."""
+        """Number (T+1, L) of the outermost device in the middle of each link.
+
+        Args:
+            line: (T+1, L+1, 3), joints from proximal to distal, then the head.
+        """
         beyond = _beyond(line)
         middle = (beyond[:, 1:] + beyond[:, :-1]) / 2
         number = np.broadcast_to(self.gaps.argmin(axis=1)[:, None], middle.shape).copy()
@@ -78,7 +86,11 @@ def _beyond(line: np.ndarray) -> np.ndarray:
 
 
 def device_meta(task: Any, rows: dict[str, np.ndarray]) -> list[dict[str, Any]]:
-    """What ``meta['devices']`` holds; rows of ``SERIES`` by name, (T+1, K)."""
+    """What ``meta['devices']`` holds.
+
+    Args:
+        rows: ``SERIES`` by name, (T+1, K).
+    """
     chain = task.scene.catheter
     return [
         {

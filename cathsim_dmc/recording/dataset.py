@@ -83,7 +83,15 @@ class DatasetError(ValueError):
 
 
 def read_episodes(path: str | os.PathLike[str]) -> Iterator[Any]:
-    """Episodes as `minari.EpisodeData`; DatasetError if there are none to read."""
+    """Episodes of a dataset, one after the other, as `minari.EpisodeData`.
+
+    Args:
+        path: Directory of the dataset, or the directory `data` in it.
+
+    Raises:
+        DatasetError: there is none, or it is damaged.
+        ModuleNotFoundError: minari is not installed.
+    """
     try:
         import minari
     except ModuleNotFoundError as error:

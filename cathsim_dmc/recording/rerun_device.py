@@ -28,7 +28,11 @@ DEVICE_COLOURS = ((90, 220, 190), SHAFT_COLOUR, (200, 170, 255))
 
 
 def log_catheter(log: Log, radii: np.ndarray) -> None:
-    """Log the device of link radii (L,) m, its head and its path."""
+    """Log the device as capsules coloured by what they press, its head and its path.
+
+    Args:
+        radii: (L,) radii of the links, metres.
+    """
     entity = "world/catheter"
     joints = log.episode.catheter
     states, links = joints.shape[0], joints.shape[1] - 1

@@ -38,7 +38,11 @@ class BodyGeom:
 
 
 def body_geoms(physics: Any) -> Iterator[BodyGeom]:
-    """The visible primitives of robot and sheath, in the order of the model."""
+    """The visible primitives of robot and sheath, in the order of the model.
+
+    Args:
+        physics: A dm_control ``Physics``.
+    """
     import mujoco
 
     model = physics.model

@@ -299,7 +299,11 @@ def write(
     path: Path, anatomy: Anatomy, states: States, options: SequenceOptions,
     seed: Sequence[int], **about: Any,
 ) -> int:  # fmt: skip
-    """Writes the file of an anatomy with attributes; returns its frames."""
+    """Writes the file of an anatomy, whole or not at all; returns its frames.
+
+    Args:
+        about: attributes of the file.
+    """
     import h5py
 
     rows, count = len(states.kept) * options.views * options.frames, options.frames

@@ -109,7 +109,11 @@ class StandardObservation(Transform):
 
 
 def standard_observations(env: EnvBase) -> TransformedEnv:
-    """An environment whose observation is VECTOR and/or PIXELS."""
+    """An environment whose observation is VECTOR and/or PIXELS, see `standard`.
+
+    Nested entries (forces and other information) are no part of the observation and
+    stay as they are; double precision becomes single.
+    """
     spec, batch = env.observation_spec, len(env.batch_size)
     keys = [
         name

@@ -29,7 +29,11 @@ class CommonChain:
     """
 
     def __init__(self, chain: Chain, shaft_link: float):
-        """Finds the places of the simulated joints and links."""
+        """Finds the places of the simulated joints and links.
+
+        Args:
+            shaft_link: longest link of the shaft, m.
+        """
         tip = max(device.tip_length for device in chain.devices)
         whole = Discretisation(max(COMMON_LENGTH, 2 * tip), shaft_link)
         self.num_links = len(whole.link_lengths(*chain.devices))
@@ -54,7 +58,11 @@ class CommonChain:
         self._share = np.round(share, 9)[:, None]  # without rounding errors at joints
 
     def joints(self, values: np.ndarray) -> np.ndarray:
-        """Values (..., J) of the joints shown, 0 for those that are not simulated."""
+        """Values (..., J) of the joints shown, from those (..., j) of the chain.
+
+        Base and torsion come first, then the bending hinges, of which those behind the
+        simulated links are 0.
+        """
         taken = values.take(self._joints, axis=-1)
         taken[..., self._missing] = 0.0
         return taken

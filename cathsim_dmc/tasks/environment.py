@@ -28,7 +28,11 @@ class Environment(composer.Environment):
     _plain = False
 
     def reset(self):
-        """Starts an episode; returns the first time step."""
+        """Starts an episode.
+
+        Returns:
+            The first time step.
+        """
         if not self._changes_model():
             self._mjcf_never_compiled = False
         timestep = super().reset()
@@ -36,7 +40,11 @@ class Environment(composer.Environment):
         return timestep
 
     def step(self, action) -> dm_env.TimeStep:
-        """Does a control step, or starts an episode after the end of one."""
+        """Does a control step, or starts an episode after the end of one.
+
+        Args:
+            action: As `action_spec` says.
+        """
         if self._reset_next_step or not self._plain or self._is_watched():
             return super().step(action)
         self._hooks.before_step(self._physics_proxy, action, self._random_state)

@@ -264,7 +264,11 @@ class Navigation(composer.Task):
 
     @property
     def scene(self) -> Scene:
-        """Entities and where they stand, in the anatomy of this episode."""
+        """Entities and where they stand, in the anatomy of this episode.
+
+        Where episodes draw their anatomy, a batch has another scene in each
+        simulation: see `Rollout.case`. This is the first one then.
+        """
         rollout = self.rollout
         return self._scene if rollout is None else rollout.case().scene
 

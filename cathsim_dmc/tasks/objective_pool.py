@@ -16,7 +16,11 @@ from cathsim_dmc.tasks.objectives import (
 
 
 def together(objectives: Sequence[Objective], chosen: np.ndarray) -> Objective:
-    """One objective for N simulations with objectives of numbers (N,)."""
+    """One objective for N simulations.
+
+    Args:
+        chosen: (N,), number of the objective of each simulation.
+    """
     numbers = np.unique(chosen)
     if len(numbers) == 1:
         return objectives[int(numbers[0])]

@@ -349,7 +349,12 @@ class Cannulation(Shiftable, Routed):
         return np.abs(self.goal_arc_length - place.arc_length) + place.distance
 
     def shifted(self, shift: np.ndarray) -> "Cannulation":
-        """The same objective, its goal moved by `shift` () or (N,) m in its branch."""
+        """The same objective with the goal moved along its branch.
+
+        Args:
+            shift: () or (N,), m, positive away from the ostium; the goal stays between
+                the ostium and the end of the branch.
+        """
         branch = self.branch
         start = branch.project(self.goal).arc_length
         stop = np.clip(start + shift, self.ostium, branch.length)

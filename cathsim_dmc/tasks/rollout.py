@@ -185,7 +185,11 @@ class Rollout:
         self._state.qpos[:, self.index.robot_qpos] = self._devices.follower_posture()
 
     def command(self, action: np.ndarray) -> None:
-        """Takes actions (N, A) float64 of a control step; physics steps must follow."""
+        """Takes the actions of a control step; its physics steps must follow.
+
+        Args:
+            action: (N, A) float64 as `actions.check_action` returns it.
+        """
         self._previous_action, self._action = self._action, action
         self._pose_robot()
         self._stepper.begin(self._effects.act(action, self.readings))

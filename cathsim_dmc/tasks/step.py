@@ -14,7 +14,12 @@ _INFO = ("distance", "insertion", "push_force", *forces.NAMES, "path_ratio")
 
 
 def info_types(terms: Sequence[str], living: bool = False) -> dict[str, type]:
-    """Type of each figure of `Step.info`, float or bool."""
+    """Type of each figure of `Step.info`, float or bool.
+
+    Args:
+        terms: Names of the terms of the reward.
+        living: Whether there are figures of the vessel.
+    """
     return {
         **dict.fromkeys(_INFO, float),
         **dict.fromkeys(INFO if living else (), float),

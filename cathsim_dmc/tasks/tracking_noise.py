@@ -17,7 +17,12 @@ class TrackingNoise:
     """
 
     def __init__(self, deviation: float, num_simulations: int):
-        """Starts without errors, of a standard deviation in m."""
+        """Starts without errors.
+
+        Args:
+            deviation: Standard deviation of each coordinate, m.
+            num_simulations: N.
+        """
         self.on = deviation > 0.0
         self._deviation = deviation
         self._line = np.zeros((num_simulations, 0, 3))

@@ -139,7 +139,11 @@ class Held:
         return self._advance(0.0)
 
     def release(self, points: np.ndarray) -> np.ndarray:
-        """Lays the wire along points (n, 3), m; its shape (n, 3) at rest, m."""
+        """Lays the wire along a line and lets it go; its shape (n, 3) at rest, m.
+
+        Args:
+            points: (n, 3) m, moved to the entry and, where too short, made longer.
+        """
         rig = self._rig
         end = points[-1] - points[-2]
         longer = points[-1] + 2.0 * self.length * end / np.linalg.norm(end)

@@ -95,7 +95,12 @@ class DeadEnd(NamedTuple):
 
 
 def dead_end(command: float, size: tuple[float, float] = GUIDING_TUBE) -> DeadEnd:
-    """Pushes the device against the end of a tube of a length and radius, m."""
+    """Pushes the device of the tasks against the end of a straight tube.
+
+    Args:
+        command: of the translation, in (0, 1].
+        size: length and radius of the tube, m.
+    """
     environment = in_tube(size)
     task = environment.task
     model, data = environment.physics.model.ptr, environment.physics.data.ptr

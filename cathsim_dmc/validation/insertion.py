@@ -69,7 +69,15 @@ def run(
     goal: str | Goal = "lcca",
     **options: Any,
 ) -> Insertion:
-    """Runs a script to its end or the episode's; RuntimeError if it diverges."""
+    """Runs a script until its end or that of the episode.
+
+    Args:
+        goal: it sets the stroke of the base.
+        **options: further fields of `tasks.navigation.NavigationConfig`.
+
+    Raises:
+        RuntimeError: if the simulation diverges.
+    """
     kwargs = {"random": seed, "anatomy": anatomy, "goal": goal, **options}
     environment = suite.load(suite.DOMAIN, "navigate", kwargs)
     task = environment.task

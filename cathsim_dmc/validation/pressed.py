@@ -66,7 +66,11 @@ class Jam(NamedTuple):
 
 
 def jam(pair: tuple[str, str]) -> Jam:
-    """Pushes guidewire and catheter to the end of their stroke, and on."""
+    """Pushes both devices at full speed to the end of their stroke, and on.
+
+    Args:
+        pair: Names of guidewire and catheter.
+    """
     options = {"devices": pair, "random": 1, "observation": "tracking"}
     environment = in_tube(JAM_TUBE, **options)
     task = environment.task
@@ -90,7 +94,11 @@ def jam(pair: tuple[str, str]) -> Jam:
 
 
 def checks(pair: tuple[str, str]) -> list[Check]:
-    """Presses a mass and jams a guidewire and catheter, and judges both."""
+    """Presses a mass and jams a pair, and judges both.
+
+    Args:
+        pair: Names of guidewire and catheter.
+    """
     made = Checks()
     depths, ripples = zip(*map(pressed, LOADS), strict=True)
     made.at_most(

@@ -35,7 +35,13 @@ SINGLE_TWIST_BOUND = 2.0
 def free_ends(
     rig: Rig, gaps: Sequence[float], turns: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Ends (T, 3), m, from the base, and directions (T, 3) of the last link at rest."""
+    """Ends (T, 3), m, from the base, and directions (T, 3) of the last link at rest.
+
+    Args:
+        rig: compiled, with coaxial devices.
+        gaps: (K,) from the end of each device to that of the chain, m.
+        turns: (T,), rotations of all devices, rad.
+    """
     entity = rig.catheter
     assert isinstance(entity, DeviceStack)
     ends = []

@@ -22,7 +22,11 @@ _GOAL_RADIUS = 8.0  # mm, the published task's
 
 
 def draw(anatomy: Anatomy, path: str | Path, title: str | None = None) -> None:
-    """Draws lumen, centrelines, goals and inlet from three sides."""
+    """Draws lumen, centrelines, goals and inlet from three sides.
+
+    Args:
+        title: over the picture; the anatomy's name if None.
+    """
     figure = Figure(figsize=(13.5, 5.6), layout="constrained")
     FigureCanvasAgg(figure)
     axes = figure.subplots(1, 3)

@@ -85,7 +85,11 @@ def build_arch(
 
 
 def build_seed(seed: ArchSeed, *, access: str = "ascending") -> Anatomy:
-    """Anatomy of one arch of a set, see `arch_set`; the same at every call."""
+    """Anatomy of one arch of a set, see `sampler.arch_set`; the same at every call.
+
+    Args:
+        access: as of `build_arch`.
+    """
     return build_arch(seed.parameters(), seed.name, access=access)
 
 
