@@ -10,8 +10,7 @@ import numpy as np
 CONTACT_SIZE = 1 + 3 + 1 + 3 + 3 + 3
 
 # A physics step was too long if one begins with a contact harder, N, or deeper, m, than
-# this: something crossed the lumen and hit the wall. It may hit again, and where the
-# last physics step of a control step ends is seen only in the next control step.
+# this, or a control step ends deeper: something crossed the lumen and hit the wall.
 HARDEST = 5.0
 DEEPEST = 0.3e-3
 # The control step is then done again with steps so many times shorter; a power of two,
