@@ -1,6 +1,6 @@
 """Test rigs: the catheter of the tasks, with their settings, under known loads."""
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import mujoco
 import numpy as np
@@ -18,10 +18,24 @@ from cathsim_dmc.entities.chain import Chain
 from cathsim_dmc.entities.contact import FRICTION
 from cathsim_dmc.tasks.config import PHYSICS_TIMESTEP
 
-# A rig has come to rest when no joint has moved by more than this, rad and m, over
-# that time, s. The constraint solver's tolerance leaves less. Until then the time is
-# the relaxation time of the hinges: a device damped by its material swings for minutes.
-REST_CHANGE, RESTING_TIME = 1e-6, 0.4
+RESTING_TIME = 0.4  # s
+
+
+class Rest(NamedTuple):
+    """How a rig comes to rest.
+
+    Attributes:
+        change: it is at rest when no joint moves by more over `RESTING_TIME`, rad
+            and m. The constraint solver's tolerance leaves less.
+        damping: least relaxation time of the hinges until then, s. Damped by its
+            material alone a device swings for minutes, and seems at rest as it turns.
+    """
+
+    change: float = 1e-6
+    damping: float = RESTING_TIME
+
+
+REST = Rest()
 
 
 def tube(length: float, radius: float, bend: float = 0.0) -> Anatomy:
@@ -201,14 +215,14 @@ class Rig:
         self,
         force=None,
         *,
-        rest_change: float = REST_CHANGE,
+        rest: Rest = REST,
         longest: float = 20.0,
     ) -> float:
         """Steps, strongly damped, until the device is at rest.
 
         Args:
             force: (3,) dead load on the distal end, N; None leaves what is applied.
-            rest_change: of every joint over one relaxation time, rad and m.
+            rest: when it is at rest, and how it is damped until then.
 
         Returns:
             The time that took, s.
@@ -220,17 +234,17 @@ class Rig:
         model, damping = self.model, self.model.dof_damping.copy()
         model.dof_damping[model.jnt_dofadr] = np.where(
             model.jnt_type == mujoco.mjtJoint.mjJNT_HINGE,
-            np.maximum(damping[model.jnt_dofadr], RESTING_TIME * model.jnt_stiffness),
+            np.maximum(damping[model.jnt_dofadr], rest.damping * model.jnt_stiffness),
             damping[model.jnt_dofadr],
         )
-        while change > rest_change:
+        while change > rest.change:
             before = self.data.qpos.copy()
             self.run(RESTING_TIME, force)
             change = np.abs(self.data.qpos - before).max()
             if self.data.time - start > longest:
                 raise RuntimeError(
                     f"after {longest} s a joint still moves by {change:.2g} in "
-                    f"{RESTING_TIME} s, more than {rest_change:g}; the load "
+                    f"{RESTING_TIME} s, more than {rest.change:g}; the load "
                     "is too large or the time too short"
                 )
         model.dof_damping[:] = damping
