@@ -1,13 +1,15 @@
 """Submissions to the leaderboard: what they hold, and what is refused."""
 
+import hashlib
 import importlib.util
 import json
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from cathsim_dmc import __version__
-from cathsim_dmc.agents import evaluation, pretrained, submission
+from cathsim_dmc.agents import actions, evaluation, pretrained, submission
 from cathsim_dmc.agents.episodes import EpisodeOutcome
 from cathsim_dmc.analysis.force_statistics import EpisodeForces, Statistics
 
@@ -68,6 +70,10 @@ def test_an_edited_or_a_short_submission_is_refused(played, script, tmp_path):
     path.write_text(json.dumps(values))
     with pytest.raises(ValueError, match="changed after"):
         script.read(path)
+    values["settings"]["task_kwargs"] = {"goal_radius": 0.02}
+    path.write_text(json.dumps({**values, "sha256": submission.seal(values)}))
+    with pytest.raises(ValueError, match="changes the options"):
+        script.read(path)
     values["episodes"] = values["episodes"][:3]
     path.write_text(json.dumps({**values, "sha256": submission.seal(values)}))
     with pytest.raises(ValueError, match="not the 100 episodes"):
@@ -87,3 +93,44 @@ def test_the_page_lists_the_submissions(script):
     rows = script.table([script.read(path) for path in script.FOLDER.glob("*.json")])
     text = script.PAGE.read_text()
     assert all(row in text for row in rows), "run docs/scripts/leaderboard.py"
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory):
+    """(file of the actions of four episodes, their evaluation)."""
+    path = tmp_path_factory.mktemp("recorded") / "mine.npz"
+    options = {"observation": "tracking", "task_kwargs": {"max_steps": 12}}
+    return path, actions.record_actions(
+        "random", path, "type1_lcca", episodes=4, **options
+    )
+
+
+def test_recorded_actions_give_the_same_episodes(recorded, tmp_path):
+    path, expected = recorded
+    found = submission.submit(str(path), tmp_path / "one.json", episodes=4)
+    again = json.loads(json.dumps(expected.to_dict()))
+    assert found["episodes"] == again["episodes"]
+    assert found["policy"] == "random, recorded actions"
+    assert found["settings"] == again["settings"]
+    assert found["policy_sha256"] == hashlib.sha256(path.read_bytes()).hexdigest()
+
+
+@pytest.mark.parametrize(
+    "changed, given, message",
+    [
+        ({}, {"episodes": None}, "4 episodes recorded are not the 100"),
+        ({}, {"task": "type1_bca"}, "actions of type1_lcca, not of type1_bca"),
+        ({"seeds": np.arange(4)}, {}, "not the 4 of the varied protocol"),
+        ({"lengths": np.ones(4, int)}, {}, "do not fit"),
+        ({"actions": np.full((48, 21), np.nan, np.float32)}, {}, "not finite"),
+        ({"actions": np.zeros((48, 21))}, {}, "no float32"),
+        ({"header": np.array("{}")}, {}, "holds no recorded actions"),
+    ],
+)
+def test_actions_of_other_episodes_are_refused(
+    recorded, tmp_path, changed, given, message
+):
+    path = tmp_path / "mine.npz"
+    np.savez(path, **{**np.load(recorded[0]), **changed})
+    with pytest.raises(ValueError, match=message):
+        submission.submit(str(path), tmp_path / "one.json", **{"episodes": 4, **given})

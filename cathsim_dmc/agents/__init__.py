@@ -8,6 +8,7 @@ import torchrl.collectors  # noqa: F401
 
 # isort: on
 
+from cathsim_dmc.agents.actions import record_actions
 from cathsim_dmc.agents.checkpoint import Checkpoint, CheckpointError
 from cathsim_dmc.agents.config import ConfigError, TrainingConfig
 from cathsim_dmc.agents.demonstrations import record_demonstrations
@@ -36,6 +37,7 @@ __all__ = [
     "load_policy",
     "make_config",
     "make_env",
+    "record_actions",
     "record_demonstrations",
     "train",
 ]

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from cathsim_dmc import __version__, files
-from cathsim_dmc.agents import evaluation, pretrained
+from cathsim_dmc.agents import actions, evaluation, pretrained
 from cathsim_dmc.agents.checkpoint import Checkpoint
 from cathsim_dmc.agents.report import require_registered
 from cathsim_dmc.policies import POLICIES
@@ -29,7 +29,8 @@ def submit(
     the commit gets the same episodes.
 
     Args:
-        policy: Name of a policy, "pretrained:NAME", or directory of a run.
+        policy: Name of a policy, "pretrained:NAME", file of a pretrained policy or of
+            `actions.record_actions`, or directory of a run.
         out: File to write, ending in .json.
         task: Name of the task; None takes the one that the policy was trained on.
         episodes: Number of episodes, fewer than those of the protocol to try it out.
@@ -39,7 +40,8 @@ def submit(
         The submission; "sha256" is the digest of all other entries.
 
     Raises:
-        ValueError: `out` is no .json file, or no such task.
+        ValueError: `out` is no .json file, no such task, or recorded actions are
+            damaged, of another task or of other episodes.
         CheckpointError: there is no such policy, or it is damaged.
     """
     out = Path(out)
@@ -48,9 +50,16 @@ def submit(
     if task is not None:
         require_registered(task)
     weights = digest_of(policy)
+    player: str | actions.RecordedActions = policy
+    if policy.endswith(actions.SUFFIX):
+        player = actions.RecordedActions(policy)
+        if task not in (None, player.task):
+            raise ValueError(f"{policy} holds actions of {player.task}, not of {task}")
+        require_registered(str(player.task))
+        actions.require_protocol(player, episodes)
     out.parent.mkdir(parents=True, exist_ok=True)
     result = evaluation.evaluate(
-        policy, task, episodes, protocol=PROTOCOL, num_threads=num_threads
+        player, task, episodes, protocol=PROTOCOL, num_threads=num_threads
     )
     submission = {
         "policy_sha256": weights,
@@ -80,12 +89,12 @@ def seal(submission: dict[str, Any]) -> str:
 
 
 def digest_of(policy: str) -> str | None:
-    """SHA-256 of the weights of a policy; None for one without a file."""
+    """SHA-256 of a policy's weights or recorded actions; None without a file."""
     if policy in POLICIES:
         return None
     if policy.startswith(pretrained.PREFIX):
         policy = str(pretrained.pretrained_path(policy))
-    if policy.endswith(pretrained.SUFFIX):
+    if policy.endswith((pretrained.SUFFIX, actions.SUFFIX)):
         return hashlib.sha256(Path(policy).read_bytes()).hexdigest()
     sums = json.dumps(dict(Checkpoint.open(policy).sha256), sort_keys=True)
     return hashlib.sha256(sums.encode()).hexdigest()

@@ -119,6 +119,8 @@ def submit(
 ) -> int:
     """Play a policy under the varied protocol and write a file for the leaderboard.
 
+    In place of a policy, a file of agents.record_actions is played again.
+
     Args:
         out: File to write, ending in .json.
         task: Task of `cathsim list`; by default the one that the policy was trained on.

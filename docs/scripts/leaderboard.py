@@ -10,6 +10,7 @@ import sys
 import figures
 
 from cathsim_dmc.agents import protocols, submission
+from cathsim_dmc.tasks.config import MAX_STEPS
 
 PAGE = figures.ROOT / "docs" / "leaderboard.md"
 FOLDER = figures.DATA / "leaderboard"
@@ -24,6 +25,9 @@ def read(path):
     wanted = protocols.get(submission.PROTOCOL).episodes
     if len(found["episodes"]) != wanted:
         raise ValueError(f"{path.name} has not the {wanted} episodes of the protocol")
+    options = found["settings"]["task_kwargs"]
+    if options not in ({}, {"max_steps": MAX_STEPS}):
+        raise ValueError(f"{path.name} changes the options of its task: {options}")
     return found
 
 
