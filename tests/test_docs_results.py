@@ -25,12 +25,12 @@ def script(monkeypatch):
 
 @pytest.fixture
 def page(script, tmp_path):
-    """Writes the page of `tmp_path`/results; returns (exit code, text)."""
+    """Writes pages of `tmp_path`/results; returns (exit code, text, that in detail)."""
 
     def write():
         out = tmp_path / "docs/results.md"
         code = script.main(["--results", str(tmp_path / "results"), "--out", str(out)])
-        return code, out.read_text()
+        return code, out.read_text(), out.with_name("results_detail.md").read_text()
 
     return write
 
@@ -47,23 +47,26 @@ def test_ours_stands_beside_the_published(page, tmp_path):
             tmp_path / "results", "type1_bca", "PPO-Internal", "ppo", "internal", seed,
             rate,
         )  # fmt: skip
-    code, text = page()
+    code, main, text = page()
     assert code == 0
     ours = line_of(text, "| PPO-Internal | 2 | 95 % / 53 % |")
     assert ours[3] == "90 %"  # the worst seed
     # Mean force and mean contact force, as `cathsim eval` calls them.
-    assert [float(cell.split(" ±")[0]) for cell in ours[5:7]] == [
+    assert [float(cell.split(" ±")[0]) for cell in ours[6:8]] == [
         pytest.approx(21.5, abs=1.0),
         pytest.approx(11.5, abs=1.0),
     ]
-    theirs = [ours[place].split(" / ")[1] for place in (2, 4, 6, 7)]
+    theirs = [ours[place].split(" / ")[1] for place in (2, 4, 7, 8)]
     assert theirs == ["53 %", "-70 ± 28", "11 ± 21", "121 ± 95"]
     assert "2 of the 38 cells" in text or re.search(r"\n2 of the \d+ cells", text)
     missing = line_of(text, "- PPO-Internal: type1_lcca (seed 0, 1, 2)")[0]
     assert "type1_bca (seed 2)" in missing
-    assert line_of(text, "PPO-Internal", "1 of 4")[2] == "2"
     assert line_of(text, "PPO-Sequential (missing)", "97 %")
-    for name in re.findall(r"\]\((images/\S+)\)", text):
+    short = ["PPO-Internal", "2", "95 % / 53 %", "– / 7 %", "– / 50 %", "– / 87 %"]
+    assert line_of(main, "| PPO-Internal | 2 |")[:6] == short
+    assert line_of(main, "| PPO-Internal |", "121")[1:] == ours[5:]
+    assert line_of(main, "PPO-Sequential")[1:3] == ["–", "– / 97 %"]
+    for name in re.findall(r"\]\((images/\S+)\)", main + text):
         assert (tmp_path / "docs" / name).stat().st_size > 5_000
     assert {path.name for path in (tmp_path / "docs/images").iterdir()} == {
         "results_curves.png",
@@ -86,7 +89,7 @@ def test_a_broken_file_is_named_and_left_out(page, tmp_path, capsys, damage):
         tmp_path / "results", "type1_bca", "PPO-Internal", "ppo", "internal", 0, 1.0
     )
     path.write_text(damage(path.read_text()))
-    code, text = page()
+    code, _, text = page()
     assert code == 1
     assert path.name in capsys.readouterr().err
     assert path.name in text and str(tmp_path) not in text

@@ -1,4 +1,4 @@
-"""Writes docs/results.md and its figures from the files of finished cells.
+"""Writes docs/results.md and results_detail.md from the files of finished cells.
 
     python benchmarks/trainings.py     # trains what is missing, into results/
     python docs/scripts/results.py
@@ -31,6 +31,7 @@ DOCS = Path(__file__).parents[1]
 PUBLISHED = DOCS / "data/published_results.json"
 DIFFICULTY = DOCS / "data/difficulty.json"
 TEST_ARCHES = DOCS / "data/test_arches.jsonl"
+PAGE, DETAIL_PAGE = "results.md", "results_detail.md"
 PUBLISHED_TASKS = ("type1_bca", "type1_lcca", "type2_bca", "type2_lcca")
 # Where learning with and without demonstrations is compared, and who needs them.
 DEMONSTRATED, TAUGHT = "type1_lcca", ("bc", "dagger")
@@ -39,50 +40,70 @@ NAMES = {"internal": "Internal", "image": "Image", "sequential": "Sequential"}
 INTRODUCTION = """\
 # Results
 
-Written by `python docs/scripts/results.py` from the JSON files in `results/`, one for
-each training; `python benchmarks/trainings.py` makes those that are missing.
+Success and force of trained agents beside those of the publication (Jianu et al.).
+[Results in detail](results_detail.md) has all columns, seeds, times of training and
+what is missing. `python docs/scripts/results.py` writes both pages from `results/`,
+which has a file for each training.
 
 Every policy acts deterministically in 30 episodes with their own seeds, by the
 published rule: 2,000 control steps at most, success within 8 mm of the goal and inside
-the target branch, the published reward. Reward and length of its training episodes may
-differ. Published figures are those of Jianu et al.; their simulator, walls and force
-readings differ ([physics](physics.md), [forces](forces.md)), so rates can be compared,
-forces only in their order of magnitude. Agents have the preset `tuned` unless their row
-says otherwise; those that read images have `tuned_image` ([settings](training.md)).
+the target branch. These episodes differ only by 1 mm of the start;
+[robustness](robustness.md) and the [leaderboard](leaderboard.md) have distinct
+conditions. Simulator, walls and force readings of the publication differ
+([physics](physics.md)), so rates can be compared, forces only in their order of
+magnitude. Agents have the preset `tuned`, or `tuned_image`, unless their row says
+otherwise ([settings](training.md)).
 """
 
-COLUMNS = """\
-Cells show ours / published. Success counts the episodes of all seeds, *worst* those of
-the worst seed. Episodes in one anatomy differ only by 1 mm of the start and have no
-interval; episodes in their own arches have Wilson's 95 % interval. Distinct conditions
-are in [robustness](robustness.md) (`cathsim eval --protocol varied`).
+SUCCESS = """\
+## Success
 
-[Forces](forces.md) are in mN, ± deviation over episodes: *mean force* is the sum over
-all contacts, mean over all steps; *contact force* is the largest contact, mean over the
-steps with contact, nearest to the published f_mean; *max force* is the largest contact
-of an episode, the published f_max.
+Cells show ours / published; – is not trained yet. *Mean* is the interquartile mean
+over tasks and seeds (Agarwal et al. 2021), with the 95 % interval of a bootstrap over
+seeds where there are several.
+"""
+
+FORCE = """\
+## Force
+
+Cells show ours / published, in mN, ± deviation over episodes
+([definitions](forces.md)): *mean* is the sum over all contacts, mean over all steps;
+*contact* is the largest contact, mean over the steps with contact, nearest to the
+published f_mean; *largest* is the largest contact of an episode, the published f_max.
+*Steps* is the length of the episodes.
+"""
+
+DETAIL = """\
+# Results in detail
+
+All columns of [results](results.md), written by the same script.
+
+Cells show ours / published. Success counts the episodes of all seeds, *worst* those of
+the worst seed; episodes in their own arches have Wilson's 95 % interval.
+Forces are in mN, ± deviation over episodes: see [results](results.md#force).
 """
 
 HEADER = (
-    "| agent | seeds | success | worst | reward | mean force | contact force "
-    "| max force |",
-    "|---|---|---|---|---|---|---|---|",
+    "| agent | seeds | success | worst | reward | steps | mean | contact | largest |",
+    "|---|---|---|---|---|---|---|---|---|",
 )
+# Places of the columns of `HEADER` on the page of results.
+FORCE_COLUMNS = (0, 5, 6, 7, 8)
 
 
 def main(arguments=None):
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--results", type=Path, default=DOCS.parent / "results")
     parser.add_argument("--grid", type=Path, default=HERE / "grid.toml")
-    parser.add_argument("--out", type=Path, default=DOCS / "results.md")
+    parser.add_argument("--out", type=Path, default=DOCS / PAGE)
     options = parser.parse_args(arguments)
     results, broken = read_all(options.results)
     cells = read_grid(options.grid)
     for line in broken:
         print(line, file=sys.stderr)
-    text = page(results, broken, cells, options.out)
     options.out.parent.mkdir(parents=True, exist_ok=True)
-    files.write_text(options.out, text)
+    for name, text in pages(results, broken, cells, options.out.parent).items():
+        files.write_text(options.out.with_name(name), text)
     return 1 if broken else 0
 
 
@@ -97,20 +118,18 @@ def read_all(directory):
     return results, broken
 
 
-def page(results, broken, cells, out):
-    """The text of the page; draws its figures beside it."""
+def pages(results, broken, cells, directory):
+    """Text of both pages by name; draws their figures beside them."""
     table = arranged(results, cells)
-    parts = [INTRODUCTION]
+    main, detail = [INTRODUCTION], [DETAIL]
     if results:
-        parts += [
-            aggregates(table),
-            beside_published(table),
-            other_tasks(table),
-            cost(table),
-            *drawn(table, out),
-        ]
-    parts.append(standing(results, broken, cells))
-    return "\n".join(part for part in parts if part)
+        main_figures, further_figures = drawn(table, directory)
+        main += [successes(table), force_tables(table), other_tasks(table)]
+        main += main_figures
+        detail += [full_tables(table), cost(table), *further_figures]
+    detail.append(standing(results, broken, cells))
+    parts = {PAGE: main, DETAIL_PAGE: detail}
+    return {name: "\n".join(filter(None, one)) for name, one in parts.items()}
 
 
 def arranged(results, cells):
@@ -165,21 +184,84 @@ def taught(result):
     return config["algorithm"] in TAUGHT or bool(config.get("demonstrations"))
 
 
-def beside_published(table):
-    """One table for each published task."""
-    published = json.loads(PUBLISHED.read_text())["agents"]
-    lines = ["## Beside the published figures", "", COLUMNS]
+def published_agents():
+    """Published figures, {agent: {task: figures}}."""
+    return json.loads(PUBLISHED.read_text())["agents"]
+
+
+def successes(table):
+    """Success on the published tasks: a row for each agent, ours or published."""
+    published, repeated = published_agents(), set()
+    header = ["agent", "seeds", *(f"`{task}`" for task in PUBLISHED_TASKS), "mean"]
+    lines = [SUCCESS, f"| {' | '.join(header)} |", "|---" * len(header) + "|"]
+    labels = dict.fromkeys(label for t in PUBLISHED_TASKS for label in table.get(t, {}))
+    for label in labels:
+        of_task = {
+            t: table[t][label] for t in PUBLISHED_TASKS if label in table.get(t, {})
+        }
+        repeated.add(label)
+        seeds = sorted({len(one) for one in of_task.values()})
+        count = "–".join(map(str, (seeds[0], seeds[-1]) if len(seeds) > 1 else seeds))
+        lines.append(success_row(label, count, of_task, published.get(label, {})))
+    for name, theirs in published.items():
+        if name not in repeated:
+            lines.append(success_row(name, "–", {}, theirs))
+    return "\n".join(lines) + "\n"
+
+
+def success_row(label, count, of_task, theirs):
+    """A line of `successes`."""
+    cells = [label, count]
     for task in PUBLISHED_TASKS:
-        lines += [f"### {task}", "", *HEADER]
-        agents_ = table.get(task, {})
+        found = of_task.get(task)
+        ours = percent(rate_of(found)[0]) if found else "–"
+        cells.append(f"{ours} / {percent(theirs[task]['success'])}" if theirs else ours)
+    whole, ours = len(of_task) == len(PUBLISHED_TASKS), "–"
+    if whole:
+        rates = [[result.success for result in one] for one in of_task.values()]
+        mean, interval = interquartile_mean(rates)
+        ours = percent(mean)
+        if interval is not None:
+            ours += f" ({100 * interval[0]:.0f}–{100 * interval[1]:.0f})"
+    if theirs:
+        rates = [[theirs[task]["success"]] for task in PUBLISHED_TASKS]
+        ours += f" / {percent(interquartile_mean(rates)[0])}"
+    return f"| {' | '.join([*cells, ours])} |"
+
+
+def force_tables(table):
+    """Steps and forces on each published task, of the agents that are trained."""
+    published, lines = published_agents(), [FORCE]
+    for task in PUBLISHED_TASKS:
+        if task not in table:
+            continue
+        lines += [f"### {task}", "", *(line_of(header) for header in HEADER)]
+        for label, found in table[task].items():
+            theirs = published.get(label, {}).get(task)
+            lines.append(line_of(row(label, found, theirs)))
+        lines.append("")
+    return "\n".join(lines)
+
+
+def line_of(line):
+    """The columns of a line of a full table that the page of results has."""
+    cells = line.strip("|").split("|")
+    return f"|{'|'.join(cells[place] for place in FORCE_COLUMNS)}|"
+
+
+def full_tables(table):
+    """One table with all columns for each task."""
+    published, lines = published_agents(), []
+    for task in dict.fromkeys((*PUBLISHED_TASKS, *table)):
+        lines += [f"## {task}", "", *HEADER]
         repeated = set()
-        for label, found in agents_.items():
+        for label, found in table.get(task, {}).items():
             name = published_label(found[0])
             repeated.add(name)
             theirs = published.get(name, {}).get(task)
             lines.append(row(label, found, theirs))
         for name, tasks in published.items():
-            if name not in repeated:
+            if name not in repeated and task in tasks:
                 lines.append(row(f"{name} (missing)", [], tasks[task]))
         lines.append("")
     return "\n".join(lines)
@@ -192,8 +274,9 @@ def other_tasks(table):
         if task in PUBLISHED_TASKS:
             continue
         for label, found in agents_.items():
-            cells = [task, label, *figures_of(found)]
-            cells.append(percent(experts[task]) if task in experts else "–")
+            _, success, _, _, steps, mean, _, largest = figures_of(found)
+            expert = percent(experts[task]) if task in experts else "–"
+            cells = [f"`{task}`", label, success, expert, steps, mean, largest]
             lines.append(f"| {' | '.join(cells)} |")
     if not lines:
         return ""
@@ -201,9 +284,10 @@ def other_tasks(table):
         [
             "## Further tasks",
             "",
-            "| task | agent | seeds | success (95 %) | worst | reward | mean force "
-            "| contact force | max force | expert |",
-            "|---|---|---|---|---|---|---|---|---|---|",
+            "Forces as above, in mN.",
+            "",
+            "| task | agent | success (95 %) | expert | steps | mean | largest |",
+            "|---|---|---|---|---|---|---|",
             *lines,
             "",
         ]
@@ -229,27 +313,34 @@ def expert_rates():
 
 def row(label, found, theirs):
     """A line of a table: ours, and the published figures of the same agent."""
-    cells = [label, *(figures_of(found) if found else ["–"] * 7)]
+    cells = [label, *(figures_of(found) if found else ["–"] * 8)]
     if theirs is not None:
         for place, text in published_figures(theirs).items():
             cells[place] += f" / {text}"
     return f"| {' | '.join(cells)} |"
 
 
-def figures_of(found):
-    """Seeds, success, worst seed, reward and forces of one agent, as text."""
-    rates = [result.success for result in found]
+def rate_of(found):
+    """Success over the episodes of all seeds, and their number."""
     counts = [result.evaluation["summary"]["episodes"] for result in found]
+    rates = [result.success for result in found]
     reached = sum(round(r * n) for r, n in zip(rates, counts, strict=True))
-    success = percent(reached / sum(counts))
+    return reached / sum(counts), sum(counts)
+
+
+def figures_of(found):
+    """Seeds, success, worst seed, reward, steps and forces of one agent, as text."""
+    rate, count = rate_of(found)
+    success = percent(rate)
     if found[0].evaluation.get("groups"):
-        low, high = success_interval(reached, sum(counts))
+        low, high = success_interval(round(rate * count), count)
         success += f" ({100 * low:.0f}–{100 * high:.0f})"
     return [
         str(len(found)),
         success,
-        percent(min(rates)),
+        percent(min(result.success for result in found)),
         spread(found, "reward", 1, 0),
+        spread(found, "length", 1, 0),
         spread(found, "mean_force", 1e3, 1),
         spread(found, "mean_contact_force", 1e3, 1),
         spread(found, "max_force", 1e3, 0),
@@ -261,8 +352,8 @@ def published_figures(theirs):
     return {
         2: percent(theirs["success"]),
         4: "{:.0f} ± {:.0f}".format(*theirs["reward"]),
-        6: "{:.0f} ± {:.0f}".format(*(1e3 * value for value in theirs["mean_force"])),
-        7: "{:.0f} ± {:.0f}".format(*(1e3 * value for value in theirs["max_force"])),
+        7: "{:.0f} ± {:.0f}".format(*(1e3 * value for value in theirs["mean_force"])),
+        8: "{:.0f} ± {:.0f}".format(*(1e3 * value for value in theirs["max_force"])),
     }
 
 
@@ -277,39 +368,6 @@ def spread(found, name, scale, digits):
 
 def percent(rate):
     return f"{100 * rate:.0f} %"
-
-
-def aggregates(table):
-    """Interquartile mean of the success over the four published tasks."""
-    published = json.loads(PUBLISHED.read_text())["agents"]
-    lines = [
-        "## Over the four published tasks",
-        "",
-        "Interquartile mean of the success rate over tasks and seeds (Agarwal et al. "
-        "2021), with the 95 % interval of a bootstrap that resamples seeds within "
-        "tasks; a single seed has no interval. Published agents have one seed.",
-        "",
-        "| agent | tasks | seeds | interquartile mean | published |",
-        "|---|---|---|---|---|",
-    ]
-    labels = dict.fromkeys(label for t in PUBLISHED_TASKS for label in table.get(t, {}))
-    for label in labels:
-        found = [table[t][label] for t in PUBLISHED_TASKS if label in table.get(t, {})]
-        mean, interval = interquartile_mean([[r.success for r in one] for one in found])
-        text = percent(mean)
-        if interval is not None:
-            text += f" ({100 * interval[0]:.0f}–{100 * interval[1]:.0f})"
-        seeds = sorted({len(one) for one in found})
-        theirs = published.get(published_label(found[0][0]))
-        reference = "–"
-        if theirs is not None and len(found) == len(PUBLISHED_TASKS):
-            rates = [[theirs[task]["success"]] for task in PUBLISHED_TASKS]
-            reference = percent(interquartile_mean(rates)[0])
-        count = "–".join(map(str, (seeds[0], seeds[-1]) if len(seeds) > 1 else seeds))
-        lines.append(
-            f"| {label} | {len(found)} of 4 | {count} | {text} | {reference} |"
-        )
-    return "\n".join(lines) + "\n" if labels else ""
 
 
 def clock(seconds):
@@ -380,16 +438,16 @@ def cost(table):
     return "\n".join(lines) + "\n"
 
 
-def drawn(table, out):
-    """The parts of the page that show figures, which are drawn beside it."""
-    published = json.loads(PUBLISHED.read_text())["agents"]
+def drawn(table, directory):
+    """The parts of both pages that show figures, which are drawn beside them."""
+    published = published_agents()
     reference = {task: {} for task in PUBLISHED_TASKS}
     for task, of_task in reference.items():
         for label, found in table.get(task, {}).items():
             theirs = published.get(published_label(found[0]), {})
             if task in theirs:
                 of_task[label] = theirs[task]["max_force"]
-    images = out.parent / "images"
+    images = directory / "images"
     return figures.drawn(table, reference, demonstrated(table), images)
 
 

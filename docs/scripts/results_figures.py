@@ -275,7 +275,7 @@ def _save(figure, path):
 
 
 def drawn(table, reference, compared, images):
-    """Draws the figures; yields the parts of the page that show them.
+    """Draws the figures.
 
     Args:
         table: {task: {label: [results by seed]}}.
@@ -283,17 +283,21 @@ def drawn(table, reference, compared, images):
             label, for every published task.
         compared: {label: [results]} with and without demonstrations on one task.
         images: Folder of the figures.
+
+    Returns:
+        The parts that show those of the published tasks, and those of all others.
     """
     looks = Looks(dict.fromkeys(label for one in table.values() for label in one))
     main = {task: table[task] for task in reference if task in table}
     further = {task: one for task, one in table.items() if task not in main}
-    yield "## Figures\n"
+    shown_main, shown_further = ["## Figures\n"], ["## Figures\n"]
     for name, tasks in (("", main), ("_further", further)):
         if not tasks:
             continue
+        parts = shown_further if name else shown_main
         which = "further" if name else "published"
         path = learning_curves(tasks, looks, images / f"results_curves{name}.png")
-        yield shown(
+        parts += shown(
             path,
             f"Success in training on the {which} tasks, mean over seeds (number in the "
             "legend) with a band from the least to the most successful seed. Training "
@@ -301,7 +305,7 @@ def drawn(table, reference, compared, images):
         )
         path = images / f"results_forces{name}.png"
         force_boxes(tasks, looks, reference, path)
-        yield shown(
+        parts += shown(
             path,
             f"Largest contact force of every evaluation episode on the {which} tasks, "
             "episodes of all seeds together; whiskers at 1.5 interquartile ranges. "
@@ -314,7 +318,7 @@ def drawn(table, reference, compared, images):
         task = next(iter(compared.values()))[0].evaluation["task"]
         path = images / "results_demonstrations.png"
         with_demonstrations(compared, looks, path)
-        yield shown(
+        shown_further += shown(
             path,
             f"With and without demonstrations on {task}, all from the "
             "observation `internal`: success of the evaluation (points, with 95 % "
@@ -330,13 +334,14 @@ def drawn(table, reference, compared, images):
     }
     path = force_maps(best, images / "results_force_maps.png")
     if path is not None:
-        yield shown(
+        shown_further += shown(
             path,
             "Mean contact force per place (2 mm) over all evaluation episodes of the "
             "most successful agent of each task, seen from the front; the colour scale "
             "ends at the 98th percentile.",
         )
+    return shown_main, shown_further
 
 
 def shown(path, caption):
-    return f"![{caption}](images/{path.name})\n\n{caption}\n"
+    return [f"![{caption.split(',')[0]}](images/{path.name})\n\n{caption}\n"]

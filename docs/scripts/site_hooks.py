@@ -17,7 +17,7 @@ from nbconvert import MarkdownExporter
 ROOT = Path(__file__).parents[2]
 OF_THE_REPOSITORY = ("CONTRIBUTING.md", "CHANGELOG.md")
 # Pages that not every state of the repository has.
-OPTIONAL = ("results.md", "reliability.md", "imitation.md")
+OPTIONAL = ("results.md", "results_detail.md", "reliability.md", "imitation.md")
 # A table with this many columns takes the room of the page's table of contents.
 _WIDE = 5
 # A link out of docs/ and where it leads on the site.
