@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial import cKDTree
 from scipy.spatial.distance import cdist
 
 from cathsim_dmc.anatomy.scan.ways import Ways
@@ -84,7 +83,6 @@ def free_ends(ways: Ways) -> list[FreeEnd]:
     reach = ways.lengths_from(first)
     # Own vessels are told on the ways to that end: the widest place may be one, too.
     back = ways.deepest_from(first)
-    lookup = cKDTree(ways.points[nodes])
     taken = np.zeros(len(ways.points), dtype=bool)
     cover, ends = Cover(ways), []
     tips = _local_maxima(ways, reach)
@@ -95,7 +93,7 @@ def free_ends(ways: Ways) -> list[FreeEnd]:
         steps = np.linalg.norm(np.diff(ways.points[way], axis=0), axis=1)
         along = np.concatenate([[0.0], np.cumsum(steps)])
         local = float(ways.depth[way][along < END_SEARCH].max())
-        near = nodes[lookup.query_ball_point(ways.points[node], 2.5 * local)]
+        near = ways.around(node, 2.5 * local)
         taken[near] = True
         if node != first and reach[near].max() > reach[node] + 1e-9:
             continue

@@ -182,6 +182,13 @@ class Ways:
                 )
         return node
 
+    def around(self, node: int, radius: float) -> np.ndarray:
+        """Rows (m,) of the points in a ball (m) that are joined to its middle in it."""
+        near = self._nodes[self._lookup.query_ball_point(self.points[node], radius)]
+        part = self._graph(self._lengths)[near][:, near]
+        label = connected_components(part, directed=False)[1]
+        return near[label == label[near == node]]
+
     def lengths_from(self, node: int) -> np.ndarray:
         """Length (n,) m of the shortest way from ``node`` to every point."""
         if node not in self._reach:

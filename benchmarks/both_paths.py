@@ -1,0 +1,166 @@
+"""Episodes of a policy in the batch, each played again as a composer environment.
+
+    python benchmarks/both_paths.py --task femoral_type1_lcca_pair
+    python benchmarks/both_paths.py --task type1_lcca --policy random --steps 200
+
+The conditions of an episode are those of the varied protocol. Observation, reward, end,
+positions, velocities and wall force must be equal bit for bit in every control step.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import tyro
+
+from cathsim_dmc import policies, suite
+from cathsim_dmc.agents import protocols
+from cathsim_dmc.analysis.intervals import success_interval
+from cathsim_dmc.cli.options import EVALUATION_SEED, show
+from cathsim_dmc.simulation import episodes
+from cathsim_dmc.simulation.batch import BatchSimulation
+from cathsim_dmc.validation.checks import Checks, Report
+
+OBSERVED = ("internal", "tracking", "force")
+
+
+class Play:
+    """First episodes of a batch.
+
+    Attributes:
+        actions: (T, A) of each episode.
+        states: what `state_of_batch` gives after every step, by episode.
+        success: whether each reached its goal.
+        force: largest sum of the force on the wall in each, N.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        policy: str,
+        seeds: Sequence[int],
+        options: dict[str, Any],
+        steps: int | None,
+        threads: int,
+    ):
+        task = suite.make_task(name, observation=OBSERVED, **options)
+        batch = BatchSimulation(
+            task, len(seeds), seeds=list(seeds), num_threads=threads
+        )
+        player = policies.make_policy(policy, seeds[0])
+        view = policies.View(batch)
+        self.actions = [[] for _ in seeds]
+        self.states = [[] for _ in seeds]
+        self.success = np.zeros(len(seeds), bool)
+        self.force = np.zeros(len(seeds))
+        turns = episodes.play(
+            episodes.BatchedSimulations(batch),
+            player.act,
+            lambda which: player.reset(view, which),
+            len(seeds),
+        )
+        for number, (action, step, running) in enumerate(turns):
+            for i in np.flatnonzero(running):
+                if action is not None:
+                    self.actions[i].append(np.array(action[i], np.float64))
+                    self.success[i] |= step.outcome.success[i]
+                    self.force[i] = max(self.force[i], step.wall_force.peak_sum[i])
+                self.states[i].append(
+                    [np.array(v[i]) for _, v in sorted(step.observation.items())]
+                    + [batch.batch.qpos[i].copy(), batch.batch.qvel[i].copy()]
+                    + ([] if action is None else outcome_of_batch(step, i))
+                )
+            if number == steps:
+                break
+
+
+def outcome_of_batch(step: Any, index: int) -> list[np.ndarray]:
+    """Reward, end and wall force of one simulation."""
+    ended = step.terminated[index], step.terminated[index] or step.truncated[index]
+    force = step.wall_force
+    return [
+        np.array([step.outcome.reward[index], *ended]),
+        np.array([force.sum[index], force.peak_sum[index], force.peak_max[index]]),
+    ]
+
+
+def first_difference(
+    name: str, seed: int, options: dict[str, Any], actions: list, states: list
+) -> int | None:
+    """First control step that differs in a composer environment, or None."""
+    task = suite.make_task(name, observation=OBSERVED, random=seed, **options)
+    environment = suite.environment(task)
+    seen = environment.reset()
+    for number, state in enumerate(states):
+        if number:
+            seen = environment.step(actions[number - 1])
+        data = environment.physics.data
+        own = [np.array(v) for _, v in sorted(seen.observation.items())]
+        own += [data.qpos.copy(), data.qvel.copy()]
+        if number:
+            force = environment.task.wall_force
+            own.append(np.array([seen.reward, seen.discount == 0, seen.last()]))
+            own.append(np.array([force.sum, force.peak_sum, force.peak_max]))
+        if any(not np.array_equal(*both) for both in zip(own, state, strict=True)):
+            return number
+    return None
+
+
+def main(
+    task: str,
+    policy: str = "expert",
+    seeds: int = 30,
+    seed: int = EVALUATION_SEED,
+    steps: int | None = None,
+    threads: int = 0,
+    json: bool = False,
+) -> int:
+    """Play episodes in the batch, and each again as a composer environment.
+
+    Args:
+        task: Task of `cathsim list`.
+        policy: Name of a policy.
+        seeds: Number of episodes, each with conditions of its own.
+        seed: The seeds lie at or above it.
+        steps: Control steps after which episodes are cut off.
+        threads: Number of threads of the batch, 0 for one per core.
+        json: Whether to print one JSON object and nothing else.
+    """
+    protocol = protocols.get("varied")
+    play = []
+    for part in protocols.parts(protocol, task, {}, seeds, seed):
+        options = dict(part.task_kwargs)
+        one = Play(task, policy, part.seeds, options, steps, threads)
+        print(f"{one.success.sum()} of {len(part.seeds)} succeed", file=sys.stderr)
+        for i, own in enumerate(part.seeds):
+            differs = first_difference(
+                task, own, options, one.actions[i], one.states[i]
+            )
+            play.append((own, one.success[i], len(one.actions[i]), one.force[i]))
+            play[-1] += (differs,)
+            print(*play[-1], file=sys.stderr, flush=True)
+    success = sum(bool(row[1]) for row in play)
+    different = sum(row[4] is not None for row in play)
+    low, high = success_interval(success, len(play))
+    checks = Checks()
+    label = f"{task}, {policy}: episodes that differ between batch and environment"
+    checks.at_most(label, different, 0, "", f"of {len(play)}")
+    findings = {
+        "episodes": len(play),
+        "successes": success,
+        "success_ci95": [low, high],
+        "safe at 0.5 N": sum(bool(row[1]) and row[3] <= 0.5 for row in play),
+        "control steps, mean": float(np.mean([row[2] for row in play])),
+        "control steps, longest": max(row[2] for row in play),
+        "control steps compared": sum(row[2] for row in play),
+        "largest sum, N": float(max(row[3] for row in play)),
+        "failed seeds": [row[0] for row in play if not row[1]],
+    }
+    return show(Report("both paths", checks, findings), json)
+
+
+if __name__ == "__main__":
+    sys.exit(tyro.cli(main))
