@@ -13,9 +13,11 @@ from cathsim_dmc.anatomy.anatomy import Anatomy
 from cathsim_dmc.anatomy.centreline import Centreline, Vessel, VesselTree
 from cathsim_dmc.anatomy.parts import Goal, Surface
 from cathsim_dmc.anatomy.scan.check import check_tree
+from cathsim_dmc.anatomy.scan.ends import free_ends
 from cathsim_dmc.anatomy.scan.importer import import_scan
 from cathsim_dmc.anatomy.scan.tree import grow_tree
 from cathsim_dmc.anatomy.scan.ways import Ways
+from cathsim_dmc.anatomy.surface import lumen_surface
 from cathsim_dmc.anatomy.surface_depth import SurfaceDepth
 
 
@@ -237,6 +239,15 @@ def test_arms_far_thinner_than_their_trunk_are_branches(tmp_path):
     anatomy = import_scan(mesh)
     assert np.linalg.norm(anatomy.inlet.position) < 15e-3
     assert {"branch_1", "branch_2"} <= set(anatomy.goals)
+
+
+def test_branches_that_end_side_by_side_are_two():
+    vessels = {"trunk": Vessel("trunk", tube([(0, 0, 0), (0, 0, 60)], [9, 9]))}
+    for name, x, end in (("left", 15, 110), ("right", -15, 108)):
+        points = [(0, 0, 60), (x, 0, 80), (x, 0, 95), (0.3 * x, 0, end)]
+        vessels[name] = Vessel(name, tube(points, [6, 6, 6, 4]), "trunk", 12e-3)
+    surface = lumen_surface(VesselTree(vessels), 1.5e-3)
+    assert len(free_ends(Ways(SurfaceDepth(surface)))) == 3
 
 
 def test_a_lumen_thinner_than_the_device_is_refused(tmp_path):

@@ -293,7 +293,7 @@ class _Work:
     def _smooth_folds(self) -> bool:
         """Move vertices of folds to their neighbours; False if that does not help."""
         vertices, count = self.vertices, 0
-        for _ in range(ROUNDS):
+        for _ in range(2 * ROUNDS):
             faces, edges = SurfaceDepth(Surface(vertices, self.faces)).crossings()
             if not len(faces):
                 break
@@ -307,7 +307,7 @@ class _Work:
                 / np.maximum(np.bincount(one, minlength=len(vertices)), 1)[:, None]
             )
             vertices = vertices.copy()
-            vertices[moved] = 0.5 * (vertices + middle)[moved]
+            vertices[moved] += 0.25 * (middle - vertices)[moved]
         else:
             return False
         far = float(np.linalg.norm(vertices - self.vertices, axis=1).max())
