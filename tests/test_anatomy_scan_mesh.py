@@ -202,6 +202,17 @@ def test_edges_shared_by_three_triangles_are_mended(y_mesh, tmp_path):
     assert said(lumen, "1 edges shared by more than two triangles")
 
 
+def test_a_hole_that_mending_makes_between_large_triangles_is_filled():
+    ball = trimesh.creation.icosphere(2, 14e-3)
+    one, other, _ = ball.faces[0]
+    vertices = np.vstack([ball.vertices, 1.3 * ball.vertices[one]])
+    faces = np.vstack([ball.faces, [[one, other, len(ball.vertices)]]])
+    surface, notes = mend("ball", vertices, faces)
+    assert surface.volume == pytest.approx(ball.volume, rel=0.1)
+    (filled,) = (note for note in notes if "holes filled" in note)
+    assert float(re.search(r"widest (\S+) mm", filled)[1]) > 8.0
+
+
 def thick(outer_radius, capped):
     """A bent tube of 5 mm inner radius with a wall, open at both ends (mm)."""
     t = np.linspace(0.0, np.pi, 60)

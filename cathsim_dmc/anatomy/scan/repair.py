@@ -70,6 +70,7 @@ class _Work:
         self.name, self.vertices, self.faces = name, vertices, faces
         self.notes: list[str] = []
         self._ends = 0
+        self._cut: set[tuple[float, ...]] = set()  # corners of what was cut out
 
     def merge(self) -> None:
         """One vertex per place, and no triangle without area or twice."""
@@ -152,7 +153,7 @@ class _Work:
                     "of the surface are glued together. Export it from the "
                     "segmentation again, or remesh it."
                 )
-            self._keep(~bad)
+            self._cut_out(bad)
         if first:
             self.notes.append(
                 f"{first[0]} edges shared by more than two triangles, near "
@@ -186,8 +187,8 @@ class _Work:
             self.faces = self.faces[:, ::-1]
             self._drop_small_parts()
 
-    def close(self, widest: float = HOLE) -> None:
-        """Cap the ends of vessels and fill holes of up to a width, m."""
+    def close(self) -> None:
+        """Cap the ends of vessels; fill holes, wider ones where a part was cut out."""
         filled = []
         for loop in border_loops(self.faces):
             points = self.vertices[loop]
@@ -197,7 +198,9 @@ class _Work:
             large = len(loop) > 3 and area > END_AREA
             if large and self._is_end(loop, axis):
                 self._ends += 1
-            elif wide > widest:
+            elif wide > (
+                widest := CUT if self._cut & set(map(tuple, points)) else HOLE
+            ):
                 raise ValueError(
                     f"{self.name} is not closed: a hole {wide * 1e3:.1f} mm wide in "
                     f"the side of a vessel at {in_mm(middle)} (at most "
@@ -269,10 +272,10 @@ class _Work:
                     "place, or export the segmentation again."
                 )
             touched = np.isin(self.faces, self.faces[tangled]).any(axis=1)
-            self._keep(np.asarray(~touched))
+            self._cut_out(np.asarray(touched))
             self._drop_small_parts()
             self.cut_non_manifold()
-            self.close(CUT)
+            self.close()
         else:
             assert first is not None  # every round has found some
             raise ValueError(
@@ -323,6 +326,10 @@ class _Work:
     def _widest_patch(self, chosen: np.ndarray) -> float:
         label = parts(self.faces[chosen])
         return float(widths(self.vertices, self.faces[chosen], label).max())
+
+    def _cut_out(self, chosen: np.ndarray) -> None:
+        self._cut.update(map(tuple, self.vertices[np.unique(self.faces[chosen])]))
+        self._keep(~chosen)
 
     def _keep(self, chosen: np.ndarray) -> None:
         used, numbers = np.unique(self.faces[chosen], return_inverse=True)
