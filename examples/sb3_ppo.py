@@ -1,19 +1,25 @@
 """PPO of Stable-Baselines3, evaluated and recorded as the package's own policies are.
 
     pip install "cathsim-dmc[gym]" stable-baselines3
-    python examples/sb3_ppo.py --task type1_lcca --frames 200000 --out runs/sb3
+    python examples/sb3_ppo.py --frames 150000 --out runs/sb3
+    python examples/sb3_ppo.py --policy examples/sb3_ppo.safetensors --out runs/shipped
 
+The last command evaluates the policy beside this file, which the one before it trained.
 `PPO_SETTINGS` and `TRAINING` are the settings. The motors of the tip that bend it about
 one axis get one command, so the policy has three outputs: two bends and the
 translation. The evaluation is that of the task: its reward, its start, its time limit.
 """
 
+import json
 from pathlib import Path
 
 import gymnasium
 import numpy as np
+import stable_baselines3
 import torch
 import tyro
+from safetensors import safe_open
+from safetensors.torch import save_file
 from stable_baselines3 import PPO
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import VecNormalize
@@ -69,34 +75,68 @@ def policy_of(model: PPO, normalise: VecNormalize, groups: np.ndarray):
     return sb3_ppo
 
 
+def untrained(task: str, envs: int, seed: int) -> tuple[PPO, VecNormalize]:
+    """PPO with new networks, and the environments that it trains in."""
+    name = f"cathsim/{task}-v{cathsim_dmc.gym.VERSION}"
+    env = make_vec_env(name, envs, seed, env_kwargs=TRAINING, wrapper_class=wrapped)
+    normalise = VecNormalize(env, norm_reward=False)
+    return PPO("MlpPolicy", normalise, seed=seed, verbose=1, **PPO_SETTINGS), normalise
+
+
+def save(path: Path, model: PPO, normalise: VecNormalize, **metadata) -> None:
+    """Networks and normalisation as safetensors: unlike pickle, it holds no code."""
+    statistics = normalise.obs_rms
+    tensors = {f"policy.{name}": x for name, x in model.policy.state_dict().items()}
+    for name in ("mean", "var", "count"):
+        tensors[name] = torch.as_tensor(getattr(statistics, name))
+    save_file(tensors, path, {name: json.dumps(x) for name, x in metadata.items()})
+
+
+def load(path: Path, task: str | None = None) -> tuple[PPO, VecNormalize, dict]:
+    """What `save` wrote; `model.learn` trains it on."""
+    with safe_open(path, framework="pt") as file:
+        metadata = {name: json.loads(x) for name, x in file.metadata().items()}
+        tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+    model, normalise = untrained(task or metadata["task"], 1, metadata["seed"])
+    for name in ("mean", "var", "count"):
+        setattr(normalise.obs_rms, name, tensors.pop(name).numpy())
+    model.policy.load_state_dict(
+        {name.removeprefix("policy."): x for name, x in tensors.items()}
+    )
+    return model, normalise, metadata
+
+
 def main(
     task: str = "type1_lcca",
     frames: int = 200_000,
     envs: int = 8,
     seed: int = 0,
+    policy: Path | None = None,
     episodes: int | None = None,
     out: Path = Path("runs/sb3"),
 ) -> None:
-    """Trains, evaluates under both protocols, records an episode, saves the policy."""
+    """Trains, or loads `policy`; evaluates under both protocols, records an episode."""
     torch.set_num_threads(1)  # the networks are small
-    name = f"cathsim/{task}-v{cathsim_dmc.gym.VERSION}"
-    env = make_vec_env(name, envs, seed, env_kwargs=TRAINING, wrapper_class=wrapped)
-    normalise = VecNormalize(env, norm_reward=False)
-    model = PPO("MlpPolicy", normalise, seed=seed, verbose=1, **PPO_SETTINGS)
-    model.learn(frames)
     out.mkdir(parents=True, exist_ok=True)
-    model.save(out / "model.zip")
-    normalise.save(str(out / "normalisation.pkl"))
-    policy = policy_of(model, normalise, groups_of(env.envs[0]))
+    if policy:
+        model, normalise, metadata = load(policy, task)
+        print(", ".join(f"{name} {x}" for name, x in metadata.items()))
+    else:
+        model, normalise = untrained(task, envs, seed)
+        model.learn(frames)
+        steps = model.num_timesteps
+        save(out / "policy.safetensors", model, normalise, task=task, steps=steps,
+             seed=seed, stable_baselines3=stable_baselines3.__version__)  # fmt: skip
+    play = policy_of(model, normalise, groups_of(normalise.venv.envs[0]))
     for protocol in ("published", "varied"):
         result = agents.evaluate(
-            policy, task, episodes, protocol=protocol, observation=OBSERVATION,
+            play, task, episodes, protocol=protocol, observation=OBSERVATION,
             out_dir=out / protocol,
         )  # fmt: skip
         rate, safe = result.summary()["success"], result.safe_success(0.5)
         print(f"{protocol}: success {rate:.0%}, safe at 0.5 N {safe:.0%}")
     one = suite.load("cathsim", task, task_kwargs={"observation": OBSERVATION})
-    cathsim_dmc.record(one, agents.load_policy(policy), out / "episode.npz", seed=seed)
+    cathsim_dmc.record(one, agents.load_policy(play), out / "episode.npz", seed=seed)
 
 
 if __name__ == "__main__":
