@@ -179,7 +179,8 @@ def sources(known: dict[str, dict]) -> str:
     for name in sorted(quoted):
         one = known[name]
         value = one["value"]
-        shown = value if isinstance(value, str) else f"{value:.3g}"
+        form = ",.0f" if not isinstance(value, str) and value >= 1000 else ".3g"
+        shown = value if isinstance(value, str) else format(value, form)
         rows.append(
             f"| {name} | {shown} {one['unit']} | `{one['command']}` | {one['date']} "
             f"| {one['commit']} |"

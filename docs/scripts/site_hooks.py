@@ -20,8 +20,14 @@ OF_THE_REPOSITORY = ("CONTRIBUTING.md", "CHANGELOG.md")
 OPTIONAL = ("results.md", "results_detail.md", "reliability.md", "imitation.md")
 # A table with this many columns takes the room of the page's table of contents.
 _WIDE = 5
+# Characters of a word of code in a table that is not broken.
+_WHOLE = 26
 # A link out of docs/ and where it leads on the site.
 _LINK = re.compile(r"\]\((?:\.\./)*(docs/|examples/)?([\w./-]*)(#[\w-]*)?\)")
+# In a table: blanks that a line may not end at, and words of code.
+_UNIT = re.compile(r"(?<=\d) (?=(?:%|°|[µmk]?[mNs]|M?B)(?![\w/·]))|(?<=[±≤≥]) | (?=±)")
+_CELL_CODE = re.compile(r"(<t[dh][^>]*>)(.*?)(?=</t[dh]>)", re.DOTALL)
+_CODE = re.compile(r"<code>([^<]+)</code>")
 
 
 def on_config(config):
@@ -85,7 +91,34 @@ def on_page_markdown(markdown, page, config, files):
             return f"]({up}{Path(target).name}{anchor})"
         return match.group(0).replace(".ipynb", ".md")
 
+    markdown = re.sub(r"(?m)^\|.*$", lambda row: _row(row[0]), markdown)
     return _LINK.sub(lead, markdown)
+
+
+def _row(line: str) -> str:
+    """A row of a table in which no figure is parted from its unit."""
+    parts = line.split("`")  # code stays as it is: it is copied
+    for i in range(0, len(parts), 2):
+        text = parts[i].replace("<= ", "≤ ").replace(">= ", "≥ ")
+        text = _UNIT.sub("\N{NO-BREAK SPACE}", text)
+        text = re.sub(r"(?<=\d)–(?=\d)", "–\N{WORD JOINER}", text)
+        text = re.sub(r"(?<=\d)-(?=\d\d\b)", "\N{NON-BREAKING HYPHEN}", text)
+        parts[i] = text
+    return "`".join(parts)
+
+
+def on_page_content(html, page, config, files):
+    """Keeps words of code in tables whole, such as options and names of tasks."""
+    del page, config, files
+
+    def whole(code: re.Match) -> str:
+        words = (
+            f'<span class="whole">{word}</span>' if len(word) <= _WHOLE else word
+            for word in code[1].split(" ")
+        )
+        return f"<code>{' '.join(words)}</code>"
+
+    return _CELL_CODE.sub(lambda cell: cell[1] + _CODE.sub(whole, cell[2]), html)
 
 
 def _examples() -> str:
