@@ -1,10 +1,9 @@
 """Writes the tables and pictures of docs/anatomies.md.
 
-python docs/scripts/anatomies.py [--no-push]  (about five minutes)
+python docs/scripts/anatomies.py
 """
 
 import json
-import sys
 from pathlib import Path
 
 import figures
@@ -17,9 +16,7 @@ from cathsim_dmc.anatomy import measures, phantoms
 from cathsim_dmc.anatomy.arch import arch, sampler
 from cathsim_dmc.anatomy.surface import lumen_surface
 from cathsim_dmc.anatomy.surface_depth import SurfaceDepth
-from cathsim_dmc.entities.chain import MAX_PUSH_SPEED
 from cathsim_dmc.validation import views, wall
-from cathsim_dmc.validation.insertion import Script, run
 
 ROOT = Path(__file__).parents[1]
 PAGE, IMAGES = ROOT / "anatomies.md", ROOT / "images"
@@ -126,44 +123,6 @@ def against_measured():
     return table(header, rows)
 
 
-def straight_push(anatomy, goal):
-    """Pushes the device at full speed without steering it, 80 mm past the goal."""
-    duration = (anatomy.route(goal).length + 0.08) / MAX_PUSH_SPEED
-    script = Script("straight push", 1.0, (0.0, 0.0), duration)
-    pushed = run(script, anatomy=anatomy, goal=goal)
-    return {
-        "success": pushed.success,
-        "steps": len(pushed.head),
-        "mean_force": float(pushed.wall_force.mean()),
-        "peak_force": float(pushed.peak.max(initial=0.0)),
-    }
-
-
-def pushes(names):
-    rows = []
-    for name in names:
-        for access in phantoms.ACCESSES:
-            anatomy = phantoms.load(name, access=access)
-            for goal in MAIN:
-                push = straight_push(anatomy, goal)
-                rows.append(
-                    [
-                        name,
-                        access,
-                        goal,
-                        f"reached, {push['steps']} steps"
-                        if push["success"]
-                        else "missed",
-                        " / ".join(
-                            f"{1e3 * push[key]:.0f}"
-                            for key in ("mean_force", "peak_force")
-                        ),
-                    ]
-                )
-    header = ["", "access", "goal", "straight push"]
-    return table([*header, "force mean of sums / largest contact, mN"], rows)
-
-
 def distributions():
     """Sampled sizes of the test arches beside the tables."""
     seeds = arch.arch_set("test")
@@ -236,8 +195,6 @@ def main():
         "against measured": against_measured(),
         "distributions": distributions(),
     }
-    if "--no-push" not in sys.argv:
-        blocks["pushes"] = pushes(phantoms.PHANTOMS)
     figures.put(PAGE, **blocks)
 
 
