@@ -8,7 +8,6 @@ from scipy.spatial.transform import Rotation
 from cathsim_dmc.recording.geometry import (
     FORCE_COLOUR_MAX,
     force_colours,
-    xyzw,
     z_to,
 )
 
@@ -23,7 +22,7 @@ def test_z_to_turns_z_into_the_direction(direction):
     quaternion = z_to(direction)
     assert np.linalg.norm(quaternion) == pytest.approx(1)
     unit = direction / np.linalg.norm(direction)
-    turned = Rotation.from_quat(xyzw(quaternion)).apply([0, 0, 1])
+    turned = Rotation.from_quat(quaternion).apply([0, 0, 1])
     np.testing.assert_allclose(turned, unit, atol=1e-6)
 
 

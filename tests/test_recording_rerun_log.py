@@ -16,8 +16,8 @@ from cathsim_dmc.pictures.recorded import xray_film
 from cathsim_dmc.recording.episode import Episode
 from cathsim_dmc.recording.living import DENT, VesselRecord, dented
 from cathsim_dmc.recording.recorder import EpisodeRecorder
-from cathsim_dmc.recording.rerun_device import arrow_scale
 from cathsim_dmc.recording.rerun_log import write_rrd
+from cathsim_dmc.recording.rerun_scene import arrow_scale
 from cathsim_dmc.recording.scene import BodyGeom
 
 STEPS = 6

@@ -13,7 +13,7 @@ from PIL import Image
 from cathsim_dmc.files import atomic_path
 from cathsim_dmc.pictures import figure as drawing
 from cathsim_dmc.pictures.moment import Moment, xray
-from cathsim_dmc.pictures.translucent import Glass, ParallelProjection, glass
+from cathsim_dmc.pictures.translucent import ParallelProjection, glass
 from cathsim_dmc.recording.episode import Episode
 
 SUFFIXES = (".gif", ".webp")
@@ -72,25 +72,17 @@ def animate(
     seconds = float(np.clip(length, 2.0, 12.0)) if seconds is None else seconds
     count = min(frames, episode.steps + 1)
     chosen = np.unique(np.linspace(0, episode.steps, count).round().astype(int))
-    pictures = [
-        Image.fromarray(picture)
-        for picture in _Film(episode, surface, view, width).pictures(chosen)
-    ]
+    made = _frames(episode, surface, view, width, chosen)
+    pictures = [Image.fromarray(picture) for picture in made]
     tick = max(round(1000 * seconds / len(pictures)), _TICK_MS)
     times = [tick] * (len(pictures) - 1) + [_HOLD_MS]
     options: dict[str, Any] = {"quality": quality, "method": 4}
     if path.suffix == ".gif":
         pictures, options = _one_palette(pictures), {"optimize": False}
+    options |= {"append_images": pictures[1:], "duration": times, "loop": 0}
     with atomic_path(path, path.suffix) as temporary:
-        pictures[0].save(
-            temporary,
-            format=path.suffix[1:].upper(),
-            save_all=True,
-            append_images=pictures[1:],
-            duration=times,
-            loop=0,
-            **options,
-        )
+        kind = path.suffix[1:].upper()
+        pictures[0].save(temporary, format=kind, save_all=True, **options)
     return path
 
 
@@ -109,83 +101,66 @@ def _one_palette(pictures: list[Image.Image]) -> list[Image.Image]:
     return [picture.quantize(palette=palette, dither=none) for picture in pictures]
 
 
-class _Film:
-    """A figure in which each frame redraws only moving parts."""
-
-    def __init__(self, episode: Episode, surface: Any, view: str, width: int):
-        self._episode, self._surface = episode, surface
-        # Points; in a small film the label must not run under the X-ray image.
-        self._font = float(np.clip(width / 65, 6.5, 10))
-        azimuth = drawing.VIEWS[view][0]
-        rough = ParallelProjection.of(surface.vertices, azimuth=azimuth, margin=_MARGIN)
-        rows, columns = rough.shape
-        left = columns / rows  # width of the scene as a share of the height
-        height = width / (left + 0.66)
-        # One pixel of the glass for each of the film.
-        self._projection = ParallelProjection.of(
-            surface.vertices, azimuth=azimuth, margin=_MARGIN, height=round(height)
-        )
-        self._glass: Glass = glass(surface.vertices, surface.faces, self._projection)
-        self._figure = drawing.Picture(
-            figsize=(width / _DPI, height / _DPI), dpi=_DPI, facecolor="white"
-        )
-        share = left / (left + 0.66)
-        self._scene = self._figure.add_axes((0, 0, share, 1))
-        self._scene.axis("off")
-        beside = (share + 0.01, 0.34, 0.98 - share, 0.64)
-        self._xray = self._figure.add_axes(beside)
-        self._force = self._figure.add_axes((share + 0.09, 0.1, 0.89 - share, 0.19))
-        self._draw_force()
-
-    def _draw_force(self) -> None:
-        episode, axes = self._episode, self._force
-        peak = episode.meta.get("wall_force_peak_max") or episode.wall_force_max
-        time = episode.time[1:] - episode.time[0]
-        force = 1e3 * np.asarray(peak, dtype=np.float64)
-        axes.fill_between(time, force, color=_FORCE_COLOUR, alpha=0.18, lw=0)
-        axes.plot(time, force, color=_FORCE_COLOUR, lw=1.1)
-        axes.set_xlim(0, max(float(time[-1]), 1e-3) if len(time) else 1.0)
-        axes.set_ylim(0, max(1.15 * force.max(initial=0.0), 1.0))
-        axes.set_xlabel("s", fontsize=8, labelpad=0)
-        axes.set_ylabel("wall force, mN", fontsize=8)
-        axes.tick_params(labelsize=7)
-        for side in ("top", "right"):
-            axes.spines[side].set_visible(False)
-        self._now = axes.axvline(0.0, color="0.2", lw=1.0)
-
-    def pictures(self, steps: np.ndarray) -> Iterator[np.ndarray]:
-        """RGB pictures (rows, columns, 3) uint8 of some states."""
-        image = None
-        for step in steps:
-            moment = Moment.of_episode(self._episode, self._surface, int(step))
-            self._scene.clear()
-            self._scene.axis("off")
-            pane, now = self._glass, moment.surface
-            if now is not self._surface:
-                pane = glass(now.vertices, now.faces, self._projection)
-            drawing.draw_scene(self._scene, moment, self._projection, pane)
-            self._label(moment, int(step))
-            if image is None:
-                image = drawing.draw_fluoroscopy(
-                    self._xray, moment, FLUOROSCOPY, int(step)
-                )
-                self._xray.set_title("")
-            else:
-                image.set_data(xray(moment, FLUOROSCOPY, int(step)))
-                ring = cast(Circle, self._xray.patches[0])
-                column, row = drawing.goal_ring(moment, FLUOROSCOPY)[0]
-                ring.center = column, row
-            now = float(self._episode.time[step] - self._episode.time[0])
-            self._now.set_xdata([now, now])
-            self._figure.agg.draw()
-            yield np.asarray(self._figure.agg.buffer_rgba())[..., :3].copy()
-
-    def _label(self, moment: Moment, step: int) -> None:
-        time = self._episode.time[step] - self._episode.time[0]
-        text = f"{self._episode.task}   {time:4.1f} s"
-        if step == self._episode.steps:
-            text += f"   {self._episode.termination.replace('_', ' ')}"
-        self._scene.text(
-            0.02, 0.985, text, transform=self._scene.transAxes, va="top",
-            fontsize=self._font, fontweight="bold", color="0.2", zorder=10,
+def _frames(
+    episode: Episode, surface: Any, view: str, width: int, steps: np.ndarray
+) -> Iterator[np.ndarray]:
+    """RGB pictures (rows, columns, 3) uint8 of some states of an episode."""
+    azimuth = drawing.VIEWS[view][0]
+    rough = ParallelProjection.of(surface.vertices, azimuth=azimuth, margin=_MARGIN)
+    left = rough.shape[1] / rough.shape[0]  # width of the scene per height
+    height = width / (left + 0.66)
+    # One pixel of the glass for each of the film.
+    projection = ParallelProjection.of(
+        surface.vertices, azimuth=azimuth, margin=_MARGIN, height=round(height)
+    )
+    rest = glass(surface.vertices, surface.faces, projection)
+    size, share = (width / _DPI, height / _DPI), left / (left + 0.66)
+    figure = drawing.Picture(figsize=size, dpi=_DPI, facecolor="white")
+    scene = figure.add_axes((0, 0, share, 1))
+    beside = figure.add_axes((share + 0.01, 0.34, 0.98 - share, 0.64))
+    cursor = _draw_force(
+        figure.add_axes((share + 0.09, 0.1, 0.89 - share, 0.19)), episode
+    )
+    image = None
+    for step in steps.tolist():
+        moment = Moment.of_episode(episode, surface, step)
+        scene.clear()
+        scene.axis("off")
+        pane, now = rest, moment.surface
+        if now is not surface:
+            pane = glass(now.vertices, now.faces, projection)
+        drawing.draw_scene(scene, moment, projection, pane)
+        time = float(episode.time[step] - episode.time[0])
+        text = f"{episode.task}   {time:4.1f} s"
+        if step == episode.steps:
+            text += f"   {episode.termination.replace('_', ' ')}"
+        scene.text(
+            0.02, 0.985, text, transform=scene.transAxes, va="top", color="0.2",
+            # In a small film the label must not run under the X-ray image.
+            fontsize=np.clip(width / 65, 6.5, 10), fontweight="bold", zorder=10,
         )  # fmt: skip
+        if image is None:
+            image = drawing.draw_fluoroscopy(beside, moment, FLUOROSCOPY, step)
+            beside.set_title("")
+        image.set_data(xray(moment, FLUOROSCOPY, step))
+        ring = cast(Circle, beside.patches[0])
+        ring.center = drawing.goal_ring(moment, FLUOROSCOPY)[0]
+        cursor.set_xdata([time, time])
+        figure.agg.draw()
+        yield np.asarray(figure.agg.buffer_rgba())[..., :3].copy()
+
+
+def _draw_force(axes: Any, episode: Episode) -> Any:
+    """Draws the force on the wall over time; the line that marks the present."""
+    peak = episode.meta.get("wall_force_peak_max") or episode.wall_force_max
+    time = episode.time[1:] - episode.time[0]
+    force = 1e3 * np.asarray(peak, dtype=np.float64)
+    axes.fill_between(time, force, color=_FORCE_COLOUR, alpha=0.18, lw=0)
+    axes.plot(time, force, color=_FORCE_COLOUR, lw=1.1)
+    axes.set_xlim(0, time.max(initial=1e-3))
+    axes.set_ylim(0, max(1.15 * force.max(initial=0.0), 1.0))
+    axes.set_xlabel("s", fontsize=8, labelpad=0)
+    axes.set_ylabel("wall force, mN", fontsize=8)
+    axes.tick_params(labelsize=7)
+    axes.spines[["top", "right"]].set_visible(False)
+    return axes.axvline(0.0, color="0.2", lw=1.0)

@@ -40,8 +40,7 @@ PATH_COLOUR = "#c77f00"
 ARROW_MM, ARROW_LEAST_MM = 22.0, 5.0
 # Below this, N, a contact is drawn as a dot without an arrow.
 ARROW_LEAST_N = 1e-4
-# Pieces of the drawn curve in each link.
-_PIECES = 6
+_PIECES = 6  # of the drawn curve in each link
 # Default X-ray image of `scene_figure`; the arch fills it.
 FLUOROSCOPY = FluoroscopyOptions(size=400, magnification=1.3)
 # Percentiles of an image that are shown as black and white.
@@ -50,9 +49,6 @@ _HEIGHT_IN = 6.0
 # A scan that lies is wider than high: its figure is no wider than this and less high,
 # apart from titles, axes and caption.
 _WIDEST_IN, _LETTERING_IN = 16.0, 1.2
-# Shaft of an arrow.
-_ARROW_WIDTH_IN = 0.037
-_POINTS_PER_INCH = 72.0
 
 
 class Picture(Figure):
@@ -119,33 +115,35 @@ def scene_figure(
         raise ValueError(f"views are {views!r}; give some of {', '.join(VIEWS)}")
     moved = moment.surface is not moment.rest
     draw = background.__wrapped__ if moved else background  # which keeps what it drew
-    given = pixels, moment.rest
-    drawn = [draw(moment.surface, VIEWS[v][0], *given) for v in views]
+    drawn = [draw(moment.surface, VIEWS[v][0], pixels, moment.rest) for v in views]
     ratios = [p.shape[1] / p.shape[0] for p, _ in drawn] + [1.0] * fluoroscopy
     size = _HEIGHT_IN * 0.84 * sum(ratios) + 1.6, _HEIGHT_IN
     if size[0] > _WIDEST_IN:
         size = _WIDEST_IN, (_WIDEST_IN - 1.6) / sum(ratios) + _LETTERING_IN
     figure = Picture(figsize=size, dpi=120, layout="constrained")
     panels = figure.subplots(1, len(ratios), width_ratios=ratios, squeeze=False)[0]
-    for panel, view, (projection, picture) in zip(
-        panels[: len(views)], views, drawn, strict=True
-    ):
-        draw_scene(panel, moment, projection, picture)
+    for panel, view, seen in zip(panels, views, drawn, strict=False):
+        draw_scene(panel, moment, *seen)
         panel.set_xlabel(VIEWS[view][1])
         panel.set_title(f"from the {view}", fontsize=10)
-    if len(views):
+    if views:
         panels[0].set_ylabel("z, mm (head ↑)")
-        bar = figure.colorbar(
-            ScalarMappable(Normalize(0, 1e3 * moment.force_scale), force_map()),
-            ax=panels[: len(views)].tolist(),
-            shrink=0.55,
-            pad=0.01,
-            extend="max",
-        )
-        bar.set_label("contact force on the wall, mN")
+        scale = Normalize(0, 1e3 * moment.force_scale)
+        beside = panels[: len(views)].tolist()
+        figure.colorbar(
+            ScalarMappable(scale, force_map()), ax=beside, shrink=0.55, pad=0.01,
+            extend="max", label="contact force on the wall, mN",
+        )  # fmt: skip
     if fluoroscopy:
         draw_fluoroscopy(panels[-1], moment)
-    figure.suptitle(_caption(moment), fontsize=11)
+    caption, magnitude = f"{moment.title}; no contact with the wall", moment.magnitude
+    if count := len(magnitude):
+        caption = (
+            f"{moment.title}; {count} contact{'s' * (count > 1)}, "
+            f"{force_text(magnitude.sum())} in all, {force_text(magnitude.max())} the "
+            "largest"
+        )
+    figure.suptitle(caption, fontsize=11)
     return figure
 
 
@@ -161,38 +159,22 @@ def draw_scene(
     axes.set_facecolor("white")
     tidy(axes)
     axes.grid(False)
-    _draw_goal(axes, moment, projection)
-    if len(moment.path) > 1:
-        axes.plot(
-            *projection.flat_mm(moment.path).T, color=PATH_COLOUR, lw=0.9, zorder=3
-        )
+    x, z = projection.flat_mm(moment.goal).tolist()
+    inside = {"fc": GOAL_COLOUR, "alpha": 0.22, "zorder": 2}
+    for look in (inside, {"fill": False, "lw": 1.6, "zorder": 7}):
+        axes.add_patch(Circle((x, z), 1e3 * moment.goal_radius, ec=GOAL_COLOUR, **look))
+    way = projection.flat_mm(moment.path)
+    axes.plot(*way.T, color=PATH_COLOUR, lw=0.9, zorder=3)
     _draw_device(axes, moment, projection)
     axes.imshow(picture.glaze, extent=extent, zorder=6, interpolation="bilinear")
     _draw_forces(axes, moment, projection)
 
 
-def _draw_goal(axes: Any, moment: Moment, projection: ParallelProjection) -> None:
-    x, z = projection.flat_mm(moment.goal)
-    radius = 1e3 * moment.goal_radius
-    axes.add_patch(
-        Circle((x, z), radius, fc=GOAL_COLOUR, ec=GOAL_COLOUR, alpha=0.22, zorder=2)
-    )
-    axes.add_patch(Circle((x, z), radius, fill=False, ec=GOAL_COLOUR, lw=1.6, zorder=7))
-
-
-def _points_per_mm(axes: Any) -> float:
-    """Length of a millimetre of the axes on paper, points."""
-    box = axes.get_position()
-    height = box.height * axes.figure.get_figheight() * _POINTS_PER_INCH
-    low, high = axes.get_ylim()
-    return height / (high - low)
-
-
 def _draw_device(axes: Any, moment: Moment, projection: ParallelProjection) -> None:
     line = projection.flat_mm(curve(np.float64(moment.device), _PIECES))
-    radius = np.repeat(moment.radius, _PIECES)
     # Thicker than in truth, by half: as printed it would be two points wide.
-    width = 1.5 * 2e3 * radius * _points_per_mm(axes)
+    height = 72.0 * axes.get_position().height * axes.figure.get_figheight()  # points
+    width = 3e3 * np.repeat(moment.radius, _PIECES) * height / np.ptp(axes.get_ylim())
     pieces = np.stack([line[:-1], line[1:]], axis=1)
     dark, light = DEVICE_COLOUR, DEVICE_LIGHT
     if moment.outermost is not None:
@@ -200,24 +182,17 @@ def _draw_device(axes: Any, moment: Moment, projection: ParallelProjection) -> N
         dark, light = ([pair[shade] for pair in own] for shade in (0, 1))
         dark, light = np.repeat(dark, _PIECES), np.repeat(light, _PIECES)
     for colour, share in (("white", 1.5), (dark, 1.0), (light, 0.35)):
-        axes.add_collection(
-            LineCollection(
-                list(pieces),
-                linewidths=share * width,
-                colors=colour,
-                capstyle="round",
-                zorder=4,
-            )
-        )
-    for number, end in enumerate(projection.flat_mm(moment.ends)):
-        axes.plot(
-            *end, "o", ms=1.3 * width.max(), mfc=DEVICES[number % len(DEVICES)][1],
-            mec="0.1", mew=0.8, zorder=5,
-        )  # fmt: skip
-    axes.plot(
-        *line[-1], "o", ms=1.6 * width[-1], mfc=HEAD_COLOUR, mec="white", mew=0.8,
-        zorder=5,
-    )  # fmt: skip
+        look = {"linewidths": share * width, "colors": colour, "capstyle": "round"}
+        axes.add_collection(LineCollection(list(pieces), zorder=4, **look))
+    dots = [
+        (end, 1.3 * width.max(), DEVICES[number % len(DEVICES)][1], "0.1")
+        for number, end in enumerate(projection.flat_mm(moment.ends))
+    ]
+    for place, size, colour, edge in (
+        *dots,
+        (line[-1], 1.6 * width[-1], HEAD_COLOUR, "white"),
+    ):
+        axes.plot(*place, "o", ms=size, mfc=colour, mec=edge, mew=0.8, zorder=5)
 
 
 def _draw_forces(axes: Any, moment: Moment, projection: ParallelProjection) -> None:
@@ -234,24 +209,18 @@ def _draw_forces(axes: Any, moment: Moment, projection: ParallelProjection) -> N
     along = projection.flat_mm(unit) / 1e3 * length[:, None]
     axes.quiver(
         *place[strong].T, *along[strong].T, color=colours[strong], angles="xy",
-        scale_units="xy", scale=1, units="inches", width=_ARROW_WIDTH_IN,
+        scale_units="xy", scale=1, units="inches", width=0.037,
         edgecolor="0.15", linewidth=0.4, zorder=8,
     )  # fmt: skip
     top = int(magnitude.argmax())
     end = place[top] + (along[top] if strong[top] else 0)
     beyond = bool(end[0] > np.mean(axes.get_xlim()))  # what stands beside hides it
+    box = {"boxstyle": "round,pad=0.15", "fc": "white", "ec": "none", "alpha": 0.75}
     axes.annotate(
-        force_text(magnitude[top]),
-        end,
-        xytext=(-5 if beyond else 5, 4),
-        ha="right" if beyond else "left",
-        textcoords="offset points",
-        fontsize=9,
-        fontweight="bold",
-        color="0.1",
-        bbox={"boxstyle": "round,pad=0.15", "fc": "white", "ec": "none", "alpha": 0.75},
-        zorder=9,
-    )
+        force_text(magnitude[top]), end, xytext=(-5 if beyond else 5, 4),
+        ha="right" if beyond else "left", textcoords="offset points", fontsize=9,
+        fontweight="bold", color="0.1", bbox=box, zorder=9,
+    )  # fmt: skip
 
 
 def draw_fluoroscopy(
@@ -286,14 +255,3 @@ def goal_ring(moment: Moment, options: FluoroscopyOptions) -> tuple[np.ndarray, 
     carm = fluoroscope_of(moment.rest, options).carm
     middle, depth = carm.project(moment.goal)
     return middle, moment.goal_radius * carm.focal_length / float(depth)
-
-
-def _caption(moment: Moment) -> str:
-    magnitude = moment.magnitude
-    if not len(magnitude):
-        return f"{moment.title}; no contact with the wall"
-    contacts = "1 contact" if len(magnitude) == 1 else f"{len(magnitude)} contacts"
-    return (
-        f"{moment.title}; {contacts}, {force_text(magnitude.sum())} in all, "
-        f"{force_text(magnitude.max())} the largest"
-    )

@@ -8,14 +8,10 @@ import numpy as np
 
 from cathsim_dmc.imaging import Angiograph, FluoroscopyOptions
 from cathsim_dmc.recording.coaxial import CoaxialRecord
-from cathsim_dmc.recording.drawing import link_radii
 from cathsim_dmc.recording.episode import Episode
 from cathsim_dmc.recording.geometry import force_scale
 from cathsim_dmc.recording.living import VesselRecord, dented, dents
 from cathsim_dmc.recording.recorder import EpisodeRecorder, navigation_of
-
-# Prepared views of anatomies that are kept: each holds some megabytes.
-_VIEWS = 8
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -63,17 +59,17 @@ class Moment:
         """The present state of an environment; TypeError for any other object."""
         task = navigation_of(env)
         contacts, scene = task.contacts(env.physics), task.scene
+        there, depth = contacts.present, dents(task, contacts)
         episode = EpisodeRecorder(env, task.name).present()
         distance = 1e3 * episode.meta["distance"][0]
         moment = cls.of_episode(episode, scene.anatomy.surface)
-        depth, touched = dents(task, contacts), contacts.position[contacts.present]
-        surface = dented(moment.surface, touched, depth) if depth.size else None
+        surface, position = moment.surface, contacts.position[there]
         return dataclasses.replace(
             moment,
-            surface=surface or moment.surface,
-            position=contacts.position[contacts.present],
-            force=contacts.force[contacts.present],
-            force_scale=force_scale(contacts.magnitude[contacts.present]),
+            surface=dented(surface, position, depth) if depth.size else surface,
+            position=position,
+            force=contacts.force[there],
+            force_scale=force_scale(contacts.magnitude[there]),
             path=np.zeros((0, 3)),
             title=f"{task.name}: {distance:.0f} mm to {scene.goal.name}",
         )
@@ -99,8 +95,16 @@ class Moment:
             raise ValueError("the episode was recorded without a goal")
         # Contacts of state t + 1 belong to step t.
         there = episode.contact_step == step - 1
-        record = VesselRecord.of(episode)
+        record, coaxial = VesselRecord.of(episode), CoaxialRecord.of(episode)
         now = surface if record is None else record.surface(surface, episode, step)
+        own: dict[str, np.ndarray] = {"radius": episode.radii}
+        if coaxial is not None:
+            outermost = coaxial.outermost(episode.catheter)[step]
+            own = {
+                "outermost": outermost,
+                "radius": coaxial.radii[outermost],
+                "ends": coaxial.ends(episode.catheter)[step],
+            }
         return cls(
             surface=now,
             rest=surface,
@@ -113,28 +117,11 @@ class Moment:
             force_scale=force_scale(np.linalg.norm(episode.contact_force, axis=-1)),
             path=episode.head[: step + 1],
             title=f"{episode.task}, {episode.time[step] - episode.time[0]:.1f} s",
-            **_coaxial(episode, step, link_radii(episode)),
+            **own,
         )
 
 
-def _coaxial(episode: Episode, state: int, radius: np.ndarray) -> dict[str, np.ndarray]:
-    """Radii (L,) of the links in a state, and outermost and ends of coaxial devices.
-
-    Args:
-        radius: (L,), of a device alone.
-    """
-    coaxial = CoaxialRecord.of(episode)
-    if coaxial is None:
-        return {"radius": radius}
-    outermost = coaxial.outermost(episode.catheter)[state]
-    return {
-        "outermost": outermost,
-        "radius": coaxial.radii[outermost],
-        "ends": coaxial.ends(episode.catheter)[state],
-    }
-
-
-@functools.lru_cache(maxsize=_VIEWS)
+@functools.lru_cache(maxsize=8)  # each holds some megabytes
 def fluoroscope_of(surface: Any, options: FluoroscopyOptions) -> Any:
     """The frontal plane of an angiography machine before a surface."""
     return Angiograph(surface.vertices, surface.faces, options).planes()[0]

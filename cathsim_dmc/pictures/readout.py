@@ -47,22 +47,22 @@ class ForceReadout:
 
     def __repr__(self) -> str:
         """A table of the contacts and a line of the other forces."""
+        total, largest, peak, push = (
+            f"{1e3 * force:.2f} mN"
+            for force in (
+                self.wall_sum, self.wall_max, self.wall_peak_max, self.push_force
+            )
+        )  # fmt: skip
+        cell = ", ".join(f"{1e3 * force:.1f}" for force in self.load_cell)
         lines = [
-            f"{len(self)} contact{'s' * (len(self) != 1)} with the wall: sum "
-            f"{_mn(self.wall_sum)}, largest {_mn(self.wall_max)}, "
-            f"peak within the step {_mn(self.wall_peak_max)}",
-            f"push {_mn(self.push_force)}, load cell "
-            f"({', '.join(f'{1e3 * f:.1f}' for f in self.load_cell)}) mN",
+            f"{len(self)} contact{'s' * (len(self) != 1)} with the wall: sum {total}, "
+            f"largest {largest}, peak within the step {peak}",
+            f"push {push}, load cell ({cell}) mN",
         ]
         if len(self):
             lines.append("     position, mm          force on the wall, mN")
-        for place, force in zip(1e3 * self.position, 1e3 * self.force, strict=True):
-            lines.append(
-                "  "
-                + " ".join(f"{x:6.1f}" for x in place)
-                + "  "
-                + " ".join(f"{f:8.2f}" for f in force)
-            )
+        row = "  {:6.1f} {:6.1f} {:6.1f}  {:8.2f} {:8.2f} {:8.2f}"
+        lines += [row.format(*r) for r in 1e3 * np.hstack([self.position, self.force])]
         return "\n".join(lines)
 
 
@@ -78,19 +78,13 @@ def forces(env: Any) -> ForceReadout:
     task = navigation_of(env)
     contacts, readings = task.contacts(env.physics), task.readings
     there = contacts.present
-    names = ("wall_sum", "wall_max", "wall_peak_sum", "wall_peak_max")
-    wall = dict(zip(names, map(float, task.wall_force), strict=True))
     return ForceReadout(
-        position=contacts.position[there],
-        force=contacts.force[there],
-        magnitude=contacts.magnitude[there],
-        penetration=contacts.penetration[there],
-        **wall,
+        contacts.position[there],
+        contacts.force[there],
+        contacts.magnitude[there],
+        contacts.penetration[there],
+        *map(float, task.wall_force),
         push_force=float(readings.push_force),
         push_torque=float(readings.push_torque),
         load_cell=np.array(readings.load_cell),
     )
-
-
-def _mn(newtons: float) -> str:
-    return f"{1e3 * newtons:.2f} mN"

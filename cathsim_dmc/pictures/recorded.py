@@ -10,7 +10,6 @@ import numpy as np
 
 from cathsim_dmc import policies
 from cathsim_dmc.imaging import Angiograph, FluoroscopyOptions
-from cathsim_dmc.recording.drawing import link_radii
 from cathsim_dmc.recording.episode import Episode
 from cathsim_dmc.recording.living import MESH_EVERY, VesselRecord
 from cathsim_dmc.recording.recorder import EpisodeRecorder, navigation_of
@@ -54,13 +53,12 @@ def record(
             returns no action of the environment.
         FileNotFoundError: the file's folder does not exist.
     """
-    task = navigation_of(env)
-    target = None if path is None else _checked(path)
-    name = task_name or getattr(task, "name", None)
-    recorder = EpisodeRecorder(env, name)
+    if path is not None:
+        _checked(path)
+    recorder = EpisodeRecorder(env, task_name or navigation_of(env).name)
     episode = recorder.record_episode(as_function(policy, env, seed), seed, max_steps)
-    if target is not None:
-        write(episode, env, target)
+    if path is not None:
+        write(episode, env, path)
     return episode
 
 
@@ -91,8 +89,7 @@ def as_function(
             "cathsim_dmc.policies.Policy, or a function from the observation to the "
             "action"
         )
-    function = policy
-    return lambda timestep: np.asarray(function(timestep.observation))
+    return lambda timestep: np.asarray(policy(timestep.observation))
 
 
 def write(
@@ -115,13 +112,9 @@ def write(
     if target.suffix == ".rrd":
         from cathsim_dmc.recording.rerun_log import write_rrd
 
-        frames = None
-        if fluoroscopy:
-            frames = xray_film(episode, surface, film_options(env.task))
-        geoms = body_geoms(env.physics)
-        return write_rrd(
-            episode, surface, target, robot_geoms=geoms, fluoroscopy=frames
-        )
+        options, geoms = film_options(env.task), body_geoms(env.physics)
+        film = xray_film(episode, surface, options) if fluoroscopy else None
+        return write_rrd(episode, surface, target, robot_geoms=geoms, fluoroscopy=film)
     from cathsim_dmc.pictures.animation import animate
 
     return animate(episode, surface, target)
@@ -152,25 +145,18 @@ def xray_film(
         the brightest of each plane's grey levels are black and white. A vessel that
         moves is drawn anew in every fourth state.
     """
-    planes = Angiograph(surface.vertices, surface.faces, options).planes()
-    record, states = VesselRecord.of(episode), episode.steps + 1
+    record, states, films = VesselRecord.of(episode), episode.steps + 1, []
     moved = None if record is None or record.still else record
     span = MESH_EVERY if moved else states
-    films = [np.empty((states, *p.carm.resolution, 1), np.uint8) for p in planes]
-    radii = link_radii(episode)
-    for first in range(0, states, span):
-        line = episode.catheter[first : first + span]
-        radius = np.broadcast_to(radii, (len(line), len(radii)))
-        now = moved and moved.surface(surface, episode, first)
-        for film, plane in zip(films, planes, strict=True):
-            seen = plane.around(now) if now else plane
-            film[first : first + span] = seen.render(line, radius)
-    return np.concatenate([_windowed(film) for film in films], axis=-1)
-
-
-def _windowed(film: np.ndarray) -> np.ndarray:
-    """Grey levels (uint8) stretched over the whole scale, alike in all frames."""
-    darkest, brightest = int(film.min()), int(film.max())
-    levels = np.arange(256.0) - darkest
-    scale = np.clip(255 * levels / max(brightest - darkest, 1), 0, 255)
-    return scale.round().astype(np.uint8)[film]
+    for plane in Angiograph(surface.vertices, surface.faces, options).planes():
+        film = np.empty((states, *plane.carm.resolution, 1), np.uint8)
+        for first in range(0, states, span):
+            line = episode.catheter[first : first + span]
+            radius = np.broadcast_to(episode.radii, (len(line), len(episode.radii)))
+            if moved:
+                plane = plane.around(moved.surface(surface, episode, first))
+            film[first : first + span] = plane.render(line, radius)
+        darkest, brightest = int(film.min()), int(film.max())
+        levels = 255 * (np.arange(256.0) - darkest) / max(brightest - darkest, 1)
+        films.append(np.clip(levels, 0, 255).round().astype(np.uint8)[film])
+    return np.concatenate(films, axis=-1)

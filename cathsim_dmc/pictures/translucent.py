@@ -13,7 +13,7 @@ import numpy as np
 from cathsim_dmc.anatomy.parts import Surface
 
 # Colour of the wall, RGB in [0, 1], as lit from the left above the viewer's eye.
-WALL_COLOUR = (0.80, 0.36, 0.33)
+WALL_COLOUR = np.array([0.80, 0.36, 0.33])
 LIGHT = np.array([-0.35, 0.55, 0.76])
 # Opacity of one layer of the wall: seen straight on, and along the surface.
 FACING, GRAZING = 0.08, 0.70
@@ -76,10 +76,9 @@ class ParallelProjection:
         return max(int(height), 1), max(int(width), 1)
 
     @property
-    def extent_mm(self) -> tuple[float, float, float, float]:
+    def extent_mm(self) -> tuple[float, ...]:
         """Left, right, bottom and top of the picture, mm, for matplotlib."""
-        (left, bottom), (right, top) = 1e3 * self.low, 1e3 * self.high
-        return float(left), float(right), float(bottom), float(top)
+        return tuple((1e3 * np.stack([self.low, self.high], axis=1)).ravel().tolist())
 
     def flat_mm(self, points: np.ndarray) -> np.ndarray:
         """Points (..., 3) in metres as (..., 2) in the picture, mm."""
@@ -88,9 +87,8 @@ class ParallelProjection:
     def pixel(self, points: np.ndarray) -> np.ndarray:
         """Points (..., 3) in metres as (..., 2): column and row, from the top left."""
         flat = self.flat_mm(points) / 1e3
-        return np.stack(
-            [flat[..., 0] - self.low[0], self.high[1] - flat[..., 1]], axis=-1
-        ) * (self.pixels)
+        corner = np.array([self.low[0], self.high[1]])
+        return (flat - corner) * [self.pixels, -self.pixels]
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,88 +118,64 @@ def glass(
     pixel, depth, normal = _hits(vertices, faces, fine, (rows, columns))
     order = np.lexsort((depth, pixel))  # within a pixel, the farthest first
     pixel, normal = pixel[order], normal[order]
-    shade = _lit(normal, np.array(WALL_COLOUR))
-    slant = 1.0 - np.abs(normal[:, 2])
+    slant = 1.0 - np.abs(normal[:, 2:])
     opacity = FACING + (GRAZING - FACING) * slant**2.5
+    # Colours are premultiplied with opacity until the end.
+    hits = np.hstack([_lit(normal) * opacity, opacity])
     first = np.flatnonzero(np.diff(pixel, prepend=-1))
     count = np.diff(np.append(first, len(pixel)))
-    where = pixel[first]
-    behind = np.zeros((rows * columns, 4))
+    behind, glaze = np.zeros((2, rows * columns, 4))
     for layer in range(min(int(count.max(initial=0)), _LAYERS)):
         deep = count > layer
-        _over(
-            behind,
-            where[deep],
-            shade[first[deep] + layer],
-            opacity[first[deep] + layer],
-        )
-    glaze = np.zeros((rows * columns, 4))
-    last = first + count - 1
-    _over(glaze, where, shade[last], GLAZE * opacity[last])
-    return Glass(*(_smaller(each, (rows, columns)) for each in (behind, glaze)))
+        where, over = pixel[first[deep]], hits[first[deep] + layer]
+        behind[where] = over + (1.0 - over[:, 3:]) * behind[where]
+    glaze[pixel[first]] = GLAZE * hits[first + count - 1]
+    return Glass(*(_smaller(each, projection.shape) for each in (behind, glaze)))
 
 
 def _hits(vertices, faces, projection, shape):
     """Pixels (H,), depths (H,) towards the viewer and unit normals (H, 3) of hits."""
-    rows, columns = shape
     frame = np.stack([projection.right, projection.up, projection.towards], axis=1)
     normals = Surface(vertices, faces).normals @ frame
     flat = projection.pixel(vertices)[faces]  # (F, 3, 2)
     depth = (vertices @ projection.towards)[faces]
+    # Pixels of the boxes around the triangles.
     low = np.maximum(np.ceil(flat.min(1) - 0.5).astype(int), 0)
     high = np.floor(flat.max(1) - 0.5).astype(int)
-    high = np.minimum(high, [columns - 1, rows - 1])
-    size = np.maximum(high - low + 1, 0)
+    size = np.maximum(np.minimum(high, np.array(shape)[::-1] - 1) - low + 1, 0)
     boxes = size.prod(1)
     face = np.repeat(np.arange(len(faces)), boxes)
     number = np.arange(len(face)) - np.repeat(np.cumsum(boxes) - boxes, boxes)
-    column = low[face, 0] + number % np.maximum(size[face, 0], 1)
-    row = low[face, 1] + number // np.maximum(size[face, 0], 1)
-    a, b, c = flat[:, 0], flat[:, 1], flat[:, 2]
+    pixel = low[face] + np.stack(np.divmod(number, size[face, 0])[::-1], axis=1)
+    a, b, c = flat.transpose(1, 0, 2)
     area = _cross(b - a, c - a)
-    point = np.stack([column, row], axis=1) + 0.5
     # Triangles seen edge on cover nothing.
-    area = np.where(np.abs(area) > 1e-12, area, np.inf)[face]
-    second = _cross(point - a[face], (c - a)[face]) / area
-    third = _cross((b - a)[face], point - a[face]) / area
+    area = np.where(np.abs(area) > 1e-12, area, np.nan)[face]
+    point = pixel + 0.5 - a[face]
+    second = _cross(point, (c - a)[face]) / area
+    third = _cross((b - a)[face], point) / area
     inside = (second >= 0) & (third >= 0) & (second + third <= 1)
-    inside &= np.isfinite(area)
     face, second, third = face[inside], second[inside], third[inside]
     share = np.stack([1 - second - third, second, third], axis=1)
     normal = np.einsum("hi,hij->hj", share, normals[faces[face]])
     normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-9)
-    pixel = row[inside] * columns + column[inside]
-    return pixel, np.vecdot(share, depth[face]), normal
+    return pixel[inside] @ [1, shape[1]], np.vecdot(share, depth[face]), normal
 
 
 def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
 
 
-def _lit(normal: np.ndarray, colour: np.ndarray) -> np.ndarray:
+def _lit(normal: np.ndarray) -> np.ndarray:
     """Colours (H, 3) of glass lit from both sides."""
     facing = np.where(normal[:, 2:] < 0, -normal, normal)
     light = np.clip(facing @ (LIGHT / np.linalg.norm(LIGHT)), 0, 1)[:, None]
-    shine = 0.5 * light**24
-    return np.clip(colour * (0.55 + 0.55 * light) + shine, 0, 1)
-
-
-def _over(image: np.ndarray, where: np.ndarray, colour, opacity) -> None:
-    below = image[where]
-    cover = opacity[:, None]
-    alpha = cover + below[:, 3:] * (1 - cover)
-    mixed = colour * cover + below[:, :3] * below[:, 3:] * (1 - cover)
-    image[where, :3] = mixed / np.maximum(alpha, 1e-9)
-    image[where, 3:] = alpha
+    return np.clip(WALL_COLOUR * (0.55 + 0.55 * light) + 0.5 * light**24, 0, 1)
 
 
 def _smaller(image: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
-    """Means over the samples of every pixel, colours weighted by opacity."""
+    """Means over the samples of every pixel, colours no longer premultiplied."""
     rows, columns = shape
-    image = image.reshape(rows, columns, 4)
-    image = np.concatenate([image[..., :3] * image[..., 3:], image[..., 3:]], axis=-1)
-    parts = image.reshape(
-        rows // _SAMPLES, _SAMPLES, columns // _SAMPLES, _SAMPLES, 4
-    ).mean((1, 3))
-    parts[..., :3] /= np.maximum(parts[..., 3:], 1e-9)
-    return np.clip(parts, 0, 1)
+    image = image.reshape(rows, _SAMPLES, columns, _SAMPLES, 4).mean((1, 3))
+    image[..., :3] /= np.maximum(image[..., 3:], 1e-9)
+    return np.clip(image, 0, 1)

@@ -38,11 +38,11 @@ class CoaxialRecord:
         devices = episode.meta.get("devices")
         if not devices:
             return None
-        series = (
-            np.array([one[name] for one in devices], np.float64).T for name in SERIES
+        columns = (
+            np.array([one[name] for one in devices], np.float64).T
+            for name in ("radius", *SERIES)
         )
-        radii = np.array([one["radius"] for one in devices], np.float64)
-        return cls(tuple(one["name"] for one in devices), radii, *series)
+        return cls(tuple(one["name"] for one in devices), *columns)
 
     @property
     def gaps(self) -> np.ndarray:
@@ -55,14 +55,13 @@ class CoaxialRecord:
         Args:
             line: (T+1, L+1, 3), joints from proximal to distal, then the head.
         """
-        beyond = _beyond(line)
-        found = np.empty((*self.gaps.shape, 3))
-        for state, gaps in enumerate(self.gaps):
-            # Ascending for interpolation: from the head backwards.
-            places, points = beyond[state, ::-1], line[state, ::-1]
-            for axis in range(3):
-                found[state, :, axis] = np.interp(gaps, places, points[:, axis])
-        return found
+        return np.array(
+            [
+                # Ascending for interpolation: from the head backwards.
+                np.stack([np.interp(gap, way[::-1], x[::-1]) for x in points.T], -1)
+                for gap, way, points in zip(self.gaps, _beyond(line), line, strict=True)
+            ]
+        )
 
     def outermost(self, line: np.ndarray) -> np.ndarray:
         """Number (T+1, L) of the outermost device in the middle of each link.

@@ -20,8 +20,8 @@ FORMAT = "cathsim-episode"
 FORMAT_VERSION = 1
 SUFFIX = ".npz"
 TERMINATIONS = ("success", "truncated", "physics_error")
-
-
+# 5F diagnostic catheter, 1.67 mm outer diameter; used when the record has no radii.
+CATHETER_RADIUS = 0.835e-3
 # Leading axis of every array: "state" has T+1 rows, "step" has T, "contact" has K.
 _AXES: dict[str, tuple[str, tuple[int | str, ...]]] = {
     "time": ("state", ()),
@@ -118,20 +118,14 @@ class Episode:
         for name, (axis, tail) in _AXES.items():
             shape = getattr(self, name).shape
             for size, have in zip(tail, shape[1:], strict=False):
-                if isinstance(size, str):
-                    sizes.setdefault(size, have)
+                sizes.setdefault(size, have if isinstance(size, str) else size)
             wanted = tuple(sizes.get(size, size) for size in (axis, *tail))
-            if shape != wanted:
+            if shape != wanted or (name == "catheter" and shape[1] < 2):
                 raise ValueError(
                     f"{name} must have shape {wanted} because time has "
-                    f"{self.time.size} entries and contact_step {contacts}; got {shape}"
+                    f"{self.time.size} entries and contact_step {contacts}, and at "
+                    f"least one joint and the head; got {shape}"
                 )
-        if sizes["L+1"] < 2:
-            raise ValueError(
-                "catheter needs at least one joint and the head, so shape "
-                f"(T+1, >=2, 3); got {self.catheter.shape}"
-            )
-
         steps = self.contact_step
         order = np.diff(steps, prepend=0, append=self.steps - 1)
         if steps.size and (order < 0).any():
@@ -159,6 +153,12 @@ class Episode:
     def head(self) -> np.ndarray:
         """(T+1, 3) position of the distal end of the catheter, world frame, metres."""
         return self.catheter[:, -1]
+
+    @property
+    def radii(self) -> np.ndarray:
+        """(L,) radii of the links, metres: ``meta['catheter_radius']``, or a 5F's."""
+        given = self.meta.get("catheter_radius", CATHETER_RADIUS)
+        return np.broadcast_to(np.float64(given), (self.catheter.shape[1] - 1,))
 
     @property
     def contact_counts(self) -> np.ndarray:
@@ -213,9 +213,7 @@ class Episode:
             )
         try:
             return cls(header["task"], header["seed"], header["meta"], **arrays)
-        except KeyError as error:
-            raise ValueError(f"{path} lacks the entry {error}") from error
-        except ValueError as error:
+        except (KeyError, ValueError) as error:
             raise ValueError(f"{path}: {error}") from error
 
     def equals(self, other: "Episode") -> bool:

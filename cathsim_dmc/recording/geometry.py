@@ -2,7 +2,6 @@
 
 import numpy as np
 
-UP = np.array([0.0, 0.0, 1.0])
 # Top of the colour scale, newtons. Published in-contact forces lie mostly within
 # 0-0.2 N with outliers above 0.4 N, so ordinary contacts use half the scale.
 FORCE_COLOUR_MAX = 0.4
@@ -18,9 +17,9 @@ _FORCE_COLOURS = np.array(
 
 
 def z_to(direction: np.ndarray) -> np.ndarray:
-    """Return the shortest rotations taking +z to ``direction``, as quaternions wxyz.
+    """Return the shortest rotations taking +z to ``direction``, as quaternions xyzw.
 
-    Half-angle construction: q = (1 + z.d, z x d), normalised; for d = -z, where that
+    Half-angle construction: q = (z x d, 1 + z.d), normalised; for d = -z, where that
     vanishes, half a turn about x.
 
     Args:
@@ -29,20 +28,11 @@ def z_to(direction: np.ndarray) -> np.ndarray:
     Returns:
         (..., 4) unit quaternions.
     """
-    direction = np.asarray(direction, dtype=np.float64)
     length = np.linalg.norm(direction, axis=-1, keepdims=True)
-    unit = np.where(length > 0, direction / np.where(length > 0, length, 1), UP)
-    quaternion = np.stack(
-        [
-            1 + unit[..., 2],
-            -unit[..., 1],
-            unit[..., 0],
-            np.zeros(unit.shape[:-1]),
-        ],
-        axis=-1,
-    )
+    x, y, z = np.moveaxis(direction / np.where(length > 0, length, 1), -1, 0)
+    quaternion = np.stack([-y, x, 0 * z, 1 + z], axis=-1)
     norm = np.linalg.norm(quaternion, axis=-1, keepdims=True)
-    flipped = np.broadcast_to([0.0, 1.0, 0.0, 0.0], quaternion.shape)
+    flipped = np.array([1.0, 0.0, 0.0, 0.0])
     return np.where(norm > 1e-9, quaternion / np.where(norm > 1e-9, norm, 1), flipped)
 
 
@@ -58,10 +48,8 @@ def force_colours(
 
     The scale is linear from 0 to ``largest`` and saturates above.
     """
-    magnitude = np.asarray(magnitude, dtype=np.float64)
-    last = len(_FORCE_COLOURS) - 1
-    place = np.clip(magnitude / largest, 0, 1) * last
-    mixed = [np.interp(place, range(last + 1), one) for one in _FORCE_COLOURS.T]
+    stops = np.linspace(0.0, largest, len(_FORCE_COLOURS))
+    mixed = [np.interp(magnitude, stops, one) for one in _FORCE_COLOURS.T]
     return np.round(np.stack(mixed, axis=-1)).astype(np.uint8)
 
 

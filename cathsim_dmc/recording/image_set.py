@@ -30,9 +30,6 @@ from cathsim_dmc.recording.sequences import KEYPOINTS, KITS, SequenceOptions
 SPLITS = {"train": "train", "val": "train", "test": "test"}  # and their sets of arches
 _TRIES = 8  # arches that are tried in place of those that no device enters
 _FORMAT = "cathsim-image-set"
-_NO_H5PY = "h5py is not installed; `pip install 'cathsim-dmc[gym]'` adds it"
-
-
 Labels = dict[str, list[Any]]  # as `coco.labels` returns them
 
 
@@ -121,13 +118,15 @@ def write(
     try:
         import h5py  # noqa: F401
     except ModuleNotFoundError as error:
-        raise ModuleNotFoundError(_NO_H5PY) from error
+        raise ModuleNotFoundError(
+            "h5py is not installed; `pip install 'cathsim-dmc[gym]'` adds it"
+        ) from error
     out, options = Path(out), options or ImageSetOptions()
     count = os.cpu_count() or 1
     if processes is not None:
         count = bounds.whole("processes", processes, 1, bounds.MOST_THREADS)
     _begin(out, options)
-    start, used = time.monotonic(), _processor()
+    start, used = time.monotonic(), sum(os.times()[:4])
     shards, labels, new = _shards(out, options), [], 0
     for rows, line, own in _over(_write_shard, shards, count):
         labels.append(own)
@@ -136,17 +135,13 @@ def write(
             say(line)
     frames = _label(out, shards, labels)
     files.write_text(out / "README.md", _card(options, frames))
-    took = time.monotonic() - start
-    return Written(out, frames, new, took, _processor() - used)
+    took, spent = time.monotonic() - start, sum(os.times()[:4]) - used
+    return Written(out, frames, new, took, spent)
 
 
 def _begin(out: Path, options: ImageSetOptions) -> None:
     """Makes the folders; refuses one with anything else in it."""
-    about = {
-        "format": _FORMAT,
-        "version": __version__,
-        "options": dataclasses.asdict(options),
-    }
+    about = {"format": _FORMAT, "version": __version__, "options": vars(options)}
     text = json.dumps(about, indent=2) + "\n"
     if not out.parent.is_dir():
         raise FileNotFoundError(f"no directory {out.parent}; create it first")
@@ -245,12 +240,6 @@ def _label(out: Path, shards: list[_Shard], labels: list[Labels]) -> dict[str, i
         files.write_text(out / "annotations" / f"{split}.json", json.dumps(joined))
         frames[split] = len(joined["images"])
     return frames
-
-
-def _processor() -> float:
-    """Processor time of this process and those that it has waited for, s."""
-    spent = os.times()
-    return spent.user + spent.system + spent.children_user + spent.children_system
 
 
 def _card(options: ImageSetOptions, frames: dict[str, int]) -> str:

@@ -18,19 +18,12 @@ SERIES = {
     "indentation": (1e3, "indentation, mm"),
     "wall_work": (1e6, "work on the wall, µJ"),
 }
-
-
 # Waves P, Q, R, S and T of the curve that stands for an ECG: middle, in beats from the
 # beginning of the ejection, width and height.
-_WAVES = np.array(
-    [
-        (-0.20, 0.030, 0.15),
-        (-0.07, 0.012, -0.12),
-        (-0.04, 0.025, 1.0),
-        (-0.01, 0.012, -0.2),
-        (0.24, 0.045, 0.3),
-    ]
-)
+_WAVES = np.array([
+    (-0.20, 0.030, 0.15), (-0.07, 0.012, -0.12), (-0.04, 0.025, 1.0),
+    (-0.01, 0.012, -0.2), (0.24, 0.045, 0.3),
+])  # fmt: skip
 MESH_EVERY = 4  # states, of which a recording keeps the moved surface
 DENT = 6e-3  # m around a contact, in which a wall that gives is drawn pressed in
 
@@ -118,19 +111,13 @@ def dented(surface: Surface, place: np.ndarray, depth: np.ndarray) -> Surface:
 
 def vessel_state(task: Any) -> dict[str, Any]:
     """What a record keeps of the vessel in a state; nothing of one that rests."""
-    rollout = task.rollout
-    state = rollout.vessel
-    if state is None:
+    vessel = task.rollout.vessel
+    if vessel is None:
         return {}
-    info = {name: float(value[0]) for name, value in state.info().items()}
-    moving = rollout.moving
     return {
-        "vessel": {
-            **info,
-            "blood_velocity": state.blood_velocity[0].tolist(),
-            "goal": rollout.goal.reshape(3).tolist(),
-        },
-        "vessel_motion": {} if moving is None else moving.record(),
+        **{name: float(value[0]) for name, value in vessel.info().items()},
+        "blood_velocity": vessel.blood_velocity[0].tolist(),
+        "goal": task.rollout.goal.reshape(3).tolist(),
     }
 
 
@@ -138,12 +125,3 @@ def dents(task: Any, contacts: Any) -> np.ndarray:
     """Depths (K,) m of the contacts; (0,) in a wall that does not give."""
     gives = task.config.vessel_options.wall is not None
     return contacts.penetration[contacts.present] if gives else np.zeros(0)
-
-
-def vessel_meta(
-    states: list[dict[str, Any]], motion: dict[str, Any], depth: np.ndarray
-) -> dict[str, Any]:
-    """Entry ``meta['vessel']`` of an episode: its states, and depths of contacts."""
-    columns = {name: [state[name] for state in states] for name in states[0]}
-    meta = {**columns, "lattice": [], "parameters": [], **motion}
-    return {**meta, "depth": depth.tolist()}

@@ -1,5 +1,6 @@
 """Recording of whole episodes of a composer environment."""
 
+import collections
 import functools
 import itertools
 import logging
@@ -11,14 +12,13 @@ from typing import Any
 import numpy as np
 from dm_control.rl import control
 
+from cathsim_dmc import __version__, bounds
 from cathsim_dmc.recording.coaxial import SERIES, device_meta
-from cathsim_dmc.recording.episode import TERMINATIONS, Episode
-from cathsim_dmc.recording.living import dents, vessel_meta, vessel_state
+from cathsim_dmc.recording.episode import Episode
+from cathsim_dmc.recording.living import dents, vessel_state
 from cathsim_dmc.simulation.episodes import ComposerSimulation, play
 
 Policy = Callable[[Any], np.ndarray]
-
-_VERSIONED = ("cathsim-dmc", "mujoco", "dm-control", "numpy")
 
 
 def navigation_of(env: Any) -> Any:
@@ -33,27 +33,15 @@ def navigation_of(env: Any) -> Any:
     return task
 
 
-def read_termination(task: Any, timestep: Any) -> str | None:
-    """Return why the episode ended, or None while it runs.
-
-    A task never sees the end by diverged physics or by composer's time limit: the
-    environment then ends the episode itself, with discount 0 and 1.
-    """
-    if not timestep.last() or task.termination not in (None, "truncated"):
-        return task.termination
-    return "truncated" if timestep.discount else "physics_error"
-
-
-class _EpisodeRows(dict[str, list]):
+class _Rows(collections.defaultdict[str, list]):
     """Growing lists, one per array of an episode."""
 
-    def add(self, **values: Any) -> None:
+    def add(self, values: dict[str, Any]) -> None:
         for name, value in values.items():
-            self.setdefault(name, []).append(value)
+            self[name].append(value)
 
     def array(self, name: str, row_shape: tuple[int, ...] = ()) -> np.ndarray:
-        values = self.get(name)
-        return np.array(values) if values else np.zeros((0, *row_shape))
+        return np.array(self[name]) if self[name] else np.zeros((0, *row_shape))
 
 
 class EpisodeRecorder:
@@ -77,8 +65,7 @@ class EpisodeRecorder:
         task_name: str | None = None,
         task_kwargs: dict[str, Any] | None = None,
     ) -> None:
-        navigation_of(env)
-        self._env = env
+        self._env, self._task = env, navigation_of(env)
         self._task_name = task_name or type(env.task).__name__
         self._task_kwargs = dict(task_kwargs or {})
 
@@ -101,158 +88,131 @@ class EpisodeRecorder:
             ValueError: if the policy returns an action of a wrong shape or with
                 values that are not finite, or ``max_steps`` is not positive.
         """
-        if max_steps is not None and max_steps < 1:
-            raise ValueError(f"max_steps must be at least 1, got {max_steps}")
+        if max_steps is not None:
+            bounds.whole("max_steps", max_steps, 1)
         if seed is not None:
             self._env.random_state.seed(seed)
-        turns = play(
-            ComposerSimulation(self._env), functools.partial(self._action, policy)
-        )
+        choose = functools.partial(self._action, policy)
+        turns = play(ComposerSimulation(self._env), choose)
         next(turns)
-        rows = _EpisodeRows()
-        rows.add(**self._state())
-        steps, error, termination, discount = 0, None, None, 1.0
+        rows = _Rows(list)
+        rows.add(self._state())
+        steps, end = 0, {"termination": None, "discount": 1.0}
         try:
             for action, timestep, _ in itertools.islice(turns, max_steps):
-                discount = float(timestep.discount)
-                termination = read_termination(self._env.task, timestep)
-                if termination == "physics_error":
-                    error = "the environment ended the episode"
-                    break
-                rows.add(**self._state())
-                rows.add(action=action, reward=float(timestep.reward))
-                forces, contacts = self._forces()
-                rows.add(**forces)
-                for name, values in contacts.items():
-                    rows.setdefault(name, []).extend(values)
-                rows.setdefault("contact_step", []).extend(
-                    [steps] * len(contacts["contact_force"])
-                )
+                termination = self._task.termination
+                end = {"termination": termination, "discount": timestep.discount}
+                # The environment itself ends an episode by diverged physics, discount
+                # 0, or composer's time limit, discount 1; the task never sees that.
+                alone = timestep.last() and termination in (None, "truncated")
+                lost = alone and not timestep.discount
+                if lost or termination == "physics_error":
+                    raise control.PhysicsError("the environment ended the episode")
+                rows.add(self._state())
+                rows.add({"action": action, "reward": float(timestep.reward)})
+                self._add_forces(rows, steps)
                 steps += 1
-        except control.PhysicsError as caught:
-            error, termination = str(caught), "physics_error"
-        if error is not None:
+        except control.PhysicsError as error:
+            end |= {"termination": "physics_error", "error": str(error)}
             logging.getLogger(__name__).warning(
                 "physics diverged after %d steps: %s", steps, error
             )
-        meta = self._meta(rows, termination or "truncated", discount)
-        if error is not None:
-            meta["error"] = error
-        return self._episode(rows, seed, meta)
+        return self._episode(rows, seed, end)
 
     def present(self) -> Episode:
         """The present state as an episode of no steps."""
-        rows = _EpisodeRows()
-        rows.add(**self._state())
-        return self._episode(rows, None, self._meta(rows, "truncated", 1.0))
+        rows = _Rows(list)
+        rows.add(self._state())
+        return self._episode(rows, None, {"termination": None, "discount": 1.0})
+
+    def _action(self, policy: Policy, timestep: Any) -> np.ndarray:
+        shape = self._env.action_spec().shape
+        action = bounds.array("the policy's action", policy(timestep), "biuf", shape)
+        return np.array(action, dtype=np.float64)
 
     def _state(self) -> dict[str, Any]:
-        data, task = self._env.physics.data, self._env.task
-        devices = task.devices
+        data, readings, devices = (
+            self._env.physics.data, self._task.readings, self._task.devices
+        )  # fmt: skip
         coaxial = {} if devices is None else {n: getattr(devices, n) for n in SERIES}
+        vessel = vessel_state(self._task)
         return {
             **coaxial,
             "time": float(data.time),
             "qpos": np.array(data.qpos),
-            "catheter": np.array(task.readings.centreline),
+            "catheter": np.array(readings.centreline),
             "body_pos": np.array(data.xpos),
             "body_quat": np.array(data.xquat),
-            "base_insertion": float(task.readings.insertion),
-            **vessel_state(task),
+            "base_insertion": float(readings.insertion),
+            **({"vessel": vessel} if vessel else {}),
         }
 
-    def _forces(self) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-        """Forces and reward terms of the step that has just ended, and contacts."""
-        task, wall = self._env.task, self._env.task.wall_force
+    def _add_forces(self, rows: _Rows, step: int) -> None:
+        """Adds forces, contacts and reward terms of the step that has just ended."""
+        task, prefix = self._task, "reward_"
+        rows.add({name: float(one) for name, one in task.wall_force.named().items()})
+        rows.add({"push_force": float(task.readings.push_force)})
+        for name, value in task.info().items():
+            if name.startswith(prefix):
+                rows[name].append(value)
         contacts = task.contacts(self._env.physics)
-        prefix = "reward_"
-        forces = {
-            **{name: float(value) for name, value in wall.named().items()},
-            "push_force": float(task.readings.push_force),
-            "reward_terms": {
-                name.removeprefix(prefix): value
-                for name, value in task.info().items()
-                if name.startswith(prefix)
-            },
-        }
-        return forces, {
-            "contact_position": contacts.position[contacts.present],
-            "contact_force": contacts.force[contacts.present],
-            "contact_depth": dents(task, contacts),
-        }
+        there = contacts.present
+        rows["contact_position"] += list(contacts.position[there])
+        rows["contact_force"] += list(contacts.force[there])
+        rows["contact_depth"] += list(dents(task, contacts))
+        rows["contact_step"] += [step] * int(there.sum())
 
-    def _action(self, policy: Policy, timestep: Any) -> np.ndarray:
-        action = np.array(policy(timestep), dtype=np.float64)
-        shape = self._env.action_spec().shape
-        if action.shape != shape:
-            raise ValueError(
-                f"the policy returned an action of shape {action.shape}, the "
-                f"environment takes {shape}"
-            )
-        if not np.isfinite(action).all():
-            raise ValueError(f"the policy returned an action with {action}")
-        return action
-
-    def _meta(
-        self, rows: _EpisodeRows, termination: str, discount: float
-    ) -> dict[str, Any]:
-        model, task = self._env.physics.model, self._env.task
-        if termination not in TERMINATIONS:
-            raise ValueError(
-                f"the task ended with termination {termination!r}; it must be one of "
-                f"{', '.join(TERMINATIONS)} or None"
-            )
-        meta = {
-            "success": termination == "success",
-            "termination": termination,
-            "discount": discount,
-            "task_kwargs": self._task_kwargs,
-            "versions": _versions(),
-            "control_timestep": float(self._env.control_timestep()),
-            "action_names": self._env.action_spec().name.split("\t"),
-            "body_names": [model.id2name(i, "body") for i in range(model.nbody)],
-            "catheter_radius": [float(task.scene.device.outer_radius)]
-            * len(task.scene.catheter.links),
-            "wall_force_peak_sum": rows.array("wall_force_peak_sum").tolist(),
-            "wall_force_peak_max": rows.array("wall_force_peak_max").tolist(),
-            "reward_terms": _columns(rows.get("reward_terms", [])),
-        }
-        if SERIES[0] in rows:
-            series = {name: rows.array(name) for name in SERIES}
-            meta["devices"] = device_meta(task, series)
-        position = task.objective.goal.reshape(3)
-        meta["goal_position"] = position.tolist()
-        meta["goal_radius"] = float(task.objective.goal_radius)
-        if "vessel" in rows:
-            moves, depth = rows["vessel_motion"][-1], rows.array("contact_depth")
-            meta["vessel"] = vessel_meta(rows["vessel"], moves, depth)
-            position = np.array(meta["vessel"]["goal"])
-        head = rows.array("catheter")[:, -1]
-        meta["distance"] = np.linalg.norm(head - position, axis=-1).tolist()
-        return meta
-
-    def _episode(self, rows: _EpisodeRows, seed: int | None, meta: dict) -> Episode:
+    def _episode(self, rows: _Rows, seed: int | None, end: dict[str, Any]) -> Episode:
         shapes = {"action": self._env.action_spec().shape}
         shapes |= dict.fromkeys(("contact_position", "contact_force"), (3,))
         names = set(Episode.__annotations__) - {"task", "seed", "meta", "insertion"}
         return Episode(
             task=self._task_name,
             seed=seed,
-            meta=meta,
+            meta=self._meta(rows, end),
             insertion=rows.array("base_insertion"),
             **{name: rows.array(name, shapes.get(name, ())) for name in names},
         )
 
-
-def _columns(rows: list[dict[str, float]]) -> dict[str, list[float]]:
-    return {name: [row[name] for row in rows] for name in (rows[0] if rows else ())}
-
-
-def _versions() -> dict[str, str]:
-    versions = {"python": platform.python_version()}
-    for name in _VERSIONED:
-        try:
-            versions[name] = metadata.version(name)
-        except metadata.PackageNotFoundError:
-            versions[name] = "not installed"
-    return versions
+    def _meta(self, rows: _Rows, end: dict[str, Any]) -> dict[str, Any]:
+        model, task = self._env.physics.model, self._task
+        termination = end["termination"] or "truncated"
+        goal = task.objective.goal.reshape(3)
+        peaks, prefix = ("wall_force_peak_sum", "wall_force_peak_max"), "reward_"
+        meta = {
+            "success": termination == "success",
+            **end,
+            "termination": termination,
+            "task_kwargs": self._task_kwargs,
+            "versions": {
+                "python": platform.python_version(),
+                "cathsim-dmc": __version__,
+                **{n: metadata.version(n) for n in ("mujoco", "dm-control", "numpy")},
+            },
+            "control_timestep": float(self._env.control_timestep()),
+            "action_names": self._env.action_spec().name.split("\t"),
+            "body_names": [model.id2name(i, "body") for i in range(model.nbody)],
+            "catheter_radius": [float(task.scene.device.outer_radius)]
+            * len(task.scene.catheter.links),
+            **{name: rows[name] for name in peaks},
+            "reward_terms": {
+                name.removeprefix(prefix): values
+                for name, values in rows.items()
+                if name.startswith(prefix)
+            },
+            "goal_position": goal.tolist(),
+            "goal_radius": float(task.objective.goal_radius),
+        }
+        if task.devices is not None:
+            meta["devices"] = device_meta(task, {n: rows.array(n) for n in SERIES})
+        if states := rows["vessel"]:
+            moving = task.rollout.moving
+            meta["vessel"] = {
+                **{name: [state[name] for state in states] for name in states[0]},
+                **(moving.record() if moving else {"lattice": [], "parameters": []}),
+                "depth": rows.array("contact_depth").tolist(),
+            }
+            goal = np.array(meta["vessel"]["goal"])
+        head = rows.array("catheter")[:, -1]
+        meta["distance"] = np.linalg.norm(head - goal, axis=-1).tolist()
+        return meta

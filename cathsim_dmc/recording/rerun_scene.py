@@ -1,135 +1,188 @@
-"""Static parts of the scene, and the moving bodies, as Rerun entities."""
+"""The scene in 3D as Rerun entities: vessel, goal, device, contacts, bodies."""
 
+import itertools
+from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
 import rerun as rr
 from scipy.spatial.transform import Rotation
 
-from cathsim_dmc.recording.drawing import Drawing
-from cathsim_dmc.recording.geometry import xyzw
-from cathsim_dmc.recording.living import MESH_EVERY, VesselRecord
-from cathsim_dmc.recording.rerun_stream import Log
+from cathsim_dmc.anatomy.parts import Surface
+from cathsim_dmc.recording.episode import Episode
+from cathsim_dmc.recording.geometry import force_colours, force_scale, xyzw, z_to
+from cathsim_dmc.recording.living import MESH_EVERY
+from cathsim_dmc.recording.rerun_stream import (
+    MEASURED,
+    SHAFT_COLOUR,
+    Log,
+    device_colours,
+)
 from cathsim_dmc.recording.scene import BodyGeom
 
 VESSEL_COLOUR = (225, 140, 130, 60)
 GOAL_COLOUR = (60, 190, 90, 110)
-BLOOD_COLOUR = (200, 30, 40)
-BLOOD_SCALE = 0.02  # s; an arrow of 20 mm is 1 m/s
+BLOOD_COLOUR, BLOOD_SCALE = (200, 30, 40), 0.02  # s; an arrow of 20 mm is 1 m/s
+HEAD_COLOUR, TRAIL_COLOUR = (255, 200, 0), (255, 200, 0, 160)
 # Entities that would hide the device inside them, and how opaque they are drawn.
 SEE_THROUGH = {"sheath": 0.3}
+# Drawing only: the longest arrow of an episode is about this long.
+LONGEST_ARROW = 25e-3
+ARROW_RADIUS, HEAT_RADIUS, TRAIL_RADIUS = 0.7e-3, 0.9e-3, 0.25e-3
+HEAD_SCALE = 1.8
 
 
-def log_static(log: Log, drawing: Drawing) -> None:
-    """Log vessel, goal and directions."""
-    surface = drawing.surface
+def log_vessel(log: Log, surface: Surface) -> None:
+    """Log vessel, goal, directions and blood, and how vessel and goal move."""
+    record, meta = log.vessel, log.episode.meta
+    moves = record is not None and not record.still
     # Patient frame LPS: x to the patient's left, y to the back, z up.
     log.static("world", rr.ViewCoordinates.LBU)
-    record = VesselRecord.of(log.episode)
-    moves = record is not None and not record.still
-    log.static(
-        "world/vessel",
-        rr.Mesh3D.from_fields(
-            # What is static hides what moves.
-            vertex_positions=None if moves else surface.vertices.astype(np.float32),
-            vertex_normals=surface.normals.astype(np.float32),
-            triangle_indices=surface.faces.astype(np.uint32),
-            albedo_factor=VESSEL_COLOUR,
-        ),
+    mesh = rr.Mesh3D.from_fields(
+        # What is static hides what moves.
+        vertex_positions=None if moves else surface.vertices.astype(np.float32),
+        vertex_normals=surface.normals.astype(np.float32),
+        triangle_indices=surface.faces.astype(np.uint32),
+        albedo_factor=VESSEL_COLOUR,
     )
-    if drawing.goal is not None:
-        position, radius = drawing.goal
-        log.static(
-            "world/goal",
-            rr.Ellipsoids3D(
-                centers=[position],
-                half_sizes=[[radius] * 3],
-                colors=[GOAL_COLOUR],
-                fill_mode="solid",
-            ),
+    log.static("world/vessel", mesh)
+    if "goal_position" in meta:
+        goal = rr.Ellipsoids3D(
+            centers=[meta["goal_position"]],
+            half_sizes=[[meta["goal_radius"]] * 3],
+            colors=[GOAL_COLOUR],
+            fill_mode="solid",
         )
-
-
-def log_vessel(log: Log, drawing: Drawing) -> None:
-    """Log heart, breathing, blood and wall of a vessel that lives, and its motion."""
-    record = VesselRecord.of(log.episode)
+        log.static("world/goal", goal)
     if record is None:
         return
-    for name, (values, label) in record.curves().items():
-        log.series(f"series/vessel/{name}", values, slice(None), label)
     log.static("world/blood", rr.Arrows3D.from_fields(colors=[BLOOD_COLOUR]))
-    arrows = rr.Arrows3D.columns(
-        origins=log.episode.head, vectors=BLOOD_SCALE * record.blood_velocity
-    )
+    vectors = BLOOD_SCALE * record.blood_velocity
+    arrows = rr.Arrows3D.columns(origins=log.episode.head, vectors=vectors)
     log.columns("world/blood", arrows)
-    if drawing.goal is not None:
-        log.columns(
-            "world/goal",
-            rr.Transform3D.columns(translation=record.goal - drawing.goal[0]),
-        )
-    if record.still:
-        return
-    rest = drawing.surface
-    rows = np.arange(0, log.episode.steps + 1, MESH_EVERY)
-    moved = [
-        record.surface(rest, log.episode, state).vertices.astype(np.float32)
-        for state in rows.tolist()
-    ]
-    columns = rr.Mesh3D.columns(vertex_positions=np.concatenate(moved))
-    columns = columns.partition(np.full(len(rows), len(rest.vertices)))
-    log.columns("world/vessel", columns, rows)
+    if "goal_position" in meta:
+        way = record.goal - meta["goal_position"]
+        log.columns("world/goal", rr.Transform3D.columns(translation=way))
+    if moves:
+        rows = np.arange(0, log.episode.steps + 1, MESH_EVERY)
+        states = (record.surface(surface, log.episode, int(row)) for row in rows)
+        vertices = np.concatenate([each.vertices for each in states]).astype("f4")
+        columns = rr.Mesh3D.columns(vertex_positions=vertices)
+        columns = columns.partition(np.full(len(rows), len(surface.vertices)))
+        log.columns("world/vessel", columns, rows)
 
 
-def log_bodies(log: Log, geoms: tuple[BodyGeom, ...]) -> None:
-    """Log the shapes of the bodies and how they move."""
+def log_catheter(log: Log) -> None:
+    """Log the device as capsules coloured by what they press, its head and its path."""
+    entity, coaxial, joints = "world/catheter", log.coaxial, log.episode.catheter
+    radii = log.episode.radii
+    states, links = joints.shape[0], joints.shape[1] - 1
+    along = np.diff(joints, axis=1)
+    colours = np.broadcast_to(np.array(SHAFT_COLOUR, np.uint8), (states, links, 3))
+    thickness = np.broadcast_to(radii, (states, links))
+    if coaxial is not None:
+        outermost = coaxial.outermost(joints)
+        own = device_colours(len(coaxial.names))
+        colours, thickness = own[outermost], coaxial.radii[outermost]
+        ends = np.moveaxis(coaxial.ends(joints), 1, 0)
+        for name, colour, radius, end in zip(
+            coaxial.names, own, coaxial.radii, ends, strict=True
+        ):
+            _log_point(log, f"{entity}/{name}", end, colour, radius)
+    log.static(entity, rr.Capsules3D.from_fields(fill_mode="solid"))
+    capsules = rr.Capsules3D.columns(
+        lengths=np.linalg.norm(along, axis=-1).ravel(),
+        radii=thickness.ravel(),
+        translations=joints[:, :-1].reshape(-1, 3),
+        quaternions=z_to(along).reshape(-1, 4),
+        colors=link_colours(log.episode, colours).reshape(-1, 3),
+    )
+    log.columns(entity, capsules.partition(np.full(states, links)))
+    head = log.episode.head
+    _log_point(log, f"{entity}/head", head, HEAD_COLOUR, radii[-1])
+    look = rr.LineStrips3D.from_fields(colors=[TRAIL_COLOUR], radii=[TRAIL_RADIUS])
+    log.static(f"{entity}/trail", look)
+    pieces = rr.LineStrips3D.columns(strips=np.stack([head[:-1], head[1:]], axis=1))
+    log.columns(f"{entity}/trail", pieces, MEASURED)
+
+
+def _log_point(log: Log, entity: str, places, colour, radius: float) -> None:
+    look = rr.Points3D.from_fields(colors=[colour], radii=[HEAD_SCALE * radius])
+    log.static(entity, look)
+    log.columns(entity, rr.Points3D.columns(positions=places))
+
+
+def link_colours(episode: Episode, colours: np.ndarray) -> np.ndarray:
+    """Colours (T+1, L, 3) uint8 of the links: that of the largest force, or their own.
+
+    Args:
+        colours: (T+1, L, 3) uint8, of links that press nothing.
+    """
+    pressed = np.zeros(colours.shape[:2])
+    magnitude = np.linalg.norm(episode.contact_force, axis=-1)
+    row = episode.contact_step + 1
+    middle = (episode.catheter[row, :-1] + episode.catheter[row, 1:]) / 2
+    away = np.linalg.norm(middle - episode.contact_position[:, None], axis=-1)
+    np.maximum.at(pressed, (row, away.argmin(axis=1)), magnitude)
+    hot = force_colours(pressed, force_scale(magnitude))
+    return np.where(pressed[..., None] > 0, hot, colours)
+
+
+def arrow_scale(episode: Episode) -> float:
+    """Length of an arrow for each newton, metres."""
+    return LONGEST_ARROW / force_scale(np.linalg.norm(episode.contact_force, axis=-1))
+
+
+def log_contacts(log: Log) -> None:
+    """Log the forces of each step as arrows, and the places pressed so far."""
     episode = log.episode
-    bodies: dict[int, list[BodyGeom]] = {}
-    for geom in geoms:
-        bodies.setdefault(geom.body, []).append(geom)
-    for body, parts in bodies.items():
+    magnitude = np.linalg.norm(episode.contact_force, axis=-1)
+    colours = force_colours(magnitude, force_scale(magnitude))
+    places, counts = episode.contact_position, episode.contact_counts
+    log.static("world/contacts", rr.Arrows3D.from_fields(radii=[ARROW_RADIUS]))
+    vectors = arrow_scale(episode) * episode.contact_force
+    arrows = rr.Arrows3D.columns(vectors=vectors, origins=places, colors=colours)
+    # A step without contact is an empty row, which takes the old arrows away.
+    log.columns("world/contacts", arrows.partition(counts), MEASURED)
+    if len(magnitude):
+        log.static("world/heat", rr.Points3D.from_fields(radii=[HEAT_RADIUS]))
+        heat = rr.Points3D.columns(positions=places, colors=colours)
+        log.columns("world/heat", heat.partition(counts), MEASURED)
+
+
+def log_bodies(log: Log, geoms: Iterable[BodyGeom]) -> None:
+    """Log the shapes of the bodies and how they move."""
+    by_body = sorted(geoms, key=lambda geom: (geom.body, geom.kind))
+    for body, parts in itertools.groupby(by_body, lambda geom: geom.body):
+        parts = list(parts)
         entity = f"world/{parts[0].body_name.strip('/')}"
-        for kind in sorted({g.kind for g in parts}):
-            log.static(f"{entity}/{kind}", _shape([g for g in parts if g.kind == kind]))
-        position = episode.body_pos[:, body]
-        quaternion = xyzw(episode.body_quat[:, body])
-        moves = np.ptp(position, axis=0).any() or np.ptp(quaternion, axis=0).any()
-        if moves:
-            log.columns(
-                entity,
-                rr.Transform3D.columns(translation=position, quaternion=quaternion),
-            )
+        for kind, same in itertools.groupby(parts, lambda geom: geom.kind):
+            log.static(f"{entity}/{kind}", _shape(kind, list(same)))
+        place = log.episode.body_pos[:, body]
+        turn = xyzw(log.episode.body_quat[:, body])
+        if np.ptp(place, axis=0).any() or np.ptp(turn, axis=0).any():
+            moved = rr.Transform3D.columns(translation=place, quaternion=turn)
+            log.columns(entity, moved)
         else:
-            log.static(
-                entity,
-                rr.Transform3D(
-                    translation=position[0],
-                    quaternion=rr.Quaternion(xyzw=quaternion[0]),
-                ),
-            )
+            still = rr.Quaternion(xyzw=turn[0])
+            log.static(entity, rr.Transform3D(translation=place[0], quaternion=still))
 
 
-def _shape(parts: list[BodyGeom]) -> Any:
-    size = np.stack([g.size for g in parts])
-    centre = np.stack([g.position for g in parts])
-    turn = np.stack([g.quaternion for g in parts])
-    rgba = np.array([g.rgba for g in parts], dtype=np.float64)
+def _shape(kind: str, parts: list[BodyGeom]) -> Any:
+    size, centre, turn, rgba = (
+        np.array([getattr(geom, name) for geom in parts], np.float64)
+        for name in ("size", "position", "quaternion", "rgba")
+    )
     rgba[:, 3] *= SEE_THROUGH.get(parts[0].body_name.split("/", 1)[0], 1.0)
-    common = {
-        "quaternions": xyzw(turn),
-        "colors": np.round(255 * rgba).astype(np.uint8),
-        "fill_mode": "solid",
-    }
-    kind = parts[0].kind
+    colours = np.round(255 * rgba).astype(np.uint8)
+    look = {"quaternions": xyzw(turn), "colors": colours, "fill_mode": "solid"}
     if kind == "box":
-        return rr.Boxes3D(half_sizes=size, centers=centre, **common)
+        return rr.Boxes3D(half_sizes=size, centers=centre, **look)
     if kind == "sphere":
-        return rr.Ellipsoids3D(
-            half_sizes=np.repeat(size, 3, axis=1), centers=centre, **common
-        )
-    radii, lengths = size[:, 0], 2 * size[:, 1]
+        return rr.Ellipsoids3D(half_sizes=size.repeat(3, 1), centers=centre, **look)
+    look |= {"radii": size[:, 0], "lengths": 2 * size[:, 1]}
     if kind == "cylinder":
-        return rr.Cylinders3D(radii=radii, lengths=lengths, centers=centre, **common)
+        return rr.Cylinders3D(centers=centre, **look)
     # MuJoCo centres a capsule, Rerun starts it at its lower end.
     along = Rotation.from_quat(turn, scalar_first=True).apply([0.0, 0.0, 1.0])
-    lower = centre - size[:, 1:] * along
-    return rr.Capsules3D(radii=radii, lengths=lengths, translations=lower, **common)
+    return rr.Capsules3D(translations=centre - size[:, 1:] * along, **look)

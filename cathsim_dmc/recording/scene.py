@@ -48,21 +48,11 @@ def body_geoms(physics: Any) -> Iterator[BodyGeom]:
     model = physics.model
     kinds = {int(getattr(mujoco.mjtGeom, f"mjGEOM_{k.upper()}")): k for k in SIZES}
     for geom in range(model.ngeom):
-        kind = kinds.get(int(model.geom_type[geom]))
-        body = int(model.geom_bodyid[geom])
-        name = model.id2name(body, "body")
-        if kind is None or name.split("/", 1)[0] not in ("robot", "sheath"):
-            continue
-        material = int(model.geom_matid[geom])
+        kind, body = kinds.get(int(model.geom_type[geom])), int(model.geom_bodyid[geom])
+        name, material = model.id2name(body, "body"), int(model.geom_matid[geom])
         rgba = model.mat_rgba[material] if material >= 0 else model.geom_rgba[geom]
-        if rgba[3] == 0 or model.geom_group[geom] >= _VISIBLE_GROUPS:
-            continue
-        yield BodyGeom(
-            body=body,
-            body_name=name,
-            kind=kind,
-            size=model.geom_size[geom][: SIZES[kind]],
-            position=model.geom_pos[geom],
-            quaternion=model.geom_quat[geom],
-            rgba=rgba,
-        )
+        visible = rgba[3] > 0 and model.geom_group[geom] < _VISIBLE_GROUPS
+        if visible and kind and name.split("/", 1)[0] in ("robot", "sheath"):
+            size = model.geom_size[geom][: SIZES[kind]]
+            pose = model.geom_pos[geom], model.geom_quat[geom]
+            yield BodyGeom(body, name, kind, size, *pose, rgba)

@@ -134,10 +134,10 @@ def simulate(
             step = simulation.step(np.clip(mean + added, -1.0, 1.0))
             failed |= step.physics_error
         shadows.append(rollout.shadows)
-        state, force = step.readings, step.wall_force
+        state = step.readings
         turns.append({
             "centreline": state.centreline,
-            "wall_force": np.stack(force, axis=-1),
+            "wall_force": np.stack(step.wall_force, axis=-1),
             "push_force": np.stack([state.push_force, state.push_torque], axis=-1),
             "load_cell": state.load_cell,
         })  # fmt: skip
@@ -145,7 +145,7 @@ def simulate(
             for name in ("heart_phase", "breath_phase"):
                 turns[-1][name] = getattr(step.vessel, name)
         if (moving := rollout.moving) is not None:
-            every = (moving.warp(number) for number in range(count))
+            every = map(moving.warp, range(count))
             warps.append([(course.copy(), time) for _, course, time in every])
     columns = {name: np.stack([turn[name] for turn in turns]) for name in turns[0]}
     joined = [
@@ -187,25 +187,13 @@ def ends(shadow: Shadow) -> np.ndarray:
 class Camera:
     """C-arm, contrast and dose of one sequence, as drawn."""
 
-    def __init__(
-        self,
-        anatomy: Anatomy,
-        size: int,
-        aim: np.ndarray,
-        random: np.random.RandomState,
-    ):
-        """Draws them.
-
-        Args:
-            aim: (3,) m, towards which the isocentre lies from the middle of the lumen.
-        """
+    def __init__(self, anatomy: Anatomy, size: int, aim: np.ndarray, random: Any):
+        """Draws them; the isocentre lies from the lumen's middle towards `aim`, m."""
         self.angles = random.uniform(*PRIMARY), random.uniform(*SECONDARY)
         middle = np.mean(anatomy.lumen.box, axis=0)
-        share, zoom = random.uniform(), random.uniform(*ZOOM)
-        isocentre = middle + share * (aim - middle)
-        primary, secondary = np.radians(self.angles)
+        isocentre = middle + random.uniform() * (aim - middle)
         self.arm = CArm(
-            primary=primary, secondary=secondary, magnification=zoom,
+            *np.radians(self.angles), magnification=random.uniform(*ZOOM),
             detector_size=DETECTOR_SIZE, resolution=(size, size),
             isocentre=tuple(isocentre),
         )  # fmt: skip
@@ -214,12 +202,27 @@ class Camera:
         self.kerma = float(np.exp(random.uniform(*np.log(KERMA))))
         self.gain = random.uniform(*GAIN)
 
+    def seen(self, places: np.ndarray) -> np.ndarray:
+        """Keypoints (T, K, 3) from places (T, K, 3) m, NaN for none.
+
+        Returns:
+            Column, row, and `ABSENT`, `UNSEEN` or `SEEN`.
+        """
+        pixels, _ = self.arm.project(np.nan_to_num(places, nan=1e3))
+        size = self.arm.resolution[0]
+        inside = ((pixels >= -0.5) & (pixels < size - 0.5)).all(axis=-1)
+        inside &= np.isfinite(places[..., 0])
+        state = np.where(inside, SEEN, ABSENT)
+        if not self.iodine:
+            state[:, -len(OSTIA) :] = np.minimum(state[:, -len(OSTIA) :], UNSEEN)
+        pixels = np.where(inside[..., None], pixels, 0.0)
+        return np.concatenate([pixels, state[..., None]], axis=-1)
+
     def before(self, anatomy: Anatomy, warp: Warp | None = None) -> Fluoroscope:
         """The fluoroscope before the vessel, as it has moved at one time."""
         surface = anatomy.surface
         if warp is not None:
-            course, time = warp
-            surface = anatomy.motion.surface(course, time, surface)
+            surface = anatomy.motion.surface(*warp, surface)
         depth = surface_thickness(self.arm, surface.vertices, surface.faces, 1)
         return Fluoroscope(
             self.arm, depth, depth > 0.0, self.iodine, kerma=self.kerma, gain=self.gain
@@ -232,41 +235,39 @@ def frames_of(
     """Sequences (T rows of every array) before C-arms drawn for each."""
     random = np.random.RandomState(seed)
     rest, found = ostia(anatomy), 0
+    here = np.isfinite(rest[:, 0])
+    # Frames before one state of the vessel, and how it has moved.
+    parts: list[tuple[slice, list[Warp] | None]] = [(slice(None), None)]
+    if states.warps is not None:
+        parts = [(slice(row, row + 1), w) for row, w in enumerate(states.warps)]
     device = np.concatenate([ends(shadow) for shadow in states.shadows], axis=-2)
     count = options.frames
     for motion in states.kept:
         for _ in range(options.views):
             aim = device[count // 2, motion, 0]
             camera = Camera(anatomy, options.size, aim, random)
-            own = [
-                dataclasses.replace(each, points=each.points[:, motion])
-                for each in states.shadows
-            ]
             places = np.full((count, len(KEYPOINTS), 3), np.nan)
             places[:, : device.shape[-2]] = device[:, motion]
-            if states.warps is None:
-                places[:, -len(OSTIA) :] = rest
-                view = camera.before(anatomy)
-                image, seen = view.image(own, random), view.device_mask(own)
-                vessel = VESSEL * view.vessel_mask.astype(np.uint8)
-                mask = DEVICE * seen.astype(np.uint8) + vessel
-            else:
-                image = np.empty((count, options.size, options.size, 1), np.uint8)
-                mask = np.empty(image.shape[:-1], np.uint8)
-                here = np.isfinite(rest[:, 0])
-                for row, warp in enumerate(every[motion] for every in states.warps):
+            places[:, -len(OSTIA) :] = rest
+            image, mask = np.empty((2, count, options.size, options.size), np.uint8)
+            for rows, every in parts:
+                warp = None if every is None else every[motion]
+                view = camera.before(anatomy, warp)
+                own = [
+                    dataclasses.replace(each, points=each.points[rows, motion])
+                    for each in states.shadows
+                ]
+                image[rows] = view.image(own, random)[..., 0]
+                mask[rows] = DEVICE * view.device_mask(own)
+                mask[rows] |= VESSEL * view.vessel_mask.astype(np.uint8)
+                if warp is not None:
                     course, time = warp
                     moved, _ = anatomy.motion.to_space(course, time, rest[here])
-                    places[row, len(DEVICE_KEYPOINTS) :][here] = moved
-                    view = camera.before(anatomy, warp)
-                    one = [each.of(np.array([row])) for each in own]
-                    image[row] = view.image(one, random)[0]
-                    mask[row] = DEVICE * view.device_mask(one)[0]
-                    mask[row] += VESSEL * view.vessel_mask.astype(np.uint8)
+                    places[rows, -len(OSTIA) :][:, here] = moved
             yield {
-                "image": image[..., 0],
+                "image": image,
                 "mask": mask,
-                "keypoints": _seen(camera, places),
+                "keypoints": camera.seen(places),
                 "keypoints_3d": places,
                 "camera_matrix": np.tile(camera.arm.matrix, (count, 1, 1)),
                 "angles": np.tile(camera.angles, (count, 1)),
@@ -277,19 +278,6 @@ def frames_of(
                 **{name: each[:, motion] for name, each in states.columns.items()},
             }
             found += 1
-
-
-def _seen(camera: Camera, places: np.ndarray) -> np.ndarray:
-    """Keypoints (T, K, 3): column, row, and `ABSENT`, `UNSEEN` or `SEEN`."""
-    pixels, _ = camera.arm.project(np.nan_to_num(places, nan=1e3))
-    size = camera.arm.resolution[0]
-    inside = ((pixels >= -0.5) & (pixels < size - 0.5)).all(axis=-1)
-    inside &= np.isfinite(places[..., 0])
-    state = np.where(inside, SEEN, ABSENT)
-    if not camera.iodine:
-        state[:, -len(OSTIA) :] = np.where(inside[:, -len(OSTIA) :], UNSEEN, ABSENT)
-    pixels = np.where(inside[..., None], pixels, 0.0)
-    return np.concatenate([pixels, state[..., None]], axis=-1)
 
 
 _TYPES = {"camera_matrix": "f8", "sequence": "i4", "motion": "i4"}
@@ -319,14 +307,12 @@ def write(
         for start, clip in zip(range(0, rows, count), every, strict=True):
             for name, values in clip.items():
                 if name not in columns:
-                    kind = _TYPES.get(name, "u1" if values.dtype == np.uint8 else "f4")
-                    chunk, packed = True, None
-                    if kind == "u1":
-                        chunk, packed = (1, *values.shape[1:]), 1
+                    pixels, shape = values.dtype == np.uint8, (rows, *values.shape[1:])
+                    kind = _TYPES.get(name, "u1" if pixels else "f4")
+                    packed = {"compression": "gzip", "compression_opts": 1}
                     columns[name] = file.create_dataset(
-                        name, (rows, *values.shape[1:]), kind, chunks=chunk,
-                        compression="gzip" if packed and name == "mask" else None,
-                        compression_opts=packed if name == "mask" else None,
+                        name, shape, kind, chunks=(1, *shape[1:]) if pixels else True,
+                        **(packed if name == "mask" else {}),
                     )  # fmt: skip
                 columns[name][start : start + count] = values
     return rows
