@@ -22,7 +22,7 @@ from cathsim_dmc.analysis.intervals import success_interval
 from cathsim_dmc.cli.options import EVALUATION_SEED, show
 from cathsim_dmc.simulation import episodes
 from cathsim_dmc.simulation.batch import BatchSimulation
-from cathsim_dmc.validation.checks import Checks, Report
+from cathsim_dmc.validation.checks import Check, Report
 
 OBSERVED = ("internal", "tracking", "force")
 
@@ -145,9 +145,8 @@ def main(
     success = sum(bool(row[1]) for row in play)
     different = sum(row[4] is not None for row in play)
     low, high = success_interval(success, len(play))
-    checks = Checks()
     label = f"{task}, {policy}: episodes that differ between batch and environment"
-    checks.at_most(label, different, 0, "", f"of {len(play)}")
+    checks = [Check.at_most(label, different, 0, "", f"of {len(play)}")]
     findings = {
         "episodes": len(play),
         "successes": success,

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+import functools
+import itertools
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from cathsim_dmc.anatomy.field import Field
 from cathsim_dmc.anatomy.scan.ways import Ways
 from cathsim_dmc.anatomy.surface_depth import SurfaceDepth
 from cathsim_dmc.entities.contact import FRICTION
@@ -66,14 +67,12 @@ class Experiment:
     def __init__(self, bench: Bench):
         """Takes a bench that was read."""
         self.bench = bench
-        self._fields: dict[float, Field] = {}
-        self._ways: Ways | None = None
+        # Lumen, larger by a factor.
+        self.field = functools.cache(bench.field)
 
-    def field(self, scale: float = 1.0) -> Field:
-        """Lumen, larger by a factor."""
-        if scale not in self._fields:
-            self._fields[scale] = self.bench.field(scale)
-        return self._fields[scale]
+    @functools.cached_property
+    def _ways(self) -> Ways:
+        return Ways(SurfaceDepth(self.bench.surface))
 
     def setting(self, wire: Wire, down: str = DOWN, **changes: Any) -> Setting:
         """The device of a wire on the bench, with changes of the setting."""
@@ -110,8 +109,6 @@ class Experiment:
 
     def centreline(self, wire: Wire) -> Result:
         """The vessel's centreline from the entry to the vessel that the tip is in."""
-        if self._ways is None:
-            self._ways = Ways(SurfaceDepth(self.bench.surface))
         node = self._ways.node(self.bench.ends[wire.vessel])
         before = self._ways.deepest_from(self._ways.node(self.bench.entry.position))
         return _result(wire, [self._ways.points[self._ways.trace(before, node)]])
@@ -123,16 +120,13 @@ class Experiment:
 
     def _nearest(self, wire: Wire) -> Wire | None:
         """The other recommended wire of the product whose tip is nearest, if any."""
-        others = [
-            other
-            for other in self.bench.wires
-            if other is not wire and other.kind == wire.kind and other.recommended
-            if not other.folded
-        ]
-        tip = wire.points[-1]
-        return min(
-            others, key=lambda o: np.linalg.norm(o.points[-1] - tip), default=None
-        )
+
+        def away(other: Wire) -> float:
+            return float(np.linalg.norm(other.points[-1] - wire.points[-1]))
+
+        others = (one for one in self.bench.wires if one.recommended)
+        others = (one for one in others if one is not wire and one.kind == wire.kind)
+        return min((o for o in others if not o.folded), key=away, default=None)
 
     def hull(self, wire: Wire) -> Result:
         """The wire pushed into MuJoCo's own mesh, which is its convex hull."""
@@ -142,19 +136,14 @@ class Experiment:
 
 def _result(wire: Wire, shapes: Sequence[np.ndarray]) -> Result:
     found = [1e3 * bench_data.distances(wire.points, shape) for shape in shapes]
-    rms = [float(np.sqrt((each**2).mean())) for each in found] or [np.nan]
-    largest = [float(each.max()) for each in found] or [np.nan]
-    return Result(np.array(rms), np.array(largest))
+    rows = [(np.sqrt((each**2).mean()), each.max()) for each in found]
+    return Result(*np.array(rows or [(np.nan, np.nan)]).T)
 
 
 def halves(wires: Iterable[Wire]) -> dict[str, str]:
     """Which half a frame belongs to: parameters are fitted to one, tested on other."""
-    found: dict[str, str] = {}
-    count: dict[str, int] = dict.fromkeys(bench_data.KINDS, 0)
-    for wire in wires:
-        found[wire.name] = ("fit", "test")[count[wire.kind] % 2]
-        count[wire.kind] += 1
-    return found
+    turn = {kind: itertools.cycle(("fit", "test")) for kind in bench_data.KINDS}
+    return {wire.name: next(turn[wire.kind]) for wire in wires}
 
 
 def validate_bench(
@@ -183,7 +172,7 @@ def validate_bench(
         rows.append(row := _row(experiment, wire, half[wire.name]))
         figures = (f"{key} {row[key]['rms']:.2f} mm" for key in (*WAYS, *BASELINES))
         say(f"{wire.name} ({wire.kind}, {wire.vessel}): {', '.join(figures)}")
-    return Report("Guidewires on a bench", _checks(rows), {"frames": rows})
+    return Report("Guidewires on a bench", list(_checks(rows)), {"frames": rows})
 
 
 def _row(experiment: Experiment, wire: Wire, half: str) -> dict[str, Any]:
@@ -210,9 +199,8 @@ def _row(experiment: Experiment, wire: Wire, half: str) -> dict[str, Any]:
     return row
 
 
-def _checks(rows: Sequence[dict[str, Any]]) -> list[Check]:
+def _checks(rows: Sequence[dict[str, Any]]) -> Iterator[Check]:
     """Medians against the aims and the baselines; folded frames apart."""
-    found = []
     for kind, bound in zip(bench_data.KINDS, (STRAIGHT, ANGLED), strict=True):
         chosen = [row for row in rows if row["wire"] == kind and not row["folded"]]
         if not chosen:
@@ -230,12 +218,10 @@ def _checks(rows: Sequence[dict[str, Any]]) -> list[Check]:
             name = f"{kind} wires, {way}: median RMS"
             behind = f"of {len(each)} frames, largest distance {largest:.1f} mm"
             value = float(np.median(each))
-            found.append(Check.at_most(name, value, bound, "mm", behind))
+            yield Check.at_most(name, value, bound, "mm", behind)
             if way != "laid":
                 label = f"{name}, against the best baseline"
-                found.append(Check.at_most(label, value, least, "mm", note))
+                yield Check.at_most(label, value, least, "mm", note)
             if tested:
                 label, behind = f"{name}, test half", f"of {len(tested)} frames"
-                value = float(np.median(tested))
-                found.append(Check.at_most(label, value, bound, "mm", behind))
-    return found
+                yield Check.at_most(label, np.median(tested), bound, "mm", behind)

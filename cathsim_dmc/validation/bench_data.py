@@ -28,8 +28,7 @@ _CHORD = 6e-3  # m, over which directions are taken
 _STEP = 1e-3  # m
 _ASTRAY = 30e-3  # m outside of the mesh, where no wire in it can be
 _CUTS = (0.0, 0.5e-3, 1e-3, 1.5e-3, 2e-3, 3e-3)  # m into the lumen, tried in turn
-_COLUMNS = ("run", "frame", "wire", "tip_region", "recommended", "inserted_length_mm")
-_COLUMNS += ("entry_point_mm", "entry_direction", "centreline_mm")
+_SIDES = {"superior": "inferior", "left_about": "right", "posterior_about": "front"}
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,7 +54,7 @@ class Wire:
     @property
     def length(self) -> float:
         """Inserted length, m."""
-        return float(np.linalg.norm(np.diff(self.points, axis=0), axis=1).sum())
+        return length_of(self.points)
 
     @property
     def folded(self) -> bool:
@@ -92,6 +91,11 @@ class Bench:
         return Field.from_surface(surface, [self.entry])
 
 
+def length_of(points: np.ndarray) -> float:
+    """Length of a line (n, 3), m."""
+    return float(np.linalg.norm(np.diff(points, axis=0), axis=1).sum())
+
+
 def along(points: np.ndarray, at: np.ndarray) -> np.ndarray:
     """Points (m, 3) of a line (n, 3) at arc lengths (m,) from its first point."""
     steps = np.linalg.norm(np.diff(points, axis=0), axis=1)
@@ -101,8 +105,7 @@ def along(points: np.ndarray, at: np.ndarray) -> np.ndarray:
 
 def distances(one: np.ndarray, other: np.ndarray) -> np.ndarray:
     """Distances (k,) m of two lines (n, 3), (m, 3) at equal arc lengths, every mm."""
-    lengths = [np.linalg.norm(np.diff(x, axis=0), axis=1).sum() for x in (one, other)]
-    at = np.arange(0.0, min(lengths) + 1e-9, _STEP)
+    at = np.arange(0.0, min(length_of(one), length_of(other)) + 1e-9, _STEP)
     return np.linalg.norm(along(one, at) - along(other, at), axis=1)
 
 
@@ -111,7 +114,9 @@ def read(folder: str | Path) -> Bench:
 
     Args:
         folder: with `MESH` (mm) and `WIRES`, which holds "wires", a list of objects
-            with `_COLUMNS`, points from the tip on and beyond the entry, and
+            with "run", "frame", "wire" (one of `KINDS`), "tip_region",
+            "recommended", "inserted_length_mm", "entry_point_mm", "entry_direction"
+            and "centreline_mm", points from the tip on and beyond the entry; and
             "landmarks": "entry" (point_mm, outward_normal, radius_mm), the far end
             "ascending_aorta_root_mm", the "patient_axes", and branches (ostium_mm,
             end_mm or fork_mm).
@@ -126,28 +131,33 @@ def read(folder: str | Path) -> Bench:
             raise FileNotFoundError(
                 f"no file {folder / name}; the folder has {MESH} and {WIRES}"
             )
-    path = folder / WIRES
-    try:
-        found = json.loads(path.read_text(encoding="utf-8"))
-    except ValueError as error:
-        raise ValueError(f"{path} is no JSON: {error}") from error
-    marks = _part(found, "landmarks", dict, str(path))
-    entry = _part(marks, "entry", dict, "landmarks")
-    where = _vector(entry, "point_mm", "entry") / 1e3
-    out = _unit(entry, "outward_normal", "entry")
     vertices, faces = read_triangles(folder / MESH)
     vertices, faces = merged(vertices / 1e3, faces)
-    radius = 1e-3 * bounds.number("entry radius_mm", entry.get("radius_mm"), 0.1, 100.0)
-    surface, where = _opened(vertices, faces, Inlet("entry", where, -out, radius))
-    measure = SurfaceDepth(surface)
-    rows, ends = _part(found, "wires", list, str(path)), _ends(marks)
-    return Bench(
-        surface=surface,
-        entry=End("entry", where, out, 2.0 * radius, True),
-        ends=ends,
-        down=_axes(_part(marks, "patient_axes", dict, "landmarks")),
-        wires=tuple(_wire(row, n, measure, ends) for n, row in enumerate(rows)),
-    )
+    try:
+        found = json.loads((folder / WIRES).read_text(encoding="utf-8"))
+        marks, rows = found["landmarks"], found["wires"]
+        entry = marks["entry"]
+        where, out = _vector(entry, "point_mm") / 1e3, _unit(entry, "outward_normal")
+        radius = 1e-3 * float(entry["radius_mm"])
+        surface, where = _opened(vertices, faces, Inlet("entry", where, -out, radius))
+        ends = {ARCH: _vector(marks, "ascending_aorta_root_mm") / 1e3}
+        for name, mark in marks.items():
+            if "ostium_mm" in mark:
+                end = "end_mm" if "end_mm" in mark else "fork_mm"
+                ends[name] = _vector(mark, end) / 1e3
+        # Directions to the patient's six sides, and none.
+        down = {"none": np.zeros(3)}
+        for key, opposite in _SIDES.items():
+            axis = _unit(marks["patient_axes"], key)
+            down[key.removesuffix("_about")], down[opposite] = axis, -axis
+        measure = SurfaceDepth(surface)
+        wires = tuple(_wire(row, measure, ends) for row in rows)
+    except (KeyError, TypeError) as error:
+        raise ValueError(
+            f"{folder / WIRES} is not as `bench_data.read` describes: {error!r}"
+        ) from error
+    end = End("entry", where, out, 2.0 * radius, True)
+    return Bench(surface, end, ends, down, wires)
 
 
 def _opened(
@@ -174,55 +184,21 @@ def _opened(
     )
 
 
-def _ends(marks: Mapping[str, Any]) -> dict[str, np.ndarray]:
-    found = {ARCH: _vector(marks, "ascending_aorta_root_mm", "landmarks") / 1e3}
-    for name, mark in marks.items():
-        if isinstance(mark, dict) and "ostium_mm" in mark:
-            end = "end_mm" if "end_mm" in mark else "fork_mm"
-            found[name] = _vector(mark, end, name) / 1e3
-    return found
-
-
-def _axes(axes: Mapping[str, Any]) -> dict[str, np.ndarray]:
-    """Directions to the patient's six sides, and none."""
-    sides = {"superior": "inferior", "left_about": "right", "posterior_about": "front"}
-    found = {"none": np.zeros(3)}
-    for key, opposite in sides.items():
-        axis = _unit(axes, key, "patient_axes")
-        found[key.removesuffix("_about")], found[opposite] = axis, -axis
-    return found
-
-
 def _wire(
-    row: Any, number: int, measure: SurfaceDepth, ends: Mapping[str, Any]
+    row: Mapping[str, Any], measure: SurfaceDepth, ends: Mapping[str, Any]
 ) -> Wire:
-    missing = [key for key in _COLUMNS if not (isinstance(row, dict) and key in row)]
-    if missing:
-        raise ValueError(
-            f"wire {number} of {WIRES} lacks {', '.join(missing)}; each has "
-            f"{', '.join(_COLUMNS)}"
-        )
     name = f"{row['run']}, {row['frame']}"
-    kind = bounds.choice(f"wire of {name}", row["wire"], KINDS)
-    points = bounds.array(f"centreline_mm of {name}", row["centreline_mm"], "fiu")
-    if points.ndim != 2 or points.shape[1] != 3 or len(points) < 3:
-        raise ValueError(
-            f"centreline_mm of {name} has shape {points.shape}; give (n, 3), n >= 3"
-        )
-    points = np.asarray(points, dtype=np.float64) / 1e3
-    seen = float(np.linalg.norm(np.diff(points, axis=0), axis=1).sum())
-    length = 1e-3 * bounds.number(
-        f"inserted_length_mm of {name}", row["inserted_length_mm"], positive=True
-    )
-    if length > seen + 2.0 * _STEP:
+    points = np.array(row["centreline_mm"], dtype=np.float64) / 1e3
+    seen, length = length_of(points), 1e-3 * float(row["inserted_length_mm"])
+    if not 0.0 < length <= seen + 2.0 * _STEP:
         raise ValueError(
             f"inserted_length_mm of {name} is {1e3 * length:g}, but its centreline is "
             f"{1e3 * seen:.1f} mm long; give points from the tip to beyond the entry"
         )
     inside = along(points, np.append(np.arange(0.0, length, _STEP), length))[::-1]
-    inside[0] = _vector(row, "entry_point_mm", name) / 1e3
+    inside[0] = _vector(row, "entry_point_mm") / 1e3
     out = -float(measure(inside).min())
-    if out > _ASTRAY:
+    if not out <= _ASTRAY:
         raise ValueError(
             f"{name} is {1e3 * out:.0f} mm outside of the mesh (at most "
             f"{1e3 * _ASTRAY:g} mm are branches that hang elsewhere); mesh and wires "
@@ -230,28 +206,18 @@ def _wire(
         )
     return Wire(
         name,
-        kind,
+        bounds.choice(f"wire of {name}", row["wire"], KINDS),
         bounds.choice(f"tip_region of {name}", row["tip_region"], ends),
         bounds.switch(f"recommended of {name}", row["recommended"]),
         inside,
-        _unit(row, "entry_direction", name),
+        _unit(row, "entry_direction"),
     )
 
 
-def _part(found: Any, key: str, kind: type, where: str) -> Any:
-    if not (isinstance(found, dict) and isinstance(found.get(key), kind)):
-        what = "an object" if kind is dict else "a list"
-        raise ValueError(f"{where} of {WIRES} has no {key!r}; it must be {what}")
-    return found[key]
+def _vector(found: Mapping[str, Any], key: str) -> np.ndarray:
+    return np.array(bounds.vector(key, found[key], 3))
 
 
-def _vector(found: Mapping[str, Any], key: str, where: str) -> np.ndarray:
-    return np.array(bounds.vector(f"{key} of {where}", found.get(key), 3))
-
-
-def _unit(found: Mapping[str, Any], key: str, where: str) -> np.ndarray:
-    vector = _vector(found, key, where)
-    norm = np.linalg.norm(vector)
-    if norm < 1e-9:
-        bounds.refuse(f"{key} of {where}", found[key], "a direction other than 0")
-    return vector / norm
+def _unit(found: Mapping[str, Any], key: str) -> np.ndarray:
+    vector = _vector(found, key)
+    return vector / np.linalg.norm(vector)

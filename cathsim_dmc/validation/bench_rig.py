@@ -74,8 +74,8 @@ class Held:
         """
         # Rest does not depend on damping; so much makes it soon.
         device = replace(setting.device, loss_factor=2.0)
-        self.length = wire.length
-        reach = wire.length + setting.overshoot
+        self.length, self._reach = wire.length, wire.length + setting.overshoot
+        reach = self._reach
         shaft = reach - device.tip_length
         if shaft < _LINK:
             raise ValueError(
@@ -90,10 +90,8 @@ class Held:
             stroke=reach + 1e-3,
             friction=setting.friction,
         )
-        self._overshoot = setting.overshoot
         axis = wire.direction
-        side = np.eye(3)[np.abs(axis).argmin()]
-        across = np.cross(side, axis)
+        across = np.cross(np.eye(3)[np.abs(axis).argmin()], axis)
         across /= np.linalg.norm(across)
         frame = np.stack([across, np.cross(axis, across), axis], axis=1)
         self._frame = frame @ Rotation.from_euler("z", turn).as_matrix()
@@ -119,19 +117,16 @@ class Held:
         rig.compile()
         if setting.taper is not None:
             self._grind(device.shaft.bending_stiffness, *setting.taper)
-        self._slide = rig.data.joint(f"{rig.name}/insertion")
-        self._servo = rig.model.actuator(f"{rig.name}/insertion").id
 
     def _grind(self, stiffness: float, length: float, thinnest: float) -> None:
         """Lets the core taper: EI goes with the fourth power of its diameter."""
-        lengths = self._rig.lengths
-        ahead = lengths[::-1].cumsum()[::-1]
-        for number in range(1, len(lengths)):
-            share = min(ahead[number] / length, 1.0)
-            here = stiffness * (thinnest + (1.0 - thinnest) * share) ** 4
+        rig, lengths = self._rig, self._rig.lengths
+        share = np.minimum(lengths[::-1].cumsum()[::-1] / length, 1.0)
+        here = stiffness * (thinnest + (1.0 - thinnest) * share[1:]) ** 4
+        joints = 2.0 * here / (lengths[1:] + lengths[:-1])
+        for number, own in enumerate(joints, start=1):
             for name in "xy":
-                joint = self._rig.model.joint(f"{self._rig.name}/bend_{name}_{number}")
-                joint.stiffness = here / lengths[number - 1 : number + 1].mean()
+                rig.model.joint(f"{rig.name}/bend_{name}_{number}").stiffness = own
 
     def push(self) -> np.ndarray:
         """Pushes the wire in, from outside; its shape (n, 3) at rest, m."""
@@ -148,50 +143,42 @@ class Held:
         end = points[-1] - points[-2]
         longer = points[-1] + 2.0 * self.length * end / np.linalg.norm(end)
         local = (np.vstack([points, longer]) - points[0]) @ self._frame
-        nodes, first = [np.array([0.0, 0.0, rig.lengths[0] / 2])], rig.lengths[0] / 2
-        arcs = first + np.cumsum(rig.lengths[1:])
-        steps = np.diff(np.vstack([nodes, along(local, arcs)]), axis=0)
+        first = rig.lengths[0] / 2
+        nodes = along(local, first + np.cumsum(rig.lengths[1:]))
+        steps = np.diff(np.vstack([[0.0, 0.0, first], nodes]), axis=0)
         steps /= np.linalg.norm(steps, axis=1)[:, None]
-        bends = bends_of(np.vstack([[0.0, 0.0, 1.0], steps]))
         rig.data.qpos[:] = 0.0
-        self._slide.qpos = self.length
-        for number, angles in enumerate(bends, start=1):
-            for name, angle in zip("xy", angles, strict=True):
-                rig.data.joint(f"{rig.name}/bend_{name}_{number}").qpos = angle
+        rig.data.joint(f"{rig.name}/insertion").qpos = self.length
+        rig.bend(bends_of(np.vstack([[0.0, 0.0, 1.0], steps])))
         return self._advance(self.length)
 
     def _advance(self, place: float) -> np.ndarray:
-        """Moves the carriage from a place, m, to the inserted length; shape at rest."""
-        rig = self._rig
-        servo = rig.model.actuator_actadr[self._servo]
-        step = MAX_PUSH_SPEED * rig.model.opt.timestep
-        rig.data.act[servo] = place / MAX_PUSH_SPEED
-        for goal in (self.length + self._overshoot, self.length):
-            while place != goal:
-                place += np.clip(goal - place, -step, step)
-                rig.data.act[servo] = place / MAX_PUSH_SPEED
-                rig.step()
-        return self._rest()
+        """Moves the carriage from a place, m, to the inserted length.
 
-    def _rest(self) -> np.ndarray:
-        """Steps until the wire is at rest; what of it is in (n, 3), frame of the mesh.
+        Returns:
+            What of the wire is in, at rest, (n, 3) m, frame of the mesh.
 
         Raises:
             RuntimeError: if the simulation diverges.
         """
-        rig, end = self._rig, self._rig.data.time + _LONGEST
-        mujoco.mj_forward(rig.model, rig.data)
-        before, nodes = np.inf, self._nodes()
-        while np.abs(nodes - before).max() > _REST and rig.data.time < end:
-            for _ in range(round(_WHILE / rig.model.opt.timestep)):
+        rig = self._rig
+        actuator = rig.model.actuator(f"{rig.name}/insertion").id
+        servo = rig.model.actuator_actadr[actuator]
+        step = MAX_PUSH_SPEED * rig.model.opt.timestep
+        rig.data.act[servo] = place / MAX_PUSH_SPEED
+        for goal in (self._reach, self.length):
+            while place != goal:
+                place += np.clip(goal - place, -step, step)
+                rig.data.act[servo] = place / MAX_PUSH_SPEED
                 rig.step()
-            before, nodes = nodes, self._nodes()
-        if any(warning.number for warning in rig.data.warning):
+        end = rig.data.time + _LONGEST
+        mujoco.mj_forward(rig.model, rig.data)
+        before, nodes = np.inf, np.vstack([rig.joints, rig.head_position])
+        while np.abs(nodes - before).max() > _REST and rig.data.time < end:
+            rig.run(_WHILE)
+            before, nodes = nodes, np.vstack([rig.joints, rig.head_position])
+        if rig.data.warning.number.any():
             raise RuntimeError("the wire in the phantom diverges")
-        start = float(rig.lengths.sum()) - self.length
         total = float(rig.lengths.sum())
-        arcs = np.append(np.arange(start, total, 1e-3), total)
+        arcs = np.append(np.arange(total - self.length, total, 1e-3), total)
         return self._entry + along(nodes, arcs) @ self._frame.T
-
-    def _nodes(self) -> np.ndarray:
-        return np.vstack([self._rig.joints, self._rig.head_position])

@@ -36,16 +36,16 @@ class Check:
         cls, name: str, value: float, bound: float, unit: str = "", note: str = ""
     ) -> "Check":
         """A check of value <= bound; a value that is no number fails."""
-        value = float(value)
-        return cls(name, value, unit, f"<= {bound:g}", bool(value <= bound), note)
+        kept = bool(value <= bound)
+        return cls(name, float(value), unit, f"<= {bound:g}", kept, note)
 
     @classmethod
     def at_least(
         cls, name: str, value: float, bound: float, unit: str = "", note: str = ""
     ) -> "Check":
         """A check of value >= bound; a value that is no number fails."""
-        value = float(value)
-        return cls(name, value, unit, f">= {bound:g}", bool(value >= bound), note)
+        kept = bool(value >= bound)
+        return cls(name, float(value), unit, f">= {bound:g}", kept, note)
 
     @classmethod
     def deviation(
@@ -72,19 +72,6 @@ class Check:
             )
         note = note or f"{measured:.5g} {unit}, expected {expected:.5g} {unit}".rstrip()
         return cls.at_most(name, 100 * abs(measured / expected - 1), percent, "%", note)
-
-
-class Checks(list[Check]):
-    """Checks in the order in which they are made; methods as those of `Check`."""
-
-    def at_most(self, *row: Any) -> None:  # noqa: D102
-        self.append(Check.at_most(*row))
-
-    def at_least(self, *row: Any) -> None:  # noqa: D102
-        self.append(Check.at_least(*row))
-
-    def deviation(self, *row: Any) -> None:  # noqa: D102
-        self.append(Check.deviation(*row))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -135,18 +122,14 @@ class Report:
         from rich.table import Table
 
         table = Table("check", title=self.title)
-        for name in ("measured", "bound"):
-            table.add_column(name, justify="right")
+        table.add_column("measured", justify="right")
+        table.add_column("bound", justify="right")
         table.add_column("")
         table.add_column("behind it", style="dim")
         for check in self.checks:
-            table.add_row(
-                check.name,
-                check.measured,
-                f"{check.bound} {check.unit}".rstrip(),
-                "[green]pass[/]" if check.passed else "[bold red]FAIL[/]",
-                check.note,
-            )
+            bound = f"{check.bound} {check.unit}".rstrip()
+            kept = "[green]pass[/]" if check.passed else "[bold red]FAIL[/]"
+            table.add_row(check.name, check.measured, bound, kept, check.note)
         return table
 
 

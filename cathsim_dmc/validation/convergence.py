@@ -1,6 +1,6 @@
 """Convergence of tip path and wall force with the time step and the link length."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -8,7 +8,7 @@ import numpy as np
 from cathsim_dmc.anatomy import Centreline
 from cathsim_dmc.tasks.config import PHYSICS_TIMESTEP, NavigationConfig
 from cathsim_dmc.validation import insertion
-from cathsim_dmc.validation.checks import Check, Checks
+from cathsim_dmc.validation.checks import Check
 
 TIMESTEPS = (0.001, 0.002, 0.004, 0.008)  # s
 SHAFT_LINKS = (0.005, 0.007, 0.010, 0.014, 0.0175, 0.025)  # m
@@ -34,10 +34,9 @@ def study(
 
     Returns:
         "script" (name), "parameter", and lists with an entry for each value: "value",
-        number of "links", mean and largest distance (mm) of the head from the finest
-        run's at the same time ("path_mean_mm", "path_max_mm") and from its track
-        whatever the time ("track_max_mm"), wall force ("force_mean", "force_p95", N)
-        and "penetration_max_mm".
+        mean and largest distance (mm) of the head from the finest run's at the same
+        time ("path_mean_mm", "path_max_mm") and from its track whatever the time
+        ("track_max_mm"), and "force_mean" (N), that of the wall force.
     """
     ascending = sorted(float(value) for value in values)
     # A tiny goal: the script runs to its end.
@@ -50,13 +49,10 @@ def study(
         "script": script.name,
         "parameter": parameter,
         "value": ascending,
-        "links": [run.links for run in runs],
         "path_mean_mm": [float(each.mean()) for each in away],
         "path_max_mm": [float(each.max()) for each in away],
         "track_max_mm": [float(each.max()) for each in track],
-        "force_mean": [float(run.wall_force.mean()) for run in runs],
-        "force_p95": [float(np.percentile(run.wall_force, 95)) for run in runs],
-        "penetration_max_mm": [1e3 * float(run.penetration.max()) for run in runs],
+        "force_mean": [float(run.wall_force_sum.mean()) for run in runs],
     }
 
 
@@ -77,25 +73,23 @@ def studies() -> list[dict[str, Any]]:
     ]
 
 
-def checks(results: Sequence[dict[str, Any]]) -> list[Check]:
+def checks(results: Sequence[dict[str, Any]]) -> Iterator[Check]:
     """Whether the defaults, which are among the values, are converged."""
-    found = Checks()
     for one in results:
         default, finest = DEFAULTS[one["parameter"]], one["value"][0]
         of_step = one["parameter"] == "physics_timestep"
         kind, unit = ("step", "ms") if of_step else ("links", "mm")
         label = f"{kind} of {1e3 * default:g} {unit} against {1e3 * finest:g} {unit}, "
         label += one["script"]
-        index = int(np.flatnonzero(np.isclose(one["value"], default))[0])
+        index = int(np.argmin(np.abs(np.array(one["value"]) - default)))
         note = f"largest {one['path_max_mm'][index]:.2f} mm, off the track by at most "
         note += f"{one['track_max_mm'][index]:.2f} mm"
         path, name = (
             one["path_mean_mm"][index],
             f"{label}: mean distance of the tip paths",
         )
-        found.at_most(name, path, PATH_BOUND, "mm", note)
+        yield Check.at_most(name, path, PATH_BOUND, "mm", note)
         force, reference = (1e3 * one["force_mean"][k] for k in (index, 0))
         if reference > 1e3 * LEAST_FORCE:
             name = f"{label}: mean wall force"
-            found.deviation(name, force, reference, FORCE_BOUND, "mN")
-    return found
+            yield Check.deviation(name, force, reference, FORCE_BOUND, "mN")

@@ -6,6 +6,7 @@ The release is compared with the equation of a beam whose material damps as it i
 
 import dataclasses
 import types
+from collections.abc import Iterator
 
 import mujoco
 import numpy as np
@@ -22,8 +23,8 @@ from cathsim_dmc.physics.drives import hold
 from cathsim_dmc.physics.effects import Effects, Episode, World, userdata_size
 from cathsim_dmc.physics.readings import ids
 from cathsim_dmc.physics.stepper import CONTROL_TIMESTEP
-from cathsim_dmc.validation.checks import Check, Checks
-from cathsim_dmc.validation.rig import Rig
+from cathsim_dmc.validation.checks import Check
+from cathsim_dmc.validation.rig import Rig, half_circle
 
 RELEASE_BOUND = 5.0  # % of frequency and decay
 RELEASE = 0.01  # m, deflection of the end before the release
@@ -53,10 +54,7 @@ def _swing(time: np.ndarray, curve: np.ndarray) -> tuple[float, float]:
     share = curve[crossings] / (curve[crossings] - curve[crossings + 1])
     zeros = time[crossings] + share * (time[1] - time[0])
     half = np.diff(zeros).mean()
-    peaks = [
-        np.abs(curve[a:b]).max()
-        for a, b in zip(crossings[:-1], crossings[1:], strict=True)
-    ]
+    peaks = np.maximum.reduceat(np.abs(curve), crossings)[:-1]
     decay = np.log(peaks[0] / peaks[-1]) / (len(peaks) - 1) / half
     return 0.5 / half, float(decay)
 
@@ -91,12 +89,10 @@ def release(*, blood: bool = True) -> tuple[float, float, float, float]:
         rig.model.body_inertia[links] *= factor
         mujoco.mj_setConst(rig.model, rig.data)
     length = float(rig.sections[0].sum())
-    nodes = np.cumsum(rig.lengths)[:-1] - rig.lengths[0] / 2
-    slope = _modes(np.append(nodes, length) / length)[0]
-    ends = np.append(nodes, length)
+    ends = np.append(np.cumsum(rig.lengths)[:-1] - rig.lengths[0] / 2, length)
     # Turning angles of the links along the mode shape.
-    angle = np.arctan(np.diff(RELEASE * slope / 2) / np.diff(ends))
-    turning = np.diff(np.append([0.0], angle))
+    shape = RELEASE * _modes(ends / length)[0] / 2
+    turning = np.diff(np.arctan(np.diff(shape) / np.diff(ends)), prepend=0.0)
     rig.bend(np.stack([0 * turning, turning], axis=-1))
     start = rig.head_position[0]
     curve = [start]
@@ -105,9 +101,12 @@ def release(*, blood: bool = True) -> tuple[float, float, float, float]:
         mujoco.mj_kinematics(rig.model, rig.data)
         curve.append(rig.head_position[0])
     time = rig.model.opt.timestep * np.arange(len(curve))
-    mine = _swing(time, np.array(curve))
-    theirs = _swing(time, _beam(one, length, start, time, blood))
-    return mine[0], theirs[0], mine[1], theirs[1]
+    beam = _beam(one, length, start, time, blood)
+    (mine, decay), (theirs, expected) = (
+        _swing(time, np.array(curve)),
+        _swing(time, beam),
+    )
+    return mine, theirs, decay, expected
 
 
 def fill(rig: Rig, blood: StillBlood) -> None:
@@ -182,9 +181,8 @@ def spin(speed: float) -> tuple[float, float]:
     """
     length = devices.Discretisation(working_length=0.3, torsion_joints=4)
     rig = Rig("steerable_5f", length, rotation=True, friction=0.0)
-    turn = np.linspace(0.0, np.pi, 31)
-    arc = _BEND * np.stack([1 - np.cos(turn), 0 * turn, np.sin(turn)], axis=-1)
-    line = np.vstack([[[0, 0, -0.1]], arc, [[2 * _BEND, 0, -0.2]]])
+    ends = [[0, 0, -0.1]], [[2 * _BEND, 0, -0.2]]
+    line = np.vstack([ends[0], half_circle(_BEND, 0.0, 30), ends[1]])
     line[:, 2] += 0.1 - rig.lengths.sum()
     rig.arena.attach(Sheath(line[:-1], rig.device.outer_radius, rig.lengths.max()))
     rig.compile()
@@ -234,7 +232,7 @@ def three_point(span: float, link: float, on_joint: bool) -> float:
     rig.compile()
     joints = np.append(rig.joints[:, 2], rig.head_position[2])
     near = int(np.argmin(np.abs(joints - joints.mean())))
-    middle = joints[near] + (0.0 if on_joint else (joints[near + 1] - joints[near]) / 2)
+    middle = joints[near] if on_joint else joints[near : near + 2].mean()
     places = middle + span * np.array([-0.5, 0.0, 0.5])
     links = np.searchsorted(joints, places, side="right") - 1
     bodies = ids(rig.model, rig.catheter.links)[links]
@@ -248,33 +246,30 @@ def three_point(span: float, link: float, on_joint: bool) -> float:
         axes = rig.data.xmat[bodies].reshape(-1, 3, 3)[:, :, 2]
         return rig.data.xpos[bodies] + local[:, None] * axes
 
-    for body, share, point in zip(bodies, (-0.5, 1.0, -0.5), points(), strict=True):
-        lever = point - rig.data.xipos[body]
-        push = np.array([share * force, 0.0, 0.0])
-        rig.data.xfrc_applied[body] += np.concatenate([push, np.cross(lever, push)])
+    push = force * np.outer((-0.5, 1.0, -0.5), (1.0, 0.0, 0.0))
+    turn = np.cross(points() - rig.data.xipos[bodies], push)
+    np.add.at(rig.data.xfrc_applied, bodies, np.hstack([push, turn]))
     rig.settle()
     across = points()[:, 0]
     return float((across[1] - (across[0] + across[2]) / 2) / expected)
 
 
-def checks() -> list[Check]:
+def checks() -> Iterator[Check]:
     """Release, turning and three-point bending."""
-    made = Checks()
     for medium, blood in (("still blood", True), ("air", False)):
         mine, theirs, decay, expected = release(blood=blood)
         name = f"release of a cantilever in {medium}"
-        made.deviation(f"{name}, frequency", mine, theirs, RELEASE_BOUND, "Hz")
-        made.deviation(f"{name}, decay", decay, expected, RELEASE_BOUND, "1/s")
+        yield Check.deviation(f"{name}, frequency", mine, theirs, RELEASE_BOUND, "Hz")
+        yield Check.deviation(f"{name}, decay", decay, expected, RELEASE_BOUND, "1/s")
     for speed in SPEEDS:
         lag, expected = np.degrees(spin(speed))
         name = f"lag in a frictionless half circle at {speed:g} rad/s, deviation from "
         name += "that of the material"
         note = f"{lag:.1f}°, Σ τωθ²/C {expected:.1f}°"
-        made.at_most(name, abs(lag - expected), SPIN_BOUND, "°", note)
+        yield Check.at_most(name, abs(lag - expected), SPIN_BOUND, "°", note)
     for span in SPANS:
         ratios = [three_point(span, SPAN_LINK, on_joint) for on_joint in (True, False)]
         worst = max(ratios, key=lambda ratio: abs(ratio - 1))
         name = f"three-point bending, span {1e3 * span:.0f} mm, links of 7 mm"
         note = "load on a joint {:.4f}, on a link {:.4f} FS³/48EI".format(*ratios)
-        made.deviation(name, worst, 1.0, SPAN_BOUND, "", note)
-    return made
+        yield Check.deviation(name, worst, 1.0, SPAN_BOUND, "", note)

@@ -1,11 +1,13 @@
 """The drive of the base under load: it holds, slips at a stated force, and is exact."""
 
+from collections.abc import Iterator
+
 import numpy as np
 
 from cathsim_dmc.entities.chain import MAX_PUSH_FORCE, MAX_PUSH_SPEED
 from cathsim_dmc.physics.drives import hold
 from cathsim_dmc.physics.stepper import CONTROL_TIMESTEP
-from cathsim_dmc.validation.checks import Check, Checks
+from cathsim_dmc.validation.checks import Check
 from cathsim_dmc.validation.rig import Rig
 
 JAM = 3.0  # N
@@ -48,15 +50,17 @@ def slip_force() -> float:
     return np.inf
 
 
-def checks() -> list[Check]:
+def checks() -> Iterator[Check]:
     """Holds, moves and slips under load."""
-    made, driven = Checks(), Driven()
+    driven = Driven()
     driven.move(0.4, 0.0, 0.0)
-    held = 1e3 * abs(driven.move(10.0, 0.0, JAM))
-    made.at_most(f"drive, command 0, {JAM:g} N for 10 s: way", held, HOLD_BOUND, "mm")
+    held, name = (
+        driven.move(10.0, 0.0, JAM),
+        f"drive, command 0, {JAM:g} N for 10 s: way",
+    )
+    yield Check.at_most(name, 1e3 * abs(held), HOLD_BOUND, "mm")
     driven.move(0.4, 1.0, JAM)
     moved, name = driven.move(1.0, 1.0, JAM), f"drive, full speed against {JAM:g} N"
-    made.deviation(name, moved, MAX_PUSH_SPEED, SPEED_BOUND, "m/s")
+    yield Check.deviation(name, moved, MAX_PUSH_SPEED, SPEED_BOUND, "m/s")
     name = "drive, force at which the clamp slips"
-    made.deviation(name, slip_force(), MAX_PUSH_FORCE, SLIP_BOUND, "N")
-    return made
+    yield Check.deviation(name, slip_force(), MAX_PUSH_FORCE, SLIP_BOUND, "N")

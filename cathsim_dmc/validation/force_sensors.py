@@ -1,20 +1,18 @@
 """`cathsim validate forces`: sensors against known loads."""
 
-import dataclasses
-from typing import NamedTuple
+from collections.abc import Iterator
+from typing import Any, NamedTuple
 
 import mujoco
 import numpy as np
 
-from cathsim_dmc.anatomy.anatomy import Anatomy
-from cathsim_dmc.anatomy.field import Field
 from cathsim_dmc.entities.chain import MAX_PUSH_SPEED
-from cathsim_dmc.entities.phantom import Phantom
 from cathsim_dmc.physics import forces
+from cathsim_dmc.recording.episode import Episode
 from cathsim_dmc.tasks.config import PHYSICS_TIMESTEP
 from cathsim_dmc.validation import insertion
-from cathsim_dmc.validation.checks import Checks, Report
-from cathsim_dmc.validation.rig import Rig, in_tube, tube
+from cathsim_dmc.validation.checks import Check, Report
+from cathsim_dmc.validation.rig import Rig, in_tube
 
 BALANCE_BOUND = 1.0  # %
 RESTING_LOADS = (0.01, 0.1, 1.0)  # N
@@ -43,9 +41,7 @@ def resting_link(load: float) -> np.ndarray:
         the plate, and by the sensor of the base, N; penetration, m.
     """
     rig = Rig()
-    wall = Phantom(plate(rig.device.outer_radius))
-    rig.arena.attach(wall)
-    wall.add_wall(rig.catheter.links[0])
+    rig.add_plate(rig.device.outer_radius)
     rig.compile()
     steps = round(RESTING_TIME / rig.model.opt.timestep)
     rows = []
@@ -64,23 +60,6 @@ def resting_link(load: float) -> np.ndarray:
             )
         )
     return np.mean(rows[-round(AVERAGING / rig.model.opt.timestep) :], axis=0)
-
-
-def walled(field: Field, name: str) -> Anatomy:
-    """An anatomy whose wall is any field; its tree stands for nothing."""
-    anatomy = dataclasses.replace(tube(*GUIDING_TUBE), name=name)
-    vars(anatomy)["lumen"] = field
-    return anatomy
-
-
-def plate(height: float) -> Anatomy:
-    """An anatomy whose wall is a plate at y = `height`, m."""
-    field = Field.sampled(
-        lambda blocks, points: height - blocks[:, None, 1] - points[:, 1],
-        np.array([-0.05, -0.05, -0.5]),
-        np.array([0.05, height, 0.5]),
-    )
-    return walled(field, "plate")
 
 
 class DeadEnd(NamedTuple):
@@ -111,11 +90,10 @@ def dead_end(command: float, size: tuple[float, float] = GUIDING_TUBE) -> DeadEn
     sheath = environment.physics.bind(task.scene.sheath.bodies).element_id
     way = size[0] - task.scene.placement.start_depth
     steps = round((SETTLING + way / (command * MAX_PUSH_SPEED)) / PHYSICS_TIMESTEP)
-    rows = []
-    for step in range(steps):
+    last, rows = round(AVERAGING / PHYSICS_TIMESTEP), []
+    mujoco.mj_step(model, data, steps - last)
+    for _ in range(last):
         mujoco.mj_step(model, data)
-        if step < steps - round(AVERAGING / PHYSICS_TIMESTEP):
-            continue
         reading = task.rollout.index.read(data)
         contacts = task.rollout.index.contacts(data.sensordata)
         rows.append(
@@ -126,28 +104,24 @@ def dead_end(command: float, size: tuple[float, float] = GUIDING_TUBE) -> DeadEn
                 _axial_force_on(model, data, sheath),
             )
         )
-    rows = np.array(rows)
-    means = rows.mean(axis=0).tolist()
-    return DeadEnd(push, *means, ripple=float(rows[:, 0].std()))
+    means = np.mean(rows, axis=0).tolist()
+    return DeadEnd(push, *means, ripple=float(np.std(rows, axis=0)[0]))
 
 
 def _axial_force_on(model, data, sheath: np.ndarray) -> float:
     """Sum of the contact forces on static bodies along z, N."""
     total, wrench = 0.0, np.zeros(6)
-    for index in range(data.ncon):
-        contact = data.contact[index]
-        bodies = model.geom_bodyid[list(contact.geom)]
-        if not np.isin(bodies, sheath).any():
-            continue
+    for index, contact in enumerate(data.contact[: data.ncon]):
+        first, second = np.isin(model.geom_bodyid[contact.geom], sheath)
         mujoco.mj_contactForce(model, data, index, wrench)
         # The frame's first row is the normal from the first geom to the second, on
         # which the force acts.
         on_second = (contact.frame.reshape(3, 3).T @ wrench[:3])[2]
-        total += on_second if bodies[1] in sheath else -on_second
+        total += (second or -int(first)) * on_second
     return float(total)
 
 
-def scripted_cannulations() -> dict[float, list[insertion.Insertion]]:
+def scripted_cannulations() -> dict[float, list[Episode]]:
     """Insertions into the BCA of the type-I arch, by speed (share of 40 mm/s)."""
     return {
         speed: [
@@ -163,46 +137,47 @@ def scripted_cannulations() -> dict[float, list[insertion.Insertion]]:
     }
 
 
-def validate_forces() -> Report:
-    """Runs every check of the forces."""
-    checks, pushed = Checks(), {"guiding": [], "wide": []}
+def _checks(pushed: dict[str, list[DeadEnd]]) -> Iterator[Check]:
     for load in RESTING_LOADS:
         contacts, load_cell, _, depth = resting_link(load)
         name = f"last link resting under {load:g} N, contact sensor"
         note = (
             f"{contacts:.5f} N, load cell {load_cell:.5f} N, {1e3 * depth:.2f} mm deep"
         )
-        checks.deviation(name, contacts, load, BALANCE_BOUND, "N", note)
-    for command in PUSHES:
-        one = dead_end(command)
-        pushed["guiding"].append(one)
+        yield Check.deviation(name, contacts, load, BALANCE_BOUND, "N", note)
+    for one in pushed["guiding"]:
         for what, value in (("load cell", one.load_cell), ("contacts", one.contacts)):
             name = f"dead end, motor {one.motor:g} N: push force = {what}"
-            checks.deviation(name, value, one.push, BALANCE_BOUND, "N")
-    for command in PUSHES:
-        one = dead_end(command, WIDE_TUBE)
-        pushed["wide"].append(one)
+            yield Check.deviation(name, value, one.push, BALANCE_BOUND, "N")
+    for one in pushed["wide"]:
         name = f"wide dead end, motor {one.motor:g} N: push force = load cell + rim "
-        name += "of the sheath"
-        value = one.load_cell + one.sheath
-        checks.deviation(name, value, one.push, BALANCE_BOUND, "N")
-    cannulations = scripted_cannulations()
-    for speed, runs in cannulations.items():
-        single = np.concatenate([run.contact_forces for run in runs])
-        checks.at_least(
-            f"insertion into the BCA at {40 * speed:g} mm/s: contact forces up to "
-            f"{USUAL_FORCE:g} N",
-            100 * float((single <= USUAL_FORCE).mean()),
-            USUAL_SHARE,
-            "%",
+        name, value = f"{name}of the sheath", one.load_cell + one.sheath
+        yield Check.deviation(name, value, one.push, BALANCE_BOUND, "N")
+    for speed, runs in scripted_cannulations().items():
+        every = np.concatenate([run.contact_force for run in runs])
+        single = np.linalg.norm(every, axis=-1)
+        usual = 100 * float((single <= USUAL_FORCE).mean())
+        name = f"insertion into the BCA at {40 * speed:g} mm/s: contact forces up to "
+        name += f"{USUAL_FORCE:g} N"
+        note = (
             f"{len(single)} samples of {len(runs)} insertions "
             f"({sum(run.success for run in runs)} arrive), mean "
             f"{1e3 * single.mean():.2f} mN, largest "
-            f"{max(run.peak.max() for run in runs):.3f} N",
+            f"{max(max(run.meta['wall_force_peak_max']) for run in runs):.3f} N"
         )
-    ripples = {
+        yield Check.at_least(name, usual, USUAL_SHARE, "%", note)
+
+
+def validate_forces() -> Report:
+    """Runs every check of the forces."""
+    tubes = {"guiding": GUIDING_TUBE, "wide": WIDE_TUBE}
+    pushed = {
+        name: [dead_end(command, size) for command in PUSHES]
+        for name, size in tubes.items()
+    }
+    ripples: dict[str, Any] = {
         name: {f"{one.motor:g} N": one.ripple for one in runs}
         for name, runs in pushed.items()
     }
-    ripple = "ripple of the push force against a dead end, N"
-    return Report("forces", checks, {ripple: ripples}, {"pushed": pushed})
+    findings = {"ripple of the push force against a dead end, N": ripples}
+    return Report("forces", list(_checks(pushed)), findings, {"pushed": pushed})

@@ -1,21 +1,18 @@
 """Friction of devices on a wall: sliding, sticking, and pulled round a drum."""
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Iterator
 
 import numpy as np
 
-from cathsim_dmc.anatomy.field import Field
 from cathsim_dmc.entities import devices
 from cathsim_dmc.entities.chain import MAX_PUSH_SPEED
 from cathsim_dmc.entities.contact import FRICTION
 from cathsim_dmc.entities.device_stack import DeviceStack
-from cathsim_dmc.entities.phantom import Phantom
-from cathsim_dmc.physics import chain_fields
 from cathsim_dmc.physics.drives import hold
-from cathsim_dmc.validation.checks import Check, Checks
-from cathsim_dmc.validation.force_sensors import plate, walled
-from cathsim_dmc.validation.pair import PAIR, straightened
+from cathsim_dmc.validation import rod
+from cathsim_dmc.validation.checks import Check
+from cathsim_dmc.validation.pair import PAIR
 from cathsim_dmc.validation.rig import Rig
 
 LOADS = (0.02, 0.2, 2.0)  # N
@@ -53,23 +50,25 @@ _LEAD = 0.02  # m of rod between the clamp and the drum; first part of the pull
 _PULL = 0.1  # m
 
 
-def _on_plate(names: tuple[str, ...]) -> tuple[Rig, np.ndarray, np.ndarray]:
-    """A straight device over a plate; numbers (n,) and shares of its pressed links."""
-    chosen = list(straightened(names))
-    coaxial = len(chosen) > 1
-    rig = Rig(catheter=DeviceStack(chosen)) if coaxial else Rig(chosen[0])
-    wall = Phantom(plate(rig.device.outer_radius + _DROP))
-    rig.arena.attach(wall)
-    wall.add_wall(rig.catheter.links[0])
+def _on_plate(names: tuple[str, ...], load: float) -> tuple[Rig, np.ndarray]:
+    """A straight device on a plate, settled under a load, N, on its end.
+
+    Returns:
+        The rig, and the load of each of its bodies, N.
+    """
+    chosen = [rod.straight(name) for name in names]
+    rig = Rig(stack=DeviceStack(chosen)) if len(chosen) > 1 else Rig(chosen[0])
+    rig.add_plate(rig.device.outer_radius + _DROP)
     rig.compile()
-    if isinstance(rig.catheter, DeviceStack):
-        chain_fields.write_still(rig.catheter, rig.model, np.zeros(len(chosen)))
     rig.data.joint(f"{rig.name}/insertion").qpos = 0.09
     hold(rig.model, rig.data)
     beyond = np.cumsum(rig.lengths[::-1])[::-1] - rig.lengths
-    pressed = np.flatnonzero(beyond < _PRESSED - 1e-9)
-    bodies = rig.tip_body + 1 - len(rig.lengths) + pressed
-    return rig, bodies, rig.lengths[pressed] / rig.lengths[pressed].sum()
+    pressed = np.where(beyond < _PRESSED - 1e-9, rig.lengths, 0.0)
+    loads, last = np.zeros(rig.model.nbody), rig.tip_body + 1
+    loads[last - len(pressed) : last] = load * pressed / pressed.sum()
+    rig.data.xfrc_applied[:, 1] = loads
+    rig.run(_SETTLED)
+    return rig, loads
 
 
 def slid(names: tuple[str, ...], load: float, speed: float) -> tuple[float, float]:
@@ -84,9 +83,7 @@ def slid(names: tuple[str, ...], load: float, speed: float) -> tuple[float, floa
         Coefficient of friction that acts, pull over load; standard deviation of the
         pull over its mean.
     """
-    rig, bodies, shares = _on_plate(names)
-    rig.data.xfrc_applied[bodies, 1] = load * shares
-    rig.run(_SETTLED)
+    rig, _ = _on_plate(names, load)
     rig.data.actuator(f"{rig.name}/insertion").ctrl[0] = -speed / MAX_PUSH_SPEED
     rig.run(_SLID / speed)
     pull = []
@@ -99,10 +96,8 @@ def slid(names: tuple[str, ...], load: float, speed: float) -> tuple[float, floa
 
 def creep(names: tuple[str, ...]) -> float:
     """Speed (m/s) of devices that stick, pulled sideways at half the limit."""
-    rig, bodies, shares = _on_plate(names)
-    rig.data.xfrc_applied[bodies, 1] = CREEP_LOAD * shares
-    rig.run(_SETTLED)
-    rig.data.xfrc_applied[bodies, 0] = 0.5 * FRICTION * CREEP_LOAD * shares
+    rig, loads = _on_plate(names, CREEP_LOAD)
+    rig.data.xfrc_applied[:, 0] = 0.5 * FRICTION * loads
     rig.run(0.5 * _SETTLED)
     before = rig.head_position
     rig.run(_SETTLED)
@@ -154,15 +149,12 @@ class Capstan:
         The ratio of a slippery rod is near 1 whatever happens: 12 % less friction
         over a quarter turn are 0.9 % of it at 0.05. So the exponent is bounded.
         """
-        return Check.deviation(
-            f"capstan, friction {self.friction:g} over {np.degrees(self.angle):.0f}°",
-            self.acting,
-            self.friction,
-            CAPSTAN_BOUND,
-            "",
-            f"friction {self.acting:.4f} acts, ratio {self.mean:.4f}, "
-            f"{self.free:.4f} without friction, expected {self.expected:.4f}",
-        )
+        angle = np.degrees(self.angle)
+        name = f"capstan, friction {self.friction:g} over {angle:.0f}°"
+        note = f"friction {self.acting:.4f} acts, ratio {self.mean:.4f}, "
+        note += f"{self.free:.4f} without friction, expected {self.expected:.4f}"
+        both = self.acting, self.friction
+        return Check.deviation(name, *both, CAPSTAN_BOUND, "", note)
 
 
 def capstan(friction: float, wrap: float = np.pi) -> Capstan:
@@ -179,7 +171,7 @@ def capstan(friction: float, wrap: float = np.pi) -> Capstan:
     Raises:
         RuntimeError: if the rod sticks to the drum.
     """
-    (device,) = straightened(("steerable_5f",))
+    device = rod.straight("steerable_5f")
     angle, travel, ratio = _pulled(device, friction, wrap)
     _, far, free = _pulled(device, 0.0, wrap)
     axis = DRUM_RADIUS + device.outer_radius
@@ -195,49 +187,33 @@ def capstan(friction: float, wrap: float = np.pi) -> Capstan:
     )
 
 
-Measure = Callable[[np.ndarray, np.ndarray], np.ndarray]
-
-
-def _drum(x: float, z: float, tube: float | None) -> Measure:
-    """Measure of the clearance outside a drum about a line along y at x, z, m.
+def _pulled(
+    device: devices.Device, friction: float, wrap: float, tube: float | None = None
+) -> tuple[float, np.ndarray, np.ndarray]:
+    """Pulls a rod round a drum about a line along y.
 
     Args:
-        x, z: m.
         tube: radius (m) of a tube that leads round the drum by half a turn, from below
             and back, with the drum as its inner wall; None for the drum alone.
-    """
 
-    def measure(blocks: np.ndarray, points: np.ndarray) -> np.ndarray:
-        there = blocks[:, None, :] + points
-        across, y, along = there[..., 0] - x, there[..., 1], there[..., 2] - z
+    Returns:
+        Angle of the wrap, rad; way of the base (n,), m; ratio of the tensions (n,).
+    """
+    radius = DRUM_RADIUS + device.outer_radius
+    length = 2 * _LEAD + _PULL + wrap * radius
+    fine = devices.Discretisation(working_length=length)
+    rig = Rig(device, fine, friction=friction, stroke=_PULL)
+    middle = np.array([radius, 0, _PULL - rig.lengths.sum() + _LEAD])
+    half = np.array([length, 0.02, length])  # around the whole rod
+
+    def clearance(blocks: np.ndarray, points: np.ndarray) -> np.ndarray:
+        across, y, along = np.moveaxis(blocks[:, None, :] + points - middle, -1, 0)
         if tube is None:
             return np.hypot(across, along) - DRUM_RADIUS
         reach = np.hypot(across, np.maximum(along, 0.0))
         return tube - np.hypot(reach - DRUM_RADIUS - tube, y)
 
-    return measure
-
-
-def _pulled(
-    device: devices.Device, friction: float, wrap: float, tube: float | None = None
-) -> tuple[float, np.ndarray, np.ndarray]:
-    """Angle of the wrap, way of the base (n,) and ratio of the tensions (n,)."""
-    radius = DRUM_RADIUS + device.outer_radius
-    length = 2 * _LEAD + _PULL + wrap * radius
-    rig = Rig(
-        device,
-        devices.Discretisation(working_length=length),
-        friction=friction,
-        stroke=_PULL,
-    )
-    base = _PULL - rig.lengths.sum()
-    middle = np.array([radius, 0, base + _LEAD])
-    half = np.array([length, 0.02, length])  # around the whole rod
-    measure = _drum(middle[0], middle[2], tube)
-    field = Field.sampled(measure, middle - half, middle + half)
-    drum = Phantom(walled(field, "drum"), friction=friction)
-    rig.arena.attach(drum)
-    drum.add_wall(rig.catheter.links[0])
+    rig.add_wall(clearance, middle - half, middle + half, friction)
     rig.compile()
     middles = np.cumsum(rig.lengths) - rig.lengths / 2
     heading = np.clip((middles - _LEAD) / radius, 0.0, wrap)
@@ -245,19 +221,16 @@ def _pulled(
     hold(rig.model, rig.data)
     rig.bend(np.stack([0 * heading[1:], np.diff(heading)], axis=-1))
     load = TENSION * np.array([np.sin(wrap), 0.0, np.cos(wrap)])
-    motor = rig.data.actuator(f"{rig.name}/insertion")
     rig.run(_SETTLING, load)
-    motor.ctrl[0] = -PULL_SPEED / MAX_PUSH_SPEED
-    travel, force = [], []
-    while not travel or travel[-1] < _PULL - 0.02:
+    rig.data.actuator(f"{rig.name}/insertion").ctrl[0] = -PULL_SPEED / MAX_PUSH_SPEED
+    rows = [np.zeros(4)]
+    while rows[-1][0] < _PULL - 0.02:
         rig.step(load)
-        travel.append(_PULL - rig.qpos("insertion"))
-        force.append(rig.sensor(f"{rig.name}/push_force"))
-        if len(travel) > 10_000:
-            raise RuntimeError(
-                f"the rod stuck on the drum after {1e3 * travel[-1]:.1f} mm"
-            )
-    travel, force = np.array(travel), np.array(force)
+        travel = _PULL - rig.qpos("insertion")
+        rows.append(np.append(travel, rig.sensor(f"{rig.name}/push_force")))
+        if len(rows) > 10_000:
+            raise RuntimeError(f"the rod stuck on the drum after {1e3 * travel:.1f} mm")
+    travel, force = (each := np.array(rows[1:]))[:, 0], each[:, 1:]
     tension = np.linalg.norm(force, axis=1)
     # Link 0 never turns, so its frame is the world's. Both forces point away from
     # the drum; that of the base against its heading, which is about 0.
@@ -269,20 +242,18 @@ def _pulled(
 
 def arch_ripple() -> float:
     """Deviation over mean of the force that draws a device round an arch."""
-    (device,) = straightened(("steerable_5f",))
+    device = rod.straight("steerable_5f")
     _, travel, ratio = _pulled(device, FRICTION, np.pi, ARCH_RADIUS)
     sliding = ratio[travel > _LEAD]
     return float(sliding.std() / sliding.mean())
 
 
-def checks() -> tuple[list[Check], list[Capstan]]:
-    """Friction that acts on devices, sliding and sticking, and the capstans."""
-    found = Checks()
+def checks(pulled: list[Capstan]) -> Iterator[Check]:
+    """Friction on devices, sliding and sticking; capstans are put into `pulled`."""
     for name, names in (("steerable_5f", ("steerable_5f",)), ("pair", PAIR)):
         for load in LOADS:
-            acting, ripples = zip(
-                *(slid(names, load, speed) for speed in SPEEDS), strict=True
-            )
+            found = [slid(names, load, speed) for speed in SPEEDS]
+            acting, ripples = zip(*found, strict=True)
             worst = max(acting, key=lambda one: abs(one - FRICTION))
             label = f"{name} sliding under {load:g} N"
             note = ", ".join(
@@ -290,12 +261,15 @@ def checks() -> tuple[list[Check], list[Capstan]]:
                 for speed, one in zip(SPEEDS, acting, strict=True)
             )
             acts = f"{label}: friction that acts"
-            found.deviation(acts, worst, FRICTION, ACTING_BOUND, "", note)
-            ripple = 100 * max(ripples)
-            found.at_most(f"{label}: ripple of the pull", ripple, RIPPLE_BOUND, "%")
-        label = f"{name} under {CREEP_LOAD:g} N, pulled sideways at half the limit: "
-        found.at_most(label + "creep", 1e3 * creep(names), CREEP_BOUND, "mm/s")
+            yield Check.deviation(acts, worst, FRICTION, ACTING_BOUND, "", note)
+            label += ": ripple of the pull"
+            yield Check.at_most(label, 100 * max(ripples), RIPPLE_BOUND, "%")
+        label = (
+            f"{name} under {CREEP_LOAD:g} N, pulled sideways at half the limit: creep"
+        )
+        yield Check.at_most(label, 1e3 * creep(names), CREEP_BOUND, "mm/s")
     label = f"drawn round an arch under {TENSION:g} N: ripple of the force"
-    found.at_most(label, 100 * arch_ripple(), ARCH_RIPPLE, "%")
-    pulled = [capstan(friction, wrap) for friction, wrap in CAPSTANS]
-    return found + [one.check() for one in pulled], pulled
+    yield Check.at_most(label, 100 * arch_ripple(), ARCH_RIPPLE, "%")
+    for friction, wrap in CAPSTANS:
+        pulled.append(capstan(friction, wrap))
+        yield pulled[-1].check()

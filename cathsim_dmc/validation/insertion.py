@@ -2,13 +2,14 @@
 
 import dataclasses
 import itertools
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from cathsim_dmc import suite
 from cathsim_dmc.anatomy import Anatomy, Goal
-from cathsim_dmc.simulation.episodes import ComposerSimulation, play
+from cathsim_dmc.recording.episode import Episode
+from cathsim_dmc.recording.recorder import EpisodeRecorder
 from cathsim_dmc.tasks.config import CONTROL_TIMESTEP
 
 CURL_TIME = 2.0  # s
@@ -49,18 +50,6 @@ SCRIPTS = (
 )
 
 
-class Insertion(NamedTuple):
-    """Measurements of an insertion at T control steps."""
-
-    head: np.ndarray  # (T, 3), m
-    wall_force: np.ndarray  # (T,), sum of the magnitudes of all contacts, N
-    peak: np.ndarray  # (T,), largest single contact of any physics step, N
-    contact_forces: np.ndarray  # (K,), single contacts of all steps, N
-    penetration: np.ndarray  # (T,), largest, m
-    links: int  # of the device
-    success: bool  # whether the goal was reached
-
-
 def run(
     script: Script,
     *,
@@ -68,7 +57,7 @@ def run(
     anatomy: str | Anatomy = "type1",
     goal: str | Goal = "lcca",
     **options: Any,
-) -> Insertion:
+) -> Episode:
     """Runs a script until its end or that of the episode.
 
     Args:
@@ -80,35 +69,13 @@ def run(
     """
     kwargs = {"random": seed, "anatomy": anatomy, "goal": goal, **options}
     environment = suite.load(suite.DOMAIN, "navigate", kwargs)
-    task = environment.task
-    steps = round(script.duration / CONTROL_TIMESTEP)
-    actions = (script.action(step, task) for step in range(steps))
-    turns = play(ComposerSimulation(environment), lambda timestep: next(actions))
-    rows: list[tuple] = []
-    single: list[np.ndarray] = []
-    for _ in itertools.islice(turns, 1, None):
-        if environment.physics.data.ptr.warning.number.any():
-            raise RuntimeError(
-                f"insertion {script.name!r} with {options} diverged at step {len(rows)}"
-            )
-        contacts = task.contacts(environment.physics)
-        single.append(contacts.magnitude[contacts.present])
-        rows.append(
-            (
-                task.readings.head,
-                task.wall_force.sum,
-                task.wall_force.peak_max,
-                contacts.penetration.max(initial=0.0),
-            )
-        )
-    head, wall_force, peak, penetration = map(np.array, zip(*rows, strict=True))
-    environment.close()
-    return Insertion(
-        head,
-        wall_force,
-        peak,
-        np.concatenate(single),
-        penetration,
-        len(task.scene.catheter.links),
-        task.termination == "success",
+    steps, duration = itertools.count(), round(script.duration / CONTROL_TIMESTEP)
+    episode = EpisodeRecorder(environment).record_episode(
+        lambda _: script.action(next(steps), environment.task), max_steps=duration
     )
+    environment.close()
+    if "error" in episode.meta:
+        raise RuntimeError(
+            f"insertion {script.name!r} with {options} diverged at step {episode.steps}"
+        )
+    return episode

@@ -1,5 +1,7 @@
 """A moving vessel against what is prescribed: where its wall is, what it carries."""
 
+from collections.abc import Iterator, Sequence
+
 import mujoco
 import numpy as np
 
@@ -14,7 +16,7 @@ from cathsim_dmc.entities.contact import (
 )
 from cathsim_dmc.physics.flow import moving_velocities
 from cathsim_dmc.physics.stepper import PHYSICS_TIMESTEP
-from cathsim_dmc.validation.checks import Check, Checks
+from cathsim_dmc.validation.checks import Check
 from cathsim_dmc.validation.rig import bare, slider
 
 WALL_BOUND = 0.02  # mm
@@ -54,29 +56,32 @@ def begin(model: mujoco.MjModel, course: np.ndarray) -> mujoco.MjData:
     return data
 
 
-class Probes:
-    """Small spheres that measure how far a moving wall is away."""
+def clearances(
+    anatomy: Anatomy, course: np.ndarray, times: Sequence[float], points: np.ndarray
+) -> np.ndarray:
+    """Distances (T, n) m of points from a moving wall at times; NaN where too far.
 
-    def __init__(self, anatomy: Anatomy, course: np.ndarray, count: int):
-        """Takes the anatomy, its motion's parameters, and how many places to look."""
-        spec = stirred(anatomy.lumen, anatomy.motion.lattice)
-        ball = {"size": (_PROBE, 0, 0), "margin": 2e-3, "conaffinity": 0}
-        for _ in range(count):
-            slider(spec, np.eye(3), **ball)
-        self._model = spec.compile()
-        self._data = begin(self._model, course)
+    Small spheres measure them.
 
-    def clearances(self, points: np.ndarray, time: float) -> np.ndarray:
-        """Distances (n,) m of points (n, 3) from the wall; NaN where too far."""
-        self._data.time = time
-        self._data.qpos[:] = points.ravel()
-        mujoco.mj_fwdPosition(self._model, self._data)
-        found = np.full(len(points), np.nan)
-        for contact in self._data.contact[: self._data.ncon]:
-            found[contact.geom2 - 1 if contact.geom1 == 0 else contact.geom1 - 1] = (
-                contact.dist + _PROBE
-            )
-        return found
+    Args:
+        course: of the motion, see `parameters`.
+        times: (T,) s.
+        points: (n, 3) m, or (T, n, 3).
+    """
+    points = np.broadcast_to(points, (len(times), *points.shape[-2:]))
+    spec = stirred(anatomy.lumen, anatomy.motion.lattice)
+    ball = {"size": (_PROBE, 0, 0), "margin": 2e-3, "conaffinity": 0}
+    for _ in range(points.shape[1]):
+        slider(spec, np.eye(3), **ball)
+    model = spec.compile()
+    data, found = begin(model, course), np.full(points.shape[:2], np.nan)
+    for time, places, row in zip(times, points, found, strict=True):
+        data.time = time
+        data.qpos[:] = places.ravel()
+        mujoco.mj_fwdPosition(model, data)
+        # The wall is geom 0.
+        row[data.contact.geom.max(axis=1) - 1] = data.contact.dist + _PROBE
+    return found
 
 
 def diameters(anatomy: Anatomy) -> tuple[float, np.ndarray, np.ndarray]:
@@ -89,23 +94,17 @@ def diameters(anatomy: Anatomy) -> tuple[float, np.ndarray, np.ndarray]:
     course = parameters(0.0, 0.0, _SOFT)
     sides = np.array([[1, 0, 0], [-1, 0, 0]]) * (RADIUS - 1e-3)
     points = np.concatenate([sides + [0, 0, z] for z in PLACES])
-    probes = Probes(anatomy, course, len(points))
     # From 2 s on all of it moves.
     times = 2.0 + np.linspace(0.0, 1.0, 251)
-    apart = 2 * (RADIUS - 1e-3)
-    found = np.array([probes.clearances(points, time) for time in times])
-    found = apart + found.reshape(len(times), -1, 2).sum(axis=-1)
+    found = clearances(anatomy, course, times.tolist(), points)
+    found = 2 * (RADIUS - 1e-3) + found.reshape(len(times), -1, 2).sum(axis=-1)
     growth = _SOFT * distensibility(np.array(RADIUS)) * PULSE_PRESSURE * RADIUS
-    expected = [
-        [2 * RADIUS + growth * pulse(t - z / course[6])[0] for z in PLACES]
-        for t in times
-    ]
+    grown = [[pulse(t - z / course[6])[0] for z in PLACES] for t in times]
+    deviation = np.abs(found - 2 * RADIUS - growth * np.array(grown)).max()
     middle = 2 * RADIUS + 0.5 * growth
     rising = slice(0, 60)  # of the beat
-    rises = [np.interp(middle, found[rising, n], times[rising]) for n in range(3)]
-    way = np.diff(PLACES) / course[6]
-    deviation = np.abs(found - np.array(expected)).max()
-    return float(deviation), np.diff(rises), way
+    rises = [np.interp(middle, each, times[rising]) for each in found[rising].T]
+    return float(deviation), np.diff(rises), np.diff(PLACES) / course[6]
 
 
 def wall_place(anatomy: Anatomy, number: int = 40) -> float:
@@ -116,29 +115,25 @@ def wall_place(anatomy: Anatomy, number: int = 40) -> float:
     course = parameters(_HEART, _BREATHING, _SOFT)
     random, lumen = np.random.RandomState(0), anatomy.lumen
     vertices, normals = anatomy.surface.vertices, anatomy.surface.normals
-    open_ends = [end.position for end in anatomy.ends]
-    far = np.min(
-        [np.linalg.norm(vertices - place, axis=1) for place in open_ends], axis=0
-    )
+    open_ends = np.array([end.position for end in anatomy.ends])
+    far = np.linalg.norm(vertices - open_ends[:, None], axis=-1).min(axis=0)
     chosen = random.choice(np.flatnonzero(far > 0.02), number, replace=False)
-    at = vertices[chosen] - 3e-3 * normals[chosen]
+    inwards = -normals[chosen]
+    at = vertices[chosen] + 3e-3 * inwards
     # Where the field has its wall along the normal.
     for _ in range(20):
-        at += lumen(at)[:, None] * normals[chosen]
-    inwards = -normals[chosen]
+        at -= lumen(at)[:, None] * inwards
     # Away from the edges of ostia.
     smooth = (lumen.gradient(at + 1e-3 * inwards) * inwards).sum(axis=1) > 0.99
     at, inwards = at[smooth], inwards[smooth]
-    probes = Probes(anatomy, course, len(at))
-    worst = 0.0
-    for time in (1.2, 2.3, 3.35):
+    times, places = (1.2, 2.3, 3.35), []
+    for time in times:
         place, growth = anatomy.motion.to_space(course, time, at)
         beside = anatomy.motion.to_space(course, time, at + 1e-4 * inwards)[0]
         normal = (beside - place) / np.linalg.norm(beside - place, axis=1)[:, None]
-        place = place - growth[:, None] * normal
-        found = probes.clearances(place + _PROBE * normal, time)
-        worst = max(worst, float(np.nanmax(np.abs(found - _PROBE))))
-    return worst
+        places.append(place + (_PROBE - growth[:, None]) * normal)
+    found = clearances(anatomy, course, times, np.array(places))
+    return float(np.nanmax(np.abs(found - _PROBE)))
 
 
 def section_flow(anatomy: Anatomy, time: float) -> float:
@@ -245,20 +240,19 @@ def frame(anatomy: Anatomy) -> float:
     return float(100 * away / np.ptp(expected, axis=0).max())
 
 
-def checks(tube: Anatomy, phantom: Anatomy) -> list[Check]:
+def checks(tube: Anatomy, phantom: Anatomy) -> Iterator[Check]:
     """Checks of a straight tube along z, and of a phantom."""
-    made = Checks()
     for time in FLOW_TIMES:
         name = f"flow through a section in motion at {time:g} s"
-        made.deviation(name, section_flow(tube, time), 1.0, FLOW_BOUND)
+        yield Check.deviation(name, section_flow(tube, time), 1.0, FLOW_BOUND)
     deviation, delays, expected = diameters(tube)
     name = "lumen's diameter over the beat at three places"
-    made.at_most(name, 1e3 * deviation, WALL_BOUND, "mm")
+    yield Check.at_most(name, 1e3 * deviation, WALL_BOUND, "mm")
     late = 1e3 * np.abs(delays - expected).max()
-    made.at_most("delay of the pulse", late, DELAY_BOUND, "ms")
+    yield Check.at_most("delay of the pulse", late, DELAY_BOUND, "ms")
     name = f"wall of {phantom.name} with all motions"
-    made.at_most(name, 1e3 * wall_place(phantom), WALL_BOUND, "mm")
-    made.at_most("slip of a link that the wall carries", slip(tube), SLIP_BOUND, "%")
+    yield Check.at_most(name, 1e3 * wall_place(phantom), WALL_BOUND, "mm")
+    name = "slip of a link that the wall carries"
+    yield Check.at_most(name, slip(tube), SLIP_BOUND, "%")
     name = "sliding in a moving wall's frame, and at rest under its inertia"
-    made.at_most(name, frame(tube), FRAME_BOUND, "%")
-    return made
+    yield Check.at_most(name, frame(tube), FRAME_BOUND, "%")

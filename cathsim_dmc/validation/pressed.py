@@ -1,5 +1,6 @@
 """Devices pressed on a wall: whether the contact law keeps them at rest."""
 
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import mujoco
@@ -9,7 +10,7 @@ from cathsim_dmc.entities import contact
 from cathsim_dmc.entities.chain import MAX_PUSH_FORCE, MAX_PUSH_SPEED
 from cathsim_dmc.physics import forces
 from cathsim_dmc.tasks.config import CONTROL_TIMESTEP
-from cathsim_dmc.validation.checks import Check, Checks
+from cathsim_dmc.validation.checks import Check
 from cathsim_dmc.validation.rig import bare, in_tube, slider
 
 # N, on a gram: about what a link of the pair weighs as a contact feels it.
@@ -75,46 +76,27 @@ def jam(pair: tuple[str, str]) -> Jam:
     environment = in_tube(JAM_TUBE, **options)
     task = environment.task
     way = task.scene.catheter.stroke / (MAX_PUSH_SPEED * CONTROL_TIMESTEP)
-    count = round(way + _JAMMED / CONTROL_TIMESTEP)
-    depth, force = [], []
-    for _ in range(count):
+    rows = []
+    for _ in range(round(way + _JAMMED / CONTROL_TIMESTEP)):
         environment.step(np.array([1.0, 0.0, 1.0, 0.0]))
         contacts = forces.Contacts.from_sensor(task.contact_rows)
-        depth.append(contacts.penetration.max(-1, initial=0.0))
-        force.append(contacts.magnitude.max(-1, initial=0.0))
-    last = round(_END / CONTROL_TIMESTEP)
-    force = np.concatenate(force[-last:])
-    found = Jam(
-        float(task.readings.push_force),
-        float(np.percentile(np.concatenate(depth[-last:]), 99)),
-        (float(force.min()), float(force.max())),
-    )
+        both = contacts.penetration, contacts.magnitude
+        rows.append([each.max(-1, initial=0.0) for each in both])
+    push = float(task.readings.push_force)
     environment.close()
-    return found
+    depth, force = np.hstack(rows[-round(_END / CONTROL_TIMESTEP) :])
+    deep = float(np.percentile(depth, 99))
+    return Jam(push, deep, (float(force.min()), float(force.max())))
 
 
-def checks(pair: tuple[str, str]) -> list[Check]:
-    """Presses a mass and jams a pair, and judges both.
-
-    Args:
-        pair: Names of guidewire and catheter.
-    """
-    made = Checks()
+def checks(pair: tuple[str, str]) -> Iterator[Check]:
+    """Presses a mass and jams a pair, guidewire and catheter by name."""
     depths, ripples = zip(*map(pressed, LOADS), strict=True)
-    made.at_most(
-        f"pressed by {LOADS[0]:g} to {LOADS[-1]:g} N: ripple of the depth",
-        1e3 * max(ripples),
-        RIPPLE,
-        "mm",
-        f"depth {1e3 * depths[0]:.2f} to {1e3 * depths[-1]:.2f} mm",
-    )
+    name = f"pressed by {LOADS[0]:g} to {LOADS[-1]:g} N: ripple of the depth"
+    note = f"depth {1e3 * depths[0]:.2f} to {1e3 * depths[-1]:.2f} mm"
+    yield Check.at_most(name, 1e3 * max(ripples), RIPPLE, "mm", note)
     jammed = jam(pair)
-    made.at_most(
-        "pair jammed in a dead end: 99th percentile of the penetration",
-        1e3 * jammed.penetration,
-        DEPTH,
-        "mm",
-        f"pushed with {jammed.push_force:.1f} N, largest contact "
-        "{:.2f} to {:.2f} N".format(*jammed.forces),
-    )
-    return made
+    name = "pair jammed in a dead end: 99th percentile of the penetration"
+    note = f"pushed with {jammed.push_force:.1f} N, largest contact "
+    note += "{:.2f} to {:.2f} N".format(*jammed.forces)
+    yield Check.at_most(name, 1e3 * jammed.penetration, DEPTH, "mm", note)

@@ -1,10 +1,12 @@
 """Devices pushed at full speed: contacts, and control steps that are done again."""
 
+from collections.abc import Iterator
+
 import numpy as np
 
 from cathsim_dmc import suite
 from cathsim_dmc.physics import forces
-from cathsim_dmc.validation.checks import Check, Checks
+from cathsim_dmc.validation.checks import Check
 
 TASKS = ("type1_lcca", "femoral_type1_lcca_pair")
 REPEATED = 0.5  # %, of the control steps
@@ -57,16 +59,14 @@ def push(task: str) -> dict[str, float]:
     }
 
 
-def checks() -> tuple[list[Check], list[dict]]:
-    """Pushes the devices of `TASKS` and judges them."""
-    made, pushed = Checks(), []
+def checks(pushed: list[dict]) -> Iterator[Check]:
+    """Pushes the devices of `TASKS`; what `push` finds is put into `pushed`."""
     for task in TASKS:
         one, name = push(task), f"{task}, full push"
         pushed.append({"task": task, **one})
         note = f"{one['contacts']:.2f} contacts for each link that has one"
         again = f"{name}: control steps done again"
-        made.at_most(again, 100 * one["repeated"], REPEATED, "%", note)
+        yield Check.at_most(again, 100 * one["repeated"], REPEATED, "%", note)
         deep, note = 1e3 * one["deepest"], f"99th percentile {1e3 * one['deep']:.3f} mm"
-        made.at_most(f"{name}: deepest penetration", deep, DEEPEST, "mm", note)
-        made.at_most(f"{name}: largest contact", one["force"], HARDEST, "N")
-    return made, pushed
+        yield Check.at_most(f"{name}: deepest penetration", deep, DEEPEST, "mm", note)
+        yield Check.at_most(f"{name}: largest contact", one["force"], HARDEST, "N")

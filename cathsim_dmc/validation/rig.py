@@ -1,6 +1,8 @@
 """Test rigs: the catheter of the tasks, with their settings, under known loads."""
 
-from typing import Any, NamedTuple
+import dataclasses
+from collections.abc import Callable
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -10,32 +12,25 @@ from cathsim_dmc import suite
 from cathsim_dmc.anatomy.anatomy import Anatomy
 from cathsim_dmc.anatomy.builder import VesselPlace
 from cathsim_dmc.anatomy.centreline import Centreline, Vessel, VesselTree
+from cathsim_dmc.anatomy.field import Field
 from cathsim_dmc.collision import fields
 from cathsim_dmc.entities import devices
 from cathsim_dmc.entities.arena import AngiographyArena
 from cathsim_dmc.entities.catheter import Catheter
-from cathsim_dmc.entities.chain import Chain
 from cathsim_dmc.entities.contact import FRICTION
+from cathsim_dmc.entities.device_stack import DeviceStack
+from cathsim_dmc.entities.phantom import Phantom
+from cathsim_dmc.physics import chain_fields
 from cathsim_dmc.tasks.config import PHYSICS_TIMESTEP
 
 RESTING_TIME = 0.4  # s
 
 
-class Rest(NamedTuple):
-    """How a rig comes to rest.
-
-    Attributes:
-        change: it is at rest when no joint moves by more over `RESTING_TIME`, rad
-            and m. The constraint solver's tolerance leaves less.
-        damping: least relaxation time of the hinges until then, s. Damped by its
-            material alone a device swings for minutes, and seems at rest as it turns.
-    """
-
-    change: float = 1e-6
-    damping: float = RESTING_TIME
-
-
-REST = Rest()
+def half_circle(radius: float, start: float, pieces: int) -> np.ndarray:
+    """Half a circle (pieces + 1, 3) m towards +x, that leaves +z at a height, m."""
+    angle = np.linspace(0.0, np.pi, pieces + 1)
+    arc = np.stack([1 - np.cos(angle), 0 * angle, np.sin(angle)], axis=-1)
+    return radius * arc + (0, 0, start)
 
 
 def tube(length: float, radius: float, bend: float = 0.0) -> Anatomy:
@@ -49,9 +44,7 @@ def tube(length: float, radius: float, bend: float = 0.0) -> Anatomy:
     z = np.linspace(0.0, length, max(3, round(length / 5e-3) + 1))
     points = np.stack([0 * z, 0 * z, z], axis=-1)
     if bend:
-        angle = np.linspace(0.0, np.pi, 61)[1:]
-        arc = np.stack([1 - np.cos(angle), 0 * angle, np.sin(angle)], axis=-1)
-        arc = points[-1] + bend * arc
+        arc = half_circle(bend, length, 60)[1:]
         points = np.vstack([points, arc, arc[-1] - points[1:]])
     line = Centreline(points, np.full(len(points), radius))
     end = VesselPlace("tube", arc_length=line.length - 1e-3)
@@ -122,15 +115,29 @@ class Rig:
         stroke: float = 0.1,
         rotation: bool = False,
         friction: float = FRICTION,
-        catheter: Chain | None = None,
+        stack: DeviceStack | None = None,
+        gaps: np.ndarray | None = None,
     ):
-        self.catheter = catheter or Catheter(
+        """Makes the device.
+
+        Args:
+            device: Name or device, if it is a single one.
+            discretisation: Default of the tasks if None.
+            stroke: Longest insertion, m.
+            rotation: Whether its base turns.
+            friction: Coulomb coefficient.
+            stack: Coaxial devices in its place.
+            gaps: (K,) m, from the end of each of them, at rest, to that of the chain; 0
+                if None.
+        """
+        self.catheter = stack or Catheter(
             devices.get(device),
             discretisation,
             stroke=stroke,
             rotation=rotation,
             friction=friction,
         )
+        self._gaps = np.zeros(len(stack.devices)) if stack and gaps is None else gaps
         self.device = self.catheter.device
         self.arena = AngiographyArena(self.catheter.density)
         self.arena.mjcf_model.option.timestep = self.catheter.timestep
@@ -154,6 +161,30 @@ class Rig:
             np.array([section.torsional_stiffness for section in both]),
         )
 
+    def add_wall(self, measure: Callable, low, high, friction: float = FRICTION):
+        """Adds a wall that sensors read.
+
+        Args:
+            measure: Depth behind it, see `Field.sampled`.
+            low: Corner (3,) of the box in which it is known, m.
+            high: Likewise.
+            friction: Coulomb coefficient.
+        """
+        # The tree of the anatomy stands for nothing.
+        anatomy = dataclasses.replace(tube(0.04, 1.5e-3), name="wall")
+        vars(anatomy)["lumen"] = Field.sampled(measure, np.array(low), np.array(high))
+        wall = Phantom(anatomy, friction=friction)
+        self.arena.attach(wall)
+        wall.add_wall(self.catheter.links[0])
+
+    def add_plate(self, height: float) -> None:
+        """Adds a plate at y = `height`, m."""
+
+        def measure(blocks: np.ndarray, points: np.ndarray) -> np.ndarray:
+            return height - blocks[:, None, 1] - points[:, 1]
+
+        self.add_wall(measure, (-0.05, -0.05, -0.5), (0.05, height, 0.5))
+
     def compile(self) -> None:
         """Compiles the model; fixtures are added before."""
         physics = mjcf.Physics.from_mjcf_model(self.arena.mjcf_model)
@@ -163,6 +194,8 @@ class Rig:
         self.name = self.catheter.mjcf_model.model
         self.head = self.model.site(f"{self.name}/head").id
         self.tip_body = self.model.body(f"{self.name}/link_{len(self.lengths) - 1}").id
+        if isinstance(self.catheter, DeviceStack):
+            chain_fields.write_still(self.catheter, self.model, self._gaps)
         mujoco.mj_forward(self.model, self.data)
 
     def qpos(self, joint: str) -> float:
@@ -176,9 +209,8 @@ class Rig:
     @property
     def joints(self) -> np.ndarray:
         """Places (n, 3) of the proximal ends of the links, m."""
-        return self.data.xpos[self.tip_body + 1 - len(self.lengths) :][
-            : len(self.lengths)
-        ].copy()
+        last = self.tip_body + 1
+        return self.data.xpos[last - len(self.lengths) : last].copy()
 
     @property
     def head_position(self) -> np.ndarray:
@@ -215,45 +247,40 @@ class Rig:
         self,
         force=None,
         *,
-        rest: Rest = REST,
+        change: float = 1e-6,
+        damping: float = RESTING_TIME,
         longest: float = 20.0,
-    ) -> float:
+    ) -> None:
         """Steps, strongly damped, until the device is at rest.
 
         Args:
             force: (3,) dead load on the distal end, N; None leaves what is applied.
-            rest: when it is at rest, and how it is damped until then.
-
-        Returns:
-            The time that took, s.
+            change: it is at rest when no joint moves by more over `RESTING_TIME`, rad
+                and m. The constraint solver's tolerance leaves less.
+            damping: least relaxation time of the hinges until then, s. Damped by its
+                material alone a device swings for minutes, and seems at rest as it
+                turns.
+            longest: time until then, s.
 
         Raises:
             RuntimeError: if it is not at rest by then, or the simulation diverges.
         """
-        start, change = self.data.time, np.inf
-        model, damping = self.model, self.model.dof_damping.copy()
-        model.dof_damping[model.jnt_dofadr] = np.where(
-            model.jnt_type == mujoco.mjtJoint.mjJNT_HINGE,
-            np.maximum(damping[model.jnt_dofadr], rest.damping * model.jnt_stiffness),
-            damping[model.jnt_dofadr],
-        )
-        while change > rest.change:
-            before = self.data.qpos.copy()
+        end, moved = self.data.time + longest, np.inf
+        model, before = self.model, self.model.dof_damping.copy()
+        hinges = model.jnt_type == mujoco.mjtJoint.mjJNT_HINGE
+        chosen, least = model.jnt_dofadr[hinges], damping * model.jnt_stiffness[hinges]
+        model.dof_damping[chosen] = np.maximum(before[chosen], least)
+        while moved > change:
+            start = self.data.qpos.copy()
             self.run(RESTING_TIME, force)
-            change = np.abs(self.data.qpos - before).max()
-            if self.data.time - start > longest:
+            moved = np.abs(self.data.qpos - start).max()
+            if self.data.time > end:
                 raise RuntimeError(
-                    f"after {longest} s a joint still moves by {change:.2g} in "
-                    f"{RESTING_TIME} s, more than {rest.change:g}; the load "
-                    "is too large or the time too short"
+                    f"after {longest} s a joint still moves by {moved:.2g} in "
+                    f"{RESTING_TIME} s, more than {change:g}; the load is too large "
+                    "or the time too short"
                 )
-        model.dof_damping[:] = damping
-        warnings = [
-            mujoco.mjtWarning(kind).name
-            for kind, warning in enumerate(self.data.warning)
-            if warning.number
-        ]
-        if warnings:
-            raise RuntimeError(f"MuJoCo warned of {', '.join(warnings)}")
+        model.dof_damping[:] = before
+        if self.data.warning.number.any():
+            raise RuntimeError("MuJoCo warned while the device settled")
         mujoco.mj_forward(self.model, self.data)
-        return float(self.data.time - start)

@@ -1,9 +1,10 @@
 """Unloaded shapes turned about the axis, and twist of the chain in a bend."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import mujoco
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
 from cathsim_dmc.entities import devices, posture
@@ -13,7 +14,7 @@ from cathsim_dmc.entities.device_stack import DeviceStack
 from cathsim_dmc.physics import chain_fields
 from cathsim_dmc.validation import theory
 from cathsim_dmc.validation.checks import Check
-from cathsim_dmc.validation.rig import Rig
+from cathsim_dmc.validation.rig import Rig, half_circle
 
 _FINE = 0.05e-3  # m, of the curve that is integrated
 TURNS = np.radians(np.arange(0, 360, 15))
@@ -32,82 +33,59 @@ TWIST_BOUND = 1.0  # °, of the last frame there
 SINGLE_TWIST_BOUND = 2.0
 
 
-def free_ends(
-    rig: Rig, gaps: Sequence[float], turns: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Ends (T, 3), m, from the base, and directions (T, 3) of the last link at rest.
+def free_curve(chosen: Sequence[Device], gaps: ArrayLike, length: float) -> np.ndarray:
+    """End (3,), m, of the curve of the EI-weighted curvature of devices at rest.
 
     Args:
-        rig: compiled, with coaxial devices.
-        gaps: (K,) from the end of each device to that of the chain, m.
-        turns: (T,), rotations of all devices, rad.
-    """
-    entity = rig.catheter
-    assert isinstance(entity, DeviceStack)
-    ends = []
-    for turn in turns:
-        rotation = np.full(len(entity.devices), turn)
-        chain_fields.write_still(entity, rig.model, np.asarray(gaps), rotation)
-        rig.data.qpos[:] = rig.model.qpos_spring
-        mujoco.mj_kinematics(rig.model, rig.data)
-        axis = rig.data.xmat[rig.tip_body].reshape(3, 3)[:, 2]
-        ends.append((rig.head_position - rig.joints[0], axis.copy()))
-    return np.array([end for end, _ in ends]), np.array([axis for _, axis in ends])
-
-
-def weighted_curvature(
-    chosen: Sequence[Device],
-    gaps: np.ndarray,
-    rotation: np.ndarray,
-    length: float,
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Pieces (n,) of 0.05 mm: arc length of their beginning, length, curvature x + iy.
-
-    The curvature leads towards x and y; where no device is, there is none.
+        chosen: K coaxial devices, not turned: the curve lies in the plane of x and z.
+        gaps: (K,) from the end of each device to that of the curve, m.
+        length: m.
     """
     arc = np.arange(0.0, length, _FINE)
     steps = np.diff(np.append(arc, length))
     middle = length - (arc + steps / 2)  # from the end
-    rows = [
-        theory.profile(device, middle - gap)
-        for device, gap in zip(chosen, gaps, strict=True)
-    ]
-    bending, _, own = (np.array(each) for each in zip(*rows, strict=True))
-    moment = (bending * own * np.exp(1j * rotation)[:, None]).sum(axis=0)
-    stiffness = bending.sum(axis=0)
-    curvature = np.divide(
-        moment, stiffness, out=np.zeros_like(moment), where=stiffness > 0
-    )
-    return arc, steps, curvature
+    moment, stiffness = np.zeros((2, len(arc)))
+    for device, gap in zip(chosen, np.asarray(gaps), strict=True):
+        bending, _, own = theory.profile(device, middle - gap)
+        moment += bending * own
+        stiffness += bending
+    # Where no device is, there is no curvature.
+    turning = moment / np.maximum(stiffness, 1e-12) * steps
+    heading = np.cumsum(turning) - turning / 2
+    return np.array([np.sin(heading) @ steps, 0.0, np.cos(heading) @ steps])
 
 
 def turned(names: Sequence[str], gaps: Sequence[float]) -> tuple[float, float, float]:
     """Largest deviations of the unloaded end, turned by `TURNS`.
+
+    Args:
+        names: K coaxial devices.
+        gaps: (K,) from the end of each to that of the chain, m.
 
     Returns:
         Deviation from the turned shape of 0° and from the continuous curve of the
         EI-weighted curvature, as fractions of the displacement of the end; deviation of
         the last link's direction from that of 0°, rad.
     """
-    rig = Rig(catheter=DeviceStack(names))
+    entity = DeviceStack(names)
+    rig = Rig(stack=entity)
     rig.compile()
-    ends, axes = free_ends(rig, gaps, TURNS)
+    rows = []
+    for turn in TURNS:
+        rotation = np.full(len(names), turn)
+        chain_fields.write_still(entity, rig.model, np.asarray(gaps), rotation)
+        rig.data.qpos[:] = rig.model.qpos_spring
+        mujoco.mj_kinematics(rig.model, rig.data)
+        axis = rig.data.xmat[rig.tip_body].reshape(3, 3)[:, 2].copy()
+        rows.append((rig.head_position - rig.joints[0], axis))
     back = Rotation.from_euler("z", -TURNS[:, None])
-    ends, axes = back.apply(ends), back.apply(axes)
-    length, still = float(rig.lengths.sum()), np.zeros(len(names))
-    _, steps, curvature = weighted_curvature(
-        rig.catheter.devices, np.asarray(gaps), still, length
-    )
-    turning = np.real(curvature) * steps
-    heading = np.cumsum(turning) - turning / 2
-    curve = np.array([np.sin(heading) @ steps, 0.0, np.cos(heading) @ steps])
+    ends, axes = (back.apply(each) for each in np.moveaxis(np.array(rows), 1, 0))
+    length = float(rig.lengths.sum())
+    curve = free_curve(entity.devices, gaps, length)
     moved = float(np.linalg.norm(curve - (0.0, 0.0, length)))
     angle = np.linalg.norm(np.cross(axes, axes[0]), axis=-1).max()
-    return (
-        float(np.linalg.norm(ends - ends[0], axis=-1).max()) / moved,
-        float(np.linalg.norm(ends - curve, axis=-1).max()) / moved,
-        float(np.arcsin(angle)),
-    )
+    away = [np.linalg.norm(ends - one, axis=-1).max() for one in (ends[0], curve)]
+    return float(away[0] / moved), float(away[1] / moved), float(np.arcsin(angle))
 
 
 def twists(link_lengths: np.ndarray, start: float, plane: float) -> tuple[float, float]:
@@ -122,10 +100,8 @@ def twists(link_lengths: np.ndarray, start: float, plane: float) -> tuple[float,
         Twist of the last link, and of the link before it less the twist that coaxial
         devices take out (`Stack.bent`), against frames that do not twist, rad.
     """
-    angle = np.linspace(0.0, np.pi, 400)
-    arc = np.stack([1 - np.cos(angle), 0 * angle, np.sin(angle)], axis=-1)
-    line = np.vstack([[[0, 0, 0]], BEND_RADIUS * arc + (0, 0, start)])
-    line = np.vstack([line, [[2 * BEND_RADIUS, 0, -1.0]]])
+    end = [[2 * BEND_RADIUS, 0, -1.0]]
+    line = np.vstack([[[0, 0, 0]], half_circle(BEND_RADIUS, start, 399), end])
     line = Rotation.from_euler("z", plane).apply(line)
     angles = posture.joints_along(link_lengths, line)
     frame = still = Rotation.identity()
@@ -140,42 +116,40 @@ def twists(link_lengths: np.ndarray, start: float, plane: float) -> tuple[float,
         still = Rotation.from_rotvec(across) * still
         found.append((still.inv() * frame).as_rotvec()[2])
     stack = Stack([devices.get("berenstein_5f")], link_lengths)
-    order = [posture.x_first(joint) for joint in range(1, len(link_lengths))]
-    hinges = np.where(np.array(order)[:, None], angles, angles[:, ::-1])
-    _, taken = stack.bent(hinges.reshape(1, -1))
+    _, taken = stack.bent(in_order(angles)[None])
     return float(found[-1]), float(found[-2] - taken[0, -1])
 
 
-def checks() -> list[Check]:
+def in_order(angles: np.ndarray) -> np.ndarray:
+    """Angles (n - 1, 2) about x and y of the joints of a chain as its hinges lie."""
+    first = [posture.x_first(joint) for joint in range(1, len(angles) + 1)]
+    return np.where(np.array(first)[:, None], angles, angles[:, ::-1]).ravel()
+
+
+def checks() -> Iterator[Check]:
     """Turned shapes of all devices and pairs, and twist in half a circle."""
     alone = [
         ((name,), (0.0,)) for name, one in devices.DEVICES.items() if one.tip_shape
     ]
     pairs = [(pair, gaps) for pair in PAIRS for gaps in GAPS]
-    made = []
+    parts = (
+        ("end against that at 0°", END_BOUND, 100.0, "%"),
+        ("end against the curve", CURVE_BOUND, 100.0, "%"),
+        ("direction against that at 0°", DIRECTION_BOUND, 57.29578, "°"),
+    )
     for label, cases in (("single", alone), ("pairs", pairs)):
-        found = {f"{' in '.join(n)} {g}": turned(n, g) for n, g in cases}
-        for part, (what, bound, scale, unit) in enumerate(
-            (
-                ("end against that at 0°", END_BOUND, 100.0, "%"),
-                ("end against the curve", CURVE_BOUND, 100.0, "%"),
-                ("direction against that at 0°", DIRECTION_BOUND, 57.29578, "°"),
-            )
-        ):
-            worst = max(found, key=lambda name, part=part: found[name][part])
+        found = [(turned(n, g), f"{' in '.join(n)} {g}") for n, g in cases]
+        for part, (what, bound, scale, unit) in enumerate(parts):
+            worst, note = max(found, key=lambda one, part=part: one[0][part])
             name = f"unloaded shapes turned by 0 to 345°, {label}, {what}"
-            value = scale * found[worst][part]
-            made.append(Check.at_most(name, value, bound, unit, worst))
+            yield Check.at_most(name, scale * worst[part], bound, unit, note)
     lengths = devices.Discretisation().link_lengths(devices.get("steerable_5f"))
-    bent = [
-        twists(lengths, start, plane)
-        for start in np.arange(0.02, 0.2, 0.0175 / 2)
-        for plane in TURNS[:7]
-    ]
-    for part, (what, bound) in enumerate(
-        (("single", SINGLE_TWIST_BOUND), ("coaxial", TWIST_BOUND))
+    starts = np.arange(0.02, 0.2, 0.0175 / 2)
+    bent = [twists(lengths, start, plane) for start in starts for plane in TURNS[:7]]
+    worst = np.degrees(np.abs(bent).max(axis=0))
+    for what, value, bound in (
+        ("single", worst[0], SINGLE_TWIST_BOUND),
+        ("coaxial", worst[1], TWIST_BOUND),
     ):
-        value = np.degrees(max(abs(each[part]) for each in bent))
         name = f"twist of the last frame in half a circle of 40 mm, {what} devices"
-        made.append(Check.at_most(name, value, bound, "°"))
-    return made
+        yield Check.at_most(name, value, bound, "°")

@@ -1,7 +1,7 @@
 """Coaxial devices on the move: sliding through each other, and turned in a tube."""
 
-import dataclasses
-from typing import Any
+from collections.abc import Iterator
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -9,7 +9,7 @@ from cathsim_dmc import suite
 from cathsim_dmc.entities.chain import MAX_PUSH_SPEED, MAX_ROTATION_SPEED
 from cathsim_dmc.entities.devices import get
 from cathsim_dmc.tasks.config import CONTROL_TIMESTEP
-from cathsim_dmc.validation.checks import Check, Checks
+from cathsim_dmc.validation.checks import Check
 from cathsim_dmc.validation.rig import in_tube
 
 SLIDING_PAIR = ("wire_035_amplatz", "diagnostic_5f_simmons")
@@ -74,26 +74,21 @@ def slide() -> list[dict[str, Any]]:
     return parts
 
 
-@dataclasses.dataclass(frozen=True)
-class Torque:
+class Torque(NamedTuple):
     """Rotation of a device's end against that of its base.
 
     Attributes:
         name: of the tube.
         base: (T,), rad.
         tip: (T,), rad.
-        torque: (T,), of the rotary unit on the device at rest, N·m.
-        stiffness: K of the whole device, N·m/rad.
-        shape: A, the torque by which the shape resists at most, EI κ α, N·m; 0 in a
-            straight tube.
+        ratio: A/K, rad, of the torque A by which the shape resists at most, EI κ α, 0
+            in a straight tube, and the torsional stiffness K of the whole device.
     """
 
     name: str
     base: np.ndarray
     tip: np.ndarray
-    torque: np.ndarray
-    stiffness: float
-    shape: float
+    ratio: float
 
     @property
     def lag(self) -> np.ndarray:
@@ -112,10 +107,7 @@ class Torque:
         With the shape gathered at the end, K (β - φ) = A sin φ; as the base turns on,
         the end follows until 1 + A/K cos φ = 0, and then whips round.
         """
-        ratio = self.shape / self.stiffness
-        if ratio <= 1.0:
-            return ratio
-        return float(ratio * np.sqrt(1 - 1 / ratio**2))
+        return float(np.sqrt(self.ratio**2 - 1) if self.ratio > 1 else self.ratio)
 
 
 def turn(bent: bool, **options: Any) -> Torque:
@@ -128,51 +120,47 @@ def turn(bent: bool, **options: Any) -> Torque:
     ahead = 0.05 + np.pi * BEND_RADIUS - play.scene.placement.start_depth
     for _ in range(round(ahead / (0.5 * MAX_PUSH_SPEED * CONTROL_TIMESTEP))):
         environment.step(np.array([0.5, 0.0]))
-    rods = play.scene.catheter.rods
+    compliance = float((1 / play.scene.catheter.rods.stiffness[0]).sum())
     rows = []
     for _ in range(round(2 * np.pi * TURNS / (TURN_RATE * CONTROL_TIMESTEP))):
         environment.step(np.array([0.0, TURN_RATE / MAX_ROTATION_SPEED]))
         state = play.rollout.devices
-        rows.append((state.rotation[0, 0], state.tip_rotation[0, 0], state.twist[0, 0]))
+        rows.append((state.rotation[0, 0], state.tip_rotation[0, 0]))
     environment.close()
-    base, tip, torque = np.array(rows).T
     angle = abs(sum(arc.angle for arc in device.tip_shape))
     shape = device.tip.bending_stiffness * angle / BEND_RADIUS if bent else 0.0
-    stiffness = float(1 / (1 / rods.stiffness[0]).sum())
     name = "half circle" if bent else "straight tube"
-    return Torque(name, base, tip, torque, stiffness, shape)
+    return Torque(name, *np.array(rows).T, ratio=shape * compliance)
 
 
-def checks() -> tuple[list[Check], dict[str, Any], list[Torque]]:
-    """Runs the devices; returns checks, findings and the turned devices."""
-    parts, made = slide(), Checks()
+def checks(data: dict[str, Any], findings: dict[str, Any]) -> Iterator[Check]:
+    """Runs the devices; puts the turned ones into `data`, figures into `findings`."""
+    findings["sliding"] = parts = slide()
     for part in parts[1:]:
-        made.at_most(
-            f"sliding, {part['name']}: largest step of the end in 40 ms",
-            1e3 * part["largest_step"],
-            LARGEST_STEP,
-            "mm",
-            f"moves by {1e3 * part['moved']:.1f} mm, largest contact "
-            f"{part['peak_force']:.3f} N, {part['warnings']} warnings",
-        )
-    made.at_most("sliding, warnings", parts[-1]["warnings"], 0, "", "of MuJoCo")
-    turned = [turn(False), turn(True)]
-    straight, bent = turned
+        name = f"sliding, {part['name']}: largest step of the end in 40 ms"
+        note = f"moves by {1e3 * part['moved']:.1f} mm, largest contact "
+        note += f"{part['peak_force']:.3f} N, {part['warnings']} warnings"
+        yield Check.at_most(name, 1e3 * part["largest_step"], LARGEST_STEP, "mm", note)
+    warnings = parts[-1]["warnings"]
+    yield Check.at_most("sliding, warnings", warnings, 0, "", "of MuJoCo")
+    straight, bent = data["turned"] = [turn(False), turn(True)]
     lag = float(np.degrees(np.abs(straight.lag).max()))
-    name = "torque in a straight tube, lag of the end"
-    made.at_most(name, lag, STRAIGHT_LAG, "°", "friction alone holds it back")
+    name, note = (
+        "torque in a straight tube, lag of the end",
+        "friction alone holds it back",
+    )
+    yield Check.at_most(name, lag, STRAIGHT_LAG, "°", note)
     name = "torque in a half circle, fastest turning of the end over the base's"
-    note = f"A/K = {bent.shape / bent.stiffness:.1f}: above 1 it whips"
-    made.at_least(name, bent.whips, WHIP, "", note)
-    torque = {
+    note = f"A/K = {bent.ratio:.1f}: above 1 it whips"
+    yield Check.at_least(name, bent.whips, WHIP, "", note)
+    findings["torque"] = {
         one.name: {
             "largest lag, °": float(np.degrees(one.lag.max())),
             "largest lag without friction and clearance, °": float(
                 np.degrees(one.expected_lag)
             ),
             "fastest turning of the end over the base's": one.whips,
-            "shape over torsional stiffness, rad": one.shape / one.stiffness,
+            "shape over torsional stiffness, rad": one.ratio,
         }
-        for one in turned
+        for one in (straight, bent)
     }
-    return made, {"sliding": parts, "torque": torque}, turned

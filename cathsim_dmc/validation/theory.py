@@ -1,17 +1,20 @@
-"""Closed forms for slender rods: elastica, column and twist.
+"""Closed forms for slender rods: elastica, column, and EI of a device along it.
 
 A rod is a sequence of uniform sections, from the clamp to the free end, given by
 their lengths (m) and bending stiffnesses EI (N·m²). SI units throughout.
 """
 
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.integrate import solve_ivp
 from scipy.optimize import brentq
 
 from cathsim_dmc.entities.device import Device
+
+# Loads of Euler in those of a column whose end is free to move sideways.
+GUIDES = {"sliding": 1, "fixed": 4}
 
 
 class Elastica(NamedTuple):
@@ -28,62 +31,35 @@ class Elastica(NamedTuple):
     angle: np.ndarray
 
 
-def elastica(
-    lengths: Sequence[float] | np.ndarray,
-    stiffnesses: Sequence[float] | np.ndarray,
-    end_angle: float,
-) -> Elastica:
-    """The elastica of a stepped cantilever that ends at `end_angle` (rad).
+def elastica(lengths: ArrayLike, stiffnesses: ArrayLike, end_angle: float) -> Elastica:
+    """The elastica of a stepped cantilever that ends at `end_angle` (0 to π/2 rad).
 
     The equation is EI θ'' = -F cos θ with θ = 0 at the clamp and θ' = 0 at the end
     (Love, A Treatise on the Mathematical Theory of Elasticity, ch. XIX). It is
     integrated from the end to the clamp; the force is the one that meets the clamp.
-
-    Raises:
-        ValueError: if the end angle is not inside (0, π/2).
     """
-    if not 0 < end_angle < np.pi / 2:
-        raise ValueError(f"end_angle is {end_angle} rad; it must be inside (0, π/2)")
-    sections = list(zip(lengths, stiffnesses, strict=True))[::-1]
-    compliance = _tip_compliance(lengths, stiffnesses)
+    lengths, stiffnesses = np.asarray(lengths)[::-1], np.asarray(stiffnesses)[::-1]
 
     def shape(force):
         # θ, M and the place relative to the end, along t, the way from the end.
-        state = np.array([end_angle, 0.0, 0.0, 0.0])
-        rows = [state]
-        for length, stiffness in sections:
+        rows = [np.array([end_angle, 0.0, 0.0, 0.0])]
+        for length, stiffness in zip(lengths, stiffnesses, strict=True):
 
             def slope(t, y, stiffness=stiffness):
-                theta, moment = y[:2]
-                cos, sin = np.cos(theta), np.sin(theta)
-                return -moment / stiffness, force * cos, -cos, -sin
+                cos, sin = np.cos(y[0]), np.sin(y[0])
+                return -y[1] / stiffness, force * cos, -cos, -sin
 
-            solution = solve_ivp(
-                slope,
-                (0.0, length),
-                state,
-                rtol=1e-10,
-                atol=1e-12,
-                t_eval=np.linspace(0.0, length, 41),
-            )
-            state = solution.y[:, -1]
-            rows.extend(solution.y.T[1:])
+            t, limits = np.linspace(0.0, length, 41), {"rtol": 1e-10, "atol": 1e-12}
+            solved = solve_ivp(slope, (0.0, length), rows[-1], t_eval=t, **limits)
+            rows.extend(solved.y.T[1:])
         return np.array(rows[::-1])
 
     # The small-deflection slope is F Σ∫(L - s)/EI ds; the real one is less.
-    low = end_angle / compliance
+    from_end = np.append(0.0, np.cumsum(lengths))
+    low = end_angle / (np.diff(from_end**2) / (2 * stiffnesses)).sum()
     force = brentq(lambda f: shape(f)[0, 0], 0.5 * low, 20 * low, xtol=1e-12 * low)
     rows = shape(force)
     return Elastica(force, rows[:, 2:] - rows[0, 2:], rows[:, 0])
-
-
-def _tip_compliance(lengths, stiffnesses) -> float:
-    """Slope at the end per transverse force in the linear theory, rad/N."""
-    total, beyond = 0.0, 0.0
-    for length, stiffness in list(zip(lengths, stiffnesses, strict=True))[::-1]:
-        total += ((beyond + length) ** 2 - beyond**2) / (2 * stiffness)
-        beyond += length
-    return total
 
 
 def buckling_load(length: float, stiffness: float, end: str = "sliding") -> float:
@@ -92,17 +68,7 @@ def buckling_load(length: float, stiffness: float, end: str = "sliding") -> floa
     The end keeps its direction. "sliding": it is free to move sideways (π²EI/L²);
     "fixed": it is not (4π²EI/L²).
     """
-    factors = {"sliding": 1, "fixed": 4}
-    if end not in factors:
-        raise ValueError(f"end is {end!r}; allowed are {', '.join(factors)}")
-    return factors[end] * np.pi**2 * stiffness / length**2
-
-
-def twist(torque: float, lengths, torsional_stiffnesses) -> float:
-    """Twist angle (rad) Σ T l / GJ of a stepped shaft under an end torque (N·m)."""
-    return float(
-        torque * np.sum(np.asarray(lengths) / np.asarray(torsional_stiffnesses))
-    )
+    return GUIDES[end] * np.pi**2 * stiffness / length**2
 
 
 def profile(device: Device, places: np.ndarray) -> tuple[np.ndarray, ...]:

@@ -4,7 +4,7 @@ The reference minimises the bending and twist energy over the increments of shap
 twists on a fine grid; it shares no code with the model but the devices' data.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import mujoco
@@ -20,8 +20,9 @@ from cathsim_dmc.entities.device_stack import DeviceStack
 from cathsim_dmc.physics import chain_fields
 from cathsim_dmc.physics.stepper import CONTROL_TIMESTEP
 from cathsim_dmc.validation import theory
-from cathsim_dmc.validation.checks import Check, Checks
-from cathsim_dmc.validation.rig import Rig, in_tube
+from cathsim_dmc.validation.checks import Check
+from cathsim_dmc.validation.rig import Rig, half_circle, in_tube
+from cathsim_dmc.validation.shapes import in_order
 
 _FINE = 0.5e-3  # m
 BEND_RADIUS = 0.04  # m, of half a circle in which the pairs are held
@@ -59,13 +60,13 @@ class Rods(NamedTuple):
         rotation: (K,), of the ends of the devices, rad.
         end: (3,), of the chain from its base, m.
         energy: of the reference, N·m.
-        force: (K,), axial forces on the bases of simulated devices, N.
+        force: (K,), axial forces on the bases of simulated devices, N, or (0,).
     """
 
     rotation: np.ndarray
     end: np.ndarray
     energy: float = np.nan
-    force: np.ndarray | None = None
+    force: np.ndarray = np.zeros(0)
 
 
 def reference(
@@ -153,18 +154,20 @@ def simulate(
         beyond: free length of the chain after the half circle, m; None where all is.
     """
     entity = DeviceStack(names)
-    rig = Rig(catheter=entity)
+    rig = Rig(stack=entity)
     rig.compile()
     stack, rods = entity.stack, entity.rods
     fields = chain_fields.ChainFields(rig.model, entity)
     arrays = [getattr(rig.model, name) for name in chain_fields.FIELDS]
     if beyond is not None:
-        angles = posture.joints_along(rig.lengths, _line(stack.nodes[0] - beyond))
-        order = [posture.x_first(joint) for joint in range(1, len(rig.lengths))]
-        hinges = np.where(np.array(order)[:, None], angles, angles[:, ::-1]).ravel()
+        # Straight, half a circle, and straight.
+        start = stack.nodes[0] - beyond - np.pi * BEND_RADIUS
+        line = np.vstack([[[0, 0, 0]], half_circle(BEND_RADIUS, start, 1999)])
+        line = np.vstack([line, line[-1:] - (0, 0, 1)])
+        angles = posture.joints_along(rig.lengths, line)
+        rig.data.qpos[fields.qpos] = in_order(angles)
         # Joints before the end of the half circle and at it do not move.
         held = 2 * int((stack.nodes[1:-1] > beyond - 1e-6).sum())
-        rig.data.qpos[fields.qpos] = hinges
         start = int(rig.model.jnt_dofadr[rig.model.joint(f"{rig.name}/bend_x_1").id])
         rig.model.dof_armature[start : start + held] = _HELD
     gap, ones = np.asarray(gaps, float)[None], np.ones(1)
@@ -191,14 +194,6 @@ def simulate(
     force = stack.axial(overlap, gap, bends, after, slopes)[0].sum(axis=-1)
     end = rig.head_position - rig.joints[0]
     return Rods(turns[0, :, -1], end, force=force)
-
-
-def _line(length: float) -> np.ndarray:
-    """A line along +z that ends with half a circle at a length; straight after it."""
-    angle = np.linspace(0.0, np.pi, 2000)
-    arc = np.stack([1 - np.cos(angle), 0 * angle, np.sin(angle)], axis=-1)
-    arc = BEND_RADIUS * arc + (0, 0, length - np.pi * BEND_RADIUS)
-    return np.vstack([[[0, 0, 0]], arc, arc[-1:] - (0, 0, 1)])
 
 
 def work(speed: float) -> tuple[float, float]:
@@ -247,19 +242,18 @@ def in_half_circle(
     return simulate(names, gaps, rotation, beyond), expected
 
 
-def checks() -> list[Check]:
+def checks() -> Iterator[Check]:
     """Pairs held in half a circle, and the axial force of a bend."""
-    made = Checks()
     for names, gaps, rotation, beyond in CASES:
         found, expected = in_half_circle(names, gaps, rotation, beyond)
         length = DeviceStack(names).link_lengths.sum()
         name = f"two rods in half a circle, {' in '.join(names)}"
         off = 100 * float(np.linalg.norm(found.end - expected.end)) / length
-        made.at_most(f"{name}, tip", off, TIP_BOUND, "% of its length")
+        yield Check.at_most(f"{name}, tip", off, TIP_BOUND, "% of its length")
         off = float(np.degrees(np.abs(found.rotation - expected.rotation).max()))
         turned = np.degrees(np.abs(expected.rotation - rotation).max())
         note = f"the bend turns an end by {turned:.0f}°"
-        made.at_most(f"{name}, rotation", off, ROTATION_BOUND, "°", note)
+        yield Check.at_most(f"{name}, rotation", off, ROTATION_BOUND, "°", note)
     for names, gaps in SLIDES:
         rotation, gap = (0.0, SLIDE_TURN), np.asarray(gaps)
         found, entity = simulate(names, gaps, rotation), DeviceStack(names)
@@ -268,13 +262,11 @@ def checks() -> list[Check]:
             reference(entity.devices, gap + side * step, rotation, length).energy
             for side in (-1, 1)
         )
-        assert found.force is not None
-        force = found.force[int(gap.argmax())]
         name = f"axial force of a bend, {' in '.join(names)}, ends "
         name += " and ".join(f"{1e3 * each:.1f}" for each in gaps) + " mm back"
-        made.deviation(name, force, (low - high) / (2 * _STEP), RESISTANCE_BOUND, "N")
+        force, expected = found.force[gap.argmax()], (low - high) / (2 * _STEP)
+        yield Check.deviation(name, force, expected, RESISTANCE_BOUND, "N")
     (fast, _), (slow, change) = (work(speed) for speed in SPEEDS)
     done = (SPEEDS[0] * slow - SPEEDS[1] * fast) / (SPEEDS[0] - SPEEDS[1])
     name = f"work of the drives, {' in '.join(WORKING)}, wire withdrawn by 20 mm"
-    made.deviation(name, 1e3 * done, 1e3 * change, RESISTANCE_BOUND, "mJ")
-    return made
+    yield Check.deviation(name, 1e3 * done, 1e3 * change, RESISTANCE_BOUND, "mJ")

@@ -1,7 +1,7 @@
 """The vessel against closed forms: blood that flows, a wall that gives and moves."""
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import mujoco
 import numpy as np
@@ -18,7 +18,7 @@ from cathsim_dmc.physics.flow import EXPONENT, velocities
 from cathsim_dmc.physics.wall import RELAXATION, SOLIMP, reference, stiffness
 from cathsim_dmc.simulation.batch import BatchSimulation
 from cathsim_dmc.validation import damping, motion
-from cathsim_dmc.validation.checks import Checks, Report
+from cathsim_dmc.validation.checks import Check, Report
 from cathsim_dmc.validation.damping import LINK, drag
 from cathsim_dmc.validation.rig import bare, slider, tube
 
@@ -49,19 +49,12 @@ def cantilever(speed: float) -> tuple[float, float]:
     def change(s, state):
         # Angle from the axis at rest, moment / EI, shear and tension, deflection.
         angle, curvature, shear, tension, _ = state
-        load = drag(speed * np.cos(angle), diameter)
-        return np.stack(
-            [
-                curvature,
-                -shear / bending,
-                -load - tension * curvature,
-                shear * curvature,
-                np.sin(angle),
-            ]
-        )
+        pull = -drag(speed * np.cos(angle), diameter) - tension * curvature
+        bend, along = -shear / bending, shear * curvature
+        return np.stack([curvature, bend, pull, along, np.sin(angle)])
 
     def ends(first, last):
-        return np.array([first[0], first[4], last[1], last[2], last[3]])
+        return np.array([*first[[0, 4]], *last[1:4]])
 
     s = np.linspace(0.0, length, 60)
     solved = solve_bvp(change, ends, s, np.zeros((5, len(s))), tol=1e-8)
@@ -157,8 +150,10 @@ def indentation(
         priority=1,
     )
     model, number = spec.compile(), geom.id
-    spring = stiffness(radius, modulus, 1.5e-3, 1.0)
-    weight = model.body_invweight0[1, 0]
+    spring, weight = (
+        stiffness(radius, modulus, 1.5e-3, 1.0),
+        model.body_invweight0[1, 0],
+    )
     law = reference(spring, weight, *SOLIMP[:2], RELAXATION)
     model.geom_solref[number], model.geom_solimp[number] = law, SOLIMP
     depths = []
@@ -172,9 +167,8 @@ def indentation(
 
 def stiffened(factor: float) -> float:
     """Change of the joints, rad, in a push against a wall of a stiffer aorta."""
-    walls = "rigid", {"wall": {"modulus": factor * MODULI[0]}}
     found = []
-    for vessel in walls:
+    for vessel in ("rigid", {"wall": {"modulus": factor * MODULI[0]}}):
         batch = BatchSimulation(suite.make_task("simple1_bca", vessel=vessel), 1)
         batch.reset()
         action = np.zeros((1, batch.num_actions))
@@ -182,37 +176,39 @@ def stiffened(factor: float) -> float:
         for _ in range(50):
             batch.step(action)
         found.append(batch.batch.qpos.copy())
-    return float(np.abs(found[0] - found[1]).max())
+    return float(np.abs(np.subtract(*found)).max())
+
+
+def _checks() -> Iterator[Check]:
+    for speed in CROSS_FLOWS:
+        name = f"cantilever of 0.2 m in a cross-flow of {speed:g} m/s"
+        bent, elastica = cantilever(speed)
+        yield Check.deviation(name, 1e3 * bent, 1e3 * elastica, FLOW_BOUND, "mm")
+    for force in FORCES:
+        name = f"terminal velocity of a free link under {1e3 * force:g} mN"
+        yield Check.deviation(name, *terminal_velocity(force), FLOW_BOUND, "m/s")
+    for name in ANATOMIES:
+        lost = volume_defect(phantoms.load(name))
+        yield Check.at_most(
+            f"volume lost at the junctions of {name}", lost, VOLUME_BOUND
+        )
+    deviation, flow = profile()
+    name = "profile in a tube, deviation over the mean"
+    yield Check.at_most(name, deviation, PROFILE_BOUND)
+    yield Check.deviation("flow through the profile", flow, 1.0, 1e-6)
+    # A capsule that lies along the tube touches with both ends.
+    shapes = (("sphere", 1), ("capsule", 2))
+    for (kind, ends), radius, modulus in itertools.product(shapes, RADII, MODULI):
+        expected = ends * stiffness(radius, modulus, 1.5e-3, 1.0)
+        loads = expected * np.array([2e-4, 6e-4])
+        slope = np.ptp(loads) / np.ptp(indentation(kind, radius, modulus, loads))
+        name = f"{kind} in a tube of {1e3 * radius:g} mm, {1e-6 * modulus:g} MPa"
+        yield Check.deviation(name, slope, expected, SLOPE_BOUND, "N/m")
+    name = "joint positions after a push, wall of 1,000 times the modulus to rigid wall"
+    yield Check.at_most(name, stiffened(1000.0), 0.0, "rad")
+    yield from motion.checks(tube(0.2, motion.RADIUS), phantoms.load("type1"))
 
 
 def validate_vessel() -> Report:
     """Checks what `vessel` does to blood and wall."""
-    checks = Checks()
-    for speed in CROSS_FLOWS:
-        name = f"cantilever of 0.2 m in a cross-flow of {speed:g} m/s"
-        bent, elastica = cantilever(speed)
-        checks.deviation(name, 1e3 * bent, 1e3 * elastica, FLOW_BOUND, "mm")
-    for force in FORCES:
-        name = f"terminal velocity of a free link under {1e3 * force:g} mN"
-        checks.deviation(name, *terminal_velocity(force), FLOW_BOUND, "m/s")
-    for name in ANATOMIES:
-        lost = volume_defect(phantoms.load(name))
-        checks.at_most(f"volume lost at the junctions of {name}", lost, VOLUME_BOUND)
-    deviation, flow = profile()
-    name = "profile in a tube, deviation over the mean"
-    checks.at_most(name, deviation, PROFILE_BOUND)
-    checks.deviation("flow through the profile", flow, 1.0, 1e-6)
-    for kind, radius, modulus in itertools.product(
-        ("sphere", "capsule"), RADII, MODULI
-    ):
-        expected = stiffness(radius, modulus, 1.5e-3, 1.0)
-        # A capsule that lies along the tube touches with both ends.
-        expected *= 2 if kind == "capsule" else 1
-        loads = expected * np.array([2e-4, 6e-4])
-        slope = np.ptp(loads) / np.ptp(indentation(kind, radius, modulus, loads))
-        name = f"{kind} in a tube of {1e3 * radius:g} mm, {1e-6 * modulus:g} MPa"
-        checks.deviation(name, slope, expected, SLOPE_BOUND, "N/m")
-    name = "joint positions after a push, wall of 1,000 times the modulus to rigid wall"
-    checks.at_most(name, stiffened(1000.0), 0.0, "rad")
-    moving = motion.checks(tube(0.2, motion.RADIUS), phantoms.load("type1"))
-    return Report("vessel", [*checks, *moving])
+    return Report("vessel", list(_checks()))

@@ -48,27 +48,20 @@ def draw_view(ax: Axes, anatomy: Anatomy, view: tuple = VIEWS[0]) -> None:
     corners = anatomy.surface.vertices[anatomy.surface.faces]
     normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     normal /= np.maximum(np.linalg.norm(normal, axis=1), 1e-30)[:, None]
-    facing = towards * normal[:, out] > 0.0
     # The far ones first, lit by how much they face the reader.
     order = np.argsort(towards * corners[:, :, out].mean(axis=1))
-    order = order[facing[order]]
+    order = order[towards * normal[order, out] > 0.0]
     light = 0.55 + 0.4 * np.abs(normal[order, out])
-    colours = light[:, None] * np.array([[1.0, 0.86, 0.83]])
+    look = {"facecolors": np.outer(light, [1.0, 0.86, 0.83]), "edgecolors": "face"}
     ax.add_collection(
-        PolyCollection(
-            list(flat(corners[order])),
-            facecolors=colours,
-            edgecolors="face",
-            linewidths=0.3,
-        )
+        PolyCollection(list(flat(corners[order])), linewidths=0.3, **look)
     )
     for index, (vessel, branch) in enumerate(anatomy.tree.vessels.items()):
         line = flat(branch.centreline.points)
         colour = style.COLOURS[index % len(style.COLOURS)]
         ax.plot(*line.T, color=colour, lw=1.4, label=vessel)
-        ax.annotate(
-            vessel, tuple(line[-1]), (2, 2), textcoords="offset points", fontsize=6
-        )
+        look = {"textcoords": "offset points", "fontsize": 6}
+        ax.annotate(vessel, tuple(line[-1]), (2, 2), **look)
     for goal in anatomy.goals.values():
         place = flat(goal.position)
         angle = np.linspace(0.0, 2.0 * np.pi, 60)
@@ -77,16 +70,11 @@ def draw_view(ax: Axes, anatomy: Anatomy, view: tuple = VIEWS[0]) -> None:
         ax.plot(*place, ".", color="#157a3c", ms=4)
     inlet = flat(anatomy.inlet.position)
     way = flat(anatomy.inlet.position + 0.015 * anatomy.inlet.direction) - inlet
-    ax.annotate(
-        "",
-        tuple(inlet + way),
-        tuple(inlet - way),
-        arrowprops={"arrowstyle": "->", "color": "k"},
-    )
+    arrow = {"arrowstyle": "->", "color": "k"}
+    ax.annotate("", tuple(inlet + way), tuple(inlet - way), arrowprops=arrow)
     ax.set_aspect("equal")
     ax.autoscale_view()
-    ax.set_xlabel(_AXES[right] + ", mm")
-    ax.set_ylabel(_AXES[up] + ", mm")
+    ax.set(xlabel=_AXES[right] + ", mm", ylabel=_AXES[up] + ", mm")
     if sign < 0:
         ax.invert_yaxis()
     ax.set_title(name, fontsize=10)

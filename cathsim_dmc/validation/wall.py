@@ -1,6 +1,7 @@
 """`cathsim validate wall`: wall against lumen, friction that acts, convergence."""
 
 import dataclasses
+import itertools
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -17,7 +18,7 @@ from cathsim_dmc.anatomy.surface_depth import SurfaceDepth
 from cathsim_dmc.anatomy.tree_depth import TreeDepth
 from cathsim_dmc.entities import devices
 from cathsim_dmc.validation import convergence, friction, pushing
-from cathsim_dmc.validation.checks import Check, Checks, Report
+from cathsim_dmc.validation.checks import Check, Report
 
 # Bounds (mm) on the difference between the field and the distance that it stands for,
 # at the 99th percentile of places within 1 mm of the wall: of a union of tubes, and of
@@ -48,67 +49,46 @@ def lumen_checks(anatomy: Anatomy) -> list[Check]:
     name = anatomy.name
     error = 1e3 * field_error(anatomy)
     radius = devices.get("steerable_5f").outer_radius
-    narrow = _narrow(anatomy, radius)
+    # Places, 0.5 mm apart, on the way to each goal that are too narrow.
+    narrow, astray = {}, []
+    for goal in anatomy.goals.values():
+        route = anatomy.route(goal.name)
+        s = np.arange(1.5 * radius, route.length - 1.5 * radius, 0.5e-3)
+        depth = anatomy.lumen(route.at(s).position, free=True)
+        narrow[goal.name] = int((depth < radius).sum())
+        own = float(anatomy.tree.depths(goal.position)[goal.vessel])
+        if not min(float(anatomy.depth(goal.position)), own) > radius:
+            astray.append(goal.name)
     faces = anatomy.surface.faces.astype(np.int64)
     loose = int((topology.edge_counts(faces)[1] != 2).sum())
-    astray = [
-        goal.name
-        for goal in anatomy.goals.values()
-        if not min(
-            float(anatomy.depth(goal.position)),
-            float(anatomy.tree.depths(goal.position)[goal.vessel]),
-        )
-        > radius
-    ]
-    made = Checks()
+    made = []
+
+    def check(what: str, value: float, bound: float, unit: str = "", note: str = ""):
+        made.append(Check.at_most(f"{name}: {what}", value, bound, unit, note))
+
     if not anatomy.scanned:  # scans have rings of vessels
         note = "tubes that touch beyond the place where they part"
-        handles = topology.handles(faces)
-        made.at_most(f"{name}: handles of the surface", handles, 0, "", note)
+        check("handles of the surface", topology.handles(faces), 0, "", note)
     note = f"{len(faces)} triangles, {1e6 * anatomy.surface.volume:.0f} ml"
-    edges = f"{name}: edges of the surface without two triangles"
-    made.at_most(edges, loose, 0, "", note)
+    check("edges of the surface without two triangles", loose, 0, "", note)
     parts = int(topology.parts(faces).max()) + 1
-    made.at_most(f"{name}: separate parts of the surface", parts, 1)
-    made.at_most(
-        f"{name}: error of the field, 99th percentile",
-        float(np.percentile(error, 99)),
-        ERROR_SURFACE if anatomy.scanned else ERROR_TREE,
-        "mm",
-        f"mean {error.mean():.4f} mm, at most {error.max():.3f} mm, at "
-        f"{len(error)} places within {1e3 * _NEAR_WALL:g} mm of the wall",
-    )
-    size = anatomy.lumen.nbytes / 1e6
-    made.at_most(f"{name}: memory of the field", size, LARGEST_FIELD, "MB")
-    made.at_most(
-        f"{name}: places of the centrelines that the device does not pass",
-        sum(narrow.values()),
-        0,
-        "",
-        f"radius {1e3 * radius:.2f} mm"
-        + (f", blocked: {', '.join(narrow)}" if narrow else ""),
-    )
-    made.at_most(
-        f"{name}: goals that the device cannot reach in their vessel",
-        len(astray),
-        0,
-        "",
-        f"of {', '.join(anatomy.goals) or 'none'}"
-        + (f", astray: {', '.join(astray)}" if astray else ""),
+    check("separate parts of the surface", parts, 1)
+    bound = ERROR_SURFACE if anatomy.scanned else ERROR_TREE
+    note = f"mean {error.mean():.4f} mm, at most {error.max():.3f} mm, at "
+    note += f"{len(error)} places within {1e3 * _NEAR_WALL:g} mm of the wall"
+    worst = float(np.percentile(error, 99))
+    check("error of the field, 99th percentile", worst, bound, "mm", note)
+    check("memory of the field", anatomy.lumen.nbytes / 1e6, LARGEST_FIELD, "MB")
+    blocked = ", ".join(one for one, count in narrow.items() if count)
+    note = f"radius {1e3 * radius:.2f} mm" + (blocked and f", blocked: {blocked}")
+    what = "places of the centrelines that the device does not pass"
+    check(what, sum(narrow.values()), 0, "", note)
+    lost = ", ".join(astray)
+    note = f"of {', '.join(anatomy.goals) or 'none'}" + (lost and f", astray: {lost}")
+    check(
+        "goals that the device cannot reach in their vessel", len(astray), 0, "", note
     )
     return made
-
-
-def _narrow(anatomy: Anatomy, radius: float) -> dict[str, int]:
-    """Places, 0.5 mm apart, of each vessel on the way to a goal that are too narrow."""
-    narrow = {}
-    for name in anatomy.goals:
-        route = anatomy.route(name)
-        s = np.arange(1.5 * radius, route.length - 1.5 * radius, 0.5e-3)
-        count = int((anatomy.lumen(route.at(s).position, free=True) < radius).sum())
-        if count:
-            narrow[name] = count
-    return narrow
 
 
 def validate_anatomy(
@@ -121,13 +101,12 @@ def validate_anatomy(
         anatomies: generated, measured or imported.
         figure_path: PNG of three views of the first one, or None.
     """
-    checks, findings = Checks(), {}
+    checks, findings = [], {}
     for name, anatomy in anatomies.items():
         checks += lumen_checks(dataclasses.replace(anatomy, name=name))
-        for found in check_tree(anatomy):
-            violations = int(not found.passed)
-            label = f"{name}: {found.name}, violations"
-            checks.at_most(label, violations, 0, "", found.detail)
+        for one in check_tree(anatomy):
+            label = f"{name}: {one.name}, violations"
+            checks.append(Check.at_most(label, int(not one.passed), 0, "", one.detail))
         findings[name] = {"measures": shape(anatomy)}
     if figure_path is not None:
         from cathsim_dmc.validation import views
@@ -188,13 +167,15 @@ def validate_wall(
                 )
             phantom = Anatomy.load(phantom)
         anatomies.append(phantom)
-    checks = [check for anatomy in anatomies for check in lumen_checks(anatomy)]
-    rubbed, pulled = friction.checks()
-    pushes, pushed = pushing.checks()
     studies = convergence.studies() if with_convergence else []
-    checks += rubbed + pushes + convergence.checks(studies)
-    findings: dict[str, Any] = {"pushed": pushed}
-    if studies:
-        findings["convergence"] = studies
+    pulled: list[friction.Capstan] = []
+    pushed: list[dict[str, Any]] = []
+    checks = itertools.chain(
+        *map(lumen_checks, anatomies),
+        friction.checks(pulled),
+        pushing.checks(pushed),
+        convergence.checks(studies),
+    )
+    findings = {"pushed": pushed} | ({"convergence": studies} if studies else {})
     data = {"anatomies": anatomies, "capstans": pulled, "studies": studies}
-    return Report("wall", checks, findings, data)
+    return Report("wall", list(checks), findings, data)
