@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from recording_samples import make_episode
+from recording_samples import make_episode, same
 
 from cathsim_dmc.recording.episode import Episode
 
@@ -23,7 +23,7 @@ def test_save_and_load_return_the_same_bits(
     episode = make_episode(steps, links, actions, seed)
     assert episode.save(path) == path
     loaded = Episode.load(path)
-    assert loaded.equals(episode)
+    assert same(loaded, episode)
     assert loaded.steps == steps
     assert loaded.contact_counts.sum() == len(loaded.contact_step)
 
@@ -35,6 +35,13 @@ def test_save_and_load_return_the_same_bits(
         ("action", np.zeros(6), "action must have shape"),
         ("catheter", np.zeros((7, 5, 2)), "catheter must have shape"),
         ("insertion", np.full(7, np.nan), "finite numbers"),
+        ("meta", {"success": True, "termination": "won"}, "must be one of"),
+        ("meta", {"success": False, "termination": "success"}, "but"),
+        (
+            "meta",
+            {"success": False, "termination": "truncated", "x": float("nan")},
+            "JSON",
+        ),
     ],
 )
 def test_wrong_values_are_named(name, value, message):
@@ -57,19 +64,6 @@ def test_contacts_must_belong_to_steps_in_order(steps, message):
         make_episode(
             contact_step=np.array(steps), contact_position=zeros, contact_force=zeros
         )
-
-
-@pytest.mark.parametrize(
-    ("meta", "message"),
-    [
-        ({"success": True, "termination": "won"}, "must be one of"),
-        ({"success": False, "termination": "success"}, "but"),
-        ({"success": False, "termination": "truncated", "x": float("nan")}, "JSON"),
-    ],
-)
-def test_wrong_metadata_is_refused(meta, message):
-    with pytest.raises(ValueError, match=message):
-        make_episode(meta=meta)
 
 
 def test_a_later_format_is_refused(tmp_path):

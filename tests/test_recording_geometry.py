@@ -2,14 +2,10 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from recording_samples import make_tube
 from scipy.spatial.transform import Rotation
 
-from cathsim_dmc.recording.geometry import (
-    FORCE_COLOUR_MAX,
-    force_colours,
-    z_to,
-)
+from cathsim_dmc.recording.geometry import FORCE_COLOUR_MAX, force_colours
+from cathsim_dmc.recording.rerun_scene import z_to
 
 directions = st.tuples(*[st.floats(-1, 1)] * 3).filter(
     lambda d: np.linalg.norm(d) > 1e-3
@@ -24,14 +20,6 @@ def test_z_to_turns_z_into_the_direction(direction):
     unit = direction / np.linalg.norm(direction)
     turned = Rotation.from_quat(quaternion).apply([0, 0, 1])
     np.testing.assert_allclose(turned, unit, atol=1e-6)
-
-
-def test_normals_of_a_tube_point_outwards():
-    tube = make_tube(sides=24)
-    vertices, normals = tube.vertices, tube.normals
-    np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1)
-    radial = vertices[:, :2] / np.linalg.norm(vertices[:, :2], axis=1, keepdims=True)
-    assert ((normals[:, :2] * radial).sum(axis=1) > 0.99).all()
 
 
 def test_colours_darken_with_force_and_saturate():

@@ -17,8 +17,7 @@ from cathsim_dmc.recording.episode import Episode
 from cathsim_dmc.recording.living import DENT, VesselRecord, dented
 from cathsim_dmc.recording.recorder import EpisodeRecorder
 from cathsim_dmc.recording.rerun_log import write_rrd
-from cathsim_dmc.recording.rerun_scene import arrow_scale
-from cathsim_dmc.recording.scene import BodyGeom
+from cathsim_dmc.recording.rerun_scene import BodyGeom, arrow_scale
 
 STEPS = 6
 GOAL = (0.01, 0.0, 0.03)
@@ -26,19 +25,12 @@ GOAL = (0.01, 0.0, 0.03)
 
 def make_geoms():
     common = {"quaternion": [1, 0, 0, 0], "rgba": [1, 0.5, 0, 1]}
+    turned = {"quaternion": [0.5**0.5, 0.5**0.5, 0, 0], "rgba": [0, 0, 1, 0.5]}
     return [
         BodyGeom(1, "robot/base", "box", [0.01, 0.02, 0.03], [0, 0, 0], **common),
         BodyGeom(1, "robot/base", "sphere", [0.01], [0, 0, 0.1], **common),
         BodyGeom(2, "robot/wheel", "cylinder", [0.01, 0.02], [0, 0, 0], **common),
-        BodyGeom(
-            2,
-            "robot/wheel",
-            "capsule",
-            [0.01, 0.02],
-            [0.1, 0, 0],
-            quaternion=[0.5**0.5, 0.5**0.5, 0, 0],
-            rgba=[0, 0, 1, 0.5],
-        ),
+        BodyGeom(2, "robot/wheel", "capsule", [0.01, 0.02], [0.1, 0, 0], **turned),
     ]
 
 
@@ -67,12 +59,9 @@ class Recording:
         self.static, self.temporal = {}, {}
         for chunk in reader.stream():
             batch = chunk.to_record_batch()
-            names = [
-                n for n in batch.schema.names if n not in ("rerun.controls.RowId",)
-            ]
             target = self.static if chunk.is_static else self.temporal
             rows = target.setdefault(chunk.entity_path, {})
-            for name in names:
+            for name in batch.schema.names:
                 rows.setdefault(name, []).extend(batch.column(name))
         self.views = {}
         for store in self.blueprints:
@@ -99,14 +88,8 @@ def written(tmp_path_factory):
     episode = make_recorded()
     frames = np.arange((STEPS + 1) * 20 * 16, dtype=np.uint32) % 251
     frames = frames.astype(np.uint8).reshape(STEPS + 1, 20, 16, 1)
-    returned = write_rrd(
-        episode,
-        make_tube(),
-        path,
-        robot_geoms=make_geoms(),
-        fluoroscopy=frames,
-    )
-    assert returned == path
+    shapes = {"robot_geoms": make_geoms(), "fluoroscopy": frames}
+    assert write_rrd(episode, make_tube(), path, **shapes) == path
     return episode, frames, path, Recording(path)
 
 
@@ -117,13 +100,8 @@ def test_the_file_holds_one_recording_and_its_layout(written):
     assert recording.views["/world"] == "3D"
     assert recording.views["/fluoroscopy"] == "2D"
     plots = {o for o, kind in recording.views.items() if kind == "TimeSeries"}
-    assert plots == {
-        "/series/reward",
-        "/series/distance_mm",
-        "/series/force",
-        "/series/insertion_mm",
-        "/series/action",
-    }
+    named = ("reward", "distance_mm", "force", "insertion_mm", "action")
+    assert plots == {f"/series/{name}" for name in named}
     assert [p.name for p in path.parent.iterdir()] == ["episode.rrd"]
 
 
@@ -141,22 +119,13 @@ def test_rerun_itself_accepts_the_file(written):
 def test_every_entity_lives_on_both_timelines_at_the_right_rows(written):
     episode, _, _, recording = written
     states, steps = list(range(STEPS + 1)), list(range(1, STEPS + 1))
-    expected = {
-        "/world/catheter": states,
-        "/world/catheter/head": states,
-        "/world/catheter/trail": steps,
-        "/world/robot/wheel": states,
-        "/world/contacts": steps,
-        "/world/heat": steps,
-        "/fluoroscopy": states,
-        "/series/reward": steps,
-        "/series/distance_mm": states,
-        "/series/force/wall_sum": steps,
-        "/series/force/wall_max": steps,
-        "/series/force/push": steps,
-        "/series/insertion_mm": states,
-        "/series/action": states[:-1],
-    }
+    of_states = "world/catheter world/catheter/head world/robot/wheel fluoroscopy "
+    of_states += "series/distance_mm series/insertion_mm"
+    of_steps = "world/catheter/trail world/contacts world/heat series/reward "
+    of_steps += "series/force/wall_sum series/force/wall_max series/force/push"
+    expected = {"/series/action": states[:-1]}
+    expected |= {f"/{entity}": states for entity in of_states.split()}
+    expected |= {f"/{entity}": steps for entity in of_steps.split()}
     assert set(recording.temporal) == set(expected)
     for entity, rows in expected.items():
         assert recording.values(entity, "step") == rows, entity
@@ -185,14 +154,10 @@ def test_arrows_show_the_contacts_of_their_step_only(written):
     assert [len(v or []) for v in vectors] == [2, 0, 1, 3, 0, 0]
     # An empty row clears the arrows of the step before; a null would keep them.
     assert all(v is not None for v in vectors)
-    np.testing.assert_allclose(
-        np.concatenate([v for v in vectors if v]),
-        arrow_scale(episode) * episode.contact_force,
-        atol=1e-6,
-    )
-    np.testing.assert_allclose(
-        np.concatenate([o for o in origins if o]), episode.contact_position, atol=1e-6
-    )
+    expected = arrow_scale(episode) * episode.contact_force
+    for rows, wanted in ((vectors, expected), (origins, episode.contact_position)):
+        found = np.concatenate([row for row in rows if row])
+        np.testing.assert_allclose(found, wanted, atol=1e-6)
 
 
 def test_series_hold_the_values_of_the_episode(written):
@@ -222,9 +187,8 @@ def test_bodies_carry_their_geoms(written):
     episode, _, _, recording = written
     moved = "/world/robot/wheel"
     turns = np.array(recording.values(moved, "Transform3D:quaternion"))[:, 0]
-    np.testing.assert_allclose(
-        turns, np.roll(episode.body_quat[:, 2], -1, axis=-1), atol=1e-6
-    )
+    xyzw = np.roll(episode.body_quat[:, 2], -1, axis=-1)
+    np.testing.assert_allclose(turns, xyzw, atol=1e-6)
     places = np.array(recording.values(moved, "Transform3D:translation"))[:, 0]
     np.testing.assert_allclose(places, episode.body_pos[:, 2], atol=1e-6)
     # A body that never moves is written once.
@@ -233,9 +197,8 @@ def test_bodies_carry_their_geoms(written):
     capsule = f"{moved}/capsule"
     lower = recording.fixed(capsule, "Capsules3D:translations")[0]
     geom = make_geoms()[3]
-    centre = np.array(lower) + Rotation.from_quat(
-        geom.quaternion, scalar_first=True
-    ).apply([0, 0, 0.02])
+    turn = Rotation.from_quat(geom.quaternion, scalar_first=True)
+    centre = np.array(lower) + turn.apply([0, 0, 0.02])
     np.testing.assert_allclose(centre, geom.position, atol=1e-6)
     np.testing.assert_allclose(recording.fixed(capsule, "Capsules3D:lengths"), [0.04])
     half = recording.fixed("/world/robot/base/box", "Boxes3D:half_sizes")
@@ -245,13 +208,10 @@ def test_bodies_carry_their_geoms(written):
 def test_the_scene_is_in_the_patient_frame_with_a_translucent_vessel(written):
     _, _, _, recording = written
     tube = make_tube()
-    vertices, faces = tube.vertices, tube.faces
-    assert len(recording.fixed("/world/vessel", "Mesh3D:vertex_positions")) == len(
-        vertices
-    )
-    assert len(recording.fixed("/world/vessel", "Mesh3D:triangle_indices")) == len(
-        faces
-    )
+    drawn = recording.fixed("/world/vessel", "Mesh3D:vertex_positions")
+    np.testing.assert_allclose(drawn, tube.vertices, atol=1e-6)
+    drawn = recording.fixed("/world/vessel", "Mesh3D:triangle_indices")
+    np.testing.assert_array_equal(drawn, tube.faces)
     rgba = recording.fixed("/world/vessel", "Mesh3D:albedo_factor")[0]
     assert 0 < rgba & 0xFF < 128
     # Left, back, up in Rerun's numbering of directions.
@@ -273,9 +233,8 @@ def test_an_episode_without_extras_opens_without_them(tmp_path):
 
 def test_two_planes_are_two_images(tmp_path):
     frames = np.full((STEPS + 1, 16, 16, 2), (60, 200), np.uint8)
-    path = write_rrd(
-        make_recorded(), make_tube(), tmp_path / "e.rrd", fluoroscopy=frames
-    )
+    path = tmp_path / "e.rrd"
+    write_rrd(make_recorded(), make_tube(), path, fluoroscopy=frames)
     recording = Recording(path)
     for plane, entity in enumerate(("/fluoroscopy", "/fluoroscopy_lateral")):
         assert recording.views[entity] == "2D"

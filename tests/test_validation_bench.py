@@ -10,7 +10,6 @@ from cathsim_dmc.cli.measurements import validate
 from cathsim_dmc.entities.arena import BLOOD_DENSITY, GRAVITY
 from cathsim_dmc.validation import bench, bench_data
 from cathsim_dmc.validation.bench_data import MESH, WIRES, Wire
-from cathsim_dmc.validation.bench_rig import Held
 from cathsim_dmc.validation.checks import Report
 
 ENTRY = np.array([3.0, 0.0, 0.0])  # mm, off the middle of the tube
@@ -72,8 +71,7 @@ def folder(tmp_path_factory):
     made = bench_data.read(path)
     experiment = bench.Experiment(made)
     (wire,) = made.wires
-    held = Held(experiment.setting(wire), experiment.field(), wire)
-    shape = 1e3 * held.push()
+    shape = 1e3 * experiment.held(wire, experiment.field()).push()
     beyond = [[3.0, -1.0, 0.0], [3.0, -3.0, 0.0]]
     measured = row | {"centreline_mm": [*shape[::-1].tolist(), *beyond]}
     write(path, marks, measured, row | {"frame": 2, "inserted_length_mm": 50.0})
@@ -126,7 +124,7 @@ def test_a_wire_has_its_weight_in_blood(folder):
     path, _, _, lumen = folder
     experiment = bench.Experiment(bench_data.read(path))
     wire = experiment.bench.wires[0]
-    rig = Held(experiment.setting(wire, down="left"), lumen, wire)._rig
+    rig = experiment.held(wire, lumen, down="left")._rig
     weight = rig.model.body_mass.sum() * rig.model.opt.gravity / rig.lengths.sum()
     device = bench.DEVICES["straight"]
     displaced = BLOOD_DENSITY * np.pi * device.outer_radius**2

@@ -28,9 +28,3 @@ def test_push_force_is_load_cell_is_contacts_at_a_dead_end(command):
 def test_rim_of_the_sheath_closes_the_balance_of_a_buckled_device():
     one = forces.dead_end(0.5, forces.WIDE_TUBE)
     assert one.load_cell + one.sheath == pytest.approx(one.push, rel=1e-3)
-
-
-@pytest.mark.slow
-def test_forces_report_passes():
-    report = forces.validate_forces()
-    assert report.passed, report.failures

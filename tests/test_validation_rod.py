@@ -5,7 +5,7 @@ import pytest
 
 from cathsim_dmc.entities import devices
 from cathsim_dmc.entities.chain import MAX_ROTATION_SPEED
-from cathsim_dmc.validation import drive, rod
+from cathsim_dmc.validation import rod
 from cathsim_dmc.validation.rig import Rig
 
 
@@ -26,16 +26,12 @@ def test_rig_has_the_settings_of_the_tasks():
         )
 
 
-def test_cantilever_is_the_elastica_up_to_60_degrees():
+def test_cantilever_is_the_elastica_up_to_60_degrees_in_any_plane():
     results = rod.cantilevers(end_angles=(2.0, 30.0, 60.0))
+    results += rod.cantilevers(end_angles=(45.0,), plane=np.pi / 2)
     assert max(one.deviation for one in results) < rod.CANTILEVER_BOUND / 100
     # The loads are not trivial: the end moves by more than half of the length.
-    assert results[-1].expected.position[-1, 1] > 0.2
-
-
-def test_bending_does_not_depend_on_the_plane():
-    (one,) = rod.cantilevers(end_angles=(45.0,), plane=np.pi / 2)
-    assert one.deviation < rod.CANTILEVER_BOUND / 100
+    assert results[2].expected.position[-1, 1] > 0.2
 
 
 def test_coarse_chain_fails_the_cantilever():
@@ -82,15 +78,9 @@ def test_settle_says_when_it_does_not():
         rig.settle((1e-3, 0, 0), longest=0.1)
 
 
-@pytest.mark.slow
-def test_rod_report_passes():
-    report = rod.validate_rod()
-    assert report.passed, report.failures
-
-
 def test_the_drive_holds_and_is_exact_until_its_clamp_slips():
     """A dashpot of 100 N·s/m gave way by 30 mm a second."""
-    driven = drive.Driven()
+    driven = rod.Driven()
     assert abs(driven.move(1.0, 0.0, 3.0)) < 1e-5
     driven.move(0.2, 1.0, 3.0)
     assert driven.move(0.4, 1.0, 3.0) == pytest.approx(0.4 * 0.04, rel=0.01)

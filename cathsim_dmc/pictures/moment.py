@@ -10,7 +10,7 @@ from cathsim_dmc.imaging import Angiograph, FluoroscopyOptions
 from cathsim_dmc.recording.coaxial import CoaxialRecord
 from cathsim_dmc.recording.episode import Episode
 from cathsim_dmc.recording.geometry import force_scale
-from cathsim_dmc.recording.living import VesselRecord, dented, dents
+from cathsim_dmc.recording.living import VesselRecord
 from cathsim_dmc.recording.recorder import EpisodeRecorder, navigation_of
 
 
@@ -58,20 +58,12 @@ class Moment:
     def of(cls, env: Any) -> "Moment":
         """The present state of an environment; TypeError for any other object."""
         task = navigation_of(env)
-        contacts, scene = task.contacts(env.physics), task.scene
-        there, depth = contacts.present, dents(task, contacts)
         episode = EpisodeRecorder(env, task.name).present()
-        distance = 1e3 * episode.meta["distance"][0]
-        moment = cls.of_episode(episode, scene.anatomy.surface)
-        surface, position = moment.surface, contacts.position[there]
+        distance = 1e3 * episode.meta["distance"][-1]
         return dataclasses.replace(
-            moment,
-            surface=dented(surface, position, depth) if depth.size else surface,
-            position=position,
-            force=contacts.force[there],
-            force_scale=force_scale(contacts.magnitude[there]),
+            cls.of_episode(episode, task.scene.anatomy.surface),
             path=np.zeros((0, 3)),
-            title=f"{task.name}: {distance:.0f} mm to {scene.goal.name}",
+            title=f"{task.name}: {distance:.0f} mm to {task.scene.goal.name}",
         )
 
     @classmethod

@@ -13,7 +13,6 @@ from cathsim_dmc.imaging import Angiograph, FluoroscopyOptions
 from cathsim_dmc.recording.episode import Episode
 from cathsim_dmc.recording.living import MESH_EVERY, VesselRecord
 from cathsim_dmc.recording.recorder import EpisodeRecorder, navigation_of
-from cathsim_dmc.recording.scene import body_geoms
 
 # A name of `policies.POLICIES`, a policy, or a function from the observation (a
 # dictionary of arrays) to the action (A,).
@@ -111,6 +110,7 @@ def write(
         return episode.save(target)
     if target.suffix == ".rrd":
         from cathsim_dmc.recording.rerun_log import write_rrd
+        from cathsim_dmc.recording.rerun_scene import body_geoms
 
         options, geoms = film_options(env.task), body_geoms(env.physics)
         film = xray_film(episode, surface, options) if fluoroscopy else None

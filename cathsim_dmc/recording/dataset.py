@@ -11,8 +11,15 @@ import numpy as np
 
 from cathsim_dmc.files import atomic_directory
 
-_NO_MINARI = "minari is not installed; `pip install 'cathsim-dmc[gym]'` adds it"
-_VERSION = re.compile(r"-v\d+$")
+
+def _minari() -> Any:
+    try:
+        import minari
+    except ModuleNotFoundError as error:
+        raise ModuleNotFoundError(
+            "minari is not installed; `pip install 'cathsim-dmc[gym]'` adds it"
+        ) from error
+    return minari
 
 
 def write(
@@ -48,11 +55,8 @@ def write(
     """
     path = Path(path)
     check_free(path)
-    try:
-        from minari.dataset.minari_storage import MinariStorage
-    except ModuleNotFoundError as error:
-        raise ModuleNotFoundError(_NO_MINARI) from error
-    from importlib.metadata import version
+    version = _minari().__version__
+    from minari.dataset.minari_storage import MinariStorage
 
     name = path.name
     with atomic_directory(path) as temporary:
@@ -68,10 +72,10 @@ def write(
         storage.update_metadata(
             {
                 # The last part of an id is a name with a version.
-                "dataset_id": name if _VERSION.search(name) else f"{name}-v0",
+                "dataset_id": name if re.search(r"-v\d+$", name) else f"{name}-v0",
                 "algorithm_name": algorithm,
                 "description": description,
-                "minari_version": version("minari"),
+                "minari_version": version,
             }
         )
         storage.update_episodes(buffers)
@@ -92,10 +96,7 @@ def read_episodes(path: str | os.PathLike[str]) -> Iterator[Any]:
         DatasetError: there is none, or it is damaged.
         ModuleNotFoundError: minari is not installed.
     """
-    try:
-        import minari
-    except ModuleNotFoundError as error:
-        raise ModuleNotFoundError(_NO_MINARI) from error
+    minari = _minari()
     data = next(Path(path).glob("data"), Path(path)) / "metadata.json"
     if not data.is_file():
         raise DatasetError(

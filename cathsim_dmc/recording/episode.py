@@ -7,7 +7,7 @@ the environment is gone, on a machine that has neither MuJoCo nor Rerun.
 
 import json
 import os
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -199,31 +199,19 @@ class Episode:
         try:
             arrays = read_arrays(path, ("header", *_AXES))
             header = json.loads(str(arrays.pop("header")))
-        except (ValueError, RecursionError) as error:
+            if header["format"] != FORMAT:
+                raise ValueError("it is of another kind")
+            if repr(header["version"]) != repr(FORMAT_VERSION):  # True is no 1
+                raise ValueError(
+                    f"it has format {header['version']!r} and this version reads "
+                    f"{FORMAT_VERSION}: record it again or use the version of "
+                    "cathsim_dmc that wrote it"
+                )
+            return cls(header["task"], header["seed"], header["meta"], **arrays)
+        except (KeyError, TypeError, ValueError, RecursionError) as error:
             raise ValueError(
                 f"{path} is not an episode written by Episode.save: {error}"
             ) from error
-        if not isinstance(header, dict) or header.get("format") != FORMAT:
-            raise ValueError(f"{path} is an archive of another kind, not an episode")
-        if repr(header.get("version")) != repr(FORMAT_VERSION):  # True is no 1
-            raise ValueError(
-                f"{path} has episode format {header.get('version')!r}; this version "
-                f"reads {FORMAT_VERSION}: record it again or use the version of "
-                "cathsim_dmc that wrote it"
-            )
-        try:
-            return cls(header["task"], header["seed"], header["meta"], **arrays)
-        except (KeyError, ValueError) as error:
-            raise ValueError(f"{path}: {error}") from error
-
-    def equals(self, other: "Episode") -> bool:
-        """Whether both hold the same values, bit for bit."""
-        return all(
-            np.array_equal(getattr(self, f.name), getattr(other, f.name))
-            if f.name in _AXES
-            else getattr(self, f.name) == getattr(other, f.name)
-            for f in fields(self)
-        )
 
 
 def _plain(value: Any) -> Any:

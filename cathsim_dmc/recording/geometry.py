@@ -1,4 +1,4 @@
-"""Small geometry for drawing: orientations, shading normals, force colours."""
+"""Forces in drawings: colours, scales and text."""
 
 import numpy as np
 
@@ -14,31 +14,6 @@ _FORCE_SCALES = (0.02, 0.05, 0.1, 0.2, FORCE_COLOUR_MAX)
 _FORCE_COLOURS = np.array(
     [[255, 240, 150], [253, 170, 70], [225, 65, 40], [120, 0, 45]], dtype=np.float64
 )
-
-
-def z_to(direction: np.ndarray) -> np.ndarray:
-    """Return the shortest rotations taking +z to ``direction``, as quaternions xyzw.
-
-    Half-angle construction: q = (z x d, 1 + z.d), normalised; for d = -z, where that
-    vanishes, half a turn about x.
-
-    Args:
-        direction: (..., 3) vectors of any length; a zero vector gives the identity.
-
-    Returns:
-        (..., 4) unit quaternions.
-    """
-    length = np.linalg.norm(direction, axis=-1, keepdims=True)
-    x, y, z = np.moveaxis(direction / np.where(length > 0, length, 1), -1, 0)
-    quaternion = np.stack([-y, x, 0 * z, 1 + z], axis=-1)
-    norm = np.linalg.norm(quaternion, axis=-1, keepdims=True)
-    flipped = np.array([1.0, 0.0, 0.0, 0.0])
-    return np.where(norm > 1e-9, quaternion / np.where(norm > 1e-9, norm, 1), flipped)
-
-
-def xyzw(quaternion_wxyz: np.ndarray) -> np.ndarray:
-    """Reorder quaternions (..., 4) from MuJoCo's wxyz to Rerun's xyzw."""
-    return np.roll(quaternion_wxyz, -1, axis=-1)
 
 
 def force_colours(

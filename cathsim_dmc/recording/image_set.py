@@ -163,15 +163,12 @@ def _shards(out: Path, options: ImageSetOptions) -> list[_Shard]:
 
     shards, taken = [], dict.fromkeys(SPLITS.values(), 0)
     for (split, name), count in zip(SPLITS.items(), options.anatomies, strict=True):
-        order = np.random.RandomState(options.seed)
-        order = order.permutation(len(arch.arch_set(name)))
+        random, size = np.random.RandomState(options.seed), len(arch.arch_set(name))
+        order = random.permutation(size)
+        # A place of its own for each of its candidates, whatever becomes of others.
+        ahead = np.arange(_TRIES) * (100 if size >= 100 * _TRIES else 0)
         for number in range(count):
-            # A place of its own for each of its candidates, whatever becomes of others.
-            first = taken[name]
-            places = [(first + 100 * k) % len(order) for k in range(_TRIES)]
-            if len(order) < 100 * _TRIES:
-                places = [first]
-            chosen = tuple(order[places].tolist())
+            chosen = tuple(order[(taken[name] + ahead) % size].tolist())
             shards.append(_Shard(out, split, number, chosen, options))
             taken[name] += 1
     return shards
@@ -192,7 +189,7 @@ def _simulate_shard(shard: _Shard) -> tuple[int, str]:
 
     random, faults = np.random.RandomState(shard.seed), []
     seeds = arch.arch_set(SPLITS[shard.split])
-    for place in np.resize(shard.candidates, _TRIES).tolist():
+    for place in shard.candidates:
         kit = list(KITS)[random.randint(len(KITS))]
         access = ACCESSES[random.randint(len(ACCESSES))]
         anatomy = arch.build_seed(seeds[place], access=access)

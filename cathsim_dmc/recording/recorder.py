@@ -120,9 +120,12 @@ class EpisodeRecorder:
         return self._episode(rows, seed, end)
 
     def present(self) -> Episode:
-        """The present state as an episode of no steps."""
+        """The present state as an episode of one step, whose contacts are present."""
         rows = _Rows(list)
         rows.add(self._state())
+        rows.add(self._state())
+        rows.add({"action": np.zeros(self._env.action_spec().shape), "reward": 0.0})
+        self._add_forces(rows, 0)
         return self._episode(rows, None, {"termination": None, "discount": 1.0})
 
     def _action(self, policy: Policy, timestep: Any) -> np.ndarray:

@@ -18,6 +18,7 @@ from cathsim_dmc.anatomy.parts import Surface
 from cathsim_dmc.files import atomic_path
 from cathsim_dmc.recording import rerun_scene
 from cathsim_dmc.recording.episode import Episode
+from cathsim_dmc.recording.rerun_scene import BodyGeom
 from cathsim_dmc.recording.rerun_stream import (
     FLUOROSCOPY,
     TIMELINE_STEP,
@@ -26,7 +27,6 @@ from cathsim_dmc.recording.rerun_stream import (
     log_frames,
     log_series,
 )
-from cathsim_dmc.recording.scene import BodyGeom
 
 APPLICATION_ID = "cathsim"
 _PLANE_NAMES = ("Fluoroscopy, frontal", "Fluoroscopy, second plane")

@@ -1,7 +1,8 @@
 """The scene in 3D as Rerun entities: vessel, goal, device, contacts, bodies."""
 
 import itertools
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -10,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from cathsim_dmc.anatomy.parts import Surface
 from cathsim_dmc.recording.episode import Episode
-from cathsim_dmc.recording.geometry import force_colours, force_scale, xyzw, z_to
+from cathsim_dmc.recording.geometry import force_colours, force_scale
 from cathsim_dmc.recording.living import MESH_EVERY
 from cathsim_dmc.recording.rerun_stream import (
     MEASURED,
@@ -18,7 +19,6 @@ from cathsim_dmc.recording.rerun_stream import (
     Log,
     device_colours,
 )
-from cathsim_dmc.recording.scene import BodyGeom
 
 VESSEL_COLOUR = (225, 140, 130, 60)
 GOAL_COLOUR = (60, 190, 90, 110)
@@ -30,6 +30,11 @@ SEE_THROUGH = {"sheath": 0.3}
 LONGEST_ARROW = 25e-3
 ARROW_RADIUS, HEAT_RADIUS, TRAIL_RADIUS = 0.7e-3, 0.9e-3, 0.25e-3
 HEAD_SCALE = 1.8
+# Geoms that bodies collide with are not drawn, as in MuJoCo's own viewers.
+_VISIBLE_GROUPS = 3
+# MuJoCo geom types that a recording can draw, and how many sizes each one uses:
+# sphere (radius), capsule and cylinder (radius, half length), box (half extents).
+SIZES = {"sphere": 1, "capsule": 2, "cylinder": 2, "box": 3}
 
 
 def log_vessel(log: Log, surface: Surface) -> None:
@@ -150,6 +155,51 @@ def log_contacts(log: Log) -> None:
         log.columns("world/heat", heat.partition(counts), MEASURED)
 
 
+@dataclass(frozen=True, eq=False)
+class BodyGeom:
+    """One primitive fixed to a body.
+
+    Attributes:
+        body: Row of the body in ``Episode.body_pos`` (the MuJoCo body id).
+        body_name: Full name of the body, such as ``robot/carriage``.
+        kind: "sphere", "capsule", "cylinder" or "box".
+        size: MuJoCo half sizes in metres: (radius,), (radius, half length) or
+            (half x, half y, half z).
+        position: (3,) centre in the frame of the body, metres.
+        quaternion: (4,) wxyz, orientation in the frame of the body.
+        rgba: (4,) colour in [0, 1].
+    """
+
+    body: int
+    body_name: str
+    kind: str
+    size: np.ndarray
+    position: np.ndarray
+    quaternion: np.ndarray
+    rgba: np.ndarray
+
+
+def body_geoms(physics: Any) -> Iterator[BodyGeom]:
+    """The visible primitives of robot and sheath, in the order of the model.
+
+    Args:
+        physics: A dm_control ``Physics``.
+    """
+    import mujoco
+
+    model = physics.model
+    kinds = {int(getattr(mujoco.mjtGeom, f"mjGEOM_{k.upper()}")): k for k in SIZES}
+    for geom in range(model.ngeom):
+        kind, body = kinds.get(int(model.geom_type[geom])), int(model.geom_bodyid[geom])
+        name, material = model.id2name(body, "body"), int(model.geom_matid[geom])
+        rgba = model.mat_rgba[material] if material >= 0 else model.geom_rgba[geom]
+        visible = rgba[3] > 0 and model.geom_group[geom] < _VISIBLE_GROUPS
+        if visible and kind and name.split("/", 1)[0] in ("robot", "sheath"):
+            size = model.geom_size[geom][: SIZES[kind]]
+            pose = model.geom_pos[geom], model.geom_quat[geom]
+            yield BodyGeom(body, name, kind, size, *pose, rgba)
+
+
 def log_bodies(log: Log, geoms: Iterable[BodyGeom]) -> None:
     """Log the shapes of the bodies and how they move."""
     by_body = sorted(geoms, key=lambda geom: (geom.body, geom.kind))
@@ -186,3 +236,28 @@ def _shape(kind: str, parts: list[BodyGeom]) -> Any:
     # MuJoCo centres a capsule, Rerun starts it at its lower end.
     along = Rotation.from_quat(turn, scalar_first=True).apply([0.0, 0.0, 1.0])
     return rr.Capsules3D(translations=centre - size[:, 1:] * along, **look)
+
+
+def z_to(direction: np.ndarray) -> np.ndarray:
+    """Return the shortest rotations taking +z to ``direction``, as quaternions xyzw.
+
+    Half-angle construction: q = (z x d, 1 + z.d), normalised; for d = -z, where that
+    vanishes, half a turn about x.
+
+    Args:
+        direction: (..., 3) vectors of any length; a zero vector gives the identity.
+
+    Returns:
+        (..., 4) unit quaternions.
+    """
+    length = np.linalg.norm(direction, axis=-1, keepdims=True)
+    x, y, z = np.moveaxis(direction / np.where(length > 0, length, 1), -1, 0)
+    quaternion = np.stack([-y, x, 0 * z, 1 + z], axis=-1)
+    norm = np.linalg.norm(quaternion, axis=-1, keepdims=True)
+    flipped = np.array([1.0, 0.0, 0.0, 0.0])
+    return np.where(norm > 1e-9, quaternion / np.where(norm > 1e-9, norm, 1), flipped)
+
+
+def xyzw(quaternion_wxyz: np.ndarray) -> np.ndarray:
+    """Reorder quaternions (..., 4) from MuJoCo's wxyz to Rerun's xyzw."""
+    return np.roll(quaternion_wxyz, -1, axis=-1)

@@ -168,19 +168,14 @@ def ostia(anatomy: Anatomy) -> np.ndarray:
 def ends(shadow: Shadow) -> np.ndarray:
     """Distal end of a device and where its marker begins (..., 2, 3), m."""
     length = MARKER_LENGTH if shadow.mu is None else shadow.marker_length
-    last = shadow.points[..., -1, :]
-    found = np.empty((*last.shape[:-1], 2, 3))
-    found[..., 0, :], left = last, np.full(last.shape[:-1], length)
-    place = last.copy()
-    for number in range(shadow.points.shape[-2] - 2, -1, -1):
-        back = shadow.points[..., number, :] - shadow.points[..., number + 1, :]
-        size = np.linalg.norm(back, axis=-1)
-        share = np.clip(left / np.maximum(size, 1e-12), 0.0, 1.0)
-        place += share[..., None] * back
-        left = np.maximum(left - size, 0.0)
-        if not left.any():
-            break
-    found[..., 1, :] = place
+    back = shadow.points[..., ::-1, :]
+    steps = np.linalg.norm(np.diff(back, axis=-2), axis=-1)
+    way = np.concatenate([0 * steps[..., :1], np.cumsum(steps, axis=-1)], axis=-1)
+    found = np.empty((*back.shape[:-2], 2, 3))
+    for row in np.ndindex(back.shape[:-2]):
+        for axis in range(3):
+            place = np.interp([0.0, length], way[row], back[(*row, slice(None), axis)])
+            found[(*row, slice(None), axis)] = place
     return found
 
 

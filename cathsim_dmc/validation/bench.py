@@ -10,14 +10,15 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from cathsim_dmc.anatomy.field import Field
+from cathsim_dmc.anatomy.parts import Surface
 from cathsim_dmc.anatomy.scan.ways import Ways
 from cathsim_dmc.anatomy.surface_depth import SurfaceDepth
-from cathsim_dmc.entities.contact import FRICTION
 from cathsim_dmc.entities.device import Device, Section
 from cathsim_dmc.entities.devices import METAL_LOSS, METAL_POISSON_RATIO, WIRE_035_GLIDE
 from cathsim_dmc.validation import bench_data
 from cathsim_dmc.validation.bench_data import Bench, Wire
-from cathsim_dmc.validation.bench_rig import Held, Setting
+from cathsim_dmc.validation.bench_rig import Held
 from cathsim_dmc.validation.checks import Check, Report
 
 # Median RMS distance, mm, of straight wires, and of angled ones at their best turn.
@@ -74,12 +75,14 @@ class Experiment:
     def _ways(self) -> Ways:
         return Ways(SurfaceDepth(self.bench.surface))
 
-    def setting(self, wire: Wire, down: str = DOWN, **changes: Any) -> Setting:
-        """The device of a wire on the bench, with changes of the setting."""
+    def held(
+        self, wire: Wire, wall: Field | Surface, turn: float = 0.0, **changes: Any
+    ) -> Held:
+        """A wire on the bench, with changes of `Held`, see `compare`."""
         device = changes.pop("device", DEVICES)[wire.kind]
-        friction = changes.pop("friction", FRICTION)
-        changes["taper"] = changes.get("taper", {}).get(wire.kind)
-        return Setting(device, friction, self.bench.down[down], **changes)
+        taper = changes.pop("taper", {}).get(wire.kind)
+        down = self.bench.down[changes.pop("down", DOWN)]
+        return Held(wall, wire, device, down, turn, taper=taper, **changes)
 
     def compare(
         self,
@@ -99,11 +102,11 @@ class Experiment:
             **changes: of the setting: `friction`, `down`, `overshoot`; by kind of the
                 wire `device` and `taper`.
         """
-        setting, wall = self.setting(wire, **changes), self.field(scale)
+        wall = self.field(scale)
         start = {"led": self._nearest(wire), "laid": wire}.get(way)
         shapes = []
         for turn in turns if way == "pushed" or start is not None else ():
-            held = Held(setting, wall, wire, turn)
+            held = self.held(wire, wall, turn, **changes)
             shapes.append(held.push() if start is None else held.release(start.points))
         return _result(wire, shapes)
 
@@ -130,8 +133,7 @@ class Experiment:
 
     def hull(self, wire: Wire) -> Result:
         """The wire pushed into MuJoCo's own mesh, which is its convex hull."""
-        held = Held(self.setting(wire), self.bench.surface, wire)
-        return _result(wire, [held.push()])
+        return _result(wire, [self.held(wire, self.bench.surface).push()])
 
 
 def _result(wire: Wire, shapes: Sequence[np.ndarray]) -> Result:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import mujoco
 import numpy as np
@@ -13,7 +13,7 @@ from cathsim_dmc.anatomy.parts import Surface
 from cathsim_dmc.collision import fields
 from cathsim_dmc.entities.arena import BLOOD_DENSITY, GRAVITY
 from cathsim_dmc.entities.chain import MAX_PUSH_SPEED
-from cathsim_dmc.entities.contact import wall_contact
+from cathsim_dmc.entities.contact import FRICTION, wall_contact
 from cathsim_dmc.entities.device import Device
 from cathsim_dmc.entities.devices import Discretisation
 from cathsim_dmc.entities.phantom import mesh_file
@@ -27,26 +27,6 @@ _LINK = 7e-3  # m, longest of the shaft
 _REST, _WHILE, _LONGEST = 0.1e-3, 0.4, 20.0
 
 
-@dataclass(frozen=True)
-class Setting:
-    """What is the same for all frames.
-
-    Attributes:
-        device: the wire.
-        friction: Coulomb coefficient.
-        down: (3,) direction of gravity, frame of the mesh; 0 for none.
-        overshoot: by which the wire is pushed too far and pulled back, m.
-        taper: m from the tip to where the core has its diameter, and by what factor
-            it is thinner at the tip; None for the two sections of the device.
-    """
-
-    device: Device
-    friction: float
-    down: np.ndarray
-    overshoot: float = 0.0
-    taper: tuple[float, float] | None = None
-
-
 class Held:
     """A wire held by the middle of its first link, where and as it enters.
 
@@ -56,25 +36,35 @@ class Held:
 
     def __init__(
         self,
-        setting: Setting,
         wall: Field | Surface,
         wire: Wire,
+        device: Device,
+        down: np.ndarray,
         turn: float = 0.0,
+        *,
+        friction: float = FRICTION,
+        overshoot: float = 0.0,
+        taper: tuple[float, float] | None = None,
     ):
         """Builds the scene.
 
         Args:
-            setting: device and bench.
             wall: lumen, frame of the mesh; of a surface its convex hull.
             wire: whose entry and length are taken.
+            device: the wire.
+            down: (3,) direction of gravity, frame of the mesh; 0 for none.
             turn: of the device about its axis, rad.
+            friction: Coulomb coefficient.
+            overshoot: by which the wire is pushed too far and pulled back, m.
+            taper: m from the tip to where the core has its diameter, and by what factor
+                it is thinner at the tip; None for the two sections of the device.
 
         Raises:
             ValueError: if less of the wire is inserted than its tip is long.
         """
         # Rest does not depend on damping; so much makes it soon.
-        device = replace(setting.device, loss_factor=2.0)
-        self.length, self._reach = wire.length, wire.length + setting.overshoot
+        device = replace(device, loss_factor=2.0)
+        self.length, self._reach = wire.length, wire.length + overshoot
         reach = self._reach
         shaft = reach - device.tip_length
         if shaft < _LINK:
@@ -88,7 +78,7 @@ class Held:
             device,
             Discretisation(reach + first / 2, shaft_link=first * (1 + 1e-6)),
             stroke=reach + 1e-3,
-            friction=setting.friction,
+            friction=friction,
         )
         axis = wire.direction
         across = np.cross(np.eye(3)[np.abs(axis).argmin()], axis)
@@ -98,7 +88,7 @@ class Held:
         self._entry = wire.points[0]
         root = rig.arena.mjcf_model
         buoyancy = BLOOD_DENSITY / rig.catheter.density
-        root.option.gravity = GRAVITY * (1.0 - buoyancy) * setting.down @ self._frame
+        root.option.gravity = GRAVITY * (1.0 - buoyancy) * down @ self._frame
         rig.arena.attach(
             Sheath(straight(float(rig.lengths.sum())), device.outer_radius)
         )
@@ -113,10 +103,10 @@ class Held:
             file = mesh_file(wall.vertices, wall.faces)
             root.asset.add("mesh", name="hull", file=file, inertia="shell")
             shape = {"type": "mesh", "mesh": "hull"}
-        body.add("geom", name="wall", **shape, **wall_contact(setting.friction), mass=0)
+        body.add("geom", name="wall", **shape, **wall_contact(friction), mass=0)
         rig.compile()
-        if setting.taper is not None:
-            self._grind(device.shaft.bending_stiffness, *setting.taper)
+        if taper is not None:
+            self._grind(device.shaft.bending_stiffness, *taper)
 
     def _grind(self, stiffness: float, length: float, thinnest: float) -> None:
         """Lets the core taper: EI goes with the fourth power of its diameter."""

@@ -1,13 +1,21 @@
-"""Convergence of tip path and wall force with the time step and the link length."""
+"""Scripted insertions; convergence of tip path and wall force with step and links."""
 
+import dataclasses
+import itertools
 from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
 
-from cathsim_dmc.anatomy import Centreline
-from cathsim_dmc.tasks.config import PHYSICS_TIMESTEP, NavigationConfig
-from cathsim_dmc.validation import insertion
+from cathsim_dmc import suite
+from cathsim_dmc.anatomy import Anatomy, Centreline, Goal
+from cathsim_dmc.recording.episode import Episode
+from cathsim_dmc.recording.recorder import EpisodeRecorder
+from cathsim_dmc.tasks.config import (
+    CONTROL_TIMESTEP,
+    PHYSICS_TIMESTEP,
+    NavigationConfig,
+)
 from cathsim_dmc.validation.checks import Check
 
 TIMESTEPS = (0.001, 0.002, 0.004, 0.008)  # s
@@ -22,11 +30,76 @@ PATH_BOUND = 1.0  # mm
 FORCE_BOUND = 10.0  # % of the mean wall force
 # Least mean wall force of a script whose force is compared, N.
 LEAST_FORCE = 1e-3
+CURL_TIME = 2.0  # s
 
 
-def study(
-    script: insertion.Script, parameter: str, values: Sequence[float]
-) -> dict[str, Any]:
+@dataclasses.dataclass(frozen=True)
+class Script:
+    """An insertion that depends on nothing but the time.
+
+    Attributes:
+        name: where it leads in the type-I arch.
+        speed: of the base, share of its full speed.
+        curl: commands in [-1, 1] of all tip motors about x and about y, reached in
+            `CURL_TIME`.
+        duration: s.
+    """
+
+    name: str
+    speed: float
+    curl: tuple[float, float]
+    duration: float
+
+    def action(self, step: int, task: Any) -> np.ndarray:
+        """Action (A,) of a control step of a task."""
+        catheter, action = task.scene.catheter, np.zeros(task.num_actions)
+        ramp = min(1.0, (step + 1) * CONTROL_TIMESTEP / CURL_TIME)
+        motors = len(catheter.tip_motors)
+        action[0:motors:2], action[1:motors:2] = ramp * np.array(self.curl)[:, None]
+        action[list(catheter.translations)] = self.speed
+        return action
+
+
+# Over the arch along its wall, into the first branch, into the last one.
+SCRIPTS = (
+    Script("over the arch", 0.5, (0.3, 0.0), 8.0),
+    Script("into the BCA", 0.5, (0.0, 0.0), 6.4),
+    Script("into the LSA", 0.5, (-0.3, 0.0), 7.2),
+)
+
+
+def run(
+    script: Script,
+    *,
+    seed: int = 0,
+    anatomy: str | Anatomy = "type1",
+    goal: str | Goal = "lcca",
+    **options: Any,
+) -> Episode:
+    """Runs a script until its end or that of the episode.
+
+    Args:
+        goal: it sets the stroke of the base.
+        **options: further fields of `tasks.navigation.NavigationConfig`.
+
+    Raises:
+        RuntimeError: if the simulation diverges.
+    """
+    kwargs = {"random": seed, "anatomy": anatomy, "goal": goal, **options}
+    environment = suite.load(suite.DOMAIN, "navigate", kwargs)
+    steps, duration = itertools.count(), round(script.duration / CONTROL_TIMESTEP)
+    episode = EpisodeRecorder(environment).record_episode(
+        lambda _: script.action(next(steps), environment.task), max_steps=duration
+    )
+    environment.close()
+    if "error" in episode.meta:
+        raise RuntimeError(
+            f"insertion {script.name!r} with {options} diverged at step {episode.steps}"
+        )
+    return episode
+
+
+def study(script: Script, parameter: str, values: Sequence[float]) -> dict[str, Any]:
     """Runs a script at several resolutions, other settings at their defaults.
 
     Args:
@@ -42,9 +115,9 @@ def study(
     # A tiny goal: the script runs to its end.
     fixed = {"goal_radius": 1e-5, "outside_range": True}
     options = [{**fixed, parameter: value} for value in ascending]
-    runs = [insertion.run(script, **each) for each in options]  # type: ignore
-    away = [1e3 * np.linalg.norm(run.head - runs[0].head, axis=1) for run in runs]
-    track = [1e3 * _off(run.head, runs[0].head) for run in runs]
+    runs = [run(script, **each) for each in options]  # type: ignore
+    away = [1e3 * np.linalg.norm(one.head - runs[0].head, axis=1) for one in runs]
+    track = [1e3 * _off(one.head, runs[0].head) for one in runs]
     return {
         "script": script.name,
         "parameter": parameter,
@@ -52,7 +125,7 @@ def study(
         "path_mean_mm": [float(each.mean()) for each in away],
         "path_max_mm": [float(each.max()) for each in away],
         "track_max_mm": [float(each.max()) for each in track],
-        "force_mean": [float(run.wall_force_sum.mean()) for run in runs],
+        "force_mean": [float(one.wall_force_sum.mean()) for one in runs],
     }
 
 
@@ -68,7 +141,7 @@ def studies() -> list[dict[str, Any]]:
     resolutions = {"physics_timestep": TIMESTEPS, "shaft_link": SHAFT_LINKS}
     return [
         study(script, parameter, values)
-        for script in insertion.SCRIPTS
+        for script in SCRIPTS
         for parameter, values in resolutions.items()
     ]
 

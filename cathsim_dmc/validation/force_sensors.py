@@ -10,7 +10,7 @@ from cathsim_dmc.entities.chain import MAX_PUSH_SPEED
 from cathsim_dmc.physics import forces
 from cathsim_dmc.recording.episode import Episode
 from cathsim_dmc.tasks.config import PHYSICS_TIMESTEP
-from cathsim_dmc.validation import insertion
+from cathsim_dmc.validation import convergence
 from cathsim_dmc.validation.checks import Check, Report
 from cathsim_dmc.validation.rig import Rig, in_tube
 
@@ -125,8 +125,8 @@ def scripted_cannulations() -> dict[float, list[Episode]]:
     """Insertions into the BCA of the type-I arch, by speed (share of 40 mm/s)."""
     return {
         speed: [
-            insertion.run(
-                insertion.Script("into the BCA", speed, curl, 4.0 / speed),
+            convergence.run(
+                convergence.Script("into the BCA", speed, curl, 4.0 / speed),
                 seed=seed,
                 goal="bca",
             )

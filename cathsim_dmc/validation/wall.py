@@ -17,7 +17,7 @@ from cathsim_dmc.anatomy.surface import sampled
 from cathsim_dmc.anatomy.surface_depth import SurfaceDepth
 from cathsim_dmc.anatomy.tree_depth import TreeDepth
 from cathsim_dmc.entities import devices
-from cathsim_dmc.validation import convergence, friction, pushing
+from cathsim_dmc.validation import convergence, friction, pressed
 from cathsim_dmc.validation.checks import Check, Report
 
 # Bounds (mm) on the difference between the field and the distance that it stands for,
@@ -173,7 +173,7 @@ def validate_wall(
     checks = itertools.chain(
         *map(lumen_checks, anatomies),
         friction.checks(pulled),
-        pushing.checks(pushed),
+        pressed.push_checks(pushed),
         convergence.checks(studies),
     )
     findings = {"pushed": pushed} | ({"convergence": studies} if studies else {})
