@@ -7,7 +7,6 @@ from cathsim_dmc import suite
 from cathsim_dmc.anatomy.parts import Surface
 from cathsim_dmc.recording import rerun_log
 from cathsim_dmc.recording.coaxial import CoaxialRecord
-from cathsim_dmc.recording.episode import Episode
 from cathsim_dmc.recording.recorder import EpisodeRecorder
 
 STEPS = 12
@@ -56,13 +55,6 @@ def test_links_look_like_the_outermost_device_there(recorded):
     assert coaxial.gaps[-1, 1] < coaxial.gaps[0, 1]
 
 
-def test_a_saved_record_keeps_them(recorded, tmp_path):
-    episode, _ = recorded
-    again = Episode.load(episode.save(tmp_path / "pair.npz"))
-    theirs, ours = CoaxialRecord.of(again), CoaxialRecord.of(episode)
-    np.testing.assert_array_equal(theirs.insertion, ours.insertion)
-
-
 def test_the_rerun_file_has_both(recorded, tmp_path):
     from rerun.chunk import RrdReader
 
@@ -71,8 +63,7 @@ def test_the_rerun_file_has_both(recorded, tmp_path):
     box = Surface(np.eye(3), np.array([[0, 1, 2]]))
     rerun_log.write_rrd(episode, box, path)
     entities = {str(chunk.entity_path) for chunk in RrdReader(path).stream()}
+    wire = "world/catheter/{} series/insertion_mm/{} series/rotation_deg/{}"
     for name in ("guidewire", "catheter"):
-        assert f"/world/catheter/{name}" in entities
-        assert f"/series/insertion_mm/{name}" in entities
-        assert f"/series/rotation_deg/{name}" in entities
+        assert {f"/{one.format(name)}" for one in wire.split()} <= entities
         assert f"/series/rotation_deg/{name}_end" in entities

@@ -80,12 +80,8 @@ def test_the_mask_is_where_the_device_changes_the_image(arch, states):
     view = Fluoroscope(camera.arm, vessel, vessel > 0, contrast=0.0)
     for shadow in states.shadows:
         own = [dataclasses.replace(shadow, points=shadow.points[:1, 0])]
-        changed = (
-            view.image(own)[0, ..., 0]
-            != view.image([dataclasses.replace(own[0], points=own[0].points + 5.0)])[
-                0, ..., 0
-            ]
-        )
+        away = [dataclasses.replace(own[0], points=own[0].points + 5.0)]
+        changed = (view.image(own) != view.image(away))[0, ..., 0]
         mask = view.device_mask(own)[0]
         assert mask.sum() > 40 and changed[mask].all()
         # What is changed beside the mask are its neighbours, which are covered less.
@@ -184,11 +180,8 @@ def test_a_set_is_resumed_and_refused_where_it_must_be(tmp_path, monkeypatch, pa
     assert "| train | 2 | 16 |" in (out / "README.md").read_text()
     (out / "train" / "train_001.h5").unlink()
     assert image_set.write(out, options, processes=1).new == 8
-    ids = [
-        i["id"]
-        for i in json.loads((out / "annotations/train.json").read_text())["images"]
-    ]
-    assert len(set(ids)) == 16
+    found = json.loads((out / "annotations/train.json").read_text())["images"]
+    assert len({image["id"] for image in found}) == 16
     with pytest.raises(ValueError, match="other options"):
         image_set.write(out, OPTIONS, processes=1)
     with pytest.raises(ValueError, match="not empty"):

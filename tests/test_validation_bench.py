@@ -51,22 +51,16 @@ def folder(tmp_path_factory):
         "entry": {"point_mm": [0, 0, 0], "outward_normal": [0, -1, 0], "radius_mm": 7},
         "ascending_aorta_root_mm": far.tolist(),
         "patient_axes": {
-            "superior": [0, -1, 0],
-            "left_about": [0, 0, 1],
+            "superior": [0, -1, 0], "left_about": [0, 0, 1],
             "posterior_about": [1, 0, 0],
         },
-    }
+    }  # fmt: skip
     row = {
-        "run": "made",
-        "frame": 1,
-        "wire": "straight",
-        "tip_region": "arch",
-        "recommended": True,
-        "inserted_length_mm": 60.0,
-        "entry_point_mm": ENTRY.tolist(),
-        "entry_direction": [0.0, 1.0, 0.0],
+        "run": "made", "frame": 1, "wire": "straight", "tip_region": "arch",
+        "recommended": True, "inserted_length_mm": 60.0,
+        "entry_point_mm": ENTRY.tolist(), "entry_direction": [0.0, 1.0, 0.0],
         "centreline_mm": [[3.0, 60.0 - y, 0.0] for y in range(0, 70, 2)],
-    }
+    }  # fmt: skip
     write(path, marks, row)
     made = bench_data.read(path)
     experiment = bench.Experiment(made)

@@ -49,14 +49,10 @@ def test_sliding_does_not_lift_a_device_off_the_wall():
     assert ripple < 0.05
 
 
-def test_tube_passes_the_checks_of_the_lumen():
+def test_a_tube_passes_the_checks_of_the_lumen_a_false_field_and_a_narrow_one_fail():
     tube = straight_tube(0.06, 4e-3)
     checks = wall.lumen_checks(tube)
     assert all(check.passed for check in checks), checks
-
-
-def test_a_false_field_and_a_narrow_tube_fail_the_checks_of_the_lumen():
-    tube = straight_tube(0.06, 4e-3)
     false = dataclasses.replace(tube)
     vars(false)["lumen"] = straight_tube(0.06, 3.9e-3).lumen
     checks = {check.name: check for check in wall.lumen_checks(false)}

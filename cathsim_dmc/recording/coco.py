@@ -16,6 +16,7 @@ CATEGORIES = [
     for number, (name, _, keypoints) in enumerate(_CLASSES, 1)
 ]
 _MOST_ROWS = 10**6  # in one file
+_SHIFTS = 5 * np.arange(7)  # enough for masks of 2**30 pixels
 
 
 def described(columns: np.ndarray, bit: int = 1) -> dict[str, Any]:
@@ -31,27 +32,28 @@ def described(columns: np.ndarray, bit: int = 1) -> dict[str, Any]:
         Segmentation in compressed run lengths, which `pycocotools.mask.decode` reads;
         area; bounding box.
     """
-    values = columns & bit > 0
+    values = (columns & bit).astype(bool)
     flat = values.ravel()
-    runs = np.flatnonzero(np.diff(flat, prepend=False, append=not flat[-1]))
-    rest = runs = np.diff(runs, prepend=0)
-    if len(runs) > 3:
-        rest = np.concatenate([runs[:3], runs[3:] - runs[1:-2]])
-    left = rest[:, None] >> 5 * np.arange(7)
+    edges = np.flatnonzero(flat[1:] != flat[:-1]) + 1
+    runs = np.diff([0, *([0] if flat[0] else []), *edges, flat.size])
+    rest = runs.copy()
+    rest[3:] -= runs[1:-2]
+    left = rest[:, None] >> _SHIFTS
     more = left[:, 1:] != -(left[:, :-1] >> 4 & 1)
     codes = (left[:, :-1] & 31) + 32 * more + 48
-    there = np.pad(more[:, :-1], ((0, 0), (1, 0)), constant_values=True)
-    box = [0] * 4
-    if flat.any():
-        across, down = (np.flatnonzero(values.any(axis)) for axis in (1, 0))
-        first, last = (across[0], down[0]), (across[-1], down[-1])
-        box = [int(n) for n in (*first, *np.subtract(last, first) + 1)]
+    there = np.ones_like(more)
+    there[:, 1:] = more[:, :-1]
+    box, area = [0] * 4, int(runs[1::2].sum())
+    if area:
+        across, down = (values.any(axis).nonzero()[0].tolist() for axis in (1, 0))
+        left, top = across[0], down[0]
+        box = [left, top, across[-1] - left + 1, down[-1] - top + 1]
     return {
         "segmentation": {
             "size": list(columns.shape[::-1]),
             "counts": codes[there].astype(np.uint8).tobytes().decode(),
         },
-        "area": int(flat.sum()),
+        "area": area,
         "bbox": box,
         "iscrowd": 0,
     }

@@ -230,7 +230,8 @@ def _pulled(
         rows.append(np.append(travel, rig.sensor(f"{rig.name}/push_force")))
         if len(rows) > 10_000:
             raise RuntimeError(f"the rod stuck on the drum after {1e3 * travel:.1f} mm")
-    travel, force = (each := np.array(rows[1:]))[:, 0], each[:, 1:]
+    travel, force = np.split(np.array(rows[1:]), [1], axis=1)
+    travel = travel[:, 0]
     tension = np.linalg.norm(force, axis=1)
     # Link 0 never turns, so its frame is the world's. Both forces point away from
     # the drum; that of the base against its heading, which is about 0.
