@@ -35,7 +35,7 @@ def described(columns: np.ndarray, bit: int = 1) -> dict[str, Any]:
     values = (columns & bit).astype(bool)
     flat = values.ravel()
     edges = np.flatnonzero(flat[1:] != flat[:-1]) + 1
-    runs = np.diff([0, *([0] if flat[0] else []), *edges, flat.size])
+    runs = np.diff(np.concatenate([[0] * (1 + int(flat[0])), edges, [flat.size]]))
     rest = runs.copy()
     rest[3:] -= runs[1:-2]
     left = rest[:, None] >> _SHIFTS
@@ -45,16 +45,15 @@ def described(columns: np.ndarray, bit: int = 1) -> dict[str, Any]:
     there[:, 1:] = more[:, :-1]
     box, area = [0] * 4, int(runs[1::2].sum())
     if area:
-        across, down = (values.any(axis).nonzero()[0].tolist() for axis in (1, 0))
-        left, top = across[0], down[0]
-        box = [left, top, across[-1] - left + 1, down[-1] - top + 1]
+        across, down = (np.flatnonzero(values.any(axis=axis)) for axis in (1, 0))
+        box = [across[0], down[0], np.ptp(across) + 1, np.ptp(down) + 1]
     return {
         "segmentation": {
             "size": list(columns.shape[::-1]),
             "counts": codes[there].astype(np.uint8).tobytes().decode(),
         },
         "area": area,
-        "bbox": box,
+        "bbox": [int(each) for each in box],
         "iscrowd": 0,
     }
 

@@ -116,8 +116,9 @@ def study(script: Script, parameter: str, values: Sequence[float]) -> dict[str, 
     fixed = {"goal_radius": 1e-5, "outside_range": True}
     options = [{**fixed, parameter: value} for value in ascending]
     runs = [run(script, **each) for each in options]  # type: ignore
-    away = [1e3 * np.linalg.norm(one.head - runs[0].head, axis=1) for one in runs]
-    track = [1e3 * _off(one.head, runs[0].head) for one in runs]
+    heads = [one.head[1:] for one in runs]
+    away = [1e3 * np.linalg.norm(head - heads[0], axis=1) for head in heads]
+    track = [1e3 * _off(head, heads[0]) for head in heads]
     return {
         "script": script.name,
         "parameter": parameter,
