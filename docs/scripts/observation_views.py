@@ -33,7 +33,7 @@ PANELS = {
     "biplane, second": ({"biplane": "LATERAL"}, "image"),
     "(20, -25) degrees": ({"view": (20, -25)}, "image"),
     "magnified on the arch": (
-        {"magnification": 2.5, "centre": (0.02, 0, 0.15)},
+        {"magnification": 2.5, "centre": (-0.01, 0, 0.06)},
         "image",
     ),
     "segmentation: device": ({}, "segmentation"),

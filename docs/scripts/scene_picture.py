@@ -38,8 +38,8 @@ def main():
     physics = env.physics
     physics.model.vis.global_.offwidth = 1600
     physics.model.vis.global_.offheight = HEIGHT
-    whole = draw(physics, (0.03, 0.02, -0.15), 1.2, 118, -22, 420, 38.0)
-    arch = draw(physics, (0.02, 0.01, 0.12), 0.5, 140, -8, 400)
+    whole = draw(physics, (0.14, 0.02, -0.21), 1.3, 118, -22, 420, 38.0)
+    arch = draw(physics, (0.02, 0.01, 0.055), 0.42, 140, -8, 400)
     Image.fromarray(np.concatenate([whole, arch], axis=1)).save(OUT)
 
 
