@@ -15,6 +15,7 @@ from cathsim_dmc import suite  # noqa: E402
 from cathsim_dmc.simulation.gymnasium import CathSimEnv  # noqa: E402
 
 TASK = "cathsim/simple1_bca-v0"
+EXAMPLE = Path(__file__).parents[1] / "examples" / "sb3_ppo.py"
 
 
 def run(env, steps, seed):
@@ -142,26 +143,24 @@ def test_success_terminates():
     assert info["success"] and not info["physics_error"]
 
 
-@pytest.mark.slow
-def test_the_example_of_stable_baselines_trains_and_its_policy_is_evaluated():
+@pytest.fixture(scope="module")
+def example():
+    """What examples/sb3_ppo.py defines."""
     pytest.importorskip("stable_baselines3")
-    from stable_baselines3 import PPO
-    from stable_baselines3.common.env_util import make_vec_env
-    from stable_baselines3.common.vec_env import VecNormalize
+    return runpy.run_path(str(EXAMPLE))
 
+
+@pytest.mark.slow
+def test_the_example_of_stable_baselines_trains_and_keeps_its_policy(example, tmp_path):
     from cathsim_dmc import agents
 
-    path = Path(__file__).parents[1] / "examples" / "sb3_ppo.py"
-    example = runpy.run_path(str(path))
-    env = make_vec_env(
-        TASK, 2, 0, env_kwargs=example["TRAINING"], wrapper_class=example["wrapped"]
-    )
-    settings = {**example["PPO_SETTINGS"], "n_steps": 64, "batch_size": 64}
-    normalise = VecNormalize(env, norm_reward=False)
-    model = PPO("MlpPolicy", normalise, seed=0, **settings).learn(256)
-    policy = example["policy_of"](model, normalise, example["groups_of"](env.envs[0]))
+    settings = example["PPO_SETTINGS"]
+    settings |= {"n_steps": 64, "batch_size": 64}
+    model, normalise = example["untrained"]("type1_bca", 2, 0)
+    model.learn(256)
+    single = normalise.venv.envs[0]
+    policy = example["policy_of"](model, normalise, example["groups_of"](single))
     # What the network reads is in the order in which it was trained.
-    single = env.envs[0]
     entries = single.unwrapped.observation_space.spaces
     assert list(entries) == sorted(entries)
     result = agents.evaluate(
@@ -169,3 +168,11 @@ def test_the_example_of_stable_baselines_trains_and_its_policy_is_evaluated():
         task_kwargs={"max_steps": 5},
     )  # fmt: skip
     assert result.policy == "sb3_ppo" and result.values("length").tolist() == [5, 5]
+    path = tmp_path / "policy.safetensors"
+    example["save"](path, model, normalise, task="type1_bca", seed=0)
+    again, statistics, about = example["load"](path)
+    assert about == {"task": "type1_bca", "seed": 0}
+    seen = np.random.RandomState(0).normal(size=(4, *model.observation_space.shape))
+    expected, _ = model.predict(normalise.normalize_obs(seen), deterministic=True)
+    found, _ = again.predict(statistics.normalize_obs(seen), deterministic=True)
+    np.testing.assert_array_equal(found, expected)
