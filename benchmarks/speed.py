@@ -34,6 +34,7 @@ from pace import (
 
 from cathsim_dmc.anatomy.arch import arch
 from cathsim_dmc.cli.options import show
+from cathsim_dmc.imaging import Shadow
 from cathsim_dmc.simulation.batch import BatchSimulation
 from cathsim_dmc.tasks.config import CONTROL_TIMESTEP
 from cathsim_dmc.validation.checks import Check, Report
@@ -260,16 +261,13 @@ def frame_rates(frames: int = 100) -> dict[str, float]:
     environment.reset()
     task = environment.task
     scope, radius = task.rollout.fluoroscope, task.scene.catheter.device.outer_radius
-    line = task.readings.centreline
-    many = np.repeat(line[None], NUM_SIMULATIONS, axis=0)
+    one = [Shadow(task.readings.centreline, radius)]
+    many = [Shadow(np.repeat(one[0].points[None], NUM_SIMULATIONS, axis=0), radius)]
     random_state = np.random.RandomState(0)
     ways = {
-        "one at a time": (1, lambda: scope.render(line, radius)),
-        f"{NUM_SIMULATIONS} at a time": (
-            NUM_SIMULATIONS,
-            lambda: scope.render(many, radius),
-        ),
-        "with noise": (1, lambda: scope.render(line, radius, random_state)),
+        "one at a time": (1, lambda: scope.render(one)),
+        f"{NUM_SIMULATIONS} at a time": (NUM_SIMULATIONS, lambda: scope.render(many)),
+        "with noise": (1, lambda: scope.render(one, random_state)),
     }
     rates = {}
     for name, (count, render) in ways.items():

@@ -68,7 +68,7 @@ def scene(builder, tmp_path_factory):
 @needs_node
 def test_webassembly_moves_and_draws_as_python_does(builder, scene, tmp_path):
     from cathsim_dmc import suite
-    from cathsim_dmc.imaging.angiograph import Angiograph
+    from cathsim_dmc.imaging import Angiograph, Shadow
 
     rng = np.random.RandomState(0)
     actions = rng.uniform(-1, 1, (25, 21))
@@ -93,8 +93,9 @@ def test_webassembly_moves_and_draws_as_python_does(builder, scene, tmp_path):
     np.testing.assert_allclose(page["peak_max"], forces, atol=0.02)
     surface = suite.make_task("type1_lcca").scene.anatomy.surface
     options = builder.FLUOROSCOPY
-    plane = Angiograph(surface.vertices, surface.faces, options).planes()[0]
-    drawn = plane.render(np.array(page["line"]), builder.DEVICE_RADIUS)[..., 0]
+    plane = Angiograph(surface, options).planes()[0]
+    device = Shadow(np.array(page["line"]), builder.DEVICE_RADIUS)
+    drawn = plane.render([device])[..., 0]
     grey = np.frombuffer(image.read_bytes(), np.uint8).reshape(drawn.shape)
     assert np.abs(grey.astype(int) - drawn).max() <= 1
     assert grey.std() > 1

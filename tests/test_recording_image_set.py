@@ -76,12 +76,12 @@ def test_keypoints_are_where_the_camera_matrix_puts_them_and_on_their_masks(rows
 def test_the_mask_is_where_the_device_changes_the_image(arch, states):
     random = np.random.RandomState(0)
     camera = sequences.Camera(arch, 128, states.shadows[0].points[0, 0, -1], random)
-    vessel = surface_thickness(camera.arm, arch.surface.vertices, arch.surface.faces, 1)
+    vessel = surface_thickness(camera.arm, arch.surface, 1)
     view = Fluoroscope(camera.arm, vessel, vessel > 0, contrast=0.0)
     for shadow in states.shadows:
         own = [dataclasses.replace(shadow, points=shadow.points[:1, 0])]
         away = [dataclasses.replace(own[0], points=own[0].points + 5.0)]
-        changed = (view.image(own) != view.image(away))[0, ..., 0]
+        changed = (view.render(own) != view.render(away))[0, ..., 0]
         mask = view.device_mask(own)[0]
         assert mask.sum() > 40 and changed[mask].all()
         # What is changed beside the mask are its neighbours, which are covered less.

@@ -1,6 +1,7 @@
 """What the observations show, and when."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -66,15 +67,10 @@ def test_the_image_is_the_fluoroscopes(make, anatomy):
     image = push(env, 10)[-1].observation["image"]
     options = FluoroscopyOptions(view="LAO45", size=SIZE)
     surface = anatomy.surface
-    scope = Fluoroscope.from_surface(
-        surface.vertices,
-        surface.faces,
-        options.carms(surface.vertices)[0],
-        contrast=25.0,
-    )
-    task = env.task
-    radius = task.scene.catheter.device.outer_radius
-    np.testing.assert_array_equal(image, scope.render(task.readings.centreline, radius))
+    arm = options.carms(surface.vertices)[0]
+    scope = Fluoroscope.from_surface(surface, arm, contrast=25.0)
+    shadows = env.task.rollout.shadows
+    np.testing.assert_array_equal(image, scope.render(shadows)[0])
 
 
 def test_noise_is_new_in_every_image_and_the_same_for_a_seed(make):
@@ -124,9 +120,9 @@ def test_segmentation_is_device_and_vessel(make):
     r, c = round(row), round(column)
     assert device[r - 1 : r + 2, c - 1 : c + 2].any()
     # Where the device is, the image is darker than that of the vessel alone.
-    away = env.task.readings.centreline + [1.0, 0.0, 0.0]
-    radius = env.task.scene.catheter.device.outer_radius
-    empty = env.task.rollout.fluoroscope.render(away, radius)
+    (shadow,) = env.task.rollout.shadows
+    away = replace(shadow, points=shadow.points[0] + [1.0, 0.0, 0.0])
+    empty = env.task.rollout.fluoroscope.render([away])
     assert (after["image"][device] < empty[device]).all()
     far = after["image"] == empty
     assert far.mean() > 0.9 and not (device & far[..., 0]).any()

@@ -2,7 +2,7 @@
 
 from cathsim_dmc.imaging.angiograph import Angiograph, Deviation
 from cathsim_dmc.imaging.carm import VIEWS, CArm
-from cathsim_dmc.imaging.device import device_attenuation, device_thickness
+from cathsim_dmc.imaging.device import Shadow, device_attenuation
 from cathsim_dmc.imaging.fluoroscopy import Fluoroscope
 from cathsim_dmc.imaging.options import FluoroscopyOptions
 from cathsim_dmc.imaging.thickness import surface_thickness
@@ -14,7 +14,7 @@ __all__ = [
     "Deviation",
     "Fluoroscope",
     "FluoroscopyOptions",
+    "Shadow",
     "device_attenuation",
-    "device_thickness",
     "surface_thickness",
 ]

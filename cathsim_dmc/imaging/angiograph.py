@@ -1,10 +1,11 @@
 """The angiography machine: one or two C-arms before one anatomy, for many devices."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
+from cathsim_dmc.anatomy.parts import Surface
 from cathsim_dmc.imaging.device import Shadow
 from cathsim_dmc.imaging.fluoroscopy import Fluoroscope
 from cathsim_dmc.imaging.options import FluoroscopyOptions
@@ -38,31 +39,25 @@ class Angiograph:
         options: Set-up of the machine.
     """
 
-    def __init__(
-        self,
-        vertices: np.ndarray,
-        faces: np.ndarray,
-        options: FluoroscopyOptions | None = None,
-    ):
+    def __init__(self, surface: Surface, options: FluoroscopyOptions | None = None):
         """Computes the path length through the vessel for the default angles.
 
         Args:
-            vertices: (V, 3) of the lumen surface, world frame, m.
-            faces: (F, 3), counter-clockwise seen from outside.
+            surface: of the lumen, world frame, m.
+            options: Set-up of the machine; the default one if None.
         """
-        self._vertices, self._faces = vertices, faces
+        self._surface = surface
         self.options = options or FluoroscopyOptions()
         self._views: dict[tuple[int, int], Planes] = {}
-        self._usual = self._view(0, 0)
+        self.planes()
 
-    def _view(self, primary: int, secondary: int) -> Planes:
-        key = (primary, secondary)
-        if key not in self._views:
-            options = self.options
-            self._views[key] = tuple(
+    def planes(self, deviation: Deviation = Deviation()) -> Planes:
+        """Fluoroscopes of every plane, frontal first."""
+        angles, options = (deviation.primary, deviation.secondary), self.options
+        if angles not in self._views:
+            self._views[angles] = tuple(
                 Fluoroscope.from_surface(
-                    self._vertices,
-                    self._faces,
+                    self._surface,
                     arm,
                     contrast=options.iodine,
                     kerma=options.kerma,
@@ -70,25 +65,13 @@ class Angiograph:
                     gain=options.gain,
                     roadmap=options.roadmap,
                 )
-                for arm in options.carms(self._vertices, key)
+                for arm in options.carms(self._surface.vertices, angles)
             )
-        return self._views[key]
-
-    def planes(self, deviation: Deviation | None = None) -> Planes:
-        """Fluoroscopes of every plane, frontal first."""
-        if deviation is None or deviation == Deviation():
-            return self._usual
-        view = self._view(deviation.primary, deviation.secondary)
-        if deviation.gain == 1.0 and deviation.kerma == 1.0:
+        view = self._views[angles]
+        if deviation.gain == deviation.kerma == 1.0:
             return view
-        return tuple(
-            replace(
-                plane,
-                gain=plane.gain * deviation.gain,
-                kerma=plane.kerma * deviation.kerma,
-            )
-            for plane in view
-        )
+        gain, kerma = options.gain * deviation.gain, options.kerma * deviation.kerma
+        return tuple(replace(plane, gain=gain, kerma=kerma) for plane in view)
 
 
 def images(
@@ -107,19 +90,12 @@ def images(
     Returns:
         (N, rows, columns, planes) uint8.
     """
-    groups = _alike(machines)
-    images = []
-    for plane, shape in enumerate(_resolutions(machines)):
-        if len(groups) == 1:
-            images.append(machines[0][plane].image(shadows, random_states))
-            continue
-        image = np.empty((len(machines), *shape, 1), dtype=np.uint8)
-        for chosen in groups:
-            states = random_states and [random_states[i] for i in chosen]
-            own = [shadow.of(chosen) for shadow in shadows]
-            image[chosen] = machines[chosen[0]][plane].image(own, states)
-        images.append(image)
-    return np.concatenate(images, axis=-1) if len(images) > 1 else images[0]
+    image = _blank(machines, 1)
+    for plane, chosen, fluoroscope in _each(machines):
+        states = random_states and [random_states[i] for i in chosen]
+        own = [shadow.of(chosen) for shadow in shadows]
+        image[chosen, ..., plane] = fluoroscope.render(own, states)[..., 0]
+    return image
 
 
 def masks(machines: Sequence[Planes], shadows: Sequence[Shadow]) -> np.ndarray:
@@ -128,16 +104,12 @@ def masks(machines: Sequence[Planes], shadows: Sequence[Shadow]) -> np.ndarray:
     Channels: device and vessel of the frontal plane, then of the second one. Arguments
     as in `images`.
     """
-    channels = []
-    for plane, shape in enumerate(_resolutions(machines)):
-        both = np.empty((len(machines), *shape, 2), dtype=np.uint8)
-        for chosen in _alike(machines):
-            own = [shadow.of(chosen) for shadow in shadows]
-            fluoroscope = machines[chosen[0]][plane]
-            both[chosen, ..., 0] = fluoroscope.device_mask(own) * np.uint8(255)
-            both[chosen, ..., 1] = fluoroscope.vessel_mask * np.uint8(255)
-        channels.append(both)
-    return np.concatenate(channels, axis=-1)
+    mask = _blank(machines, 2)
+    for plane, chosen, fluoroscope in _each(machines):
+        own = [shadow.of(chosen) for shadow in shadows]
+        mask[chosen, ..., 2 * plane] = fluoroscope.device_mask(own) * np.uint8(255)
+        mask[chosen, ..., 2 * plane + 1] = fluoroscope.vessel_mask * np.uint8(255)
+    return mask
 
 
 def pixels(machines: Sequence[Planes], points: np.ndarray) -> np.ndarray:
@@ -146,19 +118,24 @@ def pixels(machines: Sequence[Planes], points: np.ndarray) -> np.ndarray:
     Points that no ray reaches, nearer to a source than its housing, are at -1.
     """
     places = np.empty((len(points), len(machines[0]), points.shape[1], 2))
-    for chosen in _alike(machines):
-        for plane, fluoroscope in enumerate(machines[chosen[0]]):
-            places[chosen, plane] = fluoroscope.carm.project(points[chosen])[0]
+    for plane, chosen, fluoroscope in _each(machines):
+        places[chosen, plane] = fluoroscope.carm.project(points[chosen])[0]
     return np.nan_to_num(places, copy=False, nan=-1.0)
 
 
-def _resolutions(machines: Sequence[Planes]) -> list[tuple[int, int]]:
-    return [plane.carm.resolution for plane in machines[0]]
+def _blank(machines: Sequence[Planes], channels: int) -> np.ndarray:
+    planes = machines[0]
+    shape = (len(machines), *planes[0].carm.resolution, channels * len(planes))
+    return np.empty(shape, np.uint8)
 
 
-def _alike(machines: Sequence[Planes]) -> list[np.ndarray]:
-    """Indices of devices before the same machine, in the order of the devices."""
+def _each(
+    machines: Sequence[Planes],
+) -> Iterator[tuple[int, np.ndarray, Fluoroscope]]:
+    """Number of a plane, indices of the devices before it, and its fluoroscope."""
     groups: dict[int, list[int]] = {}
     for index, planes in enumerate(machines):
         groups.setdefault(id(planes), []).append(index)
-    return [np.array(group) for group in groups.values()]
+    for plane in range(len(machines[0])):
+        for group in groups.values():
+            yield plane, np.array(group), machines[group[0]][plane]

@@ -11,7 +11,6 @@ AP image and the head is up.
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
-from types import MappingProxyType
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -20,14 +19,12 @@ from cathsim_dmc import bounds
 
 # Primary and secondary angle of the views used for the arch, degrees. Signs are those
 # of the DICOM positioner angles: LAO and cranial positive.
-VIEWS: Mapping[str, tuple[float, float]] = MappingProxyType(
-    {
-        "AP": (0.0, 0.0),
-        "LAO45": (45.0, 0.0),
-        "LATERAL": (90.0, 0.0),
-        "RAO30": (-30.0, 0.0),
-    }
-)
+VIEWS: Mapping[str, tuple[float, float]] = {
+    "AP": (0.0, 0.0),
+    "LAO45": (45.0, 0.0),
+    "LATERAL": (90.0, 0.0),
+    "RAO30": (-30.0, 0.0),
+}
 
 # Usual geometry of an angiography C-arm, m: source to isocentre is fixed by the
 # gantry (0.72-0.81), source to detector is adjustable (0.90-1.20).
@@ -39,7 +36,16 @@ RESOLUTION = (128, 128)  # the published image observation
 
 # Closer to the source than this (m) nothing is imaged: the tube housing is there.
 NEAREST = 0.05
-_STEEPEST = np.deg2rad(89.0)  # largest secondary angle
+# Least and largest value of each number, and its unit: wider than real systems, within
+# the computable.
+_BOUNDS = {
+    "primary": (-np.inf, np.inf, "rad"),
+    "secondary": (-np.deg2rad(89.0), np.deg2rad(89.0), "rad"),
+    "magnification": (0.01, 1000.0, ""),
+    "source_detector": (NEAREST, bounds.FAR, "m"),
+    "source_isocentre": (NEAREST, bounds.FAR, "m"),
+    "detector_size": (1e-3, bounds.FAR, "m"),
+}
 
 
 @dataclass(frozen=True)
@@ -69,28 +75,17 @@ class CArm:
 
     def __post_init__(self) -> None:
         checked = {
-            "primary": bounds.number("primary", self.primary, unit="rad"),
-            "secondary": bounds.number(
-                "secondary", self.secondary, -_STEEPEST, _STEEPEST, "rad"
-            ),
-            "source_detector": bounds.number(
-                "source_detector", self.source_detector, NEAREST, unit="m"
-            ),
-            "source_isocentre": bounds.number(
-                "source_isocentre", self.source_isocentre, NEAREST, unit="m"
-            ),
-            "resolution": bounds.pixels("resolution", self.resolution),
-            "isocentre": bounds.vector("isocentre", self.isocentre, 3, unit="m"),
+            name: bounds.number(name, getattr(self, name), *limits)
+            for name, limits in _BOUNDS.items()
         }
-        for name in ("magnification", "detector_size"):
-            checked[name] = bounds.number(name, getattr(self, name), positive=True)
         if checked["source_detector"] < checked["source_isocentre"]:
             raise ValueError(
                 f"source_detector is {self.source_detector} m and source_isocentre "
                 f"{self.source_isocentre} m; the detector must lie beyond the isocentre"
             )
-        for name, value in checked.items():
-            object.__setattr__(self, name, value)
+        isocentre = bounds.vector("isocentre", self.isocentre, 3, unit="m")
+        resolution = bounds.pixels("resolution", self.resolution)
+        vars(self).update(checked, isocentre=isocentre, resolution=resolution)
 
     @classmethod
     def view(cls, name: str = "AP", **fields) -> "CArm":
@@ -113,19 +108,13 @@ class CArm:
         """(3, 3) float64, rows: image right, image down, source to detector (world)."""
         ca, sa = np.cos(self.primary), np.sin(self.primary)
         cb, sb = np.cos(self.secondary), np.sin(self.secondary)
-        right = (ca, sa, 0.0)
-        down = (sb * sa, -sb * ca, -cb)
         beam = (cb * sa, -cb * ca, sb)
-        axes = np.array([right, down, beam])
-        axes.flags.writeable = False
-        return axes
+        return np.array([(ca, sa, 0.0), (sb * sa, -sb * ca, -cb), beam])
 
     @cached_property
     def source(self) -> np.ndarray:
         """(3,) float64, position of the X-ray focus, world frame, m."""
-        source = np.asarray(self.isocentre) - self.source_isocentre * self.axes[2]
-        source.flags.writeable = False
-        return source
+        return np.asarray(self.isocentre) - self.source_isocentre * self.axes[2]
 
     @property
     def pitch(self) -> float:
@@ -187,15 +176,8 @@ class CArm:
         Returns:
             (rows * supersample, columns * supersample) float64, >= 1.
         """
-        rows, columns = (_subpixels(n, supersample) for n in self.resolution)
-        return np.sqrt(
-            1.0
-            + ((columns / self.focal_length) ** 2)[None, :]
-            + ((rows / self.focal_length) ** 2)[:, None]
-        )
-
-
-def _subpixels(count: int, supersample: int) -> np.ndarray:
-    """Positions (px, from the image centre) of the ray grid along one side."""
-    step = np.arange(count * supersample) + 0.5
-    return step / supersample - 0.5 * count
+        across = []
+        for count in self.resolution:
+            place = (np.arange(count * supersample) + 0.5) / supersample - 0.5 * count
+            across.append((place / self.focal_length) ** 2)
+        return np.sqrt(1.0 + across[1] + across[0][:, None])

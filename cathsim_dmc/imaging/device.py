@@ -1,18 +1,34 @@
-"""Shadow of a slender device: path length or optical depth, frame by frame.
+"""Shadow of a slender device: its optical depth, frame by frame.
 
-A device is a polyline with a radius: a chain of capsules. Its shadow is drawn with
-sub-pixel accuracy even when it is thinner than a pixel, and keeps its weight: summed
-over the image, thickness times pixel area is the volume of the device, wherever it
-moves and however it turns.
+A device is a polyline with a radius: a chain of capsules whose axis is a smooth curve
+through the joints. Its shadow is drawn with sub-pixel accuracy even when it is thinner
+than a pixel, and keeps its weight: summed over the image, path length times pixel area
+is the volume of the device, wherever it moves and however it turns.
+
+The chord of a ray through a round rod, as a function of the ray's distance from the
+axis, is a half ellipse; a uniform disc swept along the projected axis leaves exactly
+that profile, whatever the direction. So the shadow of a device is a sum of discs,
+and what a pixel receives of a disc is the area the two share, which has a closed
+form: nothing is tabulated, and nothing is lost between pixels.
 """
 
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from cathsim_dmc.imaging import kernel, materials
-from cathsim_dmc.imaging.carm import CArm
+from cathsim_dmc.compiled import compiled
+from cathsim_dmc.imaging import materials
+from cathsim_dmc.imaging.carm import NEAREST, CArm
+
+# Distance of the discs along the projected axis, px. At this distance the ripple of
+# a rod thinner than a pixel stays below 0.5 % at every angle.
+_SPACING = 1.0 / 3.0
+# Discs may lie further apart on wide shadows: this fraction of their radius.
+_RELATIVE_SPACING = 0.1
+# Discs wider than this (px) are no device's, but one whose radius is in other units.
+_WIDEST = 128
 
 
 @dataclass(frozen=True, eq=False)
@@ -20,9 +36,11 @@ class Shadow:
     """A device, or one of several coaxial ones, in the beam.
 
     Attributes:
-        points: (..., n, 3) joints from base to tip, world frame, m.
-        radius: as in `device_thickness`.
-        mu: excess attenuation, homogenised over its cross-section, 1/m.
+        points: (..., n, 3) joints from base to tip, world frame, m, n >= 2.
+        radius: its radius, m: one number, one per device (...,), or one per link
+            (..., n - 1).
+        mu: excess attenuation, homogenised over its cross-section, 1/m; with 1, the
+            optical depth is the path length, m.
         marker_mu: that of the marker at its tip, 1/m; None for no marker.
         marker_length: of the marker, m, measured back from the tip.
     """
@@ -38,96 +56,254 @@ class Shadow:
         return replace(self, points=self.points[rows])
 
 
-def device_thickness(
-    carm: CArm,
-    points: ArrayLike,
-    radius: ArrayLike,
-) -> np.ndarray:
-    """Path length through a device, averaged over each pixel.
-
-    Args:
-        points: (..., n, 3) joints of the device from its base to its tip, world
-            frame, m, n >= 2.
-        radius: its radius, m: one number, one per device (...,), or one per link
-            (..., n - 1).
+def device_attenuation(carm: CArm, shadow: Shadow) -> np.ndarray:
+    """Optical depth of a device, averaged over each pixel.
 
     Returns:
-        (..., rows, columns) float32, m. Overlaps add up; the two ends of the chain
-        are round, drawn as a cylinder of the volume of a hemisphere. Links with a
-        joint that is not finite or not in front of the source are left out.
+        (..., rows, columns) float32, no unit. Overlaps add up; the two ends of the
+        chain are round, drawn as a cylinder of the volume of a hemisphere. Links with
+        a joint that is not finite or not in front of the source are left out.
 
     Raises:
         ValueError: if shapes do not match, a radius is not positive, or a shadow is
             wider than 256 pixels.
     """
-    return device_attenuation(carm, points, radius, mu=1.0)
-
-
-def device_attenuation(
-    carm: CArm,
-    points: ArrayLike,
-    radius: ArrayLike,
-    mu: float,
-    marker_mu: float | None = None,
-    marker_length: float = 0.0,
-) -> np.ndarray:
-    """Optical depth of a device with a marker at its tip, averaged over each pixel.
-
-    Args:
-        mu: attenuation of the device, homogenised over its cross-section, 1/m.
-        marker_mu: attenuation of the marker, 1/m; None for a device without one.
-        marker_length: length of the marker, m, measured back from the tip.
-
-    Returns:
-        (..., rows, columns) float32, no unit.
-
-    Raises:
-        ValueError: as in `device_thickness`.
-    """
-    points, radius, batch = _chain(points, radius)
-    if marker_mu is None:
-        marker_mu, marker_length = mu, 0.0
-    image = np.zeros((len(points), *carm.resolution), dtype=np.float32)
+    points = np.asarray(shadow.points, dtype=np.float64)
+    radius = np.asarray(shadow.radius, dtype=np.float64)
+    # Filled in, and not a broadcast view: what is compiled is compiled again for
+    # another kind of array.
+    radii = np.empty((*points.shape[:-2], points.shape[-2] - 1))
+    radii[...] = radius if radius.ndim == radii.ndim else radius[..., None]
+    if not (radii > 0.0).all():
+        raise ValueError(f"the smallest radius is {radii.min():g} m; it must be > 0.")
+    marker = shadow.mu, 0.0
+    if shadow.marker_mu is not None:
+        marker = shadow.marker_mu, shadow.marker_length
+    image = np.zeros((*points.shape[:-2], *carm.resolution), dtype=np.float32)
     with np.errstate(invalid="ignore"):  # joints that are not finite
         camera = carm.camera(points)
-    widest = kernel.add_devices(
-        image,
-        camera,
-        radius,
+    widest = _add_devices(
+        image.reshape(-1, *carm.resolution),
+        camera.reshape(-1, *points.shape[-2:]),
+        radii.reshape(-1, radii.shape[-1]),
         carm.focal_length,
-        float(mu),
-        float(marker_mu),
-        float(marker_length),
+        (float(shadow.mu), float(marker[0]), float(marker[1])),
     )
-    if widest > kernel.WIDEST:
+    if widest > _WIDEST:
         raise ValueError(
-            f"a shadow is {widest:.0f} px in radius; at most {kernel.WIDEST} can be "
+            f"a shadow is {widest:.0f} px in radius; at most {_WIDEST} can be "
             "drawn. Lower the resolution or magnification, or check the radius "
             "(metres)."
         )
-    return image.reshape(*batch, *carm.resolution)
+    return image
 
 
-def _chain(points: ArrayLike, radius: ArrayLike):
-    """Points (B, n, 3), radii (B, n - 1) and the batch shape."""
-    points = np.asarray(points, dtype=np.float64)
-    if points.ndim < 2 or points.shape[-1] != 3 or points.shape[-2] < 2:
-        raise ValueError(
-            f"points have shape {points.shape}; give (..., n, 3) with n >= 2."
-        )
-    batch, links = points.shape[:-2], points.shape[-2] - 1
-    radius = np.asarray(radius, dtype=np.float64)
-    per_link = radius.ndim == points.ndim - 1
-    # Filled in, and not a broadcast view: what is compiled is compiled again for
-    # another kind of array.
-    radii = np.empty((*batch, links))
-    try:
-        radii[...] = radius if per_link else radius[..., None]
-    except ValueError:
-        raise ValueError(
-            f"radius has shape {radius.shape}; for points {points.shape} give one "
-            f"number, {batch} or {(*batch, links)}."
-        ) from None
-    if not (radii > 0.0).all():
-        raise ValueError(f"the smallest radius is {radii.min():g} m; it must be > 0.")
-    return points.reshape(-1, links + 1, 3), radii.reshape(-1, links), batch
+@compiled
+def _left(t):
+    """Area of the unit disc on one side of a line, t in [-1, 1]."""
+    return 0.5 * math.pi + t * math.sqrt(1.0 - t * t) + math.asin(t)
+
+
+@compiled
+def _below_left(x, y, left, below):
+    if x * x + y * y < 1.0:
+        return 0.5 * (left + below) + x * y - 0.25 * math.pi
+    if x < 0.0:
+        return 0.0 if y < 0.0 else left
+    return below if y < 0.0 else left + below - math.pi
+
+
+@compiled
+def add_disc(image, row, column, radius, weight, scratch):
+    """Spreads a weight over the pixels that a disc covers, by the area they share.
+
+    Args:
+        image: (rows, columns), added to in place; what falls beside it is left out.
+        row, column: centre of the disc, px.
+        radius: of the disc, px, > 0.
+        weight: of the whole disc.
+        scratch: (3, columns of the disc or more), overwritten.
+    """
+    rows, columns = image.shape
+    # Pixel k spans [k - 1/2, k + 1/2].
+    top, bottom = math.floor(row - radius + 0.5), math.floor(row + radius + 0.5)
+    first, last = math.floor(column - radius + 0.5), math.floor(column + radius + 0.5)
+    if bottom < 0 or last < 0 or top >= rows or first >= columns:
+        return
+    weight /= math.pi
+    # Area above the lower edge of a row of pixels, column edge by column edge, is the
+    # area above its upper edge and what the row adds.
+    width = int(last - first) + 1
+    edges, lefts, above = scratch[0], scratch[1], scratch[2]
+    for j in range(width):
+        above[j] = 0.0
+        edges[j] = min((first + j + 0.5 - column) / radius, 1.0)
+        lefts[j] = _left(edges[j])
+    for i in range(int(top), int(bottom) + 1):
+        y = min((i + 0.5 - row) / radius, 1.0)
+        below = _left(y)
+        before = 0.0
+        for j in range(width):
+            corner = _below_left(edges[j], y, lefts[j], below)
+            added = corner - above[j]
+            above[j] = corner
+            share = added - before
+            before = added
+            k = int(first) + j
+            if share > 0.0 and 0 <= i < rows and 0 <= k < columns:
+                image[i, k] += weight * share
+
+
+@compiled
+def _chord(joints, link):
+    """A link from its proximal to its distal joint, and its length."""
+    x = joints[link + 1, 0] - joints[link, 0]
+    y = joints[link + 1, 1] - joints[link, 1]
+    z = joints[link + 1, 2] - joints[link, 2]
+    return x, y, z, math.sqrt(x * x + y * y + z * z)
+
+
+@compiled
+def _turn(joints, link, other):
+    """Tangent less chord of a link where it meets another, times its length.
+
+    The tangent is that of the parabola through the three joints; zero if the other
+    link is none, has no length or is not finite.
+    """
+    if 0 <= other < len(joints) - 1:
+        x, y, z, length = _chord(joints, link)
+        u, v, w, beside = _chord(joints, other)
+        if 0.0 < beside < math.inf:
+            share, ratio = length / (length + beside), length / beside
+            u, v, w = u * ratio - x, v * ratio - y, w * ratio - z
+            return share * u, share * v, share * w
+    return 0.0, 0.0, 0.0
+
+
+@compiled
+def _bends(joints, link):
+    """Turns of a link's curve at its two ends, of a parabola where one end is free."""
+    a, b, c = _turn(joints, link, link - 1)
+    d, e, f = _turn(joints, link, link + 1)
+    if a == b == c == 0.0:
+        a, b, c = -d, -e, -f
+    elif d == e == f == 0.0:
+        d, e, f = -a, -b, -c
+    return a, b, c, d, e, f
+
+
+@compiled
+def curve(joints, pieces):
+    """Smooth curve ((n - 1) * pieces + 1, 3) through joints, a cubic on each link.
+
+    Args:
+        joints: (n, 3), finite and apart.
+        pieces: of each link.
+    """
+    points = np.empty(((len(joints) - 1) * pieces + 1, 3))
+    points[-1] = joints[-1]
+    for link in range(len(joints) - 1):
+        a, b, c, d, e, f = _bends(joints, link)
+        x, y, z, _ = _chord(joints, link)
+        for piece in range(pieces):
+            t = piece / pieces
+            row = points[link * pieces + piece]
+            sag = t * (1.0 - t)
+            behind, before = sag * (1.0 - t), sag * t
+            row[0] = joints[link, 0] + t * x + behind * a - before * d
+            row[1] = joints[link, 1] + t * y + behind * b - before * e
+            row[2] = joints[link, 2] + t * z + behind * c - before * f
+    return points
+
+
+@compiled
+def _add_devices(images, cameras, radii, focal, material):
+    """Adds the optical depth of devices to images, each frame on its own.
+
+    Args:
+        images: (B, rows, columns), added to in place.
+        cameras: (B, n, 3), joints in camera coordinates (`CArm.camera`), m.
+        radii: (B, n - 1), of each link, m.
+        focal: distance of source and detector, px.
+        material: attenuation of device and marker, 1/m, and length of the marker, m.
+
+    Returns:
+        Radius of the widest shadow in view, px; those above `_WIDEST` are not drawn.
+    """
+    widest = 0.0
+    scratch = np.empty((3, 2 * _WIDEST + 2))
+    for frame in range(len(images)):
+        image, camera, radius = images[frame], cameras[frame], radii[frame]
+        to_tip = 0.0  # arc length from the tip, m
+        for link in range(len(radius) - 1, -1, -1):
+            length, wide = _add_link(
+                image, camera, link, radius, focal, material, to_tip, scratch
+            )
+            to_tip += length
+            widest = max(widest, wide)
+    return widest
+
+
+@compiled
+def _add_link(image, camera, link, radii, focal, material, to_tip, scratch):
+    """Adds one link whose distal end is `to_tip` from the tip.
+
+    Returns:
+        its length, m, and the radius of its shadow, px, 0 if it is not in view.
+    """
+    rows, columns = image.shape
+    radius = radii[link]
+    x0, y0, z0 = camera[link]
+    dx, dy, dz, length = _chord(camera, link)
+    # A link that is not finite cannot be drawn; one without length has no direction.
+    if not 0.0 < length < math.inf:
+        return 0.0, 0.0
+    # The two ends are lengthened by 2/3 radius: the volume of a hemispherical cap.
+    cap = 2.0 / 3.0 * radius / length
+    back = cap if link == 0 else 0.0
+    ahead = cap if link == len(radii) - 1 else 0.0
+    x0, y0, z0 = x0 - back * dx, y0 - back * dy, z0 - back * dz
+    stretch = 1.0 + back + ahead
+    dx, dy, dz, length = dx * stretch, dy * stretch, dz * stretch, length * stretch
+    nearest = min(z0, z0 + dz)
+    if not nearest > NEAREST:
+        return length, 0.0
+    # Ends in pixels from the middle of the image.
+    wide = radius * focal / nearest
+    u0, v0 = x0 * focal / z0, y0 * focal / z0
+    u1, v1 = (x0 + dx) * focal / (z0 + dz), (y0 + dy) * focal / (z0 + dz)
+    broad, high = 0.5 * columns + wide, 0.5 * rows + wide
+    beside = min(u0, u1) >= broad or max(u0, u1) <= -broad
+    if beside or min(v0, v1) >= high or max(v0, v1) <= -high:
+        return length, 0.0
+    if wide > _WIDEST:
+        return length, wide
+    spacing = max(_SPACING, _RELATIVE_SPACING * wide)
+    # A link that runs far out of the image must not take for ever.
+    most = 4.0 * (rows + columns) / _SPACING
+    count = int(min(max(math.ceil(math.hypot(u1 - u0, v1 - v0) / spacing), 1.0), most))
+    piece = length / count
+    mu, marker_mu, marker_length = material
+    a, b, _, d, e, _ = _bends(camera, link)
+    for step in range(count):
+        fraction = (step + 0.5) / count
+        weight = mu
+        if marker_length > 0.0:
+            distal = to_tip + (1.0 - fraction) * length
+            inside = min(max((marker_length - distal) / piece + 0.5, 0.0), 1.0)
+            weight += (marker_mu - mu) * inside
+        # Of the link without its round ends, which are straight.
+        t = min(max(fraction * stretch - back, 0.0), 1.0)
+        sag = t * (1.0 - t)
+        behind, before = sag * (1.0 - t), sag * t
+        x = x0 + fraction * dx + behind * a - before * d
+        y = y0 + fraction * dy + behind * b - before * e
+        z = z0 + fraction * dz  # a bend hardly changes the magnification
+        # A pixel sees, at this depth, an area (depth / focal)² across the beam axis
+        # and 1 / slant of that across its ray; volume over area is the mean path.
+        scale = focal / z
+        slant = math.sqrt(x * x + y * y + z * z) / z
+        weight *= math.pi * radius**2 * piece * slant * scale**2
+        row, column = y * scale + 0.5 * (rows - 1), x * scale + 0.5 * (columns - 1)
+        add_disc(image, row, column, radius * scale, weight, scratch)
+    return length, wide

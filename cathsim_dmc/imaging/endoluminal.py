@@ -59,33 +59,31 @@ def views(
     rows = zip(lumens, warps, heads, frames, grey, distance, strict=True)
     for lumen, warp, head, frame, levels, lengths in rows:
         axes = np.ascontiguousarray(frame)
-        _trace(*lumen.arrays, *warp, head, axes, focal, levels, lengths)
+        _trace(lumen.arrays, *warp, head, axes, focal, levels, lengths)
     return grey[..., None], distance[..., None]
 
 
 @compiled
-def _clear(head, coarse, index, samples, lattice, course, x, y, z, values):
+def _clear(lumen, lattice, course, x, y, z, values):
     """Depth (m) of a place in space; in a vessel that moves, within its stretch."""
     growth = 0.0
     if len(lattice):
         there = values[8:].reshape(-1)
         motion_loops.warp(lattice, course, x, y, z, values, there)
         x, y, z, growth = there[0], there[1], there[2], there[12]
-    level = behind(head, x, y, z)
-    if level > 0.0:
-        return -level
-    return depth_at(head, coarse, index, samples, x, y, z) + growth
+    level = behind(lumen[0], x, y, z)
+    return -level if level > 0.0 else depth_at(*lumen, x, y, z) + growth
 
 
 @compiled
-def _met(head, coarse, index, samples, lattice, course, eye, x, y, z, values):
+def _met(lumen, lattice, course, eye, x, y, z, values):
     """Way (m) of a ray from an eye (3) along a unit vector to the wall."""
     # A displacement that stretches space makes distances in it shorter.
     stride = 1.0 / (1.0 + STEEPEST) if len(lattice) else 1.0
     t, step, before = 0.0, 0.0, 0.0
     for _ in range(_MOST_STEPS):
         a, b, c = eye[0] + t * x, eye[1] + t * y, eye[2] + t * z
-        depth = _clear(head, coarse, index, samples, lattice, course, a, b, c, values)
+        depth = _clear(lumen, lattice, course, a, b, c, values)
         if abs(depth) < _CLOSE or t == FARTHEST_WALL:
             break
         ahead = stride * depth
@@ -98,11 +96,10 @@ def _met(head, coarse, index, samples, lattice, course, eye, x, y, z, values):
 
 
 @compiled
-def _trace(
-    head, coarse, index, samples, lattice, parameters, time, eye, axes, focal, grey, far
-):
+def _trace(lumen, lattice, parameters, time, eye, axes, focal, grey, far):
     """Writes grey levels and distances (rows, columns) of the view of one camera."""
-    values, slope = np.empty((8 + motion_loops.WARP // 4, 4)), np.empty(3)
+    values = np.empty((8 + motion_loops.WARP // 4, 4))
+    slope, place = np.empty(3), np.empty(3)
     course = motion_loops.courses(parameters, time)
     rows, columns = far.shape
     for i in range(rows):
@@ -113,23 +110,16 @@ def _trace(
             x = (axes[0, 0] * u + axes[0, 1] * v + axes[0, 2]) / norm
             y = (axes[1, 0] * u + axes[1, 1] * v + axes[1, 2]) / norm
             z = (axes[2, 0] * u + axes[2, 1] * v + axes[2, 2]) / norm
-            t = _met(
-                head, coarse, index, samples, lattice, course, eye, x, y, z, values
-            )
+            t = _met(lumen, lattice, course, eye, x, y, z, values)
             far[i, j] = t
             for k in range(3):
                 slope[k] = 0.0
                 for side in (-_STEP, _STEP):
-                    a, b, c = eye[0] + t * x, eye[1] + t * y, eye[2] + t * z
-                    if k == 0:
-                        a += side
-                    elif k == 1:
-                        b += side
-                    else:
-                        c += side
-                    slope[k] += side * _clear(
-                        head, coarse, index, samples, lattice, course, a, b, c, values
-                    )
+                    place[0], place[1] = eye[0] + t * x, eye[1] + t * y
+                    place[2] = eye[2] + t * z
+                    place[k] += side
+                    a, b, c = place
+                    slope[k] += side * _clear(lumen, lattice, course, a, b, c, values)
             size = math.sqrt(slope[0] ** 2 + slope[1] ** 2 + slope[2] ** 2)
             facing = -(slope[0] * x + slope[1] * y + slope[2] * z)
             cosine = facing / size if size > 0.0 else 0.0

@@ -9,12 +9,11 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from cathsim_dmc.anatomy.parts import Surface
 from cathsim_dmc.imaging import detector, materials
 from cathsim_dmc.imaging.carm import CArm
-from cathsim_dmc.imaging.device import Shadow, device_attenuation, device_thickness
+from cathsim_dmc.imaging.device import Shadow, device_attenuation
 from cathsim_dmc.imaging.thickness import surface_thickness
 
 # A pixel shows the device if the path through it is at least this share of its
@@ -60,31 +59,16 @@ class Fluoroscope:
     roadmap: float = 0.0
 
     def __post_init__(self) -> None:
-        shape = self.carm.resolution
-        for name, dtype in (("vessel", np.float32), ("vessel_mask", bool)):
-            value = np.array(getattr(self, name), dtype=dtype)
-            if value.shape != shape:
-                raise ValueError(
-                    f"{name} has shape {value.shape}, the C-arm {shape}; compute it "
-                    "with the same C-arm (Fluoroscope.from_surface)."
-                )
-            value.flags.writeable = False
-            object.__setattr__(self, name, value)
+        vars(self).update(vessel=np.asarray(self.vessel, np.float32))
 
     @classmethod
     def from_surface(
-        cls,
-        vertices: ArrayLike,
-        faces: ArrayLike,
-        carm: CArm | None = None,
-        supersample: int = 3,
-        **fields,
+        cls, surface: Surface, carm: CArm | None = None, supersample: int = 3, **fields
     ) -> "Fluoroscope":
-        """Fluoroscope of a lumen surface: the static part, once per anatomy and view.
+        """Fluoroscope of a lumen: the static part, once per anatomy and view.
 
         Args:
-            vertices: (V, 3) of the lumen surface, world frame, m.
-            faces: (F, 3), counter-clockwise seen from outside, without open ends.
+            surface: of the lumen, world frame, m, without open ends.
             carm: the view; by default AP with the isocentre in the middle of the
                 surface.
             supersample: rays along each side of a pixel.
@@ -94,41 +78,37 @@ class Fluoroscope:
             ValueError: if the surface is not oriented outwards, or reaches the source.
         """
         if carm is None:
-            carm = CArm.view("AP").centred_on(vertices)
-        paths = _paths(carm, vertices, faces, supersample)
-        return cls(carm, *paths, **fields)
+            carm = CArm.view("AP").centred_on(surface.vertices)
+        central = surface_thickness(carm, surface, 1)
+        path = surface_thickness(carm, surface, supersample)
+        return cls(carm, path, central > 0.0, **fields)
 
-    def around(self, surface: Surface, supersample: int = 3) -> "Fluoroscope":
+    def around(self, surface: Surface) -> "Fluoroscope":
         """The same view of a lumen whose surface has moved."""
-        paths = _paths(self.carm, surface.vertices, surface.faces, supersample)
-        return replace(self, vessel=paths[0], vessel_mask=paths[1])
+        moved = Fluoroscope.from_surface(surface, self.carm)
+        return replace(self, vessel=moved.vessel, vessel_mask=moved.vessel_mask)
 
     @cached_property
     def signal(self) -> np.ndarray:
         """(rows, columns) float32, signal behind patient and vessel, no device."""
-        vessel = materials.IODINE * self.contrast * self.vessel
-        signal = detector.transmission(vessel)
-        signal.flags.writeable = False
-        return signal
+        # Beer-Lambert: the share of quanta that pass.
+        return np.exp(-materials.IODINE * self.contrast * self.vessel)
 
     @property
     def quanta(self) -> float:
         """Mean number of quanta on a pixel behind plain tissue in one frame."""
-        return detector.quanta_per_pixel(self.carm.pitch, self.kerma)
+        return detector.QUANTA_PER_KERMA * self.kerma * self.carm.pitch**2
 
     def render(
-        self,
-        points: ArrayLike,
-        radius: ArrayLike,
-        random_state: RandomStates | None = None,
+        self, shadows: Sequence[Shadow], random_states: RandomStates | None = None
     ) -> np.ndarray:
-        """Images of a device in the vessel.
+        """Images of devices in the vessel, whose optical depths add up.
 
         Args:
-            points: (..., n, 3) joints of the device from base to tip, world frame, m.
-            radius: m, one number, one per device (...,), or per link (..., n - 1).
-            random_state: source of quantum noise: one state, or one per frame in the
-                order of the flattened batch; None for an image without noise.
+            shadows: of one device, or of several in each other, with the same leading
+                axes.
+            random_states: source of quantum noise: one state, or one per frame in the
+                order of the flattened batch; None for images without noise.
 
         Returns:
             (..., rows, columns, 1) uint8, dark = opaque. A batch equals its frames
@@ -137,80 +117,47 @@ class Fluoroscope:
         Raises:
             ValueError: if shapes do not match (see `device_attenuation`).
         """
-        return self.image([Shadow(np.asarray(points), radius)], random_state)
-
-    def image(
-        self, shadows: Sequence[Shadow], random_state: RandomStates | None = None
-    ) -> np.ndarray:
-        """Images of devices in the vessel, whose optical depths add up.
-
-        Args:
-            shadows: of one device, or of several in each other, with the same leading
-                axes.
-
-        Returns:
-            (..., rows, columns, 1) uint8, as `render`.
-        """
-        depth = self._depth(shadows[0])
+        depth = device_attenuation(self.carm, shadows[0])
         for shadow in shadows[1:]:
-            depth += self._depth(shadow)
-        batch, shape = depth.shape[:-2], self.carm.resolution
-        depth = depth.reshape(-1, *shape)
-        states = random_state
-        if states is not None and not isinstance(states, np.random.RandomState):
-            states = list(states)
-            if len(states) != len(depth):
-                raise ValueError(
-                    f"{len(states)} random states for {len(depth)} frames; give "
-                    "one, or one per frame."
-                )
-        image = np.empty(depth.shape, dtype=np.uint8)
-        for start in range(0, len(depth), _CHUNK):
+            depth += device_attenuation(self.carm, shadow)
+        frames = depth.reshape(-1, *self.carm.resolution)
+        states = random_states
+        if isinstance(states, np.random.RandomState):
+            states = [states] * len(frames)
+        if states is not None and len(states) != len(frames):
+            raise ValueError(
+                f"{len(states)} random states for {len(frames)} frames; give one, or "
+                "one per frame."
+            )
+        image = np.empty(frames.shape, dtype=np.uint8)
+        for start in range(0, len(frames), _CHUNK):
             part = slice(start, start + _CHUNK)
-            of_part = states[part] if isinstance(states, list) else states
-            image[part] = self._developed(depth[part], of_part)
-        return image.reshape(*batch, *shape, 1)
-
-    def _depth(self, shadow: Shadow) -> np.ndarray:
-        """Optical depth (..., rows, columns) of a device."""
-        points = np.asarray(shadow.points, dtype=np.float64)
-        material = shadow.mu, shadow.marker_mu, shadow.marker_length
-        return device_attenuation(self.carm, points, shadow.radius, *material)
-
-    def _developed(self, depth: np.ndarray, states) -> np.ndarray:
-        """Grey images of optical depths (B, rows, columns); `depth` is used up."""
-        np.negative(depth, out=depth)
-        signal = np.exp(depth, out=depth)
-        signal *= self.signal
-        if states is not None:
-            signal = detector.quantum_noise(signal, self.quanta, states)
-        signal = detector.blurred(signal, self.blur / self.carm.pitch)
-        if self.roadmap > 0.0:
-            signal = signal * self._roadmap_gain
-        return detector.grey(signal, self.gain)
+            signal = np.exp(-frames[part]) * self.signal
+            if states is not None:
+                signal = detector.quantum_noise(signal, self.quanta, states[part])
+            signal = detector.blurred(signal, self.blur / self.carm.pitch)
+            if self.roadmap > 0.0:
+                signal = signal * self._roadmap_gain
+            image[part] = detector.grey(signal, self.gain)
+        return image.reshape(*depth.shape, 1)
 
     @cached_property
     def _roadmap_gain(self) -> np.ndarray:
-        return detector.roadmap_gain(self.vessel_mask, self.roadmap, self.gain)
+        # A factor, not a blend, so that a device in the vessel keeps its contrast.
+        white = 1.0 + self.roadmap * (1.0 / self.gain - 1.0)
+        return np.where(self.vessel_mask, white, 1.0).astype(np.float32)
 
     def device_mask(self, shadows: Sequence[Shadow]) -> np.ndarray:
         """Pixels (..., rows, columns) bool that show one of several devices."""
         return np.any([self._shows(shadow) for shadow in shadows], axis=0)
 
     def _shows(self, shadow: Shadow) -> np.ndarray:
-        thickness = device_thickness(self.carm, shadow.points, shadow.radius)
+        plain = replace(shadow, mu=1.0, marker_mu=None)
         radii = np.asarray(shadow.radius, dtype=np.float64)
         if radii.ndim == np.ndim(shadow.points) - 1:
             # A chain of unlike links is seen where its thinnest link would be.
             radii = np.asarray(radii.min(axis=-1))
         arm, diameter = self.carm, 2.0 * radii[..., None, None]
         width = diameter * arm.focal_length / arm.source_isocentre
-        return thickness >= MASK_SHARE * diameter * np.minimum(width, 1.0)
-
-
-def _paths(
-    carm: CArm, vertices: ArrayLike, faces: ArrayLike, supersample: int
-) -> tuple[np.ndarray, np.ndarray]:
-    """Path length through the lumen, and pixels whose central ray meets it."""
-    central = surface_thickness(carm, vertices, faces, 1)
-    return surface_thickness(carm, vertices, faces, supersample), central > 0.0
+        least = MASK_SHARE * diameter * np.minimum(width, 1.0)
+        return device_attenuation(arm, plain) >= least

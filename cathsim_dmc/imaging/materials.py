@@ -12,9 +12,6 @@ Whatever lies in the patient takes the place of as much water (tissue), so vesse
 and device count with their *excess* over water: `mu - WATER`.
 """
 
-import numpy as np
-from numpy.typing import ArrayLike
-
 # Water and soft tissue, 1/m: 2.059e-2 m²/kg x 1000 kg/m³.
 WATER = 20.6
 
@@ -33,40 +30,16 @@ PLATINUM = 9310.0  # 90/10 platinum-iridium, 21550 kg/m³
 # radio-opaque tubing (20-60 %): density 1576 kg/m³, 0.4 x 0.512 + 0.6 x 0.0195 m²/kg.
 BARIUM_POLYMER = 341.0
 
-
-def homogenised(mu: ArrayLike, fraction: ArrayLike) -> np.ndarray:
-    """Excess attenuation (1/m) of a cross-section of which a fraction is material.
-
-    Args:
-        mu: (k,) linear attenuation of the constituents, 1/m.
-        fraction: (k,) their shares of the area, whose sum is at most 1; the rest
-            counts as water (a saline-filled lumen).
-
-    Returns:
-        Scalar float64, 1/m, the mean excess over water of the full cross-section.
-
-    Raises:
-        ValueError: if a share is negative or the sum exceeds one.
-    """
-    mu, fraction = np.broadcast_arrays(
-        np.asarray(mu, dtype=np.float64), np.asarray(fraction, dtype=np.float64)
-    )
-    if (fraction < 0.0).any() or fraction.sum(axis=-1).max() > 1.0 + 1e-9:
-        raise ValueError(
-            f"area fractions are {fraction.tolist()}; give shares >= 0 with sum <= 1."
-        )
-    return ((mu - WATER) * fraction).sum(axis=-1)
-
-
 # A 5F braided catheter (outer 1.67 mm, lumen 1.17 mm = 0.046 in): the polymer fills
 # 0.49 of the cross-section and a braid of sixteen 0.025 x 0.1 mm steel wires 0.018.
-CATHETER = float(homogenised([BARIUM_POLYMER, STEEL], [0.49, 0.018]))
+# The rest of it counts as water (a saline-filled lumen).
+CATHETER = 0.49 * (BARIUM_POLYMER - WATER) + 0.018 * (STEEL - WATER)
 
 # Solid wires, and a platinum marker band 0.05 mm thick round a 5F tube: 4 x 0.05 / 1.67
 # of the area, with the catheter wall under it.
 STEEL_WIRE = STEEL - WATER
 NITINOL_WIRE = NITINOL - WATER
-MARKER = float(homogenised([PLATINUM, BARIUM_POLYMER], [0.116, 0.39]))
+MARKER = 0.116 * (PLATINUM - WATER) + 0.39 * (BARIUM_POLYMER - WATER)
 
 # Length of a marker band, m: bands are sold in lengths of 1-2 mm.
 MARKER_LENGTH = 2.0e-3

@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Circle
 
 from cathsim_dmc.imaging import FluoroscopyOptions
-from cathsim_dmc.imaging.kernel import curve
+from cathsim_dmc.imaging.device import curve
 from cathsim_dmc.pictures.moment import Moment, fluoroscope_of, xray
 from cathsim_dmc.pictures.translucent import Glass, ParallelProjection, glass
 from cathsim_dmc.recording.geometry import force_colours, force_text

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from cathsim_dmc.imaging import Angiograph, FluoroscopyOptions
+from cathsim_dmc.imaging import Angiograph, FluoroscopyOptions, Shadow
 from cathsim_dmc.recording.coaxial import CoaxialRecord
 from cathsim_dmc.recording.episode import Episode
 from cathsim_dmc.recording.geometry import force_scale
@@ -116,7 +116,7 @@ class Moment:
 @functools.lru_cache(maxsize=8)  # each holds some megabytes
 def fluoroscope_of(surface: Any, options: FluoroscopyOptions) -> Any:
     """The frontal plane of an angiography machine before a surface."""
-    return Angiograph(surface.vertices, surface.faces, options).planes()[0]
+    return Angiograph(surface, options).planes()[0]
 
 
 def xray(moment: Moment, options: FluoroscopyOptions, seed: int = 0) -> np.ndarray:
@@ -129,4 +129,4 @@ def xray(moment: Moment, options: FluoroscopyOptions, seed: int = 0) -> np.ndarr
     fluoroscope = fluoroscope_of(moment.rest, options)
     if moment.surface is not moment.rest:
         fluoroscope = fluoroscope.around(moment.surface)
-    return fluoroscope.render(moment.device, moment.radius, state)[..., 0]
+    return fluoroscope.render([Shadow(moment.device, moment.radius)], state)[..., 0]

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from cathsim_dmc import policies
-from cathsim_dmc.imaging import Angiograph, FluoroscopyOptions
+from cathsim_dmc.imaging import Angiograph, FluoroscopyOptions, Shadow
 from cathsim_dmc.recording.episode import Episode
 from cathsim_dmc.recording.living import MESH_EVERY, VesselRecord
 from cathsim_dmc.recording.recorder import EpisodeRecorder, navigation_of
@@ -148,14 +148,14 @@ def xray_film(
     record, states, films = VesselRecord.of(episode), episode.steps + 1, []
     moved = None if record is None or record.still else record
     span = MESH_EVERY if moved else states
-    for plane in Angiograph(surface.vertices, surface.faces, options).planes():
+    for plane in Angiograph(surface, options).planes():
         film = np.empty((states, *plane.carm.resolution, 1), np.uint8)
         for first in range(0, states, span):
             line = episode.catheter[first : first + span]
             radius = np.broadcast_to(episode.radii, (len(line), len(episode.radii)))
             if moved:
                 plane = plane.around(moved.surface(surface, episode, first))
-            film[first : first + span] = plane.render(line, radius)
+            film[first : first + span] = plane.render([Shadow(line, radius)])
         darkest, brightest = int(film.min()), int(film.max())
         levels = 255 * (np.arange(256.0) - darkest) / max(brightest - darkest, 1)
         films.append(np.clip(levels, 0, 255).round().astype(np.uint8)[film])

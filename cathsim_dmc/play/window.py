@@ -125,7 +125,7 @@ def _planes(task: Any) -> angiograph.Planes:
     factor = max(1, round(SIZE / max(rows, columns)))
     options = dataclasses.replace(options, size=(rows * factor, columns * factor))
     surface = task.scene.anatomy.surface
-    return angiograph.Angiograph(surface.vertices, surface.faces, options).planes()
+    return angiograph.Angiograph(surface, options).planes()
 
 
 def _name(keysym: str) -> str:

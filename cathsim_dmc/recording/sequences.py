@@ -218,7 +218,7 @@ class Camera:
         surface = anatomy.surface
         if warp is not None:
             surface = anatomy.motion.surface(*warp, surface)
-        depth = surface_thickness(self.arm, surface.vertices, surface.faces, 1)
+        depth = surface_thickness(self.arm, surface, 1)
         return Fluoroscope(
             self.arm, depth, depth > 0.0, self.iodine, kerma=self.kerma, gain=self.gain
         )
@@ -252,7 +252,7 @@ def frames_of(
                     dataclasses.replace(each, points=each.points[rows, motion])
                     for each in states.shadows
                 ]
-                image[rows] = view.image(own, random)[..., 0]
+                image[rows] = view.render(own, random)[..., 0]
                 mask[rows] = DEVICE * view.device_mask(own)
                 mask[rows] |= VESSEL * view.vessel_mask.astype(np.uint8)
                 if warp is not None:

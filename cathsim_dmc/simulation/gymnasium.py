@@ -163,9 +163,8 @@ class CathSimEnv(gymnasium.Env):
         task = self.environment.task
         surface = task.scene.anatomy.surface
         if surface not in self._machines:
-            self._machines[surface] = angiograph.Angiograph(
-                surface.vertices, surface.faces, task.config.fluoroscopy
-            )
+            machine = angiograph.Angiograph(surface, task.config.fluoroscopy)
+            self._machines[surface] = machine
         return self._machines[surface]
 
     def close(self) -> None:

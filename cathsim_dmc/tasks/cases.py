@@ -73,8 +73,7 @@ class Case:
         """The angiography machine before this anatomy; None where there is none."""
         if self._fluoroscopy is None:
             return None
-        surface = self.scene.anatomy.surface
-        return Angiograph(surface.vertices, surface.faces, self._fluoroscopy)
+        return Angiograph(self.scene.anatomy.surface, self._fluoroscopy)
 
 
 def model_index(scene: Scene, model: mujoco.MjModel) -> ModelIndex:

@@ -1,7 +1,7 @@
 /**
  * Fluoroscopy of a device, as `cathsim_dmc.imaging` draws it: the signal behind patient
  * and vessel is given, the shadow of the device is laid over it. See the Python package
- * for the derivation (imaging/kernel.py, imaging/fluoroscopy.py).
+ * for the derivation (imaging/device.py, imaging/fluoroscopy.py).
  */
 
 const SPACING = 1 / 3; // of the discs along a link, px

@@ -183,7 +183,7 @@ def write_scene(name: str, out: Path) -> None:
 def _fluoroscopy(surface, out: Path) -> dict:
     """Geometry of the AP view, and the signal behind patient and vessel."""
     options = FLUOROSCOPY
-    plane = Angiograph(surface.vertices, surface.faces, options).planes()[0]
+    plane = Angiograph(surface, options).planes()[0]
     arm = plane.carm
     plane.signal.astype("<f4").tofile(out / "signal.bin")
     rows, columns = arm.resolution

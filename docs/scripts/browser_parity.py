@@ -27,7 +27,7 @@ import mujoco
 
 from cathsim_dmc import suite
 from cathsim_dmc.agents import load_policy
-from cathsim_dmc.imaging.angiograph import Angiograph
+from cathsim_dmc.imaging import Angiograph, Shadow
 from cathsim_dmc.pictures.figure import Picture
 from cathsim_dmc.pictures.recorded import as_function
 from cathsim_dmc.style import COLOURS, tidy
@@ -124,8 +124,9 @@ def replay(scene: Path, actions: list) -> dict[str, np.ndarray]:
 def drawn(line: list) -> np.ndarray:
     """The fluoroscopy of a device by the package, as the page draws it."""
     surface = suite.make_task(TASK).scene.anatomy.surface
-    plane = Angiograph(surface.vertices, surface.faces, browser.FLUOROSCOPY).planes()[0]
-    return plane.render(np.array(line), browser.DEVICE_RADIUS)[..., 0].astype(int)
+    plane = Angiograph(surface, browser.FLUOROSCOPY).planes()[0]
+    shadow = Shadow(np.array(line), browser.DEVICE_RADIUS)
+    return plane.render([shadow])[..., 0].astype(int)
 
 
 def row(each: dict) -> dict:

@@ -60,7 +60,7 @@ def main() -> None:
     )
     for number, (title, options) in enumerate(ROWS.items()):
         row = axes[number]
-        planes = Angiograph(surface.vertices, surface.faces, options).planes()
+        planes = Angiograph(surface, options).planes()
         carm = planes[0].carm
         goal, depth = carm.project(task.goal_position)
         radius = task.objective.goal_radius * carm.focal_length / depth

@@ -44,35 +44,28 @@ def catheter(tree, goal: str = "lcca", depth: float = 0.03) -> np.ndarray:
 def views(tree, surface) -> dict[str, np.ndarray]:
     """Images by title, (rows, columns) or (rows, columns, 3) uint8."""
     points = catheter(tree)
+    device = [Shadow(points, CATHETER_RADIUS)]
     images = {}
     for name in VIEWS:
         carm = CArm.view(name, detector_size=DETECTOR_SIZE).centred_on(surface.vertices)
-        scope = Fluoroscope.from_surface(surface.vertices, surface.faces, carm)
-        images[name] = scope.render(points, CATHETER_RADIUS, np.random.RandomState(0))
+        scope = Fluoroscope.from_surface(surface, carm)
+        images[name] = scope.render(device, np.random.RandomState(0))
 
     carm = CArm.view("LAO45", detector_size=DETECTOR_SIZE).centred_on(surface.vertices)
-    scope = Fluoroscope.from_surface(surface.vertices, surface.faces, carm)
+    scope = Fluoroscope.from_surface(surface, carm)
     live = replace(scope, contrast=0.0)
     road = replace(live, roadmap=0.7)
-    images["LAO45, contrast off"] = live.render(
-        points, CATHETER_RADIUS, np.random.RandomState(1)
-    )
-    images["LAO45, roadmap"] = road.render(
-        points, CATHETER_RADIUS, np.random.RandomState(2)
-    )
-    coloured = live.render(points, CATHETER_RADIUS).repeat(3, axis=-1) // 2 + 100
+    images["LAO45, contrast off"] = live.render(device, np.random.RandomState(1))
+    images["LAO45, roadmap"] = road.render(device, np.random.RandomState(2))
+    coloured = live.render(device).repeat(3, axis=-1) // 2 + 100
     coloured[scope.vessel_mask] = (140, 170, 220)
-    coloured[scope.device_mask([Shadow(points, CATHETER_RADIUS)])] = (200, 30, 30)
+    coloured[scope.device_mask(device)] = (200, 30, 30)
     images["LAO45, masks"] = coloured
 
     close = CArm.view("LAO45", magnification=2.5, resolution=(512, 512))
     close = replace(close, isocentre=tuple(points[-5]))
-    scope = Fluoroscope.from_surface(
-        surface.vertices, surface.faces, close, kerma=100e-9
-    )
-    images["LAO45, 2.5x, 512 x 512"] = scope.render(
-        points, CATHETER_RADIUS, np.random.RandomState(3)
-    )
+    scope = Fluoroscope.from_surface(surface, close, kerma=100e-9)
+    images["LAO45, 2.5x, 512 x 512"] = scope.render(device, np.random.RandomState(3))
     return images
 
 
