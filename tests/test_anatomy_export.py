@@ -11,7 +11,6 @@ from scipy.spatial import ConvexHull
 
 from cathsim_dmc.anatomy import export, phantoms
 from cathsim_dmc.anatomy.centreline import Centreline, Vessel, VesselTree
-from cathsim_dmc.anatomy.convex_wall import wall_pieces
 from cathsim_dmc.validation.rig import tube as straight_tube
 
 
@@ -22,7 +21,7 @@ def tube():
 
 @pytest.fixture(scope="module")
 def pieces(tube):
-    return wall_pieces(tube)
+    return export.wall_pieces(tube)
 
 
 def test_pieces_surround_the_lumen(tube, pieces):
@@ -75,7 +74,7 @@ def test_the_ending_is_checked_before_any_work(tube, tmp_path):
 @pytest.mark.parametrize("name", phantoms.MEASURED)
 def test_the_walls_of_the_phantoms(name):
     anatomy = phantoms.load(name)
-    pieces = wall_pieces(anatomy)
+    pieces = export.wall_pieces(anatomy)
     found = export.fidelity(anatomy, pieces)
     # At an edge between two branches the wall is thinner than what is looked through.
     assert found.open < 5e-4 * found.places and found.blocked == ()
@@ -97,5 +96,5 @@ def test_a_thin_wall_between_two_lumens_stays_out_of_both():
         {"a": Vessel("a", trunk), "b": Vessel("b", arm, "a", ostium=3e-3)}
     )
     anatomy = Anatomy.from_tree(tree, "two", goals={})
-    found = export.fidelity(anatomy, wall_pieces(anatomy))
+    found = export.fidelity(anatomy, export.wall_pieces(anatomy))
     assert found.blocked == () and found.intrusion[1] < 0.4e-3

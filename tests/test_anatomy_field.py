@@ -32,7 +32,7 @@ def tube():
         End("root", np.zeros(3), -UP, RADIUS, True),
         End("root", LENGTH * UP, UP, RADIUS, False),
     )
-    return tree, ends, Field.from_tree(tree, ends)
+    return tree, ends, Field.of(tree, ends)
 
 
 @pytest.fixture(scope="module")
@@ -75,7 +75,7 @@ def test_the_depth_at_a_junction_is_the_distance_to_the_wall(fork):
     clear = distance > 0.3e-3
     np.testing.assert_allclose(measured[clear], exact[clear], atol=0.06e-3)
     assert np.abs(old - exact)[clear].max() > 0.5e-3
-    field = Field.from_tree(fork)(points)
+    field = Field.of(fork)(points)
     close = np.abs(measured) < 1e-3
     assert np.quantile(np.abs(field - measured)[close], 0.99) < 0.06e-3
 
@@ -125,7 +125,7 @@ def test_a_vessel_that_passes_behind_the_inlet_keeps_its_wall():
     back = np.linspace((58e-3, 0, -60e-3), (-20e-3, 0, -60e-3), 60)
     points = np.concatenate([arch, down, back])
     tree = tree_of(Vessel("root", Centreline(points, np.full(len(points), RADIUS))))
-    field = Field.from_tree(tree, [End("root", np.zeros(3), -UP, RADIUS, True)])
+    field = Field.of(tree, [End("root", np.zeros(3), -UP, RADIUS, True)])
     wall = np.array(
         [(0, 0, -60e-3 + RADIUS - 0.5e-3), (0, 0, -60e-3 + RADIUS + 0.5e-3)]
     )
@@ -154,7 +154,7 @@ def box(side):
 def test_a_surface_gives_the_same_field_by_libigl():
     """A box, open at z = -10 mm."""
     end = End("root", -10e-3 * UP, -UP, 5e-3, True)
-    field = Field.from_surface(box((12e-3, 12e-3, 20e-3)), [end])
+    field = Field.of(box((12e-3, 12e-3, 20e-3)), [end])
     points = [(5.2e-3, 0, 0), (0, -6.4e-3, 3e-3), (0, 0, 9.5e-3), (4e-3, 0, -9.9e-3)]
     np.testing.assert_allclose(
         field(points), [0.8e-3, -0.4e-3, 0.5e-3, 2e-3], atol=0.02e-3
@@ -178,8 +178,8 @@ def test_a_surface_knows_inside_from_outside():
 
 def test_equal_fields_have_one_digest(tube):
     tree, ends, field = tube
-    assert Field.from_tree(tree, ends).digest == field.digest
-    assert Field.from_tree(tree).digest != field.digest
+    assert Field.of(tree, ends).digest == field.digest
+    assert Field.of(tree).digest != field.digest
 
 
 def test_points_that_are_not_finite_have_no_depth():

@@ -36,13 +36,13 @@ def built(monkeypatch, folder):
         done.append(content)
         return one
 
-    monkeypatch.setattr(Field, "from_tree", fake)
+    monkeypatch.setattr(Field, "of", fake)
     return done
 
 
 def test_a_field_is_built_once_and_read_as_it_was(folder):
     ends = [End("root", np.zeros(3), -UP, 4e-3, True)]
-    first, again = (field_cache.tree_field(tube(), ends) for _ in range(2))
+    first, again = (field_cache.field_of(tube(), ends) for _ in range(2))
     assert first is not again and first.digest == again.digest
     for one, other in zip(first.arrays, again.arrays, strict=True):
         assert one.dtype == other.dtype and one.shape == other.shape
@@ -50,9 +50,9 @@ def test_a_field_is_built_once_and_read_as_it_was(folder):
 
 def test_a_cached_field_lies_in_its_file(folder):
     ends = [End("root", np.zeros(3), -UP, 4e-3, True)]
-    fields = [field_cache.tree_field(tube(), ends) for _ in range(2)]
+    fields = [field_cache.field_of(tube(), ends) for _ in range(2)]
     points = np.random.default_rng(0).uniform(-5e-3, 5e-3, (50, 3))
-    built = Field.from_tree(tube(), ends)
+    built = Field.of(tube(), ends)
     for field in fields:
         assert built.pages is None and field.pages is not None
         assert np.shares_memory(field.samples, field.pages)
@@ -66,15 +66,15 @@ def test_a_cached_field_lies_in_its_file(folder):
 @pytest.mark.parametrize("name", phantoms.MEASURED)
 def test_fields_of_the_measured_phantoms_come_with_the_package(name, folder, built):
     anatomy = phantoms.load(name)
-    field = field_cache.tree_field(anatomy.tree, anatomy.ends)
+    field = field_cache.field_of(anatomy.tree, anatomy.ends)
     assert not built, MEND
     assert field.pages is not None and field.nbytes > 2e6
 
 
 def test_a_field_that_ships_is_the_one_that_would_be_built(folder):
     anatomy = phantoms.load("type2")
-    shipped = field_cache.tree_field(anatomy.tree, anatomy.ends)
-    built = Field.from_tree(anatomy.tree, anatomy.ends)
+    shipped = field_cache.field_of(anatomy.tree, anatomy.ends)
+    built = Field.of(anatomy.tree, anatomy.ends)
     for one, other in zip(shipped.arrays, built.arrays, strict=True):
         # Processors round differently, and a depth is a whole number.
         np.testing.assert_allclose(one, other, rtol=1e-12, atol=1, err_msg=MEND)
@@ -85,33 +85,33 @@ def test_lumen_and_ends_count(built):
     for radius in (4e-3, 5e-3):
         for ends in ((), (end,)):
             for _ in range(2):
-                field_cache.tree_field(tube(radius), ends)
+                field_cache.field_of(tube(radius), ends)
     assert len(built) == 4
 
 
 def test_a_damaged_field_is_built_again(built, folder):
-    field_cache.tree_field(tube())
+    field_cache.field_of(tube())
     (path,) = folder.iterdir()
     data = path.read_bytes()
     path.write_bytes(data[:-200])
-    field_cache.tree_field(tube())
+    field_cache.field_of(tube())
     path.write_bytes(data.replace(np.float64(7.5).tobytes(), b"x" * 8, 1))
-    field_cache.tree_field(tube())
-    field_cache.tree_field(tube())
+    field_cache.field_of(tube())
+    field_cache.field_of(tube())
     assert len(built) == 3
 
 
 def test_the_folder_stays_within_its_bound(built, folder, monkeypatch):
-    field_cache.tree_field(tube())
+    field_cache.field_of(tube())
     (path,) = folder.iterdir()
     monkeypatch.setattr(field_cache, "KEPT", 2.5 * path.stat().st_size)
     for number in range(5, 9):
-        field_cache.tree_field(tube(1e-3 * number))
+        field_cache.field_of(tube(1e-3 * number))
     assert len(list(folder.iterdir())) == 2
 
 
 def test_a_folder_that_cannot_be_written_to_keeps_nothing(built, folder):
     folder.parent.write_text("a file")
-    field_cache.tree_field(tube())
-    field_cache.tree_field(tube())
+    field_cache.field_of(tube())
+    field_cache.field_of(tube())
     assert len(built) == 2

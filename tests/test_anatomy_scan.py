@@ -157,7 +157,7 @@ def test_the_lumen_ends_at_the_inlet(cut_tube):
     points, shell, cap = cut_tube
     end = End("aorta", CUT.position, -CUT.direction, CUT.radius, True)
     surface = Surface(points, np.concatenate([shell, cap]))
-    depth = Field.from_surface(surface, [end])
+    depth = Field.of(surface, [end])
     s = np.linspace(-19e-3, 30e-3, 99)
     line = CUT.position + s[:, None] * CUT.direction + (4e-3, 0.0, 0.0)
     ahead = s > 0.0

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from cathsim_dmc.anatomy import lattice, phantoms, surface
+from cathsim_dmc.anatomy import geodesic, phantoms, surface
 from cathsim_dmc.anatomy.centreline import Centreline, Vessel, VesselTree
 from cathsim_dmc.anatomy.scan import topology
 from cathsim_dmc.anatomy.tree_depth import TreeDepth
@@ -40,7 +40,7 @@ def test_surface_spacing_must_be_positive():
 def test_lattice_points_inside_are_all_found():
     low, spacing, shape = np.array([-1.3, -1.2, -1.1]), 0.1, np.array([27, 25, 23])
     depth = lambda points: 1.0 - np.linalg.norm(points, axis=1)  # noqa: E731
-    ijk, found = lattice.inside(depth, low, shape, spacing, above=0.15)
+    ijk, found = geodesic.inside(depth, low, shape, spacing, above=0.15)
     every = np.stack(np.meshgrid(*map(np.arange, shape), indexing="ij"), -1)
     exact = depth((low + spacing * every).reshape(-1, 3))
     assert len(ijk) == (exact > 0.15).sum() and found.min() > 0.15

@@ -27,7 +27,7 @@ def tree_along(points, radius=RADIUS):
 def tube():
     """Along z from 0, where it is open, to 60 mm."""
     tree = tree_along(np.linspace((0, 0, 0), (0, 0, 60e-3), 61))
-    return Field.from_tree(
+    return Field.of(
         tree, [End("root", np.zeros(3), np.array([0, 0, -1.0]), RADIUS, True)]
     )
 
@@ -91,7 +91,7 @@ def test_a_capsule_in_a_straight_tube_overlaps_by_what_it_does(tube):
 def test_a_capsule_in_a_bend_touches_once_inside_and_twice_outside(overlap, planes):
     angle = np.linspace(0, np.pi / 2, 61)
     circle = np.stack([np.cos(angle), np.sin(angle), 0 * angle], axis=-1)
-    field = Field.from_tree(tree_along(30e-3 * circle))
+    field = Field.of(tree_along(30e-3 * circle))
     middle = np.array([np.cos(np.pi / 4), np.sin(np.pi / 4), 0])
     along = "90 45 0"  # the capsule lies along the bend there
     inside, outside = 25e-3 + DEVICE - overlap, 35e-3 - DEVICE + overlap
@@ -113,7 +113,7 @@ def test_a_capsule_across_an_ostium_touches_its_edge():
     root = tree_along(np.linspace((0, 0, -20e-3), (0, 0, 20e-3), 41)).root
     side = tree_along(np.linspace((0, 0, 0), (20e-3, 0, 0), 21), 3e-3).root
     branch = Vessel("branch", side.centreline, "root", RADIUS)
-    field = Field.from_tree(VesselTree({"root": root, "branch": branch}))
+    field = Field.of(VesselTree({"root": root, "branch": branch}))
     # Along z before the ostium: it rests on the two rims, at z = +-3 mm.
     place = (RADIUS - DEVICE + 0.1e-3, 0, 0)
     found = contacts_of(carrier(field) + capsule(place, size=(DEVICE, 8e-3)))
@@ -305,7 +305,7 @@ def test_batch_and_composer_step_alike_on_any_number_of_threads(tube):
 
 
 def test_copies_and_models_of_a_batch_keep_their_fields(tube):
-    other = Field.from_tree(tree_along(np.linspace((0, 0, 0), (0, 0, 60e-3), 61), 4e-3))
+    other = Field.of(tree_along(np.linspace((0, 0, 0), (0, 0, 60e-3), 61), 4e-3))
     model, _ = rolling(tube)
     narrow = copy.copy(model)
     narrow.geom_user[model.geom("wall").id] = fields.register(other)

@@ -15,9 +15,7 @@ def main() -> None:
     for old in paths[0].parent.glob("*.field"):
         old.unlink()
     for anatomy, path in zip(anatomies, paths, strict=True):
-        path.write_bytes(
-            field_cache.packed(Field.from_tree(anatomy.tree, anatomy.ends))
-        )
+        path.write_bytes(field_cache.packed(Field.of(anatomy.tree, anatomy.ends)))
         print(f"{anatomy.name}: {path.name}, {path.stat().st_size:,} bytes")
 
 

@@ -6,7 +6,7 @@ Lengths are metres, positions are in the patient frame LPS.
 import json
 import os
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -17,12 +17,7 @@ from numpy.typing import ArrayLike
 from cathsim_dmc import bounds, files
 from cathsim_dmc.anatomy import builder, field_cache
 from cathsim_dmc.anatomy.builder import VesselPlace
-from cathsim_dmc.anatomy.centreline import (
-    Array,
-    Centreline,
-    Vessel,
-    VesselTree,
-)
+from cathsim_dmc.anatomy.centreline import Array, Centreline, Vessel, VesselTree
 from cathsim_dmc.anatomy.circulation import Circulation
 from cathsim_dmc.anatomy.curves import Curve, smooth_tree
 from cathsim_dmc.anatomy.field import Field
@@ -62,8 +57,7 @@ class Anatomy:
                 raise ValueError(f"goal {goal.name!r} is filed under {key!r}.")
             self.tree.vessel(goal.vessel)
         self.tree.vessel(self.inlet.vessel)
-        object.__setattr__(self, "goals", dict(self.goals))
-        object.__setattr__(self, "ends", tuple(self.ends))
+        vars(self).update(goals=dict(self.goals), ends=tuple(self.ends))
 
     def __repr__(self) -> str:
         """Name, vessels, size, goals and inlet in one line."""
@@ -112,9 +106,8 @@ class Anatomy:
 
         Built when first asked for, and kept in `field_cache.cache_folder()`.
         """
-        if self.scanned:
-            return field_cache.surface_field(self.surface, self.ends)
-        return field_cache.tree_field(self.tree, self.ends)
+        lumen = self.surface if self.scanned else self.tree
+        return field_cache.field_of(lumen, self.ends)
 
     @cached_property
     def circulation(self) -> Circulation:
@@ -145,18 +138,12 @@ class Anatomy:
     def route(self, goal: str | Goal, spare: float = 0.0) -> Centreline:
         """Polyline with radii from the inlet to a goal, or `spare` (m) past it."""
         target = goal if isinstance(goal, Goal) else self.goal(goal)
-        there = target.arc_length
-        if spare:
-            end = self.tree.vessel(target.vessel).centreline.length
-            there = min(there + spare, end)
-        line = self.tree.vessel(self.inlet.vessel).centreline
+        end = self.tree.vessel(target.vessel).centreline.length
+        there = min(target.arc_length + spare, end)
+        entered = self.inlet.vessel
+        line = self.tree.vessel(entered).centreline
         start = float(line.project(self.inlet.position).arc_length)
-        return self.tree.route(
-            self.inlet.vessel,
-            target.vessel,
-            there,
-            start_arc_length=start,
-        )
+        return self.tree.route(entered, target.vessel, there, start_arc_length=start)
 
     def save(self, directory: str | os.PathLike[str]) -> Path:
         """Write the anatomy into `directory` and return that path.
@@ -166,7 +153,25 @@ class Anatomy:
         """
         directory = Path(directory)
         directory.mkdir(parents=True, exist_ok=True)
-        arrays, header = _pack(self)
+        arrays = {
+            "surface_vertices": self.surface.vertices,
+            "surface_faces": self.surface.faces,
+        }
+        vessels = []
+        for index, vessel in enumerate(self.tree.vessels.values()):
+            arrays[f"vessel_{index}_points"] = vessel.centreline.points
+            arrays[f"vessel_{index}_radii"] = vessel.centreline.radii
+            own = {"name": vessel.name, "parent": vessel.parent}
+            vessels.append({**own, "ostium": vessel.ostium})
+        header = {
+            **_FORMAT,
+            "name": self.name,
+            "scanned": self.scanned,
+            "vessels": vessels,
+            "inlet": _plain(self.inlet),
+            "goals": [_plain(goal) for goal in self.goals.values()],
+            "ends": [_plain(end) for end in self.ends],
+        }
         text = np.array(json.dumps(header))
         with files.atomic_path(directory / _FILE) as path, open(path, "wb") as stream:
             np.savez_compressed(stream, allow_pickle=False, header=text, **arrays)
@@ -192,33 +197,8 @@ class Anatomy:
             raise ValueError(f"{path}: {error}") from error
 
 
-def _pack(anatomy: Anatomy) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-    arrays: dict[str, np.ndarray] = {
-        "surface_vertices": anatomy.surface.vertices,
-        "surface_faces": anatomy.surface.faces,
-    }
-    vessels = []
-    for index, vessel in enumerate(anatomy.tree.vessels.values()):
-        arrays[f"vessel_{index}_points"] = vessel.centreline.points
-        arrays[f"vessel_{index}_radii"] = vessel.centreline.radii
-        vessels.append(
-            {"name": vessel.name, "parent": vessel.parent, "ostium": vessel.ostium}
-        )
-    description = {
-        **_FORMAT,
-        "name": anatomy.name,
-        "scanned": anatomy.scanned,
-        "vessels": vessels,
-        "inlet": _plain(anatomy.inlet),
-        "goals": [_plain(goal) for goal in anatomy.goals.values()],
-        "ends": [_plain(end) for end in anatomy.ends],
-    }
-    return arrays, description
-
-
 def _plain(part: Goal | Inlet | End) -> dict[str, Any]:
-    values = {field.name: getattr(part, field.name) for field in fields(part)}
-    return {name: np.asarray(value).tolist() for name, value in values.items()}
+    return {name: np.asarray(value).tolist() for name, value in vars(part).items()}
 
 
 def _unpack(arrays: dict[str, np.ndarray]) -> Anatomy:
@@ -228,19 +208,17 @@ def _unpack(arrays: dict[str, np.ndarray]) -> Anatomy:
         kept = {key: header[key] for key in ("format", "version", "units", "frame")}
         if repr(kept) != repr(_FORMAT):  # True is no 1
             raise ValueError(f"it is {kept}, not {_FORMAT}; write it again")
-        vessels: dict[str, Vessel] = {}
+        vessels = []
         for index, entry in enumerate(_listed(header, "vessels")):
             points, radii = (arrays[f"vessel_{index}_{k}"] for k in ("points", "radii"))
-            vessel = Vessel(centreline=Centreline(points, radii), **entry)
-            if vessel.name in vessels:
-                raise ValueError(f"vessels has {vessel.name!r} twice")
-            vessels[vessel.name] = vessel
+            vessels.append(Vessel(centreline=Centreline(points, radii), **entry))
         goals = [Goal(**entry) for entry in _listed(header, "goals")]
-        if len({goal.name for goal in goals}) < len(goals):
-            raise ValueError("goals has a name twice")
+        for kind, parts in (("vessels", vessels), ("goals", goals)):
+            if len({part.name for part in parts}) < len(parts):
+                raise ValueError(f"{kind} has a name twice")
         return Anatomy(
             name=bounds.text("name", header["name"]),
-            tree=VesselTree(vessels),
+            tree=VesselTree({vessel.name: vessel for vessel in vessels}),
             surface=Surface(arrays["surface_vertices"], arrays["surface_faces"]),
             inlet=Inlet(**header["inlet"]),
             goals={goal.name: goal for goal in goals},

@@ -22,7 +22,7 @@ class VesselPlace:
 
     Attributes:
         vessel: name.
-        arc_length: m along its centreline from its first point.
+        arc_length: m along its centreline from its first point; infinite for its last.
         past_ostium: m along its centreline from its ostium.
         position: (3,) m, a point of the lumen; the place is the nearest one of the
             centreline.
@@ -47,10 +47,10 @@ class VesselPlace:
         line = vessel.centreline
         if self.position is not None:
             return float(line.project(np.asarray(self.position, float)).arc_length)
-        if self.past_ostium is not None:
-            arc = vessel.ostium + float(self.past_ostium)
+        if self.arc_length is not None:
+            arc = line.length if self.arc_length == math.inf else self.arc_length
         else:
-            arc = float(self.arc_length or 0.0)
+            arc = vessel.ostium + float(self.past_ostium or 0.0)
         if not -1e-9 <= arc <= line.length + 1e-9:
             raise ValueError(
                 f"place {arc * 1e3:.1f} mm along vessel {self.vessel!r} is not on it: "
@@ -72,46 +72,29 @@ def placed(
     Raises:
         ValueError: if a place is not on its vessel, or lies behind the inlet.
     """
-    found = (
-        default_goals(tree)
-        if goals is None
-        else {key: _goal(key, place, tree) for key, place in goals.items()}
-    )
+    if goals is None:
+        found = default_goals(tree)
+    else:
+        found = {key: _goal(key, place, tree) for key, place in goals.items()}
     inlet = inlet or VesselPlace(tree.root.name, arc_length=0.0)
-    tree, entered = _cut_at(tree, inlet, found)
+    tree, at_first = _cut_at(tree, inlet, found)
     if inlet.vessel == tree.root.name:
         # Arc lengths count from the new first point.
-        found = {key: _moved(goal, tree) for key, goal in found.items()}
-    ends = flat_ends(tree, *entered)
-    return tree, ends, _inlet(ends), found
+        for key, goal in found.items():
+            near = tree.vessel(goal.vessel).centreline.project(goal.position)
+            found[key] = replace(goal, arc_length=float(near.arc_length))
 
+    def end(name: str, arc: float, side: float, is_open: bool) -> End:
+        place = tree.vessel(name).centreline.at(arc)
+        outward = side * place.tangent
+        return End(name, place.position, outward, float(place.radius), is_open)
 
-def access_inlet(tree: VesselTree, access: str) -> VesselPlace:
-    """Place of the inlet: "ascending", the root's first point, or "descending"."""
-    if access not in ACCESSES:
-        raise ValueError(f"access is {access!r}; choose one of {', '.join(ACCESSES)}.")
-    root = tree.root
-    arc = 0.0 if access == "ascending" else root.centreline.length
-    return VesselPlace(root.name, arc_length=arc)
-
-
-def flat_ends(tree: VesselTree, entered: str, at_first: bool) -> tuple[End, ...]:
-    """Every flat end of a tree, the one where the device enters open.
-
-    Args:
-        entered: vessel that the device enters.
-        at_first: whether it enters at the first point of the root's centreline.
-    """
-    root = tree.root
-    first = root.centreline.at(0.0)
-    ends = [
-        End(root.name, first.position, -first.tangent, float(first.radius), at_first)
-    ]
-    for name, vessel in tree.vessels.items():
-        last = vessel.centreline.at(vessel.centreline.length)
-        is_open = name == entered and not at_first
-        ends.append(End(name, last.position, last.tangent, float(last.radius), is_open))
-    return tuple(ends)
+    ends = [end(tree.root.name, 0.0, -1.0, at_first)]
+    for name in tree.vessels:
+        ends.append(end(name, math.inf, 1.0, name == inlet.vessel and not at_first))
+    entry = next(end for end in ends if end.open)
+    opening = Inlet(entry.vessel, entry.position, -entry.direction, entry.radius)
+    return tree, tuple(ends), opening, found
 
 
 def default_goals(tree: VesselTree) -> dict[str, Goal]:
@@ -149,20 +132,10 @@ def _goal(name: str, place: VesselPlace, tree: VesselTree) -> Goal:
     return Goal(name, place.vessel, position, arc)
 
 
-def _moved(goal: Goal, tree: VesselTree) -> Goal:
-    line = tree.vessel(goal.vessel).centreline
-    return replace(goal, arc_length=float(line.project(goal.position).arc_length))
-
-
-def _inlet(ends: tuple[End, ...]) -> Inlet:
-    entry = next(end for end in ends if end.open)
-    return Inlet(entry.vessel, entry.position, -entry.direction, entry.radius)
-
-
 def _cut_at(
     tree: VesselTree, inlet: VesselPlace, goals: Mapping[str, Goal]
-) -> tuple[VesselTree, tuple[str, bool]]:
-    """The tree cut at the inlet, and the end entered; or ValueError."""
+) -> tuple[VesselTree, bool]:
+    """The tree cut at the inlet, and whether its first point is entered."""
     vessel = tree.vessel(inlet.vessel)
     line = vessel.centreline
     arc = inlet.arc(tree)
@@ -194,7 +167,7 @@ def _cut_at(
                 f"{goal.arc_length * 1e3:.1f} mm along {vessel.name!r}."
             )
     if math.isclose(low, 0.0) and math.isclose(high, line.length):
-        return tree, (vessel.name, at_first)
+        return tree, at_first
     vessels = dict(tree.vessels)
     vessels[vessel.name] = replace(vessel, centreline=line.slice(low, high))
-    return VesselTree(vessels), (vessel.name, at_first)
+    return VesselTree(vessels), at_first

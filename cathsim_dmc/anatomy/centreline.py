@@ -4,23 +4,42 @@ All lengths are metres, all points are in the patient frame LPS (+x patient
 left, +y posterior, +z superior).
 """
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from types import MappingProxyType
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from cathsim_dmc import bounds
-from cathsim_dmc.anatomy.segments import Array, Segments, arc_lengths, as_points
+
+Array = NDArray[np.float64]
 
 # Points x segments handled at once while projecting: stays within the L2 cache.
 _CHUNK_ELEMENTS = 64_000
 
+# Vertices closer than this (m) to a cut would repeat the cut point.
+_GAP = 1e-9
 # Points this little (m) beyond a flat end still lie in the vessel.
 _END_PLANE = 1e-9
+
+
+def as_points(points: ArrayLike) -> Array:
+    """Points as float64 (..., 3); ValueError if the last axis is another."""
+    array = np.asarray(points, dtype=np.float64)
+    if array.ndim == 0 or array.shape[-1] != 3:
+        raise ValueError(
+            f"points have shape {array.shape}; give coordinates (x, y, z) in metres "
+            "on the last axis, shape (..., 3)."
+        )
+    return array
+
+
+def arc_lengths(points: Array) -> Array:
+    """Arc length (n,) of each point (n, k) of a polyline from the first."""
+    steps = np.linalg.norm(np.diff(points, axis=0), axis=1)
+    return np.concatenate([[0.0], np.cumsum(steps)])
 
 
 class CentrelinePoint(NamedTuple):
@@ -40,6 +59,15 @@ class Projection(NamedTuple):
     arc_length: Array
     distance: Array
     radius: Array
+
+
+def parents_first(name: str, parent: str | None, before: Collection[str]) -> None:
+    """Raise ValueError unless a vessel's parent is among those listed before it."""
+    if parent not in before:
+        raise ValueError(
+            f"parent {parent!r} of vessel {name!r} is not among {sorted(before)}; list "
+            "parents before their children."
+        )
 
 
 def _readonly(values: ArrayLike) -> Array:
@@ -64,12 +92,10 @@ class Centreline:
     radii: Array
 
     def __post_init__(self) -> None:
-        points = _readonly(bounds.array("centreline points", self.points))
+        points = bounds.array("centreline points", self.points, shape=(-1, 3))
         radii = _readonly(bounds.array("centreline radii", self.radii))
-        if points.ndim != 2 or points.shape[1] != 3 or len(points) < 2:
-            raise ValueError(
-                f"centreline points have shape {points.shape}; give (n, 3), n >= 2."
-            )
+        if len(points) < 2:
+            raise ValueError(f"a centreline has {len(points)} points; give 2 or more.")
         if radii.shape != (len(points),):
             raise ValueError(
                 f"centreline radii have shape {radii.shape}; give one radius for "
@@ -81,12 +107,12 @@ class Centreline:
             )
         steps = np.linalg.norm(np.diff(points, axis=0), axis=1)
         if steps.min() <= 0.0:
+            first = int(steps.argmin())
             raise ValueError(
-                f"centreline points {int(steps.argmin())} and "
-                f"{int(steps.argmin()) + 1} coincide; drop repeated points."
+                f"centreline points {first} and {first + 1} coincide; drop repeated "
+                "points."
             )
-        object.__setattr__(self, "points", points)
-        object.__setattr__(self, "radii", radii)
+        vars(self).update(points=_readonly(points), radii=radii)
 
     @cached_property
     def arc_length(self) -> Array:
@@ -99,21 +125,35 @@ class Centreline:
         return float(self.arc_length[-1])
 
     @cached_property
-    def _segments(self) -> Segments:
-        return Segments(self.points[:-1], self.points[1:])
+    def _segments(self) -> tuple[Array, Array, Array]:
+        """Directions (s, 3) of the segments, not normalised; squares; lengths (s,)."""
+        way = self.points[1:] - self.points[:-1]
+        squared = np.einsum("sj,sj->s", way, way)
+        return way, squared, np.sqrt(squared)
+
+    @cached_property
+    def _products(self) -> tuple[Array, Array]:
+        """Matrix (3, 2 s) and offset (2 s,) of a product with points p (n, 3).
+
+        It gives p.d/|d|^2 and |p - a|^2 - |p|^2 for every segment from a along d, which
+        are all that a distance needs but for a few elementwise passes.
+        """
+        start, (way, squared, _) = self.points[:-1], self._segments
+        matrix = np.concatenate([(way / squared[:, None]).T, -2.0 * start.T], axis=1)
+        along = -np.einsum("sj,sj->s", start, way) / squared
+        return matrix, np.append(along, np.einsum("sj,sj->s", start, start))
 
     def at(self, s: ArrayLike) -> CentrelinePoint:
         """Interpolate linearly at arc length `s` (...), clamped to the polyline."""
         s = np.clip(np.asarray(s, dtype=np.float64), 0.0, self.length)
         index = np.searchsorted(self.arc_length, s, side="right") - 1
         index = np.clip(index, 0, len(self.points) - 2)
-        lengths = self._segments.length[index]
+        way, _, lengths = (values[index] for values in self._segments)
         t = (s - self.arc_length[index]) / lengths
-        direction = self._segments.direction[index]
         return CentrelinePoint(
-            position=self.points[index] + t[..., None] * direction,
+            position=self.points[index] + t[..., None] * way,
             radius=self.radii[index] * (1.0 - t) + self.radii[index + 1] * t,
-            tangent=direction / lengths[..., None],
+            tangent=way / lengths[..., None],
         )
 
     def project(self, points: ArrayLike) -> Projection:
@@ -121,47 +161,46 @@ class Centreline:
         points = as_points(points)
         flat = points.reshape(-1, 3)
         out = np.empty((3, len(flat)))
-        segments = self._segments
-        chunk = max(1, _CHUNK_ELEMENTS // len(segments.length))
+        (way, squared, lengths), (matrix, offset) = self._segments, self._products
+        chunk = max(1, _CHUNK_ELEMENTS // len(lengths))
         for first in range(0, len(flat), chunk):
             part = flat[first : first + chunk]
-            squared, raw = segments.squared_distance(part)
-            index = squared.argmin(axis=1)
-            t = np.clip(raw[np.arange(len(part)), index], 0.0, 1.0)
-            nearest = segments.start[index] + t[:, None] * segments.direction[index]
-            offset = part - nearest
+            product = part @ matrix
+            product += offset
+            raw, base = product[:, : len(lengths)], product[:, len(lengths) :]
+            # |p-a|^2 - 2 t raw |d|^2 + t^2 |d|^2 with t = clip(raw, 0, 1)
+            clamped = np.clip(raw, 0.0, 1.0)
+            step = clamped - 2.0 * raw
+            step *= clamped
+            step *= squared
+            step += base
+            index = step.argmin(axis=1)
+            t = clamped[np.arange(len(part)), index]
+            away = part - (self.points[index] + t[:, None] * way[index])
             out[:, first : first + chunk] = (
-                self.arc_length[index] + t * segments.length[index],
-                np.sqrt(np.einsum("nj,nj->n", offset, offset)),
+                self.arc_length[index] + t * lengths[index],
+                np.sqrt(np.einsum("nj,nj->n", away, away)),
                 self.radii[index] * (1.0 - t) + self.radii[index + 1] * t,
             )
         return Projection(*(values.reshape(points.shape[:-1]) for values in out))
 
     def resampled(self, spacing: float) -> "Centreline":
         """Same curve with equal steps of about `spacing` (m), ends kept."""
-        if not spacing > 0.0:
-            raise ValueError(f"spacing is {spacing:g} m; it must be > 0.")
         count = max(1, round(self.length / spacing))
-        place = self.at(np.linspace(0.0, self.length, count + 1))
-        return Centreline(place.position, place.radius)
+        return Centreline(*self.at(np.linspace(0.0, self.length, count + 1))[:2])
 
     def slice(self, s0: float, s1: float) -> "Centreline":
         """Part from `s0` to `s1` (m), maybe backwards; ValueError if it is empty."""
         low, high = sorted((float(s0), float(s1)))
         low, high = max(low, 0.0), min(high, self.length)
-        # Vertices closer than a nanometre to a cut would repeat the cut point.
-        gap = 1e-9
-        if high - low <= gap:
+        if high - low <= _GAP:
             raise ValueError(
                 f"slice from {s0:g} to {s1:g} m is empty; the centreline spans "
                 f"0 to {self.length:g} m."
             )
-        inner = (self.arc_length > low + gap) & (self.arc_length < high - gap)
+        inner = (self.arc_length > low + _GAP) & (self.arc_length < high - _GAP)
         s = np.concatenate([[low], self.arc_length[inner], [high]])
-        if s0 > s1:
-            s = s[::-1]
-        place = self.at(s)
-        return Centreline(place.position, place.radius)
+        return Centreline(*self.at(s if s0 <= s1 else s[::-1])[:2])
 
 
 @dataclass(frozen=True, eq=False)
@@ -204,9 +243,8 @@ class VesselTree:
     vessels: Mapping[str, Vessel]
 
     def __post_init__(self) -> None:
-        vessels = dict(self.vessels)
-        seen: set[str] = set()
-        for key, vessel in vessels.items():
+        seen: list[str] = []
+        for key, vessel in self.vessels.items():
             if key != vessel.name:
                 raise ValueError(f"vessel {vessel.name!r} is filed under {key!r}.")
             if (vessel.parent is None) != (not seen):
@@ -214,19 +252,12 @@ class VesselTree:
                     f"vessel {key!r} has parent {vessel.parent!r}; the first vessel, "
                     "and only the first, has no parent."
                 )
-            if vessel.parent is not None and vessel.parent not in seen:
-                raise ValueError(
-                    f"parent {vessel.parent!r} of vessel {key!r} is not among "
-                    f"{sorted(seen)}; list parents before their children."
-                )
-            seen.add(key)
+            if seen:
+                parents_first(key, vessel.parent, seen)
+            seen.append(key)
         if not seen:
             raise ValueError("a vessel tree needs at least one vessel.")
-        object.__setattr__(self, "vessels", MappingProxyType(vessels))
-
-    def __reduce__(self) -> tuple:
-        # A mapping proxy cannot be pickled; worker processes need trees.
-        return (VesselTree, (dict(self.vessels),))
+        vars(self).update(vessels=dict(self.vessels))
 
     @property
     def root(self) -> Vessel:
@@ -266,10 +297,8 @@ class VesselTree:
 
     def _lineage(self, name: str) -> list[str]:
         """Names from `name` up to the root."""
-        names = [self.vessel(name).name]
-        while (parent := self.vessels[names[-1]].parent) is not None:
-            names.append(parent)
-        return names
+        parent = self.vessel(name).parent
+        return [name] if parent is None else [name, *self._lineage(parent)]
 
     def origin(self, name: str) -> float:
         """Arc length (m) on the parent's centreline where branch `name` starts."""
@@ -312,9 +341,9 @@ class VesselTree:
         for name in up[: up.index(common)]:
             legs.append((name, here, 0.0))
             here = self.origin(name)
-        for name in reversed(down[: down.index(common) + 1]):
-            child = down.index(name) - 1
-            there = goal_arc_length if child < 0 else self.origin(down[child])
+        way = down[down.index(common) :: -1]
+        for name, child in zip(way, [*way[1:], None], strict=True):
+            there = goal_arc_length if child is None else self.origin(child)
             legs.append((name, here, there))
             here = 0.0
         parts = [
@@ -327,5 +356,5 @@ class VesselTree:
         points = np.concatenate([part.points for part in parts])
         radii = np.concatenate([part.radii for part in parts])
         steps = np.linalg.norm(np.diff(points, axis=0), axis=1)
-        keep = np.concatenate([[True], steps > 1e-9])
+        keep = np.append(True, steps > _GAP)
         return Centreline(points[keep], radii[keep])

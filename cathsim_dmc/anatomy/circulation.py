@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from cathsim_dmc.anatomy.centreline import Array, VesselTree
+from cathsim_dmc.anatomy.centreline import Array, Centreline, VesselTree
 from cathsim_dmc.anatomy.parts import End
 
 # Mean shares of the inflow, from the resistances of ADAN56 (Boileau 2015).
@@ -100,45 +100,42 @@ class Circulation:
         return self.ends, self.radii, self.shares, self.ways, self.vessel
 
 
-def _along(line, course: Course, number: int) -> tuple[np.ndarray, ...]:
+def _along(line: Centreline, course: Course, number: int) -> tuple[np.ndarray, ...]:
     count = max(2, round(line.length / _SPACING) + 1)
     s = np.linspace(0.0, line.length, count)
     way = line.length - s if course.reverse else s
-    place, sign = line.at(s), -1.0 if course.reverse else 1.0
-    values = (
-        place.position,
-        place.radius,
-        sign * course.share(way),
-        course.begin + way,
-    )
+    place, share = line.at(s), course.share(way)
+    flow = -share if course.reverse else share
+    values = place.position, place.radius, flow, course.begin + way
     pairs = [np.stack([value[:-1], value[1:]], axis=1) for value in values]
     return (*pairs, np.full(count - 1, number))
 
 
 def _courses(tree: VesselTree, reverse: bool, murray: bool) -> dict[str, Course]:
     outlets = _outlets(tree, reverse, murray)
-    taken = dict(outlets)
+    taken, begins = dict(outlets), {}
     for name in reversed(tuple(tree.vessels)):  # branches before their parents
         parent = tree.vessels[name].parent
         if parent is not None:
             taken[parent] += taken[name]
-    courses: dict[str, Course] = {}
+    branches: dict[str, list] = {name: [] for name in tree.vessels}
     for name, vessel in tree.vessels.items():
-        back = reverse and vessel.parent is None
-        length = vessel.centreline.length
-        branches, begin = [], 0.0
-        for child, other in tree.vessels.items():
-            if other.parent == name:
-                origin = tree.origin(child)
-                branches.append((length - origin if back else origin, taken[child]))
+        begins[name] = 0.0
         if vessel.parent is not None:
-            above, origin = courses[vessel.parent], tree.origin(name)
-            if above.reverse:
-                origin = tree.vessels[vessel.parent].centreline.length - origin
-            begin = above.begin + origin
-        branches = np.array(branches).reshape(-1, 2)
-        courses[name] = Course(begin, back, outlets[name], branches)
-    return courses
+            way = tree.origin(name)
+            if reverse and vessel.parent == tree.root.name:
+                way = tree.root.centreline.length - way
+            begins[name] = begins[vessel.parent] + way
+            branches[vessel.parent].append((way, taken[name]))
+    return {
+        name: Course(
+            begins[name],
+            reverse and name == tree.root.name,
+            outlets[name],
+            np.array(branches[name]).reshape(-1, 2),
+        )
+        for name in tree.vessels
+    }
 
 
 def _outlets(tree: VesselTree, reverse: bool, murray: bool) -> dict[str, float]:

@@ -5,15 +5,20 @@ Lengths are metres, points are in one frame (LPS unless said otherwise).
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 from scipy import interpolate
 
 from cathsim_dmc import bounds
-from cathsim_dmc.anatomy.centreline import Array, Centreline, Vessel, VesselTree
-from cathsim_dmc.anatomy.segments import arc_lengths
-from cathsim_dmc.anatomy.septa import check_septa
+from cathsim_dmc.anatomy.centreline import (
+    Array,
+    Centreline,
+    Vessel,
+    VesselTree,
+    arc_lengths,
+    parents_first,
+)
 
 # Standard deviations of measured positions and radii, m: how far the spline may
 # depart from them, root mean square: less than what a lattice of 0.5 mm leaves open.
@@ -30,11 +35,15 @@ _LEAST_BEND = 1.05
 _WIDEST_OSTIUM = 0.95
 # The flare reaches this far into the parent beyond the estimate for a straight one.
 _FLARE_MARGIN = 1.25
+# Two lumens side by side need this much wall between them, m.
+_LEAST_WALL = 0.2e-3
+# A branch may share its lumen with its parent up to so many radii past its ostium.
+_LONGEST_JUNCTION = 8.0
 
 
 @dataclass(frozen=True, eq=False)
-class Curve:
-    """A measured centreline.
+class Curve(Centreline):
+    """A measured centreline; ValueError if a shape or a value is not as stated.
 
     Attributes:
         points: (n, 3) float64, metres; n >= 2. A branch begins inside its parent or
@@ -44,17 +53,7 @@ class Curve:
         parent: name of the vessel it leaves, None for the root.
     """
 
-    points: Array
-    radii: Array
     parent: str | None = None
-    line: Centreline = field(init=False, repr=False)
-
-    def __post_init__(self) -> None:
-        # Centreline refuses wrong shapes, NaN, repeated points, radii <= 0.
-        line = Centreline(self.points, self.radii)
-        object.__setattr__(self, "line", line)
-        object.__setattr__(self, "points", line.points)
-        object.__setattr__(self, "radii", line.radii)
 
 
 def smooth_tree(
@@ -85,14 +84,9 @@ def smooth_tree(
     vessels: dict[str, Vessel] = {}
     for name, curve in curves.items():
         if curve.parent is None:
-            line = _spline(curve.points, curve.radii, smoothing)
-            vessels[name] = Vessel(name, line)
+            vessels[name] = Vessel(name, _spline(curve, smoothing))
         else:
-            if curve.parent not in vessels:
-                raise ValueError(
-                    f"parent {curve.parent!r} of vessel {name!r} is not among "
-                    f"{sorted(vessels)}; list parents before their children."
-                )
+            parents_first(name, curve.parent, vessels)
             parent = vessels[curve.parent]
             vessels[name] = _branch(name, curve, parent, smoothing, flare)
         _check_bends(vessels[name])
@@ -101,30 +95,28 @@ def smooth_tree(
     return tree
 
 
-def _fit(
-    points: Array, smoothing: float, weights: Array | None = None
-) -> tuple[interpolate.BSpline, float]:
-    """Cubic spline (3 coordinates) over chord length, and the whole chord length."""
+def _smooth(
+    points: Array, smoothing: float, step: float, first_weight: float = 1.0
+) -> Array:
+    """Points (n, 3) of a cubic spline at equal arcs of about `step` (m), ends included.
+
+    Its parameter is the chord length.
+    """
     chord = arc_lengths(points)
-    order = min(3, len(points) - 1)
-    weights = np.ones(len(points)) if weights is None else weights
+    weights = np.ones(len(points))
+    weights[0] = first_weight
     # In millimetres, which fitpack's tolerances suit.
     (knots, coefficients, degree), _ = interpolate.splprep(
         1e3 * points.T,
         u=chord,
         w=weights,
-        k=order,
+        k=min(3, len(points) - 1),
         s=len(points) * (1e3 * smoothing) ** 2,
     )
     spline = interpolate.BSpline(knots, 1e-3 * np.array(coefficients).T, degree)
-    return spline, float(chord[-1])
-
-
-def _sampled(spline: interpolate.BSpline, end: float, step: float) -> Array:
-    """Points (n, 3) of a spline at equal arcs of about `step` (m), ends included."""
+    end = float(chord[-1])
     parameter = np.linspace(0.0, end, max(20, 10 * math.ceil(end / step)))
-    points = spline(parameter)
-    arc = arc_lengths(points)
+    arc = arc_lengths(spline(parameter))
     count = max(2, math.ceil(arc[-1] / step) + 1)
     # Chords between the points interpolated would show as wrinkles in its curvature.
     return spline(np.interp(np.linspace(0.0, arc[-1], count), arc, parameter))
@@ -142,14 +134,18 @@ def _radii(places: Array, values: Array, at: Array) -> Array:
     return np.clip(smooth, 0.9 * values.min(), 1.1 * values.max())
 
 
-def _spline(points: Array, radii: Array, smoothing: float) -> Centreline:
-    spline, end = _fit(points, smoothing)
-    dense = _sampled(spline, end, _STEP)
+def _spline(curve: Curve, smoothing: float) -> Centreline:
+    dense = _smooth(curve.points, smoothing, _STEP)
     line = Centreline(dense, np.ones(len(dense)))
-    places = np.maximum.accumulate(line.project(points).arc_length)
-    fresh = np.concatenate([[True], np.diff(places) > 1e-6])
-    smooth = _radii(places[fresh], radii[fresh], line.arc_length)
+    places, fresh = _places(line, curve.points)
+    smooth = _radii(places[fresh], curve.radii[fresh], line.arc_length)
     return Centreline(dense, smooth)
+
+
+def _places(line: Centreline, points: Array) -> tuple[Array, np.ndarray]:
+    """Arc lengths (n,) m of points along a line, and which are past the one before."""
+    places = np.maximum.accumulate(line.project(points).arc_length)
+    return places, np.append(True, np.diff(places) > 1e-6)
 
 
 def _branch(
@@ -157,10 +153,7 @@ def _branch(
 ) -> Vessel:
     start = _onto_parent(name, curve.points, parent)
     # The start is no measurement: it lies on the parent.
-    weights = np.ones(len(start))
-    weights[0] = 100.0
-    spline, end = _fit(start, smoothing, weights)
-    dense = _sampled(spline, end, _FINE)
+    dense = _smooth(start, smoothing, _FINE, first_weight=100.0)
     dense[0] = start[0]
     fine = Centreline(dense, np.ones(len(dense)))
     ostium = _ostium(name, fine, parent)
@@ -169,16 +162,15 @@ def _branch(
     outward = place.position - foot.position
     outward /= np.linalg.norm(outward)
     tilt = math.acos(float(np.clip(place.tangent @ outward, -1.0, 1.0)))
-    places = np.maximum.accumulate(fine.project(curve.points).arc_length)
-    own = places >= ostium
-    own &= np.concatenate([[True], np.diff(places) > 1e-6])
+    places, own = _places(fine, curve.points)
+    own &= places >= ostium
     if not own.any():
         raise ValueError(
             f"branch {name!r} has no point beyond its ostium; give it more points."
         )
-    s = np.linspace(0.0, fine.length, max(2, math.ceil(fine.length / _STEP) + 1))
     calibre = float(curve.radii[own][0])
-    parent_radius = float(parent.centreline.at(_origin(fine, parent)).radius)
+    origin = parent.centreline.project(fine.points[0]).arc_length
+    parent_radius = float(parent.centreline.at(origin).radius)
     parent_radius = max(parent_radius, float(foot.radius))
     room = _WIDEST_OSTIUM * parent_radius - calibre
     if room < 0.0:
@@ -190,9 +182,10 @@ def _branch(
         )
     wide = calibre + min(flare, room)
     begin, over = _flare_span(wide, calibre, parent_radius, tilt, ostium)
+    s = np.linspace(0.0, fine.length, max(2, math.ceil(fine.length / _STEP) + 1))
     fine_s = np.arange(begin, over, 0.5e-3)
     s = np.unique(np.concatenate([s[(s < begin) | (s > over)], fine_s, [over]]))
-    s = s[np.concatenate([[True], np.diff(s) > 0.1e-3])]
+    s = s[np.append(True, np.diff(s) > 0.1e-3)]
     u = np.clip((s - begin) / (over - begin), 0.0, 1.0)
     radii = _radii(places[own], curve.radii[own], s)
     radii = radii + (wide - calibre) * (1.0 - u) ** 2
@@ -252,10 +245,6 @@ def _ostium(name: str, line: Centreline, parent: Vessel) -> float:
     return float(s[last] + share * (s[last + 1] - s[last]))
 
 
-def _origin(line: Centreline, parent: Vessel) -> float:
-    return float(parent.centreline.project(line.points[0]).arc_length)
-
-
 def _check_bends(vessel: Vessel) -> None:
     line = vessel.centreline
     # Over a lumen radius, below which a kink is no bend.
@@ -264,9 +253,7 @@ def _check_bends(vessel: Vessel) -> None:
         return
     place = line.at(s)
     ahead, behind = (line.at(s + sign * place.radius) for sign in (0.5, -0.5))
-    turn = np.arccos(
-        np.clip(np.einsum("nj,nj->n", ahead.tangent, behind.tangent), -1.0, 1.0)
-    )
+    turn = np.arccos(np.clip(np.vecdot(ahead.tangent, behind.tangent), -1.0, 1.0))
     bend = place.radius / np.maximum(turn, 1e-9)
     worst = int((bend / place.radius).argmin())
     if bend[worst] < _LEAST_BEND * place.radius[worst]:
@@ -277,3 +264,52 @@ def _check_bends(vessel: Vessel) -> None:
             f"radius is {place.radius[worst] * 1e3:.1f} mm; the lumen would fold. "
             "Smooth more, or mend the points there."
         )
+
+
+def _junction_end(vessel: Vessel, parent: Vessel) -> float:
+    """Arc length (m) from which a branch's lumen is free of its parent's.
+
+    It is the first place past the ostium where the two tubes are `_LEAST_WALL` apart.
+    """
+    line = vessel.centreline
+    s = np.arange(vessel.ostium, line.length, 0.5e-3)
+    place = line.at(s)
+    near = parent.centreline.project(place.position)
+    free = near.distance - near.radius - place.radius >= _LEAST_WALL
+    most = _LONGEST_JUNCTION * place.radius[0]
+    if not (free & (s - vessel.ostium <= most)).any():
+        raise ValueError(
+            f"branch {vessel.name!r} does not part from {parent.name!r} within "
+            f"{most * 1e3:.0f} mm of its ostium; it runs along its parent's wall. "
+            "Start it further on, or merge the two."
+        )
+    return float(s[int(free.argmax())])
+
+
+def check_septa(tree: VesselTree) -> None:
+    """Raise ValueError if two lumens touch away from where one leaves the other."""
+    free = {
+        name: _junction_end(vessel, tree.vessel(vessel.parent))
+        for name, vessel in tree.vessels.items()
+        if vessel.parent is not None
+    }
+    for name, start in free.items():
+        vessel = tree.vessel(name)
+        line = vessel.centreline
+        for other in tree.vessels.values():
+            if other is vessel or name == other.parent:
+                continue
+            is_parent, body = other.name == vessel.parent, other.centreline
+            outside = line.slice(start if is_parent else vessel.ostium, line.length)
+            if other.name in free and not is_parent:
+                body = body.slice(other.ostium, body.length)
+            near = body.project(outside.points)
+            clear = near.distance - near.radius - outside.radii
+            worst = int(clear.argmin())
+            if clear[worst] < _LEAST_WALL - 1e-9:
+                x, y, z = np.round(outside.points[worst] * 1e3, 1)
+                raise ValueError(
+                    f"vessels {name!r} and {other.name!r} come within "
+                    f"{clear[worst] * 1e3:.1f} mm of each other at ({x}, {y}, {z}) mm; "
+                    f"a wall between them needs {_LEAST_WALL * 1e3:.1f} mm."
+                )

@@ -1,8 +1,14 @@
-"""Export of an anatomy as MJCF with convex wall pieces, and its deviations."""
+"""Export of an anatomy as MJCF with convex wall pieces, and their deviations.
+
+For engines that collide nothing but convex shapes. A prism stands on every triangle of
+the lumen's surface and reaches outwards along the vertex normals; neighbours share
+their side faces, so nothing can pass between two of them. The vertices are moved
+outwards by what the triangles around them stand in the lumen.
+"""
 
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -10,16 +16,94 @@ from scipy.spatial import ConvexHull, cKDTree
 
 from cathsim_dmc import files
 from cathsim_dmc.anatomy.anatomy import Anatomy
-from cathsim_dmc.anatomy.convex_wall import wall_pieces
+from cathsim_dmc.anatomy.parts import INLET_HOLE_RADIUS, Inlet
 from cathsim_dmc.anatomy.scan.extract import DEVICE_RADIUS
+from cathsim_dmc.anatomy.scan.inlet import cut_open
+from cathsim_dmc.anatomy.scan.topology import decimated
 from cathsim_dmc.anatomy.surface import sampled
 
+TRIANGLES = 3_000  # of the surface that carries prisms; others are decimated
+THICKNESS = 4e-3  # m, of the wall where no other lumen is near
+THINNEST = 0.3e-3  # m, of the wall between two lumens
+MOVE = 0.3e-3  # m, largest outward movement of a vertex
+CAP_OVERLAP = 2e-3  # m, of the inlet's cap under the wall around it
+_BEHIND = 0.05e-3  # m, of the surface that is cut off ahead of the inlet's flat cap
 _PLACES = 10_000  # of the wall that are looked at
 _NEAR = 1.5e-3  # m from an open end, where there is no wall
 # Levels (m) along the normal at which pieces are looked for, > 0 in the lumen.
 _LEVELS = np.arange(-1.5e-3, 1.5e-3, 0.05e-3)
 _GRAZE = 0.05e-3  # m, by which a piece may touch a 5 Fr catheter on a centreline
 _OFF = 0.3e-3  # m; farther from the wall a place of the surface is on an open end
+
+
+def wall_pieces(anatomy: Anatomy) -> tuple[np.ndarray, ...]:
+    """Vertices (n_i, 3) m of convex pieces around the lumen; takes seconds.
+
+    The pieces lie outside the lumen but for some tenths of a millimetre. The inlet is
+    closed but for a hole of `INLET_HOLE_RADIUS`.
+    """
+    inlet, lumen, surface = anatomy.inlet, anatomy.lumen, anatomy.surface
+    vertices, faces = decimated(surface.vertices, surface.faces, TRIANGLES)
+    at = inlet.position + _BEHIND * inlet.direction
+    points, shell, cap = cut_open(vertices, faces, replace(inlet, position=at))
+    normals = _outward_normals(points, shell)
+    # How far each vertex can move out before another lumen comes near.
+    reach = np.full(len(points), THINNEST)
+    going = np.ones(len(points), dtype=bool)
+    for s in np.arange(0.4e-3, THICKNESS + 1e-9, 0.2e-3):
+        going &= -lumen(points + s * normals) > 0.35 * s
+        reach[going] = s
+    chords = lumen(points[shell].mean(axis=1)).clip(0.0, MOVE)
+    move = np.zeros(len(points))
+    np.maximum.at(move, shell, chords[:, None])
+    # Between two lumens there is no room to move into.
+    inner = points + np.minimum(move, 0.5 * reach)[:, None] * normals
+    outer = inner + reach[:, None] * normals
+    prisms = np.concatenate([inner[shell], outer[shell]], axis=1)
+    return (*prisms, *_inlet_cap(points[cap[:, :2]], inlet))
+
+
+def _inlet_cap(border: np.ndarray, inlet: Inlet) -> list[np.ndarray]:
+    """Convex sectors on edges (n, 2, 3) m of the cut that close it but for the hole."""
+    # A chord between two spokes cuts into the hole less than this at 12 sectors.
+    hole = INLET_HOLE_RADIUS / np.cos(np.pi / 12)
+    spokes = border - inlet.position
+    reach = np.linalg.norm(spokes, axis=-1, keepdims=True)
+    spokes = spokes / np.maximum(reach, 1e-9)
+    sectors = []
+    for spoke, far in zip(spokes, reach, strict=True):
+        if far.max() <= hole:
+            continue
+        face = inlet.position + np.concatenate(
+            [hole * spoke, np.maximum(far, hole) * spoke + CAP_OVERLAP * spoke]
+        )
+        sectors.append(np.concatenate([face, face - THICKNESS * inlet.direction]))
+    return sectors
+
+
+def _outward_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """Unit normals (V, 3) that lean outwards from all triangles around a vertex.
+
+    The angle-weighted mean can point into one of the triangles where the surface
+    folds sharply; while it does, the worst triangle is added.
+    """
+    import igl
+
+    flat = igl.per_face_normals(vertices, faces, np.zeros(3))
+    weighting = igl.PER_VERTEX_NORMALS_WEIGHTING_TYPE_ANGLE
+    normals = igl.per_vertex_normals(vertices, faces, weighting)
+    normals[~np.isfinite(normals)] = 0.0  # of vertices without triangles
+    for _ in range(20):
+        lean = np.einsum("fkd,fd->fk", normals[faces], flat)
+        push = np.zeros_like(vertices)
+        for k in range(3):
+            low = lean[:, k] < 0.2
+            np.add.at(push, faces[low, k], 0.25 * flat[low])
+        if not push.any():
+            break
+        normals = normals + push
+        normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30)
+    return normals
 
 
 @dataclass(frozen=True)
@@ -60,13 +144,12 @@ def fidelity(anatomy: Anatomy, pieces: Sequence[np.ndarray]) -> Fidelity:
         around = place[:, None] + free[:, None, None] * directions
         if _within(np.concatenate([around, place[:, None]], axis=1), pieces).any():
             blocked.append(name)
-    return Fidelity(
-        _summary(inside),
-        _summary(behind[closed]),
-        len(points),
-        int((~closed).sum()),
-        tuple(blocked),
+    intrusion, recession = (
+        (float(one.mean()), float(np.percentile(one, 95)), float(one.max()))
+        for one in (inside, behind[closed])
     )
+    missed = int((~closed).sum())
+    return Fidelity(intrusion, recession, len(points), missed, tuple(blocked))
 
 
 def _within(points: np.ndarray, pieces: Sequence[np.ndarray]) -> np.ndarray:
@@ -96,11 +179,6 @@ def _wall_places(anatomy: Anatomy) -> tuple[np.ndarray, np.ndarray]:
     return (points - depth[:, None] * inward)[wall], inward[wall]
 
 
-def _summary(values: np.ndarray) -> tuple[float, float, float]:
-    p95 = np.percentile(values, 95)
-    return float(values.mean()), float(p95), float(values.max())
-
-
 def write_mjcf(anatomy: Anatomy, path: str | os.PathLike[str]) -> tuple[int, Fidelity]:
     """Write an anatomy as a model of convex geoms, with a site at the inlet and goals.
 
@@ -128,8 +206,7 @@ def write_mjcf(anatomy: Anatomy, path: str | os.PathLike[str]) -> tuple[int, Fid
         spec.worldbody.add_geom(
             name=name, type=mujoco.mjtGeom.mjGEOM_MESH, meshname=name
         )
-    places = {"inlet": anatomy.inlet, **anatomy.goals}
-    for name, place in places.items():
+    for name, place in {"inlet": anatomy.inlet, **anatomy.goals}.items():
         spec.worldbody.add_site(name=name, pos=place.position.tolist())
     spec.compile()
     files.write_text(path, spec.to_xml())

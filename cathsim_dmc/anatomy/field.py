@@ -11,11 +11,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from cathsim_dmc import file_maps
-from cathsim_dmc.anatomy.centreline import Array, VesselTree
-from cathsim_dmc.anatomy.field_loops import END, FIRST_END, depths, gradients
-from cathsim_dmc.anatomy.lattice import MARGIN
+from cathsim_dmc.anatomy.centreline import Array, VesselTree, as_points
+from cathsim_dmc.anatomy.field_loops import END, FIRST_END, MARGIN, depths, gradients
 from cathsim_dmc.anatomy.parts import End, Surface
-from cathsim_dmc.anatomy.segments import as_points
 
 EDGE = 4e-3  # m, of a brick
 # Depths, m, between which a device touches the wall: from as deep as an impact takes
@@ -71,16 +69,9 @@ class Field:
                 lumen, is `field_loops.FREE` deep; otherwise it is outside, by its
                 distance from the plane of the end.
         """
-        points = as_points(points)
-        # Writable: numba would compile another function for those that are not.
-        flat = np.require(points.reshape(-1, 3), None, ["C", "W"])
-        out = np.full(len(flat), np.nan)
-        fine = np.isfinite(flat).all(axis=1)
-        if fine.all():
-            depths(*self.arrays, flat, free, out)
-        else:  # the compiled lookup would read beyond its arrays
-            out[fine] = self(flat[fine], free)
-        return out.reshape(points.shape[:-1])
+        flat, out = _flat(points), np.empty(np.shape(points)[:-1])
+        depths(self.arrays, flat, free, out.reshape(-1))
+        return out
 
     def gradient(self, points: ArrayLike) -> Array:
         """Gradients (..., 3) of the depth at points (..., 3) m; open ends do not count.
@@ -88,14 +79,10 @@ class Field:
         They point away from the wall and change without jumps from cell to cell; NaN
         at points that are not finite.
         """
-        points = as_points(points)
-        flat = np.ascontiguousarray(points.reshape(-1, 3))
-        out = np.full(flat.shape, np.nan)
-        fine = np.isfinite(flat).all(axis=1)
-        found = np.empty((fine.sum(), 3))
-        gradients(*self.arrays, flat[fine], _STEP, found)
-        out[fine] = found
-        return out.reshape(points.shape)
+        flat = _flat(points)
+        out = np.empty(flat.shape)
+        gradients(self.arrays, flat, _STEP, out)
+        return out.reshape(np.shape(points))
 
     @property
     def arrays(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
@@ -142,34 +129,19 @@ class Field:
         """What copies hold: arrays in memory of their own."""
         return {**vars(self), "pages": None}
 
-    def __repr__(self) -> str:
-        """Bricks and memory."""
-        bricks = int((self.index >= 0).sum())
-        return f"<Field: {bricks:,} bricks, {self.nbytes / 1e6:.1f} MB>"
-
     @classmethod
-    def from_tree(cls, tree: VesselTree, ends: Sequence[End] = ()) -> Field:
-        """Field of the union of a tree's tubes.
+    def of(cls, lumen: VesselTree | Surface, ends: Sequence[End] = ()) -> Field:
+        """Field of the union of a tree's tubes, or of what a surface encloses.
 
         Args:
-            ends: flat ends; those that are open let a device pass.
-        """
-        from cathsim_dmc.anatomy.tree_depth import TreeDepth
-
-        measure = TreeDepth(tree, ends)
-        return cls.sampled(measure.around, *measure.box, ends)
-
-    @classmethod
-    def from_surface(cls, surface: Surface, ends: Sequence[End] = ()) -> Field:
-        """Field of what a closed surface encloses.
-
-        Args:
-            surface: closed, normals outwards; flat over the ends.
+            lumen: a surface is closed, with normals outwards, and flat over the ends.
             ends: flat ends; those that are open let a device pass.
         """
         from cathsim_dmc.anatomy.surface_depth import SurfaceDepth
+        from cathsim_dmc.anatomy.tree_depth import TreeDepth
 
-        measure = SurfaceDepth(surface, ends)
+        kind = SurfaceDepth if isinstance(lumen, Surface) else TreeDepth
+        measure = kind(lumen, ends)  # type: ignore[arg-type]
         return cls.sampled(measure.around, *measure.box, ends)
 
     @classmethod
@@ -197,8 +169,8 @@ class Field:
         near = _near_wall(depth, depth) | across[tuple(rows.T)]
         rows, middles = rows[near], middles[near]
         exact = _measured(measure, middles, 4)
-        eight = np.stack([coarse[tuple((rows + c).T)] for c in np.ndindex(2, 2, 2)], 1)
-        cells = _cells(exact, eight.reshape(-1, 2, 2, 2), LARGEST - 6 * coarse.size)
+        eight = corners[tuple(rows.T)]
+        cells = _cells(exact, eight, LARGEST - 6 * coarse.size)
         index = np.full(tuple(shape), -1, dtype=np.int32)
         parts, end = [], 0
         for n in np.unique(cells[cells > 1]):
@@ -207,10 +179,10 @@ class Field:
                 depth = exact[chosen, :: 4 // n, :: 4 // n, :: 4 // n]
             else:
                 depth = _measured(measure, middles[chosen], n)
-            size = 1 + (n + 1) ** 3
-            index[tuple(rows[chosen].T)] = end + size * np.arange(len(depth))
-            bricks = np.full((len(depth), size), n, dtype=np.int16)
+            bricks = np.full((len(depth), 1 + (n + 1) ** 3), n, dtype=np.int16)
             bricks[:, 1:] = _whole(depth).reshape(len(depth), -1)
+            first = end + bricks.shape[1] * np.arange(len(depth))
+            index[tuple(rows[chosen].T)] = first
             parts.append(bricks.ravel())
             end += bricks.size
         free = [(*e.position, *e.direction, e.radius, e.radius) for e in ends if e.open]
@@ -219,21 +191,27 @@ class Field:
         return cls(head, _whole(coarse).ravel(), index.ravel(), samples)
 
 
+def _flat(points: ArrayLike) -> Array:
+    # Writable: numba would compile another function for those that are not.
+    return np.require(as_points(points).reshape(-1, 3), None, ["C", "W"])
+
+
 def _corners(measure: Measure, origin: Array, shape: np.ndarray) -> Array:
     """Depths m at all corners of bricks; far outside, those of a block's middle."""
-    blocks = -(-shape // _TOGETHER)
-    rows = np.stack(np.meshgrid(*(np.arange(n) for n in blocks), indexing="ij"), -1)
-    steps = EDGE * (np.arange(_TOGETHER) - (_TOGETHER - 1) / 2)
-    lattice = np.meshgrid(steps, steps, steps, indexing="ij")
-    local = np.stack(lattice, -1).reshape(-1, 3).astype(np.float64)
-    middles: Array = origin + EDGE * (_TOGETHER * rows + (_TOGETHER - 1) / 2)
-    middles = middles.reshape(-1, 3)
+    blocks, half = -(-shape // _TOGETHER), (_TOGETHER - 1) / 2
+    middles = origin + EDGE * (_TOGETHER * _lattice(*map(np.arange, blocks)) + half)
+    local = _lattice(*[EDGE * (np.arange(_TOGETHER) - half)] * 3)
     depth = np.repeat(measure(middles, np.zeros((1, 3))), len(local), axis=1)
     near = depth[:, 0] > _FAR
     depth[near] = measure(middles[near], local)
     depth = depth.reshape(*blocks, _TOGETHER, _TOGETHER, _TOGETHER)
     depth = depth.transpose(0, 3, 1, 4, 2, 5).reshape(_TOGETHER * blocks)
     return depth[: shape[0], : shape[1], : shape[2]]
+
+
+def _lattice(*along: np.ndarray) -> Array:
+    """Points (n, 3) of a lattice by their places along the three axes."""
+    return np.stack(np.meshgrid(*along, indexing="ij"), -1).reshape(-1, 3)
 
 
 def _near_wall(low: Array, high: Array) -> np.ndarray:
@@ -245,15 +223,11 @@ def _near_wall(low: Array, high: Array) -> np.ndarray:
 
 def _measured(measure: Measure, middles: Array, cells: int) -> Array:
     """Depths (n, c + 1, c + 1, c + 1) m in bricks with middles (n, 3) m."""
-    steps = EDGE * (np.arange(cells + 1) / cells - 0.5)
-    local = np.stack(np.meshgrid(steps, steps, steps, indexing="ij"), -1)
-    parts = [
-        measure(middles[first : first + _CHUNK], local.reshape(-1, 3))
-        for first in range(0, len(middles), _CHUNK)
-    ]
-    return np.concatenate(parts or [np.empty((0, local.size // 3))]).reshape(
-        -1, *local.shape[:-1]
-    )
+    local = _lattice(*[EDGE * (np.arange(cells + 1) / cells - 0.5)] * 3)
+    parts = [np.empty((0, len(local)))]
+    for first in range(0, len(middles), _CHUNK):
+        parts.append(measure(middles[first : first + _CHUNK], local))
+    return np.concatenate(parts).reshape(-1, cells + 1, cells + 1, cells + 1)
 
 
 def _cells(exact: Array, eight: Array, room: int) -> np.ndarray:

@@ -10,7 +10,7 @@ import hashlib
 import io
 import lzma
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from functools import cache
 from pathlib import Path
 
@@ -31,7 +31,7 @@ _SHIPPED = Path(__file__).parent / "data"
 _DIGITS = 9  # of lengths, m, that count: processors round differently
 _SUFFIX = ".npy"
 # Modules whose code decides what a field holds.
-_MODULES = ("field", "tree_depth", "tree_depth_loops")
+_MODULES = ("field", "tree_depth")
 
 
 def cache_folder() -> Path:
@@ -40,51 +40,21 @@ def cache_folder() -> Path:
     return Path(home) / "cathsim_dmc" / "fields"
 
 
-def tree_field(tree: VesselTree, ends: Sequence[End] = ()) -> Field:
-    """As `Field.from_tree`, read from the cache if it was built before."""
-    name = _name(_parts(tree), ends)
-    return _cached(name, lambda: Field.from_tree(tree, ends))
-
-
-def shipped_path(tree: VesselTree, ends: Sequence[End] = ()) -> Path:
-    """Where the field of a tree is, if it comes with the package."""
-    return _SHIPPED / f"{_name(_parts(tree), ends)[:16]}.field"
-
-
-def surface_field(surface: Surface, ends: Sequence[End] = ()) -> Field:
-    """As `Field.from_surface`, read from the cache if it was built before."""
-    name = _name([surface.vertices, surface.faces], ends)
-    return _cached(name, lambda: Field.from_surface(surface, ends))
-
-
-def _parts(tree: VesselTree) -> list[np.ndarray]:
-    lines = [vessel.centreline for vessel in tree.vessels.values()]
-    return [part for line in lines for part in (line.points, line.radii)]
-
-
-def _name(parts: Sequence[np.ndarray], ends: Sequence[End]) -> str:
-    flat = [(*e.position, *e.direction, e.radius, e.open) for e in ends]
-    digest = hashlib.sha256()
-    for part in (*parts, np.array(flat)):
-        rounded = np.round(part, _DIGITS) + 0  # no negative zeros
-        digest.update(f"{part.dtype}{part.shape}".encode() + rounded.tobytes())
-    return digest.hexdigest()
-
-
-def _cached(name: str, build: Callable[[], Field]) -> Field:
-    """A field from the cache, or built and kept.
+def field_of(lumen: VesselTree | Surface, ends: Sequence[End] = ()) -> Field:
+    """As `Field.of`, read from the cache if it was built before.
 
     It lies in the file, which is mapped into memory. A file appears whole or not at
     all, and holds its checksum: a damaged one is built again. Where the folder cannot
     be written to, nothing is kept.
     """
-    shipped = _SHIPPED / f"{name[:16]}.field"
-    digest = hashlib.sha256(name.encode() + _code()).hexdigest()
+    shipped = shipped_path(lumen, ends)
+    digest = hashlib.sha256(_name(lumen, ends).encode() + _code()).hexdigest()
     path = cache_folder() / f"{digest[:32]}{_SUFFIX}"
     try:
         field = _read(path)
     except (OSError, ValueError):
-        field = _unpacked(shipped.read_bytes()) if shipped.is_file() else build()
+        found = shipped.is_file()
+        field = _unpacked(shipped.read_bytes()) if found else Field.of(lumen, ends)
         with contextlib.suppress(OSError, ValueError):
             _keep(field, path)
             field = _read(path)
@@ -92,6 +62,25 @@ def _cached(name: str, build: Callable[[], Field]) -> Field:
         with contextlib.suppress(OSError):
             os.utime(path)
     return field
+
+
+def shipped_path(lumen: VesselTree | Surface, ends: Sequence[End] = ()) -> Path:
+    """Where the field of a lumen is, if it comes with the package."""
+    return _SHIPPED / f"{_name(lumen, ends)[:16]}.field"
+
+
+def _name(lumen: VesselTree | Surface, ends: Sequence[End]) -> str:
+    if isinstance(lumen, Surface):
+        parts = [lumen.vertices, lumen.faces]
+    else:
+        lines = [vessel.centreline for vessel in lumen.vessels.values()]
+        parts = [part for line in lines for part in (line.points, line.radii)]
+    flat = [(*e.position, *e.direction, e.radius, e.open) for e in ends]
+    digest = hashlib.sha256()
+    for part in (*parts, np.array(flat)):
+        rounded = np.round(part, _DIGITS) + 0  # no negative zeros
+        digest.update(f"{part.dtype}{part.shape}".encode() + rounded.tobytes())
+    return digest.hexdigest()
 
 
 def _read(path: Path) -> Field:
@@ -150,13 +139,9 @@ def _keep(field: Field, path: Path) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     with files.atomic_path(path) as temporary, open(temporary, "wb") as stream:
         np.save(stream, _record(field), allow_pickle=False)
-    sizes = []
-    for entry in path.parent.glob(f"*{_SUFFIX}"):
-        with contextlib.suppress(OSError):  # another process drops it
-            found = entry.stat()
-            sizes.append((found.st_mtime, found.st_size, entry))
-    total = 0
-    for _, size, entry in sorted(sizes, reverse=True):
-        total += size
-        if total > KEPT:
+    with contextlib.suppress(OSError):  # another process drops one
+        kept = [(entry.stat(), entry) for entry in path.parent.glob(f"*{_SUFFIX}")]
+        kept.sort(key=lambda pair: pair[0].st_mtime, reverse=True)
+        total = np.cumsum([size.st_size for size, _ in kept])
+        for _, entry in kept[np.searchsorted(total, KEPT, side="right") :]:
             entry.unlink(missing_ok=True)

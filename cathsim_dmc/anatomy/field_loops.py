@@ -10,6 +10,7 @@ from cathsim_dmc.compiled import compiled
 ORIGIN, EDGE, SHAPE, QUANTUM, ENDS = 0, 3, 4, 7, 8
 # Numbers of an open end: position, outward direction, radii of lumen and of its hole.
 END, FIRST_END = 8, 9
+MARGIN = 4e-3  # m, by which the box of a field exceeds the lumen
 FREE = 1.0  # m, depth of what lies behind an open end
 # As far behind an open end a device is free, m: two bricks more than the lattices there
 # belong to it. Farther off another vessel may pass.
@@ -19,57 +20,23 @@ _THICK = 5e-3
 
 
 @compiled
+def _over(head, number, x, y, z):
+    """Height (m) of a point over an open end, and squared distance from its axis."""
+    at = FIRST_END + END * number
+    dx, dy, dz = x - head[at], y - head[at + 1], z - head[at + 2]
+    level = dx * head[at + 3] + dy * head[at + 4] + dz * head[at + 5]
+    return level, dx * dx + dy * dy + dz * dz - level * level
+
+
+@compiled
 def behind(head, x, y, z):
     """How far (m) a point lies behind an open end of the lumen; 0 for all others."""
     for number in range(int(head[ENDS])):
+        level, across = _over(head, number, x, y, z)
         at = FIRST_END + END * number
-        dx, dy, dz = x - head[at], y - head[at + 1], z - head[at + 2]
-        level = dx * head[at + 3] + dy * head[at + 4] + dz * head[at + 5]
-        if 0.0 < level < _NEAR:
-            across = dx * dx + dy * dy + dz * dz - level * level
-            if across < min(head[at + 6], head[at + 7]) ** 2:
-                return level
+        if 0.0 < level < _NEAR and across < min(head[at + 6], head[at + 7]) ** 2:
+            return level
     return 0.0
-
-
-@compiled
-def capped(head, value, x, y, z):
-    """Depth (m) where flat caps leave holes in open ends, from that without caps."""
-    for number in range(int(head[ENDS])):
-        at = FIRST_END + END * number
-        radius, hole = head[at + 6], head[at + 7]
-        if hole >= radius:
-            continue
-        dx, dy, dz = x - head[at], y - head[at + 1], z - head[at + 2]
-        level = dx * head[at + 3] + dy * head[at + 4] + dz * head[at + 5]
-        across = math.sqrt(max(dx * dx + dy * dy + dz * dz - level * level, 0.0))
-        if hole < across <= radius:
-            value = min(value, -level)
-        elif across <= hole and level <= 0.0:
-            value = min(value, math.hypot(level, hole - across))
-    return value
-
-
-@compiled
-def boxed(head, x, y, z):
-    """Whether a point lies in the box of the field."""
-    edge = head[EDGE]
-    return (
-        0.0 <= x - head[0] <= edge * head[SHAPE]
-        and 0.0 <= y - head[1] <= edge * head[SHAPE + 1]
-        and 0.0 <= z - head[2] <= edge * head[SHAPE + 2]
-    )
-
-
-@compiled
-def past(head, x, y, z):
-    """Whether a point lies past the plane of an open end."""
-    for number in range(int(head[ENDS])):
-        at = FIRST_END + END * number
-        level = (x - head[at]) * head[at + 3] + (y - head[at + 1]) * head[at + 4]
-        if level + (z - head[at + 2]) * head[at + 5] > 0.0:
-            return True
-    return False
 
 
 @compiled
@@ -114,8 +81,20 @@ def depth_at(head, coarse, index, samples, x, y, z):
 
 @compiled
 def walled_at(head, coarse, index, samples, x, y, z):
-    """Depth (m) at a point, without the holes of open ends."""
-    return capped(head, depth_at(head, coarse, index, samples, x, y, z), x, y, z)
+    """Depth (m) at a point where flat caps leave holes in open ends."""
+    value = depth_at(head, coarse, index, samples, x, y, z)
+    for number in range(int(head[ENDS])):
+        at = FIRST_END + END * number
+        radius, hole = head[at + 6], head[at + 7]
+        if hole >= radius:
+            continue
+        level, across = _over(head, number, x, y, z)
+        across = math.sqrt(max(across, 0.0))
+        if hole < across <= radius:
+            value = min(value, -level)
+        elif across <= hole and level <= 0.0:
+            value = min(value, math.hypot(level, hole - across))
+    return value
 
 
 @compiled
@@ -124,23 +103,31 @@ def clearance_at(head, coarse, index, samples, x, y, z):
     if behind(head, x, y, z) > 0.0:
         return FREE
     depth = walled_at(head, coarse, index, samples, x, y, z)
-    if (depth < -_THICK or not boxed(head, x, y, z)) and past(head, x, y, z):
-        return FREE
+    edge = head[EDGE]
+    boxed = (
+        0.0 <= x - head[0] <= edge * head[SHAPE]
+        and 0.0 <= y - head[1] <= edge * head[SHAPE + 1]
+        and 0.0 <= z - head[2] <= edge * head[SHAPE + 2]
+    )
+    if depth < -_THICK or not boxed:
+        for number in range(int(head[ENDS])):
+            if _over(head, number, x, y, z)[0] > 0.0:
+                return FREE
     return depth
 
 
 @compiled
-def depths(head, coarse, index, samples, points, free, out):
+def depths(field, points, free, out):
     """Depths (n,) m at points (n, 3) m; behind open ends `FREE`, or outside."""
     for n in range(len(points)):
         x, y, z = points[n]
-        if free:
-            out[n] = clearance_at(head, coarse, index, samples, x, y, z)
-            continue
-        level = behind(head, x, y, z)
-        out[n] = depth_at(head, coarse, index, samples, x, y, z)
-        if level > 0.0:
-            out[n] = -level
+        if not math.isfinite(x + y + z):
+            out[n] = math.nan
+        elif free:
+            out[n] = clearance_at(*field, x, y, z)
+        else:
+            level = behind(field[0], x, y, z)
+            out[n] = -level if level > 0.0 else depth_at(*field, x, y, z)
 
 
 @compiled
@@ -157,10 +144,11 @@ def gradient_at(head, coarse, index, samples, x, y, z, step):
 
 
 @compiled
-def gradients(head, coarse, index, samples, points, step, out):
+def gradients(field, points, step, out):
     """Gradients (n, 3) of the depth at points (n, 3) m."""
     for n in range(len(points)):
         x, y, z = points[n]
-        gx, gy, gz = gradient_at(head, coarse, index, samples, x, y, z, step)
-        out[n, 0], out[n, 1], out[n, 2] = gx, gy, gz
-        out[n] /= 2.0 * step
+        out[n] = math.nan
+        if math.isfinite(x + y + z):
+            out[n, 0], out[n, 1], out[n, 2] = gradient_at(*field, x, y, z, step)
+            out[n] /= 2.0 * step

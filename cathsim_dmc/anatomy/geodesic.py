@@ -1,14 +1,50 @@
-"""Length of the shortest path inside the lumen to one point."""
+"""Points of a lattice inside a lumen, and the shortest paths among them to one."""
 
 from collections.abc import Callable
 
 import numpy as np
 from scipy import ndimage
 
-from cathsim_dmc.anatomy import lattice
+Depth = Callable[[np.ndarray], np.ndarray]
 
 SPACING = 1.5e-3  # m: vessels down to a radius of 1.3 mm stay connected
 FINEST = 0.4e-3  # m: the lattice is refined down to here where they do not
+
+# Points along the edges of the blocks that are looked at first, and of their parts.
+_BLOCKS = ((8, 2), (2, 1))
+# An interpolated depth may change by a little more than 1 m per m.
+_SLOPE = 1.2
+
+
+def inside(
+    depth: Depth,
+    low: np.ndarray,
+    shape: np.ndarray,
+    spacing: float,
+    above: float = 0.0,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Lattice points deeper than a depth; only blocks near the lumen are evaluated.
+
+    Args:
+        depth: signed depth (n,) m of points (n, 3) m in the lumen, > 0 inside.
+        low: (3,) m, the first point.
+        shape: (3,) numbers of points.
+        spacing: m.
+        above: m, smallest depth.
+
+    Returns:
+        (ijk (n, 3) int64, depth (n,) m).
+    """
+    size = _BLOCKS[0][0]
+    ijk = size * np.argwhere(np.ones(-(-np.asarray(shape) // size), bool))
+    for size, part in _BLOCKS:
+        half = 0.5 * (size - 1) * spacing
+        near = depth(low + spacing * ijk + half) > above - _SLOPE * np.sqrt(3) * half
+        cells = part * np.argwhere(np.ones((size // part,) * 3, bool))
+        ijk = (ijk[near][:, None] + cells).reshape(-1, 3)
+    ijk = ijk[(ijk < shape).all(-1)]
+    found = depth(low + spacing * ijk)
+    return ijk[found > above], found[found > above]
 
 
 class LumenDistance:
@@ -22,7 +58,7 @@ class LumenDistance:
 
     def __init__(
         self,
-        depth: Callable[[np.ndarray], np.ndarray],
+        depth: Depth,
         bounds: np.ndarray,
         target: np.ndarray,
         origin: np.ndarray,
@@ -47,13 +83,13 @@ class LumenDistance:
         while True:
             self._low, self._spacing = low - 1.5 * spacing, spacing
             shape = np.ceil((high - low) / spacing).astype(int) + 4
-            cells, _ = lattice.inside(depth, self._low, shape, spacing)
-            inside = np.zeros(shape, bool)
-            inside[tuple(cells.T)] = True
+            cells, _ = inside(depth, self._low, shape, spacing)
+            lumen = np.zeros(shape, bool)
+            lumen[tuple(cells.T)] = True
             start, end = (self._nearest(cells, point) for point in (target, origin))
-            costs = graph.MCP_Geometric(np.where(inside, 1.0, -1.0)).find_costs(
-                [start]
-            )[0]
+            costs = graph.MCP_Geometric(np.where(lumen, 1.0, -1.0)).find_costs([start])[
+                0
+            ]
             if np.isfinite(costs[end]):
                 break
             spacing /= 2.0

@@ -106,9 +106,9 @@ def measure(
             if None.
     """
     aorta = tree.root.centreline
+    first_chord = _chord(aorta, 0.0, _END_CHORD)
     origin = aorta.points[0] if start is None else np.asarray(start, float)
-    if axis is None:
-        axis = _chord(aorta, 0.0, _END_CHORD)
+    axis = first_chord if axis is None else axis
     along, normal = _arch_plane(aorta)
     branches = {
         name: _branch(vessel, origin, axis, along, normal)
@@ -119,9 +119,8 @@ def measure(
     # With an aberrant right subclavian the right carotid stands in the BCA's place.
     first_branch = "bca" if "bca" in branches else "rcca"
     if {first_branch, "lcca"} <= branches.keys():
-        bca = tree.vessel(first_branch)
-        ostium = bca.centreline.at(bca.ostium).position[2]
-        drop = (top_of_arch(aorta) - ostium) / branches["lcca"].diameter
+        height = _top_of_arch(aorta) - _ostium(tree.vessel(first_branch))[2]
+        drop = float(height / branches["lcca"].diameter)
     levels = {
         name: float(aorta.project(_ostium(vessel)).arc_length)
         for name, vessel in tree.vessels.items()
@@ -130,25 +129,21 @@ def measure(
     first = min(levels.values(), default=0.5 * aorta.length)
     last = max(levels.values(), default=0.5 * aorta.length)
     # Half-way to the branches on one side and to the end on the other.
-    stations = {
-        "ascending": 0.5 * first,
-        **levels,
-        "descending": 0.5 * (last + aorta.length),
-    }
+    end = 0.5 * (last + aorta.length)
+    stations = {"ascending": 0.5 * first, **levels, "descending": end}
     turn = _angle(_chord(aorta, 0.0, _START_CHORD), aorta.at(first).tangent)
+    flat = aorta.resampled(2e-3).points[:, :2]
     return ArchMeasures(
         arch_type=None if drop is None else arch_type(drop),
-        drop=None if drop is None else float(drop),
+        drop=drop,
         diameters={
             name: 2.0 * float(aorta.at(place).radius)
             for name, place in stations.items()
         },
-        span=_span(aorta),
+        span=float(np.linalg.norm(flat[:, None] - flat[None], axis=-1).max()),
         height=float(aorta.points[:, 2].max() - aorta.points[0, 2]),
         plane=math.atan2(along[0], along[1]),
-        ascending_tilt=_angle(
-            _chord(aorta, 0.0, _END_CHORD), np.array([0.0, 0.0, 1.0])
-        ),
+        ascending_tilt=_angle(first_chord, np.array([0.0, 0.0, 1.0])),
         ascending_turn=turn,
         bend_radius=first / max(turn, 1e-9),
         tightest_bend=_tightest_bend(aorta),
@@ -166,7 +161,7 @@ def inlet_axis(anatomy: Anatomy) -> Array:
     return way / np.linalg.norm(way)
 
 
-def top_of_arch(aorta: Centreline) -> float:
+def _top_of_arch(aorta: Centreline) -> float:
     """Height z (m) of the highest point of the aorta's lumen."""
     place = aorta.at(np.linspace(0.0, aorta.length, 400))
     level = np.sqrt(np.clip(1.0 - place.tangent[:, 2] ** 2, 0.0, 1.0))
@@ -174,10 +169,7 @@ def top_of_arch(aorta: Centreline) -> float:
 
 
 def _angle(first: Array, second: Array) -> float:
-    first, second = np.asarray(first, float), np.asarray(second, float)
-    return float(
-        math.atan2(np.linalg.norm(np.cross(first, second)), float(first @ second))
-    )
+    return math.atan2(np.linalg.norm(np.cross(first, second)), float(first @ second))
 
 
 def _chord(line: Centreline, s0: float, s1: float) -> Array:
@@ -198,11 +190,6 @@ def _arch_plane(aorta: Centreline) -> tuple[Array, Array]:
     if along @ (points[-1] - points[0]) < 0.0:
         along = -along
     return along, np.cross([0.0, 0.0, 1.0], along)
-
-
-def _span(aorta: Centreline) -> float:
-    flat = aorta.resampled(2e-3).points[:, :2]
-    return float(np.linalg.norm(flat[:, None] - flat[None], axis=-1).max())
 
 
 def _tightest_bend(line: Centreline) -> float:

@@ -3,10 +3,13 @@
 Lengths are metres, positions are in the patient frame LPS.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
+from typing import ClassVar
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from cathsim_dmc import bounds
 from cathsim_dmc.anatomy.centreline import Array, _readonly
@@ -16,22 +19,38 @@ from cathsim_dmc.anatomy.centreline import Array, _readonly
 INLET_HOLE_RADIUS = 2.5e-3
 
 
-def _checked(part: "Goal | Inlet | End", what: str) -> None:
-    """Checks the fields that goals, inlets and ends share, and freezes the vectors."""
-    bounds.text(f"{what} vessel", part.vessel)
-    for field in ("position", "direction"):
-        if hasattr(part, field):
-            vector = np.array(bounds.vector(f"{what} {field}", getattr(part, field), 3))
-            if field == "direction":
-                norm = np.linalg.norm(vector)
-                if norm < 1e-9:
-                    raise ValueError(f"{what} direction is zero; give a direction.")
-                vector = vector / norm
-            object.__setattr__(part, field, _readonly(vector))
+def _vector(name: str, value: ArrayLike) -> Array:
+    return _readonly(bounds.vector(name, value, 3))
+
+
+def _unit(name: str, value: ArrayLike) -> Array:
+    vector = _vector(name, value)
+    if (norm := np.linalg.norm(vector)) < 1e-9:
+        raise ValueError(f"{name} is zero; give a direction.")
+    return _readonly(vector / norm)
+
+
+class _Part:
+    """A place in a vessel, whose fields are checked by their names."""
+
+    _CHECKS: ClassVar[dict[str, Callable]] = {
+        "name": bounds.text,
+        "vessel": bounds.text,
+        "position": _vector,
+        "direction": _unit,
+        "arc_length": bounds.number,
+        "radius": partial(bounds.number, positive=True),
+        "open": bounds.switch,
+    }
+
+    def __post_init__(self) -> None:
+        what = type(self).__name__.lower()
+        for field, value in list(vars(self).items()):
+            vars(self)[field] = self._CHECKS[field](f"{what} {field}", value)
 
 
 @dataclass(frozen=True, eq=False)
-class Goal:
+class Goal(_Part):
     """A place to reach: `position` (3,), `arc_length` (m) on a vessel's centreline."""
 
     name: str
@@ -39,14 +58,9 @@ class Goal:
     position: Array
     arc_length: float
 
-    def __post_init__(self) -> None:
-        _checked(self, "goal")
-        bounds.text("goal name", self.name)
-        bounds.number("goal arc_length", self.arc_length)
-
 
 @dataclass(frozen=True, eq=False)
-class Inlet:
+class Inlet(_Part):
     """Where the device enters: `position` (3,), unit `direction` (3,) into the lumen.
 
     `radius` (m) is the lumen radius there.
@@ -57,16 +71,13 @@ class Inlet:
     direction: Array
     radius: float
 
-    def __post_init__(self) -> None:
-        _checked(self, "inlet")
-        bounds.number("inlet radius", self.radius, positive=True)
-
 
 @dataclass(frozen=True, eq=False)
-class End:
+class End(_Part):
     """A flat end of the lumen: `position` (3,), unit `direction` (3,) out of it.
 
-    `open` is true for the inlet, false where a wall cap closes the vessel.
+    `radius` (m) is that of the lumen; `open` is true for the inlet, false where a wall
+    cap closes the vessel.
     """
 
     vessel: str
@@ -74,11 +85,6 @@ class End:
     direction: Array
     radius: float
     open: bool
-
-    def __post_init__(self) -> None:
-        _checked(self, "end")
-        bounds.number("end radius", self.radius)
-        bounds.switch("end open", self.open)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -103,12 +109,7 @@ class Surface:
                 f"faces name vertices {faces.min()} to {faces.max()}; there are "
                 f"{len(vertices)}."
             )
-        object.__setattr__(self, "vertices", vertices)
-        object.__setattr__(self, "faces", faces)
-
-    def __repr__(self) -> str:
-        """Numbers of vertices and triangles."""
-        return f"<Surface: {len(self.vertices)} vertices, {len(self.faces)} triangles>"
+        vars(self).update(vertices=vertices, faces=faces)
 
     @property
     def volume(self) -> float:

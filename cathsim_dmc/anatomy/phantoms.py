@@ -3,6 +3,7 @@
 from functools import lru_cache
 from pathlib import Path
 
+from cathsim_dmc import bounds
 from cathsim_dmc.anatomy.anatomy import Anatomy
 from cathsim_dmc.anatomy.arch import arch
 from cathsim_dmc.anatomy.builder import ACCESSES
@@ -32,10 +33,8 @@ def load(name: str, *, access: str = "ascending") -> Anatomy:
     Raises:
         ValueError: if there is no such phantom or access; the message lists them.
     """
-    if name not in PHANTOMS:
-        raise ValueError(f"no phantom {name!r}; there are {', '.join(PHANTOMS)}.")
-    if access not in ACCESSES:
-        raise ValueError(f"access is {access!r}; choose one of {', '.join(ACCESSES)}.")
+    bounds.choice("phantom", name, PHANTOMS)
+    bounds.choice("access", access, ACCESSES)
     if name in TREES:
         return _built(name, access)
     return arch.build_arch(arch.ARCHES[name], name, access=access)

@@ -1,9 +1,8 @@
 """Triangles of the lumen surface, from the depth field of the vessel tree."""
 
-from collections.abc import Sequence
-
 import numpy as np
 
+from cathsim_dmc import bounds
 from cathsim_dmc.anatomy.centreline import Array, VesselTree
 from cathsim_dmc.anatomy.parts import Surface
 
@@ -20,7 +19,7 @@ class TubeSurface(Surface):
 
     def __init__(self, tree: VesselTree):
         """Keeps the tree."""
-        object.__setattr__(self, "_tree", tree)
+        vars(self)["_tree"] = tree
 
     def __getattr__(self, name: str):
         """Vertices and faces, which are there from then on."""
@@ -30,24 +29,20 @@ class TubeSurface(Surface):
         return vars(self)[name]
 
 
-def depth_grid(tree: VesselTree, spacing: float) -> tuple[Array, Array]:
+def _depth_grid(tree: VesselTree, spacing: float) -> tuple[Array, Array]:
     """Closed depth field (nx, ny, nz) and the position (3,) of its first point.
 
     Only points near a vessel are computed; elsewhere the field is -2 spacing.
     """
+    lines = [(one.centreline, one.parent is None) for one in tree.vessels.values()]
     margin = 3.0 * spacing
-    low = np.full(3, np.inf)
-    high = np.full(3, -np.inf)
-    for vessel in tree.vessels.values():
-        line = vessel.centreline
-        low = np.minimum(low, (line.points - line.radii[:, None]).min(axis=0))
-        high = np.maximum(high, (line.points + line.radii[:, None]).max(axis=0))
+    low = np.min([(x.points - x.radii[:, None]).min(0) for x, _ in lines], axis=0)
+    high = np.max([(x.points + x.radii[:, None]).max(0) for x, _ in lines], axis=0)
     origin = low - margin
     shape = np.ceil((high - low + 2.0 * margin) / spacing).astype(int) + 1
     axes = [origin[i] + spacing * np.arange(shape[i]) for i in range(3)]
     grid = np.full(shape, -2.0 * spacing)
-    for vessel in tree.vessels.values():
-        line = vessel.centreline
+    for line, is_root in lines:
         # Short pieces have small boxes: few grid points meet few segments.
         count = max(1, round(line.length / 10e-3))
         stops = np.linspace(0.0, line.length, count + 1)
@@ -55,39 +50,26 @@ def depth_grid(tree: VesselTree, spacing: float) -> tuple[Array, Array]:
             part = line.slice(s0, s1)
             reach = part.radii.max() + margin
             box = []
-            for i in range(3):
-                first = np.searchsorted(axes[i], part.points[:, i].min() - reach)
-                last = np.searchsorted(axes[i], part.points[:, i].max() + reach)
-                box.append(slice(first, last))
-            mesh = np.meshgrid(*(axes[i][box[i]] for i in range(3)), indexing="ij")
-            near = part.project(np.stack(mesh, axis=-1))
+            for axis, places in zip(axes, part.points.T, strict=True):
+                ends = places.min() - reach, places.max() + reach
+                box.append(slice(*np.searchsorted(axis, ends)))
+            x, y, z = np.meshgrid(*(axes[i][box[i]] for i in range(3)), indexing="ij")
+            near = part.project(np.stack([x, y, z], axis=-1))
             depth = near.radius - near.distance
             # Pieces have round ends, which only repeat what the neighbouring piece
             # says; those that reach over a flat end of the vessel are cut there.
-            if line.length - s1 < reach:
-                end = line.at(line.length)
-                depth = np.minimum(depth, _behind(mesh, end.position, end.tangent))
-            if s0 < reach and vessel.parent is None:
-                end = line.at(0.0)
-                depth = np.minimum(depth, _behind(mesh, end.position, -end.tangent))
+            for s, side, reaches in (
+                (line.length, 1.0, line.length - s1 < reach),
+                (0.0, -1.0, s0 < reach and is_root),
+            ):
+                if reaches:
+                    end = line.at(s)
+                    way = side * end.tangent
+                    along = x * way[0] + y * way[1] + z * way[2]
+                    depth = np.minimum(depth, float(way @ end.position) - along)
             view = grid[tuple(box)]
             np.maximum(view, depth, out=view)
     return grid, origin
-
-
-def _behind(mesh: Sequence[Array], position: Array, direction: Array) -> Array:
-    """Distance (m) of grid points behind the plane through `position`."""
-    level = float(direction @ position)
-    x, y, z = mesh
-    return level - (x * direction[0] + y * direction[1] + z * direction[2])
-
-
-def fitting_spacing(tree: VesselTree) -> float:
-    """Grid step (m) that shows the narrowest lumen of a tree without gaps."""
-    narrowest = min(
-        float(vessel.centreline.radii.min()) for vessel in tree.vessels.values()
-    )
-    return min(SPACING, max(_NARROW * narrowest, _LEAST_SPACING))
 
 
 def lumen_surface(tree: VesselTree, spacing: float | None = None) -> Surface:
@@ -95,16 +77,17 @@ def lumen_surface(tree: VesselTree, spacing: float | None = None) -> Surface:
 
     Args:
         tree: vessels; the flat ends of the tubes are closed by triangles.
-        spacing: grid step (m) of the marching cubes; `fitting_spacing` if None.
+        spacing: grid step (m) of the marching cubes; if None one that shows the
+            narrowest lumen without gaps.
     """
-    if spacing is None:
-        spacing = fitting_spacing(tree)
-    if not spacing > 0.0:
-        raise ValueError(f"spacing is {spacing:g} m; it must be > 0.")
     from scipy.ndimage import binary_fill_holes
     from skimage.measure import marching_cubes
 
-    grid, origin = depth_grid(tree, spacing)
+    if spacing is None:
+        radii = [vessel.centreline.radii.min() for vessel in tree.vessels.values()]
+        spacing = min(SPACING, max(_NARROW * float(min(radii)), _LEAST_SPACING))
+    bounds.number("spacing", spacing, positive=True)
+    grid, origin = _depth_grid(tree, spacing)
     # Vessels that meet may leave a grid point between them by less than a micrometre.
     grid[binary_fill_holes(grid > 0.0) & (grid <= 0.0)] = 0.1 * spacing
     vertices, faces, _, _ = marching_cubes(

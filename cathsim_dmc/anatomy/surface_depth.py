@@ -5,9 +5,9 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.sparse import coo_array
 
-from cathsim_dmc.anatomy.lattice import MARGIN
+from cathsim_dmc.anatomy.centreline import Array
+from cathsim_dmc.anatomy.field_loops import MARGIN
 from cathsim_dmc.anatomy.parts import End, Surface
-from cathsim_dmc.anatomy.segments import Array
 
 # Cosines: of normals of neighbours, and up to which a normal tells inside from outside.
 _SMOOTH, _BEFORE = 0.5, 0.9

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import numpy as np
 
 from cathsim_dmc.anatomy.centreline import Array, Centreline, VesselTree
 from cathsim_dmc.anatomy.parts import End
-from cathsim_dmc.anatomy.tree_depth_loops import onto_creases, tree_depths
+from cathsim_dmc.compiled import compiled
 
 # Farther from the wall than this, m, another vessel does not matter to a point.
 _SLACK = 3e-3
@@ -19,7 +20,10 @@ _APART = 0.1e-3
 _GROUP = 2.5  # points along each axis of a group, about
 # Projections on the one wall and the other; walls that meet at 30° take the most.
 _ROUNDS = 30
-_ON_BOTH = 5e-6  # m
+# A place on a wall that lies no further than this inside another vessel is wall, m.
+_TOUCHING = 5e-6
+# As far behind an open end, m, its lumen goes on; another vessel may pass farther off.
+_BEHIND = 20e-3
 
 
 class TreeDepth:
@@ -41,46 +45,34 @@ class TreeDepth:
             ends: flat ends of the tree; those that are not named are closed.
         """
         lines = [vessel.centreline for vessel in tree.vessels.values()]
+        stops = np.cumsum([0, *(len(line.points) for line in lines)])
+
+        def closed(point: Array) -> bool:
+            free = [end.position for end in ends if end.open]
+            return all(np.linalg.norm(point - place) >= 1e-6 for place in free)
+
+        # Centres (3), unit tangents (3) and radii of all rings; the first and the last
+        # of each vessel; its two ends: 0 open, 1 closed, 2 within another vessel.
         self._nodes = np.concatenate([_rings(line) for line in lines])
-        stops = np.cumsum([len(line.points) for line in lines])
-        starts = np.concatenate([[0], stops[:-1]])
-        self._spans = np.stack([starts, stops - 1], axis=1)
-        free = [end.position for end in ends if end.open]
-        self._flats = np.array(
-            [
-                [
-                    2 if row and not at_end else int(not _among(free, line, at_end))
-                    for at_end in (0, 1)
-                ]
-                for row, line in enumerate(lines)
-            ]
-        )
+        self._spans = np.stack([stops[:-1], stops[1:] - 1], axis=1)
+        first = [2 if row else closed(x.points[0]) for row, x in enumerate(lines)]
+        last = [closed(line.points[-1]) for line in lines]
+        self._tree = self._nodes, self._spans, np.stack([first, last], 1).astype(int)
         self._creases = self._find_creases()
 
     def __call__(self, points: Array) -> Array:
         """Signed distances (n,) m at points (n, 3) m, > 0 inside."""
-        points = np.asarray(points, dtype=np.float64).reshape(-1, 3)
         return self.around(points, np.zeros((1, 3)))[:, 0]
 
     def around(self, blocks: Array, points: Array) -> Array:
         """Signed distances (n, m) m at blocks (n, 3) + points (m, 3) m, > 0 inside."""
-        blocks, points = np.asarray(blocks), np.asarray(points)
-        groups, middles, reaches = _grouped(points)
-        out = np.empty((len(blocks), len(points)))
-        tree_depths(
-            self._nodes,
-            self._spans,
-            self._flats,
-            self._creases,
-            np.ascontiguousarray(blocks, dtype=np.float64),
-            np.ascontiguousarray(points, dtype=np.float64),
-            float(np.linalg.norm(points, axis=1).max()),
-            groups,
-            middles,
-            reaches,
-            _SLACK,
-            out,
+        blocks, points = (
+            np.ascontiguousarray(each, dtype=np.float64) for each in (blocks, points)
         )
+        reach = float(np.linalg.norm(points, axis=1).max())
+        out = np.empty((len(blocks), len(points)))
+        groups = _grouped(points)
+        _tree_depths(self._tree, self._creases, blocks, points, reach, groups, out)
         return out
 
     @property
@@ -94,14 +86,13 @@ class TreeDepth:
         for one in range(count):
             for two in range(one + 1, count):
                 seeds = self._on_walls(two)
-                first, last = self._spans[one]
-                low, high = _box(self._nodes[first : last + 1])
+                low, high = _box(self._rings_of(one))
                 seeds = seeds[((seeds > low) & (seeds < high)).all(axis=1)]
                 seeds = seeds[np.abs(self._onto(one, two, seeds, 0)[:, 0]) < _SEED]
                 left = self._onto(one, two, seeds, _ROUNDS)
-                seeds = seeds[(np.abs(left) < _ON_BOTH).all(axis=1)]
+                seeds = seeds[(np.abs(left) < _TOUCHING).all(axis=1)]
                 for other in set(range(count)) - {one, two}:
-                    inside = self._onto(other, two, seeds, 0)[:, 0] > _ON_BOTH
+                    inside = self._onto(other, two, seeds, 0)[:, 0] > _TOUCHING
                     seeds = seeds[~inside]
                 # Many seeds come to one place.
                 _, kept = np.unique(np.rint(seeds / _APART), axis=0, return_index=True)
@@ -111,15 +102,16 @@ class TreeDepth:
     def _onto(self, one: int, two: int, seeds: Array, rounds: int) -> Array:
         """Moves seeds (n, 3) onto both walls; their depths (n, 2) in both, m."""
         left = np.empty((len(seeds), 2))
-        onto_creases(
-            self._nodes, self._spans, self._flats, one, two, seeds, rounds, left
-        )
+        _onto_creases(self._tree, (one, two), seeds, rounds, left)
         return left
+
+    def _rings_of(self, vessel: int) -> Array:
+        first, last = self._spans[vessel]
+        return self._nodes[first : last + 1]
 
     def _on_walls(self, vessel: int) -> Array:
         """Points (n, 3) on the rings of a vessel, m."""
-        first, last = self._spans[vessel]
-        nodes = self._nodes[first : last + 1]
+        nodes = self._rings_of(vessel)
         across = np.eye(3)[np.abs(nodes[:, 3:6]).argmin(axis=1)]
         u = np.cross(nodes[:, 3:6], across)
         u /= np.linalg.norm(u, axis=1, keepdims=True)
@@ -138,25 +130,258 @@ def _rings(line: Centreline) -> Array:
     return np.concatenate([line.points, tangents, line.radii[:, None]], axis=1)
 
 
-def _grouped(points: Array) -> tuple[np.ndarray, Array, Array]:
-    along = max(1, round(len(points) ** (1 / 3) / _GROUP))
-    size = max(float(np.ptp(points, axis=0).max()), 1e-9) / along
-    cells = ((points - points.min(axis=0)) / size).astype(int).clip(0, along - 1)
-    _, groups = np.unique(cells @ (1, along, along**2), return_inverse=True)
-    middles, reaches = [], []
-    for group in range(groups.max() + 1):
-        own = points[groups == group]
-        middles.append(own.mean(axis=0))
-        reaches.append(np.linalg.norm(own - middles[-1], axis=1).max())
-    return groups, np.array(middles), np.array(reaches)
-
-
 def _box(nodes: Array) -> tuple[Array, Array]:
     centres, radii = nodes[:, :3], nodes[:, 6:]
     return (centres - radii).min(axis=0), (centres + radii).max(axis=0)
 
 
-def _among(places: Sequence[Array], line: Centreline, at_end: int) -> bool:
-    """Whether an end of a centreline is one of some places."""
-    point = line.points[-at_end]
-    return any(np.linalg.norm(point - place) < 1e-6 for place in places)
+def _grouped(points: Array) -> tuple[np.ndarray, Array, Array]:
+    """Groups (m,) of near points (m, 3), their middles (g, 3) and reaches (g,)."""
+    along = max(1, round(len(points) ** (1 / 3) / _GROUP))
+    size = max(float(np.ptp(points, axis=0).max()), 1e-9) / along
+    cells = ((points - points.min(axis=0)) / size).astype(int).clip(0, along - 1)
+    _, groups = np.unique(cells @ (1, along, along**2), return_inverse=True)
+    parts = [points[groups == group] for group in range(groups.max() + 1)]
+    middles = [own.mean(axis=0) for own in parts]
+    reaches = [
+        np.linalg.norm(own - middle, axis=1).max()
+        for own, middle in zip(parts, middles, strict=True)
+    ]
+    return groups, np.array(middles), np.array(reaches)
+
+
+@compiled
+def _ring(nodes, k, u, x, y, z):
+    """A ring between nodes k and k + 1: axial and radial place of a point, radius."""
+    v = 1.0 - u
+    a, b = nodes[k], nodes[k + 1]
+    dx = x - (v * a[0] + u * b[0])
+    dy = y - (v * a[1] + u * b[1])
+    dz = z - (v * a[2] + u * b[2])
+    tx, ty, tz = v * a[3] + u * b[3], v * a[4] + u * b[4], v * a[5] + u * b[5]
+    axial = (dx * tx + dy * ty + dz * tz) / math.sqrt(tx * tx + ty * ty + tz * tz)
+    across = max(dx * dx + dy * dy + dz * dz - axial * axial, 0.0)
+    return axial, math.sqrt(across), v * a[6] + u * b[6]
+
+
+@compiled
+def _from_ring(nodes, k, u, x, y, z):
+    """Squared distance of a point from a ring between nodes k and k + 1."""
+    axial, radial, radius = _ring(nodes, k, u, x, y, z)
+    return axial * axial + (radial - radius) ** 2
+
+
+@compiled
+def _from_node(nodes, k, x, y, z):
+    """Squared distance of a point from the ring of a node."""
+    dx, dy, dz = x - nodes[k, 0], y - nodes[k, 1], z - nodes[k, 2]
+    axial = dx * nodes[k, 3] + dy * nodes[k, 4] + dz * nodes[k, 5]
+    whole = dx * dx + dy * dy + dz * dz
+    radius = nodes[k, 6]
+    # axial² + (radial - radius)²
+    across = math.sqrt(max(whole - axial * axial, 0.0))
+    return whole + radius * (radius - 2.0 * across)
+
+
+@compiled
+def _nearest(nodes, first, last, chosen, x, y, z):
+    """The ring of one vessel that is nearest to a point: (segment, share, square)."""
+    best, at = np.inf, first
+    for k in chosen:
+        value = _from_node(nodes, k, x, y, z)
+        if value < best:
+            best, at = value, k
+    # In a segment the square is a parabola, but for how much the tangent turns.
+    place, value = min(at, last - 1), best
+    share = 1.0 if at == last else 0.0
+    for k in range(max(at - 1, first), min(at + 1, last)):
+        f0, f1 = _from_node(nodes, k, x, y, z), _from_node(nodes, k + 1, x, y, z)
+        middle = _from_ring(nodes, k, 0.5, x, y, z)
+        bend, slope = 2.0 * f0 - 4.0 * middle + 2.0 * f1, 4.0 * middle - 3.0 * f0 - f1
+        if bend <= 0.0 or slope >= 0.0 or -slope >= 2.0 * bend:
+            continue
+        u = -0.5 * slope / bend
+        lower = _from_ring(nodes, k, u, x, y, z)
+        if lower < value:
+            place, share, value = k, u, lower
+    return place, share, value
+
+
+@compiled
+def _signed(tree, vessel, chosen, x, y, z, out):
+    """Signed depth (m) in one vessel, and the nearest place of its wall in `out`.
+
+    Args:
+        tree: arrays of `TreeDepth`.
+        chosen: numbers of the vessel's rings that matter.
+    """
+    nodes, (first, last), flats = tree[0], tree[1][vessel], tree[2][vessel]
+    k, u, value = _nearest(nodes, first, last, chosen, x, y, z)
+    axial, radial, radius = _ring(nodes, k, u, x, y, z)
+    inside = radial < radius
+    # The place on the ring, in the point's half plane.
+    a, b, v = nodes[k], nodes[k + 1], 1.0 - u
+    tx, ty, tz = v * a[3] + u * b[3], v * a[4] + u * b[4], v * a[5] + u * b[5]
+    shift = axial / math.sqrt(tx * tx + ty * ty + tz * tz)
+    cx, cy, cz = v * a[0] + u * b[0], v * a[1] + u * b[1], v * a[2] + u * b[2]
+    ex, ey, ez = x - cx - shift * tx, y - cy - shift * ty, z - cz - shift * tz
+    length = math.sqrt(ex * ex + ey * ey + ez * ez)
+    if length < 1e-12:
+        ex, ey, ez = ty - tz, tz - tx, tx - ty
+        length = math.sqrt(ex * ex + ey * ey + ez * ez)
+    scale = radius / length
+    out[0], out[1], out[2] = cx + scale * ex, cy + scale * ey, cz + scale * ez
+    distance = math.sqrt(max(value, 0.0))
+    place = k + u
+    for end in range(2):
+        k, u, way = (first, 0.0, -1.0) if end == 0 else (last - 1, 1.0, 1.0)
+        axial, radial, radius = _ring(nodes, k, u, x, y, z)
+        level = way * axial
+        if radial > radius or (level <= 0.0 and flats[end] != 1):
+            continue
+        if level > 0.0:
+            if abs(place - k - u) > 0.01:
+                continue  # beside another part of a vessel that turns back
+            # Beyond an open end the lumen goes on as a straight tube.
+            inside = flats[end] == 0 and level < _BEHIND
+        if flats[end] == 1 and abs(level) < distance:
+            distance = abs(level)
+            node = nodes[first] if end == 0 else nodes[last]
+            out[0] = x - axial * node[3]
+            out[1] = y - axial * node[4]
+            out[2] = z - axial * node[5]
+    return distance if inside else -distance
+
+
+@compiled
+def _square(place, x, y, z):
+    return (place[0] - x) ** 2 + (place[1] - y) ** 2 + (place[2] - z) ** 2
+
+
+@compiled
+def _rings_near(nodes, among, x, y, z, margin, chosen):
+    """Depth of the rings of one vessel around a place.
+
+    Those that matter are written behind their number, chosen[0].
+    """
+    best, deepest, count = np.inf, -np.inf, 0
+    for k in among:
+        best = min(best, _from_node(nodes, k, x, y, z))
+        deepest = max(deepest, nodes[k, 6] - math.sqrt(_square(nodes[k], x, y, z)))
+    limit = (math.sqrt(best) + margin) ** 2
+    for k in among:
+        if _from_node(nodes, k, x, y, z) <= limit:
+            count += 1
+            chosen[count] = k
+    chosen[0] = count
+    return deepest
+
+
+@compiled
+def _creases_near(creases, among, x, y, z, margin, near):
+    """Those of the creases that matter around a place, a part of `near`."""
+    closest, found = np.inf, 0
+    for c in among:
+        closest = min(closest, _square(creases[c], x, y, z))
+    limit = (math.sqrt(closest) + margin) ** 2
+    for c in among:
+        if _square(creases[c], x, y, z) <= limit:
+            near[found] = c
+            found += 1
+    return near[:found]
+
+
+@compiled
+def _tree_depths(tree, creases, blocks, points, reach, groups, out):
+    """Signed distance to the wall at every point of every block.
+
+    Args:
+        tree: arrays of `TreeDepth`.
+        creases: (c, 3) points where walls of two vessels meet, m.
+        blocks: (n, 3) middles of the blocks, m.
+        points: (q, 3) relative to the middle of a block, m, within `reach`.
+        groups: see `_grouped`; middles are relative to that of a block.
+        out: (n, q) m, > 0 inside.
+    """
+    nodes, spans, _ = tree
+    group, middles, reaches = groups
+    vessels = len(spans)
+    rings, edges = np.arange(len(nodes)), np.arange(len(creases))
+    wide = np.empty((vessels, len(nodes) + 1), np.int64)
+    close = np.empty((vessels, len(nodes) + 1), np.int64)
+    level, depths = np.empty(vessels), np.empty(vessels)
+    first, second = np.empty(len(creases), np.int64), np.empty(len(creases), np.int64)
+    places = np.empty((2, 3))
+    for n in range(len(blocks)):
+        x, y, z = blocks[n]
+        margin = 2.0 * reach + _SLACK
+        for v in range(vessels):
+            among = rings[spans[v, 0] : spans[v, 1] + 1]
+            level[v] = _rings_near(nodes, among, x, y, z, margin, wide[v])
+        bar = level.max() - margin
+        around = _creases_near(creases, edges, x, y, z, 2.0 * reach + 1e-6, first)
+        for g in range(len(middles)):
+            gx, gy, gz = x + middles[g, 0], y + middles[g, 1], z + middles[g, 2]
+            margin = 2.0 * reaches[g] + 1e-6
+            for v in range(vessels):
+                depths[v] = -np.inf
+                if level[v] >= bar:
+                    among = wide[v, 1 : 1 + wide[v, 0]]
+                    depths[v] = _rings_near(nodes, among, gx, gy, gz, margin, close[v])
+            lowest = depths.max() - 2.0 * reaches[g] - _SLACK
+            near = _creases_near(creases, around, gx, gy, gz, margin, second)
+            here = depths >= lowest, close, level >= bar - _SLACK, wide, places
+            for q in range(len(points)):
+                if group[q] == g:
+                    px, py, pz = x + points[q, 0], y + points[q, 1], z + points[q, 2]
+                    depth = _tree_depth(tree, here, px, py, pz)
+                    closest = np.inf
+                    for c in near:
+                        closest = min(closest, _square(creases[c], px, py, pz))
+                    distance = min(abs(depth), math.sqrt(closest))
+                    out[n, q] = math.copysign(distance, depth)
+
+
+@compiled
+def _tree_depth(tree, here, x, y, z):
+    """Signed distance (m) of one point from the walls, without creases.
+
+    Args:
+        tree: arrays of `TreeDepth`.
+        here: which vessels matter to the point, and their rings; the same of those
+            that may hold the wall of another; scratch (2, 3).
+    """
+    matters, close, others, wide, places = here
+    inside, distance = False, np.inf
+    for v in range(len(matters)):
+        if not matters[v]:
+            continue
+        rings, wall = close[v, 1 : 1 + close[v, 0]], places[0]
+        depth = _signed(tree, v, rings, x, y, z, wall)
+        inside = inside or depth > 0.0
+        if abs(depth) >= distance:
+            continue
+        valid = True
+        for w in range(len(others)):
+            if valid and w != v and others[w]:
+                rings, (a, b, c) = wide[w, 1 : 1 + wide[w, 0]], wall
+                valid = _signed(tree, w, rings, a, b, c, places[1]) <= _TOUCHING
+        if valid:
+            distance = abs(depth)
+    return distance if inside else -distance
+
+
+@compiled
+def _onto_creases(tree, pair, seeds, rounds, left):
+    """Moves seeds (n, 3) to where the walls of two vessels meet; (n, 2) depths left."""
+    nodes, spans, _ = tree
+    every, place = np.arange(len(nodes)), np.empty(3)
+    for n in range(len(seeds)):
+        for turn in range(rounds + 1):
+            for row in range(2):
+                first, last = spans[pair[row]]
+                x, y, z = seeds[n]
+                rings = every[first : last + 1]
+                left[n, row] = _signed(tree, pair[row], rings, x, y, z, place)
+                if turn < rounds:
+                    seeds[n] = place

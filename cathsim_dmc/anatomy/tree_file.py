@@ -47,6 +47,11 @@ _MM = 1e-3
 _FARTHEST = 2000.0
 _RADII = (0.3, 60.0)
 _MOST_POINTS = 20_000
+# Ways to say where an inlet or a goal is.
+_WAYS = {
+    "inlet": ("end", "arc_length_mm"),
+    "goal": ("arc_length_mm", "past_ostium_mm", "position_mm"),
+}
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,15 +61,14 @@ class TreeFile:
     Attributes:
         name: of the anatomy.
         curves: centrelines by name, the root first.
-        inlets: vessel and arc length along it, infinite for its last point, by name of
-            the access; the first is the usual one.
+        inlets: by name of the access; the first is the usual one.
         goals: by name; None for one in each branch.
         note: where the figures come from.
     """
 
     name: str
     curves: Mapping[str, Curve]
-    inlets: Mapping[str, tuple[str, float]]
+    inlets: Mapping[str, VesselPlace]
     goals: Mapping[str, VesselPlace] | None = None
     note: str = field(default="", repr=False)
 
@@ -76,12 +80,8 @@ class TreeFile:
         """Anatomy that is entered by `access`, by default the first inlet's."""
         if access is None:
             access = next(iter(self.inlets))
-        vessel, arc = self.inlets[bounds.choice("access", access, self.inlets)]
-        tree = self.tree()
-        if arc == math.inf:
-            arc = tree.vessel(vessel).centreline.length
-        inlet = VesselPlace(vessel, arc_length=arc)
-        return Anatomy.from_tree(tree, self.name, inlet=inlet, goals=self.goals)
+        inlet = self.inlets[bounds.choice("access", access, self.inlets)]
+        return Anatomy.from_tree(self.tree(), self.name, inlet=inlet, goals=self.goals)
 
 
 def read_tree(path: str | os.PathLike[str]) -> TreeFile:
@@ -111,18 +111,17 @@ def parse_tree(content: Any) -> TreeFile:
         curves[key] = _curve(f"vessel {key!r}", entry, flip, list(curves))
     root = next(iter(curves), "")
     bounds.choice("the first of vessels", root, curves)
-    inlets = {
-        key: _inlet(f"inlet {key!r}", entry, curves)
-        for key, entry in _parts(content, "inlets")
-    }
-    goals = {
-        key: _goal(f"goal {key!r}", entry, curves, flip)
-        for key, entry in _parts(content, "goals")
-    }
+    inlets, goals = (
+        {
+            key: _place(f"{kind} {key!r}", entry, ways, curves, flip)
+            for key, entry in _parts(content, f"{kind}s")
+        }
+        for kind, ways in _WAYS.items()
+    )
     return TreeFile(
         bounds.text("name", content["name"]),
         curves,
-        inlets or {"first": (root, 0.0)},
+        inlets or {"first": VesselPlace(root, arc_length=0.0)},
         goals if "goals" in content else None,
         bounds.instance("note", content.get("note", ""), str),
     )
@@ -170,39 +169,24 @@ def _numbers(name: str, value: Any, columns: int) -> np.ndarray:
 
 
 def _place(
-    where: str, entry: Any, curves: Mapping[str, Curve], ways: tuple
-) -> tuple[str, str]:
-    """Vessel of an entry, and the one of the ways to say a place that it has."""
+    where: str, entry: Any, ways: tuple, curves: Mapping[str, Curve], flip: np.ndarray
+) -> VesselPlace:
     _entries(where, entry, ("vessel",), ways)
     given = [way for way in ways if way in entry]
     if len(given) != 1:
         raise ValueError(f"{where}: give one of {', '.join(ways)}.")
-    return bounds.choice(f"vessel of {where}", entry["vessel"], curves), given[0]
-
-
-def _length(where: str, entry: Mapping[str, Any], way: str) -> float:
-    return bounds.number(f"{where}: {way}", entry[way], 0.0, _FARTHEST, "mm") * _MM
-
-
-def _inlet(where: str, entry: Any, curves: Mapping[str, Curve]) -> tuple[str, float]:
-    vessel, way = _place(where, entry, curves, ("end", "arc_length_mm"))
-    if way == "arc_length_mm":
-        return vessel, _length(where, entry, way)
-    ends = {"first": 0.0, "last": math.inf}
-    if curves[vessel].parent is not None:
-        del ends["first"]
-    return vessel, ends[bounds.choice(f"{where}: end", entry["end"], ends)]
-
-
-def _goal(
-    where: str, entry: Any, curves: Mapping[str, Curve], flip: np.ndarray
-) -> VesselPlace:
-    ways = ("arc_length_mm", "past_ostium_mm", "position_mm")
-    vessel, way = _place(where, entry, curves, ways)
+    vessel = bounds.choice(f"vessel of {where}", entry["vessel"], curves)
+    way, name = given[0], f"{where}: {given[0]}"
+    value = entry[way]
+    if way == "end":
+        ends = {"first": 0.0, "last": math.inf}
+        if curves[vessel].parent is not None:
+            del ends["first"]
+        return VesselPlace(vessel, arc_length=ends[bounds.choice(name, value, ends)])
     if way == "position_mm":
-        position = np.array(bounds.vector(f"{where}: {way}", entry[way], 3))
-        return VesselPlace(vessel, position=position * flip * _MM)
-    length = _length(where, entry, way)
+        position = np.array(bounds.vector(name, value, 3)) * flip * _MM
+        return VesselPlace(vessel, position=position)
+    length = bounds.number(name, value, 0.0, _FARTHEST, "mm") * _MM
     if way == "past_ostium_mm":
         return VesselPlace(vessel, past_ostium=length)
     return VesselPlace(vessel, arc_length=length)

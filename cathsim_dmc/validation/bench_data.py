@@ -88,7 +88,7 @@ class Bench:
         """Depth in the lumen, larger by a factor about the entry."""
         middle, vertices = self.entry.position, self.surface.vertices
         surface = Surface(middle + scale * (vertices - middle), self.surface.faces)
-        return Field.from_surface(surface, [self.entry])
+        return Field.of(surface, [self.entry])
 
 
 def length_of(points: np.ndarray) -> float:

@@ -22,7 +22,7 @@ from dm_control import mjcf
 from lxml import etree
 
 from cathsim_dmc import bounds, suite
-from cathsim_dmc.anatomy.convex_wall import wall_pieces
+from cathsim_dmc.anatomy.export import wall_pieces
 from cathsim_dmc.entities.phantom import read_mesh_file
 from cathsim_dmc.entities.sheath import Sheath
 from cathsim_dmc.files import atomic_directory

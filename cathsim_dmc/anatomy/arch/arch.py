@@ -13,8 +13,8 @@ import math
 from collections.abc import Mapping
 from dataclasses import replace
 from functools import lru_cache
-from types import MappingProxyType
 
+from cathsim_dmc import bounds
 from cathsim_dmc.anatomy.anatomy import Anatomy
 from cathsim_dmc.anatomy.arch.parameters import (
     INLET_TUBE,
@@ -30,7 +30,7 @@ from cathsim_dmc.anatomy.arch.sampler import (
     sample,
 )
 from cathsim_dmc.anatomy.arch.tree import arch_tree
-from cathsim_dmc.anatomy.builder import VesselPlace, access_inlet
+from cathsim_dmc.anatomy.builder import ACCESSES, VesselPlace
 from cathsim_dmc.anatomy.centreline import VesselTree
 
 __all__ = [
@@ -48,15 +48,9 @@ __all__ = [
 
 def _goals(params: ArchParameters, tree: VesselTree) -> dict[str, VesselPlace]:
     goals = {
-        name: VesselPlace(name, past_ostium=getattr(params, name).goal_depth)
-        for name in ("bca", "lcca", "lsa")
+        name: VesselPlace(name, past_ostium=branch.goal_depth)
+        for name, branch in params.branches.items()
     }
-    if params.aberrant is not None:
-        goals = {
-            "rcca": replace(goals.pop("bca"), vessel="rcca"),
-            **goals,
-            "rsa": VesselPlace("rsa", past_ostium=params.aberrant.goal_depth),
-        }
     arc = tree.root.centreline.length - params.descending_goal_depth
     goals["descending"] = VesselPlace("aorta", arc_length=arc)
     return goals
@@ -78,10 +72,11 @@ def build_arch(
     Raises:
         ValueError: if the parameters give no valid arch.
     """
+    bounds.choice("access", access, ACCESSES)
     tree = arch_tree(params)
-    return Anatomy.from_tree(
-        tree, name, inlet=access_inlet(tree, access), goals=_goals(params, tree)
-    )
+    arc = 0.0 if access == "ascending" else math.inf
+    inlet = VesselPlace(tree.root.name, arc_length=arc)
+    return Anatomy.from_tree(tree, name, inlet=inlet, goals=_goals(params, tree))
 
 
 def build_seed(seed: ArchSeed, *, access: str = "ascending") -> Anatomy:
@@ -186,6 +181,9 @@ BOVINE = replace(
     lcca_lsa_spacing=36.1e-3,
     bovine=True,
 )
-ARCHES: Mapping[str, ArchParameters] = MappingProxyType(
-    {"simple1": TYPE_I, "simple2": TYPE_II, "type3": TYPE_III, "bovine": BOVINE}
-)
+ARCHES: Mapping[str, ArchParameters] = {
+    "simple1": TYPE_I,
+    "simple2": TYPE_II,
+    "type3": TYPE_III,
+    "bovine": BOVINE,
+}

@@ -12,7 +12,6 @@ MINIMUM_SEPTUM = 1e-3
 # the ascending aorta.
 INLET_TUBE = 70e-3
 
-
 LEVELS = ("ascending", "bca_level", "lcca_level", "lsa_level", "descending")
 # Least and largest value of each figure, and its unit.
 _TURN = 2.0 * math.pi
@@ -80,9 +79,9 @@ class BranchParameters:
         for name, limits in _OF_BRANCH.items():
             bounds.number(f"branch {name}", getattr(self, name), *limits)
         for name in ("bend_radius", "second_bend_radius"):
-            bend = getattr(self, name)
-            if bend is not None or name == "bend_radius":
-                bounds.number(f"branch {name}", bend, 3.0 * self.radius, 10.0, "m")
+            if getattr(self, name) is not None or name == "bend_radius":
+                least = 3.0 * self.radius
+                bounds.number(f"branch {name}", getattr(self, name), least, 10.0, "m")
         deepest = self.length - 5e-3
         bounds.number("branch goal_depth", self.goal_depth, 5e-3, deepest, "m")
 
@@ -153,59 +152,56 @@ class ArchParameters:
 
     def __post_init__(self) -> None:
         for name in ("bca", "lcca", "lsa", "aberrant"):
-            branch = getattr(self, name)
-            if not isinstance(branch, BranchParameters) and (
-                branch is not None or name != "aberrant"
-            ):
-                bounds.refuse(name, branch, "BranchParameters")
+            if getattr(self, name) is not None or name != "aberrant":
+                bounds.instance(name, getattr(self, name), BranchParameters)
         bounds.switch("bovine", self.bovine)
         for name, limits in _OF_ARCH.items():
             bounds.number(name, getattr(self, name), *limits)
-        deepest = self.descending_length
-        name = "descending_goal_depth"
+        name, deepest = "descending_goal_depth", self.descending_length
         bounds.number(name, self.descending_goal_depth, 5e-3, deepest, "m")
         self._check_bends()
         self._check_spacings()
 
+    @property
+    def branches(self) -> dict[str, BranchParameters]:
+        """The branches by the names of their vessels, in the order of the arch."""
+        if self.aberrant is None:
+            return {"bca": self.bca, "lcca": self.lcca, "lsa": self.lsa}
+        first = {"rcca": self.bca, "lcca": self.lcca}
+        return {**first, "lsa": self.lsa, "rsa": self.aberrant}
+
     def _check_bends(self) -> None:
         widest = max(getattr(self, f"{level}_radius") for level in LEVELS)
         radius, height = self.arch_radius, self.arch_height
-        tightest = min(radius**2 / height, height**2 / radius)
-        if tightest < 1.25 * widest:
-            raise ValueError(
-                f"the arch (arch_radius {radius:g} m, arch_height {height:g} m) bends "
-                f"with a radius of {tightest:g} m; it must be at least 1.25 times the "
-                f"widest lumen radius ({widest:g} m). Enlarge arch_radius and "
-                "arch_height or bring them closer together."
-            )
+        bends = {"arch": min(radius**2 / height, height**2 / radius)}
         for limb in ("ascending", "descending"):
-            length = getattr(self, f"{limb}_length")
-            bend = abs(getattr(self, f"{limb}_bend"))
-            if length < 1.25 * widest * bend:
+            if bend := abs(getattr(self, f"{limb}_bend")):
+                bends[f"{limb} limb"] = getattr(self, f"{limb}_length") / bend
+        for name, bend in bends.items():
+            if bend < 1.25 * widest:
                 raise ValueError(
-                    f"the {limb} limb ({length:g} m long) turns by {bend:g} rad, with "
-                    f"a radius of {length / bend:g} m; it must be at least 1.25 times "
-                    f"the widest lumen radius ({widest:g} m). Reduce {limb}_bend."
+                    f"the {name} bends with a radius of {bend:g} m; it must be at "
+                    f"least 1.25 times the widest lumen radius ({widest:g} m). Enlarge "
+                    "arch_radius and arch_height, or reduce the limb's bend."
                 )
 
     def _check_spacings(self) -> None:
-        before_lsa = self.bca if self.bovine else self.lcca
-        pairs = [("lcca_lsa_spacing", before_lsa, self.lsa)]
+        # Leave the ostium before branching, and keep the branch on the trunk.
+        before_lsa, low, high = self.bca, self.lcca.radius + 2e-3, 25e-3
         if not self.bovine:
-            pairs.append(("bca_lcca_spacing", self.bca, self.lcca))
+            before_lsa, high = self.lcca, 80e-3
+            low = self.bca.radius + self.lcca.radius + MINIMUM_SEPTUM
+        elif self.aberrant is not None:
+            raise ValueError("an arch is bovine or has an aberrant, not both.")
+        elif self.lcca.radius > 0.8 * self.bca.radius:
+            raise ValueError(
+                f"a bovine LCCA of radius {self.lcca.radius:g} m needs a BCA of "
+                f"radius {self.lcca.radius / 0.8:g} m or more."
+            )
+        bounds.number("bca_lcca_spacing", self.bca_lcca_spacing, low, high, "m")
+        pairs = {"lcca_lsa_spacing": (before_lsa, self.lsa)}
         if self.aberrant is not None:
-            if self.bovine:
-                raise ValueError("an arch is bovine or has an aberrant, not both.")
-            pairs.append(("lsa_aberrant_spacing", self.lsa, self.aberrant))
-        for name, first, second in pairs:
+            pairs["lsa_aberrant_spacing"] = self.lsa, self.aberrant
+        for name, (first, second) in pairs.items():
             need = first.radius + second.radius + MINIMUM_SEPTUM
             bounds.number(name, getattr(self, name), need, 80e-3, "m")
-        if self.bovine:
-            # Leave the ostium before branching, and keep the branch on the trunk.
-            low = self.lcca.radius + 2e-3
-            bounds.number("bca_lcca_spacing", self.bca_lcca_spacing, low, 25e-3, "m")
-            if self.lcca.radius > 0.8 * self.bca.radius:
-                raise ValueError(
-                    f"a bovine LCCA of radius {self.lcca.radius:g} m needs a BCA of "
-                    f"radius {self.lcca.radius / 0.8:g} m or more."
-                )

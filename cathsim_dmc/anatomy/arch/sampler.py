@@ -4,19 +4,21 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from types import MappingProxyType
 
 import numpy as np
 
+from cathsim_dmc import bounds
 from cathsim_dmc.anatomy import measures
 from cathsim_dmc.anatomy.arch.parameters import ArchParameters, BranchParameters
 from cathsim_dmc.anatomy.arch.tree import arch_tree
 
 # Range of the BCA drop in LCCA diameters for each type of arch (class by the
 # vertical distance from the BCA origin to the top of the arch).
-DROP_RANGES: Mapping[str, tuple[float, float]] = MappingProxyType(
-    {"I": (0.0, 1.0), "II": (1.0, 2.0), "III": (2.0, 3.0)}
-)
+DROP_RANGES: Mapping[str, tuple[float, float]] = {
+    "I": (0.0, 1.0),
+    "II": (1.0, 2.0),
+    "III": (2.0, 3.0),
+}
 # How the branches leave the arch. Bovine: a common trunk of BCA and LCCA (78 %), or
 # the LCCA off the BCA further on (22 %). Aberrant: the right subclavian artery leaves
 # last and passes behind; the right carotid leaves first.
@@ -24,27 +26,21 @@ VARIANTS = ("normal", "bovine_trunk", "bovine_branch", "aberrant")
 # Share of the types I, II and III (one of the published cohorts).
 _PREVALENCE = (0.336, 0.434, 0.230)
 # Mean and standard deviation of the lumen diameters of the aorta, m (61 aortas).
-AORTA_DIAMETERS = MappingProxyType(
-    {
-        "ascending_radius": (29.5e-3, 3.9e-3),
-        "bca_level_radius": (28.6e-3, 3.9e-3),
-        "lcca_level_radius": (27.1e-3, 3.2e-3),
-        "lsa_level_radius": (25.3e-3, 3.0e-3),
-        "descending_radius": (23.9e-3, 3.3e-3),
-    }
-)
+AORTA_DIAMETERS = {
+    "ascending_radius": (29.5e-3, 3.9e-3),
+    "bca_level_radius": (28.6e-3, 3.9e-3),
+    "lcca_level_radius": (27.1e-3, 3.2e-3),
+    "lsa_level_radius": (25.3e-3, 3.0e-3),
+    "descending_radius": (23.9e-3, 3.3e-3),
+}
 # The same for branch diameters at the origin, m (217 CT angiographies) ...
-BRANCH_DIAMETERS = MappingProxyType(
-    {
-        "bca": (12.5e-3, 1.95e-3),
-        "lcca": (8.28e-3, 1.51e-3),
-        "lsa": (10.4e-3, 2.2e-3),
-    }
-)
+BRANCH_DIAMETERS = {
+    "bca": (12.5e-3, 1.95e-3),
+    "lcca": (8.28e-3, 1.51e-3),
+    "lsa": (10.4e-3, 2.2e-3),
+}
 # ... and take-off angles, degrees, upstream positive (118 CT studies).
-TAKE_OFFS = MappingProxyType(
-    {"bca": (44.9, 15.9), "lcca": (25.7, 15.5), "lsa": (-28.8, 14.5)}
-)
+TAKE_OFFS = {"bca": (44.9, 15.9), "lcca": (25.7, 15.5), "lsa": (-28.8, 14.5)}
 # From the root to the BCA along the centreline, m; angle of the plane of the arch from
 # the sagittal plane, degrees (BCA-LSA line).
 ASCENDING_LENGTH = (62.6e-3, 11.4e-3)
@@ -100,29 +96,27 @@ def sample(
         ValueError: if `arch_type` or `variant` is unknown.
     """
     if arch_type is None:
-        place = np.searchsorted(np.cumsum(_PREVALENCE), random_state.uniform())
-        arch_type = list(DROP_RANGES)[min(int(place), 2)]
-    if arch_type not in DROP_RANGES:
-        raise ValueError(
-            f"arch_type is {arch_type!r}; choose one of {', '.join(DROP_RANGES)}."
-        )
-    if variant not in VARIANTS:
-        raise ValueError(
-            f"variant is {variant!r}; choose one of {', '.join(VARIANTS)}."
-        )
+        arch_type = _kind(random_state.uniform())
+    bounds.choice("arch_type", arch_type, DROP_RANGES)
+    bounds.choice("variant", variant, VARIANTS)
     for _ in range(_ATTEMPTS):
         # Independent draws now and then give branches that cross: draw again.
         draw = _Draw(random_state)
         drop = draw.uniform(*DROP_RANGES[arch_type])
         try:
-            params = _corrected(
-                _draw(draw, drop, variant), drop, draw.normal(*ASCENDING_LENGTH)
-            )
+            params = _draw(draw, drop, variant)
+            params = _corrected(params, drop, draw.normal(*ASCENDING_LENGTH))
         except ValueError:
             continue
         if params is not None:
             return params
     raise RuntimeError(f"no valid arch of type {arch_type} in {_ATTEMPTS} attempts.")
+
+
+def _kind(share: float) -> str:
+    """Type of arch at a share (0 to 1) of all by prevalence."""
+    place = np.searchsorted(np.cumsum(_PREVALENCE), share)
+    return list(DROP_RANGES)[min(int(place), 2)]
 
 
 @dataclass(frozen=True)
@@ -156,8 +150,9 @@ def _corrected(
     for _ in range(_CORRECTIONS):
         tree = arch_tree(params)
         found = measures.measure(tree)
-        first = next(name for name, one in tree.vessels.items() if one.parent)
-        short = ascending - _level(tree, first)
+        first = next(one for one in tree.vessels.values() if one.parent)
+        ostium = first.centreline.at(first.ostium).position
+        short = ascending - float(tree.root.centreline.project(ostium).arc_length)
         if found.drop is None:  # without the branches that it is measured by
             return None
         low = drop - found.drop
@@ -174,12 +169,6 @@ def _corrected(
     else:
         return None
     return params if measures.arch_type(drop) == found.arch_type else None
-
-
-def _level(tree, name: str) -> float:
-    vessel = tree.vessel(name)
-    ostium = vessel.centreline.at(vessel.ostium).position
-    return float(tree.root.centreline.project(ostium).arc_length)
 
 
 def _draw(draw: _Draw, drop: float, variant: str) -> ArchParameters:
@@ -241,14 +230,10 @@ def _draw(draw: _Draw, drop: float, variant: str) -> ArchParameters:
 
 
 def _aorta(draw: _Draw) -> dict[str, float]:
-    common = draw.score()
+    share, common = math.sqrt(_AORTA_CORRELATION), draw.score()
     own = math.sqrt(1.0 - _AORTA_CORRELATION)
     return {
-        name: 0.5
-        * (
-            mean
-            + deviation * (math.sqrt(_AORTA_CORRELATION) * common + own * draw.score())
-        )
+        name: 0.5 * (mean + deviation * (share * common + own * draw.score()))
         for name, (mean, deviation) in AORTA_DIAMETERS.items()
     }
 
@@ -271,12 +256,10 @@ def _branch(draw: _Draw, name: str) -> BranchParameters:
         lean=math.radians(draw.normal(*_LEAN)),
         second_bend_radius=draw.uniform(*bends),
         # Most turn back, as arteries that go up the neck do.
-        second_bend_azimuth=_wrapped(towards + turn + math.pi + draw.normal(0.0, 0.8)),
+        second_bend_azimuth=math.remainder(
+            towards + turn + math.pi + draw.normal(0.0, 0.8), 2.0 * math.pi
+        ),
     )
-
-
-def _wrapped(angle: float) -> float:
-    return math.remainder(angle, 2.0 * math.pi)
 
 
 @dataclass(frozen=True)
@@ -326,9 +309,7 @@ def arch_set(name: str) -> tuple[ArchSeed, ...]:
     Raises:
         ValueError: if there is no such set.
     """
-    if name not in SETS:
-        raise ValueError(f"no set {name!r} of arches; there are {', '.join(SETS)}.")
-    first = _FIRST_SEEDS[name]
+    first = _FIRST_SEEDS[bounds.choice("set of arches", name, SETS)]
     if name == "test":
         kinds = [(kind, "normal") for kind in ("I", "II") * (TEST_SIZE // 2)]
     elif name == "test_variants":
@@ -339,12 +320,11 @@ def arch_set(name: str) -> tuple[ArchSeed, ...]:
         kinds = []
         for _ in range(TRAIN_SIZE):
             kind, bovine, trunk = source.uniform(size=3)
-            place = np.searchsorted(np.cumsum(_PREVALENCE), kind)
             variant = "normal"
             if bovine < _BOVINE_SHARE:
                 is_trunk = trunk < _BOVINE_TRUNK_SHARE
                 variant = "bovine_trunk" if is_trunk else "bovine_branch"
-            kinds.append((list(DROP_RANGES)[min(int(place), 2)], variant))
+            kinds.append((_kind(kind), variant))
     return tuple(
         ArchSeed(first + index, kind, variant)
         for index, (kind, variant) in enumerate(kinds)

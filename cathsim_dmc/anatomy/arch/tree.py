@@ -11,9 +11,14 @@ from cathsim_dmc.anatomy.arch.parameters import (
     ArchParameters,
     BranchParameters,
 )
-from cathsim_dmc.anatomy.centreline import Array, Centreline, Vessel, VesselTree
-from cathsim_dmc.anatomy.segments import arc_lengths
-from cathsim_dmc.anatomy.septa import check_septa
+from cathsim_dmc.anatomy.centreline import (
+    Array,
+    Centreline,
+    Vessel,
+    VesselTree,
+    arc_lengths,
+)
+from cathsim_dmc.anatomy.curves import check_septa
 
 # Polyline steps, m: the chord of 2 mm on a 34 mm arch departs 0.015 mm from it.
 _STRAIGHT_STEP = 5e-3
@@ -59,7 +64,7 @@ def _aorta_points(p: ArchParameters) -> Array:
     return np.concatenate([rise[:-1], ellipse, fall[1:]])
 
 
-def _outer_curve(p: ArchParameters) -> tuple[Array, Array, Array, dict[str, float]]:
+def _outer_curve(p: ArchParameters) -> tuple[Array, Array, Array, list[float]]:
     """Aorta in its plane: points (n, 2), radii (n,), outer curve, branch levels.
 
     The levels are arc lengths on the centreline. They depend on the outer curve,
@@ -71,11 +76,11 @@ def _outer_curve(p: ArchParameters) -> tuple[Array, Array, Array, dict[str, floa
     tangent /= np.linalg.norm(tangent, axis=1)[:, None]
     outward = np.stack([-tangent[:, 1], tangent[:, 0]], axis=1)
     top = s[points[:, 1].argmax()]
-    levels = {"bca": top - 15e-3, "lcca": top, "lsa": top + 12e-3}
+    levels = [top - 15e-3, top, top + 12e-3]
     arch_end = float(s[-1] - p.descending_length)
+    radii_of = np.array([getattr(p, f"{level}_radius") for level in LEVELS])
     for _ in range(8):
-        main = [levels[name] for name in ("bca", "lcca", "lsa")]
-        stations = np.array([0.5 * p.ascending_length, *main, arch_end])
+        stations = np.array([0.5 * p.ascending_length, *levels[:3], arch_end])
         if np.any(np.diff(stations) <= 1e-3):
             raise ValueError(
                 f"the branches lie at {np.round(stations[1:4] * 1e3, 1).tolist()} mm "
@@ -84,8 +89,7 @@ def _outer_curve(p: ArchParameters) -> tuple[Array, Array, Array, dict[str, floa
                 f"({arch_end * 1e3:.1f} mm); reduce bca_drop or the spacings, or "
                 "enlarge the arch."
             )
-        levels_of = [getattr(p, f"{level}_radius") for level in LEVELS]
-        radii = _smooth_interpolation(s, stations, np.array(levels_of))
+        radii = _smooth_interpolation(s, stations, radii_of)
         outer = points + radii[:, None] * outward
         arc = arc_lengths(outer)
         summit = outer[:, 1].argmax()
@@ -98,12 +102,9 @@ def _outer_curve(p: ArchParameters) -> tuple[Array, Array, Array, dict[str, floa
         else:
             lcca = bca + p.bca_lcca_spacing
             lsa = lcca + p.lcca_lsa_spacing
-        places = {"bca": bca, "lcca": lcca, "lsa": lsa}
-        if p.aberrant is not None:
-            places["rsa"] = lsa + p.lsa_aberrant_spacing
-        levels = {
-            name: float(np.interp(place, arc, s)) for name, place in places.items()
-        }
+        places = [bca, lcca, lsa, lsa + p.lsa_aberrant_spacing]
+        places = places[: len(p.branches)]
+        levels = [float(np.interp(place, arc, s)) for place in places]
     return points, radii, outer, levels
 
 
@@ -118,11 +119,8 @@ def _in_space(p: ArchParameters, plane: Plane, flat: Array) -> Array:
 def _direction(branch: BranchParameters, plane: Plane) -> Array:
     upright = np.array([0.0, 0.0, 1.0])
     aside = np.cross(upright, plane.along)
-    direction = (
-        upright
-        - math.tan(branch.take_off) * plane.along
-        + math.tan(branch.lean) * aside
-    )
+    upstream, lean = math.tan(branch.take_off), math.tan(branch.lean)
+    direction = upright - upstream * plane.along + lean * aside
     return direction / np.linalg.norm(direction)
 
 
@@ -132,15 +130,11 @@ def arch_tree(params: ArchParameters) -> VesselTree:
     points, radii, outer, levels = _outer_curve(params)
     aorta = Vessel("aorta", Centreline(_in_space(params, plane, points), radii))
     vessels = {"aorta": aorta}
-    first = "bca" if params.aberrant is None else "rcca"
-    branches = {first: params.bca, "lcca": params.lcca, "lsa": params.lsa}
-    if params.aberrant is not None:
-        branches["rsa"] = params.aberrant
-    septa = _septa(params)
-    for name, branch in branches.items():
+    for (name, branch), level, septum in zip(
+        params.branches.items(), levels, _septa(params), strict=True
+    ):
         direction = _direction(branch, plane)
-        level = "bca" if name == "rcca" else name
-        fillet = min(params.fillet, 0.4 * max(septa[level] - MINIMUM_SEPTUM, 0.0))
+        fillet = min(params.fillet, 0.4 * max(septum - MINIMUM_SEPTUM, 0.0))
         parent = aorta
         if name == "lcca" and params.bovine:
             parent = vessels["bca"]
@@ -152,7 +146,7 @@ def arch_tree(params: ArchParameters) -> VesselTree:
             ostium = trunk.position + trunk.radius * across
             fillet = min(fillet, 0.9 * trunk.radius - branch.radius, 1e-3)
         else:
-            ostium = _ostium(points, outer, levels[level], aorta, plane, branch.lean)
+            ostium = _ostium(points, outer, level, aorta, plane, branch.lean)
         vessels[name] = branch_vessel(
             name, branch, parent, ostium, direction, plane, max(float(fillet), 0.0)
         )
@@ -162,22 +156,15 @@ def arch_tree(params: ArchParameters) -> VesselTree:
 
 
 def _ostium(
-    points: Array,
-    outer: Array,
-    level: float,
-    aorta: Vessel,
-    plane: Plane,
-    lean: float,
+    points: Array, outer: Array, level: float, aorta: Vessel, plane: Plane, lean: float
 ) -> Array:
     """Point (3,) on the aorta's surface, `lean` round it from its outer curve."""
-    flat = arc_lengths(points)
-    index = float(np.interp(level, flat, np.arange(len(flat))))
+    flat, numbers = arc_lengths(points), np.arange(len(points))
+    index = float(np.interp(level, flat, numbers))
     # The curve in space is a little longer than the one in the plane.
-    s = float(np.interp(index, np.arange(len(flat)), aorta.centreline.arc_length))
-    way = outer - points
-    outward = plane.to_world(
-        np.array([np.interp(level, flat, way[:, axis]) for axis in (0, 1)])
-    )
+    s = float(np.interp(index, numbers, aorta.centreline.arc_length))
+    way = [np.interp(level, flat, axis) for axis in (outer - points).T]
+    outward = plane.to_world(np.array(way))
     place = aorta.centreline.at(s)
     outward = outward - (outward @ place.tangent) * place.tangent
     outward /= np.linalg.norm(outward)
@@ -187,19 +174,17 @@ def _ostium(
     return place.position + float(place.radius) * around
 
 
-def _septa(params: ArchParameters) -> dict[str, float]:
-    """Wall (m) between each ostium, without its flare, and its nearest neighbour."""
-    first = params.bca if params.bovine else params.lcca
-    after = params.lcca_lsa_spacing - first.radius - params.lsa.radius
-    before = math.inf
+def _septa(params: ArchParameters) -> list[float]:
+    """Wall (m) between the ostium of each branch, without its flare, and the nearest.
+
+    That of a bovine LCCA is on the BCA.
+    """
+    radii = [branch.radius for branch in params.branches.values()]
+    before, last = math.inf, math.inf
+    after = params.lcca_lsa_spacing - radii[0 if params.bovine else 1] - radii[2]
     if not params.bovine:
-        before = params.bca_lcca_spacing - params.bca.radius - params.lcca.radius
-    last = math.inf
+        before = params.bca_lcca_spacing - radii[0] - radii[1]
     if params.aberrant is not None:
-        last = params.lsa_aberrant_spacing - params.lsa.radius - params.aberrant.radius
-    return {
-        "bca": before,
-        "lcca": min(before, after),
-        "lsa": min(after, last),
-        "rsa": last,
-    }
+        last = params.lsa_aberrant_spacing - radii[2] - radii[3]
+    septa = [before, min(before, after), min(after, last), last]
+    return septa[: len(radii)]

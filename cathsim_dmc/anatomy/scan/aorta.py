@@ -9,10 +9,10 @@ import numpy as np
 from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.distance import cdist
 
+from cathsim_dmc.anatomy.centreline import arc_lengths
 from cathsim_dmc.anatomy.scan.centring import resample
 from cathsim_dmc.anatomy.scan.ends import FreeEnd
 from cathsim_dmc.anatomy.scan.ways import Ways
-from cathsim_dmc.anatomy.segments import arc_lengths
 
 RADIUS = 4.5e-3  # m, least median radius of an aorta
 THIN = 0.25  # of the widest end: ends that are no wider are no end of the aorta

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import cKDTree
 
-from cathsim_dmc.anatomy import lattice
+from cathsim_dmc.anatomy import geodesic
 from cathsim_dmc.anatomy.anatomy import Anatomy
 from cathsim_dmc.anatomy.centreline import Vessel
 from cathsim_dmc.anatomy.parts import INLET_HOLE_RADIUS
@@ -241,7 +241,7 @@ def _lumen_beyond(
     low = position - 0.5 * (shape - 1) * spacing
     # Lattice points lie beside the middle. Tails are cut off at `TAIL_RADIUS`.
     deep = max(PASSABLE, TAIL_RADIUS - 0.5 * spacing)
-    ijk, _ = lattice.inside(depth, low, shape, spacing, deep)
+    ijk, _ = geodesic.inside(depth, low, shape, spacing, deep)
     local = low + spacing * ijk - position
     along = local @ tangent
     aside = np.linalg.norm(local - along[:, None] * tangent, axis=1)

@@ -8,10 +8,10 @@ from itertools import product
 
 import numpy as np
 
+from cathsim_dmc.anatomy.centreline import arc_lengths
 from cathsim_dmc.anatomy.scan.aorta import BRANCH, Bend, chord
 from cathsim_dmc.anatomy.scan.offshoots import Offshoot, common, depth_of
 from cathsim_dmc.anatomy.scan.ways import Ways
-from cathsim_dmc.anatomy.segments import arc_lengths
 
 SURE = 0.95  # least probability of a name, and of the end at the heart
 EXTRA = 0.002  # probability that a branch is none of those that are looked for

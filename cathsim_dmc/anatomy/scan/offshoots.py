@@ -8,11 +8,11 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import cKDTree
 
+from cathsim_dmc.anatomy.centreline import arc_lengths
 from cathsim_dmc.anatomy.scan.aorta import Bend
 from cathsim_dmc.anatomy.scan.centring import resample
 from cathsim_dmc.anatomy.scan.topology import groups
 from cathsim_dmc.anatomy.scan.ways import CELL, Ways
-from cathsim_dmc.anatomy.segments import arc_lengths
 
 OUT = 1.15  # radii of the aorta beyond which a branch has left it
 SHARED = 3e-3  # m beyond that, which curves of one branch share

@@ -7,7 +7,7 @@ from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import connected_components, dijkstra
 from scipy.spatial import cKDTree
 
-from cathsim_dmc.anatomy import lattice
+from cathsim_dmc.anatomy import geodesic
 from cathsim_dmc.anatomy.scan.centring import resample
 from cathsim_dmc.anatomy.surface_depth import SurfaceDepth
 
@@ -37,7 +37,7 @@ class Ways:
         """Build the lattice graph of a depth ``field`` (26 neighbours)."""
         low, high = field.box
         size = np.ceil((high - low) / spacing).astype(int) + 1
-        ijk, depth = lattice.inside(field, low, size, spacing, SHALLOW)
+        ijk, depth = geodesic.inside(field, low, size, spacing, SHALLOW)
         points = low + spacing * ijk
         shape = tuple((ijk.max(axis=0) + 3).tolist())
         key = np.asarray(np.ravel_multi_index(tuple((ijk + 1).T), shape))
