@@ -128,12 +128,10 @@ class Anatomy:
 
     def goal(self, name: str) -> Goal:
         """Goal called `name`; ValueError lists those that there are."""
-        try:
-            return self.goals[name]
-        except KeyError:
-            raise ValueError(
-                f"no goal {name!r}; there are {', '.join(self.goals) or 'none'}."
-            ) from None
+        if name not in self.goals:
+            known = ", ".join(self.goals) or "none"
+            raise ValueError(f"no goal {name!r}; there are {known}.")
+        return self.goals[name]
 
     def route(self, goal: str | Goal, spare: float = 0.0) -> Centreline:
         """Polyline with radii from the inlet to a goal, or `spare` (m) past it."""
@@ -141,8 +139,7 @@ class Anatomy:
         end = self.tree.vessel(target.vessel).centreline.length
         there = min(target.arc_length + spare, end)
         entered = self.inlet.vessel
-        line = self.tree.vessel(entered).centreline
-        start = float(line.project(self.inlet.position).arc_length)
+        start = self.tree.vessel(entered).centreline.locate(self.inlet.position)
         return self.tree.route(entered, target.vessel, there, start_arc_length=start)
 
     def save(self, directory: str | os.PathLike[str]) -> Path:

@@ -46,7 +46,7 @@ class VesselPlace:
         vessel = tree.vessel(self.vessel)
         line = vessel.centreline
         if self.position is not None:
-            return float(line.project(np.asarray(self.position, float)).arc_length)
+            return line.locate(self.position)
         if self.arc_length is not None:
             arc = line.length if self.arc_length == math.inf else self.arc_length
         else:
@@ -81,8 +81,8 @@ def placed(
     if inlet.vessel == tree.root.name:
         # Arc lengths count from the new first point.
         for key, goal in found.items():
-            near = tree.vessel(goal.vessel).centreline.project(goal.position)
-            found[key] = replace(goal, arc_length=float(near.arc_length))
+            line = tree.vessel(goal.vessel).centreline
+            found[key] = replace(goal, arc_length=line.locate(goal.position))
 
     def end(name: str, arc: float, side: float, is_open: bool) -> End:
         place = tree.vessel(name).centreline.at(arc)
@@ -111,9 +111,7 @@ def default_goals(tree: VesselTree) -> dict[str, Goal]:
         deepest = min(vessel.ostium + GOAL_DEPTH, vessel.centreline.length - _GOAL_END)
         for fork in tree.vessels.values():
             if fork.parent == name:
-                ostium = fork.centreline.at(fork.ostium).position
-                level = float(vessel.centreline.project(ostium).arc_length)
-                deepest = min(deepest, level)
+                deepest = min(deepest, vessel.centreline.locate(fork.mouth.position))
         goals[name] = _goal(name, VesselPlace(name, arc_length=deepest), tree)
     return goals
 
@@ -139,21 +137,18 @@ def _cut_at(
     vessel = tree.vessel(inlet.vessel)
     line = vessel.centreline
     arc = inlet.arc(tree)
-    is_root = vessel.parent is None
-    at_first = is_root and arc <= 0.5 * line.length
-    if not is_root and arc < vessel.ostium + 5e-3:
-        raise ValueError(
-            f"the inlet lies {arc * 1e3:.1f} mm along branch {vessel.name!r}, whose "
-            f"ostium is at {vessel.ostium * 1e3:.1f} mm; it must be 5 mm past it."
-        )
+    at_first = vessel.parent is None and arc <= 0.5 * line.length
     low, high = (arc, line.length) if at_first else (0.0, arc)
-    if high - low < 10e-3:
-        raise ValueError(f"the inlet leaves nothing of vessel {vessel.name!r}.")
+    if high - low < 10e-3 or (vessel.parent and arc < vessel.ostium + 5e-3):
+        raise ValueError(
+            f"the inlet, {arc * 1e3:.1f} mm along {vessel.name!r}, leaves nothing of "
+            f"it; keep 10 mm of a vessel, and of a branch 5 mm past its ostium at "
+            f"{vessel.ostium * 1e3:.1f} mm."
+        )
     for name, child in tree.vessels.items():
         if child.parent == vessel.name:
-            centre = child.centreline.at(child.ostium)
-            place = float(line.project(centre.position).arc_length)
-            reach = float(centre.radius)
+            place = line.locate(child.mouth.position)
+            reach = float(child.mouth.radius)
             if place - reach < low or place + reach > high:
                 raise ValueError(
                     f"the inlet, {arc * 1e3:.1f} mm along {vessel.name!r}, is at or "
@@ -168,6 +163,5 @@ def _cut_at(
             )
     if math.isclose(low, 0.0) and math.isclose(high, line.length):
         return tree, at_first
-    vessels = dict(tree.vessels)
-    vessels[vessel.name] = replace(vessel, centreline=line.slice(low, high))
-    return VesselTree(vessels), at_first
+    cut = replace(vessel, centreline=line.slice(low, high))
+    return VesselTree({**tree.vessels, vessel.name: cut}), at_first

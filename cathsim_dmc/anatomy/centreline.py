@@ -4,6 +4,7 @@ All lengths are metres, all points are in the patient frame LPS (+x patient
 left, +y posterior, +z superior).
 """
 
+import math
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from functools import cached_property
@@ -184,6 +185,10 @@ class Centreline:
             )
         return Projection(*(values.reshape(points.shape[:-1]) for values in out))
 
+    def locate(self, point: ArrayLike) -> float:
+        """Arc length (m) of the place nearest to one point (3,), m."""
+        return float(self.project(point).arc_length)
+
     def resampled(self, spacing: float) -> "Centreline":
         """Same curve with equal steps of about `spacing` (m), ends kept."""
         count = max(1, round(self.length / spacing))
@@ -227,6 +232,11 @@ class Vessel:
                 f"its own centreline, 0 <= ostium < {self.centreline.length:g} m."
             )
 
+    @property
+    def mouth(self) -> CentrelinePoint:
+        """Place of its centreline at which it leaves its parent's lumen."""
+        return self.centreline.at(self.ostium)
+
 
 @dataclass(frozen=True, eq=False)
 class VesselTree:
@@ -266,12 +276,9 @@ class VesselTree:
 
     def vessel(self, name: str) -> Vessel:
         """Vessel called `name`; ValueError lists those that there are."""
-        try:
-            return self.vessels[name]
-        except KeyError:
-            raise ValueError(
-                f"no vessel {name!r}; there are {', '.join(self.vessels)}."
-            ) from None
+        if name not in self.vessels:
+            raise ValueError(f"no vessel {name!r}; there are {', '.join(self.vessels)}")
+        return self.vessels[name]
 
     def depths(self, points: ArrayLike) -> dict[str, Array]:
         """Radius less distance (m) of `points` (..., 3) in each vessel's own tube.
@@ -303,41 +310,32 @@ class VesselTree:
     def origin(self, name: str) -> float:
         """Arc length (m) on the parent's centreline where branch `name` starts."""
         vessel = self.vessel(name)
-        if vessel.parent is None:
-            raise ValueError(f"vessel {name!r} is the root and has no origin.")
-        parent = self.vessels[vessel.parent].centreline
-        return float(parent.project(vessel.centreline.points[0]).arc_length)
+        return self.vessel(str(vessel.parent)).centreline.locate(
+            vessel.centreline.points[0]
+        )
 
     def route(
         self,
         start: str,
         goal: str,
-        goal_arc_length: float | None = None,
+        goal_arc_length: float = math.inf,
         *,
-        start_arc_length: float | None = None,
+        start_arc_length: float = 0.0,
     ) -> Centreline:
         """Polyline from a place in vessel `start` to a place in vessel `goal`.
 
         Args:
             start: vessel the device enters by.
             goal: vessel to reach.
-            goal_arc_length: place (m) on the goal's centreline, its end if None.
-            start_arc_length: place (m) on the start's centreline; if None its
-                free end, which is the first point of the root and the last point
-                of a branch.
+            goal_arc_length: place (m) on the goal's centreline, its end if infinite.
+            start_arc_length: the same of the start.
 
         Raises:
             ValueError: if a name is unknown, or start and goal are one place.
         """
         up, down = self._lineage(start), self._lineage(goal)
-        if goal_arc_length is None:
-            goal_arc_length = self.vessels[goal].centreline.length
-        here = start_arc_length
-        if here is None:
-            root = self.vessels[start].parent is None
-            here = 0.0 if root else self.vessels[start].centreline.length
         common = next(name for name in up if name in down)
-        legs: list[tuple[str, float, float]] = []
+        here, legs = start_arc_length, []
         for name in up[: up.index(common)]:
             legs.append((name, here, 0.0))
             here = self.origin(name)
@@ -349,7 +347,7 @@ class VesselTree:
         parts = [
             self.vessels[name].centreline.slice(s0, s1)
             for name, s0, s1 in legs
-            if abs(s1 - s0) > 1e-6
+            if not math.isclose(s0, s1, rel_tol=0.0, abs_tol=1e-6)
         ]
         if not parts:
             raise ValueError(f"route from {start!r} to {goal!r} has no length.")

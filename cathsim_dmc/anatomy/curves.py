@@ -158,7 +158,8 @@ def _branch(
     fine = Centreline(dense, np.ones(len(dense)))
     ostium = _ostium(name, fine, parent)
     place = fine.at(ostium)
-    foot = parent.centreline.at(parent.centreline.project(place.position).arc_length)
+    line = parent.centreline
+    foot = line.at(line.locate(place.position))
     outward = place.position - foot.position
     outward /= np.linalg.norm(outward)
     tilt = math.acos(float(np.clip(place.tangent @ outward, -1.0, 1.0)))
@@ -169,9 +170,8 @@ def _branch(
             f"branch {name!r} has no point beyond its ostium; give it more points."
         )
     calibre = float(curve.radii[own][0])
-    origin = parent.centreline.project(fine.points[0]).arc_length
-    parent_radius = float(parent.centreline.at(origin).radius)
-    parent_radius = max(parent_radius, float(foot.radius))
+    origin = line.at(line.locate(fine.points[0]))
+    parent_radius = max(float(origin.radius), float(foot.radius))
     room = _WIDEST_OSTIUM * parent_radius - calibre
     if room < 0.0:
         raise ValueError(
@@ -181,7 +181,9 @@ def _branch(
             "are those of its own lumen, not of the sphere inside both."
         )
     wide = calibre + min(flare, room)
-    begin, over = _flare_span(wide, calibre, parent_radius, tilt, ostium)
+    tilt = min(tilt, math.radians(60.0))
+    begin = flare_begin(wide, parent_radius, tilt, ostium)
+    over = ostium + 2.0 * max(wide - calibre, 0.5e-3) + calibre * math.tan(tilt)
     s = np.linspace(0.0, fine.length, max(2, math.ceil(fine.length / _STEP) + 1))
     fine_s = np.arange(begin, over, 0.5e-3)
     s = np.unique(np.concatenate([s[(s < begin) | (s > over)], fine_s, [over]]))
@@ -192,15 +194,17 @@ def _branch(
     return Vessel(name, Centreline(fine.at(s).position, radii), parent.name, ostium)
 
 
-def _flare_span(
-    wide: float, calibre: float, parent_radius: float, tilt: float, ostium: float
-) -> tuple[float, float]:
-    """Arc lengths at which a flare begins, inside the parent, and is over."""
+def flare_begin(wide: float, parent_radius: float, tilt: float, ostium: float) -> float:
+    """Arc length (m) at which the flare of a branch begins, inside the parent.
+
+    Args:
+        wide: radius of the branch at its ostium, m.
+        tilt: of the branch from the normal of the parent's wall, rad.
+        ostium: arc length of the ostium, m.
+    """
     sag = parent_radius - math.sqrt(parent_radius**2 - min(wide, parent_radius) ** 2)
-    slant = math.tan(min(tilt, math.radians(60.0)))
-    inwards = _FLARE_MARGIN * (sag + wide * slant) + 1e-3
-    begin = max(ostium - inwards, 0.1 * ostium)
-    return begin, ostium + 2.0 * max(wide - calibre, 0.5e-3) + calibre * slant
+    inwards = _FLARE_MARGIN * (sag + wide * math.tan(tilt)) + 1e-3
+    return max(ostium - inwards, 0.1 * ostium)
 
 
 def _onto_parent(name: str, points: Array, parent: Vessel) -> Array:

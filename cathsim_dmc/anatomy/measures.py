@@ -119,10 +119,10 @@ def measure(
     # With an aberrant right subclavian the right carotid stands in the BCA's place.
     first_branch = "bca" if "bca" in branches else "rcca"
     if {first_branch, "lcca"} <= branches.keys():
-        height = _top_of_arch(aorta) - _ostium(tree.vessel(first_branch))[2]
+        height = _top_of_arch(aorta) - tree.vessel(first_branch).mouth.position[2]
         drop = float(height / branches["lcca"].diameter)
     levels = {
-        name: float(aorta.project(_ostium(vessel)).arc_length)
+        name: aorta.locate(vessel.mouth.position)
         for name, vessel in tree.vessels.items()
         if vessel.parent == tree.root.name
     }
@@ -154,7 +154,7 @@ def measure(
 def inlet_axis(anatomy: Anatomy) -> Array:
     """First direction (3,) of a device: the chord over 30 mm from the inlet."""
     line = anatomy.tree.vessel(anatomy.inlet.vessel).centreline
-    s = float(line.project(anatomy.inlet.position).arc_length)
+    s = line.locate(anatomy.inlet.position)
     way = line.at(s + _END_CHORD).position - line.at(s).position
     back = line.at(s - _END_CHORD).position - line.at(s).position
     way = max((way, back), key=lambda chord: float(chord @ anatomy.inlet.direction))
@@ -175,10 +175,6 @@ def _angle(first: Array, second: Array) -> float:
 def _chord(line: Centreline, s0: float, s1: float) -> Array:
     way = line.at(min(s1, line.length)).position - line.at(s0).position
     return way / np.linalg.norm(way)
-
-
-def _ostium(vessel: Vessel) -> Array:
-    return vessel.centreline.at(vessel.ostium).position
 
 
 def _arch_plane(aorta: Centreline) -> tuple[Array, Array]:
@@ -205,7 +201,7 @@ def _branch(
     vessel: Vessel, start: Array, axis: Array, along: Array, normal: Array
 ) -> BranchMeasures:
     line = vessel.centreline
-    ostium = _ostium(vessel)
+    ostium = vessel.mouth.position
     own = line.slice(vessel.ostium, line.length)
     level = min(vessel.ostium + BRANCH_LEVEL, line.length)
     direction = _chord(line, vessel.ostium, level)

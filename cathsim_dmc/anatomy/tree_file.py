@@ -41,7 +41,6 @@ from cathsim_dmc.anatomy.curves import Curve, smooth_tree
 
 FORMAT = "cathsim-vessel-tree"
 FORMAT_VERSION = 1
-_FRAMES = {"LPS": (1.0, 1.0, 1.0), "RAS": (-1.0, -1.0, 1.0)}
 _MM = 1e-3
 # A coordinate beyond this, mm, or a radius outside the range is another unit.
 _FARTHEST = 2000.0
@@ -101,19 +100,18 @@ def parse_tree(content: Any) -> TreeFile:
     """Tree file from what JSON holds; ValueError names an entry that is wrong."""
     needed = ("format", "version", "name", "units", "frame", "vessels")
     _entries("the file", content, needed, ("note", "inlets", "goals"))
-    fixed = {"format": FORMAT, "version": FORMAT_VERSION, "units": "mm"}
-    for key, value in fixed.items():
+    fixed = {"format": FORMAT, "version": FORMAT_VERSION}
+    for key, value in {**fixed, "units": "mm", "frame": "LPS"}.items():
         if content[key] != value:
             bounds.refuse(key, content[key], repr(value))
-    flip = np.array(_FRAMES[bounds.choice("frame", content["frame"], _FRAMES)])
     curves: dict[str, Curve] = {}
     for key, entry in _parts(content, "vessels"):
-        curves[key] = _curve(f"vessel {key!r}", entry, flip, list(curves))
+        curves[key] = _curve(f"vessel {key!r}", entry, list(curves))
     root = next(iter(curves), "")
     bounds.choice("the first of vessels", root, curves)
     inlets, goals = (
         {
-            key: _place(f"{kind} {key!r}", entry, ways, curves, flip)
+            key: _place(f"{kind} {key!r}", entry, ways, curves)
             for key, entry in _parts(content, f"{kind}s")
         }
         for kind, ways in _WAYS.items()
@@ -138,7 +136,7 @@ def _entries(name: str, value: Any, needed: tuple, more: tuple = ()) -> None:
         raise ValueError(f"{name} lacks {', '.join(sorted(missing))}.")
 
 
-def _curve(where: str, entry: Any, flip: np.ndarray, before: list[str]) -> Curve:
+def _curve(where: str, entry: Any, before: list[str]) -> Curve:
     _entries(where, entry, ("parent", "points_mm", "radii_mm"))
     parent = entry["parent"]
     if parent not in (before or [None]):
@@ -154,7 +152,7 @@ def _curve(where: str, entry: Any, flip: np.ndarray, before: list[str]) -> Curve
             f"{high:g} mm. Are these millimetres, and no diameters?"
         )
     try:
-        return Curve(points * flip * _MM, radii * _MM, parent)
+        return Curve(points * _MM, radii * _MM, parent)
     except ValueError as error:
         raise ValueError(f"{where}: {error}") from error
 
@@ -169,7 +167,7 @@ def _numbers(name: str, value: Any, columns: int) -> np.ndarray:
 
 
 def _place(
-    where: str, entry: Any, ways: tuple, curves: Mapping[str, Curve], flip: np.ndarray
+    where: str, entry: Any, ways: tuple, curves: Mapping[str, Curve]
 ) -> VesselPlace:
     _entries(where, entry, ("vessel",), ways)
     given = [way for way in ways if way in entry]
@@ -184,7 +182,7 @@ def _place(
             del ends["first"]
         return VesselPlace(vessel, arc_length=ends[bounds.choice(name, value, ends)])
     if way == "position_mm":
-        position = np.array(bounds.vector(name, value, 3)) * flip * _MM
+        position = np.array(bounds.vector(name, value, 3)) * _MM
         return VesselPlace(vessel, position=position)
     length = bounds.number(name, value, 0.0, _FARTHEST, "mm") * _MM
     if way == "past_ostium_mm":

@@ -161,7 +161,7 @@ def ostia(anatomy: Anatomy) -> np.ndarray:
     for row, name in enumerate(BRANCHES):
         if name in anatomy.tree.vessels:
             vessel = anatomy.tree.vessels[name]
-            found[row] = vessel.centreline.at(vessel.ostium).position
+            found[row] = vessel.mouth.position
     return found
 
 

@@ -200,7 +200,7 @@ def _way_to_branching(anatomy: Anatomy) -> float:
     places = [length if start < length / 2 else vessel.ostium]
     for child in tree.vessels.values():
         if child.parent == vessel.name:
-            ostium = child.centreline.at(child.ostium).position
+            ostium = child.mouth.position
             places.append(float(vessel.centreline.project(ostium).arc_length))
     return min(abs(place - start) for place in places)
 

@@ -151,8 +151,7 @@ def _corrected(
         tree = arch_tree(params)
         found = measures.measure(tree)
         first = next(one for one in tree.vessels.values() if one.parent)
-        ostium = first.centreline.at(first.ostium).position
-        short = ascending - float(tree.root.centreline.project(ostium).arc_length)
+        short = ascending - tree.root.centreline.locate(first.mouth.position)
         if found.drop is None:  # without the branches that it is measured by
             return None
         low = drop - found.drop

@@ -162,7 +162,7 @@ def _sides(anatomy: Anatomy) -> TreeCheck:
     vessels = [tree.vessels[key] for key in ARCH_BRANCHES if key in tree.vessels]
     vessels = [vessel for vessel in vessels if vessel.parent == root.name]
     names = [vessel.name for vessel in vessels]
-    ostia = [vessel.centreline.at(vessel.ostium).position for vessel in vessels]
+    ostia = [vessel.mouth.position for vessel in vessels]
     along = np.diff([root.centreline.project(ostium).arc_length for ostium in ostia])
     # What leaves in one lumen, as in a bovine arch, has no order.
     apart = along[np.abs(along) > ONE_OSTIUM]
@@ -333,7 +333,7 @@ def _start(anatomy: Anatomy, measure: SurfaceDepth) -> TreeCheck:
         while (parent := tree.vessel(lineage).parent) not in (inlet.vessel, None):
             lineage = parent
         branch = tree.vessel(lineage)
-        ostium = branch.centreline.at(branch.ostium).position
+        ostium = branch.mouth.position
         route = anatomy.route(name)
         here = float(route.project(head).arc_length)
         there = float(route.project(ostium).arc_length)
