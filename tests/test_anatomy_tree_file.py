@@ -179,42 +179,31 @@ def test_wrong_entries_are_named(apply, message):
         parse_tree(tree)
 
 
-def moved_side(offset, count=11):
-    points, _ = helix()
-    return (points[12] + np.outer(np.linspace(0.0, 60.0, count), offset)).tolist()
+SIDE = np.array(content()["vessels"]["side"]["points_mm"])
+
+
+def side_points(points):
+    return change(["vessels", "side", "points_mm"], np.array(points).tolist())
 
 
 @pytest.mark.parametrize(
     ("apply", "message"),
     [
         (
-            change(
-                ["vessels", "side", "points_mm"],
-                (np.array(moved_side([0.3, 0.5, 0.81])) + [0, 0, 60.0]).tolist(),
+            side_points(
+                np.array(content()["vessels"]["side"]["points_mm"]) + [0, 0, 60]
             ),
             "'side' begins .* from the centreline of 'trunk'",
         ),
         (change(["vessels", "side", "radii_mm"], [8.9] * 11), "of its parent's"),
+        (side_points(helix(41)[0][20:31]), "'side' ends inside its parent"),
         (
-            change(
-                ["vessels", "side", "points_mm"],
-                np.array(helix(41)[0][20:31]).tolist(),
-            ),
-            "'side' ends inside its parent",
-        ),
-        (
-            change(
-                ["vessels", "side", "points_mm"],
-                (np.array(helix(41)[0][20:31]) * [1.27, 1.27, 1.0]).tolist(),
-            ),
+            side_points(helix(41)[0][20:31] * [1.27, 1.27, 1.0]),
             "does not part from 'trunk'|begins",
         ),
         (change(["vessels", "trunk", "radii_mm"], [49.0] * 25), "would fold"),
         (change(["goals", "side", "past_ostium_mm"], 200.0), "is not on it"),
-        (
-            change(["goals", "free", "position_mm"], [0, 0, 0]),
-            "outside vessel 'side'",
-        ),
+        (change(["goals", "free", "position_mm"], [0, 0, 0]), "outside vessel 'side'"),
         (
             change(["inlets", "low"], {"vessel": "trunk", "arc_length_mm": 54}),
             "ostium of branch 'side'",
