@@ -1,24 +1,7 @@
 """Geometry without physics: vessels, arches, lumen surfaces and wall pieces."""
 
 from cathsim_dmc.anatomy.anatomy import Anatomy
-from cathsim_dmc.anatomy.centreline import (
-    Centreline,
-    CentrelinePoint,
-    Projection,
-    Vessel,
-    VesselTree,
-)
-from cathsim_dmc.anatomy.parts import End, Goal, Inlet, Surface
+from cathsim_dmc.anatomy.centreline import Centreline, Vessel, VesselTree
+from cathsim_dmc.anatomy.parts import Goal, Surface
 
-__all__ = [
-    "Anatomy",
-    "Centreline",
-    "CentrelinePoint",
-    "End",
-    "Goal",
-    "Inlet",
-    "Projection",
-    "Surface",
-    "Vessel",
-    "VesselTree",
-]
+__all__ = ["Anatomy", "Centreline", "Goal", "Surface", "Vessel", "VesselTree"]

@@ -173,7 +173,7 @@ def _angle(first: Array, second: Array) -> float:
 
 
 def _chord(line: Centreline, s0: float, s1: float) -> Array:
-    way = line.at(min(s1, line.length)).position - line.at(s0).position
+    way = line.at(s1).position - line.at(s0).position
     return way / np.linalg.norm(way)
 
 
@@ -203,9 +203,9 @@ def _branch(
     line = vessel.centreline
     ostium = vessel.mouth.position
     own = line.slice(vessel.ostium, line.length)
-    level = min(vessel.ostium + BRANCH_LEVEL, line.length)
+    level = vessel.ostium + BRANCH_LEVEL
     direction = _chord(line, vessel.ostium, level)
-    far = line.at(min(vessel.ostium + _OUT_OF_PLANE_AT, line.length)).position
+    far = line.at(vessel.ostium + _OUT_OF_PLANE_AT).position
     way = ostium - start
     return BranchMeasures(
         parent=str(vessel.parent),

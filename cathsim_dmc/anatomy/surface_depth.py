@@ -39,7 +39,13 @@ class SurfaceDepth:
         normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
         sizes = np.linalg.norm(normals, axis=1, keepdims=True)
         self._normals = normals / np.maximum(sizes, 1e-300)
-        self._sharp = self._turns()
+        # Triangles with a neighbour, at a corner, whose normal turns sharply.
+        count = len(self._wall)
+        places = np.repeat(np.arange(count), 3), self._wall.ravel()
+        at = coo_array((np.ones(3 * count), places), (count, len(vertices))).tocsr()
+        one, other = (at @ at.T).nonzero()
+        sharp = np.vecdot(self._normals[one], self._normals[other]) < _SMOOTH
+        self._sharp = np.bincount(one, sharp, count) > 0
 
     def __call__(self, points: Array) -> Array:
         """Signed distances (...) m at points (..., 3) m, > 0 inside."""
@@ -65,20 +71,9 @@ class SurfaceDepth:
             moved[beyond] -= (level[beyond] + 2.0 * _CAP)[:, None] * end.direction
             doubtful |= beyond
         if doubtful.any():
-            winding = self._winding.winding_number(moved[doubtful], 2.0)
-            sign = np.where(winding > 0.5, 1.0, -1.0)
-            depth[doubtful] = sign * distance[doubtful]
+            inside = self._winding.winding_number(moved[doubtful], 2.0) > 0.5
+            depth[doubtful] = np.where(inside, 1.0, -1.0) * distance[doubtful]
         return depth.reshape(shape)
-
-    def _turns(self) -> np.ndarray:
-        """Triangles (F,) with a neighbour, at a corner, whose normal turns sharply."""
-        count = len(self._wall)
-        rows = np.repeat(np.arange(count), 3)
-        shape = (count, len(self._vertices))
-        at = coo_array((np.ones(3 * count), (rows, self._wall.ravel())), shape).tocsr()
-        one, other = (at @ at.T).nonzero()
-        sharp = np.vecdot(self._normals[one], self._normals[other]) < _SMOOTH
-        return np.bincount(one, sharp, count) > 0
 
     @property
     def box(self) -> tuple[Array, Array]:
@@ -96,11 +91,7 @@ class SurfaceDepth:
         return self(every.reshape(-1, 3)[first])[same].reshape(every.shape[:-1])
 
     def crossings(self) -> tuple[np.ndarray, np.ndarray]:
-        """Faces that an edge of another face pierces, and those edges' vertices.
-
-        Returns:
-            (faces (n,), edges (n, 2)), one pair for every crossing.
-        """
+        """Faces (n,) that an edge of another face pierces, and those edges (n, 2)."""
         import igl
 
         sides = self._wall[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
