@@ -1,19 +1,136 @@
-"""The anatomy container."""
+"""The anatomy container: what is saved is read, every wrong entry has its message."""
 
+from __future__ import annotations
+
+import json
 import pickle
 
 import numpy as np
 import pytest
 
 from cathsim_dmc import suite
-from cathsim_dmc.anatomy import phantoms
-from cathsim_dmc.anatomy.anatomy import Anatomy
-from cathsim_dmc.anatomy.parts import Goal
+from cathsim_dmc.anatomy import Anatomy, Goal, phantoms
 
 
 @pytest.fixture(scope="module")
 def anatomy():
     return phantoms.load("simple1")
+
+
+@pytest.fixture(scope="module")
+def saved(anatomy, tmp_path_factory):
+    return anatomy.save(tmp_path_factory.mktemp("saved") / "a") / "anatomy.npz"
+
+
+@pytest.fixture
+def forged(saved, tmp_path):
+    """Writes the anatomy anew after a change of its header and arrays."""
+
+    def write(change) -> None:
+        with np.load(saved) as archive:
+            arrays = dict(archive)
+        header = json.loads(str(arrays["header"]))
+        change(header, arrays)
+        if "header" in arrays:
+            arrays["header"] = np.array(json.dumps(header))
+        np.savez(tmp_path / "anatomy.npz", **arrays)
+
+    return write
+
+
+def put(*keys_and_value):
+    """A change that puts a value where the keys lead in the header."""
+    *keys, last, value = keys_and_value
+
+    def change(header, arrays):
+        place = header
+        for key in keys:
+            place = place[key]
+        place[last] = value
+
+    return change
+
+
+def array(name, edit):
+    """A change of one array."""
+
+    def change(header, arrays):
+        arrays[name] = edit(np.array(arrays[name]))
+
+    return change
+
+
+def spoilt(row, value):
+    def edit(values):
+        values[row] = value
+        return values
+
+    return edit
+
+
+WRONG = {
+    "unit": (put("units", "mm"), "'units': 'mm'.*write it again"),
+    "version": (put("version", 99), "'version': 99.*write it again"),
+    "name": (put("name", 3), "name is 3; it must be a text"),
+    "vessel": (put("vessels", 0, "left"), "an entry is wrong: .*mapping, not str"),
+    "field": (put("inlet", "width", 3.0), "an entry is wrong: .*'width'"),
+    "twice": (put("goals", 1, "name", "bca"), "goals has a name twice"),
+    "inlet text": (
+        put("inlet", "position", "here"),
+        "inlet position is 'here'; it must be 3 numbers, each a finite",
+    ),
+    "goal": (put("goals", 0, "vessel", "renal"), "no vessel 'renal'"),
+    "nan": (
+        array("surface_vertices", spoilt(5, np.nan)),
+        "vertices is .*finite numbers",
+    ),
+    "scanned": (put("scanned", "yes"), "scanned is 'yes'"),
+    "shape": (array("vessel_0_radii", lambda v: v[:-1]), "give one radius for each"),
+    "faces": (array("surface_faces", spoilt(0, 10**8)), "faces name vertices"),
+    "pickle": (
+        lambda d, a: a.update(vessel_0_radii=np.array([{}], dtype=object)),
+        "allow_pickle",
+    ),
+    "missing": (lambda d, a: a.pop("surface_faces") is None, "lacks .*surface_faces"),
+    "header": (lambda d, a: a.pop("header") is None, "lacks .*header"),
+}
+
+
+@pytest.mark.parametrize("fault", WRONG)
+def test_a_wrong_entry_is_named_in_one_line(forged, tmp_path, fault):
+    change, match = WRONG[fault]
+    forged(change)
+    with pytest.raises(ValueError, match=match) as error:
+        Anatomy.load(tmp_path)
+    assert "\n" not in str(error.value) and "anatomy.npz" in str(error.value)
+
+
+def test_round_trip(anatomy, saved):
+    again = Anatomy.load(saved.parent)
+    assert again.name == anatomy.name
+    np.testing.assert_array_equal(again.surface.faces, anatomy.surface.faces)
+    points = np.random.default_rng(0).uniform(-0.05, 0.2, (200, 3))
+    np.testing.assert_array_equal(again.depth(points), anatomy.depth(points))
+    assert again.goals.keys() == anatomy.goals.keys()
+    np.testing.assert_array_equal(again.inlet.direction, anatomy.inlet.direction)
+    assert [end.open for end in again.ends] == [end.open for end in anatomy.ends]
+
+
+def test_saving_again_replaces_the_file(anatomy, tmp_path):
+    anatomy.save(tmp_path)
+    phantoms.load("simple2").save(tmp_path)
+    assert len(list(tmp_path.iterdir())) == 1
+    assert Anatomy.load(tmp_path).name == "simple2"
+
+
+def test_damage_is_found(saved, tmp_path):
+    data = bytearray(saved.read_bytes())
+    data[len(data) // 2] ^= 1
+    (tmp_path / "anatomy.npz").write_bytes(data)
+    with pytest.raises(ValueError, match="CRC|decompress"):
+        Anatomy.load(tmp_path)
+    with pytest.raises(FileNotFoundError, match=r"no anatomy\.npz .*Anatomy.save"):
+        Anatomy.load(tmp_path / "nothing")
 
 
 def test_route_starts_at_the_inlet_and_ends_at_the_goal(anatomy):

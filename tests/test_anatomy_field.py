@@ -176,12 +176,6 @@ def test_a_surface_knows_inside_from_outside():
     assert ((depth > 0) == inside)[clear].all()
 
 
-def test_equal_fields_have_one_digest(tube):
-    tree, ends, field = tube
-    assert Field.of(tree, ends).digest == field.digest
-    assert Field.of(tree).digest != field.digest
-
-
 def test_points_that_are_not_finite_have_no_depth():
     def measure(blocks, points):
         return 0.01 - np.linalg.norm(blocks[:, None] + points, axis=-1)

@@ -57,14 +57,11 @@ def test_samples_are_valid_arches_of_their_type(seed, arch_type, variant):
         assert (past < 12e-3) if variant == "bovine_trunk" else (past < 20e-3)
 
 
-def test_types_are_drawn_by_prevalence():
+def test_the_train_set_has_the_published_shares():
     kinds = [one.arch_type for one in arch.arch_set("train")]
     share = [kinds.count(kind) / len(kinds) for kind in arch.DROP_RANGES]
     # 1,000 draws: three standard errors are 0.047.
     np.testing.assert_allclose(share, [0.336, 0.434, 0.230], atol=0.047)
-
-
-def test_bovine_variants_in_the_train_set_have_the_published_shares():
     variants = [one.variant for one in arch.arch_set("train")]
     trunk, branch = (variants.count(f"bovine_{one}") for one in ("trunk", "branch"))
     assert (trunk + branch) / len(variants) == pytest.approx(0.20, abs=0.04)
@@ -95,10 +92,8 @@ def test_unknown_kinds_list_the_known():
 
 
 def test_arches_curve_as_measured_ones_do():
-    found = [
-        measures.measure(arch_tree(one.parameters()))
-        for one in arch.arch_set("test")[:20]
-    ]
+    seeds = arch.arch_set("test")[:20]
+    found = [measures.measure(arch_tree(one.parameters())) for one in seeds]
     turns = np.degrees([one.ascending_turn for one in found])
     # The published phantoms: 47, 93 and 107 degrees.
     assert 60 < turns.mean() < 95
