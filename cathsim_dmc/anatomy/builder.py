@@ -63,15 +63,7 @@ class VesselPlace:
 def placed(
     tree: VesselTree, inlet: VesselPlace | None, goals: Mapping[str, VesselPlace] | None
 ) -> tuple[VesselTree, tuple[End, ...], Inlet, dict[str, Goal]]:
-    """The tree from its inlet on, its flat ends, inlet and goals.
-
-    Args:
-        inlet: where the device enters; the first point of the root if None.
-        goals: by name; see `default_goals` if None.
-
-    Raises:
-        ValueError: if a place is not on its vessel, or lies behind the inlet.
-    """
+    """The tree from its inlet on, flat ends, inlet and goals of `Anatomy.from_tree`."""
     if goals is None:
         found = default_goals(tree)
     else:

@@ -57,12 +57,7 @@ class LumenDistance:
     """
 
     def __init__(
-        self,
-        depth: Depth,
-        bounds: np.ndarray,
-        target: np.ndarray,
-        origin: np.ndarray,
-        spacing: float = SPACING,
+        self, depth: Depth, bounds: np.ndarray, target: np.ndarray, origin: np.ndarray
     ):
         """Computes the distances to a target; takes 0.4 to 0.8 s.
 
@@ -71,7 +66,6 @@ class LumenDistance:
             bounds: (2, 3), m, corners of a box that holds the lumen.
             target: (3,), m, point in the lumen.
             origin: (3,), m, another point in it, which must be connected to the target.
-            spacing: Edge of a cell, m; halved while target and origin are apart.
 
         Raises:
             ValueError: if no way inside the lumen joins origin and target.
@@ -79,7 +73,7 @@ class LumenDistance:
         # Slow to import, and only a reward along the path needs it.
         from skimage import graph
 
-        low, high = np.asarray(bounds, float)
+        (low, high), spacing = np.asarray(bounds, float), SPACING
         while True:
             self._low, self._spacing = low - 1.5 * spacing, spacing
             shape = np.ceil((high - low) / spacing).astype(int) + 4
@@ -120,8 +114,7 @@ class LumenDistance:
         cell = np.clip(cell, 0.0, np.array(self._ways.shape) - 1.001)
         corner = cell.astype(int)
         rest = cell - corner
-        total = np.zeros(len(cell))
-        weight = np.zeros(len(cell))
+        total, weight = np.zeros((2, len(cell)))
         for offset in np.ndindex(2, 2, 2):
             share = np.where(offset, rest, 1.0 - rest)
             share = share[:, 0] * share[:, 1] * share[:, 2]

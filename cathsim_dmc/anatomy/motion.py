@@ -163,24 +163,18 @@ def _along_aorta(blood: Circulation, tree: VesselTree) -> tuple[Array, Array]:
     ways = blood.ways.mean(axis=1)
     root, names = tree.root, list(tree.vessels)
     length = root.centreline.length
-    begins = {}
+    begins: dict[str | None, float | None] = {}
     for name, vessel in tree.vessels.items():
         top = vessel.parent == root.name
         begins[name] = blood.courses[name].begin if top else begins.get(vessel.parent)
     ostia = [begin for begin in begins.values() if begin is not None]
     first, last = min(ostia, default=length / 2), max(ostia, default=length / 2)
-    place = np.array(
-        [
-            way if begins[names[number]] is None else begins[names[number]]
-            for way, number in zip(ways, blood.vessel, strict=True)
-        ]
-    )
+    found = [begins[names[number]] for number in blood.vessel]
+    place = np.where([one is None for one in found], ways, np.array(found, float))
     fading = np.exp(-0.5 * (place / _HEART_REACH) ** 2)
     sites = [first / 2, first, last, max(length, last + 1e-3)]
     medial, posterior, superior = _INSPIRATION
-    unit = np.stack(
-        [medial * _MEDIAL, np.full(4, posterior), np.full(4, superior)], axis=-1
-    )
+    unit = np.array([(medial * sign, posterior, superior) for sign in _MEDIAL])
     unit *= (_BREATHING / np.linalg.norm(unit, axis=1))[:, None]
     breath = np.stack([np.interp(place, sites, unit[:, k]) for k in range(3)], -1)
     return fading[:, None] * _HEART_WAY, breath

@@ -90,9 +90,7 @@ def read_tree(path: str | os.PathLike[str]) -> TreeFile:
         raise FileNotFoundError(f"no file {path}; give a vessel tree in JSON.")
     try:
         return parse_tree(json.loads(path.read_text(encoding="utf-8")))
-    except (json.JSONDecodeError, UnicodeDecodeError, RecursionError) as error:
-        raise ValueError(f"{path} is no JSON: {error}") from error
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:  # of JSON, or of its entries
         raise ValueError(f"{path}: {error}") from error
 
 
