@@ -38,61 +38,38 @@ def forged(saved, tmp_path):
     return write
 
 
-def put(*keys_and_value):
-    """A change that puts a value where the keys lead in the header."""
-    *keys, last, value = keys_and_value
-
-    def change(header, arrays):
-        place = header
-        for key in keys:
-            place = place[key]
-        place[last] = value
-
-    return change
-
-
-def array(name, edit):
-    """A change of one array."""
-
-    def change(header, arrays):
-        arrays[name] = edit(np.array(arrays[name]))
-
-    return change
-
-
-def spoilt(row, value):
-    def edit(values):
-        values[row] = value
-        return values
-
-    return edit
-
-
+# Changes of the header and the arrays, and what the error says.
 WRONG = {
-    "unit": (put("units", "mm"), "'units': 'mm'.*write it again"),
-    "version": (put("version", 99), "'version': 99.*write it again"),
-    "name": (put("name", 3), "name is 3; it must be a text"),
-    "vessel": (put("vessels", 0, "left"), "an entry is wrong: .*mapping, not str"),
-    "field": (put("inlet", "width", 3.0), "an entry is wrong: .*'width'"),
-    "twice": (put("goals", 1, "name", "bca"), "goals has a name twice"),
+    "unit": (lambda h, a: h.update(units="mm"), "'units': 'mm'.*write it again"),
+    "version": (lambda h, a: h.update(version=99), "'version': 99.*write it again"),
+    "name": (lambda h, a: h.update(name=3), "name is 3; it must be a text"),
+    "vessel": (
+        lambda h, a: h.update(vessels=["left"]),
+        "an entry is wrong: .*mapping, not str",
+    ),
+    "field": (lambda h, a: h["inlet"].update(width=3.0), "is wrong: .*'width'"),
+    "twice": (lambda h, a: h["goals"][1].update(name="bca"), "goals has a name twice"),
     "inlet text": (
-        put("inlet", "position", "here"),
+        lambda h, a: h["inlet"].update(position="here"),
         "inlet position is 'here'; it must be 3 numbers, each a finite",
     ),
-    "goal": (put("goals", 0, "vessel", "renal"), "no vessel 'renal'"),
+    "goal": (lambda h, a: h["goals"][0].update(vessel="renal"), "no vessel 'renal'"),
     "nan": (
-        array("surface_vertices", spoilt(5, np.nan)),
+        lambda h, a: a["surface_vertices"].put(5, np.nan),
         "vertices is .*finite numbers",
     ),
-    "scanned": (put("scanned", "yes"), "scanned is 'yes'"),
-    "shape": (array("vessel_0_radii", lambda v: v[:-1]), "give one radius for each"),
-    "faces": (array("surface_faces", spoilt(0, 10**8)), "faces name vertices"),
+    "scanned": (lambda h, a: h.update(scanned="yes"), "scanned is 'yes'"),
+    "shape": (
+        lambda h, a: a.update(vessel_0_radii=a["vessel_0_radii"][:-1]),
+        "give one radius for each",
+    ),
+    "faces": (lambda h, a: a["surface_faces"].put(0, 10**8), "faces name vertices"),
     "pickle": (
-        lambda d, a: a.update(vessel_0_radii=np.array([{}], dtype=object)),
+        lambda h, a: a.update(vessel_0_radii=np.array([{}], dtype=object)),
         "allow_pickle",
     ),
-    "missing": (lambda d, a: a.pop("surface_faces") is None, "lacks .*surface_faces"),
-    "header": (lambda d, a: a.pop("header") is None, "lacks .*header"),
+    "missing": (lambda h, a: a.pop("surface_faces"), "lacks .*surface_faces"),
+    "header": (lambda h, a: a.pop("header"), "lacks .*header"),
 }
 
 

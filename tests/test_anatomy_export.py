@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.spatial import ConvexHull
 
-from cathsim_dmc.anatomy import export, phantoms
+from cathsim_dmc.anatomy import Anatomy, export, phantoms
 from cathsim_dmc.anatomy.centreline import Centreline, Vessel, VesselTree
 from cathsim_dmc.validation.rig import tube as straight_tube
 
@@ -38,9 +38,7 @@ def test_a_missing_piece_and_a_plug_are_found(tube, pieces):
     assert export.fidelity(tube, gap).open > 5
     plug = 2e-3 * np.stack(np.meshgrid(*[(-1, 1)] * 3), -1).reshape(-1, 3)
     found = export.fidelity(tube, [*pieces, plug + (0, 0, 0.02)])
-    assert found.blocked == ("tube",) and found.intrusion[2] == pytest.approx(
-        0.0, abs=1
-    )
+    assert found.blocked == ("tube",)
 
 
 def test_the_command_writes_a_model_that_other_engines_read(tube, tmp_path, cathsim):
@@ -82,8 +80,6 @@ def test_the_walls_of_the_phantoms(name):
 
 
 def test_a_thin_wall_between_two_lumens_stays_out_of_both():
-    from cathsim_dmc.anatomy.anatomy import Anatomy
-
     def line(*points):
         steps = np.linspace(0.0, 1.0, 30)[:, None]
         parts = [(1 - steps) * a + steps * b for a, b in pairwise(points)]

@@ -1,26 +1,8 @@
 """Vessel trees in JSON: centrelines, inlets and goals in millimetres.
 
-```json
-{
-  "format": "cathsim-vessel-tree", "version": 1,
-  "name": "arch", "units": "mm", "frame": "LPS", "note": "where from",
-  "vessels": {
-    "aorta": {"parent": null, "points_mm": [[0, 0, 0], ...], "radii_mm": [12.6, ...]},
-    "bca": {"parent": "aorta", "points_mm": [...], "radii_mm": [...]}
-  },
-  "inlets": {
-    "ascending": {"vessel": "aorta", "end": "first"},
-    "descending": {"vessel": "aorta", "arc_length_mm": 180.0}
-  },
-  "goals": {
-    "bca": {"vessel": "bca", "past_ostium_mm": 27.0},
-    "other": {"vessel": "bca", "position_mm": [3.0, 11.0, 90.0]}
-  }
-}
-```
-
-The first vessel is the root; parents stand before their children. `note`, `inlets`
-and `goals` may be left out.
+The section "Your own centrelines" of docs/anatomies.md has the format. The first vessel
+is the root; parents stand before their children. `note`, `inlets` and `goals` may be
+left out.
 """
 
 import json

@@ -41,12 +41,7 @@ class Fluoroscope:
         vessel: (rows, columns) path length through the lumen, m.
         vessel_mask: (rows, columns) bool, pixels whose central ray meets the lumen.
         contrast: iodine in the lumen, kg/m³ (mg/ml); 0 is contrast off.
-        kerma: air kerma at the detector per frame behind plain tissue, Gy; more is
-            less noise.
-        blur: standard deviation of the detector's point spread, m.
-        gain: share of full white given to plain tissue.
-        roadmap: opacity of the vessel laid over the live image in white, 0 for none,
-            1 for tissue in full white; usually shown with contrast 0.
+        kerma, blur, gain, roadmap: Gy, m and two shares, see `FluoroscopyOptions`.
     """
 
     carm: CArm
