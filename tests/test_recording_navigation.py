@@ -4,7 +4,6 @@ import mujoco
 import numpy as np
 import pytest
 from conftest import twin
-from dm_control import composer
 from recording_samples import same
 from test_own_objective import advancing
 
@@ -130,13 +129,6 @@ def test_wrong_actions_are_refused(env):
             recorder.record_episode(lambda timestep, wrong=wrong: wrong)
     with pytest.raises(ValueError, match="at least 1"):
         recorder.record_episode(bend_and_push, max_steps=0)
-
-
-def test_another_environment_is_refused():
-    empty = composer.NullTask(composer.Arena())
-    other = composer.Environment(empty, strip_singleton_obs_buffer_dim=True)
-    with pytest.raises(TypeError, match="no environment of cathsim"):
-        EpisodeRecorder(other)
 
 
 def test_the_episode_is_drawn_with_its_robot(env, episode, tmp_path):

@@ -6,7 +6,7 @@ import pytest
 from cathsim_dmc.entities import contact
 from cathsim_dmc.entities.devices import Discretisation, get
 from cathsim_dmc.tasks.config import PHYSICS_TIMESTEP
-from cathsim_dmc.validation import pair, pressed, shapes, sliding, two_rods
+from cathsim_dmc.validation import pair, pressed, sliding, two_rods
 from cathsim_dmc.validation.rig import Rig
 
 
@@ -91,7 +91,7 @@ def test_a_bend_whips_in_a_curve_and_follows_in_a_straight_tube():
 
 def test_a_turned_shape_is_the_shape_turned():
     """Hinges in one order, with components for angles, were off by 19 % and 31°."""
-    end, curve, direction = shapes.turned(
+    end, curve, direction = pair.turned(
         ("wire_035_amplatz", "diagnostic_5f_simmons"), (0.012, 0.0)
     )
     assert end < 0.001 and direction < 0.001
@@ -126,7 +126,7 @@ def test_a_bend_does_not_twist_the_chain():
     """Hinges in one order twisted by 18°."""
     lengths = Discretisation().link_lengths(get("steerable_5f"))
     for plane in np.radians([30, 45, 60]):
-        alone, coaxial = shapes.twists(lengths, 0.06, plane)
+        alone, coaxial = pair.twists(lengths, 0.06, plane)
         assert abs(np.degrees(alone)) < 2.0 and abs(coaxial) < 1e-6
 
 

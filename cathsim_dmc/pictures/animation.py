@@ -58,16 +58,13 @@ def animate(
         The path.
 
     Raises:
-        ValueError: on another suffix, an unknown view, fewer than two frames, or an
-            episode without a goal.
+        ValueError: on another suffix, an unknown view, or an episode without a goal.
         FileNotFoundError: if the folder does not exist.
     """
     path = Path(path)
     check_film(path)
     if view not in drawing.VIEWS:
         raise ValueError(f"no view {view!r}; there are {', '.join(drawing.VIEWS)}")
-    if frames < 2:
-        raise ValueError(f"frames is {frames}; give at least 2")
     length = float(episode.time[-1] - episode.time[0])
     seconds = float(np.clip(length, 2.0, 12.0)) if seconds is None else seconds
     count = min(frames, episode.steps + 1)

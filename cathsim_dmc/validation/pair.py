@@ -3,13 +3,20 @@
 from collections.abc import Iterator, Sequence
 from typing import Any
 
+import mujoco
 import numpy as np
+from numpy.typing import ArrayLike
+from scipy.spatial.transform import Rotation
 
+from cathsim_dmc.entities import devices, posture
+from cathsim_dmc.entities.coaxial import Stack
+from cathsim_dmc.entities.device import Device
 from cathsim_dmc.entities.device_stack import DeviceStack
+from cathsim_dmc.physics import chain_fields
 from cathsim_dmc.tasks.config import CONTROL_TIMESTEP
-from cathsim_dmc.validation import pressed, rod, shapes, sliding, theory, two_rods
+from cathsim_dmc.validation import pressed, rod, sliding, theory, two_rods
 from cathsim_dmc.validation.checks import Check, Report
-from cathsim_dmc.validation.rig import Rig
+from cathsim_dmc.validation.rig import Rig, half_circle, in_order
 
 PAIR = ("wire_035_glide", "berenstein_5f")
 PROTRUSIONS = (0.0, 0.02, 0.05, 0.10)  # m, of the wire out of the catheter
@@ -17,6 +24,23 @@ END_ANGLES = (15.0, 45.0)  # degrees
 # Largest step of the free end as one device slides in the other, in that of the curve:
 # a chain whose hinges jumped one after the other would make several at once.
 STEP_BOUND = 1.1
+
+# Unloaded shapes turned about the axis, and twist of the chain in a bend.
+_FINE = 0.05e-3  # m, of the curve that is integrated
+TURNS = np.radians(np.arange(0, 360, 15))
+# Distances (m) of the ends of wire and catheter from the end of the chain.
+GAPS = ((0.0, 0.02), (0.012, 0.0), (0.0, 0.005))
+_PAIRS = (
+    ("wire_035_glide", "berenstein_5f"),
+    ("wire_035_amplatz", "diagnostic_5f_simmons"),
+)
+END_BOUND = 1.0  # % of the displacement of the end from the straight line
+DIRECTION_BOUND = 1.5  # °, of the last link
+CURVE_BOUND = 1.0  # % likewise
+BEND_RADIUS = 0.04  # m, of half a circle
+TWIST_BOUND = 1.0  # °, of the last frame there
+# °, of a single device, whose shape does not take the twist out: that of one link.
+SINGLE_TWIST_BOUND = 2.0
 
 
 def straightened(names: Sequence[str]) -> DeviceStack:
@@ -48,6 +72,93 @@ def cantilevers(protrusion: float) -> list[rod.Cantilever]:
     return rod.bent(rig, *sections(entity, gaps), END_ANGLES)
 
 
+def free_curve(chosen: Sequence[Device], gaps: ArrayLike, length: float) -> np.ndarray:
+    """End (3,), m, of the curve of the EI-weighted curvature of devices at rest.
+
+    Args:
+        chosen: K coaxial devices, not turned: the curve lies in the plane of x and z.
+        gaps: (K,) from the end of each device to that of the curve, m.
+        length: m.
+    """
+    arc = np.arange(0.0, length, _FINE)
+    steps = np.diff(np.append(arc, length))
+    middle = length - (arc + steps / 2)  # from the end
+    moment, stiffness = np.zeros((2, len(arc)))
+    for device, gap in zip(chosen, np.asarray(gaps), strict=True):
+        bending, _, own = theory.profile(device, middle - gap)
+        moment += bending * own
+        stiffness += bending
+    # Where no device is, there is no curvature.
+    turning = moment / np.maximum(stiffness, 1e-12) * steps
+    heading = np.cumsum(turning) - turning / 2
+    return np.array([np.sin(heading) @ steps, 0.0, np.cos(heading) @ steps])
+
+
+def turned(names: Sequence[str], gaps: Sequence[float]) -> tuple[float, float, float]:
+    """Largest deviations of the unloaded end, turned by `TURNS`.
+
+    Args:
+        names: K coaxial devices.
+        gaps: (K,) from the end of each to that of the chain, m.
+
+    Returns:
+        Deviation from the turned shape of 0° and from the continuous curve of the
+        EI-weighted curvature, as fractions of the displacement of the end; deviation of
+        the last link's direction from that of 0°, rad.
+    """
+    entity = DeviceStack(names)
+    rig = Rig(stack=entity)
+    rig.compile()
+    rows = []
+    for turn in TURNS:
+        rotation = np.full(len(names), turn)
+        chain_fields.write_still(entity, rig.model, np.asarray(gaps), rotation)
+        rig.data.qpos[:] = rig.model.qpos_spring
+        mujoco.mj_kinematics(rig.model, rig.data)
+        axis = rig.data.xmat[rig.tip_body].reshape(3, 3)[:, 2].copy()
+        rows.append((rig.head_position - rig.joints[0], axis))
+    back = Rotation.from_euler("z", -TURNS[:, None])
+    ends, axes = (back.apply(each) for each in np.moveaxis(np.array(rows), 1, 0))
+    length = float(rig.lengths.sum())
+    curve = free_curve(entity.devices, gaps, length)
+    moved = float(np.linalg.norm(curve - (0.0, 0.0, length)))
+    angle = np.linalg.norm(np.cross(axes, axes[0]), axis=-1).max()
+    away = [np.linalg.norm(ends - one, axis=-1).max() for one in (ends[0], curve)]
+    return float(away[0] / moved), float(away[1] / moved), float(np.arcsin(angle))
+
+
+def twists(link_lengths: np.ndarray, start: float, plane: float) -> tuple[float, float]:
+    """Twist of the last frame of a chain laid along half a circle of 40 mm.
+
+    Args:
+        link_lengths: (L,), m.
+        start: length of the straight piece before the half circle, m.
+        plane: of the half circle about the axis, rad.
+
+    Returns:
+        Twist of the last link, and of the link before it less the twist that coaxial
+        devices take out (`Stack.bent`), against frames that do not twist, rad.
+    """
+    end = [[2 * BEND_RADIUS, 0, -1.0]]
+    line = np.vstack([[[0, 0, 0]], half_circle(BEND_RADIUS, start, 399), end])
+    line = Rotation.from_euler("z", plane).apply(line)
+    angles = posture.joints_along(link_lengths, line)
+    frame = still = Rotation.identity()
+    found = []
+    for joint, (x, y) in enumerate(angles, start=1):
+        first = posture.x_first(joint)
+        turn = Rotation.from_euler("XY" if first else "YX", [x, y] if first else [y, x])
+        frame = frame * turn
+        across = np.cross(still.apply([0, 0, 1]), frame.apply([0, 0, 1]))
+        sine = np.linalg.norm(across)
+        across *= np.arcsin(sine) / sine if sine else 1.0
+        still = Rotation.from_rotvec(across) * still
+        found.append((still.inv() * frame).as_rotvec()[2])
+    stack = Stack([devices.get("berenstein_5f")], link_lengths)
+    _, taken = stack.bent(in_order(angles)[None])
+    return float(found[-1]), float(found[-2] - taken[0, -1])
+
+
 def free_ends(names: Sequence[str], leads: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Ends (n, 3) of the unloaded chain and of the curve, as the wire slides, m.
 
@@ -65,7 +176,7 @@ def free_ends(names: Sequence[str], leads: np.ndarray) -> tuple[np.ndarray, np.n
     heading = np.concatenate([np.zeros((len(leads), 1)), np.cumsum(angles, -1)], -1)
     x = (np.sin(heading) * stack.link_lengths).sum(-1)
     z = (np.cos(heading) * stack.link_lengths).sum(-1)
-    curve = [shapes.free_curve(entity.devices, gap, length) for gap in gaps]
+    curve = [free_curve(entity.devices, gap, length) for gap in gaps]
     return np.stack([x, 0 * x, z], axis=-1), np.array(curve)
 
 
@@ -89,11 +200,40 @@ def buckling(end: str) -> rod.Buckling:
     return rod.column(Rig(stack=entity), end, last, stiffness)
 
 
+def _shape_checks() -> Iterator[Check]:
+    """Turned shapes of all devices and pairs, and twist in half a circle."""
+    alone = [
+        ((name,), (0.0,)) for name, one in devices.DEVICES.items() if one.tip_shape
+    ]
+    pairs = [(pair, gaps) for pair in _PAIRS for gaps in GAPS]
+    parts = (
+        ("end against that at 0°", END_BOUND, 100.0, "%"),
+        ("end against the curve", CURVE_BOUND, 100.0, "%"),
+        ("direction against that at 0°", DIRECTION_BOUND, 57.29578, "°"),
+    )
+    for label, cases in (("single", alone), ("pairs", pairs)):
+        found = [(turned(n, g), f"{' in '.join(n)} {g}") for n, g in cases]
+        for part, (what, bound, scale, unit) in enumerate(parts):
+            worst, note = max(found, key=lambda one, part=part: one[0][part])
+            name = f"unloaded shapes turned by 0 to 345°, {label}, {what}"
+            yield Check.at_most(name, scale * worst[part], bound, unit, note)
+    lengths = devices.Discretisation().link_lengths(devices.get("steerable_5f"))
+    starts = np.arange(0.02, 0.2, 0.0175 / 2)
+    bent = [twists(lengths, start, plane) for start in starts for plane in TURNS[:7]]
+    worst = np.degrees(np.abs(bent).max(axis=0))
+    for what, value, bound in (
+        ("single", worst[0], SINGLE_TWIST_BOUND),
+        ("coaxial", worst[1], TWIST_BOUND),
+    ):
+        name = f"twist of the last frame in half a circle of 40 mm, {what} devices"
+        yield Check.at_most(name, value, bound, "°")
+
+
 def _checks(data: dict[str, Any], findings: dict[str, Any]) -> Iterator[Check]:
     for protrusion in PROTRUSIONS:
         what = f"wire out by {1e3 * protrusion:.0f} mm" if protrusion else "pair"
         yield from (one.check(what) for one in cantilevers(protrusion))
-    yield from shapes.checks()
+    yield from _shape_checks()
     yield from two_rods.checks()
     for end in ("sliding", "fixed"):
         yield buckling(end).check("buckling load of the pair")

@@ -14,7 +14,7 @@ from cathsim_dmc.anatomy.builder import VesselPlace
 from cathsim_dmc.anatomy.centreline import Centreline, Vessel, VesselTree
 from cathsim_dmc.anatomy.field import Field
 from cathsim_dmc.collision import fields
-from cathsim_dmc.entities import devices
+from cathsim_dmc.entities import devices, posture
 from cathsim_dmc.entities.arena import AngiographyArena
 from cathsim_dmc.entities.catheter import Catheter
 from cathsim_dmc.entities.contact import FRICTION
@@ -31,6 +31,12 @@ def half_circle(radius: float, start: float, pieces: int) -> np.ndarray:
     angle = np.linspace(0.0, np.pi, pieces + 1)
     arc = np.stack([1 - np.cos(angle), 0 * angle, np.sin(angle)], axis=-1)
     return radius * arc + (0, 0, start)
+
+
+def in_order(angles: np.ndarray) -> np.ndarray:
+    """Angles (n - 1, 2) about x and y of the joints of a chain as its hinges lie."""
+    first = [posture.x_first(joint) for joint in range(1, len(angles) + 1)]
+    return np.where(np.array(first)[:, None], angles, angles[:, ::-1]).ravel()
 
 
 def tube(length: float, radius: float, bend: float = 0.0) -> Anatomy:

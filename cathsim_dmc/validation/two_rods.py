@@ -21,8 +21,7 @@ from cathsim_dmc.physics import chain_fields
 from cathsim_dmc.physics.stepper import CONTROL_TIMESTEP
 from cathsim_dmc.validation import theory
 from cathsim_dmc.validation.checks import Check
-from cathsim_dmc.validation.rig import Rig, half_circle, in_tube
-from cathsim_dmc.validation.shapes import in_order
+from cathsim_dmc.validation.rig import Rig, half_circle, in_order, in_tube
 
 _FINE = 0.5e-3  # m
 BEND_RADIUS = 0.04  # m, of half a circle in which the pairs are held

@@ -141,32 +141,24 @@ def _for_people(values: Mapping[str, Any], inside: str = "") -> dict[str, Any]:
 
 
 def validate_wall(
-    phantoms: Sequence[str | Path | Anatomy] = (),
+    phantoms: Sequence[str | Path] = (),
     with_convergence: bool = True,
 ) -> Report:
     """Runs every check of the wall.
 
     Args:
-        phantoms: further anatomies beside the arches, such as an imported scan: the
-            directory of one, or the anatomy.
+        phantoms: directories of further anatomies beside the arches, such as an
+            imported scan.
         with_convergence: whether to run the convergence studies, which take longer
             than all the rest.
 
     Raises:
-        ValueError: if a directory holds no anatomy.
+        FileNotFoundError: if a directory holds no anatomy.
+        ValueError: if its file is damaged.
     """
     from cathsim_dmc.anatomy import phantoms as shipped
 
-    anatomies = [shipped.load(name) for name in ARCHES]
-    for phantom in phantoms:
-        if not isinstance(phantom, Anatomy):
-            if not Path(phantom).is_dir():
-                raise ValueError(
-                    f"no phantom at {str(phantom)!r}; give a directory written by "
-                    "`cathsim phantom import`, `build` or `generate`"
-                )
-            phantom = Anatomy.load(phantom)
-        anatomies.append(phantom)
+    anatomies = [*map(shipped.load, ARCHES), *map(Anatomy.load, phantoms)]
     studies = convergence.studies() if with_convergence else []
     pulled: list[friction.Capstan] = []
     pushed: list[dict[str, Any]] = []
