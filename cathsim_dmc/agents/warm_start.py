@@ -7,9 +7,10 @@ from cathsim_dmc.agents.config import ConfigError, TrainingConfig
 from cathsim_dmc.agents.imitation import network_of, statistics_of
 from cathsim_dmc.agents.networks import LOG_STD_RANGE, NetworkShapes
 from cathsim_dmc.agents.policies import TrainedPolicy, load_policy
+from cathsim_dmc.tasks import observations
 
 # What must agree for the weights to mean the same.
-_ALIKE = ("observation", "hidden", "activation", "subtract_background",
+_ALIKE = ("hidden", "activation", "subtract_background",
           "convolutions", "cnn_features", "observation_clip")  # fmt: skip
 
 
@@ -35,6 +36,11 @@ def take_over(policy: nn.Module, config: TrainingConfig, shapes: NetworkShapes) 
         for name in _ALIKE
         if getattr(source.config, name) != getattr(config, name)
     ]
+    if _entries(source.config.observation) != _entries(config.observation):
+        differing.append(
+            f"observation: it has {source.config.observation!r}, given is "
+            f"{config.observation!r}"
+        )
     if source.shapes != shapes:
         differing.append(f"sizes: it has {source.shapes}, the task has {shapes}")
     if differing:
@@ -52,6 +58,15 @@ def take_over(policy: nn.Module, config: TrainingConfig, shapes: NetworkShapes) 
         statistics_of(policy), statistics_of(given), strict=True
     ):
         own.load_state_dict(statistics.state_dict())
+
+
+def _entries(names: str | tuple[str, ...]) -> list[str]:
+    """Entries of an observation without the word of where they are from.
+
+    "route" and "biplane" have the same: one measures what the other reconstructs.
+    """
+    rows = observations.entries(observations.resolve(names))
+    return sorted(entry.key.partition("_")[2] or entry.key for entry in rows)
 
 
 def _set_deviation(

@@ -89,6 +89,11 @@ class Fluoroscope:
         # Beer-Lambert: the share of quanta that pass.
         return np.exp(-materials.IODINE * self.contrast * self.vessel)
 
+    @cached_property
+    def empty(self) -> np.ndarray:
+        """(rows, columns) uint8, the image without a device and without noise."""
+        return self._developed(np.zeros(self.carm.resolution, np.float32), None)
+
     @property
     def quanta(self) -> float:
         """Mean number of quanta on a pixel behind plain tissue in one frame."""

@@ -148,6 +148,9 @@ class ModelIndex:
         (self.insertion_qpos,) = model.jnt_qposadr[
             ids(model, [chain.insertion])
         ].tolist()
+        # Of the slide, along z of the handle, and of the first hinge, about its x.
+        first = [chain.insertion, chain.bends[0]]
+        self.handle_dofs = model.jnt_dofadr[ids(model, first)].tolist()
         self.rotation_qpos: int | None = None
         if chain.rotation is not None:
             (rotation,) = ids(model, [chain.rotation])

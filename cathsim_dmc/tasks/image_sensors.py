@@ -8,6 +8,7 @@ from cathsim_dmc.imaging import angiograph as angiographs
 from cathsim_dmc.imaging.device import Shadow
 from cathsim_dmc.imaging.fluoroscopy import Fluoroscope
 from cathsim_dmc.tasks import observations
+from cathsim_dmc.tasks.biplane_sight import BiplaneSight
 from cathsim_dmc.tasks.common_chain import CommonChain
 
 _AGES = tuple(f"past_{age}" for age in range(observations.SEQUENCE_LENGTH))
@@ -43,10 +44,16 @@ class ImageSensors:
         self._endoscope = endoscope if self._wants(*ENDOLUMINAL) else None
         self.on = angiograph is not None or self._endoscope is not None
         self._planes: list[angiographs.Planes] = []
+        self._sight = BiplaneSight(num_simulations)
         self._noise = False
         if angiograph is not None:
             self._planes = [angiograph.planes()] * num_simulations
             self._noise = angiograph.options.noise
+            if observations.needs(names, "biplane") and angiograph.options.planes < 2:
+                raise ValueError(
+                    "the observation 'biplane' needs two planes: give fluoroscopy a "
+                    "biplane, such as {'view': 'LAO45', 'biplane': [-45, 0]}"
+                )
         # The last images (N, ...) by name, and those before: past_0 is the last one.
         self._held: dict[str, np.ndarray] = {}
 
@@ -69,6 +76,7 @@ class ImageSensors:
         fresh: np.ndarray | None = None,
         device_points: np.ndarray | None = None,
         around: Callable[[angiographs.Planes, int], angiographs.Planes] | None = None,
+        handles: np.ndarray | None = None,
     ) -> dict[str, np.ndarray]:
         """Captures the next images.
 
@@ -80,6 +88,8 @@ class ImageSensors:
                 captured, and fill their history. None for a control step of all.
             device_points: (N, K, P, 3), tracked points of coaxial devices, m.
             around: moves the vessel before the machine of a simulation.
+            handles: (N, 3, 3), orientation of the handles, axes in columns; needed for
+                "biplane".
         """
         count = len(lines)
         chosen = np.arange(count) if fresh is None else fresh
@@ -87,12 +97,22 @@ class ImageSensors:
         planes = [self._planes[index] for index in chosen] if self._planes else []
         if around and self._wants("image", "sequential", "segmentation"):
             planes = list(map(around, planes, chosen.tolist()))
-        if self._wants("image", "sequential"):
+        image = None
+        if self._wants("image", "sequential", "biplane"):
             states = None
             if random_states is not None and self._noise:
                 states = [random_states[index] for index in chosen.tolist()]
             image = angiographs.images(planes, [s.of(chosen) for s in shadows], states)
             self._remember(image, count, fresh)
+        if self._wants("biplane") and image is not None and handles is not None:
+            ends = np.broadcast_to(goal, (count, 3))[chosen, None]
+            # The roadmaps show the vessel at rest.
+            own = [self._planes[index] for index in chosen]
+            marked = angiographs.pixels(own, ends)[:, :, 0]
+            given = own, image, marked, handles[chosen], chosen
+            seen = self._sight.see(*given, fresh is not None)
+            for key, value in seen.items():
+                self._hold(f"biplane_{key}", value, count, fresh)
         if self._wants("segmentation"):
             masks = angiographs.masks(planes, [s.of(chosen) for s in shadows])
             self._hold("masks", masks, count, fresh)

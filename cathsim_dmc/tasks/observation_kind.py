@@ -83,6 +83,7 @@ class ObservationKind:
         observe: function from a frame to the arrays of the observation.
         entries: its arrays.
         fluoroscopic: whether it needs the angiography machine.
+        biplane: whether it needs two planes of it.
         routed: whether it needs the route to the goal.
         coaxial: whether it needs coaxial devices.
         living: whether it needs a vessel that lives.
@@ -92,6 +93,7 @@ class ObservationKind:
     observe: Callable[[Frame], Observation]
     entries: tuple[Entry, ...]
     fluoroscopic: bool = False
+    biplane: bool = False
     routed: bool = False
     coaxial: bool = False
     living: bool = False

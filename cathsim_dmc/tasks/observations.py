@@ -242,6 +242,42 @@ def route(frame: Frame) -> Observation:
 
 
 @OBSERVATIONS.row(
+    Entry(
+        "biplane_points",
+        3 * len(AHEAD),
+        "m",
+        f"{len(AHEAD)} points of the route through both roadmaps, every "
+        f"{1e3 * AHEAD[1]:g} mm from the place of the head on, tip frame",
+    ),
+    Entry("biplane_radii", len(AHEAD), "m", "of the lumen there in the roadmaps", 0),
+    Entry("biplane_goal", 3, "m", "goal marker of both planes, tip frame"),
+    Entry(
+        "biplane_device",
+        3 * (TRACKED_POINTS - 1),
+        "m",
+        f"{TRACKED_POINTS - 1} points along the device in both live images, proximal "
+        "to the head and without it, tip frame",
+    ),
+    Entry(
+        "biplane_deviation",
+        1,
+        "radius",
+        "by how much the head is out of the route through the roadmaps, in radii "
+        "there; negative inside",
+        -1,
+    ),
+    Entry("biplane_action", _actions, "1", "the last action, 0 after a reset", -1, 1),
+    fluoroscopic=True,
+    biplane=True,
+)
+def biplane(frame: Frame) -> Observation:
+    """The entries of `route`, reconstructed from the images of two planes."""
+    parts = "points", "radii", "goal", "device", "deviation"
+    seen = {f"biplane_{part}": frame.images[f"biplane_{part}"] for part in parts}
+    return {**seen, "biplane_action": frame.action}
+
+
+@OBSERVATIONS.row(
     Entry("goal_position", 3, "m", "centre of the goal, world frame"),
     Entry("goal_from_head", 3, "m", "from the head to the goal, world frame"),
 )

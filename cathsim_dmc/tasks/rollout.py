@@ -295,6 +295,7 @@ class Rollout:
                 fresh,
                 None if devices is None else devices.points,
                 None if self.moving is None else self.around,
+                self._handles(),
             )
         if self._routes is not None:
             seen = self._at_rest(state) if self._tracking.on else self.resting
@@ -304,6 +305,12 @@ class Rollout:
             *(images, ahead, devices, self._measured.vessel),
         )
         return observations.observe(self._names, frame)
+
+    def _handles(self) -> np.ndarray:
+        """Orientations (N, 3, 3) of the handles, axes in columns."""
+        slide, hinge = self.index.handle_dofs
+        z, x = self._state.cdof[:, slide, 3:], self._state.cdof[:, hinge, :3]
+        return np.stack([x, np.cross(z, x), z], axis=-1)
 
     def _endoscope(self, indices: np.ndarray) -> dict[str, np.ndarray]:
         """What the heads of some simulations (K,) see of the wall, by name."""

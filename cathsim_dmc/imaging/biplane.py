@@ -1,0 +1,187 @@
+"""Biplane reconstruction: device, vessel and route in space from two X-ray images.
+
+Both C-arms know their geometry. The device is what the live image shows and the mask
+image of the empty vessel does not (digital subtraction): the marker at its tip is dark
+in both planes, and the shaft is followed backwards from it. The vessel is the visual
+hull of its outlines in both roadmaps: points that both planes see inside. The route is
+the way from the device to the goal marker that keeps to the middle of the hull.
+"""
+
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from cathsim_dmc.imaging import biplane_loops as loops
+from cathsim_dmc.imaging import materials
+from cathsim_dmc.imaging.fluoroscopy import Fluoroscope
+
+# Distance of the points along the device, m, and their number: 0.2 m of it.
+TRACE_SPACING = 5e-3
+TRACE_POINTS = 41
+# With fewer points, the device is sought in other directions behind its tip, too.
+TRACE_ENOUGH = 12
+# From the middle of the marker to the end of the device, m.
+MARKER_TO_HEAD = 0.5 * materials.MARKER_LENGTH
+
+# Distance of the points at which the hull is known, m, and of those of the route.
+HULL_SPACING = 3e-3
+ROUTE_SPACING = 1e-3
+# The route is smoothed by a Gaussian of this deviation, m: three points of the hull.
+_SMOOTHING = 4e-3
+# Farther than this from its outlines, m, no place of a vessel is better than another.
+_WIDE = 8e-3
+_SHAFT = 1.6e-3  # m, width of a usual device
+# From a pixel at the outline to the outline, px, on average.
+_EDGE = 0.25
+
+
+class Biplane:
+    """Two C-arms before one vessel.
+
+    Attributes:
+        matrices: (2, 3, 4), from places to pixels, see `CArm.matrix`.
+    """
+
+    def __init__(self, planes: tuple[Fluoroscope, Fluoroscope]):
+        """Takes the roadmap and the mask image of each plane."""
+        self._planes = planes
+        self.matrices = np.array([plane.carm.matrix for plane in planes])
+        self._focal = np.array([plane.carm.focal_length for plane in planes])
+        # Grey levels without a device, (2, rows, columns).
+        self._masks = np.stack([plane.empty for plane in planes]).astype(np.float32)
+        self._goal: tuple[np.ndarray, np.ndarray] | None = None
+
+    @property
+    def isocentre(self) -> np.ndarray:
+        """Point (3,) about which the arms turn, m."""
+        return np.asarray(self._planes[0].carm.isocentre)
+
+    def device(self, images: np.ndarray) -> list[np.ndarray]:
+        """Follows the device from its tip.
+
+        Args:
+            images: (K, rows, columns, 2) uint8, live images of the two planes.
+
+        Returns:
+            Points (P, 3) of each, world frame, m: the marker at the tip, then every
+            `TRACE_SPACING` behind it; (0, 3) where no marker is seen.
+        """
+        found = []
+        pitch = np.mean([plane.carm.pitch for plane in self._planes])
+        pixel = pitch * self._planes[0].carm.source_isocentre
+        pixel /= self._planes[0].carm.source_detector
+        # Of a rod across a pixel: the mean path through it.
+        full = materials.CATHETER * 0.25 * np.pi * _SHAFT**2 / max(pixel, _SHAFT)
+        for image in images:
+            grey = np.moveaxis(image, -1, 0).astype(np.float32)
+            depth = np.log(np.maximum(self._masks, 1.0) / np.maximum(grey, 1.0))
+            line = np.empty((TRACE_POINTS, 3))
+            count = loops.trace(
+                np.ascontiguousarray(depth, dtype=np.float32),
+                self.matrices,
+                _directions(),
+                TRACE_SPACING,
+                float(full),
+                TRACE_ENOUGH,
+                line,
+            )
+            found.append(line[:count])
+        return found
+
+    def point(self, pixels: ArrayLike) -> np.ndarray:
+        """Point (3,), m, that is seen at pixels (2, 2), (column, row) of each plane."""
+        places, found = np.asarray(pixels, dtype=np.float64)[:, ::-1], np.empty(3)
+        loops.triangulated(self.matrices, np.ascontiguousarray(places), found)
+        return found
+
+    def depth(self, points: ArrayLike) -> np.ndarray:
+        """Signed distance (...), m, of points (..., 3) from the outlines, + inside."""
+        points = np.asarray(points, dtype=np.float64)
+        flat = np.ascontiguousarray(points.reshape(-1, 3))
+        found = loops.depths(flat, self.matrices, self._walls, self._focal)
+        return found.reshape(points.shape[:-1])
+
+    @cached_property
+    def _walls(self) -> np.ndarray:
+        """Signed distances of pixels from the outlines, px, (2, rows, columns)."""
+        from scipy.ndimage import distance_transform_edt as distances
+
+        walls = []
+        for plane in self._planes:
+            inside = plane.vessel_mask
+            wall = np.where(
+                inside, distances(inside) - _EDGE, _EDGE - distances(~inside)
+            )
+            walls.append(wall.astype(np.float32))
+        return np.stack(walls)
+
+    @cached_property
+    def _hull(self) -> tuple[np.ndarray, np.ndarray]:
+        """First corner (3,) of a grid of `HULL_SPACING`, and its depths (X, Y, Z)."""
+        arm = self._planes[0].carm
+        half = 0.5 * arm.resolution[1] * arm.source_isocentre / arm.focal_length
+        low = np.asarray(arm.isocentre) - half
+        number = np.arange(int(2 * half / HULL_SPACING) + 1) * HULL_SPACING
+        grid = np.stack(np.meshgrid(*(low[:, None] + number), indexing="ij"), -1)
+        return low, self.depth(grid)
+
+    def route(self, start: ArrayLike, goal: ArrayLike) -> np.ndarray:
+        """Points (P, 3), m, every `ROUTE_SPACING` from a place in the hull to a goal.
+
+        Args:
+            start: (3,) world frame, m.
+            goal: (3,) world frame, m.
+        """
+        from scipy.ndimage import gaussian_filter1d
+
+        start, goal = (np.asarray(end, dtype=np.float64) for end in (start, goal))
+        found = self._path(start, goal)
+        line = np.vstack([start, found[1:-1], goal])
+        way = np.append(0.0, np.linalg.norm(np.diff(line, axis=0), axis=1).cumsum())
+        fine = np.arange(0.0, way[-1], ROUTE_SPACING)
+        line = np.stack([np.interp(fine, way, axis) for axis in line.T], axis=1)
+        # The ends stay where they are: the line continues beyond them, point reflected.
+        beyond = min(round(3 * _SMOOTHING / ROUTE_SPACING), len(line) - 1)
+        before = 2 * line[0] - line[beyond:0:-1]
+        after = 2 * line[-1] - line[-2 : -beyond - 2 : -1]
+        whole = np.vstack([before, line, after])
+        smooth = gaussian_filter1d(whole, _SMOOTHING / ROUTE_SPACING, axis=0)
+        return smooth[beyond : beyond + len(line)]
+
+    def _path(self, start: np.ndarray, goal: np.ndarray) -> np.ndarray:
+        """Points of the grid from the start to the goal, the cheapest way."""
+        from skimage.graph import MCP_Geometric
+
+        low, depth = self._hull
+        if self._goal is None or not np.array_equal(self._goal[0], goal):
+            margin = 0.4 * HULL_SPACING
+            cost = (_WIDE / np.clip(depth, margin, _WIDE)) ** 2
+            cost = np.where(depth > -0.5 * HULL_SPACING, cost, -1.0)
+            end = _nearest(cost > 0.0, (goal - low) / HULL_SPACING)
+            graph = MCP_Geometric(cost)
+            reached = graph.find_costs([end])[0]
+            self._goal, self._graph = (goal, np.isfinite(reached)), graph
+        begin = _nearest(self._goal[1], (start - low) / HULL_SPACING)
+        path = np.array(self._graph.traceback(begin))[::-1]
+        return low + path * HULL_SPACING
+
+
+def _nearest(allowed: np.ndarray, place: np.ndarray) -> tuple[int, ...]:
+    """Indices of the nearest point of a grid that is allowed, to a place in indices."""
+    indices = np.argwhere(allowed)
+    chosen = indices[np.square(indices - place).sum(axis=1).argmin()]
+    return tuple(chosen.tolist())
+
+
+_CACHED: list[np.ndarray] = []
+
+
+def _directions(count: int = 300) -> np.ndarray:
+    """Unit vectors (count, 3) all around, evenly spaced (Fibonacci)."""
+    if not _CACHED:
+        number = np.arange(count) + 0.5
+        z, angle = 1.0 - 2.0 * number / count, np.pi * (1.0 + 5**0.5) * number
+        flat = np.sqrt(1.0 - z**2)
+        _CACHED.append(np.stack([flat * np.cos(angle), flat * np.sin(angle), z], 1))
+    return _CACHED[0]

@@ -1,0 +1,121 @@
+"""What two X-ray planes show of N simulations, in the terms of the route's observation.
+
+Device, goal and route are reconstructed from the images (`imaging.biplane`); beside
+them, the frame of the tip needs the orientation of the handle, which its drive knows.
+"""
+
+import functools
+
+import numpy as np
+
+from cathsim_dmc.imaging import biplane
+from cathsim_dmc.imaging import biplane_loops as loops
+from cathsim_dmc.imaging.biplane import Biplane
+from cathsim_dmc.tasks.common_chain import TRACKED_PLACES
+from cathsim_dmc.tasks.route import AHEAD, Route, into_frame, locate
+
+# A device with fewer points counts as lost.
+_FEWEST = 7
+# The direction of the head is that of the chord to this point behind the marker.
+_CHORD = 2
+_OUT = -1e-3  # m from the outline; behind, the device is in its sheath
+_LEAST_RADIUS = 1e-3  # m, of the route
+
+
+class BiplaneSight:
+    """Reconstructs what the planes show; remembers the route of each simulation."""
+
+    def __init__(self, num_simulations: int):
+        """Begins with nothing seen.
+
+        Args:
+            num_simulations: N.
+        """
+        self._routes: list[Route | None] = [None] * num_simulations
+        self._lines = [np.zeros((0, 3))] * num_simulations
+
+    def see(
+        self,
+        planes: list[tuple],
+        images: np.ndarray,
+        pixels: np.ndarray,
+        handles: np.ndarray,
+        numbers: np.ndarray,
+        fresh: bool,
+    ) -> dict[str, np.ndarray]:
+        """Entries of the observation, for some simulations.
+
+        Args:
+            planes: The two planes before each of the K simulations.
+            images: (K, rows, columns, 2) uint8, live images.
+            pixels: (K, 2, 2), goal marker in each plane, (column, row).
+            handles: (K, 3, 3), orientation of the handle, its axes in columns.
+            numbers: (K,) of the simulations.
+            fresh: Whether they begin an episode.
+
+        Returns:
+            Arrays (K, ...) by name, m, in the frame of the tip.
+        """
+        rows = []
+        for k, number in enumerate(numbers.tolist()):
+            machine = _machine(planes[k])
+            (line,) = machine.device(images[k : k + 1])
+            if len(line) >= _FEWEST or not len(self._lines[number]) or fresh:
+                self._lines[number] = line
+            line = self._lines[number]
+            if len(line) < _FEWEST:
+                # Lost in the first image: a device along the handle.
+                line = _along(handles[k], line, machine)
+            goal = machine.point(pixels[k])
+            if fresh or self._routes[number] is None:
+                self._routes[number] = _route(machine, line, goal)
+            rows.append(_seen(line, handles[k], self._routes[number], goal))
+        return {name: np.stack([row[name] for row in rows]) for name in rows[0]}
+
+
+# A machine holds some megabytes; an evaluation has one for each episode.
+@functools.lru_cache(maxsize=256)
+def _machine(planes: tuple) -> Biplane:
+    return Biplane(planes)
+
+
+def _along(handle: np.ndarray, line: np.ndarray, machine: Biplane) -> np.ndarray:
+    """A straight line behind the first point, or behind the isocentre."""
+    first = line[0] if len(line) else machine.isocentre
+    ways = biplane.TRACE_SPACING * np.arange(_FEWEST)
+    return first - ways[:, None] * handle[:, 2]
+
+
+def _route(machine: Biplane, line: np.ndarray, goal: np.ndarray) -> Route:
+    """The route from where the device enters the vessel."""
+    out = np.flatnonzero(machine.depth(line) < _OUT)
+    first = max(int(out[0]) - 1, 0) if len(out) else len(line) - 1
+    points = machine.route(line[first], goal)
+    radii = np.maximum(machine.depth(points), _LEAST_RADIUS)
+    ways = np.append(0.0, np.linalg.norm(np.diff(points, axis=0), axis=1).cumsum())
+    return Route(points, radii, ways)
+
+
+def _seen(
+    line: np.ndarray, handle: np.ndarray, route: Route, goal: np.ndarray
+) -> dict[str, np.ndarray]:
+    ways = biplane.TRACE_SPACING * np.arange(len(line))
+    direction = line[0] - line[_CHORD]
+    direction = direction / np.linalg.norm(direction)
+    head = line[0] + biplane.MARKER_TO_HEAD * direction
+    frame = loops.carried(np.ascontiguousarray(handle), line, direction)
+    places = TRACKED_PLACES[:-1] - biplane.MARKER_TO_HEAD
+    # Where it has been lost, it is straight.
+    beyond = np.maximum(places - ways[-1], 0.0)[:, None]
+    back = (line[-1] - line[-2]) / biplane.TRACE_SPACING
+    device = np.stack([np.interp(places, ways, axis) for axis in line.T], axis=1)
+    device = device + beyond * back
+    place = locate(route, head)
+    ahead = place.arc_length + AHEAD
+    return {
+        "points": into_frame(route.at(ahead) - head, frame).ravel(),
+        "radii": np.interp(ahead, route.arc_length, route.radii),
+        "goal": into_frame((goal - head)[None], frame)[0],
+        "device": into_frame(device - head, frame).ravel(),
+        "deviation": np.atleast_1d(place.excess),
+    }

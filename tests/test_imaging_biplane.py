@@ -1,0 +1,83 @@
+"""What two planes tell of device, vessel and route in space."""
+
+import numpy as np
+import pytest
+from test_imaging_device import RADIUS
+
+from cathsim_dmc.anatomy import phantoms
+from cathsim_dmc.imaging import FluoroscopyOptions
+from cathsim_dmc.imaging.angiograph import Angiograph
+from cathsim_dmc.imaging.biplane import TRACE_SPACING, Biplane
+from cathsim_dmc.imaging.device import Shadow
+
+
+@pytest.fixture(scope="module")
+def anatomy():
+    return phantoms.load("type1")
+
+
+@pytest.fixture(scope="module")
+def planes(anatomy):
+    surface, (view, biplane) = anatomy.surface, ("LAO45", (-45, 0))
+    options = FluoroscopyOptions(view=view, biplane=biplane, roadmap=0.5)
+    return Angiograph(surface.vertices, surface.faces, options).planes()
+
+
+@pytest.fixture(scope="module")
+def machine(planes):
+    return Biplane(planes)
+
+
+def images(planes, line, random_state=None):
+    shadows = [Shadow(line[None], RADIUS)]
+    return np.concatenate([p.image(shadows, random_state) for p in planes], axis=-1)
+
+
+@pytest.mark.parametrize("noise", [False, True])
+@pytest.mark.parametrize("goal", ["bca", "lcca"])
+def test_a_device_on_a_route_is_found_from_its_marker_on(
+    anatomy, planes, machine, goal, noise
+):
+    route = anatomy.route(goal).resampled(3e-3).points
+    state = np.random.RandomState(0) if noise else None
+    (line,) = machine.device(images(planes, route, state))
+    assert len(line) >= 15
+    apart = np.linalg.norm(line[:15, None] - route, axis=-1).min(axis=1)
+    assert np.median(apart) < 1.5e-3 and apart.max() < 4e-3
+    assert np.linalg.norm(line[0] - route[-1]) < 2.5e-3
+    steps = np.linalg.norm(np.diff(line, axis=0), axis=1)
+    np.testing.assert_allclose(steps, TRACE_SPACING, rtol=1e-6)
+
+
+def test_nothing_is_found_in_empty_images(planes, machine):
+    empty = np.stack([plane.empty for plane in planes], axis=-1)
+    (line,) = machine.device(empty[None])
+    assert line.shape == (0, 3)
+
+
+def test_a_point_is_where_both_planes_see_it(planes, machine):
+    for point in np.random.RandomState(1).uniform(-0.04, 0.04, (5, 3)):
+        there = np.asarray(planes[0].carm.isocentre) + point
+        seen = [plane.carm.project(there)[0] for plane in planes]
+        np.testing.assert_allclose(machine.point(seen), there, atol=1e-9)
+
+
+def test_the_hull_holds_the_vessel(anatomy, machine):
+    line = anatomy.route("lcca").resampled(3e-3)
+    depth = machine.depth(line.points)
+    assert (depth > 0.3 * line.radii).all()
+    aside = np.asarray(machine.isocentre) + [0.09, 0.0, 0.0]
+    assert machine.depth(aside) < -0.01
+
+
+@pytest.mark.parametrize("goal", ["bca", "lcca"])
+def test_the_route_through_the_roadmaps_is_near_that_of_the_tree(
+    anatomy, machine, goal
+):
+    line = anatomy.route(goal).resampled(1e-3)
+    found = machine.route(line.points[20], anatomy.goals[goal].position)
+    apart = np.linalg.norm(found[:, None] - line.points, axis=-1)
+    assert apart.min(axis=1).mean() < 5e-3
+    assert apart.min(axis=1).max() < 12e-3
+    np.testing.assert_allclose(found[0], line.points[20], atol=1e-6)
+    assert np.linalg.norm(found[-1] - anatomy.goals[goal].position) < 2e-3
