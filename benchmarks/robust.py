@@ -19,6 +19,7 @@ import tyro
 
 from cathsim_dmc.agents import evaluation, protocols
 from cathsim_dmc.agents.evaluation import SAFE_FORCES
+from cathsim_dmc.agents.policies import load_policy
 from cathsim_dmc.anatomy.arch import arch
 from cathsim_dmc.tasks.anatomies import load_anatomy
 
@@ -52,9 +53,9 @@ class Cell:
     protocol: str = "varied"
 
 
-def arches():
-    """Every held-out arch once, for each branch and access."""
-    pool = len(arch.arch_set("test"))
+def arches(pool=None):
+    """Every held-out arch once, or so many, for each branch and access."""
+    pool = pool or len(arch.arch_set("test"))
     for goal in GOALS:
         for access in ACCESSES:
             where = {"goal": goal, "access": access}
@@ -101,13 +102,16 @@ def changes(episodes=20):
 
 def play(policy: str, cell: Cell) -> dict:
     """The line of a cell."""
-    began = time.monotonic()
+    began, player = time.monotonic(), load_policy(policy)
+    # A policy that reads images needs the planes that it was trained with.
+    planes = (player.task_kwargs or {}).get("fluoroscopy")
+    seen = {} if planes is None else {"fluoroscopy": planes}
     found = evaluation.evaluate(
-        policy,
+        player,
         cell.task,
         cell.episodes,
         protocol=cell.protocol or "published",
-        task_kwargs=cell.options,
+        task_kwargs={**seen, **cell.options},
     )
     reached = found.values("success") > 0
     sums = found.values("forces.peak_sum.maximum")
@@ -158,6 +162,8 @@ def main(
     out: Path,
     only: tuple[Part, ...] = ("arches", "variants", "anatomies", "changes"),
     anatomy: tuple[str, ...] = PHANTOMS,
+    pool: int | None = None,
+    max_steps: int | None = None,
 ) -> None:
     """Play the cells that are missing in a file.
 
@@ -166,9 +172,13 @@ def main(
         out: File with a line of JSON for each cell.
         only: Parts to play.
         anatomy: Names or directories of the anatomies of the part `anatomies`.
+        pool: Number of held-out arches of the part `arches`, the first ones; all by
+            default.
+        max_steps: Number of control steps after which an episode is cut off; that of
+            the task by default.
     """
     cells = {
-        "arches": arches,
+        "arches": lambda: arches(pool),
         "variants": variants,
         "anatomies": lambda: anatomies(anatomy),
     }
@@ -180,6 +190,9 @@ def main(
         key = {"policy": policy, "part": cell.part, **cell.labels}
         if any(key.items() <= line.items() for line in done):
             continue
+        if max_steps is not None:
+            options = {**cell.options, "max_steps": max_steps}
+            cell = dataclasses.replace(cell, options=options)
         line = play(policy, cell)
         with out.open("a") as file:
             file.write(json.dumps(line) + "\n")

@@ -18,7 +18,7 @@ def anatomy():
 
 @pytest.fixture(scope="module")
 def planes(anatomy):
-    surface, (view, biplane) = anatomy.surface, ("LAO45", (-45, 0))
+    surface, (view, biplane) = anatomy.surface, ((60, 0), (-30, 0))
     options = FluoroscopyOptions(view=view, biplane=biplane, roadmap=0.5)
     return Angiograph(surface.vertices, surface.faces, options).planes()
 
@@ -77,7 +77,7 @@ def test_the_route_through_the_roadmaps_is_near_that_of_the_tree(
     line = anatomy.route(goal).resampled(1e-3)
     found = machine.route(line.points[20], anatomy.goals[goal].position)
     apart = np.linalg.norm(found[:, None] - line.points, axis=-1)
-    assert apart.min(axis=1).mean() < 5e-3
-    assert apart.min(axis=1).max() < 12e-3
-    np.testing.assert_allclose(found[0], line.points[20], atol=1e-6)
+    assert apart.min(axis=1).mean() < 8e-3
+    assert apart.min(axis=1).max() < 15e-3
+    np.testing.assert_allclose(found[0], line.points[20], atol=1e-5)
     assert np.linalg.norm(found[-1] - anatomy.goals[goal].position) < 2e-3

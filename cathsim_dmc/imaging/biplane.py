@@ -30,7 +30,7 @@ ROUTE_SPACING = 1e-3
 # The route is smoothed by a Gaussian of this deviation, m: three points of the hull.
 _SMOOTHING = 4e-3
 # Farther than this from its outlines, m, no place of a vessel is better than another.
-_WIDE = 8e-3
+_WIDE = 12e-3
 _SHAFT = 1.6e-3  # m, width of a usual device
 # From a pixel at the outline to the outline, px, on average.
 _EDGE = 0.25

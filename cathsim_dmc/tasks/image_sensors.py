@@ -52,7 +52,7 @@ class ImageSensors:
             if observations.needs(names, "biplane") and angiograph.options.planes < 2:
                 raise ValueError(
                     "the observation 'biplane' needs two planes: give fluoroscopy a "
-                    "biplane, such as {'view': 'LAO45', 'biplane': [-45, 0]}"
+                    "biplane, such as {'view': [60, 0], 'biplane': [-30, 0]}"
                 )
         # The last images (N, ...) by name, and those before: past_0 is the last one.
         self._held: dict[str, np.ndarray] = {}

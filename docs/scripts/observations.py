@@ -57,8 +57,8 @@ Tasks with the suffix `_wire` or `_pair` add these entries to `internal`, `track
 FLUOROSCOPY = f"""
 ## Fluoroscopy
 
-`image`, `sequential`, `segmentation`, `tracking_2d` and `biplane` use a simulated C-arm,
-without OpenGL. `task_kwargs={{"fluoroscopy": {{...}}}}` configures it:
+`image`, `sequential`, `segmentation`, `tracking_2d` and `biplane` use a simulated
+C-arm, without OpenGL. `task_kwargs={{"fluoroscopy": {{...}}}}` configures it:
 
 {{table}}
 
@@ -68,13 +68,14 @@ C-arm follow those of the first.
 
 ![Views and modes](images/observation_views.png)
 
-`biplane` has the entries of `route`, reconstructed from what an angiography suite has: the live
-images and the roadmaps of two planes with known geometry, and the goal marker in both
-(`cathsim_dmc/imaging/biplane.py`). The device is what a live image shows and the mask image of
-the empty vessel does not: the marker at its tip is dark in both planes, and the shaft is
-followed from there. The vessel is the set of points that both roadmaps show inside. The route
-through it is found when an episode begins. From the drive come the last action and the roll of
-the handle, by which the frame of the tip is known.
+`biplane` has the entries of `route`, reconstructed from what an angiography suite has:
+the live images and the roadmaps of two planes with known geometry, and the goal marker
+in both (`cathsim_dmc/imaging/biplane.py`). The device is what a live image shows and
+the mask image of the empty vessel does not: the marker at its tip is dark in both
+planes, and the shaft is followed from there. The vessel is the set of points that both
+roadmaps show inside. The route through it is found when an episode begins. From the
+drive come the last action and the roll of the handle, by which the frame of the tip is
+known.
 
 A cannulation of the left common carotid artery by the scripted expert:
 
@@ -141,7 +142,7 @@ def entries_table() -> str:
     }
     single = [name for name, kind in kinds.items() if not kind.biplane]
     double = [name for name, kind in kinds.items() if kind.biplane]
-    planes = {"view": "LAO45", "biplane": [-45, 0]}
+    planes = {"view": [60, 0], "biplane": [-30, 0]}
     specs = {
         **suite.make_task(TASK, observation=single).observation_specs,
         **suite.make_task(

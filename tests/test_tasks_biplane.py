@@ -1,0 +1,63 @@
+"""The observation that two X-ray planes give, beside what they reconstruct."""
+
+import numpy as np
+import pytest
+
+from cathsim_dmc import suite
+from cathsim_dmc.imaging.biplane_loops import carried
+from cathsim_dmc.simulation.batch import BatchSimulation
+
+TASK = "type1_lcca"
+OPTIONS = {
+    "observation": ["biplane", "route"],
+    "fluoroscopy": {"view": [60, 0], "biplane": [-30, 0], "contrast": False},
+    "randomisation": {"roll": [1.0, 1.0], "start_insertion": [0.04, 0.04]},
+}
+STEPS = 6
+
+
+@pytest.fixture(scope="module")
+def both_paths():
+    """Observations of a composer environment and of a batch, of the same actions."""
+    environment = suite.load("cathsim", TASK, {**OPTIONS, "random": 5})
+    batch = BatchSimulation(suite.make_task(TASK, **OPTIONS), 1, seeds=5)
+    single, many = [environment.reset().observation], [batch.reset().observation]
+    action = np.zeros(21)
+    action[:20:2], action[-1] = 0.4, 0.5
+    for _ in range(STEPS):
+        single.append(environment.step(action).observation)
+        many.append(batch.step(action[None]).observation)
+    return single, many
+
+
+def test_both_paths_see_the_same(both_paths):
+    for one, of_batch in zip(*both_paths, strict=True):
+        for key in (key for key in one if key.startswith("biplane_")):
+            np.testing.assert_array_equal(one[key], of_batch[key][0], err_msg=key)
+
+
+def test_the_planes_show_what_the_route_measures(both_paths):
+    for seen in both_paths[0]:
+        points = (seen["biplane_points"] - seen["route_points"]).reshape(-1, 3)
+        assert np.linalg.norm(points, axis=1).mean() < 8e-3
+        device = (seen["biplane_device"] - seen["route_device"]).reshape(-1, 3)
+        assert np.linalg.norm(device[-3:], axis=1).max() < 8e-3
+        way = np.linalg.norm(seen["route_goal"])
+        assert np.linalg.norm(seen["biplane_goal"] - seen["route_goal"]) < 0.35 * way
+        np.testing.assert_array_equal(seen["biplane_action"], seen["route_action"])
+
+
+def test_one_plane_is_not_enough():
+    with pytest.raises(ValueError, match="needs two planes"):
+        suite.load("cathsim", TASK, {"observation": "biplane"}).reset()
+
+
+def test_a_frame_is_carried_without_turning_about_the_line():
+    angle = np.linspace(2.0, 0.0, 200)
+    line = np.stack([np.sin(angle), 0 * angle, 1 - np.cos(angle)], axis=1)
+    tip = np.array([np.cos(2.0), 0.0, np.sin(2.0)])
+    handle = np.array([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]])
+    frame = carried(handle, line, tip)
+    np.testing.assert_allclose(frame.T @ frame, np.eye(3), atol=1e-9)
+    np.testing.assert_allclose(frame[:, 2], tip, atol=1e-9)
+    np.testing.assert_allclose(frame[:, 1], [0.0, 1.0, 0.0], atol=1e-9)
