@@ -92,7 +92,7 @@ class Fluoroscope:
     @cached_property
     def empty(self) -> np.ndarray:
         """(rows, columns) uint8, the image without a device and without noise."""
-        return self._developed(np.zeros(self.carm.resolution, np.float32), None)
+        return self._developed(np.zeros((1, *self.carm.resolution)), None)[0]
 
     @property
     def quanta(self) -> float:
@@ -132,14 +132,21 @@ class Fluoroscope:
         image = np.empty(frames.shape, dtype=np.uint8)
         for start in range(0, len(frames), _CHUNK):
             part = slice(start, start + _CHUNK)
-            signal = np.exp(-frames[part]) * self.signal
-            if states is not None:
-                signal = detector.quantum_noise(signal, self.quanta, states[part])
-            signal = detector.blurred(signal, self.blur / self.carm.pitch)
-            if self.roadmap > 0.0:
-                signal = signal * self._roadmap_gain
-            image[part] = detector.grey(signal, self.gain)
+            of_part = None if states is None else states[part]
+            image[part] = self._developed(frames[part], of_part)
         return image.reshape(*depth.shape, 1)
+
+    def _developed(
+        self, depths: np.ndarray, states: Sequence[np.random.RandomState] | None
+    ) -> np.ndarray:
+        """Grey images (B, rows, columns) of optical depths of devices."""
+        signal = np.exp(-depths) * self.signal
+        if states is not None:
+            signal = detector.quantum_noise(signal, self.quanta, states)
+        signal = detector.blurred(signal, self.blur / self.carm.pitch)
+        if self.roadmap > 0.0:
+            signal = signal * self._roadmap_gain
+        return detector.grey(signal, self.gain)
 
     @cached_property
     def _roadmap_gain(self) -> np.ndarray:
