@@ -37,11 +37,8 @@ def numbers(values):
 
 
 def carrier(field, name="wall", more=""):
-    made = fields.carrier(field)
-    values = " ".join(
-        f'{key}="{value if key == "type" else numbers(value)}"'
-        for key, value in made.items()
-    )
+    made = {k: np.ravel(v).tolist() for k, v in fields.carrier(field).items()}
+    values = " ".join(f'{key}="{" ".join(map(str, v))}"' for key, v in made.items())
     return f'<geom name="{name}" {values} {more}/>'
 
 

@@ -174,7 +174,7 @@ def register(field: Field | Bore) -> tuple[float, ...]:
 
 
 def carrier(field: Field | Bore, motion: np.ndarray | None = None) -> dict[str, Any]:
-    """Attributes of the geom that carries a field, on a body that has its frame.
+    """Attributes of the geom that carries a field, unseen, on a body with its frame.
 
     Args:
         field: wall that touches from its inside.
@@ -191,6 +191,9 @@ def carrier(field: Field | Bore, motion: np.ndarray | None = None) -> dict[str, 
         "pos": (low + high) / 2,
         "size": (high - low) / 2 + around,
         "user": user,
+        "mass": 0,
+        "group": 5,
+        "rgba": (0, 0, 0, 0),
     }
 
 

@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from dm_control import composer, mjcf
 
+from cathsim_dmc.entities import contact
 from cathsim_dmc.entities.device import Device
 from cathsim_dmc.entities.posture import x_first
 
@@ -34,6 +35,9 @@ CARRIAGE_STIFFNESS = 1e4
 COMPRESSION_DAMPING = 0.5
 COMPRESSION_ARMATURE = 1e-3  # kg, about the mass of the device
 
+# Lag of the drives of the tip, s. It has no source; with 0.05 s, noise on the motors
+# whips the tip into the wall (docs/soak.md).
+STEERING_LAG = 0.2
 ROTOR_INERTIA = 1e-4  # kg·m², rotary unit: a 0.3 kg clamp of 2 cm
 MAX_TORQUE = 0.02  # N·m, slip of the clamps
 MAX_ROTATION_SPEED = 3.14  # rad/s
@@ -66,6 +70,7 @@ class Links(NamedTuple):
         rest_angles: n - 1 pairs, of the hinges about x and y, rad.
         axial_stiffness: EA of the whole device, N.
         tip: number of the first link that is drawn as part of the tip.
+        steering: torque of the motors about x and y, N·m, by link.
         twists: compliance of the torsion hinges, rad/(N·m), by link.
     """
 
@@ -76,10 +81,11 @@ class Links(NamedTuple):
     rest_angles: Sequence[tuple[float, float]]
     axial_stiffness: float
     tip: int
+    steering: Mapping[int, float] = MappingProxyType({})
     twists: Mapping[int, float] = MappingProxyType({})
 
 
-class Chain(composer.Entity):
+class Chain(composer.ModelWrapperEntity):
     """Links with hinges about x and y; +z of every link points to the distal end.
 
     The origin of the entity is the position of the distal end at zero insertion.
@@ -87,290 +93,198 @@ class Chain(composer.Entity):
 
     Attributes:
         coaxial: Whether the devices are coaxial ones, each moved by itself.
+        devices: The devices, from the innermost outwards.
+        device: The device; of coaxial devices the outermost, which the sheath guides.
+        density: Effective density, kg/m³, that determines the buoyancy in blood.
+        timestep: Physics step with which the chain is simulated, s.
+        stroke: Longest insertion, m.
+        link_lengths: (n,), of the links from proximal to distal, m.
+        links: Bodies from proximal to distal.
+        link_geoms: Their capsules.
+        head: Site at the distal end.
+        insertion: Slide joint of the base.
+        rotation: Hinge joint of the base, or None.
+        bends: Bending hinges from proximal to distal, x before y.
+        hinges: Hinges that represent the bending and torsion of the rod.
+        joints: All joints in the order of the chain, of each link x before y.
+        tip_motors: Motors of the tip from proximal to distal, x before y.
+        actuators: All actuators: tip, insertion, rotation.
+        action_names: Names of the entries of an action.
+        translations: Indices of the translations in the action.
+        push_force: Sensor of the force on the base.
+        push_torque: Sensor of the torque on the base.
     """
 
     coaxial = False
+    devices: tuple[Device, ...]
+    density: float
+    action_names: tuple[str, ...]
+    translations: tuple[int, ...]
 
     def _assemble(
         self,
         links: Links,
-        contact: dict[str, Any],
+        surface: dict[str, Any],
         *,
         stroke: float,
         rotation: bool,
         timestep: float,
         name: str,
     ) -> None:
-        """Builds base, links, head, motors and sensors.
+        """Builds base, links, head, motors and sensors; `devices` are there.
 
         Args:
             links: what the chain is made of.
-            contact: attributes of the geoms.
+            surface: attributes of the geoms, see `contact`.
             stroke: longest insertion, m.
             rotation: whether the base has a rotation joint.
             timestep: physics step with which the chain will be simulated, s.
         """
         if not stroke > 0:
             raise ValueError(f"stroke is {stroke} m; it must be positive")
-        self._made, self._contact, self._stroke = links, contact, stroke
-        self._lengths, self._radius = links.lengths, links.radius
-        self._timestep = timestep
-        self._mjcf_root = mjcf.RootElement(model=name)
-        self._mjcf_root.compiler.angle = "radian"
-        self._links = []
-        self._link_geoms = []
-        self._bends, self._twists = [], []
-        self._build_base(rotation)
-        for index in range(1, len(self._lengths)):
-            self._build_link(index)
-        self._head = self._links[-1].add(
+        self.device = self.devices[-1]
+        self.stroke, self.timestep, self.link_lengths = stroke, timestep, links.lengths
+        root = mjcf.RootElement(model=name)
+        root.compiler.angle = "radian"
+        super()._build(root)
+        bodies = [self._add_base(links, rotation)]
+        bends, twists = [], []
+        for index in range(1, len(links.lengths)):
+            place = (0, 0, links.lengths[index - 1])
+            bodies.append(bodies[-1].add("body", name=f"link_{index}", pos=place))
+            if index in links.twists:
+                twist = bodies[-1], f"twist_{index}", (0, 0, 1), links.twists[index]
+                twists.append(self._add_hinge(*twist, armature=TORSION_ARMATURE))
+            bends += self._add_bends(bodies[-1], index, links)
+        self.links, self.bends = tuple(bodies), tuple(bends)
+        self.link_geoms = tuple(
+            _add_capsule(body, index, links, surface)
+            for index, body in enumerate(bodies)
+        )
+        self._add_shaft(links)
+        self.hinges = (*bends, *twists)
+        straight, mine = iter(bends), set(bends)
+        self.joints = tuple(
+            next(straight) if joint in mine else joint
+            for joint in root.find_all("joint")
+        )
+        self.head = bodies[-1].add(
             "site",
             name="head",
-            pos=(0, 0, self._lengths[-1]),
-            size=[self._radius],
+            pos=(0, 0, links.lengths[-1]),
+            size=[links.radius],
             rgba=TIP_COLOUR,
             group=4,
         )
-        self._build_motors()
-        self._build_sensors()
+        self._add_motors(links)
+        grip = bodies[0].add("site", name="grip", size=[1e-3], group=4)
+        self.push_force = root.sensor.add("force", name="push_force", site=grip)
+        self.push_torque = root.sensor.add("torque", name="push_torque", site=grip)
 
-    @property
-    def device(self) -> Device:
-        """The device; of coaxial devices the outermost."""
-        raise NotImplementedError
-
-    @property
-    def devices(self) -> tuple[Device, ...]:
-        """The devices, from the innermost outwards."""
-        raise NotImplementedError
-
-    @property
-    def density(self) -> float:
-        """Effective density, kg/m³, that determines the buoyancy in blood."""
-        raise NotImplementedError
-
-    # Assembly.
-
-    def _build_base(self, rotation: bool):
-        base = self._mjcf_root.worldbody.add(
-            "body", name="link_0", pos=(0, 0, -self._lengths.sum())
-        )
-        self._insertion = base.add(
+    def _add_base(self, links: Links, rotation: bool):
+        length = links.lengths.sum()
+        base = self.mjcf_model.worldbody.add("body", name="link_0", pos=(0, 0, -length))
+        along = {"type": "slide", "axis": (0, 0, 1)}
+        self.insertion = base.add(
             "joint",
             name="insertion",
-            type="slide",
-            axis=(0, 0, 1),
+            **along,
             armature=CARRIAGE_MASS,
             limited=True,
-            range=(0.0, self._stroke),
+            range=(0.0, self.stroke),
         )
-        stiffness = self._made.axial_stiffness / self._lengths.sum()
+        stiffness = links.axial_stiffness / length
         base.add(
             "joint",
             name="compression",
-            type="slide",
-            axis=(0, 0, 1),
+            **along,
             stiffness=stiffness,
             damping=2 * COMPRESSION_DAMPING * (stiffness * CARRIAGE_MASS) ** 0.5,
             armature=COMPRESSION_ARMATURE,
         )
-        self._rotation = None
+        self.rotation = None
         if rotation:
-            self._rotation = base.add(
-                "joint",
-                name="rotation",
-                type="hinge",
-                axis=(0, 0, 1),
-                armature=ROTOR_INERTIA,
-            )
-        self._links.append(base)
-        self._add_capsule(base, 0)
-        # The part of the device that the follower holds, drawn only.
-        base.add(
+            turn = {"type": "hinge", "axis": (0, 0, 1), "armature": ROTOR_INERTIA}
+            self.rotation = base.add("joint", name="rotation", **turn)
+        return base
+
+    def _add_shaft(self, links: Links):
+        """The part of the device that the follower holds, drawn only."""
+        self.links[0].add(
             "geom",
             name="shaft",
             type="capsule",
-            fromto=(0, 0, -_VISIBLE_SHAFT - self._stroke, 0, 0, 0),
-            size=[self._radius],
-            mass=0,
-            contype=0,
-            conaffinity=0,
-            group=2,
+            fromto=(0, 0, -_VISIBLE_SHAFT - self.stroke, 0, 0, 0),
+            size=[links.radius],
+            **contact.DRAWN,
             rgba=COLOUR,
         )
 
-    def _build_link(self, index: int):
-        link = self._links[-1].add(
-            "body", name=f"link_{index}", pos=(0, 0, self._lengths[index - 1])
+    def _add_hinge(self, body, name: str, axis, compliance: float, **attributes):
+        stiffness = 1 / compliance
+        time = float(hinge_time(self.device.relaxation_time, self.timestep))
+        return body.add(
+            "joint",
+            name=name,
+            axis=axis,
+            stiffness=stiffness,
+            damping=time * stiffness,
+            **attributes,
         )
-        self._links.append(link)
-        stiffness = 1 / self._made.compliances[index - 1]
-        rest = dict(zip("xy", self._made.rest_angles[index - 1], strict=True))
-        if index in self._made.twists:
-            twist = 1 / self._made.twists[index]
-            self._twists.append(
-                link.add(
-                    "joint",
-                    name=f"twist_{index}",
-                    axis=(0, 0, 1),
-                    stiffness=twist,
-                    damping=self._relaxation_time * twist,
-                    armature=TORSION_ARMATURE,
-                )
-            )
+
+    def _add_bends(self, body, index: int, links: Links):
+        """Bending hinges of a link, x before y."""
+        compliance = links.compliances[index - 1]
+        rest = dict(zip("xy", links.rest_angles[index - 1], strict=True))
+        ways = {"x": (1, 0, 0), "y": (0, 1, 0)}
         bends = {
-            axis: link.add(
-                "joint",
-                name=f"bend_{axis}_{index}",
-                axis=(1, 0, 0) if axis == "x" else (0, 1, 0),
-                stiffness=stiffness,
-                damping=self._relaxation_time * stiffness,
+            axis: self._add_hinge(
+                body,
+                f"bend_{axis}_{index}",
+                ways[axis],
+                compliance,
                 springref=rest[axis],
                 armature=HINGE_ARMATURE,
             )
             for axis in ("xy" if x_first(index) else "yx")
         }
-        self._bends += [bends["x"], bends["y"]]
-        self._add_capsule(link, index)
+        return bends["x"], bends["y"]
 
-    def _add_capsule(self, body, index: int):
-        length = self._lengths[index]
-        self._link_geoms.append(
-            body.add(
-                "geom",
-                name=f"link_{index}",
-                type="capsule",
-                fromto=(0, 0, 0, 0, 0, length),
-                size=[self._radius],
-                mass=self._made.masses[index],
-                rgba=TIP_COLOUR if index >= self._made.tip else COLOUR,
-                **self._contact,
+    def _add_motors(self, links: Links):
+        """The motors of the tip, which add no stiffness, and the servos of the base."""
+        drives, tip = self.mjcf_model.actuator, []
+        bounded = {"ctrllimited": True, "ctrlrange": (-1, 1)}
+        for number, (index, torque) in enumerate(links.steering.items()):
+            for axis, joint in zip("xy", self.bends[2 * index - 2 :], strict=False):
+                motor = {"name": f"tip_{axis}_{number}", "joint": joint, **bounded}
+                lag = {"dyntype": "filterexact", "dynprm": [STEERING_LAG]}
+                tip.append(drives.add("general", **motor, **lag, gainprm=[torque]))
+        servos = []
+        for joint, stiffness, speed, effort in (
+            (self.insertion, CARRIAGE_STIFFNESS, MAX_PUSH_SPEED, MAX_PUSH_FORCE),
+            (self.rotation, ROTATION_STIFFNESS, MAX_ROTATION_SPEED, MAX_TORQUE),
+        ):
+            if joint is None:
+                continue
+            # On the integral of a speed, see `physics.drives`.
+            damping = 2 * SERVO_DAMPING * (stiffness * joint.armature) ** 0.5
+            servos.append(
+                drives.add(
+                    "general",
+                    name=joint.name,
+                    joint=joint,
+                    **bounded,
+                    forcelimited=True,
+                    forcerange=(-effort, effort),
+                    dyntype="integrator",
+                    gainprm=[stiffness * speed],
+                    biastype="affine",
+                    biasprm=[0, -stiffness, -damping],
+                )
             )
-        )
-
-    def _build_motors(self):
-        self._insertion_motor = self._add_servo(
-            self._insertion, CARRIAGE_STIFFNESS, MAX_PUSH_SPEED, MAX_PUSH_FORCE
-        )
-        self._rotation_motor = None
-        if self._rotation is not None:
-            self._rotation_motor = self._add_servo(
-                self._rotation, ROTATION_STIFFNESS, MAX_ROTATION_SPEED, MAX_TORQUE
-            )
-
-    def _add_servo(self, joint, stiffness, max_speed, max_effort):
-        """A servo on the integral of a speed, see `physics.drives`."""
-        damping = 2 * SERVO_DAMPING * (stiffness * joint.armature) ** 0.5
-        return self._mjcf_root.actuator.add(
-            "general",
-            name=joint.name,
-            joint=joint,
-            ctrllimited=True,
-            ctrlrange=(-1, 1),
-            forcelimited=True,
-            forcerange=(-max_effort, max_effort),
-            dyntype="integrator",
-            gainprm=[stiffness * max_speed],
-            biastype="affine",
-            biasprm=[0, -stiffness, -damping],
-        )
-
-    def _build_sensors(self):
-        grip = self._links[0].add("site", name="grip", size=[1e-3], group=4)
-        sensors = self._mjcf_root.sensor
-        self._push_force = sensors.add("force", name="push_force", site=grip)
-        self._push_torque = sensors.add("torque", name="push_torque", site=grip)
-
-    @property
-    def _relaxation_time(self) -> float:
-        """Damping over stiffness of the hinges, s."""
-        return float(hinge_time(self.device.relaxation_time, self._timestep))
-
-    @property
-    def timestep(self) -> float:
-        """Physics step with which the chain is simulated, s."""
-        return self._timestep
-
-    @property
-    def mjcf_model(self) -> mjcf.RootElement:
-        """The MJCF model of the chain."""
-        return self._mjcf_root
-
-    @property
-    def link_lengths(self) -> np.ndarray:
-        """Lengths (n,) of the links from proximal to distal, m."""
-        return self._lengths
-
-    @property
-    def stroke(self) -> float:
-        """Longest insertion, m."""
-        return self._stroke
-
-    @property
-    def links(self) -> tuple:
-        """Bodies from proximal to distal."""
-        return tuple(self._links)
-
-    @property
-    def link_geoms(self) -> tuple:
-        """Capsules of the links from proximal to distal."""
-        return tuple(self._link_geoms)
-
-    @property
-    def head(self):
-        """Site at the distal end."""
-        return self._head
-
-    @property
-    def insertion(self):
-        """Slide joint of the base."""
-        return self._insertion
-
-    @property
-    def rotation(self):
-        """Hinge joint of the base, or None."""
-        return self._rotation
-
-    @property
-    def bends(self) -> tuple:
-        """Bending hinges from proximal to distal, x before y."""
-        return tuple(self._bends)
-
-    @property
-    def hinges(self) -> tuple:
-        """Hinges that represent the bending and torsion of the rod."""
-        return (*self._bends, *self._twists)
-
-    @property
-    def push_force(self):
-        """Sensor of the force on the base."""
-        return self._push_force
-
-    @property
-    def push_torque(self):
-        """Sensor of the torque on the base."""
-        return self._push_torque
-
-    @property
-    def tip_motors(self) -> tuple:
-        """Motors of the tip from proximal to distal, x before y."""
-        return ()
-
-    @property
-    def actuators(self) -> tuple:
-        """All actuators: tip, insertion, rotation."""
-        rotation = () if self._rotation_motor is None else (self._rotation_motor,)
-        return (*self.tip_motors, self._insertion_motor, *rotation)
-
-    @property
-    def action_names(self) -> tuple[str, ...]:
-        """Names of the entries of an action: those of the actuators."""
-        return tuple(actuator.name for actuator in self.actuators)
-
-    @property
-    def translations(self) -> tuple[int, ...]:
-        """Indices of the translations in the action."""
-        return (len(self.tip_motors),)
+        self.tip_motors, self.actuators = tuple(tip), (*tip, *servos)
+        self.action_names = tuple(actuator.name for actuator in self.actuators)
+        self.translations = (len(tip),)
 
     @property
     def action_groups(self) -> tuple[int, ...]:
@@ -383,10 +297,15 @@ class Chain(composer.Entity):
         first = min(tip, 2)
         return (*axes, *range(first, first + len(self.action_names) - tip))
 
-    @property
-    def joints(self) -> tuple:
-        """All joints in the order of the chain, of each link x before y."""
-        joints = self._mjcf_root.find_all("joint")
-        bends = iter(self._bends)
-        mine = set(self._bends)
-        return tuple(next(bends) if joint in mine else joint for joint in joints)
+
+def _add_capsule(body, index: int, links: Links, surface: dict[str, Any]):
+    return body.add(
+        "geom",
+        name=f"link_{index}",
+        type="capsule",
+        fromto=(0, 0, 0, 0, 0, links.lengths[index]),
+        size=[links.radius],
+        mass=links.masses[index],
+        rgba=TIP_COLOUR if index >= links.tip else COLOUR,
+        **surface,
+    )

@@ -17,11 +17,20 @@ CONTACT_SOLIMP = (0.02, 0.95, 0.0002, 0.01, 2)
 # Friction below its limit is a stiff damper in MuJoCo: what sticks creeps by its
 # compliance, which is that of the normal force over this ratio.
 FRICTION_STIFFNESS = 20.0
+# Attributes of a geom that is there to be seen only.
+DRAWN = {"contype": 0, "conaffinity": 0, "mass": 0, "group": 2}
 
 
 def wall_contact(friction: float) -> dict[str, Any]:
     """Attributes of a wall geom with a Coulomb coefficient."""
-    return {"contype": 1, "conaffinity": 0, **_surface(friction)}
+    return {
+        "contype": 1,
+        "conaffinity": 0,
+        "condim": 3,
+        "friction": (friction, 0, 0),
+        "solref": CONTACT_SOLREF,
+        "solimp": CONTACT_SOLIMP,
+    }
 
 
 def device_contact(friction: float) -> dict[str, Any]:
@@ -30,38 +39,15 @@ def device_contact(friction: float) -> dict[str, Any]:
     Args:
         friction: Coulomb coefficient; MuJoCo takes the larger of the two geoms'.
     """
-    return {"contype": 0, "conaffinity": 1, **_surface(friction)}
+    return {**wall_contact(friction), "contype": 0, "conaffinity": 1}
 
 
 def coaxial_contact(friction: float) -> dict[str, Any]:
-    """Attributes of a geom of coaxial devices, which override those of the wall.
-
-    Args:
-        friction: Coulomb coefficient; replaces that of the wall.
-    """
-    return {
-        **device_contact(friction),
-        "priority": 1,
-    }
+    """As `device_contact`; the friction replaces that of the wall."""
+    return {**device_contact(friction), "priority": 1}
 
 
 def sheath_contact() -> dict[str, Any]:
     """Attributes of a geom of the sheath, frictionless for every device."""
-    return {
-        "contype": 1,
-        "conaffinity": 0,
-        # Overrides the device: one constraint row a contact instead of three.
-        "priority": 2,
-        "condim": 1,
-        "solref": CONTACT_SOLREF,
-        "solimp": CONTACT_SOLIMP,
-    }
-
-
-def _surface(friction: float) -> dict[str, Any]:
-    return {
-        "condim": 3,
-        "friction": (friction, 0, 0),
-        "solref": CONTACT_SOLREF,
-        "solimp": CONTACT_SOLIMP,
-    }
+    # Overrides the device: one constraint row a contact instead of three.
+    return {**wall_contact(0.0), "priority": 2, "condim": 1}

@@ -28,11 +28,17 @@ class DeviceStack(Chain):
     entries for each device, from the innermost outwards: translation and rotation.
 
     Attributes:
+        device_names: Kind of each device, such as "guidewire" and "catheter".
+        stack: Properties of the chain as functions of insertions and rotations.
+        rods: Torsional rods of the devices.
+        start_gaps: (K,), distances of the devices' ends from the end of the chain at
+            start, m.
+        friction: Coulomb coefficient of an uncoated device on the wall.
+        lumen_friction: Coulomb coefficient between a device and the lumen around it.
         material_times: (K,), relaxation times of the materials of the devices, s.
     """
 
     coaxial = True
-    material_times: np.ndarray
 
     def _build(
         self,
@@ -61,107 +67,59 @@ class DeviceStack(Chain):
         Raises:
             ValueError: if a device does not fit into the next one, or is steerable.
         """
-        self._devices = tuple(library.get(device) for device in devices)
-        for device in self._devices:
+        self.devices = tuple(library.get(device) for device in devices)
+        for device in self.devices:
             if device.steerable:
                 raise ValueError(
                     f"device {device.name!r} has motors in its tip, but coaxial "
                     "devices must be passive; give a passive one, or the option "
                     "`device` for a single steerable device"
                 )
-        chosen = discretisation or library.Discretisation()
-        self._friction, self._lumen_friction = friction, lumen_friction
-        self._stack = Stack(self._devices, chosen.link_lengths(*self._devices))
-        self.material_times = np.array(
-            [device.relaxation_time for device in self._devices]
-        )
-        self._rods = Rods(self._devices, self._stack.nodes, self.material_times)
-        self._gaps = lead * np.arange(len(self._devices), dtype=np.float64)
-        overlap = self._stack.overlap(self._gaps[None])
-        turns = np.zeros((1, len(self._devices), len(self._stack.spans)))
-        tip = self._stack.nodes <= self._devices[0].tip_length + 1e-9
-        links = Links(
-            self._stack.link_lengths,
-            # The largest radius, so that the bounding volumes enclose all devices.
-            max(device.outer_radius for device in self._devices),
-            masses=self._stack.links(overlap, np.zeros(1)).mass[0].tolist(),
-            compliances=overlap.compliance[0].tolist(),
-            rest_angles=self._stack.unloaded_hinges(overlap, turns)[0].tolist(),
-            axial_stiffness=sum(device.axial_stiffness for device in self._devices),
-            tip=int(tip.argmax()),
-        )
+        division = discretisation or library.Discretisation()
+        self.friction, self.lumen_friction = friction, lumen_friction
+        self.stack = Stack(self.devices, division.link_lengths(*self.devices))
+        times = [device.relaxation_time for device in self.devices]
+        self.material_times = np.array(times)
+        self.rods = Rods(self.devices, self.stack.nodes, self.material_times)
+        self.start_gaps = lead * np.arange(len(self.devices), dtype=np.float64)
+        overlap = self.stack.overlap(self.start_gaps[None])
+        turns = np.zeros((1, len(self.devices), len(self.stack.spans)))
+        tip = self.stack.nodes <= self.devices[0].tip_length + 1e-9
+        # Its buoyancy in blood is that of all devices.
+        weight = sum(weight_density(device) for device in self.devices)
+        mass = sum(device.linear_density for device in self.devices)
+        mass += carried_mass(self.devices)
+        self.density = BLOOD_DENSITY / (1 - weight / mass)
         self._assemble(
-            links,
+            Links(
+                self.stack.link_lengths,
+                # The largest radius, so that the bounding volumes enclose all devices.
+                max(device.outer_radius for device in self.devices),
+                masses=self.stack.links(overlap, np.zeros(1)).mass[0].tolist(),
+                compliances=overlap.compliance[0].tolist(),
+                rest_angles=self.stack.unloaded_hinges(overlap, turns)[0].tolist(),
+                axial_stiffness=sum(device.axial_stiffness for device in self.devices),
+                tip=int(tip.argmax()),
+            ),
             coaxial_contact(friction),
             stroke=stroke,
             rotation=False,
             timestep=timestep,
             name=name,
         )
-
-    @property
-    def device(self) -> Device:
-        """The outermost device, which the sheath guides."""
-        return self._devices[-1]
-
-    @property
-    def devices(self) -> tuple[Device, ...]:
-        """The devices from the innermost outwards."""
-        return self._devices
-
-    @property
-    def device_names(self) -> tuple[str, ...]:
-        """Kind of each device, such as "guidewire" and "catheter"."""
-        names: list[str] = []
-        for device in self._devices:
-            kind = "guidewire" if device.is_wire else "catheter"
-            again = sum(name.startswith(kind) for name in names)
-            names.append(f"{kind}_{again + 1}" if again else kind)
-        return tuple(names)
-
-    @property
-    def action_names(self) -> tuple[str, ...]:
-        """Translation and rotation of each device, from the innermost outwards."""
-        return tuple(
+        self.device_names = _names(self.devices)
+        self.action_names = tuple(
             f"{name}/{motion}"
             for name in self.device_names
             for motion in ("insertion", "rotation")
         )
+        self.translations = tuple(range(0, len(self.action_names), 2))
 
-    @property
-    def translations(self) -> tuple[int, ...]:
-        """Indices of the translations in the action."""
-        return tuple(range(0, 2 * len(self._devices), 2))
 
-    @property
-    def stack(self) -> Stack:
-        """Properties of the chain as functions of insertions and rotations."""
-        return self._stack
-
-    @property
-    def rods(self) -> Rods:
-        """Torsional rods of the devices."""
-        return self._rods
-
-    @property
-    def start_gaps(self) -> np.ndarray:
-        """Distances (K,) of the devices' ends from the end of the chain at start, m."""
-        return self._gaps.copy()
-
-    @property
-    def friction(self) -> float:
-        """Coulomb coefficient of an uncoated device on the wall."""
-        return self._friction
-
-    @property
-    def lumen_friction(self) -> float:
-        """Coulomb coefficient between a device and the lumen around it."""
-        return self._lumen_friction
-
-    @property
-    def density(self) -> float:
-        """Effective density, kg/m³: its buoyancy in blood is that of all devices."""
-        weight = sum(weight_density(device) for device in self._devices)
-        mass = sum(device.linear_density for device in self._devices)
-        mass += carried_mass(self._devices)
-        return BLOOD_DENSITY / (1 - weight / mass)
+def _names(devices: Sequence[Device]) -> tuple[str, ...]:
+    names: list[str] = []
+    for device in devices:
+        kind = "guidewire" if device.is_wire else "catheter"
+        again = sum(name.startswith(kind) for name in names)
+        names.append(f"{kind}_{again + 1}" if again else kind)
+    return tuple(names)

@@ -5,7 +5,7 @@ from dm_control import composer, mjcf
 
 from cathsim_dmc.anatomy import Anatomy
 from cathsim_dmc.collision import fields
-from cathsim_dmc.entities.contact import FRICTION, wall_contact
+from cathsim_dmc.entities.contact import DRAWN, FRICTION, wall_contact
 
 # Of a geom of the device with the wall, at most; the wall's sensor has room for all.
 MOST_CONTACTS = 4
@@ -16,8 +16,15 @@ _UNSEEN = 1e-4  # m
 _GOAL_COLOUR = (0.1, 0.7, 0.3, 0.5)
 
 
-class Phantom(composer.Entity):
-    """A rigid wall around the lumen of an anatomy, on a load cell."""
+class Phantom(composer.ModelWrapperEntity):
+    """A rigid wall around the lumen of an anatomy, on a load cell.
+
+    Attributes:
+        anatomy: Lumen and goals.
+        body: The static body of the drawn surface and the goals.
+        surface: The geom of the drawn surface.
+        goals: Goal sites by name.
+    """
 
     def _build(
         self,
@@ -36,13 +43,21 @@ class Phantom(composer.Entity):
         """
         if not 0 <= friction <= 2:
             raise ValueError(f"friction is {friction}; it must be between 0 and 2")
-        self._anatomy = anatomy
-        self._mjcf_root = mjcf.RootElement(model=name)
-        self._body = self._mjcf_root.worldbody.add("body", name="wall")
-        self._friction = friction
-        self._add_surface(drawn)
-        self._goals = {
-            goal.name: self._body.add(
+        self.anatomy, self._friction = anatomy, friction
+        root = mjcf.RootElement(model=name)
+        super()._build(root)
+        self.body = root.worldbody.add("body", name="wall")
+        shape = {"type": "sphere", "size": [_UNSEEN]}
+        if drawn:
+            file = mesh_file(anatomy.surface.vertices, anatomy.surface.faces)
+            root.asset.add("mesh", name="lumen", file=file, inertia="shell")
+            shape = {"type": "mesh", "mesh": "lumen"}
+        colour = _LUMEN_COLOUR if drawn else (0, 0, 0, 0)
+        self.surface = self.body.add(
+            "geom", name="lumen", **shape, **DRAWN, rgba=colour
+        )
+        self.goals = {
+            goal.name: self.body.add(
                 "site",
                 name=f"goal_{goal.name}",
                 pos=goal.position,
@@ -53,28 +68,6 @@ class Phantom(composer.Entity):
             for goal in anatomy.goals.values()
         }
 
-    def _add_surface(self, drawn: bool):
-        shape = {"type": "sphere", "size": [_UNSEEN]}
-        if drawn:
-            surface = self._anatomy.surface
-            self._mjcf_root.asset.add(
-                "mesh",
-                name="lumen",
-                file=mesh_file(surface.vertices, surface.faces),
-                inertia="shell",
-            )
-            shape = {"type": "mesh", "mesh": "lumen"}
-        self._surface = self._body.add(
-            "geom",
-            name="lumen",
-            **shape,
-            contype=0,
-            conaffinity=0,
-            mass=0,
-            group=2,
-            rgba=_LUMEN_COLOUR if drawn else (0, 0, 0, 0),
-        )
-
     def add_wall(self, device_body, hole: float = np.inf, moving: bool = False) -> None:
         """Adds the carrier of the wall and the sensors of its contacts with a device.
 
@@ -83,61 +76,27 @@ class Phantom(composer.Entity):
             hole: radius of the hole in the cap over the inlet, m; open if larger.
             moving: whether heart and breathing may move it.
         """
-        root = self._mjcf_root.root_model
-        lumen = self._anatomy.lumen.with_hole(hole)
-        motion = self._anatomy.motion.lattice if moving else None
+        root = self.mjcf_model.root_model
+        lumen = self.anatomy.lumen.with_hole(hole)
+        motion = self.anatomy.motion.lattice if moving else None
         root.worldbody.add(
             "geom",
             name="wall",
             **fields.carrier(lumen, motion),
             **wall_contact(self._friction),
-            mass=0,
-            group=5,
-            rgba=(0, 0, 0, 0),
         )
+        between = {"body1": "world", "subtree2": device_body}
         root.sensor.add(
             "contact",
             name="wall_contacts",
-            body1="world",
-            subtree2=device_body,
+            **between,
             num=MOST_CONTACTS * len(device_body.find_all("geom")),
             data=" ".join(CONTACT_FIELDS),
             reduce="none",
         )
         # A load cell under the phantom carries the sum of the contacts.
-        root.sensor.add(
-            "contact",
-            name="load_cell",
-            body1="world",
-            subtree2=device_body,
-            data="force",
-            reduce="netforce",
-        )
-
-    @property
-    def mjcf_model(self) -> mjcf.RootElement:
-        """The MJCF model of the phantom."""
-        return self._mjcf_root
-
-    @property
-    def anatomy(self) -> Anatomy:
-        """Lumen and goals."""
-        return self._anatomy
-
-    @property
-    def body(self):
-        """The static body of the drawn surface and the goals."""
-        return self._body
-
-    @property
-    def surface(self):
-        """The geom of the drawn surface."""
-        return self._surface
-
-    @property
-    def goals(self) -> dict:
-        """Goal sites by name."""
-        return self._goals
+        cell = {"name": "load_cell", "data": "force", "reduce": "netforce"}
+        root.sensor.add("contact", **cell, **between)
 
 
 def mesh_file(vertices: np.ndarray, faces: np.ndarray | None = None) -> mjcf.Asset:

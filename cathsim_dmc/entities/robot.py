@@ -81,8 +81,12 @@ def postures(given: NDArray[np.float64]) -> NDArray[np.float64]:
     return _postures(given, _PHASES, _CYCLE, ROLLER_RADIUS, teeth)
 
 
-class Robot(composer.Entity):
-    """The follower; attach it to the arena at the mouth of the introducer sheath."""
+class Robot(composer.ModelWrapperEntity):
+    """The follower; attach it to the arena at the mouth of the introducer sheath.
+
+    Attributes:
+        joints: The MJCF joints in the order of ``JOINTS``.
+    """
 
     def _build(self, device_radius: float = DEVICE_RADIUS, name: str = "robot"):
         """Builds the model.
@@ -96,25 +100,16 @@ class Robot(composer.Entity):
                 f"device_radius is {device_radius} m; allowed are 1e-4 to 4e-3 m "
                 "(devices up to 24 French); did you mean millimetres?"
             )
-        self._mjcf_root = mjcf.from_path(str(MODEL))
-        self._mjcf_root.model = name
+        root = mjcf.from_path(str(MODEL))
+        root.model = name
+        super()._build(root)
         for joint in JOINTS:
             part, _, side = joint.rpartition("_")
             if side in ("left", "right"):
-                body = self._mjcf_root.find("body", joint)
+                body = root.find("body", joint)
                 way = device_radius + ROLLER_RADIUS * part.endswith("roller")
                 body.pos = (way if side == "left" else -way, 0, body.pos[2])
-        self._joints = tuple(self._mjcf_root.find("joint", name) for name in JOINTS)
-
-    @property
-    def mjcf_model(self) -> mjcf.RootElement:
-        """The PyMJCF model."""
-        return self._mjcf_root
-
-    @property
-    def joints(self) -> tuple[mjcf.Element, ...]:
-        """The MJCF joints in the order of ``JOINTS``."""
-        return self._joints
+        self.joints = tuple(root.find("joint", name) for name in JOINTS)
 
 
 @compiled

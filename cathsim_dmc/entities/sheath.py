@@ -1,11 +1,13 @@
 """The introducer sheath: a frictionless guide along a line, straight or curved."""
 
+import itertools
+
 import numpy as np
 from dm_control import composer, mjcf
 
 from cathsim_dmc.anatomy import Centreline
 from cathsim_dmc.collision import fields
-from cathsim_dmc.entities.contact import sheath_contact
+from cathsim_dmc.entities.contact import DRAWN, sheath_contact
 
 CLEARANCE = 0.35e-3  # m between the device and the bore all round
 _LEAST_CURVE_RADIUS, _SPACING = 0.01, 0.5e-3  # m
@@ -18,7 +20,7 @@ def straight(length: float) -> np.ndarray:
     return np.array([[0.0, 0.0, -length], [0.0, 0.0, 0.0]])
 
 
-class Sheath(composer.Entity):
+class Sheath(composer.ModelWrapperEntity):
     """A bore that follows a line; its mouth is the line's last point.
 
     Real followers grip the device just outside the sheath and support it up to there.
@@ -27,6 +29,12 @@ class Sheath(composer.Entity):
 
     The bore is round: one geom that carries it as a field (`collision.fields`), which
     touches capsules from inside, with no edge at which a link could catch.
+
+    Attributes:
+        bore: The geom that carries the bore.
+        bore_radius: Radius of the bore where it is straight, m.
+        vertices: Points (n, 3) of the axis, m, entity's frame.
+        length: Length of the bore along its axis, m.
     """
 
     def _build(
@@ -53,66 +61,27 @@ class Sheath(composer.Entity):
         """
         if not device_radius > 0:
             raise ValueError(f"device_radius is {device_radius} m; it must be positive")
-        self._bore_radius = device_radius + CLEARANCE
-        line = Centreline(centreline, np.full(len(centreline), self._bore_radius))
+        self.bore_radius = device_radius + CLEARANCE
+        line = Centreline(centreline, np.full(len(centreline), self.bore_radius))
         _refuse_sharp_bends(line)
-        self._line = line
-        self._mjcf_root = mjcf.RootElement(model=name)
-        self._bore = self._mjcf_root.worldbody.add("body", name="bore")
+        self.vertices, self.length = line.points, line.length
+        root = mjcf.RootElement(model=name)
+        super()._build(root)
+        body = root.worldbody.add("body", name="bore")
         inwards = _sagitta(line, link_length) / 2
-        widths = self._bore_radius + np.linalg.norm(inwards, axis=-1)
-        self._bore_geom = self._bore.add(
-            "geom",
-            name="bore",
-            **fields.carrier(fields.Bore(line.points + inwards, widths)),
-            **sheath_contact(),
-            mass=0,
-            group=5,
-            rgba=(0, 0, 0, 0),
-        )
-        for index in range(len(line.points) - 1):
-            self._bore.add(
+        widths = self.bore_radius + np.linalg.norm(inwards, axis=-1)
+        carrier = fields.carrier(fields.Bore(line.points + inwards, widths))
+        self.bore = body.add("geom", name="bore", **carrier, **sheath_contact())
+        for index, ends in enumerate(itertools.pairwise(line.points)):
+            body.add(
                 "geom",
                 name=f"tube_{index}",
                 type="cylinder",
-                fromto=line.points[index : index + 2].ravel(),
-                size=[self._bore_radius + _VISIBLE_WALL],
-                contype=0,
-                conaffinity=0,
-                mass=0,
-                group=2,
+                fromto=np.ravel(ends),
+                size=[self.bore_radius + _VISIBLE_WALL],
+                **DRAWN,
                 rgba=_COLOUR,
             )
-
-    @property
-    def mjcf_model(self) -> mjcf.RootElement:
-        """The MJCF model of the sheath."""
-        return self._mjcf_root
-
-    @property
-    def bodies(self) -> tuple:
-        """The static body of the sheath."""
-        return (self._bore,)
-
-    @property
-    def bore(self):
-        """The geom that carries the bore."""
-        return self._bore_geom
-
-    @property
-    def vertices(self) -> np.ndarray:
-        """Points (n, 3) of the axis, m, entity's frame."""
-        return self._line.points
-
-    @property
-    def length(self) -> float:
-        """Length of the bore along its axis, m."""
-        return self._line.length
-
-    @property
-    def bore_radius(self) -> float:
-        """Radius of the bore where it is straight, m."""
-        return self._bore_radius
 
 
 def _refuse_sharp_bends(line: Centreline) -> None:

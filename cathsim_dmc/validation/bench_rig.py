@@ -102,8 +102,8 @@ class Held:
         else:
             file = mesh_file(wall.vertices, wall.faces)
             root.asset.add("mesh", name="hull", file=file, inertia="shell")
-            shape = {"type": "mesh", "mesh": "hull"}
-        body.add("geom", name="wall", **shape, **wall_contact(friction), mass=0)
+            shape = {"type": "mesh", "mesh": "hull", "mass": 0}
+        body.add("geom", name="wall", **shape, **wall_contact(friction))
         rig.compile()
         if taper is not None:
             self._grind(device.shaft.bending_stiffness, *taper)
