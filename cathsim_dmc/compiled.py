@@ -7,6 +7,7 @@ first called, and numba is imported with it.
 import functools
 import hashlib
 from collections.abc import Callable
+from importlib import metadata
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +18,8 @@ _MARKS = (b"\n@compiled", b"\n@callback", b"import numba", b"from numba")
 
 @functools.cache
 def _stamp() -> bytes:
-    digest = hashlib.sha256()
+    # Compiled code knows where the fields of MuJoCo's structs lie.
+    digest = hashlib.sha256(metadata.version("mujoco").encode())
     for path in sorted(_PACKAGE.rglob("*.py")):
         source = path.read_bytes()
         if any(mark in source for mark in _MARKS):

@@ -14,6 +14,9 @@ of it at once. What a carrier is to `mj_geomDistance` and to rays is that box, t
 from __future__ import annotations
 
 import ctypes
+import functools
+import hashlib
+import re
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -32,9 +35,6 @@ _SPHERE = int(mujoco.mjtGeom.mjGEOM_SPHERE)
 _BOX = int(mujoco.mjtGeom.mjGEOM_BOX)
 _TYPES = int(mujoco.mjtGeom.mjNGEOMTYPES)
 
-# Impedance of all contacts with a field. It does not change with the depth, so the
-# contact is a spring of one stiffness, and its rattle (docs/physics.md) has m = 0.
-IMPEDANCE = 0.95
 _EXCURSION = 40e-3  # m, by which a moving wall may leave the box of its field
 
 
@@ -72,85 +72,52 @@ class _Table:
     """The process's fields, by their keys, where compiled functions find them."""
 
     def __init__(self):
-        from cathsim_dmc.collision import loops, native
-        from cathsim_dmc.collision import table as words
+        from cathsim_dmc.collision import loops, table
 
-        self._words = words.TABLE
         # The arrays whose addresses are in the table, for as long as the process.
         self._kept: dict[int, Any] = {}
-        model = ("nuser_geom", "geom_user", "geom_size", "geom_bodyid")
-        model += ("body_parentid",)
-        self._words[:5] = native.offsets("mjModel", model)
-        data = ("geom_xpos", "geom_xmat", "xpos")
-        self._words[5:8] = native.offsets("mjData", data)
-        moving = ("body_dofadr", "body_dofnum", "body_rootid", "dof_parentid")
-        moving += ("opt.timestep",)
-        self._words[16:21] = native.offsets("mjModel", moving)
-        velocity = ("qvel", "cdof", "subtree_com")
-        self._words[21:24] = native.offsets("mjData", velocity)
-        more = native.offsets("mjModel", ("geom_solimp", "nuserdata", "geom_solref"))
-        for place, offset in zip(
-            (words.GEOM_SOLIMP, words.NUSERDATA, words.GEOM_SOLREF), more, strict=True
-        ):
-            self._words[place // 8] = offset
-        user = native.offsets("mjData", ("userdata", "time"))
-        self._words[words.USERDATA // 8 : words.TIME // 8 + 1] = user
+        self._words, self._message = table.TABLE, ctypes.create_string_buffer(_MESSAGE)
         self._library = _mujoco_library()
-        table = (ctypes.c_void_p * (_TYPES * _TYPES)).in_dll(
+        functions = (ctypes.c_void_p * (_TYPES * _TYPES)).in_dll(
             self._library, "mjCOLLISIONFUNC"
         )
-        error = ctypes.cast(self._library.mju_error, ctypes.c_void_p)
-        self._message = ctypes.create_string_buffer(_MESSAGE)
-        places = {_CAPSULE: words.OF_CAPSULE, _SPHERE: words.OF_SPHERE}
-        for kind, place in places.items():
-            self._words[place // 8] = table[kind * _TYPES + _BOX] or 0
-        self._words[words.ERROR // 8] = error.value or 0
-        self._words[words.MESSAGE // 8] = ctypes.addressof(self._message)
-        table[_CAPSULE * _TYPES + _BOX] = loops.of_capsule.address
-        table[_SPHERE * _TYPES + _BOX] = loops.of_sphere.address
+        error = ctypes.cast(self._library.mju_error, ctypes.c_void_p).value
+        self._words[table.ERROR // 8] = error or 0
+        self._words[table.MESSAGE // 8] = ctypes.addressof(self._message)
+        for kind, place, function in (
+            (_CAPSULE, table.OF_CAPSULE, loops.of_capsule),
+            (_SPHERE, table.OF_SPHERE, loops.of_sphere),
+        ):
+            self._words[place // 8] = functions[kind * _TYPES + _BOX] or 0
+            functions[kind * _TYPES + _BOX] = function.address
+        self._rows = self._words[table.HEAD :].reshape(-1, table.ENTRY)
+        self._motion = table.MOTION_ENTRY // 8
 
     def put(
         self, key: int, kind: int, middle: np.ndarray, arrays: Sequence[np.ndarray]
     ) -> None:
-        from cathsim_dmc.collision.table import CAPACITY, ENTRY, HEAD
-
         if key in self._kept:
             return
-        if len(self._kept) >= CAPACITY // 2:
-            raise MemoryError(
-                f"a process can hold {CAPACITY // 2} fields; start another"
-            )
-        slot = key % CAPACITY
-        while self._words[HEAD + ENTRY * slot]:
-            slot = (slot + 1) % CAPACITY
-        row = self._words[HEAD + ENTRY * slot :][:ENTRY]
+        most = len(self._rows) // 2
+        if len(self._kept) >= most:
+            raise MemoryError(f"a process can hold {most} fields; start another")
+        slot = key % len(self._rows)
+        while self._rows[slot, 0]:
+            slot = (slot + 1) % len(self._rows)
+        row = self._rows[slot]
         kept = [np.ascontiguousarray(array) for array in (middle, *arrays)]
-        self._kept[key] = kept
-        row[1] = kind
-        row[2 : 2 + len(kept)] = [array.ctypes.data for array in kept]
-        row[0] = key  # last: threads may look for other entries meanwhile
+        row[1 : 2 + len(kept)] = kind, *(array.ctypes.data for array in kept)
+        # Last: threads may look for other entries meanwhile.
+        self._kept[key], row[0] = kept, key
 
     def move(self, key: int, lattice: np.ndarray) -> None:
         """Gives the field of an entry a motion, for simulations that have one."""
-        from cathsim_dmc.collision.table import ENTRY, HEAD, MOTION_ENTRY
-
-        rows = self._words[HEAD:].reshape(-1, ENTRY)
-        row = rows[np.flatnonzero(rows[:, 0] == key)[0]]
         self._kept[key].append(lattice)
-        row[MOTION_ENTRY // 8] = lattice.ctypes.data
-
-    def knows(self, key: int) -> bool:
-        return key in self._kept
+        row = self._rows[np.flatnonzero(self._rows[:, 0] == key)[0]]
+        row[self._motion] = lattice.ctypes.data
 
 
-_table: _Table | None = None
-
-
-def _get_table() -> _Table:
-    global _table
-    if _table is None:
-        _table = _Table()
-    return _table
+_get_table = functools.cache(_Table)
 
 
 def register(field: Field | Bore) -> tuple[float, ...]:
@@ -164,11 +131,13 @@ def register(field: Field | Bore) -> tuple[float, ...]:
     """
     from cathsim_dmc.collision.table import BORE, LUMEN, MARK, PART
 
-    digest = _digest(field)
+    whole = isinstance(field, Field)
+    digest = (
+        field.digest if whole else hashlib.sha256(bytes(field.arrays[0].data)).digest()
+    )
     parts = [int.from_bytes(digest[3 * k : 3 * k + 3], "big") % PART for k in range(3)]
     parts[0] = parts[0] or 1  # a key of 0 is none
-    kind = BORE if isinstance(field, Bore) else LUMEN
-    low, high = field.box
+    (low, high), kind = field.box, LUMEN if whole else BORE
     _get_table().put(_key(parts), kind, (low + high) / 2, field.arrays)
     return (MARK, *map(float, parts))
 
@@ -197,88 +166,15 @@ def carrier(field: Field | Bore, motion: np.ndarray | None = None) -> dict[str, 
     }
 
 
-def check(model: mujoco.MjModel) -> None:
-    """Refuses a model with carriers that cannot do what they are for.
-
-    Raises:
-        ValueError: if a carrier's field is unknown, or something other than capsules
-            and spheres can touch it; names the geoms.
-    """
-    from cathsim_dmc.collision.table import MARK, USER
-
-    if model.nuser_geom < USER:
-        return
-    for geom in np.flatnonzero(model.geom_user[:, 0] == MARK):
-        name = model.geom(geom).name or geom
-        parts = [int(part) for part in model.geom_user[geom, 1:USER]]
-        if not _get_table().knows(_key(parts)):
-            raise ValueError(
-                f"geom {name!r} carries a field that this process does not know; "
-                "register it, or load the task anew"
-            )
-        touching = (model.geom_contype & model.geom_conaffinity[geom]) | (
-            model.geom_conaffinity & model.geom_contype[geom]
-        )
-        body = model.geom_bodyid[geom]
-        wrong = (touching != 0) & ~np.isin(model.geom_type, (_CAPSULE, _SPHERE))
-        wrong &= model.geom_bodyid != body
-        if wrong.any() or model.geom_type[geom] != _BOX:
-            other = np.flatnonzero(wrong)[0] if wrong.any() else geom
-            raise ValueError(
-                f"geom {model.geom(other).name or other!r} cannot touch the field that "
-                f"geom {name!r} carries; a carrier is a box that capsules and spheres "
-                "touch: change its type, or its contype and conaffinity"
-            )
-
-
-def springs(
-    model: mujoco.MjModel, geoms: np.ndarray, stiffness: float, relaxation: float
-) -> np.ndarray:
-    """`geom_solref` that makes contacts with the world springs of one stiffness.
-
-    MuJoCo's contact is a spring in N/m only for one inverse inertia: at a depth r and
-    with an impedance d that does not change with it, its force at rest is
-    |solref₀| r / ((1 - d) A), A the inverse weight of the link, `body_invweight0`.
-
-    Args:
-        model: compiled, with the masses that count.
-        geoms: (n,) numbers of the geoms, each on a body of its own.
-        stiffness: N/m.
-        relaxation: s, within which a contact without load returns: damping over
-            stiffness.
-
-    Returns:
-        (n, 2), for an impedance of `IMPEDANCE`, see `solimp`.
-    """
-    weight = model.body_invweight0[model.geom_bodyid[geoms], 0]
-    scaled = stiffness * (1 - IMPEDANCE) * weight
-    return -np.stack([scaled, relaxation * scaled], axis=-1)
-
-
-def solimp() -> tuple[float, ...]:
-    """`geom_solimp` of a contact whose impedance does not change with its depth."""
-    return (IMPEDANCE, IMPEDANCE, 1e-3, 0.5, 2)
-
-
 def _key(parts: Sequence[int]) -> int:
     from cathsim_dmc.collision.table import PART
 
     return (parts[0] * PART + parts[1]) * PART + parts[2]
 
 
-def _digest(field: Field | Bore) -> bytes:
-    if isinstance(field, Field):
-        return field.digest
-    import hashlib
-
-    return hashlib.sha256(field.arrays[0].tobytes()).digest()
-
-
 def _mujoco_library() -> ctypes.CDLL:
     folder = Path(mujoco.__path__[0])
     for path in sorted(folder.glob("*mujoco*")):
-        if path.suffix != ".py" and any(
-            part in path.name for part in (".so", ".dylib", ".dll")
-        ):
+        if re.search(r"\.(so|dylib|dll)", path.name):
             return ctypes.CDLL(str(path))
     raise RuntimeError(f"no MuJoCo library in {folder}; install the wheel of mujoco")

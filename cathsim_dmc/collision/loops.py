@@ -13,6 +13,8 @@ from cathsim_dmc.collision.native import (
     call_collision,
     call_error,
     callback,
+    data_field,
+    model_field,
     numbers,
     wholes,
     word,
@@ -28,20 +30,13 @@ from cathsim_dmc.collision.places import (
     touches,
 )
 from cathsim_dmc.collision.table import (
-    COUNT,
     ERROR,
-    GEOM_SIZE,
-    GEOM_SOLIMP,
-    GEOM_SOLREF,
-    GEOM_XMAT,
-    GEOM_XPOS,
     LUMEN,
     MESSAGE,
     MOTION_ENTRY,
     OF_CAPSULE,
     OF_SPHERE,
     SYMBOL,
-    TIME,
     ends,
     entry_of,
     into,
@@ -173,21 +168,21 @@ def tangents(entry, place, axis, normal, depth, limit, held, light, turns, rows)
 
 
 @compiled
-def put(table, data, contacts, geoms, written, most, rows, planes, t, limit, law):
+def put(data, contacts, geoms, written, most, rows, planes, t, limit, law):
     """Writes planes as contacts after those written, and returns how many there are."""
     radius, near, soft, _, _ = law
-    turns = word(data + word(table + GEOM_XMAT))
-    centre = numbers(word(data + word(table + GEOM_XPOS)) + 24 * geoms[0], 3)
-    turned, frame = numbers(turns + 72 * geoms[0], 9), numbers(turns + 72 * geoms[1], 9)
+    turns = data_field(data, "geom_xmat")
+    centre = data_field(data, "geom_xpos")[geoms[0]]
+    turned, frame = turns[geoms[0]], turns[geoms[1]]
     for plane in range(planes):
         if written == most or rows[plane, 3] > limit:
             continue
-        contact = numbers(contacts + 80 * written, 10)
+        contact = numbers(contacts + 80 * written)
         distance = rows[plane, 3] - radius
         reached = radius + 0.5 * distance
         contact[0] = min(distance, _AT_WALL) if near > 0.0 else distance
         if soft:
-            bits = wholes(contacts + 80 * written, 1)
+            bits = wholes(contacts + 80 * written)
             bits[0] = (bits[0] & -2) | int(planes > 1)
         for k in range(3):
             towards = 0.0
@@ -217,7 +212,7 @@ def nth(seen, n, soft):
 
 
 @compiled
-def sweep(table, model, data, geoms, axis, half, law):
+def sweep(model, data, geoms, axis, half, law):
     """How a capsule moves in a physics step, in the frame of the field.
 
     Returns:
@@ -227,8 +222,8 @@ def sweep(table, model, data, geoms, axis, half, law):
     still = (0.0, 0.0, 0.0)
     if law[1] == 0.0 or law[2]:
         return still, still, -np.inf
-    travel, turn = swept(table, model, data, geoms[0])
-    frame = numbers(word(data + word(table + GEOM_XMAT)) + 72 * geoms[1], 9)
+    travel, turn = swept(model, data, geoms[0])
+    frame = data_field(data, "geom_xmat")[geoms[1]]
     travel, turn = into(frame, travel), into(frame, turn)
     aside = across(turn, axis)
     ahead = length(travel) + half * length(aside)
@@ -236,14 +231,12 @@ def sweep(table, model, data, geoms, axis, half, law):
 
 
 @compiled
-def at_rest(
-    table, model, data, contacts, geoms, entry, pose, half, closed, margin, law
-):
+def at_rest(model, data, contacts, geoms, entry, pose, half, closed, margin, law):
     """Number of contacts, written, with a field that does not move."""
     radius, near, soft, held, light = law
     local, axis = pose
     limit = radius + margin + near
-    travel, aside, far = sweep(table, model, data, geoms, axis, half, law)
+    travel, aside, far = sweep(model, data, geoms, axis, half, law)
     far = max(limit, far)
     seen = touches(entry, local, axis, half, closed, far)
     if seen[0] == 0:  # most links; rows take as long to make as all before
@@ -260,9 +253,8 @@ def at_rest(
         if depth <= (limit if lowest else radius + margin):
             # A sphere may have one contact, so one plane.
             turns = 0 if half == 0.0 else 1 + int(lowest and abs(t) >= half)
-            planes = tangents(
-                entry, place, axis, normal, depth, limit, held, light, turns, rows
-            )
+            seen_at = place, axis, normal, depth, limit
+            planes = tangents(entry, *seen_at, held, light, turns, rows)
         else:
             hits = along(travel, aside, t)
             ahead = normal[0] * hits[0] + normal[1] * hits[1] + normal[2] * hits[2]
@@ -270,26 +262,22 @@ def at_rest(
                 continue
             rows[0, 0], rows[0, 1], rows[0, 2] = normal
             rows[0, 3], planes = depth, 1
-        written = put(
-            table, data, contacts, geoms, written, most, rows, planes, t, np.inf, law
-        )
+        found = rows, planes, t, np.inf, law
+        written = put(data, contacts, geoms, written, most, *found)
     return written
 
 
 @compiled
-def in_motion(
-    table, model, data, contacts, geoms, entry, pose, half, closed, margin, law
-):
+def in_motion(model, data, contacts, geoms, entry, pose, half, closed, margin, law):
     """Number of contacts, written, with a field that moves."""
     radius, near, soft, held, light = law
     local, axis = pose
     limit = radius + margin + near
-    time = numbers(data + word(table + TIME), 1)[0]
-    lattice = numbers(word(entry + MOTION_ENTRY), COUNT)
-    parameters = numbers(motion_of(table, model, data), COUNT)
+    time, lattice = data_field(data, "time"), numbers(word(entry + MOTION_ENTRY))
+    parameters = data_field(data, "userdata")[motion_of(model, data) :]
     # The sheath lies where it does, whatever moves past it.
-    centre = numbers(word(data + word(table + GEOM_XPOS)) + 24 * geoms[0], 3)
-    if sheathed(table, model, data, int(parameters[10]), centre):
+    centre = data_field(data, "geom_xpos")[geoms[0]]
+    if sheathed(model, data, int(parameters[10]), centre):
         if clearance(entry, local[0], local[1], local[2]) >= FREE:
             return 0
     scratch = np.empty(WARP + 4 * VALUES)
@@ -299,14 +287,12 @@ def in_motion(
     strain = 0.0
     for k in range(3, 12):
         strain += (there[k] - (1.0 if k % 4 == 3 else 0.0)) ** 2
-    x, y, z = (
-        there[3] * axis[0] + there[4] * axis[1] + there[5] * axis[2],
-        there[6] * axis[0] + there[7] * axis[1] + there[8] * axis[2],
-        there[9] * axis[0] + there[10] * axis[1] + there[11] * axis[2],
-    )
+    x = there[3] * axis[0] + there[4] * axis[1] + there[5] * axis[2]
+    y = there[6] * axis[0] + there[7] * axis[1] + there[8] * axis[2]
+    z = there[9] * axis[0] + there[10] * axis[1] + there[11] * axis[2]
     stretch = math.sqrt(x * x + y * y + z * z)
     way, image = (x / stretch, y / stretch, z / stretch), (there[0], there[1], there[2])
-    travel, aside, far = sweep(table, model, data, geoms, axis, half, law)
+    travel, aside, far = sweep(model, data, geoms, axis, half, law)
     reach = (1.0 + math.sqrt(strain)) * (max(limit, far) - there[12]) + _IMAGE
     seen = touches(entry, image, way, half * stretch, closed, reach)
     if seen[0] == 0:
@@ -334,18 +320,15 @@ def in_motion(
         if rows[0, 3] <= bound:
             # A lumen that has grown is held where it is, not where it was at rest.
             grown = max(held - there[12], 1e-9) if held > 0.0 else 0.0
-            planes = tangents(
-                entry, place, way, normal, depth, reach, grown, light, turns, rows
-            )
+            seen_at = place, way, normal, depth, reach
+            planes = tangents(entry, *seen_at, grown, light, turns, rows)
             in_space(there, rows, planes)
         else:
             bound, hits = np.inf, along(travel, aside, t)
             ahead = rows[0, 0] * hits[0] + rows[0, 1] * hits[1] + rows[0, 2] * hits[2]
             if rows[0, 3] + ahead > radius - _IMPACT:
                 continue
-        written = put(
-            table, data, contacts, geoms, written, most, rows, planes, t, bound, law
-        )
+        written = put(data, contacts, geoms, written, most, rows, planes, t, bound, law)
     return written
 
 
@@ -357,7 +340,7 @@ def collide(model, data, contacts, geom1, geom2, margin, before):
     would be compiled once for each.
     """
     table = address_of(SYMBOL)
-    key = key_of(table, model, geom2)
+    key = key_of(model, geom2)
     if key == 0:
         old = word(table + before)
         return call_collision(old, model, data, contacts, geom1, geom2, margin)
@@ -365,31 +348,25 @@ def collide(model, data, contacts, geom1, geom2, margin, before):
     if entry == 0:
         call_error(word(table + ERROR), word(table + MESSAGE), geom2)
         return np.int32(0)
-    size = numbers(word(model + word(table + GEOM_SIZE)) + 24 * geom1, 3)
+    size = model_field(model, "geom_size")[geom1]
     radius, half = size[0], size[1] if before == OF_CAPSULE else 0.0
-    geoms, closed = (geom1, geom2), ends(table, model, data, geom1, half)
-    pose = local, axis = posed(table, data, entry, geom1, geom2)
+    geoms, closed = (geom1, geom2), ends(model, data, geom1, half)
+    pose = local, axis = posed(data, entry, geom1, geom2)
     # What is no number has no place in a lattice; MuJoCo's checks of the state tell.
     if not math.isfinite(local[0] + local[1] + local[2] + axis[0] + axis[1] + axis[2]):
         return np.int32(0)
     # A straight sheath holds the shaft without any load.
     near = 0.0 if margin > 0.0 or straight(entry) else _TOUCH
-    impedance = numbers(word(model + word(table + GEOM_SOLIMP)) + 40 * geom1, 1)[0]
+    impedance = model_field(model, "geom_solimp")[geom1, 0]
     soft = impedance == SOFT and word(entry + 8) == LUMEN
     light = 0.0
     if soft:
-        spring = numbers(word(model + word(table + GEOM_SOLREF)) + 16 * geom1, 1)[0]
-        light = _LIGHT / abs(spring)
+        light = _LIGHT / abs(model_field(model, "geom_solref")[geom1, 0])
     law = (radius, near, soft, radius if impedance < _SLACK or soft else 0.0, light)
-    if word(entry + MOTION_ENTRY) != 0 and motion_of(table, model, data) != 0:
-        written = in_motion(
-            table, model, data, contacts, geoms, entry, pose, half, closed, margin, law
-        )
-    else:
-        written = at_rest(
-            table, model, data, contacts, geoms, entry, pose, half, closed, margin, law
-        )
-    return np.int32(written)
+    given = model, data, contacts, geoms, entry, pose, half, closed, margin, law
+    if word(entry + MOTION_ENTRY) != 0 and motion_of(model, data) != 0:
+        return np.int32(in_motion(*given))
+    return np.int32(at_rest(*given))
 
 
 @callback("int32(int64, int64, int64, int32, int32, float64)")

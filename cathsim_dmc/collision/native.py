@@ -1,9 +1,11 @@
 """MuJoCo's structs in memory, for callbacks that are compiled.
 
-A compiled callback gets the addresses of `mjModel` and `mjData` as int64. `offsets`
-says where their fields lie and proves it; `word`, `number` and `array` read them.
-Constants that differ from process to process, such as the address of a table, reach
-code that is cached on disk as symbols (`symbol`, `address_of`).
+A compiled callback gets the addresses of `mjModel` and `mjData` as int64. The readers
+`model_field`, `data_field` and `contact_field` read their fields by name. Where a field
+lies is found, and proved, when the callback is compiled; what is kept on disk is
+compiled anew for another MuJoCo. Constants that differ from process to process, such as
+the address of a table, reach code that is kept on disk as symbols (`symbol`,
+`address_of`).
 """
 
 from __future__ import annotations
@@ -11,17 +13,16 @@ from __future__ import annotations
 import ctypes
 import functools
 import operator
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any
 
 import llvmlite.binding as llvm
 import mujoco
 import numpy as np
 from llvmlite import ir
-from mujoco.introspect import ast_nodes, structs
 from numba import cfunc
 from numba.core import cgutils, types
-from numba.extending import intrinsic, register_jitable
+from numba.extending import intrinsic, overload, register_jitable
 from numba.np.numpy_support import carray
 
 from cathsim_dmc.compiled import keep_together
@@ -29,16 +30,19 @@ from cathsim_dmc.compiled import keep_together
 # Compiled code calls what this decorates without its first argument.
 _intrinsic: Any = intrinsic
 
-# Bytes of a value of each of MuJoCo's types that is neither a pointer nor a struct.
-_SIZES = {"mjtNum": 8, "mjtSize": 8, "mjtBool": 1, "mjtByte": 1, "int": 4, "float": 4}
-_SIZES |= {"size_t": 8, "uint64_t": 8, "uintptr_t": 8, "unsigned char": 1}
+COUNT = 1 << 40  # more than any array has; nothing checks it
+# Types of values that are neither pointers nor structs; the others are enumerations.
+_KINDS = {"mjtNum": "f8", "float": "f4", "mjtBool": "i1", "mjtByte": "i1"}
+_KINDS |= dict.fromkeys(("mjtSize", "size_t", "uint64_t", "uintptr_t"), "i8")
 # Every kind of thing whose arrays callbacks may ask for, so that none is empty.
 _PROBE = """
 <mujoco>
   <size nuserdata="2" nuser_geom="3" nuser_body="2" nuser_jnt="2" nkey="1"/>
   <worldbody>
-    <body>
+    <geom type="plane" size="1 1 1"/>
+    <body pos="0 0 0.9">
       <joint name="hinge"/>
+      <joint type="slide" axis="0 0 1"/>
       <geom size="1"/>
       <site name="site"/>
     </body>
@@ -50,169 +54,163 @@ _PROBE = """
 """
 
 
-def offsets(struct: str, names: Sequence[str]) -> np.ndarray:
-    """Bytes from the beginning of a struct to some of its fields, proved.
+@functools.cache
+def layout(struct: str) -> Any:
+    """A struct of MuJoCo, such as "mjData", as C lays it out."""
+    from mujoco.introspect import ast_nodes, structs
+
+    def kind(of) -> np.dtype:
+        if isinstance(of, ast_nodes.PointerType):
+            return np.dtype("i8")
+        if isinstance(of, ast_nodes.ArrayType):
+            return np.dtype((kind(of.inner_type), of.extents))
+        if isinstance(of, ast_nodes.AnonymousStructDecl):
+            return whole(of)
+        if of.name in structs.STRUCTS:
+            return layout(of.name)
+        return np.dtype(_KINDS.get(of.name, "i4"))
+
+    def whole(of) -> np.dtype:
+        return np.dtype(
+            [(each.name, kind(each.type)) for each in of.fields], align=True
+        )
+
+    return whole(structs.STRUCTS[struct])
+
+
+@functools.cache
+def _probe() -> dict[str, tuple[Any, int]]:
+    """An object of each struct, and its address."""
+    model = mujoco.MjModel.from_xml_string(_PROBE)
+    data = mujoco.MjData(model)
+    data.time = 0.5
+    mujoco.mj_forward(model, data)
+    first = layout("mjData").fields["contact"][1]
+    contact = ctypes.c_int64.from_address(data._address + first).value
+    return {
+        "mjModel": (model, model._address),
+        "mjData": (data, data._address),
+        "mjContact": (data.contact, contact),
+    }
+
+
+def field(struct: str, name: str) -> tuple[int, Any, Any]:
+    """Where a field of a struct lies, proved by what MuJoCo's Python types know.
 
     Args:
-        struct: "mjModel" or "mjData".
-        names: Fields that are arrays behind a pointer, sizes, or numbers of 8 bytes;
-            "opt.timestep" is one of `mjOption`.
+        struct: "mjModel", "mjData" or "mjContact".
+        name: An array, a size or a number; "opt.timestep" is one of `mjOption`.
 
     Returns:
-        (n,) int64.
+        Bytes from the beginning of the struct, type of what is there, and the value in
+        a sample of it.
 
     Raises:
-        RuntimeError: if a field of this MuJoCo does not lie where its own description
-            says, or has no proof.
+        RuntimeError: if it does not lie where MuJoCo's own description says, or has no
+            proof.
     """
-    model, data = _probe()
-    owner = {"mjModel": model, "mjData": data}[struct]
-    found = []
-    for name in names:
-        place = _place(struct, name)
-        if place is None or not _proved(owner, name, place):
-            raise RuntimeError(
-                f"{struct}.{name} of MuJoCo {mujoco.__version__} is not where it is "
-                "said to be; install a version that pyproject.toml allows"
-            )
-        found.append(place)
-    return np.array(found, dtype=np.int64)
-
-
-_CONTACT = """
-<mujoco>
-  <worldbody>
-    <geom type="plane" size="1 1 1"/>
-    <body pos="0 0 0.9"><freejoint/><geom size="1"/></body>
-  </worldbody>
-</mujoco>
-"""
-
-
-def contact_places() -> np.ndarray:
-    """Where contacts and their constraints lie in memory, proved.
-
-    Returns:
-        (11,) int64, bytes: in mjData of the number of contacts (int32), of their
-        address and that of the Jacobian; size of a contact, which begins with its
-        depth, and in it its position, frame, dimension, second geom and first
-        constraint (int32 these three), `solimp` and `solref`.
-
-    Raises:
-        RuntimeError: if they do not lie where MuJoCo's own description says.
-    """
-    model = mujoco.MjModel.from_xml_string(_CONTACT)
-    data = mujoco.MjData(model)
-    mujoco.mj_forward(model, data)
-    places = _places("mjData")
-    inner, size, _ = _lay(structs.STRUCTS["mjContact"].fields)
-    names = ("ncon", "contact", "efc_J")
-    own = ("pos", "frame", "dim", "geom2", "efc_address", "solimp", "solref")
-    found = [places[name] for name in names]
-    found += [size, *(inner[name] for name in own)]
-    count = ctypes.c_int32.from_address(data._address + places["ncon"]).value
-    first = ctypes.c_int64.from_address(data._address + places["contact"]).value
-    jacobian = ctypes.c_int64.from_address(data._address + places["efc_J"]).value
-    contact = data.contact[0]
-    read = [
-        ctypes.c_double.from_address(first).value,
-        *(ctypes.c_double * 5).from_address(first + inner["solimp"]),
-        *(ctypes.c_double * 2).from_address(first + inner["solref"]),
-        *(ctypes.c_double * 3).from_address(first + inner["pos"]),
-        *(ctypes.c_double * 9).from_address(first + inner["frame"]),
-        *(ctypes.c_int32.from_address(first + inner[n]).value for n in own[2:5]),
-    ]
-    known = [contact.dist, *contact.solimp, *contact.solref, *contact.pos]
-    known += [*contact.frame, contact.dim, contact.geom2, contact.efc_address]
-    proved = read == known and jacobian == data.efc_J.ctypes.data and count == 1
+    owner, address = _probe()[struct]
+    place, kind = 0, layout(struct)
+    try:
+        for part in name.split("."):
+            kind, offset = kind.fields[part][:2]
+            place += offset
+        known = operator.attrgetter(name)(owner)
+        if struct == "mjContact":  # whose arrays lie in it
+            proved = known.ctypes.data == address + place
+            proved &= known.strides[0] == layout(struct).itemsize
+        else:
+            pointer = isinstance(known, np.ndarray)
+            value = (known.ctypes.data if known.size else 0) if pointer else known
+            held = ctypes.string_at(address + place, kind.itemsize)
+            proved = bool(value) and held == np.array(value, kind).tobytes()
+    except (AttributeError, KeyError, TypeError):
+        proved = False
     if not proved:
         raise RuntimeError(
-            f"mjContact of MuJoCo {mujoco.__version__} is not laid out as it is said "
+            f"{struct}.{name} of MuJoCo {mujoco.__version__} is not where it is said "
             "to be; install a version that pyproject.toml allows"
         )
-    return np.array(found, dtype=np.int64)
+    return place, kind, known
 
 
-def follow(function: Any) -> int:
-    """Has MuJoCo call a compiled function in `mjcb_passive`.
+def _reader(struct: str) -> Any:
+    def read(address, name):
+        """A field of the struct at an address: a number, or an array.
+
+        An array (COUNT,) or (COUNT, n) owns nothing, and nothing checks its bounds. The
+        name is a literal.
+        """
+
+    @overload(read, prefer_literal=True)
+    def generate(address, name):
+        if not isinstance(name, types.StringLiteral):
+            return None
+        place, held, known = field(struct, name.literal_value)
+        if not isinstance(known, np.ndarray):
+            kind = held.type
+            return lambda address, name: carray(pointer(address + place), 1, kind)[0]
+        kind, shape = known.dtype.type, known.shape[1:]
+        if struct == "mjContact":
+            shape = shape or (1,)
+            return lambda address, name: carray(pointer(address + place), shape, kind)
+        # Widths that a model chooses are not known here.
+        shape = (COUNT, *(() if name.literal_value.endswith("_user") else shape))
+        return lambda address, name: carray(pointer(word(address + place)), shape, kind)
+
+    return read
+
+
+model_field = _reader("mjModel")
+data_field = _reader("mjData")
+contact_field = _reader("mjContact")
+
+
+def contact_at(data, number):
+    """Address of a contact in the `mjData` at an address."""
+
+
+@overload(contact_at)
+def _contact_at(data, number):
+    place = layout("mjData").fields["contact"][1]
+    size = layout("mjContact").itemsize
+    return lambda data, number: word(data + place) + number * size
+
+
+def symbol(name: str, count: int) -> np.ndarray:
+    """An array (count,) of int64, 0 at first, that has a name for `address_of`."""
+    array = np.zeros(count, np.int64)
+    llvm.add_symbol(name, array.ctypes.data)
+    return array
+
+
+def stands_in(name: str) -> int:
+    """Address of the function in a callback of MuJoCo, "mjcb_passive" or other.
 
     Returns:
-        Address of the function that stood there before, which it must call; 0 for none.
+        0 for none.
 
     Raises:
         RuntimeError: if a Python function stands there.
     """
-    before = mujoco.get_mjcb_passive()
-    if before is not None and not hasattr(before, "argtypes"):
+    stood = getattr(mujoco, f"get_{name}")()
+    if stood is not None and not hasattr(stood, "argtypes"):
         raise RuntimeError(
-            f"mjcb_passive is the Python function {before!r}, which compiled functions "
-            "cannot call; remove it with mujoco.set_mjcb_passive(None)"
+            f"{name} is the Python function {stood!r}, which compiled functions cannot "
+            f"call; remove it with mujoco.set_{name}(None)"
         )
+    return 0 if stood is None else ctypes.cast(stood, ctypes.c_void_p).value or 0
+
+
+def follow(function: Any, before: np.ndarray) -> None:
+    """Has MuJoCo call a compiled function in `mjcb_passive`.
+
+    Args:
+        before: (1,), gets the address of the function that stood there, which the
+            function must call (`call_before`); see `stands_in`.
+    """
+    before[0] = stands_in("mjcb_passive")
     mujoco.set_mjcb_passive(function.ctypes)
-    return 0 if before is None else ctypes.cast(before, ctypes.c_void_p).value or 0
-
-
-def _proved(owner: mujoco.MjModel | mujoco.MjData, name: str, place: int) -> bool:
-    """Whether memory holds what MuJoCo's own Python types know of a field."""
-    try:
-        known = operator.attrgetter(name)(owner)
-    except AttributeError:
-        return False
-    if isinstance(known, np.ndarray):
-        known = known.ctypes.data if known.size else 0
-    kind = ctypes.c_double if isinstance(known, float) else ctypes.c_int64
-    return bool(known) and kind.from_address(owner._address + place).value == known
-
-
-@functools.cache
-def _probe() -> tuple[mujoco.MjModel, mujoco.MjData]:
-    model = mujoco.MjModel.from_xml_string(_PROBE)
-    data = mujoco.MjData(model)
-    data.time = 0.5
-    return model, data
-
-
-def _place(struct: str, name: str) -> int | None:
-    """Offset of a field, perhaps one of a struct in the struct, bytes."""
-    if name.startswith("opt."):
-        inner = _places("mjOption").get(name.removeprefix("opt."))
-        return None if inner is None else _places(struct)["opt"] + inner
-    return _places(struct).get(name)
-
-
-@functools.cache
-def _places(struct: str) -> dict[str, int]:
-    return _lay(structs.STRUCTS[struct].fields)[0]
-
-
-def _lay(fields) -> tuple[dict[str, int], int, int]:
-    """Offsets of fields as C lays them out, their size and alignment in bytes."""
-    places, end, widest = {}, 0, 1
-    for field in fields:
-        size, alignment = _size(field.type)
-        end += -end % alignment
-        places[field.name] = end
-        end, widest = end + size, max(widest, alignment)
-    return places, end + -end % widest, widest
-
-
-def _size(kind) -> tuple[int, int]:
-    if isinstance(kind, ast_nodes.PointerType):
-        return 8, 8
-    if isinstance(kind, ast_nodes.ArrayType):
-        size, alignment = _size(kind.inner_type)
-        return size * int(np.prod(kind.extents)), alignment
-    if isinstance(kind, ast_nodes.AnonymousStructDecl):
-        return _lay(kind.fields)[1:]
-    if kind.name in structs.STRUCTS:
-        return _lay(structs.STRUCTS[kind.name].fields)[1:]
-    size = _SIZES.get(kind.name, 4)  # the others are enumerations
-    return size, size
-
-
-def symbol(name: str, array: np.ndarray) -> None:
-    """Gives an array that lives as long as the process a name for `address_of`."""
-    llvm.add_symbol(name, array.ctypes.data)
 
 
 @_intrinsic
@@ -230,18 +228,15 @@ def address_of(_, name):
     return types.int64(name), generate
 
 
-def _load(kind: ir.Type):
-    def generate(context, builder, signature, arguments):
-        place = builder.inttoptr(arguments[0], kind.as_pointer())
-        return builder.load(place)
-
-    return generate
-
-
 @_intrinsic
 def word(_, address):
     """The int64 at an address: a size, or the address of an array."""
-    return types.int64(types.int64), _load(ir.IntType(64))
+
+    def generate(context, builder, signature, arguments):
+        place = builder.inttoptr(arguments[0], ir.IntType(64).as_pointer())
+        return builder.load(place)
+
+    return types.int64(types.int64), generate
 
 
 @_intrinsic
@@ -264,22 +259,24 @@ def pointer(_, address):
     return types.voidptr(types.int64), generate
 
 
-@register_jitable
-def numbers(address, count):
-    """The array (count,) of float64 at an address; it owns nothing."""
-    return carray(pointer(address), count, np.float64)
+def _array(kind: Any) -> Any:
+    @register_jitable
+    def array(address):
+        """The array (COUNT,) at an address; it owns nothing."""
+        return carray(pointer(address), COUNT, kind)
+
+    return array
 
 
-@register_jitable
-def wholes(address, count):
-    """The array (count,) of int32 at an address; it owns nothing."""
-    return carray(pointer(address), count, np.int32)
+numbers, wholes, shorts = map(_array, (np.float64, np.int32, np.int16))
 
 
-@register_jitable
-def shorts(address, count):
-    """The array (count,) of int16 at an address; it owns nothing."""
-    return carray(pointer(address), count, np.int16)
+def _call(builder, values, result, variadic=False):
+    """Calls the function at the address that is the first value, on the others."""
+    kinds = [value.type for value in values[1:]]
+    kind = ir.FunctionType(result, kinds[:1] if variadic else kinds, var_arg=variadic)
+    place = builder.inttoptr(values[0], kind.as_pointer())
+    return builder.call(place, values[1:])
 
 
 @_intrinsic
@@ -287,10 +284,7 @@ def call_collision(_, address, model, data, contacts, geom1, geom2, margin):
     """Calls a function of MuJoCo's collision table; returns the number of contacts."""
 
     def generate(context, builder, signature, values):
-        kinds = [value.type for value in values[1:]]
-        kind = ir.FunctionType(ir.IntType(32), kinds)
-        place = builder.inttoptr(values[0], kind.as_pointer())
-        return builder.call(place, values[1:])
+        return _call(builder, values, ir.IntType(32))
 
     places = [types.int64] * 4
     return types.int32(*places, types.int32, types.int32, types.float64), generate
@@ -301,9 +295,7 @@ def call_callback(_, address, model, data):
     """Calls one of MuJoCo's callbacks on a model and its data, given by addresses."""
 
     def generate(context, builder, signature, values):
-        kind = ir.FunctionType(ir.VoidType(), [value.type for value in values[1:]])
-        place = builder.inttoptr(values[0], kind.as_pointer())
-        builder.call(place, values[1:])
+        _call(builder, values, ir.VoidType())
         return context.get_dummy_value()
 
     return types.void(types.int64, types.int64, types.int64), generate
@@ -314,13 +306,18 @@ def call_error(_, address, text, number):
     """Calls `mju_error` with the text at an address, and an int32 for its %d."""
 
     def generate(context, builder, signature, values):
-        kind = ir.FunctionType(ir.VoidType(), [cgutils.voidptr_t], var_arg=True)
-        place = builder.inttoptr(values[0], kind.as_pointer())
-        line = builder.inttoptr(values[1], cgutils.voidptr_t)
-        builder.call(place, [line, values[2]])
+        _call(builder, values, ir.VoidType(), variadic=True)
         return context.get_dummy_value()
 
     return types.void(types.int64, types.int64, types.int32), generate
+
+
+@register_jitable
+def call_before(table, model, data):
+    """Calls the callback whose address `follow` has put into a table, if any."""
+    before = word(table)
+    if before != 0:
+        call_callback(before, model, data)
 
 
 def callback(signature: str, cache: bool = True) -> Callable:

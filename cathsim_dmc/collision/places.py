@@ -8,7 +8,7 @@ import numpy as np
 
 from cathsim_dmc.anatomy.field_loops import FREE, clearance_at, gradient_at
 from cathsim_dmc.collision.native import numbers, shorts, wholes, word
-from cathsim_dmc.collision.table import BORE, COUNT
+from cathsim_dmc.collision.table import BORE
 from cathsim_dmc.compiled import compiled
 
 EVERY = 1e-3  # m, apart are the places of a capsule that are looked at first
@@ -30,11 +30,8 @@ def bore_at(head, x, y, z):
     best, value, way = np.inf, FREE, (0.0, 0.0, 0.0)
     for k in range(count - 1):
         a, b = 1 + 4 * k, 5 + 4 * k
-        dx, dy, dz = (
-            head[b] - head[a],
-            head[b + 1] - head[a + 1],
-            head[b + 2] - head[a + 2],
-        )
+        dx, dy = head[b] - head[a], head[b + 1] - head[a + 1]
+        dz = head[b + 2] - head[a + 2]
         px, py, pz = x - head[a], y - head[a + 1], z - head[a + 2]
         u = (px * dx + py * dy + pz * dz) / (dx * dx + dy * dy + dz * dz)
         beyond = (k == 0 and u < 0.0) or (k == count - 2 and u > 1.0)
@@ -51,20 +48,18 @@ def bore_at(head, x, y, z):
 
 
 @compiled
+def lumen(entry):
+    """Head, coarse lattice, index and samples of an entry's `Field`."""
+    coarse, index = shorts(word(entry + 32)), wholes(word(entry + 40))
+    return numbers(word(entry + 24)), coarse, index, shorts(word(entry + 48))
+
+
+@compiled
 def clearance(entry, x, y, z):
     """Distance (m) from the wall of an entry's field, `FREE` past its open ends."""
-    head = numbers(word(entry + 24), COUNT)
     if word(entry + 8) == BORE:
-        return bore_at(head, x, y, z)[0]
-    return clearance_at(
-        head,
-        shorts(word(entry + 32), COUNT),
-        wholes(word(entry + 40), COUNT),
-        shorts(word(entry + 48), COUNT),
-        x,
-        y,
-        z,
-    )
+        return bore_at(numbers(word(entry + 24)), x, y, z)[0]
+    return clearance_at(*lumen(entry), x, y, z)
 
 
 @compiled
@@ -86,14 +81,10 @@ def across(one, other):
 @compiled
 def away(entry, x, y, z):
     """Unit vector (3) away from the wall; zeros where there is none."""
-    head = numbers(word(entry + 24), COUNT)
     if word(entry + 8) == BORE:
-        way = bore_at(head, x, y, z)[1]
+        way = bore_at(numbers(word(entry + 24)), x, y, z)[1]
     else:
-        coarse = shorts(word(entry + 32), COUNT)
-        index = wholes(word(entry + 40), COUNT)
-        samples = shorts(word(entry + 48), COUNT)
-        way = gradient_at(head, coarse, index, samples, x, y, z, _STEP)
+        way = gradient_at(*lumen(entry), x, y, z, _STEP)
     norm = length(way)
     if norm < 1e-12:
         return (0.0, 0.0, 0.0)
@@ -103,11 +94,8 @@ def away(entry, x, y, z):
 @compiled
 def along(centre, axis, t):
     """Place (3) m along a capsule's axis."""
-    return (
-        centre[0] + t * axis[0],
-        centre[1] + t * axis[1],
-        centre[2] + t * axis[2],
-    )
+    x, y, z = centre
+    return (x + t * axis[0], y + t * axis[1], z + t * axis[2])
 
 
 @compiled
@@ -172,7 +160,7 @@ def lowest(entry, centre, axis, half, t, value, step):
 @compiled
 def straight(entry):
     """Whether an entry is a bore with one piece."""
-    return word(entry + 8) == BORE and numbers(word(entry + 24), 1)[0] == 2.0
+    return word(entry + 8) == BORE and numbers(word(entry + 24))[0] == 2.0
 
 
 @compiled
@@ -184,11 +172,8 @@ def in_straight_bore(head, centre, axis, half, closed, limit):
     dx, dy, dz = head[5] - head[1], head[6] - head[2], head[7] - head[3]
     length = math.sqrt(dx * dx + dy * dy + dz * dz)
     dx, dy, dz = dx / length, dy / length, dz / length
-    level = (
-        (centre[0] - head[1]) * dx
-        + (centre[1] - head[2]) * dy
-        + (centre[2] - head[3]) * dz
-    )
+    level = (centre[0] - head[1]) * dx + (centre[1] - head[2]) * dy
+    level += (centre[2] - head[3]) * dz
     rate = axis[0] * dx + axis[1] * dy + axis[2] * dz
     low, high, first, second = -half, half, closed[0], closed[1]
     if abs(rate) > 1e-9:
@@ -304,7 +289,7 @@ def touches(entry, centre, axis, half, closed, limit):
         Number of places; of each, m along the axis and the clearance there, m.
     """
     if straight(entry):
-        head = numbers(word(entry + 24), COUNT)
+        head = numbers(word(entry + 24))
         return in_straight_bore(head, centre, axis, half, closed, limit)
     seen = NONE
     if apart(entry, centre, axis, half, limit):

@@ -1,17 +1,15 @@
 """Drag of blood, compiled; MuJoCo calls it in every physics step. See `blood`."""
 
+import functools
 import math
-
-import numpy as np
 
 from cathsim_dmc.anatomy.circulation import BEAT
 from cathsim_dmc.collision import native
 from cathsim_dmc.collision.native import (
     address_of,
-    call_callback,
-    numbers,
-    wholes,
-    word,
+    call_before,
+    data_field,
+    model_field,
 )
 from cathsim_dmc.compiled import compiled
 
@@ -25,14 +23,8 @@ HEADER, MARK = 7, 1843.0
 OF_LINK = 8
 # Numbers of `userdata` before the parameters of the first effect.
 _FIRST = 2
-_MODEL = ("nuserdata", "body_geomadr", "geom_size", "body_dofadr", "body_dofnum", "nv")
-_DATA = ("userdata", "xipos", "xmat", "cvel", "subtree_com", "cdof", "qfrc_passive")
-_DATA += ("time",)
-_BEFORE = 8 * (len(_MODEL) + len(_DATA))
 _SYMBOL = "cathsim_blood"
-# Offsets of these fields, and the function that stood in `mjcb_passive`.
-_TABLE = np.zeros(len(_MODEL) + len(_DATA) + 1, np.int64)
-native.symbol(_SYMBOL, _TABLE)
+_before = native.symbol(_SYMBOL, 1)
 
 
 @compiled
@@ -47,39 +39,29 @@ def beat(phase):
 @native.callback("void(int64, int64)")
 def _drag(model, data):
     """Adds the drag on each link to the passive forces of a model with blood."""
-    table = address_of(_SYMBOL)
-    before = word(table + _BEFORE)
-    if before != 0:
-        call_callback(before, model, data)
-    count = word(model + word(table))
-    if count < _FIRST + HEADER:
+    call_before(address_of(_SYMBOL), model, data)
+    if model_field(model, "nuserdata") < _FIRST + HEADER:
         return
-    user = numbers(word(data + word(table + 48)), count)
+    user = data_field(data, "userdata")
     if user[_FIRST] != MARK:
         return
     links, user = (int(user[1]) - HEADER) // OF_LINK, user[_FIRST:]
     density, viscosity, first = user[1], user[2], int(user[3])
     if viscosity == 0.0:
         return
-    bodies, nv = first + links, word(model + word(table + 40))
-    geoms = wholes(word(model + word(table + 8)), bodies)
-    sizes = numbers(word(model + word(table + 16)), 3 * (geoms[bodies - 1] + 1))
-    dofs = wholes(word(model + word(table + 24)), bodies)
-    counts = wholes(word(model + word(table + 32)), bodies)
-    xipos = numbers(word(data + word(table + 56)), 3 * bodies)
-    xmat = numbers(word(data + word(table + 64)), 9 * bodies)
-    cvel = numbers(word(data + word(table + 72)), 6 * bodies)
-    pole = numbers(word(data + word(table + 80)), 3 * bodies)[3 * first :]
-    cdof = numbers(word(data + word(table + 88)), 6 * nv)
-    passive = numbers(word(data + word(table + 96)), nv)
+    geoms, sizes = model_field(model, "body_geomadr"), model_field(model, "geom_size")
+    dofs, counts = model_field(model, "body_dofadr"), model_field(model, "body_dofnum")
+    xipos, xmat = data_field(data, "xipos"), data_field(data, "xmat")
+    cvel, pole = data_field(data, "cvel"), data_field(data, "subtree_com")[first]
+    cdof, passive = data_field(data, "cdof"), data_field(data, "qfrc_passive")
     peak, rate, factor = user[4], user[5], 1.0
-    phase = rate * numbers(data + word(table + 104), 1)[0] + user[6]
+    phase = rate * data_field(data, "time") + user[6]
     # Force of all links from here to the end, and its torque about the pole.
     fx = fy = fz = tx = ty = tz = 0.0
     for link in range(links - 1, -1, -1):
         body, flow = first + link, user[HEADER + OF_LINK * link :]
-        radius, half = sizes[3 * geoms[body]], sizes[3 * geoms[body] + 1]
-        spin, axes, place = cvel[6 * body :], xmat[9 * body :], xipos[3 * body :]
+        radius, half = sizes[geoms[body], 0], sizes[geoms[body], 1]
+        spin, axes, place = cvel[body], xmat[body], xipos[body]
         x, y, z = place[0] - pole[0], place[1] - pole[1], place[2] - pole[2]
         if peak != 0.0:
             factor = peak * beat(phase - rate * flow[3])
@@ -100,15 +82,12 @@ def _drag(model, data):
         fx, fy, fz = fx + u, fy + v, fz + w
         tx, ty, tz = tx + y * w - z * v, ty + z * u - x * w, tz + x * v - y * u
         for dof in range(dofs[body], dofs[body] + counts[body]):
-            way = cdof[6 * dof :]
+            way = cdof[dof]
             passive[dof] += way[0] * tx + way[1] * ty + way[2] * tz
             passive[dof] += way[3] * fx + way[4] * fy + way[5] * fz
 
 
+@functools.cache
 def install() -> None:
     """Has MuJoCo add the drag where there is blood; RuntimeError as `follow`."""
-    if _TABLE[0]:
-        return
-    _TABLE[len(_MODEL) : -1] = native.offsets("mjData", _DATA)
-    _TABLE[: len(_MODEL)] = native.offsets("mjModel", _MODEL)
-    _TABLE[-1] = native.follow(_drag)
+    native.follow(_drag, _before)

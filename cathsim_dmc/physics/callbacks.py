@@ -5,25 +5,19 @@ installed becomes one more link of a chain: it calls what was there before, then
 the models that bear the mark of its effects in `userdata`, and on no other.
 """
 
-import ctypes
 import functools
 from collections.abc import Callable
 
 import mujoco
 
 from cathsim_dmc.collision import native
+from cathsim_dmc.collision.native import data_field, model_field
 from cathsim_dmc.compiled import compiled
 from cathsim_dmc.physics.readings import MARK, Bodies
 
 # Links refer to each other: none is kept on disk.
 _compiled = functools.partial(compiled, cache=False)
 
-_NUSERDATA, _NBODY = native.offsets("mjModel", ("nuserdata", "nbody")).tolist()
-_USERDATA, _TIME, *_ARRAYS = native.offsets(
-    "mjData", ("userdata", "time", *Bodies._fields)
-).tolist()
-_XIPOS, _XIMAT, _XMAT, _CVEL, _COM, _FORCE = _ARRAYS
-_C_FUNCTION = ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_void_p)
 
 # Mark of each function, and the links of the chain, which must stay alive.
 _marks: dict[Callable, int] = {}
@@ -51,61 +45,37 @@ def install(function: Callable) -> int:
 
 
 def _append(function: Callable, mark: int) -> None:
-    before = mujoco.get_mjcb_control()
-    if before is not None and not hasattr(before, "argtypes"):
-        raise RuntimeError(
-            f"mjcb_control is the Python function {before!r}, which compiled effects "
-            "cannot call; remove it with mujoco.set_mjcb_control(None)"
-        )
-    link = native.callback("void(int64, int64)", cache=False)(
-        _link(_compiled(function), mark, _called(before))
-    )
-    _links.append(link)
-    mujoco.set_mjcb_control(link.ctypes)
-
-
-def _called(before) -> Callable:
-    if before is None:
-
-        @_compiled
-        def call(model, data):
-            pass
-
-        return call
-    function = ctypes.cast(before, _C_FUNCTION)
-
-    @_compiled
-    def call(model, data):
-        function(native.pointer(model), native.pointer(data))
-
-    return call
+    made = _link(_compiled(function), mark, native.stands_in("mjcb_control"))
+    _links.append(native.callback("void(int64, int64)", cache=False)(made))
+    mujoco.set_mjcb_control(_links[-1].ctypes)
 
 
 def _clear(parameters, time, bodies):
     bodies.xfrc_applied[:] = 0.0
 
 
-def _link(apply: Callable, mark: int, before: Callable) -> Callable:
-    """A link of the chain; with mark 0 it acts once on each model with effects."""
+def _link(apply: Callable, mark: int, before: int) -> Callable:
+    """A link of the chain; with mark 0 it acts once on each model with effects.
+
+    `before` is the address of the one before it.
+    """
 
     def link(model, data):
-        before(model, data)
-        count = native.word(model + _NUSERDATA)
-        if count == 0:
+        if before != 0:
+            native.call_callback(before, model, data)
+        count = model_field(model, "nuserdata")
+        user = data_field(data, "userdata")
+        if count == 0 or user[count - 1] != MARK:
             return
-        user = native.numbers(native.word(data + _USERDATA), count)
-        if user[count - 1] != MARK:
-            return
-        nbody = native.word(model + _NBODY)
+        nbody, time = model_field(model, "nbody"), data_field(data, "time")
         bodies = Bodies(
-            _rows(data + _XIPOS, nbody, 3),
-            _rows(data + _XIMAT, nbody, 9),
-            _rows(data + _XMAT, nbody, 9),
-            _rows(data + _CVEL, nbody, 6),
-            _rows(data + _COM, nbody, 3),
-            _rows(data + _FORCE, nbody, 6),
+            data_field(data, "xipos")[:nbody],
+            data_field(data, "ximat")[:nbody],
+            data_field(data, "xmat")[:nbody],
+            data_field(data, "cvel")[:nbody],
+            data_field(data, "subtree_com")[:nbody],
+            data_field(data, "xfrc_applied")[:nbody],
         )
-        time = native.numbers(data + _TIME, 1)[0]
         if mark == 0:
             apply(user[:0], time, bodies)
             return
@@ -117,8 +87,3 @@ def _link(apply: Callable, mark: int, before: Callable) -> Callable:
             start = own
 
     return link
-
-
-@_compiled
-def _rows(place, count, width):
-    return native.numbers(native.word(place), count * width).reshape(count, width)
