@@ -84,15 +84,8 @@ def test_masses_and_inertias_are_the_physical_ones(name):
     ]
     compiled_moments = np.sort(model.body_inertia[bodies], axis=-1)[:, ::-1]
     np.testing.assert_allclose(compiled_moments, expected, rtol=1e-6)
-
-
-def test_floors_would_have_acted():
-    """The links are lighter than the floors, or the test above would prove nothing."""
-    catheter, physics = compiled("microcatheter_021")
-    model = physics.model.ptr
-    bodies = link_bodies(physics)
-    assert model.body_mass[bodies].min() < 1e-5
-    assert model.body_inertia[bodies].min() < 1e-11
+    if name == "microcatheter_021":  # or floors would not have acted
+        assert masses.min() < 1e-5 and compiled_moments.min() < 1e-11
 
 
 @pytest.mark.parametrize("name", devices.DEVICES)
@@ -136,12 +129,6 @@ def test_compliance_does_not_depend_on_the_links(shaft_link):
     assert lengths.sum() == pytest.approx(LENGTH, rel=1e-12)
 
 
-def test_published_discretisation_of_the_tip():
-    catheter, _ = compiled()
-    np.testing.assert_allclose(catheter.link_lengths[-10:], 0.007)
-    assert len(catheter.tip_motors) == 20
-
-
 def test_capsules_have_the_device_s_radius_and_the_links_length(published):
     catheter, physics = published
     model = physics.model.ptr
@@ -153,18 +140,6 @@ def test_capsules_have_the_device_s_radius_and_the_links_length(published):
         np.testing.assert_allclose(geom.pos, [0, 0, length / 2], atol=1e-12)
         assert geom.condim[0] == 3
         assert geom.margin[0] == 0 and geom.gap[0] == 0
-
-
-def test_the_device_does_not_collide_with_itself(published):
-    _, physics = published
-    model = physics.model.ptr
-    geoms = [
-        geom
-        for geom in range(model.ngeom)
-        if model.geom(geom).name.startswith("catheter/")
-    ]
-    types, affinities = model.geom_contype[geoms], model.geom_conaffinity[geoms]
-    assert not (types[:, None] & affinities[None, :]).any()
 
 
 def test_a_curled_device_has_no_contact(published):
@@ -192,14 +167,11 @@ def test_straight_device_ends_at_its_origin(published):
 # Motors.
 
 
-def names_of_actions(catheter):
-    return [actuator.name for actuator in catheter.actuators]
-
-
 def test_actuators_are_in_the_order_of_the_action(published):
     catheter, physics = published
+    np.testing.assert_allclose(catheter.link_lengths[-10:], 0.007)  # as published
     tip = [f"tip_{axis}_{joint}" for joint in range(10) for axis in "xy"]
-    assert names_of_actions(catheter) == [*tip, "insertion"]
+    assert catheter.action_names == (*tip, "insertion")
     model = physics.model.ptr
     assert model.nu == 21
     compiled_names = [model.actuator(index).name for index in range(model.nu)]
@@ -216,18 +188,14 @@ def test_actuators_are_in_the_order_of_the_action(published):
 
 def test_rotation_adds_one_action():
     catheter, physics = compiled(rotation=True, torsion_joints=4)
-    assert names_of_actions(catheter)[20:] == ["insertion", "rotation"]
+    assert catheter.action_names[20:] == ("insertion", "rotation")
+    passive, _ = compiled("wire_035_amplatz", rotation=True)
+    assert passive.action_names == ("insertion", "rotation")
     model = physics.model.ptr
     assert model.nu == 22
     joint = model.joint("catheter/rotation")
     assert model.dof_armature[joint.dofadr[0]] == ROTOR_INERTIA
     np.testing.assert_allclose(joint.axis, [0, 0, 1])
-
-
-def test_passive_devices_have_no_tip_motors():
-    catheter, physics = compiled("wire_035_amplatz", rotation=True)
-    assert names_of_actions(catheter) == ["insertion", "rotation"]
-    assert physics.model.nu == 2
 
 
 @pytest.mark.parametrize("name", STEERABLE)
@@ -263,7 +231,7 @@ def test_carriage_moves_at_the_speed_asked_for(published):
 # Torsion and rest shape.
 
 
-@pytest.mark.parametrize("count", [1, 4, 9])
+@pytest.mark.parametrize("count", [0, 1, 4, 9])
 def test_torsion_hinges_add_up_to_the_rod(count):
     catheter, physics = compiled(rotation=True, torsion_joints=count)
     model, device = physics.model.ptr, catheter.device
@@ -273,6 +241,8 @@ def test_torsion_hinges_add_up_to_the_rod(count):
         if "/twist_" in model.joint(index).name
     ]
     assert len(twists) == count
+    if count == 0:
+        return
     compliance = sum(1 / twist.stiffness[0] for twist in twists)
     first_half = catheter.link_lengths[0] / 2
     expected = (
@@ -284,14 +254,6 @@ def test_torsion_hinges_add_up_to_the_rod(count):
     for twist in twists:
         np.testing.assert_allclose(twist.axis, [0, 0, 1])
         assert model.dof_armature[twist.dofadr[0]] == TORSION_ARMATURE
-
-
-def test_without_torsion_hinges_nothing_twists(published):
-    catheter, physics = published
-    model = physics.model.ptr
-    names = [model.joint(index).name for index in range(model.njnt)]
-    assert not [name for name in names if "twist" in name]
-    assert len(catheter.bends) == 2 * (len(catheter.link_lengths) - 1)
 
 
 @pytest.mark.parametrize("name", ["diagnostic_5f_j", "diagnostic_5f_simmons"])

@@ -142,15 +142,6 @@ def test_nothing_jumps_as_one_device_slides_through_the_other(pair):
         assert np.abs(after - before).max() < 1e-3 * scale
 
 
-def test_a_rotation_turns_the_shape(pair):
-    overlap = pair.overlap(np.array([[0.03, 0.0]]))
-    still = np.zeros((1, 2, len(pair.spans)))
-    straight = pair.rest_angles(overlap, still)
-    turned = pair.rest_angles(overlap, still + 0.7)
-    np.testing.assert_allclose(turned, straight * np.exp(0.7j), rtol=1e-12)
-    assert np.abs(straight.imag).max() == 0.0 < straight.real.max()
-
-
 def test_restoring_torque_is_the_derivative_of_the_energy(pair):
     rng = np.random.default_rng(1)
     overlap = pair.overlap(np.array([[0.0, 0.013]]))
@@ -327,40 +318,3 @@ def test_friction_winds_the_device_up_until_it_gives():
     for _ in range(200):
         angles = one.turn(angles, np.zeros((1, 1)), 0.04, friction=friction)
     assert 0.3 < base[-1] - angles[0, 0, -1] < 0.5
-
-
-def test_many_are_turned_as_each_alone():
-    """Bit for bit, whatever lies beside."""
-    two = rods(("wire_035_glide", "berenstein_5f"))
-    rng = np.random.default_rng(2)
-    shape = (5, 2, len(LENGTHS))
-    angles = rng.normal(size=(5, 2, len(LENGTHS) + 1))
-    turned = rng.normal(size=(5, 2))
-    torque, rate = 1e-4 * rng.normal(size=shape), 1e-4 * rng.normal(size=shape)
-    friction = 1e-5 * rng.random(shape)
-    many = two.turn(angles, turned, 0.04, torque, rate, friction)
-    for i in range(5):
-        row = slice(i, i + 1)
-        one = two.turn(
-            angles[row], turned[row], 0.04, torque[row], rate[row], friction[row]
-        )
-        assert one.tobytes() == many[row].tobytes()
-
-
-def test_overlaps_of_many_are_those_of_each(pair):
-    rng = np.random.default_rng(3)
-    gaps = np.where(rng.random(6)[:, None] < 0.5, [0.0, 1.0], [1.0, 0.0]) * (
-        rng.uniform(0, 0.2, (6, 1))
-    )
-    turns = rng.uniform(-3, 3, (6, 2, len(pair.spans)))
-    many = pair.overlap(gaps)
-    bends = pair.rest_angles(many, turns) + 0.1
-    for i in range(6):
-        row = slice(i, i + 1)
-        one = pair.overlap(gaps[row])
-        for mine, theirs in zip(one, many, strict=True):
-            assert mine.tobytes() == np.ascontiguousarray(theirs[row]).tobytes()
-        for function in (pair.restoring, lambda *a: pressed(pair, *a)):
-            alone = function(one, bends[row], turns[row])
-            for mine, theirs in zip(alone, function(many, bends, turns), strict=True):
-                assert mine.tobytes() == np.ascontiguousarray(theirs[row]).tobytes()

@@ -152,15 +152,10 @@ def test_the_wall_is_one_geom_that_touches_the_device_only(model):
     assert wall.margin[0] == 0 and wall.gap[0] == 0
     lumen = model.geom("phantom/lumen")
     assert lumen.contype[0] == 0 and lumen.conaffinity[0] == 0
-
-
-def test_device_and_wall_have_the_same_contact(model):
-    wall, link = model.geom("wall"), model.geom("catheter/link_3")
-    np.testing.assert_array_equal(wall.solref, link.solref)
-    np.testing.assert_array_equal(wall.solimp, link.solimp)
-    np.testing.assert_array_equal(wall.solref, contact.CONTACT_SOLREF)
-    np.testing.assert_array_equal(wall.solimp, contact.CONTACT_SOLIMP)
-    assert wall.friction[0] == link.friction[0] == contact.FRICTION
+    for geom in (wall, model.geom("catheter/link_3")):
+        np.testing.assert_array_equal(geom.solref, contact.CONTACT_SOLREF)
+        np.testing.assert_array_equal(geom.solimp, contact.CONTACT_SOLIMP)
+        assert geom.friction[0] == contact.FRICTION
 
 
 def test_contacts_lie_on_the_wall_of_the_anatomy(environment, pressed):
@@ -218,28 +213,12 @@ def test_every_element_has_a_name(shared_environment, rotation):
 # Arena.
 
 
-def test_settings_of_the_physics(model):
-    option = model.opt
-    assert option.integrator == mujoco.mjtIntegrator.mjINT_DISCRETE
-    assert option.cone == mujoco.mjtCone.mjCONE_ELLIPTIC
-    assert option.noslip_iterations == 0
-    assert option.density == 0 and option.viscosity == 0
-    assert option.timestep == pytest.approx(0.004)
-
-
-def test_gravity_pulls_to_the_back_less_the_buoyancy(environment, model):
-    device = environment.task.scene.catheter.device
-    density = device.linear_density / (math.pi * device.outer_radius**2)
-    # A hollow catheter is lighter than blood, in which it is taken to float.
+@pytest.mark.parametrize("density", [900.0, BLOOD_DENSITY, 1500.0, 6450.0])
+def test_gravity_pulls_to_the_back_less_the_buoyancy(density):
+    gravity = AngiographyArena(device_density=density).mjcf_model.option.gravity
+    # What is lighter than blood is taken to float.
     expected = GRAVITY * max(0.0, 1 - BLOOD_DENSITY / density)
-    np.testing.assert_allclose(model.opt.gravity, [0, expected, 0])
-
-
-@pytest.mark.parametrize("density", [BLOOD_DENSITY, 1500.0, 6450.0])
-def test_a_denser_device_sinks_more(density):
-    arena = AngiographyArena(device_density=density)
-    gravity = arena.mjcf_model.option.gravity
-    np.testing.assert_allclose(gravity[1], GRAVITY * (1 - BLOOD_DENSITY / density))
+    np.testing.assert_allclose(gravity, [0, expected, 0])
 
 
 def test_camera_looks_at_its_target():

@@ -64,9 +64,6 @@ def clamps(insertion):
     ]
 
 
-# ------------------------------------------------------------------ posture
-
-
 @given(insertions, st.floats(1e-7, 1e-4), rotations)
 def test_posture_is_continuous(insertion, step, rotation):
     change = np.abs(
@@ -103,17 +100,6 @@ def test_posture_stays_in_range(insertion, rotation):
         assert ends is None or ends[0] <= value <= ends[1], name
 
 
-def test_posture_broadcasts_over_batch_axes():
-    insertion = np.linspace(0, 0.3, 12).reshape(3, 4)
-    rotation = np.linspace(-1, 1, 4)
-    batch = follower_posture(insertion, rotation)
-    assert batch.shape == (3, 4, len(JOINTS)) and batch.dtype == np.float64
-    for i in np.ndindex(3, 4):
-        np.testing.assert_array_equal(
-            batch[i], follower_posture(insertion[i], rotation[i[1]])
-        )
-
-
 def test_rear_clamps_and_guidewire_unit_follow_a_guidewire_of_its_own():
     both = follower_posture(0.1, 1.0)
     own = follower_posture(0.1, 1.0, 0.15, -2.0)
@@ -138,17 +124,6 @@ def test_platforms_never_meet():
     assert gaps.min() > 0.004
     assert (centre + half).max() < -0.016  # the front end plate
     assert (centre - half).min() > -0.360 + 0.012  # the rear one
-
-
-@pytest.mark.parametrize("bad", [np.nan, np.inf])
-def test_posture_refuses_what_is_not_finite(bad):
-    with pytest.raises(ValueError, match="finite"):
-        follower_posture(bad)
-    with pytest.raises(ValueError, match="finite"):
-        follower_posture(0.0, bad)
-
-
-# ------------------------------------------------------------------- entity
 
 
 def test_joints_and_names():

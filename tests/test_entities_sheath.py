@@ -101,14 +101,6 @@ def test_a_straight_sheath_is_one_round_bore(straight_rig):
     rig.model.body_pos[sheath] = 0.0
 
 
-def test_the_sheath_is_frictionless_and_only_guides_the_device(straight_rig):
-    model = straight_rig.model
-    bore = model.geom("sheath/bore")
-    assert bore.condim[0] == 1 and bore.priority[0] == 2
-    assert bore.contype[0] == 1 and bore.conaffinity[0] == 0
-    assert model.geom("sheath/tube_0").contype[0] == 0
-
-
 def test_the_sheath_holds_a_device_that_is_pushed_aside(straight_rig):
     rig = straight_rig
     mujoco.mj_resetData(rig.model, rig.data)
@@ -195,12 +187,8 @@ def test_a_device_goes_round_a_bend_without_jam(bent_rig):
 def test_lines_that_no_sheath_follows(line, message):
     with pytest.raises(ValueError, match=message):
         Sheath(np.asarray(line, float), 0.8e-3)
-
-
-@pytest.mark.parametrize("radius", [0.0, -1e-3, np.nan])
-def test_sizes_are_checked(radius):
     with pytest.raises(ValueError, match="must be positive"):
-        Sheath(straight(0.1), radius)
+        Sheath(straight(0.1), 0.0)
 
 
 # Joints along a line.

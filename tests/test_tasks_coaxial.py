@@ -179,11 +179,7 @@ def test_a_step_of_a_single_device_does_no_pair_work(shared_environment, monkeyp
     chain = environment.task.scene.catheter
     own = userdata_size([StillBlood()], chain)
     assert environment.physics.model.ptr.nuserdata == own
-    monkeypatch.setattr(
-        sliding,
-        "chain_properties",
-        lambda *_: pytest.fail("coaxial work for one device"),
-    )
+    monkeypatch.setattr(sliding, "sliding_loops", None)
     environment.reset()
     environment.step(np.zeros(21))
 

@@ -1,5 +1,6 @@
 """The angiography suite: world settings of the physics, light and cameras."""
 
+import numpy as np
 from dm_control import composer
 
 from cathsim_dmc.entities.contact import FRICTION_STIFFNESS
@@ -46,24 +47,11 @@ class AngiographyArena(composer.Arena):
         root.visual.headlight.ambient = (0.35, 0.35, 0.35)
         root.visual.headlight.diffuse = (0.5, 0.5, 0.5)
         root.visual.scale.forcewidth = 0.02
-        root.asset.add(
-            "texture",
-            name="backdrop",
-            type="skybox",
-            builtin="gradient",
-            rgb1=(0.96, 0.97, 0.98),
-            rgb2=(0.75, 0.8, 0.86),
-            width=64,
-            height=64,
-        )
-        root.worldbody.add(
-            "light",
-            name="ceiling",
-            pos=(0, -1.5, 0.3),
-            dir=(0, 1, 0),
-            diffuse=(0.45, 0.45, 0.45),
-            castshadow=False,
-        )
+        bright, dark = (0.96, 0.97, 0.98), (0.75, 0.8, 0.86)
+        sky = {"type": "skybox", "builtin": "gradient", "rgb1": bright, "rgb2": dark}
+        root.asset.add("texture", name="backdrop", **sky, width=64, height=64)
+        light = root.worldbody.add("light", name="ceiling", castshadow=False)
+        light.pos, light.dir, light.diffuse = (0, -1.5, 0.3), (0, 1, 0), [0.45] * 3
 
     def add_camera(self, name: str, target, distance: float, xyaxes, fovy=30.0):
         """Adds a camera that looks at a point.
@@ -74,13 +62,7 @@ class AngiographyArena(composer.Arena):
             xyaxes: right and up directions (6,) of the image.
             fovy: vertical field of view, degrees.
         """
-        right, up = xyaxes[:3], xyaxes[3:]
-        backward = (
-            right[1] * up[2] - right[2] * up[1],
-            right[2] * up[0] - right[0] * up[2],
-            right[0] * up[1] - right[1] * up[0],
-        )
-        position = [t + distance * b for t, b in zip(target, backward, strict=True)]
+        position = target + distance * np.cross(xyaxes[:3], xyaxes[3:])
         return self._mjcf_root.worldbody.add(
             "camera", name=name, pos=position, xyaxes=xyaxes, fovy=fovy
         )

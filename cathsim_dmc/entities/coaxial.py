@@ -19,6 +19,7 @@ bend_y - i bend_x, and a rotation by φ about the device multiplies by exp(iφ).
 frames of the links twist, because two hinges do (`Stack.bent`).
 """
 
+import itertools
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -96,10 +97,6 @@ class Stack:
     def __init__(self, devices: Sequence[Device], link_lengths: np.ndarray):
         """Tabulates the sections of the devices.
 
-        Args:
-            devices: from the innermost outwards.
-            link_lengths: (L,), from proximal to distal, m.
-
         Raises:
             ValueError: if `devices` is empty, or one does not fit into the next.
         """
@@ -110,9 +107,7 @@ class Stack:
         self.nodes = np.append(beyond, 0.0)
         self.spans = (self.link_lengths[:-1] + self.link_lengths[1:]) / 2
         count = len(devices)
-        self.pairs = np.array(
-            [(k, j) for k in range(count) for j in range(k + 1, count)], dtype=int
-        ).reshape(-1, 2)
+        self.pairs = np.stack(np.triu_indices(count, 1), axis=-1)
         # Start of the uniform pieces of each device, their EI and EI κ; the first entry
         # of the latter two is the space beyond the device's end.
         pieces = [_pieces(device) for device in self.devices]
@@ -124,20 +119,17 @@ class Stack:
             bending[k, 1 : len(starts) + 1] = stiffness
             moment[k, 1 : len(starts) + 1] = moments
         self._tables = self.nodes, self.link_lengths, edges, bending, moment
-        self._radius = np.array([device.outer_radius for device in devices])
-        self._ratio = np.array([device.friction_ratio for device in devices])
-        self._densities = np.array(
-            [
-                [device.linear_density for device in devices],
-                [weight_density(device) for device in devices],
-                [2 * _disc(device.outer_radius) for device in devices],
-                [
-                    _disc(device.inner_radius) - _disc(device.outer_radius)
-                    for device in devices
-                ],
-            ]
-        )
-        self._arms = self._ratio * self._radius
+        radii = np.array([device.outer_radius for device in devices])
+        ratios = np.array([device.friction_ratio for device in devices])
+        # Mass, weight in blood, blood carried by a device that is the outermost and by
+        # one that is present, kg/m.
+        outer = [_disc(device.outer_radius) for device in devices]
+        inner = [_disc(device.inner_radius) for device in devices]
+        masses = [device.linear_density for device in devices]
+        weights = [weight_density(device) for device in devices]
+        carried = 2 * np.array(outer), np.subtract(inner, outer)
+        self._of_links = radii, ratios, np.array([masses, weights, *carried])
+        self._arms = ratios * radii
 
     def overlap(self, gaps: np.ndarray) -> Overlap:
         """Integrals around the joints and over the links."""
@@ -166,10 +158,7 @@ class Stack:
         return hinge_loops.unloaded_hinges(self.rest_angles(overlap, turns))
 
     def free_hinges(
-        self,
-        overlap: Overlap,
-        turns: np.ndarray,
-        angles: np.ndarray,
+        self, overlap: Overlap, turns: np.ndarray, angles: np.ndarray
     ) -> np.ndarray:
         """Rest angles of the hinges of the chain as it is bent.
 
@@ -181,23 +170,13 @@ class Stack:
         Returns:
             (N, J, 2), about x and about y, rad.
         """
-        return hinge_loops.free_hinges(
-            self.rest_angles(overlap, turns),
-            overlap.compliance,
-            np.ascontiguousarray(angles),
-        )
+        shape, angles = self.rest_angles(overlap, turns), np.ascontiguousarray(angles)
+        return hinge_loops.free_hinges(shape, overlap.compliance, angles)
 
     def links(self, overlap: Overlap, friction: np.ndarray) -> Links:
         """Properties of the links."""
-        made = coaxial_loops.links(
-            overlap.outermost,
-            overlap.present,
-            self.link_lengths,
-            friction,
-            self._radius,
-            self._ratio,
-            self._densities,
-        )
+        lengths = self.link_lengths
+        made = coaxial_loops.links(*overlap[5:], lengths, friction, *self._of_links)
         return Links(*made)
 
     def wall_friction(
@@ -211,8 +190,8 @@ class Stack:
         Returns:
             (N, K, J), N·m; each joint has half of its two links.
         """
-        outermost = overlap.outermost
-        return coaxial_loops.wall_friction(outermost, force, friction, self._arms)
+        given = overlap.outermost, force, friction, self._arms
+        return coaxial_loops.wall_friction(*given)
 
     def restoring(
         self, overlap: Overlap, bends: np.ndarray, turns: np.ndarray
@@ -228,9 +207,7 @@ class Stack:
             Torque (N, K, J) on each device about its axis, N·m, and minus its
             derivative by the rotation, N·m/rad.
         """
-        return coaxial_loops.restoring(
-            overlap.rest, overlap.compliance, overlap.coupling, bends, turns
-        )
+        return coaxial_loops.restoring(*overlap[:3], bends, turns)
 
     def axial(
         self,
@@ -252,15 +229,8 @@ class Stack:
         Returns:
             (N, K, J), N, positive where a device must be pushed forward.
         """
-        return coaxial_loops.axial(
-            np.ascontiguousarray(gaps),
-            *self._tables,
-            overlap.compliance,
-            overlap.rest,
-            bends,
-            turns,
-            slopes,
-        )
+        given = *overlap[:2], bends, turns, slopes
+        return coaxial_loops.axial(np.ascontiguousarray(gaps), *self._tables, *given)
 
     def pressure(
         self,
@@ -289,18 +259,8 @@ class Stack:
             (N, K - 1, J), force of device k on device k + 1 at the joints, N, and
             (N, K - 1), the axial force that their friction demands of device k, N.
         """
-        return coaxial_loops.pressure(
-            overlap.stiffness,
-            overlap.moment,
-            overlap.present,
-            bends,
-            turns,
-            self.link_lengths,
-            axial,
-            start,
-            ways,
-            coefficient,
-        )
+        given = *overlap[3:5], overlap.present, bends, turns, self.link_lengths
+        return coaxial_loops.pressure(*given, axial, start, ways, coefficient)
 
 
 def _disc(radius: float) -> float:
@@ -336,10 +296,8 @@ def _pieces(device: Device) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         end += arc.length
     starts = {0.0, device.tip_length, *(each for arc in curved for each in arc[:2])}
     edges = np.array(sorted(starts))
-    in_tip = edges < device.tip_length
-    bending = np.where(
-        in_tip, device.tip.bending_stiffness, device.shaft.bending_stiffness
-    )
+    tip, shaft = device.tip.bending_stiffness, device.shaft.bending_stiffness
+    bending = np.where(edges < device.tip_length, tip, shaft)
     curvature = np.zeros(len(edges))
     for start, stop, value in curved:
         curvature[(edges >= start) & (edges < stop)] = value
@@ -349,15 +307,12 @@ def _pieces(device: Device) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 def _check_fit(devices: Sequence[Device]) -> None:
     if not devices:
         raise ValueError("there is no device in devices; give at least one")
-    for inner, outer in zip(devices[:-1], devices[1:], strict=True):
+    for inner, outer in itertools.pairwise(devices):
         if not inner.outer_radius < outer.inner_radius:
-            lumen = (
-                f"has a lumen of {2e3 * outer.inner_radius:.3g} mm"
-                if outer.inner_radius
-                else "is solid"
-            )
+            lumen = f"has a lumen of {2e3 * outer.inner_radius:.3g} mm"
             raise ValueError(
                 f"device {inner.name!r} is {2e3 * inner.outer_radius:.3g} mm thick, "
-                f"but {outer.name!r} around it {lumen}; give devices "
-                "from the innermost outwards, each thinner than the lumen of the next"
+                f"but {outer.name!r} around it "
+                f"{'is solid' if outer.is_wire else lumen}; give devices from the "
+                "innermost outwards, each thinner than the lumen of the next"
             )

@@ -54,19 +54,13 @@ def _piece(place, edges):
 
 @compiled
 def overlaps(gaps, nodes, lengths, edges, bending, moment):
-    """Integrals around the joints, see `coaxial.Overlap`.
+    """Integrals around the joints, the first five of `coaxial.Overlap`.
 
     Args:
-        gaps: (N, K), m.
-        nodes: (L + 1,), m.
-        lengths: (L,), m.
         edges: (K, E), start of the pieces of the devices, m from their ends; padded
             with infinity.
-        bending: (K, E + 1), EI beyond the device (0) and of the pieces, N·m².
-        moment: (K, E + 1), EI κ likewise, N·m.
-
-    Returns:
-        Compliance, rest, coupling, stiffness and moment of `coaxial.Overlap`.
+        bending, moment: (K, E + 1), EI (N·m²) and EI κ (N·m) beyond the device (0) and
+            of the pieces.
     """
     count, devices = gaps.shape
     joints = len(lengths) - 1
@@ -130,7 +124,7 @@ def shares(gaps, nodes, lengths):
 
 
 @compiled
-def restoring(rest, compliance, coupling, bends, turns):
+def restoring(compliance, rest, coupling, bends, turns):
     """Restoring torques and minus their derivatives, see `Stack.restoring`."""
     count, devices, joints = turns.shape
     torque, rate = np.empty(turns.shape), np.empty(turns.shape)
@@ -179,13 +173,7 @@ def _pull(place, load, turns, gaps, edges, bending, moment, piece, device):
 def axial(
     gaps, nodes, lengths, edges, bending, moment, compliance, rest, bends, turns, slopes
 ):
-    """Axial forces (N, K, J) of the joints, see `Stack.axial`.
-
-    Args:
-        gaps, nodes, lengths, edges, bending, moment: see `overlaps`.
-        compliance, rest, bends, turns: see `restoring`.
-        slopes: (N, K, J), torque times the derivative of the rotation by the gap, N.
-    """
+    """Axial forces (N, K, J) of the joints, see `Stack.axial`."""
     count, devices, joints = turns.shape
     force = np.zeros(turns.shape)
     loads = np.empty(joints, np.complex128)
@@ -288,16 +276,7 @@ def _inertia(mass, radius, length):
 
 @compiled
 def links(outermost, present, lengths, friction, radii, ratios, densities):
-    """Properties of the links, see `coaxial.Links`.
-
-    Args:
-        outermost, present: (N, K, L).
-        lengths: (L,), m.
-        friction: (N,), Coulomb coefficient of an uncoated device.
-        radii, ratios: (K,), radii (m) and friction ratios of the devices.
-        densities: (4, K), mass, weight in blood, blood carried by a device that is the
-            outermost and by one that is present, kg/m.
-    """
+    """Properties of the links, see `coaxial.Links` and `Stack`."""
     count, devices, number = outermost.shape
     made, moments = np.zeros((4, count, number)), np.empty((count, number, 2))
     carried = densities[2, devices - 1] + densities[3].sum()

@@ -113,15 +113,13 @@ class Device:
         bounds.whole(f"tip_links {of_device}", self.tip_links, 1, _MOST_LINKS)
         for name in ("shaft", "tip"):
             bounds.instance(f"{name} {of_device}", getattr(self, name), Section)
-        arcs = self.tip_shape
-        if not isinstance(arcs, tuple) or not all(isinstance(a, Arc) for a in arcs):
-            bounds.refuse(f"tip_shape {of_device}", arcs, "a tuple of Arc")
+        for arc in bounds.instance(f"tip_shape {of_device}", self.tip_shape, tuple):
+            bounds.instance(f"an entry of tip_shape {of_device}", arc, Arc)
         lumen = f"inner_radius {of_device}"
         if bounds.number(lumen, self.inner_radius, 0.0) >= self.outer_radius:
             bounds.refuse(lumen, self.inner_radius, "less than its outer_radius")
-        for name in ("friction_ratio", "loss_factor"):
-            bounds.number(f"{name} {of_device}", getattr(self, name), 0.0)
-        for name in ("attenuation", "marker_attenuation", "marker_length"):
+        others = "attenuation", "marker_attenuation", "marker_length"
+        for name in ("friction_ratio", "loss_factor", *others):
             bounds.number(f"{name} {of_device}", getattr(self, name), 0.0)
         bounds.instance(f"source {of_device}", self.source, str)
         angle = f"steering_angle {of_device}"

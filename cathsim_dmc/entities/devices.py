@@ -78,53 +78,48 @@ STEERABLE_4F = Device(
     source=_STEERABLE_TUBE,
 )
 
-# J tip: an arc of 12.1 mm over 72 degrees.
-DIAGNOSTIC_5F_J = Device(
-    name="diagnostic_5f_j",
-    outer_radius=5 * FRENCH / 2,
-    linear_density=_tube_density(5 * FRENCH / 2, 0.5e-3, POLYMER_DENSITY),
-    shaft=_polymer(50e-6),
-    tip=_polymer(22.7e-6),
-    tip_shape=(Arc(12.1e-3, math.radians(72)),),
-    inner_radius=0.5e-3,
-    source=f"{_FIVE_FRENCH}; arc of 12.1 mm over 72°",
-)
-
-# Simmons: arcs of 20, 20, 6 and 10 mm at -70, 20, 185 and -2 degrees up to the tip.
-DIAGNOSTIC_5F_SIMMONS = dataclasses.replace(
-    DIAGNOSTIC_5F_J,
-    name="diagnostic_5f_simmons",
-    tip_links=14,
-    tip_shape=(
-        Arc(20e-3, math.radians(-70)),
-        Arc(20e-3, math.radians(20)),
-        Arc(6e-3, math.radians(185)),
-        Arc(10e-3, math.radians(-2)),
-    ),
-    source=f"{_FIVE_FRENCH}; arcs of 20, 20, 6 and 10 mm over -70°, 20°, 185° and -2°",
-)
-
 
 def _straight(length: float) -> Arc:
     """A straight section, as an arc of a very large radius."""
     return Arc(1e3, length / 1e3)
 
 
-_OUTLINE = "one bend, as the type has; its size assumed, within some 10° and 2 mm"
+def _shaped(name: str, source: str, *arcs: Arc, tip_links: int = 10) -> Device:
+    """A 5F catheter without motors whose tip has a shape."""
+    return dataclasses.replace(
+        STEERABLE_5F,
+        name=name,
+        steering_angle=0.0,
+        tip_shape=arcs,
+        tip_links=tip_links,
+        source=f"{_FIVE_FRENCH}; {source}",
+    )
 
+
+_OUTLINE = "one bend, as the type has; its size assumed, within some 10° and 2 mm"
+DIAGNOSTIC_5F_J = _shaped(
+    "diagnostic_5f_j", "arc of 12.1 mm over 72°", Arc(12.1e-3, math.radians(72))
+)
+DIAGNOSTIC_5F_SIMMONS = _shaped(
+    "diagnostic_5f_simmons",
+    "arcs of 20, 20, 6 and 10 mm over -70°, 20°, 185° and -2°",
+    Arc(20e-3, math.radians(-70)),
+    Arc(20e-3, math.radians(20)),
+    Arc(6e-3, math.radians(185)),
+    Arc(10e-3, math.radians(-2)),
+    tip_links=14,
+)
 # Catheters with a single bend near the end, steep and short or gentle and long: the
 # first choice for carotids.
-BERENSTEIN_5F = dataclasses.replace(
-    DIAGNOSTIC_5F_J,
-    name="berenstein_5f",
-    tip_shape=(Arc(8e-3, math.radians(60)), _straight(8e-3)),
-    source=f"{_FIVE_FRENCH}; {_OUTLINE}: 60° over 8 mm, then 8 mm straight",
+BERENSTEIN_5F = _shaped(
+    "berenstein_5f",
+    f"{_OUTLINE}: 60° over 8 mm, then 8 mm straight",
+    *(Arc(8e-3, math.radians(60)), _straight(8e-3)),
 )
-VERTEBRAL_5F = dataclasses.replace(
-    DIAGNOSTIC_5F_J,
-    name="vertebral_5f",
-    tip_shape=(Arc(18e-3, math.radians(45)), _straight(10e-3)),
-    source=f"{_FIVE_FRENCH}; {_OUTLINE}: 45° over 14 mm, then 10 mm straight",
+VERTEBRAL_5F = _shaped(
+    "vertebral_5f",
+    f"{_OUTLINE}: 45° over 14 mm, then 10 mm straight",
+    *(Arc(18e-3, math.radians(45)), _straight(10e-3)),
 )
 
 # Distal part of a 2.1F tube of 0.021 inch lumen: I = π (R⁴ - r⁴) / 4 = 7.9e-15 m⁴, of

@@ -47,10 +47,8 @@ def _hinges(bend, first):
 @compiled
 def _twist(x, y, first):
     """Angle by which two hinges turn the distal link about its axis, rad."""
-    sines, cosines = (
-        math.sin(x / 2) * math.sin(y / 2),
-        math.cos(x / 2) * math.cos(y / 2),
-    )
+    sines = math.sin(x / 2) * math.sin(y / 2)
+    cosines = math.cos(x / 2) * math.cos(y / 2)
     return 2 * math.atan2(sines if first == 0 else -sines, cosines)
 
 

@@ -30,8 +30,7 @@ def joints_along(
         ValueError: if the line is too short, or does not begin along +z.
     """
     lengths = np.asarray(link_lengths, np.float64)
-    points = np.asarray(line, np.float64)
-    nodes = _nodes(lengths, points, advance)
+    nodes = _nodes(lengths, np.asarray(line, np.float64), advance)
     return bends_of(np.diff(nodes, axis=0) / lengths[:, None])
 
 
@@ -101,16 +100,12 @@ def _nodes(lengths: np.ndarray, points: np.ndarray, advance: float) -> np.ndarra
             )
         following = piece + int(np.argmax(beyond))
         begin = centre if following == piece else points[following]
-        nodes.append(_crossing(begin, points[following + 1], centre, length))
+        # Where this segment leaves a sphere around the last node.
+        along, offset = points[following + 1] - begin, begin - centre
+        a, b, c = along @ along, along @ offset, offset @ offset - length**2
+        nodes.append(begin + (-b + np.sqrt(b * b - a * c)) / a * along)
         piece = following
     return np.array(nodes)
-
-
-def _crossing(begin, end, centre, radius: float) -> np.ndarray:
-    """Intersection of a segment that leaves a sphere with the sphere."""
-    along, offset = end - begin, begin - centre
-    a, b, c = along @ along, along @ offset, offset @ offset - radius**2
-    return begin + (-b + np.sqrt(b * b - a * c)) / a * along
 
 
 def _turn_x(angle: float) -> np.ndarray:

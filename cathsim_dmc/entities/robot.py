@@ -18,7 +18,6 @@ They are slides and hinges without load (gravity compensated, no actuator, no co
 no limit in the solver), so they do not move between two poses.
 """
 
-import math
 from pathlib import Path
 
 import numpy as np
@@ -27,7 +26,7 @@ from numpy.typing import NDArray
 
 from cathsim_dmc.compiled import compiled
 
-# --- The clamp-advance-release cycle, in metres of insertion. ---
+# The clamp-advance-release cycle, in metres of insertion.
 # The stroke fits a rail of 0.35 m, and the clamps change about once a second at the
 # fastest push (40 mm/s).
 STROKE = 0.040  # m, insertion over which a pair of clamps stays closed
@@ -68,15 +67,7 @@ def postures(given: NDArray[np.float64]) -> NDArray[np.float64]:
         given: (4, N), insertion (m) and rotation (rad) of the catheter from the start,
             which the front clamps hold, and of the guidewire in the rear clamps; both
             pairs hold one device where they are the same.
-
-    Raises:
-        ValueError: a number is not finite.
     """
-    if not math.isfinite(given.sum()):
-        raise ValueError(
-            "insertion, rotation, guidewire insertion and guidewire rotation must be "
-            f"finite, got {given}: check for a diverged simulation"
-        )
     teeth = RING_TEETH / PINION_TEETH
     return _postures(given, _PHASES, _CYCLE, ROLLER_RADIUS, teeth)
 

@@ -28,10 +28,7 @@ class Rods:
     """
 
     def __init__(
-        self,
-        devices: Sequence[Device],
-        nodes: np.ndarray,
-        relaxation_times: np.ndarray,
+        self, devices: Sequence[Device], nodes: np.ndarray, relaxation_times: np.ndarray
     ):
         """Computes the stiffness of the segments.
 
@@ -40,9 +37,14 @@ class Rods:
                 to distal, m; the last one is 0.
             relaxation_times: (K,), relaxation times τ, s.
         """
-        self._nodes = nodes
-        self._relaxation_times = relaxation_times
-        self.stiffness = np.stack([1 / _twist(device, nodes) for device in devices])
+        self._nodes, self._relaxation_times = nodes, relaxation_times
+        tips = np.minimum(nodes, [[device.tip_length] for device in devices])
+        in_tips = -np.diff(tips)
+        in_shafts = -np.diff(nodes) - in_tips
+        # Twist per torque of a segment, ∫ds/GJ.
+        in_tips /= [[device.tip.torsional_stiffness] for device in devices]
+        in_shafts /= [[device.shaft.torsional_stiffness] for device in devices]
+        self.stiffness = 1 / (in_tips + in_shafts)
 
     def turn(
         self,
@@ -70,15 +72,9 @@ class Rods:
         """
         loads = np.empty((4, *angles.shape[:-1], angles.shape[-1] - 1))
         loads[0], loads[1], loads[2], loads[3] = torque, rate, friction, brake
-        return _turned(
-            np.ascontiguousarray(angles),
-            turned,
-            self.stiffness,
-            self._relaxation_times / duration,
-            STICKING * duration,
-            duration,
-            loads,
-        )
+        lag, least = self._relaxation_times / duration, STICKING * duration
+        given = np.ascontiguousarray(angles), turned, self.stiffness, lag, least
+        return _turned(*given, duration, loads)
 
     def at_joints(self, angles: np.ndarray, gaps: np.ndarray) -> np.ndarray:
         """Rotations of the devices at the joints of the chain.
@@ -121,26 +117,13 @@ class Rods:
         """
         most = torque / self.stiffness[:, 0]
         lead = angles[..., 0] - angles[..., 1]
-        held = np.where(
-            np.abs(lead) > most,
-            angles[..., 1] + np.clip(lead, -most, most),
-            angles[..., 0],
-        )
+        slipped = angles[..., 1] + np.clip(lead, -most, most)
+        held = np.where(np.abs(lead) > most, slipped, angles[..., 0])
         return np.abs(angles[..., 0] - held), held
 
     def base_torque(self, angles: np.ndarray) -> np.ndarray:
         """Torque (N, K) of the rotary units on the devices at rest, N·m."""
         return -self.stiffness[:, 0] * np.diff(angles[..., :2], axis=-1)[..., 0]
-
-
-def _twist(device: Device, nodes: np.ndarray) -> np.ndarray:
-    """Twist (M,) per torque of the segments between nodes, ∫ds/GJ, rad/(N·m)."""
-    in_tip = -np.diff(np.minimum(nodes, device.tip_length))
-    in_shaft = -np.diff(nodes) - in_tip
-    return (
-        in_tip / device.tip.torsional_stiffness
-        + in_shaft / device.shaft.torsional_stiffness
-    )
 
 
 @compiled
@@ -155,8 +138,7 @@ def _on_rod(joint, gap, nodes, first):
 @compiled
 def _at_joints(angles, gaps, nodes):
     """Rotations (N, K, J) at the joints of the chain, see `Rods.at_joints`."""
-    count, devices = gaps.shape
-    joints = len(nodes) - 2
+    (count, devices), joints = gaps.shape, len(nodes) - 2
     turns = np.empty((count, devices, joints))
     for i in range(count):
         for k in range(devices):

@@ -42,9 +42,7 @@ class Drives:
         stiffness, limit = -spring[:, 1], model.actuator_forcerange[found, 1]
         reach = gain / stiffness * CONTROL_TIMESTEP
         self._constants = np.stack([gain, stiffness, -spring[:, 2], limit, reach])
-        count = len(arrays.qpos)
-        self.slipped = np.zeros((count, len(found)))
-        self.told = np.zeros((count, len(found)))
+        self.slipped, self.told = np.zeros((2, len(arrays.qpos), len(found)))
 
     def hold(self, index: int) -> None:
         """Sets the command of one simulation to where its base stands."""
@@ -64,13 +62,10 @@ class Drives:
         Returns:
             Way (N, D) by which the clamps have slipped in the last one, m and rad.
         """
-        arrays, slip = self._arrays, np.zeros_like(self.told)
-        _follow(
-            *(arrays.qpos, arrays.qvel, arrays.act),
-            *(self._places, self._constants),
-            *(self.told, self.slipped),
-            *(np.ascontiguousarray(command), slip),
-        )
+        state = self._arrays.qpos, self._arrays.qvel, self._arrays.act
+        command, slip = np.ascontiguousarray(command), np.zeros_like(self.told)
+        servos = self._places, self._constants, self.told, self.slipped
+        _follow(*state, *servos, command, slip)
         return slip
 
 

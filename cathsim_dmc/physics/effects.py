@@ -105,7 +105,6 @@ class Effect:
 
     def num_parameters(self, chain: Chain) -> int:
         """P, how many parameters it has; the compiled function needs one or more."""
-        del chain
         return 0
 
     def bind(self, world: World) -> None:
@@ -136,7 +135,6 @@ class Effect:
         Returns:
             What the next effect gets, and after the last one the actuators.
         """
-        del state
         return action
 
 
@@ -168,28 +166,21 @@ class Effects:
                 f"scene has room for {self._user.shape[1]}: build it with the same "
                 "configuration"
             )
-        self._labels = np.zeros(needed)
-        self._labelled = []
+        # What `userdata` holds beside parameters, by place.
+        self._labels: dict[int, float] = {}
         start = 0
         for effect in self._effects:
-            count = effect.num_parameters(world.chain)
+            count, mark = effect.num_parameters(world.chain), 0
             first = start + _HEADER if count else start
-            parameters = self._user[:, first : first + count]
+            if count and effect.forces is not None:
+                from cathsim_dmc.physics import callbacks  # late, as numba takes long
+
+                mark, self._labels[needed - 1] = callbacks.install(effect.forces), MARK
             if count:
-                self._label(start, effect, count)
-                start = first + count
+                self._labels |= {start: mark, start + 1: count}
+            start = first + count
+            parameters = self._user[:, first:start]
             effect.bind(dataclasses.replace(world, parameters=parameters))
-
-    def _label(self, start: int, effect: Effect, count: int) -> None:
-        mark = 0
-        if effect.forces is not None:
-            from cathsim_dmc.physics import callbacks  # late, as numba takes long
-
-            mark = callbacks.install(effect.forces)
-            self._labels[-1] = MARK
-            self._labelled.append(-1)
-        self._labels[start : start + _HEADER] = mark, count
-        self._labelled += [start, start + 1]
 
     def enter(self, index: int, anatomy: "Anatomy") -> None:
         """Takes the anatomy of one simulation; see `Effect.enter`."""
@@ -200,7 +191,7 @@ class Effects:
         self, index: int, episode: Episode, random_state: np.random.RandomState
     ) -> None:
         """Begins an episode of one simulation; see `Effect.restart`."""
-        self._user[index, self._labelled] = self._labels[self._labelled]
+        self._user[index, list(self._labels)] = list(self._labels.values())
         for effect in self._effects:
             effect.restart(index, episode, random_state)
 

@@ -102,10 +102,9 @@ class Flow(StillBlood):
 
     def enter(self, index: int, anatomy: Anatomy) -> None:
         """Fills the vessels of an anatomy."""
-        murray = self._options is not None and self._options.split == "murray"
-        self._circulations[index] = (
-            Circulation.of(anatomy.tree, murray) if murray else anatomy.circulation
-        )
+        self._circulations[index] = anatomy.circulation
+        if self._options is not None and self._options.split == "murray":
+            self._circulations[index] = Circulation.of(anatomy.tree, True)
 
     def restart(
         self, index: int, episode: Episode, random_state: np.random.RandomState
@@ -126,14 +125,8 @@ class Flow(StillBlood):
         nodes = state.centreline
         found = self._at(0.5 * (nodes[:, :-1] + nodes[:, 1:]))
         self.radius = found[..., 4]
-        fill(
-            found,
-            self._wave_speed,
-            self._header[:, 2],
-            self._link_radii,
-            self._options is not None,
-            self._links,
-        )
+        given = self._header[:, 2], self._link_radii, self._options is not None
+        fill(found, self._wave_speed, *given, self._links)
         return action
 
     def heart(self, index: int) -> dict[str, float]:
@@ -221,11 +214,7 @@ def velocities(points, growth, ends, radii, shares, ways, vessel, out):
     Args:
         points: (P, 3), m, in the vessel at rest.
         growth: (P,), of the radius of the lumen, m.
-        ends: as the others, of `anatomy.circulation.Circulation`.
-        radii: (S, 2), m.
-        shares: (S, 2).
-        ways: (S, 2), m.
-        vessel: (S,).
+        ends, radii, shares, ways, vessel: of `anatomy.circulation.Circulation`.
         out: (P, 5 or more): velocity for an inflow of 1 m³/s, 1/m²; way, m; radius,
             m; 0 outside the lumen.
     """

@@ -44,15 +44,11 @@ class Contacts:
     def from_sensor(cls, row: np.ndarray) -> "Contacts":
         """Reads the sensor's row (..., K * 14) as `entities.phantom` declares it."""
         slots = row.reshape(*row.shape[:-1], -1, CONTACT_SIZE)
-        found = slots[..., 0]
+        found, local = slots[..., 0], slots[..., 1:4]
         present = found > 0
         normal, tangent = slots[..., 8:11], slots[..., 11:14]
-        local = slots[..., 1:4]
-        force = (
-            local[..., 0:1] * normal
-            + local[..., 1:2] * tangent
-            + local[..., 2:3] * np.cross(normal, tangent)
-        )
+        force = local[..., 0:1] * normal + local[..., 1:2] * tangent
+        force += local[..., 2:3] * np.cross(normal, tangent)
         return cls(
             present=present,
             force=-force,
@@ -84,7 +80,6 @@ class WallForce(NamedTuple):
 
 
 NAMES = tuple(f"wall_force_{name}" for name in WallForce._fields)
-NO_FORCE = WallForce(*(np.zeros(()) for _ in WallForce._fields))
 
 
 def wall_force(rows: np.ndarray) -> tuple[WallForce, np.ndarray]:

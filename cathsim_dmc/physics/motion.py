@@ -10,7 +10,7 @@ begins at rest, at the end of diastole and of expiration, and moves in full afte
 from __future__ import annotations
 
 import dataclasses
-from typing import Protocol
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -74,29 +74,21 @@ class MotionOptions:
         anatomy.motion.check(anatomy.name, *map(float, largest))
 
 
-class Hearted(Protocol):
-    """A flow with a heart."""
-
-    def heart(self, index: int) -> dict[str, float]:
-        """Rate, 1/s, phase and wave speed, m/s, of one simulation."""
-        ...
-
-
 class Moving(Effect):
     """Moves the wall of each simulation.
 
     Attributes:
-        flow: Flow with the same heart; None for none.
+        flow: `flow.Flow` with the same heart; None for none.
     """
 
+    flow: Any
+
     def __init__(self, options: MotionOptions):
-        """Takes the options of the task; `flow` may become one with the same heart."""
-        self._options = options
-        self.flow: Hearted | None = None
+        """Takes the options of the task."""
+        self._options, self.flow = options, None
 
     def num_parameters(self, chain: Chain) -> int:
         """Those of `motion_loops`."""
-        del chain
         return motion_loops.PARAMETERS
 
     def bind(self, world: World) -> None:
@@ -105,9 +97,9 @@ class Moving(Effect):
 
         super().bind(world)
         carrying.install()
-        kind = mujoco.mjtObj.mjOBJ_GEOM
+        model, kind = world.model, mujoco.mjtObj.mjOBJ_GEOM
         names = "wall", "sheath/bore"
-        self._geoms = [mujoco.mj_name2id(world.model, kind, name) for name in names]
+        self._geoms = [mujoco.mj_name2id(model, kind, name) for name in names]
         self._motions: dict[int, Motion] = {}
         self._surfaces: dict[int, Surface] = {}
         self._inlets = np.zeros((world.num_simulations, 2, 3))
@@ -116,29 +108,21 @@ class Moving(Effect):
 
     def enter(self, index: int, anatomy: Anatomy) -> None:
         """Takes the motion of an anatomy."""
-        self._motions[index] = anatomy.motion
-        self._surfaces[index] = anatomy.surface
-        inlet = anatomy.inlet
-        self._inlets[index] = np.array([inlet.position, inlet.direction])
+        self._motions[index], self._surfaces[index] = anatomy.motion, anatomy.surface
+        self._inlets[index] = anatomy.inlet.position, anatomy.inlet.direction
 
     def restart(
         self, index: int, episode: Episode, random_state: np.random.RandomState
     ) -> None:
         """Draws amplitudes, rates and phases."""
-        values = {}
-        for name in _LIMITS:
-            value = getattr(self._options, name)
-            default = OF_HEART.get(name, 0.0)
-            values[name] = drawn(default if value is None else value, random_state)
+        given = {name: getattr(self._options, name) for name in _LIMITS}
+        given |= {name: OF_HEART[name] for name in OF_HEART if given[name] is None}
+        values = {name: drawn(value, random_state) for name, value in given.items()}
         values["rate"] /= 60.0
         values["breath_rate"] /= 60.0
         if self.flow is not None:
             values |= self.flow.heart(index)
-        self.world.parameters[index] = (
-            motion_loops.MARK,
-            *values.values(),
-            *self._geoms,
-        )
+        self.world.parameters[index] = motion_loops.MARK, *values.values(), *self._geoms
         self._clock[index] = 0.0
 
     def act(self, action: np.ndarray, state: Readings) -> np.ndarray:

@@ -95,20 +95,18 @@ class Randomisation:
     tracking_noise: float = 0.0
 
     def __post_init__(self):
-        for name, (low, high, unit) in _RANGES.items():
+        for name, limits in _RANGES.items():
             value = getattr(self, name)
-            if value is None:
-                continue
-            if isinstance(value, variation.Variation):
-                if name in ("delay", "goal_shift", "start_insertion"):
-                    raise ValueError(
-                        f"{name} is a Variation; its bounds must be known before, so "
-                        "give (low, high)"
-                    )
-                continue
-            whole = name == "delay"
-            ends = bounds.interval(name, value, low, high, unit, integers=whole)
-            object.__setattr__(self, name, ends)
+            varied = isinstance(value, variation.Variation)
+            if varied and name in ("delay", "goal_shift", "start_insertion"):
+                raise ValueError(
+                    f"{name} is a Variation; its bounds must be known before, so give "
+                    "(low, high)"
+                )
+            if value is not None and not varied:
+                whole = name == "delay"
+                ends = bounds.interval(name, value, *limits, integers=whole)
+                object.__setattr__(self, name, ends)
         bounds.number("start_radius", self.start_radius, 0.0, _FARTHEST_START, "m")
         bounds.number("tracking_noise", self.tracking_noise, 0.0, _MOST_NOISE, "m")
 
@@ -157,29 +155,21 @@ class Randomisation:
 
         displacement = start_displacement(random_state, self.start_radius)
         names = "friction", "stiffness", "loss", "viscosity"
-        factors = {name: value(name) for name in names}
+        drawn: dict[str, Any] = {name: value(name) for name in names}
         primary, secondary = value("view"), value("view")
         gain, kerma = value("gain"), value("kerma")
-        shift, roll = value("goal_shift"), value("roll")
-        delay = 0
+        drawn |= {"goal_shift": value("goal_shift"), "roll": value("roll")}
         if self.delay is not None:
             low, high = map(int, self.delay)
-            delay = int(random_state.randint(low, high + 1))
-        insertion = value("start_insertion")
-        return Episode(
-            displacement=displacement,
-            **factors,
-            deviation=Deviation(
-                primary=round(primary or 0.0),
-                secondary=round(secondary or 0.0),
-                gain=1.0 if gain is None else gain,
-                kerma=1.0 if kerma is None else kerma,
-            ),
-            goal_shift=shift,
-            roll=roll,
-            delay=delay,
-            insertion=insertion,
+            drawn["delay"] = int(random_state.randint(low, high + 1))
+        drawn["insertion"] = value("start_insertion")
+        deviation = Deviation(
+            primary=round(primary or 0.0),
+            secondary=round(secondary or 0.0),
+            gain=1.0 if gain is None else gain,
+            kerma=1.0 if kerma is None else kerma,
         )
+        return Episode(displacement, deviation=deviation, **drawn)
 
 
 # Friction and EI over what real devices and lubrication show (the friction that is
@@ -199,26 +189,22 @@ DEFAULT_RANGES = Randomisation(
 )
 
 
+# Fields of the model that what is drawn changes.
+_WRITTEN = {
+    "friction": ["geom_friction"],
+    "stiffness": ["jnt_stiffness", "actuator_gainprm", "dof_damping"],
+    "loss": ["dof_damping"],
+    "roll": ["body_quat"],
+}
+
+
 class RandomisedModel(Effect):
     """Friction, stiffness, loss and roll of the device as drawn for each episode."""
 
     def __init__(self, randomisation: Randomisation):
         """Names the fields of the model that the randomisation changes."""
-        fields, drawn = [], []
-        if randomisation.friction is not None:
-            drawn, fields = ["friction"], ["geom_friction"]
-        if randomisation.stiffness is not None:
-            drawn.append("stiffness")
-            fields += ["jnt_stiffness", "actuator_gainprm"]
-        if randomisation.loss is not None:
-            drawn.append("loss")
-        if "stiffness" in drawn or "loss" in drawn:
-            fields.append("dof_damping")
-        if randomisation.roll is not None:
-            drawn.append("roll")
-            fields.append("body_quat")
-        self.model_fields = tuple(fields)
-        self._drawn = drawn
+        self._drawn = [n for n in _WRITTEN if getattr(randomisation, n) is not None]
+        self.model_fields = tuple({f for name in self._drawn for f in _WRITTEN[name]})
 
     def bind(self, world: World) -> None:
         """Finds the elements in the model, as it is without randomisation."""

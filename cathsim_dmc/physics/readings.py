@@ -117,20 +117,8 @@ class ModelIndex:
     """Places of a task's quantities in the arrays of a compiled model."""
 
     # Fields of `mujoco.MjData` that `reader` uses, for a batch to bind beforehand.
-    FIELDS = (
-        "qpos",
-        "qvel",
-        "cinert",
-        "cvel",
-        "qfrc_actuator",
-        "cfrc_ext",
-        "xpos",
-        "site_xpos",
-        "site_xmat",
-        "sensordata",
-        "cdof",
-        "subtree_com",
-    )
+    FIELDS = ("qpos", "qvel", "cinert", "cvel", "qfrc_actuator", "cfrc_ext", "xpos")
+    FIELDS += ("site_xpos", "site_xmat", "sensordata", "cdof", "subtree_com")
 
     def __init__(self, model: mujoco.MjModel, chain: Chain, robot: Robot):
         """Finds the elements; ValueError if the model lacks one of them."""
@@ -145,23 +133,19 @@ class ModelIndex:
         self._order = joints - joints.min()
         # (n - 1, 2), of the hinges about x and y.
         self.bends_qpos = model.jnt_qposadr[ids(model, chain.bends)].reshape(-1, 2)
-        (self.insertion_qpos,) = model.jnt_qposadr[
-            ids(model, [chain.insertion])
-        ].tolist()
+        base = [each for each in (chain.insertion, chain.rotation) if each is not None]
+        self.insertion_qpos, *turned = model.jnt_qposadr[ids(model, base)].tolist()
+        self.rotation_qpos: int | None = turned[0] if turned else None
         # Of the slide, along z of the handle, and of the first hinge, about its x.
         first = [chain.insertion, chain.bends[0]]
         self.handle_dofs = model.jnt_dofadr[ids(model, first)].tolist()
-        self.rotation_qpos: int | None = None
-        if chain.rotation is not None:
-            (rotation,) = ids(model, [chain.rotation])
-            self.rotation_qpos = int(model.jnt_qposadr[rotation])
         # Whole numbers of the size that numpy indexes with: others are cast each time.
         self.robot_qpos = model.jnt_qposadr[ids(model, robot.joints)].astype(np.intp)
         (self.head_site,) = ids(model, [chain.head]).tolist()
-        self.push_force = _sensor(model, chain.push_force.full_identifier)
-        self.push_torque = _sensor(model, chain.push_torque.full_identifier)
-        self.load_cell = _sensor(model, "load_cell")
-        self.wall_contacts = wall_contacts(model)
+        self.push_force = sensor(model, chain.push_force.full_identifier)
+        self.push_torque = sensor(model, chain.push_torque.full_identifier)
+        self.load_cell = sensor(model, "load_cell")
+        self.wall_contacts = sensor(model, "wall_contacts")
 
     def reader(self, data) -> Callable[[], Readings]:
         """Finds the readings in a simulator's arrays.
@@ -180,11 +164,8 @@ class ModelIndex:
         nodes = (data.xpos[..., self.links, :], head[..., None, :])
         frame = data.site_xmat[..., self.head_site, :]
         insertion = qpos[..., self.insertion_qpos]
-        inertia, velocity = (
-            data.cinert[..., self.links, :],
-            data.cvel[..., self.links, :],
-        )
-        external = data.cfrc_ext[..., self.links, :]
+        moving = data.cinert, data.cvel, data.cfrc_ext
+        inertia, velocity, external = (each[..., self.links, :] for each in moving)
         # MuJoCo reports the force of the parent on the site's body.
         force = sensors[..., self.push_force.start + 2]
         torque = sensors[..., self.push_torque.start + 2]
@@ -218,11 +199,6 @@ class ModelIndex:
         return forces.Contacts.from_sensor(sensordata[..., self.wall_contacts])
 
 
-def wall_contacts(model: mujoco.MjModel) -> slice:
-    """Place in `sensordata` of what the device does to the wall."""
-    return _sensor(model, "wall_contacts")
-
-
 def ids(model: mujoco.MjModel, elements: Sequence[Any]) -> np.ndarray:
     """Numbers (n,) of MJCF elements in a model; ValueError if one is missing."""
     kinds = mujoco.mjtObj.__members__
@@ -240,10 +216,11 @@ def _id(model: mujoco.MjModel, kind: mujoco.mjtObj, name: str) -> int:
     return index
 
 
-def _sensor(model: mujoco.MjModel, name: str) -> slice:
-    sensor = _id(model, mujoco.mjtObj.mjOBJ_SENSOR, name)
-    start = int(model.sensor_adr[sensor])
-    return slice(start, start + int(model.sensor_dim[sensor]))
+def sensor(model: mujoco.MjModel, name: str) -> slice:
+    """Place of a sensor in `sensordata`; ValueError if the model has none."""
+    index = _id(model, mujoco.mjtObj.mjOBJ_SENSOR, name)
+    start = int(model.sensor_adr[index])
+    return slice(start, start + int(model.sensor_dim[index]))
 
 
 def _as_slice(indices) -> slice:

@@ -1,10 +1,12 @@
-"""Coaxial devices of N simulations, moved by the actions.
+"""The devices of N simulations, moved by the actions.
 
-Once in a control step, before its physics steps, the devices are moved along and about
-their axis; `chain_fields` then writes the properties of the chain. Where each device is
-and how it is turned lies in MuJoCo's `userdata`, so it is part of the state that is
-saved, dumped and replayed.
+Once in a control step, before its physics steps, coaxial devices are moved along and
+about their axis; `chain_fields` then writes the properties of the chain. Where each
+device is and how it is turned lies in MuJoCo's `userdata`, so it is part of the state
+that is saved, dumped and replayed.
 """
+
+import operator
 
 import mujoco
 import numpy as np
@@ -21,17 +23,14 @@ from cathsim_dmc.entities.device_stack import DeviceStack
 from cathsim_dmc.entities.robot import postures
 from cathsim_dmc.imaging.device import Shadow
 from cathsim_dmc.physics import sliding_loops
-from cathsim_dmc.physics.chain_fields import (
-    FIELDS,
-    ChainFields,
-    chain_properties,
-    write_still,
-)
-from cathsim_dmc.physics.effects import Episode, World
+from cathsim_dmc.physics.chain_fields import FIELDS, ChainFields, write_still
+from cathsim_dmc.physics.drives import Drives
+from cathsim_dmc.physics.effects import Effect, Episode, World
 from cathsim_dmc.physics.readings import CoaxialReadings, Readings
-from cathsim_dmc.physics.single_device import BEHIND, SingleDevice
 from cathsim_dmc.physics.stepper import CONTROL_TIMESTEP
 
+# Length of the straight device behind its base that X-rays meet, m.
+BEHIND = 0.3
 # Where points of a device are tracked, m from its end.
 DEVICE_PLACES = np.arange(7, -1, -1) * 15e-3
 # Way by which a device slides before the friction in the lumen acts in full, m.
@@ -42,11 +41,64 @@ _GAP_STEP = 1e-8  # m, for a derivative
 _GIVE = 1e-3
 
 
-def devices_of(chain: Chain) -> SingleDevice:
-    """The effect by which actions move the devices of a chain."""
-    return (
-        SlidingDevices(chain) if isinstance(chain, DeviceStack) else SingleDevice(chain)
-    )
+class SingleDevice(Effect):
+    """One device, whose own motors move it.
+
+    Attributes:
+        slipped: Way by which the clamps have slipped in the episode, m and rad: (N, 1)
+            or, with rotation, (N, 2) of a single device; (N, 2 K) of coaxial devices,
+            translation and rotation of each.
+    """
+
+    data_fields: tuple[str, ...] = ("act",)
+    model_fields: tuple[str, ...] = ()
+
+    def __init__(self, chain: Chain):
+        """Takes the entity of the device."""
+        self._radius = chain.device.outer_radius
+        self._behind = BEHIND / float(chain.link_lengths[0])  # links
+
+    def settle(self, model: mujoco.MjModel) -> None:
+        """Writes the properties of the chain at the start into a model."""
+
+    def bind(self, world: World) -> None:
+        """Finds the drives in the model."""
+        super().bind(world)
+        self._drives = Drives(world.model, world.arrays)
+        self.slipped = self._drives.slipped
+
+    def restart(
+        self, index: int, episode: Episode, random_state: np.random.RandomState
+    ) -> None:
+        """Holds the base of one simulation where it stands."""
+        self._drives.hold(index)
+
+    def act(self, action: np.ndarray, state: Readings) -> np.ndarray:
+        """Lets clamps slip; the motors take the action as it is."""
+        self._drives.follow(action[:, len(self.world.chain.tip_motors) :])
+        return action
+
+    def follower_posture(self) -> np.ndarray:
+        """Joints (N, len(JOINTS)) of the robot that holds the devices."""
+        index, qpos = self.world.index, self.world.arrays.qpos
+        held = np.zeros((4, len(qpos)))
+        held[::2] = qpos[:, index.insertion_qpos]
+        if index.rotation_qpos is not None:
+            held[1::2] = qpos[:, index.rotation_qpos]
+        return postures(held)
+
+    def shadows(self, line: np.ndarray) -> list[Shadow]:
+        """The devices as X-rays meet them, from the innermost outwards.
+
+        Args:
+            line: (N, L + 1, 3), `Readings.centreline`.
+        """
+        first = line[:, :1] + self._behind * (line[:, :1] - line[:, 1:2])
+        return [Shadow(np.concatenate([first, line], axis=1), self._radius)]
+
+    def read(self, readings: Readings) -> CoaxialReadings | None:
+        """State of coaxial devices at some readings; None for one alone."""
+        return None
 
 
 class SlidingDevices(SingleDevice):
@@ -70,28 +122,24 @@ class SlidingDevices(SingleDevice):
     def bind(self, world: World) -> None:
         """Finds the places in the model."""
         super().bind(world)
-        self._slipped = np.zeros((world.num_simulations, 2 * len(self._entity.devices)))
+        total, count = world.num_simulations, len(self._entity.devices)
+        self.slipped = np.zeros((total, 2 * count))
         self._index, self._qpos = world.index, world.arrays.qpos
         self._internal_force = world.arrays.cfrc_int[:, world.index.links]
-        self._start_depth = world.start_depth
         (base,) = np.flatnonzero(world.model.jnt_qposadr == self._index.insertion_qpos)
-        dof = world.model.jnt_dofadr[base]
-        self._others = world.arrays.qfrc_applied[:, dof]
-        count, nodes = len(self._entity.devices), len(self._stack.nodes)
+        self._others = world.arrays.qfrc_applied[:, world.model.jnt_dofadr[base]]
         # Views: writing to them writes the state.
         self._insertion = world.parameters[:, :count]
-        self._angles = world.parameters[:, count:].reshape(-1, count, nodes)
+        self._angles = world.parameters[:, count:].reshape(total, count, -1)
         self._places = ChainFields(world.model, self._entity)
-        total = world.num_simulations
         self._arrays: list[list[np.ndarray]] = [[]] * total
         self._radii = np.array([device.outer_radius for device in self._entity.devices])
-        self._friction = np.full(total, self._entity.friction)
-        self._factor, self._loss = np.ones(total), np.ones(total)
+        # Factors of all stiffnesses, and of all loss factors.
+        self._friction, self._factors = np.zeros(total), np.ones((2, total))
         # Fraction of the friction between devices that acts, positive when the inner
         # one has slid forward; that friction, and the forces of the drives but for the
         # push force, which the leading device bears, N.
-        self._ways = np.zeros((total, count - 1))
-        self._drag = np.zeros((total, count - 1))
+        self._ways, self._drag = np.zeros((2, total, count - 1))
         self._axial = np.zeros((total, count))
 
     # The course of an episode.
@@ -101,25 +149,20 @@ class SlidingDevices(SingleDevice):
     ) -> None:
         """Puts the devices of one simulation to the start of the chain."""
         super().restart(index, episode, random_state)
-        friction, stiffness = episode.friction, episode.stiffness
-        self._slipped[index] = 0.0
         gaps = self._entity.start_gaps
         self._insertion[index] = self._qpos[index, self._index.insertion_qpos] - gaps
-        self._angles[index] = 0.0
-        for each in (self._ways, self._drag, self._axial, self._others):
+        for each in (self._angles, self.slipped, self._ways, self._drag):
             each[index] = 0.0
-        self._friction[index] = self._entity.friction if friction is None else friction
-        self._factor[index] = 1.0 if stiffness is None else stiffness
-        self._loss[index] = 1.0 if episode.loss is None else episode.loss
+        self._axial[index] = self._others[index] = 0.0
+        drawn = episode.friction, episode.stiffness, episode.loss
+        usual = self._entity.friction, 1.0, 1.0
+        self._friction[index], *self._factors[:, index] = (
+            default if value is None else value
+            for value, default in zip(drawn, usual, strict=True)
+        )
         self._arrays[index] = [self.world.field(index, name) for name in FIELDS]
-        row = np.array([index])
         turns = np.zeros((1, len(gaps), len(self._stack.spans)))
-        self._write(row, self._stack.overlap(gaps[None]), turns)
-
-    @property
-    def slipped(self) -> np.ndarray:
-        """Way (N, 2 K) by which the clamps have slipped, see `SingleDevice.slipped`."""
-        return self._slipped
+        self._write(np.array([index]), self._stack.overlap(gaps[None]), turns)
 
     def act(self, action: np.ndarray, state: Readings) -> np.ndarray:
         """Moves the devices and writes the properties of the chains.
@@ -134,28 +177,22 @@ class SlidingDevices(SingleDevice):
         Returns:
             Control (N, 1) of the chain's motor.
         """
-        reached = self._reached()
-        step = MAX_PUSH_SPEED * CONTROL_TIMESTEP
-        before = self._held(reached)
+        reached = self._qpos[:, self._index.insertion_qpos].copy()
+        before, step = self._pushed(), MAX_PUSH_SPEED * CONTROL_TIMESTEP
         every, leaders = np.arange(len(before)), np.argmax(self._insertion, axis=1)
         told = step * action[:, 0::2]
         moved = self._clamped(told, leaders)
-        self._slipped[:, 0::2] += np.abs(told - moved)
-        target, lead = sliding_loops.advance(
-            before,
-            moved,
-            # A device may be withdrawn until its end has left the patient.
-            -self._start_depth,
-            self._entity.stroke,
-        )
+        self.slipped[:, 0::2] += np.abs(told - moved)
+        # A device may be withdrawn until its end has left the patient.
+        least = -self.world.start_depth
+        target, lead = sliding_loops.advance(before, moved, least, self._entity.stroke)
         slid = -np.diff(target - before, axis=1) / _PRESLIDING
         self._ways[:] = np.clip(self._ways + slid, -1.0, 1.0)
         self._insertion[:] = target
-        overlap, turns = self._turn(action[:, 1::2], lead, state)
-        self._write(every, overlap, turns)
+        self._write(every, *self._turn(action[:, 1::2], lead, state))
         command = ((lead - reached) / step)[:, None]
         slip = np.abs(self._drives.follow(command)[:, 0])
-        self._slipped[every, 2 * leaders] += slip
+        self.slipped[every, 2 * leaders] += slip
         return command
 
     def _clamped(self, told: np.ndarray, leaders: np.ndarray) -> np.ndarray:
@@ -171,13 +208,6 @@ class SlidingDevices(SingleDevice):
         given = way * np.minimum(way * told, -excess * _GIVE)
         return np.where(excess < 0.0, told, given)
 
-    def _reached(self) -> np.ndarray:
-        return self._qpos[:, self._index.insertion_qpos].copy()
-
-    def _held(self, reached: np.ndarray) -> np.ndarray:
-        """Insertions (N, K): leading devices as measured, the others as commanded."""
-        return sliding_loops.held(np.ascontiguousarray(self._insertion), reached)
-
     def _turn(
         self, rate: np.ndarray, lead: np.ndarray, state: Readings
     ) -> tuple[Overlap, np.ndarray]:
@@ -188,11 +218,10 @@ class SlidingDevices(SingleDevice):
         bends, _ = stack.bent(self._qpos[:, self._places.qpos])
         loads = np.empty((3, *turns.shape))
         loads[0], loads[1] = stack.restoring(overlap, bends, turns)
-        loads[:2] *= self._factor[:, None, None]
+        loads[:2] *= self._factors[0, :, None, None]
         # Nothing rubs in the sheath.
-        force = sliding_loops.rubbing(
-            state.external_force, lead, self._start_depth, stack.nodes
-        )
+        depth = self.world.start_depth
+        force = sliding_loops.rubbing(state.external_force, lead, depth, stack.nodes)
         loads[2] = stack.wall_friction(overlap, force, self._friction)
         if len(self._entity.devices) > 1:
             pressure = self._push(overlap, gaps, bends, turns, loads[0], state)
@@ -205,7 +234,7 @@ class SlidingDevices(SingleDevice):
             self._angles, turned, CONTROL_TIMESTEP, *rods.at_nodes(loads, gaps)
         )
         slip, self._angles[..., 0] = rods.slip(self._angles, MAX_TORQUE)
-        self._slipped[:, 1::2] += slip
+        self.slipped[:, 1::2] += slip
         return overlap, rods.at_joints(self._angles, gaps)
 
     def _push(
@@ -222,7 +251,7 @@ class SlidingDevices(SingleDevice):
         Returns:
             Forces (N, K - 1, J) of each device on the next one at the joints, N.
         """
-        stack, factor = self._stack, self._factor[:, None, None]
+        stack, factor = self._stack, self._factors[0, :, None, None]
         slopes = self._rods.at_joints(self._angles, gaps + _GAP_STEP) - turns
         slopes *= torque / factor / _GAP_STEP
         axial = factor * stack.axial(overlap, gaps, bends, turns, slopes)
@@ -233,12 +262,10 @@ class SlidingDevices(SingleDevice):
         start[every, leaders] = sliding_loops.leading_load(
             np.ascontiguousarray(beyond), state.centreline, gaps, stack.nodes
         )
-        stiff = overlap._replace(
-            stiffness=factor * overlap.stiffness, moment=factor * overlap.moment
-        )
-        pressure, drag = stack.pressure(
-            stiff, bends, turns, axial, start, self._ways, self._entity.lumen_friction
-        )
+        own = {"stiffness": overlap.stiffness, "moment": overlap.moment}
+        stiff = overlap._replace(**{name: factor * each for name, each in own.items()})
+        given = stiff, bends, turns, axial, start, self._ways
+        pressure, drag = stack.pressure(*given, self._entity.lumen_friction)
         self._drag[:] = drag
         self._axial[:] = axial.sum(axis=-1)
         self._axial[:, :-1] += drag
@@ -249,19 +276,19 @@ class SlidingDevices(SingleDevice):
 
     def _write(self, rows: np.ndarray, overlap: Overlap, turns: np.ndarray) -> None:
         """Writes the properties of the chains of some simulations."""
-        friction, factor = self._friction[rows], self._factor[rows]
-        angles, loss = self._qpos[rows, self._places.qpos], self._loss[rows]
-        made = chain_properties(
-            self._entity, overlap, turns, friction, factor, loss, angles
-        )
+        angles, factors = self._qpos[rows, self._places.qpos], self._factors[:, rows]
+        rest = self._stack.free_hinges(overlap, turns, angles)
+        links = self._stack.links(overlap, self._friction[rows])
         for row, number in enumerate(rows.tolist()):
-            self._places.write(self._arrays[number], made, row)
+            arrays = self._arrays[number]
+            self._places.write(arrays, row, overlap, rest, links, factors)
 
     # What others may read.
 
-    def pushed(self) -> np.ndarray:
-        """Insertion (N, K) of each device, m."""
-        return self._held(self._reached())
+    def _pushed(self) -> np.ndarray:
+        """Insertion (N, K): leading devices as measured, the others as commanded, m."""
+        reached = self._qpos[:, self._index.insertion_qpos].copy()
+        return sliding_loops.held(np.ascontiguousarray(self._insertion), reached)
 
     def follower_posture(self) -> np.ndarray:
         """Joints (N, len(JOINTS)) of the robot that holds the outer and inner device.
@@ -269,13 +296,9 @@ class SlidingDevices(SingleDevice):
         Of more than two devices it holds the outermost and the innermost; of one, both
         units work on the same.
         """
-        pushed, turned = self.pushed(), self._angles[..., 0]
+        pushed, turned = self._pushed(), self._angles[..., 0]
         ends = (pushed[:, -1], turned[:, -1], pushed[:, 0], turned[:, 0])
         return postures(np.array(ends))
-
-    def turned(self) -> np.ndarray:
-        """Rotation (N, K) of the rotary unit of each device, rad."""
-        return self._angles[..., 0].copy()
 
     def read(self, readings: Readings) -> CoaxialReadings:
         """State of the devices.
@@ -283,61 +306,44 @@ class SlidingDevices(SingleDevice):
         Args:
             readings: of the same control step.
         """
-        insertion = self.pushed()
-        gaps = sliding_loops.gaps(insertion)
-        push = self._axial.copy()
+        insertion, nodes = self._pushed(), self._stack.nodes
+        gaps, push = sliding_loops.gaps(insertion), self._axial.copy()
         push[np.arange(len(gaps)), gaps.argmin(axis=1)] += readings.push_force
+        line, load = readings.centreline, readings.push_force.copy()
+        if gaps.shape[1] > 1:
+            force = np.ascontiguousarray(self._internal_force)
+            load = sliding_loops.leading_load(force, line, gaps, nodes)
         return CoaxialReadings(
             insertion=insertion,
-            rotation=self.turned(),
+            rotation=self._angles[..., 0].copy(),
             tip_rotation=self._angles[..., -1].copy(),
             twist=self._rods.base_torque(self._angles),
-            points=self.points(readings.centreline, gaps[..., None] + DEVICE_PLACES),
-            leading_load=self._leading_load(readings, gaps),
+            points=sliding_loops.points(line, gaps[..., None] + DEVICE_PLACES, nodes),
+            leading_load=load,
             lumen_friction=np.abs(self._drag).sum(axis=1),
             push=push,
         )
 
-    def points(self, line: np.ndarray, places: np.ndarray) -> np.ndarray:
-        """Points (N, K, P, 3) of the chain at places (N, K, P), m, from its end.
-
-        Args:
-            line: (N, L + 1, 3), `Readings.centreline`.
-            places: behind its base the device is straight.
-        """
-        return sliding_loops.points(line, places, self._stack.nodes)
-
     def shadows(self, line: np.ndarray) -> list[Shadow]:
-        """The devices as X-rays meet them, from the innermost outwards.
-
-        Args:
-            line: (N, L + 1, 3), `Readings.centreline`.
-        """
-        nodes = self._stack.nodes
-        insertion = self.pushed()
-        gaps = sliding_loops.gaps(insertion)
+        """See `SingleDevice.shadows`."""
+        nodes, gaps = self._stack.nodes, sliding_loops.gaps(self._pushed())
         # A device has one point more than the chain: behind, its own nodes, its end.
         beyond = (nodes < gaps[..., None]).sum(axis=-1, keepdims=True)
         own = np.arange(len(nodes)) - np.maximum(beyond - 1, 0)
         places = np.maximum(nodes[np.maximum(own, 0)], gaps[..., None])
         behind = np.full((*places.shape[:2], 1), nodes[0] + BEHIND)
-        points = self.points(line, np.concatenate([behind, places], axis=-1))
+        places = np.concatenate([behind, places], axis=-1)
+        points = sliding_loops.points(line, places, nodes)
+        x_rays = "outer_radius", "attenuation", "marker_attenuation", "marker_length"
+        of = operator.attrgetter(*x_rays)
         return [
-            Shadow(
-                points[:, k],
-                device.outer_radius,
-                device.attenuation,
-                device.marker_attenuation,
-                device.marker_length,
-            )
-            for k, device in enumerate(self._entity.devices)
+            Shadow(points[:, k], *of(each))
+            for k, each in enumerate(self._entity.devices)
         ]
 
-    def _leading_load(self, readings: Readings, gaps: np.ndarray) -> np.ndarray:
-        """Axial force (N,) in the leading device where it leaves the others, N."""
-        if gaps.shape[1] == 1:
-            return readings.push_force.copy()
-        force = np.ascontiguousarray(self._internal_force)
-        return sliding_loops.leading_load(
-            force, readings.centreline, gaps, self._stack.nodes
-        )
+
+def devices_of(chain: Chain) -> SingleDevice:
+    """The effect by which actions move the devices of a chain."""
+    return (
+        SlidingDevices(chain) if isinstance(chain, DeviceStack) else SingleDevice(chain)
+    )

@@ -1,4 +1,4 @@
-"""Coaxial devices in a task: the compiled loops behind `coaxial` and `chain_fields`.
+"""Coaxial devices in a task: the compiled loops behind `sliding`.
 
 N simulations, K devices, J joints, L links; each simulation on its own.
 """
@@ -37,15 +37,14 @@ def gaps(insertion):
 
 @compiled
 def advance(before, step, least, most):
-    """Where the devices are told to go, and which insertion the chain then has.
+    """Where (N, K) the devices are told to go, and the chain's insertion (N,) then, m.
+
+    It cannot be drawn back behind its start.
 
     Args:
         before: (N, K), insertions, m.
         step: (N, K), by how much they are told to move, m.
         least, most: insertion of a device at least and at most, m.
-
-    Returns:
-        (N, K), and the chain's (N,): it cannot be drawn back behind its start.
     """
     count, devices = before.shape
     target, lead = np.empty((count, devices)), np.empty(count)
@@ -132,44 +131,3 @@ def leading_load(force, line, ways, nodes):
             length += along[axis] * along[axis]
         load[i] = borne / np.sqrt(length)
     return load
-
-
-@compiled
-def write(row, places, chain, fields):
-    """Writes what a chain is made of into the fields of a model.
-
-    Args:
-        row: number of the simulation.
-        places: (3,) first hinge among joints, degrees of freedom and positions; number
-            of the first link; (L,) geoms of the links; (L,) which of a link's axes of
-            inertia lies along it; (L,) half lengths of their cylinders, m.
-        chain: arrays of `chain_fields.ChainProperties`, with those of the links.
-        fields: live `chain_fields.FIELDS`.
-    """
-    hinges, bodies, geoms, axes, half_lengths = places
-    stiffness, damping, rest, radius, friction, mass, buoyancy, inertia = chain
-    jnt_stiffness, dof_damping, qpos_spring = fields[:3]
-    geom_size, geom_rbound, geom_aabb, geom_friction = fields[3:7]
-    body_mass, body_inertia, body_subtreemass, body_gravcomp = fields[7:]
-    for j in range(stiffness.shape[1]):
-        for axis in range(2):
-            hinge = 2 * j + (axis + j) % 2  # see `posture.x_first`
-            jnt_stiffness[hinges[0] + hinge] = stiffness[row, j]
-            dof_damping[hinges[1] + hinge] = damping[row, j]
-            qpos_spring[hinges[2] + hinge] = rest[row, j, axis]
-    beyond = 0.0
-    for link in range(len(geoms) - 1, -1, -1):
-        geom, body = geoms[link], bodies + link
-        thick, long = radius[row, link], radius[row, link] + half_lengths[link]
-        geom_size[geom, 0] = thick
-        geom_rbound[geom] = long
-        geom_aabb[geom, 3] = geom_aabb[geom, 4] = thick
-        geom_aabb[geom, 5] = long
-        geom_friction[geom, 0] = friction[row, link]
-        beyond += mass[row, link]
-        body_mass[body] = mass[row, link]
-        body_subtreemass[body] = beyond
-        body_gravcomp[body] = buoyancy[row, link]
-        for axis in range(3):
-            along = 1 if axis == axes[link] else 0
-            body_inertia[body, axis] = inertia[row, link, along]

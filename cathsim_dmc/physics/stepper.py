@@ -9,8 +9,8 @@ the simulation that composer steps, `simulation.batch` those of `mujoco.batch`.
 
 import abc
 import math
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+import types
+from collections.abc import Callable, Sequence
 from typing import Any, Protocol
 
 import mujoco
@@ -27,11 +27,10 @@ _ACTUATION = mujoco.mjtDisableBit.mjDSBL_ACTUATION.value
 
 
 class Anatomic(Protocol):
-    """An anatomy that can be written into a compiled model."""
+    """An anatomy."""
 
     def write(self, model: mujoco.MjModel) -> None:
-        """Puts the anatomy into a model, in place of the one in it."""
-        ...
+        """Puts the anatomy into a compiled model, in place of the one in it."""
 
 
 class Stepper(abc.ABC):
@@ -57,14 +56,12 @@ class Stepper(abc.ABC):
         self.num_simulations, self.substeps = num_simulations, substeps
         self.repeated = np.zeros(num_simulations, np.int64)
         self.deepest: float | None = None
-        self._contacts = readings.wall_contacts(model)
+        self._contacts = readings.sensor(model, "wall_contacts")
         self._before = self._warnings_before = np.empty(0)
         self._timestep, self._scratch = model.opt.timestep, mujoco.MjData(model)
         self._wall = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_GEOM, "wall")
         self._links = _moving(model)
         self._views: tuple[np.ndarray, ...] = ()
-
-    # What a simulator does.
 
     @abc.abstractmethod
     def field(self, index: int, name: str) -> np.ndarray:
@@ -109,8 +106,6 @@ class Stepper(abc.ABC):
     ) -> None:
         """Changes an option of the models of some simulations."""
 
-    # What is the same for all.
-
     def begin(self, control: np.ndarray) -> None:
         """Begins a control step with the control (N, U) of all its physics steps."""
         self.arrays.ctrl[:] = control
@@ -142,13 +137,9 @@ class Stepper(abc.ABC):
 
     def forward_unactuated(self, indices: np.ndarray) -> None:
         """What dm_control does at a reset, when there is no control yet."""
-        with self._changed(
-            indices,
-            "disableflags",
-            lambda flags: flags | _ACTUATION,
-            lambda flags: flags & ~_ACTUATION,
-        ):
-            self._forward(indices)
+        self._change(indices, "disableflags", lambda flags: flags | _ACTUATION)
+        self._forward(indices)
+        self._change(indices, "disableflags", lambda flags: flags & ~_ACTUATION)
 
     def _depth_at_end(self, depth: np.ndarray, warned: np.ndarray) -> np.ndarray:
         """Depth (N,) m of the deepest contact in a control step and at its end.
@@ -177,21 +168,11 @@ class Stepper(abc.ABC):
         """Does the control step of some simulations again, in steps so much shorter."""
         self.repeated[indices] += 1
         self.set_states(indices, self._before[indices])
-        with self._changed(
-            indices,
-            "timestep",
-            lambda timestep: timestep / parts,
-            lambda timestep: timestep * parts,
-        ):
-            self._run(indices, parts)
-
-    @contextmanager
-    def _changed(self, indices, option, change, undo) -> Iterator[None]:
-        self._change(indices, option, change)
+        self._change(indices, "timestep", lambda timestep: timestep / parts)
         try:
-            yield
+            self._run(indices, parts)
         finally:
-            self._change(indices, option, undo)
+            self._change(indices, "timestep", lambda timestep: timestep * parts)
 
     def _warned(self) -> np.ndarray:
         """Whether MuJoCo has warned in each simulation (N,) in the control step."""
@@ -214,7 +195,8 @@ class SingleStepper(Stepper):
         """Takes views, which stay valid as long as `data` lives."""
         super().__init__(model, 1, substeps)
         self._model, self._data = model, data
-        self.arrays = _Arrays(data, fields)
+        views = {name: getattr(data, name) for name in (*fields, "ctrl", "userdata")}
+        self.arrays = types.SimpleNamespace(**{n: v[None] for n, v in views.items()})
         self.warnings = data.warning.number[None]
         self._case: Anatomic | None = None
         self._sensor = data.sensordata[self._contacts]
@@ -239,16 +221,13 @@ class SingleStepper(Stepper):
 
     def field(self, index: int, name: str) -> np.ndarray:
         """A field of the model, to be written."""
-        del index
         return getattr(self._model, name)
 
     def _model_of(self, index: int) -> mujoco.MjModel:
-        del index
         return self._model
 
     def load(self, index: int, case: Anatomic) -> None:
         """Puts an anatomy into the model; the data begin anew."""
-        del index
         if case is not self._case:
             case.write(self._model)
             self._case = case
@@ -263,7 +242,6 @@ class SingleStepper(Stepper):
 
     def set_states(self, indices: np.ndarray, states: np.ndarray) -> None:
         """Writes the state (1, nstate)."""
-        del indices
         mujoco.mj_setState(self._model, self._data, states[0], _STATE)
 
     def run(self, parts: int = 1) -> None:
@@ -303,14 +281,6 @@ def _moving(model: mujoco.MjModel) -> tuple[np.ndarray, ...]:
     reach = np.linalg.norm(model.geom_pos[links], axis=1) + model.geom_size[links, 1]
     roots = model.body_rootid[bodies]
     return model.dof_parentid.copy(), bodies, np.array(last), roots, reach
-
-
-class _Arrays:
-    """Arrays of one `mujoco.MjData`, not copied, with a leading axis of length 1."""
-
-    def __init__(self, data: mujoco.MjData, fields: Sequence[str]):
-        for field in (*fields, "ctrl", "userdata"):
-            setattr(self, field, getattr(data, field)[None])
 
 
 @compiled

@@ -68,15 +68,13 @@ def read(
     from cathsim_dmc.physics import forces_loops  # late, as numba takes long
 
     deepest, work = forces_loops.pressed(rows, forces.CONTACT_SIZE)
-    still = np.zeros(len(time))
-    found = VesselReadings(still, still, np.zeros((len(time), 3)), deepest, work)
+    phases = {name: np.zeros(len(time)) for name in INFO[:2]}
     for effect in effects:
         if isinstance(effect, Moving):
-            heart, breath = effect.phases()
-            found = found._replace(heart_phase=heart, breath_phase=breath)
+            phases |= zip(INFO, effect.phases(), strict=False)
         if isinstance(effect, Flow):
-            found = found._replace(**effect.read(time, state))
-    return found
+            phases |= effect.read(time, state)
+    return VesselReadings(**phases, indentation=deepest, wall_work=work)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -110,10 +108,10 @@ class VesselOptions:
         if isinstance(value, str):
             value = PRESETS[bounds.choice("vessel", value, PRESETS)]
         if not isinstance(value, Mapping):
-            names = ", ".join(field.name for field in dataclasses.fields(cls))
-            bounds.refuse(
-                "vessel", value, f"one of {', '.join(PRESETS)}, or a mapping of {names}"
+            allowed = (
+                f"one of {', '.join(PRESETS)}, or a mapping of {', '.join(_KINDS)}"
             )
+            bounds.refuse("vessel", value, allowed)
         bounds.mapping("vessel", value, _KINDS)
         return cls(**{name: _part(name, part) for name, part in value.items()})
 

@@ -99,11 +99,9 @@ class Wall(Effect):
 
         super().bind(world)
         carrying.install()
-        model, links = world.model, world.index.geoms
-        self._geoms = links
-        self._weight = model.body_invweight0[model.geom_bodyid[links], 0]
-        self._rigid = rigid_stiffness(self._weight)
-        count = world.num_simulations
+        model, links, count = world.model, world.index.geoms, world.num_simulations
+        weight = model.body_invweight0[model.geom_bodyid[links], 0]
+        self._links = links, weight, rigid_stiffness(weight)
         # Of the lumen around each link, 0 where it has never been in one.
         self._radius = np.zeros((count, len(links)))
         self._material = np.ones((count, len(_LIMITS)))
@@ -113,25 +111,16 @@ class Wall(Effect):
     ) -> None:
         """Draws what the wall is made of."""
         self._radius[index] = 0.0
-        for number, name in enumerate(_LIMITS):
-            value = getattr(self._options, name)
-            self._material[index, number] = (
-                np.nan if value is None else drawn(value, random_state)
-            )
+        given = [getattr(self._options, name) for name in _LIMITS]
+        self._material[index] = [
+            np.nan if value is None else drawn(value, random_state) for value in given
+        ]
         self._write(index)
 
     def _write(self, index: int) -> None:
-        contacts(
-            self._geoms,
-            self._radius[index],
-            self._material[index],
-            self._weight,
-            self._rigid,
-            _LAWS,
-            RELAXATION,
-            self.world.field(index, "geom_solref"),
-            self.world.field(index, "geom_solimp"),
-        )
+        fields = [self.world.field(index, name) for name in self.model_fields]
+        vessel = self._radius[index], self._material[index]
+        contacts(*vessel, *self._links, _LAWS, RELAXATION, *fields)
 
     def act(self, action: np.ndarray, state: Readings) -> np.ndarray:
         """Takes the radius of the vessel around each link."""
@@ -168,13 +157,13 @@ def reference(stiffness, weight, first, last, relaxation):
 
 
 @compiled
-def contacts(geoms, radius, material, weight, rigid, laws, relaxation, solref, solimp):
+def contacts(radius, material, geoms, weight, rigid, laws, relaxation, solref, solimp):
     """Writes the contacts of the links of one simulation.
 
     Args:
-        geoms: (n,) numbers of the links' geoms.
         radius: (n,) of the lumen around them, m, 0 for none.
         material: (3,) modulus, thickness and support.
+        geoms: (n,) numbers of the links' geoms.
         weight: (n,) inverse weights, 1/kg.
         rigid: (n,) stiffness of the rigid wall's contact, N/m.
         laws: (2, 7) of the rigid wall and of one that gives: `solimp`, then `solref`,
@@ -191,8 +180,7 @@ def contacts(geoms, radius, material, weight, rigid, laws, relaxation, solref, s
         soft = found < rigid[n]
         for k in range(5):
             solimp[geom, k] = laws[1 if soft else 0, k]
-        solref[geom, 0], solref[geom, 1] = laws[0, 5], laws[0, 6]
+        law = laws[0, 5], laws[0, 6]
         if soft:
-            solref[geom, 0], solref[geom, 1] = reference(
-                found, weight[n], first, last, relaxation
-            )
+            law = reference(found, weight[n], first, last, relaxation)
+        solref[geom, 0], solref[geom, 1] = law

@@ -20,7 +20,7 @@ from cathsim_dmc.physics import forces, readings, vessel
 from cathsim_dmc.physics.effects import Effects, World
 from cathsim_dmc.physics.motion import Moving
 from cathsim_dmc.physics.readings import CoaxialReadings
-from cathsim_dmc.physics.single_device import SingleDevice
+from cathsim_dmc.physics.sliding import SingleDevice
 from cathsim_dmc.physics.stepper import CONTROL_TIMESTEP, Stepper
 from cathsim_dmc.tasks import observations
 from cathsim_dmc.tasks.cases import Case, model_index

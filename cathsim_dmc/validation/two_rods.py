@@ -169,7 +169,7 @@ def simulate(
         held = 2 * int((stack.nodes[1:-1] > beyond - 1e-6).sum())
         start = int(rig.model.jnt_dofadr[rig.model.joint(f"{rig.name}/bend_x_1").id])
         rig.model.dof_armature[start : start + held] = _HELD
-    gap, ones = np.asarray(gaps, float)[None], np.ones(1)
+    gap, none = np.asarray(gaps, float)[None], np.zeros(1)
     overlap = stack.overlap(gap)
     turns = np.zeros((1, len(names), len(stack.nodes)))
     turns += np.asarray(rotation)[:, None]
@@ -181,10 +181,11 @@ def simulate(
             turns, np.zeros(gap.shape), CONTROL_TIMESTEP, *rods.at_nodes(loads, gap)
         )
         after = rods.at_joints(turns, gap)
-        made = chain_fields.chain_properties(
-            entity, overlap, after, ones * 0, ones, ones, qpos
+        rest, links = (
+            stack.free_hinges(overlap, after, qpos),
+            stack.links(overlap, none),
         )
-        fields.write(arrays, made, 0)
+        fields.write(arrays, 0, overlap, rest, links, np.ones((2, 1)))
         rig.run(CONTROL_TIMESTEP)
     mujoco.mj_kinematics(rig.model, rig.data)
     bends, _ = stack.bent(rig.data.qpos[None, fields.qpos])
