@@ -183,9 +183,6 @@ def test_friction_outside_its_range(friction):
         Phantom(phantoms.load("simple1"), friction)
 
 
-# Names.
-
-
 @pytest.mark.parametrize("rotation", [False, True])
 def test_every_element_has_a_name(shared_environment, rotation):
     environment = shared_environment("type1_bca", rotation=rotation)
@@ -208,9 +205,6 @@ def test_every_element_has_a_name(shared_environment, rotation):
         # PyMJCF calls what has no name "//unnamed_geom_3".
         bare = [name for name in names if not name or "unnamed" in name]
         assert not bare, f"{kind}: {bare}"
-
-
-# Arena.
 
 
 @pytest.mark.parametrize("density", [900.0, BLOOD_DENSITY, 1500.0, 6450.0])

@@ -144,12 +144,6 @@ def test_ranges_are_written_but_not_enforced():
     np.testing.assert_allclose(bound.range, wanted)
 
 
-@pytest.mark.parametrize("radius", [0.0, 0.835, -1e-3])
-def test_device_radius_is_checked(radius):
-    with pytest.raises(ValueError, match="millimetres"):
-        Robot(device_radius=radius)
-
-
 def test_all_geoms_are_for_looks_only():
     physics, robot = arena_with_robot()
     geoms = physics.bind(robot.mjcf_model.find_all("geom"))

@@ -81,9 +81,6 @@ def polyline(line):
     return Centreline(line, np.ones(len(line)))
 
 
-# Straight.
-
-
 def test_a_straight_sheath_is_one_round_bore(straight_rig):
     """Whichever way a device moves, the bore stops it at the clearance."""
     rig = straight_rig

@@ -52,10 +52,6 @@ class Bore:
             ValueError: if the line repeats a point, or a radius is not positive.
         """
         points = np.asarray(points, dtype=np.float64)
-        if points.ndim != 2 or points.shape[1] != 3 or len(points) < 2:
-            raise ValueError(
-                f"the bore's line has shape {points.shape}; give (n, 3), n >= 2"
-            )
         radii = np.broadcast_to(np.asarray(radii, dtype=np.float64), len(points))
         steps = np.linalg.norm(np.diff(points, axis=0), axis=1)
         if not (steps.min() > 0 and radii.min() > 0 and np.isfinite(points).all()):

@@ -53,11 +53,32 @@ JOINTS = (
 )
 
 
-# Insertion 0 lies in the middle of an overlap: both pairs are closed at the start.
-_PHASES = (OVERLAP / 2, OVERLAP / 2 + CYCLE / 2)
-_CYCLE = (CYCLE, STROKE, JAW_TRAVEL, RETURN, JAW_OPENING)
+@compiled
+def _clamp(insertion, offset):
+    """Travel of a pair's platform from home, and opening of each of its jaws, m.
+
+    A platform moves with the device while its jaws are closed, opening or closing, and
+    returns in between:
+    ``travel = phase - stroke / 2 - cycle * smoothstep(return progress)``. Position and
+    speed are continuous. Both depend on the insertion alone, so a withdrawal reverses
+    the motion.
+    """
+    # The jaws are closed over phases [0, STROKE].
+    phase = (insertion + offset) % CYCLE
+    swung = _smoothstep((phase - (STROKE + JAW_TRAVEL)) / RETURN)
+    opened = _smoothstep((phase - STROKE) / JAW_TRAVEL)
+    closed = _smoothstep((phase - (CYCLE - JAW_TRAVEL)) / JAW_TRAVEL)
+    return phase - STROKE / 2 - CYCLE * swung, JAW_OPENING * (opened - closed)
 
 
+@compiled
+def _smoothstep(u):
+    """0 before 0, 1 after 1, and smooth between."""
+    u = min(max(u, 0.0), 1.0)
+    return u * u * (3.0 - 2.0 * u)
+
+
+@compiled
 def postures(given: NDArray[np.float64]) -> NDArray[np.float64]:
     """Joint positions (N, len(JOINTS)) of N followers, m for slides, rad for hinges.
 
@@ -68,8 +89,26 @@ def postures(given: NDArray[np.float64]) -> NDArray[np.float64]:
             which the front clamps hold, and of the guidewire in the rear clamps; both
             pairs hold one device where they are the same.
     """
-    teeth = RING_TEETH / PINION_TEETH
-    return _postures(given, _PHASES, _CYCLE, ROLLER_RADIUS, teeth)
+    count, ratio = given.shape[1], RING_TEETH / PINION_TEETH
+    joints = np.empty((count, 16))
+    for i in range(count):
+        pushed, turned, wire_pushed, wire_turned = given[:, i]
+        # Insertion 0 lies in the middle of an overlap: both pairs are closed.
+        front, front_opening = _clamp(pushed, OVERLAP / 2)
+        rear, rear_opening = _clamp(wire_pushed, OVERLAP / 2 + CYCLE / 2)
+        # The catheter unit stays half-way between the clamps, so the free lengths of
+        # shaft on both sides are equal; the guidewire unit moves with the rear clamps.
+        middle = (front + rear) / 2
+        own = joints[i]
+        own[0], own[1], own[2], own[3] = front, middle, rear, rear
+        own[4:6], own[6:8] = front_opening, rear_opening
+        # Ring, pinion and rollers of the two units.
+        own[8], own[9] = turned, -turned * ratio
+        own[10] = (pushed - middle) / ROLLER_RADIUS
+        own[12], own[13] = wire_turned, -wire_turned * ratio
+        own[14] = (wire_pushed - rear) / ROLLER_RADIUS
+        own[11], own[15] = -own[10], -own[14]
+    return joints
 
 
 class Robot(composer.ModelWrapperEntity):
@@ -86,11 +125,6 @@ class Robot(composer.ModelWrapperEntity):
             device_radius: radius of the device between jaws and rollers, m.
             name: name of the model, the prefix of its elements once attached.
         """
-        if not 1e-4 <= device_radius <= 4e-3:
-            raise ValueError(
-                f"device_radius is {device_radius} m; allowed are 1e-4 to 4e-3 m "
-                "(devices up to 24 French); did you mean millimetres?"
-            )
         root = mjcf.from_path(str(MODEL))
         root.model = name
         super()._build(root)
@@ -101,52 +135,3 @@ class Robot(composer.ModelWrapperEntity):
                 way = device_radius + ROLLER_RADIUS * part.endswith("roller")
                 body.pos = (way if side == "left" else -way, 0, body.pos[2])
         self.joints = tuple(root.find("joint", name) for name in JOINTS)
-
-
-@compiled
-def _clamp(insertion, offset, cycle):
-    """Travel of a pair's platform from home, and opening of each of its jaws, m.
-
-    A platform moves with the device while its jaws are closed, opening or closing, and
-    returns in between:
-    ``travel = phase - stroke / 2 - cycle * smoothstep(return progress)``. Position and
-    speed are continuous. Both depend on the insertion alone, so a withdrawal reverses
-    the motion.
-    """
-    length, stroke, jaws, back, opening = cycle
-    # The jaws are closed over phases [0, stroke].
-    phase = (insertion + offset) % length
-    swung = _smoothstep((phase - (stroke + jaws)) / back)
-    opened = _smoothstep((phase - stroke) / jaws)
-    closed = _smoothstep((phase - (length - jaws)) / jaws)
-    return phase - stroke / 2 - length * swung, opening * (opened - closed)
-
-
-@compiled
-def _smoothstep(u):
-    """0 before 0, 1 after 1, and smooth between."""
-    u = min(max(u, 0.0), 1.0)
-    return u * u * (3.0 - 2.0 * u)
-
-
-@compiled
-def _postures(given, phases, cycle, radius, ratio):
-    """Joints (N, 16) in the order of `JOINTS`, see `postures`."""
-    count = given.shape[1]
-    joints = np.empty((count, 16))
-    for i in range(count):
-        pushed, turned, wire_pushed, wire_turned = given[:, i]
-        front, front_opening = _clamp(pushed, phases[0], cycle)
-        rear, rear_opening = _clamp(wire_pushed, phases[1], cycle)
-        # The catheter unit stays half-way between the clamps, so the free lengths of
-        # shaft on both sides are equal; the guidewire unit moves with the rear clamps.
-        middle = (front + rear) / 2
-        own = joints[i]
-        own[0], own[1], own[2], own[3] = front, middle, rear, rear
-        own[4:6], own[6:8] = front_opening, rear_opening
-        # Ring, pinion and rollers of the two units.
-        own[8], own[9], own[10] = turned, -turned * ratio, (pushed - middle) / radius
-        own[12], own[13] = wire_turned, -wire_turned * ratio
-        own[14] = (wire_pushed - rear) / radius
-        own[11], own[15] = -own[10], -own[14]
-    return joints

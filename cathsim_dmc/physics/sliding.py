@@ -8,7 +8,6 @@ that is saved, dumped and replayed.
 
 import operator
 
-import mujoco
 import numpy as np
 
 from cathsim_dmc.entities.chain import (
@@ -23,7 +22,7 @@ from cathsim_dmc.entities.device_stack import DeviceStack
 from cathsim_dmc.entities.robot import postures
 from cathsim_dmc.imaging.device import Shadow
 from cathsim_dmc.physics import sliding_loops
-from cathsim_dmc.physics.chain_fields import FIELDS, ChainFields, write_still
+from cathsim_dmc.physics.chain_fields import FIELDS, ChainFields
 from cathsim_dmc.physics.drives import Drives
 from cathsim_dmc.physics.effects import Effect, Episode, World
 from cathsim_dmc.physics.readings import CoaxialReadings, Readings
@@ -57,9 +56,6 @@ class SingleDevice(Effect):
         """Takes the entity of the device."""
         self._radius = chain.device.outer_radius
         self._behind = BEHIND / float(chain.link_lengths[0])  # links
-
-    def settle(self, model: mujoco.MjModel) -> None:
-        """Writes the properties of the chain at the start into a model."""
 
     def bind(self, world: World) -> None:
         """Finds the drives in the model."""
@@ -110,10 +106,6 @@ class SlidingDevices(SingleDevice):
     def __init__(self, stack: DeviceStack):
         """Takes the entity of the devices."""
         self._entity, self._stack, self._rods = stack, stack.stack, stack.rods
-
-    def settle(self, model: mujoco.MjModel) -> None:
-        """Writes the properties of the chain at the start into a model."""
-        write_still(self._entity, model)
 
     def num_parameters(self, chain: Chain) -> int:
         """Insertions, and rotations of nodes."""

@@ -64,12 +64,12 @@ class Stepper(abc.ABC):
         self._views: tuple[np.ndarray, ...] = ()
 
     @abc.abstractmethod
-    def field(self, index: int, name: str) -> np.ndarray:
-        """A field of the model that one simulation has for itself, to be written."""
-
-    @abc.abstractmethod
     def _model_of(self, index: int) -> mujoco.MjModel:
         """The model that one simulation runs on."""
+
+    def field(self, index: int, name: str) -> np.ndarray:
+        """A field of the model that one simulation has for itself, to be written."""
+        return getattr(self._model_of(index), name)
 
     @abc.abstractmethod
     def load(self, index: int, case: Anatomic) -> None:
@@ -100,11 +100,13 @@ class Stepper(abc.ABC):
     def _forward(self, indices: np.ndarray) -> None:
         """Computes what MuJoCo derives from the states of some simulations."""
 
-    @abc.abstractmethod
     def _change(
         self, indices: np.ndarray, option: str, change: Callable[[Any], Any]
     ) -> None:
         """Changes an option of the models of some simulations."""
+        models = map(self._model_of, indices)
+        for options in {id(model): model.opt for model in models}.values():
+            setattr(options, option, change(getattr(options, option)))
 
     def begin(self, control: np.ndarray) -> None:
         """Begins a control step with the control (N, U) of all its physics steps."""
@@ -219,10 +221,6 @@ class SingleStepper(Stepper):
         """Rows (1, S, M * 14) of the wall's sensor in the last control step."""
         return self._rows[None]
 
-    def field(self, index: int, name: str) -> np.ndarray:
-        """A field of the model, to be written."""
-        return getattr(self._model, name)
-
     def _model_of(self, index: int) -> mujoco.MjModel:
         return self._model
 
@@ -263,11 +261,6 @@ class SingleStepper(Stepper):
 
     def _forward(self, indices: np.ndarray) -> None:
         mujoco.mj_forward(self._model, self._data)
-
-    def _change(
-        self, indices: np.ndarray, option: str, change: Callable[[Any], Any]
-    ) -> None:
-        setattr(self._model.opt, option, change(getattr(self._model.opt, option)))
 
 
 def _moving(model: mujoco.MjModel) -> tuple[np.ndarray, ...]:

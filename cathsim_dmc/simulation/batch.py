@@ -288,8 +288,7 @@ class _PoolStepper(_BatchStepper):
         self._models = [copy.copy(model) if own else model for _ in self.rows]
         self._loaded: dict[int | Anatomic, Any] = {}
 
-    def field(self, index: int, name: str) -> np.ndarray:
-        return getattr(self._models[index], name)
+    field = Stepper.field
 
     def _model_of(self, index: int) -> mujoco.MjModel:
         return self._models[index]
@@ -311,8 +310,7 @@ class _PoolStepper(_BatchStepper):
     def _change(
         self, indices: np.ndarray, option: str, change: Callable[[Any], Any]
     ) -> None:
-        for model in {id(m): m for m in (self._models[i] for i in indices)}.values():
-            setattr(model.opt, option, change(getattr(model.opt, option)))
+        Stepper._change(self, indices, option, change)
         self.batch.set_models(self._models)
 
 

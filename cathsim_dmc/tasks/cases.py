@@ -12,10 +12,11 @@ from collections.abc import Iterable
 import mujoco
 import numpy as np
 
+from cathsim_dmc.entities.device_stack import DeviceStack
 from cathsim_dmc.imaging.angiograph import Angiograph
 from cathsim_dmc.imaging.options import FluoroscopyOptions
+from cathsim_dmc.physics.chain_fields import write_still
 from cathsim_dmc.physics.readings import ModelIndex
-from cathsim_dmc.physics.sliding import devices_of
 from cathsim_dmc.tasks.config import NavigationConfig
 from cathsim_dmc.tasks.objectives import Objective
 from cathsim_dmc.tasks.scene import Scene
@@ -52,7 +53,8 @@ class Case:
         self.scene = scene
         self.objective = objective
         index = model_index(scene, model)
-        devices_of(scene.catheter).settle(model)
+        if isinstance(scene.catheter, DeviceStack):
+            write_still(scene.catheter, model)
         farthest = config.ranges.farthest_insertion
         self.start = StartPosture(
             scene, model, index, config.start_along_route, farthest
