@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.integrate import quad
 
-from cathsim_dmc.entities import devices
+from cathsim_dmc.entities import coaxial_loops, devices
 from cathsim_dmc.entities.arena import BLOOD_DENSITY
 from cathsim_dmc.entities.catheter import Catheter
 from cathsim_dmc.entities.coaxial import Stack
@@ -155,15 +155,15 @@ def test_restoring_torque_is_the_derivative_of_the_energy(pair):
         joint = np.abs(bends - rest) ** 2 / (2 * overlap.compliance)
         return joint - overlap.coupling[:, 0] * np.cos(turns[:, 0] - turns[:, 1])
 
-    torque, rate = pair.restoring(overlap, bends, turns)
+    torque, rate = coaxial_loops.restoring(overlap, bends, turns)
     for k in range(2):
         step = np.zeros_like(turns)
         step[:, k] = 1e-5
         slope = (energy(turns + step) - energy(turns - step)) / 2e-5
         np.testing.assert_allclose(torque[:, k], -slope, atol=1e-9)
         change = (
-            pair.restoring(overlap, bends, turns + step)[0][:, k]
-            - pair.restoring(overlap, bends, turns - step)[0][:, k]
+            coaxial_loops.restoring(overlap, bends, turns + step)[0][:, k]
+            - coaxial_loops.restoring(overlap, bends, turns - step)[0][:, k]
         ) / 2e-5
         np.testing.assert_allclose(rate[:, k], -change, atol=1e-9)
 
@@ -195,7 +195,8 @@ def pressed(stack, overlap, bends, turns, ways=1.0):
     """Pressure and friction of devices without axial forces of the joints."""
     force, start = np.zeros(turns.shape), np.zeros(turns.shape[:2])
     ways = np.full((len(bends), turns.shape[1] - 1), ways)
-    return stack.pressure(overlap, bends, turns, force, start, ways, 0.04)
+    given = stack.link_lengths, overlap, bends, turns, force, start, ways
+    return coaxial_loops.pressure(*given, 0.04)
 
 
 def energy(stack, gaps, bends, angles):
@@ -233,8 +234,9 @@ def test_axial_forces_are_the_derivative_of_the_energy(pair, gaps):
     rods = Rods(pair.devices, pair.nodes, 0.4)
     overlap, turns = pair.overlap(gaps[None]), rods.at_joints(angles, gaps[None])
     slopes = (rods.at_joints(angles, gaps[None] + 1e-8) - turns) / 1e-8
-    slopes *= pair.restoring(overlap, bends, turns)[0]
-    force = pair.axial(overlap, gaps[None], bends, turns, slopes).sum(axis=-1)[0]
+    slopes *= coaxial_loops.restoring(overlap, bends, turns)[0]
+    given = pair.tables, overlap, gaps[None], bends, turns, slopes
+    force = coaxial_loops.axial(*given).sum(axis=-1)[0]
     step = 2e-5 * (np.arange(2) == follower)
     ends = [energy(pair, gaps + side * step, bends, angles) for side in (1, -1)]
     assert force[follower] == pytest.approx(-(ends[0] - ends[1]) / 4e-5, rel=1e-3)

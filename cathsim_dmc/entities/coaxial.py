@@ -16,7 +16,8 @@ Pure functions of arrays with a leading axis N of simulations; SI units. Directi
 across the chain are complex numbers x + iy in frames that do not twist along the chain:
 a joint bent by a small `bend_y` about y and `bend_x` about x leads towards
 bend_y - i bend_x, and a rotation by φ about the device multiplies by exp(iφ). The
-frames of the links twist, because two hinges do (`Stack.bent`).
+frames of the links twist, because two hinges do (`hinge_loops.bent`). What devices do
+to each other is in `coaxial_loops`.
 """
 
 import itertools
@@ -92,6 +93,9 @@ class Stack:
             from proximal to distal, m.
         spans: (J,), length of rod of each joint, half of its two links, m.
         pairs: (P, 2), indices of every two devices.
+        tables: nodes, link lengths and the uniform pieces of the devices, see
+            `coaxial_loops.overlaps`.
+        arms: (K,), radius of each device on the wall by its friction ratio, m.
     """
 
     def __init__(self, devices: Sequence[Device], link_lengths: np.ndarray):
@@ -118,7 +122,7 @@ class Stack:
             edges[k, : len(starts)] = starts
             bending[k, 1 : len(starts) + 1] = stiffness
             moment[k, 1 : len(starts) + 1] = moments
-        self._tables = self.nodes, self.link_lengths, edges, bending, moment
+        self.tables = self.nodes, self.link_lengths, edges, bending, moment
         radii = np.array([device.outer_radius for device in devices])
         ratios = np.array([device.friction_ratio for device in devices])
         # Mass, weight in blood, blood carried by a device that is the outermost and by
@@ -129,29 +133,18 @@ class Stack:
         weights = [weight_density(device) for device in devices]
         carried = 2 * np.array(outer), np.subtract(inner, outer)
         self._of_links = radii, ratios, np.array([masses, weights, *carried])
-        self._arms = ratios * radii
+        self.arms = ratios * radii
 
     def overlap(self, gaps: np.ndarray) -> Overlap:
         """Integrals around the joints and over the links."""
         gaps = np.ascontiguousarray(gaps, np.float64)
-        integrals = coaxial_loops.overlaps(gaps, *self._tables)
+        integrals = coaxial_loops.overlaps(gaps, *self.tables)
         shares = coaxial_loops.shares(gaps, self.nodes, self.link_lengths)
         return Overlap(*integrals, *shares)
 
     def rest_angles(self, overlap: Overlap, turns: np.ndarray) -> np.ndarray:
         """Rest angles (N, J) of the joints, complex, rad."""
         return (overlap.rest * np.exp(1j * turns)).sum(axis=1)
-
-    def bent(self, angles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Bends of the joints, and twists of the links before them.
-
-        The twist is that of the chain's frames against frames that do not twist along
-        the chain, in which bends and rotations of the devices are measured.
-
-        Returns:
-            Bends (N, J) complex, and twists (N, J), rad.
-        """
-        return hinge_loops.bent(np.ascontiguousarray(angles))
 
     def unloaded_hinges(self, overlap: Overlap, turns: np.ndarray) -> np.ndarray:
         """Angles (N, J, 2) of the hinges about x and y of the unloaded chain, rad."""
@@ -178,89 +171,6 @@ class Stack:
         lengths = self.link_lengths
         made = coaxial_loops.links(*overlap[5:], lengths, friction, *self._of_links)
         return Links(*made)
-
-    def wall_friction(
-        self, overlap: Overlap, force: np.ndarray, friction: np.ndarray
-    ) -> np.ndarray:
-        """Limits of the friction torque of the wall on the devices.
-
-        Args:
-            force: (N, L), force of the wall on the links, N.
-
-        Returns:
-            (N, K, J), N·m; each joint has half of its two links.
-        """
-        given = overlap.outermost, force, friction, self._arms
-        return coaxial_loops.wall_friction(*given)
-
-    def restoring(
-        self, overlap: Overlap, bends: np.ndarray, turns: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Restoring torques of the shapes of the devices, and their stiffness.
-
-        The energy of a joint bent by θ is |θ - Σ R_k e_k|²/2C, e_k = exp(iφ_k), and
-        that of two devices against each other -S cos(φ_k - φ_l). The derivative by a
-        rotation turns a shaped device into the plane of a curved vessel and makes it
-        whip.
-
-        Returns:
-            Torque (N, K, J) on each device about its axis, N·m, and minus its
-            derivative by the rotation, N·m/rad.
-        """
-        return coaxial_loops.restoring(*overlap[:3], bends, turns)
-
-    def axial(
-        self,
-        overlap: Overlap,
-        gaps: np.ndarray,
-        bends: np.ndarray,
-        turns: np.ndarray,
-        slopes: np.ndarray,
-    ) -> np.ndarray:
-        """Axial forces by which the joints resist the sliding of the devices.
-
-        Minus the derivative of the energy by the gap of a device, at given bends and
-        rotations of its rod; that of the leading device is minus the others' sum.
-
-        Args:
-            slopes: (N, K, J), torque of `restoring` times the derivative of `turns` by
-                the gap, N.
-
-        Returns:
-            (N, K, J), N, positive where a device must be pushed forward.
-        """
-        given = *overlap[:2], bends, turns, slopes
-        return coaxial_loops.axial(np.ascontiguousarray(gaps), *self._tables, *given)
-
-    def pressure(
-        self,
-        overlap: Overlap,
-        bends: np.ndarray,
-        turns: np.ndarray,
-        axial: np.ndarray,
-        start: np.ndarray,
-        ways: np.ndarray,
-        coefficient: float,
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Lateral forces of each device on the lumen of the next one, and friction.
-
-        The force of a device with the moment M and the compression P is M'' + Pκ per
-        length. P is EI (κ² - κ_k²)/2, the axial forces of the joints distal of the
-        place, and their friction.
-
-        Args:
-            axial: (N, K, J), see `axial`, N.
-            start: (N, K), compression where each device leaves the others, N.
-            ways: (N, K - 1) in [-1, 1], fraction of the friction that acts on device k,
-                positive when it slides forward in the next one.
-            coefficient: Coulomb coefficient between the devices.
-
-        Returns:
-            (N, K - 1, J), force of device k on device k + 1 at the joints, N, and
-            (N, K - 1), the axial force that their friction demands of device k, N.
-        """
-        given = *overlap[3:5], overlap.present, bends, turns, self.link_lengths
-        return coaxial_loops.pressure(*given, axial, start, ways, coefficient)
 
 
 def _disc(radius: float) -> float:

@@ -1,8 +1,9 @@
-"""Coaxial devices: compiled loops over simulations, devices and joints.
+"""Coaxial devices: what they do to each other and to the chain, compiled.
 
-`coaxial` calls them and defines the quantities. A chain has some thirty joints, for
-which compiled loops are faster than numpy. Each simulation is computed on its own, so
-single and batched simulations agree bit for bit.
+`coaxial` defines the quantities: an `Overlap`, and `gaps`, `bends` and `turns` as the
+methods of a `Stack` have them; `tables` and `arms` are those of a `Stack`. A chain has
+some thirty joints, for which compiled loops are faster than numpy. Each simulation is
+computed on its own, so single and batched simulations agree bit for bit.
 
 Arrays have a leading axis N of simulations; K devices, J joints, L = J + 1 links. All
 are C-contiguous.
@@ -124,8 +125,18 @@ def shares(gaps, nodes, lengths):
 
 
 @compiled
-def restoring(compliance, rest, coupling, bends, turns):
-    """Restoring torques and minus their derivatives, see `Stack.restoring`."""
+def restoring(overlap, bends, turns):
+    """Restoring torques of the shapes of the devices, and their stiffness.
+
+    The energy of a joint bent by θ is |θ - Σ R_k e_k|²/2C, e_k = exp(iφ_k), and that of
+    two devices against each other -S cos(φ_k - φ_l). The derivative by a rotation turns
+    a shaped device into the plane of a curved vessel and makes it whip.
+
+    Returns:
+        Torque (N, K, J) on each device about its axis, N·m, and minus its derivative by
+        the rotation, N·m/rad.
+    """
+    compliance, rest, coupling = overlap.compliance, overlap.rest, overlap.coupling
     count, devices, joints = turns.shape
     torque, rate = np.empty(turns.shape), np.empty(turns.shape)
     pulls = np.empty(devices, np.complex128)
@@ -170,10 +181,21 @@ def _pull(place, load, turns, gaps, edges, bending, moment, piece, device):
 
 
 @compiled
-def axial(
-    gaps, nodes, lengths, edges, bending, moment, compliance, rest, bends, turns, slopes
-):
-    """Axial forces (N, K, J) of the joints, see `Stack.axial`."""
+def axial(tables, overlap, gaps, bends, turns, slopes):
+    """Axial forces by which the joints resist the sliding of the devices.
+
+    Minus the derivative of the energy by the gap of a device, at given bends and
+    rotations of its rod; that of the leading device is minus the others' sum.
+
+    Args:
+        slopes: (N, K, J), torque of `restoring` times the derivative of `turns` by the
+            gap, N.
+
+    Returns:
+        (N, K, J), N, positive where a device must be pushed forward.
+    """
+    nodes, lengths, edges, bending, moment = tables
+    compliance, rest = overlap.compliance, overlap.rest
     count, devices, joints = turns.shape
     force = np.zeros(turns.shape)
     loads = np.empty(joints, np.complex128)
@@ -208,10 +230,26 @@ def axial(
 
 
 @compiled
-def pressure(
-    stiffness, moment, present, bends, turns, lengths, axial, start, ways, coefficient
-):
-    """Forces of each device on the next, and friction, see `Stack.pressure`."""
+def pressure(lengths, overlap, bends, turns, axial, start, ways, coefficient):
+    """Lateral forces of each device on the lumen of the next one, and friction.
+
+    The force of a device with the moment M and the compression P is M'' + Pκ per
+    length. P is EI (κ² - κ_k²)/2, the axial forces of the joints distal of the place,
+    and their friction.
+
+    Args:
+        lengths: (L,), of the links, m.
+        axial: (N, K, J), see `axial`, N.
+        start: (N, K), compression where each device leaves the others, N.
+        ways: (N, K - 1) in [-1, 1], fraction of the friction that acts on device k,
+            positive when it slides forward in the next one.
+        coefficient: Coulomb coefficient between the devices.
+
+    Returns:
+        (N, K - 1, J), force of device k on device k + 1 at the joints, N, and
+        (N, K - 1), the axial force that their friction demands of device k, N.
+    """
+    stiffness, moment, present = overlap.stiffness, overlap.moment, overlap.present
     count, devices, joints = turns.shape
     force = np.empty((count, devices - 1, joints))
     drag = np.zeros((count, devices - 1))
@@ -248,8 +286,16 @@ def pressure(
 
 
 @compiled
-def wall_friction(outermost, force, coefficient, arms):
-    """Friction limits (N, K, J) on the wall, see `Stack.wall_friction`."""
+def wall_friction(arms, overlap, force, coefficient):
+    """Limits (N, K, J) of the friction torque of the wall on the devices, N·m.
+
+    Each joint has half of its two links.
+
+    Args:
+        force: (N, L), force of the wall on the links, N.
+        coefficient: (N,), Coulomb coefficient of an uncoated device on the wall.
+    """
+    outermost = overlap.outermost
     count, devices, links = outermost.shape
     torque = np.empty((count, devices, links - 1))
     for i in range(count):

@@ -83,7 +83,17 @@ def _twist_rates(x, y, first):
 
 @compiled
 def bent(angles):
-    """Bends and twists (N, J) of joints, see `Stack.bent`."""
+    """Bends of the joints, and twists of the links before them.
+
+    The twist is that of the chain's frames against frames that do not twist along the
+    chain, in which bends and rotations of the devices are measured.
+
+    Args:
+        angles: (N, 2 J), positions of the hinges in the order of the chain, rad.
+
+    Returns:
+        Bends (N, J) complex, and twists (N, J), rad.
+    """
     count, joints = angles.shape[0], angles.shape[1] // 2
     bends = np.empty((count, joints), np.complex128)
     twists = np.empty((count, joints))

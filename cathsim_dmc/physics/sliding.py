@@ -10,6 +10,7 @@ import operator
 
 import numpy as np
 
+from cathsim_dmc.entities import coaxial_loops, hinge_loops
 from cathsim_dmc.entities.chain import (
     MAX_PUSH_FORCE,
     MAX_PUSH_SPEED,
@@ -207,14 +208,16 @@ class SlidingDevices(SingleDevice):
         stack, rods = self._stack, self._rods
         gaps = sliding_loops.gaps(np.ascontiguousarray(self._insertion))
         overlap, turns = stack.overlap(gaps), rods.at_joints(self._angles, gaps)
-        bends, _ = stack.bent(self._qpos[:, self._places.qpos])
+        hinges = np.ascontiguousarray(self._qpos[:, self._places.qpos])
+        bends, _ = hinge_loops.bent(hinges)
         loads = np.empty((3, *turns.shape))
-        loads[0], loads[1] = stack.restoring(overlap, bends, turns)
+        loads[0], loads[1] = coaxial_loops.restoring(overlap, bends, turns)
         loads[:2] *= self._factors[0, :, None, None]
         # Nothing rubs in the sheath.
         depth = self.world.start_depth
         force = sliding_loops.rubbing(state.external_force, lead, depth, stack.nodes)
-        loads[2] = stack.wall_friction(overlap, force, self._friction)
+        given = stack.arms, overlap, force, self._friction
+        loads[2] = coaxial_loops.wall_friction(*given)
         if len(self._entity.devices) > 1:
             pressure = self._push(overlap, gaps, bends, turns, loads[0], state)
             # The lumen holds back the device in it; that one is too soft in torsion
@@ -246,7 +249,8 @@ class SlidingDevices(SingleDevice):
         stack, factor = self._stack, self._factors[0, :, None, None]
         slopes = self._rods.at_joints(self._angles, gaps + _GAP_STEP) - turns
         slopes *= torque / factor / _GAP_STEP
-        axial = factor * stack.axial(overlap, gaps, bends, turns, slopes)
+        given = stack.tables, overlap, gaps, bends, turns, slopes
+        axial = factor * coaxial_loops.axial(*given)
         start = np.zeros(gaps.shape)
         every, leaders = np.arange(len(gaps)), np.argmin(gaps, axis=1)
         # What the wall does to the links beyond; forces within are not MuJoCo's state.
@@ -256,8 +260,9 @@ class SlidingDevices(SingleDevice):
         )
         own = {"stiffness": overlap.stiffness, "moment": overlap.moment}
         stiff = overlap._replace(**{name: factor * each for name, each in own.items()})
-        given = stiff, bends, turns, axial, start, self._ways
-        pressure, drag = stack.pressure(*given, self._entity.lumen_friction)
+        given = stack.link_lengths, stiff, bends, turns, axial, start, self._ways
+        friction = self._entity.lumen_friction
+        pressure, drag = coaxial_loops.pressure(*given, friction)
         self._drag[:] = drag
         self._axial[:] = axial.sum(axis=-1)
         self._axial[:, :-1] += drag

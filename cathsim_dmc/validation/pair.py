@@ -8,8 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
-from cathsim_dmc.entities import devices, posture
-from cathsim_dmc.entities.coaxial import Stack
+from cathsim_dmc.entities import devices, hinge_loops, posture
 from cathsim_dmc.entities.device import Device
 from cathsim_dmc.entities.device_stack import DeviceStack
 from cathsim_dmc.physics import chain_fields
@@ -137,7 +136,7 @@ def twists(link_lengths: np.ndarray, start: float, plane: float) -> tuple[float,
 
     Returns:
         Twist of the last link, and of the link before it less the twist that coaxial
-        devices take out (`Stack.bent`), against frames that do not twist, rad.
+        devices take out (`hinge_loops.bent`), against frames that do not twist, rad.
     """
     end = [[2 * BEND_RADIUS, 0, -1.0]]
     line = np.vstack([[[0, 0, 0]], half_circle(BEND_RADIUS, start, 399), end])
@@ -154,8 +153,7 @@ def twists(link_lengths: np.ndarray, start: float, plane: float) -> tuple[float,
         across *= np.arcsin(sine) / sine if sine else 1.0
         still = Rotation.from_rotvec(across) * still
         found.append((still.inv() * frame).as_rotvec()[2])
-    stack = Stack([devices.get("berenstein_5f")], link_lengths)
-    _, taken = stack.bent(in_order(angles)[None])
+    _, taken = hinge_loops.bent(in_order(angles)[None])
     return float(found[-1]), float(found[-2] - taken[0, -1])
 
 

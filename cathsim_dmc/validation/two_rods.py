@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation
 
-from cathsim_dmc.entities import posture
+from cathsim_dmc.entities import coaxial_loops, hinge_loops, posture
 from cathsim_dmc.entities.chain import MAX_PUSH_SPEED
 from cathsim_dmc.entities.device import Device
 from cathsim_dmc.entities.device_stack import DeviceStack
@@ -176,22 +176,22 @@ def simulate(
     for _ in range(round(duration / CONTROL_TIMESTEP)):
         at = rods.at_joints(turns, gap)
         qpos = rig.data.qpos[None, fields.qpos]
-        loads = np.array(stack.restoring(overlap, stack.bent(qpos)[0], at))
+        bends, _ = hinge_loops.bent(qpos)
+        loads = np.array(coaxial_loops.restoring(overlap, bends, at))
         turns = rods.turn(
             turns, np.zeros(gap.shape), CONTROL_TIMESTEP, *rods.at_nodes(loads, gap)
         )
         after = rods.at_joints(turns, gap)
-        rest, links = (
-            stack.free_hinges(overlap, after, qpos),
-            stack.links(overlap, none),
-        )
+        rest = stack.free_hinges(overlap, after, qpos)
+        links = stack.links(overlap, none)
         fields.write(arrays, 0, overlap, rest, links, np.ones((2, 1)))
         rig.run(CONTROL_TIMESTEP)
     mujoco.mj_kinematics(rig.model, rig.data)
-    bends, _ = stack.bent(rig.data.qpos[None, fields.qpos])
+    bends, _ = hinge_loops.bent(rig.data.qpos[None, fields.qpos])
     slopes = rods.at_joints(turns, gap + 1e-8) - rods.at_joints(turns, gap)
     slopes *= loads[0] / 1e-8
-    force = stack.axial(overlap, gap, bends, after, slopes)[0].sum(axis=-1)
+    force = coaxial_loops.axial(stack.tables, overlap, gap, bends, after, slopes)
+    force = force[0].sum(axis=-1)
     end = rig.head_position - rig.joints[0]
     return Rods(turns[0, :, -1], end, force=force)
 
