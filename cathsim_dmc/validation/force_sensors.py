@@ -8,7 +8,6 @@ import numpy as np
 
 from cathsim_dmc.entities.chain import MAX_PUSH_SPEED
 from cathsim_dmc.physics import forces
-from cathsim_dmc.recording.episode import Episode
 from cathsim_dmc.tasks.config import PHYSICS_TIMESTEP
 from cathsim_dmc.validation import convergence
 from cathsim_dmc.validation.checks import Check, Report
@@ -121,22 +120,6 @@ def _axial_force_on(model, data, sheath: np.ndarray) -> float:
     return float(total)
 
 
-def scripted_cannulations() -> dict[float, list[Episode]]:
-    """Insertions into the BCA of the type-I arch, by speed (share of 40 mm/s)."""
-    return {
-        speed: [
-            convergence.run(
-                convergence.Script("into the BCA", speed, curl, 4.0 / speed),
-                seed=seed,
-                goal="bca",
-            )
-            for curl in INSERTION_CURLS
-            for seed in range(INSERTION_SEEDS)
-        ]
-        for speed in INSERTION_SPEEDS
-    }
-
-
 def _checks(pushed: dict[str, list[DeadEnd]]) -> Iterator[Check]:
     for load in RESTING_LOADS:
         contacts, load_cell, _, depth = resting_link(load)
@@ -153,7 +136,17 @@ def _checks(pushed: dict[str, list[DeadEnd]]) -> Iterator[Check]:
         name = f"wide dead end, motor {one.motor:g} N: push force = load cell + rim "
         name, value = f"{name}of the sheath", one.load_cell + one.sheath
         yield Check.deviation(name, value, one.push, BALANCE_BOUND, "N")
-    for speed, runs in scripted_cannulations().items():
+    # Insertions into the BCA of the type-I arch.
+    for speed in INSERTION_SPEEDS:
+        runs = [
+            convergence.run(
+                convergence.Script("into the BCA", speed, curl, 4.0 / speed),
+                seed=seed,
+                goal="bca",
+            )
+            for curl in INSERTION_CURLS
+            for seed in range(INSERTION_SEEDS)
+        ]
         every = np.concatenate([run.contact_force for run in runs])
         single = np.linalg.norm(every, axis=-1)
         usual = 100 * float((single <= USUAL_FORCE).mean())

@@ -56,11 +56,8 @@ def sections(entity: DeviceStack, gaps: np.ndarray) -> tuple[np.ndarray, np.ndar
     tips = [device.tip_length for device in entity.devices]
     places = np.unique(np.minimum([0.0, length, *gaps, *(gaps + tips)], length))
     middles = (places[1:] + places[:-1]) / 2
-    bending = sum(
-        theory.profile(device, middles - gap)[0]
-        for device, gap in zip(entity.devices, gaps, strict=True)
-    )
-    return np.diff(places)[::-1], np.asarray(bending)[::-1]
+    bending = theory.profile(entity.devices, gaps, middles)[0].sum(axis=0)
+    return np.diff(places)[::-1], bending[::-1]
 
 
 def cantilevers(protrusion: float) -> list[rod.Cantilever]:
@@ -82,13 +79,10 @@ def free_curve(chosen: Sequence[Device], gaps: ArrayLike, length: float) -> np.n
     arc = np.arange(0.0, length, _FINE)
     steps = np.diff(np.append(arc, length))
     middle = length - (arc + steps / 2)  # from the end
-    moment, stiffness = np.zeros((2, len(arc)))
-    for device, gap in zip(chosen, np.asarray(gaps), strict=True):
-        bending, _, own = theory.profile(device, middle - gap)
-        moment += bending * own
-        stiffness += bending
+    bending, _, own = theory.profile(chosen, gaps, middle)
     # Where no device is, there is no curvature.
-    turning = moment / np.maximum(stiffness, 1e-12) * steps
+    stiffness = np.maximum(bending.sum(axis=0), 1e-12)
+    turning = (bending * own).sum(axis=0) / stiffness * steps
     heading = np.cumsum(turning) - turning / 2
     return np.array([np.sin(heading) @ steps, 0.0, np.cos(heading) @ steps])
 

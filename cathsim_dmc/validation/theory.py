@@ -4,6 +4,7 @@ A rod is a sequence of uniform sections, from the clamp to the free end, given b
 their lengths (m) and bending stiffnesses EI (N·m²). SI units throughout.
 """
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -71,16 +72,25 @@ def buckling_load(length: float, stiffness: float, end: str = "sliding") -> floa
     return GUIDES[end] * np.pi**2 * stiffness / length**2
 
 
-def profile(device: Device, places: np.ndarray) -> tuple[np.ndarray, ...]:
-    """EI, GJ and curvature at places (n,) from the device's end, 0 beyond it."""
-    there, tip = places >= 0, places < device.tip_length
-    parts = [
-        there * np.where(tip, getattr(device.tip, name), getattr(device.shaft, name))
-        for name in ("bending_stiffness", "torsional_stiffness")
-    ]
-    curvature, start = np.zeros(len(places)), 0.0
-    for arc in reversed(device.tip_shape):
-        inside = (places >= start) & (places < start + arc.length)
-        curvature[inside] = np.copysign(1 / arc.radius, arc.angle)
-        start += arc.length
-    return (*parts, curvature)
+def profile(
+    devices: Sequence[Device], gaps: ArrayLike, places: np.ndarray
+) -> np.ndarray:
+    """EI, GJ and curvature (3, K, n) of coaxial devices, 0 beyond their ends.
+
+    Args:
+        devices: K, not turned.
+        gaps: (K,), from the end of each to that of the chain, m.
+        places: (n,), from the end of the chain, m.
+    """
+    found = np.zeros((3, len(devices), len(places)))
+    for k, (device, gap) in enumerate(zip(devices, np.asarray(gaps), strict=True)):
+        place, start = places - gap, 0.0
+        tip = place < device.tip_length
+        for row, name in enumerate(("bending_stiffness", "torsional_stiffness")):
+            own = np.where(tip, getattr(device.tip, name), getattr(device.shaft, name))
+            found[row, k] = (place >= 0) * own
+        for arc in reversed(device.tip_shape):
+            inside = (place >= start) & (place < start + arc.length)
+            found[2, k, inside] = np.copysign(1 / arc.radius, arc.angle)
+            start += arc.length
+    return found

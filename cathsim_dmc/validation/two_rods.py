@@ -87,11 +87,7 @@ def reference(
     count = round(length / _FINE)
     places = length - (np.arange(count) + 0.5) * _FINE
     given = np.zeros(0, complex) if held is None else held
-    made = [
-        theory.profile(device, places - gap)
-        for device, gap in zip(devices, np.asarray(gaps), strict=True)
-    ]
-    bending, torsion, own = (np.array(each) for each in zip(*made, strict=True))
+    bending, torsion, own = theory.profile(devices, gaps, places)
     free, shape = count - len(given), (len(devices), count)
     # Unknowns scaled by the roots of the stiffnesses: the energy is well conditioned.
     scales = np.sqrt(_FINE * np.where(torsion > 0, torsion, 1e-6))

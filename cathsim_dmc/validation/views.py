@@ -21,12 +21,8 @@ _AXES = ("x, to the left", "y, posterior", "z, superior")
 _GOAL_RADIUS = 8.0  # mm, the published task's
 
 
-def draw(anatomy: Anatomy, path: str | Path, title: str | None = None) -> None:
-    """Draws lumen, centrelines, goals and inlet from three sides.
-
-    Args:
-        title: over the picture; the anatomy's name if None.
-    """
+def draw(anatomy: Anatomy, path: str | Path) -> None:
+    """Draws lumen, centrelines, goals and inlet from three sides into a PNG."""
     figure = Figure(figsize=(13.5, 5.6), layout="constrained")
     FigureCanvasAgg(figure)
     axes = figure.subplots(1, 3)
@@ -34,7 +30,7 @@ def draw(anatomy: Anatomy, path: str | Path, title: str | None = None) -> None:
         draw_view(ax, anatomy, view)
     names, labels = axes[0].get_legend_handles_labels()
     figure.legend(names, labels, fontsize=8, loc="outside lower center", ncols=7)
-    figure.suptitle(title or anatomy.name)
+    figure.suptitle(anatomy.name)
     style.save(figure, path)
 
 
