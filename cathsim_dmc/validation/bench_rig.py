@@ -74,12 +74,9 @@ class Held:
             )
         # n - 1/2 links of the shaft are in.
         first = shaft / (np.ceil(shaft / _LINK) - 0.5)
-        self._rig = rig = Rig(
-            device,
-            Discretisation(reach + first / 2, shaft_link=first * (1 + 1e-6)),
-            stroke=reach + 1e-3,
-            friction=friction,
-        )
+        fine = Discretisation(reach + first / 2, shaft_link=first * (1 + 1e-6))
+        rig = Rig(device, fine, stroke=reach + 1e-3, friction=friction)
+        self._rig = rig
         axis = wire.direction
         across = np.cross(np.eye(3)[np.abs(axis).argmin()], axis)
         across /= np.linalg.norm(across)
@@ -89,9 +86,8 @@ class Held:
         root = rig.arena.mjcf_model
         buoyancy = BLOOD_DENSITY / rig.catheter.density
         root.option.gravity = GRAVITY * (1.0 - buoyancy) * down @ self._frame
-        rig.arena.attach(
-            Sheath(straight(float(rig.lengths.sum())), device.outer_radius)
-        )
+        bore = straight(float(rig.lengths.sum()))
+        rig.arena.attach(Sheath(bore, device.outer_radius))
         body = root.worldbody.add(
             "body",
             pos=-self._entry @ self._frame,
