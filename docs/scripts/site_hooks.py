@@ -20,14 +20,13 @@ OF_THE_REPOSITORY = ("CONTRIBUTING.md", "CHANGELOG.md")
 OPTIONAL = ("results.md", "results_detail.md", "reliability.md", "imitation.md")
 # A table with this many columns takes the room of the page's table of contents.
 _WIDE = 5
-# Characters of a word of code in a table that is not broken.
+# Characters of a word of code that is not broken.
 _WHOLE = 26
 # A link out of docs/ and where it leads on the site.
 _LINK = re.compile(r"\]\((?:\.\./)*(docs/|examples/)?([\w./-]*)(#[\w-]*)?\)")
-# In a table: blanks that a line may not end at, and words of code.
+# Blanks in a table that a line may not end at; code in a sentence.
 _UNIT = re.compile(r"(?<=\d) (?=(?:%|°|[µmk]?[mNs]|M?B)(?![\w/·]))|(?<=[±≤≥]) | (?=±)")
-_CELL_CODE = re.compile(r"(<t[dh][^>]*>)(.*?)(?=</t[dh]>)", re.DOTALL)
-_CODE = re.compile(r"<code>([^<]+)</code>")
+_CODE = re.compile(r"<pre.*?</pre>|<code>([^<]+)</code>", re.DOTALL)
 
 
 def on_config(config):
@@ -108,17 +107,19 @@ def _row(line: str) -> str:
 
 
 def on_page_content(html, page, config, files):
-    """Keeps words of code in tables whole, such as options and names of tasks."""
+    """Keeps words of code in a sentence whole, such as options and names of tasks."""
     del page, config, files
 
     def whole(code: re.Match) -> str:
+        if code[1] is None:
+            return code[0]
         words = (
             f'<span class="whole">{word}</span>' if len(word) <= _WHOLE else word
             for word in code[1].split(" ")
         )
         return f"<code>{' '.join(words)}</code>"
 
-    return _CELL_CODE.sub(lambda cell: cell[1] + _CODE.sub(whole, cell[2]), html)
+    return _CODE.sub(whole, html)
 
 
 def _examples() -> str:
