@@ -101,9 +101,7 @@ def test_phantoms_are_of_the_type_they_are_named_after():
 
 def test_measured_phantoms_are_as_was_measured():
     """Beside the figures taken from the scans themselves."""
-    one, two = (
-        measures.measure(phantoms.load(name).tree) for name in ("type1", "type2")
-    )
+    one, two = (measures.measure(phantoms.load(n).tree) for n in ("type1", "type2"))
     assert one.drop == pytest.approx(0.3, abs=0.2)
     assert two.drop == pytest.approx(1.9, abs=0.35)
     for name, unit, expected, atol in (

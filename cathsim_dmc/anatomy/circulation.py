@@ -73,14 +73,13 @@ class Circulation:
         """The circulation of a tree, perhaps with all outlets by Murray's law."""
         root = tree.root.centreline
         reverse = bool(root.radii[-1] > root.radii[0])
-        heart = -1 if reverse else 0
         courses = _courses(tree, reverse, murray)
         columns = [
             _along(vessel.centreline, courses[name], number)
             for number, (name, vessel) in enumerate(tree.vessels.items())
         ]
         joined = [np.concatenate(column) for column in zip(*columns, strict=True)]
-        return cls(courses, float(root.radii[heart]), *joined)
+        return cls(courses, float(root.radii[-1 if reverse else 0]), *joined)
 
     def check(self, name: str, tree: VesselTree, ends: Sequence[End]) -> None:
         """Raises ValueError unless blood can enter at the heart's end and leave."""
@@ -127,26 +126,23 @@ def _courses(tree: VesselTree, reverse: bool, murray: bool) -> dict[str, Course]
                 way = tree.root.centreline.length - way
             begins[name] = begins[vessel.parent] + way
             branches[vessel.parent].append((way, taken[name]))
-    return {
-        name: Course(
-            begins[name],
-            reverse and name == tree.root.name,
-            outlets[name],
-            np.array(branches[name]).reshape(-1, 2),
-        )
-        for name in tree.vessels
-    }
+    courses = {}
+    for name, parts in branches.items():
+        back = reverse and name == tree.root.name
+        own = np.array(parts).reshape(-1, 2)
+        courses[name] = Course(begins[name], back, outlets[name], own)
+    return courses
 
 
 def _outlets(tree: VesselTree, reverse: bool, murray: bool) -> dict[str, float]:
     """Share of the inflow that leaves through the free end of each vessel."""
-    cubes, artery = {}, {}
+    cubes, artery = {}, {None: ""}
     measured = not murray and set(SHARES) <= set(tree.vessels)
     for name, vessel in tree.vessels.items():
         first = reverse and vessel.parent is None
         cubes[name] = float(vessel.centreline.radii[0 if first else -1]) ** 3
-        inherited = artery.get(vessel.parent, "")
-        artery[name] = name if measured and name in SHARES else inherited
+        own = measured and name in SHARES
+        artery[name] = name if own else artery[vessel.parent]
     totals = {**SHARES, "": 1.0 - sum(SHARES.values())} if measured else {"": 1.0}
     summed = dict.fromkeys(totals, 0.0)
     for name, cube in cubes.items():

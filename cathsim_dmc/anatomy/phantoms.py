@@ -7,7 +7,7 @@ from cathsim_dmc import bounds
 from cathsim_dmc.anatomy.anatomy import Anatomy
 from cathsim_dmc.anatomy.arch import arch
 from cathsim_dmc.anatomy.builder import ACCESSES
-from cathsim_dmc.anatomy.tree_file import TreeFile, read_tree
+from cathsim_dmc.anatomy.tree_file import read_tree
 
 _DATA = Path(__file__).parent / "data"
 # The published silicone phantoms, measured; see docs/anatomies.md. The tests hold them
@@ -16,11 +16,6 @@ MEASURED = ("type1", "type2")
 # All that come as a file of centrelines, `data/<name>.json`.
 TREES = (*MEASURED,)
 PHANTOMS = (*TREES, *arch.ARCHES)
-
-
-def shipped_tree(name: str) -> TreeFile:
-    """Centrelines, inlets and goals of an anatomy of `TREES`."""
-    return read_tree(_DATA / f"{name}.json")
 
 
 def load(name: str, *, access: str = "ascending") -> Anatomy:
@@ -42,4 +37,4 @@ def load(name: str, *, access: str = "ascending") -> Anatomy:
 
 @lru_cache(maxsize=8)
 def _built(name: str, access: str) -> Anatomy:
-    return shipped_tree(name).build(access)
+    return read_tree(_DATA / f"{name}.json").build(access)

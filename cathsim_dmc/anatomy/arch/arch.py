@@ -31,7 +31,6 @@ from cathsim_dmc.anatomy.arch.sampler import (
 )
 from cathsim_dmc.anatomy.arch.tree import arch_tree
 from cathsim_dmc.anatomy.builder import ACCESSES, VesselPlace
-from cathsim_dmc.anatomy.centreline import VesselTree
 
 __all__ = [
     "ARCHES",
@@ -44,16 +43,6 @@ __all__ = [
     "build_seed",
     "sample",
 ]
-
-
-def _goals(params: ArchParameters, tree: VesselTree) -> dict[str, VesselPlace]:
-    goals = {
-        name: VesselPlace(name, past_ostium=branch.goal_depth)
-        for name, branch in params.branches.items()
-    }
-    arc = tree.root.centreline.length - params.descending_goal_depth
-    goals["descending"] = VesselPlace("aorta", arc_length=arc)
-    return goals
 
 
 @lru_cache(maxsize=32)
@@ -76,7 +65,13 @@ def build_arch(
     tree = arch_tree(params)
     arc = 0.0 if access == "ascending" else math.inf
     inlet = VesselPlace(tree.root.name, arc_length=arc)
-    return Anatomy.from_tree(tree, name, inlet=inlet, goals=_goals(params, tree))
+    goals = {
+        branch: VesselPlace(branch, past_ostium=figures.goal_depth)
+        for branch, figures in params.branches.items()
+    }
+    arc = tree.root.centreline.length - params.descending_goal_depth
+    goals["descending"] = VesselPlace(tree.root.name, arc_length=arc)
+    return Anatomy.from_tree(tree, name, inlet=inlet, goals=goals)
 
 
 def build_seed(seed: ArchSeed, *, access: str = "ascending") -> Anatomy:
