@@ -136,7 +136,8 @@ def _courses(tree: VesselTree, reverse: bool, murray: bool) -> dict[str, Course]
 
 def _outlets(tree: VesselTree, reverse: bool, murray: bool) -> dict[str, float]:
     """Share of the inflow that leaves through the free end of each vessel."""
-    cubes, artery = {}, {None: ""}
+    cubes: dict[str, float] = {}
+    artery: dict[str | None, str] = {None: ""}
     measured = not murray and set(SHARES) <= set(tree.vessels)
     for name, vessel in tree.vessels.items():
         first = reverse and vessel.parent is None

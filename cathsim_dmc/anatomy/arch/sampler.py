@@ -198,11 +198,9 @@ def _draw(draw: _Draw, drop: float, variant: str) -> ArchParameters:
         along = least + draw.uniform(0.0, 2e-3)
         if variant == "bovine_branch":
             along = max(draw.uniform(10e-3, 18e-3), least)
-        spacings = {
-            "bca_lcca_spacing": along,
-            "lcca_lsa_spacing": sum(spacings.values()),
-        }
-    arch_radius = draw.normal(*_ARCH_RADIUS)
+        both = sum(spacings.values())
+        spacings = {"bca_lcca_spacing": along, "lcca_lsa_spacing": both}
+    arch_radius, last = draw.normal(*_ARCH_RADIUS), aberrant.radius if aberrant else 0.0
     return ArchParameters(
         bca=branches["bca"],
         lcca=branches["lcca"],
@@ -221,9 +219,7 @@ def _draw(draw: _Draw, drop: float, variant: str) -> ArchParameters:
         bow=draw.normal(*_BOW),
         sway=draw.normal(*_SWAY),
         aberrant=aberrant,
-        lsa_aberrant_spacing=radii["lsa"]
-        + (aberrant.radius if aberrant else 0.0)
-        + draw.uniform(2e-3, 6e-3),
+        lsa_aberrant_spacing=radii["lsa"] + last + draw.uniform(2e-3, 6e-3),
         **spacings,
     )
 
