@@ -1,7 +1,5 @@
 """Scans made of tubes: surfaces and centrelines with known truth, mm in files."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

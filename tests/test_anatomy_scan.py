@@ -1,7 +1,5 @@
 """Import of a scan: a synthetic Y-shaped lumen, every error, and a real patient."""
 
-from __future__ import annotations
-
 import json
 import os
 from pathlib import Path
@@ -18,8 +16,8 @@ from cathsim_dmc.anatomy.scan import importer
 from cathsim_dmc.anatomy.scan.curves import read_curve, vessel_name
 from cathsim_dmc.anatomy.scan.importer import import_scan
 from cathsim_dmc.anatomy.scan.inlet import cut_open
-from cathsim_dmc.anatomy.scan.report import describe
-from cathsim_dmc.anatomy.scan.trunk import name_trunk
+from cathsim_dmc.anatomy.scan.places import describe
+from cathsim_dmc.anatomy.scan.tree import name_trunk
 from cathsim_dmc.anatomy.surface import lumen_surface
 from cathsim_dmc.anatomy.surface_depth import SurfaceDepth
 from cathsim_dmc.anatomy.tree_depth import TreeDepth
@@ -118,7 +116,7 @@ def test_inlet_in_the_middle_cuts_the_lumen(y_scan):
     short = []
     for path in curves:  # they start at the trunk's end, so the cut shortens them
         curve = read_curve(path)
-        keep = curve.points[curve.points[:, 2] > 30e-3] * 1e3
+        keep = curve[curve[:, 2] > 30e-3] * 1e3
         short.append(write_markup(path.with_name(f"short-{path.name}"), keep))
     anatomy = import_scan(mesh, short, inlet=(0.0, 0.0, 28.0))
     assert anatomy.inlet.position[2] == pytest.approx(28e-3, abs=2e-3)
@@ -249,16 +247,16 @@ def test_branches_that_are_right_ones_need_no_name():
 
 def test_ras_markup_and_table_are_the_same_curve(y_scan, tmp_path):
     curve = read_curve(y_scan[1][0])
-    ras = curve.points * 1e3 * (-1.0, -1.0, 1.0)
+    ras = curve * 1e3 * (-1.0, -1.0, 1.0)
     path = write_markup(tmp_path / "c-A.mrk.json", ras, system="RAS")
-    np.testing.assert_allclose(read_curve(path).points, curve.points, atol=1e-12)
+    np.testing.assert_allclose(read_curve(path), curve, atol=1e-12)
     table = tmp_path / "centreline_A.csv"
-    rows = np.c_[curve.points * 1e3, np.full(len(curve.points), 2.0)]
+    rows = np.c_[curve * 1e3, np.full(len(curve), 2.0)]
     body = "\n".join(",".join(f"{x:.9f}" for x in row) for row in rows)
     table.write_text("x,y,z,radius\n" + body + "\n")
-    np.testing.assert_allclose(read_curve(table).points, curve.points, atol=1e-9)
+    np.testing.assert_allclose(read_curve(table), curve, atol=1e-9)
     table.write_text(body)  # without headings
-    np.testing.assert_allclose(read_curve(table).points, curve.points, atol=1e-9)
+    np.testing.assert_allclose(read_curve(table), curve, atol=1e-9)
 
 
 @pytest.mark.parametrize(
@@ -275,7 +273,7 @@ def test_vessels_are_called_after_their_files(file, name):
 
 def test_centreline_elsewhere(y_scan, tmp_path):
     mesh, curves, _ = y_scan
-    points = read_curve(curves[0]).points * 1e3
+    points = read_curve(curves[0]) * 1e3
     away = write_markup(tmp_path / "centreline-A.mrk.json", points + (30.0, 0, 0))
     with pytest.raises(ValueError, match=r"only \d+% of the centreline"):
         import_scan(mesh, [away])

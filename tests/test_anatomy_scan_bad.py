@@ -3,112 +3,54 @@
 import json
 
 import numpy as np
-import pytest
 from synthetic_scans import marched, write_obj, y_tree
 
 
-@pytest.fixture(scope="module")
-def y_mesh():
-    return marched(y_tree(), 2.0e-3)
-
-
-def empty(y_mesh, folder):
-    (folder / "scan.stl").touch()
-    return ["scan.stl"], r"is empty (0 bytes)"
-
-
-def text(y_mesh, folder):
-    (folder / "scan.ply").write_text("Dear all,\nthe scan follows tomorrow.\n")
-    return ["scan.ply"], "cannot be read"
-
-
-def intersecting(y_mesh, folder):
-    vertices, faces = y_mesh
-    spiked = vertices.copy()
+def scans(vertices, faces):
+    """Name, file, its bytes or its mesh, further arguments, words of the error."""
+    spiked, broken = vertices.copy(), vertices.copy()
     spiked[np.linalg.norm(spiked - (6, 0, 25), axis=1).argmin()] = (-25, 0, 25)
-    write_obj(folder / "scan.obj", spiked, faces)
-    return ["scan.obj"], "intersects itself: 5 triangles, one at"
-
-
-def two_components(y_mesh, folder):
-    vertices, faces = y_mesh
-    both = np.concatenate([vertices, vertices + 200.0])
-    write_obj(folder / "scan.obj", both, np.concatenate([faces, faces + len(vertices)]))
-    return ["scan.obj"], "2 separate parts"
-
-
-def no_volume(y_mesh, folder):
-    vertices, faces = y_mesh
-    write_obj(folder / "scan.obj", vertices * (1.0, 1.0, 0.0), faces)
-    return ["scan.obj"], ""
-
-
-def not_finite(y_mesh, folder):
-    vertices, faces = y_mesh
-    broken = vertices.copy()
     broken[7] = np.nan
-    write_obj(folder / "scan.obj", broken, faces)
-    return ["scan.obj"], "1 vertices whose coordinates are NaN"
+    both = np.concatenate([vertices, vertices + 200.0])
+    both = both, np.concatenate([faces, faces + len(vertices)])
+    good, drawn = (vertices, faces), ["--centreline", "bca.mrk.json"]
+    flat = vertices * (1.0, 1.0, 0.0), faces
+    yield "empty", "scan.stl", b"", [], "is empty (0 bytes)"
+    yield "text", "scan.ply", b"Dear all,\ntomorrow.\n", [], "cannot be read"
+    yield "format", "scan.glb", b"glTF", [], "formats obj, stl, ply, vtp"
+    pierced = "intersects itself: 5 triangles, one at"
+    yield "intersecting", "scan.obj", (spiked, faces), [], pierced
+    yield "two parts", "scan.obj", both, [], "2 separate parts"
+    yield "no volume", "scan.obj", flat, [], ""
+    bad = "1 vertices whose coordinates are NaN"
+    yield "not finite", "scan.obj", (broken, faces), [], bad
+    yield "wrong unit", "scan.obj", good, ["--units", "m"], "pass units='mm'"
+    yield "no curve", "scan.obj", good, drawn, "no centreline file bca.mrk.json"
+    yield "half a curve", "scan.obj", good, drawn, "is no 3D Slicer markup"
 
 
-def wrong_unit(y_mesh, folder):
-    write_obj(folder / "scan.obj", *y_mesh)
-    return ["scan.obj", "--units", "m"], "pass units='mm'"
-
-
-def missing_centreline(y_mesh, folder):
-    write_obj(folder / "scan.obj", *y_mesh)
-    return [
-        "scan.obj",
-        "--centreline",
-        "bca.mrk.json",
-    ], "no centreline file bca.mrk.json"
-
-
-def truncated_centreline(y_mesh, folder):
-    write_obj(folder / "scan.obj", *y_mesh)
-    curve = json.dumps({"markups": [{"type": "Curve", "controlPoints": []}]})
-    (folder / "bca.mrk.json").write_text(curve[: len(curve) // 2])
-    return ["scan.obj", "--centreline", "bca.mrk.json"], "is not JSON"
-
-
-def another_format(y_mesh, folder):
-    (folder / "scan.glb").write_bytes(b"glTF")
-    return ["scan.glb"], "formats obj, stl, ply, vtp"
-
-
-SCANS = (
-    empty,
-    text,
-    intersecting,
-    two_components,
-    no_volume,
-    not_finite,
-    wrong_unit,
-    missing_centreline,
-    truncated_centreline,
-    another_format,
-)
-
-
-def test_bad_scans_are_told_apart_and_leave_nothing(
-    y_mesh, tmp_path, monkeypatch, cathsim
-):
+def test_bad_scans_are_told_apart_and_leave_nothing(tmp_path, monkeypatch, cathsim):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     said = {}
-    for scan in SCANS:
-        folder = tmp_path / scan.__name__
+    for name, file, content, arguments, words in scans(*marched(y_tree(), 2.0e-3)):
+        folder = tmp_path / name
         folder.mkdir()
         monkeypatch.chdir(folder)
-        arguments, words = scan(y_mesh, folder)
+        if isinstance(content, bytes):
+            (folder / file).write_bytes(content)
+        else:
+            write_obj(folder / file, *content)
+        if name == "half a curve":
+            curve = json.dumps({"markups": [{"type": "Curve", "controlPoints": []}]})
+            (folder / "bca.mrk.json").write_text(curve[: len(curve) // 2])
         before = sorted(folder.iterdir())
-        code, out, err = cathsim("phantom", "import", *arguments, "--out", "OUT")
-        assert code == 2 and not out, scan.__name__
+        code, out, err = cathsim("phantom", "import", file, *arguments, "--out", "OUT")
+        assert code == 2 and not out, name
         assert "Traceback" not in err
         message = " ".join(err.split())
-        assert words in message, f"{scan.__name__}: {message}"
+        assert words in message, f"{name}: {message}"
         # Progress before it is the same for several; its end is not.
-        said[scan.__name__] = err.strip().splitlines()[-1]
+        said[name] = err.strip().splitlines()[-1]
         assert sorted(folder.iterdir()) == before, "something was written"
-    assert len(set(said.values())) == len(SCANS), said
+    assert len(set(said.values())) == len(said) == 10, said
     assert not list((tmp_path / "cache" / "cathsim_dmc").glob("**/*"))

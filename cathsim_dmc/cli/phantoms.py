@@ -51,8 +51,8 @@ def import_phantom(
         heart: Near the end of the aorta that is at the heart; found if not given.
         rename: Names of computed branches, each as computed=wanted.
     """
-    from cathsim_dmc.anatomy.scan import report
     from cathsim_dmc.anatomy.scan.importer import import_scan
+    from cathsim_dmc.anatomy.scan.places import describe
     from cathsim_dmc.validation import views
 
     changes = dict(_change(text) for text in rename)
@@ -77,13 +77,12 @@ def import_phantom(
     )
     anatomy.save(out)
     views.draw(anatomy, out / _PICTURE)
-    figures = report.describe(anatomy)
     print_json(
         {
             "directory": str(out),
             "picture": str(out / _PICTURE),
             "notes": notes,
-            **figures,
+            **describe(anatomy),
         }
     )
     return 0

@@ -1,17 +1,15 @@
 """The aorta of a lumen: its two ends, its bend, and which end is at the heart."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Self
 
 import numpy as np
 from scipy.ndimage import gaussian_filter1d
-from scipy.spatial.distance import cdist
 
 from cathsim_dmc.anatomy.centreline import arc_lengths
-from cathsim_dmc.anatomy.scan.centring import resample
-from cathsim_dmc.anatomy.scan.ends import FreeEnd
+from cathsim_dmc.anatomy.scan.centring import resample, tangents
+from cathsim_dmc.anatomy.scan.extract import FreeEnd
 from cathsim_dmc.anatomy.scan.ways import Ways
 
 RADIUS = 4.5e-3  # m, least median radius of an aorta
@@ -80,14 +78,13 @@ class Bend:
     along: np.ndarray
 
     @classmethod
-    def of(cls, way: np.ndarray, branches: Sequence[np.ndarray] = ()) -> Bend:
+    def of(cls, way: np.ndarray, branches: Sequence[np.ndarray] = ()) -> Self:
         """The bend of a way (n, 3) m, with branches (m_i, 3) m that leave it."""
         line = resample(way)
         width = min(SMOOTH / 1e-3, len(line) / 6)
         line = gaussian_filter1d(line, width, axis=0, mode="nearest")
         reach = max(2, min(round(ARM / 1e-3), len(line) // 3))
-        tangent = np.gradient(line, axis=0)
-        tangent /= np.maximum(np.linalg.norm(tangent, axis=1, keepdims=True), 1e-12)
+        tangent = tangents(line)
         rows = np.arange(len(line))
         first = np.maximum(rows - reach, 0)
         last = np.minimum(rows + reach, len(line) - 1)
@@ -131,9 +128,8 @@ class Bend:
         """
         height, top = self.line @ self.head, self.top
         off = np.abs(height - max(height[0], height[-1], height[top] - ARM))
-        x, y, _ = (
-            self.line[top + off[top:].argmin()] - self.line[off[: top + 1].argmin()]
-        )
+        first, last = off[: top + 1].argmin(), top + off[top:].argmin()
+        x, y, _ = self.line[last] - self.line[first]
         if not self.upright or np.hypot(x, y) < 10e-3:
             return None
         return float(np.arctan2(-x, -y) if heart_last else np.arctan2(x, y))
@@ -153,45 +149,36 @@ def mirrored(azimuth: float | None) -> str | None:
     )
 
 
-def heart_evidence(
-    bend: Bend, depth: np.ndarray, first: float, last: float
-) -> tuple[float, list[str]]:
-    """Log odds that the heart is at the last point of the aorta, and what says so.
+def heart_odds(bend: Bend, depth: np.ndarray, places: Sequence[float]) -> float:
+    """Log odds that the heart is at the last point of the aorta, branches aside.
 
     Args:
         bend: of the aorta.
         depth: (n,) m, of the points of its line.
-        first: m, arc length at which its first branch leaves, of those of the arch.
-        last: m, the same of its last branch.
+        places: m, arc lengths at which the branches of the arch leave.
     """
+    first, last = min(places), max(places)
     s = 1e-3 * np.arange(len(bend.line))
-    total, why = 0.0, []
-
-    def add(value: float, most: float, text: str) -> None:
-        nonlocal total
-        value = float(np.clip(value, -most, most))
-        total += value
-        if abs(value) > 0.2:
-            why.append(f"{text} ({value:+.1f})")
-
     legs = [
         (s > max(first - 10e-3 - LEG, 5e-3)) & (s < first - 10e-3),
         (s > last + 10e-3) & (s < min(last + 10e-3 + LEG, s[-1] - 5e-3)),
     ]
+    total = 0.0
     if all(leg.sum() >= 10 for leg in legs):
         before, after = (float(np.median(depth[leg])) for leg in legs)
         # Diameters 29.5 and 23.9 mm; their ratio has a standard deviation of 15 %.
-        add(18.0 * np.log(after / before), 4.0, "width of the legs")
+        total += np.clip(18.0 * np.log(after / before), -4.0, 4.0)
     # The ascending aorta is 63 (11) mm long up to its branches, or cut off.
     longer = [max(leg - ASCENDING, 0.0) / LONGER for leg in (first, s[-1] - last)]
-    add(min(longer[0], 5.0) - min(longer[1], 5.0), 5.0, "length of the legs")
+    total += min(longer[0], 5.0) - min(longer[1], 5.0)
+    # The branches leave before the top.
     before = 1e-3 * bend.top - 0.5 * (first + last)
-    add(-2.0 * BEFORE * before / BEFORE_SPREAD**2, 2.5, "branches before the top")
+    total += np.clip(-2.0 * BEFORE * before / BEFORE_SPREAD**2, -2.5, 2.5)
+    # The descending leg is behind and left.
     azimuth = bend.azimuth(heart_last=True)
     if azimuth is not None:
-        right, wrong = _facing(azimuth), _facing(azimuth + np.pi)
-        add(float(np.log(right / wrong)), np.inf, "descending leg behind and left")
-    return total, why
+        total += np.log(_facing(azimuth) / _facing(azimuth + np.pi))
+    return float(total)
 
 
 def _facing(azimuth: float) -> float:
@@ -200,11 +187,6 @@ def _facing(azimuth: float) -> float:
     peak = np.exp(-0.5 * (off / FACING_SPREAD) ** 2)
     peak /= FACING_SPREAD * np.sqrt(2.0 * np.pi)
     return float((1.0 - TURNED) * peak + TURNED / (2.0 * np.pi))
-
-
-def depth_along(ways: Ways, way: np.ndarray, line: np.ndarray) -> np.ndarray:
-    """Depth (m,) of the lumen on a smoothed line (m, 3) of a way (n,) of nodes."""
-    return ways.depth[way][cdist(line, ways.points[way]).argmin(axis=1)]
 
 
 def chord(row: np.ndarray) -> np.ndarray:

@@ -1,10 +1,9 @@
 """Curves moved to the middle of a lumen."""
 
-from __future__ import annotations
-
 import numpy as np
 from scipy.ndimage import gaussian_filter1d
 
+from cathsim_dmc.anatomy.centreline import arc_lengths
 from cathsim_dmc.anatomy.surface_depth import SurfaceDepth
 
 STEP = 1e-3  # m, spacing of the centrelines that result
@@ -21,21 +20,15 @@ SLIT = 1.25  # of the ball's radius: a section's radius is no larger
 
 def resample(points: np.ndarray, step: float = STEP) -> np.ndarray:
     """Points of a polyline (n, 3) m at equal distances of about ``step``."""
-    lengths = np.linalg.norm(np.diff(points, axis=0), axis=1)
-    points = points[np.concatenate([[True], lengths > 1e-9])]
-    lengths = lengths[lengths > 1e-9]
-    s = np.concatenate([[0.0], np.cumsum(lengths)])
-    count = max(2, int(round(s[-1] / step)) + 1)
-    t = np.linspace(0.0, s[-1], count)
+    apart = np.linalg.norm(np.diff(points, axis=0), axis=1) > 1e-9
+    points = points[np.concatenate([[True], apart])]
+    s = arc_lengths(points)
+    t = np.linspace(0.0, s[-1], max(2, int(round(s[-1] / step)) + 1))
     return np.stack([np.interp(t, s, points[:, k]) for k in range(3)], -1)
 
 
 def centred(
-    field: SurfaceDepth,
-    curve: np.ndarray,
-    *,
-    fixed_start: bool = False,
-    rounds: int = ROUNDS,
+    field: SurfaceDepth, curve: np.ndarray, *, fixed_start: bool = False
 ) -> np.ndarray:
     """Move a curve (n, 3) sideways towards the middle of the lumen.
 
@@ -43,8 +36,8 @@ def centred(
     step shrinks, so that the curve settles on the ridge of the depth.
     """
     points = curve.copy()
-    for turn in range(rounds):
-        share = 1.0 - turn / rounds
+    for turn in range(ROUNDS):
+        share = 1.0 - turn / ROUNDS
         sides = _across(points)
         offsets = REACH * np.concatenate([sides, -sides], axis=1)
         around = field(points[:, None] + offsets) / (2.0 * REACH)
@@ -61,10 +54,15 @@ def centred(
     return resample(_smoothed(points, field(points)))
 
 
+def tangents(points: np.ndarray) -> np.ndarray:
+    """Unit vectors (n, 3) along a curve (n, 3)."""
+    step = np.gradient(points, axis=0)
+    return step / np.maximum(np.linalg.norm(step, axis=1, keepdims=True), 1e-12)
+
+
 def _across(points: np.ndarray) -> np.ndarray:
     """Two unit vectors (n, 2, 3) across a curve (n, 3)."""
-    tangent = np.gradient(points, axis=0)
-    tangent /= np.maximum(np.linalg.norm(tangent, axis=1, keepdims=True), 1e-12)
+    tangent = tangents(points)
     u = np.cross(tangent, np.eye(3)[np.abs(tangent).argmin(axis=1)])
     u /= np.linalg.norm(u, axis=1, keepdims=True)
     return np.stack([u, np.cross(tangent, u)], axis=1)
@@ -78,22 +76,16 @@ def section_radii(field: SurfaceDepth, points: np.ndarray) -> np.ndarray:
     the middle changes it; of a narrow one the radius of the largest ball.
     """
     ball = field(points)
-    radii = ball.copy()
-    wide = ball > BALL
-    if not wide.any():
-        return radii
     angle = 2.0 * np.pi * np.arange(RAYS) / RAYS
     turn = np.stack([np.cos(angle), np.sin(angle)], axis=1)
-    rays = np.einsum("rs,nsd->nrd", turn, _across(points)[wide])
-    reach = np.repeat(ball[wide][:, None], RAYS, axis=1)
+    rays = np.einsum("rs,nsd->nrd", turn, _across(points))
+    reach = np.repeat(ball[:, None], RAYS, axis=1)
     # A ball of the lumen's depth holds no wall: step on by it. An ostium never ends.
-    limit = SLIT * ball[wide][:, None]
     for _ in range(4):
-        depth = field(points[wide][:, None] + reach[..., None] * rays)
-        reach = np.minimum(reach + np.maximum(depth, 0.0), limit)
-    share = np.clip((ball[wide] - BALL) / (SECTION - BALL), 0.0, 1.0)
-    radii[wide] += share * (np.median(reach, axis=1) - ball[wide])
-    return radii
+        depth = field(points[:, None] + reach[..., None] * rays)
+        reach = np.minimum(reach + np.maximum(depth, 0.0), SLIT * ball[:, None])
+    share = np.clip((ball - BALL) / (SECTION - BALL), 0.0, 1.0)
+    return ball + share * (np.median(reach, axis=1) - ball)
 
 
 def _smoothed(points: np.ndarray, depth: np.ndarray) -> np.ndarray:
@@ -105,17 +97,9 @@ def _smoothed(points: np.ndarray, depth: np.ndarray) -> np.ndarray:
     """
     width = np.clip(SMOOTH * (depth - NARROW) / STEP, 0.0, 12.0)
     pad = min(len(points) - 1, 40)
-    padded = np.concatenate(
-        [
-            2.0 * points[0] - points[pad:0:-1],
-            points,
-            2.0 * points[-1] - points[-2 : -pad - 2 : -1],
-        ]
-    )
+    padded = np.pad(points, ((pad, pad), (0, 0)), mode="reflect", reflect_type="odd")
     levels = np.array([0.0, 1.0, 2.0, 4.0, 8.0, 12.0])
-    bank = np.stack(
-        [_gauss(padded, sigma)[pad:-pad] if sigma else points for sigma in levels]
-    )
+    bank = np.stack([points, *(_gauss(padded, x)[pad:-pad] for x in levels[1:])])
     at = np.interp(width, levels, np.arange(len(levels)))
     low = np.minimum(at.astype(int), len(levels) - 2)
     rest = (at - low)[:, None]

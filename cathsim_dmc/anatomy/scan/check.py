@@ -1,15 +1,13 @@
 """Checks of a vessel tree against the surface of its lumen."""
 
-from __future__ import annotations
-
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial import cKDTree
 
 from cathsim_dmc.anatomy import geodesic
 from cathsim_dmc.anatomy.anatomy import Anatomy
-from cathsim_dmc.anatomy.centreline import Vessel
+from cathsim_dmc.anatomy.centreline import CentrelinePoint
 from cathsim_dmc.anatomy.parts import INLET_HOLE_RADIUS
 from cathsim_dmc.anatomy.scan.aorta import TURN, Bend, mirrored
 from cathsim_dmc.anatomy.scan.naming import ARCH_BRANCHES
@@ -27,7 +25,7 @@ JOINS = 15e-3  # m of lumen between the end of a vessel and another that it join
 PASSABLE = 0.6e-3  # m, depth of a lumen that counts as going on
 BESIDE = 15e-3  # m that two vessels may run in one lumen beyond their parting
 VOLUME = (0.5e-6, 2e-3)  # m^3 of a lumen
-RADIUS = (0.3e-3, 30e-3)  # m, median of a vessel
+RADII = (0.3e-3, 30e-3)  # m, allowed median of a vessel: arteriole, aneurysm
 WIDEST = 45e-3  # m
 ONE_OSTIUM = 3e-3  # m of the aorta between ostia that are one
 START = 75e-3  # m past the inlet, deepest start of a device
@@ -35,8 +33,7 @@ START_CLEARANCE = 1e-3  # m between the device and the wall there
 START_ROOM = 10e-3  # m between the head at the start and a goal's ostium
 
 
-@dataclass(frozen=True)
-class TreeCheck:
+class TreeCheck(NamedTuple):
     """One finding about a tree.
 
     Attributes:
@@ -62,24 +59,14 @@ def check_tree(anatomy: Anatomy) -> list[TreeCheck]:
         free ends, goals, sizes, the inlet, and the start of the device.
     """
     measure = SurfaceDepth(anatomy.surface)
-    return [
-        _inside(anatomy, measure),
-        _own_lumen(anatomy),
-        _parents(anatomy),
-        _sides(anatomy),
-        _free_ends(anatomy, measure),
-        _goals(anatomy, measure),
-        _sizes(anatomy),
-        _inlet(anatomy, measure),
-        _start(anatomy, measure),
-    ]
+    out = []
+    for name, look in _CHECKS.items():
+        wrong, fine = look(anatomy, measure)
+        out.append(TreeCheck(name, not wrong, "; ".join(wrong) or fine))
+    return out
 
 
-def _finding(name: str, wrong: list[str], fine: str) -> TreeCheck:
-    return TreeCheck(name, not wrong, "; ".join(wrong) if wrong else fine)
-
-
-def _inside(anatomy: Anatomy, measure: SurfaceDepth) -> TreeCheck:
+def _inside(anatomy: Anatomy, measure: SurfaceDepth) -> tuple[list[str], str]:
     wrong, least = [], np.inf
     for key, vessel in anatomy.tree.vessels.items():
         line = vessel.centreline
@@ -98,46 +85,36 @@ def _inside(anatomy: Anatomy, measure: SurfaceDepth) -> TreeCheck:
                 f"{key} leaves the lumen {s[worst] * 1e3:.0f} mm from its start, at "
                 f"{in_mm(place.position[worst])}, by {-depth[worst] * 1e3:.1f} mm"
             )
-    return _finding(
-        "centrelines in the lumen", wrong, f"at least {least * 1e3:.2f} mm deep"
-    )
+    return wrong, f"at least {least * 1e3:.2f} mm deep"
 
 
-def _own_lumen(anatomy: Anatomy) -> TreeCheck:
+def _own_lumen(anatomy: Anatomy, _: SurfaceDepth) -> tuple[list[str], str]:
     wrong = []
     vessels = list(anatomy.tree.vessels.values())
     for vessel in vessels:
-        s, own = _own_part(vessel)
+        line = vessel.centreline
+        own = line.at(np.arange(vessel.ostium, line.length, STEP))
         for other in vessels:
             if other is vessel or other.parent == vessel.name:
                 continue
             place = other.centreline.project(own.position)
-            reach = 0.5 * np.minimum(place.radius, own.radius)
-            beside = place.distance < reach
+            beside = place.distance < 0.5 * np.minimum(place.radius, own.radius)
             if other.parent is not None:
                 beside &= place.arc_length > other.ostium
-            length = STEP * int(beside.sum())
-            if length > BESIDE:
+            if (length := STEP * int(beside.sum())) > BESIDE:
                 wrong.append(
                     f"{vessel.name} runs {length * 1e3:.0f} mm in the lumen of "
                     f"{other.name}, around {in_mm(own.position[beside.argmax()])}"
                 )
-    return _finding("every vessel in a lumen of its own", wrong, f"{len(vessels)}")
+    return wrong, f"{len(vessels)}"
 
 
-def _own_part(vessel: Vessel):
-    line = vessel.centreline
-    s = np.arange(vessel.ostium, line.length, STEP)
-    return s, line.at(s)
-
-
-def _parents(anatomy: Anatomy) -> TreeCheck:
+def _parents(anatomy: Anatomy, _: SurfaceDepth) -> tuple[list[str], str]:
     wrong = []
-    tree = anatomy.tree
-    for key, vessel in tree.vessels.items():
+    for key, vessel in anatomy.tree.vessels.items():
         if vessel.parent is None:
             continue
-        parent = tree.vessel(vessel.parent)
+        parent = anatomy.tree.vessel(vessel.parent)
         place = parent.centreline.project(vessel.centreline.points[0])
         if place.distance > place.radius:
             wrong.append(
@@ -149,10 +126,10 @@ def _parents(anatomy: Anatomy) -> TreeCheck:
                 f"{key} leaves {parent.name} {place.arc_length * 1e3:.0f} mm from its "
                 f"start, before that has an ostium ({parent.ostium * 1e3:.0f} mm)"
             )
-    return _finding("branches on their parents", wrong, "in order")
+    return wrong, "in order"
 
 
-def _sides(anatomy: Anatomy) -> TreeCheck:
+def _sides(anatomy: Anatomy, _: SurfaceDepth) -> tuple[list[str], str]:
     """Whether the arch leads from right and front to left and back, as named.
 
     It tells a scan that is mirrored, or whose frame is not what it was said to be.
@@ -161,105 +138,88 @@ def _sides(anatomy: Anatomy) -> TreeCheck:
     root = tree.root
     vessels = [tree.vessels[key] for key in ARCH_BRANCHES if key in tree.vessels]
     vessels = [vessel for vessel in vessels if vessel.parent == root.name]
-    names = [vessel.name for vessel in vessels]
+    if len(vessels) < 2:
+        return [], "no arch"
     ostia = [vessel.mouth.position for vessel in vessels]
-    along = np.diff([root.centreline.project(ostium).arc_length for ostium in ostia])
+    along = np.diff(root.centreline.project(np.array(ostia)).arc_length)
     # What leaves in one lumen, as in a bovine arch, has no order.
     apart = along[np.abs(along) > ONE_OSTIUM]
     if (apart > 0).any() and (apart < 0).any():
-        wrong.append(f"{', '.join(names)} do not leave {root.name} in this order")
-    fine = f"{len(vessels)} in order" if len(vessels) > 1 else "no arch"
+        names = ", ".join(vessel.name for vessel in vessels)
+        wrong.append(f"{names} do not leave {root.name} in this order")
+    fine = f"{len(vessels)} in order"
     bend = Bend.of(root.centreline.points, [v.centreline.points for v in vessels])
-    if len(vessels) > 1 and bend.turn > TURN:
+    if bend.turn > TURN:
         if (text := mirrored(bend.azimuth(bool(along.sum() < 0)))) is not None:
             wrong.append(text)
         elif not bend.upright:
             fine += ", in a scan that does not stand upright"
-    return _finding("branches of the arch on their sides", wrong, fine)
+    return wrong, fine
 
 
-def _free_ends(anatomy: Anatomy, measure: SurfaceDepth) -> TreeCheck:
+def _free_ends(anatomy: Anatomy, measure: SurfaceDepth) -> tuple[list[str], str]:
     wrong, farthest = [], 0.0
-    tree = anatomy.tree
-    for key, vessel in tree.vessels.items():
+    vessels = anatomy.tree.vessels
+    for key, vessel in vessels.items():
         line = vessel.centreline
-        goes_on = any(
-            v.parent == key and tree.origin(v.name) > line.length - 2e-3
-            for v in tree.vessels.values()
-        )
-        if goes_on:
-            continue
+        branches = [name for name, other in vessels.items() if other.parent == key]
+        if any(anatomy.tree.origin(name) > line.length - 2e-3 for name in branches):
+            continue  # goes on in its branches
         end = line.at(line.length)
         tail = line.radii[line.arc_length > line.length - 30e-3]
         wide = float(max(tail.max(), end.radius))
-        ahead = _lumen_beyond(
-            measure, end.position, end.tangent, wide, float(end.radius)
-        )
-        beyond = float(np.linalg.norm(ahead - end.position, axis=1).max(initial=0.0))
+        ahead = _lumen_beyond(measure, end, wide)
+        gap = np.linalg.norm(ahead - end.position, axis=1)
+        beyond = float(gap.max(initial=0.0))
         # What no device can follow was cut off, and is not missing.
         cut = TAIL + END_TRIM if end.radius < NARROW_END * TAIL_RADIUS else 0.0
         if beyond <= max(FREE, FREE_RADII * wide, cut):
             farthest = max(farthest, beyond)
             continue
         # Or it ends in another vessel, where a ring of vessels closes.
-        near = ahead[np.linalg.norm(ahead - end.position, axis=1) < JOINS + wide]
-        others = [v.centreline for v in tree.vessels.values() if v is not vessel]
+        near = ahead[gap < JOINS + wide]
+        others = [v.centreline for v in vessels.values() if v is not vessel]
         places = [other.project(near) for other in others]
-        if any((place.distance < 0.7 * place.radius).any() for place in places):
-            continue
-        wrong.append(
-            f"{key} ends at {in_mm(end.position)}, but its lumen goes on for "
-            f"{beyond * 1e3:.0f} mm or more"
-        )
-    return _finding(
-        "vessels end at ends of the surface",
-        wrong,
-        f"at most {farthest * 1e3:.1f} mm before",
-    )
+        if not any((place.distance < 0.7 * place.radius).any() for place in places):
+            wrong.append(
+                f"{key} ends at {in_mm(end.position)}, but its lumen goes on for "
+                f"{beyond * 1e3:.0f} mm or more"
+            )
+    return wrong, f"at most {farthest * 1e3:.1f} mm before"
 
 
 def _lumen_beyond(
-    depth: SurfaceDepth,
-    position: np.ndarray,
-    tangent: np.ndarray,
-    radius: float,
-    narrow: float,
+    depth: SurfaceDepth, end: CentrelinePoint, radius: float
 ) -> np.ndarray:
-    """Lattice points (n, 3) of the passable lumen ahead of a place, within 60 mm.
+    """Lattice points (n, 3) of the passable lumen ahead of an end, within 60 mm.
 
     Args:
         depth: of the lumen.
-        position: (3,) m, in the lumen.
-        tangent: (3,), unit, ahead.
-        radius: m, of the lumen up to here: what lies behind is cut off there.
-        narrow: m, radius at the place itself.
+        end: of a centreline.
+        radius: m, of the lumen up to there: what lies behind is cut off there.
     """
     reach = (FREE_RADII + 1.5) * radius
-    spacing = float(np.clip(max(narrow / 3.0, reach / 40.0), 0.5e-3, 2.0e-3))
-    reach = max(24 * spacing, reach)
-    shape = np.full(3, 2 * round(reach / spacing) + 1)
-    low = position - 0.5 * (shape - 1) * spacing
+    narrow = float(end.radius) / 3.0
+    spacing = float(np.clip(max(narrow, reach / 40.0), 0.5e-3, 2.0e-3))
+    shape = np.full(3, 2 * round(max(24 * spacing, reach) / spacing) + 1)
+    low = end.position - 0.5 * (shape - 1) * spacing
     # Lattice points lie beside the middle. Tails are cut off at `TAIL_RADIUS`.
     deep = max(PASSABLE, TAIL_RADIUS - 0.5 * spacing)
     ijk, _ = geodesic.inside(depth, low, shape, spacing, deep)
-    local = low + spacing * ijk - position
-    along = local @ tangent
-    aside = np.linalg.norm(local - along[:, None] * tangent, axis=1)
+    local = low + spacing * ijk - end.position
+    along = local @ end.tangent
+    aside = np.linalg.norm(local - along[:, None] * end.tangent, axis=1)
     behind = (along < 0.0) & (along > -2.0 * spacing) & (aside < 1.6 * radius + 2e-3)
-    points = local[~behind] + position
-    if not len(points):
-        return points
-    pairs = cKDTree(points).query_pairs(1.8 * spacing, output_type="ndarray")
-    label = groups(len(points), pairs)
-    gap = np.linalg.norm(points - position, axis=1)
-    gap[(points - position) @ tangent < -1e-9] = np.inf
-    nearest = int(gap.argmin())
-    if gap[nearest] > radius + 2.0 * spacing:
-        return points[:0]
-    return points[label == label[nearest]]
+    local, along = local[~behind], along[~behind]
+    gap = np.where(along < -1e-9, np.inf, np.linalg.norm(local, axis=1))
+    if gap.min(initial=np.inf) > radius + 2.0 * spacing:
+        return np.empty((0, 3))
+    pairs = cKDTree(local).query_pairs(1.8 * spacing, output_type="ndarray")
+    label = groups(len(local), pairs)
+    return local[label == label[gap.argmin()]] + end.position
 
 
-def _goals(anatomy: Anatomy, measure: SurfaceDepth) -> TreeCheck:
+def _goals(anatomy: Anatomy, measure: SurfaceDepth) -> tuple[list[str], str]:
     wrong = []
     for name, goal in anatomy.goals.items():
         line = anatomy.tree.vessel(goal.vessel).centreline
@@ -274,10 +234,10 @@ def _goals(anatomy: Anatomy, measure: SurfaceDepth) -> TreeCheck:
             wrong.append(f"{name} lies in {best}, not in {goal.vessel}")
         if not float(measure(goal.position)) > 0.0:
             wrong.append(f"{name} lies outside the lumen")
-    return _finding("goals in their vessels", wrong, f"{len(anatomy.goals)} goals")
+    return wrong, f"{len(anatomy.goals)} goals"
 
 
-def _sizes(anatomy: Anatomy) -> TreeCheck:
+def _sizes(anatomy: Anatomy, _: SurfaceDepth) -> tuple[list[str], str]:
     wrong = []
     volume = anatomy.surface.volume
     if not VOLUME[0] <= volume <= VOLUME[1]:
@@ -287,39 +247,35 @@ def _sizes(anatomy: Anatomy) -> TreeCheck:
         )
     for key, vessel in anatomy.tree.vessels.items():
         own = vessel.centreline.radii[vessel.centreline.arc_length >= vessel.ostium]
-        middle, widest = float(np.median(own)), float(own.max())
-        if not RADIUS[0] <= middle <= RADIUS[1] or widest > WIDEST:
+        middle = float(np.median(own))
+        if not RADII[0] <= middle <= RADII[1] or own.max() > WIDEST:
             wrong.append(
                 f"{key} has a radius of {middle * 1e3:.3g} mm (median; allowed "
-                f"{RADIUS[0] * 1e3:g} to {RADIUS[1] * 1e3:g})"
+                f"{RADII[0] * 1e3:g} to {RADII[1] * 1e3:g})"
             )
-    return _finding("sizes of vessels", wrong, f"{volume * 1e6:.0f} ml")
+    return wrong, f"{volume * 1e6:.0f} ml"
 
 
-def _inlet(anatomy: Anatomy, measure: SurfaceDepth) -> TreeCheck:
+def _inlet(anatomy: Anatomy, measure: SurfaceDepth) -> tuple[list[str], str]:
     inlet, wrong = anatomy.inlet, []
-    line = anatomy.tree.vessel(inlet.vessel).centreline
-    place = line.project(inlet.position)
+    place = anatomy.tree.vessel(inlet.vessel).centreline.project(inlet.position)
     if place.distance > place.radius:
-        wrong.append(
-            f"it lies {place.distance * 1e3:.0f} mm from the centreline of "
-            f"{inlet.vessel}"
-        )
+        away = f"{place.distance * 1e3:.0f} mm from the centreline of {inlet.vessel}"
+        wrong.append(f"it lies {away}")
     s = np.linspace(1e-3, max(2e-3, 0.5 * inlet.radius), 5)
-    ahead = measure(inlet.position + s[:, None] * inlet.direction)
-    if ahead.min() <= 0.0:
+    if measure(inlet.position + s[:, None] * inlet.direction).min() <= 0.0:
         wrong.append("its direction does not lead into the lumen")
     if inlet.radius < INLET_HOLE_RADIUS:
         wrong.append(
             f"its radius of {inlet.radius * 1e3:.2g} mm is less than that of the "
             f"sheath's hole ({INLET_HOLE_RADIUS * 1e3:.2g} mm)"
         )
-    return _finding("inlet", wrong, f"{inlet.radius * 2e3:.1f} mm wide")
+    return wrong, f"{inlet.radius * 2e3:.1f} mm wide"
 
 
-def _start(anatomy: Anatomy, measure: SurfaceDepth) -> TreeCheck:
+def _start(anatomy: Anatomy, measure: SurfaceDepth) -> tuple[list[str], str]:
     """Whether a device that starts straight begins before every goal's ostium."""
-    inlet, wrong = anatomy.inlet, []
+    inlet, tree, wrong = anatomy.inlet, anatomy.tree, []
     s = np.arange(START_CLEARANCE, START, STEP)
     depth = measure(inlet.position + s[:, None] * inlet.direction)
     # At the inlet's cap the surface is near, but open.
@@ -329,18 +285,28 @@ def _start(anatomy: Anatomy, measure: SurfaceDepth) -> TreeCheck:
     for name, goal in anatomy.goals.items():
         if goal.vessel == inlet.vessel:
             continue
-        lineage, tree = goal.vessel, anatomy.tree
-        while (parent := tree.vessel(lineage).parent) not in (inlet.vessel, None):
-            lineage = parent
-        branch = tree.vessel(lineage)
+        branch = tree.vessel(goal.vessel)
+        while branch.parent not in (inlet.vessel, None):
+            branch = tree.vessel(branch.parent)
         ostium = branch.mouth.position
-        route = anatomy.route(name)
-        here = float(route.project(head).arc_length)
-        there = float(route.project(ostium).arc_length)
+        here, there = anatomy.route(name).project(np.stack([head, ostium])).arc_length
         if here > there - START_ROOM:
             wrong.append(
-                f"the ostium of {lineage} is {there * 1e3:.0f} mm from the inlet and a "
-                f"device starts {here * 1e3:.0f} mm deep, past it: {name} cannot be "
-                "reached; choose an inlet farther back"
+                f"the ostium of {branch.name} is {there * 1e3:.0f} mm from the inlet "
+                f"and a device starts {here * 1e3:.0f} mm deep, past it: {name} cannot "
+                "be reached; choose an inlet farther back"
             )
-    return _finding("start of the device", wrong, f"{run * 1e3:.0f} mm deep at most")
+    return wrong, f"{run * 1e3:.0f} mm deep at most"
+
+
+_CHECKS = {
+    "centrelines in the lumen": _inside,
+    "every vessel in a lumen of its own": _own_lumen,
+    "branches on their parents": _parents,
+    "branches of the arch on their sides": _sides,
+    "vessels end at ends of the surface": _free_ends,
+    "goals in their vessels": _goals,
+    "sizes of vessels": _sizes,
+    "inlet": _inlet,
+    "start of the device": _start,
+}

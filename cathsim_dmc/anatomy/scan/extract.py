@@ -1,16 +1,22 @@
-"""Centrelines computed from a lumen's surface."""
-
-from __future__ import annotations
+"""Free ends of a lumen, its inlet, and centrelines computed between them."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from typing import Any, NamedTuple
 
 import numpy as np
+from scipy.spatial.distance import cdist
 
-from cathsim_dmc.anatomy.scan.ends import Cover, FreeEnd, LumenEntry, length_of
+from cathsim_dmc.anatomy.centreline import arc_lengths
 from cathsim_dmc.anatomy.scan.topology import groups
-from cathsim_dmc.anatomy.scan.ways import CELL, Ways
+from cathsim_dmc.anatomy.scan.units import in_mm
+from cathsim_dmc.anatomy.scan.ways import CELL, Ways, common
 
+END_SEARCH = 15e-3  # m from a blind end in which its width is looked for
+COVER = 1.5  # radii; what lies nearer to a way is no vessel of its own
+STUB = 3e-3  # m, shortest own vessel beyond that
+WIDE = 0.4  # of the widest free end: narrower ends are no inlet by default
+ROOT_WIDTH = 0.5  # of the inlet: narrower free ends do not continue the root
+STARTS = 30e-3  # m along the lumen; curves that start nearer to an end start there
 DEVICE_RADIUS = 0.84e-3  # m, 5 Fr catheter (1 Fr = 1/3 mm diameter)
 BRANCH = 15e-3  # m, shortest passable length of a branch worth a name
 # A ring of vessels has no free end: two ways from the inlet meet in it. They come from
@@ -21,24 +27,188 @@ APART_MIN = 4e-3  # m
 RING = 40e-3  # m, shortest ring
 
 
-@dataclass(frozen=True)
-class Found:
-    """A computed centreline, from the inlet to an end.
+class FreeEnd(NamedTuple):
+    """A blind end of the lumen.
 
     Attributes:
-        points: (n, 3) m, first point at the inlet.
-        tip: (3,) m, where it ends.
-        own: m, length that it shares with no wider one.
+        position: (3,) m.
+        radius: m, of the lumen near the end.
+        bottleneck: m, largest sphere that reaches the widest part from here.
     """
 
-    points: np.ndarray
-    tip: np.ndarray
-    own: float
+    position: np.ndarray
+    radius: float
+    bottleneck: float
+
+
+class Cover:
+    """Nodes in or close to vessels that are already known."""
+
+    def __init__(self, ways: Ways):
+        """Nothing is covered yet."""
+        self._ways = ways
+        self._centres, self._reach = np.empty((0, 3)), np.empty(0)
+
+    def add(self, way: np.ndarray) -> None:
+        """Cover the surroundings of a way (n,) of nodes."""
+        # Every other point does: their spheres overlap.
+        way = way[::2]
+        self._centres = np.concatenate([self._centres, self._ways.points[way]])
+        reach = COVER * self._ways.depth[way] + 1e-3
+        self._reach = np.concatenate([self._reach, reach])
+
+    def own_part(self, way: np.ndarray) -> np.ndarray:
+        """Nodes of a way, given from its tip on, before it meets what is covered."""
+        gap = cdist(self._ways.points[way], self._centres)
+        met = (gap < self._reach).any(axis=1)
+        return way[: int(met.argmax())] if met.any() else way
+
+
+def free_ends(ways: Ways) -> list[FreeEnd]:
+    """Blind ends of the lumen, bulges left out."""
+    nodes = ways.nodes
+    centre = int(nodes[ways.depth[nodes].argmax()])
+    before = ways.deepest_from(centre)
+    # Seen from one blind end, every other one is farther than all around it.
+    first = int(nodes[ways.lengths_from(centre)[nodes].argmax()])
+    reach = ways.lengths_from(first)
+    # Own vessels are told on the ways to that end: the widest place may be one, too.
+    back = ways.deepest_from(first)
+    taken = np.zeros(len(ways.points), dtype=bool)
+    cover, ends = Cover(ways), []
+    # Nodes of the largest piece from which no neighbour is farther.
+    rows, cols = ways.links.T
+    top = ways.main.copy()
+    top[rows[reach[cols] > reach[rows]]] = False
+    top[cols[reach[rows] > reach[cols]]] = False
+    tips = np.flatnonzero(top)
+    for node in [first, *tips[np.argsort(-reach[tips])]]:
+        covered = not len(cover.own_part(np.array([node])))
+        if taken[node] or (node != first and covered):
+            continue
+        way = ways.trace(before, node)[::-1]
+        along, depth = arc_lengths(ways.points[way]), ways.depth[way]
+        local = float(depth[along < END_SEARCH].max())
+        near = ways.around(node, 2.5 * local)
+        taken[near] = True
+        if node != first:
+            if reach[near].max() > reach[node] + 1e-9:
+                continue
+            path = ways.trace(back, node)[::-1]
+            own = cover.own_part(path)
+            if ways.length(own) < max(STUB, float(np.median(ways.depth[own]))):
+                continue  # a bulge of a vessel that is known
+            cover.add(path)
+        # The depth falls to nothing at the very end, which is no bottleneck.
+        inner = along > 2.0 * local
+        narrow = float(depth[inner].min()) if inner.any() else local
+        part = (along > 0.5 * local) & (along < END_SEARCH)
+        radius = float(np.median(depth[part])) if part.any() else local
+        ends.append(FreeEnd(ways.points[node], radius, narrow))
+    return ends
+
+
+class LumenEntry(NamedTuple):
+    """Where the device enters and where the root vessel leads.
+
+    Attributes:
+        position: (3,) m.
+        at_end: whether that is a free end, or a place where the lumen is cut.
+        far: (3,) m, far end of the root, or None.
+    """
+
+    position: np.ndarray
+    at_end: bool
+    far: np.ndarray | None
+
+
+def plan_inlet(
+    ways: Ways,
+    ends: Sequence[FreeEnd],
+    curves: Sequence[np.ndarray],
+    inlet: np.ndarray | None,
+) -> LumenEntry:
+    """Choose where the device enters and where the root vessel leads.
+
+    Args:
+        ways: of the lumen.
+        ends: its free ends.
+        curves: (n_i, 3) m, given centrelines, first point proximal; may be empty.
+        inlet: (3,) m near the end to use or in the middle of a vessel that is to be
+            cut there, or None to choose: the end at which the curves start, else the
+            wide end farthest along the lumen from their starts. Without curves it is
+            the widest.
+
+    Raises:
+        ValueError: if no end can be chosen; lists them.
+    """
+    nodes = [ways.node(end.position) for end in ends]
+    width = np.array([end.bottleneck for end in ends])
+    # Ends at which a curve ends are no candidates.
+    free = np.ones(len(ends), dtype=bool)
+    close = np.array([max(2.5 * end.radius, 4e-3) for end in ends])
+    for curve in curves:
+        gap = np.array([np.linalg.norm(end.position - curve[-1]) for end in ends])
+        nearest = int((gap / close).argmin())
+        free[nearest] &= gap[nearest] >= close[nearest]
+    cut = False
+    if inlet is not None:
+        gap = np.array([np.linalg.norm(end.position - inlet) for end in ends])
+        chosen = int(gap.argmin())
+        # Beyond the last place where the vessel has its width, there is nothing to
+        # cut off but the end itself.
+        cut = bool(gap[chosen] > 2.5 * ends[chosen].radius)
+    elif curves:
+        chosen = _chosen_by_curves(ways, ends, nodes, width, free, curves)
+    else:
+        chosen = int(width.argmax())
+    position = inlet if inlet is not None and cut else ends[chosen].position
+    # The root leads to the widest other end, if a wide vessel leads there.
+    reach = ways.lengths_from(ways.node(position))
+    around = ways.depth[ways.main & (reach < 25e-3)].max()
+    floor = ROOT_WIDTH * around
+    others = free & (reach[nodes] > 2.0 * around)
+    others[chosen] &= cut
+    if curves:
+        lasts = [ways.node(curve[-1]) for curve in curves]
+        floor = max(floor, 1.2 * float(np.median(ways.depth[lasts])))
+        if cut:
+            # Ends behind it are nearer to the inlet than to where the curves end.
+            others &= ways.lengths_from(lasts[0])[nodes] < reach[lasts[0]]
+    others &= width > floor
+    far = ends[int(np.where(others, width, -np.inf).argmax())].position
+    return LumenEntry(position, not cut, far if others.any() else None)
+
+
+def _chosen_by_curves(ways, ends, nodes, width, free, curves) -> int:
+    """The end at which the curves start, else a wide one far from their starts."""
+    reach = np.stack([ways.lengths_from(ways.node(c[0]))[nodes] for c in curves])
+    # A curve leads away from the end at which it starts.
+    last = np.stack([ways.lengths_from(ways.node(c[-1]))[nodes] for c in curves])
+    behind = (last > reach).all(axis=0)
+    near = np.where(free & behind, reach.min(axis=0), np.inf)
+    if near.min() < STARTS:
+        return int(near.argmin())
+    wide = free & (width >= WIDE * width[free].max(initial=0.0))
+    if not wide.any():
+        raise ValueError(
+            "every free end of the lumen is the end of a given centreline; pass "
+            f"inlet=(x, y, z) near the end by which the device enters: {listed(ends)}."
+        )
+    return int(np.where(wide, reach[0], -np.inf).argmax())
+
+
+def listed(ends: Sequence[FreeEnd]) -> str:
+    """Ends with their places and widths, widest first, for a message."""
+    ordered = sorted(ends, key=lambda end: -end.radius)
+    return ", ".join(
+        f"{in_mm(end.position)}, {end.radius * 2e3:.1f} mm wide" for end in ordered[:8]
+    )
 
 
 def centrelines(
     ways: Ways, ends: Sequence[FreeEnd], entry: LumenEntry
-) -> tuple[list[Found], int]:
+) -> tuple[list[np.ndarray], int]:
     """Deepest ways from the inlet to every branch that a 5 Fr catheter can enter.
 
     Branches have a free end, or close a ring (such as the two vertebral arteries,
@@ -50,25 +220,23 @@ def centrelines(
         entry: where the device enters and where the root leads.
 
     Returns:
-        (centrelines, the bulkiest first, without the root; how many more branches
-        are too thin or too short).
+        (centrelines (n_i, 3) m, first point at the inlet, the bulkiest first, without
+        the root; how many more branches are too thin or too short).
     """
-    start = ways.node(entry.position)
-    before = ways.deepest_from(start)
-    cover = Cover(ways)
+    before = ways.deepest_from(ways.node(entry.position))
+    cover, known, toward = Cover(ways), [entry.position], None
     if entry.far is not None:
-        cover.add(ways.trace(before, ways.node(entry.far)))
-    todo = []
-    for end in ends:
-        gaps = [np.linalg.norm(end.position - entry.position)]
-        if entry.far is not None:
-            gaps.append(np.linalg.norm(end.position - entry.far))
-        if min(gaps) > 1e-6:
-            todo.append(ways.trace(before, ways.node(end.position)))
-    if not entry.at_end and entry.far is not None:
+        known.append(entry.far)
         toward = ways.trace(before, ways.node(entry.far))
-        todo = [way for way in todo if _ahead(ways, way, toward)]
-    todo = [way for way in todo if len(way) > 3]
+        cover.add(toward)
+    todo: list[Any] = []
+    for end in ends:
+        way = ways.trace(before, ways.node(end.position))
+        apart = min(np.linalg.norm(end.position - place) for place in known)
+        if apart < 1e-6 or len(way) <= 3:
+            continue
+        if entry.at_end or toward is None or _ahead(ways, way, toward):
+            todo.append(way)
     todo.sort(key=lambda way: -float(ways.depth[way].sum()))
     # Rings last: what they share with a branch that has an end is that branch's.
     todo += _rings(ways, before)
@@ -82,16 +250,13 @@ def centrelines(
         if len(own) == len(way):
             # It begins at the inlet, at whose very end the lattice has no depth.
             own = own[int((ways.depth[own] >= DEVICE_RADIUS).argmax()) :]
-        depth = ways.depth[own] + CELL
-        narrow = np.flatnonzero(depth < DEVICE_RADIUS)
+        narrow = np.flatnonzero(ways.depth[own] + CELL < DEVICE_RADIUS)
         passable = own[: narrow[0]] if len(narrow) else own
-        if len(passable) < 2 or length_of(ways, passable) < BRANCH:
+        if ways.length(passable) < BRANCH:
             thin += 1
             continue
         cover.add(way)
-        found.append(
-            Found(ways.points[way], ways.points[way[-1]], length_of(ways, own))
-        )
+        found.append(ways.points[way])
     return found, thin
 
 
@@ -114,8 +279,7 @@ def continued(
     Returns:
         (curves; metres by which each was continued, where it was).
     """
-    start = ways.node(entry.position)
-    before = ways.deepest_from(start)
+    before = ways.deepest_from(ways.node(entry.position))
     paths = [ways.trace(before, ways.node(end.position)) for end in ends]
     added: dict[str, float] = {}
     out = dict(curves)
@@ -124,28 +288,23 @@ def continued(
         curves, key=lambda key: -ways.depth[[ways.node(p) for p in curves[key]]].sum()
     )
     for name in order:
-        curve = curves[name]
-        last = ways.node(curve[-1])
-        here = ways.points[last]
-        reach = max(3.0 * ways.depth[last], 6e-3)
-        if any(np.linalg.norm(end.position - here) < reach for end in ends):
-            continue
+        last = ways.node(curves[name][-1])
+        here, depth = ways.points[last], float(ways.depth[last])
         # It may end in a vessel that goes on, as one vertebral artery in the other's.
-        others = [line for key, line in out.items() if key in added]
-        if any(np.linalg.norm(c - here, axis=1).min() < reach for c in others):
+        others = [out[key] for key in added] + [end.position[None] for end in ends]
+        gaps = [np.linalg.norm(other - here, axis=1).min() for other in others]
+        if min(gaps) < max(3.0 * depth, 6e-3):
             continue
-        best = None
+        rests = []
         for path in paths:
             gap = np.linalg.norm(ways.points[path] - here, axis=1)
             at = int(gap.argmin())
             if gap[at] < max(ways.depth[path[at]], 1.5e-3) and len(path) - at > 3:
-                bulk = float(ways.depth[path[at:]].sum())
-                if best is None or bulk > best[0]:
-                    best = (bulk, path[at + 1 :])
-        if best is not None:
-            rest = ways.points[best[1]]
-            added[name] = length_of(ways, best[1])
-            out[name] = np.concatenate([curve, rest])
+                rests.append(path[at:])
+        if rests:
+            rest = max(rests, key=lambda path: ways.depth[path].sum())[1:]
+            added[name] = ways.length(rest)
+            out[name] = np.concatenate([curves[name], ways.points[rest]])
     return out, added
 
 
@@ -159,43 +318,32 @@ def _ahead(ways: Ways, way: np.ndarray, toward: np.ndarray) -> bool:
 
 def _rings(ways: Ways, before: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
     """Pairs of ways from the inlet whose ends touch, for every ring of vessels."""
-    back = _upstream(ways, before)
-    rows, cols = ways.links
-    gap = np.linalg.norm(ways.points[back[rows]] - ways.points[back[cols]], axis=1)
-    near = APART * (ways.depth[back[rows]] + ways.depth[back[cols]]) + APART_MIN
-    meet = ways.main[rows] & (gap > near)
-    rows, cols = rows[meet], cols[meet]
-    if not len(rows):
-        return []
-    label = groups(len(ways.points), np.stack([rows, cols], axis=1))[rows]
-    depth = np.minimum(ways.depth[rows], ways.depth[cols])
-    order = np.lexsort((-depth, label))  # of each place the deepest link first
-    first = order[np.unique(label[order], return_index=True)[1]]
+    back = _upstream(ways, before)[ways.links]
+    gap = np.linalg.norm(np.diff(ways.points[back], axis=1)[:, 0], axis=1)
+    near = APART * ways.depth[back].sum(axis=1) + APART_MIN
+    links = ways.links[ways.main[ways.links[:, 0]] & (gap > near)]
+    depth = ways.depth[links].min(axis=1)
+    label = groups(len(ways.points), links)[links[:, 0]]
     rings = []
-    for at in first[depth[first] >= DEVICE_RADIUS]:
-        one, other = (ways.trace(before, int(k[at])) for k in (rows, cols))
-        count = min(len(one), len(other))
-        same = one[:count] == other[:count]
-        shared = count if same.all() else int(same.argmin())
-        if length_of(ways, one[shared:]) + length_of(ways, other[shared:]) > RING:
+    for key in np.unique(label):
+        # Of each place the deepest link.
+        at = int(np.where(label == key, depth, -np.inf).argmax())
+        one, other = (ways.trace(before, int(node)) for node in links[at])
+        shared = common(ways.points[one], ways.points[other])
+        own = [way[shared:] for way in (one, other)]
+        if depth[at] >= DEVICE_RADIUS and sum(map(ways.length, own)) > RING:
             rings.append((one, other))
     return rings
 
 
 def _upstream(ways: Ways, before: np.ndarray) -> np.ndarray:
     """Node (n,) that lies ``BACK`` up the way of each node, or the way's start."""
-    count = len(ways.points)
-    up = [np.where(before >= 0, before, np.arange(count))]
-    step = [np.linalg.norm(ways.points - ways.points[up[0]], axis=1)]
-    # Jumps of 2, 4, 8 ... nodes, put together to the longest that is not too long.
-    while 2 ** len(up) * 1e-3 < BACK:
-        step.append(step[-1] + step[-1][up[-1]])
-        up.append(up[-1][up[-1]])
-    here, gone = np.arange(count), np.zeros(count)
-    for jump, length in zip(up[::-1], step[::-1], strict=True):
-        fits = gone + length[here] <= BACK
-        gone = np.where(fits, gone + length[here], gone)
-        here = np.where(fits, jump[here], here)
+    here, gone = np.arange(len(ways.points)), np.zeros(len(ways.points))
+    up = np.where(before >= 0, before, here)
+    step = np.linalg.norm(ways.points - ways.points[up], axis=1)
+    while (fits := (up[here] != here) & (gone + step[here] <= BACK)).any():
+        gone[fits] += step[here[fits]]
+        here[fits] = up[here[fits]]
     return here
 
 

@@ -1,30 +1,52 @@
-"""Reading a lumen's triangles from a file, and guessing their unit."""
+"""Reading a lumen's triangles from a mesh, or a label map of a segmented scan."""
 
-from __future__ import annotations
-
-import importlib
-import importlib.util
 import io
 import re
+from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
-from scipy.spatial import cKDTree
 
-from cathsim_dmc.anatomy.parts import Surface
-from cathsim_dmc.anatomy.scan.topology import areas
-from cathsim_dmc.anatomy.scan.units import UNITS
-from cathsim_dmc.anatomy.surface import sampled
+from cathsim_dmc.anatomy.scan.units import to_lps
 
 # Endings, and the least bytes a triangle takes where no header counts them: a face
-# "f 1 2 3" and half a vertex in OBJ, seven lines of text in STL.
-FORMATS = {"obj": 35, "stl": 100, "ply": 12, "vtp": 12}
+# "f 1 2 3" and half a vertex in OBJ, binary in STL.
+FORMATS = {"obj": 35, "stl": 50, "ply": 12, "vtp": 12}
+_STL_TEXT = 100  # seven lines
 MOST = 4_000_000  # triangles; reading more takes gigabytes
-# Largest radius (95th percentile) of a scan's lumen, m: between that of a single
-# cerebral artery and that of an aneurysm of the aorta.
-WIDTH = (1.2e-3, 35e-3)
-TYPICAL = 7e-3  # m, that radius where two units are possible
-_SAMPLES = 3000
+LABEL_MAPS = (".nii", ".nii.gz", ".nrrd")
+BLUR = 0.7  # voxels, standard deviation that takes the steps off a surface
+_PAD = 3  # voxels around the labels
+_NIFTI_UNITS = {"meter": 1.0, "mm": 1e-3, "micron": 1e-6, "unknown": 1e-3}
+
+
+def parsed(path: Path, kind: str, read: Callable[[Path], Any], extra: str = "") -> Any:
+    """What ``read`` makes of a file.
+
+    Raises:
+        FileNotFoundError: if there is no such file.
+        ValueError: if it is damaged, or the ``extra`` that reads it is not installed;
+            the message is one line.
+    """
+    if not path.is_file():
+        raise FileNotFoundError(
+            f"no mesh file {path}; give a lumen's surface (STL, OBJ, PLY or VTP), or a "
+            "label map (NIfTI, NRRD)."
+        )
+    if not path.stat().st_size:
+        raise ValueError(f"{path} is empty (0 bytes); export it again.")
+    try:
+        return read(path)
+    except ImportError as error:
+        raise ValueError(
+            f"{path} needs {error.name}: pip install 'cathsim-dmc[{extra}]'."
+        ) from error
+    except Exception as error:  # readers raise whatever their format leads to
+        said = re.sub(r"\s+", " ", str(error)).strip()[:150] or type(error).__name__
+        raise ValueError(
+            f"{path} cannot be read as {kind.upper()}: {said}. Export it again."
+        ) from error
 
 
 def read_triangles(path: str | Path) -> tuple[np.ndarray, np.ndarray]:
@@ -42,38 +64,21 @@ def read_triangles(path: str | Path) -> tuple[np.ndarray, np.ndarray]:
             triangles or far too many; the message is one line.
     """
     path = Path(path)
-    if not path.is_file():
-        raise FileNotFoundError(
-            f"no mesh file {path}; give the path of the lumen surface (OBJ, STL, PLY "
-            "or VTP)."
-        )
     kind = path.suffix.lower().lstrip(".")
     if kind not in FORMATS:
         raise ValueError(
             f"{path} has the ending {path.suffix!r}; give a mesh in one of the formats "
             f"{', '.join(FORMATS)}."
         )
-    if kind == "vtp" and importlib.util.find_spec("vtkmodules") is None:
-        raise ValueError(
-            f"{path} needs VTK: pip install 'cathsim-dmc[vtp]', or save it as STL."
-        )
-    size = path.stat().st_size
-    if size == 0:
-        raise ValueError(f"{path} is empty (0 bytes); export it again.")
-    count = announced(path, kind, size)
+    count = parsed(path, kind, announced)
     if count > MOST:
         raise ValueError(
-            f"{path} has some {count / 1e6:.1f} million triangles ({size / 1e6:.0f} "
-            f"MB); at most {MOST / 1e6:g} million are read. Decimate it before export "
-            "(3D Slicer: Surface Toolbox, Decimate)."
+            f"{path} has some {count / 1e6:.1f} million triangles; at most "
+            f"{MOST / 1e6:g} million are read. Decimate it before export (3D Slicer: "
+            "Surface Toolbox, Decimate)."
         )
-    try:
-        vertices, faces = _parsed(path.read_bytes(), kind)
-    except Exception as error:  # readers raise whatever their format leads to
-        said = re.sub(r"\s+", " ", str(error)).strip()[:150] or type(error).__name__
-        raise ValueError(
-            f"{path} cannot be read as {kind.upper()}: {said}. Export it again."
-        ) from error
+    read = _read_vtp if kind == "vtp" else _read_mesh
+    vertices, faces = parsed(path, kind, read, "vtp")
     if len(faces) < 4:
         raise ValueError(
             f"{path} has {len(faces)} triangles; give a triangle mesh of the lumen "
@@ -88,152 +93,158 @@ def read_triangles(path: str | Path) -> tuple[np.ndarray, np.ndarray]:
     return vertices, faces
 
 
-def announced(path: Path, kind: str, size: int) -> int:
+def announced(path: Path) -> int:
     """Triangles that a file announces, or the most its size leaves room for."""
     with path.open("rb") as stream:
         head = stream.read(4096)
-    text = None
-    if kind == "stl":
-        binary = not head.lstrip().startswith(b"solid") or b"\0" in head
-        if binary and len(head) >= 84:
-            return (size - 84) // 50  # whatever the header says
-    elif kind == "ply":
-        text = re.search(rb"element face (\d+)", head)
-    elif kind == "vtp":
-        text = re.search(rb'NumberOfPolys="\s*(\d+)', head)
-    if text:
-        # A header that says less than follows may not hide it.
-        return max(int(text[1]), size // 400)
-    return size // FORMATS[kind]
+    said = re.search(rb'element face (\d+)|NumberOfPolys="\s*(\d+)', head)
+    if said:
+        return int(said[1] or said[2])
+    kind = path.suffix.lower().lstrip(".")
+    text = kind == "stl" and head.lstrip().startswith(b"solid") and b"\0" not in head
+    return path.stat().st_size // (_STL_TEXT if text else FORMATS[kind])
 
 
-def guess_units(
-    vertices: np.ndarray, faces: np.ndarray, units: str | None
-) -> tuple[str, str]:
-    """The unit in which a lumen has a plausible width, and a line that says why.
-
-    Args:
-        vertices: (V, 3), in the file's unit.
-        faces: (F, 3).
-        units: as given by the user, or None to guess.
-
-    Raises:
-        ValueError: if none is given and the lumen has no plausible width in any.
-    """
-    width = typical_radius(vertices, faces)
-    fits = [u for u, s in UNITS.items() if WIDTH[0] <= width * s <= WIDTH[1]]
-    if units is None:
-        if not fits:
-            raise ValueError(
-                f"the lumen's radius is {width:.3g} units of the file, which no vessel "
-                f"has in {', '.join(UNITS)} (allowed {WIDTH[0] * 1e3:g} to "
-                f"{WIDTH[1] * 1e3:g} mm); check the unit of the export."
-            )
-        units = min(fits, key=lambda u: abs(np.log(width * UNITS[u] / TYPICAL)))
-        others = [u for u in fits if u != units]
-        doubt = f"; {others[0]} is possible too: pass units" if others else ""
-        return units, (
-            f"unit guessed: {units}, which makes the widest lumen "
-            f"{width * UNITS[units] * 2e3:.1f} mm wide{doubt}"
-        )
-    if units not in fits:
-        better = f"pass units={' or '.join(map(repr, fits))}" if fits else "check it"
-        return units, (
-            f"unit: {units}, as given, which makes the widest lumen "
-            f"{width * UNITS[units] * 2e3:.3g} mm wide ({WIDTH[0] * 2e3:g} to "
-            f"{WIDTH[1] * 2e3:g} mm are usual); if that is wrong, {better}"
-        )
-    return units, f"unit: {units}, as given"
-
-
-def typical_radius(vertices: np.ndarray, faces: np.ndarray) -> float:
-    """Radius (file's unit) of the wide part of a tube-like surface.
-
-    The 95th percentile, by area, of the radius of the largest ball that touches the
-    surface at a place and holds no other part of it: neither holes nor turned faces
-    disturb it (Ma et al., 3D medial axis point approximation, 2012).
-    """
-    if not areas(vertices, faces).sum() > 0.0:
-        raise ValueError("all triangles have no area; give the surface of a lumen.")
-    points, normals = sampled(Surface(vertices, faces), _SAMPLES)
-    tree = cKDTree(np.concatenate([points, vertices[np.unique(faces)]]))
-    size = float(np.linalg.norm(np.ptp(vertices, axis=0)))
-    radii = np.minimum(*(_ball(tree, points, s * normals, size) for s in (1.0, -1.0)))
-    found = radii[radii < 0.4 * size]
-    if len(found) < 0.2 * _SAMPLES:
-        raise ValueError(
-            "the surface is no tube: hardly any place of it faces another one; give "
-            "the surface of a lumen."
-        )
-    return float(np.percentile(found, 95))
-
-
-def _ball(
-    tree: cKDTree, points: np.ndarray, normals: np.ndarray, size: float
-) -> np.ndarray:
-    """Radii of the balls that touch at ``points`` on the side of ``normals``."""
-    radii = np.full(len(points), size)
-    active = np.arange(len(points))
-    for _ in range(30):
-        centre = points[active] + radii[active, None] * normals[active]
-        gap, other = tree.query(centre)
-        away = points[active] - tree.data[other]
-        square = np.einsum("nd,nd->n", away, away)
-        slope = np.einsum("nd,nd->n", normals[active], away)
-        with np.errstate(divide="ignore", invalid="ignore"):
-            smaller = -0.5 * square / slope
-        # Points beside the place itself say nothing: the surface is not smooth.
-        steep = slope < -0.35 * np.sqrt(square)
-        shrinks = (gap < 0.999 * radii[active]) & steep
-        if not shrinks.any():
-            break
-        active = active[shrinks]
-        radii[active] = np.minimum(smaller[shrinks], 0.999 * radii[active])
-    return radii
-
-
-def _parsed(data: bytes, kind: str) -> tuple[np.ndarray, np.ndarray]:
-    if kind == "vtp":
-        return _read_vtp(data)
+def _read_mesh(path: Path) -> tuple[np.ndarray, np.ndarray]:
     import trimesh
 
+    kind = path.suffix.lower().lstrip(".")
     # From bytes and without a resolver: nothing beside the file is opened.
     options = {"skip_materials": True} if kind == "obj" else {}
-    mesh = trimesh.load_mesh(io.BytesIO(data), file_type=kind, process=False, **options)
+    data = io.BytesIO(path.read_bytes())
+    mesh = trimesh.load_mesh(data, file_type=kind, process=False, **options)
     if isinstance(mesh, trimesh.Scene):
         mesh = mesh.to_mesh()
     faces = np.asarray(mesh.faces, dtype=np.int64).reshape(-1, 3)
     return np.array(mesh.vertices, dtype=np.float64).reshape(-1, 3), faces
 
 
-def _read_vtp(data: bytes) -> tuple[np.ndarray, np.ndarray]:
-    """Triangles of a VTK PolyData file, by VTK; polygons and strips are divided."""
-    modules = ("vtkCommonCore", "vtkFiltersCore", "vtkIOXML", "util.numpy_support")
-    core, filters, xml, arrays = (
-        importlib.import_module(f"vtkmodules.{name}") for name in modules
-    )
-    core.vtkObject.GlobalWarningDisplayOff()  # it prints what it cannot read
-    reader, triangles = xml.vtkXMLPolyDataReader(), filters.vtkTriangleFilter()
-    reader.SetReadFromInputString(True)
-    reader.SetInputString(data)
+def _read_vtp(path: Path) -> tuple[np.ndarray, np.ndarray]:
+    """Triangles of a VTK PolyData file; polygons and strips are divided."""
+    from vtkmodules import vtkCommonCore, vtkFiltersCore, vtkIOXML
+    from vtkmodules.util.numpy_support import vtk_to_numpy
+
+    vtkCommonCore.vtkObject.GlobalWarningDisplayOff()  # it prints what it cannot read
+    reader = vtkIOXML.vtkXMLPolyDataReader()
+    reader.SetFileName(str(path))
     reader.Update()
     read = reader.GetOutput()
     for cells in (read.GetVerts(), read.GetLines(), read.GetPolys(), read.GetStrips()):
         # VTK does not look, and would read beyond the arrays.
-        corners = arrays.vtk_to_numpy(cells.GetConnectivityArray())
-        stops = arrays.vtk_to_numpy(cells.GetOffsetsArray())
+        corners = vtk_to_numpy(cells.GetConnectivityArray())
+        stops = vtk_to_numpy(cells.GetOffsetsArray())
         beyond = stops[-1:] != len(corners) or np.diff(stops, prepend=0).min() < 0
         if beyond or np.any((corners < 0) | (corners >= read.GetNumberOfPoints())):
             raise ValueError("its cells name points that it does not have")
     if reader.GetErrorCode() or not read.GetNumberOfPoints():
         raise ValueError("it is damaged, or no PolyData")
+    triangles = vtkFiltersCore.vtkTriangleFilter()
     triangles.SetInputData(read)
     triangles.PassLinesOff()
     triangles.PassVertsOff()
     triangles.Update()
     found = triangles.GetOutput()
-    corners = arrays.vtk_to_numpy(found.GetPolys().GetConnectivityArray())
-    points = np.array(
-        arrays.vtk_to_numpy(found.GetPoints().GetData()), dtype=np.float64
-    )
+    corners = vtk_to_numpy(found.GetPolys().GetConnectivityArray())
+    points = vtk_to_numpy(found.GetPoints().GetData()).astype(np.float64)
     return points, corners.astype(np.int64).reshape(-1, 3)
+
+
+def is_label_map(path: str | Path) -> bool:
+    """Whether a file's ending is that of a label map."""
+    return str(path).lower().endswith(LABEL_MAPS)
+
+
+def label_surface(
+    path: str | Path, labels: Sequence[int] = ()
+) -> tuple[np.ndarray, np.ndarray, str]:
+    """Surface of some labels of a label map.
+
+    Args:
+        path: NIfTI (.nii, .nii.gz) or NRRD (.nrrd, .seg.nrrd) with whole numbers.
+        labels: values whose union is the lumen; none where the file holds one only.
+
+    Returns:
+        (vertices (V, 3) m in LPS, faces (F, 3), a line that says what was taken).
+
+    Raises:
+        FileNotFoundError: if there is no such file.
+        ValueError: if it is no label map, the package that reads it is missing, or
+            the labels are not in it; lists those that are.
+    """
+    from scipy.ndimage import find_objects, gaussian_filter
+    from skimage.measure import marching_cubes
+
+    path = Path(path)
+    nrrd = path.suffix.lower() == ".nrrd"
+    read, kind = (_nrrd, "nrrd") if nrrd else (_nifti, "nii")
+    voxels, matrix, origin, names = parsed(path, kind, read, "segmentation")
+    if voxels.ndim != 3:
+        raise ValueError(
+            f"{path} has the shape {voxels.shape}; give one label map in three "
+            "dimensions (3D Slicer: export the segmentation as a label map)."
+        )
+    if not np.array_equal(np.rint(voxels), voxels):
+        raise ValueError(
+            f"{path} holds numbers that are not whole, so it is an image or a "
+            "probability map; give a segmentation (label map)."
+        )
+    values, counts = np.unique(voxels, return_counts=True)
+    seen = {int(k): int(n) for k, n in zip(values, counts, strict=True) if k != 0}
+    chosen = [int(k) for k in labels] or list(seen)
+    if (not labels and len(seen) != 1) or not set(chosen) <= set(seen):
+        listed = ", ".join(
+            f"{k} {names.get(k, '')}".strip() + f" ({n:,} voxels)"
+            for k, n in list(seen.items())[:20]
+        )
+        missing = [k for k in chosen if k not in seen]
+        lacks = f"no label {missing[0]}; it has " if missing else ""
+        raise ValueError(
+            f"{path} has {lacks}{len(seen)} labels: {listed or 'all voxels are 0'}; "
+            "choose those of the lumen (--label)."
+        )
+    mask = np.isin(voxels, chosen)
+    (box,) = find_objects(mask.astype(np.uint8))
+    low = [rows.start for rows in box]
+    part = gaussian_filter(np.pad(mask[box], _PAD).astype(np.float32), BLUR)
+    points, faces, _, _ = marching_cubes(part, 0.5)
+    vertices = (points + low - _PAD) @ matrix.T + origin
+    if np.linalg.det(matrix) > 0.0:
+        faces = faces[:, ::-1]
+    size = " x ".join(f"{x * 1e3:.2g}" for x in np.linalg.norm(matrix, axis=0))
+    called = ", ".join(f"{k} {names.get(k, '')}".strip() for k in chosen)
+    return (
+        vertices,
+        faces.astype(np.int64),
+        f"label {called} of {path.name}: {int(mask.sum()):,} voxels of {size} mm; unit "
+        "and frame are the file's",
+    )
+
+
+def _nifti(path: Path):
+    """Voxels, matrix (3, 3) and origin (3,) to m in LPS, names of labels."""
+    import nibabel
+
+    image: Any = nibabel.load(path)
+    unit = _NIFTI_UNITS.get(image.header.get_xyzt_units()[0], 1e-3)
+    affine = unit * to_lps("m", "RAS") @ image.affine[:3]
+    voxels = np.asanyarray(image.dataobj)
+    shape = voxels.shape[:3] + tuple(n for n in voxels.shape[3:] if n != 1)
+    return voxels.reshape(shape), affine[:, :3], affine[:, 3], {}
+
+
+def _nrrd(path: Path):
+    """As `_nifti`; Slicer's files name their labels."""
+    import nrrd
+
+    voxels, header = nrrd.read(str(path))
+    space = str(header.get("space", "LPS")).upper()
+    space = "".join(re.findall(r"\b\w", space)) if "-" in space else space
+    to = to_lps("mm", space)
+    rows = np.asarray(header["space directions"], dtype=float)
+    origin = np.asarray(header.get("space origin", np.zeros(3)), dtype=float)
+    names = {
+        int(value): str(header.get(key.replace("_LabelValue", "_Name"), ""))
+        for key, value in header.items()
+        if key.endswith("_LabelValue")
+    }
+    return voxels, to @ rows.T, to @ origin, names

@@ -6,28 +6,25 @@ calibres, spacings and forks that are seen. A branch gets its name if the hypoth
 that give it sum up to `SURE`; otherwise it gets a neutral one, and the notes ask.
 """
 
-from __future__ import annotations
-
 import re
-from collections import defaultdict
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from itertools import combinations
+from typing import NamedTuple
 
 import numpy as np
 
+from cathsim_dmc.anatomy.scan import offshoots
 from cathsim_dmc.anatomy.scan.aorta import Bend, chord
-from cathsim_dmc.anatomy.scan.forks import (
+from cathsim_dmc.anatomy.scan.offshoots import (
     EXTRA,
     SPREAD,
     SURE,
-    leads,
+    Offshoot,
     normal,
-    without_twins,
+    summed,
 )
-from cathsim_dmc.anatomy.scan.offshoots import Offshoot, common
 from cathsim_dmc.anatomy.scan.units import in_mm
-from cathsim_dmc.anatomy.scan.ways import Ways
+from cathsim_dmc.anatomy.scan.ways import Ways, common
 
 ARCH_BRANCHES = ("bca", "lcca", "lsa")  # in their order from the heart
 ANATOMICAL = frozenset((*ARCH_BRANCHES, "rcca", "rsa", "rva", "lva"))
@@ -38,10 +35,7 @@ PATTERNS = {
     ("bovine", "lsa"): (0.18, "a bovine arch"),
     ("bca", "lcca", "lva", "lsa"): (0.04, "an arch with its own left vertebral artery"),
     ("rcca", "lcca", "lsa", "rsa"): (0.02, "an aberrant right subclavian artery"),
-    ("bovine", "lva", "lsa"): (
-        0.01,
-        "a bovine arch with its own left vertebral artery",
-    ),
+    ("bovine", "lva", "lsa"): (0.01, "a bovine arch with its own left vertebral"),
 }
 CUT = 0.03  # probability that the scan shows nothing of a branch
 SHORT = 0.04  # that it is cut short
@@ -50,115 +44,98 @@ SHORT = 0.04  # that it is cut short
 EXTRA_RADIUS, EXTRA_SPREAD = 2.0e-3, 0.8
 BETWEEN = 0.2  # of these, how many leave between LCCA and LSA, where vertebral ones do
 BUMP = 0.02  # that one that looks cut short is none
-# Radii beyond the ostium, m (`arch.sampler`, vertebral: 1.9), for an aorta as wide as
-# `AORTA`; `SPREAD` is the standard deviation of their logarithm.
-RADII = {
-    "bca": 6.2e-3,
-    "bovine": 6.4e-3,
-    "lcca": 4.0e-3,
-    "lsa": 5.0e-3,
-    "lva": 1.9e-3,
-    "rcca": 3.9e-3,
-    "rsa": 4.8e-3,
+# Of each: radius beyond the ostium, m (`arch.sampler`, vertebral: 1.9), for an aorta as
+# wide as `AORTA` (`SPREAD`: deviation of its logarithm); its share in the distance
+# between neighbours, m (a vertebral artery leaves between others that are no farther
+# apart); length up to the first fork, m: mean, deviation, and how often none is seen.
+BRANCHES = {
+    "bca": (6.2e-3, 11e-3, (42e-3, 10e-3, 0.5)),
+    "bovine": (6.4e-3, 26e-3, (12e-3, 8e-3, 0.02)),
+    "lcca": (4.0e-3, 9e-3, (120e-3, 30e-3, 0.95)),
+    "lsa": (5.0e-3, 8e-3, (38e-3, 10e-3, 0.5)),
+    "lva": (1.9e-3, 0.0, (150e-3, 30e-3, 0.99)),
+    "rcca": (3.9e-3, 8e-3, (120e-3, 30e-3, 0.95)),
+    "rsa": (4.8e-3, 8e-3, (38e-3, 10e-3, 0.5)),
 }
 AORTA = 13.3e-3
-# Share of each in the distance (m) between neighbours; the deviation of its logarithm.
-# A vertebral artery leaves between others that are no farther apart.
-SPACING = {"bca": 11e-3, "lcca": 9e-3, "lsa": 8e-3, "bovine": 26e-3, "lva": 0.0}
-APART = 0.5
-# Length up to the first fork, m: mean, deviation, and how often none is in the scan.
-FORKS = {
-    "bca": (42e-3, 10e-3, 0.5),
-    "bovine": (12e-3, 8e-3, 0.02),
-    "lsa": (38e-3, 10e-3, 0.5),
-    "lcca": (120e-3, 30e-3, 0.95),
-    "rcca": (120e-3, 30e-3, 0.95),
-    "rsa": (38e-3, 10e-3, 0.5),
-    "lva": (150e-3, 30e-3, 0.99),
-}
+APART = 0.5  # deviation of the logarithm of a distance between neighbours
 # Cosine between the way of a branch and the right and back of the arch's plane: mean
 # and deviation. An aberrant right subclavian artery runs behind to the right.
 SIDE, SIDE_OF_RSA = (0.0, 0.35), (0.65, 0.3)
 _SIDES = np.log(2.0 / np.sqrt(2.0 * np.pi))  # against one of any side
+VESSEL_NAME = re.compile("[a-z][a-z0-9_]*")
 _FORK_DENSITY = 1.0 / 60e-3  # 1/m, to which densities of forks are compared
-_NAME = re.compile(r"[a-z][a-z0-9_]*")
 
 
-@dataclass(frozen=True)
-class Naming:
+class Naming(NamedTuple):
     """What a lumen's branches are.
 
     Attributes:
         names: of the curves.
-        heart_last: whether the last point of the aorta is at the heart.
-        heart: probability of that.
         notes: names with their probability, and questions.
         right: rows of the curves that share a brachiocephalic artery, named or not.
     """
 
     names: list[str]
-    heart_last: bool
-    heart: float
     notes: list[str]
     right: tuple[int, ...] = ()
+
+
+class Hypothesis(NamedTuple):
+    """Heart at the last point of the aorta, pattern, labels from the heart on."""
+
+    heart_last: bool
+    pattern: tuple[str, ...]
+    labels: tuple[str, ...]
 
 
 def name_branches(
     ways: Ways,
     bend: Bend,
-    width: float,
+    scale: float,
     found: Sequence[Offshoot],
     curves: Sequence[np.ndarray],
-    odds: float,
+    heart_last: bool,
 ) -> Naming:
     """Names for the curves that leave an aortic arch.
 
     Args:
         ways: of the lumen.
         bend: of its aorta.
-        width: m, median radius of the aorta.
+        scale: width of the aorta by that of a usual one.
         found: offshoots of the arch, in the order of the bend's line.
         curves: (m_i, 3) m, computed centrelines.
-        odds: log odds that the heart is at the last point of the line; infinite where
-            that is given.
+        heart_last: whether the heart is at the last point of the line.
     """
-    scale = float(np.clip(width / AORTA, 0.5, 1.5))
-    share = _probabilities(found, _sides(bend, found), odds, scale)
-    heart = sum(value for (last, _, _), value in share.items() if last)
-    heart_last = bool(heart >= 0.5)
-    heart = max(heart, 1.0 - heart)
+    share = hypotheses(bend, found, scale, {heart_last: 0.0})
     seen = list(found)[::-1] if heart_last else list(found)
-    marginal: list[dict[str, float]] = [defaultdict(float) for _ in seen]
-    for (last, _, labels), value in share.items():
-        for place, label in enumerate(labels):
-            if last == heart_last:
-                marginal[place][label] += value
     names: dict[int, str] = {}
-    said, right = [], []
-    open_: list[Offshoot] = []
-    forked: list[tuple[str, Offshoot]] = []
-    for one, odds_of in zip(seen, marginal, strict=True):
-        label = max(odds_of, key=lambda key: odds_of[key])
-        sure = odds_of[label]
+    said, right, forked = [], [], []
+    asks = False
+    for place, one in enumerate(seen):
+        odds = summed(share, lambda key, place=place: key.labels[place])
+        label = max(odds, key=odds.__getitem__)
+        sure = odds[label]
+        if not one.curves:
+            continue
         if sure < SURE or label == "extra":
-            if one.curves:
-                open_.append(one)
+            asks = True
             continue
         if label == "bca" and len(one.curves) > 1:
             right += one.curves
             said.append(f"bca {sure:.2f}")
-        parts, surety = leads(ways, bend, one, (label, sure), scale, heart_last)
-        for number, name in parts.items():
+        parts = offshoots.leads(ways, bend, one, (label, sure), scale, heart_last)
+        for number, (name, surety) in parts.items():
             names[number] = name
-            said.append(f"{name} {surety[number]:.2f}")
-        if len(parts) < len(without_twins(one.rows)):
+            said.append(f"{name} {surety:.2f}")
+        if len(parts) < len(offshoots.without_twins(one.rows)):
             forked.append((label, one))
-    _neutral(names, curves, bend)
-    notes = []
-    if said:
-        notes.append("names with their probability: " + ", ".join(said))
-    if open_:
-        notes.append(_question(share, seen, heart_last, names))
+    rest = [i for i in range(len(curves)) if i not in names]
+    rest.sort(key=lambda i: _leaves(curves[i], bend))
+    names |= {i: f"branch_{number + 1}" for number, i in enumerate(rest)}
+    notes = ["names with their probability: " + ", ".join(said)] if said else []
+    if asks:
+        notes.append(_question(share, seen, names))
     for label, one in forked:
         own = " and ".join(sorted(names[i] for i in one.curves))
         label = "trunk of bca and lcca" if label == "bovine" else label
@@ -166,40 +143,26 @@ def name_branches(
             f"question: the {label} that leaves the arch at {in_mm(one.place)} leads "
             f"to {own}: which is which? Name them (--rename)"
         )
-    if heart < SURE:
-        notes.append(
-            f"question: which end of the aorta is at the heart? ({heart:.2f} for the "
-            "one taken); give a point near it (--heart)"
-        )
-    every = [names[i] for i in range(len(curves))]
-    return Naming(every, heart_last, heart, notes, tuple(right))
+    return Naming([names[i] for i in range(len(curves))], notes, tuple(right))
 
 
 def neutral_names(curves: Sequence[np.ndarray]) -> list[str]:
     """Names of curves that leave no arch, in the order in which they part."""
-    leave = [
-        max((common(one, other) for other in curves if other is not one), default=0)
-        for one in curves
-    ]
-    order = sorted(range(len(curves)), key=leave.__getitem__)
-    return [f"branch_{order.index(i) + 1}" for i in range(len(curves))]
+    leave = [max(0, 0, *(common(a, b) for b in curves if b is not a)) for a in curves]
+    order = np.argsort(np.argsort(leave, kind="stable"))
+    return [f"branch_{place + 1}" for place in order]
 
 
 def renamed(names: Sequence[str], changes: Mapping[str, str], root: str) -> list[str]:
     """Names after the user's changes.
 
     Raises:
-        ValueError: if a name to change does not exist, or a new one is taken or is
-            no name.
+        ValueError: if a name to change does not exist, or a new one is taken.
     """
-    for old, new in changes.items():
+    for old in changes:
         if old not in names:
             raise ValueError(
                 f"no vessel {old!r} to rename; there are {', '.join(names)}."
-            )
-        if not _NAME.fullmatch(str(new)):
-            raise ValueError(
-                f"{new!r} is no vessel name; give small letters, digits and '_'."
             )
     out = [changes.get(name, name) for name in names]
     for name in out:
@@ -208,39 +171,33 @@ def renamed(names: Sequence[str], changes: Mapping[str, str], root: str) -> list
     return out
 
 
-def _sides(bend: Bend, found: Sequence[Offshoot]) -> list[float]:
-    """Cosine of each branch to one side of the arch's plane, where it can be seen.
+def hypotheses(
+    bend: Bend, found: Sequence[Offshoot], scale: float, odds: Mapping[bool, float]
+) -> dict[Hypothesis, float]:
+    """Probability of every hypothesis about the offshoots of an arch.
 
-    The side is the patient's right and back if the heart is at the first point.
+    Args:
+        bend: of the aorta.
+        found: its offshoots, in the order of its line.
+        scale: width of the aorta by that of a usual one.
+        odds: of what else is seen, log odds by whether the heart is at the last point
+            of the line; what is left out is excluded.
     """
+    # To the patient's right and back if the heart is at the first point.
     side = np.cross(bend.up, bend.along)
     ways = [max(one.rows, key=len, default=np.zeros((1, 3))) for one in found]
-    return [float(chord(way) @ side) for way in ways]
-
-
-def _probabilities(
-    found: Sequence[Offshoot], sides: Sequence[float], odds: float, scale: float
-) -> dict[tuple[bool, tuple[str, ...], tuple[str, ...]], float]:
-    """Of every (heart at the last point, pattern, labels from the heart on)."""
+    sides = [float(chord(way) @ side) for way in ways]
     weights = {}
-    for heart_last in (False, True):
-        side = odds if heart_last else 0.0
-        if np.isinf(odds):
-            if heart_last != (odds > 0.0):
-                continue
-            side = 0.0
-        seen, right = list(found), list(sides)
-        if heart_last:
-            seen, right = seen[::-1], [-value for value in right[::-1]]
-        for pattern, labels, weight in _hypotheses(seen, right, scale):
-            weights[heart_last, pattern, labels] = weight + side
-    most = max(weights.values())
-    share = {key: float(np.exp(weight - most)) for key, weight in weights.items()}
-    total = sum(share.values())
-    return {key: value / total for key, value in share.items()}
+    for last, more in odds.items():
+        seen, right = list(found), sides
+        if last:
+            seen, right = seen[::-1], [-value for value in sides[::-1]]
+        for pattern, labels, weight in _labellings(seen, right, scale):
+            weights[Hypothesis(last, pattern, labels)] = weight + more
+    return offshoots.normalised(weights)
 
 
-def _hypotheses(seen: Sequence[Offshoot], right: Sequence[float], scale: float):
+def _labellings(seen: Sequence[Offshoot], right: Sequence[float], scale: float):
     """Every (pattern, labels, log weight) of offshoots in order from the heart."""
     count = len(seen)
     for pattern, (frequency, _) in PATTERNS.items():
@@ -278,17 +235,17 @@ def _fit(one: Offshoot, label: str, scale: float, side: float) -> float:
             return float(np.log(BUMP))
         wider = max(np.log(one.radius / (scale * EXTRA_RADIUS)), 0.0) / EXTRA_SPREAD
         return float(np.log(EXTRA) - 0.5 * wider**2)
+    radius, _, (length, spread_of_it, none) = BRANCHES[label]
     # What was cut short shows little more than the mouth of a branch.
     spread = SPREAD if one.curves else 2.0 * SPREAD
-    weight = normal(np.log(one.radius / (scale * RADII[label])), spread)
+    weight = normal(np.log(one.radius / (scale * radius)), spread)
     if one.curves:
         mean, deviation = SIDE_OF_RSA if label == "rsa" else SIDE
         weight += normal(side - mean, deviation) + _SIDES
-    mean, deviation, none = FORKS[label]
     if one.fork is None:
         return weight + np.log(none if one.curves else SHORT)
-    density = np.exp(-0.5 * ((one.fork - mean) / deviation) ** 2)
-    density = 0.02 + density / (deviation * np.sqrt(2.0 * np.pi) * _FORK_DENSITY)
+    density = np.exp(-0.5 * ((one.fork - length) / spread_of_it) ** 2)
+    density = 0.02 + density / (spread_of_it * np.sqrt(2.0 * np.pi) * _FORK_DENSITY)
     return weight + np.log((1.0 - none) * density)
 
 
@@ -296,50 +253,37 @@ def _spacings(seen, pattern, shown, at, scale: float) -> float:
     """Log probability of the distances between neighbours of a pattern."""
     weight = 0.0
     for k in range(len(at) - 1):
-        between = pattern[shown[k] : shown[k + 1] + 1]
-        wanted = sum(SPACING.get(name, 8e-3) for name in between[:-1])
-        wanted += sum(SPACING.get(name, 8e-3) for name in between[1:])
+        shares = [BRANCHES[name][1] for name in pattern[shown[k] : shown[k + 1] + 1]]
+        wanted = sum(shares[:-1]) + sum(shares[1:])
         there = max(abs(seen[at[k + 1]].s - seen[at[k]].s), 2e-3)
         weight += normal(np.log(there / (scale * wanted)), APART)
     return weight
 
 
-def _neutral(names: dict[int, str], curves, bend: Bend) -> None:
-    """Gives what has no name a neutral one, in the order from the bend's start."""
-    rest = [i for i in range(len(curves)) if i not in names]
-    tips = {
-        i: int(np.linalg.norm(bend.line - _leaves(curves[i], bend), axis=1).argmin())
-        for i in rest
-    }
-    for number, i in enumerate(sorted(rest, key=lambda k: tips[k])):
-        names[i] = f"branch_{number + 1}"
-
-
-def _leaves(curve: np.ndarray, bend: Bend) -> np.ndarray:
+def _leaves(curve: np.ndarray, bend: Bend) -> int:
+    """Row of the bend's line where a curve leaves it."""
     gap = np.linalg.norm(curve[:, None] - bend.line[None, ::8], axis=2).min(axis=1)
     away = np.flatnonzero(gap < 6e-3)
-    return curve[int(away[-1]) if len(away) else 0]
+    place = curve[int(away[-1]) if len(away) else 0]
+    return int(np.linalg.norm(bend.line - place, axis=1).argmin())
 
 
-def _question(share, seen, heart_last, names) -> str:
+def _question(share, seen, names) -> str:
     """What the notes ask where not every branch has a name."""
-    by: dict[str, float] = defaultdict(float)
-    for (last, pattern, labels), value in share.items():
-        if last == heart_last:
-            missing = [name for name in pattern if name not in labels]
-            text = PATTERNS[pattern][1]
-            if missing:
-                text += f" without its {' and '.join(missing)}"
-            by[text] += value
-    best = sorted(by.items(), key=lambda item: -item[1])
+
+    def text(key: Hypothesis) -> str:
+        missing = [name for name in key.pattern if name not in key.labels]
+        without = f" without its {' and '.join(missing)}" if missing else ""
+        return PATTERNS[key.pattern][1] + without
+
+    best = sorted(summed(share, text).items(), key=lambda item: -item[1])
     texts = [f"{text} ({value:.2f})" for text, value in best[:3] if value > 0.02]
     places = []
     for one in seen:
         own = ", ".join(names[i] for i in one.curves) or "a branch that is cut short"
         places.append(f"{own} at {in_mm(one.place)}")
-    count = {1: "one branch leaves", 2: "two branches leave"}.get(
-        len(seen), f"{len(seen)} branches leave"
-    )
+    few = ("one branch leaves", "two branches leave")
+    count = few[len(seen) - 1] if len(seen) < 3 else f"{len(seen)} branches leave"
     return (
         f"question: {count} the arch, from the heart on {'; '.join(places)}: "
         f"{', or '.join(texts)}? Name them (--rename)"

@@ -1,18 +1,20 @@
-"""Branches as they leave an aorta: their ostia, calibres and forks."""
+"""Branches as they leave an aorta: ostia, calibres, forks, and what they lead to."""
 
-from __future__ import annotations
-
-from collections.abc import Sequence
+from collections import defaultdict
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import product
+from typing import TypeVar
 
 import numpy as np
 from scipy.spatial import cKDTree
+from scipy.special import softmax
 
 from cathsim_dmc.anatomy.centreline import arc_lengths
-from cathsim_dmc.anatomy.scan.aorta import Bend
+from cathsim_dmc.anatomy.scan.aorta import BRANCH, Bend, chord
 from cathsim_dmc.anatomy.scan.centring import resample
 from cathsim_dmc.anatomy.scan.topology import groups
-from cathsim_dmc.anatomy.scan.ways import CELL, Ways
+from cathsim_dmc.anatomy.scan.ways import CELL, Ways, common
 
 OUT = 1.15  # radii of the aorta beyond which a branch has left it
 SHARED = 3e-3  # m beyond that, which curves of one branch share
@@ -24,6 +26,29 @@ STUB_RADIUS = 1.2e-3  # m
 STUB_END = 2.5  # radii from an end of the aorta
 STUB_APART = 45e-3  # m of aorta, at most, to the nearest branch
 STUB_WIDE = 30e-3  # m along the aorta: wider ones are no stub
+Key = TypeVar("Key")
+SURE = 0.95  # least probability of a name, and of the end at the heart
+EXTRA = 0.002  # probability that a branch is none of those that are looked for
+SPREAD = 0.3  # standard deviation of the logarithm of a radius
+VARIED = 0.45  # the same of vertebral arteries
+# Of the vessels that a branch leads to: radius (m), range of the angle of their way
+# from the head's direction (degrees), and the deviation beyond it.
+PARTS = {
+    "rcca": (3.2e-3, 0.0, 25.0, 15.0),
+    "lcca": (3.2e-3, 0.0, 30.0, 15.0),
+    "rsa": (3.4e-3, 65.0, 160.0, 15.0),
+    "lsa": (3.6e-3, 65.0, 160.0, 15.0),
+    "rva": (1.9e-3, 0.0, 35.0, 15.0),
+    "lva": (1.9e-3, 0.0, 35.0, 15.0),
+    "bca": (5.6e-3, 0.0, 50.0, 20.0),
+}
+LEADS = {
+    "bca": ("rcca", "rsa", "rva"),
+    "bovine": ("lcca", "bca", "rcca", "rsa", "rva"),
+    "lsa": ("lsa", "lva"),
+    "rsa": ("rsa", "rva"),
+}
+TWINS = 85e-3  # m that two curves share after all others have left: one vessel
 
 
 @dataclass(frozen=True)
@@ -59,53 +84,36 @@ def offshoots(
         curves: (m_i, 3) m, computed centrelines, from an end of the aorta on.
     """
     aorta = cKDTree(bend.line)
-    out: list[tuple[list[int], list[np.ndarray], int]] = []
+    groups_: list[tuple[list[int], list[np.ndarray], float]] = []
     for number, curve in enumerate(curves):
         distance, near = aorta.query(curve)
         inside = np.flatnonzero(distance < OUT * depth[near])
         start = int(inside[-1]) + 1 if len(inside) else 0
-        if start >= len(curve) - 2:
+        row = curve[start:]
+        if len(row) <= 2:
             continue
-        row, at = curve[start:], int(near[start])
-        for members, rows, _ in out:
-            shared = rows[0][: common(rows[0], row)]
-            apart = np.linalg.norm(rows[0][0] - row[0])
+        for members, rows, _ in groups_:
+            shared = arc_lengths(rows[0][: max(common(rows[0], row), 1)])[-1]
             # They leave in one lumen, even if they part at once.
-            if apart < depth_of(ways, rows[0][:1])[0] or (
-                len(shared) > 1 and arc_lengths(shared)[-1] > SHARED
-            ):
+            apart = np.linalg.norm(rows[0][0] - row[0])
+            if apart < depth_of(ways, rows[0][:1])[0] or shared > SHARED:
                 members.append(number)
                 rows.append(row)
                 break
         else:
-            out.append(([number], [row], at))
-    found = [
-        Offshoot(
-            rows[0][0],
-            1e-3 * at,
-            _calibre(ways, rows[0], fork := _fork(rows)),
-            tuple(members),
-            fork,
-            tuple(rows),
-        )
-        for members, rows, at in out
-        if max((row[-1] - row[0]) @ bend.up for row in rows) > 0.0
-    ]
-    near = [one.s for one in found]
-    found += [
-        one
-        for one in _stubs(ways, bend, depth, curves, aorta)
-        if near and min(abs(one.s - s) for s in near) < STUB_APART
-    ]
+            groups_.append(([number], [row], 1e-3 * near[start]))
+    found = []
+    for members, rows, s in groups_:
+        if max((row[-1] - row[0]) @ bend.up for row in rows) > 0.0:
+            fork, place = _fork(rows), rows[0][0]
+            radius = _calibre(ways, rows[0], fork)
+            found.append(Offshoot(place, s, radius, tuple(members), fork, tuple(rows)))
+    places = np.array([one.s for one in found])
+    for stub in _stubs(ways, bend, depth, curves, aorta):
+        if len(places) and abs(places - stub.s).min() < STUB_APART:
+            found.append(stub)
     found = [f for f in found if abs(f.s - 1e-3 * bend.apex) < NEAR]
     return sorted(found, key=lambda f: f.s)
-
-
-def common(one: np.ndarray, other: np.ndarray) -> int:
-    """How many first points two curves share."""
-    count = min(len(one), len(other))
-    same = (one[:count] == other[:count]).all(axis=1)
-    return count if same.all() else int(same.argmin())
 
 
 def depth_of(ways: Ways, line: np.ndarray) -> np.ndarray:
@@ -147,10 +155,8 @@ def _stubs(ways, bend, depth, curves, aorta) -> list[Offshoot]:
     points, radius = ways.points[nodes[outside]], ways.depth[nodes[outside]]
     if not len(points):
         return []
-    one, other = ways.links
-    linked = (row[one] >= 0) & (row[other] >= 0)
-    pairs = np.stack([row[one[linked]], row[other[linked]]], axis=1)
-    label = groups(len(points), pairs)
+    pairs = row[ways.links]
+    label = groups(len(points), pairs[(pairs >= 0).all(axis=1)])
     known = cKDTree(np.concatenate([resample(curve) for curve in curves]))
     taken = np.unique(label[known.query(points)[0] < 1.2e-3])
     found = []
@@ -169,3 +175,140 @@ def _stubs(ways, bend, depth, curves, aorta) -> list[Offshoot]:
             calibre = float(radius[among].max()) + CELL
             found.append(Offshoot(points[low], 1e-3 * at[low], calibre, (), None, ()))
     return found
+
+
+def leads(
+    ways: Ways,
+    bend: Bend,
+    one: Offshoot,
+    called: tuple[str, float],
+    scale: float,
+    heart_last: bool,
+) -> dict[int, tuple[str, float]]:
+    """Names of the curves of a branch with their probabilities, by their rows.
+
+    Args:
+        ways: of the lumen.
+        bend: of its aorta.
+        one: the branch.
+        called: what the branch is, and the probability of that.
+        scale: width of the aorta by that of a usual one.
+        heart_last: whether the heart is at the last point of the aorta.
+    """
+    label, sure = called
+    kept = without_twins(one.rows) if label in LEADS else [0]
+    rows, numbers = [one.rows[k] for k in kept], [one.curves[k] for k in kept]
+    if len(rows) == 1:
+        return {numbers[0]: ("bca" if label == "bovine" else label, sure)}
+    share = _shares(rows)
+    seen = [_look(ways, bend, row, max(share[i])) for i, row in enumerate(rows)]
+    downstream = bend.along * (-1.0 if heart_last else 1.0)
+    aside = np.array([(row[-1] - row[0]) @ downstream for row in rows])
+    weights = {}
+    for order in product((*LEADS[label], "extra"), repeat=len(rows)):
+        names = [name for name in order if name != "extra"]
+        twice = len(set(names)) < len(names)
+        if not twice and not ("bca" in order and {"rcca", "rsa", "rva"} & set(order)):
+            weights[order] = _assignment(order, label, seen, share, aside, scale)
+    odds = normalised(weights)
+    found = {}
+    for place, number in enumerate(numbers):
+        by = summed(odds, lambda order, place=place: order[place])
+        name = max(by, key=by.__getitem__)
+        if sure * by[name] >= SURE and name != "extra":
+            found[number] = (name, sure * by[name])
+    if label == "bovine" and len(rows) == 2 and len(found) == 1:
+        # What parts from the left carotid begins as the brachiocephalic artery.
+        ((name, surety),) = found.values()
+        (other,) = set(numbers) - set(found)
+        if name == "lcca":
+            found[other] = ("bca", surety)
+    return found
+
+
+def normalised(weights: Mapping[Key, float]) -> dict[Key, float]:
+    """Probabilities of hypotheses that exclude each other, from their log weights."""
+    return dict(zip(weights, softmax(list(weights.values())).tolist(), strict=True))
+
+
+def summed(odds: Mapping[Key, float], of: Callable[[Key], str]) -> dict[str, float]:
+    """Probability of each thing that hypotheses say, which `of` tells of each."""
+    by: dict[str, float] = defaultdict(float)
+    for key, value in odds.items():
+        by[of(key)] += value
+    return by
+
+
+def _shares(rows: Sequence[np.ndarray]) -> list[list[int]]:
+    """First points that every two of some curves share."""
+    return [[0 if a is b else common(a, b) for b in rows] for a in rows]
+
+
+def without_twins(rows: Sequence[np.ndarray]) -> list[int]:
+    """Rows of the curves but for those that run in the vessel of a longer one."""
+    share = _shares(rows)
+    along = [arc_lengths(row) for row in rows]
+    out: list[int] = []
+    for i in sorted(range(len(rows)), key=lambda k: -along[k][-1]):
+        for j in out:
+            third = [share[i][k] for k in range(len(rows)) if share[i][k] < share[i][j]]
+            alone = along[i][min(share[i][j], len(rows[i]) - 1)]
+            if alone - along[i][max(third, default=0)] > TWINS:
+                break
+        else:
+            out.append(i)
+    return sorted(out)
+
+
+def _look(ways: Ways, bend: Bend, row: np.ndarray, shared: int) -> tuple[float, float]:
+    """Radius (m) and angle (degrees) from the head of what a curve has for its own."""
+    own = row[min(shared, len(row) - 3) :]
+    s = arc_lengths(own)
+    part = own[(s >= min(8e-3, 0.4 * s[-1])) & (s <= BRANCH)]
+    cosine = chord(part if len(part) > 1 else own) @ bend.head
+    radius = float(np.median(depth_of(ways, part)))
+    return radius, float(np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0))))
+
+
+def _assignment(order, label, seen, share, aside, scale) -> float:
+    """Log weight of names for the curves of one branch."""
+    weight = np.log(EXTRA) * order.count("extra")
+    place = {name: k for k, name in enumerate(order) if name != "extra"}
+    for name, k in place.items():
+        radius, angle = seen[k]
+        mean, least, most, deviation = PARTS[name]
+        spread = VARIED if name in ("rva", "lva") else SPREAD
+        weight += normal(np.log(radius / (scale * mean)), spread)
+        off = max(least - angle, angle - most, 0.0) / deviation
+        weight += max(normal(off, 1.0), -6.0)
+    for vertebral, artery in (("rva", "rsa"), ("lva", "lsa")):
+        # It leaves the subclavian artery, not the trunk.
+        if vertebral in place and artery in place:
+            own = share[place[vertebral]]
+            weight -= 5.0 if own[place[artery]] < max(own) else 0.0
+        elif vertebral in place:
+            weight -= 3.0
+    if {"rcca", "rva", "rsa"} <= set(place):
+        arm = share[place["rsa"]]
+        weight -= 6.0 if arm[place["rva"]] < arm[place["rcca"]] else 0.0
+    if label in ("bca", "bovine") and "bca" not in place:
+        weight -= 1.0 if "rsa" not in place else 0.0
+        weight -= 4.0 if "rcca" not in place else 0.0
+    missing = "lcca" if label == "bovine" else label
+    if label in ("lsa", "rsa", "bovine") and missing not in place:
+        weight -= 4.0
+    elif label == "bovine":
+        # It leaves the trunk first, on the side of the descending aorta.
+        k = place["lcca"]
+        rest = [j for j in range(len(order)) if j != k]
+        if len(rest) > 1:
+            inner = min(share[i][j] for i in rest for j in rest if i != j)
+            weight -= 5.0 if max(share[k]) > inner else 0.0
+        gap = aside[k] - np.mean(aside[rest])
+        weight += float(np.clip(gap / 8e-3, -4.0, 4.0))
+    return float(weight)
+
+
+def normal(value: float, deviation: float) -> float:
+    """Logarithm of a normal density, but for a constant."""
+    return float(-0.5 * (value / deviation) ** 2 - np.log(deviation))

@@ -1,6 +1,4 @@
-"""Triangles and how they hang together: merging, parts, borders, orientation."""
-
-from __future__ import annotations
+"""Triangles and how they hang together: parts, borders, orientation, walls."""
 
 import contextlib
 
@@ -8,8 +6,15 @@ import numpy as np
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
+from cathsim_dmc.anatomy.parts import Surface
+
 MERGE = 1e-6  # of the mesh's size: vertices nearer than this are one
 ROUNDS = 6  # in which triangles without area are taken out, neighbours of others later
+# Of the wall of a vessel with a thickness:
+RAYS = 64
+ENCLOSED = 0.75  # share of rays that hit: the place is inside a vessel
+WALL = 0.25  # of the area: a surface of which so much is enclosed is a wall
+EDGE = 0.6  # cosine between the normals of triangles at the rim of an open end
 
 
 def merged(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -20,8 +25,6 @@ def merged(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndar
     faces = inverse.reshape(-1)[faces]
     a, b, c = faces.T
     faces = faces[(a != b) & (b != c) & (c != a)]
-    if not len(faces):
-        return vertices[:0], faces
     _, once = np.unique(np.sort(faces, axis=1), axis=0, return_index=True)
     faces = faces[np.sort(once)]
     used, renumbered = np.unique(faces, return_inverse=True)
@@ -52,8 +55,9 @@ def edge_counts(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 def handles(faces: np.ndarray) -> int:
     """Handles of a closed surface in one part, by its Euler characteristic."""
-    edges = len(edge_counts(faces)[0])
-    return 1 - (len(np.unique(faces)) - edges + len(faces)) // 2
+    import igl
+
+    return 1 - igl.euler_characteristic(np.ascontiguousarray(faces)) // 2
 
 
 def parts(faces: np.ndarray) -> np.ndarray:
@@ -77,17 +81,11 @@ def groups(count: int, pairs: np.ndarray) -> np.ndarray:
     return connected_components(link, directed=False)[1]
 
 
-def oriented(faces: np.ndarray) -> tuple[np.ndarray, int] | None:
-    """Faces (F, 3) turned so that all neighbours agree, and how many were turned.
-
-    None where no turning does, as on a Moebius strip.
-    """
+def oriented(faces: np.ndarray) -> tuple[np.ndarray, int]:
+    """Faces (F, 3) turned so that all neighbours agree, and how many were turned."""
     import igl
 
     out, part = igl.bfs_orient(np.ascontiguousarray(faces))
-    sides = out[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
-    if len(np.unique(sides, axis=0)) < len(sides):
-        return None
     changed = (out != faces).any(axis=1)
     # Of both ways to orient a part, the one in which more triangles stay as given.
     other = (np.bincount(part, changed) > 0.5 * np.bincount(part))[part]
@@ -134,16 +132,8 @@ def border_loops(faces: np.ndarray) -> list[np.ndarray]:
     return [loop for loop in loops if len(loop) >= 3]
 
 
-def loop_axis(points: np.ndarray) -> tuple[np.ndarray, float]:
-    """Unit normal (3,) of a closed loop, and its area (m^2)."""
-    spokes = points - points.mean(axis=0)
-    total = 0.5 * np.cross(spokes, np.roll(spokes, -1, axis=0)).sum(axis=0)
-    area = float(np.linalg.norm(total))
-    return total / max(area, 1e-30), area
-
-
 def without_slivers(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, int]:
-    """Triangles of which three corners lie in line are taken out.
+    """Triangles of which three corners lie in line are taken out, and how many.
 
     The corner between the other two is put into the neighbour at the long edge, so
     that no hole is left.
@@ -152,38 +142,85 @@ def without_slivers(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray
     for _ in range(ROUNDS):
         corners = vertices[faces]
         sides = np.linalg.norm(corners - np.roll(corners, -1, axis=1), axis=2)
-        height = 2.0 * areas(vertices, faces) / np.maximum(sides.max(axis=1), 1e-30)
-        flat = np.flatnonzero(height < 1e-4 * np.maximum(sides.max(axis=1), 1e-30))
-        if not len(flat):
+        longest = np.maximum(sides.max(axis=1), 1e-30)
+        flat = 2.0 * areas(vertices, faces) < 1e-4 * longest**2
+        if not flat.any():
             break
-        owner: dict[tuple[int, int], list[int]] = {}
-        for row, face in enumerate(faces):
-            for k in range(3):
-                a, b = int(face[k]), int(face[(k + 1) % 3])
-                owner.setdefault((min(a, b), max(a, b)), []).append(row)
-        gone, fresh, touched = [], [], set()
-        for row in flat:
-            k = int(sides[row].argmax())
-            a, b, m = (int(faces[row, (k + j) % 3]) for j in range(3))
-            others = [r for r in owner[(min(a, b), max(a, b))] if r != row]
-            if len(others) != 1 or touched & {row, others[0]} or others[0] in flat:
+        pairs = np.concatenate([adjacent(faces), adjacent(faces)[:, ::-1]])
+        pairs = pairs[flat[pairs[:, 0]] & ~flat[pairs[:, 1]]]
+        edges = set(map(tuple, edge_counts(faces)[0].tolist()))
+        keep, fresh = np.ones(len(faces), dtype=bool), []
+        for row, other in pairs[np.argsort(pairs[:, 0], kind="stable")]:
+            a, b, m = np.roll(faces[row], -sides[row].argmax())
+            beside = np.isin(faces[other], (a, b))
+            if beside.sum() < 2 or not (keep[row] and keep[other]):
                 continue
-            other = others[0]
-            face = list(map(int, faces[other]))
-            top = next(corner for corner in face if corner not in (a, b))
+            top, p, q = np.roll(faces[other], -beside.argmin())
             edge = (min(m, top), max(m, top))
-            if edge in owner:
+            if edge in edges:
                 continue  # a third and a fourth triangle would share it
-            owner[edge] = [int(row), other]
-            j = face.index(top)
-            p, q = face[(j + 1) % 3], face[(j + 2) % 3]
+            edges.add(edge)
             fresh += [(p, m, top), (m, q, top)]
-            gone += [row, other]
-            touched |= {row, other}
-        if not gone:
+            keep[[row, other]] = False
+        if not fresh:
             break
-        removed += len(gone) // 2
-        keep = np.ones(len(faces), dtype=bool)
-        keep[gone] = False
+        removed += len(fresh) // 2
         faces = np.concatenate([faces[keep], np.array(fresh, dtype=faces.dtype)])
     return faces, removed
+
+
+def inner_shell(vertices: np.ndarray, *shells: np.ndarray) -> int | None:
+    """Which of two surfaces lies inside the other, or None if neither does.
+
+    Args:
+        vertices: (V, 3) m.
+        *shells: faces (n, 3) of the two surfaces, closed or open at vessel ends.
+    """
+    import igl
+
+    share = []
+    for own, other in (shells, shells[::-1]):
+        middles = vertices[own].mean(axis=1)
+        winding = igl.fast_winding_number(vertices, other, middles)
+        share.append(float((np.abs(winding) > 0.5).mean()))
+    if max(share) < 0.9 or min(share) > 0.5:
+        return None
+    return int(share[1] > share[0])
+
+
+def lumen_of_wall(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray | None:
+    """Faces (F,) bool of the inner surface of a wall, or None if it is no wall.
+
+    A wall with open ends is one closed surface with holes through it. Seen from its
+    inner side almost every ray meets the wall again.
+
+    Args:
+        vertices: (V, 3) m.
+        faces: (F, 3), oriented alike, in one part.
+    """
+    import igl
+
+    if (edge_counts(faces)[1] != 2).any() or handles(faces) < 1:
+        return None  # open, or without a hole through it
+    area = areas(vertices, faces)
+    outward = igl.per_face_normals(vertices, faces, np.zeros(3))
+    outward *= np.sign(Surface(vertices, faces).volume)
+    middles = 1e3 * vertices[faces].mean(axis=1)  # its tolerances suit millimetres
+    hits = igl.ambient_occlusion(1e3 * vertices, faces, middles, outward, RAYS)
+    if area[hits > ENCLOSED].sum() < WALL * area.sum():
+        return None
+    # Parts between sharp edges are of one side.
+    pairs = adjacent(faces)
+    smooth = np.vecdot(outward[pairs[:, 0]], outward[pairs[:, 1]]) > EDGE
+    label = groups(len(faces), pairs[smooth])
+    share = np.bincount(label, area * hits) / np.bincount(label, area)
+    size = np.bincount(label, area) / area.sum()
+    inner = share > 0.6
+    if not (size[inner].sum() > 0.15 and size[~inner].sum() > 0.15):
+        # Rounded rims: every triangle for itself, then the largest patch.
+        chosen = hits > 0.5
+        label = groups(len(faces), pairs[chosen[pairs].all(axis=1)])
+        sizes = np.bincount(label, area * chosen)
+        return label == sizes.argmax()
+    large = inner & (size > 0.02 * size[inner].max())
+    return large[label]

@@ -6,7 +6,8 @@ the lumen, the shared beginnings are merged, and every curve is moved to the mid
 of the lumen, whose depth then serves as its radius.
 """
 
-from __future__ import annotations
+import re
+from collections.abc import Collection
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -24,6 +25,11 @@ TRUNKS = ("rsa", "lsa")
 # These, where they are named, keep what they share with what has no name.
 STEMS = ("bca", "lcca", "rcca")
 MIN_RADIUS = 0.1e-3  # m, floor of a centreline's radius where it scrapes the wall
+TRUNK = "bca"  # name of the common trunk of the right branches
+# Branches of which the brachiocephalic artery is the trunk.
+_RIGHT = re.compile(
+    r"(r|right_?)(cca|ica|eca|va|sa|sca|aa|(common_)?carotid\w*|vertebral\w*|subclavian\w*)(_\d+)?"
+)
 
 
 def grow_tree(
@@ -48,16 +54,14 @@ def grow_tree(
         drawn: whether the curves are drawn, and so may run off the deepest way and
             start anywhere, or computed ways from the inlet on.
     """
-    start = ways.node(inlet)
-    before = ways.deepest_from(start)
+    before = ways.deepest_from(ways.node(inlet))
     raw = {}
     for name, curve in curves.items():
-        if not drawn:
-            raw[name] = resample(curve)
-            continue
-        way = ways.along(curve, name)
-        lead = ways.points[ways.trace(before, ways.node(way[0]))]
-        raw[name] = resample(np.concatenate([lead, way]))
+        if drawn:
+            way = ways.along(curve, name)
+            lead = ways.points[ways.trace(before, ways.node(way[0]))]
+            curve = np.concatenate([lead, way])
+        raw[name] = resample(curve)
     if far is not None:
         root = resample(ways.points[ways.trace(before, ways.node(far))])
     else:
@@ -65,12 +69,9 @@ def grow_tree(
     root = _deep_start(root, field)
     lines = {root_name: root}
     vessels = {root_name: Vessel(root_name, _finish(field, root, None))}
-    stems = () if drawn else STEMS
-
-    def rank(name: str) -> tuple[bool, bool, float]:
-        return name not in TRUNKS, name not in stems, -_bulk(field, raw[name])
-
-    for name in sorted(raw, key=rank):
+    first = TRUNKS if drawn else (*TRUNKS, *STEMS)
+    ranks = {k: (k not in TRUNKS, k not in first, -_bulk(field, raw[k])) for k in raw}
+    for name in sorted(raw, key=ranks.__getitem__):
         curve = raw[name]
         parent, at = _parent(curve, lines, vessels, field)
         trunk = vessels[parent].centreline
@@ -104,19 +105,13 @@ def _separation(curve: np.ndarray, other: np.ndarray, field: SurfaceDepth) -> in
     between = curve[apart] + share * (other[nearest] - curve)[apart]
     walled = apart.copy()
     walled[apart] = field(between).min(axis=0) < 0.0
-    if walled.any():
-        # Not at a corner of the lumen that the two cut before they ever met.
-        met = int((~apart).argmax())
-        walled[:met] = False
+    # Not at a corner of the lumen that the two cut before they ever met.
+    walled[: int((~apart).argmax())] = False
     end = int(walled.argmax()) if walled.any() else len(curve)
     together = np.nonzero(~apart[:end])[0]
     first = min(int(together[-1]) + 1, len(curve) - 2) if len(together) else 0
     # Walk back to where the two still ran together.
-    while (
-        first > 0
-        and distance[first] > 0.5e-3
-        and distance[first - 1] < (distance[first])
-    ):
+    while first and distance[first] > max(0.5e-3, distance[first - 1]):
         first -= 1
     return min(first, len(curve) - 3)
 
@@ -129,8 +124,7 @@ def _parent(curve, lines, vessels, field) -> tuple[str, int]:
     """
     at = {key: _separation(curve, line, field) for key, line in lines.items()}
     key = max(at, key=lambda name: at[name])
-    while vessels[key].parent is not None:
-        vessel = vessels[key]
+    while (vessel := vessels[key]).parent is not None:
         if vessel.centreline.project(curve[at[key]]).arc_length > vessel.ostium:
             break
         key = vessel.parent
@@ -181,3 +175,49 @@ def ostium_of(line: Centreline, trunk: Centreline) -> float:
     outside = place.distance > place.radius
     at = int(outside.argmax()) if outside.any() else len(outside) // 2
     return float(min(line.arc_length[at], 0.5 * line.length))
+
+
+def name_trunk(tree: VesselTree, right: Collection[str] = ()) -> VesselTree:
+    """Give the common trunk of right branches its name, the brachiocephalic artery.
+
+    Where curves share a trunk, the trunk is part of one of them: the right carotid
+    then leaves the right vertebral. If both are right branches, the part up to the
+    first of them becomes a vessel of its own and the parent of both, and of the left
+    carotid of a bovine arch, which leaves it before. Nothing changes if the trunk's
+    name is taken or no two right branches share one.
+
+    Args:
+        tree: as it was grown.
+        right: names of branches that are right ones, whatever they are called; others
+            are known by their names.
+    """
+    root = tree.root.name
+    if TRUNK in tree.vessels:
+        return tree
+    for name, vessel in tree.vessels.items():
+        names = [name, *(key for key, v in tree.vessels.items() if v.parent == name)]
+        own = [key for key in names if key in right or _RIGHT.fullmatch(key)]
+        if vessel.parent != root or name not in own or len(own) < 2:
+            continue
+        line = vessel.centreline
+        split = min(tree.origin(key) for key in own[1:])
+        # Only the left carotid, of a bovine arch, leaves the trunk before it.
+        others = set(names) - set(own)
+        if any(key != "lcca" or tree.origin(key) > split for key in others):
+            continue
+        if not vessel.ostium + 2.0 * STEP < split < line.length - 2.0 * STEP:
+            continue  # they part in the root's lumen, or at the curve's end
+        trunk = line.slice(0.0, split)
+        rest = line.slice(split, line.length)
+        vessels = {}
+        for key, other in tree.vessels.items():
+            if key == name:
+                vessels[TRUNK] = Vessel(TRUNK, trunk, root, vessel.ostium)
+                vessels[key] = Vessel(key, rest, TRUNK, ostium_of(rest, trunk))
+            elif other.parent == name and tree.origin(key) < split + STEP:
+                ostium = ostium_of(other.centreline, trunk)
+                vessels[key] = Vessel(key, other.centreline, TRUNK, ostium)
+            else:
+                vessels[key] = other
+        return VesselTree(vessels)
+    return tree

@@ -1,40 +1,17 @@
 """Units and frames of scans."""
 
-from __future__ import annotations
-
 import re
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from cathsim_dmc import bounds
+
 UNITS = {"mm": 1e-3, "cm": 1e-2, "m": 1.0}  # metres per unit
 # 3D Slicer wrote numbers before it wrote names.
-_SYSTEMS = {"LPS": 1.0, "1": 1.0, "RAS": -1.0, "0": -1.0}
-_AXES = {
-    "L": (1, 0, 0),
-    "R": (-1, 0, 0),
-    "P": (0, 1, 0),
-    "A": (0, -1, 0),
-    "S": (0, 0, 1),
-    "I": (0, 0, -1),
-}
-
-_NEITHER = (
-    "axes are {!r}; give three letters of L, R, A, P, S and I, where +x, +y and +z of "
-    "the scan point, such as 'ILA', or nine numbers: the patient's left, back and head "
-    "as directions in the scan."
-)
+_SYSTEMS = {"LPS": 1.0, "RAS": -1.0, "1": 1.0, "0": -1.0}
+_AXES = dict(zip("LPSRAI", np.concatenate([np.eye(3), -np.eye(3)]), strict=True))
 _OFF = 0.05  # most by which directions given by numbers may differ from a rotation
-
-
-def metres_per(units: str) -> float:
-    """Metres per unit of length; ValueError lists the units."""
-    try:
-        return UNITS[units]
-    except (KeyError, TypeError):
-        raise ValueError(
-            f"units are {units!r}; give one of {', '.join(UNITS)}."
-        ) from None
 
 
 def in_mm(point: np.ndarray) -> str:
@@ -42,15 +19,22 @@ def in_mm(point: np.ndarray) -> str:
     return "(" + ", ".join(f"{x * 1e3:.0f}" for x in point) + ") mm"
 
 
-def frame_sign(frame: str) -> np.ndarray:
-    """Factors (3,) that take a point of ``frame`` ("LPS" or "RAS") to LPS."""
-    try:
-        sign = _SYSTEMS[str(frame)]
-    except KeyError:
-        raise ValueError(
-            f"coordinate system is {frame!r}; give 'LPS' or 'RAS'."
-        ) from None
-    return np.array([sign, sign, 1.0])
+def to_lps(
+    units: str, frame: str = "LPS", axes: str | ArrayLike | None = None
+) -> np.ndarray:
+    """Matrix (3, 3) that takes points of a scan to metres in LPS.
+
+    Args:
+        units: of the scan, a key of `UNITS`.
+        frame: "LPS" or "RAS".
+        axes: how that frame is turned in the patient; see `upright`.
+
+    Raises:
+        ValueError: if one of them is not as stated.
+    """
+    scale = UNITS[bounds.choice("units", units, UNITS)]
+    sign = _SYSTEMS[bounds.choice("mesh_frame", frame, _SYSTEMS)]
+    return upright(axes) * (sign * scale, sign * scale, scale)
 
 
 def upright(axes: str | ArrayLike | None) -> np.ndarray:
@@ -68,31 +52,25 @@ def upright(axes: str | ArrayLike | None) -> np.ndarray:
     """
     if axes is None:
         return np.eye(3)
-    if isinstance(axes, str) and not re.search(r"\d", axes):
-        letters = axes.upper()
-        if len(letters) != 3 or not set(letters) <= set(_AXES):
-            raise ValueError(_NEITHER.format(axes))
-        turn = np.array([_AXES[letter] for letter in letters], dtype=float).T
-        if abs(np.linalg.det(turn)) < 0.5:
-            raise ValueError(f"axes {axes!r} name one direction twice; give all three.")
-    else:
-        try:
+    try:
+        if isinstance(axes, str) and not re.search(r"\d", axes):
+            given = np.array([_AXES[letter] for letter in axes.upper()]).T
+        else:
             text = isinstance(axes, str)
-            numbers = re.split(r"[\s,;]+", axes.strip()) if text else axes
-            given = np.array(numbers, dtype=float).reshape(3, 3)
-            given /= np.linalg.norm(given, axis=1, keepdims=True)
-            left, _, right = np.linalg.svd(given)
-            turn = left @ right  # the nearest rotation
-        except (ValueError, TypeError, np.linalg.LinAlgError):
-            raise ValueError(_NEITHER.format(axes)) from None
-        if not np.abs(turn - given).max() < _OFF:
-            raise ValueError(
-                f"axes {axes!r} are not at right angles; give the patient's left, back "
-                "and head as three perpendicular directions of the scan."
-            )
-    if np.linalg.det(turn) < 0.0:
+            given = re.split(r"[\s,;]+", axes.strip()) if text else axes
+        given = np.array(given, dtype=float).reshape(3, 3)
+        given /= np.maximum(np.linalg.norm(given, axis=1, keepdims=True), 1e-9)
+        left, _, right = np.linalg.svd(given)
+        turn = left @ right  # the nearest rotation
+    except (ValueError, TypeError, KeyError, np.linalg.LinAlgError):
         raise ValueError(
-            f"axes {axes!r} mirror the patient; check the directions (LPS and RAS do "
-            "not)."
+            f"axes are {bounds.shown(axes)}; give three letters of L, R, A, P, S and "
+            "I, where +x, +y and +z of the scan point, such as 'ILA', or nine numbers: "
+            "the patient's left, back and head as directions in the scan."
+        ) from None
+    if not np.abs(turn - given).max() < _OFF or np.linalg.det(turn) < 0.0:
+        raise ValueError(
+            f"axes {bounds.shown(axes)} are not three directions at right angles, or "
+            "mirror the patient (LPS and RAS do not); check them."
         )
     return turn
