@@ -85,9 +85,7 @@ class Arch:
         found = centrelines(ways, ends, entry)
         bend, width, branches = _branches(ways, first.position, last.position, found[0])
         if heart is None:
-            places = [one.s for one in branches] or [1e-3 * bend.apex]
-            odds = {False: 0.0, True: aorta.heart_odds(bend, width, places)}
-            share = naming.hypotheses(bend, branches, _scale(width), odds)
+            share = _shares(bend, width, branches)
             heart = sum(value for key, value in share.items() if key.heart_last)
         return cls(ways, (first, last), entry, found, bend, heart)
 
@@ -127,13 +125,30 @@ class Arch:
         if not found:
             return Naming([f"branch_{k + 1}" for k in range(len(curves))], [])
         if self.heart < SURE:
-            question = (
+            names = naming.neutral_names(curves)
+            share = {
+                key: value
+                for key, value in _shares(bend, width, found).items()
+                if key.heart_last == toward
+            }
+            seen = found[::-1] if toward else found
+            which = naming.question(share, seen, dict(enumerate(names)))
+            heart = (
                 f"question: which end of the aorta is at the heart? ({self.heart:.2f} "
                 "for the one taken); give a point near it (--heart)"
             )
-            return Naming(naming.neutral_names(curves), [question])
+            return Naming(names, [which, heart])
         scale = _scale(width)
         return naming.name_branches(self.ways, bend, scale, found, curves, toward)
+
+
+def _shares(
+    bend: Bend, width: np.ndarray, found: Sequence[Offshoot]
+) -> dict[naming.Hypothesis, float]:
+    """Probabilities of the hypotheses about an arch whose heart is not known."""
+    places = [one.s for one in found] or [1e-3 * bend.apex]
+    odds = {False: 0.0, True: aorta.heart_odds(bend, width, places)}
+    return naming.hypotheses(bend, found, _scale(width), odds)
 
 
 def _scale(width: np.ndarray) -> float:

@@ -135,7 +135,7 @@ def name_branches(
     names |= {i: f"branch_{number + 1}" for number, i in enumerate(rest)}
     notes = ["names with their probability: " + ", ".join(said)] if said else []
     if asks:
-        notes.append(_question(share, seen, names))
+        notes.append(question(share, seen, names))
     for label, one in forked:
         own = " and ".join(sorted(names[i] for i in one.curves))
         label = "trunk of bca and lcca" if label == "bovine" else label
@@ -268,8 +268,18 @@ def _leaves(curve: np.ndarray, bend: Bend) -> int:
     return int(np.linalg.norm(bend.line - place, axis=1).argmin())
 
 
-def _question(share, seen, names) -> str:
-    """What the notes ask where not every branch has a name."""
+def question(
+    share: Mapping[Hypothesis, float],
+    seen: Sequence[Offshoot],
+    names: Mapping[int, str],
+) -> str:
+    """What the notes ask where not every branch has a name.
+
+    Args:
+        share: probabilities of hypotheses with the heart where it is taken to be.
+        seen: offshoots in their order from the heart.
+        names: of the curves, by their rows.
+    """
 
     def text(key: Hypothesis) -> str:
         missing = [name for name in key.pattern if name not in key.labels]
