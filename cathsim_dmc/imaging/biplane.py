@@ -26,6 +26,7 @@ MARKER_TO_HEAD = 0.5 * materials.MARKER_LENGTH
 
 # Distance of the points at which the hull is known, m, and of those of the route.
 HULL_SPACING = 3e-3
+_OUTSIDE = -0.5 * HULL_SPACING  # m; a point so deep still counts as inside
 ROUTE_SPACING = 1e-3
 # The route is smoothed by a Gaussian of this deviation, m: three points of the hull.
 _SMOOTHING = 4e-3
@@ -118,13 +119,17 @@ class Biplane:
 
     @cached_property
     def _hull(self) -> tuple[np.ndarray, np.ndarray]:
-        """First corner (3,) of a grid of `HULL_SPACING`, and its depths (X, Y, Z)."""
+        """First corner (3,) of a grid round the hull, and its depths (X, Y, Z)."""
         arm = self._planes[0].carm
         half = 0.5 * arm.resolution[1] * arm.source_isocentre / arm.focal_length
         low = np.asarray(arm.isocentre) - half
         number = np.arange(int(2 * half / HULL_SPACING) + 1) * HULL_SPACING
         grid = np.stack(np.meshgrid(*(low[:, None] + number), indexing="ij"), -1)
-        return low, self.depth(grid)
+        depth = self.depth(grid)
+        inside = np.argwhere(depth > _OUTSIDE)
+        first, last = inside.min(axis=0), inside.max(axis=0)
+        box = tuple(slice(a, b + 1) for a, b in zip(first, last, strict=True))
+        return low + first * HULL_SPACING, depth[box].copy()
 
     def route(self, start: ArrayLike, goal: ArrayLike) -> np.ndarray:
         """Points (P, 3), m, every `ROUTE_SPACING` from a place in the hull to a goal.
@@ -157,7 +162,7 @@ class Biplane:
         if self._goal is None or not np.array_equal(self._goal[0], goal):
             margin = 0.4 * HULL_SPACING
             cost = (_WIDE / np.clip(depth, margin, _WIDE)) ** 2
-            cost = np.where(depth > -0.5 * HULL_SPACING, cost, -1.0)
+            cost = np.where(depth > _OUTSIDE, cost, -1.0)
             end = _nearest(cost > 0.0, (goal - low) / HULL_SPACING)
             graph = MCP_Geometric(cost)
             reached = graph.find_costs([end])[0]

@@ -23,7 +23,7 @@ _LEAST_RADIUS = 1e-3  # m, of the route
 
 
 class BiplaneSight:
-    """Reconstructs what the planes show; remembers the route of each simulation."""
+    """Reconstructs what the planes show; remembers each simulation's episode."""
 
     def __init__(self, num_simulations: int):
         """Begins with nothing seen.
@@ -33,6 +33,7 @@ class BiplaneSight:
         """
         self._routes: list[Route | None] = [None] * num_simulations
         self._lines = [np.zeros((0, 3))] * num_simulations
+        self._machines: dict[int, Biplane] = {}
 
     def see(
         self,
@@ -58,7 +59,9 @@ class BiplaneSight:
         """
         rows = []
         for k, number in enumerate(numbers.tolist()):
-            machine = _machine(planes[k])
+            if fresh or number not in self._machines:
+                self._machines[number] = _machine(planes[k])
+            machine = self._machines[number]
             (line,) = machine.device(images[k : k + 1])
             if len(line) >= _FEWEST or not len(self._lines[number]) or fresh:
                 self._lines[number] = line
@@ -73,8 +76,8 @@ class BiplaneSight:
         return {name: np.stack([row[name] for row in rows]) for name in rows[0]}
 
 
-# A machine holds some megabytes; an evaluation has one for each episode.
-@functools.lru_cache(maxsize=256)
+# Episodes in the same anatomy share a machine, which holds a megabyte.
+@functools.lru_cache(maxsize=64)
 def _machine(planes: tuple) -> Biplane:
     return Biplane(planes)
 
