@@ -178,7 +178,7 @@ def run(simulation: BatchSimulation, episodes: list[Episode], steps: int) -> lis
     before = simulation.batch.warning.reshape(size, -1).copy()
     excess, force, total = (Peak.none(size) for _ in range(3))
     penetration, overflow = Peak.none(size), Peak.none(size)
-    tip_step, tip = Peak.none(size), simulation.readings.head
+    tip_step, tip = Peak.none(size), simulation.rollout.readings.head
     counts = np.zeros((size, BINS), dtype=np.int64)
     force_sum = np.zeros(size)
     errors = np.full(size, -1)
@@ -189,7 +189,7 @@ def run(simulation: BatchSimulation, episodes: list[Episode], steps: int) -> lis
         warnings += (after != before).any(-1)
         before = after
         errors[result.physics_error & (errors < 0)] = step
-        rows = simulation.sensor_rows[..., simulation.rollout.index.wall_contacts]
+        rows = simulation.stepper.rows[..., simulation.rollout.index.wall_contacts]
         contacts = forces.Contacts.from_sensor(rows)
         deepest = contacts.penetration.max(-1)
         touching = contacts.present.any(-1)

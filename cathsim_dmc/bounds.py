@@ -110,12 +110,8 @@ def indices(name: str, value: Any, count: int) -> np.ndarray:
         return np.arange(count)
     row = _row(value)
     if not row or not all(_is_whole(one) and 0 <= one < count for one in row):
-        refuse(
-            name,
-            value,
-            f"None for all, or at least one integer from 0 to {count - 1} in a row; "
-            "np.flatnonzero(mask) makes one of a mask",
-        )
+        allowed = f"None for all, or integers from 0 to {count - 1} in a row"
+        refuse(name, value, f"{allowed}; np.flatnonzero(mask) makes them of a mask")
     return np.unique(np.array(row, dtype=int))
 
 
@@ -211,6 +207,18 @@ def array(
     return given
 
 
+def actions(value: Any, shape: tuple[int, ...]) -> np.ndarray:
+    """Finite actions of a shape as float64, clipped to [-1, 1] as the drives would."""
+    try:
+        given = array("the action", value, shape=shape)
+    except ValueError as error:
+        raise ValueError(
+            f"{error}, in [-1, 1]: tip motors from proximal to distal (x before y), "
+            "translation, and rotation if the task has it"
+        ) from None
+    return np.clip(given.astype(np.float64), -1.0, 1.0)
+
+
 def instance(name: str, value: Any, kind: type) -> Any:
     """An object of a class."""
     if not isinstance(value, kind):
@@ -244,9 +252,8 @@ def made(name: str, value: Any, kind: type, others: str = "") -> Any:
     if isinstance(value, kind):
         return value
     known = [field.name for field in dataclasses.fields(kind)]
-    if others and not isinstance(value, Mapping):
-        refuse(name, value, f"{others}some of {', '.join(known)}")
-    mapping(name, value, known)
+    if not isinstance(value, Mapping) or set(value) - set(known):
+        refuse(name, value, f"{others}a mapping with some of {', '.join(known)}")
     try:
         return kind(**value)
     except ValueError as error:

@@ -27,6 +27,19 @@ def _stamp() -> bytes:
     return digest.digest()
 
 
+class _Together:
+    """A place for numba's cache of the package, with one stamp for all sources."""
+
+    @classmethod
+    def from_function(cls, py_func, py_file):
+        if not Path(py_file).is_relative_to(_PACKAGE):
+            return None
+        return super().from_function(py_func, py_file)  # type: ignore[misc]
+
+    def get_source_stamp(self) -> bytes:
+        return _stamp()
+
+
 @functools.cache
 def keep_together() -> None:
     """Has numba compile all loops anew when the source of any of them changes.
@@ -36,25 +49,10 @@ def keep_together() -> None:
     """
     from numba.core import caching
 
-    class Together:
-        """A place for the cache of the package, with one stamp for all sources."""
-
-        @classmethod
-        def from_function(cls, py_func, py_file):
-            if not Path(py_file).is_relative_to(_PACKAGE):
-                return None
-            return super().from_function(py_func, py_file)  # type: ignore[misc]
-
-        def get_source_stamp(self) -> bytes:
-            return _stamp()
-
-    class BesideSource(Together, caching.InTreeCacheLocator):
-        """In the folder of the source."""
-
-    class OfUser(Together, caching.UserWideCacheLocator):
-        """In the folder of the user, where that of the source is read-only."""
-
-    caching.CacheImpl._locator_classes[1:1] = [BesideSource, OfUser]  # noqa: SLF001
+    # In the folder of the source, or of the user where that is read-only.
+    for place in (caching.UserWideCacheLocator, caching.InTreeCacheLocator):
+        kind = type(f"_Together{place.__name__}", (_Together, place), {})
+        caching.CacheImpl._locator_classes.insert(1, kind)  # noqa: SLF001
 
 
 class _Compiled:

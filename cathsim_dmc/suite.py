@@ -11,7 +11,6 @@ TorchRL's `DMControlEnv` know it too.
 
 import dataclasses
 import inspect
-import math
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
@@ -34,16 +33,16 @@ from cathsim_dmc.tasks.scene import Scene, chosen_devices, longest_tip
 DOMAIN = "cathsim"
 SUITE = containers.TaggedTasks()
 
-# Constants of dm_control.suite that are computed from its domains at import.
-_TAGGED = {"BENCHMARKING": "benchmarking", "EASY": "easy", "HARD": "hard"}
 # Rewards are distances, not in [0, 1], and nothing is coloured by them.
 _TAG = "no_reward_visualization"
-# Arguments of `composer.Environment` beside those that the suite gives.
-_SETTINGS = {
-    name: parameter
-    for name, parameter in inspect.signature(composer.Environment).parameters.items()
-    if name not in ("task", "random_state")
+# Constants of dm_control.suite that are computed from its domains at import.
+_TAGGED = {
+    "BENCHMARKING": "benchmarking",
+    "EASY": "easy",
+    "HARD": "hard",
+    "NO_REWARD_VIZ": _TAG,
 }
+_UNTAGGED = {"EXTRA": "BENCHMARKING", "REWARD_VIZ": "NO_REWARD_VIZ"}
 _CONFIG_FIELDS = tuple(field.name for field in dataclasses.fields(NavigationConfig))
 
 
@@ -108,12 +107,20 @@ def register(name: str, definition: TaskDefinition, *tags: str) -> None:
     TASKS[name] = definition
 
     def factory(random=None, environment_kwargs=None, **options):
-        settings = _environment_settings(environment_kwargs)
+        settings = bounds.options("environment_kwargs", environment_kwargs)
         return environment(make_task(name, random=random, **options), **settings)
 
     factory.__name__, factory.__doc__ = name, definition.description
     SUITE.add(*tags, _TAG)(factory)
     _register_domain()
+
+
+def _definition(name: str) -> TaskDefinition:
+    if name not in TASKS:
+        raise ValueError(
+            f"no task {name!r} in domain {DOMAIN!r}; there are {', '.join(TASKS)}"
+        )
+    return TASKS[name]
 
 
 def make_task(
@@ -132,11 +139,7 @@ def make_task(
     Raises:
         ValueError: if the task or an option does not exist; lists those that do.
     """
-    if name not in TASKS:
-        raise ValueError(
-            f"no task {name!r} in domain {DOMAIN!r}; there are {', '.join(TASKS)}"
-        )
-    definition = TASKS[name]
+    definition = _definition(name)
     options = {**definition.options, **options}
     if unknown := sorted(set(options) - {*task_options(name)}):
         raise ValueError(
@@ -178,7 +181,7 @@ def make_task(
             objective,
         )
 
-    others = map(room, range(1, len(anatomies)))
+    others = map(room, range(1, len(anatomies))) if len(anatomies) > 1 else None
     return Navigation(*room(0), config, random, others=others, name=name)
 
 
@@ -222,10 +225,8 @@ def load(
     Raises:
         ValueError: if domain, task or an option does not exist; lists those that do.
     """
-    if domain_name == DOMAIN and task_name not in SUITE:
-        raise ValueError(
-            f"no task {task_name!r} in domain {DOMAIN!r}; there are {', '.join(SUITE)}"
-        )
+    if domain_name == DOMAIN:
+        _definition(task_name)
     if domain_name not in dm_suite._DOMAINS:  # noqa: SLF001
         raise ValueError(
             f"no domain {domain_name!r}; there are {DOMAIN} and those of "
@@ -249,9 +250,6 @@ def environment(task: Navigation, **environment_kwargs: Any) -> composer.Environ
     Args:
         task: Task that no other environment owns.
         **environment_kwargs: Arguments of `composer.Environment`.
-
-    Raises:
-        ValueError: if there is no such argument, or its value is not allowed.
     """
     settings = {
         "strip_singleton_obs_buffer_dim": True,
@@ -260,44 +258,23 @@ def environment(task: Navigation, **environment_kwargs: Any) -> composer.Environ
         "legacy_step": False,
         # Divergence ends the episode with a reason.
         "raise_exception_on_physics_error": False,
-        **_environment_settings(environment_kwargs),
+        **environment_kwargs,
     }
     return Environment(task, random_state=task.random, **settings)
 
 
-def _environment_settings(given: Mapping[str, Any] | None) -> dict[str, Any]:
-    settings = bounds.options("environment_kwargs", given)
-    bounds.mapping("environment_kwargs", settings, _SETTINGS)
-    limit = settings.get("time_limit", math.inf)
-    if not (isinstance(limit, float) and limit == math.inf):
-        bounds.number("time_limit", limit, positive=True)
-    for name, value in settings.items():
-        if isinstance(_SETTINGS[name].default, bool):
-            bounds.switch(name, value)
-    return settings
-
-
 def _register_domain() -> None:
     """Registers the domain and its tasks in dm_control.suite; may be repeated."""
-    needed = ("_DOMAINS", "_get_tasks", "_get_tasks_by_domain", "ALL_TASKS", *_TAGGED)
-    missing = [name for name in needed if not hasattr(dm_suite, name)]
-    if missing:
-        raise ImportError(
-            f"dm_control.suite lacks {', '.join(missing)}, so the domain "
-            f"{DOMAIN!r} cannot be registered; install dm-control 1.0.50"
-        )
     dm_suite._DOMAINS[DOMAIN] = sys.modules[__name__]  # noqa: SLF001
     tasks = dm_suite._get_tasks  # noqa: SLF001
-    dm_suite.ALL_TASKS = tasks(None)
+    dm_suite.ALL_TASKS = every = tasks(None)
     for constant, tag in _TAGGED.items():
         setattr(dm_suite, constant, tasks(tag))
-    everything = set(dm_suite.ALL_TASKS)
-    dm_suite.EXTRA = tuple(sorted(everything - set(dm_suite.BENCHMARKING)))
-    dm_suite.NO_REWARD_VIZ = tasks("no_reward_visualization")
-    dm_suite.REWARD_VIZ = tuple(sorted(everything - set(dm_suite.NO_REWARD_VIZ)))
-    dm_suite.TASKS_BY_DOMAIN = dm_suite._get_tasks_by_domain(  # noqa: SLF001
-        dm_suite.ALL_TASKS
-    )
+    for constant, others in _UNTAGGED.items():
+        left = set(every) - set(getattr(dm_suite, others))
+        setattr(dm_suite, constant, tuple(sorted(left)))
+    grouped = dm_suite._get_tasks_by_domain(every)  # noqa: SLF001
+    dm_suite.TASKS_BY_DOMAIN = grouped
 
 
 _ARTERIES = {

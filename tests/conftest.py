@@ -12,6 +12,7 @@ import pytest
 from cathsim_dmc import cli, suite
 from cathsim_dmc.tasks import observations
 from cathsim_dmc.tasks.navigation import Navigation
+from cathsim_dmc.tasks.observation_kind import BIPLANE, COAXIAL, LIVING
 
 # A first call may import scipy or compile; how long it takes is not what is tested.
 hypothesis.settings.register_profile("default", deadline=None)
@@ -27,7 +28,7 @@ EACH_TASK = [
 OBSERVATIONS = [
     name
     for name, row in observations.OBSERVATIONS.items()
-    if not (row.coaxial or row.living or row.biplane)
+    if row.needs not in (BIPLANE, COAXIAL, LIVING)
 ]
 SHORT_EPISODE = 12  # control steps
 

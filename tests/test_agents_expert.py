@@ -1,7 +1,5 @@
 """The scripted expert: its geometry against MuJoCo, its retries, and its success."""
 
-import dataclasses
-
 import numpy as np
 import pytest
 from conftest import twin
@@ -11,8 +9,11 @@ from hypothesis import strategies as st
 from cathsim_dmc import agents, policies, suite
 from cathsim_dmc.anatomy.arch import arch
 from cathsim_dmc.physics import forces
-from cathsim_dmc.policies import attempts, expert, pursuit
-from cathsim_dmc.simulation import batch
+from cathsim_dmc.policies import attempts, pursuit
+from cathsim_dmc.policies.attempts import State
+from cathsim_dmc.simulation.batch import BatchSimulation
+from cathsim_dmc.tasks.route import Place, locate
+from cathsim_dmc.tasks.rows import part
 
 TASKS = (
     "type1_bca",
@@ -45,12 +46,16 @@ def to_bca():
 @pytest.fixture(scope="module")
 def plan(task):
     """Plan of the same."""
-    return pursuit.Plan.for_task(task)
+    return plan_of(task)
+
+
+def plan_of(task):
+    return pursuit.Plan.for_case(BatchSimulation(task, 1).rollout.case())
 
 
 def jiggled(task, count, steps, seed=0):
     """Simulations after random actions that push forwards."""
-    simulation = batch.BatchSimulation(task, count, num_threads=1, seeds=seed)
+    simulation = BatchSimulation(task, count, num_threads=1, seeds=seed)
     simulation.reset()
     random = np.random.default_rng(seed)
     for step in range(steps):
@@ -78,7 +83,9 @@ def test_tip_frames_are_mujocos(rotation, roll):
     head = physics.bind(task.scene.catheter.head).xmat.reshape(3, 3)[:, 2]
     state = task.rollout.index.read(physics.data.ptr)
     axes, direction = pursuit.tip_frames(
-        pursuit.Plan.for_task(task), state.joint_positions, state.head_frame
+        pursuit.Plan.for_case(task.rollout.case()),
+        state.joint_positions,
+        state.head_frame,
     )
     # The y hinge sits on the frame that the x hinge has turned.
     np.testing.assert_allclose(axes, expected, atol=1e-9)
@@ -89,14 +96,14 @@ def test_tip_frames_are_mujocos(rotation, roll):
     "hinge, towards", [(0, (0, -1)), (1, (1, 0))], ids=["bend_x", "bend_y"]
 )
 def test_a_positive_bend_turns_the_head_as_documented(task, hinge, towards):
-    simulation = batch.BatchSimulation(task, 1, num_threads=1)
+    simulation = BatchSimulation(task, 1, num_threads=1)
     simulation.reset()
-    before = simulation.readings.head[0]
+    before = simulation.rollout.readings.head[0]
     action = np.zeros((1, simulation.num_actions))
     action[0, hinge:20:2] = 0.3
     for _ in range(15):
         simulation.step(action)
-    moved = (simulation.readings.head[0] - before)[:2]
+    moved = (simulation.rollout.readings.head[0] - before)[:2]
     assert moved @ towards > 0.9 * np.linalg.norm(moved) > 5e-3
 
 
@@ -107,7 +114,7 @@ def test_a_head_in_the_tube_is_not_outside(plan, s, fraction, angle):
     across = np.linalg.svd(np.gradient(plan.points, axis=0)[index][None])[2][1:]
     offset = np.cos(angle) * across[0] + np.sin(angle) * across[1]
     head = plan.points[index] + fraction * plan.radii[index] * offset
-    place = pursuit.locate(plan, head)
+    place = locate(plan, head)
     assert place.excess <= 0
     distance = np.linalg.norm(plan.at(place.arc_length) - head)
     assert distance <= fraction * plan.radii[index] + 1e-9
@@ -123,32 +130,32 @@ def test_beside_the_ostium_the_head_is_still_in_the_parent(task, plan):
     head = branch.position + away
     assert task.scene.anatomy.depth(head) > 0
     assert task.objective.route.project(head).arc_length > origin + 5e-3
-    place = pursuit.locate(plan, head)
+    place = locate(plan, head)
     assert place.excess <= 0
     assert place.arc_length <= origin + 1e-3
 
 
 def test_many_act_as_each_alone(task, plan):
     simulation = jiggled(task, 3, 20)
-    readings, wall_force = simulation.readings, simulation.wall_force
-    together = expert.Expert(plan)
-    alone = [expert.Expert(plan) for _ in range(3)]
+    readings, wall_force = simulation.rollout.readings, simulation.rollout.wall_force
+    together, alone = plan.fresh((3,)), [plan.fresh(()) for _ in range(3)]
     for _ in range(3):
-        action = together.act(readings, wall_force)
+        action, together = plan.decide(plan.settings, together, readings, wall_force)
         assert action.shape == (3, plan.num_actions)
         assert np.abs(action).max() <= 1.0
-        for index, single in enumerate(alone):
-            part = type(readings)(*(value[index] for value in readings))
-            force = forces.WallForce(*(value[index] for value in wall_force))
-            np.testing.assert_allclose(
-                action[index], single.act(part, force), rtol=0, atol=1e-12
+        for index in range(3):
+            own, alone[index] = plan.decide(
+                plan.settings,
+                alone[index],
+                part(readings, index),
+                part(wall_force, index),
             )
+            np.testing.assert_allclose(action[index], own, rtol=0, atol=1e-12)
 
 
 def test_bends_follow_the_leader(plan):
     bend = np.random.default_rng(0).uniform(-0.3, 0.3, (1, len(plan.tip), 2))
-    state = pursuit.State.fresh((1,), len(plan.tip))
-    state = dataclasses.replace(state, bend=bend, insertion=np.array([0.05]))
+    state = plan.fresh((1,))._replace(bend=bend, insertion=np.array([0.05]))
     link = plan.link_length
     pushed = pursuit._follow_the_leader(plan, state, state.insertion + link)
     np.testing.assert_allclose(pushed[:, :-1], bend[:, 1:])
@@ -160,12 +167,12 @@ def test_bends_follow_the_leader(plan):
 
 def test_a_head_that_stands_still_is_withdrawn_and_tried_again():
     options = pursuit.Settings(patience=5)
-    state = pursuit.State.fresh((2,), 10)
+    state = State.fresh((2,), 10)
     insertion, retracted = np.full(2, 0.08), []
     for step in range(24):
         # The first gains a millimetre a step, the second nothing.
         arc = np.array([0.1 + 1e-3 * step, 0.1])
-        place = pursuit.Place(arc, np.full(2, 0.01), np.full(2, -0.5))
+        place = Place(arc, np.full(2, 0.01), np.full(2, -0.5))
         state = attempts.advance(options, state, place, insertion)
         retracted.append(state.retracting.copy())
         insertion = insertion - 1e-3 * state.retracting
@@ -179,30 +186,31 @@ def test_a_head_that_stands_still_is_withdrawn_and_tried_again():
 
 def test_pressing_on_the_wall_slows_the_device_down():
     # In a straight vessel the tip points along the route.
-    task = make_task("simple1_lcca")
-    plan = pursuit.Plan.for_task(task)
-    simulation = jiggled(task, 2, 1)
-    options = pursuit.Settings()
+    simulation, options = jiggled(make_task("simple1_lcca"), 2, 1), pursuit.Settings()
+    plan = pursuit.Plan.for_case(simulation.rollout.case())
     pressing = forces.WallForce(*[np.array([0.0, 1.0])] * 4)
-    action = expert.Expert(plan, options).act(simulation.readings, pressing)
+    action, _ = plan.decide(
+        options, plan.fresh((2,)), simulation.rollout.readings, pressing
+    )
     assert action[0, 20] > 0.5 * options.speed
     assert action[1, 20] == pytest.approx(options.speed * options.creep)
 
 
-def test_reset_forgets_only_those_named(task, plan):
+def test_reset_forgets_only_those_named(task):
     simulation = jiggled(task, 3, 20)
-    pilot = expert.Expert(plan)
-    pilot.act(simulation.readings, simulation.wall_force)
+    view, pilot = policies.View(simulation), policies.make_policy("expert")
+    pilot.reset(view, np.ones(3, bool))
+    pilot.act(None)
     kept = pilot.state.bend.copy()
     assert (np.abs(kept).max((1, 2)) > 0).all()
-    pilot.reset(np.array([False, True, False]))
+    pilot.reset(view, np.array([False, True, False]))
     assert not pilot.state.bend[1].any() and np.isnan(pilot.state.insertion[1])
     np.testing.assert_array_equal(pilot.state.bend[[0, 2]], kept[[0, 2]])
 
 
 def test_a_device_without_motors_is_refused():
     with pytest.raises(ValueError, match="has no motors.*steerable_5f"):
-        expert.Expert.for_task(make_task(device="diagnostic_5f_j"))
+        plan_of(make_task(device="diagnostic_5f_j"))
 
 
 def test_policy_reaches_the_goal_in_a_composer_environment(task):
@@ -222,24 +230,25 @@ def test_policy_reaches_the_goal_in_a_composer_environment(task):
     assert max(lengths) < 300
 
 
-def test_it_recovers_from_a_wrong_branch(task, plan, to_bca):
+def test_it_recovers_from_a_wrong_branch(task, to_bca):
     # A straight push ends in the BCA of this phantom.
-    simulation = batch.BatchSimulation(task, 1, num_threads=1, seeds=3)
+    simulation = BatchSimulation(task, 1, num_threads=1, seeds=3)
     simulation.reset()
     push = np.zeros((1, simulation.num_actions))
     push[0, 20] = 1.0
     bca = to_bca.objective
     for _ in range(150):
         simulation.step(push)
-        if bca.in_branch(simulation.readings.head)[0]:
+        if bca.in_branch(simulation.rollout.readings.head)[0]:
             break
     else:
         pytest.fail("the push did not end in the BCA")
     for _ in range(10):
         simulation.step(push)
-    pilot = expert.Expert(plan)
+    pilot, view = policies.make_policy("expert"), policies.View(simulation)
+    pilot.reset(view, np.ones(1, bool))
     for _ in range(600):
-        step = simulation.step(pilot.act(simulation.readings, simulation.wall_force))
+        step = simulation.step(pilot.act(None))
         if step.terminated[0]:
             break
     assert step.outcome.success[0]
@@ -268,18 +277,3 @@ def test_it_solves_arches_that_nobody_tuned_it_on(number, access):
         )
         assert result.successes == 2
         assert result.values("forces.peak_max.maximum").max() < GENTLE
-
-
-def test_a_lost_head_is_withdrawn_until_it_is_back():
-    options = pursuit.Settings(lost_patience=3, backoff=5e-3)
-    state = pursuit.State.fresh((), 10)
-    insertion = np.array(0.08)
-    for step in range(60):
-        excess = np.array(2.0 if insertion > 0.06 else -0.5)
-        place = pursuit.Place(np.array(0.1 + 1e-3 * step), np.array(0.004), excess)
-        state = attempts.advance(options, state, place, insertion)
-        if state.attempts and not state.retracting:
-            break
-        insertion = insertion - 1e-3 * state.retracting
-    assert state.attempts == 1
-    assert insertion == pytest.approx(0.06, abs=1.1e-3)

@@ -7,7 +7,6 @@ import signal
 import numpy as np
 import pytest
 from conftest import OBSERVATIONS, TASKS
-from dm_control import suite as dm_suite
 from dm_control.composer.variation import distributions
 
 from cathsim_dmc import suite
@@ -96,7 +95,7 @@ def test_action_that_is_not_finite(environment, value):
     action = np.zeros(21)
     action[[3, 20]] = value
     before = environment.physics.data.qpos.copy()
-    with pytest.raises(ValueError, match=r"2 NaN or infinite.*\[-1, 1\]"):
+    with pytest.raises(ValueError, match=r"finite numbers.*\[-1, 1\]"):
         environment.step(action)
     np.testing.assert_array_equal(environment.physics.data.qpos, before)
 
@@ -185,17 +184,6 @@ def test_options_that_are_no_mapping_are_refused(value):
     for name in ("task_kwargs", "environment_kwargs"):
         with pytest.raises(ValueError, match=f"{name} is .*None, or a mapping"):
             suite.load("cathsim", "type1_bca", **{name: value})
-
-
-@pytest.mark.parametrize(
-    ("name", "value"),
-    [("time_limit", value) for value in (np.nan, -1, 0, None, "1", -np.inf)]
-    + [("legacy_step", 1), ("task", None), ("time_limits", 1.0)],
-)
-def test_settings_of_an_environment_are_checked_before_the_work(name, value):
-    for load in (suite.load, dm_suite.load):
-        with pytest.raises(ValueError, match=name):
-            load("cathsim", "type1_bca", environment_kwargs={name: value})
 
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="there is no fork")

@@ -122,7 +122,7 @@ def test_randomised_episodes_are_equal():
     seen, touched = [], False
     for episode in range(2):
         pair.reset()
-        seen.append(pair.batch.rollout.objective.goal.copy())
+        seen.append(pair.batch.rollout.resting_goal.copy())
         for index, action in enumerate(actions(20, episode)):
             touched |= bool((pair.step(action).wall_force.sum > 0).any())
             if index == 15:
@@ -186,4 +186,4 @@ def test_one_policy_on_images_runs_alike(anatomy, noise):
     for _ in range(20):
         observation = pair.step(steer(observation["image"])).observation
     heads = [each.task.readings.head for each in pair.environments]
-    np.testing.assert_array_equal(pair.batch.readings.head, heads)
+    np.testing.assert_array_equal(pair.batch.rollout.readings.head, heads)

@@ -80,12 +80,12 @@ def test_goal_and_head_are_judged_in_the_vessel_at_rest():
     task = suite.make_task("simple1_bca", vessel={"motion": True})
     batch = BatchSimulation(task, 1, seeds=0)
     batch.reset()
-    np.testing.assert_allclose(batch.rollout.goal[0], batch.rollout.objective.goal)
+    np.testing.assert_allclose(batch.rollout.goal, batch.rollout.resting_goal)
     for _ in range(50):  # to the end of inspiration
         step = batch.step(np.zeros((1, 21)))
     rollout = batch.rollout
-    assert np.linalg.norm(rollout.goal[0] - rollout.objective.goal) > 5e-3
-    resting = np.linalg.norm(rollout.resting.head - rollout.objective.goal, axis=-1)
+    assert np.linalg.norm(rollout.goal - rollout.resting_goal, axis=-1)[0] > 5e-3
+    resting = np.linalg.norm(rollout.resting.head - rollout.resting_goal, axis=-1)
     np.testing.assert_allclose(step.distance, resting)
     np.testing.assert_allclose(step.info()["breath_phase"], 0.5, atol=1e-9)
     # What is in the sheath has not moved, so it has not left the vessel either.

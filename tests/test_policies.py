@@ -66,8 +66,8 @@ class Backwards(Policy):
         self.begun.append(which.copy())
         self.shape = view.num_simulations, view.num_actions
         self.motors = len(view.task.scene.catheter.tip_motors)
-        assert view.readings.head.shape == (self.shape[0], 3)
-        assert view.wall_force.sum.shape == self.shape[:1]
+        assert view.rollout.readings.head.shape == (self.shape[0], 3)
+        assert view.rollout.wall_force.sum.shape == self.shape[:1]
 
     def act(self, observation):
         action = np.zeros(self.shape)

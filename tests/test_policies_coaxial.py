@@ -1,18 +1,15 @@
 """The scripted expert of coaxial devices."""
 
-import dataclasses
-
 import numpy as np
 import pytest
 from test_policies import assert_same_in_composer
 
 from cathsim_dmc import policies, suite
 from cathsim_dmc.agents import evaluate
-from cathsim_dmc.policies import attempts, coaxial_pursuit, pursuit
-from cathsim_dmc.policies.attempts import Attempts
+from cathsim_dmc.policies import attempts, coaxial_pursuit
+from cathsim_dmc.policies.attempts import State
 from cathsim_dmc.policies.coaxial_pursuit import CoaxialPlan, CoaxialSettings
-from cathsim_dmc.policies.expert import Expert
-from cathsim_dmc.policies.teacher import Teacher
+from cathsim_dmc.policies.expert import Teacher
 from cathsim_dmc.simulation.batch import BatchSimulation
 from cathsim_dmc.tasks.route import Place, locate
 
@@ -42,19 +39,18 @@ def test_frames_of_the_links_are_those_of_the_simulator(environment):
     for number in range(1, 9):
         frame = coaxial_pursuit._before(frame, joints, number)
         np.testing.assert_allclose(frame[0], rotations[-1 - number], atol=1e-12)
-    assert view.devices.insertion.shape == (1, 2)
+    assert view.rollout.devices.insertion.shape == (1, 2)
 
 
 def test_turning_by_the_error_turns_the_side_to_the_route(environment):
     environment.reset()
-    plan = CoaxialPlan.for_task(environment.task)
-    view = policies.View(environment)
+    plan = CoaxialPlan.for_case(environment.task.rollout.case())
+    rollout = environment.task.rollout
 
     def directions():
-        readings = view.readings
-        place = locate(plan, readings.head)
-        ahead = np.full(1, 0.02)
-        return coaxial_pursuit._directions(plan, readings, view.devices, place, ahead)
+        readings, ahead = rollout.readings, np.full(1, 0.02)
+        place, devices = locate(plan, readings.head), rollout.devices
+        return coaxial_pursuit._directions(plan, readings, devices, place, ahead)
 
     before, away = directions()
     wrong = float(np.angle(np.exp(1j * before[0, 0])))
@@ -71,12 +67,9 @@ def test_turning_by_the_error_turns_the_side_to_the_route(environment):
 
 
 def fresh(arc_length, insertion, **values):
-    state = Attempts.none((1,))
     changes = {"arc_length": arc_length, "best": arc_length, "held": insertion}
-    changes.update(values)
-    return dataclasses.replace(
-        state, **{name: np.array([value]) for name, value in changes.items()}
-    )
+    changes = {name: np.array([value]) for name, value in (changes | values).items()}
+    return State.fresh((1,))._replace(**changes)
 
 
 def attempt(state, arc_length, insertion, excess=-0.5):
@@ -133,24 +126,17 @@ def test_it_plays_the_same_in_composer():
 
 def test_a_new_episode_forgets_the_last():
     task = suite.make_task(TASK, random=0, observation="tracking")
-    expert = Expert.for_task(task)
-    assert not hasattr(expert.plan, "tip")
     simulation = BatchSimulation(task, 2, seeds=3)
     simulation.reset()
-    state = (simulation.readings, simulation.wall_force, simulation.rollout.devices)
-    first = expert.act(*state)
+    expert, view = policies.make_policy("expert"), policies.View(simulation)
+    expert.reset(view, np.ones(2, bool))
+    first = expert.act(None)
     expert.state.attempts[:] = 4  # which has another direction
-    expert.reset(np.array([True, False]))
+    expert.reset(view, np.array([True, False]))
     np.testing.assert_array_equal(expert.state.attempts, [0, 4])
-    again = expert.act(*state)
+    again = expert.act(None)
     np.testing.assert_array_equal(again[0], first[0])
     assert not np.array_equal(again[1], first[1])
-
-
-def test_what_is_for_one_device_is_refused_for_several():
-    task = suite.make_task(TASK, random=0, observation="tracking")
-    with pytest.raises(ValueError, match="coaxial_pursuit.CoaxialSettings"):
-        Expert.for_task(task, pursuit.Settings())
 
 
 @pytest.mark.parametrize(

@@ -73,8 +73,6 @@ def test_a_seed_is_the_suites_seed():
         np.testing.assert_array_equal(rows[0][key], timestep.observation[key])
         np.testing.assert_array_equal(rows[-1][key], again[-1][key])
     assert not np.array_equal(rows[0]["position"], other[0]["position"])
-    rows, _ = run(env, 1, seed=2**70 + 1)
-    assert not np.array_equal(rows[0]["position"], again[0]["position"])
 
 
 def test_time_truncates_and_does_not_terminate():
@@ -137,7 +135,7 @@ def test_success_terminates():
     env.reset(seed=0)
     task = env.unwrapped.environment.task
     # Any place in the branch counts with such a goal, so the branch is moved here.
-    task.rollout.objective = _everywhere(task.objective)
+    task.rollout.objectives[0] = _everywhere(task.objective), slice(None)
     _, reward, terminated, truncated, info = env.step(np.zeros(21, np.float32))
     assert (reward, terminated, truncated) == (10.0, True, False)
     assert info["success"] and not info["physics_error"]

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import torch
-from conftest import SHORT_EPISODE, twin
+from conftest import SHORT_EPISODE
 from torchrl.envs import DMControlEnv
 from torchrl.envs.utils import check_env_specs
 
@@ -102,21 +102,6 @@ def test_only_what_is_done_is_reset(batched):
     assert not torch.equal(after[0], before[0])
     assert not torch.equal(after[2], before[2])
     assert batched.simulation.rollout.steps.tolist() == [0, 3, 0]
-
-
-def test_the_first_episode_is_that_of_the_seed():
-    """So that an episode of an evaluation can be recorded by its seed."""
-    from cathsim_dmc.simulation.environments import make_env
-
-    env = make_env("simple1_lcca", num_envs=2, seed=31, num_threads=1)
-    distances = env.reset()["info", "distance"].flatten().tolist()
-    task = suite.make_task("simple1_lcca")
-    for index, distance in enumerate(distances):
-        single = suite.environment(twin(task, 31 + index))
-        single.reset()
-        assert distance == np.float32(single.task.info()["distance"])
-        single.close()
-    env.close()
 
 
 def test_success_is_terminated_in_torchrl():

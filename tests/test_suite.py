@@ -116,21 +116,6 @@ def test_action_spec(shared_environment, task_name):
 
 
 @pytest.mark.parametrize("task_name", EACH_TASK)
-def test_observations_conform_to_their_specs(shared_environment, task_name):
-    environment = shared_environment(task_name)
-    expected = environment.observation_spec()
-    timestep = environment.reset()
-    for action in random_actions(environment, 5):
-        assert list(timestep.observation) == list(expected)
-        for key, spec in expected.items():
-            spec.validate(timestep.observation[key])
-            assert np.isfinite(timestep.observation[key]).all(), key
-        timestep = environment.step(action)
-    environment.reward_spec().validate(timestep.reward)
-    environment.discount_spec().validate(timestep.discount)
-
-
-@pytest.mark.parametrize("task_name", EACH_TASK)
 def test_start_is_randomised_within_a_millimetre(shared_environment, task_name):
     """Around where the device has settled, which no seed decides."""
     environment = shared_environment(task_name)
@@ -144,19 +129,6 @@ def test_start_is_randomised_within_a_millimetre(shared_environment, task_name):
     suite.environment(task).reset()
     displacement = np.linalg.norm(heads - task.readings.head, axis=-1)
     assert 0.3e-3 < displacement.max() < 1.02e-3
-
-
-@pytest.mark.parametrize("task_name", EACH_TASK)
-def test_same_seed_gives_the_same_episode(shared_environment, reseed, task_name):
-    environment = shared_environment(task_name)
-    actions = random_actions(environment, 20)
-    runs = []
-    for seed in (7, 7, 8):
-        timesteps = [reseed(environment, seed)]
-        timesteps += [environment.step(action) for action in actions]
-        runs.append([timestep.observation for timestep in timesteps])
-    assert_bitwise_equal(runs[0], runs[1])
-    assert (runs[0][0]["position"] != runs[2][0]["position"]).any()
 
 
 def test_no_memory_is_shared_between_any_observations(shared_environment):
@@ -397,7 +369,7 @@ def test_halton_noise_breaks_nothing(
         assert timestep.last() == (count == 2000)  # noise finds no branch
         excess.append(containment.largest_excess(task.readings.centreline))
         force.append(task.wall_force.peak_max)
-        contacts = forces.Contacts.from_sensor(task.contact_rows)
+        contacts = forces.Contacts.from_sensor(task.stepper.contact_rows[0])
         depth.append(contacts.penetration.max(initial=0.0))
     assert count == steps
     warnings = [warning.number for warning in environment.physics.data.ptr.warning]

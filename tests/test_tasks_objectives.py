@@ -240,9 +240,9 @@ def test_start_is_uniform_in_a_ball_of_a_millimetre():
 @pytest.mark.parametrize(
     ("field", "value", "message"),
     [
-        ("weights", "sparse", "mapping of reward terms.*distance, path"),
-        ("weights", {}, "mapping of reward terms"),
-        ("weights", {"sparse": 1.0}, "no term sparse.*distance, path"),
+        ("weights", "sparse", "mapping with some of distance, path"),
+        ("weights", {}, "some of distance"),
+        ("weights", {"sparse": 1.0}, "reward is.*sparse.*distance, path"),
         ("weights", {"distance": float("nan")}, "finite"),
         ("weights", {"distance": "1"}, "finite"),
         ("goal_radius", 0.0, "above 0"),

@@ -183,9 +183,9 @@ def test_the_route_ahead_is_that_of_the_centreline_seen_from_the_tip(make):
 def test_the_route_goes_straight_on_behind_the_goal():
     objective = suite.make_task("simple1_bca").objective
     line = objective.route
-    ahead = route.Routes([objective]).ahead(
-        np.zeros(1, int), line.points[-1:] - 1e-4, np.eye(3)[None]
-    )
+    head, frame = line.points[-1:] - 1e-4, np.eye(3)[None]
+    routes = [route.Route.of(objective)]
+    ahead = route.look_ahead(routes, np.zeros(1, int), head, frame)
     points = ahead.points[0] + line.points[-1] - 1e-4
     way = np.diff(points[2:], axis=0)
     np.testing.assert_allclose(np.linalg.norm(way, axis=-1), 5e-3, atol=1e-9)
@@ -201,7 +201,8 @@ def test_a_head_beside_the_route_sees_how_far_it_is_out_of_the_lumen():
     aside *= line.radii[middle] / np.linalg.norm(aside)
     heads = line.points[middle] + np.outer([0.0, 1.0, 3.0], aside)
     frames = np.broadcast_to(np.eye(3), (3, 3, 3))
-    ahead = route.Routes([objective]).ahead(np.zeros(3, int), heads, frames)
+    routes = [route.Route.of(objective)]
+    ahead = route.look_ahead(routes, np.zeros(3, int), heads, frames)
     np.testing.assert_allclose(ahead.excess, [-1, 0, 2], atol=0.1)
 
 
@@ -210,7 +211,7 @@ def test_an_objective_without_a_route_cannot_show_one():
         goal, goal_radius = np.zeros(3), 1.0
 
     with pytest.raises(ValueError, match="Anywhere has no route"):
-        route.Routes([Anywhere()])
+        route.Route.of(Anywhere())
 
 
 def test_options_are_json_and_wrong_ones_are_refused():

@@ -7,10 +7,10 @@ from test_parity import PICTURES, SIMULATIONS, Pair, actions
 
 from cathsim_dmc import policies, suite
 from cathsim_dmc.anatomy.arch import arch
-from cathsim_dmc.policies.expert import Expert
+from cathsim_dmc.policies.pursuit import Plan
 from cathsim_dmc.tasks import cases, placement
-from cathsim_dmc.tasks.objective_pool import part
 from cathsim_dmc.tasks.physics_errors import ESCAPE_INTERVAL
+from cathsim_dmc.tasks.rows import part
 
 POOL = 3
 STEPS = 55  # past the first look for an escape
@@ -173,12 +173,15 @@ def test_the_expert_follows_the_arch_of_each_simulation(plain_pair):
     view = policies.View(simulation)
     policy = policies.make_policy("expert")
     policy.reset(view, np.ones(SIMULATIONS, dtype=bool))
-    alone = [Expert.for_task(simulation.rollout.case(i)) for i in range(SIMULATIONS)]
+    rollout = simulation.rollout
+    plans = [Plan.for_case(rollout.case(i)) for i in range(SIMULATIONS)]
+    states = [plan.fresh((1,)) for plan in plans]
     for _ in range(5):
         action = policy.act(None)
-        for i, expert in enumerate(alone):
+        for i, plan in enumerate(plans):
             row = np.array([i])
-            own = expert.act(part(view.readings, row), part(view.wall_force, row))
+            seen = part(rollout.readings, row), part(rollout.wall_force, row)
+            own, states[i] = plan.decide(plan.settings, states[i], *seen)
             np.testing.assert_array_equal(action[i], own[0])
         simulation.step(action)
 
@@ -188,9 +191,7 @@ def test_goals_and_measures_are_those_of_the_own_arch(plain_pair):
     step = plain_pair.batch.step(np.zeros((SIMULATIONS, 21)))
     for environment in plain_pair.environments:
         environment.step(np.zeros(21))
-    # One for all where they have drawn one arch.
-    goals = plain_pair.batch.rollout.objective.goal
-    goals = np.broadcast_to(goals, (SIMULATIONS, 3))
+    goals = plain_pair.batch.rollout.resting_goal
     for i in range(SIMULATIONS):
         case = plain_pair.batch.rollout.case(i)
         np.testing.assert_array_equal(goals[i], case.scene.goal.position)

@@ -53,9 +53,9 @@ def test_what_goes_deep_in_the_last_physics_step_is_seen():
     batch.reset()
     before, never = np.array([1e-4]), np.array([False])
     batch.batch.qpos[:, batch.rollout.index.insertion_qpos] += 0.1
-    assert batch._stepper._depth_at_end(before.copy(), never) == before
+    assert batch.stepper._depth_at_end(before.copy(), never) == before
     batch.batch.qvel[:, batch.rollout.index.dofs.start] = 1.0
-    assert batch._stepper._depth_at_end(before.copy(), never) > 1e-3
+    assert batch.stepper._depth_at_end(before.copy(), never) > 1e-3
 
 
 @pytest.mark.parametrize(

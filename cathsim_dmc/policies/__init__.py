@@ -2,10 +2,9 @@
 
 from collections.abc import Callable
 
-from cathsim_dmc.policies.expert import ExpertPolicy
+from cathsim_dmc.policies.expert import ExpertPolicy, Teacher
 from cathsim_dmc.policies.policy import Policy, in_environment
 from cathsim_dmc.policies.scripted import Curl, Idle, Push, Random, RandomCurl
-from cathsim_dmc.policies.teacher import Teacher
 from cathsim_dmc.policies.view import View
 
 # Policies by name: a new one is a class and a line here.

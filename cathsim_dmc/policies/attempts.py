@@ -1,4 +1,4 @@
-"""Attempts of a pursuit: when it gives up, how far it withdraws, when it goes on.
+"""Attempts of a pursuit: how fast it drives, when it gives up, how far it withdraws.
 
 When the head makes no progress, or has left the tube of the route as in a wrong branch,
 the device is withdrawn until the head is back in the route, from farther back with each
@@ -10,11 +10,11 @@ Pure functions of arrays with leading batch axes, written `...`; metres.
 """
 
 import dataclasses
-from typing import TypeVar
+from typing import NamedTuple
 
 import numpy as np
 
-from cathsim_dmc.tasks.route import Place
+from cathsim_dmc.tasks.route import Place, Route, locate
 
 _WITHDRAWN = 2e-3  # m, insertion below which there is nothing left to withdraw
 _GROWING = 4  # retries over which the way back grows
@@ -22,9 +22,19 @@ _GROWING = 4  # retries over which the way back grows
 
 @dataclasses.dataclass(frozen=True)
 class AttemptSettings:
-    """When to give up and how far to withdraw.
+    """How fast to drive, when to give up and how far to withdraw.
 
     Attributes:
+        lookahead: longest way along the route to the point pursued, m.
+        least_lookahead: shortest, m; about one link of the tip.
+        lookahead_radii: in between it is so many radii of the lumen.
+        lookahead_factors: multiply it in successive attempts, over and over.
+        speed: fastest translation, as a part of what the carriage can do.
+        creep: slowest, as a part of `speed`, when misaligned or pressing.
+        aligned, misaligned: cosines of the error of direction between which the speed
+            falls from full to creeping.
+        soft_force, hard_force: largest contact, N, between which it falls likewise; the
+            published forces lie below 0.2 N, with outliers above 0.4 N.
         progress: m; what the head must gain to count as moving.
         patience: control steps without progress until a retry.
         lost_patience: control steps outside the route's tube until a retry.
@@ -36,6 +46,16 @@ class AttemptSettings:
         thorough: every n-th retry withdraws the whole way, not the slack alone.
     """
 
+    lookahead: float = 16e-3
+    least_lookahead: float = 8e-3
+    lookahead_radii: float = 1.5
+    lookahead_factors: tuple[float, ...] = (1.0, 0.75, 1.3)
+    speed: float = 0.6
+    creep: float = 0.05
+    aligned: float = 0.9
+    misaligned: float = 0.5
+    soft_force: float = 0.1
+    hard_force: float = 0.35
     progress: float = 0.3e-3
     patience: int = 40
     lost_patience: int = 10
@@ -47,9 +67,8 @@ class AttemptSettings:
     thorough: int = 1
 
 
-@dataclasses.dataclass(frozen=True)
-class Attempts:
-    """Progress of each simulation, arrays (...).
+class State(NamedTuple):
+    """Memory of the expert for each simulation, arrays (...).
 
     Attributes:
         arc_length: of the place on the route at the last step, m; NaN before the
@@ -62,6 +81,8 @@ class Attempts:
         stale: control steps since then.
         lost: control steps out of the route's tube.
         attempts: retries so far.
+        insertion: at the last step, m; NaN before the first.
+        bend: (..., M, 2), told to the hinges of a steerable tip, rad.
     """
 
     arc_length: np.ndarray
@@ -73,24 +94,56 @@ class Attempts:
     stale: np.ndarray
     lost: np.ndarray
     attempts: np.ndarray
+    insertion: np.ndarray
+    bend: np.ndarray
 
     @classmethod
-    def none(cls, shape: tuple[int, ...]) -> "Attempts":
-        """Before the first step of an episode."""
-        return Attempts(
-            arc_length=np.full(shape, np.nan),
-            retracting=np.zeros(shape, dtype=bool),
-            taking_up=np.zeros(shape, dtype=bool),
-            turn=np.zeros(shape),
-            best=np.zeros(shape),
-            held=np.zeros(shape),
-            stale=np.zeros(shape, dtype=int),
-            lost=np.zeros(shape, dtype=int),
-            attempts=np.zeros(shape, dtype=int),
+    def fresh(cls, shape: tuple[int, ...], joints: int = 0) -> "State":
+        """State (...) at the start of an episode, of a tip of so many joints."""
+        unknown, no, zero = (
+            np.full(shape, np.nan),
+            np.zeros(shape, bool),
+            np.zeros(shape),
+        )
+        none = np.zeros(shape, int)
+        counts = none, none, none
+        return cls(
+            *(unknown, no, no, zero, zero, zero, *counts, unknown),
+            bend=np.zeros((*shape, joints, 2)),
         )
 
 
-State = TypeVar("State", bound=Attempts)
+def aim(
+    route: Route, settings: AttemptSettings, state: State, head: np.ndarray
+) -> tuple[Place, np.ndarray]:
+    """Place of a head (..., 3) on the route, and way (...) to the point pursued, m."""
+    # Every other attempt stays near the last place: both ways fail in some
+    # branchings.
+    steady = np.where(state.attempts % 2 == 1, state.arc_length, np.nan)
+    place = locate(route, head, steady)
+    # The lumen that counts is the one to come, or a branch is entered too obliquely.
+    coming = place.arc_length + settings.least_lookahead
+    radius = np.interp(coming, route.arc_length, route.radii)
+    ahead = np.clip(
+        settings.lookahead_radii * radius, settings.least_lookahead, settings.lookahead
+    )
+    factors = np.asarray(settings.lookahead_factors)
+    return place, ahead * factors[state.attempts % len(factors)]
+
+
+def translation(
+    settings: AttemptSettings, state: State, contact: np.ndarray, cosine: np.ndarray
+) -> np.ndarray:
+    """Translation (...) in [-1, 1] at a largest contact, N, and error of direction."""
+    free = _ramp(contact, settings.hard_force, settings.soft_force)
+    clear = _ramp(cosine, settings.misaligned, settings.aligned)
+    forward = settings.speed * np.maximum(free * clear, settings.creep)
+    return np.where(state.retracting, -settings.speed, forward)
+
+
+def _ramp(value: np.ndarray, none: float, full: float) -> np.ndarray:
+    """Linear from 0 at `none` to 1 at `full`, constant beyond either."""
+    return np.clip((value - none) / (full - none), 0.0, 1.0)
 
 
 def advance(
@@ -122,8 +175,7 @@ def advance(
     back = ((insertion <= turn) | comes_back) & ~outside | (insertion <= _WITHDRAWN)
     retracting = (state.retracting | give_up) & ~back
     again = state.retracting & ~retracting
-    return dataclasses.replace(
-        state,
+    return state._replace(
         arc_length=np.array(place.arc_length),
         retracting=retracting,
         taking_up=slack,

@@ -31,12 +31,17 @@ from cathsim_dmc.entities.chain import MAX_PUSH_SPEED, MAX_ROTATION_SPEED
 from cathsim_dmc.entities.device_stack import DeviceStack
 from cathsim_dmc.physics import forces
 from cathsim_dmc.physics.readings import CoaxialReadings, Readings
-from cathsim_dmc.policies import pursuit
-from cathsim_dmc.policies.attempts import Attempts, advance
-from cathsim_dmc.tasks import navigation
+from cathsim_dmc.policies.attempts import (
+    AttemptSettings,
+    State,
+    advance,
+    aim,
+    translation,
+)
+from cathsim_dmc.policies.pursuit import turned
 from cathsim_dmc.tasks.cases import Case
 from cathsim_dmc.tasks.config import CONTROL_TIMESTEP
-from cathsim_dmc.tasks.route import Place, Route, locate
+from cathsim_dmc.tasks.route import Place, Route
 
 # What a full action moves (m) and turns (rad) a device by in a control step.
 _MOVE = MAX_PUSH_SPEED * CONTROL_TIMESTEP
@@ -44,8 +49,8 @@ _TURN = MAX_ROTATION_SPEED * CONTROL_TIMESTEP
 
 
 @dataclasses.dataclass(frozen=True)
-class CoaxialSettings(pursuit.Settings):
-    """Settings of the expert of coaxial devices, beside those of `pursuit.Settings`.
+class CoaxialSettings(AttemptSettings):
+    """Settings of the expert of coaxial devices.
 
     Attributes:
         leads: by how much each device is ahead of the one around it in successive
@@ -89,14 +94,14 @@ class CoaxialPlan(Route):
     shaped: np.ndarray
     nodes: np.ndarray
     ostium: float
-    settings: ClassVar = CoaxialSettings
+    settings: ClassVar = CoaxialSettings()
 
     @classmethod
-    def for_task(cls, task: navigation.Navigation | Case) -> "CoaxialPlan":
-        """Reads off a task or anatomy; ValueError if its objective has no route."""
-        stack = task.scene.catheter
+    def for_case(cls, case: Case) -> "CoaxialPlan":
+        """Reads off an anatomy of a task."""
+        stack = case.scene.catheter
         assert isinstance(stack, DeviceStack)
-        route = Route.of(task.objective)
+        route = Route.of(case.objective)
         shapes = [[arc.length for arc in one.tip_shape] for one in stack.devices]
         return cls(
             **vars(route),
@@ -105,11 +110,11 @@ class CoaxialPlan(Route):
             ostium=float(route.arc_length[np.diff(route.radii).argmin()]),
         )
 
-    def fresh(self, shape: tuple[int, ...]) -> Attempts:
+    def fresh(self, shape: tuple[int, ...]) -> State:
         """Memory (N,) at the start of an episode."""
-        return Attempts.none(shape)
+        return State.fresh(shape)
 
-    def told(self, state: Attempts, action: np.ndarray) -> Attempts:
+    def told(self, state: State, action: np.ndarray) -> State:
         """The memory as it is, which no action is part of."""
         del action
         return state
@@ -117,11 +122,11 @@ class CoaxialPlan(Route):
     def decide(
         self,
         settings: CoaxialSettings,
-        state: Attempts,
+        state: State,
         readings: Readings,
         wall_force: forces.WallForce,
         devices: CoaxialReadings,
-    ) -> tuple[np.ndarray, Attempts]:
+    ) -> tuple[np.ndarray, State]:
         """One control step of the expert: a pure function.
 
         Args:
@@ -132,11 +137,7 @@ class CoaxialPlan(Route):
         Returns:
             Action (N, 2 K) in [-1, 1] and the new state.
         """
-        # Every other attempt stays near the last place: both ways fail in some
-        # branchings.
-        steady = np.where(state.attempts % 2 == 1, state.arc_length, np.nan)
-        place = locate(self, readings.head, steady)
-        ahead = pursuit.lookahead(self, settings, state.attempts, place)
+        place, ahead = aim(self, settings, state, readings.head)
         error, away = _directions(self, readings, devices, place, ahead)
         offsets = np.asarray(settings.offsets)
         error = error + offsets[state.attempts % len(offsets)][:, None]
@@ -148,10 +149,7 @@ class CoaxialPlan(Route):
         leader = devices.insertion.argmax(axis=1)[:, None]
         looks = np.where(turns, np.cos(error), 1.0)
         cosine = np.take_along_axis(looks, leader, axis=1)[:, 0]
-        clear = pursuit.ramp(cosine, settings.misaligned, settings.aligned)
-        free = pursuit.ramp(wall_force.max, settings.hard_force, settings.soft_force)
-        forward = settings.speed * np.maximum(free * clear, settings.creep)
-        speed = np.where(state.retracting, -settings.speed, forward)
+        speed = translation(settings, state, wall_force.max, cosine)
         deep = np.maximum(place.arc_length - self.ostium, 0.0)
         action[:, 0::2] = _led(settings, state, devices.insertion, speed, deep)
         return np.clip(action, -1.0, 1.0), state
@@ -159,7 +157,7 @@ class CoaxialPlan(Route):
 
 def _led(
     settings: CoaxialSettings,
-    state: Attempts,
+    state: State,
     insertion: np.ndarray,
     speed: np.ndarray,
     deep: np.ndarray,
@@ -220,5 +218,5 @@ def _before(frame: np.ndarray, joints: np.ndarray, number: int) -> np.ndarray:
     """
     place = joints.shape[1] // 2 - number  # of the joint; two slides precede it
     for axis in (1, 0) if posture.x_first(place) else (0, 1):
-        frame = pursuit.turned(frame, axis, -joints[:, -2 * number + axis])
+        frame = turned(frame, axis, -joints[:, -2 * number + axis])
     return frame

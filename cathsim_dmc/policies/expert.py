@@ -4,108 +4,52 @@ Its success shows that a task can be solved, and is compared with that of traine
 agents. `pursuit` has its decisions, `coaxial_pursuit` those for coaxial devices.
 """
 
-import dataclasses
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
 
-from cathsim_dmc.physics import forces
-from cathsim_dmc.physics.readings import CoaxialReadings, Readings
-from cathsim_dmc.policies.attempts import Attempts
-from cathsim_dmc.policies.coaxial_pursuit import CoaxialPlan
+from cathsim_dmc.policies.attempts import State
+from cathsim_dmc.policies.coaxial_pursuit import CoaxialPlan, CoaxialSettings
 from cathsim_dmc.policies.policy import Policy
-from cathsim_dmc.policies.pursuit import Plan, Settings
+from cathsim_dmc.policies.pursuit import Plan
 from cathsim_dmc.policies.view import View
-from cathsim_dmc.tasks import navigation
 from cathsim_dmc.tasks.cases import Case
-from cathsim_dmc.tasks.objective_pool import part
+from cathsim_dmc.tasks.route import locate
+from cathsim_dmc.tasks.rows import merged, part
 
 
-class Expert:
-    """The expert on one task; remembers the attempt of each simulation.
+class _Plans:
+    """What is known of the anatomies of N simulations."""
 
-    Attributes:
-        plan: What is known of the task.
-        state: What is remembered; None before the first action.
-    """
+    def __init__(self, view: View):
+        self.view = view
+        self._plans: dict[Case, Plan | CoaxialPlan] = {}
 
-    def __init__(self, plan: Plan | CoaxialPlan, settings: Settings | None = None):
-        """Starts before the first episode; `for_task` makes the plan.
-
-        Args:
-            plan: Of a steerable device, or of coaxial devices.
-            settings: Of the same kind; None for the defaults.
-        """
-        self.plan: Any = plan
-        self._settings = settings or plan.settings()
-        self.state: Attempts | None = None
-
-    @classmethod
-    def for_task(
-        cls, task: navigation.Navigation | Case, settings: Settings | None = None
-    ) -> "Expert":
-        """The expert for a task, or for one of the anatomies that episodes draw from.
-
-        Args:
-            settings: Settings of its driving; those of coaxial devices are
-                `coaxial_pursuit.CoaxialSettings`.
-
-        Raises:
-            ValueError: if the device can neither be steered nor turned at its base, or
-                the settings are not for it.
-        """
-        kind = CoaxialPlan if task.scene.coaxial else Plan
-        if settings is not None and not isinstance(settings, kind.settings):
-            raise ValueError(
-                "these settings are of a steerable device's expert; coaxial devices "
-                "need coaxial_pursuit.CoaxialSettings"
-            )
-        return cls(kind.for_task(task), settings)
-
-    def reset(self, which: np.ndarray | None = None) -> None:
-        """Forgets the simulations that begin a new episode.
-
-        Args:
-            which: Mask or indices of the simulations, None for all.
-        """
-        if which is None or self.state is None:
-            self.state = None
-            return
-        fresh = self.plan.fresh(self.state.attempts.shape)
-        for field in dataclasses.fields(fresh):
-            getattr(self.state, field.name)[which] = getattr(fresh, field.name)[which]
-
-    def act(
-        self,
-        readings: Readings,
-        wall_force: forces.WallForce,
-        devices: CoaxialReadings | None = None,
-    ) -> np.ndarray:
-        """Action (..., A) in [-1, 1]; ValueError if the leading axes changed."""
-        shape = readings.head.shape[:-1]
-        state = self.plan.fresh(shape) if self.state is None else self.state
-        if state.attempts.shape != shape:
-            raise ValueError(
-                f"the readings have leading axes {shape}, those before had "
-                f"{state.attempts.shape}; call reset() in between"
-            )
-        action, self.state = self.plan.decide(
-            self._settings, state, readings, wall_force, devices
-        )
-        return action
-
-    def follow(self, action: np.ndarray) -> None:
-        """Replace the last action by the one (..., A) that was carried out."""
-        if self.state is not None:
-            self.state = self.plan.told(self.state, action)
+    def chosen(self) -> Iterator[tuple[Any, np.ndarray, tuple[Any, ...]]]:
+        """Plans, the numbers (K,) of their simulations, and what is read of these."""
+        rollout = self.view.rollout
+        cases = [rollout.case(i) for i in range(self.view.num_simulations)]
+        state = rollout.resting, rollout.wall_force, rollout.devices
+        for case in dict.fromkeys(cases):
+            if case not in self._plans:
+                kind = CoaxialPlan if case.scene.coaxial else Plan
+                self._plans[case] = kind.for_case(case)
+            rows = np.array([i for i, one in enumerate(cases) if one is case])
+            yield self._plans[case], rows, tuple(part(one, rows) for one in state)
 
 
 class ExpertPolicy(Policy):
-    """The expert as a policy; it reads the simulations, not the observation."""
+    """The expert as a policy; it reads the simulations, not the observation.
+
+    Attributes:
+        state: What is remembered of the simulations, arrays (N, ...).
+    """
 
     name = "expert"
     # Cheapest to observe.
     observation = "tracking"
+    state: State
 
     def __init__(self, seed: int = 0):
         """Starts before the first episode.
@@ -113,44 +57,29 @@ class ExpertPolicy(Policy):
         Args:
             seed: Not used: the expert draws no random numbers.
         """
-        self._view: View | None = None
-        # One for all simulations; where their anatomies differ, one for each.
-        self._experts: dict[int, Expert] = {}
-        self._cases: dict[int, Case] = {}
-        self._several = False
+        self._plans: _Plans | None = None
 
     def reset(self, view: View, which: np.ndarray) -> None:
         """Forget simulations that begin an episode; ValueError if it cannot steer."""
-        if self._view is not view:
-            self._view, self._experts, self._cases = view, {}, {}
-            self._several = view.task.num_anatomies > 1
-        if not self._several:
-            if not self._experts:
-                self._experts[0] = Expert.for_task(view.task)
-            self._experts[0].reset(which)
-            return
-        for index in np.flatnonzero(which).tolist():
-            case = view.case(index)
-            if self._cases.get(index) is not case:
-                self._cases[index] = case
-                self._experts[index] = Expert.for_task(case)
-            self._experts[index].reset()
+        begins = self._plans is None or self._plans.view is not view
+        if self._plans is None or begins:
+            self._plans = _Plans(view)
+        for plan, _, _ in self._plans.chosen():
+            self._plan, fresh = plan, plan.fresh((view.num_simulations,))
+        old = fresh if begins else self.state
+        self.state = merged(old, part(fresh, which), which)
 
     def act(self, observation: Any) -> np.ndarray:
         """Actions (N, A) for the state of the devices."""
-        view = self._view
-        if view is None:
+        if self._plans is None:
             raise RuntimeError("the expert must be reset before it acts")
-        readings, wall_force, devices = view.resting, view.wall_force, view.devices
-        if not self._several:
-            return self._experts[0].act(readings, wall_force, devices)
-        actions = []
-        for index in range(view.num_simulations):
-            row = np.array([index])
-            own = None if devices is None else part(devices, row)
-            state = part(readings, row), part(wall_force, row), own
-            actions.append(self._experts[index].act(*state))
-        return np.concatenate(actions)
+        view = self._plans.view
+        action = np.empty((view.num_simulations, view.num_actions))
+        for plan, rows, seen in self._plans.chosen():
+            state = part(self.state, rows)
+            action[rows], state = plan.decide(plan.settings, state, *seen)
+            self.state = merged(self.state, state, rows)
+        return action
 
     def follow(self, action: np.ndarray) -> None:
         """Replace the last actions by those that were carried out.
@@ -158,5 +87,69 @@ class ExpertPolicy(Policy):
         Args:
             action: (N, A) in [-1, 1].
         """
-        for index, expert in self._experts.items():
-            expert.follow(action[[index]] if self._several else action)
+        self.state = self._plan.told(self.state, action)
+
+
+class Teacher:
+    """The expert as a teacher: its action in states that another policy reaches.
+
+    The expert remembers its commands to a steerable tip, to which every correction
+    adds, and its retries. Neither fits the state that another policy has reached, and a
+    learner does not observe retries. The teacher therefore takes the action that was
+    carried out for its own and judges every state by itself: it withdraws outside the
+    tube of the route and advances inside it. Coaxial devices keep one lead and one
+    look-ahead. All follows from the observation if that has the last action.
+    """
+
+    def __init__(self, view: View, lead: float = 0.02):
+        """Looks at simulations; `reset` comes before the first question.
+
+        Args:
+            lead: of a guidewire ahead of the catheter around it, m. With 0.02 it
+                reaches the left common carotid of Type I without retries; the
+                brachiocephalic artery of Type II takes -0.02, the catheter first.
+        """
+        self._plans, self._insertion = (
+            _Plans(view),
+            np.full(view.num_simulations, np.nan),
+        )
+        # A longer look-ahead than the expert's needs no retry.
+        self._coaxial = CoaxialSettings(
+            leads=(lead,), offsets=(0.0,), lookahead_factors=(1.4,)
+        )
+
+    def reset(self, which: np.ndarray) -> None:
+        """Forgets the simulations that begin a new episode.
+
+        Args:
+            which: (N,) bool.
+        """
+        self._insertion[which] = np.nan
+
+    def act(self, last_action: np.ndarray) -> np.ndarray:
+        """The expert's action in every state; to be asked once in a control step.
+
+        Args:
+            last_action: (N, A) in [-1, 1], carried out in the control step before;
+                zeros at the start of an episode.
+
+        Returns:
+            (N, A) in [-1, 1].
+
+        Raises:
+            ValueError: the task's device can neither be steered nor turned.
+        """
+        action = np.empty(last_action.shape)
+        for plan, rows, (readings, force, devices) in self._plans.chosen():
+            coaxial = isinstance(plan, CoaxialPlan)
+            settings = self._coaxial if coaxial else plan.settings
+            state = plan.fresh((len(rows),))._replace(
+                retracting=locate(plan, readings.head).excess > settings.tolerance,
+                turn=np.full(len(rows), np.inf),
+                held=readings.insertion,
+                insertion=self._insertion[rows],
+            )
+            state = plan.told(state, last_action[rows])
+            decided = plan.decide(settings, state, readings, force, devices)
+            action[rows], self._insertion[rows] = decided[0], readings.insertion
+        return action

@@ -24,51 +24,36 @@ import numpy as np
 from cathsim_dmc.entities import devices
 from cathsim_dmc.physics import forces
 from cathsim_dmc.physics.readings import CoaxialReadings, Readings
-from cathsim_dmc.policies import attempts
-from cathsim_dmc.tasks import navigation
+from cathsim_dmc.policies.attempts import (
+    AttemptSettings,
+    State,
+    advance,
+    aim,
+    translation,
+)
 from cathsim_dmc.tasks.cases import Case
-from cathsim_dmc.tasks.route import Place, Route, locate
+from cathsim_dmc.tasks.route import Route
 
 
 @dataclasses.dataclass(frozen=True)
-class Settings(attempts.AttemptSettings):
-    """Settings of the expert; `attempts.AttemptSettings` has when it gives up.
+class Settings(AttemptSettings):
+    """Settings of the expert of a steerable device.
 
     None of the values is critical. The published tasks were solved without a retry
     with 0.5 to 1.6 times the gain or the speed, with 0.75 to 1.4 times the look-ahead,
     and with shares from 0.4 to 0.85.
 
     Attributes:
-        lookahead: longest way along the route to the point pursued, m.
-        least_lookahead: shortest, m; about one link of the tip.
-        lookahead_radii: in between it is so many radii of the lumen.
-        lookahead_factors: multiply it in successive attempts, over and over.
         gain: share of the error of direction corrected in a control step. The drives
             and the damping of the tip answer within some 0.25 s, six steps; a gain well
             above 1/6 overshoots.
         share: of a joint's part in steering to that of its distal neighbour.
         max_bend_rate: largest correction of one hinge in a control step, rad.
-        speed: fastest translation, as a part of what the carriage can do.
-        creep: slowest, as a part of `speed`, when misaligned or pressing.
-        aligned, misaligned: cosines of the error of direction between which the speed
-            falls from full to creeping.
-        soft_force, hard_force: largest contact, N, between which it falls likewise; the
-            published forces lie below 0.2 N, with outliers above 0.4 N.
     """
 
-    lookahead: float = 16e-3
-    least_lookahead: float = 8e-3
-    lookahead_radii: float = 1.5
-    lookahead_factors: tuple[float, ...] = (1.0, 0.75, 1.3)
     gain: float = 0.12
     share: float = 0.65
     max_bend_rate: float = 0.08
-    speed: float = 0.6
-    creep: float = 0.05
-    aligned: float = 0.9
-    misaligned: float = 0.5
-    soft_force: float = 0.1
-    hard_force: float = 0.35
 
 
 @dataclasses.dataclass(frozen=True)
@@ -89,17 +74,12 @@ class Plan(Route):
     steering_angle: float
     link_length: float
     num_actions: int
-    settings: ClassVar = Settings
+    settings: ClassVar = Settings()
 
     @classmethod
-    def for_task(cls, task: navigation.Navigation | Case) -> "Plan":
-        """Reads off a task or anatomy; ValueError if the tip has no motors."""
-        catheter = task.scene.catheter
-        if task.scene.coaxial:
-            raise ValueError(
-                "this expert steers the tip of one device, and the task has coaxial "
-                "devices: they have their own"
-            )
+    def for_case(cls, case: Case) -> "Plan":
+        """Reads off an anatomy of a task; ValueError if the tip has no motors."""
+        catheter = case.scene.catheter
         if not catheter.device.steerable:
             steerable = [d.name for d in devices.DEVICES.values() if d.steerable]
             raise ValueError(
@@ -115,7 +95,7 @@ class Plan(Route):
             hinges.append((columns[joint.name], int(np.argmax(joint.axis))))
         motors = [numbers[motor.joint.name] for motor in catheter.tip_motors]
         return cls(
-            **vars(Route.of(task.objective)),
+            **vars(Route.of(case.objective)),
             hinges=tuple(hinges),
             tip=np.array(motors).reshape(-1, 2),
             steering_angle=catheter.device.steering_angle,
@@ -123,23 +103,23 @@ class Plan(Route):
             num_actions=len(catheter.actuators),
         )
 
-    def fresh(self, shape: tuple[int, ...]) -> "State":
+    def fresh(self, shape: tuple[int, ...]) -> State:
         """Memory (...) at the start of an episode."""
         return State.fresh(shape, len(self.tip))
 
-    def told(self, state: "State", action: np.ndarray) -> "State":
+    def told(self, state: State, action: np.ndarray) -> State:
         """Memory as if the last action were this one (..., A)."""
         bend = action[..., : self.tip.size] * self.steering_angle
-        return dataclasses.replace(state, bend=bend.reshape(state.bend.shape))
+        return state._replace(bend=bend.reshape(state.bend.shape))
 
     def decide(
         self,
         settings: Settings,
-        state: "State",
+        state: State,
         readings: Readings,
         wall_force: forces.WallForce,
         devices: CoaxialReadings | None = None,
-    ) -> "tuple[np.ndarray, State]":
+    ) -> tuple[np.ndarray, State]:
         """One control step of the expert: a pure function.
 
         Args:
@@ -151,51 +131,22 @@ class Plan(Route):
         Returns:
             Action (..., A) in [-1, 1] and the new state.
         """
-        # Every other attempt stays near the last place: both ways fail in some
-        # branchings.
-        steady = np.where(state.attempts % 2 == 1, state.arc_length, np.nan)
-        place = locate(self, readings.head, steady)
+        place, way = aim(self, settings, state, readings.head)
         joints, frame = readings.joint_positions, readings.head_frame
         axes, direction = tip_frames(self, joints, frame)
-        way = lookahead(self, settings, state.attempts, place)
         target = self.at(place.arc_length + way)
         turn, cosine = _rotation_to(direction, target - readings.head)
         bend = _follow_the_leader(self, state, readings.insertion)
         bend = bend + _correction(settings, axes, turn)
         bend = np.clip(bend, -self.steering_angle, self.steering_angle)
-        state = attempts.advance(settings, state, place, readings.insertion)
-        free = ramp(wall_force.max, settings.hard_force, settings.soft_force)
-        clear = ramp(cosine, settings.misaligned, settings.aligned)
-        advance = settings.speed * np.maximum(free * clear, settings.creep)
-        translation = np.where(state.retracting, -settings.speed, advance)
-        action = np.zeros((*translation.shape, self.num_actions))
+        state = advance(settings, state, place, readings.insertion)
+        speed = translation(settings, state, wall_force.max, cosine)
+        action = np.zeros((*speed.shape, self.num_actions))
         motors = self.tip.size
-        told = (bend / self.steering_angle).reshape(*translation.shape, -1)
-        action[..., :motors], action[..., motors] = told, translation
+        told = (bend / self.steering_angle).reshape(*speed.shape, -1)
+        action[..., :motors], action[..., motors] = told, speed
         insertion = np.array(readings.insertion)
-        return action, dataclasses.replace(state, bend=bend, insertion=insertion)
-
-
-@dataclasses.dataclass(frozen=True)
-class State(attempts.Attempts):
-    """Memory of the expert for each simulation, arrays (...).
-
-    Attributes:
-        bend: (..., M, 2), told to the hinges of the tip, rad.
-        insertion: at the last step, m; NaN before the first.
-    """
-
-    bend: np.ndarray
-    insertion: np.ndarray
-
-    @classmethod
-    def fresh(cls, shape: tuple[int, ...], joints: int) -> "State":
-        """State at the start of an episode."""
-        return cls(
-            **vars(attempts.Attempts.none(shape)),
-            bend=np.zeros((*shape, joints, 2)),
-            insertion=np.full(shape, np.nan),
-        )
+        return action, state._replace(bend=bend, insertion=insertion)
 
 
 def tip_frames(
@@ -219,20 +170,6 @@ def tip_frames(
         frame = turned(frame, axis, -joints[..., column])
     stacked = np.stack(axes[::-1], axis=-2)
     return stacked[..., plan.tip - first, :], head[..., 2]
-
-
-def lookahead(
-    plan: Route, settings: Settings, number: np.ndarray, place: Place
-) -> np.ndarray:
-    """Way (...) from the place to the point pursued in the n-th attempt (...), m."""
-    # The lumen that counts is the one to come, or a branch is entered too obliquely.
-    coming = place.arc_length + settings.least_lookahead
-    radius = np.interp(coming, plan.arc_length, plan.radii)
-    ahead = np.clip(
-        settings.lookahead_radii * radius, settings.least_lookahead, settings.lookahead
-    )
-    factors = np.asarray(settings.lookahead_factors)
-    return ahead * factors[number % len(factors)]
 
 
 def _rotation_to(direction: np.ndarray, way: np.ndarray) -> tuple[np.ndarray, ...]:
@@ -273,8 +210,3 @@ def turned(frame: np.ndarray, axis: int, angle: np.ndarray) -> np.ndarray:
     turned[..., first] = cosine * frame[..., first] + sine * frame[..., second]
     turned[..., second] = cosine * frame[..., second] - sine * frame[..., first]
     return turned
-
-
-def ramp(value: np.ndarray, none: float, full: float) -> np.ndarray:
-    """Linear from 0 at `none` to 1 at `full`, constant beyond either."""
-    return np.clip((value - none) / (full - none), 0.0, 1.0)

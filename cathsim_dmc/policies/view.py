@@ -2,10 +2,7 @@
 
 from dm_control import composer
 
-from cathsim_dmc.physics.forces import WallForce
-from cathsim_dmc.physics.readings import CoaxialReadings, Readings
 from cathsim_dmc.simulation.batch import BatchSimulation
-from cathsim_dmc.tasks.cases import Case
 from cathsim_dmc.tasks.rollout import Rollout
 
 
@@ -27,31 +24,6 @@ class View:
         self._stepped = simulations if batched else self.task
 
     @property
-    def _rollout(self) -> Rollout:
-        rollout = self._stepped.rollout
-        assert rollout is not None  # an environment has compiled its model
-        return rollout
-
-    def case(self, index: int) -> Case:
-        """Scene and objective of the episode of one simulation."""
-        return self._rollout.case(index)
-
-    @property
-    def readings(self) -> Readings:
-        """State of the devices; every array has the leading axis N."""
-        return self._rollout.readings
-
-    @property
-    def resting(self) -> Readings:
-        """The same, with all places where they are in the vessel at rest."""
-        return self._rollout.resting
-
-    @property
-    def wall_force(self) -> WallForce:
-        """Force on the wall over the last control step; arrays (N,), N."""
-        return self._rollout.wall_force
-
-    @property
-    def devices(self) -> CoaxialReadings | None:
-        """State of coaxial devices, arrays (N, ...); None for one device alone."""
-        return self._rollout.devices
+    def rollout(self) -> Rollout:
+        """What is measured of them; arrays (N, ...), see `tasks.rollout.Rollout`."""
+        return self._stepped.rollout

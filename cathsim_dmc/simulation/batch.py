@@ -17,9 +17,8 @@ from dm_control import mjcf
 from mujoco import batch as mujoco_batch
 
 from cathsim_dmc import bounds
-from cathsim_dmc.physics import forces, readings
+from cathsim_dmc.physics import forces
 from cathsim_dmc.physics.stepper import Anatomic, Stepper
-from cathsim_dmc.tasks.actions import check_action
 from cathsim_dmc.tasks.navigation import Navigation
 from cathsim_dmc.tasks.rollout import Rollout
 from cathsim_dmc.tasks.step import Step
@@ -60,7 +59,12 @@ class BatchSimulation:
 
     Attributes:
         task: The task that all simulations run.
-        rollout: Objective, readings and forces of all simulations.
+        num_simulations: N.
+        num_actions: A, entries of an action.
+        rollout: Objectives, readings and forces of all simulations.
+        batch: The simulations; `expand` gives model fields of their own to each.
+        stepper: Does their physics steps; `rows` (N, S, nsensordata) are the sensors in
+            the S physics steps of the last step.
     """
 
     def __init__(
@@ -90,16 +94,11 @@ class BatchSimulation:
         self.task = task
         physics = mjcf.Physics.from_mjcf_model(task.root_entity.mjcf_model)
         self._model = physics.model.ptr
-        if task.num_anatomies > 1:
-            writes = any(effect.model_fields for effect in task.effects)
-            self._stepper = _PoolStepper(
-                task, self._model, num_simulations, num_threads, own=writes
-            )
-        else:
-            self._stepper = _BatchStepper(
-                task, self._model, num_simulations, num_threads
-            )
-        self.rollout: Rollout = task.make_rollout(self._model, self._stepper)
+        steppers = _PoolStepper if task.num_anatomies > 1 else _BatchStepper
+        self.stepper = steppers(task, self._model, num_simulations, num_threads)
+        self.num_simulations, self.num_actions = num_simulations, task.num_actions
+        self.batch: mujoco_batch.Batch = self.stepper.batch
+        self.rollout: Rollout = task.make_rollout(self._model, self.stepper)
         self.seed(seeds)
         self._begun = np.zeros(num_simulations, dtype=bool)
         self._process = os.getpid()
@@ -133,9 +132,9 @@ class BatchSimulation:
         self._refuse_fork()
         indices = bounds.indices("indices", indices, self.num_simulations)
         self._begun[indices] = True
-        self._stepper.reset(indices)
+        self.stepper.reset(indices)
         self.rollout.begin(indices, self._random_states)
-        self._stepper.forward_unactuated(indices)
+        self.stepper.forward_unactuated(indices)
         return _own(self.rollout.start(indices))
 
     def step(self, action: np.ndarray) -> Step:
@@ -156,9 +155,9 @@ class BatchSimulation:
                 f"simulations {bounds.shown(waiting)} have no episode; call reset() "
                 "first"
             )
-        action = check_action(action, (self.num_simulations, self.num_actions))
+        action = bounds.actions(action, (self.num_simulations, self.num_actions))
         self.rollout.command(action)
-        self._stepper.run()
+        self.stepper.run()
         return _own(self.rollout.finish())
 
     def _refuse_fork(self):
@@ -168,39 +167,9 @@ class BatchSimulation:
                 "the batch after the fork, or start processes by spawn"
             )
 
-    @property
-    def num_simulations(self) -> int:
-        """N."""
-        return self._stepper.num_simulations
-
-    @property
-    def num_actions(self) -> int:
-        """A, entries of an action."""
-        return self.task.num_actions
-
-    @property
-    def readings(self) -> readings.Readings:
-        """State of the devices after the last step or reset, arrays (N, ...)."""
-        return self.rollout.readings
-
-    @property
-    def wall_force(self) -> forces.WallForce:
-        """Force on the wall over the last step, arrays (N,)."""
-        return self.rollout.wall_force
-
-    @property
-    def batch(self) -> mujoco_batch.Batch:
-        """The simulations; `expand` gives model fields of their own to each."""
-        return self._stepper.batch
-
-    @property
-    def sensor_rows(self) -> np.ndarray:
-        """Sensor rows (N, S, nsensordata) of the S physics steps of the last step."""
-        return self._stepper.rows
-
     def contacts(self) -> forces.Contacts:
         """Contacts with the wall in the last physics step, arrays (N, K, ...)."""
-        return self.rollout.index.contacts(self.sensor_rows[:, -1])
+        return self.rollout.index.contacts(self.stepper.rows[:, -1])
 
 
 class _BatchStepper(Stepper):
@@ -274,15 +243,14 @@ class _BatchStepper(Stepper):
 class _PoolStepper(_BatchStepper):
     """Simulations each in the anatomy that it has drawn."""
 
-    def __init__(self, *arguments, own: bool):
+    def __init__(self, task: Navigation, *arguments):
         """Makes the models.
 
-        Args:
-            *arguments: Those of `_BatchStepper`.
-            own: Whether each simulation needs a model of its own, into which episodes
-                write; those that have drawn one anatomy share a model otherwise.
+        Where episodes write into a model each simulation has its own; those that have
+        drawn one anatomy share one otherwise.
         """
-        super().__init__(*arguments)
+        own = any(effect.model_fields for effect in task.effects)
+        super().__init__(task, *arguments)
         model = self.batch.model
         self._own = own
         self._models = [copy.copy(model) if own else model for _ in self.rows]

@@ -115,20 +115,7 @@ def standard_observations(env: EnvBase) -> TransformedEnv:
     stay as they are; double precision becomes single.
     """
     spec, batch = env.observation_spec, len(env.batch_size)
-    keys = [
-        name
-        for name, leaf in spec.items()
-        if not isinstance(leaf, Composite)
-        and (
-            leaf.dtype.is_floating_point
-            or (leaf.dtype == torch.uint8 and leaf.ndim - batch == 3)
-        )
-    ]
-    if not keys:
-        raise ValueError(
-            f"the environment offers neither numbers nor images to observe; its "
-            f"entries are {sorted(map(str, spec.keys(True, True)))}."
-        )
+    keys = [name for name, leaf in spec.items() if not isinstance(leaf, Composite)]
     seen = standard({key: spec[key].zero() for key in keys}, batch)
     observe = StandardObservation(in_keys=keys, out_keys=list(seen))
     return TransformedEnv(env, Compose(DoubleToFloat(), observe, StepCounter()))

@@ -1,7 +1,7 @@
 """The loop of an episode: evaluations, recordings and measurements play with it."""
 
 from collections.abc import Callable, Iterator
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import dm_env
 import numpy as np
@@ -11,29 +11,11 @@ from cathsim_dmc.simulation.batch import BatchSimulation
 from cathsim_dmc.tasks.step import Step
 
 
-class Simulations(Protocol):
-    """N simulations that are stepped together.
-
-    Attributes:
-        seen: What chooses the next actions sees this.
-    """
-
-    seen: Any
-
-    def reset(self, which: np.ndarray | None) -> Any:
-        """Begin episodes in the simulations of a mask (N,), None for all; the state."""
-        ...
-
-    def step(self, action: np.ndarray) -> tuple[Any, np.ndarray]:
-        """Advance by a control step; the state, and (N,) bool whether episodes end."""
-        ...
-
-
 class ComposerSimulation:
-    """A composer environment; its state, which is seen, is the time step.
+    """A composer environment, as `play` steps it; its state is the time step.
 
     Attributes:
-        seen: The present time step.
+        seen: What chooses the next action sees this: the present time step.
     """
 
     seen: dm_env.TimeStep
@@ -42,18 +24,18 @@ class ComposerSimulation:
         self._environment = environment
 
     def reset(self, which: np.ndarray | None) -> dm_env.TimeStep:
-        """Begin an episode."""
+        """Begin an episode; the state."""
         self.seen = self._environment.reset()
         return self.seen
 
     def step(self, action: np.ndarray) -> tuple[dm_env.TimeStep, np.ndarray]:
-        """Advance by a control step."""
+        """Advance by a control step; the state, and (1,) bool whether it ends."""
         self.seen = self._environment.step(action)
         return self.seen, np.array([self.seen.last()])
 
 
 class BatchedSimulations:
-    """The simulations of a batch; their state is a `Step`, the observation is seen.
+    """The N simulations of a batch, as `play` steps them; their state is a `Step`.
 
     Attributes:
         seen: Present observation, arrays (N, ...) by name.
@@ -64,14 +46,13 @@ class BatchedSimulations:
         self.seen: Any = None
 
     def reset(self, which: np.ndarray | None) -> Step:
-        """Begin episodes."""
-        chosen = () if which is None else (np.flatnonzero(which),)
-        step = self._simulation.reset(*chosen)
+        """Begin episodes in the simulations of a mask (N,), None for all."""
+        step = self._simulation.reset(None if which is None else np.flatnonzero(which))
         self.seen = step.observation
         return step
 
     def step(self, action: np.ndarray) -> tuple[Step, np.ndarray]:
-        """Advance by a control step."""
+        """Advance by a control step; the state, and (N,) bool whether episodes end."""
         step = self._simulation.step(np.asarray(action, dtype=np.float64))
         self.seen = step.observation
         return step, step.terminated | step.truncated
@@ -93,7 +74,7 @@ class Turn(NamedTuple):
 
 
 def play(
-    simulations: Simulations,
+    simulations: ComposerSimulation | BatchedSimulations,
     choose: Callable[[Any], np.ndarray],
     begin: Callable[[np.ndarray], None] = lambda which: None,
     count: int = 1,

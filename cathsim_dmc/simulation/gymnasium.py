@@ -8,16 +8,13 @@ import numpy as np
 from dm_env import specs
 from gymnasium.envs.registration import EnvSpec
 
-from cathsim_dmc import suite
+from cathsim_dmc import bounds, suite
 from cathsim_dmc.anatomy.parts import Surface
 from cathsim_dmc.imaging import angiograph
 from cathsim_dmc.tasks.config import CONTROL_TIMESTEP
 
 RENDER_MODES = ("rgb_array",)
 VERSION = 0  # of the ids
-# Arguments of the suite's factories beside the options of the task.
-_FACTORY_OPTIONS = ("random", "environment_kwargs")
-_MOST_SEED = 2**32  # first seed that numpy's RandomState does not take
 
 
 def space(spec: specs.Array, dtype: np.dtype) -> gymnasium.spaces.Box:
@@ -40,39 +37,11 @@ def space_of(
     return gymnasium.spaces.Dict({k: space(spec, dtype) for k, spec in entries.items()})
 
 
-def _float_type(dtype: str) -> np.dtype:
-    if np.dtype(dtype) not in (np.float32, np.float64):
-        raise ValueError(f"dtype is {dtype!r}; give float32 or float64")
-    return np.dtype(dtype)
-
-
-def _refuse_unknown(task: str, options: Mapping[str, Any]) -> None:
-    """Raises TypeError for an unknown option: TorchRL catches it."""
-    known = suite.task_options(task) if task in suite.TASKS else ()
-    for name in options if known else ():
-        if name not in (*_FACTORY_OPTIONS, *known):
-            raise TypeError(
-                f"{CathSimEnv.__name__}.__init__() got an unexpected keyword argument "
-                f"'{name}'; options are {', '.join(known)}"
-            )
-
-
 def _converted(observation, dtype: np.dtype) -> dict[str, np.ndarray]:
     return {
         key: value.copy() if value.dtype == np.uint8 else value.astype(dtype)
         for key, value in observation.items()
     }
-
-
-def _words(seed: int) -> int | list[int]:
-    """A seed of any size as `RandomState.seed` takes it; small ones as they are."""
-    if seed < _MOST_SEED:
-        return seed
-    words = []
-    while seed:
-        seed, word = divmod(seed, _MOST_SEED)
-        words.append(word)
-    return words
 
 
 class CathSimEnv(gymnasium.Env):
@@ -105,14 +74,12 @@ class CathSimEnv(gymnasium.Env):
             dtype: of the numbers observed and of the action, float32 or float64.
             **task_kwargs: options of the task, such as `observation`.
         """
-        if render_mode not in (None, *RENDER_MODES):
-            raise ValueError(
-                f"render_mode is {render_mode!r}; give None or "
-                f"{', '.join(map(repr, RENDER_MODES))}"
-            )
-        _refuse_unknown(task, task_kwargs)
+        if render_mode is not None:
+            bounds.choice("render_mode", render_mode, RENDER_MODES)
+        if "frameskip" in task_kwargs:  # TorchRL goes on without it
+            raise TypeError("unexpected keyword argument 'frameskip'")
         self.render_mode = render_mode
-        self._dtype = _float_type(dtype)
+        self._dtype = np.dtype(bounds.choice("dtype", dtype, ("float32", "float64")))
         self.environment = suite.load(suite.DOMAIN, task, task_kwargs)
         entries = self.environment.task.observation_specs
         self.observation_space = space_of(entries, self._dtype)
@@ -125,7 +92,7 @@ class CathSimEnv(gymnasium.Env):
         """Starts an episode; see `gymnasium.Env.reset`. `options` has no meaning."""
         super().reset(seed=seed)
         if seed is not None:
-            self.environment.random_state.seed(_words(seed))
+            self.environment.random_state.seed(seed)
         timestep = self.environment.reset()
         self._begun, self._ended = True, False
         info = self.environment.task.info()
@@ -157,15 +124,15 @@ class CathSimEnv(gymnasium.Env):
             return None
         if not self._begun:
             raise gymnasium.error.ResetNeeded("there is nothing to see before reset()")
-        return fluoroscopy_frame(self.environment.task, self._machine())
-
-    def _machine(self) -> angiograph.Angiograph:
         task = self.environment.task
-        surface = task.scene.anatomy.surface
+        surface, rollout = task.scene.anatomy.surface, task.rollout
         if surface not in self._machines:
             machine = angiograph.Angiograph(surface, task.config.fluoroscopy)
             self._machines[surface] = machine
-        return self._machines[surface]
+        planes = rollout.around(self._machines[surface].planes())
+        image = angiograph.images([planes], rollout.shadows)[0]
+        row = np.concatenate(list(np.moveaxis(image, -1, 0)), axis=1)
+        return np.repeat(row[..., None], 3, axis=-1)
 
     def close(self) -> None:
         """Frees the simulator; closing twice does nothing."""
@@ -174,25 +141,8 @@ class CathSimEnv(gymnasium.Env):
         self._closed = True
 
 
-def fluoroscopy_frame(task, machine: angiograph.Angiograph) -> np.ndarray:
-    """The device of a task before a machine, (rows, columns, 3) uint8, no noise."""
-    rollout = task.rollout
-    image = angiograph.images([rollout.around(machine.planes())], rollout.shadows)[0]
-    row = np.concatenate(list(np.moveaxis(image, -1, 0)), axis=1)
-    return np.repeat(row[..., None], 3, axis=-1)
-
-
-def make(task: str, **options: Any) -> gymnasium.Env:
-    """An environment without wrappers, with the spec that makes it again.
-
-    Args:
-        **options: of `CathSimEnv`, JSON-able if the spec is to be written.
-    """
-    return gymnasium.make(env_spec(task, **options))
-
-
 def env_spec(task: str, **options: Any) -> EnvSpec:
-    """Spec of an environment, see `make`."""
+    """Spec that makes an environment again, without wrappers."""
     return EnvSpec(
         id=f"{suite.DOMAIN}/{task}-v{VERSION}",
         entry_point=f"{__name__}:{CathSimEnv.__name__}",

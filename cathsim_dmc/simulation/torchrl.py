@@ -60,13 +60,18 @@ class BatchedEnv(EnvBase):
     def _make_specs(self, task: Navigation) -> None:
         shape = self.batch_size
         entries = {k: _spec(spec, shape) for k, spec in task.observation_specs.items()}
-        entries["info"] = info_spec(task.info_types, shape)
+        flag = Binary(1, (*shape, 1), dtype=torch.bool)
+        number = Unbounded((*shape, 1), dtype=torch.float32)
+        info = {
+            key: (flag if kind is bool else number).clone()
+            for key, kind in task.info_types.items()
+        }
+        entries["info"] = Composite(info, shape=shape)
         self.observation_spec = Composite(entries, shape=shape)
         self.action_spec = Bounded(
             -1.0, 1.0, (*shape, self.simulation.num_actions), dtype=torch.float32
         )
-        self.reward_spec = Unbounded((*shape, 1), dtype=torch.float32)
-        flag = Binary(1, (*shape, 1), dtype=torch.bool)
+        self.reward_spec = number
         self.done_spec = Composite(
             done=flag, terminated=flag.clone(), truncated=flag.clone(), shape=shape
         )
@@ -117,19 +122,6 @@ def _spec(spec: specs.Array, batch: torch.Size) -> TensorSpec:
     if not isinstance(spec, specs.BoundedArray):
         return Unbounded(shape, dtype=dtype)
     return Bounded(spec.minimum.item(), spec.maximum.item(), shape, dtype=dtype)
-
-
-def info_spec(types: Mapping[str, type], shape: torch.Size) -> Composite:
-    """Spec of "info": one column of bool or float32 for each figure."""
-    return Composite(
-        {
-            key: Binary(1, (*shape, 1), dtype=torch.bool)
-            if kind is bool
-            else Unbounded((*shape, 1), dtype=torch.float32)
-            for key, kind in types.items()
-        },
-        shape=shape,
-    )
 
 
 def _column(values: np.ndarray, dtype: torch.dtype) -> torch.Tensor:

@@ -23,11 +23,10 @@ def load_anatomy(anatomy: str | Path | Anatomy, access: str = "ascending") -> An
     """
     if isinstance(anatomy, Anatomy):
         return anatomy
-    # What builds anatomies takes a while to import.
-    from cathsim_dmc.anatomy import phantoms
-
     if not isinstance(anatomy, str | Path):
         bounds.refuse("anatomy", anatomy, "an Anatomy, a name or a directory")
+    from cathsim_dmc.anatomy import phantoms  # late: what builds them is slow to import
+
     if str(anatomy) in phantoms.PHANTOMS:
         return phantoms.load(str(anatomy), access=access)
     if not Path(anatomy).is_dir():
@@ -82,12 +81,7 @@ def load_arches(
 
 
 def goal_of(anatomy: Anatomy, goal: str, number: int) -> str:
-    """Name of a goal; for "any", one branch of the arch after the other.
-
-    Args:
-        goal: Name, or "any".
-        number: Number of the arch in its set.
-    """
+    """Name of a goal; "any" is one branch after the other, by the arch's number."""
     if goal != "any":
         return goal
     branches = [name for name in BRANCHES if name in anatomy.goals]

@@ -52,7 +52,7 @@ class Case:
         """
         self.scene = scene
         self.objective = objective
-        index = model_index(scene, model)
+        index = ModelIndex(model, scene.catheter, scene.robot)
         if isinstance(scene.catheter, DeviceStack):
             write_still(scene.catheter, model)
         farthest = config.ranges.farthest_insertion
@@ -76,11 +76,6 @@ class Case:
         if self._fluoroscopy is None:
             return None
         return Angiograph(self.scene.anatomy.surface, self._fluoroscopy)
-
-
-def model_index(scene: Scene, model: mujoco.MjModel) -> ModelIndex:
-    """Places of a task's quantities in a compiled scene."""
-    return ModelIndex(model, scene.catheter, scene.robot)
 
 
 def compile_together(
@@ -141,7 +136,12 @@ def _differences(
             )
         if not np.array_equal(room[:size], value):
             fields[name] = value.copy()
-    _check_names(host, model, names)
+    for theirs, ours in zip(_names(model), _names(host), strict=True):
+        if theirs != ours:
+            raise ValueError(
+                f"{names}: {theirs} stands for {ours} there; give anatomies with the "
+                "same goals"
+            )
     return fields
 
 
@@ -154,21 +154,12 @@ def _array_names(model: mujoco.MjModel) -> list[str]:
     ]
 
 
-def _check_names(host: mujoco.MjModel, model: mujoco.MjModel, names: str) -> None:
-    """Raises if what has a number in one model has another one in the other."""
-    for kind, count in (
-        ("body", model.nbody),
-        ("joint", model.njnt),
-        ("geom", model.ngeom),
-        ("site", model.nsite),
-        ("actuator", model.nu),
-        ("sensor", model.nsensor),
-    ):
-        for index in range(count):
-            theirs = getattr(model, kind)(index).name
-            ours = getattr(host, kind)(index).name
-            if theirs != ours:
-                raise ValueError(
-                    f"{names}: {kind} {index} is {theirs!r}, and {ours!r} there; give "
-                    "anatomies with the same goals"
-                )
+def _names(model: mujoco.MjModel) -> list[str]:
+    """What has a number in a model, by kind and name."""
+    kinds = "body", "joint", "geom", "site", "actuator", "sensor"
+    counts = model.nbody, model.njnt, model.ngeom, model.nsite, model.nu, model.nsensor
+    return [
+        f"{kind} {getattr(model, kind)(index).name!r}"
+        for kind, count in zip(kinds, counts, strict=True)
+        for index in range(count)
+    ]

@@ -27,10 +27,16 @@ from cathsim_dmc.physics.vessel import VesselOptions
 MAX_STEPS = 2000  # published
 _MOST_JOINTS = 1000
 WORKING_LENGTHS = (0.02, 3.0)  # m, up to the longest wires sold
-_LONGEST_LEAD = 0.3  # m
-MOST_FRICTION = 2.0  # Coulomb coefficient
-# A link is longer than its radius and shorter than the diameter of a large vessel.
-_LEAST_LINK, _LONGEST_LINK = 2e-3, 0.1  # m
+_FRICTION = (0.0, 2.0)  # Coulomb coefficient
+# Least and largest numbers. A link is longer than its radius and shorter than the
+# diameter of a large vessel.
+_NUMBERS = {
+    "lead": (0.0, 0.3, "m"),
+    "lumen_friction": _FRICTION,
+    "friction": _FRICTION,
+    "shaft_link": (2e-3, 0.1, "m"),
+    "working_length": (*WORKING_LENGTHS, "m"),
+}
 # Range in which the physics holds (docs/physics.md); the library stays within it.
 _LONGEST_TIMESTEP = 5e-3  # s
 _STIFFEST = 5e-3  # N·m², EI
@@ -99,13 +105,15 @@ class NavigationConfig:
         self._check_devices()
         self._check_numbers()
         self._check_range()
-        bounds.pixels("endoluminal_size", self.endoluminal_size)
-        given = bounds.made("fluoroscopy", self.fluoroscopy, FluoroscopyOptions)
-        object.__setattr__(self, "fluoroscopy", given)
-        object.__setattr__(
-            self, "randomisation", Randomisation.make(self.randomisation)
-        )
-        object.__setattr__(self, "vessel", VesselOptions.make(self.vessel))
+        for name, made in (
+            (
+                "fluoroscopy",
+                bounds.made("fluoroscopy", self.fluoroscopy, FluoroscopyOptions),
+            ),
+            ("randomisation", Randomisation.make(self.randomisation)),
+            ("vessel", VesselOptions.make(self.vessel)),
+        ):
+            object.__setattr__(self, name, made)
         if self.start_along_route is not None and self.ranges.start_insertion:
             raise ValueError(
                 "start_along_route and randomisation start_insertion both say where an "
@@ -159,43 +167,37 @@ class NavigationConfig:
                 "['wire_035_glide', 'berenstein_5f']",
             )
         object.__setattr__(self, "devices", tuple(self.devices))
-        for name, option in (
-            ("device", self.device != type(self).device),
-            ("rotation", self.rotation),
-            ("torsion_joints", self.torsion_joints is not None),
-        ):
-            if option:
+        for name in ("device", "rotation", "torsion_joints"):
+            if getattr(self, name) != getattr(type(self), name):
                 raise ValueError(
                     f"{name} is {getattr(self, name)!r}, but devices is "
                     f"{self.devices!r}, which replaces it; leave one of the two out"
                 )
 
     def _check_numbers(self):
-        bounds.number("lead", self.lead, 0.0, _LONGEST_LEAD, "m")
-        bounds.number("lumen_friction", self.lumen_friction, 0.0, MOST_FRICTION)
+        for name, limits in _NUMBERS.items():
+            value = getattr(self, name)
+            if value is not None or getattr(type(self), name) is not None:
+                bounds.number(name, value, *limits)
         bounds.switch("rotation", self.rotation)
         bounds.whole("max_steps", self.max_steps, 1, bounds.MOST_STEPS)
+        bounds.pixels("endoluminal_size", self.endoluminal_size)
         if (shares := self.start_along_route) is not None:
             bounds.interval("start_along_route", shares, 0.0, bounds.MOST_START_SHARE)
         if self.torsion_joints is not None:
             bounds.whole("torsion_joints", self.torsion_joints, 0, _MOST_JOINTS)
-        bounds.number("friction", self.friction, 0.0, MOST_FRICTION)
-        bounds.number("shaft_link", self.shaft_link, _LEAST_LINK, _LONGEST_LINK, "m")
-        if self.working_length is not None:
-            bounds.number("working_length", self.working_length, *WORKING_LENGTHS, "m")
         timestep = bounds.number("physics_timestep", self.physics_timestep)
         substeps = CONTROL_TIMESTEP / timestep if timestep else 0
+        least, most = _FEWEST_SUBSTEPS, _MOST_SUBSTEPS
         if not (
-            timestep > 0
-            and _FEWEST_SUBSTEPS <= substeps + 1e-6
-            and substeps - 1e-6 <= _MOST_SUBSTEPS
+            least - 1e-6 <= substeps <= most + 1e-6
             and abs(substeps - round(substeps)) < 1e-6
         ):
             bounds.refuse(
                 "physics_timestep",
                 self.physics_timestep,
                 f"a whole part of the control step of {CONTROL_TIMESTEP:g} s, from "
-                f"{_FEWEST_SUBSTEPS} to {_MOST_SUBSTEPS} physics steps each",
+                f"{least} to {most} physics steps each",
             )
 
     def _check_range(self):
@@ -207,15 +209,12 @@ class NavigationConfig:
                 f"holds up to {_LONGEST_TIMESTEP:g} s"
             )
         for device in (self.device, *(self.devices or ())):
-            if not isinstance(device, Device):
-                continue
-            stiffest = max(
-                part.bending_stiffness for part in (device.shaft, device.tip)
-            )
-            if stiffest > _STIFFEST:
+            parts = (device.shaft, device.tip) if isinstance(device, Device) else ()
+            ei = max((part.bending_stiffness for part in parts), default=0.0)
+            if ei > _STIFFEST:
                 faults.append(
-                    f"device {device.name!r} has an EI of {stiffest:g} N·m², but the "
-                    f"physics holds up to {_STIFFEST:g} N·m²"
+                    f"device {getattr(device, 'name', device)!r} has an EI of {ei:g} "
+                    f"N·m², but the physics holds up to {_STIFFEST:g} N·m²"
                 )
         if faults and not self.outside_range:
             raise ValueError(f"{faults[0]}; outside_range=True takes it with a warning")

@@ -1,26 +1,23 @@
 """Image sensors of N simulations, with the last few images of each."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
 from cathsim_dmc.imaging import angiograph as angiographs
 from cathsim_dmc.imaging.device import Shadow
-from cathsim_dmc.imaging.fluoroscopy import Fluoroscope
 from cathsim_dmc.tasks import observations
 from cathsim_dmc.tasks.biplane_sight import BiplaneSight
 from cathsim_dmc.tasks.common_chain import CommonChain
-
-_AGES = tuple(f"past_{age}" for age in range(observations.SEQUENCE_LENGTH))
-
-ENDOLUMINAL = ("endoluminal", "endoluminal_distance")
+from cathsim_dmc.tasks.observation_kind import BIPLANE
 
 
 class ImageSensors:
     """Captures the images that the observations ask for, of N simulations.
 
     Attributes:
-        on: Whether an observation needs them.
+        planes: Of the machine before each simulation; empty without fluoroscopy.
+        images: The last images (N, ...) by name; "past_1" is the one before "past_0".
     """
 
     def __init__(
@@ -29,33 +26,27 @@ class ImageSensors:
         angiograph: angiographs.Angiograph | None,
         num_simulations: int,
         chain: CommonChain,
-        endoscope: Callable[[np.ndarray], Mapping[str, np.ndarray]] | None = None,
     ):
         """Prepares the sensors.
 
         Args:
+            names: Of the observations.
             angiograph: Angiography machine; None without fluoroscopic observations.
             num_simulations: N.
             chain: The device as observations show it.
-            endoscope: Function from numbers (K,) of simulations to the endoluminal
-                views (K, ...) from their heads, by name.
         """
-        self._names, self._chain = names, chain
-        self._endoscope = endoscope if self._wants(*ENDOLUMINAL) else None
-        self.on = angiograph is not None or self._endoscope is not None
-        self._planes: list[angiographs.Planes] = []
-        self._sight = BiplaneSight(num_simulations)
-        self._noise = False
+        self._names, self._chain, self._count = names, chain, num_simulations
+        self.planes: list[angiographs.Planes] = []
+        self._sight, self._noise = BiplaneSight(num_simulations), False
         if angiograph is not None:
-            self._planes = [angiograph.planes()] * num_simulations
+            self.planes = [angiograph.planes()] * num_simulations
             self._noise = angiograph.options.noise
-            if observations.needs(names, "biplane") and angiograph.options.planes < 2:
+            if observations.needs(names, BIPLANE) and angiograph.options.planes < 2:
                 raise ValueError(
                     "the observation 'biplane' needs two planes: give fluoroscopy a "
                     "biplane, such as {'view': [60, 0], 'biplane': [-30, 0]}"
                 )
-        # The last images (N, ...) by name, and those before: past_0 is the last one.
-        self._held: dict[str, np.ndarray] = {}
+        self.images: dict[str, np.ndarray] = {}
 
     def restart(
         self,
@@ -65,95 +56,69 @@ class ImageSensors:
     ) -> None:
         """Begins an episode of one simulation with its machine and its deviation."""
         if angiograph is not None:
-            self._planes[index] = angiograph.planes(deviation)
+            self.planes[index] = angiograph.planes(deviation)
 
     def capture(
         self,
-        lines: np.ndarray,
+        rows: np.ndarray,
+        begins: bool,
+        points: Sequence[np.ndarray],
         shadows: Sequence[Shadow],
-        goal: np.ndarray,
+        handles: np.ndarray,
         random_states: Sequence[np.random.RandomState] | None,
-        fresh: np.ndarray | None = None,
-        device_points: np.ndarray | None = None,
-        around: Callable[[angiographs.Planes, int], angiographs.Planes] | None = None,
-        handles: np.ndarray | None = None,
-    ) -> dict[str, np.ndarray]:
-        """Captures the next images.
+        around: Callable[[angiographs.Planes, int], angiographs.Planes],
+    ) -> None:
+        """Captures the next images of fluoroscopy.
 
         Args:
-            lines: (N, n, 3), centrelines of the chains, m.
-            goal: (3,) or (N, 3), m.
+            rows: (K,) numbers of the simulations whose images are captured.
+            begins: Whether they begin an episode: the images fill their history. All
+                are captured otherwise.
+            points: Centrelines of the chains (N, n, 3), tracked points of coaxial
+                devices (N, m, 3), and goals (3,) or (N, 3), m.
+            handles: (N, 3, 3), orientation of the handles, axes in columns.
             random_states: N sources of quantum noise, None for images without.
-            fresh: indices of simulations that begin an episode: only their images are
-                captured, and fill their history. None for a control step of all.
-            device_points: (N, K, P, 3), tracked points of coaxial devices, m.
-            around: moves the vessel before the machine of a simulation.
-            handles: (N, 3, 3), orientation of the handles, axes in columns; needed for
-                "biplane".
+            around: Moves the vessel before the machine of a simulation.
         """
-        count = len(lines)
-        chosen = np.arange(count) if fresh is None else fresh
-        line = lines[chosen]
-        planes = [self._planes[index] for index in chosen] if self._planes else []
-        if around and self._wants("image", "sequential", "segmentation"):
-            planes = list(map(around, planes, chosen.tolist()))
-        image = None
+        if not self.planes:
+            return
+        planes = [self.planes[index] for index in rows]
+        own = [shadow.of(rows) for shadow in shadows]
+        if self._wants("image", "sequential", "segmentation"):
+            planes = list(map(around, planes, rows.tolist()))
         if self._wants("image", "sequential", "biplane"):
-            states = None
+            noise = None
             if random_states is not None and self._noise:
-                states = [random_states[index] for index in chosen.tolist()]
-            image = angiographs.images(planes, [s.of(chosen) for s in shadows], states)
-            self._remember(image, count, fresh)
-        if self._wants("biplane") and image is not None and handles is not None:
-            ends = np.broadcast_to(goal, (count, 3))[chosen, None]
-            # The roadmaps show the vessel at rest.
-            own = [self._planes[index] for index in chosen]
-            marked = angiographs.pixels(own, ends)[:, :, 0]
-            given = own, image, marked, handles[chosen], chosen
-            seen = self._sight.see(*given, fresh is not None)
-            for key, value in seen.items():
-                self._hold(f"biplane_{key}", value, count, fresh)
+                noise = [random_states[index] for index in rows]
+            image = angiographs.images(planes, own, noise)
+            for age in reversed(range(observations.SEQUENCE_LENGTH)):
+                if begins or not age:
+                    self.hold(f"past_{age}", image, rows)
+                else:
+                    self.images[f"past_{age}"] = self.images[f"past_{age - 1}"].copy()
+            if self._wants("biplane"):
+                ends = np.broadcast_to(points[-1], (self._count, 3))[rows, None]
+                # The roadmaps show the vessel at rest.
+                resting = [self.planes[index] for index in rows]
+                marked = angiographs.pixels(resting, ends)[:, :, 0]
+                given = resting, image, marked, handles[rows], rows, begins
+                for key, value in self._sight.see(*given).items():
+                    self.hold(f"biplane_{key}", value, rows)
         if self._wants("segmentation"):
-            masks = angiographs.masks(planes, [s.of(chosen) for s in shadows])
-            self._hold("masks", masks, count, fresh)
+            self.hold("masks", angiographs.masks(planes, own), rows)
         if self._wants("tracking_2d"):
-            ends = np.broadcast_to(goal, (count, 3))[chosen, None]
-            points = [self._chain.tracked(line)]
-            if device_points is not None:
-                points.append(device_points[chosen].reshape(len(line), -1, 3))
-            points = np.concatenate([*points, ends], axis=-2)
-            self._hold("pixels", angiographs.pixels(planes, points), count, fresh)
-        if self._endoscope is not None:
-            for key, view in self._endoscope(chosen).items():
-                self._hold(key, view, count, fresh)
-        return dict(self._held)
+            line, devices, goal = points
+            goal = np.broadcast_to(goal, (self._count, 3))[rows, None]
+            seen = self._chain.tracked(line[rows]), devices[rows], goal
+            pixels = angiographs.pixels(planes, np.concatenate(seen, axis=-2))
+            self.hold("pixels", pixels, rows)
 
-    def _hold(self, name, image, count, fresh):
-        self._held[name] = _merged(self._held.get(name), image, count, fresh)
+    def hold(self, name: str, image: np.ndarray, rows: np.ndarray) -> None:
+        """Keeps images (K, ...) of some simulations (K,)."""
+        if name not in self.images:
+            shape = (self._count, *image.shape[1:])
+            self.images[name] = np.zeros(shape, dtype=image.dtype)
+        self.images[name][rows] = image
 
     def _wants(self, *names: str) -> bool:
         return any(name in self._names for name in names)
-
-    def _remember(self, image, count, fresh):
-        if fresh is None and _AGES[0] in self._held:
-            past = [image, *(self._held[age] for age in _AGES[:-1])]
-            self._held.update(zip(_AGES, past, strict=True))
-            return
-        for age in _AGES:
-            self._hold(age, image, count, fresh)
-
-    @property
-    def fluoroscope(self) -> Fluoroscope | None:
-        """Frontal plane before the first simulation, or None without fluoroscopy."""
-        return self._planes[0][0] if self._planes else None
-
-
-def _merged(old, new, count, fresh):
-    """`new` in the rows `fresh` of `old`; the caller's arrays are not shared."""
-    if fresh is None:
-        return new
-    if old is None:
-        old = np.zeros((count, *new.shape[1:]), dtype=new.dtype)
-    old = old.copy()
-    old[fresh] = new
-    return old

@@ -15,12 +15,17 @@ from cathsim_dmc.physics.effects import Effect
 from cathsim_dmc.physics.readings import CoaxialReadings
 from cathsim_dmc.physics.stepper import SingleStepper, Stepper
 from cathsim_dmc.tasks import cases, observations
-from cathsim_dmc.tasks.actions import check_action
 from cathsim_dmc.tasks.common_chain import CommonChain
 from cathsim_dmc.tasks.config import CONTROL_TIMESTEP, NavigationConfig
 from cathsim_dmc.tasks.objectives import Objective, Shiftable
-from cathsim_dmc.tasks.observation_kind import FrameObservable, Sizes
+from cathsim_dmc.tasks.observation_kind import (
+    BIPLANE,
+    FLUOROSCOPY,
+    FrameObservable,
+    Sizes,
+)
 from cathsim_dmc.tasks.rollout import Rollout
+from cathsim_dmc.tasks.rows import part
 from cathsim_dmc.tasks.scene import Scene
 from cathsim_dmc.tasks.step import Step, info_types
 
@@ -41,7 +46,13 @@ class Navigation(composer.Task):
     Attributes:
         config: Options.
         num_actions: A, entries of an action.
+        rollout: The course of the episode; there once an environment has compiled the
+            model, as is
+        stepper: which does its physics steps.
     """
+
+    rollout: Rollout
+    stepper: SingleStepper
 
     def __init__(
         self,
@@ -49,7 +60,7 @@ class Navigation(composer.Task):
         objective: Objective,
         config: NavigationConfig | None = None,
         random: np.random.RandomState | int | None = None,
-        others: Iterable[tuple[Scene, Objective]] = (),
+        others: Iterable[tuple[Scene, Objective]] | None = None,
         name: str | None = None,
     ):
         """Takes over the scene.
@@ -82,33 +93,21 @@ class Navigation(composer.Task):
         living = config.vessel_options.living
         self._names = observations.resolve(config.observation, scene.coaxial, living)
         self._fluoroscopy = None
-        if observations.needs(self._names, "fluoroscopic"):
+        if observations.needs(self._names, FLUOROSCOPY, BIPLANE):
             self._fluoroscopy = config.fluoroscopy_options
-        rooms = iter(others)
-        second = next(rooms, None)
         self.set_timesteps(CONTROL_TIMESTEP, config.physics_timestep)
         self._cases: tuple[cases.Case, ...] = ()
-        if second is not None:
-            self._cases = cases.compile_together(
-                itertools.chain([(scene, objective), second], rooms),
-                config,
-                self._fluoroscopy,
-            )
-        self._rollout: Rollout  # there once the model is compiled
+        if others is not None:
+            rooms = itertools.chain([(scene, objective)], others)
+            self._cases = cases.compile_together(rooms, config, self._fluoroscopy)
+        self._compiled = False
         self._observables = None
         self._step: Step | None = None
 
-    def make_rollout(
-        self,
-        model: mujoco.MjModel,
-        stepper: Stepper,
-    ) -> Rollout:
+    def make_rollout(self, model: mujoco.MjModel, stepper: Stepper) -> Rollout:
         """The course of the task's episodes; see `Rollout`."""
-        chosen = self._cases or [
-            cases.Case(
-                self._scene, self._objective, model, self.config, self._fluoroscopy
-            )
-        ]
+        own = self._scene, self._objective, model, self.config, self._fluoroscopy
+        chosen = self._cases or [cases.Case(*own)]
         return Rollout(chosen, self.config, model, stepper)
 
     @property
@@ -149,10 +148,7 @@ class Navigation(composer.Task):
         """One observable per entry of the chosen observations."""
         if self._observables is None:
             self._observables = {
-                key: FrameObservable(
-                    lambda physics, key=key: self.observation[key][0],
-                    spec,
-                )
+                key: FrameObservable(lambda _, key=key: self.observation[key][0], spec)
                 for key, spec in self.observation_specs.items()
             }
         return self._observables
@@ -198,19 +194,15 @@ class Navigation(composer.Task):
         """Starts a rollout on the new model."""
         del random_state
         model = physics.model.ptr
-        self._stepper = SingleStepper(
-            model, physics.data.ptr, self.data_fields, self.substeps
-        )
-        self._rollout = self.make_rollout(model, self._stepper)
-        self._step = None
+        data, fields = physics.data.ptr, self.data_fields
+        self.stepper = SingleStepper(model, data, fields, self.substeps)
+        self.rollout = self.make_rollout(model, self.stepper)
+        self._compiled, self._step = True, None
 
     def initialize_episode(self, physics, random_state):
         """Draws what differs between episodes and puts the device to its start."""
         self._step = None
-        self._rollout.begin(_ONLY, [random_state])
-        self._show_goal(physics)
-
-    def _show_goal(self, physics):
+        self.rollout.begin(_ONLY, [random_state])
         goal = self._scene.phantom.goals.get(self._scene.goal.name)
         if goal is not None and self.config.ranges.goal_shift:
             physics.bind(goal).pos = self.goal_position
@@ -218,7 +210,7 @@ class Navigation(composer.Task):
     def before_step(self, physics, action, random_state):
         """Applies the action and moves the robot along."""
         del physics, random_state
-        self._rollout.command(check_action(action, (self.num_actions,))[None])
+        self.rollout.command(bounds.actions(action, (self.num_actions,))[None])
 
     @property
     def substeps(self) -> int:
@@ -228,21 +220,17 @@ class Navigation(composer.Task):
     def after_substep(self, physics, random_state):
         """Keeps the contacts of a physics step."""
         del physics, random_state
-        self._stepper.keep()
-
-    def run_substeps(self) -> None:
-        """Does all physics steps of a control step, in place of composer."""
-        self._stepper.run()
+        self.stepper.keep()
 
     def after_step(self, physics, random_state):
         """Decides reward, success and end of the episode, once."""
         del physics, random_state
-        self._step = self._rollout.finish()
+        self._step = self.rollout.finish()
 
     def _current(self) -> Step:
         """The last control step, or the start of the episode, looked at once."""
         if self._step is None:
-            self._step = self._rollout.start(_ONLY)
+            self._step = self.rollout.start(_ONLY)
         return self._step
 
     def get_reward(self, physics) -> float:
@@ -269,8 +257,7 @@ class Navigation(composer.Task):
         Where episodes draw their anatomy, a batch has another scene in each
         simulation: see `Rollout.case`. This is the first one then.
         """
-        rollout = self.rollout
-        return self._scene if rollout is None else rollout.case().scene
+        return self.rollout.case().scene if self._compiled else self._scene
 
     @property
     def num_anatomies(self) -> int:
@@ -280,40 +267,28 @@ class Navigation(composer.Task):
     @property
     def objective(self) -> Objective:
         """Success and reward, with the goal of this episode."""
-        return self._objective if self.rollout is None else self.rollout.objective
+        return self.rollout.objectives[0][0] if self._compiled else self._objective
 
     @property
     def goal_position(self) -> np.ndarray:
         """Position (3,) of the goal now, m, world frame; it moves with its vessel."""
-        goal = self.objective.goal if self.rollout is None else self.rollout.goal
-        return goal.reshape(3)
-
-    @property
-    def rollout(self) -> Rollout | None:
-        """The course of the episode, or None before the model is compiled."""
-        return getattr(self, "_rollout", None)
+        return self.rollout.goal[0] if self._compiled else self._objective.goal
 
     @property
     def readings(self) -> readings.Readings:
         """State of the device after the last control step, without a leading axis."""
-        return _only(self._current().readings)
+        return part(self._current().readings, 0)
 
     @property
     def wall_force(self) -> forces.WallForce:
         """Force on the wall over the last control step, N, without a leading axis."""
-        return _only(self._current().wall_force)
+        return part(self._current().wall_force, 0)
 
     @property
     def devices(self) -> CoaxialReadings | None:
         """State of coaxial devices, without a leading axis; None for one alone."""
         self._current()
-        state = self._rollout.devices
-        return None if state is None else _only(state)
-
-    @property
-    def contact_rows(self) -> np.ndarray:
-        """Rows (S, M * 14) of the wall's sensor in the last control step's S steps."""
-        return self._stepper.contact_rows[0]
+        return part(self.rollout.devices, 0)
 
     @property
     def termination(self) -> str | None:
@@ -338,7 +313,7 @@ class Navigation(composer.Task):
 
     def contacts(self, physics) -> forces.Contacts:
         """Contacts with the wall in the last physics step."""
-        return self._rollout.index.contacts(physics.data.ptr.sensordata)
+        return self.rollout.index.contacts(physics.data.ptr.sensordata)
 
     # TorchRL seeds a dm_control environment by replacing `task._random`; composer
     # draws from a RandomState of its own. Both are this one.
@@ -355,8 +330,3 @@ class Navigation(composer.Task):
     @_random.setter
     def _random(self, random_state: np.random.RandomState):
         self._random_state.set_state(random_state.get_state())
-
-
-def _only(measured):
-    """The one simulation's part of a named tuple of arrays."""
-    return type(measured)._make(value[0] for value in measured)

@@ -13,6 +13,7 @@ from cathsim_dmc import bounds
 from cathsim_dmc.anatomy import Anatomy, Centreline, Goal
 from cathsim_dmc.anatomy.geodesic import LumenDistance
 from cathsim_dmc.physics import forces, readings
+from cathsim_dmc.tasks.rows import part
 
 _NOTHING = np.zeros(())
 GOAL_RADIUS = 8e-3  # m, δ of the published task
@@ -93,57 +94,53 @@ class Objective(Protocol):
         ...
 
 
+# Objectives, each with the rows of its simulations.
+Groups = Sequence[tuple[Objective, np.ndarray | slice]]
+
+
 def judge(
-    objective: Objective, measurement: Measurement, failed: np.ndarray | None = None
+    groups: Groups, measurement: Measurement, failed: np.ndarray | None = None
 ) -> Outcome:
-    """Asks an objective about a control step of N simulations and checks its answer.
+    """Asks objectives about a control step of N simulations and checks their answers.
 
     Args:
+        groups: Objectives with the rows of their simulations; all have the same terms.
         measurement: What there is to judge, arrays (N, ...).
         failed: (N,) bool, where the physics failed: there the reward and its terms are
             0 and there is no success. None for nowhere.
 
     Raises:
-        ValueError: if the outcome has a wrong type or shape, or is not finite.
+        ValueError: if an outcome has a wrong type or shape, or is not finite.
     """
-    outcome = ask(objective, measurement)
-    if failed is not None:
-        outcome = Outcome(
-            reward=np.where(failed, 0.0, outcome.reward),
-            success=outcome.success & ~failed,
-            terms={n: np.where(failed, 0.0, t) for n, t in outcome.terms.items()},
-        )
-    # A sum of plain numbers takes a tenth of the time of `isfinite` and `all`.
-    for name, value in (("reward", outcome.reward), *outcome.terms.items()):
-        if not math.isfinite(sum(value.tolist())) and not np.isfinite(value).all():
-            _refuse(objective, f"{name} {bounds.shown(value)}, which is not finite")
-    return outcome
-
-
-def ask(objective: Objective, measurement: Measurement) -> Outcome:
-    """Outcome of an objective, copied as float64 and bool; it may be infinite."""
-    outcome, shape = objective.outcome(measurement), measurement.distance.shape
-    if not isinstance(outcome, Outcome) or not isinstance(outcome.terms, Mapping):
-        _refuse(objective, bounds.shown(outcome))
-    if (*outcome.terms,) != (*objective.terms,):
-        _refuse(objective, f"the terms {[*outcome.terms]}, not {[*objective.terms]}")
-    terms = {
-        name: _copied(objective, name, term, "fiu", shape)
-        for name, term in outcome.terms.items()
-    }
-    return Outcome(
-        reward=_copied(objective, "reward", outcome.reward, "fiu", shape),
-        success=_copied(objective, "success", outcome.success, "b", shape),
-        terms=terms,
-    )
-
-
-def _copied(objective, name, value, kinds, shape) -> np.ndarray:
-    if type(value) is not np.ndarray or value.dtype.kind not in kinds:
-        _refuse(objective, f"{name} {bounds.shown(value)}")
-    if value.shape != shape:
-        _refuse(objective, f"{name} of shape {value.shape}; it must be {shape}")
-    return np.array(value, dtype=bool if kinds == "b" else float)
+    count, names = len(measurement.distance), tuple(groups[0][0].terms)
+    reward, success = np.empty(count), np.empty(count, dtype=bool)
+    terms = {name: np.empty(count) for name in names}
+    for objective, rows in groups:
+        own = part(measurement, rows)
+        outcome = objective.outcome(own)
+        if not isinstance(outcome, Outcome) or not isinstance(outcome.terms, Mapping):
+            _refuse(objective, bounds.shown(outcome))
+        if (*outcome.terms,) != names:
+            _refuse(objective, f"the terms {[*outcome.terms]}, not {[*names]}")
+        for name, value, kinds, into in (
+            ("reward", outcome.reward, "fiu", reward),
+            ("success", outcome.success, "b", success),
+            *((name, outcome.terms[name], "fiu", terms[name]) for name in names),
+        ):
+            if type(value) is not np.ndarray or value.dtype.kind not in kinds:
+                _refuse(objective, f"{name} {bounds.shown(value)}")
+            if value.shape != own.distance.shape:
+                shapes = f"{value.shape}; it must be {own.distance.shape}"
+                _refuse(objective, f"{name} of shape {shapes}")
+            into[rows] = value
+            if failed is not None:
+                into[failed] = 0
+            # A sum of plain numbers takes a tenth of the time of `isfinite`.
+            if not math.isfinite(sum(into[rows].tolist())):
+                if not np.isfinite(into[rows]).all():
+                    given = f"{name} {bounds.shown(value)}, which is not finite"
+                    _refuse(objective, given)
+    return Outcome(reward, success, terms)
 
 
 def _refuse(objective: Objective, given: str) -> NoReturn:
@@ -239,28 +236,11 @@ class Cannulation(Shiftable, Routed):
 
     def __post_init__(self):
         bounds.number("goal_radius", self.goal_radius, positive=True)
-        object.__setattr__(self, "weights", self._checked(self.weights))
-
-    def _checked(self, weights: Mapping[str, float]) -> Mapping[str, float]:
         known = (*self.TERMS, "success")
-        problem = None
-        if not isinstance(weights, Mapping) or not weights:
-            problem = "give a mapping of reward terms to weights"
-        elif set(weights) - set(known):
-            problem = (
-                f"no term {', '.join(sorted(map(str, set(weights) - set(known))))}"
-            )
-        elif not all(
-            isinstance(weight, int | float) and np.isfinite(weight)
-            for weight in weights.values()
-        ):
-            problem = "weights must be finite numbers"
-        if problem:
-            raise ValueError(
-                f"reward is {weights!r}: {problem}; terms are {', '.join(known)}, and "
-                f"the published reward is {dict(PUBLISHED_REWARD)}"
-            )
-        return MappingProxyType({name: float(w) for name, w in weights.items()})
+        if not bounds.mapping("reward", self.weights, known):
+            bounds.refuse("reward", self.weights, f"some of {', '.join(known)}")
+        weights = {n: bounds.number(f"reward {n}", w) for n, w in self.weights.items()}
+        object.__setattr__(self, "weights", MappingProxyType(weights))
 
     @classmethod
     def to(
@@ -283,7 +263,12 @@ class Cannulation(Shiftable, Routed):
         vessel = anatomy.tree.vessel(goal.vessel)
         route = anatomy.route(goal, farthest_shift)
         arc_length = route.project(goal.position).arc_length if farthest_shift else None
-        objective = cls(
+        lumen = None
+        if isinstance(reward, Mapping) and "path" in reward:
+            vertices, inlet = anatomy.surface.vertices, anatomy.inlet.position
+            box = np.stack([vertices.min(0), vertices.max(0)])
+            lumen = LumenDistance(anatomy.depth, box, route.points[-1], inlet)
+        return cls(
             goal=goal.position,
             branch=vessel.centreline,
             ostium=vessel.ostium,
@@ -291,10 +276,8 @@ class Cannulation(Shiftable, Routed):
             goal_radius=goal_radius,
             weights=reward,
             goal_arc_length=arc_length,
+            lumen=lumen,
         )
-        if "path" not in objective.weights:
-            return objective
-        return dataclasses.replace(objective, lumen=_ways_to(anatomy, route))
 
     def outcome(self, measurement: Measurement) -> Outcome:
         """Judges a control step."""
@@ -362,11 +345,3 @@ class Cannulation(Shiftable, Routed):
         goal = self.goal + moved
         arc_length = self.route.project(goal).arc_length
         return dataclasses.replace(self, goal=goal, goal_arc_length=arc_length)
-
-
-def _ways_to(anatomy: Anatomy, route: Centreline) -> LumenDistance:
-    vertices = anatomy.surface.vertices
-    bounds = np.stack([vertices.min(0), vertices.max(0)])
-    return LumenDistance(
-        anatomy.depth, bounds, route.points[-1], anatomy.inlet.position
-    )

@@ -2,18 +2,51 @@
 
 import dataclasses
 import math
-from collections.abc import Callable, Sequence
-from typing import cast
+from collections.abc import Callable, Mapping, Sequence
+from typing import NamedTuple, cast
 
 import numpy as np
 from dm_control.composer.observation import observable
 from dm_env import specs
 
 from cathsim_dmc.imaging.options import FluoroscopyOptions
-from cathsim_dmc.tasks.frame import Frame
+from cathsim_dmc.physics.forces import WallForce
+from cathsim_dmc.physics.readings import CoaxialReadings, Readings
+from cathsim_dmc.physics.vessel import VesselReadings
+from cathsim_dmc.tasks.common_chain import CommonChain
+from cathsim_dmc.tasks.route import Ahead
 
 Observation = dict[str, np.ndarray]
 Shape = int | tuple[int, ...]
+
+
+class Frame(NamedTuple):
+    """Input of the observations after a control step.
+
+    Attributes:
+        readings: state of the device.
+        wall_force: force on the wall over the control step.
+        action: (..., A), the last action, zeros after a reset.
+        goal: (3,) or (..., 3), m.
+        chain: the device as observations show it.
+        images: of the sensors, by name: (..., H, W, P) uint8 of P planes "past_0", the
+            last one, "past_1" and "past_2"; (..., H, W, 2 P) uint8 "masks", see
+            `imaging.angiograph.masks`; (..., P, K + 1, 2) "pixels" of tracked points
+            and goal, (column, row); endoluminal views.
+        ahead: route ahead of the tip; None where no observation needs it.
+        devices: state of coaxial devices; None for a device alone.
+        vessel: state of the vessel; None for a rigid one with blood at rest.
+    """
+
+    readings: Readings
+    wall_force: WallForce
+    action: np.ndarray
+    goal: np.ndarray
+    chain: CommonChain
+    images: Mapping[str, np.ndarray]
+    ahead: Ahead | None
+    devices: CoaxialReadings | None
+    vessel: VesselReadings | None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -75,6 +108,12 @@ class Entry:
         return specs.BoundedArray(shape, self.dtype, low, high, self.key)
 
 
+# What a row of the table may need.
+FLUOROSCOPY, BIPLANE = "fluoroscopy", "fluoroscopy with two planes"
+ROUTE = "a route"
+COAXIAL, LIVING = "coaxial devices", "a living vessel (option vessel)"
+
+
 @dataclasses.dataclass(frozen=True)
 class ObservationKind:
     """One row of the table.
@@ -82,32 +121,25 @@ class ObservationKind:
     Attributes:
         observe: function from a frame to the arrays of the observation.
         entries: its arrays.
-        fluoroscopic: whether it needs the angiography machine.
-        biplane: whether it needs two planes of it.
-        routed: whether it needs the route to the goal.
-        coaxial: whether it needs coaxial devices.
-        living: whether it needs a vessel that lives.
+        needs: `FLUOROSCOPY`, `BIPLANE`, `ROUTE`, `COAXIAL` or `LIVING`; empty for
+            nothing.
         joined: names of the rows that coaxial devices add to it.
     """
 
     observe: Callable[[Frame], Observation]
     entries: tuple[Entry, ...]
-    fluoroscopic: bool = False
-    biplane: bool = False
-    routed: bool = False
-    coaxial: bool = False
-    living: bool = False
+    needs: str = ""
     joined: tuple[str, ...] = ()
 
 
 class ObservationTable(dict[str, ObservationKind]):
     """Observations by name."""
 
-    def row(self, *entries: Entry, **needs) -> Callable:
+    def row(self, *entries: Entry, **options) -> Callable:
         """Puts the decorated function into the table under its own name."""
 
         def add(function: Callable[[Frame], Observation]):
-            self[function.__name__] = ObservationKind(function, entries, **needs)
+            self[function.__name__] = ObservationKind(function, entries, **options)
             return function
 
         return add
@@ -131,17 +163,12 @@ class ObservationTable(dict[str, ObservationKind]):
         """
         listed = isinstance(names, Sequence) and not isinstance(names, str | bytes)
         chosen = cast(tuple[str, ...], tuple(names) if listed else (names,))
-        allowed = [
-            name
-            for name, row in self.items()
-            if (coaxial is not False or not row.coaxial)
-            and (living is not False or not row.living)
-        ]
+        there = {COAXIAL: coaxial is not False, LIVING: living is not False}
+        allowed = [n for n, row in self.items() if there.get(row.needs, True)]
         unknown = [n for n in chosen if not isinstance(n, str) or n not in allowed]
         if unknown or not chosen or len(set(chosen)) < len(chosen):
-            needs = ("a living vessel (option vessel)", "coaxial devices")
             known = [n for n in unknown if isinstance(n, str) and n in self]
-            hints = [f"{n!r} needs {needs[self[n].coaxial]}; " for n in known]
+            hints = [f"{n!r} needs {self[n].needs}; " for n in known]
             raise ValueError(
                 f"observation is {names!r}; {''.join(hints)}give one of "
                 f"{', '.join(allowed)}, or a list of different ones"
@@ -149,16 +176,14 @@ class ObservationTable(dict[str, ObservationKind]):
         joined = [n for name in chosen for n in self[name].joined if coaxial]
         return tuple(dict.fromkeys([*chosen, *joined]))
 
-    def needs(self, names: Sequence[str], what: str) -> bool:
-        """Whether any of the named rows is "fluoroscopic", "routed" or "coaxial"."""
-        return any(getattr(self[name], what) for name in names)
+    def needs(self, names: Sequence[str], *what: str) -> bool:
+        """Whether any of the named rows has one of these needs."""
+        return any(self[name].needs in what for name in names)
 
     def observe(self, names: Sequence[str], frame: Frame) -> Observation:
         """Computes the named rows; arrays may share memory with the frame."""
-        observation: Observation = {}
-        for name in names:
-            observation.update(self[name].observe(frame))
-        return observation
+        rows = [self[name].observe(frame) for name in names]
+        return {key: value for row in rows for key, value in row.items()}
 
     def entries(self, names: Sequence[str]) -> list[Entry]:
         """Entries of the named rows."""

@@ -10,9 +10,14 @@ import numpy as np
 from cathsim_dmc.imaging.options import FARTHEST_WALL
 from cathsim_dmc.physics.sliding import DEVICE_PLACES
 from cathsim_dmc.tasks.common_chain import TRACKED_PLACES
-from cathsim_dmc.tasks.frame import Frame
 from cathsim_dmc.tasks.observation_kind import (
+    BIPLANE,
+    COAXIAL,
+    FLUOROSCOPY,
+    LIVING,
+    ROUTE,
     Entry,
+    Frame,
     Observation,
     ObservationTable,
     Sizes,
@@ -109,7 +114,7 @@ def internal(frame: Frame) -> Observation:
 
 @OBSERVATIONS.row(
     _fluoroscopic("image", 1, "grey level", "fluoroscopy, dark = opaque, by plane"),
-    fluoroscopic=True,
+    needs=FLUOROSCOPY,
 )
 def image(frame: Frame) -> Observation:
     """One fluoroscopic image, a channel for each plane."""
@@ -123,7 +128,7 @@ def image(frame: Frame) -> Observation:
         "grey level",
         "three consecutive images, oldest first; equal after a reset",
     ),
-    fluoroscopic=True,
+    needs=FLUOROSCOPY,
 )
 def sequential(frame: Frame) -> Observation:
     """Three consecutive images, oldest first."""
@@ -134,7 +139,7 @@ def sequential(frame: Frame) -> Observation:
 
 @OBSERVATIONS.row(
     _fluoroscopic("segmentation", 2, "0 or 255", "channels: device, vessel, by plane"),
-    fluoroscopic=True,
+    needs=FLUOROSCOPY,
 )
 def segmentation(frame: Frame) -> Observation:
     """Which pixels show the device, and which the vessel."""
@@ -182,7 +187,7 @@ def _pixels(sizes: Sizes) -> int:
         "goal: column, row",
     ),
     *_OPERATOR,
-    fluoroscopic=True,
+    needs=FLUOROSCOPY,
     joined=("drives",),
 )
 def tracking_2d(frame: Frame) -> Observation:
@@ -221,7 +226,7 @@ def tracking_2d(frame: Frame) -> Observation:
         -1,
     ),
     Entry("route_action", _actions, "1", "the last action, 0 after a reset", -1, 1),
-    routed=True,
+    needs=ROUTE,
     joined=("drives", "devices"),
 )
 def route(frame: Frame) -> Observation:
@@ -267,8 +272,7 @@ def route(frame: Frame) -> Observation:
         -1,
     ),
     Entry("biplane_action", _actions, "1", "the last action, 0 after a reset", -1, 1),
-    fluoroscopic=True,
-    biplane=True,
+    needs=BIPLANE,
 )
 def biplane(frame: Frame) -> Observation:
     """The entries of `route`, reconstructed from the images of two planes."""
@@ -324,7 +328,7 @@ def force(frame: Frame) -> Observation:
     Entry("breath_phase", 2, "1", "sine and cosine of that of breathing", -1, 1),
     Entry("blood_velocity", 3, "m/s", "of the blood at the head, world frame"),
     Entry("indentation", 1, "m", "of the wall under the deepest contact", 0),
-    living=True,
+    needs=LIVING,
 )
 def vessel(frame: Frame) -> Observation:
     """Heart, blood and wall of a vessel that lives."""
@@ -387,7 +391,7 @@ def endoluminal_distance(frame: Frame) -> Observation:
         "chain's end is at the start of the stroke",
     ),
     Entry("device_rotation", _devices, "rad", "of the rotary unit of each device"),
-    coaxial=True,
+    needs=COAXIAL,
 )
 def drives(frame: Frame) -> Observation:
     """How far the operator has pushed and turned each coaxial device."""
@@ -412,7 +416,7 @@ def drives(frame: Frame) -> Observation:
         "axial force in the device that reaches farthest where it leaves the others, "
         "and friction between the devices",
     ),
-    coaxial=True,
+    needs=COAXIAL,
 )
 def devices(frame: Frame) -> Observation:
     """Shape of each coaxial device and the load on it."""

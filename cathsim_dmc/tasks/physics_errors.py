@@ -1,6 +1,6 @@
 """Physics errors: detection and names."""
 
-import logging
+from collections.abc import Callable
 
 import numpy as np
 
@@ -20,8 +20,6 @@ _ESCAPE_DEPTH = 2e-3
 _MOUTH = 2e-3
 # No contact of a device that is pushed with 5 N at most is harder than this, N.
 MAX_FORCE = 50.0
-
-_LOG = logging.getLogger(__name__)
 
 
 def escaped(
@@ -50,62 +48,30 @@ def escaped(
     return outside.any(-1)
 
 
-class PhysicsMonitor:
-    """Watches N simulations for errors of physics."""
+def find(
+    scene_of: Callable[[int], Scene],
+    diverged: np.ndarray,
+    steps: np.ndarray,
+    centreline: np.ndarray,
+    peak_force: np.ndarray,
+) -> tuple[str | None, ...]:
+    """Physics errors of N simulations in the last control step.
 
-    def __init__(self, scene: Scene, num_simulations: int):
-        """Starts with no episode running, all in one scene until one begins."""
-        self._scenes = [scene] * num_simulations
-        self._failed = [False] * num_simulations
+    Args:
+        scene_of: function from the number of a simulation to its scene.
+        diverged: (N,) bool, MuJoCo warned.
+        steps: (N,), control steps of the episodes.
+        centreline: (N, n, 3), nodes of the devices, m.
+        peak_force: (N,), largest single contact force within the step, N.
 
-    def restart(self, index: int, scene: Scene) -> None:
-        """Begins an episode of a simulation in a scene."""
-        self._scenes[index], self._failed[index] = scene, False
-
-    def errors(
-        self,
-        diverged: np.ndarray,
-        steps: np.ndarray,
-        centreline: np.ndarray,
-        peak_force: np.ndarray,
-    ) -> tuple[str | None, ...]:
-        """Physics errors of the last control step.
-
-        The first error of an episode is logged.
-
-        Args:
-            diverged: (N,) bool, MuJoCo warned.
-            steps: (N,), control steps of the episodes.
-            centreline: (N, n, 3), nodes of the devices, m.
-            peak_force: (N,), largest single contact force within the step, N.
-
-        Returns:
-            A reason for each simulation, None where nothing did.
-        """
-        looked = [
-            i for i, taken in enumerate(steps.tolist()) if not taken % ESCAPE_INTERVAL
-        ]
-        wrong = diverged | ~(peak_force <= MAX_FORCE)
-        reasons: list[str | None] = [None] * len(self._scenes)
-        if not looked and not np.count_nonzero(wrong):
-            return tuple(reasons)
-        out = np.zeros(len(reasons), dtype=bool)
-        if looked:
-            out[looked] = self._escaped(looked, centreline)
-        for index in np.flatnonzero(wrong | out).tolist():
-            reason = ESCAPED if out[index] and not wrong[index] else EXPLODED
-            reasons[index] = reason = DIVERGED if diverged[index] else reason
-            if not self._failed[index]:
-                _LOG.error("%s after %d steps", reason, steps[index])
-            self._failed[index] = True
-        return tuple(reasons)
-
-    def _escaped(self, looked: list[int], centreline: np.ndarray) -> np.ndarray:
-        """Whether some simulations have left the lumen, each its own: (len,) bool."""
-        out = np.zeros(len(looked), dtype=bool)
-        own = [self._scenes[index] for index in looked]
-        for scene in {id(scene): scene for scene in own}.values():
-            rows = [row for row, other in enumerate(own) if other is scene]
-            nodes = centreline[[looked[row] for row in rows]]
-            out[rows] = escaped(scene.anatomy, nodes, scene.placement.direction)
-        return out
+    Returns:
+        A reason for each simulation, None where nothing went wrong.
+    """
+    reasons: list[str | None] = [None] * len(steps)
+    for index in np.flatnonzero(steps % ESCAPE_INTERVAL == 0).tolist():
+        scene = scene_of(index)
+        if escaped(scene.anatomy, centreline[index], scene.placement.direction):
+            reasons[index] = ESCAPED
+    for index in np.flatnonzero(diverged | ~(peak_force <= MAX_FORCE)).tolist():
+        reasons[index] = DIVERGED if diverged[index] else EXPLODED
+    return tuple(reasons)

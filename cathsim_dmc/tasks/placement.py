@@ -8,7 +8,7 @@ import numpy as np
 
 from cathsim_dmc import bounds
 from cathsim_dmc.anatomy import Anatomy, Goal
-from cathsim_dmc.entities import arena, devices
+from cathsim_dmc.entities import devices
 from cathsim_dmc.tasks.config import WORKING_LENGTHS
 
 # The steerable tip starts free of the sheath wherever the way to the first branching
@@ -127,12 +127,11 @@ def place_device(
     if direction is None:  # what lies in the way is refused once the device is there
         direction = np.array(inlet.direction)
     quaternion = _frame(direction)
-    matrix = np.empty(9)
-    mujoco.mju_quat2Mat(matrix, quaternion)
+    matrix = _matrix(quaternion)
     outside = np.array([0.0, 0.0, working_length - start_depth])
     # Longer than the device lies in, whose links are chords of the line.
     ahead = np.arange(0.0, route.length, _LINE_SPACING)
-    inside = (route.at(ahead).position - inlet.position) @ matrix.reshape(3, 3)
+    inside = (route.at(ahead).position - inlet.position) @ matrix
     # The first point of the route is the inlet; the sheath ends there, straight.
     line = np.vstack([np.zeros(3), inside - inside[0] + outside])
     return Placement(
@@ -170,9 +169,7 @@ def sheath_direction(anatomy: Anatomy) -> np.ndarray | None:
     along = np.asarray(inlet.direction, dtype=float)
     if _clear(anatomy, along[None])[0]:
         return along
-    matrix = np.empty(9)
-    mujoco.mju_quat2Mat(matrix, _frame(along))
-    x, y, _ = matrix.reshape(3, 3).T
+    x, y, _ = _matrix(_frame(along)).T
     turns = np.arange(0.0, 2 * np.pi, _AZIMUTH_STEP)
     around = np.cos(turns)[:, None] * x + np.sin(turns)[:, None] * y
     for tilt in np.arange(_TILT_STEP, _LARGEST_TILT + 1e-9, _TILT_STEP):
@@ -205,6 +202,12 @@ def _way_to_branching(anatomy: Anatomy) -> float:
     return min(abs(place - start) for place in places)
 
 
+def _matrix(quaternion: np.ndarray) -> np.ndarray:
+    matrix = np.empty(9)
+    mujoco.mju_quat2Mat(matrix, quaternion)
+    return matrix.reshape(3, 3)
+
+
 def _frame(direction: np.ndarray) -> np.ndarray:
     """Quaternion wxyz that turns +z into a direction and keeps +y posterior."""
     z = direction / np.linalg.norm(direction)
@@ -216,25 +219,10 @@ def _frame(direction: np.ndarray) -> np.ndarray:
     matrix = np.stack([x, np.cross(z, x), z], axis=-1)
     w = np.sqrt(max(0.0, 1 + np.trace(matrix))) / 2
     if w > 1e-6:
-        xyz = np.array(
-            [
-                matrix[2, 1] - matrix[1, 2],
-                matrix[0, 2] - matrix[2, 0],
-                matrix[1, 0] - matrix[0, 1],
-            ]
-        ) / (4 * w)
-        return np.concatenate([[w], xyz])
+        skew = matrix - matrix.T
+        return np.array(
+            [w, *(np.array([skew[2, 1], skew[0, 2], skew[1, 0]]) / (4 * w))]
+        )
     # Half turn: the axis is the eigenvector of eigenvalue 1.
     values, vectors = np.linalg.eigh((matrix + matrix.T) / 2)
     return np.concatenate([[0.0], vectors[:, np.argmax(values)]])
-
-
-def add_cameras(
-    scene: arena.AngiographyArena, low: np.ndarray, high: np.ndarray
-) -> None:
-    """Adds the published top view and a view from the side of a box (3,), (3,) m."""
-    centre, size = (low + high) / 2, float((high - low).max())
-    distance = 2.6 * size
-    # Seen from the front, the patient's left is on the right of the image.
-    scene.add_camera("top", centre, distance, (1, 0, 0, 0, 0, 1))
-    scene.add_camera("side", centre, distance, (0, 1, 0, 0, 0, 1))

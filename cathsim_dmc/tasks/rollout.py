@@ -6,6 +6,7 @@ The composer environment steps a `Rollout` of one simulation, the batched simula
 one of N; so both draw, command, judge and observe alike, bit for bit.
 """
 
+import logging
 from collections.abc import Sequence
 from typing import cast
 
@@ -16,20 +17,18 @@ from cathsim_dmc.imaging import endoluminal
 from cathsim_dmc.imaging.angiograph import Planes
 from cathsim_dmc.imaging.device import Shadow
 from cathsim_dmc.imaging.fluoroscopy import Fluoroscope
-from cathsim_dmc.physics import forces, readings, vessel
+from cathsim_dmc.physics import forces
+from cathsim_dmc.physics import vessel as vessels
 from cathsim_dmc.physics.effects import Effects, World
 from cathsim_dmc.physics.motion import Moving
-from cathsim_dmc.physics.readings import CoaxialReadings
+from cathsim_dmc.physics.readings import CoaxialReadings, ModelIndex, Readings
 from cathsim_dmc.physics.sliding import SingleDevice
 from cathsim_dmc.physics.stepper import CONTROL_TIMESTEP, Stepper
-from cathsim_dmc.tasks import observations
-from cathsim_dmc.tasks.cases import Case, model_index
+from cathsim_dmc.tasks import observations, physics_errors
+from cathsim_dmc.tasks.cases import Case
 from cathsim_dmc.tasks.common_chain import CommonChain
 from cathsim_dmc.tasks.config import NavigationConfig
-from cathsim_dmc.tasks.frame import Frame
 from cathsim_dmc.tasks.image_sensors import ImageSensors
-from cathsim_dmc.tasks.measured import Measured, Path, merged
-from cathsim_dmc.tasks.objective_pool import part, together
 from cathsim_dmc.tasks.objectives import (
     Measurement,
     Objective,
@@ -37,11 +36,12 @@ from cathsim_dmc.tasks.objectives import (
     judge,
     straight,
 )
-from cathsim_dmc.tasks.observation_kind import Observation
-from cathsim_dmc.tasks.physics_errors import PhysicsMonitor
-from cathsim_dmc.tasks.route import Routes
+from cathsim_dmc.tasks.observation_kind import ROUTE, Frame, Observation
+from cathsim_dmc.tasks.route import Route, look_ahead
 from cathsim_dmc.tasks.step import Step
 from cathsim_dmc.tasks.tracking_noise import TrackingNoise
+
+_LOG = logging.getLogger(__name__)
 
 
 class Rollout:
@@ -49,14 +49,24 @@ class Rollout:
 
     Attributes:
         index: Places of the task's quantities in the compiled model.
-        objective: Goals, which may differ between simulations, reward and success rule.
+        objectives: Objectives with their goals of these episodes, and the rows of the
+            simulations of each.
+        resting_goal: (N, 3) m, goals where they are in the vessel at rest.
         steps: Control steps (N,) since each episode began.
         moving: What moves the vessels; None where they rest.
-        resting: Readings, with places where they are in the vessel at rest: judged
+        readings: State of the devices after the last step or reset.
+        resting: The same, with places where they are in the vessel at rest: judged
             there.
+        wall_force: Force on the wall over the last step.
+        devices: State of coaxial devices; None for one alone.
+        vessel: State of the vessels; None for rigid ones with blood at rest.
     """
 
-    resting: readings.Readings
+    readings: Readings
+    resting: Readings
+    wall_force: forces.WallForce
+    devices: CoaxialReadings | None
+    vessel: vessels.VesselReadings | None
 
     def __init__(
         self,
@@ -72,62 +82,46 @@ class Rollout:
                 there are several.
             stepper: Steps the N simulations.
         """
-        self._cases = tuple(cases)
-        num_simulations = stepper.num_simulations
-        self._case_of = np.zeros(num_simulations, dtype=int)
-        self.objective: Objective = cases[0].objective
-        scene = cases[0].scene
-        self._config = config
-        self._stepper = stepper
+        self._cases, self._config, self._stepper = tuple(cases), config, stepper
+        count, scene = stepper.num_simulations, cases[0].scene
+        self._case_of = np.zeros(count, dtype=int)
         self._state = state = stepper.arrays
         living = config.vessel_options.living
         self._names = observations.resolve(config.observation, scene.coaxial, living)
-        self.index = model_index(scene, model)
+        self.index = ModelIndex(model, scene.catheter, scene.robot)
         self._read = self.index.reader(state)
-        num_actions = len(scene.catheter.action_names)
-        listed = config.effects_on(scene.catheter)
-        self._listed, stepper.deepest = listed, config.vessel_options.deepest
+        self._listed = listed = config.effects_on(scene.catheter)
+        stepper.deepest = config.vessel_options.deepest
         moving = [effect for effect in listed if isinstance(effect, Moving)]
         self.moving: Moving | None = moving[0] if moving else None
         self._devices = cast(SingleDevice, listed[-1])
+        depth, field = scene.placement.start_depth, stepper.field
         self._effects = Effects(
             listed,
             World(
-                model,
-                scene.catheter,
-                self.index,
-                scene.placement.start_depth,
-                state,
-                stepper.field,
-                state.userdata,
+                *(model, scene.catheter, self.index, depth, state, field),
+                parameters=state.userdata,
             ),
         )
-        for index in range(num_simulations):
+        for index in range(count):
             self._effects.enter(index, scene.anatomy)
-        self._routes: Routes | None = None
-        if observations.needs(self._names, "routed"):
-            self._routes = Routes([case.objective for case in cases])
+        self._routes: list[Route] = []
+        if observations.needs(self._names, ROUTE):
+            self._routes = [Route.of(case.objective) for case in cases]
         self._chain = CommonChain(scene.catheter, config.shaft_link)
-        self._sensors = ImageSensors(
-            self._names,
-            cases[0].angiograph,
-            num_simulations,
-            self._chain,
-            self._endoscope,
-        )
-        self._tracking = TrackingNoise(config.ranges.tracking_noise, num_simulations)
-        self._monitor = PhysicsMonitor(scene, num_simulations)
-        still = np.zeros((num_simulations, 3))
-        self._path = Path(still, still[:, 0], np.ones(num_simulations))
+        machine = cases[0].angiograph
+        self._sensors = ImageSensors(self._names, machine, count, self._chain)
+        self._tracking = TrackingNoise(config.ranges.tracking_noise)
         # None before the first episode.
         self._random_states: list[np.random.RandomState] | None = None
-        self._goal_shift = np.zeros(num_simulations)
-        self.steps = np.zeros(num_simulations, dtype=int)
-        self._action = np.zeros((num_simulations, num_actions))
+        self._goal_shift = np.zeros(count)
+        self.steps = np.zeros(count, dtype=int)
+        self._action = np.zeros((count, len(scene.catheter.action_names)))
         self._previous_action = self._action
-        # There from the first measurement on.
-        self._measured: Measured
-        self._errors: tuple[str | None, ...]
+        # Of the heads: length of the path so far, shortest way to the goal, m.
+        self._way, self._shortest = np.zeros(count), np.ones(count)
+        self._errors: tuple[str | None, ...] = (None,) * count
+        self._choose_objectives()
 
     # The course of an episode.
 
@@ -147,22 +141,28 @@ class Rollout:
         for index in indices:
             self._draw(index, random_states[index])
         self._pose_robot()
-        self._choose_objective()
+        self._choose_objectives()
         self.steps[indices] = 0
         # New arrays: those handed out before stay what they were.
         self._action = self._action.copy()
         self._action[indices] = 0.0
         self._previous_action = self._action
 
-    def _choose_objective(self) -> None:
+    def _choose_objectives(self) -> None:
         """Takes the objective of each simulation's anatomy, with its goal."""
-        self.objective = together(
-            [case.objective for case in self._cases], self._case_of
-        )
-        if self._config.ranges.goal_shift is not None:
-            # Navigation has made sure that it can be shifted.
-            shiftable = cast(Shiftable, self.objective)
-            self.objective = shiftable.shifted(self._goal_shift)
+        self.objectives: list[tuple[Objective, np.ndarray | slice]] = []
+        self.resting_goal = np.empty((len(self._case_of), 3))
+        numbers = np.unique(self._case_of)
+        for number in numbers:
+            objective, rows = self._cases[number].objective, slice(None)
+            if len(numbers) > 1:
+                rows = np.flatnonzero(self._case_of == number)
+            if self._config.ranges.goal_shift is not None:
+                # Navigation has made sure that it can be shifted.
+                shiftable = cast(Shiftable, objective)
+                objective = shiftable.shifted(self._goal_shift[rows])
+            self.objectives.append((objective, rows))
+            self.resting_goal[rows] = objective.goal
 
     def _draw(self, index: int, random_state: np.random.RandomState) -> None:
         """Draws the episode of one simulation and puts its device to the start."""
@@ -177,7 +177,6 @@ class Rollout:
         posture = case.start.draw(random_state)
         case.start.write(self._state.qpos[index], episode, posture)
         self._effects.restart(index, episode, random_state)
-        self._monitor.restart(index, case.scene)
         self._sensors.restart(index, case.angiograph, episode.deviation)
         self._goal_shift[index] = episode.goal_shift or 0.0
 
@@ -188,7 +187,7 @@ class Rollout:
         """Takes the actions of a control step; its physics steps must follow.
 
         Args:
-            action: (N, A) float64 as `actions.check_action` returns it.
+            action: (N, A) float64 as `bounds.actions` returns it.
         """
         self._previous_action, self._action = self._action, action
         self._pose_robot()
@@ -203,106 +202,94 @@ class Rollout:
         Returns:
             All simulations as they stand; no episode ends at its start.
         """
-        self._measure(self._stepper.still(indices), indices)
-        head = self.resting.head
-        shortest = self.objective.path_distance(head)
-        begun = Path(head, np.zeros(len(head)), shortest)
-        self._path = merged(self._path, part(begun, indices), indices)
-        self._errors = (None,) * len(head)
-        return self._step(indices, np.zeros(len(head), dtype=bool))
+        # The others have not moved: what is measured of them stays.
+        self._measure(self._stepper.still(indices))
+        self._way[indices] = 0.0
+        shortest = np.empty(len(self._way))
+        for objective, rows in self.objectives:
+            shortest[rows] = objective.path_distance(self.resting.head[rows])
+        self._shortest[indices] = shortest[indices]
+        self._errors = (None,) * len(self.steps)
+        return self._step(indices, begins=True)
 
     def finish(self) -> Step:
         """Measures, judges and observes after the physics steps of a control step."""
         force, warned = self._stepper.end()
         self.steps += 1
+        before = self.resting.head
         self._measure(force)
-        resting = self.resting
-        self._path = self._path.to(resting.head)
-        self._errors = self._monitor.errors(
-            warned, self.steps, resting.centreline, force.peak_max
+        # A new array: that handed out before stays what it was.
+        self._way = self._way + straight(before, self.resting.head)
+        old, nodes = self._errors, self.resting.centreline
+        self._errors = physics_errors.find(
+            lambda index: self.case(index).scene,
+            *(warned, self.steps, nodes, force.peak_max),
         )
-        return self._step()
+        for error, last, steps in zip(self._errors, old, self.steps, strict=True):
+            if error is not None and last is None:
+                _LOG.error("%s after %d steps", error, steps)
+        return self._step(np.arange(len(self.steps)))
 
-    def _measure(self, force: forces.WallForce, rows: np.ndarray | None = None) -> None:
-        """Measures all simulations, or some, when the others have not moved."""
-        now = self._read()
+    def _measure(self, force: forces.WallForce) -> None:
+        self.readings, self.wall_force = self._read(), force
+        self.devices = self._devices.read(self.readings)
         time, last = CONTROL_TIMESTEP * self.steps, self._stepper.contact_rows[:, -1]
-        vessel_now = vessel.read(self._listed, time, now, last)
-        new = Measured(now, force, self._devices.read(now), vessel_now)
-        if rows is not None and hasattr(self, "_measured"):
-            new = self._measured.updated(new, rows)
-        self._measured = new
+        self.vessel = vessels.read(self._listed, time, self.readings, last)
         self.resting = self._at_rest(self.readings)
 
-    def _at_rest(self, state: readings.Readings) -> readings.Readings:
+    def _at_rest(self, state: Readings) -> Readings:
         """Readings with places where they are in the vessel at rest."""
         return state if self.moving is None else self.moving.at_rest(state)
 
-    def _step(
-        self, fresh: np.ndarray | None = None, ended: np.ndarray | None = None
-    ) -> Step:
+    def _step(self, rows: np.ndarray, begins: bool = False) -> Step:
         """Judges and observes what was measured.
 
         Args:
-            fresh: (K,) numbers of simulations that have just begun an episode: only
-                their images are captured. None for all, one control step on.
-            ended: (N,) bool, None for what the objective and the physics say.
+            rows: (K,) numbers of the simulations whose images are captured: all, or
+                those that have just begun an episode.
+            begins: Whether these have begun an episode, so that none ends.
         """
-        errors, goal, resting = self._errors, self.objective.goal, self.resting
-        distance = straight(resting.head, goal)
-        failed = None
-        if errors.count(None) < len(errors):
-            failed = np.array([error is not None for error in errors])
+        actions = self._action, self._previous_action
+        distance = straight(self.resting.head, self.resting_goal)
+        failed = np.array([error is not None for error in self._errors])
         outcome = judge(
-            self.objective,
-            Measurement(
-                resting,
-                self.wall_force,
-                self._action,
-                self._previous_action,
-                distance,
-            ),
+            self.objectives,
+            Measurement(self.resting, self.wall_force, *actions, distance),
             failed,
         )
-        terminated = outcome.success if ended is None else ended
-        if failed is not None:
-            terminated = terminated | failed
+        ended = np.zeros(len(failed), bool) if begins else outcome.success | failed
         return Step(
-            observation=self._observe(self.goal, fresh),
+            observation=self._observe(rows, begins),
             outcome=outcome,
-            terminated=terminated,
-            truncated=~terminated & (self.steps >= self._config.max_steps),
-            errors=errors,
+            terminated=ended,
+            truncated=~ended & (self.steps >= self._config.max_steps),
+            errors=self._errors,
             readings=self.readings,
             wall_force=self.wall_force,
             distance=distance,
-            path_ratio=self._path.ratio,
-            vessel=self._measured.vessel,
+            path_ratio=self._way / self._shortest,
+            vessel=self.vessel,
         )
 
-    def _observe(self, goal: np.ndarray, fresh: np.ndarray | None) -> Observation:
-        if self._tracking.on and self._random_states is not None:
-            devices = self._measured.devices
-            self._tracking.draw(self.readings, devices, self._random_states, fresh)
-        state, devices = self._tracking.seen(self.readings, self.devices)
-        ahead, images = None, {}
-        if self._sensors.on:
-            images = self._sensors.capture(
-                state.centreline,
-                self.shadows,
-                goal,
-                self._random_states,
-                fresh,
-                None if devices is None else devices.points,
-                None if self.moving is None else self.around,
-                self._handles(),
-            )
-        if self._routes is not None:
-            seen = self._at_rest(state) if self._tracking.on else self.resting
-            ahead = self._routes.ahead(self._case_of, seen.head, state.head_frame)
+    def _observe(self, rows: np.ndarray, begins: bool) -> Observation:
+        random, sensors, goal = self._random_states, self._sensors, self.goal
+        state, devices = self._tracking.seen(self.readings, self.devices, random, rows)
+        ends = np.zeros((len(goal), 0, 3))
+        if devices is not None:
+            ends = devices.points.reshape(len(goal), -1, 3)
+        points = state.centreline, ends, goal
+        own = points, self.shadows, self._handles(), random, self.around
+        sensors.capture(rows, begins, *own)
+        if any(name.startswith("endoluminal") for name in self._names):
+            for name, view in self._endoscope(rows).items():
+                sensors.hold(name, view, rows)
+        ahead = None
+        if self._routes:
+            seen = self._at_rest(state) if self._tracking.deviation else self.resting
+            ahead = look_ahead(self._routes, self._case_of, seen.head, state.head_frame)
         frame = Frame(
             *(state, self.wall_force, self._action, goal, self._chain),
-            *(images, ahead, devices, self._measured.vessel),
+            *(sensors.images, ahead, devices, self.vessel),
         )
         return observations.observe(self._names, frame)
 
@@ -315,12 +302,10 @@ class Rollout:
     def _endoscope(self, indices: np.ndarray) -> dict[str, np.ndarray]:
         """What the heads of some simulations (K,) see of the wall, by name."""
         moving, state = self.moving, self.readings
-        warps = [
-            endoluminal.AT_REST if moving is None else moving.warp(i) for i in indices
-        ]
+        rest = endoluminal.AT_REST
         grey, distance = endoluminal.views(
             [self.case(index).scene.anatomy.lumen for index in indices],
-            warps,
+            [rest if moving is None else moving.warp(index) for index in indices],
             state.head[indices],
             state.head_frame[indices],
             self._config.endoluminal_resolution,
@@ -339,23 +324,10 @@ class Rollout:
         return self._cases[self._case_of[index]]
 
     @property
-    def readings(self) -> readings.Readings:
-        """State of the devices after the last step or reset."""
-        return self._measured.readings
-
-    @property
     def goal(self) -> np.ndarray:
-        """(3,) or (N, 3) m, the goal in space, which moves with its vessel."""
-        goal = self.objective.goal
-        if self.moving is None:
-            return goal
-        every = np.broadcast_to(goal, self.readings.head.shape)
-        return self.moving.to_space(every.copy())
-
-    @property
-    def vessel(self) -> vessel.VesselReadings | None:
-        """State of the vessels; None for rigid ones with blood at rest."""
-        return self._measured.vessel
+        """(N, 3) m, the goals in space, which move with their vessels."""
+        goal = self.resting_goal
+        return goal if self.moving is None else self.moving.to_space(goal.copy())
 
     def around(self, planes: Planes, index: int = 0) -> Planes:
         """A machine's planes with one simulation's vessel where it is now."""
@@ -370,21 +342,11 @@ class Rollout:
         return self._devices.shadows(self.readings.centreline)
 
     @property
-    def devices(self) -> CoaxialReadings | None:
-        """State of coaxial devices after the last step or reset; None for one alone."""
-        return self._measured.devices
-
-    @property
     def slipped(self) -> np.ndarray:
         """Way by which the clamps have slipped, see `SingleDevice.slipped`."""
         return self._devices.slipped.copy()
 
     @property
-    def wall_force(self) -> forces.WallForce:
-        """Force on the wall over the last step."""
-        return self._measured.wall_force
-
-    @property
     def fluoroscope(self) -> Fluoroscope | None:
         """Frontal C-arm of the first simulation, or None without fluoroscopy."""
-        return self._sensors.fluoroscope
+        return self._sensors.planes[0][0] if self._sensors.planes else None

@@ -9,7 +9,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from cathsim_dmc.anatomy import Centreline
 from cathsim_dmc.tasks.objectives import Objective, Routed
 
 ROUTE_SPACING = 1e-3  # m, resolution of the route
@@ -34,12 +33,14 @@ class Route:
 
     @classmethod
     def of(cls, objective: Objective) -> "Route":
-        """The route of an objective.
-
-        Raises:
-            ValueError: the objective is not `Routed`.
-        """
-        fine = line_of(objective).resampled(ROUTE_SPACING)
+        """The route of an objective; ValueError if it is not `Routed`."""
+        if not isinstance(objective, Routed):
+            raise ValueError(
+                f"the objective {type(objective).__name__} has no route, a centreline "
+                "from the inlet to the goal, which the observation 'route' and the "
+                "expert need; derive it from tasks.objectives.Routed"
+            )
+        fine = objective.route.resampled(ROUTE_SPACING)
         return cls(fine.points, fine.radii, fine.arc_length)
 
     def at(self, arc_length: np.ndarray) -> np.ndarray:
@@ -49,17 +50,6 @@ class Route:
         last = last / np.linalg.norm(last)
         beyond = np.maximum(arc_length - float(self.arc_length[-1]), 0.0)
         return np.stack(axes, axis=-1) + beyond[..., None] * last
-
-
-def line_of(objective: Objective) -> Centreline:
-    """The route of an objective as a centreline; ValueError if it is not `Routed`."""
-    if not isinstance(objective, Routed):
-        raise ValueError(
-            f"the objective {type(objective).__name__} has no route, a centreline from "
-            "the inlet to the goal, which the observation 'route' and the expert need; "
-            "derive it from tasks.objectives.Routed"
-        )
-    return objective.route
 
 
 @dataclasses.dataclass(frozen=True)
@@ -127,41 +117,28 @@ class Ahead(NamedTuple):
     excess: np.ndarray
 
 
-class Routes:
-    """Routes of N simulations, whose goals may lie in different anatomies."""
+def look_ahead(
+    routes: Sequence[Route], chosen: np.ndarray, head: np.ndarray, frame: np.ndarray
+) -> Ahead:
+    """Routes and lumens ahead of N tips, which may lie in different anatomies.
 
-    def __init__(self, objectives: Sequence[Objective]):
-        """Takes the objective of every anatomy.
-
-        Raises:
-            ValueError: one of them has no route.
-        """
-        for objective in objectives:
-            line_of(objective)
-        self._objectives = objectives
-        self._routes: dict[int, Route] = {}
-
-    def ahead(self, chosen: np.ndarray, head: np.ndarray, frame: np.ndarray) -> Ahead:
-        """What lies ahead.
-
-        Args:
-            chosen: (N,) int, number of the anatomy of each simulation.
-            head: (N, 3), m, world frame.
-            frame: (N, 3, 3), orientation of each tip, its axes in columns.
-        """
-        points = np.empty((len(head), len(AHEAD), 3))
-        radii = np.empty((len(head), len(AHEAD)))
-        excess = np.empty(len(head))
-        for number in np.unique(chosen).tolist():
-            if number not in self._routes:
-                self._routes[number] = Route.of(self._objectives[number])
-            route, rows = self._routes[number], np.flatnonzero(chosen == number)
-            place = locate(route, head[rows])
-            ways = place.arc_length[:, None] + AHEAD
-            points[rows] = route.at(ways)
-            radii[rows] = np.interp(ways, route.arc_length, route.radii)
-            excess[rows] = place.excess
-        return Ahead(into_frame(points - head[:, None], frame), radii, excess)
+    Args:
+        routes: Of the anatomies.
+        chosen: (N,) int, number of the anatomy of each simulation.
+        head: (N, 3), m, world frame.
+        frame: (N, 3, 3), orientation of each tip, its axes in columns.
+    """
+    points = np.empty((len(head), len(AHEAD), 3))
+    radii = np.empty((len(head), len(AHEAD)))
+    excess = np.empty(len(head))
+    for number in np.unique(chosen).tolist():
+        route, rows = routes[number], np.flatnonzero(chosen == number)
+        place = locate(route, head[rows])
+        ways = place.arc_length[:, None] + AHEAD
+        points[rows] = route.at(ways)
+        radii[rows] = np.interp(ways, route.arc_length, route.radii)
+        excess[rows] = place.excess
+    return Ahead(into_frame(points - head[:, None], frame), radii, excess)
 
 
 def into_frame(vectors: np.ndarray, frame: np.ndarray) -> np.ndarray:

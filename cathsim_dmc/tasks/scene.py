@@ -93,11 +93,15 @@ class Scene:
         moving = config.vessel_options.motion is not None
         user_data = effects.userdata_size(config.effects_on(catheter), catheter)
         scene._attach(user_data, moving)
-        box = anatomy.lumen.box
+        low, high = anatomy.lumen.box
         if drawn:
             vertices = anatomy.surface.vertices
-            box = vertices.min(0), vertices.max(0)
-        placement.add_cameras(scene.arena, *box)
+            low, high = vertices.min(0), vertices.max(0)
+        # The published top view and one from the side. Seen from the front, the
+        # patient's left is on the right of the image.
+        centre, distance = (low + high) / 2, 2.6 * float((high - low).max())
+        scene.arena.add_camera("top", centre, distance, (1, 0, 0, 0, 0, 1))
+        scene.arena.add_camera("side", centre, distance, (0, 1, 0, 0, 0, 1))
         return scene
 
     def in_anatomy(self, other: "Scene") -> "Scene":
@@ -163,26 +167,14 @@ def _chain(
     torsion = config.torsion_joints
     if torsion is None:
         torsion = _TORSION_JOINTS if config.rotation else 0
-    discretisation = devices.Discretisation(
-        working_length=place.working_length,
-        shaft_link=config.shaft_link,
-        torsion_joints=torsion,
-    )
-    if config.devices is not None:
-        return DeviceStack(
-            chosen,
-            discretisation,
-            stroke=place.stroke,
-            lead=config.lead,
-            friction=config.friction,
-            lumen_friction=config.lumen_friction,
-            timestep=config.physics_timestep,
-        )
-    return Catheter(
-        chosen[0],
-        discretisation,
-        stroke=place.stroke,
-        rotation=config.rotation,
-        friction=config.friction,
-        timestep=config.physics_timestep,
-    )
+    length, link = place.working_length, config.shaft_link
+    discretisation = devices.Discretisation(length, link, torsion)
+    common = {
+        "stroke": place.stroke,
+        "friction": config.friction,
+        "timestep": config.physics_timestep,
+    }
+    if config.devices is None:
+        return Catheter(chosen[0], discretisation, rotation=config.rotation, **common)
+    own = {"lead": config.lead, "lumen_friction": config.lumen_friction}
+    return DeviceStack(chosen, discretisation, **own, **common)

@@ -76,7 +76,8 @@ class StartPosture:
         self._ahead: list[_Posture] = []
         if along_route is not None:
             low, high = (share * way for share in along_route)
-            self._ahead = _settled(settle, low, high, _STARTS_ALONG_ROUTE)
+            advances = np.linspace(low, high, _STARTS_ALONG_ROUTE)
+            self._ahead = _settled(settle, advances)
             if not self._ahead:
                 raise ValueError(
                     f"start_along_route is {tuple(along_route)}: "
@@ -88,7 +89,7 @@ class StartPosture:
         if farthest:
             reach = min(farthest, _LARGEST_START * way)
             count = math.ceil(reach / _START_SPACING)
-            self._starts += _settled(settle, reach / count, reach, count)
+            self._starts += _settled(settle, np.linspace(reach / count, reach, count))
             self._scale = reach / farthest
 
     def draw(self, random_state: np.random.RandomState) -> int | None:
@@ -151,17 +152,14 @@ class _Posture:
         jacobian = np.zeros((3, model.nv))
         mujoco.mj_jacSite(model, data, jacobian, None, index.head_site)
         places = [self._insertion, *self._bends[self._free]]
-        dofs = [_dof_of(model, place) for place in places]
+        dofs = [model.jnt_dofadr[model.jnt_qposadr == place].item() for place in places]
         # Joint steps for a displacement in the frame of the inlet.
         self._steps = np.linalg.inv(self._frame.T @ jacobian[:, dofs])
         # The joints that the first free one moves and the head, as far as they move.
         swinging = slice(index.links.start + self._free + 2, index.links.stop)
         self._nodes = np.vstack([data.xpos[swinging], data.site_xpos[index.head_site]])
-        self._shares = (
-            1.0
-            - np.append(beyond[self._free + 2 :], 0.0)[:, None]
-            / (beyond[self._free + 1])
-        )
+        ahead = np.append(beyond[self._free + 2 :], 0.0)[:, None]
+        self._shares = 1.0 - ahead / beyond[self._free + 1]
         self._anatomy = scene.anatomy
         depth = scene.anatomy.depth(self._nodes)
         self._least = np.minimum(depth, scene.device.outer_radius)
@@ -190,8 +188,10 @@ class _Posture:
         """
         angles, step = self._angles, self._steps @ displacement
         if roll:
-            angles = bends_of(_turned(self._directions, -roll))
-            step = np.concatenate([step[:1], _turn(-roll) @ step[1:]])
+            turn, directions = _turn(-roll), self._directions.copy()
+            directions[:, :2] = self._directions[:, :2] @ turn.T
+            angles = bends_of(directions)
+            step = np.concatenate([step[:1], turn @ step[1:]])
         qpos[self._bends] = angles
         qpos[self._bends[self._free]] += step[1:]
         qpos[self._insertion] = max(self._inserted + step[0], 0.0)
@@ -215,13 +215,13 @@ def _settle(
 
 
 def _settled(
-    settle: Callable[[float], _Posture], low: float, high: float, count: int
+    settle: Callable[[float], _Posture], advances: np.ndarray
 ) -> list[_Posture]:
-    """Postures that come to rest, further and further in, from `low` to `high`, m."""
+    """Postures that come to rest, so far advanced (m)."""
     settled = []
-    for advance in np.linspace(low, high, count):
+    for advance in advances.tolist():
         with contextlib.suppress(ValueError):
-            settled.append(settle(float(advance)))
+            settled.append(settle(advance))
     return settled
 
 
@@ -253,17 +253,6 @@ def _refuse_outside(
     )
 
 
-def _dof_of(model: mujoco.MjModel, place: int) -> int:
-    return int(model.jnt_dofadr[np.flatnonzero(model.jnt_qposadr == place)[0]])
-
-
 def _turn(angle: float) -> np.ndarray:
     c, s = np.cos(angle), np.sin(angle)
     return np.array([[c, -s], [s, c]])
-
-
-def _turned(vectors: np.ndarray, angle: float) -> np.ndarray:
-    """Vectors (n, 3) turned about z."""
-    turned = vectors.copy()
-    turned[:, :2] = vectors[:, :2] @ _turn(angle).T
-    return turned

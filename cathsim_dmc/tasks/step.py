@@ -20,13 +20,8 @@ def info_types(terms: Sequence[str], living: bool = False) -> dict[str, type]:
         terms: Names of the terms of the reward.
         living: Whether there are figures of the vessel.
     """
-    return {
-        **dict.fromkeys(_INFO, float),
-        **dict.fromkeys(INFO if living else (), float),
-        "success": bool,
-        "physics_error": bool,
-        **{f"reward_{name}": float for name in terms},
-    }
+    numbers = *_INFO, *(INFO if living else ()), *(f"reward_{name}" for name in terms)
+    return {**dict.fromkeys(numbers, float), "success": bool, "physics_error": bool}
 
 
 class Step(NamedTuple):
@@ -38,8 +33,7 @@ class Step(NamedTuple):
             there is no success where the physics failed.
         terminated: (N,) bool, success or a physics error.
         truncated: (N,) bool, out of time.
-        errors: N reasons, None where the physics went well; the others are logged with
-            a dump that replays the episode, which says nothing about the policy.
+        errors: N reasons, None where the physics went well.
         readings: state of the devices.
         wall_force: force on the wall over the control step.
         distance: (N,), straight from head to goal, m.
@@ -70,8 +64,8 @@ class Step(NamedTuple):
         "wall_force_max" and their peaks within the control step in N (see
         `forces.WallForce`); "path_ratio"; of a vessel that lives "heart_phase",
         "breath_phase", "blood_speed" (at the head, m/s), "indentation" (m) and
-        "wall_work" (J); "success" and "physics_error" (bool); and "reward_<term>" for
-        each weighted term.
+        "wall_work" (J); "reward_<term>" for each weighted term; and "success" and
+        "physics_error" (bool).
         """
         return {
             "distance": self.distance,
@@ -80,7 +74,7 @@ class Step(NamedTuple):
             **self.wall_force.named(),
             "path_ratio": self.path_ratio,
             **({} if self.vessel is None else self.vessel.info()),
+            **{f"reward_{name}": term for name, term in self.outcome.terms.items()},
             "success": self.outcome.success,
             "physics_error": self.physics_error,
-            **{f"reward_{name}": term for name, term in self.outcome.terms.items()},
         }

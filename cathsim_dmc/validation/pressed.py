@@ -88,7 +88,7 @@ def jam(pair: tuple[str, str]) -> Jam:
     rows = []
     for _ in range(round(way + _JAMMED / CONTROL_TIMESTEP)):
         environment.step(np.array([1.0, 0.0, 1.0, 0.0]))
-        contacts = forces.Contacts.from_sensor(task.contact_rows)
+        contacts = forces.Contacts.from_sensor(task.stepper.contact_rows[0])
         both = contacts.penetration, contacts.magnitude
         rows.append([each.max(-1, initial=0.0) for each in both])
     push = float(task.readings.push_force)
@@ -134,7 +134,7 @@ def push(task: str) -> dict[str, float]:
         action[list(catheter.translations)] = 1.0
         for _ in range(_PUSHES):
             environment.step(action)
-            found = forces.Contacts.from_sensor(play.contact_rows)
+            found = forces.Contacts.from_sensor(play.stepper.contact_rows[0])
             depth.append(found.penetration.max(-1, initial=0.0))
             force = max(force, float(found.magnitude.max(initial=0.0)))
             geoms = data.contact.geom

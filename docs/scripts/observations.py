@@ -13,7 +13,7 @@ import numpy as np
 from cathsim_dmc import suite
 from cathsim_dmc.imaging import VIEWS, FluoroscopyOptions
 from cathsim_dmc.physics.randomisation import DEFAULT_RANGES, Randomisation
-from cathsim_dmc.tasks import observations
+from cathsim_dmc.tasks import observation_kind, observations
 from cathsim_dmc.tasks.observation_kind import Entry
 from cathsim_dmc.tasks.placement import COMMON_LENGTH
 
@@ -138,10 +138,14 @@ def entries_table() -> str:
     kinds = {
         n: k
         for n, k in observations.OBSERVATIONS.items()
-        if not (k.coaxial or k.living)
+        if k.needs not in (observation_kind.COAXIAL, observation_kind.LIVING)
     }
-    single = [name for name, kind in kinds.items() if not kind.biplane]
-    double = [name for name, kind in kinds.items() if kind.biplane]
+    single = [
+        name for name, kind in kinds.items() if kind.needs != observation_kind.BIPLANE
+    ]
+    double = [
+        name for name, kind in kinds.items() if kind.needs == observation_kind.BIPLANE
+    ]
     planes = {"view": [60, 0], "biplane": [-30, 0]}
     specs = {
         **suite.make_task(TASK, observation=single).observation_specs,
