@@ -74,7 +74,7 @@ class Turn(NamedTuple):
 
 
 def play(
-    simulations: ComposerSimulation | BatchedSimulations,
+    simulations: Any,
     choose: Callable[[Any], np.ndarray],
     begin: Callable[[np.ndarray], None] = lambda which: None,
     count: int = 1,
@@ -85,6 +85,8 @@ def play(
     all have ended.
 
     Args:
+        simulations: `ComposerSimulation`, `BatchedSimulations`, or another class with
+            their attribute and methods.
         choose: Function from what is seen to the actions. It may raise StopIteration
             to end all episodes.
         begin: Function that is called with a mask (N,) of simulations that have begun
