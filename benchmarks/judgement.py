@@ -9,7 +9,6 @@ from cathsim_dmc.agents import evaluation  # isort: skip
 import numpy as np
 
 from cathsim_dmc import suite
-from cathsim_dmc.agents.report import ContactLog
 from cathsim_dmc.analysis.force_statistics import FIGURES
 from cathsim_dmc.analysis.heatmap import AP_AXES, MARGIN, ForceMap, force_map
 from cathsim_dmc.anatomy.arch.arch import arch_set, build_seed
@@ -46,7 +45,7 @@ def judge(policy, task, task_kwargs, episodes=EPISODES, name=None):
 
     The map is None where every episode has an anatomy of its own.
     """
-    log = ContactLog()
+    log = evaluation.ContactLog()
     found = evaluation.evaluate(
         policy, task, episodes, name=name, task_kwargs=task_kwargs, observer=log
     )
@@ -55,7 +54,7 @@ def judge(policy, task, task_kwargs, episodes=EPISODES, name=None):
     surface = suite.make_task(task, **task_kwargs).scene.anatomy.surface
     outline = surface.vertices[:, AP_AXES]
     low, high = outline.min(0) - MARGIN, outline.max(0) + MARGIN
-    return found, force_map(log.positions, log.magnitudes, low, high)
+    return found, force_map(*log.contacts(), low, high)
 
 
 def judge_each_arch(policy, task, task_kwargs, arches, name=None, numbers=None):

@@ -20,18 +20,14 @@ class ReachEnv(EnvBase):
 
     batch_locked = True
 
-    def __init__(
-        self, num_envs, seed=0, max_steps=40, image=False, padding=0, numbers=True
-    ):
+    def __init__(self, num_envs, seed=0, max_steps=40, image=False, numbers=True):
         super().__init__(batch_size=[num_envs])
         self.max_steps = max_steps
         self.image, self.numbers = image, numbers
-        self.padding = padding
         n = num_envs
-        sizes = dict(SIZES, padding=padding) if padding else SIZES
         entries = {
             name: Unbounded((n, size), dtype=torch.float64)
-            for name, size in sizes.items()
+            for name, size in SIZES.items()
         }
         if not numbers:
             entries = {}
@@ -72,10 +68,6 @@ class ReachEnv(EnvBase):
             "com_inertia": inertia,
             "external_force": external,
         }
-        if self.padding:
-            entries["padding"] = np.tile(self.point, (1, self.padding))[
-                :, : self.padding
-            ]
         out = {
             name: torch.as_tensor(value.copy())
             for name, value in entries.items()
@@ -112,11 +104,7 @@ class ReachEnv(EnvBase):
             self.moved[i] = 0.0
             self.count[i] = 0
         entries, _ = self._observation(np.zeros(n))
-        flags = {
-            name: torch.zeros(n, 1, dtype=torch.bool)
-            for name in ("done", "terminated", "truncated")
-        }
-        return TensorDict(entries | flags, [n])
+        return TensorDict(entries | _flags(np.zeros(n, bool), np.zeros(n, bool)), [n])
 
     def _step(self, tensordict):
         n = self.batch_size[0]
@@ -131,16 +119,16 @@ class ReachEnv(EnvBase):
         truncated = (self.count >= self.max_steps) & ~terminated
         reward = np.where(terminated, 10.0, -distance)
 
-        def column(value, dtype):
-            return torch.as_tensor(np.asarray(value), dtype=dtype)[:, None]
+        reward = torch.as_tensor(reward, dtype=torch.float32)[:, None]
+        return TensorDict(
+            entries | _flags(terminated, truncated) | {"reward": reward}, [n]
+        )
 
-        flags = {
-            "done": column(terminated | truncated, torch.bool),
-            "terminated": column(terminated, torch.bool),
-            "truncated": column(truncated, torch.bool),
-        }
-        reward = {"reward": column(reward, torch.float32)}
-        return TensorDict(entries | flags | reward, [n])
+
+def _flags(terminated, truncated):
+    ends = {"terminated": terminated, "truncated": truncated}
+    ends["done"] = terminated | truncated
+    return {name: torch.as_tensor(value)[:, None] for name, value in ends.items()}
 
 
 def make_env(

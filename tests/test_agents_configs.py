@@ -42,13 +42,13 @@ def test_configs_survive_json(algorithm, preset):
 @pytest.mark.parametrize(
     ("kind", "settings", "message"),
     [
-        (PPOConfig, {"num_envs": 7}, "steps_per_update=512.*num_envs=7"),
-        (PPOConfig, {"minibatch_size": 100}, "minibatch_size=100"),
-        (PPOConfig, {"learning_rate": 10**400}, "learning_rate=.*finite number"),
+        (PPOConfig, {"num_envs": 7}, "num_envs is 7; .*divisor.*steps_per_update=512"),
+        (PPOConfig, {"minibatch_size": 100}, "minibatch_size is 100"),
+        (PPOConfig, {"learning_rate": 10**400}, "learning_rate is .*finite number"),
         (PPOConfig, {"task_kwargs": {"a": float("inf")}}, "task_kwargs.*finite"),
         (PPOConfig, {"training_reward": {"path": "x"}}, "training_reward.*finite"),
-        (SACConfig, {"random_frames": 10}, "random_frames=10.*256"),
-        (SACConfig, {"replay_frames": 32}, "replay_frames=32"),
+        (SACConfig, {"random_frames": 10}, "random_frames is 10.*256"),
+        (SACConfig, {"replay_frames": 32}, "replay_frames is 32"),
     ],
 )
 def test_bad_values_are_named(kind, settings, message):

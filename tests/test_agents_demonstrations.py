@@ -80,26 +80,25 @@ def test_the_same_seed_gives_the_same_demonstrations(recorded, tmp_path, monkeyp
     assert not np.array_equal(one.actions[:10], many[0].actions[:10])
 
 
+def follows(env, transitions, steps):
+    """An environment that is given the actions shows the observations, bit for bit."""
+    state = env.reset()
+    for row in range(steps):
+        expected, key = transitions[row], "observation_vector"
+        assert torch.equal(state[key][0], expected[key])
+        state["action"] = expected["action"][None]
+        state = env.step(state)["next"]
+        torch.testing.assert_close(state["reward"][0], expected["next", "reward"])
+        assert torch.equal(state[key][0], expected["next", key])
+
+
 def test_transitions_are_what_an_environment_gives(recorded, shapes):
     transitions = load_transitions(recorded.path, "tracking", shapes)
     assert len(transitions) == recorded.steps
     env = make_env(
         TASK, observation="tracking", seed=2_000_000, task_kwargs=OPTIONS
     )  # the numbers of the first episode
-    state = env.reset()
-    for row in range(4):
-        expected = transitions[row]
-        torch.testing.assert_close(
-            state["observation_vector"][0], expected["observation_vector"],
-            rtol=0, atol=0,
-        )  # fmt: skip
-        state["action"] = expected["action"][None]
-        state = env.step(state)["next"]
-        torch.testing.assert_close(state["reward"][0], expected["next", "reward"])
-        torch.testing.assert_close(
-            state["observation_vector"][0], expected["next", "observation_vector"],
-            rtol=0, atol=0,
-        )  # fmt: skip
+    follows(env, transitions, 4)
     ends = transitions["next", "done"].flatten().nonzero().flatten()
     assert len(ends) == 3 and transitions["next", "terminated"][ends].all()
 
@@ -229,13 +228,4 @@ def test_demonstrations_of_coaxial_devices_are_what_an_environment_gives(tmp_pat
     shapes = NetworkShapes(size, None, 4)
     transitions = load_transitions(recorded.path, "tracking", shapes)
     assert len(transitions) == recorded.steps
-    state = env.reset()
-    for row in range(3):
-        torch.testing.assert_close(
-            state["observation_vector"][0],
-            transitions[row]["observation_vector"],
-            rtol=0,
-            atol=0,
-        )
-        state["action"] = transitions[row]["action"][None]
-        state = env.step(state)["next"]
+    follows(env, transitions, 3)

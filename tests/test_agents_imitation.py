@@ -19,9 +19,8 @@ from cathsim_dmc.agents import (
 from cathsim_dmc.agents.bc import BC
 from cathsim_dmc.agents.dagger import DAgger
 from cathsim_dmc.agents.demonstrations import EXPERT_ACTION, load_transitions
-from cathsim_dmc.agents.imitation import network_of
 from cathsim_dmc.agents.learners import make_learner
-from cathsim_dmc.agents.networks import NetworkShapes
+from cathsim_dmc.agents.networks import NetworkShapes, network_of
 from cathsim_dmc.agents.sac import SAC
 from cathsim_dmc.agents.training_log import read_metrics
 from cathsim_dmc.agents.warm_start import take_over
@@ -190,7 +189,7 @@ def test_a_policy_starts_from_that_of_another_run(
     expected = act(source, vectors)
     fresh, _ = act(learner.policy, vectors)
     assert (fresh.tanh() - expected[0].tanh()).abs().max() > 0.1
-    take_over(learner.policy, config, shapes)
+    take_over(learner.network, config, shapes)
     for one, other in zip(act(learner.policy, vectors), expected, strict=True):
         torch.testing.assert_close(one, other, rtol=1e-6, atol=1e-6)
 
@@ -209,7 +208,7 @@ def test_a_policy_that_does_not_fit_is_refused(cloned, tmp_path):
     config = small("ppo", initial_policy=str(cloned), hidden=(16,))
     with pytest.raises(ConfigError, match=r"hidden: it has \(32,\), given is \(16,\)"):
         train(config, tmp_path, progress=False)
-    with pytest.raises(ConfigError, match="initial_std=0"):
+    with pytest.raises(ConfigError, match="initial_std is 0"):
         small("ppo", initial_std=0.0)
 
 

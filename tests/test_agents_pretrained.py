@@ -109,7 +109,7 @@ def test_damaged_weights_are_refused(exported, tmp_path):
     with pytest.raises(CheckpointError, match="damaged"):
         load_policy(weights)
     weights.unlink()
-    with pytest.raises(CheckpointError, match="cannot be used"):
+    with pytest.raises(CheckpointError, match="cannot be read"):
         load_policy(weights)
 
 

@@ -13,8 +13,8 @@ from tensordict import TensorDict
 from test_agents_training import run, small_ppo, small_sac
 
 from cathsim_dmc.agents import Checkpoint, ConfigError, evaluate
-from cathsim_dmc.agents.learners import make_config, make_policy
-from cathsim_dmc.agents.networks import NetworkShapes
+from cathsim_dmc.agents.learners import make_config
+from cathsim_dmc.agents.networks import NetworkShapes, make_policy
 from cathsim_dmc.agents.policies import load_policy
 from cathsim_dmc.agents.replay import ReplayError
 from cathsim_dmc.agents.training_log import read_metrics
@@ -54,13 +54,6 @@ def test_a_folder_is_free_again_after_a_kill(tmp_path):
     assert run(small_ppo(total_frames=512), tmp_path).frames == 512
 
 
-def test_a_policy_is_not_played_with_another_device(trained):
-    policy = load_policy(trained / "ppo")
-    view = types.SimpleNamespace(num_actions=2)
-    with pytest.raises(ValueError, match="21 entries, the task has 2.*reach"):
-        policy.reset(view, None)
-
-
 def test_a_run_without_its_replay_goes_on_if_asked(tmp_path, trained):
     shutil.copytree(trained / "sac", tmp_path / "run")
     shutil.rmtree(tmp_path / "run" / "replay")
@@ -87,8 +80,10 @@ def test_a_full_disk_names_the_file(tmp_path, trained, small_disk, name, full):
     assert run(small_ppo(), tmp_path / "run", resume=True).frames == 1_024
 
 
-def test_a_policy_names_an_observation_of_another_size(trained):
+def test_a_policy_names_a_device_and_an_observation_of_another_size(trained):
     policy = load_policy(trained / "ppo")
+    with pytest.raises(ValueError, match="21 numbers, the task gives 2:.*reach"):
+        policy.reset(types.SimpleNamespace(num_actions=2), None)
     for entries in ({}, {environments.VECTOR: torch.zeros(1, 3)}):
         with pytest.raises(ValueError, match="reads 20 numbers, the task gives [03]:"):
             policy.act(TensorDict(entries, [1]))

@@ -106,16 +106,6 @@ def test_sac_learns_the_best_action_of_each_state(tmp_path):
     torch.testing.assert_close(chosen, torch.tensor([-0.5, 0.5]), atol=0.15, rtol=0)
 
 
-def test_images_train(tmp_path):
-    config = small_ppo(
-        observation="image", total_frames=64, steps_per_update=64, epochs=1,
-        minibatch_size=32, cnn_features=16, normalisation_frames=0,
-    )  # fmt: skip
-    result = run(config, tmp_path)
-    assert result.metrics["gradient_steps"] == 2
-    assert evaluate(tmp_path, episodes=2, make_env=synthetic_env.make_env).episodes
-
-
 SMALL_IMAGES = {
     "observation": "image", "critic_observation": "internal",
     "convolutions": ((4, 8, 8), (4, 3, 2)), "cnn_features": 16, "hidden": (16,),

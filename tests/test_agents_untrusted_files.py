@@ -92,7 +92,7 @@ def checkpoint_of(folder):
         (None, "format", "2", "format is"),
         (None, "sha256", 3, "sha256|subscript"),
         ("config", "hidden", [0], "hidden"),
-        ("shapes", "vector", "x", "shapes.vector="),
+        ("shapes", "vector", "x", "shapes.vector is"),
     ],
 )
 def test_a_wrong_description_names_the_field(

@@ -128,10 +128,6 @@ def test_check_measures_and_draws_into_a_directory(cathsim, tmp_path):
     assert found["branches"]["lcca"]["diameter_mm"] == pytest.approx(6.1, abs=0.2)
     assert (tmp_path / "one/check.png").stat().st_size > 20_000
     assert "check.png" in err
-    wrong = ("check", tmp_path / "one", "--access", "ascending")
-    code, _, err = cathsim("phantom", *wrong)
-    assert code == 2
-    assert "no named phantom" in err
 
 
 def test_check_fails_where_a_goal_is_in_another_vessel():

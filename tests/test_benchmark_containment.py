@@ -27,12 +27,6 @@ def test_points_along_are_no_further_apart_than_asked():
     np.testing.assert_allclose(points[0, [0, 10, -1]], line, atol=1e-15)
 
 
-@pytest.mark.parametrize("shape", [(3,), (1, 3), (4, 2)])
-def test_points_along_names_the_shape(shape):
-    with pytest.raises(ValueError, match=r"L \+ 1, 3"):
-        points_along(np.zeros(shape))
-
-
 def test_excess_in_the_lumen_is_measured_from_its_surface(containment):
     inlet = containment.anatomy.inlet
     for gap in (3e-3, 0.0, -0.5e-3, -3e-3):

@@ -11,9 +11,12 @@ import pytest
 import synthetic_env
 from test_agents_training import run, small_ppo
 
-from cathsim_dmc.agents import ConfigError, report
+from cathsim_dmc import suite
+from cathsim_dmc.agents import ConfigError, evaluate
 from cathsim_dmc.agents.checkpoint import Checkpoint, checkpoints_in
 from cathsim_dmc.agents.training_log import read_metrics
+from cathsim_dmc.cli.agents import record
+from cathsim_dmc.cli.task_options import TaskOptions
 
 
 @pytest.mark.parametrize("kind", ["a file", "under a file", "read-only"])
@@ -36,12 +39,11 @@ def test_folders_that_cannot_be_written_are_refused_before_the_work(
     monkeypatch.setattr(synthetic_env, "make_env", work)
     with pytest.raises((OSError, ConfigError), match="out"):
         run(small_ppo(), out, make_env=work)
-    monkeypatch.setattr(report.evaluation, "evaluate", work)
     with pytest.raises(OSError, match="out"):
-        report.evaluate("push", task="type1_bca", out_dir=out)
-    monkeypatch.setattr(report.suite, "load", work)
+        evaluate("push", "type1_bca", out_dir=out, make_env=work)
+    monkeypatch.setattr(suite, "load", work)
     with pytest.raises(OSError, match="out"):
-        report.record("push", out / "a.rrd", task="type1_bca")
+        record("push", out / "a.rrd", task="type1_bca", options=TaskOptions())
     if kind != "read-only":
         assert (tmp_path / "out").read_text() == "mine"
 

@@ -30,8 +30,8 @@ socket.socket.connect = socket.socket.connect_ex = connect
 RUN = """
 import numpy as np
 from pathlib import Path
-from cathsim_dmc import suite
-from cathsim_dmc.agents import evaluate, make_config, report, train
+from cathsim_dmc import pictures, suite
+from cathsim_dmc.agents import evaluate, load_policy, make_config, train
 environment = suite.load("cathsim", "type1_bca", task_kwargs={"observation": "image"})
 environment.reset()
 environment.step(np.zeros(environment.action_spec().shape))
@@ -41,7 +41,8 @@ config = make_config("ppo", task="type1_bca", total_frames=32, num_envs=2,
 out = Path(sys.argv[1])
 train(config, out / "run", progress=False)
 evaluate(out / "run", episodes=1, task_kwargs={"max_steps": 3})
-report.record(out / "run", out / "a.rrd", max_steps=2)
+environment = suite.load("cathsim", "type1_bca")
+pictures.record(environment, load_policy(out / "run"), out / "a.rrd", max_steps=2)
 """
 
 

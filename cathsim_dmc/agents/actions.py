@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from cathsim_dmc import files
+from cathsim_dmc import bounds, files
 from cathsim_dmc.agents import evaluation, protocols
 from cathsim_dmc.agents.policies import PolicyLike, load_policy
 from cathsim_dmc.policies import Policy, View
@@ -25,28 +25,22 @@ class RecordedActions(Policy):
 
     def __init__(self, path: str | Path):
         """Reads a file of `record_actions`; ValueError if it is none or damaged."""
+        names = ("header", "seeds", "lengths", "actions")
         try:
-            names = ("header", "seeds", "lengths", "actions")
-            header, seeds, lengths, actions = files.read_arrays(
-                Path(path), names
-            ).values()
+            header, *arrays = files.read_arrays(Path(path), names).values()
             values = json.loads(str(header))
             if values["format"] != FORMAT:
                 raise ValueError(f"its format is {values['format']!r}")
-            whole = seeds.dtype.kind == lengths.dtype.kind == "i"
-            same = whole and seeds.shape == lengths.shape == (len(seeds),)
-            if not same or (lengths < 1).any() or lengths.sum() != len(actions):
-                raise ValueError("seeds, lengths and actions do not fit")
-            if actions.dtype != np.float32 or actions.ndim != 2:
-                raise ValueError("the actions are no float32 array (steps, A)")
-            if not np.isfinite(actions).all():
-                raise ValueError("an action is not finite")
+            seeds = bounds.array("seeds", arrays[0], "i", (-1,))
+            lengths = bounds.array("lengths", arrays[1], "i", seeds.shape)
+            actions = bounds.array("actions", arrays[2], "f", (lengths.sum(), -1))
             self.name = f"{values['policy']}, recorded actions"
             self.task, self.task_kwargs = values["task"], dict(values["task_kwargs"])
             self.observation = values["observation"]
         except (LookupError, TypeError, ValueError) as error:
             raise ValueError(f"{path} holds no recorded actions: {error}") from error
         self.seeds: tuple[int, ...] = tuple(seeds.tolist())
+        actions = actions.astype(np.float32)
         self._episodes = np.split(actions, np.cumsum(lengths)[:-1])
         self._view, self._first, self._step = None, 0, 0
 
@@ -122,19 +116,12 @@ def record_actions(
             task_kwargs=task_kwargs, num_threads=num_threads,
         )  # fmt: skip
         simulations = (
-            one
-            for batch in recorder.batches
-            for one in np.stack(batch, axis=1)  # (N, steps, A)
-        )
+            one for batch in recorder.batches for one in np.stack(batch, axis=1)
+        )  # (N, steps, A)
         lengths = [episode.length for episode in result.episodes]
         kept = [one[:n] for one, n in zip(simulations, lengths, strict=True)]
-        header = {
-            "format": FORMAT,
-            "policy": result.policy,
-            "task": result.task,
-            "observation": result.settings["observation"],
-            "task_kwargs": result.settings["task_kwargs"],
-        }
+        own = {name: result.settings[name] for name in ("observation", "task_kwargs")}
+        header = {"format": FORMAT, "policy": result.policy, "task": result.task, **own}
         with open(path, "wb") as stream:
             np.savez_compressed(
                 stream,

@@ -35,7 +35,7 @@ class BCConfig(TrainingConfig):
     algorithm: ClassVar[str] = "bc"
     resumable: ClassVar[frozenset[str]] = TrainingConfig.resumable - {"total_frames"}
 
-    demonstrations: str = ""
+    demonstrations: str | None = None
     gradient_steps: int = positive(10_000)
     batch_size: int = positive(256)
     steps_per_env: int = positive(128)
@@ -45,11 +45,6 @@ class BCConfig(TrainingConfig):
     normalisation_frames: int = 0
     training_max_steps: int | None = 300
     checkpoint_frames: int = 10_240
-
-    @property
-    def frames_per_batch(self) -> int:
-        """Frames between two stretches of learning, over all environments."""
-        return self.num_envs * self.steps_per_env
 
 
 class BC(CloningLearner):
@@ -68,7 +63,7 @@ class BC(CloningLearner):
             config.demonstrations, config.observation, shapes
         ).exclude("next")
         super().__init__(config, shapes, directory)
-        self.normalisers.observe(self.states)
+        self.observe(self.states)
 
     @override
     def update(self, batch: TensorDictBase, progress: float) -> dict[str, float]:

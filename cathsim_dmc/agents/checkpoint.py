@@ -3,7 +3,6 @@
 import hashlib
 import io
 import json
-import os
 import shutil
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -16,15 +15,14 @@ from tensordict.nn import TensorDictSequential
 
 from cathsim_dmc import files
 from cathsim_dmc.agents.config import TrainingConfig
-from cathsim_dmc.agents.learners import config_from_dict, make_policy
-from cathsim_dmc.agents.networks import NetworkShapes
+from cathsim_dmc.agents.learners import config_from_dict
+from cathsim_dmc.agents.networks import NetworkShapes, make_policy
 
 FORMAT = 2
 _DIRECTORY = "checkpoints"
 _DESCRIPTION = "checkpoint.json"
 _POLICY = "policy.pt"
 _LEARNING = "learning.pt"
-_UNFINISHED = ".unfinished-"
 
 
 class CheckpointError(RuntimeError):
@@ -94,24 +92,27 @@ class Checkpoint:
 
     def _load(self, name: str) -> dict[str, Any]:
         path = self.path / name
-        try:
-            data = path.read_bytes()
-        except OSError as error:
-            raise CheckpointError(f"{path} cannot be read: {error}.") from error
-        given = hashlib.sha256(data).hexdigest()
-        if given != self.sha256[name]:
-            raise CheckpointError(
-                f"{path} is damaged: its SHA-256 is {given[:12]}…, {_DESCRIPTION} says "
-                f"{self.sha256[name][:12]}…. Use an older checkpoint of the run."
-            )
+        data = read_bytes(path, self.sha256[name])
         try:
             # weights_only: a checkpoint from elsewhere must not be able to run code.
-            state = torch.load(io.BytesIO(data), map_location="cpu", weights_only=True)
+            return torch.load(io.BytesIO(data), map_location="cpu", weights_only=True)
         except Exception as error:  # torch's reader of weights fails in many ways
-            raise CheckpointError(
-                f"{path} holds no weights: {line_of(error)}"
-            ) from error
-        return state
+            text = f"{path} holds no weights: {line_of(error)}"
+            raise CheckpointError(text) from error
+
+
+def read_bytes(path: Path, sha256: str) -> bytes:
+    """Content of a file; CheckpointError if it is missing or its checksum differs."""
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise CheckpointError(f"{path} cannot be read: {error}.") from error
+    if hashlib.sha256(data).hexdigest() != sha256:
+        raise CheckpointError(
+            f"{path} is damaged: its SHA-256 is not {sha256[:12]}…, as the JSON file "
+            "beside it says. Use another copy, or an older checkpoint of the run."
+        )
+    return data
 
 
 def policy_of(
@@ -135,14 +136,8 @@ def line_of(error: Exception) -> str:
 
 def checkpoints_in(run: Path) -> list[Path]:
     """Complete checkpoints of a run, oldest first."""
-    directory = Path(run) / _DIRECTORY
-    if not directory.is_dir():
-        return []
-    complete = (
-        child
-        for child in directory.iterdir()
-        if child.name.isdecimal() and (child / _DESCRIPTION).exists()
-    )
+    found = (Path(run) / _DIRECTORY).glob(f"*/{_DESCRIPTION}")
+    complete = (file.parent for file in found if file.parent.name.isdecimal())
     return sorted(complete, key=lambda child: int(child.name))
 
 
@@ -165,39 +160,33 @@ def save_checkpoint(
     """
     directory = Path(run) / _DIRECTORY
     directory.mkdir(parents=True, exist_ok=True)
-    for leftover in directory.glob(f"{_UNFINISHED}*"):
-        shutil.rmtree(leftover)
-    name = f"{frames:010d}"
-    target = directory / name
+    for leftover in set(directory.iterdir()) - set(checkpoints_in(run)):
+        shutil.rmtree(leftover)  # of a process that was killed
+    target = directory / f"{frames:010d}"
     if target.exists():
         # No frame was added since, as when a run is interrupted right after saving.
         return target
-    temporary = directory / f"{_UNFINISHED}{name}"
-    temporary.mkdir()
-    checksums = {}
-    for file, state in ((_POLICY, policy), (_LEARNING, learning)):
-        # By way of memory: torch's own writer hides the cause on a full disk.
-        stream = io.BytesIO()
-        torch.save(dict(state), stream)
-        data = stream.getvalue()
-        checksums[file] = hashlib.sha256(data).hexdigest()
-        files.write_bytes(temporary / file, data)
+    packages = ("torch", "torchrl", "mujoco", "dm-control")
     description = {
         "format": FORMAT,
         "frames": frames,
         "seconds": seconds,
         "config": config.to_dict(),
         "shapes": shapes.to_dict(),
-        "sha256": checksums,
-        "versions": {
-            name: version(name) for name in ("torch", "torchrl", "mujoco", "dm-control")
-        },
+        "sha256": {},
+        "versions": {name: version(name) for name in packages},
     }
-    files.write_text(temporary / _DESCRIPTION, json.dumps(description, indent=2) + "\n")
-    os.rename(temporary, target)
+    with files.atomic_directory(target) as temporary:
+        for file, state in ((_POLICY, policy), (_LEARNING, learning)):
+            # By way of memory: torch's own writer hides the cause on a full disk.
+            stream = io.BytesIO()
+            torch.save(dict(state), stream)
+            data = stream.getvalue()
+            description["sha256"][file] = hashlib.sha256(data).hexdigest()
+            files.write_bytes(temporary / file, data)
+        text = json.dumps(description, indent=2) + "\n"
+        files.write_text(temporary / _DESCRIPTION, text)
     for old in checkpoints_in(run)[: -config.keep_checkpoints]:
-        # Killed while it removes, it must not leave half a checkpoint with a name.
-        dropped = old.with_name(f"{_UNFINISHED}{old.name}")
-        os.rename(old, dropped)
-        shutil.rmtree(dropped)
+        (old / _DESCRIPTION).unlink()  # first: without it, it is no checkpoint
+        shutil.rmtree(old)
     return target

@@ -1,6 +1,7 @@
 """Settings that all algorithms share."""
 
 import dataclasses
+import itertools
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -17,6 +18,24 @@ from cathsim_dmc.bounds import MOST_START_SHARE
 
 # Convolutions of the published agents: (filters, kernel size, stride) of each.
 PUBLISHED_CONVOLUTIONS = ((32, 8, 4), (64, 4, 2), (64, 3, 1))
+
+# What the presets "tuned" learn from, found on type1_lcca (docs/training.md): the way
+# through the lumen as reward, episodes that are short and start anywhere along it.
+TUNED_TRAINING: Mapping[str, Any] = {
+    "training_reward": {"path": -1.0, "success": 10.0},
+    "training_max_steps": 120,
+    "training_start": (0.0, 0.9),
+}
+# What the presets "tuned_image" add: images without their background, whose first
+# convolution strides by its size (a fifth of the published cost), and a critic that
+# reads the state.
+TUNED_IMAGES: Mapping[str, Any] = {
+    "observation": "image",
+    "critic_observation": "internal",
+    "subtract_background": True,
+    "convolutions": ((32, 8, 8), (64, 4, 2), (64, 3, 1)),
+    "cnn_features": 256,
+}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -75,21 +94,16 @@ class TrainingConfig:
     """
 
     algorithm: ClassVar[str] = ""
+    # Whether the deviation of the actions is an output of the network (SAC), or a
+    # parameter of each action.
+    state_dependent_std: ClassVar[bool] = False
     # Settings by the name of a preset; what a preset leaves out has its default.
     presets: ClassVar[Mapping[str, Mapping[str, Any]]] = {"published": {}}
     # What may differ between a run and its continuation: nothing that learning
     # depends on, apart from how long it lasts.
     resumable: ClassVar[frozenset[str]] = frozenset(
-        {
-            "total_frames",
-            "checkpoint_frames",
-            "checkpoint_seconds",
-            "keep_checkpoints",
-            "metrics_frames",
-            "num_threads",
-            "torch_threads",
-            "torch_device",
-        }
+        {"total_frames", "checkpoint_frames", "checkpoint_seconds", "keep_checkpoints"}
+        | {"metrics_frames", "num_threads", "torch_threads", "torch_device"}
     )
 
     task: str = "type1_bca"
@@ -97,20 +111,22 @@ class TrainingConfig:
     task_kwargs: Mapping[str, Any] = field(default_factory=dict)
     training_reward: Mapping[str, float] | None = None
     training_max_steps: int | None = positive(None)
-    training_start: tuple[float, float] | None = None
+    training_start: tuple[float, float] | None = within(
+        None, low=0.0, high=MOST_START_SHARE
+    )
     num_envs: int = positive(16)
     num_threads: int | None = positive(None)
-    seed: int = within(0, 0)
+    seed: int = within(0, low=0)
     total_frames: int = positive(600_000)
-    hidden: tuple[int, ...] = (64, 64)
+    hidden: tuple[int, ...] = positive((64, 64))
     activation: Literal["tanh", "relu", "elu"] = "tanh"
     subtract_background: bool = False
-    convolutions: tuple[tuple[int, int, int], ...] = PUBLISHED_CONVOLUTIONS
-    cnn_features: int = 512
+    convolutions: tuple[tuple[int, int, int], ...] = positive(PUBLISHED_CONVOLUTIONS)
+    cnn_features: int = positive(512)
     learning_rate: float = positive(3e-4)
-    gamma: float = within(0.99, 0, 1, "(]")
+    gamma: float = positive(0.99, high=1.0)
     observation_clip: float = positive(10.0)
-    normalisation_frames: int = within(4_096, 0)
+    normalisation_frames: int = within(4_096, low=0)
     initial_policy: str | None = None
     initial_std: float | None = positive(None)
     checkpoint_frames: int = positive(51_200)
@@ -123,31 +139,16 @@ class TrainingConfig:
     def __post_init__(self):
         """Validate; every message says what was given and what is allowed."""
         check_fields(self)
-        require(bool(self.task), "task", self.task, "the name of a task")
-        require(bool(self.observation), "observation", self.observation, "a name")
-        for name in ("hidden", "convolutions"):
-            require(bool(getattr(self, name)), name, (), "one layer or more")
-        layers = self.convolutions
-        fit = all(len(layer) == 3 and min(layer) > 0 for layer in layers)
-        require(fit, "convolutions", layers, "positive (filters, kernel size, stride)")
-        widths = (*self.hidden, self.cnn_features)
-        require(min(widths) > 0, "hidden or cnn_features", widths, "positive")
-        start = self.training_start
-        require(
-            start is None
-            or (len(start) == 2 and 0 <= start[0] <= start[1] <= MOST_START_SHARE),
-            "training_start",
-            start,
-            "two shares (low, high) with 0 <= low <= high <= "
-            f"{MOST_START_SHARE:g}, or None",
-        )
+        layers, start = self.convolutions, self.training_start
+        fit = all(len(layer) == 3 for layer in layers)
+        require(fit, "convolutions", layers, "(filters, kernel size, stride) of each")
+        ordered = start is None or (len(start) == 2 and start[0] <= start[1])
+        require(ordered, "training_start", start, "two shares (low, high), low <= high")
         try:
             json.dumps(self.task_kwargs, allow_nan=False)
         except (TypeError, ValueError) as error:
-            raise ConfigError(
-                f"task_kwargs={self.task_kwargs!r} cannot be written to config.json "
-                f"({error}); use finite numbers, strings, lists and dicts only."
-            ) from error
+            what = f"finite numbers, strings, lists and dicts only: {error}"
+            require(False, "task_kwargs", self.task_kwargs, what)
 
     @property
     def training_kwargs(self) -> dict[str, Any]:
@@ -167,24 +168,26 @@ class TrainingConfig:
 
     @property
     def frames_per_batch(self) -> int:
-        """Number of frames between two calls of the learner's update."""
-        raise NotImplementedError
+        """Frames between two calls of the learner's update, over all environments."""
+        return self.num_envs * vars(self)["steps_per_env"]
 
     def replace(self, **changes: Any) -> "TrainingConfig":
         """A copy with some fields changed, validated again."""
-        _require_fields(type(self), changes)
-        return dataclasses.replace(self, **changes)
+        return self.from_dict({**vars(self), **changes})
 
     def to_dict(self) -> dict[str, Any]:
         """The config as JSON-able values, with the algorithm's name."""
-        values = dataclasses.asdict(self)
         # Tuples become lists.
-        return {"algorithm": self.algorithm, **json.loads(json.dumps(values))}
+        return {"algorithm": self.algorithm, **json.loads(json.dumps(vars(self)))}
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> "TrainingConfig":
         """A config from its fields by name; ConfigError if one is not allowed."""
-        _require_fields(cls, values)
+        valid = [item.name for item in dataclasses.fields(cls)]
+        if unknown := sorted(set(values) - set(valid)):
+            raise ConfigError(
+                f"{cls.__name__} has no field {unknown}; valid fields are {valid}."
+            )
         return cls(**values)
 
     def changed_for_resume(self, other: "TrainingConfig") -> dict[str, tuple]:
@@ -197,10 +200,24 @@ class TrainingConfig:
         }
 
 
-def _require_fields(kind: type[TrainingConfig], names: Mapping[str, Any]) -> None:
-    valid = [item.name for item in dataclasses.fields(kind)]
-    unknown = sorted(set(names) - set(valid))
-    if unknown:
-        raise ConfigError(
-            f"{kind.__name__} has no field {unknown}; valid fields are {valid}."
-        )
+@dataclass(frozen=True, kw_only=True)
+class ActorCriticConfig(TrainingConfig):
+    """Settings shared by the algorithms with a critic.
+
+    Attributes:
+        critic_observation: Name or names of the vector observations that the critic
+            reads in place of the images that the policy reads (Pinto et al. 2018,
+            "Asymmetric Actor Critic for Image-Based Robot Learning"); only the
+            training needs them. None lets it read what the policy reads.
+    """
+
+    critic_observation: str | tuple[str, ...] | None = None
+
+    @property
+    def collected_observation(self) -> str | tuple[str, ...]:
+        """Those of the policy and those of the critic."""
+        if self.critic_observation is None:
+            return self.observation
+        both = self.observation, self.critic_observation
+        names = ((one,) if isinstance(one, str) else one for one in both)
+        return tuple(itertools.chain(*names))

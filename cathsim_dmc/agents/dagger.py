@@ -21,8 +21,7 @@ from cathsim_dmc.agents.fields import positive, within
 from cathsim_dmc.agents.imitation import CloningLearner, decaying
 from cathsim_dmc.agents.networks import NetworkShapes
 from cathsim_dmc.agents.replay import ReplayMemory
-from cathsim_dmc.agents.views import view_of
-from cathsim_dmc.policies import Teacher
+from cathsim_dmc.policies import Teacher, View
 
 _BEGUN = "step_count"  # control steps since an episode began
 
@@ -58,11 +57,11 @@ class DAggerConfig(TrainingConfig):
     }
 
     steps_per_env: int = positive(128)
-    expert_share: float = within(0.5, 0, 1)
+    expert_share: float = within(0.5, low=0, high=1)
     gradient_steps: int = positive(2_000)
     batch_size: int = positive(256)
-    withdrawal_weight: float = within(20.0, 1, 1_000)
-    expert_lead: float = within(0.02, -0.1, 0.1)
+    withdrawal_weight: float = within(20.0, low=1, high=1_000)
+    expert_lead: float = within(0.02, low=-0.1, high=0.1)
     replay_frames: int = 1_000_000
     replay_bytes: int = positive(2 * 1024**3)
     total_frames: int = 20_480
@@ -75,30 +74,21 @@ class DAggerConfig(TrainingConfig):
     def __post_init__(self):
         """Validate the algorithm's own fields after the shared ones."""
         super().__post_init__()
-        require(
-            self.replay_frames >= self.frames_per_batch,
-            "replay_frames",
-            self.replay_frames,
-            f"at least num_envs * steps_per_env={self.frames_per_batch}",
-        )
-
-    @property
-    def frames_per_batch(self) -> int:
-        """Frames of a round, over all environments."""
-        return self.num_envs * self.steps_per_env
+        least, most = self.frames_per_batch, self.replay_frames
+        allowed = f"at least num_envs * steps_per_env={least}"
+        require(most >= least, "replay_frames", most, allowed)
 
 
 class _Guided(TensorDictModuleBase):
     """Acts with expert or learner at random; records the expert's action."""
 
-    def __init__(self, policy: TensorDictSequential, env: EnvBase, lead: float):
+    def __init__(self, policy: TensorDictSequential, view: View, lead: float):
         super().__init__()
         self.policy, self.share = policy, 1.0
         self.in_keys = [*policy.in_keys, _BEGUN]
         self.out_keys = ["action", EXPERT_ACTION]
-        self._view = view_of(env)
-        self._teacher = Teacher(self._view, lead)
-        self._last = torch.zeros(self._view.num_simulations, self._view.num_actions)
+        self._teacher = Teacher(view, lead)
+        self._last = torch.zeros(view.num_simulations, view.num_actions)
 
     @torch.no_grad()
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -120,27 +110,20 @@ class DAgger(CloningLearner):
     """Fits a policy to all states that expert and learner have visited."""
 
     metrics: ClassVar[tuple[str, ...]] = (
-        "loss",
-        "deviation",
-        "expert_share",
-        "replay_frames",
-        "gradient_steps",
-    )
+        "loss", "deviation", "expert_share", "replay_frames", "gradient_steps",
+    )  # fmt: skip
 
     def __init__(self, config: DAggerConfig, shapes: NetworkShapes, directory: Path):
         super().__init__(config, shapes, directory)
         self._keys = [*shapes.raw_keys, EXPERT_ACTION]
-        self.replay = ReplayMemory(
-            directory / "replay",
-            self._keys,
-            config.replay_frames,
-            config.replay_bytes,
-        )
+        limits = config.replay_frames, config.replay_bytes
+        self.replay = ReplayMemory(directory / "replay", self._keys, *limits)
 
     @override
     def attach(self, env: EnvBase) -> None:
-        self.policy = _Guided(self.network, env, self.config.expert_lead)
-        self._translations = list(view_of(env).task.scene.catheter.translations)
+        view = View(env.base_env.simulation)
+        self.policy = _Guided(self.network, view, self.config.expert_lead)
+        self._translations = list(view.task.scene.catheter.translations)
         self._set_share()
 
     @override
@@ -164,7 +147,7 @@ class DAgger(CloningLearner):
     def update(self, batch: TensorDictBase, progress: float) -> dict[str, float]:
         config, share = self.config, self._set_share()
         self.replay.extend(batch.select(*self._keys).reshape(-1))
-        self.normalisers.observe(batch)
+        self.observe(batch)
         rates = decaying(config.learning_rate, 0.0, config.gradient_steps)
         figures = self.fit(self.replay.sample, config.batch_size, rates)
         self._set_share()

@@ -1,5 +1,6 @@
 """Expert demonstrations: recorded as Minari datasets, read back for learning."""
 
+import collections
 import dataclasses
 import functools
 from collections.abc import Callable, Mapping, Sequence
@@ -19,7 +20,6 @@ from cathsim_dmc.recording import dataset
 from cathsim_dmc.recording.dataset import DatasetError, read_episodes
 from cathsim_dmc.simulation import environments
 from cathsim_dmc.simulation.batch import BatchSimulation
-from cathsim_dmc.simulation.environments import PIXELS, VECTOR
 from cathsim_dmc.simulation.episodes import BatchedSimulations, play
 from cathsim_dmc.tasks import observations
 from cathsim_dmc.tasks.observation_kind import Sizes
@@ -120,26 +120,22 @@ def record_demonstrations(
         description=f"{episodes} demonstrations of the task {task} of cathsim_dmc, "
         f"seeds from {seed}",
     )
-    return _summary(out, buffers)
-
-
-def _summary(out: Path, buffers: Sequence[Any]) -> Demonstrations:
-    def steps(name: str) -> list[np.ndarray]:
-        return [np.asarray(buffer.infos[name][1:]) for buffer in buffers]
-
+    forces = {
+        name: [np.asarray(buffer.infos[f"wall_force_{name}"][1:]) for buffer in buffers]
+        for name in ("sum", "max")
+    }
     return Demonstrations(
         path=out,
         episodes=len(buffers),
         successes=sum(bool(buffer.infos["success"][-1]) for buffer in buffers),
         steps=sum(len(buffer.rewards) for buffer in buffers),
-        mean_force=float(np.mean([one.mean() for one in steps("wall_force_sum")])),
-        max_force=float(max(one.max() for one in steps("wall_force_max"))),
+        mean_force=float(np.mean([one.mean() for one in forces["sum"]])),
+        max_force=float(max(one.max() for one in forces["max"])),
     )
 
 
 def _play(simulation: Any, seeds: np.ndarray, noise: float) -> list[Any]:
     """An episode of the expert for each seed, side by side, as Minari's buffers."""
-    count = len(seeds)
     simulation.seed(seeds.tolist())
     generators = [np.random.default_rng(int(seed)) for seed in seeds]
     expert, view = ExpertPolicy(), View(simulation)
@@ -157,47 +153,43 @@ def _play(simulation: Any, seeds: np.ndarray, noise: float) -> list[Any]:
         return action
 
     begin = functools.partial(expert.reset, view)
-    turns: list[dict[str, Any]] = []
-    for action, step, running in play(
-        BatchedSimulations(simulation), act, begin, count
-    ):
-        ends = step.terminated, step.truncated
-        own = (chosen, action, running, step.outcome.reward, *ends)
-        turns.append({
-            "observations": step.observation,
-            "infos": {key: np.array(value) for key, value in step.info().items()},
-            "own": [np.array(one) for one in own],
-        })  # fmt: skip
-    return [_buffer(int(seed), row, turns) for row, seed in enumerate(seeds)]
+    columns: dict[Any, list[np.ndarray]] = collections.defaultdict(list)
+    turns = play(BatchedSimulations(simulation), act, begin, len(seeds))
+    for action, step, running in turns:
+        kept: dict[Any, Any] = {
+            **{("observations", key): one for key, one in step.observation.items()},
+            **{("infos", key): one for key, one in step.info().items()},
+        }
+        if action is not None:
+            kept |= {"chosen": chosen, "actions": action, "running": running}
+            kept |= {"terminations": step.terminated, "truncations": step.truncated}
+            kept["rewards"] = step.outcome.reward
+        for key, value in kept.items():
+            columns[key].append(np.array(value))
+    stacked = {key: np.stack(one, axis=1) for key, one in columns.items()}
+    return [
+        _buffer(int(seed), {key: one[row] for key, one in stacked.items()})
+        for row, seed in enumerate(seeds)
+    ]
 
 
-def _buffer(seed: int, row: int, turns: Sequence[Mapping[str, Any]]) -> Any:
+def _buffer(seed: int, columns: Mapping[Any, np.ndarray]) -> Any:
     """The first episode of a simulation; its expert's last action is repeated."""
     from minari.data_collector import EpisodeBuffer
 
-    turns = [turn for turn in turns if turn["own"][2][row]]
-    steps = [[one[row] for one in turn["own"]] for turn in turns[1:]]
-    chosen, actions, _, *others = (np.stack(each) for each in zip(*steps, strict=True))
-    rewards, terminations, truncations = (each.tolist() for each in others)
-    columns = {
-        kind: {
-            key: np.stack([turn[kind][key][row] for turn in turns])
-            for key in turns[0][kind]
-        }
-        for kind in ("observations", "infos")
-    }
-    columns["infos"][EXPERT_ACTION] = np.stack([*chosen, chosen[-1]])
-    for key, value in columns["observations"].items():
-        if value.dtype != np.uint8:
-            columns["observations"][key] = value.astype(np.float32)
-    return EpisodeBuffer(
-        seed=seed,
-        actions=actions,
-        rewards=rewards,
-        terminations=terminations,
-        truncations=truncations,
-        **columns,
-    )
+    steps = np.count_nonzero(columns["running"])
+    found: dict[str, Any] = {"observations": {}, "infos": {}}
+    for key, values in columns.items():
+        if isinstance(key, tuple):
+            found[key[0]][key[1]] = values[: steps + 1]
+    for key, values in found["observations"].items():
+        if values.dtype != np.uint8:
+            found["observations"][key] = values.astype(np.float32)
+    chosen = columns["chosen"][:steps]
+    found["infos"][EXPERT_ACTION] = np.append(chosen, chosen[-1:], axis=0)
+    for name in ("rewards", "terminations", "truncations"):
+        found[name] = columns[name][:steps].tolist()
+    return EpisodeBuffer(seed=seed, actions=columns["actions"][:steps], **found)
 
 
 def load_transitions(
@@ -227,7 +219,7 @@ def load_transitions(
     if not succeeded:
         raise DatasetError(f"none of the {len(episodes)} episodes in {path} succeeds")
     transitions = TensorDict.cat(succeeded)
-    found = _shapes(transitions)
+    found = NetworkShapes.sized(transitions, transitions["action"])
     if found != shapes:
         raise DatasetError(
             f"{path} holds {found}, and the task with the observation {observation!r} "
@@ -236,32 +228,20 @@ def load_transitions(
     return transitions
 
 
-def _shapes(transitions: TensorDictBase) -> NetworkShapes:
-    vector, pixels = (transitions.get(key, None) for key in (VECTOR, PIXELS))
-    image = None
-    if pixels is not None:
-        channels, height, width = pixels.shape[1:]
-        image = (channels, height, width)
-    size = 0 if vector is None else vector.shape[-1]
-    return NetworkShapes(size, image, transitions["action"].shape[-1])
-
-
-def _keys(names: Sequence[str], coaxial: bool) -> set[str]:
-    rows = observations.resolve(names, coaxial or None)
-    return set(observations.entry_specs(rows, Sizes()))
-
-
 def _tensors(path: str | Path, episode: Any, names: Sequence[str]) -> TensorDict | None:
     """Transitions of an episode; None if it did not succeed."""
+    given = set(episode.observations)
+    single, coaxial = (
+        set(observations.entry_specs(observations.resolve(names, kind), Sizes()))
+        for kind in (None, True)
+    )
     # What only coaxial devices show tells their episodes.
-    own = _keys(names, True) - _keys(names, False)
-    keys = _keys(names, bool(own & set(episode.observations)))
-    missing = sorted(keys - set(episode.observations))
+    keys = coaxial if (coaxial - single) & given else single
+    missing = sorted(keys - given)
     if missing:
         raise DatasetError(
-            f"{path} lacks {', '.join(missing)}; it has "
-            f"{', '.join(sorted(episode.observations))}: record the observation that "
-            "the learner is to see"
+            f"{path} lacks {', '.join(missing)}; it has {', '.join(sorted(given))}: "
+            "record the observation that the learner is to see"
         )
     if not np.any(episode.infos.get("success", False)):
         return None

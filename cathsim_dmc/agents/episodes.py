@@ -40,14 +40,6 @@ class EpisodeOutcome:
     path_ratio: float | None = None
 
 
-def information(batch: TensorDictBase, name: str) -> np.ndarray | None:
-    """Info entry after each step as float64 (num_envs, steps), None if absent."""
-    value = batch.get(("next", INFO, name), None)
-    if value is None:
-        return None
-    return value.reshape(batch.shape).double().numpy()
-
-
 class EpisodeTracker:
     """Sums over the running episode of each of `num_envs` environments."""
 
@@ -59,23 +51,24 @@ class EpisodeTracker:
 
     def add(self, batch: TensorDictBase) -> list[EpisodeOutcome]:
         """Add steps (num_envs, steps); return the episodes that ended, in order."""
-        reward = batch["next", "reward"].reshape(batch.shape).double().numpy()
-        done = batch["next", "done"].reshape(batch.shape).numpy()
-        terminated = batch["next", "terminated"].reshape(batch.shape).numpy()
-        forces = {name: information(batch, key) for name, key in _FORCES.items()}
-        success = information(batch, "success")
-        error = information(batch, "physics_error")
-        ratio = information(batch, "path_ratio")
+
+        def read(*name: str) -> np.ndarray | None:
+            """Entry after each step (num_envs, steps), None if absent."""
+            value = batch.get(("next", *name), None)
+            return None if value is None else value.reshape(batch.shape).numpy()
+
+        reward, done, terminated = map(read, ("reward", "done", "terminated"))
+        assert reward is not None and done is not None and terminated is not None
+        forces = {name: read(INFO, key) for name, key in _FORCES.items()}
+        success, error, ratio = (
+            read(INFO, name) for name in ("success", "physics_error", "path_ratio")
+        )
         finished = []
         for step in range(batch.shape[1]):
             self.reward += reward[:, step]
             self.length += 1
-            self.forces.add(
-                {
-                    name: None if values is None else values[:, step]
-                    for name, values in forces.items()
-                }
-            )
+            known = {n: one[:, step] for n, one in forces.items() if one is not None}
+            self.forces.add(known)
             if success is not None:
                 self.success |= success[:, step] > 0
             for env in map(int, np.flatnonzero(done[:, step])):

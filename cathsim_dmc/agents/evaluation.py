@@ -1,7 +1,6 @@
 """Evaluation: fixed seeds, each episode counted once, intervals beside every mean."""
 
 import contextlib
-import dataclasses
 import itertools
 import json
 from collections.abc import Callable, Mapping, Sequence
@@ -11,20 +10,23 @@ from typing import Any
 
 import numpy as np
 import torch
-from tensordict import TensorDictBase
 from torchrl.envs import EnvBase
 from torchrl.envs.utils import step_mdp
 
-from cathsim_dmc import bounds, files
+from cathsim_dmc import bounds, files, suite
 from cathsim_dmc.agents import protocols
 from cathsim_dmc.agents.episodes import EpisodeOutcome, EpisodeTracker
-from cathsim_dmc.agents.policies import PolicyLike, load_policy, task_and_options
-from cathsim_dmc.agents.views import view_of
-from cathsim_dmc.analysis.force_statistics import QUANTITIES, Statistics
+from cathsim_dmc.agents.policies import (
+    PolicyLike,
+    load_policy,
+    task_and_options,
+    view_of,
+)
+from cathsim_dmc.analysis import heatmap
+from cathsim_dmc.analysis.force_statistics import QUANTITIES, STATISTICS
 from cathsim_dmc.analysis.intervals import success_interval
 from cathsim_dmc.policies import Policy
 from cathsim_dmc.simulation import environments
-from cathsim_dmc.simulation.episodes import play
 
 EnvFactory = Callable[..., EnvBase]
 # Called after every step with the environment and which episodes (n,) bool still run.
@@ -34,7 +36,6 @@ EVALUATION_SEED = 1_000_000  # apart from the seeds of training
 
 # Largest sums of the force on the wall up to which success is called safe, N.
 SAFE_FORCES = (0.5, 1.0, 2.0)
-_REPORTED = ("reward", "length", "path_ratio")
 
 
 @dataclass(frozen=True)
@@ -113,31 +114,20 @@ class EvaluationResult:
         The interval is None where the episodes are not distinct. Forces in N, by
         quantity and statistic as docs/forces.md defines them.
         """
-        result: dict[str, Any] = {"episodes": len(self.episodes)}
-        for name in _REPORTED:
+        count, successes = len(self.episodes), self.successes
+        result: dict[str, Any] = {"episodes": count}
+        for name in ("reward", "length", "path_ratio"):
             result[name], result[f"{name}_sd"] = self.mean_sd(name)
-        result["forces"] = {
-            quantity: {
-                field.name: dict(
-                    zip(
-                        ("mean", "sd"),
-                        self.mean_sd(f"forces.{quantity}.{field.name}"),
-                        strict=True,
-                    )
-                )
-                for field in dataclasses.fields(Statistics)
-            }
-            for quantity in QUANTITIES
-        }
+        result["forces"] = {quantity: {} for quantity in QUANTITIES}
+        for quantity, name in itertools.product(QUANTITIES, STATISTICS):
+            mean, deviation = self.mean_sd(f"forces.{quantity}.{name}")
+            result["forces"][quantity][name] = {"mean": mean, "sd": deviation}
         result["physics_errors"] = sum(e.physics_error for e in self.episodes)
-        successes = self.successes
-        rate = interval = None
+        result["success"] = result["success_ci95"] = None
         if successes is not None:
-            rate = successes / len(self.episodes)
+            result["success"] = successes / count
             if self.distinct:
-                interval = list(success_interval(successes, len(self.episodes)))
-        result["success"] = rate
-        result["success_ci95"] = interval
+                result["success_ci95"] = list(success_interval(successes, count))
         result["safe_success"] = {
             f"{limit:g} N": self.safe_success(limit) for limit in SAFE_FORCES
         }
@@ -145,13 +135,13 @@ class EvaluationResult:
 
     def to_dict(self) -> dict[str, Any]:
         """JSON-able: identity, summary and every episode."""
+        drawn = [{"conditions": dict(one)} for one in self.conditions]
         episodes = [
-            {"seed": seed, **asdict(episode)}
-            for seed, episode in zip(self.seeds, self.episodes, strict=True)
+            {"seed": seed, **asdict(episode), **conditions}
+            for seed, episode, conditions in zip(
+                self.seeds, self.episodes, drawn or [{}] * len(self.seeds), strict=True
+            )
         ]
-        if self.conditions:
-            for episode, drawn in zip(episodes, self.conditions, strict=True):
-                episode["conditions"] = dict(drawn)
         return {
             "task": self.task,
             "policy": self.policy,
@@ -204,12 +194,18 @@ def evaluate(
     """
     conditions = protocols.get(protocol)
     episodes = conditions.episodes if episodes is None else episodes
-    check_numbers(episodes, seed, num_threads)
+    bounds.whole("episodes", episodes, 1, bounds.MOST_SIMULATIONS)
+    bounds.seed("seed", seed)
+    if num_threads is not None:
+        bounds.whole("num_threads (--threads)", num_threads, 1, bounds.MOST_THREADS)
     player = load_policy(policy, seed)
     task, options = task_and_options(player, task, task_kwargs)
     options = options if task_kwargs is None else dict(task_kwargs)
     observed = observation or player.observation or "internal"
     parts = protocols.parts(conditions, task, options, episodes, seed)
+    if out_dir is not None:
+        # Now: an evaluation that cannot be written would be lost.
+        Path(out_dir).mkdir(parents=True, exist_ok=True)
     outcomes: list[EpisodeOutcome] = []
     for part in parts:
         env = make_env(
@@ -235,57 +231,57 @@ def evaluate(
     return result
 
 
-def check_numbers(episodes: int, seed: int, num_threads: int | None) -> None:
-    """Refuse numbers that no evaluation has; ValueError names them."""
-    bounds.whole("episodes", episodes, 1, bounds.MOST_SIMULATIONS)
-    bounds.seed("seed", seed)
-    if num_threads is not None:
-        bounds.whole("num_threads (--threads)", num_threads, 1, bounds.MOST_THREADS)
-
-
-class _Environments:
-    """The environments of a TorchRL environment; their state is its TensorDict."""
-
-    seen: TensorDictBase
-
-    def __init__(self, env: EnvBase):
-        self._env, self.view = env, view_of(env)
-
-    def reset(self, which: np.ndarray | None) -> TensorDictBase:
-        fresh = which is None
-        self.seen = self._env.reset() if fresh else self._env.maybe_reset(self.seen)
-        return self.seen
-
-    def step(self, action: np.ndarray) -> tuple[TensorDictBase, np.ndarray]:
-        self.seen["action"] = torch.as_tensor(action).to(torch.float32)
-        stepped = self._env.step(self.seen)
-        self.seen = step_mdp(stepped)
-        return stepped, stepped["next", "done"].reshape(-1).numpy()
-
-
 @torch.no_grad()
 def _first_episodes(
     env: EnvBase, policy: Policy, observer: Observer | None
 ) -> tuple[EpisodeOutcome, ...]:
     (count,) = env.batch_size
-    tracker, environments_ = EpisodeTracker(count), _Environments(env)
+    view, tracker = view_of(env), EpisodeTracker(count)
     outcomes: dict[int, EpisodeOutcome] = {}
-
-    def begin(which: np.ndarray) -> None:
-        policy.reset(environments_.view, which)
-
-    turns = play(environments_, policy.act, begin, count)
-    for _, stepped, running in itertools.islice(turns, 1, None):
+    state, begun = env.reset(), np.ones(count, dtype=bool)
+    running = begun
+    while running.any():
+        state = env.maybe_reset(state)
+        if begun.any():
+            policy.reset(view, begun)
+        state["action"] = torch.as_tensor(policy.act(state)).to(torch.float32)
+        stepped = env.step(state)
         if observer is not None:
             observer(env, running)
         for outcome in tracker.add(stepped.unsqueeze(1)):
             outcomes.setdefault(outcome.env, outcome)
-    return tuple(outcomes[env_index] for env_index in range(count))
+        begun = stepped["next", "done"].reshape(-1).numpy()
+        running = running & ~begun
+        state = step_mdp(stepped)
+    return tuple(outcomes[number] for number in range(count))
 
 
 def write_evaluation(out_dir: str | Path, values: Mapping[str, Any]) -> Path:
     """Write evaluation.json atomically; return its path."""
-    directory = Path(out_dir)
-    directory.mkdir(parents=True, exist_ok=True)
     text = json.dumps(values, indent=2) + "\n"
-    return files.write_text(directory / "evaluation.json", text)
+    return files.write_text(Path(out_dir) / "evaluation.json", text)
+
+
+class ContactLog:
+    """An observer that keeps the contacts with the wall."""
+
+    def __init__(self):
+        self._steps = [(np.zeros((0, 3)), np.zeros(0))]
+
+    def __call__(self, env: EnvBase, running: np.ndarray) -> None:
+        """Adds the contacts at the end of a control step."""
+        found = env.base_env.simulation.contacts()
+        present = found.present & running[:, None]
+        self._steps.append((found.position[present], found.magnitude[present]))
+
+    def contacts(self) -> tuple[np.ndarray, np.ndarray]:
+        """Positions (K, 3), m, world frame, and magnitudes (K,), N."""
+        positions, magnitudes = map(np.concatenate, zip(*self._steps, strict=True))
+        return positions, magnitudes
+
+    def draw(self, result: EvaluationResult, path: Path) -> None:
+        """Writes the heatmap of an evaluation as PNG."""
+        task = suite.make_task(result.task, **result.settings["task_kwargs"])
+        title = f"{result.task}, {result.policy}: {len(result.episodes)} episodes"
+        surface = task.scene.anatomy.surface
+        heatmap.heatmap(*self.contacts(), surface, path, title)

@@ -1,13 +1,14 @@
 """Values of settings: refused by the name of the field, with what is allowed."""
 
 import dataclasses
-import math
 import types
 import typing
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Any, ClassVar, Literal
 
-MAX_INTEGER = 2**62
+from cathsim_dmc import bounds
+
+_MOST = 2**62
 
 
 class ConfigError(ValueError):
@@ -17,27 +18,17 @@ class ConfigError(ValueError):
 def require(condition: bool, name: str, given: object, allowed: str) -> None:
     """Raise ConfigError naming the field, what was given and what is allowed."""
     if not condition:
-        raise ConfigError(f"{name}={given!r} is not allowed: {name} must be {allowed}.")
+        raise ConfigError(f"{name} is {bounds.shown(given)}; it must be {allowed}")
 
 
-def positive(default: Any) -> Any:
-    """A field greater than zero; None passes where its type allows it."""
-    return _checked(default, lambda value: value > 0, "positive")
+def positive(default: Any, **limits: Any) -> Any:
+    """A field of numbers greater than zero, with limits as for `within`."""
+    return dataclasses.field(default=default, metadata={"positive": True, **limits})
 
 
-def within(default: Any, low: float, high: float = math.inf, ends: str = "[]") -> Any:
-    """A field in an interval, whose `ends` belong to it ("[]") or not ("()")."""
-
-    def fits(value: float) -> bool:
-        above = value > low if ends[0] == "(" else value >= low
-        return above and (value < high if ends[1] == ")" else value <= high)
-
-    bounds = f"in {ends[0]}{low:g}, {high:g}{ends[1]}"
-    return _checked(default, fits, bounds if high < math.inf else f">= {low:g}")
-
-
-def _checked(default: Any, fits: Callable[[Any], bool], allowed: str) -> Any:
-    return dataclasses.field(default=default, metadata={"check": (fits, allowed)})
+def within(default: Any, **limits: Any) -> Any:
+    """A field of numbers in a closed interval, from `low` to `high`."""
+    return dataclasses.field(default=default, metadata=limits)
 
 
 def check_fields(config: Any) -> None:
@@ -48,74 +39,51 @@ def check_fields(config: Any) -> None:
     for name, kind in typing.get_type_hints(type(config)).items():
         if typing.get_origin(kind) is ClassVar:
             continue
-        value = getattr(config, name)
-        value = dict(value) if isinstance(value, Mapping) else tuples(value)
-        require_type(name, value, kind)
-        object.__setattr__(config, name, value)
-        for base in type(config).__mro__:
+        limits: dict[str, Any] = {}
+        for base in reversed(type(config).__mro__):
             field = getattr(base, "__dataclass_fields__", {}).get(name)
-            if field is None or value is None or "check" not in field.metadata:
-                continue
-            fits, allowed = field.metadata["check"]
-            whole = isinstance(value, int) and allowed == "positive"
-            require(
-                fits(value), name, value, "a positive integer" if whole else allowed
-            )
+            limits |= {} if field is None else field.metadata
+        value = checked(name, getattr(config, name), kind, **limits)
+        object.__setattr__(config, name, value)
 
 
-_KINDS = {
-    int: "an integer below 2**62",
-    float: "a finite number",
-    str: "a string",
-    bool: "true or false",
-    type(None): "None",
-}
+def checked(name: str, value: Any, kind: Any, **limits: Any) -> Any:
+    """A value of an annotated type, lists as tuples; or ConfigError."""
+    try:
+        return _checked(name, value, kind, limits)
+    except ValueError as error:
+        raise ConfigError(str(error)) from error
 
 
-def require_type(name: str, value: object, kind: Any) -> None:
-    """Raise ConfigError unless a value is of an annotated type."""
-    require(_fits(value, kind), name, value, _description(kind))
-
-
-def _fits(value: object, kind: Any) -> bool:
-    """Whether a value is of an annotated type; of numbers only finite ones."""
-    origin, arguments = typing.get_origin(kind), typing.get_args(kind)
-    if origin is Literal:
-        return any(value == choice and isinstance(value, str) for choice in arguments)
+def _checked(name: str, value: Any, kind: Any, limits: dict[str, Any]) -> Any:
+    origin, kinds = typing.get_origin(kind), typing.get_args(kind)
     if origin in (typing.Union, types.UnionType):
-        return any(_fits(value, argument) for argument in arguments)
-    if origin is tuple:
-        return isinstance(value, tuple) and all(_fits(v, arguments[0]) for v in value)
+        if value is None and types.NoneType in kinds:
+            return None
+        kinds = [one for one in kinds if one is not types.NoneType]
+        # Of a name or names, the first is the name.
+        return _checked(name, value, kinds[-(not isinstance(value, str))], limits)
+    if origin is Literal:
+        return bounds.choice(name, value, kinds)
     if origin is Mapping:
-        return isinstance(value, Mapping) and all(
-            isinstance(name, str) and (arguments[1] is Any or _fits(one, arguments[1]))
-            for name, one in value.items()
-        )
-    if type(value) is int and abs(value) > MAX_INTEGER:
-        return False
-    if kind is float:
-        if not isinstance(value, int | float) or isinstance(value, bool):
-            return False
-        return math.isfinite(value)
-    # A bool is an int to Python, but no number of anything.
-    return type(value) is kind
-
-
-def _description(kind: Any) -> str:
-    origin, arguments = typing.get_origin(kind), typing.get_args(kind)
-    if origin is Literal:
-        return "one of " + ", ".join(map(repr, arguments))
-    if origin in (typing.Union, types.UnionType):
-        return " or ".join(_description(argument) for argument in arguments)
+        values = bounds.options(name, bounds.instance(name, value, Mapping))
+        if kinds[1] is Any:
+            return values
+        return {
+            key: _checked(f"{name}[{key!r}]", one, kinds[1], limits)
+            for key, one in values.items()
+        }
     if origin is tuple:
-        return f"a list, each entry {_description(arguments[0])}"
-    if origin is Mapping and arguments[1] is not Any:
-        return f"names, each with {_description(arguments[1])}"
-    return _KINDS.get(kind, "an object of settings")
-
-
-def tuples(value: Any) -> Any:
-    """Lists as tuples, at every depth."""
-    if isinstance(value, list | tuple):
-        return tuple(tuples(one) for one in value)
+        if not isinstance(value, list | tuple) or not value:
+            bounds.refuse(name, value, "a list with one entry or more")
+        return tuple(_checked(name, one, kinds[0], limits) for one in value)
+    if kind is int:
+        low = 1 if "positive" in limits else limits.get("low", -_MOST)
+        return bounds.whole(name, value, low, limits.get("high", _MOST))
+    if kind is float:
+        return bounds.number(name, value, **limits)
+    if kind is bool:
+        return bounds.switch(name, value)
+    if not isinstance(value, str) or not value:
+        bounds.refuse(name, value, "a text")
     return value

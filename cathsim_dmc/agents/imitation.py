@@ -5,20 +5,12 @@ from pathlib import Path
 
 import torch
 from tensordict import TensorDictBase
-from tensordict.nn import TensorDictSequential
 from torch import nn
-from typing_extensions import override
 
 from cathsim_dmc.agents.config import TrainingConfig
 from cathsim_dmc.agents.demonstrations import EXPERT_ACTION
-from cathsim_dmc.agents.learner import Learner
-from cathsim_dmc.agents.networks import (
-    LOG_STD_RANGE,
-    GaussianActor,
-    NetworkShapes,
-    make_policy,
-)
-from cathsim_dmc.agents.normalisation import ImageNormaliser, ObservationNormaliser
+from cathsim_dmc.agents.learner import Learner, means
+from cathsim_dmc.agents.networks import LOG_STD_RANGE, NetworkShapes, network_of
 
 # Beyond it an action counts as saturated: its deviation before the tanh says nothing.
 _SATURATED = 0.99
@@ -44,18 +36,6 @@ class CloningLearner(Learner):
             fused=True,
         )
 
-    @staticmethod
-    @override
-    def make_policy(
-        shapes: NetworkShapes, config: TrainingConfig
-    ) -> TensorDictSequential:
-        network = GaussianActor(shapes, config, state_dependent_std=False)
-        return make_policy(shapes, config, network)
-
-    @override
-    def observe(self, batch: TensorDictBase) -> None:
-        """Take no statistics: they are those of the states that are fitted."""
-
     def fit(
         self,
         sample: Callable[[int], TensorDictBase],
@@ -72,21 +52,16 @@ class CloningLearner(Learner):
         Returns:
             "loss", the mean, and "deviation", root mean square error at the end.
         """
-        total = torch.zeros((), device=self.device)
+        losses = []
         for rate in rates.tolist():
             for group in self.optimiser.param_groups:
                 group["lr"] = rate
             mean, target = self._means(sample(batch_size))
             loss = ((mean.tanh() - target).square() * self._weights(target)).mean()
-            self.optimiser.zero_grad()
-            loss.backward()
-            self.optimiser.step()
-            total += loss.detach()
-        self.gradient_steps += len(rates)
-        return {
-            "loss": float(total) / max(len(rates), 1),
-            "deviation": self._set_deviation(sample(_SAMPLE)),
-        }
+            self.descend(loss)
+            losses.append({"loss": loss.detach()})
+        figures = {"loss": 0.0, **means(losses)}
+        return {**figures, "deviation": self._set_deviation(sample(_SAMPLE))}
 
     def _weights(self, target: torch.Tensor) -> torch.Tensor:
         """Weights (n, 1) of the squared errors of the actions `target` (n, A)."""
@@ -95,7 +70,7 @@ class CloningLearner(Learner):
     def _means(self, states: TensorDictBase) -> tuple[torch.Tensor, torch.Tensor]:
         """Means before the tanh and the actions that are wanted."""
         states = states.select(*self.shapes.raw_keys, EXPERT_ACTION).to(self.device)
-        self.normalisers.add(states)
+        self.normalise(states)
         mean, _ = self._actor(*(states[key] for key in self.shapes.keys))
         return mean, states[EXPERT_ACTION]
 
@@ -108,17 +83,6 @@ class CloningLearner(Learner):
         log_std = squares.clamp_min(1e-12).log() / 2
         self._log_std.data.copy_(log_std.clamp(*LOG_STD_RANGE))
         return float((mean.tanh() - target).square().mean().sqrt())
-
-
-def network_of(policy: nn.Module) -> GaussianActor:
-    """The network of a policy."""
-    return next(m for m in policy.modules() if isinstance(m, GaussianActor))
-
-
-def statistics_of(policy: nn.Module) -> list[nn.Module]:
-    """The observation statistics of a policy."""
-    kinds = ObservationNormaliser, ImageNormaliser
-    return [module for module in policy.modules() if isinstance(module, kinds)]
 
 
 def decaying(start: float, stop: float, steps: int) -> torch.Tensor:

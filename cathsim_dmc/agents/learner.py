@@ -2,20 +2,20 @@
 
 import abc
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, ClassVar
 
 import torch
 from tensordict import TensorDictBase
-from tensordict.nn import TensorDictModuleBase, TensorDictSequential
-from torch import device
+from tensordict.nn import TensorDictModuleBase
+from torch import nn
 from torchrl.collectors import Collector
 from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType
 
 from cathsim_dmc.agents.config import TrainingConfig
-from cathsim_dmc.agents.networks import NetworkShapes, Normalisers
+from cathsim_dmc.agents.networks import NetworkShapes, make_normalisers, make_policy
 
 
 class Learner(abc.ABC):
@@ -27,7 +27,7 @@ class Learner(abc.ABC):
     shapes: Sizes of what the policy reads, and of the action.
     network: The policy that is learnt: raw observation in, sampled action out.
     policy: The policy to collect with; `network`, or one around it.
-    normalisers: Observation statistics of policy and critic.
+    critic_normalisers: Normalisers of what the critic alone reads.
     optimiser: Adam with the parameters of all networks, made by the subclass.
     gradient_steps: Number of gradient steps so far.
     """
@@ -53,22 +53,41 @@ class Learner(abc.ABC):
         del directory
         self.config, self.shapes = config, shapes
         self.device = torch.device(config.torch_device)
-        self.network = self.make_policy(shapes, config).to(self.device)
+        self.network = make_policy(shapes, config).to(self.device)
         self.policy: TensorDictModuleBase = self.network
-        self.normalisers = Normalisers(self.network, critic_shapes, config)
+        own = [] if critic_shapes is None else make_normalisers(critic_shapes, config)
+        self.critic_normalisers = nn.ModuleList(own).to(self.device)
+        self._policy_normalisers: list[Any] = list(self.network.module)[:-1]
         self.gradient_steps = 0
-
-    @staticmethod
-    @abc.abstractmethod
-    def make_policy(shapes: NetworkShapes, config: Any) -> TensorDictSequential:
-        """A policy with fresh weights: raw observation in, action out."""
 
     def attach(self, env: EnvBase) -> None:  # noqa: B027
         """Adapt `policy` to the environment; called once, before the first batch."""
 
     def observe(self, batch: TensorDictBase) -> None:
         """Take observation statistics from a batch without learning from it."""
-        self.normalisers.observe(batch)
+        chosen: list[Any] = [*self._policy_normalisers, *self.critic_normalisers]
+        for module in chosen:
+            module.module.update(batch[module.in_keys[0]].to(self.device))
+
+    def normalise(self, batch: TensorDictBase, critic_only: bool = False) -> None:
+        """Add what policy and critic read to raw observations, or the critic alone."""
+        chosen: list[Any] = list(self.critic_normalisers)
+        if not critic_only or not chosen:
+            chosen = [*self._policy_normalisers, *chosen]
+        for module in chosen:
+            module(batch)
+
+    def descend(self, loss: torch.Tensor, max_norm: float = math.inf) -> torch.Tensor:
+        """Take a gradient step, with a gradient of `max_norm` at most; its norm."""
+        self.optimiser.zero_grad()
+        loss.backward()
+        norm = torch.zeros(())
+        if max_norm < math.inf:
+            (group,) = self.optimiser.param_groups
+            norm = nn.utils.clip_grad_norm_(group["params"], max_norm)
+        self.optimiser.step()
+        self.gradient_steps += 1
+        return norm
 
     @abc.abstractmethod
     def update(self, batch: TensorDictBase, progress: float) -> dict[str, float]:
@@ -92,7 +111,7 @@ class Learner(abc.ABC):
         return {
             "optimiser": self.optimiser.state_dict(),
             "gradient_steps": self.gradient_steps,
-            "normalisers": self.normalisers.critics.state_dict(),
+            "normalisers": self.critic_normalisers.state_dict(),
         }
 
     def load(self, policy: dict[str, Any], learning: dict[str, Any]) -> None:
@@ -100,8 +119,13 @@ class Learner(abc.ABC):
         self.network.load_state_dict(policy)
         self.optimiser.load_state_dict(learning["optimiser"])
         self.gradient_steps = learning["gradient_steps"]
-        # A checkpoint may have no critic with an observation of its own.
-        self.normalisers.critics.load_state_dict(learning.get("normalisers", {}))
+        self.critic_normalisers.load_state_dict(learning["normalisers"])
+
+
+def means(steps: Sequence[Mapping[str, torch.Tensor]]) -> dict[str, float]:
+    """Means of the figures of gradient steps by name; empty without a step."""
+    names = steps[0] if steps else ()
+    return {n: float(torch.stack([one[n] for one in steps]).mean()) for n in names}
 
 
 def make_collector(
@@ -129,7 +153,7 @@ def make_collector(
 
 
 def _on_cpu(
-    policy: TensorDictModuleBase, device: device
+    policy: TensorDictModuleBase, device: torch.device
 ) -> Callable[[TensorDictBase], TensorDictBase]:
     if device.type == "cpu":
         return policy

@@ -4,8 +4,6 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from tensordict.nn import TensorDictSequential
-
 from cathsim_dmc.agents.bc import BC, BCConfig
 from cathsim_dmc.agents.config import ConfigError, TrainingConfig
 from cathsim_dmc.agents.dagger import DAgger, DAggerConfig
@@ -13,12 +11,6 @@ from cathsim_dmc.agents.learner import Learner
 from cathsim_dmc.agents.networks import NetworkShapes
 from cathsim_dmc.agents.ppo import PPO, PPOConfig
 from cathsim_dmc.agents.sac import SAC, SACConfig
-
-# Fields of configs in older files that mean nothing any more.
-_RETIRED = frozenset(
-    {"backend", "collector", "collectors", "tensorboard"}
-    | {"rerun", "rerun_every", "rerun_steps", "rerun_viewer"}
-)
 
 
 class Algorithm(NamedTuple):
@@ -47,7 +39,8 @@ def make_config(
 
 def config_from_dict(values: Mapping[str, Any]) -> TrainingConfig:
     """The inverse of TrainingConfig.to_dict; ConfigError if a value is wrong."""
-    values = {name: one for name, one in values.items() if name not in _RETIRED}
+    # A field of older cards that means nothing any more.
+    values = {name: one for name, one in values.items() if name != "tensorboard"}
     kind = _choice(LEARNERS, values.pop("algorithm", None), "algorithm").config
     return kind.from_dict(values)
 
@@ -57,11 +50,6 @@ def make_learner(
 ) -> Learner:
     """The learner of a config's algorithm, with fresh weights."""
     return LEARNERS[config.algorithm].learner(config, shapes, directory)
-
-
-def make_policy(shapes: NetworkShapes, config: TrainingConfig) -> TensorDictSequential:
-    """The policy of a config's algorithm, with fresh weights."""
-    return LEARNERS[config.algorithm].learner.make_policy(shapes, config)
 
 
 def _choice(table: Mapping[str, Any], name: object, what: str) -> Any:

@@ -3,18 +3,16 @@
 import typing
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
-from typing import Any, cast
+from typing import Any
 
 import torch
-from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule, TensorDictSequential
 from torch import nn
 from torchrl.envs import EnvBase
 from torchrl.modules import ProbabilisticActor, TanhNormal, ValueOperator
 
-from cathsim_dmc.agents.actor_critic import ActorCriticConfig
-from cathsim_dmc.agents.config import ConfigError, TrainingConfig
-from cathsim_dmc.agents.fields import require_type, tuples
+from cathsim_dmc.agents.config import ActorCriticConfig, ConfigError, TrainingConfig
+from cathsim_dmc.agents.fields import checked
 from cathsim_dmc.agents.normalisation import ImageNormaliser, ObservationNormaliser
 from cathsim_dmc.simulation.environments import PIXELS, VECTOR
 from cathsim_dmc.tasks import observations
@@ -47,20 +45,24 @@ class NetworkShapes:
 
     @classmethod
     def of(cls, env: EnvBase) -> "NetworkShapes":
-        """Read the sizes from an environment's specs."""
-        spec = env.observation_spec
-        keys = list(spec.keys())
-        pixels = tuple(spec[PIXELS].shape[-3:]) if PIXELS in keys else None
-        vector = spec[VECTOR].shape[-1] if VECTOR in keys else 0
-        return cls(int(vector), pixels, int(env.action_spec.shape[-1]))
+        """The sizes of an environment's observation and action."""
+        return cls.sized(env.observation_spec, env.action_spec)
+
+    @classmethod
+    def sized(cls, observation: Any, action: Any) -> "NetworkShapes":
+        """The sizes of an observation and an action, or of their specs."""
+        keys, pixels = list(observation.keys()), None
+        if PIXELS in keys:
+            channels, height, width = observation[PIXELS].shape[-3:]
+            pixels = channels, height, width
+        vector = observation[VECTOR].shape[-1] if VECTOR in keys else 0
+        return cls(int(vector), pixels, int(action.shape[-1]))
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> "NetworkShapes":
         """The inverse of to_dict; ConfigError if a size is missing or no integer."""
-        fields = {name: tuples(values.get(name)) for name in cls.__annotations__}
-        for name, kind in typing.get_type_hints(cls).items():
-            require_type(f"shapes.{name}", fields[name], kind)
-        return cls(**fields)
+        kinds = typing.get_type_hints(cls).items()
+        return cls(**{n: checked(f"shapes.{n}", values.get(n), k) for n, k in kinds})
 
     def to_dict(self) -> dict[str, Any]:
         """JSON-able values."""
@@ -112,26 +114,24 @@ class Convolutions(nn.Module):
     def __init__(self, shape: tuple[int, int, int], config: TrainingConfig):
         super().__init__()
         layers: list[nn.Module] = []
-        channels, *size = shape
+        channels = shape[0]
         for filters, kernel, stride in config.convolutions:
-            if min(size) < kernel:
-                raise ConfigError(
-                    f"convolutions={config.convolutions!r} do not fit images of "
-                    f"{shape[1]} x {shape[2]} pixels: one of {kernel} x {kernel} "
-                    f"meets {size[0]} x {size[1]}; give fewer or smaller ones."
-                )
-            size = [(length - kernel) // stride + 1 for length in size]
             layers += [nn.Conv2d(channels, filters, kernel, stride), nn.ReLU()]
             channels = filters
         self.filters = nn.Sequential(*layers, nn.Flatten(-3))
-        entries = channels * size[0] * size[1]
+        try:
+            entries = self.filters(torch.zeros(shape)).numel()
+        except RuntimeError as error:
+            raise ConfigError(
+                f"convolutions do not fit images of {shape[1]} x {shape[2]} pixels; "
+                f"give fewer or smaller ones: {error}"
+            ) from error
         self.head = nn.Sequential(nn.Linear(entries, config.cnn_features), nn.ReLU())
 
     def forward(self, pixels: torch.Tensor) -> torch.Tensor:
         """Take any number of dimensions before the channels."""
-        batch = pixels.shape[:-3]
         flat = pixels.reshape(-1, *pixels.shape[-3:])
-        return self.head(self.filters(flat)).reshape(*batch, -1)
+        return self.head(self.filters(flat)).reshape(*pixels.shape[:-3], -1)
 
 
 class Body(nn.Module):
@@ -167,23 +167,15 @@ class Body(nn.Module):
 
 
 class GaussianActor(nn.Module):
-    """Mean and deviation of the actions before the tanh, each (..., actions).
+    """Mean and deviation of the actions before the tanh, each (..., actions)."""
 
-    Args:
-        state_dependent_std: whether the deviation is an output of the network (SAC)
-            or one parameter per action (PPO).
-    """
-
-    def __init__(
-        self, shapes: NetworkShapes, config: TrainingConfig, state_dependent_std: bool
-    ):
+    def __init__(self, shapes: NetworkShapes, config: TrainingConfig):
         super().__init__()
         self.body = Body(shapes, config)
         self.mean = nn.Linear(self.body.features, shapes.actions)
-        # A layer, or a parameter.
         self.log_std: nn.Linear | nn.Parameter = (
             nn.Linear(self.body.features, shapes.actions)
-            if state_dependent_std
+            if config.state_dependent_std
             else nn.Parameter(torch.zeros(shapes.actions))
         )
 
@@ -218,77 +210,32 @@ def orthogonal_(module: nn.Module, head: nn.Linear, gain: float) -> None:
                 nn.init.zeros_(layer.bias)
 
 
-def make_critic(shapes: NetworkShapes, config: TrainingConfig) -> ValueOperator:
-    """State value, key "state_value"."""
-    network = Value(shapes, config)
-    orthogonal_(network, network.value, 1.0)
-    return ValueOperator(network, in_keys=shapes.keys)
-
-
-def make_q_function(shapes: NetworkShapes, config: TrainingConfig) -> ValueOperator:
-    """Action value, key "state_action_value"."""
-    network = Value(shapes, config, shapes.actions)
-    return ValueOperator(network, in_keys=[*shapes.keys, "action"])
+def make_critic(
+    shapes: NetworkShapes, config: TrainingConfig, actions: int = 0
+) -> ValueOperator:
+    """State value, or with a number of actions the value of an action."""
+    keys = [*shapes.keys, "action"] if actions else shapes.keys
+    return ValueOperator(Value(shapes, config, actions), in_keys=keys)
 
 
 def make_normalisers(
     shapes: NetworkShapes, config: TrainingConfig
 ) -> list[TensorDictModule]:
     """The modules that turn raw observations into what the networks read."""
-    modules: list[TensorDictModule] = []
+    made: dict[str, nn.Module] = {}
     if shapes.vector:
-        vector = ObservationNormaliser(shapes.vector, config.observation_clip)
-        modules.append(TensorDictModule(vector, in_keys=[VECTOR], out_keys=[NORMAL]))
+        made[VECTOR] = ObservationNormaliser(shapes.vector, config.observation_clip)
     if shapes.pixels is not None:
-        images = ImageNormaliser(shapes.pixels, config.subtract_background)
-        modules.append(
-            TensorDictModule(images, in_keys=[PIXELS], out_keys=[NORMAL_PIXELS])
-        )
-    return modules
+        made[PIXELS] = ImageNormaliser(shapes.pixels, config.subtract_background)
+    return [
+        TensorDictModule(module, in_keys=[raw], out_keys=[key])
+        for (raw, module), key in zip(made.items(), shapes.keys, strict=True)
+    ]
 
 
-class Normalisers:
-    """The normalisers that a learner needs: of its policy, and of its critic.
-
-    Attributes:
-        critics: Those of what the critic alone reads; none if it reads what the policy
-            reads. The state of the others is that of the policy.
-    """
-
-    def __init__(
-        self,
-        policy: TensorDictSequential,
-        critic_shapes: NetworkShapes | None,
-        config: TrainingConfig,
-    ):
-        """Takes the sizes of what the critic reads, None for those of the policy."""
-        self._policys = cast(list[TensorDictModule], list(policy.module)[:-1])
-        own = [] if critic_shapes is None else make_normalisers(critic_shapes, config)
-        self.critics = nn.ModuleList(own).to(config.torch_device)
-        self._all = [*self._policys, *own]
-
-    def observe(self, batch: TensorDictBase) -> None:
-        """Take observation statistics from raw observations."""
-        for module in self._all:
-            statistics = cast(ObservationNormaliser | ImageNormaliser, module.module)
-            raw = batch[module.in_keys[0]]
-            statistics.update(raw.to(statistics.mean.device))
-
-    def add(self, batch: TensorDictBase) -> None:
-        """Add what policy and critic read to raw observations."""
-        for module in self._all:
-            module(batch)
-
-    def add_for_critic(self, batch: TensorDictBase) -> None:
-        """Add what the critic reads to raw observations."""
-        for module in self.critics or self._policys:
-            module(batch)
-
-
-def make_policy(
-    shapes: NetworkShapes, config: TrainingConfig, network: GaussianActor
-) -> TensorDictSequential:
+def make_policy(shapes: NetworkShapes, config: TrainingConfig) -> TensorDictSequential:
     """Normalisers and stochastic actor: raw observation in, action in [-1, 1] out."""
+    network = GaussianActor(shapes, config)
     actor = ProbabilisticActor(
         TensorDictModule(network, in_keys=shapes.keys, out_keys=["loc", "scale"]),
         in_keys=["loc", "scale"],
@@ -297,3 +244,8 @@ def make_policy(
         return_log_prob=True,
     )
     return TensorDictSequential(*make_normalisers(shapes, config), actor)
+
+
+def network_of(policy: nn.Module) -> GaussianActor:
+    """The network of a policy."""
+    return next(m for m in policy.modules() if isinstance(m, GaussianActor))

@@ -1,12 +1,14 @@
 """Policies by name, from a checkpoint, or from a function."""
 
+import types
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import torch
 from tensordict import TensorDict, TensorDictBase
+from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from cathsim_dmc import suite
@@ -37,7 +39,8 @@ class FunctionPolicy(Policy):
     def act(self, observation: Any) -> np.ndarray:
         """Actions (N, A) float32."""
         if not isinstance(observation, TensorDictBase):
-            observation = _tensors(observation)
+            entries = {k: torch.as_tensor(one)[None] for k, one in observation.items()}
+            observation = TensorDict(environments.standard(entries, 1), batch_size=[1])
         with set_exploration_type(ExplorationType.DETERMINISTIC):
             answer = self._function(observation)
         action = answer if isinstance(answer, torch.Tensor) else answer["action"]
@@ -55,49 +58,46 @@ class TrainedPolicy(FunctionPolicy):
         card: What the policy of a file reached, see `pretrained.read_card`.
     """
 
+    checkpoint: Checkpoint | None = None
+    card: dict[str, Any] | None = None
+
     def __init__(self, source: Checkpoint | Path):
         """Loads a checkpoint or a `.safetensors` file; CheckpointError if damaged."""
-        self.checkpoint = self.card = None
         if isinstance(source, Checkpoint):
-            self.checkpoint = source
-            network, self.shapes, self.config = (
-                source.policy(), source.shapes, source.config,
-            )  # fmt: skip
+            self.checkpoint, self.network = source, source.policy()
+            self.shapes, self.config = source.shapes, source.config
             self.task, self.task_kwargs = source.config.task, source.config.task_kwargs
             name = f"{source.config.algorithm} {source.path.name}"
         else:
-            self.card, network, self.shapes, self.config = pretrained.read_pretrained(
+            card, self.network, self.shapes, self.config = pretrained.read_pretrained(
                 source
             )
-            self.task, self.task_kwargs = self.card["task"], self.card["task_kwargs"]
-            name = f"{pretrained.PREFIX}{self.card['name']}"
-        super().__init__(network, name)
-        self.network, self.observation = network, self.config.observation
+            self.card, self.task, self.task_kwargs = (
+                card, card["task"], card["task_kwargs"],
+            )  # fmt: skip
+            name = f"{pretrained.PREFIX}{card['name']}"
+        super().__init__(self._answer, name)
+        self.observation = self.config.observation
 
     def reset(self, view: View, which: np.ndarray) -> None:
         """Refuse simulations of a device with other motors, as ValueError."""
-        if view.num_actions != self.shapes.actions:
-            raise ValueError(
-                f"{self.name} has actions of {self.shapes.actions} entries, the task "
-                f"has {view.num_actions}: play it with the device that it was trained "
-                f"with, that of {self.task} with {self.task_kwargs}"
-            )
+        self._require("has actions of", self.shapes.actions, view.num_actions)
 
-    def act(self, observation: Any) -> np.ndarray:
-        """Actions (N, A) float32; ValueError if the observation has another size."""
-        if not isinstance(observation, TensorDictBase):
-            observation = _tensors(observation)
-        vector = observation.get(environments.VECTOR, None)
-        size = 0 if vector is None else vector.shape[-1]
+    def _answer(self, observation: TensorDictBase) -> TensorDictBase:
         # In training its critic may have read numbers that it does not.
-        reads = environments.VECTOR in self.network.in_keys
-        if reads and size != self.shapes.vector:
+        if environments.VECTOR in self.network.in_keys:
+            vector = observation.get(environments.VECTOR, None)
+            size = 0 if vector is None else vector.shape[-1]
+            self._require("reads", self.shapes.vector, size)
+        return self.network(observation)
+
+    def _require(self, what: str, own: int, given: int) -> None:
+        if own != given:
             raise ValueError(
-                f"{self.name} reads {self.shapes.vector} numbers, the task gives "
-                f"{size}: play it with the device and the options that it was trained "
-                f"with, {self.task} with {self.task_kwargs}"
+                f"{self.name} {what} {own} numbers, the task gives {given}: play it "
+                "with the device and the options that it was trained with, "
+                f"{self.task} with {self.task_kwargs}"
             )
-        return super().act(observation)
 
 
 def load_policy(policy: PolicyLike, seed: int = 0) -> Policy:
@@ -125,12 +125,6 @@ def load_policy(policy: PolicyLike, seed: int = 0) -> Policy:
         is_file = path.suffix == pretrained.SUFFIX
         return TrainedPolicy(path if is_file else Checkpoint.open(path))
     return FunctionPolicy(policy)
-
-
-def _tensors(observation: Mapping[str, np.ndarray]) -> TensorDict:
-    """One observation as `environments.standard_observations` arranges it."""
-    entries = {name: torch.as_tensor(one)[None] for name, one in observation.items()}
-    return TensorDict(environments.standard(entries, 1), batch_size=[1])
 
 
 def task_and_options(
@@ -164,3 +158,16 @@ def task_and_options(
     if task != policy.task:
         trained = {name: value for name, value in trained.items() if name not in own}
     return task, {**trained, **options}
+
+
+def view_of(env: EnvBase) -> View:
+    """The view of the simulations of a TorchRL environment.
+
+    Of one that is not of this package only the numbers of simulations and actions.
+    """
+    base = getattr(env, "base_env", env)
+    if hasattr(base, "simulation"):
+        return View(base.simulation)
+    sizes = {"num_simulations": env.batch_size[0]}
+    sizes["num_actions"] = env.action_spec.shape[-1]
+    return cast(View, types.SimpleNamespace(**sizes))

@@ -1,8 +1,6 @@
 """Proximal policy optimisation on TorchRL's ClipPPOLoss and GAE."""
 
-import functools
 import math
-import operator
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,27 +8,27 @@ from typing import Any, ClassVar, cast
 
 import torch
 from tensordict import TensorDictBase
-from tensordict.nn import TensorDictSequential
 from torch import nn
 from torchrl.envs import EnvBase
 from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.value import GAE
 from typing_extensions import override
 
-from cathsim_dmc.agents.actor_critic import (
+from cathsim_dmc.agents.config import (
     TUNED_IMAGES,
     TUNED_TRAINING,
     ActorCriticConfig,
+    ConfigError,
+    TrainingConfig,
+    require,
 )
-from cathsim_dmc.agents.config import ConfigError, TrainingConfig, require
 from cathsim_dmc.agents.exploration import CorrelatedExploration, CorrelatedNoise
 from cathsim_dmc.agents.fields import positive, within
-from cathsim_dmc.agents.learner import Learner
+from cathsim_dmc.agents.learner import Learner, means
 from cathsim_dmc.agents.networks import (
-    GaussianActor,
     NetworkShapes,
     make_critic,
-    make_policy,
+    network_of,
     orthogonal_,
 )
 
@@ -54,7 +52,7 @@ _TUNED: Mapping[str, Any] = {
     "noise_shared": 0.8,
     "total_frames": 300_000,
 }
-_TERMS = ("loss_objective", "loss_critic", "loss_entropy")
+_TERMS = ("loss_objective", "loss_critic", "entropy", "kl_approx", "clip_fraction")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -99,31 +97,29 @@ class PPOConfig(ActorCriticConfig):
     steps_per_update: int = positive(512)
     minibatch_size: int = positive(32)
     epochs: int = positive(20)
-    gae_lambda: float = within(0.95, 0, 1)
-    clip: float = within(0.1, 0, 1, "()")
-    entropy_coefficient: float = within(5.85e-4, 0)
-    value_coefficient: float = within(0.872, 0)
+    gae_lambda: float = within(0.95, low=0, high=1)
+    clip: float = positive(0.1, high=0.999)
+    entropy_coefficient: float = within(5.85e-4, low=0)
+    value_coefficient: float = within(0.872, low=0)
     max_grad_norm: float = positive(1.0)
     target_kl: float | None = positive(None)
     initial_deviation: float = positive(1.0)
-    noise_correlation: float = within(0.0, 0, 1, "[)")
-    noise_shared: float = within(0.0, 0, 1, "[)")
+    noise_correlation: float = within(0.0, low=0, high=0.999)
+    noise_shared: float = within(0.0, low=0, high=0.999)
     anneal: bool = False
 
     def __post_init__(self):
         """Validate the algorithm's own fields after the shared ones."""
         super().__post_init__()
-        if self.steps_per_update % self.num_envs:
-            raise ConfigError(
-                f"steps_per_update={self.steps_per_update} is not a multiple of "
-                f"num_envs={self.num_envs}: choose num_envs that divides it, or set "
-                f"steps_per_update to a multiple."
-            )
-        if self.steps_per_update % self.minibatch_size:
-            raise ConfigError(
-                f"steps_per_update={self.steps_per_update} is not a multiple of "
-                f"minibatch_size={self.minibatch_size}: a smaller last minibatch "
-                f"would weigh its frames more than the others."
+        for name in ("num_envs", "minibatch_size"):
+            value = getattr(self, name)
+            # A smaller last minibatch would weigh its frames more than the others.
+            fits = self.steps_per_update % value == 0
+            require(
+                fits,
+                name,
+                value,
+                f"a divisor of steps_per_update={self.steps_per_update}",
             )
         require(self.minibatch_size > 1, "minibatch_size", self.minibatch_size, "> 1")
 
@@ -144,22 +140,19 @@ class PPO(Learner):
     """Updates from whole batches, collected with the policy of the moment."""
 
     metrics: ClassVar[tuple[str, ...]] = (
-        "loss_objective",
-        "loss_critic",
-        "entropy",
-        "kl_approx",
-        "clip_fraction",
-        "grad_norm",
-        "explained_variance",
-        "learning_rate",
-        "gradient_steps",
-    )
+        *_TERMS, "grad_norm", "explained_variance", "learning_rate", "gradient_steps",
+    )  # fmt: skip
 
     def __init__(self, config: PPOConfig, shapes: NetworkShapes, directory: Path):
         own, critic_shapes = shapes.split(config)
         super().__init__(config, own, directory, critic_shapes)
-        self.actor = self.network[-1]
+        self.actor, network = self.network[-1], network_of(self.network)
+        # A small head starts the policy near the middle of every action's range.
+        orthogonal_(network, network.mean, 0.01)
+        log_std = cast(nn.Parameter, network.log_std)
+        nn.init.constant_(log_std, math.log(config.initial_deviation))
         self.critic = make_critic(critic_shapes or own, config).to(self.device)
+        orthogonal_(self.critic, self.critic.module.value, 1.0)
         self.loss = ClipPPOLoss(
             self.actor,
             self.critic,
@@ -177,29 +170,15 @@ class PPO(Learner):
         self.advantage = GAE(
             gamma=config.gamma, lmbda=config.gae_lambda, value_network=None
         )
-        # A plain list: walking the loss module's parameters costs as much as a layer.
-        self.parameters = [*self.actor.parameters(), *self.critic.parameters()]
         self.optimiser = torch.optim.Adam(
-            self.parameters, lr=config.learning_rate, eps=1e-5, fused=True
+            [*self.actor.parameters(), *self.critic.parameters()],
+            lr=config.learning_rate,
+            eps=1e-5,
+            fused=True,
         )
-        self.loss_keys = [
-            *self.shapes.keys,
-            *(critic_shapes.keys if critic_shapes else []),
-            "action",
-            "action_log_prob",
-            "advantage",
-            "value_target",
-        ]
-
-    @staticmethod
-    @override
-    def make_policy(shapes: NetworkShapes, config: PPOConfig) -> TensorDictSequential:
-        network = GaussianActor(shapes, config, state_dependent_std=False)
-        log_std = cast(nn.Parameter, network.log_std)
-        nn.init.constant_(log_std, math.log(config.initial_deviation))
-        # A small head starts the policy near the middle of every action's range.
-        orthogonal_(network, network.mean, 0.01)
-        return make_policy(shapes, config, network)
+        critic_keys = critic_shapes.keys if critic_shapes else []
+        self.loss_keys = [*own.keys, *critic_keys, "action", "action_log_prob"]
+        self.loss_keys += ["advantage", "value_target"]
 
     @override
     def attach(self, env: EnvBase) -> None:
@@ -226,26 +205,19 @@ class PPO(Learner):
         batch = batch.to(self.device)
         explained = self._add_advantages(batch)
         frames = batch.select(*self.loss_keys).reshape(-1)
-        sums: dict[str, torch.Tensor] = {}
-        steps = 0
+        kept: list[dict[str, torch.Tensor]] = []
         for _ in range(config.epochs):
             # One gather per epoch; the minibatches are then views.
             shuffled = frames[torch.randperm(len(frames), device=self.device)]
-            divergence = 0.0
-            for minibatch in shuffled.split(config.minibatch_size):
-                terms = self._step(minibatch)
-                for name, value in terms.items():
-                    sums[name] = sums.get(name, 0.0) + value
-                divergence += terms["kl_approx"]
-                steps += 1
-            mean_kl = divergence * config.minibatch_size / len(frames)
-            if config.target_kl is not None and float(mean_kl) > config.target_kl:
+            last = [self._step(one) for one in shuffled.split(config.minibatch_size)]
+            kept += last
+            limit = config.target_kl
+            if limit is not None and means(last)["kl_approx"] > limit:
                 break
-        self.gradient_steps += steps
         # Only now: learning needs the statistics that the actions were chosen under.
         self.observe(batch)
         return {
-            **{name: float(value) / steps for name, value in sums.items()},
+            **means(kept),
             "explained_variance": explained,
             "learning_rate": self.optimiser.param_groups[0]["lr"],
             "gradient_steps": float(self.gradient_steps),
@@ -258,11 +230,9 @@ class PPO(Learner):
         A truncated episode continues in the value of its last observation, a
         terminated one is worth nothing afterwards: GAE reads both flags.
         """
-        following = batch["next"]
-        self.normalisers.add_for_critic(batch)
-        self.normalisers.add_for_critic(following)
-        self.critic(batch)
-        self.critic(following)
+        for states in (batch, batch["next"]):
+            self.normalise(states, critic_only=True)
+            self.critic(states)
         self.advantage(batch)
         target = batch["value_target"]
         left = (target - batch["state_value"]).var()
@@ -270,14 +240,9 @@ class PPO(Learner):
 
     def _step(self, minibatch: TensorDictBase) -> dict[str, torch.Tensor]:
         losses = self.loss(minibatch)
-        loss = functools.reduce(operator.add, (losses[name] for name in _TERMS))
-        self.optimiser.zero_grad()
-        loss.backward()
-        norm = nn.utils.clip_grad_norm_(self.parameters, self.config.max_grad_norm)
-        self.optimiser.step()
-        names = ("loss_objective", "loss_critic", "entropy", "kl_approx")
-        terms = {name: losses[name].detach() for name in (*names, "clip_fraction")}
-        return {**terms, "grad_norm": norm}
+        loss = losses["loss_objective"] + losses["loss_critic"] + losses["loss_entropy"]
+        norm = self.descend(loss, self.config.max_grad_norm)
+        return {**{name: losses[name].detach() for name in _TERMS}, "grad_norm": norm}
 
     @override
     def learning_state(self) -> dict[str, Any]:

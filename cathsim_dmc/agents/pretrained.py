@@ -1,14 +1,20 @@
 """Policies that ship with the package: weights in safetensors, and a card."""
 
-import hashlib
 import json
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from safetensors import SafetensorError
+from safetensors.torch import load
 from tensordict.nn import TensorDictSequential
 
-from cathsim_dmc.agents.checkpoint import CheckpointError, line_of, policy_of
+from cathsim_dmc.agents.checkpoint import (
+    CheckpointError,
+    line_of,
+    policy_of,
+    read_bytes,
+)
 from cathsim_dmc.agents.config import TrainingConfig
 from cathsim_dmc.agents.learners import config_from_dict
 from cathsim_dmc.agents.networks import NetworkShapes
@@ -18,14 +24,10 @@ PREFIX = "pretrained:"
 SUFFIX = ".safetensors"
 DIRECTORY = Path(__file__).parents[1] / "pretrained"
 _PARTS: Mapping[str, type] = {
-    "name": str,
-    "task": str,
-    "task_kwargs": dict,
-    "config": dict,
-    "shapes": dict,
-    "sha256": str,
-    "training": dict,
-    "evaluation": dict,
+    **dict.fromkeys(("name", "task", "sha256"), str),
+    **dict.fromkeys(
+        ("task_kwargs", "config", "shapes", "training", "evaluation"), dict
+    ),
 }
 
 
@@ -36,10 +38,9 @@ def pretrained_names(directory: str | Path = DIRECTORY) -> list[str]:
 
 def pretrained_path(name: str) -> Path:
     """Weights of the policy that ships under a name; CheckpointError lists names."""
-    name = name.removeprefix(PREFIX)
-    names = pretrained_names()
+    name, names = name.removeprefix(PREFIX), pretrained_names()
     if name not in names:
-        there = ", ".join(PREFIX + one for one in names) or "none yet"
+        there = ", ".join(PREFIX + one for one in names)
         raise CheckpointError(f"no policy {PREFIX}{name}; there are {there}.")
     return DIRECTORY / f"{name}{SUFFIX}"
 
@@ -55,23 +56,15 @@ def read_pretrained(
     Raises:
         CheckpointError: there is none, or it is damaged.
     """
-    from safetensors import SafetensorError
-    from safetensors.torch import load
-
     weights = Path(weights)
     card = read_card(weights.with_suffix(".json"))
+    data = read_bytes(weights, card["sha256"])
     try:
-        data = weights.read_bytes()
-        if hashlib.sha256(data).hexdigest() != card["sha256"]:
-            raise ValueError("the SHA-256 differs from that in its card")
         config = config_from_dict(card["config"])
         shapes = NetworkShapes.from_dict(card["shapes"])
         return card, policy_of(weights, load(data), shapes, config), shapes, config
-    except (OSError, SafetensorError, ValueError) as error:
-        raise CheckpointError(
-            f"{weights} cannot be used; it or its card is missing or damaged: "
-            f"{line_of(error)}"
-        ) from error
+    except (SafetensorError, ValueError) as error:
+        raise CheckpointError(f"{weights} cannot be used: {line_of(error)}") from error
 
 
 def read_card(path: str | Path) -> dict[str, Any]:

@@ -1,13 +1,13 @@
 """Conditions under which policies are evaluated."""
 
 import dataclasses
+import itertools
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
-from cathsim_dmc import suite
-from cathsim_dmc.entities import devices
+from cathsim_dmc import bounds, suite
 from cathsim_dmc.physics.randomisation import START_JITTER, Episode, Randomisation
 from cathsim_dmc.tasks.anatomies import POOL
 
@@ -84,9 +84,7 @@ class Part:
 
 def get(name: str) -> Protocol:
     """The protocol of a name; ValueError lists those that there are."""
-    if name not in PROTOCOLS:
-        raise ValueError(f"no protocol {name!r}; there are {', '.join(PROTOCOLS)}")
-    return PROTOCOLS[name]
+    return PROTOCOLS[bounds.choice("protocol", name, PROTOCOLS)]
 
 
 def parts(
@@ -109,7 +107,12 @@ def parts(
     """
     options = {**task_kwargs, **protocol.task_kwargs}
     ranges = Randomisation.make(options.get("randomisation", False))
-    pools = _pools(protocol, task, options)
+    preset = suite.TASKS[task].options if task in suite.TASKS else {}
+    coaxial = options.get("devices", preset.get("devices"))
+    pools = [options]
+    if not coaxial and options.get("device", "steerable_5f") in protocol.devices:
+        pools = [{**options, "device": name} for name in protocol.devices]
+    arches = options.get("pool", POOL) if random_arch(task) else 1
     found, played = [], 0
     for number, own in enumerate(pools):
         count = len(range(number, episodes, len(pools)))
@@ -117,24 +120,13 @@ def parts(
             continue
         first = seed + number * _CANDIDATES * episodes
         seeds = tuple(range(first, first + count))
-        arches = own.get("pool", POOL) if random_arch(task) else 1
         if protocol.task_kwargs:
             wanted = [n % arches for n in range(played, played + count)]
             seeds = stratified(ranges, wanted, first, arches)
         played += count
-        found.append(Part(own, seeds, _conditions(ranges, seeds, arches, own)))
+        drawn = tuple(_conditions(ranges, one, arches, own) for one in seeds)
+        found.append(Part(own, seeds, drawn if ranges != Randomisation() else ()))
     return tuple(found)
-
-
-def _pools(
-    protocol: Protocol, task: str, options: dict[str, Any]
-) -> list[dict[str, Any]]:
-    preset = suite.TASKS[task].options if task in suite.TASKS else {}
-    coaxial = options.get("devices", preset.get("devices"))
-    own = options.get("device", "steerable_5f")
-    if coaxial or own not in devices.DEVICES or own not in protocol.devices:
-        return [options]
-    return [{**options, "device": name} for name in protocol.devices]
 
 
 def random_arch(task: str) -> bool:
@@ -147,21 +139,16 @@ def _drawn(ranges: Randomisation, seed: int, arches: int) -> tuple[int, Episode]
 
 
 def _conditions(
-    ranges: Randomisation, seeds: Sequence[int], arches: int, options: Mapping[str, Any]
-) -> tuple[Mapping[str, Any], ...]:
-    if ranges == Randomisation():
-        return ()
-    found = []
-    for seed in seeds:
-        arch, episode = _drawn(ranges, seed, arches)
-        where = {"arch": options.get("first", 0) + arch} if arches > 1 else {}
-        values = {
-            name: value.tolist() if isinstance(value, np.ndarray) else value
-            for name, value in dataclasses.asdict(episode).items()
-            if value is not None
-        }
-        found.append({"device": options.get("device"), **where, **values})
-    return tuple(found)
+    ranges: Randomisation, seed: int, arches: int, options: Mapping[str, Any]
+) -> Mapping[str, Any]:
+    arch, episode = _drawn(ranges, seed, arches)
+    where = {"arch": options.get("first", 0) + arch} if arches > 1 else {}
+    values = {
+        name: value.tolist() if isinstance(value, np.ndarray) else value
+        for name, value in dataclasses.asdict(episode).items()
+        if value is not None
+    }
+    return {"device": options.get("device"), **where, **values}
 
 
 def stratified(
@@ -182,36 +169,25 @@ def stratified(
     Returns:
         Seeds, in the order of `wanted`.
     """
-    # Candidates of each arch, as many as its episodes may choose from.
-    left: dict[int, list[int]] = {arch: [] for arch in wanted}
+    # Candidates of each arch, as many as its episodes may choose from, and their bins.
+    left: dict[int, dict[int, np.ndarray]] = {arch: {} for arch in wanted}
     short = {arch: _CANDIDATES * wanted.count(arch) for arch in left}
-    candidate = seed
+    candidates = itertools.count(seed)
     while any(short.values()):
+        candidate = next(candidates)
         arch, _ = _drawn(Randomisation(), candidate, arches)
         if short.get(arch):
-            left[arch].append(candidate)
+            left[arch][candidate] = _bins(ranges, candidate, arches)
             short[arch] -= 1
-        candidate += 1
-    bins = {
-        candidate: _bins(ranges, candidate, arches)
-        for candidates in left.values()
-        for candidate in candidates
-    }
-    return _least_crowded(wanted, left, bins)
-
-
-def _least_crowded(
-    wanted: Sequence[int],
-    left: Mapping[int, list[int]],
-    bins: Mapping[int, np.ndarray],
-) -> tuple[int, ...]:
-    columns = np.arange(len(next(iter(bins.values()))))
-    filled = np.zeros((len(columns), _STRATA), dtype=int)
-    chosen = []
+    filled, chosen = np.zeros((len(_STRATIFIED), _STRATA), dtype=int), []
     for arch in wanted:
-        crowd = [(filled[columns, bins[c]] ** 2).sum() for c in left[arch]]
-        chosen.append(left[arch].pop(int(np.argmin(crowd))))
-        filled[columns, bins[chosen[-1]]] += 1
+        crowd = {
+            candidate: (filled[range(len(bins)), bins] ** 2).sum()
+            for candidate, bins in left[arch].items()
+        }
+        chosen.append(min(crowd, key=crowd.__getitem__))
+        bins = left[arch].pop(chosen[-1])
+        filled[range(len(bins)), bins] += 1
     return tuple(chosen)
 
 

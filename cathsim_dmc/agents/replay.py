@@ -36,7 +36,7 @@ class ReplayMemory:
     def __init__(
         self, directory: Path, keys: Sequence[Key], capacity: int, max_bytes: int
     ):
-        self.directory = Path(directory)
+        self.directory = directory
         self.capacity = capacity
         self.max_bytes = max_bytes
         self.cursor = 0
@@ -74,8 +74,6 @@ class ReplayMemory:
 
     def state(self) -> dict[str, Any]:
         """How far the ring is filled."""
-        if self._storage is None:
-            return {"cursor": 0, "size": 0, "capacity": self.capacity}
         return {"cursor": self.cursor, "size": self.size, "capacity": self.capacity}
 
     def load(self, state: Mapping[str, Any]) -> None:

@@ -1,7 +1,5 @@
 """Soft actor-critic on TorchRL's SACLoss and SoftUpdate."""
 
-import functools
-import operator
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -9,25 +7,19 @@ from typing import Any, ClassVar
 
 import torch
 from tensordict import TensorDictBase
-from tensordict.nn import TensorDictSequential
 from torchrl.objectives import SACLoss, SoftUpdate
 from typing_extensions import override
 
-from cathsim_dmc.agents.actor_critic import (
+from cathsim_dmc.agents.config import (
     TUNED_IMAGES,
     TUNED_TRAINING,
     ActorCriticConfig,
+    require,
 )
-from cathsim_dmc.agents.config import require
 from cathsim_dmc.agents.demonstrations import load_transitions
-from cathsim_dmc.agents.fields import positive, within
-from cathsim_dmc.agents.learner import Learner
-from cathsim_dmc.agents.networks import (
-    GaussianActor,
-    NetworkShapes,
-    make_policy,
-    make_q_function,
-)
+from cathsim_dmc.agents.fields import positive
+from cathsim_dmc.agents.learner import Learner, means
+from cathsim_dmc.agents.networks import NetworkShapes, make_critic
 from cathsim_dmc.agents.replay import ReplayMemory
 
 # 2 GiB hold about 270,000 transitions of the internal observation.
@@ -43,7 +35,7 @@ _TUNED: Mapping[str, Any] = {
     "initial_alpha": 1e-3,
     "total_frames": 60_000,
 }
-_TERMS = ("loss_actor", "loss_qvalue", "loss_alpha")
+_TERMS = ("loss_actor", "loss_qvalue", "loss_alpha", "alpha", "entropy")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -70,6 +62,7 @@ class SACConfig(ActorCriticConfig):
     """
 
     algorithm: ClassVar[str] = "sac"
+    state_dependent_std: ClassVar[bool] = True
     presets: ClassVar[Mapping[str, Mapping[str, Any]]] = {
         "published": {},
         "demo": {"num_envs": 32, "updates_per_frame": 0.25},
@@ -78,7 +71,7 @@ class SACConfig(ActorCriticConfig):
     }
 
     batch_size: int = positive(256)
-    tau: float = within(0.005, 0, 1, "(]")
+    tau: float = positive(0.005, high=1)
     replay_frames: int = positive(600_000)
     replay_bytes: int = positive(REPLAY_BYTES)
     random_frames: int = 5_000
@@ -91,24 +84,12 @@ class SACConfig(ActorCriticConfig):
     def __post_init__(self):
         """Validate the algorithm's own fields after the shared ones."""
         super().__post_init__()
-        require(
-            self.random_frames >= self.batch_size,
-            "random_frames",
-            self.random_frames,
-            f"at least batch_size={self.batch_size}",
-        )
-        require(
-            self.replay_frames >= max(self.batch_size, self.frames_per_batch),
-            "replay_frames",
-            self.replay_frames,
-            f"at least batch_size={self.batch_size} and "
-            f"num_envs * steps_per_env={self.frames_per_batch}",
-        )
-
-    @property
-    def frames_per_batch(self) -> int:
-        """Frames between two updates, over all environments."""
-        return self.num_envs * self.steps_per_env
+        first, most = self.random_frames, self.replay_frames
+        least = f"at least batch_size={self.batch_size}"
+        require(first >= self.batch_size, "random_frames", first, least)
+        least += f" and num_envs * steps_per_env={self.frames_per_batch}"
+        fits = most >= max(self.batch_size, self.frames_per_batch)
+        require(fits, "replay_frames", most, least)
 
 
 class SAC(Learner):
@@ -118,26 +99,18 @@ class SAC(Learner):
     when sampled, so old and new transitions agree.
     """
 
-    metrics: ClassVar[tuple[str, ...]] = (
-        "loss_actor",
-        "loss_qvalue",
-        "loss_alpha",
-        "alpha",
-        "entropy",
-        "replay_frames",
-        "gradient_steps",
-    )
+    metrics: ClassVar[tuple[str, ...]] = (*_TERMS, "replay_frames", "gradient_steps")
 
     def __init__(self, config: SACConfig, shapes: NetworkShapes, directory: Path):
         own, critic_shapes = shapes.split(config)
         super().__init__(config, own, directory, critic_shapes)
         self.random_frames = config.random_frames
         self.actor = self.network[-1]
-        q_function = make_q_function(critic_shapes or own, config).to(self.device)
+        critic = make_critic(critic_shapes or own, config, own.actions)
         target = config.target_entropy
         self.loss = SACLoss(
             self.actor,
-            q_function,
+            critic.to(self.device),
             num_qvalue_nets=2,
             loss_function="l2",
             alpha_init=config.initial_alpha,
@@ -156,12 +129,8 @@ class SAC(Learner):
             "action",
             *[("next", key) for key in keys],
         ]
-        self.replay = ReplayMemory(
-            directory / "replay",
-            self.replay_keys,
-            config.replay_frames,
-            config.replay_bytes,
-        )
+        limits = config.replay_frames, config.replay_bytes
+        self.replay = ReplayMemory(directory / "replay", self.replay_keys, *limits)
         self.demonstrations: TensorDictBase | None = None
         if config.demonstrations is not None:
             shown = load_transitions(
@@ -171,45 +140,32 @@ class SAC(Learner):
             self.observe(shown)
         self.owed_steps = 0.0
 
-    @staticmethod
-    @override
-    def make_policy(shapes: NetworkShapes, config: SACConfig) -> TensorDictSequential:
-        network = GaussianActor(shapes, config, state_dependent_std=True)
-        return make_policy(shapes, config, network)
-
     @override
     def update(self, batch: TensorDictBase, progress: float) -> dict[str, float]:
         transitions = batch.select(*self.replay_keys).reshape(-1)
         self.replay.extend(transitions)
         self.observe(batch)
-        sums: dict[str, torch.Tensor] = {}
-        steps = 0
         if len(self.replay) >= min(self.random_frames, self.replay.capacity):
             self.owed_steps += len(transitions) * self.config.updates_per_frame
-            steps = int(self.owed_steps)
-            self.owed_steps -= steps
-        for _ in range(steps):
-            for name, value in self._step().items():
-                sums[name] = sums.get(name, 0.0) + value
-        self.gradient_steps += steps
+        steps = int(self.owed_steps)
+        self.owed_steps -= steps
         return {
-            **{name: float(value) / steps for name, value in sums.items()},
+            **means([self._step() for _ in range(steps)]),
             "replay_frames": float(len(self.replay)),
             "gradient_steps": float(self.gradient_steps),
         }
 
     def _step(self) -> dict[str, torch.Tensor]:
         sample = self._sample(self.config.batch_size).to(self.device)
-        self.normalisers.add(sample)
-        self.normalisers.add(sample["next"])
+        self.normalise(sample)
+        self.normalise(sample["next"])
         losses = self.loss(sample)
         # Each term has gradients for its own parameters only, so one sum serves.
-        loss = functools.reduce(operator.add, (losses[name] for name in _TERMS))
-        self.optimiser.zero_grad()
-        loss.backward()
-        self.optimiser.step()
+        self.descend(
+            losses["loss_actor"] + losses["loss_qvalue"] + losses["loss_alpha"]
+        )
         self.targets.step()
-        return {name: losses[name].detach() for name in (*_TERMS, "alpha", "entropy")}
+        return {name: losses[name].detach() for name in _TERMS}
 
     def _sample(self, count: int) -> TensorDictBase:
         """Transitions (count,), half of them demonstrations if there are any."""

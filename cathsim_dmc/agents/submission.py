@@ -6,10 +6,9 @@ import subprocess
 from pathlib import Path
 from typing import Any
 
-from cathsim_dmc import __version__, files
+from cathsim_dmc import __version__, bounds, files, suite
 from cathsim_dmc.agents import actions, evaluation, pretrained
 from cathsim_dmc.agents.checkpoint import Checkpoint
-from cathsim_dmc.agents.report import require_registered
 from cathsim_dmc.policies import POLICIES
 
 PROTOCOL = "varied"
@@ -48,14 +47,14 @@ def submit(
     if out.suffix != ".json":
         raise ValueError(f"the submission is to be written to {out}; give a .json file")
     if task is not None:
-        require_registered(task)
+        bounds.choice("task", task, suite.SUITE)
     weights = digest_of(policy)
     player: str | actions.RecordedActions = policy
     if policy.endswith(actions.SUFFIX):
         player = actions.RecordedActions(policy)
         if task not in (None, player.task):
             raise ValueError(f"{policy} holds actions of {player.task}, not of {task}")
-        require_registered(str(player.task))
+        bounds.choice("task", player.task, suite.SUITE)
         actions.require_protocol(player, episodes)
     out.parent.mkdir(parents=True, exist_ok=True)
     result = evaluation.evaluate(

@@ -37,7 +37,6 @@ from cathsim_dmc.agents.warm_start import take_over
 from cathsim_dmc.simulation import environments
 
 CONFIG_FILE = "config.json"
-_LOCK_FILE = ".lock"
 
 
 @dataclass(frozen=True)
@@ -95,11 +94,18 @@ def train(
         OSError: the disk is full, or the directory cannot be written to.
     """
     run = Path(out_dir)
-    _require_device(config.torch_device)
+    try:
+        torch.zeros(1, device=config.torch_device)
+    except (RuntimeError, AssertionError, NotImplementedError) as error:
+        raise ConfigError(
+            f"torch_device={config.torch_device!r} cannot be used here "
+            f"({line_of(error)}); 'cpu' always can."
+        ) from error
     with contextlib.ExitStack() as stack:
         stack.enter_context(_only_process(run))
         checkpoint = _prepare(run, config, resume)
-        stack.enter_context(_torch_threads(config.torch_threads))
+        stack.callback(torch.set_num_threads, torch.get_num_threads())
+        torch.set_num_threads(config.torch_threads)
         env = _make_environment(config, checkpoint, make_env)
         torch.manual_seed(config.seed)
         learner = make_learner(config, NetworkShapes.of(env), run)
@@ -111,34 +117,21 @@ def train(
         files.write_text(run / CONFIG_FILE, text)
         # After everything that draws numbers while being made.
         if checkpoint:
-            torch.set_rng_state(state.pop("rng"))
+            torch.set_rng_state(state["rng"])
         else:
             torch.manual_seed(config.seed + 1)
-        log = TrainingLog(
-            run, config, learner.metrics, **state, resumed=checkpoint is not None,
-            progress=progress,
-        )  # fmt: skip
+        log = TrainingLog(run, config, learner.metrics, state, progress)
         stack.callback(log.close)
         newest = checkpoint.path if checkpoint else None
         loop = _Loop(run, config, iter(collector), learner, log, newest)
         return loop.run_until(stack.enter_context(_interruption()))
 
 
-def _require_device(name: str) -> None:
-    try:
-        torch.zeros(1, device=name)
-    except (RuntimeError, AssertionError, NotImplementedError) as error:
-        line = " ".join(str(error).split())[:200]
-        raise ConfigError(
-            f"torch_device={name!r} cannot be used here ({line}); 'cpu' always can."
-        ) from error
-
-
 @contextlib.contextmanager
 def _only_process(run: Path) -> Iterator[None]:
     """Make the directory of a run; lock it until this process ends, even killed."""
     run.mkdir(parents=True, exist_ok=True)
-    lock = FileLock(run / _LOCK_FILE)
+    lock = FileLock(run / ".lock")
     try:
         lock.acquire(blocking=False)
     except Timeout as error:
@@ -169,19 +162,19 @@ def _prepare(run: Path, config: TrainingConfig, resume: bool) -> Checkpoint | No
             f"there is no run in {run} to resume: give the directory of one, or start "
             "a new one without resume."
         )
-    checkpoint = Checkpoint.open(existing[-1]) if existing else None
-    if checkpoint is not None:
-        changed = checkpoint.config.changed_for_resume(config)
-        if changed:
-            lines = "; ".join(
-                f"{name}: the run has {old!r}, given is {new!r}"
-                for name, (old, new) in changed.items()
-            )
-            raise ConfigError(
-                f"{run} cannot be resumed with other settings ({lines}). Resume with "
-                f"the run's own, or start a new run in another directory. These may "
-                f"change: {sorted(config.resumable)}."
-            )
+    if not existing:
+        return None
+    checkpoint = Checkpoint.open(existing[-1])
+    changed = checkpoint.config.changed_for_resume(config).items()
+    if changed:
+        lines = (
+            f"{n}: the run has {old!r}, given is {new!r}" for n, (old, new) in changed
+        )
+        raise ConfigError(
+            f"{run} cannot be resumed with other settings ({'; '.join(lines)}). Resume "
+            "with the run's own, or start a new run in another directory. These may "
+            f"change: {sorted(config.resumable)}."
+        )
     return checkpoint
 
 
@@ -217,7 +210,7 @@ def _start(
     """
     if checkpoint is None:
         if config.initial_policy is not None:
-            take_over(learner.policy, config, learner.shapes)
+            take_over(learner.network, config, learner.shapes)
         elif config.normalisation_frames and not learner.random_frames:
             # The first update sees normalised observations.
             steps = math.ceil(config.normalisation_frames / config.num_envs)
@@ -227,21 +220,14 @@ def _start(
     if without_replay:
         state["learner"].pop("replay", None)
     try:
-        learner.load(policy, state["learner"])
+        learner.load(policy, state.pop("learner"))
     except (KeyError, TypeError, AttributeError, RuntimeError) as error:
         raise CheckpointError(
             f"{checkpoint.path} cannot be continued from: it does not fit what "
             f"{checkpoint.config.algorithm} learns with ({line_of(error)}). Its policy "
             "may still be evaluated."
         ) from error
-    return {
-        "frames": checkpoint.frames,
-        "seconds": checkpoint.seconds,
-        "rng": state["rng"],
-        "episodes": state["episodes"],
-        # A checkpoint may lack it.
-        "window": state.get("window", []),
-    }
+    return {"frames": checkpoint.frames, "seconds": checkpoint.seconds, **state}
 
 
 @dataclass
@@ -255,57 +241,57 @@ class _Loop:
     log: TrainingLog
     newest: Path | None
 
-    def __post_init__(self):
-        self._tracker = EpisodeTracker(self.config.num_envs)
-        self._frames, self._time = self.log.frames, time.monotonic()
-
     def run_until(self, interruption: threading.Event) -> TrainingResult:
         """Train to the last frame, or until an event is set."""
-        log, total = self.log, self.config.total_frames
-        while log.frames < total and not interruption.is_set():
-            self.step(interruption)
+        config, log = self.config, self.log
+        tracker, saved, since = (
+            EpisodeTracker(config.num_envs),
+            log.frames,
+            time.monotonic(),
+        )
+        while log.frames < config.total_frames and not interruption.is_set():
+            batch = next(self.batches)
+            finished = tracker.add(batch)
+            _truncate_diverged(batch)
+            losses = self.learner.update(batch, log.frames / config.total_frames)
+            frames = log.frames + batch.numel()
+            broken = {name: x for name, x in losses.items() if not math.isfinite(x)}
+            if broken:
+                raise FloatingPointError(
+                    f"after {frames} frames these are not finite: {broken}. Nothing "
+                    f"was saved since {self.newest}; lower the learning rate, or look "
+                    "at the observations."
+                )
+            step_reward = float(batch["next", "reward"].mean())
+            last = frames >= config.total_frames or interruption.is_set()
+            log.add(batch.numel(), finished, step_reward, losses, last)
+            if (
+                crossed(saved, log.frames, config.checkpoint_frames)
+                or time.monotonic() - since >= config.checkpoint_seconds
+            ):
+                self.save()
+                saved, since = log.frames, time.monotonic()
         # However it ended; writes nothing if the last batch has just been saved.
-        newest, short = self.save(), log.frames < total
+        newest, short = self.save(), log.frames < config.total_frames
         return TrainingResult(self.run, newest, log.frames, log.seconds, short, log.row)
 
-    def step(self, interruption: threading.Event) -> None:
-        config, log = self.config, self.log
-        batch = next(self.batches)
-        finished = self._tracker.add(batch)
-        _truncate_diverged(batch)
-        progress = min(log.frames / config.total_frames, 1.0)
-        losses = self.learner.update(batch, progress)
-        frames = log.frames + batch.numel()
-        _require_finite(losses, frames, self.newest)
-        log.add(
-            batch.numel(),
-            finished,
-            step_reward=float(batch["next", "reward"].mean()),
-            losses=losses,
-            last=frames >= config.total_frames or interruption.is_set(),
-        )
-        if (
-            crossed(self._frames, log.frames, config.checkpoint_frames)
-            or time.monotonic() - self._time >= config.checkpoint_seconds
-        ):
-            self.save()
-
     def save(self) -> Path:
+        """Write a checkpoint; return its directory."""
+        learner, log = self.learner, self.log
         self.newest = save_checkpoint(
             self.run,
             config=self.config,
-            shapes=self.learner.shapes,
-            frames=self.log.frames,
-            seconds=self.log.seconds,
-            policy=self.learner.policy_state(),
+            shapes=learner.shapes,
+            frames=log.frames,
+            seconds=log.seconds,
+            policy=learner.policy_state(),
             learning={
-                "learner": self.learner.learning_state(),
+                "learner": learner.learning_state(),
                 "rng": torch.get_rng_state(),
-                "episodes": self.log.episodes,
-                "window": list(self.log.window),
+                "episodes": log.episodes,
+                "window": list(log.window),
             },
         )
-        self._frames, self._time = self.log.frames, time.monotonic()
         return self.newest
 
 
@@ -323,40 +309,14 @@ def _truncate_diverged(batch: TensorDictBase) -> None:
 @contextlib.contextmanager
 def _interruption() -> Iterator[threading.Event]:
     """Yield an event that the first SIGINT or SIGTERM of the main thread sets."""
-    requested, before = threading.Event(), {}
+    requested = threading.Event()
+    with contextlib.ExitStack() as handlers:
 
-    def restore() -> None:
-        for number, handler in before.items():
-            signal.signal(number, handler)
-        before.clear()
+        def note(number: int, frame: object) -> None:
+            requested.set()
+            handlers.close()
 
-    def note(number: int, frame: object) -> None:
-        requested.set()
-        restore()
-
-    if threading.current_thread() is threading.main_thread():
-        for number in (signal.SIGINT, signal.SIGTERM):
-            before[number] = signal.signal(number, note)
-    try:
+        if threading.current_thread() is threading.main_thread():
+            for number in (signal.SIGINT, signal.SIGTERM):
+                handlers.callback(signal.signal, number, signal.signal(number, note))
         yield requested
-    finally:
-        restore()
-
-
-@contextlib.contextmanager
-def _torch_threads(count: int) -> Iterator[None]:
-    before = torch.get_num_threads()
-    torch.set_num_threads(count)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)
-
-
-def _require_finite(losses: dict[str, float], frames: int, saved: Path | None) -> None:
-    broken = {name: value for name, value in losses.items() if not math.isfinite(value)}
-    if broken:
-        raise FloatingPointError(
-            f"after {frames} frames these are not finite: {broken}. Nothing was saved "
-            f"since {saved}; lower the learning rate, or look at the observations."
-        )

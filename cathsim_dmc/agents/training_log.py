@@ -2,19 +2,24 @@
 
 import csv
 import io
+import sys
 import time
 from collections import deque
 from collections.abc import Iterable, Mapping, Sequence
 from operator import attrgetter
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from tqdm import tqdm
 
 from cathsim_dmc import files
 from cathsim_dmc.agents.config import TrainingConfig
 from cathsim_dmc.agents.episodes import EpisodeOutcome
-from cathsim_dmc.agents.progress import progress_bar
 
+# Seconds between two lines of progress in a log file, where no terminal redraws them.
+LINE_INTERVAL = 15.0
+_LINE = "{desc}: {n_fmt}{unit} [{elapsed}, {rate_fmt}{postfix}]\n"
 # Number of finished episodes over which the running figures are taken.
 EPISODE_WINDOW = 100
 
@@ -28,8 +33,9 @@ _FIGURES = {
 }
 _VALUES = attrgetter(*_FIGURES.values())
 # The rest of metrics.csv's columns are the learner's own.
-_COUNTS = ("frames", "seconds", "frames_per_second", "episodes")
-COLUMNS = (*_COUNTS, *_FIGURES, "step_reward")
+COLUMNS = (
+    "frames", "seconds", "frames_per_second", "episodes", *_FIGURES, "step_reward",
+)  # fmt: skip
 
 
 class TrainingLog:
@@ -47,39 +53,34 @@ class TrainingLog:
         run: Path,
         config: TrainingConfig,
         metrics: Sequence[str],
-        *,
-        frames: int,
-        seconds: float,
-        episodes: int,
-        window: Iterable[Sequence[float | None]],
-        resumed: bool,
+        state: Mapping[str, Any],
         progress: bool,
     ):
         """Opens the files, shows the progress and starts the clock.
 
         Args:
             metrics: Names of the learner's own figures.
-            frames: Number of frames that earlier processes of the run have seen.
+            state: What earlier processes of the run have counted: frames, seconds,
+                episodes and the figures ("window") of the last of these.
             progress: Whether to show progress on standard error.
         """
-        self.frames, self.episodes = frames, episodes
+        self.frames, self.episodes = state["frames"], state["episodes"]
+        self.window = deque(map(list, state["window"]), maxlen=EPISODE_WINDOW)
         self.row: dict[str, float | None] = {}
-        self.window = deque(map(list, window), maxlen=EPISODE_WINDOW)
         self._interval = config.metrics_frames
         self._path, self._columns = run / "metrics.csv", [*COLUMNS, *metrics]
         # A killed run has rows beyond its checkpoint.
-        rows = _texts(self._path) if resumed and self._path.exists() else []
-        self._rows: list[dict] = [r for r in rows if int(r["frames"]) <= frames]
+        rows = _texts(self._path) if self._path.exists() else []
+        self._rows: list[dict] = [r for r in rows if int(r["frames"]) <= self.frames]
         self._write()
         self._bar = progress_bar(
             f"{config.algorithm} {config.task}",
             " frames",
             total=config.total_frames,
-            initial=frames,
+            initial=self.frames,
             disable=not progress,
         )
-        self._frames_before, self._seconds_before = frames, seconds
-        self._began = time.monotonic()
+        self._before, self._began = state, time.monotonic()
 
     def close(self) -> None:
         """Closes the progress bar."""
@@ -88,7 +89,7 @@ class TrainingLog:
     @property
     def seconds(self) -> float:
         """Wall time of the run so far, over all its processes."""
-        return self._seconds_before + time.monotonic() - self._began
+        return self._before["seconds"] + time.monotonic() - self._began
 
     def add(
         self,
@@ -110,17 +111,15 @@ class TrainingLog:
             [v if v is None else float(v) for v in _VALUES(episode)]
             for episode in finished
         )
-        means = _episode_means(self.window)
+        means = {**_episode_means(self.window), "step_reward": step_reward}
         if last or crossed(before, self.frames, self._interval):
-            seconds = self.seconds
-            elapsed = seconds - self._seconds_before
+            new, seconds = self.frames - self._before["frames"], self.seconds
             self.row = {
                 "frames": self.frames,
                 "seconds": seconds,
-                "frames_per_second": (self.frames - self._frames_before) / elapsed,
+                "frames_per_second": new / (seconds - self._before["seconds"]),
                 "episodes": self.episodes,
                 **means,
-                "step_reward": step_reward,
                 **losses,
             }
             texts = {
@@ -129,11 +128,8 @@ class TrainingLog:
             }
             self._rows.append(texts)
             self._write()
-        shown = {"step_reward": step_reward, **means}
-        self._bar.set_postfix(
-            {name: value for name, value in shown.items() if value is not None},
-            refresh=False,
-        )
+        known = {name: value for name, value in means.items() if value is not None}
+        self._bar.set_postfix(known, refresh=False)
         self._bar.update(frames)
 
     def _write(self) -> None:
@@ -145,6 +141,21 @@ class TrainingLog:
         writer.writeheader()
         writer.writerows(self._rows)
         files.write_text(self._path, text.getvalue())
+
+
+def progress_bar(label: str, unit: str, **options: Any) -> tqdm:
+    """A bar of tqdm on standard error; a log file gets a line every 15 s."""
+    terminal = sys.stderr.isatty()
+    interval = 0.1 if terminal else LINE_INTERVAL
+    return tqdm(
+        desc=label,
+        unit=unit,
+        mininterval=interval,
+        maxinterval=max(interval, 10.0),
+        dynamic_ncols=terminal,
+        bar_format=None if terminal else _LINE,
+        **options,
+    )
 
 
 def _texts(path: Path) -> list[dict[str, str]]:

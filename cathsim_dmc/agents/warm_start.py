@@ -4,7 +4,6 @@ import torch
 from torch import nn
 
 from cathsim_dmc.agents.config import ConfigError, TrainingConfig
-from cathsim_dmc.agents.imitation import network_of, statistics_of
 from cathsim_dmc.agents.networks import LOG_STD_RANGE, NetworkShapes
 from cathsim_dmc.agents.policies import TrainedPolicy, load_policy
 from cathsim_dmc.tasks import observations
@@ -14,7 +13,9 @@ _ALIKE = ("hidden", "activation", "subtract_background",
           "convolutions", "cnn_features", "observation_clip")  # fmt: skip
 
 
-def take_over(policy: nn.Module, config: TrainingConfig, shapes: NetworkShapes) -> None:
+def take_over(
+    network: nn.Module, config: TrainingConfig, shapes: NetworkShapes
+) -> None:
     """Give a policy the weights and observation statistics of `initial_policy`.
 
     A deviation that depends on the state (SAC) starts as one that does not (PPO,
@@ -24,40 +25,41 @@ def take_over(policy: nn.Module, config: TrainingConfig, shapes: NetworkShapes) 
         ConfigError: the other policy has another network, sizes or observation.
         CheckpointError: there is none, or it is damaged.
     """
+    name = f"initial_policy={config.initial_policy!r}"
     source = load_policy(str(config.initial_policy))
     if not isinstance(source, TrainedPolicy):
         raise ConfigError(
-            f"initial_policy={config.initial_policy!r} has no network: give the "
-            'directory of a run or of a checkpoint, or "pretrained:NAME".'
+            f"{name} has no network: give the directory of a run or of a checkpoint, "
+            'or "pretrained:NAME".'
         )
+    pairs = {n: (getattr(source.config, n), getattr(config, n)) for n in _ALIKE}
+    pairs["sizes"] = source.shapes, shapes
+    seen = source.config.observation, config.observation
+    if _entries(seen[0]) != _entries(seen[1]):
+        pairs["observation"] = seen
     differing = [
-        f"{name}: it has {getattr(source.config, name)!r}, given is "
-        f"{getattr(config, name)!r}"
-        for name in _ALIKE
-        if getattr(source.config, name) != getattr(config, name)
+        f"{what}: it has {theirs!r}, given is {ours!r}"
+        for what, (theirs, ours) in pairs.items()
+        if theirs != ours
     ]
-    if _entries(source.config.observation) != _entries(config.observation):
-        differing.append(
-            f"observation: it has {source.config.observation!r}, given is "
-            f"{config.observation!r}"
-        )
-    if source.shapes != shapes:
-        differing.append(f"sizes: it has {source.shapes}, the task has {shapes}")
     if differing:
         raise ConfigError(
-            f"initial_policy={config.initial_policy!r} does not fit "
-            f"({'; '.join(differing)}); give the same settings, or another policy."
+            f"{name} does not fit ({'; '.join(differing)}); give the same settings, or "
+            "another policy."
         )
-    given = source.network
-    theirs, ours = network_of(given), network_of(policy)
-    ours.body.load_state_dict(theirs.body.state_dict())
-    ours.mean.load_state_dict(theirs.mean.state_dict())
-    with torch.no_grad():
-        _set_deviation(ours.log_std, theirs.log_std, config.initial_std)
-    for own, statistics in zip(
-        statistics_of(policy), statistics_of(given), strict=True
-    ):
-        own.load_state_dict(statistics.state_dict())
+    given, state = source.network.state_dict(), network.state_dict()
+    (middle,) = (v for n, v in given.items() if n.endswith(("log_std", "log_std.bias")))
+    if config.initial_std is not None:
+        middle = torch.full_like(middle, config.initial_std).log()
+    alike = given.keys() == state.keys() and config.initial_std is None
+    for key, value in state.items():
+        if alike or "log_std" not in key:
+            state[key] = given[key]
+        elif value.ndim == 1:
+            state[key] = middle.clamp(*LOG_STD_RANGE)
+        else:
+            state[key] = torch.zeros_like(value)  # alike in all states
+    network.load_state_dict(state)
 
 
 def _entries(names: str | tuple[str, ...]) -> list[str]:
@@ -67,21 +69,3 @@ def _entries(names: str | tuple[str, ...]) -> list[str]:
     """
     rows = observations.entries(observations.resolve(names))
     return sorted(entry.key.partition("_")[2] or entry.key for entry in rows)
-
-
-def _set_deviation(
-    ours: nn.Linear | nn.Parameter,
-    theirs: nn.Linear | nn.Parameter,
-    value: float | None,
-) -> None:
-    """Copy what a deviation depends on, or give it one value."""
-    if isinstance(ours, nn.Linear) and isinstance(theirs, nn.Linear) and value is None:
-        ours.load_state_dict(theirs.state_dict())
-        return
-    middle = theirs.bias if isinstance(theirs, nn.Linear) else theirs
-    if value is not None:
-        middle = torch.full_like(middle, value).log()
-    if isinstance(ours, nn.Linear):
-        ours.weight.zero_()
-    target = ours.bias if isinstance(ours, nn.Linear) else ours
-    target.data.copy_(middle.clamp(*LOG_STD_RANGE))

@@ -70,13 +70,14 @@ class EpisodeForces:
         return self.peak_max and self.peak_max.maximum
 
 
+STATISTICS = tuple(field.name for field in dataclasses.fields(Statistics))
 QUANTITIES = tuple(field.name for field in dataclasses.fields(EpisodeForces))
 # Properties of `EpisodeForces`.
 FIGURES = ("mean_force", "mean_contact_force", "max_force", "peak_force")
 
 
 class ForceTracker:
-    """Statistics of the running episodes of N simulations, step by step."""
+    """Forces of the running episodes of N simulations, step by step."""
 
     def __init__(self, num_simulations: int):
         """Starts N episodes.
@@ -84,12 +85,7 @@ class ForceTracker:
         Args:
             num_simulations: N.
         """
-        self._steps = np.zeros(num_simulations, dtype=np.int64)
-        shape = (len(QUANTITIES), num_simulations)
-        self._known = np.zeros(shape, dtype=bool)
-        self._total = np.zeros(shape)
-        self._contacts = np.zeros(shape, dtype=np.int64)
-        self._largest = np.zeros(shape)
+        self._steps: list[list[np.ndarray]] = [[] for _ in range(num_simulations)]
 
     def add(self, forces: Mapping[str, np.ndarray | None]) -> None:
         """Add a control step.
@@ -98,32 +94,26 @@ class ForceTracker:
             forces: Values (N,) in N by their names in `QUANTITIES`; None or left out
                 where they are not known.
         """
-        self._steps += 1
+        table = np.full((len(self._steps), len(QUANTITIES)), np.nan)
         for index, name in enumerate(QUANTITIES):
             values = forces.get(name)
-            if values is None:
-                continue
-            self._known[index] = True
-            self._total[index] += values
-            self._contacts[index] += values > 0
-            np.maximum(self._largest[index], values, out=self._largest[index])
+            if values is not None:
+                table[:, index] = values
+        for steps, row in zip(self._steps, table, strict=True):
+            steps.append(row)
 
     def finish(self, simulation: int) -> EpisodeForces:
         """Statistics of a simulation's episode, which ends; the next one begins."""
-        found = {}
-        for index, name in enumerate(QUANTITIES):
-            if self._known[index, simulation]:
-                total = self._total[index, simulation]
-                contacts = self._contacts[index, simulation]
-                found[name] = Statistics(
-                    mean=float(total / self._steps[simulation]),
-                    mean_in_contact=float(total / contacts) if contacts else None,
-                    maximum=float(self._largest[index, simulation]),
-                )
-        self._steps[simulation] = 0
-        for table in (self._known, self._total, self._contacts, self._largest):
-            table[:, simulation] = 0
-        return EpisodeForces(**found)
+        steps, self._steps[simulation] = self._steps[simulation], []
+        return EpisodeForces(*map(_statistics, np.transpose(steps)))
+
+
+def _statistics(values: np.ndarray) -> Statistics | None:
+    if np.isnan(values).any():
+        return None
+    touching = values[values > 0]
+    in_contact = float(touching.mean()) if len(touching) else None
+    return Statistics(float(values.mean()), in_contact, float(values.max()))
 
 
 def recorded_forces(episode: Episode) -> EpisodeForces:
@@ -134,17 +124,10 @@ def recorded_forces(episode: Episode) -> EpisodeForces:
         "peak_sum": episode.meta.get("wall_force_peak_sum"),
         "peak_max": episode.meta.get("wall_force_peak_max"),
     }
-    known = {
-        name: np.asarray(values, dtype=np.float64)
-        for name, values in columns.items()
-        if values is not None
-    }
     if not episode.steps:
         return EpisodeForces()
-    tracker = ForceTracker(1)
-    for step in range(episode.steps):
-        tracker.add({name: values[step : step + 1] for name, values in known.items()})
-    return tracker.finish(0)
+    known = {n: np.asarray(one, float) for n, one in columns.items() if one is not None}
+    return EpisodeForces(**{name: _statistics(one) for name, one in known.items()})
 
 
 def millinewtons(mean: float | None, deviation: float | None = None) -> str:

@@ -72,8 +72,7 @@ def force_map(
     x, z = position[:, AP_AXES].T
     count = np.histogram2d(z, x, edges[::-1])[0][:-1, :-1].astype(np.int64)
     total = np.histogram2d(z, x, edges[::-1], weights=force)[0][:-1, :-1]
-    mean = np.full(count.shape, np.nan)
-    np.divide(total, count, out=mean, where=count > 0)
+    mean = np.where(count > 0, total / np.maximum(count, 1), np.nan)
     outside = len(force) - int(count.sum())
     return ForceMap(edges[0][:-1], edges[1][:-1], mean, count, outside)
 

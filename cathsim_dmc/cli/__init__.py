@@ -1,120 +1,36 @@
-"""The command `cathsim`. Thin: every command imports what it needs when it runs."""
+"""The command `cathsim`: the module of a command is imported when it is called."""
 
+import importlib
 import os
 import sys
-from pathlib import Path
-from typing import Annotated
+from collections.abc import Callable
+from typing import Any
 
 from tyro import conf
 from tyro.extras import SubcommandApp
 
 from cathsim_dmc import __version__
-from cathsim_dmc.cli import agents, training
-from cathsim_dmc.cli.installation import doctor
-from cathsim_dmc.cli.measurements import validate
-from cathsim_dmc.cli.options import (
-    BAD_INPUT,
-    INTERRUPTED,
-    Json,
-    print_json,
-)  # fmt: skip
-from cathsim_dmc.cli.phantoms import phantoms
+from cathsim_dmc.cli.options import BAD_INPUT, INTERRUPTED
 
 _DESCRIPTION = (
     "Autonomous endovascular navigation: train, evaluate, record, validate. "
     "`cathsim COMMAND --help` explains a command, `cathsim --version` names it."
 )
-
-app = SubcommandApp()
-# First of the list of commands; what it does is put there when its arguments are known.
-app.command(name="train")(training.command([]))
-
-
-@app.command(name="list")
-def list_tasks(devices: bool = False, json: Json = False) -> int:
-    """List the tasks, or the devices with their properties.
-
-    Args:
-        devices: Whether to list the devices in place of the tasks.
-    """
-    from rich.console import Console
-    from rich.table import Table
-
-    if devices:
-        from cathsim_dmc.cli import devices as library
-
-        return library.show(json)
-    from cathsim_dmc import suite
-
-    lines = {name: make.__doc__.splitlines()[0] for name, make in suite.SUITE.items()}
-    if json:
-        print_json({"domain": suite.DOMAIN, "tasks": lines})
-        return 0
-    table = Table("task", "what to do", box=None)
-    for name, line in lines.items():
-        if not name.endswith(tuple(f"_{suffix}" for suffix in suite.COAXIAL)):
-            table.add_row(name, line)
-    for suffix, (_, words) in suite.COAXIAL.items():
-        table.add_row(f"…_{suffix}", f"Each task but navigate, {words}.")
-    Console().print(table)
-    return 0
-
-
-@app.command
-def dataset(
-    out: Annotated[Path, conf.Positional],
-    /,
-    anatomies: tuple[int, int, int] = (8, 2, 2),
-    sequences: int = 32,
-    frames: int = 32,
-    views: int = 2,
-    stride: int = 1,
-    size: int = 128,
-    vessel: str = "rigid",
-    pictures: bool = False,
-    seed: int = 0,
-    processes: int | None = None,
-    json: Json = False,
-) -> int:
-    """Write labelled fluoroscopy of random arches: images, masks, keypoints, forces.
-
-    Args:
-        out: Folder of the data set; an interrupted run goes on in it.
-        anatomies: Number of arches in train, val and test.
-        sequences: Number of motions in each anatomy.
-        frames: Number of frames of a sequence.
-        views: Number of C-arms that see each motion.
-        stride: Control steps of 40 ms from frame to frame.
-        size: Pixels along a side of an image.
-        vessel: State of the vessel: rigid, silicone or living.
-        pictures: Whether to write the images as PNG too, for tools of COCO.
-        seed: Seed of all that is drawn.
-        processes: Number of processes; one per core by default.
-    """
-    from cathsim_dmc.recording.image_set import ImageSetOptions, write
-
-    done = write(
-        out,
-        ImageSetOptions(
-            sequences, frames, views, stride, size, vessel, anatomies, pictures, seed
-        ),
-        processes=processes,
-        say=lambda text: print(text, file=sys.stderr, flush=True),
-    )
-    rates = done.new / done.seconds, done.new / done.processor
-    if json:
-        found = {**vars(done), "path": str(out), "frames_per_second": rates[0]}
-        print_json({**found, "frames_per_processor_second": rates[1]})
-        return 0
-    held = ", ".join(f"{count} {name}" for name, count in done.frames.items())
-    print(f"{held} images, {rates[0]:.0f} new ones a second: {out}")
-    return 0
-
-
-agents.add_to(app)
-app.command(doctor)
-app.command(phantoms, name="phantom", help="Make, import and check anatomies.")
-app.command(validate)
+# Where each command is, and what it does.
+COMMANDS = {
+    "train": ("training:command", "Train an agent."),
+    "list": ("listing:show", "List the tasks, or the devices with their properties."),
+    "dataset": ("recordings:dataset", "Write labelled fluoroscopy of random arches."),
+    "eval": ("agents:evaluate", "Play episodes with a policy and report figures."),
+    "submit": ("agents:submit", "Write a file for the leaderboard."),
+    "record": ("agents:record", "Record one episode: as a Rerun file, or as a film."),
+    "demos": ("agents:demos", "Write demonstrations of the expert as a dataset."),
+    "replay": ("recordings:replay", "Open a recording in the Rerun viewer."),
+    "play": ("agents:play", "Cannulate by keyboard, with the forces on the screen."),
+    "doctor": ("installation:doctor", "Check what is installed; say what to do."),
+    "phantom": ("phantoms:phantoms", "Make, import and check anatomies."),
+    "validate": ("measurements:validate", "Compare the physics with theory."),
+}
 
 
 def main() -> None:
@@ -129,14 +45,8 @@ def main() -> None:
     except KeyboardInterrupt:
         print("cathsim: interrupted", file=sys.stderr)
         code = INTERRUPTED
-    except (
-        ValueError,
-        OSError,
-        RuntimeError,
-        ImportError,
-        ArithmeticError,
-        MemoryError,
-    ) as error:
+    except (ValueError, OSError, RuntimeError, ImportError, ArithmeticError,
+            MemoryError) as error:  # fmt: skip
         # Errors with a message for the user; anything else is ours, with traceback.
         text = " ".join(str(error).split()) or "no message"
         print(f"cathsim: {type(error).__name__}: {text}", file=sys.stderr)
@@ -148,10 +58,26 @@ def _run(arguments: list[str]) -> int:
     if arguments == ["--version"]:
         print(f"cathsim-dmc {__version__}")
         return 0
-    app.command(name="train")(training.command(arguments))
-    app.command(name="eval")(agents.evaluation(arguments))
+    app = SubcommandApp()
+    for name, (where, summary) in COMMANDS.items():
+        command: Any = _line(summary)
+        if arguments[:1] == [name]:
+            module, _, function = where.partition(":")
+            found = importlib.import_module(f"cathsim_dmc.cli.{module}")
+            command = getattr(found, function)
+            if name == "train":  # its options depend on its arguments
+                command = command(arguments[1:])
+        app.command(command, name=name)
     return app.cli(
-        prog="cathsim",
-        description=_DESCRIPTION,
-        config=(conf.OmitArgPrefixes,),
+        prog="cathsim", description=_DESCRIPTION, config=(conf.OmitArgPrefixes,)
     )
+
+
+def _line(summary: str) -> Callable[[], int]:
+    """A command that is only listed."""
+
+    def listed() -> int:
+        raise AssertionError("another command is called")
+
+    listed.__doc__ = summary
+    return listed

@@ -1,78 +1,65 @@
-"""`cathsim eval`, `record`, `demos`, `replay` and `play`."""
+"""`cathsim eval`, `submit`, `record`, `demos` and `play`."""
 
-import dataclasses
 import sys
-from collections.abc import Callable, Sequence
+import time
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
+import numpy as np
 from tyro import conf
-from tyro.extras import SubcommandApp
 
-from cathsim_dmc.cli.options import (
-    DEMONSTRATION_SEED,
-    EVALUATION_SEED,
-    NO_ANATOMY,
-    Json,
-    MaxSteps,
-    OwnAnatomy,
-    PolicyName,
-    Task,
-    Threads,
-    print_json,
-)  # fmt: skip
-from cathsim_dmc.cli.task_options import given, task_kind
+# torchrl goes before dm_control.
+from cathsim_dmc import agents  # isort: skip
 
+from cathsim_dmc import bounds, files, suite
+from cathsim_dmc import play as by_hand
+from cathsim_dmc.agents import evaluation, submission
+from cathsim_dmc.agents.demonstrations import DEMONSTRATION_SEED
+from cathsim_dmc.agents.policies import task_and_options
+from cathsim_dmc.agents.training_log import LINE_INTERVAL, progress_bar
+from cathsim_dmc.analysis.force_statistics import millinewtons, recorded_forces
+from cathsim_dmc.cli import tables
+from cathsim_dmc.cli.options import EVALUATION_SEED, Json, Task, Threads, print_json
+from cathsim_dmc.cli.task_options import TaskOptions, task_kind
+from cathsim_dmc.pictures import recorded
+from cathsim_dmc.pictures.animation import SUFFIXES
+from cathsim_dmc.policies import in_environment
+from cathsim_dmc.recording.recorder import EpisodeRecorder
 
-def add_to(app: SubcommandApp) -> None:
-    """Adds the commands."""
-    app.command(name="eval")(evaluation([]))
-    for command in (submit, record, demos, replay, play):
-        app.command(command)
-
-
-@dataclasses.dataclass(frozen=True)
-class NoOptions:
-    """Stands for the options of a task where another command is called."""
-
-
-def evaluation(arguments: Sequence[str]) -> Callable[..., int]:
-    """The command `eval` for a command line.
-
-    Args:
-        arguments: Arguments of `cathsim`. If they are for another command, the options
-            of the task, which take time to import, are left out.
-    """
-    kind: type = NoOptions
-    if list(arguments[:1]) == ["eval"]:
-        from cathsim_dmc import agents  # noqa: F401  torchrl goes before dm_control
-
-        kind = task_kind(frozenset({"observation"}))
-    evaluate.__annotations__["options"] = Annotated[kind, conf.arg(name="")]
-    return evaluate
+PolicyName = Annotated[
+    str,
+    conf.Positional,
+    conf.arg(
+        help="Directory of a run or checkpoint, or name of a policy: random, push, "
+        "expert, idle, curl, random_curl, pretrained:NAME."
+    ),
+]
+_TASK = (
+    "Task of `cathsim list`; by default the one that the policy was trained on, or "
+    "navigate where `--anatomy` names another anatomy."
+)
+PolicysTask = Annotated[str | None, conf.arg(help=_TASK)]
+Options = Annotated[TaskOptions, conf.arg(name="", constructor=task_kind())]
 
 
 def evaluate(
     policy: PolicyName,
     /,
-    task: str | None = None,
+    task: PolicysTask = None,
     episodes: int | None = None,
     seed: int = EVALUATION_SEED,
     protocol: Literal["published", "varied"] = "published",
     out: Path | None = None,
     baseline: bool = True,
-    anatomy: OwnAnatomy = NO_ANATOMY,
     threads: Threads = None,
     report: bool = False,
     json: Json = False,
     *,
-    options: NoOptions,
+    options: Options,
 ) -> int:
     """Play episodes with a policy and report reward, forces and success.
 
     Args:
-        task: Task of `cathsim list`; by default the one that the policy was trained on,
-            or navigate where `--anatomy` names another anatomy.
         episodes: Number of episodes, each with a seed of its own; by default 30, and
             100 of the varied protocol.
         seed: Seed of the first episode; the others lie above it.
@@ -81,31 +68,46 @@ def evaluate(
             and noise differ from episode to episode.
         out: Directory for evaluation.json and heatmap.png.
         baseline: Whether to compare with the random policy on the same seeds.
-        anatomy: Where the task takes place.
         report: Whether to print each episode too: seed, anatomy, device, end, time,
             path and forces (docs/start.md).
         options: Options of the task, over those that the policy was trained with.
     """
-    from cathsim_dmc.agents import report as reports
+    began = time.monotonic()
+    player = agents.load_policy(policy, seed)
+    task, task_kwargs = task_and_options(player, task, options.given)
+    bounds.choice("task", task, suite.SUITE)
+    contacts = evaluation.ContactLog()
 
-    result = reports.evaluate(
-        policy,
-        task=task,
-        episodes=episodes,
-        seed=seed,
-        protocol=protocol,
-        task_kwargs={**given(options), **anatomy.task_kwargs},
-        num_threads=threads,
-        baseline=baseline,
-        out_dir=out,
-    )
+    def play(who: Any, out_dir: Path | None = None) -> evaluation.EvaluationResult:
+        bar = progress_bar(getattr(who, "name", who), " steps", delay=LINE_INTERVAL)
+
+        def observe(env: Any, running: np.ndarray) -> None:
+            if who is player:
+                contacts(env, running)
+            text = f"{np.count_nonzero(running)} of {len(running)} episodes run"
+            bar.set_postfix_str(text, refresh=False)
+            bar.update()
+
+        return agents.evaluate(
+            who, task, episodes, seed, protocol=protocol, task_kwargs=task_kwargs,
+            num_threads=threads, observer=observe, out_dir=out_dir,
+        )  # fmt: skip
+
+    results = {"policy": play(player, out)}
+    if baseline and policy != "random":
+        results["baseline"] = play("random")
+    values: dict[str, Any] = {name: one.to_dict() for name, one in results.items()}
+    values["seconds"] = round(time.monotonic() - began, 1)
+    if out is not None:
+        evaluation.write_evaluation(out, values)
+        contacts.draw(results["policy"], out / "heatmap.png")
     if json:
         # No figure of a policy has a bar to keep.
-        print_json({"checks": [], **result.to_dict()})
-    else:
-        result.print()
-        if report:
-            result.print_episodes()
+        print_json({"checks": [], **values})
+        return 0
+    tables.print_results(*results.values())
+    if report:
+        tables.print_episodes(results["policy"])
     return 0
 
 
@@ -113,7 +115,7 @@ def submit(
     policy: PolicyName,
     /,
     out: Path,
-    task: str | None = None,
+    task: PolicysTask = None,
     episodes: int | None = None,
     threads: Threads = None,
 ) -> int:
@@ -123,13 +125,9 @@ def submit(
 
     Args:
         out: File to write, ending in .json.
-        task: Task of `cathsim list`; by default the one that the policy was trained on.
         episodes: Number of episodes; fewer than the 100 of the protocol are not listed.
     """
-    from cathsim_dmc.agents import submission
-
-    given = {"episodes": episodes, "num_threads": threads}
-    done = submission.submit(policy, out, task, **given)
+    done = submission.submit(policy, out, task, episodes=episodes, num_threads=threads)
     rates = done["summary"]["success"], done["summary"]["safe_success"]
     print(f"{out}: success {rates[0]}, safe success {rates[1]}, {done['sha256']}")
     return 0
@@ -140,38 +138,50 @@ def record(
     /,
     out: Path | None = None,
     gif: Path | None = None,
-    task: str | None = None,
+    task: PolicysTask = None,
     seed: int = EVALUATION_SEED,
-    max_steps: MaxSteps = None,
-    anatomy: OwnAnatomy = NO_ANATOMY,
     fluoroscopy: bool = True,
+    *,
+    options: Annotated[
+        TaskOptions,
+        conf.arg(name="", constructor=task_kind(("observation", "fluoroscopy"))),
+    ],
 ) -> int:
     """Record one episode: as a Rerun file, and as .npz beside it; or as a film.
 
     Args:
         out: Path of the .rrd file.
         gif: Path of a film for slides, .gif or .webp; needs no OpenGL.
-        task: Task of `cathsim list`; by default the one that the policy was trained on,
-            or navigate where `--anatomy` names another anatomy.
         seed: Seed of the episode.
-        anatomy: Where the task takes place.
         fluoroscopy: Whether to include X-ray images.
+        options: Options of the task, over those that the policy was trained with.
     """
-    from cathsim_dmc.agents import report
-    from cathsim_dmc.analysis.force_statistics import millinewtons, recorded_forces
-
-    episode = report.record(
-        policy,
-        out,
-        task=task,
-        seed=seed,
-        max_steps=max_steps,
-        task_kwargs=anatomy.task_kwargs,
-        fluoroscopy=fluoroscopy,
-        gif=gif,
-    )
-    written = " ".join(str(path) for path in (out, gif) if path is not None)
-    print(f"{episode.steps} steps, {episode.termination}: {written}")
+    targets = [path for path in (out, gif) if path is not None]
+    if not targets:
+        raise ValueError("nothing is to be written; give --out, an .rrd file, or --gif")
+    for path, endings in (out, (".rrd",)), (gif, SUFFIXES):
+        if path is not None and path.suffix not in endings:
+            raise ValueError(f"{path} does not end in {' or '.join(endings)}")
+    bounds.seed("seed", seed)
+    player = agents.load_policy(policy, seed)
+    task, task_kwargs = task_and_options(player, task, options.given)
+    bounds.choice("task", task, suite.SUITE)
+    # Now: an episode that cannot be written would be lost.
+    for path in targets:
+        path.parent.mkdir(parents=True, exist_ok=True)
+    if player.observation is not None:
+        task_kwargs["observation"] = player.observation
+    env = suite.load(suite.DOMAIN, task, {**task_kwargs, "random": seed})
+    recorder = EpisodeRecorder(env, task, task_kwargs)
+    episode = recorder.record_episode(in_environment(player, env), seed)
+    if out is not None:
+        # Put in place last, once both are written.
+        with files.atomic_path(out.with_suffix(".npz")) as arrays:
+            episode.write(arrays)
+            recorded.write(episode, env, out, fluoroscopy)
+    if gif is not None:
+        recorded.write(episode, env, gif)
+    print(f"{episode.steps} steps, {episode.termination}:", *targets)
     forces = recorded_forces(episode)
     if forces.mean_force is not None:
         print(
@@ -189,10 +199,10 @@ def demos(
     observation: tuple[str, ...] = ("tracking",),
     noise: float = 0.0,
     seed: int = DEMONSTRATION_SEED,
-    max_steps: MaxSteps = None,
-    anatomy: OwnAnatomy = NO_ANATOMY,
     threads: Threads = None,
     json: Json = False,
+    *,
+    options: Options,
 ) -> int:
     """Write demonstrations of the expert as a Minari dataset.
 
@@ -204,12 +214,8 @@ def demos(
         noise: Standard deviation of normal noise added to every entry of the expert's
             action, so that it shows how it comes back to its way.
         seed: Seed of the first episode; the others count up.
-        anatomy: Anatomy of one's own, for the task `navigate`.
+        options: Options of the task.
     """
-    from cathsim_dmc import agents
-    from cathsim_dmc.analysis.force_statistics import millinewtons
-
-    limit = {} if max_steps is None else {"max_steps": max_steps}
     done = agents.record_demonstrations(
         task,
         out,
@@ -217,7 +223,7 @@ def demos(
         observation=observation if len(observation) != 1 else observation[0],
         seed=seed,
         noise=noise,
-        task_kwargs={**limit, **anatomy.task_kwargs},
+        task_kwargs=options.given,
         num_threads=threads,
         say=lambda text: print(text, file=sys.stderr, flush=True),
     )
@@ -232,25 +238,6 @@ def demos(
     return 0
 
 
-def replay(
-    recording: Annotated[Path, conf.Positional],
-    /,
-    web: bool = False,
-    port: int = 9090,
-) -> int:
-    """Open a recording in the Rerun viewer.
-
-    Args:
-        recording: Path of an .rrd file.
-        web: Whether to serve it to a browser instead of opening a window.
-        port: Port of the web page.
-    """
-    from cathsim_dmc.recording import viewer
-
-    viewer.open_viewer(recording, web=web, port=port)
-    return 0
-
-
 def play(
     task: Task,
     /,
@@ -259,7 +246,8 @@ def play(
     episodes: int | None = None,
     speed: float = 1.0,
     policy: str | None = None,
-    anatomy: OwnAnatomy = NO_ANATOMY,
+    *,
+    options: Options,
 ) -> int:
     """Cannulate by keyboard, with the forces on the screen.
 
@@ -270,24 +258,16 @@ def play(
         speed: Speed of the simulation, in multiples of real time.
         policy: Policy to watch instead of playing yourself: directory of a run or of
             a checkpoint, or name of a policy, such as "pretrained:type1_bca".
-        anatomy: Where the task takes place.
+        options: Options of the task.
     """
-    watched = None
-    if policy is not None:
-        # torchrl goes before dm_control.
-        from cathsim_dmc.agents import load_policy
-
-        watched = load_policy(policy, seed)
-    from cathsim_dmc.play import play as run
-
-    written = run(
+    written = by_hand.play(
         task,
         out,
         seed=seed,
         episodes=episodes,
         speed=speed,
-        task_kwargs=anatomy.task_kwargs,
-        policy=watched,
+        task_kwargs=options.given,
+        policy=agents.load_policy(policy, seed) if policy else None,
     )
     for path in written:
         print(path)

@@ -8,7 +8,10 @@ from importlib import metadata
 from pathlib import Path
 from typing import NamedTuple
 
+from packaging.requirements import Requirement
+
 from cathsim_dmc.cli.options import CHECK_FAILED, Json, print_json
+from cathsim_dmc.collision import loops
 
 _OPENGL = "import mujoco; mujoco.GLContext(8, 8).make_current()"
 
@@ -43,8 +46,6 @@ def doctor(json: Json = False) -> int:
 
 
 def _versions(name: str) -> list[Finding]:
-    from packaging.requirements import Requirement
-
     try:
         required, own = metadata.requires(name) or (), metadata.version(name)
     except metadata.PackageNotFoundError:
@@ -64,8 +65,6 @@ def _versions(name: str) -> list[Finding]:
 
 
 def _kernels() -> Finding:
-    from cathsim_dmc.collision import loops
-
     folder = loops.straight.cache_path
     if folder is None:
         advice = "every process compiles anew; set NUMBA_CACHE_DIR to a folder"
@@ -76,9 +75,9 @@ def _kernels() -> Finding:
 
 
 def _opengl() -> Finding:
-    name = os.environ.get("MUJOCO_GL", "not set")
     command = [sys.executable, "-c", _OPENGL]
     works = not subprocess.run(command, capture_output=True, check=False).returncode
     advice = "" if works else "physics.render and viewers need it: try MUJOCO_GL=egl"
-    found = f"{'works' if works else 'none'} (MUJOCO_GL {name})"
+    setting = os.environ.get("MUJOCO_GL", "not set")
+    found = f"{'works' if works else 'none'} (MUJOCO_GL {setting})"
     return Finding("OpenGL", found, note=advice)

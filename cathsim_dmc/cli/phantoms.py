@@ -2,16 +2,21 @@
 
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import Annotated, Literal
 
 from tyro import conf
 from tyro.extras import SubcommandApp
 
-from cathsim_dmc import bounds
-from cathsim_dmc.cli.options import Access, Json, print_json, show
-
-if TYPE_CHECKING:
-    from cathsim_dmc.anatomy import Anatomy
+from cathsim_dmc import bounds, suite
+from cathsim_dmc.anatomy import export as exported
+from cathsim_dmc.anatomy import phantoms as shipped
+from cathsim_dmc.anatomy.arch import arch
+from cathsim_dmc.anatomy.scan.importer import import_scan
+from cathsim_dmc.anatomy.scan.places import describe
+from cathsim_dmc.anatomy.tree_file import read_tree
+from cathsim_dmc.cli.options import Json, print_json, show
+from cathsim_dmc.validation import views
+from cathsim_dmc.validation.wall import validate_anatomy
 
 phantoms = SubcommandApp()
 _PICTURE = "check.png"  # three views of an anatomy, in its directory
@@ -51,16 +56,13 @@ def import_phantom(
         heart: Near the end of the aorta that is at the heart; found if not given.
         rename: Names of computed branches, each as computed=wanted.
     """
-    from cathsim_dmc.anatomy.scan.importer import import_scan
-    from cathsim_dmc.anatomy.scan.places import describe
-    from cathsim_dmc.validation import views
-
-    changes = dict(_change(text) for text in rename)
+    changes = [text.partition("=") for text in rename]
+    for old, _, new in changes:
+        if not (old and new):
+            raise ValueError(
+                f"rename is {rename}; give computed=wanted, e.g. branch_1=lra"
+            )
     notes: list[str] = []
-
-    def progress(text: str) -> None:
-        print(text, file=sys.stderr, flush=True)
-
     anatomy = import_scan(
         mesh,
         centreline,
@@ -71,28 +73,15 @@ def import_phantom(
         name=name or out.name,
         inlet=inlet,
         heart=heart,
-        rename=changes,
-        progress=progress,
+        rename={old: new for old, _, new in changes},
+        progress=lambda text: print(text, file=sys.stderr, flush=True),
         notes=notes,
     )
     anatomy.save(out)
     views.draw(anatomy, out / _PICTURE)
-    print_json(
-        {
-            "directory": str(out),
-            "picture": str(out / _PICTURE),
-            "notes": notes,
-            **describe(anatomy),
-        }
-    )
+    files = {"directory": str(out), "picture": str(out / _PICTURE), "notes": notes}
+    print_json({**files, **describe(anatomy)})
     return 0
-
-
-def _change(text: str) -> tuple[str, str]:
-    old, equals, new = text.partition("=")
-    if not equals or not old or not new:
-        raise ValueError(f"rename is {text!r}; give computed=wanted, e.g. branch_1=lra")
-    return old, new
 
 
 @phantoms.command
@@ -110,8 +99,6 @@ def build(
         out: Directory of the anatomy.
         access: Inlet of the file that the device enters by; the first if left out.
     """
-    from cathsim_dmc.anatomy.tree_file import read_tree
-
     anatomy = read_tree(tree).build(access)
     anatomy.save(out)
     print(f"{anatomy.name}: goals {', '.join(anatomy.goals)}: {out}")
@@ -140,9 +127,6 @@ def generate(
         index: Place of an arch in its set.
         access: End of the aorta that the device enters, ascending or descending.
     """
-    from cathsim_dmc.anatomy import phantoms as shipped
-    from cathsim_dmc.anatomy.arch import arch
-
     needs = dict.fromkeys(shipped.PHANTOMS) | dict.fromkeys(arch.SETS, "index")
     needs |= dict.fromkeys(arch.DROP_RANGES, "seed")
     if kind not in needs:
@@ -169,7 +153,6 @@ def check(
     phantom: Annotated[str, conf.Positional],
     /,
     figure: Path | None = None,
-    access: Access = None,
     json: Json = False,
 ) -> int:
     """Check an anatomy and measure what it is like.
@@ -182,9 +165,7 @@ def check(
         figure: PNG of three views; check.png in a directory of an anatomy if left
             out.
     """
-    from cathsim_dmc.validation.wall import validate_anatomy
-
-    anatomy = _loaded(phantom, access)
+    anatomy = suite.load_anatomy(phantom)
     if figure is None and Path(phantom).is_dir():
         figure = Path(phantom) / _PICTURE
     report = validate_anatomy({anatomy.name: anatomy}, figure)
@@ -197,22 +178,14 @@ def check(
 
 
 @phantoms.command
-def export(
-    phantom: Annotated[str, conf.Positional],
-    /,
-    out: Path,
-    access: Access = None,
-) -> int:
+def export(phantom: Annotated[str, conf.Positional], /, out: Path) -> int:
     """Write an anatomy as MJCF with convex wall pieces, for other engines.
 
     Args:
         phantom: Directory of an anatomy, or the name of a phantom.
         out: File of the model, ending in .xml.
     """
-    from cathsim_dmc.anatomy import export as exported
-
-    anatomy = _loaded(phantom, access)
-    count, found = exported.write_mjcf(anatomy, out)
+    count, found = exported.write_mjcf(suite.load_anatomy(phantom), out)
     mean, p95, largest = (round(1e3 * value, 3) for value in found.intrusion)
     print_json(
         {
@@ -225,17 +198,3 @@ def export(
         }
     )
     return 0
-
-
-def _loaded(phantom: str, access: str | None) -> "Anatomy":
-    from cathsim_dmc import suite
-    from cathsim_dmc.anatomy import phantoms as shipped
-
-    if access is None:
-        return suite.load_anatomy(phantom)
-    if phantom in shipped.PHANTOMS:
-        return shipped.load(phantom, access=access)
-    raise ValueError(
-        f"{phantom!r} is no named phantom, so its access is as built; named are "
-        f"{', '.join(shipped.PHANTOMS)}"
-    )

@@ -7,20 +7,18 @@ import functools
 import json
 import shlex
 import sys
-from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
 from tyro import conf
 
-from cathsim_dmc.cli.options import INTERRUPTED, NO_ANATOMY, OwnAnatomy
-from cathsim_dmc.cli.task_options import field_helps, given, task_kind
+# torchrl goes before dm_control.
+from cathsim_dmc import agents  # isort: skip
 
-_SUMMARY = "Train an agent."
-_DETAILS = (
-    "The defaults of the settings are those of the algorithm and preset chosen; a run "
-    "that is resumed keeps its own."
-)
+from cathsim_dmc.agents.learners import config_from_dict
+from cathsim_dmc.cli.options import INTERRUPTED
+from cathsim_dmc.cli.task_options import field_helps, task_kind
+
 # Shorter names of settings.
 _ALIASES = {"total_frames": ["--frames"], "num_threads": ["--threads"]}
 
@@ -48,60 +46,41 @@ class _Run:
     quiet: bool = False
 
 
-def command(arguments: Sequence[str]) -> Callable[..., int]:
-    """The command for a command line, whose options depend on the algorithm in it.
-
-    Args:
-        arguments: Arguments of `cathsim`. If they are for another command, it has no
-            options, only a line in the list of commands.
+def command(arguments: list[str]) -> Any:
+    """The command, whose options depend on the algorithm among its arguments.
 
     Raises:
         ValueError: the run to be resumed has no readable settings, or there is no such
             algorithm or preset.
     """
-    if list(arguments[:1]) != ["train"]:
-
-        def unused() -> int:
-            raise AssertionError("the options of another command")
-
-        unused.__doc__ = _SUMMARY
-        return unused
-    settings, resumed = _settings(arguments[1:])
-    setting_options = _setting_options(settings)
-    task_options = task_kind(frozenset(vars(settings)))
-    task = {"default": settings.task} if resumed else {}
+    settings, resumed = _settings(arguments)
+    kinds = {"settings": _setting_kind(settings), "options": task_kind(vars(settings))}
     name = conf.arg(help="Task of `cathsim list`.", metavar="TASK")
+    task = dataclasses.field(default=settings.task if resumed else dataclasses.MISSING)
     fields: list[tuple[str, Any, Any]] = [
-        ("task", conf.Positional[Annotated[str, name]], dataclasses.field(**task)),
+        ("task", conf.Positional[Annotated[str, name]], task),
         ("run", Annotated[_Run, conf.arg(name="")], dataclasses.field()),
-        (
-            "settings",
-            Annotated[setting_options, conf.arg(name="")],
-            dataclasses.field(default_factory=setting_options),
-        ),
-        ("anatomy", OwnAnatomy, dataclasses.field(default=NO_ANATOMY)),
-        (
-            "options",
-            Annotated[task_options, conf.arg(name="task")],
-            dataclasses.field(default_factory=task_options),
-        ),
     ]
-    kind = dataclasses.make_dataclass("Train", fields, kw_only=True, frozen=True)
+    for group, kind in kinds.items():
+        shown = Annotated[kind, conf.arg(name="" if group == "settings" else "task")]
+        fields.append((group, shown, dataclasses.field(default_factory=kind)))
+    options = dataclasses.make_dataclass("Train", fields, kw_only=True, frozen=True)
 
     def train(options: Any) -> int:
+        """Train an agent.
+
+        The defaults of the settings are those of the algorithm and preset chosen; a run
+        that is resumed keeps its own.
+        """
         return _train(options, settings)
 
     # The class of the options is made here, so no annotation can name it.
-    train.__annotations__["options"] = Annotated[kind, conf.arg(name="")]
-    train.__doc__ = f"{_SUMMARY}\n\n{_DETAILS}"
+    train.__annotations__["options"] = Annotated[options, conf.arg(name="")]
     return train
 
 
-def _settings(arguments: Sequence[str]) -> tuple[Any, bool]:
+def _settings(arguments: list[str]) -> tuple[agents.TrainingConfig, bool]:
     """Settings that the options start from, and whether they are those of a run."""
-    # torchrl goes before dm_control.
-    from cathsim_dmc.agents.learners import config_from_dict, make_config
-
     parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
     # Wrong values are refused by the parser of all options.
     for name in ("--algo", "--preset", "--out"):
@@ -116,12 +95,14 @@ def _settings(arguments: Sequence[str]) -> tuple[Any, bool]:
             raise ValueError(f"{path} holds no settings of a run: {error}") from error
         if found.algo in (None, config.algorithm):
             return config, True
-    algorithm = _Run.algo if found.algo is None else found.algo
-    preset = _Run.preset if found.preset is None else found.preset
-    return make_config(algorithm, preset), False
+    chosen = (
+        _Run.algo if found.algo is None else found.algo,
+        _Run.preset if found.preset is None else found.preset,
+    )
+    return agents.make_config(*chosen), False
 
 
-def _setting_options(settings: Any) -> type:
+def _setting_kind(settings: agents.TrainingConfig) -> type:
     helps, fields = field_helps(type(settings)), []
     for item in dataclasses.fields(settings):
         if item.name in ("task", "task_kwargs"):
@@ -134,14 +115,12 @@ def _setting_options(settings: Any) -> type:
     return dataclasses.make_dataclass("Settings", fields, kw_only=True, frozen=True)
 
 
-def _train(options: Any, settings: Any) -> int:
-    from cathsim_dmc import agents
-
-    run, task_kwargs = options.run, given(options.options) | options.anatomy.task_kwargs
+def _train(options: Any, settings: agents.TrainingConfig) -> int:
+    run = options.run
     config = settings.replace(
         task=options.task,
         **vars(options.settings),
-        task_kwargs=settings.task_kwargs | task_kwargs,
+        task_kwargs={**settings.task_kwargs, **options.options.given},
     )
     result = agents.train(
         config,

@@ -38,9 +38,9 @@ class ImageSetOptions(SequenceOptions):
     """Content of a data set.
 
     Attributes:
-        anatomies: number of random arches in train, val and test.
-        pictures: whether the images are also written as PNG, for tools of COCO.
-        seed: of all that is drawn.
+        anatomies: Number of random arches in train, val and test.
+        pictures: Whether the images are also written as PNG, for tools of COCO.
+        seed: Seed of all that is drawn.
     """
 
     anatomies: tuple[int, int, int] = (8, 2, 2)

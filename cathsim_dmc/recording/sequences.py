@@ -64,12 +64,12 @@ class SequenceOptions:
     """Recordings in each anatomy.
 
     Attributes:
-        sequences: number of motions.
-        frames: of each sequence.
-        views: C-arms that see each motion, a sequence each.
-        stride: control steps of 40 ms from frame to frame.
-        size: pixels along a side of an image.
-        vessel: "rigid", or another of `physics.vessel.PRESETS`.
+        sequences: Number of motions.
+        frames: Number of frames of a sequence.
+        views: Number of C-arms that see each motion, a sequence each.
+        stride: Control steps of 40 ms from frame to frame.
+        size: Pixels along a side of an image.
+        vessel: State of the vessel: rigid, silicone or living.
     """
 
     sequences: int = 32

@@ -29,11 +29,12 @@ import rerun_cli
 from PIL import Image
 
 from cathsim_dmc import agents, suite  # agents before anything of dm_control
-from cathsim_dmc.agents import report
+from cathsim_dmc.agents.policies import task_and_options
 from cathsim_dmc.imaging import FluoroscopyOptions, materials
 from cathsim_dmc.imaging.angiograph import Angiograph
 from cathsim_dmc.physics import forces
 from cathsim_dmc.physics.drives import Drives
+from cathsim_dmc.pictures import record
 from cathsim_dmc.pictures.figure import VIEWS
 from cathsim_dmc.pictures.translucent import ParallelProjection, glass
 
@@ -218,8 +219,12 @@ def write_recordings(out: Path) -> None:
     listed = []
     for name, title, policy, task, seed, steps in RECORDINGS:
         path = out / f"{name}.rrd"
-        episode = report.record(policy, path, task=task, seed=seed, max_steps=steps)
-        path.with_suffix(".npz").unlink()
+        player = agents.load_policy(policy, seed)
+        limit = {"max_steps": steps} if steps else {}
+        played, options = task_and_options(player, task, limit)
+        options["observation"] = player.observation or "internal"
+        env = suite.load("cathsim", played, options)
+        episode = record(env, player, path, seed=seed)
         largest = 1e3 * episode.wall_force_max.max()
         command = f"cathsim record {policy} --seed {seed} --out {path.name}"
         command += f" --task {task}" if task else ""
