@@ -2,9 +2,9 @@
 
     pip install "cathsim-dmc[gym]" stable-baselines3
     python examples/sb3_ppo.py --frames 150000 --out runs/sb3
-    python examples/sb3_ppo.py --policy runs/sb3/policy.safetensors --out runs/again
+    python examples/sb3_ppo.py --policy examples/sb3_ppo.safetensors --out runs/shipped
 
-The last command evaluates the policy that the one before it trained.
+The last command evaluates the policy beside this file, which the one before it trained.
 `PPO_SETTINGS` and `TRAINING` are the settings. The motors of the tip that bend it about
 one axis get one command, so the policy has three outputs: two bends and the
 translation. The evaluation is that of the task: its reward, its start, its time limit.

@@ -174,3 +174,19 @@ def test_the_example_of_stable_baselines_trains_and_keeps_its_policy(example, tm
     expected, _ = model.predict(normalise.normalize_obs(seen), deterministic=True)
     found, _ = again.predict(statistics.normalize_obs(seen), deterministic=True)
     np.testing.assert_array_equal(found, expected)
+
+
+@pytest.mark.slow
+def test_the_policy_beside_the_example_of_stable_baselines_reaches_its_goal(example):
+    from cathsim_dmc import agents
+
+    path = EXAMPLE.with_suffix(".safetensors")
+    assert path.stat().st_size < 2**20
+    model, normalise, about = example["load"](path)
+    groups = example["groups_of"](normalise.venv.envs[0])
+    policy = example["policy_of"](model, normalise, groups)
+    result = agents.evaluate(
+        policy, about["task"], 2, observation=example["OBSERVATION"],
+        task_kwargs={"max_steps": 200},
+    )  # fmt: skip
+    assert result.summary()["success"] == 1.0
