@@ -101,10 +101,10 @@ def test_saved_anatomy_keeps_its_depth(y_anatomy, tmp_path):
 
 
 def test_the_command_draws_what_it_imports(y_anatomy, tmp_path, monkeypatch, capsys):
-    from cathsim_dmc.cli.phantoms import import_phantom
+    from cathsim_dmc.cli import phantoms
 
-    monkeypatch.setattr(importer, "import_scan", lambda *_, **options: y_anatomy)
-    import_phantom(Path("lumen.obj"), out=tmp_path / "one")
+    monkeypatch.setattr(phantoms, "import_scan", lambda *_, **options: y_anatomy)
+    phantoms.import_phantom(Path("lumen.obj"), out=tmp_path / "one")
     said = json.loads(capsys.readouterr().out)
     assert Path(said["picture"]).parent == tmp_path / "one"
     assert Path(said["picture"]).stat().st_size > 20_000

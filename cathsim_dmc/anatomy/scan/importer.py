@@ -101,9 +101,10 @@ def import_scan(
     for wanted in changes.values():
         if not VESSEL_NAME.fullmatch(str(wanted)):
             bounds.refuse("rename", rename, "names of small letters, digits and '_'")
-    to_lps(units or "mm", mesh_frame, axes)
     # Refused before the long steps, or read when the unit is known.
-    read_curves(centreline_paths, units or "mm", mesh_frame, axes, root)
+    supposed = "mm" if units is None else units
+    to_lps(supposed, mesh_frame, axes)
+    read_curves(centreline_paths, supposed, mesh_frame, axes, root)
     lumen = read_lumen(mesh_path, units, mesh_frame, axes, labels, say)
     note(*lumen.notes)
     measure = SurfaceDepth(lumen.surface)
