@@ -103,7 +103,8 @@ def test_render_shows_the_device_as_it_goes():
         env.step(push)
     darker = (first.astype(int) - env.render())[..., 0]
     unwrapped = env.unwrapped
-    carm = unwrapped._machine().planes()[0].carm
+    (machine,) = unwrapped._machines.values()
+    carm = machine.planes()[0].carm
     (column, row), _ = carm.project(unwrapped.environment.task.readings.head)
     # The tip has come here: the picture is darker, and nowhere far from the device.
     top, left = round(row) - 1, round(column) - 1

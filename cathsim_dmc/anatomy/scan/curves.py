@@ -11,6 +11,8 @@ from numpy.typing import ArrayLike
 from cathsim_dmc.anatomy.scan.units import to_lps, upright
 from cathsim_dmc.anatomy.surface_depth import SurfaceDepth
 
+# Older versions of 3D Slicer write numbers for the names of frames.
+_FRAMES = {"1": "LPS", "0": "RAS"}
 INSIDE = 0.7  # share of a centreline's points that must lie in the lumen
 
 
@@ -128,7 +130,8 @@ def _markup(text: str) -> np.ndarray:
     points = np.array([p["position"] for p in markup["controlPoints"]], dtype=float)
     units = markup.get("coordinateUnits", "mm")
     system = str(markup.get("coordinateSystem", "LPS"))
-    return points @ to_lps(units if isinstance(units, str) else "mm", system).T
+    frame = _FRAMES.get(system, system)
+    return points @ to_lps(units if isinstance(units, str) else "mm", frame).T
 
 
 def _table(text: str, units: str, frame: str) -> np.ndarray:

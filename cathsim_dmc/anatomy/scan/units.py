@@ -8,8 +8,7 @@ from numpy.typing import ArrayLike
 from cathsim_dmc import bounds
 
 UNITS = {"mm": 1e-3, "cm": 1e-2, "m": 1.0}  # metres per unit
-# 3D Slicer wrote numbers before it wrote names.
-_SYSTEMS = {"LPS": 1.0, "RAS": -1.0, "1": 1.0, "0": -1.0}
+_SYSTEMS = {"LPS": 1.0, "RAS": -1.0}
 _AXES = dict(zip("LPSRAI", np.concatenate([np.eye(3), -np.eye(3)]), strict=True))
 _OFF = 0.05  # most by which directions given by numbers may differ from a rotation
 
