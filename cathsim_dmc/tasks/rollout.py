@@ -278,8 +278,9 @@ class Rollout:
         if devices is not None:
             ends = devices.points.reshape(len(goal), -1, 3)
         points = state.centreline, ends, goal
-        own = points, self.shadows, self._handles(), random, self.around
-        sensors.capture(rows, begins, *own)
+        if sensors.planes:
+            own = points, self.shadows, self._handles(), random, self.around
+            sensors.capture(rows, begins, *own)
         if any(name.startswith("endoluminal") for name in self._names):
             for name, view in self._endoscope(rows).items():
                 sensors.hold(name, view, rows)
