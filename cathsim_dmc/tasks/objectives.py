@@ -116,7 +116,8 @@ def judge(
     reward, success = np.empty(count), np.empty(count, dtype=bool)
     terms = {name: np.empty(count) for name in names}
     for objective, rows in groups:
-        own = part(measurement, rows)
+        # One objective judges all simulations, so there is nothing to select.
+        own = measurement if isinstance(rows, slice) else part(measurement, rows)
         outcome = objective.outcome(own)
         if not isinstance(outcome, Outcome) or not isinstance(outcome.terms, Mapping):
             _refuse(objective, bounds.shown(outcome))
