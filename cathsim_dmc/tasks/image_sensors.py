@@ -68,7 +68,7 @@ class ImageSensors:
         random_states: Sequence[np.random.RandomState] | None,
         around: Callable[[angiographs.Planes, int], angiographs.Planes],
     ) -> None:
-        """Captures the next images of fluoroscopy.
+        """Captures the next images; there are `planes`.
 
         Args:
             rows: (K,) numbers of the simulations whose images are captured.
@@ -80,8 +80,6 @@ class ImageSensors:
             random_states: N sources of quantum noise, None for images without.
             around: Moves the vessel before the machine of a simulation.
         """
-        if not self.planes:
-            return
         planes = [self.planes[index] for index in rows]
         own = [shadow.of(rows) for shadow in shadows]
         if self._wants("image", "sequential", "segmentation"):

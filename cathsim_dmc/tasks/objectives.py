@@ -136,9 +136,10 @@ def judge(
             into[rows] = value
             if failed is not None:
                 into[failed] = 0
+            judged = into[rows]
             # A sum of plain numbers takes a tenth of the time of `isfinite`.
-            if not math.isfinite(sum(into[rows].tolist())):
-                if not np.isfinite(into[rows]).all():
+            if not math.isfinite(sum(judged.tolist())):
+                if not np.isfinite(judged).all():
                     given = f"{name} {bounds.shown(value)}, which is not finite"
                     _refuse(objective, given)
     return Outcome(reward, success, terms)

@@ -255,7 +255,7 @@ class Rollout:
         outcome = judge(
             self.objectives,
             Measurement(self.resting, self.wall_force, *actions, distance),
-            failed,
+            failed if failed.any() else None,
         )
         ended = np.zeros(len(failed), bool) if begins else outcome.success | failed
         return Step(
@@ -274,11 +274,11 @@ class Rollout:
     def _observe(self, rows: np.ndarray, begins: bool) -> Observation:
         random, sensors, goal = self._random_states, self._sensors, self.goal
         state, devices = self._tracking.seen(self.readings, self.devices, random, rows)
-        ends = np.zeros((len(goal), 0, 3))
-        if devices is not None:
-            ends = devices.points.reshape(len(goal), -1, 3)
-        points = state.centreline, ends, goal
         if sensors.planes:
+            ends = np.zeros((len(goal), 0, 3))
+            if devices is not None:
+                ends = devices.points.reshape(len(goal), -1, 3)
+            points = state.centreline, ends, goal
             own = points, self.shadows, self._handles(), random, self.around
             sensors.capture(rows, begins, *own)
         if any(name.startswith("endoluminal") for name in self._names):
