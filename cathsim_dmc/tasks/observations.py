@@ -42,6 +42,10 @@ def _fluoroscopic(key: str, channels: int, unit: str, meaning: str) -> Entry:
     return Entry(key, shape, unit, meaning, 0, 255, np.uint8)
 
 
+def _action(key: str) -> Entry:
+    return Entry(key, _actions, "1", "the last action, 0 after a reset", -1, 1)
+
+
 _PLACES = ", ".join(f"{1e3 * place:.4g}" for place in TRACKED_PLACES)
 _POINTS = f"{TRACKED_POINTS} points along the device, proximal to head"
 _OPERATOR = (
@@ -52,7 +56,7 @@ _OPERATOR = (
         "slide of the base, 0 at the start of the stroke; its stops are soft",
         -0.001,
     ),
-    Entry("tracking_action", _actions, "1", "the last action, 0 after a reset", -1, 1),
+    _action("tracking_action"),
 )
 
 
@@ -200,32 +204,38 @@ def tracking_2d(frame: Frame) -> Observation:
     }
 
 
+def _ahead(
+    name: str, way: str, lumen: str, goal: str, device: str, inside: str
+) -> tuple[Entry, ...]:
+    """Entries of a route ahead, whose names begin with `name`."""
+    places = f"every {1e3 * AHEAD[1]:g} mm from the place of the head on, tip frame"
+    count = TRACKED_POINTS - 1
+    device = f"along the device{device}, proximal to the head and without it, tip frame"
+    out = f"by how much the head is out of {inside}, in radii there; negative inside"
+    return (
+        Entry(
+            f"{name}_points",
+            3 * len(AHEAD),
+            "m",
+            f"{len(AHEAD)} points of {way}, {places}",
+        ),
+        Entry(f"{name}_radii", len(AHEAD), "m", f"of the lumen {lumen}", 0),
+        Entry(f"{name}_goal", 3, "m", f"{goal}, tip frame"),
+        Entry(f"{name}_device", 3 * count, "m", f"{count} points {device}"),
+        Entry(f"{name}_deviation", 1, "radius", out, -1),
+        _action(f"{name}_action"),
+    )
+
+
 @OBSERVATIONS.row(
-    Entry(
-        "route_points",
-        3 * len(AHEAD),
-        "m",
-        f"{len(AHEAD)} points of the centreline of the route, every "
-        f"{1e3 * AHEAD[1]:g} mm from the place of the head on, tip frame",
+    *_ahead(
+        "route",
+        way="the centreline of the route",
+        lumen="at these points",
+        goal="centre of the goal",
+        device="",
+        inside="the lumen of the route",
     ),
-    Entry("route_radii", len(AHEAD), "m", "of the lumen at these points", 0),
-    Entry("route_goal", 3, "m", "centre of the goal, tip frame"),
-    Entry(
-        "route_device",
-        3 * (TRACKED_POINTS - 1),
-        "m",
-        f"{TRACKED_POINTS - 1} points along the device, proximal to the head and "
-        "without it, tip frame",
-    ),
-    Entry(
-        "route_deviation",
-        1,
-        "radius",
-        "by how much the head is out of the lumen of the route, in radii there; "
-        "negative inside",
-        -1,
-    ),
-    Entry("route_action", _actions, "1", "the last action, 0 after a reset", -1, 1),
     needs=ROUTE,
     joined=("drives", "devices"),
 )
@@ -247,31 +257,14 @@ def route(frame: Frame) -> Observation:
 
 
 @OBSERVATIONS.row(
-    Entry(
-        "biplane_points",
-        3 * len(AHEAD),
-        "m",
-        f"{len(AHEAD)} points of the route through both roadmaps, every "
-        f"{1e3 * AHEAD[1]:g} mm from the place of the head on, tip frame",
+    *_ahead(
+        "biplane",
+        way="the route through both roadmaps",
+        lumen="there in the roadmaps",
+        goal="goal marker of both planes",
+        device=" in both live images",
+        inside="the route through the roadmaps",
     ),
-    Entry("biplane_radii", len(AHEAD), "m", "of the lumen there in the roadmaps", 0),
-    Entry("biplane_goal", 3, "m", "goal marker of both planes, tip frame"),
-    Entry(
-        "biplane_device",
-        3 * (TRACKED_POINTS - 1),
-        "m",
-        f"{TRACKED_POINTS - 1} points along the device in both live images, proximal "
-        "to the head and without it, tip frame",
-    ),
-    Entry(
-        "biplane_deviation",
-        1,
-        "radius",
-        "by how much the head is out of the route through the roadmaps, in radii "
-        "there; negative inside",
-        -1,
-    ),
-    Entry("biplane_action", _actions, "1", "the last action, 0 after a reset", -1, 1),
     needs=BIPLANE,
 )
 def biplane(frame: Frame) -> Observation:
