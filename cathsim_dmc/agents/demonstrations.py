@@ -120,6 +120,10 @@ def record_demonstrations(
         description=f"{episodes} demonstrations of the task {task} of cathsim_dmc, "
         f"seeds from {seed}",
     )
+    return _described(out, buffers)
+
+
+def _described(out: Path, buffers: list[Any]) -> Demonstrations:
     forces = {
         name: [np.asarray(buffer.infos[f"wall_force_{name}"][1:]) for buffer in buffers]
         for name in ("sum", "max")

@@ -194,10 +194,7 @@ def evaluate(
     """
     conditions = protocols.get(protocol)
     episodes = conditions.episodes if episodes is None else episodes
-    bounds.whole("episodes", episodes, 1, bounds.MOST_SIMULATIONS)
-    bounds.seed("seed", seed)
-    if num_threads is not None:
-        bounds.whole("num_threads (--threads)", num_threads, 1, bounds.MOST_THREADS)
+    _check_numbers(episodes, seed, num_threads)
     player = load_policy(policy, seed)
     task, options = task_and_options(player, task, task_kwargs)
     options = options if task_kwargs is None else dict(task_kwargs)
@@ -229,6 +226,13 @@ def evaluate(
     if out_dir is not None:
         write_evaluation(out_dir, result.to_dict())
     return result
+
+
+def _check_numbers(episodes: int, seed: int, num_threads: int | None) -> None:
+    bounds.whole("episodes", episodes, 1, bounds.MOST_SIMULATIONS)
+    bounds.seed("seed", seed)
+    if num_threads is not None:
+        bounds.whole("num_threads (--threads)", num_threads, 1, bounds.MOST_THREADS)
 
 
 @torch.no_grad()

@@ -85,11 +85,7 @@ class DeviceStack(Chain):
         overlap = self.stack.overlap(self.start_gaps[None])
         turns = np.zeros((1, len(self.devices), len(self.stack.spans)))
         tip = self.stack.nodes <= self.devices[0].tip_length + 1e-9
-        # Its buoyancy in blood is that of all devices.
-        weight = sum(weight_density(device) for device in self.devices)
-        mass = sum(device.linear_density for device in self.devices)
-        mass += carried_mass(self.devices)
-        self.density = BLOOD_DENSITY / (1 - weight / mass)
+        self.density = _density(self.devices)
         self._assemble(
             Links(
                 self.stack.link_lengths,
@@ -114,6 +110,14 @@ class DeviceStack(Chain):
             for motion in ("insertion", "rotation")
         )
         self.translations = tuple(range(0, len(self.action_names), 2))
+
+
+def _density(devices: Sequence[Device]) -> float:
+    """Density, kg/m³, with which the chain has the buoyancy of all devices."""
+    weight = sum(weight_density(device) for device in devices)
+    mass = sum(device.linear_density for device in devices)
+    mass += carried_mass(devices)
+    return BLOOD_DENSITY / (1 - weight / mass)
 
 
 def _names(devices: Sequence[Device]) -> tuple[str, ...]:

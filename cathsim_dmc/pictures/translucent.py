@@ -174,7 +174,7 @@ def _lit(normal: np.ndarray) -> np.ndarray:
 
 
 def _smaller(image: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
-    """Means over the samples of every pixel, colours no longer premultiplied."""
+    """Means over the samples of every pixel, colours not premultiplied."""
     rows, columns = shape
     image = image.reshape(rows, _SAMPLES, columns, _SAMPLES, 4).mean((1, 3))
     image[..., :3] /= np.maximum(image[..., 3:], 1e-9)

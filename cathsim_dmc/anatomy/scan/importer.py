@@ -81,26 +81,13 @@ def import_scan(
             does not agree with the surface; says how to mend it.
     """
     started = time.monotonic()
-
-    def say(text: str) -> None:
-        if progress is not None:
-            progress(text)
-
-    def note(*texts: str) -> None:
-        for text in texts:
-            if notes is not None:
-                notes.append(text)
-            say(f"note: {text}")
-
+    say, note = _reporters(progress, notes)
     given = {
         key: np.array(bounds.vector(key, place, 3))
         for key, place in (("inlet", inlet), ("heart", heart))
         if place is not None
     }
-    changes = bounds.options("rename", rename)
-    for wanted in changes.values():
-        if not VESSEL_NAME.fullmatch(str(wanted)):
-            bounds.refuse("rename", rename, "names of small letters, digits and '_'")
+    changes = _changes(rename)
     # Refused before the long steps, or read when the unit is known.
     supposed = "mm" if units is None else units
     to_lps(supposed, mesh_frame, axes)
@@ -115,12 +102,7 @@ def import_scan(
     say(f"tree: looking for vessels in {len(lumen.surface.faces):,} triangles")
     grown, at_end = _tree(measure, curves, places, root, changes, note)
     tree, opening, surface = _opened(grown, at_end, lumen.surface)
-    sizes = [
-        f"{key} {vessel.centreline.length * 1e3:.0f} mm"
-        + (f" from {vessel.parent}" if vessel.parent else "")
-        for key, vessel in tree.vessels.items()
-    ]
-    say(f"tree: {', '.join(sizes)}")
+    say(f"tree: {', '.join(_sizes(tree))}")
     name, goals = name or Path(mesh_path).name.split(".")[0], place_goals(tree)
     ends = flat_ends(tree, opening)
     anatomy = Anatomy(name, tree, surface, opening, goals, ends, scanned=True)
@@ -128,6 +110,42 @@ def import_scan(
     seconds = time.monotonic() - started
     say(f"done in {seconds:.0f} s, goals {', '.join(goals) or 'none'}")
     return anatomy
+
+
+def _reporters(
+    progress: Callable[[str], None] | None, notes: list[str] | None
+) -> tuple[Callable[[str], None], Callable[..., None]]:
+    """What tells of a step, and what tells and keeps notes."""
+
+    def say(text: str) -> None:
+        if progress is not None:
+            progress(text)
+
+    def note(*texts: str) -> None:
+        for text in texts:
+            if notes is not None:
+                notes.append(text)
+            say(f"note: {text}")
+
+    return say, note
+
+
+def _changes(rename: Mapping[str, str] | None) -> dict[str, str]:
+    """New names by the computed ones, checked."""
+    changes = bounds.options("rename", rename)
+    for wanted in changes.values():
+        if not VESSEL_NAME.fullmatch(str(wanted)):
+            bounds.refuse("rename", rename, "names of small letters, digits and '_'")
+    return changes
+
+
+def _sizes(tree: VesselTree) -> list[str]:
+    """Name, length and parent of every vessel."""
+    return [
+        f"{key} {vessel.centreline.length * 1e3:.0f} mm"
+        + (f" from {vessel.parent}" if vessel.parent else "")
+        for key, vessel in tree.vessels.items()
+    ]
 
 
 def _tree(field, curves, places, root, changes, note) -> tuple[VesselTree, bool]:
