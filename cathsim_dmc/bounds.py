@@ -191,20 +191,21 @@ def array(
         given = np.asarray(value)
     except ValueError:  # rows of different lengths
         given = np.array(None)
-    what = f"an array of {'finite numbers' if 'f' in kinds else 'integers'}"
     fits = not given.size or given.dtype.kind in kinds
-    if shape is not None:
+    if shape is not None and shape != given.shape:
         sizes = zip(shape, given.shape, strict=False)
         fits &= len(shape) == given.ndim and all(m in (-1, n) for m, n in sizes)
+    if fits and (not given.size or np.isfinite(given).all()):
+        return given
+    what = f"an array of {'finite numbers' if 'f' in kinds else 'integers'}"
+    if shape is not None:
         wanted = ", ".join("n" if n < 0 else str(n) for n in shape)
         what = f"{what} of shape ({wanted})"
         if not fits:
             raise ValueError(
                 f"{name} is {given.dtype} of shape {given.shape}; it must be {what}"
             )
-    if given.size and not (fits and np.isfinite(given).all()):
-        refuse(name, value, what)
-    return given
+    return refuse(name, value, what)
 
 
 def actions(value: Any, shape: tuple[int, ...]) -> np.ndarray:
@@ -216,7 +217,8 @@ def actions(value: Any, shape: tuple[int, ...]) -> np.ndarray:
             f"{error}, in [-1, 1]: tip motors from proximal to distal (x before y), "
             "translation, and rotation if the task has it"
         ) from None
-    return np.clip(given.astype(np.float64), -1.0, 1.0)
+    # A fraction of the time of `np.clip`.
+    return np.minimum(np.maximum(given.astype(np.float64), -1.0), 1.0)
 
 
 def instance(name: str, value: Any, kind: type) -> Any:
