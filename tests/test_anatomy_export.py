@@ -26,19 +26,20 @@ def pieces(tube):
 
 def test_pieces_surround_the_lumen(tube, pieces):
     found = export.fidelity(tube, pieces)
-    assert found.places > 200 and found.open == 0 and found.blocked == ()
-    mean, p95, largest = found.intrusion
-    assert mean <= 0.05e-3 and p95 <= 0.2e-3 and largest <= 0.4e-3
-    assert found.recession[1] <= 0.3e-3
+    assert found["places"] > 200
+    assert found["open_places"] == 0 and not found["closed_to_5fr"]
+    mean, p95, largest = found["intrusion_mm"].values()
+    assert mean <= 0.05 and p95 <= 0.2 and largest <= 0.4
+    assert found["recession_mm"]["p95"] <= 0.3
     assert min(ConvexHull(piece * 1e3).volume for piece in pieces) > 1e-3
 
 
 def test_a_missing_piece_and_a_plug_are_found(tube, pieces):
     gap = [piece for piece in pieces if abs(piece[:, 2].mean() - 0.02) > 5e-3]
-    assert export.fidelity(tube, gap).open > 5
+    assert export.fidelity(tube, gap)["open_places"] > 5
     plug = 2e-3 * np.stack(np.meshgrid(*[(-1, 1)] * 3), -1).reshape(-1, 3)
     found = export.fidelity(tube, [*pieces, plug + (0, 0, 0.02)])
-    assert found.blocked == ("tube",)
+    assert found["closed_to_5fr"] == ["tube"]
 
 
 def test_the_command_writes_a_model_that_other_engines_read(tube, tmp_path, cathsim):
@@ -75,8 +76,9 @@ def test_the_walls_of_the_phantoms(name):
     pieces = export.wall_pieces(anatomy)
     found = export.fidelity(anatomy, pieces)
     # At an edge between two branches the wall is thinner than what is looked through.
-    assert found.open < 5e-4 * found.places and found.blocked == ()
-    assert found.intrusion[0] <= 0.02e-3 and found.intrusion[2] <= 0.4e-3
+    assert found["open_places"] < 5e-4 * found["places"]
+    assert not found["closed_to_5fr"]
+    assert found["intrusion_mm"]["mean"] <= 0.02 and found["intrusion_mm"]["max"] <= 0.4
 
 
 def test_a_thin_wall_between_two_lumens_stays_out_of_both():
@@ -93,4 +95,4 @@ def test_a_thin_wall_between_two_lumens_stays_out_of_both():
     )
     anatomy = Anatomy.from_tree(tree, "two", goals={})
     found = export.fidelity(anatomy, export.wall_pieces(anatomy))
-    assert found.blocked == () and found.intrusion[1] < 0.4e-3
+    assert not found["closed_to_5fr"] and found["intrusion_mm"]["p95"] < 0.4

@@ -8,8 +8,8 @@ outwards by what the triangles around them stand in the lumen.
 
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from pathlib import Path
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from scipy.spatial import ConvexHull, cKDTree
@@ -106,28 +106,15 @@ def _outward_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     return normals
 
 
-@dataclass(frozen=True)
-class Fidelity:
-    """Deviations of convex pieces from a lumen.
+def fidelity(anatomy: Anatomy, pieces: Sequence[np.ndarray]) -> dict[str, Any]:
+    """Measures convex pieces (n_i, 3) m against the lumen of an anatomy.
 
-    Attributes:
-        intrusion: mean, 95th percentile and maximum of how far the pieces stand in the
-            lumen, m, over places all over its wall; 0 where they do not.
-        recession: the same of how far they stay behind the wall.
-        places: number of places.
-        open: number of them where no piece is met within 1.5 mm behind the wall.
-        blocked: vessels whose centreline the pieces close to a 5 Fr catheter.
+    Returns:
+        Over `places` all over the wall, mean, 95th percentile and maximum of how far
+        the pieces stand in the lumen (`intrusion_mm`), and of how far they stay behind
+        the wall (`recession_mm`); `open_places`, where no piece is met within 1.5 mm
+        behind the wall; and the vessels whose centreline is `closed_to_5fr`.
     """
-
-    intrusion: tuple[float, float, float]
-    recession: tuple[float, float, float]
-    places: int
-    open: int
-    blocked: tuple[str, ...]
-
-
-def fidelity(anatomy: Anatomy, pieces: Sequence[np.ndarray]) -> Fidelity:
-    """Measures convex pieces (n_i, 3) m against the lumen of an anatomy."""
     points, inward = _wall_places(anatomy)
     met = _within(points[:, None] + _LEVELS[:, None] * inward[:, None], pieces)
     inside = np.where(met, _LEVELS, 0.0).max(axis=1).clip(0.0)
@@ -140,16 +127,23 @@ def fidelity(anatomy: Anatomy, pieces: Sequence[np.ndarray]) -> Fidelity:
         line, margin = vessel.centreline, 1.5 * DEVICE_RADIUS
         s = np.arange(margin, max(line.length - margin, 1.1 * margin), 1e-3)
         place = line.at(s).position
-        free = np.minimum(DEVICE_RADIUS, 0.8 * anatomy.depth(place)) - _GRAZE
+        free = np.minimum(DEVICE_RADIUS, 0.8 * anatomy.lumen(place)) - _GRAZE
         around = place[:, None] + free[:, None, None] * directions
         if _within(np.concatenate([around, place[:, None]], axis=1), pieces).any():
             blocked.append(name)
-    intrusion, recession = (
-        (float(one.mean()), float(np.percentile(one, 95)), float(one.max()))
-        for one in (inside, behind[closed])
-    )
-    missed = int((~closed).sum())
-    return Fidelity(intrusion, recession, len(points), missed, tuple(blocked))
+    return {
+        "intrusion_mm": _summary(inside),
+        "recession_mm": _summary(behind[closed]),
+        "places": len(points),
+        "open_places": int((~closed).sum()),
+        "closed_to_5fr": blocked,
+    }
+
+
+def _summary(lengths: np.ndarray) -> dict[str, float]:
+    figures = lengths.mean(), np.percentile(lengths, 95), lengths.max()
+    rounded = [round(1e3 * float(figure), 3) for figure in figures]
+    return dict(zip(("mean", "p95", "max"), rounded, strict=True))
 
 
 def _within(points: np.ndarray, pieces: Sequence[np.ndarray]) -> np.ndarray:
@@ -169,7 +163,7 @@ def _within(points: np.ndarray, pieces: Sequence[np.ndarray]) -> np.ndarray:
 def _wall_places(anatomy: Anatomy) -> tuple[np.ndarray, np.ndarray]:
     """Places (n, 3) m all over the wall, and unit normals (n, 3) into the lumen."""
     points, _ = sampled(anatomy.surface, _PLACES)
-    depth, inward = anatomy.depth(points), anatomy.lumen.gradient(points)
+    depth, inward = anatomy.lumen(points), anatomy.lumen.gradient(points)
     inward /= np.maximum(np.linalg.norm(inward, axis=1, keepdims=True), 1e-9)
     wall = np.abs(depth) < _OFF
     for end in anatomy.ends:
@@ -179,35 +173,32 @@ def _wall_places(anatomy: Anatomy) -> tuple[np.ndarray, np.ndarray]:
     return (points - depth[:, None] * inward)[wall], inward[wall]
 
 
-def write_mjcf(anatomy: Anatomy, path: str | os.PathLike[str]) -> tuple[int, Fidelity]:
+def write_mjcf(anatomy: Anatomy, path: str | os.PathLike[str]) -> dict[str, Any]:
     """Write an anatomy as a model of convex geoms, with a site at the inlet and goals.
 
     Args:
         path: of the file, which must end in .xml; lengths in it are metres.
 
     Returns:
-        How many pieces there are, and how well they stand for the lumen.
+        Number of `pieces`, and how well they stand for the lumen, see `fidelity`.
 
     Raises:
         ValueError: if the file name has another ending.
     """
     import mujoco
 
-    path = Path(path)
-    if path.suffix != ".xml":
-        raise ValueError(f"the file name must end in .xml, got {path.name!r}.")
-    wall = wall_pieces(anatomy)
-    spec = mujoco.MjSpec()
-    spec.modelname = anatomy.name
-    for index, piece in enumerate(wall):
-        name = f"wall_{index:04d}"
-        mesh = spec.add_mesh(name=name, uservert=piece.ravel().tolist())
-        mesh.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL
-        spec.worldbody.add_geom(
-            name=name, type=mujoco.mjtGeom.mjGEOM_MESH, meshname=name
-        )
-    for name, place in {"inlet": anatomy.inlet, **anatomy.goals}.items():
-        spec.worldbody.add_site(name=name, pos=place.position.tolist())
-    spec.compile()
-    files.write_text(path, spec.to_xml())
-    return len(wall), fidelity(anatomy, wall)
+    with files.atomic_path(path, ".xml") as temporary:
+        wall = wall_pieces(anatomy)
+        spec = mujoco.MjSpec()
+        spec.modelname = anatomy.name
+        for index, piece in enumerate(wall):
+            name = f"wall_{index:04d}"
+            mesh = spec.add_mesh(name=name, uservert=piece.ravel().tolist())
+            mesh.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL
+            shape = mujoco.mjtGeom.mjGEOM_MESH
+            spec.worldbody.add_geom(name=name, type=shape, meshname=name)
+        for name, place in {"inlet": anatomy.inlet, **anatomy.goals}.items():
+            spec.worldbody.add_site(name=name, pos=place.position.tolist())
+        spec.compile()
+        temporary.write_text(spec.to_xml())
+    return {"pieces": len(wall), **fidelity(anatomy, wall)}

@@ -185,16 +185,6 @@ def export(phantom: Annotated[str, conf.Positional], /, out: Path) -> int:
         phantom: Directory of an anatomy, or the name of a phantom.
         out: File of the model, ending in .xml.
     """
-    count, found = exported.write_mjcf(suite.load_anatomy(phantom), out)
-    mean, p95, largest = (round(1e3 * value, 3) for value in found.intrusion)
-    print_json(
-        {
-            "file": str(out),
-            "pieces": count,
-            "intrusion_mm": {"mean": mean, "p95": p95, "max": largest},
-            "open_places": found.open,
-            "places": found.places,
-            "closed_to_5fr": list(found.blocked),
-        }
-    )
+    found = exported.write_mjcf(suite.load_anatomy(phantom), out)
+    print_json({"file": str(out), **found})
     return 0

@@ -107,37 +107,12 @@ def validate_anatomy(
         for one in check_tree(anatomy):
             label = f"{name}: {one.name}, violations"
             checks.append(Check.at_most(label, int(not one.passed), 0, "", one.detail))
-        findings[name] = {"measures": shape(anatomy)}
+        findings[name] = {"measures": measures.measure(anatomy.tree, anatomy.inlet)}
     if figure_path is not None:
         from cathsim_dmc.validation import views
 
         views.draw(next(iter(anatomies.values())), figure_path)
     return Report("anatomy of " + ", ".join(anatomies), checks, findings)
-
-
-_ANGLES = "plane ascending_tilt ascending_turn take_off lean axis_angle".split()
-_PLAIN = ("drop", "tortuosity")
-
-
-def shape(anatomy: Anatomy) -> dict[str, Any]:
-    """What an anatomy is like, for people: millimetres and degrees in the names."""
-    start, axis = anatomy.inlet.position, measures.inlet_axis(anatomy)
-    return _for_people(dataclasses.asdict(measures.measure(anatomy.tree, start, axis)))
-
-
-def _for_people(values: Mapping[str, Any], inside: str = "") -> dict[str, Any]:
-    out: dict[str, Any] = {}
-    for key, value in values.items():
-        if isinstance(value, Mapping):
-            out[key] = _for_people(value, key)
-        elif not isinstance(value, float) or key in _PLAIN:
-            out[key] = value
-        elif key in _ANGLES:
-            out[f"{key}_deg"] = round(float(np.degrees(value)), 1)
-        else:
-            end = "" if inside == "diameters" else "_mm"
-            out[f"{key}{end}"] = round(1e3 * value, 2)
-    return out
 
 
 def validate_wall(

@@ -29,42 +29,40 @@ def table(header, rows):
     return ["| " + " | ".join(map(str, line)) + " |" for line in lines]
 
 
-def per_branch(found, key, scale=1.0, digits=0):
+def per_branch(found, key, digits=0):
     """Figures of BCA, LCCA and LSA side by side."""
-    values = [scale * getattr(found.branches[name], key) for name in MAIN]
+    values = [found["branches"][name][key] for name in MAIN]
     return " / ".join(f"{value:.{digits}f}" for value in values)
 
 
 def shapes(anatomies):
     """What the shipped anatomies are like, a column for each."""
     found = {
-        name: measures.measure(one.tree, one.inlet.position, measures.inlet_axis(one))
-        for name, one in anatomies.items()
+        name: measures.measure(one.tree, one.inlet) for name, one in anatomies.items()
     }
-    degrees = 180.0 / np.pi
     lines = {
         "type, drop of the BCA in LCCA diameters": lambda m: (
-            f"{m.arch_type}, {m.drop:.2f}"
+            f"{m['arch_type']}, {m['drop']:.2f}"
         ),
         "Ø aorta ascending / at BCA / at LSA / descending, mm": lambda m: " / ".join(
-            f"{1e3 * m.diameters[level]:.0f}"
+            f"{m['diameters'][level]:.0f}"
             for level in ("ascending", "bca", "lsa", "descending")
         ),
-        "Ø BCA / LCCA / LSA, mm": lambda m: per_branch(m, "diameter", 1e3, 1),
-        "narrowest Ø of the same, mm": lambda m: per_branch(m, "narrowest", 1e3, 1),
-        "take-off upstream, °": lambda m: per_branch(m, "take_off", degrees),
-        "lean out of the plane, °": lambda m: per_branch(m, "lean", degrees),
-        "out of the plane 40 mm on, mm": lambda m: per_branch(m, "out_of_plane", 1e3),
-        "length over chord": lambda m: per_branch(m, "tortuosity", 1.0, 2),
-        "span / height, mm": lambda m: f"{1e3 * m.span:.0f} / {1e3 * m.height:.0f}",
+        "Ø BCA / LCCA / LSA, mm": lambda m: per_branch(m, "diameter_mm", 1),
+        "narrowest Ø of the same, mm": lambda m: per_branch(m, "narrowest_mm", 1),
+        "take-off upstream, °": lambda m: per_branch(m, "take_off_deg"),
+        "lean out of the plane, °": lambda m: per_branch(m, "lean_deg"),
+        "out of the plane 40 mm on, mm": lambda m: per_branch(m, "out_of_plane_mm"),
+        "length over chord": lambda m: per_branch(m, "tortuosity", 2),
+        "span / height, mm": lambda m: f"{m['span_mm']:.0f} / {m['height_mm']:.0f}",
         "first 30 mm against the vertical, °": lambda m: (
-            f"{degrees * m.ascending_tilt:.0f}"
+            f"{m['ascending_tilt_deg']:.0f}"
         ),
         "turn up to the BCA, °; mean radius, mm": lambda m: (
-            f"{degrees * m.ascending_turn:.0f}; {1e3 * m.bend_radius:.0f}"
+            f"{m['ascending_turn_deg']:.0f}; {m['bend_radius_mm']:.0f}"
         ),
-        "tightest bend of the aorta, mm": lambda m: f"{1e3 * m.tightest_bend:.0f}",
-        "ostia off the start axis, mm": lambda m: per_branch(m, "axis_offset", 1e3),
+        "tightest bend of the aorta, mm": lambda m: f"{m['tightest_bend_mm']:.0f}",
+        "ostia off the start axis, mm": lambda m: per_branch(m, "axis_offset_mm"),
     }
     rows = [
         [line, *(show(one) for one in found.values())] for line, show in lines.items()
@@ -153,15 +151,19 @@ def distributions():
         row(f"take-off {name}, °", values, angles)
     row(
         "root to BCA, mm",
-        [1e3 * one.bend_radius * one.ascending_turn for one in found],
+        [
+            one["bend_radius_mm"] * np.radians(one["ascending_turn_deg"])
+            for one in found
+        ],
         [1e3 * figure for figure in sampler.ASCENDING_LENGTH],
     )
     nothing = (0.0, 0.0)
-    row("turn up to the BCA, °", [np.degrees(m.ascending_turn) for m in found], nothing)
-    row("radius of that bend, mm", [1e3 * m.bend_radius for m in found], nothing)
-    aside = [1e3 * abs(b.out_of_plane) for m in found for b in m.branches.values()]
+    row("turn up to the BCA, °", [m["ascending_turn_deg"] for m in found], nothing)
+    row("radius of that bend, mm", [m["bend_radius_mm"] for m in found], nothing)
+    branches = [branch for m in found for branch in m["branches"].values()]
+    aside = [abs(branch["out_of_plane_mm"]) for branch in branches]
     row("branches out of the plane 40 mm on, mm", aside, nothing)
-    bent = [b.tortuosity for m in found for b in m.branches.values()]
+    bent = [branch["tortuosity"] for branch in branches]
     row("branches, length over chord", bent, nothing, 2)
     return table(["", "table", "98 test arches", "range"], rows)
 

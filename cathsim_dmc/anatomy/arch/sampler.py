@@ -149,12 +149,12 @@ def _corrected(
     bend = params.ascending_bend
     for _ in range(_CORRECTIONS):
         tree = arch_tree(params)
-        found = measures.measure(tree)
+        found = measures.bca_drop(tree)
         first = next(one for one in tree.vessels.values() if one.parent)
         short = ascending - tree.root.centreline.locate(first.mouth.position)
-        if found.drop is None:  # without the branches that it is measured by
+        if found is None:  # without the branches that it is measured by
             return None
-        low = drop - found.drop
+        low = drop - found
         if abs(short) < _LENGTH_TOLERANCE and abs(low) < _DROP_TOLERANCE:
             break
         limb = max(params.ascending_length + short, _SHORTEST_LIMB)
@@ -167,7 +167,8 @@ def _corrected(
         )
     else:
         return None
-    return params if measures.arch_type(drop) == found.arch_type else None
+    same = measures.arch_type(drop) == measures.arch_type(found)
+    return params if same else None
 
 
 def _draw(draw: _Draw, drop: float, variant: str) -> ArchParameters:
