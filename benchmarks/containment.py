@@ -84,7 +84,7 @@ class Containment:
           (...), m; at most 0 where the device is inside.
         """
         points = np.asarray(points, dtype=np.float64)
-        in_lumen = self.device_radius - self.anatomy.depth(points)
+        in_lumen = self.device_radius - self.anatomy.lumen(points)
         offset = points - self.anatomy.inlet.position
         lateral = np.linalg.norm(np.cross(offset, self.axis), axis=-1)
         in_sheath = lateral + self.device_radius - self.bore_radius

@@ -128,7 +128,7 @@ def test_beside_the_ostium_the_head_is_still_in_the_parent(task, plan):
     across = np.cross(branch.tangent, aorta.tangent)
     away = branch.radius * 1.3 * across / np.linalg.norm(across)
     head = branch.position + away
-    assert task.scene.anatomy.depth(head) > 0
+    assert task.scene.anatomy.lumen(head) > 0
     assert task.objective.route.project(head).arc_length > origin + 5e-3
     place = locate(plan, head)
     assert place.excess <= 0

@@ -53,7 +53,7 @@ WRONG = {
         lambda h, a: h["inlet"].update(position="here"),
         "inlet position is 'here'; it must be 3 numbers, each a finite",
     ),
-    "goal": (lambda h, a: h["goals"][0].update(vessel="renal"), "no vessel 'renal'"),
+    "goal": (lambda h, a: h["goals"][0].update(vessel="renal"), "vessel is 'renal'"),
     "nan": (
         lambda h, a: a["surface_vertices"].put(5, np.nan),
         "vertices is .*finite numbers",
@@ -61,7 +61,7 @@ WRONG = {
     "scanned": (lambda h, a: h.update(scanned="yes"), "scanned is 'yes'"),
     "shape": (
         lambda h, a: a.update(vessel_0_radii=a["vessel_0_radii"][:-1]),
-        "give one radius for each",
+        "radii is float64 of shape",
     ),
     "faces": (lambda h, a: a["surface_faces"].put(0, 10**8), "faces name vertices"),
     "pickle": (
@@ -87,7 +87,7 @@ def test_round_trip(anatomy, saved):
     assert again.name == anatomy.name
     np.testing.assert_array_equal(again.surface.faces, anatomy.surface.faces)
     points = np.random.default_rng(0).uniform(-0.05, 0.2, (200, 3))
-    np.testing.assert_array_equal(again.depth(points), anatomy.depth(points))
+    np.testing.assert_array_equal(again.lumen(points), anatomy.lumen(points))
     assert again.goals.keys() == anatomy.goals.keys()
     np.testing.assert_array_equal(again.inlet.direction, anatomy.inlet.direction)
     assert [end.open for end in again.ends] == [end.open for end in anatomy.ends]
@@ -115,7 +115,7 @@ def test_route_starts_at_the_inlet_and_ends_at_the_goal(anatomy):
     np.testing.assert_allclose(route.points[0], anatomy.inlet.position, atol=1e-9)
     goal = anatomy.goal("lcca").position
     np.testing.assert_allclose(route.points[-1], goal, atol=1e-9)
-    assert anatomy.depth(route.points[1:-1]).min() > 0.0
+    assert anatomy.lumen(route.points[1:-1]).min() > 0.0
 
 
 def test_triangles_of_a_tree_are_built_when_they_are_asked_for():
@@ -127,7 +127,7 @@ def test_triangles_of_a_tree_are_built_when_they_are_asked_for():
 def test_names_and_shapes_are_checked(anatomy):
     with pytest.raises(ValueError, match="bca, lcca, lsa, descending"):
         anatomy.goal("renal")
-    with pytest.raises(ValueError, match="no vessel 'rca'"):
+    with pytest.raises(ValueError, match="vessel is 'rca'"):
         Anatomy(
             "x",
             anatomy.tree,

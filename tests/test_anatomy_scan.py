@@ -85,7 +85,7 @@ def test_import_places_inlet_and_goals(y_anatomy):
     assert inlet.direction[2] > 0.97
     assert sum(end.open for end in y_anatomy.ends) == 1
     for goal in y_anatomy.goals.values():
-        assert y_anatomy.depth(goal.position) > DEVICE_RADIUS
+        assert y_anatomy.lumen(goal.position) > DEVICE_RADIUS
         assert y_anatomy.route(goal.name).radii.min() > DEVICE_RADIUS
     assert {"left", "right"} <= set(y_anatomy.goals)
     assert json.dumps(describe(y_anatomy))
@@ -96,7 +96,7 @@ def test_saved_anatomy_keeps_its_depth(y_anatomy, tmp_path):
     again = Anatomy.load(tmp_path / "a")
     rng = np.random.default_rng(3)
     points = rng.uniform(-0.03, 0.09, size=(500, 3))
-    np.testing.assert_array_equal(again.depth(points), y_anatomy.depth(points))
+    np.testing.assert_array_equal(again.lumen(points), y_anatomy.lumen(points))
     assert again.scanned and again.lumen.digest == y_anatomy.lumen.digest
 
 

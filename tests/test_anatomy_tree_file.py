@@ -74,7 +74,7 @@ def test_tree_along_a_space_curve_is_free_and_closed(access):
 
 def test_spline_is_the_curve_and_the_ostium_is_on_the_wall():
     points, _ = helix()
-    tree = parse_tree(content()).tree()
+    tree = smooth_tree(parse_tree(content()).curves)
     dense, _ = helix(2000)
     away = tree.vessel("trunk").centreline.project(dense * 1e-3).distance
     assert away.max() < 0.5e-3
@@ -115,7 +115,7 @@ def test_cut_inlet_drops_what_lies_behind_it():
     moved = whole.goal("far").arc_length - cut.goal("far").arc_length
     assert moved == pytest.approx(15e-3)
     behind = cut.inlet.position - 10e-3 * cut.inlet.direction
-    assert whole.depth(behind) > 0.0 > cut.depth(behind)
+    assert whole.lumen(behind) > 0.0 > cut.lumen(behind)
 
 
 def test_from_tree_sets_a_goal_in_each_branch():
@@ -157,7 +157,7 @@ def change(path, value):
         (change(["vessels", "trunk", "radii_mm", 3], True), r"\[3\] is \[True"),
         (change(["vessels", "trunk", "points_mm", 3], [1, 2]), "must be 3 numbers"),
         (change(["vessels", "trunk", "points_mm", 3], [1e5, 2, 3]), "millimetres"),
-        (change(["vessels", "side", "radii_mm"], [3.5]), "one radius"),
+        (change(["vessels", "side", "radii_mm"], [3.5]), r"of shape \(1,\)"),
         (change(["vessels", "side", "parent"], "aorta"), "before it: trunk"),
         (change(["vessels", "side", "parent"], None), "before it: trunk"),
         (change(["vessels", "trunk", "radii_mm"], [0.009] * 25), "millimetres"),

@@ -60,4 +60,4 @@ def test_rays_end_on_the_wall_of_a_moving_vessel():
     met = head + distance[..., None] * rays(frame)
     rest = arch.motion.to_rest(*warp[1:], met)
     _, growth = arch.motion.to_space(*warp[1:], rest)
-    assert np.percentile(np.abs(arch.depth(rest) + growth), 99) < 20e-6
+    assert np.percentile(np.abs(arch.lumen(rest) + growth), 99) < 20e-6

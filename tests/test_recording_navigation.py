@@ -50,13 +50,13 @@ def test_contacts_make_up_the_forces_of_the_task(env, episode):
 
 
 def test_contacts_lie_on_the_wall_and_press_outwards(env, episode):
-    depth = env.task.scene.anatomy.depth(episode.contact_position)
+    depth = env.task.scene.anatomy.lumen(episode.contact_position)
     assert np.abs(depth).max() < 2e-3
     firm = np.linalg.norm(episode.contact_force, axis=1) > 1e-3
     unit = episode.contact_force[firm]
     unit /= np.linalg.norm(unit, axis=1, keepdims=True)
     outside = episode.contact_position[firm] + 3e-3 * unit
-    assert (env.task.scene.anatomy.depth(outside) < depth[firm]).mean() > 0.95
+    assert (env.task.scene.anatomy.lumen(outside) < depth[firm]).mean() > 0.95
 
 
 def test_poses_are_those_of_the_task(env, episode):

@@ -175,7 +175,7 @@ def test_a_batch_is_many_single_ones(task, heads):
 def test_success_is_near_and_inside(task, anatomy, heads):
     outcome = judge(task, heads)
     assert (task.distance(heads)[outcome.success] < task.goal_radius).all()
-    assert (anatomy.depth(heads[outcome.success]) >= 0).all()
+    assert (anatomy.lumen(heads[outcome.success]) >= 0).all()
     assert (outcome.reward[~outcome.success] < 0).all()
 
 

@@ -59,7 +59,7 @@ def test_the_device_starts_inside_and_reaches_every_goal(name):
     for goal in anatomy.goals.values():
         route = anatomy.route(goal)
         placed = placement.place_device(anatomy, goal, devices.STEERABLE_5F)
-        assert anatomy.depth(placed.start) > devices.STEERABLE_5F.outer_radius
+        assert anatomy.lumen(placed.start) > devices.STEERABLE_5F.outer_radius
         assert placed.start_depth + placed.stroke >= route.length
         assert placed.working_length > placed.start_depth + placed.stroke
         np.testing.assert_allclose(
@@ -123,7 +123,7 @@ def test_the_device_waits_in_the_lumen_at_rest(shared_environment, task_name):
     inside = free[(free - inlet.position) @ inlet.direction > 2e-3]
     radius = task.scene.device.outer_radius
     # It may lean on the wall, as deep as a contact at rest.
-    assert (task.scene.anatomy.depth(inside) > radius - 0.5e-3).all()
+    assert (task.scene.anatomy.lumen(inside) > radius - 0.5e-3).all()
     first = task.readings.head
     for _ in range(10):
         environment.step(np.zeros(21))
@@ -217,7 +217,7 @@ def test_an_episode_may_start_along_the_route():
         environment.reset()
         head = task.readings.head
         starts.append(head)
-        assert task.scene.anatomy.depth(head) > 0
+        assert task.scene.anatomy.lumen(head) > 0
     ways = task.objective.path_distance(np.array(starts))
     whole = task.objective.route.length - task.scene.placement.start_depth
     assert ways.min() < 0.25 * whole and ways.max() > 0.75 * whole
@@ -237,7 +237,7 @@ def test_episodes_may_start_farther_in_and_off_the_line():
     start = batch.reset()
     heads, anatomy = start.readings.head, batch.task.scene.anatomy
     radius = batch.task.scene.device.outer_radius
-    assert anatomy.depth(heads).min() > 0.8 * radius
+    assert anatomy.lumen(heads).min() > 0.8 * radius
     way = batch.task.objective.path_distance(heads)
     assert np.ptp(way) > 0.03
     spread = [np.ptp(heads[abs(way - place) < 4e-3], axis=0).max() for place in way]

@@ -196,7 +196,7 @@ def test_goals_and_measures_are_those_of_the_own_arch(plain_pair):
         case = plain_pair.batch.rollout.case(i)
         np.testing.assert_array_equal(goals[i], case.scene.goal.position)
         head = step.readings.head[i]
-        assert case.scene.anatomy.depth(head) > 0
+        assert case.scene.anatomy.lumen(head) > 0
         assert step.distance[i] == np.linalg.norm(head - case.scene.goal.position)
 
 
@@ -281,7 +281,7 @@ def test_the_sheath_is_tilted_past_an_aorta_that_bends_back():
     behind = np.arange(0.015, placement.COMMON_LENGTH, 1e-3)[:, None]
     # Sheath and wall, 4 mm, clear of one another; the straight one is not.
     clear, crossing = (
-        anatomy.depth(anatomy.inlet.position - behind * way).max()
+        anatomy.lumen(anatomy.inlet.position - behind * way).max()
         for way in (direction, along)
     )
     assert clear < -5e-3 < crossing

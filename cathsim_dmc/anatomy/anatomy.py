@@ -12,12 +12,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from cathsim_dmc import bounds, files
 from cathsim_dmc.anatomy import builder, field_cache
 from cathsim_dmc.anatomy.builder import VesselPlace
-from cathsim_dmc.anatomy.centreline import Array, Centreline, Vessel, VesselTree
+from cathsim_dmc.anatomy.centreline import Centreline, Vessel, VesselTree
 from cathsim_dmc.anatomy.circulation import Circulation
 from cathsim_dmc.anatomy.curves import Curve, smooth_tree
 from cathsim_dmc.anatomy.field import Field
@@ -76,7 +75,6 @@ class Anatomy:
         *,
         inlet: VesselPlace | None = None,
         goals: Mapping[str, VesselPlace] | None = None,
-        **smoothing: float,
     ) -> "Anatomy":
         """Build lumen surface, inlet and goals around centrelines.
 
@@ -87,7 +85,6 @@ class Anatomy:
                 point of the root if None.
             goals: places to reach; if None one in each branch, see
                 `anatomy.builder.default_goals`.
-            **smoothing: `smoothing` and `flare` of `anatomy.curves.smooth_tree`, m.
 
         Raises:
             ValueError: if the centrelines give no valid lumen, or a place is not on
@@ -96,13 +93,13 @@ class Anatomy:
         from cathsim_dmc.anatomy.surface import TubeSurface
 
         if not isinstance(tree, VesselTree):
-            tree = smooth_tree(tree, **smoothing)
+            tree = smooth_tree(tree)
         tree, ends, entry, places = builder.placed(tree, inlet, goals)
         return cls(name, tree, TubeSurface(tree), entry, places, ends)
 
     @cached_property
     def lumen(self) -> Field:
-        """Signed depth to the wall, which a device touches.
+        """Signed depth to the wall, which a device touches: m at points, > 0 inside.
 
         Built when first asked for, and kept in `field_cache.cache_folder()`.
         """
@@ -119,19 +116,9 @@ class Anatomy:
         """Motion of the anatomy with heart and breathing."""
         return Motion.of(self.lumen.box, self.tree, self.ends, self.circulation)
 
-    def depth(self, points: ArrayLike) -> Array:
-        """Signed depth (...) of `points` (..., 3) in the lumen, metres, > 0 inside.
-
-        Behind an open end it is minus the distance from the plane of the end.
-        """
-        return self.lumen(points)
-
     def goal(self, name: str) -> Goal:
         """Goal called `name`; ValueError lists those that there are."""
-        if name not in self.goals:
-            known = ", ".join(self.goals) or "none"
-            raise ValueError(f"no goal {name!r}; there are {known}.")
-        return self.goals[name]
+        return self.goals[bounds.choice("goal", name, self.goals)]
 
     def route(self, goal: str | Goal, spare: float = 0.0) -> Centreline:
         """Polyline with radii from the inlet to a goal, or `spare` (m) past it."""

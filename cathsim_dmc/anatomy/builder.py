@@ -18,28 +18,20 @@ ACCESSES = ("ascending", "descending")
 
 @dataclass(frozen=True, eq=False)
 class VesselPlace:
-    """A place on a vessel: exactly one of the three ways to say where.
+    """A place on a vessel.
 
     Attributes:
         vessel: name.
         arc_length: m along its centreline from its first point; infinite for its last.
-        past_ostium: m along its centreline from its ostium.
+        past_ostium: whether the arc length counts from its ostium.
         position: (3,) m, a point of the lumen; the place is the nearest one of the
-            centreline.
+            centreline, whatever the arc length.
     """
 
     vessel: str
-    arc_length: float | None = None
-    past_ostium: float | None = None
+    arc_length: float = 0.0
+    past_ostium: bool = False
     position: Array | None = None
-
-    def __post_init__(self) -> None:
-        given = (self.arc_length, self.past_ostium, self.position)
-        if sum(value is not None for value in given) != 1:
-            raise ValueError(
-                f"a place on vessel {self.vessel!r} needs one of arc_length, "
-                "past_ostium and position, and only one."
-            )
 
     def arc(self, tree: VesselTree) -> float:
         """Arc length (m) of the place; ValueError if it is not on the tree."""
@@ -47,10 +39,9 @@ class VesselPlace:
         line = vessel.centreline
         if self.position is not None:
             return line.locate(self.position)
-        if self.arc_length is not None:
-            arc = line.length if self.arc_length == math.inf else self.arc_length
-        else:
-            arc = vessel.ostium + float(self.past_ostium or 0.0)
+        arc = line.length if self.arc_length == math.inf else self.arc_length
+        if self.past_ostium:
+            arc += vessel.ostium
         if not -1e-9 <= arc <= line.length + 1e-9:
             raise ValueError(
                 f"place {arc * 1e3:.1f} mm along vessel {self.vessel!r} is not on it: "
@@ -64,11 +55,9 @@ def placed(
     tree: VesselTree, inlet: VesselPlace | None, goals: Mapping[str, VesselPlace] | None
 ) -> tuple[VesselTree, tuple[End, ...], Inlet, dict[str, Goal]]:
     """The tree from its inlet on, flat ends, inlet and goals of `Anatomy.from_tree`."""
-    if goals is None:
-        found = default_goals(tree)
-    else:
-        found = {key: _goal(key, place, tree) for key, place in goals.items()}
-    inlet = inlet or VesselPlace(tree.root.name, arc_length=0.0)
+    places = default_goals(tree) if goals is None else goals
+    found = {key: _goal(key, place, tree) for key, place in places.items()}
+    inlet = inlet or VesselPlace(tree.root.name)
     tree, at_first = _cut_at(tree, inlet, found)
     if inlet.vessel == tree.root.name:
         # Arc lengths count from the new first point.
@@ -89,7 +78,7 @@ def placed(
     return tree, tuple(ends), opening, found
 
 
-def default_goals(tree: VesselTree) -> dict[str, Goal]:
+def default_goals(tree: VesselTree) -> dict[str, VesselPlace]:
     """A goal in each branch: 27 mm past its ostium where there is room for it.
 
     It lies at least 5 mm before the branch's free end, and not beyond the place
@@ -104,7 +93,7 @@ def default_goals(tree: VesselTree) -> dict[str, Goal]:
         for fork in tree.vessels.values():
             if fork.parent == name:
                 deepest = min(deepest, vessel.centreline.locate(fork.mouth.position))
-        goals[name] = _goal(name, VesselPlace(name, arc_length=deepest), tree)
+        goals[name] = VesselPlace(name, deepest)
     return goals
 
 

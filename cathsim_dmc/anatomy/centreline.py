@@ -5,7 +5,7 @@ left, +y posterior, +z superior).
 """
 
 import math
-from collections.abc import Collection, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple
@@ -62,15 +62,6 @@ class Projection(NamedTuple):
     radius: Array
 
 
-def parents_first(name: str, parent: str | None, before: Collection[str]) -> None:
-    """Raise ValueError unless a vessel's parent is among those listed before it."""
-    if parent not in before:
-        raise ValueError(
-            f"parent {parent!r} of vessel {name!r} is not among {sorted(before)}; list "
-            "parents before their children."
-        )
-
-
 def _readonly(values: ArrayLike) -> Array:
     array = np.array(values, dtype=np.float64)
     array.setflags(write=False)
@@ -94,14 +85,10 @@ class Centreline:
 
     def __post_init__(self) -> None:
         points = bounds.array("centreline points", self.points, shape=(-1, 3))
-        radii = _readonly(bounds.array("centreline radii", self.radii))
         if len(points) < 2:
             raise ValueError(f"a centreline has {len(points)} points; give 2 or more.")
-        if radii.shape != (len(points),):
-            raise ValueError(
-                f"centreline radii have shape {radii.shape}; give one radius for "
-                f"each of the {len(points)} points."
-            )
+        shape = (len(points),)
+        radii = _readonly(bounds.array("centreline radii", self.radii, shape=shape))
         if radii.min() <= 0.0:
             raise ValueError(
                 f"smallest centreline radius is {radii.min():g} m; radii must be > 0."
@@ -253,6 +240,8 @@ class VesselTree:
     vessels: Mapping[str, Vessel]
 
     def __post_init__(self) -> None:
+        if not self.vessels:
+            raise ValueError("a vessel tree needs at least one vessel.")
         seen: list[str] = []
         for key, vessel in self.vessels.items():
             if key != vessel.name:
@@ -263,10 +252,8 @@ class VesselTree:
                     "and only the first, has no parent."
                 )
             if seen:
-                parents_first(key, vessel.parent, seen)
+                bounds.choice(f"the parent before {key!r}", vessel.parent, seen)
             seen.append(key)
-        if not seen:
-            raise ValueError("a vessel tree needs at least one vessel.")
         vars(self).update(vessels=dict(self.vessels))
 
     @property
@@ -276,9 +263,7 @@ class VesselTree:
 
     def vessel(self, name: str) -> Vessel:
         """Vessel called `name`; ValueError lists those that there are."""
-        if name not in self.vessels:
-            raise ValueError(f"no vessel {name!r}; there are {', '.join(self.vessels)}")
-        return self.vessels[name]
+        return self.vessels[bounds.choice("vessel", name, self.vessels)]
 
     def depths(self, points: ArrayLike) -> dict[str, Array]:
         """Radius less distance (m) of `points` (..., 3) in each vessel's own tube.
@@ -340,8 +325,8 @@ class VesselTree:
             legs.append((name, here, 0.0))
             here = self.origin(name)
         way = down[down.index(common) :: -1]
-        for name, child in zip(way, [*way[1:], None], strict=True):
-            there = goal_arc_length if child is None else self.origin(child)
+        stops = [*map(self.origin, way[1:]), goal_arc_length]
+        for name, there in zip(way, stops, strict=True):
             legs.append((name, here, there))
             here = 0.0
         parts = [

@@ -17,7 +17,6 @@ from cathsim_dmc.anatomy.centreline import (
     Vessel,
     VesselTree,
     arc_lengths,
-    parents_first,
 )
 
 # Standard deviations of measured positions and radii, m: how far the spline may
@@ -25,7 +24,7 @@ from cathsim_dmc.anatomy.centreline import (
 SMOOTHING = 0.35e-3
 _RADIUS_SMOOTHING = 0.15e-3
 # By how much a branch's radius grows at its ostium, m, if its parent has the room.
-FLARE = 1e-3
+_FLARE = 1e-3
 _STEP = 1e-3  # m, between the points of a built centreline
 _FINE = 0.25e-3  # m, steps in which an ostium is looked for
 # The lumen may not fold on the inner side of a bend: least ratio of the radius of
@@ -57,10 +56,7 @@ class Curve(Centreline):
 
 
 def smooth_tree(
-    curves: Mapping[str, Curve],
-    *,
-    smoothing: float = SMOOTHING,
-    flare: float = FLARE,
+    curves: Mapping[str, Curve], *, smoothing: float = SMOOTHING
 ) -> VesselTree:
     """Vessel tree through measured centrelines.
 
@@ -72,23 +68,20 @@ def smooth_tree(
         curves: centrelines by name, parents before their children, the root first.
         smoothing: root mean square (m) by which the spline may miss the points; 0
             runs through all of them.
-        flare: growth (m) of a branch's radius at its ostium, at most.
 
     Raises:
         ValueError: if a branch does not begin in its parent or never leaves it, if a
             vessel bends more sharply than its lumen allows, or if two vessels run
             into each other; names the vessel and the place.
     """
-    for name, value in (("smoothing", smoothing), ("flare", flare)):
-        bounds.number(name, value, 0.0, 5e-3, "m")
+    bounds.number("smoothing", smoothing, 0.0, 5e-3, "m")
     vessels: dict[str, Vessel] = {}
     for name, curve in curves.items():
         if curve.parent is None:
             vessels[name] = Vessel(name, _spline(curve, smoothing))
         else:
-            parents_first(name, curve.parent, vessels)
-            parent = vessels[curve.parent]
-            vessels[name] = _branch(name, curve, parent, smoothing, flare)
+            before = bounds.choice(f"the parent before {name!r}", curve.parent, vessels)
+            vessels[name] = _branch(name, curve, vessels[before], smoothing)
         _check_bends(vessels[name])
     tree = VesselTree(vessels)
     check_septa(tree)
@@ -148,9 +141,7 @@ def _places(line: Centreline, points: Array) -> tuple[Array, np.ndarray]:
     return places, np.append(True, np.diff(places) > 1e-6)
 
 
-def _branch(
-    name: str, curve: Curve, parent: Vessel, smoothing: float, flare: float
-) -> Vessel:
+def _branch(name: str, curve: Curve, parent: Vessel, smoothing: float) -> Vessel:
     start = _onto_parent(name, curve.points, parent)
     # The start is no measurement: it lies on the parent.
     dense = _smooth(start, smoothing, _FINE, first_weight=100.0)
@@ -180,7 +171,7 @@ def _branch(
             f"branch may have {_WIDEST_OSTIUM:g} of its parent's. Radii of a branch "
             "are those of its own lumen, not of the sphere inside both."
         )
-    wide = calibre + min(flare, room)
+    wide = calibre + min(_FLARE, room)
     tilt = min(tilt, math.radians(60.0))
     begin = flare_begin(wide, parent_radius, tilt, ostium)
     over = ostium + 2.0 * max(wide - calibre, 0.5e-3) + calibre * math.tan(tilt)

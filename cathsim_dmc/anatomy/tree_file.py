@@ -9,7 +9,7 @@ import json
 import math
 import os
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -18,8 +18,7 @@ import numpy as np
 from cathsim_dmc import bounds
 from cathsim_dmc.anatomy.anatomy import Anatomy
 from cathsim_dmc.anatomy.builder import VesselPlace
-from cathsim_dmc.anatomy.centreline import VesselTree
-from cathsim_dmc.anatomy.curves import Curve, smooth_tree
+from cathsim_dmc.anatomy.curves import Curve
 
 FORMAT = "cathsim-vessel-tree"
 FORMAT_VERSION = 1
@@ -44,25 +43,19 @@ class TreeFile:
         curves: centrelines by name, the root first.
         inlets: by name of the access; the first is the usual one.
         goals: by name; None for one in each branch.
-        note: where the figures come from.
     """
 
     name: str
     curves: Mapping[str, Curve]
     inlets: Mapping[str, VesselPlace]
     goals: Mapping[str, VesselPlace] | None = None
-    note: str = field(default="", repr=False)
-
-    def tree(self) -> VesselTree:
-        """Smooth vessel tree through the centrelines."""
-        return smooth_tree(self.curves)
 
     def build(self, access: str | None = None) -> Anatomy:
         """Anatomy that is entered by `access`, by default the first inlet's."""
         if access is None:
             access = next(iter(self.inlets))
         inlet = self.inlets[bounds.choice("access", access, self.inlets)]
-        return Anatomy.from_tree(self.tree(), self.name, inlet=inlet, goals=self.goals)
+        return Anatomy.from_tree(self.curves, self.name, inlet=inlet, goals=self.goals)
 
 
 def read_tree(path: str | os.PathLike[str]) -> TreeFile:
@@ -96,12 +89,12 @@ def parse_tree(content: Any) -> TreeFile:
         }
         for kind, ways in _WAYS.items()
     )
+    bounds.instance("note", content.get("note", ""), str)
     return TreeFile(
         bounds.text("name", content["name"]),
         curves,
-        inlets or {"first": VesselPlace(root, arc_length=0.0)},
+        inlets or {"first": VesselPlace(root)},
         goals if "goals" in content else None,
-        bounds.instance("note", content.get("note", ""), str),
     )
 
 
@@ -160,11 +153,9 @@ def _place(
         ends = {"first": 0.0, "last": math.inf}
         if curves[vessel].parent is not None:
             del ends["first"]
-        return VesselPlace(vessel, arc_length=ends[bounds.choice(name, value, ends)])
+        return VesselPlace(vessel, ends[bounds.choice(name, value, ends)])
     if way == "position_mm":
         position = np.array(bounds.vector(name, value, 3)) * _MM
         return VesselPlace(vessel, position=position)
     length = bounds.number(name, value, 0.0, _FARTHEST, "mm") * _MM
-    if way == "past_ostium_mm":
-        return VesselPlace(vessel, past_ostium=length)
-    return VesselPlace(vessel, arc_length=length)
+    return VesselPlace(vessel, length, way == "past_ostium_mm")

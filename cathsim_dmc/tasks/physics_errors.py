@@ -44,7 +44,7 @@ def escaped(
     axis = np.cross(centreline - inlet.position, along)
     in_sheath = ~beyond & (np.linalg.norm(axis, axis=-1) < inlet.radius)
     outside = aside & ~in_sheath
-    outside[outside] = anatomy.depth(centreline[outside]) < -_ESCAPE_DEPTH
+    outside[outside] = anatomy.lumen(centreline[outside]) < -_ESCAPE_DEPTH
     return outside.any(-1)
 
 

@@ -75,7 +75,7 @@ def resolve_goal(anatomy: Anatomy, goal: "str | Goal") -> Goal:
     if isinstance(goal, str):
         goal = anatomy.goal(goal)
     bounds.instance("goal", goal, Goal)
-    depth = float(anatomy.depth(goal.position))
+    depth = float(anatomy.lumen(goal.position))
     if not depth > 0:
         raise ValueError(
             f"goal {goal.name!r} at {np.round(goal.position, 4).tolist()} m lies "
@@ -184,7 +184,7 @@ def _clear(anatomy: Anatomy, directions: np.ndarray) -> np.ndarray:
     """Whether (k,) sheaths in directions (k, 3) run outside all vessels."""
     behind = np.arange(_NEAR_INLET, COMMON_LENGTH, _LINE_SPACING)
     lines = anatomy.inlet.position - behind[:, None] * directions[:, None]
-    depth = anatomy.depth(lines.reshape(-1, 3)).reshape(len(directions), -1)
+    depth = anatomy.lumen(lines.reshape(-1, 3)).reshape(len(directions), -1)
     return np.asarray((depth < -_CLEAR_OF_LUMEN).all(-1))
 
 

@@ -161,7 +161,7 @@ class _Posture:
         ahead = np.append(beyond[self._free + 2 :], 0.0)[:, None]
         self._shares = 1.0 - ahead / beyond[self._free + 1]
         self._anatomy = scene.anatomy
-        depth = scene.anatomy.depth(self._nodes)
+        depth = scene.anatomy.lumen(self._nodes)
         self._least = np.minimum(depth, scene.device.outer_radius)
         self._least[:-1] -= _PRESSED
 
@@ -233,7 +233,7 @@ def _refuse_outside(
     place, anatomy = scene.placement, scene.anatomy
     # Those behind the mouth lie in the sheath, and touch the wall where that does.
     entered = (nodes - place.inlet) @ place.direction > 0.0
-    out = -float(anatomy.depth(nodes[entered]).min(initial=0.0))
+    out = -float(anatomy.lumen(nodes[entered]).min(initial=0.0))
     touching = np.isin(data.contact.geom, index.walls).any(axis=-1)
     deepest = -float(data.contact.dist[touching].min(initial=0.0))
     if data.warning.number[_DIVERGED].any():

@@ -57,7 +57,7 @@ def lumen_checks(anatomy: Anatomy) -> list[Check]:
         depth = anatomy.lumen(route.at(s).position, free=True)
         narrow[goal.name] = int((depth < radius).sum())
         own = float(anatomy.tree.depths(goal.position)[goal.vessel])
-        if not min(float(anatomy.depth(goal.position)), own) > radius:
+        if not min(float(anatomy.lumen(goal.position)), own) > radius:
             astray.append(goal.name)
     faces = anatomy.surface.faces.astype(np.int64)
     loose = int((topology.edge_counts(faces)[1] != 2).sum())

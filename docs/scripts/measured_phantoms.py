@@ -17,6 +17,7 @@ import numpy as np
 from cathsim_dmc import files
 from cathsim_dmc.anatomy.builder import default_goals
 from cathsim_dmc.anatomy.centreline import Centreline
+from cathsim_dmc.anatomy.curves import smooth_tree
 from cathsim_dmc.anatomy.phantoms import _DATA, MEASURED
 from cathsim_dmc.anatomy.tree_file import FORMAT, FORMAT_VERSION, parse_tree
 
@@ -85,7 +86,7 @@ def tree_file(name):
             "descending": {"vessel": "aorta", "end": "last"},
         },
     }
-    tree = parse_tree(content).tree()
+    tree = smooth_tree(parse_tree(content).curves)
     goals = default_goals(tree)
     content["goals"] = {
         key: {

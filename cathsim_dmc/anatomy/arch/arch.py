@@ -63,14 +63,13 @@ def build_arch(
     """
     bounds.choice("access", access, ACCESSES)
     tree = arch_tree(params)
-    arc = 0.0 if access == "ascending" else math.inf
-    inlet = VesselPlace(tree.root.name, arc_length=arc)
+    inlet = VesselPlace(tree.root.name, 0.0 if access == "ascending" else math.inf)
     goals = {
-        branch: VesselPlace(branch, past_ostium=figures.goal_depth)
+        branch: VesselPlace(branch, figures.goal_depth, past_ostium=True)
         for branch, figures in params.branches.items()
     }
     arc = tree.root.centreline.length - params.descending_goal_depth
-    goals["descending"] = VesselPlace(tree.root.name, arc_length=arc)
+    goals["descending"] = VesselPlace(tree.root.name, arc)
     return Anatomy.from_tree(tree, name, inlet=inlet, goals=goals)
 
 
