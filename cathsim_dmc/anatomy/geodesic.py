@@ -81,9 +81,8 @@ class LumenDistance:
             lumen = np.zeros(shape, bool)
             lumen[tuple(cells.T)] = True
             start, end = (self._nearest(cells, point) for point in (target, origin))
-            costs = graph.MCP_Geometric(np.where(lumen, 1.0, -1.0)).find_costs([start])[
-                0
-            ]
+            field = graph.MCP_Geometric(np.where(lumen, 1.0, -1.0))
+            costs, _ = field.find_costs([start])
             if np.isfinite(costs[end]):
                 break
             spacing /= 2.0
@@ -98,6 +97,7 @@ class LumenDistance:
             ~self._inside, return_distances=False, return_indices=True
         )
         self._ways = (costs * spacing)[tuple(nearest)].astype(np.float32)
+        self._own = np.where(self._inside, self._ways, 0.0)
 
     def _nearest(self, cells: np.ndarray, point: np.ndarray) -> tuple[int, ...]:
         offset = self._low + self._spacing * cells - point
@@ -110,20 +110,13 @@ class LumenDistance:
         be nearer to another vessel, count only where there is no other.
         """
         points = np.asarray(points, float)
-        cell = (points.reshape(-1, 3) - self._low) / self._spacing
-        cell = np.clip(cell, 0.0, np.array(self._ways.shape) - 1.001)
-        corner = cell.astype(int)
-        rest = cell - corner
-        total, weight = np.zeros((2, len(cell)))
-        for offset in np.ndindex(2, 2, 2):
-            share = np.where(offset, rest, 1.0 - rest)
-            share = share[:, 0] * share[:, 1] * share[:, 2]
-            at = tuple((corner + offset).T)
-            share = share * self._inside[at]
-            weight += share
-            total += share * self._ways[at]
-        outside = weight < 1e-6
-        if outside.any():
-            at = tuple(np.rint(cell[outside]).astype(int).T)
-            total[outside], weight[outside] = self._ways[at], 1.0
-        return (total / weight).reshape(points.shape[:-1])
+        cell = ((points.reshape(-1, 3) - self._low) / self._spacing).T
+        total, weight = (
+            ndimage.map_coordinates(lattice, cell, float, order=1, mode="nearest")
+            for lattice in (self._own, self._inside)
+        )
+        last = np.array(self._ways.shape)[:, None] - 1
+        nearest = self._ways[tuple(np.rint(cell).astype(int).clip(0, last))]
+        with np.errstate(invalid="ignore"):  # no lattice point inside
+            lengths = np.where(weight < 1e-6, nearest, total / weight)
+        return lengths.reshape(points.shape[:-1])

@@ -269,7 +269,7 @@ class Cannulation(Shiftable, Routed):
         if isinstance(reward, Mapping) and "path" in reward:
             vertices, inlet = anatomy.surface.vertices, anatomy.inlet.position
             box = np.stack([vertices.min(0), vertices.max(0)])
-            lumen = LumenDistance(anatomy.depth, box, route.points[-1], inlet)
+            lumen = LumenDistance(anatomy.lumen, box, route.points[-1], inlet)
         return cls(
             goal=goal.position,
             branch=vessel.centreline,

@@ -169,7 +169,7 @@ class _Posture:
         """The displacement (3,), m, reversed or halved where it would press."""
         for factor in (1.0, -1.0, *_SMALLER):
             displaced = self._frame @ (factor * displacement)
-            depth = self._anatomy.depth(self._nodes + self._shares * displaced)
+            depth = self._anatomy.lumen(self._nodes + self._shares * displaced)
             if (depth >= self._least).all():
                 return factor * displacement
         return np.zeros(3)
