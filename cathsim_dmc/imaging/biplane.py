@@ -7,11 +7,12 @@ hull of its outlines in both roadmaps: points that both planes see inside. The r
 the way from the device to the goal marker that keeps to the middle of the hull.
 """
 
-from functools import cached_property
+from functools import cache, cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from cathsim_dmc.anatomy.centreline import arc_lengths
 from cathsim_dmc.imaging import biplane_loops as loops
 from cathsim_dmc.imaging import materials
 from cathsim_dmc.imaging.fluoroscopy import Fluoroscope
@@ -42,53 +43,40 @@ class Biplane:
 
     Attributes:
         matrices: (2, 3, 4), from places to pixels, see `CArm.matrix`.
+        isocentre: point (3,) about which the arms turn, m.
     """
 
     def __init__(self, planes: tuple[Fluoroscope, Fluoroscope]):
         """Takes the roadmap and the mask image of each plane."""
         self._planes = planes
+        self.isocentre = np.asarray(planes[0].carm.isocentre)
         self.matrices = np.array([plane.carm.matrix for plane in planes])
         self._focal = np.array([plane.carm.focal_length for plane in planes])
         # Grey levels without a device, (2, rows, columns).
         self._masks = np.stack([plane.empty for plane in planes]).astype(np.float32)
         self._goal: tuple[np.ndarray, np.ndarray] | None = None
 
-    @property
-    def isocentre(self) -> np.ndarray:
-        """Point (3,) about which the arms turn, m."""
-        return np.asarray(self._planes[0].carm.isocentre)
-
-    def device(self, images: np.ndarray) -> list[np.ndarray]:
+    def device(self, image: np.ndarray) -> np.ndarray:
         """Follows the device from its tip.
 
         Args:
-            images: (K, rows, columns, 2) uint8, live images of the two planes.
+            image: (rows, columns, 2) uint8, live image of the two planes.
 
         Returns:
-            Points (P, 3) of each, world frame, m: the marker at the tip, then every
+            Points (P, 3), world frame, m: the marker at the tip, then every
             `TRACE_SPACING` behind it; (0, 3) where no marker is seen.
         """
-        found = []
         pitch = np.mean([plane.carm.pitch for plane in self._planes])
         pixel = pitch * self._planes[0].carm.source_isocentre
         pixel /= self._planes[0].carm.source_detector
         # Of a rod across a pixel: the mean path through it.
         full = materials.CATHETER * 0.25 * np.pi * _SHAFT**2 / max(pixel, _SHAFT)
-        for image in images:
-            grey = np.moveaxis(image, -1, 0).astype(np.float32)
-            depth = np.log(np.maximum(self._masks, 1.0) / np.maximum(grey, 1.0))
-            line = np.empty((TRACE_POINTS, 3))
-            count = loops.trace(
-                np.ascontiguousarray(depth, dtype=np.float32),
-                self.matrices,
-                _directions(),
-                TRACE_SPACING,
-                float(full),
-                TRACE_ENOUGH,
-                line,
-            )
-            found.append(line[:count])
-        return found
+        grey = np.moveaxis(image, -1, 0).astype(np.float32)
+        depth = np.log(np.maximum(self._masks, 1.0) / np.maximum(grey, 1.0))
+        depth = np.ascontiguousarray(depth, dtype=np.float32)
+        line = np.empty((TRACE_POINTS, 3))
+        wanted = TRACE_SPACING, float(full), TRACE_ENOUGH
+        return line[: loops.trace(depth, self.matrices, _directions(), *wanted, line)]
 
     def point(self, pixels: ArrayLike) -> np.ndarray:
         """Point (3,), m, that is seen at pixels (2, 2), (column, row) of each plane."""
@@ -111,10 +99,8 @@ class Biplane:
         walls = []
         for plane in self._planes:
             inside = plane.vessel_mask
-            wall = np.where(
-                inside, distances(inside) - _EDGE, _EDGE - distances(~inside)
-            )
-            walls.append(wall.astype(np.float32))
+            out, within = _EDGE - distances(~inside), distances(inside) - _EDGE
+            walls.append(np.where(inside, within, out).astype(np.float32))
         return np.stack(walls)
 
     @cached_property
@@ -143,14 +129,13 @@ class Biplane:
         start, goal = (np.asarray(end, dtype=np.float64) for end in (start, goal))
         found = self._path(start, goal)
         line = np.vstack([start, found[1:-1], goal])
-        way = np.append(0.0, np.linalg.norm(np.diff(line, axis=0), axis=1).cumsum())
+        way = arc_lengths(line)
         fine = np.arange(0.0, way[-1], ROUTE_SPACING)
         line = np.stack([np.interp(fine, way, axis) for axis in line.T], axis=1)
         # The ends stay where they are: the line continues beyond them, point reflected.
         beyond = min(round(3 * _SMOOTHING / ROUTE_SPACING), len(line) - 1)
-        before = 2 * line[0] - line[beyond:0:-1]
-        after = 2 * line[-1] - line[-2 : -beyond - 2 : -1]
-        whole = np.vstack([before, line, after])
+        around = ((beyond, beyond), (0, 0))
+        whole = np.pad(line, around, "reflect", reflect_type="odd")
         smooth = gaussian_filter1d(whole, _SMOOTHING / ROUTE_SPACING, axis=0)
         return smooth[beyond : beyond + len(line)]
 
@@ -179,14 +164,10 @@ def _nearest(allowed: np.ndarray, place: np.ndarray) -> tuple[int, ...]:
     return tuple(chosen.tolist())
 
 
-_CACHED: list[np.ndarray] = []
-
-
+@cache
 def _directions(count: int = 300) -> np.ndarray:
     """Unit vectors (count, 3) all around, evenly spaced (Fibonacci)."""
-    if not _CACHED:
-        number = np.arange(count) + 0.5
-        z, angle = 1.0 - 2.0 * number / count, np.pi * (1.0 + 5**0.5) * number
-        flat = np.sqrt(1.0 - z**2)
-        _CACHED.append(np.stack([flat * np.cos(angle), flat * np.sin(angle), z], 1))
-    return _CACHED[0]
+    number = np.arange(count) + 0.5
+    z, angle = 1.0 - 2.0 * number / count, np.pi * (1.0 + 5**0.5) * number
+    flat = np.sqrt(1.0 - z**2)
+    return np.stack([flat * np.cos(angle), flat * np.sin(angle), z], 1)

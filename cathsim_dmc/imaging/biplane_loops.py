@@ -11,7 +11,7 @@ PEAKS = 16
 
 
 @compiled
-def _sampled(image: np.ndarray, row: float, column: float) -> float:
+def _sampled(image, row, column):
     """Bilinear value; that of the nearest pixel outside the image."""
     rows, columns = image.shape
     row = min(max(row, 0.0), rows - 1.001)
@@ -33,9 +33,7 @@ def _place(matrix, x, y, z):
 
 
 @compiled
-def depths(
-    points: np.ndarray, matrices: np.ndarray, walls: np.ndarray, focal: np.ndarray
-) -> np.ndarray:
+def depths(points, matrices, walls, focal):
     """Signed distances (n,) to the outline of the vessel, the lesser of both planes, m.
 
     Args:
@@ -46,19 +44,17 @@ def depths(
     """
     found = np.empty(len(points))
     for n in range(len(points)):
-        least = math.inf
+        x, y, z = points[n]
+        found[n] = math.inf
         for plane in range(2):
-            row, column, depth = _place(
-                matrices[plane], points[n, 0], points[n, 1], points[n, 2]
-            )
+            row, column, depth = _place(matrices[plane], x, y, z)
             wall = _sampled(walls[plane], row, column) * depth / focal[plane]
-            least = min(least, wall)
-        found[n] = least
+            found[n] = min(found[n], wall)
     return found
 
 
 @compiled
-def triangulated(matrices: np.ndarray, places: np.ndarray, point: np.ndarray) -> float:
+def triangulated(matrices, places, point):
     """Writes the point (3,) that two places see; returns the error in the image, px.
 
     Args:
@@ -83,7 +79,7 @@ def triangulated(matrices: np.ndarray, places: np.ndarray, point: np.ndarray) ->
 
 
 @compiled
-def _centred(image: np.ndarray, row: float, column: float, least: float):
+def _centred(image, row, column, least):
     """Centre of mass of what exceeds `least` in the 3 x 3 pixels round a place."""
     rows, columns = image.shape
     i, j = round(row), round(column)
@@ -100,7 +96,7 @@ def _centred(image: np.ndarray, row: float, column: float, least: float):
 
 
 @compiled
-def _peaks(image: np.ndarray, least: float, found: np.ndarray) -> int:
+def _peaks(image, least, found):
     """Writes the highest local maxima (`PEAKS`, 3): value, row, column."""
     rows, columns = image.shape
     count = 0
@@ -121,7 +117,7 @@ def _peaks(image: np.ndarray, least: float, found: np.ndarray) -> int:
 
 
 @compiled
-def _marker(images, matrices, least, widest, point) -> float:
+def _marker(images, matrices, least, widest, point):
     """Writes where the marker is: dark in both planes. Returns how dark, 0 if nowhere.
 
     Args:
@@ -144,18 +140,16 @@ def _marker(images, matrices, least, widest, point) -> float:
 
 
 @compiled
-def _line(images, matrices, full, point, direction, way) -> float:
+def _line(images, matrices, full, point, direction, way):
     """How well both planes show a device along a direction, 0 to 1."""
     least, total = math.inf, 0.0
     for plane in range(2):
         seen = 0.0
         for part in (0.5, 1.0):
-            row, column, _ = _place(
-                matrices[plane],
-                point[0] + part * way * direction[0],
-                point[1] + part * way * direction[1],
-                point[2] + part * way * direction[2],
-            )
+            step = part * way
+            x, y = point[0] + step * direction[0], point[1] + step * direction[1]
+            z = point[2] + step * direction[2]
+            row, column, _ = _place(matrices[plane], x, y, z)
             seen += 0.5 * min(_sampled(images[plane], row, column) / full, 1.0)
         least = min(least, seen)
         total += 0.5 * seen
@@ -163,7 +157,7 @@ def _line(images, matrices, full, point, direction, way) -> float:
 
 
 @compiled
-def _next(images, matrices, directions, way, full, point, last, tried) -> int:
+def _next(images, matrices, directions, way, full, point, last, tried):
     """Number of the direction in which the device goes on, -1 if none.
 
     Args:
@@ -186,7 +180,7 @@ def _next(images, matrices, directions, way, full, point, last, tried) -> int:
 
 
 @compiled
-def _follow(images, matrices, directions, way, full, tried, line) -> int:
+def _follow(images, matrices, directions, way, full, tried, line):
     """Writes points behind the first; returns their number with it.
 
     Directions beside that of the first step are marked as tried.
@@ -219,15 +213,7 @@ def _follow(images, matrices, directions, way, full, tried, line) -> int:
 
 
 @compiled
-def trace(
-    images: np.ndarray,
-    matrices: np.ndarray,
-    directions: np.ndarray,
-    way: float,
-    full: float,
-    enough: int,
-    line: np.ndarray,
-) -> int:
+def trace(images, matrices, directions, way, full, enough, line):
     """Follows a device from the marker at its tip back to where it is lost.
 
     Args:
@@ -257,7 +243,7 @@ def trace(
 
 
 @compiled
-def carried(frame: np.ndarray, line: np.ndarray, direction: np.ndarray) -> np.ndarray:
+def carried(frame, line, direction):
     """Axes (3, 3) in columns, carried along a device without turning about it.
 
     Args:

@@ -21,9 +21,6 @@ from cathsim_dmc.imaging.thickness import surface_thickness
 # whose path is averaged over the pixel, it is that share of its width in pixels.
 MASK_SHARE = 0.25
 
-# Frames rendered at once.
-_CHUNK = 16
-
 RandomStates = np.random.RandomState | Sequence[np.random.RandomState]
 
 
@@ -58,7 +55,7 @@ class Fluoroscope:
 
     @classmethod
     def from_surface(
-        cls, surface: Surface, carm: CArm | None = None, supersample: int = 3, **fields
+        cls, surface: Surface, carm: CArm | None = None, **fields
     ) -> "Fluoroscope":
         """Fluoroscope of a lumen: the static part, once per anatomy and view.
 
@@ -66,7 +63,6 @@ class Fluoroscope:
             surface: of the lumen, world frame, m, without open ends.
             carm: the view; by default AP with the isocentre in the middle of the
                 surface.
-            supersample: rays along each side of a pixel.
             **fields: `contrast` and the further attributes.
 
         Raises:
@@ -75,7 +71,7 @@ class Fluoroscope:
         if carm is None:
             carm = CArm.view("AP").centred_on(surface.vertices)
         central = surface_thickness(carm, surface, 1)
-        path = surface_thickness(carm, surface, supersample)
+        path = surface_thickness(carm, surface)
         return cls(carm, path, central > 0.0, **fields)
 
     def around(self, surface: Surface) -> "Fluoroscope":
@@ -124,17 +120,7 @@ class Fluoroscope:
         states = random_states
         if isinstance(states, np.random.RandomState):
             states = [states] * len(frames)
-        if states is not None and len(states) != len(frames):
-            raise ValueError(
-                f"{len(states)} random states for {len(frames)} frames; give one, or "
-                "one per frame."
-            )
-        image = np.empty(frames.shape, dtype=np.uint8)
-        for start in range(0, len(frames), _CHUNK):
-            part = slice(start, start + _CHUNK)
-            of_part = None if states is None else states[part]
-            image[part] = self._developed(frames[part], of_part)
-        return image.reshape(*depth.shape, 1)
+        return self._developed(frames, states).reshape(*depth.shape, 1)
 
     def _developed(
         self, depths: np.ndarray, states: Sequence[np.random.RandomState] | None

@@ -62,7 +62,7 @@ class BiplaneSight:
             if fresh or number not in self._machines:
                 self._machines[number] = _machine(planes[k])
             machine = self._machines[number]
-            (line,) = machine.device(images[k : k + 1])
+            line = machine.device(images[k])
             if len(line) >= _FEWEST or not len(self._lines[number]) or fresh:
                 self._lines[number] = line
             line = self._lines[number]
