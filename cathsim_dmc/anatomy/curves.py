@@ -45,8 +45,8 @@ class Curve(Centreline):
     """A measured centreline; ValueError if a shape or a value is not as stated.
 
     Attributes:
-        points: (n, 3) float64, metres; n >= 2. A branch begins inside its parent or
-            within the parent's radius of its wall, and runs away from it.
+        points: (n, 3) float64, metres; n >= 2. A branch begins inside its parent and
+            runs away from it.
         radii: (n,) float64, metres: radius of the vessel's own lumen. Those of a
             branch are not used where it still lies in its parent.
         parent: name of the vessel it leaves, None for the root.
@@ -202,7 +202,7 @@ def _onto_parent(name: str, points: Array, parent: Vessel) -> Array:
     """The branch's points with the first on its parent's centreline."""
     line = parent.centreline
     first = line.project(points[0])
-    if first.distance > 2.0 * first.radius:
+    if first.distance > first.radius:
         raise ValueError(
             f"branch {name!r} begins {first.distance * 1e3:.1f} mm from the "
             f"centreline of {parent.name!r}, whose lumen radius is "
@@ -213,15 +213,6 @@ def _onto_parent(name: str, points: Array, parent: Vessel) -> Array:
     # A point next to the foot would make a sharp turn of its own.
     near = np.linalg.norm(points - foot, axis=1) < max(0.25 * first.radius, 1e-3)
     kept = points[np.argmin(near) :] if not near.all() else points[-1:]
-    if first.distance <= first.radius:
-        return np.concatenate([foot[None], kept])
-    # It begins outside: carry its first direction back to the parent.
-    direction = kept[min(1, len(kept) - 1)] - kept[0]
-    back = kept[0] - np.linspace(0.0, 4.0, 200)[:, None] * first.radius * (
-        direction / max(float(np.linalg.norm(direction)), 1e-9)
-    )
-    way = line.project(back)
-    foot = line.at(way.arc_length[way.distance.argmin()]).position
     return np.concatenate([foot[None], kept])
 
 

@@ -99,22 +99,8 @@ class Phantom(composer.ModelWrapperEntity):
         root.sensor.add("contact", **cell, **between)
 
 
-def mesh_file(vertices: np.ndarray, faces: np.ndarray | None = None) -> mjcf.Asset:
-    """A mesh in MuJoCo's own binary format (MSH).
-
-    Args:
-        vertices: (n, 3), m.
-        faces: (m, 3) indices of vertices; None for the convex hull.
-    """
-    faces = np.empty((0, 3)) if faces is None else faces
+def mesh_file(vertices: np.ndarray, faces: np.ndarray) -> mjcf.Asset:
+    """Vertices (n, 3) m and triangles (m, 3) in MuJoCo's own binary format (MSH)."""
     counts = np.array([len(vertices), 0, 0, len(faces)], dtype="<i4")
     parts = (counts, vertices.astype("<f4"), faces.astype("<i4"))
     return mjcf.Asset(b"".join(part.tobytes() for part in parts), ".msh")
-
-
-def read_mesh_file(data: bytes) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices (n, 3) float32, m, and faces (m, 3) of a mesh of a `Phantom`."""
-    vertices, _, _, faces = np.frombuffer(data, "<i4", 4)
-    points = np.frombuffer(data, "<f4", 3 * vertices, 16)
-    numbers = np.frombuffer(data, "<i4", 3 * faces, 16 + 12 * vertices)
-    return points.reshape(-1, 3), numbers.reshape(-1, 3)

@@ -50,8 +50,7 @@ class Case:
             fields: What `write` writes beside the statistics, by its name in MuJoCo's
                 model.
         """
-        self.scene = scene
-        self.objective = objective
+        self.scene, self.objective = scene, objective
         index = ModelIndex(model, scene.catheter, scene.robot)
         if isinstance(scene.catheter, DeviceStack):
             write_still(scene.catheter, model)
@@ -136,12 +135,11 @@ def _differences(
             )
         if not np.array_equal(room[:size], value):
             fields[name] = value.copy()
-    for theirs, ours in zip(_names(model), _names(host), strict=True):
-        if theirs != ours:
-            raise ValueError(
-                f"{names}: {theirs} stands for {ours} there; give anatomies with the "
-                "same goals"
-            )
+    ours, theirs = (
+        [one.site(index).name for index in range(one.nsite)] for one in (host, model)
+    )
+    if ours != theirs:
+        raise ValueError(f"{names}: {theirs} are not {ours}; give the same goals")
     return fields
 
 
@@ -151,15 +149,4 @@ def _array_names(model: mujoco.MjModel) -> list[str]:
         for name in dir(model)
         if not name.startswith(("_", "name", "path", "text", _OF_MESH))
         and isinstance(getattr(model, name), np.ndarray)
-    ]
-
-
-def _names(model: mujoco.MjModel) -> list[str]:
-    """What has a number in a model, by kind and name."""
-    kinds = "body", "joint", "geom", "site", "actuator", "sensor"
-    counts = model.nbody, model.njnt, model.ngeom, model.nsite, model.nu, model.nsensor
-    return [
-        f"{kind} {getattr(model, kind)(index).name!r}"
-        for kind, count in zip(kinds, counts, strict=True)
-        for index in range(count)
     ]

@@ -23,7 +23,6 @@ from lxml import etree
 
 from cathsim_dmc import bounds, suite
 from cathsim_dmc.anatomy.export import wall_pieces
-from cathsim_dmc.entities.phantom import read_mesh_file
 from cathsim_dmc.entities.sheath import Sheath
 from cathsim_dmc.files import atomic_directory
 from cathsim_dmc.physics.forces import CONTACT_SIZE
@@ -149,12 +148,12 @@ def _in_one_file(path: Path, scene: Scene) -> None:
     for texture in tree.iter("texture"):
         texture.attrib.pop("class", None)
     files = set()
+    surface = scene.anatomy.surface
     for mesh in tree.iterfind("asset/mesh[@file]"):
         file = path.parent / mesh.attrib.pop("file")
         files.add(file)
-        vertices, faces = read_mesh_file(file.read_bytes())
-        mesh.set("vertex", _text(vertices))
-        mesh.set("face", " ".join(map(str, faces.ravel().tolist())))
+        mesh.set("vertex", _text(surface.vertices.astype(np.float32)))
+        mesh.set("face", " ".join(map(str, surface.faces.ravel().tolist())))
     carrier = tree.find(".//geom[@name='wall']")
     for number, piece in enumerate(wall_pieces(scene.anatomy)):
         name = f"wall_{number:03d}"
