@@ -98,7 +98,6 @@ BRANCH = {
     "bend_azimuth": number(-7, 7),
     "second_bend_radius": number(3e-3, 10, optional=True),
     "second_bend_azimuth": number(-7, 7),
-    "goal_depth": number(5e-3, 145e-3),
     "lean": number(-1.3, 1.3),
 }
 ARCH_FIGURES = {
@@ -109,7 +108,6 @@ ARCH_FIGURES = {
     "aberrant": options(),
     "plane_rotation": number(-math.pi, math.pi),
     "bca_drop": number(0, 4),
-    "fillet": number(0, 5e-3),
     **{
         name: number(4e-3, 0.4)
         for name in (
@@ -124,7 +122,6 @@ ARCH_FIGURES = {
             "arch_height",
             "bca_lcca_spacing",
             "lcca_lsa_spacing",
-            "descending_goal_depth",
         )
     },
     **{name: number(-1, 1) for name in ("ascending_bend", "descending_bend")},

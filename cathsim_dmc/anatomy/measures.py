@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 
 from cathsim_dmc.anatomy.centreline import Array, Centreline, Vessel, VesselTree
-from cathsim_dmc.anatomy.parts import Inlet
 
 # A branch is measured this far (m) past its ostium, where the mouth's funnel is over,
 # and its direction is that of the chord up to there.
@@ -30,15 +29,15 @@ def arch_type(drop: float) -> str:
     return "I" if drop < 1.0 else "II" if drop <= 2.0 else "III"
 
 
-def bca_drop(tree: VesselTree) -> float | None:
+def bca_drop(tree: VesselTree) -> float:
     """Height of the top of the arch over the BCA's ostium, in diameters of the LCCA.
 
-    None without these branches. With an aberrant right subclavian the right carotid
+    NaN without these branches. With an aberrant right subclavian the right carotid
     stands in the BCA's place.
     """
     first, lcca = tree.vessels.get("bca", tree.vessels.get("rcca")), "lcca"
     if first is None or lcca not in tree.vessels:
-        return None
+        return math.nan
     aorta = tree.root.centreline
     place = aorta.at(np.linspace(0.0, aorta.length, 400))
     level = np.sqrt(np.clip(1.0 - place.tangent[:, 2] ** 2, 0.0, 1.0))
@@ -46,17 +45,10 @@ def bca_drop(tree: VesselTree) -> float | None:
     return float((top - first.mouth.position[2]) / _diameter(tree.vessel(lcca)))
 
 
-def measure(tree: VesselTree, inlet: Inlet | None = None) -> dict[str, Any]:
-    """Measure a tree whose root is an aorta with its ascending end first.
-
-    Args:
-        inlet: where a device enters; the root's first point if None.
-    """
+def measure(tree: VesselTree) -> dict[str, Any]:
+    """Measure a tree whose root is an aorta with its ascending end first."""
     aorta = tree.root.centreline
     start, axis = aorta.points[0], _chord(aorta, 0.0, _END_CHORD)
-    tilt = _angle(axis, np.array([0.0, 0.0, 1.0]))
-    if inlet is not None:
-        start, axis = inlet.position, _inlet_axis(tree, inlet)
     along = _along_arch(aorta)
     plane = along, np.cross([0.0, 0.0, 1.0], along)
     vessels = [one for one in tree.vessels.values() if one.parent is not None]
@@ -74,8 +66,8 @@ def measure(tree: VesselTree, inlet: Inlet | None = None) -> dict[str, Any]:
     flat = aorta.resampled(2e-3).points[:, :2]
     drop = bca_drop(tree)
     return {
-        "arch_type": None if drop is None else arch_type(drop),
-        "drop": drop,
+        "arch_type": None if math.isnan(drop) else arch_type(drop),
+        "drop": None if math.isnan(drop) else drop,
         # Of the aorta at its ends and branches, mm.
         "diameters": {
             name: _mm(2.0 * aorta.at(place).radius) for name, place in stations.items()
@@ -87,7 +79,7 @@ def measure(tree: VesselTree, inlet: Inlet | None = None) -> dict[str, Any]:
         # Of the plane of the arch from the sagittal plane.
         "plane_deg": _degrees(math.atan2(along[0], along[1])),
         # Of the first 30 mm from the vertical.
-        "ascending_tilt_deg": _degrees(tilt),
+        "ascending_tilt_deg": _degrees(_angle(axis, np.array([0.0, 0.0, 1.0]))),
         # Of the first 15 mm from the axis at the first branch, and length over turn.
         "ascending_turn_deg": _degrees(turn),
         "bend_radius_mm": _mm(first / max(turn, 1e-9)),
@@ -118,10 +110,8 @@ def _branch(
         "out_of_plane_mm": _mm((far - ostium) @ normal),
         # Length over the chord from ostium to end.
         "tortuosity": round(own.length / np.linalg.norm(own.points[-1] - ostium), 4),
-        # Distance of the ostium from the axis of the inlet, and angle between that axis
-        # and the way from the inlet to the ostium.
+        # Distance of the ostium from the axis of the first 30 mm of the aorta.
         "axis_offset_mm": _mm(np.linalg.norm(way - (way @ axis) * axis)),
-        "axis_angle_deg": _degrees(_angle(axis, way)),
     }
 
 
@@ -135,18 +125,6 @@ def _mm(length: Any) -> float:
 
 def _degrees(angle: float) -> float:
     return round(math.degrees(angle), 1)
-
-
-def _inlet_axis(tree: VesselTree, inlet: Inlet) -> Array:
-    """First direction (3,) of a device: the chord over 30 mm from the inlet."""
-    line = tree.vessel(inlet.vessel).centreline
-    s = line.locate(inlet.position)
-    ways = [
-        line.at(s + step).position - line.at(s).position
-        for step in (_END_CHORD, -_END_CHORD)
-    ]
-    way = max(ways, key=lambda chord: float(chord @ inlet.direction))
-    return way / np.linalg.norm(way)
 
 
 def _angle(first: Array, second: Array) -> float:

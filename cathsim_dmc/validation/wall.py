@@ -107,7 +107,7 @@ def validate_anatomy(
         for one in check_tree(anatomy):
             label = f"{name}: {one.name}, violations"
             checks.append(Check.at_most(label, int(not one.passed), 0, "", one.detail))
-        findings[name] = {"measures": measures.measure(anatomy.tree, anatomy.inlet)}
+        findings[name] = {"measures": measures.measure(anatomy.tree)}
     if figure_path is not None:
         from cathsim_dmc.validation import views
 

@@ -37,9 +37,7 @@ def per_branch(found, key, digits=0):
 
 def shapes(anatomies):
     """What the shipped anatomies are like, a column for each."""
-    found = {
-        name: measures.measure(one.tree, one.inlet) for name, one in anatomies.items()
-    }
+    found = {name: measures.measure(one.tree) for name, one in anatomies.items()}
     lines = {
         "type, drop of the BCA in LCCA diameters": lambda m: (
             f"{m['arch_type']}, {m['drop']:.2f}"

@@ -30,7 +30,7 @@ from cathsim_dmc.anatomy.arch.sampler import (
     sample,
 )
 from cathsim_dmc.anatomy.arch.tree import arch_tree
-from cathsim_dmc.anatomy.builder import ACCESSES, VesselPlace
+from cathsim_dmc.anatomy.builder import ACCESSES, GOAL_DEPTH, VesselPlace
 
 __all__ = [
     "ARCHES",
@@ -43,6 +43,9 @@ __all__ = [
     "build_seed",
     "sample",
 ]
+
+
+_FROM_CAP = 30e-3  # m, distance of the goal "descending" from the end of the aorta
 
 
 @lru_cache(maxsize=32)
@@ -65,10 +68,10 @@ def build_arch(
     tree = arch_tree(params)
     inlet = VesselPlace(tree.root.name, 0.0 if access == "ascending" else math.inf)
     goals = {
-        branch: VesselPlace(branch, figures.goal_depth, past_ostium=True)
-        for branch, figures in params.branches.items()
+        branch: VesselPlace(branch, GOAL_DEPTH, past_ostium=True)
+        for branch in params.branches
     }
-    arc = tree.root.centreline.length - params.descending_goal_depth
+    arc = tree.root.centreline.length - _FROM_CAP
     goals["descending"] = VesselPlace(tree.root.name, arc)
     return Anatomy.from_tree(tree, name, inlet=inlet, goals=goals)
 

@@ -14,15 +14,13 @@ INLET_TUBE = 70e-3
 
 LEVELS = ("ascending", "bca_level", "lcca_level", "lsa_level", "descending")
 # Least and largest value of each figure, and its unit.
-_TURN = 2.0 * math.pi
+_ANGLE, _TURN = (-1.3, 1.3, "rad"), (-2.0 * math.pi, 2.0 * math.pi, "rad")
 _OF_BRANCH = {
     "radius": (1.5e-3, 12e-3, "m"),
     "end_radius": (1.0e-3, 12e-3, "m"),
-    "take_off": (-1.3, 1.3, "rad"),
     "length": (40e-3, 150e-3, "m"),
-    "lean": (-1.3, 1.3, "rad"),
-    "bend_azimuth": (-_TURN, _TURN, "rad"),
-    "second_bend_azimuth": (-_TURN, _TURN, "rad"),
+    **dict.fromkeys(("take_off", "lean"), _ANGLE),
+    **dict.fromkeys(("bend_azimuth", "second_bend_azimuth"), _TURN),
 }
 _OF_ARCH = {
     **{f"{level}_radius": (7e-3, 25e-3, "m") for level in LEVELS},
@@ -33,7 +31,6 @@ _OF_ARCH = {
     "arch_height": (15e-3, 90e-3, "m"),
     "plane_rotation": (-math.pi, math.pi, "rad"),
     "bca_drop": (0.0, 4.0, "LCCA diameters"),
-    "fillet": (0.0, 5e-3, "m"),
     "lsa_aberrant_spacing": (0.0, 80e-3, "m"),
     "ascending_bend": (0.0, 1.0, "rad"),
     "descending_bend": (-0.5, 0.5, "rad"),
@@ -56,7 +53,6 @@ class BranchParameters:
         bend_radius: radius of curvature after the straight first part.
         bend_azimuth: direction of the bend: 0 downstream in the plane of the arch,
             pi upstream, pi/2 out of the plane to the patient's right and back.
-        goal_depth: distance of the goal beyond the ostium, along the branch.
         lean: angle of the first part out of the plane of the arch, positive to the
             patient's right and back; the ostium lies as far round the aorta.
         second_bend_radius: radius of curvature of the distal half, after the first
@@ -70,7 +66,6 @@ class BranchParameters:
     length: float = 45e-3
     bend_radius: float = 100e-3
     bend_azimuth: float = 0.0
-    goal_depth: float = 27e-3
     lean: float = 0.0
     second_bend_radius: float | None = None
     second_bend_azimuth: float = 0.0
@@ -82,8 +77,6 @@ class BranchParameters:
             if getattr(self, name) is not None or name == "bend_radius":
                 least = 3.0 * self.radius
                 bounds.number(f"branch {name}", getattr(self, name), least, 10.0, "m")
-        deepest = self.length - 5e-3
-        bounds.number("branch goal_depth", self.goal_depth, 5e-3, deepest, "m")
 
 
 @dataclass(frozen=True)
@@ -106,8 +99,6 @@ class ArchParameters:
         bca_lcca_spacing, lcca_lsa_spacing: between ostium centres along the outer
             curve of the arch.
         bca, lcca, lsa: the branches.
-        fillet: by how much the radius of a branch grows at its ostium, at most.
-        descending_goal_depth: distance of the goal "descending" from the cap.
         bovine: the LCCA leaves the BCA, `bca_lcca_spacing` above the BCA's ostium
             along the BCA, instead of leaving the arch; `lcca_lsa_spacing` is then
             from the BCA to the LSA.
@@ -139,8 +130,6 @@ class ArchParameters:
     bca_drop: float = 0.5
     bca_lcca_spacing: float = 21.8e-3
     lcca_lsa_spacing: float = 14.3e-3
-    fillet: float = 2.5e-3
-    descending_goal_depth: float = 30e-3
     bovine: bool = False
     ascending_bend: float = 0.0
     descending_bend: float = 0.0
@@ -157,8 +146,6 @@ class ArchParameters:
         bounds.switch("bovine", self.bovine)
         for name, limits in _OF_ARCH.items():
             bounds.number(name, getattr(self, name), *limits)
-        name, deepest = "descending_goal_depth", self.descending_length
-        bounds.number(name, self.descending_goal_depth, 5e-3, deepest, "m")
         self._check_bends()
         self._check_spacings()
 

@@ -101,11 +101,11 @@ def sample(
     bounds.choice("variant", variant, VARIANTS)
     for _ in range(_ATTEMPTS):
         # Independent draws now and then give branches that cross: draw again.
-        draw = _Draw(random_state)
-        drop = draw.uniform(*DROP_RANGES[arch_type])
+        drop = random_state.uniform(*DROP_RANGES[arch_type])
         try:
-            params = _draw(draw, drop, variant)
-            params = _corrected(params, drop, draw.normal(*ASCENDING_LENGTH))
+            params = _draw(random_state, drop, variant)
+            length = _normal(random_state, *ASCENDING_LENGTH)
+            params = _corrected(params, drop, length)
         except ValueError:
             continue
         if params is not None:
@@ -119,41 +119,24 @@ def _kind(share: float) -> str:
     return list(DROP_RANGES)[min(int(place), 2)]
 
 
-@dataclass(frozen=True)
-class _Draw:
-    """Truncated normal and uniform numbers from one source."""
-
-    source: Random
-
-    def normal(self, mean: float, deviation: float) -> float:
-        return mean + deviation * self.score()
-
-    def score(self) -> float:
-        # Again, not clipped, or the bounds would be likely values.
-        while True:
-            z = float(self.source.normal())
-            if abs(z) <= _CUT:
-                return z / _CUT_DEVIATION
-
-    def uniform(self, low: float, high: float) -> float:
-        return float(self.source.uniform(low, high))
+def _normal(source: Random, mean: float = 0.0, deviation: float = 1.0) -> float:
+    # Again, not clipped, or the bounds would be likely values.
+    while True:
+        z = float(source.normal())
+        if abs(z) <= _CUT:
+            return mean + deviation * (z / _CUT_DEVIATION)
 
 
 def _corrected(
     params: ArchParameters, drop: float, ascending: float
 ) -> ArchParameters | None:
-    """The arch whose measured drop and ascending length are those drawn.
-
-    None if its limb would be too short, or its type is another one after all.
-    """
+    """The arch whose measured drop and ascending length are those drawn, or None."""
     bend = params.ascending_bend
     for _ in range(_CORRECTIONS):
         tree = arch_tree(params)
         found = measures.bca_drop(tree)
         first = next(one for one in tree.vessels.values() if one.parent)
         short = ascending - tree.root.centreline.locate(first.mouth.position)
-        if found is None:  # without the branches that it is measured by
-            return None
         low = drop - found
         if abs(short) < _LENGTH_TOLERANCE and abs(low) < _DROP_TOLERANCE:
             break
@@ -171,21 +154,21 @@ def _corrected(
     return params if same else None
 
 
-def _draw(draw: _Draw, drop: float, variant: str) -> ArchParameters:
-    aorta = _aorta(draw)
-    branches = {name: _branch(draw, name) for name in BRANCH_DIAMETERS}
+def _draw(source: Random, drop: float, variant: str) -> ArchParameters:
+    aorta = _aorta(source)
+    branches = {name: _branch(source, name) for name in BRANCH_DIAMETERS}
     aberrant = None
     if variant == "aberrant":
         # The first branch is the right carotid, as wide as the left one.
-        radius = 0.5 * draw.normal(*BRANCH_DIAMETERS["lcca"])
+        radius = 0.5 * _normal(source, *BRANCH_DIAMETERS["lcca"])
         branches["bca"] = replace(
             branches["bca"], radius=radius, end_radius=min(radius, 3.15e-3)
         )
         # It leaves the back of the arch, to the right and up.
         aberrant = replace(
-            _branch(draw, "lsa"),
-            take_off=math.radians(draw.uniform(-10.0, 20.0)),
-            lean=math.radians(draw.uniform(35.0, 60.0)),
+            _branch(source, "lsa"),
+            take_off=math.radians(source.uniform(-10.0, 20.0)),
+            lean=math.radians(source.uniform(35.0, 60.0)),
         )
     radii = {name: branch.radius for name, branch in branches.items()}
     spacings = {
@@ -196,64 +179,67 @@ def _draw(draw: _Draw, drop: float, variant: str) -> ArchParameters:
         # The LSA stays where it would be. The LCCA leaves right above the ostium of a
         # common trunk, or 10 to 18 mm up the BCA (both lengths are assumptions).
         least = radii["lcca"] + 2.2e-3
-        along = least + draw.uniform(0.0, 2e-3)
+        along = least + source.uniform(0.0, 2e-3)
         if variant == "bovine_branch":
-            along = max(draw.uniform(10e-3, 18e-3), least)
+            along = max(source.uniform(10e-3, 18e-3), least)
         both = sum(spacings.values())
         spacings = {"bca_lcca_spacing": along, "lcca_lsa_spacing": both}
-    arch_radius, last = draw.normal(*_ARCH_RADIUS), aberrant.radius if aberrant else 0.0
+    arch_radius, last = (
+        _normal(source, *_ARCH_RADIUS),
+        aberrant.radius if aberrant else 0.0,
+    )
     return ArchParameters(
         bca=branches["bca"],
         lcca=branches["lcca"],
         lsa=branches["lsa"],
         **aorta,
         ascending_length=40e-3,  # corrected to the drawn length up to the BCA
-        descending_length=draw.uniform(*_DESCENDING_LENGTH),
+        descending_length=source.uniform(*_DESCENDING_LENGTH),
         arch_radius=arch_radius,
-        arch_height=arch_radius * draw.uniform(*_ARCH_ASPECT),
-        plane_rotation=math.radians(draw.normal(*PLANE_ROTATION)),
+        arch_height=arch_radius * source.uniform(*_ARCH_ASPECT),
+        plane_rotation=math.radians(_normal(source, *PLANE_ROTATION)),
         bca_drop=drop,
         bovine=variant.startswith("bovine"),
-        ascending_bend=max(0.0, math.radians(draw.normal(*ASCENDING_BEND))),
-        descending_bend=math.radians(draw.normal(*_DESCENDING_BEND)),
-        plane_tilt=math.radians(draw.normal(*_PLANE_TILT)),
-        bow=draw.normal(*_BOW),
-        sway=draw.normal(*_SWAY),
+        ascending_bend=max(0.0, math.radians(_normal(source, *ASCENDING_BEND))),
+        descending_bend=math.radians(_normal(source, *_DESCENDING_BEND)),
+        plane_tilt=math.radians(_normal(source, *_PLANE_TILT)),
+        bow=_normal(source, *_BOW),
+        sway=_normal(source, *_SWAY),
         aberrant=aberrant,
-        lsa_aberrant_spacing=radii["lsa"] + last + draw.uniform(2e-3, 6e-3),
+        lsa_aberrant_spacing=radii["lsa"] + last + source.uniform(2e-3, 6e-3),
         **spacings,
     )
 
 
-def _aorta(draw: _Draw) -> dict[str, float]:
-    share, common = math.sqrt(_AORTA_CORRELATION), draw.score()
+def _aorta(source: Random) -> dict[str, float]:
+    share, common = math.sqrt(_AORTA_CORRELATION), _normal(source)
     own = math.sqrt(1.0 - _AORTA_CORRELATION)
     return {
-        name: 0.5 * (mean + deviation * (share * common + own * draw.score()))
+        name: 0.5 * (mean + deviation * (share * common + own * _normal(source)))
         for name, (mean, deviation) in AORTA_DIAMETERS.items()
     }
 
 
-def _branch(draw: _Draw, name: str) -> BranchParameters:
-    radius = 0.5 * draw.normal(*BRANCH_DIAMETERS[name])
+def _branch(source: Random, name: str) -> BranchParameters:
+    radius = 0.5 * _normal(source, *BRANCH_DIAMETERS[name])
     # Taper: the LCCA narrows to a mid common carotid of 6.3 mm, others by a tenth.
     end = min(radius, 3.15e-3) if name == "lcca" else 0.9 * radius
     # Downstream at first for those that lean upstream, and back for the LSA.
     towards = math.pi if name == "lsa" else 0.0
-    turn = draw.uniform(-math.pi / 2, math.pi / 2)
+    turn = source.uniform(-math.pi / 2, math.pi / 2)
     bends = (_TIGHTEST_BRANCH_BEND * radius, _WIDEST_BRANCH_BEND)
     return BranchParameters(
         radius=radius,
         end_radius=end,
-        take_off=math.radians(draw.normal(*TAKE_OFFS[name])),
-        length=draw.uniform(45e-3, 55e-3),
-        bend_radius=draw.uniform(*bends),
+        take_off=math.radians(_normal(source, *TAKE_OFFS[name])),
+        length=source.uniform(45e-3, 55e-3),
+        bend_radius=source.uniform(*bends),
         bend_azimuth=towards + turn,
-        lean=math.radians(draw.normal(*_LEAN)),
-        second_bend_radius=draw.uniform(*bends),
+        lean=math.radians(_normal(source, *_LEAN)),
+        second_bend_radius=source.uniform(*bends),
         # Most turn back, as arteries that go up the neck do.
         second_bend_azimuth=math.remainder(
-            towards + turn + math.pi + draw.normal(0.0, 0.8), 2.0 * math.pi
+            towards + turn + math.pi + _normal(source, 0.0, 0.8), 2.0 * math.pi
         ),
     )
 

@@ -1,7 +1,6 @@
 """Geometry of parametric aortic arches: from their figures to a vessel tree."""
 
 import math
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -24,6 +23,8 @@ from cathsim_dmc.anatomy.curves import check_septa, flare_begin
 _STRAIGHT_STEP = 5e-3
 _CURVED_STEP = 2e-3
 _FLARE_STEP = 0.5e-3
+# By how much the radius of a branch grows at its ostium, at most, m.
+_FILLET = 2.5e-3
 # A branch must leave its parent within this angle of the wall's normal, rad, and
 # within this multiple of the parent's radius along its axis: an ostium more
 # oblique than that is a slit.
@@ -32,26 +33,20 @@ _LONGEST_EXIT = 2.2
 # The second bend takes over within this length, m, so that no kink marks it.
 _BLEND = 8e-3
 _INTEGRATION_STEP = 0.5e-3  # m
+_UPRIGHT = np.array([0.0, 0.0, 1.0])
 
 
-@dataclass(frozen=True)
 class Plane:
-    """The plane of the arch: `along` the arch, `up`, and its `normal`, unit vectors.
+    """The plane of the arch: vertical, turned from the sagittal one, its top tilted.
 
-    The normal points to the patient's right and back.
+    Unit vectors `along` the arch, `up`, and `normal`, to the patient's right and back.
     """
 
-    along: Array
-    up: Array
-    normal: Array
-
-    @classmethod
-    def turned(cls, rotation: float, tilt: float = 0.0) -> "Plane":
-        """Vertical plane turned from the sagittal one, its top then tilted."""
-        along = np.array([math.sin(rotation), math.cos(rotation), 0.0])
-        side = np.cross([0.0, 0.0, 1.0], along)
-        up = math.cos(tilt) * np.array([0.0, 0.0, 1.0]) + math.sin(tilt) * side
-        return cls(along, up, np.cross(up, along))
+    def __init__(self, rotation: float, tilt: float):
+        self.along = np.array([math.sin(rotation), math.cos(rotation), 0.0])
+        side = np.cross(_UPRIGHT, self.along)
+        self.up = math.cos(tilt) * _UPRIGHT + math.sin(tilt) * side
+        self.normal = np.cross(self.up, self.along)
 
     def to_world(self, flat: Array) -> Array:
         """World coordinates (..., 3) of in-plane ones (..., 2)."""
@@ -117,10 +112,8 @@ def _outer_curve(p: ArchParameters) -> tuple[Array, Array, Array, list[float]]:
         if np.any(np.diff(stations) <= 1e-3):
             raise ValueError(
                 f"the branches lie at {np.round(stations[1:4] * 1e3, 1).tolist()} mm "
-                "along the aorta, which does not fit between the middle of the "
-                f"ascending ({stations[0] * 1e3:.1f} mm) and the end of the arch "
-                f"({arch_end * 1e3:.1f} mm); reduce bca_drop or the spacings, or "
-                "enlarge the arch."
+                f"along the aorta, and must between {stations[0] * 1e3:.1f} and "
+                f"{arch_end * 1e3:.1f} mm; reduce bca_drop or spacings, or enlarge it"
             )
         radii = _smooth_interpolation(s, stations, radii_of)
         outer = points + radii[:, None] * outward
@@ -128,13 +121,10 @@ def _outer_curve(p: ArchParameters) -> tuple[Array, Array, Array, list[float]]:
         summit = outer[:, 1].argmax()
         height = outer[summit, 1] - p.bca_drop * 2.0 * p.lcca.radius
         bca = np.interp(height, outer[: summit + 1, 1], arc[: summit + 1])
-        if p.bovine:
-            # No LCCA ostium: its level of the aorta is half-way to the LSA.
-            lsa = bca + p.lcca_lsa_spacing
+        lcca = bca + (0.0 if p.bovine else p.bca_lcca_spacing)
+        lsa = lcca + p.lcca_lsa_spacing
+        if p.bovine:  # no LCCA ostium: its level of the aorta is half-way to the LSA
             lcca = 0.5 * (bca + lsa)
-        else:
-            lcca = bca + p.bca_lcca_spacing
-            lsa = lcca + p.lcca_lsa_spacing
         places = [bca, lcca, lsa, lsa + p.lsa_aberrant_spacing]
         places = places[: len(p.branches)]
         levels = [float(np.interp(place, arc, s)) for place in places]
@@ -150,16 +140,15 @@ def _in_space(p: ArchParameters, plane: Plane, flat: Array) -> Array:
 
 
 def _direction(branch: BranchParameters, plane: Plane) -> Array:
-    upright = np.array([0.0, 0.0, 1.0])
-    aside = np.cross(upright, plane.along)
+    aside = np.cross(_UPRIGHT, plane.along)
     upstream, lean = math.tan(branch.take_off), math.tan(branch.lean)
-    direction = upright - upstream * plane.along + lean * aside
+    direction = _UPRIGHT - upstream * plane.along + lean * aside
     return direction / np.linalg.norm(direction)
 
 
 def arch_tree(params: ArchParameters) -> VesselTree:
     """Vessels of an arch; ValueError if branches do not fit or meet each other."""
-    plane = Plane.turned(params.plane_rotation, params.plane_tilt)
+    plane = Plane(params.plane_rotation, params.plane_tilt)
     points, radii, outer, levels = _outer_curve(params)
     aorta = Vessel("aorta", Centreline(_in_space(params, plane, points), radii))
     vessels = {"aorta": aorta}
@@ -167,7 +156,7 @@ def arch_tree(params: ArchParameters) -> VesselTree:
         params.branches.items(), levels, _septa(params), strict=True
     ):
         direction = _direction(branch, plane)
-        fillet = min(params.fillet, 0.4 * max(septum - MINIMUM_SEPTUM, 0.0))
+        fillet = min(_FILLET, 0.4 * max(septum - MINIMUM_SEPTUM, 0.0))
         parent = aorta
         if name == "lcca" and params.bovine:
             parent = vessels["bca"]
@@ -232,18 +221,7 @@ def _branch_vessel(
     plane: Plane,
     fillet: float,
 ) -> Vessel:
-    """Branch of an arch.
-
-    Args:
-        p: its figures.
-        parent: vessel that it leaves.
-        ostium: (3,) m, on the parent's surface.
-        direction: (3,) unit vector of its first part.
-        fillet: growth (m) of its radius at the ostium.
-
-    Raises:
-        ValueError: if it is too oblique or too wide for its parent.
-    """
+    """Branch with its first direction (3,) and fillet (m), from an ostium (3,) m."""
     # Start where the axis, followed back into the parent, is nearest to the
     # parent's centreline; then aim from there at the ostium.
     line = parent.centreline
@@ -281,16 +259,15 @@ def _check_exit(
 ) -> None:
     if tilt > _MOST_OBLIQUE or exit_length > _LONGEST_EXIT * parent_radius:
         raise ValueError(
-            f"branch {name!r} leaves at {math.degrees(tilt):.0f} degrees from the "
-            f"normal of its parent's wall, {exit_length * 1e3:.0f} mm from its "
-            f"centreline; at most {math.degrees(_MOST_OBLIQUE):.0f} degrees and "
-            f"{_LONGEST_EXIT * parent_radius * 1e3:.0f} mm are allowed. Change its "
-            "take_off."
+            f"branch {name!r} leaves at {math.degrees(tilt):.0f} degrees, "
+            f"{exit_length * 1e3:.0f} mm from its parent's centreline; at most "
+            f"{math.degrees(_MOST_OBLIQUE):.0f} degrees and "
+            f"{_LONGEST_EXIT * parent_radius * 1e3:.0f} mm are allowed: mend take_off"
         )
     if wide > 0.95 * parent_radius:
         raise ValueError(
-            f"branch {name!r} with its fillet has radius {wide:g} m at the ostium; its "
-            f"parent's lumen radius is {parent_radius:g} m. Make the branch smaller."
+            f"branch {name!r} has a radius of {wide:g} m at its ostium, more than 0.95 "
+            f"of its parent's, {parent_radius:g} m; make it smaller"
         )
 
 
