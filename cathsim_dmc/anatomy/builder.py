@@ -118,13 +118,13 @@ def _cut_at(
     vessel = tree.vessel(inlet.vessel)
     line = vessel.centreline
     arc = inlet.arc(tree)
+    where = f"the inlet, {arc * 1e3:.1f} mm along {vessel.name!r},"
     at_first = vessel.parent is None and arc <= 0.5 * line.length
     low, high = (arc, line.length) if at_first else (0.0, arc)
     if high - low < 10e-3 or (vessel.parent and arc < vessel.ostium + 5e-3):
         raise ValueError(
-            f"the inlet, {arc * 1e3:.1f} mm along {vessel.name!r}, leaves nothing of "
-            f"it; keep 10 mm of a vessel, and of a branch 5 mm past its ostium at "
-            f"{vessel.ostium * 1e3:.1f} mm."
+            f"{where} leaves nothing of it; keep 10 mm of a vessel, and of a branch 5 "
+            f"mm past its ostium at {vessel.ostium * 1e3:.1f} mm"
         )
     for name, child in tree.vessels.items():
         if child.parent == vessel.name:
@@ -132,16 +132,12 @@ def _cut_at(
             reach = float(child.mouth.radius)
             if place - reach < low or place + reach > high:
                 raise ValueError(
-                    f"the inlet, {arc * 1e3:.1f} mm along {vessel.name!r}, is at or "
-                    f"beyond the ostium of branch {name!r} at {place * 1e3:.1f} mm; "
-                    "put it nearer to the free end, or leave the branch out."
+                    f"{where} is not before the ostium of branch {name!r} at "
+                    f"{place * 1e3:.1f} mm; put it nearer to the free end"
                 )
     for goal in goals.values():
         if goal.vessel == vessel.name and not low < goal.arc_length < high:
-            raise ValueError(
-                f"goal {goal.name!r} lies behind the inlet, "
-                f"{goal.arc_length * 1e3:.1f} mm along {vessel.name!r}."
-            )
+            raise ValueError(f"{where} has the goal {goal.name!r} behind it")
     if math.isclose(low, 0.0) and math.isclose(high, line.length):
         return tree, at_first
     cut = replace(vessel, centreline=line.slice(low, high))

@@ -37,6 +37,12 @@ def as_points(points: ArrayLike) -> Array:
     return array
 
 
+def as_rows(points: ArrayLike) -> Array:
+    """Points (..., 3) as rows (n, 3) for compiled loops."""
+    # Writable: numba would compile another function for those that are not.
+    return np.require(as_points(points).reshape(-1, 3), None, ["C", "W"])
+
+
 def arc_lengths(points: Array) -> Array:
     """Arc length (n,) of each point (n, k) of a polyline from the first."""
     steps = np.linalg.norm(np.diff(points, axis=0), axis=1)

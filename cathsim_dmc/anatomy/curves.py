@@ -157,19 +157,16 @@ def _branch(name: str, curve: Curve, parent: Vessel, smoothing: float) -> Vessel
     places, own = _places(fine, curve.points)
     own &= places >= ostium
     if not own.any():
-        raise ValueError(
-            f"branch {name!r} has no point beyond its ostium; give it more points."
-        )
+        raise ValueError(f"branch {name!r} has no point past its ostium; give it more")
     calibre = float(curve.radii[own][0])
     origin = line.at(line.locate(fine.points[0]))
     parent_radius = max(float(origin.radius), float(foot.radius))
     room = _WIDEST_OSTIUM * parent_radius - calibre
     if room < 0.0:
         raise ValueError(
-            f"branch {name!r} has a lumen radius of {calibre * 1e3:.1f} mm at its "
-            f"ostium, {parent.name!r} one of {parent_radius * 1e3:.1f} mm there; a "
-            f"branch may have {_WIDEST_OSTIUM:g} of its parent's. Radii of a branch "
-            "are those of its own lumen, not of the sphere inside both."
+            f"branch {name!r} has a radius of {calibre * 1e3:.1f} mm at its ostium, "
+            f"and may have {_WIDEST_OSTIUM:g} of its parent's, which is "
+            f"{parent_radius * 1e3:.1f} mm; give that of its own lumen"
         )
     wide = calibre + min(_FLARE, room)
     tilt = min(tilt, math.radians(60.0))
@@ -188,10 +185,8 @@ def _branch(name: str, curve: Curve, parent: Vessel, smoothing: float) -> Vessel
 def flare_begin(wide: float, parent_radius: float, tilt: float, ostium: float) -> float:
     """Arc length (m) at which the flare of a branch begins, inside the parent.
 
-    Args:
-        wide: radius of the branch at its ostium, m.
-        tilt: of the branch from the normal of the parent's wall, rad.
-        ostium: arc length of the ostium, m.
+    The branch has the radius `wide` (m) at its ostium, an arc length (m), and stands
+    `tilt` (rad) off the normal of the parent's wall.
     """
     sag = parent_radius - math.sqrt(parent_radius**2 - min(wide, parent_radius) ** 2)
     inwards = _FLARE_MARGIN * (sag + wide * math.tan(tilt)) + 1e-3
@@ -204,10 +199,9 @@ def _onto_parent(name: str, points: Array, parent: Vessel) -> Array:
     first = line.project(points[0])
     if first.distance > first.radius:
         raise ValueError(
-            f"branch {name!r} begins {first.distance * 1e3:.1f} mm from the "
-            f"centreline of {parent.name!r}, whose lumen radius is "
-            f"{first.radius * 1e3:.1f} mm there; let it begin in its parent, or name "
-            "another parent."
+            f"branch {name!r} begins {first.distance * 1e3:.1f} mm from the centreline "
+            f"of {parent.name!r}, outside its radius of {first.radius * 1e3:.1f} mm; "
+            "let it begin in its parent, or name another"
         )
     foot = line.at(first.arc_length).position
     # A point next to the foot would make a sharp turn of its own.
@@ -222,8 +216,7 @@ def _ostium(name: str, line: Centreline, parent: Vessel) -> float:
     outside = near.distance - near.radius
     if outside[-1] <= 0.0:
         raise ValueError(
-            f"branch {name!r} ends inside its parent {parent.name!r}; it must leave "
-            "its lumen. Name another parent or give more points."
+            f"branch {name!r} ends inside its parent {parent.name!r}; give more points"
         )
     last = int(np.flatnonzero(outside <= 0.0)[-1])
     share = -outside[last] / (outside[last + 1] - outside[last])
@@ -246,9 +239,8 @@ def _check_bends(vessel: Vessel) -> None:
         x, y, z = np.round(place.position[worst] * 1e3, 1)
         raise ValueError(
             f"vessel {vessel.name!r} bends with a radius of {bend[worst] * 1e3:.1f} mm "
-            f"at ({x}, {y}, {z}) mm, {s[worst] * 1e3:.0f} mm along it, where its lumen "
-            f"radius is {place.radius[worst] * 1e3:.1f} mm; the lumen would fold. "
-            "Smooth more, or mend the points there."
+            f"at ({x}, {y}, {z}) mm, where its lumen radius is "
+            f"{place.radius[worst] * 1e3:.1f} mm; the lumen would fold: mend the points"
         )
 
 
@@ -266,8 +258,7 @@ def _junction_end(vessel: Vessel, parent: Vessel) -> float:
     if not (free & (s - vessel.ostium <= most)).any():
         raise ValueError(
             f"branch {vessel.name!r} does not part from {parent.name!r} within "
-            f"{most * 1e3:.0f} mm of its ostium; it runs along its parent's wall. "
-            "Start it further on, or merge the two."
+            f"{most * 1e3:.0f} mm of its ostium; start it further on, or merge the two"
         )
     return float(s[int(free.argmax())])
 

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from cathsim_dmc import file_maps
-from cathsim_dmc.anatomy.centreline import Array, VesselTree, as_points
+from cathsim_dmc.anatomy.centreline import Array, VesselTree, as_rows
 from cathsim_dmc.anatomy.field_loops import END, FIRST_END, MARGIN, depths, gradients
 from cathsim_dmc.anatomy.parts import End, Surface
 
@@ -69,7 +69,7 @@ class Field:
                 lumen, is `field_loops.FREE` deep; otherwise it is outside, by its
                 distance from the plane of the end.
         """
-        flat, out = _flat(points), np.empty(np.shape(points)[:-1])
+        flat, out = as_rows(points), np.empty(np.shape(points)[:-1])
         depths(self.arrays, flat, free, out.reshape(-1))
         return out
 
@@ -79,8 +79,8 @@ class Field:
         They point away from the wall and change without jumps from cell to cell; NaN
         at points that are not finite.
         """
-        flat = _flat(points)
-        out = np.empty(flat.shape)
+        flat = as_rows(points)
+        out = np.empty_like(flat)
         gradients(self.arrays, flat, _STEP, out)
         return out.reshape(np.shape(points))
 
@@ -189,11 +189,6 @@ class Field:
         head = np.concatenate([origin, [EDGE], shape, [QUANTUM, len(free)], *free])
         samples = np.concatenate([*parts, np.zeros(1, np.int16)])
         return cls(head, _whole(coarse).ravel(), index.ravel(), samples)
-
-
-def _flat(points: ArrayLike) -> Array:
-    # Writable: numba would compile another function for those that are not.
-    return np.require(as_points(points).reshape(-1, 3), None, ["C", "W"])
 
 
 def _corners(measure: Measure, origin: Array, shape: np.ndarray) -> Array:

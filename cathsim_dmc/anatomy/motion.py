@@ -17,7 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from cathsim_dmc.anatomy import motion_loops
-from cathsim_dmc.anatomy.centreline import Array, VesselTree
+from cathsim_dmc.anatomy.centreline import Array, VesselTree, as_rows
 from cathsim_dmc.anatomy.circulation import Circulation
 from cathsim_dmc.anatomy.parts import End, Surface
 
@@ -72,16 +72,7 @@ class Motion:
         return cls(np.concatenate([low, [_STEP], shape, values.ravel()]))
 
     def check(self, name: str, heart: float, breathing: float) -> None:
-        """Refuses amplitudes that fold space.
-
-        Args:
-            name: Of the anatomy.
-            heart: Largest amplitude of the heart, m.
-            breathing: Largest amplitude of breathing.
-
-        Raises:
-            ValueError: if the displacement changes too steeply.
-        """
+        """ValueError if the largest heart (m) and breathing amplitudes fold space."""
         shape = self.lattice[4:7].astype(int)
         values = self.lattice[7:].reshape(*shape, 8)
         steepest = 0.0
@@ -92,15 +83,13 @@ class Motion:
         if steepest > STEEPEST:
             raise ValueError(
                 f"vessel motion: heart {1e3 * heart:g} mm and breathing {breathing:g} "
-                f"fold {name!r}: displacements change by {steepest:.2f} m a metre, "
-                f"{STEEPEST:g} are allowed; give smaller amplitudes"
+                f"fold {name!r}: give smaller amplitudes"
             )
 
     def to_rest(self, parameters: Array, time: float, points: Array) -> Array:
         """Places at rest (..., 3) of places in space (..., 3), m."""
-        flat = np.require(points.reshape(-1, 3), np.float64, ["C", "W"])
-        out = np.empty_like(flat)
-        motion_loops.rest(self.lattice, parameters, time, flat, out)
+        out = np.empty((points.size // 3, 3))
+        motion_loops.rest(self.lattice, parameters, time, as_rows(points), out)
         return out.reshape(points.shape)
 
     def to_space(
@@ -111,7 +100,7 @@ class Motion:
         Returns:
             And by how much the radius has grown there (...), m.
         """
-        flat = np.require(points.reshape(-1, 3), np.float64, ["C", "W"])
+        flat = as_rows(points)
         out, growth = np.empty_like(flat), np.empty(len(flat))
         motion_loops.moved(self.lattice, parameters, time, flat, out, growth)
         return out.reshape(points.shape), growth.reshape(points.shape[:-1])

@@ -121,39 +121,32 @@ def interpolate(lattice, x, y, z, out):
 
 
 @compiled
-def warp(lattice, course, x, y, z, values, out):
-    """Writes what the motion does to a place in space, see `WARP`.
+def warp(lattice, course, x, y, z, scratch, out):
+    """Writes what the motion does to a place (m) in space, see `WARP`.
 
-    Args:
-        lattice: of the anatomy.
-        course: what `courses` says of a time.
-        x: with y and z, the place, m.
-        values: (8, 4), scratch.
-        out: (20,).
+    The course is what `courses` says of a time; scratch is (8, 4).
     """
-    interpolate(lattice, x, y, z, values)
+    interpolate(lattice, x, y, z, scratch)
     a, b, r, da, db, dr, beats, lag, often = course
     out[0], out[1], out[2] = x, y, z
     for i in range(3):
-        out[i] -= a * values[i, 0] + b * values[3 + i, 0]
+        out[i] -= a * scratch[i, 0] + b * scratch[3 + i, 0]
         for j in range(3):
-            out[3 + 3 * i + j] = -a * values[i, 1 + j] - b * values[3 + i, 1 + j]
+            out[3 + 3 * i + j] = -a * scratch[i, 1 + j] - b * scratch[3 + i, 1 + j]
         out[3 + 4 * i] += 1.0
-        out[16 + i] = da * values[i, 0] + db * values[3 + i, 0]
-    share, rate = pulse(beats - lag * values[7, 0])
-    out[12] = r * share * values[6, 0]
+        out[16 + i] = da * scratch[i, 0] + db * scratch[3 + i, 0]
+    share, rate = pulse(beats - lag * scratch[7, 0])
+    out[12] = r * share * scratch[6, 0]
     for j in range(3):
-        out[13 + j] = r * share * values[6, 1 + j]
-    out[19] = (dr * share + r * rate * often) * values[6, 0]
+        out[13 + j] = r * share * scratch[6, 1 + j]
+    out[19] = (dr * share + r * rate * often) * scratch[6, 0]
 
 
 @compiled
 def first_past(inlet, points):
-    """Number of the first of some places (n, 3), m, past an inlet, n for none.
+    """Number of the first of places (n, 3), m, past an inlet, n for none.
 
-    Args:
-        inlet: (2, 3), its position, m, and the direction into the vessel.
-        points: of a device, from its proximal end.
+    The inlet is (2, 3), its position, m, and the direction into the vessel.
     """
     for n in range(len(points)):
         level = 0.0
@@ -187,7 +180,7 @@ def moved(lattice, parameters, time, points, out, growth):
         x, y, z = points[n]
         for _ in range(_TURNS):
             warp(lattice, course, x, y, z, values, there)
-            ax, ay, az = points[n, 0] - there[0], points[n, 1] - there[1], 0.0
+            ax, ay = points[n, 0] - there[0], points[n, 1] - there[1]
             az = points[n, 2] - there[2]
             x, y, z = x + ax, y + ay, z + az
             if max(abs(ax), abs(ay), abs(az)) < _CLOSE:
@@ -219,9 +212,8 @@ def wall_velocity(there, normal):
     Space goes with A⁻¹ ∂u/∂t, and a wall that widens away from its normal (3).
     """
     u, v, w, scale = carried(there, there[16], there[17], there[18])
-    grow = there[19]
-    u, v, w = u / scale, v / scale, w / scale
-    return (u - grow * normal[0], v - grow * normal[1], w - grow * normal[2])
+    u, v, w, grow = u / scale, v / scale, w / scale, there[19]
+    return u - grow * normal[0], v - grow * normal[1], w - grow * normal[2]
 
 
 @compiled

@@ -193,9 +193,7 @@ def _nearest(nodes, first, last, chosen, x, y, z):
 def _signed(tree, vessel, chosen, x, y, z, out):
     """Signed depth (m) in one vessel, and the nearest place of its wall in `out`.
 
-    Args:
-        tree: arrays of `TreeDepth`.
-        chosen: numbers of the vessel's rings that matter.
+    Only the vessel's chosen rings are looked at.
     """
     nodes, (first, last), flats = tree[0], tree[1][vessel], tree[2][vessel]
     k, u, value = _nearest(nodes, first, last, chosen, x, y, z)
@@ -275,15 +273,7 @@ def _creases_near(creases, x, y, z, margin, near):
 
 @compiled
 def _tree_depths(tree, creases, blocks, points, out):
-    """Signed distance to the wall at every point of every block.
-
-    Args:
-        tree: arrays of `TreeDepth`.
-        creases: (c, 3) points where walls of two vessels meet, m.
-        blocks: (n, 3) middles of the blocks, m.
-        points: (q, 3) relative to the middle of a block, m.
-        out: (n, q) m, > 0 inside.
-    """
+    """Signed distances (n, q) m at blocks (n, 3) + points (q, 3) m, see `TreeDepth`."""
     nodes, spans, _ = tree
     wide = np.empty((len(spans), len(nodes) + 1), np.int64)
     close, level, places = wide.copy(), np.empty(len(spans)), np.empty((2, 3))
@@ -314,10 +304,8 @@ def _tree_depths(tree, creases, blocks, points, out):
 def _tree_depth(tree, here, x, y, z):
     """Signed distance (m) of one point from the walls, without creases.
 
-    Args:
-        tree: arrays of `TreeDepth`.
-        here: which vessels matter to the point, and their rings; the same of those
-            that may hold the wall of another; scratch (2, 3).
+    `here` says which vessels matter to the point, and their rings; the same of those
+    that may hold the wall of another; scratch (2, 3).
     """
     matters, close, others, wide, places = here
     inside, distance = False, np.inf

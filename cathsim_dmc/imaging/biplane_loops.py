@@ -36,11 +36,8 @@ def _place(matrix, x, y, z):
 def depths(points, matrices, walls, focal):
     """Signed distances (n,) to the outline of the vessel, the lesser of both planes, m.
 
-    Args:
-        points: (n, 3), world frame, m.
-        matrices: (2, 3, 4), see `CArm.matrix`.
-        walls: (2, rows, columns), signed distances of pixels, positive inside, px.
-        focal: (2,), focal lengths, px.
+    Walls (2, rows, columns) are those of pixels, > 0 inside, and focal lengths (2,)
+    in px.
     """
     found = np.empty(len(points))
     for n in range(len(points)):
@@ -120,8 +117,7 @@ def _peaks(image, least, found):
 def _marker(images, matrices, least, widest, point):
     """Writes where the marker is: dark in both planes. Returns how dark, 0 if nowhere.
 
-    Args:
-        widest: largest distance of the two rays, px.
+    The two rays are at most `widest` (px) apart.
     """
     first, second = np.zeros((PEAKS, 3)), np.zeros((PEAKS, 3))
     counts = _peaks(images[0], least, first), _peaks(images[1], least, second)
@@ -160,9 +156,7 @@ def _line(images, matrices, full, point, direction, way):
 def _next(images, matrices, directions, way, full, point, last, tried):
     """Number of the direction in which the device goes on, -1 if none.
 
-    Args:
-        last: direction before, zero at the first point.
-        tried: (D,) bool, directions that are left out.
+    The direction before is zero at the first point; those tried are left out.
     """
     best, chosen = 0.25, -1
     first = (last * last).sum() == 0.0

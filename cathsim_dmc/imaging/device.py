@@ -117,12 +117,8 @@ def _below_left(x, y, left, below):
 def add_disc(image, row, column, radius, weight, scratch):
     """Spreads a weight over the pixels that a disc covers, by the area they share.
 
-    Args:
-        image: (rows, columns), added to in place; what falls beside it is left out.
-        row, column: centre of the disc, px.
-        radius: of the disc, px, > 0.
-        weight: of the whole disc.
-        scratch: (3, columns of the disc or more), overwritten.
+    Centre and radius in px; what falls beside the image is left out. Scratch is (3, n),
+    n at least the columns of the disc.
     """
     rows, columns = image.shape
     # Pixel k spans [k - 1/2, k + 1/2].
@@ -194,11 +190,9 @@ def _bends(joints, link):
 
 @compiled
 def curve(joints, pieces):
-    """Smooth curve ((n - 1) * pieces + 1, 3) through joints, a cubic on each link.
+    """Smooth curve ((n - 1) * pieces + 1, 3) through joints (n, 3), a cubic on a link.
 
-    Args:
-        joints: (n, 3), finite and apart.
-        pieces: of each link.
+    Joints are finite and apart.
     """
     points = np.empty(((len(joints) - 1) * pieces + 1, 3))
     points[-1] = joints[-1]
@@ -218,17 +212,10 @@ def curve(joints, pieces):
 
 @compiled
 def _add_devices(images, cameras, radii, focal, material):
-    """Adds the optical depth of devices to images, each frame on its own.
+    """Adds devices to images (B, rows, columns); returns the widest radius in view, px.
 
-    Args:
-        images: (B, rows, columns), added to in place.
-        cameras: (B, n, 3), joints in camera coordinates (`CArm.camera`), m.
-        radii: (B, n - 1), of each link, m.
-        focal: distance of source and detector, px.
-        material: attenuation of device and marker, 1/m, and length of the marker, m.
-
-    Returns:
-        Radius of the widest shadow in view, px; those above `_WIDEST` are not drawn.
+    Joints (B, n, 3) in camera coordinates and radii (B, n - 1) in m, focal length in
+    px; material: attenuation of device and marker, 1/m, and length of the marker, m.
     """
     widest = 0.0
     scratch = np.empty((3, 2 * _WIDEST + 2))
@@ -236,21 +223,20 @@ def _add_devices(images, cameras, radii, focal, material):
         image, camera, radius = images[frame], cameras[frame], radii[frame]
         to_tip = 0.0  # arc length from the tip, m
         for link in range(len(radius) - 1, -1, -1):
-            length, wide = _add_link(
-                image, camera, link, radius, focal, material, to_tip, scratch
-            )
+            part = link, radius, focal, material, to_tip
+            length, wide = _add_link(image, camera, part, scratch)
             to_tip += length
             widest = max(widest, wide)
     return widest
 
 
 @compiled
-def _add_link(image, camera, link, radii, focal, material, to_tip, scratch):
-    """Adds one link whose distal end is `to_tip` from the tip.
+def _add_link(image, camera, part, scratch):
+    """Adds a link, whose distal end is `to_tip` (m) from the tip, up to `_WIDEST`.
 
-    Returns:
-        its length, m, and the radius of its shadow, px, 0 if it is not in view.
+    Returns its length, m, and the radius of its shadow, px, 0 if it is not in view.
     """
+    link, radii, focal, material, to_tip = part
     rows, columns = image.shape
     radius = radii[link]
     x0, y0, z0 = camera[link]

@@ -62,13 +62,10 @@ def surface_thickness(carm: CArm, surface: Surface, supersample: int = 3) -> np.
 
 @compiled
 def _add_surface(image, corners, inverse, faces):
-    """Adds the depths at which rays leave a surface, less those at which they enter.
+    """Adds the depths (m) at which rays leave a surface, less those where they enter.
 
-    Args:
-        image: (rows, columns) of rays, added to in place, m.
-        corners: (V, 2) int64, column and row of the vertices times `_SUBDIVISIONS`.
-        inverse: (V,) of their depth, 1/m.
-        faces: (F, 3), counter-clockwise seen from outside.
+    Corners (V, 2) int64 are columns and rows times `_SUBDIVISIONS`, inverse (V,) is one
+    over their depth, 1/m.
     """
     rows, columns = image.shape
     for face in range(len(faces)):
@@ -80,10 +77,8 @@ def _add_surface(image, corners, inverse, faces):
             continue
         # Rows run downwards: a face turned to the detector, where rays leave, is
         # clockwise in its coordinates and so has a negative area.
-        sign = 1.0
-        if area > 0:
-            sign = -1.0
-        else:
+        sign = -1.0 if area > 0 else 1.0
+        if area < 0:
             bx, by, cx, cy, j, k = cx, cy, bx, by, k, j
         left = max(-(-min(ax, bx, cx) // _SUBDIVISIONS), 0)
         right = min(max(ax, bx, cx) // _SUBDIVISIONS, columns - 1)
