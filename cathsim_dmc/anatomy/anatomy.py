@@ -132,8 +132,7 @@ class Anatomy:
     def save(self, directory: str | os.PathLike[str]) -> Path:
         """Write the anatomy into `directory` and return that path.
 
-        A reader finds the old anatomy or the new one. Of processes that save into one
-        directory at once, the last one's anatomy stays.
+        A reader finds the old anatomy or the new one.
         """
         directory = Path(directory)
         directory.mkdir(parents=True, exist_ok=True)
@@ -143,10 +142,11 @@ class Anatomy:
         }
         vessels = []
         for index, vessel in enumerate(self.tree.vessels.values()):
-            arrays[f"vessel_{index}_points"] = vessel.centreline.points
-            arrays[f"vessel_{index}_radii"] = vessel.centreline.radii
-            own = {"name": vessel.name, "parent": vessel.parent}
-            vessels.append({**own, "ostium": vessel.ostium})
+            own = dict(vars(vessel))
+            line = own.pop("centreline")
+            arrays[f"vessel_{index}_points"] = line.points
+            arrays[f"vessel_{index}_radii"] = line.radii
+            vessels.append(own)
         header = {
             **_FORMAT,
             "name": self.name,

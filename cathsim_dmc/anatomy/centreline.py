@@ -95,17 +95,13 @@ class Centreline:
             raise ValueError(f"a centreline has {len(points)} points; give 2 or more.")
         shape = (len(points),)
         radii = _readonly(bounds.array("centreline radii", self.radii, shape=shape))
-        if radii.min() <= 0.0:
-            raise ValueError(
-                f"smallest centreline radius is {radii.min():g} m; radii must be > 0."
-            )
+        bounds.number(
+            "smallest centreline radius", radii.min(), unit="m", positive=True
+        )
         steps = np.linalg.norm(np.diff(points, axis=0), axis=1)
         if steps.min() <= 0.0:
             first = int(steps.argmin())
-            raise ValueError(
-                f"centreline points {first} and {first + 1} coincide; drop repeated "
-                "points."
-            )
+            raise ValueError(f"centreline points {first} and {first + 1} coincide")
         vars(self).update(points=_readonly(points), radii=radii)
 
     @cached_property
@@ -192,10 +188,7 @@ class Centreline:
         low, high = sorted((float(s0), float(s1)))
         low, high = max(low, 0.0), min(high, self.length)
         if high - low <= _GAP:
-            raise ValueError(
-                f"slice from {s0:g} to {s1:g} m is empty; the centreline spans "
-                f"0 to {self.length:g} m."
-            )
+            raise ValueError(f"no slice from {s0:g} to {s1:g} m of {self.length:g} m")
         inner = (self.arc_length > low + _GAP) & (self.arc_length < high - _GAP)
         s = np.concatenate([[low], self.arc_length[inner], [high]])
         return Centreline(*self.at(s if s0 <= s1 else s[::-1])[:2])
@@ -218,12 +211,8 @@ class Vessel:
         bounds.text("vessel name", self.name)
         if self.parent is not None:
             bounds.text(f"parent of vessel {self.name!r}", self.parent)
-        bounds.number(f"ostium of vessel {self.name!r}", self.ostium)
-        if not 0.0 <= self.ostium < self.centreline.length:
-            raise ValueError(
-                f"ostium of vessel {self.name!r} is {self.ostium:g} m; it must lie on "
-                f"its own centreline, 0 <= ostium < {self.centreline.length:g} m."
-            )
+        last = self.centreline.length - _GAP
+        bounds.number(f"ostium of vessel {self.name!r}", self.ostium, 0.0, last, "m")
 
     @property
     def mouth(self) -> CentrelinePoint:
@@ -344,6 +333,5 @@ class VesselTree:
             raise ValueError(f"route from {start!r} to {goal!r} has no length.")
         points = np.concatenate([part.points for part in parts])
         radii = np.concatenate([part.radii for part in parts])
-        steps = np.linalg.norm(np.diff(points, axis=0), axis=1)
-        keep = np.append(True, steps > _GAP)
+        keep = np.append(True, np.diff(arc_lengths(points)) > _GAP)
         return Centreline(points[keep], radii[keep])

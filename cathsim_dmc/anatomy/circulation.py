@@ -102,52 +102,49 @@ class Circulation:
 def _along(line: Centreline, course: Course, number: int) -> tuple[np.ndarray, ...]:
     count = max(2, round(line.length / _SPACING) + 1)
     s = np.linspace(0.0, line.length, count)
-    way = line.length - s if course.reverse else s
-    place, share = line.at(s), course.share(way)
-    flow = -share if course.reverse else share
-    values = place.position, place.radius, flow, course.begin + way
+    way, sign = (line.length - s, -1.0) if course.reverse else (s, 1.0)
+    place = line.at(s)
+    values = place.position, place.radius, sign * course.share(way), course.begin + way
     pairs = [np.stack([value[:-1], value[1:]], axis=1) for value in values]
     return (*pairs, np.full(count - 1, number))
 
 
 def _courses(tree: VesselTree, reverse: bool, murray: bool) -> dict[str, Course]:
     outlets = _outlets(tree, reverse, murray)
-    taken, begins = dict(outlets), {}
-    for name in reversed(tuple(tree.vessels)):  # branches before their parents
-        parent = tree.vessels[name].parent
-        if parent is not None:
-            taken[parent] += taken[name]
+    taken, begins, root = dict(outlets), {tree.root.name: 0.0}, tree.root
     branches: dict[str, list] = {name: [] for name in tree.vessels}
-    for name, vessel in tree.vessels.items():
-        begins[name] = 0.0
-        if vessel.parent is not None:
-            way = tree.origin(name)
-            if reverse and vessel.parent == tree.root.name:
-                way = tree.root.centreline.length - way
-            begins[name] = begins[vessel.parent] + way
-            branches[vessel.parent].append((way, taken[name]))
-    courses = {}
-    for name, parts in branches.items():
-        back = reverse and name == tree.root.name
-        own = np.array(parts).reshape(-1, 2)
-        courses[name] = Course(begins[name], back, outlets[name], own)
-    return courses
+    below = [vessel for vessel in tree.vessels.values() if vessel.parent is not None]
+    for vessel in reversed(below):  # branches before their parents
+        taken[str(vessel.parent)] += taken[vessel.name]
+    for vessel in below:
+        parent, way = str(vessel.parent), tree.origin(vessel.name)
+        if reverse and parent == root.name:
+            way = root.centreline.length - way
+        begins[vessel.name] = begins[parent] + way
+        branches[parent].append((way, taken[vessel.name]))
+    return {
+        name: Course(
+            begins[name],
+            reverse and name == root.name,
+            outlets[name],
+            np.array(own).reshape(-1, 2),
+        )
+        for name, own in branches.items()
+    }
 
 
 def _outlets(tree: VesselTree, reverse: bool, murray: bool) -> dict[str, float]:
     """Share of the inflow that leaves through the free end of each vessel."""
-    cubes: dict[str, float] = {}
+    shares = {} if murray or not set(SHARES) <= set(tree.vessels) else SHARES
     artery: dict[str | None, str] = {None: ""}
-    measured = not murray and set(SHARES) <= set(tree.vessels)
+    cubes: dict[str, float] = {}
+    summed = dict.fromkeys((*shares, ""), 0.0)
     for name, vessel in tree.vessels.items():
+        artery[name] = name if name in shares else artery[vessel.parent]
         first = reverse and vessel.parent is None
         cubes[name] = float(vessel.centreline.radii[0 if first else -1]) ** 3
-        own = measured and name in SHARES
-        artery[name] = name if own else artery[vessel.parent]
-    totals = {**SHARES, "": 1.0 - sum(SHARES.values())} if measured else {"": 1.0}
-    summed = dict.fromkeys(totals, 0.0)
-    for name, cube in cubes.items():
-        summed[artery[name]] += cube
+        summed[artery[name]] += cubes[name]
+    totals = {**shares, "": 1.0 - sum(shares.values())}
     return {
         n: totals[artery[n]] * cube / summed[artery[n]] for n, cube in cubes.items()
     }

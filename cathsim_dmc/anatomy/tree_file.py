@@ -27,10 +27,10 @@ _MM = 1e-3
 _FARTHEST = 2000.0
 _RADII = (0.3, 60.0)
 _MOST_POINTS = 20_000
-# Ways to say where an inlet or a goal is.
+# Ways to say where inlets and goals are.
 _WAYS = {
-    "inlet": ("end", "arc_length_mm"),
-    "goal": ("arc_length_mm", "past_ostium_mm", "position_mm"),
+    "inlets": ("end", "arc_length_mm"),
+    "goals": ("arc_length_mm", "past_ostium_mm", "position_mm"),
 }
 
 
@@ -84,8 +84,8 @@ def parse_tree(content: Any) -> TreeFile:
     bounds.choice("the first of vessels", root, curves)
     inlets, goals = (
         {
-            key: _place(f"{kind} {key!r}", entry, ways, curves)
-            for key, entry in _parts(content, f"{kind}s")
+            key: _place(f"{kind[:-1]} {key!r}", entry, ways, curves)
+            for key, entry in _parts(content, kind)
         }
         for kind, ways in _WAYS.items()
     )
@@ -120,14 +120,12 @@ def _curve(where: str, entry: Any, before: list[str]) -> Curve:
     far, (low, high) = np.abs(points).max(), _RADII
     if far > _FARTHEST or radii.min() < low or radii.max() > high:
         raise ValueError(
-            f"{where} has coordinates up to {far:g} mm and radii from {radii.min():g} "
-            f"to {radii.max():g} mm; allowed are {_FARTHEST:g} mm, and {low:g} to "
-            f"{high:g} mm. Are these millimetres, and no diameters?"
+            f"{where} has coordinates up to {far:g} and radii from {radii.min():g} to "
+            f"{radii.max():g}; allowed are {_FARTHEST:g}, and {low:g} to {high:g}: are "
+            "these millimetres, and no diameters?"
         )
-    try:
-        return Curve(points * _MM, radii * _MM, parent)
-    except ValueError as error:
-        raise ValueError(f"{where}: {error}") from error
+    curve = {"points": points * _MM, "radii": radii * _MM, "parent": parent}
+    return bounds.made(where, curve, Curve)
 
 
 def _numbers(name: str, value: Any, columns: int) -> np.ndarray:
