@@ -1,7 +1,5 @@
 """Centrelines, projections, vessel trees and routes."""
 
-import pickle
-
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -141,9 +139,3 @@ def test_route_into_a_branch_and_between_branches():
 def test_trees_need_parents_first_and_one_root(vessels, message):
     with pytest.raises(ValueError, match=message):
         VesselTree(vessels)
-
-
-def test_trees_can_be_sent_to_workers():
-    vessels = pickle.loads(pickle.dumps(tree()))
-    point = np.array([0.01, 0.0, 0.05])
-    assert vessels.depths(point) == tree().depths(point)

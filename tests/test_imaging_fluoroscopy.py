@@ -76,11 +76,6 @@ def test_grey_levels():
     assert image.tolist() == [[0, 0, 102], [204, 245, 255]]
 
 
-def test_materials_are_ordered_as_on_a_screen():
-    assert 0 < materials.CATHETER < materials.NITINOL_WIRE < materials.STEEL_WIRE
-    assert materials.CATHETER < materials.MARKER < materials.PLATINUM
-
-
 def test_image_is_beer_lambert_of_its_parts(fluoroscope, frames):
     image = drawn(fluoroscope, frames)
     assert image.shape == (20, 128, 128, 1) and image.dtype == np.uint8

@@ -186,20 +186,6 @@ def test_the_expert_follows_the_arch_of_each_simulation(plain_pair):
         simulation.step(action)
 
 
-def test_goals_and_measures_are_those_of_the_own_arch(plain_pair):
-    plain_pair.reset()
-    step = plain_pair.batch.step(np.zeros((SIMULATIONS, 21)))
-    for environment in plain_pair.environments:
-        environment.step(np.zeros(21))
-    goals = plain_pair.batch.rollout.resting_goal
-    for i in range(SIMULATIONS):
-        case = plain_pair.batch.rollout.case(i)
-        np.testing.assert_array_equal(goals[i], case.scene.goal.position)
-        head = step.readings.head[i]
-        assert case.scene.anatomy.lumen(head) > 0
-        assert step.distance[i] == np.linalg.norm(head - case.scene.goal.position)
-
-
 @pytest.mark.parametrize("task", TASKS)
 def test_tasks_are_registered_and_have_the_common_shape(task, shared_environment):
     task = suite.make_task(task, pool=1, arches="test", first=0)
@@ -249,13 +235,6 @@ def test_any_arch_names_the_branches_and_accesses(wrong):
 def test_bad_pools_are_refused_before_anything_is_built(options):
     with pytest.raises(ValueError, match="arches"):
         suite.make_task("arch_bca", **options)
-
-
-def test_all_cases_share_the_entities(plain_pair):
-    scenes = [case.scene for case in plain_pair.batch.task._cases]
-    assert [scene.anatomy.name for scene in scenes] == names()
-    for scene in scenes[1:]:
-        assert scene.arena is scenes[0].arena and scene.sheath is scenes[0].sheath
 
 
 def test_anatomies_with_other_goals_are_refused():
