@@ -97,7 +97,7 @@ def test_saved_anatomy_keeps_its_depth(y_anatomy, tmp_path):
     rng = np.random.default_rng(3)
     points = rng.uniform(-0.03, 0.09, size=(500, 3))
     np.testing.assert_array_equal(again.lumen(points), y_anatomy.lumen(points))
-    assert again.scanned and again.lumen.digest == y_anatomy.lumen.digest
+    assert again.scan and again.lumen.digest == y_anatomy.lumen.digest
 
 
 def test_the_command_draws_what_it_imports(y_anatomy, tmp_path, monkeypatch, capsys):

@@ -34,21 +34,19 @@ class Anatomy:
     Attributes:
         name: what to call it.
         tree: centrelines and radii.
-        surface: triangles of the lumen surface, closed.
         inlet: where the device enters.
         goals: places to reach, by name.
         ends: flat ends of the lumen, open or capped.
-        scanned: whether the surface bounds the true lumen, as that of a scan; it is the
-            union of the tree's tubes if not.
+        scan: closed surface of the true lumen; None if it is the union of the tree's
+            tubes.
     """
 
     name: str
     tree: VesselTree
-    surface: Surface
     inlet: Inlet
     goals: Mapping[str, Goal]
     ends: tuple[End, ...] = ()
-    scanned: bool = False
+    scan: Surface | None = None
 
     def __post_init__(self) -> None:
         for key, goal in self.goals.items():
@@ -90,12 +88,10 @@ class Anatomy:
             ValueError: if the centrelines give no valid lumen, or a place is not on
                 its vessel; names the vessel.
         """
-        from cathsim_dmc.anatomy.surface import TubeSurface
-
         if not isinstance(tree, VesselTree):
             tree = smooth_tree(tree)
         tree, ends, entry, places = builder.placed(tree, inlet, goals)
-        return cls(name, tree, TubeSurface(tree), entry, places, ends)
+        return cls(name, tree, entry, places, ends)
 
     @cached_property
     def lumen(self) -> Field:
@@ -103,13 +99,19 @@ class Anatomy:
 
         Built when first asked for, and kept in `field_cache.cache_folder()`.
         """
-        lumen = self.surface if self.scanned else self.tree
-        return field_cache.field_of(lumen, self.ends)
+        return field_cache.field_of(self.scan or self.tree, self.ends)
+
+    @cached_property
+    def surface(self) -> Surface:
+        """Triangles of the lumen surface, closed."""
+        from cathsim_dmc.anatomy.surface import lumen_surface
+
+        return self.scan or lumen_surface(self.tree)
 
     @cached_property
     def circulation(self) -> Circulation:
         """Distribution of the inflow among the vessels."""
-        return Circulation.of(self.tree, murray=self.scanned)
+        return Circulation.of(self.tree, murray=self.scan is not None)
 
     @cached_property
     def motion(self) -> Motion:
@@ -150,7 +152,7 @@ class Anatomy:
         header = {
             **_FORMAT,
             "name": self.name,
-            "scanned": self.scanned,
+            "scanned": self.scan is not None,
             "vessels": vessels,
             "inlet": _plain(self.inlet),
             "goals": [_plain(goal) for goal in self.goals.values()],
@@ -200,14 +202,14 @@ def _unpack(arrays: dict[str, np.ndarray]) -> Anatomy:
         for kind, parts in (("vessels", vessels), ("goals", goals)):
             if len({part.name for part in parts}) < len(parts):
                 raise ValueError(f"{kind} has a name twice")
+        surface = Surface(arrays["surface_vertices"], arrays["surface_faces"])
         return Anatomy(
             name=bounds.text("name", header["name"]),
             tree=VesselTree({vessel.name: vessel for vessel in vessels}),
-            surface=Surface(arrays["surface_vertices"], arrays["surface_faces"]),
             inlet=Inlet(**header["inlet"]),
             goals={goal.name: goal for goal in goals},
             ends=tuple(End(**entry) for entry in _listed(header, "ends")),
-            scanned=bounds.switch("scanned", header["scanned"]),
+            scan=surface if bounds.switch("scanned", header["scanned"]) else None,
         )
     except KeyError as error:
         raise ValueError(f"it lacks the entry {error}") from error

@@ -14,21 +14,6 @@ _NARROW = 0.9
 _LEAST_SPACING = 1e-3
 
 
-class TubeSurface(Surface):
-    """Surface of the union of a tree's tubes, built when it is first looked at."""
-
-    def __init__(self, tree: VesselTree):
-        """Keeps the tree."""
-        vars(self)["_tree"] = tree
-
-    def __getattr__(self, name: str):
-        """Vertices and faces, which are there from then on."""
-        if name not in ("vertices", "faces"):
-            raise AttributeError(name)
-        vars(self).update(vars(lumen_surface(self._tree)))
-        return vars(self)[name]
-
-
 def _depth_grid(tree: VesselTree, spacing: float) -> tuple[Array, Array]:
     """Closed depth field (nx, ny, nz) and the position (3,) of its first point.
 

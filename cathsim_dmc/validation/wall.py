@@ -35,7 +35,7 @@ def field_error(anatomy: Anatomy) -> np.ndarray:
     points, normals = sampled(anatomy.surface, _PLACES)
     away = np.random.default_rng(0).uniform(-1.2e-3, 1.2e-3, (_PLACES, 1))
     points = points + away * normals
-    if anatomy.scanned:
+    if anatomy.scan:
         exact = SurfaceDepth(anatomy.surface, anatomy.ends)(points)
     else:
         exact = TreeDepth(anatomy.tree, anatomy.ends)(points)
@@ -66,14 +66,14 @@ def lumen_checks(anatomy: Anatomy) -> list[Check]:
     def check(what: str, value: float, bound: float, unit: str = "", note: str = ""):
         made.append(Check.at_most(f"{name}: {what}", value, bound, unit, note))
 
-    if not anatomy.scanned:  # scans have rings of vessels
+    if not anatomy.scan:  # scans have rings of vessels
         note = "tubes that touch beyond the place where they part"
         check("handles of the surface", topology.handles(faces), 0, "", note)
     note = f"{len(faces)} triangles, {1e6 * anatomy.surface.volume:.0f} ml"
     check("edges of the surface without two triangles", loose, 0, "", note)
     parts = int(topology.parts(faces).max()) + 1
     check("separate parts of the surface", parts, 1)
-    bound = ERROR_SURFACE if anatomy.scanned else ERROR_TREE
+    bound = ERROR_SURFACE if anatomy.scan else ERROR_TREE
     note = f"mean {error.mean():.4f} mm, at most {error.max():.3f} mm, at "
     note += f"{len(error)} places within {1e3 * _NEAR_WALL:g} mm of the wall"
     worst = float(np.percentile(error, 99))

@@ -105,7 +105,7 @@ def import_scan(
     say(f"tree: {', '.join(_sizes(tree))}")
     name, goals = name or Path(mesh_path).name.split(".")[0], place_goals(tree)
     ends = flat_ends(tree, opening)
-    anatomy = Anatomy(name, tree, surface, opening, goals, ends, scanned=True)
+    anatomy = Anatomy(name, tree, opening, goals, ends, surface)
     _prove(anatomy, note)
     seconds = time.monotonic() - started
     say(f"done in {seconds:.0f} s, goals {', '.join(goals) or 'none'}")
