@@ -30,7 +30,7 @@ def test_same_seed_gives_the_same_bytes():
 @settings(max_examples=8)
 @given(
     st.integers(0, 2**31 - 1),
-    st.sampled_from(list(arch.DROP_RANGES)),
+    st.sampled_from(list(sampler.DROP_RANGES)),
     st.sampled_from(arch.VARIANTS),
 )
 def test_samples_are_valid_arches_of_their_type(seed, arch_type, variant):
@@ -38,7 +38,7 @@ def test_samples_are_valid_arches_of_their_type(seed, arch_type, variant):
     tree = arch_tree(params)
     drop = measures.bca_drop(tree)
     assert measures.arch_type(drop) == arch_type
-    low, high = arch.DROP_RANGES[arch_type]
+    low, high = sampler.DROP_RANGES[arch_type]
     assert low - 0.05 <= drop <= high + 0.05
     bovine = variant.startswith("bovine")
     assert tree.vessel("lcca").parent == ("bca" if bovine else "aorta")
@@ -50,7 +50,7 @@ def test_samples_are_valid_arches_of_their_type(seed, arch_type, variant):
 
 def test_the_train_set_has_the_published_shares():
     kinds = [one.arch_type for one in arch.arch_set("train")]
-    share = [kinds.count(kind) / len(kinds) for kind in arch.DROP_RANGES]
+    share = [kinds.count(kind) / len(kinds) for kind in sampler.DROP_RANGES]
     # 1,000 draws: three standard errors are 0.047.
     np.testing.assert_allclose(share, [0.336, 0.434, 0.230], atol=0.047)
     variants = [one.variant for one in arch.arch_set("train")]

@@ -209,8 +209,6 @@ class Vessel:
 
     def __post_init__(self) -> None:
         bounds.text("vessel name", self.name)
-        if self.parent is not None:
-            bounds.text(f"parent of vessel {self.name!r}", self.parent)
         last = self.centreline.length - _GAP
         bounds.number(f"ostium of vessel {self.name!r}", self.ostium, 0.0, last, "m")
 

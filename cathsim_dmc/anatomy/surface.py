@@ -15,10 +15,7 @@ _LEAST_SPACING = 1e-3
 
 
 def _depth_grid(tree: VesselTree, spacing: float) -> tuple[Array, Array]:
-    """Closed depth field (nx, ny, nz) and the position (3,) of its first point.
-
-    Only points near a vessel are computed; elsewhere the field is -2 spacing.
-    """
+    """Depths (nx, ny, nz) m, those far outside -2 spacing, and the first point (3,)."""
     lines = [(one.centreline, one.parent is None) for one in tree.vessels.values()]
     margin = 3.0 * spacing
     low = np.min([(x.points - x.radii[:, None]).min(0) for x, _ in lines], axis=0)
@@ -78,10 +75,7 @@ def lumen_surface(tree: VesselTree, spacing: float | None = None) -> Surface:
     vertices, faces, _, _ = marching_cubes(
         grid, level=0.0, spacing=(spacing,) * 3, gradient_direction="ascent"
     )
-    surface = Surface(vertices + origin, faces)
-    if surface.volume < 0.0:
-        surface = Surface(surface.vertices, surface.faces[:, ::-1])
-    return surface
+    return Surface(vertices + origin, faces)
 
 
 def sampled(surface: Surface, count: int) -> tuple[Array, Array]:

@@ -10,7 +10,7 @@ from tyro.extras import SubcommandApp
 from cathsim_dmc import bounds, suite
 from cathsim_dmc.anatomy import export as exported
 from cathsim_dmc.anatomy import phantoms as shipped
-from cathsim_dmc.anatomy.arch import arch
+from cathsim_dmc.anatomy.arch import arch, sampler
 from cathsim_dmc.anatomy.scan.importer import import_scan
 from cathsim_dmc.anatomy.scan.places import describe
 from cathsim_dmc.anatomy.tree_file import read_tree
@@ -128,7 +128,7 @@ def generate(
         access: End of the aorta that the device enters, ascending or descending.
     """
     needs = dict.fromkeys(shipped.PHANTOMS) | dict.fromkeys(arch.SETS, "index")
-    needs |= dict.fromkeys(arch.DROP_RANGES, "seed")
+    needs |= dict.fromkeys(sampler.DROP_RANGES, "seed")
     if kind not in needs:
         raise ValueError(f"no phantom, type or set {kind!r}; there are {[*needs]}")
     for option, value in {"seed": seed, "index": index}.items():

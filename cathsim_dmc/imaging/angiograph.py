@@ -40,14 +40,8 @@ class Angiograph:
     """
 
     def __init__(self, surface: Surface, options: FluoroscopyOptions | None = None):
-        """Computes the path length through the vessel for the default angles.
-
-        Args:
-            surface: of the lumen, world frame, m.
-            options: Set-up of the machine; the default one if None.
-        """
-        self._surface = surface
-        self.options = options or FluoroscopyOptions()
+        """Computes the path lengths through a lumen (world frame, m) for its angles."""
+        self._surface, self.options = surface, options or FluoroscopyOptions()
         self._views: dict[tuple[int, int], Planes] = {}
         self.planes()
 

@@ -127,14 +127,7 @@ class CArm:
         return self.source_detector / self.pitch
 
     def camera(self, points: ArrayLike) -> np.ndarray:
-        """Coordinates of world points along the axes, seen from the source.
-
-        Args:
-            points: (..., 3) world frame, m.
-
-        Returns:
-            (..., 3) float64: right, down and depth, m.
-        """
+        """Right, down and depth (..., 3) m of points (..., 3) m, from the source."""
         relative = np.asarray(points, dtype=np.float64) - self.source
         # Sums written out: a matrix product would round differently for batches.
         terms = relative[..., None, :] * self.axes
@@ -170,11 +163,7 @@ class CArm:
     def slant(self, supersample: int = 1) -> np.ndarray:
         """Path along each ray per unit of depth, 1 / cos of its angle to the axis.
 
-        Args:
-            supersample: rays along each side of a pixel.
-
-        Returns:
-            (rows * supersample, columns * supersample) float64, >= 1.
+        (rows * supersample, columns * supersample) float64, >= 1.
         """
         across = []
         for count in self.resolution:

@@ -50,9 +50,6 @@ class Fluoroscope:
     gain: float = detector.GAIN
     roadmap: float = 0.0
 
-    def __post_init__(self) -> None:
-        vars(self).update(vessel=np.asarray(self.vessel, np.float32))
-
     @classmethod
     def from_surface(
         cls, surface: Surface, carm: CArm | None = None, **fields
@@ -83,7 +80,8 @@ class Fluoroscope:
     def signal(self) -> np.ndarray:
         """(rows, columns) float32, signal behind patient and vessel, no device."""
         # Beer-Lambert: the share of quanta that pass.
-        return np.exp(-materials.IODINE * self.contrast * self.vessel)
+        path = np.asarray(self.vessel, np.float32)
+        return np.exp(-materials.IODINE * self.contrast * path)
 
     @cached_property
     def empty(self) -> np.ndarray:

@@ -18,8 +18,7 @@ DETECTOR_SIZE = 0.38
 # endoscope; and the distance, m, at which a ray ends that meets no wall.
 VIEW_ANGLE, FARTHEST_WALL = 90.0, 0.3
 
-# Bounds of the numbers that are no C-arm's: wider than real systems, within the
-# computable.
+# Bounds of the numbers that are no C-arm's.
 _BOUNDS = {
     "kerma": (0.0, 1.0, "Gy"),
     "gain": (0.0, 1000.0, ""),
@@ -72,7 +71,6 @@ class FluoroscopyOptions:
     detector_size: float = DETECTOR_SIZE
 
     def __post_init__(self) -> None:
-        bounds.pixels("size", self.size)
         for name, limits in _BOUNDS.items():
             positive = name in ("kerma", "gain")
             bounds.number(name, getattr(self, name), *limits, positive=positive)
@@ -128,8 +126,5 @@ class FluoroscopyOptions:
 def _angles(name: str, view: View) -> tuple[float, float]:
     if isinstance(view, str):
         return VIEWS[bounds.choice(name, view, VIEWS)]
-    try:
-        primary, secondary = bounds.vector(name, view, 2, -360.0, 360.0, "degrees")
-    except ValueError as error:
-        raise ValueError(f"{error}, or one of {', '.join(VIEWS)}") from error
+    primary, secondary = bounds.vector(name, view, 2, -360.0, 360.0, "degrees")
     return primary, secondary

@@ -1,4 +1,4 @@
-"""Parametric aortic arches: presets, and the anatomy that parameters give.
+"""Parametric aortic arches: presets, sets of random ones, and their anatomies.
 
 Built in the patient frame LPS with the inlet of the ascending aorta at the
 origin. The arch is half an ellipse in a plane, between an ascending and a
@@ -11,8 +11,10 @@ draws does.
 
 import math
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import lru_cache
+
+import numpy as np
 
 from cathsim_dmc import bounds
 from cathsim_dmc.anatomy.anatomy import Anatomy
@@ -21,29 +23,9 @@ from cathsim_dmc.anatomy.arch.parameters import (
     ArchParameters,
     BranchParameters,
 )
-from cathsim_dmc.anatomy.arch.sampler import (
-    DROP_RANGES,
-    SETS,
-    VARIANTS,
-    ArchSeed,
-    arch_set,
-    sample,
-)
+from cathsim_dmc.anatomy.arch.sampler import VARIANTS, kind_at, sample
 from cathsim_dmc.anatomy.arch.tree import arch_tree
 from cathsim_dmc.anatomy.builder import ACCESSES, GOAL_DEPTH, VesselPlace
-
-__all__ = [
-    "ARCHES",
-    "DROP_RANGES",
-    "SETS",
-    "VARIANTS",
-    "ArchSeed",
-    "arch_set",
-    "build_arch",
-    "build_seed",
-    "sample",
-]
-
 
 _FROM_CAP = 30e-3  # m, distance of the goal "descending" from the end of the aorta
 
@@ -74,15 +56,6 @@ def build_arch(
     arc = tree.root.centreline.length - _FROM_CAP
     goals["descending"] = VesselPlace(tree.root.name, arc)
     return Anatomy.from_tree(tree, name, inlet=inlet, goals=goals)
-
-
-def build_seed(seed: ArchSeed, *, access: str = "ascending") -> Anatomy:
-    """Anatomy of one arch of a set, see `sampler.arch_set`; the same at every call.
-
-    Args:
-        access: as of `build_arch`.
-    """
-    return build_arch(seed.parameters(), seed.name, access=access)
 
 
 # The published Type-I phantom, as measured: outer width 91 mm, 186 mm from the end
@@ -184,3 +157,77 @@ ARCHES: Mapping[str, ArchParameters] = {
     "type3": TYPE_III,
     "bovine": BOVINE,
 }
+
+
+@dataclass(frozen=True)
+class ArchSeed:
+    """One arch of a set: kind and seed.
+
+    Attributes:
+        seed: of the `RandomState` that draws it.
+        arch_type: "I", "II" or "III".
+        variant: one of `VARIANTS`.
+    """
+
+    seed: int
+    arch_type: str
+    variant: str = "normal"
+
+    @property
+    def name(self) -> str:
+        """Such as "arch-II-2000049"."""
+        variant = "" if self.variant == "normal" else f"-{self.variant}"
+        return f"arch-{self.arch_type}{variant}-{self.seed}"
+
+    def parameters(self) -> ArchParameters:
+        """The arch; the same one at every call."""
+        random_state = np.random.RandomState(self.seed)
+        return sample(random_state, self.arch_type, variant=self.variant)
+
+
+# Names of the sets with the first of their seeds; no two share one.
+_FIRST_SEEDS = {"train": 1_000_000, "test": 2_000_000, "test_variants": 3_000_000}
+SETS = tuple(_FIRST_SEEDS)
+TRAIN_SIZE = 1000
+TEST_SIZE = 98
+_VARIANT_SIZE = 12  # of each kind in `test_variants`
+_BOVINE_SHARE, _BOVINE_TRUNK_SHARE = 0.20, 0.78
+
+
+@lru_cache
+def arch_set(name: str) -> tuple[ArchSeed, ...]:
+    """The arches of a set; sets are disjoint and never change.
+
+    "train" holds 1,000 arches of all types by prevalence, a fifth of them bovine.
+    "test" holds 98 normal arches, 49 of type I and 49 of type II. "test_variants"
+    holds 12 each of type III, of both bovine variants and with an aberrant right
+    subclavian (which have no BCA: their goals are rcca, lcca, lsa and rsa).
+
+    Raises:
+        ValueError: if there is no such set.
+    """
+    first = _FIRST_SEEDS[bounds.choice("set of arches", name, SETS)]
+    if name == "test":
+        kinds = [(kind, "normal") for kind in ("I", "II") * (TEST_SIZE // 2)]
+    elif name == "test_variants":
+        four = [("III", "normal"), *(("II", one) for one in VARIANTS[1:])]
+        kinds = four * _VARIANT_SIZE
+    else:
+        source = np.random.RandomState(first)
+        kinds = []
+        for _ in range(TRAIN_SIZE):
+            kind, bovine, trunk = source.uniform(size=3)
+            variant = "normal"
+            if bovine < _BOVINE_SHARE:
+                is_trunk = trunk < _BOVINE_TRUNK_SHARE
+                variant = "bovine_trunk" if is_trunk else "bovine_branch"
+            kinds.append((kind_at(kind), variant))
+    return tuple(
+        ArchSeed(first + index, kind, variant)
+        for index, (kind, variant) in enumerate(kinds)
+    )
+
+
+def build_seed(seed: ArchSeed, *, access: str = "ascending") -> Anatomy:
+    """Anatomy of one arch of a set; the same at every call, see `build_arch`."""
+    return build_arch(seed.parameters(), seed.name, access=access)

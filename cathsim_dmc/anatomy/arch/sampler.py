@@ -1,9 +1,9 @@
-"""Random aortic arches from anatomical distributions, and named sets of them."""
+"""Random aortic arches from anatomical distributions."""
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
-from functools import lru_cache
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -96,7 +96,7 @@ def sample(
         ValueError: if `arch_type` or `variant` is unknown.
     """
     if arch_type is None:
-        arch_type = _kind(random_state.uniform())
+        arch_type = kind_at(random_state.uniform())
     bounds.choice("arch_type", arch_type, DROP_RANGES)
     bounds.choice("variant", variant, VARIANTS)
     for _ in range(_ATTEMPTS):
@@ -113,7 +113,7 @@ def sample(
     raise RuntimeError(f"no valid arch of type {arch_type} in {_ATTEMPTS} attempts.")
 
 
-def _kind(share: float) -> str:
+def kind_at(share: float) -> str:
     """Type of arch at a share (0 to 1) of all by prevalence."""
     place = np.searchsorted(np.cumsum(_PREVALENCE), share)
     return list(DROP_RANGES)[min(int(place), 2)]
@@ -155,7 +155,12 @@ def _corrected(
 
 
 def _draw(source: Random, drop: float, variant: str) -> ArchParameters:
-    aorta = _aorta(source)
+    share, common = math.sqrt(_AORTA_CORRELATION), _normal(source)
+    own = math.sqrt(1.0 - _AORTA_CORRELATION)
+    aorta: dict[str, Any] = {
+        name: 0.5 * (mean + deviation * (share * common + own * _normal(source)))
+        for name, (mean, deviation) in AORTA_DIAMETERS.items()
+    }
     branches = {name: _branch(source, name) for name in BRANCH_DIAMETERS}
     aberrant = None
     if variant == "aberrant":
@@ -184,14 +189,10 @@ def _draw(source: Random, drop: float, variant: str) -> ArchParameters:
             along = max(source.uniform(10e-3, 18e-3), least)
         both = sum(spacings.values())
         spacings = {"bca_lcca_spacing": along, "lcca_lsa_spacing": both}
-    arch_radius, last = (
-        _normal(source, *_ARCH_RADIUS),
-        aberrant.radius if aberrant else 0.0,
-    )
+    arch_radius = _normal(source, *_ARCH_RADIUS)
+    last = aberrant.radius if aberrant else 0.0
     return ArchParameters(
-        bca=branches["bca"],
-        lcca=branches["lcca"],
-        lsa=branches["lsa"],
+        **branches,
         **aorta,
         ascending_length=40e-3,  # corrected to the drawn length up to the BCA
         descending_length=source.uniform(*_DESCENDING_LENGTH),
@@ -209,15 +210,6 @@ def _draw(source: Random, drop: float, variant: str) -> ArchParameters:
         lsa_aberrant_spacing=radii["lsa"] + last + source.uniform(2e-3, 6e-3),
         **spacings,
     )
-
-
-def _aorta(source: Random) -> dict[str, float]:
-    share, common = math.sqrt(_AORTA_CORRELATION), _normal(source)
-    own = math.sqrt(1.0 - _AORTA_CORRELATION)
-    return {
-        name: 0.5 * (mean + deviation * (share * common + own * _normal(source)))
-        for name, (mean, deviation) in AORTA_DIAMETERS.items()
-    }
 
 
 def _branch(source: Random, name: str) -> BranchParameters:
@@ -241,73 +233,4 @@ def _branch(source: Random, name: str) -> BranchParameters:
         second_bend_azimuth=math.remainder(
             towards + turn + math.pi + _normal(source, 0.0, 0.8), 2.0 * math.pi
         ),
-    )
-
-
-@dataclass(frozen=True)
-class ArchSeed:
-    """One arch of a set: kind and seed.
-
-    Attributes:
-        seed: of the `RandomState` that draws it.
-        arch_type: "I", "II" or "III".
-        variant: one of `VARIANTS`.
-    """
-
-    seed: int
-    arch_type: str
-    variant: str = "normal"
-
-    @property
-    def name(self) -> str:
-        """Such as "arch-II-2000049"."""
-        variant = "" if self.variant == "normal" else f"-{self.variant}"
-        return f"arch-{self.arch_type}{variant}-{self.seed}"
-
-    def parameters(self) -> ArchParameters:
-        """The arch; the same one at every call."""
-        random_state = np.random.RandomState(self.seed)
-        return sample(random_state, self.arch_type, variant=self.variant)
-
-
-# Names of the sets with the first of their seeds; no two share one.
-_FIRST_SEEDS = {"train": 1_000_000, "test": 2_000_000, "test_variants": 3_000_000}
-SETS = tuple(_FIRST_SEEDS)
-TRAIN_SIZE = 1000
-TEST_SIZE = 98
-_VARIANT_SIZE = 12  # of each kind in `test_variants`
-_BOVINE_SHARE, _BOVINE_TRUNK_SHARE = 0.20, 0.78
-
-
-@lru_cache
-def arch_set(name: str) -> tuple[ArchSeed, ...]:
-    """The arches of a set; sets are disjoint and never change.
-
-    "train" holds 1,000 arches of all types by prevalence, a fifth of them bovine.
-    "test" holds 98 normal arches, 49 of type I and 49 of type II. "test_variants"
-    holds 12 each of type III, of both bovine variants and with an aberrant right
-    subclavian (which have no BCA: their goals are rcca, lcca, lsa and rsa).
-
-    Raises:
-        ValueError: if there is no such set.
-    """
-    first = _FIRST_SEEDS[bounds.choice("set of arches", name, SETS)]
-    if name == "test":
-        kinds = [(kind, "normal") for kind in ("I", "II") * (TEST_SIZE // 2)]
-    elif name == "test_variants":
-        four = [("III", "normal"), *(("II", one) for one in VARIANTS[1:])]
-        kinds = four * _VARIANT_SIZE
-    else:
-        source = np.random.RandomState(first)
-        kinds = []
-        for _ in range(TRAIN_SIZE):
-            kind, bovine, trunk = source.uniform(size=3)
-            variant = "normal"
-            if bovine < _BOVINE_SHARE:
-                is_trunk = trunk < _BOVINE_TRUNK_SHARE
-                variant = "bovine_trunk" if is_trunk else "bovine_branch"
-            kinds.append((_kind(kind), variant))
-    return tuple(
-        ArchSeed(first + index, kind, variant)
-        for index, (kind, variant) in enumerate(kinds)
     )
