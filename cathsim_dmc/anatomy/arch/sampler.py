@@ -176,7 +176,7 @@ def _draw(source: Random, drop: float, variant: str) -> ArchParameters:
             lean=math.radians(source.uniform(35.0, 60.0)),
         )
     radii = {name: branch.radius for name, branch in branches.items()}
-    spacings = {
+    spacings: dict[str, Any] = {
         "bca_lcca_spacing": max(SPACINGS[0], radii["bca"] + radii["lcca"] + _WALL),
         "lcca_lsa_spacing": max(SPACINGS[1], radii["lcca"] + radii["lsa"] + _WALL),
     }
