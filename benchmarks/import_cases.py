@@ -105,7 +105,7 @@ def cases(seed: int = SEED) -> list[Case]:
     for name in phantoms.PHANTOMS:
         for count in (4_000, 100_000):
             groups.append([Case("phantom", name, 0, triangles=count)])
-        groups.append([Case("phantom, turned", name, seed - SEED + 1, turn="any")])
+        groups.append([Case("phantom, turned", name, abs(seed - SEED) + 1, turn="any")])
     # In turns, so that a run that is cut off has seen every kind.
     longest = max(map(len, groups))
     return [g[k] for k in range(longest) for g in groups if k < len(g)]

@@ -18,6 +18,7 @@ WIDEST = 4  # ends from which the aorta may start
 SMOOTH = 6e-3  # m, standard deviation along the way, which steps from node to node
 ARM = 60e-3  # m to both sides of a place, over which the bend there is taken
 TURN = np.radians(75.0)  # least bend of an arch
+TURN_OF_STUMP = np.radians(60.0)  # the same of one that is cut off past its branches
 LEG = 80e-3  # m of each leg that are compared, from 10 mm past the branches on
 # m of a limb from the bend on, at most half, that has no direction yet; its length from
 # which on its direction counts, and what more makes that as sure as the branches'.
@@ -36,8 +37,10 @@ FACING, FACING_SPREAD, TURNED = np.radians(50.0), np.radians(25.0), 0.02
 AZIMUTH = (np.radians(-5.0), np.radians(97.0))
 
 
-def find_aorta(ways: Ways, ends: Sequence[FreeEnd]) -> tuple[int, int] | None:
-    """The two ends (rows) between which an aorta runs in an arch, or None.
+def find_aorta(
+    ways: Ways, ends: Sequence[FreeEnd], turn: float = TURN
+) -> tuple[int, int] | None:
+    """The two ends (rows) between which an aorta bends by a ``turn`` (rad), or None.
 
     It is the way between two free ends with the largest sum of fourth powers of the
     depth: a wide stump counts more than a long branch.
@@ -56,7 +59,7 @@ def find_aorta(ways: Ways, ends: Sequence[FreeEnd]) -> tuple[int, int] | None:
     pair, way = best[1:]
     if pair is None or np.median(ways.depth[way]) < RADIUS:
         return None
-    return pair if Bend.of(ways.points[way]).turn > TURN else None
+    return pair if Bend.of(ways.points[way]).turn > turn else None
 
 
 @dataclass(frozen=True)

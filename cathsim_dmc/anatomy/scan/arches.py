@@ -14,6 +14,7 @@ from cathsim_dmc.anatomy.scan.extract import (
     LumenEntry,
     centrelines,
     listed,
+    stump,
 )
 from cathsim_dmc.anatomy.scan.naming import SURE, Naming
 from cathsim_dmc.anatomy.scan.offshoots import Offshoot, offshoots
@@ -27,7 +28,7 @@ class Arch:
     Attributes:
         ways: of the lumen.
         ends: of the aorta, that at the heart last.
-        entry: at the first of them, towards the last.
+        entry: at the first of them, towards the last; the other way if that is a stump.
         found: the centrelines from there, as `centrelines` gives them.
         bend: of the aorta, from there on.
         heart: probability that the heart is at the last end.
@@ -54,7 +55,10 @@ class Arch:
         Raises:
             ValueError: if ``heart`` is near no end of an aorta.
         """
-        pair = aorta.find_aorta(ways, ends)
+        pair, cut = aorta.find_aorta(ways, ends), None
+        if pair is None and (cut := stump(ways, ends)) is not None:
+            ends = [*ends, cut]
+            pair = aorta.find_aorta(ways, ends, aorta.TURN_OF_STUMP)
         if pair is None:
             if heart is not None:
                 raise ValueError(
@@ -73,11 +77,18 @@ class Arch:
                     f"heart is {min(gaps) * 1e3:.0f} mm away from both ends of the "
                     f"aorta; give a point near one of them: {listed([first, last])}."
                 )
-            return cls._seen(ways, ends, first, last, 1.0)
-        arch = cls._seen(ways, ends, first, last)
-        if arch.heart < 0.5:
-            arch = cls._seen(ways, ends, last, first)
-        return replace(arch, heart=max(arch.heart, 1.0 - arch.heart))
+            arch = cls._seen(ways, ends, first, last, 1.0)
+        else:
+            arch = cls._seen(ways, ends, first, last)
+            if arch.heart < 0.5:
+                arch = cls._seen(ways, ends, last, first)
+            arch = replace(arch, heart=max(arch.heart, 1.0 - arch.heart))
+        first, last = arch.ends
+        if first is not cut:
+            return arch
+        # Too short for a device that enters there.
+        entry = LumenEntry(last.position, True, first.position)
+        return replace(arch, entry=entry, found=centrelines(ways, ends, entry))
 
     @classmethod
     def _seen(cls, ways, ends, first, last, heart: float | None = None) -> Self:

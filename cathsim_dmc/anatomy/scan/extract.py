@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
+from scipy.spatial import cKDTree
 from scipy.spatial.distance import cdist
 
 from cathsim_dmc.anatomy.centreline import arc_lengths
@@ -14,6 +15,7 @@ from cathsim_dmc.anatomy.scan.ways import CELL, Ways, common
 END_SEARCH = 15e-3  # m from a blind end in which its width is looked for
 COVER = 1.5  # radii; what lies nearer to a way is no vessel of its own
 STUB = 3e-3  # m, shortest own vessel beyond that
+STUMP = 500  # lattice points beyond that, least of a wide vessel that is cut off
 WIDE = 0.4  # of the widest free end: narrower ends are no inlet by default
 ROOT_WIDTH = 0.5  # of the inlet: narrower free ends do not continue the root
 STARTS = 30e-3  # m along the lumen; curves that start nearer to an end start there
@@ -106,6 +108,29 @@ def free_ends(ways: Ways) -> list[FreeEnd]:
         radius = float(np.median(depth[part])) if part.any() else local
         ends.append(FreeEnd(ways.points[node], radius, narrow))
     return ends
+
+
+def stump(ways: Ways, ends: Sequence[FreeEnd]) -> FreeEnd | None:
+    """The end of a wide vessel that is cut off less than its width past a branch.
+
+    It is the largest piece of lumen that no way between the free ends comes near.
+    """
+    wide = ways.node(max(ends, key=lambda end: end.bottleneck).position)
+    before = ways.deepest_from(wide)
+    traces = [ways.trace(before, ways.node(end.position)) for end in ends]
+    centres = np.unique(np.concatenate(traces))
+    places, reach = ways.points[centres], COVER * ways.depth[centres] + 1e-3
+    near = cKDTree(ways.points).query_ball_point(places, reach)
+    beyond = ways.main.copy()
+    beyond[np.concatenate(near).astype(int)] = False
+    label = groups(len(beyond), ways.links[beyond[ways.links].all(axis=1)])
+    sizes = np.bincount(label, beyond)
+    piece = np.flatnonzero(beyond & (label == sizes.argmax()))
+    if len(piece) < STUMP:
+        return None
+    last = piece[cKDTree(places).query(ways.points[piece])[0].argmax()]
+    radius = float(ways.depth[ways.around(last, END_SEARCH)].max())
+    return FreeEnd(ways.points[last], radius, radius)
 
 
 class LumenEntry(NamedTuple):

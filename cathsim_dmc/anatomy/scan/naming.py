@@ -49,19 +49,21 @@ BUMP = 0.02  # that one that looks cut short is none
 # between neighbours, m (a vertebral artery leaves between others that are no farther
 # apart); length up to the first fork, m: mean, deviation, and how often none is seen.
 BRANCHES = {
-    "bca": (6.2e-3, 11e-3, (42e-3, 10e-3, 0.5)),
+    "bca": (6.2e-3, 12e-3, (42e-3, 10e-3, 0.5)),
     "bovine": (6.4e-3, 26e-3, (12e-3, 8e-3, 0.02)),
-    "lcca": (4.0e-3, 9e-3, (120e-3, 30e-3, 0.95)),
-    "lsa": (5.0e-3, 8e-3, (38e-3, 10e-3, 0.5)),
+    "lcca": (4.0e-3, 8e-3, (120e-3, 30e-3, 0.95)),
+    "lsa": (5.0e-3, 6.3e-3, (38e-3, 10e-3, 0.5)),
     "lva": (1.9e-3, 0.0, (150e-3, 30e-3, 0.99)),
-    "rcca": (3.9e-3, 8e-3, (120e-3, 30e-3, 0.95)),
-    "rsa": (4.8e-3, 8e-3, (38e-3, 10e-3, 0.5)),
+    "rcca": (3.9e-3, 10e-3, (120e-3, 30e-3, 0.95)),
+    "rsa": (4.8e-3, 6e-3, (38e-3, 10e-3, 0.5)),
 }
 AORTA = 13.3e-3
 APART = 0.5  # deviation of the logarithm of a distance between neighbours
-# Cosine between the way of a branch and the right and back of the arch's plane: mean
-# and deviation. An aberrant right subclavian artery runs behind to the right.
-SIDE, SIDE_OF_RSA = (0.0, 0.35), (0.65, 0.3)
+# Cosine between the way of a branch, or its ostium seen from the middle of the aorta,
+# and the right and back of the arch's plane: mean and deviation. An aberrant right
+# subclavian artery leaves the back of the aorta and runs behind to the right.
+SIDES = {"way": (0.0, 0.35), "ostium": (0.0, 0.3)}
+SIDES_OF_RSA = {"way": (0.55, 0.3), "ostium": (0.6, 0.25)}
 _SIDES = np.log(2.0 / np.sqrt(2.0 * np.pi))  # against one of any side
 VESSEL_NAME = re.compile("[a-z][a-z0-9_]*")
 _FORK_DENSITY = 1.0 / 60e-3  # 1/m, to which densities of forks are compared
@@ -185,19 +187,23 @@ def hypotheses(
     """
     # To the patient's right and back if the heart is at the first point.
     side = np.cross(bend.up, bend.along)
-    ways = [max(one.rows, key=len, default=np.zeros((1, 3))) for one in found]
-    sides = [float(chord(way) @ side) for way in ways]
+    sides = []
+    for one in found:
+        way = max(one.rows, key=len, default=np.zeros((1, 3)))
+        out = one.place - bend.line[min(round(1e3 * one.s), len(bend.line) - 1)]
+        ostium = out / max(float(np.linalg.norm(out)), 1e-12)
+        sides.append(np.array([chord(way), ostium]) @ side)
     weights = {}
     for last, more in odds.items():
         seen, right = list(found), sides
         if last:
-            seen, right = seen[::-1], [-value for value in sides[::-1]]
+            seen, right = seen[::-1], [-values for values in sides[::-1]]
         for pattern, labels, weight in _labellings(seen, right, scale):
             weights[Hypothesis(last, pattern, labels)] = weight + more
     return offshoots.normalised(weights)
 
 
-def _labellings(seen: Sequence[Offshoot], right: Sequence[float], scale: float):
+def _labellings(seen: Sequence[Offshoot], right: Sequence[np.ndarray], scale: float):
     """Every (pattern, labels, log weight) of offshoots in order from the heart."""
     count = len(seen)
     for pattern, (frequency, _) in PATTERNS.items():
@@ -228,8 +234,8 @@ def _between(seen: Sequence[Offshoot], labels: Sequence[str]) -> int:
     )
 
 
-def _fit(one: Offshoot, label: str, scale: float, side: float) -> float:
-    """Log probability of the calibre, the fork and the side of an offshoot."""
+def _fit(one: Offshoot, label: str, scale: float, sides: np.ndarray) -> float:
+    """Log probability of the calibre, the fork and the sides of an offshoot."""
     if label == "extra":
         if not one.curves:
             return float(np.log(BUMP))
@@ -240,8 +246,9 @@ def _fit(one: Offshoot, label: str, scale: float, side: float) -> float:
     spread = SPREAD if one.curves else 2.0 * SPREAD
     weight = normal(np.log(one.radius / (scale * radius)), spread)
     if one.curves:
-        mean, deviation = SIDE_OF_RSA if label == "rsa" else SIDE
-        weight += normal(side - mean, deviation) + _SIDES
+        usual = SIDES_OF_RSA if label == "rsa" else SIDES
+        for side, (mean, deviation) in zip(sides, usual.values(), strict=True):
+            weight += normal(float(side) - mean, deviation) + _SIDES
     if one.fork is None:
         return weight + np.log(none if one.curves else SHORT)
     density = np.exp(-0.5 * ((one.fork - length) / spread_of_it) ** 2)
